@@ -1,15 +1,15 @@
-"""Turning in free flight: a policy turns the floating robot by 90 degrees about each axis, each way, and about others.
+"""Turns in free flight: a policy turns the floating robot by 90 degrees about each body axis and about random axes.
 
     python experiments/attitude.py --policy attitude --turns 60 --out outputs/attitude
     python experiments/attitude.py --policy logs/attitude/<run> --randomize --angle 60
 
-Robots float at rest in the default pose, in zero gravity, and are told to turn once. A turn is settled from when the
-error stays within a tolerance until the end; it succeeds if it is, and nothing has touched anything. The authors' robot
-turned by 90 degrees in 2.6 s. Nothing but its own legs turns the robot, so that its angular momentum should stay 0:
-what the solver makes of it is told, as the largest of all robots at any time, and as the angle by which it alone turns
-a robot: its integral over the moment of inertia in the default pose. By default the momentum is kept (`Simulation`);
-`--no-keep-momentum` tells what the solver alone would do, `--refine 4` turns the same robots with a physics step of a
-quarter, and `--solver mujoco` with physics that the policy was not trained on and that keep no momentum.
+Robots float at rest in the default pose, in zero gravity, and one turn is commanded. The settling time is that from
+which the error stays within a tolerance until the end; a turn succeeds if it settles without a collision. The authors'
+robot turned by 90 degrees in 2.6 s. The robot turns by its legs alone, so its angular momentum should stay 0. Its drift
+is reported as the largest value of all robots, and as the turn that it causes: its integral over the moment of inertia
+in the default pose. By default the momentum is conserved (`Simulation`). `--no-keep-momentum` shows the solver alone,
+`--refine 4` a physics step of a quarter, and `--solver mujoco` physics that the policy was not trained on and that
+does not conserve momentum.
 """
 
 from __future__ import annotations
@@ -20,18 +20,17 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
+from jumper_warp.evaluation.attitude import DIRECTIONS, AttitudeFlags, AttitudeLog, random_turns, turn_metrics
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.turns import DIRECTIONS, TurnFlags, Turns, axis_metrics, turn_metrics, turns_about_any
-from support.momentum import MomentumWatch, rotational_inertia
+from support.momentum import MomentumRecorder, rotational_inertia
 
-HARDWARE = {"mean_settling_s": 2.6}
-"""The authors' robot, 90 degrees."""
+HARDWARE = {"mean_settling_s": 2.6}  # Settling time of the authors' robot, 90 degrees
 COLORS = ("tab:red", "tab:green", "tab:blue")
 
 
 @dataclass(frozen=True)
-class Args(EvaluationArgs, TurnFlags):
+class Args(EvaluationArgs, AttitudeFlags):
     """Flags; as many turns about any axis as about the body's."""
 
     policy: str = "attitude"
@@ -44,11 +43,11 @@ class Args(EvaluationArgs, TurnFlags):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        TurnFlags.__post_init__(self)
+        AttitudeFlags.__post_init__(self)
 
 
-def plot(run: EvaluationRun, turns: Turns, title: str) -> None:
-    """Draw the errors of turns about the body's axes over time."""
+def plot_turns(run: EvaluationRun, turns: AttitudeLog, title: str) -> None:
+    """Plot errors over time and settling times of turns about the body's axes, a color per axis."""
     errors = np.degrees(np.array(turns.errors))
     time = (np.arange(len(errors)) + 1) * turns.step_dt
     with figure(run.folder / "turns.png", 1, 2, figsize=(11, 4.2)) as axes:
@@ -56,7 +55,7 @@ def plot(run: EvaluationRun, turns: Turns, title: str) -> None:
             style = {"color": COLORS[i // 2], "linestyle": "-" if i % 2 == 0 else "--"}
             axes[0].plot(time, errors[:, i::6], alpha=0.15 if errors.shape[1] > 6 else 0.0, linewidth=0.6, **style)
             axes[0].plot(time, np.nanmean(errors[:, i::6], axis=1), label=name.replace("_", " "), **style)
-            settled = turns.settling[i::6]
+            settled = turns.settling_time[i::6]
             axes[1].scatter(np.full(len(settled), i), settled, s=12, color=COLORS[i // 2])
         axes[0].axhline(turns.tolerance, color="0.6", linewidth=0.8)
         axes[0].set(xlabel="time [s]", ylabel="angle to the goal [deg]", title=title)
@@ -68,17 +67,17 @@ def plot(run: EvaluationRun, turns: Turns, title: str) -> None:
 
 
 def main(args: Args) -> dict:
-    """Run the test and return its figures."""
-    run = EvaluationRun.of("attitude", args, ("attitude",))
+    """Run both tests and return the metrics."""
+    run = EvaluationRun.from_args("attitude", args, ("attitude",))
     env = run.env(args.turns, lambda task: replace(task, keep_momentum=args.keep_momentum), refine=args.refine)
-    run.told |= {"physics_step_s": env.physics_dt, "keep_momentum": args.keep_momentum}
-    turns, watch = args.log(run.task, args.seed), MomentumWatch(env)
+    run.setup_metrics |= {"physics_step_s": env.physics_dt, "keep_momentum": args.keep_momentum}
+    turns, momentum = args.log(run.task, args.seed), MomentumRecorder(env)
     inertia = rotational_inertia(env.sim)
-    run.follow(env, turns, film="turns", watch=watch)
-    values = turn_metrics(turns) | axis_metrics(turns) | watch.metrics(turns.apart, inertia)
-    plot(run, turns, f"{args.turns} turns by {args.angle:g} degrees, {run.title}")
-    others = Turns(turns_about_any(args.turns, args.angle, args.seed), args.tolerance, args.seconds)
-    run.follow(env, others)
+    run.run_episodes(env, turns, film="turns", on_step=momentum)
+    values = args.metrics(turns) | momentum.metrics(turns.diverged, inertia)
+    plot_turns(run, turns, f"{args.turns} turns by {args.angle:g} degrees, {run.title}")
+    others = AttitudeLog(random_turns(args.turns, args.angle, args.seed), args.tolerance, args.seconds)
+    run.run_episodes(env, others)
     values |= {f"any_axis_{name}": value for name, value in turn_metrics(others).items()}
     return run.report(values, HARDWARE)
 

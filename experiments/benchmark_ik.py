@@ -1,8 +1,8 @@
-"""Inverse kinematics of whole robots per second, in one launch, for reachable and for scattered paw targets.
+"""Benchmark of inverse kinematics: robots per second in one launch, for reachable and for scattered paw targets.
 
     python experiments/benchmark_ik.py --out outputs/benchmark_ik
 
-Before anything is timed the answer is checked: every paw position that a pose within limits takes is reached.
+The result is checked before timing: every paw position of a pose within the limits must be reached.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ import warp as wp
 from jumper_warp.cli.main import run_command
 from jumper_warp.robot.description import load_description
 from jumper_warp.utils.output import output_dir
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.runtime import configure_device
 from support.inverse_kinematics import InverseKinematics, random_motors
 from support.scripts import DeviceArgs, report
 from support.timing import median_time
@@ -37,7 +37,7 @@ class Args(DeviceArgs):
 
 def main(args: Args) -> dict:
     """Run the benchmark and return its metrics."""
-    info, device, n = announce(args.device), wp.get_device(args.device), args.poses
+    info, device, n = configure_device(args.device), wp.get_device(args.device), args.poses
     folder = output_dir("benchmark_ik", args.out)
     description, rng = load_description(), np.random.default_rng(args.seed)
     robots = InverseKinematics(description, n, device)
@@ -45,16 +45,16 @@ def main(args: Args) -> dict:
     offset = rng.uniform(-args.scatter, args.scatter, (4, n, 3)).astype(np.float32)
     scattered = wp.array(paws.numpy() + offset, dtype=wp.vec3, device=device)
     robots.solve(paws)
-    reached, farthest = robots.reachable.numpy().mean(), float(robots.residual.numpy().max())
-    if reached < 1.0 or not farthest < 1.0e-5:
-        raise RuntimeError(f"{100.0 * reached:.4f} % reached, residual {farthest:.2e} m: the time means nothing")
+    reached, max_residual = robots.reachable.numpy().mean(), float(robots.residual.numpy().max())
+    if reached < 1.0 or not max_residual < 1.0e-5:
+        raise RuntimeError(f"{100.0 * reached:.4f} % reached, residual {max_residual:.2e} m: the time means nothing")
     times = [median_time(lambda aim=aim: robots.solve(aim), device, repeats=args.repeats) for aim in (paws, scattered)]
     values = {
         "device": info.name,
         "poses": n,
         "reachable_time [ms]": 1.0e3 * times[0],
         "reachable_rate [poses/s]": n / times[0],
-        "reachable_max_residual [m]": farthest,
+        "reachable_max_residual [m]": max_residual,
         "scattered_time [ms]": 1.0e3 * times[1],
         "scattered_reachable [%]": 100.0 * robots.reachable.numpy().mean(),
     }

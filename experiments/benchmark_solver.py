@@ -1,11 +1,11 @@
-"""Policy steps per second of SolverJumper and of Newton's SolverMuJoCo, on the same robot, in one run.
+"""Benchmark of SolverJumper and Newton's SolverMuJoCo on the same robot: policy steps per second.
 
     python experiments/benchmark_solver.py --envs 4096 --out outputs/benchmark
 
-A policy step is 8 physics steps of 1/480 s, motors included. Both solvers replay a captured graph. Before anything is
-timed, the outcome is checked: the robots stand, or reach their apex. `--baseline PATH` runs the same script of another
-checkout too, and tells how much faster this one is. `--threads 1 2` compares numbers of CPU threads, on physics and on
-whole environments; all other figures are those of the last number.
+A policy step is 8 physics steps of 1/480 s, motors included. Both solvers replay a captured graph. The outcome is
+checked before timing: the robots must stand, or reach their apex. `--baseline PATH` also runs the script of another
+checkout and reports the speed ratio. `--threads 1 2` compares numbers of CPU threads, on physics and on whole
+environments; all other metrics are those of the last number.
 """
 
 from __future__ import annotations
@@ -20,11 +20,11 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.threads import checked_threads
 from support.scripts import DeviceArgs, report
 from support.speed import time_solver, time_threads
-from support.timing import over_baseline
+from support.timing import baseline_ratios
 
 
 @dataclass(frozen=True)
@@ -44,28 +44,27 @@ class Args(DeviceArgs):
     """Numbers of CPU threads to compare (default: all cores, nothing is compared)."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a number of threads is not one."""
         for threads in self.threads or []:
             checked_threads(threads)
 
 
 def main(args: Args) -> dict:
     """Run the benchmark and return its metrics."""
-    values: dict = {"device": announce(args.device, args.threads[-1] if args.threads else None).name}
+    values: dict = {"device": configure_device(args.device, args.threads[-1] if args.threads else None).name}
     if args.threads and wp.get_device(args.device).is_cuda:
         raise InputError("threads are compared on a CPU; add --device cpu")
     folder = output_dir("benchmark_solver", args.out)
     sizes = args.steps, args.repeats, args.device
     for envs in args.envs:
-        figures = {f"{s}_{name}": value for s in args.solvers for name, value in time_solver(s, envs, *sizes).items()}
+        metrics = {f"{s}_{name}": value for s in args.solvers for name, value in time_solver(s, envs, *sizes).items()}
         for phase in ("standing", "jump") if len(set(args.solvers)) == 2 else ():
-            rates = (figures[f"{solver}_steps_per_s_{phase}"] for solver in ("jumper", "mujoco"))
-            figures[f"ratio_{phase}"] = next(rates) / next(rates)
+            rates = (metrics[f"{solver}_steps_per_s_{phase}"] for solver in ("jumper", "mujoco"))
+            metrics[f"ratio_{phase}"] = next(rates) / next(rates)
         if args.threads and len(args.threads) > 1:
-            figures |= time_threads(envs, args.threads, args.steps, args.repeats)
+            metrics |= time_threads(envs, args.threads, args.steps, args.repeats)
         prefix = "" if len(args.envs) == 1 else f"envs_{envs}_"
-        values |= {f"{prefix}{name}": value for name, value in figures.items()}
-    values |= {"envs": args.envs, **over_baseline(args.baseline, "experiments/benchmark_solver.py", args, values)}
+        values |= {f"{prefix}{name}": value for name, value in metrics.items()}
+    values |= {"envs": args.envs, **baseline_ratios(args.baseline, "experiments/benchmark_solver.py", args, values)}
     report(folder, values)
     return values
 

@@ -1,12 +1,12 @@
-"""How fast training is, and where its time goes: solver, environment and PPO in one run on one machine.
+"""Benchmark of training: speed of solver, environment and PPO, and shares of their parts.
 
     python experiments/benchmark_training.py --envs 4096 8192 16384 --out outputs/benchmark_training
 
-Steps are policy steps of 1/60 s, 8 physics steps each, of all environments together. The solver stands; environment
-and training see random or learned actions, with randomisation and noise. rsl-rl-lib trains on the same environment
-through the package's adapter. Before anything is timed, its outcome is checked.
+Steps are policy steps of 1/60 s, 8 physics steps each, of all environments together. The solver is timed with standing
+robots; environment and training have random or learned actions, randomisation and noise. rsl-rl-lib trains on the same
+environment through the package's adapter. Outcomes are checked before timing.
 `--variants all` times PPO compiled or not and in either precision; `--only-ppo` nothing else.
-`--baseline PATH` runs the same script of another checkout too, and tells how much faster this one is.
+`--baseline PATH` also runs the script of another checkout and reports the speed ratio.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.runtime import configure_device
 from support.scripts import ThreadArgs, report
 from support.speed import time_parts, time_ppo, time_rsl_rl
-from support.timing import over_baseline
+from support.timing import baseline_ratios
 from support.variants import VARIANTS, variant
 
 
@@ -61,13 +61,13 @@ class Args(ThreadArgs):
             variant(PpoCfg(), name)
 
     def names(self) -> tuple[str, ...]:
-        """Return the names of the variants."""
+        """Return the names of the variants to time."""
         return tuple(VARIANTS) if self.variants == ("all",) else self.variants
 
 
 def main(args: Args) -> dict:
-    """Run the benchmark and return its figures."""
-    info = announce(args.device, args.threads)
+    """Run the benchmark and return its metrics."""
+    info = configure_device(args.device, args.threads)
     folder = output_dir("benchmark_training", args.out)
     gpu = wp.get_device(args.device).is_cuda
     envs = args.envs or ((4096, 8192, 16384) if gpu else (64,))
@@ -78,15 +78,15 @@ def main(args: Args) -> dict:
     cfg = PpoCfg(num_steps=args.num_steps)
     values |= time_ppo(train_envs, cfg, args.iterations, args.device)
     for name in args.names():
-        figures = time_ppo(train_envs, variant(cfg, name), args.iterations, args.device)
-        values |= {f"{figure}_{name}": value for figure, value in figures.items()}
+        metrics = time_ppo(train_envs, variant(cfg, name), args.iterations, args.device)
+        values |= {f"{metric}_{name}": value for metric, value in metrics.items()}
         write_metrics(folder, values)
     if not args.only_ppo:
         values["collect_env_share"] = args.num_steps * 1.0e-6 * values["env_step_us"] / values["ppo_collect_s"]
     if args.rsl_rl and not args.only_ppo:
         values |= time_rsl_rl(train_envs, args.num_steps, args.iterations, args.device)
         values["ppo_over_rsl_rl"] = values["ppo_steps_per_s"] / values["rsl_rl_steps_per_s"]
-    values |= over_baseline(args.baseline, "experiments/benchmark_training.py", args, values)
+    values |= baseline_ratios(args.baseline, "experiments/benchmark_training.py", args, values)
     report(folder, values)
     return values
 

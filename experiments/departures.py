@@ -1,14 +1,14 @@
-"""What departures of a jump from the paper and its authors' configuration change: trained without each, one at a time.
+"""Ablation of a jump task's departures from the paper and its authors' configuration, one at a time.
 
     python experiments/departures.py --task vertical-jump --out outputs/departures
     python experiments/departures.py --task horizontal-jump --only bracing goals --seeds 1 2
 
-Trainings are alike but for what is undone (`support.departures`): from nothing (on Mars from the policy of Earth),
-randomised, equally long. The task with all departures, `kept`, is trained with every seed of `--kept-seeds`: its spread
-is that of seeds. Each policy then makes nominal and randomised jumps as `jumper evaluate` has them, a fall or a touch
-after the landing being a failure, and robots of each kind wait in their squats for 3 s. The task's own terminations end
-a jump, whatever the training had. A training that `--out` holds already is not repeated, so that an interrupted run
-continues, and `--no-measure` may train on one machine while another measures.
+Trainings differ only in the departure that is undone (`support.departures`): they are equally long, randomised, and
+start from random weights (on Mars from the policy of Earth). The task with all departures, `kept`, is trained with each
+seed of `--kept-seeds`, to show the spread between seeds. Each policy then makes nominal and randomised jumps as in
+`jumper evaluate`, where a fall or a collision after the landing is a failure, and nominal and randomised robots hold
+their squats for 3 s. Jumps are ended by the terminations of the task, regardless of those of the training. A training
+that is already in `--out` is loaded, so that an interrupted run continues; `--no-measure` only trains.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ from rich.console import Console
 from jumper_warp.cli.main import run_command
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
-from support.departure_runs import JUMPS, KEPT, TESTS, WIDTH, Jump, measured, report, settings, trained
-from support.departures import DEPARTURES, Undone, flags_of
+from support.departure_runs import BASELINE, JUMP_TASKS, TESTS, WIDTH, JumpTask, evaluate, parse, report, train_or_load
+from support.departures import DEPARTURES, Ablation, ablation_flags
 from support.scripts import ThreadArgs, prepare
 
 
@@ -34,7 +34,7 @@ from support.scripts import ThreadArgs, prepare
 class Args(ThreadArgs):
     """Flags."""
 
-    task: Jump = "vertical-jump"
+    task: JumpTask = "vertical-jump"
     """Whose departures."""
     only: tuple[str, ...] = ()
     """Names of those that are undone (default: all)."""
@@ -56,7 +56,7 @@ class Args(ThreadArgs):
     """Make the jumps after each training."""
 
     def __post_init__(self) -> None:
-        unknown = set(self.only) - {KEPT, *DEPARTURES[self.task]}
+        unknown = set(self.only) - {BASELINE, *DEPARTURES[self.task]}
         if unknown:
             raise InputError(f"departures of {self.task} are {', '.join(DEPARTURES[self.task])}, not {min(unknown)}")
         if self.length < 1 or self.envs < 1 or min(self.jumps) < 1 or self.squats < 1:
@@ -64,42 +64,42 @@ class Args(ThreadArgs):
 
     @property
     def length(self) -> int:
-        """Iterations of each training."""
-        return JUMPS[self.task].iterations if self.iterations is None else self.iterations
+        """Number of iterations of each training."""
+        return JUMP_TASKS[self.task].iterations if self.iterations is None else self.iterations
 
-    def trainings(self) -> Iterator[tuple[str, int, Undone]]:
-        """Yield name, seed, and what undoes the departure."""
-        for name in self.only or (KEPT, *DEPARTURES[self.task]):
-            for seed in self.kept_seeds if name == KEPT else self.seeds:
+    def trainings(self) -> Iterator[tuple[str, int, Ablation]]:
+        """Yield name, seed and ablation of every training."""
+        for name in self.only or (BASELINE, *DEPARTURES[self.task]):
+            for seed in self.kept_seeds if name == BASELINE else self.seeds:
                 yield name, seed, DEPARTURES[self.task].get(name, "")
 
-    def command(self, undone: Undone, seed: int, folder: Path) -> list[str]:
-        """Return the arguments of `jumper train`."""
+    def command(self, ablation: Ablation, seed: int, folder: Path) -> list[str]:
+        """Return the arguments of `jumper train` for an ablation; folder: of its log."""
         flags = f"--num-envs {self.envs} --iterations {self.length} --seed {seed} --no-tensorboard"
         flags += "" if self.device is None else f" --device {self.device}"
         flags += "" if self.threads is None else f" --threads {self.threads}"
-        flags = f"{flags} {JUMPS[self.task].begin} {self.train} {flags_of(undone)}"
+        flags = f"{flags} {JUMP_TASKS[self.task].begin} {self.train} {ablation_flags(ablation)}"
         return [self.task, *shlex.split(flags), "--log-root", str(folder)]
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Train and measure each, and return the metrics."""
-    for name, seed, undone in args.trainings():  # a wrong flag is refused before any training
-        settings(undone, args.command(undone, seed, Path(name)))
-    folder, found, table = prepare("departures", args, args.threads), {}, None
+    """Train and evaluate each ablation, write the table and the plot, and return the metrics."""
+    for name, seed, ablation in args.trainings():  # a wrong flag is refused before any training
+        parse(ablation, args.command(ablation, seed, Path(name)))
+    folder, results, table = prepare("departures", args, args.threads), {}, None
     values: dict[str, Any] = {"task": args.task, "iterations": args.length, "envs": args.envs}
-    for name, seed, undone in args.trainings():
-        checkpoint = trained(undone, args.command(undone, seed, folder / f"{name}_{seed}"))
+    for name, seed, ablation in args.trainings():
+        checkpoint = train_or_load(ablation, args.command(ablation, seed, folder / f"{name}_{seed}"))
         if not args.measure:
             continue
-        tests = found[name, seed] = measured(checkpoint, args, folder)
-        values[f"flags_{name}"] = flags_of(undone)
+        tests = results[name, seed] = evaluate(checkpoint, args, folder)
+        values[f"flags_{name}"] = ablation_flags(ablation)
         values |= {f"{test}_{key}_{name}_{seed}": tests[test][key] for test in TESTS for key in tests[test]}
         write_metrics(folder, values)
-        table = report(found, f"{args.task}, {args.length} iterations", folder)
+        table = report(results, f"{args.task}, {args.length} iterations", folder)
     if table is not None:
         Console(width=WIDTH).print(table)
-    print(f"{'metrics, table, plot and ' if found else ''}runs in {folder}")
+    print(f"{'metrics, table, plot and ' if results else ''}runs in {folder}")
     return values
 
 

@@ -2,7 +2,7 @@
 
     python experiments/diagonal_jump_grid.py --policy horizontal_jump --out outputs/grid
 
-The suite `grid`: `jumper evaluate horizontal_jump --suite grid` is the same.
+Runs the suite `grid`, as `jumper evaluate horizontal_jump --suite grid` does.
 """
 
 import tyro

@@ -1,10 +1,11 @@
-"""Do our dynamics agree with Pinocchio's? Accelerations, paw positions and paw Jacobians of random states in flight.
+"""Comparison of the dynamics with Pinocchio: accelerations, paw positions and paw Jacobians of random flight states.
 
     python experiments/dynamics_agreement.py --robot assets/jumper/leg_springs.json --out outputs/dynamics_agreement
 
-Both robots have the masses and armatures of the description or of an overlay and random motor torques, but neither
-ground, friction, knee damping nor springs. Ours compute in double precision, with masses that Newton's model holds in
-single precision, which leaves seven digits. A relative difference is one over the largest value of the same state.
+Both robots have the masses and armatures of the description or of an overlay and random motor torques, without ground,
+friction, knee damping and springs. The project's dynamics compute in double precision with masses that Newton's model
+stores in single precision, so seven digits can agree. Relative differences are those over the largest value of the same
+state.
 """
 
 from __future__ import annotations
@@ -20,8 +21,8 @@ from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
-from support.agreement import ours, pinocchios, random_states
+from jumper_warp.utils.runtime import configure_device
+from support.agreement import jumper_quantities, pinocchio_quantities, random_states
 
 UNITS = {
     "base_acceleration": "m/s^2",
@@ -50,24 +51,27 @@ class Args:
             raise InputError(f"states must be at least 1, got {self.states}")
 
 
-def differences(found: np.ndarray, expected: np.ndarray) -> tuple[float, float, float]:
-    """Return the largest value, the largest difference, and the largest one relative to its state's largest value."""
-    size, off = (np.abs(rows.reshape(len(rows), -1)).max(axis=1) for rows in (expected, found - expected))
-    return float(size.max()), float(off.max()), float((off / size).max())
+def differences(ours: np.ndarray, expected: np.ndarray) -> tuple[float, float, float]:
+    """Return the largest expected value, difference, and difference relative to its state's largest value.
+
+    ours, expected: (states, ...) values of one quantity.
+    """
+    size, difference = (np.abs(rows.reshape(len(rows), -1)).max(axis=1) for rows in (expected, ours - expected))
+    return float(size.max()), float(difference.max()), float((difference / size).max())
 
 
 def main(args: Args) -> dict:
     """Compare all quantities and return the metrics."""
-    announce("cpu")
+    configure_device("cpu")
     folder = output_dir("dynamics_agreement", args.out)
     values = RobotValues.nominal(1) if args.robot is None else load_overlay(args.robot).robots()
     states = random_states(args.states, args.seed)
-    found, expected = ours(values, states), pinocchios(values, states)
+    ours, expected = jumper_quantities(values, states), pinocchio_quantities(values, states)
     metrics: dict = {"states": args.states, "robot": None if args.robot is None else str(args.robot)}
     for name, unit in UNITS.items():
-        size, off, relative = differences(found[name], expected[name])
-        metrics |= {f"{name}_difference [{unit}]": off, f"{name}_relative_difference": relative}
-        print(f"{name:26} up to {size:.4g} {unit}, largest difference {off:.1e} {unit}, relative {relative:.1e}")
+        size, difference, relative = differences(ours[name], expected[name])
+        metrics |= {f"{name}_difference [{unit}]": difference, f"{name}_relative_difference": relative}
+        print(f"{name:26} up to {size:.4g} {unit}, largest difference {difference:.1e} {unit}, relative {relative:.1e}")
     write_metrics(folder, metrics)
     print(f"metrics in {folder}")
     return metrics

@@ -1,14 +1,14 @@
-"""Turning upright in a long flight on Mars: tilted takeoffs, with and without turning, and how they are landed.
+"""Attitude control in long flights on Mars: tilted takeoffs and their landings, with and without a turning policy.
 
     python experiments/flight_attitude.py --policy attitude --flights 100 --out outputs/flight
     python experiments/flight_attitude.py --takeoff policy --landing mars_vertical_jump --randomize
 
-Robots squat and extend their legs (24.8 N m, kp 20, 3.71 m/s^2), some a few milliseconds later than others, which
-throws them up tilting and turning. In flight the policy that was trained to turn in zero gravity takes over, with the
-level orientation as its goal; 0.35 s before the landing the jump takes over again: by the policy `--landing`, or with
-the legs held in the default pose. A landing is good if nothing but paws touched anything and the base is within 30
-degrees of level 1.5 s later. The same takeoffs without turning stand beside it. With `--takeoff policy` the policy that
-lands takes off too, half a second after the start.
+Robots squat and extend their legs (24.8 N m, kp 20, 3.71 m/s^2), some legs a few milliseconds later than others, so
+that they take off tilted and rotating. In flight a policy trained to turn in zero gravity takes over, with the level
+orientation as its goal. 0.35 s before the landing the jump takes over again: the policy `--landing`, or the default
+pose. A landing succeeds if only paws touch the ground and the base is within 30 degrees of level 1.5 s later. The same
+takeoffs without turning are the comparison. With `--takeoff policy` the landing policy also takes off, half a second
+after the start.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ import tyro
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.run import EvaluationArgs
 from jumper_warp.utils.errors import InputError
-from support.flights import FlightRun, Flights, delays, draw_flights, flight_metrics
+from support.flights import FlightLog, FlightRun, extension_delays, flight_metrics, plot_flights
 
 
 @dataclass(frozen=True)
@@ -55,17 +55,17 @@ class Args(EvaluationArgs):
 
 
 def main(args: Args) -> dict:
-    """Run the test and return its figures."""
+    """Run the flights with and without turning, and return the metrics."""
     run = FlightRun(args, args.landing, args.jump)
     env, heights = run.env(args.flights), np.linspace(*args.heights, args.flights)
-    late = delays(args.flights, 1.0e-3 * args.late, args.seed) if args.takeoff == "open-loop" else None
-    found = {
-        name: run.fly(env, Flights(heights, late, turns=name == "turning"), name) for name in ("turning", "without")
+    late = extension_delays(args.flights, 1.0e-3 * args.late, args.seed) if args.takeoff == "open-loop" else None
+    flights = {
+        name: run.fly(env, FlightLog(heights, late, turns=name == "turning"), name) for name in ("turning", "without")
     }
-    draw_flights(run.folder / "flights.png", found)
-    told = {"takeoff": args.takeoff, "landing": args.landing or "default pose"}
-    values = told | ({} if late is None else {"late_ms": args.late}) | flight_metrics(found["turning"])
-    values |= {f"without_turning_{name}": value for name, value in flight_metrics(found["without"]).items()}
+    plot_flights(run.folder / "flights.png", flights)
+    settings = {"takeoff": args.takeoff, "landing": args.landing or "default pose"}
+    values = settings | ({} if late is None else {"late_ms": args.late}) | flight_metrics(flights["turning"])
+    values |= {f"without_turning_{name}": value for name, value in flight_metrics(flights["without"]).items()}
     return run.report(values, {})
 
 

@@ -1,9 +1,9 @@
-"""Gradients of a jump's apex against central differences, and a jump raised by gradient ascent.
+"""Check of the gradients of a jump's apex against central differences, and gradient ascent on the apex.
 
     python experiments/gradient_check.py --out outputs/gradients
 
-The jump starts in a squat on the ground and goes through filter, motors, dynamics and contact, at the solver's usual
-step. Gradients and differences are in double precision, the ascent in single precision.
+The jump starts in a squat on the ground and is simulated with filter, motors, dynamics and contact, at the solver's
+default step. Gradients and differences are in double precision, the ascent in single precision.
 """
 
 from __future__ import annotations
@@ -11,26 +11,24 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
+from jumper_warp.diff.rollout import Trajectory
 from jumper_warp.evaluation.plots import figure
-from support.gradients import INNER, OUTER, TICKS, GradientJump, apex, check, schedule
+from support.gradients import INNER, OUTER, TICKS, GradientJump, GradientPair, apex, check, schedule
 from support.scripts import DeviceArgs, prepare, report
 
-WEAK_PUSH = (20.0, 20.0)
-"""[deg] The push-off that the ascent starts from."""
+WEAK_PUSH = (20.0, 20.0)  # [deg] Commands of the push-off that the ascent starts from
 ASCENT_STEPS = 20
-ASCENT_CHANGE = 0.05
-"""[rad] Largest change of a target in a step of the ascent."""
+ASCENT_CHANGE = 0.05  # [rad] Largest change of a target in a step of the ascent
 
 
 @dataclass
 class Ascent:
-    """A jump improved by gradient ascent."""
+    """Result of the gradient ascent."""
 
     apex: list[float]  # [m] before each step and after the last
     before: np.ndarray  # targets [rad], (TICKS, 12)
@@ -38,7 +36,7 @@ class Ascent:
 
 
 def ascend(device: str | None) -> Ascent:
-    """Raise the weak jump by steps along the gradient with respect to all targets."""
+    """Return the result of ASCENT_STEPS normalised gradient steps on all motor targets of the weak jump."""
     jump = GradientJump(1, double=False, device=device)
     targets, heights = schedule(WEAK_PUSH), []
     for _ in range(ASCENT_STEPS):
@@ -49,18 +47,18 @@ def ascend(device: str | None) -> Ascent:
     return Ascent(heights, schedule(WEAK_PUSH), targets)
 
 
-def plot(rollout: Any, actions: tuple[np.ndarray, np.ndarray], ascent: Ascent, path: Path) -> None:
-    """Draw the gradient along the jump with the differences on it, the jump, and the ascent."""
+def plot_gradients(jump: Trajectory, actions: GradientPair, ascent: Ascent, path: Path) -> None:
+    """Plot gradient and differences over the targets' time, the jump's height, and the ascent; actions: of `check`."""
     with figure(path, 4, 1, figsize=(8, 11)) as axes:
         ticks = np.arange(TICKS) / 60.0
-        found, differenced = (values.reshape(2, TICKS) for values in actions)
+        gradient, differenced = (values.reshape(2, TICKS) for values in actions)
         for i, name in enumerate(("outer", "inner")):
-            (line,) = axes[0].plot(ticks, 100.0 * found[i], label=f"FL {name}, gradient")
+            (line,) = axes[0].plot(ticks, 100.0 * gradient[i], label=f"FL {name}, gradient")
             axes[0].plot(
                 ticks, 100.0 * differenced[i], "o", mfc="none", color=line.get_color(), label="central difference"
             )
-        height = rollout.q.numpy()[:, 2, 0]
-        pushed = np.flatnonzero(rollout.impulse.numpy()[: height.argmax(), :, 0].any(axis=(1, 2)))
+        height = jump.q.numpy()[:, 2, 0]
+        pushed = np.flatnonzero(jump.impulse.numpy()[: height.argmax(), :, 0].any(axis=(1, 2)))
         axes[1].plot(np.arange(len(height)) / 480.0, height)
         axes[1].axvline((pushed[-1] + 1) / 480.0, color="0.6", linestyle="--", label="takeoff")
         axes[2].plot(range(ASCENT_STEPS + 1), ascent.apex, "o-")
@@ -77,22 +75,22 @@ def plot(rollout: Any, actions: tuple[np.ndarray, np.ndarray], ascent: Ascent, p
 
 
 def main(args: DeviceArgs) -> dict:
-    """Run the experiment and return its figures."""
+    """Run check and ascent, and return the metrics."""
     folder = prepare("gradient_check", args)
     start = time.perf_counter()
-    rollout, checks = check(args.device)
+    jump, checks = check(args.device)
     ascent = ascend(args.device)
     values = {
-        f"worst_relative_error_{name}": float(np.abs(found - differenced).max() / np.abs(differenced).max())
-        for name, (found, differenced) in checks.items()
+        f"worst_relative_error_{name}": float(np.abs(gradient - differenced).max() / np.abs(differenced).max())
+        for name, (gradient, differenced) in checks.items()
     }
     values |= {
-        "jump_apex_m": float(apex(rollout)[0]),
+        "jump_apex_m": float(apex(jump)[0]),
         "apex_before_m": ascent.apex[0],
         "apex_after_m": ascent.apex[-1],
         "seconds": time.perf_counter() - start,
     }
-    plot(rollout, checks["actions"], ascent, folder / "gradients.png")
+    plot_gradients(jump, checks["actions"], ascent, folder / "gradients.png")
     report(folder, values)
     return values
 

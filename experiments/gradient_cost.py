@@ -1,12 +1,12 @@
-"""What a gradient of a jump costs, in times of its simulation by the solver's own kernel.
+"""Cost of the gradient of a jump, relative to its simulation by the solver's own kernel.
 
     python experiments/gradient_cost.py --out outputs/gradient_cost
     python experiments/gradient_cost.py --device cuda --worlds 4096
 
 The same jump (squat, push-off, flight; 36 policy steps of 8 physics steps) is run by the solver's kernel with the
-command filter, and as a rollout with its reverse pass, by all parameters, targets and the initial state. Both in single
-precision, with the solver's usual tolerance, on one thread of a CPU. The gradient is checked first: it must be that of
-double precision.
+command filter, and as a rollout with its reverse pass, which differentiates by all parameters, targets and the initial
+state. Both run in single precision, with the solver's default tolerance, on one thread of a CPU. The errors of the
+gradient are those against double precision.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.runtime import configure_device
 from support.gradient_runs import GradientRun, PlainJump
 from support.gradients import PUSH, TICKS, schedule
 from support.scripts import DeviceArgs, report
@@ -45,25 +45,25 @@ class Args(DeviceArgs):
 
 
 def main(args: Args) -> dict:
-    """Run the experiment and return its figures."""
-    name, device = announce(args.device, 1).name, wp.get_device(args.device)
+    """Run the comparison and return its metrics."""
+    name, device = configure_device(args.device, 1).name, wp.get_device(args.device)
     folder = output_dir("gradient_cost", args.out)
     worlds = args.worlds or (4096 if device.is_cuda else 64)
     exact = GradientRun(1, True, args.device).run()
     before = device_memory(device) if device.is_cuda else 0
-    mine = GradientRun(worlds, args.double, args.device)
-    plain = PlainJump(mine.rollout, schedule(PUSH))
-    found = mine.run()
+    differentiable = GradientRun(worlds, args.double, args.device)
+    plain = PlainJump(differentiable.rollout, schedule(PUSH))
+    gradient = differentiable.run()
     errors = {
-        key: float(np.abs(found[key].numpy()[..., 0] - exact[key].numpy()[..., 0]).max())
+        key: float(np.abs(gradient[key].numpy()[..., 0] - exact[key].numpy()[..., 0]).max())
         / float(np.abs(exact[key].numpy()).max())
         for key in ("targets", "q", "qd", "table", "saturation")
     }
-    trajectory = mine.forward()
-    kept = (trajectory.q, trajectory.qd, trajectory.torque, trajectory.impulse, trajectory.pressed, trajectory.safe)
+    trajectory = differentiable.forward()
+    saved = (trajectory.q, trajectory.qd, trajectory.torque, trajectory.impulse, trajectory.pressed, trajectory.safe)
     times = {"plain": [], "forward": [], "gradient": []}
     for _ in range(args.repeats):
-        for kind, run in (("plain", plain.run), ("forward", mine.forward), ("gradient", mine.run)):
+        for kind, run in (("plain", plain.run), ("forward", differentiable.forward), ("gradient", differentiable.run)):
             times[kind].append(wall_time(run, args.device))
     plain.run()
     best = {kind: min(values) for kind, values in times.items()}
@@ -74,7 +74,7 @@ def main(args: Args) -> dict:
         f"{'gpu' if device.is_cuda else 'cpu'}_ratio": best["gradient"] / best["plain"],
         "forward_ratio": best["forward"] / best["plain"],
         **{f"{kind}_us_a_step": 1.0e6 * value / steps for kind, value in best.items()},
-        "kept_bytes_a_policy_step": sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in kept) / worlds / TICKS,
+        "kept_bytes_a_policy_step": sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in saved) / worlds / TICKS,
         "height_difference_m": float(np.abs(plain.heights() - trajectory.q.numpy()[-1, 2]).max()),
         **{f"error_{key}": error for key, error in errors.items()},
     }

@@ -2,7 +2,7 @@
 
     python experiments/horizontal_jump_sweep.py --policy horizontal_jump --jumps 200 --out outputs/sweep
 
-The suite `sweep` of policies that jump to places: `jumper evaluate horizontal_jump --suite sweep` is the same.
+Runs the suite `sweep` of policies that jump to landing positions, as `jumper evaluate horizontal_jump --suite sweep`.
 """
 
 import tyro

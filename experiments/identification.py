@@ -1,10 +1,10 @@
-"""Identification of known robots: by this project, at a finer step, on SolverMuJoCo, and by other methods.
+"""Identification of known robots: by this project, with a finer step or SolverMuJoCo as truth, and by other methods.
 
     python experiments/identification.py --seeds 20 --out outputs/identification
 
-Each robot is drawn from the priors and does two hung chirps, a standing chirp and a small jump of 1.25 s, measured with
-noise (0.05 deg, 1 deg/s at 240 Hz; 5 mm, 0.5 deg at 120 Hz) and weighed (20 g). Starts are unknown. A jump at 16 N m
-instead of 12 is held out: its angles and height are predicted from the targets alone.
+Robots are sampled from the priors and execute two hung chirps, a standing chirp and a small jump of 1.25 s, recorded
+with noise (0.05 deg, 1 deg/s at 240 Hz; 5 mm, 0.5 deg at 120 Hz) and weighed (20 g). Initial states are unknown. A jump
+at 16 N m instead of 12 is held out: its angles and height are predicted from the targets alone.
 """
 
 from __future__ import annotations
@@ -20,17 +20,16 @@ import tyro
 from jumper_warp.cli.main import run_command
 from jumper_warp.identification.parameters import jumper_parameters
 from jumper_warp.identification.recording import KINDS, replay_plan, simulate_plan
-from jumper_warp.identification.replay import Replay
+from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.runtime import configure_device
 from support.identification_methods import compare_methods
 from support.known_robots import make_case, plot_cases, policy_errors, run_case
 from support.scripts import report
 
-REFINE = 16
-"""Steps of the finer truth in a step of the model."""
-Part = Literal["same", "fine", "rough", "mujoco", "methods", "policy"]
+REFINE = 16  # Physics steps of the finer truth per step of the model
+Experiment = Literal["same", "fine", "rough", "mujoco", "methods", "policy"]
 
 
 @dataclass(frozen=True)
@@ -41,7 +40,7 @@ class Args:
     """Robots that are identified on the simulator that recorded them."""
     others: int = 1
     """Robots of each part whose truth is not that of the model: fine, rough, mujoco. Metrics are of the first."""
-    parts: tuple[Part, ...] = get_args(Part)
+    parts: tuple[Experiment, ...] = get_args(Experiment)
     """What is run."""
     fine_dt: float = 1.0 / 3840.0
     """[s] Physics step of the model that identifies the robot recorded at a sixteenth of 1/480 s; "rough": 1/480."""
@@ -62,12 +61,13 @@ class Args:
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Run the experiment and return its metrics."""
-    announce("cpu", args.threads)
+    """Run the parts of the experiment and return their metrics."""
+    configure_device("cpu", args.threads)
     folder, parameters = output_dir("identification", args.out), jumper_parameters()
     replay = Replay(device="cpu", threads=args.threads)
     ours = partial(replay_plan, Replay(device="cpu", threads=1))
-    finely, as_fine_model = (partial(ours, refine=n) for n in (REFINE, max(1, round(1.0 / 480.0 / args.fine_dt))))
+    fine_steps = max(1, round(1.0 / 480.0 / args.fine_dt))
+    simulate_finely, replay_finely = (partial(ours, refine=n) for n in (REFINE, fine_steps))
     values: dict[str, Any] = {"parameters": len(parameters), "seconds_of_data": 1.25 * len(KINDS)}
 
     cases = []
@@ -80,18 +80,19 @@ def main(args: Args) -> dict[str, Any]:
         values |= {name: float(np.median([row[name] for row in rows])) for name in rows[0]}
         values["coverage"] = float(np.mean([row["coverage"] for row in rows]))
         values |= {f"{name}_of_seeds": [row[name] for row in rows] for name in ("chi2", "wall_s", "cpu_s", "coverage")}
-    others = {"fine": (finely, as_fine_model, args.fine_dt), "rough": (finely, ours, None),
+    others = {"fine": (simulate_finely, replay_finely, args.fine_dt), "rough": (simulate_finely, ours, None),
               "mujoco": (partial(simulate_plan, solver="mujoco"), ours, None)}  # fmt: skip
-    for part, (carry, model, dt) in others.items():
+    for part, (simulate, model, dt) in others.items():
         if part in args.parts:
-            found = []
+            results = []
             for seed in range(100, 100 + args.others):
-                found.append(run_case(parameters, make_case(parameters, seed, carry, replay), replay, model, dt)[0])
-                print(part, {name: round(value, 4) for name, value in found[-1].items()}, flush=True)
-            values |= {f"{part}_{name}": value for name, value in found[0].items()}
-            values |= {f"{part}_{name}_of_seeds": [row[name] for row in found] for name in ("coverage", "identified")}
+                case = make_case(parameters, seed, simulate, replay)
+                results.append(run_case(parameters, case, replay, model, dt)[0])
+                print(part, {name: round(value, 4) for name, value in results[-1].items()}, flush=True)
+            values |= {f"{part}_{name}": value for name, value in results[0].items()}
+            values |= {f"{part}_{name}_of_seeds": [row[name] for row in results] for name in ("coverage", "identified")}
     if "methods" in args.parts:
-        values |= compare_methods(parameters, cases[0][0], replay, ours, cases[0][2].seconds)
+        values |= compare_methods(parameters, cases[0][0], replay, ours, cases[0][2].effort.seconds)
     if "policy" in args.parts:
         values |= policy_errors(args.policy, args.jumps, cases[0][0], cases[0][2], folder)
     if rows:

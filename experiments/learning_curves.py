@@ -1,13 +1,13 @@
-"""How soon the vertical jump is learnt, nominal: success over wall time and over steps, for seeds and trainer variants.
+"""Learning curves of the vertical jump: success over wall time and over steps, for seeds and trainer variants.
 
     python experiments/learning_curves.py --seconds 60 --seeds 0 1 2 --variants default compiled_bfloat16
     python experiments/learning_curves.py --device cpu --envs 2048 --history 1 --variants small --heights 0.5 0.9 \
         --seconds 450 --every 30                                        # two cores of a CPU
 
-Each training is a process of its own, from nothing, one after the other. Every few seconds, off the clock, its policy
-makes the same jumps to heights of 0.5 to 1.1 m from standing. Reported are the training times to success rates up to
-100 %, and the time from the start of the process until training began, when all kernels and functions are compiled.
-Variants are those of `support.variants`; a second process finds what the first one compiled in the caches on disk.
+Trainings start from random weights, one after the other, each in a separate process. Every few seconds of training time
+the policy is evaluated on jumps to heights of 0.5 to 1.1 m. Reported are the training times to success rates up to
+100 %, and the time from the start of the process to the start of the training, when everything is compiled. Variants
+are those of `support.variants`; a second process loads compiled kernels and functions from the caches on disk.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
-from support.learning import TESTED, Curve, curve_metrics, draw_curves, timed_training
+from support.learning import TEST_HEIGHTS, LearningCurve, curve_metrics, plot_curves, train_and_time
 from support.scripts import DeviceArgs, prepare
 from support.variants import DEFAULT, variant
 
@@ -49,7 +49,7 @@ class Args(DeviceArgs):
     """Number of environments."""
     jumps: int = 200
     """Jumps of an evaluation."""
-    heights: tuple[float, float] = TESTED
+    heights: tuple[float, float] = TEST_HEIGHTS
     """[m] Lowest and highest of them."""
     history: int | None = None
     """Policy steps that the policy sees, as `jumper train --history` (default: as the task says)."""
@@ -65,15 +65,15 @@ class Args(DeviceArgs):
             raise InputError(f"seconds and every must be positive, got {self.seconds} and {self.every}")
 
 
-def train(args: Args, name: str, seed: int) -> Curve:
-    """Train a variant with a seed, and return the curve."""
+def train(args: Args, name: str, seed: int) -> LearningCurve:
+    """Train a variant with a seed, and return the learning curve."""
     wp.config.log_level = wp.LOG_WARNING
     task, cfg = with_history(make_task(TASK), args.history), variant(trainer_settings(TASK), name)
-    return timed_training(task, cfg, args, seed)
+    return train_and_time(task, cfg, args, seed)
 
 
-def train_in_process(args: Args, name: str, seed: int) -> Curve:
-    """Train in a process of its own."""
+def train_in_process(args: Args, name: str, seed: int) -> LearningCurve:
+    """Run `train` in a separate process."""
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         return pool.submit(train, args, name, seed).result()
 
@@ -83,14 +83,14 @@ def main(args: Args) -> dict[str, Any]:
     folder = prepare("learning_curves", args)
     values: dict[str, Any] = {"seconds": args.seconds, "envs": args.envs, "randomize": args.randomize}
     values |= {"seeds": list(args.seeds), "heights_m": list(args.heights), "history": args.history}
-    curves: dict[str, list[Curve]] = {name: [] for name in args.variants}
+    curves: dict[str, list[LearningCurve]] = {name: [] for name in args.variants}
     for name, seed in itertools.product(args.variants, args.seeds):
         curve = train_in_process(args, name, seed)
         curves[name].append(curve)
         values |= curve_metrics(curve, f"{name}_{seed}") | {f"ready_s_{name}_{seed}": curve.ready}
         print(f"ready after {curve.ready:.1f} s", flush=True)
         write_metrics(folder, values)
-        draw_curves(curves, folder / "learning_curves.png")
+        plot_curves(curves, folder / "learning_curves.png")
     print(f"metrics and plot in {folder}")
     return values
 

@@ -1,12 +1,12 @@
-"""How much higher springs between the knees of each leg let the robot jump: open-loop jumps over stiffness and squat.
+"""Effect of springs between the knees of each leg on the open-loop jump, over stiffness and squat.
 
     python experiments/leg_springs.py --out outputs/springs
     python experiments/leg_springs.py --gravity 3.71 --torque 24.8 --kp 20 --length 0.17
 
-Every robot makes the jump of `open_loop_jump.py` (squat, hold, full extension), each with its own stiffness and squat;
-the highest jump of each stiffness counts. Springs that are longer than at rest pull the knees together: up to 90
-degrees they stretch the leg, so that the motors have to pull the robot down into its squat, beyond it they fold it, and
-the motors have to push it up. A spring that they cannot master leaves the robot standing, or down in its squat.
+Every robot makes the jump of `open_loop_jump.py` (squat, hold, full extension) with another stiffness and squat; the
+highest jump of each stiffness is reported. A stretched spring pulls the knees together: up to 90 degrees it extends the
+leg, and the motors have to pull the robot into its squat; beyond 90 degrees it folds the leg, and the motors have to
+push the robot up. If a spring is too stiff for the motors, the robot stays standing or in its squat.
 The authors' sequel has 1000 N/m and 0.17 m.
 """
 
@@ -57,29 +57,29 @@ class Args(DeviceArgs):
             with_springs(stiffness, self.length)
 
     def jumps(self, name: str) -> SpringJumps:
-        """Return the jumps with a command filter of this name."""
+        """Return the jumps with the command filter of a name in FILTERS."""
         motors = jumping_motors(self.torque)
         motors = replace(motors, transversal=replace(motors.transversal, kp=self.kp))
         return SpringJumps(motors, name, self.gravity, self.length, self.device)
 
 
 def main(args: Args) -> dict:
-    """Run the experiment and return its figures."""
+    """Run the jumps of all springs, plot apex over stiffness, and return the metrics."""
     start = time.perf_counter()
     folder = prepare("leg_springs", args)
     values: dict[str, Any] = {"gravity_m_s2": args.gravity, "torque_limit_nm": args.torque, "kp_nm_rad": args.kp,
                               "spring_length_m": args.length, "stiffness_n_m": list(args.stiffness)}  # fmt: skip
-    place = {EARTH: "Earth", MARS: "Mars"}.get(args.gravity, f"{args.gravity:g} m/s^2")
+    planet = {EARTH: "Earth", MARS: "Mars"}.get(args.gravity, f"{args.gravity:g} m/s^2")
     table = Table(
-        "stiffness [N/m]", title=f"open-loop apex in m, {place}, {args.torque:g} N m, springs {args.length:g} m"
+        "stiffness [N/m]", title=f"open-loop apex in m, {planet}, {args.torque:g} N m, springs {args.length:g} m"
     )
     rows = [[f"{stiffness:g}"] for stiffness in args.stiffness]
     with figure(folder / "springs.png", figsize=(7, 4.5)) as axis:
         for name in FILTERS if args.filter == "both" else (args.filter,):
             jumps = args.jumps(name)
-            found = jumps.apexes(args.stiffness, args.squats)
-            best, top = found.max(axis=1), int(found.max(axis=1).argmax())
-            squats = [args.squats[i] for i in found.argmax(axis=1)]
+            apexes = jumps.apexes(args.stiffness, args.squats)
+            best, top = apexes.max(axis=1), int(apexes.max(axis=1).argmax())
+            squats = [args.squats[i] for i in apexes.argmax(axis=1)]
             values |= {f"{name}_apex_m": best.tolist(), f"{name}_squat_command_deg": squats,
                        f"{name}_highest_stiffness_n_m": args.stiffness[top]}  # fmt: skip
             recorded = jumps.record(args.stiffness[top], squats[top], folder)
@@ -94,7 +94,7 @@ def main(args: Args) -> dict:
         table.add_row(*row)
     write_metrics(folder, values)
     Console().print(table)
-    print(f"{time.perf_counter() - start:.1f} s; figures, plot and recordings in {folder}")
+    print(f"{time.perf_counter() - start:.1f} s; metrics, plot and recordings in {folder}")
     return values
 
 

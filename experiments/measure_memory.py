@@ -1,7 +1,7 @@
-"""Memory that each world of a training takes: main memory while the environment is built, and its arrays on the device.
+"""Memory per world of a training: main memory while the environment is built, and its arrays on the device.
 
-The slope between two numbers of worlds, each in a process of its own; `jumper_warp.cli.training_memory` holds the
-figures.
+Measured as the slope between two numbers of worlds, each in a separate process; the results are the constants of
+`jumper_warp.cli.training_memory`.
 
     python experiments/measure_memory.py --solver mujoco
 """
@@ -40,16 +40,16 @@ class Args:
 
 
 def array_bytes() -> int:
-    """Return the bytes of all Warp arrays that own their memory and that something still refers to."""
+    """Return the total size [byte] of all live Warp arrays that own their memory."""
     gc.collect()
     arrays = [each for each in gc.get_objects() if type(each) is wp.array and each.ptr and each.deleter is not None]
     return sum({array.ptr: array.capacity for array in arrays}.values())
 
 
 def measure(args: Args) -> dict[str, float]:
-    """Return the peak of this process's main memory and the size of all arrays [byte] after building one environment.
+    """Build one environment on the CPU, and return the process's peak main memory and the size of all arrays [byte].
 
-    All is on the CPU; the arrays are the same on a GPU.
+    The arrays are the same on a GPU.
     """
     wp.config.log_level = wp.LOG_WARNING
     env = Env(make_task(args.task), args.envs[0], device="cpu", solver=args.solver)
@@ -58,7 +58,7 @@ def measure(args: Args) -> dict[str, float]:
 
 
 def main(args: Args) -> dict[str, float]:
-    """Return the bytes of each world."""
+    """Return the memory per world [byte]; for a single number of worlds that of `measure`."""
     if len(args.envs) == 1:
         values = measure(args)
         print(json.dumps(values))

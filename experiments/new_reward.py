@@ -1,4 +1,4 @@
-"""How to add a reward term from a script of your own, without touching the package.
+"""Example of a reward term that is defined in a script, without changes to the package.
 
     python experiments/new_reward.py --iterations 5
 
@@ -59,7 +59,7 @@ class Args:
 
 
 def main(args: Args) -> dict:
-    """Train for a few iterations and return what was logged of the new term."""
+    """Train for a few iterations and return the logged value of the new term."""
     wp.config.log_level = wp.LOG_WARNING
     folder = output_dir("new_reward", args.out)
     ppo = PpoCfg(num_steps=args.steps)
@@ -67,8 +67,8 @@ def main(args: Args) -> dict:
                    device=args.device, tensorboard=False)  # fmt: skip
     result = train(cfg, make_env)
     values = {
-        "even_load_per_episode": result.figures["Episode_Reward/even_load"],
-        "mean_return": result.figures.get("Train/mean_return"),
+        "even_load_per_episode": result.metrics["Episode_Reward/even_load"],
+        "mean_return": result.metrics.get("Train/mean_return"),
         "iterations": result.iteration,
     }
     write_metrics(folder, values)

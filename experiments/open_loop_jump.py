@@ -4,8 +4,8 @@
 
 The hardware reached 1.075 m at 18 N m with the gains and filter of the policies. With 24.8 N m, stiffer gains and a
 looser filter, neither of which it states, the paper's simulation gives 1.42 m: `--torque 24.8 --loose --kp 20`. Springs
-between the knees of each leg, as in the authors' sequel, are `--spring 1000 0.17`. Beyond 90 degrees they pull the legs
-farther in: `--squat` says how deep. `--robot` takes a robot of other parameters, for example with a load on its base.
+between the knees of each leg, as in the authors' sequel, are `--spring 1000 0.17`. Beyond 90 degrees they fold the legs
+further: `--squat` sets the depth. `--robot` takes a robot with other parameters, for example with a load on its base.
 """
 
 from __future__ import annotations
@@ -19,7 +19,8 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.commands import print_figures
+from jumper_warp.evaluation.commands import print_metrics
+from jumper_warp.evaluation.run import SOLVER_TITLES
 from jumper_warp.robot.description import LEGS
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.model import build_model
@@ -29,15 +30,14 @@ from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from jumper_warp.viz.snapshot import Camera, contact_sheet
-from support.open_loop import SQUAT, draw_trace, follow_jump, jump_metrics
+from support.open_loop import SQUAT, plot_trace, simulate_jump, trace_metrics
 from support.scripts import DeviceArgs, prepare
 
-HARDWARE_APEX = 1.075
-"""[m] Paper, open loop on the robot at 18 N m."""
-MOMENTS = (0.9, 2.2, 2.32, 2.45, 2.7, 2.95, 3.15, 3.8)
-"""[s] Of the filmstrip: standing, squatting, push-off, rising, apex, falling, landing, standing."""
+HARDWARE_APEX = 1.075  # [m] Paper, open loop on the robot at 18 N m
+STRIP_TIMES = (0.9, 2.2, 2.32, 2.45, 2.7, 2.95, 3.15, 3.8)
+"""[s] Times of the filmstrip's pictures: standing, squatting, push-off, rising, apex, falling, landing, standing."""
 PER_MOTOR = tuple(f"peak_{what}_{leg}" for what in ("torque", "speed") for leg in LEGS)
-"""Beginnings of the figures that are saved but not printed."""
+"""Prefixes of the metrics that are saved but not printed."""
 
 
 @dataclass(frozen=True)
@@ -66,19 +66,19 @@ class Args(DeviceArgs):
             raise InputError("give springs or a robot, which may have springs")
 
 
-def draw_filmstrip(frames: list[np.ndarray], path: Path) -> None:
-    """Draw the robot at a few moments side by side; frames: body poses of every tick, (21, 7) each."""
+def save_filmstrip(frames: list[np.ndarray], path: Path) -> None:
+    """Write pictures of the robot at STRIP_TIMES; frames: body poses of every policy step, (21, 7) each."""
     model = build_model(1)
     state = model.state()
     camera, pictures = Camera(model, eye=(1.6, 2.0, 0.75), target=(0.0, 0.0, 0.55), size=(300, 400)), []
-    for moment in MOMENTS:
-        state.body_q.assign(frames[round(60 * moment)])
+    for time_s in STRIP_TIMES:
+        state.body_q.assign(frames[round(60 * time_s)])
         pictures.append(camera.picture(state))
-    contact_sheet(pictures, path, [f"{moment:.2f} s" for moment in MOMENTS])
+    contact_sheet(pictures, path, [f"{time_s:.2f} s" for time_s in STRIP_TIMES])
 
 
 def main(args: Args) -> dict:
-    """Run the experiment and return its figures."""
+    """Simulate the jump, write its plots and recording, and return the metrics."""
     start = time.perf_counter()
     folder = prepare("open_loop_jump", args)
     variant = {"solver": args.solver, "gravity_m_s2": args.gravity, "torque_limit_nm": args.torque,
@@ -96,16 +96,17 @@ def main(args: Args) -> dict:
         1, solver=args.solver, motors=motors, command_filter=command_filter, gravity=args.gravity, robot=robot,
         device=args.device,
     )  # fmt: skip
-    trace, recorder, frames = follow_jump(sim, variant, args.squat)
-    draw_filmstrip(frames, folder / "jump_strip.png")
-    values: dict[str, Any] = {**variant, **jump_metrics(trace), "hardware_apex_height_m": None}
+    trace, recorder, frames = simulate_jump(sim, variant, args.squat)
+    save_filmstrip(frames, folder / "jump_strip.png")
+    values: dict[str, Any] = {**variant, **trace_metrics(trace), "hardware_apex_height_m": None}
     if args.torque == 18.0 and args.gravity == EARTH and not args.loose and robot is None:
         values["hardware_apex_height_m"] = HARDWARE_APEX
     write_metrics(folder, values)
-    draw_trace(folder / "jump.png", trace, f"Open-loop jump, {args.solver}, {args.torque:g} N m", HARDWARE_APEX)
+    title = f"Open-loop jump, {SOLVER_TITLES[args.solver]}, {args.torque:g} N m"
+    plot_trace(folder / "jump.png", trace, title, HARDWARE_APEX)
     recorder.save_rrd(folder / "jump.rrd")
-    print_figures({name: value for name, value in values.items() if not name.startswith(PER_MOTOR)})
-    print(f"{time.perf_counter() - start:.1f} s; figures, plot and recording (rerun {folder / 'jump.rrd'}) in {folder}")
+    print_metrics({name: value for name, value in values.items() if not name.startswith(PER_MOTOR)})
+    print(f"{time.perf_counter() - start:.1f} s; metrics, plot and recording (rerun {folder / 'jump.rrd'}) in {folder}")
     return values
 
 

@@ -1,10 +1,10 @@
-"""The paper's tests of jumps, each with the paper's numbers beside those of given policies.
+"""The paper's tests of jumps: results of given policies beside the paper's values.
 
     python experiments/paper_tests.py --out outputs/paper
     python experiments/paper_tests.py --policies vertical_jump logs/horizontal-jump/RUN --randomize
 
-Every policy goes through all suites of its task that have numbers in the paper (`jumper_warp.evaluation.suites`). The
-folder has a folder for each of them.
+Every policy is evaluated by all suites of its task that have values in the paper (`jumper_warp.evaluation.suites`). The
+output folder has a subfolder for each.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, shown
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, format_value
 from jumper_warp.evaluation.suites import suites_for
 from jumper_warp.utils.output import output_dir, write_metrics
 
@@ -33,7 +33,7 @@ class Args(EvaluationArgs):
 
 
 def main(args: Args) -> dict:
-    """Run all tests and return the metrics that the paper has too."""
+    """Run all tests, and return the metrics that also have a value in the paper."""
     folder, values = output_dir("paper_tests", args.out), {}
     table = Table("policy", "test", "metric", "here", "paper")
     for policy in args.policies:
@@ -41,10 +41,10 @@ def main(args: Args) -> dict:
             if not suite.paper:
                 continue
             flags: dict[str, Any] = {key: value for key, value in asdict(args).items() if key != "policies"}
-            found = suite(**flags | {"policy": policy, "out": folder / f"{Path(policy).name}_{name}"}).run()
+            metrics = suite(**flags | {"policy": policy, "out": folder / f"{Path(policy).name}_{name}"}).run()
             for metric, paper in suite.paper.items():
-                values[f"{Path(policy).name}_{name}_{metric}"] = found[metric]
-                table.add_row(policy, name, metric, shown(found[metric]), f"{paper:g}")
+                values[f"{Path(policy).name}_{name}_{metric}"] = metrics[metric]
+                table.add_row(policy, name, metric, format_value(metrics[metric]), f"{paper:g}")
     write_metrics(folder, values)
     Console().print(table)
     return values

@@ -1,11 +1,11 @@
-"""SHAC against PPO on the nominal vertical jump, and how noisy gradients through contact are.
+"""Comparison of SHAC and PPO on the nominal vertical jump, and noise of gradients through contact.
 
     python experiments/shac.py --envs 4096 --seconds 120 --out outputs/shac          # on a GPU
     python experiments/shac.py --envs 128 --seconds 300 --hidden 64 64 --history 1 --seeds 0     # on a CPU
 
-First the spread of the policy's gradient between worlds is measured against the length of the window, through the
-physics and by the score function of PPO, for new and for trained weights. Then both train. Every few seconds, off the
-clock, a policy makes the same jumps to heights of 0.5 to 1.1 m; time and steps to 50, 90 and 95 % success are reported.
+First the variance of the policy gradient between worlds is measured over the length of the window, through the physics
+and by the score function of PPO, for random and for trained weights. Then both train. Every few seconds of training
+time, the policy is evaluated on jumps to heights of 0.5 to 1.1 m; time and steps to success rates are reported.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from jumper_warp.rl.shac import Shac
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
-from support.gradient_variance import variances
-from support.learning import Curve, curve_metrics, draw_curves, learning_curve, make_judge
+from support.gradient_variance import measure_stats, plot_variances, print_variances, variance_metrics
+from support.learning import LearningCurve, curve_metrics, make_eval_env, plot_curves, train_and_evaluate
 from support.scripts import DeviceArgs, prepare
 
 TASK = "vertical-jump"
@@ -65,50 +65,53 @@ class Args(DeviceArgs):
     """Worlds of that."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         if not self.seeds or not self.trainers or min((self.every, *self.horizons, self.worlds - 1)) <= 0:
             raise InputError("need seeds, trainers, at least 2 worlds, and positive times and horizons")
 
 
 def make_env(args: Args, num_envs: int, seed: int = 0, *, history: int | None = None) -> Env:
-    """Return the nominal task; history: policy steps that the policy sees."""
+    """Return an environment of the nominal task; history: number of policy steps in the observation."""
     task = with_history(make_task(TASK), history)
     return Env(task, num_envs, seed=seed, device=args.device, randomize=False, noise=False)
 
 
-def train(args: Args, trainer: str, seed: int) -> Curve:
-    """Train once and return the curve."""
+def train(args: Args, algorithm: str, seed: int) -> LearningCurve:
+    """Train with "ppo" or "shac" and a seed, and return the learning curve."""
     torch.manual_seed(seed)
     env, settings = make_env(args, args.envs, seed, history=args.history), trainer_settings(TASK)
-    judge = make_judge(env.tasks[0], args.jumps, args.device)
+    eval_env = make_eval_env(env.tasks[0], args.jumps, args.device)
     settings = replace(settings, hidden=args.hidden)
-    if trainer == "shac":
-        smooth = cast(DifferentiableVecEnv, DifferentiableEnv(env))
+    if algorithm == "shac":
+        differentiable = cast(DifferentiableVecEnv, DifferentiableEnv(env))
         settings = replace(settings, num_steps=args.window, init_std=args.init_std)
-        return learning_curve(smooth, Shac(smooth, settings, ShacCfg()), judge, args.seconds, args.every)
-    return learning_curve(env, Ppo(env, settings), judge, args.seconds, args.every)
+        trainer = Shac(differentiable, settings, ShacCfg())
+        return train_and_evaluate(differentiable, trainer, eval_env, args.seconds, args.every)
+    return train_and_evaluate(env, Ppo(env, settings), eval_env, args.seconds, args.every)
 
 
 def compare(args: Args, folder: Path) -> dict[str, Any]:
-    """Train with every trainer and seed, draw the curves, and return the metrics."""
+    """Train with every trainer and seed, plot the learning curves, and return the metrics."""
     values, curves = {}, {trainer: [] for trainer in args.trainers}
     for trainer in args.trainers:
         for seed in args.seeds:
             curves[trainer].append(train(args, trainer, seed))
             values |= curve_metrics(curves[trainer][-1], f"{trainer}_{seed}")
             write_metrics(folder, values)
-    draw_curves(curves, folder / "curves.png")
+    plot_curves(curves, folder / "curves.png")
     return values
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Measure, train, draw, and return the figures."""
+    """Measure gradient noise, train, plot both, and return the metrics."""
     folder = prepare("shac", args)
-    values = {"envs": args.envs, "window": args.window, "worlds": args.worlds}
-    values |= variances(lambda: make_env(args, args.worlds), args.horizons, folder / "variance.png")
+    values: dict[str, Any] = {"envs": args.envs, "window": args.window, "worlds": args.worlds}
+    stats = measure_stats(lambda: make_env(args, args.worlds), args.horizons)
+    plot_variances(stats, args.horizons, folder / "variance.png")
+    print_variances(stats, args.horizons)
+    values |= {"horizons": list(args.horizons)} | variance_metrics(stats)
     values |= compare(args, folder) if args.seconds > 0.0 else {}
     write_metrics(folder, values)
-    print(f"figures and plots in {folder}")
+    print(f"metrics and plots in {folder}")
     return values
 
 

@@ -1,12 +1,12 @@
-"""Random actions for a long time: does any world ever become non-finite?
+"""Soak test: random actions for a long time, to see whether any world becomes non-finite.
 
     python experiments/soak_test.py --envs 4096 --steps 2500 --out outputs/soak
     python experiments/soak_test.py --envs 16384 --steps 61036 --task velocity-rough   # a billion, whole environments
 
-An action is a target angle for every motor, drawn anew at random within the limits of the jump. Worlds start again
-after `episode` steps, the legs' masses and the paws' friction differ from world to world. With `--task` it is a whole
-environment of any task, randomised, that takes random actions: its episodes end and begin on their own. A map of
-grounds has its hardest row alone. On a GPU the steps for which an action is held are one graph.
+Actions are random target angles of all motors within the limits of the jump. Worlds are reset after `episode` steps;
+masses and paw friction differ between worlds. With `--task` a whole randomised environment of any task takes random
+actions, and its episodes end and begin as in training; a map of grounds has only its hardest row. On a GPU the steps
+for which an action is held are one graph.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from support.soak import SoakArgs, hardest, soak_env, soak_simulation
 
 
 def main(args: SoakArgs) -> dict:
-    """Run the soak test and return its figures."""
+    """Run the soak test and return its metrics."""
     folder = prepare("soak_test", args, args.threads)
     torch.manual_seed(args.seed)
     if args.task is None:
         command_filter = vertical_jump_filter() if args.filter else None
         sim = Simulation(args.envs, command_filter=command_filter, visuals=False, device=args.device)
-        figures = soak_simulation(sim, args)
+        metrics = soak_simulation(sim, args)
     else:
         env = Env(hardest(make_task(args.task)), args.envs, seed=args.seed, device=args.device, threads=args.threads)
-        figures = soak_env(env, args) | {"task": args.task}
-    report(folder, figures | {"envs": args.envs, "filter": args.filter, "seed": args.seed})
-    return figures
+        metrics = soak_env(env, args) | {"task": args.task}
+    report(folder, metrics | {"envs": args.envs, "filter": args.filter, "seed": args.seed})
+    return metrics
 
 
 if __name__ == "__main__":

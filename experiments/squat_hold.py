@@ -1,11 +1,11 @@
-"""Squats that are held: how quietly a policy waits for the command to jump.
+"""Held squats: variation of paw forces and motor torques while a policy waits for the command to jump.
 
     python experiments/squat_hold.py --policy vertical_jump --out outputs/hold
     python experiments/squat_hold.py --policy horizontal_jump --squats 500 --randomize
 
-Robots stand, get a goal but no command, and squat. In the last second it is looked at how much the force on each paw
-varies, of all physics steps for the largest and of policy steps for the smallest, and how much the torques of the
-motors ripple. Randomised robots see noise and are pushed by up to 10 N.
+Robots stand, get a goal but no command, and squat. Evaluated over the last second are the range of the force on each
+paw (largest value over physics steps, smallest over policy steps) and the ripple of the motor torques. Randomised
+robots have observation noise and are pushed by up to 10 N.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.utils.errors import InputError
-from support.holds import Holds, hold_goals, hold_metrics
+from support.squats import SquatLog, squat_goals, squat_metrics
 
 
 @dataclass(frozen=True)
@@ -47,29 +47,29 @@ class Args(EvaluationArgs):
                 raise InputError(f"{name} must be in (0, 10) m and rise, got {low}, {high}")
 
 
-def plot(run: EvaluationRun, holds: Holds) -> None:
-    """Draw forces and torques of the robot whose forces vary most, and the ranges of all."""
-    time = (np.arange(len(holds.forces)) + 1) * holds.step_dt
-    robot = np.flatnonzero(~holds.over)[holds.force_range.argmax()]
+def plot_squats(run: EvaluationRun, squats: SquatLog) -> None:
+    """Plot forces and torques of the robot with the largest force range, and the force ranges of all robots."""
+    time = (np.arange(len(squats.forces)) + 1) * squats.step_dt
+    robot = np.flatnonzero(~squats.ended)[squats.force_range.argmax()]
     with figure(run.folder / "hold.png", 1, 3, figsize=(14, 4)) as axes:
-        axes[0].plot(time, np.array(holds.forces)[:, robot], linewidth=0.8)
+        axes[0].plot(time, np.array(squats.forces)[:, robot], linewidth=0.8)
         axes[0].set(xlabel="time [s]", ylabel="force on each paw [N]", title="the robot whose forces vary most")
-        axes[1].plot(time, np.array(holds.torques)[:, robot], linewidth=0.8)
+        axes[1].plot(time, np.array(squats.torques)[:, robot], linewidth=0.8)
         axes[1].set(xlabel="time [s]", ylabel="torque of each motor [N m]")
-        axes[2].hist(holds.force_range, bins=30)
+        axes[2].hist(squats.force_range, bins=30)
         axes[2].set(xlabel="range of a paw's force in the last second [N]", ylabel="robots", title=run.title)
 
 
 def main(args: Args) -> dict:
-    """Hold squats and return the figures."""
-    run = EvaluationRun.of("squat_hold", args, (*HEIGHTS, *PLACES))
+    """Run the squats and return the metrics."""
+    run = EvaluationRun.from_args("squat_hold", args, (*HEIGHTS, *PLACES))
     env = run.env(args.squats)
     up = run.task.evaluation_suite in HEIGHTS
-    goals = hold_goals(args.squats, args.height if up else args.distance, up=up)
-    holds = run.follow(env, Holds(goals, args.hold), film="holds")
-    if not holds.over.all():
-        plot(run, holds)
-    return run.report({"hold_s": args.hold} | hold_metrics(holds), {})
+    goals = squat_goals(args.squats, args.height if up else args.distance, up=up)
+    squats = run.run_episodes(env, SquatLog(goals, args.hold), film="holds")
+    if not squats.ended.all():
+        plot_squats(run, squats)
+    return run.report({"hold_s": args.hold} | squat_metrics(squats), {})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Jumps by gradients through the simulation: farthest, highest, least work, one that lands still, and what limits them.
+"""Optimisation of jumps by gradients through the simulation: farthest, highest, least work, still landing; and limits.
 
     python experiments/trajectory_optimization.py --out outputs/trajectories
     python experiments/trajectory_optimization.py --jumps farthest farthest_torque_24_8 farthest_filter
@@ -10,9 +10,9 @@ smoothed gradients (`trajectory.smoothing`) and ends with limited-memory BFGS in
 policies, at every physics step, where collisions of all links are counted.
 
 The farthest flight stays within 0.3 m of its start in stance, without a run-up, and lands within 30 degrees of level.
-`farthest_*` change one limit (`support.optimized_jumps.LIMITS`) and start from the farthest flight too if it comes
-before them. In vertical jumps only the paws touch the ground, the tilt is at most 8 degrees and the base stays within
-0.15 m of its start. Work is the motors' positive work until takeoff.
+`farthest_*` change one limit (`support.optimized_jumps.LIMITS`) and also start from the farthest flight if it was
+optimised before. In vertical jumps only the paws touch the ground, the tilt is at most 8 degrees and the base stays
+within 0.15 m of its start. Work is the motors' positive work until takeoff.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from rich.table import Table
 from jumper_warp.cli.main import run_command
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
-from support.motion_replay import Replay, plot
+from support.motion_replay import MotionReplay, plot_replays
 from support.optimized_jumps import FINE, JUMPS, LIMITED, around, optimise
 from support.scripts import ThreadArgs, prepare
 
@@ -63,16 +63,16 @@ class Args(ThreadArgs):
             raise InputError(f"need at least 48 samples, got {self.samples}")
 
 
-def run_jump(name: str, args: Args, folder: Path, found: dict[str, np.ndarray]) -> tuple[dict[str, float], Replay]:
-    """Optimise one jump, and return its metrics and replay; found: best candidates by jump, to which it is added."""
+def run_jump(name: str, args: Args, folder: Path, best: dict[str, np.ndarray]) -> tuple[dict[str, float], MotionReplay]:
+    """Optimise one jump, and return its metrics and replay; best: solutions by jump, to which it is added."""
     jump, wall, cpu = KNOWN[name], time.perf_counter(), time.process_time()
     settings: dict[str, Any] = {"device": args.device, "threads": args.threads}
     knots, rng = jump.make(**FINE, **settings).knots, np.random.default_rng(args.seed)
     begin = jump.draw(knots, args.samples or jump.samples, rng)
-    if jump.after in found:
-        begin = np.concatenate([begin, around(found[jump.after], knots, rng)])
+    if jump.after in best:
+        begin = np.concatenate([begin, around(best[jump.after], knots, rng)])
     progress, steps = optimise(jump.scaled(args.effort), begin, args.seed, args.polish or jump.polish, **settings)
-    x = found[name] = progress.x[progress.best]
+    x = best[name] = progress.x[progress.best]
     targets = knots.targets(torch.as_tensor(x[None]))[..., 0].numpy()
     np.savez(folder / f"{name}.npz", targets=targets, knots=x.reshape(len(knots.at), -1), at=np.array(knots.at))
     values = steps | {"wall_s": time.perf_counter() - wall, "cpu_s": time.process_time() - cpu}
@@ -81,28 +81,28 @@ def run_jump(name: str, args: Args, folder: Path, found: dict[str, np.ndarray]) 
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Optimise, and return the metrics."""
+    """Optimise the jumps in order, write their replays, and return the metrics."""
     torch.set_num_threads(1)  # its arrays are small, and the worlds have the cores
-    folder, found = prepare("trajectory_optimization", args, args.threads), {}
-    replays: dict[str, Replay] = {}
+    folder, best = prepare("trajectory_optimization", args, args.threads), {}
+    replays: dict[str, MotionReplay] = {}
     values: dict[str, Any] = {}
     table = Table("jump", "reached", "violation", "simulated steps", "reverse steps", "processor [s]", "wall [s]")
     for name in args.jumps:
-        row, replay = run_jump(name, args, folder, found)
+        row, replay = run_jump(name, args, folder, best)
         replays[KNOWN[name].label] = replay
         values |= {f"{name}_gradients_{key}": value for key, value in row.items()}
         values |= {f"{name}_{key}": value for key, value in replay.metrics().items()}
         if name == "still":
             values |= {"still_longest_lift_s": replay.longest_lift, "still_highest_lift_m": replay.highest_lift}
         replay.recorder.save_rrd(folder / f"{name}.rrd")
-        replay.save_strip(folder / f"{name}_strip.png")
+        replay.save_filmstrip(folder / f"{name}_strip.png")
         write_metrics(folder, values)
         table.add_row(
             KNOWN[name].label, f"{row['value']:.3f} {KNOWN[name].unit}", f"{row['violation']:.4f}",
             f"{row['simulated_steps'] / 1e6:.2f} M", f"{row['reverse_steps'] / 1e6:.2f} M", f"{row['cpu_s']:.0f}",
             f"{row['wall_s']:.0f}",
         )  # fmt: skip
-    plot(replays, folder / "trajectories.png")
+    plot_replays(replays, folder / "trajectories.png")
     Console().print(table)
     print(f"metrics, plots, targets and recordings in {folder}")
     return values

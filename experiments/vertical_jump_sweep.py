@@ -3,7 +3,7 @@
     python experiments/vertical_jump_sweep.py --policy vertical_jump --jumps 200 --out outputs/sweep
     python experiments/vertical_jump_sweep.py --gains 0.6 1 --heights 0.55 1.05   # weak motors
 
-The suite `sweep` of policies that jump to heights: `jumper evaluate vertical_jump --suite sweep` is the same.
+Runs the suite `sweep` of policies that jump to heights, as `jumper evaluate vertical_jump --suite sweep` does.
 """
 
 import tyro

@@ -2,13 +2,12 @@
 
     python experiments/walk_jump_walk.py --robots 200 --out outputs/walk_jump_walk
 
-Every robot walks after commands of its own, redrawn every two seconds within 0.8 m/s and 0.8 rad/s, jumps to 0.75 m,
-walks, jumps 0.85 m ahead, and walks. `--course` gives every robot ten commands of its own instead: to walk, to turn,
-to jump up, to jump to a place and to jump onto a sliding block of 0.05 m, drawn at random (no block on SolverMuJoCo).
-The block lies under the goal from when the jump takes over, and stays where it then slides. A jump is commanded while
-the robot walks: it comes to a stop, stands, jumps, and walks again. `success_rate` is the share of robots that carried
-out every command without a fall. `--randomize` adds the jumps' randomisation, noise, latency and pushes;
-`--solver mujoco` is a check against physics that the policies were not trained on, for which fewer robots will do.
+Every robot walks by random commands, sampled every two seconds within 0.8 m/s and 0.8 rad/s, jumps to 0.75 m, walks,
+jumps 0.85 m ahead, and walks. `--course` gives every robot ten random commands instead: to walk, turn, jump up, jump to
+a landing position, or jump onto a sliding block of 0.05 m (no block on SolverMuJoCo). The block is placed under the
+goal when the jump takes over. A jump is commanded while the robot walks: it stops, stands, jumps, and walks again.
+`success_rate` is the share of robots that finished every command without a fall. `--randomize` adds the jumps'
+randomisation, noise, latency and pushes; `--solver mujoco` evaluates on physics that the policies were not trained on.
 """
 
 from __future__ import annotations
@@ -19,25 +18,20 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.courses import Course, course_metrics, plot_course
-from jumper_warp.evaluation.places import random_headings
+from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_course
+from jumper_warp.evaluation.landings import random_headings
 from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.utils.errors import InputError
 from support.walks import PAPER
 
-REACH, EACH = 0.8, 2.0
-"""[m/s] and [rad/s] of the commands; [s] from one to the next."""
-HEIGHT, DISTANCE = 0.75, 0.85
-"""[m] Of the paper's two jumps."""
-WALKS = (3, 3, 2)
-"""Commands before, between and after the jumps."""
-COMMANDS = 10
-"""In a course."""
+REACH, EACH = 0.8, 2.0  # [m/s] and [rad/s] Limit of the commanded velocities; [s] time of each command
+HEIGHT, DISTANCE = 0.75, 0.85  # [m] Apex height and distance of the paper's two jumps
+WALKS = (3, 3, 2)  # Numbers of walking commands before, between and after the jumps
+COMMANDS = 10  # Number of commands in a course
 JUMPS = ("jump_up", "jump_to", "jump_onto")
-PROBABILITIES = (0.35, 0.2, 0.15, 0.15, 0.15)
-"""Of walking, turning and each of the jumps."""
+PROBABILITIES = (0.35, 0.2, 0.15, 0.15, 0.15)  # Probabilities of walking, turning and each of the jumps
 
 
 @dataclass(frozen=True)
@@ -63,25 +57,25 @@ class Args(EvaluationArgs):
             raise InputError(f"robots must be in 1 to 20000, got {self.robots}")
 
 
-def walks(rng: np.random.Generator, count: int) -> list[ScriptStep]:
-    """Return commands to walk anywhere."""
+def random_walks(rng: np.random.Generator, count: int) -> list[ScriptStep]:
+    """Return a number of walking commands with random velocities."""
     return [ScriptStep("walk", tuple(rng.uniform(-REACH, REACH, 3).tolist()), EACH) for _ in range(count)]
 
 
 def paper_script(rng: np.random.Generator) -> list[ScriptStep]:
-    """Return the paper's test with drawn velocities."""
+    """Return the script of the paper's test with random walking velocities."""
     up, ahead = ScriptStep("jump_up", (HEIGHT,)), ScriptStep("jump_to", (DISTANCE, 0.0))
-    before, between, after = (walks(rng, count) for count in WALKS)
+    before, between, after = (random_walks(rng, count) for count in WALKS)
     return [*before, up, *between, ahead, *after]
 
 
 def random_script(rng: np.random.Generator, blocks: bool = True) -> list[ScriptStep]:
-    """Return ten commands: a jump of each kind, the others drawn; blocks: whether there are any to jump onto."""
-    drawn_kinds = rng.choice(["walk", "turn", *JUMPS], COMMANDS - len(JUMPS), p=PROBABILITIES)
+    """Return ten commands in random order: a jump of each kind, the others random; blocks: allow jumps onto a block."""
+    random_kinds = rng.choice(["walk", "turn", *JUMPS], COMMANDS - len(JUMPS), p=PROBABILITIES)
     script = []
-    for kind in rng.permutation([*JUMPS, *drawn_kinds]):
+    for kind in rng.permutation([*JUMPS, *random_kinds]):
         if kind == "walk":
-            script += walks(rng, 1)
+            script += random_walks(rng, 1)
         elif kind == "turn":
             rate = float(rng.choice([-1.0, 1.0]) * rng.uniform(0.3, REACH))
             script.append(ScriptStep("walk", (0.0, 0.0, rate), EACH))
@@ -95,17 +89,17 @@ def random_script(rng: np.random.Generator, blocks: bool = True) -> list[ScriptS
 
 
 def scripts(args: Args) -> list[list[ScriptStep]]:
-    """Return what every robot is to do."""
+    """Return one script per robot."""
     rng, blocks = np.random.default_rng(args.seed), args.blocks and args.solver == "jumper"
     return [random_script(rng, blocks) if args.course else paper_script(rng) for _ in range(args.robots)]
 
 
 def main(args: Args) -> dict:
-    """Run the test and return its figures."""
+    """Run the test, plot one robot's course, and return the metrics."""
     name = "course" if args.course else "walk_jump_walk"
-    run = SkillRun.of(name, args, SkillNames(args.policy, args.jump_up, args.jump_to))
-    course = Course(scripts(args), random_headings(args.robots, args.seed))
-    run.follow(run.env(args.robots, block=course.block), course, film=name)
+    run = SkillRun.from_args(name, args, SkillNames(args.policy, args.jump_up, args.jump_to))
+    course = CourseLog(scripts(args), random_headings(args.robots, args.seed))
+    run.run_episodes(run.env(args.robots, block=course.block), course, film=name)
     title = f"walk, jump, walk: robot 0 of {course.count}, {run.title}"
     plot_course(run.folder / "course.png", course, 0, title)
     return run.report(course_metrics(course), {} if args.course else PAPER)

@@ -1,11 +1,11 @@
-"""How far a walking policy comes on uneven ground, slopes and steps that it does not see.
+"""Distance that a walking policy covers on uneven ground, slopes and steps that it does not observe.
 
     python experiments/walking_terrain.py --policy walking_rough --robots 500 --out outputs/terrain
 
-Robots start in the middle of a tile with headings of their own and are commanded to go straight ahead at 0.5 m/s for
-10 s. The success rate of a terrain is the share of the way that they walk before they fall, on average. Slopes and
-stairs go down from the start, bowls and pits up. `--randomize` adds the randomisation, noise and latency of the
-training; `--solver mujoco` is a check against physics that the policy was not trained on.
+Robots start in the middle of a tile with random headings and are commanded to walk straight ahead at 0.5 m/s for 10 s.
+The success rate of a terrain is the mean share of the commanded distance that they walk before they fall. Slopes and
+stairs descend from the start, bowls and pits ascend. `--randomize` adds the randomisation, noise and latency of the
+training; `--solver mujoco` evaluates on physics that the policy was not trained on.
 """
 
 from __future__ import annotations
@@ -16,16 +16,15 @@ import numpy as np
 import tyro
 
 from jumper_warp.cli.main import run_command
-from jumper_warp.evaluation.places import random_headings
+from jumper_warp.evaluation.landings import random_headings
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.velocities import Walks, check_walks
+from jumper_warp.evaluation.velocities import VelocityLog, check_velocity_settings
 from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile
 from jumper_warp.utils.errors import InputError
-from support.walks import walked
+from support.walks import walked_share
 
-SECONDS = 10.0
-"""[s] Of each walk."""
+SECONDS = 10.0  # [s] Time of each walk
 
 
 @dataclass(frozen=True)
@@ -50,28 +49,28 @@ class Args(EvaluationArgs):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_walks(self.robots, SECONDS, self.speed)
+        check_velocity_settings(self.robots, SECONDS, self.speed)
         if not 0.0 < self.speed <= 0.6:
             raise InputError(f"speed must be in (0, 0.6] m/s, so that the walk ends on the tile, got {self.speed}")
 
 
 def main(args: Args) -> dict:
-    """Walk on every terrain and return the figures."""
-    run = EvaluationRun.of("walking_terrain", args, ("velocity",))
-    commands, figures, shares = np.tile([args.speed, 0.0, 0.0], (args.robots, 1, 1)), {}, {}
+    """Run the walks on every terrain, plot the shares, and return the metrics."""
+    run = EvaluationRun.from_args("walking_terrain", args, ("velocity",))
+    commands, metrics, shares = np.tile([args.speed, 0.0, 0.0], (args.robots, 1, 1)), {}, {}
     terrain = TerrainCfg(tile=14.0, uneven=args.uneven, slope=args.slope, step=(args.step, args.step))
     for kind in args.terrains:
         ground = single_tile(terrain, kind)
         env = run.env(args.robots, ground=ground)
-        asked = Walks(commands, env.task, SECONDS, headings=random_headings(args.robots, args.seed))
-        walks = run.follow(env, asked, film=kind, figure={"ground": ground})
-        shares[kind] = walked(walks)
-        figures[f"success_rate_{kind}"] = float(shares[kind].mean())
-        figures[f"fall_rate_{kind}"] = float(walks.fallen.mean())
+        log = VelocityLog(commands, env.task, SECONDS, headings=random_headings(args.robots, args.seed))
+        walks = run.run_episodes(env, log, film=kind, film_scene={"ground": ground})
+        shares[kind] = walked_share(walks)
+        metrics[f"success_rate_{kind}"] = float(shares[kind].mean())
+        metrics[f"fall_rate_{kind}"] = float(walks.fallen.mean())
     with figure(run.folder / "terrain.png", figsize=(7, 4)) as axis:
         axis.boxplot([shares[kind] for kind in args.terrains], tick_labels=list(args.terrains), whis=(5, 95))
         axis.set(ylabel="share of the way", title=f"{args.robots} robots each, {run.title}", ylim=(0.0, 1.05))
-    return run.report({"robots": args.robots, "speed_m_s": args.speed} | figures, {})
+    return run.report({"robots": args.robots, "speed_m_s": args.speed} | metrics, {})
 
 
 if __name__ == "__main__":

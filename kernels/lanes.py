@@ -1,7 +1,7 @@
-"""Exchange between the threads of a GPU's warp that share a world: four, a thread a leg, or 32, eight attempts of four.
+"""Exchange between the threads of a GPU's warp that share a world: four, one per leg, or 32, eight attempts of four.
 
 Legs are neighbours, leg fastest, and all threads of a warp must reach every call together: none may stand behind an
-`and` or `or`, which leave out what no longer matters, or in a branch that not all take. On the CPU, where these
+`and` or `or`, which may skip them, or in a branch that not all take. On the CPU, where these
 functions serve tests, a block is the threads of one world (launch with `block_dim=4`, or 32).
 """
 
@@ -17,8 +17,8 @@ def _exchange(gpu: str, sent: str, received: str, threads: int = 4) -> str:
     {gpu}
 #else
     static decltype({sent}) box[{threads}];
-    const int place = WP_TILE_THREAD_IDX % {threads};
-    box[place] = {sent};
+    const int lane = WP_TILE_THREAD_IDX % {threads};
+    box[lane] = {sent};
     WP_TILE_SYNC();
     const auto received = {received};
     WP_TILE_SYNC();
@@ -47,10 +47,10 @@ _LEAST = _exchange(
 )  # fmt: skip
 _ALL = _exchange(
     "return __all_sync(0xfu << (threadIdx.x & 28u), flag);",
-    "flag", "box[place & 28] && box[place & 28 | 1] && box[place & 28 | 2] && box[place & 28 | 3]", 32,
+    "flag", "box[lane & 28] && box[lane & 28 | 1] && box[lane & 28 | 2] && box[lane & 28 | 3]", 32,
 )  # fmt: skip
-_FROM_OWN = _exchange("return __shfl_sync(0xfu << (threadIdx.x & 28u), x, leg, 4);", "x", "box[place & 28 | leg]", 32)
-_TURNS = """
+_FROM_OWN = _exchange("return __shfl_sync(0xfu << (threadIdx.x & 28u), x, leg, 4);", "x", "box[lane & 28 | leg]", 32)
+_STEP_THREADS = """
 #if defined(__CUDA_ARCH__)
     x += __shfl_xor_sync(0xffffffffu, x, 4);
     x += __shfl_xor_sync(0xffffffffu, x, 8);
@@ -80,8 +80,8 @@ def sum_legs(x: real) -> real:
     ...
 
 
-@wp.func_native(_TURNS)
-def sum_turns(x: real) -> real:
+@wp.func_native(_STEP_THREADS)
+def sum_step_threads(x: real) -> real:
     """Return the sum over threads of a leg where a warp has one world, its threads being (8, 4); itself on a CPU."""
     ...
 
@@ -130,7 +130,7 @@ def any_world(flag: bool) -> bool:
 
 @wp.func_native(_MEET)
 def sync_lanes():
-    """Wait until the threads of a world got here; each then sees what the others wrote to memory."""
+    """Synchronise the threads of a world; memory writes before it are visible to all of them after it."""
     ...
 
 

@@ -1,4 +1,4 @@
-"""Where things stand in flat arrays: rows of the parameter table, and Newton's joints and bodies a world.
+"""Layout of flat arrays: rows of the parameter table, and Newton's joints and bodies a world.
 
 The table has one column per world and one row per parameter, so that neighbouring GPU threads read neighbouring
 addresses. Rows: a block for each leg (constants below, relative to the block's start), then the base block.
@@ -43,6 +43,6 @@ COORDS = wp.constant(43)  # per world: 7 base, 5 a leg, 4 a loop joint
 
 @wp.func
 def motor_slot(motor: int) -> int:
-    """Return the place of a motor among a world's joints behind the base: joints 0, 1 and 3 of each leg's five."""
+    """Return the index of a motor among a world's joints after the base: joints 0, 1 and 3 of each leg's five."""
     kind = motor % 3
     return 5 * (motor // 3) + kind + kind // 2

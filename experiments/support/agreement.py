@@ -1,8 +1,8 @@
-"""The same random states by this project's dynamics and by Pinocchio, without ground, friction, damping and springs.
+"""Dynamics of random states by this project and by Pinocchio, without ground, friction, damping and springs.
 
 Quantities, first axis states: acceleration of the body's origin [m/s^2] (3,) and its angular acceleration [rad/s^2]
-(3,), body axes; accelerations of the motors [rad/s^2] (12,); places of the paws' centres [m] (4, 3), body axes; their
-Jacobians [m] (4, 3, 3) by the rates of the leg's motors.
+(3,), body axes; accelerations of the motors [rad/s^2] (12,); positions of the paws' centres [m] (4, 3), body axes;
+their Jacobians [m] (4, 3, 3) with respect to the rates of the leg's motors.
 """
 
 from __future__ import annotations
@@ -19,16 +19,18 @@ from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.overlay import MOTOR_DOFS, write_model
 from support.inverse_kinematics import random_motors
 
-MARGIN = 0.35
-"""[rad] From the stops: a stretched leg is singular."""
-DT = 1.0e-6
-"""[s] Step whose change of velocity is the acceleration."""
+MARGIN = 0.35  # [rad] Distance of the motor angles from the stops; a stretched leg is singular
+DT = 1.0e-6  # [s] Time step over which the change of velocity gives the acceleration
 States = dict[str, np.ndarray]
 Quantities = dict[str, np.ndarray]
 
 
 def random_states(n: int, seed: int) -> States:
-    """Return n states: base quat (xyzw), com_vel [m/s] and ang_vel [rad/s], world; angles, rates, torque of motors."""
+    """Return n random states by name, first axis states.
+
+    quat (xyzw), com_vel [m/s], ang_vel [rad/s] of the base, world frame; angles [rad], rates [rad/s], torque [N m] of
+    the 12 motors.
+    """
     rng = np.random.default_rng(seed)
     quat = rng.normal(size=(n, 4))
     return {
@@ -41,8 +43,8 @@ def random_states(n: int, seed: int) -> States:
     }
 
 
-def ours(values: RobotValues, states: States) -> Quantities:
-    """Return all quantities of a robot (the first of some values) by this project's dynamics."""
+def jumper_quantities(values: RobotValues, states: States) -> Quantities:
+    """Return all quantities by this project's dynamics, of the first robot of `values`."""
     n = len(states["angles"])
     model = build_model(n, ground=None, visuals=False, device="cpu")
     write_model(model, values)
@@ -57,7 +59,8 @@ def ours(values: RobotValues, states: States) -> Quantities:
     def array(rows: np.ndarray) -> wp.array:
         return wp.array(rows.ravel(), dtype=wp.float64, device="cpu")
 
-    def base(q: np.ndarray, qd: np.ndarray) -> tuple[Rotation, np.ndarray, np.ndarray]:
+    def base_velocity(q: np.ndarray, qd: np.ndarray) -> tuple[Rotation, np.ndarray, np.ndarray]:
+        """Return orientation, velocity of the base origin (world axes) and angular velocity (body axes)."""
         turn = Rotation.from_quat(q[:, 3:7])
         origin = qd[:, :3] - np.cross(qd[:, 3:6], turn.apply(values.base_com[0].astype(np.float32)))
         return turn, origin, turn.inv().apply(qd[:, 3:6])
@@ -66,17 +69,17 @@ def ours(values: RobotValues, states: States) -> Quantities:
     drive = dynamics.drive(array(force), wp.zeros(21 * n, dtype=wp.spatial_vectorf, device="cpu"))
     dynamics.advance(dynamics.settings(DT, 1, 50, 1.0e-5), drive, *after, *after)
     new_q, new_qd = (rows.numpy().reshape(n, -1) for rows in after)
-    (turn, origin, spin), (_, new_origin, new_spin) = base(q, qd), base(new_q, new_qd)
-    found = {
+    (turn, origin, spin), (_, new_origin, new_spin) = base_velocity(q, qd), base_velocity(new_q, new_qd)
+    accelerations = {
         "base_acceleration": turn.inv().apply(new_origin - origin) / DT,
         "base_angular_acceleration": (new_spin - spin) / DT,
         "joint_acceleration": (new_qd - qd)[:, MOTOR_DOFS] / DT,
     }
-    return found | our_paws(dynamics, q)
+    return accelerations | jumper_paws(dynamics, q)
 
 
-def our_paws(dynamics: JumperDynamics, q: np.ndarray) -> Quantities:
-    """Return the paws' places and Jacobians of coordinates (n, 43), the base level and at rest in the origin."""
+def jumper_paws(dynamics: JumperDynamics, q: np.ndarray) -> Quantities:
+    """Return paw positions and Jacobians of coordinates q (n, 43), with the base level and at rest in the origin."""
     n, model = len(q), dynamics.model
     q[:, 3:7] = 0.0, 0.0, 0.0, 1.0
     shanks = [model.body_label.index(f"world_0/{leg}_inner_shank") for leg in LEGS]
@@ -96,8 +99,8 @@ def our_paws(dynamics: JumperDynamics, q: np.ndarray) -> Quantities:
     return {"paw_position": paws[0], "paw_jacobian": np.stack(columns, axis=3)}
 
 
-def pinocchios(values: RobotValues, states: States) -> Quantities:
-    """Return all quantities of a robot (the first of some values) by Pinocchio."""
+def pinocchio_quantities(values: RobotValues, states: States) -> Quantities:
+    """Return all quantities by Pinocchio, of the first robot of `values`."""
     robot, rows = build_pinocchio(values=values), []
     for quat, com_vel, ang_vel, angles, rates, torque in zip(*states.values(), strict=True):
         turn = Rotation.from_quat(quat)

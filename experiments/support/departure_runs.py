@@ -1,4 +1,4 @@
-"""Trainings without a departure from the paper, the jumps of their policies, and the report of both."""
+"""Trainings of ablations, evaluation of their policies, and the report."""
 
 from __future__ import annotations
 
@@ -17,23 +17,20 @@ from jumper_warp.cli.train import env_maker, parse_train
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
 from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.warm_start import load_init_policy
+from jumper_warp.policies.warm_start import actor_init_from_policy
 from jumper_warp.registry import make_task
 from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.rl.runner import CONFIG, train
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
-from support.departures import Undone
-from support.holds import Holds, hold_goals, hold_metrics
+from support.departures import Ablation
+from support.squats import SquatLog, squat_goals, squat_metrics
 
-ELSEWHERE = {"log_root", "device", "threads"}
-"""Settings in which a training may differ from one that is there already."""
-HOLD = 3.0
-"""[s]"""
+ELSEWHERE = {"log_root", "device", "threads"}  # Settings in which a training may differ from a saved one
+HOLD = 3.0  # [s] Time for which squats are held
 TESTS = ("nominal", "randomized")
-KEPT = "kept"
-"""Name of the task with all departures."""
+BASELINE = "kept"  # Name of the training with all departures
 COLUMNS = {
     "error [mm]": ("error_m", 1000.0),
     "success [%]": ("success_rate", 100.0),
@@ -46,104 +43,99 @@ COLUMNS = {
     "paw force varies [N]": ("median_paw_force_range_n", 1.0),
     "torque ripple [N m]": ("mean_torque_ripple_nm", 1.0),
 }
-"""Of the table: metric and scale; nominal / randomised."""
-WIDTH = 180
-"""Of the table, in characters."""
-Found = dict[tuple[str, int], dict[str, dict[str, Any]]]
-"""Metrics by training (name, seed) and test."""
+"""Columns of the table: metric and scale; cells are nominal / randomised."""
+WIDTH = 180  # Width of the table in characters
+MetricsByTraining = dict[tuple[str, int], dict[str, dict[str, Any]]]
+"""Metrics by training (name, seed), test and name."""
 
 
 @dataclass(frozen=True)
-class Jumps:
-    """How the departures of a task are measured."""
+class DepartureCfg:
+    """How the ablations of a task are trained and evaluated."""
 
-    iterations: int
-    """Of each training."""
-    goals: dict[str, Any]
-    """[m] Of the jumps."""
-    squats: tuple[float, float]
-    """[m] Goals for which robots wait."""
-    begin: str = ""
-    """More flags of each training."""
+    iterations: int  # Iterations of each training
+    goals: dict[str, Any]  # [m] Flags that set the goals of the evaluated jumps
+    squats: tuple[float, float]  # [m] Range of goals for which squats are held
+    begin: str = ""  # More flags of every training
 
 
-Jump = Literal["vertical-jump", "horizontal-jump", "omnidirectional-jump", "horizontal-jump-mars-loose"]
-JUMPS: dict[Jump, Jumps] = {
-    "vertical-jump": Jumps(1000, {"lower": 0.5, "upper": 1.05}, (0.6, 1.05)),
-    "horizontal-jump": Jumps(800, {"x": (0.3, 1.5)}, (0.3, 1.5)),
-    "omnidirectional-jump": Jumps(1000, {"x": (-0.8, 1.2), "y": (-0.8, 0.8)}, (0.3, 1.2)),
-    "horizontal-jump-mars-loose": Jumps(
+JumpTask = Literal["vertical-jump", "horizontal-jump", "omnidirectional-jump", "horizontal-jump-mars-loose"]
+JUMP_TASKS: dict[JumpTask, DepartureCfg] = {
+    "vertical-jump": DepartureCfg(1000, {"lower": 0.5, "upper": 1.05}, (0.6, 1.05)),
+    "horizontal-jump": DepartureCfg(800, {"x": (0.3, 1.5)}, (0.3, 1.5)),
+    "omnidirectional-jump": DepartureCfg(1000, {"x": (-0.8, 1.2), "y": (-0.8, 0.8)}, (0.3, 1.2)),
+    "horizontal-jump-mars-loose": DepartureCfg(
         1000, {"x": (0.5, 4.2)}, (0.5, 4.2), "--init-policy horizontal_jump --ppo.init-std 0.3"
     ),
 }
 
 
-def settings(undone: Undone, arguments: list[str]) -> tuple[Any, TaskCfg]:
-    """Return the settings of `jumper train` with arguments, and its task without a departure."""
+def parse(ablation: Ablation, arguments: list[str]) -> tuple[Any, TaskCfg]:
+    """Return the parsed settings of `jumper train`, and its task with the ablation."""
     parsed, task = parse_train(arguments)
-    return parsed, task if isinstance(undone, str) else undone(task)
+    return parsed, task if isinstance(ablation, str) else ablation(task)
 
 
-def trained(undone: Undone, arguments: list[str]) -> Path:
-    """Return the last checkpoint of a training, made unless it is there. Raises InputError: it has other settings."""
-    (parsed, task), name = settings(undone, arguments), f"{CHECKPOINTS}/iteration_{{:06d}}.pt"
-    if found := sorted(Path(parsed.cfg.log_root).glob(f"*/*/{name.format(parsed.cfg.iterations)}")):
-        config = json.loads((found[-1].parents[1] / CONFIG).read_text())
-        wanted = json.loads(json.dumps(asdict(parsed.cfg), default=str))
-        other = {key for key in wanted.keys() - ELSEWHERE if wanted[key] != config["train"].get(key)}
+def train_or_load(ablation: Ablation, arguments: list[str]) -> Path:
+    """Return the last checkpoint of a training, which is run unless it exists. Raises InputError: other settings."""
+    (parsed, task), name = parse(ablation, arguments), f"{CHECKPOINTS}/iteration_{{:06d}}.pt"
+    if checkpoints := sorted(Path(parsed.cfg.log_root).glob(f"*/*/{name.format(parsed.cfg.iterations)}")):
+        config = json.loads((checkpoints[-1].parents[1] / CONFIG).read_text())
+        requested = json.loads(json.dumps(asdict(parsed.cfg), default=str))
+        other = {key for key in requested.keys() - ELSEWHERE if requested[key] != config["train"].get(key)}
         if other or config["env"]["task"] != task_to_json(task):
-            raise InputError(f"{found[-1].parents[1]} was trained with other settings: choose another --out")
-        return found[-1]
-    start = load_init_policy(parsed.cfg.init_policy, task, parsed.cfg.ppo) if parsed.cfg.init_policy else None
+            raise InputError(f"{checkpoints[-1].parents[1]} was trained with other settings: choose another --out")
+        return checkpoints[-1]
+    start = actor_init_from_policy(parsed.cfg.init_policy, task, parsed.cfg.ppo) if parsed.cfg.init_policy else None
     typed = shlex.join(["jumper", "train", *arguments])
-    result = train(parsed.cfg, env_maker(task, parsed), typed, start=start)
+    result = train(parsed.cfg, env_maker(task, parsed), typed, actor_init=start)
     return result.folder / name.format(result.iteration)
 
 
-def measured(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, Any]]:
-    """Return metrics of a policy's jumps and squats by test; args: as `experiments/departures.py` has them."""
+def evaluate(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, Any]]:
+    """Return the metrics of a policy's jumps and held squats by test; args: `Args` of `experiments/departures.py`."""
     run, ends = EvaluationRun(checkpoint), make_task(args.task).terminations
     run.prepare("departures", Conditions(device=args.device, threads=args.threads), folder)
     tests = {}
     for test, count in zip(TESTS, args.jumps, strict=True):
-        drawn_robots = test == "randomized"
-        conditions = replace(run.conditions, randomize=drawn_robots, noise=drawn_robots)
-        flags: Any = replace(cast(Any, run.evaluation.flags), jumps=count, **JUMPS[args.task].goals)
-        env = run.env(count, lambda task: run.evaluation.for_evaluation(replace(task, terminations=ends)), conditions)
-        values = flags.metrics(run.follow(env, flags.log(env.task, 0)))
+        randomize = test == "randomized"
+        conditions = replace(run.conditions, randomize=randomize, noise=randomize)
+        flags: Any = replace(cast(Any, run.evaluation.flags), jumps=count, **JUMP_TASKS[args.task].goals)
+        env = run.env(count, lambda task: run.evaluation.prepare_task(replace(task, terminations=ends)), conditions)
+        values = flags.metrics(run.run_episodes(env, flags.log(env.task, 0)))
         values["error_m"] = values.get("mean_abs_error_m", values.get("mean_error_m"))
-        goals = hold_goals(args.squats, JUMPS[args.task].squats, up=run.task.evaluation_suite in HEIGHTS)
-        values |= hold_metrics(run.follow(run.env(args.squats, conditions=conditions), Holds(goals, HOLD)))
+        goals = squat_goals(args.squats, JUMP_TASKS[args.task].squats, up=run.task.evaluation_suite in HEIGHTS)
+        values |= squat_metrics(run.run_episodes(run.env(args.squats, conditions=conditions), SquatLog(goals, HOLD)))
         tests[test] = {name: value for name, value in values.items() if isinstance(value, bool | int | float | None)}
     return tests
 
 
-def report(found: Found, title: str, folder: Path) -> Table:
-    """Write table and plot into a folder, and return the table."""
-    table = Table("undone, seed", *map(escape, COLUMNS), title=title)
-    for (name, seed), tests in found.items():
+def report(results: MetricsByTraining, title: str, folder: Path) -> Table:
+    """Write the table and the plot of all results into a folder, and return the table."""
+    table = Table("ablation, seed", *map(escape, COLUMNS), title=title)
+    for (name, seed), tests in results.items():
         table.add_row(f"{name.replace('_', ' ')}, {seed}", *(cell(tests, *column) for column in COLUMNS.values()))
     with (folder / "departures.txt").open("w") as file:
         Console(file=file, width=WIDTH).print(table)
-    plot(found, folder / "departures.png")
+    plot_results(results, folder / "departures.png")
     return table
 
 
 def cell(tests: dict[str, dict[str, Any]], name: str, scale: float) -> str:
-    """Return a metric of both tests as the table has it."""
-    found = (tests[test][name] for test in TESTS)
-    return " / ".join("-" if value is None else f"{scale * value:.3g}" for value in found)
+    """Return a metric, scaled, of both tests as text of a table cell."""
+    values = (tests[test][name] for test in TESTS)
+    return " / ".join("-" if value is None else f"{scale * value:.3g}" for value in values)
 
 
-def plot(found: Found, path: Path) -> None:
-    """Draw success and error of each training, the task with all departures as lines."""
-    rows = [*found]
+def plot_results(results: MetricsByTraining, path: Path) -> None:
+    """Plot success and error of every training; the lines are those with all departures."""
+    rows = [*results]
     with figure(path, 1, 2, figsize=(11, 1.0 + 0.25 * len(rows)), sharey=True) as axes:
         for axis, name, scale in zip(axes, ("success_rate", "error_m"), (100.0, 1000.0), strict=True):
             for test, marker in zip(TESTS, "ox", strict=True):
-                x = [np.nan if (v := found[row][test][name]) is None else scale * v for row in rows]
+                x = [np.nan if (v := results[row][test][name]) is None else scale * v for row in rows]
                 axis.plot(x, range(len(rows)), marker, label=test)
-                for value in (x[i] for i, (row, _) in enumerate(rows) if row == KEPT):
+                for value in (x[i] for i, (row, _) in enumerate(rows) if row == BASELINE):
                     axis.axvline(value, color="0.8", linewidth=0.8, zorder=0)
         axes[0].set(xlabel="success [%]", yticks=range(len(rows)))
         axes[0].set_yticklabels([f"{name.replace('_', ' ')}, {seed}" for name, seed in rows])

@@ -1,6 +1,6 @@
 """Departures of the jumps from the paper and its authors' configuration, undone one at a time.
 
-`docs/tasks.md` has their reasons, and what `experiments/departures.py` found that they change.
+`docs/tasks.md` has their reasons and their effects, measured by `experiments/departures.py`.
 """
 
 from __future__ import annotations
@@ -10,19 +10,19 @@ from dataclasses import replace
 
 from jumper_warp.tasks.cfg import TaskCfg
 
-Undone = str | Callable[[TaskCfg], TaskCfg]
-"""How a departure is undone: flags of `jumper train TASK`, or what no flag can, the task without it."""
+Ablation = str | Callable[[TaskCfg], TaskCfg]
+"""How a departure is undone: flags of `jumper train TASK`, or a function that returns the task without it."""
 Point = tuple[float, float, float]
 
 
 def may_jump_early(task: TaskCfg) -> TaskCfg:
-    """Return the task in which a takeoff before the command ends nothing."""
-    kept = tuple(term for term in task.terminations if term.name != "early_takeoff")
-    return replace(task, terminations=kept)
+    """Return the task without its termination on a takeoff before the command."""
+    terminations = tuple(term for term in task.terminations if term.name != "early_takeoff")
+    return replace(task, terminations=terminations)
 
 
 def with_goals(task: TaskCfg, goals: Sequence[tuple[Point, Point]], starts: int) -> TaskCfg:
-    """Return the task with other ranges of goals, each with the last `starts` starts of the task's own."""
+    """Return the task with levels of other goal ranges [m] (lower, upper), each with the last `starts` base heights."""
     last, heights = task.levels[-1], dict.fromkeys(level.base_height for level in task.levels)
     ranges = [*heights][-starts:]
     levels = (replace(last, goal_lower=a, goal_upper=b, base_height=start) for a, b in goals for start in ranges)
@@ -30,25 +30,25 @@ def with_goals(task: TaskCfg, goals: Sequence[tuple[Point, Point]], starts: int)
 
 
 def heights_of_paper(task: TaskCfg) -> TaskCfg:
-    """Return the task with heights of 0.6 to 1.1 m in three steps, and all starts from the first on."""
+    """Return the task with goal heights of 0.6 to 1.1 m in three levels, all starts from the first level on."""
     return with_goals(task, [((0.0, 0.0, 0.6), (0.0, 0.0, top)) for top in (0.75, 0.9, 1.1)], starts=1)
 
 
 def places_of_paper(task: TaskCfg) -> TaskCfg:
-    """Return the task with places 0.4 to 1.0 m ahead, up to 0.3 m aside, in four steps, two starts each."""
+    """Return the task with goals 0.4 to 1.0 m ahead, up to 0.3 m aside, in four steps with two levels each."""
     tops = ((0.55, 0.0), (0.7, 0.1), (0.85, 0.2), (1.0, 0.3))
     return with_goals(task, [((0.4, -y, 0.0), (top, y, 0.0)) for top, y in tops], starts=2)
 
 
 def places_of_sequel(task: TaskCfg) -> TaskCfg:
-    """Return the task on Mars with places 1.4 to 4.75 m ahead in the four steps of the sequel, two starts each."""
+    """Return the task on Mars with goals 1.4 to 4.75 m ahead in the sequel's four steps with two levels each."""
     (_, *low), (_, *top) = task.levels[-1].goal_lower, task.levels[-1].goal_upper
     ahead = ((1.4, 1.85), (1.6, 2.25), (2.0, 3.75), (3.0, 4.75))
     return with_goals(task, [((near, *low), (far, *top)) for near, far in ahead], starts=2)
 
 
 def alike_all_around(task: TaskCfg) -> TaskCfg:
-    """Return the task with goals that are as far aside and back as ahead."""
+    """Return the task whose levels with goals all around reach as far aside and back as ahead."""
     levels = list(task.levels)
     for i, level in enumerate(levels):
         reach = level.goal_upper[0]
@@ -58,11 +58,11 @@ def alike_all_around(task: TaskCfg) -> TaskCfg:
 
 
 def without_another_goal(task: TaskCfg) -> TaskCfg:
-    """Return the task in which no landed robot gets another goal."""
+    """Return the task in which a landed robot is never given a next goal."""
     return replace(task, levels=tuple(replace(level, next_jump_probability=0.0) for level in task.levels))
 
 
-DEPARTURES: dict[str, dict[str, Undone]] = {
+DEPARTURES: dict[str, dict[str, Ablation]] = {
     "vertical-jump": {
         "standing_still_and_level": "--env.rewards.base-at-rest.weight 0 --env.rewards.landing-tilt.weight 0",
         "paws_down": "--env.rewards.paws-down.weight 0",
@@ -118,9 +118,9 @@ DEPARTURES: dict[str, dict[str, Undone]] = {
         ),
     },
 }
-"""By task and name; most of the vertical jump are the horizontal jump's too, those on Mars are from the sequel."""
+"""Ablations by task and name; most of the vertical jump also apply to the horizontal one; Mars refers to the sequel."""
 
 
-def flags_of(undone: Undone) -> str:
-    """Return the flags that undo a departure."""
-    return undone if isinstance(undone, str) else ""
+def ablation_flags(ablation: Ablation) -> str:
+    """Return the flags of an ablation, empty if it is a function."""
+    return ablation if isinstance(ablation, str) else ""

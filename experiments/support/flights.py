@@ -1,8 +1,8 @@
-"""Long flights and what becomes of them: takeoffs by a policy, or open-loop ones whose legs push off unequally.
+"""Long flights: takeoff by a policy, or open loop with legs that push off unequally; log, metrics and environment.
 
-Open loop the robot squats, holds and extends as in `open_loop`, some legs a little later than others, which throws it
-up tilting and turning. In flight it is asked to turn level; shortly before the landing the jump takes over again, by a
-policy or with the legs held in the default pose.
+Open loop, the robot squats, holds and extends as in `open_loop`, some legs later than others, so that it takes off
+tilted and rotating. In flight the turning skill is requested; shortly before the landing the jump skill takes over
+again, a policy or the default pose.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ import torch
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import DELAY, jump_commands, yaw_of
-from jumper_warp.evaluation.log import NO_END, EvaluationLog, Metrics, failures, finite, largest, mean, mean_and_max
+from jumper_warp.evaluation.log import NO_END, EvaluationLog, Metrics, failed_by, finite, largest, mean, mean_and_max
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
 from jumper_warp.policies.policy import Policy
@@ -28,43 +28,34 @@ from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import FALLS_FROM_FLIGHT, flight_skills
 from support.momentum import momentum
 
-JUMP, TURN = 0, 1
-"""Indices of the skills in the environment."""
+JUMP, TURN = 0, 1  # Indices of the skills in the environment
 RAMP, HOLD, EXTEND = 25, 35, 40
-"""Policy steps of the squat, of holding it, and of the extension at most."""
-SQUAT = 120.0
-"""[deg] Transversal angle of the squat."""
-STRETCHED = -45.0
-"""[deg] Commanded in the extension."""
-HIGH = 0.7
-"""[m] Of the base, from where no paw can touch level ground."""
-UPRIGHT = 30.0
-"""[deg] Tilt of a good landing."""
-CLEAR = 3
-"""Policy steps with all paws up that make a takeoff by a policy; open loop none comes down again, and one will do."""
-AFTER = 1.5
-"""[s] After touchdown, in which a robot must not fall."""
+"""Numbers of policy steps of the ramp into the squat, the held squat, and at most of the extension."""
+SQUAT = 120.0  # [deg] Commanded transversal angle of the squat
+STRETCHED = -45.0  # [deg] Commanded transversal angle of the extension
+HIGH = 0.7  # [m] Base height above which no paw can touch level ground
+UPRIGHT = 30.0  # [deg] Largest tilt of a successful landing
+CLEAR = 3  # Policy steps without contact that count as takeoff of a policy; open loop, one is enough
+AFTER = 1.5  # [s] Time after touchdown at which a landing is evaluated
 OUTCOMES = (*(term.name for term in FALLS_FROM_FLIGHT), "landed", "tilted", "no_takeoff")
-ROWS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
-"""Of the legs FL, FR, BL, BR: front and left."""
+LEG_SIGNS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+"""Sign of each leg FL, FR, BL, BR along front and left."""
 
 
 @dataclass
-class Flights(EvaluationLog):
-    """What became of one jump per world; arrays have shape (num_envs,). Nothing changes after its end."""
+class FlightLog(EvaluationLog):
+    """Log of one flight per world; arrays have shape (num_envs,) and do not change after the flight's end."""
 
-    apex: np.ndarray
-    """[m] (num_envs,) Heights that the jump's policy is told."""
+    apex: np.ndarray  # [m] (num_envs,) Apex heights that are commanded to the jump's policy
     late: np.ndarray | None = None
-    """[s] (num_envs, 2) By how much later front and left legs extend; None: the jump's policy takes off."""
-    turns: bool = True
-    """Whether the robots turn in flight."""
+    """[s] (num_envs, 2) Delay of the extension of front and left legs; None: the jump's policy takes off."""
+    turns: bool = True  # Whether the turning skill is requested in flight
     seconds: float = 9.0
-    row = "flight"
+    row_name = "flight"
     spacing = 1.6
 
     def __post_init__(self) -> None:
-        """Begin with nothing done."""
+        """Begin with no flight ended."""
         self.count, self.step_dt = len(self.apex), 1.0 / 60.0
         n = self.count
         self.end = np.full(n, -1)  # index in OUTCOMES, -1 while under way
@@ -72,48 +63,48 @@ class Flights(EvaluationLog):
         self.takeoff_momentum = np.full(n, np.nan)  # [kg m^2/s] angular, about the com
         self.largest_tilt = np.zeros(n)  # [rad] in flight
         self.touchdown_tilt = np.full(n, np.nan)  # [rad] in the step before the touchdown
-        self.touchdown_turn = np.full(n, np.nan)  # [rad] out of the heading that it began with, at that time
-        self.height = np.zeros(n)  # [m] largest of the base
+        self.touchdown_turn = np.full(n, np.nan)  # [rad] yaw relative to the start, in the step before
+        self.height = np.zeros(n)  # [m] largest base height
         self.flight_time = np.full(n, np.nan)  # [s]
-        self.drift = np.zeros(n)  # [kg m^2/s] largest change of the angular momentum high in flight, by the solver
+        self.drift = np.zeros(n)  # [kg m^2/s] largest change of the angular momentum above HIGH
         self.tilts: list[np.ndarray] = []  # [rad] (num_envs,) after every policy step, until the end
-        self.heights: list[np.ndarray] = []  # [m] (num_envs,) of the base
-        self._left, self._down = np.full(n, -1), np.full(n, -1)
-        self._clear, self._turned, self._begun = np.zeros(n, dtype=int), np.zeros(n), np.zeros((n, 3))
+        self.heights: list[np.ndarray] = []  # [m] (num_envs,) base height after every policy step
+        self._takeoff_step, self._touchdown_step = np.full(n, -1), np.full(n, -1)
+        self._airborne_steps, self._yaw, self._initial_momentum = np.zeros(n, dtype=int), np.zeros(n), np.zeros((n, 3))
 
     def begin(self, env: Any) -> None:
-        """Stand every robot in the default pose."""
+        """Reset every robot to the default pose, with its commanded height."""
         self.step_dt, goals = env.step_dt, np.zeros((len(self.apex), 3))
         goals[:, 2] = self.apex
         env.evaluation_reset(jump_commands(goals, DELAY if self.late is None else 0.0, env.step_dt))
 
     def open_loop(self, late: np.ndarray) -> np.ndarray:
-        """Return the transversal angles [deg] of the next policy step, (num_envs, 4); late: as of the flights."""
+        """Return the open-loop transversal angles [deg] of the next policy step, (num_envs, 4); late: the field."""
         step, n = len(self.tilts), len(self.apex)
         squat = 45.0 + (SQUAT - 45.0) * min(step / RAMP, 1.0)
-        delay = late @ (0.5 * ROWS.T) / self.step_dt
+        delay = late @ (0.5 * LEG_SIGNS.T) / self.step_dt
         share = np.clip(step + 1 - (RAMP + HOLD) - (delay - delay.min(axis=1, keepdims=True)), 0.0, 1.0)
         if step < RAMP + HOLD + EXTEND:
             return squat + (STRETCHED - squat) * share
         return np.full((n, 4), 45.0)
 
     def action(self, scale: float, policy: torch.Tensor | None) -> np.ndarray:
-        """Return the jump's action, (num_envs, 12): a policy's, or the default pose; open loop up to takeoff if asked.
+        """Return the jump's action, (num_envs, 12): open loop up to takeoff if `late` is set, else the policy's.
 
-        scale [deg]: of the transversal motors' actions.
+        scale [deg]: action scale of the transversal motors; policy: its action, None for the default pose.
         """
         n = len(self.apex)
-        chosen = np.zeros((n, 12)) if policy is None else policy.cpu().numpy().copy()
+        action = np.zeros((n, 12)) if policy is None else policy.cpu().numpy().copy()
         if self.late is None:
-            return chosen
-        pushing = self._left < 0
+            return action
+        pushing = self._takeoff_step < 0
         legs = np.zeros((n, 4, 3))
         legs[:, :, 1:] = ((self.open_loop(self.late) - 45.0) / scale)[:, :, None]
-        chosen[pushing] = legs.reshape(n, 12)[pushing]
-        return chosen
+        action[pushing] = legs.reshape(n, 12)[pushing]
+        return action
 
-    def look(self, env: Any) -> dict[str, np.ndarray]:
-        """Return what is to be known of every robot."""
+    def read_env(self, env: Any) -> dict[str, np.ndarray]:
+        """Return base state, tilt and yaw [rad], paw contact, termination and angular momentum of every robot."""
         q, qd = env.sim.joint_q(), env.sim.joint_qd()
         quat = q[:, 3:7]
         up = 1.0 - 2.0 * (quat[:, 0] ** 2 + quat[:, 1] ** 2)
@@ -122,35 +113,36 @@ class Flights(EvaluationLog):
                 "rise": qd[:, 2].copy(), "spin": np.linalg.norm(qd[:, 3:6], axis=1), "down": (forces > 0.1).any(axis=0),
                 "termination": env.episodes.termination.numpy().copy(), "momentum": momentum(env.sim)[1]}  # fmt: skip
 
-    def follow(self, env: Any) -> bool:
-        """Look at the environment after a policy step, and ask for a turn where a flight has begun."""
-        before = self._left.copy()
-        ended = super().follow(env)
-        fresh = (self._left >= 0) & (before < 0)
+    def record_step(self, env: Any) -> bool:
+        """Record a policy step, and request a turn where a flight has begun."""
+        before = self._takeoff_step.copy()
+        ended = super().record_step(env)
+        fresh = (self._takeoff_step >= 0) & (before < 0)
         if self.turns and fresh.any():
-            env.requested_task(TURN, fresh)
+            env.request(TURN, fresh)
         return ended
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
-        """Take in a policy step; return whether all have ended."""
+        """Record a policy step from the arrays of `read_env`; return whether all flights have ended."""
         step, running = len(self.tilts), self.end < 0
-        self._clear = np.where(arrays["down"], 0, self._clear + 1)
+        self._airborne_steps = np.where(arrays["down"], 0, self._airborne_steps + 1)
         earliest, needed = (0, CLEAR) if self.late is None else (RAMP + HOLD, 1)
-        left = running & (self._left < 0) & (self._clear >= needed) & (arrays["rise"] > 0.75) & (step >= earliest)
-        self._left[left] = step
+        rising = (self._airborne_steps >= needed) & (arrays["rise"] > 0.75) & (step >= earliest)
+        left = running & (self._takeoff_step < 0) & rising
+        self._takeoff_step[left] = step
         for name, key in (("takeoff_tilt", "tilt"), ("takeoff_spin", "spin")):
             getattr(self, name)[left] = arrays[key][left]
         self.takeoff_momentum[left] = np.linalg.norm(arrays["momentum"][left], axis=1)
-        self._begun[left] = arrays["momentum"][left]
-        landed = running & (self._left >= 0) & (self._down < 0) & arrays["down"]
-        self._down[landed] = step
+        self._initial_momentum[left] = arrays["momentum"][left]
+        landed = running & (self._takeoff_step >= 0) & (self._touchdown_step < 0) & arrays["down"]
+        self._touchdown_step[landed] = step
         self.touchdown_tilt[landed] = self.tilts[-1][landed] if self.tilts else np.nan
-        self.touchdown_turn[landed] = self._turned[landed]
-        self._turned = arrays["turn"]
-        self.flight_time[landed] = (step - self._left[landed]) * step_dt
-        flying = running & (self._left >= 0) & (self._down < 0)
+        self.touchdown_turn[landed] = self._yaw[landed]
+        self._yaw = arrays["turn"]
+        self.flight_time[landed] = (step - self._takeoff_step[landed]) * step_dt
+        flying = running & (self._takeoff_step >= 0) & (self._touchdown_step < 0)
         self.largest_tilt[flying] = np.maximum(self.largest_tilt, arrays["tilt"])[flying]
-        change = np.linalg.norm(arrays["momentum"] - self._begun, axis=1)
+        change = np.linalg.norm(arrays["momentum"] - self._initial_momentum, axis=1)
         high = flying & (arrays["base_pos"][:, 2] > HIGH)
         self.drift[high] = np.maximum(self.drift, change)[high]
         self.height[running] = np.maximum(self.height, arrays["base_pos"][:, 2])[running]
@@ -158,25 +150,25 @@ class Flights(EvaluationLog):
             kept.append(np.where(running, now, kept[-1]) if kept else now)
         fell = running & (arrays["termination"] >= 0)
         self.end[fell] = arrays["termination"][fell]
-        over = running & ~fell & (self._down >= 0) & (step - self._down >= round(AFTER / step_dt))
+        over = running & ~fell & (self._touchdown_step >= 0) & (step - self._touchdown_step >= round(AFTER / step_dt))
         good = np.degrees(arrays["tilt"]) < UPRIGHT
         self.end[over] = np.where(good[over], OUTCOMES.index("landed"), OUTCOMES.index("tilted"))
-        late = running & (self._left < 0) & (step > RAMP + HOLD + EXTEND)
+        late = running & (self._takeoff_step < 0) & (step > RAMP + HOLD + EXTEND)
         self.end[late] = OUTCOMES.index("no_takeoff")
         return bool((self.end >= 0).all())
 
     @property
     def success(self) -> np.ndarray:
-        """Whether each robot landed, and stood upright AFTER seconds later."""
+        """Whether each robot landed and was upright AFTER seconds later."""
         return self.end == OUTCOMES.index("landed")
 
     @property
     def outcomes(self) -> np.ndarray:
-        """Name of what became of each robot."""
+        """Outcome of each flight, one of OUTCOMES or NO_END."""
         return np.array([*OUTCOMES, NO_END])[self.end]
 
     def columns(self) -> dict[str, list]:
-        """Return takeoffs, flights and landings."""
+        """Return tilts [deg], spin, apex height [m] and outcome of every flight."""
         numbers = {
             "takeoff_tilt_deg": np.degrees(self.takeoff_tilt), "takeoff_spin_rad_s": self.takeoff_spin,
             "touchdown_tilt_deg": np.degrees(self.touchdown_tilt), "apex_m": self.height,
@@ -184,7 +176,7 @@ class Flights(EvaluationLog):
         return {name: finite(values) for name, values in numbers.items()} | {"end": self.outcomes.tolist()}
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return tilts and heights."""
+        """Return tilt and base height of some worlds."""
         series = {}
         for world in worlds:
             series[f"tilt/of {world} [deg]"] = float(np.degrees(self.tilts[-1][world]))
@@ -192,13 +184,13 @@ class Flights(EvaluationLog):
         return series
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the heights that are asked for, and by how much later legs extend."""
-        told = {"asked_m": self.apex[list(worlds)].tolist()}
-        return told if self.late is None else told | {"late_ms": (1000.0 * self.late[list(worlds)]).tolist()}
+        """Return the commanded heights [m] and the delays of the extension [ms] of some worlds."""
+        notes = {"asked_m": self.apex[list(worlds)].tolist()}
+        return notes if self.late is None else notes | {"late_ms": (1000.0 * self.late[list(worlds)]).tolist()}
 
 
-def flight_metrics(flights: Flights) -> Metrics:
-    """Return the metrics of flights; means are over all that took off, or touched down."""
+def flight_metrics(flights: FlightLog) -> Metrics:
+    """Return the metrics of flights; means are over the flights that took off or touched down."""
     return {
         "flights": len(flights.end),
         "landed_upright_rate": float(flights.success.mean()),
@@ -212,22 +204,22 @@ def flight_metrics(flights: Flights) -> Metrics:
         "mean_largest_tilt_deg": mean(np.degrees(flights.largest_tilt)),
         **mean_and_max("touchdown_tilt_deg", np.degrees(flights.touchdown_tilt)),
         **mean_and_max("touchdown_turn_deg", np.degrees(flights.touchdown_turn)),
-        **failures(flights.outcomes[~flights.success]),
+        **failed_by(flights.outcomes[~flights.success]),
         "failed_before_touchdown": int((~flights.success & np.isnan(flights.flight_time)).sum()),
     }
 
 
-def delays(count: int, most: float, seed: int) -> np.ndarray:
-    """Return by how much later front and left legs extend, (count, 2): from half of the most to it, to any side."""
+def extension_delays(count: int, most: float, seed: int) -> np.ndarray:
+    """Return random delays of front and left legs [s], (count, 2): vectors of length most / 2 to most."""
     rng = np.random.default_rng(seed)
     size, angle = rng.uniform(0.5 * most, most, count), rng.uniform(0.0, 2.0 * np.pi, count)
     return np.stack([size * np.cos(angle), size * np.sin(angle)], axis=1)
 
 
-def draw_flights(path: Path, found: Mapping[str, Flights]) -> None:
-    """Draw tilt and height of all flights over time, a column for each name."""
-    with figure(path, 2, len(found), figsize=(11, 6), sharex=True, sharey="row") as axes:
-        for column, (name, flights) in zip(axes.T, found.items(), strict=True):
+def plot_flights(path: Path, logs: Mapping[str, FlightLog]) -> None:
+    """Plot tilt and base height of all flights over time, one column per log (by name)."""
+    with figure(path, 2, len(logs), figsize=(11, 6), sharex=True, sharey="row") as axes:
+        for column, (name, flights) in zip(axes.T, logs.items(), strict=True):
             time = np.arange(len(flights.tilts)) * flights.step_dt
             column[0].plot(time, np.degrees(np.array(flights.tilts)), linewidth=0.6, alpha=0.5, color="tab:red")
             column[1].plot(time, np.array(flights.heights), linewidth=0.6, alpha=0.5, color="tab:blue")
@@ -236,13 +228,13 @@ def draw_flights(path: Path, found: Mapping[str, Flights]) -> None:
 
 
 class FlightRun(Run):
-    """Follows flights of a jump and a policy that turns."""
+    """Evaluation of flights with two skills: a jump, and a policy that turns in flight."""
 
-    flights: Flights
-    """Under way."""
+    flights: FlightLog
+    """Log of the flights under way."""
 
     def __init__(self, args: EvaluationArgs, landing: str, jump: str) -> None:
-        """Open the policies that turn (args) and land (none if empty); jump: the task that takes off and lands then.
+        """Open the policies that turn (`args.policy`) and land (`landing`; empty: none, `jump` is the task that lands).
 
         Raises PolicyError or CheckpointError: one cannot be used, or is of another kind of task.
         """
@@ -259,7 +251,7 @@ class FlightRun(Run):
         self.prepare("flight_attitude", conditions_of(args), args.out, record=args.record)
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return the actions of both skills, (2, num_envs, 12)."""
+        """Return the function that gives the actions of both skills, (2, num_envs, 12)."""
         scale = env.skills[JUMP].task.action_scale[1]
 
         def act(obs: torch.Tensor) -> torch.Tensor:
@@ -270,7 +262,7 @@ class FlightRun(Run):
         return act
 
     def env(self, count: int) -> Env:
-        """Return the environment of robots that jump and turn."""
+        """Return an environment of `count` robots with the skills JUMP and TURN."""
         conditions = self.conditions
         tasks, handovers = flight_skills(*(conditions.applied(task) for task in self.tasks))
         env = Env(
@@ -281,11 +273,11 @@ class FlightRun(Run):
         for policy in (self.turn, self.landing):
             if policy is not None:
                 policy.to(env.device)
-        self.told["gravity_m_s2"] = env.task.gravity
+        self.setup_metrics["gravity_m_s2"] = env.task.gravity
         return env
 
-    def fly(self, env: Env, flights: Flights, film: str) -> Flights:
-        """Follow flights, and return them."""
+    def fly(self, env: Env, flights: FlightLog, film: str) -> FlightLog:
+        """Run the flights, and return their log; film: name of the recording."""
         self.flights = flights
-        self.follow(env, flights, film=film)
+        self.run_episodes(env, flights, film=film)
         return flights

@@ -1,4 +1,4 @@
-"""How a robot walks: steps, swings, contacts, torques and what it costs, from samples of every policy step."""
+"""Gait metrics: step frequency, swing height, contact patterns, torques and cost of transport."""
 
 from __future__ import annotations
 
@@ -13,30 +13,23 @@ from jumper_warp.robot.description import LEGS
 
 
 @dataclass
-class Gait:
-    """Samples of all worlds; call it after every policy step. All of them should walk with one command."""
+class GaitRecorder:
+    """Samples the gait of all worlds, which walk with one command; call it after every policy step."""
 
-    env: Any
-    """`jumper_warp.envs.env.Env`"""
-    skip: float = 2.0
-    """[s] From the start that are not sampled."""
-    contact: list[np.ndarray] = field(default_factory=list)
-    """(robots, 4) Whether each paw is on the ground."""
+    env: Any  # The sampled `jumper_warp.envs.env.Env`
+    skip: float = 2.0  # [s] Time at the start that is not sampled
+    contact: list[np.ndarray] = field(default_factory=list)  # (robots, 4) Whether each paw is on the ground
     paw_height: list[np.ndarray] = field(default_factory=list)
-    """[m] (robots, 4) Above the ground below it."""
+    """[m] (robots, 4) Height of each paw above the ground below it."""
     force: list[np.ndarray] = field(default_factory=list)
-    """[N] (robots, 4) Upward, of the last physics step."""
-    torque: list[np.ndarray] = field(default_factory=list)
-    """[N m] (robots, 12)"""
-    power: list[np.ndarray] = field(default_factory=list)
-    """[W] (robots,) That the motors give, without what they take back."""
-    speed: list[np.ndarray] = field(default_factory=list)
-    """[m/s] (robots,) Of the base in the plane."""
-    steps: int = 0
-    """Policy steps seen."""
+    """[N] (robots, 4) Upward force on each paw in the last physics step."""
+    torque: list[np.ndarray] = field(default_factory=list)  # [N m] (robots, 12) Motor torques
+    power: list[np.ndarray] = field(default_factory=list)  # [W] (robots,) Sum of the positive powers of the motors
+    speed: list[np.ndarray] = field(default_factory=list)  # [m/s] (robots,) Horizontal speed of the base
+    steps: int = 0  # Number of policy steps so far
 
     def __call__(self, *_: Any) -> None:
-        """Take a sample."""
+        """Append a sample, unless within `skip` of the start."""
         self.steps += 1
         if self.steps <= round(self.skip / self.env.step_dt):
             return
@@ -51,7 +44,7 @@ class Gait:
         self.speed.append(np.linalg.norm(sim.base_velocity()[:, :2], axis=1))
 
     def metrics(self, standing: np.ndarray) -> Metrics:
-        """Return what robots do that have not fallen, nothing if there are none; standing: (robots,) bool."""
+        """Return `gait_metrics` of the robots that have not fallen, {} if there are none; standing: (robots,) bool."""
         if not standing.any():
             return {}
         model = self.env.sim.model
@@ -68,20 +61,21 @@ def gait_metrics(
     contact: np.ndarray, paw_height: np.ndarray, force: np.ndarray, torque: np.ndarray, power: np.ndarray,
     speed: np.ndarray, weight: np.ndarray, step_dt: float,
 ) -> Metrics:  # fmt: skip
-    """Return the figures of a gait from samples (steps, robots, ...), as `Gait` has them; weight [N]: (robots,).
+    """Return the metrics of a gait from the samples of `GaitRecorder`, (steps, robots, ...); weight [N]: (robots,).
 
-    The cost of transport is the mean power over that of lifting the weight at the mean speed; None if a robot does not
-    come on. Contact patterns have the names of the paws on the ground.
+    The cost of transport is mean power / (weight * mean speed); None if a robot does not move. Contact patterns are
+    named by the paws on the ground.
     """
     apexes = np.concatenate([np.zeros(0), *(swing_apexes(contact[:, i, k], paw_height[:, i, k])
                                            for i in range(contact.shape[1]) for k in range(4))])  # fmt: skip
     seconds, robots = len(contact) * step_dt, max(contact.shape[1], 1)
     touchdowns = int((contact[1:] & ~contact[:-1]).sum())
-    load, pace = force.sum(axis=2) / weight, speed.mean(axis=0)
+    transport = power.mean(axis=0)
+    load, mean_speed = force.sum(axis=2) / weight, speed.mean(axis=0)
     metrics: Metrics = {
         "steps_hz": touchdowns / (4.0 * robots * seconds),
         "median_swing_apex_m": float(np.median(apexes)) if len(apexes) else None,
-        "cost_of_transport": float(np.mean(power.mean(axis=0) / (weight * pace))) if pace.min() > 0.05 else None,
+        "cost_of_transport": float(np.mean(transport / (weight * mean_speed))) if mean_speed.min() > 0.05 else None,
         "mean_speed_m_s": float(speed.mean()),
         "largest_torque_nm": float(np.abs(torque).max()),
         "rms_torque_nm": float(np.sqrt(np.mean(torque**2))),
@@ -98,7 +92,7 @@ def gait_metrics(
 
 
 def swing_apexes(contact: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Return the highest point [m] of each swing of a paw that both begins and ends within the samples (steps,)."""
+    """Return the largest height [m] in each complete swing of a paw; contact (bool), height [m]: (steps,)."""
     change = np.diff(contact.astype(int))
     lifts, lands = np.flatnonzero(change == -1) + 1, np.flatnonzero(change == 1) + 1
     lands = lands[lands > lifts[0]] if len(lifts) else lands[:0]

@@ -1,4 +1,4 @@
-"""A jump by the solver's own kernel, and as a rollout with its reverse pass, to be timed."""
+"""The same jump by the solver's own kernel, and as a rollout with its reverse pass, for timing."""
 
 from __future__ import annotations
 
@@ -15,30 +15,30 @@ from support.gradients import PUSH, schedule, start
 
 
 class PlainJump:
-    """The jump by the solver's kernel: a captured graph of filter and physics, a policy step after the other."""
+    """The jump by the solver's kernel, as a captured graph of filter and physics of all policy steps."""
 
     def __init__(self, rollout: Rollout, targets: np.ndarray):
-        """Capture; the model and the parameters are those of the rollout."""
+        """Capture the graph; model and parameters are the rollout's; targets [rad]: (steps, 12)."""
         self._rollout, n = rollout, rollout.num_worlds
         dynamics, modules = rollout.dynamics, rollout.dynamics.modules
         self._start = [rollout.array(np.tile(values, n)) for values in start()]
         self._q, self._qd = (wp.clone(array) for array in self._start)
         self._targets = rollout.array(np.repeat(targets[:, :, None], n, axis=2))
-        safe = rollout.array(np.zeros((12, n)))
+        filtered = rollout.array(np.zeros((12, n)))
         limits = filter_params(vertical_jump_filter(), module=modules.command_filter)
         wrench = wp.zeros(dynamics.model.body_count, dtype=wp.spatial_vectorf, device=rollout.device)
         motors = rollout.motors
-        drive = dynamics.drive(rollout.array(np.zeros(38 * n)), wrench, motors, safe)
+        drive = dynamics.drive(rollout.array(np.zeros(38 * n)), wrench, motors, filtered)
         settings = dynamics.settings(PHYSICS_DT, SUBSTEPS, MAX_SWEEPS, TOLERANCE)
 
         def run() -> None:
             dynamics.work.impulse.zero_()
-            for mine, first in zip((self._q, self._qd), self._start, strict=True):
-                wp.copy(mine, first)
+            for current, initial in zip((self._q, self._qd), self._start, strict=True):
+                wp.copy(current, initial)
             for target in (self._targets[step] for step in range(len(targets))):
                 wp.launch(
                     modules.command_filter.command_filter_kernel, dim=(4, n), device=rollout.device,
-                    inputs=[0, target, self._q, self._qd, COORDS, DOFS, motors.offset, limits], outputs=[safe],
+                    inputs=[0, target, self._q, self._qd, COORDS, DOFS, motors.offset, limits], outputs=[filtered],
                 )  # fmt: skip
                 dynamics.advance(settings, drive, self._q, self._qd, self._q, self._qd)
 
@@ -46,22 +46,22 @@ class PlainJump:
         with wp.ScopedCapture(device=rollout.device) as capture:
             run()
         assert capture.graph is not None
-        self._graph, self._arrays = capture.graph, (drive, safe, wrench)  # a graph on a GPU keeps no arrays alive
+        self._graph, self._arrays = capture.graph, (drive, filtered, wrench)  # a graph on a GPU keeps no arrays alive
 
     def run(self) -> None:
-        """Simulate."""
+        """Simulate the jump."""
         wp.capture_launch(self._graph)
 
     def heights(self) -> np.ndarray:
-        """Return the final heights [m] of the bases, (num_worlds,)."""
+        """Return the final base heights [m], (num_worlds,)."""
         return self._q.numpy().reshape(self._rollout.num_worlds, -1)[:, 2]
 
 
 class GradientRun:
-    """The jump as a rollout, and the reverse pass of its final height."""
+    """The jump as a rollout, and the gradient of its final height by the reverse pass."""
 
     def __init__(self, worlds: int, double: bool, device: str | None):
-        """Allocate."""
+        """Build the rollout and its inputs for a number of worlds; double: precision."""
         model = build_model(worlds, visuals=False, device=device)
         self.rollout = Rollout(
             model, jumping_motors(), vertical_jump_filter(), double=double, tolerance=TOLERANCE, threads=1
@@ -69,14 +69,14 @@ class GradientRun:
         self._q, self._qd = (self.rollout.array(np.repeat(row, worlds, axis=1)) for row in compact(*start()))
         self._targets = self.rollout.array(np.repeat(schedule(PUSH)[:, :, None], worlds, axis=2))
         trajectory = self.forward()
-        seed = np.zeros(trajectory.q.shape)
-        seed[-1, 2] = 1.0
-        self._seed = self.rollout.array(seed)
+        cotangent = np.zeros(trajectory.q.shape)
+        cotangent[-1, 2] = 1.0
+        self._cotangent = self.rollout.array(cotangent)
 
     def forward(self) -> Trajectory:
-        """Simulate."""
+        """Simulate the jump and return the trajectory."""
         return self.rollout.run(self._targets, self._q, self._qd)
 
     def run(self) -> dict[str, wp.array]:
-        """Simulate, and return the gradient."""
-        return self.rollout.backward(self.forward(), q=self._seed)
+        """Simulate the jump and return the gradients by name of the input."""
+        return self.rollout.backward(self.forward(), q=self._cotangent)

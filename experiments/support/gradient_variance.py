@@ -1,4 +1,4 @@
-"""How noisy a policy's gradient is over windows of different lengths, through the physics and by the score function."""
+"""Noise of policy gradients over windows of different lengths, through the physics and by the score function."""
 
 from __future__ import annotations
 
@@ -17,104 +17,126 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.runs import open_policy
-from jumper_warp.rl.networks import ActorCritic, weights_of
+from jumper_warp.rl.networks import ActorCritic, linear_layers
 from jumper_warp.trajectory.gauss_newton import Network, Tape, world_rows
 
-NOISE = 0.2
-"""[1] Standard deviation of the actions in windows."""
+NOISE = 0.2  # [1] Standard deviation of the actions in windows
 ESTIMATORS = ("physics", "score")
+METRICS = {"deviation": "std", "signal": "signal", "worlds_needed": "worlds_needed", "non_finite": "non_finite"}
+"""Field of `GradientStats` by name of the metric."""
 
 
 @dataclass(frozen=True)
-class Spread:
-    """Of one estimator's gradients of the worlds, each (weights,)."""
+class GradientStats:
+    """Statistics over worlds of one estimator's gradients, (weights,) each."""
 
-    deviation: float
-    """Root of the sum over weights of the variance between worlds."""
-    signal: float
-    """Length of the mean over worlds, the part that noise alone would give taken off; 0 if noise explains it."""
-    non_finite: float
-    """Share of worlds whose gradient is not finite."""
+    std: float  # Square root of the sum over weights of the variance between worlds
+    signal: float  # Norm of the mean over worlds, without the part expected from noise alone; 0 if noise explains it
+    non_finite: float  # Share of worlds whose gradient is not finite
 
     @property
     def worlds_needed(self) -> float:
-        """Number of worlds whose mean has noise as long as the signal."""
-        return (self.deviation / self.signal) ** 2 if self.signal > 0.0 else float("inf")
+        """Number of worlds for which the noise of the mean is as long as the signal."""
+        return (self.std / self.signal) ** 2 if self.signal > 0.0 else float("inf")
 
 
-def spread_of(rows: torch.Tensor) -> Spread:
-    """Return the spread of gradients (worlds, weights)."""
+StatsByPolicy = dict[str, dict[str, list[GradientStats]]]
+"""Statistics by policy and estimator, one per horizon."""
+
+
+def gradient_stats(rows: torch.Tensor) -> GradientStats:
+    """Return the statistics of gradients (worlds, weights) over the worlds whose gradient is finite."""
     finite = rows.isfinite().all(1)
-    kept = rows[finite].double()
-    variance = float(kept.var(0).sum())
-    signal = float(kept.mean(0).square().sum()) - variance / len(kept)
-    return Spread(variance**0.5, max(signal, 0.0) ** 0.5, 1.0 - float(finite.double().mean()))
+    valid = rows[finite].double()
+    variance = float(valid.var(0).sum())
+    signal = float(valid.mean(0).square().sum()) - variance / len(valid)
+    return GradientStats(variance**0.5, max(signal, 0.0) ** 0.5, 1.0 - float(finite.double().mean()))
 
 
 def gradients(env: DifferentiableEnv, network: Network, horizon: int, std: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return each world's gradient (worlds, weights) of the reward of a window: by physics, and by the score function.
+    """Return each world's gradient of the reward of a window, (worlds, weights), by physics and by the score function.
 
-    The window begins where the environment is; a world's counts until its episode ends. std: of the actions' noise [1].
-    The score function's advantage is what is left of the window's reward, less its mean over the worlds.
+    The window starts at the present state; rewards of a world count until its episode ends. std: standard deviation of
+    the actions' noise [1]. The advantage of the score function is the remaining reward minus its mean over worlds.
     """
     env.begin_window()
-    tape, scores, scored, rewards = Tape(), [], Tape(), []
+    tape, score_tape, scores, rewards = Tape(), Tape(), [], []
     alive = torch.ones(env.num_envs, device=env.device)
     for _ in range(horizon):
         obs, _ = env.observe()
         mean = network.act(obs, tape=tape)
         action = mean + std * torch.randn_like(mean)
-        again = network.act(obs.detach(), tape=scored)
-        scores.append(-0.5 * alive * ((action.detach() - again) / std).square().sum(1))
+        score_mean = network.act(obs.detach(), tape=score_tape)
+        scores.append(-0.5 * alive * ((action.detach() - score_mean) / std).square().sum(1))
         rewards.append(alive * env.step_with_gradient(action))
         alive = alive * (1.0 - env.done)
     by_physics = world_rows(torch.stack(rewards).sum(), tape)
-    left = torch.stack(rewards).detach().flip(0).cumsum(0).flip(0)
-    advantage = left - left.mean(1, keepdim=True)
-    return by_physics, world_rows((torch.stack(scores) * advantage).sum(), scored)
+    to_go = torch.stack(rewards).detach().flip(0).cumsum(0).flip(0)
+    advantage = to_go - to_go.mean(1, keepdim=True)
+    return by_physics, world_rows((torch.stack(scores) * advantage).sum(), score_tape)
 
 
 def policies() -> dict[str, Policy]:
-    """Return the trained policy, and one with new weights and the same interface."""
+    """Return `trained`, the shipped policy, and `new`, one with random weights and the same interface."""
     trained = open_policy("vertical_jump")
-    face = trained.interface
+    interface = trained.interface
     torch.manual_seed(0)
-    new = ActorCritic(face.sizes[0], face.sizes[-1], face.hidden, face.activation)
-    return {"new": Policy(weights_of(new.actor), trained.mean, trained.std, face), "trained": trained}
+    new = ActorCritic(interface.sizes[0], interface.sizes[-1], interface.hidden, interface.activation)
+    return {"new": Policy(linear_layers(new.actor), trained.mean, trained.std, interface), "trained": trained}
 
 
-def spreads_of(policy: Policy, env: DifferentiableEnv, horizons: tuple[int, ...]) -> dict[str, list[Spread]]:
-    """Return the spreads of a policy's gradients over windows of these policy steps, by estimator."""
-    network, found = Network(policy, device=env.device), []
+def stats_over_horizons(
+    policy: Policy, env: DifferentiableEnv, horizons: tuple[int, ...]
+) -> dict[str, list[GradientStats]]:
+    """Return the statistics of a policy's gradients by estimator, one per horizon [policy steps]."""
+    network, stats = Network(policy, device=env.device), []
     for horizon in horizons:
         torch.manual_seed(1)
         env.reset(seed=1)
-        found.append([spread_of(rows) for rows in gradients(env, network, horizon, NOISE)])
-    return dict(zip(ESTIMATORS, map(list, zip(*found, strict=True)), strict=True))
+        stats.append([gradient_stats(rows) for rows in gradients(env, network, horizon, NOISE)])
+    return dict(zip(ESTIMATORS, map(list, zip(*stats, strict=True)), strict=True))
 
 
-def variances(make_env: Callable[[], Env], horizons: tuple[int, ...], path: Path) -> dict[str, Any]:
-    """Measure spreads over horizons, draw them, and return them."""
-    values: dict[str, Any] = {"horizons": list(horizons)}
+def measure_stats(make_env: Callable[[], Env], horizons: tuple[int, ...]) -> StatsByPolicy:
+    """Return the statistics of all gradients, by policy and estimator, one per horizon [policy steps]."""
+    return {
+        name: stats_over_horizons(policy, DifferentiableEnv(make_env(), world_norm=math.inf), horizons)
+        for name, policy in policies().items()
+    }
+
+
+def variance_metrics(stats: StatsByPolicy) -> dict[str, Any]:
+    """Return the statistics as metrics, one list over horizons each; None where not finite."""
+    values = {}
+    for policy, by_estimator in stats.items():
+        for estimator, of_horizons in by_estimator.items():
+            for key, field in METRICS.items():
+                series = [getattr(each, field) for each in of_horizons]
+                values[f"{key}_{estimator}_{policy}"] = [x if math.isfinite(x) else None for x in series]
+    return values
+
+
+def print_variances(stats: StatsByPolicy, horizons: tuple[int, ...]) -> None:
+    """Print a table of standard deviations and numbers of worlds by policy and horizon."""
     table = Table("policy", "steps", *(f"{name}: {what}" for name in ESTIMATORS for what in ("deviation", "worlds")))
+    for policy, by_estimator in stats.items():
+        for horizon, *pair in zip(horizons, *by_estimator.values(), strict=True):
+            cells = [f"{x:.3g}" for each in pair for x in (each.std, each.worlds_needed)]
+            table.add_row(policy, str(horizon), *cells)
+    Console().print(table)
+
+
+def plot_variances(stats: StatsByPolicy, horizons: tuple[int, ...], path: Path) -> None:
+    """Plot standard deviation and number of worlds over the horizon, a color per policy."""
     with figure(path, 1, 2, figsize=(11, 4.5)) as axes:
-        for i, (who, policy) in enumerate(policies().items()):
-            found = spreads_of(policy, DifferentiableEnv(make_env(), world_norm=math.inf), horizons)
-            for horizon, *pair in zip(horizons, *found.values(), strict=True):
-                cells = [f"{x:.3g}" for spread in pair for x in (spread.deviation, spread.worlds_needed)]
-                table.add_row(who, str(horizon), *cells)
-            for name, spreads in found.items():
-                for what in ("deviation", "signal", "worlds_needed", "non_finite"):
-                    series = [getattr(spread, what) for spread in spreads]
-                    values[f"{what}_{name}_{who}"] = [x if math.isfinite(x) else None for x in series]
+        for i, (policy, by_estimator) in enumerate(stats.items()):
+            for name, of_horizons in by_estimator.items():
                 style = {"color": f"C{i}", "linestyle": "-" if name == "physics" else "--", "marker": "o"}
-                axes[0].plot(horizons, [s.deviation for s in spreads], label=f"{who}, {name}", **style)
-                axes[1].plot(horizons, [s.worlds_needed for s in spreads], **style)
+                axes[0].plot(horizons, [s.std for s in of_horizons], label=f"{policy}, {name}", **style)
+                axes[1].plot(horizons, [s.worlds_needed for s in of_horizons], **style)
         axes[0].set(ylabel="deviation between worlds")
         axes[1].set(ylabel="worlds until noise is as long as the signal")
         for axis in axes:
             axis.set(xscale="log", yscale="log", xlabel="policy steps of the window")
             axis.grid(alpha=0.3)
         axes[0].legend()
-    Console().print(table)
-    return values

@@ -1,7 +1,7 @@
-"""Gradients of a jump's apex, beside central differences.
+"""Gradients of a jump's apex, by the reverse pass and by central differences.
 
-The jump starts in a squat on the ground and goes through filter, motors, dynamics and contact, at the solver's usual
-step.
+The jump starts in a squat on the ground and is simulated with filter, motors, dynamics and contact, at the solver's
+default step.
 """
 
 from __future__ import annotations
@@ -18,23 +18,20 @@ from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import build_model, standing_configuration
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
 
-TICKS = 36
-"""Policy steps of 1/60 s."""
+TICKS = 36  # Number of policy steps of 1/60 s of the jump
 SQUAT = math.radians(85.0)
 PUSH = (-5.0, -8.0)
 """[deg] Outer and inner transversal command of the push-off; the filter binds, the motors saturate at first."""
-SLIP_SPEED = 1.5
-"""[m/s] Forward speed of the jump on slippery ground that friction is checked on."""
+SLIP_SPEED = 1.5  # [m/s] Initial forward speed of the jump on slippery ground for the gradient by friction
 SLIP_FRICTION = 0.25
-OUTER, INNER = 1, 2
-"""Motors of the front left leg in the plot."""
+OUTER, INNER = 1, 2  # Motors of the front left leg whose targets are checked
 PARAMETERS = ("table", "saturation")
-Pair = tuple[np.ndarray, np.ndarray]
-"""A gradient and its differences."""
+GradientPair = tuple[np.ndarray, np.ndarray]
+"""Gradient of the apex along some directions, and its central differences; the same shape."""
 
 
 def schedule(push: tuple[float, float]) -> np.ndarray:
-    """Return the motor targets [rad] of a push-off [deg], shape (TICKS, 12)."""
+    """Return the motor targets [rad], (TICKS, 12), of a push-off to outer and inner transversal angles [deg]."""
     targets = np.zeros((TICKS, 4, 3))
     targets[:2, :, 1:] = SQUAT
     targets[2:, :, 1:] = np.radians(push)
@@ -42,7 +39,7 @@ def schedule(push: tuple[float, float]) -> np.ndarray:
 
 
 def start() -> tuple[np.ndarray, np.ndarray]:
-    """Return coordinates (43,) and rates (38,) of the squat, in the ground, where no contact is about to switch."""
+    """Return coordinates (43,) and rates (38,) of the squat, 0.1 mm into the ground, so that contacts do not switch."""
     squat = dataclasses.replace(load_description(), poses={"squat": (0.0, SQUAT)})
     q = standing_configuration(squat, "squat")
     q[2] -= 1.0e-4
@@ -50,9 +47,10 @@ def start() -> tuple[np.ndarray, np.ndarray]:
 
 
 class GradientJump:
-    """Jumps from NumPy inputs, by name: targets (TICKS, 12), q (19,), qd (18,), table (rows,), saturation (12,)."""
+    """Simulates the jump from inputs: targets (TICKS, 12), q (19,), qd (18,), table (rows,), saturation (12,)."""
 
     def __init__(self, num_worlds: int, double: bool, device: str | None):
+        """Build the rollout and the default inputs, `values`; double: precision."""
         self.num_worlds = num_worlds
         model = build_model(num_worlds, visuals=False, device=device)
         self.rollout = Rollout(model, jumping_motors(), vertical_jump_filter(), double=double, every=1)
@@ -61,7 +59,7 @@ class GradientJump:
         self.values |= {name: self.rollout.parameters[name].numpy()[:, 0].astype(float) for name in PARAMETERS}
 
     def run(self, inputs: dict[str, np.ndarray]) -> Trajectory:
-        """Simulate. Inputs have the world as first axis where they differ."""
+        """Simulate with some inputs changed; they have the world as first axis where worlds differ."""
         full = {}
         for name, value in (self.values | inputs).items():
             whole = np.broadcast_to(value, (self.num_worlds, *value.shape[-self.values[name].ndim :]))
@@ -71,14 +69,14 @@ class GradientJump:
         return self.rollout.run(full["targets"], full["q"], full["qd"])
 
     def gradients(self, inputs: dict[str, np.ndarray]) -> tuple[Trajectory, dict[str, np.ndarray]]:
-        """Return a jump in one world and the gradients of its apex, by each body's mass too."""
+        """Return the jump in one world and the gradients of its apex by each input, and by body mass, `mass` (21,)."""
         jump = self.run(inputs)
-        seed = np.zeros(jump.q.shape)
-        seed[jump.q.numpy()[:, 2, 0].argmax(), 2, 0] = 1.0
-        found = {name: array.numpy()[..., 0].astype(float) for name, array in
-                 self.rollout.backward(jump, q=self.rollout.array(seed)).items()}  # fmt: skip
-        found["mass"] = body_gradients(self.rollout.parameters["table"].numpy(), found["table"][:, None])["mass"][:, 0]
-        return jump, found
+        cotangent = np.zeros(jump.q.shape)
+        cotangent[jump.q.numpy()[:, 2, 0].argmax(), 2, 0] = 1.0
+        grads = {name: array.numpy()[..., 0].astype(float) for name, array in
+                 self.rollout.backward(jump, q=self.rollout.array(cotangent)).items()}  # fmt: skip
+        grads["mass"] = body_gradients(self.rollout.parameters["table"].numpy(), grads["table"][:, None])["mass"][:, 0]
+        return jump, grads
 
 
 def apex(jump: Trajectory) -> np.ndarray:
@@ -89,7 +87,10 @@ def apex(jump: Trajectory) -> np.ndarray:
 def differences(
     inputs: dict[str, np.ndarray], name: str, directions: np.ndarray, step: float, device: str | None
 ) -> np.ndarray:
-    """Return central differences of the apex along directions (n, ...) of an input, each end in a world of its own."""
+    """Return central differences of the apex along directions (n, ...) of the input `name`, (n,).
+
+    inputs: changed from the defaults; step: half distance. All 2 n jumps run in parallel worlds.
+    """
     batch = GradientJump(2 * len(directions), double=True, device=device)
     middle = inputs.get(name, batch.values[name])
     ends = np.concatenate([middle + step * directions, middle - step * directions])
@@ -97,16 +98,16 @@ def differences(
     return (ahead - behind) / (2.0 * step)
 
 
-def entries(shape: tuple[int, ...], chosen: list) -> np.ndarray:
-    """Return unit directions along single entries of an input, (n, *shape)."""
-    directions = np.zeros((len(chosen), *shape))
-    for direction, entry in zip(directions, chosen, strict=True):
+def unit_directions(shape: tuple[int, ...], indices: list) -> np.ndarray:
+    """Return unit directions along the entries of an input at some indices, (n, *shape)."""
+    directions = np.zeros((len(indices), *shape))
+    for direction, entry in zip(directions, indices, strict=True):
         direction[entry] = 1.0
     return directions
 
 
 def mass_directions(table: np.ndarray) -> np.ndarray:
-    """Return what 1 kg more of each body, its com and the inertia about it held, adds to the parameter table."""
+    """Return the change of the parameter table, (bodies, rows), by 1 kg more of each body, com and inertia constant."""
     directions = np.zeros((int(BODIES), len(table)))
     for body, direction in enumerate(directions):
         moments = table[moment_rows(body)]
@@ -115,31 +116,31 @@ def mass_directions(table: np.ndarray) -> np.ndarray:
     return directions
 
 
-def check(device: str | None) -> tuple[Trajectory, dict[str, Pair]]:
-    """Return the jump, and by input the gradient of its apex beside the differences."""
+def check(device: str | None) -> tuple[Trajectory, dict[str, GradientPair]]:
+    """Return the jump, and gradient and differences of its apex by kind of input."""
     jump = GradientJump(1, double=True, device=device)
-    rollout, grads = jump.gradients({})
+    trajectory, grads = jump.gradients({})
     motors = [(t, m) for m in (OUTER, INNER) for t in range(TICKS)]
     coords, rates = [2, 3, 4, 5, *range(7, 19)], list(range(18))
 
-    def pair(found: np.ndarray, name: str, directions: np.ndarray, step: float, inputs: dict) -> Pair:
-        return found, differences(inputs, name, directions, step, device)
+    def compare(gradient: np.ndarray, name: str, directions: np.ndarray, step: float, inputs: dict) -> GradientPair:
+        return gradient, differences(inputs, name, directions, step, device)
 
-    def chosen(name: str, which: list, step: float, gradient: np.ndarray, inputs: dict) -> Pair:
-        found = np.array([gradient[entry] for entry in which])
-        return pair(found, name, entries(gradient.shape, which), step, inputs)
+    def at_entries(name: str, indices: list, step: float, gradient: np.ndarray, inputs: dict) -> GradientPair:
+        directions = unit_directions(gradient.shape, indices)
+        return compare(np.array([gradient[index] for index in indices]), name, directions, step, inputs)
 
     slip = {"table": jump.values["table"].copy(), "qd": jump.values["qd"].copy()}
     friction_rows = [leg * int(LEG_ROWS) + int(row) for leg in range(4) for row in (MU_DYNAMIC, MU_STATIC)]
     slip["table"][friction_rows] = [SLIP_FRICTION, 1.2 * SLIP_FRICTION] * 4
     slip["qd"][0] = SLIP_SPEED
     slip_grad = jump.gradients(slip)[1]["table"]
-    position = chosen("q", coords, 1.0e-7, grads["q"], {})
-    speed = chosen("qd", rates, 1.0e-6, grads["qd"], {})
-    return rollout, {
-        "actions": chosen("targets", motors, 2.0e-6, grads["targets"], {}),
-        "mass": pair(grads["mass"], "table", mass_directions(jump.values["table"]), 1.0e-6, {}),
-        "torque_limit": chosen("saturation", list(range(12)), 1.0e-5, grads["saturation"], {}),
-        "friction": chosen("table", friction_rows, 1.0e-6, slip_grad, slip),
+    position = at_entries("q", coords, 1.0e-7, grads["q"], {})
+    speed = at_entries("qd", rates, 1.0e-6, grads["qd"], {})
+    return trajectory, {
+        "actions": at_entries("targets", motors, 2.0e-6, grads["targets"], {}),
+        "mass": compare(grads["mass"], "table", mass_directions(jump.values["table"]), 1.0e-6, {}),
+        "torque_limit": at_entries("saturation", list(range(12)), 1.0e-5, grads["saturation"], {}),
+        "friction": at_entries("table", friction_rows, 1.0e-6, slip_grad, slip),
         "initial_state": (np.concatenate([position[0], speed[0]]), np.concatenate([position[1], speed[1]])),
     }

@@ -1,4 +1,4 @@
-"""Other methods of identification, on the same data and the same parallel worlds."""
+"""Other methods of identification on the same data and the same parallel worlds: SciPy and CMA-ES."""
 
 from __future__ import annotations
 
@@ -12,55 +12,55 @@ from jumper_warp.identification.identify import identify_by_evolution
 from jumper_warp.identification.least_squares import LeastSquares, Point
 from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import ParameterSet
-from jumper_warp.identification.replay import Replay
+from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.residuals import MotionResiduals
-from support.known_robots import Carry, Case, prediction_errors
+from support.known_robots import Case, Simulate, prediction_errors
 
 
-def problem_of(parameters: ParameterSet, case: Case, replay: Replay) -> LeastSquares:
-    """Return the problem whose motions start as their first rows say."""
+def make_problem(parameters: ParameterSet, case: Case, replay: Replay) -> LeastSquares:
+    """Return the least-squares problem of a case, with the initial states of the recorded motions as start."""
     whole = [MotionResiduals(motion, parameters, NoiseLevels(), replay.description) for motion in case.motions]
     return LeastSquares(parameters, whole, replay, [case.mass])
 
 
 def chi2_at(problem: LeastSquares, point: Point) -> float:
-    """Return the mean squared weighed residual at a point."""
-    return sum(float(found @ found) for found in problem.residuals(point)) / problem.count
+    """Return the mean squared weighted residual at a point."""
+    return sum(float(residual @ residual) for residual in problem.residuals(point)) / problem.count
 
 
 def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
-    """Return where SciPy's trust region comes in `seconds`, by differences over the same parallel worlds."""
+    """Return the best point of SciPy's trust-region method within `seconds`, with differences over parallel worlds."""
     begin, size, ends = problem.expected(), len(problem.parameters), time.perf_counter() + seconds
     edges = np.cumsum([size, *(len(start) for start in begin.starts)])
     best = (np.inf, begin)
 
     class OutOfTime(Exception):
-        pass
+        """The time is over."""
 
-    def point_of(x: np.ndarray) -> Point:
+    def to_point(x: np.ndarray) -> Point:
         z, *starts = np.split(x.copy(), edges[:-1])
         return Point(z, starts)
 
     def residuals(x: np.ndarray) -> np.ndarray:
         nonlocal best
-        point = point_of(x)
-        found = np.concatenate([*problem.residuals(point), [problem.known(point.z)[0][0]], x])
-        cost = float(found @ found)
+        point = to_point(x)
+        residual = np.concatenate([*problem.residuals(point), [problem.known(point.z)[0][0]], x])
+        cost = float(residual @ residual)
         if cost < best[0]:
             best = (cost, point)
         if time.perf_counter() > ends:
             raise OutOfTime
-        return np.nan_to_num(found, posinf=1.0e6)
+        return np.nan_to_num(residual, posinf=1.0e6)
 
     def jacobian(x: np.ndarray) -> np.ndarray:
-        point = point_of(x)
+        point = to_point(x)
         table = np.zeros((problem.count + 1 + len(x), len(x)))
         row = 0
         for motion, start, first in zip(problem.motions, point.starts, edges, strict=False):
-            found = motion.linearise(problem.replay, point.z, start).jacobian
-            rows = table[row : row + len(found)]
-            rows[:, :size], rows[:, first : first + len(start)] = found[:, :size], found[:, size:]
-            row += len(found)
+            block = motion.linearise(problem.replay, point.z, start).jacobian
+            rows = table[row : row + len(block)]
+            rows[:, :size], rows[:, first : first + len(start)] = block[:, :size], block[:, size:]
+            row += len(block)
         table[row, :size] = problem.known(point.z)[0][1]
         table[row + 1 :] = np.eye(len(x))
         return table
@@ -78,12 +78,12 @@ def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
     return best[1]
 
 
-def compare_methods(parameters: ParameterSet, case: Case, replay: Replay, ours: Carry, seconds: float) -> dict:
-    """Return χ² and held-out errors of CMA-ES and SciPy in the time that this project took."""
-    problem = problem_of(parameters, case, replay)
+def compare_methods(parameters: ParameterSet, case: Case, replay: Replay, ours: Simulate, seconds: float) -> dict:
+    """Return χ² and held-out errors of CMA-ES and SciPy, each run for `seconds`."""
+    problem = make_problem(parameters, case, replay)
     evolved = identify_by_evolution(case.motions, parameters, knowledge=[case.mass], max_seconds=seconds)
     points = {"cma": Point(evolved.z, list(evolved.starts)), "scipy": scipy_fit(problem, seconds)}
-    metrics = {"methods_wall_s": seconds, "cma_million_world_steps": evolved.world_steps / 1.0e6}
+    metrics = {"methods_wall_s": seconds, "cma_million_world_steps": evolved.effort.world_steps / 1.0e6}
     for name, point in points.items():
         angle, height = prediction_errors(case, parameters.robots(point.z[None]), ours)
         metrics |= {

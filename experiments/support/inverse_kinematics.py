@@ -1,4 +1,4 @@
-"""Random poses, and poses of many robots from the places of their paws; the kernels are imported: no facade."""
+"""Random poses, and inverse kinematics of many robots by direct launches of the kernels."""
 
 from __future__ import annotations
 
@@ -35,16 +35,17 @@ def leg_limits(description: RobotDescription) -> Any:
 
 
 class InverseKinematics:
-    """Poses of n robots, four legs each."""
+    """Forward and inverse kinematics of the four legs of n robots."""
 
     def __init__(self, description: RobotDescription, n: int, device: wp.Device) -> None:
+        """Allocate the outputs on a device."""
         self._legs, self._limits = leg_geometry_array(description, geometry, device), leg_limits(description)
         self._base = [wp.zeros(n, dtype=kind, device=device) for kind in (wp.vec3, wp.quat)]
-        self._found = [wp.zeros((rows, n), dtype=float, device=device) for rows in (12, 8)]
+        self._angles = [wp.zeros((rows, n), dtype=float, device=device) for rows in (12, 8)]
         self.reachable = wp.zeros((4, n), dtype=wp.int32, device=device)
-        """1: the last targets' paw is reached."""
+        """(4, n) 1 where the last `solve` reached the paw's target."""
         self.residual = wp.zeros((4, n), dtype=float, device=device)
-        """[m] Distance left to them."""
+        """[m] (4, n) Remaining distance to the targets of the last `solve`."""
 
     def paws(self, motors: np.ndarray) -> wp.array:
         """Return paw positions [m] (4, n), body frame, of motor angles [rad] (12, n)."""
@@ -55,7 +56,7 @@ class InverseKinematics:
         return paws
 
     def solve(self, targets: wp.array) -> None:
-        """Find the poses that put the paws at targets [m] (4, n), body frame."""
+        """Solve for the poses that put the paws at targets [m], (4, n), body frame; sets `reachable` and `residual`."""
         inputs = [self._legs, self._limits, *self._base, targets, 0]
-        outputs = [*self._found, self.reachable, self.residual]
+        outputs = [*self._angles, self.reachable, self.residual]
         wp.launch(inverse_kinematics_kernel, targets.shape, inputs, outputs, device=targets.device)

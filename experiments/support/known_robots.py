@@ -1,4 +1,4 @@
-"""Robots whose parameters are known: drawn from the priors, recorded as they move, identified, and compared."""
+"""Robots with known parameters: sampled from the priors, recorded, identified, and compared with the truth."""
 
 from __future__ import annotations
 
@@ -10,46 +10,41 @@ import numpy as np
 
 from jumper_warp.evaluation.heights import run_jumps
 from jumper_warp.evaluation.plots import figure
-from jumper_warp.identification.excitation import unsafe
-from jumper_warp.identification.findings import Identification
-from jumper_warp.identification.identify import identify, total_mass, weighed
-from jumper_warp.identification.least_squares import Knowledge
-from jumper_warp.identification.motions import Motion
-from jumper_warp.identification.parameters import ParameterSet
-from jumper_warp.identification.recording import KINDS, Plan, measured, plot_plan, replay_plan
-from jumper_warp.identification.replay import Record, Replay
+from jumper_warp.identification.excitation import unsafe_reason
+from jumper_warp.identification.identify import identify
+from jumper_warp.identification.motions import RecordedMotion
+from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement, total_mass, weighed_mass
+from jumper_warp.identification.recording import KINDS, Plan, measure, replay_plan, sample_plan
+from jumper_warp.identification.replay import MotionReplay, Record
+from jumper_warp.identification.report import identified_overlay
+from jumper_warp.identification.results import Identification
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.robot.overlay import overlay_of
 from jumper_warp.robot.values import RobotValues
 
-SPREAD, MOST = 0.7, 1.5
-"""Of the drawn robots, in deviations of the priors."""
-HELD_OUT_TORQUE = 16.0
-"""[N m]"""
-SCALE = 0.02
-"""[kg] Deviation of the scale."""
+SPREAD, MOST = 0.7, 1.5  # Standard deviation and limit of the sampled parameters, in standard deviations of the priors
+HELD_OUT_TORQUE = 16.0  # [N m] Torque limit of the held-out jump
+SCALE_STD = 0.02  # [kg] Standard deviation of the weighed mass
 
 
 @dataclass
 class Case:
     """A known robot, its recorded motions, and a held-out jump."""
 
-    truth: np.ndarray
-    """(P,) normalised."""
+    truth: np.ndarray  # (parameters,) True parameters, normalised by the priors
     robots: RobotValues
-    motions: list[Motion]
-    mass: Knowledge
+    motions: list[RecordedMotion]
+    mass: PriorMeasurement
     held_out: Plan
-    record: Record
-    """Of the held-out jump."""
+    record: Record  # Measured trajectory of the held-out jump
 
 
-Carry = Callable[[Plan, RobotValues], Record]
+Simulate = Callable[[Plan, RobotValues], Record]
 
 
-def make_case(parameters: ParameterSet, seed: int, carry: Carry, replay: Replay) -> Case:
-    """Return a robot and what it did; carry: carries a plan out."""
+def make_case(parameters: ParameterSet, seed: int, simulate: Simulate, replay: Replay) -> Case:
+    """Return a random robot with its recorded motions; simulate: records a plan on it; replay: checks safety."""
     rng = np.random.default_rng(seed)
     z = np.clip(SPREAD * rng.normal(size=len(parameters)), -MOST, MOST)
     late = parameters.names.index("latency")
@@ -58,33 +53,33 @@ def make_case(parameters: ParameterSet, seed: int, carry: Carry, replay: Replay)
     nominal = parameters.robots(np.zeros((1, len(z))))
     plans: list[Plan] = []
     while len(plans) < len(KINDS):
-        plan = plot_plan(KINDS[len(plans)], rng)
-        if not unsafe(plan, replay_plan(replay, plan, nominal)):
+        plan = sample_plan(KINDS[len(plans)], rng)
+        if not unsafe_reason(plan, replay_plan(replay, plan, nominal)):
             plans.append(plan)
-    motions = [measured(p, f"{i} {p.kind}", carry(p, robots), robots, rng) for i, p in enumerate(plans)]
+    motions = [measured(p, f"{i} {p.kind}", simulate(p, robots), robots, rng) for i, p in enumerate(plans)]
     held_out = plot_plan("small jump", rng, torque_limit=HELD_OUT_TORQUE)
-    mass = weighed(float(total_mass(robots)[0] + SCALE * rng.normal()), SCALE)
-    return Case(z, robots, motions, mass, held_out, carry(held_out, robots))
+    mass = weighed(float(total_mass(robots)[0] + SCALE_STD * rng.normal()), SCALE_STD)
+    return Case(z, robots, motions, mass, held_out, simulate(held_out, robots))
 
 
-def prediction_errors(case: Case, robots: RobotValues, carry: Carry) -> tuple[float, float]:
-    """Return rms errors of angles [deg] and height [mm] of the held-out jump as some robot predicts it."""
-    found = carry(case.held_out, robots)
-    angle = found.angle[..., 0] + robots.offset[:1] - case.record.angle[..., 0] - case.robots.offset[:1]
-    height = found.position[:, 2, 0] - case.record.position[:, 2, 0]
+def prediction_errors(case: Case, robots: RobotValues, simulate: Simulate) -> tuple[float, float]:
+    """Return RMS errors of angles [deg] and height [mm] of the held-out jump as predicted by `robots`."""
+    predicted = simulate(case.held_out, robots)
+    angle = predicted.angle[..., 0] + robots.offset[:1] - case.record.angle[..., 0] - case.robots.offset[:1]
+    height = predicted.position[:, 2, 0] - case.record.position[:, 2, 0]
     return float(np.degrees(np.sqrt(np.mean(angle**2)))), 1000.0 * float(np.sqrt(np.mean(height**2)))
 
 
-def accuracy(parameters: ParameterSet, case: Case, found: Identification) -> dict[str, float]:
-    """Return the errors of what was found, the worst of each kind."""
-    values, true = found.values, parameters.values(case.truth)
+def accuracy(parameters: ParameterSet, case: Case, result: Identification) -> dict[str, float]:
+    """Return the largest error of each quantity, the coverage of the 95 % intervals, and the mismatch."""
+    values, true = result.values, parameters.values(case.truth)
 
     def worst(quantity: str, relative: bool) -> float:
         chosen = [i for i, p in enumerate(parameters) if p.quantity == quantity]
         error = np.abs(values[chosen] - true[chosen])
         return float((error / np.abs(true[chosen]) if relative else error).max())
 
-    error = np.abs(found.z - case.truth) / np.maximum(found.deviations, 1.0e-9)
+    error = np.abs(result.z - case.truth) / np.maximum(result.deviations, 1.0e-9)
     return {
         "kp_worst_percent": 100.0 * worst("kp", True),
         "kd_worst_percent": 100.0 * worst("kd", True),
@@ -92,34 +87,37 @@ def accuracy(parameters: ParameterSet, case: Case, found: Identification) -> dic
         "offset_worst_deg": float(np.degrees(worst("offset", False))),
         "armature_worst_percent": 100.0 * worst("armature", True),
         "latency_us": 1.0e6 * worst("latency", False),
-        "coverage": float(np.mean(error[found.identified] < 1.96)),
-        "error_over_deviation_rms": float(np.sqrt(np.mean(error[found.identified] ** 2))),
-        "mismatch": found.mismatch,
+        "coverage": float(np.mean(error[result.identified] < 1.96)),
+        "error_over_deviation_rms": float(np.sqrt(np.mean(error[result.identified] ** 2))),
+        "mismatch": result.mismatch,
     }
 
 
 def run_case(
-    parameters: ParameterSet, case: Case, replay: Replay, ours: Carry, dt: float | None = None
+    parameters: ParameterSet, case: Case, replay: Replay, ours: Simulate, dt: float | None = None
 ) -> tuple[dict[str, float], Identification]:
-    """Identify one robot and return its metrics; ours: carries a plan out as the model does."""
-    found = identify(case.motions, parameters, knowledge=[case.mass], replay=replay, dt=dt)
+    """Identify a robot, and return its metrics and the result.
+
+    ours: simulates a plan with the model; dt [s]: physics step of the model.
+    """
+    result = identify(case.motions, parameters, knowledge=[case.mass], replay=replay, dt=dt)
     (nominal_deg, nominal_mm), (deg, mm) = (
         prediction_errors(case, robots, ours)
-        for robots in (parameters.robots(np.zeros((1, len(parameters)))), found.robots())
+        for robots in (parameters.robots(np.zeros((1, len(parameters)))), result.robots())
     )
-    metrics = accuracy(parameters, case, found) | {
-        "chi2": found.chi2, "nominal_chi2": found.nominal_chi2, "identified": float(found.identified.sum()),
-        "wall_s": found.seconds, "cpu_s": found.cpu_seconds, "million_world_steps": found.world_steps / 1.0e6,
+    metrics = accuracy(parameters, case, result) | {
+        "chi2": result.chi2, "nominal_chi2": result.nominal_chi2, "identified": float(result.identified.sum()),
+        "wall_s": result.seconds, "cpu_s": result.cpu_seconds, "million_world_steps": result.world_steps / 1.0e6,
         "held_out_nominal_deg": nominal_deg, "held_out_deg": deg, "held_out_ratio": nominal_deg / deg,
         "held_out_nominal_mm": nominal_mm, "held_out_mm": mm, "held_out_height_ratio": nominal_mm / mm,
     }  # fmt: skip
-    return metrics, found
+    return metrics, result
 
 
-def policy_errors(name: str, jumps: int, case: Case, found: Identification, folder: Path) -> dict[str, float]:
-    """Return how well the described and the identified robot predict a policy's jumps on the true one."""
-    quantities = tuple(dict.fromkeys(parameter.quantity for parameter in found.parameters))
-    overlays = {"true": overlay_of(case.robots, quantities, source="truth"), "identified": found.overlay("identified")}
+def policy_errors(name: str, jumps: int, case: Case, result: Identification, folder: Path) -> dict[str, float]:
+    """Return the errors of the described and the identified robot in predicting a policy's jumps on the true one."""
+    quantities = tuple(dict.fromkeys(parameter.quantity for parameter in result.parameters))
+    overlays = {"true": overlay_of(case.robots, quantities, source="truth"), "identified": result.overlay("identified")}
     apex, success = {}, {}
     for robot in ("true", "identified", "described"):
         if robot in overlays:
@@ -138,7 +136,7 @@ def policy_errors(name: str, jumps: int, case: Case, found: Identification, fold
 
 
 def plot_cases(rows: list[dict[str, float]], path: Path) -> None:
-    """Draw χ², coverage, held-out errors and time of `run_case` over seeds."""
+    """Plot χ², coverage, held-out errors and time over seeds; rows: metrics of `run_case`."""
     panels = (
         ("χ² per value", {"": "chi2"}, {}),
         ("share within 95 % interval", {"": "coverage"}, {"ylim": (0.0, 1.0)}),

@@ -1,4 +1,4 @@
-"""Success of a policy for jumps to heights over the time of its training."""
+"""Learning curves: success of a policy at jumps to heights over its training time."""
 
 from __future__ import annotations
 
@@ -22,108 +22,105 @@ from jumper_warp.rl.shac import Shac
 from jumper_warp.tasks.cfg import TaskCfg
 from support.timing import process_age
 
-RATES = (0.5, 0.8, 0.9, 0.95, 1.0)
-"""[1] Success rates whose first times are reported."""
-TESTED = (0.5, 1.1)
-"""[m] Heights of the test's jumps, unless others are asked for."""
+RATES = (0.5, 0.8, 0.9, 0.95, 1.0)  # [1] Success rates for which the time to reach them is reported
+TEST_HEIGHTS = (0.5, 1.1)  # [m] Default range of the heights of the evaluated jumps
 
 
 @dataclass
-class Curve:
-    """Success of one variant over its training time."""
+class LearningCurve:
+    """Success of one training over its time; lists have one entry per evaluation."""
 
-    seconds: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)  # Training time so far
     success: list[float] = field(default_factory=list)
-    steps: list[int] = field(default_factory=list)
-    """Policy steps of all worlds together, so far."""
+    steps: list[int] = field(default_factory=list)  # Policy steps of all worlds together so far
     iterations: int = 0
-    ready: float = 0.0
-    """[s] From the start of the process until training began, where it was measured."""
+    ready: float = 0.0  # [s] Time from the start of the process to the start of the training; 0 if not measured
 
     def seconds_to(self, rate: float) -> float | None:
-        """Return the first training time [s] at which an evaluation had at least this success rate, if any."""
+        """Return the training time [s] of the first evaluation with at least this success rate, or None."""
         return next((t for t, success in zip(self.seconds, self.success, strict=True) if success >= rate), None)
 
 
-def make_judge(task: TaskCfg, jumps: int, device: str | None) -> Env:
-    """Return where policies of a task are tested: nominal, without noise, and links may come near one another."""
+def make_eval_env(task: TaskCfg, jumps: int, device: str | None) -> Env:
+    """Return a nominal environment of `jumps` worlds to evaluate policies of a task, without noise and link margins."""
     return Env(task.without_margins(), jumps, device=device, randomize=False, noise=False, auto_reset=False)
 
 
-def success(ppo: Ppo | Shac, judge: Env, heights: tuple[float, float] = TESTED) -> float:
-    """Return the share of jumps to heights [m] from the first to the second that succeed, one a world."""
-    return float(run_jumps(ppo.model.act, judge, np.linspace(*heights, judge.num_envs)).success.mean())
+def success_rate(trainer: Ppo | Shac, eval_env: Env, heights: tuple[float, float] = TEST_HEIGHTS) -> float:
+    """Return the success rate of jumps to evenly spaced heights between two limits [m], one per world of `eval_env`."""
+    return float(run_jumps(trainer.model.act, eval_env, np.linspace(*heights, eval_env.num_envs)).success.mean())
 
 
-def warm_up(env: VecEnv, ppo: Ppo | Shac) -> None:
-    """Compile the environment's kernels and the trainer's functions, and begin all episodes anew."""
+def warm_up(env: VecEnv, trainer: Ppo | Shac) -> None:
+    """Compile the environment's kernels and the trainer's functions, then reset all episodes."""
     env.reset()
     env.step(torch.zeros(env.num_envs, env.num_actions, device=env.device))
-    ppo.prepare()
+    trainer.compile()
     env.reset()
     env.metrics()
 
 
-def learning_curve(
-    env: VecEnv, ppo: Ppo | Shac, judge: Env, seconds: float, every: float, heights: tuple[float, float] = TESTED
-) -> Curve:
-    """Train for a time [s] as `jumper train --max-seconds` does, and return the curve; the test is off the clock.
+def train_and_evaluate(
+    env: VecEnv, trainer: Ppo | Shac, eval_env: Env, seconds: float, every: float,
+    heights: tuple[float, float] = TEST_HEIGHTS,
+) -> LearningCurve:  # fmt: skip
+    """Train for a time [s] as `jumper train --max-seconds` does, and return the learning curve.
 
-    What is compiled is compiled before, see `warm_up`.
+    Compilation (`warm_up`) and evaluations do not count as training time.
 
-    env: of the training, not yet reset; judge: one world a jump; every [s]: training time between two evaluations;
-    heights [m]: of the test's jumps.
+    env: environment of the training, not yet reset; eval_env: one world per evaluated jump; every [s]: training time
+    between two evaluations; heights [m]: range of the evaluated jumps.
     """
-    warm_up(env, ppo)
-    curve, trained, device = Curve(), 0.0, wp.device_from_torch(env.device)
+    warm_up(env, trainer)
+    curve, trained, device = LearningCurve(), 0.0, wp.device_from_torch(env.device)
     while trained < seconds:
         wp.synchronize_device(device)
         start = time.perf_counter()
         until = min(trained + every, seconds)
-        while (steps_per_mode := trained + time.perf_counter() - start) < until:
-            ppo.set_progress(steps_per_mode / seconds)
-            ppo.iterate()
+        while (spent := trained + time.perf_counter() - start) < until:
+            trainer.set_progress(spent / seconds)
+            trainer.iterate()
             curve.iterations += 1
             wp.synchronize_device(device)
         trained += time.perf_counter() - start
         curve.seconds.append(trained)
-        curve.steps.append(curve.iterations * ppo.batch_size)
-        curve.success.append(success(ppo, judge, heights))
+        curve.steps.append(curve.iterations * trainer.batch_size)
+        curve.success.append(success_rate(trainer, eval_env, heights))
     return curve
 
 
-def timed_training(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Curve:
-    """Train, and return the curve with the time from the start of this process until the training was ready.
+def train_and_time(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> LearningCurve:
+    """Train with PPO and return the learning curve, with the time from the start of this process to the training.
 
-    args: envs, device, randomize, jumps, seconds, every and heights, as `experiments/learning_curves.py` has them.
+    args: `Args` of `experiments/learning_curves.py`.
     """
     torch.manual_seed(seed)
     env = Env(task, args.envs, seed=seed, device=args.device, randomize=args.randomize, noise=args.randomize)
-    ppo = Ppo(env, cfg)
-    warm_up(env, ppo)
-    ready, judge = process_age(), make_judge(task, args.jumps, args.device)
-    success(ppo, judge)
-    curve = learning_curve(env, ppo, judge, args.seconds, args.every, args.heights)
+    trainer = Ppo(env, cfg)
+    warm_up(env, trainer)
+    ready, eval_env = process_age(), make_eval_env(task, args.jumps, args.device)
+    success_rate(trainer, eval_env)
+    curve = train_and_evaluate(env, trainer, eval_env, args.seconds, args.every, args.heights)
     curve.ready = ready
     return curve
 
 
-def curve_metrics(curve: Curve, name: str) -> dict[str, Any]:
-    """Return the metrics of one training, and print when it reached each of RATES."""
-    pace = curve.steps[-1] / curve.seconds[-1]
-    values = {f"success_{name}": curve.success[-1], f"steps_per_s_{name}": pace}
+def curve_metrics(curve: LearningCurve, name: str) -> dict[str, Any]:
+    """Return the metrics of one training, with suffix `name`, and print the times to reach each of RATES."""
+    steps_per_s = curve.steps[-1] / curve.seconds[-1]
+    values = {f"success_{name}": curve.success[-1], f"steps_per_s_{name}": steps_per_s}
     values |= {f"curve_{series}_{name}": getattr(curve, series) for series in ("seconds", "steps", "success")}
     for rate in RATES:
         seconds, key = curve.seconds_to(rate), f"{100 * rate:g}_percent_{name}"
         steps = None if seconds is None else curve.steps[curve.seconds.index(seconds)]
         values |= {f"seconds_to_{key}": seconds, f"steps_to_{key}": steps}
         print(f"{name}, {100 * rate:g} %: " + ("never" if steps is None else f"{seconds:.0f} s, {steps / 1e6:.2f} M"))
-    print(f"{name}: {100 * curve.success[-1]:.1f} % at the end, {pace:,.0f} steps a second", flush=True)
+    print(f"{name}: {100 * curve.success[-1]:.1f} % at the end, {steps_per_s:,.0f} steps a second", flush=True)
     return values
 
 
-def draw_curves(curves: Mapping[str, Sequence[Curve]], path: Path) -> None:
-    """Draw success over time and steps, a color for each name."""
+def plot_curves(curves: Mapping[str, Sequence[LearningCurve]], path: Path) -> None:
+    """Plot success over training time and over steps, a color for each name."""
     with figure(path, 1, 2, figsize=(11, 4.5), sharey=True) as axes:
         for i, (name, runs) in enumerate(curves.items()):
             for number, curve in enumerate(runs):

@@ -1,25 +1,25 @@
-"""Momentum of the robot, from its links."""
+"""Momentum and rotational inertia of the robot, computed from its links."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from jumper_warp.evaluation.log import Metrics
-from jumper_warp.utils.rotations import INVERSE, rotate
+from jumper_warp.utils.rotations import CONJUGATE, rotate
 
 
 def momentum(sim: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the links' linear [kg m/s] and angular momentum [kg m^2/s] about the robot's com, (num_worlds, 3) each.
+    """Return the linear [kg m/s] and angular momentum [kg m^2/s] about the robot's com, (num_worlds, 3) each.
 
-    World axes. What the rotors spin at besides their links is left out: no link turns in answer to it.
+    World axes. The spin of the rotors relative to their links is not included, as it turns no link.
     """
     mass, inertia, quat, arm, twist = _links(sim)
     linear = mass * twist[..., :3]
-    own = np.einsum("nbij,nbj->nbi", inertia, rotate(quat * INVERSE, twist[..., 3:]))
-    return linear.sum(axis=1), (np.cross(arm, linear) + rotate(quat, own)).sum(axis=1)
+    spin = np.einsum("nbij,nbj->nbi", inertia, rotate(quat * CONJUGATE, twist[..., 3:]))
+    return linear.sum(axis=1), (np.cross(arm, linear) + rotate(quat, spin)).sum(axis=1)
 
 
 def rotational_inertia(sim: Any) -> np.ndarray:
@@ -27,14 +27,24 @@ def rotational_inertia(sim: Any) -> np.ndarray:
     mass, inertia, quat, arm, _ = _links(sim)
     columns = []
     for axis in np.eye(3):
-        own = np.einsum("nbij,nbj->nbi", inertia, rotate(quat * INVERSE, np.broadcast_to(axis, arm.shape)))
-        spin = np.cross(arm, mass * np.cross(axis, arm)) + rotate(quat, own)
-        columns.append(spin.sum(axis=1))
+        spin = np.einsum("nbij,nbj->nbi", inertia, rotate(quat * CONJUGATE, np.broadcast_to(axis, arm.shape)))
+        angular = np.cross(arm, mass * np.cross(axis, arm)) + rotate(quat, spin)
+        columns.append(angular.sum(axis=1))
     return np.stack(columns, axis=-1)
 
 
-def _links(sim: Any) -> tuple[np.ndarray, ...]:
-    """Return of all links mass [kg], inertia [kg m^2], orientation (xyzw), arm [m] from the robot's com, and twist."""
+class LinkStates(NamedTuple):
+    """State of all links, (num_worlds, links, ...) each."""
+
+    mass: np.ndarray  # (..., 1) [kg]
+    inertia: np.ndarray  # (..., 3, 3) [kg m^2] about the link's com, link axes
+    quat: np.ndarray  # (..., 4) orientation, xyzw
+    arm: np.ndarray  # (..., 3) [m] from the robot's com to the link's, world axes
+    twist: np.ndarray  # (..., 6) velocity of the com [m/s] and angular velocity [rad/s], world axes
+
+
+def _links(sim: Any) -> LinkStates:
+    """Return the present state of all links; waits for the device."""
     model, n = sim.model, sim.num_worlds
     sim.physics.write_bodies()
     frame = sim.state.body_q.numpy().reshape(n, -1, 7).astype(float)
@@ -43,25 +53,28 @@ def _links(sim: Any) -> tuple[np.ndarray, ...]:
     inertia = model.body_inertia.numpy().reshape(n, -1, 3, 3).astype(float)
     com = frame[..., :3] + rotate(frame[..., 3:], model.body_com.numpy().reshape(n, -1, 3).astype(float))
     arm = com - (mass * com).sum(axis=1, keepdims=True) / mass.sum(axis=1, keepdims=True)
-    return mass, inertia, frame[..., 3:], arm, twist
+    return LinkStates(mass, inertia, frame[..., 3:], arm, twist)
 
 
 @dataclass
-class MomentumWatch:
-    """Follows the momentum of all robots; call it after every policy step."""
+class MomentumRecorder:
+    """Records the angular momentum of all robots; call it after every policy step."""
 
     env: Any
     angular: list[np.ndarray] = field(default_factory=list)
     """[kg m^2/s] (num_envs, 3) after every policy step, world axes."""
 
     def __call__(self, *_: Any) -> None:
-        """Add the moment."""
+        """Record the present angular momentum."""
         self.angular.append(momentum(self.env.sim)[1])
 
-    def metrics(self, apart: np.ndarray, inertia: np.ndarray) -> Metrics:
-        """Return drifts of robots that did not come apart; inertia [kg m^2]: (num_envs, 3, 3) about the com."""
-        drift = np.array(self.angular)[:, ~apart]
-        turned = np.linalg.solve(inertia[~apart], drift.sum(axis=0)[..., None])[..., 0] * self.env.step_dt
+    def metrics(self, diverged: np.ndarray, inertia: np.ndarray) -> Metrics:
+        """Return the momentum drift, and the turn that it causes, of the robots that have not diverged.
+
+        diverged: (num_envs,) bool; inertia [kg m^2]: (num_envs, 3, 3), of `rotational_inertia`.
+        """
+        drift = np.array(self.angular)[:, ~diverged]
+        turned = np.linalg.solve(inertia[~diverged], drift.sum(axis=0)[..., None])[..., 0] * self.env.step_dt
         size, by = np.linalg.norm(drift, axis=-1), np.degrees(np.linalg.norm(turned, axis=-1))
         return {
             "max_angular_momentum_nm_s": float(size.max()),

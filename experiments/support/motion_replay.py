@@ -1,4 +1,4 @@
-"""A motion replayed from its targets in the simulation that trains policies, followed at every physics step."""
+"""Replay of a motion's targets in the simulation that trains policies, measured at every physics step."""
 
 from __future__ import annotations
 
@@ -21,21 +21,22 @@ from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.simulation import Simulation, motor_values
-from jumper_warp.trajectory.problem import Motion, Problem
+from jumper_warp.trajectory.problem import Problem, SimulatedMotion
 
-CONTACT_FORCE = 0.1
-"""[N] Above it a paw is in contact."""
-SPEED = 0.25
-"""[m/s] Of the base upward, with which a jump takes off."""
-PAW_RADIUS = 0.025
-"""[m]"""
+CONTACT_FORCE = 0.1  # [N] Force above which a paw is in contact
+TAKEOFF_SPEED = 0.25  # [m/s] Smallest upward speed of the base at takeoff
+PAW_RADIUS = 0.025  # [m] Radius of a paw
 
 
-class Replay:
-    """A motion in one world of the simulation that trains policies, in single precision, at every physics step."""
+class MotionReplay:
+    """One world of the simulation that trains policies, in single precision, driven by the targets of a motion.
+
+    The measured arrays have one row per physics step: time [s], height [m], up (speed) [m/s], force (n, 4) [N],
+    gap (n, 4) [m] of the paws above the ground, tilt [rad], power [W], angle (n, 12) [rad], torque (n, 12) [N m].
+    """
 
     def __init__(self, targets: np.ndarray, problem: Problem, *, notes: dict[str, Any] | None = None) -> None:
-        """Simulate targets [rad] (steps, 12) from standing, with the robot of a problem."""
+        """Simulate targets [rad], (steps, 12), from standing, with the robot of a problem; notes: of the recording."""
         from jumper_warp.viz.recorder import Recorder
 
         self.problem = problem
@@ -56,9 +57,10 @@ class Replay:
         columns = (np.array(column) for column in zip(*rows, strict=True))
         (self.time, self.height, self.up, self.force, self.gap, self.tilt, self.power, self.angle,
          self.torque) = columns  # fmt: skip
-        self._follow()
+        self._evaluate()
 
     def _physics_step(self, number: int) -> tuple:
+        """Advance by a physics step, and return its row of the measured arrays; number: steps before it."""
         sim = self.sim
         before = motor_values(sim.joint_qd()[0, 6:])
         sim.physics_step()
@@ -76,6 +78,7 @@ class Replay:
         )  # fmt: skip
 
     def _record(self, row: tuple) -> None:
+        """Record a policy step: state, link poses, collision flags and a frame; row: of its last physics step."""
         sim = self.sim
         pose = sim.state.body_q.numpy().copy()
         self.poses.append(pose)
@@ -92,24 +95,24 @@ class Replay:
             series |= {f"torque/{name} [N m]": row[8][i], f"angle/{name} [deg]": math.degrees(row[7][i])}
         self.recorder.record(row[0], sim.state.body_q, series, ankles(pose[None])[0], sim.paw_force.numpy()[:, 0])
 
-    def _follow(self) -> None:
-        """Find takeoff, apex and what happens after touchdown."""
+    def _evaluate(self) -> None:
+        """Compute takeoff, work, apex, landing acceleration, and paws lifted after touchdown."""
         down = self.force > CONTACT_FORCE
         ticks = slice(self.sim.substeps - 1, None, self.sim.substeps)
-        free = ~down[ticks].any(axis=1) & (self.up[ticks] > SPEED)
+        free = ~down[ticks].any(axis=1) & (self.up[ticks] > TAKEOFF_SPEED)
         self.takeoff = int(free.argmax()) + 1 if free.any() else len(free)
-        """Policy step at whose end the robot is off the ground; the last where it never is."""
+        """Policy step at whose end the robot is off the ground; the last if it never is."""
         first = self.takeoff * self.sim.substeps
         self.work = float(self.sim.dt * self.power[:first].sum())
-        """[J] Positive, of the motors until takeoff."""
+        """[J] Positive work of the motors until takeoff."""
         landing = np.flatnonzero(down[first:].any(axis=1))
         self.apex = float(self.height[first - 1 : first + landing[0] if len(landing) else None].max())
-        """[m] Highest base before a paw comes down."""
+        """[m] Largest base height before a paw touches down."""
         ups = np.diff(self.up[ticks][max(self.takeoff - 1, 0) :], prepend=self.up[ticks][max(self.takeoff - 1, 0)])
         self.hardest = float(ups.max() / (self.sim.substeps * self.sim.dt * EARTH))
         """[g] Largest upward acceleration of the base over a policy step after takeoff."""
         self.longest_lift, self.highest_lift, self.touched = 0.0, 0.0, 0
-        """[s] and [m] Of a paw that had come down after the flight; how many have."""
+        """[s] and [m] Longest time and largest height of a paw lifted after touchdown; number of paws that touched."""
         for leg in range(4):
             later = np.flatnonzero(down[first:, leg])
             if len(later):
@@ -121,21 +124,21 @@ class Replay:
 
     @cached_property
     def motion(self) -> Motion:
-        """Return the replay as what objectives and constraints are functions of."""
+        """Return the replay as a `Motion`, the argument of objectives and constraints."""
         q, qd = (np.stack(column) for column in zip(*self.states, strict=True))
         parts = q, qd, self.torque[..., None], np.stack(self.impulses), self.targets[..., None]
         device = str(self.problem.rollout(1).device)
-        return self.problem.recorded(TorchTrajectory(*(torch.as_tensor(x, dtype=torch.float64, device=device)
+        return self.problem.motion_of(TorchTrajectory(*(torch.as_tensor(x, dtype=torch.float64, device=device)
                                                        for x in parts)))  # fmt: skip
 
     @property
     def violation(self) -> float:
-        """Return the largest constraint of the problem, at least 0."""
+        """Return the largest constraint violation of the problem, at least 0."""
         constraints = self.problem.values(self.motion).constraints
         return max(0.0, float(constraints.max())) if constraints.shape[1] else 0.0
 
     def metrics(self) -> dict[str, Any]:
-        """Return what is told of every jump."""
+        """Return the metrics of the jump."""
         return {
             "apex_m": self.apex, "takeoff_s": float(self.takeoff / 60.0), "landing_g": self.hardest,
             "work_j": self.work,
@@ -143,23 +146,23 @@ class Replay:
             "deepest_paw_mm": float(-1000.0 * self.gap.min()), "peak_torque_nm": float(np.abs(self.torque).max()),
         }  # fmt: skip
 
-    def save_strip(self, path: Path, count: int = 8) -> None:
-        """Draw the robot at evenly spaced moments from the push-off on."""
+    def save_filmstrip(self, path: Path, count: int = 8) -> None:
+        """Write `count` pictures of the robot, evenly spaced in time from the push-off on, side by side."""
         from jumper_warp.viz.snapshot import Camera, contact_sheet
 
         first = max(self.takeoff - 20, 0)
-        moments = np.linspace(first, len(self.poses) - 1, count).round().astype(int)
+        frames = np.linspace(first, len(self.poses) - 1, count).round().astype(int)
         model = build_model(1)
         state, pictures = model.state(), []
-        for moment in moments:
-            x = float(self.poses[moment][0, 0])
-            state.body_q.assign(self.poses[moment])
+        for frame in frames:
+            x = float(self.poses[frame][0, 0])
+            state.body_q.assign(self.poses[frame])
             pictures.append(Camera(model, (x + 1.2, 2.0, 0.7), (x, 0.0, 0.5), (300, 400)).picture(state))
-        contact_sheet(pictures, path, [f"{moment / 60:.2f} s" for moment in moments])
+        contact_sheet(pictures, path, [f"{frame / 60:.2f} s" for frame in frames])
 
 
-def plot(replays: dict[str, Replay], path: Path) -> None:
-    """Draw height, angles of two legs, torques and paw forces over time, a column for each label."""
+def plot_replays(replays: dict[str, MotionReplay], path: Path) -> None:
+    """Plot height, angles and torques of two legs, and paw forces over time, a column for each label."""
     with figure(path, 4, len(replays), figsize=(4.2 * len(replays), 10), sharex="col", squeeze=False) as axes:
         for column, (label, replay) in zip(axes.T, replays.items(), strict=True):
             column[0].plot(replay.time, replay.height)

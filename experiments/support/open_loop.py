@@ -1,4 +1,4 @@
-"""The open-loop jump: squat, hold, full extension, followed at every physics step."""
+"""The open-loop jump (squat, hold, full extension), measured at every physics step."""
 
 from __future__ import annotations
 
@@ -18,15 +18,13 @@ from jumper_warp.sim.simulation import Simulation, motor_values
 if TYPE_CHECKING:
     from jumper_warp.viz.recorder import Recorder
 
-STAND, LAND = 60, 60
-"""Ticks of 1/60 s in the default pose, before and after the jump."""
+STAND, LAND = 60, 60  # Numbers of policy steps in the default pose before and after the jump
 
-SQUAT = 135.0
-"""[deg] Transversal angle commanded for the squat; the filter holds it back."""
+SQUAT = 135.0  # [deg] Commanded transversal angle of the squat, which the command filter does not let the legs reach
 
 
 def transversal_command(tick: int, squat: float = SQUAT) -> float:
-    """Return the commanded transversal angle [rad] at a tick; squat [deg]: that of the squat."""
+    """Return the commanded transversal angle [rad] at a policy step; squat [deg]: commanded angle of the squat."""
     ramp = np.clip((tick - STAND) / RAMP, 0.0, 1.0)
     degrees = 45.0 + (squat - 45.0) * ramp
     if tick >= STAND + RAMP + HOLD:
@@ -38,24 +36,24 @@ def transversal_command(tick: int, squat: float = SQUAT) -> float:
 
 @dataclass
 class Trace:
-    """What was measured at every physics step."""
+    """Measurements of the jump, one row per physics step."""
 
     time: np.ndarray  # (n,) [s]
-    height: np.ndarray  # (n,) [m]
+    height: np.ndarray  # (n,) [m] of the base
     speed: np.ndarray  # (n,) [m/s], vertical, of the base origin
-    angle: np.ndarray  # (n, 12) [rad]
+    angle: np.ndarray  # (n, 12) [rad] of the motors
     rate: np.ndarray  # (n, 12) [rad/s]
     torque: np.ndarray  # (n, 12) [N m]
-    force: np.ndarray  # (n, 4, 3) [N]
-    gap: np.ndarray  # (n,) [m]
+    force: np.ndarray  # (n, 4, 3) [N] on the paws
+    gap: np.ndarray  # (n,) [m] largest gap of the legs' loops
 
 
-def follow_jump(
+def simulate_jump(
     sim: Simulation, notes: Mapping[str, Any], squat: float = SQUAT
 ) -> tuple[Trace, Recorder, list[np.ndarray]]:
-    """Simulate the jump in one world; also return a recording at 60 Hz with notes, and the body poses of every tick.
+    """Simulate the jump in one world; return measurements, a recording at 60 Hz, and body poses of every policy step.
 
-    squat [deg]: transversal angle commanded for the squat.
+    notes: metadata of the recording; squat [deg]: commanded transversal angle of the squat.
     """
     from jumper_warp.viz.recorder import Recorder
 
@@ -80,7 +78,7 @@ def follow_jump(
 
 
 def record(recorder: Recorder, poses: np.ndarray, row: tuple) -> None:
-    """Add a frame to the recording; poses: (21, 7) of the links."""
+    """Add a frame to the recording; poses: of the links, (21, 7); row: fields of `Trace` at the frame."""
     now, height, speed, angle, rate, torque, force, _ = row
     series = {"base/height [m]": height, "base/vertical speed [m s⁻¹]": speed}
     for i, name in enumerate(MOTOR_JOINTS):
@@ -92,8 +90,8 @@ def record(recorder: Recorder, poses: np.ndarray, row: tuple) -> None:
     recorder.record(now, poses, series, contact_points=ankles(poses[None])[0], contact_forces=force)
 
 
-def jump_metrics(trace: Trace) -> dict[str, float]:
-    """Return the metrics of the jump, in SI units but for the gap of the loops [mm]."""
+def trace_metrics(trace: Trace) -> dict[str, float]:
+    """Return the metrics of the jump."""
     contact = np.linalg.norm(trace.force, axis=2).max(axis=1) > 0.1
     extend = trace.time > (STAND + RAMP + HOLD) / 60.0
     apex = int(np.argmax(np.where(extend, trace.height, 0.0)))
@@ -118,8 +116,8 @@ def jump_metrics(trace: Trace) -> dict[str, float]:
     return {name: float(value) for name, value in values.items()}
 
 
-def draw_trace(path: Path, trace: Trace, title: str, hardware: float) -> None:
-    """Draw height, vertical speed, angles, torques and paw forces over time; hardware [m]: apex of the robot."""
+def plot_trace(path: Path, trace: Trace, title: str, hardware: float) -> None:
+    """Plot height, vertical speed, angles, torques and paw forces over time; hardware [m]: apex of the real robot."""
     with figure(path, 5, 1, figsize=(9, 12), sharex=True) as axes:
         axes[0].plot(trace.time, trace.height)
         axes[0].axhline(hardware, color="0.6", linestyle="--", label="hardware, 18 N m")

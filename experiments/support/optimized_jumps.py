@@ -1,4 +1,4 @@
-"""Jumps that `jumper_warp.trajectory.problem` optimises, and their replay in the simulation that trains policies."""
+"""Optimisation problems of jumps (`jumper_warp.trajectory.problem`), their search, and their replay."""
 
 from __future__ import annotations
 
@@ -24,37 +24,29 @@ from jumper_warp.trajectory import jumps
 from jumper_warp.trajectory.augmented_lagrangian import Progress, minimise
 from jumper_warp.trajectory.problem import Knots, Problem, Term
 from jumper_warp.trajectory.smoothing import Stage, smoothed
-from support.motion_replay import SPEED, Replay
+from support.motion_replay import TAKEOFF_SPEED, MotionReplay
 
 PITCH, AWAY, AHEAD = math.radians(29.8), 0.2985, 0.045
 """[rad], [m], [m] Largest pitch at landing, distance of the base from its start in stance, and distance of hind paws on
 the ground ahead of their start; slightly inside 30 degrees, 0.3 m (the task's limit) and 0.05 m."""
-FREE = 100.0
-"""[rad], [m] Limit that never binds."""
-TILT = math.radians(8.0)
-"""[rad] Most of vertical jumps, at any time."""
-DRIFT = 0.15
-"""[m] Most of the base from its start in vertical jumps, at any time."""
-HEIGHT = 0.80
-"""[m] Of the jump with the least work."""
-STILL_HEIGHT = 0.65
-"""[m] Of the jump that lands still."""
-SOFT = 4.5
-"""[g] Most acceleration of the base over a policy step of its landing; the tasks end an episode at 5."""
-ESTIMATE = 61
-"""Policy steps of a motion up to the apex."""
+FREE = 100.0  # [rad], [m] Value of a limit that never binds
+TILT = math.radians(8.0)  # [rad] Largest tilt of vertical jumps at any time
+DRIFT = 0.15  # [m] Largest distance of the base from its start in vertical jumps at any time
+HEIGHT = 0.80  # [m] Apex height of the jump with the least work
+STILL_HEIGHT = 0.65  # [m] Apex height of the jump that lands still
+SOFT = 4.5  # [g] Largest acceleration of the base over a policy step of the landing; the tasks end an episode at 5
+APEX_STEPS = 61  # Number of policy steps of a motion up to the apex
 BACK, LEAN = 0.28, 1.0
-"""[m], [1] How far back the base is drawn in the first parts of the search for the farthest flight, and its weight."""
+"""[m], [1] Backward distance of the base that early stages of the search for the farthest flight reward; weight."""
 POSTURES = np.array([[-0.2, -0.7, 0.7, -0.3], [0.6, 0.0, 0.3, 0.8], [0.9, 0.5, 0.9, 0.5]])
-"""[1] Actions of a run-up in place: base behind the paws, hind legs drawn in under it, crouch."""
-SCATTER = 0.35
-"""[1] Standard deviation of these postures."""
+"""[1] Actions of a run-up in place: base behind the paws, hind legs folded under it, crouch."""
+SCATTER = 0.35  # [1] Standard deviation of these postures
 
 
 def squats(knots: Knots, count: int, rng: np.random.Generator, push: int = 32) -> np.ndarray:
-    """Return random candidates: two postures, then stretched legs, front and hind at their times, around step `push`.
+    """Return random candidates, (count, len(knots)): two postures, then extension of front and hind legs.
 
-    Shape (count, len(knots)), equal left and right.
+    The extension begins around step `push`, separately for front and hind legs; left and right are equal.
     """
     shape, now = (count, 1, 4), np.array(knots.at)[None, :, None]
     first, second = rng.uniform(-1.0, 1.0, shape), rng.uniform(-0.2, 1.0, shape)
@@ -64,10 +56,9 @@ def squats(knots: Knots, count: int, rng: np.random.Generator, push: int = 32) -
 
 
 def run_ups(knots: Knots, count: int, rng: np.random.Generator, push: int = 40) -> np.ndarray:
-    """Return random candidates that lean back, fall forward into a crouch, and stretch the hind legs, then the front.
+    """Return random candidates, (count, len(knots)): lean back, fall forward, crouch, extend hind legs, then front.
 
-    Postures scatter around POSTURES, times are random; the hind legs push around step `push`. Shape (count,
-    len(knots)), equal left and right.
+    Postures scatter around POSTURES, times are random; the hind legs push around step `push`; left and right are equal.
     """
     now, each = np.array(knots.at)[None, :, None], (count, 1, 1)
     lean, fall, crouch = np.clip(POSTURES[:, None, None] + SCATTER * rng.normal(size=(3, count, 1, 4)), -1.0, 1.0)
@@ -81,7 +72,7 @@ def run_ups(knots: Knots, count: int, rng: np.random.Generator, push: int = 40) 
 
 
 def around(x: np.ndarray, knots: Knots, rng: np.random.Generator) -> np.ndarray:
-    """Return a jump that may be shorter and variants of it, as candidates for other knots; its end is filled with 0."""
+    """Return 64 noisy variants of a solution x of as many or fewer knots, as candidates, padded with 0."""
     whole = np.zeros((len(knots.at), 4))
     whole[: len(x) // 4] = x.reshape(-1, 4)
     spread = np.linspace(0.0, 0.2, 64)[:, None]
@@ -90,44 +81,35 @@ def around(x: np.ndarray, knots: Knots, rng: np.random.Generator) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Jump:
-    """What is optimised."""
+    """A jump to optimise: its problem, the stages of the search, and the reported value."""
 
     label: str
-    unit: str
-    """Of `value`."""
-    make: Callable[..., Problem]
-    """Returns the problem, given a part's settings, device and threads."""
-    stages: tuple[tuple[Mapping[str, Any], Stage], ...]
-    """Parts of the search: settings of `make`, and the part."""
-    value: Callable[[Replay], float]
-    """Returns the reported value of a replay."""
-    draw: Callable[[Knots, int, np.random.Generator], np.ndarray] = squats
-    """Returns so many random candidates."""
-    samples: int = 2048
-    """Random candidates, among which the search begins."""
-    polish: int = 40
-    """Iterations of the last descent."""
-    after: str = ""
-    """Name of the jump whose best motion is a start too."""
+    unit: str  # Unit of `value`
+    make: Callable[..., Problem]  # Returns the problem for the settings of a stage, device and threads
+    stages: tuple[tuple[Mapping[str, Any], Stage], ...]  # Stages of the search, each with its settings of `make`
+    value: Callable[[MotionReplay], float]  # Returns the reported value of a replay
+    draw: Callable[[Knots, int, np.random.Generator], np.ndarray] = squats  # Returns a number of random candidates
+    samples: int = 2048  # Default number of random candidates
+    polish: int = 40  # Default number of iterations of the last descent
+    after: str = ""  # Name of the jump whose solution is also a candidate; empty: none
 
-    def replay(self, targets: np.ndarray, device: str | None = None) -> Replay:
-        """Return the replay of targets [rad] (steps, 12)."""
-        return Replay(targets, self.make(**FINE, device=device, threads=1), notes={"jump": self.label})
+    def replay(self, targets: np.ndarray, device: str | None = None) -> MotionReplay:
+        """Return the replay of targets [rad], (steps, 12)."""
+        return MotionReplay(targets, self.make(**FINE, device=device, threads=1), notes={"jump": self.label})
 
     def scaled(self, effort: float) -> Jump:
-        """Return the same with other numbers of iterations."""
+        """Return the jump with all numbers of iterations scaled."""
         stages = tuple(
             (how, replace(part, iterations=max(1, round(effort * part.iterations)))) for how, part in self.stages
         )
         return replace(self, stages=stages)
 
 
-FORWARD_KNOTS = Knots((0.0, 8.0, 16.0, *map(float, range(24, 48))), steps=53)
-"""Of the farthest flight."""
+FORWARD_KNOTS = Knots((0.0, 8.0, 16.0, *map(float, range(24, 48))), steps=53)  # Knots of the farthest flight
 
 
 def motors_of(torque: float, speed: float = 1.0) -> MotorCfg:
-    """Return motors with a torque limit [N m] of the transversal ones, and their speeds times `speed`."""
+    """Return motors with a torque limit [N m] and scaled speed limits of the transversal motors."""
     motors = jumping_motors(torque, lateral_torque=12.0)
     kind = motors.transversal
     faster = replace(kind, cutoff_speed=speed * kind.cutoff_speed, no_load_speed=speed * kind.no_load_speed)
@@ -138,56 +120,55 @@ def _far(
     lean: float = 0.0, *, torque: float = 18.0, speed: float = 1.0, pitch: float = PITCH, away: float = AWAY,
     command_filter: Callable[[], FilterCfg] = horizontal_jump_filter, **settings: Any,
 ) -> Problem:  # fmt: skip
-    """Return the farthest flight; lean: [1] weight of how far back the base goes before it, up to BACK."""
+    """Return the problem of the farthest flight; lean [1]: weight of leaning back before it, up to BACK."""
     constraints = (
-        jumps.landing_pitch(pitch), jumps.stays(away, SPEED), jumps.clear(speed=SPEED), jumps.no_run_up(AHEAD),
-        jumps.takes_off(SPEED),
+        jumps.landing_pitch(pitch), jumps.stays(away, TAKEOFF_SPEED), jumps.clear(speed=TAKEOFF_SPEED),
+        jumps.no_run_up(AHEAD), jumps.takes_off(TAKEOFF_SPEED),
     )  # fmt: skip
-    far, back = jumps.farthest(SPEED), jumps.leans_back(BACK, SPEED)
+    far, back = jumps.farthest(TAKEOFF_SPEED), jumps.leans_back(BACK, TAKEOFF_SPEED)
     objective = (lambda motion: far(motion) + lean * back(motion)) if lean else far
     return Problem(FORWARD_KNOTS, objective, constraints, motors_of(torque, speed), command_filter(), **settings)
 
 
-UP = Knots((0.0, 6.0, 12.0, 18.0, 22.0, *map(float, range(24, 44, 1))), steps=ESTIMATE)
-"""Of vertical jumps: squat within half a second, push-off, legs stretched or drawn in."""
+UP = Knots((0.0, 6.0, 12.0, 18.0, 22.0, *map(float, range(24, 44, 1))), steps=APEX_STEPS)
+"""Knots of vertical jumps: squat within half a second, push-off, legs extended or folded."""
 LANDING = Knots((*UP.at, 48.0, 52.0, *map(float, range(54, 74, 2)), 80.0, 90.0, 100.0), steps=126)
-"""The same, on to a second after touchdown."""
+"""Knots of vertical jumps, continued to a second after touchdown."""
 
 
 def _vertical(
     objective: Term, *more: Term, torque: float = 18.0, knots: Knots = UP, **settings: Any
 ) -> Problem:  # fmt: skip
+    """Return the problem of a vertical jump with some objective; more: constraints beyond the common ones."""
     constraints = (jumps.clear(), jumps.upright(TILT, at_end=False), jumps.drifts(DRIFT), *more)
     return Problem(knots, objective, constraints, jumping_motors(torque), vertical_jump_filter(), **settings)
 
 
 FINE: dict[str, Any] = {"substeps": SUBSTEPS}
-COARSE = FINE | {"substeps": 4}
-"""Fewer physics steps in a policy step, for the first parts of a search."""
-QUICK = FINE | {"double": False, "tolerance": None}
-"""Single precision, and its tolerance of the contact iteration."""
+COARSE = FINE | {"substeps": 4}  # Fewer physics steps per policy step, for the first stages of a search
+QUICK = FINE | {"double": False, "tolerance": None}  # Single precision, and its tolerance of the contact iteration
 UPWARD = (
-    (COARSE, Stage(32, 40, rate=0.05, noise=0.05, least=1.0)),
+    (COARSE, Stage(32, 40, rate=0.05, noise=0.05, final_fraction=1.0)),
     (COARSE, Stage(12, 100, rate=0.04, noise=0.04)),
     (FINE, Stage(4, 100, rate=0.02, noise=0.02, penalty=100.0)),
 )
 CALM: dict[str, Any] = {"slack": 0.03, "look": 5, "calmer": 0.7}
-"""Starts that go back often, and on with smaller steps."""
+"""Settings of stages that often return to the best motion and continue with smaller steps."""
 CALMEST: dict[str, Any] = CALM | {"slack": 0.02}
 FORWARD = (
-    (QUICK | {"lean": LEAN}, Stage(40, 40, rate=0.05, noise=0.05, least=1.0, slack=0.1)),
-    (QUICK | {"lean": LEAN}, Stage(16, 40, rate=0.05, noise=0.05, least=1.0, slack=0.1)),
-    (QUICK, Stage(10, 60, rate=0.04, noise=0.03, least=0.5, slack=0.1)),
-    (QUICK, Stage(10, 80, rate=0.02, noise=0.015, least=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
-    (QUICK, Stage(8, 80, rate=0.02, noise=0.015, least=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
-    (QUICK, Stage(6, 80, rate=0.02, noise=0.01, least=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
-    (QUICK, Stage(4, 100, rate=0.015, noise=0.006, least=0.1, penalty=40.0, dual=2.0, crossings=40, **CALM)),
-    (QUICK, Stage(3, 150, rate=0.01, noise=0.003, least=0.1, penalty=100.0, dual=4.0, **CALMEST)),
+    (QUICK | {"lean": LEAN}, Stage(40, 40, rate=0.05, noise=0.05, final_fraction=1.0, slack=0.1)),
+    (QUICK | {"lean": LEAN}, Stage(16, 40, rate=0.05, noise=0.05, final_fraction=1.0, slack=0.1)),
+    (QUICK, Stage(10, 60, rate=0.04, noise=0.03, final_fraction=0.5, slack=0.1)),
+    (QUICK, Stage(10, 80, rate=0.02, noise=0.015, final_fraction=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
+    (QUICK, Stage(8, 80, rate=0.02, noise=0.015, final_fraction=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
+    (QUICK, Stage(6, 80, rate=0.02, noise=0.01, final_fraction=0.2, penalty=40.0, dual=2.0, crossings=40, **CALM)),
+    (QUICK, Stage(4, 100, rate=0.015, noise=0.006, final_fraction=0.1, penalty=40.0, dual=2.0, crossings=40, **CALM)),
+    (QUICK, Stage(3, 150, rate=0.01, noise=0.003, final_fraction=0.1, penalty=100.0, dual=4.0, **CALMEST)),
 )
 JUMPS = {
     "farthest": Jump(
-        "farthest flight, 18 N m", "m", _far, FORWARD, lambda replay: -float(jumps.farthest(SPEED)(replay.motion)),
-        draw=run_ups, samples=768, polish=5,
+        "farthest flight, 18 N m", "m", _far, FORWARD,
+        lambda replay: -float(jumps.farthest(TAKEOFF_SPEED)(replay.motion)), draw=run_ups, samples=768, polish=5,
     ),
     "highest": Jump(
         "highest jump, 18 N m", "m", lambda **s: _vertical(jumps.highest(), jumps.takes_off(), **s), UPWARD,
@@ -207,7 +188,7 @@ JUMPS = {
         f"still landing from {STILL_HEIGHT:g} m", "s",
         lambda **s: _vertical(jumps.still(), jumps.reaches(STILL_HEIGHT), jumps.soft(SOFT), knots=LANDING, **s),
         (
-            (FINE, Stage(16, 60, rate=0.05, noise=0.05, least=1.0)),
+            (FINE, Stage(16, 60, rate=0.05, noise=0.05, final_fraction=1.0)),
             (FINE, Stage(6, 100, rate=0.03, noise=0.03)),
         ),
         lambda replay: replay.longest_lift, draw=partial(squats, push=30), samples=1024, after="least_work",
@@ -222,7 +203,7 @@ LIMITS: dict[str, tuple[str, dict[str, Any]]] = {
     "stance": ("stance beyond 0.3 m", {"away": FREE}),
     "filter": ("loose command filter", {"command_filter": loose_filter}),
 }
-"""What may limit the farthest flight: label, and the changed settings of its problem."""
+"""Limits of the farthest flight: label, and the changed settings of its problem."""
 LIMITED = {
     f"farthest_{name}": replace(
         JUMPS["farthest"], label=f"farthest flight, {label}", make=partial(_far, **changed), after="farthest"
@@ -234,17 +215,20 @@ LIMITED = {
 def optimise(
     jump: Jump, begin: np.ndarray, seed: int, polish: int, **settings: Any
 ) -> tuple[Progress, dict[str, float]]:
-    """Return what was found from candidates, and the simulated and reverse policy steps; settings: device, threads."""
+    """Search from candidates; return the last descent and the numbers of simulated and reverse policy steps.
+
+    begin: candidates, (n, len(knots)); polish: iterations of the last descent; settings: device, threads.
+    """
     problems = {str(how): jump.make(**how, **settings) for how in (FINE, *(how for how, _ in jump.stages))}
-    merits: list[torch.Tensor] = []
-    found = begin
+    costs: list[torch.Tensor] = []
+    candidates = begin
     for number, (how, stage) in enumerate(jump.stages):
-        found = smoothed(
-            problems[str(how)], found, stages=(stage,), seed=seed + number, tell=lambda _, last: merits.append(last)
+        candidates = smoothed(
+            problems[str(how)], candidates, stages=(stage,), seed=seed + number, tell=lambda _, last: costs.append(last)
         )
-        best = float(merits[-1][0])
-        print(f"{jump.label}, part {number + 1}: {len(found)} starts, objective with penalties {best:.3f}", flush=True)
-    progress = minimise(problems[str(FINE)], found, iterations=polish, step=0.01, seed=seed)
+        best = float(costs[-1][0])
+        print(f"{jump.label}, part {number + 1}: {len(candidates)} starts, cost with penalties {best:.3f}", flush=True)
+    progress = minimise(problems[str(FINE)], candidates, iterations=polish, step=0.01, seed=seed)
     return progress, {
         "simulated_steps": float(sum(problem.world_steps for problem in problems.values())),
         "reverse_steps": float(sum(problem.reverse_steps for problem in problems.values())),

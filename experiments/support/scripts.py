@@ -1,4 +1,4 @@
-"""Flags and report that many scripts share."""
+"""Flags and report shared by scripts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.runtime import configure_device
 
 
 @dataclass(frozen=True)
@@ -30,13 +30,13 @@ class ThreadArgs(DeviceArgs):
 
 
 def prepare(name: str, args: DeviceArgs, threads: int | None = None) -> Path:
-    """Take up device and threads, print them, and return the folder of a script's results."""
-    announce(args.device, threads)
+    """Select device and threads, print them, and return the output folder of a script."""
+    configure_device(args.device, threads)
     return output_dir(name, args.out)
 
 
 def report(folder: Path, values: Mapping[str, Any]) -> None:
-    """Write metrics.json into a folder, and print the metrics and the folder."""
+    """Write metrics to `metrics.json` in a folder, and print them and the folder."""
     write_metrics(folder, values)
     for name, value in values.items():
         items = value if isinstance(value, list | tuple) else [value]
@@ -45,7 +45,7 @@ def report(folder: Path, values: Mapping[str, Any]) -> None:
 
 
 def number_text(value: Any) -> str:
-    """Return a number with four digits, a large one with all before the decimal point; anything else as text."""
+    """Return a value as text; floats have four significant digits, or all before the decimal point."""
     if not isinstance(value, float):
         return str(value)
     return f"{value:,.0f}" if abs(value) >= 1.0e3 else f"{value:.4g}"

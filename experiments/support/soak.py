@@ -1,17 +1,18 @@
-"""Random actions for a long time, on a simulation or on a whole environment."""
+"""Soak tests: random actions for a long time, on a simulation or on a whole environment."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
-from jumper_warp.rl.graphs import Captured
+from jumper_warp.rl.graphs import CapturedProcedure
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.tasks.cfg import TaskCfg
@@ -49,7 +50,7 @@ class SoakArgs(ThreadArgs):
 
 
 def randomize(sim: Simulation, rng: np.random.Generator) -> None:
-    """Give every world its own masses (0.8 to 1.25 times) and paw friction (0.2 to 1.2)."""
+    """Scale the masses of every world by 0.8 to 1.25, and set its paw friction to 0.2 to 1.2, at random."""
     model, n = sim.model, sim.num_worlds
     scale = rng.uniform(0.8, 1.25, n).astype(np.float32)
     model.body_mass.assign(model.body_mass.numpy() * np.repeat(scale, 21))
@@ -62,11 +63,11 @@ def randomize(sim: Simulation, rng: np.random.Generator) -> None:
 
 
 def simulation_steps(sim: Simulation, args: SoakArgs) -> Iterator[torch.Tensor]:
-    """Make all steps of a simulation under random targets; after each, give which worlds are flagged as non-finite."""
+    """Step a simulation under random targets; after each step, yield which worlds are flagged as non-finite, (n,)."""
     if sim.device.is_cuda:
         torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(sim.device)))
     randomize(sim, np.random.default_rng(args.seed))
-    target, invalid = wp.to_torch(sim.target), wp.to_torch(sim.physics.invalid)
+    target, diverged = wp.to_torch(sim.target), wp.to_torch(sim.physics.diverged)
     lateral, low, high = (np.radians(value) for value in (args.lateral, *args.transversal))
     lower, upper = (
         target.new_tensor([row] * 4).reshape(12, 1) for row in ([-lateral, low, low], [lateral, high, high])
@@ -76,13 +77,13 @@ def simulation_steps(sim: Simulation, args: SoakArgs) -> Iterator[torch.Tensor]:
             target.copy_(lower + (upper - lower) * torch.rand_like(target))
         sim.step()
         last = (step + 1) % args.episode == 0 or step + 1 == args.steps
-        yield (invalid != 0) & last
+        yield (diverged != 0) & last
         if last:  # flagged worlds are counted once
             sim.reset()
 
 
 def hardest(task: TaskCfg) -> TaskCfg:
-    """Return a task whose map, if it has one, has the last row alone, since robots that fall go back to the first."""
+    """Return the task with only the last row of its terrain map, if it has one, as falls return robots to the first."""
     settings = task.reset.settings
     terrain = getattr(settings, "terrain", None)
     if terrain is None or terrain.rows == 0:
@@ -90,10 +91,21 @@ def hardest(task: TaskCfg) -> TaskCfg:
     return replace(task, reset=replace(task.reset, settings=replace(settings, terrain=replace(terrain, rows=1))))
 
 
-class Totals:
-    """What is counted of worlds while they are soaked, on the device."""
+class SoakTotals(NamedTuple):
+    """Totals of a soak test over all worlds and steps."""
+
+    flagged: int  # worlds flagged as non-finite
+    unsolved: int  # world steps whose contacts did not converge
+    rows: int  # world steps with a value that is not finite
+    speed: float  # [m/s] largest speed of a base
+    joint_speed: float  # [rad/s] largest speed of a joint
+
+
+class SoakCounters:
+    """Counts invalid worlds and unsolved contacts, and keeps the largest speeds, on the device."""
 
     def __init__(self, sim: Simulation) -> None:
+        """Begin at zero."""
         self._rates = wp.to_torch(sim.state.joint_qd).view(sim.num_worlds, -1)
         self._state = wp.to_torch(sim.state.joint_q).view(sim.num_worlds, -1)
         assert isinstance(sim.solver, SolverJumper)
@@ -102,68 +114,68 @@ class Totals:
         self._counts = torch.zeros(3, dtype=torch.int64, device=self._rates.device)
         self._fast = self._rates.new_zeros(2)
 
-    def take(self, bad: torch.Tensor, *rows: torch.Tensor) -> None:
-        """Take in a policy step. bad: (num_worlds,) bool, flagged; rows: (num_worlds, ...) that should be finite."""
+    def update(self, flagged: torch.Tensor, *rows: torch.Tensor) -> None:
+        """Count a policy step. flagged: (num_worlds,) bool; rows: (num_worlds, ...) values that should be finite."""
         self._fast[0] = self._rates[:, :3].square().sum(dim=1).max().sqrt()
         self._fast[1] = self._rates[:, 6:26].abs().max()
         torch.maximum(self._speeds, self._fast, out=self._speeds)
         finite = self._rates.isfinite().all(dim=1) & self._state.isfinite().all(dim=1)
         for each in rows:
             finite &= each.view(len(finite), -1).isfinite().all(dim=1)
-        self._counts += torch.stack([bad.sum(), (self._residual > self._tolerance).sum(), (~finite).sum()])
+        self._counts += torch.stack([flagged.sum(), (self._residual > self._tolerance).sum(), (~finite).sum()])
 
-    def read(self) -> tuple[int, int, int, float, float]:
-        """Return flagged worlds, steps with a contact unsolved, rows not finite, and the largest speeds."""
-        flagged, unsolved, rows = self._counts.tolist()
-        return flagged, unsolved, rows, *self._speeds.tolist()
+    def read(self) -> SoakTotals:
+        """Return the totals; waits for the device."""
+        return SoakTotals(*self._counts.tolist(), *self._speeds.tolist())
 
 
 def soak_simulation(sim: Simulation, args: SoakArgs) -> dict:
-    """Make all steps of a simulation under random targets, and return the figures."""
-    totals, start = Totals(sim), time.perf_counter()
-    for step, bad in enumerate(simulation_steps(sim, args)):
-        totals.take(bad)
-        if (step + 1) % args.episode == 0 and totals.read()[2]:
+    """Step a simulation under random targets, and return the metrics. Raises RuntimeError: unflagged NaN or inf."""
+    counters, start = SoakCounters(sim), time.perf_counter()
+    for step, flagged in enumerate(simulation_steps(sim, args)):
+        counters.update(flagged)
+        if (step + 1) % args.episode == 0 and counters.read().rows:
             raise RuntimeError(f"a world holds values that are not finite but was not flagged, step {step}")
-    return figures_of(totals, args.steps * sim.num_worlds, time.perf_counter() - start)
+    return soak_metrics(counters, args.steps * sim.num_worlds, time.perf_counter() - start)
 
 
 def soak_env(env: Env, args: SoakArgs) -> dict:
-    """Make all steps of an environment under random actions, `hold` of them as one graph, and return the figures.
+    """Step an environment under random actions, `hold` steps as one graph, and return the metrics.
 
-    Flagged are worlds that came apart. Not finite may be no row of the coordinates, rates, rewards and observations,
-    those of the next episode where one has ended.
+    Worlds that diverged are flagged. Raises RuntimeError: a coordinate, rate, reward or observation after the step (and
+    reset) is NaN or infinite.
     """
     env.reset()
-    apart = [term.name for term in env.task.terminations].index("came_apart")
-    termination, totals, action = wp.to_torch(env.episodes.termination), Totals(env.sim), torch.zeros_like(env.action)
+    diverged = [term.name for term in env.task.terminations].index("came_apart")
+    counters, action = SoakCounters(env.sim), torch.zeros_like(env.action)
+    termination = wp.to_torch(env.episodes.termination)
 
-    def some() -> None:
+    def step_held() -> None:
         action.uniform_(-1.0, 1.0)
         for _ in range(args.hold):
             env.step(action)
-            totals.take(termination == apart, env.obs, env.critic_obs, env.reward)
+            counters.update(termination == diverged, env.obs, env.critic_obs, env.reward)
 
-    run, rounds = Captured(some, env.device.type == "cuda"), -(-args.steps // args.hold)
-    looks = max(args.episode // args.hold, 1)
+    run, rounds = CapturedProcedure(step_held, env.device.type == "cuda"), -(-args.steps // args.hold)
+    check_interval = max(args.episode // args.hold, 1)
     start = time.perf_counter()
     for i in range(rounds):
         run()
-        if (i + 1) % looks == 0 and (rows := totals.read()[2]):
+        if (i + 1) % check_interval == 0 and (rows := counters.read().rows):
             raise RuntimeError(f"{rows} rows hold values that are not finite, by step {(i + 1) * args.hold}")
-    return figures_of(totals, rounds * args.hold * env.num_envs, time.perf_counter() - start)
+    return soak_metrics(counters, rounds * args.hold * env.num_envs, time.perf_counter() - start)
 
 
-def figures_of(totals: Totals, count: int, wall: float) -> dict:
-    """Return the figures of so many steps of worlds, made in a time [s]; waits for the device."""
-    flagged, unsolved, rows, speed, joint_speed = totals.read()
+def soak_metrics(counters: SoakCounters, count: int, wall: float) -> dict:
+    """Return the metrics of `count` steps of all worlds together, made in a time [s]; waits for the device."""
+    totals = counters.read()
     return {
         "steps": count,
-        "non_finite_worlds": flagged,
-        "non_finite_rows": rows,
-        "largest_speed_m_s": speed,
-        "largest_joint_speed_rad_s": joint_speed,
-        "share_of_steps_contact_unsolved": unsolved / count,
+        "non_finite_worlds": totals.flagged,
+        "non_finite_rows": totals.rows,
+        "largest_speed_m_s": totals.speed,
+        "largest_joint_speed_rad_s": totals.joint_speed,
+        "share_of_steps_contact_unsolved": totals.unsolved / count,
         "wall_s": wall,
         "steps_per_s": count / wall,
     }

@@ -1,4 +1,4 @@
-"""What is timed of solver, environment and training; each is checked before."""
+"""Timing of solver, environment and training, each after a check of its outcome."""
 
 from __future__ import annotations
 
@@ -21,37 +21,34 @@ from jumper_warp.sim.simulation import Simulation, SolverName
 from jumper_warp.sim.slices import SlicedGraph, WorldRange
 from support.timing import device_memory, median_time, wall_time
 
-SQUAT, DEFAULT, EXTEND = 110.0, 45.0, -10.0
-"""[deg] Commanded transversal angles of the scripted jump."""
-JUMP_STEPS = 45
-"""Policy steps of the scripted jump that are timed: push-off, flight, landing."""
-CALLS = 3
-"""Of a part of a policy step in a repetition."""
+SQUAT, DEFAULT, EXTEND = 110.0, 45.0, -10.0  # [deg] Commanded transversal angles of the scripted jump
+JUMP_STEPS = 45  # Number of timed policy steps of the scripted jump: push-off, flight, landing
+CALLS = 3  # Launches of a part of a policy step per repetition
 
 
 def command(sim: Simulation, degrees: float, steps: int) -> float:
-    """Command all transversal motors to an angle for some policy steps; return the wall time of one [s]."""
+    """Command all transversal motors to an angle for some policy steps; return the wall time per step [s]."""
     target = np.tile([0.0, 1.0, 1.0], 4) * np.radians(degrees)
     sim.target.assign(np.repeat(target[:, None], sim.num_worlds, axis=1).astype(np.float32))
     return wall_time(sim.step, sim.device, steps)
 
 
 def check_standing(sim: Simulation, most: float) -> None:
-    """Raise RuntimeError unless the base of every robot is between 0.33 m and the most [m] high."""
+    """Raise RuntimeError unless the base height of every robot is between 0.33 m and `most` [m]."""
     height = sim.joint_q()[:, 2]
     if not (np.all(height > 0.33) and np.all(height < most)):
         raise RuntimeError(f"the robots do not stand: heights {height.min():.3f} to {height.max():.3f} m")
 
 
 def time_standing(sim: Simulation, steps: int, repeats: int) -> float:
-    """Return seconds a policy step while standing; every robot must stand."""
+    """Return the wall time per policy step [s] while standing. Raises RuntimeError: a robot does not stand."""
     command(sim, DEFAULT, 90)
     check_standing(sim, 0.37)
     return median_time(sim.step, sim.device, steps, repeats)
 
 
 def time_jump(sim: Simulation, repeats: int) -> tuple[float, float]:
-    """Return seconds a policy step during a jump, and the mean apex [m]; every robot must jump."""
+    """Return the wall time per policy step [s] during a jump, and the mean apex [m]. Raises RuntimeError: no jump."""
     times, apex, push = [], np.zeros(1), JUMP_STEPS // 3
     for repeat in range(repeats + 1):
         command(sim, DEFAULT, 60)
@@ -70,17 +67,17 @@ def time_jump(sim: Simulation, repeats: int) -> tuple[float, float]:
 
 
 def time_solver(solver: SolverName, envs: int, steps: int, repeats: int, device: str | None) -> dict[str, float]:
-    """Return the metrics of one solver at one number of environments; steps: in a repetition, standing."""
+    """Return the metrics of one solver at one number of environments; steps: per repetition, standing."""
     build_model(1, device=device)  # Newton's own modules are not part of the metrics
-    before, made = device_memory(wp.get_device(device)), []
+    before, sims = device_memory(wp.get_device(device)), []
 
-    def make() -> None:
-        made.append(Simulation(envs, solver=solver, observe_forces=False, visuals=False, device=device))
-        made[0].step()
-        made[0].step()
+    def build() -> None:
+        sims.append(Simulation(envs, solver=solver, observe_forces=False, visuals=False, device=device))
+        sims[0].step()
+        sims[0].step()
 
-    values = {"setup_s": wall_time(make, device)}
-    (sim,) = made
+    values = {"setup_s": wall_time(build, device)}
+    (sim,) = sims
     values["ms_per_step_standing"] = 1e3 * time_standing(sim, steps, repeats)
     jump, values["apex_m"] = time_jump(sim, repeats)
     values["ms_per_step_jump"] = 1e3 * jump
@@ -94,7 +91,7 @@ def time_solver(solver: SolverName, envs: int, steps: int, repeats: int, device:
 
 
 def standing_solver(envs: int, device: str | None) -> Callable[[], None]:
-    """Return what makes a policy step of motors and physics alone, as a graph; every robot must stand."""
+    """Return a function that replays the graph of a policy step of motors and physics, with standing robots."""
     task = make_task("vertical-jump")
     sim = Simulation(envs, motors=task.motors, visuals=False, device=device)
     for _ in range(60):
@@ -104,12 +101,12 @@ def standing_solver(envs: int, device: str | None) -> Callable[[], None]:
     def advance(worlds: WorldRange) -> None:
         sim.physics.advance(sim.substeps, sim.target, bodies=False, worlds=worlds)
 
-    kept = (sim, SlicedGraph(advance, sim.slices, sim.device))  # the graph works on the simulation's arrays
-    return lambda: kept[1].replay()
+    graph_and_sim = (SlicedGraph(advance, sim.slices, sim.device), sim)  # keeps the arrays of the graph alive
+    return lambda: graph_and_sim[0].replay()
 
 
 def stepping_env(envs: int, device: str | None, threads: int | None = None) -> tuple[Env, Callable[[], None]]:
-    """Return an environment in the middle of its episodes, and what steps it with random actions."""
+    """Return an environment in the middle of its episodes, and a function that steps it with random actions."""
     env = Env(make_task("vertical-jump"), envs, device=device, threads=threads)
     actions = torch.rand(16, envs, env.num_actions, device=env.device) * 2.0 - 1.0
     count = 0
@@ -122,34 +119,34 @@ def stepping_env(envs: int, device: str | None, threads: int | None = None) -> t
     env.reset()
     for _ in range(100):
         step()
-    figures = env.metrics()
-    if not bool(env.obs.isfinite().all()) or figures["Episode_Termination/came_apart"] > 0.01:
-        raise RuntimeError(f"{100 * figures['Episode_Termination/came_apart']:.1f} % of the episodes came apart")
+    metrics = env.metrics()
+    if not bool(env.obs.isfinite().all()) or metrics["Episode_Termination/came_apart"] > 0.01:
+        raise RuntimeError(f"{100 * metrics['Episode_Termination/came_apart']:.1f} % of the episodes came apart")
     return env, step
 
 
 def time_threads(envs: int, threads: Sequence[int], steps: int, repeats: int) -> dict[str, float]:
-    """Return policy steps a second on a CPU by numbers of threads, and how much faster the last is than the first.
+    """Return policy steps per second on a CPU by number of threads, and the speedup of the last over the first.
 
-    Repetitions take turns and the best counts, as other work on the machine only slows them down. `thread_speedup` is
-    the smaller one of physics and environment.
+    Repetitions alternate and the fastest counts, as other load only slows them down. `thread_speedup` is the smaller
+    speedup of physics and environment.
     """
-    bodies: dict[str, list[Callable[[], object]]] = {"physics": [], "env": []}
+    steps_of: dict[str, list[Callable[[], object]]] = {"physics": [], "env": []}
     for n in threads:
         sim = Simulation(envs, visuals=False, device="cpu", threads=n)
         command(sim, DEFAULT, 90)
-        bodies["physics"].append(sim.step)
-        bodies["env"].append(stepping_env(envs, "cpu", n)[1])
-    figures = {}
-    for name, body in bodies.items():
-        times = np.array([[wall_time(each, "cpu", steps) for each in body] for _ in range(repeats)]).min(axis=0)
-        figures |= {f"{name}_steps_per_s_threads_{n}": envs / t for n, t in zip(threads, times, strict=True)}
-        figures[f"thread_speedup_{name}"] = float(times[0] / times[-1])
-    return figures | {"thread_speedup": min(figures[f"thread_speedup_{name}"] for name in bodies)}
+        steps_of["physics"].append(sim.step)
+        steps_of["env"].append(stepping_env(envs, "cpu", n)[1])
+    metrics = {}
+    for name, functions in steps_of.items():
+        times = np.array([[wall_time(each, "cpu", steps) for each in functions] for _ in range(repeats)]).min(axis=0)
+        metrics |= {f"{name}_steps_per_s_threads_{n}": envs / t for n, t in zip(threads, times, strict=True)}
+        metrics[f"thread_speedup_{name}"] = float(times[0] / times[-1])
+    return metrics | {"thread_speedup": min(metrics[f"thread_speedup_{name}"] for name in steps_of)}
 
 
 def time_stages(envs: int, device: str | None, repeats: int) -> dict[str, float]:
-    """Return seconds of each part of a policy step (`Env.stages`), launched again and again from the same state."""
+    """Return the wall time [s] of each part of a policy step (`Env.stages`), always from the same state."""
     env, _ = stepping_env(envs, device)
     saved, parts = env.state_dict(), {}
     for name in env.stages():
@@ -160,7 +157,7 @@ def time_stages(envs: int, device: str | None, repeats: int) -> dict[str, float]
 
 
 def time_parts(envs: Sequence[int], train_envs: int, steps: int, repeats: int, device: str | None) -> dict[str, float]:
-    """Return metrics of solver and environment by number of environments, and of the parts of a policy step."""
+    """Return speeds of solver and environment by number of environments, and times of the parts of a policy step."""
     values: dict[str, float] = {}
     for n in sorted({*envs, train_envs}):
         bodies = standing_solver(n, device), stepping_env(n, device)[1]
@@ -174,38 +171,38 @@ def time_parts(envs: Sequence[int], train_envs: int, steps: int, repeats: int, d
 
 
 def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dict[str, float]:
-    """Return figures of training with this package's PPO; the policy must have changed and stayed finite.
+    """Return metrics of training with this package's PPO. Raises RuntimeError: policy unchanged or not finite.
 
-    `ppo_device_memory_gib`: in use on a GPU, by whatever. `ppo_ready_s`: compilation and the first iterations, until
-    all graphs are captured.
+    `ppo_device_memory_gib`: total memory in use on the GPU. `ppo_ready_s`: time of compilation and first iterations,
+    until all graphs are captured.
     """
     env, _ = stepping_env(envs, device)
     begin = time.perf_counter()
     ppo = Ppo(env, cfg)
     before = ppo.model.log_std.detach().clone()
-    ppo.prepare()
+    ppo.compile()
     for _ in range(3):  # eager, capture, replay
         ppo.iterate()
     wp.synchronize_device(device)
-    ready, watch = time.perf_counter() - begin, Stopwatch(env.device)
+    ready, stopwatch = time.perf_counter() - begin, Stopwatch(env.device)
 
     def iterate() -> None:
-        watch.start()
-        ppo.iterate(mark=watch.mark)
+        stopwatch.start()
+        ppo.iterate(mark=stopwatch.mark)
 
     wall = wall_time(iterate, device, iterations)
-    (collect, update), _ = watch.read()
+    (collect, update), _ = stopwatch.read()
     after = ppo.model.log_std.detach()
     if not bool(after.isfinite().all()) or torch.equal(after, before):
         raise RuntimeError("the policy did not learn")
-    figures = {"ppo_steps_per_s": cfg.num_steps * envs / wall, "ppo_iteration_s": wall, "ppo_ready_s": ready}
+    metrics = {"ppo_steps_per_s": cfg.num_steps * envs / wall, "ppo_iteration_s": wall, "ppo_ready_s": ready}
     if memory := device_memory(wp.get_device(device)):
-        figures["ppo_device_memory_gib"] = memory / 2**30
-    return {**figures, "ppo_collect_s": collect, "ppo_update_s": update}
+        metrics["ppo_device_memory_gib"] = memory / 2**30
+    return {**metrics, "ppo_collect_s": collect, "ppo_update_s": update}
 
 
 def time_rsl_rl(envs: int, num_steps: int, iterations: int, device: str | None) -> dict[str, float]:
-    """Return figures of training with rsl-rl-lib on the same environment, with the same settings."""
+    """Return metrics of training with rsl-rl-lib on the same environment with the same settings."""
     from jumper_warp.envs.rsl_rl import RslRlVecEnv
     from jumper_warp.rl.rsl_rl import train_rsl_rl
 

@@ -1,4 +1,4 @@
-"""Wall time of work on a device, and the same script of another checkout beside it."""
+"""Wall time of work on a device, and comparison with the same script of another checkout."""
 
 from __future__ import annotations
 
@@ -18,12 +18,11 @@ import warp as wp
 
 from jumper_warp.utils.errors import InputError
 
-RATE = "steps_per_s"
-"""Part of the names of figures that are compared."""
+RATE = "steps_per_s"  # Part of the names of metrics that are compared with a baseline
 
 
 def wall_time(body: Callable[[], Any], device: wp.DeviceLike = None, calls: int = 1) -> float:
-    """Return the seconds of a call; waits for the device before and after all of them."""
+    """Return the mean wall time of a call [s]; waits for the device before the first and after the last call."""
     wp.synchronize_device(device)
     start = time.perf_counter()
     for _ in range(calls):
@@ -33,52 +32,48 @@ def wall_time(body: Callable[[], Any], device: wp.DeviceLike = None, calls: int 
 
 
 def median_time(body: Callable[[], Any], device: wp.DeviceLike = None, calls: int = 1, repeats: int = 5) -> float:
-    """Return the seconds of a call as `wall_time`, the median of some repetitions."""
+    """Return the median over repetitions of `wall_time` [s]."""
     return float(np.median([wall_time(body, device, calls) for _ in range(repeats)]))
 
 
 def process_age() -> float:
-    """Return the seconds since this process was started, by the system's clock."""
+    """Return the time since the start of this process [s]."""
     ticks = int(Path("/proc/self/stat").read_text().rsplit(")", 1)[1].split()[19])
     return time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
 
 
 def device_memory(device: wp.Device) -> int:
-    """Return bytes in use on a GPU, 0 on a CPU."""
+    """Return the memory in use on a GPU [byte], 0 on a CPU."""
     return device.total_memory - device.free_memory if device.is_cuda else 0
 
 
-def over_baseline(checkout: Path | None, script: str, args: Any, figures: Mapping[str, Any]) -> dict[str, float]:
-    """Run the same script of another checkout on this machine, and return the ratios of all rates, ours over its own.
+def baseline_ratios(checkout: Path | None, script: str, args: Any, metrics: Mapping[str, Any]) -> dict[str, float]:
+    """Run the same script of another checkout, and return the ratios of all rates, this run over the baseline.
 
-    Args:
-        checkout: Its root; None: nothing is run or returned.
-        script: Path of the script within.
-        args: A dataclass, the flags of this run; `out`, `baseline` and what is as by default are left out, so that
-            another checkout need not know the newest flags.
-        figures: Of this run.
-
-    Raises:
-        InputError: There is no such script, or it fails.
+    checkout: root of the other checkout, None: no comparison; script: path within; args: dataclass with the flags of
+    this run; metrics: of this run. Raises InputError: there is no such script, or it fails.
     """
     if checkout is None:
         return {}
     if not (checkout / script).is_file():
         raise InputError(f"no {script} in {checkout}")
     with tempfile.TemporaryDirectory() as folder:
-        command = [sys.executable, script, *flags_of(args), "--out", folder]
-        found = [str(checkout.resolve()), *filter(None, [os.environ.get("PYTHONPATH")])]
-        env = os.environ | {"PYTHONPATH": os.pathsep.join(found)}
+        command = [sys.executable, script, *changed_flags(args), "--out", folder]
+        paths = [str(checkout.resolve()), *filter(None, [os.environ.get("PYTHONPATH")])]
+        env = os.environ | {"PYTHONPATH": os.pathsep.join(paths)}
         done = subprocess.run(command, cwd=checkout, env=env, capture_output=True, text=True, check=False)
         if done.returncode:
             raise InputError(f"{script} of {checkout} fails: {done.stderr.strip().splitlines()[-1:]}")
         base = json.loads((Path(folder) / "metrics.json").read_text())
-    rates = [name for name, value in figures.items() if RATE in name and isinstance(value, float) and base.get(name)]
-    return {f"{name}_over_baseline": figures[name] / base[name] for name in rates}
+    rates = [name for name, value in metrics.items() if RATE in name and isinstance(value, float) and base.get(name)]
+    return {f"{name}_over_baseline": metrics[name] / base[name] for name in rates}
 
 
-def flags_of(args: Any) -> list[str]:
-    """Return a dataclass as flags of the command line, without `out`, `baseline` and what is as by default."""
+def changed_flags(args: Any) -> list[str]:
+    """Return the fields of a dataclass as command-line flags, without defaults, `out` and `baseline`.
+
+    Defaults are left out so that another checkout need not know the newest flags.
+    """
     flags: list[str] = []
     for spec in dataclasses.fields(args):
         value, name = getattr(args, spec.name), spec.name.replace("_", "-")

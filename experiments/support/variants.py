@@ -1,4 +1,4 @@
-"""Ways to run the trainer that are compared with each other, by name."""
+"""Named variants of the trainer's settings."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ from typing import Any
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
 
-DEFAULT = "default"
-"""Name of the trainer as it is."""
+DEFAULT = "default"  # Name of the unchanged settings
 VARIANTS: dict[str, dict[str, Any]] = {
     DEFAULT: {},
     **{
@@ -22,11 +21,11 @@ VARIANTS: dict[str, dict[str, Any]] = {
     "less_noise_bfloat16": {"init_std": 0.5, "precision": "bfloat16"},
     "small": {"hidden": (128, 64, 64), "final_desired_kl": 0.005},
 }
-"""What each changes of `PpoCfg`."""
+"""Changed fields of `PpoCfg` by name of the variant."""
 
 
 def variant(cfg: PpoCfg, name: str) -> PpoCfg:
-    """Return settings changed as a variant says. Raises ValueError: there is no such variant."""
+    """Return the settings of a variant. Raises InputError: there is no such variant."""
     if name not in VARIANTS:
         raise InputError(f"variants are {', '.join(VARIANTS)}, got {name!r:.60}")
     return dataclasses.replace(cfg, **VARIANTS[name])

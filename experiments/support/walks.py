@@ -1,4 +1,4 @@
-"""Tests of walking beside constant commands: redirected, sped up, kicked, and how far robots come."""
+"""Tests of walking with changing commands: redirected, sped up and kicked walks, and their metrics."""
 
 from __future__ import annotations
 
@@ -6,61 +6,58 @@ import numpy as np
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.log import Metrics
-from jumper_warp.evaluation.velocities import SKIP, Walks
+from jumper_warp.evaluation.velocities import SETTLING_TIME, VelocityLog
 
 REACH, STEP, KICK = 0.8, 0.8, 0.5
-"""[m/s] and [rad/s] of the commands; [m/s] by which a command and a velocity jump."""
+"""[m/s] and [rad/s] Limit of the commands; [m/s] step of a changed command; [m/s] step of a kicked velocity."""
 RAMP, KEEP, SHARE = 3.0, 5.0, 0.1
-"""[s] In which the command rises, for which it is kept, and within which share."""
+"""[s] Time of the command's ramp, time for which it is held, and [1] tolerance of a kept speed."""
 DIRECTIONS = {"ahead": (0, 1.0, 4.0), "back": (0, -1.0, 4.0), "sideways": (1, 1.0, 2.0), "turning": (2, 1.0, 4.0)}
 """Axis, sign and highest command [m/s] or [rad/s] of the test of top speed."""
-SETTLED = 0.1
-"""[m/s] Error of a robot that has settled on a new command."""
-SMOOTHING = 0.2
-"""[s] Over which velocities are averaged to tell whether it has."""
+SETTLED = 0.1  # [m/s] Largest error of a robot that has settled on a new command
+SMOOTHING = 0.2  # [s] Window over which velocities are averaged for the settling time
 PAPER = {"rmse_vx_m_s": 0.17, "rmse_vy_m_s": 0.05, "rmse_yaw_rate_rad_s": 0.12}
 """Tracking errors of the paper, one test on the robot: commands up to 0.8 that a person gave."""
-HOLD = 0.5
-"""[s] For which a robot stays within that error that has settled in spite of pushes."""
+HOLD = 0.5  # [s] Time within that error after which a robot has settled, regardless of later pushes
 
 
-def redirected(env: Env, rng: np.random.Generator) -> Walks:
-    """Return walks with another command after 3 s."""
-    commands = steps_of(rng, env.num_envs, REACH, STEP)
-    return Walks(commands, env.task, 7.0, times=np.array([0.0, 3.0]))
+def redirected_walks(env: Env, rng: np.random.Generator) -> VelocityLog:
+    """Return the log of walks whose random command changes after 3 s."""
+    commands = step_commands(rng, env.num_envs, REACH, STEP)
+    return VelocityLog(commands, env.task, 7.0, times=np.array([0.0, 3.0]))
 
 
-def sped_up(env: Env) -> tuple[Walks, np.ndarray]:
-    """Return walks at ever higher speeds, and the index of each robot's direction."""
+def sped_up_walks(env: Env) -> tuple[VelocityLog, np.ndarray]:
+    """Return the log of walks whose command rises to a speed, and each robot's index in DIRECTIONS, (robots,)."""
     which = np.arange(env.num_envs) % len(DIRECTIONS)
     commands = np.zeros((env.num_envs, 7, 3))
     for i, (axis, sign, highest) in enumerate(DIRECTIONS.values()):
         speeds = sign * np.linspace(0.3, highest, int((which == i).sum()))
         commands[which == i, :, axis] = speeds[:, None] * np.linspace(1.0 / 7.0, 1.0, 7)
     times = RAMP * np.arange(7) / 7.0
-    return Walks(commands, env.task, RAMP + 1.0 + KEEP, times=times), which
+    return VelocityLog(commands, env.task, RAMP + 1.0 + KEEP, times=times), which
 
 
-def kicked(env: Env, rng: np.random.Generator) -> Walks:
-    """Return walks with drawn commands whose velocity jumps at a drawn moment."""
+def kicked_walks(env: Env, rng: np.random.Generator) -> VelocityLog:
+    """Return the log of walks with random commands and a kick at a random time."""
     n = env.num_envs
     commands, angle = rng.uniform(-REACH, REACH, (n, 1, 3)), rng.uniform(0.0, 2.0 * np.pi, n)
     kick = KICK * np.stack([np.cos(angle), np.sin(angle)], axis=1)
-    return Walks(commands, env.task, 7.0, kick_time=rng.uniform(2.0, 4.0, n), kick=kick)
+    return VelocityLog(commands, env.task, 7.0, kick_time=rng.uniform(2.0, 4.0, n), kick=kick)
 
 
-def speed_metrics(walks: Walks, which: np.ndarray) -> Metrics:
-    """Return the highest speed that was kept in each direction."""
-    found: Metrics = {}
+def speed_metrics(walks: VelocityLog, direction: np.ndarray) -> Metrics:
+    """Return the top speed in each direction; direction: index in DIRECTIONS of each robot, (robots,)."""
+    metrics: Metrics = {}
     for i, (name, (axis, _, _)) in enumerate(DIRECTIONS.items()):
         unit = "rad_s" if axis == 2 else "m_s"
-        kept = kept_speeds(walks, axis, KEEP, SHARE)[which == i]
-        found[f"top_{name}_{unit}"] = top_speed(np.abs(walks.commands[which == i, -1, axis]), kept)
-    return found
+        kept = kept_speeds(walks, axis, KEEP, SHARE)[direction == i]
+        metrics[f"top_{name}_{unit}"] = top_speed(np.abs(walks.commands[direction == i, -1, axis]), kept)
+    return metrics
 
 
-def steps_of(rng: np.random.Generator, robots: int, reach: float, step: float) -> np.ndarray:
-    """Return two commands a robot whose velocities differ by `step` [m/s] in any direction, (robots, 2, 3)."""
+def step_commands(rng: np.random.Generator, robots: int, reach: float, step: float) -> np.ndarray:
+    """Return two random commands per robot whose planar velocities differ by `step` [m/s], (robots, 2, 3)."""
     commands = np.zeros((robots, 2, 3))
     commands[..., 2] = rng.uniform(-reach, reach, robots)[:, None]
     todo = np.arange(robots)
@@ -73,19 +70,19 @@ def steps_of(rng: np.random.Generator, robots: int, reach: float, step: float) -
     return commands
 
 
-def settling_times(walks: Walks, hold: float | None = None) -> np.ndarray:
-    """Return how long after the last command each robot's velocity in the plane stays within SETTLED of it [s].
+def settling_times(walks: VelocityLog, hold: float | None = None) -> np.ndarray:
+    """Return the time [s] from the last command until the planar velocity stays within SETTLED of it, (robots,).
 
-    Velocities are means of the last SMOOTHING seconds. Infinite where it never does, or the robot falls.
+    Velocities are means over the last SMOOTHING seconds. Infinite if a robot never settles, or falls.
 
-    hold: Seconds for which it stays; None: to the end, so that a push seconds later counts too.
+    hold [s]: time for which the velocity must stay; None: to the end, so that later pushes count too.
     """
     window, first = round(SMOOTHING / walks.step_dt), round(walks.times[-1] / walks.step_dt)
-    velocity = walks.history()[..., :2]
+    velocity = walks.velocity_history()[..., :2]
     total = np.cumsum(velocity, axis=0)
     smooth = velocity.copy()
     smooth[window:] = (total[window:] - total[:-window]) / window
-    off = np.linalg.norm(smooth[first:] - walks.wanted()[first:, :, :2], axis=2)
+    off = np.linalg.norm(smooth[first:] - walks.command_history()[first:, :, :2], axis=2)
     outside = ~(off <= SETTLED)
     if hold is not None:
         steps = min(round(hold / walks.step_dt), len(off))
@@ -95,29 +92,30 @@ def settling_times(walks: Walks, hold: float | None = None) -> np.ndarray:
     return np.where(last == len(off), np.inf, last * walks.step_dt)
 
 
-def kept_speeds(walks: Walks, axis: int, seconds: float, share: float) -> np.ndarray:
-    """Return which robots kept their last command along an axis within a share of it over the last seconds on average.
+def kept_speeds(walks: VelocityLog, axis: int, seconds: float, share: float) -> np.ndarray:
+    """Return which robots kept their last command along an axis, within a share, as the mean of the last seconds.
 
-    The two other velocities are not judged.
+    The other two velocity components are ignored.
     """
-    last = walks.history()[-round(seconds / walks.step_dt) :, :, axis].mean(axis=0)
+    last = walks.velocity_history()[-round(seconds / walks.step_dt) :, :, axis].mean(axis=0)
     wanted = walks.commands[:, -1, axis]
     return np.abs(last - wanted) <= share * np.abs(wanted)
 
 
-def walked(walks: Walks) -> np.ndarray:
-    """Return the share of the way that each robot went until it fell, at most 1, commanded to go straight ahead.
+def walked_share(walks: VelocityLog) -> np.ndarray:
+    """Return the share of the commanded distance straight ahead that each robot walked until its fall, at most 1.
 
-    What it goes ahead counts, whatever its heading is then; the time of setting off, SKIP, is not asked for.
+    Distance is along the robot's present heading; SETTLING_TIME at the start is not part of the commanded distance.
     """
-    way = np.nansum(walks.history()[..., 0], axis=0) * walks.step_dt
-    return np.clip(way / (walks.commands[:, 0, 0] * (walks.seconds - SKIP)), 0.0, 1.0)
+    distance = np.nansum(walks.velocity_history()[..., 0], axis=0) * walks.step_dt
+    return np.clip(distance / (walks.commands[:, 0, 0] * (walks.seconds - SETTLING_TIME)), 0.0, 1.0)
 
 
 def top_speed(commanded: np.ndarray, kept: np.ndarray, share: float = 0.9, width: float = 0.1) -> float:
-    """Return the highest speed that at least a share of the robots kept, of classes of a width; 0 if there is none.
+    """Return the highest speed that at least a share of the robots kept, 0 if there is none.
 
-    commanded: (robots,) at least 0; kept: (robots,) bool. The result is the largest commanded one of its class.
+    Robots are grouped by commanded speed into bins of a width; the result is the largest command of its bin.
+    commanded [m/s] or [rad/s]: (robots,), at least 0; kept: (robots,) bool.
     """
     classes, top = np.floor(commanded / width + 1.0e-9).astype(int), 0.0
     for each in np.unique(classes):

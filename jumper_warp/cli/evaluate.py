@@ -13,7 +13,7 @@ from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError
 from jumper_warp.cli.main import parse as parse_flags
 
 if TYPE_CHECKING:
-    from jumper_warp.evaluation.registry import Evaluation
+    from jumper_warp.evaluation.evaluations import Evaluation
     from jumper_warp.evaluation.run import EvaluationRun
 
 HELP = """\

@@ -23,14 +23,14 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     from jumper_warp.policies.folder import checked_folder, save_policy
     from jumper_warp.policies.runs import open_policy
     from jumper_warp.policies.spec import PolicyError
-    from jumper_warp.utils.runtime import announce
+    from jumper_warp.utils.runtime import configure_device
 
     parsed: FinetuneArgs = parse(FinetuneArgs, f"finetune {name}", args[1:])
     out = checked_folder(parsed.out or Path(f"{Path(name).name}_finetuned"))
     if out.exists() and not parsed.overwrite:
         raise PolicyError(f"{out} exists")
     policy = open_policy(name)
-    announce(parsed.device, parsed.threads)
+    configure_device(parsed.device, parsed.threads)
     policy, record = finetune(policy, parsed, modules)
     files = {"finetuning.json": (json.dumps(record, indent=1) + "\n").encode()}
     print(save_policy(out, policy, files=files, overwrite=parsed.overwrite))

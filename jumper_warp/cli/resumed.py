@@ -9,7 +9,7 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from jumper_warp.policies.restore import restored_task
-from jumper_warp.rl.checkpoint import DAMAGE, CheckpointError, one_line
+from jumper_warp.rl.checkpoint import DECODE_ERRORS, CheckpointError, one_line_message
 from jumper_warp.rl.resume import SESSION
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.tasks.saving import TaskError, check_version
@@ -40,8 +40,8 @@ def settings_of_run(checkpoint: Checkpoint, cfg: TrainCfg) -> tuple[dict[str, An
         settings["solver"] = "mujoco" if env.get("solver") == "SolverMuJoCo" else "jumper"
         settings["robot_of_run"] = RobotOverlay.from_json(env["robot"]) if "robot" in env else None
         return settings, restored_task(saved, loaded_modules(), leave_out=())
-    except DAMAGE as error:
-        raise CheckpointError(f"{checkpoint.path}: settings in its configuration: {one_line(error)}") from error
+    except DECODE_ERRORS as error:
+        raise CheckpointError(f"{checkpoint.path}: settings in its configuration: {one_line_message(error)}") from error
 
 
 def _config(checkpoint: Checkpoint, task: str) -> dict[str, Any]:

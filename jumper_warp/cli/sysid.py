@@ -12,9 +12,9 @@ import tyro
 
 from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError, parse
 from jumper_warp.identification.motions import NoiseLevels, load_motions
-from jumper_warp.identification.parameters import jumper_parameters
+from jumper_warp.identification.parameters import jumper_parameters, total_mass, weighed_mass
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import json_bytes, write_whole
+from jumper_warp.utils.files import json_bytes, write_atomically
 
 HELP = f"""\
 usage: jumper sysid DATA ... [flags]
@@ -147,18 +147,18 @@ def sysid(cfg: SysidCfg) -> None:
     from rich.console import Console
     from rich.table import Table
 
-    from jumper_warp.identification.identify import identify, identify_by_evolution, weighed
+    from jumper_warp.identification.identify import identify, identify_by_evolution
     from jumper_warp.identification.report import write_results
     from jumper_warp.utils.output import output_dir
-    from jumper_warp.utils.runtime import announce
+    from jumper_warp.utils.runtime import configure_device
 
     cfg.noise.check()
     parameters = jumper_parameters(names(cfg.params)).without(names(cfg.without))
     settings: dict[str, Any] = {name: getattr(cfg, name) for name in ("noise", "dt", "device", "threads")}
-    settings["knowledge"] = [] if cfg.mass is None else [weighed(cfg.mass, cfg.mass_deviation)]
+    settings["prior_measurements"] = [] if cfg.mass is None else [weighed_mass(cfg.mass, cfg.mass_deviation)]
     given = {name: getattr(cfg, name) for name in ("base", "gains", "torque_limit", "torque_constant")}
     motions = load_motions(cfg.data, **given)
-    announce(cfg.device, cfg.threads)
+    configure_device(cfg.device, cfg.threads)
     if cfg.method == "cma":
         found = identify_by_evolution(motions, parameters, max_seconds=cfg.max_seconds, **settings)
     else:
@@ -172,10 +172,10 @@ def sysid(cfg: SysidCfg) -> None:
         table.add_row(*row, style=None if sure else "dim")
     Console().print(table)
     wider = f"; intervals {found.mismatch:.3g} times wider for the model's errors" if found.mismatch != 1.0 else ""
-    print(f"χ² {found.chi2:.4g} (described {found.nominal_chi2:.4g}), {found.seconds:.1f} s{wider}")
+    print(f"χ² {found.chi2:.4g} (described {found.nominal_chi2:.4g}), {found.effort.seconds:.1f} s{wider}")
     for words in dict.fromkeys(direction.words for direction in found.directions):
         print(f"open: {words}")
-    for line in found.doubts:
+    for line in found.warnings:
         print(f"misfit: {line}")
     print(folder / "report.html")
 
@@ -184,29 +184,30 @@ def excite(cfg: ExciteCfg) -> None:
     """Plan, record and write motions; raises as `run`."""
     import numpy as np
 
-    from jumper_warp.identification.excitation import Scorer, choose, record
-    from jumper_warp.identification.identify import total_mass
+    from jumper_warp.identification.excitation import Scorer, choose, record_motions
     from jumper_warp.identification.recording import KINDS
-    from jumper_warp.identification.replay import Replay
+    from jumper_warp.identification.replay import MotionReplay
     from jumper_warp.robot.overlay import load_overlay
     from jumper_warp.robot.values import RobotValues
     from jumper_warp.utils.output import output_dir
-    from jumper_warp.utils.runtime import announce
+    from jumper_warp.utils.runtime import configure_device
 
     cfg.noise.check()
     parameters = jumper_parameters(names(cfg.params))
     robots = RobotValues.nominal(1) if cfg.robot is None else load_overlay(cfg.robot).robots()
-    announce("cpu", cfg.threads)
-    scorer = Scorer(parameters, cfg.noise, Replay(device="cpu", threads=cfg.threads))
+    configure_device("cpu", cfg.threads)
+    scorer = Scorer(parameters, cfg.noise, MotionReplay(device="cpu", threads=cfg.threads))
     chosen = choose(scorer, KINDS * cfg.sets, candidates=cfg.candidates, seconds=cfg.seconds, seed=cfg.seed)
     rng = None if cfg.exact else np.random.default_rng([cfg.seed, 1])
     folder = output_dir("excite", cfg.out)
-    motions = record(chosen, folder, robots=robots, noise=cfg.noise, solver=cfg.solver, rng=rng, torque=cfg.torque)
+    motions = record_motions(
+        chosen, folder, robots=robots, noise=cfg.noise, solver=cfg.solver, rng=rng, torque=cfg.torque
+    )
     for motion, gain in zip(motions, chosen.gain, strict=True):
         print(f"{motion.name}: {len(motion.time) / 240.0:.2f} s, information up to here {gain:.1f} nat")
     mass = float(total_mass(robots)[0])
-    write_whole(folder / "excite.json", json_bytes({"mass_kg": mass} | chosen.to_json()))
-    sure = int((chosen.deviations < 0.5).sum())
+    write_atomically(folder / "excite.json", json_bytes({"mass_kg": mass} | chosen.to_json()))
+    sure = int((chosen.std < 0.5).sum())
     print(f"{sure} of {len(parameters)} parameters are expected to be identified; motions in {folder}")
     print(f"the recorded robot weighs {mass:.3f} kg: jumper sysid {folder} --mass {mass:.3f}")
 
@@ -218,7 +219,7 @@ def characterise(cfg: ActuatorCfg) -> None:
 
     found = characterise_motor(load_bench(cfg.bench), cfg.motor, cfg.torque_noise)
     folder = output_dir("actuator", cfg.out)
-    write_whole(folder / "actuator.json", json_bytes(found.to_json()))
+    write_atomically(folder / "actuator.json", json_bytes(found.to_json()))
     for name, (value, low, high, unit) in found.rows().items():
         print(f"{name:<16}{value:10.5g} {unit:<6} 95 % {low:.5g} … {high:.5g}")
     print(folder / "actuator.json")

@@ -179,24 +179,24 @@ def check_saving(task: TaskCfg) -> None:
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     """Train as the arguments say; modules: that the user has named, whose tasks are registered by now.
 
-    Raises as `parse_train`, `jumper_warp.policies.warm_start.load_init_policy` and `jumper_warp.rl.runner.train`.
+    Raises as `parse_train`, `jumper_warp.policies.warm_start.actor_init_from_policy` and `jumper_warp.rl.runner.train`.
     """
     parsed, task = parse_train(args)
     from jumper_warp.rl.runner import train
     from jumper_warp.tasks.mirror import mirror_of
-    from jumper_warp.utils.runtime import announce
+    from jumper_warp.utils.runtime import configure_device
 
     check_saving(task)
     if parsed.cfg.ppo.symmetry != "off":
         mirror_of(task, "actor")  # raises InputError where a term has no known mirror image
     start = None
     if parsed.cfg.init_policy and not parsed.checkpoint:
-        from jumper_warp.policies.warm_start import load_init_policy
+        from jumper_warp.policies.warm_start import actor_init_from_policy
 
-        start = load_init_policy(parsed.cfg.init_policy, task, parsed.cfg.ppo)
+        start = actor_init_from_policy(parsed.cfg.init_policy, task, parsed.cfg.ppo)
     first = os.environ.get("RANK", "0") == "0"
     if first:
-        announce(parsed.cfg.device, parsed.cfg.threads)
+        configure_device(parsed.cfg.device, parsed.cfg.threads)
     as_rsl_rl = None
     if parsed.cfg.trainer == "rsl-rl":
         from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl

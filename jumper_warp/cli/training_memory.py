@@ -29,14 +29,22 @@ ZEROS = 21
 """At most so many numbers fill up a sample's row."""
 
 
-class Need(NamedTuple):
+class MemoryNeed(NamedTuple):
     """Memory that a process needs [byte]."""
 
     fixed: int
     per_world: int
 
 
-def learning_need(cfg: PpoCfg, num_obs: int, num_critic_obs: int) -> Need:
+class MemoryPool(NamedTuple):
+    """A kind of memory: what the training needs of it, and how much is free [byte]."""
+
+    need: MemoryNeed
+    free: int
+    name: str
+
+
+def learning_need(cfg: PpoCfg, num_obs: int, num_critic_obs: int) -> MemoryNeed:
     """Return what PPO takes on the device, for networks and rollouts; num_critic_obs: the environment's, of a world.
 
     The peak is in the critic's pass over the whole rollout: the buffers, the samples as rows with their orders, the
@@ -48,7 +56,7 @@ def learning_need(cfg: PpoCfg, num_obs: int, num_critic_obs: int) -> Need:
     row = FLOAT * (num_obs + critic_obs + 2 * NUM_ACTIONS + 4 + ZEROS)
     rows = cfg.num_steps * (row * (1.0 + 1.0 / cfg.minibatches) + ORDER * cfg.epochs)
     passing = FLOAT * cfg.num_steps * (2 * critic_obs + 2 * max(cfg.hidden))
-    return Need(4 * FLOAT * weights, rollout_bytes(cfg.num_steps, num_obs, critic_obs) + int(rows) + passing)
+    return MemoryNeed(4 * FLOAT * weights, rollout_bytes(cfg.num_steps, num_obs, critic_obs) + int(rows) + passing)
 
 
 def rollout_bytes(num_steps: int, num_obs: int, num_critic_obs: int) -> int:
@@ -74,18 +82,19 @@ def check_memory(task: TaskCfg, ppo: PpoCfg, solver: SolverName, num_envs: int, 
     widths = [max(end for _, end in task.layout(group).values()) for group in ("actor", "critic")]
     learning = learning_need(ppo, *widths)
     main = free_main_memory() // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-    building = Need(0, BUILDING[solver])
+    building = MemoryNeed(0, BUILDING[solver])
     if device.type == "cuda":
-        standing = Need(learning.fixed, STANDING[solver] + learning.per_world)
+        standing = MemoryNeed(learning.fixed, STANDING[solver] + learning.per_world)
         card = torch.cuda.mem_get_info(device)[0]
-        memories = [(building, main, "main memory"), (standing, card, f"memory of {device}")]
+        pools = [MemoryPool(building, main, "main memory"), MemoryPool(standing, card, f"memory of {device}")]
     else:
-        memories = [(Need(learning.fixed, building.per_world + learning.per_world), main, "main memory")]
-    fits = [(free - need.fixed) // need.per_world for need, free, _ in memories]
+        both = MemoryNeed(learning.fixed, building.per_world + learning.per_world)
+        pools = [MemoryPool(both, main, "main memory")]
+    fits = [(pool.free - pool.need.fixed) // pool.need.per_world for pool in pools]
     fit = min(fits)
     if num_envs <= fit:
         return
-    need, free, name = memories[fits.index(fit)]
+    need, free, name = pools[fits.index(fit)]
     needed = (need.fixed + num_envs * need.per_world) / 1.0e9
     grain = ppo.minibatches // math.gcd(ppo.minibatches, ppo.num_steps)
     most = world_size() * (fit // grain * grain)

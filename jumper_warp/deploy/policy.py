@@ -1,6 +1,6 @@
-"""A policy as a robot runs it, in NumPy and onnxruntime alone: from readings to an observation, an action and targets.
+"""Policy inference on a robot with NumPy and ONNX Runtime: sensor readings to observation, action and motor targets.
 
-Of the package it needs `jumper_warp/utils/errors.py` alone. `docs/deployment.md` tells what each reading is.
+From this package it imports `jumper_warp/utils/errors.py` only. `docs/deployment.md` defines each reading.
 """
 
 from __future__ import annotations
@@ -17,24 +17,24 @@ import onnxruntime
 from jumper_warp.utils.errors import InputError
 
 COMMAND_BOUND = 4.0 * math.pi
-"""[rad] Commands are bounded to this before the filter."""
-OWN = "last_action"
-"""The term of the observation that a policy remembers itself."""
+"""[rad] Motor targets are clipped to ± this before the filter."""
+LAST_ACTION = "last_action"
+"""Term of the observation that `DeployedPolicy` fills in itself."""
 
 
 class DeployedPolicy:
-    """One policy on one robot. `targets` is a whole policy step; `observe`, `act` and `filtered` are its parts."""
+    """One policy on one robot. `targets` runs a policy step: `observe`, `act` and `filter_targets`."""
 
     def __init__(self, file: str | Path) -> None:
-        """Load `policy.onnx`, which tells all that is needed; `interface` is what it tells, as a dict.
+        """Load `policy.onnx`; its metadata becomes `interface`, a dict of the fields of `PolicyInterface`.
 
-        Raises ValueError: the file does not tell how its observation is laid out.
+        Raises ValueError: the metadata has no observation layout.
         """
         options = onnxruntime.SessionOptions()
-        options.intra_op_num_threads = 1  # small networks lose by more
+        options.intra_op_num_threads = 1  # more threads slow down small networks
         self._session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
-        entries = self._session.get_modelmeta().custom_metadata_map
-        self.interface: dict[str, Any] = json.loads(entries.get("jumper_warp", "{}"))
+        metadata = self._session.get_modelmeta().custom_metadata_map
+        self.interface: dict[str, Any] = json.loads(metadata.get("jumper_warp", "{}"))
         if not self.interface.get("observation_layout"):
             raise InputError(f"{file}: no observation_layout in its metadata: export the policy again")
         self.layout = self.interface["observation_layout"]
@@ -43,29 +43,29 @@ class DeployedPolicy:
         self.reset()
 
     def reset(self) -> None:
-        """Forget the past, as where the robot has been put down anew."""
+        """Clear last action and history; call it whenever the robot restarts."""
         self.action = np.zeros(len(self.scale), dtype=np.float32)
         self._frames: dict[str, np.ndarray] = {}
 
     def targets(self, readings: Mapping[str, Any]) -> np.ndarray:
-        """Return what the motors follow until the next policy step [rad], (12,); call every `policy_dt`.
+        """Return the motor targets until the next policy step [rad], (12,); call it every `policy_dt`.
 
-        readings: of each term of the observation but last_action, by its name; angles as the sensors read them.
+        readings: each observation term but last_action, by name; `angle` without subtracting the default pose.
         Raises ValueError: readings are missing, unknown, or of another size.
         """
         action = self.act(self.observe(readings))
-        return self.filtered(self.default + self.scale * action, readings["angle"], readings["rate"])
+        return self.filter_targets(self.default + self.scale * action, readings["angle"], readings["rate"])
 
     def observe(self, readings: Mapping[str, Any]) -> np.ndarray:
-        """Return the observation, (columns,); advances the history by a policy step. Arguments: as of `targets`."""
-        different = sorted(set(readings) ^ (set(self.layout) - {OWN}))
+        """Return the observation, (num_obs,), and advance the history by a policy step; arguments as for `targets`."""
+        different = sorted(set(readings) ^ (set(self.layout) - {LAST_ACTION}))
         if different:
             raise InputError(f"readings missing or unknown: {', '.join(different)}")
         return np.concatenate([self._term(name, term, readings) for name, term in self.layout.items()])
 
     def _term(self, name: str, term: Mapping[str, Any], readings: Mapping[str, Any]) -> np.ndarray:
-        """Return the columns of a term, its oldest frame first; at the start all frames are the first reading."""
-        value = self.action if name == OWN else np.atleast_1d(np.asarray(readings[name], dtype=np.float32))
+        """Return the columns of an observation term (an entry of `layout`), oldest frame first, at first all equal."""
+        value = self.action if name == LAST_ACTION else np.atleast_1d(np.asarray(readings[name], dtype=np.float32))
         width = (term["end"] - term["first"]) // term["history"]
         if value.shape != (width,):
             raise InputError(f"{name} takes {width} numbers, got an array of shape {value.shape}")
@@ -78,64 +78,66 @@ class DeployedPolicy:
         return self._frames[name].ravel()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action, (12,) within -1 to 1, and remember it for the next observation."""
+        """Return the action, (12,) in [-1, 1], and store it for the next observation; observation: (num_obs,)."""
         self.action = np.asarray(self._session.run(["actions"], {"obs": observation[None]})[0])[0]
         return self.action
 
-    def filtered(self, target: np.ndarray, angle: Any, rate: Any) -> np.ndarray:
-        """Return targets [rad] that give way to the limits of angles as these come near; all (12,), [rad], [rad/s].
+    def filter_targets(self, target: np.ndarray, angle: Any, rate: Any) -> np.ndarray:
+        """Return motor targets [rad], (12,), limited near the joint limits (`kernels/actuation/command_filter.py`).
 
-        It is the filter of `kernels/actuation/command_filter.py`, which states its equations.
+        target, angle: (12,) [rad]; rate: (12,) [rad/s].
         """
-        limits = self.interface["command_filter"]
+        settings = self.interface["command_filter"]
         target = np.clip(target, -COMMAND_BOUND, COMMAND_BOUND).reshape(4, 3)
         angle, rate = (np.asarray(values, dtype=np.float32).reshape(4, 3) for values in (angle, rate))
-        safe = np.empty_like(target)
+        filtered = np.empty_like(target)
         for motor, kind in enumerate(("lateral", "transversal", "transversal")):
-            safe[:, motor] = limited(target[:, motor], angle[:, motor], rate[:, motor], limits[kind], limits)
-        total = safe[:, 1] + safe[:, 2]
-        both = limited(total, angle[:, 1] + angle[:, 2], rate[:, 1] + rate[:, 2], limits["sum"], limits)
-        safe[:, 1:] += 0.5 * (both - total)[:, None]
-        return safe.ravel()
+            joint = (target[:, motor], angle[:, motor], rate[:, motor])
+            filtered[:, motor] = limit_command(*joint, settings[kind], settings)
+        total = filtered[:, 1] + filtered[:, 2]
+        sums = (total, angle[:, 1] + angle[:, 2], rate[:, 1] + rate[:, 2])
+        filtered[:, 1:] += 0.5 * (limit_command(*sums, settings["sum"], settings) - total)[:, None]
+        return filtered.ravel()
 
 
-def limited(
+def limit_command(
     command: np.ndarray, pos: np.ndarray, vel: np.ndarray, limits: Mapping[str, float], settings: Mapping[str, Any]
 ) -> np.ndarray:
-    """Return commands [rad] of quantities at `pos` [rad], `vel` [rad/s], within limits [deg] as far as these bind.
+    """Return commands [rad], pulled into the limits the sooner the joint would reach them; all arrays have one shape.
 
-    settings: horizon [s] and speed_floor [deg/s].
+    command, pos: [rad]; vel: [rad/s]; limits: lower, upper, lower_zone and upper_zone [deg]; settings: horizon [s] and
+    speed_floor [deg/s].
     """
     lower, upper, lower_zone, upper_zone = (
         np.float32(math.radians(limits[name])) for name in ("lower", "upper", "lower_zone", "upper_zone")
     )
     floor = np.float32(math.radians(settings["speed_floor"]))
-    above, below = upper - pos, pos - lower
-    left = np.minimum(above / np.maximum(vel, floor), below / np.maximum(-vel, floor))
-    weight = np.clip(1.0 - left / np.float32(settings["horizon"]), 0.0, 1.0)
-    near_upper, near_lower = above < upper_zone, below < lower_zone
+    to_upper, to_lower = upper - pos, pos - lower
+    time_to_limit = np.minimum(to_upper / np.maximum(vel, floor), to_lower / np.maximum(-vel, floor))
+    weight = np.clip(1.0 - time_to_limit / np.float32(settings["horizon"]), 0.0, 1.0)
+    near_upper, near_lower = to_upper < upper_zone, to_lower < lower_zone
     weight = np.where(near_upper | near_lower, 0.0, weight)
-    toward = (near_upper & (command > pos)) | (near_lower & (command < pos))
-    weight = np.where(toward | (above < 0.0) | (below < 0.0), 1.0, weight)
+    toward_limit = (near_upper & (command > pos)) | (near_lower & (command < pos))
+    weight = np.where(toward_limit | (to_upper < 0.0) | (to_lower < 0.0), 1.0, weight)
     return command + weight.astype(np.float32) * (np.clip(command, lower, upper) - command)
 
 
 class JumpCommand:
-    """`jump_command` of jumps to heights: 1 from `give` on until the robot has landed, else 0."""
+    """State of the observation term `jump_command` of vertical jumps: 1 from `request` until the landing, else 0."""
 
     def __init__(self, takeoff_speed: float = 0.75) -> None:
-        """Begin without a command; takeoff_speed [m/s]: upward, that a flight begins with."""
+        """Start without a request; takeoff_speed: least upward speed [m/s] that counts as a takeoff."""
         self._takeoff_speed = takeoff_speed
-        self.wanted, self.in_flight = False, False
+        self.requested, self.in_flight = False, False
 
-    def give(self) -> None:
-        """Ask for a jump."""
-        self.wanted = True
+    def request(self) -> None:
+        """Request a jump."""
+        self.requested = True
 
     def update(self, up: float, paws_down: int) -> float:
-        """Return the command of this policy step, before `targets`; up [m/s]: velocity of the base, world z."""
+        """Return `jump_command` for `targets`; up: vertical velocity of the base in the world frame [m/s]."""
         if self.in_flight and paws_down > 0:
-            self.wanted, self.in_flight = False, False
+            self.requested, self.in_flight = False, False
         elif paws_down == 0 and up > self._takeoff_speed:
             self.in_flight = True
-        return float(self.wanted)
+        return float(self.requested)

@@ -1,4 +1,4 @@
-"""Gradients by mass, centre of mass and inertia of the bodies, from those by the parameter table's mass moments."""
+"""Gradients by mass, centre of mass and inertia of the bodies, by the chain rule from the parameter table's moments."""
 
 from __future__ import annotations
 
@@ -7,33 +7,33 @@ import numpy as np
 from jumper_warp.kernels.layout import BASE, BODIES, LEG_BODIES, LEG_ROWS, MOMENT_ROWS
 
 PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
-"""Axes of packed second moments and inertias."""
+"""Entries of packed second moments and inertias: xx, yy, zz, xy, xz, yz."""
 
 
 def moment_rows(body: int) -> slice:
-    """Return the rows of the parameter table that hold a body's mass moments; bodies as in the model."""
+    """Return the rows of the parameter table with the mass moments of a body; bodies are numbered as in the model."""
     leg, link = divmod(body - 1, int(LEG_BODIES))
     first = int(BASE) if body == 0 else leg * int(LEG_ROWS) + link * MOMENT_ROWS
     return slice(first, first + MOMENT_ROWS)
 
 
 def body_gradients(table: np.ndarray, gradient: np.ndarray) -> dict[str, np.ndarray]:
-    """Return gradients by each body's mass [kg], com [m] and inertia about it [kg m^2] in the axes of its link.
+    """Return gradients by each body's mass [kg], com [m] and inertia about its com [kg m^2], in link axes.
 
-    table, gradient: parameter table and gradient by it, (321, num_worlds). With first moments m c and second moments
-    S = 1/2 tr(I) 1 - I + m c c^T (parallel axes). Returned: mass (21, num_worlds), com (21, 3, num_worlds), inertia
-    (21, 6, num_worlds): xx, yy, zz, and by an xy, xz and yz that are entries of both halves.
+    table, gradient: parameter table and gradient by it, (321, num_worlds). The table holds first moments m c and second
+    moments S = 1/2 tr(I) 1 - I + m c c^T (parallel axes). Returned: mass (21, num_worlds), com (21, 3, num_worlds),
+    inertia (21, 6, num_worlds): xx, yy, zz, xy, xz, yz, an off-diagonal one changing both of its entries.
     """
     worlds = table.shape[1]
     mass = np.zeros((int(BODIES), worlds))
     com, inertia = np.zeros((int(BODIES), 3, worlds)), np.zeros((int(BODIES), 6, worlds))
     for body in range(int(BODIES)):
         rows = moment_rows(body)
-        moments, by = table[rows].astype(float), gradient[rows].astype(float)
+        moments, by_moments = table[rows].astype(float), gradient[rows].astype(float)
         c = moments[1:4] / moments[0]
-        by_second = by[4:10]
-        mass[body] = by[0] + np.sum(c * by[1:4], axis=0)
-        com[body] = moments[0] * by[1:4]
+        by_second = by_moments[4:10]
+        mass[body] = by_moments[0] + np.sum(c * by_moments[1:4], axis=0)
+        com[body] = moments[0] * by_moments[1:4]
         for (i, j), s in zip(PAIRS, by_second, strict=True):
             mass[body] += s * c[i] * c[j]
             com[body, i] += moments[0] * s * c[j]

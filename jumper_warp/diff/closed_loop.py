@@ -1,7 +1,7 @@
-"""Robots under a policy, with gradients: what a policy sees is computed from the simulated state, in PyTorch.
+"""Differentiable closed loop of a policy and the simulation, with observations computed in PyTorch.
 
-An environment gives robots, commands, noise and all values; a `Rollout` of the same robots beside it gives the
-derivatives of every policy step by the action and by the state before.
+An environment provides robots, commands, noise and all values; a `Rollout` of the same robots provides the derivatives
+of every policy step by the action and by the previous state.
 """
 
 from __future__ import annotations
@@ -19,33 +19,34 @@ from jumper_warp.diff.torch_rollout import simulate
 from jumper_warp.utils.errors import InputError
 
 DOWN = (0.0, 0.0, -1.0)
+"""Direction of gravity, world axes."""
 
 
 class LoopState(NamedTuple):
-    """What the next policy step depends on, worlds last, in the layout of `jumper_warp.diff.rollout.Trajectory`."""
+    """State at the beginning of a policy step, worlds last, in the layout of `jumper_warp.diff.rollout.Trajectory`."""
 
     q: torch.Tensor
     """(19, num_worlds) [m], xyzw, [rad]"""
     qd: torch.Tensor
     """(18, num_worlds) [m/s], [rad/s]"""
-    before: torch.Tensor
-    """(12, num_worlds) [rad] Filtered targets of the step before."""
+    initial_target: torch.Tensor
+    """(12, num_worlds) [rad] Filtered targets of the last policy step."""
     impulse: torch.Tensor
-    """(4, num_worlds, 3) [N s] On the paws in the last physics step; carries no gradient."""
+    """(4, num_worlds, 3) [N s] Contact impulses in the last physics step; has no gradient."""
     action: torch.Tensor
-    """(12, num_worlds) Of the step before, within ±1."""
+    """(12, num_worlds) Of the last policy step, within ±1."""
     torque: torch.Tensor
     """(12, num_worlds) [N m] Of the last physics step."""
-    past: torch.Tensor
-    """(earlier columns, num_worlds) What the policy saw in the steps before, of terms with a history, oldest first."""
+    history: torch.Tensor
+    """(columns, num_worlds) Earlier frames of the policy's terms with a history, oldest first."""
 
     def detach(self) -> LoopState:
-        """Return the same without gradients."""
+        """Return the state without gradients."""
         return LoopState(*(tensor.detach() for tensor in self))
 
 
-class Motion(NamedTuple):
-    """The base and the motors in the terms of observations and rewards, worlds first."""
+class RobotState(NamedTuple):
+    """Base and motors as observations and rewards use them, worlds first."""
 
     pos: torch.Tensor
     """(num_worlds, 3) [m] Base origin, world axes."""
@@ -63,41 +64,41 @@ class Motion(NamedTuple):
     """(num_worlds, 12) [rad/s]"""
 
 
-def rotated_back(quat: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-    """Return vectors (n, 3) in the body axes of orientations (n, 4), xyzw."""
+def rotate_inverse(quat: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+    """Return world vectors (n, 3) in the body axes of orientations (n, 4), xyzw."""
     u, w = -quat[:, :3], quat[:, 3:]
     twice = 2.0 * torch.linalg.cross(u, v)
     return v + w * twice + torch.linalg.cross(u, twice)
 
 
-def rotated(quat: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-    """Return body vectors (n, 3) in world axes, for orientations (n, 4), xyzw."""
-    return rotated_back(quat * quat.new_tensor([-1.0, -1.0, -1.0, 1.0]), v)
+def rotate(quat: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
+    """Return body vectors (n, 3) in world axes, given orientations (n, 4), xyzw."""
+    return rotate_inverse(quat * quat.new_tensor([-1.0, -1.0, -1.0, 1.0]), v)
 
 
 def heading_of(quat: torch.Tensor) -> torch.Tensor:
     """Return the yaw [rad] (n,) of orientations (n, 4), xyzw: the heading of body x in the world plane."""
-    ahead = rotated(quat, quat.new_tensor([1.0, 0.0, 0.0]).expand(len(quat), 3))
+    ahead = rotate(quat, quat.new_tensor([1.0, 0.0, 0.0]).expand(len(quat), 3))
     return torch.atan2(ahead[:, 1], ahead[:, 0])
 
 
-def anchored(value: torch.Tensor, computed: torch.Tensor) -> torch.Tensor:
-    """Return the value with the derivatives of what was computed."""
+def with_gradient_of(value: torch.Tensor, computed: torch.Tensor) -> torch.Tensor:
+    """Return `value` with the derivatives of `computed`, of the same shape."""
     return value + (computed - computed.detach())
 
 
 class ClosedLoop:
-    """The robots of an environment with gradients.
+    """Differentiable policy steps and observations of the robots of an environment.
 
-    `advance` and `observe` are functions of tensors, in single or double precision; `step` moves the environment too,
-    and gives its values with their derivatives.
+    `advance` and `observe` are functions of tensors, in single or double precision; `step` also steps the environment
+    and returns its values with derivatives.
     """
 
     def __init__(self, env: Any, *, double: bool = False) -> None:
-        """Take the robots of a `jumper_warp.envs.env.Env` as they are; see `read_parameters`.
+        """Copy the robots of a `jumper_warp.envs.env.Env`; see `read_parameters`.
 
-        Raises InputError: several tasks, another solver, drawn blocks, late sensors, or a history of what is not the
-        robot's state alone.
+        Raises InputError: several tasks, another solver, moving blocks, sensor latency, or a history of a term that is
+        not a function of the robot's state alone.
         """
         robots: Snapshot = env.snapshot()
         self.task = task = robots.tasks[0]
@@ -107,67 +108,69 @@ class ClosedLoop:
             raise InputError("gradients need a ground without moving blocks: train with level ground")
         if task.randomization.observation_latency:
             raise InputError(f"{task.name}: gradients need observations without latency")
-        for term in (*task.observations.actor, *task.observations.critic):
-            if term.options["history"] > 1 and (term.func.key not in OWN or term not in task.observations.actor):
+        actor = task.observations.actor
+        for term in (*actor, *task.observations.critic):
+            if term.options["history"] > 1 and (term.func.key not in STATE_TERMS or term not in actor):
                 raise InputError(f"{task.name}: gradients of a history need one of the robot's state, not {term.name}")
         self.env, self.num_worlds = env, env.num_envs
         self.rollout = Rollout(
             robots.model, task.motors, task.command_filter, double=double, dt=robots.dt, substeps=robots.substeps
         )
         self.dtype = torch.float64 if double else torch.float32
-        self.draws = bool(task.params.slots["events"])
-        """Whether resets draw other robots."""
+        self.randomizes = bool(task.params.slots["events"])
+        """Whether resets randomise the robots."""
         self.layout = task.layout("actor")
         self._columns = {
             group: [(term, *task.layout(group)[term.name]) for term in getattr(task.observations, group)]
             for group in task.groups
         }
-        self._remembered = [entry for entry in self._columns["actor"] if entry[0].options["history"] > 1]
+        self._history_terms = [entry for entry in self._columns["actor"] if entry[0].options["history"] > 1]
         lateral, transversal = (math.radians(scale) for scale in task.action_scale)
         like = {"dtype": self.dtype, "device": env.device}
         self.scale = torch.tensor(4 * [lateral, transversal, transversal], **like)
-        """(12,) [rad]"""
+        """(12,) [rad] Of an action of 1."""
         self.default = robots.default_angle.to(**like)
-        """(12,) [rad]"""
+        """(12,) [rad] Motor angles of a zero action."""
         self.read_parameters()
 
     def read_parameters(self) -> dict[str, torch.Tensor]:
-        """Take over masses, motors, friction and latency of the environment's robots; return them by name."""
+        """Copy the robots' masses, motors, friction and latency into the rollout; return them by name."""
         robots: Snapshot = self.env.snapshot()
-        found = {name: tensor.to(self.dtype, copy=True) for name, tensor in robots.parameters.items()}
-        for name, tensor in found.items():
+        parameters = {name: tensor.to(self.dtype, copy=True) for name, tensor in robots.parameters.items()}
+        for name, tensor in parameters.items():
             wp.to_torch(self.rollout.parameters[name]).copy_(tensor)
         self.com = robots.com.to(self.dtype, copy=True)
-        self.offset = found["offset"].T
-        return found
+        self.offset = parameters["offset"].T
+        return parameters
 
     def state(self) -> LoopState:
         """Return the environment's state, without gradients."""
         now: Snapshot = self.env.snapshot()
-        parts = (now.q, now.qd, now.before, now.impulse, now.action, now.torque, self._earlier(self.env.obs))
+        history = self._history_of(self.env.obs)
+        parts = (now.q, now.qd, now.initial_target, now.impulse, now.action, now.torque, history)
         return LoopState(*(part.to(self.dtype, copy=True).contiguous() for part in parts))
 
-    def _earlier(self, obs: torch.Tensor) -> torch.Tensor:
-        """Return the frames before the last of all terms that have some, as `LoopState.past`."""
-        ends = [(first, end - term.width) for term, first, end in self._remembered]
+    def _history_of(self, obs: torch.Tensor) -> torch.Tensor:
+        """Return `LoopState.history` from the policy's observation (num_worlds, columns)."""
+        ends = [(first, end - term.width) for term, first, end in self._history_terms]
         return torch.cat([obs[:, first:last] for first, last in ends] or [obs[:, :0]], 1).T
 
-    def _pasts(self, state: LoopState) -> list[torch.Tensor]:
-        """Return the earlier frames of each term that has some, (num_worlds, columns)."""
-        counts = [end - first - term.width for term, first, end in self._remembered]
-        return list(state.past.T.split(counts, 1)) if counts else []
+    def _histories(self, state: LoopState) -> list[torch.Tensor]:
+        """Return the earlier frames of each term with a history, (num_worlds, columns)."""
+        counts = [end - first - term.width for term, first, end in self._history_terms]
+        return list(state.history.T.split(counts, 1)) if counts else []
 
-    def _aged(self, state: LoopState) -> torch.Tensor:
-        """Return the earlier frames of the state that follows: those of this state without the oldest, and its own."""
-        motion, found = self.motion(state), []
-        for (term, _, _), past in zip(self._remembered, self._pasts(state), strict=True):
-            found += [past[:, term.width :], self._frame(term, motion, state, past[:, : term.width])]
-        return torch.cat(found, 1).T if found else state.past
+    def _next_history(self, state: LoopState) -> torch.Tensor:
+        """Return the history of the next state: the oldest frame is dropped and this state's frame added."""
+        motion, frames = self.motion(state), []
+        for (term, _, _), past in zip(self._history_terms, self._histories(state), strict=True):
+            frames += [past[:, term.width :], self._frame(term, motion, state, past[:, : term.width])]
+        return torch.cat(frames, 1).T if frames else state.history
 
-    def _frame(self, term: Any, motion: Motion, state: LoopState, told: torch.Tensor) -> torch.Tensor:
-        """Return what a term shows of a state; told: as the environment shows it."""
+    def _frame(self, term: Any, motion: RobotState, state: LoopState, observed: torch.Tensor) -> torch.Tensor:
+        """Return a term's observation of a state, (num_worlds, width); observed: the environment's."""
         scale, clip = term.numbers["scale"], term.numbers["clip"]
-        return scale * SEEN[term.func.key](self, motion, state, told / scale).clamp(-clip, clip)
+        return scale * SMOOTH_TERMS[term.func.key](self, motion, state, observed / scale).clamp(-clip, clip)
 
     def advance(
         self,
@@ -176,99 +179,99 @@ class ClosedLoop:
         wrench: torch.Tensor | None = None,
         parameters: dict[str, torch.Tensor] | None = None,
     ) -> LoopState:
-        """Return the state a policy step later.
+        """Return the state after one policy step.
 
         action: (num_worlds, 12), clamped to ±1; latencies are at most a policy step. wrench: (6, num_worlds) [N],
-        [N m] on the base. parameters: as `read_parameters` returned them, kept for the reverse pass; by default those
-        that the rollout has now.
+        [N m] on the base. parameters: of `read_parameters`, which the reverse pass restores; by default the rollout's
+        present ones.
         """
         clamped = action.clamp(-1.0, 1.0).T
         targets = clamped * self.scale[:, None] + self.default[:, None]
-        made = simulate(
-            self.rollout, targets[None], state.q, state.qd, before=state.before, impulse=state.impulse,
-            wrench=None if wrench is None else wrench[None], trusted=True, **(parameters or {}),
+        trajectory = simulate(
+            self.rollout, targets[None], state.q, state.qd, initial_target=state.initial_target,
+            impulse=state.impulse, wrench=None if wrench is None else wrench[None], trusted=True, **(parameters or {}),
         )  # fmt: skip
-        impulse = made.impulse[-1].detach()
-        return LoopState(made.q[-1], made.qd[-1], made.safe[-1], impulse, clamped, made.torque[-1], self._aged(state))
+        end, history = trajectory.end(), self._next_history(state)
+        return LoopState(**end, action=clamped, torque=trajectory.torque[-1], history=history)
 
-    def motion(self, state: LoopState) -> Motion:
-        """Return base and motors of a state."""
+    def motion(self, state: LoopState) -> RobotState:
+        """Return base and motors of a state, worlds first."""
         q, qd = state.q.T, state.qd.T
         quat = q[:, 3:7] / q[:, 3:7].norm(dim=1, keepdim=True)
         ang = qd[:, 3:6]
-        lin_vel = qd[:, :3] - torch.linalg.cross(ang, rotated(quat, self.com))
-        gravity = rotated_back(quat, q.new_tensor(DOWN).expand(len(q), 3))
-        return Motion(q[:, :3], quat, lin_vel, rotated_back(quat, ang), gravity, q[:, 7:], qd[:, 6:])
+        lin_vel = qd[:, :3] - torch.linalg.cross(ang, rotate(quat, self.com))
+        gravity = rotate_inverse(quat, q.new_tensor(DOWN).expand(len(q), 3))
+        return RobotState(q[:, :3], quat, lin_vel, rotate_inverse(quat, ang), gravity, q[:, 7:], qd[:, 6:])
 
-    def observe(self, state: LoopState, told: torch.Tensor, group: str = "actor") -> torch.Tensor:
-        """Return what the policy, or the critic, sees of a state, (num_worlds, columns), without noise.
+    def observe(self, state: LoopState, observed: torch.Tensor, group: str = "actor") -> torch.Tensor:
+        """Return the observation of a group at a state, (num_worlds, columns), without noise.
 
-        told: (num_worlds, columns), of which those that are not of the robot's state, such as commands, are taken.
+        observed: the environment's, (num_worlds, columns), for columns that do not depend on the robot's state, such as
+        commands.
         """
-        motion, columns, pasts = self.motion(state), [], iter(self._pasts(state))
+        motion, columns, histories = self.motion(state), [], iter(self._histories(state))
         for term, first, end in self._columns[group]:
-            value = told[:, first:end].to(self.dtype)
+            value = observed[:, first:end].to(self.dtype)
             if term.options["history"] > 1:
-                columns.append(next(pasts))
+                columns.append(next(histories))
                 value = value[:, -term.width :]
-            columns.append(self._frame(term, motion, state, value) if term.func.key in SEEN else value)
+            columns.append(self._frame(term, motion, state, value) if term.func.key in SMOOTH_TERMS else value)
         return torch.cat(columns, 1)
 
     def step(self, state: LoopState, action: torch.Tensor) -> tuple[LoopState, LoopState]:
-        """Let the environment make a policy step from the state that it has; return the next state twice.
+        """Step the environment; return the next state, and the rollout's state before any reset.
 
-        The first is of worlds as they go on, with the environment's values; a world that has begun a new episode has
-        no gradient. The second is that of the rollout, where no episode has ended.
-        action: (num_worlds, 12); state: of the environment, as `state` or the step before returned it.
+        The next state has the environment's values with derivatives; a world with a new episode has no gradient.
+        action: (num_worlds, 12); state: the environment's present one, from `state` or the last `step`.
         """
         env = self.env
-        parameters = self.read_parameters() if self.draws else None
+        parameters = self.read_parameters() if self.randomizes else None
         env.step(action.detach())
         wrench = None
-        if self.draws:
+        if self.randomizes:
             wrench = env.snapshot().wrench.to(self.dtype).contiguous()
-        made, now = self.advance(state, action, wrench, parameters), self.state()
-        begun = env.done > 0.0 if env.auto_reset else torch.zeros_like(env.done, dtype=torch.bool)
+        simulated, now = self.advance(state, action, wrench, parameters), self.state()
+        reset = env.done > 0.0 if env.auto_reset else torch.zeros_like(env.done, dtype=torch.bool)
         parts = []
-        for name, value, computed in zip(LoopState._fields, now, made, strict=True):
-            mask = begun[None, :, None] if name == "impulse" else begun[None]
-            parts.append(torch.where(mask, value, anchored(value, computed)))
-        if self.draws:
+        for name, value, computed in zip(LoopState._fields, now, simulated, strict=True):
+            mask = reset[None, :, None] if name == "impulse" else reset[None]
+            parts.append(torch.where(mask, value, with_gradient_of(value, computed)))
+        if self.randomizes:
             self.read_parameters()
-        return LoopState(*parts), made
+        return LoopState(*parts), simulated
 
-    def seen(self, state: LoopState) -> torch.Tensor:
-        """Return the environment's observation, noise included, with its derivatives by the state."""
-        return anchored(self.env.obs.to(self.dtype), self.observe(state, self.env.obs))
+    def observation(self, state: LoopState) -> torch.Tensor:
+        """Return the environment's observation, with its noise, and its derivatives by the state."""
+        return with_gradient_of(self.env.obs.to(self.dtype), self.observe(state, self.env.obs))
 
 
-def _way(loop: ClosedLoop, motion: Motion, state: LoopState, told: torch.Tensor) -> torch.Tensor:
-    """Return the way to the goal that the environment tells, as a function of where the base is."""
+def _goal_offset(loop: ClosedLoop, motion: RobotState, state: LoopState, observed: torch.Tensor) -> torch.Tensor:
+    """Return the observed offset to the goal (n, 2) [m], body yaw frame, as a function of the base's position."""
     heading = heading_of(motion.quat)
     cos, sin = torch.cos(heading), torch.sin(heading)
     axes = torch.stack([torch.stack([cos, sin], 1), torch.stack([-sin, cos], 1)], 1)
-    goal = motion.pos[:, :2].detach() + torch.einsum("nij,ni->nj", axes.detach(), told)
-    way = torch.einsum("nij,nj->ni", axes, goal - motion.pos[:, :2])
-    return torch.where((told == 0.0).all(1, keepdim=True), told, way)
+    goal = motion.pos[:, :2].detach() + torch.einsum("nij,ni->nj", axes.detach(), observed)
+    offset = torch.einsum("nij,nj->ni", axes, goal - motion.pos[:, :2])
+    return torch.where((observed == 0.0).all(1, keepdim=True), observed, offset)
 
 
-def _height_errors(loop: ClosedLoop, motion: Motion, state: LoopState, told: torch.Tensor) -> torch.Tensor:
-    """Return the misses of height as told, the ballistic one with its derivatives."""
+def _height_errors(loop: ClosedLoop, motion: RobotState, state: LoopState, observed: torch.Tensor) -> torch.Tensor:
+    """Return the observed height errors (n, 2), the ballistic one with derivatives."""
     apex = motion.pos[:, 2] + motion.lin_vel[:, 2].clamp(min=0.0).square() / (2.0 * loop.task.gravity)
-    return torch.stack([told[:, 0], anchored(told[:, 1], apex)], 1)
+    return torch.stack([observed[:, 0], with_gradient_of(observed[:, 1], apex)], 1)
 
 
-SEEN: dict[str, Callable[..., torch.Tensor]] = {
-    "goal": _way,
+SMOOTH_TERMS: dict[str, Callable[..., torch.Tensor]] = {
+    "goal": _goal_offset,
     "height_errors": _height_errors,
-    "height": lambda loop, motion, state, told: motion.pos[:, 2:],
-    "lin_vel": lambda loop, motion, state, told: rotated_back(motion.quat, motion.lin_vel),
-    "ang_vel": lambda loop, motion, state, told: motion.ang_vel,
-    "gravity": lambda loop, motion, state, told: motion.gravity,
-    "angle": lambda loop, motion, state, told: motion.angle + loop.offset - loop.default,
-    "rate": lambda loop, motion, state, told: motion.rate,
-    "last_action": lambda loop, motion, state, told: state.action.T,
+    "height": lambda loop, motion, state, observed: motion.pos[:, 2:],
+    "lin_vel": lambda loop, motion, state, observed: rotate_inverse(motion.quat, motion.lin_vel),
+    "ang_vel": lambda loop, motion, state, observed: motion.ang_vel,
+    "gravity": lambda loop, motion, state, observed: motion.gravity,
+    "angle": lambda loop, motion, state, observed: motion.angle + loop.offset - loop.default,
+    "rate": lambda loop, motion, state, observed: motion.rate,
+    "last_action": lambda loop, motion, state, observed: state.action.T,
 }
-"""Observation terms of the robot's state, by name; the height is that above level ground."""
-OWN = frozenset(SEEN) - {"goal", "height_errors"}
-"""Those of the robot's state alone."""
+"""Differentiable observation terms by name; the height is above level ground."""
+STATE_TERMS = frozenset(SMOOTH_TERMS) - {"goal", "height_errors"}
+"""Terms that depend on the robot's state alone."""

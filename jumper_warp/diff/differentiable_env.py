@@ -1,4 +1,4 @@
-"""An environment whose observations and rewards carry derivatives by the actions before."""
+"""Environment whose observations and rewards have derivatives by earlier actions."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ from typing import Any
 
 import torch
 
-from jumper_warp.diff.closed_loop import ClosedLoop, LoopState, anchored
-from jumper_warp.diff.smooth_rewards import SMOOTH, make_moment, smooth_reward
+from jumper_warp.diff.closed_loop import ClosedLoop, LoopState, with_gradient_of
+from jumper_warp.diff.smooth_rewards import SMOOTH, make_context, smooth_reward
 from jumper_warp.utils.errors import InputError
 
 WORLD_NORM = 100.0
-"""Longest gradient that a world's state passes on from a policy step to the one before."""
+"""Largest norm of a world's gradient between policy steps."""
 
 
 class DifferentiableEnv:
-    """An environment with all that it has, and gradients: see `jumper_warp.envs.vec_env.DifferentiableVecEnv`."""
+    """Environment with gradients, see `jumper_warp.envs.vec_env.DifferentiableVecEnv`; delegates to the wrapped one."""
 
     def __init__(self, env: Any, world_norm: float = WORLD_NORM) -> None:
         """Wrap a `jumper_warp.envs.env.Env`.
 
-        world_norm: longest gradient by a world's positions, and by its velocities, that is passed on.
+        world_norm: largest norm of the gradient by each part of a world's state that is passed to the step before.
         Raises InputError: as `ClosedLoop`, or no reward has a derivative.
         """
         self.env, self.loop, self.world_norm = env, ClosedLoop(env), world_norm
@@ -31,56 +31,58 @@ class DifferentiableEnv:
         self._final: LoopState
 
     def __getattr__(self, name: str) -> Any:
-        """Return what the environment has of that name."""
+        """Return an attribute of the wrapped environment."""
         return getattr(self.env, name)
 
     def begin_window(self) -> None:
-        """Forget what the present depends on."""
+        """Start a window: the present state becomes a constant."""
         self._state = self.loop.state()
 
     def observe(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return `obs` and `critic_obs` with their derivatives."""
-        return self._anchored(self._state, self.env.obs, self.env.critic_obs)
+        return self._observe_both(self._state, self.env.obs, self.env.critic_obs)
 
     def observe_final(self) -> tuple[torch.Tensor, torch.Tensor]:
         """Return `final_obs` and `final_critic_obs` of the last step with their derivatives."""
-        return self._anchored(self._final, self.env.final_obs, self.env.final_critic_obs)
+        return self._observe_both(self._final, self.env.final_obs, self.env.final_critic_obs)
 
-    def _anchored(
+    def _observe_both(
         self, state: LoopState, obs: torch.Tensor, critic_obs: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
         """Return observations of both networks with their derivatives by a state."""
         observe = self.loop.observe
-        return anchored(obs, observe(state, obs)), anchored(critic_obs, observe(state, critic_obs, "critic"))
+        return with_gradient_of(obs, observe(state, obs)), with_gradient_of(
+            critic_obs, observe(state, critic_obs, "critic")
+        )
 
     def step_with_gradient(self, action: torch.Tensor) -> torch.Tensor:
-        """Make a policy step; return the reward (num_envs,) with the derivatives of its smooth terms.
+        """Step the environment; return the reward (num_envs,) with the derivatives of its smooth terms.
 
-        The last reward of an episode has none. A window must have begun, and no other step been made since.
+        The last reward of an episode has none. Call `begin_window` first, and no other `step` in a window.
         """
         env, old = self.env, self._state
-        state, made = self.loop.step(old, action)
-        made = self._final = LoopState(*(self._kept(part) for part in made))
-        smooth = smooth_reward(self.loop.task, make_moment(self.loop, made, old, env.task_arrays()))
+        state, final = self.loop.step(old, action)
+        final = self._final = LoopState(*(self._clip_gradient(part) for part in final))
+        smooth = smooth_reward(self.loop.task, make_context(self.loop, final, old, env.task_arrays()))
         smooth = torch.where((env.done == 0.0) & smooth.isfinite(), smooth, 0.0)
-        self._state = LoopState(*(self._kept(part) for part in state))
-        return anchored(env.reward.clone(), smooth)
+        self._state = LoopState(*(self._clip_gradient(part) for part in state))
+        return with_gradient_of(env.reward.clone(), smooth)
 
-    def _kept(self, part: torch.Tensor) -> torch.Tensor:
-        """Let a part of the state pass on finite gradients, of bounded length for each world."""
+    def _clip_gradient(self, part: torch.Tensor) -> torch.Tensor:
+        """Return a part of the state whose gradient is clipped to a norm in each world; NaN becomes 0."""
         if not part.requires_grad:
             return part
-        part = part * 1.0  # a tensor of its own, whose gradient is the sum of all
-        part.register_hook(limited(self.world_norm))
+        part = part * 1.0  # a new tensor, whose gradient sums all uses
+        part.register_hook(clip_norm(self.world_norm))
         return part
 
 
-def limited(longest: float) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return what shortens the gradient of each world, the last axis, to a length, and a non-finite one to 0."""
+def clip_norm(max_norm: float) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Return a hook that clips the gradient of each world (last axis) to a norm, and a non-finite one to 0."""
 
-    def limit(grad: torch.Tensor) -> torch.Tensor:
+    def clip(grad: torch.Tensor) -> torch.Tensor:
         grad = torch.where(grad.isfinite().all(0, keepdim=True), grad, 0.0)
         length = grad.norm(dim=0, keepdim=True)
-        return grad * (longest / length.clamp(min=1.0e-30)).clamp(max=1.0)
+        return grad * (max_norm / length.clamp(min=1.0e-30)).clamp(max=1.0)
 
-    return limit
+    return clip

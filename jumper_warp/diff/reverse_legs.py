@@ -1,4 +1,4 @@
-"""The reverse pass of a rollout where a thread has a leg: a few rows at a time, in four launches."""
+"""Reverse pass of a rollout with a thread per leg: four launches for every few rows."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ import warp as wp
 from jumper_warp.sim.dynamics import JumperDynamics
 
 SPAN = 4
-"""Rows whose steps are taken at a time."""
+"""Rows that one set of launches reverses."""
 
 
-class LegReverse:
-    """Launches `jumper_warp.kernels.dynamics.adjoint.rollout_legs_adjoint` and `constants_adjoint`."""
+class LegThreadReverse:
+    """Launches the kernels of `jumper_warp.kernels.dynamics.adjoint.rollout_legs_adjoint` and `constants_adjoint`."""
 
     def __init__(self, dynamics: JumperDynamics, every: int):
-        """Allocate; every: physics steps from row to row."""
+        """Allocate the record of `SPAN` rows; every: physics steps between rows."""
         self._dynamics, self._modules = dynamics, dynamics.modules
         self._device, self._num = dynamics.model.device, dynamics.model.world_count
         module, shape = self._modules.leg_record, {"dtype": dynamics.real, "device": self._device}
@@ -25,16 +25,16 @@ class LegReverse:
         self._record.base = wp.zeros((entries, int(module.BASE_FIELDS), self._num), **shape)
         self._record.legs = wp.zeros((entries, int(module.LEG_FIELDS), self._num, 4), **shape)
 
-    def run(self, settings: Any, motion: list[Any], seeds: Any, gradients: Any) -> None:
-        """Add to `gradients`, whose q and qd hold the seeds of the last row.
+    def run(self, settings: Any, motion: list[Any], cotangents: Any, gradients: Any) -> None:
+        """Add to the kernels' `Gradients`, whose q and qd hold the cotangents of the last row.
 
         settings: `StepSettings`. motion: `Timing`, `Actuation`, `Commands`, filtered targets, `Rows` of the rollout.
-        seeds: gradient by these rows.
+        cotangents: `Rows`, the gradient of the loss by those of the rollout.
         """
         robot, record, num = self._dynamics.robot, self._record, self._num
         legs, constants = self._modules.rollout_legs_adjoint, self._modules.constants_adjoint
         timing, *actuated, rows = motion
-        turns = 8 if self._device.is_cuda else 1  # a warp of a GPU has eight worlds, or eight steps of one
+        turns = 8 if self._device.is_cuda else 1  # a GPU warp holds eight worlds, or eight steps of one world
         threads = -(-num // 8) * 8
 
         def launch(kernel: wp.Kernel, dim: tuple[int, ...], *inputs: Any) -> None:
@@ -44,12 +44,14 @@ class LegReverse:
             span = legs.Span()
             span.begin, span.end = max(0, end - SPAN), end
             launch(legs.replay_legs_kernel, (end - span.begin, threads), num, robot, settings, *motion, span, record)
-            launch(legs.reverse_legs_kernel, (threads,), num, robot, settings, *motion, seeds, span, record, gradients)
+            launch(
+                legs.reverse_legs_kernel, (threads,), num, robot, settings, *motion, cotangents, span, record, gradients
+            )
             launch(
                 constants.leg_constants_kernel, (num, turns),
-                turns, robot, settings, timing, rows, seeds, span, record, gradients,
+                turns, robot, settings, timing, rows, cotangents, span, record, gradients,
             )  # fmt: skip
             launch(
                 constants.motor_constants_kernel, (num, turns),
-                turns, settings, timing, *actuated, seeds, span, record, gradients,
+                turns, settings, timing, *actuated, cotangents, span, record, gradients,
             )  # fmt: skip

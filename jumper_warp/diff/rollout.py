@@ -1,8 +1,8 @@
-"""Batches of rollouts with gradients: policy steps of filter, latency, motors and physics, forwards and backwards.
+"""Batched rollouts with gradients: forward and reverse passes through filter, latency, motors and physics.
 
-A rollout of all worlds is one launch, and so is its reverse pass, on a CPU one for each thread; on a GPU the reverse
-pass is four launches for every few policy steps (`reverse_legs`). Nothing but a row of the state every few physics
-steps and the paws' impulses is kept in between; see `jumper_warp.kernels.dynamics.adjoint.step_adjoint`.
+A forward pass is one launch for all worlds, as is a reverse pass (on a CPU one per thread); on a GPU the reverse pass
+is four launches per few policy steps (`reverse_legs`). Between the passes only a row of the state every few physics
+steps and the paws' impulses are stored; see `jumper_warp.kernels.dynamics.adjoint.step_adjoint`.
 """
 
 from __future__ import annotations
@@ -16,11 +16,17 @@ from typing import Any
 import numpy as np
 import warp as wp
 
-from jumper_warp.diff.actuation import MOTOR_CONSTANTS, filter_rows
-from jumper_warp.diff.reverse_legs import LegReverse
+from jumper_warp.diff.reverse_legs import LegThreadReverse
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.model import PHYSICS_DT
-from jumper_warp.robot.motors import FilterCfg, MotorCfg, jumping_motors, motor_arrays
+from jumper_warp.robot.motors import (
+    MOTOR_CONSTANTS,
+    FilterCfg,
+    MotorCfg,
+    filter_constants,
+    jumping_motors,
+    motor_arrays,
+)
 from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.simulation import SUBSTEPS, motor_values
 from jumper_warp.sim.slices import WorldRange, slices_of
@@ -28,16 +34,16 @@ from jumper_warp.sim.solver import check_step
 from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
-from jumper_warp.utils.threads import checked_threads, run_side_by_side
+from jumper_warp.utils.threads import checked_threads, run_in_parallel
 
 MAX_SWEEPS = 200
-"""Most sweeps of the contact iteration in a step."""
+"""Sweeps of the contact iteration in a step, at most."""
 TOLERANCE = 1.0e-6
-"""[m/s] Of the contact iteration in single precision. Gradients inherit its error."""
+"""[m/s] Of the contact iteration in single precision; gradients inherit its error."""
 TOLERANCE_DOUBLE = 1.0e-13
-"""[m/s] The same in double precision."""
+"""[m/s] Of the contact iteration in double precision."""
 LATENCY_RANGE = (0.0, 0.1)
-"""[s] Of `Rollout.parameters`, as long as an environment's may be."""
+"""[s] Allowed values of `Rollout.parameters["latency"]`."""
 GEOMETRY_NAMES = (
     "hip_x", "hip_y", "hip_z", "outer_x", "inner_x", "plane_y", "knee_y", "thigh", "shank", "paw_radius",
 )  # fmt: skip
@@ -46,41 +52,46 @@ GEOMETRY_NAMES = (
 
 @dataclass(frozen=True)
 class Trajectory:
-    """What a rollout left behind: T policy steps of S physics steps, rows every `every` of these, K = T S / every.
+    """Trajectory of T policy steps of S physics steps, with a row every `every` physics steps, K = T S / every.
 
-    Arrays of the rollout's precision, worlds last; a gradient by a trajectory has the same shapes.
+    Arrays have the rollout's precision, worlds last; a cotangent of a trajectory has the same shapes.
     """
 
     q: wp.array
-    """(K + 1, 19, num_worlds): position [m] and orientation (xyzw) of the base, motor angles [rad]; row 0 the start."""
+    """(K + 1, 19, num_worlds) Position [m] and orientation (xyzw) of the base, motor angles [rad]; row 0: start."""
     qd: wp.array
-    """(K + 1, 18, num_worlds): velocity of the base's centre of mass [m/s], its angular velocity [rad/s], world frame,
+    """(K + 1, 18, num_worlds) Velocity of the base's centre of mass [m/s], its angular velocity [rad/s], world frame,
     motor rates [rad/s]."""
     torque: wp.array
-    """(T S, 12, num_worlds) [N m] Of the motors, in each physics step."""
+    """(T S, 12, num_worlds) [N m] Motor torques in each physics step."""
     impulse: wp.array
-    """(T S, 4, num_worlds) vec3 [N s] Of the ground on each paw, world frame, in each physics step."""
+    """(T S, 4, num_worlds) vec3 [N s] Contact impulses on the paws in each physics step, world frame."""
     pressed: wp.array
-    """(T S, 4, num_worlds) Sets of the legs' pressed hard stops, see `jumper_warp.kernels.actuation.stops`."""
-    safe: wp.array
-    """(T, 12, num_worlds) [rad] Targets that the filter let through."""
+    """(T S, 4, num_worlds) Bit sets of each leg's pressed hard stops, see `jumper_warp.kernels.actuation.stops`."""
+    filtered_target: wp.array
+    """(T, 12, num_worlds) [rad] Targets after the command filter."""
     commands: Any
-    """The kernels' `Commands` that led to it."""
+    """The kernels' `Commands` of the rollout."""
     from_start: bool = False
-    """Whether the motors followed the angles that they started at, and not a `before` that was given."""
+    """Whether `initial_target` was the initial angles by default, so that the gradient by q includes its own."""
 
     def end(self) -> dict[str, Any]:
-        """Return what a rollout that goes on from here is given: q, qd, before, impulse."""
+        """Return the arguments of `Rollout.run` that continue from here: q, qd, initial_target, impulse."""
         last = self.impulse.shape[0] - 1
-        return {"q": self.q[-1], "qd": self.qd[-1], "before": self.safe[-1], "impulse": self.impulse[last]}
+        return {
+            "q": self.q[-1],
+            "qd": self.qd[-1],
+            "initial_target": self.filtered_target[-1],
+            "impulse": self.impulse[last],
+        }
 
 
 class Rollout:
-    """Simulates worlds over policy steps, and runs the simulation backwards; in single or double precision.
+    """Forward and reverse simulation of worlds over policy steps, in single or double precision.
 
-    Gradients are those of the contact modes and of the branches of filter and motors that the rollout went through:
-    exact where no mode changes (`adjoint.step_adjoint`). The worlds' parameters are in `parameters`, which may
-    be written at any time between a reverse pass and the next rollout.
+    Gradients are exact at the contact modes and branches of filter and motors of the forward pass
+    (`adjoint.step_adjoint`). The worlds' parameters are in `parameters`, which may be written between a reverse pass
+    and the next rollout.
 
     Args:
         model: The robot's worlds, as `jumper_warp.robot.model.build_model` returns it, without moving blocks.
@@ -88,14 +99,14 @@ class Rollout:
         command_filter: None leaves the targets as they are.
         description: The model's, by default the project's.
         dt: Physics step [s], `substeps` of which are in a policy step.
-        every: Physics steps from one row of a trajectory to the next, a divisor of `substeps`; by default all.
+        every: Physics steps between rows of a trajectory, a divisor of `substeps`; by default `substeps`.
         tolerance: Of the contact iteration [m/s], by default `TOLERANCE` or `TOLERANCE_DOUBLE`.
-        threads: Of a CPU, which share the worlds out and change no bit; as in `Simulation`.
+        threads: CPU threads that share the worlds; results do not depend on them. As in `Simulation`.
 
     Raises:
         NotThisRobotError: the model is another robot's.
-        InputError: dt or tolerance not finite and positive, substeps no whole number above 0, or `every` no divisor
-            of it.
+        InputError: dt or tolerance not finite and positive, substeps not a whole number above 0, or not a multiple
+            of `every`.
     """
 
     def __init__(
@@ -135,16 +146,16 @@ class Rollout:
         }
         """By name, worlds last: the parameter table of `kernels.layout` (321, n), motor constants (12, n) as in
         `MotorKindCfg` and the sensors' `offset` [rad], `fade` [rad/s] (2, n), `latency` [s] (n,), and the filter's
-        constants (14, n), rows as in `jumper_warp.diff.actuation.FILTER_NAMES`, in rad."""
+        constants (14, n), rows as in `jumper_warp.robot.motors.FILTER_NAMES`, in rad."""
         self.writes = dict.fromkeys([*self.parameters, "geometry"], 0)
-        """How often `simulate` has changed each of them."""
+        """Number of times that `simulate` has changed each parameter."""
         self.by_legs = self.device.is_cuda
-        """Whether a thread has a leg or a world, by default a leg on a GPU and a world on a CPU."""
+        """Whether kernels use a thread per leg (default on a GPU) or per world (default on a CPU)."""
         self.slices = slices_of(self.num_worlds, 1 if self.device.is_cuda else checked_threads(threads))
         wrench = wp.zeros(model.body_count, dtype=wp.spatial_vectorf, device=self.device)
         self._drive = self.dynamics.drive(self._zeros(model.joint_dof_count), wrench)
         self._record: Any = None
-        self._legs: LegReverse | None = None
+        self._legs: LegThreadReverse | None = None
         self._launched: set[str] = set()
 
     def _make_actuation(self, cfg: MotorCfg, command_filter: FilterCfg | None) -> Any:
@@ -155,7 +166,7 @@ class Rollout:
         actuation.fade = self.array([[cfg.fade_start] * n, [cfg.fade_end] * n])
         actuation.latency = self._zeros(n)
         actuation.filtered = int(command_filter is not None)
-        actuation.limits = self.array(np.repeat(filter_rows(command_filter)[:, None], n, axis=1))
+        actuation.limits = self.array(np.repeat(filter_constants(command_filter)[:, None], n, axis=1))
         return actuation
 
     def standing(self) -> tuple[np.ndarray, np.ndarray]:
@@ -163,7 +174,7 @@ class Rollout:
         return compact(self.dynamics.model.joint_q.numpy(), np.zeros(38 * self.num_worlds), self.num_worlds)
 
     def hold(self, worlds: Any = True) -> None:
-        """Hang up the bases of some worlds: they keep the position and the velocity that they start with.
+        """Hold the bases of some worlds at their initial position and velocity.
 
         worlds: bool, (num_worlds,) or one for all. Raises InputError for another shape.
         """
@@ -190,25 +201,32 @@ class Rollout:
         self.dynamics.robot.geometry.assign(legs)
 
     def run(
-        self, targets: Any, q: Any, qd: Any, *, before: Any = None, wrench: Any = None, impulse: wp.array | None = None
+        self,
+        targets: Any,
+        q: Any,
+        qd: Any,
+        *,
+        initial_target: Any = None,
+        wrench: Any = None,
+        impulse: wp.array | None = None,
     ) -> Trajectory:
-        """Simulate. Arrays of Warp or NumPy, of the shapes below or without worlds, which then are alike.
+        """Return the trajectory of all worlds. Arrays are of Warp or NumPy; without the last axis for equal worlds.
 
         Args:
             targets: Raw motor targets [rad] of T policy steps, (T, 12, num_worlds).
-            q: First row, (19, num_worlds), as in `Trajectory.q`.
-            qd: First row, (18, num_worlds).
-            before: What the motors follow [rad] until the first target arrives, (12, num_worlds), by default the angles
-                that they start at, by which the gradient by q has it too. Only `parameters["latency"]` makes it matter.
+            q: Initial row, (19, num_worlds), as in `Trajectory.q`.
+            qd: Initial row, (18, num_worlds).
+            initial_target: Targets [rad] until the first ones arrive, (12, num_worlds); matters with a latency. By
+                default the initial angles; the gradient by q then includes that by initial_target.
             wrench: Force [N] and moment [N m] on the base at its com, world axes, in each policy step,
                 (T, 6, num_worlds).
-            impulse: What pushed the paws in the step before, as in `Trajectory.impulse`, (4, num_worlds) vec3; zero
-                by default. Contact is found from there, and paws that pushed and hardly slip have static friction.
+            impulse: Contact impulses of the step before, as in `Trajectory.impulse`, (4, num_worlds) vec3; zero by
+                default. The contact iteration starts from them; loaded paws that hardly slip have static friction.
 
         Raises:
-            InputError: an array of another shape or type, numbers of NumPy that are not finite, or, on a CPU, a latency
-                outside of `LATENCY_RANGE`. What is on a GPU is not waited for: a world of NaN ends as NaN, and no
-                target arrives before it is sent.
+            InputError: an array of another shape or type, NumPy values that are not finite, or, on a CPU, a latency
+                outside of `LATENCY_RANGE`. Values on a GPU are not checked: NaN stays in its world, and latencies
+                below 0 count as 0.
         """
         if not self.device.is_cuda:
             check_within("latency [s]", self.parameters["latency"].numpy(), LATENCY_RANGE)
@@ -217,29 +235,30 @@ class Rollout:
         commands = self.dynamics.modules.trajectory.Commands()
         commands.target = self._input("targets", targets, (count, 12))
         q, qd = self._input("q", q, (19,)), self._input("qd", qd, (18,))
-        commands.before = q[7:] if before is None else self._input("before", before, (12,))
+        commands.before = q[7:] if initial_target is None else self._input("initial_target", initial_target, (12,))
         commands.wrench = self._zeros(count, 6, self.num_worlds) if wrench is None else (
             self._input("wrench", wrench, (count, 6))
         )  # fmt: skip
-        pushes = (4, self.num_worlds)
+        impulse_shape = (4, self.num_worlds)
         if impulse is not None and not (
-            isinstance(impulse, wp.array) and impulse.shape == pushes and impulse.dtype == vec3
+            isinstance(impulse, wp.array) and impulse.shape == impulse_shape and impulse.dtype == vec3
         ):
-            raise InputError(f"impulse must be an array {pushes} of {vec3.__name__}, as in `Trajectory.impulse`")
-        commands.impulse = self._zeros(*pushes, dtype=vec3) if impulse is None else impulse
+            raise InputError(f"impulse must be an array {impulse_shape} of {vec3.__name__}, as in `Trajectory.impulse`")
+        commands.impulse = self._zeros(*impulse_shape, dtype=vec3) if impulse is None else impulse
         if count < 1:
             raise InputError("a rollout needs at least one policy step of targets")
         rows = self._rows(count)
         wp.copy(rows.q[0], q)
         wp.copy(rows.qd[0], qd)
-        safe = self._zeros(count, 12, self.num_worlds)
+        filtered_target = self._zeros(count, 12, self.num_worlds)
         inputs = [self._timing(count), self._actuation, commands, self._drive]
         modules = self.dynamics.modules
         if self.by_legs:
-            self._launch_legs(modules.rollout_legs.rollout_legs_kernel, inputs, [safe, rows])
+            self._launch_legs(modules.rollout_legs.rollout_legs_kernel, inputs, [filtered_target, rows])
         else:
-            self._launch(modules.rollout.rollout_kernel, inputs, [self.dynamics.work, safe, rows])
-        return Trajectory(rows.q, rows.qd, rows.torque, rows.impulse, rows.pressed, safe, commands, before is None)
+            self._launch(modules.rollout.rollout_kernel, inputs, [self.dynamics.work, filtered_target, rows])
+        arrays = (rows.q, rows.qd, rows.torque, rows.impulse, rows.pressed, filtered_target)
+        return Trajectory(*arrays, commands, from_start=initial_target is None)
 
     def backward(
         self,
@@ -249,16 +268,16 @@ class Rollout:
         qd: wp.array | None = None,
         torque: wp.array | None = None,
         impulse: wp.array | None = None,
-        safe: wp.array | None = None,
+        filtered_target: wp.array | None = None,
     ) -> dict[str, wp.array]:
-        """Return the gradient of one number a world, given its gradient by the trajectory.
+        """Return the gradient of each world's loss by the inputs of the rollout, given its gradient by the trajectory.
 
-        q, qd, torque, impulse, safe: that gradient, of the shapes and types of `Trajectory`; None is zero. The
-        parameters must be those of the rollout.
+        q, qd, torque, impulse, filtered_target: cotangents, the gradient of the loss by these arrays of the trajectory,
+        with the same shapes and types; None: zero. The parameters must be those of the forward pass.
 
-        Returned by name, worlds last: targets, q, qd (of the first row), before, wrench, the entries of `parameters`,
-        and `geometry` (4, 10, num_worlds) by the legs' lengths [m], see `GEOMETRY_NAMES`. The gradient by the first
-        row's quaternion is that of a function which normalises it.
+        Returned by name, worlds last: targets, q, qd (initial row), initial_target, wrench, the entries of
+        `parameters`, and `geometry` (4, 10, num_worlds) by the legs' lengths [m], see `GEOMETRY_NAMES`. The gradient by
+        the initial quaternion assumes that it is normalised first.
         """
         n, modules = self.num_worlds, self.dynamics.modules
         commands = trajectory.commands
@@ -266,7 +285,8 @@ class Rollout:
         rows_of = (count * self.substeps // self.every + 1, 19, n)
         if trajectory.q.shape != rows_of or trajectory.q.dtype != self.real:
             raise InputError(f"this rollout makes trajectories {rows_of}, got {trajectory.q.shape}")
-        seeds = self._seeds(trajectory, {"q": q, "qd": qd, "torque": torque, "impulse": impulse, "safe": safe})
+        given = {"q": q, "qd": qd, "torque": torque, "impulse": impulse, "filtered_target": filtered_target}
+        cotangents = self._cotangents(trajectory, given)
         rows = modules.trajectory.Rows()
         for name in ("q", "qd", "torque", "impulse", "pressed"):
             setattr(rows, name, getattr(trajectory, name))
@@ -275,29 +295,29 @@ class Rollout:
                   "safe": (count, 12), "parameters": (int(modules.gradients.GRADIENT_ROWS),)}  # fmt: skip
         for name, shape in shapes.items():
             setattr(gradients, name, self._zeros(*shape, n))
-        if safe is not None:
-            wp.copy(gradients.safe, safe)  # which the reverse pass adds to
-        motion = [self._timing(count), self._actuation, commands, trajectory.safe, rows]
+        if filtered_target is not None:
+            wp.copy(gradients.safe, filtered_target)  # the reverse pass adds to it
+        motion = [self._timing(count), self._actuation, commands, trajectory.filtered_target, rows]
         if self.by_legs:
             last: Any
             for into, last in ((gradients.q, q), (gradients.qd, qd)):
                 if last is not None:
                     wp.copy(into, last[-1])
             if self._legs is None:
-                self._legs = LegReverse(self.dynamics, self.every)
-            self._legs.run(self._new_settings(), motion, seeds, gradients)
+                self._legs = LegThreadReverse(self.dynamics, self.every)
+            self._legs.run(self._new_settings(), motion, cotangents, gradients)
         else:
             if self._record is None:
                 self._record = self.dynamics.step_record(self.every)
-            self._launch(modules.rollout_adjoint.reverse_kernel, [*motion, seeds], [self._record, gradients])
+            self._launch(modules.rollout_adjoint.reverse_kernel, [*motion, cotangents], [self._record, gradients])
         if trajectory.from_start:
             wp.map(wp.add, gradients.q[7:], gradients.before, out=gradients.q[7:])
-        found = {"targets": gradients.target, "q": gradients.q, "qd": gradients.qd, "before": gradients.before}
-        return found | {"wrench": gradients.wrench} | self._named(gradients.parameters)
+        by_inputs = {"targets": gradients.target, "q": gradients.q, "qd": gradients.qd, "wrench": gradients.wrench}
+        return by_inputs | {"initial_target": gradients.before} | self._split_parameters(gradients.parameters)
 
-    def _seeds(self, trajectory: Trajectory, given: dict[str, wp.array | None]) -> Any:
-        """Return the kernels' `Rows` of a gradient by a trajectory. Raises InputError: an array unlike it."""
-        seeds = self.dynamics.modules.trajectory.Rows()
+    def _cotangents(self, trajectory: Trajectory, given: dict[str, wp.array | None]) -> Any:
+        """Return the kernels' `Rows` of a gradient by a trajectory. Raises InputError: another shape or type."""
+        cotangents = self.dynamics.modules.trajectory.Rows()
         for name, array in given.items():
             like = getattr(trajectory, name)
             alike = isinstance(array, wp.array) and array.shape == like.shape and array.dtype == like.dtype
@@ -306,14 +326,14 @@ class Rollout:
                 raise InputError(
                     f"the gradient by {name} must be like it, {like.dtype.__name__} {like.shape}, got {got}"
                 )
-            if name != "safe":
+            if name != "filtered_target":
                 empty = wp.zeros((0,) * like.ndim, dtype=like.dtype, device=self.device)
-                setattr(seeds, name, empty if array is None else array)
-        seeds.pressed = wp.zeros((0, 0, 0), dtype=wp.uint8, device=self.device)
-        return seeds
+                setattr(cotangents, name, empty if array is None else array)
+        cotangents.pressed = wp.zeros((0, 0, 0), dtype=wp.uint8, device=self.device)
+        return cotangents
 
-    def _named(self, gradient: Any) -> dict[str, wp.array]:
-        """Return the rows of a gradient by name."""
+    def _split_parameters(self, gradient: Any) -> dict[str, wp.array]:
+        """Return the rows of a gradient by parameters, by name, with the shapes of `parameters` and `geometry`."""
         names, first = {}, 0
         for name, array in self.parameters.items():
             count = 1 if array.ndim == 1 else array.shape[0]
@@ -322,12 +342,13 @@ class Rollout:
         return names | {"geometry": gradient[first:].reshape((4, len(GEOMETRY_NAMES), self.num_worlds))}
 
     def _timing(self, count: int) -> Any:
+        """Return the kernels' `Timing` of `count` policy steps."""
         timing = self.dynamics.modules.trajectory.Timing()
         timing.steps, timing.substeps, timing.every = count, self.substeps, self.every
         return timing
 
     def _rows(self, count: int) -> Any:
-        """Return an empty trajectory."""
+        """Return the kernels' `Rows` of `count` policy steps, uninitialised."""
         steps, n = count * self.substeps, self.num_worlds
         rows = self.dynamics.modules.trajectory.Rows()
         rows.q, rows.qd = (self._empty(steps // self.every + 1, size, n) for size in (19, 18))
@@ -337,7 +358,7 @@ class Rollout:
         return rows
 
     def _launch_legs(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        """Launch a kernel over all worlds, a thread a leg."""
+        """Launch a kernel over all worlds with a thread per leg."""
         n = self.num_worlds
         inputs = [n, self.dynamics.robot, self._new_settings(), *inputs]
         wp.launch(
@@ -346,10 +367,10 @@ class Rollout:
         )  # fmt: skip
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        """Launch a kernel over all worlds, on a CPU in slices side by side."""
+        """Launch a kernel over all worlds with a thread per world; on a CPU in concurrent slices."""
 
         def launch(worlds: WorldRange) -> None:
-            settings = self._new_settings()  # a copy of a Warp struct shares its memory, and slices run side by side
+            settings = self._new_settings()  # copies of a Warp struct share memory, and slices run concurrently
             settings.first = worlds.first
             wp.launch(
                 kernel, dim=worlds.count, inputs=[self.dynamics.robot, settings, *inputs], outputs=outputs,
@@ -357,12 +378,12 @@ class Rollout:
             )  # fmt: skip
 
         jobs: list[Callable[[], None]] = [partial(launch, worlds) for worlds in self.slices]
-        # Warp finds a kernel's function at its first launch; of two threads that do so at once one would run nothing
-        run_side_by_side(jobs, len(jobs) if kernel.key in self._launched else 1)
+        # Warp loads a kernel at its first launch; of two threads that do so at once one would launch nothing
+        run_in_parallel(jobs, len(jobs) if kernel.key in self._launched else 1)
         self._launched.add(kernel.key)
 
     def _input(self, name: str, values: Any, shape: tuple[int, ...]) -> wp.array:
-        """Return values as an array (*shape, num_worlds). Raises InputError: another shape or type, or not finite."""
+        """Return values as an array (*shape, num_worlds). Raises InputError: wrong shape or type, or not finite."""
         full = (*shape, self.num_worlds)
         if isinstance(values, wp.array):
             if values.shape != full or values.dtype != self.real:

@@ -1,8 +1,8 @@
 """Rewards of the vertical jump as smooth functions of the robot's state, for their derivatives.
 
-Values always come from the environment. What has no derivative here counts steps or events (lifted paws), or is of
-forces and decelerations at impacts. Phases (stance, flight, landed) switch terms and are no function of the state here:
-nothing says how to take off sooner. The floor under the total passes derivatives.
+Reward values always come from the environment. Terms that count steps or events (lifted paws) or depend on forces and
+decelerations at impacts have no derivative. Phases (stance, flight, landed) switch terms without depending on the
+state, so that no derivative rewards an earlier takeoff. The floor under the total passes derivatives.
 """
 
 from __future__ import annotations
@@ -13,140 +13,150 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from jumper_warp.diff.closed_loop import ClosedLoop, LoopState, Motion
+from jumper_warp.diff.closed_loop import ClosedLoop, LoopState, RobotState
 
 STANCE, FLIGHT, LANDED = 0, 1, 2
-SOON, RECOVERED = 18, 30
-"""Policy steps after touchdown."""
+LANDING, RECOVERED = 18, 30
+"""Policy steps after touchdown that count as landing, and after which the robot should rest."""
 
 
-class Moment(NamedTuple):
-    """A policy step of all worlds."""
+class RewardContext(NamedTuple):
+    """Inputs of the rewards of a policy step, n worlds."""
 
-    motion: Motion
-    before: Motion
+    motion: RobotState
+    """At the end of the step."""
+    prev_motion: RobotState
     """At its beginning."""
     state: LoopState
-    old: LoopState
+    """At the end of the step."""
+    prev_state: LoopState
+    """At its beginning."""
     phase: torch.Tensor
-    """(n,) The jump's, at the end of the step."""
-    due: torch.Tensor
-    """(n,) bool, whether a jump is commanded that has not begun."""
-    soon: torch.Tensor
-    """(n,) bool, whether the touchdown was within the last 0.3 s."""
+    """(n,) `STANCE`, `FLIGHT` or `LANDED`, at the end of the step."""
+    jump_due: torch.Tensor
+    """(n,) bool, a commanded jump has not begun."""
+    landing: torch.Tensor
+    """(n,) bool, touchdown was within the last 0.3 s."""
     resting: torch.Tensor
-    """(n,) bool, whether the robot should stand still."""
+    """(n,) bool, the robot should stand still."""
     rising: torch.Tensor
     """(n,) bool, in flight before the apex."""
     at_apex: torch.Tensor
-    """(n,) bool"""
+    """(n,) bool, the apex was passed in this step."""
     goal: torch.Tensor
     """(n,) [m] Commanded height."""
     default: torch.Tensor
-    """(12,) [rad]"""
+    """(12,) [rad] Motor angles of the default pose."""
     gravity: float
+    """[m/s^2] Downward."""
     step_dt: float
+    """[s] Policy step."""
 
 
-def make_moment(loop: ClosedLoop, state: LoopState, old: LoopState, arrays: Mapping[str, np.ndarray]) -> Moment:
-    """Return a step; arrays: `Env.task_arrays` at its end, of the episode that it belongs to."""
+def make_context(
+    loop: ClosedLoop, state: LoopState, prev_state: LoopState, arrays: Mapping[str, np.ndarray]
+) -> RewardContext:
+    """Return the rewards' inputs of a policy step; arrays: `Env.task_arrays` at its end, before any reset."""
 
-    def at(values: np.ndarray) -> torch.Tensor:
+    def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(np.ascontiguousarray(values), device=state.q.device)
 
     phase, after, steps = arrays["phase"], arrays["phase_steps"], arrays["steps"]
-    asked = steps >= arrays["command_step"]
-    resting = ((phase == LANDED) & (after >= RECOVERED)) | ((phase == STANCE) & ~asked)
+    commanded = steps >= arrays["command_step"]
+    resting = ((phase == LANDED) & (after >= RECOVERED)) | ((phase == STANCE) & ~commanded)
     rising = (phase == FLIGHT) & (arrays["apex_passed"] == 0)
-    return Moment(
-        loop.motion(state), loop.motion(old), state, old, at(phase), at((phase == STANCE) & asked),
-        at((phase == LANDED) & (after < SOON)), at(resting), at(rising), at(arrays["at_apex"] == 1),
-        at(arrays["goal"][:, 2]), loop.default, loop.task.gravity, loop.env.step_dt,
+    return RewardContext(
+        loop.motion(state), loop.motion(prev_state), state, prev_state, tensor(phase),
+        tensor((phase == STANCE) & commanded), tensor((phase == LANDED) & (after < LANDING)),
+        tensor(resting), tensor(rising), tensor(arrays["at_apex"] == 1), tensor(arrays["goal"][:, 2]), loop.default,
+        loop.task.gravity, loop.env.step_dt,
     )  # fmt: skip
 
 
-def phi(squared: torch.Tensor, std: float) -> torch.Tensor:
-    """Return exp(-x^2 / std^2) for x^2."""
+def gaussian(squared: torch.Tensor, std: float) -> torch.Tensor:
+    """Return exp(-x^2 / std^2), given x^2."""
     return torch.exp(-squared / std**2)
 
 
-def norm(x: torch.Tensor) -> torch.Tensor:
-    """Return the norms of the rows of x, with a finite derivative at 0."""
+def row_norm(x: torch.Tensor) -> torch.Tensor:
+    """Return the norms of the rows of x (n, k), (n,), with a finite derivative at 0."""
     return (x.square().sum(1) + 1.0e-12).sqrt()
 
 
-def apex(m: Moment) -> torch.Tensor:
-    """Return the height [m] of the apex of the base's projectile, to come or just past, (n,)."""
+def ballistic_apex(m: RewardContext) -> torch.Tensor:
+    """Return the apex height [m] of the base's ballistic path through the present state, (n,)."""
     return m.motion.pos[:, 2] + m.motion.lin_vel[:, 2].square() / (2.0 * m.gravity)
 
 
-def height_kernel(m: Moment, p: Mapping[str, float]) -> torch.Tensor:
-    """Return how close the apex is to the goal."""
-    miss = apex(m) - m.goal
+def height_kernel(m: RewardContext, p: Mapping[str, float]) -> torch.Tensor:
+    """Return the closeness of the ballistic apex to the goal, (n,), at most 5."""
+    error = ballistic_apex(m) - m.goal
     return (
-        phi(miss.square(), p["std_fine"])
-        + 3.0 * torch.exp(-miss.abs() / p["scale_sharp"])
-        + phi(miss.square(), p["std_wide"])
+        gaussian(error.square(), p["std_fine"])
+        + 3.0 * torch.exp(-error.abs() / p["scale_sharp"])
+        + gaussian(error.square(), p["std_wide"])
     )
 
 
-def patience(m: Moment, p: Mapping[str, float]) -> torch.Tensor:
-    """Return 1, or `waiting_scale` while a commanded jump has not begun."""
-    return torch.where(m.due, p["waiting_scale"], 1.0)
+def waiting_scale(m: RewardContext, p: Mapping[str, float]) -> torch.Tensor:
+    """Return the scale of a reward, (n,): below 1 while a commanded jump has not begun."""
+    return torch.where(m.jump_due, p["waiting_scale"], 1.0)
 
 
-def posture(m: Moment, p: Mapping[str, float], shift: float) -> torch.Tensor:
-    """Return phi of the rms offset from the default pose, transversal motors moved by a shift [rad]."""
+def posture(m: RewardContext, p: Mapping[str, float], shift: float) -> torch.Tensor:
+    """Return the closeness of the angles to the default pose, (n,), transversal motors shifted by `shift` [rad]."""
     shifts = m.default.new_tensor(4 * [0.0, shift, shift])
-    return phi((m.motion.angle - m.default - shifts).square().mean(1), p["std"])
+    return gaussian((m.motion.angle - m.default - shifts).square().mean(1), p["std"])
 
 
-def symmetry(m: Moment, p: Mapping[str, float]) -> torch.Tensor:
-    """Return the closeness of the transversal angles to each other and of the lateral ones to 0."""
+def symmetry(m: RewardContext, p: Mapping[str, float]) -> torch.Tensor:
+    """Return the closeness of the transversal angles to each other and of the lateral ones to 0, (n,)."""
     legs = m.motion.angle.view(-1, 4, 3)
     spread = legs[:, :, 1:].flatten(1).var(1, correction=0)
     return (
-        phi(spread.square(), p["std_variance"]) * phi(legs[:, :, 0].square().sum(1), p["std_lateral"]) * patience(m, p)
+        gaussian(spread.square(), p["std_variance"])
+        * gaussian(legs[:, :, 0].square().sum(1), p["std_lateral"])
+        * waiting_scale(m, p)
     )
 
 
-def level(m: Moment) -> torch.Tensor:
+def squared_tilt(m: RewardContext) -> torch.Tensor:
     """Return the squared sine of the tilt, (n,)."""
     return m.motion.gravity[:, :2].square().sum(1)
 
 
-Smooth = Callable[[Moment, Mapping[str, float]], torch.Tensor]
+Smooth = Callable[[RewardContext, Mapping[str, float]], torch.Tensor]
 SMOOTH: dict[str, Smooth] = {
     "jump_height": lambda m, p: m.at_apex * height_kernel(m, p),
     "estimated_jump_height": lambda m, p: m.rising * height_kernel(m, p),
     "horizontal_velocity": lambda m, p: (
-        torch.exp(-norm(m.motion.lin_vel[:, :2]) / p["speed_scale"]) * torch.where(m.phase == STANCE, 1.0, 2.0)
-    ) * patience(m, p),
-    "orientation": lambda m, p: phi(level(m), p["std"]) * patience(m, p),
-    "angular_velocity": lambda m, p: phi(m.motion.ang_vel.square().sum(1), p["std"]) * patience(m, p),
+        torch.exp(-row_norm(m.motion.lin_vel[:, :2]) / p["speed_scale"]) * torch.where(m.phase == STANCE, 1.0, 2.0)
+    ) * waiting_scale(m, p),
+    "orientation": lambda m, p: gaussian(squared_tilt(m), p["std"]) * waiting_scale(m, p),
+    "angular_velocity": lambda m, p: gaussian(m.motion.ang_vel.square().sum(1), p["std"]) * waiting_scale(m, p),
     "joint_symmetry": symmetry,
-    "ground_posture": lambda m, p: (m.phase != FLIGHT) * posture(m, p, p["shift"]) * patience(m, p),
+    "ground_posture": lambda m, p: (m.phase != FLIGHT) * posture(m, p, p["shift"]) * waiting_scale(m, p),
     "air_posture": lambda m, p: (m.phase == FLIGHT) * posture(m, p, 0.0),
-    "post_landing_posture": lambda m, p: m.soon * posture(m, p, p["shift"]),
-    "base_at_rest": lambda m, p: m.resting * phi(m.motion.lin_vel.square().sum(1), p["std_lin_vel"])
-    * phi(m.motion.ang_vel.square().sum(1), p["std_ang_vel"]),
-    "landing_tilt": lambda m, p: (m.phase == LANDED) * level(m) / np.sin(p["angle"]) ** 2,
-    "catch_landing": lambda m, p: m.soon * (-m.motion.lin_vel[:, 2]).clamp(0.0, 1.0),
-    "damp_landing": lambda m, p: m.soon * m.motion.rate.view(-1, 4, 3)[:, :, 1:].flatten(1).clamp(0.0, 1.0).mean(1),
+    "post_landing_posture": lambda m, p: m.landing * posture(m, p, p["shift"]),
+    "base_at_rest": lambda m, p: m.resting * gaussian(m.motion.lin_vel.square().sum(1), p["std_lin_vel"])
+    * gaussian(m.motion.ang_vel.square().sum(1), p["std_ang_vel"]),
+    "landing_tilt": lambda m, p: (m.phase == LANDED) * squared_tilt(m) / np.sin(p["angle"]) ** 2,
+    "catch_landing": lambda m, p: m.landing * (-m.motion.lin_vel[:, 2]).clamp(0.0, 1.0),
+    "damp_landing": lambda m, p: m.landing * m.motion.rate.view(-1, 4, 3)[:, :, 1:].flatten(1).clamp(0.0, 1.0).mean(1),
     "motor_torque_sq": lambda m, p: m.state.torque.square().sum(0),
-    "joint_acceleration": lambda m, p: ((m.motion.rate - m.before.rate) / m.step_dt).square().sum(1),
-    "action_rate": lambda m, p: (m.state.action - m.old.action).square().sum(0),
-    "resting_action_rate": lambda m, p: m.resting * (m.state.action - m.old.action).square().sum(0),
-    "torque_ripple": lambda m, p: m.resting * (m.state.torque - m.old.torque).square().sum(0),
+    "joint_acceleration": lambda m, p: ((m.motion.rate - m.prev_motion.rate) / m.step_dt).square().sum(1),
+    "action_rate": lambda m, p: (m.state.action - m.prev_state.action).square().sum(0),
+    "resting_action_rate": lambda m, p: m.resting * (m.state.action - m.prev_state.action).square().sum(0),
+    "torque_ripple": lambda m, p: m.resting * (m.state.torque - m.prev_state.torque).square().sum(0),
 }  # fmt: skip
-"""By the name of the term's function."""
+"""Smooth reward terms by name of the term's function, each (n,)."""
 
 
-def smooth_reward(task: Any, moment: Moment) -> torch.Tensor:
-    """Return the sum of the rewards that are in `SMOOTH`, weights and policy step applied, (n,)."""
-    total = torch.zeros_like(moment.goal)
+def smooth_reward(task: Any, context: RewardContext) -> torch.Tensor:
+    """Return the weighted sum of the rewards that are in `SMOOTH`, (n,), scaled by the policy step."""
+    total = torch.zeros_like(context.goal)
     for term in task.rewards:
         if term.func.key in SMOOTH:
-            time = moment.step_dt if term.options["scale_by_dt"] else 1.0
-            total = total + term.numbers["weight"] * time * SMOOTH[term.func.key](moment, term.numbers)
+            time = context.step_dt if term.options["scale_by_dt"] else 1.0
+            total = total + term.numbers["weight"] * time * SMOOTH[term.func.key](context, term.numbers)
     return total

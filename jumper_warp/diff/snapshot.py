@@ -1,4 +1,4 @@
-"""The view of an environment that gradients need: its robots, their parameters and their state."""
+"""Snapshot of an environment for gradients: its robots, their parameters and their state."""
 
 from __future__ import annotations
 
@@ -10,10 +10,13 @@ from jumper_warp.utils.newton_types import Model
 
 
 class Snapshot(NamedTuple):
-    """Robots of an environment; tensors, float32 on its device, are read only and may change with its next step."""
+    """State and parameters of an environment's robots.
+
+    Tensors are float32 on its device and read-only; its next step may change them.
+    """
 
     tasks: tuple[Any, ...]
-    """`jumper_warp.tasks.cfg.TaskCfg` of each skill, draws that the environment leaves out removed."""
+    """`jumper_warp.tasks.cfg.TaskCfg` of each skill, without randomisation that the environment leaves out."""
     solver: str
     """Name of the solver's class."""
     blocks: bool
@@ -33,12 +36,12 @@ class Snapshot(NamedTuple):
     """(19, num_worlds) [m], xyzw, [rad], as in `jumper_warp.diff.rollout.Trajectory`."""
     qd: torch.Tensor
     """(18, num_worlds) [m/s], [rad/s]"""
-    before: torch.Tensor
-    """(12, num_worlds) [rad] Filtered targets of the step before."""
+    initial_target: torch.Tensor
+    """(12, num_worlds) [rad] Filtered targets of the last policy step."""
     impulse: torch.Tensor
-    """(4, num_worlds, 3) [N s] On the paws in the last physics step, world axes."""
+    """(4, num_worlds, 3) [N s] Contact impulses in the last physics step, world axes."""
     action: torch.Tensor
-    """(12, num_worlds) Of the step before, within ±1."""
+    """(12, num_worlds) Of the last policy step, within ±1."""
     torque: torch.Tensor
     """(12, num_worlds) [N m] Of the last physics step."""
     wrench: torch.Tensor
@@ -46,7 +49,7 @@ class Snapshot(NamedTuple):
 
 
 def compact_columns(joint_values: torch.Tensor, base: int) -> torch.Tensor:
-    """Return (base + 12, num_worlds): `base` values and the motors' of Newton's coordinates or rates of each world."""
+    """Return base and motor values, (base + 12, num_worlds), of Newton's coordinates or rates (num_worlds, ...)."""
     legs = joint_values[:, base : base + 20].unflatten(1, (4, 5))
     motors = torch.cat([legs[..., :2], legs[..., 3:4]], -1).flatten(1)
     return torch.cat([joint_values[:, :base], motors], 1).T

@@ -1,4 +1,4 @@
-"""Rollouts as a function of PyTorch tensors, whose gradients come from the reverse pass of `Rollout`."""
+"""PyTorch bridge: a rollout as a differentiable function of tensors."""
 
 from __future__ import annotations
 
@@ -15,12 +15,14 @@ from jumper_warp.diff.rollout import LATENCY_RANGE, Rollout, Trajectory
 from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
 
-COMMANDS = ("targets", "q", "qd", "before", "wrench", "impulse")
-OUTPUTS = ("q", "qd", "torque", "impulse", "safe")
+COMMANDS = ("targets", "q", "qd", "initial_target", "wrench", "impulse")
+"""Arguments of `Rollout.run`."""
+OUTPUTS = ("q", "qd", "torque", "impulse", "filtered_target")
+"""Differentiable arrays of a `Trajectory`."""
 
 
 class TorchTrajectory(NamedTuple):
-    """A trajectory as tensors, see `Trajectory`; all carry gradients, for which nobody may change them in place."""
+    """A `Trajectory` as tensors with gradients; they must not be changed in place."""
 
     q: torch.Tensor
     """(K + 1, 19, num_worlds)"""
@@ -30,12 +32,13 @@ class TorchTrajectory(NamedTuple):
     """(T S, 12, num_worlds) [N m]"""
     impulse: torch.Tensor
     """(T S, 4, num_worlds, 3) [N s]; divide by the physics step for the force."""
-    safe: torch.Tensor
+    filtered_target: torch.Tensor
     """(T, 12, num_worlds) [rad]"""
 
     def end(self) -> dict[str, torch.Tensor]:
-        """Return what `simulate` is given to go on from here, `impulse` without gradients."""
-        return {"q": self.q[-1], "qd": self.qd[-1], "before": self.safe[-1], "impulse": self.impulse[-1].detach()}
+        """Return the arguments of `simulate` that continue from here; `impulse` has no gradient."""
+        state = {"q": self.q[-1], "qd": self.qd[-1], "initial_target": self.filtered_target[-1]}
+        return state | {"impulse": self.impulse[-1].detach()}
 
 
 def simulate(
@@ -44,24 +47,24 @@ def simulate(
     q: torch.Tensor,
     qd: torch.Tensor,
     *,
-    before: torch.Tensor | None = None,
+    initial_target: torch.Tensor | None = None,
     wrench: torch.Tensor | None = None,
     impulse: torch.Tensor | None = None,
     trusted: bool = False,
     **parameters: torch.Tensor,
 ) -> TorchTrajectory:
-    """Run a rollout; first derivatives reach all tensors but `impulse`.
+    """Return the trajectory of a rollout, differentiable once by all tensors except `impulse`.
 
-    Shapes as in `Rollout.run`, with worlds or without them. parameters: entries of `Rollout.parameters`, which are
-    written to the rollout and stay there, or `geometry` (4, 10) [m], the legs' lengths of all worlds; gradients by them
-    are of the calls that they are given to. trusted: do not look at the numbers; of those on a GPU a latency alone is
-    looked at, and waited for, as in `Rollout.run`.
+    Shapes are those of `Rollout.run`, with or without the axis of worlds. parameters: entries of `Rollout.parameters`,
+    which are written to the rollout and stay there, or `geometry` (4, 10) [m], the legs' lengths of all worlds; a
+    parameter has a gradient from the calls that it is passed to. trusted: do not check the values; otherwise on a GPU
+    only the latency is checked, which waits for the device.
 
-    A policy that sees the state runs one policy step a call, each from `end()` of the one before. Raises InputError for
-    a parameter of another name, what is no tensor of the shape or not finite, or a latency outside of `LATENCY_RANGE`;
-    its reverse pass for a parameter that another call has changed meanwhile, and this one was not given.
+    A policy in the loop runs one policy step per call, each from `end()` of the last. Raises InputError: unknown
+    parameter, not a tensor, wrong shape, not finite, or a latency outside of `LATENCY_RANGE`. The reverse pass raises
+    it for a parameter that a later call has changed and that was not passed to this one.
     """
-    named = {"targets": targets, "q": q, "qd": qd, "before": before, "wrench": wrench} | parameters
+    named = {"targets": targets, "q": q, "qd": qd, "initial_target": initial_target, "wrench": wrench} | parameters
     given: dict[str, Any] = {
         name: tensor for name, tensor in named.items() if tensor is not None or name in COMMANDS[:3]
     }
@@ -77,8 +80,8 @@ def simulate(
         raise InputError(
             f"a rollout has no parameter {unknown!r:.60}; it has {', '.join(rollout.parameters)}, geometry"
         )
-    shapes = {"targets": (len(targets), 12), "q": (19,), "qd": (18,), "before": (12,), "wrench": (len(targets), 6)}
-    shapes |= {name: array.shape[:-1] for name, array in rollout.parameters.items()}
+    shapes = {"targets": (len(targets), 12), "q": (19,), "qd": (18,), "wrench": (len(targets), 6)}
+    shapes |= {"initial_target": (12,)} | {name: array.shape[:-1] for name, array in rollout.parameters.items()}
     real = torch.float64 if rollout.real is wp.float64 else torch.float32
     for name, tensor in given.items():
         full = (4, 10) if name == "geometry" else (*shapes[name], rollout.num_worlds)
@@ -87,7 +90,7 @@ def simulate(
         if tuple(tensor.shape) != full:
             raise InputError(f"{name} must have shape {full}, got {tuple(tensor.shape)}")
         given[name] = tensor.to(dtype=real).contiguous()
-    given.setdefault("before", given["q"][7:].contiguous())
+    given.setdefault("initial_target", given["q"][7:].contiguous())
     if impulse is not None:
         if tuple(impulse.shape) != (4, rollout.num_worlds, 3):
             raise InputError(f"impulse must have shape {(4, rollout.num_worlds, 3)}, got {tuple(impulse.shape)}")
@@ -98,7 +101,7 @@ def simulate(
 
 
 def _check_numbers(given: dict[str, torch.Tensor]) -> None:
-    """Raise InputError for a latency that is none, on a CPU for what is not finite, of parameters for NaN."""
+    """Raise InputError: a latency out of range; on a CPU also commands not finite or parameters NaN."""
     if "latency" in given:
         check_within("latency [s]", given["latency"].detach().cpu().numpy(), LATENCY_RANGE)
     for name, tensor in given.items():
@@ -108,7 +111,7 @@ def _check_numbers(given: dict[str, torch.Tensor]) -> None:
 
 
 class _Simulate(torch.autograd.Function):
-    """`Rollout.run` and `Rollout.backward`."""
+    """Autograd function of `Rollout.run` and `Rollout.backward`."""
 
     @staticmethod
     def forward(ctx: Any, rollout: Rollout, names: tuple[str, ...], impulse: Any, *tensors: torch.Tensor) -> tuple:
@@ -122,14 +125,14 @@ class _Simulate(torch.autograd.Function):
             trajectory = rollout.run(**commands)
         ctx.rollout, ctx.names, ctx.trajectory, ctx.writes = rollout, names, trajectory, dict(rollout.writes)
         outputs = [wp.to_torch(getattr(trajectory, name)) for name in OUTPUTS]
-        ctx.save_for_backward(*tensors, *outputs)  # the latter so that torch tells when they have been changed in place
+        ctx.save_for_backward(*tensors, *outputs)  # outputs so that torch detects in-place changes
         ctx.set_materialize_grads(False)
         return tuple(outputs)
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: torch.Tensor | None) -> tuple:
-        """Run it backwards, with the parameters that it had."""
+        """Run the reverse pass with the parameters of the forward pass."""
         rollout, trajectory = ctx.rollout, ctx.trajectory
         given = dict(zip(ctx.names, ctx.saved_tensors, strict=False))
         changed = {name for name, count in rollout.writes.items() if ctx.writes[name] != count}
@@ -137,24 +140,24 @@ class _Simulate(torch.autograd.Function):
             raise InputError(f"{min(lost)} has been changed since this rollout: give it to each call of simulate")
         with _stream(rollout):
             _write_parameters(rollout, given, changed)
-            seeds = {name: _seed(trajectory, name, grad) for name, grad in zip(OUTPUTS, grads, strict=False)}
-            found = rollout.backward(trajectory, **seeds)
-            sums = []
+            cotangents = {name: _cotangent(trajectory, name, grad) for name, grad in zip(OUTPUTS, grads, strict=False)}
+            gradients = rollout.backward(trajectory, **cotangents)
+            by_inputs = []
             for name in ctx.names:
-                grad = wp.to_torch(found[name].contiguous())
-                sums.append(grad.sum(-1) if name == "geometry" else grad)
-        return (None, None, None, *sums)
+                grad = wp.to_torch(gradients[name].contiguous())
+                by_inputs.append(grad.sum(-1) if name == "geometry" else grad)
+        return (None, None, None, *by_inputs)
 
 
-def _seed(trajectory: Trajectory, name: str, grad: torch.Tensor | None) -> wp.array | None:
-    """Return a gradient by an output of the trajectory as Warp sees it."""
+def _cotangent(trajectory: Trajectory, name: str, grad: torch.Tensor | None) -> wp.array | None:
+    """Return the gradient by an output of the trajectory as a Warp array; None: zero."""
     if grad is None:
         return None
     return wp.from_torch(grad.detach().contiguous(), dtype=getattr(trajectory, name).dtype)
 
 
 def _write_parameters(rollout: Rollout, given: dict[str, torch.Tensor], new: Container[str] | None = None) -> None:
-    """Write what is given of the parameters to the rollout; new: those that it does not hold yet, by default all."""
+    """Write the given parameters to the rollout; new: names of those to count as changed, by default all."""
     for name, tensor in given.items():
         if name in rollout.writes and (new is None or name in new):
             rollout.writes[name] += 1
@@ -166,10 +169,10 @@ def _write_parameters(rollout: Rollout, given: dict[str, torch.Tensor], new: Con
 
 @contextlib.contextmanager
 def _stream(rollout: Rollout) -> Iterator[None]:
-    """Let Warp work on PyTorch's stream.
+    """Make Warp use PyTorch's stream within the context.
 
-    Warp forgets a stream, its own too, when a `wp.Stream` that wraps it is deleted, and captures no graph on it any
-    more: where PyTorch works on Warp's stream, as it does beside an environment, nothing is wrapped.
+    Warp drops a stream, even its own, when a `wp.Stream` that wraps it is deleted, and then captures no graph on it. So
+    nothing is wrapped where PyTorch already uses Warp's stream, as it does with an environment.
     """
     device = rollout.device
     if not device.is_cuda or torch.cuda.current_stream().cuda_stream == wp.get_stream(device).cuda_stream:

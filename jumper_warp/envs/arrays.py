@@ -32,7 +32,7 @@ def robot_arrays(sim: Simulation, step_dt: float) -> Any:
     n, device, robot = sim.num_worlds, sim.device, RobotArrays()
     robot.joint_q, robot.joint_qd, robot.body_f = sim.state.joint_q, sim.state.joint_qd, sim.state.body_f
     robot.body_com, robot.gravity = sim.model.body_com, sim.model.gravity
-    robot.invalid, robot.impulse = sim.physics.invalid, sim.physics.impulse
+    robot.diverged, robot.impulse = sim.physics.diverged, sim.physics.impulse
     robot.paw_force, robot.peak_force = sim.paw_force, sim.physics.peak_paw_force
     robot.torque, robot.joint_offset = sim.torque, sim.motors.offset
     motors = ("prev_torque", "action", "prev_action", "prev_prev_action", "target", "filtered_target", "prev_rate")

@@ -9,7 +9,6 @@ import numpy as np
 import torch
 import warp as wp
 
-from jumper_warp.diff.actuation import MOTOR_CONSTANTS
 from jumper_warp.diff.snapshot import Snapshot, compact_columns
 from jumper_warp.envs.arrays import (
     FIRST_STEP_COUNT,
@@ -26,6 +25,7 @@ from jumper_warp.envs.state import load_state, save_state
 from jumper_warp.kernels.mdp.reset import default_pose_kernel
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT
+from jumper_warp.robot.motors import MOTOR_CONSTANTS
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.sim.simulation import SUBSTEPS, Simulation, SolverName
 from jumper_warp.sim.slices import SlicedGraph
@@ -309,7 +309,7 @@ class Env(Stages):
             | {"table": wp.to_torch(dynamics.robot.table), "latency": wp.to_torch(self.parameters.latency) * sim.dt},
             q=compact_columns(wp.to_torch(self.robot.joint_q).view(n, -1), 7),
             qd=compact_columns(wp.to_torch(self.robot.joint_qd).view(n, -1), 6),
-            before=past[(step_count - 1) % len(past), :, torch.arange(n, device=self.device)].T,
+            initial_target=past[(step_count - 1) % len(past), :, torch.arange(n, device=self.device)].T,
             impulse=wp.to_torch(self.robot.impulse),
             action=wp.to_torch(self.robot.action),
             torque=wp.to_torch(self.robot.torque),

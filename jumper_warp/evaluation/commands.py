@@ -1,4 +1,4 @@
-"""What `jumper evaluate` and `jumper play` do with a policy that was opened: run, write and print."""
+"""Implementation of `jumper evaluate` and `jumper play` on an opened policy: run, write and print."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.evaluation.courses import Course, course_metrics, plot_course
+from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_course
 from jumper_warp.evaluation.film import Film
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.run import EvaluationRun, SkillRun
@@ -34,7 +34,7 @@ class EvaluateCfg(Generic[Flags]):
     """Try a policy many times and report how well it did."""
 
     flags: Annotated[Flags, tyro.conf.arg(name="")]
-    """`jumper_warp.evaluation.registry.EvaluationFlags`"""
+    """Flags of the task's kind, `jumper_warp.evaluation.evaluations.EvaluationFlags`."""
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
     """What the policy is tried in."""
     out: Path | None = None
@@ -44,34 +44,34 @@ class EvaluateCfg(Generic[Flags]):
 
 
 def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
-    """Evaluate, print a table, write `metrics.json` and the rows of the log as CSV, and return the figures.
+    """Evaluate a policy, write `metrics.json` and the rows of the log as CSV, print and return the metrics.
 
-    Raises PolicyError: the policy cannot be used or cannot keep figures; OSError: the folder cannot be made.
+    Raises PolicyError: the policy cannot be used or cannot store metrics; OSError: the folder cannot be created.
     """
     if cfg.keep and is_run(run.source):
         raise PolicyError(f"{run.source}: a run keeps no figures; export it first")
     run.prepare("evaluate", cfg.conditions, cfg.out)
-    log = cfg.flags.log(run.evaluation.for_evaluation(run.task), cfg.conditions.seed)
-    run.follow(run.env(log.count), log)
-    figures = {
+    log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.seed)
+    run.run_episodes(run.env(log.count), log)
+    metrics = {
         "task": run.policy.interface.task,
-        **run.tried_in,
+        **run.condition_metrics,
         "noise": cfg.conditions.noise,
         **cfg.flags.metrics(log),
     }
-    write_metrics(run.folder, figures)
-    rows = f"{log.row}s.csv"
+    write_metrics(run.folder, metrics)
+    rows = f"{log.row_name}s.csv"
     (run.folder / rows).write_text(csv_text(log))
     if cfg.keep:
         files = {name: (run.folder / name).read_bytes() for name in ("metrics.json", "run.json", rows)}
         add_files(find_policy(run.source), files)
-    print_figures(figures)
+    print_metrics(metrics)
     Console(stderr=True).print(f"{run.folder}/metrics.json", highlight=False, soft_wrap=True)
-    return figures
+    return metrics
 
 
 def csv_text(log: EvaluationLog) -> str:
-    """Return a heading and one line a row: what was asked for, what came of it, and how it ended."""
+    """Return the columns of a log as CSV text: a heading, then one line per row."""
     columns = log.columns()
     lines = [",".join(columns)]
     for row in zip(*columns.values(), strict=True):
@@ -79,10 +79,10 @@ def csv_text(log: EvaluationLog) -> str:
     return "\n".join(lines) + "\n"
 
 
-def print_figures(figures: dict[str, Any]) -> None:
-    """Print a table of figures to standard output."""
-    table = Table("figure", "value", box=None)
-    for name, value in figures.items():
+def print_metrics(metrics: dict[str, Any]) -> None:
+    """Print a table of metrics to standard output."""
+    table = Table("metric", "value", box=None)
+    for name, value in metrics.items():
         table.add_row(name, f"{value:.4g}" if isinstance(value, float) else json.dumps(value))
     Console().print(table)
 
@@ -104,32 +104,31 @@ class PlayCfg(RecordingCfg, Generic[Flags]):
     """Let a policy act, and record it."""
 
     flags: Annotated[Flags, tyro.conf.arg(name="")]
-    """`jumper_warp.evaluation.registry.PlayFlags`"""
+    """Flags of the task's kind, `jumper_warp.evaluation.evaluations.PlayFlags`."""
     seconds: float | None = None
     """[s] Length of the recording (default: for jumps 3.5, and 2.5 for each further one; else 10)."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         if self.seconds is not None and not 0.0 < self.seconds <= 600.0:
             raise InputError(f"seconds must be in (0, 600], got {self.seconds}")
 
 
 def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
-    """Simulate, write a recording and `metrics.json`, print a table; return the path of the recording.
+    """Simulate a policy, write a recording and `metrics.json`, print the outcomes; return the path of the recording.
 
-    Raises PolicyError: the policy cannot be used; OSError: the folder cannot be made.
+    Raises PolicyError: the policy cannot be used; OSError: the folder cannot be created.
     """
     flags, name = cfg.flags, run.policy.interface.task
     run.prepare("play", cfg.conditions, cfg.out)
-    log = flags.log(run.evaluation.for_evaluation(run.task))
+    log = flags.log(run.evaluation.prepare_task(run.task))
     env, worlds = run.env(log.count), range(log.count)
     notes = {"task": name, **log.notes(worlds), "solver": cfg.conditions.solver}
-    film = Film(env, log.series, worlds, spacing=log.spacing, notes=notes, motors=True)
-    run_evaluation(run.policy.act, env, log, seconds=cfg.seconds or flags.length, watch=film, stop=False)
-    path = film.save_rrd(run.folder / f"{log.row}.rrd", log.marks(worlds))
+    film = Film(env, log.series, worlds, spacing=log.spacing, notes=notes, record_motors=True)
+    run_evaluation(run.policy.act, env, log, seconds=cfg.seconds or flags.length, on_step=film, stop=False)
+    path = film.save_rrd(run.folder / f"{log.row_name}.rrd", log.goal_markers(worlds))
     write_metrics(run.folder, log.columns())
     print_rows(log)
-    return shown(path, cfg.viewer)
+    return show_recording(path, cfg.viewer)
 
 
 @dataclass(frozen=True)
@@ -148,27 +147,27 @@ class ScriptCfg(RecordingCfg):
 
 
 def play_script(cfg: ScriptCfg) -> Path:
-    """Simulate, write a recording, a plot and `metrics.json`, print a table; return the path of the recording.
+    """Simulate a script, write a recording, a plot and `metrics.json`, print them; return the path of the recording.
 
     Raises InputError: the script or device cannot be used; PolicyError: a policy; OSError: the folder.
     """
     script = read_script(cfg.script)
     run = SkillRun(cfg.policies)
     run.prepare("play", cfg.conditions, cfg.out)
-    course = Course([script])
+    course = CourseLog([script])
     env = run.env(1, block=course.block)
     film = Film(env, course.series, [0], notes={**course.notes([0]), "solver": cfg.conditions.solver})
-    run_evaluation(run.actor(env), env, course, watch=film)
+    run_evaluation(run.actor(env), env, course, on_step=film)
     path = film.save_rrd(run.folder / "course.rrd")
     plot_course(run.folder / "course.png", course, 0)
-    figures = {"outcome": str(course.outcomes[0]), **course_metrics(course)}
-    write_metrics(run.folder, figures)
-    print_figures(figures)
-    return shown(path, cfg.viewer)
+    metrics = {"outcome": str(course.outcomes[0]), **course_metrics(course)}
+    write_metrics(run.folder, metrics)
+    print_metrics(metrics)
+    return show_recording(path, cfg.viewer)
 
 
-def shown(path: Path, viewer: str) -> Path:
-    """Print the path of a recording to standard error, open the viewer if there is one, and return the path."""
+def show_recording(path: Path, viewer: str) -> Path:
+    """Print the path of a recording to standard error, open it if `viewer` is "rerun", and return the path."""
     Console(stderr=True).print(str(path), highlight=False, soft_wrap=True)
     if viewer == "rerun":
         subprocess.run(viewer_command(path), check=False)
@@ -176,12 +175,12 @@ def shown(path: Path, viewer: str) -> Path:
 
 
 def viewer_command(path: Path) -> list[str]:
-    """Return the command that shows a recording and listens on loopback only."""
+    """Return the command that opens a recording in the Rerun viewer, listening on loopback only."""
     return [sys.executable, "-m", "rerun", str(path), "--bind", "127.0.0.1"]
 
 
 def print_rows(log: EvaluationLog) -> None:
-    """Print one line a row of a log to standard output."""
+    """Print the columns of a log as a table to standard output."""
     columns = log.columns()
     table = Table(*columns, box=None)
     for row in zip(*columns.values(), strict=True):

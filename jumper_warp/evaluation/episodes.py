@@ -1,4 +1,4 @@
-"""Episodes of any task: how long they last, how they end, and where the base goes."""
+"""Episodes of any task: log and metrics of length, termination and base position."""
 
 from __future__ import annotations
 
@@ -15,48 +15,42 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.commands import layout_of
 from jumper_warp.utils.errors import InputError
 
-MOST_SECONDS = 600.0
-MOST_NUMBERS = 4
-"""In a command."""
+MAX_SECONDS = 600.0
+MAX_COMMAND_SIZE = 4
+"""Maximum number of values in a command."""
 
 
 @dataclass
-class Episodes(EvaluationLog):
-    """What became of one episode per world; each array has shape (num_envs, ...). Nothing changes after its end."""
+class EpisodeLog(EvaluationLog):
+    """Log of one episode per world; arrays have shape (num_envs, ...) and do not change after the episode's end."""
 
-    commands: np.ndarray
-    """One row a world, of what the task's command takes."""
+    commands: np.ndarray  # (num_envs, n) Command of each world, as the task takes it
     task: TaskCfg
-    seconds: float = 10.0
-    """Simulated time at most."""
-    end: np.ndarray = field(init=False)
-    """Index of the termination, -1 before it."""
-    length: np.ndarray = field(init=False)
-    """[s] Of the episode."""
-    start: np.ndarray = field(init=False)
-    """[m] (..., 3) Base at the start, world."""
-    place: np.ndarray = field(init=False)
-    """[m] (..., 3) Base at the end, world."""
+    seconds: float = 10.0  # [s] Maximum simulated time
+    end: np.ndarray = field(init=False)  # (num_envs,) Index of the termination that ended the episode, -1 while it runs
+    length: np.ndarray = field(init=False)  # [s] (num_envs,) Length of the episode
+    start_position: np.ndarray = field(init=False)  # [m] (num_envs, 3) Base position at the start, world frame
+    end_position: np.ndarray = field(init=False)  # [m] (num_envs, 3) Base position at the end, world frame
 
-    row = "episode"
+    row_name = "episode"
     spacing = 2.0
 
     def __post_init__(self) -> None:
         """Begin with no episode ended."""
         self.count = count = len(self.commands)
         self.end, self.length = np.full(count, -1), np.zeros(count)
-        self.start, self.place = (np.full((count, 3), np.nan) for _ in range(2))
+        self.start_position, self.end_position = (np.full((count, 3), np.nan) for _ in range(2))
         self._height_sum, self._steps = np.zeros(count), np.zeros(count, dtype=int)
 
     def begin(self, env: Env) -> None:
-        """Stand every world in the default pose with its command."""
+        """Reset every world to the default pose and set its command."""
         env.evaluation_reset(self.commands)
-        self.start = env.task_arrays()["base_pos"].copy()
+        self.start_position = env.task_arrays()["base_pos"].copy()
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
-        """Take in a policy step; return whether all episodes have ended."""
+        """Record a policy step from the arrays of `read_env`; return whether all episodes have ended."""
         running = self.end < 0
-        self.place[running] = arrays["base_pos"][running]
+        self.end_position[running] = arrays["base_pos"][running]
         self._height_sum[running] += arrays["base_pos"][running, 2]
         self._steps[running] += 1
         self.length[running] += step_dt
@@ -66,75 +60,75 @@ class Episodes(EvaluationLog):
 
     @property
     def mean_height(self) -> np.ndarray:
-        """[m] Of the base over the episode; not a number before the first step."""
+        """[m] (num_envs,) Mean base height over the episode, NaN before the first step."""
         return np.where(self._steps > 0, self._height_sum / np.maximum(self._steps, 1), np.nan)
 
     @property
-    def moved(self) -> np.ndarray:
-        """[m] (..., 2) From start to end of the base, world."""
-        return (self.place - self.start)[:, :2]
+    def displacement(self) -> np.ndarray:
+        """[m] (num_envs, 2) Horizontal displacement of the base from start to end, world frame."""
+        return (self.end_position - self.start_position)[:, :2]
 
     @property
     def outcomes(self) -> np.ndarray:
-        """Name of each episode's end."""
+        """Name of the termination of each episode, NO_END if it still runs."""
         return np.array([*(term.name for term in self.task.terminations), NO_END])[self.end]
 
-    def of_kind(self, option: str) -> np.ndarray:
-        """Return which episodes ended by a termination with an option, such as `success` or `time_out`."""
+    def ended_with(self, option: str) -> np.ndarray:
+        """Return which episodes were ended by a termination with an option, such as `success` or `time_out`."""
         return np.array([*(bool(term.options[option]) for term in self.task.terminations), False])[self.end]
 
     def columns(self) -> dict[str, list]:
-        """Return commands, lengths, heights and places [m] and the ends."""
+        """Return commands, lengths, mean heights, end positions and terminations, one value per episode."""
         numbers = {f"command_{i}": self.commands[:, i] for i in range(self.commands.shape[1])}
         numbers |= {"length_s": self.length, "mean_base_height_m": self.mean_height}
-        numbers |= {f"base_{axis}_m": self.place[:, i] for i, axis in enumerate("xyz")}
+        numbers |= {f"base_{axis}_m": self.end_position[:, i] for i, axis in enumerate("xyz")}
         return {name: finite(values) for name, values in numbers.items()} | {"end": self.outcomes.tolist()}
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the base's height and its distance from the start [m]."""
-        series, pos = {}, self.seen["base_pos"]
+        """Return the base's height and horizontal distance from the start [m] of some worlds."""
+        series, pos = {}, self.arrays["base_pos"]
         for world in worlds:
             series[f"height/base of {world} [m]"] = pos[world, 2]
-            series[f"distance/start of {world} [m]"] = np.linalg.norm((pos - self.start)[world, :2])
+            series[f"distance/start of {world} [m]"] = np.linalg.norm((pos - self.start_position)[world, :2])
         return series
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the commands."""
+        """Return the commands of some worlds."""
         return {"commands": self.commands[list(worlds)].tolist()}
 
 
-def episode_metrics(episodes: Episodes) -> Metrics:
-    """Return the metrics of episodes: shares of all, means over all, and how many ended in which way."""
-    outcomes, still = episodes.outcomes, episodes.end < 0
-    success, timed_out = episodes.of_kind("success"), episodes.of_kind("time_out")
-    distance = np.linalg.norm(episodes.moved, axis=1)
+def episode_metrics(episodes: EpisodeLog) -> Metrics:
+    """Return rates and means over all episodes, and the number of episodes by termination."""
+    outcomes, running = episodes.outcomes, episodes.end < 0
+    success, timed_out = episodes.ended_with("success"), episodes.ended_with("time_out")
+    distance = np.linalg.norm(episodes.displacement, axis=1)
     metrics: Metrics = {
         "episodes": len(outcomes),
         "mean_episode_s": mean(episodes.length),
         "success_rate": float(success.mean()),
-        "failure_rate": float((~still & ~success & ~timed_out).mean()),
-        "no_end_rate": float(still.mean()),
+        "failure_rate": float((~running & ~success & ~timed_out).mean()),
+        "no_end_rate": float(running.mean()),
         "mean_base_height_m": mean(np.array(finite(episodes.mean_height), dtype=float)),
-        "mean_base_height_at_the_end_m": mean(np.array(finite(episodes.place[:, 2]), dtype=float)),
+        "mean_base_height_at_the_end_m": mean(np.array(finite(episodes.end_position[:, 2]), dtype=float)),
         "mean_distance_from_start_m": mean(np.array(finite(distance), dtype=float)),
-        "mean_moved_x_m": mean(np.array(finite(episodes.moved[:, 0]), dtype=float)),
-        "mean_moved_y_m": mean(np.array(finite(episodes.moved[:, 1]), dtype=float)),
+        "mean_moved_x_m": mean(np.array(finite(episodes.displacement[:, 0]), dtype=float)),
+        "mean_moved_y_m": mean(np.array(finite(episodes.displacement[:, 1]), dtype=float)),
     }
     return metrics | {f"ended_by_{name}": int((outcomes == name).sum()) for name in sorted(set(outcomes))}
 
 
 def check_episodes(count: int, command: tuple[float, ...], seconds: float) -> None:
-    """Raise InputError unless this can be asked of a number of worlds."""
+    """Raise InputError unless number of episodes, command and length [s] are within their limits."""
     if count < 1:
         raise InputError(f"episodes must be at least 1, got {count}")
-    if len(command) > MOST_NUMBERS or not all(math.isfinite(value) for value in command):
-        raise InputError(f"command takes up to {MOST_NUMBERS} finite numbers, got {command}")
-    if not 0.0 < seconds <= MOST_SECONDS:
-        raise InputError(f"seconds must be in (0, {MOST_SECONDS:g}], got {seconds}")
+    if len(command) > MAX_COMMAND_SIZE or not all(math.isfinite(value) for value in command):
+        raise InputError(f"command takes up to {MAX_COMMAND_SIZE} finite numbers, got {command}")
+    if not 0.0 < seconds <= MAX_SECONDS:
+        raise InputError(f"seconds must be in (0, {MAX_SECONDS:g}], got {seconds}")
 
 
-def filled(command: tuple[float, ...], count: int, task: TaskCfg) -> np.ndarray:
-    """Return commands of worlds that are all asked for the same, one a row; numbers that are left out are 0."""
+def tile_command(command: tuple[float, ...], count: int, task: TaskCfg) -> np.ndarray:
+    """Return the command for each of `count` worlds, (count, n), padded with zeros to the size that the task takes."""
     missing = max(layout_of(task).counts[-1] - len(command), 0)
     return np.tile(np.pad(np.array(command, dtype=float), (0, missing)), (count, 1))
 
@@ -151,20 +145,19 @@ class EpisodeFlags:
     """[s] Length at most."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         check_episodes(self.episodes, self.command, self.seconds)
 
-    def log(self, task: TaskCfg, seed: int) -> Episodes:
-        """Return episodes with this command."""
-        return Episodes(filled(self.command, self.episodes, task), task, self.seconds)
+    def log(self, task: TaskCfg, seed: int) -> EpisodeLog:
+        """Return the log of episodes with this command."""
+        return EpisodeLog(tile_command(self.command, self.episodes, task), task, self.seconds)
 
-    def metrics(self, log: Episodes) -> Metrics:
+    def metrics(self, log: EpisodeLog) -> Metrics:
         """Return `episode_metrics`."""
         return episode_metrics(log)
 
 
 @dataclass(frozen=True)
-class EpisodeGoals:
+class EpisodePlayFlags:
     """An episode that is recorded."""
 
     command: tuple[float, ...] = ()
@@ -173,9 +166,8 @@ class EpisodeGoals:
     length = 10.0
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         check_episodes(1, self.command, self.length)
 
-    def log(self, task: TaskCfg) -> Episodes:
-        """Return one robot's episode."""
-        return Episodes(filled(self.command, 1, task), task, self.length)
+    def log(self, task: TaskCfg) -> EpisodeLog:
+        """Return the log of one robot's episode."""
+        return EpisodeLog(tile_command(self.command, 1, task), task, self.length)

@@ -1,6 +1,6 @@
-"""Filming an environment: some of its worlds as a recording for the Rerun viewer, and as strips of pictures.
+"""Recordings of some worlds of an environment, for the Rerun viewer and as filmstrips.
 
-Nothing of the viewer or the pictures is imported before there is something to film.
+Viewer and renderer are imported only when something is recorded.
 """
 
 from __future__ import annotations
@@ -24,36 +24,31 @@ if TYPE_CHECKING:
     from jumper_warp.sim.simulation import Simulation
 
 ANKLE = np.array([0.0, 0.0, -0.3])
-"""[m] In the shank's frame."""
-EYE_DISTANCE = 2.4
-"""[m] From the path to the eye of a picture."""
-PICTURE = (400, 320)
-"""[px] Of a robot that is seen from beside its path."""
+"""[m] Position of the ankle in the shank's frame."""
+CAMERA_DISTANCE = 2.4
+"""[m] Distance from the path to the camera in `side_view`."""
+PICTURE_SIZE = (400, 320)
+"""[px] Width and height of a filmstrip's picture in `side_view`."""
 
 
 @dataclass(frozen=True)
-class Strip:
-    """What a filmstrip shows."""
+class Filmstrip:
+    """Frames, captions and camera of a filmstrip of one world."""
 
-    index: int
-    """Of the filmed world."""
-    frames: Sequence[int]
+    index: int  # Index among the recorded worlds
+    frames: Sequence[int]  # Indices of the recorded frames
     captions: Sequence[str]
-    eye: Sequence[float] | np.ndarray
-    """[m] Of the camera, world frame."""
-    target: Sequence[float] | np.ndarray
-    """[m] Where it looks."""
-    size: tuple[int, int]
-    """[px] Width and height of a picture."""
-    name: str = ""
-    """Of the file (default: the film's)."""
+    eye: Sequence[float] | np.ndarray  # [m] Position of the camera, world frame, (3,)
+    target: Sequence[float] | np.ndarray  # [m] Point in the middle of the picture, world frame, (3,)
+    size: tuple[int, int]  # [px] Width and height of one picture
+    name: str = ""  # Name of the file without suffix (default: name of the recording)
 
 
-class Links:
-    """Reads all links, from base and motor coordinates; the simulation is left as it is."""
+class LinkReader:
+    """Computes the state of all links from base and motor coordinates, without changing the simulation."""
 
     def __init__(self, env: Env) -> None:
-        """Allocate a state of the environment's model."""
+        """Allocate a separate state of the environment's model."""
         self._sim, self._state = env.sim, env.sim.model.state()
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:
@@ -67,7 +62,7 @@ class Links:
 
 
 class Film:
-    """Collects what some worlds of an environment look like; call it after every policy step."""
+    """Records some worlds of an environment; call it after every policy step."""
 
     def __init__(
         self,
@@ -79,38 +74,39 @@ class Film:
         ground: Any = "plane",
         block: BlockCfg | None = None,
         notes: Mapping[str, Any] | None = None,
-        motors: bool = False,
+        record_motors: bool = False,
     ) -> None:
-        """Film worlds (at least one) of the environment, together with series of numbers.
+        """Record worlds (at least one) of the environment, and time series.
 
-        series: returns what to draw of the worlds over time, as `EvaluationLog.series`.
-
-        spacing: [m] along y, by which each world is drawn beside the one before it; 0 on a heightfield. ground: as in
-        `build_model`; block: the environment's sliding blocks, if it has any; notes: saved along, must be JSON;
-        motors: whether to add torques and actions of the first world.
+        series: returns the present values of the time series, as `EvaluationLog.series`; spacing [m]: distance along y
+        at which worlds are shown side by side, 0 on a heightfield; ground: as in `build_model`; block: the
+        environment's sliding blocks, if any; notes: metadata of the recording, must be JSON; record_motors: add
+        torques and actions of the first world.
         """
         from jumper_warp.viz.recorder import Recorder
 
-        self.env, self.series, self.worlds, self.spacing, self.motors = env, series, list(worlds), spacing, motors
-        self.links = Links(env)
+        self.env, self.series, self.worlds = env, series, list(worlds)
+        self.spacing, self.record_motors = spacing, record_motors
+        self.links = LinkReader(env)
         self.model = build_model(len(worlds), ground=ground, device=env.wp_device)
         self.recorder = Recorder(self.model, range(len(worlds)), spacing=spacing, notes=notes)
         self.frames = 0
         self.block = None if block is None else block.per_world(env.num_envs)
-        self.block_places: list[np.ndarray] = []
+        self.block_positions: list[np.ndarray] = []
 
     def __call__(self) -> None:
-        """Add the environment's state of the moment."""
+        """Record the environment's present state as a frame."""
         sim = self.env.sim
         poses = self.links.read()[0][self.worlds]
-        series = {**self.series(self.worlds), **(self._motor_series() if self.motors else {})}
+        series = {**self.series(self.worlds), **(self._motor_series() if self.record_motors else {})}
         forces = sim.paw_force.numpy().transpose(1, 0, 2)[self.worlds]
         if self.block is not None:
-            self.block_places.append(block_places(sim)[self.worlds])
+            self.block_positions.append(block_positions(sim)[self.worlds])
         self.frames += 1
         self.recorder.record(self.frames * self.env.step_dt, poses.reshape(-1, 7), series, ankles(poses), forces)
 
     def _motor_series(self) -> dict[str, float]:
+        """Return torque [N m] and action [1] of every motor of the first recorded world."""
         from jumper_warp.robot.description import MOTOR_JOINTS
 
         world = self.worlds[0]
@@ -118,51 +114,55 @@ class Film:
         series = {f"torque/{name} [N m]": torque[i] for i, name in enumerate(MOTOR_JOINTS)}
         return series | {f"action/{name} [1]": action[i] for i, name in enumerate(MOTOR_JOINTS)}
 
-    def base(self, index: int) -> np.ndarray:
-        """Return the base's positions [m], world frame, (frames, 3), of the index-th filmed world."""
+    def base_positions(self, index: int) -> np.ndarray:
+        """Return the base positions [m] of the index-th recorded world, world frame, (frames, 3)."""
         recording = self.recorder.recording()
         return recording.poses[:, index * len(recording.bodies) // len(self.worlds), :3]
 
     def save_rrd(self, path: Path, goals: np.ndarray | None = None) -> Path:
-        """Write the recording; goals [m]: (filmed worlds, goals a world, 3) places to mark, world frame."""
-        from jumper_warp.viz.props import with_blocks, with_marks
+        """Write the recording; goals [m]: positions to mark, world frame, (recorded worlds, goals per world, 3)."""
+        from jumper_warp.viz.props import with_blocks, with_goal_markers
         from jumper_warp.viz.rerun import write_rrd
 
         recording = self.recorder.recording()
         if goals is not None:
-            recording = with_marks(recording, goals)
+            recording = with_goal_markers(recording, goals)
         if self.block is not None:
             half, height = self.block["half"][self.worlds], self.block["height"][self.worlds]
-            recording = with_blocks(recording, np.stack(self.block_places), half, height)
+            recording = with_blocks(recording, np.stack(self.block_positions), half, height)
         return write_rrd(recording, path)
 
-    def save_strip(self, strip: Strip, path: Path) -> None:
-        """Write the pictures of a filmstrip side by side."""
+    def save_filmstrip(self, filmstrip: Filmstrip, path: Path) -> None:
+        """Render the pictures of a filmstrip and write them side by side as one PNG file."""
         from jumper_warp.viz.snapshot import Camera, contact_sheet
 
         recording = self.recorder.recording()
-        camera = Camera(self.model, tuple(strip.eye), tuple(strip.target), strip.size, world=strip.index)
+        eye, target = tuple(filmstrip.eye), tuple(filmstrip.target)
+        camera = Camera(self.model, eye, target, filmstrip.size, world=filmstrip.index)
         state, pictures = self.model.state(), []
-        for frame in strip.frames:
+        for frame in filmstrip.frames:
             state.body_q.assign(recording.poses[frame])
             pictures.append(camera.picture(state))
-        contact_sheet(pictures, path, strip.captions)
+        contact_sheet(pictures, path, filmstrip.captions)
 
 
-def block_places(sim: Simulation) -> np.ndarray:
-    """Return the places [m] of the sliding blocks, world frame, (num_worlds, 2); SolverJumper alone has any."""
+def block_positions(sim: Simulation) -> np.ndarray:
+    """Return the positions [m] of the sliding blocks, world frame, (num_worlds, 2); only SolverJumper has blocks."""
     assert isinstance(sim.solver, SolverJumper)
     return sim.solver.block_position()
 
 
 def ankles(poses: np.ndarray) -> np.ndarray:
-    """Return the ankles [m], world frame, (num_worlds, 4, 3), from the poses (num_worlds, 21, 7) of all links."""
+    """Return ankle positions [m], world frame, (num_worlds, 4, 3), from the poses (num_worlds, 21, 7) of all links."""
     shanks = poses[:, 5 * np.arange(1, len(LEGS) + 1)]
     return shanks[..., :3] + rotate(shanks[..., 3:], ANKLE)
 
 
-def moments(height: np.ndarray, command: int) -> list[int]:
-    """Return the frames of a filmstrip: command, squat, push-off, apex, fall, catch, end; height (frames,) [m]."""
+def keyframes(height: np.ndarray, command: int) -> list[int]:
+    """Return seven frames of a jump for a filmstrip: command, squat, push-off, apex, fall, catch, end.
+
+    height [m]: of the base, (frames,); command: frame in which the jump is commanded.
+    """
     command = min(max(command, 0), len(height) - 1)
     apex = command + int(np.argmax(height[command:]))
     squat = command + int(np.argmin(height[command : apex + 1]))
@@ -171,11 +171,11 @@ def moments(height: np.ndarray, command: int) -> list[int]:
     return [command, squat, push, apex, (apex + catch) // 2, catch, len(height) - 1]
 
 
-def beside(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return an eye beside the way from start to end (2,), and the point that it looks at, (3,); [m], world frame."""
-    way = end - start
-    length = float(np.linalg.norm(way))
-    ahead = way / length if length > 1.0e-3 else np.array([1.0, 0.0])
-    middle = np.append(start + 0.5 * way, 0.4)
-    back = EYE_DISTANCE * max(1.0, length / 1.5)
-    return middle + np.array([back * ahead[1], -back * ahead[0], 0.35]), middle
+def side_view(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return a camera position beside the path from start to end (2,), and its target, (3,) each; [m], world frame."""
+    path = end - start
+    length = float(np.linalg.norm(path))
+    ahead = path / length if length > 1.0e-3 else np.array([1.0, 0.0])
+    middle = np.append(start + 0.5 * path, 0.4)
+    distance = CAMERA_DISTANCE * max(1.0, length / 1.5)
+    return middle + np.array([distance * ahead[1], -distance * ahead[0], 0.35]), middle

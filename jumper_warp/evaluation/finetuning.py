@@ -1,7 +1,7 @@
-"""Fine-tuning of a jumping policy by its misses: apex against commanded height, or landing place.
+"""Fine-tuning of a jumping policy: Gauss-Newton on the errors of apex heights or landing positions.
 
-Gauss-Newton on the misses of many jumps, of the nominal robot and of drawn ones, held near the policy as it came. A
-policy for places first gets its aim right: the goal that it sees is shifted by what its robots missed.
+The jumps are those of the nominal robot and of randomised ones, and the actions are held near those of the original
+policy. For landing positions the aim is corrected first: the observed goal is shifted by the mean error.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ from typing import Any
 import numpy as np
 import torch
 
-from jumper_warp.evaluation.jump_misses import Group, Misses, follow
+from jumper_warp.evaluation.evaluations import evaluation_of
+from jumper_warp.evaluation.jump_errors import JumpErrors, JumpGroup, jump_errors
 from jumper_warp.evaluation.jumps import LANDED, jump_commands
-from jumper_warp.evaluation.registry import evaluation_of
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.policy import Policy
 from jumper_warp.tasks.cfg import TaskCfg
@@ -31,15 +31,16 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.runtime import git_commit
 
 AHEAD = "goal_x"
-"""Observation of jumps to places: way to the goal ahead [m]."""
+"""Observation of jumps to landing positions: distance to the goal ahead [m]."""
 DELAYS = (0.3, 0.7)
-"""[s] Between which jumps are commanded."""
-ANCHOR_SECONDS = 3.5
-ANCHOR_ROWS = 4096
+"""[s] Range of the time until jumps are commanded."""
+TRUST_REGION_SECONDS = 3.5
+"""[s] Length of the episodes whose observations are sampled."""
+TRUST_REGION_SAMPLES = 4096
 DAMPING = 1.0e-2
-"""Of the first step."""
+"""Damping of the first step."""
 AIM_ROUNDS = 3
-"""Corrections of the aim, at most: where robots come to rest follows the goal that they see, by and large."""
+"""Maximum number of corrections of the aim."""
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,6 @@ class FinetuneCfg:
     """CPU threads that share the worlds (default: all cores); they change no result."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         if self.goals < 2 or min(self.late, self.randomized, self.iterations) < 0:
             raise InputError("fine-tuning needs at least 2 goals, and no negative number of jumps or steps")
         for name in ("miss_std", "late_std", "randomized_std", "action_std", "landing_std"):
@@ -97,21 +97,22 @@ class FinetuneArgs(FinetuneCfg):
     """Replace a policy that is there already."""
 
 
-def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] = ()) -> list[Group]:
-    """Return the groups of jumps that have any."""
+def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] = ()) -> list[JumpGroup]:
+    """Return the groups of jumps that are not empty: nominal, late (with latency) and randomised robots."""
     rng, groups = np.random.default_rng(cfg.seed), []
 
-    def level(task: TaskCfg) -> TaskCfg:
-        return evaluation_of(task).for_evaluation(task).on_level_ground()
+    def on_level_ground(task: TaskCfg) -> TaskCfg:
+        return evaluation_of(task).prepare_task(task).on_level_ground()
 
-    def latencies(task: TaskCfg) -> TaskCfg:
+    def with_latencies(task: TaskCfg) -> TaskCfg:
         ranges = RandomizationCfg.off().with_fixed(friction=task.randomization.nominal_friction)
-        return replace(level(task), randomization=replace(ranges, latency=task.randomization.latency), events=())
+        ranges = replace(ranges, latency=task.randomization.latency)
+        return replace(on_level_ground(task), randomization=ranges, events=())
 
     kinds: tuple[tuple[str, int, float, bool, Callable[[TaskCfg], TaskCfg]], ...] = (
-        ("nominal", cfg.goals, cfg.miss_std, False, level),
-        ("late", cfg.late, cfg.late_std, True, latencies),
-        ("randomized", cfg.randomized, cfg.randomized_std, True, level),
+        ("nominal", cfg.goals, cfg.miss_std, False, on_level_ground),
+        ("late", cfg.late, cfg.late_std, True, with_latencies),
+        ("randomized", cfg.randomized, cfg.randomized_std, True, on_level_ground),
     )
     for name, count, std, draws, change in kinds:
         if count:
@@ -119,114 +120,117 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
                 randomize=draws, noise=name == "randomized", seed=cfg.seed, device=cfg.device, threads=cfg.threads
             )
             env = env_of_policy(policy, count, conditions, change=change, modules=modules)
-            misses = evaluation_of(env.task).misses
-            if misses is None:
+            target = evaluation_of(env.task).finetune_target
+            if target is None:
                 raise InputError(f"fine-tuning is for jumps to heights and places, not for {env.task.name}")
-            goals, to_height = np.zeros((count, 3)), misses == "height"
+            goals, to_height = np.zeros((count, 3)), target == "apex"
             goals[:, 2 if to_height else 0] = np.linspace(*(cfg.heights if to_height else cfg.distances), count)
             delays = rng.uniform(*DELAYS, count)
-            groups.append(Group(name, env, std, jump_commands(goals, delays, env.step_dt), to_height))
+            groups.append(JumpGroup(name, env, std, jump_commands(goals, delays, env.step_dt), to_height))
     return groups
 
 
-def make_anchor(groups: list[Group], network: Network, cfg: FinetuneCfg) -> Anchor:
-    """Return what holds the network over observations of whole jumps of all groups, from standing to rest."""
-    seen, landed = [], []
+def collect_trust_region_samples(groups: list[JumpGroup], network: Network, cfg: FinetuneCfg) -> Anchor:
+    """Run all groups, and return the trust region of the actions on a sample of their observations.
+
+    Observations are from standing to rest; those after touchdown have the standard deviation `landing_std`.
+    """
+    observations, landed = [], []
     for group in groups:
         group.begin()
         with torch.no_grad():
-            for _ in range(round(ANCHOR_SECONDS / group.env.step_dt)):
-                seen.append(group.env.obs.clone())
+            for _ in range(round(TRUST_REGION_SECONDS / group.env.step_dt)):
+                observations.append(group.env.obs.clone())
                 landed.append(group.env.task_arrays()["phase"] == LANDED)
                 group.env.step(network.act(group.env.obs))
     stds = np.where(np.concatenate(landed), cfg.landing_std, cfg.action_std).astype(np.float32)
-    chosen = np.random.default_rng(cfg.seed).permutation(len(stds))[:ANCHOR_ROWS]
-    obs = torch.cat(seen)[torch.as_tensor(chosen, device=seen[0].device)]
-    return Anchor(network, obs, torch.as_tensor(stds[chosen], device=obs.device))
+    sample = np.random.default_rng(cfg.seed).permutation(len(stds))[:TRUST_REGION_SAMPLES]
+    obs = torch.cat(observations)[torch.as_tensor(sample, device=observations[0].device)]
+    return Anchor(network, obs, torch.as_tensor(stds[sample], device=obs.device))
 
 
-def mean_abs_misses(groups: list[Group], found: list[Misses]) -> dict[str, float]:
-    """Return the mean absolute miss [m] of each group."""
-    return {group.name: float(m.value[m.valid].abs().mean()) for group, m in zip(groups, found, strict=True)}
+def mean_abs_errors(groups: list[JumpGroup], errors: list[JumpErrors]) -> dict[str, float]:
+    """Return the mean absolute error [m] by name of the group."""
+    return {group.name: float(e.value[e.valid].abs().mean()) for group, e in zip(groups, errors, strict=True)}
 
 
-def with_aim(policy: Policy, shift: float) -> Policy:
-    """Return the policy that sees its goals so much [m] farther ahead; the observation's normaliser does it."""
+def shift_goal_observation(policy: Policy, shift: float) -> Policy:
+    """Return the policy that observes its goals `shift` [m] farther ahead, by a change of its normaliser."""
     mean = policy.mean.clone()
     mean[policy.interface.observation_names.index(AHEAD)] -= shift
     return Policy(policy.layers, mean, policy.std, policy.interface, policy.config)
 
 
-def take_aim(
-    policy: Policy, groups: list[Group], say: Callable[[str], object]
+def correct_aim(
+    policy: Policy, groups: list[JumpGroup], log: Callable[[str], object]
 ) -> tuple[Policy, list[dict[str, dict[str, float]]]]:
-    """Return the policy with its aim at goals straight ahead corrected, and the misses [m] by group on the way.
+    """Return the policy with its aim at goals straight ahead corrected, and the errors [m] by group of each round.
 
-    Every round takes the mean of what the robots missed, as the groups weigh it, off the goal that they see; one that
-    does not lower the cost is taken back, and the last. A stretch would do little: the way to the goal that a robot
-    sees is short by the time that it lands.
+    Every round subtracts the weighted mean error from the observed goal; a round that does not lower the cost is undone
+    and ends the correction. A factor on the goal would have little effect: the observed distance is short at landing.
     """
 
-    def measure(policy: Policy) -> tuple[float, list[Misses], dict[str, dict[str, float]]]:
+    def measure(policy: Policy) -> tuple[float, list[JumpErrors], dict[str, dict[str, float]]]:
         network = Network(policy, device=groups[0].env.device)
-        found = [follow(group, network, derivatives=False) for group in groups]
-        pairs = list(zip(groups, found, strict=True))
-        cost = sum(float((group.importance(m) * m.value.square()).sum()) for group, m in pairs)
-        ahead = {g.name: m.value[: len(g.commands)][m.valid[: len(g.commands)]] for g, m in pairs}
+        errors = [jump_errors(group, network, derivatives=False) for group in groups]
+        pairs = list(zip(groups, errors, strict=True))
+        cost = sum(float((group.importance(e) * e.value.square()).sum()) for group, e in pairs)
+        ahead = {g.name: e.value[: len(g.commands)][e.valid[: len(g.commands)]] for g, e in pairs}
         means = {"ahead": {name: float(value.mean()) for name, value in ahead.items()}}
-        means["mean_abs_miss_m"] = mean_abs_misses(groups, found)
+        means["mean_abs_miss_m"] = mean_abs_errors(groups, errors)
         words = ", ".join(f"{name} {1000.0 * miss:+.2f} mm" for name, miss in means["ahead"].items())
-        say(f"aim: cost {cost:.4g}, robots end ahead of their goals by {words}")
-        return cost, found, means
+        log(f"aim: cost {cost:.4g}, robots end ahead of their goals by {words}")
+        return cost, errors, means
 
-    cost, found, means = measure(policy)
-    told = [means]
+    cost, errors, means = measure(policy)
+    history = [means]
     for _ in range(AIM_ROUNDS):
-        ahead = [m.value[: len(g.commands)] for g, m in zip(groups, found, strict=True)]
-        weight = [g.importance(m)[: len(g.commands)] for g, m in zip(groups, found, strict=True)]
-        aimed = with_aim(policy, -float((torch.cat(weight) * torch.cat(ahead)).sum() / torch.cat(weight).sum()))
-        new_cost, new, means = measure(aimed)
+        ahead = [e.value[: len(g.commands)] for g, e in zip(groups, errors, strict=True)]
+        weight = [g.importance(e)[: len(g.commands)] for g, e in zip(groups, errors, strict=True)]
+        mean_error = float((torch.cat(weight) * torch.cat(ahead)).sum() / torch.cat(weight).sum())
+        aimed = shift_goal_observation(policy, -mean_error)
+        new_cost, new_errors, means = measure(aimed)
         if not new_cost < cost:
             break
-        policy, cost, found = aimed, new_cost, new
-        told.append(means)
-    return policy, told
+        policy, cost, errors = aimed, new_cost, new_errors
+        history.append(means)
+    return policy, history
 
 
 def tune_weights(
-    groups: list[Group], network: Network, cfg: FinetuneCfg, say: Callable[[str], object], begin: float
+    groups: list[JumpGroup], network: Network, cfg: FinetuneCfg, log: Callable[[str], object], begin: float
 ) -> list[dict[str, Any]]:
-    """Take Gauss-Newton steps on the network's weights; return the misses [m] by group before and after each step.
+    """Take Gauss-Newton steps on the network's weights; return cost and errors [m] by group before and after each step.
 
     begin: time from which the reported seconds count, by `time.perf_counter`.
     """
-    anchor = make_anchor(groups, network, cfg)
+    anchor = collect_trust_region_samples(groups, network, cfg)
 
-    def measure(derivatives: bool) -> tuple[float, list[Misses]]:
-        found = [follow(group, network, derivatives=derivatives) for group in groups]
-        pairs = zip(groups, found, strict=True)
-        total = sum(float((0.5 * group.importance(m) * m.value.square()).sum()) for group, m in pairs)
-        return total + anchor.cost(network.weights), found
+    def measure(derivatives: bool) -> tuple[float, list[JumpErrors]]:
+        errors = [jump_errors(group, network, derivatives=derivatives) for group in groups]
+        pairs = zip(groups, errors, strict=True)
+        total = sum(float((0.5 * group.importance(e) * e.value.square()).sum()) for group, e in pairs)
+        return total + anchor.cost(network.weights), errors
 
-    cost, found = measure(cfg.iterations > 0)
+    cost, errors = measure(cfg.iterations > 0)
     damping, history = DAMPING, []
     for step in range(cfg.iterations + 1):
-        row = {"step": step, "mean_abs_miss_m": mean_abs_misses(groups, found), "cost": cost,
+        row = {"step": step, "mean_abs_miss_m": mean_abs_errors(groups, errors), "cost": cost,
                "action_change": anchor.change(network.weights), "seconds": time.perf_counter() - begin}  # fmt: skip
         history.append(row)
         words = ", ".join(f"{name} {1000.0 * miss:.2f} mm" for name, miss in row["mean_abs_miss_m"].items())
-        say(f"step {step}: cost {cost:.4g}, {words}, actions moved {row['action_change']:.4f}, {row['seconds']:.0f} s")
+        log(f"step {step}: cost {cost:.4g}, {words}, actions moved {row['action_change']:.4f}, {row['seconds']:.0f} s")
         if step == cfg.iterations:
             break
-        kept = network.weights
-        importance = [group.importance(m) for group, m in zip(groups, found, strict=True)]
-        rows, values = [m.rows for m in found], [m.value for m in found]
-        network.weights = kept + gauss_newton_step(kept, rows, values, importance, anchor, damping)
-        new_cost, new = measure(step + 1 < cfg.iterations)
+        previous = network.weights
+        importance = [group.importance(e) for group, e in zip(groups, errors, strict=True)]
+        jacobians, values = [e.jacobian for e in errors], [e.value for e in errors]
+        network.weights = previous + gauss_newton_step(previous, jacobians, values, importance, anchor, damping)
+        new_cost, new_errors = measure(step + 1 < cfg.iterations)
         if math.isfinite(new_cost) and new_cost < cost:
-            cost, found, damping = new_cost, new, damping / 3.0
+            cost, errors, damping = new_cost, new_errors, damping / 3.0
         else:
-            network.weights, damping = kept, 10.0 * damping
+            network.weights, damping = previous, 10.0 * damping
     return history
 
 
@@ -234,22 +238,22 @@ def finetune(
     policy: Policy,
     cfg: FinetuneCfg,
     modules: Iterable[ModuleType] = (),
-    say: Callable[[str], object] = print,
+    log: Callable[[str], object] = print,
 ) -> tuple[Policy, dict]:
-    """Return the fine-tuned policy, and its record: settings, and misses [m] by group before and after each step.
+    """Return the fine-tuned policy and its record: settings, and errors [m] by group before and after each step.
 
-    modules: that the user has named. say: prints a line. Raises InputError as `ClosedLoop` and `make_groups`,
-    and if there is nothing to do.
+    modules: the user's task modules; log: prints a line of progress. Raises InputError as `ClosedLoop` and
+    `make_groups`, and if there is nothing to do.
     """
     begin = time.perf_counter()
     groups = make_groups(policy, cfg, modules)
     aims = []
     if not groups[0].to_height:
-        policy, aims = take_aim(policy, groups, say)
+        policy, aims = correct_aim(policy, groups, log)
     elif cfg.iterations == 0:
         raise InputError("a policy for heights has no aim to be taken apart: fine-tuning it needs an iteration")
     network = Network(policy, device=groups[0].env.device)
-    history = tune_weights(groups, network, cfg, say, begin)
+    history = tune_weights(groups, network, cfg, log, begin)
     layers = network.layers(network.weights)
     settings = {name: value for name, value in asdict(cfg).items() if name not in ("out", "overwrite")}
     record = {"settings": json.loads(json.dumps(settings, default=str)), "aims": aims, "steps": history}

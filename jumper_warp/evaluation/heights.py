@@ -1,4 +1,4 @@
-"""Jumps to heights: their log, the metrics of it, and the flags that make it."""
+"""Jumps to apex heights: log, metrics, and flags of `jumper evaluate` and `play`."""
 
 from __future__ import annotations
 
@@ -11,63 +11,66 @@ import torch
 import tyro
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.film import Film, Strip, moments
+from jumper_warp.evaluation.film import Film, Filmstrip, keyframes
 from jumper_warp.evaluation.jumps import DELAY, REST_SPEED, REST_TIME, STANCE, JumpFlags, JumpLog, stance_metrics
 from jumper_warp.evaluation.log import (
-    CAME_APART,
     COLLIDED,
+    DIVERGED,
     SUCCESS,
     Metrics,
-    failures,
+    failed_by,
     finite,
     largest,
     mean,
     mean_and_max,
     run_evaluation,
     termination_names,
-    with_ends,
+    with_terminations,
     within,
 )
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 
 SUCCESS_TOLERANCE = 0.1
-"""[m] A jump that comes this close reaches its height."""
-LEVEL = 10.0
-"""[deg] A good landing tilts the base less."""
-SWEEP_ENDS = (CAME_APART, "low_base", "tilted", COLLIDED, "no_jump", "too_long", SUCCESS)
-"""Terminations that end a jump of a sweep, in this order; the others only shape the training."""
+"""[m] Largest difference between apex and commanded height of a jump that reaches its height."""
+LEVEL_TILT = 10.0
+"""[deg] Tilt of the base below which a landing of a sweep is good."""
+SWEEP_ENDS = (DIVERGED, "low_base", "tilted", COLLIDED, "no_jump", "too_long", SUCCESS)
+"""Terminations that end a jump of a sweep, in order of precedence; the others only shape the training."""
 FALLS = ("low_base", "tilted")
 WRONG_HEIGHT = "wrong_height"
-"""Outcome of a jump that came down from another height."""
+"""Outcome of a jump that landed from another apex height than commanded."""
 DRIFT, TURN = 0.2, 25.0
-"""[m], [deg] Of the base, beyond which the authors' configuration ends an episode."""
+"""[m], [deg] Drift and turn of the base beyond which the authors' configuration ends an episode."""
 MAX_ROBOTS = 64
-"""In one recording."""
+"""Maximum number of robots in one recording."""
 LOWEST, HIGHEST, ABOVE = -0.37, 1.47, 0.45
-"""[m] What pictures of a jump show at least, from the ground before it up, and what they leave above the base."""
+"""[m] Lower and upper edge of a filmstrip's pictures at the robot, and margin above the base."""
 SHOWN_HEIGHT = 1.0
-"""[m] The filmstrip shows the jump nearest to this."""
+"""[m] The filmstrip shows the jump whose commanded height is nearest to this."""
 
 
-def for_evaluation(task: TaskCfg) -> TaskCfg:
-    """Return a task whose success is judged last, so that it hides no fall."""
+def with_success_last(task: TaskCfg) -> TaskCfg:
+    """Return the task with its terminations in order, success last, so that it hides no fall."""
     names = [term.name for term in task.terminations if term.name != SUCCESS]
-    return with_ends(task, (*names, SUCCESS))
+    return with_terminations(task, (*names, SUCCESS))
 
 
-def for_sweep(task: TaskCfg) -> TaskCfg:
-    """Return a task with the terminations that count in a sweep."""
-    return with_ends(task, SWEEP_ENDS)
+def with_sweep_terminations(task: TaskCfg) -> TaskCfg:
+    """Return the task with the terminations of a sweep, SWEEP_ENDS."""
+    return with_terminations(task, SWEEP_ENDS)
 
 
 class HeightLog(JumpLog):
-    """One jump to a height per world. A jump that landed within the task's limit, if it has one, is a success."""
+    """Log of one jump to an apex height per world; success: landed without a termination of the task."""
 
     success, outcomes = JumpLog.landed, JumpLog.ends
 
     def __init__(self, heights: np.ndarray, terminations: tuple[str, ...], rest: float = REST_TIME) -> None:
-        """heights: (num_envs,) [m] of the base; terminations, rest: as in `JumpLog`, rest at least REST_TIME."""
+        """Begin with no jump ended.
+
+        heights [m]: commanded base heights, (num_envs,); terminations, rest: as in `JumpLog`, rest at least REST_TIME.
+        """
         goals = np.zeros((len(heights), 1, 3))
         goals[:, 0, 2] = heights
         super().__init__(goals, terminations, rest=rest)
@@ -75,76 +78,79 @@ class HeightLog(JumpLog):
 
     @property
     def seconds(self) -> float:
-        """[s] In which a jump has ended."""
+        """[s] Maximum simulated time."""
         return 7.0 + self.rest
 
-    def _mark_early(self, arrays: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray]) -> None:
-        """Mark the jumps that have begun when the command comes."""
+    def _record_early(self, arrays: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray]) -> None:
+        """Mark jumps that have left the stance phase when the command comes; at: unused."""
         commanded = arrays["steps"] == arrays["command_step"]
         self.early[commanded] = (arrays["phase"] != STANCE)[commanded, None]
 
     @property
     def commanded(self) -> np.ndarray:
-        """[m] Base height."""
+        """[m] (num_envs, 1) Commanded base height at the apex."""
         return self.goals[..., 2]
 
     @property
     def error(self) -> np.ndarray:
-        """[m] Apex minus commanded height; NaN where the simulation came apart."""
-        return np.where(self.broken | ~np.isfinite(self.apex), np.nan, self.apex - self.commanded)
+        """[m] Apex minus commanded height; NaN where the simulation diverged."""
+        return np.where(self.diverged | ~np.isfinite(self.apex), np.nan, self.apex - self.commanded)
 
     @property
     def reached(self) -> np.ndarray:
-        """Whether the jump, begun on command, came near its height."""
+        """Whether the jump began on command and its apex is within SUCCESS_TOLERANCE of the commanded height."""
         return (np.abs(self.error) <= SUCCESS_TOLERANCE) & ~self.early
 
     def columns(self) -> dict[str, list]:
-        """Return commanded heights, apexes and errors [m] and the ends."""
+        """Return commanded heights, apexes and errors [m] and the terminations, one value per jump."""
         numbers = {"target_m": self.commanded, "apex_m": self.apex, "error_m": self.error}
         return {name: finite(values.ravel()) for name, values in numbers.items()} | {"end": self.ends.ravel().tolist()}
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the base's height and the commanded one [m]."""
+        """Return the base's present and commanded height [m] of some worlds."""
         return super().series(worlds) | {f"height/target of {i} [m]": self.commanded[i, 0] for i in worlds}
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the commanded heights [m]."""
+        """Return the commanded heights [m] of some worlds."""
         return {"targets_m": self.commanded[list(worlds), 0].tolist()}
 
-    def strip(self, film: Film) -> Strip:
-        """Return pictures of the jump nearest to SHOWN_HEIGHT."""
+    def filmstrip(self, film: Film) -> Filmstrip:
+        """Return a filmstrip of the jump whose commanded height is nearest to SHOWN_HEIGHT."""
         heights = self.commanded[film.worlds, 0]
         index = int(np.argmin(np.abs(heights - SHOWN_HEIGHT)))
-        height = film.base(index)[:, 2]
-        frames = moments(height, round(DELAY / film.env.step_dt) - 1)
+        height = film.base_positions(index)[:, 2]
+        frames = keyframes(height, round(DELAY / film.env.step_dt) - 1)
         captions = [f"{(frame + 1) * film.env.step_dt:.2f} s, {height[frame]:.2f} m" for frame in frames]
-        eye, target, size = view_of(float(height[frames].max()))
-        return Strip(index, frames, captions, eye, target, size, name=f"jump_{heights[index]:.2f}_m")
+        eye, target, size = side_camera(float(height[frames].max()))
+        return Filmstrip(index, frames, captions, eye, target, size, name=f"jump_{heights[index]:.2f}_m")
 
 
-def view_of(apex: float) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[int, int]]:
-    """Return eye and target [m] and size [px] of pictures of a jump to an apex [m], as tall as it needs, one scale."""
+def side_camera(apex: float) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[int, int]]:
+    """Return camera position and target [m], and size of a picture [px], that show a jump to an apex [m].
+
+    Pictures of higher jumps are taller, at the same scale.
+    """
     taller = max(1.0, (apex + ABOVE - LOWEST) / (HIGHEST - LOWEST))
     middle = LOWEST + 0.5 * taller * (HIGHEST - LOWEST)
     return (1.5 * taller, 2.0 * taller, middle + 0.35 * taller), (0.0, 0.0, middle), (320, round(420 * taller))
 
 
 def run_jumps(act: Callable[[torch.Tensor], torch.Tensor], env: Env, heights: np.ndarray) -> HeightLog:
-    """Let every world jump to its height (num_envs,) [m] once; act: as in `run_evaluation`."""
+    """Run one jump per world to heights [m], (num_envs,), and return the log; act: as in `run_evaluation`."""
     jumps = HeightLog(heights, termination_names(env.task))
     run_evaluation(act, env, jumps)
     return jumps
 
 
-def jump_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
-    """Return the metrics of jumps to heights.
+def apex_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
+    """Return the metrics of `jumper evaluate`, where a jump succeeds if none of the task's terminations ends it.
 
-    Errors are over all jumps, failed ones included, but those whose simulation came apart, which `came_apart` counts.
-    Metrics of landings are over the successful jumps. in_range [m]: heights that `success_rate_in_range` counts.
+    Errors include failed jumps, but not those whose simulation diverged, which `came_apart` counts. Metrics of landings
+    are over successful jumps. in_range [m]: commanded heights that the `in_range` metrics count.
     """
     success, outcomes = jumps.success, jumps.outcomes
     metrics: Metrics = {
-        **height_metrics(jumps, in_range),
+        **apex_error_metrics(jumps, in_range),
         "max_abs_error_of_successes_m": largest(np.abs(jumps.error)[success]),
         "success_rate": mean(success),
         "success_rate_in_range": mean(success[within(jumps.commanded, in_range)]),
@@ -152,14 +158,14 @@ def jump_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
         "range_upper_m": in_range[1],
         "at_rest_within_1_s_rate": mean((jumps.rest_speed < REST_SPEED)[success]),
         "mean_landing_tilt_deg": mean(np.degrees(jumps.tilt[success])),
-        "fall_rate": mean(np.isin(outcomes, (*FALLS, COLLIDED, CAME_APART))),
+        "fall_rate": mean(np.isin(outcomes, (*FALLS, COLLIDED, DIVERGED))),
         "miss_rate": mean(outcomes == WRONG_HEIGHT),
     }
-    return metrics | failures(outcomes[~success])
+    return metrics | failed_by(outcomes[~success])
 
 
-def height_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
-    """Return the errors, and how landed jumps stand: a second takeoff, drift in the plane, turn."""
+def apex_error_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
+    """Return the metrics of `apex_metrics` and `sweep_metrics`: apex errors of all jumps, stance of landed ones."""
     error, landed = np.abs(jumps.error), jumps.landed
     beyond = (jumps.drift > DRIFT) | (np.degrees(np.abs(jumps.yaw)) > TURN)
     return {
@@ -170,22 +176,21 @@ def height_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
         "second_takeoff_rate": mean((jumps.takeoffs > 0)[landed]),
         **mean_and_max("drift_m", jumps.drift[landed]),
         "beyond_authors_drift_or_turn_rate": mean(beyond[landed]),
-        CAME_APART: int(np.isnan(error).sum()),
+        DIVERGED: int(np.isnan(error).sum()),
     }
 
 
 def sweep_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
-    """Return the metrics of jumps of which one succeeds that comes near its height, however it is landed.
+    """Return the metrics of a sweep, where a jump succeeds if it reaches its height, however it lands.
 
-    `miss_rate` is the share that began on command and landed, but came to another height; falls and collisions after
-    the apex count neither there nor against the success.
-    in_range [m]: heights that `success_rate_in_range` counts.
+    `miss_rate` is the share that began on command and landed, but from another height; falls and collisions after the
+    apex count neither as misses nor against the success. in_range [m]: heights that the `in_range` metrics count.
     """
     commanded, near = jumps.commanded, jumps.reached
     tilt, at_rest = np.where(np.isnan(jumps.error), 0.0, np.degrees(jumps.tilt)), jumps.rest_speed < REST_SPEED
-    landed = jumps.landed & (tilt < LEVEL) & at_rest
+    landed = jumps.landed & (tilt < LEVEL_TILT) & at_rest
     return {
-        **height_metrics(jumps, in_range),
+        **apex_error_metrics(jumps, in_range),
         "mean_error_m": mean(jumps.error),
         "success_rate": mean(near),
         "success_and_landing_rate": mean(near & landed),
@@ -213,22 +218,21 @@ class HeightFlags(JumpFlags):
     """[m] Highest."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         super().__post_init__()
         if not 0.0 < self.lower <= self.upper < 10.0:
             raise InputError(f"heights must be in (0, 10) m and rise, got {self.lower}, {self.upper}")
 
     def log(self, task: TaskCfg, seed: int) -> HeightLog:
-        """Return jumps to these heights."""
+        """Return the log of jumps to these heights, one per world."""
         return HeightLog(np.linspace(self.lower, self.upper, self.jumps), termination_names(task))
 
     def metrics(self, log: HeightLog) -> Metrics:
-        """Return `jump_metrics`."""
-        return jump_metrics(log, self.in_range)
+        """Return `apex_metrics`."""
+        return apex_metrics(log, self.in_range)
 
 
 @dataclass(frozen=True)
-class HeightGoals:
+class HeightPlayFlags:
     """Jumps to heights that are recorded."""
 
     height: tuple[float, ...] = (0.6, 0.9, 1.1)
@@ -237,10 +241,9 @@ class HeightGoals:
     """[s] Of the recording, unless another is given."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a height is out of range, or their number."""
         if not 1 <= len(self.height) <= MAX_ROBOTS or not all(0.0 < height < 10.0 for height in self.height):
             raise InputError(f"height takes 1 to {MAX_ROBOTS} numbers in (0, 10) m, got {self.height}")
 
     def log(self, task: TaskCfg) -> HeightLog:
-        """Return one jump a robot."""
+        """Return the log of the jumps, one per robot."""
         return HeightLog(np.array(self.height), termination_names(task))

@@ -1,4 +1,4 @@
-"""Log of jumps: one row of jumps in every world, each from its command to the rest after its landing."""
+"""Base class of the logs of jumps: one sequence of jumps per world, each from its command to rest after landing."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.log import (
-    CAME_APART,
     COLLIDED,
+    DIVERGED,
     NO_END,
     EvaluationLog,
     Metrics,
@@ -24,49 +24,49 @@ from jumper_warp.utils.errors import InputError
 STANCE, LANDED = 0, 2
 """Values of the jump's phase before takeoff and after touchdown."""
 REST_SPEED = 0.1
-"""[m/s] Of the base's centre of mass, below which it is at rest."""
+"""[m/s] Speed of the base's centre of mass below which the robot is at rest."""
 REST_TIME = 1.0
-"""[s] After touchdown, when it should be."""
+"""[s] Time after touchdown at which the robot should be at rest."""
 DELAY = 0.5
-"""[s] Until the first jump is commanded."""
-SOON = 0.3
-"""[s] After touchdown, when the base's place is recorded as well."""
+"""[s] Time until the first jump is commanded."""
+SOON_AFTER = 0.3
+"""[s] Time after touchdown at which the base position is recorded as well."""
 HOP_TIME = 0.05
-"""[s] A robot that is off the ground for longer after touchdown has jumped again; one that lifts a paw, which had come
-down, for as long has stepped."""
+"""[s] Longest time with no paw on the ground after touchdown that is no second hop, and shortest time for which a paw
+is lifted again that is a step."""
 TAKEOFF_SPEED = 0.25
 """[m/s] Upward speed of the base, with no paw down, of a second takeoff (authors' configuration)."""
 TIME_EPS = 1.0e-6
-"""[s] Rounding of sums of steps."""
+"""[s] Tolerance for rounding of sums of steps."""
 NOT_BEGUN = "not_begun"
-"""Outcome of a jump that was due after one that failed."""
+"""Outcome of a jump that was not commanded, as one before it failed."""
 
 
 def paw_arrays(env: Env) -> dict[str, np.ndarray]:
-    """Return which paws are on the ground, (num_envs, 4), and the base's upward speed [m/s]."""
+    """Return `paws_down`, whether each paw is on the ground, (num_envs, 4), and `up`, the base's upward speed [m/s]."""
     force = np.linalg.norm(env.sim.paw_force.numpy(), axis=2)
     return {"paws_down": (force > env.task.contact_force).T, "up": env.sim.base_velocity()[:, 2]}
 
 
 def jump_commands(goals: np.ndarray, delay: np.ndarray | float, step_dt: float) -> np.ndarray:
-    """Return commands (num_envs, 4) of jump tasks.
+    """Return commands of jump tasks, (num_envs, 4): goal x, y, z [m] and policy step of the command.
 
-    goals [m]: (num_envs, 3), landing x, y relative to start and heading, and base height at the apex, 0 if any will do.
-    delay [s]: until the jump is commanded; (num_envs,) or one for all.
+    goals [m]: (num_envs, 3), landing x, y relative to start and heading, and base height at the apex, 0 for any;
+    delay [s]: time until the jump is commanded, (num_envs,) or one for all.
     """
     steps = np.broadcast_to(np.round(np.asarray(delay) / step_dt), len(goals))
     return np.concatenate([goals, steps[:, None]], axis=1).astype(np.float32)
 
 
 class JumpLog(EvaluationLog):
-    """One row of jumps per world; arrays have shape (num_envs, jumps in a row), NaN before the jump.
+    """Log of a sequence of jumps per world; arrays have shape (num_envs, jumps in a row), NaN before the jump.
 
-    The first jump goes to a place relative to start and heading, each other one relative to the base's place and yaw
-    when it is commanded. Nothing of a jump changes after its end.
+    The goal of the first jump is relative to start and heading, that of each further jump to base position and yaw at
+    its command. A jump's entries do not change after its end.
     """
 
     speed_time: float
-    """[s] After touchdown, when the base's speed is recorded."""
+    """[s] Time after touchdown at which the base's speed is recorded."""
 
     def __init__(
         self,
@@ -78,10 +78,10 @@ class JumpLog(EvaluationLog):
     ) -> None:
         """Begin with no jump ended.
 
-        goals: [m] (num_envs, jumps in a row, 2) landing places ahead and to the left, or 3: with the base height at the
-        apex, 0 if any will do; terminations: names of the ends of an episode, SUCCESS among them; headings: [rad]
-        (num_envs,) or one for all; delay: [s] until the first jump is commanded, likewise; rest: [s] from touchdown
-        until the jump is over, and the next one commanded. Raises InputError: another shape, or no SUCCESS.
+        goals [m]: landing positions ahead and to the left, (num_envs, jumps in a row, 2 or 3), third the base height at
+        the apex, 0 for any; terminations: names of the task's terminations, SUCCESS among them; headings [rad]:
+        (num_envs,) or one for all; delay [s]: time until the first jump is commanded, likewise; rest [s]: time from
+        touchdown until the jump is over and the next one is commanded. Raises InputError: another shape, or no SUCCESS.
         """
         goals = np.asarray(goals, dtype=float)
         if goals.ndim != 3 or goals.shape[2] not in (2, 3):
@@ -89,40 +89,39 @@ class JumpLog(EvaluationLog):
         self.goals, self.terminations = np.pad(goals, ((0, 0), (0, 0), (0, 3 - goals.shape[2]))), terminations
         self.headings, self.delay, self.rest, self.speed_time = headings, delay, rest, rest
         self.count, *_ = shape = goals.shape[:2]
-        self.current = np.zeros(
-            self.count, dtype=int
-        )  # (num_envs,) number of the jump under way; after the end, of all
-        self.end = np.full(shape, -1)  # index of the end in `terminations`, -1 before it
-        self.place = np.full((*shape, 2), np.nan)  # [m] (..., 2) base at the end, world
-        self.target = np.full((*shape, 2), np.nan)  # [m] (..., 2) where it should be, world
-        self.touchdown = np.full((*shape, 2), np.nan)  # [m] (..., 2) base at touchdown, world
-        self.place_soon = np.full((*shape, 2), np.nan)  # [m] (..., 2) base SOON after touchdown, world
-        self.heading = np.full(shape, np.nan)  # [rad] of the jump
-        self.yaw = np.full(shape, np.nan)  # [rad] of the base at the end, from the jump's heading
-        self.drift = np.full(shape, np.nan)  # [m] of the base in the plane, from the start to the end
+        # (num_envs,) index of the jump under way; the number of jumps in a row after the last
+        self.current = np.zeros(self.count, dtype=int)
+        self.end = np.full(shape, -1)  # index in `terminations` of what ended the jump, -1 while under way
+        self.end_position = np.full((*shape, 2), np.nan)  # [m] (..., 2) base position at the end, world
+        self.goal_world = np.full((*shape, 2), np.nan)  # [m] (..., 2) goal, world
+        self.touchdown = np.full((*shape, 2), np.nan)  # [m] (..., 2) base position at touchdown, world
+        self.position_soon = np.full((*shape, 2), np.nan)  # [m] (..., 2) base position SOON_AFTER touchdown, world
+        self.heading = np.full(shape, np.nan)  # [rad] heading of the jump
+        self.yaw = np.full(shape, np.nan)  # [rad] yaw of the base at the end, relative to the heading
+        self.drift = np.full(shape, np.nan)  # [m] horizontal distance of the base from its start at the end
         self.apex = np.full(shape, np.nan)  # [m] largest base height
-        self.tilt = np.full(shape, np.nan)  # [rad] largest since touchdown
-        self.rest_speed = np.full(shape, np.inf)  # [m/s] of the base `speed_time` after touchdown; infinite before
+        self.tilt = np.full(shape, np.nan)  # [rad] largest tilt since touchdown
+        self.rest_speed = np.full(shape, np.inf)  # [m/s] speed `speed_time` after touchdown; inf before
         self.early = np.zeros(shape, dtype=bool)  # whether the jump began before the command
-        self.air_time = np.zeros(shape)  # [s] longest that no paw was on the ground after touchdown
-        self.lift_time = np.zeros(shape)  # [s] longest that a paw was off the ground after its own first contact
-        self.takeoffs = np.zeros(shape, dtype=int)  # after touchdown: upward at TAKEOFF_SPEED with no paw down
-        self._aloft, self._lifted = np.zeros(self.count), np.zeros((self.count, 4))
-        self._came_down, self._flies = np.zeros((self.count, 4), dtype=bool), np.zeros(self.count, dtype=bool)
+        self.air_time = np.zeros(shape)  # [s] longest time with no paw on the ground after touchdown
+        self.lift_time = np.zeros(shape)  # [s] longest time off the ground of a paw after its own first contact
+        self.takeoffs = np.zeros(shape, dtype=int)  # second takeoffs: upward at TAKEOFF_SPEED with no paw down
+        self._air_time, self._paw_air_time = np.zeros(self.count), np.zeros((self.count, 4))
+        self._paw_touched, self._rising_flight = np.zeros((self.count, 4), dtype=bool), np.zeros(self.count, dtype=bool)
         self._success = success_index(terminations)
 
     def begin(self, env: Env) -> None:
-        """Stand every world in the default pose with its first goal."""
+        """Reset every world to the default pose and set its first goal."""
         env.evaluation_reset(jump_commands(self.goals[:, 0], self.delay, env.step_dt), self.headings)
 
-    def look(self, env: Env) -> dict[str, np.ndarray]:
-        """Return the state of every world's episode, which of its paws are on the ground, and how fast it rises."""
+    def read_env(self, env: Env) -> dict[str, np.ndarray]:
+        """Return the state of every world's episode and `paw_arrays`."""
         return env.task_arrays() | paw_arrays(env)
 
-    def follow(self, env: Env) -> bool:
-        """Look at the environment after a policy step, and command the jumps that are due."""
+    def record_step(self, env: Env) -> bool:
+        """Record a policy step, and command the next jumps that are due."""
         before = self.current.copy()
-        ended = super().follow(env)
+        ended = super().record_step(env)
         due = (self.current > before) & (self.current < self.goals.shape[1])
         if due.any():
             goals = np.zeros((env.num_envs, 3), dtype=np.float32)
@@ -131,19 +130,19 @@ class JumpLog(EvaluationLog):
         return ended
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
-        """Take in a policy step; return whether all jumps have ended."""
+        """Record a policy step from the arrays of `read_env`; return whether all jumps have ended."""
         count = self.goals.shape[1]
         row = np.flatnonzero(self.current < count)
         now = {name: values[row] for name, values in arrays.items()}
         at = (row, self.current[row])
-        self._mark_early(arrays, at)
-        self.place[at], self.target[at] = now["base_pos"][:, :2], now["goal"][:, :2]
+        self._record_early(arrays, at)
+        self.end_position[at], self.goal_world[at] = now["base_pos"][:, :2], now["goal"][:, :2]
         self.heading[at] = now["heading"]
         self.yaw[at] = wrapped(yaw_of(now["base_quat"]) - now["heading"])
         self.drift[at] = np.linalg.norm((now["base_pos"] - now["start"])[:, :2], axis=1)
         self.apex[at], self.tilt[at] = now["max_height"], now["peak_tilt"]
         landed = now["phase"] == LANDED
-        self._follow_landing(now, at, landed, step_dt)
+        self._record_landing(now, at, landed, step_dt)
         failed = (now["termination"] >= 0) & (now["termination"] != self._success)
         rested = ~failed & landed & (now["phase_steps"] >= round(self.rest / step_dt))
         self.end[at] = np.where(failed, now["termination"], np.where(rested, self._success, -1))
@@ -151,78 +150,82 @@ class JumpLog(EvaluationLog):
         self.current[row[failed]] = count
         return bool((self.current >= count).all())
 
-    def _mark_early(self, arrays: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray]) -> None:
-        """Mark the jumps that take off before the command; at: worlds and numbers of the jumps under way."""
+    def _record_early(self, arrays: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray]) -> None:
+        """Mark jumps that take off before the command; at: world and number of each jump under way."""
         takes_off = (arrays["took_off"] == 1) & (arrays["steps"] < arrays["command_step"])
         self.early[at] |= takes_off[at[0]]
 
-    def _follow_landing(
+    def _record_landing(
         self, now: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray], landed: np.ndarray, step_dt: float
     ) -> None:
-        """Take in where the bases of the jumps under way are after touchdown, and what their paws do."""
+        """Record base positions, speeds and paw contacts after touchdown.
+
+        now: arrays of the worlds whose jumps are under way; at: world and number of these jumps; landed: whether each
+        has touched down; step_dt [s].
+        """
         row, number = at
         steps, speed = now["phase_steps"], np.linalg.norm(now["base_vel"], axis=1)
-        for kept, moment, values in (
+        for record, is_time, values in (
             (self.touchdown, now["touched_down"] == 1, now["base_pos"][:, :2]),
-            (self.place_soon, steps == round(SOON / step_dt), now["base_pos"][:, :2]),
+            (self.position_soon, steps == round(SOON_AFTER / step_dt), now["base_pos"][:, :2]),
             (self.rest_speed, steps == round(self.speed_time / step_dt), speed),
         ):
-            due = landed & moment
-            kept[row[due], number[due]] = values[due]
+            due = landed & is_time
+            record[row[due], number[due]] = values[due]
         down = landed[:, None] & now["paws_down"]
-        aloft = landed & ~down.any(axis=1)
-        self._aloft[row] = np.where(aloft, self._aloft[row] + step_dt, 0.0)
-        self._came_down[row] = landed[:, None] & (self._came_down[row] | down)
-        self._lifted[row] = np.where(self._came_down[row] & ~down, self._lifted[row] + step_dt, 0.0)
-        flies = aloft & (self._flies[row] | (now["up"] > TAKEOFF_SPEED))
-        self.takeoffs[at] += flies & ~self._flies[row]
-        self._flies[row] = flies
-        self.air_time[at] = np.maximum(self.air_time[at], self._aloft[row])
-        self.lift_time[at] = np.maximum(self.lift_time[at], self._lifted[row].max(axis=1))
+        airborne = landed & ~down.any(axis=1)
+        self._air_time[row] = np.where(airborne, self._air_time[row] + step_dt, 0.0)
+        self._paw_touched[row] = landed[:, None] & (self._paw_touched[row] | down)
+        self._paw_air_time[row] = np.where(self._paw_touched[row] & ~down, self._paw_air_time[row] + step_dt, 0.0)
+        rising_flight = airborne & (self._rising_flight[row] | (now["up"] > TAKEOFF_SPEED))
+        self.takeoffs[at] += rising_flight & ~self._rising_flight[row]
+        self._rising_flight[row] = rising_flight
+        self.air_time[at] = np.maximum(self.air_time[at], self._air_time[row])
+        self.lift_time[at] = np.maximum(self.lift_time[at], self._paw_air_time[row].max(axis=1))
 
     @property
     def ends(self) -> np.ndarray:
-        """Name of each jump's end, whether or not it met its goal."""
+        """Name of the termination of each jump, regardless of its distance from the goal; NO_END, NOT_BEGUN."""
         names = np.array([*self.terminations, NO_END], dtype=object)[self.end]
         return np.where(self.begun, names, NOT_BEGUN)
 
     @property
     def begun(self) -> np.ndarray:
-        """Whether the jump was begun."""
+        """Whether the jump was commanded."""
         return ~np.isnan(self.heading)
 
     @property
-    def broken(self) -> np.ndarray:
-        """Whether the simulation came apart."""
-        return self.ends == CAME_APART
+    def diverged(self) -> np.ndarray:
+        """Whether the simulation diverged."""
+        return self.ends == DIVERGED
 
     @property
     def landed(self) -> np.ndarray:
-        """Whether the robot came down on its paws and stayed there, wherever it was."""
+        """Whether the robot landed on its paws and stayed up until the jump was over, wherever it landed."""
         return self.end == self._success
 
     @property
     def hopped(self) -> np.ndarray:
-        """Whether the robot jumped again after touchdown."""
+        """Whether no paw was on the ground for longer than HOP_TIME after touchdown."""
         return self.air_time > HOP_TIME + TIME_EPS
 
     @property
     def stepped(self) -> np.ndarray:
-        """Whether any paw that had come down was off the ground again for HOP_TIME or longer."""
+        """Whether a paw was off the ground for HOP_TIME or longer after its first contact."""
         return self.lift_time > HOP_TIME - TIME_EPS
 
     @property
     def still(self) -> np.ndarray:
-        """Whether the robot landed, wherever it was, without a step."""
+        """Whether the robot landed without a step, wherever it landed."""
         return self.landed & ~self.stepped
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
         """Return the base's height [m]."""
-        return {f"height/base of {world} [m]": self.seen["base_pos"][world, 2] for world in worlds}
+        return {f"height/base of {world} [m]": self.arrays["base_pos"][world, 2] for world in worlds}
 
 
 def stance_metrics(jumps: JumpLog) -> Metrics:
-    """Return still landings and collisions, shares of all jumps, and the largest tilt and turns of the landed ones."""
+    """Return the rates of still landings and collisions among all jumps, and tilt and turn of the landed ones."""
     begun, landed = jumps.begun, jumps.landed
     return {
         "still_landing_rate": mean(jumps.still[begun]),
@@ -242,7 +245,6 @@ class JumpFlags:
     """[m] Distances or heights that the success rate in range counts."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
         if self.jumps < 1:
             raise InputError(f"jumps must be at least 1, got {self.jumps}")
         if not 0.0 <= self.in_range[0] <= self.in_range[1] < 10.0:

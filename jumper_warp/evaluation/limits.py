@@ -1,4 +1,4 @@
-"""How high the open-loop jump takes each robot of an environment: squat, hold, full extension."""
+"""Apex of the open-loop jump of each robot of an environment: squat, hold, full extension."""
 
 from __future__ import annotations
 
@@ -15,61 +15,58 @@ if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
 
 RAMP, HOLD, EXTEND = 25, 50, 40
-"""Policy steps of the ramp into the squat, the squat, and the full extension."""
-STAND = 31
-"""Policy steps in the default pose, after which jumps are commanded."""
-MORE = 30
-"""Policy steps from the end of the extension on, in which the apex has passed."""
-INNER = (0.6, 1.1)
-"""[m] Heights that are told apart."""
-PUSHES = ("events.push.force_", "events.push.torque_")
-"""Beginnings of the names of numbers that pushes are drawn from."""
+"""Numbers of policy steps of the ramp into the squat, the held squat, and the full extension."""
+STAND = 31  # Policy steps in the default pose before the ramp, as before the command of a sweep's jumps
+COAST = 30  # Policy steps after the extension, within which the apex has passed
+INNER_RANGE = (0.6, 1.1)  # [m] Commanded heights with metrics of their own
+PUSH_PARAMS = ("events.push.force_", "events.push.torque_")
+"""Prefixes of the names of parameters that set the ranges of pushes."""
 
 
 def open_loop_action(step: int) -> float:
-    """Return the action [1] of all transversal motors at a policy step: 1 is the squat, -1 full extension."""
+    """Return the open-loop action [1] of all transversal motors at a policy step: 1 squat, -1 full extension."""
     since = step - STAND
     if since >= RAMP + HOLD:
         return -1.0 if since < RAMP + HOLD + EXTEND else 0.0
     return min(max(since, 0) / RAMP, 1.0)
 
 
-def open_loop_limits(env: Env, fresh: dict[str, Any]) -> np.ndarray:
-    """Return the largest base height [m] of each robot in the open-loop jump, (num_envs,).
+def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
+    """Return the apex of the open-loop jump of each robot, its largest base height [m], (num_envs,).
 
-    The robots have the parameters that their first `evaluation_reset` draws, latency included, but no pushes. Where the
-    simulation comes apart it is not a number.
+    The robots have the parameters that their first `evaluation_reset` samples, latency included, but no pushes. NaN
+    where the simulation diverges.
 
-    env: a jump task, whose actions of one reach squat and full extension; it is left at the end of the jump.
-    fresh: `env.state_dict()` before its first `evaluation_reset`.
+    env: of a jump task whose actions of ±1 are full extension and squat; it is left at the end of the jump.
+    initial_state: `env.state_dict()` before its first `evaluation_reset`.
     """
-    env.load_state_dict(fresh)
+    env.load_state_dict(initial_state)
     params = env.skills[0].task.params
-    pushes = {name: params.values[i] for name, i in params.names.items() if name.startswith(PUSHES)}
+    pushes = {name: params.values[i] for name, i in params.names.items() if name.startswith(PUSH_PARAMS)}
     for name in pushes:
         env.set(name, 0.0)
     env.evaluation_reset(jump_commands(np.zeros((env.num_envs, 3)), 0.0, env.step_dt))
-    highest, diverged = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=bool)
-    for step in range(STAND + RAMP + HOLD + EXTEND + MORE):
+    apex, diverged = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=bool)
+    for step in range(STAND + RAMP + HOLD + EXTEND + COAST):
         level = open_loop_action(step)
         env.step(torch.tensor([0.0, level, level] * 4, device=env.device).repeat(env.num_envs, 1))
         arrays = env.task_arrays()
         diverged |= env.episodes.diverged.numpy() != 0
         if step >= STAND + RAMP + HOLD:
-            highest = np.fmax(highest, arrays["base_pos"][:, 2])
+            apex = np.fmax(apex, arrays["base_pos"][:, 2])
     for name, value in pushes.items():
         env.set(name, value)
-    return np.where(diverged, np.nan, highest)
+    return np.where(diverged, np.nan, apex)
 
 
 def limit_metrics(jumps: HeightLog, limit: np.ndarray) -> Metrics:
-    """Return the metrics of jumps against the open-loop jump of the same robots, limit [m], (num_envs,).
+    """Return the metrics of jumps relative to `limit`, the open-loop apex of the same robots [m], (num_envs,).
 
-    A height is reachable if the open-loop jump comes within the tolerance of it or higher. `success_rate_beyond_limit`
-    is that of the others. `open_loop_mean_abs_error_m` is that of jumps which stop at the limit and are perfect below.
+    A height is reachable if it is at most the tolerance above the open-loop apex; `success_rate_beyond_limit` counts
+    the other heights. `open_loop_mean_abs_error_m` is the error of ideal jumps that cannot exceed the limit.
     """
     target, near = jumps.commanded[:, 0], jumps.reached[:, 0]
-    reachable, below, inner = target <= limit + SUCCESS_TOLERANCE, target <= limit, within(target, INNER)
+    reachable, below, inner = target <= limit + SUCCESS_TOLERANCE, target <= limit, within(target, INNER_RANGE)
     return {
         "open_loop_limit_m": mean(limit),
         "lowest_open_loop_limit_m": float(np.nanmin(limit)),

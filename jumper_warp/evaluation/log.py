@@ -1,6 +1,6 @@
-"""An evaluation run: what every world is asked for, step by step, and what became of it.
+"""Evaluation loop and the base class of its logs: one episode per world, commands given and outcomes recorded.
 
-One log follows one episode a world. `run_evaluation` is the loop; what is asked for and told differs between tasks.
+`run_evaluation` is the loop. Each kind of task has a log, which sets the commands and computes the outcomes.
 """
 
 from __future__ import annotations
@@ -20,70 +20,70 @@ from jumper_warp.utils.errors import InputError
 if TYPE_CHECKING:
     import torch
 
-    from jumper_warp.evaluation.film import Film, Strip
+    from jumper_warp.evaluation.film import Film, Filmstrip
 
 SUCCESS = "success"
-CAME_APART = "came_apart"
+DIVERGED = "came_apart"
 COLLIDED = "collided"
 NO_END = "no_end"
-"""Outcome of what was still under way at the end."""
+"""Outcome of an episode that was still running when the time was over."""
 
 Metrics = dict[str, float | int | None]
 
 
 class EvaluationLog(ABC):
-    """Asks every world for something, and keeps what became of it."""
+    """Commands one episode per world and records its outcome."""
 
-    row = "jump"
-    """What a row of `columns` is about, in a word."""
+    row_name = "jump"
+    """Noun for a row of `columns`; names the CSV file and the recording."""
     spacing = 1.2
-    """[m] Between robots that are drawn side by side."""
+    """[m] Distance between robots that a recording shows side by side."""
     count: int
     """Number of worlds."""
-    seen: dict[str, np.ndarray]
-    """What was seen of the environment last."""
+    arrays: dict[str, np.ndarray]
+    """Result of the last `read_env`, one row per world."""
 
     @property
     @abstractmethod
     def seconds(self) -> float:
-        """[s] Simulated time after which what has not ended is a failure."""
+        """[s] Maximum simulated time; an episode that has not ended by then has failed."""
 
     @abstractmethod
     def begin(self, env: Env) -> None:
-        """Stand every world at its start."""
+        """Reset every world and set its first command."""
 
     @abstractmethod
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
-        """Take in a policy step; return whether everything has ended."""
+        """Record a policy step from the arrays of `read_env`; return whether all episodes have ended."""
 
     @abstractmethod
     def columns(self) -> dict[str, list]:
-        """Return what to tell of every row, one list a quantity."""
+        """Return the columns of the CSV file by heading, one value per row."""
 
     @abstractmethod
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return what to draw of some worlds over time, `group/quantity [unit]` to its present value."""
+        """Return the present values of the recorded time series of some worlds, by `group/quantity [unit]`."""
 
-    def marks(self, worlds: Sequence[int]) -> np.ndarray | None:
-        """Return places to mark in a picture [m], world frame, (worlds, places a world, 3), if there are any."""
+    def goal_markers(self, worlds: Sequence[int]) -> np.ndarray | None:
+        """Return goal positions [m] to mark in a recording, world frame, (worlds, goals per world, 3), or None."""
         return None
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return what to save with a recording of some worlds, as JSON can hold it."""
+        """Return the metadata that a recording of some worlds saves; must be JSON."""
         return {}
 
-    def strip(self, film: Film) -> Strip | None:
-        """Return the filmstrip that shows most of a film, if there is one."""
+    def filmstrip(self, film: Film) -> Filmstrip | None:
+        """Return frames, captions and camera of a filmstrip, or None if this kind of log has none."""
         return None
 
-    def look(self, env: Env) -> dict[str, np.ndarray]:
-        """Return what is to be known of every world after a policy step."""
+    def read_env(self, env: Env) -> dict[str, np.ndarray]:
+        """Return the arrays that `update` needs, one row per world; waits for the device."""
         return env.task_arrays()
 
-    def follow(self, env: Env) -> bool:
-        """Look at the environment after a policy step; return whether everything has ended."""
-        self.seen = self.look(env)
-        return self.update(self.seen, env.step_dt)
+    def record_step(self, env: Env) -> bool:
+        """Read the environment after a policy step and record it; return whether all episodes have ended."""
+        self.arrays = self.read_env(env)
+        return self.update(self.arrays, env.step_dt)
 
 
 def run_evaluation(
@@ -92,70 +92,70 @@ def run_evaluation(
     log: EvaluationLog,
     *,
     seconds: float | None = None,
-    watch: Callable[[], object] | None = None,
+    on_step: Callable[[], object] | None = None,
     stop: bool = True,
 ) -> None:
-    """Run one episode a world as the log commands, until all have ended.
+    """Run one episode per world with the commands of the log, until all have ended.
 
-    act: observations (num_envs, num_obs) to actions, such as `Policy.act`; seconds: simulated time at most (default:
-    the log's); watch: called after every policy step; stop: False to continue to the end of the time.
+    act: observations (num_envs, num_obs) to actions, such as `Policy.act`; seconds: maximum simulated time (default:
+    the log's); on_step: called after every policy step; stop: False to continue to the end of the time.
     """
     log.begin(env)
     for _ in range(round((log.seconds if seconds is None else seconds) / env.step_dt)):
         env.step(act(env.obs))
-        ended = log.follow(env)
-        if watch is not None:
-            watch()
+        ended = log.record_step(env)
+        if on_step is not None:
+            on_step()
         if ended and stop:
             return
 
 
 def success_index(terminations: Sequence[str]) -> int:
-    """Return the place of SUCCESS among the names of terminations. Raises InputError: it is not there."""
+    """Return the index of SUCCESS among termination names. Raises InputError: it is missing."""
     if SUCCESS not in terminations:
         raise InputError(f"this evaluation needs a termination {SUCCESS!r}, the task has {', '.join(terminations)}")
     return list(terminations).index(SUCCESS)
 
 
-def with_ends(task: TaskCfg, names: Sequence[str]) -> TaskCfg:
-    """Return a task of whose terminations those with some names are left, judged in the order of the names."""
+def with_terminations(task: TaskCfg, names: Sequence[str]) -> TaskCfg:
+    """Return the task with only the named terminations, checked in the order of the names; others are ignored."""
     terms = {term.name: term for term in task.terminations}
     return replace(task, terminations=tuple(terms[name] for name in names if name in terms))
 
 
 def termination_names(task: TaskCfg) -> tuple[str, ...]:
-    """Return the names of a task's terminations."""
+    """Return the names of a task's terminations, in the order in which they are checked."""
     return tuple(term.name for term in task.terminations)
 
 
 def within(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
-    """Return which values [m] are between limits, give or take half a millimetre for those that were evenly spaced."""
+    """Return which values [m] are between two limits, with half a millimetre of tolerance for rounding."""
     return (values >= limits[0] - 5e-4) & (values <= limits[1] + 5e-4)
 
 
 def mean(values: ArrayLike | Sequence[float | None]) -> float | None:
-    """Return the mean of what is a number, None if nothing is."""
+    """Return the mean of the values that are not NaN or None, None if there are none."""
     numbers = np.asarray(values, dtype=float)
     numbers = numbers[~np.isnan(numbers)]
     return float(numbers.mean()) if len(numbers) else None
 
 
 def largest(values: np.ndarray) -> float | None:
-    """Return the largest of what is a number, None if nothing is."""
+    """Return the largest of the values that are not NaN, None if there are none."""
     values = values[~np.isnan(values)]
     return float(values.max()) if len(values) else None
 
 
 def mean_and_max(name: str, values: np.ndarray) -> Metrics:
-    """Return the mean and the largest of what is a number, as `mean_<name>` and `max_<name>`."""
+    """Return mean and maximum of the values that are not NaN, as `mean_<name>` and `max_<name>`."""
     return {f"mean_{name}": mean(values), f"max_{name}": largest(values)}
 
 
-def failures(outcomes: np.ndarray) -> Metrics:
-    """Return how many failed rows ended in which way."""
+def failed_by(outcomes: np.ndarray) -> Metrics:
+    """Return the number of failed episodes by outcome, as `failed_by_<outcome>`; outcomes: of the failed ones."""
     return {f"failed_by_{name}": int((outcomes == name).sum()) for name in sorted(set(outcomes))}
 
 
 def finite(values: np.ndarray) -> list[float | None]:
-    """Return values as JSON holds them, None where there is no number."""
+    """Return values as a list for JSON, None in place of NaN and infinity."""
     return [float(value) if np.isfinite(value) else None for value in values]

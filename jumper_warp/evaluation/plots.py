@@ -1,4 +1,4 @@
-"""Plots that several experiments draw."""
+"""Plots that several experiments and suites share."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import matplotlib
 import numpy as np
 
 from jumper_warp.evaluation.jumps import JumpLog
-from jumper_warp.evaluation.places import PlaceLog
+from jumper_warp.evaluation.landings import LandingLog
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 
 @contextmanager
 def figure(path: Path, *shape: int, **settings: Any) -> Iterator[Any]:
-    """Give the axes of a figure, which is written to a file afterwards; shape, settings: as of `subplots`."""
+    """Context of the axes of a new figure, written to `path` at its end; shape, settings: as of `plt.subplots`."""
     fig, axes = plt.subplots(*shape, constrained_layout=True, **settings)
     yield axes
     fig.savefig(path, dpi=110)
@@ -29,7 +29,11 @@ def figure(path: Path, *shape: int, **settings: Any) -> Iterator[Any]:
 def plot_sweep(
     axis: Any, commanded: np.ndarray, reached: np.ndarray, good: np.ndarray, tolerance: float, names: tuple[str, str]
 ) -> None:
-    """Draw reached over commanded values [m], and what counts as reached; names: of the good ones and the others."""
+    """Plot reached over commanded values [m] with the band of success.
+
+    commanded, reached [m], good (bool): (jumps, 1) each; tolerance [m]: half width of the band; names: legend of the
+    good and of the other jumps.
+    """
     line = np.array([commanded.min(), commanded.max()])
     axis.fill_between(
         line, line - tolerance, line + tolerance, color="tab:green", alpha=0.12, label=f"within {tolerance:g} m"
@@ -40,11 +44,14 @@ def plot_sweep(
     axis.legend(loc="upper left")
 
 
-def plot_landings(path: Path, tests: dict[str, PlaceLog], size: tuple[float, float]) -> None:
-    """Draw goals and landings of first jumps from above, the start at the origin, a panel a test (title to jumps)."""
+def plot_landings(path: Path, tests: dict[str, LandingLog], size: tuple[float, float]) -> None:
+    """Plot goals and landing positions of first jumps from above, relative to the start, one panel per test.
+
+    tests: log by title of its panel; size [in]: of the figure.
+    """
     with figure(path, 1, len(tests), figsize=size, squeeze=False) as axes:
         for axis, (title, landings) in zip(axes[0], tests.items(), strict=True):
-            good, goals, landing = landings.success[:, 0], landings.places[:, 0], landings.landing[:, 0]
+            good, goals, landing = landings.success[:, 0], landings.goal_positions[:, 0], landings.landing[:, 0]
             axis.plot(*np.stack([goals, landing]).transpose(2, 0, 1), color="0.7", linewidth=0.8)
             axis.scatter(goals[:, 0], goals[:, 1], s=20, color="0.4", marker="x", linewidth=0.8, label="goal")
             axis.scatter(landing[good, 0], landing[good, 1], s=12, color="tab:blue", label="landed there")
@@ -53,33 +60,33 @@ def plot_landings(path: Path, tests: dict[str, PlaceLog], size: tuple[float, flo
         axes[0, 0].figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
 
 
-class Track:
-    """Keeps where every base was."""
+class BasePaths:
+    """Records the path of every base; call it after every policy step."""
 
     def __init__(self) -> None:
-        self.places: list[np.ndarray] = []
+        self.positions: list[np.ndarray] = []
 
     def __call__(self, landings: JumpLog) -> None:
-        """Add the moment; places of rows that have ended are not numbers."""
+        """Record the present base positions; those of rows of jumps that have ended are NaN."""
         running = landings.current < landings.goals.shape[1]
-        self.places.append(np.where(running[:, None], landings.seen["base_pos"][:, :2], np.nan))
+        self.positions.append(np.where(running[:, None], landings.arrays["base_pos"][:, :2], np.nan))
 
     def in_start_frame(self, headings: np.ndarray) -> np.ndarray:
-        """Return the places [m], (worlds, steps, 2), ahead and to the left of start and heading (worlds,) [rad]."""
-        x, y = np.moveaxis(np.stack(self.places, axis=1), -1, 0)
+        """Return the paths [m], (worlds, steps, 2), ahead and to the left of the start; headings [rad]: (worlds,)."""
+        x, y = np.moveaxis(np.stack(self.positions, axis=1), -1, 0)
         cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
 
 def plot_paths(path: Path, paths: dict[str, np.ndarray], goals: Mapping[str, Sequence], title: str) -> None:
-    """Draw ways of bases from above, a panel a test; where a test has a row of goals, these if no jump has an error.
+    """Plot paths of bases from above, one panel per test, with the goals of a test whose robots share them.
 
-    paths [m]: by test, of `Track.in_start_frame`; goals [m]: by test, each relative to the one before.
+    paths [m]: by test, as `BasePaths.in_start_frame` returns; goals [m]: by test, each relative to the one before.
     """
     with figure(path, 1, len(paths), figsize=(5.0 * len(paths), 4.5)) as axes:
-        for axis, (name, places) in zip(axes, paths.items(), strict=True):
-            for way in places:
-                axis.plot(way[:, 0], way[:, 1], linewidth=0.8, alpha=0.5, color="tab:blue")
+        for axis, (name, test_paths) in zip(axes, paths.items(), strict=True):
+            for base_path in test_paths:
+                axis.plot(base_path[:, 0], base_path[:, 1], linewidth=0.8, alpha=0.5, color="tab:blue")
             if name in goals:
                 ideal = np.cumsum(goals[name], axis=0)
                 axis.scatter(*ideal.T, s=50, color="tab:red", marker="x", zorder=3, label="goal, no error")

@@ -1,4 +1,4 @@
-"""A policy under evaluation: its environment, runs that are followed and filmed, and their report.
+"""Evaluation of a policy: its environment, recorded runs of episodes, and the report of their metrics.
 
 Experiments and the commands `jumper evaluate` and `jumper play` share it.
 """
@@ -20,9 +20,9 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.evaluations import evaluation_of
 from jumper_warp.evaluation.film import Film
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
-from jumper_warp.evaluation.registry import evaluation_of
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.runs import open_policy
@@ -33,13 +33,14 @@ from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
-from jumper_warp.utils.runtime import announce
+from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.threads import checked_threads
 
-HEIGHTS = ("apex_height", "apex_height_mars")
-"""Evaluations of policies that jump to heights."""
-PLACES = ("landing_position", "omnidirectional", "landing_position_mars")
-"""Of those that jump to places."""
+HEIGHTS = ("height", "height-mars")
+"""Keys of `EVALUATIONS` of policies that jump to a commanded height."""
+PLACES = ("place", "around", "place-mars")
+"""Keys of `EVALUATIONS` of policies that jump to a commanded landing position."""
+SOLVER_TITLES = {"jumper": "SolverJumper", "mujoco": "SolverMuJoCo"}
 Log = TypeVar("Log", bound=EvaluationLog)
 
 
@@ -63,14 +64,14 @@ class EvaluationArgs(Conditions):
 
 
 def conditions_of(args: EvaluationArgs) -> Conditions:
-    """Return the conditions that an experiment's flags ask for."""
+    """Return the conditions that an experiment's flags set; randomised robots have observation noise."""
     values: dict[str, Any] = {spec.name: getattr(args, spec.name) for spec in fields(Conditions)}
     values["noise"] = args.randomize
     return Conditions(**values)
 
 
 class Run(ABC):
-    """Follows robots as often as wanted, films some, and reports. Those who inherit say who acts."""
+    """Base class of evaluations: runs episodes, records some worlds, reports metrics. A subclass provides the actor."""
 
     folder: Path
 
@@ -78,29 +79,29 @@ class Run(ABC):
         """Call `prepare` before anything else."""
         self.started = time.perf_counter()
         self.conditions, self.record = Conditions(), 0
-        self.told: dict[str, Any] = {}
+        self.setup_metrics: dict[str, Any] = {}
         self._latency: list[np.ndarray] = []
         self._physics_dt = PHYSICS_DT
 
     @abstractmethod
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return what gives actions for the environment's observations, as `run_evaluation` takes it."""
+        """Return the function from observations to actions, as `run_evaluation` takes it."""
 
     def prepare(self, name: str, conditions: Conditions, out: Path | None = None, *, record: int = 0) -> None:
-        """Take up the conditions, look for the device and make the folder, before anything is simulated.
+        """Set the conditions, select the device and create the output folder, before anything is simulated.
 
-        name: of the folder, unless `out` is given; record: number of worlds that are filmed.
-        Raises InputError: there is no such device or number of threads; OSError: the folder cannot be made.
+        name: of the folder, unless `out` is given; record: number of worlds to record.
+        Raises InputError: no such device or number of threads; OSError: the folder cannot be created.
         """
-        announce(conditions.device, conditions.threads)
+        configure_device(conditions.device, conditions.threads)
         self.conditions, self.record = conditions, record
         self.folder = output_dir(name, out)
 
     @property
     def title(self) -> str:
-        """What the policy is tried in."""
+        """Solver, robots and changed conditions in words, for tables and plots."""
         conditions = self.conditions
-        words = [conditions.solver, "randomised" if conditions.randomize else "nominal"]
+        words = [SOLVER_TITLES[conditions.solver], "randomised" if conditions.randomize else "nominal"]
         if conditions.latency is not None and self._latency:
             words.append(f"latency {latency_text(self._latency[0], self._physics_dt)}")
         words += [] if conditions.gains is None else ["kp x {:g}, kd x {:g}".format(*conditions.gains)]
@@ -109,9 +110,9 @@ class Run(ABC):
         return ", ".join(words + (["pushed in flight too"] if conditions.push_in_flight else []))
 
     @property
-    def tried_in(self) -> dict[str, Any]:
-        """The conditions as they are reported, latency as it was simulated in all that was followed."""
-        conditions, values = self.conditions, {**self.told}
+    def condition_metrics(self) -> dict[str, Any]:
+        """Conditions as they are reported; latency is that of all episodes simulated so far."""
+        conditions, values = self.conditions, {**self.setup_metrics}
         values |= {name: getattr(conditions, name) for name in ("solver", "randomize", "seed")}
         if conditions.randomize:
             values["push_in_flight"] = conditions.push_in_flight
@@ -122,70 +123,70 @@ class Run(ABC):
             values |= latency_metrics(np.concatenate(self._latency), self._physics_dt, conditions.latency)
         return values
 
-    def follow(
+    def run_episodes(
         self,
         env: Env,
         log: Log,
         *,
         film: str = "",
-        figure: Mapping[str, Any] | None = None,
-        watch: Callable[[Log], None] | None = None,
+        film_scene: Mapping[str, Any] | None = None,
+        on_step: Callable[[Log], None] | None = None,
     ) -> Log:
-        """Run one episode a world as a log commands, and return the log.
+        """Run one episode per world with the commands of a log, and return the log.
 
-        film: name of the recording and filmstrip of some of the worlds; no film without. drawn: the environment's
-        `ground` and `block`, if the film shows them. watch: called with the log after every policy step.
+        film: name of the recording and filmstrip of some worlds; empty: none. film_scene: the environment's `ground`
+        and `block`, to show them in the recording. on_step: called with the log after every policy step.
         """
-        pictures = self._film(env, log, figure or {}) if film and self.record else None
+        recorder = self._make_film(env, log, film_scene or {}) if film and self.record else None
 
-        def look() -> None:
-            if watch is not None:
-                watch(log)
-            if pictures is not None:
-                pictures()
+        def after_step() -> None:
+            if on_step is not None:
+                on_step(log)
+            if recorder is not None:
+                recorder()
 
-        run_evaluation(self.actor(env), env, log, watch=look)
+        run_evaluation(self.actor(env), env, log, on_step=after_step)
         self._latency.append(env.parameters.latency.numpy().copy())
         self._physics_dt = env.physics_dt
-        if pictures is not None:
-            self._develop(pictures, log, film)
+        if recorder is not None:
+            self._save_film(recorder, log, film)
         return log
 
-    def _film(self, env: Env, log: EvaluationLog, figure: Mapping[str, Any]) -> Film:
-        """Return the film of some worlds, evenly chosen."""
-        ground = figure.get("ground", "plane")
+    def _make_film(self, env: Env, log: EvaluationLog, film_scene: Mapping[str, Any]) -> Film:
+        """Return a film of `record` evenly chosen worlds."""
+        ground = film_scene.get("ground", "plane")
         worlds = np.linspace(0, env.num_envs - 1, min(self.record, env.num_envs)).round().astype(int).tolist()
         spacing = log.spacing if isinstance(ground, str) else 0.0
-        block, notes = figure.get("block"), log.notes(worlds)
+        block, notes = film_scene.get("block"), log.notes(worlds)
         return Film(env, log.series, worlds, spacing=spacing, ground=ground, block=block, notes=notes)
 
-    def _develop(self, film: Film, log: EvaluationLog, name: str) -> None:
-        """Write a film as a recording, and as a filmstrip; this shows no blocks."""
-        film.save_rrd(self.folder / f"{name}.rrd", log.marks(film.worlds))
-        strip = None if film.block is not None else log.strip(film)
-        if strip is not None:
-            film.save_strip(strip, self.folder / f"{strip.name or name}.png")
+    def _save_film(self, film: Film, log: EvaluationLog, name: str) -> None:
+        """Write a film as a recording, and as a filmstrip unless it has blocks, which filmstrips do not show."""
+        film.save_rrd(self.folder / f"{name}.rrd", log.goal_markers(film.worlds))
+        filmstrip = None if film.block is not None else log.filmstrip(film)
+        if filmstrip is not None:
+            film.save_filmstrip(filmstrip, self.folder / f"{filmstrip.name or name}.png")
 
     def report(self, metrics: Mapping[str, Any], paper: Mapping[str, float]) -> dict[str, Any]:
-        """Write and print metrics beside the paper's, conditions before them; return all."""
-        values = self.tried_in | dict(metrics)
+        """Write conditions and metrics to `metrics.json`, print them beside the paper's values, and return them."""
+        values = self.condition_metrics | dict(metrics)
         write_metrics(self.folder, values)
-        table = Table("figure", self.title, "paper")
+        table = Table("metric", self.title, "paper")
         for name, value in values.items():
-            table.add_row(name, shown(value), str(paper.get(name, "")))
+            table.add_row(name, format_value(value), str(paper.get(name, "")))
         Console().print(table)
-        print(f"{time.perf_counter() - self.started:.1f} s; figures, plots and recordings in {self.folder}")
+        print(f"{time.perf_counter() - self.started:.1f} s; metrics, plots and recordings in {self.folder}")
         return values
 
 
 class EvaluationRun(Run):
-    """Opens a policy, follows it as often as wanted, and reports."""
+    """Evaluation of one policy."""
 
     def __init__(self, source: str | Path, modules: Iterable[ModuleType] = ()) -> None:
         """Open a policy; call `prepare` before anything else.
 
-        source: name or folder of a policy, a run's folder, or a checkpoint; modules: that the user has named, for tasks
-        that are not the project's. Raises PolicyError, also for an unknown evaluation, or CheckpointError.
+        source: name or folder of a policy, a run's folder, or a checkpoint; modules: the user's task modules.
+        Raises PolicyError, also for an unknown evaluation, or CheckpointError.
         """
         super().__init__()
         self.source, self.modules = source, list(modules)
@@ -194,17 +195,17 @@ class EvaluationRun(Run):
         self.evaluation = evaluation_of(self.task)
 
     @classmethod
-    def of(
+    def from_args(
         cls,
         name: str,
         args: EvaluationArgs,
         evaluations: Sequence[str] = PLACES,
         modules: Iterable[ModuleType] = (),
     ) -> EvaluationRun:
-        """Return the run of an experiment, prepared.
+        """Return the prepared evaluation of an experiment.
 
-        evaluations: keys of `EVALUATIONS`, one of which the policy must have, else PolicyError; modules: that the user
-        has named. Raises as the constructor and `prepare`.
+        name: of the output folder; evaluations: accepted keys of `EVALUATIONS`, else PolicyError; modules: the user's
+        task modules. Raises as the constructor and `prepare`.
         """
         run = cls(args.policy, modules)
         if run.task.evaluation_suite not in evaluations:
@@ -213,11 +214,11 @@ class EvaluationRun(Run):
                 f"{args.policy} is of {run.task.name}, by {run.task.evaluation_suite}"
             )
         run.prepare(name, conditions_of(args), args.out, record=args.record)
-        run.told = {"task": run.task.name} if len(evaluations) > 1 else {}
+        run.setup_metrics = {"task": run.task.name} if len(evaluations) > 1 else {}
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return the policy's action."""
+        """Return the policy's `act`."""
         return self.policy.act
 
     def env(
@@ -227,21 +228,21 @@ class EvaluationRun(Run):
         conditions: Conditions | None = None,
         **scene: Any,
     ) -> Env:
-        """Return the policy's environment of `count` worlds. Raises PolicyError as `env_of_policy`.
+        """Return an environment of the policy's task with `count` worlds. Raises PolicyError as `env_of_policy`.
 
-        change: returns the task with the terminations that count (default: as its evaluation says); conditions: other
-        ones than the run's; scene: more settings of `Env`.
+        change: returns the task with other terminations (default: `Evaluation.prepare_task`); conditions: in place of
+        the run's; scene: more arguments of `Env`.
         """
-        change, conditions = change or self.evaluation.for_evaluation, conditions or self.conditions
+        change, conditions = change or self.evaluation.prepare_task, conditions or self.conditions
         env = env_of_policy(self.policy, count, conditions, change=change, modules=self.modules, **scene)
         self.policy.to(env.device)
-        self.told["gravity_m_s2"] = env.task.gravity
-        self.told["torque_limit_nm"] = torque_limit(env)
+        self.setup_metrics["gravity_m_s2"] = env.task.gravity
+        self.setup_metrics["torque_limit_nm"] = torque_limit(env)
         return env
 
 
 class SkillRun(Run):
-    """Opens the policies of one robot, follows it as often as wanted, and reports."""
+    """Evaluation of several policies on one robot."""
 
     def __init__(self, names: SkillNames | None = None) -> None:
         """Open policies; call `prepare` before anything else. Raises PolicyError or CheckpointError."""
@@ -249,34 +250,33 @@ class SkillRun(Run):
         self.skills = SkillPolicies(names)
 
     @classmethod
-    def of(cls, name: str, args: EvaluationArgs, names: SkillNames) -> SkillRun:
-        """Return the run of an experiment, prepared. Raises PolicyError, CheckpointError, or InputError: no device."""
+    def from_args(cls, name: str, args: EvaluationArgs, names: SkillNames) -> SkillRun:
+        """Return the prepared evaluation of an experiment. Raises PolicyError, CheckpointError or InputError."""
         run = cls(names)
         run.prepare(name, conditions_of(args), args.out, record=args.record)
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return the actions of all skills."""
+        """Return the function that gives the actions of all skills, (skills, num_envs, 12)."""
         return lambda obs: self.skills.act(env)
 
     def env(self, count: int, **scene: Any) -> Env:
-        """Return the environment of the robot; scene: more settings of `Env`."""
+        """Return the environment of the robot with all skills; scene: more arguments of `Env`."""
         return self.skills.env(count, self.conditions, **scene)
 
 
-def latency_metrics(steps: np.ndarray, physics_dt: float, asked: float | None = None) -> dict[str, Any]:
-    """Return the latency from action to motor as it was simulated.
+def latency_metrics(steps: np.ndarray, physics_dt: float, requested: float | None = None) -> dict[str, Any]:
+    """Return the simulated latency from action to motor: mean `latency_ms`, and `latency` in words.
 
-    steps: [physics steps] of all worlds; physics_dt [s]; asked [ms]: what was asked for, if anything.
-    `latency_ms` is the mean, `latency` all of it in words.
+    steps: [physics steps] of all worlds, (num_envs,); physics_dt [s]; requested [ms]: value of the flag, if any.
     """
-    told: dict[str, Any] = {} if asked is None else {"latency_asked_ms": asked}
+    metrics: dict[str, Any] = {} if requested is None else {"latency_asked_ms": requested}
     mean = 1000.0 * physics_dt * float(np.mean(steps))
-    return told | {"latency_ms": mean, "latency": latency_text(steps, physics_dt)}
+    return metrics | {"latency_ms": mean, "latency": latency_text(steps, physics_dt)}
 
 
 def latency_text(steps: np.ndarray, physics_dt: float) -> str:
-    """Return a latency in milliseconds and in physics steps, or the range and the mean of several."""
+    """Return latencies in milliseconds and physics steps as text: one value, or range and mean."""
     least, most = int(np.min(steps)), int(np.max(steps))
     low, high, mean = (f"{1000.0 * physics_dt * float(value):.3g}" for value in (least, most, np.mean(steps)))
     if least == most:
@@ -285,13 +285,13 @@ def latency_text(steps: np.ndarray, physics_dt: float) -> str:
 
 
 def torque_limit(env: Env) -> float:
-    """Return the least torque limit of the thighs' motors [N m]: the task's, as an overlay scales it."""
+    """Return the smallest torque limit of the transversal motors [N m], scaled by a robot overlay if there is one."""
     limit = env.task.motors.transversal.saturation
     return limit if env.sim.robot is None else limit * float(env.sim.robot.saturation[:, TRANSVERSAL].min())
 
 
-def shown(value: Any) -> str:
-    """Return a figure as it is printed: numbers, and those in lists, with four digits."""
+def format_value(value: Any) -> str:
+    """Return a metric as text; floats, also those in lists, have four significant digits."""
     if isinstance(value, list):
-        return ", ".join(shown(item) for item in value)
+        return ", ".join(format_value(item) for item in value)
     return f"{value:.4g}" if isinstance(value, float) else str(value)

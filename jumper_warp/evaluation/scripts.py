@@ -1,4 +1,4 @@
-"""What a robot is to do, one command after the other, and how it is written in a file.
+"""Scripts: sequences of commands to one robot, and their files.
 
 A script is a JSON list of commands: `{"walk": [vx, vy, yaw_rate], "seconds": s}` ([m/s], [rad/s], [s]),
 `{"stand": seconds}`, `{"jump_up": height}` (of the base at the apex [m]), `{"jump_to": [ahead, left]}` ([m]), and
@@ -16,36 +16,32 @@ from typing import Any
 
 from jumper_warp.utils.errors import InputError
 
-KINDS = {"walk": 3, "stand": 1, "jump_up": 1, "jump_to": 2, "jump_onto": 2}
-"""Commands, and how many numbers each takes."""
+KINDS = {"walk": 3, "stand": 1, "jump_up": 1, "jump_to": 2, "jump_onto": 2}  # Number of values of each kind of command
 LIMITS = {"walk": 10.0, "stand": 600.0, "jump_up": 2.0, "jump_to": 5.0, "jump_onto": 5.0}
-"""Largest number of each."""
-LONGEST = 600.0
-"""[s] Of walking and standing in one script."""
-MOST_COMMANDS = 1000
+"""Largest absolute value of each kind of command."""
+MAX_SECONDS = 600.0  # [s] Maximum total time of walking and standing in one script
+MAX_COMMANDS = 1000
 MAX_BYTES = 2**20
 
 
 @dataclass(frozen=True)
 class ScriptStep:
-    """One command."""
+    """One command of a script."""
 
-    kind: str
-    """Of `KINDS`."""
+    kind: str  # One of `KINDS`
     values: tuple[float, ...] = (0.0, 0.0, 0.0)
     """walk: velocity ahead, to the left [m/s], about z [rad/s]; jump_up: height [m]; jump_to, jump_onto: place
     ahead, left [m]."""
-    seconds: float = 0.0
-    """[s] How long to walk or stand."""
+    seconds: float = 0.0  # [s] Time of walking or standing; 0 for jumps
 
     @property
     def jumps(self) -> bool:
-        """Whether this is a jump."""
+        """Whether the command is a jump."""
         return self.kind.startswith("jump")
 
     @property
     def goal(self) -> tuple[float, float, float]:
-        """What the environment is commanded: a velocity, or a jump's place and height."""
+        """Command to the environment: velocity, or landing position x, y and apex height z of a jump."""
         if self.kind == "jump_up":
             return (0.0, 0.0, self.values[0])
         x, y, z = (*self.values, 0.0, 0.0, 0.0)[:3]
@@ -53,7 +49,7 @@ class ScriptStep:
 
 
 def read_script(path: Path) -> tuple[ScriptStep, ...]:
-    """Return the commands of a file. Raises InputError: it cannot be read, or a command is malformed."""
+    """Return the commands of a script file. Raises InputError: it cannot be read, or a command is malformed."""
     try:
         too_large = path.stat().st_size > MAX_BYTES
         content = None if too_large else json.loads(path.read_bytes())
@@ -70,17 +66,18 @@ def read_script(path: Path) -> tuple[ScriptStep, ...]:
 
 
 def parse_script(content: Any) -> tuple[ScriptStep, ...]:
-    """Return the commands of a script as JSON holds it. Raises InputError: one of them is malformed."""
-    if not isinstance(content, list) or not 1 <= len(content) <= MOST_COMMANDS:
-        raise InputError(f"a script is a list of 1 to {MOST_COMMANDS} commands, such as {{'walk': [0.5, 0, 0.3]}}")
+    """Return the commands of a parsed JSON script. Raises InputError: a command is malformed."""
+    if not isinstance(content, list) or not 1 <= len(content) <= MAX_COMMANDS:
+        raise InputError(f"a script is a list of 1 to {MAX_COMMANDS} commands, such as {{'walk': [0.5, 0, 0.3]}}")
     steps = tuple(_step(i, item) for i, item in enumerate(content))
     total = sum(step.seconds for step in steps)
-    if not total <= LONGEST:
-        raise InputError(f"walking and standing take {total:g} s, at most {LONGEST:g} are allowed")
+    if not total <= MAX_SECONDS:
+        raise InputError(f"walking and standing take {total:g} s, at most {MAX_SECONDS:g} are allowed")
     return steps
 
 
 def _step(index: int, item: Any) -> ScriptStep:
+    """Return the index-th command from its JSON object. Raises InputError: it is malformed."""
     where = f"command {index + 1}"
     kinds = [key for key in item if key in KINDS] if isinstance(item, dict) else []
     if len(kinds) != 1:
@@ -89,8 +86,8 @@ def _step(index: int, item: Any) -> ScriptStep:
     unknown = set(item) - {kind} - ({"seconds"} if kind == "walk" else set())
     if unknown:
         raise InputError(f"{where}: {kind} has no {sorted(map(str, unknown))[0]!r:.40}")
-    given = item[kind]
-    values = _numbers(f"{where}: {kind}", given if isinstance(given, list) else [given], KINDS[kind], LIMITS[kind])
+    value = item[kind]
+    values = _numbers(f"{where}: {kind}", value if isinstance(value, list) else [value], KINDS[kind], LIMITS[kind])
     if kind == "stand":
         return ScriptStep("stand", seconds=_seconds(where, values[0]))
     if kind == "walk":
@@ -101,13 +98,15 @@ def _step(index: int, item: Any) -> ScriptStep:
 
 
 def _seconds(where: str, value: Any) -> float:
-    (seconds,) = _numbers(f"{where}: seconds", [value], 1, LONGEST)
+    """Return a positive time [s]. Raises InputError; where: beginning of its message."""
+    (seconds,) = _numbers(f"{where}: seconds", [value], 1, MAX_SECONDS)
     if not seconds > 0.0:
         raise InputError(f"{where}: seconds must be positive, got {seconds:g}")
     return seconds
 
 
 def _numbers(where: str, values: Sequence[Any], count: int, most: float) -> tuple[float, ...]:
+    """Return `count` finite numbers of size up to `most`. Raises InputError; where: beginning of its message."""
     good = len(values) == count and all(
         isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and abs(v) <= most for v in values
     )

@@ -1,7 +1,7 @@
-"""Suites of jumps to places beside the sweep, and the table of all suites.
+"""Suites of jumps to landing positions other than the sweep, and the table of all suites.
 
-`jumper evaluate POLICY --suite NAME` runs one. Headings are drawn from the full circle; errors and success are those of
-the sweep.
+`jumper evaluate POLICY --suite NAME` runs one. Headings are sampled from the full circle; error and success are defined
+as in the sweep.
 """
 
 from __future__ import annotations
@@ -13,44 +13,44 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from jumper_warp.evaluation.film import block_places
+from jumper_warp.evaluation.film import block_positions
+from jumper_warp.evaluation.landings import AT_REST_AT_END, FALLS, MISSED, LandingLog, landing_metrics, trained_range
 from jumper_warp.evaluation.log import largest, mean, within
-from jumper_warp.evaluation.places import AT_END, FALLS, MISSED, PlaceLog, landing_metrics, trained_range
-from jumper_warp.evaluation.plots import Track, figure, plot_landings, plot_paths
+from jumper_warp.evaluation.plots import BasePaths, figure, plot_landings, plot_paths
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite, check
 from jumper_warp.robot.grounds import BlockCfg, platform, uneven
 
 AHEAD, ASIDE = (0.35, 1.4), (-0.35, 0.35)
-"""[m] Goals of the grid."""
+"""[m] Ranges of the grid's goals ahead and to the left."""
 SECTORS = ("ahead", "left", "back", "right")
 """Quarters of a ring, each centred on its direction."""
 PAIRS = {"diagonal": ((0.8, 0.2), (0.75, -0.2)), "straight": ((0.8, 0.0), (0.8, 0.0))}
-"""[m] The paper's two jumps in a row."""
+"""[m] Goals of the paper's two jumps in a row, each relative to the one before."""
 ROW_LOWER, ROW_UPPER, DELAYS = (0.4, -0.2), (0.9, 0.2), (0.3, 1.0)
-"""[m] Goals of the jumps in a long row; [s] until the first command of any row."""
-OF_ROWS = (
+"""[m] Range of goals in a long row; [s] range of the time until the first command of any row."""
+ROW_METRICS = (
     "success_rate", "fall_rate", "miss_rate", "step_rate", "still_landing_rate", "second_takeoff_rate",
-    "max_landing_tilt_deg", AT_END,
+    "max_landing_tilt_deg", AT_REST_AT_END,
 )  # fmt: skip
-"""Metrics that are reported of the long rows too."""
+"""Metrics that are also reported for the long rows, with the suffix `_ten`."""
 GROUND_LOWER, GROUND_UPPER = (0.8, -0.15), (1.4, 0.15)
-"""[m] Goals off the platform, or on the block, with all paws; as far as the paper's simulation always succeeds."""
+"""[m] Range of goals off the platform or on the block; the paper's simulation always succeeds in it."""
 DROP, AMPLITUDE, FLAT_RADIUS = 0.15, 0.05, 0.35
-"""[m] Height of the platform; of the uneven ground; radius of level ground around the start there."""
+"""[m] Height of the platform; amplitude of the uneven ground; radius of level ground around its start."""
 BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION, BLOCK_BEYOND, BLOCK_WIDTH = 0.05, 10.0, 0.4, 0.40, 0.8
-"""[m], [kg], [1] with the floor; [m] from the goal to the block's far side, and along y."""
+"""[m], [kg], [1] Height, mass, friction with the floor; [m] distance from goal to far side; [m] width along y."""
 BIN, IN_RANGE, LIMIT = 0.1, (1.0, 1.4), 9.0
-"""[m] Width of a bin of distances; the upper part of what the paper reaches always; farthest bin."""
+"""[m] Width of a bin of distances; distances of `success_rate_in_range`; largest distance."""
 GIVEN_UP, RELIABLE = 0.5, 0.95
-"""[1] Success below which no farther bin is tried; success of a distance that counts."""
+"""[1] Success rate below which no farther bin is tried; success rate of a reliable distance."""
 KINDS = {"": "success_rate", "_without_hop": "single_jump_success_rate", "_without_step": "step_free_success_rate"}
-"""Ends of the names of reliable distances, and the rate that each takes."""
-EACH = (
+"""Success rate of each reliable distance, by the suffix of its name."""
+BIN_METRICS = (
     *KINDS.values(), "mean_error_m", "mean_error_of_successes_m", "mean_error_at_touchdown_m",
     "mean_error_0_3_s_after_touchdown_m", "fall_rate", "miss_rate", "still_landing_rate", "max_landing_tilt_deg",
 )  # fmt: skip
-"""Metrics with an entry a bin."""
+"""Metrics that are reported for each bin."""
 PUBLISHED = {
     "Barkour (Caluwaerts et al. 2023)": 0.5,
     "Margolis et al. 2021": 0.66,
@@ -83,16 +83,16 @@ class Grid(Suite):
         check(min(self.columns, self.rows) >= 1, f"need at least one column and row, got {self.columns}, {self.rows}")
 
     @property
-    def places(self) -> np.ndarray:
-        """[m] Goals (columns * rows * jumps, 1, 2)."""
+    def goals(self) -> np.ndarray:
+        """[m] Goals ahead and to the left, (columns * rows * jumps, 1, 2)."""
         x, y = np.meshgrid(np.linspace(*AHEAD, self.columns), np.linspace(*ASIDE, self.rows), indexing="ij")
         return np.repeat(np.stack([x.ravel(), y.ravel()], axis=1), self.jumps, axis=0)[:, None]
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
-        """Follow jumps, draw them, and return the metrics."""
-        landings = self.jump(run, self.places, film="jumps")
+        """Run the jumps, plot the landing positions, and return the metrics."""
+        landings = self.run_landings(run, self.goals, film="jumps")
         plot_landings(run.folder / "grid.png", {f"{len(landings.end)} jumps, {run.title}": landings}, (8.0, 5.0))
-        inside = landings.places[..., 0] < AHEAD[1] - 1.0e-6
+        inside = landings.goal_positions[..., 0] < AHEAD[1] - 1.0e-6
         return {"goals": self.columns * self.rows, **landing_metrics(landings, inside)}
 
 
@@ -112,13 +112,13 @@ class Ring(Suite):
         check(0.0 < self.radius < 3.0, f"radius must be in (0, 3) m, got {self.radius}")
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
-        """Follow jumps, draw them, and return the metrics, also those of each quarter."""
+        """Run the jumps, plot the landing positions, and return the metrics, also for each quarter of the ring."""
         angle = np.linspace(0.0, 2.0 * np.pi, self.jumps, endpoint=False)
-        places = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
-        landings = self.jump(run, places, film="jumps")
+        goals = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
+        landings = self.run_landings(run, goals, film="jumps")
         title = f"{self.jumps} jumps over {self.radius:g} m, {run.title}"
         plot_landings(run.folder / "landings.png", {title: landings}, (6.0, 6.5))
-        sector = np.round(np.arctan2(places[..., 1], places[..., 0]) / (0.5 * np.pi)).astype(int) % len(SECTORS)
+        sector = np.round(np.arctan2(goals[..., 1], goals[..., 0]) / (0.5 * np.pi)).astype(int) % len(SECTORS)
         fell, missed = np.isin(landings.ends, FALLS), landings.outcomes == MISSED
         values = landing_metrics(landings)
         for i, name in enumerate(SECTORS):
@@ -153,26 +153,26 @@ class Consecutive(Suite):
         check(min(self.trials, self.row) >= 1, f"need at least one trial and row, got {self.trials}, {self.row}")
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
-        """Follow both tests, draw the paths, and return the metrics."""
+        """Run pairs and long rows, plot the paths of the bases, and return the metrics."""
         rng = np.random.default_rng(self.seed)
         pairs = np.repeat(np.array(list(PAIRS.values())), self.jumps, axis=0)
         rows = rng.uniform(ROW_LOWER, ROW_UPPER, (self.trials, self.row, 2))
         logs, paths = [], []
-        for name, places in (("pairs", pairs), ("row", rows)):
-            track, delay = Track(), rng.uniform(*DELAYS, len(places))
-            logs.append(self.jump(run, places, delay=delay, film=name, watch=track))
-            paths.append(track.in_start_frame(logs[-1].headings))
+        for name, goals in (("pairs", pairs), ("row", rows)):
+            base_paths, delay = BasePaths(), rng.uniform(*DELAYS, len(goals))
+            logs.append(self.run_landings(run, goals, delay=delay, film=name, on_step=base_paths))
+            paths.append(base_paths.in_start_frame(logs[-1].headings))
         parts = dict(zip((*PAIRS, f"{self.row} in a row"), (*np.split(paths[0], 2), paths[1]), strict=True))
         plot_paths(run.folder / "paths.png", parts, PAIRS, run.title)
         return {"rest_s": self.rest} | consecutive_metrics(*logs)
 
 
-def consecutive_metrics(pairs: PlaceLog, row: PlaceLog) -> dict[str, Any]:
-    """Return the metrics of both tests of jumps in a row; the first half of the pairs are the diagonal ones."""
+def consecutive_metrics(pairs: LandingLog, row: LandingLog) -> dict[str, Any]:
+    """Return the metrics of pairs and long rows of jumps; the first half of the pairs are the diagonal ones."""
     values, ten = (landing_metrics(landings) for landings in (pairs, row))
     for part in (values, ten):
         if "at_rest_within_1_s_rate" in part:
-            part[AT_END] = part.pop("at_rest_within_1_s_rate")
+            part[AT_REST_AT_END] = part.pop("at_rest_within_1_s_rate")
     halves = zip(PAIRS, np.split(pairs.error, 2), strict=True)
     return values | {
         "success_rate_in_range": values["success_rate"],
@@ -185,7 +185,7 @@ def consecutive_metrics(pairs: PlaceLog, row: PlaceLog) -> dict[str, Any]:
         "row_all_on_goal_rate": mean(row.success.all(axis=1)),
         "mean_jumps_until_the_end": mean(row.landed.sum(axis=1)),
         "mean_error_ten_m": ten["mean_error_m"],
-        **{f"{name}_ten": ten[name] for name in OF_ROWS},
+        **{f"{name}_ten": ten[name] for name in ROW_METRICS},
         "mean_error_by_number_m": [mean(error) for error in row.error.T],
     }
 
@@ -212,7 +212,7 @@ class Platform(Suite):
         check(low <= self.edge < high, f"edge must be from {low} m to below {high} m, got {self.edge}")
 
     def scenes(self, goals: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[str, dict[str, Any], np.ndarray]]:
-        """Yield the name of each scene, its settings of the environment, and headings; goals [m]: (num_envs, 2)."""
+        """Yield name, arguments of `Env`, and headings [rad] of each scene; goals [m]: (num_envs, 2)."""
         straight = np.zeros(len(goals))
         yield "platform", {"ground": platform(-DROP, edge=self.edge)}, straight
         bumps = uneven(AMPLITUDE, int(rng.integers(2**31)), flat_radius=FLAT_RADIUS)
@@ -224,16 +224,16 @@ class Platform(Suite):
             yield "block", {"block": BlockCfg(center, half, BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION)}, straight
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
-        """Follow the jumps of all scenes, draw them, and return each scene's metrics under its name, and their mean."""
+        """Run the jumps of all scenes, plot them, and return the metrics of each scene by prefix, and their means."""
         rng = np.random.default_rng(self.seed)
         goals, values = rng.uniform(GROUND_LOWER, GROUND_UPPER, (self.jumps, 2)), {}
-        done: dict[str, PlaceLog] = {}
-        for name, special, headings in self.scenes(goals, rng):
-            env = run.env(self.jumps, **special)
-            done[name] = self.jump(run, goals[:, None], env, headings=headings, film=name, figure=special)
+        done: dict[str, LandingLog] = {}
+        for name, scene, headings in self.scenes(goals, rng):
+            env = run.env(self.jumps, **scene)
+            done[name] = self.run_landings(run, goals[:, None], env, headings=headings, film=name, film_scene=scene)
             values |= {f"{name}_{metric}": value for metric, value in landing_metrics(done[name]).items()}
-            if "block" in special:
-                slide = np.linalg.norm(block_places(env.sim) - special["block"].center, axis=1)
+            if "block" in scene:
+                slide = np.linalg.norm(block_positions(env.sim) - scene["block"].center, axis=1)
                 values |= {"block_mean_slide_m": float(slide.mean()), "block_max_slide_m": float(slide.max())}
         titles = {f"{name}, {run.title}": landings for name, landings in done.items()}
         plot_landings(run.folder / "landings.png", titles, (5.0 * len(done), 4.0))
@@ -274,29 +274,29 @@ class Farthest(Suite):
         check(good, f"need {limits}, got {self.first} and {self.last}")
         check(-180.0 <= self.direction <= 180.0, f"direction must be in -180..180 deg, got {self.direction}")
 
-    def places(self, middle: float) -> np.ndarray:
-        """Return the goals of the bin around a distance [m], (jumps, 1, 2) [m]."""
+    def goals(self, middle: float) -> np.ndarray:
+        """Return the goals [m] of the bin around a distance [m], (jumps, 1, 2)."""
         distance = middle + BIN * (np.linspace(0.0, 1.0, self.jumps) - 0.5 if self.jumps > 1 else np.zeros(1))
         angle = math.radians(self.direction)
         return distance[:, None, None] * np.array([math.cos(angle), math.sin(angle)])
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
-        """Follow jumps of growing distance, draw their success, and return the metrics."""
+        """Run bins of growing distance until success is below GIVEN_UP, plot them, and return the metrics."""
         env, bins = run.env(self.jumps), {}
         for number in range(round((self.last - self.first) / BIN) + 1):
             middle = round(self.first + number * BIN, 6)
-            bins[middle] = self.jump(run, self.places(middle), env, film=f"jump_{middle:.1f}_m")
+            bins[middle] = self.run_landings(run, self.goals(middle), env, film=f"jump_{middle:.1f}_m")
             success = bins[middle].success.mean()
             print(f"{middle:.1f} m: {success:.1%} success", flush=True)
             if success < GIVEN_UP:
                 break
         values = distance_metrics(bins) | trained_range(env.task) | {"direction_deg": self.direction}
-        draw_distances(run, values)
+        plot_distances(run, values)
         return values
 
 
-def draw_distances(run: EvaluationRun, values: dict[str, Any]) -> None:
-    """Draw success and error over the distance."""
+def plot_distances(run: EvaluationRun, values: dict[str, Any]) -> None:
+    """Plot success rates and mean error over distance; values: of `distance_metrics`."""
     with figure(run.folder / "max_jump.png", 2, 1, figsize=(7, 6), sharex=True) as (top, bottom):
         for kind, rate in KINDS.items():
             label = f"success{kind.replace('_', ' ')}"
@@ -312,13 +312,13 @@ def draw_distances(run: EvaluationRun, values: dict[str, Any]) -> None:
         bottom.set(xlabel="commanded distance [m]", ylabel="mean error of successes [m]", ylim=(0.0, None))
 
 
-def distance_metrics(bins: dict[float, PlaceLog]) -> dict[str, Any]:
-    """Return the metrics over all bins (middle [m] to jumps), and lists with an entry a bin."""
+def distance_metrics(bins: dict[float, LandingLog]) -> dict[str, Any]:
+    """Return metrics over all bins (log by middle [m]), reliable distances, and `bin_` lists with one entry per bin."""
     each = [landing_metrics(landings) for landings in bins.values()]
-    lists: dict[str, list[Any]] = {name: [values[name] for values in each] for name in EACH}
+    lists: dict[str, list[Any]] = {name: [values[name] for values in each] for name in BIN_METRICS}
     flown = [mean(np.linalg.norm(log.touchdown[log.success], axis=-1)) for log in bins.values()]
     landed = [landings.landing[landings.success][:, 0] for landings in bins.values()]
-    inside = [landings.success[within(landings.places[..., 0], IN_RANGE)] for landings in bins.values()]
+    inside = [landings.success[within(landings.goal_positions[..., 0], IN_RANGE)] for landings in bins.values()]
     values: dict[str, Any] = {
         "jumps": sum(int(landings.begun.sum()) for landings in bins.values()),
         "mean_error_m": mean(lists["mean_error_m"]),
@@ -340,5 +340,5 @@ SUITES: tuple[type[Suite], ...] = (HeightSweep, DistanceSweep, Grid, Ring, Conse
 
 
 def suites_for(evaluation: str) -> dict[str, type[Suite]]:
-    """Return the suites of policies with a key of `EVALUATIONS`, by name."""
+    """Return the suites, by name, that accept policies with a key of `EVALUATIONS`."""
     return {suite.name: suite for suite in SUITES if evaluation in suite.evaluations}

@@ -1,7 +1,8 @@
-"""Suites, which are tests of jumping policies, and those two that the paper has for each policy: the sweeps."""
+"""Base class of the suites of jump tests, and the paper's two sweeps: over heights and over distances."""
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from types import ModuleType
@@ -10,38 +11,38 @@ from typing import Any, ClassVar
 import numpy as np
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.heights import SUCCESS_TOLERANCE, HeightLog, for_sweep, sweep_metrics
+from jumper_warp.evaluation.heights import SUCCESS_TOLERANCE, HeightLog, sweep_metrics, with_sweep_terminations
 from jumper_warp.evaluation.jumps import DELAY, REST_TIME
-from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
-from jumper_warp.evaluation.log import Metrics, mean, termination_names, within
-from jumper_warp.evaluation.places import (
-    PlaceLog,
-    ended_by_takeoff,
-    for_evaluation,
+from jumper_warp.evaluation.landings import (
+    LandingLog,
     landing_metrics,
     random_headings,
     trained_range,
+    with_landing_terminations,
+    with_second_takeoff,
 )
+from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
+from jumper_warp.evaluation.log import Metrics, mean, termination_names, within
 from jumper_warp.evaluation.plots import figure, plot_sweep
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.utils.errors import InputError
 
 HEIGHTS_IN_RANGE, DISTANCES_IN_RANGE = (0.5, 1.1), (0.3, 1.4)
-"""[m] That the paper reaches always."""
-TRAINED = (0.4, 1.0)
-"""[m] Distances of the paper's training."""
+"""[m] Ranges in which all jumps of the paper succeed."""
+PAPER_TRAINED = (0.4, 1.0)
+"""[m] Range of goal distances in the paper's training."""
 
 
 def check(good: bool, message: str) -> None:
-    """Raise InputError with a message unless settings are good."""
+    """Raise InputError with the message unless the condition `good` holds."""
     if not good:
         raise InputError(message)
 
 
 @dataclass(frozen=True)
-class Suite(EvaluationArgs):
-    """Flags of a suite, and its measurement."""
+class Suite(EvaluationArgs, ABC):
+    """A test of jumping policies: its flags, and what it measures."""
 
     jumps: int = 200
     """Number of jumps (where there are several scenes, bins or goals on a grid, of each)."""
@@ -50,11 +51,11 @@ class Suite(EvaluationArgs):
 
     name: ClassVar[str]
     evaluations: ClassVar[tuple[str, ...]] = PLACES
-    """Keys of `EVALUATIONS` of the policies that it takes."""
+    """Keys of `EVALUATIONS` of the policies that the suite accepts."""
     paper: ClassVar[dict[str, float]] = {}
-    """Metrics in the paper, of its simulation or its robot."""
+    """Values in the paper of metrics with the same names."""
     least: ClassVar[tuple[int, float]] = (1, 0.1)
-    """Jumps and rest [s] at least."""
+    """Minimum number of jumps and minimum rest [s]."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -62,19 +63,19 @@ class Suite(EvaluationArgs):
         check(self.jumps >= jumps, f"need at least {jumps} jump{'s' * (jumps > 1)}, got {self.jumps}")
         check(rest <= self.rest <= 10.0, f"rest must be in [{rest:g}, 10] s, got {self.rest}")
 
+    @abstractmethod
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
-        """Follow jumps, draw them, and return the metrics."""
-        raise NotImplementedError
+        """Run the jumps, write their plots into the run's folder, and return the metrics."""
 
     def run(self, modules: Iterable[ModuleType] = ()) -> dict[str, Any]:
-        """Measure the policy, report and return the metrics; modules: that the user has named.
+        """Evaluate the policy, report and return the metrics; modules: the user's task modules.
 
-        Raises PolicyError, CheckpointError or InputError as `EvaluationRun.of`.
+        Raises PolicyError, CheckpointError or InputError as `EvaluationRun.from_args`.
         """
-        run = EvaluationRun.of(self.name, self, self.evaluations, modules)
+        run = EvaluationRun.from_args(self.name, self, self.evaluations, modules)
         return run.report(self.measure(run), self.paper)
 
-    def jump(
+    def run_landings(
         self,
         run: EvaluationRun,
         places: np.ndarray,
@@ -82,18 +83,22 @@ class Suite(EvaluationArgs):
         *,
         headings: np.ndarray | None = None,
         delay: np.ndarray | float = DELAY,
-        **follow: Any,
-    ) -> PlaceLog:
-        """Return jumps to places [m], (num_envs, jumps in a row, 2).
+        **options: Any,
+    ) -> LandingLog:
+        """Run jumps to goals [m], (num_envs, jumps in a row, 2), and return their log.
 
-        env, headings: made and drawn unless given; delay: as in `PlaceLog`; follow: as in `EvaluationRun.follow`.
+        env, headings: new and sampled by default; delay: as in `LandingLog`; options: of `EvaluationRun.run_episodes`.
         """
         env = run.env(len(places)) if env is None else env
         headings = random_headings(len(places), self.seed) if headings is None else headings
-        return run.follow(env, PlaceLog(places, termination_names(env.task), headings, delay, self.rest), **follow)
+        log = LandingLog(places, termination_names(env.task), headings, delay, self.rest)
+        return run.run_episodes(env, log, **options)
 
     def pushed_in_flight(self, run: EvaluationRun, measure: Callable[[Conditions], Metrics], *names: str) -> Metrics:
-        """Return some metrics of a randomised test in which robots are pushed in flight too."""
+        """Return the named metrics of the same randomised test with pushes in flight; empty if not applicable.
+
+        measure: runs the test under given conditions and returns its metrics.
+        """
         if not self.randomize or self.push_in_flight:
             return {}
         values = measure(replace(run.conditions, push_in_flight=True))
@@ -125,17 +130,17 @@ class HeightSweep(Suite):
         super().__post_init__()
         check(0.0 < self.heights[0] <= self.heights[1] < 10.0, f"heights must be in (0, 10) m, got {self.heights}")
 
-    def follow(self, run: EvaluationRun, env: Env, film: str = "") -> HeightLog:
-        """Return the jumps."""
+    def run_jumps(self, run: EvaluationRun, env: Env, film: str = "") -> HeightLog:
+        """Run one jump per height and return the log; film: name of the recording."""
         heights = np.linspace(*self.heights, self.jumps)
-        return run.follow(env, HeightLog(heights, termination_names(env.task), self.rest), film=film)
+        return run.run_episodes(env, HeightLog(heights, termination_names(env.task), self.rest), film=film)
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
-        """Follow jumps and open-loop jumps, draw them, and return the metrics."""
-        env = run.env(self.jumps, for_sweep)
-        fresh = env.state_dict()
-        jumps = self.follow(run, env, "jumps")
-        limit = open_loop_limits(env, fresh)
+        """Run the jumps and the open-loop jumps of the same robots, plot both, and return the metrics."""
+        env = run.env(self.jumps, with_sweep_terminations)
+        initial_state = env.state_dict()
+        jumps = self.run_jumps(run, env, "jumps")
+        limit = open_loop_limits(env, initial_state)
         with figure(run.folder / "sweep.png", figsize=(6, 5.5)) as axis:
             axis.scatter(jumps.commanded, limit, s=5, color="0.6", label="open-loop jump of the same robot")
             plot_sweep(axis, jumps.commanded, jumps.apex, jumps.reached, SUCCESS_TOLERANCE, ("reached", "missed"))
@@ -144,7 +149,8 @@ class HeightSweep(Suite):
             axis.set_title(f"{self.jumps} jumps, {run.title}", wrap=True)
 
         def pushed(conditions: Conditions) -> Metrics:
-            return sweep_metrics(self.follow(run, run.env(self.jumps, for_sweep, conditions)), HEIGHTS_IN_RANGE)
+            pushed_env = run.env(self.jumps, with_sweep_terminations, conditions)
+            return sweep_metrics(self.run_jumps(run, pushed_env), HEIGHTS_IN_RANGE)
 
         names = ("mean_abs_error_m", "success_rate", "success_rate_in_range", "fall_rate", "miss_rate", "landing_rate")
         values = sweep_metrics(jumps, HEIGHTS_IN_RANGE) | limit_metrics(jumps, limit)
@@ -180,34 +186,34 @@ class DistanceSweep(Suite):
         (near, far), goals = self.distances, f"{self.distances}, {self.aside} aside"
         check(0.0 < near < far < 10.0 and 0.0 <= self.aside < 10.0, f"goals must be within 10 m and rise, got {goals}")
 
-    def follow(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> PlaceLog:
-        """Return the jumps in some conditions."""
+    def run_jumps(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> LandingLog:
+        """Run one jump per distance under some conditions and return the log; film: name of the recording."""
         aside = np.random.default_rng(self.seed + 1).uniform(-self.aside, self.aside, self.jumps)
-        places = np.stack([np.linspace(*self.distances, self.jumps), aside], axis=1)[:, None]
-        env = run.env(self.jumps, ended_by_takeoff if self.end_at_second_takeoff else for_evaluation, conditions)
-        return self.jump(run, places, env, film=film)
+        goals = np.stack([np.linspace(*self.distances, self.jumps), aside], axis=1)[:, None]
+        change = with_second_takeoff if self.end_at_second_takeoff else with_landing_terminations
+        return self.run_landings(run, goals, run.env(self.jumps, change, conditions), film=film)
 
     @staticmethod
-    def metrics(landings: PlaceLog) -> Metrics:
-        """Return the metrics of the sweep."""
-        distance = landings.places[..., 0]
+    def metrics(landings: LandingLog) -> Metrics:
+        """Return the metrics of a log of the sweep."""
+        distance = landings.goal_positions[..., 0]
         values = landing_metrics(landings, within(distance, DISTANCES_IN_RANGE))
-        return values | {"success_rate_0_4_1_0": mean(landings.success[within(distance, TRAINED)])}
+        return values | {"success_rate_0_4_1_0": mean(landings.success[within(distance, PAPER_TRAINED)])}
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
-        """Follow jumps, draw them, and return the metrics."""
-        landings, trained = self.follow(run, run.conditions, "jumps"), trained_range(run.task)
+        """Run the jumps, plot reached over commanded distance, and return the metrics."""
+        landings, trained = self.run_jumps(run, run.conditions, "jumps"), trained_range(run.task)
         with figure(run.folder / "sweep.png", figsize=(6, 5.5)) as axis:
-            axis.axvspan(*TRAINED, color="0.5", alpha=0.08, label="training of the paper")
+            axis.axvspan(*PAPER_TRAINED, color="0.5", alpha=0.08, label="training of the paper")
             axis.axvspan(*trained.values(), color="tab:orange", alpha=0.06, label="training of this policy")
-            commanded, reached = landings.places[..., 0], landings.landing[..., 0]
+            commanded, reached = landings.goal_positions[..., 0], landings.landing[..., 0]
             plot_sweep(axis, commanded, reached, landings.success, SUCCESS_TOLERANCE, ("landed there", "failed"))
             axis.set(xlabel="commanded distance [m]", ylabel="distance of the base at the end [m]")
             axis.set(xlim=(self.distances[0] - 0.05, self.distances[1] + 0.05))
             axis.set_title(f"{self.jumps} jumps, {run.title}", wrap=True)
         values = {"rest_s": self.rest, "end_at_second_takeoff": self.end_at_second_takeoff, **self.metrics(landings)}
         pushed = self.pushed_in_flight(
-            run, lambda conditions: self.metrics(self.follow(run, conditions)), "mean_error_m", "success_rate",
+            run, lambda conditions: self.metrics(self.run_jumps(run, conditions)), "mean_error_m", "success_rate",
             "success_rate_in_range", "fall_rate", "miss_rate", "still_landing_rate", "max_landing_tilt_deg",
         )  # fmt: skip
         return values | trained | pushed

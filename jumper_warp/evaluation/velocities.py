@@ -1,4 +1,4 @@
-"""Commanded velocities, followed by one robot in every world: how closely, how soon, how fast, and who falls."""
+"""Velocity tracking: log, metrics, and flags of `jumper evaluate` and `play`."""
 
 from __future__ import annotations
 
@@ -10,52 +10,48 @@ import numpy as np
 import tyro
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.film import PICTURE, Film, Strip, beside
+from jumper_warp.evaluation.film import PICTURE_SIZE, Film, Filmstrip, side_view
 from jumper_warp.evaluation.log import EvaluationLog, Metrics, finite
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.rotations import INVERSE, rotate
+from jumper_warp.utils.rotations import CONJUGATE, rotate
 
 Velocity = tuple[float, float, float]
 AXES = ("vx", "vy", "yaw_rate")
-SKIP = 1.0
-"""[s] After a command that do not count for the error."""
+SETTLING_TIME = 1.0
+"""[s] Time after each command that is excluded from tracking errors."""
 SHOWN_TIME = 0.6
-"""[s] At the end of a walk, that its filmstrip shows: more than a stride."""
+"""[s] Length of the filmstrip at the end of a walk, more than a stride."""
 PICTURES = 9
-"""Of the filmstrip."""
-MOST_ROBOTS = 20_000
+"""Number of pictures in a filmstrip."""
+MAX_ROBOTS = 20_000
 
 
 @dataclass
-class Walks(EvaluationLog):
-    """What became of one robot per world; nothing of a robot counts after its fall."""
+class VelocityLog(EvaluationLog):
+    """Velocity-tracking log, one robot per world; samples after a robot's fall are ignored."""
 
     commands: np.ndarray
-    """(robots, commands, 3) One after the other: ahead, to the left [m/s], about z [rad/s], body axes."""
+    """(robots, commands, 3) Successive commands: velocity ahead, to the left [m/s], about z [rad/s], body axes."""
     task: TaskCfg
-    seconds: float = 10.0
-    """Simulated time."""
+    seconds: float = 10.0  # [s] Simulated time
     times: np.ndarray = field(default_factory=lambda: np.zeros(1))
-    """[s] (commands,) When each command comes; the first at 0."""
-    headings: np.ndarray | float = 0.0
-    """[rad] (robots,) At the start."""
-    kick_time: np.ndarray | None = None
-    """[s] (robots,) When the base's velocity jumps."""
-    kick: np.ndarray | None = None
-    """[m/s] (robots, 2) By how much, world axes."""
+    """[s] (commands,) Time of each command; the first is 0."""
+    headings: np.ndarray | float = 0.0  # [rad] (robots,) Headings at the start, or one for all
+    kick_time: np.ndarray | None = None  # [s] (robots,) Time of a step change of each base's velocity, or None
+    kick: np.ndarray | None = None  # [m/s] (robots, 2) Step change of the velocity at `kick_time`, world axes, or None
     velocity: list[np.ndarray] = field(default_factory=list, init=False)
-    """(robots, 3) After every policy step, as the commands."""
+    """(robots, 3) Velocity after every policy step, in the components of `commands`."""
     end: np.ndarray = field(init=False)
-    """(robots,) Index of the termination by which a robot fell, -1: it did not."""
+    """(robots,) Index of the termination of a fall, -1 for robots that have not fallen."""
     fall_step: np.ndarray = field(init=False)
-    """(robots,) Policy step of the fall; one past the last where there is none."""
+    """(robots,) Policy step of the fall; the number of steps for robots that have not fallen."""
 
-    row = "robot"
+    row_name = "robot"
     spacing = 2.0
 
     def __post_init__(self) -> None:
-        """Begin with nobody fallen."""
+        """Begin with no robot fallen."""
         self.count = len(self.commands)
         self.end, self.fall_step = np.full(self.count, -1), np.zeros(self.count, dtype=int)
         self.times = np.asarray(self.times, dtype=float)
@@ -64,17 +60,17 @@ class Walks(EvaluationLog):
         self._is_fall = np.array([*falls, False])
 
     def begin(self, env: Env) -> None:
-        """Stand every robot in the default pose with its first command, and the gait's clock as the task has it."""
+        """Reset every robot to the default pose, with its first command and the gait phase of the task's reset."""
         self.step_dt = env.step_dt
         gait = np.full((len(self.commands), 1), getattr(self.task.reset.settings, "gait", 0.0))
         env.evaluation_reset(np.concatenate([self.commands[:, 0], gait], axis=1), self.headings)
 
-    def look(self, env: Env) -> dict[str, np.ndarray]:
-        """Return attitude and velocity of every base, give the commands that are due, and kick."""
+    def read_env(self, env: Env) -> dict[str, np.ndarray]:
+        """Return orientation, velocities and terminations of all robots; set the commands and kicks that are due."""
         sim = env.sim
         q, qd = sim.joint_q(), sim.joint_qd()
-        seen = {"base_quat": q[:, 3:7].copy(), "base_vel": sim.base_velocity(), "base_ang_vel": qd[:, 3:6].copy(),
-                "termination": env.task_arrays()["termination"]}  # fmt: skip
+        arrays = {"base_quat": q[:, 3:7].copy(), "base_vel": sim.base_velocity(), "base_ang_vel": qd[:, 3:6].copy(),
+                  "termination": env.task_arrays()["termination"]}  # fmt: skip
         step = len(self.velocity) + 1
         due = np.flatnonzero(np.round(self.times / env.step_dt).astype(int) == step)
         if len(due) and due[-1] > 0:
@@ -85,10 +81,10 @@ class Walks(EvaluationLog):
                 rates = qd.copy()
                 rates[kicked, :2] += self.kick[kicked]
                 sim.state.joint_qd.assign(rates.ravel())
-        return seen
+        return arrays
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
-        """Take in a policy step; return whether all have fallen."""
+        """Record a policy step from the arrays of `read_env`; return whether all robots have fallen."""
         self.step_dt = step_dt
         standing = self.end < 0
         self.velocity.append(body_velocity(arrays).astype(np.float32))
@@ -107,95 +103,98 @@ class Walks(EvaluationLog):
         """Name of the termination by which each robot fell, `walked` where it did not."""
         return np.array([*(term.name for term in self.task.terminations), "walked"])[self.end]
 
-    def history(self) -> np.ndarray:
+    def velocity_history(self) -> np.ndarray:
         """Return the velocities after every policy step, (steps, robots, 3), NaN from the fall on."""
         velocity = np.array(self.velocity, dtype=float).reshape(-1, len(self.commands), 3)
         after = np.arange(len(velocity))[:, None] >= self.fall_step
         velocity[after] = np.nan
         return velocity
 
-    def wanted(self) -> np.ndarray:
-        """Return the commands at every policy step, (steps, robots, 3); one counts from the step after it came."""
+    def command_history(self) -> np.ndarray:
+        """Return the command at every policy step, (steps, robots, 3); it counts from the step after its time."""
         steps = np.arange(1, len(self.velocity) + 1)
         which = np.searchsorted(np.round(self.times / self.step_dt), steps, side="left") - 1
         return self.commands[:, np.maximum(which, 0)].transpose(1, 0, 2)
 
     def columns(self) -> dict[str, list]:
-        """Return the first commands, the errors over all time that counts, and the ends."""
+        """Return first command, RMS errors without excluded samples, and outcome of every robot."""
         error = rms(self.errors(), axis=0)
         numbers = {f"command_{axis}": self.commands[:, 0, i] for i, axis in enumerate(AXES)}
         numbers |= {f"rms_error_{axis}": error[:, i] for i, axis in enumerate(AXES)}
         return {name: finite(values) for name, values in numbers.items()} | {"end": self.outcomes.tolist()}
 
     def errors(self) -> np.ndarray:
-        """Return velocity less command, (steps, robots, 3), NaN in the first SKIP seconds of each and after falls."""
-        error = self.history() - self.wanted()
+        """Return velocity minus command, (steps, robots, 3); NaN within SETTLING_TIME of a command and after a fall."""
+        error = self.velocity_history() - self.command_history()
         steps = np.arange(1, len(error) + 1)
         for time in self.times:
             since = steps - round(time / self.step_dt)
-            error[(since > 0) & (since <= round(SKIP / self.step_dt))] = np.nan
+            error[(since > 0) & (since <= round(SETTLING_TIME / self.step_dt))] = np.nan
         return error
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return velocity and command of robots."""
-        return velocity_series(self.velocity[-1], self.wanted()[-1], worlds)
+        """Return velocities and commands of some robots."""
+        return velocity_series(self.velocity[-1], self.command_history()[-1], worlds)
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the commands."""
+        """Return the commands of some robots, and their times."""
         return {"commands": self.commands[list(worlds)].tolist(), "times_s": self.times.tolist()}
 
-    def strip(self, film: Film) -> Strip:
-        """Return pictures of the last stride of the first filmed robot."""
-        base = film.base(0)
+    def filmstrip(self, film: Film) -> Filmstrip:
+        """Return a filmstrip of the last stride of the first recorded robot."""
+        base = film.base_positions(0)
         first = max(0, len(base) - 1 - round(SHOWN_TIME / film.env.step_dt))
         frames = np.linspace(first, len(base) - 1, PICTURES).round().astype(int).tolist()
-        eye, target = beside(base[first, :2], base[-1, :2])
+        eye, target = side_view(base[first, :2], base[-1, :2])
         captions = [f"{(frame + 1) * film.env.step_dt:.2f} s" for frame in frames]
-        return Strip(0, frames, captions, eye + [0.0, 0.0, base[-1, 2] - 0.3], target, PICTURE)
+        return Filmstrip(0, frames, captions, eye + [0.0, 0.0, base[-1, 2] - 0.3], target, PICTURE_SIZE)
 
 
 def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:
-    """Return the velocity ahead and to the left [m/s] and the yaw rate [rad/s], body axes, (robots, 3)."""
-    back = arrays["base_quat"].astype(float) * INVERSE
+    """Return velocity ahead and to the left [m/s] and yaw rate [rad/s], body axes, (robots, 3).
+
+    arrays: base_quat (xyzw), base_vel [m/s] and base_ang_vel [rad/s], world axes.
+    """
+    back = arrays["base_quat"].astype(float) * CONJUGATE
     vel = rotate(back, arrays["base_vel"].astype(float))
     ang = rotate(back, arrays["base_ang_vel"].astype(float))
     return np.stack([vel[:, 0], vel[:, 1], ang[:, 2]], axis=1)
 
 
-def velocity_series(velocity: np.ndarray, wanted: np.ndarray, worlds: Sequence[int]) -> dict[str, float]:
-    """Return velocities and commands, (robots, 3) each, of some robots as `EvaluationLog.series` has them."""
+def velocity_series(velocity: np.ndarray, command: np.ndarray, worlds: Sequence[int]) -> dict[str, float]:
+    """Return velocities and commands, (robots, 3) each, of some robots in the form of `EvaluationLog.series`."""
     series = {}
     for world in worlds:
         for i, (axis, unit) in enumerate(zip(AXES, ("m/s", "m/s", "rad/s"), strict=True)):
             series[f"{axis}/robot {world} [{unit}]"] = float(velocity[world, i])
-            series[f"{axis}/command of {world} [{unit}]"] = float(wanted[world, i])
+            series[f"{axis}/command of {world} [{unit}]"] = float(command[world, i])
     return series
 
 
 def rmse_metrics(error: np.ndarray) -> Metrics:
-    """Return the root mean square of velocity errors (steps, robots, 3), without those that are NaN."""
+    """Return the RMS of velocity errors (steps, robots, 3) over all that are not NaN, one metric per component."""
     names = ("rmse_vx_m_s", "rmse_vy_m_s", "rmse_yaw_rate_rad_s")
     return dict(zip(names, finite(rms(error, axis=(0, 1))), strict=True))
 
 
 def rms(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np.ndarray:
-    """Return the root of the mean square of what is a number, NaN where nothing is."""
+    """Return the root mean square of the finite values along axes, NaN where there are none."""
     known = np.isfinite(values)
     total = np.where(known, values, 0.0) ** 2
     with np.errstate(invalid="ignore"):
         return np.sqrt(total.sum(axis=axis) / np.where(known.sum(axis=axis) > 0, known.sum(axis=axis), np.nan))
 
 
-def tracking_metrics(walks: Walks) -> Metrics:
-    """Return errors over all robots and all time that counts, and how many fell."""
+def tracking_metrics(walks: VelocityLog) -> Metrics:
+    """Return RMS tracking errors over all robots without excluded samples, and number and rate of falls."""
     robots, falls = walks.count, int(walks.fallen.sum())
     metrics = rmse_metrics(walks.errors()) | {"robots": robots, "falls": falls, "fall_rate": falls / robots}
     return metrics | {f"fell_by_{name}": int((walks.outcomes == name).sum())
                       for name in sorted(set(walks.outcomes[walks.fallen]))}  # fmt: skip
 
 
-def grid(per_axis: int, reach: Sequence[float]) -> np.ndarray:
-    """Return commands on a grid of all three at once, from minus to plus `reach`, (per_axis^3, 1, 3)."""
+def command_grid(per_axis: int, reach: Sequence[float]) -> np.ndarray:
+    """Return commands on a grid from minus to plus `reach` [m/s], [m/s], [rad/s], (per_axis^3, 1, 3)."""
     axes = [np.linspace(-limit, limit, per_axis) for limit in reach]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 1, 3)
 
@@ -212,27 +211,26 @@ class VelocityFlags:
     """[s] Length; the first second does not count for the error."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
-        check_walks(self.per_axis**3, self.seconds, *self.reach)
+        check_velocity_settings(self.per_axis**3, self.seconds, *self.reach)
         if self.per_axis < 2:
             raise InputError(f"per_axis must be at least 2, got {self.per_axis}")
 
-    def log(self, task: TaskCfg, seed: int) -> Walks:
-        """Return walks with these commands."""
-        return Walks(grid(self.per_axis, self.reach), task, self.seconds)
+    def log(self, task: TaskCfg, seed: int) -> VelocityLog:
+        """Return the log of walks, one command of the grid per robot."""
+        return VelocityLog(command_grid(self.per_axis, self.reach), task, self.seconds)
 
-    def metrics(self, log: Walks) -> Metrics:
+    def metrics(self, log: VelocityLog) -> Metrics:
         """Return `tracking_metrics`."""
         return tracking_metrics(log)
 
 
 @dataclass(frozen=True)
-class VelocityGoals:
+class VelocityPlayFlags:
     """A walk that is recorded: commands one after the other."""
 
     velocity: tyro.conf.UseAppendAction[tuple[Velocity, ...]] = ()
     """[m/s], [m/s], [rad/s] Ahead, to the left and about z; once for each command (default: a walk of six)."""
-    unless_told: tyro.conf.Suppress[tuple[Velocity, ...]] = (
+    default_velocities: tyro.conf.Suppress[tuple[Velocity, ...]] = (
         (0.8, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0), (0.6, 0.3, 0.6), (0.0, 0.0, 0.0),
     )  # fmt: skip
     """Commands if there are none; flags that are given several times would be added to a default."""
@@ -240,29 +238,28 @@ class VelocityGoals:
     """[s] From command to command."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a setting is out of range."""
-        check_walks(1, self.length, *(value for command in self.velocity for value in command))
+        check_velocity_settings(1, self.length, *(value for command in self.velocity for value in command))
 
     @property
     def velocities(self) -> tuple[Velocity, ...]:
-        """Commands, one after the other."""
-        return self.velocity or self.unless_told
+        """Successive commands."""
+        return self.velocity or self.default_velocities
 
     @property
     def length(self) -> float:
-        """[s] Of the recording."""
+        """[s] Length of the recording."""
         return self.each * len(self.velocities)
 
-    def log(self, task: TaskCfg) -> Walks:
-        """Return one robot's walk."""
+    def log(self, task: TaskCfg) -> VelocityLog:
+        """Return the log of one robot's walk."""
         commands = np.array(self.velocities, dtype=float)[None]
-        return Walks(commands, task, self.length, times=self.each * np.arange(commands.shape[1]))
+        return VelocityLog(commands, task, self.length, times=self.each * np.arange(commands.shape[1]))
 
 
-def check_walks(robots: int, seconds: float, *commands: float) -> None:
-    """Raise InputError unless this can be asked of a number of robots."""
-    if not 1 <= robots <= MOST_ROBOTS:
-        raise InputError(f"robots must be in 1 to {MOST_ROBOTS}, got {robots}")
+def check_velocity_settings(robots: int, seconds: float, *commands: float) -> None:
+    """Raise InputError unless number of robots, time [s] and commanded velocities are within their limits."""
+    if not 1 <= robots <= MAX_ROBOTS:
+        raise InputError(f"robots must be in 1 to {MAX_ROBOTS}, got {robots}")
     if not 0.0 < seconds <= 600.0:
         raise InputError(f"seconds must be in (0, 600], got {seconds}")
     if not all(abs(value) <= 10.0 for value in commands):

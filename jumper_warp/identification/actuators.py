@@ -1,6 +1,6 @@
-"""One motor on a test bench: torque against speed, and steps of torque; limits, friction and latency from them.
+"""Limits, friction and latency of one motor from a test bench: torque against speed, and steps of torque.
 
-A bench drives the output shaft at a speed and measures the torque that comes out while the motor is commanded. With
+A bench drives the output shaft at a speed and measures the output torque while the motor is commanded. With
 speed w [rad/s] and a commanded torque c [N m], after the latency,
 
     torque = fade(w) clamp(c, -limit(-w), limit(w)) - friction sign(w),
@@ -28,22 +28,20 @@ from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 
 COLUMNS = ("test", "time", "command", "speed", "torque")
-"""Columns of a bench's data: number of the test; [s]; [N m] commanded; [rad/s] of the output; [N m] measured there."""
+"""Columns of a bench's data: number of the test, [s], commanded [N m], output speed [rad/s], measured torque [N m]."""
 STANDSTILL = 0.01
-"""[rad/s] Below it friction falls linearly to zero, as in the simulation."""
+"""[rad/s] Speed below which friction falls linearly to zero, as in the simulation."""
 PRIORS = {
     "saturation": (0.5, "N m"), "peak": (0.3, "N m"), "cutoff_speed": (0.3, "rad/s"), "no_load_speed": (0.3, "rad/s"),
     "fade_start": (0.2, "rad/s"), "fade_end": (0.2, "rad/s"), "friction": (1.5, "N m"), "latency": (2.0, "s"),
     "time_constant": (2.0, "s"),
 }  # fmt: skip
-"""Deviation of the logarithm, and unit, of each constant."""
-FASTEST = 1.0e-4
-"""[s] Latency and time constant that are told from 0."""
+"""Standard deviation of the prior's logarithm, and unit, of each constant."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """Rows of a test bench; every test begins with the command and speed of its first row, long before."""
+    """Recording of a test bench; command and speed of a test's first row also hold before it."""
 
     test: np.ndarray
     """(n,) int"""
@@ -73,9 +71,9 @@ class Bench:
 
 
 def load_bench(path: Path) -> Bench:
-    """Return the data of a CSV file with the names COLUMNS in its first line.
+    """Return the recording in a CSV file whose first line has the names COLUMNS.
 
-    Raises InputError: what is wrong with it; OSError: it cannot be read.
+    Raises InputError: a missing column, or rows that are not numbers; OSError: it cannot be read.
     """
     rows = csv_rows(Path(path))
     names = [name.strip() for name in rows[0]] if rows else []
@@ -93,9 +91,9 @@ def load_bench(path: Path) -> Bench:
 
 
 def torque_law(constants: Mapping[str, float], command: np.ndarray, speed: np.ndarray) -> np.ndarray:
-    """Return the torque at the output [N m] of a motor that has settled."""
-    ahead = np.sign(command) * speed
-    headroom = (constants["no_load_speed"] - ahead) / (constants["no_load_speed"] - constants["cutoff_speed"])
+    """Return the steady output torque [N m] for commands [N m] and speeds [rad/s] of one shape."""
+    driving_speed = np.sign(command) * speed
+    headroom = (constants["no_load_speed"] - driving_speed) / (constants["no_load_speed"] - constants["cutoff_speed"])
     limit = np.minimum(constants["saturation"], constants["peak"] * np.clip(headroom, 0.0, 1.0))
     bounded = np.sign(command) * np.minimum(np.abs(command), limit)
     fade = (constants["fade_end"] - np.abs(speed)) / (constants["fade_end"] - constants["fade_start"])
@@ -103,40 +101,44 @@ def torque_law(constants: Mapping[str, float], command: np.ndarray, speed: np.nd
     return bounded * np.clip(fade, 0.0, 1.0) - friction
 
 
-def response(constants: Mapping[str, float], bench: Bench) -> np.ndarray:
-    """Return the torques [N m] that a bench would measure."""
-    found = np.zeros(len(bench.time))
+def bench_torque(constants: Mapping[str, float], bench: Bench) -> np.ndarray:
+    """Return the torques [N m] that a bench would measure of a motor, (n,)."""
+    torque = np.zeros(len(bench.time))
     for test in np.unique(bench.test):
         rows = np.flatnonzero(bench.test == test)
         time, command = bench.time[rows], bench.command[rows]
-        # the command, late and smoothed: a sum of the responses to its steps
-        late = np.full(len(rows), command[0])
+        # the delayed and smoothed command is the sum of the responses to its steps
+        followed = np.full(len(rows), command[0])
         for i in np.flatnonzero(np.diff(command)) + 1:
             after = (time - time[i] - constants["latency"]) / constants["time_constant"]
-            late += (command[i] - command[i - 1]) * np.where(after > 0.0, 1.0 - np.exp(-np.maximum(after, 0.0)), 0.0)
-        found[rows] = torque_law(constants, late, bench.speed[rows])
-    return found
+            followed += (command[i] - command[i - 1]) * np.where(
+                after > 0.0, 1.0 - np.exp(-np.maximum(after, 0.0)), 0.0
+            )
+        torque[rows] = torque_law(constants, followed, bench.speed[rows])
+    return torque
 
 
 @dataclass(frozen=True, eq=False)
 class Actuator:
-    """What was found of a motor."""
+    """Identified constants of a motor."""
 
     kind: str
+    """"lateral" or "transversal"."""
     constants: Mapping[str, float]
+    """By the names and units of `PRIORS`."""
     intervals: Mapping[str, tuple[float, float]]
-    """95 %, wider where the law does not explain the data."""
+    """95 % intervals, wider where the law does not fit the data."""
     open: tuple[str, ...]
-    """Constants of which the data says less than what was known before."""
+    """Constants whose standard deviation is above half the prior's."""
     chi2: float
-    """Mean squared weighed residual."""
+    """[1] Mean squared weighed residual."""
 
     def rows(self) -> dict[str, tuple[float, float, float, str]]:
         """Return (value, low, high, unit) of each constant by name."""
         return {name: (value, *self.intervals[name], PRIORS[name][1]) for name, value in self.constants.items()}
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything as JSON can hold it."""
+        """Return the content of `actuator.json`."""
         rows = {
             name: {"value": value, "interval_95": [low, high], "unit": unit, "identified": name not in self.open}
             for name, (value, low, high, unit) in self.rows().items()
@@ -145,7 +147,7 @@ class Actuator:
 
 
 def described_constants(kind: Literal["lateral", "transversal"]) -> dict[str, float]:
-    """Return the constants of a kind of motor as described."""
+    """Return the described constants of a kind of motor, by the names of `PRIORS`."""
     motor = load_description().motors[0 if kind == "lateral" else 1]
     return {
         "saturation": 18.0, "peak": motor.peak_torque, "cutoff_speed": motor.cutoff_speed,
@@ -157,7 +159,7 @@ def described_constants(kind: Literal["lateral", "transversal"]) -> dict[str, fl
 def characterise_motor(
     bench: Bench, kind: Literal["lateral", "transversal"] = "transversal", torque_noise: float = 0.1
 ) -> Actuator:
-    """Return the constants of a motor that explain a bench's data best; torque_noise [N m]: of its sensor.
+    """Return the least-squares constants of a motor from a bench's data; torque_noise [N m]: of its sensor.
 
     Raises InputError: noise that is not positive, or data without torque.
     """
@@ -166,30 +168,30 @@ def characterise_motor(
         raise InputError("bench: the command never changes, which tells nothing of the motor")
     nominal = described_constants(kind)
     names = list(PRIORS)
-    prior = np.array([PRIORS[name][0] for name in names])
+    prior_std = np.array([PRIORS[name][0] for name in names])
 
     def constants(z: np.ndarray) -> dict[str, float]:
-        values = {name: nominal[name] * math.exp(p * x) for name, p, x in zip(names, prior, z, strict=True)}
+        values = {name: nominal[name] * math.exp(p * x) for name, p, x in zip(names, prior_std, z, strict=True)}
         values["no_load_speed"] = max(values["no_load_speed"], 1.001 * values["cutoff_speed"])
         values["fade_end"] = max(values["fade_end"], 1.001 * values["fade_start"])
         return values
 
     def residuals(z: np.ndarray) -> np.ndarray:
-        return np.concatenate([(response(constants(z), bench) - bench.torque) / torque_noise, z])
+        return np.concatenate([(bench_torque(constants(z), bench) - bench.torque) / torque_noise, z])
 
     starts = [np.zeros(len(names))]
-    for late in (-1.5, 1.0):  # a delay and a slow rise look alike from far away
-        starts.append(np.where(np.array(names) == "latency", late, 0.0))
+    for latency in (-1.5, 1.0):  # far from the minimum a delay and a slow rise look alike
+        starts.append(np.where(np.array(names) == "latency", latency, 0.0))
     fits = [least_squares(residuals, start, diff_step=1.0e-5, x_scale="jac", max_nfev=100) for start in starts]
     best = min(fits, key=lambda fit: fit.cost)
     errors = best.fun[: len(bench.time)]
     chi2 = float(np.mean(errors**2))
     factor = mismatch_factor([errors[bench.test == test][:, None] for test in np.unique(bench.test)])
-    deviation = np.minimum(factor * np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac))), 1.0)
-    found = constants(best.x)
+    std = np.minimum(factor * np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac))), 1.0)
+    values = constants(best.x)
     intervals = {
         name: (value * math.exp(-1.96 * p * d), value * math.exp(1.96 * p * d))
-        for (name, value), p, d in zip(found.items(), prior, deviation, strict=True)
+        for (name, value), p, d in zip(values.items(), prior_std, std, strict=True)
     }
-    unknown = tuple(name for name, d in zip(names, deviation, strict=True) if d > 0.5)
-    return Actuator(kind, found, intervals, unknown, chi2)
+    unknown = tuple(name for name, d in zip(names, std, strict=True) if d > 0.5)
+    return Actuator(kind, values, intervals, unknown, chi2)

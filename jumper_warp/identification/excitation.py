@@ -1,4 +1,4 @@
-"""Motions that tell much of the robot, within limits and scored by the information that they give."""
+"""Planning of safe, informative motions: random candidates are scored by their information about the parameters."""
 
 from __future__ import annotations
 
@@ -10,28 +10,28 @@ from typing import Any
 
 import numpy as np
 
-from jumper_warp.identification.motions import DEGREES, Motion, NoiseLevels
+from jumper_warp.identification.motions import DEGREES, NoiseLevels, RecordedMotion
 from jumper_warp.identification.parameters import ParameterSet
-from jumper_warp.identification.recording import KINDS, Kind, Plan, measured, plot_plan, replay_plan, simulate_plan
-from jumper_warp.identification.replay import Record, Replay
+from jumper_warp.identification.recording import KINDS, Kind, Plan, measure, replay_plan, sample_plan, simulate_plan
+from jumper_warp.identification.replay import MotionReplay, Record
 from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.robot.motors import FilterCfg, walking_filter
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.errors import InputError
 
-SHARPEST = 25.0
-"""[rad/s] Fastest joint of a safe motion: two thirds of the slowest motor's no-load speed."""
-STEEPEST = 20.0
-"""[deg] Most that the base may lean."""
-HIGHEST = 0.65
-"""[m] Highest base of a small jump."""
+MAX_JOINT_SPEED = 25.0
+"""[rad/s] Of a safe motion: two thirds of the slowest motor's no-load speed."""
+MAX_TILT = 20.0
+"""[deg] Of the base in a safe motion."""
+MIN_HEIGHT, MAX_HEIGHT = 0.15, 0.65
+"""[m] Of a free base in a safe motion."""
 MARGIN = 5.0
-"""[deg] Between a safe motion and the limits of its angles."""
+"""[deg] Between the angles of a safe motion and the filter's limits."""
 
 
-def unsafe(plan: Plan, record: Record, limits: FilterCfg | None = None) -> str:
-    """Return why a record of a plan is not safe; nothing if it is."""
+def unsafe_reason(plan: Plan, record: Record, limits: FilterCfg | None = None) -> str:
+    """Return why the record of a plan is unsafe, empty if it is safe; limits: of angles, by default for walking."""
     limits = walking_filter() if limits is None else limits
     angle, rate = record.angle[..., 0] / DEGREES, np.abs(record.rate[..., 0]).max()
     legs = angle.reshape(-1, 4, 3)
@@ -45,62 +45,63 @@ def unsafe(plan: Plan, record: Record, limits: FilterCfg | None = None) -> str:
     for name, values, limit in checks:
         if values.min() < limit.lower + MARGIN or values.max() > limit.upper - MARGIN:
             return f"the {name} comes within {MARGIN:g} deg of its limits"
-    if rate > SHARPEST:
+    if rate > MAX_JOINT_SPEED:
         return f"a joint moves at {rate:.1f} rad/s"
     if plan.base == "free":
         x, y, _, _ = np.moveaxis(record.quaternion[..., 0], 1, 0)
-        lean = np.degrees(np.arccos(np.clip(1.0 - 2.0 * (x**2 + y**2), -1.0, 1.0))).max()
-        if lean > STEEPEST:
-            return f"the base leans by {lean:.0f} deg"
-        if record.position[:, 2].max() > HIGHEST:
+        tilt = np.degrees(np.arccos(np.clip(1.0 - 2.0 * (x**2 + y**2), -1.0, 1.0))).max()
+        if tilt > MAX_TILT:
+            return f"the base leans by {tilt:.0f} deg"
+        if record.position[:, 2].max() > MAX_HEIGHT:
             return f"the base rises to {record.position[:, 2].max():.2f} m"
-        if record.position[:, 2].min() < 0.15:
+        if record.position[:, 2].min() < MIN_HEIGHT:
             return "the base comes close to the ground"
     return ""
 
 
 class Scorer:
-    """Tells what motions would say of parameters, by the described robot."""
+    """Scores motions by their information about parameters, on the described robot."""
 
-    def __init__(self, parameters: ParameterSet, noise: NoiseLevels | None = None, replay: Replay | None = None):
-        """Prepare; replay: worlds to be used, whose description counts."""
+    def __init__(self, parameters: ParameterSet, noise: NoiseLevels | None = None, replay: MotionReplay | None = None):
+        """Prepare; replay: worlds to use, by default of the project's description."""
         self.parameters, self.noise = parameters, noise or NoiseLevels()
-        self.replay = replay or Replay()
+        self.replay = replay or MotionReplay()
         self._nominal = parameters.robots(np.zeros((1, len(parameters))))
 
     def record(self, plan: Plan) -> Record:
-        """Return what the described robot does, from rest in the pose of the first targets."""
+        """Return the described robot's motion in a plan, from rest in the pose of the first targets."""
         return replay_plan(self.replay, plan, self._nominal)
 
     def information(self, plan: Plan, record: Record) -> np.ndarray:
-        """Return what a motion says of the parameters, its start unknown: (P, P), in prior deviations."""
-        motion = measured(plan, plan.kind, record, self._nominal, None, base_every=1)
+        """Return the Fisher information of a motion about the parameters, normalised, (P, P)."""
+        motion = measure(plan, plan.kind, record, self._nominal, None, base_every=1)
         problem = MotionResiduals(motion, self.parameters, self.noise, self.replay.description)
         size = len(self.parameters)
-        found = problem.linearise(self.replay, np.zeros(size), np.zeros(problem.start_size), 1.0e-3)
-        square = found.jacobian.T @ found.jacobian
-        own = square[size:, size:] + np.eye(problem.start_size)
-        return square[:size, :size] - square[:size, size:] @ np.linalg.solve(own, square[size:, :size])
+        linear = problem.linearise(self.replay, np.zeros(size), np.zeros(problem.start_size), 1.0e-3)
+        square = linear.jacobian.T @ linear.jacobian
+        start_matrix = square[size:, size:] + np.eye(problem.start_size)
+        return square[:size, :size] - square[:size, size:] @ np.linalg.solve(start_matrix, square[size:, :size])
 
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """Chosen motions and what they are expected to tell."""
+    """Chosen motions and their expected information."""
 
     plans: tuple[Plan, ...]
+    """In the order of the motions."""
     gain: tuple[float, ...]
     """[nat] Information about the parameters after each motion."""
-    deviations: np.ndarray
-    """(P,) Expected standard deviations after all, in prior deviations."""
+    std: np.ndarray
+    """(P,) Expected standard deviations after all motions, relative to the prior's."""
     refused: tuple[str, ...]
-    """Why candidates were left out."""
+    """Reasons for which candidates were unsafe."""
     parameters: ParameterSet
 
     def to_json(self) -> dict[str, Any]:
-        """Return everything but the motions, as JSON can hold it."""
+        """Return the content of `excite.json` except the robot's mass."""
         expected = {
-            p.name: {"unit": p.unit, "expected_deviation": p.deviation(0.0, float(d)), "of_prior": float(d)}
-            for p, d in zip(self.parameters, self.deviations, strict=True)
+            p.name: {"unit": p.unit, "expected_deviation": p.std(0.0, float(d)), "of_prior": float(d)}
+            for p, d in zip(self.parameters, self.std, strict=True)
         }
         return {"gain_nat": list(self.gain), "refused": list(self.refused), "parameters": expected}
 
@@ -108,35 +109,35 @@ class Excitation:
 def choose(
     scorer: Scorer, kinds: Sequence[Kind] = KINDS, *, candidates: int = 4, seconds: float = 1.25, seed: int = 0
 ) -> Excitation:
-    """Return one safe motion of each kind, in turn the one of several candidates that tells most besides the others.
+    """Return one safe motion of each kind: of several candidates the one that adds most information to those before.
 
     Raises InputError: no candidate of a kind is safe.
     """
     rng, size = np.random.default_rng(seed), len(scorer.parameters)
-    known, plans, gains, refused = np.eye(size), [], [], []
+    information, plans, gains, refused = np.eye(size), [], [], []
     for kind in kinds:
-        best: tuple[float, Plan | None, np.ndarray] = (-math.inf, None, known)
+        best: tuple[float, Plan | None, np.ndarray] = (-math.inf, None, information)
         for _ in range(candidates):
-            plan = plot_plan(kind, rng, seconds)
+            plan = sample_plan(kind, rng, seconds)
             record = scorer.record(plan)
-            reason = unsafe(plan, record)
+            reason = unsafe_reason(plan, record)
             if reason:
                 refused.append(f"{kind}: {reason}")
                 continue
-            after = known + scorer.information(plan, record)
+            after = information + scorer.information(plan, record)
             gain = 0.5 * float(np.linalg.slogdet(after)[1])
             if gain > best[0]:
                 best = (gain, plan, after)
         if best[1] is None:
             raise InputError(f"none of {candidates} candidates is safe; the last of them: {refused[-1]}")
-        known = best[2]
+        information = best[2]
         plans.append(best[1])
         gains.append(best[0])
-    deviations = np.sqrt(np.diag(np.linalg.inv(known)))
-    return Excitation(tuple(plans), tuple(gains), deviations, tuple(refused), scorer.parameters)
+    std = np.sqrt(np.diag(np.linalg.inv(information)))
+    return Excitation(tuple(plans), tuple(gains), std, tuple(refused), scorer.parameters)
 
 
-def record(
+def record_motions(
     chosen: Excitation,
     folder: Path,
     *,
@@ -145,16 +146,16 @@ def record(
     solver: SolverName = "jumper",
     rng: np.random.Generator | None = None,
     torque: bool = False,
-) -> list[Motion]:
-    """Carry chosen motions out by a simulated robot, and write them as npz files, whose names say their kinds.
+) -> list[RecordedMotion]:
+    """Record chosen motions on a simulated robot, write them as `<number>_<kind>.npz`, and return them.
 
-    noise, rng, torque: as of `measured`. Raises OSError.
+    robots: the robot, N = 1. noise, rng, torque: see `measure`. Raises OSError.
     """
     motions = []
     for i, plan in enumerate(chosen.plans):
         name = f"{i}_{plan.kind.replace(' ', '_')}"
         motions.append(
-            measured(plan, name, simulate_plan(plan, solver=solver, robots=robots), robots, rng, noise, torque=torque)
+            measure(plan, name, simulate_plan(plan, solver=solver, robots=robots), robots, rng, noise, torque=torque)
         )
         motions[-1].save(folder / f"{name}.npz")
     return motions

@@ -1,101 +1,92 @@
 """Identification of the robot's parameters from recorded motions (paper, Section V-F a).
 
-Unknowns are the parameters and where each motion starts. Residuals are weighed by noise, priors and further knowledge
-count like measurements, and the sum of squares is minimised by Levenberg-Marquardt over parallel worlds, in stages:
-the motions are first cut into short pieces with starts of their own, whose residuals are nearly linear in the
-parameters, and then taken as wholes.
+Unknowns are the parameters and the initial state of each motion. Residuals are divided by the noise; priors and prior
+measurements count like measurements. The sum of squares is minimised by Levenberg-Marquardt over parallel worlds, in
+stages: motions are first cut into short pieces, each with its own initial state, whose residuals are nearly linear in
+the parameters; then whole motions are fitted.
 """
 
 from __future__ import annotations
 
-import math
+import time
 from collections.abc import Sequence
 
 import numpy as np
 import warp as wp
 
-from jumper_warp.identification.descent import Descent, descend, pieces_of
-from jumper_warp.identification.findings import Fit, Identification, Step
-from jumper_warp.identification.least_squares import Knowledge, LeastSquares, Normal, Point
-from jumper_warp.identification.motions import Motion, NoiseLevels
-from jumper_warp.identification.parameters import ParameterSet
-from jumper_warp.identification.replay import Replay
-from jumper_warp.identification.residuals import MotionResiduals
-from jumper_warp.identification.uncertainty import mismatch_factor, systematic_deviations, weak_directions
-from jumper_warp.robot.description import RobotDescription, load_description
-from jumper_warp.robot.values import LINK_KINDS, RobotValues
-from jumper_warp.utils.checks import check_positive
+from jumper_warp.identification.least_squares import LeastSquares, NormalEquations, Point, Trial, replace_residuals
+from jumper_warp.identification.motions import NoiseLevels, RecordedMotion
+from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement
+from jumper_warp.identification.replay import MotionReplay
+from jumper_warp.identification.residuals import Linearised, MotionResiduals, pieces_of
+from jumper_warp.identification.results import DescentStep, Effort, Identification, summarise
+from jumper_warp.robot.description import RobotDescription
 from jumper_warp.utils.errors import InputError
 
-COARSE = 1.0 / 480.0
-"""[s] Physics step of all stages but the last ones, where a finer one is asked for."""
+COARSE_DT = 1.0 / 480.0
+"""[s] Shortest physics step of all stages but the last one."""
 POPULATION = 128
-"""Of the evolution strategy."""
-FIRST_DEVIATION = 0.3
-"""Of its search, in deviations of the priors."""
-
-
-def total_mass(robots: RobotValues) -> np.ndarray:
-    """Return the mass [kg] of N robots, (N,)."""
-    leg = [load_description().link(f"FL_{kind}").mass for kind in LINK_KINDS]
-    return robots.base_mass[:, 0] + 4.0 * robots.link_mass @ np.array(leg)
-
-
-def weighed(mass: float, deviation: float = 0.02) -> Knowledge:
-    """Return what a scale says [kg].
-
-    Raises InputError: a deviation that is not positive, or a mass that is not within 0.5 to 2 times the described one.
-    """
-    described = float(total_mass(RobotValues.nominal(1))[0])
-    if not 0.5 * described <= mass <= 2.0 * described:
-        raise InputError(
-            f"weighed mass must be in {0.5 * described:.4g} to {2.0 * described:.4g} kg (the robot is described with "
-            f"{described:.4g} kg), got {mass:.6g} kg"
-        )
-    check_positive("deviation of the weighed mass", deviation)
-    return Knowledge("total mass", total_mass, mass, deviation)
+"""Candidates of a generation of CMA-ES."""
+FIRST_STD = 0.3
+"""Initial step size of CMA-ES, in standard deviations of the priors."""
+PIECES_DECREASE, STAGE_DECREASE = 0.1, 0.02
+"""Relative decrease of the cost below which the stage on pieces, and the stages on motions, end."""
+CONVERGED = 0.5
+"""Decrease of the cost, in mean squared residuals, below which the optimisation ends: 1 is the cost of one standard
+deviation."""
+GOOD_STEP = 0.3
+"""Fraction of the predicted decrease with which a step is good enough to reuse the Jacobian."""
+HORIZONS = (0.4, 0.7, 1.0)
+"""Fractions of a motion on the ground that are fitted in turn: a paw's stroke depends on everything before it."""
+ATTEMPTS = 2
+"""Passes over all motions, at most."""
+STUCK = 20.0
+"""Shortfall of the last step, in mean squared residuals, above which kinks of contact hold the optimisation: the
+motions are then added one after another again, from the parameters reached."""
+MAX_STEPS = 40
+"""Steps of a stage, at most."""
 
 
 def identify(
-    motions: Sequence[Motion],
+    motions: Sequence[RecordedMotion],
     parameters: ParameterSet,
     *,
     noise: NoiseLevels | None = None,
-    knowledge: Sequence[Knowledge] = (),
+    prior_measurements: Sequence[PriorMeasurement] = (),
     dt: float | None = None,
     description: RobotDescription | None = None,
-    replay: Replay | None = None,
+    replay: MotionReplay | None = None,
     device: wp.DeviceLike = None,
     threads: int | None = None,
 ) -> Identification:
-    """Return the parameters that explain the motions best.
+    """Return the identification of the parameters with the least cost, by staged Levenberg-Marquardt.
 
-    knowledge: of the robot besides the motions. dt: largest physics step [s], by default 1/480. replay: worlds of an
-    earlier call, to be used again; its description counts. threads: of a CPU. Raises InputError: no motions, motions
-    with gaps, without measurements or that the model cannot follow.
+    prior_measurements: of the robot besides the motions. dt [s]: largest physics step, by default 1/480. replay: worlds
+    of an earlier call to reuse; its description is used then. threads: CPU threads. Raises InputError: no motions, or
+    motions with gaps, without measurements or at which the simulation diverges.
     """
     if not motions:
         raise InputError("there must be at least one motion")
     noise = NoiseLevels() if noise is None else noise
     if replay is None:
-        replay = Replay(description=description, device=device, threads=threads)
+        replay = MotionReplay(description=description, device=device, threads=threads)
     descent = Descent(replay)
-    robot, rough_dt = replay.description, None if dt is None else max(dt, COARSE)
+    robot, coarse_dt = replay.description, None if dt is None else max(dt, COARSE_DT)
     whole = [MotionResiduals(motion, parameters, noise, robot, dt) for motion in motions]
-    rough = whole if rough_dt == dt else [MotionResiduals(m, parameters, noise, robot, rough_dt) for m in motions]
+    coarse = whole if coarse_dt == dt else [MotionResiduals(m, parameters, noise, robot, coarse_dt) for m in motions]
     pieces = []
     if all(motion.free for motion in whole):
-        pieces = [piece for motion in motions for piece in pieces_of(motion, parameters, noise, robot, rough_dt)]
-    problem, point, normal = descend(descent, parameters, (rough, whole), pieces, knowledge)
-    return result(problem, point, normal, descent)
+        pieces = [piece for motion in motions for piece in pieces_of(motion, parameters, noise, robot, coarse_dt)]
+    problem, point, normal = descend(descent, parameters, coarse, whole, pieces, prior_measurements)
+    return summarise(problem, point, normal, descent.steps, descent.effort)
 
 
 def identify_by_evolution(
-    motions: Sequence[Motion],
+    motions: Sequence[RecordedMotion],
     parameters: ParameterSet,
     *,
     noise: NoiseLevels | None = None,
-    knowledge: Sequence[Knowledge] = (),
+    prior_measurements: Sequence[PriorMeasurement] = (),
     dt: float | None = None,
     max_seconds: float = 60.0,
     population: int = POPULATION,
@@ -103,7 +94,7 @@ def identify_by_evolution(
     device: wp.DeviceLike = None,
     threads: int | None = None,
 ) -> Identification:
-    """Return what CMA-ES finds in `max_seconds`, motions starting as their first rows say; see `identify`.
+    """Return the identification by CMA-ES within `max_seconds`, initial states as first measured; see `identify`.
 
     Raises InputError: as `identify`, or `cma` is not installed.
     """
@@ -113,76 +104,134 @@ def identify_by_evolution(
         raise InputError("CMA-ES needs the package cma, which is not installed: pip install cma") from None
     if not motions or not max_seconds > 0.0 or population < 4:
         raise InputError("evolution needs motions, a time above 0 s and a population of at least 4")
-    replay = Replay(device=device, threads=threads)
+    replay = MotionReplay(device=device, threads=threads)
     whole = [MotionResiduals(motion, parameters, noise or NoiseLevels(), replay.description, dt) for motion in motions]
-    problem = LeastSquares(parameters, whole, replay, knowledge)
-    point, descent = problem.expected(), Descent(replay)
+    problem = LeastSquares(parameters, whole, replay, prior_measurements)
+    point, descent = problem.nominal_point(), Descent(replay)
     low, high = parameters.bounds()
     options = {"popsize": population, "seed": seed + 1, "verbose": -9, "bounds": [low, high]}
-    search = cma.CMAEvolutionStrategy(point.z, FIRST_DEVIATION, options)
+    search = cma.CMAEvolutionStrategy(point.z, FIRST_STD, options)
     starts = [np.repeat(start[None], population, axis=0) for start in point.starts]
     best, cost = point.z, np.inf
-    while descent.steps_per_mode()[0] < max_seconds and not search.stop():
+    while descent.effort().seconds < max_seconds and not search.stop():
         candidates = np.array(search.ask())
         costs = problem.costs(candidates, starts)
         search.tell(list(candidates), list(np.where(np.isfinite(costs), costs, 1.0e12)))
         if costs.min() < cost:
             best, cost = candidates[int(np.argmin(costs))], float(costs.min())
-        seconds, _, count = descent.steps_per_mode()
-        descent.steps.append(Step(0, cost / problem.count, 0.0, count, seconds))
+        effort = descent.effort()
+        descent.steps.append(DescentStep(0, cost / problem.count, 0.0, effort.world_steps, effort.seconds))
     point = Point(np.clip(best, low, high), point.starts)
-    return result(problem, point, problem.normal(point), descent)
+    return summarise(problem, point, problem.normal(point), descent.steps, descent.effort)
 
 
-def channel_fits(problem: LeastSquares, point: Point) -> list[tuple[str, str, float, int, float]]:
-    """Return (motion, channel, sum of squares, count, root mean square in SI units) of all channels at a point."""
-    found = []
-    for motion, start in zip(problem.motions, point.starts, strict=True):
-        table = np.full(motion.valid.shape, math.nan)
-        table[motion.valid] = motion.residuals(problem.replay, point.z[None], start[None])[:, 0]
-        for name, columns in motion.channels:
-            values = table[:, columns][motion.valid[:, columns]]
-            if len(values):
-                rms = math.sqrt(float(np.mean(values**2))) * motion.sigma[columns][0]
-                found.append((motion.motion.name, name, float(values @ values), len(values), rms))
-    return found
+class Descent:
+    """Log of an optimisation: its steps, time and physics steps; `minimise` takes the steps of one stage."""
+
+    def __init__(self, replay: MotionReplay):
+        """Start the clocks; replay: worlds whose physics steps are counted."""
+        self.replay, self.steps, self.stage = replay, [], 0
+        self.shortfall = 0.0
+        """Predicted minus actual decrease of the cost in the last step."""
+        self._begin = (time.perf_counter(), time.process_time(), replay.world_steps)
+
+    def effort(self) -> Effort:
+        """Return time and physics steps since the beginning."""
+        seconds, cpu, steps = self._begin
+        return Effort(time.perf_counter() - seconds, time.process_time() - cpu, self.replay.world_steps - steps)
+
+    def record_step(self, problem: LeastSquares, trial: Trial) -> None:
+        """Append a step to the log."""
+        effort = self.effort()
+        chi2 = trial.cost / problem.count
+        self.steps.append(DescentStep(self.stage, chi2, trial.damping, effort.world_steps, effort.seconds))
+
+    def minimise(
+        self, problem: LeastSquares, point: Point, normal: NormalEquations, decrease: float | None = None
+    ) -> tuple[Point, NormalEquations]:
+        """Return the point that Levenberg-Marquardt steps reach, and the normal equations there.
+
+        Steps end when one lowers the cost by less than `decrease` relative to it; None: when one with a new Jacobian
+        lowers it by less than `CONVERGED`. A Jacobian is reused with Broyden's update while steps are `GOOD_STEP`.
+        """
+        new_jacobian, self.stage = decrease is not None, self.stage + 1
+        for _ in range(MAX_STEPS):
+            least = max((decrease or 0.0) * normal.cost, CONVERGED * max(1.0, normal.data_cost / problem.count))
+            trial = problem.step(point, normal, geodesic=new_jacobian)
+            self.record_step(problem, trial)
+            gain, predicted = normal.cost - trial.cost, trial.predicted_decrease
+            self.shortfall = predicted - gain
+            if gain < least and (new_jacobian or (decrease is not None and predicted < least)):
+                return trial.point, problem.assemble(trial.point, replace_residuals(normal.linearised, trial.residuals))
+            new_jacobian = gain < max(least, GOOD_STEP * predicted)
+            normal = problem.normal(trial.point) if new_jacobian else problem.broyden_update(normal, point, trial)
+            point = trial.point
+        return point, normal
 
 
-def result(problem: LeastSquares, point: Point, normal: Normal, descent: Descent) -> Identification:
-    """Return what is reported of an optimisation that ended at a point, with the normal equations there."""
-    nominal, fits = (channel_fits(problem, at) for at in (problem.expected(), point))
-    rows = [
-        Fit(motion, channel, cost / count, old / count, rms)
-        for (motion, channel, cost, count, rms), (_, _, old, _, _) in zip(fits, nominal, strict=True)
-    ]
-    information = normal.information()
-    tables = []
-    for motion, residual in zip(problem.motions, problem.residuals(point), strict=True):
-        table = np.full(motion.valid.shape, math.nan)
-        table[motion.valid] = residual
-        tables.append(table)
-    covariance = np.linalg.inv(information + np.eye(len(information)))
-    mismatch = mismatch_factor(tables)
-    columns = [np.nonzero(motion.valid)[1] for motion in problem.motions]
-    systematic = systematic_deviations(normal, columns, covariance) if mismatch > 1.0 else np.zeros(len(point.z))
-    seconds, cpu_seconds, world_steps = descent.steps_per_mode()
-    return Identification(
-        parameters=problem.parameters,
-        z=point.z,
-        covariance=covariance,
-        mismatch=mismatch,
-        systematic=systematic,
-        chi2=sum(cost for _, _, cost, _, _ in fits) / problem.count,
-        nominal_chi2=sum(cost for _, _, cost, _, _ in nominal) / problem.count,
-        count=problem.count,
-        fits=tuple(rows),
-        directions=weak_directions(problem.parameters, information),
-        steps=tuple(descent.steps),
-        dt=max(motion.dt for motion in problem.motions),
-        seconds=seconds,
-        cpu_seconds=cpu_seconds,
-        world_steps=world_steps,
-        knowledge=tuple(problem.knowledge),
-        motions=tuple(problem.motions),
-        starts=tuple(point.starts),
-    )
+def descend(
+    descent: Descent,
+    parameters: ParameterSet,
+    coarse: Sequence[MotionResiduals],
+    whole: Sequence[MotionResiduals],
+    pieces: Sequence[MotionResiduals],
+    prior_measurements: Sequence[PriorMeasurement],
+) -> tuple[LeastSquares, Point, NormalEquations]:
+    """Return the problem of all motions, its minimum, and the normal equations there.
+
+    coarse, whole: all motions, with the physics steps of the first stages and of the last one. pieces: motions in short
+    pieces for a first stage, or none. Raises InputError: the simulation diverges at a motion.
+    """
+    replay, z = descent.replay, np.zeros(len(parameters))
+    if pieces:
+        problem = LeastSquares(parameters, pieces, replay, prior_measurements, robust=True)
+        begin = problem.nominal_point()
+        z = descent.minimise(problem, begin, problem.normal(begin), PIECES_DECREASE)[0].z
+    minima = []
+    for _ in range(ATTEMPTS):
+        point, linearised = add_motions(descent, parameters, coarse, prior_measurements, z)
+        final = LeastSquares(parameters, whole, replay, prior_measurements)
+        if whole is not coarse:
+            linearised = replace_residuals(linearised, final.residuals(point))
+        point, normal = descent.minimise(final, point, final.assemble(point, linearised))
+        minima.append((final, point, normal))
+        if descent.shortfall < STUCK * max(1.0, normal.data_cost / final.count):
+            break
+        z = point.z
+    return min(minima, key=lambda minimum: minimum[2].cost)
+
+
+def add_motions(
+    descent: Descent,
+    parameters: ParameterSet,
+    motions: Sequence[MotionResiduals],
+    prior_measurements: Sequence[PriorMeasurement],
+    z: np.ndarray,
+) -> tuple[Point, list[Linearised]]:
+    """Return the robust minimum over all motions, added one after another from parameters z, and the Jacobians there.
+
+    Motions with a held base come first: their legs do not interact. The others follow, the one with the least misfit
+    next. Outliers count less (a paw that strikes 1 ms late spoils all residuals of that moment).
+    """
+    point, added, linearised = Point(z, []), [], []
+    while len(added) < len(motions):
+        left = [i for i in range(len(motions)) if i not in added]
+        held = [i for i in left if not motions[i].free]
+        new = held or [min(left, key=lambda i: misfit(motions[i], descent.replay, point.z))]
+        point = Point(point.z, point.starts + [np.zeros(motions[i].start_size) for i in new])
+        for fraction in (1.0,) if held else HORIZONS:
+            fitted = [motions[i] for i in added] + [motions[i].first_part(fraction) for i in new]
+            problem = LeastSquares(parameters, fitted, descent.replay, prior_measurements, robust=True)
+            normal = problem.normal(point, linearised[: len(added)])
+            point, normal = descent.minimise(problem, point, normal, STAGE_DECREASE)
+            linearised = normal.linearised
+        added += new
+    order = np.argsort(added)
+    return Point(point.z, [point.starts[i] for i in order]), [linearised[i] for i in order]
+
+
+def misfit(motion: MotionResiduals, replay: MotionReplay, z: np.ndarray) -> float:
+    """Return the mean of ln(1 + r^2) of a motion's residuals at parameters z and the nominal initial state."""
+    residuals = motion.residuals(replay, z[None], np.zeros((1, motion.start_size)))
+    with np.errstate(over="ignore"):
+        return float(np.mean(np.log1p(np.nan_to_num(residuals, posinf=1.0e100) ** 2)))

@@ -8,7 +8,7 @@ import json
 import math
 import re
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields, replace
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any, Literal
 
@@ -17,11 +17,11 @@ import numpy as np
 from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.files import write_atomically
 
 PER_MOTOR = ("target", "angle", "rate", "torque")
 CHANNELS = ("angle", "rate", "torque", "position", "quaternion")
-"""What may be measured."""
+"""Channels of measurements."""
 DEGREES = math.pi / 180.0
 UNITS = {
     "time": {"s": 1.0, "ms": 1.0e-3},
@@ -33,11 +33,9 @@ UNITS = {
     "position": {"m": 1.0, "mm": 1.0e-3},
     "quaternion": {"": 1.0, "1": 1.0},
 }
-"""Factor to the first unit of each quantity, which is the default."""
+"""Factor of each unit to the first one of its quantity, which is the default."""
 LARGEST = {"target": 13.0, "angle": 13.0, "rate": 300.0, "torque": 1000.0, "position": 100.0}
-"""More than that is not of this robot [rad, rad/s, N m, m]: probably of another unit."""
-FAR_APART = math.radians(20.0)
-"""[rad] Root mean square between angles and targets above which their signs are compared."""
+"""Largest plausible value [rad, rad/s, N m, m]; larger ones are probably in another unit."""
 EXAMPLE = (
     "such as time, target/FL_outer, angle/FL_outer [deg], rate/FL_outer, torque/FL_outer, position/x, quaternion/w"
 )
@@ -45,7 +43,7 @@ EXAMPLE = (
 
 @dataclass(frozen=True)
 class NoiseLevels:
-    """Standard deviations of what is measured."""
+    """Standard deviations of the measurements."""
 
     angle: float = 0.05
     """[deg] Of motor angles."""
@@ -63,29 +61,19 @@ class NoiseLevels:
         for name, value in vars(self).items():
             check_positive(f"noise {name}", value)
 
-    def of_channels(self) -> dict[str, tuple[float, int]]:
-        """Return deviation [SI] and number of columns by channel of the residuals. Raises InputError as `check`."""
-        self.check()
-        return {
-            "angle": (math.radians(self.angle), 12),
-            "rate": (math.radians(self.rate), 12),
-            "torque": (self.torque, 12),
-            "position": (1.0e-3 * self.position, 3),
-            "orientation": (math.radians(self.orientation), 3),
-        }
-
 
 @dataclass(frozen=True, eq=False)
-class Motion:
-    """What was commanded and measured in one motion. NaN marks what a row does not measure; None a missing channel."""
+class RecordedMotion:
+    """Recorded targets and measurements of one motion. NaN: not measured in a row; None: channel not measured."""
 
     name: str
+    """Of the file, without suffix."""
     time: np.ndarray
     """(n,) [s], rising."""
     target: np.ndarray
-    """(n, 12) [rad] Sent to the motors (behind the command filter), each held until the next row."""
+    """(n, 12) [rad] Sent to the motors (after the command filter), each held until the next row."""
     angle: np.ndarray | None = None
-    """(n, 12) [rad] As the sensors read."""
+    """(n, 12) [rad] Readings of the sensors."""
     rate: np.ndarray | None = None
     """(n, 12) [rad/s]"""
     torque: np.ndarray | None = None
@@ -95,12 +83,13 @@ class Motion:
     quaternion: np.ndarray | None = None
     """(n, 4) xyzw, base to world."""
     base: Literal["free", "fixed"] = "free"
-    """Whether the robot stands or jumps on the ground, or hangs from a stand with its paws in the air."""
+    """"free": the robot stands or jumps on the ground; "fixed": it hangs from a stand, paws in the air."""
     gains: Literal["jumping", "walking"] = "jumping"
-    """Gains of the description that the controllers were set to."""
+    """Gains of the controllers, of those in the description."""
     torque_limit: float = 18.0
-    """[N m] That the controllers were set to."""
+    """[N m] Of the controllers."""
     notes: Mapping[str, Any] = field(default_factory=dict)
+    """Free-form metadata, saved with the motion."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a channel of another shape, not finite, or out of range."""
@@ -126,6 +115,7 @@ class Motion:
         self._check_settings()
 
     def _check_settings(self) -> None:
+        """Raise InputError: quaternions not of length 1, nothing measured, or a setting out of range."""
         what = f"motion {self.name}"
         if self.quaternion is not None:
             size = np.linalg.norm(self.quaternion, axis=1)
@@ -138,52 +128,28 @@ class Motion:
         if not 0.1 <= self.torque_limit <= 1000.0:
             raise InputError(f"{what}: torque_limit must lie in 0.1 to 1000 N m, got {self.torque_limit}")
 
-    def check_signs(self) -> None:
-        """Raise InputError: a motor's angles are far from its targets, and less than half as far from the negated ones.
-
-        In motions of `recording` they are more than four times as far with the right signs, and less than a quarter as
-        far with the wrong ones: rounding does not matter. Motors that stay near 0 pass.
-        """
-        if self.angle is None:
-            return
-        known = np.isfinite(self.angle)
-        errors = [np.where(known, self.angle - sign * self.target, 0.0) for sign in (1.0, -1.0)]
-        apart, negated = (np.sqrt(np.sum(e**2, axis=0) / np.maximum(known.sum(axis=0), 1)) for e in errors)
-        wrong = np.flatnonzero((apart > FAR_APART) & (negated < 0.5 * apart))
-        if len(wrong):
-            raise InputError(
-                f"motion {self.name}: angles of {', '.join(MOTOR_JOINTS[i] for i in wrong)} have the sign opposite to "
-                "their targets: negate angle, rate and torque, or target, of these motors"
-            )
-
     @property
     def duration(self) -> float:
         """Time from the first row to the last [s]."""
         return float(self.time[-1] - self.time[0])
 
-    def cut(self, first: int, end: int) -> Motion:
-        """Return the rows from `first` to `end` - 1."""
-        if (first, end) == (0, len(self.time)):
-            return self
-        return replace(self, **{name: values[first:end] for name, values in self._arrays().items()})
-
-    def _arrays(self) -> dict[str, Any]:
-        """Return all columns by name."""
+    def columns(self) -> dict[str, Any]:
+        """Return all measured arrays by name."""
         return {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
 
     def save(self, path: Path) -> None:
-        """Write it as npz, as `load_motion` reads it. Raises OSError."""
+        """Write the motion as npz for `load_motion`. Raises OSError."""
         settings = {name: getattr(self, name) for name in ("base", "gains", "torque_limit")}
         settings["notes"] = dict(self.notes)
         data = io.BytesIO()
-        np.savez_compressed(data, settings=np.array(json.dumps(settings)), **self._arrays())
-        write_whole(path, data.getvalue())
+        np.savez_compressed(data, settings=np.array(json.dumps(settings)), **self.columns())
+        write_atomically(path, data.getvalue())
 
 
-def load_motions(data: Sequence[Path], **settings: Any) -> list[Motion]:
-    """Return the motions of files, those of folders by name; settings: of `load_motion`, which says what it raises.
+def load_motions(data: Sequence[Path], **settings: Any) -> list[RecordedMotion]:
+    """Return the motions of files, and of all files in folders, sorted by name.
 
-    Raises InputError also if there is no file.
+    settings: of `load_motion`. Raises InputError as `load_motion`, and if there is no file.
     """
     files: list[Path] = []
     for path in data:
@@ -195,13 +161,13 @@ def load_motions(data: Sequence[Path], **settings: Any) -> list[Motion]:
 
 def load_motion(
     path: Path, *, base: str = "", gains: str = "", torque_limit: float = 0.0, torque_constant: float = 0.0
-) -> Motion:
-    """Return the motion of a file; base, gains and torque_limit [N m] override its settings, see `Motion`.
+) -> RecordedMotion:
+    """Return the motion of a file; base, gains and torque_limit [N m] override the file's settings.
 
-    npz: arrays named as the fields of `Motion`, and its settings as JSON in `settings`. CSV and Parquet: columns named
+    npz: arrays named as the fields of `RecordedMotion`, settings as JSON in `settings`. CSV and Parquet: columns named
     `time`, `target/FL_lateral`, `position/x`, `quaternion/w` and so on, each with its unit in brackets if it is not the
-    default: `angle/FL_outer [deg]`. Settings of a table lie in a JSON file beside it of the same name, or are given.
-    torque_constant: [N m/A] of the joint's torque per current, for tables with `current` instead of `torque`.
+    default: `angle/FL_outer [deg]`. Settings of a table lie in a JSON file of the same name beside it.
+    torque_constant [N m/A]: torque at the joint per current, for tables with `current` instead of `torque`.
 
     Raises InputError: what is missing, of another shape or unit, or not finite; the message names it. OSError: the file
     cannot be read.
@@ -217,12 +183,12 @@ def load_motion(
         if not torque_constant > 0.0:
             raise InputError(f"{path}: current needs the torque constant of the joint [N m/A]")
         channels["torque"] = torque_constant * channels.pop("current")
-    known = {f.name for f in fields(Motion)} - {"name", *channels}
+    known = {f.name for f in fields(RecordedMotion)} - {"name", *channels}
     unknown = set(settings) - known
     if unknown:
         raise InputError(f"{path}: no setting {min(unknown)!r:.60} of a motion; there are {', '.join(sorted(known))}")
     try:
-        return Motion(name=path.stem, **channels, **settings)
+        return RecordedMotion(name=path.stem, **channels, **settings)
     except (InputError, TypeError) as error:
         raise InputError(f"{path}: {error}") from None
 
@@ -251,7 +217,7 @@ def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def parse_settings(path: Path, text: str) -> dict[str, Any]:
-    """Return settings from JSON. Raises InputError."""
+    """Return the settings in a JSON text. Raises InputError: not a JSON object."""
     try:
         settings = json.loads(text)
     except json.JSONDecodeError as error:
@@ -282,12 +248,12 @@ def read_csv(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         try:
             columns.append([float(cell) if cell.strip() else math.nan for cell in row])
         except ValueError:
-            raise InputError(f"{path} line {number}: expected numbers, found {next_word(row)!r:.40}") from None
-    return channels_of(path, names, np.array(columns)), beside(path)
+            raise InputError(f"{path} line {number}: expected numbers, found {first_non_number(row)!r:.40}") from None
+    return channels_of(path, names, np.array(columns)), settings_beside(path)
 
 
-def next_word(row: list[str]) -> str:
-    """Return the first cell that is no number."""
+def first_non_number(row: list[str]) -> str:
+    """Return the first cell that is not a number, empty if all are."""
     for cell in row:
         try:
             float(cell or "nan")
@@ -313,11 +279,11 @@ def read_parquet(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         columns = [column.to_numpy(zero_copy_only=False).astype(np.float64) for column in table.columns]
     except (TypeError, ValueError):
         raise InputError(f"{path}: all columns must hold numbers") from None
-    return channels_of(path, list(table.column_names), np.stack(columns, axis=1)), beside(path)
+    return channels_of(path, list(table.column_names), np.stack(columns, axis=1)), settings_beside(path)
 
 
-def beside(path: Path) -> dict[str, Any]:
-    """Return the settings in the JSON file beside a table; none without one. Raises InputError or OSError."""
+def settings_beside(path: Path) -> dict[str, Any]:
+    """Return the settings in the JSON file beside a table, empty without one. Raises InputError or OSError."""
     file = path.with_suffix(".json")
     return parse_settings(file, file.read_text(encoding="utf-8")) if file.exists() else {}
 

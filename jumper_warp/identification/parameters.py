@@ -1,10 +1,10 @@
-"""What is unknown of a robot: parameters with a prior and bounds, sets of them, and the robots that they make."""
+"""Unknown parameters of a robot, each with a prior and bounds, and prior measurements such as a weighed mass."""
 
 from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
@@ -12,6 +12,7 @@ import numpy as np
 
 from jumper_warp.robot.description import MOTOR_JOINTS, RobotDescription, load_description
 from jumper_warp.robot.values import LATERAL, LINK_KINDS, MOTOR_QUANTITIES, PAW_FRICTION, TRANSVERSAL, RobotValues
+from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 
 GROUPS = ("motors", "masses", "friction", "latency", "offsets")
@@ -21,27 +22,28 @@ BASE_ONLY = ("base_mass", "base_com", "base_inertia", "paw_friction")
 
 @dataclass(frozen=True)
 class Parameter:
-    """One unknown. It acts on some places of a quantity of `RobotValues`.
+    """Unknown parameter: the value of some entries of a quantity of `RobotValues`.
 
-    The optimiser sees z = (value - nominal) / prior, or for a ratio z = ln(value / nominal) / prior, whose prior is a
-    normal distribution of mean 0 and deviation 1.
+    The optimiser works on z = (value - nominal) / prior, or for a ratio on z = ln(value / nominal) / prior, whose prior
+    is a normal distribution of mean 0 and standard deviation 1.
     """
 
     name: str
     quantity: str
     """A field of `RobotValues`."""
     places: tuple[int, ...]
-    """Indices of the quantity that take this value."""
+    """Entries of the quantity that take this value."""
     unit: str
     nominal: float
     """[unit] Mean of the prior."""
     prior: float
-    """[unit], or of the logarithm for a ratio: standard deviation of what is known beforehand."""
+    """[unit] Standard deviation of the prior; for a ratio, of ln(value / nominal) [1]."""
     bounds: tuple[float, float]
     """[unit]"""
     scale: Literal["ratio", "absolute"] = "ratio"
-    """Whether the prior is one of ln(value / nominal) or of the value."""
+    """Whether the prior is normal in ln(value / nominal) or in the value."""
     group: str = ""
+    """One of `GROUPS`."""
 
     def __post_init__(self) -> None:
         """Raises InputError: bounds that do not hold the nominal value, or a prior that is not positive."""
@@ -55,34 +57,34 @@ class Parameter:
 
     @property
     def leg(self) -> int | None:
-        """The leg whose motor alone it acts on; None if it acts on more."""
+        """Leg of the only motor that it acts on; None if it acts on more."""
         return self.places[0] // 3 if self.quantity in MOTOR_QUANTITIES and len(self.places) == 1 else None
 
     @property
-    def growth(self) -> float:
-        """Change of the normalised coordinate per relative change of the nominal value."""
+    def z_per_growth(self) -> float:
+        """Change of z per relative change of the nominal value."""
         return (1.0 if self.scale == "ratio" else self.nominal) / self.prior
 
     def value(self, z: np.ndarray) -> np.ndarray:
-        """Return the value [unit] of normalised coordinates."""
+        """Return the value [unit] at normalised coordinates z, of any shape."""
         if self.scale == "ratio":
             return self.nominal * np.exp(self.prior * z)
         return self.nominal + self.prior * z
 
     def normalised(self, value: np.ndarray | float) -> np.ndarray:
-        """Return the normalised coordinate of a value [unit]."""
+        """Return the normalised coordinates z of values [unit], of any shape."""
         if self.scale == "ratio":
             return np.log(np.asarray(value) / self.nominal) / self.prior
         return (np.asarray(value) - self.nominal) / self.prior
 
-    def deviation(self, z: float, deviation: float) -> float:
-        """Return the standard deviation [unit] of the value, from that of z."""
-        return deviation * self.prior * (float(self.value(np.array(z))) if self.scale == "ratio" else 1.0)
+    def std(self, z: float, z_std: float) -> float:
+        """Return the standard deviation [unit] of the value at z, given that of z."""
+        return z_std * self.prior * (float(self.value(np.array(z))) if self.scale == "ratio" else 1.0)
 
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """The unknowns of an identification, in order."""
+    """Parameters of an identification, in order."""
 
     parameters: tuple[Parameter, ...]
 
@@ -102,7 +104,7 @@ class ParameterSet:
 
     @property
     def names(self) -> list[str]:
-        """Names in order."""
+        """Names of the parameters."""
         return [parameter.name for parameter in self.parameters]
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
@@ -119,7 +121,7 @@ class ParameterSet:
         return np.stack([p.normalised(values[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
 
     def robots(self, z: np.ndarray, description: RobotDescription | None = None) -> RobotValues:
-        """Return the robots of normalised coordinates (N, P); what is no parameter is as described."""
+        """Return the robots at normalised coordinates (N, P); other values are as described."""
         z = np.atleast_2d(z)
         robots, values = RobotValues.nominal(len(z), description), self.values(z)
         for i, parameter in enumerate(self.parameters):
@@ -127,7 +129,7 @@ class ParameterSet:
         return robots
 
     def without(self, names: Iterable[str]) -> ParameterSet:
-        """Return the set without some parameters, or without all of a group or quantity.
+        """Return the set without the named parameters, groups or quantities.
 
         Raises InputError: a name that is none of these.
         """
@@ -139,7 +141,7 @@ class ParameterSet:
         return ParameterSet(tuple(p for p in self.parameters if not left_out & {p.name, p.group, p.quantity}))
 
     def changed(self, **changes: dict) -> ParameterSet:
-        """Return the set with other fields in some parameters, by name, such as a tighter prior.
+        """Return the set with changed fields by parameter name, such as `kp={"prior": 0.1}`.
 
         Raises InputError for an unknown name.
         """
@@ -150,7 +152,7 @@ class ParameterSet:
 
 
 def jumper_parameters(groups: Sequence[str] = GROUPS, description: RobotDescription | None = None) -> ParameterSet:
-    """Return the robot's parameters of some groups, 79 with all.
+    """Return the robot's parameters of some groups, by default all 79.
 
     motors: gains and armature of each motor, torque limit, cutoff and no-load speed by kind; masses: of the base, its
     com and inertia, ratios by kind of link; friction: of each motor, knees and paws; latency; offsets: of each sensor.
@@ -176,66 +178,102 @@ def jumper_parameters(groups: Sequence[str] = GROUPS, description: RobotDescript
 def ratio(
     name: str, quantity: str, places: Sequence[int], unit: str, nominal: float, prior: float, group: str
 ) -> Parameter:
-    """Return a positive parameter known to a factor of exp(prior); its bounds are five deviations, at most tenfold."""
+    """Return a positive parameter known to a factor exp(prior), with bounds at five standard deviations or tenfold."""
     wide = math.exp(min(5.0 * prior, math.log(10.0)))
     return Parameter(name, quantity, tuple(places), unit, nominal, prior, (nominal / wide, nominal * wide), group=group)
 
 
-def share(
+def relative(
     name: str, quantity: str, places: Sequence[int], unit: str, nominal: float, prior: float, group: str
 ) -> Parameter:
-    """Return a positive parameter known to a share `prior` of its value; its bounds are five deviations.
+    """Return a positive parameter with a relative standard deviation `prior`, and bounds at five of them.
 
-    Equations of motion are linear in masses, gains and armature: combinations that the motions do not tell apart lie
-    along straight lines, which steps of the optimiser follow.
+    Equations of motion are linear in masses, gains and armature, so that combinations which the motions do not
+    determine lie along straight lines, which steps of the optimiser follow.
     """
     low, high = nominal * max(1.0 - 5.0 * prior, 0.1), nominal * (1.0 + 5.0 * prior)
     return Parameter(name, quantity, tuple(places), unit, nominal, prior * nominal, (low, high), "absolute", group)
 
 
 def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return gains, armature, and limits of the motors."""
-    found = []
+    """Return the parameters of gains, armature, and limits of the motors."""
+    parameters = []
     for quantity, prior in (("kp", 0.2), ("kd", 0.2)):
-        found += [
-            share(f"{quantity}/{j}", quantity, (i,), "1", 1.0, prior, "motors") for i, j in enumerate(MOTOR_JOINTS)
+        parameters += [
+            relative(f"{quantity}/{j}", quantity, (i,), "1", 1.0, prior, "motors") for i, j in enumerate(MOTOR_JOINTS)
         ]
     for i, joint in enumerate(MOTOR_JOINTS):
-        found.append(share(f"armature/{joint}", "armature", (i,), "kg m^2", robot.motors[i].armature, 0.25, "motors"))
+        parameters.append(
+            relative(f"armature/{joint}", "armature", (i,), "kg m^2", robot.motors[i].armature, 0.25, "motors")
+        )
     for kind, places in (("lateral", LATERAL), ("transversal", TRANSVERSAL)):
         motor = robot.motors[places[0]]
-        found += [
-            share(f"saturation/{kind}", "saturation", places, "1", 1.0, 0.1, "motors"),
-            share(f"cutoff_speed/{kind}", "cutoff_speed", places, "rad/s", motor.cutoff_speed, 0.1, "motors"),
-            share(f"no_load_speed/{kind}", "no_load_speed", places, "rad/s", motor.no_load_speed, 0.1, "motors"),
+        parameters += [
+            relative(f"saturation/{kind}", "saturation", places, "1", 1.0, 0.1, "motors"),
+            relative(f"cutoff_speed/{kind}", "cutoff_speed", places, "rad/s", motor.cutoff_speed, 0.1, "motors"),
+            relative(f"no_load_speed/{kind}", "no_load_speed", places, "rad/s", motor.no_load_speed, 0.1, "motors"),
         ]
-    return tuple(found)
+    return tuple(parameters)
 
 
 def mass_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return masses, centre of mass and inertia."""
+    """Return the parameters of masses, centre of mass and inertia."""
     base = robot.links[0]
-    found = [share("base_mass", "base_mass", (0,), "kg", base.mass, 0.15, "masses")]
+    parameters = [relative("base_mass", "base_mass", (0,), "kg", base.mass, 0.15, "masses")]
     for i, axis in enumerate("xyz"):
         c = float(base.com[i])
-        found.append(
+        parameters.append(
             Parameter(f"base_com/{axis}", "base_com", (i,), "m", c, 0.02, (c - 0.1, c + 0.1), "absolute", "masses")
         )
-    found.append(share("base_inertia", "base_inertia", (0,), "1", 1.0, 0.2, "masses"))
-    found += [
-        share(f"link_mass/{kind}", "link_mass", (i,), "1", 1.0, 0.15, "masses") for i, kind in enumerate(LINK_KINDS)
+    parameters.append(relative("base_inertia", "base_inertia", (0,), "1", 1.0, 0.2, "masses"))
+    parameters += [
+        relative(f"link_mass/{kind}", "link_mass", (i,), "1", 1.0, 0.15, "masses") for i, kind in enumerate(LINK_KINDS)
     ]
-    return tuple(found)
+    return tuple(parameters)
 
 
 def friction_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return friction of motors, knees and paws."""
-    found = [
+    """Return the parameters of friction of motors, knees and paws."""
+    parameters = [
         ratio(
             f"motor_friction/{joint}", "motor_friction", (i,), "N m", robot.motors[i].coulomb_friction, 0.6, "friction"
         )
         for i, joint in enumerate(MOTOR_JOINTS)
     ]
-    found.append(ratio("knee_damping", "knee_damping", (0,), "N m s/rad", robot.knee_damping, 0.4, "friction"))
-    found.append(ratio("paw_friction", "paw_friction", (0,), "1", PAW_FRICTION, 0.2, "friction"))
-    return tuple(found)
+    parameters.append(ratio("knee_damping", "knee_damping", (0,), "N m s/rad", robot.knee_damping, 0.4, "friction"))
+    parameters.append(ratio("paw_friction", "paw_friction", (0,), "1", PAW_FRICTION, 0.2, "friction"))
+    return tuple(parameters)
+
+
+@dataclass(frozen=True)
+class PriorMeasurement:
+    """A measurement of the robot besides its motions, such as its weighed mass."""
+
+    name: str
+    measure: Callable[[RobotValues], np.ndarray]
+    """Returns the quantity of N robots, (N,)."""
+    value: float
+    """Measured, in the quantity's unit."""
+    std: float
+    """Standard deviation of the measurement, in the same unit."""
+
+
+def total_mass(robots: RobotValues) -> np.ndarray:
+    """Return the mass [kg] of N robots, (N,)."""
+    leg = [load_description().link(f"FL_{kind}").mass for kind in LINK_KINDS]
+    return robots.base_mass[:, 0] + 4.0 * robots.link_mass @ np.array(leg)
+
+
+def weighed_mass(mass: float, std: float = 0.02) -> PriorMeasurement:
+    """Return a measurement of the whole robot's mass [kg]; std [kg]: of the scale.
+
+    Raises InputError: std is not positive, or the mass is not within 0.5 to 2 times the described one.
+    """
+    described = float(total_mass(RobotValues.nominal(1))[0])
+    if not 0.5 * described <= mass <= 2.0 * described:
+        raise InputError(
+            f"weighed mass must be in {0.5 * described:.4g} to {2.0 * described:.4g} kg (the robot is described with "
+            f"{described:.4g} kg), got {mass:.6g} kg"
+        )
+    check_positive("deviation of the weighed mass", std)
+    return PriorMeasurement("total mass", total_mass, mass, std)

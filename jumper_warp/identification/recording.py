@@ -1,4 +1,4 @@
-"""Motions for identification: targets drawn at random, carried out by simulated robots, and measured with noise."""
+"""Simulated recordings for identification: random targets, a robot that follows them, and sensors with noise."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ from typing import Any, Literal
 import numpy as np
 import warp as wp
 
-from jumper_warp.identification.motions import DEGREES, Motion, NoiseLevels
-from jumper_warp.identification.replay import Record, Replay, Starts
-from jumper_warp.identification.stance import HANGING_HEIGHT, stance
+from jumper_warp.identification.initial_states import HANGING_HEIGHT, InitialStates, stance
+from jumper_warp.identification.motions import DEGREES, NoiseLevels, RecordedMotion
+from jumper_warp.identification.replay import MotionReplay, Record
+from jumper_warp.identification.residuals import channel_noise
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.motors import MotorCfg
 from jumper_warp.robot.values import RobotValues
@@ -23,18 +24,18 @@ Kind = Literal["hung chirp", "standing chirp", "small jump"]
 KINDS: tuple[Kind, ...] = ("hung chirp", "hung chirp", "standing chirp", "small jump")
 """One set of motions."""
 TICK = 1.0 / 60.0
-"""[s] From target to target."""
+"""[s] Between targets."""
 SAMPLES = 4
-"""Rows of a motion in a tick: 240 Hz."""
+"""Rows of a motion per tick: 240 Hz."""
 REST = 0.75
-"""[s] In which a robot comes to rest in the first pose before a motion is recorded."""
-HELD = 1.0e4
-"""[kg] Of a base that is held in a simulation, which puts it back after each step."""
+"""[s] Time in the first pose before a motion is recorded, in which the robot comes to rest."""
+HELD_MASS = 1.0e4
+"""[kg] Of a held base in a simulation, which also resets its pose after each step."""
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Targets for a motion."""
+    """Motor targets of a motion."""
 
     kind: Kind
     target: np.ndarray
@@ -44,7 +45,7 @@ class Plan:
 
     @property
     def base(self) -> Literal["free", "fixed"]:
-        """Whether the robot stands, or hangs from a stand."""
+        """ "free": the robot stands on the ground; "fixed": it hangs from a stand."""
         return "fixed" if self.kind == "hung chirp" else "free"
 
     @property
@@ -53,8 +54,8 @@ class Plan:
         return np.repeat(self.target, SAMPLES, axis=0)
 
 
-def plot_plan(kind: Kind, rng: np.random.Generator, seconds: float = 1.25, torque_limit: float = 12.0) -> Plan:
-    """Return a random plan of a kind."""
+def sample_plan(kind: Kind, rng: np.random.Generator, seconds: float = 1.25, torque_limit: float = 12.0) -> Plan:
+    """Return random targets for a motion of a kind. Raises InputError: unknown kind, or not 0.5 to 60 s long."""
     ticks = round(seconds / TICK)
     if ticks < 30 or not seconds < 60.0:
         raise InputError(f"a motion must take 0.5 to 60 s, got {seconds:g}")
@@ -68,26 +69,26 @@ def plot_plan(kind: Kind, rng: np.random.Generator, seconds: float = 1.25, torqu
 
 
 def chirp_targets(ticks: int, rng: np.random.Generator, hung: bool) -> np.ndarray:
-    """Return targets [deg] that swing faster and faster, each motor in its own phase; paws on the ground keep still."""
+    """Return targets [deg] (ticks, 12) of a chirp, each motor in its own phase; smaller and slower if not hung."""
     time = TICK * np.arange(ticks)
     slow, fast = rng.uniform(0.3, 0.8), rng.uniform(5.0, 9.0) if hung else rng.uniform(2.5, 4.5)
-    turns = slow * time + 0.5 * (fast - slow) * time**2 / time[-1]
+    cycles = slow * time + 0.5 * (fast - slow) * time**2 / time[-1]
     middle = rng.uniform(40.0, 55.0) if hung else rng.uniform(45.0, 60.0)
     target = np.zeros((ticks, 12))
-    begin = np.minimum(time / 0.1, 1.0)  # from rest
+    ramp = np.minimum(time / 0.1, 1.0)  # from rest
     for motor in range(12):
         lateral = motor % 3 == 0
         size = (rng.uniform(6.0, 11.0) if lateral else rng.uniform(9.0, 15.0)) if hung else (
             rng.uniform(2.0, 5.0) if lateral else rng.uniform(5.0, 10.0)
         )  # fmt: skip
         pace = rng.uniform(0.8, 1.2) if hung else 1.0
-        wave = np.sin(2.0 * math.pi * (pace * turns + rng.uniform()))
-        target[:, motor] = (0.0 if lateral else middle) + size * begin * wave
+        wave = np.sin(2.0 * math.pi * (pace * cycles + rng.uniform()))
+        target[:, motor] = (0.0 if lateral else middle) + size * ramp * wave
     return target
 
 
 def jump_targets(ticks: int, rng: np.random.Generator) -> np.ndarray:
-    """Return targets [deg] of a squat, a push-off and a landing, each leg a little different."""
+    """Return targets [deg] (ticks, 12) of a squat, a push-off and a landing, with a random offset for each motor."""
     squat, push, land = rng.uniform(75.0, 95.0), rng.uniform(5.0, 25.0), rng.uniform(50.0, 65.0)
     down, hold, up = 22, rng.integers(6, 12), rng.integers(9, 13)
     target = np.zeros((ticks, 12))
@@ -101,25 +102,25 @@ def jump_targets(ticks: int, rng: np.random.Generator) -> np.ndarray:
     return target + spread * np.minimum(np.arange(ticks) / down, 1.0)[:, None]
 
 
-def start_of(replay: Replay, plan: Plan, robots: RobotValues) -> Starts:
-    """Return the pose of the first targets, at rest, paws on the ground or the base held."""
+def initial_state(replay: MotionReplay, plan: Plan, robots: RobotValues) -> InitialStates:
+    """Return one robot at rest in the pose of the first targets, paws on the ground or the base held."""
     angle, rest = plan.target[:1] - robots.offset, np.zeros((1, 12))
     height, quaternion = HANGING_HEIGHT, np.array([[0.0, 0.0, 0.0, 1.0]])
     if plan.base == "free":
         height = stance(replay.description, angle, rest).height[0] + 1.0e-3
     zero = np.zeros((1, 3))
-    return Starts(np.array([[0.0, 0.0, height]]), quaternion, zero, zero, angle, rest)
+    return InitialStates(np.array([[0.0, 0.0, height]]), quaternion, zero, zero, angle, rest)
 
 
-def replay_plan(replay: Replay, plan: Plan, robots: RobotValues, refine: int = 1) -> Record:
-    """Return what a robot does in a plan after it came to rest, rows at 240 Hz; refine: steps in 1/480 s."""
+def replay_plan(replay: MotionReplay, plan: Plan, robots: RobotValues, refine: int = 1) -> Record:
+    """Return the replay of a plan by one robot, from rest, rows at 240 Hz; refine: physics steps per 1/480 s."""
     period = TICK / SAMPLES
     stride = 2 * refine
     rest = round(REST / period)
     rows = plan.rows
     target = np.repeat(np.concatenate([np.repeat(rows[:1], rest, axis=0), rows]), stride, axis=0)
     record = replay.run(
-        robots, start_of(replay, plan, robots), target, rows=rest + len(rows), stride=stride, dt=period / stride,
+        robots, initial_state(replay, plan, robots), target, rows=rest + len(rows), stride=stride, dt=period / stride,
         base=plan.base, torque_limit=plan.torque_limit,
     )  # fmt: skip
     rows = {name: values[rest:].copy() for name, values in vars(record).items() if name != "valid"}
@@ -129,7 +130,7 @@ def replay_plan(replay: Replay, plan: Plan, robots: RobotValues, refine: int = 1
 def simulate_plan(
     plan: Plan, robots: RobotValues | None = None, *, solver: SolverName = "jumper", dt: float = 1.0 / 480.0
 ) -> Record:
-    """Return what a robot does in a plan after it came to rest, rows at 240 Hz, on one of the two solvers.
+    """Return the simulation of a plan by one robot, from rest, rows at 240 Hz, on one of the two solvers.
 
     Raises InputError: dt [s] does not divide 1/240 s.
     """
@@ -139,38 +140,38 @@ def simulate_plan(
         raise InputError(f"dt must divide 1/240 s, got {dt}")
     robots = RobotValues.nominal(1) if robots is None else robots
     held = plan.base == "fixed"
-    sim = _simulation(plan, solver, robots, dt, held)
+    sim = _make_simulation(plan, solver, robots, dt, held)
     rows = plan.rows
     rest = round(REST / period)
     target = np.concatenate([np.repeat(rows[:1], rest, axis=0), rows])
-    late = float(robots.latency[0, 0]) / dt
-    wanted = wp.zeros((12, 1), dtype=float, device=sim.device)
-    found = []
-    begin = sim.joint_q()[0, :7].copy()
+    delay = float(robots.latency[0, 0]) / dt  # in physics steps
+    delayed_target = wp.zeros((12, 1), dtype=float, device=sim.device)
+    rows_read = []
+    held_pose = sim.joint_q()[0, :7].copy()
     for row in range(len(target)):
         q, qd = sim.joint_q()[0].copy(), sim.joint_qd()[0].copy()
         for step in range(stride):
             now = row * stride + step
-            whole = math.floor(late)
+            whole = math.floor(delay)
             newer, older = (target[max(now - whole - i, 0) // stride] for i in (0, 1))
-            aim = (1.0 - (late - whole)) * newer + (late - whole) * older
-            wanted.assign(aim[:, None].astype(np.float32))
-            sim.physics.advance(1, wanted)
-            if step == 0 and row >= rest:  # the torques are those that this step began with
+            blend = (1.0 - (delay - whole)) * newer + (delay - whole) * older
+            delayed_target.assign(blend[:, None].astype(np.float32))
+            sim.physics.advance(1, delayed_target)
+            if step == 0 and row >= rest:  # the torques at the beginning of this step
                 torque = sim.torque.numpy()[:, 0]
-                found.append(np.concatenate([motor_values(q[7:27]), motor_values(qd[6:26]), torque, q[:7]]))
+                rows_read.append(np.concatenate([motor_values(q[7:27]), motor_values(qd[6:26]), torque, q[:7]]))
             if held:
-                _put_back(sim, begin)
-    table = np.array(found)[:, :, None]
+                _reset_base(sim, held_pose)
+    table = np.array(rows_read)[:, :, None]
     valid = np.array([bool(np.isfinite(table).all()) and sim.physics.invalid.numpy()[0] == 0])
     return Record(table[:, :12], table[:, 12:24], table[:, 24:36], table[:, 36:39], table[:, 39:43], valid)
 
 
-def _simulation(plan: Plan, solver: SolverName, robots: RobotValues, dt: float, held: bool) -> Simulation:
-    """Return the simulation of one robot in the first pose of a plan."""
+def _make_simulation(plan: Plan, solver: SolverName, robots: RobotValues, dt: float, held: bool) -> Simulation:
+    """Return a simulation of one robot in the pose of the first targets; held: with a heavy, weightless base."""
     values = RobotValues(**{name: value[:1].copy() for name, value in vars(robots).items()})
     if held:
-        values.base_mass[:], values.base_com[:] = HELD, 0.0
+        values.base_mass[:], values.base_com[:] = HELD_MASS, 0.0
     motors = MotorCfg.from_description(load_description(), "jumping", plan.torque_limit, plan.torque_limit)
     sim = Simulation(1, solver=solver, motors=motors, dt=dt, visuals=False, robot=values, device="cpu", threads=1)
     angle = plan.target[0] - values.offset[0]
@@ -182,20 +183,20 @@ def _simulation(plan: Plan, solver: SolverName, robots: RobotValues, dt: float, 
     sim.physics.write_bodies()
     if held:
         weight = np.zeros((sim.model.body_count, 6), dtype=np.float32)
-        weight[0, :3] = -HELD * sim.model.gravity.numpy().reshape(-1, 3)[0]
+        weight[0, :3] = -HELD_MASS * sim.model.gravity.numpy().reshape(-1, 3)[0]
         sim.state.body_f.assign(weight)
     return sim
 
 
-def _put_back(sim: Simulation, pose: np.ndarray) -> None:
-    """Put the base back to a pose, at rest."""
+def _reset_base(sim: Simulation, pose: np.ndarray) -> None:
+    """Reset the base to a pose (7,), at rest."""
     q, qd = sim.state.joint_q.numpy(), sim.state.joint_qd.numpy()
     q[:7], qd[:6] = pose, 0.0
     sim.state.joint_q.assign(q)
     sim.state.joint_qd.assign(qd)
 
 
-def measured(
+def measure(
     plan: Plan,
     name: str,
     record: Record,
@@ -205,13 +206,12 @@ def measured(
     *,
     torque: bool = False,
     base_every: int = 2,
-) -> Motion:
-    """Return a record as sensors would read it, angles and rates at 240 Hz.
+) -> RecordedMotion:
+    """Return the recording of a motion by sensors: angles and rates at 240 Hz, the base every `base_every` rows.
 
-    rng: of the noise; None: without. torque: whether the motors report theirs. base_every: rows from one measurement of
-    the base to the next.
+    rng: of the noise; None: no noise. torque: whether the motors' torques are recorded.
     """
-    levels = (noise or NoiseLevels()).of_channels()
+    levels = channel_noise(noise or NoiseLevels())
     rows = len(plan.rows)
     values: dict[str, Any] = {
         "angle": record.angle[:, :, 0] + robots.offset[:1],
@@ -223,11 +223,11 @@ def measured(
     if rng is not None:
         values = {key: x + levels[key][0] * rng.normal(size=x.shape) for key, x in values.items()}
         quaternion = multiply(from_vector(levels["orientation"][0] * rng.normal(size=(rows, 3))), quaternion)
-    between = (np.arange(rows) % base_every != 0)[:, None]
-    values["position"], quaternion = (np.where(between, math.nan, x) for x in (values["position"], quaternion))
+    unmeasured = (np.arange(rows) % base_every != 0)[:, None]
+    values["position"], quaternion = (np.where(unmeasured, math.nan, x) for x in (values["position"], quaternion))
     if not torque:
         del values["torque"]
-    return Motion(
+    return RecordedMotion(
         name=name, time=TICK / SAMPLES * np.arange(rows), target=plan.rows, quaternion=quaternion, base=plan.base,
         torque_limit=plan.torque_limit, notes={"kind": plan.kind}, **values,
     )  # fmt: skip

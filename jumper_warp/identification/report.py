@@ -1,4 +1,4 @@
-"""The report of an identification: one HTML file without anything from outside, and the same as JSON."""
+"""Output files of an identification: a robot overlay, and a report as self-contained HTML and as JSON."""
 
 from __future__ import annotations
 
@@ -13,15 +13,21 @@ from typing import Any
 
 import numpy as np
 
-from jumper_warp.identification.findings import Identification
-from jumper_warp.identification.replay import Replay
+from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.residuals import MotionResiduals
+from jumper_warp.identification.results import Identification
 from jumper_warp.robot.description import MOTOR_JOINTS
-from jumper_warp.utils.files import write_whole
+from jumper_warp.robot.overlay import RobotOverlay, overlay_of
+from jumper_warp.utils.files import write_atomically
 
 UNITS = {"angle": ("deg", 180.0 / math.pi), "rate": ("rad/s", 1.0), "torque": ("N m", 1.0), "position": ("m", 1.0),
          "orientation": ("deg", 180.0 / math.pi)}  # fmt: skip
-"""Unit that a channel is shown in, and its factor."""
+"""Unit of a channel in the report, and its factor to SI units."""
+RATIO_ROWS = {
+    "link_mass": "link_mass", "kp": "gains", "kd": "damping_gains", "armature": "armature",
+    "no_load_speed": "no_load_speed", "cutoff_speed": "cutoff_speed",
+}  # fmt: skip
+"""Row of `RandomizationCfg` that scales a quantity."""
 TITLE = "System identification"
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 68rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
@@ -32,106 +38,140 @@ th:first-child, td:first-child { text-align: left; }
 """
 
 
-def to_json(found: Identification) -> dict[str, Any]:
-    """Return everything that was found, as JSON can hold it."""
+def to_json(result: Identification) -> dict[str, Any]:
+    """Return the content of `report.json`."""
     rows = []
-    for i, parameter in enumerate(found.parameters):
-        low, high = found.intervals[i]
+    for i, parameter in enumerate(result.parameters):
+        low, high = result.intervals[i]
         rows.append(
             {
                 "name": parameter.name,
                 "unit": parameter.unit,
                 "nominal": parameter.nominal,
-                "value": float(found.values[i]),
+                "value": float(result.values[i]),
                 "interval_95": [float(low), float(high)],
-                "deviation_of_prior": float(found.deviations[i]),
-                "identified": bool(found.identified[i]),
+                "deviation_of_prior": float(result.std[i]),
+                "identified": bool(result.identified[i]),
             }
         )
     return {
         "parameters": rows,
-        "chi2": found.chi2,
-        "nominal_chi2": found.nominal_chi2,
-        "mismatch": found.mismatch,
-        "doubts": list(found.doubts),
-        "count": found.count,
-        "dt_s": found.dt,
-        "wall_s": found.seconds,
-        "cpu_s": found.cpu_seconds,
-        "world_steps": found.world_steps,
-        "fits": [vars(fit) for fit in found.fits],
+        "chi2": result.chi2,
+        "nominal_chi2": result.nominal_chi2,
+        "mismatch": result.mismatch,
+        "doubts": list(result.warnings),
+        "count": result.count,
+        "dt_s": result.dt,
+        "wall_s": result.effort.seconds,
+        "cpu_s": result.effort.cpu_seconds,
+        "world_steps": result.effort.world_steps,
+        "fits": [vars(fit) for fit in result.fits],
         "open_directions": [
-            {"information": d.information, "words": d.words, "weights": dict(d.weights)} for d in found.directions
+            {"information": d.information, "words": d.words, "weights": dict(d.weights)} for d in result.directions
         ],
-        "steps": [vars(step) for step in found.steps],
+        "steps": [vars(step) for step in result.steps],
     }
 
 
-def write_results(found: Identification, folder: Path, source: str) -> None:
-    """Write the overlay `identified.json`, whose source is noted, `report.json` and `report.html`. Raises OSError."""
-    found.overlay(source).save(folder / "identified.json")
-    write_whole(folder / "report.json", (json.dumps(to_json(found), indent=2) + "\n").encode())
-    write_report(found, folder)
+def write_results(result: Identification, folder: Path, source: str) -> None:
+    """Write `identified.json` (an overlay), `report.json` and `report.html`. Raises OSError."""
+    identified_overlay(result, source).save(folder / "identified.json")
+    write_atomically(folder / "report.json", (json.dumps(to_json(result), indent=2) + "\n").encode())
+    write_html(result, folder)
 
 
-def write_report(found: Identification, folder: Path) -> None:
+def identified_overlay(result: Identification, source: str = "") -> RobotOverlay:
+    """Return the identified robot as an overlay, with the intervals as ranges of randomisation."""
+    quantities = tuple(dict.fromkeys(parameter.quantity for parameter in result.parameters))
+    return overlay_of(result.robots(), quantities, randomization=randomization_ranges(result), source=source)
+
+
+def randomization_ranges(result: Identification) -> dict[str, tuple[float, float]]:
+    """Return rows of `RandomizationCfg` that contain all intervals, relative to the identified values."""
+    rows: dict[str, tuple[float, float]] = {}
+
+    def widen(row: str, low: float, high: float) -> None:
+        old = rows.get(row, (low, high))
+        rows[row] = (min(low, old[0]), max(high, old[1]))
+
+    for parameter, value, (low, high) in zip(result.parameters, result.values, result.intervals, strict=True):
+        quantity, value, low, high = parameter.quantity, float(value), float(low), float(high)
+        if quantity in RATIO_ROWS:
+            widen(RATIO_ROWS[quantity], low / value, high / value)
+        elif quantity == "base_mass":
+            widen("base_mass", low - value, high - value)
+        elif quantity == "base_com":
+            widen("com_shift", low - value, high - value)
+        elif quantity == "offset":
+            widen("joint_offset", math.degrees(low - value), math.degrees(high - value))
+        elif quantity == "motor_friction":
+            widen("motor_friction", low, high)
+        elif quantity == "paw_friction":
+            widen("dynamic_friction", low, high)
+            widen("static_friction", low, high)
+        elif quantity == "latency":
+            widen("latency", 1.0e3 * low, 1.0e3 * high)
+    return rows
+
+
+def write_html(result: Identification, folder: Path) -> None:
     """Write `report.html`. Raises OSError."""
     parts = [
         f"<h1>{TITLE}</h1>",
-        summary(found),
-        open_directions(found),
+        summary(result),
+        open_directions(result),
         "<h2>Parameters</h2>",
-        f"<p>{image(parameter_plot(found))}</p>",
-        parameter_table(found),
+        f"<p>{image(parameter_plot(result))}</p>",
+        parameter_table(result),
         "<h2>Fit</h2>",
-        fit_table(found),
-        f"<p>{image(progress_plot(found))}</p>",
+        fit_table(result),
+        f"<p>{image(progress_plot(result))}</p>",
     ]
-    for motion, start in zip(found.motions, found.starts, strict=True):
-        parts.append(f"<h3>{html.escape(motion.motion.name)}</h3><p>{image(motion_plot(found, motion, start))}</p>")
+    for motion, start in zip(result.motions, result.starts, strict=True):
+        parts.append(f"<h3>{html.escape(motion.motion.name)}</h3><p>{image(motion_plot(result, motion, start))}</p>")
     page = f"<!doctype html><html lang=en><meta charset=utf-8><title>{TITLE}</title><style>{STYLE}</style>"
-    write_whole(folder / "report.html", (page + "\n".join(parts) + "</html>\n").encode())
+    write_atomically(folder / "report.html", (page + "\n".join(parts) + "</html>\n").encode())
 
 
-def summary(found: Identification) -> str:
-    """Return the first paragraph."""
-    sure, count = int(found.identified.sum()), len(found.parameters)
+def summary(result: Identification) -> str:
+    """Return the first paragraph of the report: counts, χ², effort and warnings."""
+    sure, count = int(result.identified.sum()), len(result.parameters)
     text = (
-        f"{sure} of {count} parameters are identified from {found.count} measured values. Mean squared weighed "
-        f"residual {found.chi2:.3f} (as described {found.nominal_chi2:.4g}). {found.seconds:.1f} s, "
-        f"{found.cpu_seconds:.1f} s of CPU, {found.world_steps / 1e6:.2f} million physics steps of "
-        f"{1e3 * found.dt:.3g} ms."
+        f"{sure} of {count} parameters are identified from {result.count} measured values. Mean squared weighed "
+        f"residual {result.chi2:.3f} (as described {result.nominal_chi2:.4g}). {result.effort.seconds:.1f} s, "
+        f"{result.effort.cpu_seconds:.1f} s of CPU, {result.effort.world_steps / 1e6:.2f} million physics steps of "
+        f"{1e3 * result.dt:.3g} ms."
     )
-    if found.mismatch > 1.0:
+    if result.mismatch > 1.0:
         text += (
             f"</p><p class=note>The model does not explain the data to its noise: intervals are "
-            f"{found.mismatch:.3g} times as wide as noise alone would make them."
+            f"{result.mismatch:.3g} times as wide as noise alone would make them."
         )
-    notes = "".join(f"<p class=note>{html.escape(line)}</p>" for line in found.doubts)
+    notes = "".join(f"<p class=note>{html.escape(line)}</p>" for line in result.warnings)
     return f"<p>{text}</p>{notes}"
 
 
-def open_directions(found: Identification) -> str:
-    """Return what the data leaves open, in words."""
-    if not found.directions:
+def open_directions(result: Identification) -> str:
+    """Return the list of combinations of parameters that the data leaves open."""
+    if not result.directions:
         return "<p>The data determines every combination of the parameters.</p>"
-    lines = "".join(f"<li>{html.escape(words)}</li>" for words in dict.fromkeys(d.words for d in found.directions))
+    lines = "".join(f"<li>{html.escape(words)}</li>" for words in dict.fromkeys(d.words for d in result.directions))
     return f"<h2>What the data leaves open</h2><ul>{lines}</ul>"
 
 
 def table(heads: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> str:
-    """Return a table; rows: class, or nothing, and cells of each."""
+    """Return an HTML table; rows: CSS class (may be empty) and cells of each."""
     text = "<table><tr>" + "".join(f"<th>{head}</th>" for head in heads) + "</tr>"
     for kind, cells in rows:
         text += f"<tr{kind and ' class='}{kind}>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells) + "</tr>"
     return text + "</table>"
 
 
-def parameter_table(found: Identification) -> str:
-    """Return all parameters with their intervals."""
+def parameter_table(result: Identification) -> str:
+    """Return the HTML table of all parameters with their intervals."""
     rows = []
     for parameter, value, (low, high), sure in zip(
-        found.parameters, found.values, found.intervals, found.identified, strict=True
+        result.parameters, result.values, result.intervals, result.identified, strict=True
     ):
         cells = (parameter.name, parameter.unit, *(f"{x:.5g}" for x in (parameter.nominal, value, low, high)))
         rows.append(("" if sure else "open", cells))
@@ -139,10 +179,10 @@ def parameter_table(found: Identification) -> str:
     return table(heads, rows) + "<p class=open>Grey: the prior says more than the data.</p>"
 
 
-def fit_table(found: Identification) -> str:
-    """Return how well each channel is explained."""
+def fit_table(result: Identification) -> str:
+    """Return the HTML table of the fit of each channel."""
     rows = []
-    for fit in found.fits:
+    for fit in result.fits:
         unit, factor = UNITS[fit.channel]
         values = (f"{fit.nominal_chi2:.4g}", f"{fit.chi2:.3f}", f"{factor * fit.rms:.3g} {unit}")
         rows.append(("", (fit.motion, fit.channel, *values)))
@@ -150,27 +190,27 @@ def fit_table(found: Identification) -> str:
 
 
 def image(figure: Any) -> str:
-    """Return a figure as an image within the page."""
+    """Return a figure as an HTML image with embedded data."""
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=110, bbox_inches="tight")
     return f'<img alt="" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
 
 
 def new_figure(width: float, height: float) -> Any:
-    """Return a figure that no window shows."""
+    """Return an empty figure without a window, of a size in inches."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def parameter_plot(found: Identification) -> Any:
-    """Draw all parameters with their intervals, in deviations of their priors."""
+def parameter_plot(result: Identification) -> Any:
+    """Return a figure of all parameters with their intervals, in standard deviations of their priors."""
     figure = new_figure(10.0, 3.2)
     axis = figure.subplots()
-    place = np.arange(len(found.z))
+    place = np.arange(len(result.z))
     axis.axhspan(-1.0, 1.0, color="0.92", label="prior")
-    axis.errorbar(place, found.z, yerr=1.96 * found.deviations, fmt=".", capsize=2, label="found, 95 %")
-    names = [parameter.quantity for parameter in found.parameters]
+    axis.errorbar(place, result.z, yerr=1.96 * result.std, fmt=".", capsize=2, label="found, 95 %")
+    names = [parameter.quantity for parameter in result.parameters]
     edges = [i for i in place if i == 0 or names[i] != names[i - 1]]
     axis.set_xticks(edges, [names[i] for i in edges], rotation=50, ha="right", fontsize=8)
     axis.set(ylabel="deviations of the prior", xlim=(-1, len(place)))
@@ -178,26 +218,26 @@ def parameter_plot(found: Identification) -> Any:
     return figure
 
 
-def progress_plot(found: Identification) -> Any:
-    """Draw how the fit became better."""
+def progress_plot(result: Identification) -> Any:
+    """Return a figure of χ² over the steps of the optimisation."""
     figure = new_figure(6.0, 2.6)
     axis = figure.subplots()
-    for stage in sorted({step.stage for step in found.steps}):
-        steps = [step for step in found.steps if step.stage == stage]
-        label = "all, to the end" if stage == found.steps[-1].stage else f"stage {stage}"
+    for stage in sorted({step.stage for step in result.steps}):
+        steps = [step for step in result.steps if step.stage == stage]
+        label = "all, to the end" if stage == result.steps[-1].stage else f"stage {stage}"
         axis.semilogy([s.world_steps / 1e6 for s in steps], [s.chi2 for s in steps], "o-", label=label)
     axis.set(xlabel="million physics steps of all worlds", ylabel="χ² per value")
     axis.legend(fontsize=8)
     return figure
 
 
-def motion_plot(found: Identification, motion: MotionResiduals, start: np.ndarray) -> Any:
-    """Draw measurement and model of three motors, and all residuals, of one motion."""
+def motion_plot(result: Identification, motion: MotionResiduals, start: np.ndarray) -> Any:
+    """Return a figure of one motion: measurement and model of three motors above, residuals of channels below."""
     figure = new_figure(10.0, 4.6)
     axes = figure.subplots(2, 3, sharex=True)
-    replay = Replay(description=motion.description, threads=1)
-    record, robots = motion.run(replay, found.z[None], start[None])
-    model = motion.predicted(record, robots)[..., 0]
+    replay = MotionReplay(description=motion.description, threads=1)
+    record, robots = motion.run(replay, result.z[None], start[None])
+    model = motion.sensor_readings(record, robots)[..., 0]
     time = motion.motion.time - motion.motion.time[0]
     first, columns = motion.channels[0]
     unit, factor = UNITS[first]
@@ -216,6 +256,6 @@ def motion_plot(found: Identification, motion: MotionResiduals, start: np.ndarra
 
 
 def shown_channels(channels: Sequence[tuple[str, slice]]) -> list[tuple[str, slice]]:
-    """Return the three channels whose residuals are drawn."""
+    """Return the first three channels in the order of the report, whose residuals are plotted."""
     order = {name: i for i, name in enumerate(("angle", "rate", "torque", "position", "orientation"))}
     return sorted(channels, key=lambda channel: order[channel[0]])[:3]

@@ -1,42 +1,43 @@
-"""One recorded motion against its replay: weighed residuals, and their Jacobian by worlds that differ a little."""
+"""Weighed residuals of a recorded motion against its replay, and their Jacobian by differences in parallel worlds."""
 
 from __future__ import annotations
 
 import copy
+import itertools
 import math
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
 
-from jumper_warp.identification.motions import DEGREES, Motion, NoiseLevels
+from jumper_warp.identification.initial_states import InitialStatePrior
+from jumper_warp.identification.motions import NoiseLevels, RecordedMotion
 from jumper_warp.identification.parameters import BASE_ONLY, ParameterSet
-from jumper_warp.identification.replay import Record, Replay, Starts
-from jumper_warp.identification.stance import HANGING_HEIGHT, levelled, levelling, stance
-from jumper_warp.robot.description import RobotDescription
+from jumper_warp.identification.replay import MotionReplay, Record
+from jumper_warp.robot.description import MOTOR_JOINTS, RobotDescription
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.rotations import INVERSE, from_vector, multiply, rotate, to_vector
+from jumper_warp.utils.rotations import CONJUGATE, multiply, to_vector
 
 LONGEST_GAP = 0.1
-"""[s] Between two rows of a motion."""
+"""[s] Longest time between two rows of a motion."""
 LONGEST_LATENCY = 0.05
-"""[s] Targets that long before the first row matter."""
+"""[s] Targets up to this long before the first row act in the motion."""
 SETTLING = 0.02
-"""[s] From the start on, in which rows of a motion on the ground do not count: paws that do not stand on it exactly
-strike it, and when each does is a matter of micrometres."""
-FIRST_ROWS = 8
-"""Rows in which a motion's start is measured."""
-QUIET_ROWS = 2
-QUIET = 0.2
-"""[rad/s] Mean rate over the first rows of a motion below which a robot that stands has all paws on the ground."""
-TRUST = 3.0
-"""Deviations of the noise by which a start may differ from what is measured there, so that it hardly counts twice."""
+"""[s] Initial rows that are ignored where a robot on the ground is not at rest: paws that do not stand on it exactly
+strike it, at times that depend on micrometres."""
+FAR_APART = math.radians(20.0)
+"""[rad] Root mean square between angles and targets above which their signs are compared."""
+PIECE = 0.25
+"""[s] Length of the pieces that motions without a held base are first cut into."""
 DIFFERENCE = 1.0e-5
-"""Change of an unknown for its column of the Jacobian, in deviations of its prior."""
+"""Change of an unknown for its column of the Jacobian, in standard deviations of its prior."""
+FIXED_AT_REST = (24, 25, 29, 32, 33, 34)
+"""Coordinates of an initial state at rest that contact determines: tilt, height, vertical velocity, spin but yaw."""
 
 
 class NothingMeasured(InputError):
-    """A motion in which no row says anything that a replay could be compared to."""
+    """A motion without any measurement to compare with a replay."""
 
 
 class Linearised(NamedTuple):
@@ -49,29 +50,46 @@ class Linearised(NamedTuple):
 
 
 class MotionResiduals:
-    """A motion on the grid of physics steps. Unknowns are normalised: parameters (P,), and a start of I coordinates.
+    """Residuals of a motion on the grid of physics steps.
 
-    A start has the sensors' readings and rates of 12 motors, the base's rotation vector, and for a free base its
-    position, velocity and spin (world frame), as deviations from what the first rows measure.
+    Unknowns are normalised: P parameters and the I coordinates of an initial state, see `InitialStatePrior`.
     """
 
     def __init__(
         self,
-        motion: Motion,
+        motion: RecordedMotion,
         parameters: ParameterSet,
         noise: NoiseLevels,
         description: RobotDescription,
         dt: float | None = None,
         span: tuple[int, int] | None = None,
     ):
-        """Prepare; dt [s]: largest physics step, by default 1/480; span: first row and one past the last, else all.
+        """Prepare a motion; dt [s]: largest physics step, by default 1/480; span: first row and one past the last.
 
         Raises InputError: angles of the wrong sign, gaps, or nothing to compare.
         """
-        motion.check_signs()
+        check_signs(motion)
         whole, (first, end) = motion, span or (0, len(motion.time))
-        motion = whole.cut(first, end)
+        motion = rows_of(whole, first, end)
         self.motion, self.parameters, self.description = motion, parameters, description
+        self.free = motion.base == "free"
+        period = self._make_grid(dt)
+        self.lead = self.stride * min(math.ceil(LONGEST_LATENCY / (self.stride * self.dt)), 10**6 if first else 0)
+        steps = motion.time[0] + self.dt * np.arange(-self.lead, self.rows * self.stride)
+        held_row = np.searchsorted(whole.time, steps + 1.0e-6 * period, side="right") - 1
+        self.target = whole.target[np.maximum(held_row, 0)]
+        self._collect_measurements(noise)
+        self.initial = InitialStatePrior(motion, noise, description)
+        self.start_size = self.initial.size
+        if self.free and not self.initial.resting:
+            self.valid[motion.time < motion.time[0] + SETTLING] = False
+        if not self.valid.any():
+            raise NothingMeasured(f"motion {motion.name}: nothing is measured that a replay could be compared to")
+        self.jacobian_worlds = self._plan_jacobian()
+
+    def _make_grid(self, dt: float | None) -> float:
+        """Place the rows on a grid of physics steps; returns the median time between rows [s]."""
+        motion = self.motion
         gaps = np.diff(motion.time)
         if gaps.max() > LONGEST_GAP:
             row = int(np.argmax(gaps)) + 1
@@ -81,37 +99,25 @@ class MotionResiduals:
             np.abs(motion.time - motion.time[0] - period * np.arange(len(motion.time))).max() < 0.01 * period
         )
         self.stride, self.dt = grid_steps(period, dt) if uniform else (1, grid_steps(1.0, dt)[1])
-        self._place = np.arange(len(motion.time), dtype=float)
+        self._grid_row = np.arange(len(motion.time), dtype=float)
         if not uniform:
-            self._place = (motion.time - motion.time[0]) / self.dt
-        self.rows = int(math.ceil(self._place[-1] - 1.0e-9)) + 1
-        lead = self.stride * min(math.ceil(LONGEST_LATENCY / (self.stride * self.dt)), 10**6 if first else 0)
-        steps = motion.time[0] + self.dt * np.arange(-lead, self.rows * self.stride)
-        held = np.searchsorted(whole.time, steps + 1.0e-6 * period, side="right") - 1
-        self.target, self.lead = whole.target[np.maximum(held, 0)], lead
-        self.free = motion.base == "free"
-        self.start_size = 36 if self.free else 27
-        self._measure(noise)
-        self._guess_start(noise.of_channels())
-        if self.free and not self.resting:
-            self.valid[motion.time < motion.time[0] + SETTLING] = False
-        if not self.valid.any():
-            raise NothingMeasured(f"motion {motion.name}: nothing is measured that a replay could be compared to")
-        self.plan = self._plan()
+            self._grid_row = (motion.time - motion.time[0]) / self.dt
+        self.rows = int(math.ceil(self._grid_row[-1] - 1.0e-9)) + 1
+        return period
 
-    def _measure(self, noise: NoiseLevels) -> None:
-        """Collect what is measured in columns, NaN where it is not."""
+    def _collect_measurements(self, noise: NoiseLevels) -> None:
+        """Collect the measurements in columns, NaN where a row has none."""
         motion, columns = self.motion, []
         self.channels: list[tuple[str, slice]] = []
         sigma, legs, first = [], [], 0
-        for name, (deviation, width) in noise.of_channels().items():
+        for name, (std, width) in channel_noise(noise).items():
             source = motion.quaternion if name == "orientation" else getattr(motion, name)
             if source is None or (not self.free and name == "position"):
                 continue
             if name == "orientation":  # its error is compared to 0
                 source = np.where(np.isnan(source).any(axis=1)[:, None], math.nan, np.zeros((1, 3)))
             columns.append(source)
-            sigma += width * [deviation]
+            sigma += width * [std]
             legs += [i // 3 for i in range(12)] if width == 12 else width * [-1]
             self.channels.append((name, slice(first, first + width)))
             first += width
@@ -119,149 +125,92 @@ class MotionResiduals:
         self.valid = np.isfinite(self.measured)
         self.sigma, self._leg = np.array(sigma), np.array(legs)
 
-    def _guess_start(self, noise: dict[str, tuple[float, int]]) -> None:
-        """Set what the first rows say of the start, and how well."""
-        motion, rows = self.motion, min(FIRST_ROWS, len(self.motion.time))
-        angle, angle_prior = first_values(motion.angle, motion.target[0], TRUST * noise["angle"][0], 10.0 * DEGREES)
-        rate, rate_prior = first_values(motion.rate, None, TRUST * noise["rate"][0], 1.0)
-        if motion.rate is None and motion.angle is not None:
-            rate, rate_prior = slope(motion.time[:rows], motion.angle[:rows]), np.full(12, 1.0)
-        level, place = np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, HANGING_HEIGHT])
-        quaternion, _ = first_values(motion.quaternion, level, 0.0, 0.0)
-        quaternion = quaternion / np.linalg.norm(quaternion)
-        tilt = np.full(3, math.radians(2.0 if motion.quaternion is not None else 5.0))
-        velocity, base = np.zeros(3), []
-        self.standing = self.resting = False
-        if self.free:
-            ground = stance(self.description, angle[None], rate[None])
-            place[2] = ground.height[0]
-            place, place_prior = first_values(motion.position, place, 0.02, 0.05)
-            up = rotate(quaternion * INVERSE, np.array([0.0, 0.0, 1.0]))
-            near = abs(place[2] - ground.height[0]) < 0.03 and float(up @ ground.up[0]) > math.cos(math.radians(6.0))
-            self.standing = near and ground.gap[0] < 0.02
-            if motion.position is not None:
-                velocity = slope(motion.time[:rows], motion.position[:rows])
-            base = [place_prior, np.full(3, 0.3), np.full(3, 1.0)]
-            if self.standing:  # the ground says more than sensors
-                tilt = np.array([0.2 * DEGREES, 0.2 * DEGREES, tilt[2]])
-                base = [np.array([0.02, 0.02, 0.001]), np.full(3, 0.05), np.full(3, 0.3)]
-                self.resting = quiet(motion.rate)
-                self._levelling = levelling(self.description, angle)
-        self._guess = Starts(*(x[None] for x in (place, quaternion, velocity, np.zeros(3), angle, rate)))
-        self._start_prior = np.concatenate([angle_prior, rate_prior, tilt, *base])
-
-    def until(self, part: float) -> MotionResiduals:
-        """Return the first part of it, a share of its rows; the start is the same."""
-        if part >= 1.0:
+    def first_part(self, fraction: float) -> MotionResiduals:
+        """Return the residuals of the first `fraction` of the rows, with the same prior of the initial state."""
+        if fraction >= 1.0:
             return self
-        found = copy.copy(self)
-        end = max(3, round(part * len(self.motion.time)))
-        found.motion, found._place = self.motion.cut(0, end), self._place[:end]
-        found.rows = int(math.ceil(found._place[-1] - 1.0e-9)) + 1
-        found.measured, found.valid = self.measured[:end], self.valid[:end]
-        return found
-
-    def starts(self, z: np.ndarray, robots: RobotValues) -> Starts:
-        """Return the starts of normalised coordinates (N, I); true angles are readings less the robots' offsets.
-
-        All paws of a robot that stands begin on the ground, but for what the coordinates add to that.
-        """
-        guess, d = self._guess, z * self._start_prior
-        start = Starts(*(np.repeat(getattr(guess, name), len(z), axis=0) for name in vars(guess)))
-        start.angle = start.angle + d[:, :12] - robots.offset
-        start.rate = start.rate + d[:, 12:24]
-        if self.resting:
-            start.angle, start.rate = levelled(self.description, start.angle, start.rate, self._levelling)
-        if self.standing:
-            ground = stance(self.description, start.angle, start.rate)
-            turned = rotate(start.quaternion, ground.up)  # to be brought to the vertical, about a level axis
-            half = np.stack([turned[:, 1], -turned[:, 0], np.zeros(len(z)), 1.0 + turned[:, 2]], axis=1)
-            start.quaternion = multiply(half / np.linalg.norm(half, axis=1, keepdims=True), start.quaternion)
-            start.position[:, 2] = ground.height
-            start.velocity, start.spin = (rotate(start.quaternion, v) for v in (ground.velocity, ground.spin))
-        start.quaternion = multiply(from_vector(d[:, 24:27]), start.quaternion)
-        if self.free:
-            start.position = start.position + d[:, 27:30]
-            start.velocity = start.velocity + d[:, 30:33]
-            start.spin = start.spin + d[:, 33:36]
-        return start
-
-    def run(self, replay: Replay, z: np.ndarray, start: np.ndarray) -> tuple[Record, RobotValues]:
-        """Replay with N unknowns (N, P), (N, I)."""
-        robots = self.parameters.robots(z, self.description)
-        motion = self.motion
-        record = replay.run(
-            robots, self.starts(start, robots), self.target, rows=self.rows, stride=self.stride, dt=self.dt,
-            lead=self.lead, base=motion.base, gains=motion.gains, torque_limit=motion.torque_limit,
-        )  # fmt: skip
-        return record, robots
-
-    def predicted(self, record: Record, robots: RobotValues) -> np.ndarray:
-        """Return what the sensors would read, (n, columns, N); orientation as the error to what was measured."""
-        low = np.minimum(self._place.astype(int), len(record.angle) - 1)
-        high = np.minimum(low + 1, len(record.angle) - 1)
-        part = (self._place - low)[:, None, None]
-
-        def at_rows(values: np.ndarray) -> np.ndarray:
-            return values[low] if not part.any() else (1.0 - part) * values[low] + part * values[high]
-
-        columns = []
-        for name, _ in self.channels:
-            if name == "orientation":
-                found = np.moveaxis(at_rows(record.quaternion), 1, 2)
-                found = found / np.linalg.norm(found, axis=-1, keepdims=True)
-                known = np.nan_to_num(np.asarray(self.motion.quaternion)) + np.array([0.0, 0.0, 0.0, 1.0e-12])
-                known = known / np.linalg.norm(known, axis=-1, keepdims=True) * INVERSE
-                columns.append(np.moveaxis(to_vector(multiply(found, known[:, None])), 1, 2))
-            else:
-                values = at_rows(getattr(record, name))
-                columns.append(values + robots.offset.T if name == "angle" else values)
-        return np.concatenate(columns, axis=1)
-
-    def residuals(self, replay: Replay, z: np.ndarray, start: np.ndarray) -> np.ndarray:
-        """Return weighed residuals (m, N); infinite where a world broke."""
-        record, robots = self.run(replay, z, start)
-        error = self.predicted(record, robots) - self.measured[:, :, None]
-        found = (error / self.sigma[:, None])[self.valid]
-        found[:, ~record.valid] = math.inf
-        return found
+        part = copy.copy(self)
+        end = max(3, round(fraction * len(self.motion.time)))
+        part.motion, part._grid_row = rows_of(self.motion, 0, end), self._grid_row[:end]
+        part.rows = int(math.ceil(part._grid_row[-1] - 1.0e-9)) + 1
+        part.measured, part.valid = self.measured[:end], self.valid[:end]
+        return part
 
     def linearise(
-        self, replay: Replay, z: np.ndarray, start: np.ndarray, change: np.ndarray | float = DIFFERENCE
+        self, replay: MotionReplay, z: np.ndarray, start: np.ndarray, change: np.ndarray | float = DIFFERENCE
     ) -> Linearised:
         """Return residuals and Jacobian at one point, (P,) and (I,), by one-sided differences in parallel worlds.
 
-        change: of each unknown, (P + I,). Where a world broke, the Jacobian is not a number. An exact
-        Jacobian (one-step adjoints over the recorded steps) would replace this method alone.
+        change: of each unknown, (P + I,). The Jacobian is NaN where a world diverges.
         """
         change = np.broadcast_to(change, len(z) + len(start))
-        many_z, many_start = (np.repeat(x[None], len(self.plan) + 1, axis=0) for x in (z, start))
+        many_z, many_start = (np.repeat(x[None], len(self.jacobian_worlds) + 1, axis=0) for x in (z, start))
         size = len(z)
-        for world, columns in enumerate(self.plan, 1):
+        for world, columns in enumerate(self.jacobian_worlds, 1):
             for column, _ in columns:
                 if column < size:
                     many_z[world, column] += change[column]
                 else:
                     many_start[world, column - size] += change[column]
-        found = self.residuals(replay, many_z, many_start)
-        if not np.isfinite(found).all():
-            return Linearised(found[:, 0], np.full((len(found), size + self.start_size), math.nan))
-        differences = found[:, 1:] - found[:, :1]
-        leg = np.broadcast_to(self._leg, self.measured.shape)[self.valid]
-        jacobian = np.zeros((len(found), size + self.start_size))
-        for world, columns in enumerate(self.plan):
-            for column, of_leg in columns:
+        residuals = self.residuals(replay, many_z, many_start)
+        if not np.isfinite(residuals).all():
+            return Linearised(residuals[:, 0], np.full((len(residuals), size + self.start_size), math.nan))
+        differences = residuals[:, 1:] - residuals[:, :1]
+        row_leg = np.broadcast_to(self._leg, self.measured.shape)[self.valid]
+        jacobian = np.zeros((len(residuals), size + self.start_size))
+        for world, columns in enumerate(self.jacobian_worlds):
+            for column, leg in columns:
                 slope = differences[:, world] / change[column]
-                jacobian[:, column] = slope if of_leg is None else np.where(leg == of_leg, slope, 0.0)
-        return Linearised(found[:, 0], jacobian)
+                jacobian[:, column] = slope if leg is None else np.where(row_leg == leg, slope, 0.0)
+        return Linearised(residuals[:, 0], jacobian)
 
-    def _plan(self) -> list[list[tuple[int, int | None]]]:
+    def residuals(self, replay: MotionReplay, z: np.ndarray, start: np.ndarray) -> np.ndarray:
+        """Return weighed residuals (m, N) of N points, (N, P) and (N, I); infinite where a world diverges."""
+        record, robots = self.run(replay, z, start)
+        error = self.sensor_readings(record, robots) - self.measured[:, :, None]
+        residuals = (error / self.sigma[:, None])[self.valid]
+        residuals[:, ~record.valid] = math.inf
+        return residuals
+
+    def run(self, replay: MotionReplay, z: np.ndarray, start: np.ndarray) -> tuple[Record, RobotValues]:
+        """Return the replay and the robots of N points, (N, P) and (N, I)."""
+        robots = self.parameters.robots(z, self.description)
+        motion = self.motion
+        record = replay.run(
+            robots, self.initial.states(start, robots), self.target, rows=self.rows, stride=self.stride, dt=self.dt,
+            lead=self.lead, base=motion.base, gains=motion.gains, torque_limit=motion.torque_limit,
+        )  # fmt: skip
+        return record, robots
+
+    def sensor_readings(self, record: Record, robots: RobotValues) -> np.ndarray:
+        """Return the sensors' readings of a replay, (n, columns, N); orientation as its error to the measurement."""
+        low = np.minimum(self._grid_row.astype(int), len(record.angle) - 1)
+        high = np.minimum(low + 1, len(record.angle) - 1)
+        fraction = (self._grid_row - low)[:, None, None]
+
+        def at_rows(values: np.ndarray) -> np.ndarray:
+            return values[low] if not fraction.any() else (1.0 - fraction) * values[low] + fraction * values[high]
+
+        columns = []
+        for name, _ in self.channels:
+            if name == "orientation":
+                simulated = np.moveaxis(at_rows(record.quaternion), 1, 2)
+                simulated = simulated / np.linalg.norm(simulated, axis=-1, keepdims=True)
+                measured = np.nan_to_num(np.asarray(self.motion.quaternion)) + np.array([0.0, 0.0, 0.0, 1.0e-12])
+                measured = measured / np.linalg.norm(measured, axis=-1, keepdims=True) * CONJUGATE
+                columns.append(np.moveaxis(to_vector(multiply(simulated, measured[:, None])), 1, 2))
+            else:
+                values = at_rows(getattr(record, name))
+                columns.append(values + robots.offset.T if name == "angle" else values)
+        return np.concatenate(columns, axis=1)
+
+    def _plan_jacobian(self) -> list[list[tuple[int, int | None]]]:
         """Return the columns (index, leg or None) that each world of the Jacobian changes.
 
-        While the base is held the legs do not feel each other: unknowns of four legs share a world.
+        While the base is held the legs do not interact: unknowns of four legs share a world.
         """
         size, single, shared = len(self.parameters), [], {}
-        known = (24, 25, 29, 32, 33, 34) if self.resting else ()
+        fixed = FIXED_AT_REST if self.initial.resting else ()
         for i, parameter in enumerate(self.parameters):
             if self.free:
                 single.append([(i, None)])
@@ -271,7 +220,7 @@ class MotionResiduals:
                 else:
                     shared.setdefault((parameter.quantity, parameter.places[0] % 3), []).append((i, parameter.leg))
         for i in range(self.start_size):
-            if i in known:
+            if i in fixed:
                 continue
             if self.free or i >= 24:
                 single.append([(size + i, None)])
@@ -280,36 +229,65 @@ class MotionResiduals:
         return [*single, *shared.values()]
 
 
-def quiet(rate: np.ndarray | None) -> bool:
-    """Return whether the joints hardly move in the first rows [rad/s]."""
-    if rate is None or np.isnan(rate[:QUIET_ROWS]).all(axis=0).any():
-        return False
-    return bool((np.abs(np.nanmean(rate[:QUIET_ROWS], axis=0)) < QUIET).all())
+def channel_noise(noise: NoiseLevels) -> dict[str, tuple[float, int]]:
+    """Return the standard deviation [SI] and the number of columns of each channel of the residuals.
+
+    Raises InputError: a level is not positive and finite.
+    """
+    noise.check()
+    return {
+        "angle": (math.radians(noise.angle), 12),
+        "rate": (math.radians(noise.rate), 12),
+        "torque": (noise.torque, 12),
+        "position": (1.0e-3 * noise.position, 3),
+        "orientation": (math.radians(noise.orientation), 3),
+    }
 
 
-def first_values(
-    values: np.ndarray | None, default: np.ndarray | None, prior: float, wide: float
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first value of each column that is measured, else the default, and how well it is known."""
-    if values is None:
-        default = np.zeros(12) if default is None else default
-        return default.copy(), np.full(len(default), wide)
-    found = np.zeros(values.shape[1]) if default is None else default.copy()
-    known = np.isfinite(values[:FIRST_ROWS]).any(axis=0)
-    for i in np.flatnonzero(known):
-        column = values[:FIRST_ROWS, i]
-        found[i] = column[np.isfinite(column)][0]
-    return found, np.where(known, prior, wide)
+def check_signs(motion: RecordedMotion) -> None:
+    """Raise InputError: a motor's angles are far from its targets, and less than half as far from the negated ones.
+
+    In motions of `recording` they are more than four times as far with the right signs, and less than a quarter as far
+    with the wrong ones: rounding does not matter. Motors that stay near 0 pass.
+    """
+    if motion.angle is None:
+        return
+    measured = np.isfinite(motion.angle)
+    errors = [np.where(measured, motion.angle - sign * motion.target, 0.0) for sign in (1.0, -1.0)]
+    rms, negated_rms = (np.sqrt(np.sum(e**2, axis=0) / np.maximum(measured.sum(axis=0), 1)) for e in errors)
+    wrong = np.flatnonzero((rms > FAR_APART) & (negated_rms < 0.5 * rms))
+    if len(wrong):
+        raise InputError(
+            f"motion {motion.name}: angles of {', '.join(MOTOR_JOINTS[i] for i in wrong)} have the sign opposite to "
+            "their targets: negate angle, rate and torque, or target, of these motors"
+        )
 
 
-def slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the slope of each column by least squares, 0 where fewer than three values are known."""
-    found = np.zeros(values.shape[1])
-    for i in range(values.shape[1]):
-        known = np.isfinite(values[:, i])
-        if known.sum() >= 3:
-            found[i] = np.polyfit(time[known] - time[0], values[known, i], 1)[0]
-    return found
+def rows_of(motion: RecordedMotion, first: int, end: int) -> RecordedMotion:
+    """Return the motion's rows from `first` to `end` - 1."""
+    if (first, end) == (0, len(motion.time)):
+        return motion
+    return replace(motion, **{name: values[first:end] for name, values in motion.columns().items()})
+
+
+def pieces_of(
+    motion: RecordedMotion,
+    parameters: ParameterSet,
+    noise: NoiseLevels,
+    description: RobotDescription,
+    dt: float | None,
+) -> list[MotionResiduals]:
+    """Return a motion in pieces of about `PIECE`, except those without measurements."""
+    rows = len(motion.time)
+    number = max(1, min(round(motion.duration / PIECE), rows // 4))
+    edges = [round(rows * i / number) for i in range(number + 1)]
+    pieces = []
+    for span in itertools.pairwise(edges):
+        try:
+            pieces.append(MotionResiduals(motion, parameters, noise, description, dt, span))
+        except NothingMeasured:
+            continue
+    return pieces
 
 
 def grid_steps(period: float, dt: float | None) -> tuple[int, float]:

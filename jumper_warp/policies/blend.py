@@ -1,34 +1,38 @@
-"""The mean of two policies' weights.
+"""Weight averaging of two policies (Wortsman et al. 2022, Robust fine-tuning of zero-shot models).
 
-Where one policy was trained on from the other, or both from a third, the networks in between act as policies too, and
-what one does better and the other worse can be weighed (Wortsman et al. 2022, Robust fine-tuning of zero-shot models).
+If one policy was fine-tuned from the other, or both from a third, the interpolated networks work as policies too, and
+trade off what each does better.
 """
 
 from __future__ import annotations
 
+import torch
+
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError
-from jumper_warp.rl.start import scaled_by
+from jumper_warp.rl.actor_init import rescale_inputs
 
 
-def blend(policy: Policy, other: Policy, share: float) -> Policy:
-    """Return (1 - share) policy + share other, weight by weight, with the normaliser and the configuration of policy.
+def blend(policy: Policy, other: Policy, fraction: float) -> Policy:
+    """Return the policy with weights (1 - fraction) policy + fraction other, and the normaliser of `policy`.
 
-    The other's first layer is written for that normaliser before. The configuration tells the share, and commit and
-    iteration of the other, as `blended`.
+    The other's first layer is first rescaled to that normaliser. The configuration is that of `policy`, with the
+    fraction and the other's commit and iteration under `blended`.
 
-    policy: what the blend is with share 0. other: what it is with share 1, within the limits of normalised
-    observations. share: from 0 to 1.
-    Raises PolicyError: they do not read and drive the same by networks of the same form, or the share is out of range.
+    fraction: 0 gives `policy`, 1 gives `other` within the limits of normalised observations.
+    Raises PolicyError: their interfaces differ, or the fraction is not in [0, 1].
     """
-    if not 0.0 <= share <= 1.0:
-        raise PolicyError(f"the share of a blend must be from 0 to 1, got {share}")
+    if not 0.0 <= fraction <= 1.0:
+        raise PolicyError(f"the share of a blend must be from 0 to 1, got {fraction}")
     if policy.interface != other.interface:
-        raise PolicyError("policies of a blend must read and drive the same by networks of the same form")
-    its = scaled_by(other.layers, other.mean, other.std, policy.mean, policy.std)
-    pairs = zip(policy.layers, its, strict=True)
-    layers = [
-        ((1.0 - share) * w.double() + share * v, (1.0 - share) * b.double() + share * c) for (w, b), (v, c) in pairs
-    ]
-    of = {"share": share, **{key: other.config[key] for key in ("commit", "iteration") if key in other.config}}
-    return Policy(layers, policy.mean, policy.std, policy.interface, policy.config | {"blended": of})
+        raise PolicyError("policies of a blend must have the same interface: observation, action and network sizes")
+    other_layers = rescale_inputs(other.layers, other.mean, other.std, policy.mean, policy.std)
+
+    def mix(mine: torch.Tensor, theirs: torch.Tensor) -> torch.Tensor:
+        return (1.0 - fraction) * mine.double() + fraction * theirs
+
+    pairs = zip(policy.layers, other_layers, strict=True)
+    layers = [(mix(w, other_w), mix(b, other_b)) for (w, b), (other_w, other_b) in pairs]
+    origin = {key: other.config[key] for key in ("commit", "iteration") if key in other.config}
+    blended = {"share": fraction, **origin}
+    return Policy(layers, policy.mean, policy.std, policy.interface, policy.config | {"blended": blended})

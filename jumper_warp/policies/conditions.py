@@ -1,4 +1,4 @@
-"""The conditions that a policy is tried in, and the environment of a policy in them."""
+"""Test conditions of a policy, and the environment of a policy in these conditions."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
 
 SHORTEST_LATENCY = 500.0 * PHYSICS_DT
-"""[ms] A shorter one would become none."""
+"""[ms] Half a physics step; a shorter latency would be rounded to 0."""
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a policy is tried in."""
+    """Test conditions of a policy."""
 
     solver: Literal["jumper", "mujoco"] = "jumper"
     """Physics: the dedicated solver, or Newton's SolverMuJoCo."""
@@ -37,7 +37,7 @@ class Conditions:
     noise: bool = False
     """Add the training's observation noise."""
     seed: int = 0
-    """Of randomisation and noise, 0 to 2147483647."""
+    """Seed of randomisation and noise, 0 to 2147483647."""
     device: str | None = None
     """Warp device (default: a GPU if there is one)."""
     threads: int | None = None
@@ -56,7 +56,7 @@ class Conditions:
     """[m/s^2] Downward (default: that of the task)."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a value out of range, a latency of no step, or pushes in flight where there are none."""
+        """Raise InputError if a value is out of range, or push_in_flight is set without randomize."""
         check_seed(self.seed)
         if self.latency is not None and 0.0 < self.latency < SHORTEST_LATENCY:
             least = f"{SHORTEST_LATENCY:.3g} ms, half a physics step"
@@ -69,14 +69,14 @@ class Conditions:
 
     @property
     def fixed(self) -> dict[str, Any]:
-        """Parameters that are neither nominal nor drawn."""
-        given = {name: getattr(self, name) for name in ("latency", "gains", "friction")}
-        return {name: value for name, value in given.items() if value is not None}
+        """Parameters with a value given here, which are neither nominal nor randomised."""
+        values = {name: getattr(self, name) for name in ("latency", "gains", "friction")}
+        return {name: value for name, value in values.items() if value is not None}
 
     def overlay(self, config: dict[str, Any]) -> RobotOverlay | None:
-        """Return the robot that a policy of this configuration is tried on; None: as described.
+        """Return the robot overlay: the one given here, else the one that `config` saves; None for the nominal robot.
 
-        Raises InputError or OSError: the overlay cannot be used.
+        config: configuration of a policy. Raises InputError or OSError: the overlay cannot be used.
         """
         if self.robot is not None:
             return load_overlay(self.robot)
@@ -84,26 +84,27 @@ class Conditions:
         return None if saved is None else RobotOverlay.from_json(saved)
 
     def env_settings(self, config: dict[str, Any]) -> dict[str, Any]:
-        """Return settings of `Env`; config: of a policy, as in `overlay`, and raises as it."""
+        """Return keyword arguments of `Env`. Argument and errors as for `overlay`."""
         same = {name: getattr(self, name) for name in ("seed", "device", "solver", "noise", "threads")}
         return {**same, "randomize": self.draws, "auto_reset": False, "robot": self.overlay(config)}
 
     @property
     def draws(self) -> bool:
-        """Whether the environment sets parameters at resets."""
+        """Whether the environment sets robot parameters at resets."""
         return self.randomize or bool(self.fixed)
 
     def _with_fixed(self, ranges: RandomizationCfg) -> RandomizationCfg:
+        """Return randomisation ranges with the `fixed` parameters set to their value."""
         return ranges.with_fixed(**self.fixed)
 
     def applied(self, task: TaskCfg) -> TaskCfg:
-        """Return a task as it is tried in these conditions; pushes come and go, however its training had it."""
+        """Return a task with these conditions applied to its gravity, randomisation and events."""
         task = (task if self.gravity is None else replace(task, gravity=self.gravity)).without_margins()
         trained = task.randomization
         if self.randomize:
             in_flight = trained.push_in_flight or self.push_in_flight
-            drawn = replace(self._with_fixed(trained.in_tests()), push_in_flight=in_flight)
-            return replace(task, randomization=drawn)
+            randomization = replace(self._with_fixed(trained.in_tests()), push_in_flight=in_flight)
+            return replace(task, randomization=randomization)
         if not self.fixed:
             return task
         nominal = RandomizationCfg.off().with_fixed(friction=trained.nominal_friction)
@@ -111,22 +112,16 @@ class Conditions:
 
 
 def env_of_policy(
-    policy: Policy,
-    num_envs: int,
-    conditions: Conditions,
-    *,
-    change: Callable[[TaskCfg], TaskCfg] | None = None,
-    modules: Iterable[ModuleType] = (),
-    **scene: Any,
-) -> Env:
-    """Return the environment that a policy was trained in, with other conditions.
+    policy: Policy, num_envs: int, conditions: Conditions, *, change: Callable[[TaskCfg], TaskCfg] | None = None,
+    modules: Iterable[ModuleType] = (), **scene: Any,
+) -> Env:  # fmt: skip
+    """Return the environment of a policy's task in some test conditions.
 
-    Without rewards, without what the critic sees, and unless randomised without events: so their functions need not be
-    found, and are not run.
+    It has no rewards, no critic observation, and events only if randomised, so that their functions are not needed.
 
-    policy: names the task in its configuration. change: returns the task that is wanted instead. modules: that the user
-    has named, for tasks that are not the project's. scene: more settings of `Env`, such as its ground.
-    Raises PolicyError: this version of the project cannot rebuild it, or its observation is not the policy's.
+    policy: its configuration holds the task. change: modifies the task, if given. modules: user modules with functions
+    of the task. scene: more arguments of `Env`, such as its ground.
+    Raises PolicyError: the task cannot be restored, or its observation is not the policy's.
     """
     from jumper_warp.envs.env import Env
 

@@ -1,9 +1,9 @@
-"""The folder that a policy is kept in.
+"""Saving and loading of a policy's folder.
 
 It holds `policy.onnx` (weights, normaliser, interface), `config.json` (interface, environment, training, commit,
-versions), whatever is added (`metrics.json`, a learning curve), and `manifest.json` with the SHA-256 of each of these.
-A `README.md` beside them is prose and not in the manifest. The sums find damage and mix-ups; they are no signature.
-Nothing that is loaded can execute code.
+versions), added files (`metrics.json`, a learning curve), and `manifest.json` with the SHA-256 of each of these. The
+manifest does not cover `README.md`. Checksums detect damage and mix-ups; they are not a signature. Loading executes no
+code.
 """
 
 from __future__ import annotations
@@ -20,16 +20,16 @@ from typing import Any
 
 import torch
 
-from jumper_warp.policies.onnx import onnx_bytes, policy_of_onnx
+from jumper_warp.policies.onnx import onnx_bytes, policy_from_onnx
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.utils.assets import ASSETS
-from jumper_warp.utils.checks import version_refusal
-from jumper_warp.utils.files import json_bytes, write_whole
+from jumper_warp.utils.checks import version_error
+from jumper_warp.utils.files import json_bytes, write_atomically
 from jumper_warp.utils.runtime import source_versions
 
 POLICIES = ASSETS / "policies"
-"""Where the project's own policies lie."""
+"""Folder of the project's own policies."""
 FORMAT = "jumper-warp policy"
 SCHEMA_VERSION = 3
 MANIFEST = "manifest.json"
@@ -37,20 +37,20 @@ CONFIG = "config.json"
 ONNX = "policy.onnx"
 README = "README.md"
 MAX_BYTES = 256 * 2**20
-"""Larger files are refused unread."""
+"""Larger files are refused without reading."""
 FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-NO_FOLDERS = (".pt", ".pth", ".onnx", ".safetensors")
-"""Ends of names that files have."""
+FILE_SUFFIXES = (".pt", ".pth", ".onnx", ".safetensors")
+"""Suffixes that a policy's folder may not have."""
 
 
 def save_policy(
     folder: Path, policy: Policy, *, files: Mapping[str, bytes] | None = None, overwrite: bool = False
 ) -> Path:
-    """Write a policy's folder, whole or not at all; return its path.
+    """Write a policy's folder atomically, and return its path.
 
-    Commit and versions are added to the policy's configuration unless it brings its own. files: more files by name,
-    such as a learning curve. overwrite: whether a policy that is there already is replaced, with all its files.
-    Raises PolicyError: the folder exists and is not to be overwritten, or is no policy's; or a name is malformed.
+    Commit and versions are added to the configuration if it has none. files: additional files by name, such as a
+    learning curve. overwrite: whether to replace an existing policy with all its files.
+    Raises PolicyError: the folder exists and overwrite is not set, or it is not a policy's; or a name is malformed.
     """
     folder = checked_folder(folder)
     if folder.exists() and not (overwrite and (folder / MANIFEST).is_file()):
@@ -78,35 +78,38 @@ def save_policy(
 
 
 def checked_folder(folder: Path) -> Path:
-    """Return where a policy is to be saved. Raises PolicyError: the name is that of a file."""
+    """Return the path of a policy's folder. Raises PolicyError: it has the suffix of a file."""
     folder = Path(folder)
-    if folder.suffix.lower() in NO_FOLDERS:
+    if folder.suffix.lower() in FILE_SUFFIXES:
         raise PolicyError(f"a policy is saved as a folder, whose name cannot end in {folder.suffix}: got {folder}")
     return folder
 
 
 def add_files(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Add or replace files of a policy, such as its plots. The rest of the folder is checked first.
+    """Add or replace files of a policy, such as its plots, after verifying the folder.
 
-    Raises PolicyError: the folder is not a whole policy, or a name is malformed or one of the policy's own.
+    Raises PolicyError: the folder is not an intact policy, or a name is malformed or one of the policy's own.
     """
     folder = Path(folder)
-    sums = _checked_sums(folder)
-    taken = sorted({CONFIG, ONNX, MANIFEST} & set(files))
-    if taken:
-        raise PolicyError(f"{folder}: {taken[0]} is the policy itself")
-    _write(folder, files, sums)
+    checksums = _verified_checksums(folder)
+    reserved = sorted({CONFIG, ONNX, MANIFEST} & set(files))
+    if reserved:
+        raise PolicyError(f"{folder}: {reserved[0]} is the policy itself")
+    _write(folder, files, checksums)
 
 
-def _write(folder: Path, files: Mapping[str, bytes], sums: Mapping[str, str]) -> None:
-    """Write files, and last the manifest of these and of `sums`."""
+def _write(folder: Path, files: Mapping[str, bytes], checksums: Mapping[str, str]) -> None:
+    """Write files, then the manifest with their SHA-256 besides `checksums`, those of the folder's other files."""
     for name in files:
         if not FILE_NAME.fullmatch(name) or name == MANIFEST:
             raise PolicyError(f"a policy cannot hold a file named {name!r:.60}")
-    sums = {**sums, **{name: hashlib.sha256(data).hexdigest() for name, data in files.items() if name != README}}
-    manifest = {"format": FORMAT, "schema_version": SCHEMA_VERSION, "sha256": dict(sorted(sums.items()))}
+    checksums = {
+        **checksums,
+        **{name: hashlib.sha256(data).hexdigest() for name, data in files.items() if name != README},
+    }
+    manifest = {"format": FORMAT, "schema_version": SCHEMA_VERSION, "sha256": dict(sorted(checksums.items()))}
     for name, data in {**files, MANIFEST: json_bytes(manifest)}.items():
-        write_whole(folder / name, data)
+        write_atomically(folder / name, data)
 
 
 def list_policies() -> tuple[str, ...]:
@@ -115,67 +118,70 @@ def list_policies() -> tuple[str, ...]:
 
 
 def find_policy(name: str | Path) -> Path:
-    """Return the folder of one of the project's policies by name (- for _ will do), or a policy's folder.
+    """Return the folder of a policy, given the name of one of the project's (- counts as _) or a folder.
 
     Raises PolicyError: there is none.
     """
     text = str(name)
-    own = POLICIES / text.replace("-", "_")
-    if FILE_NAME.fullmatch(text) and (own / MANIFEST).is_file():
-        return own
+    project_folder = POLICIES / text.replace("-", "_")
+    if FILE_NAME.fullmatch(text) and (project_folder / MANIFEST).is_file():
+        return project_folder
     if not Path(name).is_dir():
         raise PolicyError(f"no policy {text!r}: give a policy's folder or one of: {', '.join(list_policies()) or '-'}")
     return Path(name)
 
 
 def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
-    """Return a policy by name or folder, with every file checked. See `find_policy`.
+    """Return a policy by name or folder (see `find_policy`), after verifying every file.
 
     Raises PolicyError: the policy is missing, truncated, altered, of another version, or its weights are not finite or
-    not of the shape that its configuration asks for.
+    not of the shape in its configuration.
     """
     folder = find_policy(name)
-    sums = _checked_sums(folder)
-    config = _json(folder / CONFIG, _checked_bytes(folder / CONFIG, sums[CONFIG]))
+    checksums = _verified_checksums(folder)
+    config = _parse_json(folder / CONFIG, _read_verified(folder / CONFIG, checksums[CONFIG]))
     _check_version(folder / CONFIG, config)
-    data = _checked_bytes(folder / ONNX, sums[ONNX])
+    data = _read_verified(folder / ONNX, checksums[ONNX])
     try:
         interface = PolicyInterface.from_json(config.get("interface"))
-        return policy_of_onnx(data, interface, config).to(device)
+        return policy_from_onnx(data, interface, config).to(device)
     except PolicyError as error:
         raise PolicyError(f"{folder}: {error}") from error
 
 
-def _checked_sums(folder: Path) -> dict[str, str]:
-    """Return the sums of a manifest of this version, with all its files present and unaltered."""
+def _verified_checksums(folder: Path) -> dict[str, str]:
+    """Return the manifest's SHA-256 by file name, after verifying version and files. Raises PolicyError."""
     path = folder / MANIFEST
-    manifest = _json(path, _bytes(path))
+    manifest = _parse_json(path, _read_bytes(path))
     if manifest.get("format") != FORMAT:
         raise PolicyError(f"{path}: not the manifest of a {FORMAT}")
     _check_version(path, manifest)
-    sums = manifest.get("sha256")
-    if not isinstance(sums, dict) or not {CONFIG, ONNX} <= set(sums):
-        raise PolicyError(f"{path}: lacks the sums of {CONFIG} and {ONNX}")
-    for name, digest in sums.items():
+    checksums = manifest.get("sha256")
+    if not isinstance(checksums, dict) or not {CONFIG, ONNX} <= set(checksums):
+        raise PolicyError(f"{path}: lacks the checksums of {CONFIG} and {ONNX}")
+    for name, digest in checksums.items():
         if not FILE_NAME.fullmatch(name):
             raise PolicyError(f"{path}: names a file {name!r:.60}")
-        _checked_bytes(folder / name, digest)
-    return sums
+        _read_verified(folder / name, digest)
+    return checksums
 
 
 def _check_version(path: Path, content: Mapping[str, Any]) -> None:
-    if (found := content.get("schema_version")) != SCHEMA_VERSION:
-        raise PolicyError(f"{path}: {version_refusal(f'{found!r:.20}', SCHEMA_VERSION)}")
+    """Raise PolicyError unless a JSON file's content has the present schema version."""
+    if (version := content.get("schema_version")) != SCHEMA_VERSION:
+        raise PolicyError(f"{path}: {version_error(f'{version!r:.20}', SCHEMA_VERSION)}")
 
 
-def _checked_bytes(path: Path, digest: Any) -> bytes:
-    data = _bytes(path)
+def _read_verified(path: Path, digest: Any) -> bytes:
+    """Return a file's content. Raises PolicyError: it cannot be read, or its SHA-256 is not `digest`."""
+    data = _read_bytes(path)
     if hashlib.sha256(data).hexdigest() != digest:
         raise PolicyError(f"{path}: truncated or altered, its SHA-256 is not the manifest's")
     return data
 
 
-def _bytes(path: Path) -> bytes:
+def _read_bytes(path: Path) -> bytes:
+    """Return a file's content. Raises PolicyError: it cannot be read, is not a regular file, or is too large."""
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):
@@ -187,10 +193,11 @@ def _bytes(path: Path) -> bytes:
         raise PolicyError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def _json(path: Path, data: bytes) -> dict[str, Any]:
+def _parse_json(path: Path, data: bytes) -> dict[str, Any]:
+    """Return a JSON object; path: for errors. Raises PolicyError: it is not one, or has NaN or invalid characters."""
     try:
         content = json.loads(data)
-        json_bytes(content)  # neither NaN nor half a character, which could not be written again
+        json_bytes(content)  # refuses what could not be saved again
     except (ValueError, RecursionError) as error:
         raise PolicyError(f"{path}: not JSON ({type(error).__name__})") from error
     if not isinstance(content, dict):
@@ -199,11 +206,12 @@ def _json(path: Path, data: bytes) -> dict[str, Any]:
 
 
 def default_readme(policy: Policy) -> str:
-    """Return a few lines on what a policy's folder holds and how to use it."""
-    face = policy.interface
+    """Return the README of a policy's folder: its content and usage."""
+    interface = policy.interface
+    rate = 1.0 / interface.policy_dt
     return (
-        f"# Policy for {face.task}\n\n"
-        f"Reads {face.sizes[0]} numbers, drives {face.sizes[-1]} motors at {1.0 / face.policy_dt:.0f} Hz.\n"
+        f"# Policy for {interface.task}\n\n"
+        f"Reads {interface.sizes[0]} numbers, drives {interface.sizes[-1]} motors at {rate:.0f} Hz.\n"
         f"`{ONNX}` holds the network with its normaliser, `{CONFIG}` everything that made it.\n\n"
         "    jumper play FOLDER\n"
         "    jumper evaluate FOLDER\n"

@@ -1,4 +1,4 @@
-"""Trained policies: the network that acts."""
+"""Trained policies: the actor network with its observation normaliser."""
 
 from __future__ import annotations
 
@@ -10,34 +10,30 @@ from torch import nn
 
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.rl.mirror import Weights
-from jumper_warp.rl.networks import ACTIVATIONS, weights_of
+from jumper_warp.rl.networks import ACTIVATIONS, linear_layers
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.normalise import normalise
 
-LARGEST = 1.0e38
-"""Below the largest number of single precision."""
+MAX_OUTPUT = 1.0e38
+"""Bound of layer outputs, below the largest float32."""
 
 
 class Policy(nn.Module):
-    """The actor with its normaliser. `act` is the whole way from raw observations to actions."""
+    """Actor network with its observation normaliser; `act` maps raw observations to actions."""
 
     mean: torch.Tensor
     std: torch.Tensor
 
     def __init__(
-        self,
-        layers: Weights,
-        mean: torch.Tensor,
-        std: torch.Tensor,
-        interface: PolicyInterface,
+        self, layers: Weights, mean: torch.Tensor, std: torch.Tensor, interface: PolicyInterface,
         config: Mapping[str, Any] | None = None,
-    ) -> None:
+    ) -> None:  # fmt: skip
         """Copy the tensors, as float32.
 
-        mean, std: (num_obs,) what is subtracted from raw observations, and what they are divided by. config: what else
-        made the policy, as JSON holds it: environment, training.
-        Raises PolicyError: a tensor has another shape than the interface asks for, is not finite or so large that an
-        action would not be, or std is not positive.
+        layers: weight (out, in) and bias (out,) of each layer. mean, std: (num_obs,) of raw observations. interface:
+        layout of observation and action, and network sizes. config: JSON configuration of environment and training.
+        Raises PolicyError: a tensor does not have the interface's shape, is not finite, or is so large that an action
+        could overflow; or std is not positive.
         """
         super().__init__()
         self.interface = interface
@@ -61,25 +57,24 @@ class Policy(nn.Module):
 
     @property
     def layers(self) -> Weights:
-        """Weight and bias of each layer."""
-        return weights_of(self.actor)
+        """Weight (out, in) and bias (out,) of each layer."""
+        return linear_layers(self.actor)
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Return all tensors by the names that they are saved under, on the CPU."""
-        found = {"normaliser.mean": self.mean, "normaliser.std": self.std}
+        """Return all tensors, on the CPU, by the names under which they are saved."""
+        tensors = {"normaliser.mean": self.mean, "normaliser.std": self.std}
         for i, (weight, bias) in enumerate(self.layers):
-            found |= {f"actor.{i}.weight": weight, f"actor.{i}.bias": bias}
-        return {name: tensor.detach().cpu().contiguous() for name, tensor in found.items()}
+            tensors |= {f"actor.{i}.weight": weight, f"actor.{i}.bias": bias}
+        return {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor) -> torch.Tensor:
-        """Return the mean action clipped to ±1, (..., num_actions) in single precision, for raw observations.
+        """Return the mean action clipped to ±1, (..., num_actions) float32, for raw observations.
 
-        Entries of an observation that are not finite count as 0. Nothing waits for the device.
+        Entries of an observation that are not finite count as 0. There is no host synchronisation.
 
-        obs: (..., num_obs), a tensor on the policy's device, of any kind of numbers.
-
-        Raises ValueError: no tensor, or the last axis has another size than the policy's observation.
+        obs: (..., num_obs) tensor on the policy's device, of any numeric type.
+        Raises ValueError: obs is not a tensor, or its last axis does not have num_obs entries.
         """
         if not isinstance(obs, torch.Tensor):
             raise InputError(f"the policy reads a torch tensor, got {type(obs).__name__}: torch.as_tensor makes one")
@@ -93,7 +88,7 @@ class Policy(nn.Module):
 
 
 def check_tensors(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface) -> None:
-    """Raise a PolicyError unless names, shapes and values are those of a usable policy of this interface."""
+    """Raise PolicyError unless names, shapes and values of tensors are valid for a policy of this interface."""
     sizes = interface.sizes
     expected = {"normaliser.mean": (sizes[0],), "normaliser.std": (sizes[0],)}
     for i in range(len(sizes) - 1):
@@ -113,11 +108,11 @@ def check_tensors(tensors: Mapping[str, torch.Tensor], interface: PolicyInterfac
 
 
 def _check_overflow(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface) -> None:
-    """Raise a PolicyError if there may be an observation for which a layer leaves single precision."""
-    reach = torch.full((interface.sizes[0],), interface.normalised_limit, dtype=torch.float64)
+    """Raise PolicyError if a layer's output could overflow float32 for some observation, by interval bounds."""
+    bound = torch.full((interface.sizes[0],), interface.normalised_limit, dtype=torch.float64)
     for i in range(len(interface.sizes) - 1):
-        reach = tensors[f"actor.{i}.weight"].double().abs() @ reach + tensors[f"actor.{i}.bias"].double().abs()
-        if not reach.max() < LARGEST:
+        bound = tensors[f"actor.{i}.weight"].double().abs() @ bound + tensors[f"actor.{i}.bias"].double().abs()
+        if not bound.max() < MAX_OUTPUT:
             raise PolicyError(f"the weights of layer {i} are so large that its outputs may overflow")
-        # no activation is larger than what it is given, or than 1
-        reach = torch.ones_like(reach) if interface.activation == "tanh" else reach.clamp(min=1.0)
+        # an activation's output is at most its input, or 1
+        bound = torch.ones_like(bound) if interface.activation == "tanh" else bound.clamp(min=1.0)

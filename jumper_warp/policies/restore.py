@@ -1,6 +1,6 @@
-"""The task that a policy's or a run's configuration saved.
+"""Restoring of the task that a policy's or a run's configuration holds.
 
-Configurations are data: functions are looked up in the project's modules and in those that the user has named.
+Configurations are data: functions are looked up in the project's modules and in the modules that the user names.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json
 def task_of_policy(
     policy: Policy, modules: Iterable[ModuleType] = (), *, leave_out: Collection[str] = OPTIONAL
 ) -> TaskCfg:
-    """Return a policy's task, as `restored_task`. Raises PolicyError also if its observation is not the policy's."""
+    """Return a policy's task as `restored_task`; raises PolicyError also if its observation is not the policy's."""
     task = restored_task(policy.config, modules, leave_out=leave_out)
     if task.observation_names != policy.interface.observation_names:
         raise PolicyError("the policy's observation is not the one that this version of its task gives")
@@ -28,12 +28,12 @@ def task_of_policy(
 def restored_task(
     config: dict[str, Any], modules: Iterable[ModuleType] = (), *, leave_out: Collection[str] = OPTIONAL
 ) -> TaskCfg:
-    """Return the task of a saved configuration, from its entry `env` (`Env.config`).
+    """Return the task in the entry `env.task` of a saved configuration.
 
-    config: what a policy or a run was made with. modules: that the user has named; functions that are not the project's
-    are looked up there. leave_out: sections that are not wanted, and whose functions need not be found; by default all
-    that only a training needs.
-    Raises PolicyError: the configuration is not of a task that is known here.
+    config: configuration of a policy or a run. modules: user modules in which functions from outside the project are
+    looked up. leave_out: sections to leave empty, whose functions are not looked up (default: those that only a
+    training needs).
+    Raises PolicyError: the configuration has no task, or it cannot be restored.
     """
     try:
         return task_from_json(config["env"]["task"], modules, leave_out=leave_out)

@@ -1,48 +1,42 @@
-"""Policies by name, folder or training run: the actor of a checkpoint, and the learning curve of its run."""
+"""Loading of policies by name, folder, run or checkpoint, and the learning curve of a run."""
 
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
+
+import torch
 
 from jumper_warp.envs.vec_env import RAW_LIMIT
 from jumper_warp.policies.folder import load_policy
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, make_interface
-from jumper_warp.rl.checkpoint import (
-    DAMAGE,
-    CheckpointError,
-    best_checkpoint,
-    latest_checkpoint,
-    load_checkpoint,
-    one_line,
-)
-from jumper_warp.rl.mirror import Symmetry, image, plain_layers
-from jumper_warp.rl.networks import EPS, NORMALISED_LIMIT
+from jumper_warp.rl import checkpoint as checkpoints
+from jumper_warp.rl.checkpoint import DECODE_ERRORS, CheckpointError, one_line_message
+from jumper_warp.rl.metrics_file import METRICS_FILE
+from jumper_warp.rl.mirror import Symmetry, Weights, expand_layers, mirror_map
+from jumper_warp.rl.networks import NORMALISED_LIMIT, VARIANCE_EPS
 from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.tasks.saving import TaskError, check_version
 
-if TYPE_CHECKING:
-    import torch
-
-METRICS = "metrics.jsonl"
 CURVE = (
     "iteration", "Perf/elapsed_s", "Train/mean_return", "Train/mean_length", "Metrics/success", "Metrics/score",
 )  # fmt: skip
-"""Columns of a learning curve that a policy's folder keeps."""
+"""Columns of a saved learning curve."""
 CURVE_ROWS = 60
-"""Most rows of it, evenly spaced."""
+"""Maximum number of its rows, evenly spaced."""
 
 
 def is_run(source: str | Path) -> bool:
-    """Return whether this is a training run's folder or a checkpoint."""
+    """Return whether `source` is a training run's folder or a checkpoint."""
     source = Path(source)
     return source.suffix == ".pt" or (source / CHECKPOINTS).is_dir()
 
 
 def open_policy(source: str | Path, *, newest: bool = False) -> Policy:
-    """Return a policy by name or folder, or that of a run's best (or newest) checkpoint or of a checkpoint.
+    """Return the policy of a name, a policy's folder, a checkpoint, or a run's best (or newest) checkpoint.
 
     Raises PolicyError or CheckpointError: there is none, or it cannot be used.
     """
@@ -50,68 +44,114 @@ def open_policy(source: str | Path, *, newest: bool = False) -> Policy:
         return load_policy(source)
     path = Path(source)
     if path.suffix != ".pt" and newest:
-        newest_checkpoint = latest_checkpoint(path / CHECKPOINTS)
-        return _policy_of_checkpoint(newest_checkpoint.path, newest_checkpoint.state)
-    path = path if path.suffix == ".pt" else best_checkpoint(path / CHECKPOINTS)
-    return _policy_of_checkpoint(path, load_checkpoint(path))
+        checkpoint = checkpoints.latest_checkpoint(path / CHECKPOINTS)
+        return _policy_of_checkpoint(checkpoint.path, checkpoint.state)
+    path = path if path.suffix == ".pt" else checkpoints.best_checkpoint(path / CHECKPOINTS)
+    return _policy_of_checkpoint(path, checkpoints.load_checkpoint(path))
+
+
+@dataclass(frozen=True)
+class CheckpointContents:
+    """Typed contents of a training checkpoint that make up its policy."""
+
+    config: dict[str, Any]  # configuration of the policy: of the run, with commit, dirty and iteration
+    interface: dict[str, Any]  # description of observation and action, as `jumper_warp.tasks.interface` makes it
+    policy_dt: float  # [s]
+    physics_dt: float  # [s]
+    activation: str
+    hidden: tuple[int, ...]  # widths of the hidden layers of `layers`
+    layers: Weights  # weight (out, in) and bias (out,) of each layer of the actor as a plain network
+    mean: torch.Tensor  # (num_obs,) mean of raw observations
+    std: torch.Tensor  # (num_obs,) standard deviation that observations are divided by
+
+    @classmethod
+    def from_dict(cls, state: dict[str, Any]) -> CheckpointContents:
+        """Return the contents of a loaded checkpoint.
+
+        Raises TaskError: its task has another version. CheckpointError: a part is missing or of another type.
+        """
+        try:
+            config = json.loads(state["config"])
+            env, ppo = config["env"], config["train"]["ppo"]
+            check_version(env["task"])
+            model = state["ppo"]["model"]
+            commit = config.get("commit") or {"hash": None, "dirty": None}
+            config |= {"commit": commit["hash"], "dirty": commit["dirty"], "iteration": state["iteration"]}
+            layers, hidden = _actor_layers(model), tuple(ppo["hidden"])
+            if symmetry := _symmetry(model):
+                layers, hidden = expand_layers(layers, symmetry), tuple(2 * width for width in hidden)
+            mean, var = _tensor(model, "obs_moments.mean"), _tensor(model, "obs_moments.var")
+            return cls(
+                config, dict(env["interface"]), env["policy_dt_s"], env["physics_dt_s"], ppo["activation"], hidden,
+                layers, mean.float(), (var + VARIANCE_EPS).sqrt().float(),
+            )  # fmt: skip
+        except TaskError:
+            raise
+        except DECODE_ERRORS as error:
+            reason = f"{type(error).__name__}: {one_line_message(error)}"
+            raise CheckpointError(f"not of a training of this project ({reason})") from error
+
+    def policy(self) -> Policy:
+        """Return the policy. Raises PolicyError: interface, layers and statistics do not fit each other."""
+        description = {**self.interface, "observation_limit": RAW_LIMIT, "normalised_limit": NORMALISED_LIMIT}
+        network = {"hidden": self.hidden, "activation": self.activation}
+        interface = make_interface(description, policy_dt=self.policy_dt, physics_dt=self.physics_dt, **network)
+        return Policy(self.layers, self.mean, self.std, interface, self.config)
 
 
 def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
-    """Return the actor of a checkpoint with the interface that its configuration describes."""
+    """Return the policy of a loaded checkpoint; errors name its path."""
     try:
-        config = json.loads(state["config"])
-        env, ppo = config["env"], config["train"]["ppo"]
-        check_version(env["task"])
-        model = state["ppo"]["model"]
-        names = [key for key in model if key.startswith("actor.") and key.endswith(".weight")]
-        names.sort(key=lambda key: int(key.split(".")[1]))
-        layers = [(model[name], model[name.removesuffix("weight") + "bias"]) for name in names]
-        mean = model["obs_moments.mean"].float()
-        std = (model["obs_moments.var"] + EPS).sqrt().float()
-        times = {"policy_dt": env["policy_dt_s"], "physics_dt": env["physics_dt_s"]}
-        shape = {"hidden": tuple(ppo["hidden"]), "activation": ppo["activation"]}
-        if symmetry := _symmetry(model):
-            layers, shape["hidden"] = plain_layers(layers, symmetry), tuple(2 * width for width in ppo["hidden"])
-        commit = config.get("commit") or {"hash": None, "dirty": None}
-        config |= {"commit": commit["hash"], "dirty": commit["dirty"], "iteration": state["iteration"]}
-        described = {**env["interface"], "observation_limit": RAW_LIMIT, "normalised_limit": NORMALISED_LIMIT}
-        return Policy(layers, mean, std, make_interface(described, **times, **shape), config)
-    except TaskError as error:
-        raise CheckpointError(f"{path}: {error}") from error
+        return CheckpointContents.from_dict(state).policy()
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from error
-    except DAMAGE as error:
-        said = f"not of a training of this project ({type(error).__name__}: {one_line(error)})"
-        raise CheckpointError(f"{path}: {said}") from error
+    except (TaskError, CheckpointError) as error:
+        raise CheckpointError(f"{path}: {error}") from error
+
+
+def _tensor(model: dict[str, Any], name: str) -> torch.Tensor:
+    """Return a dense tensor of a model's state. Raises LookupError or TypeError: there is none."""
+    tensor = model[name]
+    if not isinstance(tensor, torch.Tensor) or tensor.layout != torch.strided:
+        raise TypeError(f"{name} must be a dense tensor, got {type(tensor).__name__}")
+    return tensor
+
+
+def _actor_layers(model: dict[str, Any]) -> Weights:
+    """Return weight and bias of each of the actor's layers, first to last, from a model's state."""
+    names = [key for key in model if key.startswith("actor.") and key.endswith(".weight")]
+    names.sort(key=lambda key: int(key.split(".")[1]))
+    return [(_tensor(model, name), _tensor(model, name.removesuffix("weight") + "bias")) for name in names]
 
 
 def _symmetry(model: dict[str, torch.Tensor]) -> Symmetry | None:
-    """Return the symmetry of a checkpoint's actor, if it has one by its form."""
+    """Return the symmetry of a checkpoint's actor; None if it is a plain network."""
     if not any(name.startswith("mirror_") for name in model):
         return None
     parts = ((model[f"mirror_{name}_order"], model[f"mirror_{name}_signs"], name) for name in Symmetry._fields)
-    return Symmetry(*(image(*part) for part in parts))
+    return Symmetry(*(mirror_map(*part) for part in parts))
 
 
 def learning_curve(source: Path) -> bytes | None:
-    """Return the metrics of a run or of a checkpoint's run, one JSON object a line; None if there are none.
-
-    They are those of CURVE, in at most CURVE_ROWS lines, the first and the last among them.
-    """
+    """Return the learning curve of a run or a checkpoint's run as `thinned_curve`; None without a metrics file."""
     run = source.parents[1] if source.suffix == ".pt" else source
-    path = run / METRICS
-    return short_curve(path.read_bytes()) if path.is_file() else None
+    path = run / METRICS_FILE
+    return thinned_curve(path.read_bytes()) if path.is_file() else None
 
 
-def short_curve(logged: bytes) -> bytes:
-    """Return what a policy's folder keeps of logged metrics; a line that is not whole is left out."""
-    rows = [row for line in logged.splitlines() if (row := _row(line))]
+def thinned_curve(metrics: bytes) -> bytes:
+    """Return the columns CURVE of a metrics file, one JSON object a line, in at most CURVE_ROWS evenly spaced lines.
+
+    The first and the last line are among them; malformed lines are left out.
+    """
+    rows = [row for line in metrics.splitlines() if (row := _curve_row(line))]
     last = len(rows) - 1
     kept = rows if last < CURVE_ROWS else [rows[round(i * last / (CURVE_ROWS - 1))] for i in range(CURVE_ROWS)]
     return "".join(f"{json.dumps(row)}\n" for row in kept).encode()
 
 
-def _row(line: bytes) -> dict[str, Any]:
+def _curve_row(line: bytes) -> dict[str, Any]:
+    """Return the columns CURVE of a line of metrics; empty for a malformed line."""
     try:
         row = json.loads(line)
         return {name: row[name] for name in CURVE if name in row}

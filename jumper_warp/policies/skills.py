@@ -1,4 +1,4 @@
-"""Several policies on one robot: walking and jumps."""
+"""Policies for walking and jumps on one robot, as skills of one environment."""
 
 from __future__ import annotations
 
@@ -24,21 +24,21 @@ WALK, JUMP_UP, JUMP_TO = range(3)
 
 @dataclass(frozen=True)
 class SkillNames:
-    """Policies of one robot, by name or folder."""
+    """Name or folder of the policy of each skill."""
 
     walk: str = "walking_flat"
     """Follows velocities."""
     jump_up: str = "vertical_jump"
     """Jumps to a height."""
     jump_to: str = "horizontal_jump"
-    """Jumps to a place."""
+    """Jumps to a position."""
 
 
 class SkillPolicies:
-    """Opens the policies of one robot, makes its environment, and acts in it."""
+    """Policies of the three skills, with the environment that they act in."""
 
     def __init__(self, names: SkillNames | None = None) -> None:
-        """Open policies. Raises PolicyError or CheckpointError: one cannot be used, or is of another kind of task."""
+        """Open the policies. Raises PolicyError or CheckpointError: one cannot be used, or has another kind of task."""
         self.names = SkillNames() if names is None else names
         sources = (self.names.walk, self.names.jump_up, self.names.jump_to)
         self.policies = [open_policy(source) for source in sources]
@@ -50,10 +50,10 @@ class SkillPolicies:
                 raise PolicyError(
                     f"this needs a policy that is evaluated by {' or '.join(kinds)}, got one of {task.name}"
                 )
-        self.skills, self.handovers = self._in(Conditions())
+        self.skills, self.handovers = self._skills_and_handovers(Conditions())
 
-    def _in(self, conditions: Conditions) -> tuple[list[TaskCfg], list[Handover]]:
-        """Return the tasks in some conditions and their handovers. Raises PolicyError: these are no such tasks."""
+    def _skills_and_handovers(self, conditions: Conditions) -> tuple[list[TaskCfg], list[Handover]]:
+        """Return the tasks in some conditions, and the handovers between them. Raises PolicyError."""
         walk, *jumps = (conditions.applied(task) for task in self.tasks)
         try:
             return skills_and_handovers(walk, tuple(jumps))
@@ -61,10 +61,10 @@ class SkillPolicies:
             raise PolicyError(str(error)) from error
 
     def env(self, count: int, conditions: Conditions, **scene: Any) -> Env:
-        """Return an environment of robots that walk first; scene: more settings of `Env`. Raises as `Env`."""
+        """Return an environment of `count` robots that start walking; scene: more arguments of `Env`."""
         from jumper_warp.envs.env import Env
 
-        self.skills, self.handovers = self._in(conditions)
+        self.skills, self.handovers = self._skills_and_handovers(conditions)
         settings = conditions.env_settings({})
         env = Env(self.skills, count, skill=WALK, handovers=self.handovers, **settings, **scene)
         for policy in self.policies:
@@ -72,7 +72,7 @@ class SkillPolicies:
         return env
 
     def act(self, env: Env) -> torch.Tensor:
-        """Return every skill's actions for its observations, (skills, num_envs, 12); nothing waits for the device."""
+        """Return every skill's action for its observation, (skills, num_envs, 12), without host synchronisation."""
         return torch.stack(
             [policy.act(skill.obs["actor"]) for policy, skill in zip(self.policies, env.skills, strict=True)]
         )

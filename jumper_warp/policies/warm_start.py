@@ -1,4 +1,4 @@
-"""Beginning a training with a policy: whether it reads and drives what the task does, and its actor."""
+"""Warm start of a training from a policy: check of its interface, and initialisation of the actor."""
 
 from __future__ import annotations
 
@@ -10,54 +10,56 @@ from typing import Any
 from jumper_warp.envs.vec_env import RAW_LIMIT
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyInterface
+from jumper_warp.rl.actor_init import ActorInit, make_actor_init
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.mirror import Symmetry, image
+from jumper_warp.rl.mirror import Symmetry, mirror_map
 from jumper_warp.rl.networks import NORMALISED_LIMIT
-from jumper_warp.rl.start import Start, make_start
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
 from jumper_warp.utils.errors import InputError
 
 
-def load_init_policy(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> Start:
-    """Return what a training of a task begins with to act as a policy does; source: as `open_policy` takes it.
+def actor_init_from_policy(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> ActorInit:
+    """Return the actor initialisation with which a training of a task acts as a policy.
 
-    Scales of actions, gains, torques, times and all that the environment does may be others than the policy's own.
+    source: as for `open_policy`. Observation and joints must agree; action scale, gains, torque limits and time steps
+    may differ.
 
     Raises PolicyError or CheckpointError: there is no such policy, or it cannot be used. Raises InputError: its
-    observation or its joints are not the task's, or as `make_start`.
+    observation or its joints are not the task's, or as `make_actor_init`.
     """
     policy = open_policy(source)
     check_interface(policy.interface, interface(task))
-    symmetry = None
-    if cfg.symmetry == "actor":
-        obs, action = mirror_of(task, "actor"), mirror_of_action()
-        symmetry = Symmetry(image(*obs, "observation"), image(*action, "action"))
-    return make_start(policy.layers, policy.mean, policy.std, policy.interface.activation, cfg, symmetry)
+    symmetry = task_symmetry(task) if cfg.symmetry == "actor" else None
+    return make_actor_init(policy.layers, policy.mean, policy.std, policy.interface.activation, cfg, symmetry)
 
 
-def check_interface(face: PolicyInterface, described: dict[str, Any]) -> None:
-    """Raise InputError that names the first difference between what a policy and a task read and drive.
+def task_symmetry(task: TaskCfg) -> Symmetry:
+    """Return the mirror maps of a task's actor observation and action."""
+    return Symmetry(mirror_map(*mirror_of(task, "policy"), "observation"), mirror_map(*mirror_of_action(), "action"))
 
-    described: what `jumper_warp.tasks.interface` says of the task.
+
+def check_interface(policy: PolicyInterface, task: dict[str, Any]) -> None:
+    """Raise InputError with the first difference in observation or joints between a policy and a task.
+
+    task: its description by `jumper_warp.tasks.interface`.
     """
-    for what, own, other in _compared(face, described):
-        if own != other:
-            raise InputError(f"init_policy: {what}: the policy has {own}, the task {other}")
+    for what, policy_value, task_value in _compared_values(policy, task):
+        if policy_value != task_value:
+            raise InputError(f"init_policy: {what}: the policy has {policy_value}, the task {task_value}")
 
 
-def _compared(face: PolicyInterface, described: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yield what has to agree, of the policy and of the task."""
+def _compared_values(policy: PolicyInterface, task: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
+    """Yield the name, the policy's value and the task's value of everything that must agree."""
     for what, name in (("observation", "observation_names"), ("action", "joint_names")):
-        for column, pair in enumerate(zip_longest(getattr(face, name), described[name], fillvalue="none")):
-            yield f"{what} {column}", pair[0], pair[1]
-    layout = described["observation_layout"]
-    for name, term in face.observation_layout.items():  # none if they are not known
-        for key, own in term.items():
-            yield f"{key} of {name}", own, layout.get(name, {}).get(key, "none")
-    angles = zip(face.joint_names, face.default_joint_pos, described["default_joint_pos"], strict=True)
-    for joint, own, other in angles:
-        yield f"default angle [rad] of {joint}", round(own, 6), round(other, 6)
-    yield "limit of observations", face.observation_limit, RAW_LIMIT
-    yield "limit of observations in standard deviations", face.normalised_limit, NORMALISED_LIMIT
+        for column, names in enumerate(zip_longest(getattr(policy, name), task[name], fillvalue="none")):
+            yield f"{what} {column}", names[0], names[1]
+    for name, term in policy.observation_layout.items():  # empty if unknown
+        for key, value in term.items():
+            yield f"{key} of {name}", value, task["observation_layout"].get(name, {}).get(key, "none")
+    angles = zip(policy.joint_names, policy.default_joint_pos, task["default_joint_pos"], strict=True)
+    for joint, angle, task_angle in angles:
+        yield f"default angle [rad] of {joint}", round(angle, 6), round(task_angle, 6)
+    yield "limit of observations", policy.observation_limit, RAW_LIMIT
+    yield "limit of observations in standard deviations", policy.normalised_limit, NORMALISED_LIMIT

@@ -1,4 +1,4 @@
-"""Checkpoints that are written whole, carry a checksum, and are read without executing anything."""
+"""Checkpoint files: atomic writes, SHA-256 checksums, and loading without executing code."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ from typing import Any, NamedTuple
 import torch
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.files import write_atomically
 
 MANIFEST = "manifest.json"
-"""Beside the checkpoints: SHA-256, iteration and score of each."""
+"""File beside the checkpoints with SHA-256, iteration and score of each."""
 REQUIRED = {"iteration": int, "ppo": dict, "env": dict, "rng": dict, "config": str}
-"""What every checkpoint holds, and of which type."""
-DAMAGE = (LookupError, TypeError, ValueError, AttributeError, RuntimeError)
-"""What reading a part of a checkpoint raises that is missing or of another kind."""
+"""Required keys of a checkpoint, and the types of their values."""
+DECODE_ERRORS = (LookupError, TypeError, ValueError, AttributeError, RuntimeError)
+"""Exceptions raised on reading a part of a checkpoint that is missing or of another type."""
 
 
 class CheckpointError(InputError):
-    """A checkpoint that cannot be used, said in one line."""
+    """A checkpoint cannot be used; the message is one line."""
 
 
 class Checkpoint(NamedTuple):
-    """A checkpoint that was read."""
+    """A loaded checkpoint."""
 
     path: Path
-    state: dict[str, Any]
-    passed_over: list[str]
-    """Why newer ones cannot be used, a line each."""
+    state: dict[str, Any]  # contents, with at least the keys of REQUIRED
+    skipped: list[str]  # reasons why newer checkpoints cannot be used, one line each
 
 
-def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = None, keep: int = 3) -> Path:
-    """Save tensors, numbers and strings as `iteration_XXXXXX.pt`, and return its path.
+def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = None, max_checkpoints: int = 3) -> Path:
+    """Save a state as `iteration_XXXXXX.pt`, remove old checkpoints, and return the new path.
 
-    folder: made if need be. state: has at least the keys of REQUIRED. score: the higher, the better, NaN is none; the
-    best checkpoint is never removed. keep: how many of the last saved stay, at least 1.
+    folder: created if missing. state: tensors, numbers and strings, with at least the keys of REQUIRED. score: higher
+    is better, NaN counts as None; the best checkpoint is never removed. max_checkpoints: number of newest checkpoints
+    to keep besides, at least 1.
     Raises OSError: the disk is full or the folder cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -47,26 +47,26 @@ def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = N
     torch.save(state, buffer)
     data = buffer.getvalue()
     path = folder / f"iteration_{state['iteration']:06d}.pt"
-    write_whole(path, data)
+    write_atomically(path, data)
     manifest = _read_manifest(folder, missing_ok=True)
-    manifest.pop(path.name, None)  # the order is that of saving
+    manifest.pop(path.name, None)  # the order of entries is the order of saving
     digest = hashlib.sha256(data).hexdigest()
     manifest[path.name] = {"sha256": digest, "iteration": state["iteration"], "score": score}
-    kept = [*list(manifest)[-keep:], _best(manifest)]
-    old = [name for name in manifest if name not in kept]
-    for name in old:
+    kept = [*list(manifest)[-max_checkpoints:], _best(manifest)]
+    removed = [name for name in manifest if name not in kept]
+    for name in removed:
         del manifest[name]
-    write_whole(folder / MANIFEST, json.dumps(manifest, indent=1).encode())
-    for name in old:
+    write_atomically(folder / MANIFEST, json.dumps(manifest, indent=1).encode())
+    for name in removed:
         (folder / name).unlink(missing_ok=True)
     return path
 
 
 def load_checkpoint(path: Path) -> dict[str, Any]:
-    """Return what was saved, on the CPU.
+    """Return the state that `save_checkpoint` saved, on the CPU.
 
     Raises CheckpointError: the file is missing, has no checksum, differs from it, or is no checkpoint; or its iteration
-    is not the one of the manifest.
+    differs from the manifest.
     """
     entry = _read_manifest(path.parent).get(path.name)
     if not path.is_file():
@@ -82,35 +82,35 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     try:
         state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
     except Exception as error:  # a damaged pickle raises anything
-        raise CheckpointError(f"{path}: not readable as tensors: {one_line(error)}") from error
+        raise CheckpointError(f"{path}: not readable as tensors: {one_line_message(error)}") from error
     if missing := [key for key in REQUIRED if not isinstance(state, dict) or key not in state]:
         raise CheckpointError(f"{path}: lacks {', '.join(missing)}")
-    for key, kind in REQUIRED.items():
-        if type(state[key]) is not kind:
-            raise CheckpointError(f"{path}: {key} must be {kind.__name__}, got {type(state[key]).__name__}")
+    for key, expected in REQUIRED.items():
+        if type(state[key]) is not expected:
+            raise CheckpointError(f"{path}: {key} must be {expected.__name__}, got {type(state[key]).__name__}")
     if state["iteration"] != entry["iteration"]:
         raise CheckpointError(f"{path}: of iteration {state['iteration']}, {MANIFEST} says {entry['iteration']}")
     return state
 
 
-def one_line(error: Exception) -> str:
-    """Return what an error says, on one line of at most 300 characters; its type if it says nothing."""
+def one_line_message(error: Exception) -> str:
+    """Return an error's message on one line of at most 300 characters; its type if the message is empty."""
     return " ".join(str(error).split())[:300] or type(error).__name__
 
 
 def latest_checkpoint(folder: Path) -> Checkpoint:
-    """Return the last saved usable checkpoint.
+    """Return the last saved checkpoint that can be used.
 
-    Raises CheckpointError: none is usable.
+    Raises CheckpointError: there is none.
     """
     manifest = _read_manifest(folder)
-    refusals: list[str] = []
+    skipped: list[str] = []
     for name in reversed(manifest):
         try:
-            return Checkpoint(folder / name, load_checkpoint(folder / name), refusals)
+            return Checkpoint(folder / name, load_checkpoint(folder / name), skipped)
         except CheckpointError as error:
-            refusals.append(str(error))
-    raise CheckpointError("; ".join([f"{folder}: no usable checkpoint", *refusals]))
+            skipped.append(str(error))
+    raise CheckpointError("; ".join([f"{folder}: no usable checkpoint", *skipped]))
 
 
 def best_checkpoint(folder: Path) -> Path:
@@ -125,11 +125,13 @@ def best_checkpoint(folder: Path) -> Path:
 
 
 def _best(manifest: dict[str, dict[str, Any]]) -> str | None:
+    """Return the file name with the highest finite score; None without one."""
     scored = [name for name, entry in manifest.items() if entry["score"] is not None and math.isfinite(entry["score"])]
     return max(scored, key=lambda name: manifest[name]["score"], default=None)
 
 
 def _read_manifest(folder: Path, missing_ok: bool = False) -> dict[str, dict[str, Any]]:
+    """Return the manifest's entries by file name, in the order of saving. Raises CheckpointError: it is unreadable."""
     path = folder / MANIFEST
     if missing_ok and not path.exists():
         return {}
@@ -145,7 +147,8 @@ def _read_manifest(folder: Path, missing_ok: bool = False) -> dict[str, dict[str
 
 
 def _is_entry(entry: Any) -> bool:
+    """Return whether a manifest entry has SHA-256, iteration and score, each of the right type."""
     if not isinstance(entry, dict) or not {"sha256", "iteration", "score"} <= entry.keys():
         return False
-    scored = type(entry["score"]) in (int, float, type(None))
-    return isinstance(entry["sha256"], str) and type(entry["iteration"]) is int and scored
+    valid_score = type(entry["score"]) in (int, float, type(None))
+    return isinstance(entry["sha256"], str) and type(entry["iteration"]) is int and valid_score

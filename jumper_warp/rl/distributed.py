@@ -1,4 +1,4 @@
-"""Several training processes, one a device."""
+"""Distributed training: one process (rank) per device."""
 
 import hashlib
 import io
@@ -12,8 +12,8 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import available_threads
 
 NCCL = {"NCCL_NVLS_ENABLE": "0", "NCCL_GRAPH_REGISTER": "0"}
-"""Settings of NCCL that are made unless the user did: no multicast over NVLink, which not every machine allows, and no
-registration of buffers while a graph is captured, for which the ranks would have to wait for each other then."""
+"""Defaults of NCCL's environment variables: no NVLink multicast, which some machines do not allow, and no registration
+of buffers during graph capture, which would need the ranks to synchronise there."""
 
 
 def world_size() -> int:
@@ -22,13 +22,13 @@ def world_size() -> int:
 
 
 def wait_for_ranks() -> None:
-    """Wait until every process got here, so that none leaves the group while another still uses it."""
+    """Block until every process has reached this call."""
     if world_size() > 1:
         torch.distributed.barrier()
 
 
-def largest_over_ranks(values: list[int]) -> list[int]:
-    """Return the largest of each number over all processes; each waits for the others."""
+def all_reduce_max(values: list[int]) -> list[int]:
+    """Return the elementwise maximum over all processes (blocking)."""
     if world_size() == 1:
         return values
     vector = torch.tensor(values, device="cuda" if torch.distributed.get_backend() == "nccl" else "cpu")
@@ -36,30 +36,30 @@ def largest_over_ranks(values: list[int]) -> list[int]:
     return vector.tolist()
 
 
-def all_ranks(agreed: bool) -> bool:
-    """Return whether all processes agree; each waits for the others."""
-    return largest_over_ranks([int(not agreed)]) == [0]
+def all_ranks_agree(agreed: bool) -> bool:
+    """Return whether `agreed` is true in all processes (blocking)."""
+    return all_reduce_max([int(not agreed)]) == [0]
 
 
-def all_same(text: str) -> bool:
-    """Return whether all processes call this with the same text; each waits for the others."""
-    number = int.from_bytes(hashlib.sha256(text.encode()).digest()[:7], "big")
-    return largest_over_ranks([number, -number]) == [number, -number]
+def same_on_all_ranks(text: str) -> bool:
+    """Return whether all processes pass the same text (blocking)."""
+    digest = int.from_bytes(hashlib.sha256(text.encode()).digest()[:7], "big")
+    return all_reduce_max([digest, -digest]) == [digest, -digest]
 
 
-def one_rank_first(procedure: Callable[[], None]) -> None:
-    """Run a procedure on the first process of each machine, then on the others, which find its files."""
+def local_rank_zero_first(procedure: Callable[[], None]) -> None:
+    """Run a procedure on local rank 0 of each machine, then on its other ranks, which can read the files it cached."""
     if world_size() == 1:
         procedure()
         return
-    first = os.environ.get("LOCAL_RANK", "0") == "0"
+    local_rank_zero = os.environ.get("LOCAL_RANK", "0") == "0"
     for turn in (True, False):
-        if first == turn:
+        if local_rank_zero == turn:
             procedure()
         wait_for_ranks()
 
 
-def average_over_ranks(x: torch.Tensor) -> torch.Tensor:
+def all_reduce_mean(x: torch.Tensor) -> torch.Tensor:
     """Average a tensor in place over all training processes, and return it."""
     if world_size() > 1:
         torch.distributed.all_reduce(x)
@@ -68,44 +68,44 @@ def average_over_ranks(x: torch.Tensor) -> torch.Tensor:
 
 
 class Rank(NamedTuple):
-    """This process among those that train together."""
+    """Rank, world size and device of this process."""
 
-    index: int
-    """0 for the one that logs and saves."""
-    size: int
+    index: int  # 0 for the process that logs and saves
+    size: int  # number of processes
     device: torch.device
 
 
-def join_ranks(device: str | None = None, threads: int | None = None) -> Rank:
-    """Return this process's place; under torchrun (RANK, LOCAL_RANK, WORLD_SIZE), join the other processes.
+def init_distributed(device: str | None = None, threads: int | None = None) -> Rank:
+    """Select the device, join the process group under torchrun (RANK, LOCAL_RANK, WORLD_SIZE), and return the rank.
 
-    threads: of torch on a CPU, unless OMP_NUM_THREADS is set.
-
-    Raises ValueError: there is no such device.
+    threads: torch's CPU threads, unless OMP_NUM_THREADS is set. Raises ValueError: there is no such device.
     """
-    kind = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
-    if kind.type == "cuda" and not torch.cuda.is_available():
-        raise InputError(f"device {device} asked for, but torch finds no GPU")
+    selected = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
+    if selected.type == "cuda" and not torch.cuda.is_available():
+        raise InputError(f"device {device} requested, but torch finds no GPU")
     size = int(os.environ.get("WORLD_SIZE", "1"))
-    if size > 1 and kind.type == "cuda":
-        kind = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
-    elif kind.type == "cuda" and kind.index is None:
-        kind = torch.device("cuda", 0)
-    if kind.type == "cuda":
-        torch.cuda.set_device(kind)
+    if size > 1 and selected.type == "cuda":
+        selected = torch.device("cuda", int(os.environ["LOCAL_RANK"]))
+    elif selected.type == "cuda" and selected.index is None:
+        selected = torch.device("cuda", 0)
+    if selected.type == "cuda":
+        torch.cuda.set_device(selected)
     elif "OMP_NUM_THREADS" not in os.environ:
-        # small networks gain little from many threads, and lose where these wait on a busy machine
+        # small networks gain little from many threads, and lose on a busy machine
         cores = available_threads()
         torch.set_num_threads(threads or min(cores, max(2, cores // 2)))
     if size > 1 and not torch.distributed.is_initialized():
         for name, value in NCCL.items():
             os.environ.setdefault(name, value)
-        torch.distributed.init_process_group("nccl" if kind.type == "cuda" else "gloo")
-    return Rank(int(os.environ.get("RANK", "0")) if size > 1 else 0, size, kind)
+        torch.distributed.init_process_group("nccl" if selected.type == "cuda" else "gloo")
+    return Rank(int(os.environ.get("RANK", "0")) if size > 1 else 0, size, selected)
 
 
-def gather(state: dict[str, Any], rank: Rank) -> list[dict[str, Any]]:
-    """Return the state of every process, in process 0; tensors travel as bytes and are read as weights only."""
+def gather_states(state: dict[str, Any], rank: Rank) -> list[dict[str, Any]]:
+    """Return the states of all processes in rank 0, an empty list elsewhere.
+
+    States are sent as bytes and read with torch.load(weights_only=True).
+    """
     buffer = io.BytesIO()
     torch.save(state, buffer)
     data = torch.frombuffer(bytearray(buffer.getvalue()), dtype=torch.uint8).to(rank.device)

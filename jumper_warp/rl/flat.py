@@ -1,4 +1,4 @@
-"""Weights, gradients and Adam's moments of actor and critic, each one vector in memory, and a step of Adam on them."""
+"""Weights, gradients and Adam moments of actor and critic, each as one flat vector, and Adam's step on them."""
 
 from __future__ import annotations
 
@@ -8,161 +8,159 @@ from typing import Any, NamedTuple
 import torch
 
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.networks import Actor, ActorCritic, Layers
+from jumper_warp.rl.networks import ActorCritic, ActorTensors, Layers
 
 ALIGNMENT = 32
-"""Every parameter begins at a multiple of so many numbers: 128 bytes, a GPU's cache line."""
+"""Every parameter begins at a multiple of this many entries: 128 bytes, a GPU's cache line."""
 ROW_ALIGNMENT = 8
-"""Columns of an input layer's weight, and of what it multiplies, are filled up with zeros to a multiple of this."""
+"""Columns of an input layer's weight, and of its features, are zero-padded to a multiple of this."""
 BETAS = (0.9, 0.999)
-"""Decay of the means of gradient and squared gradient per step, as in Kingma & Ba 2015."""
-EPS = 1.0e-8
-"""Added to the root of the mean squared gradient."""
+"""Decay rates of Adam's first and second moment per step (Kingma & Ba 2015)."""
+ADAM_EPS = 1.0e-8
+"""Added to the square root of Adam's second moment."""
 
 
 def aligned(count: int, to: int) -> int:
-    """Return the next multiple of `to` that is not less than `count`."""
+    """Return `count` rounded up to a multiple of `to`."""
     return -(-count // to) * to
 
 
 class Segment(NamedTuple):
-    """Where a parameter lies in the vector."""
+    """Location of one parameter in a flat vector."""
 
-    first: int
-    stored: tuple[int, ...]
-    """Shape, zero columns included."""
-    shape: tuple[int, ...]
-    """Its own shape."""
+    start: int  # index of its first entry
+    padded_shape: tuple[int, ...]  # shape with zero-padded columns
+    shape: tuple[int, ...]  # shape of the parameter itself
 
     @property
     def size(self) -> int:
-        """Numbers up to the next parameter."""
-        return aligned(math.prod(self.stored), ALIGNMENT)
+        """Entries up to the start of the next parameter."""
+        return aligned(math.prod(self.padded_shape), ALIGNMENT)
+
+    def padded_view(self, vector: torch.Tensor) -> torch.Tensor:
+        """Return the parameter in a vector as a view of `padded_shape`."""
+        return vector[self.start : self.start + math.prod(self.padded_shape)].view(self.padded_shape)
 
     def view(self, vector: torch.Tensor) -> torch.Tensor:
-        """Return the parameter's part of a vector, zero columns included."""
-        return vector[self.first : self.first + math.prod(self.stored)].view(self.stored)
-
-    def own(self, vector: torch.Tensor) -> torch.Tensor:
-        """Return the parameter's part of a vector in its own shape."""
-        view = self.view(vector)
+        """Return the parameter in a vector as a view of `shape`."""
+        view = self.padded_view(vector)
         return view[:, : self.shape[1]] if len(self.shape) == 2 else view
 
 
 class FlatParameters:
     """All parameters of an `ActorCritic` as views of `value`, their gradients as views of `gradient`.
 
-    The order is actor, noise, critic. Between the parameters all numbers are zero, and stay so.
+    Order: actor, noise (log_std), critic. The padding between parameters is zero and stays zero.
     """
 
     def __init__(self, model: ActorCritic, activation: str) -> None:
-        """Move the parameters of a model, on the device where it is, into one vector."""
+        """Move the parameters of a model into one vector, on the model's device."""
         actor = [*model.actor.parameters(), model.log_std]
         self.params = [*actor, *model.critic.parameters()]
-        inputs = (model.actor[0].weight, model.critic[0].weight)
+        input_weights = (model.actor[0].weight, model.critic[0].weight)
         self.segments: list[Segment] = []
-        first = 0
+        start = 0
         for param in self.params:
             shape = tuple(param.shape)
-            wide = any(param is each for each in inputs)
-            stored = (shape[0], aligned(shape[1], ROW_ALIGNMENT)) if wide else shape
-            self.segments.append(Segment(first, stored, shape))
-            first += self.segments[-1].size
-        self.size, self.actor_size = first, self.segments[len(actor)].first
-        """Numbers of all parameters; of actor and noise, which the critic's follow."""
+            pad = any(param is weight for weight in input_weights)
+            padded_shape = (shape[0], aligned(shape[1], ROW_ALIGNMENT)) if pad else shape
+            self.segments.append(Segment(start, padded_shape, shape))
+            start += self.segments[-1].size
+        self.size, self.actor_size = start, self.segments[len(actor)].start
+        """Entries of the whole vector; entries of actor and noise, which come first."""
         device = model.log_std.device
         self.value = torch.zeros(self.size, device=device)
-        self.exchanged = torch.zeros(self.size + ALIGNMENT, device=device)
-        """What ranks average in one exchange: the gradient, and `kl` as the last number."""
-        self.gradient, self.kl = self.exchanged[: self.size], self.exchanged[-1]
-        """(size,) as `value`; () KL(old ‖ new) of the minibatch."""
+        self.all_reduced = torch.zeros(self.size + ALIGNMENT, device=device)
+        """(size + ALIGNMENT,) averaged over ranks in one all-reduce: the gradient, and `kl` as the last entry."""
+        self.gradient, self.kl = self.all_reduced[: self.size], self.all_reduced[-1]
+        """(size,) in the order of `value`; () KL(old ‖ new) of the minibatch."""
         self.actor_gradient, self.critic_gradient = self.gradient.split((self.actor_size, self.size - self.actor_size))
         for param, segment in zip(self.params, self.segments, strict=True):
-            own = segment.own(self.value)
-            own.copy_(param.data)
-            param.data, param.grad = own, segment.own(self.gradient)
-        views = [segment.view(self.value) for segment in self.segments]
+            view = segment.view(self.value)
+            view.copy_(param.data)
+            param.data, param.grad = view, segment.view(self.gradient)
+        views = [segment.padded_view(self.value) for segment in self.segments]
         *network, log_std = views[: len(actor)]
         layers, symmetry = _layers(network, activation), model.symmetry
-        self.actor = Actor(layers, log_std, symmetry and symmetry.padded(layers.weights[0].shape[1]))
+        self.actor = ActorTensors(layers, log_std, symmetry and symmetry.padded(layers.weights[0].shape[1]))
         self.critic = _layers(views[len(actor) :], activation)
 
 
-def joined(parts: list[torch.Tensor]) -> torch.Tensor:
-    """Return the gradients of consecutive parameters, zero columns included, as one part of the vector."""
+def flatten_aligned(gradients: list[torch.Tensor]) -> torch.Tensor:
+    """Return the gradients of consecutive parameters, in their padded shapes, as one slice of the flat vector."""
     pieces = []
-    for part in parts:
-        pieces.append(part.flatten())
-        if gap := aligned(part.numel(), ALIGNMENT) - part.numel():
-            pieces.append(part.new_zeros(gap))
+    for gradient in gradients:
+        pieces.append(gradient.flatten())
+        if padding := aligned(gradient.numel(), ALIGNMENT) - gradient.numel():
+            pieces.append(gradient.new_zeros(padding))
     return torch.cat(pieces)
 
 
 def _layers(params: list[torch.Tensor], activation: str) -> Layers:
+    """Return a network from its parameters in the order weight, bias of each layer."""
     return Layers(tuple(params[::2]), tuple(params[1::2]), activation)
 
 
 class AdamVectors(NamedTuple):
-    """What a step reads and changes; all vectors are (size,) as `FlatParameters.value`."""
+    """Parameters, gradient and state of Adam; all vectors are (size,) in the order of `FlatParameters.value`."""
 
-    value: torch.Tensor
+    value: torch.Tensor  # (size,) parameters
     gradient: torch.Tensor
-    mean: torch.Tensor
-    """Running mean of the gradient."""
-    square: torch.Tensor
-    """Running mean of the squared gradient."""
-    step: torch.Tensor
-    """() steps so far."""
-    lr: torch.Tensor
-    """() step size."""
+    exp_avg: torch.Tensor  # (size,) first moment: running mean of the gradient
+    exp_avg_sq: torch.Tensor  # (size,) second moment: running mean of the squared gradient
+    step: torch.Tensor  # () number of steps so far
+    lr: torch.Tensor  # () learning rate
 
 
 class FlatAdam:
-    """Adam's state for a vector of parameters; `torch.optim.Adam` to rounding, and its state for each parameter."""
+    """Adam's state for a flat vector of parameters; agrees with `torch.optim.Adam` to rounding."""
 
     def __init__(self, flat: FlatParameters, lr: float) -> None:
-        """lr: step size at the start, kept on the device as `self.lr`."""
+        """lr: initial learning rate, kept on the device as `self.lr`."""
         self.flat = flat
-        self.mean, self.square = torch.zeros_like(flat.value), torch.zeros_like(flat.value)
+        self.exp_avg, self.exp_avg_sq = torch.zeros_like(flat.value), torch.zeros_like(flat.value)
         self.step, self.lr = (torch.full((), x, device=flat.value.device) for x in (0.0, lr))
-        self.vectors = AdamVectors(flat.value, flat.gradient, self.mean, self.square, self.step, self.lr)
+        self.vectors = AdamVectors(flat.value, flat.gradient, self.exp_avg, self.exp_avg_sq, self.step, self.lr)
 
     def state_dict(self) -> dict[int, dict[str, torch.Tensor]]:
-        """Return the state of each parameter by its index, as `torch.optim.Adam` has it, copied."""
+        """Return copies of each parameter's state by its index, in the format of `torch.optim.Adam`."""
         return {
             index: {
                 "step": self.step.clone(),
-                "exp_avg": segment.own(self.mean).clone(memory_format=torch.contiguous_format),
-                "exp_avg_sq": segment.own(self.square).clone(memory_format=torch.contiguous_format),
+                "exp_avg": segment.view(self.exp_avg).clone(memory_format=torch.contiguous_format),
+                "exp_avg_sq": segment.view(self.exp_avg_sq).clone(memory_format=torch.contiguous_format),
             }
             for index, segment in enumerate(self.flat.segments)
         }
 
     def load_state_dict(self, state: dict[int, dict[str, Any]]) -> None:
-        """Take up what `state_dict` gave; all parameters have made the same steps."""
+        """Load the result of `state_dict`; the step count of parameter 0 is used for all."""
         for index, segment in enumerate(self.flat.segments):
-            segment.own(self.mean).copy_(state[index]["exp_avg"])
-            segment.own(self.square).copy_(state[index]["exp_avg_sq"])
+            segment.view(self.exp_avg).copy_(state[index]["exp_avg"])
+            segment.view(self.exp_avg_sq).copy_(state[index]["exp_avg_sq"])
         self.step.copy_(state[0]["step"])
 
 
 def adapted_lr(lr: torch.Tensor, kl: torch.Tensor, cfg: PpoCfg, desired_kl: torch.Tensor | float) -> torch.Tensor:
-    """Return the step size after a divergence: 1.5 times smaller above twice the desired one, larger below half."""
+    """Return the learning rate () adapted to the KL divergence: / 1.5 above 2 desired_kl, · 1.5 below desired_kl / 2.
+
+    It stays within cfg.min_lr and cfg.max_lr, and is fixed if cfg.desired_kl is 0.
+    """
     if cfg.desired_kl <= 0.0:
         return lr
-    slower = torch.where(kl > 2.0 * desired_kl, (lr / 1.5).clamp(min=cfg.min_lr), lr)
-    too_slow = (kl < 0.5 * desired_kl) & (kl > 0.0)
-    return torch.where(too_slow, (lr * 1.5).clamp(max=cfg.max_lr), slower)
+    reduced = torch.where(kl > 2.0 * desired_kl, (lr / 1.5).clamp(min=cfg.min_lr), lr)
+    below_half = (kl < 0.5 * desired_kl) & (kl > 0.0)
+    return torch.where(below_half, (lr * 1.5).clamp(max=cfg.max_lr), reduced)
 
 
-def clip_gradient(gradient: torch.Tensor, actor_size: int, most: float) -> torch.Tensor:
-    """Shorten the parts of actor and critic to the norm `most`, in place; return their norms before, (2,).
+def clip_gradient(gradient: torch.Tensor, actor_size: int, max_norm: float) -> torch.Tensor:
+    """Clip the gradients of actor and critic to `max_norm` each, in place; return their norms before clipping, (2,).
 
-    A non-finite part becomes zero.
+    gradient: (size,), the actor's part first. A non-finite part becomes zero.
     """
     parts = (gradient[:actor_size], gradient[actor_size:])
     norms = torch.stack([torch.linalg.vector_norm(part) for part in parts])
-    scales = (most / (norms + 1.0e-6)).clamp(max=1.0)
+    scales = (max_norm / (norms + 1.0e-6)).clamp(max=1.0)
     for part, scale in zip(parts, scales, strict=True):
         part.mul_(scale)
     gradient.nan_to_num_(nan=0.0, posinf=0.0, neginf=0.0)
@@ -170,11 +168,11 @@ def clip_gradient(gradient: torch.Tensor, actor_size: int, most: float) -> torch
 
 
 def adam_step(vectors: AdamVectors) -> None:
-    """Change parameters and state by a step of Adam (Kingma & Ba 2015, algorithm 1)."""
-    value, gradient, mean, square, step, lr = vectors
+    """Update parameters and state in place by one step of Adam (Kingma & Ba 2015, algorithm 1)."""
+    value, gradient, exp_avg, exp_avg_sq, step, lr = vectors
     step.add_(1.0)
-    mean.lerp_(gradient, 1.0 - BETAS[0])
-    square.mul_(BETAS[1]).addcmul_(gradient, gradient, value=1.0 - BETAS[1])
+    exp_avg.lerp_(gradient, 1.0 - BETAS[0])
+    exp_avg_sq.mul_(BETAS[1]).addcmul_(gradient, gradient, value=1.0 - BETAS[1])
     corrections = [-torch.expm1(step * math.log(beta)) for beta in BETAS]  # 1 - beta^step, without cancellation
-    root = (square.sqrt() / corrections[1].sqrt()).add_(EPS)
-    value.sub_(mean / root * (lr / corrections[0]))
+    root = (exp_avg_sq.sqrt() / corrections[1].sqrt()).add_(ADAM_EPS)
+    value.sub_(exp_avg / root * (lr / corrections[0]))

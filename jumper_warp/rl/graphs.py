@@ -1,4 +1,4 @@
-"""Torch functions compiled by torch.compile, and procedures captured as CUDA graphs."""
+"""Compilation of torch functions with torch.compile, and capture of procedures as CUDA graphs."""
 
 from __future__ import annotations
 
@@ -9,17 +9,17 @@ from typing import Any
 
 import torch
 
-from jumper_warp.rl.distributed import all_ranks, wait_for_ranks
+from jumper_warp.rl.distributed import all_ranks_agree, wait_for_ranks
 
 BACKEND = "inductor"
-"""Of torch.compile."""
+"""Backend of torch.compile."""
 
 
 class Compiler:
-    """Compiles functions if asked to; where that fails, says so once and runs them as they are.
+    """Wraps functions with torch.compile if enabled; after a failure it prints one warning and runs them eagerly.
 
-    A function is compiled, or read from Inductor's cache on disk, at its first call; the shapes of its tensors and its
-    other arguments stay the same from then on.
+    A function is compiled, or read from Inductor's cache on disk, at its first call. The shapes of its tensors and its
+    other arguments must stay the same afterwards.
     """
 
     def __init__(self, enabled: bool) -> None:
@@ -27,7 +27,7 @@ class Compiler:
         self.enabled = enabled
 
     def __call__(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return a function that computes the same."""
+        """Return the function, compiled at its first call."""
         if not self.enabled:
             return function
         compiled: Callable[..., Any] | None = None
@@ -43,7 +43,7 @@ class Compiler:
                 result = tried(*args)
             except Exception as error:  # whatever a compiler, or none, does
                 self.enabled = False
-                print(f"not compiled, training is slower: {_reason(error)}", file=sys.stderr)
+                print(f"not compiled, training is slower: {_failure_reason(error)}", file=sys.stderr)
                 return function(*args)
             compiled = tried
             return result
@@ -52,7 +52,7 @@ class Compiler:
 
 
 def _options() -> dict[str, str | int | bool | Callable[..., Any]] | None:
-    """Return options of Inductor: it may not choose by time between kernels that add up in another order.
+    """Return Inductor's options: deterministic, i.e. without choosing kernels of another summation order by timing.
 
     ATEN_CPU_CAPABILITY limits its vectors too: PyTorch 2.13 would compile AVX-512 code against headers of the limit.
     """
@@ -69,27 +69,28 @@ def _options() -> dict[str, str | int | bool | Callable[..., Any]] | None:
     return options
 
 
-def _reason(error: Exception) -> str:
+def _failure_reason(error: Exception) -> str:
+    """Return type and first line of an error's message, at most 300 characters."""
     inner = getattr(error, "inner_exception", error)  # of a backend's failure
     lines = [line.strip() for line in str(inner).splitlines() if line.strip()]
     return f"{type(inner).__name__}: {lines[0] if lines else ''}"[:300]
 
 
-class Captured:
-    """A procedure that, if enabled, runs eagerly once and as a CUDA graph from then on.
+class CapturedProcedure:
+    """A procedure that runs eagerly once, and is captured and replayed as a CUDA graph afterwards, if enabled.
 
-    Where it cannot be captured, on any rank, all ranks go on eagerly, and say so.
+    If the capture fails on any rank, all ranks run it eagerly, and print a warning.
     """
 
     def __init__(self, procedure: Callable[[], object], enabled: bool) -> None:
-        """procedure: reads and writes the same tensors in every call, and waits for no result."""
+        """procedure: reads and writes the same tensors in every call, without synchronising with the host."""
         self._procedure = procedure
         self.enabled = enabled
         self._graph: torch.cuda.CUDAGraph | None = None
         self._warm = False
 
     def close(self) -> None:
-        """Drop the graph; NCCL does not end a group while a graph holds exchanges of it."""
+        """Delete the graph; NCCL cannot destroy a process group whose collectives a graph holds."""
         self._graph = None
 
     def __call__(self) -> None:
@@ -103,18 +104,19 @@ class Captured:
             self._warm = True
 
     def _capture(self) -> None:
+        """Capture the procedure as a graph, or disable capture on all ranks."""
         torch.cuda.synchronize()
-        wait_for_ranks()  # no exchange of an eager call may be under way on any rank
+        wait_for_ranks()  # no collective of an eager call may be in progress on any rank
         graph, reason = torch.cuda.CUDAGraph(), ""
         current = torch.cuda.current_stream()
         stream = None if current == torch.cuda.default_stream() else current
         try:
-            # the thread that watches NCCL asks for events, which another mode would take for a mistake of the capture
+            # NCCL's watchdog thread queries events, which invalidates a capture in any other mode
             with torch.cuda.graph(graph, stream=stream, capture_error_mode="thread_local"):
                 self._procedure()
         except RuntimeError as error:
             reason = f": {str(error).splitlines()[0]}"[:300]
-        self.enabled = all_ranks(not reason)
+        self.enabled = all_ranks_agree(not reason)
         if self.enabled:
             self._graph = graph
         else:

@@ -1,4 +1,4 @@
-"""Where a training's figures go: a file, the terminal, TensorBoard and Weights & Biases."""
+"""Logging of a training's metrics: to a file, the terminal, TensorBoard and Weights & Biases."""
 
 from __future__ import annotations
 
@@ -15,17 +15,15 @@ import torch
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
 
-from jumper_warp.rl.metrics_file import MetricsFile
+from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
 from jumper_warp.utils.errors import InputError
 
-FIGURES = "metrics.jsonl"
-"""In a run's folder: one JSON object per logged iteration."""
 REWARDS = "Episode_Reward/"
-"""In the names of reward terms' means."""
+"""Part of the metric names of reward terms."""
 
 
 class Stopwatch:
-    """Seconds that a device spends between marks, without waiting for it until they are read."""
+    """Measures the device time between marks; it synchronises with the device only in `read`."""
 
     def __init__(self, device: torch.device) -> None:
         self._cuda, self._since = device.type == "cuda", time.perf_counter()
@@ -37,16 +35,16 @@ class Stopwatch:
         self.mark()
 
     def mark(self) -> None:
-        """End a part of the lap."""
+        """End a part of the present lap."""
         mark: Any = torch.cuda.Event(enable_timing=True) if self._cuda else time.perf_counter()
         if self._cuda:
             mark.record()
         self._laps[-1].append(mark)
 
     def read(self) -> tuple[list[float], float]:
-        """Return mean seconds of each part since the last call, and of an iteration on the host's clock.
+        """Return the mean time of each part since the last call [s], and the host time per lap [s].
 
-        Waits for the device. Time between laps counts to the iterations.
+        Synchronises with the device. The host time includes the time between laps.
         """
         laps, self._laps = self._laps, []
         if self._cuda:
@@ -59,28 +57,22 @@ class Stopwatch:
 
 
 class TrainingLog:
-    """Context in which figures are logged. Nothing that cannot be written stops the training; it is told once."""
+    """Context manager that logs metrics. A failure to write prints one warning, and does not stop the training."""
 
     def __init__(
-        self,
-        folder: Path,
-        config: dict[str, Any],
-        total: int,
-        tensorboard: bool = True,
-        wandb: bool = False,
+        self, folder: Path, config: dict[str, Any], total: int, tensorboard: bool = True, wandb: bool = False,
         iteration: int = 0,
-    ) -> None:
-        """folder: the run's, exists. config: everything that the run was started with, ready for JSON.
+    ) -> None:  # fmt: skip
+        """folder: the run's existing folder. config: JSON-ready configuration of the run.
 
-        total: iterations that the run has at its end. tensorboard: write events. wandb: upload to Weights & Biases.
-        iteration: how many the run has had; what was logged of later ones is dropped.
-        Raises ValueError: Weights & Biases is requested and not installed. OSError: the metrics cannot be read or
-        written.
+        total: iterations at the run's end. tensorboard: whether to write events. wandb: whether to upload to Weights &
+        Biases. iteration: iterations so far; logged lines of later ones are removed.
+        Raises ValueError: Weights & Biases is requested but not installed. OSError: the metrics file cannot be used.
         """
-        self._console = _LastingConsole(stderr=True)
-        self._figures = MetricsFile(folder / FIGURES, iteration)
+        self._console = _PipeSafeConsole(stderr=True)
+        self._file = MetricsFile(folder / METRICS_FILE, iteration)
         self._events = _event_writer(folder, iteration) if tensorboard else None
-        self._full = False
+        self._disk_full = False
         self._total = total
         self._wandb = _wandb(folder, config) if wandb else None
         columns = (BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
@@ -90,85 +82,87 @@ class TrainingLog:
 
     def __enter__(self) -> TrainingLog:
         self._progress.start()
-        if self._figures.dropped:
-            self.say(f"{self._figures.path}: dropped {self._figures.dropped} lines, cut or of later iterations")
+        if self._file.dropped:
+            self.print_line(f"{self._file.path}: dropped {self._file.dropped} lines, cut or of later iterations")
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self._progress.stop()
-        for file in (self._figures, self._events):
+        for file in (self._file, self._events):
             with suppress(OSError):
                 if file:
                     file.close()
         if self._wandb:
             self._wandb.finish()
 
-    def say(self, line: str) -> None:
-        """Print a line above the progress."""
-        with suppress(OSError):  # where would that be told
+    def print_line(self, line: str) -> None:
+        """Print a line above the progress bar."""
+        with suppress(OSError):  # there is nowhere to report it
             self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
-    def log(self, iteration: int, figures: dict[str, float], left: float) -> None:
-        """Log figures under names such as `Loss/value`; `iteration` have been done, for the rest `left` [s] is left."""
+    def log(self, iteration: int, metrics: dict[str, float], remaining: float) -> None:
+        """Log the metrics of an iteration by name, such as `Loss/value`; remaining: estimated time to the end [s]."""
         try:
-            self._figures.add(iteration, figures)
+            self._file.add(iteration, metrics)
         except OSError as error:
-            if not self._full:
-                path = self._figures.path
-                self.say(f"{path}: {error.strerror}; training continues, the metrics follow when there is room")
-            self._full = True
-        self._write_events(iteration, figures)
+            if not self._disk_full:
+                path = self._file.path
+                self.print_line(f"{path}: {error.strerror}; training continues, the metrics follow when there is room")
+            self._disk_full = True
+        self._write_events(iteration, metrics)
         if self._wandb:
-            self._wandb.log(figures, step=iteration)
-        summary = _summary(figures)
+            self._wandb.log(metrics, step=iteration)
+        summary = _summary(metrics)
         self._progress.update(self._task, completed=iteration, description=summary)
         if not self._console.is_terminal:
-            self.say(f"iteration {iteration}/{self._total}: {summary}, {_duration(left)} left")
-        for name in _broken_terms(figures):
-            self.say(f"reward term {name} was not a finite number in some steps, where it counts as 0: mend it")
+            self.print_line(f"iteration {iteration}/{self._total}: {summary}, {format_duration(remaining)} left")
+        for name in _non_finite_terms(metrics):
+            self.print_line(f"reward term {name} was not finite in some steps, where it counts as 0: correct it")
 
-    def _write_events(self, iteration: int, figures: dict[str, float]) -> None:
-        """Write TensorBoard's events; after a failure none are written any more."""
+    def _write_events(self, iteration: int, metrics: dict[str, float]) -> None:
+        """Write TensorBoard events; the first failure disables them."""
         if not self._events:
             return
         try:
-            for name, value in figures.items():
+            for name, value in metrics.items():
                 self._events.add_scalar(name, value, iteration)
             self._events.flush()
         except OSError as error:
-            self.say(f"no TensorBoard events from iteration {iteration} on: {error.strerror}; {FIGURES} has them all")
+            self.print_line(
+                f"no TensorBoard events from iteration {iteration} on: {error.strerror}; {METRICS_FILE} has them all"
+            )
             with suppress(OSError):
                 self._events.close()
             self._events = None
 
 
-class _LastingConsole(Console):
-    """Falls silent when its reader is gone, where rich would end the process."""
+class _PipeSafeConsole(Console):
+    """Console that becomes quiet on a broken pipe, where rich would end the process."""
 
     def on_broken_pipe(self) -> None:
         self.quiet = True
 
 
-def _summary(figures: dict[str, float]) -> str:
-    """Return the few figures to watch, in one line."""
-    parts = [f"{figures['Perf/fps']:,.0f} steps/s"]
-    if (total := figures.get("Train/mean_return")) is not None:
+def _summary(metrics: dict[str, float]) -> str:
+    """Return throughput, return and success in one line."""
+    parts = [f"{metrics['Perf/fps']:,.0f} steps/s"]
+    if (total := metrics.get("Train/mean_return")) is not None:
         parts.append(f"return {total:.2f}")
-    if (success := figures.get("Metrics/success")) is not None:
+    if (success := metrics.get("Metrics/success")) is not None:
         parts.append(f"success {100.0 * success:.1f} %")
     return ", ".join(parts)
 
 
-def _broken_terms(figures: dict[str, float]) -> list[str]:
-    """Return the names of reward terms whose means are not finite."""
-    means = {name.replace(REWARDS, ""): value for name, value in figures.items() if REWARDS in name}
+def _non_finite_terms(metrics: dict[str, float]) -> list[str]:
+    """Return the names of reward terms whose mean is not finite."""
+    means = {name.replace(REWARDS, ""): value for name, value in metrics.items() if REWARDS in name}
     return [name for name, value in means.items() if not math.isfinite(value)]
 
 
-def _duration(seconds: float) -> str:
-    """Return a duration in words, to the second, minute or minute of an hour."""
+def format_duration(seconds: float) -> str:
+    """Return a duration [s] as text such as `59 s`, `58 min` or `1 h 20 min`."""
     if seconds < 59.5:
         return f"{seconds:.0f} s"
     hours, minutes = divmod(round(seconds / 60.0), 60)
@@ -176,13 +170,14 @@ def _duration(seconds: float) -> str:
 
 
 def _event_writer(folder: Path, iteration: int) -> Any:
-    """Return a writer of a new file of events, which hides events after `iteration` in older ones."""
+    """Return a TensorBoard writer that hides events after `iteration` in older event files."""
     from torch.utils.tensorboard import SummaryWriter
 
     return SummaryWriter(str(folder), purge_step=iteration + 1 if iteration else None)
 
 
 def _wandb(folder: Path, config: dict[str, Any]) -> Any:
+    """Return a new run of Weights & Biases. Raises InputError: it is not installed."""
     try:
         wandb = importlib.import_module("wandb")
     except ImportError as error:

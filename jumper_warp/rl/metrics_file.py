@@ -1,4 +1,4 @@
-"""The file of a run's metrics: one JSON object a line, in the order of the iterations; it never ends in half a line."""
+"""The metrics file of a run: one JSON object a line, in the order of the iterations, without partial lines."""
 
 from __future__ import annotations
 
@@ -7,46 +7,49 @@ import math
 from contextlib import suppress
 from pathlib import Path
 
-from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.files import write_atomically
+
+METRICS_FILE = "metrics.jsonl"
+"""File in a run's folder, with one JSON object per logged iteration."""
 
 
 class MetricsFile:
-    """Lines of metrics that are appended whole, also after a full disk."""
+    """Appends lines of metrics atomically; lines that a full disk refused are appended later."""
 
     def __init__(self, path: Path, iteration: int) -> None:
-        """Open the file to continue after `iteration`: drop lines of later ones, half lines and what is no JSON.
+        """Open the file to continue after `iteration`; lines of later iterations and malformed lines are removed.
 
-        Raises OSError: it cannot be read or written.
+        Raises OSError: the file cannot be read or written.
         """
         content = path.read_bytes() if path.is_file() else b""
         lines = content.splitlines()
         kept = [line for line in lines if _iteration_of(line) <= iteration]
         self.path = path
         self.dropped = len(lines) - len(kept)
-        """Lines that were."""
-        whole = b"".join(line + b"\n" for line in kept)
-        if whole != content:
-            write_whole(path, whole)
+        """Number of removed lines."""
+        valid_content = b"".join(line + b"\n" for line in kept)
+        if valid_content != content:
+            write_atomically(path, valid_content)
         self._file = path.open("ab", buffering=0)
-        self._size = len(whole)
-        self._waiting = b""
+        self._size = len(valid_content)
+        self._pending = b""
 
     def add(self, iteration: int, metrics: dict[str, float]) -> None:
-        """Append the metrics of an iteration, null for those that are not finite.
+        """Append the metrics of an iteration, with null for non-finite values.
 
-        Raises OSError: the disk is full, say. The file is unchanged; the line is kept, and written with the next one.
+        Raises OSError, e.g. on a full disk: the file is unchanged, and the line is written with the next one.
         """
         values = {name: value if math.isfinite(value) else None for name, value in metrics.items()}
-        self._waiting += json.dumps({"iteration": iteration, **values}, allow_nan=False).encode() + b"\n"
+        self._pending += json.dumps({"iteration": iteration, **values}, allow_nan=False).encode() + b"\n"
         written = 0
         try:
-            while written < len(self._waiting):
-                written += self._file.write(self._waiting[written:])
+            while written < len(self._pending):
+                written += self._file.write(self._pending[written:])
         except OSError:
             with suppress(OSError):
                 self._file.truncate(self._size)
             raise
-        self._size, self._waiting = self._size + written, b""
+        self._size, self._pending = self._size + written, b""
 
     def close(self) -> None:
         """Close the file."""
@@ -54,7 +57,7 @@ class MetricsFile:
 
 
 def _iteration_of(line: bytes) -> float:
-    """Return the iteration of a line of metrics; infinity if it is none."""
+    """Return the iteration of a line of metrics; infinity for a malformed line."""
     try:
         return int(json.loads(line)["iteration"])
     except (ValueError, KeyError, TypeError, RecursionError):

@@ -1,11 +1,11 @@
 """Left-right symmetry of the actor.
 
-The mirror image of a vector x is `signs * x[order]`, and twice mirrored is as before. Let M be the image of an
-observation, N that of an action, and f the network. The policy's mean is (f(x) + N f(M x)) / 2, so that it answers M x
-by the image of its answer to x whatever the weights.
+A mirror map takes a vector x to its mirror image `signs * x[order]`; it is its own inverse. Let M be the mirror map of
+observations, N the one of actions, and f the network. The policy's mean is (f(x) + N f(M x)) / 2, which maps M x to the
+mirror image of its output for x, whatever the weights.
 
-The passes run once over twice the rows, x and M x. As N is a permutation with signs and its own inverse, the slope of a
-loss with respect to f(M x) is N of that with respect to N f(M x).
+The forward and backward pass run once over twice the rows, x and M x. As N is a signed permutation and its own inverse,
+the gradient of a loss by f(M x) is N times the gradient by N f(M x).
 """
 
 from __future__ import annotations
@@ -24,78 +24,80 @@ Weights = list[tuple[torch.Tensor, torch.Tensor]]
 Vector = Sequence[float] | np.ndarray | torch.Tensor
 
 
-class Image(NamedTuple):
-    """The mirror image of vectors (..., n)."""
+class MirrorMap(NamedTuple):
+    """Mirror map of vectors (..., n): a signed permutation that is its own inverse."""
 
-    order: torch.Tensor
-    """(n,) int64"""
-    signs: torch.Tensor
-    """(n,) float32, 1 or -1"""
+    order: torch.Tensor  # (n,) int64, the entry of x that each entry of the image comes from
+    signs: torch.Tensor  # (n,) float32, 1 or -1
 
-    def of(self, x: torch.Tensor) -> torch.Tensor:
-        """Return the image of x (..., n)."""
+    def apply(self, x: torch.Tensor) -> torch.Tensor:
+        """Return the mirror image of x (..., n)."""
         return self.signs * x[..., self.order]
 
-    def moments(self, mean: torch.Tensor, var: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return mean and population variance (n,) of samples that come with their images, from those of the samples.
+    def symmetrise_moments(self, mean: torch.Tensor, var: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        """Return mean and population variance (n,) of samples and their mirror images together.
 
-        They are their own images to the last bit.
+        mean, var: (n,) of the samples alone. The results are bitwise mirror-symmetric.
         """
         image = self.signs.to(mean.dtype) * mean[self.order]
         return 0.5 * (mean + image), 0.5 * (var + var[self.order]) + 0.25 * (mean - image).square()
 
-    def padded(self, columns: int) -> Image:
-        """Return the image of vectors that are filled up to so many columns, which stay where they are."""
-        more = torch.arange(len(self.order), columns, device=self.order.device)
-        return Image(torch.cat([self.order, more]), torch.cat([self.signs, torch.ones_like(more, dtype=torch.float32)]))
+    def padded(self, columns: int) -> MirrorMap:
+        """Return the mirror map of vectors that are padded to `columns` entries; padding maps to itself."""
+        padding = torch.arange(len(self.order), columns, device=self.order.device)
+        signs = torch.cat([self.signs, torch.ones_like(padding, dtype=torch.float32)])
+        return MirrorMap(torch.cat([self.order, padding]), signs)
 
     def matrix(self) -> torch.Tensor:
-        """Return the image as a matrix (n, n)."""
+        """Return the mirror map as a matrix (n, n)."""
         return self.signs[:, None] * torch.eye(len(self.order), device=self.signs.device)[self.order]
 
 
 class Symmetry(NamedTuple):
-    """Mirror images of what the actor sees and does."""
+    """Mirror maps of the actor's observation and action."""
 
-    obs: Image
-    action: Image
+    obs: MirrorMap
+    action: MirrorMap
 
     def padded(self, columns: int) -> Symmetry:
-        """Return the same for observations that are filled up to so many columns."""
+        """Return the symmetry for observations that are padded to `columns` entries."""
         return Symmetry(self.obs.padded(columns), self.action)
 
 
-def image(order: Vector, signs: Vector, name: str, device: Any = None) -> Image:
-    """Return the image of vectors called `name`. Raises ValueError: mirroring twice does not give back what was."""
-    places = torch.as_tensor(order, dtype=torch.int64, device=device)
-    flips = torch.as_tensor(signs, dtype=torch.float32, device=device)
-    fits = places.ndim == 1 and places.shape == flips.shape and bool(((places >= 0) & (places < len(places))).all())
-    each = torch.arange(len(places), device=device) if fits else None
-    if not (fits and bool((places[places] == each).all()) and bool((flips * flips[places] == 1.0).all())):
+def mirror_map(order: Vector, signs: Vector, name: str, device: Any = None) -> MirrorMap:
+    """Return the mirror map `signs * x[order]` of vectors called `name` in errors.
+
+    Raises ValueError: it is not its own inverse.
+    """
+    index = torch.as_tensor(order, dtype=torch.int64, device=device)
+    sign = torch.as_tensor(signs, dtype=torch.float32, device=device)
+    valid = index.ndim == 1 and index.shape == sign.shape and bool(((index >= 0) & (index < len(index))).all())
+    identity = torch.arange(len(index), device=device) if valid else None
+    if not (valid and bool((index[index] == identity).all()) and bool((sign * sign[index] == 1.0).all())):
         raise InputError(f"the mirror image of {name} is not its own inverse")
-    return Image(places, flips)
+    return MirrorMap(index, sign)
 
 
 def symmetry_of(env: VecEnv) -> Symmetry:
-    """Return the mirror images of an environment, on its device.
+    """Return the mirror maps of an environment's observation and action, on its device.
 
-    Raises ValueError: it tells none, or one that is not its own inverse or of other vectors.
+    Raises ValueError: the environment defines none, or one is not its own inverse or has another size.
     """
     if not isinstance(env, MirroredVecEnv):
-        raise InputError("symmetry needs an environment that tells mirror images of observation and action")
-    obs, action = (image(*env.mirror(name), name, env.device) for name in ("observation", "action"))
+        raise InputError("symmetry needs an environment that defines mirror images of observation and action")
+    obs, action = (mirror_map(*env.mirror(name), name, env.device) for name in ("observation", "action"))
     if (len(obs.order), len(action.order)) != (env.num_obs, env.num_actions):
         raise InputError("the mirror images are not of this environment's observation and action")
     return Symmetry(obs, action)
 
 
-def plain_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return weights and biases of a plain network that answers as the symmetric actor, of twice the widths.
+def expand_layers(layers: Weights, symmetry: Symmetry) -> Weights:
+    """Return the layers of a plain network, of twice the widths, with the same output as the symmetric actor.
 
-    layers: those of f, with activations between. So a symmetric policy is saved and exported as any other.
+    layers: layers of f, with activations between. A symmetric policy is saved and exported in this form.
     """
     obs, action = symmetry.obs.matrix(), symmetry.action.matrix()
-    found = []
+    expanded = []
     for index, (weight, bias) in enumerate(layers):
         if len(layers) == 1:
             weight, bias = 0.5 * (weight + action @ weight @ obs), 0.5 * (bias + action @ bias)
@@ -105,15 +107,15 @@ def plain_layers(layers: Weights, symmetry: Symmetry) -> Weights:
             weight, bias = torch.block_diag(weight, weight), torch.cat([bias, bias])
         else:
             weight, bias = 0.5 * torch.cat([weight, action @ weight], dim=1), 0.5 * (bias + action @ bias)
-        found.append((weight, bias))
-    return found
+        expanded.append((weight, bias))
+    return expanded
 
 
-def nearest_plain_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return the layers of the form of `plain_layers` that are nearest to these, of the same shapes.
+def nearest_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
+    """Return the layers, in the form of `expand_layers`, with the least squared distance to these.
 
-    layers: at least two, hidden ones of even widths. The nearest by the sum of squared differences: what must be equal
-    is the mean, what must be 0 is dropped.
+    layers: at least two, hidden ones of even widths. Blocks that must be equal are averaged, blocks that must be zero
+    are dropped; shapes stay.
     """
     obs, action = symmetry.obs.matrix().to(layers[0][0]), symmetry.action.matrix().to(layers[0][0])
     halves = []
@@ -125,28 +127,28 @@ def nearest_plain_layers(layers: Weights, symmetry: Symmetry) -> Weights:
         first = index == 0
         half = weight[:rows] + weight[rows:] @ obs if first else weight[:rows, :columns] + weight[rows:, columns:]
         halves.append((0.5 * half, 0.5 * (bias[:rows] + bias[rows:])))
-    return plain_layers(halves, symmetry)
+    return expand_layers(halves, symmetry)
 
 
-def symmetric_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return weights and biases of f, of half the widths, from those that `plain_layers` made of them; copies.
+def contract_layers(layers: Weights, symmetry: Symmetry) -> Weights:
+    """Return copies of the layers of f, of half the widths: the inverse of `expand_layers`.
 
-    Of f's last bias only the symmetric part is left, which answers alike. Raises InputError: the layers are not of that
-    form.
+    Only the symmetric part of f's last bias can be recovered; the policy is the same. Raises InputError: the layers are
+    not in that form.
     """
-    found = []
+    contracted = []
     for index, (weight, bias) in enumerate(layers):
         rows, columns = weight.shape
         first, last = index == 0, index == len(layers) - 1
         rows, columns = rows if last else rows // 2, columns if first else columns // 2
         factor = 2.0 if last and not first else 1.0
-        found.append((factor * weight[:rows, :columns], bias[:rows].clone()))
-    sizes = (layers[0][0].shape[1], layers[-1][0].shape[0])
-    again = plain_layers(found, symmetry) if sizes == (len(symmetry.obs.order), len(symmetry.action.order)) else []
+        contracted.append((factor * weight[:rows, :columns], bias[:rows].clone()))
+    sizes_fit = (layers[0][0].shape[1], layers[-1][0].shape[0]) == (len(symmetry.obs.order), len(symmetry.action.order))
+    again = expand_layers(contracted, symmetry) if sizes_fit else []
     if len(again) != len(layers) or not all(
         one.shape == other.shape and torch.allclose(one, other, rtol=1e-6, atol=1e-6)
-        for own, made in zip(layers, again, strict=True)
-        for one, other in zip(own, made, strict=True)
+        for layer, expanded in zip(layers, again, strict=True)
+        for one, other in zip(layer, expanded, strict=True)
     ):
         raise InputError("the layers are not those of a mirror-symmetric actor")
-    return found
+    return contracted

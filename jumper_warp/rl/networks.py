@@ -1,9 +1,9 @@
-"""What PPO trains: actor, critic, exploration noise, and the running statistics that scale observations and values.
+"""Actor, critic, exploration noise, and the running statistics that normalise observations and values.
 
-The passes of a multilayer perceptron are also here without autograd, as functions of tensors that compile into few
-kernels. The backward pass needs of a layer its outputs only, so that nothing else is kept, and has no bookkeeping on
-the host. With y the layer's output, x its input and s = ∂L/∂(Wx + b): ∂L/∂W = sᵀx, ∂L/∂b = Σs, ∂L/∂x = sW, and the
-slope of each activation follows from y alone: elu' = 1 + min(y, 0), relu' = [y > 0], tanh' = 1 - y².
+`Layers` implements the forward and backward pass of a multilayer perceptron without autograd, as functions of tensors
+that compile into few kernels. The backward pass needs only the input of each layer, which is the output of the one
+below. With y a layer's output, x its input and s = ∂L/∂(Wx + b): ∂L/∂W = sᵀx, ∂L/∂b = Σs, ∂L/∂x = sW, and the
+derivative of each activation follows from y alone: elu' = 1 + min(y, 0), relu' = [y > 0], tanh' = 1 - y².
 """
 
 from __future__ import annotations
@@ -18,45 +18,44 @@ from torch import nn
 from torch.nn import functional
 
 from jumper_warp.envs.vec_env import sanitise
-from jumper_warp.rl.distributed import average_over_ranks, world_size
-from jumper_warp.rl.mirror import Image, Symmetry, Weights
+from jumper_warp.rl.distributed import all_reduce_mean, world_size
+from jumper_warp.rl.mirror import MirrorMap, Symmetry, Weights
 from jumper_warp.utils.normalise import normalise
 
 NORMALISED_LIMIT = 10.0
-"""The networks see observations within plus and minus this many standard deviations."""
-EPS = 1.0e-5
-"""Added to a variance before its root is taken."""
+"""Normalised observations are clipped to ± this many standard deviations."""
+VARIANCE_EPS = 1.0e-5
+"""Added to a variance before its square root is taken."""
 ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
-"""Activations by the name that a configuration gives."""
+"""Activation modules by `PpoCfg.activation`."""
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-"""What the hidden layers compute in, by `PpoCfg.precision`."""
+"""Data type of the hidden layers, by `PpoCfg.precision`."""
 
 
 class Moments(NamedTuple):
-    """Moments of a batch of samples, each of one sample's shape."""
+    """Mean, population variance and count of a batch; mean and variance have the shape of one sample."""
 
     mean: torch.Tensor
-    var: torch.Tensor
-    """Population variance."""
-    count: int
-    """Number of samples."""
+    var: torch.Tensor  # population variance
+    count: int  # number of samples
 
     @staticmethod
-    def of(x: torch.Tensor, rows: int | None = None) -> Moments:
+    def from_samples(x: torch.Tensor, chunk_size: int | None = None) -> Moments:
         """Return the moments over the first axis of x (batch, ...).
 
-        rows: taken at a time, in two passes, which takes a CPU a sixth of the time (default: all, in one).
+        chunk_size: rows at a time, in two passes, which takes a CPU a sixth of the time (default: all, in one pass).
         """
-        if rows is None:
+        if chunk_size is None:
             var, mean = torch.var_mean(x, dim=0, correction=0)
         else:
             mean = x.mean(0)
-            var = torch.stack([(part - mean).square().sum(0) for part in x.split(rows)]).sum(0) / x.shape[0]
+            squares = [(chunk - mean).square().sum(0) for chunk in x.split(chunk_size)]
+            var = torch.stack(squares).sum(0) / x.shape[0]
         return Moments(mean, var, x.shape[0])
 
 
 class Scaling(NamedTuple):
-    """What samples are scaled by, each float32 and of one sample's shape."""
+    """Mean and standard deviation that normalise samples, float32, each of one sample's shape."""
 
     mean: torch.Tensor
     std: torch.Tensor
@@ -65,33 +64,33 @@ class Scaling(NamedTuple):
         """Return (x - mean) / std."""
         return (x - self.mean) / self.std
 
-    def restore(self, x: torch.Tensor) -> torch.Tensor:
+    def denormalise(self, x: torch.Tensor) -> torch.Tensor:
         """Return x · std + mean, the inverse of `normalise`."""
         return x * self.std + self.mean
 
     def features(self, obs: torch.Tensor, columns: int) -> torch.Tensor:
-        """Return sanitised observations (..., n) scaled, limited, and filled up with zeros to so many columns."""
+        """Return sanitised observations (..., n) normalised, clipped, and zero-padded to (..., columns)."""
         features = normalise(obs, self.mean, self.std, NORMALISED_LIMIT)
         return functional.pad(features, (0, columns - obs.shape[-1]))
 
 
-def joint_moments(own: Sequence[Moments]) -> list[Moments]:
-    """Return the moments, float64, over all ranks' batches, all in one exchange.
+def all_reduce_moments(local: Sequence[Moments]) -> list[Moments]:
+    """Return the moments, float64, over the batches of all ranks, in one all-reduce.
 
-    own: of some quantities of any shape over this rank's batch, which has the same size on every rank. E[x²] - E[x]²
-    loses nothing that counts in float64.
+    local: moments of quantities of any shape over this rank's batch, which has the same size on every rank. In float64
+    the cancellation in E[x²] - E[x]² is negligible.
     """
-    moments = [(mean.double(), var.double()) for mean, var, _ in own]
+    moments = [(mean.double(), var.double()) for mean, var, _ in local]
     if world_size() > 1:
         vector = torch.cat([part.flatten() for mean, var in moments for part in (mean, var + mean.square())])
-        parts = average_over_ranks(vector).split([mean.numel() for mean, _ in moments for _ in range(2)])
+        parts = all_reduce_mean(vector).split([mean.numel() for mean, _ in moments for _ in range(2)])
         pairs = zip(parts[::2], parts[1::2], moments, strict=True)
         moments = [(a.view_as(like), (b - a.square()).clamp(min=0.0).view_as(like)) for a, b, (like, _) in pairs]
-    return [Moments(*pair, each.count * world_size()) for pair, each in zip(moments, own, strict=True)]
+    return [Moments(*pair, each.count * world_size()) for pair, each in zip(moments, local, strict=True)]
 
 
 def gaussian_log_prob(x: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor) -> torch.Tensor:
-    """Return the log density at x (..., n) of independent Gaussians of mean (..., n) and log_std (n,); (...)."""
+    """Return the log density (...) of independent Gaussians at x (..., n), with mean (..., n) and log_std (n,)."""
     z = (x - mean) * torch.exp(-log_std)
     return (-0.5 * z.square() - log_std - 0.5 * math.log(2.0 * math.pi)).sum(-1)
 
@@ -99,48 +98,51 @@ def gaussian_log_prob(x: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor
 def gaussian_kl(
     mean: torch.Tensor, log_std: torch.Tensor, new_mean: torch.Tensor, new_log_std: torch.Tensor
 ) -> torch.Tensor:
-    """Return KL(old ‖ new) between independent Gaussians; means (..., n), log_std (n,); (...)."""
-    ratio = (2.0 * (log_std - new_log_std)).exp()
-    miss = ((mean - new_mean) * torch.exp(-new_log_std)).square()
-    return (new_log_std - log_std + 0.5 * (ratio + miss - 1.0)).sum(-1)
+    """Return KL(old ‖ new) [nat], (...), of independent Gaussians with means (..., n) and log_std (n,)."""
+    var_ratio = (2.0 * (log_std - new_log_std)).exp()
+    mean_term = ((mean - new_mean) * torch.exp(-new_log_std)).square()
+    return (new_log_std - log_std + 0.5 * (var_ratio + mean_term - 1.0)).sum(-1)
 
 
 class RunningMoments(nn.Module):
-    """Mean and variance of everything seen so far, and the scaling by them. Starts as the identity."""
+    """Running mean and variance of all samples so far, float64; its scaling is the identity at the start."""
 
     mean: torch.Tensor
     var: torch.Tensor
     count: torch.Tensor
 
     def __init__(self, shape: Sequence[int] = ()) -> None:
-        """shape: that of one sample; () for a scalar."""
+        """shape: shape of one sample; () for a scalar."""
         super().__init__()
         self.register_buffer("mean", torch.zeros(tuple(shape), dtype=torch.float64))
-        self.register_buffer("var", torch.full(tuple(shape), 1.0 - EPS, dtype=torch.float64))
+        self.register_buffer("var", torch.full(tuple(shape), 1.0 - VARIANCE_EPS, dtype=torch.float64))
         self.register_buffer("count", torch.zeros((), dtype=torch.float64))
 
     @torch.no_grad()
     def update(self, x: torch.Tensor) -> None:
-        """Take in a batch of finite samples (batch, *shape); those of the other ranks come with it, exactly."""
-        self.take(joint_moments([Moments.of(x)])[0])
+        """Update with a batch of finite samples (batch, *shape) of every rank."""
+        self.update_from_moments(all_reduce_moments([Moments.from_samples(x)])[0])
 
     @torch.no_grad()
-    def take(self, moments: Moments) -> None:
-        """Take in the moments of a batch of finite samples over all ranks."""
+    def update_from_moments(self, moments: Moments) -> None:
+        """Update with the moments of a batch of finite samples over all ranks."""
         mean, var, size = moments
-        share = size / (self.count + size)
+        weight = size / (self.count + size)
         delta = mean - self.mean
-        self.var.lerp_(var, share).add_(delta.square() * share * (1.0 - share))
-        self.mean.add_(delta * share)
+        self.var.lerp_(var, weight).add_(delta.square() * weight * (1.0 - weight))
+        self.mean.add_(delta * weight)
         self.count.add_(size)
 
     def scaling(self) -> Scaling:
-        """Return mean and standard deviation."""
-        return Scaling(self.mean.float(), (self.var + EPS).sqrt().float())
+        """Return mean and standard deviation, float32."""
+        return Scaling(self.mean.float(), (self.var + VARIANCE_EPS).sqrt().float())
 
 
 def mlp(sizes: Sequence[int], activation: str, out_gain: float) -> nn.Sequential:
-    """Return linear layers of these sizes with activations between, orthogonal weights and zero biases."""
+    """Return a multilayer perceptron with orthogonal weights and zero biases; no activation after the last layer.
+
+    sizes: widths of input, hidden layers and output. activation: a key of ACTIVATIONS. out_gain: of the last layer.
+    """
     layers: list[nn.Module] = []
     for index, (num_in, num_out) in enumerate(pairwise(sizes)):
         last = index == len(sizes) - 2
@@ -151,28 +153,22 @@ def mlp(sizes: Sequence[int], activation: str, out_gain: float) -> nn.Sequential
     return nn.Sequential(*layers)
 
 
-def weights_of(network: nn.Module) -> Weights:
-    """Return weight and bias of each linear layer of a network."""
+def linear_layers(network: nn.Module) -> Weights:
+    """Return weight (out, in) and bias (out,) of each linear layer of a network."""
     return [(module.weight, module.bias) for module in network.children() if isinstance(module, nn.Linear)]
 
 
 class ActorCritic(nn.Module):
-    """Two separate networks, each on its own normalised observation; the noise does not depend on the state."""
+    """Actor and critic as separate networks with normalised observations, and state-independent exploration noise."""
 
     def __init__(
-        self,
-        num_obs: int,
-        num_actions: int,
-        hidden: Sequence[int],
-        activation: str = "elu",
-        init_std: float = 1.0,
-        num_critic_obs: int | None = None,
-        symmetry: Symmetry | None = None,
-    ) -> None:
-        """num_obs, num_critic_obs (default: num_obs): entries of the observations of actor and critic.
+        self, num_obs: int, num_actions: int, hidden: Sequence[int], activation: str = "elu", init_std: float = 1.0,
+        num_critic_obs: int | None = None, symmetry: Symmetry | None = None,
+    ) -> None:  # fmt: skip
+        """num_obs, num_critic_obs (default: num_obs): sizes of the observations of actor and critic.
 
-        hidden: widths of the hidden layers of both networks. activation: a key of ACTIVATIONS. init_std: standard
-        deviation of the noise on every action at the start. symmetry: of the policy, saved with the weights.
+        hidden: widths of the hidden layers of both networks. activation: a key of ACTIVATIONS. init_std: initial
+        standard deviation of the noise on every action. symmetry: makes the policy mirror-symmetric; saved as buffers.
         """
         super().__init__()
         num_critic_obs = num_obs if num_critic_obs is None else num_critic_obs
@@ -183,41 +179,42 @@ class ActorCritic(nn.Module):
         self.critic_moments = RunningMoments((num_critic_obs,))
         self.value_moments = RunningMoments()
         self._symmetric = symmetry is not None
-        for name, image in symmetry._asdict().items() if symmetry is not None else ():
-            self.register_buffer(f"mirror_{name}_order", image.order)
-            self.register_buffer(f"mirror_{name}_signs", image.signs)
+        for name, mirror in symmetry._asdict().items() if symmetry is not None else ():
+            self.register_buffer(f"mirror_{name}_order", mirror.order)
+            self.register_buffer(f"mirror_{name}_signs", mirror.signs)
 
     @property
     def symmetry(self) -> Symmetry | None:
-        """Symmetry of the policy, on the device of the weights."""
+        """Symmetry of the policy, on the device of the weights; None without one."""
         if not self._symmetric:
             return None
         parts = [
-            Image(*(getattr(self, f"mirror_{name}_{part}") for part in Image._fields)) for name in Symmetry._fields
+            MirrorMap(*(getattr(self, f"mirror_{name}_{part}") for part in MirrorMap._fields))
+            for name in Symmetry._fields
         ]
         return Symmetry(*parts)
 
     def mean(self, features: torch.Tensor) -> torch.Tensor:
-        """Return the policy's mean, (..., num_actions), for what the actor sees (..., num_obs)."""
+        """Return the policy's mean, (..., num_actions), for normalised observations (..., num_obs)."""
         if (symmetry := self.symmetry) is None:
             return self.actor(features)
-        return 0.5 * (self.actor(features) + symmetry.action.of(self.actor(symmetry.obs.of(features))))
+        return 0.5 * (self.actor(features) + symmetry.action.apply(self.actor(symmetry.obs.apply(features))))
 
     def features(self, obs: torch.Tensor) -> torch.Tensor:
-        """Return what the actor sees of raw observations (..., num_obs): finite, scaled, within ±NORMALISED_LIMIT."""
+        """Return the actor's input for raw observations (..., num_obs): normalised, within ±NORMALISED_LIMIT."""
         return self.obs_moments.scaling().features(sanitise(obs), obs.shape[-1])
 
     def critic_features(self, critic_obs: torch.Tensor) -> torch.Tensor:
-        """Return what the critic sees of its raw observations (..., num_critic_obs), likewise."""
+        """Return the critic's input for its raw observations (..., num_critic_obs), as `features`."""
         return self.critic_moments.scaling().features(sanitise(critic_obs), critic_obs.shape[-1])
 
     def value_head(self, critic_features: torch.Tensor) -> torch.Tensor:
-        """Return the critic's output, in standard deviations of the return; (...)."""
+        """Return the critic's output (...) [standard deviations of the return] for (..., num_critic_obs) features."""
         return self.critic(critic_features).squeeze(-1)
 
     def value(self, critic_obs: torch.Tensor) -> torch.Tensor:
-        """Return the expected return from the critic's raw observations (..., num_critic_obs); (...)."""
-        return self.value_moments.scaling().restore(self.value_head(self.critic_features(critic_obs)))
+        """Return the expected return (...) for the critic's raw observations (..., num_critic_obs)."""
+        return self.value_moments.scaling().denormalise(self.value_head(self.critic_features(critic_obs)))
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor) -> torch.Tensor:
@@ -226,84 +223,80 @@ class ActorCritic(nn.Module):
 
 
 class Layers(NamedTuple):
-    """A network as tensors; layer i maps (batch, columns of weights[i]) to (batch, rows of weights[i])."""
+    """A multilayer perceptron as tensors, with its forward and backward pass."""
 
-    weights: tuple[torch.Tensor, ...]
-    """(outputs, inputs) each; the first has zero columns up to a multiple of `flat.ROW_ALIGNMENT`."""
-    biases: tuple[torch.Tensor, ...]
-    """(outputs,) each."""
-    activation: str
-    """Of all layers but the last: elu, relu or tanh."""
+    weights: tuple[torch.Tensor, ...]  # (outputs, inputs) each; the first is zero-padded to `flat.ROW_ALIGNMENT`
+    biases: tuple[torch.Tensor, ...]  # (outputs,) each
+    activation: str  # of all layers but the last: elu, relu or tanh
 
     def forward(self, x: torch.Tensor, dtype: torch.dtype) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        """Return the network's output, float32, and what each of its layers saw.
+        """Return the network's output (batch, outputs), float32, and the input of each layer for `backward`.
 
         The last layer computes in float32, the others in `dtype`; x: (batch, columns of the first weight), float32.
         """
-        seen = []
+        layer_inputs = []
         activation = getattr(functional, self.activation)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            seen.append(x.to(dtype))
-            x = activation(functional.linear(seen[-1], weight.to(dtype), bias.to(dtype)))
-        seen.append(x.float())
-        return functional.linear(seen[-1], self.weights[-1], self.biases[-1]), seen
+            layer_inputs.append(x.to(dtype))
+            x = activation(functional.linear(layer_inputs[-1], weight.to(dtype), bias.to(dtype)))
+        layer_inputs.append(x.float())
+        return functional.linear(layer_inputs[-1], self.weights[-1], self.biases[-1]), layer_inputs
 
-    def backward(self, seen: list[torch.Tensor], slope: torch.Tensor, dtype: torch.dtype) -> list[torch.Tensor]:
+    def backward(self, layer_inputs: list[torch.Tensor], grad: torch.Tensor, dtype: torch.dtype) -> list[torch.Tensor]:
         """Return the gradients of weight and bias of each layer, first to last, float32.
 
-        seen: as `forward` gave it; slope: (batch, outputs) of the loss with respect to the network's output.
+        layer_inputs: from `forward`; grad: (batch, outputs) gradient of the loss by the network's output.
         """
-        found: list[torch.Tensor] = []
-        for index in reversed(range(len(seen))):
-            x = seen[index]
-            slope = slope.to(x.dtype)
-            found = [(slope.t() @ x).float(), slope.sum(0, dtype=torch.float32), *found]
+        gradients: list[torch.Tensor] = []
+        for index in reversed(range(len(layer_inputs))):
+            x = layer_inputs[index]
+            grad = grad.to(x.dtype)
+            gradients = [(grad.t() @ x).float(), grad.sum(0, dtype=torch.float32), *gradients]
             if index > 0:
-                slope = _through(self.activation, slope @ self.weights[index].to(x.dtype), x).to(dtype)
-        return found
+                grad = _activation_backward(self.activation, grad @ self.weights[index].to(x.dtype), x).to(dtype)
+        return gradients
 
 
-class Actor(NamedTuple):
-    """The policy as tensors, in the notation of `jumper_warp.rl.mirror`."""
+class ActorTensors(NamedTuple):
+    """The policy as tensors, with its forward and backward pass; notation of `jumper_warp.rl.mirror`."""
 
     layers: Layers
-    log_std: torch.Tensor
-    """(num_actions,) of the noise."""
-    symmetry: Symmetry | None
-    """With an image of observations as wide as the first weight."""
+    log_std: torch.Tensor  # (num_actions,) of the exploration noise
+    symmetry: Symmetry | None  # its mirror map of observations is padded to the columns of the first weight
 
     def forward(self, x: torch.Tensor, dtype: torch.dtype) -> ActorOutput:
-        """Return the policy's output; arguments as of `Layers.forward`."""
+        """Return the policy's mean for features x; arguments as for `Layers.forward`."""
         if self.symmetry is None:
-            mean, seen = self.layers.forward(x, dtype)
-            return ActorOutput(mean, torch.zeros_like(mean), seen)
-        output, seen = self.layers.forward(torch.cat([x, self.symmetry.obs.of(x)]), dtype)
-        own, other = output.chunk(2)
-        image = self.symmetry.action.of(other)
-        return ActorOutput(0.5 * (own + image), own - image, seen)
+            mean, layer_inputs = self.layers.forward(x, dtype)
+            return ActorOutput(mean, torch.zeros_like(mean), layer_inputs)
+        outputs, layer_inputs = self.layers.forward(torch.cat([x, self.symmetry.obs.apply(x)]), dtype)
+        output, mirrored_output = outputs.chunk(2)
+        image = self.symmetry.action.apply(mirrored_output)
+        return ActorOutput(0.5 * (output + image), output - image, layer_inputs)
 
-    def backward(self, seen: list[torch.Tensor], slope: torch.Tensor, dtype: torch.dtype) -> list[torch.Tensor]:
-        """Return the gradients of weights and biases; slope: of the loss with respect to `ActorOutput.mean`."""
+    def backward(self, layer_inputs: list[torch.Tensor], grad: torch.Tensor, dtype: torch.dtype) -> list[torch.Tensor]:
+        """Return the gradients of weights and biases as `Layers.backward`.
+
+        layer_inputs: from `forward`; grad: (batch, num_actions) gradient of the loss by `ActorOutput.mean`.
+        """
         if self.symmetry is None:
-            return self.layers.backward(seen, slope, dtype)
-        half = 0.5 * slope
-        return self.layers.backward(seen, torch.cat([half, self.symmetry.action.of(half)]), dtype)
+            return self.layers.backward(layer_inputs, grad, dtype)
+        half = 0.5 * grad
+        return self.layers.backward(layer_inputs, torch.cat([half, self.symmetry.action.apply(half)]), dtype)
 
 
 class ActorOutput(NamedTuple):
-    """What a pass of the policy gives."""
+    """Output of a forward pass of the policy."""
 
-    mean: torch.Tensor
-    difference: torch.Tensor
-    """f(x) - N f(M x), 0 without symmetry; (batch, num_actions) like the mean."""
-    seen: list[torch.Tensor]
-    """What each layer saw, for `Actor.backward`."""
+    mean: torch.Tensor  # (batch, num_actions)
+    difference: torch.Tensor  # (batch, num_actions) f(x) - N f(M x); 0 without symmetry
+    layer_inputs: list[torch.Tensor]  # input of each layer, for `ActorTensors.backward`
 
 
-def _through(activation: str, slope: torch.Tensor, output: torch.Tensor) -> torch.Tensor:
-    """Return the slope before an activation from that behind it."""
+def _activation_backward(activation: str, grad: torch.Tensor, output: torch.Tensor) -> torch.Tensor:
+    """Return the gradient by an activation's input, from the gradient by its output and the output itself."""
     if activation == "elu":
-        return torch.addcmul(slope, slope, output.clamp(max=0.0))
+        return torch.addcmul(grad, grad, output.clamp(max=0.0))
     if activation == "relu":
-        return slope * (output > 0.0)
-    return torch.addcmul(slope, slope, output.square(), value=-1.0)
+        return grad * (output > 0.0)
+    return torch.addcmul(grad, grad, output.square(), value=-1.0)

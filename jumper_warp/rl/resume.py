@@ -1,4 +1,4 @@
-"""Going on with a training: which checkpoint, and the random numbers where they were left."""
+"""Resuming a training: the choice of the checkpoint, changed settings, and the state of random generators."""
 
 from __future__ import annotations
 
@@ -10,7 +10,14 @@ from typing import TYPE_CHECKING, Any
 import torch
 
 from jumper_warp.rl.cfg import LATEST, LATEST_OR_NEW
-from jumper_warp.rl.checkpoint import DAMAGE, MANIFEST, Checkpoint, CheckpointError, latest_checkpoint, load_checkpoint
+from jumper_warp.rl.checkpoint import (
+    DECODE_ERRORS,
+    MANIFEST,
+    Checkpoint,
+    CheckpointError,
+    latest_checkpoint,
+    load_checkpoint,
+)
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.sources import changed_sources
 from jumper_warp.utils.state_checks import check_parts, check_tensor
@@ -20,17 +27,17 @@ if TYPE_CHECKING:
     from jumper_warp.rl.distributed import Rank
 
 CHECKPOINTS = "checkpoints"
-"""Folder of a run that holds its checkpoints."""
+"""Folder in a run's folder that holds its checkpoints."""
 SESSION = ("device", "threads", "log_root", "resume", "init_policy", "tensorboard", "wandb")
-"""Settings of a training that are not kept when its run is resumed."""
+"""Training settings that are not restored when a run is resumed."""
 DERIVED = ("interface", "num_envs", "seed")
-"""What an environment tells of itself that other settings say."""
+"""Entries of an environment's configuration that follow from other settings."""
 
 
 def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:
-    """Return the checkpoint to resume; None: a new run begins.
+    """Return the checkpoint that cfg.resume names; None for a new run.
 
-    Raises CheckpointError: there is none that can be used.
+    Raises CheckpointError: there is no usable checkpoint.
     """
     if not cfg.resume:
         return None
@@ -49,10 +56,10 @@ def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:
     return Checkpoint(path, load_checkpoint(path), []) if path.suffix == ".pt" else latest_checkpoint(folder)
 
 
-def own_part(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
-    """Return the part of a checkpoint that is a process's own: `env`, `rng` and its part of `ppo`.
+def rank_state(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
+    """Return a rank's part of a checkpoint: `env`, `rng` and the per-rank part of `ppo`.
 
-    Raises ValueError: it was saved by another number of processes, or a part is missing.
+    Raises ValueError: another number of processes saved the checkpoint, or a part is missing.
     """
     others = state.get("others")
     if not isinstance(others, list):
@@ -61,13 +68,13 @@ def own_part(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
         raise InputError(f"saved by {1 + len(others)} processes, there are {rank.size}")
     if rank.index == 0:
         return state
-    own = others[rank.index - 1]
-    check_parts(own, ("ppo", "env", "rng"), f"others.{rank.index - 1}")
-    return own
+    local = others[rank.index - 1]
+    check_parts(local, ("ppo", "env", "rng"), f"others.{rank.index - 1}")
+    return local
 
 
-def init_policy_of(state: dict[str, Any]) -> str | None:
-    """Return the policy that the run of a checkpoint began with; None: with random weights, or it is not told."""
+def saved_init_policy(state: dict[str, Any]) -> str | None:
+    """Return the policy that a checkpoint's run was initialised with; None for random weights or if unknown."""
     try:
         settings = json.loads(state["config"])["train"]
         return str(settings["init_policy"]) if settings.get("init_policy") else None
@@ -75,40 +82,40 @@ def init_policy_of(state: dict[str, Any]) -> str | None:
         return None
 
 
-def changes(state: dict[str, Any], config: dict[str, Any]) -> list[str]:
-    """Return what a configuration changes against that of a checkpoint, a line for each setting; none if it has none.
+def changed_settings(state: dict[str, Any], config: dict[str, Any]) -> list[str]:
+    """Return a line `flag old -> new` for each setting that differs between a checkpoint's configuration and `config`.
 
-    Settings are called as their flags are.
+    Empty if the checkpoint has no readable configuration.
     """
     try:
         old, new = _settings(json.loads(state["config"])), _settings(config)
-    except DAMAGE:
+    except DECODE_ERRORS:
         return []
-    differ = [name for name in {**old, **new} if old.get(name) != new.get(name)]
-    return [f"{name} {old.get(name)!s:.80} -> {new.get(name)!s:.80}" for name in differ]
+    changed = [name for name in {**old, **new} if old.get(name) != new.get(name)]
+    return [f"{name} {old.get(name)!s:.80} -> {new.get(name)!s:.80}" for name in changed]
 
 
-def changed_files(state: dict[str, Any], config: dict[str, Any]) -> list[str]:
-    """Return a line on each of the user's files that is not what it was when the checkpoint was saved."""
+def changed_user_files(state: dict[str, Any], config: dict[str, Any]) -> list[str]:
+    """Return a line for each user file whose content changed after the checkpoint was saved."""
     try:
         return changed_sources(json.loads(state["config"])["sources"], config["sources"])
-    except DAMAGE:
+    except DECODE_ERRORS:
         return []
 
 
 def _settings(config: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of a run by name."""
+    """Return the settings of a run by the name of their flag."""
     train = {name: value for name, value in config["train"].items() if name not in (*SESSION, "task")}
     env = {name: value for name, value in config["env"].items() if name not in (*DERIVED, "task")}
     task = dict(config["env"].get("task", {}))
     reset = dict(task.get("reset", {}))
-    settings = reset.pop("settings", None) or {}  # flags call them as if they were the reset's own
+    settings = reset.pop("settings", None) or {}  # their flags leave this level out
     task["reset"] = reset | settings
     return _flat(train) | _flat(env) | _flat(task, "env")
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    """Return all that is in nested objects by a name of dots; terms in lists by their names."""
+    """Return the leaves of nested objects by dotted name; entries of lists by their `name`."""
     if isinstance(value, list) and any(isinstance(part, dict) for part in value):
         value = {part.get("name", str(i)): part for i, part in enumerate(value)}
     if not isinstance(value, dict):
@@ -117,8 +124,8 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
     return {key: leaf for part in parts for key, leaf in part.items()}
 
 
-def spent_seconds(state: dict[str, Any]) -> float:
-    """Return the seconds of the run that a checkpoint tells, 0 if it tells none. Raises ValueError: it is no time."""
+def saved_seconds(state: dict[str, Any]) -> float:
+    """Return the training time [s] that a checkpoint records, 0 without one. Raises ValueError: it is malformed."""
     seconds = state.get("seconds", 0.0)
     if type(seconds) not in (int, float) or not 0.0 <= seconds < math.inf:
         raise InputError(f"seconds must be a number, finite and not negative, got {seconds!r:.60}")
@@ -126,7 +133,7 @@ def spent_seconds(state: dict[str, Any]) -> float:
 
 
 def random_state() -> dict[str, torch.Tensor]:
-    """Return the states of torch's generators."""
+    """Return the states of torch's default generators: `cpu`, and `cuda` if there is a GPU."""
     state = {"cpu": torch.get_rng_state()}
     if torch.cuda.is_available():
         state["cuda"] = torch.cuda.get_rng_state()
@@ -134,19 +141,19 @@ def random_state() -> dict[str, torch.Tensor]:
 
 
 def set_random_state(state: dict[str, torch.Tensor]) -> None:
-    """Take up what `random_state` gave; a GPU's only where there is one.
+    """Restore the result of `random_state`; the GPU's state only where there is a GPU.
 
-    Raises ValueError: a part is missing or no state of a generator; nothing is changed.
+    Raises ValueError: a part is missing or not a generator's state; nothing is changed.
     """
-    own = random_state()
+    current = random_state()
     if not isinstance(state, dict) or "cpu" not in state:
         raise InputError("rng lacks cpu")
-    for name in own.keys() & state.keys():
-        check_tensor(state[name], own[name], f"rng.{name}")
+    for name in current.keys() & state.keys():
+        check_tensor(state[name], current[name], f"rng.{name}")
     try:
         torch.set_rng_state(state["cpu"])
-        if "cuda" in own.keys() & state.keys():
+        if "cuda" in current.keys() & state.keys():
             torch.cuda.set_rng_state(state["cuda"])
     except RuntimeError as error:
-        torch.set_rng_state(own["cpu"])
+        torch.set_rng_state(current["cpu"])
         raise InputError(f"rng is not the state of a generator: {error}") from error

@@ -1,4 +1,4 @@
-"""Rollouts: the policy acts in all worlds, and what happened is kept."""
+"""Rollout collection: the policy acts in all worlds, and a buffer records the transitions."""
 
 from __future__ import annotations
 
@@ -10,28 +10,21 @@ from jumper_warp.envs.vec_env import VecEnv, sanitise
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import FlatParameters
 from jumper_warp.rl.graphs import Compiler
-from jumper_warp.rl.networks import DTYPES, Actor, ActorCritic, Scaling
+from jumper_warp.rl.networks import DTYPES, ActorCritic, ActorTensors, Scaling
 
 
 class RolloutBuffer(NamedTuple):
-    """Buffers of policy steps of all worlds; each shape without its first axis in one step's view."""
+    """Transitions of all worlds over num_steps policy steps; `at` returns one step, without the first axis."""
 
-    obs: torch.Tensor
-    """(num_steps + 1, num_envs, num_obs) sanitised."""
-    critic_obs: torch.Tensor
-    """(num_steps + 1, num_envs, num_critic_obs) sanitised; the actor's without `PpoCfg.asymmetric_critic`."""
-    final_critic_obs: torch.Tensor
-    """(num_steps, num_envs, num_critic_obs) after the step, before a reset."""
-    action: torch.Tensor
-    mean: torch.Tensor
-    """(num_steps, num_envs, num_actions) of the policy, like the action."""
-    log_std: torch.Tensor
-    """(num_actions,) of the policy, the same in all steps."""
-    reward: torch.Tensor
-    """(num_steps, num_envs) times `PpoCfg.reward_scale`."""
-    done: torch.Tensor
-    timeout: torch.Tensor
-    """(num_steps, num_envs) 1 where the episode was cut off; done: where it ended, cut off or not."""
+    obs: torch.Tensor  # (num_steps + 1, num_envs, num_obs) sanitised
+    critic_obs: torch.Tensor  # (num_steps + 1, num_envs, num_critic_obs) sanitised; obs without `asymmetric_critic`
+    final_critic_obs: torch.Tensor  # (num_steps, num_envs, num_critic_obs) after the step, before a reset
+    action: torch.Tensor  # (num_steps, num_envs, num_actions) sampled
+    mean: torch.Tensor  # (num_steps, num_envs, num_actions) of the policy
+    log_std: torch.Tensor  # (num_actions,) of the policy, the same in all steps
+    reward: torch.Tensor  # (num_steps, num_envs) times `PpoCfg.reward_scale`
+    done: torch.Tensor  # (num_steps, num_envs) 1 where the episode ended, by termination or timeout
+    timeout: torch.Tensor  # (num_steps, num_envs) 1 where the episode was truncated
 
     def at(self, step: int) -> RolloutBuffer:
         """Return views of one step."""
@@ -39,23 +32,23 @@ class RolloutBuffer(NamedTuple):
 
 
 def make_rollout_buffer(num_steps: int, env: VecEnv, num_critic_obs: int) -> RolloutBuffer:
-    """Return buffers of zeros; num_critic_obs: entries of the critic's observation, which may be the actor's."""
+    """Return a zeroed buffer on the environment's device; num_critic_obs: size of the critic's observation."""
 
-    def buffer(*shape: int) -> torch.Tensor:
+    def zeros(*shape: int) -> torch.Tensor:
         return torch.zeros(*shape, device=env.device)
 
     steps, worlds, actions = num_steps, env.num_envs, env.num_actions
-    obs, critic_obs = buffer(steps + 1, worlds, env.num_obs), buffer(steps + 1, worlds, num_critic_obs)
-    action, mean, final_critic_obs = (buffer(steps, worlds, size) for size in (actions, actions, num_critic_obs))
-    reward, done, timeout = (buffer(steps, worlds) for _ in range(3))
-    return RolloutBuffer(obs, critic_obs, final_critic_obs, action, mean, buffer(actions), reward, done, timeout)
+    obs, critic_obs = zeros(steps + 1, worlds, env.num_obs), zeros(steps + 1, worlds, num_critic_obs)
+    action, mean, final_critic_obs = (zeros(steps, worlds, size) for size in (actions, actions, num_critic_obs))
+    reward, done, timeout = (zeros(steps, worlds) for _ in range(3))
+    return RolloutBuffer(obs, critic_obs, final_critic_obs, action, mean, zeros(actions), reward, done, timeout)
 
 
 class Collector:
-    """Fills a rollout with the present policy."""
+    """Steps the environment with the current policy, and records the transitions in `rollout`."""
 
     def __init__(self, env: VecEnv, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, compiler: Compiler) -> None:
-        """flat: the parameters of `model`."""
+        """flat: parameters of `model`."""
         self.env, self.cfg = env, cfg
         self._critic_obs = env.critic_obs if cfg.asymmetric_critic else env.obs
         self._final_critic_obs = env.final_critic_obs if cfg.asymmetric_critic else env.final_obs
@@ -65,44 +58,57 @@ class Collector:
         self._scaling = Scaling(*(torch.zeros(env.num_obs, device=env.device) for _ in Scaling._fields))
         counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
         self.episode = torch.zeros(2, env.num_envs, **counts)
-        """Return and length so far."""
+        """(2, num_envs) return and length of each world's current episode."""
         self.finished = torch.zeros(3, env.num_envs, **counts)
-        """Sums of return and length of the episodes that ended, and their number."""
-        self._act, self._keep = compiler(_act), compiler(_keep)
+        """(3, num_envs) sum of returns, sum of lengths and number of the finished episodes."""
+        self._sample_action, self._record = compiler(sample_action), compiler(record_transition)
 
     @torch.no_grad()
     def roll(self) -> None:
-        """Act for `num_steps` policy steps."""
+        """Fill the rollout: act for `num_steps` policy steps."""
         env, rollout = self.env, self.rollout
-        for place, value in zip(self._scaling, self._moments.scaling(), strict=True):
-            place.copy_(value)
+        for scaling, value in zip(self._scaling, self._moments.scaling(), strict=True):
+            scaling.copy_(value)
         rollout.log_std.copy_(self._actor.log_std)
         rollout.action.normal_()
         for step in self._steps:
-            self._decide(step)
+            self._act_step(step)
             env.step(step.action)
-            self._remember(step)
+            self._record_step(step)
         rollout.obs[-1] = sanitise(env.obs)
         rollout.critic_obs[-1] = sanitise(self._critic_obs)
 
     @torch.no_grad()
-    def rehearse(self) -> None:
-        """Compile, as if one step were made; spoils the rollout and the counts of episodes."""
-        self._decide(self._steps[0])
-        self._remember(self._steps[0])
+    def warm_up(self) -> None:
+        """Compile all functions by running one step; overwrites the rollout and the episode counts."""
+        self._act_step(self._steps[0])
+        self._record_step(self._steps[0])
 
-    def _decide(self, step: RolloutBuffer) -> None:
-        self._act(self.env.obs, self._critic_obs, step, self._actor, self._scaling, DTYPES[self.cfg.precision])
+    def _act_step(self, step: RolloutBuffer) -> None:
+        """Write observations, mean and action of the present state to `step`, one step of the buffer."""
+        self._sample_action(
+            self.env.obs, self._critic_obs, step, self._actor, self._scaling, DTYPES[self.cfg.precision]
+        )
 
-    def _remember(self, step: RolloutBuffer) -> None:
+    def _record_step(self, step: RolloutBuffer) -> None:
+        """Write the result of the environment's last step to `step`, one step of the buffer."""
         env, scale = self.env, self.cfg.reward_scale
-        self._keep(env.reward, env.done, env.timeout, self._final_critic_obs, step, self.episode, self.finished, scale)
+        final_critic_obs, counts = self._final_critic_obs, (self.episode, self.finished)
+        self._record(env.reward, env.done, env.timeout, final_critic_obs, step, *counts, scale)
 
 
-def _act(
-    obs: torch.Tensor, critic_obs: torch.Tensor, step: RolloutBuffer, actor: Actor, scaling: Scaling, dtype: torch.dtype
+def sample_action(
+    obs: torch.Tensor,
+    critic_obs: torch.Tensor,
+    step: RolloutBuffer,
+    actor: ActorTensors,
+    scaling: Scaling,
+    dtype: torch.dtype,
 ) -> None:
-    """Keep raw observations (num_envs, n), and decide: mean and action, which holds standard normal noise before."""
+    """Record raw observations (num_envs, n) in `step`, and write the policy's mean and a sampled action to it.
+
+    step.action holds standard normal noise on entry.
+    """
     step.obs.copy_(sanitise(obs))
     step.critic_obs.copy_(sanitise(critic_obs))
     mean = actor.forward(scaling.features(sanitise(obs), actor.layers.weights[0].shape[1]), dtype).mean
@@ -110,16 +116,19 @@ def _act(
     step.action.mul_(actor.log_std.exp()).add_(mean)
 
 
-def _keep(
+def record_transition(
     reward: torch.Tensor, done: torch.Tensor, timeout: torch.Tensor, final_critic_obs: torch.Tensor,
     step: RolloutBuffer, episode: torch.Tensor, finished: torch.Tensor, reward_scale: float,
 ) -> None:  # fmt: skip
-    """Keep reward, done, timeout and the critic's last observation; count returns and lengths."""
+    """Record reward, done, timeout and the critic's final observation in `step`, and count returns and lengths.
+
+    episode: (2, num_envs), finished: (3, num_envs), as in `Collector`; both are updated in place.
+    """
     reward = torch.nan_to_num(reward, nan=0.0, posinf=0.0, neginf=0.0)
     step.reward.copy_(reward * reward_scale)
     step.done.copy_(done)
     step.timeout.copy_(timeout)
     step.final_critic_obs.copy_(final_critic_obs)
-    now = episode + torch.stack([reward, torch.ones_like(reward)])
-    finished.add_(torch.cat([now * done, done[None].double()]))
-    episode.copy_(now * (1.0 - done))
+    running = episode + torch.stack([reward, torch.ones_like(reward)])
+    finished.add_(torch.cat([running * done, done[None].double()]))
+    episode.copy_(running * (1.0 - done))

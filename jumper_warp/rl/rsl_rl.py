@@ -12,9 +12,9 @@ from jumper_warp.rl.cfg import PpoCfg
 
 
 def rsl_rl_config(cfg: PpoCfg, save_interval: int, seed: int) -> dict[str, Any]:
-    """Return rsl-rl's configuration with the same settings; it knows no value normalisation and no reward scale.
+    """Return rsl-rl's configuration with the same settings; it has no value normalisation and no reward scale.
 
-    The environment has the observation groups `policy` and `critic`; save_interval: iterations between checkpoints.
+    The environment must have the observation groups `policy` and `critic`. save_interval: iterations per checkpoint.
     """
     same = {name: getattr(cfg, name) for name in ("desired_kl", "gamma", "lam", "entropy_coef", "max_grad_norm")}
     network = {"class_name": "MLPModel", "hidden_dims": list(cfg.hidden), "activation": cfg.activation}
@@ -48,7 +48,8 @@ def train_rsl_rl(
 ) -> OnPolicyRunner:
     """Train with rsl-rl's PPO, and return its runner.
 
-    env: as rsl-rl sees one, reset; folder: for checkpoints and TensorBoard's events, None: nothing is written.
+    env: environment in rsl-rl's interface, already reset. folder: for checkpoints and TensorBoard events (None: no
+    files).
     """
     config = rsl_rl_config(cfg, save_interval, seed)
     runner = OnPolicyRunner(env, config, log_dir=folder and str(folder), device=str(env.device))

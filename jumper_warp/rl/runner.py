@@ -1,4 +1,4 @@
-"""Training: one process per device, logged, interruptible at any time, and resumed where it was left."""
+"""Training loop: one process per device, with logging, checkpoints, interruption by signal, and resuming."""
 
 from __future__ import annotations
 
@@ -18,114 +18,93 @@ from typing import Any, NamedTuple, cast
 import torch
 
 from jumper_warp.envs.vec_env import DifferentiableVecEnv, VecEnv
+from jumper_warp.rl import distributed, resume
+from jumper_warp.rl.actor_init import ActorInit, apply_actor_init
 from jumper_warp.rl.cfg import TrainCfg
-from jumper_warp.rl.checkpoint import DAMAGE, Checkpoint, CheckpointError, one_line, save_checkpoint
-from jumper_warp.rl.distributed import (
-    Rank,
-    all_same,
-    gather,
-    join_ranks,
-    largest_over_ranks,
-    one_rank_first,
-    wait_for_ranks,
-    world_size,
-)
+from jumper_warp.rl.checkpoint import DECODE_ERRORS, Checkpoint, CheckpointError, one_line_message, save_checkpoint
+from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.logger import Stopwatch, TrainingLog
 from jumper_warp.rl.ppo import STATISTICS, Ppo
-from jumper_warp.rl.resume import (
-    CHECKPOINTS,
-    changed_files,
-    changes,
-    find_checkpoint,
-    init_policy_of,
-    own_part,
-    random_state,
-    set_random_state,
-    spent_seconds,
-)
+from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.rl.shac import STATISTICS as SHAC_STATISTICS
 from jumper_warp.rl.shac import Shac
-from jumper_warp.rl.start import Start, begin_with
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.files import write_atomically
 from jumper_warp.utils.runtime import git_commit, versions
-from jumper_warp.utils.sources import source_sums
+from jumper_warp.utils.sources import source_checksums
 from jumper_warp.utils.threads import set_threads
 
 CONFIG = "config.json"
-"""File of a run: all settings, versions and the commit."""
+"""File in a run's folder with all settings, versions and the commit."""
 PERF = ("Perf/fps", "Perf/collect_s", "Perf/update_s", "Perf/elapsed_s")
-"""Logged figures of the training itself: steps per second, and seconds."""
+"""Performance metrics: policy steps per second, rollout time [s], update time [s], training time [s]."""
 LEARNING = ("Loss/learning_rate", "Policy/mean_std", "Train/mean_return", "Train/mean_length")
-"""Logged besides the losses; those of Train/ once an episode has ended."""
+"""Learning metrics besides the losses; Train/ only if an episode has ended."""
 INTERRUPTED = 130
-"""Exit code of a training that was asked to stop."""
+"""Exit code of a training that a signal stopped."""
 
 MakeEnv = Callable[[int, int, torch.device], VecEnv]
-"""Makes an environment from the number of its worlds, a seed and a device."""
+"""Function that makes an environment from the number of worlds, the seed and the device."""
 AsRslRl = Callable[[VecEnv, int], Any]
-"""Makes rsl-rl's view of an environment, which reads its metrics once in so many steps."""
+"""Function that wraps an environment for rsl-rl; its second argument is the number of steps between metrics."""
 
 
 class TrainResult(NamedTuple):
-    """What a finished training leaves."""
+    """Result of a finished training."""
 
-    folder: Path
-    iteration: int
-    """Iterations that the policy has had."""
-    seconds: float
-    """Wall-clock time of this process's iterations [s], the first one included."""
-    figures: dict[str, float]
-    """The last logged ones."""
+    folder: Path  # the run's folder
+    iteration: int  # number of iterations, over all resumes
+    seconds: float  # wall-clock time of this process's iterations [s], including the first
+    metrics: dict[str, float]  # last logged metrics
 
 
-class Stop:
-    """Context in which Ctrl-C and SIGTERM set `asked`; the second Ctrl-C interrupts at once."""
+class StopRequest:
+    """Context manager in which Ctrl-C or SIGTERM sets `requested`; a second Ctrl-C raises KeyboardInterrupt."""
 
-    def __enter__(self) -> Stop:
-        self.asked = False
-        self._previous = {number: signal.signal(number, self._ask) for number in (signal.SIGINT, signal.SIGTERM)}
+    def __enter__(self) -> StopRequest:
+        self.requested = False
+        self._previous = {each: signal.signal(each, self._on_signal) for each in (signal.SIGINT, signal.SIGTERM)}
         return self
 
     def __exit__(self, *_: object) -> None:
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 
-    def _ask(self, number: int, frame: FrameType | None) -> None:
-        self.asked = True
+    def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        self.requested = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
 def train(
     cfg: TrainCfg, make_env: MakeEnv, command: str | None = None, as_rsl_rl: AsRslRl | None = None,
-    start: Start | None = None, checkpoint: Checkpoint | None = None,
+    actor_init: ActorInit | None = None, checkpoint: Checkpoint | None = None,
 ) -> TrainResult:  # fmt: skip
-    """Train to the last iteration or the time limit, and save.
+    """Train to the last iteration or the time limit, save, and return the result.
 
-    command: what the user would type to continue, without `--resume`; by default `jumper train TASK`. as_rsl_rl: needed
-    with trainer rsl-rl. start: the policy that cfg.init_policy names, needed with it. checkpoint: the one that
-    cfg.resume names, if it has been read.
+    command: command line printed for resuming, without `--resume` (default: `jumper train TASK`). as_rsl_rl: required
+    by trainer rsl-rl. actor_init: of the policy that cfg.init_policy names, required with it. checkpoint: the loaded
+    checkpoint that cfg.resume names (default: it is loaded here).
 
-    Raises ValueError: a setting does not fit the environment or the machine. CheckpointError: there is nothing usable
-    to resume from, or the end could not be saved. SystemExit: with code INTERRUPTED, after Ctrl-C or SIGTERM ended the
-    iteration and it was saved.
+    Raises ValueError: a setting does not fit the environment or the machine. CheckpointError: no usable checkpoint to
+    resume from, or the last one could not be saved. SystemExit with code INTERRUPTED: stopped by Ctrl-C or SIGTERM,
+    after a checkpoint was saved.
     """
     set_threads(cfg.threads)
-    rank = join_ranks(cfg.device, cfg.threads)
-    run: Run | None = None
+    rank = distributed.init_distributed(cfg.device, cfg.threads)
+    run: TrainingRun | None = None
     try:
         _check_processes(cfg, rank)
-        if checkpoint is None and bool(cfg.init_policy) != (start is not None):
-            raise InputError("init_policy and start, the policy that it names, need each other")
+        if checkpoint is None and bool(cfg.init_policy) != (actor_init is not None):
+            raise InputError("init_policy and actor_init, of the policy that it names, need each other")
         env = make_env(cfg.num_envs // rank.size, (cfg.seed + 1000 * rank.index) % 2**31, rank.device)
         if cfg.trainer == "rsl-rl":
             return _train_rsl_rl(cfg, env, as_rsl_rl, rank)
         torch.manual_seed(cfg.seed)  # the same weights in all processes
-        run = Run(cfg, env, rank, command, start, checkpoint)
-        with Stop() as stop:
+        run = TrainingRun(cfg, env, rank, command, actor_init, checkpoint)
+        with StopRequest() as stop:
             result = run.iterate(stop)
-        wait_for_ranks()
-        if stop.asked:
+        distributed.wait_for_ranks()
+        if stop.requested:
             raise SystemExit(INTERRUPTED)
         return result
     finally:
@@ -136,7 +115,7 @@ def train(
 
 
 def _check_processes(cfg: TrainCfg, rank: Rank) -> None:
-    """Raises ValueError: the trainer cannot be had, or worlds or samples do not divide."""
+    """Check that trainer, worlds and samples fit the number of processes. Raises ValueError."""
     if cfg.trainer != "ppo" and rank.size > 1:
         raise InputError(f"trainer {cfg.trainer} is offered for one process only")
     if cfg.num_envs % rank.size:
@@ -146,212 +125,214 @@ def _check_processes(cfg: TrainCfg, rank: Rank) -> None:
 
 
 def _check_best_metric(name: str, logged: set[str]) -> None:
-    """Raises ValueError: no figure of this name is logged."""
+    """Check that a metric of this name is logged. Raises ValueError."""
     if name not in logged:
-        some = ", ".join(sorted(each for each in logged if each.startswith(("Metrics/", "Train/"))))
-        raise InputError(f"best_metric must name a logged figure, such as {some}, got {name!r:.60}")
+        examples = ", ".join(sorted(each for each in logged if each.startswith(("Metrics/", "Train/"))))
+        raise InputError(f"best_metric must name a logged metric, such as {examples}, got {name!r:.60}")
 
 
 def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
-    """Return all settings with versions and commit, ready for JSON."""
+    """Return all settings with versions and commit, as JSON holds them."""
     settings = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
-    commit, described = git_commit(), env.config()
+    commit, env_config = git_commit(), env.config()
     return {
         "train": settings,
-        "env": described,
+        "env": env_config,
         "processes": rank.size,
         "device": str(rank.device),
         "versions": versions(),
         "commit": commit and commit._asdict(),
-        "sources": source_sums(described),
+        "sources": source_checksums(env_config),
     }
 
 
-class Run:
-    """A training under way in this process."""
+class TrainingRun:
+    """State of a training in this process: algorithm, environment, folder, iteration and time."""
 
     def __init__(
-        self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, start: Start | None = None,
+        self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, actor_init: ActorInit | None = None,
         checkpoint: Checkpoint | None = None,
     ) -> None:  # fmt: skip
-        """Build the algorithm, and take up a checkpoint if the configuration names one, or else begin with a policy.
+        """Build the algorithm, and load the checkpoint that cfg.resume names, else apply `actor_init` if given.
 
-        command, start and checkpoint: as in `train`.
+        command, actor_init and checkpoint: as in `train`.
         """
         self.cfg, self.env, self.rank = cfg, env, rank
         self._command = command or f"jumper train {cfg.task}"
-        by_gradients = cfg.trainer == "shac"
-        self.ppo = Shac(cast(DifferentiableVecEnv, env), cfg.ppo, cfg.shac) if by_gradients else Ppo(env, cfg.ppo)
-        losses = {f"Loss/{name}" for name in (SHAC_STATISTICS if by_gradients else STATISTICS)}
+        use_shac = cfg.trainer == "shac"
+        self.ppo = Shac(cast(DifferentiableVecEnv, env), cfg.ppo, cfg.shac) if use_shac else Ppo(env, cfg.ppo)
+        losses = {f"Loss/{name}" for name in (SHAC_STATISTICS if use_shac else STATISTICS)}
         _check_best_metric(cfg.best_metric, {*env.metrics(), *losses, *LEARNING, *PERF})
         self.config = full_config(cfg, env, rank)
-        self.iteration, self.seconds = 0, 0.0  # that the run had before this process
-        self._begin: float | None = None  # on the clock, as if all seconds that count were of this process
-        self.figures: dict[str, float] = {}
+        self.iteration, self.seconds = 0, 0.0  # of the run before this process
+        self._clock_start: float | None = None  # time at which the run would have started without interruption
+        self.metrics: dict[str, float] = {}
         self.notes: list[str] = []
-        checkpoint = checkpoint or find_checkpoint(cfg)
-        if not all_same(str(checkpoint and (checkpoint.path, checkpoint.state["iteration"]))):
+        checkpoint = checkpoint or resume.find_checkpoint(cfg)
+        if not distributed.same_on_all_ranks(str(checkpoint and (checkpoint.path, checkpoint.state["iteration"]))):
             raise InputError("the processes found different checkpoints: log_root must be a folder that all can read")
-        if start is not None and checkpoint is None:
-            begin_with(start, self.ppo.model, cfg.num_envs * cfg.ppo.num_steps)
-            self.notes.append(", ".join(filter(None, (f"starts from {cfg.init_policy}", start.change))))
+        if actor_init is not None and checkpoint is None:
+            apply_actor_init(actor_init, self.ppo.model, cfg.num_envs * cfg.ppo.num_steps)
+            self.notes.append(", ".join(filter(None, (f"starts from {cfg.init_policy}", actor_init.change))))
         torch.manual_seed(cfg.seed + 1 + rank.index)
         self.folder = new_folder(cfg, rank) if checkpoint is None else self._resume(checkpoint)
         if rank.index == 0:
-            write_whole(self.folder / CONFIG, json.dumps(self.config, indent=1).encode())
+            write_atomically(self.folder / CONFIG, json.dumps(self.config, indent=1).encode())
 
     def _resume(self, checkpoint: Checkpoint) -> Path:
-        path, state, refusals = checkpoint
-        changed = changes(state, self.config)
-        self.notes += [*(f"passed over: {refusal}" for refusal in refusals), f"resumed {path}", *changed]
-        self.notes += changed_files(state, self.config)
+        """Load a checkpoint, and return its run's folder. Raises CheckpointError: it does not fit the settings."""
+        path, state, skipped = checkpoint
+        changed = resume.changed_settings(state, self.config)
+        self.notes += [*(f"skipped: {reason}" for reason in skipped), f"resumed {path}", *changed]
+        self.notes += resume.changed_user_files(state, self.config)
         try:
-            own = own_part(state, self.rank)
-            self.ppo.load_state_dict({**state["ppo"], **own["ppo"]})
-            self.env.load_state_dict(own["env"])
-            self.seconds = spent_seconds(state)
-            set_random_state(own["rng"])
-        except DAMAGE as error:
-            told = f" ({', '.join(changed)})" if changed else ""
-            raise CheckpointError(f"{path}: does not fit these settings: {one_line(error)}{told}") from error
+            local = resume.rank_state(state, self.rank)
+            self.ppo.load_state_dict({**state["ppo"], **local["ppo"]})
+            self.env.load_state_dict(local["env"])
+            self.seconds = resume.saved_seconds(state)
+            resume.set_random_state(local["rng"])
+        except DECODE_ERRORS as error:
+            suffix = f" ({', '.join(changed)})" if changed else ""
+            raise CheckpointError(f"{path}: does not fit these settings: {one_line_message(error)}{suffix}") from error
         self.iteration = state["iteration"]
-        self.config["train"]["init_policy"] = init_policy_of(state)
+        self.config["train"]["init_policy"] = resume.saved_init_policy(state)
         return path.parent.parent
 
-    def iterate(self, stop: Stop) -> TrainResult:
-        """Iterate until the end, the time limit or a wish to stop; log and save on the way."""
+    def iterate(self, stop: StopRequest) -> TrainResult:
+        """Iterate until the last iteration, the time limit or a stop request, with logging and checkpoints."""
         cfg, ppo = self.cfg, self.ppo
         with ThreadPoolExecutor(1) as pool:
-            kernels = pool.submit(getattr(self.env, "compile", lambda: None))  # not every `VecEnv` has something to
-            one_rank_first(ppo.prepare)
+            kernels = pool.submit(getattr(self.env, "compile", lambda: None))  # optional for a `VecEnv`
+            distributed.local_rank_zero_first(ppo.compile)
             kernels.result()
         if self.iteration == 0:
             self.env.reset()
-        start, first = time.perf_counter(), self.iteration + 1
+        start, first_iteration = time.perf_counter(), self.iteration + 1
         watch = Stopwatch(self.rank.device)
-        with self._log() as log:
+        with self._open_log() as log:
             for note in [f"run {self.folder}", *self.notes]:
-                log.say(note)
-            ending = is_last_iteration(self.iteration, cfg, 0.0 < cfg.max_seconds <= self.seconds)
-            if ending:
+                log.print_line(note)
+            is_last = is_last_iteration(self.iteration, cfg, 0.0 < cfg.max_seconds <= self.seconds)
+            if is_last:
                 seconds = f"--max-seconds {cfg.max_seconds:g}"
                 limit = f"--iterations {cfg.iterations}" if self.iteration >= cfg.iterations else seconds
-                log.say(f"nothing is left to train after iteration {self.iteration}: give more than {limit}")
-            while not ending:
+                log.print_line(f"nothing is left to train after iteration {self.iteration}: give more than {limit}")
+            while not is_last:
                 watch.start()
                 ppo.set_progress(self._progress())
                 ppo.iterate(watch.mark)
                 self.iteration += 1
-                if self.iteration == first:
-                    self._begin_counting()
-                ending = is_last_iteration(self.iteration, cfg, self.sync_stop_request(stop))
-                if ending or self.iteration % cfg.log_interval == 0:
+                if self.iteration == first_iteration:
+                    self._start_clock()
+                is_last = is_last_iteration(self.iteration, cfg, self.sync_stop_request(stop))
+                if is_last or self.iteration % cfg.log_interval == 0:
                     times, seconds = watch.read()
-                    self.figures = self._read(times, seconds)
-                    log.log(self.iteration, self.figures, self._left(seconds))
-                elif self.iteration == first:  # it takes longer than the others
+                    self.metrics = self._read_metrics(times, seconds)
+                    log.log(self.iteration, self.metrics, self._remaining(seconds))
+                elif self.iteration == first_iteration:  # discard its time, which includes warm-up
                     watch.read()
-                if ending or self.iteration % cfg.save_interval == 0:
-                    self._save(log, ending, stop)
-        return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.figures)
+                if is_last or self.iteration % cfg.save_interval == 0:
+                    self._save(log, is_last, stop)
+        return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.metrics)
 
-    def _log(self) -> TrainingLog | _Silent:
+    def _open_log(self) -> TrainingLog | _NoLog:
+        """Return the log of rank 0, and one that discards everything elsewhere."""
         if self.rank.index != 0:
-            return _Silent()
+            return _NoLog()
         cfg = self.cfg
         return TrainingLog(self.folder, self.config, cfg.iterations, cfg.tensorboard, cfg.wandb, self.iteration)
 
-    def _begin_counting(self) -> None:
-        """Count the run's time from here on, when the device has done what it was asked to."""
+    def _start_clock(self) -> None:
+        """Start counting the training time, after synchronising with the device."""
         if self.rank.device.type == "cuda":
             torch.cuda.synchronize()
-        self._begin = time.perf_counter() - self.seconds
+        self._clock_start = time.perf_counter() - self.seconds
 
     def _elapsed(self) -> float:
-        """Return the seconds of the run that count, see `TrainCfg.max_seconds`."""
-        return self.seconds if self._begin is None else time.perf_counter() - self._begin
+        """Return the training time [s] over all resumes, as `TrainCfg.max_seconds` counts it."""
+        return self.seconds if self._clock_start is None else time.perf_counter() - self._clock_start
 
     def _progress(self) -> float:
-        """Return how much of the training is over, by iterations or by time, whichever is further."""
-        timed = self.cfg.max_seconds > 0.0
-        return max(self.iteration / self.cfg.iterations, self._elapsed() / self.cfg.max_seconds if timed else 0.0)
+        """Return the progress of the training from 0 to 1, the maximum by iterations and by time."""
+        has_limit = self.cfg.max_seconds > 0.0
+        return max(self.iteration / self.cfg.iterations, self._elapsed() / self.cfg.max_seconds if has_limit else 0.0)
 
-    def _left(self, seconds: float) -> float:
-        """Return how long the rest takes [s] at so many seconds an iteration."""
-        left = (self.cfg.iterations - self.iteration) * seconds
+    def _remaining(self, seconds: float) -> float:
+        """Return the estimated time to the end [s]; seconds: duration of an iteration [s]."""
+        remaining = (self.cfg.iterations - self.iteration) * seconds
         if self.cfg.max_seconds > 0.0:
-            left = min(left, max(self.cfg.max_seconds - self._elapsed(), 0.0))
-        return left
+            remaining = min(remaining, max(self.cfg.max_seconds - self._elapsed(), 0.0))
+        return remaining
 
-    def sync_stop_request(self, stop: Stop) -> bool:
-        """Return whether to end early, because a process was asked to or is at the time limit.
+    def sync_stop_request(self, stop: StopRequest) -> bool:
+        """Return whether to end early: a process has a stop request or has reached the time limit.
 
-        Several processes exchange this when they log, not otherwise; `stop.asked` becomes the same in all of them.
+        Several processes synchronise this, and `stop.requested`, only in iterations that they log.
         """
-        late = 0.0 < self.cfg.max_seconds <= self._elapsed()
-        if world_size() > 1:
+        over_time = 0.0 < self.cfg.max_seconds <= self._elapsed()
+        if distributed.world_size() > 1:
             if self.iteration % self.cfg.log_interval:
                 return False
-            stop.asked, late = map(bool, largest_over_ranks([int(stop.asked), int(late)]))
-        return stop.asked or late
+            stop.requested, over_time = map(bool, distributed.all_reduce_max([int(stop.requested), int(over_time)]))
+        return stop.requested or over_time
 
-    def _read(self, times: list[float], seconds: float) -> dict[str, float]:
-        """Return the figures to log; times: of collect and update [s], seconds: of an iteration."""
+    def _read_metrics(self, times: list[float], seconds: float) -> dict[str, float]:
+        """Return the metrics to log; times: of rollout and update [s]; seconds: of an iteration [s]."""
         steps = self.cfg.ppo.num_steps * self.cfg.num_envs
         perf = (steps / seconds, *times, self._elapsed())
         return {**self.ppo.statistics(), **self.env.metrics(), **dict(zip(PERF, perf, strict=True))}
 
-    def _save(self, log: TrainingLog | _Silent, ending: bool, stop: Stop) -> None:
-        """Save a checkpoint; a failure is only told, and tried again next time, unless this is the last."""
+    def _save(self, log: TrainingLog | _NoLog, is_last: bool, stop: StopRequest) -> None:
+        """Save a checkpoint in rank 0; a failure prints a warning, and raises CheckpointError only in the last."""
         seconds = self._elapsed()
-        own = {"ppo": self.ppo.state_dict(), "env": self.env.state_dict(), "rng": random_state()}
-        others = self._others(own)
+        local = {"ppo": self.ppo.state_dict(), "env": self.env.state_dict(), "rng": resume.random_state()}
+        others = self._other_ranks(local)
         if self.rank.index != 0:
             return
-        state = {"iteration": self.iteration, "seconds": seconds, **own, "others": others}
+        state = {"iteration": self.iteration, "seconds": seconds, **local, "others": others}
         state["config"] = json.dumps(self.config)
         folder = self.folder / CHECKPOINTS
         try:
-            path = save_checkpoint(folder, state, self.figures.get(self.cfg.best_metric), self.cfg.keep)
+            path = save_checkpoint(folder, state, self.metrics.get(self.cfg.best_metric), self.cfg.keep)
         except OSError as error:
-            if ending:
+            if is_last:
                 raise CheckpointError(f"{folder}: not saved: {error.strerror}") from error
-            log.say(f"{folder}: not saved, will try again: {error.strerror}")
+            log.print_line(f"{folder}: not saved, will try again: {error.strerror}")
             return
-        if ending:
-            again = f", continue with: {self._command} --resume {shlex.quote(str(self.folder))}"
-            log.say(f"saved {path}{again if stop.asked else ''}")
+        if is_last:
+            hint = f", continue with: {self._command} --resume {shlex.quote(str(self.folder))}"
+            log.print_line(f"saved {path}{hint if stop.requested else ''}")
 
-    def _others(self, own: dict[str, Any]) -> list[dict[str, Any]]:
-        """Return, in process 0, what only the other processes know: their worlds and random numbers."""
-        if world_size() == 1:
+    def _other_ranks(self, local: dict[str, Any]) -> list[dict[str, Any]]:
+        """Return, in rank 0, the per-rank state of the other ranks: worlds, episode counts and random generators."""
+        if distributed.world_size() == 1:
             return []
-        return gather({**own, "ppo": {"episode": own["ppo"]["episode"].cpu()}}, self.rank)[1:]
+        return distributed.gather_states({**local, "ppo": {"episode": local["ppo"]["episode"].cpu()}}, self.rank)[1:]
 
 
 def is_last_iteration(iteration: int, cfg: TrainCfg, end_early: bool) -> bool:
-    """Return whether a run with so many iterations behind it is at its end."""
+    """Return whether a run ends after `iteration` iterations; end_early: a stop request or the time limit."""
     return end_early or iteration >= cfg.iterations
 
 
-class _Silent:
-    """Stands for the log in all processes but the first."""
+class _NoLog:
+    """Log that discards everything, in all ranks but 0."""
 
-    def __enter__(self) -> _Silent:
+    def __enter__(self) -> _NoLog:
         return self
 
     def __exit__(self, *_: object) -> None:
         pass
 
-    def say(self, line: str) -> None:
+    def print_line(self, line: str) -> None:
         pass
 
-    def log(self, iteration: int, figures: dict[str, float], left: float) -> None:
+    def log(self, iteration: int, metrics: dict[str, float], remaining: float) -> None:
         pass
 
 
 def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
-    """Make and return the folder of a run that begins now."""
+    """Return the folder of a new run, log_root/task/time; rank 0 creates it."""
     name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
     folder = cfg.log_root / cfg.task / name
     if rank.index == 0:
@@ -360,6 +341,7 @@ def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
 
 
 def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl | None, rank: Rank) -> TrainResult:
+    """Train with rsl-rl's PPO; arguments and result as for `train`."""
     if as_rsl_rl is None:
         raise InputError("trainer rsl-rl needs as_rsl_rl, which adapts the environment")
     from jumper_warp.rl.rsl_rl import train_rsl_rl
@@ -367,7 +349,7 @@ def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl | None, rank: R
     folder = new_folder(cfg, rank)
     if rank.index == 0:
         print(f"run {folder}", file=sys.stderr)
-        write_whole(folder / CONFIG, json.dumps(full_config(cfg, env, rank), indent=1).encode())
+        write_atomically(folder / CONFIG, json.dumps(full_config(cfg, env, rank), indent=1).encode())
     begin = time.perf_counter()
     torch.manual_seed(cfg.seed + rank.index)
     env.reset()

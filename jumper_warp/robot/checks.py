@@ -1,4 +1,4 @@
-"""Checks of a robot description as a whole: the tree, the loops, the legs, and the closed form of a leg's knees."""
+"""Checks of a whole robot description (tree, loops, legs, motors, poses), and the inverse kinematics of the knees."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from jumper_warp.robot.bounds import LENGTH, PAW_RADIUS, Reading, check_bounds, refuse_outside
+from jumper_warp.robot.bounds import LENGTH, PAW_RADIUS, RangeCheck, check_bounds, refuse_outside
 from jumper_warp.robot.parts import LEGS, MOTOR_JOINTS, Joint, RobotDescription, RobotDescriptionError, require
 from jumper_warp.utils.errors import InputError
 
 TOLERANCE = 1.0e-6
-"""Largest deviation of a mirrored leg from the front left one, and of a leg from its planar form [m, kg, rad]."""
+"""[m, kg, rad] Largest deviation of a mirrored leg from the front left one, and of a leg from its planar form."""
 INERTIA_TOLERANCE = 1.0e-9
-"""The same for moments of inertia [kg m^2]."""
+"""[kg m^2] Largest deviation of mirrored moments of inertia."""
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class LegDimensions:
 
 
 def leg_dimensions(description: RobotDescription, leg: str) -> LegDimensions:
-    """Return the dimensions of a leg of a checked description, read off its joint origins."""
+    """Return the dimensions of a leg of a checked description, from its joint origins."""
     lateral, outer, inner = (description.joint(f"{leg}_{name}").origin for name in ("lateral", "outer", "inner"))
     knee = description.joint(f"{leg}_outer_knee").origin
     return LegDimensions(
@@ -54,7 +54,7 @@ def leg_dimensions(description: RobotDescription, leg: str) -> LegDimensions:
 
 
 def knee_angles(leg: LegDimensions, outer: float, inner: float) -> tuple[float, float, float]:
-    """Return outer and inner knee angle [rad] that close the loop, and the height of the ankle [m, housing z].
+    """Return outer and inner knee angles [rad] that close the loop, and the ankle's z in the housing frame [m].
 
     The ankle is the intersection of the two shank circles below the knees. Raises ValueError where they do not meet.
     """
@@ -74,7 +74,7 @@ def knee_angles(leg: LegDimensions, outer: float, inner: float) -> tuple[float, 
 
 
 def check_description(description: RobotDescription) -> RobotDescription:
-    """Return the description with links and joints in tree order. Raises RobotDescriptionError if it is impossible."""
+    """Return the description with links and joints in tree order. Raises RobotDescriptionError if a check fails."""
     check_bounds(description)
     description = in_tree_order(description)
     check_loops(description)
@@ -88,7 +88,7 @@ def check_description(description: RobotDescription) -> RobotDescription:
 
 
 def in_tree_order(description: RobotDescription) -> RobotDescription:
-    """Return the description with links and joints ordered as the legs are; refuse any other tree."""
+    """Return the description with links and joints ordered by leg; refuse any other tree."""
     file = description.urdf_path
     links = {link.name: link for link in description.links}
     joints = {joint.name: joint for joint in description.joints}
@@ -105,8 +105,8 @@ def in_tree_order(description: RobotDescription) -> RobotDescription:
     expected = tree_layout()
     for name, ends in expected.items():
         require(name in joints, file, f"joint {name}", "missing")
-        found = joints[name].parent, joints[name].child
-        require(found == ends, file, f"joint {name}", "expected to lead from {} to {}".format(*ends))
+        actual = joints[name].parent, joints[name].child
+        require(actual == ends, file, f"joint {name}", "expected to lead from {} to {}".format(*ends))
     for name in sorted(joints.keys() - expected.keys()):
         raise RobotDescriptionError(file, f"joint {name}", "expected no joint of this name")
     order = ["body", *(child for _, child in expected.values())]
@@ -115,7 +115,7 @@ def in_tree_order(description: RobotDescription) -> RobotDescription:
 
 
 def tree_layout() -> dict[str, tuple[str, str]]:
-    """Return (parent, child) of every joint, in tree order."""
+    """Return the names of the parent and child links of every joint, in tree order."""
     layout = {}
     for leg in LEGS:
         layout[f"{leg}_lateral"] = ("body", f"{leg}_housing")
@@ -126,7 +126,7 @@ def tree_layout() -> dict[str, tuple[str, str]]:
 
 
 def check_loops(description: RobotDescription) -> None:
-    """Refuse loops that name other links than a leg's shanks, or are anchored off their axis."""
+    """Refuse loops that do not join a leg's shanks, or whose anchors are off their axes."""
     file, links = description.path, {link.name for link in description.links}
     for leg, loop in zip(LEGS, description.loops, strict=True):
         part = f"loop {loop.name}"
@@ -135,14 +135,14 @@ def check_loops(description: RobotDescription) -> None:
             require(link == expected, file, part, f"expected link {expected}, found {link}")
         length = -loop.parent_anchor[2]
         for anchor in (loop.parent_anchor, loop.child_anchor):
-            on_axis = length > 0.0 and alike(anchor, (0.0, 0.0, -length))
+            on_axis = length > 0.0 and close(anchor, (0.0, 0.0, -length))
             problem = f"expected both anchors at the same place on the shanks' -z axes, found {anchor.tolist()}"
             require(on_axis, file, part, problem)
 
 
-def alike(found: Any, expected: Any, tolerance: float = TOLERANCE) -> bool:
-    """Return whether numbers deviate by no more than a tolerance."""
-    return bool(np.abs(np.asarray(found) - expected).max() <= tolerance)
+def close(actual: Any, expected: Any, tolerance: float = TOLERANCE) -> bool:
+    """Return whether all numbers deviate by at most a tolerance."""
+    return bool(np.abs(np.asarray(actual) - expected).max() <= tolerance)
 
 
 def check_leg(description: RobotDescription, leg: str) -> None:
@@ -155,14 +155,14 @@ def check_leg(description: RobotDescription, leg: str) -> None:
     axes |= {outer_knee: (0, front, 0), inner_knee: (0, -front, 0)}
     for joint, axis in axes.items():
         problem = f"expected axis {axis}, found {joint.axis.tolist()}"
-        require(alike(joint.axis, axis), file, f"joint {joint.name}", problem)
-    own_quarter = front * lateral.origin[0] > 0.0 and side * lateral.origin[1] > 0.0
+        require(close(joint.axis, axis), file, f"joint {joint.name}", problem)
+    in_quarter = front * lateral.origin[0] > 0.0 and side * lateral.origin[1] > 0.0
     farther = front * (outer.origin[0] - inner.origin[0]) > 0.0
-    planar = abs(outer.origin[2]) <= TOLERANCE and alike(outer.origin[1:], inner.origin[1:])
+    planar = abs(outer.origin[2]) <= TOLERANCE and close(outer.origin[1:], inner.origin[1:])
     knee = outer_knee.origin
-    on_axis = knee[2] < 0.0 and abs(knee[0]) <= TOLERANCE and alike(knee, inner_knee.origin)
+    on_axis = knee[2] < 0.0 and abs(knee[0]) <= TOLERANCE and close(knee, inner_knee.origin)
     for joint, holds, problem in (
-        (lateral, own_quarter, "expected the hip in its own quarter of the body"),
+        (lateral, in_quarter, "expected the hip in its own quarter of the body"),
         (outer, farther, "expected farther from the body centre than its twin"),
         (inner, planar, "expected both transversal axes at one y and at z 0"),
         (outer_knee, on_axis, "expected both knees alike, on the thighs' -z axes"),
@@ -174,13 +174,13 @@ def check_leg(description: RobotDescription, leg: str) -> None:
         counted = not link.name.startswith(leg) or len(link.collisions) == count
         require(counted, file, f"link {link.name}", f"expected {count} collision shape(s)")
     paw = description.link(loop.parent).collisions[0]
-    at_ankle = paw.kind == "sphere" and alike(paw.position, loop.parent_anchor)
+    at_ankle = paw.kind == "sphere" and close(paw.position, loop.parent_anchor)
     require(at_ankle, file, f"link {loop.parent}", "expected its collision sphere, the paw, at the ankle")
     require(not description.link("body").collisions, file, "link body", "expected no collision shape")
 
 
 def check_lengths(description: RobotDescription, leg: str) -> None:
-    """Refuse a leg of no size, in which what has to be divided by vanishes."""
+    """Refuse a leg with a length near 0 or implausibly large."""
     dimensions, urdf = leg_dimensions(description, leg), description.urdf_path
     axes = abs(dimensions.outer_x - dimensions.inner_x)
     for file, part, name, value, limits in (
@@ -191,7 +191,7 @@ def check_lengths(description: RobotDescription, leg: str) -> None:
         (description.path, f"loop {leg}_ankle", "shank length", dimensions.shank, LENGTH),
         (urdf, f"link {leg}_inner_shank", "paw radius", dimensions.paw_radius, PAW_RADIUS),
     ):
-        refuse_outside(file, part, [Reading(name, value, limits)])
+        refuse_outside(file, part, [RangeCheck(name, value, limits)])
 
 
 def check_mirror(description: RobotDescription, leg: str) -> None:
@@ -200,8 +200,8 @@ def check_mirror(description: RobotDescription, leg: str) -> None:
     file = description.urdf_path
     for link in (link for link in description.links if link.name.startswith(leg)):
         twin = description.link(f"FL{link.name[2:]}")
-        mirrored = alike(link.mass, twin.mass) and alike(link.com, flip * twin.com)
-        mirrored &= alike(link.inertia, np.outer(flip, flip) * twin.inertia, INERTIA_TOLERANCE)
+        mirrored = close(link.mass, twin.mass) and close(link.com, flip * twin.com)
+        mirrored &= close(link.inertia, np.outer(flip, flip) * twin.inertia, INERTIA_TOLERANCE)
         require(mirrored, file, f"link {link.name}", f"expected mass, com, inertia to mirror {twin.name}")
     for joint in (joint for joint in description.joints if joint.name.startswith(leg)):
         twin = description.joint(f"FL{joint.name[2:]}")
@@ -209,10 +209,10 @@ def check_mirror(description: RobotDescription, leg: str) -> None:
         if joint.name.endswith("lateral"):
             origin[1] = description.joint(f"{leg[0]}L_lateral").origin[1]
         stops, twin_stops = ([j.lower, j.upper, j.effort, j.velocity] for j in (joint, twin))
-        mirrored = alike(joint.origin, flip * origin) and alike(stops, twin_stops)
+        mirrored = close(joint.origin, flip * origin) and close(stops, twin_stops)
         require(mirrored, file, f"joint {joint.name}", f"expected to mirror {twin.name}")
-    found, expected = (leg_dimensions(description, name) for name in (leg, "FL"))
-    mirrored = alike([found.shank, found.paw_radius], [expected.shank, expected.paw_radius])
+    own, expected = (leg_dimensions(description, name) for name in (leg, "FL"))
+    mirrored = close([own.shank, own.paw_radius], [expected.shank, expected.paw_radius])
     require(mirrored, file, f"link {leg}_inner_shank", "expected ankle and paw to mirror the FL leg")
 
 

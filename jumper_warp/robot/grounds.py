@@ -1,7 +1,7 @@
 """Grounds to jump from and to land on: platforms, uneven ground, and a block that slides.
 
 Heightfields are for `build_model(ground=...)` and `Simulation(ground=...)`: square, centred on the origin, z = 0 around
-it, where the robot starts. Beyond their rim the ground goes on at the height of the rim.
+it, where the robot starts. Beyond their rim the ground keeps the height of the rim.
 """
 
 from __future__ import annotations
@@ -21,10 +21,10 @@ CELL = 0.02
 
 @dataclass(frozen=True)
 class BlockCfg:
-    """A block in every world, which slides on the floor without turning. Each value may be an array, a row per world.
+    """Block in every world that slides on the floor without turning. Each value may be an array, a row per world.
 
     Its walls are upright and its top is level. The floor's friction acts under the block's own weight and the paws'
-    load. It leans on nothing: where it meets steps of a heightfield it passes through them.
+    load. It passes through steps of a heightfield.
     """
 
     center: tuple[float, float] | np.ndarray
@@ -48,7 +48,7 @@ class BlockCfg:
             raise InputError(f"block center must be finite, got {self.center}")
 
     def per_world(self, num_worlds: int) -> dict[str, np.ndarray]:
-        """Return the values by name, `center` and `half` (num_worlds, 2), the others (num_worlds,).
+        """Return the values of every world by name: `center` and `half` (num_worlds, 2), the others (num_worlds,).
 
         Raises ValueError for arrays of another number of worlds.
         """
@@ -105,7 +105,7 @@ def uneven(
 
 
 def _nodes(size: float, cell: float) -> np.ndarray:
-    """Return the coordinates [m] of the nodes along an axis."""
+    """Return the node coordinates [m] along an axis, from -size/2 to size/2."""
     if not (size > 0.0 and 0.0 < cell <= 0.5 * size):
         raise InputError(f"a ground needs size > 0 and 0 < cell <= size / 2, got {size} and {cell}")
     return np.linspace(-0.5 * size, 0.5 * size, int(np.ceil(size / cell - 1.0e-9)) + 1)
@@ -113,14 +113,14 @@ def _nodes(size: float, cell: float) -> np.ndarray:
 
 def _gaussian_field(rng: np.random.Generator, nodes: int, cell: float, length: float) -> np.ndarray:
     """Return a random field of zero mean and correlation exp(-(distance / length)^2), (nodes, nodes)."""
-    padded = nodes + int(np.ceil(4.0 * length / cell))  # the transform is periodic: the rims must not know each other
+    padded = nodes + int(np.ceil(4.0 * length / cell))  # the transform is periodic: opposite rims must not correlate
     wave = 2.0 * np.pi * np.fft.fftfreq(padded, cell)
     spectrum = np.exp(-0.125 * length**2 * (wave[:, None] ** 2 + wave[None, :] ** 2))
     return np.fft.ifft2(np.fft.fft2(rng.normal(size=(padded, padded))) * spectrum).real[:nodes, :nodes]
 
 
 def _heightfield(heights: np.ndarray, size: float) -> newton.Heightfield:
-    """Return heights [m], rows along y, as a heightfield."""
+    """Return a heightfield of heights [m], rows along y."""
     rows, cols = heights.shape
     half = 0.5 * size
     return newton.Heightfield(data=heights.astype(np.float32), nrow=rows, ncol=cols, hx=half, hy=half)

@@ -25,7 +25,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
 
 PHYSICS_DT = 1.0 / 480.0
-"""Physics step [s] that contacts and loops are tuned for."""
+"""[s] Physics step that contacts and loops are tuned for."""
 
 CONTACT_STIFFNESS = 56689.0
 CONTACT_DAMPING = 476.0
@@ -33,24 +33,24 @@ CONTACT_DAMPING = 476.0
 steps. Softer contacts cost jump height."""
 CONTACT_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
 GROUND_FRICTION = 1.0e-4
-"""[1] Tiny: a contact takes the larger of its two coefficients, which is then the paw's."""
+"""[1] Nearly 0: a contact takes the larger of its two coefficients, so the paw's."""
 MAX_FRICTION = 10.0
 """[1] Of the paws: ten times that of rubber on concrete."""
 GROUND_COLOR = (0.42, 0.46, 0.48)
 LIMIT_STIFFNESS = CONTACT_STIFFNESS
-"""[N m/rad] Hard stops: plastic for SolverJumper, critically damped over two physics steps for MuJoCo."""
+"""[N m/rad] Stiffness of hard stops: plastic for SolverJumper, critically damped over two physics steps for MuJoCo."""
 LIMIT_DAMPING = CONTACT_DAMPING
 NO_EFFORT_LIMIT = 1.0e6
 """[N m] Motor models saturate torque; the model itself does not. A knee's limit is that of its damping."""
 KNEE_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (2, 4)]
 """A world's knees in `joint_qd`."""
 PAWS = tuple(f"{leg}_paw" for leg in LEGS)
-"""Labels of the shapes that touch the ground, behind the world's prefix."""
+"""Labels of the paws' shapes, without the world's prefix."""
 PAW_GROUP = -1
-"""Collision group of the paws: they meet the ground, but not each other."""
+"""Collision group of the paws: they collide with the ground, but not with each other."""
 
 Extras = Callable[[newton.ModelBuilder], Any]
-"""Adds to the builder of one robot what every world shall have beside it; what it returns is not used."""
+"""Adds sites and shapes to the builder of one robot, for every world; its result is ignored."""
 
 
 def build_model(
@@ -101,7 +101,7 @@ def build_model(
 
 
 def other_colliders(model: Model) -> np.ndarray:
-    """Return the indices of the shapes that collide and are neither paws nor the ground that all worlds share."""
+    """Return the indices of the colliding shapes that are neither paws nor the shared ground."""
     flags, worlds, kinds = model.shape_flags.numpy(), model.shape_world.numpy(), model.shape_type.numpy()
     ground = (worlds == -1) & np.isin(kinds, [int(newton.GeoType.PLANE), int(newton.GeoType.HFIELD)])
     colliding = np.flatnonzero(((flags & int(newton.ShapeFlags.COLLIDE_SHAPES)) != 0) & ~ground)
@@ -149,7 +149,7 @@ def standing_configuration(description: RobotDescription, pose: str = "default")
 
 
 def _paw_depth(leg: LegDimensions, lateral: float, ankle_z: float) -> float:
-    """Return how far the paw reaches below the hips [m] for a level base."""
+    """Return the distance [m] of the paw's lowest point below the hips, for a level base."""
     ankle_y = leg.plane_y + leg.knee_y
     return leg.paw_radius - math.cos(lateral) * ankle_z - leg.side * math.sin(lateral) * ankle_y
 
@@ -157,7 +157,7 @@ def _paw_depth(leg: LegDimensions, lateral: float, ankle_z: float) -> float:
 def _robot_builder(
     description: RobotDescription, friction: float, gravity: float, visuals: bool
 ) -> newton.ModelBuilder:
-    """Return the builder of one robot, whose gravity [m/s^2] is that of its world."""
+    """Return the builder of one robot in the default pose, with the world's gravity [m/s^2]."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     bodies = {}
@@ -217,7 +217,7 @@ def _add_joints(builder: newton.ModelBuilder, bodies: dict[str, int], descriptio
 def _add_paw(
     builder: newton.ModelBuilder, body: int, paw: Shape, label: str, friction: float, *, visible: bool
 ) -> None:
-    """Add the sphere that touches the ground; it is hidden where a visual shape shows the paw."""
+    """Add the sphere of a paw; it is hidden where a visual shape shows the paw."""
     config = newton.ModelBuilder.ShapeConfig(
         density=0.0,
         mu=friction,
@@ -237,7 +237,7 @@ def _add_paw(
 
 
 def _add_visuals(builder: newton.ModelBuilder, body: int, link: Link, meshes: dict[int, newton.Mesh]) -> None:
-    """Add shapes that neither collide nor weigh anything; equal meshes are shared."""
+    """Add massless shapes without collision; equal meshes are shared."""
     config = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False, has_particle_collision=False)
     for index, shape in enumerate(link.visuals):
         common = {

@@ -19,6 +19,13 @@ from jumper_warp.utils.errors import InputError
 
 OVERSPEED_START = math.radians(2000.0)
 OVERSPEED_END = math.radians(2500.0)
+"""[rad/s] Speeds at which the torque begins to fade, and is 0."""
+MOTOR_CONSTANTS = ("kp", "kd", "saturation", "peak", "cutoff_speed", "no_load_speed", "offset")
+"""Constants of a motor in `MotorArrays`; units as in `jumper_warp.kernels.actuation.motors`."""
+LIMITS = ("lower", "upper", "lower_zone", "upper_zone")
+FILTER_NAMES = (*(f"{what}.{limit}" for what in ("lateral", "transversal", "sum") for limit in LIMITS), "horizon",
+                "speed_floor")  # fmt: skip
+"""Rows of `filter_constants`: angles [rad], horizon [s], speed [rad/s]. Zones only switch: their gradient is 0."""
 
 
 @dataclass(frozen=True)
@@ -208,3 +215,10 @@ def filter_params(cfg: FilterCfg, *, module: ModuleType = command_filter) -> Any
     params.horizon = cfg.horizon
     params.speed_floor = math.radians(cfg.speed_floor)
     return params
+
+
+def filter_constants(cfg: FilterCfg | None) -> np.ndarray:
+    """Return a filter's constants, (14,), in the order of `FILTER_NAMES`; None: those of the vertical jump."""
+    cfg = cfg or vertical_jump_filter()
+    angles = [getattr(getattr(cfg, what), limit) for what in ("lateral", "transversal", "sum") for limit in LIMITS]
+    return np.array([*np.radians(angles), cfg.horizon, math.radians(cfg.speed_floor)])

@@ -1,4 +1,4 @@
-"""A robot overlay: values that replace those of the description, and ranges for randomisation around them, as JSON."""
+"""Robot overlays: JSON files of values that replace described ones, and ranges of randomisation around them."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jumper_warp.robot.bounds import Range
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.files import write_atomically
 
 SCHEMA = "jumper-warp robot overlay 1"
 RATIO = Range(0.05, 3.0, "times the described value")
@@ -39,26 +39,26 @@ RANGES = {
     "spring_stiffness": bounds.SPRING_STIFFNESS,
     "spring_length": bounds.SPRING_LENGTH,
 }
-"""What the values of each quantity may be."""
+"""Allowed values of each quantity."""
 SECTIONS = ("schema", "source", "values", "randomization")
 RANDOMIZED = (
     "static_friction", "dynamic_friction", "base_mass", "link_mass", "com_shift", "gains", "damping_gains",
     "no_load_speed", "cutoff_speed", "motor_friction", "armature", "joint_offset", "latency", "observation_latency",
     "push_force", "push_torque", "push_interval",
 )  # fmt: skip
-"""Ranges that may be given: the rows of `RandomizationCfg`."""
+"""Allowed ranges: the rows of `RandomizationCfg`."""
 
 
 @dataclass(frozen=True, eq=False)
 class RobotOverlay:
-    """What is known of one robot better than its description says."""
+    """Values of one robot that replace described ones, and ranges of randomisation around them."""
 
     values: Mapping[str, tuple[float, ...]]
     """Fields of `RobotValues` that differ from the description, of one robot."""
     randomization: Mapping[str, tuple[float, float]] = field(default_factory=dict)
     """Rows of `RandomizationCfg`, relative to these values."""
     source: str = ""
-    """Where it comes from."""
+    """Origin of the values, for the reader."""
 
     def __post_init__(self) -> None:
         """Raises InputError: an unknown quantity or range, a wrong number of values, or one out of range."""
@@ -74,7 +74,7 @@ class RobotOverlay:
             raise InputError("robot overlay: each cutoff_speed must be below the no_load_speed")
 
     def robots(self, description: RobotDescription | None = None) -> RobotValues:
-        """Return the values of the robot, N = 1."""
+        """Return the values of the robot, N = 1; other values are as described."""
         robot = RobotValues.nominal(1, description)
         for name, values in self.values.items():
             getattr(robot, name)[0] = values
@@ -82,11 +82,11 @@ class RobotOverlay:
 
     @property
     def latency(self) -> float | None:
-        """From target to motor [s], if it is known."""
+        """Latency from target to motor [s]; None: not given."""
         return self.values["latency"][0] if "latency" in self.values else None
 
     def to_json(self) -> dict[str, Any]:
-        """Return the overlay as JSON can hold it."""
+        """Return the content of the JSON file."""
         return {
             "schema": SCHEMA,
             "source": self.source,
@@ -112,19 +112,19 @@ class RobotOverlay:
         return cls(**sections, source=str(saved.get("source", "")))
 
     def save(self, path: Path) -> None:
-        """Write it as a JSON file. Raises OSError."""
-        write_whole(path, (json.dumps(self.to_json(), indent=2, allow_nan=False) + "\n").encode())
+        """Write the overlay as a JSON file. Raises OSError."""
+        write_atomically(path, (json.dumps(self.to_json(), indent=2, allow_nan=False) + "\n").encode())
 
 
 def check_names(what: str, names: Iterable[str], known: Iterable[str]) -> None:
-    """Raise InputError for a name that is not among those known; what: it names."""
+    """Raise InputError for a name that is not among the known ones; what: kind of name, for the message."""
     for name in names:
         if name not in known:
             raise InputError(f"robot overlay: no {what} {name!r:.60}; there are {', '.join(known)}")
 
 
 def check_range(name: str, values: tuple[float, ...]) -> None:
-    """Raise InputError for a value that a quantity cannot have."""
+    """Raise InputError for a value of a quantity outside `RANGES`."""
     low, high, unit = RANGES[name]
     hint = " (a ratio: 1 is as described)" if RANGES[name] is RATIO else ""
     for value in values:
@@ -134,7 +134,7 @@ def check_range(name: str, values: tuple[float, ...]) -> None:
 
 
 def numbers(name: str, values: Any) -> tuple[float, ...]:
-    """Return finite numbers. Raises InputError."""
+    """Return a list of finite numbers as a tuple. Raises InputError: anything else; name: for the message."""
     if not isinstance(values, list) or any(isinstance(x, bool) or not isinstance(x, int | float) for x in values):
         raise InputError(f"robot overlay: {name!r:.60} must be a list of numbers")
     if not all(math.isfinite(x) for x in values):
@@ -143,7 +143,7 @@ def numbers(name: str, values: Any) -> tuple[float, ...]:
 
 
 def with_springs(stiffness: float, length: float) -> RobotOverlay:
-    """Return the robot with springs between the knees of each leg, of a stiffness [N/m] and a rest length [m].
+    """Return an overlay with springs between the knees of each leg, of a stiffness [N/m] and a rest length [m].
 
     Raises InputError: one of them is out of range.
     """
@@ -151,7 +151,7 @@ def with_springs(stiffness: float, length: float) -> RobotOverlay:
 
 
 def load_overlay(path: Path) -> RobotOverlay:
-    """Return the overlay of a file. Raises InputError: it is none, or OSError: it cannot be read."""
+    """Return the overlay of a file. Raises InputError: not an overlay, or OSError: it cannot be read."""
     try:
         return RobotOverlay.from_json(json.loads(Path(path).read_text(encoding="utf-8")))
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:

@@ -1,4 +1,4 @@
-"""The parts that a robot description is made of, and the error that refuses a bad one."""
+"""Data classes of a robot description, and the error for a bad one."""
 
 from __future__ import annotations
 
@@ -127,9 +127,9 @@ class Motor:
     peak_torque: float
     """[N m]"""
     cutoff_speed: float
-    """[rad/s] Full torque up to here."""
+    """[rad/s] Speed up to which full torque is available."""
     no_load_speed: float
-    """[rad/s] The torque falls linearly to zero here."""
+    """[rad/s] Speed at which the torque has fallen linearly to 0."""
     coulomb_friction: float
     """[N m]"""
     jumping: Gains
@@ -143,7 +143,7 @@ class Motor:
 
 @dataclass(frozen=True, eq=False)
 class RobotDescription:
-    """Everything that is known of the robot before a simulator is chosen; `dataclasses.replace` makes another."""
+    """Robot independent of a simulator: links, joints, loops, motors and poses; `dataclasses.replace` modifies it."""
 
     path: Path
     """The description file."""
@@ -184,7 +184,7 @@ class RobotDescription:
 
 
 def make_read_only(part: Any) -> None:
-    """Let nobody write into the arrays of a description, or of a part of one."""
+    """Make the arrays of a description, or of a part of it, read-only."""
     if isinstance(part, np.ndarray):
         part.setflags(write=False)
     elif isinstance(part, tuple):

@@ -90,11 +90,11 @@ class PinocchioRobot:
         q: (27,); v: (26,), as `closed_velocity` returns it.
         """
         pin.forwardKinematics(self.model, self.data, q, v)
-        found = []
+        velocities = []
         for c in self.constraints:
-            twist, turn = self.data.v[c.joint1_id], self.data.oMi[c.joint1_id].rotation
-            found.append(turn @ (twist.linear + np.cross(twist.angular, c.joint1_placement.translation)))
-        return np.array(found)
+            twist, rotation = self.data.v[c.joint1_id], self.data.oMi[c.joint1_id].rotation
+            velocities.append(rotation @ (twist.linear + np.cross(twist.angular, c.joint1_placement.translation)))
+        return np.array(velocities)
 
     def paw_jacobians(self, q: np.ndarray) -> np.ndarray:
         """Return the paws' Jacobians [m], shape (4, 3, 3): velocity, world frame, by the rates of the leg's own motors.
@@ -190,12 +190,12 @@ def build_pinocchio(description: RobotDescription | None = None, values: RobotVa
 
 
 def _write_masses(model: Any, description: RobotDescription, values: RobotValues) -> None:
-    """Give the links the masses, centres of mass and inertias of the first of some robots."""
+    """Write masses, centres of mass and inertias of the first robot into a Pinocchio model."""
     base, ratio = description.links[0], values.base_mass[0, 0] / description.links[0].mass
     inertia = ratio * values.base_inertia[0, 0] * base.inertia
     model.inertias[1] = pin.Inertia(values.base_mass[0, 0], values.base_com[0], inertia)
     ratios: dict[str, float] = dict(zip(LINK_KINDS, values.link_mass[0], strict=True))
     for joint in description.joints:
         link, scale = description.link(joint.child), ratios[joint.child[3:]]
-        own = pin.Inertia(scale * link.mass, link.com, scale * link.inertia)
-        model.inertias[model.getJointId(joint.name)] = own
+        link_inertia = pin.Inertia(scale * link.mass, link.com, scale * link.inertia)
+        model.inertias[model.getJointId(joint.name)] = link_inertia

@@ -1,4 +1,4 @@
-"""A map of grounds to walk on: square tiles, harder ones with growing x, of another kind with growing y."""
+"""Terrain map of square tiles: difficulty grows along x, the kind of ground changes along y."""
 
 from __future__ import annotations
 
@@ -13,17 +13,17 @@ import numpy as np
 from jumper_warp.utils.errors import InputError
 
 KINDS = ("flat", "uneven", "waves", "slope", "bowl", "stairs", "pit", "blocks")
-"""Of tiles."""
+"""Kinds of tiles."""
 
 
 @dataclass(frozen=True)
 class TerrainCfg:
-    """A map: rows of growing difficulty, a column for each kind of ground, or several."""
+    """Terrain map: rows of growing difficulty, and a column for each entry of `kinds`."""
 
     rows: int = 10
     """Levels of difficulty, from a tenth of the heights and slopes below to all of them; 0: no map."""
     kinds: tuple[str, ...] = KINDS
-    """Of the columns."""
+    """Kind of each column."""
     tile: float = 8.0
     """[m] Edge of a tile. Its middle is level, for the start; its rim is at z = 0."""
     uneven: float = 0.05
@@ -63,7 +63,7 @@ class TerrainCfg:
 
     @classmethod
     def none(cls) -> TerrainCfg:
-        """Return the configuration of no map."""
+        """Return a configuration without a map."""
         return cls(rows=0)
 
     @property
@@ -104,7 +104,7 @@ def single_tile(cfg: TerrainCfg, kind: str) -> newton.Heightfield:
 
 
 def check_kind(kind: str) -> None:
-    """Raise InputError unless there are such tiles."""
+    """Raise InputError for an unknown kind of tile."""
     if kind not in KINDS:
         raise InputError(f"terrain must be one of {', '.join(KINDS)}, got {kind!r:.40}")
 
@@ -117,7 +117,7 @@ def tile_heights(cfg: TerrainCfg, kind: str, difficulty: float, rng: np.random.G
 
 
 class _Tile(NamedTuple):
-    """A tile: how hard it is, and the coordinates x and y [m] of its nodes, from its middle."""
+    """Tile of a difficulty (0 to 1), with the coordinates x and y [m] of its nodes from its middle."""
 
     cfg: TerrainCfg
     difficulty: float
@@ -141,21 +141,21 @@ class _Tile(NamedTuple):
         return self.cfg.step[0] + self.difficulty * (self.cfg.step[1] - self.cfg.step[0])
 
     def slope(self) -> np.ndarray:
-        """Return ground that rises from the rim to the level middle."""
+        """Return the heights [m] of a slope from the rim up to the level middle."""
         return math.tan(math.radians(self.difficulty * self.cfg.slope)) * self._inward()
 
     def stairs(self) -> np.ndarray:
-        """Return steps of 0.6 m that rise from the rim to the level middle."""
+        """Return the heights [m] of stairs from the rim up to the level middle, treads 0.6 m deep."""
         return self.step * np.floor(self._inward() / 0.6 + 1.0e-6)
 
     def _inward(self) -> np.ndarray:
-        """Return the way [m] from the rim towards the level middle, which it does not enter."""
+        """Return the distance [m] of each node from the rim, at most that of the level middle."""
         return np.clip(self.reach - self.off, 0.0, self.reach - self.cfg.start)
 
     def waves(self, shortest: float, longest: float, count: int) -> np.ndarray:
-        """Return a sum of plane waves in any direction, of wavelengths [m] drawn between two, as high as they may be.
+        """Return the heights [m] of `count` plane waves of random direction and wavelength [m].
 
-        It is level on the rim and in the middle, and grows to full height over 0.3 m.
+        Rim and middle are level; over 0.3 m the waves grow to the full height of the difficulty.
         """
         total = np.zeros_like(self.x)
         for length in self.rng.uniform(shortest, longest, count):
@@ -167,7 +167,7 @@ class _Tile(NamedTuple):
         return total / np.abs(total).max() * self.difficulty * self.cfg.uneven
 
     def blocks(self) -> np.ndarray:
-        """Return squares of 0.5 m, half of them a step high."""
+        """Return the heights [m] of squares of 0.5 m, half of them raised by a step."""
         raised = self.rng.integers(0, 2, (64, 64))
         square = raised[np.floor(self.y / 0.5).astype(int) + 32, np.floor(self.x / 0.5).astype(int) + 32]
         return self.step * square * ((self.off > self.cfg.start) & (self.off < self.reach))

@@ -89,9 +89,9 @@ class UrdfReader:
 
     def child(self, element: Element, tag: str, part: str) -> Element:
         """Return the only child element with a tag."""
-        found = element.findall(tag)
-        self.require(len(found) == 1, part, f"expected one <{tag}>, found {len(found)}")
-        return found[0]
+        children = element.findall(tag)
+        self.require(len(children) == 1, part, f"expected one <{tag}>, found {len(children)}")
+        return children[0]
 
     def numbers(self, element: Element, attribute: str, count: int, part: str, default: str = "") -> list[float]:
         """Return an attribute's finite numbers."""
@@ -104,13 +104,15 @@ class UrdfReader:
         self.require(len(values) == count and all(map(math.isfinite, values)), part, problem)
         return values
 
-    def placement(self, element: Element, part: str, turned: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Return position [m] and rotation (xyzw) of an element's <origin>; only shapes may be turned."""
+    def placement(self, element: Element, part: str, may_rotate: bool) -> tuple[np.ndarray, np.ndarray]:
+        """Return position [m] and rotation (xyzw) of an element's <origin>; only shapes may be rotated."""
         if element.find("origin") is None:
             return np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
         origin = self.child(element, "origin", part)
         angles = self.numbers(origin, "rpy", 3, part, default="0 0 0")
-        self.require(turned or not any(angles), part, "expected a frame parallel to its parent's, found rpy not zero")
+        self.require(
+            may_rotate or not any(angles), part, "expected a frame parallel to its parent's, found rpy not zero"
+        )
         self.require(max(map(abs, angles)) <= 2.0 * math.pi, part, f"expected rpy within a turn, found {angles}")
         return np.array(self.numbers(origin, "xyz", 3, part, default="0 0 0")), quat_from_rpy(*angles)
 
@@ -126,13 +128,13 @@ class UrdfReader:
         ixx, iyy, izz, ixy, ixz, iyz = (self.numbers(moments, key, 1, part)[0] for key in keys)
         inertia = np.array([[ixx, ixy, ixz], [ixy, iyy, iyz], [ixz, iyz, izz]])
         self.check_inertia(inertia, part)
-        com = self.placement(inertial, part, turned=False)[0]
+        com = self.placement(inertial, part, may_rotate=False)[0]
         visuals = tuple(self.shape(shape, part) for shape in element.findall("visual"))
         collisions = tuple(self.shape(shape, part) for shape in element.findall("collision"))
         return Link(name, mass, com, inertia, visuals, collisions)
 
     def check_inertia(self, inertia: np.ndarray, part: str) -> None:
-        """Refuse an inertia tensor that no distribution of mass has."""
+        """Refuse an inertia tensor (3, 3) [kg m^2] that no mass distribution has."""
         self.require(np.abs(inertia).max() <= 1.0e6, part, "expected moments of inertia below 1e6 kg m^2")
         low, middle, high = np.linalg.eigvalsh(inertia)
         self.require(low > 0.0, part, f"expected a positive inertia, found a moment of {low:.3g}")
@@ -153,7 +155,7 @@ class UrdfReader:
         keys = ("lower", "upper", "effort", "velocity")
         lower, upper, effort, velocity = (self.numbers(limit, key, 1, part)[0] for key in keys)
         self.require(lower < upper, part, f"expected lower < upper limit, found {lower} and {upper}")
-        origin = self.placement(element, part, turned=False)[0]
+        origin = self.placement(element, part, may_rotate=False)[0]
         return Joint(name, parent, child, origin, axis, lower, upper, effort, velocity)
 
     def shape(self, element: Element, part: str) -> Shape:
@@ -167,7 +169,7 @@ class UrdfReader:
         else:
             keys, count = SHAPE_SIZES[kind]
             size = [value for key in keys.split() for value in self.numbers(geometry[0], key, count, part)]
-        position, rotation = self.placement(element, part, turned=True)
+        position, rotation = self.placement(element, part, may_rotate=True)
         material = element.find("material")
         color = None
         if material is not None:

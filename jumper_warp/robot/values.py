@@ -1,4 +1,4 @@
-"""Values of the robot that may differ from its description: what identification finds and an overlay sets."""
+"""Values of the robot that may differ from its description, as identified or set by an overlay."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ class RobotValues:
     base_com: np.ndarray
     """(N, 3) [m], base frame."""
     base_inertia: np.ndarray
-    """(N, 1) [1] Ratio to the described inertia about the centre of mass, besides that of the mass."""
+    """(N, 1) [1] Ratio to the described inertia about the centre of mass, times the ratio of the masses."""
     link_mass: np.ndarray
     """(N, 5) [1] Ratio of mass and inertia by `LINK_KINDS`."""
     armature: np.ndarray
@@ -38,7 +38,7 @@ class RobotValues:
     kp: np.ndarray
     """(N, 12) [1] Ratio to the gain of the motion or task."""
     kd: np.ndarray
-    """(N, 12) [1] Likewise."""
+    """(N, 12) [1] Ratio to the gain of the motion or task."""
     saturation: np.ndarray
     """(N, 12) [1] Ratio to the torque limit of the motion or task."""
     no_load_speed: np.ndarray
@@ -46,7 +46,7 @@ class RobotValues:
     cutoff_speed: np.ndarray
     """(N, 12) [rad/s]"""
     offset: np.ndarray
-    """(N, 12) [rad] What a position sensor reads above the true angle."""
+    """(N, 12) [rad] Reading of a position sensor less the true angle."""
     knee_damping: np.ndarray
     """(N, 1) [N m s/rad]"""
     paw_friction: np.ndarray
@@ -60,7 +60,7 @@ class RobotValues:
 
     @classmethod
     def nominal(cls, count: int, description: RobotDescription | None = None) -> RobotValues:
-        """Return the described robot, `count` times."""
+        """Return `count` copies of the described robot."""
         robot = load_description() if description is None else description
         motors, base = robot.motors, robot.links[0]
         one = cls(

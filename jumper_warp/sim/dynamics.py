@@ -47,22 +47,22 @@ def kernel_modules(double: bool = False) -> SimpleNamespace:
 
 
 def check_model(model: Model) -> None:
-    """Raise NotThisRobotError unless every world of a model holds this robot, its labels in the expected order."""
+    """Raise NotThisRobotError unless every world of a model is this robot, with its labels in the expected order."""
     bodies = ["body"] + [f"{leg}_{link}" for leg in LEGS for link in LINKS]
     joints = ["base"] + [f"{leg}_{joint}" for leg in LEGS for joint in JOINTS] + [f"{leg}_ankle" for leg in LEGS]
     count = model.world_count
     if count < 1:
         raise NotThisRobotError("the model has no worlds; build it with jumper_warp.robot.model.build_model")
     for what, labels, expected in (("body", model.body_label, bodies), ("joint", model.joint_label, joints)):
-        found = [label.split("/")[-1] for label in labels]
-        stranger = next((label for label, name in zip(labels, found, strict=True) if name not in expected), None)
-        if stranger is not None and len(found) > count * len(expected):
+        names = [label.split("/")[-1] for label in labels]
+        stranger = next((label for label, name in zip(labels, names, strict=True) if name not in expected), None)
+        if stranger is not None and len(names) > count * len(expected):
             raise NotThisRobotError(f"{what} {stranger!r:.60} cannot be simulated: every world must hold {ALONE}")
-        if len(found) != count * len(expected):
+        if len(names) != count * len(expected):
             raise NotThisRobotError(
-                f"{count} worlds of this robot have {count * len(expected)} {what} labels, the model has {len(found)}"
+                f"{count} worlds of this robot have {count * len(expected)} {what} labels, the model has {len(names)}"
             )
-        for i, name in enumerate(found):
+        for i, name in enumerate(names):
             if name != expected[i % len(expected)]:
                 raise NotThisRobotError(f"{what} {i} must be {expected[i % len(expected)]!r}, found {name!r}")
     for name, have, want in (("joint_q", model.joint_coord_count, 43), ("joint_qd", model.joint_dof_count, 38)):
@@ -100,24 +100,24 @@ def find_ground(model: Model) -> int:
     """
     worlds, types = model.shape_world.numpy(), model.shape_type.numpy()
     kinds = (int(newton.GeoType.PLANE), int(newton.GeoType.HFIELD))
-    found = [i for i in np.flatnonzero(worlds == -1) if types[i] in kinds]
-    if len(found) > 1:
-        raise NotThisRobotError(f"the ground must be one plane or heightfield, found {len(found)}")
-    if not found:
+    grounds = [i for i in np.flatnonzero(worlds == -1) if types[i] in kinds]
+    if len(grounds) > 1:
+        raise NotThisRobotError(f"the ground must be one plane or heightfield, found {len(grounds)}")
+    if not grounds:
         return -1
-    pose = model.shape_transform.numpy()[found[0]]
-    turned = np.abs(pose[3:5]).max() > 1e-6
-    if turned or (types[found[0]] == kinds[0] and abs(pose[2]) > 1e-6):
+    pose = model.shape_transform.numpy()[grounds[0]]
+    tilted = np.abs(pose[3:5]).max() > 1e-6
+    if tilted or (types[grounds[0]] == kinds[0] and abs(pose[2]) > 1e-6):
         raise NotThisRobotError("the ground plane must be z = 0 and a heightfield must not be tilted")
-    return int(found[0])
+    return int(grounds[0])
 
 
 def ground_struct(model: Model, shape: int, ground_module: ModuleType) -> Any:
-    """Return the kernels' `Ground` for a ground shape; without one (-1) a plane far below."""
+    """Return the kernels' `Ground` for a ground shape; -1: a plane out of reach."""
     ground = ground_module.Ground()
     heights = np.zeros((1, 1), dtype=np.float32)
     if shape < 0:
-        # a flat grid a kilometre down: nothing is ever in reach
+        # a flat grid a kilometre down is never in reach
         heights = np.full((2, 2), -1000.0, dtype=np.float32)
         ground.rows, ground.cols, ground.half_x, ground.half_y = 2, 2, 1.0, 1.0
     elif model.shape_type.numpy()[shape] == int(newton.GeoType.HFIELD):
@@ -132,7 +132,7 @@ def ground_struct(model: Model, shape: int, ground_module: ModuleType) -> Any:
 
 
 def block_array(cfg: BlockCfg | None, num_worlds: int, modules: SimpleNamespace, device: wp.DeviceLike) -> wp.array:
-    """Return the kernels' `Block` of every world, at rest at its start; empty without blocks."""
+    """Return the kernels' `Block` of every world, at rest at its start, (num_worlds,); (0,) without blocks."""
     block = modules.ground.Block
     fields = {} if cfg is None else cfg.per_world(num_worlds)
     values: Any = np.zeros(num_worlds if fields else 0, dtype=block.numpy_dtype())
@@ -159,9 +159,9 @@ class JumperDynamics:
         block: BlockCfg | None = None,
         double: bool = False,
     ):
-        """Read everything from the model; `block` adds one to every world.
+        """Read all parameters from the model; `block` adds a moving block to every world.
 
-        Raises NotThisRobotError if it is not this robot, ValueError for a block that does not fit the number of worlds.
+        Raises NotThisRobotError: not this robot, InputError: a block that does not fit the number of worlds.
         """
         check_model(model)
         self.model = model
@@ -178,7 +178,7 @@ class JumperDynamics:
         """Stiffness [N/m], 0: none, and rest length [m] of the springs between the knees, shape (num_worlds,); call
         `pack_springs` after a change."""
 
-        self.robot = self.modules.step.Robot()
+        self.robot = self.modules.step.RobotModel()
         self.robot.geometry = leg_geometry_array(self.description, self.modules.geometry, self.device)
         self.robot.table = wp.zeros(
             (self.modules.layout.PARAMETER_ROWS, self.num_worlds),
@@ -193,7 +193,7 @@ class JumperDynamics:
         self.pack()
 
     def _workspace(self) -> Any:
-        """Return fresh work arrays."""
+        """Return the kernels' `Workspace`, zeroed."""
         scalar, n = self.modules.scalar, self.num_worlds
         work = self.modules.drive.Workspace()
         for names, shape, dtype in (
@@ -201,7 +201,7 @@ class JumperDynamics:
             (("peak_force", "residual"), n, scalar.real),
             (("peak_paw_force",), (4, n), scalar.real),
             (("torque",), (12, n), scalar.real),
-            (("sweeps", "invalid"), n, int),
+            (("sweeps", "diverged"), n, int),
         ):
             for name in names:
                 setattr(work, name, wp.zeros(shape, dtype=dtype, device=self.device))
@@ -209,7 +209,7 @@ class JumperDynamics:
         return work
 
     def step_record(self, steps: int) -> Any:
-        """Return room for some steps that a reverse pass makes again."""
+        """Return the kernels' `StepRecord` of the steps that a reverse pass recomputes."""
         record, n = self.modules.multipliers.StepRecord(), self.num_worlds
         for name, var in record._cls.vars.items():
             shape = (n, steps + (name in ("base", "angles", "rates")))
@@ -218,7 +218,7 @@ class JumperDynamics:
         return record
 
     def pack(self) -> None:
-        """Read masses, joints, friction and gravity of every world from the model, and its springs."""
+        """Read masses, joints, friction, gravity and springs of every world from the model."""
         self.pack_masses()
         self.pack_joints()
         self.pack_friction()
@@ -251,9 +251,9 @@ class JumperDynamics:
         )
 
     def repack(self, mask: wp.array, worlds: WorldRange | None = None) -> None:
-        """Read masses, armature, motor friction and friction of paws, where mask (num_worlds,) float is not 0.
+        """Read masses, armature, motor friction and paw friction of worlds whose mask (num_worlds,), float, is not 0.
 
-        worlds: which are looked at, by default all.
+        worlds: range to read, by default all.
         """
         m, (first, count) = self.model, worlds or (0, self.num_worlds)
         self._launch(
@@ -290,9 +290,9 @@ class JumperDynamics:
         previous: wp.array | None = None,
         delay: wp.array | None = None,
     ) -> Any:
-        """Return the kernels' `Drive`; with `motors` (MotorArrays) and `target` (12, num_worlds) the loop is closed.
+        """Return the kernels' `Drive`; closed-loop with `motors` (MotorArrays) and `target` [rad] (12, num_worlds).
 
-        With `delay` [steps], shape (num_worlds,), the motors follow `previous` until the target arrives.
+        With `delay` [physics steps], (num_worlds,), the motors follow `previous` until the target arrives.
         """
         drive = self.modules.drive.Drive()
         drive.joint_f, drive.body_f = joint_f, body_f
@@ -303,7 +303,7 @@ class JumperDynamics:
         return drive
 
     def advance_kernel(self, by_legs: bool | None = None) -> tuple[wp.Kernel, int]:
-        """Return the kernel that `advance` launches, and its block size."""
+        """Return the kernel that `advance` launches, and its block size; by_legs: see `advance`."""
         if self.device.is_cuda if by_legs is None else by_legs:
             return self.modules.advance_legs.advance_legs_kernel, 32 if self.device.is_cuda else 4
         return self.modules.advance.advance_kernel, 32 if self.device.is_cuda else 1
@@ -312,10 +312,10 @@ class JumperDynamics:
         self, settings: Any, drive: Any, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array,
         worlds: WorldRange | None = None, by_legs: bool | None = None,
     ) -> None:  # fmt: skip
-        """Advance base and motor coordinates by `settings.substeps` steps, in place if out is in.
+        """Advance base and motor coordinates by `settings.substeps` steps; outputs may be inputs.
 
-        worlds: which are advanced, by default all. by_legs: whether a thread has a leg or a world, by default a leg on
-        a GPU and a world on a CPU.
+        worlds: range to advance, by default all. by_legs: a thread per leg (default on a GPU) or per world (default on
+        a CPU).
         """
         settings.first, count = worlds or (0, self.num_worlds)
         inputs, outputs = [self.robot, settings, drive, q, qd, self.work], [q_out, qd_out]
@@ -325,14 +325,14 @@ class JumperDynamics:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block)
 
     def momenta(self) -> Any:
-        """Return the kernels' `Momenta`, not yet written."""
-        found = self.modules.momentum.Momenta()
+        """Return the kernels' `Momenta` of all worlds, zeroed."""
+        momenta = self.modules.momentum.Momenta()
         for name in ("lin", "ang"):
-            setattr(found, name, wp.zeros(self.num_worlds, dtype=self.modules.scalar.vec3, device=self.device))
-        return found
+            setattr(momenta, name, wp.zeros(self.num_worlds, dtype=self.modules.scalar.vec3, device=self.device))
+        return momenta
 
     def read_momenta(self, q: wp.array, qd: wp.array, momenta: Any, worlds: WorldRange | None = None) -> None:
-        """Write the momenta of robots, world axes; worlds: whose, by default all."""
+        """Write the robots' momenta, world axes, to `momenta`; worlds: range, by default all."""
         first, count = worlds or (0, self.num_worlds)
         inputs = [first, self.robot, q, qd, momenta]
         wp.launch(self.modules.momentum.momentum_kernel, count, inputs, device=self.device, block_dim=32)
@@ -345,15 +345,15 @@ class JumperDynamics:
         momenta: of before it. body_f: the wrenches in it. worlds: which are corrected, by default all.
         """
         first, count = worlds or (0, self.num_worlds)
-        inputs = [first, self.robot, momenta, body_f, self.work.peak_force, self.work.invalid, time, q, qd]
+        inputs = [first, self.robot, momenta, body_f, self.work.peak_force, self.work.diverged, time, q, qd]
         wp.launch(self.modules.momentum.project_momentum_kernel, count, inputs, device=self.device, block_dim=32)
 
     def full_state(
         self, q: wp.array, qd: wp.array, body_q: wp.array, body_qd: wp.array, worlds: WorldRange | None = None
     ) -> None:
-        """Write passive and loop joints (into q, qd) and all bodies from the base and motor coordinates.
+        """Write passive and loop joints (into q, qd) and all bodies, from base and motor coordinates.
 
-        worlds: whose, by default all.
+        worlds: range, by default all.
         """
         first, count = worlds or (0, self.num_worlds)
         wp.launch(

@@ -16,11 +16,11 @@ MUJOCO_FRICTION = 0.005
 def mujoco_solver(model: Model, *, dt: float = PHYSICS_DT, **overrides) -> newton.solvers.SolverMuJoCo:
     """Return Newton's MuJoCo solver with stiff loops for physics steps of `dt` [s].
 
-    It knows neither a damper with a largest torque nor a stop of the sum of two angles. `Simulation` takes the knees'
-    damping out of its model and adds both as torques (`kernels.actuation.passive`); here the damping has no cap.
+    MuJoCo has neither a damper with a torque limit nor a stop of the sum of two angles. `Simulation` removes the knees'
+    damping from the model and adds both as torques (`kernels.actuation.passive`); here the damping has no limit.
 
-    `overrides` replace settings of `newton.solvers.SolverMuJoCo`. Raises ValueError for paws of less friction than it
-    can compute with.
+    `overrides` replace settings of `newton.solvers.SolverMuJoCo`. Raises InputError: paws with less
+    friction than `MUJOCO_FRICTION`.
     """
     paws = [index for index, label in enumerate(model.shape_label) if label.split("/")[-1] in PAWS]
     friction = model.shape_material_mu.numpy()[paws].min(initial=math.inf)

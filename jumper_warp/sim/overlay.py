@@ -1,4 +1,4 @@
-"""Values of robots written into Newton's model and into the motors of a simulation."""
+"""Write values of robots into Newton's model and into the motors of a simulation."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ from jumper_warp.sim.dynamics import JumperDynamics, find_paws
 from jumper_warp.utils.newton_types import Model
 
 MOTOR_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (0, 1, 3)]
-"""A world's motors in `joint_qd`."""
+"""Indices of a world's motors in `joint_qd`."""
 
 
 def write_model(model: Model, robots: RobotValues, *, paws: bool = True) -> None:
-    """Write masses, joints and the paws' friction into a model that is as described, before a solver reads it.
+    """Write masses, joints and paw friction into a model of the described robot, before a solver reads it.
 
     robots: one for all worlds, or one a world. paws: whether to write their friction.
     """
@@ -27,8 +27,8 @@ def write_model(model: Model, robots: RobotValues, *, paws: bool = True) -> None
     com = model.body_com.numpy().reshape(n, int(BODIES), 3)
     inertia = model.body_inertia.numpy().reshape(n, int(BODIES), 3, 3)
     scale = np.tile(robots.link_mass, (1, 4)) * np.ones((n, 4 * len(LINK_KINDS)))
-    of_base = robots.base_mass[:, 0] / mass[:, 0]
-    inertia[:, 0] *= (of_base * robots.base_inertia[:, 0])[:, None, None]
+    base_ratio = robots.base_mass[:, 0] / mass[:, 0]
+    inertia[:, 0] *= (base_ratio * robots.base_inertia[:, 0])[:, None, None]
     inertia[:, 1:] *= scale[:, :, None, None]
     mass[:, 0], com[:, 0] = robots.base_mass[:, 0], robots.base_com
     mass[:, 1:] *= scale
@@ -62,7 +62,7 @@ def write_springs(dynamics: JumperDynamics, robots: RobotValues) -> None:
 
 
 def write_motors(motors: Any, robots: RobotValues) -> None:
-    """Write the motors' constants into `MotorArrays` that hold those of the description.
+    """Write motor constants into `MotorArrays` that hold the described ones.
 
     robots: one for all worlds, or one a world.
     """

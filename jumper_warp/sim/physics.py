@@ -1,4 +1,4 @@
-"""How a simulation is advanced, on either solver, behind one small interface."""
+"""Common interface of both solvers for simulations and environments."""
 
 from __future__ import annotations
 
@@ -25,38 +25,38 @@ from jumper_warp.sim.solver import SolverJumper
 
 EXPLICIT_STOP = (1000.0, 2.0)
 """[N m/rad], [N m s/rad] Stops of the transversal sum on MuJoCo, explicit and therefore softer than SolverJumper's."""
-DRAWN_FLAGS = (
+RANDOMIZED_FLAGS = (
     ModelFlags.BODY_INERTIAL_PROPERTIES
     | ModelFlags.JOINT_DOF_FORCE_PROPERTIES
     | ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES
     | ModelFlags.SHAPE_PROPERTIES
 )
-"""What domain randomisation changes."""
+"""Properties of the model that domain randomisation changes."""
 
 
 class Physics(ABC):
-    """A solver as a simulation and an environment drive it. Arrays keep their place."""
+    """Interface of a solver for simulations and environments. Arrays are never reallocated."""
 
     sliced: bool
-    """Whether it can advance some of the worlds alone."""
+    """Whether it can advance a range of worlds."""
     solver: newton.solvers.SolverBase
     dynamics: JumperDynamics
     """Geometry, ground and friction ratio; on other solvers for kinematics only."""
     invalid: wp.array
-    """(num_worlds,) int, 1: the solver gave the world up."""
+    """(num_worlds,) int, 1: the world diverged."""
     impulse: wp.array
-    """(4, num_worlds) vec3 [N s], what the contact solver carries over."""
+    """(4, num_worlds) vec3 [N s] Contact impulses that start the next contact iteration."""
     torque: wp.array
     """(12, num_worlds) [N m], of the last physics step."""
     paw_force: wp.array
     """(4, num_worlds) vec3 [N], of the last physics step."""
     peak_force: wp.array
-    """(num_worlds,) [N], largest total paw force of the last call of `advance`."""
+    """(num_worlds,) [N] Largest total paw force in the last call of `advance`."""
     peak_paw_force: wp.array
-    """(4, num_worlds) [N], largest on each paw in the last call of `advance`."""
+    """(4, num_worlds) [N] Largest force on each paw in the last call of `advance`."""
 
     def __init__(self, sim: Any) -> None:
-        """Belong to a simulation."""
+        """Attach to a `Simulation`."""
         self._sim = sim
 
     @abstractmethod
@@ -72,41 +72,41 @@ class Physics(ABC):
         """Launch physics steps towards motor targets [rad], shape (12, num_worlds).
 
         With `delay` [physics steps], shape (num_worlds,), the motors follow `previous` until the target arrives.
-        bodies False: passive joints and bodies of the state need not be written. worlds: which are advanced, by
-        default all.
+        bodies False: passive joints and bodies of the state need not be written. worlds: range to advance, by default
+        all.
         """
 
     @abstractmethod
     def parameters_changed(self, mask: wp.array | None = None, worlds: WorldRange | None = None) -> None:
-        """Read the model's masses, joints and friction again, where mask (num_worlds,) is not 0; None: everywhere.
+        """Read the model's masses, joints and friction of worlds whose mask (num_worlds,) is not 0; None: of all.
 
-        worlds: at which the mask is looked at, by default all.
+        worlds: range in which the mask is read, by default all.
         """
 
     @abstractmethod
     def forget(self, mask: wp.array) -> None:
-        """Drop what is carried from step to step where mask (num_worlds + 1,) bool is set."""
+        """Clear the solver's state of worlds whose mask (num_worlds + 1,), bool, is set."""
 
     @abstractmethod
     def after_reset(self, mask: wp.array) -> None:
-        """Let everything follow from coordinates that were written anew where mask (num_worlds,) is not 0."""
+        """Update the solver after coordinates were written in worlds whose mask (num_worlds,) is not 0."""
 
     def write_bodies(self) -> None:
-        """Bring the state's passive joints and bodies up to date."""
+        """Write the state's passive joints and bodies from base and motor coordinates."""
         state = self._sim.state
         self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
 
     def kernels(self) -> list[tuple[wp.Kernel, int]]:
-        """Return what a policy step launches and can be compiled before, each with its block size."""
+        """Return the kernels of a policy step to compile in advance, with their block sizes."""
         return []
 
     def carried(self) -> dict[str, wp.array]:
-        """Return what the next step depends on besides coordinates and impulses, by name."""
+        """Return the solver's arrays, besides coordinates and impulses, that the next step depends on, by name."""
         return {}
 
 
 class JumperPhysics(Physics):
-    """`SolverJumper`: a policy step in one launch."""
+    """`SolverJumper`, with a policy step in one launch."""
 
     sliced = True
     solver: SolverJumper
@@ -117,7 +117,7 @@ class JumperPhysics(Physics):
         self.solver = SolverJumper(sim.model, block=block, tolerance=tolerance)
         self.dynamics = self.solver.dynamics
         work = self.dynamics.work
-        self.invalid, self.impulse, self.torque = work.invalid, work.impulse, work.torque
+        self.diverged, self.impulse, self.torque = work.diverged, work.impulse, work.torque
         self.paw_force, self.peak_force, self.peak_paw_force = work.contact_force, work.peak_force, work.peak_paw_force
         self._momenta = self.dynamics.momenta() if keep_momentum else None
 
@@ -163,12 +163,12 @@ class JumperPhysics(Physics):
     def kernels(self) -> list[tuple[wp.Kernel, int]]:
         """See `Physics.kernels`."""
         momentum = self.dynamics.modules.momentum
-        kept = [(momentum.momentum_kernel, 32), (momentum.project_momentum_kernel, 32)]
-        return [self.dynamics.advance_kernel(), *(kept if self._momenta is not None else [])]
+        projection = [(momentum.momentum_kernel, 32), (momentum.project_momentum_kernel, 32)]
+        return [self.dynamics.advance_kernel(), *(projection if self._momenta is not None else [])]
 
 
 class MujocoPhysics(Physics):
-    """Newton's SolverMuJoCo, physics step by physics step, with this robot's motors and passive joints."""
+    """Newton's SolverMuJoCo with this robot's motors and passive joints, one launch set per physics step."""
 
     sliced = False
     solver: newton.solvers.SolverMuJoCo
@@ -186,7 +186,7 @@ class MujocoPhysics(Physics):
         robot = load_description()
         self._passive = [knee_damping, robot.knee_damping_limit, *robot.transversal_sum, *EXPLICIT_STOP,
                          self.dynamics.robot.geometry, self.dynamics.leg_springs]  # fmt: skip
-        self.invalid = wp.zeros(n, dtype=int, device=device)
+        self.diverged = wp.zeros(n, dtype=int, device=device)
         self.impulse = wp.zeros((4, n), dtype=wp.vec3, device=device)
         self.torque = wp.zeros((12, n), dtype=float, device=device)
         self.paw_force = wp.zeros((4, n), dtype=wp.vec3, device=device)
@@ -212,7 +212,7 @@ class MujocoPhysics(Physics):
         bodies: bool = True,
         worlds: WorldRange | None = None,
     ) -> None:
-        """See `Physics.advance`; all worlds are, and bodies are always written."""
+        """See `Physics.advance`; always advances all worlds and writes bodies."""
         for i in range(substeps):
             if delay is not None:
                 self._launch(
@@ -221,6 +221,7 @@ class MujocoPhysics(Physics):
             self._step(target if delay is None else self._arrived, restart=i == 0)
 
     def _step(self, target: wp.array, restart: bool) -> None:
+        """Advance one physics step; restart: peak forces begin with this step."""
         sim, state, joint_f = self._sim, self._sim.state, self._sim.control.joint_f
         q, qd, motors = state.joint_q, state.joint_qd, (12, sim.num_worlds)
         self._launch(motor_torque_kernel, motors, [target, q, qd, COORDS, DOFS, sim.motors], [joint_f])
@@ -236,7 +237,7 @@ class MujocoPhysics(Physics):
 
     def parameters_changed(self, mask: wp.array | None = None, worlds: WorldRange | None = None) -> None:
         """See `Physics.parameters_changed`; MuJoCo reads all worlds."""
-        self.solver.notify_model_changed(DRAWN_FLAGS)
+        self.solver.notify_model_changed(RANDOMIZED_FLAGS)
 
     def after_reset(self, mask: wp.array) -> None:
         """See `Physics.after_reset`."""
@@ -245,10 +246,10 @@ class MujocoPhysics(Physics):
         self.write_bodies()
 
     def forget(self, mask: wp.array) -> None:
-        """See `Physics.forget`; rows of the loops are made with the velocities of the last step."""
+        """See `Physics.forget`; also clears velocities of the last step, which the loops' rows use."""
         self.solver.reset(self._sim.state, mask, flags=newton.StateFlags.NONE)
-        for left_over in (self.solver.mjw_data.cvel, self.solver.mjw_data.cdof_dot):
-            self._launch(zero_worlds_kernel, left_over.shape, [mask], [left_over])
+        for stale in (self.solver.mjw_data.cvel, self.solver.mjw_data.cdof_dot):
+            self._launch(zero_worlds_kernel, stale.shape, [mask], [stale])
 
     def carried(self) -> dict[str, wp.array]:
         """See `Physics.carried`."""

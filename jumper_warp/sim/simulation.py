@@ -1,4 +1,4 @@
-"""The robot with its motors, motor command filter and a solver: what a policy step acts on."""
+"""Batched simulation of the robot with motors, motor command filter and a solver."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ SolverName = Literal["jumper", "mujoco"]
 
 
 class Simulation:
-    """Worlds of the robot under position targets, on either solver; it begins standing in the default pose.
+    """Batched simulation of the robot under position targets, standing in the default pose at first.
 
-    Give raw motor targets [rad] to `set_targets`, or write them on the device to `target`, (12, num_worlds), where
-    nothing checks them; then call `step` for one policy step: the filter once, then `substeps` times motors and
-    physics. Everything is on the device; nothing waits for it.
+    Pass raw motor targets [rad] to `set_targets`, or write them unchecked on the device to `target`, (12, num_worlds);
+    then call `step` for one policy step: the filter once, then `substeps` times motors and
+    physics. All calls are asynchronous.
 
     Args:
         solver: "jumper" or "mujoco" (Newton's SolverMuJoCo).
@@ -59,8 +59,8 @@ class Simulation:
         extras: Adds the caller's own sites and shapes to every world, as in `build_model`.
         robot: What differs from the description: an overlay, or values of one robot or of one a world. Their
             latency is the caller's to apply.
-        threads: Of a CPU, which share the worlds out and change no bit; by default what
-            `jumper_warp.utils.threads.set_threads` chose, or all cores. SolverMuJoCo and few worlds use one.
+        threads: CPU threads that share the worlds; results do not depend on them. By default those of
+            `jumper_warp.utils.threads.set_threads`, or all cores. SolverMuJoCo and few worlds use one.
 
     Raises:
         ValueError: unknown solver, a block on MuJoCo, dt or tolerance not finite and positive, substeps or
@@ -136,7 +136,7 @@ class Simulation:
         return values
 
     def _make_arrays(self) -> None:
-        """Make the state, the targets and the arrays that are read out."""
+        """Allocate state, targets and readout arrays."""
         self.state, self.control = self.model.state(), self.model.control()
         standing = motor_values(self.model.joint_q.numpy().reshape(self.num_worlds, -1)[:, 7:])
         self._standing = wp.array(standing.T, dtype=float, device=self.device)
@@ -163,11 +163,11 @@ class Simulation:
         self._captured("step", self._step)
 
     def reset(self, mask: Sequence[bool] | np.ndarray | torch.Tensor | wp.array | None = None) -> None:
-        """Put worlds back to where they were when the simulation was made: standing at rest, commanded to stand.
+        """Reset worlds to the initial state of the simulation: standing at rest, with the standing pose as target.
 
-        Contact history, torques, forces and the mark of a world that became non-finite are forgotten; blocks return
-        to their starts. What was changed in the model stays. A captured graph may hold the call with a mask on the
-        device, which it reads at every replay.
+        Contact history, torques, forces and the flags of diverged worlds are cleared; blocks return to their starts.
+        Changes of the model stay. A captured graph may contain the call with a mask on the device, which is read at
+        every replay.
 
         mask: Which worlds, bool of shape (num_worlds,), by default all. Raises ValueError for anything else.
         """
@@ -201,7 +201,7 @@ class Simulation:
     def filter_targets(self) -> None:
         """Run the motor command filter on `target` once, on the angles that the sensors read (`motors.offset`).
 
-        Follow with `physics_step`s. A captured graph may hold the calls.
+        Follow with `physics_step`s. A captured graph may contain the calls.
         """
         self._captured("filter", self._filter_targets)
 
@@ -210,11 +210,12 @@ class Simulation:
         self._captured("physics", lambda worlds: self._physics(1, worlds))
 
     def _step(self, worlds: WorldRange) -> None:
+        """Launch one policy step of a range of worlds."""
         self._filter_targets(worlds)
         self._physics(self.substeps, worlds)
 
     def _captured(self, name: str, body: Callable[[WorldRange], None]) -> None:
-        """Run a body eagerly the first time, then as a captured graph; within a capture it becomes part of that."""
+        """Run a function eagerly the first time, then as a captured graph; within another capture, as part of it."""
         if self.device.is_capturing:
             body(WorldRange(0, self.num_worlds))
             return
@@ -228,6 +229,7 @@ class Simulation:
         graph.replay()
 
     def _filter_targets(self, worlds: WorldRange) -> None:
+        """Launch the command filter, or a copy without one, for a range of worlds."""
         if self._filter is None:
             if worlds.count == self.num_worlds:
                 wp.copy(self._safe_target, self.target)
@@ -265,7 +267,7 @@ class Simulation:
     def read_base_velocity(self) -> wp.array:
         """Return the velocity of the base link's origin [m/s], world frame, vec3 of shape (num_worlds,).
 
-        It is the same array in every call, written anew on the device; a captured graph may hold the call.
+        Every call overwrites and returns the same array; a captured graph may contain the call.
         """
         inputs = [self.state.joint_q, self.state.joint_qd, self.model.body_com]
         self._launch(base_velocity_kernel, self.num_worlds, inputs, [self._base_velocity])
@@ -281,12 +283,12 @@ class Simulation:
             ends = []
             for body, anchor in ((parents[joint], model.joint_X_p), (children[joint], model.joint_X_c)):
                 point, quat = anchor.numpy()[joint, :3], frames[body, 3:6]
-                turned = point + 2.0 * np.cross(quat, np.cross(quat, point) + frames[body, 6] * point)
-                ends.append(frames[body, :3] + turned)
+                rotated = point + 2.0 * np.cross(quat, np.cross(quat, point) + frames[body, 6] * point)
+                ends.append(frames[body, :3] + rotated)
             gaps.append(np.linalg.norm(ends[0] - ends[1]))
         return np.array(gaps).reshape(self.num_worlds, 4).max(axis=1)
 
 
 def motor_values(joint_values: np.ndarray) -> np.ndarray:
-    """Return the 12 motors' columns of values of the joints behind the base, (..., 20 or more) to (..., 12)."""
+    """Return the motors' values (..., 12), given those of all joints after the base, (..., 20 or more)."""
     return joint_values[..., [5 * leg + j for leg in range(4) for j in (0, 1, 3)]]

@@ -32,11 +32,11 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Control, Model, State
 
 MAX_SWEEPS = 50
-"""Most sweeps of the contact iteration in a step."""
+"""Sweeps of the contact iteration in a step, at most."""
 TOLERANCE = 1.0e-5
 """[m/s] The contact iteration ends when a sweep changes no contact velocity by more."""
 DIFFERENTIABLE_TOLERANCE = 1.0e-6
-"""[m/s] The same where gradients are asked for, which inherit the error."""
+"""[m/s] Tolerance of steps with gradients, which inherit its error."""
 
 
 def check_step(dt: float, substeps: int = 1) -> None:
@@ -54,7 +54,7 @@ def check_tolerance(tolerance: float) -> None:
 
 
 def state_arrays(state: State | Model) -> Any:
-    """Return the kernels' view of a state, or of the reference pose of a model."""
+    """Return the kernels' `StateArrays` of a state, or of a model's reference pose."""
     arrays = StateArrays()
     arrays.joint_q, arrays.joint_qd = state.joint_q, state.joint_qd
     arrays.body_q, arrays.body_qd = state.body_q, state.body_qd
@@ -62,7 +62,7 @@ def state_arrays(state: State | Model) -> Any:
 
 
 def warn_of_colliders(model: Model) -> None:
-    """Say which shapes collide in the model but not on SolverJumper."""
+    """Warn of shapes that collide in the model but not on SolverJumper."""
     ignored = other_colliders(model)
     if len(ignored) > 0:
         warnings.warn(
@@ -96,8 +96,8 @@ class SolverJumper(SolverBase):
     Shapes of the model other than paws and ground do not collide; a warning names the first that would. Sites and
     shapes that do not collide serve sensors and viewers.
 
-    A world that becomes non-finite is flagged in `invalid`, parked at rest in the model's reference pose and left
-    there until `reset` clears it.
+    A diverged (non-finite) world is flagged in `invalid` and frozen at rest in the model's reference pose until
+    `reset` clears it.
     """
 
     model: Model
@@ -139,7 +139,7 @@ class SolverJumper(SolverBase):
         self.sweeps: wp.array = work.sweeps
         """Most contact sweeps of a step in the last call, on a GPU rounds of all paws at once, shape (num_worlds,)."""
         self.invalid: wp.array = work.invalid
-        """1 where a world became non-finite and waits for `reset`, shape (num_worlds,)."""
+        """1: the world diverged and waits for `reset`, shape (num_worlds,)."""
         self._differentiable = DifferentiableStep(self.dynamics, max_sweeps, min(tolerance, DIFFERENTIABLE_TOLERANCE))
         self._default_control = model.control(clone_variables=False)
         self._no_body_f = wp.zeros(model.body_count, dtype=wp.spatial_vectorf, device=model.device)
@@ -194,7 +194,7 @@ class SolverJumper(SolverBase):
         self._advance(state_in, state_out, drive, dt, substeps, observables, bodies, worlds)
 
     def _forces(self, state: State, control: Control | None) -> tuple[wp.array, wp.array]:
-        """Return the joint forces and body wrenches that act."""
+        """Return the joint forces [N m] of a control and the body wrenches [N], [N m] of a state."""
         control = self._default_control if control is None else control
         return control.joint_f, self._no_body_f if state.body_f is None else state.body_f
 
@@ -209,6 +209,7 @@ class SolverJumper(SolverBase):
         bodies: bool,
         worlds: WorldRange | None = None,
     ) -> None:
+        """Advance a range of worlds by `substeps` steps of dt [s]; arguments as in `step_motors`."""
         check_step(dt, substeps)
         qdd = None
         if observables is not None and observables.is_requested(SolverBase.ObservableKind.BODY_QDD):
@@ -243,7 +244,7 @@ class SolverJumper(SolverBase):
         return self._block_values()["velocity"].copy()
 
     def place_blocks(self, center: np.ndarray, worlds: Sequence[int] | None = None) -> None:
-        """Put the blocks of some worlds, by default all, at rest to new starts [m], world frame, (2,) or (worlds, 2).
+        """Place the blocks of some worlds, by default all, at rest at new starts [m], world frame, (2,) or (worlds, 2).
 
         Raises ValueError without blocks.
         """
@@ -253,7 +254,7 @@ class SolverJumper(SolverBase):
         self.reset_blocks(worlds)
 
     def reset_blocks(self, worlds: Sequence[int] | wp.array | None = None) -> None:
-        """Put the blocks of some worlds, by default all, back to their starts, at rest.
+        """Reset the blocks of some worlds, by default all, to their starts, at rest.
 
         `worlds`: indices, or a mask on the device, bool of shape (num_worlds,). Raises ValueError without blocks.
         """
@@ -292,7 +293,7 @@ class SolverJumper(SolverBase):
             self.dynamics.pack_gravity()
 
     def reset(self, state: State, world_mask: wp.array | None = None, flags: StateFlags | int | None = None) -> None:
-        """Forget contact history and the invalid flag of the masked worlds, and put them in the reference pose.
+        """Clear contact history and the invalid flag of the masked worlds, and put them in the reference pose.
 
         Blocks return to their starts.
         With `flags=StateFlags.NONE` the state is left alone, for callers that write their own.
@@ -302,7 +303,7 @@ class SolverJumper(SolverBase):
         if world_mask is None:
             world_mask = wp.full(n + 1, True, dtype=wp.bool, device=device)
         work = self.dynamics.work
-        outputs = [work.impulse, work.contact_force, work.invalid]
+        outputs = [work.impulse, work.contact_force, work.diverged]
         wp.launch(clear_contact_kernel, dim=n, inputs=[world_mask], outputs=outputs, device=device)
         if flags is not None and int(flags) == int(StateFlags.NONE):
             return

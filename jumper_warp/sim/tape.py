@@ -11,10 +11,10 @@ from jumper_warp.utils.errors import InputError
 
 
 class DifferentiableStep:
-    """Launches the step so that `wp.Tape` can run it backwards; each call makes its own buffers.
+    """One time step that `wp.Tape` can reverse; each call allocates its buffers.
 
-    Gradients flow to the state, the joint forces, the external wrench and the parameter table. At given contact modes
-    and pressed stops they are exact; see `kernels.dynamics.adjoint.tape_step`.
+    Gradients reach the state, the joint forces, the external wrench and the parameter table. They are exact at the
+    contact modes and pressed stops of the step; see `kernels.dynamics.adjoint.tape_step`.
     """
 
     def __init__(self, dynamics: JumperDynamics, max_sweeps: int, tolerance: float):
@@ -36,7 +36,7 @@ class DifferentiableStep:
     ) -> None:
         """Advance base and motor coordinates by dt [s]; arrays as in `JumperDynamics.advance`, none shared.
 
-        Raises ValueError if the result would overwrite what the step read, or if there are blocks.
+        Raises InputError: an output is an input, or there are moving blocks.
         """
         if q.ptr == q_out.ptr or qd.ptr == qd_out.ptr:
             raise InputError("a differentiable step needs its own output state: state_out must not be state_in")
@@ -55,15 +55,15 @@ class DifferentiableStep:
         wp.launch(kernels.integrate_kernel, n, [*inputs, self._record, power], [q_out, qd_out], device=device)
 
     def _solved(self) -> Any:
-        """Return an empty `SolvedStep`."""
+        """Return the kernels' `SolvedStep`, zeroed."""
         dynamics, n = self._dynamics, self._dynamics.num_worlds
-        solved, rows = dynamics.modules.tape_step.SolvedStep(), dynamics.modules.trajectory.Rows()
+        solved, trajectory = dynamics.modules.tape_step.SolvedStep(), dynamics.modules.trajectory.TrajectoryArrays()
         for name, shape in {"torque": (1, 12, n), "impulse": (1, 4, n), "pressed": (1, 4, n)}.items():
-            setattr(rows, name, wp.zeros(shape, rows._cls.vars[name].type.dtype, dynamics.device))
-        rows.q = rows.qd = wp.zeros((0, 0, 0), dynamics.real, dynamics.device)
-        solved.rows = rows
+            setattr(trajectory, name, wp.zeros(shape, trajectory._cls.vars[name].type.dtype, dynamics.device))
+        trajectory.q = trajectory.qd = wp.zeros((0, 0, 0), dynamics.real, dynamics.device)
+        solved.trajectory = trajectory
         for name, var in solved._cls.vars.items():
-            if name != "rows":
+            if name != "trajectory":
                 shape = n if var.type.ndim == 1 else (4, n)
                 setattr(solved, name, wp.zeros(shape, var.type.dtype, dynamics.device))
         return solved

@@ -111,7 +111,7 @@ class TaskCfg:
     metrics: tuple[StateMetric, ...] = ()
     """What is logged of the state, besides the means of all terms."""
     evaluation_suite: str = "episode"
-    """How policies are measured and played: a key of `jumper_warp.evaluation.registry.EVALUATIONS`."""
+    """How policies are measured and played: a key of `jumper_warp.evaluation.evaluations.EVALUATIONS`."""
 
     groups = ("actor", "critic")
     """Names of the observation groups."""

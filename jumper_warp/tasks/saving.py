@@ -23,7 +23,7 @@ from jumper_warp.kernels.mdp.env import NoSettings
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.ranges import Pair
 from jumper_warp.tasks.terms import RewardTerm, Term
-from jumper_warp.utils.checks import NAME, version_refusal
+from jumper_warp.utils.checks import NAME, version_error
 from jumper_warp.utils.errors import InputError
 
 VERSION = 4
@@ -140,7 +140,7 @@ def check_version(saved: Any) -> None:
     if not isinstance(saved, dict):
         raise TaskError(f"the task must be a JSON object, got {shown(saved)}")
     if (found := saved.get("version")) != VERSION:
-        raise TaskError(f"the task {version_refusal(shown(found), VERSION)}")
+        raise TaskError(f"the task {version_error(shown(found), VERSION)}")
 
 
 def task_from_json(saved: Any, modules: Iterable[ModuleType] = (), *, leave_out: Collection[str] = ()) -> TaskCfg:

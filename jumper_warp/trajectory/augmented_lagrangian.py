@@ -1,7 +1,7 @@
-"""Descent of many starts at once: limited-memory BFGS in a box, inside an augmented Lagrangian.
+"""Augmented Lagrangian with limited-memory BFGS in a box, for many starts at once.
 
-Every start keeps its own curvature, step length and multipliers. Step lengths are tried side by side, as worlds of one
-rollout, with a few random steps among them, which lead over the kinks that contacts make. Nocedal and Wright, Numerical
+Every start has its own curvature, step length and multipliers. Step lengths are tried in parallel worlds of one
+rollout, together with a few random steps, which cross the kinks of contacts. Nocedal and Wright, Numerical
 Optimization, 2nd edition: algorithm 7.4 (two loops) and section 17.4 (augmented Lagrangian).
 """
 
@@ -17,37 +17,37 @@ from jumper_warp.trajectory.problem import Problem, Values
 from jumper_warp.utils.errors import InputError
 
 LENGTHS = (2.0, 1.0, 0.5, 0.2, 0.06, 0.02)
-"""[1] Of the direction's step, tried side by side."""
+"""[1] Step lengths along the direction that are tried in parallel."""
 RANDOM = 2
-"""Random steps beside them."""
+"""Random steps that are tried with them."""
 MEMORY = 8
-"""Pairs of steps and changes of the gradient that a start remembers."""
-LARGEST, SMALLEST = 0.5, 1.0e-3
+"""Pairs of steps and gradient changes that BFGS keeps."""
+MAX_STEP, MIN_STEP = 0.5, 1.0e-3
 """[1] Bounds of the largest entry of a step of length 1."""
 OUTER = 15
-"""Iterations from one update of the multipliers to the next."""
-PENALTY, GROWTH, MOST_PENALTY = 20.0, 2.0, 2.0e4
-"""[1] Of squared constraints at the beginning, its growth where they do not shrink, its bound."""
+"""Iterations between updates of the multipliers."""
+PENALTY, GROWTH, MAX_PENALTY = 20.0, 2.0, 2.0e4
+"""[1] Initial penalty of squared constraints, its growth where they do not shrink, its bound."""
 FEASIBLE = 1.0e-3
-"""[1] Constraints up to here are satisfied."""
+"""[1] Constraints up to this value count as satisfied."""
 
 
 @dataclass
 class Progress:
-    """What a descent found."""
+    """Best candidates of a descent so far."""
 
     x: np.ndarray
-    """(starts, n) Best feasible candidate of each start; where there is none, the least infeasible."""
+    """(starts, n) Best feasible candidate of each start, else the least infeasible one."""
     objective: np.ndarray
-    """(starts,) Infinite where no candidate was feasible."""
+    """(starts,) Of `x`; infinite where no candidate was feasible."""
     violation: np.ndarray
-    """(starts,) Largest constraint, at least 0."""
+    """(starts,) Largest constraint of `x`, at least 0."""
     history: list[dict[str, float]] = field(default_factory=list)
-    """By iteration: seconds, simulated and reverse policy steps, best feasible objective."""
+    """Per iteration: seconds, simulated and reverse policy steps, best feasible objective."""
 
     @property
     def best(self) -> int:
-        """Return the index of the best start."""
+        """Index of the best start."""
         return int(np.argmin(np.where(np.isfinite(self.objective), self.objective, 1.0e12 + self.violation)))
 
 
@@ -61,10 +61,10 @@ def minimise(
     step: float = 0.1,
     seed: int = 0,
 ) -> Progress:
-    """Return what was found from some starts (starts, n), all entries within `lower` and `upper`.
+    """Return the best candidates that the descent reaches from starts (starts, n), within `lower` and `upper`.
 
-    An iteration takes one gradient and `len(LENGTHS) + RANDOM` simulations a start. step: [1] largest entry of the
-    first steps. Raises InputError for starts of another shape.
+    An iteration takes one gradient and `len(LENGTHS) + RANDOM` simulations per start. step [1]: largest entry of the
+    first steps. Raises InputError: starts of another shape.
     """
     if begin.ndim != 2 or begin.shape[1] != len(problem.knots) or len(begin) < 1:
         raise InputError(f"starts must have shape (starts, {len(problem.knots)}), got {begin.shape}")
@@ -85,7 +85,7 @@ def minimise(
 
 
 class _Descent:
-    """The state of all starts; tensors (starts, ...)."""
+    """State of the descent of all starts; tensors (starts, ...)."""
 
     def __init__(self, problem: Problem, begin: np.ndarray, lower: float, upper: float, step: float, seed: int):
         real = torch.float64 if problem.double else torch.float32
@@ -98,11 +98,11 @@ class _Descent:
         self.multipliers: torch.Tensor | None = None
         self.penalty = self.x.new_full((len(begin),), PENALTY)
         self.violation = self.x.new_full((len(begin),), torch.inf)
-        self.old: tuple[torch.Tensor, torch.Tensor] | None = None
+        self.previous: tuple[torch.Tensor, torch.Tensor] | None = None
         self.progress = Progress(begin.copy(), np.full(len(begin), np.inf), np.full(len(begin), np.inf))
 
     def merit(self, values: Values, repeat: int = 1) -> torch.Tensor:
-        """Return the augmented Lagrangian of candidates, `repeat` of each start."""
+        """Return the augmented Lagrangian (n,) of candidates, `repeat` of each start."""
         if self.multipliers is None:
             self.multipliers = self.x.new_zeros(len(self.x), values.constraints.shape[1])
         penalty = self.penalty[:, None].repeat_interleave(repeat, 0)
@@ -111,20 +111,20 @@ class _Descent:
         return values.objective + 0.5 * (penalty * (pressed.square() - shift.square())).sum(1)
 
     def iterate(self, number: int) -> None:
-        """Make a step of every start."""
+        """Take one step of every start."""
         values, gradient = self.problem.gradient(self.x, self.merit)
-        self._note(self.x, values, 1)
+        self._keep_best(self.x, values, 1)
         if number and number % OUTER == 0:
             self._update_multipliers(values)
             values, gradient = self.problem.gradient(self.x, self.merit)
-            self.old = None
-        self._remember(gradient)
+            self.previous = None
+        self._add_pair(gradient)
         direction = self._direction(gradient)
         size = direction.abs().amax(1).clamp_min(1.0e-12)
         direction *= torch.minimum(torch.ones_like(size), self.step / size)[:, None]
         lengths = self.x.new_tensor(LENGTHS)
-        drawn = self.rng.normal(size=(len(self.x), RANDOM, self.x.shape[1]))
-        noise = torch.as_tensor(drawn, dtype=self.x.dtype, device=self.x.device)
+        normal = self.rng.normal(size=(len(self.x), RANDOM, self.x.shape[1]))
+        noise = torch.as_tensor(normal, dtype=self.x.dtype, device=self.x.device)
         steps = torch.cat(
             [lengths[None, :, None] * direction[:, None], 0.3 * self.step[:, None, None] * noise + direction[:, None]],
             1,
@@ -133,70 +133,70 @@ class _Descent:
         tried = (self.x[:, None] + steps).clamp(self.lower, self.upper)
         flat = tried.flatten(0, 1)
         with torch.no_grad():
-            found = self.problem.evaluate(flat)
-        self._note(flat, found, count)
-        merits = self.merit(found, count).unflatten(0, (-1, count))
+            tried_values = self.problem.evaluate(flat)
+        self._keep_best(flat, tried_values, count)
+        merits = self.merit(tried_values, count).unflatten(0, (-1, count))
         merits = torch.where(merits.isnan(), torch.inf, merits)
         best, chosen = merits.min(1)
         better = best < self.merit(values)
         worlds = torch.arange(len(self.x), device=self.x.device)
-        self.old = (self.x, gradient)
+        self.previous = (self.x, gradient)
         self.x = torch.where(better[:, None], tried[worlds, chosen], self.x)
         factor = torch.where(chosen == 0, 2.0, torch.where(chosen <= 2, 1.0, 0.6))
         factor = torch.where(chosen >= len(LENGTHS), 0.9, factor)
-        self.step = (self.step * torch.where(better, factor, 0.3)).clamp(SMALLEST, LARGEST)
+        self.step = (self.step * torch.where(better, factor, 0.3)).clamp(MIN_STEP, MAX_STEP)
 
-    def _remember(self, gradient: torch.Tensor) -> None:
-        """Keep the last step and the change of the gradient, where the curvature along it was positive."""
-        if self.old is None:
+    def _add_pair(self, gradient: torch.Tensor) -> None:
+        """Add the last step and the change of the gradient to the BFGS pairs, where the curvature is positive."""
+        if self.previous is None:
             return
-        moved, change = self.x - self.old[0], gradient - self.old[1]
+        moved, change = self.x - self.previous[0], gradient - self.previous[1]
         product = (moved * change).sum(1)
-        good = product > 1.0e-9 * moved.norm(dim=1) * change.norm(dim=1)
-        self.pairs = [*self.pairs[1 - MEMORY :], (moved, change, torch.where(good, 1.0 / product, 0.0))]
+        convex = product > 1.0e-9 * moved.norm(dim=1) * change.norm(dim=1)
+        self.pairs = [*self.pairs[1 - MEMORY :], (moved, change, torch.where(convex, 1.0 / product, 0.0))]
 
     def _direction(self, gradient: torch.Tensor) -> torch.Tensor:
-        """Return descent directions; entries that would leave the box stay."""
+        """Return descent directions (starts, n) by the two loops of L-BFGS, zero where they would leave the box."""
         out = ((self.x <= self.lower) & (gradient > 0.0)) | ((self.x >= self.upper) & (gradient < 0.0))
         free = torch.where(out, 0.0, gradient)
-        d, kept = free, []
+        d, shares = free, []
         for moved, change, inverse in reversed(self.pairs):
             share = inverse * (moved * d).sum(1)
             d = d - share[:, None] * change
-            kept.append(share)
+            shares.append(share)
         scale = torch.ones_like(self.step)
         for moved, change, inverse in self.pairs:
             scale = torch.where(inverse > 0.0, (moved * change).sum(1) / change.square().sum(1).clamp_min(1e-30), scale)
         d = scale[:, None] * d
-        for (moved, change, inverse), share in zip(self.pairs, reversed(kept), strict=True):
+        for (moved, change, inverse), share in zip(self.pairs, reversed(shares), strict=True):
             d = d + (share - inverse * (change * d).sum(1))[:, None] * moved
         d = torch.where(out, 0.0, -d)
         uphill = (d * free).sum(1) >= 0.0
         d = torch.where(uphill[:, None], -free, d)
-        # without curvature a gradient says nothing of the length: the step's
+        # without curvature the largest entry is the step's
         plain = uphill | (torch.stack([pair[2] for pair in self.pairs]).sum(0) == 0.0 if self.pairs else uphill | True)
         largest = d.abs().amax(1).clamp_min(1.0e-12)
         return torch.where(plain[:, None], d * (self.step / largest)[:, None], d)
 
     def _update_multipliers(self, values: Values) -> None:
-        """Update multipliers, and penalties where constraints did not shrink."""
+        """Update the multipliers, and raise penalties where constraints did not shrink."""
         assert self.multipliers is not None
         worst = values.constraints.clamp_min(0.0).amax(1) if values.constraints.shape[1] else self.violation * 0.0
         self.multipliers = (self.multipliers + self.penalty[:, None] * values.constraints).clamp_min(0.0)
         slow = (worst > 0.5 * self.violation) & (worst > FEASIBLE)
-        self.penalty = torch.where(slow, GROWTH * self.penalty, self.penalty).clamp_max(MOST_PENALTY)
+        self.penalty = torch.where(slow, GROWTH * self.penalty, self.penalty).clamp_max(MAX_PENALTY)
         self.violation = worst
 
-    def _note(self, x: torch.Tensor, values: Values, count: int) -> None:
-        """Keep the best candidates; `count` of each start."""
+    def _keep_best(self, x: torch.Tensor, values: Values, count: int) -> None:
+        """Update `progress` with candidates (starts * count, n), `count` of each start."""
         objective = values.objective.cpu().numpy().reshape(-1, count)
-        found = values.constraints.cpu().numpy()
-        worst = (found.max(axis=1, initial=0.0)).reshape(-1, count)
+        constraints = values.constraints.cpu().numpy()
+        worst = (constraints.max(axis=1, initial=0.0)).reshape(-1, count)
         candidates = x.detach().cpu().numpy().reshape(len(objective), count, -1)
-        bad = ~np.isfinite(objective)
-        feasible = np.where(bad | (worst > FEASIBLE), np.inf, objective)
+        diverged = ~np.isfinite(objective)
+        feasible = np.where(diverged | (worst > FEASIBLE), np.inf, objective)
         here, progress, starts = feasible.argmin(1), self.progress, np.arange(len(objective))
-        least = np.where(bad, np.inf, worst).argmin(1)
+        least = np.where(diverged, np.inf, worst).argmin(1)
         for start in starts:
             if feasible[start, here[start]] < progress.objective[start]:
                 progress.objective[start] = feasible[start, here[start]]
@@ -204,5 +204,5 @@ class _Descent:
                 progress.x[start] = candidates[start, here[start]]
             elif not np.isfinite(progress.objective[start]):
                 i = least[start]
-                if not bad[start, i] and worst[start, i] < progress.violation[start]:
+                if not diverged[start, i] and worst[start, i] < progress.violation[start]:
                     progress.violation[start], progress.x[start] = worst[start, i], candidates[start, i]

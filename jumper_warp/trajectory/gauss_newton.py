@@ -1,13 +1,13 @@
-"""Gauss-Newton steps on the weights of a policy's network, held near the actions that it gave before.
+"""Gauss-Newton steps on the weights of a policy's network, in a trust region around its original actions.
 
-With misses e, weighed with W, their Jacobian J by the weights, and the network's actions a over given observations, a
+With errors e, weighed with W, their Jacobian J by the weights, and the network's actions a over given observations, a
 step d solves by conjugate gradients
 
     (J^T W J + A^T S A + c I) d = -(J^T W e + A^T S (a - a0)),
 
-A being the derivative of a by the weights and S = 1 / (m s^2), with m observations and s how far actions may move. The
-second terms are Gauss-Newton's of the mean squared change of the actions: up to a factor the divergence from the policy
-as it came, and the metric of the natural gradient.
+where A is the derivative of a by the weights and S = 1 / (m s^2), with m observations and s the allowed change of the
+actions. The second terms are Gauss-Newton's of the mean squared change of the actions, which is up to a factor the KL
+divergence from the original policy, and A^T S A the metric of the natural gradient.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from jumper_warp.utils.normalise import normalise
 ACTIVATIONS = {"elu": functional.elu, "relu": functional.relu, "tanh": torch.tanh}
 
 Tape = list[list[tuple[torch.Tensor, torch.Tensor]]]
-"""Of every policy step and layer what went in, (worlds, in), and what came out before the activation, (worlds, out)."""
+"""Input (worlds, in) and pre-activation output (worlds, out) of every layer, by policy step and layer."""
 
 
 class Actor(Protocol):
@@ -45,50 +45,50 @@ class Network:
     """A policy's network as a function of the vector of its weights."""
 
     def __init__(self, policy: Actor, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> None:
-        """Take over weights and normaliser; they are not shared."""
-        face = policy.interface
-        self.limits = face.observation_limit, face.normalised_limit
+        """Copy weights and normaliser."""
+        interface = policy.interface
+        self.limits = interface.observation_limit, interface.normalised_limit
         self.mean, self.std = (tensor.to(device, dtype, copy=True) for tensor in (policy.mean, policy.std))
-        self.activation = ACTIVATIONS[face.activation]
+        self.activation = ACTIVATIONS[interface.activation]
         self.shapes = [tensor.shape for layer in policy.layers for tensor in layer]
         parts = [tensor.detach().flatten() for layer in policy.layers for tensor in layer]
         self.weights = torch.cat(parts).to(device, dtype, copy=True)
 
     def layers(self, weights: torch.Tensor) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        """Return weight (out, in) and bias (out,) of each layer as views."""
+        """Return weight (out, in) and bias (out,) of each layer as views of a weight vector."""
         parts = weights.split([math.prod(shape) for shape in self.shapes])
         views = [part.view(shape) for part, shape in zip(parts, self.shapes, strict=True)]
         return list(zip(views[::2], views[1::2], strict=True))
 
     def act(self, obs: torch.Tensor, weights: torch.Tensor | None = None, tape: Tape | None = None) -> torch.Tensor:
-        """Return actions (n, 12) clamped to ±1 for raw observations (n, num_obs); tape: takes in what the layers did.
+        """Return actions (n, 12), clamped to ±1, for raw observations (n, num_obs).
 
-        weights: other ones than its own.
+        weights: by default the network's. tape: gets one entry with inputs and outputs of the layers.
         """
         limit, normalised = self.limits
         x = normalise(obs.clamp(-limit, limit), self.mean, self.std, normalised)
-        layers, rows = self.layers(self.weights if weights is None else weights), []
+        layers, recorded = self.layers(self.weights if weights is None else weights), []
         for i, (weight, bias) in enumerate(layers):
             out = functional.linear(x, weight, bias)
             if tape is not None and not out.requires_grad:
-                out.requires_grad_()  # the first step depends on nothing that is differentiated
-            rows.append((x, out))
+                out.requires_grad_()  # the inputs of the first step have no gradient
+            recorded.append((x, out))
             x = out if i == len(layers) - 1 else self.activation(out)
         if tape is not None:
-            tape.append(rows)
+            tape.append(recorded)
         return x.clamp(-1.0, 1.0)
 
 
-def world_rows(total: torch.Tensor, tape: Tape) -> torch.Tensor:
-    """Return the derivative of each world's number by the weights, (worlds, weights), in the order of `Network`.
+def per_world_gradients(total: torch.Tensor, tape: Tape) -> torch.Tensor:
+    """Return the gradient of each world's loss by the weights, (worlds, weights), in the order of `Network.weights`.
 
-    total: the sum of a number of every world, which depends on that world's steps alone; may be asked for again.
+    total: the sum of the losses of all worlds, each a function of that world's steps alone; its graph is kept.
     """
-    outs = [out for rows in tape for _, out in rows]
-    found = torch.autograd.grad(total, outs, retain_graph=True, allow_unused=True)
+    outs = [out for layers in tape for _, out in layers]
+    by_out = torch.autograd.grad(total, outs, retain_graph=True, allow_unused=True)
     depth, parts = len(tape[0]), []
     for layer in range(depth):
-        steps = [(rows[layer][0].detach(), by) for rows, by in zip(tape, found[layer::depth], strict=True)
+        steps = [(layers[layer][0].detach(), by) for layers, by in zip(tape, by_out[layer::depth], strict=True)
                  if by is not None]  # fmt: skip
         ins, by_outs = (torch.stack(each) for each in zip(*steps, strict=True))
         parts += [torch.einsum("tno,tni->noi", by_outs, ins).flatten(1), by_outs.sum(0)]
@@ -118,57 +118,57 @@ def conjugate_gradients(
 
 
 class Anchor:
-    """Observations over which a network should act as it did."""
+    """Trust region: observations at which a network should keep its original actions."""
 
     def __init__(self, network: Network, obs: torch.Tensor, action_std: torch.Tensor) -> None:
-        """Take the network's actions of now.
+        """Record the network's present actions.
 
-        obs: (m, num_obs), raw. action_std: (m,) change of the actions [1], the root of the sum of their squares, that
-        costs as much as a weighed miss of 1 if all observations have it.
+        obs: (m, num_obs), raw. action_std: (m,) norm of the change of the actions [1] that costs as much as a weighed
+        error of 1 if it occurs at all observations.
         """
         self.network, self.obs = network, obs
         self.scale = 1.0 / (action_std[:, None] * math.sqrt(len(obs)))
         with torch.no_grad():
             self.actions = network.act(obs)
 
-    def off(self, weights: torch.Tensor) -> torch.Tensor:
-        """Return the weighed changes of all actions, (m, 12)."""
+    def residuals(self, weights: torch.Tensor) -> torch.Tensor:
+        """Return the weighed changes of the actions, (m, 12)."""
         return self.scale * (self.network.act(self.obs, weights) - self.actions)
 
     def cost(self, weights: torch.Tensor) -> float:
-        """Return half the sum of their squares."""
+        """Return half the sum of squared `residuals`."""
         with torch.no_grad():
-            return 0.5 * float(self.off(weights).square().sum())
+            return 0.5 * float(self.residuals(weights).square().sum())
 
     def change(self, weights: torch.Tensor) -> float:
-        """Return the root mean square over observations and motors of how far the actions have moved."""
+        """Return the root mean square change of the actions over observations and motors [1]."""
         with torch.no_grad():
             return float((self.network.act(self.obs, weights) - self.actions).square().mean().sqrt())
 
 
 def gauss_newton_step(
     weights: torch.Tensor,
-    rows: Sequence[torch.Tensor],
-    misses: Sequence[torch.Tensor],
+    jacobians: Sequence[torch.Tensor],
+    errors: Sequence[torch.Tensor],
     importance: Sequence[torch.Tensor],
     anchor: Anchor,
     damping: float,
     iterations: int = 40,
     accuracy: float = 1.0e-3,
 ) -> torch.Tensor:
-    """Return the step d of the module's equation, as far as `conjugate_gradients` solves it.
+    """Return the step d (weights,) of the module's equation, solved by `conjugate_gradients`.
 
-    rows: of J, (n, weights) for each group of worlds; misses (n,); importance: the diagonal of W, (n,).
+    jacobians: J of each group of worlds, (n, weights); errors: e, (n,); importance: the diagonal of W, (n,).
     """
-    by_off, back = vjp(anchor.off, weights)[:2]
-    right = -back(by_off)[0]
-    for row, miss, weight in zip(rows, misses, importance, strict=True):
-        right = right - row.T @ (weight * miss)
+    change, back = vjp(anchor.residuals, weights)[:2]
+    right = -back(change)[0]
+    for jacobian, error, weight in zip(jacobians, errors, importance, strict=True):
+        right = right - jacobian.T @ (weight * error)
 
     def apply(v: torch.Tensor) -> torch.Tensor:
-        out = damping * v + back(jvp(anchor.off, (weights,), (v,))[1])[0]
-        for row, weight in zip(rows, importance, strict=True):
-            out = out + row.T @ (weight * (row @ v))
+        out = damping * v + back(jvp(anchor.residuals, (weights,), (v,))[1])[0]
+        for jacobian, weight in zip(jacobians, importance, strict=True):
+            out = out + jacobian.T @ (weight * (jacobian @ v))
         return out
 
     return conjugate_gradients(apply, right, iterations, accuracy)

@@ -6,50 +6,49 @@ import math
 
 import torch
 
-from jumper_warp.trajectory.problem import Motion, Term
+from jumper_warp.trajectory.problem import SimulatedMotion, Term
 
 MARGIN = 0.004
-"""[m] Of links over the ground."""
+"""[m] Clearance of links over the ground."""
 
 
 def air_time(up: torch.Tensor, drop: torch.Tensor, gravity: float) -> torch.Tensor:
-    """Return the time [s] of a projectile until it has fallen by `drop` [m], up to its apex if it never does.
+    """Return the time [s] until a projectile has fallen by `drop` [m]; the time to its apex if it never does.
 
-    up [m/s]: its upward speed. The square root is continued straight below 1e-4 m^2/s^2, so that gradients are finite.
+    up [m/s]: upward speed. The square root is constant below 1e-4 m^2/s^2, so that gradients are finite.
     """
     root = up.square() + 2.0 * gravity * drop
     return (up + root.clamp_min(1.0e-4).sqrt()) / gravity
 
 
-def flight(motion: Motion, speed: float, height: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return distance [m] and air time [s] of the centre of mass' parabola from the takeoff on, each (num,).
+def flight(motion: SimulatedMotion, speed: float, height: float) -> tuple[torch.Tensor, torch.Tensor]:
+    """Return distance [m] and air time [s] of the flight of the centre of mass, (num,) each.
 
-    From where it stood to where it falls through what it has with the base at `height` [m] in the posture of the start.
-    speed [m/s]: least upward at takeoff.
+    The flight is a parabola from takeoff down to the height of the centre of mass with the base at `height` [m] in the
+    initial posture; the distance counts from the start. speed [m/s]: upward speed that defines takeoff.
     """
 
-    def found() -> tuple[torch.Tensor, torch.Tensor]:
+    def distance_and_time() -> tuple[torch.Tensor, torch.Tensor]:
         now, start = motion.momentum_at_takeoff(speed), motion.start
         landing = height + start.com[:, 2] - motion.q[0, :, 2]
         time = air_time(now.vel[:, 2], now.com[:, 2] - landing, motion.gravity)
         return now.com[:, 0] - start.com[:, 0] + time * now.vel[:, 0], time
 
-    return motion.once(("flight", speed, height), found)
+    return motion.once(("flight", speed, height), distance_and_time)
 
 
 def farthest(speed: float = 0.25, height: float = 0.30) -> Term:
-    """Return minus the distance flown [m], see `flight`."""
+    """Objective: minus the distance of the flight [m], (num,), see `flight`."""
     return lambda motion: -flight(motion, speed, height)[0]
 
 
 def highest() -> Term:
-    """Return minus the largest base height [m] between takeoff and the first paw that comes down, by full simulation.
+    """Objective: minus the apex height of the base [m] between takeoff and the first touchdown, (num,).
 
-    A second hop does not count. The apex lies between two rows: it is that of the parabola through the highest
-    row's position and velocity.
+    The apex lies on the parabola through position and velocity of the highest row.
     """
 
-    def term(motion: Motion) -> torch.Tensor:
+    def term(motion: SimulatedMotion) -> torch.Tensor:
         height, up = motion.q[..., 2], motion.base_velocity[..., 2]
         row, _ = motion.takeoff(0.25)
         later = torch.arange(len(height), device=row.device)[:, None] >= row
@@ -63,30 +62,30 @@ def highest() -> Term:
 
 
 def positive_work() -> Term:
-    """Return the motors' positive work [J] until takeoff, in units of 100 J."""
+    """Objective: the motors' positive work until takeoff [100 J], (num,)."""
 
-    def term(motion: Motion) -> torch.Tensor:
+    def term(motion: SimulatedMotion) -> torch.Tensor:
         row = motion.takeoff(0.25)[0]
         return 0.01 * motion.positive_work[row - 1, torch.arange(motion.num, device=row.device)]
 
     return term
 
 
-def before_takeoff(motion: Motion, speed: float) -> torch.Tensor:
-    """Return which rows (steps + 1, num) are in stance, that of the takeoff excluded."""
+def before_takeoff(motion: SimulatedMotion, speed: float) -> torch.Tensor:
+    """Return which rows are before takeoff, bool (steps + 1, num)."""
     row = motion.takeoff(speed)[0]
     return torch.arange(motion.q.shape[0], device=row.device)[:, None] < row
 
 
 def pitch_of(quat: torch.Tensor) -> torch.Tensor:
-    """Return the pitch [rad] of quaternions xyzw about y, nose down positive, of robots that turn about y alone."""
+    """Return the pitch [rad], nose down positive, of quaternions xyzw (..., 4) that rotate about y alone."""
     return 2.0 * torch.atan2(quat[..., 1], quat[..., 3])
 
 
 def landing_pitch(most: float, speed: float = 0.25, height: float = 0.30) -> Term:
-    """Keep the pitch that the base would have at the end of the flight, posture of the start, within `most` [rad]."""
+    """Constraint: the predicted pitch at the end of the flight, in the initial posture, is within ±`most` [rad]."""
 
-    def term(motion: Motion) -> torch.Tensor:
+    def term(motion: SimulatedMotion) -> torch.Tensor:
         now, time, row = motion.momentum_at_takeoff(speed), flight(motion, speed, height)[1], motion.takeoff(speed)[0]
         spin = now.spin[:, 1] / motion.start.inertia[:, 1, 1]
         pitch = pitch_of(motion.q[row, torch.arange(motion.num, device=row.device), 3:7]) + spin * time
@@ -96,15 +95,15 @@ def landing_pitch(most: float, speed: float = 0.25, height: float = 0.30) -> Ter
 
 
 def stays(most: float, speed: float = 0.25) -> Term:
-    """Keep the base within `most` [m] of its start while in stance, in the plane."""
-    away = drifts(most)
-    return lambda motion: torch.where(before_takeoff(motion, speed), away(motion), 0.0)
+    """Constraint: before takeoff the base stays within `most` [m] of its start in the plane."""
+    drift = drifts(most)
+    return lambda motion: torch.where(before_takeoff(motion, speed), drift(motion), 0.0)
 
 
 def leans_back(most: float, speed: float = 0.25) -> Term:
-    """Return minus how far back of its start the base comes in stance [m], up to `most` [m], (num,)."""
+    """Objective: minus the distance that the base moves back before takeoff [m], at most `most`, (num,)."""
 
-    def term(motion: Motion) -> torch.Tensor:
+    def term(motion: SimulatedMotion) -> torch.Tensor:
         back = motion.q[0, :, 0] - motion.q[..., 0]
         return -torch.where(before_takeoff(motion, speed), back, 0.0).amax(0).clamp_max(most)
 
@@ -112,19 +111,22 @@ def leans_back(most: float, speed: float = 0.25) -> Term:
 
 
 def drifts(most: float) -> Term:
-    """Keep the base within `most` [m] of its start in the plane, in all rows."""
+    """Constraint: in all rows the base is within `most` [m] of its start in the plane."""
 
-    def term(motion: Motion) -> torch.Tensor:
-        way = motion.q[..., :2] - motion.q[0, :, :2]
-        return (way.square().sum(-1) + 1.0e-12).sqrt() - most
+    def term(motion: SimulatedMotion) -> torch.Tensor:
+        offset = motion.q[..., :2] - motion.q[0, :, :2]
+        return (offset.square().sum(-1) + 1.0e-12).sqrt() - most
 
     return term
 
 
 def clear(margin: float = MARGIN, speed: float | None = None) -> Term:
-    """Keep housings, thighs, knees and shanks off the ground by a margin [m], in stance or always (speed None)."""
+    """Constraint: housings, thighs, knees and shanks clear the ground by a margin [m].
 
-    def term(motion: Motion) -> torch.Tensor:
+    speed [m/s]: only before takeoff, see `SimulatedMotion.takeoff`; None: always.
+    """
+
+    def term(motion: SimulatedMotion) -> torch.Tensor:
         gap = 10.0 * (margin - motion.clearance.amin((-1, -2)))
         return gap if speed is None else torch.where(before_takeoff(motion, speed), gap, 0.0)
 
@@ -132,9 +134,9 @@ def clear(margin: float = MARGIN, speed: float | None = None) -> Term:
 
 
 def no_run_up(most: float = 0.04, speed: float = 0.25) -> Term:
-    """Keep hind paws that are on the ground less than `most` [m] ahead of their start."""
+    """Constraint: before takeoff hind paws on the ground are less than `most` [m] ahead of their start."""
 
-    def term(motion: Motion) -> torch.Tensor:
+    def term(motion: SimulatedMotion) -> torch.Tensor:
         paws = motion.ankles[..., 2:, 0]
         ahead = paws[1:].amax(-1) - paws[0].amax(-1) - most
         counts = motion.down[:, 2:].any(1) & before_takeoff(motion, speed)[:-1]
@@ -144,20 +146,20 @@ def no_run_up(most: float = 0.04, speed: float = 0.25) -> Term:
 
 
 def takes_off(speed: float = 0.25, lift: float = 0.01) -> Term:
-    """Ask for paws lifted by `lift` [m] at the end of the motion, and for a takeoff at all."""
+    """Constraint: the robot takes off; else its paws are below `lift` [m] at the end, which gives a gradient."""
 
-    def term(motion: Motion) -> torch.Tensor:
+    def term(motion: SimulatedMotion) -> torch.Tensor:
         lowest = (motion.ankles[-1, ..., 2] - motion.body.paw_radius).amin(-1)
-        off = motion.takeoff(speed)[1]
-        return torch.where(off, 0.0, 10.0 * (lift - lowest).clamp_min(0.0) + 0.01)
+        took_off = motion.takeoff(speed)[1]
+        return torch.where(took_off, 0.0, 10.0 * (lift - lowest).clamp_min(0.0) + 0.01)
 
     return term
 
 
 def upright(most: float, at_end: bool = True) -> Term:
-    """Keep the angle between body and world z within `most` [rad], in the last row or in all."""
+    """Constraint: the tilt of the base is within `most` [rad], in the last row or in all."""
 
-    def term(motion: Motion) -> torch.Tensor:
+    def term(motion: SimulatedMotion) -> torch.Tensor:
         quat = motion.q[-1:, :, 3:7] if at_end else motion.q[..., 3:7]
         x, y = quat[..., 0], quat[..., 1]
         sine = 2.0 * (x.square() + y.square() + 1e-12).sqrt()
@@ -167,12 +169,12 @@ def upright(most: float, at_end: bool = True) -> Term:
 
 
 def reaches(height: float) -> Term:
-    """Ask for an apex of the base of at least `height` [m]."""
+    """Constraint: the apex of the base is at least `height` [m], see `highest`."""
     return lambda motion: height + highest()(motion)
 
 
-def touchdowns(motion: Motion, speed: float = 0.25) -> torch.Tensor:
-    """Return from which row each paw has come down after the takeoff, bool (steps + 1, 4, num)."""
+def touchdowns(motion: SimulatedMotion, speed: float = 0.25) -> torch.Tensor:
+    """Return whether each paw has touched down since takeoff, bool (steps + 1, 4, num)."""
     row, _ = motion.takeoff(speed)
     later = torch.arange(motion.q.shape[0], device=row.device)[:, None, None] > row
     down = torch.cat([torch.zeros_like(motion.down[:1]), motion.down])
@@ -180,24 +182,24 @@ def touchdowns(motion: Motion, speed: float = 0.25) -> torch.Tensor:
 
 
 def soft(most: float, speed: float = 0.25) -> Term:
-    """Keep upward accelerations [g] of the base over policy steps after takeoff below `most`; in units of 10 g."""
+    """Constraint: after takeoff the base's upward acceleration per policy step is below `most` [g], scaled to 10 g."""
 
-    def term(motion: Motion) -> torch.Tensor:
+    def term(motion: SimulatedMotion) -> torch.Tensor:
         up = motion.base_velocity[..., 2]
-        gained = (up[1:] - up[:-1]) / (motion.substeps * motion.dt * motion.gravity)
+        acceleration = (up[1:] - up[:-1]) / (motion.substeps * motion.dt * motion.gravity)
         later = torch.arange(len(up), device=up.device)[1:, None] > motion.takeoff(speed)[0]
-        return torch.where(later, 0.1 * (gained - most), -1.0)
+        return torch.where(later, 0.1 * (acceleration - most), -1.0)
 
     return term
 
 
 def lifted(free: float = 0.001) -> Term:
-    """Return how far and how long paws are off the ground again after their touchdown [10 mm s], (num,).
+    """Objective: height times duration of paws lifted after touchdown [10 mm s], (num,).
 
-    Heights below `free` [m] do not count, those of paws that never come down count from the motion's end.
+    Heights up to `free` [m] do not count. Paws in the air at the end of the motion add their height there.
     """
 
-    def term(motion: Motion) -> torch.Tensor:
+    def term(motion: SimulatedMotion) -> torch.Tensor:
         height = (motion.ankles[..., 2] - motion.body.paw_radius - free).clamp_min(0.0).movedim(2, 1)
         counts = touchdowns(motion)
         step = motion.substeps * motion.dt
@@ -207,9 +209,9 @@ def lifted(free: float = 0.001) -> Term:
 
 
 def rest() -> Term:
-    """Return the squared speed [m^2/s^2] and a tenth of the squared angular velocity [rad^2/s^2] at the end, (num,)."""
+    """Objective: squared speed [m^2/s^2] plus a tenth of squared angular velocity [rad^2/s^2] at the end, (num,)."""
 
-    def term(motion: Motion) -> torch.Tensor:
+    def term(motion: SimulatedMotion) -> torch.Tensor:
         last = motion.qd[-1]
         return last[:, :3].square().sum(-1) + 0.1 * last[:, 3:6].square().sum(-1)
 
@@ -217,5 +219,5 @@ def rest() -> Term:
 
 
 def still(free: float = 0.001) -> Term:
-    """Return `lifted` and half of `rest`, (num,)."""
+    """Objective: `lifted` plus half of `rest`, (num,)."""
     return lambda motion: lifted(free)(motion) + 0.5 * rest()(motion)

@@ -1,11 +1,11 @@
-"""Trajectory optimisation: motor targets for an objective and constraints, by gradients through the simulation.
+"""Trajectory optimisation problems: motor targets, an objective and constraints, with gradients of the simulation.
 
-Targets are knots over time, interpolated to policy steps. Every start is a world of one rollout. A problem is
+Targets are knots over time, interpolated to policy steps. Every candidate is a world of one rollout. A problem is
 
     minimise f(x)  subject to  c(x) <= 0,  lower <= x <= upper,
 
-with f and c functions of the motion that the targets lead to (`jumper_warp.trajectory.jumps` has those of jumps). It is
-solved by `jumper_warp.trajectory.augmented_lagrangian.minimise`.
+with f and c functions of the simulated motion (see `jumper_warp.trajectory.jumps`).
+`jumper_warp.trajectory.augmented_lagrangian.minimise` solves it.
 """
 
 from __future__ import annotations
@@ -28,12 +28,12 @@ from jumper_warp.trajectory.whole_body import Momentum, WholeBody
 from jumper_warp.utils.errors import InputError
 
 CONTACT_FORCE = 0.1
-"""[N] Above it a paw is in contact."""
+"""[N] Force above which a paw is in contact."""
 
 
 @dataclass(frozen=True)
 class Knots:
-    """Motor targets over time: knots, linear in between, the last held to the end; a knot is an action within -1..1."""
+    """Parametrisation of motor targets: actions within ±1 at knots, linear in between, the last held to the end."""
 
     at: tuple[float, ...]
     """Policy steps of the knots, rising from 0."""
@@ -44,7 +44,7 @@ class Knots:
     middle: tuple[float, float] = (0.0, 45.0)
     """[deg] Of an action of 0."""
     symmetric: bool = True
-    """Whether left and right are alike and lateral motors are at 0, or all twelve motors are free."""
+    """True: left and right are equal and lateral motors at 0; False: all twelve motors are free."""
 
     def __post_init__(self) -> None:
         """Raises InputError: knots that do not rise from 0, or beyond the motion."""
@@ -54,16 +54,16 @@ class Knots:
 
     @property
     def motors(self) -> int:
-        """Return how many actions a knot has: front outer, front inner, hind outer, hind inner, or all motors."""
+        """Number of actions of a knot: front outer, front inner, hind outer, hind inner; or all motors."""
         return 4 if self.symmetric else 12
 
     def __len__(self) -> int:
-        """Return how many numbers describe a motion."""
+        """Return the number of variables of a candidate."""
         return len(self.at) * self.motors
 
     @cached_property
     def weights(self) -> np.ndarray:
-        """Return what each knot contributes to each policy step, (steps, knots)."""
+        """Interpolation weights of the knots at each policy step, (steps, knots)."""
         return np.stack([np.interp(np.arange(self.steps), self.at, unit) for unit in np.eye(len(self.at))], axis=1)
 
     def targets(self, x: torch.Tensor) -> torch.Tensor:
@@ -81,50 +81,53 @@ class Knots:
         return middle + scale * actions
 
 
-class Motion:
-    """What targets lead to, in `num` worlds; coordinates last, rows every policy step, row 0 the start."""
+class SimulatedMotion:
+    """Motion of `num` worlds with derived quantities, which are computed once; row 0 is the start.
+
+    Rows are policy steps, coordinates last.
+    """
 
     def __init__(self, trajectory: TorchTrajectory, body: WholeBody, rollout: Rollout, gravity: float, start: Momentum):
         self.trajectory, self.body, self.gravity, self.start = trajectory, body, gravity, start
-        """gravity: [m/s^2] downward; start: momenta of the start, without gradients."""
-        self._known: dict[Any, Any] = {}
+        """gravity [m/s^2]: downward; start: momentum at the start, without gradients."""
+        self._cache: dict[Any, Any] = {}
         self.dt, self.substeps = rollout.dt, rollout.substeps
         self.q, self.qd = trajectory.q.movedim(1, -1), trajectory.qd.movedim(1, -1)
         """(steps + 1, num, 19) and (steps + 1, num, 18), see `Trajectory`."""
         self.num = self.q.shape[1]
 
     def once(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return what several terms need of this motion, which is made when it is first asked for."""
-        if key not in self._known:
-            self._known[key] = make()
-        return self._known[key]
+        """Return `make()`, computed once per key and shared by terms."""
+        if key not in self._cache:
+            self._cache[key] = make()
+        return self._cache[key]
 
     @cached_property
     def points(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the legs' joints and ankles [m] in all rows, (steps + 1, num, ...), see `WholeBody.points`."""
+        """Positions of the legs' joints and ankles [m], (steps + 1, num, ...), see `WholeBody.points`."""
         return self.body.points(self.q)
 
     @property
     def ankles(self) -> torch.Tensor:
-        """Return the centres of the paws [m], (steps + 1, num, 4, 3)."""
+        """Centres of the paws [m], (steps + 1, num, 4, 3)."""
         return self.points[1]
 
     @cached_property
     def clearance(self) -> torch.Tensor:
-        """Return distances [m] from the ground in all rows, (steps + 1, num, 4, 4), see `WholeBody.clearance`."""
+        """Distances of links from the ground [m], (steps + 1, num, 4, 4), see `WholeBody.clearance`."""
         return self.body.clearance_of(self.q, *self.points)
 
     @cached_property
     def down(self) -> torch.Tensor:
-        """Return whether each paw is in contact at the end of each policy step, bool (steps, 4, num)."""
+        """Whether each paw is in contact at the end of each policy step, bool (steps, 4, num)."""
         impulse = self.trajectory.impulse.detach()[self.substeps - 1 :: self.substeps]
         return torch.linalg.vector_norm(impulse, dim=-1) > CONTACT_FORCE * self.dt
 
     @cached_property
     def positive_work(self) -> torch.Tensor:
-        """Return the work [J] that the motors put in until each policy step, braking apart, (steps, num).
+        """Positive work of the motors [J] until each policy step, (steps, num).
 
-        Torques are those of every physics step, rates the mean of the policy step's ends.
+        Torques are those of every physics step, rates interpolated within the policy step.
         """
         torque = self.trajectory.torque.unflatten(0, (-1, self.substeps))
         ends = self.qd[..., 6:].movedim(-1, 1)
@@ -134,9 +137,9 @@ class Motion:
         return (self.dt * (torque * rate).clamp_min(0.0)).sum((1, 2)).cumsum(0)
 
     def takeoff(self, speed: float) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the row of takeoff (num,), the last where there is none, and whether there is one.
+        """Return the row of takeoff (num,), the last row where there is none, and whether there is one, bool (num,).
 
-        As the jumps' tasks see it: no paw down at the end of a policy step, base upward faster than `speed` [m/s].
+        Takeoff as in the jumps' tasks: no paw in contact and the base rising faster than `speed` [m/s].
         """
         return self.once(("takeoff", speed), lambda: self._takeoff(speed))
 
@@ -148,47 +151,48 @@ class Motion:
 
     @cached_property
     def base_velocity(self) -> torch.Tensor:
-        """Return velocities [m/s] of the base's origin, (steps + 1, num, 3)."""
+        """Velocity of the base's origin [m/s], (steps + 1, num, 3)."""
         return self.body.base_velocity(self.q, self.qd)
 
     def momentum_at(self, row: torch.Tensor) -> Momentum:
-        """Return momenta of one row (num,) a world."""
+        """Return the momentum at a row of each world, (num,)."""
         worlds = torch.arange(self.num, device=row.device)
         return self.body.momentum(self.q[row, worlds], self.qd[row, worlds])
 
     def momentum_at_takeoff(self, speed: float) -> Momentum:
-        """Return momenta of the row of takeoff."""
+        """Return the momentum at takeoff, see `takeoff`."""
         return self.once(("momentum", speed), lambda: self.momentum_at(self.takeoff(speed)[0]))
 
 
-Term = Callable[[Motion], torch.Tensor]
-"""An objective, (num,), or constraints that must be <= 0, (..., num), in units of about 1."""
+Term = Callable[[SimulatedMotion], torch.Tensor]
+"""Returns an objective (num,), or constraints (..., num) that must be <= 0, scaled to about 1."""
 
 
 class Values(NamedTuple):
-    """What candidates are worth."""
+    """Objective and constraints of n candidates."""
 
     objective: torch.Tensor
     """(n,)"""
     constraints: torch.Tensor
-    """(n, m), satisfied where <= 0."""
+    """(n, m) Satisfied where <= 0."""
 
 
 class _Worlds(NamedTuple):
-    """What is made once for a number of candidates."""
+    """Rollout and start of n candidates, standing in the default pose."""
 
     rollout: Rollout
     body: WholeBody
     q: torch.Tensor
-    """(19, n) The start, standing."""
+    """(19, n)"""
     qd: torch.Tensor
     """(18, n)"""
     start: Momentum
+    """At the start."""
 
 
 @dataclass
 class Problem:
-    """A motion that is looked for. Worlds start standing in the default pose."""
+    """Optimisation problem of a motion that starts from standing in the default pose."""
 
     knots: Knots
     objective: Term
@@ -208,19 +212,20 @@ class Problem:
     device: Any = None
     threads: int | None = None
     world_steps: int = field(default=0, init=False)
-    """Policy steps that were simulated so far, worlds times steps."""
+    """Simulated policy steps so far, worlds times steps."""
     reverse_steps: int = field(default=0, init=False)
-    """Policy steps of reverse passes so far."""
+    """Policy steps of reverse passes so far, worlds times steps."""
 
     def __post_init__(self) -> None:
-        """Prepare."""
+        """Start without worlds."""
         self._worlds: dict[int, _Worlds] = {}
 
     def rollout(self, num_worlds: int) -> Rollout:
-        """Return the rollout of so many worlds, which is made once."""
-        return self._prepared(num_worlds).rollout
+        """Return the rollout of a number of worlds, made at first use."""
+        return self._worlds_of(num_worlds).rollout
 
-    def _prepared(self, num_worlds: int) -> _Worlds:
+    def _worlds_of(self, num_worlds: int) -> _Worlds:
+        """Return rollout and start of a number of worlds, made at first use."""
         if num_worlds not in self._worlds:
             model = build_model(
                 num_worlds, visuals=False, friction=self.friction, gravity=self.gravity, device=self.device
@@ -234,35 +239,38 @@ class Problem:
             self._worlds[num_worlds] = _Worlds(rollout, body, q, qd, body.momentum(q.T, qd.T))
         return self._worlds[num_worlds]
 
-    def motion(self, x: torch.Tensor) -> Motion:
-        """Return the motion of candidates (n, len(knots)), with gradients where x has them."""
-        rollout, body, q, qd, start = self._prepared(len(x))
+    def motion(self, x: torch.Tensor) -> SimulatedMotion:
+        """Return the simulated motion of candidates (n, len(knots)), differentiable by x."""
+        rollout, body, q, qd, start = self._worlds_of(len(x))
         targets = self.knots.targets(x)
         self.world_steps += targets.shape[0] * len(x)
-        return Motion(simulate(rollout, targets, q, qd, trusted=True), body, rollout, self.gravity, start)
+        return SimulatedMotion(simulate(rollout, targets, q, qd, trusted=True), body, rollout, self.gravity, start)
 
-    def recorded(self, trajectory: TorchTrajectory) -> Motion:
-        """Return the motion of one world whose trajectory comes from another simulation of the same robot."""
-        rollout, body, _, _, start = self._prepared(1)
-        return Motion(trajectory, body, rollout, self.gravity, start)
+    def motion_of(self, trajectory: TorchTrajectory) -> SimulatedMotion:
+        """Return the motion of a trajectory of one world from another simulation of the same robot."""
+        rollout, body, _, _, start = self._worlds_of(1)
+        return SimulatedMotion(trajectory, body, rollout, self.gravity, start)
 
     def evaluate(self, x: torch.Tensor) -> Values:
-        """Return objective and constraints of candidates (n, len(knots)); what is not finite is infinite."""
+        """Return objective and constraints of candidates (n, len(knots)), see `values`."""
         return self.values(self.motion(x))
 
-    def values(self, motion: Motion) -> Values:
-        """Return objective and constraints of a motion; infinite where one of them is not finite."""
+    def values(self, motion: SimulatedMotion) -> Values:
+        """Return objective and constraints of a motion; a diverged world has an infinite objective."""
         objective = self.objective(motion)
         rows = [term(motion).reshape(-1, motion.num) for term in self.constraints]
         constraints = torch.cat(rows).T if rows else objective.new_zeros(motion.num, 0)
-        broken = ~(objective.isfinite() & constraints.isfinite().all(1))
-        return Values(torch.where(broken, torch.inf, objective), torch.where(broken[:, None], 0.0, constraints))
+        diverged = ~(objective.isfinite() & constraints.isfinite().all(1))
+        return Values(torch.where(diverged, torch.inf, objective), torch.where(diverged[:, None], 0.0, constraints))
 
     def gradient(self, x: torch.Tensor, merit: Callable[[Values], torch.Tensor]) -> tuple[Values, torch.Tensor]:
-        """Return the values of candidates and the gradient (n, len(knots)) of their merit (n,), zero where broken."""
+        """Return the values of candidates and the gradient of their merit, (n, len(knots)), zero where they diverge.
+
+        merit: function of `Values` to minimise, returns (n,).
+        """
         x = x.detach().requires_grad_()
         values = self.evaluate(x)
-        each = merit(values)
-        gradient = torch.autograd.grad(each[each.isfinite()].sum(), x)[0]
+        merits = merit(values)
+        gradient = torch.autograd.grad(merits[merits.isfinite()].sum(), x)[0]
         self.reverse_steps += self.knots.steps * len(x)
         return Values(*(value.detach() for value in values)), torch.nan_to_num(gradient, 0.0, 0.0, 0.0)

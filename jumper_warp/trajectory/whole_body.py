@@ -1,4 +1,4 @@
-"""Where a robot's links are and what they carry, as functions of PyTorch tensors: for objectives of trajectories.
+"""Kinematics and momentum of the robot as functions of PyTorch tensors, for objectives of trajectories.
 
 States are rows of `Trajectory`: q (..., 19) and qd (..., 18), coordinates last. Positions and velocities are in the
 world frame, quaternions xyzw.
@@ -19,41 +19,43 @@ from jumper_warp.kernels.layout import BODIES
 
 FRONT = (1.0, 1.0, -1.0, -1.0)
 SIDE = (1.0, -1.0, 1.0, -1.0)
+"""Signs of the legs: front +1, hind -1; left +1, right -1."""
 OUTER, INNER = 0, 1
+"""Transversal motors of a leg."""
 LINKS = 5
-"""Of a leg: housing, outer thigh, outer shank, inner thigh, inner shank."""
+"""Links of a leg: housing, outer thigh, outer shank, inner thigh, inner shank."""
 
 
 class LegFrames(NamedTuple):
-    """Links of four legs; axes (..., leg, link, ...)."""
+    """Poses and velocities of the links of four legs, world frame; axes (..., leg, link, ...)."""
 
     pos: torch.Tensor
     """(..., 4, 5, 3) [m] Origins: hip, outer transversal axis, outer knee, inner axis, inner knee."""
-    turn: torch.Tensor
+    rotation: torch.Tensor
     """(..., 4, 5, 3, 3) Link to world."""
     vel: torch.Tensor
     """(..., 4, 5, 3) [m/s] Of the origins."""
     ang: torch.Tensor
     """(..., 4, 5, 3) [rad/s]"""
     ankle: torch.Tensor
-    """(..., 4, 3) [m]"""
+    """(..., 4, 3) [m] Centres of the paws."""
 
 
 class Momentum(NamedTuple):
-    """Of the whole robot."""
+    """Momentum of the whole robot, world frame."""
 
     com: torch.Tensor
     """(..., 3) [m] Centre of mass."""
     vel: torch.Tensor
-    """(..., 3) [m/s] Its velocity."""
+    """(..., 3) [m/s] Velocity of the centre of mass."""
     spin: torch.Tensor
-    """(..., 3) [kg m^2/s] Angular momentum about it."""
+    """(..., 3) [kg m^2/s] Angular momentum about the centre of mass."""
     inertia: torch.Tensor
-    """(..., 3, 3) [kg m^2] Of the posture, about it."""
+    """(..., 3, 3) [kg m^2] Of the posture, about the centre of mass."""
 
 
-def rotations(quat: torch.Tensor) -> torch.Tensor:
-    """Return rotation matrices (..., 3, 3) of quaternions xyzw (..., 4), which are normalised first."""
+def rotation_matrices(quat: torch.Tensor) -> torch.Tensor:
+    """Return rotation matrices (..., 3, 3) of quaternions xyzw (..., 4), normalised first."""
     x, y, z, w = torch.nn.functional.normalize(quat, dim=-1).unbind(-1)
     rows = (
         1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
@@ -63,21 +65,25 @@ def rotations(quat: torch.Tensor) -> torch.Tensor:
     return torch.stack(rows, dim=-1).unflatten(-1, (3, 3))
 
 
-def _about_x(cos: torch.Tensor, sin: torch.Tensor) -> torch.Tensor:
+def _rotation_x(cos: torch.Tensor, sin: torch.Tensor) -> torch.Tensor:
+    """Return rotation matrices (..., 3, 3) about x."""
     one, zero = torch.ones_like(cos), torch.zeros_like(cos)
     return torch.stack([one, zero, zero, zero, cos, -sin, zero, sin, cos], dim=-1).unflatten(-1, (3, 3))
 
 
-def _about_y(cos: torch.Tensor, sin: torch.Tensor) -> torch.Tensor:
+def _rotation_y(cos: torch.Tensor, sin: torch.Tensor) -> torch.Tensor:
+    """Return rotation matrices (..., 3, 3) about y."""
     one, zero = torch.ones_like(cos), torch.zeros_like(cos)
     return torch.stack([cos, zero, sin, zero, one, zero, -sin, zero, cos], dim=-1).unflatten(-1, (3, 3))
 
 
-def _apply(turn: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-    return (turn @ vector.unsqueeze(-1)).squeeze(-1)
+def _apply(rotation: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
+    """Return rotated vectors (..., 3)."""
+    return (rotation @ vector.unsqueeze(-1)).squeeze(-1)
 
 
 def _cross(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
+    """Return cross products (..., 3), broadcast."""
     return torch.linalg.cross(*torch.broadcast_tensors(a, b))
 
 
@@ -85,7 +91,7 @@ class WholeBody:
     """Kinematics and momentum of the robot of a rollout, with the masses of its first world."""
 
     def __init__(self, rollout: Rollout):
-        """Read lengths and masses; they stay."""
+        """Copy lengths and masses of a rollout; later changes have no effect."""
         self._real = torch.float64 if rollout.real is wp.float64 else torch.float32
         device = str(rollout.device)
         lengths = torch.as_tensor(rollout.geometry(), dtype=self._real, device=device)
@@ -93,7 +99,7 @@ class WholeBody:
         self._outer_x, self._inner_x, self._plane_y, self._knee_y, self._thigh, self._shank, self.paw_radius = lengths[
             :, 3:
         ].unbind(1)
-        """[m] (4,) each, in the order of `jumper_warp.diff.rollout.GEOMETRY_NAMES`."""
+        """(4,) [m] each, in the order of `jumper_warp.diff.rollout.GEOMETRY_NAMES`."""
         self._front = lengths.new_tensor(FRONT)
         self._side = lengths.new_tensor(SIDE)
         self._flip = torch.stack([self._front, -self._front], dim=-1)
@@ -107,46 +113,46 @@ class WholeBody:
         """[kg]"""
 
     def _base(self, q: torch.Tensor, qd: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return rotation, and position [m], velocity [m/s] and angular velocity [rad/s] of the base's origin."""
-        turn, ang = rotations(q[..., 3:7]), qd[..., 3:6]
-        vel = qd[..., :3] - _cross(ang, _apply(turn, (self._first[0] / self._mass[0]).expand_as(ang)))
-        return turn, q[..., :3], vel, ang
+        """Return rotation (..., 3, 3), position [m], velocity [m/s] and angular velocity [rad/s] of the base."""
+        rotation, ang = rotation_matrices(q[..., 3:7]), qd[..., 3:6]
+        vel = qd[..., :3] - _cross(ang, _apply(rotation, (self._first[0] / self._mass[0]).expand_as(ang)))
+        return rotation, q[..., :3], vel, ang
 
     def base_velocity(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor:
         """Return the velocity [m/s] of the base's origin, (..., 3)."""
         return self._base(q, qd)[2]
 
     def legs(self, q: torch.Tensor, qd: torch.Tensor) -> LegFrames:
-        """Return the frames of the legs' links. q: (..., 19), qd: (..., 18)."""
-        base_turn, base_pos, base_vel, base_ang = self._base(q, qd)
-        base_turn = base_turn.unsqueeze(-3)
+        """Return poses and velocities of the legs' links. q: (..., 19), qd: (..., 18)."""
+        base_rotation, base_pos, base_vel, base_ang = self._base(q, qd)
+        base_rotation = base_rotation.unsqueeze(-3)
         angle, rate = q[..., 7:].unflatten(-1, (4, 3)), qd[..., 6:].unflatten(-1, (4, 3))
-        arm = _apply(base_turn, self._hip.expand(*angle.shape))
+        arm = _apply(base_rotation, self._hip.expand(*angle.shape))
         pos, ang = base_pos.unsqueeze(-2) + arm, base_ang.unsqueeze(-2)
         vel = base_vel.unsqueeze(-2) + _cross(ang, arm)
-        turn = base_turn @ _about_x(angle[..., 0].cos(), self._side * angle[..., 0].sin())
-        ang = ang + base_turn[..., 0] * (self._side * rate[..., 0]).unsqueeze(-1)
-        local, ankle, way = self._planar(angle[..., 1:])
-        plane_vel, cosines, sines, rates = self._planar_rates(angle[..., 1:], rate[..., 1:], way)
-        arms = turn.unsqueeze(-3) @ local.unsqueeze(-1)
+        rotation = base_rotation @ _rotation_x(angle[..., 0].cos(), self._side * angle[..., 0].sin())
+        ang = ang + base_rotation[..., 0] * (self._side * rate[..., 0]).unsqueeze(-1)
+        local, ankle, shank_dir = self._planar(angle[..., 1:])
+        plane_vel, cosines, sines, rates = self._planar_rates(angle[..., 1:], rate[..., 1:], shank_dir)
+        arms = rotation.unsqueeze(-3) @ local.unsqueeze(-1)
         arms = arms.squeeze(-1)
-        moving = (turn.unsqueeze(-3) @ plane_vel.unsqueeze(-1)).squeeze(-1)
+        moving = (rotation.unsqueeze(-3) @ plane_vel.unsqueeze(-1)).squeeze(-1)
         return LegFrames(
             torch.cat([pos.unsqueeze(-2), pos.unsqueeze(-2) + arms], dim=-2),
-            torch.cat([turn.unsqueeze(-3), turn.unsqueeze(-3) @ _about_y(cosines, sines)], dim=-3),
+            torch.cat([rotation.unsqueeze(-3), rotation.unsqueeze(-3) @ _rotation_y(cosines, sines)], dim=-3),
             torch.cat(
                 [vel.unsqueeze(-2), vel.unsqueeze(-2) + _cross(ang.unsqueeze(-2), arms) + moving], dim=-2
             ),
             torch.cat(
-                [ang.unsqueeze(-2), ang.unsqueeze(-2) + turn[..., 1].unsqueeze(-2) * rates.unsqueeze(-1)], dim=-2
+                [ang.unsqueeze(-2), ang.unsqueeze(-2) + rotation[..., 1].unsqueeze(-2) * rates.unsqueeze(-1)], dim=-2
             ),
-            pos + _apply(turn, ankle),
+            pos + _apply(rotation, ankle),
         )  # fmt: skip
 
     def _planar(self, angle: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the five-bar in the housing frame, for (outer, inner) angles [rad] (..., 4, 2).
+        """Return positions of the five-bar in the housing frame, given outer and inner angles [rad] (..., 4, 2).
 
-        Origins (..., 4, 4, 3) [m] of outer thigh and shank and inner thigh and shank, the ankle (..., 4, 3) [m], and
+        Returned: origins (..., 4, 4, 3) [m] of outer and inner thigh and shank, ankles (..., 4, 3) [m], and
         unit vectors along the shanks (..., 4, 2, 2): outer and inner, x and z.
         """
         zero = torch.zeros_like(angle[..., 0])
@@ -157,29 +163,31 @@ class WholeBody:
         span_sq = (span_x**2 + span_z**2).clamp_min(1.0e-8)
         ratio = self._front * ((self._shank**2 - 0.25 * span_sq).clamp_min(1.0e-8) / span_sq).sqrt()
         ankle_x, ankle_z = knee_x.mean(-1) + ratio * span_z, knee_z.mean(-1) - ratio * span_x
-        way = torch.stack([(ankle_x[..., None] - knee_x) / shank, (ankle_z[..., None] - knee_z) / shank], dim=-1)
+        shank_dir = torch.stack([(ankle_x[..., None] - knee_x) / shank, (ankle_z[..., None] - knee_z) / shank], dim=-1)
         hip_y, knee_y = self._plane_y.expand_as(zero), (self._plane_y + self._knee_y).expand_as(zero)
         origins = []
         for side in (OUTER, INNER):
             origins.append(torch.stack([axis[:, side].expand_as(zero), hip_y, zero], dim=-1))
             origins.append(torch.stack([knee_x[..., side], knee_y, knee_z[..., side]], dim=-1))
-        return torch.stack(origins, dim=-2), torch.stack([ankle_x, knee_y, ankle_z], dim=-1), way
+        return torch.stack(origins, dim=-2), torch.stack([ankle_x, knee_y, ankle_z], dim=-1), shank_dir
 
-    def _planar_rates(self, angle: torch.Tensor, rate: torch.Tensor, way: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return velocities of the origins [m/s], and cosines, sines and rates [rad/s] of the links' turns about y.
+    def _planar_rates(
+        self, angle: torch.Tensor, rate: torch.Tensor, shank_dir: torch.Tensor
+    ) -> tuple[torch.Tensor, ...]:
+        """Return velocities of the origins [m/s], and cosines, sines and rates [rad/s] of the links' rotation about y.
 
-        angle, rate, way: (..., 4, 2), (..., 4, 2), (..., 4, 2, 2), see `_planar`. Returned: (..., 4, 4, 3) and three
-        times (..., 4, 4).
+        angle, rate: (..., 4, 2); shank_dir: (..., 4, 2, 2), see `_planar`. Returned: (..., 4, 4, 3), and (..., 4, 4)
+        three times.
         """
         sin, cos, thigh, shank = angle.sin(), angle.cos(), self._thigh[:, None], self._shank[:, None]
         knee_vx, knee_vz = self._flip * thigh * cos * rate, thigh * sin * rate
-        way_x, way_z = way.unbind(-1)
-        along = way_x * knee_vx + way_z * knee_vz
-        det = way_x[..., OUTER] * way_z[..., INNER] - way_z[..., OUTER] * way_x[..., INNER]
+        shank_x, shank_z = shank_dir.unbind(-1)
+        along = shank_x * knee_vx + shank_z * knee_vz
+        det = shank_x[..., OUTER] * shank_z[..., INNER] - shank_z[..., OUTER] * shank_x[..., INNER]
         det = torch.where(det.abs() < 1.0e-4, torch.where(det < 0.0, -1.0e-4, 1.0e-4), det)
-        ankle_vx = (along[..., OUTER] * way_z[..., INNER] - along[..., INNER] * way_z[..., OUTER]) / det
-        ankle_vz = (along[..., INNER] * way_x[..., OUTER] - along[..., OUTER] * way_x[..., INNER]) / det
-        shank_rate = (way_z * (ankle_vx[..., None] - knee_vx) - way_x * (ankle_vz[..., None] - knee_vz)) / shank
+        ankle_vx = (along[..., OUTER] * shank_z[..., INNER] - along[..., INNER] * shank_z[..., OUTER]) / det
+        ankle_vz = (along[..., INNER] * shank_x[..., OUTER] - along[..., OUTER] * shank_x[..., INNER]) / det
+        shank_rate = (shank_z * (ankle_vx[..., None] - knee_vx) - shank_x * (ankle_vz[..., None] - knee_vz)) / shank
         zero = torch.zeros_like(knee_vx[..., 0])
         rest = torch.stack([zero, zero, zero], dim=-1)
         outer, inner = (torch.stack([knee_vx[..., i], zero, knee_vz[..., i]], dim=-1) for i in (OUTER, INNER))
@@ -188,44 +196,49 @@ class WholeBody:
             return torch.stack([thighs, shanks], dim=-1).flatten(-2)
 
         return (
-            torch.stack([rest, outer, rest, inner], dim=-2), links(cos, -way_z), links(-self._flip * sin, -way_x),
+            torch.stack([rest, outer, rest, inner], dim=-2), links(cos, -shank_z), links(-self._flip * sin, -shank_x),
             links(-self._flip * rate, shank_rate),
         )  # fmt: skip
 
     def momentum(self, q: torch.Tensor, qd: torch.Tensor) -> Momentum:
-        """Return centre of mass and momenta of the whole robot. q: (..., 19), qd: (..., 18)."""
-        base_turn, base_pos, base_vel, base_ang = self._base(q, qd)
+        """Return centre of mass and momentum of the whole robot. q: (..., 19), qd: (..., 18)."""
+        base_rotation, base_pos, base_vel, base_ang = self._base(q, qd)
         legs = self.legs(q, qd)
 
-        def links(base: torch.Tensor, of_legs: torch.Tensor, axes: int) -> torch.Tensor:
+        def links(base: torch.Tensor, legs_part: torch.Tensor, axes: int) -> torch.Tensor:
             first = base.dim() - axes
-            return torch.cat([base.unsqueeze(first), of_legs.flatten(first, first + 1)], dim=first)
+            return torch.cat([base.unsqueeze(first), legs_part.flatten(first, first + 1)], dim=first)
 
-        turn = links(base_turn, legs.turn, 2)
+        rotation = links(base_rotation, legs.rotation, 2)
         pos, vel, ang = (
-            links(base, of_legs, 1)
-            for base, of_legs in ((base_pos, legs.pos), (base_vel, legs.vel), (base_ang, legs.ang))
+            links(base, legs_part, 1)
+            for base, legs_part in ((base_pos, legs.pos), (base_vel, legs.vel), (base_ang, legs.ang))
         )
         mass = self._mass[:, None]
-        first = _apply(turn, self._first.expand_as(pos))
-        second = turn @ self._second @ turn.transpose(-1, -2)
+        first = _apply(rotation, self._first.expand_as(pos))
+        second = rotation @ self._second @ rotation.transpose(-1, -2)
         com = (mass * pos + first).sum(-2) / self.mass
         com_vel = (mass * vel + _cross(ang, first)).sum(-2) / self.mass
         arm, moving = pos - com.unsqueeze(-2), vel - com_vel.unsqueeze(-2)
-        # moments about the centre of mass: of r r^T, r relative to it
+        # second moments about the centre of mass
         outer = mass[..., None] * arm.unsqueeze(-1) * arm.unsqueeze(-2) + second
         mixed = arm.unsqueeze(-1) * first.unsqueeze(-2)
         outer = outer + mixed + mixed.transpose(-1, -2)
-        own = _inertia(second)
-        spin = mass * _cross(arm, moving) + _cross(arm, _cross(ang, first)) + _cross(first, moving) + _apply(own, ang)
+        link_inertia = _inertia(second)
+        spin = (
+            mass * _cross(arm, moving)
+            + _cross(arm, _cross(ang, first))
+            + _cross(first, moving)
+            + _apply(link_inertia, ang)
+        )
         return Momentum(com, com_vel, spin.sum(-2), _inertia(outer.sum(-3)))
 
     def points(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return hips, transversal axes and knees of the legs, and their ankles. q: (..., 19).
+        """Return origins [m] of the legs' links, as `LegFrames.pos` (..., 4, 5, 3), and ankles [m] (..., 4, 3).
 
-        Origins as in `LegFrames.pos`, (..., 4, 5, 3), and (..., 4, 3), both [m].
+        q: (..., 19).
         """
-        turn = rotations(q[..., 3:7]).unsqueeze(-3)
+        rotation = rotation_matrices(q[..., 3:7]).unsqueeze(-3)
         angle = q[..., 7:].unflatten(-1, (4, 3))
         origins, ankle = self._planar(angle[..., 1:])[:2]
         local = torch.cat([torch.zeros_like(origins[..., :1, :]), origins, ankle.unsqueeze(-2)], dim=-2)
@@ -233,33 +246,35 @@ class WholeBody:
         x, y, z = local.unbind(-1)
         hip = self._hip[:, None]
         inside = torch.stack([x + hip[..., 0], cos * y - sin * z + hip[..., 1], sin * y + cos * z + hip[..., 2]], -1)
-        world = q[..., None, None, :3] + inside @ turn.transpose(-1, -2)
+        world = q[..., None, None, :3] + inside @ rotation.transpose(-1, -2)
         return world[..., :5, :], world[..., 5, :]
 
     def clearance(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the distances [m] of each leg's links, paw apart, from level ground, (..., 4, 4).
+        """Return the distances [m] of each leg's links without paw from level ground, (..., 4, 4).
 
-        The last axis: housing, thighs, knees, shanks, the least of the points of `jumper_warp.kernels.collision.robot`.
+        Last axis: housing, thighs, knees, shanks; each the minimum over `jumper_warp.kernels.collision.robot`.
         """
         pos, ankle = self.points(q)
         return self.clearance_of(q, pos, ankle)
 
     def clearance_of(self, q: torch.Tensor, pos: torch.Tensor, ankle: torch.Tensor) -> torch.Tensor:
-        """Return the same, given what `points` returns."""
+        """Return `clearance`, given the result of `points`."""
         height, ankle = pos[..., 2], ankle[..., 2]
-        tip = height[..., 0] + rotations(q[..., 3:7])[..., 2, 0, None] * self._front * float(HOUSING_LENGTH)
+        tip = height[..., 0] + rotation_matrices(q[..., 3:7])[..., 2, 0, None] * self._front * float(HOUSING_LENGTH)
         axes, knees = height[..., 1::2], height[..., 2::2]
-        lowest = knees + float(SHANK_FREE) * (ankle[..., None] - knees)  # of a straight link an end is lowest
-        found = (
+        lowest = knees + float(SHANK_FREE) * (
+            ankle[..., None] - knees
+        )  # one end of a straight link is the lowest point
+        distances = (
             torch.minimum(height[..., 0], tip) - float(HOUSING_RADIUS),
             torch.minimum(axes, 0.5 * (axes + knees)).amin(-1) - float(THIGH_RADIUS),
             knees.amin(-1) - float(THIGH_RADIUS),
             torch.minimum(knees, lowest).amin(-1) - float(SHANK_RADIUS),
         )
-        return torch.stack(found, dim=-1)
+        return torch.stack(distances, dim=-1)
 
 
 def _inertia(second: torch.Tensor) -> torch.Tensor:
-    """Return inertias of second moments, (..., 3, 3)."""
+    """Return inertias (..., 3, 3) of second moments (..., 3, 3)."""
     trace = second.diagonal(dim1=-2, dim2=-1).sum(-1)
     return trace[..., None, None] * torch.eye(3, dtype=second.dtype, device=second.device) - second

@@ -1,4 +1,4 @@
-"""The C library's allocator: memory that is given back to the system has to be made again, page by page."""
+"""Settings of glibc's allocator that keep freed memory, which avoids page faults on the next allocation."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import ctypes
 
 TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
 """Options of glibc's mallopt (malloc.h)."""
-KEPT, LARGEST = 1 << 30, 32 << 20
-"""[B] What may stay free at the end of the heap, and the largest block from there; glibc allows no larger."""
+MAX_FREE, MAX_HEAP_BLOCK = 1 << 30, 32 << 20
+"""[B] Free memory kept at the top of the heap, and the largest block allocated from the heap (glibc's maximum)."""
 
 
 def keep_freed_memory() -> bool:
-    """Let this process keep up to 1 GiB of what it has freed; return whether the C library could be told.
+    """Let this process keep up to 1 GiB of freed memory; return whether glibc accepted the settings.
 
-    Without it every temporary array of a minibatch may cost as many page faults as it has pages.
+    Otherwise every temporary array of a minibatch may cost one page fault per page.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt
     except (AttributeError, OSError):  # not glibc
         return False
-    return mallopt(TRIM_THRESHOLD, KEPT) == 1 and mallopt(MMAP_THRESHOLD, LARGEST) == 1
+    return mallopt(TRIM_THRESHOLD, MAX_FREE) == 1 and mallopt(MMAP_THRESHOLD, MAX_HEAP_BLOCK) == 1

@@ -1,4 +1,4 @@
-"""Refusals of numbers that no setting can have, each in one line."""
+"""Range checks of settings; each raises InputError with a one-line message."""
 
 from __future__ import annotations
 
@@ -10,62 +10,63 @@ import numpy as np
 from jumper_warp.utils.errors import InputError
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}")
-"""Of tasks, terms, observation columns and joints: lists of them are joined by commas, and they name files."""
+"""Valid names of tasks, terms, observation columns and joints, for comma-separated lists and file names."""
 FLOAT32_MAX = 3.4028234e38
-"""Beyond it, single precision is infinite, which all settings become on their way to a device."""
+"""Largest finite float32; settings are converted to float32 on a device."""
 MOST_SEED = 2**31 - 1
-"""Of the kernels' draws."""
+"""Largest seed of the kernels' random streams."""
 LAST_OF_PREVIOUS_VERSION = "05fa856"
-"""The last commit that reads policies, tasks and runs of the previous version."""
+"""Last commit that reads policies, tasks and runs of the previous version."""
 
 
 def check_finite(name: str, *values: float) -> None:
-    """Raises ValueError: one of the values is NaN, infinite, or so in single precision."""
+    """Raise ValueError if a value is NaN or infinite in float32."""
     for value in values:
         if not abs(value) <= FLOAT32_MAX:
             raise InputError(f"{name} must be finite, got {value}")
 
 
 def check_positive(name: str, *values: float) -> None:
-    """Raises ValueError: one of the values is not above 0, or not finite."""
+    """Raise ValueError unless all values are positive and finite."""
     for value in values:
         if not 0.0 < value <= FLOAT32_MAX:
             raise InputError(f"{name} must be positive and finite, got {value}")
 
 
 def check_not_negative(name: str, *values: float) -> None:
-    """Raises ValueError: one of the values is below 0, or not finite."""
+    """Raise ValueError unless all values are non-negative and finite."""
     for value in values:
         if not 0.0 <= value <= FLOAT32_MAX:
             raise InputError(f"{name} must be finite and not negative, got {value}")
 
 
 def check_within(name: str, values: np.ndarray, bounds: tuple[float, float]) -> None:
-    """Raises ValueError: one of the values is not within the bounds, or NaN."""
+    """Raise ValueError if an entry of an array is outside (lower, upper) bounds, or NaN."""
     outside = ~((values >= bounds[0]) & (values <= bounds[1]))
     if outside.any():
         raise InputError(f"{name} must be in [{bounds[0]:g}, {bounds[1]:g}], got {values[outside][0]:g}")
 
 
 def check_probabilities(what: str, cfg: Any, *names: str) -> None:
-    """Raises ValueError: one of these fields of a configuration is not in 0 to 1."""
+    """Raise ValueError unless these fields of a configuration are in [0, 1]; what: its name, for the message."""
     for name in names:
         if not 0.0 <= (value := getattr(cfg, name)) <= 1.0:
             raise InputError(f"{what} {name} must be in [0, 1], got {value}")
 
 
 def check_count(name: str, value: Any) -> None:
-    """Raises ValueError: the value is no whole number of at least 1."""
+    """Raise ValueError unless the value is an integer of at least 1."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
         raise InputError(f"{name} must be a whole number of at least 1, got {value!r:.40}")
 
 
 def check_seed(value: Any) -> None:
-    """Raises ValueError: the value is no whole number that the kernels' draws take as a seed."""
+    """Raise ValueError unless the value is an integer from 0 to MOST_SEED."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value <= MOST_SEED:
         raise InputError(f"seed must be in 0 .. {MOST_SEED}, got {value!r:.40}")
 
 
-def version_refusal(found: str, known: int) -> str:
-    """Return why a file of another version is refused, and which commit reads the previous version."""
-    return f"has version {found}, this is version {known}; commit {LAST_OF_PREVIOUS_VERSION} reads version {known - 1}"
+def version_error(version: str, known: int) -> str:
+    """Return the error message for a file of another version than `known`, with the commit that reads `known - 1`."""
+    previous = f"commit {LAST_OF_PREVIOUS_VERSION} reads version {known - 1}"
+    return f"has version {version}, this is version {known}; {previous}"

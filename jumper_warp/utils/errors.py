@@ -1,10 +1,10 @@
-"""The base of every error that is this project's word on what it was given."""
+"""Base class of errors in user input."""
 
 
 class InputError(ValueError):
-    """Something that was given cannot be used. The message is one line: what was expected, and what came.
+    """Invalid input; the message is one line with the expected and the actual value.
 
-    Commands and experiments print it and exit; any other exception is a fault and keeps its traceback.
+    Commands and experiments print it and exit with code 2; any other exception propagates with its traceback.
     """
 
     def __init__(self, message: str) -> None:

@@ -1,4 +1,4 @@
-"""Files that are written whole."""
+"""Atomic file writes."""
 
 import json
 import os
@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 
-def write_whole(path: Path, data: bytes) -> None:
-    """Write a file so that whoever looks finds either the old content or the new, also after a power cut.
+def write_atomically(path: Path, data: bytes) -> None:
+    """Write a file atomically: readers see either the old or the new content, also after a power failure.
 
-    Raises OSError: the disk is full or the folder cannot be written; `filename` is the path.
+    Raises OSError: the disk is full or the folder cannot be written; its `filename` is the path.
     """
     part = path.with_name(path.name + ".part")
     try:
@@ -32,5 +32,5 @@ def write_whole(path: Path, data: bytes) -> None:
 
 
 def json_bytes(content: Mapping[str, Any]) -> bytes:
-    """Return a JSON file's content. Raises ValueError: a number is not finite, which JSON cannot hold."""
+    """Return an object as the bytes of a JSON file. Raises ValueError: a number is not finite."""
     return (json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()

@@ -1,4 +1,4 @@
-"""Types of Warp functions and kernels, and compilation of kernels side by side."""
+"""Types of Warp functions and kernels, and parallel compilation of kernels."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
-from jumper_warp.utils.threads import available_threads, run_side_by_side
+from jumper_warp.utils.threads import available_threads, run_in_parallel
 
 if TYPE_CHECKING:  # Warp annotates its decorators as if they returned the decorated function
     Function = wp.Function | Callable[..., Any]
@@ -20,15 +20,15 @@ else:
 
 
 def records(structs: wp.array) -> NDArray[np.void]:
-    """Return an array of structs as NumPy records (waits for the device)."""
+    """Return an array of structs as a NumPy record array; synchronises with the device."""
     return cast("NDArray[np.void]", structs.numpy())
 
 
 def load_kernels(kernels: Iterable[tuple[Kernel, int]], device: wp.Device) -> None:
-    """Compile, or read from Warp's cache on disk, the modules of kernels that are launched with these block sizes.
+    """Compile the modules of kernels in parallel, or load them from Warp's cache on disk.
 
-    Raises what the compiler raises.
+    kernels: with their block sizes at launch. Compiler errors propagate.
     """
     variants = {(kernel.module, block if device.is_cuda else None): None for kernel, block in kernels}
     loads = [partial(wp.force_load, device, [module], block, 0) for module, block in variants]
-    run_side_by_side(loads, available_threads())
+    run_in_parallel(loads, available_threads())

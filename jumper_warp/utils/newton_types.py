@@ -1,6 +1,6 @@
-"""Newton's model, state and control of a built robot for a type checker: the arrays that Newton calls optional exist.
+"""Newton's Model, State and Control with arrays that are not optional, for type checkers.
 
-At run time they are Newton's own classes.
+At run time they are Newton's classes.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     import warp as wp
 
     class State(newton.State):
-        """A state of bodies and joints."""
+        """State of bodies and joints."""
 
         joint_q: wp.array
         joint_qd: wp.array
@@ -24,12 +24,12 @@ if TYPE_CHECKING:
         body_f: wp.array
 
     class Control(newton.Control):
-        """Controls of joints."""
+        """Control inputs of joints."""
 
         joint_f: wp.array
 
     class Model(newton.Model):
-        """A finalized model of bodies, joints and shapes."""
+        """Finalized model of bodies, joints and shapes."""
 
         body_com: wp.array
         body_inertia: wp.array

@@ -1,4 +1,4 @@
-"""The input of a policy's network."""
+"""Normalisation of a policy's observations."""
 
 from __future__ import annotations
 
@@ -6,5 +6,5 @@ import torch
 
 
 def normalise(obs: torch.Tensor, mean: torch.Tensor, std: torch.Tensor, limit: float) -> torch.Tensor:
-    """Return observations (..., n) in standard deviations from the mean, within plus and minus a limit."""
+    """Return observations (..., n) as standard deviations from the mean, clamped to ± limit; mean, std: (n,)."""
     return ((obs - mean) / std).clamp(-limit, limit)

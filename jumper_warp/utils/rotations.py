@@ -4,32 +4,32 @@ from __future__ import annotations
 
 import numpy as np
 
-INVERSE = np.array([-1.0, -1.0, -1.0, 1.0])
-"""Signs of the inverse of a quaternion."""
+CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
+"""Signs of the conjugate of a quaternion xyzw, the inverse of a unit quaternion."""
 
 
 def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """Return vectors (..., 3) turned by quaternions xyzw (..., 4)."""
+    """Return vectors (..., 3) rotated by quaternions xyzw (..., 4)."""
     axis, w = quaternion[..., :3], quaternion[..., 3:]
     return vector + 2.0 * np.cross(axis, np.cross(axis, vector) + w * vector)
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the product of quaternions xyzw (..., 4)."""
+    """Return the product a b of quaternions xyzw (..., 4): the rotation b, then a."""
     vector = a[..., 3:] * b[..., :3] + b[..., 3:] * a[..., :3] + np.cross(a[..., :3], b[..., :3])
     scalar = a[..., 3:] * b[..., 3:] - np.sum(a[..., :3] * b[..., :3], axis=-1, keepdims=True)
     return np.concatenate([vector, scalar], axis=-1)
 
 
-def from_vector(vector: np.ndarray) -> np.ndarray:
+def from_rotation_vector(vector: np.ndarray) -> np.ndarray:
     """Return the quaternions xyzw (..., 4) of rotation vectors (..., 3) [rad]."""
     angle = np.linalg.norm(vector, axis=-1, keepdims=True)
     return np.concatenate([0.5 * np.sinc(0.5 * angle / np.pi) * vector, np.cos(0.5 * angle)], axis=-1)
 
 
-def to_vector(quaternion: np.ndarray) -> np.ndarray:
-    """Return the rotation vectors (..., 3) [rad] of quaternions xyzw (..., 4), at most half a turn."""
+def to_rotation_vector(quaternion: np.ndarray) -> np.ndarray:
+    """Return the rotation vectors (..., 3) [rad] of quaternions xyzw (..., 4), of length at most π."""
     quaternion = quaternion * np.where(quaternion[..., 3:] < 0.0, -1.0, 1.0)
-    size = np.linalg.norm(quaternion[..., :3], axis=-1, keepdims=True)
-    angle = 2.0 * np.arctan2(size, quaternion[..., 3:])
-    return quaternion[..., :3] * np.where(size > 1.0e-12, angle / np.maximum(size, 1.0e-12), 2.0)
+    sine = np.linalg.norm(quaternion[..., :3], axis=-1, keepdims=True)
+    angle = 2.0 * np.arctan2(sine, quaternion[..., 3:])
+    return quaternion[..., :3] * np.where(sine > 1.0e-12, angle / np.maximum(sine, 1.0e-12), 2.0)

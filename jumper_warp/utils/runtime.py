@@ -1,4 +1,4 @@
-"""What a result was made with: device, driver, package versions and commit."""
+"""Device, package versions and commit of a run."""
 
 import functools
 import subprocess
@@ -14,45 +14,38 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import checked_threads, set_threads
 
 PACKAGES = ("jumper-warp", "warp-lang", "newton", "mujoco", "mujoco-warp", "torch", "numpy", "rsl-rl-lib")
-"""Distributions whose version can change a figure."""
+"""Distributions whose version can change a result."""
 
 
 class Commit(NamedTuple):
-    """State of the source tree."""
+    """Commit and state of a source tree."""
 
-    hash: str
-    """Full hash of the checked-out commit."""
-    dirty: bool
-    """Whether tracked files differ from that commit or untracked files lie beside them."""
+    hash: str  # full hash of the checked-out commit
+    dirty: bool  # whether there are modified or untracked files
 
 
 class DeviceInfo(NamedTuple):
-    """What Warp computes on."""
+    """Properties of a Warp device."""
 
-    alias: str
-    """Warp's name of the device, for example `cpu` or `cuda:0`."""
-    name: str
-    """The maker's name of the processor."""
-    driver: str | None
-    """CUDA version that the driver supports; None on a CPU."""
-    mempool: bool
-    """Whether device memory comes from a stream-ordered pool, which captured graphs need to allocate."""
-    graphs: bool
-    """Whether a step that allocates memory can be captured as a graph."""
+    alias: str  # warp's name of the device, for example `cpu` or `cuda:0`
+    name: str  # product name of the processor
+    driver: str | None  # CUDA version that the driver supports; None on a CPU
+    mempool: bool  # whether device memory comes from a stream-ordered pool, which captured graphs need to allocate
+    graphs: bool  # whether a step that allocates memory can be captured as a graph
 
 
 def device_info(device: wp.DeviceLike = None) -> DeviceInfo:
-    """Return the facts about a Warp device; None is the current one."""
-    found = wp.get_device(device)
-    if not found.is_cuda:
-        return DeviceInfo(found.alias, found.name, driver=None, mempool=False, graphs=True)
+    """Return the properties of a Warp device (default: the current one)."""
+    resolved = wp.get_device(device)
+    if not resolved.is_cuda:
+        return DeviceInfo(resolved.alias, resolved.name, driver=None, mempool=False, graphs=True)
     driver = ".".join(map(str, wp.get_cuda_driver_version() or ()))
-    pooled = wp.is_mempool_enabled(found)
-    return DeviceInfo(found.alias, found.name, driver=driver, mempool=pooled, graphs=pooled)
+    mempool = wp.is_mempool_enabled(resolved)
+    return DeviceInfo(resolved.alias, resolved.name, driver=driver, mempool=mempool, graphs=mempool)
 
 
 def report_device(device: wp.DeviceLike = None, console: Console | None = None) -> DeviceInfo:
-    """Print one line on the device to standard error, and return the same facts."""
+    """Print one line about the device to standard error, and return its properties."""
     info = device_info(device)
     parts = [f"device {info.alias} ({info.name})"]
     if info.driver is None:
@@ -61,18 +54,18 @@ def report_device(device: wp.DeviceLike = None, console: Console | None = None) 
     else:
         parts += [f"driver for CUDA {info.driver}", f"mempool {'on' if info.mempool else 'OFF'}"]
     parts.append(f"graph capture {'on' if info.graphs else 'OFF: each kernel is launched on its own'}")
-    good = info.driver is not None and info.graphs
+    style = "green" if info.driver is not None and info.graphs else "yellow"
     console = console or Console(stderr=True)
-    console.print(", ".join(parts), style="green" if good else "yellow", markup=False, highlight=False, soft_wrap=True)
+    console.print(", ".join(parts), style=style, markup=False, highlight=False, soft_wrap=True)
     return info
 
 
-def announce(device: str | None, threads: int | None = None) -> DeviceInfo:
-    """Print a line on the device that is going to be used, and silence Warp's notes on its modules.
+def configure_device(device: str | None, threads: int | None = None) -> DeviceInfo:
+    """Set the number of threads, silence Warp's module messages, and print and return the device's properties.
 
-    threads: of a CPU, for all simulations that are made from now on, as in `set_threads`.
+    device: a Warp device (default: the current one). threads: CPU threads of simulations, as in `set_threads`.
 
-    Raises InputError: there is no such device, or no such number of threads.
+    Raises InputError: there is no such device, or the number of threads is invalid.
     """
     set_threads(threads)
     wp.config.log_level = wp.LOG_WARNING
@@ -83,30 +76,30 @@ def announce(device: str | None, threads: int | None = None) -> DeviceInfo:
 
 
 def git_commit(folder: Path | None = None) -> Commit | None:
-    """Return the commit of the source tree in `folder` (default: this package's, as it was when first asked for).
+    """Return the commit of the source tree in `folder` (default: this package's, cached at the first call).
 
-    None without git, outside a git tree, in a tree without commits, and where the enclosing tree does not track
-    the folder, as for a package installed inside another project.
+    None without git, outside a git tree, in a tree without commits, and if the enclosing tree does not track the
+    folder, as for a package installed inside another project.
     """
     if folder is None:
-        return _own_commit()
+        return _package_commit()
     commit = _git(folder, "rev-parse", "--verify", "HEAD") if _git(folder, "ls-files") else None
     return Commit(commit.strip(), bool(_git(folder, "status", "--porcelain", "--", ":/"))) if commit else None
 
 
 @functools.cache
-def _own_commit() -> Commit | None:
-    """Return the commit of this package's source tree; what has been imported from it stays the same."""
+def _package_commit() -> Commit | None:
+    """Return the commit of this package's source tree; cached, since imported modules do not change either."""
     return git_commit(Path(__file__).parent)
 
 
 def _git(folder: Path, *arguments: str) -> str | None:
-    """Return what git prints for the tree in `folder`, or None if it fails or is not installed."""
+    """Return git's standard output for the tree in `folder`, or None if it fails or is not installed."""
     try:
-        answer = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=30)
+        result = subprocess.run(["git", "-C", str(folder), *arguments], capture_output=True, text=True, timeout=30)
     except (OSError, subprocess.TimeoutExpired):
         return None
-    return answer.stdout if answer.returncode == 0 else None
+    return result.stdout if result.returncode == 0 else None
 
 
 def source_versions() -> dict[str, Any]:
@@ -117,10 +110,10 @@ def source_versions() -> dict[str, Any]:
 
 def versions() -> dict[str, str | None]:
     """Return the version of Python and of each of `PACKAGES`; None for one that is not installed."""
-    found: dict[str, str | None] = {"python": python_version()}
+    by_package: dict[str, str | None] = {"python": python_version()}
     for package in PACKAGES:
         try:
-            found[package] = metadata.version(package)
+            by_package[package] = metadata.version(package)
         except metadata.PackageNotFoundError:
-            found[package] = None
-    return found
+            by_package[package] = None
+    return by_package

@@ -1,4 +1,4 @@
-"""Files of a user that a run depends on, by what they held."""
+"""Checksums of user files that a run depends on."""
 
 from __future__ import annotations
 
@@ -8,36 +8,38 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-OWN = "jumper_warp."
-"""Beginning of the names of the project's modules; the commit identifies their content."""
+PROJECT_PREFIX = "jumper_warp."
+"""Prefix of the project's modules, whose content the commit identifies."""
 
 
-def source_sums(saved: Any) -> dict[str, str]:
-    """Return the SHA-256 of each file outside the project that has a function which `module:name` in `saved` names.
+def source_checksums(saved: Any) -> dict[str, str]:
+    """Return the SHA-256 by module of the files outside the project that `saved` refers to as `module:name`.
 
-    By module; saved: nested dicts and lists, such as a task as JSON. Modules that are not loaded, or have no file that
-    can be read, are left out.
+    saved: nested dicts and lists, such as a task as JSON. Modules that are not loaded or have no file are left out.
     """
-    sums = {}
+    checksums = {}
     for module in sorted(set(_modules(saved))):
         file = getattr(sys.modules.get(module), "__file__", None)
-        if file and not module.startswith(OWN) and Path(file).is_file():
-            sums[module] = hashlib.sha256(Path(file).read_bytes()).hexdigest()
-    return sums
+        if file and not module.startswith(PROJECT_PREFIX) and Path(file).is_file():
+            checksums[module] = hashlib.sha256(Path(file).read_bytes()).hexdigest()
+    return checksums
 
 
 def changed_sources(old: Any, new: dict[str, str]) -> list[str]:
-    """Return a line on each module whose file is not what it was; old: as `source_sums` gave it, or anything."""
-    before = old if isinstance(old, dict) else {}
+    """Return a message for each module whose checksum changed.
+
+    old, new: results of `source_checksums`; if `old` is not a dict, or lacks a module, nothing is reported for it.
+    """
+    saved = old if isinstance(old, dict) else {}
     return [
-        f"{module} has changed since: its functions are those of now, settings those of the run"
-        for module, held in new.items()
-        if before.get(module, held) != held
+        f"{module} has changed since: its present functions are used, with the run's settings"
+        for module, checksum in new.items()
+        if saved.get(module, checksum) != checksum
     ]
 
 
 def _modules(saved: Any) -> Iterator[str]:
-    """Yield what comes before the colon of each string."""
+    """Yield the part before the colon of each string with a colon in nested dicts and lists."""
     if isinstance(saved, str):
         module, colon, _ = saved.partition(":")
         if colon:

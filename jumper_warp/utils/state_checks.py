@@ -1,4 +1,4 @@
-"""Refusals of a saved state, each in one line that names the part."""
+"""Checks of a saved state; each raises InputError with a one-line message that names the part."""
 
 from __future__ import annotations
 
@@ -11,34 +11,35 @@ import torch
 from jumper_warp.utils.errors import InputError
 
 
-def check_parts(found: Any, names: Iterable[Any], where: str) -> None:
-    """Raises ValueError: `found` is no dictionary with exactly these keys."""
-    if not isinstance(found, dict):
-        raise InputError(f"{where} must be a dictionary, got {type(found).__name__}")
+def check_parts(value: Any, names: Iterable[Any], where: str) -> None:
+    """Raise ValueError unless `value` is a dictionary with exactly these keys; where: its name in messages."""
+    if not isinstance(value, dict):
+        raise InputError(f"{where} must be a dictionary, got {type(value).__name__}")
     names = set(names)
-    lacking, besides = sorted(map(str, names - found.keys())), sorted(map(str, found.keys() - names))
-    if lacking or besides:
-        raise InputError(f"{where} lacks {_named(lacking)}, has {_named(besides)} besides")
+    missing, unknown = sorted(map(str, names - value.keys())), sorted(map(str, value.keys() - names))
+    if missing or unknown:
+        raise InputError(f"{where} lacks {_listed(missing)}, has {_listed(unknown)} besides")
 
 
-def _named(names: list[str]) -> str:
+def _listed(names: list[str]) -> str:
+    """Return up to three names as text."""
     shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
     return shown or "nothing"
 
 
-def check_tensor(found: Any, like: torch.Tensor, where: str, dtypes: Iterable[torch.dtype] = ()) -> None:
-    """Raises ValueError: `found` is no dense tensor of the shape and type of `like`, or of one of `dtypes` instead."""
-    if not isinstance(found, torch.Tensor) or found.layout != torch.strided:
-        raise InputError(f"{where} must be a tensor, got {type(found).__name__}")
-    if found.shape != like.shape:
-        raise InputError(f"{where} has shape {tuple(found.shape)}, expected {tuple(like.shape)}")
-    if found.dtype not in (like.dtype, *dtypes):
-        raise InputError(f"{where} has type {found.dtype}, expected {like.dtype}")
+def check_tensor(value: Any, like: torch.Tensor, where: str, dtypes: Iterable[torch.dtype] = ()) -> None:
+    """Raise ValueError unless `value` is a dense tensor with the shape of `like`, and its dtype or one of `dtypes`."""
+    if not isinstance(value, torch.Tensor) or value.layout != torch.strided:
+        raise InputError(f"{where} must be a tensor, got {type(value).__name__}")
+    if value.shape != like.shape:
+        raise InputError(f"{where} has shape {tuple(value.shape)}, expected {tuple(like.shape)}")
+    if value.dtype not in (like.dtype, *dtypes):
+        raise InputError(f"{where} has type {value.dtype}, expected {like.dtype}")
 
 
-def check_values(found: torch.Tensor, where: str, least: float = -math.inf) -> None:
-    """Raises ValueError: a number of a tensor is not finite or below `least`."""
-    if not bool(found.isfinite().all()):
+def check_values(value: torch.Tensor, where: str, minimum: float = -math.inf) -> None:
+    """Raise ValueError unless all entries of a tensor are finite and at minimum `minimum`."""
+    if not bool(value.isfinite().all()):
         raise InputError(f"{where} is not finite")
-    if not bool((found >= least).all()):
-        raise InputError(f"{where} must not be below {least:g}, got {found.min().item():g}")
+    if not bool((value >= minimum).all()):
+        raise InputError(f"{where} must not be below {minimum:g}, got {value.min().item():g}")

@@ -1,4 +1,4 @@
-"""How many threads the CPU's worlds are shared out to, and jobs that run side by side."""
+"""Number of CPU threads of simulations, and a pool of worker threads for parallel jobs."""
 
 from __future__ import annotations
 
@@ -9,69 +9,68 @@ from threading import Thread
 
 from jumper_warp.utils.errors import InputError
 
-_chosen: int | None = None
-_helpers: list[Thread] = []
-_asked: SimpleQueue[Callable[[], None]] = SimpleQueue()
-"""Work for them; a plain queue wakes a thread four times as fast as an executor."""
+_default_threads: int | None = None
+_workers: list[Thread] = []
+_jobs: SimpleQueue[Callable[[], None]] = SimpleQueue()
+"""Jobs for the workers; a plain queue wakes a thread four times as fast as an executor."""
 
 
 def available_threads() -> int:
-    """Return the CPU cores that this process may use; processes of one torchrun on one machine share them."""
+    """Return the number of CPU cores for this process, an equal part of them under torchrun."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, cores // max(1, int(os.environ.get("LOCAL_WORLD_SIZE", "1"))))
 
 
 def checked_threads(threads: int | None) -> int:
-    """Return a number of threads; None is what `set_threads` chose. Raises ValueError: no whole number above 0."""
+    """Return a valid number of threads; None: the default of `set_threads`. Raises ValueError: not positive."""
     if threads is None:
-        return available_threads() if _chosen is None else _chosen
+        return available_threads() if _default_threads is None else _default_threads
     if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
         raise InputError(f"threads must be a whole number of at least 1, got {threads!r:.60}")
     return threads
 
 
 def set_threads(threads: int | None) -> None:
-    """Choose the threads of all simulations that are made from now on; None: `available_threads`.
+    """Set the default number of threads of new simulations; None: `available_threads`.
 
     Raises ValueError as `checked_threads`.
     """
-    global _chosen
-    _chosen = None if threads is None else checked_threads(threads)
+    global _default_threads
+    _default_threads = None if threads is None else checked_threads(threads)
 
 
-def run_side_by_side(jobs: Iterable[Callable[[], object]], threads: int) -> None:
-    """Run jobs on so many threads, of which the caller's is one, and return when all have ended.
+def run_in_parallel(jobs: Iterable[Callable[[], object]], threads: int) -> None:
+    """Run jobs on `threads` threads, the caller's included, and return when all have finished.
 
-    Raises what one of them raised; jobs that no thread has begun by then are left out.
+    If a job raises, jobs that have not started are skipped, and its exception is raised here.
     """
     jobs = list(jobs)
-    helpers = min(threads, len(jobs)) - 1
-    left, ended = iter(jobs), SimpleQueue()
+    workers = min(threads, len(jobs)) - 1
+    remaining, errors = iter(jobs), SimpleQueue()
 
     def work() -> None:
         error = None
         try:
-            for job in left:
+            for job in remaining:
                 job()
-        except BaseException as raised:  # of any kind: the caller waits for all, and raises it
+        except BaseException as raised:  # the caller waits for all threads, and raises it
             error = raised
-            for _ in left:  # nothing more is begun
+            for _ in remaining:  # skip the rest
                 pass
-        ended.put(error)
+        errors.put(error)
 
-    while len(_helpers) < helpers:
-        _helpers.append(Thread(target=_help, name=f"worlds_{len(_helpers)}", daemon=True))
-        _helpers[-1].start()
-    for _ in range(helpers):
-        _asked.put(work)
+    while len(_workers) < workers:
+        _workers.append(Thread(target=_run_jobs, name=f"worlds_{len(_workers)}", daemon=True))
+        _workers[-1].start()
+    for _ in range(workers):
+        _jobs.put(work)
     work()
-    errors = [ended.get() for _ in range(helpers + 1)]
-    for error in errors:
+    for error in [errors.get() for _ in range(workers + 1)]:
         if error is not None:
             raise error
 
 
-def _help() -> None:
-    """Do what is asked for, for ever."""
+def _run_jobs() -> None:
+    """Run jobs from the queue, for ever."""
     while True:
-        _asked.get()()
+        _jobs.get()()

@@ -20,7 +20,7 @@ MARK_COLOR = (0.85, 0.15, 0.15)
 BLOCK_COLOR = (0.55, 0.45, 0.35)
 
 
-def with_marks(recording: Recording, places: np.ndarray) -> Recording:
+def with_goal_markers(recording: Recording, places: np.ndarray) -> Recording:
     """Return the recording with a disc at each place, (recorded worlds, places a world, 3) [m], that is a number."""
     angle = np.linspace(0.0, 2.0 * math.pi, MARK_CORNERS, endpoint=False)
     rim = MARK_RADIUS * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)

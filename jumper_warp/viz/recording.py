@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.files import write_atomically
 from jumper_warp.viz.shapes import ShapeMesh
 
 FORMAT = "jumper-warp recording"
@@ -76,7 +76,7 @@ class Recording:
             arrays |= {f"shape{index}_{part}": getattr(shape, part) for part in SURFACE}
         data = io.BytesIO()
         np.savez_compressed(data, **arrays)
-        write_whole(Path(path), data.getvalue())
+        write_atomically(Path(path), data.getvalue())
         return Path(path)
 
 

@@ -1,4 +1,4 @@
-"""The motor command filter (paper, Section III): position targets give way to the limits as these come near.
+"""The motor command filter (paper, Section III): position targets are limited near the joint limits.
 
 A quantity x (a motor angle, or the sum of a leg's two transversal angles) has limits [lower, upper]. With margins
 m_u = upper - x and m_l = x - lower, and the speed floor v_0, the time to violation is
@@ -66,17 +66,17 @@ def limit_weight(command: real, pos: real, vel: real, limits: Limits, horizon: r
 
 @wp.func
 def limit_command(command: real, pos: real, vel: real, limits: Limits, horizon: real, speed_floor: real) -> real:
-    """Return the safe command [rad] for a quantity at `pos` [rad] that moves at `vel` [rad/s]."""
+    """Return the filtered command [rad] for a quantity at `pos` [rad] that moves at `vel` [rad/s]."""
     weight = limit_weight(command, pos, vel, limits, horizon, speed_floor)
     return command + weight * (wp.clamp(command, limits.lower, limits.upper) - command)
 
 
 @wp.func
 def filter_leg(target: vec3, pos: vec3, vel: vec3, params: FilterParams) -> vec3:
-    """Return the safe targets [rad] of one leg. All vectors: (lateral, outer, inner), [rad] and [rad/s].
+    """Return the filtered targets [rad] of one leg. All vectors: (lateral, outer, inner), [rad] and [rad/s].
 
     The single motors' limits come first. The limits of the transversal sum then act on the sum of what is left, and
-    both transversal commands give way by half of what they must.
+    each transversal command takes half of the correction.
     """
     t, h, v = params.transversal, params.horizon, params.speed_floor
     lateral = limit_command(wp.clamp(target[0], -COMMAND_BOUND, COMMAND_BOUND), pos[0], vel[0], params.lateral, h, v)
@@ -103,8 +103,8 @@ def command_filter_kernel(
 ):
     """Filter the motor targets of every leg. Launch over (4, worlds from `first` on).
 
-    raw_target, safe_target [rad]: (12, num_worlds). joint_q, joint_qd: flat over worlds, laid out as Newton's.
-    offset [rad]: what each position sensor reads above the true angle, (12, num_worlds); the filter sees what it reads.
+    raw_target, filtered_target [rad]: (12, num_worlds). joint_q, joint_qd: flat over worlds, laid out as Newton's.
+    offset [rad]: added by each position sensor to the true angle, (12, num_worlds); the filter uses the reading.
     """
     leg, world = wp.tid()
     world += first
@@ -112,12 +112,12 @@ def command_filter_kernel(
     coord = coords_per_world * world + 7 + 5 * leg
     dof = dofs_per_world * world + 6 + 5 * leg
     error = vec3(offset[lateral, world], offset[outer, world], offset[inner, world])
-    safe = filter_leg(
+    filtered = filter_leg(
         vec3(raw_target[lateral, world], raw_target[outer, world], raw_target[inner, world]),
         vec3(joint_q[coord], joint_q[coord + 1], joint_q[coord + 3]) + error,
         vec3(joint_qd[dof], joint_qd[dof + 1], joint_qd[dof + 3]),
         params,
     )
-    filtered_target[lateral, world] = safe[0]
-    filtered_target[outer, world] = safe[1]
-    filtered_target[inner, world] = safe[2]
+    filtered_target[lateral, world] = filtered[0]
+    filtered_target[outer, world] = filtered[1]
+    filtered_target[inner, world] = filtered[2]

@@ -8,7 +8,7 @@ import warp as wp
 
 from ..kinematics.five_bar import FiveBar
 from ..scalar import mat33, real, vec3
-from .stops import StopRows, stop_forces
+from .stops import StopRates, stop_forces
 
 # below this rate [rad/s] Coulomb friction falls linearly to zero
 FRICTION_SPEED = wp.constant(real(0.01))
@@ -65,14 +65,14 @@ def knee_damping(p: JointParams, loop: FiveBar, front: real, rates: vec3) -> mat
 
 @wp.func
 def joint_forces(
-    p: JointParams, loop: FiveBar, front: real, rates: vec3, rows: StopRows, pressed: int, dt: real
+    p: JointParams, loop: FiveBar, front: real, rates: vec3, stop_rates: StopRates, pressed: int, dt: real
 ) -> JointForces:
     """Return friction, knee damping and pressed hard stops of one leg.
 
     rates: lateral, outer, inner [rad/s]; rows, pressed: the leg's stops, see `stops`; dt: step [s].
     """
     damping = knee_damping(p, loop, front, rates) + wp.diag(joint_friction(p, rates))
-    stops = stop_forces(rows, rates, pressed, dt)
+    stops = stop_forces(stop_rates, rates, pressed, dt)
     forces = JointForces()
     forces.torque = stops.torque - damping * rates
     forces.inertia = stops.inertia + dt * damping

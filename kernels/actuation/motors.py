@@ -12,11 +12,11 @@ class MotorParams:
 
     kp: real  # [N m/rad]
     kd: real  # [N m s/rad]
-    saturation: real  # [N m] largest torque that the controller asks for, either way
+    saturation: real  # [N m] largest torque that the controller commands, either way
     peak: real  # [N m] largest torque that the motor gives, up to the cutoff speed
     cutoff_speed: real  # [rad/s] full driving torque up to here
     no_load_speed: real  # [rad/s] no driving torque from here, > cutoff_speed
-    offset: real  # [rad] what the position sensor reads above the true angle
+    offset: real  # [rad] added by the position sensor to the true angle
     fade_start: real  # [rad/s] over-speed protection takes torque away from here
     fade_end: real  # [rad/s] and has taken all of it here, > fade_start
 
@@ -57,7 +57,7 @@ def envelope(direction: real, vel: real, motor: MotorParams) -> real:
     """Return the largest torque [N m], >= 0, along `direction` (+1 or -1) at joint speed `vel` [rad/s].
 
     The motor brakes with its peak torque. Driving it keeps the peak up to the cutoff speed, then loses it linearly
-    until the no-load speed. The controller asks for no more than the saturation torque.
+    until the no-load speed. The controller commands at most the saturation torque.
     """
     headroom = (motor.no_load_speed - direction * vel) / (motor.no_load_speed - motor.cutoff_speed)
     return wp.min(motor.saturation, motor.peak * wp.clamp(headroom, real(0.0), real(1.0)))

@@ -11,8 +11,8 @@ It gives back no more than the spring took. With s the speed away from the stop 
 where goal = -gap / dt outside the stop (the gap closes exactly) and -gap ke / c inside. Where a stop is pressed,
 torque = c (goal - s) is linear in the rates, so that it joins the leg's inertia as damping does (`joint_forces`).
 
-Which stops are pressed is settled together with contact: a step is solved with a set of pressed stops, and again with
-another one until the set is the one that the resulting rates ask for (`pressed_stops`). Most steps need one set, few
+The pressed stops are found together with contact: a step is solved with a set of pressed stops, and again with
+another one until the set is the one that the resulting rates require (`pressed_stops`). Most steps need one set, few
 three. Friction can make sets cycle, in a violent impact on jammed legs: stops are then pressed and no more released.
 """
 
@@ -26,8 +26,8 @@ UPPER_STOP = wp.constant(2)
 ROW_BITS = wp.constant(2)
 ROW_MASK = wp.constant(3)
 ROWS = wp.constant(4)
-# after so many sets of a step only one stop changes at a time, which alone cannot cycle without friction; after so many
-# none is released; and after so many the last set stands
+# after this many sets of a step only one stop changes at a time, which cannot cycle without friction; then none is
+# released; and after the last number the set stands
 ONE_BY_ONE = wp.constant(3)
 PRESS_ONLY = wp.constant(8)
 MAX_SETS = wp.constant(12)
@@ -48,8 +48,8 @@ class StopParams:
 
 
 @wp.struct
-class StopRows:
-    """The stops of one leg in a step; rows are lateral, outer, inner, outer + inner."""
+class StopRates:
+    """Rates at which the stops of one leg press in a step; rows are lateral, outer, inner, outer + inner."""
 
     lower: vec4  # [rad/s] rate at the end of the step above which the lower stop is free
     upper: vec4  # [rad/s] rate below which the upper stop is free
@@ -65,8 +65,8 @@ class StopForces:
 
 
 @wp.func
-def stop_rows(p: StopParams, angles: vec3, dt: real) -> StopRows:
-    """Return the stops in a step dt [s] from motor angles [rad]."""
+def stop_rates(p: StopParams, angles: vec3, dt: real) -> StopRates:
+    """Return the rates at which the stops press in a step dt [s] from motor angles [rad]: lateral, outer, inner."""
     damping = wp.max(dt * p.ke + p.kd, real(1.0e-9))
     inside = p.ke / damping
     outside = real(1.0) / dt
@@ -75,21 +75,21 @@ def stop_rows(p: StopParams, angles: vec3, dt: real) -> StopRows:
     above = p.upper - angles
     below_fold = p.sum_lower - fold
     above_fold = p.sum_upper - fold
-    rows = StopRows()
-    rows.damping = damping
-    rows.lower = vec4(
+    stop_rates = StopRates()
+    stop_rates.damping = damping
+    stop_rates.lower = vec4(
         below[0] * wp.where(below[0] > real(0.0), inside, outside),
         below[1] * wp.where(below[1] > real(0.0), inside, outside),
         below[2] * wp.where(below[2] > real(0.0), inside, outside),
         below_fold * wp.where(below_fold > real(0.0), inside, outside),
     )
-    rows.upper = vec4(
+    stop_rates.upper = vec4(
         above[0] * wp.where(above[0] < real(0.0), inside, outside),
         above[1] * wp.where(above[1] < real(0.0), inside, outside),
         above[2] * wp.where(above[2] < real(0.0), inside, outside),
         above_fold * wp.where(above_fold < real(0.0), inside, outside),
     )
-    return rows
+    return stop_rates
 
 
 @wp.func
@@ -109,35 +109,35 @@ def row_side(pressed: int, i: int) -> int:
 
 
 @wp.func
-def pressed_stops(rows: StopRows, rates: vec3, slack: real, pressed: int) -> int:
+def pressed_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int) -> int:
     """Return the set of stops that a leg presses which ends the step at `rates` [rad/s].
 
     pressed: the set that led to the rates; its stops are released, and others pressed, only beyond the slack [rad/s].
     """
     rate = vec4(rates[0], rates[1], rates[2], rates[1] + rates[2])
-    if pressed == 0 and not wp.max(wp.max(rows.lower - rate, rate - rows.upper)) > slack:
+    if pressed == 0 and not wp.max(wp.max(stop_rates.lower - rate, rate - stop_rates.upper)) > slack:
         return 0
-    found = int(0)
+    stops = int(0)
     for i in range(ROWS):
         side = row_side(pressed, i)
-        if rows.lower[i] - rate[i] > wp.where(side == LOWER_STOP, -slack, slack):
-            found += LOWER_STOP << (ROW_BITS * i)
-        elif rate[i] - rows.upper[i] > wp.where(side == UPPER_STOP, -slack, slack):
-            found += UPPER_STOP << (ROW_BITS * i)
-    return found
+        if stop_rates.lower[i] - rate[i] > wp.where(side == LOWER_STOP, -slack, slack):
+            stops += LOWER_STOP << (ROW_BITS * i)
+        elif rate[i] - stop_rates.upper[i] > wp.where(side == UPPER_STOP, -slack, slack):
+            stops += UPPER_STOP << (ROW_BITS * i)
+    return stops
 
 
 @wp.func
-def revised_stops(rows: StopRows, rates: vec3, slack: real, pressed: int, sets: int) -> int:
+def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int, sets: int) -> int:
     """Return the set to try after `sets` sets of a step, the last of which, `pressed`, led to `rates` [rad/s]."""
-    wanted = pressed_stops(rows, rates, slack, pressed)
-    if wanted == pressed or sets < PRESS_ONLY:
-        return wanted
-    found = pressed
+    required = pressed_stops(stop_rates, rates, slack, pressed)
+    if required == pressed or sets < PRESS_ONLY:
+        return required
+    stops = pressed
     for i in range(ROWS):
         if row_side(pressed, i) == 0:
-            found += wanted & (ROW_MASK << (ROW_BITS * i))
-    return found
+            stops += required & (ROW_MASK << (ROW_BITS * i))
+    return stops
 
 
 @wp.func
@@ -147,26 +147,26 @@ def one_by_one(sets: int) -> bool:
 
 
 @wp.func
-def change_one(pressed: int, wanted: int) -> int:
-    """Return `pressed` with the first row in which it differs from `wanted` changed."""
+def change_one(pressed: int, required: int) -> int:
+    """Return `pressed` with the first row in which it differs from `required` changed."""
     for i in range(ROWS):
         bits = ROW_MASK << (ROW_BITS * i)
-        if (pressed ^ wanted) & bits != 0:
-            return (pressed & ~bits) | (wanted & bits)
+        if (pressed ^ required) & bits != 0:
+            return (pressed & ~bits) | (required & bits)
     return pressed
 
 
 @wp.func
-def row_torque(rows: StopRows, i: int, rate: real, pressed: int) -> real:
+def row_torque(stop_rates: StopRates, i: int, rate: real, pressed: int) -> real:
     """Return the torque [N m] of row i at its current rate [rad/s]."""
     side = row_side(pressed, i)
     if side == 0:
         return real(0.0)
-    return rows.damping * (wp.where(side == LOWER_STOP, rows.lower[i], rows.upper[i]) - rate)
+    return stop_rates.damping * (wp.where(side == LOWER_STOP, stop_rates.lower[i], stop_rates.upper[i]) - rate)
 
 
 @wp.func
-def stop_forces(rows: StopRows, rates: vec3, pressed: int, dt: real) -> StopForces:
+def stop_forces(stop_rates: StopRates, rates: vec3, pressed: int, dt: real) -> StopForces:
     """Return the forces of a leg's pressed stops; rates [rad/s] at the start of the step."""
     forces = StopForces()
     if pressed == 0:
@@ -174,12 +174,12 @@ def stop_forces(rows: StopRows, rates: vec3, pressed: int, dt: real) -> StopForc
     zero = real(0.0)
     both = vec3(zero, real(1.0), real(1.0))
     single = vec3(
-        row_torque(rows, 0, rates[0], pressed),
-        row_torque(rows, 1, rates[1], pressed),
-        row_torque(rows, 2, rates[2], pressed),
+        row_torque(stop_rates, 0, rates[0], pressed),
+        row_torque(stop_rates, 1, rates[1], pressed),
+        row_torque(stop_rates, 2, rates[2], pressed),
     )
-    forces.torque = single + row_torque(rows, 3, rates[1] + rates[2], pressed) * both
-    c = dt * rows.damping
+    forces.torque = single + row_torque(stop_rates, 3, rates[1] + rates[2], pressed) * both
+    c = dt * stop_rates.damping
     diagonal = vec3(
         wp.where(row_side(pressed, 0) != 0, c, zero),
         wp.where(row_side(pressed, 1) != 0, c, zero),

@@ -1,4 +1,4 @@
-"""Distances between the simple shapes that stand for links: capsules and boxes.
+"""Distances between the simple shapes that model links: capsules and boxes.
 
 A sphere is a capsule of zero length. Distances are signed as far as the radii go: two overlapping capsules report
 minus their overlap, but never less than minus the sum of their radii.
@@ -14,18 +14,18 @@ def segment_segment_sq(start_a: vec3, end_a: vec3, start_b: vec3, end_b: vec3) -
     """Return the squared distance [m^2] between two segments, either of which may be a point."""
     a = end_a - start_a
     b = end_b - start_b
-    uniform = start_a - start_b
+    start_offset = start_a - start_b
     aa = wp.max(wp.dot(a, a), real(1.0e-12))
     bb = wp.max(wp.dot(b, b), real(1.0e-12))
     ab = wp.dot(a, b)
-    a_between = wp.dot(a, uniform)
-    b_between = wp.dot(b, uniform)
+    a_between = wp.dot(a, start_offset)
+    b_between = wp.dot(b, start_offset)
     # for (nearly) parallel segments the floor on the determinant turns the division into a step downhill
     det = wp.max(aa * bb - ab * ab, real(1.0e-7) * aa * bb)
     along_a = wp.clamp((ab * b_between - a_between * bb) / det, real(0.0), real(1.0))
     along_b = wp.clamp((ab * along_a + b_between) / bb, real(0.0), real(1.0))
     nearest_a = wp.clamp((ab * along_b - a_between) / aa, real(0.0), real(1.0))
-    gap = uniform + nearest_a * a - along_b * b
+    gap = start_offset + nearest_a * a - along_b * b
     return wp.dot(gap, gap)
 
 
@@ -56,8 +56,8 @@ def segment_box_sq(start: vec3, end: vec3, half: vec3) -> real:
                 low = seam
     slope_low = wp.min(wp.dot(step, outside_box(start + low * step, half)), real(0.0))
     slope_high = wp.max(wp.dot(step, outside_box(start + high * step, half)), real(0.0))
-    share = -slope_low / wp.max(slope_high - slope_low, real(1.0e-20))
-    gap = outside_box(start + (low + share * (high - low)) * step, half)
+    fraction = -slope_low / wp.max(slope_high - slope_low, real(1.0e-20))
+    gap = outside_box(start + (low + fraction * (high - low)) * step, half)
     return wp.dot(gap, gap)
 
 
@@ -70,8 +70,8 @@ def segment_box_bound_sq(start: vec3, end: vec3, half: vec3) -> real:
 
 
 @wp.func
-def swell(distance_sq: real, radius: real, bound: real) -> real:
-    """Return the distance [m] of shapes swollen by `radius` in total, or `bound` (>= 0) if it is not below that."""
+def inflated_distance(distance_sq: real, radius: real, bound: real) -> real:
+    """Return the distance [m] of shapes inflated by `radius` [m] in total, or `bound` (>= 0) if it is not smaller."""
     reach = bound + radius
     if distance_sq >= reach * reach:
         return bound

@@ -16,7 +16,7 @@ from ..kinematics.five_bar import five_bar
 from ..kinematics.geometry import LegGeometry
 from ..scalar import mat33, quat, real, vec3
 from ..terrain.ground import Ground, ground_distance, world_ground
-from .distances import segment_box_bound_sq, segment_box_sq, segment_segment_sq, swell
+from .distances import inflated_distance, segment_box_bound_sq, segment_box_sq, segment_segment_sq
 
 wp.set_module_options({"enable_backward": False})
 
@@ -64,10 +64,10 @@ class LegCapsules:
 
 @wp.struct
 class Collisions:
-    """Result for one robot."""
+    """Forbidden contacts of one robot."""
 
     flags: int  # bitmask of the contacts that exist
-    clearance: real  # [m] smallest distance found, negative in contact
+    clearance: real  # [m] smallest distance, negative in contact
 
 
 @wp.func
@@ -121,9 +121,9 @@ def leg_self_distance(capsules: LegCapsules, bound: real) -> real:
     outer_thigh_sq = segment_segment_sq(outer_axis, outer_knee, inner_knee, ankle)
     inner_thigh_sq = segment_segment_sq(inner_axis, inner_knee, outer_knee, ankle)
     span = SHANK_APART * (outer_knee - inner_knee)
-    thighs = swell(thighs_sq, real(2.0) * THIGH_RADIUS, bound)
-    crossed = swell(wp.min(outer_thigh_sq, inner_thigh_sq), THIGH_RADIUS + SHANK_RADIUS, bound)
-    shanks = swell(wp.dot(span, span), real(2.0) * SHANK_RADIUS, bound)
+    thighs = inflated_distance(thighs_sq, real(2.0) * THIGH_RADIUS, bound)
+    crossed = inflated_distance(wp.min(outer_thigh_sq, inner_thigh_sq), THIGH_RADIUS + SHANK_RADIUS, bound)
+    shanks = inflated_distance(wp.dot(span, span), real(2.0) * SHANK_RADIUS, bound)
     return wp.min(thighs, wp.min(crossed, shanks))
 
 
@@ -146,8 +146,8 @@ def leg_box_distance(capsules: LegCapsules, box: int, bound: real) -> real:
             start = capsules.ends[k] - center
             end = capsules.ends[capsule_end(k)] - center
             radius = capsule_radius(capsules, k)
-            if swell(segment_box_bound_sq(start, end, half), radius, nearest) < nearest:
-                nearest = wp.min(nearest, swell(segment_box_sq(start, end, half), radius, bound))
+            if inflated_distance(segment_box_bound_sq(start, end, half), radius, nearest) < nearest:
+                nearest = wp.min(nearest, inflated_distance(segment_box_sq(start, end, half), radius, bound))
     return nearest
 
 
@@ -174,7 +174,7 @@ def leg_leg_distance(leg: LegCapsules, other: LegCapsules, bound: real) -> real:
             distance_sq = segment_segment_sq(
                 leg.ends[k], leg.ends[capsule_end(k)], other.ends[m], other.ends[capsule_end(m)]
             )
-            nearest = wp.min(nearest, swell(distance_sq, radius, bound))
+            nearest = wp.min(nearest, inflated_distance(distance_sq, radius, bound))
     return nearest
 
 
@@ -219,18 +219,18 @@ def leg_ground_distances(ground: Ground, capsules: LegCapsules, pos: vec3, rotat
         thigh = wp.min(thigh, ground_distance(ground, real(0.5) * (axis_world + knee_world)))
         knee = wp.min(knee, ground_distance(ground, knee_world))
         for i in range(3):
-            share = SHANK_FREE * real(i + 1) / real(3.0)
-            shank = wp.min(shank, ground_distance(ground, knee_world + share * (ankle_world - knee_world)))
+            fraction = SHANK_FREE * real(i + 1) / real(3.0)
+            shank = wp.min(shank, ground_distance(ground, knee_world + fraction * (ankle_world - knee_world)))
     shank = wp.min(shank, knee)
     return vec4(housing - HOUSING_RADIUS, thigh - THIGH_RADIUS, knee - THIGH_RADIUS, shank - SHANK_RADIUS)
 
 
 @wp.func
-def record(found: Collisions, distance: real, least: real, flag: int) -> Collisions:
+def add_distance(collisions: Collisions, distance: real, least: real, flag: int) -> Collisions:
     """Return the result with one more distance [m] taken into account: below `least` it raises `flag`."""
     result = Collisions()
-    result.flags = found.flags | wp.where(distance < least, flag, 0)
-    result.clearance = wp.min(found.clearance, distance)
+    result.flags = collisions.flags | wp.where(distance < least, flag, 0)
+    result.clearance = wp.min(collisions.clearance, distance)
     return result
 
 
@@ -244,15 +244,15 @@ def load_leg(
 
 
 @wp.func
-def next_leg(turn: int) -> int:
-    """Return the leg at a place of the way around the body: FL, FR, BR, BL."""
-    return (turn % 4) ^ ((turn % 4) >> 1)
+def next_leg(order: int) -> int:
+    """Return the leg at a position around the body, modulo 4: FL, FR, BR, BL are legs 0, 1, 3, 2."""
+    return (order % 4) ^ ((order % 4) >> 1)
 
 
 @wp.func
-def add_leg(
-    found: Collisions, ground: Ground, leg: LegCapsules, neighbour: LegCapsules, pos: vec3, rotation: mat33,
-    apart: real,
+def add_leg_distances(
+    collisions: Collisions, ground: Ground, leg: LegCapsules, neighbour: LegCapsules, pos: vec3, rotation: mat33,
+    min_distance: real,
 ) -> Collisions:  # fmt: skip
     """Return the result with one leg taken into account: with the ground, itself, the shell and the next leg.
 
@@ -260,14 +260,14 @@ def add_leg(
     """
     zero = real(0.0)
     over_ground = leg_ground_distances(ground, leg, pos, rotation)
-    result = record(found, over_ground[0], zero, HOUSING_GROUND)
-    result = record(result, over_ground[1], zero, THIGH_GROUND)
-    result = record(result, over_ground[2], zero, KNEE_GROUND)
-    result = record(result, over_ground[3], zero, SHANK_GROUND)
-    bound = wp.max(result.clearance, apart)
-    result = record(result, leg_self_distance(leg, bound), apart, LEG_SELF)
-    result = record(result, leg_shell_distance(leg, bound), apart, LEG_SHELL)
-    return record(result, leg_leg_distance(leg, neighbour, bound), apart, LEG_LEG)
+    result = add_distance(collisions, over_ground[0], zero, HOUSING_GROUND)
+    result = add_distance(result, over_ground[1], zero, THIGH_GROUND)
+    result = add_distance(result, over_ground[2], zero, KNEE_GROUND)
+    result = add_distance(result, over_ground[3], zero, SHANK_GROUND)
+    bound = wp.max(result.clearance, min_distance)
+    result = add_distance(result, leg_self_distance(leg, bound), min_distance, LEG_SELF)
+    result = add_distance(result, leg_shell_distance(leg, bound), min_distance, LEG_SHELL)
+    return add_distance(result, leg_leg_distance(leg, neighbour, bound), min_distance, LEG_LEG)
 
 
 @wp.func
@@ -289,24 +289,26 @@ def world_collisions(
     rotation = wp.quat_to_matrix(
         quat(real(joint_q[start + 3]), real(joint_q[start + 4]), real(joint_q[start + 5]), real(joint_q[start + 6]))
     )
-    found = Collisions()
-    found.clearance = margin
-    found = record(found, body_ground_distance(ground, pos, rotation), real(0.0), BODY_GROUND)
+    collisions = Collisions()
+    collisions.clearance = margin
+    collisions = add_distance(collisions, body_ground_distance(ground, pos, rotation), real(0.0), BODY_GROUND)
     leg = load_leg(geometry, joint_q, start, 0)
     count = wp.int32(4)
-    for turn in range(count):
-        neighbour = load_leg(geometry, joint_q, start, next_leg(turn + 1))
-        found = add_leg(found, ground, leg, neighbour, pos, rotation, real(0.0))
+    for order in range(count):
+        neighbour = load_leg(geometry, joint_q, start, next_leg(order + 1))
+        collisions = add_leg_distances(collisions, ground, leg, neighbour, pos, rotation, real(0.0))
         leg = neighbour
-    return found
+    return collisions
 
 
 @wp.func
 def leg_collisions(
-    geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), start: int, turn: int,
-    apart: real,
+    geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), start: int, order: int,
+    min_distance: real,
 ) -> int:  # fmt: skip
-    """Return the flags of one leg, counted around the body; together the four give those of `world_collisions`.
+    """Return the flags of the leg at position `order` around the body, see `next_leg`.
+
+    Those of all four are those of `world_collisions`.
 
     apart: links closer to one another than this [m] count as touching; `world_collisions` has 0.
     """
@@ -314,12 +316,12 @@ def leg_collisions(
     rotation = wp.quat_to_matrix(
         quat(real(joint_q[start + 3]), real(joint_q[start + 4]), real(joint_q[start + 5]), real(joint_q[start + 6]))
     )
-    found = Collisions()
-    if turn == 0:
-        found = record(found, body_ground_distance(ground, pos, rotation), real(0.0), BODY_GROUND)
-    leg = load_leg(geometry, joint_q, start, next_leg(turn))
-    neighbour = load_leg(geometry, joint_q, start, next_leg(turn + 1))
-    return add_leg(found, ground, leg, neighbour, pos, rotation, apart).flags
+    collisions = Collisions()
+    if order == 0:
+        collisions = add_distance(collisions, body_ground_distance(ground, pos, rotation), real(0.0), BODY_GROUND)
+    leg = load_leg(geometry, joint_q, start, next_leg(order))
+    neighbour = load_leg(geometry, joint_q, start, next_leg(order + 1))
+    return add_leg_distances(collisions, ground, leg, neighbour, pos, rotation, min_distance).flags
 
 
 @wp.kernel
@@ -337,6 +339,6 @@ def collision_kernel(
     """Check one world per thread; see `world_collisions`. joint_q: Newton's, flat, `coords_per_world` a world."""
     world = wp.tid()
     here = world_ground(ground, world)
-    found = world_collisions(geometry, here, joint_q, world * coords_per_world, margin)
-    flags[world] = found.flags
-    clearance[world] = wp.float32(found.clearance)
+    collisions = world_collisions(geometry, here, joint_q, world * coords_per_world, margin)
+    flags[world] = collisions.flags
+    clearance[world] = wp.float32(collisions.clearance)

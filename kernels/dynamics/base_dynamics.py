@@ -14,28 +14,28 @@ class LegSolve:
 
     inverse: mat33  # inverse of D, implicit terms included [1/(kg m^2)]
     free: vec3  # D^-1 (tau - h) [rad/s^2]
-    to_lin: mat33  # D^-1 Bv^T
-    to_ang: mat33  # D^-1 Bw^T
+    to_lin: mat33  # D^-1 Bv^T [1/m]
+    to_ang: mat33  # D^-1 Bw^T [1]
 
 
 @wp.struct
 class BaseSystem:
     """Equations of the base, in 3x3 blocks: [lin cross; cross^T ang] [a; alpha] = [force; moment]."""
 
-    lin: mat33
-    cross: mat33
-    ang: mat33
-    force: vec3
-    moment: vec3
+    lin: mat33  # [kg]
+    cross: mat33  # [kg m]
+    ang: mat33  # [kg m^2]
+    force: vec3  # [N]
+    moment: vec3  # [N m] about the base's origin
 
 
 @wp.struct
 class BaseInverse:
     """Inverse of the base's system in 3x3 blocks."""
 
-    lin: mat33
-    cross: mat33
-    ang: mat33
+    lin: mat33  # [1/kg]
+    cross: mat33  # [1/(kg m)]
+    ang: mat33  # [1/(kg m^2)]
 
 
 @wp.func
@@ -51,7 +51,7 @@ def eliminate_leg(leg: LegDynamics, implicit: mat33, torque: vec3) -> LegSolve:
 
 
 @wp.func
-def base_alone(body: MassMoments, omega: vec3, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
+def base_link_system(body: MassMoments, omega: vec3, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
     """Return the system of the base link alone.
 
     omega: angular velocity [rad/s], g: gravity [m/s^2], force [N] and moment about the origin [N m] from outside;

@@ -24,12 +24,12 @@ def external_wrench(base: BaseState, com: vec3, force_at_com: vec3, moment: vec3
 
 
 @wp.func
-def exp_rotation(turn: vec3) -> quat:
+def exp_rotation(rotation_vector: vec3) -> quat:
     """Return the quaternion (xyzw) of a rotation vector [rad]."""
-    half_sq = real(0.25) * wp.dot(turn, turn)
+    half_sq = real(0.25) * wp.dot(rotation_vector, rotation_vector)
     # sin(h)/h and cos(h) to float32 rounding for the turns of one step (h < 0.2)
     sinc = real(1.0) - half_sq / real(6.0) * (real(1.0) - half_sq / real(20.0) * (real(1.0) - half_sq / real(42.0)))
-    v = real(0.5) * sinc * turn
+    v = real(0.5) * sinc * rotation_vector
     cosine = real(1.0) - half_sq / real(2.0) * (
         real(1.0) - half_sq / real(12.0) * (real(1.0) - half_sq / real(30.0) * (real(1.0) - half_sq / real(56.0)))
     )
@@ -37,8 +37,8 @@ def exp_rotation(turn: vec3) -> quat:
 
 
 @wp.func
-def moved_base(base: BaseState, lin: vec3, ang: vec3, dt: real) -> BaseState:
-    """Return the base moved for dt [s]; lin, ang: its new twist in the present body axes [m/s], [rad/s]."""
+def integrate_base(base: BaseState, lin: vec3, ang: vec3, dt: real) -> BaseState:
+    """Return the base state after dt [s] (semi-implicit Euler); lin [m/s], ang [rad/s]: new twist, old body axes."""
     moved = BaseState()
     moved.lin = wp.quat_rotate(base.quat, lin)
     moved.ang = ang

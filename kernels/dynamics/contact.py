@@ -47,17 +47,17 @@ class PawContact:
 
     active: int  # 0: too far from the ground to touch within the step
     on_block: int  # 1: the ground is the sliding block there
-    normal: vec3
-    mu: real
+    normal: vec3  # unit, out of the ground
+    mu: real  # friction coefficient
     mu_row: int  # row of mu in the parameter table
     goal: real  # smallest admissible normal velocity at the end of the step [m/s]
     free: vec3  # contact point velocity without any impulse [m/s]
     jacobian: mat33  # contact velocity per motor rate [m/rad]
-    from_lin: mat33  # G: contact velocity per base twist
-    from_ang: mat33
-    to_lin: mat33  # S^-1 G^T: base twist per impulse
-    to_ang: mat33
-    own: mat33  # A: contact velocity per impulse through the leg alone [1/kg]
+    from_lin: mat33  # G: contact velocity per base velocity [1]
+    from_ang: mat33  # and per base angular velocity [m]
+    to_lin: mat33  # S^-1 G^T: base velocity per impulse [1/kg]
+    to_ang: mat33  # base angular velocity per impulse [1/(kg m)]
+    leg_response: mat33  # A: contact velocity per impulse through the leg alone [1/kg]
     total_inv: mat33  # inverse of `total` [kg]
     total: mat33  # A + G S^-1 G^T, plus 1/mass of the block along the floor: relative velocity per impulse [1/kg]
     impulse: vec3  # [N s]
@@ -84,8 +84,8 @@ def contact_jacobian(paw: PawKinematics, arm: vec3) -> mat33:
 def target_normal_velocity(gap: real, pressed: int, dt: real) -> real:
     """Return the smallest admissible normal velocity [m/s] for a gap [m]: close it exactly, push penetration out.
 
-    pressed: the leg's pressed hard stops. On stops the legs carry the body as those of a table, and what rounding adds
-    to a gap would shift load between them: then gaps within `STIFF_BAND` stay, and close gently at first beyond it.
+    pressed: the leg's pressed hard stops. On stops the legs are stiff like those of a table, and the rounding error
+    of a gap would shift load between them: then gaps within `STIFF_BAND` stay, and close gently at first beyond it.
     """
     beyond = gap
     if pressed != 0:
@@ -108,8 +108,8 @@ def couple_contact(contact: PawContact, point: vec3, leg: LegSolve, base: BaseIn
     ang_t = wp.transpose(c.from_ang)
     c.to_lin = base.lin * lin_t + base.cross * ang_t
     c.to_ang = wp.transpose(base.cross) * lin_t + base.ang * ang_t
-    c.own = c.jacobian * leg_response
-    c.total = c.own + c.from_lin * c.to_lin + c.from_ang * c.to_ang
+    c.leg_response = c.jacobian * leg_response
+    c.total = c.leg_response + c.from_lin * c.to_lin + c.from_ang * c.to_ang
     c.total_inv = wp.inverse(c.total)
     return c
 
@@ -209,7 +209,7 @@ def sweep_contacts(contacts: wp.array(dtype=PawContact), block: BlockLaw, state:
     for k in range(contacts.shape[0]):
         if contacts[k].active != 0:
             c = contacts[k]
-            velocity = c.free + c.from_lin * s.lin + c.from_ang * s.ang + c.own * c.impulse
+            velocity = c.free + c.from_lin * s.lin + c.from_ang * s.ang + c.leg_response * c.impulse
             if c.on_block != 0:
                 velocity -= block_velocity(block, push_on_block(contacts))
             impulse = local_impulse(c, c.impulse, velocity)

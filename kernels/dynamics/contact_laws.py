@@ -8,56 +8,56 @@ from ..terrain.ground import floor_normal
 from .base_dynamics import BaseInverse, LegSolve
 from .contact import SEPARATE, SLIDE, PawContact, contact_jacobian, contact_mode, couple_contact
 from .leg_dynamics import PawKinematics
-from .step import Robot, friction_row
+from .step import RobotModel, friction_row
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
 class PawLaw:
-    """A paw's contact law at the solution: its derivatives by velocity and impulse, 0 where separated."""
+    """A paw's contact law R(impulse, velocity) = 0 at the solution, see `contact_residual`; body axes."""
 
     mode: int  # SEPARATE, STICK or SLIDE
     mu_row: int  # row of the friction coefficient in the parameter table
-    mu: real
-    by_velocity: mat33
-    by_impulse: mat33  # at fixed velocity
+    mu: real  # friction coefficient
+    by_velocity: mat33  # dR/dv^T, 0 where separated
+    by_impulse: mat33  # dR/dp at fixed velocity, 0 where separated
 
 
 @wp.func
 def contact_at(
-    robot: Robot, k: int, base: BaseState, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, impulse: vec3
+    model: RobotModel, k: int, base: BaseState, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, impulse: vec3
 ) -> PawContact:
     """Return paw k's response to impulses; impulse [N s]: in body axes."""
     contact = PawContact()
     contact.active = 1
     contact.impulse = impulse
     centre = base.pos + wp.quat_rotate(base.quat, paw.position)
-    contact.normal = wp.quat_rotate_inv(base.quat, floor_normal(robot.ground, centre))
-    arm = -robot.geometry[k].paw_radius * contact.normal
+    contact.normal = wp.quat_rotate_inv(base.quat, floor_normal(model.ground, centre))
+    arm = -model.geometry[k].paw_radius * contact.normal
     contact.jacobian = contact_jacobian(paw, arm)
     return couple_contact(contact, paw.position + arm, leg, inverse)
 
 
 @wp.func
-def contact_point(robot: Robot, k: int, paw: PawKinematics, contact: PawContact) -> vec3:
+def contact_point(model: RobotModel, k: int, paw: PawKinematics, contact: PawContact) -> vec3:
     """Return where paw k touches [m], body axes, from the base's origin."""
-    return paw.position - robot.geometry[k].paw_radius * contact.normal
+    return paw.position - model.geometry[k].paw_radius * contact.normal
 
 
 @wp.func
 def paw_law(
-    robot: Robot, world: int, k: int, contact: PawContact, before: vec3, velocity: vec3, old_impulse: vec3
+    model: RobotModel, world: int, k: int, contact: PawContact, old_velocity: vec3, velocity: vec3, old_impulse: vec3
 ) -> PawLaw:
     """Return the contact law of paw k.
 
-    before, velocity [m/s]: of the contact point at the start and the end of the step; old_impulse [N s]: of the step
-    before; body axes.
+    old_velocity, velocity [m/s]: of the contact point at the start and the end of the step; old_impulse [N s]: in the
+    preceding step; all in body axes.
     """
     law = PawLaw()
     p, n = contact.impulse, contact.normal
-    law.mu_row = friction_row(k, before, old_impulse, n)
-    law.mu = robot.table[law.mu_row, world]
+    law.mu_row = friction_row(k, old_velocity, old_impulse, n)
+    law.mu = model.table[law.mu_row, world]
     law.mode = contact_mode(p, n, law.mu)
     if law.mode == SEPARATE:
         return law

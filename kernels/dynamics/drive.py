@@ -1,4 +1,4 @@
-"""What drives the robot over a launch, and what the solver keeps of every world."""
+"""Inputs of a launch of the dynamics (targets, forces), and the solver's results for every world."""
 
 import warp as wp
 
@@ -7,36 +7,36 @@ from ..layout import BODIES, COORDS, DOFS
 from ..scalar import real, vec3, vec6
 from ..state import leg_dof, load_motors
 from ..terrain.ground import rest_block
-from .step import Robot
+from .step import RobotModel
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
 class Drive:
-    """What acts on the robot: motor targets, joint forces and a wrench on the base, held over the launch."""
+    """Inputs of a launch: motor targets, joint forces and a wrench on the base, constant over it."""
 
     closed_loop: int  # 1: the motors follow `target`; 0: only `joint_f` acts
     motors: MotorArrays
     target: wp.array2d(dtype=real)  # [rad], (12, num_worlds)
-    previous: wp.array2d(dtype=real)  # [rad], (12, num_worlds), followed before the target arrives
-    delay: wp.array(dtype=int)  # steps until it does, (num_worlds,); empty: none
+    previous: wp.array2d(dtype=real)  # [rad], (12, num_worlds), followed until the target arrives
+    delay: wp.array(dtype=int)  # physics steps until it arrives, (num_worlds,); empty: none
     joint_f: wp.array(dtype=real)  # [N m] and, for the base, world wrench at its com; Newton's layout
     body_f: wp.array(dtype=wp.spatial_vector)  # world wrench at the com of each body; the base's is used
 
 
 @wp.struct
 class LegDrive:
-    """What drives one leg of one world over the launch; vectors are lateral, outer, inner."""
+    """Inputs of one leg of one world over a launch; vectors are lateral, outer, inner."""
 
-    closed_loop: int
+    closed_loop: int  # as in `Drive`
     lateral: MotorParams
     outer: MotorParams
     inner: MotorParams
     target: vec3  # [rad]
     previous: vec3  # [rad]
-    delay: int  # steps
-    extra: vec3  # [N m]
+    delay: int  # steps that `previous` is followed
+    extra: vec3  # [N m] added to the motors' torque
 
 
 @wp.struct
@@ -50,16 +50,16 @@ class Workspace:
     torque: wp.array2d(dtype=real)  # [N m] of each motor in the last step, (12, num_worlds)
     residual: wp.array(dtype=real)  # [m/s] of the contact iteration, largest of the launch
     sweeps: wp.array(dtype=int)  # of the contact iteration, most of the launch
-    invalid: wp.array(dtype=int)  # 1: the world became non-finite and waits for a reset
-    reference_q: wp.array(dtype=real)  # joint_q where invalid worlds are parked
+    diverged: wp.array(dtype=int)  # 1: the state became non-finite; the world is frozen until a reset
+    reference_q: wp.array(dtype=real)  # joint_q that diverged worlds are frozen in
 
 
 @wp.func
 def freeze_diverged_world(
-    robot: Robot, work: Workspace, world: int, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)
+    model: RobotModel, work: Workspace, world: int, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)
 ):
     """Put a world at rest in its reference pose, its block at rest at its start."""
-    rest_block(robot.ground, world)
+    rest_block(model.ground, world)
     for i in range(int(COORDS)):
         joint_q[world * COORDS + i] = work.reference_q[world * COORDS + i]
     for i in range(int(DOFS)):
@@ -71,7 +71,7 @@ def freeze_diverged_world(
 
 @wp.func
 def load_leg_drive(drive: Drive, world: int, k: int) -> LegDrive:
-    """Return what drives leg k."""
+    """Return the inputs of leg k of a world."""
     leg = LegDrive()
     leg.extra = load_motors(drive.joint_f, leg_dof(world, k))
     leg.closed_loop = drive.closed_loop

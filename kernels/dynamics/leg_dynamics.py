@@ -40,10 +40,10 @@ class LegMasses:
 
 @wp.struct
 class LegPose:
-    """Where a leg is: the five-bar in the housing, and the housing's rotation about body x."""
+    """Configuration of a leg: the five-bar in the housing, and the housing's rotation about body x."""
 
     loop: FiveBar
-    cosine: real
+    cosine: real  # of the lateral angle times `side`
     sine: real
 
 
@@ -72,11 +72,11 @@ class PawKinematics:
 @wp.func
 def leg_pose(geo: LegGeometry, angles: vec3) -> LegPose:
     """Return a leg's pose for its motor angles [rad]: lateral, outer, inner."""
-    turn = sin_cos(angles[0])
+    lateral_sin_cos = sin_cos(angles[0])
     pose = LegPose()
     pose.loop = five_bar(geo, angles[1], angles[2])
-    pose.cosine = turn[1]
-    pose.sine = geo.side * turn[0]
+    pose.cosine = lateral_sin_cos[1]
+    pose.sine = geo.side * lateral_sin_cos[0]
     return pose
 
 
@@ -88,7 +88,7 @@ def columns(a: vec3, b: vec3, c: vec3) -> mat33:
 
 @wp.func
 def paw_kinematics(geo: LegGeometry, pose: LegPose) -> PawKinematics:
-    """Return the paw's position and maps."""
+    """Return the position and Jacobians of a leg's paw centre in body axes."""
     loop, cosine, sine = pose.loop, pose.cosine, pose.sine
     zero = real(0.0)
     y = geo.plane_y + geo.knee_y
@@ -169,11 +169,11 @@ def assemble_leg(
     lin_rel = rates[1] * sums.lin_o + rates[2] * sums.lin_i
     ang_rel = rates[1] * sums.ang_o + rates[2] * sums.ang_i
     second_rate = rates[1] * sums.second_o + rates[2] * sums.second_i
-    swing = wp.cross(w, sums.first) + real(2.0) * vec3(lin_rel[0], zero, lin_rel[1])
+    coriolis_momentum = wp.cross(w, sums.first) + real(2.0) * vec3(lin_rel[0], zero, lin_rel[1])
     force = (
         sums.mass * hip_acc
         + wp.cross(w_acc, sums.first)
-        + wp.cross(w, swing)
+        + wp.cross(w, coriolis_momentum)
         + vec3(sums.lin_acc[0], zero, sums.lin_acc[1])
     )
     moment = (
@@ -184,7 +184,7 @@ def assemble_leg(
         - mul_plane(second_rate, w)
         + sums.ang_acc
     )
-    swirl = w[1] * sums.coriolis
+    coriolis_torque = w[1] * sums.coriolis
 
     leg = couple_leg(geo, sums, cosine, sine)
     leg.bias_torque = vec3(
@@ -192,12 +192,12 @@ def assemble_leg(
         wp.dot(sums.lin_o, hip_plane)
         + wp.dot(sums.ang_o, w_acc)
         - centrifugal(sums.second_o, w)
-        + swirl * rates[2]
+        + coriolis_torque * rates[2]
         + sums.bias_o,
         wp.dot(sums.lin_i, hip_plane)
         + wp.dot(sums.ang_i, w_acc)
         - centrifugal(sums.second_i, w)
-        - swirl * rates[1]
+        - coriolis_torque * rates[1]
         + sums.bias_i,
     )
     leg.bias_force = rotate_x(force, cosine, sine)

@@ -19,36 +19,36 @@ from .inertia import MassMoments, rotate_y, rotate_y_second, sym_outer
 class LinkSums:
     """Integrals over link mass; subscripts o and i mean derivatives by the outer and inner motor angle.
 
-    Of a link or of a side of the leg, o is the motor of its own side and i the other; `leg_sums` tells them apart.
+    Of a link or a side of the leg, o is the motor of the same side and i the other; `leg_sums` sorts them.
     """
 
-    mass: real  # of 1
-    first: vec3  # of r
-    second: vec6  # of r r^T
+    mass: real  # [kg]
+    first: vec3  # [kg m] of r
+    second: vec6  # [kg m^2] of r r^T: xx yy zz xy xz yz
     second_o: vec5  # of r_o r^T + r r_o^T: xx zz xy xz yz
     second_i: vec5
-    lin_o: vec2  # of r_o: linear momentum per motor rate
+    lin_o: vec2  # [kg m] of r_o: linear momentum per motor rate
     lin_i: vec2
-    ang_o: vec3  # of r x r_o: angular momentum about the hip per motor rate
+    ang_o: vec3  # [kg m^2] of r x r_o: angular momentum about the hip per motor rate
     ang_i: vec3
-    inertia_oo: real  # of r_o . r_o
+    inertia_oo: real  # [kg m^2] of r_o . r_o
     inertia_oi: real
     inertia_ii: real
-    coriolis: real  # y component of 2 r_i x r_o
-    lin_acc: vec2  # of the acceleration while motor accelerations are zero
-    ang_acc: vec3  # of r x that acceleration
-    bias_o: real  # of r_o . that acceleration
+    coriolis: real  # [kg m^2] y component of 2 r_i x r_o
+    lin_acc: vec2  # [N] of the acceleration while motor accelerations are zero
+    ang_acc: vec3  # [N m] of r x that acceleration
+    bias_o: real  # [N m] of r_o . that acceleration
     bias_i: real
 
 
 @wp.func
-def turn_y(v: vec3) -> vec2:
+def cross_y(v: vec3) -> vec2:
     """Return x and z of e_y x v."""
     return vec2(v[2], -v[0])
 
 
 @wp.func
-def turn_y_second(s: vec6) -> vec5:
+def cross_y_second(s: vec6) -> vec5:
     """Return the derivative of packed second moments by a rotation about y."""
     two = real(2.0)
     return vec5(two * s[4], -two * s[4], s[5], s[2] - s[0], -s[3])
@@ -79,64 +79,69 @@ def shank_sums(
     knee: vec3,
     direction: vec2,
     knee_do: vec2,
-    turn_do: real,
-    turn_di: real,
+    rotation_do: real,
+    rotation_di: real,
     rate: real,
     knee_acc: vec2,
-    turn_acc: real,
+    rotation_acc: real,
 ) -> LinkSums:
-    """Return the sums of a shank whose frame sits at the knee of its own side and turns about y."""
+    """Return the sums of a shank, whose frame has its origin at the knee of its side and rotates about y.
+
+    link: about that frame. knee [m], direction (unit, knee to ankle): in the housing frame. knee_do [m/rad]: derivative
+    by the motor of its side. rotation_do, _di [1]: of the shank's angle about y by that motor and the other. rate
+    [rad/s], knee_acc [m/s^2], rotation_acc [rad/s^2]: at zero motor accelerations, see `FiveBarBias`.
+    """
     # a shank hanging along -z has direction (0, -1): its rotation has sine -x and cosine -z
     u = rotate_y(link.first, -direction[1], -direction[0])
     s = rotate_y_second(link.second, -direction[1], -direction[0])
     first = link.mass * knee + u
     spin = spin_y(s)
-    u_turned = turn_y(u)
-    s_turned = turn_y_second(s)
-    u_o = turn_do * u_turned
-    u_i = turn_di * u_turned
+    u_by_angle = cross_y(u)
+    s_by_angle = cross_y_second(s)
+    u_o = rotation_do * u_by_angle
+    u_i = rotation_di * u_by_angle
     planar = s[0] + s[2]
-    u_acc = turn_acc * u_turned - rate * rate * vec2(u[0], u[2])
+    u_acc = rotation_acc * u_by_angle - rate * rate * vec2(u[0], u[2])
 
     sums = LinkSums()
     sums.mass = link.mass
     sums.first = first
     sums.second = real(0.5) * link.mass * sym_outer(knee, knee) + sym_outer(knee, u) + s
-    sums.second_o = sym_outer_plane(knee_do, first) + sym_outer_plane(u_o, knee) + turn_do * s_turned
-    sums.second_i = sym_outer_plane(u_i, knee) + turn_di * s_turned
+    sums.second_o = sym_outer_plane(knee_do, first) + sym_outer_plane(u_o, knee) + rotation_do * s_by_angle
+    sums.second_i = sym_outer_plane(u_i, knee) + rotation_di * s_by_angle
     sums.lin_o = link.mass * knee_do + u_o
     sums.lin_i = u_i
-    sums.ang_o = cross_plane(first, knee_do) + cross_plane(knee, u_o) + turn_do * spin
-    sums.ang_i = cross_plane(knee, u_i) + turn_di * spin
-    sums.inertia_oo = wp.dot(knee_do, sums.lin_o) + wp.dot(knee_do, u_o) + turn_do * turn_do * planar
-    sums.inertia_oi = wp.dot(knee_do, u_i) + turn_do * turn_di * planar
-    sums.inertia_ii = turn_di * turn_di * planar
+    sums.ang_o = cross_plane(first, knee_do) + cross_plane(knee, u_o) + rotation_do * spin
+    sums.ang_i = cross_plane(knee, u_i) + rotation_di * spin
+    sums.inertia_oo = wp.dot(knee_do, sums.lin_o) + wp.dot(knee_do, u_o) + rotation_do * rotation_do * planar
+    sums.inertia_oi = wp.dot(knee_do, u_i) + rotation_do * rotation_di * planar
+    sums.inertia_ii = rotation_di * rotation_di * planar
     sums.coriolis = real(2.0) * (u_i[1] * knee_do[0] - u_i[0] * knee_do[1])
     sums.lin_acc = link.mass * knee_acc + u_acc
     sums.ang_acc = (
         cross_plane(first, knee_acc)
         + cross_plane(knee, u_acc)
-        + turn_acc * spin
+        + rotation_acc * spin
         - rate * rate * vec3(s[5], real(0.0), -s[3])
     )
-    sums.bias_o = wp.dot(knee_do, sums.lin_acc) + wp.dot(u_o, knee_acc) + turn_do * turn_acc * planar
-    sums.bias_i = wp.dot(u_i, knee_acc) + turn_di * turn_acc * planar
+    sums.bias_o = wp.dot(knee_do, sums.lin_acc) + wp.dot(u_o, knee_acc) + rotation_do * rotation_acc * planar
+    sums.bias_i = wp.dot(u_i, knee_acc) + rotation_di * rotation_acc * planar
     return sums
 
 
 @wp.func
 def add_thigh(
-    shank: LinkSums, link: MassMoments, axis: vec2, cosine: real, sine: real, rate: real, turn: real
+    shank: LinkSums, link: MassMoments, axis: vec2, cosine: real, sine: real, rate: real, sign: real
 ) -> LinkSums:
     """Return a shank's sums with those of the thigh above it.
 
-    The thigh turns about its transversal axis, at x and y `axis` [m], z = 0, by `turn` (-1 or +1) per angle of its own
-    motor.
+    The thigh turns about its transversal axis, at x and y `axis` [m], z = 0, by `sign` (-1 or +1) times its motor's
+    angle, at `rate` [rad/s]; cosine, sine: of that angle about y.
     """
     u = rotate_y(link.first, cosine, sine)
     s = rotate_y_second(link.second, cosine, sine)
     x, y = axis[0], axis[1]
-    u_o = turn * turn_y(u)
+    u_o = sign * cross_y(u)
     u_acc = -rate * rate * vec2(u[0], u[2])
     two = real(2.0)
     along_x = two * u[0] + link.mass * x
@@ -155,9 +160,9 @@ def add_thigh(
         )
         + s
     )
-    sums.second_o += vec5(two * u_o[0] * x, real(0.0), u_o[0] * y, u_o[1] * x, u_o[1] * y) + turn * turn_y_second(s)
+    sums.second_o += vec5(two * u_o[0] * x, real(0.0), u_o[0] * y, u_o[1] * x, u_o[1] * y) + sign * cross_y_second(s)
     sums.lin_o += u_o
-    sums.ang_o += vec3(y * u_o[1], -x * u_o[1], -y * u_o[0]) + turn * spin_y(s)
+    sums.ang_o += vec3(y * u_o[1], -x * u_o[1], -y * u_o[0]) + sign * spin_y(s)
     sums.inertia_oo += s[0] + s[2]
     sums.lin_acc += u_acc
     sums.ang_acc += vec3(y * u_acc[1] - rate * rate * s[5], -x * u_acc[1], rate * rate * s[3] - y * u_acc[0])
@@ -167,27 +172,27 @@ def add_thigh(
 @wp.func
 def outer_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: FiveBar, bias: FiveBarBias) -> LinkSums:
     """Return the sums of the outer thigh and shank."""
-    turn = loop.outer_turn
+    sin_cos = loop.outer_sin_cos
     knee = vec3(loop.outer_knee[0], geo.plane_y + geo.knee_y, loop.outer_knee[1])
-    below = shank_sums(
+    shank_part = shank_sums(
         shank, knee, loop.outer_shank, loop.outer_knee_do, loop.outer_shank_do, loop.outer_shank_di,
         bias.outer_shank_rate, bias.outer_knee_acc, bias.outer_shank_acc,
     )  # fmt: skip
     axis = vec2(geo.outer_x, geo.plane_y)
-    return add_thigh(below, thigh, axis, turn[1], -geo.front * turn[0], bias.outer_thigh_rate, -geo.front)
+    return add_thigh(shank_part, thigh, axis, sin_cos[1], -geo.front * sin_cos[0], bias.outer_thigh_rate, -geo.front)
 
 
 @wp.func
 def inner_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: FiveBar, bias: FiveBarBias) -> LinkSums:
     """Return the sums of the inner thigh and shank."""
-    turn = loop.inner_turn
+    sin_cos = loop.inner_sin_cos
     knee = vec3(loop.inner_knee[0], geo.plane_y + geo.knee_y, loop.inner_knee[1])
-    below = shank_sums(
+    shank_part = shank_sums(
         shank, knee, loop.inner_shank, loop.inner_knee_di, loop.inner_shank_di, loop.inner_shank_do,
         bias.inner_shank_rate, bias.inner_knee_acc, bias.inner_shank_acc,
     )  # fmt: skip
     axis = vec2(geo.inner_x, geo.plane_y)
-    return add_thigh(below, thigh, axis, turn[1], geo.front * turn[0], bias.inner_thigh_rate, geo.front)
+    return add_thigh(shank_part, thigh, axis, sin_cos[1], geo.front * sin_cos[0], bias.inner_thigh_rate, geo.front)
 
 
 @wp.func

@@ -1,4 +1,4 @@
-"""Putting worlds back to where they started."""
+"""Reset of masked worlds to their initial state."""
 
 import warp as wp
 
@@ -10,7 +10,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class StateArrays:
-    """What is known of the motion of all worlds, in Newton's layout."""
+    """State of all worlds, in Newton's layout."""
 
     joint_q: wp.array(dtype=float)  # (43 num_worlds,)
     joint_qd: wp.array(dtype=float)  # (38 num_worlds,)
@@ -53,7 +53,7 @@ def restore_motors_kernel(
     paw_force: wp.array2d(dtype=wp.vec3),
     peak_force: wp.array(dtype=float),
 ):
-    """Command the standing angles [rad] in the masked worlds, and forget torques and forces; launch over worlds."""
+    """Command the standing angles [rad] in the masked worlds, and zero torques and forces; launch over worlds."""
     world = wp.tid()
     if not mask[world]:
         return
@@ -98,12 +98,12 @@ def clear_contact_kernel(
     # out
     impulse: wp.array2d(dtype=wp.vec3),
     contact_force: wp.array2d(dtype=wp.vec3),
-    invalid: wp.array(dtype=int),
+    diverged: wp.array(dtype=int),
 ):
-    """Forget contact history and the invalid flag of the masked worlds; one thread per world."""
+    """Zero contact history and the flag `diverged` of the masked worlds; one thread per world."""
     world = wp.tid()
     if mask[world]:
-        invalid[world] = 0
+        diverged[world] = 0
         for k in range(4):
             impulse[k, world] = wp.vec3(0.0)
             contact_force[k, world] = wp.vec3(0.0)

@@ -1,4 +1,4 @@
-"""The parts of a time step that `advance` and `advance_legs` put together: a leg's terms, a paw's contact, the base.
+"""The parts of a time step shared by `advance` and `advance_legs`: a leg's terms, a paw's contact, the base.
 
 Semi-implicit Euler: forces and Jacobians at the start of the step, positions moved with the velocities at its end.
 """
@@ -7,7 +7,7 @@ import warp as wp
 
 from ..actuation.joint_forces import JointParams, joint_forces
 from ..actuation.springs import LegSpring, spring_torque
-from ..actuation.stops import StopRows
+from ..actuation.stops import StopRates
 from ..kinematics.geometry import LegGeometry
 from ..layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
 from ..scalar import real, vec3
@@ -17,7 +17,7 @@ from .base_dynamics import (
     BaseInverse,
     BaseSystem,
     LegSolve,
-    base_alone,
+    base_link_system,
     eliminate_leg,
 )
 from .base_motion import external_wrench
@@ -38,13 +38,13 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class Robot:
-    """What the step reads of the robot and the ground, besides its state."""
+class RobotModel:
+    """Parameters of the robots and their ground in every world; constant during a launch, blocks aside."""
 
-    geometry: wp.array(dtype=LegGeometry)  # (4,)
-    table: wp.array2d(dtype=real)  # parameters, see `parameters`
+    geometry: wp.array(dtype=LegGeometry)  # (4,): FL, FR, BL, BR, the same in all worlds
+    table: wp.array2d(dtype=real)  # (PARAMETER_ROWS, num_worlds), rows as in `layout`
     ground: Ground
-    held: wp.array(dtype=int)  # (num_worlds,), not 0: the base stays as it is, hung up; empty: none
+    held: wp.array(dtype=int)  # (num_worlds,), not 0: the base keeps its twist (hung up); empty: none
 
 
 @wp.struct
@@ -52,15 +52,15 @@ class StepSettings:
     """Numerical settings of the step."""
 
     dt: real  # [s]
-    substeps: int
-    max_sweeps: int
+    substeps: int  # steps of a launch
+    max_sweeps: int  # of the contact iteration
     tolerance: real  # [m/s], of the contact iteration
     first: int  # world of the first thread of a launch
 
 
 @wp.struct
 class LegParams:
-    """One leg of one world: what does not change as it moves."""
+    """Constants of one leg of one world."""
 
     geometry: LegGeometry
     masses: LegMasses
@@ -77,26 +77,30 @@ class LegTerms:
 
 
 @wp.func
-def load_leg(robot: Robot, world: int, k: int) -> LegParams:
+def load_leg(model: RobotModel, world: int, k: int) -> LegParams:
     """Return the parameters of leg k."""
     params = LegParams()
-    params.geometry = robot.geometry[k]
-    params.masses = load_masses(robot.table, k, world)
-    params.joints = load_joint_params(robot.table, k, world)
+    params.geometry = model.geometry[k]
+    params.masses = load_masses(model.table, k, world)
+    params.joints = load_joint_params(model.table, k, world)
     return params
 
 
 @wp.func
 def leg_terms(
-    params: LegParams, spring: LegSpring, angles: vec3, rates: vec3, torque: vec3, rows: StopRows, pressed: int,
+    params: LegParams, spring: LegSpring, angles: vec3, rates: vec3, torque: vec3, stop_rates: StopRates, pressed: int,
     omega: vec3, g: vec3, dt: real,
 ) -> LegTerms:  # fmt: skip
-    """Return a leg's dynamics, its elimination with the pressed stops, and its paw."""
+    """Return a leg's dynamics, its elimination with the pressed stops, and its paw, in body axes.
+
+    angles [rad], rates [rad/s], torque [N m] of the motors: lateral, outer, inner, at the start of the step dt [s].
+    omega [rad/s], g [m/s^2]: of the base, body axes. stop_rates, pressed: see `stops`.
+    """
     geo = params.geometry
     joints = params.joints
     pose = leg_pose(geo, angles)
     dynamics = leg_dynamics(geo, params.masses, pose, rates, omega, g)
-    passive = joint_forces(joints, pose.loop, geo.front, rates, rows, pressed, dt)
+    passive = joint_forces(joints, pose.loop, geo.front, rates, stop_rates, pressed, dt)
     total = torque + passive.torque
     if spring.stiffness != real(0.0):
         total += spring_torque(spring, pose.loop)
@@ -117,36 +121,36 @@ class Touch:
 
 
 @wp.func
-def block_law(robot: Robot, world: int, base: BaseState, dt: real) -> BlockLaw:
+def block_law(model: RobotModel, world: int, base: BaseState, dt: real) -> BlockLaw:
     """Return the law of a world's block in body axes; a block without mass where there is none."""
     law = BlockLaw()
-    if robot.ground.blocks.shape[0] > 0:
-        block = robot.ground.blocks[world]
+    if model.ground.blocks.shape[0] > 0:
+        block = model.ground.blocks[world]
         law.velocity = wp.quat_rotate_inv(base.quat, vec3(block.velocity[0], block.velocity[1], real(0.0)))
         law.up = wp.quat_rotate_inv(base.quat, vec3(real(0.0), real(0.0), real(1.0)))
         law.mass = block.mass
         law.friction = block.friction
-        law.weight = -dt * block.mass * robot.table[GRAVITY + 2, world]
+        law.weight = -dt * block.mass * model.table[GRAVITY + 2, world]
     return law
 
 
 @wp.func
-def touch_floor(robot: Robot, k: int, base: BaseState, paw: PawKinematics) -> Touch:
+def touch_floor(model: RobotModel, k: int, base: BaseState, paw: PawKinematics) -> Touch:
     """Return where paw k is nearest to the floor."""
     centre = base.pos + wp.quat_rotate(base.quat, paw.position)
     touch = Touch()
-    touch.gap = floor_distance(robot.ground, centre) - robot.geometry[k].paw_radius
-    touch.normal = wp.quat_rotate_inv(base.quat, floor_normal(robot.ground, centre))
+    touch.gap = floor_distance(model.ground, centre) - model.geometry[k].paw_radius
+    touch.normal = wp.quat_rotate_inv(base.quat, floor_normal(model.ground, centre))
     return touch
 
 
 @wp.func
-def touch_block(robot: Robot, world: int, k: int, base: BaseState, paw: PawKinematics, law: BlockLaw) -> Touch:
+def touch_block(model: RobotModel, world: int, k: int, base: BaseState, paw: PawKinematics, law: BlockLaw) -> Touch:
     """Return where paw k is nearest to the block."""
     centre = base.pos + wp.quat_rotate(base.quat, paw.position)
-    block = robot.ground.blocks[world]
+    block = model.ground.blocks[world]
     touch = Touch()
-    touch.gap = block_distance(block, centre) - robot.geometry[k].paw_radius
+    touch.gap = block_distance(block, centre) - model.geometry[k].paw_radius
     touch.normal = wp.quat_rotate_inv(base.quat, block_normal(block, centre))
     touch.velocity = law.velocity
     return touch
@@ -163,7 +167,7 @@ def friction_row(k: int, velocity: vec3, impulse: vec3, normal: vec3) -> int:
 
 @wp.func
 def paw_contact(
-    robot: Robot, world: int, k: int, base: BaseState, lin: vec3, ang: vec3, rates: vec3, old_rates: vec3,
+    model: RobotModel, world: int, k: int, base: BaseState, lin: vec3, ang: vec3, rates: vec3, old_rates: vec3,
     impulse: vec3, pressed: int, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, block: BlockLaw, dt: real,
 ) -> PawContact:  # fmt: skip
     """Return paw k's contact problem with floor or block, whichever is nearer.
@@ -172,16 +176,16 @@ def paw_contact(
     `base`: at its start; impulse: first guess [N s], world frame; pressed: the leg's hard stops.
     """
     contact = PawContact()
-    touch = touch_floor(robot, k, base, paw)
+    touch = touch_floor(model, k, base, paw)
     on_block = bool(False)
-    if has_block(robot.ground, world):
-        above = touch_block(robot, world, k, base, paw, block)
+    if has_block(model.ground, world):
+        above = touch_block(model, world, k, base, paw, block)
         if above.gap < touch.gap:
             touch = above
             on_block = True
     gap = touch.gap
     normal = touch.normal
-    arm = -robot.geometry[k].paw_radius * normal
+    arm = -model.geometry[k].paw_radius * normal
     point = paw.position + arm
     contact.jacobian = contact_jacobian(paw, arm)
     contact.normal = normal
@@ -191,9 +195,9 @@ def paw_contact(
     contact.active = 1
     contact.goal = target_normal_velocity(gap, pressed, dt)
     contact.impulse = wp.quat_rotate_inv(base.quat, impulse)
-    before = wp.quat_rotate_inv(base.quat, base.lin) + wp.cross(base.ang, point) + contact.jacobian * old_rates
-    contact.mu_row = friction_row(k, before - touch.velocity, contact.impulse, normal)
-    contact.mu = robot.table[contact.mu_row, world]
+    old_velocity = wp.quat_rotate_inv(base.quat, base.lin) + wp.cross(base.ang, point) + contact.jacobian * old_rates
+    contact.mu_row = friction_row(k, old_velocity - touch.velocity, contact.impulse, normal)
+    contact.mu = model.table[contact.mu_row, world]
     contact = couple_contact(contact, point, leg, inverse)
     if on_block:
         contact = add_block(contact, block)
@@ -201,17 +205,17 @@ def paw_contact(
 
 
 @wp.func
-def base_system(robot: Robot, world: int, base: BaseState, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
+def base_system(model: RobotModel, world: int, base: BaseState, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
     """Return the base link's own equations; force [N] and moment [N m] from outside at its com, world axes."""
-    wrench = external_wrench(base, base_com(robot.table, world), force, moment)
-    return base_alone(load_moments(robot.table, BASE, world), base.ang, g, wrench.force, wrench.moment)
+    wrench = external_wrench(base, base_com(model.table, world), force, moment)
+    return base_link_system(load_moments(model.table, BASE, world), base.ang, g, wrench.force, wrench.moment)
 
 
 @wp.func
-def hold_base(robot: Robot, world: int, inverse: BaseInverse) -> BaseInverse:
-    """Return the inverse of a world's base system, zero where the base is held: nothing accelerates it."""
-    if robot.held.shape[0] > 0:
-        if robot.held[world] != 0:
+def hold_base(model: RobotModel, world: int, inverse: BaseInverse) -> BaseInverse:
+    """Return the inverse of a world's base system, or zero (no acceleration) where the base is held."""
+    if model.held.shape[0] > 0:
+        if model.held[world] != 0:
             return BaseInverse()
     return inverse
 

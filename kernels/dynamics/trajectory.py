@@ -1,4 +1,4 @@
-"""What the kernels of rollouts share: their commands, rows of the state, and the targets that motors follow."""
+"""Data of rollouts shared by their kernels: commands, trajectory rows, latency and command filter."""
 
 import warp as wp
 
@@ -31,28 +31,28 @@ class Timing:
 
 @wp.struct
 class Actuation:
-    """What lies between targets and torques, per world."""
+    """Motors, latency and command filter of every world: from targets to torques."""
 
-    motors: MotorArrays  # fades aside
+    motors: MotorArrays  # without its fades, see `fade`
     fade: wp.array2d(dtype=real)  # [rad/s], (2, num_worlds): start and end of the over-speed protection
     latency: wp.array(dtype=real)  # [s], (num_worlds,)
-    filtered: int  # 0: the targets pass as they are
+    filtered: int  # 0: targets are not filtered
     limits: wp.array2d(dtype=real)  # constants of the filter, (FILTER_ROWS, num_worlds)
 
 
 @wp.struct
 class Commands:
-    """What a rollout is told; K = T S / every."""
+    """Inputs of a rollout of T policy steps."""
 
     target: wp.array3d(dtype=real)  # [rad], (T, 12, num_worlds)
-    before: wp.array2d(dtype=real)  # [rad], (12, num_worlds): what the motors follow until the first target arrives
+    initial_target: wp.array2d(dtype=real)  # [rad], (12, num_worlds), followed until the first target arrives
     wrench: wp.array3d(dtype=real)  # [N], [N m] at the base's com, world axes, (T, 6, num_worlds)
     impulse: wp.array2d(dtype=vec3)  # [N s] of each paw in the step before the first, world axes, (4, num_worlds)
 
 
 @wp.struct
-class Rows:
-    """A trajectory, or the gradient of a number by it; an empty array is one of zeros."""
+class TrajectoryArrays:
+    """A trajectory, or a gradient by one, where an empty array means zeros; K = T S / every, see `Timing`."""
 
     q: wp.array3d(dtype=real)  # [m], [rad], (K + 1, ROW_COORDS, num_worlds)
     qd: wp.array3d(dtype=real)  # [m/s], [rad/s], (K + 1, ROW_RATES, num_worlds)
@@ -73,44 +73,45 @@ def row_base(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3) 
 
 
 @wp.func
-def row_vec3(rows: wp.array3d(dtype=real), row: int, first: int, world: int) -> vec3:
-    """Return three entries of a row."""
-    return vec3(rows[row, first, world], rows[row, first + 1, world], rows[row, first + 2, world])
+def row_vec3(values: wp.array3d(dtype=real), row: int, first: int, world: int) -> vec3:
+    """Return three entries of a row, from index `first`; values: (rows, entries, num_worlds)."""
+    return vec3(values[row, first, world], values[row, first + 1, world], values[row, first + 2, world])
 
 
 @wp.func
-def row_quat(rows: wp.array3d(dtype=real), row: int, first: int, world: int) -> quat:
-    """Return four entries of a row."""
+def row_quat(values: wp.array3d(dtype=real), row: int, first: int, world: int) -> quat:
+    """Return four entries of a row, from index `first`."""
     return quat(
-        rows[row, first, world], rows[row, first + 1, world], rows[row, first + 2, world], rows[row, first + 3, world]
-    )
-
-
-@wp.func
-def store_row_vec3(rows: wp.array3d(dtype=real), row: int, first: int, world: int, v: vec3):
-    """Write three entries of a row."""
-    for i in range(3):
-        rows[row, first + i, world] = v[i]
-
-
-@wp.func
-def load_row_base(rows: Rows, row: int, world: int, com: vec3) -> BaseState:
-    """Return the base's state in a row."""
-    return row_base(
-        row_vec3(rows.q, row, 0, world), row_quat(rows.q, row, 3, world),
-        row_vec3(rows.qd, row, 0, world), row_vec3(rows.qd, row, 3, world), com,
+        values[row, first, world], values[row, first + 1, world], values[row, first + 2, world],
+        values[row, first + 3, world],
     )  # fmt: skip
 
 
 @wp.func
-def store_row_base(rows: Rows, row: int, world: int, com: vec3, base: BaseState):
+def store_row_vec3(values: wp.array3d(dtype=real), row: int, first: int, world: int, v: vec3):
+    """Write three entries of a row, from index `first`."""
+    for i in range(3):
+        values[row, first + i, world] = v[i]
+
+
+@wp.func
+def load_row_base(trajectory: TrajectoryArrays, row: int, world: int, com: vec3) -> BaseState:
+    """Return the base's state in a row."""
+    return row_base(
+        row_vec3(trajectory.q, row, 0, world), row_quat(trajectory.q, row, 3, world),
+        row_vec3(trajectory.qd, row, 0, world), row_vec3(trajectory.qd, row, 3, world), com,
+    )  # fmt: skip
+
+
+@wp.func
+def store_row_base(trajectory: TrajectoryArrays, row: int, world: int, com: vec3, base: BaseState):
     """Write the base's state to a row."""
     ang = wp.quat_rotate(base.quat, base.ang)
-    store_row_vec3(rows.q, row, 0, world, base.pos)
+    store_row_vec3(trajectory.q, row, 0, world, base.pos)
     for i in range(4):
-        rows.q[row, 3 + i, world] = base.quat[i]
-    store_row_vec3(rows.qd, row, 0, world, base.lin + wp.cross(ang, wp.quat_rotate(base.quat, com)))
-    store_row_vec3(rows.qd, row, 3, world, ang)
+        trajectory.q[row, 3 + i, world] = base.quat[i]
+    store_row_vec3(trajectory.qd, row, 0, world, base.lin + wp.cross(ang, wp.quat_rotate(base.quat, com)))
+    store_row_vec3(trajectory.qd, row, 3, world, ang)
 
 
 @wp.func
@@ -147,21 +148,21 @@ def load_world_motor(actuation: Actuation, motor: int, world: int) -> MotorParam
 
 @wp.struct
 class Arrival:
-    """Which targets a motor follows in a physics step, late by the latency: the mean over the step of what arrived."""
+    """Interpolation of the targets that a motor follows in a physics step, delayed by the latency: its mean target."""
 
-    older: int  # policy step of the target at the start of the physics step; -1: `Commands.before`
+    older: int  # policy step of the target at the start of the physics step; -1: `Commands.initial_target`
     newer: int  # and at its end
     weight: real  # of the newer one
 
 
 @wp.func
-def arrival(step: int, substeps: int, late: real) -> Arrival:
-    """Return what arrives during a physics step; late: latency in physics steps, any fraction.
+def arrival(step: int, substeps: int, delay: real) -> Arrival:
+    """Return the targets that arrive during a physics step; delay: latency in physics steps, any fraction.
 
     Where a target arrives just as the step begins it has weight 1, whose derivative is that of more latency. No target
     arrives before it is sent, whatever the latency.
     """
-    begin = real(step) - late
+    begin = real(step) - delay
     size = real(substeps)
     a = Arrival()
     a.older = wp.clamp(int(wp.ceil(begin / size)) - 1, -1, step / substeps)
@@ -173,33 +174,37 @@ def arrival(step: int, substeps: int, late: real) -> Arrival:
 
 
 @wp.func
-def commanded(safe: wp.array3d(dtype=real), before: wp.array2d(dtype=real), step: int, motor: int, world: int) -> real:
-    """Return a motor's target [rad] of a policy step, before the first one what it followed until then."""
+def policy_target(
+    filtered_target: wp.array3d(dtype=real), initial_target: wp.array2d(dtype=real), step: int, motor: int, world: int
+) -> real:
+    """Return a motor's filtered target [rad] of a policy step; step -1: its initial target."""
     if step < 0:
-        return before[motor, world]
-    return safe[step, motor, world]
+        return initial_target[motor, world]
+    return filtered_target[step, motor, world]
 
 
 @wp.func
-def arrived_target(commands: Commands, safe: wp.array3d(dtype=real), arrived: Arrival, motor: int, world: int) -> real:
-    """Return the target [rad] that a motor follows in a physics step."""
-    newer = commanded(safe, commands.before, arrived.newer, motor, world)
+def arrived_target(
+    commands: Commands, filtered_target: wp.array3d(dtype=real), arrived: Arrival, motor: int, world: int
+) -> real:
+    """Return the target [rad] that a motor follows in a physics step; filtered_target [rad]: (T, 12, num_worlds)."""
+    newer = policy_target(filtered_target, commands.initial_target, arrived.newer, motor, world)
     if arrived.weight == real(1.0):
         return newer
-    older = commanded(safe, commands.before, arrived.older, motor, world)
+    older = policy_target(filtered_target, commands.initial_target, arrived.older, motor, world)
     return older + arrived.weight * (newer - older)
 
 
 @wp.func
 def leg_torque(
-    commands: Commands, actuation: Actuation, safe: wp.array3d(dtype=real), arrived: Arrival, leg: int, world: int,
-    angles: vec3, rates: vec3,
+    commands: Commands, actuation: Actuation, filtered_target: wp.array3d(dtype=real), arrived: Arrival, leg: int,
+    world: int, angles: vec3, rates: vec3,
 ) -> vec3:  # fmt: skip
-    """Return the torques [N m] of a leg's motors in a physics step."""
+    """Return a leg's motor torques [N m] in a physics step; angles [rad], rates [rad/s]: of its motors."""
     torque = vec3(real(0.0))
     for j in range(3):
         motor = 3 * leg + j
-        target = arrived_target(commands, safe, arrived, motor, world)
+        target = arrived_target(commands, filtered_target, arrived, motor, world)
         torque[j] = motor_torque(target, angles[j], rates[j], load_world_motor(actuation, motor, world))
     return torque
 
@@ -207,13 +212,13 @@ def leg_torque(
 @wp.func
 def filter_commands(
     commands: Commands, actuation: Actuation, step: int, leg: int, world: int, angles: vec3, rates: vec3,
-    safe: wp.array3d(dtype=real),
+    filtered_target: wp.array3d(dtype=real),
 ):  # fmt: skip
-    """Write what the filter lets through of a leg's targets at the start of a policy step."""
+    """Write a leg's filtered targets [rad] of a policy step, for angles [rad] and rates [rad/s] at its start."""
     m = 3 * leg
     target = row_vec3(commands.target, step, m, world)
     if actuation.filtered != 0:
         offset = actuation.motors.offset
-        read = angles + vec3(offset[m, world], offset[m + 1, world], offset[m + 2, world])
-        target = filter_leg(target, read, rates, load_filter(actuation.limits, world))
-    store_row_vec3(safe, step, m, world, target)
+        measured = angles + vec3(offset[m, world], offset[m + 1, world], offset[m + 2, world])
+        target = filter_leg(target, measured, rates, load_filter(actuation.limits, world))
+    store_row_vec3(filtered_target, step, m, world, target)

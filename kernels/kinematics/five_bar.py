@@ -18,8 +18,8 @@ from .trig import sin_cos
 class FiveBar:
     """Configuration of the loop and its first derivatives with respect to the outer and inner motor angles."""
 
-    outer_turn: vec2  # sine and cosine of the outer motor angle
-    inner_turn: vec2
+    outer_sin_cos: vec2  # sine and cosine of the outer motor angle
+    inner_sin_cos: vec2
     outer_knee: vec2  # [m]
     inner_knee: vec2  # [m]
     ankle: vec2  # [m]
@@ -51,13 +51,13 @@ class FiveBarBias:
 
 
 @wp.func
-def turn_rate(direction: vec2, velocity: vec2, length: real) -> real:
+def rotation_rate(direction: vec2, velocity: vec2, length: real) -> real:
     """Return the rate about +y [rad/s] of a link whose far end moves at `velocity` relative to its near end."""
     return (direction[1] * velocity[0] - direction[0] * velocity[1]) / length
 
 
 @wp.func
-def meet_projections(a: vec2, b: vec2, along_a: real, along_b: real) -> vec2:
+def solve_projections(a: vec2, b: vec2, along_a: real, along_b: real) -> vec2:
     """Return the vector x with a.x = along_a and b.x = along_b, for unit vectors a and b."""
     det = a[0] * b[1] - a[1] * b[0]
     # the shanks are parallel only where the knees coincide: keep the division finite there
@@ -71,9 +71,9 @@ def five_bar(geo: LegGeometry, outer: real, inner: real) -> FiveBar:
     """Return the loop's configuration and derivatives for motor angles `outer` and `inner` [rad]."""
     f = geo.front
     loop = FiveBar()
-    outer_turn, inner_turn = sin_cos(outer), sin_cos(inner)
-    outer_sin, outer_cos = outer_turn[0], outer_turn[1]
-    inner_sin, inner_cos = inner_turn[0], inner_turn[1]
+    outer_sin_cos, inner_sin_cos = sin_cos(outer), sin_cos(inner)
+    outer_sin, outer_cos = outer_sin_cos[0], outer_sin_cos[1]
+    inner_sin, inner_cos = inner_sin_cos[0], inner_sin_cos[1]
     outer_knee = vec2(geo.outer_x + f * geo.thigh * outer_sin, -geo.thigh * outer_cos)
     inner_knee = vec2(geo.inner_x - f * geo.thigh * inner_sin, -geo.thigh * inner_cos)
     outer_knee_do = vec2(f * geo.thigh * outer_cos, geo.thigh * outer_sin)
@@ -85,11 +85,11 @@ def five_bar(geo: LegGeometry, outer: real, inner: real) -> FiveBar:
     ankle = real(0.5) * (outer_knee + inner_knee) + f * wp.sqrt(height_sq / span_sq) * vec2(span[1], -span[0])
     outer_shank = (ankle - outer_knee) / geo.shank
     inner_shank = (ankle - inner_knee) / geo.shank
-    ankle_do = meet_projections(outer_shank, inner_shank, wp.dot(outer_shank, outer_knee_do), real(0.0))
-    ankle_di = meet_projections(outer_shank, inner_shank, real(0.0), wp.dot(inner_shank, inner_knee_di))
+    ankle_do = solve_projections(outer_shank, inner_shank, wp.dot(outer_shank, outer_knee_do), real(0.0))
+    ankle_di = solve_projections(outer_shank, inner_shank, real(0.0), wp.dot(inner_shank, inner_knee_di))
 
-    loop.outer_turn = outer_turn
-    loop.inner_turn = inner_turn
+    loop.outer_sin_cos = outer_sin_cos
+    loop.inner_sin_cos = inner_sin_cos
     loop.outer_knee = outer_knee
     loop.inner_knee = inner_knee
     loop.ankle = ankle
@@ -99,10 +99,10 @@ def five_bar(geo: LegGeometry, outer: real, inner: real) -> FiveBar:
     loop.inner_knee_di = inner_knee_di
     loop.ankle_do = ankle_do
     loop.ankle_di = ankle_di
-    loop.outer_shank_do = turn_rate(outer_shank, ankle_do - outer_knee_do, geo.shank)
-    loop.outer_shank_di = turn_rate(outer_shank, ankle_di, geo.shank)
-    loop.inner_shank_do = turn_rate(inner_shank, ankle_do, geo.shank)
-    loop.inner_shank_di = turn_rate(inner_shank, ankle_di - inner_knee_di, geo.shank)
+    loop.outer_shank_do = rotation_rate(outer_shank, ankle_do - outer_knee_do, geo.shank)
+    loop.outer_shank_di = rotation_rate(outer_shank, ankle_di, geo.shank)
+    loop.inner_shank_do = rotation_rate(inner_shank, ankle_do, geo.shank)
+    loop.inner_shank_di = rotation_rate(inner_shank, ankle_di - inner_knee_di, geo.shank)
     return loop
 
 
@@ -119,7 +119,7 @@ def five_bar_bias(geo: LegGeometry, loop: FiveBar, outer_rate: real, inner_rate:
     inner_knee_acc = inner_rate * inner_rate * (vec2(geo.inner_x, real(0.0)) - loop.inner_knee)
     outer_rel = ankle_vel - outer_knee_vel
     inner_rel = ankle_vel - inner_knee_vel
-    ankle_acc = meet_projections(
+    ankle_acc = solve_projections(
         loop.outer_shank,
         loop.inner_shank,
         wp.dot(loop.outer_shank, outer_knee_acc) - wp.dot(outer_rel, outer_rel) / geo.shank,
@@ -132,8 +132,8 @@ def five_bar_bias(geo: LegGeometry, loop: FiveBar, outer_rate: real, inner_rate:
     bias.outer_knee_acc = outer_knee_acc
     bias.inner_knee_acc = inner_knee_acc
     bias.ankle_acc = ankle_acc
-    bias.outer_shank_acc = turn_rate(loop.outer_shank, ankle_acc - outer_knee_acc, geo.shank)
-    bias.inner_shank_acc = turn_rate(loop.inner_shank, ankle_acc - inner_knee_acc, geo.shank)
+    bias.outer_shank_acc = rotation_rate(loop.outer_shank, ankle_acc - outer_knee_acc, geo.shank)
+    bias.inner_shank_acc = rotation_rate(loop.inner_shank, ankle_acc - inner_knee_acc, geo.shank)
     return bias
 
 

@@ -4,7 +4,7 @@ A reachable target takes one closed-form solution: the lateral angle from the ci
 each thigh angle from the triangle of thigh, shank and the line to the ankle, knees outward. Within the joint limits
 every ankle position has exactly one such solution, and `five_bar` returns the same ankle for it.
 
-A target that cannot be reached is answered with the pose within limits whose ankle is nearest to it: a coarse grid over
+For an unreachable target the result is the pose within limits whose ankle is nearest to it: a coarse grid over
 both thigh angles, then a compass search around the best point, with the lateral angle solved exactly at each. The
 distance left is within 1 mm of the true least distance, and most often within 1 micrometre.
 
@@ -16,7 +16,7 @@ import warp as wp
 from ..scalar import quat, real, vec2, vec3
 from .five_bar import five_bar
 from .geometry import LegGeometry
-from .leg import ankle_in_housing, knee_angles, leg_forward_kinematics, turn_lateral
+from .leg import ankle_in_housing, knee_angles, leg_forward_kinematics, rotate_lateral
 
 wp.set_module_options({"enable_backward": False})
 
@@ -46,7 +46,7 @@ class LegLimits:
 
 @wp.struct
 class LegPose:
-    """Joint angles of a leg for a wanted ankle position."""
+    """Joint angles of a leg for a target ankle position."""
 
     motors: vec3  # [rad] lateral, outer, inner
     knees: vec2  # [rad] outer, inner; passive
@@ -56,14 +56,14 @@ class LegPose:
 
 @wp.func
 def clamp_transversal(limits: LegLimits, outer: real, inner: real) -> vec2:
-    """Return (outer, inner) [rad] moved within limits; the inner one gives way to the limits of the sum."""
+    """Return (outer, inner) [rad] clamped to limits; the limits of the sum change the inner one."""
     lower = limits.transversal_lower
     upper = limits.transversal_upper
-    safe_outer = wp.clamp(outer, wp.max(lower, limits.sum_lower - upper), wp.min(upper, limits.sum_upper - lower))
-    safe_inner = wp.clamp(
-        inner, wp.max(lower, limits.sum_lower - safe_outer), wp.min(upper, limits.sum_upper - safe_outer)
+    clamped_outer = wp.clamp(outer, wp.max(lower, limits.sum_lower - upper), wp.min(upper, limits.sum_upper - lower))
+    clamped_inner = wp.clamp(
+        inner, wp.max(lower, limits.sum_lower - clamped_outer), wp.min(upper, limits.sum_upper - clamped_outer)
     )
-    return vec2(safe_outer, safe_inner)
+    return vec2(clamped_outer, clamped_inner)
 
 
 @wp.func
@@ -114,7 +114,7 @@ def clamped_closed_form(geo: LegGeometry, limits: LegLimits, target: vec3) -> ve
 def nearest_ankle(geo: LegGeometry, limits: LegLimits, target: vec3, thighs: vec2) -> vec3:
     """Return the ankle position nearest to `target` for thigh angles [rad]; both [m] relative to the hip, body axes."""
     ankle = ankle_in_housing(geo, five_bar(geo, thighs[0], thighs[1]))
-    return turn_lateral(geo, nearest_lateral(geo, limits, target, ankle[2]), ankle)
+    return rotate_lateral(geo, nearest_lateral(geo, limits, target, ankle[2]), ankle)
 
 
 @wp.func
@@ -166,17 +166,17 @@ def nearest_reachable(geo: LegGeometry, limits: LegLimits, target: vec3, guess: 
 
 @wp.func
 def leg_inverse_kinematics(geo: LegGeometry, limits: LegLimits, ankle_body: vec3) -> LegPose:
-    """Return the leg's pose for a wanted ankle position [m] in the body frame.
+    """Return the leg's pose for a target ankle position [m] in the body frame.
 
-    Out of reach: the pose within limits with the nearest ankle. A target that is not finite is answered as if it were
+    Out of reach: the pose within limits with the nearest ankle. A target that is not finite counts as
     the point a shank's length below the middle of the two transversal axes; no result is ever NaN.
     """
     pose = LegPose()
     finite = wp.isfinite(ankle_body)
     below = vec3(real(0.5) * (geo.outer_x + geo.inner_x), geo.plane_y + geo.knee_y, -geo.shank)
-    wanted = wp.where(finite, ankle_body - geo.hip, below)
-    farthest = wp.max(wp.max(wp.abs(wanted[0]), wp.abs(wanted[1])), wp.abs(wanted[2]))
-    target = wanted * (FAR / wp.max(farthest, FAR))
+    from_hip = wp.where(finite, ankle_body - geo.hip, below)
+    farthest = wp.max(wp.max(wp.abs(from_hip[0]), wp.abs(from_hip[1])), wp.abs(from_hip[2]))
+    target = from_hip * (FAR / wp.max(farthest, FAR))
     motors = clamped_closed_form(geo, limits, target)
     miss = wp.length(leg_forward_kinematics(geo, motors[0], motors[1], motors[2]) - geo.hip - target)
     if miss > REACHED:
@@ -223,7 +223,7 @@ def inverse_kinematics_kernel(
 ):
     """Write the poses of whole robots; one thread per (leg, robot), launched over (4, n).
 
-    geometry: 4 legs. base_pos [m] (n,), base_quat (n,) xyzw, unit: body to world. paws [m] (4, n): wanted centres of
+    geometry: 4 legs. base_pos [m] (n,), base_quat (n,) xyzw, unit: body to world. paws [m] (4, n): target centres of
     the paws, in the body frame, or in the world frame if `paws_in_world` is 1 (the base is not read otherwise).
     motors (12, n), knees (8, n: outer, inner per leg) [rad]. reachable (4, n), residual [m] (4, n): see `LegPose`.
     """

@@ -12,7 +12,7 @@ from .geometry import LegGeometry
 
 
 @wp.func
-def turn_lateral(geo: LegGeometry, lateral: real, housing_vector: vec3) -> vec3:
+def rotate_lateral(geo: LegGeometry, lateral: real, housing_vector: vec3) -> vec3:
     """Return a housing-frame vector in the body frame, for the lateral angle [rad]; a negated angle turns back."""
     c = wp.cos(lateral)
     s = geo.side * wp.sin(lateral)
@@ -31,16 +31,16 @@ def ankle_in_housing(geo: LegGeometry, loop: FiveBar) -> vec3:
 def leg_forward_kinematics(geo: LegGeometry, lateral: real, outer: real, inner: real) -> vec3:
     """Return the ankle [m] in the body frame, for motor angles [rad]."""
     loop = five_bar(geo, outer, inner)
-    return geo.hip + turn_lateral(geo, lateral, ankle_in_housing(geo, loop))
+    return geo.hip + rotate_lateral(geo, lateral, ankle_in_housing(geo, loop))
 
 
 @wp.func
 def leg_jacobian(geo: LegGeometry, lateral: real, outer: real, inner: real) -> mat33:
     """Return d ankle / d (lateral, outer, inner) [m/rad], shape (3, 3), ankle in the body frame, angles in rad."""
     loop = five_bar(geo, outer, inner)
-    arm = turn_lateral(geo, lateral, ankle_in_housing(geo, loop))
-    by_outer = turn_lateral(geo, lateral, vec3(loop.ankle_do[0], real(0.0), loop.ankle_do[1]))
-    by_inner = turn_lateral(geo, lateral, vec3(loop.ankle_di[0], real(0.0), loop.ankle_di[1]))
+    arm = rotate_lateral(geo, lateral, ankle_in_housing(geo, loop))
+    by_outer = rotate_lateral(geo, lateral, vec3(loop.ankle_do[0], real(0.0), loop.ankle_do[1]))
+    by_inner = rotate_lateral(geo, lateral, vec3(loop.ankle_di[0], real(0.0), loop.ankle_di[1]))
     return mat33(
         real(0.0), by_outer[0], by_inner[0],
         -geo.side * arm[2], by_outer[1], by_inner[1],
@@ -67,7 +67,7 @@ def leg_inverse_velocity(geo: LegGeometry, angles: vec3, ankle_vel: vec3) -> vec
     line; nearer to it the rates are damped: at most 100 rad/s per m/s along the shank.
     """
     loop = five_bar(geo, angles[1], angles[2])
-    vel = turn_lateral(geo, -angles[0], ankle_vel)
+    vel = rotate_lateral(geo, -angles[0], ankle_vel)
     # only the lateral motor moves the ankle along housing y; within joint limits the ankle is 0.1 m below or more
     lateral_rate = -geo.side * vel[1] / wp.min(loop.ankle[1], real(-0.01))
     in_plane = vec2(vel[0], vel[2] - geo.side * lateral_rate * (geo.plane_y + geo.knee_y))

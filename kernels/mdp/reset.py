@@ -228,5 +228,5 @@ def clear_history_kernel(
         arrays.collisions[m, world] = 0
         update_paw_kinematics(arrays, geometry[m], world, m)
     if m == 0:
-        arrays.invalid[world] = 0
+        arrays.diverged[world] = 0
         arrays.prev_lin_vel[world] = base_velocity(arrays, world, base_quat(arrays, world))

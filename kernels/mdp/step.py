@@ -89,7 +89,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         termination = int(NOT_TERMINATED)
         timeout = float(0.0)
         success = bool(False)
-        diverged = arrays.invalid[world] != 0 or episode.bad_action[world] != 0 or has_diverged(robot)
+        diverged = arrays.diverged[world] != 0 or episode.bad_action[world] != 0 or has_diverged(robot)
         if diverged:
             termination = wp.static(broken_ending)
         for i in range(wp.static(len(endings))):

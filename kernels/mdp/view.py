@@ -57,7 +57,7 @@ class RobotArrays:
     body_com: wp.array(dtype=wp.vec3)
     body_f: wp.array(dtype=wp.spatial_vector)  # [N], [N m] wrench on each body at its com, world axes
     gravity: wp.array(dtype=wp.vec3)  # [m/s^2] (num_worlds + 1,), world axes
-    invalid: wp.array(dtype=int)  # (num_worlds,) 1: the solver froze the world because its state diverged
+    diverged: wp.array(dtype=int)  # (num_worlds,) 1: the solver froze the world because its state diverged
     impulse: wp.array2d(dtype=wp.vec3)  # [N s] (4, num_worlds) first guess of the next contact
     paw_force: wp.array2d(dtype=wp.vec3)  # [N] (4, num_worlds), like all of paws
     peak_force: wp.array2d(dtype=float)  # [N]

@@ -1,6 +1,6 @@
-"""The ground that the paws stand on: a plane z = 0 or a heightfield, and in each world a block that slides on it.
+"""The ground under the paws: a plane z = 0 or a heightfield, and in each world a block that slides on it.
 
-A function that is given a `Ground` sees the block in `Ground.block`, that of one world: `world_ground` puts it there.
+Functions of a point take the ground of one world, whose block `world_ground` has copied to `Ground.block`.
 """
 
 import warp as wp
@@ -42,7 +42,7 @@ class Ground:
 
 @wp.func
 def world_ground(ground: Ground, world: int) -> Ground:
-    """Return the ground as one world has it, with that world's block."""
+    """Return the ground of one world, with that world's block."""
     here = ground
     if ground.blocks.shape[0] > 0:
         here.block = ground.blocks[world]

@@ -18,8 +18,8 @@ from jumper_warp.cli.task_flags import flag_name, flags_of, with_flags
 from jumper_warp.cli.train import TrainArgs, parse_settings, parse_train
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.commands import PlayCfg, viewer_command
-from jumper_warp.evaluation.heights import HeightFlags, HeightGoals
-from jumper_warp.evaluation.places import PlaceFlags, PlaceGoals
+from jumper_warp.evaluation.heights import HeightFlags, HeightPlayFlags
+from jumper_warp.evaluation.landings import LandingFlags, LandingPlayFlags
 from jumper_warp.policies.folder import load_policy, save_policy
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.runs import open_policy
@@ -336,18 +336,18 @@ def test_terms_whose_names_make_the_same_flag_are_refused():
     ("make", "message"),
     [
         (lambda: HeightFlags(jumps=0), "jumps must be at least 1"),
-        (lambda: PlaceFlags(jumps=0), "jumps must be at least 1"),
+        (lambda: LandingFlags(jumps=0), "jumps must be at least 1"),
         (lambda: HeightFlags(lower=1.0, upper=0.5), "heights must be"),
         (lambda: HeightFlags(lower=0.0), "heights must be"),
-        (lambda: PlaceFlags(x=(1.0, 0.5)), "x must be in"),
-        (lambda: PlaceFlags(heading=float("inf")), "heading must be finite or any"),
+        (lambda: LandingFlags(x=(1.0, 0.5)), "x must be in"),
+        (lambda: LandingFlags(heading=float("inf")), "heading must be finite or any"),
         (lambda: HeightFlags(in_range=(1.0, 0.5)), "in_range must be in"),
-        (lambda: PlaceFlags(in_range=(1.0, 0.5)), "in_range must be in"),
-        (lambda: HeightGoals(height=()), "height takes 1 to 64"),
-        (lambda: HeightGoals(height=(-1.0,)), "height takes 1 to 64"),
-        (lambda: PlaceGoals(goal=((float("nan"), 0.0),)), "goal takes up to 64"),
-        (lambda: PlaceGoals(then=((0.5, 0.0),) * 65), "then takes up to 64"),
-        (lambda: PlayCfg(HeightGoals(), seconds=0.0), "seconds must be in"),
+        (lambda: LandingFlags(in_range=(1.0, 0.5)), "in_range must be in"),
+        (lambda: HeightPlayFlags(height=()), "height takes 1 to 64"),
+        (lambda: HeightPlayFlags(height=(-1.0,)), "height takes 1 to 64"),
+        (lambda: LandingPlayFlags(goal=((float("nan"), 0.0),)), "goal takes up to 64"),
+        (lambda: LandingPlayFlags(then=((0.5, 0.0),) * 65), "then takes up to 64"),
+        (lambda: PlayCfg(HeightPlayFlags(), seconds=0.0), "seconds must be in"),
     ],
 )
 def test_impossible_settings_are_refused(make, message):

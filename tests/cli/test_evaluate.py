@@ -6,16 +6,16 @@ import pytest
 
 from jumper_warp.cli import evaluate, play
 from jumper_warp.evaluation.commands import csv_text
+from jumper_warp.evaluation.evaluations import EVALUATIONS, evaluation_of
 from jumper_warp.evaluation.heights import HeightFlags, HeightLog
-from jumper_warp.evaluation.places import ENDS, PlaceFlags
-from jumper_warp.evaluation.registry import EVALUATIONS, evaluation_of
+from jumper_warp.evaluation.landings import LANDING_TERMINATIONS, LandingFlags
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.utils.errors import InputError
 from landing_helpers import still_policy
 
-TASK = EVALUATIONS["landing_position"].for_evaluation(make_task("horizontal-jump"))
+TASK = EVALUATIONS["place"].prepare_task(make_task("horizontal-jump"))
 
 
 @pytest.fixture(scope="module")
@@ -34,8 +34,8 @@ def test_every_task_is_measured_by_a_success_that_comes_after_all_falls():
         ("omnidirectional-jump", "omnidirectional"),
     )] == [True] * 3  # fmt: skip
     for name, kind in kinds.items():
-        ends = [term.name for term in kind.for_evaluation(make_task(name)).terminations]
-        assert ends[-1] == "success" and (name == "vertical-jump" or set(ends) == set(ENDS))
+        ends = [term.name for term in kind.prepare_task(make_task(name)).terminations]
+        assert ends[-1] == "success" and (name == "vertical-jump" or set(ends) == set(LANDING_TERMINATIONS))
 
 
 def test_task_with_an_unknown_evaluation_is_refused():
@@ -46,18 +46,18 @@ def test_task_with_an_unknown_evaluation_is_refused():
 
 
 def test_places_are_spread_ahead_and_drawn_aside_and_headings_too():
-    flags = PlaceFlags(jumps=5, y=(-0.2, 0.1))
+    flags = LandingFlags(jumps=5, y=(-0.2, 0.1))
     log = flags.log(TASK, seed=3)
-    assert log.places[:, 0, 0] == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.5])
-    aside = log.places[:, 0, 1]
+    assert log.goal_positions[:, 0, 0] == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.5])
+    aside = log.goal_positions[:, 0, 1]
     assert -0.2 <= aside.min() < aside.max() <= 0.1
     assert len(set(log.headings)) == 5 and np.abs(log.headings).max() <= math.pi
-    assert np.array_equal(flags.log(TASK, seed=3).places, log.places)
+    assert np.array_equal(flags.log(TASK, seed=3).goal_positions, log.goal_positions)
     assert not np.array_equal(flags.log(TASK, seed=4).headings, log.headings)
 
 
 def test_one_heading_is_that_of_all_in_radians():
-    assert PlaceFlags(jumps=2, x=(0.3, 0.4), y=(0.0, 0.0), heading=90.0).log(TASK, 0).headings == pytest.approx(
+    assert LandingFlags(jumps=2, x=(0.3, 0.4), y=(0.0, 0.0), heading=90.0).log(TASK, 0).headings == pytest.approx(
         0.5 * math.pi
     )
 
@@ -107,12 +107,12 @@ def test_policy_comes_first(command, args):
 
 def test_range_of_places_counts_distances():
     goals = [[0.3, 0.0], [0.0, -0.3], [0.6, 0.6]]
-    flags = PlaceFlags(jumps=3, x=(0.0, 0.0), y=(0.0, 0.0), heading=0.0, in_range=(0.3, 0.5))
+    flags = LandingFlags(jumps=3, x=(0.0, 0.0), y=(0.0, 0.0), heading=0.0, in_range=(0.3, 0.5))
     landings = flags.log(TASK, 0)
-    landings.places[:, 0] = goals
+    landings.goal_positions[:, 0] = goals
     landings.place[:, 0], landings.target[:, 0] = goals, goals
     landings.heading[:], landings.yaw[:], landings.tilt[:] = 0.0, 0.0, 0.0
-    landings.end[:, 0] = [*[ENDS.index("success")] * 2, ENDS.index("low_base")]
+    landings.end[:, 0] = [*[LANDING_TERMINATIONS.index("success")] * 2, LANDING_TERMINATIONS.index("low_base")]
     metrics = flags.metrics(landings)
     assert (metrics["success_rate_in_range"], metrics["success_rate"]) == (1.0, pytest.approx(2 / 3))
     assert (metrics["range_lower_m"], metrics["range_upper_m"]) == (0.3, 0.5)

@@ -11,8 +11,8 @@ import pytest
 
 from jumper_warp.cli.main import main
 from jumper_warp.identification.actuators import COLUMNS, described_constants
-from jumper_warp.identification.identify import total_mass
 from jumper_warp.identification.motions import load_motion
+from jumper_warp.identification.parameters import total_mass
 from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.robot.values import RobotValues

@@ -229,7 +229,7 @@ def test_a_changed_file_is_told_and_settings_stay_those_of_the_run(capsys, runs,
     args = ["--device", "cpu", "--iterations", "2", "--resume", str(folder)]
     code, _, err = run(capsys, "train", "tame-jump", "--task-module", str(edited), *args)
     assert code == 0, err
-    told = "my_jumps has changed since: its functions are those of now, settings those of the run"
+    told = "my_jumps has changed since: its present functions are used, with the run's settings"
     assert err.count(told) == 1 and "iterations 1 -> 2" in err
     config = json.loads((folder / "config.json").read_text())
     assert config["sources"] == {"my_jumps": hashlib.sha256(edited.read_bytes()).hexdigest()}

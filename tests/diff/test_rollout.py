@@ -1,4 +1,4 @@
-"""Rollouts forwards: as the simulation, in double precision, on threads; as functions of PyTorch tensors; refusals."""
+"""Rollouts: forward pass against the simulation, threads, the PyTorch bridge, and refusals of bad input."""
 
 import math
 
@@ -15,7 +15,7 @@ from jumper_warp.sim.simulation import Simulation
 from tests.helpers.rollout_helpers import DT, SUBSTEPS, defaults, push_off, rollout, run, squat
 
 
-def test_a_rollout_is_what_the_simulation_does_bit_for_bit():
+def test_rollout_matches_simulation_bitwise():
     settings = {"command_filter": vertical_jump_filter(), "tolerance": 1.0e-5}
     simulation = Simulation(2, motors=jumping_motors(), visuals=False, **settings)
     model = build_model(2, visuals=False)
@@ -32,9 +32,9 @@ def test_a_rollout_is_what_the_simulation_does_bit_for_bit():
     np.testing.assert_allclose(trajectory.impulse.numpy()[-1] * 480, simulation.paw_force.numpy(), rtol=1.0e-6)
 
 
-def test_threads_change_no_bit():
+def test_threads_do_not_change_results():
     model = build_model(40, visuals=False)
-    found = []
+    results = []
     for threads in (1, 2):
         of = Rollout(model, command_filter=vertical_jump_filter(), double=True, dt=DT, substeps=4, threads=threads)
         assert len(of.slices) == threads
@@ -42,19 +42,19 @@ def test_threads_change_no_bit():
         q[2] += np.linspace(0.0, 0.1, 40)
         trajectory = of.run(push_off(6), q, qd)
         gradients = of.backward(trajectory, qd=wp.full_like(trajectory.qd, 1.0))
-        found.append({"q": trajectory.q.numpy()} | {f"by {name}": array.numpy() for name, array in gradients.items()})
-    for name, values in found[0].items():
-        np.testing.assert_array_equal(found[1][name], values, err_msg=name)
+        results.append({"q": trajectory.q.numpy()} | {f"by {name}": array.numpy() for name, array in gradients.items()})
+    for name, values in results[0].items():
+        np.testing.assert_array_equal(results[1][name], values, err_msg=name)
 
 
-def test_slices_that_run_side_by_side_have_settings_of_their_own(monkeypatch):
+def test_concurrent_slices_have_separate_settings(monkeypatch):
     of, given = Rollout(build_model(40, visuals=False), threads=2), []
     monkeypatch.setattr(wp, "launch", lambda kernel, **call: given.append(call["inputs"][1]))
     of.run(push_off(1), *of.standing())
     assert sorted(settings._ctype.first for settings in given) == [worlds.first for worlds in of.slices] != [0, 0]
 
 
-def test_rollouts_go_on_where_they_ended():
+def test_rollout_continues_from_end():
     whole = run(rollout(), defaults())
     first = rollout().run(push_off()[:5], *squat())
     rest = rollout().run(push_off()[5:], **first.end())
@@ -62,26 +62,26 @@ def test_rollouts_go_on_where_they_ended():
 
 
 def test_a_wrench_acts_in_double_precision():
-    """A robot in the air, its motors idle: twice a force of 0.1 uN, twice the speed that it adds to that of falling."""
+    """On a robot in the air with idle motors, doubling a force of 0.1 uN doubles the speed that it adds."""
     q, qd = squat()
     q[2] = 1.0
     of = rollout()
-    run(of, defaults() | {"kp": np.zeros(12), "kd": np.zeros(12)})  # writes the parameters
+    run(of, defaults() | {"kp": np.zeros(12), "kd": np.zeros(12)})  # write the parameters
     speeds = []
     for force in (0.0, 1.0e-7, 2.0e-7):
         wrench = np.tile([force, 0.0, 0.0, 0.0, 0.0, 0.0], (2, 1))
         speeds.append(of.run(np.zeros((2, 12)), q, 0.0 * qd, wrench=wrench).qd.numpy()[-1, 0, 0])
     added = np.diff(speeds)
     assert added[1] == pytest.approx(added[0], rel=1.0e-5)
-    # at least the speed of a robot of 14.5 kg that is rigid; less of the legs follow at once
+    # at least the speed of a rigid robot of 14.5 kg: the legs do not follow fully
     assert 1.0e-7 * 2 * SUBSTEPS * DT / 14.6 < added[0] < 1.0e-7 * 2 * SUBSTEPS * DT / 4.0
 
 
-def test_what_is_kept_of_a_policy_step_is_below_two_kilobytes():
+def test_trajectory_stores_below_two_kilobytes_per_policy_step():
     trajectory = rollout().run(push_off(8), *squat())
     usual = Rollout(rollout().dynamics.model, double=True).run(push_off(8), *squat())
     for made, steps in ((trajectory, 8), (usual, 8)):
-        arrays = (made.q, made.qd, made.torque, made.impulse, made.pressed, made.safe)
+        arrays = (made.q, made.qd, made.torque, made.impulse, made.pressed, made.filtered_target)
         per_step = sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays) / (steps + 1)
         assert per_step <= 2000.0
 
@@ -95,7 +95,7 @@ def losses(trajectory):
     return 1.0e-3 * trajectory.torque.square().sum() + 0.01 * trajectory.impulse[..., 2].sum()
 
 
-def test_torch_gives_the_gradients_of_differences():
+def test_torch_gradients_match_central_differences():
     of, (q, qd) = rollout(2), tensors()
     targets = torch.tensor(push_off(10)).requires_grad_()
     kp = torch.full((12,), 70.0, dtype=torch.float64, requires_grad=True)
@@ -117,13 +117,13 @@ def test_torch_gives_the_gradients_of_differences():
 
 
 @pytest.mark.parametrize("late", [0.0, 0.011])
-def test_torch_step_by_step_gives_the_gradients_of_the_whole(late):
-    """As with a policy between the steps; a later run with other parameters does not disturb an earlier one's pass.
+def test_torch_gradients_step_by_step_match_the_whole(late):
+    """One call per step, as with a policy in the loop; a later run with other parameters changes no gradient.
 
-    What arrives late [s] acts in the next call, through what the motors followed before.
+    With a latency [s] a target acts in the next call, through `initial_target`.
     """
     of, (q, qd) = rollout(), tensors()
-    found, latency = [], torch.full((1,), late, dtype=torch.float64)
+    results, latency = [], torch.full((1,), late, dtype=torch.float64)
     for stepwise in (False, True):
         targets = torch.tensor(push_off(8)).requires_grad_()
         kp = torch.full((12,), 70.0, dtype=torch.float64, requires_grad=True)
@@ -138,40 +138,40 @@ def test_torch_step_by_step_gives_the_gradients_of_the_whole(late):
             made = simulate(of, targets, q, qd, kp=kp, latency=latency)
             total = losses(made) + made.q[-1, 2].sum()
         total.backward()
-        found.append((total.item(), targets.grad.numpy(), kp.grad.numpy()))
+        results.append((total.item(), targets.grad.numpy(), kp.grad.numpy()))
     simulate(of, targets.detach(), q, qd, latency=0.0 * latency)
-    for whole, stepped in zip(*found, strict=True):
+    for whole, stepped in zip(*results, strict=True):
         np.testing.assert_allclose(stepped, whole, rtol=0.0, atol=1.0e-12 * np.abs(whole).max())
 
 
-def test_what_is_late_at_first_makes_the_start_matter_twice():
-    """Motors follow the angles that they start at, unless told otherwise: the gradient by q has both."""
-    of, (q, qd) = rollout.__wrapped__(), tensors()  # whose parameters are its own
-    targets, late, found = torch.tensor(push_off(6)), torch.tensor([0.006], dtype=torch.float64), []
+def test_gradient_by_q_includes_default_initial_target():
+    """Motors follow the initial angles by default, so that the gradient by q includes both effects."""
+    of, (q, qd) = rollout.__wrapped__(), tensors()  # with its own parameters
+    targets, late, results = torch.tensor(push_off(6)), torch.tensor([0.006], dtype=torch.float64), []
 
     def height(q, **before):
         return simulate(of, targets, q, qd, latency=late, **before).q[-1, 2].sum()
 
     for before in (False, True):
         start = q.clone().requires_grad_()
-        height(start, **({"before": start[7:]} if before else {})).backward()
-        found.append(start.grad)
-    runs = [of.run(targets.numpy(), q.numpy(), qd.numpy(), before=start) for start in (None, q[7:].numpy())]
+        height(start, **({"initial_target": start[7:]} if before else {})).backward()
+        results.append(start.grad)
+    runs = [of.run(targets.numpy(), q.numpy(), qd.numpy(), initial_target=start) for start in (None, q[7:].numpy())]
     seed = np.zeros(runs[0].q.shape)
     seed[-1, 2] = 1.0
     with_start, without = (of.backward(made, q=of.array(seed))["q"].numpy() for made in runs)
-    found.append(with_start)
+    results.append(with_start)
     for entry in (8, 9):
         step = torch.zeros_like(q)
         step[entry] = 1.0e-8
         expected = (height(q + step) - height(q - step)).item() / 2.0e-8
-        for gradient in found:
+        for gradient in results:
             assert gradient[entry].item() == pytest.approx(expected, rel=1.0e-4)
         assert without[entry].item() != pytest.approx(expected, rel=1.0e-2)
 
 
-def test_what_a_reverse_pass_needs_cannot_be_lost_silently():
-    of, (q, qd) = rollout.__wrapped__(), tensors()  # whose parameters are its own
+def test_reverse_pass_refuses_changed_outputs_and_parameters():
+    of, (q, qd) = rollout.__wrapped__(), tensors()  # with its own parameters
     targets = torch.tensor(push_off(2)).requires_grad_()
     made = simulate(of, targets, q, qd)
     made.torque.div_(18.0)
@@ -246,7 +246,7 @@ def test_simulate_refuses_unknown_parameters():
 
 
 @pytest.mark.parametrize("late", [-0.05, 5.0, float("nan")])
-def test_latencies_that_are_none_are_refused(late):
+def test_refuses_latency_out_of_range(late):
     message = r"latency \[s\] must be in \[0, 0.1\], got "
     of = Rollout(build_model(2, visuals=False))
     with pytest.raises(ValueError, match=message):
@@ -257,8 +257,8 @@ def test_latencies_that_are_none_are_refused(late):
 
 
 @pytest.mark.parametrize("late", [-0.05, -0.001, float("-inf"), float("nan")])
-def test_no_target_arrives_before_it_is_sent(late, monkeypatch):
-    """Where nothing looks at latencies, as on a GPU."""
+def test_negative_latency_counts_as_zero(late, monkeypatch):
+    """Latencies are not checked, as on a GPU."""
     monkeypatch.setattr("jumper_warp.diff.rollout.check_within", lambda *_: None)
     of, targets, ends = Rollout(build_model(4, visuals=False)), np.full((3, 12), 0.4), []
     for latency in (0.0, late):
@@ -274,7 +274,7 @@ def test_no_target_arrives_before_it_is_sent(late, monkeypatch):
 
 
 @pytest.mark.parametrize("name", ["targets", "q", "wrench", "kp"])
-def test_simulate_refuses_what_is_not_a_number(name):
+def test_simulate_refuses_nan(name):
     q, qd = tensors()
     given = {"targets": torch.zeros(2, 12), "q": q, "qd": qd, "wrench": torch.zeros(2, 6), "kp": torch.ones(12)}
     given[name] = torch.full_like(given[name], float("nan"))
@@ -284,7 +284,7 @@ def test_simulate_refuses_what_is_not_a_number(name):
         rollout().run(np.full((2, 12), np.nan), *squat())
 
 
-def test_simulate_refuses_what_is_no_tensor():
+def test_simulate_refuses_other_types():
     q, qd = tensors()
     with pytest.raises(ValueError, match="kp must be a torch tensor, got float"):
         simulate(rollout(), torch.zeros(2, 12), q, qd, kp=80.0)
@@ -299,7 +299,7 @@ def test_simulate_refuses_what_is_no_tensor():
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (4, 2, 3), (4, 3)])
-def test_impulses_of_another_shape_are_refused(shape):
+def test_refuses_impulse_of_another_shape(shape):
     of, (q, qd) = rollout(), tensors()
     with pytest.raises(ValueError, match=r"impulse must have shape \(4, 1, 3\)"):
         simulate(of, torch.zeros(2, 12), q, qd, impulse=torch.zeros(shape))
@@ -324,7 +324,7 @@ def test_backward_refuses_a_trajectory_of_another_rollout():
 
 @pytest.fixture
 def blocks_of_threads():
-    """Let the CPU run blocks of several threads."""
+    """Enable blocks of several threads on the CPU."""
     wp.config.enable_cpu_blocks = True
     yield
     wp.config.enable_cpu_blocks = False
@@ -332,31 +332,31 @@ def blocks_of_threads():
 
 @pytest.mark.usefixtures("blocks_of_threads")
 @pytest.mark.parametrize("every", [4, 2])
-def test_a_thread_a_leg_does_what_a_thread_a_world_does(every):
-    """As on a GPU; with latency, fading motors, a wrench and worlds in the air, 11 of them, no multiple of 8."""
+def test_thread_per_leg_matches_thread_per_world(every):
+    """With latency, fading motors, a wrench and worlds in the air; 11 worlds, not a multiple of 8."""
     count = 11
     of = rollout(count, every=every)
     values = defaults() | {"latency": np.array(0.0061), "fade": np.array([4.0, 60.0])}
     values["wrench"][5:15] = [3.0, -2.0, 4.0, 0.1, -0.2, 0.3]
     values["q"] = np.repeat(values["q"][:, None], count, axis=1)
     values["q"][2] += np.linspace(0.0, 0.05, count)
-    found = []
+    results = []
     for of.by_legs in (True, False):
         trajectory = run(of, values)
         names, rng = ("q", "qd", "torque", "impulse"), np.random.default_rng(0)
-        seeds = {name: rng.normal(size=getattr(trajectory, name).numpy().shape) for name in names}
+        cotangents = {name: rng.normal(size=getattr(trajectory, name).numpy().shape) for name in names}
         gradients = of.backward(
-            trajectory, **{name: (of.vectors if name == "impulse" else of.array)(s) for name, s in seeds.items()}
+            trajectory, **{name: (of.vectors if name == "impulse" else of.array)(s) for name, s in cotangents.items()}
         )
         made = {name: getattr(trajectory, name).numpy().copy() for name in names}
-        found.append(made | {f"by {name}": array.numpy().copy() for name, array in gradients.items()})
-    for name, values in found[1].items():
+        results.append(made | {f"by {name}": array.numpy().copy() for name, array in gradients.items()})
+    for name, values in results[1].items():
         scale = np.abs(values).max()
-        np.testing.assert_allclose(found[0][name], values, rtol=0.0, atol=1.0e-9 * scale, err_msg=name)
+        np.testing.assert_allclose(results[0][name], values, rtol=0.0, atol=1.0e-9 * scale, err_msg=name)
 
 
-def test_first_run_of_several_threads_is_whole():
-    """The kernel's module is loaded anew: no thread may begin before it is there."""
+def test_first_run_on_two_threads_matches_one():
+    """The kernel's module is unloaded before each run: no thread may launch before it is loaded."""
     model, targets = build_model(64, visuals=False), np.full((4, 12), 0.8)
     heights = []
     for threads in (1, 2):

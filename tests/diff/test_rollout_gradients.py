@@ -1,8 +1,7 @@
 """Gradients of a whole jump, through filter, latency, motors, dynamics, stops and contact, against differences.
 
-What is differentiated is a random sum over the states, the torques and the impulses of all times. A difference is
-wrong, not the gradient, where the perturbation makes a contact, a stop or a branch of filter and motors change sides:
-the motions are chosen so that none does.
+The loss is a random weighted sum of states, torques and impulses at all times. A difference is wrong where the
+perturbation switches a contact, a stop or a branch of filter and motors; the motions are chosen so that none switches.
 """
 
 import numpy as np
@@ -37,7 +36,7 @@ from tests.helpers.rollout_helpers import (
     rollout,
     run,
     squat,
-    weighed,
+    weighted_sum,
     weights,
 )
 
@@ -48,7 +47,7 @@ JOINTS = [int(ARMATURE) + 1, int(FRICTION) + 1, int(DAMPING) + LEG, int(KNEE_DAM
 
 
 def jump(**changes) -> dict[str, np.ndarray]:
-    """Return what a jump reads, late by 6.1 ms, pulled sideways, with fading motors."""
+    """Return the inputs of a jump with a latency of 6.1 ms, a wrench, and fading motors."""
     values = defaults()
     values["latency"] = np.array(0.0061)
     values["wrench"][5:15] = [3.0, -2.0, 4.0, 0.1, -0.2, 0.3]
@@ -57,7 +56,7 @@ def jump(**changes) -> dict[str, np.ndarray]:
 
 
 def sliding() -> dict[str, np.ndarray]:
-    """Return a jump from a forward speed on slippery ground."""
+    """Return the inputs of a jump from a forward speed on slippery ground."""
     values = jump()
     values["table"][MU_ROWS] = [0.25, 0.3] * 4
     values["qd"][0] = 1.5
@@ -65,7 +64,7 @@ def sliding() -> dict[str, np.ndarray]:
 
 
 def folding() -> dict[str, np.ndarray]:
-    """Return a jump whose legs are pressed against stops that are narrower than the targets."""
+    """Return the inputs of a jump whose targets press the legs against narrow stops."""
     values = jump()
     for leg in range(4):
         values["table"][leg * LEG + int(LOWER) : leg * LEG + int(LOWER) + 3] = [-0.6, 0.25, 0.3]
@@ -73,7 +72,7 @@ def folding() -> dict[str, np.ndarray]:
 
 
 def sprung() -> dict[str, np.ndarray]:
-    """Return a jump with springs between the knees, no two alike."""
+    """Return the inputs of a jump with four different springs between the knees."""
     values = jump()
     for leg in range(4):
         values["table"][leg * LEG + int(SPRING) : leg * LEG + int(SPRING) + 2] = [300.0 + 40.0 * leg, 0.17 + 0.01 * leg]
@@ -84,7 +83,7 @@ CASES = {
     "targets": (jump, "targets", [(0, 1), (3, 0), (4, 4), (8, 7), (20, 8)], 2.0e-6),
     "position": (jump, "q", [0, 2, 3, 4, 5, 7, 8, 12, 18], 1.0e-7),
     "velocity": (jump, "qd", [0, 2, 3, 5, 6, 7, 14], 2.0e-6),
-    "before": (jump, "before", [1, 5], 1.0e-5),
+    "initial_target": (jump, "initial_target", [1, 5], 1.0e-5),
     "wrench": (jump, "wrench", [(0, 2), (6, 0), (6, 5), (30, 1)], 1.0e-4),
     "masses": (jump, "table", MASSES, 1.0e-6),
     "joints": (jump, "table", JOINTS, 1.0e-6),
@@ -109,16 +108,16 @@ CASES = {
 def test_gradient_matches_differences(case):
     make, name, entries, h = CASES[case]
     values = make()
-    by, found = gradients(rollout(), values)
+    by, gradient_by = gradients(rollout(), values)
     expected = differences(values, by, name, entries, h)
     scale = np.abs(expected).max()
     assert scale > 1.0e-6, "the sum does not depend on this input: the comparison means nothing"
-    np.testing.assert_allclose([found[name][entry] for entry in entries], expected, rtol=0.0, atol=1.0e-6 * scale)
+    np.testing.assert_allclose([gradient_by[name][entry] for entry in entries], expected, rtol=0.0, atol=1.0e-6 * scale)
 
 
 def test_gradients_by_leg_lengths_match_differences():
     values = jump()
-    by, found = gradients(rollout(), values)
+    by, gradient_by = gradients(rollout(), values)
     lengths = rollout().geometry()
     expected = np.zeros((2, 10))
     for row, leg in enumerate((0, 3)):
@@ -127,10 +126,12 @@ def test_gradients_by_leg_lengths_match_differences():
                 moved = lengths.copy()
                 moved[leg, column] += side * 1.0e-7
                 rollout().set_geometry(moved)
-                expected[row, column] += side * weighed(run(rollout(), values), by)[0] / 2.0e-7
+                expected[row, column] += side * weighted_sum(run(rollout(), values), by)[0] / 2.0e-7
     rollout().set_geometry(lengths)
     assert np.abs(expected[:, GEOMETRY_NAMES.index("thigh")]).min() > 1.0
-    np.testing.assert_allclose(found["geometry"][[0, 3]], expected, rtol=0.0, atol=2.0e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(
+        gradient_by["geometry"][[0, 3]], expected, rtol=0.0, atol=2.0e-6 * np.abs(expected).max()
+    )
 
 
 def test_gradients_on_uneven_ground_match_differences():
@@ -138,11 +139,11 @@ def test_gradients_on_uneven_ground_match_differences():
     values["q"] = values["q"].copy()
     values["q"][2] += 0.012
     of = rollout(ground="uneven")
-    by, found = gradients(of, values)
+    by, gradient_by = gradients(of, values)
     entries = [0, 1, 2, 3, 4, 8]
     expected = differences(values, by, "q", entries, 1.0e-7, ground="uneven")
     assert np.abs(expected[:2]).max() > 1.0e-2  # the place on the ground matters
-    np.testing.assert_allclose(found["q"][entries], expected, rtol=0.0, atol=2.0e-6 * np.abs(expected).max())
+    np.testing.assert_allclose(gradient_by["q"][entries], expected, rtol=0.0, atol=2.0e-6 * np.abs(expected).max())
 
 
 def test_gradients_of_a_hung_robot_match_differences():
@@ -152,14 +153,14 @@ def test_gradients_of_a_hung_robot_match_differences():
     for of in (rollout(), rollout(8)):
         of.hold()
     try:
-        by, found = gradients(rollout(), values)
+        by, gradient_by = gradients(rollout(), values)
         expected = differences(values, by, "kp", [1, 8], 1.0e-4)
         held = run(rollout(), values)
     finally:
         for of in (rollout(), rollout(8)):
             of.hold(False)
     assert (held.q.numpy()[:, :7] == held.q.numpy()[0, :7]).all() and np.ptp(held.q.numpy()[:, 8]) > 0.5
-    np.testing.assert_allclose(found["kp"][[1, 8]], expected, rtol=1.0e-6)
+    np.testing.assert_allclose(gradient_by["kp"][[1, 8]], expected, rtol=1.0e-6)
 
 
 def test_gradients_by_bodies_match_differences_of_their_moments():
@@ -177,18 +178,18 @@ def test_gradients_by_bodies_match_differences_of_their_moments():
 
     mass, c, inertia = 0.3, np.array([0.01, -0.02, -0.1]), np.array([3.0, 4.0, 2.0, 0.1, -0.2, 0.3]) * 1.0e-3
     table[moment_rows(body), 0] = moments(mass, c, inertia)
-    found = body_gradients(table, gradient)
+    gradient_by = body_gradients(table, gradient)
     by = gradient[moment_rows(body), 0]
     by_mass = (moments(mass + 1.0e-6, c, inertia) - moments(mass - 1.0e-6, c, inertia)) @ by / 2.0e-6
-    assert found["mass"][body, 0] == pytest.approx(by_mass, rel=1.0e-7)
+    assert gradient_by["mass"][body, 0] == pytest.approx(by_mass, rel=1.0e-7)
     for i in range(3):
         d = 1.0e-6 * np.eye(3)[i]
         by_com = (moments(mass, c + d, inertia) - moments(mass, c - d, inertia)) @ by / 2.0e-6
-        assert found["com"][body, i, 0] == pytest.approx(by_com, rel=1.0e-7)
+        assert gradient_by["com"][body, i, 0] == pytest.approx(by_com, rel=1.0e-7)
     for i in range(6):
         d = 1.0e-6 * np.eye(6)[i]
         by_inertia = (moments(mass, c, inertia + d) - moments(mass, c, inertia - d)) @ by / 2.0e-6
-        assert found["inertia"][body, i, 0] == pytest.approx(by_inertia, rel=1.0e-7)
+        assert gradient_by["inertia"][body, i, 0] == pytest.approx(by_inertia, rel=1.0e-7)
 
 
 def test_single_precision_gradients_are_those_of_double_precision():
@@ -220,30 +221,30 @@ def by_end(name: str, entry: int) -> dict[str, np.ndarray]:
 
 
 @pytest.mark.parametrize("touches", [False, True])
-def test_touchdown_has_the_gradient_of_its_side(touches):
-    """Falling for four steps from rest, by g dt^2 (1 + 2 + 3 + 4), a robot lands that was closer to the ground.
+def test_touchdown_gradient_matches_differences_on_either_side(touches):
+    """A robot falls for four steps from rest, by g dt^2 (1 + 2 + 3 + 4), and lands if it starts closer to the ground.
 
-    Not landing, the new height follows the old one exactly. Landing, the paws close the gap and hold the base back.
+    In the air the final height follows the initial one exactly; on the ground the paws hold the base back.
     """
     gap = 9.81 * DT * DT * 10.0 + 1.0e-4  # the squat starts 0.1 mm in the ground
     height = gap - 2.0e-5 if touches else gap + 2.0e-5
     values = one_step(height=height)
-    by, found = gradients(rollout(), values, by_end("q", 2))
+    by, gradient_by = gradients(rollout(), values, by_end("q", 2))
     expected = differences(values, by, "q", [2], 1.0e-6)[0]
-    assert found["q"][2] == pytest.approx(expected, rel=1.0e-6)
-    assert (found["q"][2] == pytest.approx(1.0, abs=1.0e-9)) != touches
+    assert gradient_by["q"][2] == pytest.approx(expected, rel=1.0e-6)
+    assert (gradient_by["q"][2] == pytest.approx(1.0, abs=1.0e-9)) != touches
 
 
 @pytest.mark.parametrize("slides", [False, True])
-def test_sliding_has_a_gradient_by_friction_and_sticking_has_none(slides):
+def test_gradient_by_friction_is_zero_while_sticking(slides):
     values = one_step(speed=0.02, friction=0.05 if slides else 5.0)
-    _, found = gradients(rollout(), values, by_end("qd", 0))
-    by_friction = found["table"][MU_ROWS].sum()
+    _, gradient_by = gradients(rollout(), values, by_end("qd", 0))
+    by_friction = gradient_by["table"][MU_ROWS].sum()
     assert by_friction < -1.0e-3 if slides else by_friction == 0.0  # more friction, less speed
 
 
-def test_more_rows_change_no_gradient():
-    """Steps made again from a row a policy step have the gradients of those from a row a step."""
+def test_gradients_do_not_depend_on_rows():
+    """Gradients with a row per policy step match those with a row per physics step."""
     values = jump()
     by = weights(run(rollout(), values), ("torque", "impulse"))
     (_, few), (_, many) = gradients(rollout(), values, by), gradients(rollout(every=1), values, by)
@@ -251,7 +252,7 @@ def test_more_rows_change_no_gradient():
         np.testing.assert_allclose(many[name], gradient, rtol=0.0, atol=1.0e-9 * np.abs(gradient).max() + 1.0e-30)
 
 
-def test_nothing_is_left_of_a_gradient_that_is_zero():
+def test_zero_cotangent_gives_zero_gradients():
     trajectory = run(rollout(), jump())
-    found = rollout().backward(trajectory, q=wp.zeros_like(trajectory.q))
-    assert not any(array.numpy().any() for array in found.values())
+    gradient_by = rollout().backward(trajectory, q=wp.zeros_like(trajectory.q))
+    assert not any(array.numpy().any() for array in gradient_by.values())

@@ -1,12 +1,12 @@
-"""Rewards with derivatives: values against the environment's terms, and gradients by actions against differences."""
+"""Differentiable rewards: values against the environment's terms, gradients by actions against differences."""
 
 import numpy as np
 import pytest
 import torch
 
 from jumper_warp.diff.closed_loop import ClosedLoop
-from jumper_warp.diff.differentiable_env import DifferentiableEnv, limited
-from jumper_warp.diff.smooth_rewards import SMOOTH, make_moment
+from jumper_warp.diff.differentiable_env import DifferentiableEnv, clip_norm
+from jumper_warp.diff.smooth_rewards import SMOOTH, make_context
 from jumper_warp.envs.env import Env
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.registry import make_task
@@ -17,45 +17,46 @@ TASK = make_task("vertical-jump").on_level_ground()
 
 
 def height_reward(term, error):
-    """The reward for a height error [m], as its page defines it: phi_fine + 3 psi_sharp + phi_wide, once."""
+    """Return the documented reward of height errors [m]: Gaussian fine + 3 exponential sharp + Gaussian wide."""
     fine, sharp, wide = (term.numbers[name] for name in ("std_fine", "scale_sharp", "std_wide"))
-    shares = np.exp(-((error / fine) ** 2)) + 3.0 * np.exp(-np.abs(error) / sharp) + np.exp(-((error / wide) ** 2))
-    return term.numbers["weight"] * shares
+    kernels = np.exp(-((error / fine) ** 2)) + 3.0 * np.exp(-np.abs(error) / sharp) + np.exp(-((error / wide) ** 2))
+    return term.numbers["weight"] * kernels
 
 
-def test_smooth_rewards_have_the_values_of_the_environments_terms():
-    """Of worlds all over a jump; at the apex one pays the highest of policy steps, the other the ballistic one."""
+def test_smooth_rewards_match_the_environments_terms():
+    """Worlds are at all phases of a jump. At the apex the environment rewards the highest policy step, the smooth term
+    the ballistic apex."""
     env = Env(TASK, 24, seed=2, randomize=False, noise=False, device="cpu")
     env.reset()
     loop, network, paid = ClosedLoop(env), Network(open_policy("vertical_jump")), set()
     old = loop.state()
     for _ in range(30):
         env.step(network.act(env.obs) + 0.1 * torch.sin(torch.arange(12.0) + env.obs[:, :1]))
-        state, goes_on, arrays = loop.state(), env.done == 0.0, env.task_arrays()
-        moment = make_moment(loop, state, old, arrays)
+        state, running, arrays = loop.state(), env.done == 0.0, env.task_arrays()
+        context = make_context(loop, state, old, arrays)
         for term, values in zip(TASK.rewards, env.skills[0].term_value.numpy(), strict=True):
             if term.func.key not in SMOOTH:
                 continue
             time = env.step_dt if term.options["scale_by_dt"] else 1.0
-            found = term.numbers["weight"] * time * SMOOTH[term.func.key](moment, term.numbers)
+            smooth = term.numbers["weight"] * time * SMOOTH[term.func.key](context, term.numbers)
             if term.name == "jump_height":
-                at_apex = (goes_on.numpy() == 1) & (arrays["at_apex"] == 1)
-                base, goal = moment.motion, arrays["goal"][:, 2]
+                at_apex = (running.numpy() == 1) & (arrays["at_apex"] == 1)
+                base, goal = context.motion, arrays["goal"][:, 2]
                 ballistic = (base.pos[:, 2] + base.lin_vel[:, 2] ** 2 / (2.0 * TASK.gravity)).numpy()
-                for mine, height in ((found.numpy(), ballistic), (values, arrays["max_height"])):
+                for mine, height in ((smooth.numpy(), ballistic), (values, arrays["max_height"])):
                     np.testing.assert_allclose(mine[at_apex], height_reward(term, height - goal)[at_apex], rtol=2e-4)
-                assert not found.numpy()[~at_apex & (goes_on.numpy() == 1)].any()
-                # the highest of the policy steps is that before the apex or that after it
-                highest = torch.maximum(moment.before.pos[:, 2], base.pos[:, 2]).numpy()
+                assert not smooth.numpy()[~at_apex & (running.numpy() == 1)].any()
+                # the highest policy step is the one before or after the apex
+                highest = torch.maximum(context.prev_motion.pos[:, 2], base.pos[:, 2]).numpy()
                 np.testing.assert_allclose(arrays["max_height"][at_apex], highest[at_apex], rtol=0.0, atol=1.0e-6)
-                # legs move, so that a base loses other than g; what it lost in this step holds the apex
-                lost = (moment.before.lin_vel - base.lin_vel)[:, 2].numpy()
-                assert (np.abs(ballistic - highest) < lost**2 / (2.0 * TASK.gravity))[at_apex].all()
+                # moving legs change the base's acceleration; its change of velocity in this step bounds the error
+                speed_change = (context.prev_motion.lin_vel - base.lin_vel)[:, 2].numpy()
+                assert (np.abs(ballistic - highest) < speed_change**2 / (2.0 * TASK.gravity))[at_apex].all()
                 paid |= {term.name} if at_apex.sum() else set()
                 continue
-            expected = torch.as_tensor(values)[goes_on]
+            expected = torch.as_tensor(values)[running]
             atol = 1.0e-5 + 1.0e-4 * float(expected.abs().max())
-            torch.testing.assert_close(found[goes_on].float(), expected, rtol=0.0, atol=atol, msg=term.name)
+            torch.testing.assert_close(smooth[running].float(), expected, rtol=0.0, atol=atol, msg=term.name)
             paid |= {term.name} if float(expected.abs().max()) > 0.0 else set()
         old = state
     rough = {term.name for term in TASK.rewards if term.func.key not in SMOOTH}
@@ -65,8 +66,8 @@ def test_smooth_rewards_have_the_values_of_the_environments_terms():
     }  # fmt: skip
 
 
-def test_an_environment_with_gradients_has_the_same_values_and_its_rewards_those_derivatives():
-    """Three steps of robots in flight: single precision, so by differences of a hundredth of the action."""
+def test_differentiable_env_matches_values_and_central_differences():
+    """Robots in flight take three steps; in single precision differences need 0.01 of an action."""
     flights = TASK.reset.settings
     flights = type(flights)(start_probability=StartProbability(in_flight=1.0), flight_time=(0.05, 0.3))
     task = TASK.__class__(**{**vars_of(TASK), "reset": TASK.reset.__class__(TASK.reset.func, flights)})
@@ -85,23 +86,23 @@ def test_an_environment_with_gradients_has_the_same_values_and_its_rewards_those
             total = total + by_gradients.step_with_gradient(action)
         return total
 
-    asked = actions.clone().requires_grad_()
-    total = rewards(asked)
+    variable = actions.clone().requires_grad_()
+    total = rewards(variable)
     plain = sum(envs[0].step(action).reward.clone() for action in actions)
     torch.testing.assert_close(total.detach(), plain, rtol=0.0, atol=0.0)
     torch.testing.assert_close(envs[1].obs, envs[0].obs, rtol=0.0, atol=0.0)
-    gradient = torch.autograd.grad(total.sum(), asked)[0]
+    gradient = torch.autograd.grad(total.sum(), variable)[0]
     rough = [i for i, term in enumerate(task.rewards) if term.func.key not in SMOOTH]
 
     def smooth_total(actions):
         envs[1].load_state_dict(start)
-        found = 0.0
+        total = 0.0
         for action in actions:
             envs[1].step(action)
             values = envs[1].skills[0].term_value.numpy().copy()
             values[rough] = 0.0
-            found = found + values.sum()
-        return found
+            total = total + values.sum()
+        return total
 
     for entry in ((0, 0, 1), (0, 2, 5), (1, 1, 0)):
         ends = []
@@ -114,10 +115,11 @@ def test_an_environment_with_gradients_has_the_same_values_and_its_rewards_those
 
 
 def vars_of(task):
+    """Return the fields of a task by name."""
     return {name: getattr(task, name) for name in task.__dataclass_fields__}
 
 
-def test_long_gradients_are_shortened_world_by_world_and_broken_ones_dropped():
+def test_clip_norm_clips_each_world_and_zeroes_non_finite_gradients():
     grad = torch.tensor([[3.0, 0.3, np.nan], [4.0, 0.4, 1.0]])
     expected = torch.tensor([[0.6, 0.3, 0.0], [0.8, 0.4, 0.0]])
-    torch.testing.assert_close(limited(1.0)(grad), expected)
+    torch.testing.assert_close(clip_norm(1.0)(grad), expected)

@@ -10,8 +10,8 @@ import warp as wp
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.attitude import AttitudeLog, axis_metrics, axis_turns, turn_metrics
 from jumper_warp.evaluation.log import run_evaluation
-from jumper_warp.evaluation.turns import Turns, axis_metrics, turn_metrics, turns_about_axes
 from jumper_warp.kernels.attitude.state import AttitudeState
 from jumper_warp.registry import make_task
 from jumper_warp.robot.pinocchio_model import build_pinocchio
@@ -138,7 +138,7 @@ def test_leg_motions_turn_the_robot_but_give_it_no_momentum(env):
 
 
 def test_turns_are_followed_until_they_settle(env):
-    turns = Turns(turns_about_axes(N, 90.0), seconds=0.2)
+    turns = AttitudeLog(axis_turns(N, 90.0), seconds=0.2)
     run_evaluation(lambda obs: torch.zeros(N, 12), env, turns)
     np.testing.assert_allclose(env.task_arrays()["base_pos"][:, 2], 2.35, atol=0.05)
     np.testing.assert_allclose(np.degrees(turns.error), 90.0, atol=5.0)
@@ -146,7 +146,7 @@ def test_turns_are_followed_until_they_settle(env):
     np.testing.assert_allclose(axis, 90.0 * np.repeat(np.eye(3), 2, axis=0) * np.tile([[1], [-1]], (3, 1)), atol=1e-9)
     assert turn_metrics(turns)["success_rate"] == 0.0 and axis_metrics(turns)["roll_plus_settling_s"] is None
     turns.errors = [np.full(N, e) * DEG for e in (40.0, 3.0, 8.0, 4.0, 2.0)]
-    np.testing.assert_allclose([turns.first[0], turns.settling[0]], [2.0 / 60.0, 4.0 / 60.0])
+    np.testing.assert_allclose([turns.first_time[0], turns.settling_time[0]], [2.0 / 60.0, 4.0 / 60.0])
     assert turn_metrics(turns)["success_rate"] == 1.0
     turns.collided[:] = np.arange(N) < 16
     assert turn_metrics(turns)["success_rate"] == 0.75

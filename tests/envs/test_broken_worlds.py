@@ -58,7 +58,7 @@ def test_a_world_that_came_apart_ends_at_once_and_touches_no_other(env, case, ep
         env.step(REST)
         ended = (ending_names(env)[9], env.reward[9].item(), env.timeout[9].item())
         tensors = (env.obs, env.critic_obs, env.final_obs, env.final_critic_obs, env.reward)
-        outcomes.append([*(tensor.clone() for tensor in tensors), env.robot.invalid.numpy().copy()])
+        outcomes.append([*(tensor.clone() for tensor in tensors), env.robot.diverged.numpy().copy()])
     assert ended == ("came_apart", 0.0, 0.0)
     others = [world for world in range(N) if world != 9]
     for whole, harmed in zip(outcomes[0][:-1], outcomes[1][:-1], strict=True):

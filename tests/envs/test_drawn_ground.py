@@ -99,7 +99,7 @@ def test_an_evaluation_stands_robots_on_the_block_below_them():
     np.testing.assert_allclose(env.obs[:, 2], env.sim.model.joint_q.numpy()[2], atol=1e-5)
     for _ in range(20):
         env.step(REST)
-        assert not env.done.any() and not env.robot.invalid.numpy().any()
+        assert not env.done.any() and not env.robot.diverged.numpy().any()
     env.sim.physics.write_bodies()
     np.testing.assert_allclose(paw_centres(env.sim)[..., 2], tops[:, None] + PAW_RADIUS + np.zeros(4), atol=2e-3)
 
@@ -144,7 +144,7 @@ def test_the_next_jump_of_an_evaluation_knows_the_ground_at_its_goal(landed):
 
 def test_another_jump_of_an_episode_knows_the_ground_at_its_goal(landed):
     edit_episodes(landed, next_jump_step=5, level=4)
-    landed._begin(landed._part(), landed.episodes.done)
+    landed._reset_worlds(landed._part(), landed.episodes.done)
     found = landed.task_arrays()
     assert (found["phase"] == STANCE).all() and (found["jumps"] == 1).all() and not landed.done.any()
     np.testing.assert_allclose(found["goal_ground"], on_block(found["goal"]), atol=1e-6)

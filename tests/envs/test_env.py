@@ -69,7 +69,7 @@ def rollout():
         expected.append(expected_terms(TASK, before, after, action.clamp(-1.0, 1.0).numpy().T))
         rewarded.append(env.reward.clone().numpy())
         phases.append(after["phase"])
-        env._begin(env._part(), wp.clone(env.episodes.done))
+        env._reset_worlds(env._part(), wp.clone(env.episodes.done))
     return np.array(logged), np.array(expected), np.array(rewarded), np.array(phases)
 
 

@@ -9,7 +9,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import flight_skills
 from jumper_warp.utils.errors import InputError
-from support.flights import JUMP, OUTCOMES, TURN, Flights, flight_metrics
+from support.flights import JUMP, OUTCOMES, TURN, FlightLog, flight_metrics
 
 N = 4
 LATE = np.array([[0.01, 0.0], [-0.01, 0.0], [0.0, 0.01], [0.0, 0.0]])
@@ -21,7 +21,7 @@ def flown():
     """Robots that jump tilted and do nothing in flight: the environment, the flights, and their skills over time."""
     tasks, handovers = flight_skills(make_task("vertical-jump-mars"), make_task("attitude"))
     env = Env(tasks, N, device="cpu", randomize=False, noise=False, auto_reset=False, handovers=handovers)
-    flights, seen = Flights(np.full(len(LATE), 2.5), LATE), []
+    flights, seen = FlightLog(np.full(len(LATE), 2.5), LATE), []
     flights.begin(env)
     for _ in range(round(flights.seconds / env.step_dt)):
         action = torch.tensor(flights.action(90.0, None), dtype=torch.float32)
@@ -29,7 +29,7 @@ def flown():
         turn, jump = (env.skills[skill].states.numpy().copy() for skill in (TURN, JUMP))
         height, rise = env.sim.joint_q()[:, 2].copy(), env.sim.joint_qd()[:, 2].copy()
         seen.append((env.episodes.skill.numpy().copy(), turn, jump, height, rise))
-        if flights.follow(env):
+        if flights.record_step(env):
             break
     return env, flights, seen
 
@@ -70,7 +70,7 @@ def test_legs_that_push_later_tilt_the_robot(flown):
 
 
 def test_failures_in_flight_are_told_from_those_after_it():
-    flights = Flights(np.full(4, 2.5))
+    flights = FlightLog(np.full(4, 2.5))
     flights.end[:] = [OUTCOMES.index(name) for name in ("collided", "collided", "landed", "tilted")]
     flights.flight_time[1:] = 2.0
     metrics = flight_metrics(flights)

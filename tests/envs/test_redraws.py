@@ -21,7 +21,7 @@ from randomization_helpers import (
     randomized,
     read,
     seen,
-    uniform_range,
+    within,
 )
 
 
@@ -43,7 +43,7 @@ def test_drawing_again_begins_with_the_nominal_values(nominal):
     then = {name: values[..., :1] for name, values in nominal.items()}
     for row, value in ROWS.items():
         assert not np.array_equal(value(before, then), value(after, then)), row
-        assert uniform_range(value(after, then), *ALL[row]), row
+        assert within(value(after, then), *ALL[row]), row
 
 
 @pytest.mark.parametrize("solver", ["jumper", "mujoco"])

@@ -8,7 +8,7 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.courses import SQUAT, Course
+from jumper_warp.evaluation.courses import SQUAT_TIME, CourseLog
 from jumper_warp.evaluation.scripts import parse_script
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK, SkillNames, SkillPolicies
@@ -45,7 +45,7 @@ def followed():
     """Return policies, environment, course and all switches of a nominal run whose stages are launched one by one."""
     policies = SkillPolicies()
     env = policies.env(N, Conditions(device="cpu", threads=1))
-    course, switches, fresh = Course(SCRIPTS), [], []
+    course, switches, fresh = CourseLog(SCRIPTS), [], []
     course.begin(env)
     for _ in range(round(course.seconds / env.step_dt)):
         env.actions.copy_(policies.act(env))
@@ -59,7 +59,7 @@ def followed():
                     each.next_safe = env.robot.filtered_target.numpy()[:, each.world].copy()
         fresh = [Switch(env, w) for w in np.flatnonzero(env.episodes.skill.numpy() != was)]
         switches += fresh
-        if course.follow(env):
+        if course.record_step(env):
             break
     return policies, env, course, switches
 
@@ -107,10 +107,10 @@ def test_jumps_are_commanded_from_the_squat_after_they_took_over_and_walking_sta
         if s.target == WALK:
             assert s.state["standing"] == 1 and not s.state["command"].any() and s.state["steps"] == 0
         else:
-            assert s.state["command_step"] == round(SQUAT / env.step_dt) and s.state["steps"] == 0
-    jumps = course.switched >= 0
+            assert s.state["command_step"] == round(SQUAT_TIME / env.step_dt) and s.state["steps"] == 0
+    jumps = course.switch_step >= 0
     assert jumps.sum() == 4
-    assert ((course.takeoff - course.switched)[jumps] * env.step_dt > SQUAT).all()
+    assert ((course.takeoff_step - course.switch_step)[jumps] * env.step_dt > SQUAT_TIME).all()
     first = switches[[s.target for s in switches].index(JUMP_TO)]
     way = first.state["goal"][:2] - first.after[:2]
     assert np.linalg.norm(way) == pytest.approx(0.7 if first.world else np.hypot(0.6, 0.1), abs=1e-5)

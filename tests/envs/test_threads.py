@@ -23,14 +23,14 @@ from jumper_warp.rl.checkpoint import load_checkpoint
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
-from jumper_warp.sim.slices import LEAST, WorldRange, slices_of
+from jumper_warp.sim.slices import MIN_WORLDS, WorldRange, slices_of
 from jumper_warp.tasks.cfg import Handover
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.utils import threads as pool
 from jumper_warp.utils.errors import InputError
 from skill_helpers import begin_hold, begin_jump, when_asked_to_jump
 
-N = 3 * LEAST + 2
+N = 3 * MIN_WORLDS + 2
 JUMP = dataclasses.replace(
     make_task("vertical-jump"), randomization=RandomizationCfg.walking(), action_scale=(40.0, 90.0)
 )
@@ -159,15 +159,17 @@ def flat(state, prefix=""):
 def test_slices_hold_each_world_once_and_are_about_equal(worlds, threads):
     slices = slices_of(worlds, threads)
     assert [world for each in slices for world in range(each.first, each.first + each.count)] == list(range(worlds))
-    assert len(slices) == max(1, min(threads, worlds // LEAST))
-    assert all(each.first % LEAST == 0 for each in slices)
+    assert len(slices) == max(1, min(threads, worlds // MIN_WORLDS))
+    assert all(each.first % MIN_WORLDS == 0 for each in slices)
     counts = [each.count for each in slices]
-    assert max(counts) - min(counts) < 2 * LEAST
-    assert worlds >= 2 * LEAST or slices == [WorldRange(0, worlds)]
+    assert max(counts) - min(counts) < 2 * MIN_WORLDS
+    assert worlds >= 2 * MIN_WORLDS or slices == [WorldRange(0, worlds)]
 
 
 def test_mujoco_has_one_slice():
-    assert Simulation(2 * LEAST, solver="mujoco", visuals=False, device="cpu", threads=2).slices == [(0, 2 * LEAST)]
+    assert Simulation(2 * MIN_WORLDS, solver="mujoco", visuals=False, device="cpu", threads=2).slices == [
+        (0, 2 * MIN_WORLDS)
+    ]
 
 
 # ---------------------------------------------------------------- threads
@@ -175,13 +177,13 @@ def test_mujoco_has_one_slice():
 
 def test_jobs_run_at_the_same_time():
     meeting = threading.Barrier(3, timeout=30.0)
-    pool.run_side_by_side([meeting.wait] * 3, 3)
+    pool.run_in_parallel([meeting.wait] * 3, 3)
 
 
 def test_each_job_runs_once_whatever_the_number_of_threads():
     for threads in (1, 2, 5):
         done: list[int] = []
-        pool.run_side_by_side([partial(done.append, i) for i in range(7)], threads)
+        pool.run_in_parallel([partial(done.append, i) for i in range(7)], threads)
         assert sorted(done) == list(range(7))
 
 
@@ -201,20 +203,20 @@ def test_what_a_job_raises_reaches_the_caller_when_the_others_have_ended(failing
     jobs = [take_time, take_time]
     jobs[failing] = fail
     with pytest.raises(FloatingPointError, match="a slice failed"):
-        pool.run_side_by_side(jobs, 2)
+        pool.run_in_parallel(jobs, 2)
     assert ended == [True]
-    pool.run_side_by_side([lambda: ended.append(True)] * 2, 2)  # the threads go on
+    pool.run_in_parallel([lambda: ended.append(True)] * 2, 2)  # the threads go on
     assert len(ended) == 3
 
 
 def test_a_failing_slice_reaches_the_caller_of_a_step():
-    env = Env(JUMP, 2 * LEAST, device="cpu", threads=2)
+    env = Env(JUMP, 2 * MIN_WORLDS, device="cpu", threads=2)
     env.reset()
-    env.step(torch.zeros(2 * LEAST, 12))
+    env.step(torch.zeros(2 * MIN_WORLDS, 12))
     (graph,) = env._graphs.values()
     graph._graphs[1].apic_state = object()  # not a graph's
     with pytest.raises(Exception, match="argument"):
-        env.step(torch.zeros(2 * LEAST, 12))
+        env.step(torch.zeros(2 * MIN_WORLDS, 12))
 
 
 def test_all_cores_are_used_and_shared_by_the_processes_of_a_machine(monkeypatch):

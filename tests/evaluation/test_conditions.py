@@ -1,4 +1,4 @@
-"""What policies are tried in: pushes, latency, weak motors, and ends that hide nothing."""
+"""Conditions of evaluations: terminations, pushes, latency, gains and friction."""
 
 import dataclasses
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env
-from jumper_warp.evaluation import heights, places
+from jumper_warp.evaluation import heights, landings
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, latency_metrics, latency_text
 from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.policies.conditions import Conditions
@@ -24,7 +24,7 @@ HELD = dataclasses.replace(
         push_interval=None, push_probability=1.0, resample_at="startup", push_force=(-7.0, 7.0)
     ),
 )
-"""Trained with one wrench for the whole episode, drawn once."""
+"""Task whose training has one constant wrench per world, sampled once."""
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
@@ -34,13 +34,13 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(
     ("name", "change"),
     [
-        ("horizontal-jump", places.for_evaluation),
-        ("horizontal-jump", places.ended_by_takeoff),
-        ("vertical-jump", heights.for_evaluation),
-        ("vertical-jump", heights.for_sweep),
+        ("horizontal-jump", landings.with_landing_terminations),
+        ("horizontal-jump", landings.with_second_takeoff),
+        ("vertical-jump", heights.with_success_last),
+        ("vertical-jump", heights.with_sweep_terminations),
     ],
 )
-def test_fall_two_seconds_after_a_landing_is_not_hidden_by_its_success(name, change):
+def test_fall_takes_precedence_over_success(name, change):
     env = make_env(2, task=change(make_task(name)), auto_reset=False)
     env.evaluation_reset(np.zeros((2, 4)))
     edit_episodes(env, phase=LANDED, phase_steps=119)
@@ -49,9 +49,9 @@ def test_fall_two_seconds_after_a_landing_is_not_hidden_by_its_success(name, cha
     assert ending_names(env) == ["success", "low_base"]
 
 
-def test_second_takeoff_ends_the_jump_where_that_is_asked_for():
+def test_with_second_takeoff_ends_jump_at_second_takeoff():
     names = {}
-    for change in (places.for_evaluation, places.ended_by_takeoff):
+    for change in (landings.with_landing_terminations, landings.with_second_takeoff):
         env = make_env(2, task=change(JUMP), auto_reset=False)
         env.evaluation_reset(np.zeros((2, 4)))
         edit_episodes(env, phase=LANDED, phase_steps=5)
@@ -59,27 +59,30 @@ def test_second_takeoff_ends_the_jump_where_that_is_asked_for():
             edit_coordinates(env, world, q={2: 1.0}, qd={2: up + 9.81 / 60.0})
         env.step(torch.zeros((2, 12)))
         names[change.__name__] = ending_names(env)
-    assert names == {"for_evaluation": ["", ""], "ended_by_takeoff": ["second_takeoff", ""]}
+    assert names == {"with_landing_terminations": ["", ""], "with_second_takeoff": ["second_takeoff", ""]}
 
 
 # ---------------------------------------------------------------- pushes
 
 
-def test_pushes_of_a_test_come_and_go_however_they_were_trained_with():
-    figure = Conditions(randomize=True).applied(HELD).randomization
-    assert (figure.push_interval, figure.push_probability) == (PUSH_INTERVAL, PUSH_PROBABILITY)
-    assert figure.resample_at == "reset"
-    assert (figure.push_in_flight, figure.force) == (False, (-7.0, 7.0))
-    own = dataclasses.replace(HELD, randomization=RandomizationCfg(push_interval=(1.0, 2.0), push_probability=0.5))
-    figure = Conditions(randomize=True).applied(own).randomization
-    assert (figure.push_interval, figure.push_probability) == ((1.0, 2.0), 0.5)
+def test_evaluation_uses_intermittent_pushes_by_default():
+    drawn = Conditions(randomize=True).applied(HELD).randomization
+    assert (drawn.push_interval, drawn.push_probability, drawn.resample_at) == (
+        PUSH_INTERVAL,
+        PUSH_PROBABILITY,
+        "reset",
+    )
+    assert (drawn.push_in_flight, drawn.force) == (False, (-7.0, 7.0))
+    trained = dataclasses.replace(HELD, randomization=RandomizationCfg(push_interval=(1.0, 2.0), push_probability=0.5))
+    drawn = Conditions(randomize=True).applied(trained).randomization
+    assert (drawn.push_interval, drawn.push_probability) == ((1.0, 2.0), 0.5)
 
 
 @pytest.mark.parametrize("in_flight", [False, True])
-def test_pushes_of_a_test_act_in_flight_where_that_is_asked_for(in_flight):
+def test_push_in_flight_flag_controls_pushes_in_flight(in_flight):
     conditions = Conditions(randomize=True, push_in_flight=in_flight)
     task = conditions.applied(dataclasses.replace(HELD, randomization=RandomizationCfg(push_probability=1.0)))
-    env = make_env(2, task=places.for_evaluation(task), randomize=True, auto_reset=False)
+    env = make_env(2, task=landings.with_landing_terminations(task), randomize=True, auto_reset=False)
     env.evaluation_reset(np.zeros((2, 4)))
     edit_coordinates(env, 1, q={2: 1.0})
     for _ in range(2):  # in the first, the paws of all were last seen in the air
@@ -90,7 +93,7 @@ def test_pushes_of_a_test_act_in_flight_where_that_is_asked_for(in_flight):
     np.testing.assert_array_equal(wrench, push * [[1.0], [float(in_flight)]])
 
 
-def test_walking_is_pushed_in_flight_in_any_case():
+def test_walking_conditions_keep_pushes_in_flight():
     walking = make_task("velocity-flat")
     assert Conditions(randomize=True).applied(walking).randomization == walking.randomization
 
@@ -98,15 +101,15 @@ def test_walking_is_pushed_in_flight_in_any_case():
 # ---------------------------------------------------------------- latency, gains, friction
 
 
-def test_nominal_conditions_leave_the_task_alone_but_for_margins():
+def test_nominal_conditions_change_only_margins():
     assert HELD.self_collision_margin > 0.0
     wary = dataclasses.replace(HELD, obstacle_margin=0.01)
     assert Conditions().applied(wary) == dataclasses.replace(HELD, self_collision_margin=0.0)
 
 
-def test_fixed_parameters_are_all_that_changes_of_a_nominal_robot():
+def test_conditions_change_only_the_fixed_parameters():
     conditions = Conditions(latency=8.0, gains=(0.6, 1.0), friction=0.4)
-    task = places.for_evaluation(JUMP)
+    task = landings.with_landing_terminations(JUMP)
     nominal = make_env(2, task=task, auto_reset=False)
     env = make_env(2, task=conditions.applied(task), randomize=conditions.draws, auto_reset=False)
     assert env.parameters.latency.numpy().tolist() == [4, 4]  # 3.84
@@ -120,8 +123,8 @@ def test_fixed_parameters_are_all_that_changes_of_a_nominal_robot():
     assert not env.parameters.push.numpy().any()
 
 
-def test_a_fixed_parameter_that_is_nominal_changes_no_bit():
-    conditions, task = Conditions(latency=0.0), places.for_evaluation(JUMP)
+def test_fixing_a_parameter_at_its_nominal_value_is_bitwise_neutral():
+    conditions, task = Conditions(latency=0.0), landings.with_landing_terminations(JUMP)
     pair = [make_env(2, task=task), make_env(2, task=conditions.applied(task), randomize=conditions.draws)]
     for env in pair:
         env.auto_reset = False
@@ -133,10 +136,10 @@ def test_a_fixed_parameter_that_is_nominal_changes_no_bit():
     np.testing.assert_array_equal(*(env.sim.joint_q() for env in pair))
 
 
-def test_randomised_conditions_draw_the_rest():
-    figure = Conditions(randomize=True, gains=(0.6, 1.0), latency=50.0).applied(JUMP).randomization
-    assert (figure.gains, figure.damping_gains, figure.latency) == ((0.6, 0.6), (1.0, 1.0), (50.0, 50.0))
-    assert figure.base_mass == RandomizationCfg().base_mass
+def test_randomised_conditions_keep_fixed_parameters():
+    drawn = Conditions(randomize=True, gains=(0.6, 1.0), latency=50.0).applied(JUMP).randomization
+    assert (drawn.gains, drawn.damping_gains, drawn.latency) == ((0.6, 0.6), (1.0, 1.0), (50.0, 50.0))
+    assert drawn.base_mass == RandomizationCfg().base_mass
 
 
 @pytest.mark.parametrize(
@@ -155,12 +158,12 @@ def test_randomised_conditions_draw_the_rest():
         (lambda: EvaluationArgs(push_in_flight=True), "push_in_flight needs randomize"),
     ],
 )
-def test_impossible_conditions_are_refused(make, message):
+def test_refuses_invalid_conditions(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
 
-def test_latency_is_told_as_it_was_simulated():
+def test_latency_text_rounds_to_physics_steps():
     assert latency_text(np.array([4, 4]), DT) == "8.33 ms (4 physics steps)"
     assert latency_text(np.array([1]), DT) == "2.08 ms (1 physics step)"
     assert latency_text(np.array([0, 8, 4]), DT) == "0 to 16.7 ms (0 to 8 physics steps), mean 8.33 ms"
@@ -168,14 +171,14 @@ def test_latency_is_told_as_it_was_simulated():
     assert latency_metrics(np.array([4]), DT, 8.0)["latency_asked_ms"] == 8.0
 
 
-def test_run_tells_the_latency_it_simulated_over_several_policy_steps(tmp_path):
+def test_run_reports_simulated_latency(tmp_path):
     save_policy(tmp_path / "still", still_policy("horizontal-jump"))
     args = EvaluationArgs(policy=str(tmp_path / "still"), latency=40.0, record=0, out=tmp_path, device="cpu")
-    run = EvaluationRun.of("test", args)
+    run = EvaluationRun.from_args("test", args)
     env = run.env(2)
-    asked = places.PlaceLog(np.array([[[0.5, 0.0]]] * 2), tuple(term.name for term in env.task.terminations))
-    run.follow(env, asked)
+    log = landings.LandingLog(np.array([[[0.5, 0.0]]] * 2), tuple(term.name for term in env.task.terminations))
+    run.run_episodes(env, log)
     values = run.report({}, {})
     assert (values["latency_asked_ms"], values["latency"]) == (40.0, "39.6 ms (19 physics steps)")
     assert values["latency_ms"] == pytest.approx(1000.0 * 19 / 480)
-    assert run.title == "jumper, nominal, latency 39.6 ms (19 physics steps)"
+    assert run.title == "SolverJumper, nominal, latency 39.6 ms (19 physics steps)"

@@ -1,16 +1,17 @@
-"""Following courses whose robots are made up: what is asked for, and what is told of it."""
+"""Course log and metrics on an environment of scripted robots."""
 
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.courses import PATIENCE, SLEW, Course, active_spans, course_metrics
+from jumper_warp.evaluation.courses import JUMP_TIMEOUT, MAX_ACCELERATION, CourseLog, active_spans, course_metrics
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.utils.errors import InputError
 
 DT = 1.0 / 60.0
+SLEW_STEP = MAX_ACCELERATION * DT
 SCRIPT = (
     ScriptStep("walk", (0.5, 0.1, -0.2), 2.0),
     ScriptStep("jump_up", (0.75,)),
@@ -18,13 +19,13 @@ SCRIPT = (
 )
 
 
-class MadeUp:
-    """Robots that stop 50 steps after they are asked to jump, take off 25 later and are done 40 after that."""
+class ScriptedEnv:
+    """Robots that stop 50 steps after a jump is requested, take off 25 steps later and finish 40 steps after that."""
 
     def __init__(self, n: int, error=(0.1, 0.0, 0.0), falls_at=None, never_stops=False):
         self.n, self.error, self.falls_at, self.never_stops = n, np.array(error), falls_at, never_stops
-        self.skill, self.wanted, self.since, self.command_values = np.zeros(n, int), np.full(n, -1), np.zeros(n), None
-        self.step_dt, self.steps, self.velocity, self.asked = DT, 0, np.zeros((n, 3)), []
+        self.skill, self.commands, self.since, self.command_values = np.zeros(n, int), np.full(n, -1), np.zeros(n), None
+        self.step_dt, self.steps, self.velocity, self.requests = DT, 0, np.zeros((n, 3)), []
         goals = np.zeros(n, dtype=[("goal", float, 3)])
         goals["goal"] = np.arange(3 * n).reshape(n, 3)
         self.skills = 3 * [SimpleNamespace(states=SimpleNamespace(numpy=lambda: goals))]
@@ -42,18 +43,18 @@ class MadeUp:
 
     def request(self, skill, worlds, commands):
         self.goals = commands.copy()
-        self.asked += [(self.steps, skill, int(w)) for w in np.flatnonzero(worlds)]
-        self.wanted[worlds] = skill
+        self.requests += [(self.steps, skill, int(w)) for w in np.flatnonzero(worlds)]
+        self.commands[worlds] = skill
         self.since[worlds] = 0
 
     def step(self):
-        """Return what is seen after a policy step."""
+        """Advance by a policy step, and return the arrays of `CourseLog.read_env`."""
         self.steps += 1
         self.since += 1
         took_off = (self.skill >= JUMP_UP) & (self.since == 25)
         for w in range(self.n):
-            if self.skill[w] == WALK and self.wanted[w] >= 0 and self.since[w] >= 50 and not self.never_stops:
-                self.skill[w], self.wanted[w], self.since[w] = self.wanted[w], -1, 0
+            if self.skill[w] == WALK and self.commands[w] >= 0 and self.since[w] >= 50 and not self.never_stops:
+                self.skill[w], self.commands[w], self.since[w] = self.commands[w], -1, 0
             elif self.skill[w] >= JUMP_UP and self.since[w] >= 65:
                 self.skill[w], self.since[w] = WALK, 0
         termination = np.where(self.falls_at == self.steps, 1, -1) * np.ones(self.n, int)
@@ -68,85 +69,88 @@ class MadeUp:
         }  # fmt: skip
 
 
-def followed(script=SCRIPT, n=2, **made_up) -> tuple[Course, MadeUp]:
-    course, env = Course([script] * n), MadeUp(n, **made_up)
-    course.look = lambda env: env.step()
+def run_course(script=SCRIPT, n=2, **env_settings) -> tuple[CourseLog, ScriptedEnv]:
+    """Return the log of a script on n robots, run to its end, and the environment."""
+    course, env = CourseLog([script] * n), ScriptedEnv(n, **env_settings)
+    course.read_env = lambda env: env.step()
     course.begin(env)
     for _ in range(round(course.seconds / DT)):
-        if course.follow(env):
+        if course.record_step(env):
             break
     return course, env
 
 
-def test_jump_is_asked_for_after_stopping_and_walking_goes_on_after_it():
-    course, env = followed()
-    assert env.asked == [(120, JUMP_UP, 0), (120, JUMP_UP, 1)]
+def test_jump_is_requested_at_its_command_and_walking_resumes():
+    course, env = run_course()
+    assert env.requests == [(120, JUMP_UP, 0), (120, JUMP_UP, 1)]
     np.testing.assert_allclose(env.goals, [[0.0, 0.0, 0.75, 30.0]] * 2)
     assert [skill for skill, *_ in active_spans(course, 0)] == [WALK, JUMP_UP, WALK]
-    np.testing.assert_array_equal(course.began[0], [0, 120, 235])
-    np.testing.assert_array_equal(course.over[0], [120, 235, 325])
-    assert course.switched[0, 1] == 170 and course.takeoff[0, 1] == 195
+    np.testing.assert_array_equal(course.start_step[0], [0, 120, 235])
+    np.testing.assert_array_equal(course.finish_step[0], [120, 235, 325])
+    assert course.switch_step[0, 1] == 170 and course.takeoff_step[0, 1] == 195
     assert (course.outcomes == "done").all() and not course.fallen.any() and course.on_goal.all()
-    wanted = np.array(course.wanted)[:, 0]
-    np.testing.assert_allclose(wanted[[0, 119, 150]], [[0, 0, 0], [0.5, 0.1, -0.2], [0, 0, 0]])
-    np.testing.assert_allclose(wanted[121], [0.5 - 2 * SLEW * DT, 0.1 - 2 * SLEW * DT, 2 * SLEW * DT - 0.2], rtol=1e-5)
-    assert np.isnan(wanted[171:234]).all() and wanted[300] == pytest.approx([0.3, 0.0, 0.0])
+    commands = np.array(course.commands)[:, 0]
+    np.testing.assert_allclose(commands[[0, 119, 150]], [[0, 0, 0], [0.5, 0.1, -0.2], [0, 0, 0]])
+    slewed = [0.5 - 2 * SLEW_STEP, 0.1 - 2 * SLEW_STEP, 2 * SLEW_STEP - 0.2]
+    np.testing.assert_allclose(commands[121], slewed, rtol=1e-5)
+    assert np.isnan(commands[171:234]).all() and commands[300] == pytest.approx([0.3, 0.0, 0.0])
     assert env.command_values[0] == pytest.approx([0.3, 0.0, 0.0])
 
 
-def test_figures_of_a_course():
-    course, _ = followed(error=(0.1, -0.2, 0.05))
-    figures = course_metrics(course)
-    assert figures["rmse_vx_m_s"] == pytest.approx(0.1) and figures["rmse_vy_m_s"] == pytest.approx(0.2)
-    assert figures["rmse_yaw_rate_rad_s"] == pytest.approx(0.05, rel=1e-5)
-    assert sum(np.array(course.counts)[:, 0]) == 60 + 30  # the first second of each command does not count
-    assert figures["apex_error_m"] == pytest.approx(0.03) and figures["landing_error_m"] is None
-    assert figures["command_to_takeoff_s"] == pytest.approx(75 * DT)
-    assert figures["command_to_jump_skill_s"] == pytest.approx(50 * DT)
-    assert (figures["success_rate"], figures["on_goal_rate"], figures["jumps_made"], figures["robots"]) == (1, 1, 2, 2)
-    assert figures["handover_force_ripple_n"] == pytest.approx(1.0) == figures["handover_force_step_n"]
+def test_course_metrics_match_hand_computed_values():
+    course, _ = run_course(error=(0.1, -0.2, 0.05))
+    metrics = course_metrics(course)
+    assert metrics["rmse_vx_m_s"] == pytest.approx(0.1) and metrics["rmse_vy_m_s"] == pytest.approx(0.2)
+    assert metrics["rmse_yaw_rate_rad_s"] == pytest.approx(0.05, rel=1e-5)
+    assert sum(np.array(course.is_tracked)[:, 0]) == 60 + 30  # the first second of each command does not count
+    assert metrics["apex_error_m"] == pytest.approx(0.03) and metrics["landing_error_m"] is None
+    assert metrics["command_to_takeoff_s"] == pytest.approx(75 * DT)
+    assert metrics["command_to_jump_skill_s"] == pytest.approx(50 * DT)
+    assert (metrics["success_rate"], metrics["on_goal_rate"], metrics["jumps_made"], metrics["robots"]) == (1, 1, 2, 2)
+    assert metrics["handover_force_ripple_n"] == pytest.approx(1.0) == metrics["handover_force_step_n"]
 
 
-def test_landing_is_measured_from_the_goal_and_may_miss_it():
-    course, _ = followed((ScriptStep("jump_to", (0.8, 0.0)), ScriptStep("stand", seconds=0.2)), n=1)
-    assert course_metrics(course)["landing_error_m"] == pytest.approx(0.05) and course.switched[0, 0] > 0
+def test_course_landing_error_is_distance_from_goal():
+    course, _ = run_course((ScriptStep("jump_to", (0.8, 0.0)), ScriptStep("stand", seconds=0.2)), n=1)
+    assert course_metrics(course)["landing_error_m"] == pytest.approx(0.05) and course.switch_step[0, 0] > 0
     course.offset[0, 0] = 0.2
     assert course_metrics(course)["on_goal_rate"] == 0.0 and course_metrics(course)["success_rate"] == 1.0
     assert [skill for skill, *_ in active_spans(course, 0)] == [WALK, JUMP_TO, WALK]
 
 
-def test_a_block_is_put_under_the_goal_when_the_jump_onto_it_takes_over():
+def test_block_is_placed_under_goal_when_jump_onto_it_starts():
     plain, onto = (ScriptStep(kind, (1.3, 0.1)) for kind in ("jump_to", "jump_onto"))
-    course, env = Course([(plain, plain), (plain, onto)]), MadeUp(2)
-    assert course.block is not None and Course([(plain, plain)]).block is None
-    course.look = lambda env: env.step()
+    course, env = CourseLog([(plain, plain), (plain, onto)]), ScriptedEnv(2)
+    assert course.block is not None and CourseLog([(plain, plain)]).block is None
+    course.read_env = lambda env: env.step()
     course.begin(env)
-    while not course.follow(env):
+    while not course.record_step(env):
         pass
-    assert env.placed == [(course.switched[1, 1], [[3.0, 4.0]], [1])] and course.switched[1, 1] > course.over[1, 0]
+    switch_step = course.switch_step[1, 1]
+    assert env.placed == [(switch_step, [[3.0, 4.0]], [1])] and switch_step > course.finish_step[1, 0]
 
 
-def test_a_fall_ends_a_course():
-    course, _ = followed(falls_at=np.array([60, -1]))
-    figures = course_metrics(course)
-    assert course.outcomes.tolist() == ["collided", "done"] and figures["failed_by_collided"] == 1
-    assert (figures["success_rate"], figures["fall_rate"]) == (0.5, 0.5)
-    assert np.isnan(np.array(course.velocity)[60:, 0]).all() and not np.array(course.counts)[60:, 0].any()
+def test_fall_ends_course():
+    course, _ = run_course(falls_at=np.array([60, -1]))
+    metrics = course_metrics(course)
+    assert course.outcomes.tolist() == ["collided", "done"] and metrics["failed_by_collided"] == 1
+    assert (metrics["success_rate"], metrics["fall_rate"]) == (0.5, 0.5)
+    assert np.isnan(np.array(course.velocity)[60:, 0]).all() and not np.array(course.is_tracked)[60:, 0].any()
 
 
-def test_robot_that_never_stops_is_stuck():
-    course, env = followed(never_stops=True)
+def test_robot_that_never_stops_has_outcome_stuck():
+    course, env = run_course(never_stops=True)
     assert course.outcomes.tolist() == ["stuck", "stuck"] and course_metrics(course)["stuck_rate"] == 1.0
-    assert env.steps == 120 + round(PATIENCE / DT) and course_metrics(course)["command_to_takeoff_s"] is None
+    assert env.steps == 120 + round(JUMP_TIMEOUT / DT) and course_metrics(course)["command_to_takeoff_s"] is None
 
 
-def test_scripts_of_different_lengths_are_refused():
+def test_refuses_scripts_of_different_lengths():
     with pytest.raises(InputError, match="one length"):
-        Course([SCRIPT, SCRIPT[:1]])
+        CourseLog([SCRIPT, SCRIPT[:1]])
 
 
-def test_series_and_columns_tell_of_the_robot():
-    course, _ = followed()
+def test_series_and_columns_report_robot_state():
+    course, _ = run_course()
     series = course.series([1])
     assert series["vx/robot 1 [m/s]"] == pytest.approx(0.4) and series["vx/command of 1 [m/s]"] == pytest.approx(0.3)
     assert series["skill/of 1 [1]"] == WALK and course.columns()["commands_done"] == [3, 3]

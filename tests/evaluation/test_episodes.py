@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from jumper_warp.cli import evaluate, play
-from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeGoals, Episodes, episode_metrics
+from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeLog, EpisodePlayFlags, episode_metrics
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.saving import task_to_json
@@ -17,8 +17,8 @@ ENDS = [term.name for term in TASK.terminations]
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-class Stub:
-    """An environment whose bases are where the test says."""
+class StubEnv:
+    """An environment whose arrays are set by the test."""
 
     num_envs, step_dt = 4, DT
 
@@ -31,27 +31,27 @@ class Stub:
     def task_arrays(self):
         return self.arrays
 
-    def now(self, **changes):
+    def set(self, **changes):
         for name, value in changes.items():
             self.arrays[name] = np.array(value)
 
 
 @pytest.fixture
 def episodes():
-    """One that ends well after a step, one that falls after two, one that goes on, one that comes apart."""
-    log, env = EpisodeFlags(4, command=(0.5, 0.1)).log(TASK, 0), Stub()
+    """Four episodes: success after a step, a fall after two, one still running, one that diverges."""
+    log, env = EpisodeFlags(4, command=(0.5, 0.1)).log(TASK, 0), StubEnv()
     log.begin(env)
     assert env.commands.tolist() == [[0.5, 0.1, 0.0, 0.0]] * 4
-    env.now(termination=[0, -1, -1, ENDS.index("came_apart")])
-    env.now(base_pos=[[1.5, 0.0, 0.4], [1.0, 0.1, 0.2], [1.0, 0.0, 0.3], [np.nan, 0.0, 9.0]])
-    assert not log.follow(env)
-    env.now(termination=[ENDS.index("tilted"), ENDS.index("low_base"), -1, -1])
-    env.now(base_pos=[[9.0, 9.0, 9.0], [1.0, 0.4, 0.0], [1.0, 0.0, 0.3], [9.0, 9.0, 9.0]])
-    assert not log.follow(env)
+    env.set(ending=[0, -1, -1, ENDS.index("came_apart")])
+    env.set(base_pos=[[1.5, 0.0, 0.4], [1.0, 0.1, 0.2], [1.0, 0.0, 0.3], [np.nan, 0.0, 9.0]])
+    assert not log.record_step(env)
+    env.set(ending=[ENDS.index("tilted"), ENDS.index("low_base"), -1, -1])
+    env.set(base_pos=[[9.0, 9.0, 9.0], [1.0, 0.4, 0.0], [1.0, 0.0, 0.3], [9.0, 9.0, 9.0]])
+    assert not log.record_step(env)
     return log
 
 
-def test_metrics_by_hand(episodes):
+def test_episode_metrics_match_hand_computed_values(episodes):
     expected = {
         "episodes": 4,
         "mean_episode_s": (0.5 + 1.0 + 1.0 + 0.5) / 4,
@@ -71,7 +71,7 @@ def test_metrics_by_hand(episodes):
     assert episode_metrics(episodes) == pytest.approx(expected)
 
 
-def test_columns_have_a_row_an_episode_and_none_where_there_is_no_number(episodes):
+def test_columns_have_one_row_per_episode_and_none_for_nan(episodes):
     columns = episodes.columns()
     assert columns["command_0"] == [0.5] * 4 and columns["command_3"] == [0.0] * 4
     assert columns["length_s"] == [0.5, 1.0, 1.0, 0.5]
@@ -80,8 +80,8 @@ def test_columns_have_a_row_an_episode_and_none_where_there_is_no_number(episode
     assert episodes.series([1]) == {"height/base of 1 [m]": 0.0, "distance/start of 1 [m]": pytest.approx(0.4)}
 
 
-def test_all_ended_is_told():
-    log = Episodes(np.zeros((1, 4)), TASK)
+def test_update_returns_true_when_all_episodes_ended():
+    log = EpisodeLog(np.zeros((1, 4)), TASK)
     assert log.update({"base_pos": np.zeros((1, 3)), "termination": np.array([3])}, DT)
 
 
@@ -90,11 +90,11 @@ def test_all_ended_is_told():
     [
         (lambda: EpisodeFlags(episodes=0), "episodes must be at least 1"),
         (lambda: EpisodeFlags(command=(0.0,) * 5), "command takes up to 4 finite numbers"),
-        (lambda: EpisodeGoals(command=(float("nan"),)), "command takes up to 4 finite numbers"),
+        (lambda: EpisodePlayFlags(command=(float("nan"),)), "command takes up to 4 finite numbers"),
         (lambda: EpisodeFlags(seconds=0.0), r"seconds must be in \(0, 600\]"),
     ],
 )
-def test_impossible_settings_are_refused(make, message):
+def test_refuses_invalid_settings(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
@@ -114,10 +114,10 @@ def test_policy_of_any_task_is_evaluated(policy, tmp_path):
     evaluate.run(
         [policy, *"--episodes 3 --command 0.5 0 0 30 --seconds 4 --device cpu --out".split(), str(tmp_path)], []
     )
-    figures = json.loads((tmp_path / "metrics.json").read_text())
-    assert (figures["task"], figures["episodes"], figures["ended_by_no_jump"]) == ("any-task", 3, 3)
-    assert figures["mean_base_height_m"] == pytest.approx(0.35, abs=0.02)
-    assert figures["mean_episode_s"] < 4.0 and figures["failure_rate"] == 1.0
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert (metrics["task"], metrics["episodes"], metrics["ended_by_no_jump"]) == ("any-task", 3, 3)
+    assert metrics["mean_base_height_m"] == pytest.approx(0.35, abs=0.02)
+    assert metrics["mean_episode_s"] < 4.0 and metrics["failure_rate"] == 1.0
     rows = (tmp_path / "episodes.csv").read_text().splitlines()
     assert len(rows) == 4 and rows[0].startswith("command_0,command_1") and rows[1].endswith("no_jump")
 

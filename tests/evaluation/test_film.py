@@ -1,12 +1,13 @@
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.film import ankles, moments
-from jumper_warp.viz.props import MARK_LIFT, MARK_RADIUS, with_blocks, with_marks
+from jumper_warp.evaluation.film import ankles, keyframes
+from jumper_warp.viz.props import MARK_LIFT, MARK_RADIUS, with_blocks, with_goal_markers
 from jumper_warp.viz.recording import Recording
 
 
 def recording(frames=3, worlds=2, spacing=2.0):
+    """Return a recording of bodies at the origin."""
     return Recording(
         times=np.arange(1, frames + 1) / 60.0,
         worlds=tuple(range(worlds)),
@@ -19,7 +20,7 @@ def recording(frames=3, worlds=2, spacing=2.0):
     )
 
 
-def test_ankles_hang_from_the_knees():
+def test_ankle_positions_follow_shank_poses():
     poses = np.zeros((1, 21, 7))
     poses[..., 6] = 1.0
     poses[0, 5, 2] = 1.0
@@ -30,19 +31,19 @@ def test_ankles_hang_from_the_knees():
     assert points[0, 1] == pytest.approx([-0.3, 0.0, 1.0])
 
 
-def test_filmstrip_shows_squat_apex_and_catch():
+def test_keyframes_are_command_squat_push_apex_fall_catch_end():
     height = np.array([0.35, 0.35, 0.30, 0.20, 0.40, 0.70, 0.90, 0.70, 0.40, 0.25, 0.30, 0.35])
-    assert moments(height, command=1) == [1, 3, 5, 6, 7, 9, 11]
+    assert keyframes(height, command=1) == [1, 3, 5, 6, 7, 9, 11]
 
 
 @pytest.mark.parametrize(("command", "first"), [(-1, 0), (99, 2)])
-def test_filmstrip_begins_within_the_film(command, first):
-    assert moments(np.array([0.3, 0.4, 0.3]), command)[0] == first
+def test_keyframes_clamp_command_to_recording(command, first):
+    assert keyframes(np.array([0.3, 0.4, 0.3]), command)[0] == first
 
 
-def test_marks_lie_at_their_places_beside_each_other_and_only_where_there_is_one():
+def test_goal_markers_skip_nan_and_are_spaced_by_world():
     places = np.array([[[0.8, 0.2, 0.0], [np.nan, np.nan, 0.0]], [[0.5, 0.0, 0.1], [0.6, 0.0, 0.1]]])
-    shapes = with_marks(recording(), places).shapes
+    shapes = with_goal_markers(recording(), places).shapes
     assert [shape.name for shape in shapes] == ["goal_0_0", "goal_1_0", "goal_1_1"]
     assert all(shape.body == -1 for shape in shapes)
     assert shapes[0].vertices[0] == pytest.approx([0.8, 0.2, MARK_LIFT])

@@ -1,4 +1,4 @@
-"""Fine-tuning: misses as an evaluation measures them, made smaller by gradients, and the command around it."""
+"""Fine-tuning: jump errors, their reduction by Gauss-Newton, and `jumper finetune`."""
 
 import json
 
@@ -7,8 +7,8 @@ import pytest
 import torch
 
 from jumper_warp.cli.main import main
-from jumper_warp.evaluation.finetuning import FinetuneCfg, finetune, make_groups, with_aim
-from jumper_warp.evaluation.jump_misses import follow
+from jumper_warp.evaluation.finetuning import FinetuneCfg, finetune, make_groups, shift_goal_observation
+from jumper_warp.evaluation.jump_errors import jump_errors
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.trajectory.gauss_newton import Network
@@ -19,8 +19,8 @@ FEW = {"goals": 4, "late": 0, "randomized": 0, "heights": (0.8, 1.05), "iteratio
 
 @pytest.fixture(scope="module")
 def tuned():
-    """A policy that aims 8 mm too high, fine-tuned by one step, and what was done."""
-    return finetune(aiming_high(), FinetuneCfg(**FEW), say=lambda line: None)
+    """Policy that aims 8 mm too high after one iteration of fine-tuning, and its record."""
+    return finetune(aiming_high(), FinetuneCfg(**FEW), log=lambda line: None)
 
 
 def aiming_high():
@@ -32,21 +32,21 @@ def aiming_high():
     return Policy(policy.layers, mean, tensors["normaliser.std"], policy.interface, policy.config)
 
 
-def test_misses_are_those_of_the_policy_in_its_environment_and_gradients_change_no_bit():
+def test_jump_errors_match_environment_and_ignore_derivatives():
     policy = open_policy("vertical_jump")
     (group,) = make_groups(policy, FinetuneCfg(**FEW))
     network = Network(policy)
-    found, plain = follow(group, network, derivatives=True), follow(group, network, derivatives=False)
-    assert torch.equal(found.value, plain.value)
-    assert found.rows.shape == (4, len(network.weights)) and found.valid.all()
+    errors, plain = jump_errors(group, network, derivatives=True), jump_errors(group, network, derivatives=False)
+    assert torch.equal(errors.value, plain.value)
+    assert errors.jacobian.shape == (4, len(network.weights)) and errors.valid.all()
     group.begin()
     for _ in range(120):
         group.env.step(policy.act(group.env.obs))
     misses = group.env.task_arrays()["max_height"] - np.linspace(0.8, 1.05, 4)
-    np.testing.assert_allclose(found.value.numpy(), misses, rtol=0.0, atol=1.0e-4)
+    np.testing.assert_allclose(errors.value.numpy(), misses, rtol=0.0, atol=1.0e-4)
 
 
-def test_one_step_halves_the_misses_of_a_policy_that_aims_high(tuned):
+def test_one_iteration_halves_error_of_biased_policy(tuned):
     _, record = tuned
     before, after = (step["mean_abs_miss_m"]["nominal"] for step in record["steps"])
     assert before > 0.003
@@ -54,13 +54,13 @@ def test_one_step_halves_the_misses_of_a_policy_that_aims_high(tuned):
     assert 0.0 < record["steps"][1]["action_change"] < 0.01
 
 
-def test_the_same_seed_gives_the_same_bits(tuned):
-    again, _ = finetune(aiming_high(), FinetuneCfg(**FEW), say=lambda line: None)
+def test_finetuning_is_bitwise_reproducible(tuned):
+    again, _ = finetune(aiming_high(), FinetuneCfg(**FEW), log=lambda line: None)
     for name, tensor in tuned[0].tensors().items():
         assert torch.equal(tensor, again.tensors()[name]), name
 
 
-def test_command_writes_a_policy_that_can_be_opened(tmp_path, capsys):
+def test_finetune_command_writes_a_loadable_policy(tmp_path, capsys):
     out = tmp_path / "tuned"
     flags = "--goals 2 --late 0 --randomized 0 --iterations 1 --device cpu".split()
     main(["finetune", "vertical_jump", *flags, "--out", str(out)])
@@ -75,32 +75,32 @@ def test_command_writes_a_policy_that_can_be_opened(tmp_path, capsys):
     assert capsys.readouterr().err == f"jumper: {out} exists\n"
 
 
-def test_misses_on_mars_are_those_of_robots_at_rest():
+def test_landing_errors_on_mars_are_measured_at_rest():
     policy = open_policy("mars_horizontal_jump")
     (group,) = make_groups(policy, FinetuneCfg(**FEW | {"distances": (1.0, 4.0)}))
     assert not group.to_height
-    found = follow(group, Network(policy), derivatives=False)
+    errors = jump_errors(group, Network(policy), derivatives=False)
     arrays = group.env.task_arrays()
-    assert found.valid.all() and (arrays["phase_steps"] >= 60).all()  # a second after touchdown
-    assert found.value.abs().max() < 0.05
+    assert errors.valid.all() and (arrays["phase_steps"] >= 60).all()  # a second after touchdown
+    assert errors.value.abs().max() < 0.05
 
 
-def test_a_policy_sees_its_goals_shifted():
+def test_shift_goal_observation_equals_shifted_goal():
     policy, obs = open_policy("horizontal_jump"), 0.3 * torch.randn((5, 147), generator=torch.manual_seed(3))
     moved = obs.clone()
     moved[:, policy.interface.observation_names.index("goal_x")] += 0.02
-    torch.testing.assert_close(with_aim(policy, 0.02).act(obs), policy.act(moved), rtol=0.0, atol=1.0e-5)
+    torch.testing.assert_close(shift_goal_observation(policy, 0.02).act(obs), policy.act(moved), rtol=0.0, atol=1.0e-5)
     assert (policy.act(moved) - policy.act(obs)).abs().max() > 1.0e-3
 
 
-def test_aim_brings_a_policy_that_jumps_too_far_back_to_its_goals():
-    """A policy with its goals 40 mm farther away than in training ends nearer to them than it did then."""
+def test_correct_aim_removes_constant_overshoot():
+    """A policy whose observed goals are 40 mm too far ends nearer to its goals than the original one."""
     policy, cfg = open_policy("slippery_jump"), FinetuneCfg(**FEW | {"goals": 8, "iterations": 0})  # no aim was taken
-    own = follow(make_groups(policy, cfg)[0], Network(policy), derivatives=False).value
-    aimed, record = finetune(with_aim(policy, 0.04), cfg, say=lambda line: None)
+    untouched = jump_errors(make_groups(policy, cfg)[0], Network(policy), derivatives=False).value
+    aimed, record = finetune(shift_goal_observation(policy, 0.04), cfg, log=lambda line: None)
     first, *_, last = record["aims"]
     assert first["ahead"]["nominal"] > 0.025 and abs(last["ahead"]["nominal"]) < 0.005
-    assert last["mean_abs_miss_m"]["nominal"] < float(own.abs().mean()) and len(record["steps"]) == 1
+    assert last["mean_abs_miss_m"]["nominal"] < float(untouched.abs().mean()) and len(record["steps"]) == 1
     for mine, theirs in zip(aimed.layers, policy.layers, strict=True):
         assert torch.equal(mine[0], theirs[0]) and torch.equal(mine[1], theirs[1])
     assert not torch.equal(aimed.mean, policy.mean)
@@ -109,16 +109,16 @@ def test_aim_brings_a_policy_that_jumps_too_far_back_to_its_goals():
 @pytest.mark.parametrize(
     "change", [{"goals": 1}, {"late": -1}, {"iterations": -1}, {"heights": (0.9, 0.5)}, {"action_std": 0.0}]
 )
-def test_impossible_settings_are_refused(change):
+def test_refuses_invalid_settings(change):
     with pytest.raises(InputError):
         FinetuneCfg(**(FEW | change))
 
 
-def test_policies_that_do_not_jump_are_refused():
+def test_refuses_policies_that_do_not_jump():
     with pytest.raises(InputError, match="not for velocity-flat"):
         make_groups(open_policy("walking_flat"), FinetuneCfg(**FEW))
 
 
-def test_no_step_is_refused_where_there_is_no_aim():
+def test_refuses_zero_iterations_for_height_policies():
     with pytest.raises(InputError, match="needs an iteration"):
         finetune(open_policy("vertical_jump"), FinetuneCfg(**FEW | {"iterations": 0}))

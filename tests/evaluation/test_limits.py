@@ -1,4 +1,4 @@
-"""How high the open-loop jump takes each robot."""
+"""Apex of the open-loop jump of each robot."""
 
 from dataclasses import replace
 
@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from jump_helpers import make_env
-from jumper_warp.evaluation.heights import for_sweep
+from jumper_warp.evaluation.heights import with_sweep_terminations
 from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.evaluation.limits import EXTEND, HOLD, RAMP, open_loop_limits
 from jumper_warp.policies.conditions import Conditions
@@ -21,9 +21,9 @@ from support.open_loop import STAND, transversal_command
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def begun(conditions, worlds):
+def initial_env(conditions, worlds):
     """Return an environment that has begun no episode yet, and its state."""
-    task = conditions.applied(for_sweep(make_task("vertical-jump")))
+    task = conditions.applied(with_sweep_terminations(make_task("vertical-jump")))
     env = make_env(worlds, task=task, randomize=conditions.draws, auto_reset=False)
     return env, env.state_dict()
 
@@ -44,28 +44,28 @@ def simulated_apex(kp, kd):
 
 @pytest.mark.parametrize(
     ("gains", "about"), [(None, OPEN_LOOP_APEX), ((0.6, 1.0), 0.757)], ids=["nominal", "weak"]
-)  # 0.757 m was found from outside
-def test_limit_is_the_apex_of_the_open_loop_jump(gains, about):
-    found = open_loop_limits(*begun(Conditions(gains=gains), 2))
-    assert found == pytest.approx([simulated_apex(*(gains or (1.0, 1.0)))] * 2, abs=0.002)
-    assert found == pytest.approx([about] * 2, abs=0.005)
+)  # 0.757 m: from an independent simulation
+def test_open_loop_limit_equals_simulated_apex(gains, about):
+    apexes = open_loop_limits(*initial_env(Conditions(gains=gains), 2))
+    assert apexes == pytest.approx([simulated_apex(*(gains or (1.0, 1.0)))] * 2, abs=0.002)
+    assert apexes == pytest.approx([about] * 2, abs=0.005)
 
 
-def test_limits_are_of_the_very_robots_that_jumped_before():
-    env, fresh = begun(Conditions(randomize=True), 8)
+def test_open_loop_limits_reuse_sampled_robots_without_pushes():
+    env, fresh = initial_env(Conditions(randomize=True), 8)
     command = jump_commands(np.tile([0.0, 0.0, 0.8], (8, 1)), 0.5, env.step_dt)
     env.evaluation_reset(command)
-    figure, skill = read(env), env.skills[0]
+    drawn, skill = read(env), env.skills[0]
     for _ in range(30):
         env.step(torch.zeros((8, 12)))
     numbers = skill.params.values.numpy().copy()
     limits = open_loop_limits(env, fresh)
-    found = read(env)
-    for name in figure:
+    params = read(env)
+    for name in drawn:
         if name in ("push_force", "push_torque"):
-            assert not found[name].any()
+            assert not params[name].any()
         else:
-            np.testing.assert_array_equal(found[name], figure[name], err_msg=name)
+            np.testing.assert_array_equal(params[name], drawn[name], err_msg=name)
     np.testing.assert_array_equal(skill.params.values.numpy(), numbers)
     assert 0.75 < limits.min() < limits.max() - 0.05 < 1.3
     np.testing.assert_array_equal(open_loop_limits(env, fresh), limits)

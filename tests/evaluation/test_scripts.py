@@ -1,4 +1,4 @@
-"""Scripts of commands: what they mean, and one line on each mistake."""
+"""Parsing of scripts, and one-line errors of malformed ones."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ from jumper_warp.utils.errors import InputError
 EXAMPLE = Path(__file__).parents[2] / "assets" / "scripts" / "walk_jump_walk.json"
 
 
-def test_every_command_is_understood():
+def test_parse_script_accepts_every_kind_of_command():
     script = parse_script(
         [{"walk": [0.5, 0, 0.3]}, {"walk": [0, 1, 0], "seconds": 4}, {"stand": 1.5}, {"jump_up": 0.75},
          {"jump_to": [0.85, -0.1]}, {"jump_onto": [1.3, 0.1]}]
@@ -28,7 +28,7 @@ def test_every_command_is_understood():
     assert [step.jumps for step in script] == [False, False, False, True, True, True]
 
 
-def test_the_example_walks_and_jumps():
+def test_example_script_walks_and_jumps():
     kinds = [step.kind for step in read_script(EXAMPLE)]
     assert kinds.index("jump_up") < kinds.index("jump_to") and kinds[0] == "walk" and kinds[-1] == "stand"
 
@@ -54,7 +54,7 @@ def test_the_example_walks_and_jumps():
         ([{"stand": 1}] * 1001, "1 to 1000 commands"),
     ],
 )
-def test_mistakes_are_one_line(content, message):
+def test_parse_script_refuses_malformed_commands_in_one_line(content, message):
     with pytest.raises(InputError) as caught:
         parse_script(content)
     assert message in str(caught.value) and "\n" not in str(caught.value)
@@ -66,7 +66,7 @@ def test_mistakes_are_one_line(content, message):
      (json.dumps([{"stand": 0}]), "command 1: seconds must be positive"), ("[" * 100_000, "not JSON"),
      (" " * (2**20 + 1), "larger than 1 MiB")],
 )  # fmt: skip
-def test_file_that_cannot_be_used_is_named_in_one_line(tmp_path, text, message):
+def test_unusable_script_file_is_named_in_one_line_error(tmp_path, text, message):
     path = tmp_path / "script.json"
     if text is not None:
         path.write_text(text)

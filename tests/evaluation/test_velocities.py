@@ -1,4 +1,4 @@
-"""Figures of walks and gaits, in closed form, of robots that are made up."""
+"""Metrics of walks and gaits of synthetic robots, in closed form."""
 
 from types import SimpleNamespace
 
@@ -7,11 +7,11 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.evaluation import velocities
-from jumper_warp.evaluation.velocities import VelocityFlags, VelocityGoals, Walks
+from jumper_warp.evaluation.velocities import VelocityFlags, VelocityLog, VelocityPlayFlags
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
 from support import gaits
-from support.walks import kept_speeds, settling_times, steps_of, top_speed, walked
+from support.walks import kept_speeds, settling_times, step_commands, top_speed, walked_share
 
 DT = 1.0 / 60.0
 TASK = make_task("velocity-flat")
@@ -19,10 +19,10 @@ NAMES = [term.name for term in TASK.terminations]
 ROBOTS = 3
 
 
-def followed(velocity_of, *, seconds=2.0, falls=None, task=TASK, commands=None, times=(0.0,), **given) -> Walks:
-    """Walks of robots whose velocity (robots, 3) is a function of time [s]; falls: policy step by robot."""
+def walk_log(velocity_of, *, seconds=2.0, falls=None, task=TASK, commands=None, times=(0.0,), **given) -> VelocityLog:
+    """Return the log of robots whose velocity (robots, 3) is a function of time [s]; falls: policy step by robot."""
     commands = np.tile([0.5, -0.2, 0.4], (ROBOTS, 1, 1)) if commands is None else commands
-    walks = Walks(commands, task, seconds, times=np.array(times), **given)
+    walks = VelocityLog(commands, task, seconds, times=np.array(times), **given)
     turn = Rotation.random(ROBOTS, random_state=4)
     for step in range(1, round(seconds / DT) + 1):
         wanted = velocity_of(step * DT)
@@ -37,9 +37,9 @@ def followed(velocity_of, *, seconds=2.0, falls=None, task=TASK, commands=None, 
     return walks
 
 
-def test_errors_are_those_of_body_axes_after_the_first_second():
+def test_tracking_errors_are_in_body_axes_and_exclude_first_second():
     off = np.array([[0.1, 0.0, 0.0], [0.0, -0.2, 0.0], [0.2, 0.0, 0.3]])
-    walks = followed(lambda t: np.array([0.5, -0.2, 0.4]) + off + (0.0 if t > 1.0 + 1e-6 else 5.0))
+    walks = walk_log(lambda t: np.array([0.5, -0.2, 0.4]) + off + (0.0 if t > 1.0 + 1e-6 else 5.0))
     metrics = velocities.tracking_metrics(walks)
     assert metrics["rmse_vx_m_s"] == pytest.approx(np.sqrt(0.05 / 3.0), rel=1e-5)
     assert metrics["rmse_vy_m_s"] == pytest.approx(np.sqrt(0.04 / 3.0), rel=1e-5)
@@ -48,8 +48,8 @@ def test_errors_are_those_of_body_axes_after_the_first_second():
     assert walks.columns()["rms_error_vx"] == pytest.approx([0.1, 0.0, 0.2], abs=1e-6)
 
 
-def test_nothing_counts_after_a_fall():
-    walks = followed(lambda t: np.full((ROBOTS, 3), t > 1.5) + np.array([0.5, -0.2, 0.4]), falls={1: 90, 0: 30})
+def test_samples_after_a_fall_are_ignored():
+    walks = walk_log(lambda t: np.full((ROBOTS, 3), t > 1.5) + np.array([0.5, -0.2, 0.4]), falls={1: 90, 0: 30})
     metrics = velocities.tracking_metrics(walks)
     assert (metrics["falls"], metrics["fell_by_collided"], metrics["fall_rate"]) == (2, 2, pytest.approx(2.0 / 3.0))
     np.testing.assert_array_equal(walks.outcomes, ["collided", "collided", "walked"])
@@ -58,15 +58,15 @@ def test_nothing_counts_after_a_fall():
     assert metrics["rmse_vx_m_s"] == pytest.approx(np.sqrt(30.0 / (29.0 + 60.0)), rel=1e-5)
 
 
-def test_end_of_the_time_is_no_fall():
-    walks = Walks(np.zeros((1, 1, 3)), TASK, 1.0)
+def test_time_out_is_not_a_fall():
+    walks = VelocityLog(np.zeros((1, 1, 3)), TASK, 1.0)
     arrays = {"base_quat": np.array([[0.0, 0.0, 0.0, 1.0]]), "base_vel": np.zeros((1, 3)),
               "base_ang_vel": np.zeros((1, 3)), "termination": np.array([NAMES.index("finished")])}  # fmt: skip
     walks.update(arrays, DT)
     assert not walks.fallen.any() and walks.outcomes[0] == "walked"
 
 
-def test_settling_is_when_the_mean_velocity_stays_near_the_last_command():
+def test_settling_time_is_when_mean_velocity_stays_near_command():
     commands = np.zeros((ROBOTS, 2, 3))
     commands[:, 1, 0] = 0.8
 
@@ -77,13 +77,13 @@ def test_settling_is_when_the_mean_velocity_stays_near_the_last_command():
         v[2, 0] = 0.5  # never
         return v
 
-    settling = settling_times(followed(velocity, seconds=3.0, commands=commands, times=(0.0, 1.0)))
+    settling = settling_times(walk_log(velocity, seconds=3.0, commands=commands, times=(0.0, 1.0)))
     # mean of a ramp over 0.2 s lags 0.1 s: within 0.1 of 0.8 from 0.4375 + about 0.08 s on
     assert settling[0] == pytest.approx(0.53, abs=0.03)
     assert settling[1] == pytest.approx(0.2 * 7.0 / 8.0, abs=1.5 * DT) and np.isinf(settling[2])
 
 
-def test_settling_for_a_while_is_not_spoilt_by_a_later_push():
+def test_settling_time_with_hold_ignores_later_push():
     commands = np.zeros((ROBOTS, 2, 3))
     commands[:, 1, 0] = 0.8
 
@@ -93,28 +93,28 @@ def test_settling_for_a_while_is_not_spoilt_by_a_later_push():
         v[1, 0] = 0.8 * (int(10.0 * t) % 4 > 0)  # never for half a second
         return v
 
-    walks = followed(velocity, seconds=4.0, commands=commands, times=(0.0, 1.0))
+    walks = walk_log(velocity, seconds=4.0, commands=commands, times=(0.0, 1.0))
     assert settling_times(walks)[0] > 1.7
     held = settling_times(walks, 0.5)
     assert held[0] == pytest.approx(0.2 * 7.0 / 8.0, abs=1.5 * DT) and np.isinf(held[1])
 
 
-def test_commands_count_from_the_step_after_they_came():
+def test_command_history_starts_one_step_after_command():
     commands = np.zeros((ROBOTS, 2, 3))
     commands[:, 1, 0] = 1.0
-    walks = followed(lambda t: np.zeros((ROBOTS, 3)), commands=commands, times=(0.0, 1.0))
-    np.testing.assert_array_equal(walks.wanted()[:, 0, 0], [0.0] * 60 + [1.0] * 60)
+    walks = walk_log(lambda t: np.zeros((ROBOTS, 3)), commands=commands, times=(0.0, 1.0))
+    np.testing.assert_array_equal(walks.command_history()[:, 0, 0], [0.0] * 60 + [1.0] * 60)
 
 
-def test_share_of_the_way_stops_at_a_fall():
+def test_walked_share_stops_at_fall():
     commands = np.tile([0.5, 0.0, 0.0], (ROBOTS, 1, 1))
-    walks = followed(lambda t: np.tile([0.3, 0.1, 0.0], (ROBOTS, 1)), seconds=3.0, commands=commands, falls={2: 91})
-    assert walked(walks) == pytest.approx([0.9, 0.9, 0.45], rel=1e-5)  # of the last two seconds
-    fast = followed(lambda t: np.tile([0.9, 0.0, 0.0], (ROBOTS, 1)), commands=commands)
-    assert walked(fast) == pytest.approx([1.0] * 3)
+    walks = walk_log(lambda t: np.tile([0.3, 0.1, 0.0], (ROBOTS, 1)), seconds=3.0, commands=commands, falls={2: 91})
+    assert walked_share(walks) == pytest.approx([0.9, 0.9, 0.45], rel=1e-5)  # of the last two seconds
+    fast = walk_log(lambda t: np.tile([0.9, 0.0, 0.0], (ROBOTS, 1)), commands=commands)
+    assert walked_share(fast) == pytest.approx([1.0] * 3)
 
 
-def test_top_speed_is_that_of_the_highest_class_that_is_kept():
+def test_top_speed_is_of_highest_bin_that_is_kept():
     commanded = np.array([0.31, 0.35, 0.42, 0.48, 0.55, 0.61, 0.66])
     kept = np.array([False, True, True, True, False, True, False])
     assert top_speed(commanded, kept) == 0.48
@@ -122,15 +122,15 @@ def test_top_speed_is_that_of_the_highest_class_that_is_kept():
     assert top_speed(commanded, np.zeros(7, dtype=bool)) == 0.0
 
 
-def test_kept_speed_is_the_mean_of_the_last_seconds():
-    walks = followed(lambda t: np.array([[0.46, 0, 0], [0.44, 0, 0], [0.54, 0, 0]]) - (3.0 if t < 1.0 else 0.0))
+def test_kept_speeds_use_mean_of_last_seconds():
+    walks = walk_log(lambda t: np.array([[0.46, 0, 0], [0.44, 0, 0], [0.54, 0, 0]]) - (3.0 if t < 1.0 else 0.0))
     np.testing.assert_array_equal(kept_speeds(walks, 0, 1.0, 0.1), [True, False, True])
 
 
-def test_grid_and_steps_are_where_they_should_be():
-    commands = velocities.grid(3, (0.8, 0.6, 0.4))
+def test_command_grid_and_step_commands_cover_their_ranges():
+    commands = velocities.command_grid(3, (0.8, 0.6, 0.4))
     assert commands.shape == (27, 1, 3) and {tuple(c) for c in commands[:, 0]} >= {(0.8, -0.6, 0.4), (0.0, 0.0, 0.0)}
-    pairs = steps_of(np.random.default_rng(0), 200, 0.8, 0.8)
+    pairs = step_commands(np.random.default_rng(0), 200, 0.8, 0.8)
     np.testing.assert_allclose(np.linalg.norm((pairs[:, 1] - pairs[:, 0])[:, :2], axis=1), 0.8)
     assert np.abs(pairs).max() <= 0.8 and (pairs[:, 0, 2] == pairs[:, 1, 2]).all()
 
@@ -138,24 +138,24 @@ def test_grid_and_steps_are_where_they_should_be():
 @pytest.mark.parametrize(
     "make",
     [lambda: VelocityFlags(per_axis=1), lambda: VelocityFlags(per_axis=40), lambda: VelocityFlags(seconds=0.0),
-     lambda: VelocityFlags(reach=(11.0, 0.0, 0.0)), lambda: VelocityGoals(velocity=((11.0, 0.0, 0.0),)),
-     lambda: VelocityGoals(each=-1.0)],
+     lambda: VelocityFlags(reach=(11.0, 0.0, 0.0)), lambda: VelocityPlayFlags(velocity=((11.0, 0.0, 0.0),)),
+     lambda: VelocityPlayFlags(each=-1.0)],
 )  # fmt: skip
-def test_settings_out_of_range_are_refused(make):
+def test_refuses_settings_out_of_range(make):
     with pytest.raises(InputError):
         make()
 
 
-def test_played_velocities_come_one_after_the_other():
+def test_play_flags_command_velocities_in_sequence():
     one, two = ((0.5, 0.0, 0.3),), ((0.5, 0.0, 0.3), (0.0, -0.2, 0.0))
-    np.testing.assert_array_equal(VelocityGoals(velocity=one).log(TASK).commands, [one])
-    goals = VelocityGoals(velocity=two, each=2.0)
+    np.testing.assert_array_equal(VelocityPlayFlags(velocity=one).log(TASK).commands, [one])
+    goals = VelocityPlayFlags(velocity=two, each=2.0)
     assert goals.length == 4.0 and goals.log(TASK).times.tolist() == [0.0, 2.0]
     np.testing.assert_array_equal(goals.log(TASK).commands, [two])
-    assert VelocityGoals().log(TASK).commands.shape == (1, 6, 3)
+    assert VelocityPlayFlags().log(TASK).commands.shape == (1, 6, 3)
 
 
-def test_gait_of_a_made_up_trot():
+def test_gait_metrics_of_synthetic_trot():
     steps, n = 120, 2  # 2 s; each diagonal down half a second, then up half a second
     time = np.arange(steps) * DT
     diagonal = np.mod(time, 1.0) < 0.5 - 1e-9
@@ -175,9 +175,9 @@ def test_gait_of_a_made_up_trot():
     assert metrics["median_swing_apex_m"] == pytest.approx(0.07)
 
 
-def test_gait_takes_no_sample_of_the_beginning():
+def test_gait_recorder_skips_first_seconds():
     env = SimpleNamespace(step_dt=DT)
-    gait = gaits.Gait(env, skip=0.5)
+    gait = gaits.GaitRecorder(env, skip=0.5)
     for _ in range(30):
         gait()
     assert not gait.contact and gait.metrics(np.zeros(2, dtype=bool)) == {}

@@ -1,4 +1,4 @@
-"""The experiments of turning in flight, at a tiny size, with a policy that is hardly trained."""
+"""Experiments of turns in flight at a tiny size, with a barely trained policy."""
 
 import json
 
@@ -31,7 +31,7 @@ def test_turns_about_all_axes_are_measured(run, tmp_path):
     assert (tmp_path / "turns.png").is_file() and (tmp_path / "turns.rrd").stat().st_size > 10_000
 
 
-def test_flights_are_flown_with_turning_and_without(run, tmp_path):
+def test_flights_run_with_and_without_turning(run, tmp_path):
     args = flight_attitude.Args(policy=str(run), flights=2, late=10.0, record=1, out=tmp_path, device="cpu")
     values = flight_attitude.main(args)
     assert json.loads((tmp_path / "metrics.json").read_text()) == values
@@ -41,7 +41,7 @@ def test_flights_are_flown_with_turning_and_without(run, tmp_path):
     assert (tmp_path / "flights.png").is_file() and (tmp_path / "turning.rrd").stat().st_size > 10_000
 
 
-def test_a_policy_takes_off_to_its_heights_and_lands(run, tmp_path):
+def test_policy_takes_off_to_commanded_heights_and_lands(run, tmp_path):
     args = flight_attitude.Args(
         policy=str(run), takeoff="policy", landing="mars_vertical_jump", heights=(1.5, 2.0), flights=2, record=0,
         out=tmp_path, device="cpu",
@@ -60,7 +60,7 @@ def test_a_policy_takes_off_to_its_heights_and_lands(run, tmp_path):
     )
 
 
-def test_what_cannot_be_is_refused(tmp_path):
+def test_refuses_invalid_flags(tmp_path):
     with pytest.raises(InputError, match="turns must be at least 6"):
         attitude.Args(turns=3)
     with pytest.raises(InputError, match="late in 0 to 100 ms"):

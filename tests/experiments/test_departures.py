@@ -1,4 +1,4 @@
-"""Departures of the jumps from the paper: each is undone as it says, and the experiment at a tiny size."""
+"""Ablations of the jumps' departures from the paper, and the experiment at a tiny size."""
 
 import json
 import re
@@ -13,27 +13,27 @@ from jumper_warp.registry import make_task
 from jumper_warp.tasks.saving import task_from_json, task_to_json
 from jumper_warp.utils.errors import InputError
 from support import departure_runs
-from support.departure_runs import settings, trained
-from support.departures import DEPARTURES, flags_of
+from support.departure_runs import parse, train_or_load
+from support.departures import DEPARTURES, ablation_flags
 
 
-def undone(task, name):
+def train_settings(task, name):
     """Return the settings of a training without a departure, and its task."""
     each = DEPARTURES[task][name]
-    return settings(each, departures.Args(task=task).command(each, 1, Path("logs")))
+    return parse(each, departures.Args(task=task).command(each, 1, Path("logs")))
 
 
 @pytest.mark.parametrize("task", DEPARTURES)
-def test_what_no_flag_undoes_changes_the_task(task):
+def test_ablation_functions_change_task(task):
     plain = parse_train([task])[1]
     for name, each in DEPARTURES[task].items():
-        assert flags_of(each) or each(plain) != plain, name
+        assert ablation_flags(each) or each(plain) != plain, name
 
 
 @pytest.mark.parametrize("task", ["vertical-jump", "horizontal-jump"])
-def test_all_flags_are_those_of_the_task_and_change_it(task):
+def test_ablation_flags_are_valid_and_change_task(task):
     plain = parse_train([task])[1]
-    flags = " ".join(flags_of(each) for each in DEPARTURES[task].values())
+    flags = " ".join(ablation_flags(each) for each in DEPARTURES[task].values())
     parsed, changed = parse_train([task, *flags.split()])
     assert task_from_json(json.loads(json.dumps(task_to_json(changed)))) == changed
     assert {"reset", "rewards", "terminations"} <= {
@@ -43,55 +43,55 @@ def test_all_flags_are_those_of_the_task_and_change_it(task):
     assert len(set(given)) == len(given) and parsed.cfg.task == task
 
 
-def test_what_is_undone_in_python():
-    plain, changed = parse_train(["vertical-jump"])[1], undone("vertical-jump", "jumping_early")[1]
+def test_ablation_functions_change_only_their_departure():
+    plain, changed = parse_train(["vertical-jump"])[1], train_settings("vertical-jump", "jumping_early")[1]
     names = [term.name for term in plain.terminations]
     assert [term.name for term in changed.terminations] == [name for name in names if name != "early_takeoff"]
     assert replace(changed, terminations=plain.terminations) == plain
-    heights = undone("vertical-jump", "goals")[1].levels
+    heights = train_settings("vertical-jump", "goals")[1].levels
     assert [(level.goal_lower[2], level.goal_upper[2]) for level in heights] == [(0.6, 0.75), (0.6, 0.9), (0.6, 1.1)]
     assert {level.base_height for level in heights} == {(0.22, 0.45)}
-    places = undone("horizontal-jump", "goals")[1].levels
+    places = train_settings("horizontal-jump", "goals")[1].levels
     assert [level.goal_upper for level in places[::2]] == [(0.55, 0, 0), (0.7, 0.1, 0), (0.85, 0.2, 0), (1.0, 0.3, 0)]
     assert [level.base_height for level in places] == 4 * [(0.22, 0.35), (0.22, 0.45)]
     assert {level.goal_lower[0] for level in places} == {0.4}
-    again = undone("horizontal-jump", "another_goal")[1].levels
+    again = train_settings("horizontal-jump", "another_goal")[1].levels
     assert {level.next_jump_probability for level in again} == {0.0}
 
 
-def test_what_is_undone_elsewhere():
+def test_ablations_of_mars_and_omnidirectional_jumps():
     goals = DEPARTURES["horizontal-jump-mars-loose"]["goals"](make_task("horizontal-jump-mars-loose")).levels
     assert [(level.goal_lower[0], level.goal_upper[0]) for level in goals[::2]] == [
         (1.4, 1.85), (1.6, 2.25), (2.0, 3.75), (3.0, 4.75),
     ]  # fmt: skip
     assert {(level.goal_lower[1], level.goal_upper[1]) for level in goals} == {(-0.3, 0.3)} and len(goals) == 8
-    parsed, limits = undone("horizontal-jump-mars-loose", "limits")
+    parsed, limits = train_settings("horizontal-jump-mars-loose", "limits")
     ends = {term.name: term.numbers for term in limits.terminations}
     assert parsed.cfg.init_policy == "horizontal_jump" and limits.curriculum.numbers["tolerance"] == 0.1
     assert (ends["missed_goal"]["tolerance"], ends["predicted_miss"]["tolerance"]) == (0.5, 0.55)
     earth, plain = make_task("horizontal-jump"), make_task("omnidirectional-jump")
     (touchdown,) = (term.numbers for term in earth.terminations if term.name == "turned_touchdown")
     assert ends["turned_touchdown"] == pytest.approx(touchdown, abs=1e-4)
-    assert undone("horizontal-jump-mars-loose", "wide_kernels")[1].rewards == earth.rewards
+    assert train_settings("horizontal-jump-mars-loose", "wide_kernels")[1].rewards == earth.rewards
     around = DEPARTURES["omnidirectional-jump"]["reaches"](plain).levels
     assert around[-1].goal_upper == (1.4, 1.4, 0.0) and around[-1].goal_lower == (-1.4, -1.4, 0.0)
     assert around[0] == plain.levels[0]
 
 
-def test_paws_sink_less_than_a_millimetre_as_the_page_says():
+def test_documented_paw_penetration_is_below_one_millimetre():
     text = (Path(__file__).parents[2] / "docs" / "departures.md").read_text()
     names = {}
     exec(re.search(r"```python\n(.*?)```", text, re.DOTALL)[1].replace("200", "20"), names)
     assert (names["lowest"] > -0.001).all() and (names["lowest"] < -0.0003).all()
 
 
-def test_the_table_of_departures_tells_how_these_are_undone():
+def test_documented_departures_list_their_flags():
     table = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text()
     for name, each in [one for jump in DEPARTURES.values() for one in jump.items()]:
         assert callable(each) or f"`{each}`" in table, name
 
 
-def test_trainings_are_measured_by_the_ends_of_the_task_as_it_is_and_not_made_twice(tmp_path, capsys, monkeypatch):
+def test_trainings_are_cached_and_evaluated_with_task_terminations(tmp_path, capsys, monkeypatch):
     args = departures.Args(
         only=("jumping_early",), iterations=1, envs=4, jumps=(2, 3), squats=2, out=tmp_path,
         measure=False, train="--ppo.compile off --ppo.num-steps 8 --ppo.minibatches 1", device="cpu", threads=1,
@@ -100,11 +100,11 @@ def test_trainings_are_measured_by_the_ends_of_the_task_as_it_is_and_not_made_tw
     assert not (tmp_path / "metrics.json").exists()
     config = next((tmp_path / "jumping_early_1").rglob("config.json")).read_text()
     assert "early_takeoff" not in [term["name"] for term in json.loads(config)["env"]["task"]["terminations"]]
-    ends, follow = [], departure_runs.EvaluationRun.follow
+    ends, run_episodes = [], departure_runs.EvaluationRun.run_episodes
     monkeypatch.setattr(departure_runs, "train", None)
     monkeypatch.setattr(
-        departure_runs.EvaluationRun, "follow",
-        lambda run, env, log: ends.append([term.name for term in env.task.terminations]) or follow(run, env, log),
+        departure_runs.EvaluationRun, "run_episodes",
+        lambda run, env, log: ends.append([term.name for term in env.task.terminations]) or run_episodes(run, env, log),
     )  # fmt: skip
     values = departures.main(replace(args, measure=True, threads=2))
     assert len(ends) == 4 and all("early_takeoff" in names for names in ends[::2])
@@ -120,21 +120,21 @@ def test_trainings_are_measured_by_the_ends_of_the_task_as_it_is_and_not_made_tw
         departures.main(replace(args, train=args.train + " --env.self-collision-margin 0.001"))
 
 
-def test_a_training_may_end_by_the_clock(tmp_path):
+def test_training_with_max_seconds_saves_checkpoint(tmp_path):
     flags = "--ppo.compile off --ppo.num-steps 8 --ppo.minibatches 1 --max-seconds 0.001"
     args = departures.Args(only=("drift",), iterations=1000, envs=4, train=flags, device="cpu", threads=1)
-    checkpoint = trained("", args.command("", 1, tmp_path))
+    checkpoint = train_or_load("", args.command("", 1, tmp_path))
     assert checkpoint.is_file() and int(checkpoint.stem.removeprefix("iteration_")) < 1000
 
 
-def test_the_task_as_it_is_is_trained_with_seeds_of_its_own():
+def test_baseline_is_trained_with_kept_seeds():
     args = departures.Args(only=("kept", "drift"), seeds=(1,), kept_seeds=(2, 3))
-    flags = [(name, seed, undone) for name, seed, undone in args.trainings()]
+    flags = [(name, seed, ablation) for name, seed, ablation in args.trainings()]
     assert flags == [("kept", 2, ""), ("kept", 3, ""), ("drift", 1, DEPARTURES["vertical-jump"]["drift"])]
     assert len(list(departures.Args().trainings())) == 3 + len(DEPARTURES["vertical-jump"])
 
 
-def test_what_cannot_be_is_refused_before_any_training(tmp_path):
+def test_refuses_invalid_flags_before_training(tmp_path):
     with pytest.raises(InputError, match="not bracing"):
         departures.Args(only=("bracing",))
     with pytest.raises(InputError, match="at least 1"):

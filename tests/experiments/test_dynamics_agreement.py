@@ -1,4 +1,4 @@
-"""The comparison with Pinocchio: it agrees for the described robot and an overlay, and sees a wrong mass."""
+"""Comparison with Pinocchio of the described robot and an overlay, and its sensitivity to a wrong mass."""
 
 import json
 
@@ -7,7 +7,7 @@ import pytest
 
 from experiments import dynamics_agreement
 from jumper_warp.robot.overlay import RobotOverlay
-from support.agreement import ours, pinocchios, random_states
+from support.agreement import jumper_quantities, pinocchio_quantities, random_states
 
 OVERLAY = RobotOverlay(
     {
@@ -18,7 +18,7 @@ OVERLAY = RobotOverlay(
 
 
 @pytest.mark.parametrize("overlay", [None, OVERLAY], ids=["described", "overlay"])
-def test_all_quantities_agree_to_single_precision_of_the_masses(tmp_path, overlay):
+def test_dynamics_agree_with_pinocchio_to_single_precision(tmp_path, overlay):
     path = None
     if overlay is not None:
         path = tmp_path / "robot.json"
@@ -29,10 +29,10 @@ def test_all_quantities_agree_to_single_precision_of_the_masses(tmp_path, overla
     assert len(relative) == 5 and max(relative.values()) < 1.0e-6
 
 
-def test_a_mass_that_is_wrong_by_a_hundredth_is_seen():
+def test_one_percent_mass_error_changes_acceleration():
     right, wrong, states = OVERLAY.robots(), OVERLAY.robots(), random_states(4, 1)
     wrong.base_mass *= 1.01
-    found, expected = ours(right, states), pinocchios(wrong, states)
-    relative = dynamics_agreement.differences(found["joint_acceleration"], expected["joint_acceleration"])[2]
+    actual, expected = jumper_quantities(right, states), pinocchio_quantities(wrong, states)
+    relative = dynamics_agreement.differences(actual["joint_acceleration"], expected["joint_acceleration"])[2]
     assert 1.0e-4 < relative < 1.0e-1
-    assert dynamics_agreement.differences(found["paw_jacobian"], expected["paw_jacobian"])[2] < 1.0e-6
+    assert dynamics_agreement.differences(actual["paw_jacobian"], expected["paw_jacobian"])[2] < 1.0e-6

@@ -16,16 +16,16 @@ from experiments import (
     shac,
     soak_test,
 )
-from jumper_warp.evaluation.heights import HeightLog, for_sweep, run_jumps, sweep_metrics
+from jumper_warp.evaluation.heights import HeightLog, run_jumps, sweep_metrics, with_sweep_terminations
 from jumper_warp.evaluation.limits import limit_metrics
 from jumper_warp.evaluation.sweeps import HEIGHTS_IN_RANGE, HeightSweep
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
 from landing_helpers import OPEN_LOOP_APEX, still_policy
-from support.learning import Curve
+from support.learning import LearningCurve
 from support.soak import SoakArgs, hardest
-from support.timing import flags_of, over_baseline
+from support.timing import baseline_ratios, changed_flags
 
 SWEEP_ENDS = ("success", "came_apart", "low_base", "tilted", "collided", "no_jump", "too_long")
 pytestmark = pytest.mark.usefixtures("one_thread")
@@ -33,7 +33,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def trained(tmp_path_factory):
-    """Folder, figures and run of a short training with the script's own reward."""
+    """Folder, metrics and run of a short training with the reward of `new_reward.py`."""
     folder = tmp_path_factory.mktemp("new_reward")
     values = new_reward.main(new_reward.Args(envs=16, iterations=2, steps=48, out=folder, device="cpu"))
     (run,) = (folder / "logs" / "vertical-jump").iterdir()
@@ -43,7 +43,7 @@ def trained(tmp_path_factory):
 # ---------------------------------------------------------------- a new reward
 
 
-def test_new_reward_is_trained_with_and_logged_by_its_name(trained):
+def test_new_reward_is_logged_by_name(trained):
     folder, values, run = trained
     line = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])
     assert values["even_load_per_episode"] == line["Episode_Reward/even_load"]
@@ -54,7 +54,8 @@ def test_new_reward_is_trained_with_and_logged_by_its_name(trained):
 # ---------------------------------------------------------------- the sweep
 
 
-def jumps_of(target, apex, end, tilt_deg, rest_speed, early=False):
+def height_log(target, apex, end, tilt_deg, rest_speed, early=False):
+    """Return the log of finished jumps with these outcomes; end: index in SWEEP_ENDS."""
     jumps = HeightLog(np.array(target), SWEEP_ENDS)
     jumps.apex[:, 0], jumps.end[:, 0], jumps.early[:, 0] = apex, end, early
     jumps.tilt[:, 0], jumps.rest_speed[:, 0] = np.radians(tilt_deg), rest_speed
@@ -62,8 +63,8 @@ def jumps_of(target, apex, end, tilt_deg, rest_speed, early=False):
     return jumps
 
 
-def test_sweep_figures_against_hand_numbers():
-    jumps = jumps_of(
+def test_sweep_metrics_match_hand_computed_values():
+    jumps = height_log(
         target=[0.50, 0.60, 0.80, 1.00, 1.10, 1.15, 1.18, 1.20],
         apex=[0.59, 0.60, 0.80, 0.80, 1.08, 1.08, 1.09, 1.05],
         end=[0, 0, 4, 0, 2, 0, 0, 0],
@@ -71,22 +72,22 @@ def test_sweep_figures_against_hand_numbers():
         rest_speed=[0.01, 0.2, np.inf, 0.02, np.inf, 0.01, 0.01, 0.01],
         early=[False] * 6 + [True, False],
     )
-    figures = sweep_metrics(jumps, HEIGHTS_IN_RANGE)
+    metrics = sweep_metrics(jumps, HEIGHTS_IN_RANGE)
     # errors 0.09 0 0 -0.20 -0.02 -0.07 -0.09 -0.15
-    assert figures["mean_abs_error_m"] == pytest.approx(0.62 / 8)
-    assert figures["mean_abs_error_in_range_m"] == pytest.approx(0.31 / 5)
-    assert figures["mean_error_m"] == pytest.approx(-0.44 / 8)
-    assert figures["success_rate"] == pytest.approx(5 / 8)
-    assert figures["success_rate_in_range"] == pytest.approx(4 / 5)
-    assert figures["success_rate_0_6_1_1"] == pytest.approx(3 / 4)
-    assert figures["largest_reached_m"] == pytest.approx(1.09)
-    assert figures["landing_rate"] == pytest.approx(4 / 8)
-    assert figures["success_and_landing_rate"] == pytest.approx(1 / 8)
-    assert figures["largest_tilt_deg"] == pytest.approx(20.0)
-    assert (figures["collision_rate"], figures["fall_rate"], figures["early_rate"]) == (1 / 8, 1 / 8, 1 / 8)
-    assert list(figures).index("success_and_landing_rate") == list(figures).index("success_rate") + 1
-    assert figures["max_landing_tilt_deg"] == pytest.approx(11.0)
-    assert figures["miss_rate"] == 2 / 8  # of 1.00 m and 1.20 m; the early jump is none
+    assert metrics["mean_abs_error_m"] == pytest.approx(0.62 / 8)
+    assert metrics["mean_abs_error_in_range_m"] == pytest.approx(0.31 / 5)
+    assert metrics["mean_error_m"] == pytest.approx(-0.44 / 8)
+    assert metrics["success_rate"] == pytest.approx(5 / 8)
+    assert metrics["success_rate_in_range"] == pytest.approx(4 / 5)
+    assert metrics["success_rate_0_6_1_1"] == pytest.approx(3 / 4)
+    assert metrics["largest_reached_m"] == pytest.approx(1.09)
+    assert metrics["landing_rate"] == pytest.approx(4 / 8)
+    assert metrics["success_and_landing_rate"] == pytest.approx(1 / 8)
+    assert metrics["largest_tilt_deg"] == pytest.approx(20.0)
+    assert (metrics["collision_rate"], metrics["fall_rate"], metrics["early_rate"]) == (1 / 8, 1 / 8, 1 / 8)
+    assert list(metrics).index("success_and_landing_rate") == list(metrics).index("success_rate") + 1
+    assert metrics["max_landing_tilt_deg"] == pytest.approx(11.0)
+    assert metrics["miss_rate"] == 2 / 8  # of 1.00 m and 1.20 m; the early jump is none
     expected = {
         "open_loop_limit_m": 1.0748,
         "lowest_open_loop_limit_m": 1.0748,
@@ -106,17 +107,17 @@ def test_sweep_figures_against_hand_numbers():
     assert (weak["lowest_open_loop_limit_m"], weak["reachable_share_0_6_1_1"]) == (0.49, 2 / 4)
 
 
-def test_a_world_that_came_apart_is_no_success_and_no_error():
-    jumps = jumps_of([0.6, 0.8, 1.0], [0.65, 1e6, np.nan], [0, 1, 1], [1.0] * 3, [0.0] * 3)
-    figures = sweep_metrics(jumps, HEIGHTS_IN_RANGE)
-    assert figures["mean_abs_error_m"] == pytest.approx(0.05)
-    assert figures["success_rate"] == pytest.approx(1 / 3)
-    assert figures["came_apart"] == 2
-    assert figures["largest_reached_m"] == pytest.approx(0.65)
+def test_diverged_world_is_excluded_from_success_and_error():
+    jumps = height_log([0.6, 0.8, 1.0], [0.65, 1e6, np.nan], [0, 1, 1], [1.0] * 3, [0.0] * 3)
+    metrics = sweep_metrics(jumps, HEIGHTS_IN_RANGE)
+    assert metrics["mean_abs_error_m"] == pytest.approx(0.05)
+    assert metrics["success_rate"] == pytest.approx(1 / 3)
+    assert metrics["came_apart"] == 2
+    assert metrics["largest_reached_m"] == pytest.approx(0.65)
 
 
-class Script:
-    """Squats for a second and then stretches, beginning at a policy step."""
+class OpenLoopPolicy:
+    """Squats for a second and then extends the legs, beginning at a policy step."""
 
     def __init__(self, begin):
         self.begin, self.step = begin, 0
@@ -130,20 +131,20 @@ class Script:
 
 @pytest.fixture(scope="module")
 def sweep_env():
-    return env_of_policy(still_policy("vertical-jump"), 3, Conditions(device="cpu"), change=for_sweep)
+    return env_of_policy(still_policy("vertical-jump"), 3, Conditions(device="cpu"), change=with_sweep_terminations)
 
 
 @pytest.mark.parametrize(("begin", "early"), [(31, False), (-45, True)])
 def test_scripted_jump_reaches_the_open_loop_height_and_lands(sweep_env, begin, early):
     targets = np.array([0.5, 0.7, 1.05])
-    figures = sweep_metrics(run_jumps(Script(begin).act, sweep_env, targets), HEIGHTS_IN_RANGE)
-    assert figures["largest_reached_m"] == pytest.approx(OPEN_LOOP_APEX, abs=0.02)
-    assert figures["landing_rate"] == 1.0
-    assert figures["early_rate"] == (1.0 if early else 0.0)
-    assert figures["success_rate"] == pytest.approx(0.0 if early else 1 / 3)
+    metrics = sweep_metrics(run_jumps(OpenLoopPolicy(begin).act, sweep_env, targets), HEIGHTS_IN_RANGE)
+    assert metrics["largest_reached_m"] == pytest.approx(OPEN_LOOP_APEX, abs=0.02)
+    assert metrics["landing_rate"] == 1.0
+    assert metrics["early_rate"] == (1.0 if early else 0.0)
+    assert metrics["success_rate"] == pytest.approx(0.0 if early else 1 / 3)
 
 
-def test_sweep_of_a_run_leaves_figures_plot_recording_and_filmstrip(trained, tmp_path):
+def test_sweep_of_a_run_writes_metrics_plot_recording_and_filmstrip(trained, tmp_path):
     values = HeightSweep(policy=str(trained[2]), jumps=3, record=2, randomize=True, out=tmp_path, device="cpu").run()
     saved = json.loads((tmp_path / "metrics.json").read_text())
     assert saved == values
@@ -167,16 +168,10 @@ def test_sweep_of_a_run_leaves_figures_plot_recording_and_filmstrip(trained, tmp
 # ---------------------------------------------------------------- learning curves
 
 
-def test_seconds_to_a_rate_are_those_of_the_first_evaluation_that_has_it():
-    curve = Curve(seconds=[5.0, 10.0, 15.0, 20.0], success=[0.1, 0.85, 0.7, 0.9])
-    assert curve.seconds_to(0.8) == 10.0
-    assert curve.seconds_to(0.95) is None
-
-
-def test_learning_curves_tell_when_each_training_was_good_enough(tmp_path, monkeypatch):
+def test_learning_curves_report_time_to_success_rates(tmp_path, monkeypatch):
     def train(args, name, seed):
         if seed == 1:
-            return Curve([2.0, 4.0, 6.0], [0.5, 0.96, 0.9], [10, 20, 30], ready=3.0)
+            return LearningCurve([2.0, 4.0, 6.0], [0.5, 0.96, 0.9], [10, 20, 30], ready=3.0)
         return learning_curves.train(args, name, seed)
 
     monkeypatch.setattr(learning_curves, "train_in_process", train)
@@ -217,7 +212,7 @@ def test_benchmark_reports_solver_environment_and_both_trainers(tmp_path):
     assert values["ppo_collect_s"] + values["ppo_update_s"] == pytest.approx(values["ppo_iteration_s"], rel=0.2)
 
 
-def test_soak_of_a_simulation_and_of_an_environment_finds_finite_worlds(tmp_path):
+def test_soak_reports_no_invalid_worlds(tmp_path):
     for task in (None, "horizontal-jump"):
         args = SoakArgs(envs=8, steps=40, episode=20, task=task, out=tmp_path, device="cpu")
         values = soak_test.main(args)
@@ -227,34 +222,34 @@ def test_soak_of_a_simulation_and_of_an_environment_finds_finite_worlds(tmp_path
         assert 0.01 < values["largest_speed_m_s"] < 10.0 and values["largest_joint_speed_rad_s"] > 1.0
 
 
-def test_worlds_that_come_apart_in_a_soaked_environment_are_counted(tmp_path, monkeypatch):
+def test_soak_counts_diverged_worlds(tmp_path, monkeypatch):
     step = soak_test.Env.step
     monkeypatch.setattr(soak_test.Env, "step", lambda env, action: step(env, torch.full_like(action, torch.nan)))
     args = SoakArgs(envs=4, steps=5, hold=5, episode=100, task="vertical-jump", out=tmp_path, device="cpu")
     assert soak_test.main(args)["non_finite_worlds"] == 20
 
 
-def test_row_that_is_not_finite_ends_a_soak(tmp_path, monkeypatch):
+def test_soak_raises_on_non_finite_reward(tmp_path, monkeypatch):
     step = soak_test.Env.step
 
-    def spoilt(env, action):
+    def step_with_nan(env, action):
         step(env, action)
         env.reward[2] = torch.nan
 
-    monkeypatch.setattr(soak_test.Env, "step", spoilt)
+    monkeypatch.setattr(soak_test.Env, "step", step_with_nan)
     args = SoakArgs(envs=4, steps=40, episode=20, task="vertical-jump", out=tmp_path, device="cpu")
     with pytest.raises(RuntimeError, match="20 rows hold values that are not finite, by step 20"):
         soak_test.main(args)
 
 
-def test_soak_is_on_the_hardest_row_of_a_map_and_leaves_other_tasks_alone():
+def test_hardest_keeps_last_terrain_row_and_other_tasks():
     terrain = hardest(make_task("velocity-rough")).reset.settings.terrain
     assert terrain == dataclasses.replace(make_task("velocity-rough").reset.settings.terrain, rows=1)
     for name in ("velocity-flat", "vertical-jump"):
         assert hardest(make_task(name)) == make_task(name)
 
 
-def test_rates_are_told_over_those_of_a_baseline(tmp_path):
+def test_baseline_ratios_compare_rates_with_other_checkout(tmp_path):
     script = tmp_path / "base" / "experiments" / "script.py"
     script.parent.mkdir(parents=True)
     script.write_text(
@@ -272,20 +267,20 @@ def test_rates_are_told_over_those_of_a_baseline(tmp_path):
         device: str | None = None
         newest: int = 3
 
-    figures = {"steps_per_s_jump": 100.0, "steps_per_s_new": 7.0, "apex_m": 1.1}
+    metrics = {"steps_per_s_jump": 100.0, "steps_per_s_new": 7.0, "apex_m": 1.1}
     args = Args((4, 8), False, tmp_path / "base")
-    ratios = over_baseline(args.baseline, "experiments/script.py", args, figures)
+    ratios = baseline_ratios(args.baseline, "experiments/script.py", args, metrics)
     assert ratios == {"steps_per_s_jump_over_baseline": 2.0}
-    assert over_baseline(None, "experiments/script.py", args, figures) == {}
+    assert baseline_ratios(None, "experiments/script.py", args, metrics) == {}
     with pytest.raises(InputError, match=r"fails: .*AssertionError"):
-        over_baseline(args.baseline, "experiments/script.py", Args((4,), False, args.baseline), figures)
+        baseline_ratios(args.baseline, "experiments/script.py", Args((4,), False, args.baseline), metrics)
     with pytest.raises(InputError, match=r"no experiments/other\.py in"):
-        over_baseline(args.baseline, "experiments/other.py", args, figures)
-    assert flags_of(Args((4,), True, tmp_path, device="cpu")) == ["--envs", "4", "--noise", "--device", "cpu"]
-    assert flags_of(Args((4,), True, tmp_path, newest=4)) == ["--envs", "4", "--noise", "--newest", "4"]
+        baseline_ratios(args.baseline, "experiments/other.py", args, metrics)
+    assert changed_flags(Args((4,), True, tmp_path, device="cpu")) == ["--envs", "4", "--noise", "--device", "cpu"]
+    assert changed_flags(Args((4,), True, tmp_path, newest=4)) == ["--envs", "4", "--noise", "--newest", "4"]
 
 
-def test_benchmark_of_solvers_tells_both_and_their_ratio(tmp_path):
+def test_solver_benchmark_reports_both_solvers_and_ratio(tmp_path):
     args = benchmark_solver.Args(envs=[2], repeats=1, steps=2, out=tmp_path, device="cpu")
     values = benchmark_solver.main(args)
     assert values == json.loads((tmp_path / "metrics.json").read_text())
@@ -295,7 +290,7 @@ def test_benchmark_of_solvers_tells_both_and_their_ratio(tmp_path):
     assert values["ratio_standing"] == pytest.approx(expected) and values["ratio_jump"] > 0.0
 
 
-def test_benchmark_of_solvers_compares_numbers_of_threads(tmp_path):
+def test_solver_benchmark_compares_thread_counts(tmp_path):
     args = benchmark_solver.Args(
         envs=[32], solvers=["jumper"], repeats=1, steps=2, out=tmp_path, device="cpu", threads=[1, 2]
     )
@@ -308,7 +303,7 @@ def test_benchmark_of_solvers_compares_numbers_of_threads(tmp_path):
     assert values["thread_speedup"] == pytest.approx(min(ratios)) and values["jumper_apex_m"] > 0.8
 
 
-def test_gradient_cost_checks_the_gradient_and_what_is_kept(tmp_path):
+def test_gradient_cost_reports_gradient_error_and_saved_bytes(tmp_path):
     values = gradient_cost.main(gradient_cost.Args(worlds=2, repeats=1, out=tmp_path, device="cpu"))
     assert values == json.loads((tmp_path / "metrics.json").read_text())
     assert values["height_difference_m"] == 0.0 and values["kept_bytes_a_policy_step"] <= 2000.0
@@ -318,7 +313,7 @@ def test_gradient_cost_checks_the_gradient_and_what_is_kept(tmp_path):
         assert 0.0 < values[f"error_{name}"] < 0.02
 
 
-def test_shac_is_compared_with_ppo_and_gradients_are_measured(tmp_path):
+def test_shac_experiment_reports_curves_and_gradient_noise(tmp_path):
     args = shac.Args(
         seconds=0.1, every=0.1, seeds=(0,), envs=8, window=2, hidden=(8,), jumps=3, horizons=(1, 2), worlds=4,
         out=tmp_path, device="cpu",

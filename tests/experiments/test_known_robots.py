@@ -1,4 +1,4 @@
-"""Known robots of the identification experiment: as drawn, and how well robots predict what they did."""
+"""Known robots of the identification experiment: sampling, prediction errors and χ²."""
 
 import numpy as np
 import pytest
@@ -6,40 +6,40 @@ import pytest
 from jumper_warp.identification.parameters import jumper_parameters
 from jumper_warp.identification.recording import replay_plan
 from jumper_warp.identification.replay import Replay
-from support.identification_methods import chi2_at, problem_of
+from support.identification_methods import chi2_at, make_problem
 from support.known_robots import MOST, make_case, prediction_errors
 
 
 @pytest.fixture(scope="module")
-def figure():
-    """Parameters, one known robot, what replays, and what carries a plan out."""
+def sampled_case():
+    """Parameters, a case of one known robot, the batched replay, and the function that simulates a plan."""
     parameters, one = jumper_parameters(), Replay(device="cpu", threads=1)
     many = Replay(device="cpu", threads=1)
 
-    def carry(plan, robots):
+    def simulate(plan, robots):
         return replay_plan(one, plan, robots)
 
-    return parameters, make_case(parameters, 3, carry, many), many, carry
+    return parameters, make_case(parameters, 3, simulate, many), many, simulate
 
 
-def test_a_robot_is_drawn_from_the_priors_and_always_late(figure):
-    parameters, case, _, _ = figure
+def test_sampled_robot_is_within_priors_and_has_latency(sampled_case):
+    parameters, case, _, _ = sampled_case
     assert np.abs(case.truth).max() <= 0.2 + MOST and case.truth.std() > 0.4
     assert case.truth[parameters.names.index("latency")] >= 0.2
     assert len(case.motions) == 4 and case.held_out.torque_limit == 16.0
 
 
-def test_a_robot_predicts_itself_exactly_and_another_one_does_not(figure):
-    parameters, case, _, carry = figure
-    assert max(prediction_errors(case, case.robots, carry)) < 1.0e-12
-    angle, height = prediction_errors(case, parameters.robots(np.zeros((1, len(parameters)))), carry)
+def test_true_robot_predicts_held_out_jump_exactly(sampled_case):
+    parameters, case, _, simulate = sampled_case
+    assert max(prediction_errors(case, case.robots, simulate)) < 1.0e-12
+    angle, height = prediction_errors(case, parameters.robots(np.zeros((1, len(parameters)))), simulate)
     assert angle > 0.5 and height > 1.0
 
 
-def test_the_truth_explains_what_was_measured_to_its_noise(figure):
-    """But for where the motions started, which is expected and not known here."""
-    parameters, case, many, _ = figure
-    problem = problem_of(parameters, case, many)
+def test_true_parameters_lower_chi2_of_measurements(sampled_case):
+    """Initial states are at their expected values, not the true ones."""
+    parameters, case, many, _ = sampled_case
+    problem = make_problem(parameters, case, many)
     point = problem.expected()
     described = chi2_at(problem, point)
     point.z[:] = case.truth

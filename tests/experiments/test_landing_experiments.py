@@ -10,11 +10,11 @@ import pytest
 import torch
 
 from experiments import paper_tests
-from jumper_warp.evaluation.film import beside
+from jumper_warp.evaluation.film import side_view
+from jumper_warp.evaluation.landings import LANDING_TERMINATIONS, LandingLog
 from jumper_warp.evaluation.log import run_evaluation, termination_names
-from jumper_warp.evaluation.places import ENDS, PlaceLog
-from jumper_warp.evaluation.plots import Track
-from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, shown
+from jumper_warp.evaluation.plots import BasePaths
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, format_value
 from jumper_warp.evaluation.suites import Consecutive, Farthest, Grid, Platform, consecutive_metrics, distance_metrics
 from jumper_warp.evaluation.sweeps import DistanceSweep
 from jumper_warp.policies.conditions import Conditions, env_of_policy
@@ -23,7 +23,7 @@ from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
 from landing_helpers import OPEN_LOOP_APEX, still_policy
 
-COLLIDED, NO_JUMP, LANDED = (ENDS.index(name) for name in ("collided", "no_jump", "success"))
+COLLIDED, NO_JUMP, LANDED = (LANDING_TERMINATIONS.index(name) for name in ("collided", "no_jump", "success"))
 SHARED = {"mean_error_m", "success_rate", "success_rate_in_range", "jumps", "solver", "randomize", "seed"}
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -36,51 +36,53 @@ def policy(tmp_path_factory):
     return str(folder)
 
 
-def ended(goals, landing, end, **changes):
-    """Return rows of jumps that ended as told; goals and landing [m], (rows, jumps, 2), heading 0."""
-    landings = PlaceLog(np.array(goals, dtype=float), ENDS)
+def landing_log(goals, landing, end, **changes):
+    """Return the log of finished jumps of heading 0; goals, landing [m]: (rows, jumps, 2); end: termination index."""
+    landings = LandingLog(np.array(goals, dtype=float), LANDING_TERMINATIONS)
     landings.end[:] = end
-    landings.target[:], landings.place[:], landings.touchdown[:] = goals, landing, landing
+    landings.goal_world[:], landings.end_position[:], landings.touchdown[:] = goals, landing, landing
     landings.heading[:], landings.yaw[:], landings.tilt[:] = 0.0, 0.0, 0.0
     for name, value in changes.items():
         getattr(landings, name)[:] = value
     return landings
 
 
-def ahead(distances):
+def goals_ahead(distances):
+    """Return goals straight ahead [m], (n, 1, 2)."""
     return np.stack([distances, np.zeros(len(distances))], axis=1)[:, None]
 
 
-# ---------------------------------------------------------------- figures by hand
+# ---------------------------------------------------------------- metrics by hand
 
 
-def test_sweep_counts_ranges_by_distance():
-    goals = ahead([0.3, 0.7, 1.0, 1.4, 1.5])
-    landings = ended(goals, goals + [[[0.02, 0.0]], [[0.0, 0.04]], [[0.0, 0.2]], [[0.03, 0.0]], [[-0.5, 0.0]]], LANDED)
-    figures = DistanceSweep.metrics(landings)
-    assert figures["mean_error_m"] == pytest.approx(0.79 / 5)
-    assert figures["success_rate"] == pytest.approx(3 / 5)
-    assert figures["success_rate_in_range"] == pytest.approx(3 / 4)
-    assert figures["success_rate_0_4_1_0"] == pytest.approx(1 / 2)
+def test_sweep_metrics_count_ranges_by_distance():
+    goals = goals_ahead([0.3, 0.7, 1.0, 1.4, 1.5])
+    errors = [[[0.02, 0.0]], [[0.0, 0.04]], [[0.0, 0.2]], [[0.03, 0.0]], [[-0.5, 0.0]]]
+    landings = landing_log(goals, goals + errors, LANDED)
+    metrics = DistanceSweep.metrics(landings)
+    assert metrics["mean_error_m"] == pytest.approx(0.79 / 5)
+    assert metrics["success_rate"] == pytest.approx(3 / 5)
+    assert metrics["success_rate_in_range"] == pytest.approx(3 / 4)
+    assert metrics["success_rate_0_4_1_0"] == pytest.approx(1 / 2)
 
 
-def test_grid_has_every_goal_as_often_as_wanted():
-    goals = Grid(columns=3, rows=2, jumps=2).places
+def test_grid_repeats_every_goal():
+    goals = Grid(columns=3, rows=2, jumps=2).goals
     assert goals.shape == (12, 1, 2)
     assert goals[:4, 0].tolist() == [[0.35, -0.35], [0.35, -0.35], [0.35, 0.35], [0.35, 0.35]]
     assert goals[-1, 0].tolist() == [1.4, 0.35]
-    assert len(Grid().places) == 220
+    assert len(Grid().goals) == 220
 
 
-def test_consecutive_figures_by_hand():
+def test_consecutive_metrics_match_hand_computed_values():
     goals = [[[0.8, 0.2], [0.75, -0.2]], [[0.8, 0.0], [0.8, 0.0]]]
     off = [[[0.01, 0.0], [0.0, 0.03]], [[0.05, 0.0], [0.2, 0.0]]]
-    pairs = ended(goals, np.add(goals, off), LANDED)
+    pairs = landing_log(goals, np.add(goals, off), LANDED)
     ends = [[LANDED] * 3, [LANDED, COLLIDED, -1]]
-    row = ended(np.ones((2, 3, 2)), np.ones((2, 3, 2)) + [0.0, 0.04], ends)
-    row.heading[1, 2] = row.place[1, 2] = np.nan
+    row = landing_log(np.ones((2, 3, 2)), np.ones((2, 3, 2)) + [0.0, 0.04], ends)
+    row.heading[1, 2] = row.end_position[1, 2] = np.nan
     row.rest_speed[:] = [[0.05, 0.2, 0.05], [0.05, np.inf, np.inf]]
-    figures = consecutive_metrics(pairs, row)
+    metrics = consecutive_metrics(pairs, row)
     expected = {
         "jumps": 4,
         "mean_error_m": 0.29 / 4,
@@ -103,57 +105,57 @@ def test_consecutive_figures_by_hand():
         "fall_rate_ten": 1 / 5,
         "miss_rate_ten": 0.0,
     }
-    assert {name: figures[name] for name in expected} == pytest.approx(expected)
-    assert figures["mean_error_by_number_m"] == pytest.approx([0.04, 0.04, 0.04])
-    assert "at_rest_within_1_s_rate" not in figures  # the rest may be of another length
+    assert {name: metrics[name] for name in expected} == pytest.approx(expected)
+    assert metrics["mean_error_by_number_m"] == pytest.approx([0.04, 0.04, 0.04])
+    assert "at_rest_within_1_s_rate" not in metrics  # the rest may be of another length
 
 
-def test_row_without_a_fall_may_miss_its_goals():
+def test_row_without_fall_may_miss_goals():
     off = np.ones((2, 3, 2)) + [[[0.0, 0.0]] * 3, [[0.0, 0.0], [0.3, 0.0], [0.0, 0.0]]]
     pairs = np.ones((2, 2, 2))
-    figures = consecutive_metrics(ended(pairs, pairs, LANDED), ended(np.ones((2, 3, 2)), off, LANDED))
-    assert (figures["ten_in_a_row_rate"], figures["row_all_on_goal_rate"]) == (1.0, 0.5)
+    metrics = consecutive_metrics(landing_log(pairs, pairs, LANDED), landing_log(np.ones((2, 3, 2)), off, LANDED))
+    assert (metrics["ten_in_a_row_rate"], metrics["row_all_on_goal_rate"]) == (1.0, 0.5)
 
 
-def test_paths_are_drawn_from_the_start_and_along_the_heading():
-    track = Track()
-    landings = PlaceLog(np.zeros((2, 1, 2)), ENDS)
+def test_base_paths_are_in_start_frame():
+    base_paths = BasePaths()
+    landings = LandingLog(np.zeros((2, 1, 2)), LANDING_TERMINATIONS)
     for place in ([0.0, 0.0, 0.3], [0.0, 1.0, 0.3]):
-        landings.seen = {"base_pos": np.array([place, place])}
-        track(landings)
+        landings.arrays = {"base_pos": np.array([place, place])}
+        base_paths(landings)
     landings.current[1] = 1
-    track(landings)
-    paths = track.in_start_frame(np.array([0.5 * math.pi, 0.0]))
+    base_paths(landings)
+    paths = base_paths.in_start_frame(np.array([0.5 * math.pi, 0.0]))
     assert paths[0] == pytest.approx(np.array([[0.0, 0.0], [1.0, 0.0], [1.0, 0.0]]))
     assert paths[1, 1] == pytest.approx([0.0, 1.0]) and np.isnan(paths[1, 2]).all()
 
 
-def of(middle, *, clean, stepped=0, hopped=0):
-    """Return 20 jumps of a bin, so many of which succeed, the rest collides; touchdown 0.2 m before the goal."""
-    goals, good = ahead([middle] * 20), clean + stepped + hopped
+def bin_log(middle, *, clean, stepped=0, hopped=0):
+    """Return the log of 20 jumps: clean, stepped and hopped ones, the rest collides; touchdown 0.2 m short."""
+    goals, good = goals_ahead([middle] * 20), clean + stepped + hopped
     air = [[0.0]] * (clean + stepped) + [[0.1]] * (20 - clean - stepped)
     lift = [[0.0]] * clean + [[0.1]] * (20 - clean)
     end = [[LANDED]] * good + [[COLLIDED]] * (20 - good)
-    return ended(goals, goals + [0.01, 0.0], end, air_time=air, lift_time=lift, touchdown=goals - [0.2, 0.0])
+    return landing_log(goals, goals + [0.01, 0.0], end, air_time=air, lift_time=lift, touchdown=goals - [0.2, 0.0])
 
 
 @pytest.mark.parametrize(("direction", "unit"), [(0.0, (1.0, 0.0)), (90.0, (0.0, 1.0)), (180.0, (-1.0, 0.0))])
-def test_goals_of_a_bin_lie_in_a_direction(direction, unit):
+def test_bin_goals_lie_in_commanded_direction(direction, unit):
     expected = np.array([0.75, 0.775, 0.8, 0.825, 0.85])[:, None, None] * np.array(unit)
-    np.testing.assert_allclose(Farthest(jumps=5, direction=direction).places(0.8), expected, atol=1e-12)
-    one = Farthest(jumps=1, direction=direction).places(0.8)
+    np.testing.assert_allclose(Farthest(jumps=5, direction=direction).goals(0.8), expected, atol=1e-12)
+    one = Farthest(jumps=1, direction=direction).goals(0.8)
     np.testing.assert_allclose(one, 0.8 * np.array(unit)[None, None], atol=1e-12)
 
 
-def test_reliable_distance_is_the_last_bin_before_the_first_that_is_not():
+def test_reliable_distance_is_last_bin_before_first_failure():
     bins = {
-        1.2: of(1.2, clean=19),
-        1.3: of(1.3, clean=10, stepped=10),
-        1.4: of(1.4, clean=10, hopped=9),
-        1.5: of(1.5, clean=10, stepped=8),
-        1.6: of(1.6, clean=20),
+        1.2: bin_log(1.2, clean=19),
+        1.3: bin_log(1.3, clean=10, stepped=10),
+        1.4: bin_log(1.4, clean=10, hopped=9),
+        1.5: bin_log(1.5, clean=10, stepped=8),
+        1.6: bin_log(1.6, clean=20),
     }
-    figures = distance_metrics(bins)
+    metrics = distance_metrics(bins)
     expected = {
         "largest_reliable_m": 1.4, "largest_reliable_without_hop_m": 1.3, "largest_reliable_without_step_m": 1.2,
         "base_at_touchdown_m": 1.2, "base_at_touchdown_without_hop_m": 1.1, "base_at_touchdown_without_step_m": 1.0,
@@ -162,27 +164,27 @@ def test_reliable_distance_is_the_last_bin_before_the_first_that_is_not():
         "success_rate": 0.96, "single_jump_success_rate": 0.87, "step_free_success_rate": 0.69,
         "success_rate_in_range": 58 / 60, "farthest_success_m": 1.61, "jumps": 100, "mean_error_m": 0.01,
     }  # fmt: skip
-    assert {name: figures[name] for name in expected} == pytest.approx(expected)
-    assert figures["bin_success_rate"] == pytest.approx([0.95, 1.0, 0.95, 0.9, 1.0])
-    assert figures["bin_single_jump_success_rate"] == pytest.approx([0.95, 1.0, 0.5, 0.9, 1.0])
-    assert figures["bin_step_free_success_rate"] == pytest.approx([0.95, 0.5, 0.5, 0.5, 1.0])
-    assert figures["bin_base_at_touchdown_m"] == pytest.approx([1.0, 1.1, 1.2, 1.3, 1.4])
+    assert {name: metrics[name] for name in expected} == pytest.approx(expected)
+    assert metrics["bin_success_rate"] == pytest.approx([0.95, 1.0, 0.95, 0.9, 1.0])
+    assert metrics["bin_single_jump_success_rate"] == pytest.approx([0.95, 1.0, 0.5, 0.9, 1.0])
+    assert metrics["bin_step_free_success_rate"] == pytest.approx([0.95, 0.5, 0.5, 0.5, 1.0])
+    assert metrics["bin_base_at_touchdown_m"] == pytest.approx([1.0, 1.1, 1.2, 1.3, 1.4])
 
 
-def test_distance_without_any_reliable_bin_is_none():
-    goals = ahead([1.0, 1.0])
-    bins = {1.0: ended(goals, goals, [[NO_JUMP], [NO_JUMP]])}
-    figures = distance_metrics(bins)
-    assert figures["largest_reliable_m"] is None and figures["farthest_success_m"] is None
-    assert figures["bin_base_at_touchdown_m"] == [None]
-    assert figures["hop_free_distance_m"] is None and figures["max_landing_tilt_deg"] is None
+def test_distance_metrics_without_reliable_bin_are_none():
+    goals = goals_ahead([1.0, 1.0])
+    bins = {1.0: landing_log(goals, goals, [[NO_JUMP], [NO_JUMP]])}
+    metrics = distance_metrics(bins)
+    assert metrics["largest_reliable_m"] is None and metrics["farthest_success_m"] is None
+    assert metrics["bin_base_at_touchdown_m"] == [None]
+    assert metrics["hop_free_distance_m"] is None and metrics["max_landing_tilt_deg"] is None
 
 
-def test_figures_are_printed_with_four_digits_in_lists_too():
-    assert shown([0.123456, None, 2]) == "0.1235, None, 2" and shown(1.0 / 3.0) == "0.3333"
+def test_format_value_uses_four_digits_also_in_lists():
+    assert format_value([0.123456, None, 2]) == "0.1235, None, 2" and format_value(1.0 / 3.0) == "0.3333"
 
 
-def test_scenes_put_the_ground_where_it_is_said_to_be():
+def test_platform_scenes_have_specified_ground_and_block():
     rng, goals = np.random.default_rng(0), np.array([[0.8, 0.1], [1.0, -0.1]])
     scenes = {name: scene for name, *scene in Platform(edge=0.46).scenes(goals, rng)}
     ground = scenes["platform"][0]["ground"]
@@ -198,8 +200,8 @@ def test_scenes_put_the_ground_where_it_is_said_to_be():
     assert [name for name, *_ in Platform(solver="mujoco").scenes(goals, rng)] == ["platform", "uneven"]
 
 
-def test_eye_looks_across_the_path():
-    eye, target = beside(np.array([0.0, 0.0]), np.array([0.0, 1.0]))
+def test_side_view_is_perpendicular_to_path():
+    eye, target = side_view(np.array([0.0, 0.0]), np.array([0.0, 1.0]))
     assert target == pytest.approx([0.0, 0.5, 0.4])
     assert eye == pytest.approx([2.4, 0.5, 0.75])
 
@@ -207,8 +209,8 @@ def test_eye_looks_across_the_path():
 # ---------------------------------------------------------------- real jumps
 
 
-class Hop:
-    """Squats and stretches a second after the start, and again whenever a jump was commanded since."""
+class HopPolicy:
+    """Squats and extends the legs a second after the start, and again when `begin` is set."""
 
     def __init__(self):
         self.step, self.begin = 0, 31
@@ -221,29 +223,29 @@ class Hop:
 
 @pytest.fixture(scope="module")
 def hops():
-    """Hops on the spot, each world asked for another place, and a second hop that follows at once."""
+    """Log of two hops in place of three worlds with different goals."""
     policy = still_policy("horizontal-jump")
-    ends = set(ENDS) - {"no_jump"}  # the script squats too long for the task's patience
+    ends = set(LANDING_TERMINATIONS) - {"no_jump"}  # the script squats too long for the task's patience
 
     def change(task):
         return dataclasses.replace(task, terminations=tuple(term for term in task.terminations if term.name in ends))
 
     env = env_of_policy(policy, 3, Conditions(device="cpu"), change=change)
     goals = np.array([[[0.0, 0.0], [0.0, 0.05]], [[0.05, 0.0], [0.3, 0.0]], [[0.5, -0.2], [0.0, 0.0]]])
-    landings = PlaceLog(
+    landings = LandingLog(
         goals, termination_names(env.task), headings=np.array([0.0, 2.0, -1.5]), delay=np.array([0.5, 0.4, 0.3])
     )
-    script = Hop()
+    script = HopPolicy()
 
-    def again():
+    def restart_script():
         if (landings.current == 1).any() and script.begin == 31:
             script.begin = script.step + 1
 
-    run_evaluation(script.act, env, landings, seconds=8.0, watch=again)
+    run_evaluation(script.act, env, landings, seconds=8.0, on_step=restart_script)
     return landings
 
 
-def test_hop_on_the_spot_lands_near_its_start_and_off_its_goal(hops):
+def test_hop_in_place_lands_at_start_and_misses_far_goal(hops):
     assert hops.landed.all() and not hops.early.any() and not hops.hopped.any()
     assert ((hops.apex > 0.9) & (hops.apex < OPEN_LOOP_APEX)).all()
     assert hops.landing[:, 0] == pytest.approx(np.zeros((3, 2)), abs=0.06)
@@ -251,8 +253,8 @@ def test_hop_on_the_spot_lands_near_its_start_and_off_its_goal(hops):
     assert hops.error[2, 0] == pytest.approx(math.hypot(0.5, 0.2), abs=0.06)
 
 
-def test_second_hop_is_measured_from_where_the_first_one_ended(hops):
-    start = hops.target[:, 1] - hops.place[:, 0]
+def test_second_jump_goal_is_relative_to_end_of_first(hops):
+    start = hops.goal_world[:, 1] - hops.end_position[:, 0]
     assert np.linalg.norm(start, axis=1) == pytest.approx([0.05, 0.3, 0.0], abs=1e-3)
     assert hops.outcomes[:, 1].tolist() == ["success", "missed", "success"]
 
@@ -270,7 +272,7 @@ def test_second_hop_is_measured_from_where_the_first_one_ended(hops):
         (Farthest, {"jumps": 3}, ("max_jump.png", "jump_1.0_m.rrd")),
     ],
 )
-def test_suite_leaves_metrics_plot_and_recording(suite, settings, files, policy, tmp_path):
+def test_suite_writes_metrics_plot_and_recording(suite, settings, files, policy, tmp_path):
     values = suite(policy=policy, record=1, out=tmp_path, device="cpu", **settings).run()
     saved = json.loads((tmp_path / "metrics.json").read_text())
     assert saved == values and saved.keys() >= SHARED
@@ -279,7 +281,7 @@ def test_suite_leaves_metrics_plot_and_recording(suite, settings, files, policy,
         assert (tmp_path / name).stat().st_size > 1000, name
 
 
-def test_numbers_of_the_paper_stand_beside_those_of_a_policy(policy, tmp_path, monkeypatch):
+def test_paper_tests_report_metrics_with_paper_values(policy, tmp_path, monkeypatch):
     small = dataclasses.make_dataclass("Small", [("columns", int, 1), ("rows", int, 1)], bases=(Grid,), frozen=True)
     monkeypatch.setattr(paper_tests, "suites_for", lambda evaluation: {"grid": small})
     values = paper_tests.main(paper_tests.Args(policies=(policy,), record=0, out=tmp_path, device="cpu"))
@@ -288,14 +290,14 @@ def test_numbers_of_the_paper_stand_beside_those_of_a_policy(policy, tmp_path, m
     assert (tmp_path / "still_grid" / "grid.png").is_file()
 
 
-def test_randomised_robot_that_stands_still_is_off_by_the_whole_way(policy, tmp_path):
+def test_standing_policy_has_error_of_full_distance(policy, tmp_path):
     values = DistanceSweep(policy=policy, jumps=4, record=0, randomize=True, out=tmp_path, device="cpu").run()
     assert values["mean_error_m"] == pytest.approx(0.9, abs=0.05)
     assert values["randomize"] and values["landing_rate"] == 0.0
     assert (values["trained_lower_m"], values["trained_upper_m"]) == (0.2, 2.2)
 
 
-def test_nothing_of_viewer_and_meshes_is_needed_without_a_recording(policy, tmp_path):
+def test_sweep_without_recording_needs_no_viewer(policy, tmp_path):
     code = (
         "import sys\n"
         "for name in ('rerun', 'trimesh', 'pin', 'pinocchio'): sys.modules[name] = None\n"
@@ -308,16 +310,16 @@ def test_nothing_of_viewer_and_meshes_is_needed_without_a_recording(policy, tmp_
     assert {path.name for path in tmp_path.iterdir()} == {"metrics.json", "run.json", "sweep.png"}
 
 
-def test_policy_of_another_task_is_refused_in_one_line(tmp_path):
+def test_refuses_policy_of_other_task(tmp_path):
     needed = "needs a policy that is evaluated by place or around or place-mars"
     message = f"{needed}, vertical_jump is of vertical-jump, by height"
     with pytest.raises(PolicyError, match=message):
-        EvaluationRun.of("test", EvaluationArgs(policy="vertical_jump", out=tmp_path, device="cpu"))
+        EvaluationRun.from_args("test", EvaluationArgs(policy="vertical_jump", out=tmp_path, device="cpu"))
 
 
-def test_missing_device_is_refused(policy, tmp_path):
+def test_refuses_missing_device(policy, tmp_path):
     with pytest.raises(InputError, match="no device 'abacus'"):
-        EvaluationRun.of("test", EvaluationArgs(policy=policy, out=tmp_path, device="abacus"))
+        EvaluationRun.from_args("test", EvaluationArgs(policy=policy, out=tmp_path, device="abacus"))
 
 
 def test_script_refuses_a_policy_of_another_task_in_one_line_with_code_2(policy):
@@ -342,6 +344,6 @@ def test_script_refuses_a_policy_of_another_task_in_one_line_with_code_2(policy)
         (lambda: Farthest(direction=200.0), "direction must be in -180..180 deg, got 200"),
     ],
 )
-def test_impossible_settings_are_refused(make, message):
+def test_refuses_invalid_settings(make, message):
     with pytest.raises(ValueError, match=message):
         make()

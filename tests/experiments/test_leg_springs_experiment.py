@@ -1,4 +1,4 @@
-"""The experiment with springs between the knees, at a tiny size."""
+"""Experiment with springs between the knees at a tiny size."""
 
 import json
 from pathlib import Path
@@ -20,12 +20,12 @@ def test_springs_let_the_robot_jump_higher(tmp_path):
     assert (tmp_path / "springs.png").is_file() and (tmp_path / "jump_stock.rrd").stat().st_size > 10_000
 
 
-def test_the_springs_of_the_sequel_are_an_overlay():
+def test_leg_springs_overlay_has_sequel_values():
     values = load_overlay(Path(__file__).parents[2] / "assets/jumper/leg_springs.json").values
     assert values == {"spring_stiffness": (1000.0,), "spring_length": (0.17,)}
 
 
-def test_what_cannot_be_is_refused():
+def test_refuses_invalid_flags():
     with pytest.raises(InputError, match="spring_stiffness must be in"):
         leg_springs.Args(stiffness=(-1.0,))
     with pytest.raises(InputError, match="at least one"):

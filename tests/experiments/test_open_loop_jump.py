@@ -1,4 +1,4 @@
-"""The open-loop jump of a robot that is described otherwise."""
+"""Open-loop jump of a robot with an overlay."""
 
 import json
 
@@ -20,6 +20,6 @@ def test_a_heavier_robot_jumps_lower(tmp_path):
     assert (tmp_path / "jump_strip.png").stat().st_size > 10_000
 
 
-def test_springs_and_a_robot_are_refused(tmp_path):
+def test_refuses_springs_together_with_robot(tmp_path):
     with pytest.raises(InputError, match="springs or a robot"):
         open_loop_jump.Args(robot=tmp_path / "heavy.json", spring=(1000.0, 0.17))

@@ -1,4 +1,4 @@
-"""How quietly squats are held: figures by hand, and the experiment at a tiny size."""
+"""Metrics of held squats by hand, and the experiment at a tiny size."""
 
 import json
 
@@ -7,36 +7,36 @@ import pytest
 
 from experiments import squat_hold
 from jumper_warp.utils.errors import InputError
-from support.holds import Holds, hold_metrics
+from support.squats import SquatLog, squat_metrics
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def held(steps, **changes):
-    """Return three robots, the last of which ends; steps: forces (4,) of the first two in turn; torques are 0 and 2."""
-    holds = Holds(np.zeros((3, 3)), hold=1.5, window=2.0 / 60.0)
+def squat_log(steps, **changes):
+    """Return the log of three robots, the last of which ends; steps: paw forces (4,) [N] of each policy step."""
+    squats = SquatLog(np.zeros((3, 3)), hold=1.5, window=2.0 / 60.0)
     for step, force in enumerate(steps):
         arrays = {
             "force": np.tile(force, (3, 1)), "peak": np.tile(force, (3, 1)) + [[1.0], [2.0], [900.0]],
             "torque": np.full((3, 12), 2.0 * (step % 2)), "termination": np.array([-1, -1, step - 2]),
         }  # fmt: skip
-        holds.update(arrays | changes, 1.0 / 60.0)
-    return holds
+        squats.update(arrays | changes, 1.0 / 60.0)
+    return squats
 
 
-def test_figures_against_hand_numbers():
-    holds = held([np.full(4, 500.0), np.full(4, 40.0), np.array([40.0, 43.0, 40.0, 0.0])])
-    np.testing.assert_array_equal(holds.over, [False, False, True])
+def test_squat_metrics_match_hand_computed_values():
+    squats = squat_log([np.full(4, 500.0), np.full(4, 40.0), np.array([40.0, 43.0, 40.0, 0.0])])
+    np.testing.assert_array_equal(squats.ended, [False, False, True])
     # the last two steps: the fourth paw between its peak of 40 + 1 or 2 and 0
-    np.testing.assert_allclose(holds.force_range, [41.0, 42.0])
-    np.testing.assert_allclose(holds.torque_ripple, 1.0)
-    metrics = hold_metrics(holds)
+    np.testing.assert_allclose(squats.force_range, [41.0, 42.0])
+    np.testing.assert_allclose(squats.torque_ripple, 1.0)
+    metrics = squat_metrics(squats)
     assert metrics["holding_rate"] == pytest.approx(2.0 / 3.0) and metrics["lost_paw_share"] == 1.0 / 8.0
     assert (metrics["mean_paw_force_range_n"], metrics["max_paw_force_range_n"]) == (41.5, 42.0)
 
 
-def test_robots_that_do_not_hold_have_no_forces():
-    metrics = hold_metrics(held([np.ones(4)] * 2, termination=np.zeros(3)))
+def test_squat_metrics_are_none_if_no_robot_holds():
+    metrics = squat_metrics(squat_log([np.ones(4)] * 2, ending=np.zeros(3)))
     assert metrics["holding_rate"] == 0.0
     assert all(value is None for name, value in metrics.items() if name not in ("squats", "holding_rate"))
 
@@ -51,7 +51,7 @@ def test_shipped_policies_hold_their_squats(policy, tmp_path):
     assert (tmp_path / "hold.png").is_file()
 
 
-def test_what_cannot_be_is_refused():
+def test_refuses_invalid_flags():
     with pytest.raises(InputError, match="need at least one squat"):
         squat_hold.Args(hold=0.5)
     with pytest.raises(InputError, match="height must be in"):

@@ -10,8 +10,8 @@ from support.optimized_jumps import JUMPS, LIMITED, run_ups
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-def test_experiment_tells_what_its_targets_do(tmp_path):
-    """A short search: the figures are those of a replay of the targets that it wrote."""
+def test_reported_metrics_equal_replay_of_saved_targets(tmp_path):
+    """A short search: the metrics are those of a replay of the targets that it wrote."""
     args = experiment.Args(jumps=("highest",), samples=48, effort=0.01, polish=1, out=tmp_path, device="cpu")
     values = experiment.main(args)
     saved = np.load(tmp_path / "highest.npz", allow_pickle=False)
@@ -22,7 +22,7 @@ def test_experiment_tells_what_its_targets_do(tmp_path):
     assert {"highest.rrd", "highest_strip.png", "trajectories.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
-def test_replay_sees_paws_that_are_lifted_again():
+def test_replay_measures_paws_lifted_after_touchdown():
     """A jump, a landing, a squat; and, in the second motion, another jump."""
     jump = JUMPS["still"]
     knots = jump.make(substeps=8, device="cpu").knots
@@ -36,7 +36,7 @@ def test_replay_sees_paws_that_are_lifted_again():
     assert once.work == twice.work > 20.0 and once.apex > 0.5
 
 
-def test_replay_flies_and_violates_what_the_problem_computes():
+def test_replay_matches_objective_and_constraints_of_problem():
     """Distance and constraints of a jump forward, in the simulation and in the rollout."""
     jump = JUMPS["farthest"]
     made = jump.make(device="cpu", threads=1)
@@ -51,7 +51,7 @@ def test_replay_flies_and_violates_what_the_problem_computes():
     assert [replay.violation for replay in replays] == pytest.approx(violations, abs=1e-3)
 
 
-def test_each_limit_changes_what_it_names():
+def test_each_limit_changes_only_the_named_setting():
     made = {name: jump.make() for name, jump in LIMITED.items()}
     nominal = JUMPS["farthest"].make()
     kind, kinds = nominal.motors.transversal, {name: problem.motors.transversal for name, problem in made.items()}
@@ -78,7 +78,7 @@ def test_run_ups_lean_back_before_they_push():
 
 
 @pytest.mark.parametrize("flags", [{"jumps": ("wings",)}, {"effort": 0.0}, {"samples": 3}, {"polish": 0}])
-def test_flags_that_cannot_be_are_told_in_a_line(flags, capsys):
+def test_invalid_flags_give_one_line_error(flags, capsys):
     with pytest.raises(SystemExit):
         run_command(lambda: experiment.Args(**flags))
     assert capsys.readouterr().err.count("\n") == 1

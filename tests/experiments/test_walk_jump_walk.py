@@ -1,4 +1,4 @@
-"""The experiment of walking and jumping with the shipped policies, at a tiny size."""
+"""Experiment of walking and jumping with the shipped policies at a tiny size."""
 
 import json
 
@@ -16,19 +16,19 @@ KEYS = (
 )  # fmt: skip
 
 
-def test_two_robots_do_the_papers_test(tmp_path, monkeypatch):
+def test_walk_jump_walk_with_two_robots_succeeds(tmp_path, monkeypatch):
     monkeypatch.setattr(walk_jump_walk, "WALKS", (1, 1, 1))
     monkeypatch.setattr(walk_jump_walk, "EACH", 1.5)
     values = walk_jump_walk.main(walk_jump_walk.Args(robots=2, record=1, out=tmp_path, device="cpu"))
-    figures = json.loads((tmp_path / "metrics.json").read_text())
-    assert figures == values and set(KEYS) <= set(figures)
-    assert (figures["success_rate"], figures["robots"], figures["jumps_made"]) == (1.0, 2, 4)
-    assert figures["apex_error_m"] < 0.05 and figures["landing_error_m"] < 0.05
-    assert 0.0 < figures["rmse_vx_m_s"] < 0.2 and 0.2 < figures["command_to_takeoff_s"] < 2.5
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics == values and set(KEYS) <= set(metrics)
+    assert (metrics["success_rate"], metrics["robots"], metrics["jumps_made"]) == (1.0, 2, 4)
+    assert metrics["apex_error_m"] < 0.05 and metrics["landing_error_m"] < 0.05
+    assert 0.0 < metrics["rmse_vx_m_s"] < 0.2 and 0.2 < metrics["command_to_takeoff_s"] < 2.5
     assert (tmp_path / "course.png").is_file() and (tmp_path / "walk_jump_walk.rrd").stat().st_size > 10_000
 
 
-def test_scripts_are_those_of_the_test():
+def test_scripts_have_specified_commands():
     rng = np.random.default_rng(3)
     paper = walk_jump_walk.paper_script(rng)
     assert [step.kind for step in paper] == 3 * ["walk"] + ["jump_up"] + 3 * ["walk"] + ["jump_to"] + 2 * ["walk"]
@@ -42,7 +42,7 @@ def test_scripts_are_those_of_the_test():
     assert walk_jump_walk.scripts(args) == walk_jump_walk.scripts(args)
 
 
-def test_what_cannot_be_is_refused(tmp_path):
+def test_refuses_invalid_flags(tmp_path):
     with pytest.raises(InputError, match="robots"):
         walk_jump_walk.Args(robots=0)
     with pytest.raises(PolicyError, match="evaluated by velocity"):

@@ -1,4 +1,4 @@
-"""The walking experiments with a policy that stands still: what they ask, write and refuse."""
+"""Walking experiments with a policy that stands still: commands, outputs and refused settings."""
 
 import json
 
@@ -11,7 +11,7 @@ from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
 from landing_helpers import still_policy
-from support.walks import kicked, sped_up
+from support.walks import kicked_walks, sped_up_walks
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -25,47 +25,47 @@ def policies(tmp_path_factory):
     return folder
 
 
-def test_robots_that_stand_still_follow_nothing(policies, tmp_path):
+def test_standing_policy_has_rmse_of_command(policies, tmp_path):
     args = walking_tracking.Args(
         policy=str(policies / "velocity-flat"), per_axis=2, record=0, out=tmp_path, device="cpu"
     )
     values = walking_tracking.main(args)
-    figures = json.loads((tmp_path / "metrics.json").read_text())
-    assert figures == values and (tmp_path / "tracking.png").is_file()
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
+    assert metrics == values and (tmp_path / "tracking.png").is_file()
     for name in ("rmse_vx_m_s", "rmse_vy_m_s", "rmse_yaw_rate_rad_s"):
-        assert figures[name] == pytest.approx(0.8, abs=0.02)
-    assert (figures["robots"], figures["falls"], figures["median_settling_s"]) == (8, 0, None)
-    assert figures["top_ahead_m_s"] == figures["top_turning_rad_s"] == figures["steps_hz"] == 0.0
-    assert figures["share_down_FL_FR_BL_BR"] == 1.0 and figures["cost_of_transport"] is None
-    assert figures["kicked_fall_rate"] == 0.0
+        assert metrics[name] == pytest.approx(0.8, abs=0.02)
+    assert (metrics["robots"], metrics["falls"], metrics["median_settling_s"]) == (8, 0, None)
+    assert metrics["top_ahead_m_s"] == metrics["top_turning_rad_s"] == metrics["steps_hz"] == 0.0
+    assert metrics["share_down_FL_FR_BL_BR"] == 1.0 and metrics["cost_of_transport"] is None
+    assert metrics["kicked_fall_rate"] == 0.0
 
 
-def test_robots_that_stand_still_come_nowhere_on_any_ground(policies, tmp_path):
+def test_standing_policy_has_zero_success_on_terrains(policies, tmp_path):
     args = walking_terrain.Args(
         policy=str(policies / "velocity-flat"), robots=3, terrains=("flat", "stairs"), record=1, out=tmp_path,
         device="cpu",
     )  # fmt: skip
-    figures = walking_terrain.main(args)
-    assert figures["success_rate_flat"] < 0.02 and figures["success_rate_stairs"] < 0.02
-    assert figures["fall_rate_flat"] == 0.0 and (tmp_path / "terrain.png").is_file()
+    metrics = walking_terrain.main(args)
+    assert metrics["success_rate_flat"] < 0.02 and metrics["success_rate_stairs"] < 0.02
+    assert metrics["fall_rate_flat"] == 0.0 and (tmp_path / "terrain.png").is_file()
     assert (tmp_path / "stairs.rrd").stat().st_size > 10_000 and (tmp_path / "flat.png").stat().st_size > 10_000
 
 
-def test_kicks_and_speeds_are_those_of_the_test():
+def test_kicked_and_sped_up_walks_have_specified_kicks_and_speeds():
     class Env:
         num_envs, task, step_dt = 16, make_task("velocity-flat"), 1.0 / 60.0
 
-    thrown = kicked(Env, np.random.default_rng(0))
-    np.testing.assert_allclose(np.linalg.norm(thrown.kick, axis=1), 0.5)
-    assert thrown.kick_time.min() >= 2.0 and thrown.kick_time.max() <= 4.0
-    fast, which = sped_up(Env)
+    kicked = kicked_walks(Env, np.random.default_rng(0))
+    np.testing.assert_allclose(np.linalg.norm(kicked.kick, axis=1), 0.5)
+    assert kicked.kick_time.min() >= 2.0 and kicked.kick_time.max() <= 4.0
+    fast, which = sped_up_walks(Env)
     last = fast.commands[:, -1]
     np.testing.assert_allclose(last[which == 1, 0], -np.linspace(0.3, 4.0, 4))
     np.testing.assert_allclose(last[which == 2, 1], np.linspace(0.3, 2.0, 4))
     assert not last[which == 3, :2].any() and fast.times[-1] < 3.0
 
 
-def test_policy_of_another_task_and_settings_out_of_range_are_refused(policies, tmp_path):
+def test_refuses_policy_of_other_task_and_invalid_settings(policies, tmp_path):
     with pytest.raises(PolicyError, match="evaluated by velocity"):
         walking_tracking.main(
             walking_tracking.Args(policy=str(policies / "horizontal-jump"), out=tmp_path, device="cpu")

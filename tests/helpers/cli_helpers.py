@@ -1,4 +1,4 @@
-"""The command line as a user meets it: its answers, and the curves that it records."""
+"""Running commands in tests, and reading the recorded time series."""
 
 import numpy as np
 from rerun.chunk import RrdReader
@@ -18,11 +18,11 @@ def run(capsys, *args):
 
 
 def curves(path):
-    """Return the values of each curve of a recording by its entity."""
-    found = {}
+    """Return the values of every time series of a recording by entity path."""
+    series = {}
     for chunk in RrdReader(path).stream().to_chunks():
         batch = chunk.to_record_batch()
         if "Scalars:scalars" in batch.schema.names:
             name = str(chunk.entity_path).replace("\\", "")
-            found[name] = np.ravel(batch.column("Scalars:scalars").to_pylist())
-    return found
+            series[name] = np.ravel(batch.column("Scalars:scalars").to_pylist())
+    return series

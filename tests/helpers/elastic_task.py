@@ -1,6 +1,6 @@
 """A training for torchrun: `torchrun elastic_task.py FOLDER [DEATH ...]`; each DEATH is `restart,rank,step`.
 
-In its so-manieth start, a process of that rank kills itself in that step of its environment.
+The process of that rank kills itself in that environment step after that restart.
 """
 
 import os
@@ -15,7 +15,7 @@ STEPS = SMALL.num_steps
 
 
 class Mortal(PushTask):
-    """Dies when its hour has come, like a machine that is taken away."""
+    """A task that kills its process at the given step, like a preempted machine."""
 
     def step(self, action):
         super().step(action)

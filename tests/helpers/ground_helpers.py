@@ -1,4 +1,4 @@
-"""Heightfields as NumPy sees them, and as the solver does."""
+"""Heights of heightfields, by NumPy and by the solver's kernel function."""
 
 import numpy as np
 import warp as wp
@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 
 def heights(field):
-    """Heights of the nodes [m], rows along y."""
+    """Return the heights of the nodes [m], rows along y."""
     return field.min_z + np.asarray(field.data, dtype=float) * (field.max_z - field.min_z)
 
 
@@ -23,7 +23,7 @@ def surface_kernel(ground: Ground, x: wp.array(dtype=float), y: wp.array(dtype=f
 
 
 def probe(field, x, y):
-    """Height [m] and slopes of the ground as the solver has it, (n, 3)."""
+    """Return height [m] and slopes of the ground by the solver's `surface`, (n, 3); x, y [m]: (n,)."""
     model = build_model(1, ground=field, visuals=False, device="cpu")
     ground = ground_struct(model, find_ground(model), ground_module)
     x, y = (np.asarray(v, dtype=np.float32) for v in np.broadcast_arrays(x, y))

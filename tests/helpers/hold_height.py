@@ -1,4 +1,4 @@
-"""A task of one's own, as a user writes it: hold the base at a commanded height. It touches nothing of the package."""
+"""A user-defined task, outside of the package: hold the base at a commanded height."""
 
 from __future__ import annotations
 

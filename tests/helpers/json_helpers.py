@@ -1,8 +1,8 @@
-"""Places in a JSON tree, for tests that change one of them."""
+"""Traversal of JSON trees, for tests that change one value."""
 
 
 def places(tree):
-    """Yield every place of a JSON tree: its container, and its key or index."""
+    """Yield container and key (or index) of every value in a JSON tree."""
     for key in list(tree) if isinstance(tree, dict) else range(len(tree)):
         yield tree, key
         if isinstance(tree[key], dict | list):

@@ -141,7 +141,7 @@ class Robots:
 def tilted_by(angle: float, axis=(1.0, 0.0, 0.0)) -> dict:
     """Return orientation and gravity of a robot tilted by an angle [rad] about a horizontal axis."""
     quat = wp.quat_from_axis_angle(wp.vec3(*axis), float(angle))
-    return {"quat": tuple(quat), "gravity": tuple(wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0)))}
+    return {"quat": tuple(quat), "projected_gravity": tuple(wp.quat_rotate_inv(quat, wp.vec3(0.0, 0.0, -1.0)))}
 
 
 def only(start_mode: str, reset: ResetCfg | None = None, **ranges) -> ResetCfg:

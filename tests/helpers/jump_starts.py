@@ -1,4 +1,4 @@
-"""Thousands of beginnings of jumps, and what they are made of, for tests of resets."""
+"""Samples of the start states of jumps, for tests of resets."""
 
 from functools import cached_property
 
@@ -13,14 +13,14 @@ from jumper_warp.kernels.collision.robot import collision_kernel
 from solver_helpers import Reference, States, paw_joint
 
 PLACES = ("horizontal-jump", "omnidirectional-jump")
-"""Names of the tasks of jumping to a place."""
+"""Names of the tasks of jumps to landing positions."""
 PAW_RADIUS = 0.025  # [m]
 ANKLE = np.array([0.0, 0.0, -0.3])
-"""[m] Of a paw's centre from the joint that carries it."""
+"""[m] Position of a paw's centre in the frame of the joint that carries it."""
 
 
 class Starts:
-    """Beginnings of one scheme, every world at its own level; exact: the jump starts at the origin."""
+    """Start states of one scheme, with the levels spread over the worlds; exact: starts are at the origin."""
 
     def __init__(self, env: Env, start_mode: str, exact: bool = False, **settings):
         """settings: of the reset, besides the scheme."""
@@ -45,23 +45,23 @@ class Starts:
 
     @cached_property
     def paws(self) -> np.ndarray:
-        """Places of the paws [m], (worlds, 4, 3)."""
+        """Paw positions [m], world frame, (worlds, 4, 3)."""
         return paws_of(self._model, self.q, self.qd)
 
     def split(self, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Return the parts of horizontal vectors towards the goal and to its left."""
+        """Return the components of horizontal vectors (worlds, 3) towards the goal and to its left, (worlds,)."""
         left = np.cross([0.0, 0.0, 1.0], self.along)
         return np.sum(vectors * self.along, axis=1), np.sum(vectors * left, axis=1)
 
     def paws_around(self, spot: np.ndarray) -> np.ndarray:
-        """Return the paws relative to places (worlds, 3), in the jump's heading, all as if they were front left."""
+        """Return the paws relative to positions [m], (worlds, 3), in the jump's heading, mirrored to front left."""
         relative = self.paws - spot[:, None]
         rotate_yaw = np.stack([self.heading.inv().apply(relative[:, leg]) for leg in range(4)], axis=1)
         return rotate_yaw * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
 
 
 def paws_of(model, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
-    """Return the places of the paws [m] from Pinocchio, (worlds, 4, 3), of rows of joint_q and joint_qd."""
+    """Return the paw positions [m] by Pinocchio, (worlds, 4, 3), of rows of joint_q and joint_qd."""
     reference, states = Reference(model), States.read(q, qd)
     robot, joints = reference.robot, [paw_joint(reference, leg) for leg in range(4)]
     paws = np.zeros((len(states.pos), 4, 3))
@@ -74,7 +74,7 @@ def paws_of(model, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
 
 
 def paws_and_velocities(env: Env, worlds: np.ndarray) -> np.ndarray:
-    """Return places [m] and velocities [m/s] of the paws of some worlds from Pinocchio, (2, worlds, 4, 3)."""
+    """Return positions [m] and velocities [m/s] of the paws of some worlds by Pinocchio, (2, worlds, 4, 3)."""
     reference = Reference(env.sim.model)
     states = States.read(env.sim.joint_q()[worlds], env.sim.joint_qd()[worlds])
     robot, joints = reference.robot, [paw_joint(reference, leg) for leg in range(4)]
@@ -90,7 +90,7 @@ def paws_and_velocities(env: Env, worlds: np.ndarray) -> np.ndarray:
 
 
 def collision_flags(env: Env) -> np.ndarray:
-    """Return the flags of forbidden contacts of every world."""
+    """Return the collision flags of every world, (num_envs,)."""
     flags, clearance = (wp.zeros(env.num_envs, dtype=kind, device="cpu") for kind in (int, float))
     robot = env.sim.physics.dynamics.robot
     inputs = [robot.geometry, robot.ground, env.sim.state.joint_q, 43, 0.0]
@@ -99,7 +99,7 @@ def collision_flags(env: Env) -> np.ndarray:
 
 
 def covers(values: np.ndarray, lower: float, upper: float, reach: float = 0.03) -> bool:
-    """Return whether values stay in a range and come near both of its ends."""
+    """Return whether values stay within a range and come within a share `reach` of both its ends."""
     width = upper - lower
     inside = values.min() >= lower - 2e-4 and values.max() <= upper + 2e-4
     return inside and values.min() <= lower + reach * width and values.max() >= upper - reach * width

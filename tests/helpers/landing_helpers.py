@@ -11,10 +11,11 @@ from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.saving import task_to_json
 
 OPEN_LOOP_APEX = 1.0748
-"""[m] Of the nominal robot in `open_loop_jump.py` at 18 N m, without latency; the paper's robot reached 1.075 m."""
+"""[m] Apex of the nominal robot in `open_loop_jump.py` at 18 N m, without latency; the paper's robot: 1.075 m."""
 
 
 def still_policy(name):
+    """Return a policy of a task, with zero weights: its action is the default pose."""
     task = make_task(name)
     face = make_interface(interface(task), policy_dt=1.0 / 60.0, physics_dt=1.0 / 480.0, hidden=(4,))
     sizes = face.sizes

@@ -1,4 +1,4 @@
-"""Arrays of robots and worlds made by hand, for tests of the stage kernels that every task shares."""
+"""Arrays of robots and worlds for tests of the stage kernels that every task shares."""
 
 from types import SimpleNamespace
 
@@ -26,14 +26,14 @@ def array(values, dtype=float) -> wp.array:
 
 
 def standing_robots(n: int):
-    """Return `RobotArrays` of robots at rest in the default pose, 0.35 m high, that have done nothing yet."""
+    """Return `RobotArrays` of n robots at rest in the default pose, 0.35 m high, with empty histories."""
     robot, q = RobotArrays(), np.zeros((n, int(COORDS)))
     q[:, 2], q[:, 6], q[:, 7 + MOTOR_SLOTS] = 0.35, 1.0, DEFAULT_ANGLE
     robot.joint_q, robot.joint_qd = array(q.ravel()), array(np.zeros(n * int(DOFS)))
     robot.body_com = array(np.zeros((n * int(BODIES), 3)), wp.vec3)
     robot.body_f = array(np.zeros((n * int(BODIES), 6)), wp.spatial_vector)
     robot.gravity = array(np.tile([0.0, 0.0, -9.81], (n + 1, 1)), wp.vec3)
-    robot.invalid = array(np.zeros(n), int)
+    robot.diverged = array(np.zeros(n), int)
     for names, rows in ((PAWS, 4), (MOTORS, 12)):
         for name in names:
             setattr(robot, name, wp.zeros((rows, n), dtype=RobotArrays.vars[name].type.dtype, device="cpu"))
@@ -43,30 +43,30 @@ def standing_robots(n: int):
 
 
 def new_worlds(n: int, seed: int = 0, skill=0):
-    """Return `EpisodeArrays` of worlds that have made no step."""
+    """Return the `EpisodeArrays` of n new worlds."""
     return episode_arrays(n, seed, array(np.broadcast_to(skill, n), int), "cpu")
 
 
 def no_delays(n: int, steps=0):
-    """Return `Delays` of worlds that command nothing yet; steps: latency [physics steps]."""
+    """Return the `Delays` of n new worlds; steps: latency [physics steps]."""
     return delay_arrays(n, array(np.broadcast_to(steps, n), int), SUBSTEPS, "cpu")
 
 
 def write(target: wp.array, where, values) -> None:
-    """Overwrite a part of an array."""
+    """Overwrite the elements of an array at an index `where`."""
     copy = target.numpy().copy()
     copy[where] = values
     target.assign(copy)
 
 
 def values_of(struct, kind) -> SimpleNamespace:
-    """Return copies of all arrays of a struct as NumPy."""
-    found = {name: getattr(struct, name) for name in kind.vars}
-    return SimpleNamespace(**{name: v.numpy().copy() for name, v in found.items() if isinstance(v, wp.array)})
+    """Return copies of all array fields of a struct as NumPy arrays; kind: its class."""
+    fields = {name: getattr(struct, name) for name in kind.vars}
+    return SimpleNamespace(**{name: v.numpy().copy() for name, v in fields.items() if isinstance(v, wp.array)})
 
 
 def observe(skill, robot, parameters, ground, worlds, states, numbers, after_reset: int = 0) -> None:
-    """Launch the stage that observes on a skill's arrays; beginning 1: only where something has just begun."""
+    """Launch the observation stage of a skill; after_reset 1: only in worlds whose episode has just begun."""
     arrays = skill.observations
     inputs = [skill.index, robot, parameters, ground, worlds, states, numbers, after_reset, arrays.raw]
     wp.launch(skill.kernels["observe"], (skill.num_chunks, skill.num_envs), inputs, device="cpu")

@@ -1,4 +1,4 @@
-"""What domain randomisation changes of an environment, as solver, motors and environment have it."""
+"""Parameters that domain randomisation changes, read from solver, motors and environment."""
 
 import dataclasses
 
@@ -37,7 +37,7 @@ BEYOND = {
     "observation_latency": None, "push_interval": (0.2, 0.5), "push_probability": 0.25, "push_in_flight": False,
     "damping_gains": None, "resample_at": "reset", "zero_latency_probability": 0.0,
 }  # fmt: skip
-"""What the table does not tell, for jumping."""
+"""Settings that the table does not contain, for jumping."""
 HELD = {"push_interval": None, "push_probability": 1.0}
 """A push in every episode, from its beginning to its end."""
 ALL = PAPER | {"observation_latency": (0.0, 16.0)}
@@ -50,7 +50,7 @@ def randomized(cfg, num_envs=N, **arguments):
 
 
 def read(env):
-    """Return every randomised parameter as the solver, the motors and the environment have it; worlds come last."""
+    """Return every randomised parameter from solver, motors and environment by name, (..., num_envs)."""
     n, table = env.num_envs, env.sim.physics.dynamics.robot.table.numpy().astype(float)
     legs = np.array([leg * layout.LEG_ROWS for leg in range(4)])
     links = np.array([[leg + link * layout.MOMENT_ROWS for link in range(5)] for leg in legs]).ravel()
@@ -77,7 +77,7 @@ def read(env):
 
 
 def own_model(env: Env) -> dict[str, np.ndarray]:
-    """Return what randomisation changes of SolverMuJoCo's own model, the world first; nothing on SolverJumper."""
+    """Return the randomised arrays of SolverMuJoCo's model by name, (num_envs, ...); {} on SolverJumper."""
     if not isinstance(env.sim.solver, SolverMuJoCo):
         return {}
     model = env.sim.solver.mjw_model
@@ -86,22 +86,22 @@ def own_model(env: Env) -> dict[str, np.ndarray]:
 
 
 def seen(env):
-    """Return what `read` does, but on MuJoCo without what `own_model` tells."""
+    """Return `read`, on SolverMuJoCo without the parameters in `own_model`."""
     left_out = [] if isinstance(env.sim.solver, SolverJumper) else OF_MODEL
     return {name: values for name, values in read(env).items() if name not in left_out}
 
 
-def uniform_range(values, lower, upper):
-    """Whether values stay in a range, but for rounding."""
+def within(values, lower, upper):
+    """Return whether values are within a range, with tolerance for rounding."""
     width = upper - lower
     return values.min() >= lower - 1e-5 * width and values.max() <= upper + 1e-5 * width
 
 
 def fills(values, lower, upper):
-    """Whether values stay in a range, reach its ends and lie about its middle."""
+    """Return whether values are within a range, reach both ends, and have their mean near its middle."""
     width = upper - lower
     wide = values.min() < lower + 0.03 * width and values.max() > upper - 0.03 * width
-    return uniform_range(values, lower, upper) and wide and abs(values.mean() - 0.5 * (lower + upper)) < 0.1 * width
+    return within(values, lower, upper) and wide and abs(values.mean() - 0.5 * (lower + upper)) < 0.1 * width
 
 
 ROWS = {

@@ -162,10 +162,10 @@ class Reference:
         motions[free, np.arange(18)] = 1.0
         motions[knees] = -inverse @ jacobian[:, free]
         bias[knees] = -inverse @ drift
-        found = np.linalg.solve(motions.T @ mass @ motions, motions.T @ (force - mass @ bias))
-        # Pinocchio differentiates the body-frame components; add omega x v for the origin's own acceleration
-        found[:3] += np.cross(v[3:6], v[:3])
-        return found
+        accelerations = np.linalg.solve(motions.T @ mass @ motions, motions.T @ (force - mass @ bias))
+        # Pinocchio differentiates the body-frame components; add omega x v for the acceleration of the origin
+        accelerations[:3] += np.cross(v[3:6], v[:3])
+        return accelerations
 
     def _loops(self, q: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Return Jacobian (12, 26) and drift (12,) [m/s^2] of the gaps between the loops' anchors, world axes."""

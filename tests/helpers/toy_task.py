@@ -1,4 +1,4 @@
-"""A mass on a line that is to be pushed to the origin: small enough to train in a second."""
+"""Toy task that trains in a second: push a mass on a line to the origin."""
 
 import dataclasses
 import os

@@ -1,4 +1,4 @@
-"""Motors on a synthetic test bench, whose constants are known."""
+"""Identification of motor constants from a synthetic test bench with known constants."""
 
 import math
 
@@ -23,7 +23,7 @@ TRUTH = {
 }  # fmt: skip
 
 
-def test_the_law_is_that_of_the_simulated_motor():
+def test_torque_law_matches_the_simulated_motor():
     motor = MotorParams()
     for name in ("saturation", "peak", "cutoff_speed", "no_load_speed", "fade_start", "fade_end"):
         setattr(motor, name, TRUTH[name])
@@ -31,36 +31,36 @@ def test_the_law_is_that_of_the_simulated_motor():
     for command in (-30.0, -3.0, 3.0, 30.0):
         for speed in np.linspace(-45.0, 45.0, 31):
             expected = motor_torque(command, 0.0, float(speed), motor)
-            found = torque_law(TRUTH | {"friction": 0.0}, np.array([command]), np.array([speed]))[0]
-            assert found == pytest.approx(expected, abs=1e-4)
+            torque = torque_law(TRUTH | {"friction": 0.0}, np.array([command]), np.array([speed]))[0]
+            assert torque == pytest.approx(expected, abs=1e-4)
 
 
-def test_constants_of_a_motor_are_found_within_their_intervals():
-    found = characterise_motor(synthetic_bench(TRUTH, np.random.default_rng(0)))
-    assert 0.9 < found.chi2 < 1.1
-    # where the controller never asks for the peak torque, only the slope of the curve shows
-    assert set(found.open) == {"peak", "cutoff_speed"}
-    slope, expected = (c["peak"] / (c["no_load_speed"] - c["cutoff_speed"]) for c in (found.constants, TRUTH))
+def test_motor_constants_are_identified_within_their_intervals():
+    actuator = characterise_motor(synthetic_bench(TRUTH, np.random.default_rng(0)))
+    assert 0.9 < actuator.chi2 < 1.1
+    # below the peak torque only the slope of the curve is determined
+    assert set(actuator.open) == {"peak", "cutoff_speed"}
+    slope, expected = (c["peak"] / (c["no_load_speed"] - c["cutoff_speed"]) for c in (actuator.constants, TRUTH))
     assert slope == pytest.approx(expected, rel=0.05)
-    for name, (value, low, high, _) in found.rows().items():
-        if name not in found.open:
+    for name, (value, low, high, _) in actuator.rows().items():
+        if name not in actuator.open:
             assert value == pytest.approx(TRUTH[name], rel=0.06), name
         middle, reach = 0.5 * math.log(low * high), 0.5 * math.log(high / low)
         assert abs(math.log(TRUTH[name]) - middle) < 2.0 * reach, name
 
 
-def test_what_a_bench_does_not_reach_stays_open():
+def test_constants_beyond_the_tested_speeds_stay_open():
     whole = synthetic_bench(TRUTH, np.random.default_rng(0))
     slow = np.abs(whole.speed) < 10.0
     bench = Bench(*(getattr(whole, name)[slow] for name in COLUMNS))
-    found = characterise_motor(bench)
-    assert {"no_load_speed", "cutoff_speed", "fade_start", "fade_end", "peak"} <= set(found.open)
-    assert not {"saturation", "friction", "latency"} & set(found.open)
+    actuator = characterise_motor(bench)
+    assert {"no_load_speed", "cutoff_speed", "fade_start", "fade_end", "peak"} <= set(actuator.open)
+    assert not {"saturation", "friction", "latency"} & set(actuator.open)
     described = described_constants("transversal")["no_load_speed"]
-    assert found.constants["no_load_speed"] == pytest.approx(described, rel=0.1)
+    assert actuator.constants["no_load_speed"] == pytest.approx(described, rel=0.1)
 
 
-def test_a_bench_is_read_from_csv_and_refused_in_one_line(tmp_path):
+def test_load_bench_reads_csv_and_refuses_bad_files(tmp_path):
     bench = synthetic_bench(TRUTH)
     file = tmp_path / "bench.csv"
     rows = zip(*(getattr(bench, name) for name in COLUMNS), strict=True)

@@ -1,4 +1,4 @@
-"""Recorded motions as files, and what is refused of them."""
+"""Reading and writing of recorded motions, and refusal of bad files."""
 
 import json
 import math
@@ -7,19 +7,20 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jumper_warp.identification.motions import Motion, load_motion
+from jumper_warp.identification.motions import RecordedMotion, load_motion
+from jumper_warp.identification.residuals import check_signs
 from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.utils.errors import InputError
 
 ROWS = 12
 
 
-def some_motion():
+def random_motion():
     rng = np.random.default_rng(0)
     angle = rng.normal(size=(ROWS, 12))
     angle[1::2] = math.nan
     quaternion = rng.normal(size=(ROWS, 4))
-    return Motion(
+    return RecordedMotion(
         name="walk",
         time=np.arange(ROWS) / 240.0,
         target=rng.normal(size=(ROWS, 12)),
@@ -32,7 +33,7 @@ def some_motion():
 
 
 def table_of(motion):
-    """Return the names and columns of a table, angles in degrees, currents instead of torques."""
+    """Return the columns of a motion by name, angles in degrees, currents instead of torques."""
     columns = {"time [ms]": 1000.0 * motion.time}
     for i, joint in enumerate(MOTOR_JOINTS):
         columns[f"target/{joint}"] = motion.target[:, i]
@@ -52,15 +53,15 @@ def write_csv(path, columns, settings=None):
         path.with_suffix(".json").write_text(json.dumps(settings))
 
 
-def assert_same(found, motion):
+def assert_same(loaded, motion):
     for name in ("time", "target", "angle", "torque", "quaternion"):
-        np.testing.assert_allclose(getattr(found, name), getattr(motion, name), atol=1e-12)
-    assert found.rate is None and found.position is None
-    assert (found.name, found.base, found.torque_limit, found.gains) == ("walk", "fixed", 12.0, "jumping")
+        np.testing.assert_allclose(getattr(loaded, name), getattr(motion, name), atol=1e-12)
+    assert loaded.rate is None and loaded.position is None
+    assert (loaded.name, loaded.base, loaded.torque_limit, loaded.gains) == ("walk", "fixed", 12.0, "jumping")
 
 
-def test_a_motion_comes_back_from_npz_csv_and_parquet(tmp_path):
-    motion = some_motion()
+def test_load_motion_reads_npz_csv_and_parquet(tmp_path):
+    motion = random_motion()
     motion.save(tmp_path / "walk.npz")
     assert_same(load_motion(tmp_path / "walk.npz"), motion)
     columns = table_of(motion)
@@ -87,15 +88,15 @@ def test_a_motion_comes_back_from_npz_csv_and_parquet(tmp_path):
         (lambda c: {k: v for k, v in c.items() if k.startswith(("time", "target"))}, "nothing is measured"),
     ],
 )
-def test_a_bad_table_is_refused_in_one_line(tmp_path, change, words):
-    write_csv(tmp_path / "walk.csv", change(table_of(some_motion())))
+def test_refuses_bad_table_in_one_line(tmp_path, change, words):
+    write_csv(tmp_path / "walk.csv", change(table_of(random_motion())))
     with pytest.raises(InputError, match=words) as error:
         load_motion(tmp_path / "walk.csv", torque_constant=1.5)
     assert "\n" not in str(error.value)
 
 
-def test_files_and_settings_that_cannot_be_read_are_refused(tmp_path):
-    columns = table_of(some_motion())
+def test_refuses_unreadable_files_and_settings(tmp_path):
+    columns = table_of(random_motion())
     write_csv(tmp_path / "walk.csv", columns)
     with pytest.raises(InputError, match="current needs the torque constant"):
         load_motion(tmp_path / "walk.csv")
@@ -112,17 +113,17 @@ def test_files_and_settings_that_cannot_be_read_are_refused(tmp_path):
         load_motion(tmp_path / "walk.mat")
 
 
-def test_motors_whose_angles_oppose_their_targets_are_named():
-    motion = some_motion()
+def test_check_signs_names_motors_with_inverted_angles():
+    motion = random_motion()
     target = np.tile([0.05, 0.8, 0.8], (ROWS, 4)) + 0.05 * motion.target
     lag = np.tile([-0.1, 0.2, -0.2], 4)
     gaps = np.where(np.isfinite(motion.angle), 0.0, math.nan)
     angle = target + lag + gaps
     right = replace(motion, target=target, angle=angle)
-    right.check_signs()
+    check_signs(right)
     sign = np.ones(12)
     sign[[1, 11]] = -1.0
     for wrong in (replace(right, angle=sign * angle), replace(right, target=sign * target)):
         with pytest.raises(InputError, match="motion walk: angles of FL_outer, BR_inner have the sign opposite"):
-            wrong.check_signs()
-    replace(right, angle=math.nan * angle).check_signs()
+            check_signs(wrong)
+    check_signs(replace(right, angle=math.nan * angle))

@@ -1,16 +1,18 @@
+"""Systematic standard deviations against refits without a cluster of residuals."""
+
 import numpy as np
 import pytest
 
-from jumper_warp.identification.least_squares import Normal
+from jumper_warp.identification.least_squares import NormalEquations
 from jumper_warp.identification.residuals import Linearised
-from jumper_warp.identification.uncertainty import systematic_deviations
+from jumper_warp.identification.uncertainty import systematic_std
 
 PARAMETERS, ROWS, CHANNELS, MOTIONS = 5, 60, 4, 3
 CHANNEL = np.arange(CHANNELS).repeat(ROWS // CHANNELS)
 
 
 class Refit:
-    """Linear motions, each with a start of its own, whose errors are alike in a channel; priors of deviation 1."""
+    """Linear motions with `starts` initial coordinates each, whose errors are alike in a channel; priors of std 1."""
 
     def __init__(self, starts: int, rng: np.random.Generator):
         self.starts = starts
@@ -19,7 +21,7 @@ class Refit:
         self.weights = [rng.uniform(0.2, 1.0, ROWS) for _ in range(MOTIONS)]
 
     def solve(self, kept):
-        """Return parameters (P,) and starts (MOTIONS, I) that fit the kept rows best; kept: bool (MOTIONS, ROWS)."""
+        """Return the fitted parameters (P,) and starts (MOTIONS, I) of the kept rows; kept: bool (MOTIONS, ROWS)."""
         matrix = np.eye(PARAMETERS + MOTIONS * self.starts)
         slope = np.zeros(len(matrix))
         for i in range(MOTIONS):
@@ -28,35 +30,35 @@ class Refit:
             weighed = (self.weights[i] * kept[i])[:, None] * self.jacobians[i]
             matrix[np.ix_(place, place)] += weighed.T @ self.jacobians[i]
             slope[place] += weighed.T @ self.data[i]
-        found = np.linalg.solve(matrix, slope)
-        return found[:PARAMETERS], found[PARAMETERS:].reshape(MOTIONS, self.starts)
+        solution = np.linalg.solve(matrix, slope)
+        return solution[:PARAMETERS], solution[PARAMETERS:].reshape(MOTIONS, self.starts)
 
     def normal(self, z, starts):
         """Return the normal equations at parameters and starts."""
-        matrix, mixed, own, linearised = np.zeros((PARAMETERS, PARAMETERS)), [], [], []
+        matrix, cross, start_matrices, linearised = np.zeros((PARAMETERS, PARAMETERS)), [], [], []
         for jacobian, data, weight, start in zip(self.jacobians, self.data, self.weights, starts, strict=True):
             square = jacobian.T @ (weight[:, None] * jacobian)
             matrix += square[:PARAMETERS, :PARAMETERS]
-            mixed.append(square[:PARAMETERS, PARAMETERS:])
-            own.append(square[PARAMETERS:, PARAMETERS:] + np.eye(self.starts))
+            cross.append(square[:PARAMETERS, PARAMETERS:])
+            start_matrices.append(square[PARAMETERS:, PARAMETERS:] + np.eye(self.starts))
             linearised.append(Linearised(jacobian @ np.concatenate([z, start]) - data, jacobian))
-        return Normal(0.0, 0.0, z, matrix, [], own, mixed, linearised, self.weights)
+        return NormalEquations(0.0, 0.0, z, matrix, [], start_matrices, cross, linearised, self.weights)
 
 
-@pytest.mark.parametrize(("starts", "close"), [(0, 1e-9), (3, 0.15)])  # starts stay as all data would have them
-def test_contradictions_are_what_refits_without_a_channel_or_a_motion_change(starts, close):
+@pytest.mark.parametrize(("starts", "close"), [(0, 1e-9), (3, 0.15)])  # starts are not refitted
+def test_systematic_std_matches_refits_without_a_channel_or_a_motion(starts, close):
     refit = Refit(starts, np.random.default_rng(0))
-    everything = np.ones((MOTIONS, ROWS), bool)
-    best, best_starts = refit.solve(everything)
+    all_rows = np.ones((MOTIONS, ROWS), bool)
+    best, best_starts = refit.solve(all_rows)
     normal = refit.normal(best, best_starts)
-    found = systematic_deviations(normal, [CHANNEL] * MOTIONS, np.linalg.inv(normal.information() + np.eye(PARAMETERS)))
+    std = systematic_std(normal, [CHANNEL] * MOTIONS, np.linalg.inv(normal.information() + np.eye(PARAMETERS)))
     variance = np.zeros(PARAMETERS)
     for groups in ([CHANNEL == c for c in range(CHANNELS)], [np.ones(ROWS, bool)]):
         changes = []
         for motion in range(MOTIONS):
             for rows in groups:
-                kept = everything.copy()
+                kept = all_rows.copy()
                 kept[motion] &= ~rows
                 changes.append(refit.solve(kept)[0] - best)
         variance += (len(changes) - 1) / len(changes) * np.square(changes).sum(0)
-    np.testing.assert_allclose(found, np.sqrt(variance), rtol=close)
+    np.testing.assert_allclose(std, np.sqrt(variance), rtol=close)

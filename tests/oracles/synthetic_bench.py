@@ -4,7 +4,7 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from jumper_warp.identification.actuators import Bench, response
+from jumper_warp.identification.actuators import Bench, bench_torque
 
 
 def synthetic_bench(
@@ -30,7 +30,7 @@ def synthetic_bench(
         columns.append(np.stack([np.full(len(time), number), time, command, 0.0 * time, 0.0 * time]))
         number += 1
     bench = Bench(*np.concatenate(columns, axis=1))
-    torque = response(constants, bench)
+    torque = bench_torque(constants, bench)
     if rng is not None:
         torque = torque + torque_noise * rng.normal(size=len(torque))
     return Bench(bench.test, bench.time, bench.command, bench.speed, torque)

@@ -1,4 +1,4 @@
-"""The mean of two policies' weights."""
+"""Weight averaging of two policies."""
 
 import dataclasses
 
@@ -17,7 +17,7 @@ HORIZONTAL = open_policy("horizontal_jump")
 
 @pytest.fixture(scope="module")
 def other():
-    """The policy changed in all layers, with another normaliser."""
+    """The horizontal-jump policy with perturbed layers and another normaliser."""
     torch.manual_seed(3)
     layers = [(weight + 0.05 * torch.randn_like(weight), bias + 0.1) for weight, bias in HORIZONTAL.layers]
     mean, std = HORIZONTAL.mean + 0.2 * HORIZONTAL.std, 1.5 * HORIZONTAL.std
@@ -29,41 +29,42 @@ def obs():
     return HORIZONTAL.mean + HORIZONTAL.std * torch.randn(200, 147, generator=torch.manual_seed(1)).clamp(-5.0, 5.0)
 
 
-def test_a_blend_is_one_policy_at_its_ends(other, obs):
+def test_blend_equals_each_policy_at_fractions_0_and_1(other, obs):
     assert (HORIZONTAL.act(obs) - other.act(obs)).abs().mean() > 0.1
     torch.testing.assert_close(blend(HORIZONTAL, other, 0.0).act(obs), HORIZONTAL.act(obs), atol=1e-5, rtol=0.0)
     torch.testing.assert_close(blend(HORIZONTAL, other, 1.0).act(obs), other.act(obs), atol=1e-4, rtol=0.0)
 
 
-def test_weights_are_the_mean_by_the_share(other):
+def test_blend_interpolates_the_weights(other):
     same = Policy(other.layers, HORIZONTAL.mean, HORIZONTAL.std, other.interface)
-    for found, own, its in zip(blend(HORIZONTAL, same, 0.3).layers, HORIZONTAL.layers, same.layers, strict=True):
-        for tensor, one, two in zip(found, own, its, strict=True):
+    blended = blend(HORIZONTAL, same, 0.3).layers
+    for blended_layer, layer, other_layer in zip(blended, HORIZONTAL.layers, same.layers, strict=True):
+        for tensor, one, two in zip(blended_layer, layer, other_layer, strict=True):
             torch.testing.assert_close(tensor, 0.7 * one + 0.3 * two)
 
 
-def test_its_configuration_tells_what_was_blended(other):
-    told = blend(HORIZONTAL, other, 0.3).config["blended"]
-    assert told == {"share": 0.3, "commit": other.config["commit"], "iteration": other.config["iteration"]}
+def test_blend_records_fraction_and_origin_in_its_configuration(other):
+    origin = blend(HORIZONTAL, other, 0.3).config["blended"]
+    assert origin == {"share": 0.3, "commit": other.config["commit"], "iteration": other.config["iteration"]}
 
 
-def test_what_cannot_be_blended_is_refused(other):
+def test_blend_refuses_invalid_fractions_and_other_interfaces(other):
     with pytest.raises(PolicyError, match=r"share of a blend must be from 0 to 1, got 1\.1"):
         blend(HORIZONTAL, other, 1.1)
     for policy in (open_policy("vertical_jump"), open_policy("walking_flat")):
-        with pytest.raises(PolicyError, match="must read and drive the same"):
+        with pytest.raises(PolicyError, match="must have the same interface"):
             blend(HORIZONTAL, policy, 0.5)
     interface = dataclasses.replace(HORIZONTAL.interface, action_scale=tuple(1.0 for _ in range(12)))
     scaled = Policy(other.layers, other.mean, other.std, interface)
-    with pytest.raises(PolicyError, match="must read and drive the same"):
+    with pytest.raises(PolicyError, match="must have the same interface"):
         blend(HORIZONTAL, scaled, 0.5)
 
 
-def test_the_command_writes_a_blend(other, obs, tmp_path, capsys):
+def test_export_command_writes_a_blend(other, obs, tmp_path, capsys):
     save_policy(tmp_path / "other", other)
     main(["export", "horizontal_jump", "--blend", str(tmp_path / "other"), "0.25", "--out", str(tmp_path / "blend")])
     expected = blend(HORIZONTAL, other, 0.25).act(obs)
     torch.testing.assert_close(open_policy(tmp_path / "blend").act(obs), expected, atol=1e-6, rtol=0.0)
     with pytest.raises(SystemExit, match="2"):
         main(["export", "horizontal_jump", "--blend", "walking_flat", "0.5", "--out", str(tmp_path / "no")])
-    assert "must read and drive the same" in capsys.readouterr().err and not (tmp_path / "no").exists()
+    assert "must have the same interface" in capsys.readouterr().err and not (tmp_path / "no").exists()

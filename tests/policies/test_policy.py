@@ -15,7 +15,7 @@ from jumper_warp.policies.folder import add_files, find_policy, list_policies, l
 from jumper_warp.policies.onnx import export_onnx, onnx_bytes
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
-from jumper_warp.rl.networks import ActorCritic, weights_of
+from jumper_warp.rl.networks import ActorCritic, linear_layers
 
 
 def make_interface(num_obs=1, num_actions=1, hidden=(1,), **changes):
@@ -34,7 +34,7 @@ def make_interface(num_obs=1, num_actions=1, hidden=(1,), **changes):
 
 
 def scalar_policy(out_weight=1.0):
-    """obs -> (obs - 1) / 2 -> elu(x - 2) -> out_weight * x."""
+    """Return the policy obs -> (obs - 1) / 2 -> elu(x - 2) -> out_weight * x."""
     one = torch.ones(1, 1)
     layers = [(one, torch.tensor([-2.0])), (out_weight * one, torch.zeros(1))]
     return Policy(layers, torch.tensor([1.0]), torch.tensor([2.0]), make_interface())
@@ -42,7 +42,7 @@ def scalar_policy(out_weight=1.0):
 
 @pytest.fixture(scope="module")
 def model():
-    """Actor of the size of the real one, its running statistics fed with skewed data."""
+    """Actor with running statistics of observations with various means and scales."""
     torch.manual_seed(3)
     model = ActorCritic(48, 12, (64, 32))
     model.obs_moments.update(torch.randn(1000, 48) * torch.linspace(0.1, 5.0, 48) + torch.linspace(-3.0, 3.0, 48))
@@ -56,13 +56,17 @@ def trained(model):
     interface = make_interface(48, 12, (64, 32))
     moments = model.obs_moments
     return Policy(
-        weights_of(model.actor), moments.mean, moments.scaling().std, interface, {"env": {"seed": 5}, "commit": "abc"}
+        linear_layers(model.actor),
+        moments.mean,
+        moments.scaling().std,
+        interface,
+        {"env": {"seed": 5}, "commit": "abc"},
     )
 
 
 @pytest.fixture(scope="module")
 def observations():
-    """Some in the ordinary range, some absurd, some not finite."""
+    """(9, 48) observations: ordinary, very large and not finite."""
     torch.manual_seed(4)
     obs = 4.0 * torch.randn(9, 48)
     obs[1, 3], obs[2, 4], obs[3, 5], obs[4, 6] = math.nan, math.inf, -math.inf, 1.0e13
@@ -75,7 +79,7 @@ def folder(trained, tmp_path):
 
 
 def reseal(folder, name, data):
-    """Replace a file as someone does who also mends the manifest."""
+    """Replace a file, and its checksum in the manifest."""
     (folder / name).write_bytes(data)
     manifest = json.loads((folder / "manifest.json").read_text())
     manifest["sha256"][name] = hashlib.sha256(data).hexdigest()
@@ -83,6 +87,7 @@ def reseal(folder, name, data):
 
 
 def edit_json(folder, name, change):
+    """Apply `change` to a JSON file of a policy's folder, with a valid checksum."""
     content = json.loads((folder / name).read_text())
     change(content)
     data = json.dumps(content).encode()
@@ -95,7 +100,7 @@ def edit_json(folder, name, change):
 # ---------------------------------------------------------------------- acting
 
 
-def test_action_by_hand():
+def test_action_agrees_with_hand_calculation():
     assert scalar_policy().act(torch.tensor([[3.0]])).item() == pytest.approx(math.exp(-1.0) - 1.0, abs=1e-6)
 
 
@@ -108,30 +113,30 @@ def test_normalised_observation_is_limited_to_ten_standard_deviations():
     assert policy.act(torch.tensor([90.0])).item() == pytest.approx(0.8, abs=1e-6)
 
 
-def test_policy_acts_as_the_trained_network(model, trained, observations):
+def test_policy_agrees_with_the_trained_network_bitwise(model, trained, observations):
     assert torch.equal(trained.act(observations), model.act(observations))
     actions = trained.act(observations).abs()
     assert (actions == 1.0).any() and (actions < 1.0).any()
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_observation_that_is_not_finite_counts_as_zero(bad):
+def test_non_finite_observation_counts_as_zero(bad):
     assert scalar_policy().act(torch.tensor([bad])) == scalar_policy().act(torch.tensor([0.0]))
 
 
-def test_observation_of_another_size_is_refused():
+def test_refuses_an_observation_of_another_size():
     with pytest.raises(ValueError, match="reads 1 numbers, got observations of 2"):
         scalar_policy().act(torch.zeros(3, 2))
 
 
 @pytest.mark.parametrize("dtype", [torch.float64, torch.float16, torch.int64])
-def test_observations_of_any_kind_of_numbers_are_read(dtype):
+def test_accepts_observations_of_any_numeric_type(dtype):
     policy = scalar_policy(0.1)
     action = policy.act(torch.tensor([[3.0]], dtype=dtype))
     assert action.dtype == torch.float32 and action == policy.act(torch.tensor([[3.0]]))
 
 
-def test_large_numbers_of_double_precision_are_limited_first():
+def test_float64_observations_are_clamped_before_conversion():
     policy = scalar_policy(0.1)
     assert policy.act(torch.tensor([1.0e300], dtype=torch.float64)) == policy.act(torch.tensor([100.0]))
 
@@ -140,7 +145,7 @@ def test_large_numbers_of_double_precision_are_limited_first():
     ("obs", "message"),
     [(np.zeros((1, 1)), "reads a torch tensor, got ndarray"), (torch.tensor(1.0), "got a single number")],
 )
-def test_what_is_no_observation_is_refused(obs, message):
+def test_refuses_observations_that_are_not_vectors_in_tensors(obs, message):
     with pytest.raises(ValueError, match=message):
         scalar_policy().act(obs)
 
@@ -148,7 +153,7 @@ def test_what_is_no_observation_is_refused(obs, message):
 # ---------------------------------------------------------------------- saving and loading
 
 
-def test_policy_comes_back_bitwise(trained, folder, observations):
+def test_saved_policy_loads_bitwise(trained, folder, observations):
     loaded = load_policy(folder)
     assert loaded.interface == trained.interface
     assert loaded.config["env"] == {"seed": 5} and loaded.config["commit"] == "abc"
@@ -156,7 +161,7 @@ def test_policy_comes_back_bitwise(trained, folder, observations):
     assert {path.name for path in folder.iterdir()} == {"config.json", "policy.onnx", "manifest.json", "README.md"}
 
 
-def test_policy_that_is_there_is_replaced_only_on_request(folder, trained):
+def test_existing_policy_is_replaced_only_with_overwrite(folder, trained):
     (folder / "old.txt").write_text("old")
     with pytest.raises(PolicyError, match="exists"):
         save_policy(folder, trained)
@@ -165,7 +170,7 @@ def test_policy_that_is_there_is_replaced_only_on_request(folder, trained):
     assert [path.name for path in folder.parent.iterdir()] == ["jump"]
 
 
-def test_folder_that_is_no_policy_is_never_replaced(tmp_path, trained):
+def test_folder_without_a_policy_is_never_replaced(tmp_path, trained):
     (tmp_path / "mine.txt").write_text("mine")
     with pytest.raises(PolicyError, match="no policy's"):
         save_policy(tmp_path, trained, overwrite=True)
@@ -173,20 +178,20 @@ def test_folder_that_is_no_policy_is_never_replaced(tmp_path, trained):
 
 
 @pytest.mark.parametrize("name", ["x.pt", "x.pth", "x.onnx", "x.safetensors", "X.PT"])
-def test_folder_with_the_name_of_a_file_is_refused(tmp_path, trained, name):
+def test_refuses_a_folder_with_a_file_suffix(tmp_path, trained, name):
     with pytest.raises(PolicyError, match=r"saved as a folder, whose name cannot end in \."):
         save_policy(tmp_path / name, trained)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("name", ["../evil", "manifest.json", ".hidden", ""])
-def test_save_with_a_malformed_name_leaves_nothing(tmp_path, trained, name):
+def test_save_refuses_malformed_file_names_and_writes_nothing(tmp_path, trained, name):
     with pytest.raises(PolicyError, match="cannot hold a file named"):
         save_policy(tmp_path / "jump", trained, files={name: b""})
     assert list(tmp_path.iterdir()) == []
 
 
-def test_added_figures_are_in_the_manifest(folder):
+def test_added_files_are_in_the_manifest(folder):
     add_files(folder, {"metrics.json": b"{}", "README.md": b"how it was made"})
     assert load_policy(folder) and (folder / "README.md").read_bytes() == b"how it was made"
     (folder / "metrics.json").write_bytes(b"{ }")
@@ -194,7 +199,7 @@ def test_added_figures_are_in_the_manifest(folder):
         load_policy(folder)
 
 
-def test_added_files_neither_replace_the_policy_nor_seal_an_altered_one(folder):
+def test_add_files_refuses_policy_files_and_altered_policies(folder):
     with pytest.raises(PolicyError, match="is the policy itself"):
         add_files(folder, {"policy.onnx": b""})
     (folder / "config.json").write_text("{}")
@@ -212,7 +217,7 @@ def test_project_policies_are_found_by_name(tmp_path, trained, monkeypatch):
 
 
 class Payload:
-    """Creates a file when unpickled."""
+    """Object that creates a file when unpickled."""
 
     def __init__(self, path):
         self.path = path
@@ -228,6 +233,8 @@ def flip_a_bit(folder):
 
 
 def change_model(change):
+    """Return a function that applies `change` to the ONNX model in a policy's folder, with a valid checksum."""
+
     def damage(folder):
         model = onnx.load(folder / "policy.onnx", load_external_data=False)
         change(model)
@@ -237,7 +244,7 @@ def change_model(change):
 
 
 def change_tensors(**changes):
-    """Replace initialisers by name, or add them."""
+    """Return a function that replaces or adds initialisers by name in a policy folder's ONNX file."""
 
     def change(model):
         for name, value in changes.items():
@@ -259,7 +266,7 @@ def keep_outside(model):
 
 
 F32 = np.float32
-NOT_OURS = "the graph or the metadata of the ONNX file is not what these weights and config.json make"
+NOT_REPRODUCIBLE = "the graph or the metadata of the ONNX file is not what these weights and config.json make"
 REFUSALS = {
     "manifest missing": (lambda f: (f / "manifest.json").unlink(), "manifest.json: cannot be read"),
     "manifest not JSON": (lambda f: (f / "manifest.json").write_text("{"), "manifest.json: not JSON"),
@@ -269,7 +276,7 @@ REFUSALS = {
     ),
     "manifest lacks a sum": (
         lambda f: edit_json(f, "manifest.json", lambda m: m["sha256"].pop("policy.onnx")),
-        "lacks the sums",
+        "lacks the checksums",
     ),
     "manifest names a file outside": (
         lambda f: edit_json(f, "manifest.json", lambda m: m["sha256"].update({"../x": ""})),
@@ -328,15 +335,15 @@ REFUSALS = {
         ),
         "missing or unknown: actor.0.bias",
     ),
-    "weights in another file": (change_model(keep_outside), NOT_OURS),
-    "another opset": (change_model(lambda m: setattr(m.opset_import[0], "version", 17)), NOT_OURS),
-    "another operator": (change_model(lambda m: setattr(m.graph.node[8], "op_type", "Relu")), NOT_OURS),
-    "another limit": (change_tensors(actions_upper=np.asarray(2.0, F32)), NOT_OURS),
-    "constant too many": (change_tensors(more=np.zeros(1, F32)), NOT_OURS),
-    "metadata of another interface": (change_model(lambda m: m.metadata_props.pop()), NOT_OURS),
+    "weights in another file": (change_model(keep_outside), NOT_REPRODUCIBLE),
+    "another opset": (change_model(lambda m: setattr(m.opset_import[0], "version", 17)), NOT_REPRODUCIBLE),
+    "another operator": (change_model(lambda m: setattr(m.graph.node[8], "op_type", "Relu")), NOT_REPRODUCIBLE),
+    "another limit": (change_tensors(actions_upper=np.asarray(2.0, F32)), NOT_REPRODUCIBLE),
+    "constant too many": (change_tensors(more=np.zeros(1, F32)), NOT_REPRODUCIBLE),
+    "metadata of another interface": (change_model(lambda m: m.metadata_props.pop()), NOT_REPRODUCIBLE),
     "config of another interface": (
         lambda f: edit_json(f, "config.json", lambda c: c["interface"].update(policy_dt=0.02)),
-        NOT_OURS,
+        NOT_REPRODUCIBLE,
     ),
     "other sizes in config": (
         lambda f: edit_json(f, "config.json", lambda c: c["interface"].update(hidden=[64, 32, 8])),
@@ -355,7 +362,7 @@ REFUSALS = {
 
 
 @pytest.mark.parametrize("case", REFUSALS)
-def test_unusable_policy_is_refused_in_one_line(folder, case):
+def test_refuses_an_invalid_policy_folder_in_one_line(folder, case):
     damage, message = REFUSALS[case]
     damage(folder)
     with pytest.raises(PolicyError, match=message) as refusal:
@@ -391,7 +398,7 @@ def test_pickle_in_place_of_the_weights_is_not_executed(folder, tmp_path):
         ({"quaternion_order": "wxyz"}, "quaternion_order must be xyzw"),
     ],
 )
-def test_impossible_interface_is_refused(change, message):
+def test_refuses_an_invalid_interface(change, message):
     with pytest.raises(PolicyError, match=message):
         make_interface(**change)
 
@@ -419,7 +426,7 @@ def test_onnx_runtime_agrees_with_other_activations(tmp_path, activation):
     np.testing.assert_allclose(session.run(None, {"obs": obs.numpy()})[0], policy.act(obs).numpy(), atol=1e-5)
 
 
-def test_onnx_metadata_tells_the_interface_in_full_precision(folder, trained):
+def test_onnx_metadata_has_the_interface_in_full_precision(folder, trained):
     model = onnx.load(folder / "policy.onnx", load_external_data=False)
     entries = {entry.key: entry.value for entry in model.metadata_props}
     full = json.loads(entries["jumper_warp"])
@@ -432,14 +439,14 @@ def test_onnx_metadata_tells_the_interface_in_full_precision(folder, trained):
 
 
 @pytest.mark.parametrize("name", list_policies())
-def test_shipped_onnx_tells_the_interface_and_nothing_that_contradicts_it(name):
+def test_shipped_onnx_metadata_equals_the_interface(name):
     (entry,) = (
         entry for entry in onnx.load(find_policy(name) / "policy.onnx").metadata_props if entry.key == "jumper_warp"
     )
     full = json.loads(entry.value)
-    face = json.loads(json.dumps(load_policy(name).interface.to_json()))
-    assert {key: full[key] for key in face} == face and face["observation_layout"]
-    assert set(full) - set(face) == {"commit", "dirty", "schema_version"}
+    interface = json.loads(json.dumps(load_policy(name).interface.to_json()))
+    assert {key: full[key] for key in interface} == interface and interface["observation_layout"]
+    assert set(full) - set(interface) == {"commit", "dirty", "schema_version"}
 
 
 def test_onnx_is_one_file_and_reproducible(folder, trained):
@@ -448,7 +455,7 @@ def test_onnx_is_one_file_and_reproducible(folder, trained):
     assert onnx_bytes(trained) == onnx_bytes(trained)
 
 
-def test_a_block_that_comes_twice_on_the_diagonal_is_stored_once(tmp_path):
+def test_repeated_diagonal_block_is_stored_once(tmp_path):
     torch.manual_seed(0)
     block = torch.randn(8, 16)
     layers = [(torch.randn(32, 4), torch.randn(32)), (torch.block_diag(block, block), torch.randn(16)),
@@ -458,10 +465,10 @@ def test_a_block_that_comes_twice_on_the_diagonal_is_stored_once(tmp_path):
     model = onnx.load(folder / "policy.onnx")
     assert tuple(stored(model, "actor_1_block").dims) == (8, 16)
     assert "actor_1_weight" not in {tensor.name for tensor in model.graph.initializer}
-    for (weight, bias), (own, its) in zip(load_policy(folder).layers, policy.layers, strict=True):
-        assert torch.equal(weight, own) and torch.equal(bias, its)
+    for layer, expected in zip(load_policy(folder).layers, policy.layers, strict=True):
+        assert torch.equal(layer[0], expected[0]) and torch.equal(layer[1], expected[1])
     session, obs = onnxruntime.InferenceSession(str(folder / "policy.onnx")), torch.randn(5, 4)
     np.testing.assert_allclose(session.run(None, {"obs": obs.numpy()})[0], policy.act(obs).numpy(), atol=1e-5)
-    layers[1][0][0, 16] = -0.0  # another bit than the zero that the graph pads with
+    layers[1][0][0, 16] = -0.0  # not bitwise the zero that the graph pads with
     odd = save_policy(tmp_path / "odd", Policy(layers, policy.mean, policy.std, policy.interface))
     assert stored(onnx.load(odd / "policy.onnx"), "actor_1_weight").dims == [16, 32]

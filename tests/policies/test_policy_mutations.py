@@ -1,4 +1,4 @@
-"""A policy's folder with one thing changed: it is refused in one line, or still a policy that acts and can be saved."""
+"""Mutated policy folders: each is refused with a one-line error, or loads as a policy that acts and can be saved."""
 
 import hashlib
 import itertools
@@ -47,13 +47,13 @@ def original(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def folder(original):
-    """A folder beside it to write changed policies to."""
+    """Folder for mutated policies."""
     (original.parent / "changed").mkdir()
     return original.parent / "changed"
 
 
 def write(folder, content):
-    """Make the folder hold these files by name, and no others."""
+    """Replace the folder's files with `content`, file name to bytes."""
     for path in folder.iterdir():
         path.unlink()
     for name, data in content.items():
@@ -64,8 +64,8 @@ def content_of(folder):
     return {name: (folder / name).read_bytes() for name in FILES}
 
 
-def resign(content):
-    """Mend the sums of a manifest that can still be read."""
+def update_checksums(content):
+    """Update the manifest's checksums to the files in `content`."""
     manifest = json.loads(content["manifest.json"])
     for name in manifest["sha256"]:
         manifest["sha256"][name] = hashlib.sha256(content[name]).hexdigest()
@@ -73,9 +73,9 @@ def resign(content):
 
 
 def check(folder, saved):
-    """Load the folder: either a refusal in one line, or a policy that acts, is exported, and comes back alike.
+    """Return whether a folder loads; check that an error is one line, or that the policy acts and saves bitwise.
 
-    saved: where to save it; deleted afterwards. Returns whether it was loaded.
+    saved: folder to save the policy to.
     """
     try:
         policy = load_policy(folder)
@@ -86,17 +86,17 @@ def check(folder, saved):
         actions = policy.act(torch.cat([OBSERVATIONS, torch.randn(8, 5)]))
     assert actions.shape == (len(OBSERVATIONS) + 8, 2)
     assert actions.isfinite().all() and actions.abs().max() <= 1.0
-    face = policy.interface
-    assert 0.0 < face.physics_dt <= face.policy_dt <= 1.0
-    assert min(face.torque_limit) > 0.0 and min(*face.joint_stiffness, *face.joint_damping) >= 0.0
+    interface = policy.interface
+    assert 0.0 < interface.physics_dt <= interface.policy_dt <= 1.0
+    assert min(interface.torque_limit) > 0.0 and min(*interface.joint_stiffness, *interface.joint_damping) >= 0.0
     assert onnx_bytes(policy)
     again = load_policy(save_policy(saved, policy, overwrite=True))
-    assert torch.equal(again.act(OBSERVATIONS), policy.act(OBSERVATIONS)) and again.interface == face
+    assert torch.equal(again.act(OBSERVATIONS), policy.act(OBSERVATIONS)) and again.interface == interface
     return True
 
 
 def change_one(tree, data):
-    """Change, delete or add one entry of a JSON tree."""
+    """Change, scale, delete or add one entry of a JSON tree, in place."""
     table, key = data.draw(st.sampled_from(list(places(tree))))
     kind = data.draw(st.sampled_from(["value", "value", "value", "scale", "delete", "add"]))
     if kind == "delete":
@@ -111,13 +111,13 @@ def change_one(tree, data):
         table[key] = data.draw(st.sampled_from(VALUES))
 
 
-def test_the_policy_itself_passes(original, tmp_path):
+def test_unchanged_policy_loads(original, tmp_path):
     assert check(original, tmp_path / "saved")
 
 
 @COMMON
 @given(data=st.data())
-def test_damaged_files(original, folder, data):
+def test_damaged_file_is_refused(original, folder, data):
     content = content_of(original)
     name = data.draw(st.sampled_from(FILES))
     kind = data.draw(st.sampled_from(["delete", "truncate", "flip", "insert"]))
@@ -134,19 +134,19 @@ def test_damaged_files(original, folder, data):
         del content[name]
     write(folder, content)
     loaded = check(folder, folder.parent / "saved")
-    # the README is prose; the manifest has no sum of its own, and may be spaced otherwise
+    # neither README nor manifest has a checksum
     assert name in ("README.md", "manifest.json") or not loaded
 
 
 @COMMON
 @given(data=st.data())
-def test_damaged_weights_with_a_mended_sum(original, folder, data):
+def test_damaged_weights_with_valid_checksum_load_or_are_refused(original, folder, data):
     content = content_of(original)
     weights = bytearray(content["policy.onnx"])
     at = data.draw(st.integers(0, len(weights) - 1))
     weights[at] = data.draw(st.integers(0, 255) | st.sampled_from(b'\x00\n"0189{}[],:F'))
     content["policy.onnx"] = bytes(weights[: data.draw(st.sampled_from([None, at + 1, -1]))])
-    resign(content)
+    update_checksums(content)
     write(folder, content)
     check(folder, folder.parent / "saved")
 
@@ -154,29 +154,29 @@ def test_damaged_weights_with_a_mended_sum(original, folder, data):
 @pytest.mark.parametrize("name", ["config.json", "manifest.json"])
 @COMMON
 @given(data=st.data())
-def test_changed_json_with_mended_sums(original, folder, name, data):
+def test_changed_json_with_valid_checksums_loads_or_is_refused(original, folder, name, data):
     content = content_of(original)
     tree = json.loads(content[name])
     change_one(tree, data)
     content[name] = json.dumps(tree).encode()
     if name == "config.json":
-        resign(content)
+        update_checksums(content)
     write(folder, content)
     check(folder, folder.parent / "saved")
 
 
 def with_tensors(content, change):
-    """Change the arrays of a model's initialisers, all of which `change` takes by name, and mend its sum."""
+    """Apply `change` to the dict of initialiser arrays of the ONNX file in `content`, with a valid checksum."""
     model = onnx.load_model_from_string(content["policy.onnx"])
     arrays = {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
     del model.graph.initializer[:]
     model.graph.initializer.extend(onnx.numpy_helper.from_array(array, name) for name, array in change(arrays).items())
     content["policy.onnx"] = model.SerializeToString()
-    resign(content)
+    update_checksums(content)
 
 
 @pytest.mark.parametrize("dtype", ["float64", "float16", "int64", "uint8", "bool", "complex64"])
-def test_weights_of_another_type(original, folder, dtype):
+def test_refuses_weights_of_another_type(original, folder, dtype):
     content = content_of(original)
     with_tensors(content, lambda arrays: {name: abs(array).astype(dtype) for name, array in arrays.items()})
     write(folder, content)
@@ -185,7 +185,7 @@ def test_weights_of_another_type(original, folder, dtype):
 
 @pytest.mark.parametrize("scale", [1e-45, 1e-30, 1e10, 1e20, 1e38])
 @pytest.mark.parametrize("part", ["actor_0_weight", "actor_1_bias", "actor_2_weight", "mean", "std"])
-def test_weights_of_another_size(original, folder, part, scale):
+def test_scaled_weights_load_or_are_refused(original, folder, part, scale):
     content = content_of(original)
     with_tensors(content, lambda arrays: arrays | {part: np.float32(scale) * np.maximum(abs(arrays[part]), 1.0)})
     write(folder, content)
@@ -193,11 +193,11 @@ def test_weights_of_another_size(original, folder, part, scale):
 
 
 @pytest.mark.parametrize("activation", ["elu", "relu", "tanh"])
-def test_weights_that_overflow_are_refused(activation):
+def test_refuses_weights_that_could_overflow(activation):
     policy = small_policy()
     layers = [(weight * 1e20, bias) for weight, bias in policy.layers]
     interface = PolicyInterface(**{**vars(policy.interface), "activation": activation})
-    if activation == "tanh":  # it limits what the next layer reads
+    if activation == "tanh":  # its output is bounded
         assert Policy(layers, policy.mean, policy.std, interface).act(OBSERVATIONS).isfinite().all()
         return
     with pytest.raises(PolicyError, match="overflow"):

@@ -17,21 +17,21 @@ from jumper_warp.tasks.terms import RewardTerm, TerminationTerm
 SHAPE = {"policy_dt": 1 / 60, "physics_dt": 1 / 480, "hidden": (256, 128, 128)}
 
 
-def test_interface_of_the_vertical_jump_has_the_robots_figures():
-    face = make_interface(interface(make_task("vertical-jump")), **SHAPE)
-    assert face.sizes == (147, 256, 128, 128, 12)
-    assert face.joint_names[:4] == ("FL_lateral", "FL_outer", "FL_inner", "FR_lateral")
-    assert face.action_scale[:3] == pytest.approx([0.261799, 1.570796, 1.570796], abs=1e-6)
-    assert face.default_joint_pos[3:6] == pytest.approx([0.0, 0.785398, 0.785398], abs=1e-6)
-    assert face.joint_stiffness == (17.0,) * 12
-    assert face.joint_damping[:3] == (1.8, 0.8, 0.8)
-    assert face.torque_limit[:3] == (10.0, 18.0, 18.0)
-    assert face.command_filter["sum"] == {"lower": 0.0, "upper": 240.0, "lower_zone": 35.0, "upper_zone": 45.0}
-    assert face.observation_layout["lin_vel"] == {"first": 3, "end": 15, "scale": 1.0, "clip": 100.0, "history": 4}
-    assert PolicyInterface.from_json(json.loads(json.dumps(face.to_json()))) == face
+def test_interface_of_the_vertical_jump_has_the_robots_values():
+    spec = make_interface(interface(make_task("vertical-jump")), **SHAPE)
+    assert spec.sizes == (147, 256, 128, 128, 12)
+    assert spec.joint_names[:4] == ("FL_lateral", "FL_outer", "FL_inner", "FR_lateral")
+    assert spec.action_scale[:3] == pytest.approx([0.261799, 1.570796, 1.570796], abs=1e-6)
+    assert spec.default_joint_pos[3:6] == pytest.approx([0.0, 0.785398, 0.785398], abs=1e-6)
+    assert spec.joint_stiffness == (17.0,) * 12
+    assert spec.joint_damping[:3] == (1.8, 0.8, 0.8)
+    assert spec.torque_limit[:3] == (10.0, 18.0, 18.0)
+    assert spec.command_filter["sum"] == {"lower": 0.0, "upper": 240.0, "lower_zone": 35.0, "upper_zone": 45.0}
+    assert spec.observation_layout["lin_vel"] == {"first": 3, "end": 15, "scale": 1.0, "clip": 100.0, "history": 4}
+    assert PolicyInterface.from_json(json.loads(json.dumps(spec.to_json()))) == spec
 
 
-def test_interface_tells_scales_and_history():
+def test_interface_has_scales_and_history():
     layout = make_interface(interface(hold_height.hold_height()), **SHAPE).observation_layout
     assert layout["height"] == {"first": 1, "end": 4, "scale": 5.0, "clip": 100.0, "history": 3}
 
@@ -48,17 +48,17 @@ def test_interface_tells_scales_and_history():
         (lambda layout: layout.update(height=[1]), "'height' must have the numbers"),
     ],
 )
-def test_layout_that_does_not_fit_is_refused(change, message):
-    face = make_interface(interface(make_task("vertical-jump")), **SHAPE).to_json()
-    change(face["observation_layout"])
+def test_refuses_an_invalid_observation_layout(change, message):
+    spec = make_interface(interface(make_task("vertical-jump")), **SHAPE).to_json()
+    change(spec["observation_layout"])
     with pytest.raises(PolicyError, match=message):
-        PolicyInterface.from_json(json.loads(json.dumps(face)))
+        PolicyInterface.from_json(json.loads(json.dumps(spec)))
 
 
 @pytest.fixture
 def saved():
-    """Configuration of a changed vertical jump, as a file holds it, and the task without what only a training needs."""
-    task = make_task("vertical-jump").with_terms("rewards", jump_height={"weight": 7.0, "std_fine": 0.2})
+    """A modified vertical-jump task, and its configuration as read from a JSON file."""
+    task = make_task("vertical-jump").with_terms("rewards", jump_height={"weight": 7.0, "fine": 0.2})
     randomization = dataclasses.replace(task.randomization, latency=None, gains=(0.9, 1.1))
     curriculum = task.curriculum.replace(promote_after=3)
     task = dataclasses.replace(
@@ -72,7 +72,7 @@ def whole(config, *modules):
     return restored_task(config, modules, leave_out=())
 
 
-def test_task_comes_back_from_its_configuration(saved):
+def test_restored_task_equals_the_saved_one(saved):
     task, config = saved
     assert whole(config) == task != make_task("vertical-jump")
     assert restored_task(config) == dataclasses.replace(
@@ -80,13 +80,13 @@ def test_task_comes_back_from_its_configuration(saved):
     )
 
 
-def test_setting_that_is_not_saved_keeps_its_default(saved):
+def test_missing_setting_gets_its_default(saved):
     task, config = saved
     del config["env"]["task"]["curriculum"]["promote_after"]
     assert whole(config) == dataclasses.replace(task, curriculum=task.curriculum.replace(promote_after=5))
 
 
-def test_unknown_reward_is_refused_unless_rewards_are_not_wanted(saved):
+def test_refuses_an_unknown_reward_unless_rewards_are_left_out(saved):
     _, config = saved
     config["env"]["task"]["rewards"].append({"type": "jumper_warp.tasks.terms:RewardTerm", "func": "mine:my_own"})
     with pytest.raises(PolicyError, match=r"task.rewards\[23\] needs 'mine:my_own': name the file"):
@@ -94,7 +94,7 @@ def test_unknown_reward_is_refused_unless_rewards_are_not_wanted(saved):
     assert restored_task(config).name == "vertical-jump"
 
 
-def test_a_reward_that_the_task_does_not_use_comes_back(saved):
+def test_restores_a_reward_outside_the_default_task(saved):
     task, config = saved
     task = dataclasses.replace(task, rewards=(*task.rewards, RewardTerm(rewards.lifted_again, -3.0, threshold=0.1)))
     config["env"]["task"] = json.loads(json.dumps(task_to_json(task)))
@@ -102,7 +102,7 @@ def test_a_reward_that_the_task_does_not_use_comes_back(saved):
 
 
 @pytest.mark.parametrize("success", [False, True])
-def test_a_termination_that_the_task_does_not_use_comes_back(saved, success):
+def test_restores_a_termination_outside_the_default_task(saved, success):
     task, config = saved
     ending = TerminationTerm(terminations.left_stance, distance=0.3, success=success, time_out=success)
     task = dataclasses.replace(task, terminations=(*task.terminations, ending))
@@ -116,7 +116,7 @@ def with_ground(task, ground):
     )
 
 
-def test_drawn_grounds_come_back_and_default_to_none(saved):
+def test_restores_ground_randomisation_with_none_as_default(saved):
     task, config = saved
     drawn = with_ground(task, GroundCfg(platform=0.25, block=0.5, drop=(0.05, 0.1), clearance=0.2))
     config["env"]["task"] = json.loads(json.dumps(task_to_json(drawn)))
@@ -129,7 +129,7 @@ def test_drawn_grounds_come_back_and_default_to_none(saved):
     "name", ["wp", "SOON", "__doc__", "landing_error_estimate", "", "cartwheel", "success:x", 3, None]
 )
 @pytest.mark.parametrize("prefix", ["", "jumper_warp.kernels.jump.terminations:", "jumper_warp.kernels.jump.phase:"])
-def test_a_termination_that_is_none_is_refused(saved, name, prefix):
+def test_refuses_a_function_that_is_not_a_termination(saved, name, prefix):
     _, config = saved
     config["env"]["task"]["terminations"][1]["func"] = f"{prefix}{name}" if prefix else name
     with pytest.raises(PolicyError, match=r"task.terminations\[1\]"):
@@ -155,14 +155,14 @@ def test_a_termination_that_is_none_is_refused(saved, name, prefix):
         (lambda t: t.update(reset=3), "task.reset: expected settings by name, a Reset, got 3"),
     ],
 )
-def test_configuration_that_is_no_task_is_refused(saved, change, message):
+def test_refuses_an_invalid_task_configuration(saved, change, message):
     _, config = saved
     change(config["env"]["task"])
     with pytest.raises(PolicyError, match=message):
         restored_task(config)
 
 
-def test_task_of_another_version_is_refused_with_the_commit_that_reads_it(saved):
+def test_refuses_another_version_with_the_commit_that_reads_it(saved):
     _, config = saved
     for version in (3, 5):
         config["env"]["task"]["version"] = version
@@ -171,6 +171,6 @@ def test_task_of_another_version_is_refused_with_the_commit_that_reads_it(saved)
 
 
 @pytest.mark.parametrize("config", [{}, {"env": {}}, {"env": None}, {"env": {"task": 3}}, {"env": {"task": []}}])
-def test_configuration_without_a_task_is_refused(config):
+def test_refuses_a_configuration_without_a_task(config):
     with pytest.raises(PolicyError, match="task"):
         restored_task(config)

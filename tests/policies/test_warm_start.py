@@ -1,4 +1,4 @@
-"""Trainings that begin with a shipped policy."""
+"""Warm start of a training from a shipped policy."""
 
 import dataclasses
 
@@ -7,13 +7,11 @@ import torch
 
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
-from jumper_warp.policies.warm_start import check_interface, load_init_policy
+from jumper_warp.policies.warm_start import actor_init_from_policy, check_interface, task_symmetry
 from jumper_warp.registry import TASKS, make_task
-from jumper_warp.rl.mirror import Symmetry, image
+from jumper_warp.rl.actor_init import apply_actor_init
 from jumper_warp.rl.networks import ActorCritic
-from jumper_warp.rl.start import begin_with
 from jumper_warp.tasks.interface import interface
-from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 
@@ -29,15 +27,14 @@ WIDE = {"symmetry": "off", "hidden": (512, 256, 256)}
         ("walking_flat", "velocity-flat", WIDE),
     ],
 )
-def test_a_training_begins_as_a_shipped_policy_acts(name, task, change):
+def test_initialised_actor_acts_as_the_shipped_policy(name, task, change):
     policy, cfg, task = open_policy(name), dataclasses.replace(TASKS[task].ppo, **change), make_task(task)
-    symmetry = Symmetry(image(*mirror_of(task, "actor"), "observation"), image(*mirror_of_action(), "action"))
-    symmetry = symmetry if cfg.symmetry == "actor" else None
+    symmetry = task_symmetry(task) if cfg.symmetry == "actor" else None
     assert (symmetry is not None) == (name == "slippery_jump" and not change)
     torch.manual_seed(0)
     sizes = policy.interface.sizes
     model = ActorCritic(sizes[0], sizes[-1], cfg.hidden, cfg.activation, cfg.init_std, symmetry=symmetry)
-    begin_with(load_init_policy(name, task, cfg), model, samples=1000)
+    apply_actor_init(actor_init_from_policy(name, task, cfg), model, samples=1000)
     obs = policy.mean + 2.0 * policy.std * torch.randn(500, sizes[0])
     acted = policy.act(obs)
     assert acted.std() > 0.1
@@ -53,35 +50,37 @@ def test_a_training_begins_as_a_shipped_policy_acts(name, task, change):
         ("horizontal_jump", "horizontal-jump-sighted", {}, r"observation 147: the policy has none, the task block_\w+"),
     ],
 )  # fmt: skip
-def test_what_does_not_fit_is_refused_in_one_line(name, task, change, message):
+def test_refuses_a_policy_that_does_not_fit_in_one_line(name, task, change, message):
     with pytest.raises(InputError, match=f"init_policy: .*{message}") as caught:
-        load_init_policy(name, make_task(task), dataclasses.replace(TASKS[task].ppo, **change))
+        actor_init_from_policy(name, make_task(task), dataclasses.replace(TASKS[task].ppo, **change))
     assert "\n" not in str(caught.value)
 
 
-def test_no_such_policy_is_told():
+def test_refuses_an_unknown_policy():
     with pytest.raises(PolicyError, match="no_jump"):
-        load_init_policy("no_jump", make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo)
+        actor_init_from_policy("no_jump", make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo)
 
 
-def test_another_history_is_refused():
+def test_refuses_a_policy_with_another_history():
     with pytest.raises(InputError, match=r"init_policy: observation \d+: the policy has \w+"):
-        load_init_policy("horizontal_jump", with_history(make_task("horizontal-jump"), 1), TASKS["horizontal-jump"].ppo)
+        actor_init_from_policy(
+            "horizontal_jump", with_history(make_task("horizontal-jump"), 1), TASKS["horizontal-jump"].ppo
+        )
 
 
-def test_a_symmetric_training_begins_with_the_nearest_symmetric_form_of_a_fine_tuned_policy():
+def test_symmetric_training_starts_from_the_projection_of_a_fine_tuned_policy():
     policy, task, cfg = open_policy("horizontal_jump"), make_task("horizontal-jump"), TASKS["horizontal-jump"].ppo
-    symmetry = Symmetry(image(*mirror_of(task, "actor"), "observation"), image(*mirror_of_action(), "action"))
-    start = load_init_policy("horizontal_jump", task, cfg)
+    symmetry = task_symmetry(task)
+    start = actor_init_from_policy("horizontal_jump", task, cfg)
     model = ActorCritic(147, 12, cfg.hidden, cfg.activation, cfg.init_std, symmetry=symmetry)
-    begin_with(start, model, samples=1000)
+    apply_actor_init(start, model, samples=1000)
     obs = policy.mean + policy.std * torch.randn(500, 147, generator=torch.manual_seed(2))
     assert start.change == "made mirror-symmetric"
     assert 0.0 < (model.act(obs) - policy.act(obs)).abs().mean() < 0.01
 
 
-def changed_layout(face):
-    layout = {name: dict(term) for name, term in face.observation_layout.items()}
+def changed_layout(spec):
+    layout = {name: dict(term) for name, term in spec.observation_layout.items()}
     next(iter(layout.values()))["scale"] = 7.0
     return {"observation_layout": layout}
 
@@ -91,25 +90,25 @@ def changed_layout(face):
     [
         (changed_layout, r"scale of \w+: the policy has 7.0, the task 1.0"),
         (
-            lambda face: {"joint_names": face.joint_names[1:] + face.joint_names[:1]},
+            lambda spec: {"joint_names": spec.joint_names[1:] + spec.joint_names[:1]},
             r"action 0: the policy has FL_outer, the task FL_lateral",
         ),
         (
-            lambda face: {"default_joint_pos": (1.0, *face.default_joint_pos[1:])},
+            lambda spec: {"default_joint_pos": (1.0, *spec.default_joint_pos[1:])},
             "default angle .*: the policy has 1.0",
         ),
-        (lambda face: {"observation_limit": 5.0}, "limit of observations: the policy has 5.0, the task 100.0"),
-        (lambda face: {"normalised_limit": 5.0}, "in standard deviations: the policy has 5.0, the task 10.0"),
+        (lambda spec: {"observation_limit": 5.0}, "limit of observations: the policy has 5.0, the task 100.0"),
+        (lambda spec: {"normalised_limit": 5.0}, "in standard deviations: the policy has 5.0, the task 10.0"),
     ],
 )
-def test_the_first_difference_of_the_interface_is_named(change, message):
-    face = open_policy("horizontal_jump").interface
+def test_error_message_names_the_first_difference_of_the_interfaces(change, message):
+    spec = open_policy("horizontal_jump").interface
     with pytest.raises(InputError, match=message):
-        check_interface(dataclasses.replace(face, **change(face)), interface(make_task("horizontal-jump")))
+        check_interface(dataclasses.replace(spec, **change(spec)), interface(make_task("horizontal-jump")))
 
 
-def test_scales_gains_and_a_layout_that_was_not_kept_may_differ():
-    face = open_policy("horizontal_jump").interface
-    numbers = {name: tuple(1.5 for _ in face.joint_names) for name in ("action_scale", "joint_stiffness")}
-    other = dataclasses.replace(face, **numbers, observation_layout={}, policy_dt=0.05)
+def test_scales_gains_and_an_unknown_layout_may_differ():
+    spec = open_policy("horizontal_jump").interface
+    numbers = {name: tuple(1.5 for _ in spec.joint_names) for name in ("action_scale", "joint_stiffness")}
+    other = dataclasses.replace(spec, **numbers, observation_layout={}, policy_dt=0.05)
     check_interface(other, interface(make_task("horizontal-jump-mars")))

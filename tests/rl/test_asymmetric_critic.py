@@ -9,7 +9,7 @@ from toy_task import SMALL, PushTask, fill
 SHORT = dataclasses.replace(SMALL, num_steps=8)
 
 
-def test_each_network_gets_its_own_observation():
+def test_actor_and_critic_get_their_own_observations():
     ppo = Ppo(PushTask(4, episode_length=3), SHORT)
     ppo.env.reset()
     ppo.collect()
@@ -20,17 +20,17 @@ def test_each_network_gets_its_own_observation():
     torch.testing.assert_close(final[2, :, 0], critic_obs[2, :, 0] + 0.2 * final[2, :, 1])  # of the old one
 
 
-def test_each_network_gets_its_own_statistics():
+def test_actor_and_critic_get_their_own_statistics():
     ppo = Ppo(PushTask(16), SHORT)
     fill(ppo, slice(None), 16)
     ppo.batch()
     batch = ppo.batch()  # scaled by the statistics of the first
     obs, critic_obs = ppo.rollout.obs[:-1].flatten(0, 1), ppo.rollout.critic_obs[:-1].flatten(0, 1)
-    for found, raw in ((batch.features, obs), (batch.critic_features, critic_obs)):
-        torch.testing.assert_close(found, (raw - raw.mean(0)) / raw.std(0, correction=0), atol=1e-4, rtol=1e-4)
+    for features, raw in ((batch.features, obs), (batch.critic_features, critic_obs)):
+        torch.testing.assert_close(features, (raw - raw.mean(0)) / raw.std(0, correction=0), atol=1e-4, rtol=1e-4)
 
 
-def test_a_symmetric_critic_gets_the_actors_observation():
+def test_critic_without_privileged_observation_gets_the_actors():
     ppo = Ppo(PushTask(4, episode_length=3), dataclasses.replace(SHORT, asymmetric_critic=False))
     ppo.env.reset()
     ppo.collect()
@@ -38,8 +38,8 @@ def test_a_symmetric_critic_gets_the_actors_observation():
     assert torch.equal(ppo.rollout.final_critic_obs[-1], ppo.env.final_obs)
 
 
-class WageTask(PushTask):
-    """Every other world pays 1 a step, which only the critic can see."""
+class HiddenRewardTask(PushTask):
+    """Task whose odd worlds give a reward of 1 per step, which only the critic observes."""
 
     def show_critic(self, critic_obs, obs):
         super().show_critic(critic_obs, obs)
@@ -51,15 +51,17 @@ class WageTask(PushTask):
 
 
 @pytest.mark.parametrize("asymmetric_critic", [True, False])
-def test_only_an_asymmetric_critic_knows_what_the_actor_cannot_see(asymmetric_critic):
+def test_only_an_asymmetric_critic_learns_a_value_hidden_from_the_actor(asymmetric_critic):
     torch.manual_seed(0)
-    ppo = Ppo(WageTask(128), dataclasses.replace(SMALL, gamma=0.5, lam=0.0, asymmetric_critic=asymmetric_critic))
+    ppo = Ppo(
+        HiddenRewardTask(128), dataclasses.replace(SMALL, gamma=0.5, lam=0.0, asymmetric_critic=asymmetric_critic)
+    )
     ppo.env.reset()
     for _ in range(20):
         ppo.collect()
         ppo.update()
     with torch.no_grad():
         value = ppo.model.value(ppo.rollout.critic_obs).mean(0)
-    told = (value[1::2].mean() - value[::2].mean()).item()
-    # A wage of 1 is worth 0.6 / (1 - 0.5) = 1.2.
-    assert told == pytest.approx(1.2 if asymmetric_critic else 0.0, abs=0.1)
+    difference = (value[1::2].mean() - value[::2].mean()).item()
+    # A reward of 1 per step has the value 0.6 / (1 - 0.5) = 1.2.
+    assert difference == pytest.approx(1.2 if asymmetric_critic else 0.0, abs=0.1)

@@ -13,7 +13,7 @@ from jumper_warp.rl.checkpoint import (
     load_checkpoint,
     save_checkpoint,
 )
-from jumper_warp.utils.files import write_whole
+from jumper_warp.utils.files import write_atomically
 
 
 def state(iteration):
@@ -25,35 +25,35 @@ def weight(checkpoint):
     return checkpoint["ppo"]["weight"].tolist()
 
 
-def test_what_is_saved_is_loaded(tmp_path):
+def test_load_returns_the_saved_state(tmp_path):
     path = save_checkpoint(tmp_path / "new", state(7))
     assert path.name == "iteration_000007.pt"
     assert weight(load_checkpoint(path)) == [7.0, 7.0, 7.0]
     assert sorted(entry.name for entry in path.parent.iterdir()) == [path.name, MANIFEST]
 
 
-def test_the_newest_and_the_best_stay(tmp_path):
+def test_newest_and_best_checkpoints_are_kept(tmp_path):
     for iteration, score in enumerate([0.1, 0.9, 0.3, None, 0.2], start=1):
-        save_checkpoint(tmp_path, state(iteration), score, keep=2)
+        save_checkpoint(tmp_path, state(iteration), score, max_checkpoints=2)
     assert sorted(path.stem for path in tmp_path.glob("*.pt")) == [f"iteration_00000{i}" for i in (2, 4, 5)]
     assert best_checkpoint(tmp_path).stem == "iteration_000002"
 
 
-def test_what_follows_an_older_checkpoint_is_the_newest(tmp_path):
+def test_latest_checkpoint_is_the_last_saved_not_the_highest_iteration(tmp_path):
     for iteration in (100, 200, 300, 110, 300, 120):  # resumed from 100 after 300, and from 110
-        newest = save_checkpoint(tmp_path, state(iteration), keep=2)
+        newest = save_checkpoint(tmp_path, state(iteration), max_checkpoints=2)
         assert latest_checkpoint(tmp_path)[0] == newest
     assert sorted(path.stem for path in tmp_path.glob("*.pt")) == ["iteration_000120", "iteration_000300"]
 
 
-def test_a_score_that_is_no_number_is_none(tmp_path):
+def test_nan_score_counts_as_no_score(tmp_path):
     save_checkpoint(tmp_path, state(1), float("nan"))
     best = save_checkpoint(tmp_path, state(2), 0.5)
     save_checkpoint(tmp_path, state(3), float("nan"))
     assert best_checkpoint(tmp_path) == best
 
 
-def test_without_scores_the_newest_is_the_best(tmp_path):
+def test_best_checkpoint_without_scores_is_the_newest(tmp_path):
     save_checkpoint(tmp_path, state(1))
     newest = save_checkpoint(tmp_path, state(2))
     assert best_checkpoint(tmp_path) == newest
@@ -88,7 +88,7 @@ def scramble_manifest(path):
         (lambda path: os.remove(path.parent / MANIFEST), "manifest.json: No such file"),
     ],
 )
-def test_a_damaged_checkpoint_is_refused_in_one_line(tmp_path, damage, message):
+def test_refuses_a_damaged_checkpoint_in_one_line(tmp_path, damage, message):
     path = save_checkpoint(tmp_path, state(2))
     damage(path)
     with pytest.raises(CheckpointError, match=message) as caught:
@@ -101,7 +101,7 @@ class Payload:
         return os.system, ("touch executed",)
 
 
-def test_nothing_in_a_checkpoint_is_executed(tmp_path, monkeypatch):
+def test_loading_a_checkpoint_executes_no_code(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = save_checkpoint(tmp_path, {**state(1), "env": Payload()})
     with pytest.raises(CheckpointError, match="not readable as tensors"):
@@ -111,43 +111,43 @@ def test_nothing_in_a_checkpoint_is_executed(tmp_path, monkeypatch):
     assert (tmp_path / "executed").exists()
 
 
-def test_a_checkpoint_without_its_parts_is_refused(tmp_path):
+def test_refuses_a_checkpoint_with_missing_parts(tmp_path):
     path = save_checkpoint(tmp_path, {"iteration": 1, "ppo": {}})
     with pytest.raises(CheckpointError, match="lacks env, rng, config"):
         load_checkpoint(path)
 
 
-def test_the_latest_usable_one_is_found_behind_damaged_ones(tmp_path):
+def test_latest_checkpoint_skips_damaged_ones(tmp_path):
     paths = [save_checkpoint(tmp_path, state(iteration)) for iteration in (1, 2, 3)]
     cut(paths[2])
     flip(paths[1])
-    path, found, refusals = latest_checkpoint(tmp_path)
-    assert (path, found["iteration"]) == (paths[0], 1)
-    assert [refusal.split(":")[0] for refusal in refusals] == [str(paths[2]), str(paths[1])]
+    path, loaded, skipped = latest_checkpoint(tmp_path)
+    assert (path, loaded["iteration"]) == (paths[0], 1)
+    assert [reason.split(":")[0] for reason in skipped] == [str(paths[2]), str(paths[1])]
 
 
-def test_no_usable_checkpoint_is_told(tmp_path):
+def test_latest_checkpoint_raises_if_all_are_damaged(tmp_path):
     cut(save_checkpoint(tmp_path, state(1)))
     with pytest.raises(CheckpointError, match=r"no usable checkpoint.*differs from its checksum"):
         latest_checkpoint(tmp_path)
 
 
-def test_a_failed_write_leaves_the_old_file(tmp_path, monkeypatch):
+def test_failed_atomic_write_keeps_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "file"
-    write_whole(path, b"old")
+    write_atomically(path, b"old")
 
     def full(*_):
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(OSError, match="No space left") as caught:
-        write_whole(path, b"new")
+        write_atomically(path, b"new")
     assert caught.value.filename == str(path)  # by which the command line knows a refusal
     assert path.read_bytes() == b"old"
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
 
-def test_a_checkpoint_that_the_manifest_does_not_know_is_no_latest_one(tmp_path):
+def test_latest_checkpoint_ignores_files_missing_from_the_manifest(tmp_path):
     first = save_checkpoint(tmp_path, state(1))
     manifest = (tmp_path / MANIFEST).read_text()
     save_checkpoint(tmp_path, state(2))

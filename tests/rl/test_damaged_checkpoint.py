@@ -1,4 +1,4 @@
-"""Whatever a checkpoint holds, it is taken up or refused in one line: with the right checksum, too."""
+"""Damaged checkpoints, also with valid checksums: each is resumed, or refused with a one-line error."""
 
 import copy
 import hashlib
@@ -15,15 +15,16 @@ from jumper_warp.policies.spec import PolicyError
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint, save_checkpoint
 from jumper_warp.rl.distributed import Rank
-from jumper_warp.rl.runner import CHECKPOINTS, Run, train
+from jumper_warp.rl.runner import CHECKPOINTS, TrainingRun, train
 
 PPO = PpoCfg(num_steps=4, hidden=(8, 4), minibatches=2, epochs=1)
-ALONE = Rank(0, 1, torch.device("cpu"))
-NEVER = float("nan")
+SINGLE_RANK = Rank(0, 1, torch.device("cpu"))
+REMOVED = float("nan")
+"""Result of a change that removes its part."""
 
 
 class Saved:
-    """A checkpoint of a short training, its environment, and the files that damaged copies go to."""
+    """Checkpoint of a short training with its environment; damaged copies replace its file."""
 
     def __init__(self, folder):
         self.env = make_env(2, seed=1, randomize=True, noise=True)
@@ -34,17 +35,17 @@ class Saved:
         self.data, self.state = self.path.read_bytes(), load_checkpoint(self.path)
 
     def sign(self, data):
-        """Write the checkpoint's file and its checksum."""
+        """Write `data` as the checkpoint's file, with a valid checksum."""
         self.path.write_bytes(data)
         manifest = json.loads((self.path.parent / MANIFEST).read_text())
         manifest[self.path.name]["sha256"] = hashlib.sha256(data).hexdigest()
         (self.path.parent / MANIFEST).write_text(json.dumps(manifest))
 
     def resume(self):
-        """Return what is wrong with the checkpoint, or None after an iteration from it."""
+        """Resume and run one iteration; return the error message, or None."""
         cfg = TrainCfg(**{**vars(self.cfg), "iterations": 100, "resume": str(self.path)})
         try:
-            run = Run(cfg, self.env, ALONE)
+            run = TrainingRun(cfg, self.env, SINGLE_RANK)
         except CheckpointError as error:
             return str(error)
         run.ppo.collect()
@@ -52,7 +53,7 @@ class Saved:
         return None
 
     def save(self, state):
-        """Sign a state."""
+        """Write a state as the checkpoint, with a valid checksum."""
         torch.save(state, self.path)
         self.sign(self.path.read_bytes())
 
@@ -62,22 +63,24 @@ def saved(tmp_path_factory, one_thread):
     return Saved(tmp_path_factory.mktemp("run"))
 
 
-def places(state, start=()):
-    """Return the keys that lead to each part of nested dictionaries and lists."""
+def part_paths(state, start=()):
+    """Return the tuple of keys to each part of nested dictionaries and lists."""
     keys = state.keys() if isinstance(state, dict) else range(len(state)) if isinstance(state, list) else ()
-    return [start + (key,) for key in keys] + [place for key in keys for place in places(state[key], start + (key,))]
+    return [start + (key,) for key in keys] + [
+        part_path for key in keys for part_path in part_paths(state[key], start + (key,))
+    ]
 
 
-def changed(state, place, change):
-    """Return a copy of a state with one part changed, or taken away if `change` gives that."""
+def changed(state, part_path, change):
+    """Return a copy of a state with one part changed, or removed if `change` returns REMOVED."""
     state = part = copy.deepcopy(state)
-    for key in place[:-1]:
+    for key in part_path[:-1]:
         part = part[key]
-    new = change(part[place[-1]])
-    if new is NEVER:
-        del part[place[-1]]
+    new = change(part[part_path[-1]])
+    if new is REMOVED:
+        del part[part_path[-1]]
     else:
-        part[place[-1]] = new
+        part[part_path[-1]] = new
     return state
 
 
@@ -87,7 +90,7 @@ def of_tensor(change):
 
 JUNK = [None, True, -1, 2**70, 1.5, float("inf"), "late", "", b"\0", [], {}, [1], {"a": 1}, {3: {}}, torch.zeros(0)]
 CHANGES = {
-    "gone": lambda value: NEVER,
+    "gone": lambda value: REMOVED,
     **{f"{junk!r}": (lambda value, junk=junk: junk) for junk in JUNK},
     "nan": of_tensor(lambda x: torch.full_like(x, float("nan")) if x.is_floating_point() else -x),
     "infinite": of_tensor(lambda x: x + float("inf") if x.is_floating_point() else x + 100),
@@ -110,17 +113,17 @@ def is_refusal(message, path):
 
 @settings(max_examples=120, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
-def test_a_changed_part_is_taken_up_or_refused_in_one_line(saved, data):
-    place = data.draw(st.sampled_from(places(saved.state)))
+def test_changed_part_is_resumed_or_refused_in_one_line(saved, data):
+    part_path = data.draw(st.sampled_from(part_paths(saved.state)))
     change = CHANGES[data.draw(st.sampled_from(sorted(CHANGES)))]
-    saved.save(changed(saved.state, place, change))
+    saved.save(changed(saved.state, part_path, change))
     message = saved.resume()
     assert message is None or is_refusal(message, saved.path)
 
 
 @settings(max_examples=40, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
-def test_changed_bytes_with_a_right_checksum_are_taken_up_or_refused_in_one_line(saved, data):
+def test_changed_bytes_with_valid_checksum_are_resumed_or_refused_in_one_line(saved, data):
     content = bytearray(saved.data)
     if data.draw(st.booleans()):
         del content[data.draw(st.integers(0, len(content))) :]
@@ -135,8 +138,12 @@ def test_changed_bytes_with_a_right_checksum_are_taken_up_or_refused_in_one_line
 @pytest.mark.filterwarnings("ignore:Casting complex")
 @settings(max_examples=30, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
-def test_a_policy_of_a_changed_checkpoint_is_opened_or_refused_in_one_line(saved, data):
-    read = [place for place in places(saved.state) if place[0] in ("iteration", "config") or "model" in place]
+def test_policy_of_a_changed_checkpoint_is_opened_or_refused_in_one_line(saved, data):
+    read = [
+        part_path
+        for part_path in part_paths(saved.state)
+        if part_path[0] in ("iteration", "config") or "model" in part_path
+    ]
     change = CHANGES[data.draw(st.sampled_from(sorted(CHANGES)))]
     saved.save(changed(saved.state, data.draw(st.sampled_from(read)), change))
     try:
@@ -145,20 +152,20 @@ def test_a_policy_of_a_changed_checkpoint_is_opened_or_refused_in_one_line(saved
         assert is_refusal(str(error), saved.path)
 
 
-def test_the_untouched_checkpoint_is_taken_up(saved):
+def test_unchanged_checkpoint_is_resumed(saved):
     saved.sign(saved.data)
     assert saved.resume() is None
 
 
-WRONG = [
+INVALID_PARTS = [
     (("iteration",), "late", "iteration must be int, got str"),
     (("iteration",), 7, "of iteration 7, manifest.json says 1"),
-    (("rng", "cpu"), NEVER, "rng lacks cpu"),
+    (("rng", "cpu"), REMOVED, "rng lacks cpu"),
     (("rng", "cpu"), torch.zeros(5), "rng.cpu has shape (5,), expected (5056,)"),
     (("rng", "cpu"), torch.zeros(5056, dtype=torch.uint8), "rng is not the state of a generator"),
     (("ppo",), [], "ppo must be dict, got list"),
     (("ppo", "optimiser"), {}, "ppo.optimiser lacks 0, 1, 10 and 10 more, has nothing besides"),
-    (("ppo", "optimiser", 0, "step"), NEVER, "ppo.optimiser.0 lacks step, has nothing besides"),
+    (("ppo", "optimiser", 0, "step"), REMOVED, "ppo.optimiser.0 lacks step, has nothing besides"),
     (("ppo", "optimiser", 0, "exp_avg"), torch.zeros(2), "ppo.optimiser.0.exp_avg has shape (2,), expected (8, 147)"),
     (("ppo", "optimiser", 1, "exp_avg_sq"), torch.full((8,), -1.0), "ppo.optimiser.1.exp_avg_sq must not be below 0"),
     (("ppo", "model", "actor.0.bias"), torch.full((8,), float("nan")), "ppo.model.actor.0.bias is not finite"),
@@ -176,28 +183,28 @@ WRONG = [
 ]
 
 
-@pytest.mark.parametrize(("place", "value", "message"), WRONG)
-def test_what_is_wrong_is_named(saved, place, value, message):
-    saved.save(changed(saved.state, place, lambda _: value))
-    found = saved.resume()
-    assert found is not None and message in found and is_refusal(found, saved.path)
+@pytest.mark.parametrize(("part_path", "value", "message"), INVALID_PARTS)
+def test_error_message_names_the_invalid_part(saved, part_path, value, message):
+    saved.save(changed(saved.state, part_path, lambda _: value))
+    message = saved.resume()
+    assert message is not None and message in message and is_refusal(message, saved.path)
 
 
-def test_an_empty_file_with_a_right_checksum_is_refused(saved):
+def test_refuses_an_empty_file_with_valid_checksum(saved):
     saved.sign(b"")
     assert "not readable as tensors: " in saved.resume()
 
 
-def test_parts_of_another_process_are_named(saved):
+def test_error_message_names_missing_parts_of_another_rank(saved):
     own = {"ppo": {"episode": saved.state["ppo"]["episode"]}, "env": saved.state["env"]}
     saved.save({**saved.state, "others": [own]})
     cfg = TrainCfg(**{**vars(saved.cfg), "resume": str(saved.path)})
     with pytest.raises(CheckpointError, match=r"others\.0 lacks rng, has nothing besides"):
-        Run(cfg, saved.env, Rank(1, 2, torch.device("cpu")))
+        TrainingRun(cfg, saved.env, Rank(1, 2, torch.device("cpu")))
 
 
 @pytest.mark.parametrize("entry", [{"sha256": 3}, {"iteration": "1"}, {"iteration": True}, {"score": "high"}, 3])
-def test_a_damaged_manifest_is_refused(tmp_path, entry):
+def test_refuses_a_manifest_with_an_invalid_entry(tmp_path, entry):
     state = {"iteration": 1, "ppo": {}, "env": {}, "rng": {}, "config": "{}"}
     path = save_checkpoint(tmp_path, state, 0.5)
     manifest = json.loads((tmp_path / MANIFEST).read_text())

@@ -1,12 +1,12 @@
 import pytest
 
 from jumper_warp.rl import graphs
-from jumper_warp.rl.graphs import Captured
+from jumper_warp.rl.graphs import CapturedProcedure
 
 
 @pytest.fixture
 def refusing(monkeypatch):
-    """A GPU on which no capture succeeds."""
+    """Replaces torch.cuda by one on which every graph capture fails."""
 
     def refuse(*_, **__):
         raise RuntimeError("operation not permitted when stream is capturing\nand more")
@@ -24,9 +24,9 @@ def refusing(monkeypatch):
 
 
 @pytest.mark.usefixtures("refusing")
-def test_what_cannot_be_captured_runs_eagerly_and_says_so_once(capsys):
+def test_failed_capture_runs_eagerly_and_warns_once(capsys):
     calls = []
-    captured = Captured(lambda: calls.append(None), enabled=True)
+    captured = CapturedProcedure(lambda: calls.append(None), enabled=True)
     for _ in range(4):
         captured()
     assert len(calls) == 4

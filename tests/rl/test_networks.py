@@ -6,7 +6,7 @@ from jumper_warp.envs.vec_env import sanitise
 from jumper_warp.rl.networks import ActorCritic, Moments, RunningMoments, gaussian_kl, gaussian_log_prob
 
 
-def test_log_density_and_divergence_equal_torch():
+def test_log_prob_and_kl_agree_with_torch():
     torch.manual_seed(0)
     x, mean, other, log_std, other_std = (torch.randn(5, 3), torch.randn(5, 3), torch.randn(5, 3), *torch.randn(2, 3))
     old = torch.distributions.Normal(mean, log_std.exp())
@@ -16,42 +16,42 @@ def test_log_density_and_divergence_equal_torch():
     torch.testing.assert_close(gaussian_kl(mean, log_std, other, other_std), divergence)
 
 
-def test_moments_equal_numpy_over_all_batches():
+def test_running_moments_agree_with_numpy_over_all_batches():
     rng = np.random.default_rng(0)
     batches = [rng.normal(50.0, (1.0, 5.0), (size, 2)).astype(np.float32) for size in (3, 400, 77)]
     moments = RunningMoments((2,))
     for batch in batches:
         moments.update(torch.from_numpy(batch))
-    everything = np.concatenate(batches).astype(float)
-    np.testing.assert_allclose(moments.mean, everything.mean(0), rtol=1e-6)
-    np.testing.assert_allclose(moments.var, everything.var(0), rtol=1e-5)
+    samples = np.concatenate(batches).astype(float)
+    np.testing.assert_allclose(moments.mean, samples.mean(0), rtol=1e-6)
+    np.testing.assert_allclose(moments.var, samples.var(0), rtol=1e-5)
     scaled = moments.scaling().normalise(torch.from_numpy(batches[1]))
-    np.testing.assert_allclose(scaled, (batches[1] - everything.mean(0)) / np.sqrt(everything.var(0) + 1e-5), atol=1e-4)
-    np.testing.assert_allclose(moments.scaling().restore(scaled), batches[1], rtol=1e-5)
+    np.testing.assert_allclose(scaled, (batches[1] - samples.mean(0)) / np.sqrt(samples.var(0) + 1e-5), atol=1e-4)
+    np.testing.assert_allclose(moments.scaling().denormalise(scaled), batches[1], rtol=1e-5)
 
 
 @pytest.mark.parametrize("rows", [None, 1, 64, 200, 1000])
-def test_moments_of_a_batch_do_not_depend_on_the_rows_at_a_time(rows):
+def test_batch_moments_do_not_depend_on_the_chunk_size(rows):
     batch = np.random.default_rng(0).normal(50.0, (1.0, 5.0), (200, 2)).astype(np.float32)
-    mean, var, _ = Moments.of(torch.from_numpy(batch), rows)
+    mean, var, _ = Moments.from_samples(torch.from_numpy(batch), rows)
     np.testing.assert_allclose(mean, batch.astype(float).mean(0), rtol=1e-6)
     np.testing.assert_allclose(var, batch.astype(float).var(0), rtol=1e-5)
 
 
-def test_moments_start_as_identity():
+def test_running_moments_start_as_the_identity():
     x = torch.tensor([[3.0, -4.0]])
     torch.testing.assert_close(RunningMoments((2,)).scaling().normalise(x), x, rtol=1e-6, atol=0.0)
 
 
-def test_actions_are_clipped_means():
+def test_act_returns_the_clipped_mean():
     model = ActorCritic(2, 1, (4,))
     torch.nn.init.constant_(model.actor[-1].bias, 3.0)
     assert model.act(torch.zeros(5, 2)).tolist() == [[1.0]] * 5
 
 
-def test_sanitised_observations_are_a_copy_in_its_place():
-    obs, place = torch.tensor([float("nan"), float("inf"), 2.0, -1e13]), torch.full((2, 4), 7.0)
-    sanitise(obs, out=place[1])
-    assert place.tolist() == [[7.0] * 4, [0.0, 0.0, 2.0, -100.0]]
+def test_sanitise_writes_to_out_and_leaves_its_input():
+    obs, out = torch.tensor([float("nan"), float("inf"), 2.0, -1e13]), torch.full((2, 4), 7.0)
+    sanitise(obs, out=out[1])
+    assert out.tolist() == [[7.0] * 4, [0.0, 0.0, 2.0, -100.0]]
     assert sanitise(obs).tolist() == [0.0, 0.0, 2.0, -100.0]
     assert obs.isnan()[0] and obs[3] < -1e12

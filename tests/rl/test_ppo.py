@@ -49,7 +49,7 @@ def copy_weights(ours, theirs):
 
 
 def feed(theirs, rollout):
-    """Give rsl-rl our rollout, as if it had acted itself."""
+    """Store our rollout in rsl-rl's PPO, as if it had acted itself."""
     for step in range(rollout.reward.shape[0]):
         obs = groups(rollout.obs[step], rollout.critic_obs[step])
         theirs.act(obs)
@@ -62,7 +62,10 @@ def feed(theirs, rollout):
 
 @pytest.fixture(scope="module")
 def pair():
-    """Ours and rsl-rl's after one update of the same weights, changed since they acted, on the same experience."""
+    """Our PPO and rsl-rl's after one update of the same weights on the same samples.
+
+    The weights differ from those that acted, so that the probability ratio is not 1.
+    """
     torch.manual_seed(0)
     ppo = Ppo(PushTask(16), PLAIN)
     fill(ppo, slice(None), 16)
@@ -75,23 +78,23 @@ def pair():
             param.add_(0.1 * torch.randn_like(param))
     copy_weights(ppo.model, theirs)
     their_losses = theirs.update()
-    ppo.minibatch_step(ppo.sampler.rows)
+    ppo.minibatch_step(ppo.packer.rows)
     return ppo, batch, theirs, their_losses, ppo.statistics()
 
 
-def test_returns_and_advantages_equal_rsl_rl(pair):
+def test_returns_and_advantages_agree_with_rsl_rl(pair):
     _, batch, theirs, _, _ = pair
     torch.testing.assert_close(batch.target, theirs.storage.returns.flatten(), atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(batch.advantage, theirs.storage.advantages.flatten(), atol=1e-5, rtol=1e-5)
 
 
 @pytest.mark.parametrize("name", ["surrogate", "value", "entropy"])
-def test_losses_equal_rsl_rl(pair, name):
+def test_losses_agree_with_rsl_rl(pair, name):
     _, _, _, their_losses, ours = pair
     assert ours[f"Loss/{name}"] == pytest.approx(their_losses[name], abs=1e-5, rel=1e-5)
 
 
-def test_gradients_equal_rsl_rl(pair):
+def test_gradients_agree_with_rsl_rl(pair):
     ppo, _, theirs, _, _ = pair
     ours = {**dict(ppo.model.actor.named_parameters()), "noise": ppo.model.log_std}
     their_actor = {**dict(theirs.actor.mlp.named_parameters()), "noise": theirs.actor.distribution.log_std_param}
@@ -102,13 +105,13 @@ def test_gradients_equal_rsl_rl(pair):
     assert ppo.flat.gradient.norm() > 0.1
 
 
-def test_step_size_after_the_update_equals_rsl_rl(pair):
+def test_adapted_learning_rate_agrees_with_rsl_rl(pair):
     ppo, _, theirs, _, statistics = pair
     assert statistics["Loss/kl"] > 0.02
     assert ppo.lr.item() == pytest.approx(theirs.learning_rate)
 
 
-def test_gae_by_hand():
+def test_gae_agrees_with_hand_calculation():
     # gamma 0.5, lambda 0.5; the second step ends an episode.
     # delta: 1 + 0.5*4 - 2 = 1;  2 - 4 = -2;  3 + 0.5*8 - 6 = 1.  Advantage: 1 - 0.25*2 = 0.5; -2; 1.
     advantage, returns = gae(
@@ -122,19 +125,19 @@ def test_gae_by_hand():
     assert returns.flatten().tolist() == [2.5, 2.0, 7.0]
 
 
-def test_a_timeout_counts_the_value_of_the_last_observation():
+def test_timeout_adds_the_value_of_the_final_observation():
     cfg = dataclasses.replace(PLAIN, num_steps=1, gamma=0.5)
     ppo = Ppo(PushTask(2), cfg)
     for linear in ppo.model.critic[:-1:2]:
         torch.nn.init.zeros_(linear.weight)
-    torch.nn.init.constant_(ppo.model.critic[-1].bias, 10.0)  # every state is worth 10
+    torch.nn.init.constant_(ppo.model.critic[-1].bias, 10.0)  # every state has value 10
     ppo.rollout.reward.copy_(torch.tensor([[1.0, 1.0]]))
     ppo.rollout.done.copy_(torch.tensor([[1.0, 1.0]]))
     ppo.rollout.timeout.copy_(torch.tensor([[0.0, 1.0]]))
     assert ppo.batch().target.tolist() == pytest.approx([1.0, 6.0])  # 1 and 1 + 0.5 * 10
 
 
-def test_the_timeout_looks_at_the_old_episode():
+def test_timeout_uses_the_final_observation_of_the_old_episode():
     ppo = Ppo(PushTask(2), dataclasses.replace(PLAIN, num_steps=1))
     ppo.rollout.done.fill_(1.0)
     ppo.rollout.timeout.fill_(1.0)
@@ -156,12 +159,12 @@ def test_the_timeout_looks_at_the_old_episode():
         (1e-3, float("nan"), 1e-3),
     ],
 )
-def test_step_size_follows_the_divergence(lr, kl, expected):
-    found = adapted_lr(torch.tensor(lr), torch.tensor(kl), PpoCfg(desired_kl=0.01, min_lr=1.0e-5), 0.01)
-    assert found.item() == pytest.approx(expected)
+def test_learning_rate_adapts_to_the_kl_divergence(lr, kl, expected):
+    result = adapted_lr(torch.tensor(lr), torch.tensor(kl), PpoCfg(desired_kl=0.01, min_lr=1.0e-5), 0.01)
+    assert result.item() == pytest.approx(expected)
 
 
-def test_step_size_stays_without_desired_divergence():
+def test_learning_rate_is_fixed_without_desired_kl():
     cfg = PpoCfg(desired_kl=0.0)
     assert adapted_lr(torch.tensor(1e-3), torch.tensor(9.0), cfg, 0.0).item() == pytest.approx(1e-3)
 
@@ -180,7 +183,7 @@ def trained(iterations):
 
 def test_training_learns_to_push_the_mass_to_the_origin():
     ppo, history = trained(30)
-    returns = [figures["Train/mean_return"] for figures in history if "Train/mean_return" in figures]
+    returns = [metrics["Train/mean_return"] for metrics in history if "Train/mean_return" in metrics]
     assert returns[0] < 25.0
     assert returns[-1] > 44.0  # of at most 50
     env = ppo.env
@@ -190,9 +193,9 @@ def test_training_learns_to_push_the_mass_to_the_origin():
     assert env.obs[:, 0].abs().max() < 0.2
 
 
-def test_the_critic_learns_the_return_in_its_own_unit():
+def test_critic_learns_the_normalised_return():
     ppo, history = trained(30)
-    # Held at the origin, a mass earns the scaled reward 0.6 for ever: 0.6 / (1 - 0.985) = 40.
+    # A mass that stays at the origin gets the scaled reward 0.6 in every step: 0.6 / (1 - 0.985) = 40.
     expected = 40.0 * history[-2]["Train/mean_return"] / 50.0
     with torch.no_grad():
         head = ppo.model.value_head(ppo.model.critic_features(ppo.rollout.critic_obs))
@@ -201,8 +204,8 @@ def test_the_critic_learns_the_return_in_its_own_unit():
     assert head.abs().max() < 5.0
 
 
-class BrokenWorlds(PushTask):
-    """Worlds 0 to 2 come apart at every step."""
+class DivergingTask(PushTask):
+    """Task whose worlds 0 to 2 diverge at every step."""
 
     def step(self, action):
         super().step(action)
@@ -212,16 +215,16 @@ class BrokenWorlds(PushTask):
         self.reward[:2] = bad[:2]
 
 
-def test_worlds_that_come_apart_reach_neither_networks_nor_statistics():
+def test_diverged_worlds_reach_neither_networks_nor_statistics():
     torch.manual_seed(0)
-    ppo = Ppo(BrokenWorlds(128), SMALL)
+    ppo = Ppo(DivergingTask(128), SMALL)
     ppo.env.reset()
     for _ in range(3):
         ppo.collect()
         ppo.update()
-    for kept in (ppo.rollout.obs, ppo.rollout.critic_obs):
-        assert kept.isfinite().all()
-        assert kept.abs().max() <= 100.0
+    for recorded in (ppo.rollout.obs, ppo.rollout.critic_obs):
+        assert recorded.isfinite().all()
+        assert recorded.abs().max() <= 100.0
     assert all(value.isfinite().all() for value in ppo.model.state_dict().values())
     assert ppo.model.obs_moments.var.max() < 200.0  # one world in 128 at 100 gives 78
     assert ppo.model.critic_moments.var[:2].max() < 200.0
@@ -230,14 +233,14 @@ def test_worlds_that_come_apart_reach_neither_networks_nor_statistics():
     assert ppo.statistics()["Loss/skipped"] == 0.0
 
 
-def test_a_gradient_that_is_not_finite_changes_nothing():
+def test_non_finite_gradient_changes_no_parameter():
     ppo = Ppo(PushTask(16), PLAIN)
     fill(ppo, slice(None), 16)
     batch = ppo.batch()
     before = {name: value.clone() for name, value in ppo.model.named_parameters()}
     batch.advantage.mul_(float("nan"))
     batch.target.mul_(float("inf"))
-    assert ppo.minibatch_step(ppo.sampler.rows).skipped == 1.0
+    assert ppo.minibatch_step(ppo.packer.rows).skipped == 1.0
     assert all(torch.equal(value, before[name]) for name, value in ppo.model.named_parameters())
     assert ppo.statistics()["Loss/skipped"] == 1.0
 
@@ -255,7 +258,7 @@ class NoHost(TorchDispatchMode):
         return func(*args, **(kwargs or {}))
 
 
-def test_an_iteration_never_waits_for_the_host():
+def test_iteration_has_no_host_synchronisation():
     ppo = Ppo(PushTask(16), PLAIN)
     ppo.env.reset()
     with NoHost():
@@ -263,12 +266,12 @@ def test_an_iteration_never_waits_for_the_host():
         ppo.update()
 
 
-def test_the_check_for_waiting_sees_an_item():
+def test_host_synchronisation_check_detects_item():
     with pytest.raises(AssertionError, match="_local_scalar_dense"), NoHost():
         torch.ones(()).item()
 
 
-def test_two_processes_equal_one_with_all_worlds(tmp_path):
+def test_update_of_two_ranks_agrees_with_one_rank_with_all_worlds(tmp_path):
     cfg = PpoCfg(num_steps=8, epochs=2, minibatches=2, hidden=(16, 8))
     processes = torch.multiprocessing.spawn(
         update_half, (free_port(), cfg, str(tmp_path / "half")), nprocs=2, join=False
@@ -287,14 +290,14 @@ def test_two_processes_equal_one_with_all_worlds(tmp_path):
         pass
     expected = whole.state_dict()
     for rank in range(2):
-        found = torch.load(tmp_path / f"half{rank}", weights_only=True)
+        result = torch.load(tmp_path / f"half{rank}", weights_only=True)
         for name, value in expected["model"].items():
-            torch.testing.assert_close(found["model"][name], value, atol=1e-5, rtol=1e-5, msg=name)
+            torch.testing.assert_close(result["model"][name], value, atol=1e-5, rtol=1e-5, msg=name)
             assert not torch.equal(value, start[name]), name
-        torch.testing.assert_close(found["lr"], expected["lr"])
+        torch.testing.assert_close(result["lr"], expected["lr"])
 
 
-def test_an_iteration_exchanges_its_statistics_once_and_a_gradient_a_minibatch(monkeypatch):
+def test_iteration_all_reduces_moments_once_and_each_minibatch_gradient(monkeypatch):
     cfg = dataclasses.replace(PLAIN, epochs=3, minibatches=4, normalise_value=True)
     ppos = []
     for ranks in (1, 2):
@@ -305,40 +308,42 @@ def test_an_iteration_exchanges_its_statistics_once_and_a_gradient_a_minibatch(m
             return x  # as if the other rank had seen the same
 
         monkeypatch.setattr(networks, "world_size", lambda ranks=ranks: ranks)
-        monkeypatch.setattr(networks, "average_over_ranks", exchange)
-        monkeypatch.setattr(ppo_module, "average_over_ranks", exchange)
+        monkeypatch.setattr(networks, "all_reduce_mean", exchange)
+        monkeypatch.setattr(ppo_module, "all_reduce_mean", exchange)
         torch.manual_seed(0)
         ppos.append(Ppo(PushTask(16), cfg))
         ppos[-1].env.reset()
         ppos[-1].collect()
         ppos[-1].update()
     alone, one_of_two = ppos
-    assert sizes == [2 * (1 + 1 + 2 + 3)] + 12 * [alone.flat.exchanged.numel()]
+    assert sizes == [2 * (1 + 1 + 2 + 3)] + 12 * [alone.flat.all_reduced.numel()]
     torch.testing.assert_close(one_of_two.flat.value, alone.flat.value, atol=2e-5, rtol=1e-3)
     torch.testing.assert_close(one_of_two.model.obs_moments.var, alone.model.obs_moments.var, atol=1e-6, rtol=1e-3)
     assert one_of_two.model.obs_moments.count == 2 * alone.model.obs_moments.count
 
 
-FULL = 2.0**24
-"""Where a count in single precision stands still."""
+FLOAT32_COUNT_LIMIT = 2.0**24
+"""Largest count in float32: adding 1 changes nothing."""
 
 
-def test_counts_go_on_where_single_precision_stands_still():
+def test_counters_are_exact_beyond_the_range_of_float32():
     ppo = Ppo(PushTask(1, episode_length=5), dataclasses.replace(PLAIN, num_steps=16, epochs=1, minibatches=1))
     ppo.env.reset()
     for count in (ppo.collector.episode, ppo.collector.finished, ppo._sums):
-        count.fill_(FULL)
+        count.fill_(FLOAT32_COUNT_LIMIT)
     ppo.collect()
     ppo.update()
     lengths, number = ppo.collector.finished[1:, 0].tolist()
-    assert (lengths, number) == (2.0 * FULL + 15.0, FULL + 3.0)  # of three episodes
+    assert (lengths, number) == (2.0 * FLOAT32_COUNT_LIMIT + 15.0, FLOAT32_COUNT_LIMIT + 3.0)  # of three episodes
     assert ppo.collector.episode[1].tolist() == [1.0]
-    assert ppo._sums[-1].item() == FULL + 1.0
-    entropy, skipped = (ppo._sums[STATISTICS.index(name)].item() - FULL for name in ("entropy", "skipped"))
+    assert ppo._sums[-1].item() == FLOAT32_COUNT_LIMIT + 1.0
+    entropy, skipped = (
+        ppo._sums[STATISTICS.index(name)].item() - FLOAT32_COUNT_LIMIT for name in ("entropy", "skipped")
+    )
     assert 0.0 < abs(entropy) < 10.0 and entropy != round(entropy) and skipped == 0.0
 
 
-def test_an_old_checkpoints_episodes_in_single_precision_are_taken_up():
+def test_loads_episode_counts_in_float32():
     ppo, _ = trained(2)
     state = ppo.state_dict()
     old = {**state, "episode": state["episode"].float()}
@@ -348,15 +353,15 @@ def test_an_old_checkpoints_episodes_in_single_precision_are_taken_up():
 
 
 def noise_gradient(ppo, progress):
-    """Return the gradient by the noise's logarithms at a progress of the training, on the same samples and weights."""
+    """Return the gradient by log_std at a progress of the training, on the same samples and weights."""
     ppo.set_progress(progress)
     ppo.lr.zero_()
-    ppo.minibatch_step(ppo.sampler.rows)
+    ppo.minibatch_step(ppo.packer.rows)
     return ppo.model.log_std.grad.clone()
 
 
 @pytest.mark.parametrize(("final", "late"), [(0.004, 0.012), (None, 0.02)])
-def test_the_entropy_bonus_falls_over_the_second_half(final, late):
+def test_entropy_bonus_decays_over_the_second_half(final, late):
     torch.manual_seed(0)
     ppo = Ppo(PushTask(16), dataclasses.replace(PLAIN, entropy_coef=0.02, final_entropy_coef=final))
     fill(ppo, slice(None), 16)
@@ -368,7 +373,7 @@ def test_the_entropy_bonus_falls_over_the_second_half(final, late):
         torch.testing.assert_close(noise_gradient(ppo, progress), expected, atol=1e-6, rtol=0.0)
 
 
-def test_state_is_taken_up_exactly():
+def test_load_state_dict_resumes_bitwise():
     ppo, _ = trained(2)
     torch.manual_seed(99)
     other = Ppo(PushTask(128), SMALL)
@@ -402,11 +407,11 @@ def test_state_is_taken_up_exactly():
         ({"lr": float("nan")}, "lr must be positive"),
     ],
 )
-def test_settings_out_of_range_are_refused(change, message):
+def test_refuses_settings_out_of_range(change, message):
     with pytest.raises(ValueError, match=message):
         PpoCfg(**change)
 
 
-def test_minibatches_must_divide_the_batch():
+def test_refuses_minibatches_that_do_not_divide_the_batch():
     with pytest.raises(ValueError, match="7 minibatches do not divide 8 x 16"):
         Ppo(PushTask(16), dataclasses.replace(PLAIN, minibatches=7))

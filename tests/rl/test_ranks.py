@@ -11,21 +11,21 @@ from toy_task import SMALL, PushTask
 
 
 @pytest.mark.parametrize(("cores", "threads"), [(1, 1), (2, 2), (3, 2), (4, 2), (16, 8)])
-def test_torch_has_half_the_cores_but_two_where_there_are(cores, threads, one_thread, monkeypatch):
+def test_torch_uses_half_the_cores_and_at_least_two(cores, threads, one_thread, monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     monkeypatch.setattr(distributed, "available_threads", lambda: cores)
-    assert distributed.join_ranks("cpu").size == 1
+    assert distributed.init_distributed("cpu").size == 1
     assert torch.get_num_threads() == threads
 
 
-def test_torchs_threads_stay_where_the_environment_names_them(one_thread, monkeypatch):
+def test_omp_num_threads_overrides_torchs_threads(one_thread, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
     torch.set_num_threads(1)
-    distributed.join_ranks("cpu")
+    distributed.init_distributed("cpu")
     assert torch.get_num_threads() == 1
 
 
-def test_torch_has_as_many_threads_as_a_training_asks_for(one_thread, monkeypatch, tmp_path):
+def test_torch_uses_the_threads_of_the_training_settings(one_thread, monkeypatch, tmp_path):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     cfg = TrainCfg(
         task="push", num_envs=32, iterations=1, device="cpu", log_root=tmp_path, tensorboard=False, ppo=SMALL

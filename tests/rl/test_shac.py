@@ -1,4 +1,4 @@
-"""SHAC on a mass on a line: its gradient against differences, learning, saving, refusals."""
+"""SHAC on the task of a mass on a line: gradient against finite differences, learning, saving and errors."""
 
 import dataclasses
 
@@ -15,7 +15,7 @@ CFG = dataclasses.replace(SMALL, init_std=0.3, num_steps=8)
 
 
 class SmoothPushTask(PushTask):
-    """The same with derivatives."""
+    """`PushTask` with a differentiable step."""
 
     def begin_window(self) -> None:
         self.present = self.obs.clone()
@@ -44,8 +44,8 @@ def shac(num_envs=32, seed=0, **changes):
     return Shac(env, dataclasses.replace(CFG, **changes), ShacCfg(lr=5.0e-3))
 
 
-def test_the_gradient_is_that_of_the_windows_rewards_and_values():
-    """Episodes end within the window; the first window has made the target critic one that says something."""
+def test_gradient_agrees_with_finite_differences_of_the_loss():
+    """Episodes end within the window; a first iteration makes the target critic non-trivial."""
     algorithm = shac(num_envs=8)
     algorithm.iterate()
     start, noise = algorithm.env.state_dict(), torch.get_rng_state()
@@ -53,22 +53,22 @@ def test_the_gradient_is_that_of_the_windows_rewards_and_values():
     def loss():
         algorithm.env.load_state_dict(start)
         torch.set_rng_state(noise)
-        return algorithm.window()["loss"]
+        return algorithm.window().loss
 
     weights = [*algorithm.model.actor.parameters(), algorithm.model.log_std]
-    found = torch.autograd.grad(loss(), weights)
-    length = torch.stack([gradient.norm() for gradient in found]).norm()
+    gradients = torch.autograd.grad(loss(), weights)
+    length = torch.stack([gradient.norm() for gradient in gradients]).norm()
     ends = []
     for change in (1.0e-2, -2.0e-2):
         with torch.no_grad():
-            for weight, gradient in zip(weights, found, strict=True):
+            for weight, gradient in zip(weights, gradients, strict=True):
                 weight += change * gradient / length
             ends.append(float(loss()))
     assert (ends[0] - ends[1]) / 2.0e-2 == pytest.approx(float(length), rel=0.01)
 
 
-def test_the_loss_is_what_its_definition_says_world_by_world():
-    """Two windows of episodes that end by time-out and, pushed away fast, by failure; summed by hand."""
+def test_loss_agrees_with_a_loop_over_worlds():
+    """Episodes end by timeout and, for a mass that starts fast, by termination; the loss is summed world by world."""
     algorithm = shac(num_envs=6, num_steps=14, asymmetric_critic=False)
     env, model, gamma = algorithm.env, algorithm.model, algorithm.cfg.gamma
     env.start[0] = torch.tensor([4.5, 3.0])  # lost in a step, again and again
@@ -77,7 +77,7 @@ def test_the_loss_is_what_its_definition_says_world_by_world():
         model.actor[-1].bias += 0.2
     env.begin_window()
     start, noise = env.state_dict(), torch.get_rng_state()
-    loss = float(algorithm.window()["loss"])
+    loss = float(algorithm.window().loss)
     env.load_state_dict(start)
     torch.set_rng_state(noise)
     sums, powers, ends = torch.zeros(6), torch.zeros(6), {"cut": 0, "lost": 0}
@@ -100,8 +100,8 @@ def test_the_loss_is_what_its_definition_says_world_by_world():
     assert loss == pytest.approx(-float(sums.mean()) / 14, rel=1.0e-5)
 
 
-def test_it_learns_to_push_to_the_origin():
-    """Mean distance after ten steps: 1.04 of new weights, 0.26 of learnt ones."""
+def test_shac_learns_to_push_the_mass_to_the_origin():
+    """Mean distance after ten steps: 1.04 with initial weights, 0.26 after training."""
     algorithm, means = shac(init_std=0.1), []
     for iterations in (0, 60):
         for _ in range(iterations):
@@ -113,7 +113,7 @@ def test_it_learns_to_push_to_the_origin():
     assert means[1] < 0.5 * means[0]
 
 
-def test_a_saved_training_goes_on_in_the_same_bits_and_the_same_seed_repeats_them():
+def test_same_seed_and_resume_are_bitwise_identical():
     first, second = shac(), shac()
     for algorithm in (first, second):
         torch.manual_seed(3)
@@ -134,11 +134,11 @@ def test_a_saved_training_goes_on_in_the_same_bits_and_the_same_seed_repeats_the
         fresh.load_state_dict({name: value for name, value in state.items() if name != "lr"})
 
 
-def test_a_run_trains_with_it(tmp_path):
+def test_train_with_shac_runs_resumes_and_refuses_an_env_without_gradients(tmp_path):
     cfg = push_cfg(tmp_path, num_envs=16, iterations=3, log_interval=1, trainer="shac", ppo=CFG)
     result = train(cfg, lambda n, seed, device: SmoothPushTask(n, seed, device, episode_length=8))
     assert result.iteration == 3
-    assert result.figures["Train/mean_length"] == 8.0
+    assert result.metrics["Train/mean_length"] == 8.0
     resumed = dataclasses.replace(cfg, iterations=4, resume=str(result.folder))
     assert train(resumed, lambda n, seed, device: SmoothPushTask(n, seed, device, episode_length=8)).iteration == 4
     with pytest.raises(InputError, match="an environment with gradients"):

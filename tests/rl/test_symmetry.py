@@ -12,7 +12,7 @@ from jumper_warp.rl import graphs
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import save_checkpoint
 from jumper_warp.rl.flat import FlatParameters
-from jumper_warp.rl.mirror import Symmetry, image, plain_layers
+from jumper_warp.rl.mirror import Symmetry, expand_layers, mirror_map
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.tasks.interface import interface
@@ -22,7 +22,7 @@ from jumper_warp.utils.errors import InputError
 from toy_task import PushTask, fill
 
 OBS, ACTION = mirror_of(make_task("velocity-flat"), "actor"), mirror_of_action()
-WALKING = Symmetry(image(*OBS, "observation"), image(*ACTION, "action"))
+WALKING = Symmetry(mirror_map(*OBS, "observation"), mirror_map(*ACTION, "action"))
 NUM_OBS = len(OBS.order)
 CFG = PpoCfg(num_steps=8, epochs=2, minibatches=2, hidden=(16, 9), symmetry="actor")
 
@@ -32,7 +32,7 @@ def mirrored(x, mirror):
 
 
 def walker(hidden=(32, 24)):
-    """A network with answers as large as its inputs."""
+    """Return a symmetric network with actions as large as its inputs."""
     torch.manual_seed(3)
     model = ActorCritic(NUM_OBS, 12, hidden, symmetry=WALKING)
     with torch.no_grad():
@@ -47,35 +47,35 @@ def test_mirrored_observation_gives_the_mirrored_action():
     assert (model.actor(mirrored(x, OBS)) - mirrored(model.actor(x), ACTION)).abs().max() > 0.1
 
 
-def test_no_sideways_answer_to_a_symmetric_observation():
+def test_symmetric_observation_gives_a_symmetric_action():
     model, x = walker(), torch.randn(64, NUM_OBS)
     action = model.mean(0.5 * (x + mirrored(x, OBS)))
     torch.testing.assert_close(action[:, :3], action[:, 3:6], atol=1e-5, rtol=1e-5)
 
 
-def test_passes_over_both_images_equal_autograd():
+def test_symmetric_forward_and_backward_agree_with_autograd():
     model, x = walker(), torch.randn(40, NUM_OBS)
     flat = FlatParameters(model, "elu")
     actor = flat.actor
-    slope = torch.randn(40, 12)
-    own, other = model.actor(x), mirrored(model.actor(mirrored(x, OBS)), ACTION)
-    mean = 0.5 * (own + other)
-    expected = torch.autograd.grad(mean, list(model.actor.parameters()), slope)
+    grad = torch.randn(40, 12)
+    output, image = model.actor(x), mirrored(model.actor(mirrored(x, OBS)), ACTION)
+    mean = 0.5 * (output + image)
+    expected = torch.autograd.grad(mean, list(model.actor.parameters()), grad)
     wide = torch.nn.functional.pad(x, (0, actor.layers.weights[0].shape[1] - NUM_OBS))
-    *outputs, seen = actor.forward(wide, torch.float32)
-    for found, right in zip(outputs, (mean, own - other), strict=True):
-        torch.testing.assert_close(found, right, atol=1e-5, rtol=1e-5)
-    first, *others = actor.backward(seen, slope, torch.float32)
-    for found, right in zip((first[:, :NUM_OBS], *others), expected, strict=True):
-        torch.testing.assert_close(found, right, atol=1e-4, rtol=1e-4)
+    *outputs, layer_inputs = actor.forward(wide, torch.float32)
+    for result, right in zip(outputs, (mean, output - image), strict=True):
+        torch.testing.assert_close(result, right, atol=1e-5, rtol=1e-5)
+    first, *others = actor.backward(layer_inputs, grad, torch.float32)
+    for gradient, right in zip((first[:, :NUM_OBS], *others), expected, strict=True):
+        torch.testing.assert_close(gradient, right, atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("hidden", [(), (16,), (32, 24)])
-def test_plain_network_answers_alike(hidden):
+def test_expanded_plain_network_has_the_same_output(hidden):
     model, x = walker(hidden), torch.randn(16, NUM_OBS)
     linear = [layer for layer in model.actor if isinstance(layer, torch.nn.Linear)]
     expected = model.mean(x)
-    layers = plain_layers([(layer.weight, layer.bias) for layer in linear], WALKING)
+    layers = expand_layers([(layer.weight, layer.bias) for layer in linear], WALKING)
     for index, (weight, bias) in enumerate(layers):
         x = torch.nn.functional.linear(x, weight, bias)
         x = torch.nn.functional.elu(x) if index < len(layers) - 1 else x
@@ -83,9 +83,9 @@ def test_plain_network_answers_alike(hidden):
     torch.testing.assert_close(x, expected, atol=1e-5, rtol=1e-5)
 
 
-def test_symmetric_statistics_are_those_of_both_images():
+def test_symmetrised_moments_are_those_of_samples_and_images():
     x = torch.randn(5000, NUM_OBS) * 0.7 + torch.linspace(-1.0, 1.0, NUM_OBS)
-    mean, var = WALKING.obs.moments(x.mean(0), x.var(0, correction=0))
+    mean, var = WALKING.obs.symmetrise_moments(x.mean(0), x.var(0, correction=0))
     both = torch.cat([x, mirrored(x, OBS)])
     torch.testing.assert_close(mean, both.mean(0), atol=1e-5, rtol=1e-5)
     torch.testing.assert_close(var, both.var(0, correction=0), atol=1e-5, rtol=1e-5)
@@ -98,15 +98,15 @@ def test_symmetric_statistics_are_those_of_both_images():
     [(np.array([1, 2, 0]), np.ones(3)), (np.array([1, 0]), np.array([1.0, -1.0])), (np.arange(2), np.ones(3)),
      (np.array([0, 7]), np.ones(2))],
 )  # fmt: skip
-def test_image_that_is_not_its_own_inverse_is_refused(wrong):
+def test_refuses_a_mirror_map_that_is_not_its_own_inverse(wrong):
     with pytest.raises(InputError, match="mirror image of action is not its own inverse"):
-        image(*wrong, "action")
+        mirror_map(*wrong, "action")
 
 
 # ---------------------------------------------------------------- training
 
 
-def test_symmetric_actor_acts_and_stays_symmetric_in_training():
+def test_symmetric_actor_stays_symmetric_in_training():
     torch.manual_seed(0)
     ppo = Ppo(PushTask(32), CFG)
     ppo.env.reset()
@@ -123,7 +123,7 @@ def test_symmetric_actor_acts_and_stays_symmetric_in_training():
 
 def test_symmetric_update_traces_into_one_graph(monkeypatch):
     monkeypatch.setattr(graphs, "BACKEND", "eager")
-    found = []
+    results = []
     for compiled in ("off", "on"):
         torch.manual_seed(0)
         ppo = Ppo(PushTask(16), dataclasses.replace(CFG, compile=compiled))
@@ -133,12 +133,12 @@ def test_symmetric_update_traces_into_one_graph(monkeypatch):
         ppo.env.reset()
         ppo.collect()
         assert ppo.compiler.enabled == (compiled == "on")
-        found.append((ppo.flat.value.clone(), ppo.rollout.mean.clone()))
-    for off, on in zip(*found, strict=True):
+        results.append((ppo.flat.value.clone(), ppo.rollout.mean.clone()))
+    for off, on in zip(*results, strict=True):
         torch.testing.assert_close(on, off)
 
 
-def test_checkpoint_of_a_symmetric_actor_resumes_and_becomes_a_plain_policy(tmp_path):
+def test_checkpoint_of_a_symmetric_actor_opens_as_a_plain_policy_and_resumes(tmp_path):
     task, cfg = make_task("velocity-flat"), dataclasses.replace(CFG, hidden=(8, 6))
     model = walker(cfg.hidden)
     model.obs_moments.update(torch.randn(100, NUM_OBS))
@@ -162,7 +162,7 @@ def test_checkpoint_of_a_symmetric_actor_resumes_and_becomes_a_plain_policy(tmp_
         Ppo(PushTask(8), dataclasses.replace(CFG, symmetry="off")).load_state_dict(first.state_dict())
 
 
-def test_task_without_mirror_image_is_refused_in_one_line(capsys, monkeypatch):
+def test_refuses_symmetry_for_a_task_without_mirror_map_in_one_line(capsys, monkeypatch):
     monkeypatch.setitem(TASKS, "hold-height", TaskEntry("hold_height:hold_height"))
     with pytest.raises(SystemExit):
         main(["train", "hold-height", "--ppo.symmetry", "actor", "--num-envs", "8", "--iterations", "1"])
@@ -170,7 +170,7 @@ def test_task_without_mirror_image_is_refused_in_one_line(capsys, monkeypatch):
     assert len(lines) == 1 and "hold-height policy: the mirror image of" in lines[0]
 
 
-def test_environment_without_mirror_image_is_refused():
+def test_refuses_symmetry_for_an_env_without_mirror_map():
     class Plain(PushTask):
         mirror = None
 
@@ -183,6 +183,6 @@ def test_environment_without_mirror_image_is_refused():
             Ppo(env(4), CFG)
 
 
-def test_no_symmetry_with_another_trainer():
+def test_refuses_symmetry_with_another_trainer():
     with pytest.raises(InputError, match="symmetry is not offered with trainer rsl-rl"):
         TrainCfg(trainer="rsl-rl", ppo=CFG)

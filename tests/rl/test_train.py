@@ -14,9 +14,9 @@ from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import MANIFEST, CheckpointError, load_checkpoint, save_checkpoint
 from jumper_warp.rl.distributed import Rank
-from jumper_warp.rl.logger import FIGURES
+from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
-from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, Run, Stop, train
+from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, StopRequest, TrainingRun, train
 from toy_task import SMALL, PushTask, equal, free_port, push_cfg, train_rank, train_twice
 
 
@@ -33,14 +33,14 @@ def final_state(result):
     return load_checkpoint(result.folder / CHECKPOINTS / f"iteration_{result.iteration:06d}.pt")
 
 
-def test_a_run_leaves_settings_figures_and_checkpoints(cfg):
+def test_run_writes_config_metrics_and_checkpoints(cfg):
     result = train(cfg, make_env)
     assert result.folder.parent == cfg.log_root / "push"
     settings = json.loads((result.folder / CONFIG).read_text())
     assert settings["train"]["ppo"]["num_steps"] == 16
     assert settings["env"] == {"episode_length": 16}
     assert settings["versions"]["torch"].split("+")[0] == torch.__version__.split("+")[0]
-    lines = [json.loads(line) for line in (result.folder / FIGURES).read_text().splitlines()]
+    lines = [json.loads(line) for line in (result.folder / METRICS_FILE).read_text().splitlines()]
     assert [line["iteration"] for line in lines] == [2, 4]
     assert lines[-1]["Train/mean_length"] == 16.0
     assert {"Perf/fps", "Perf/collect_s", "Perf/update_s", "Loss/kl", "Metrics/success"} <= lines[0].keys()
@@ -51,63 +51,63 @@ def test_a_run_leaves_settings_figures_and_checkpoints(cfg):
     assert json.loads(final_state(result)["config"]) == settings
 
 
-def test_each_logged_iteration_is_told(cfg, capsys):
+def test_logged_iterations_are_printed(cfg, capsys):
     result = train(cfg, make_env)
-    figures, told = result.figures, capsys.readouterr().err.splitlines()
-    fps, total = f"{figures['Perf/fps']:,.0f}", f"{figures['Train/mean_return']:.2f}"
-    success = f"{100.0 * figures['Metrics/success']:.1f}"
-    assert told[0] == f"run {result.folder}"
-    assert told[1].startswith("iteration 2/4: ") and told[1].endswith(" s left")
-    assert told[2] == f"iteration 4/4: {fps} steps/s, return {total}, success {success} %, 0 s left"
-    assert told[3:] == [f"saved {result.folder / CHECKPOINTS / 'iteration_000004.pt'}"]
+    metrics, stderr = result.metrics, capsys.readouterr().err.splitlines()
+    fps, total = f"{metrics['Perf/fps']:,.0f}", f"{metrics['Train/mean_return']:.2f}"
+    success = f"{100.0 * metrics['Metrics/success']:.1f}"
+    assert stderr[0] == f"run {result.folder}"
+    assert stderr[1].startswith("iteration 2/4: ") and stderr[1].endswith(" s left")
+    assert stderr[2] == f"iteration 4/4: {fps} steps/s, return {total}, success {success} %, 0 s left"
+    assert stderr[3:] == [f"saved {result.folder / CHECKPOINTS / 'iteration_000004.pt'}"]
 
 
 def resume_after(cfg, seconds, limit):
-    """Resume a checkpoint that tells of so many seconds (None: of none) under a time limit; return run and result."""
+    """Resume a checkpoint with `seconds` of training time (None: not saved) and a time limit; return run and result."""
     half = train(dataclasses.replace(cfg, iterations=2), make_env)
     state = final_state(half)
     assert 0.0 < state.pop("seconds") <= half.seconds
     save_checkpoint(half.folder / CHECKPOINTS, state if seconds is None else {**state, "seconds": seconds})
     cfg = dataclasses.replace(cfg, iterations=100_000, max_seconds=limit, resume=str(half.folder))
-    run = Run(cfg, make_env(cfg.num_envs, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
-    with Stop() as stop:
+    run = TrainingRun(cfg, make_env(cfg.num_envs, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
+    with StopRequest() as stop:
         return run, run.iterate(stop)
 
 
-def test_a_resumed_run_goes_on_in_time(cfg):
+def test_resumed_run_continues_the_training_time(cfg):
     run, result = resume_after(cfg, 99.7, limit=100.0)
     assert result.iteration > 2 and result.seconds < 5.0
-    assert final_state(result)["seconds"] >= result.figures["Perf/elapsed_s"] >= 100.0
+    assert final_state(result)["seconds"] >= result.metrics["Perf/elapsed_s"] >= 100.0
     assert run.ppo._desired_kl.item() == pytest.approx(
         cfg.ppo.final_desired_kl, rel=0.05
-    )  # desired_kl by its own time alone
+    )  # desired_kl without the earlier time
 
 
-def test_a_resumed_run_whose_time_is_over_ends_at_once(cfg):
+def test_resumed_run_past_its_time_limit_ends_immediately(cfg):
     assert resume_after(cfg, 100.0, limit=100.0)[1].iteration == 2
 
 
-def test_a_checkpoint_that_tells_no_time_counts_from_zero(cfg):
+def test_resume_without_saved_time_counts_from_zero(cfg):
     result = resume_after(cfg, None, limit=0.3)[1]
     assert 0.3 <= final_state(result)["seconds"] <= result.seconds < 5.0
 
 
-def test_a_checkpoint_with_an_unreadable_time_is_refused_in_one_line(cfg):
+def test_refuses_a_checkpoint_with_a_malformed_time_in_one_line(cfg):
     with pytest.raises(CheckpointError, match=r"does not fit these settings: seconds must be .*'late'"):
         resume_after(cfg, "late", limit=100.0)
 
 
-def test_latest_passes_over_a_damaged_checkpoint(cfg, capsys):
+def test_resume_latest_skips_a_damaged_checkpoint(cfg, capsys):
     result = train(cfg, make_env)
     (result.folder / CHECKPOINTS / "iteration_000004.pt").write_bytes(b"cut")
     resumed = train(dataclasses.replace(cfg, resume="latest", iterations=3), make_env)
     assert (resumed.folder, resumed.iteration) == (result.folder, 3)
-    told = capsys.readouterr().err
-    assert "passed over" in told
-    assert "iteration_000002.pt" in told
+    stderr = capsys.readouterr().err
+    assert "skipped: " in stderr
+    assert "iteration_000002.pt" in stderr
 
 
-def test_a_named_checkpoint_that_is_damaged_is_refused(cfg):
+def test_refuses_to_resume_a_damaged_checkpoint_by_name(cfg):
     path = train(cfg, make_env).folder / CHECKPOINTS / "iteration_000004.pt"
     path.write_bytes(b"cut")
     with pytest.raises(CheckpointError, match="differs from its checksum"):
@@ -115,7 +115,7 @@ def test_a_named_checkpoint_that_is_damaged_is_refused(cfg):
 
 
 @pytest.mark.parametrize("change", [{"hidden": (16, 16)}, {"asymmetric_critic": False}])
-def test_a_checkpoint_of_other_networks_is_refused_in_one_line(cfg, change):
+def test_refuses_a_checkpoint_of_other_networks_in_one_line(cfg, change):
     result = train(cfg, make_env)
     other = dataclasses.replace(cfg, resume=str(result.folder), ppo=dataclasses.replace(SMALL, **change))
     with pytest.raises(CheckpointError, match="does not fit these settings") as caught:
@@ -123,7 +123,7 @@ def test_a_checkpoint_of_other_networks_is_refused_in_one_line(cfg, change):
     assert "\n" not in str(caught.value)
 
 
-def test_a_checkpoint_without_the_critics_statistics_is_refused_in_one_line(cfg):
+def test_refuses_a_checkpoint_without_the_critics_statistics_in_one_line(cfg):
     result = train(cfg, make_env)
     old = final_state(result)
     for name in ("mean", "var", "count"):
@@ -134,13 +134,13 @@ def test_a_checkpoint_without_the_critics_statistics_is_refused_in_one_line(cfg)
     assert "\n" not in str(caught.value)
 
 
-def test_nothing_to_resume_is_told(cfg):
+def test_resume_latest_raises_without_a_run(cfg):
     with pytest.raises(CheckpointError, match="no run to resume"):
         train(dataclasses.replace(cfg, resume="latest"), make_env)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_signal_ends_the_iteration_saves_and_tells_how_to_go_on(cfg, number, capsys):
+def test_signal_finishes_the_iteration_saves_and_prints_the_resume_command(cfg, number, capsys):
     class Signalled(PushTask):
         def step(self, action):
             super().step(action)
@@ -158,7 +158,7 @@ def test_a_signal_ends_the_iteration_saves_and_tells_how_to_go_on(cfg, number, c
     assert last == f"saved {path}, continue with: jumper train push --resume {path.parent.parent}"
 
 
-def test_the_second_interrupt_does_not_wait(cfg):
+def test_second_interrupt_raises_immediately(cfg):
     class Signalled(PushTask):
         def step(self, action):
             super().step(action)
@@ -168,7 +168,7 @@ def test_the_second_interrupt_does_not_wait(cfg):
         train(cfg, lambda n, seed, device: Signalled(n, seed, device))
 
 
-def test_the_time_limit_ends_and_saves(cfg):
+def test_time_limit_ends_the_training_with_a_checkpoint(cfg):
     begin = time.perf_counter()
     result = train(dataclasses.replace(cfg, iterations=100_000, max_seconds=0.5), make_env)
     assert time.perf_counter() - begin < 10.0
@@ -176,7 +176,7 @@ def test_the_time_limit_ends_and_saves(cfg):
     assert final_state(result)["iteration"] == result.iteration
 
 
-def test_a_full_disk_is_told_and_training_goes_on(cfg, capsys):
+def test_failed_save_is_reported_and_training_continues(cfg, capsys):
     class Blocking(PushTask):
         def metrics(self):
             for folder in cfg.log_root.glob("push/*"):
@@ -186,11 +186,11 @@ def test_a_full_disk_is_told_and_training_goes_on(cfg, capsys):
     with pytest.raises(CheckpointError, match="not saved"):
         train(cfg, lambda n, seed, device: Blocking(n, seed, device))
     assert "will try again" in capsys.readouterr().err
-    (figures,) = cfg.log_root.glob(f"push/*/{FIGURES}")
-    assert len(figures.read_text().splitlines()) == 2
+    (metrics,) = cfg.log_root.glob(f"push/*/{METRICS_FILE}")
+    assert len(metrics.read_text().splitlines()) == 2
 
 
-def test_tensorboard_gets_the_figures(cfg):
+def test_tensorboard_gets_the_metrics(cfg):
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     result = train(dataclasses.replace(cfg, tensorboard=True), make_env)
@@ -210,14 +210,14 @@ def test_two_processes_train_one_policy(cfg, tmp_path):
     assert equal(load_checkpoint(folder / CHECKPOINTS / "iteration_000004.pt")["ppo"]["model"], first["model"])
 
 
-def test_every_process_takes_up_its_own_worlds(cfg):
+def test_each_rank_resumes_its_own_worlds(cfg):
     torch.multiprocessing.spawn(train_twice, ((free_port(), free_port()), cfg), nprocs=2)
     (folder,) = cfg.log_root.glob(f"push/*/{CHECKPOINTS}")
     expected = torch.load(cfg.log_root / "whole.pt", weights_only=True)
-    found = load_checkpoint(folder / "iteration_000004.pt")
+    state = load_checkpoint(folder / "iteration_000004.pt")
     assert not equal(expected["env"], expected["others"][0]["env"])
     for part in ("ppo", "env", "rng", "others"):
-        assert equal(found[part], expected[part]), part
+        assert equal(state[part], expected[part]), part
     alone = dataclasses.replace(cfg, num_envs=cfg.num_envs // 2, resume=str(folder / "iteration_000002.pt"))
     with pytest.raises(CheckpointError, match="saved by 2 processes, there are 1"):
         train(alone, lambda n, seed, device: PushTask(n, seed))
@@ -235,7 +235,7 @@ def test_every_process_takes_up_its_own_worlds(cfg):
         ({"trainer": "rsl-rl", "resume": "latest"}, "resume is not offered"),
     ],
 )
-def test_settings_out_of_range_are_refused(change, message):
+def test_refuses_settings_out_of_range(change, message):
     with pytest.raises(ValueError, match=message):
         TrainCfg(**change)
 
@@ -251,59 +251,59 @@ def must_not_be_built(num_envs, seed, device):
         ({"num_envs": 1, "ppo": dataclasses.replace(SMALL, num_steps=1, minibatches=1)}, "at least 2 samples"),
     ],
 )
-def test_what_cannot_be_divided_is_refused_before_anything_is_built(cfg, change, message):
+def test_refuses_indivisible_batches_before_the_env_is_built(cfg, change, message):
     with pytest.raises(ValueError, match=message):
         train(dataclasses.replace(cfg, **change), must_not_be_built)
 
 
-def test_a_score_that_is_never_logged_is_refused_before_the_first_iteration(cfg):
+def test_refuses_an_unknown_best_metric_before_the_first_iteration(cfg):
     class Unmoved(PushTask):
         def step(self, action):
             pytest.fail("an iteration began")
 
-    message = r"best_metric must name a logged figure, such as Metrics/success, Train/mean_length, .*, got 'nonsense'"
+    message = r"best_metric must name a logged metric, such as Metrics/success, Train/mean_length, .*, got 'nonsense'"
     with pytest.raises(ValueError, match=message):
         train(dataclasses.replace(cfg, best_metric="nonsense"), Unmoved)
     assert not cfg.log_root.exists()
 
 
-def test_every_logged_figure_can_be_the_score(cfg):
-    figures = train(cfg, make_env).figures
-    for name in figures:
-        Run(dataclasses.replace(cfg, best_metric=name), make_env(32, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
-    assert {"Train/mean_return", "Perf/fps", "Loss/kl", "Metrics/success"} <= figures.keys()
+def test_every_logged_metric_can_be_the_best_metric(cfg):
+    metrics = train(cfg, make_env).metrics
+    for name in metrics:
+        TrainingRun(dataclasses.replace(cfg, best_metric=name), make_env(32, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
+    assert {"Train/mean_return", "Perf/fps", "Loss/kl", "Metrics/success"} <= metrics.keys()
 
 
-def test_the_largest_seed_trains(cfg):
+def test_trains_with_the_largest_seed(cfg):
     assert train(dataclasses.replace(cfg, seed=2**31 - 1, iterations=1), make_env).iteration == 1
 
 
-def test_a_folder_of_logs_may_be_a_text(cfg):
+def test_log_root_may_be_a_string(cfg):
     result = train(dataclasses.replace(cfg, log_root=str(cfg.log_root), iterations=1), make_env)
     assert result.folder.parent == cfg.log_root / "push"
 
 
-def test_a_device_that_is_not_there_is_refused(cfg, monkeypatch):
+def test_refuses_a_missing_device(cfg, monkeypatch):
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     with pytest.raises(ValueError, match="torch finds no GPU"):
         train(dataclasses.replace(cfg, device="cuda"), make_env)
 
 
-def test_rsl_rl_gets_copies():
+def test_rsl_rl_adapter_returns_copies():
     env = PushTask(3, episode_length=2)  # ended by time in the second step, not in the first
     env.reset()
     adapter = RslRlVecEnv(env, metrics_every=2)
     first = adapter.get_observations()
     obs, reward, done, extras = adapter.step(torch.ones(3, 1))
-    found = (first["actor"], first["critic"], obs["actor"], obs["critic"], reward, done, extras["time_outs"])
-    shown = [value.clone() for value in found]
+    results = (first["actor"], first["critic"], obs["actor"], obs["critic"], reward, done, extras["time_outs"])
+    copies = [value.clone() for value in results]
     adapter.step(torch.ones(3, 1))
-    for value, copy in zip(found, shown, strict=True):
+    for value, copy in zip(results, copies, strict=True):
         assert torch.equal(value, copy)
 
 
 @pytest.mark.parametrize(("asymmetric_critic", "column"), [(True, 2), (False, 0)])
-def test_rsl_rl_gives_the_critic_its_own_observation(asymmetric_critic, column):
+def test_rsl_rl_critic_gets_its_own_observation(asymmetric_critic, column):
     env = PushTask(4, episode_length=50)
     env.reset()
     adapter = RslRlVecEnv(env, metrics_every=4)
@@ -319,7 +319,7 @@ def test_rsl_rl_gives_the_critic_its_own_observation(asymmetric_critic, column):
         assert not torch.equal(algorithm.critic(obs), before[1])
 
 
-def test_rsl_rl_counts_steps_and_gets_metrics_once_per_iteration():
+def test_rsl_rl_adapter_counts_steps_and_logs_metrics_once_per_iteration():
     env = PushTask(3, episode_length=3)
     env.reset()
     adapter = RslRlVecEnv(env, metrics_every=2)
@@ -336,7 +336,7 @@ def test_rsl_rl_counts_steps_and_gets_metrics_once_per_iteration():
     assert not adapter.episode_length_buf.any()
 
 
-def test_rsl_rl_trains(cfg, tmp_path):
+def test_train_with_rsl_rl_writes_model_and_config(cfg, tmp_path):
     result = train(dataclasses.replace(cfg, trainer="rsl-rl", iterations=2), make_env, as_rsl_rl=RslRlVecEnv)
     assert (result.folder / "model_1.pt").exists()
     assert (result.folder / CONFIG).exists()

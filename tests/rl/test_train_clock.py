@@ -1,4 +1,4 @@
-"""What a training's time limit counts and what is told of the rest, on a clock that the test moves."""
+"""Time limit and remaining time of a training, on a clock that the test controls."""
 
 import dataclasses
 import time
@@ -20,7 +20,7 @@ def saved_seconds(result):
 
 
 class Clocked(PushTask):
-    """Its steps take as long as `durations` says [s] on the clock `now`, as long as there are any."""
+    """Environment whose steps advance the clock `now` by successive `durations` [s]; IndexError when they run out."""
 
     def __init__(self, *args, durations, **arguments):
         super().__init__(*args, **arguments)
@@ -38,11 +38,11 @@ def train_clocked(monkeypatch, cfg, durations, **arguments):
     return train(cfg, lambda *_: env, **arguments)
 
 
-def test_the_time_limit_counts_from_the_end_of_the_first_iteration(cfg, monkeypatch):
+def test_time_limit_counts_from_the_end_of_the_first_iteration(cfg, monkeypatch):
     limited = dataclasses.replace(cfg, max_seconds=60.0)
     result = train_clocked(monkeypatch, limited, [500.0] + [1.0] * 79)  # 16 steps an iteration; the first compiles
     assert (result.iteration, result.seconds) == (5, 515.0 + 4 * 16.0)
-    assert (result.figures["Perf/elapsed_s"], saved_seconds(result)) == (64.0, 64.0)
+    assert (result.metrics["Perf/elapsed_s"], saved_seconds(result)) == (64.0, 64.0)
     on = dataclasses.replace(limited, max_seconds=80.0, resume=str(result.folder))
     again = train_clocked(monkeypatch, on, [700.0] + [1.0] * 31)  # another iteration to warm up, and one that counts
     assert (again.iteration, saved_seconds(again)) == (7, 80.0)
@@ -52,9 +52,7 @@ def test_the_time_limit_counts_from_the_end_of_the_first_iteration(cfg, monkeypa
     ("seconds", "limit", "left"),
     [(1.0, 0.0, "27 min"), (3.0, 0.0, "1 h 20 min"), (1.0, 90.0, "58 s"), (0.01, 0.0, "16 s")],
 )
-def test_what_is_left_follows_the_pace_after_the_first_iteration_and_the_limit(
-    cfg, monkeypatch, capsys, seconds, limit, left
-):
+def test_remaining_time_follows_iteration_time_and_time_limit(cfg, monkeypatch, capsys, seconds, limit, left):
     limited = dataclasses.replace(cfg, iterations=103, max_seconds=limit, log_interval=3)
     with pytest.raises(IndexError):
         train_clocked(monkeypatch, limited, [9000.0, *[seconds] * 3 * 16])

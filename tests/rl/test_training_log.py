@@ -6,8 +6,8 @@ import resource
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from jumper_warp.rl.logger import FIGURES, TrainingLog, _duration
-from jumper_warp.rl.metrics_file import MetricsFile
+from jumper_warp.rl.logger import TrainingLog, format_duration
+from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from toy_task import PushTask, push_cfg
 
@@ -21,7 +21,7 @@ def cfg(tmp_path):
 
 @contextlib.contextmanager
 def full_disk(size=0):
-    """No file of this process can grow past so many bytes: writes fail in the midst, as on a full disk."""
+    """Limit every file of this process to `size` bytes: writes fail partway, as on a full disk."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -40,8 +40,8 @@ def steps(folder):
     return [event.step for event in events.Scalars("Loss/value")]
 
 
-def test_figures_that_found_no_room_follow_in_order(tmp_path):
-    path = tmp_path / FIGURES
+def test_metrics_refused_by_a_full_disk_are_appended_later_in_order(tmp_path):
+    path = tmp_path / METRICS_FILE
     file = MetricsFile(path, 0)
     file.add(1, {"Loss/value": 0.5})
     before = path.read_bytes()
@@ -54,7 +54,7 @@ def test_figures_that_found_no_room_follow_in_order(tmp_path):
 
 
 class Filling(PushTask):
-    """The disk is full while the figures of the second and third iteration are logged."""
+    """The disk is full while the metrics of the second and third iteration are logged."""
 
     stack: contextlib.ExitStack
 
@@ -71,21 +71,21 @@ class Filling(PushTask):
 
 @pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # of the thread of SummaryWriter
 @pytest.mark.parametrize("tensorboard", [False, True])
-def test_a_disk_that_is_full_for_a_while_loses_no_figure_and_is_told_once(cfg, capsys, tensorboard):
+def test_temporarily_full_disk_loses_no_metrics_and_warns_once(cfg, capsys, tensorboard):
     cfg = dataclasses.replace(cfg, tensorboard=tensorboard)
     with contextlib.ExitStack() as Filling.stack:
         result = train(cfg, Filling)
-    assert iterations(result.folder / FIGURES) == [1, 2, 3, 4, 5, 6]
+    assert iterations(result.folder / METRICS_FILE) == [1, 2, 3, 4, 5, 6]
     assert (result.folder / CHECKPOINTS / "iteration_000006.pt").exists()
-    told = capsys.readouterr().err.splitlines()
-    assert ["training continues" in line for line in told].count(True) == 1
-    assert ["no TensorBoard events" in line for line in told].count(True) == int(tensorboard)
+    stderr = capsys.readouterr().err.splitlines()
+    assert ["training continues" in line for line in stderr].count(True) == 1
+    assert ["no TensorBoard events" in line for line in stderr].count(True) == int(tensorboard)
     if tensorboard:
         assert steps(result.folder) == [1]
 
 
-def test_a_reward_term_that_is_no_number_is_told_and_kept_as_json(tmp_path, capsys):
-    figures = NUMBERS | {
+def test_non_finite_reward_term_is_reported_and_logged_as_null(tmp_path, capsys):
+    metrics = NUMBERS | {
         "Episode_Reward/tilt": float("nan"),
         "hop/Episode_Reward/fall": float("inf"),
         "Loss/value": 1.0,
@@ -94,20 +94,20 @@ def test_a_reward_term_that_is_no_number_is_told_and_kept_as_json(tmp_path, caps
         log.log(1, NUMBERS | {"Episode_Reward/tilt": 0.5}, 5.0)
         assert "reward term" not in capsys.readouterr().err
         for iteration in (2, 3):
-            log.log(iteration, figures, 5.0)
-            told = capsys.readouterr().err
-            assert "reward term tilt was not a finite number in some steps, where it counts as 0" in told
-            assert "reward term hop/fall was not a finite number" in told and told.count("reward term") == 2
+            log.log(iteration, metrics, 5.0)
+            stderr = capsys.readouterr().err
+            assert "reward term tilt was not finite in some steps, where it counts as 0" in stderr
+            assert "reward term hop/fall was not finite" in stderr and stderr.count("reward term") == 2
 
     def refuse(text):
         raise AssertionError(text)
 
-    saved = [json.loads(line, parse_constant=refuse) for line in (tmp_path / FIGURES).read_text().splitlines()]
+    saved = [json.loads(line, parse_constant=refuse) for line in (tmp_path / METRICS_FILE).read_text().splitlines()]
     assert [line["iteration"] for line in saved] == [1, 2, 3]
     assert saved[1]["Episode_Reward/tilt"] is None and saved[1]["Loss/value"] == 1.0
 
 
-def test_a_terminal_that_is_gone_stops_nothing(tmp_path, monkeypatch):
+def test_broken_pipe_does_not_stop_logging(tmp_path, monkeypatch):
     class Gone:
         def write(self, _):
             raise BrokenPipeError(32, "Broken pipe")
@@ -118,12 +118,12 @@ def test_a_terminal_that_is_gone_stops_nothing(tmp_path, monkeypatch):
         log._console.file = Gone()
         for iteration in (1, 2):
             log.log(iteration, NUMBERS, 5.0)
-    assert iterations(tmp_path / FIGURES) == [1, 2]
+    assert iterations(tmp_path / METRICS_FILE) == [1, 2]
 
 
-def test_a_resumed_run_drops_a_half_line_and_later_iterations(cfg, capsys):
+def test_resumed_run_drops_partial_lines_and_later_iterations(cfg, capsys):
     half = train(dataclasses.replace(cfg, iterations=4), PushTask)
-    path = half.folder / FIGURES
+    path = half.folder / METRICS_FILE
     kept = path.read_text().splitlines()[:2]
     path.write_bytes(path.read_bytes()[:-30])
     resume = str(half.folder / CHECKPOINTS / "iteration_000002.pt")
@@ -131,8 +131,8 @@ def test_a_resumed_run_drops_a_half_line_and_later_iterations(cfg, capsys):
     train(dataclasses.replace(cfg, resume=resume), PushTask)
     assert iterations(path) == [1, 2, 3, 4, 5, 6]
     assert path.read_text().splitlines()[:2] == kept
-    told = [line for line in capsys.readouterr().err.splitlines() if str(path) in line]
-    assert told == [f"{path}: dropped 2 lines, cut or of later iterations"]
+    stderr = [line for line in capsys.readouterr().err.splitlines() if str(path) in line]
+    assert stderr == [f"{path}: dropped 2 lines, cut or of later iterations"]
 
 
 @pytest.mark.parametrize(
@@ -146,14 +146,14 @@ def test_a_resumed_run_drops_a_half_line_and_later_iterations(cfg, capsys):
         (b"", []),
     ],
 )
-def test_a_file_of_figures_is_whole_again(tmp_path, content, kept):
-    path = tmp_path / FIGURES
+def test_metrics_file_is_repaired_on_opening(tmp_path, content, kept):
+    path = tmp_path / METRICS_FILE
     path.write_bytes(content)
     MetricsFile(path, 2).add(3, {})
     assert iterations(path) == [*kept, 3]
 
 
-def test_events_of_iterations_after_the_resumed_one_are_hidden(cfg):
+def test_resume_hides_tensorboard_events_of_later_iterations(cfg):
     cfg = dataclasses.replace(cfg, tensorboard=True)
     half = train(dataclasses.replace(cfg, iterations=4), PushTask)
     train(dataclasses.replace(cfg, resume=str(half.folder / CHECKPOINTS / "iteration_000002.pt")), PushTask)
@@ -164,5 +164,5 @@ def test_events_of_iterations_after_the_resumed_one_are_hidden(cfg):
     ("seconds", "text"),
     [(0.0, "0 s"), (59.4, "59 s"), (59.6, "1 min"), (3569.0, "59 min"), (3571.0, "1 h 0 min"), (9000.0, "2 h 30 min")],
 )
-def test_a_duration_is_told_in_words(seconds, text):
-    assert _duration(seconds) == text
+def test_duration_is_formatted_as_text(seconds, text):
+    assert format_duration(seconds) == text

@@ -23,21 +23,21 @@ def limit(monkeypatch, main, card=10**15):
 
 @pytest.fixture(scope="module")
 def envs():
-    """Environments of 8 and 40 worlds, each with the bytes of all arrays that it added."""
-    found = []
+    """Environments of 8 and 40 worlds, each with the bytes of the arrays that it allocated."""
+    envs_and_bytes = []
     for count in (8, 40):
         before = array_bytes()
-        found.append((make_env(count, task=TASK, randomize=True), array_bytes() - before))
-    return found
+        envs_and_bytes.append((make_env(count, task=TASK, randomize=True), array_bytes() - before))
+    return envs_and_bytes
 
 
-def test_an_environments_arrays_take_what_is_said(envs):
-    (_, few), (_, many) = envs
-    assert (many - few) / 32.0 == pytest.approx(STANDING["jumper"], rel=0.05)
+def test_memory_per_world_agrees_with_the_environments_arrays(envs):
+    (_, bytes_of_8), (_, bytes_of_40) = envs
+    assert (bytes_of_40 - bytes_of_8) / 32.0 == pytest.approx(STANDING["jumper"], rel=0.05)
 
 
 @pytest.mark.parametrize("asymmetric_critic", [True, False])
-def test_the_rollout_takes_what_is_said(envs, asymmetric_critic):
+def test_memory_per_world_agrees_with_the_rollout_buffer(envs, asymmetric_critic):
     cfg = dataclasses.replace(SMALL, asymmetric_critic=asymmetric_critic)
     for env, _ in envs:
         ppo = Ppo(env, cfg)
@@ -58,7 +58,7 @@ def test_the_rollout_takes_what_is_said(envs, asymmetric_critic):
         (400e9, 3e9, "cuda:0", "memory of cuda:0"),
     ],
 )
-def test_too_many_worlds_are_refused_with_a_number_that_fits(monkeypatch, main, card, device, memory):
+def test_refuses_too_many_worlds_with_a_number_that_fits(monkeypatch, main, card, device, memory):
     limit(monkeypatch, main, card)
     device = torch.device(device)
     pattern = rf"num_envs 1000000000 needs about [\d,]+\.\d GB of {memory} in each process, [34]\.0 GB are free: "
@@ -71,7 +71,7 @@ def test_too_many_worlds_are_refused_with_a_number_that_fits(monkeypatch, main, 
         check_memory(TASK, PPO, "jumper", fit + 8, device)
 
 
-def test_the_number_that_fits_can_be_trained_with(monkeypatch):
+def test_number_of_worlds_that_fits_makes_a_valid_batch(monkeypatch):
     limit(monkeypatch, 1e9)
     ppo = dataclasses.replace(PPO, num_steps=6, minibatches=21)
     with pytest.raises(ValueError, match="would fit") as caught:
@@ -80,7 +80,7 @@ def test_the_number_that_fits_can_be_trained_with(monkeypatch):
 
 
 @pytest.mark.parametrize("changes", [{"hidden": (10**6, 10**6)}, {"num_steps": 10**9}])
-def test_settings_that_no_world_has_room_for_are_refused(monkeypatch, changes):
+def test_refuses_settings_that_no_world_has_memory_for(monkeypatch, changes):
     limit(monkeypatch, 4e9)
     with pytest.raises(ValueError, match="GB are free: none would fit"):
         check_memory(TASK, dataclasses.replace(PPO, **changes), "jumper", 8, CPU)
@@ -97,11 +97,11 @@ def test_processes_of_one_host_share_its_memory(monkeypatch):
     assert first == pytest.approx(4 * second, rel=0.01)
 
 
-def test_the_projects_trainings_have_room(monkeypatch):
+def test_default_trainings_fit_in_memory(monkeypatch):
     limit(monkeypatch, 16e9, 8e9)
     for name in TASKS:
         check_memory(make_task(name), trainer_settings(name), "jumper", 8192, torch.device("cuda", 0))
 
 
-def test_free_memory_is_some_of_the_machines():
+def test_free_memory_is_at_most_the_machines():
     assert 0 < free_main_memory() <= os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -1,4 +1,4 @@
-"""The update against a plain implementation: autograd, torch.optim.Adam, a loop over time, one tensor a quantity."""
+"""PPO's update against a reference with autograd, torch.optim.Adam and a loop over time."""
 
 import dataclasses
 import math
@@ -18,10 +18,10 @@ WORLDS = 16
 
 
 def reference_losses(model, part, old_log_std, cfg):
-    """Surrogate, value loss, entropy, asymmetry and divergence, by torch.distributions and as the papers write them."""
-    own, image = model.actor(part["features"]), -model.actor(-part["features"])  # of the task's mirror image
-    mean = 0.5 * (own + image) if cfg.symmetry == "actor" else own
-    asymmetry = torch.nn.functional.mse_loss(own, image) if cfg.symmetry != "off" else torch.zeros(())
+    """Return surrogate, value loss, entropy, asymmetry and KL divergence of a minibatch by torch.distributions."""
+    output, image = model.actor(part["features"]), -model.actor(-part["features"])  # the task's mirror map is -x
+    mean = 0.5 * (output + image) if cfg.symmetry == "actor" else output
+    asymmetry = torch.nn.functional.mse_loss(output, image) if cfg.symmetry != "off" else torch.zeros(())
     policy = torch.distributions.Normal(mean, model.log_std.exp())
     old = torch.distributions.Normal(part["mean"], old_log_std.exp())
     ratio = (policy.log_prob(part["action"]) - old.log_prob(part["action"])).sum(-1).exp()
@@ -30,15 +30,15 @@ def reference_losses(model, part, old_log_std, cfg):
     value = model.critic(part["critic_features"])[:, 0]
     loss = (value - part["target"]) ** 2
     if cfg.clip_value:
-        near = part["value"] + (value - part["value"]).clamp(-cfg.clip, cfg.clip)
-        loss = torch.max(loss, (near - part["target"]) ** 2)
+        clipped_value = part["value"] + (value - part["value"]).clamp(-cfg.clip, cfg.clip)
+        loss = torch.max(loss, (clipped_value - part["target"]) ** 2)
     entropy = policy.entropy()[0].sum()
     kl = torch.distributions.kl_divergence(old, policy).sum(-1).mean()
     return surrogate, loss.mean(), entropy, asymmetry, kl.detach()
 
 
 def reference_update(model, batch, old_log_std, orders, cfg):
-    """Several epochs of clipped Adam steps; returns the losses of each minibatch."""
+    """Run clipped Adam steps for all minibatches in `orders`; return the optimiser and the losses of each minibatch."""
     actor, critic = [*model.actor.parameters(), model.log_std], list(model.critic.parameters())
     optimiser = torch.optim.Adam([*actor, *critic], lr=cfg.lr)
     history = []
@@ -60,8 +60,8 @@ def reference_update(model, batch, old_log_std, orders, cfg):
     return optimiser, history
 
 
-def learnt(cfg, device="cpu"):
-    """Return PPO after one update on made-up experience, and model, samples and orders from before."""
+def updated_ppo(cfg, device="cpu"):
+    """Return PPO after one update on synthetic samples, the model before it, the samples and their orders."""
     torch.manual_seed(0)
     ppo = Ppo(PushTask(WORLDS, device=device), cfg)
     fill(ppo, slice(None), WORLDS)
@@ -71,23 +71,23 @@ def learnt(cfg, device="cpu"):
     before.load_state_dict(ppo.state_dict()["model"])
     torch.manual_seed(1)
     ppo.update()
-    batch = {name: part.clone() for name, part in ppo.sampler.layout.split(ppo.sampler.rows)._asdict().items()}
+    batch = {name: part.clone() for name, part in ppo.packer.layout.split(ppo.packer.rows)._asdict().items()}
     return ppo, before, batch, ppo._orders.clone()
 
 
 @pytest.mark.parametrize("rows", [1, 7, None])
-def test_samples_do_not_depend_on_how_many_are_taken_at_a_time(rows):
+def test_packed_rows_do_not_depend_on_the_chunk_size(rows):
     torch.manual_seed(0)
     ppo = Ppo(PushTask(WORLDS), CFG)
     fill(ppo, slice(None), WORLDS)
     fresh = {name: value.clone() for name, value in ppo.model.state_dict().items()}
     ppo.batch()
-    at_once = ppo.sampler.rows.clone()
+    at_once = ppo.packer.rows.clone()
     ppo.model.load_state_dict(fresh)
-    ppo.sampler.rows.zero_()
-    ppo.sampler._rows = rows
+    ppo.packer.rows.zero_()
+    ppo.packer._chunk_size = rows
     ppo.batch()
-    torch.testing.assert_close(ppo.sampler.rows, at_once, atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(ppo.packer.rows, at_once, atol=1e-5, rtol=1e-5)
     assert at_once.abs().max() > 0.5
 
 
@@ -102,19 +102,19 @@ def test_samples_do_not_depend_on_how_many_are_taken_at_a_time(rows):
         {"symmetry": "actor"},
     ],
 )
-def test_an_update_equals_autograd_and_adam(change):
+def test_update_agrees_with_autograd_and_adam(change):
     cfg = dataclasses.replace(CFG, **change)
-    ppo, model, batch, orders = learnt(cfg)
+    ppo, model, batch, orders = updated_ppo(cfg)
     optimiser, history = reference_update(model, batch, ppo.rollout.log_std, orders, cfg)
     ours = dict(ppo.model.named_parameters())
     for name, param in model.named_parameters():
         torch.testing.assert_close(ours[name], param, atol=2e-5, rtol=1e-4, msg=name)
-    figures = ppo.statistics()
+    metrics = ppo.statistics()
     means = torch.tensor(history).mean(0).tolist()
     names = ("surrogate", "value", "entropy", "asymmetry", "kl", "gradient_actor", "gradient_critic")
     for name, mean in zip(names, means, strict=True):
-        assert figures[f"Loss/{name}"] == pytest.approx(mean, rel=1e-3, abs=1e-5), name
-    assert figures["Loss/learning_rate"] == pytest.approx(optimiser.param_groups[0]["lr"])
+        assert metrics[f"Loss/{name}"] == pytest.approx(mean, rel=1e-3, abs=1e-5), name
+    assert metrics["Loss/learning_rate"] == pytest.approx(optimiser.param_groups[0]["lr"])
     assert max(row[5] for row in history) > cfg.max_grad_norm  # some were clipped
     their_state = optimiser.state_dict()["state"]
     for index, state in ppo.optimiser.state_dict().items():
@@ -122,8 +122,8 @@ def test_an_update_equals_autograd_and_adam(change):
             torch.testing.assert_close(state[name], their_state[index][name], atol=2e-5, rtol=1e-3)
 
 
-def test_samples_equal_those_of_a_loop_over_time():
-    ppo, model, batch, _ = learnt(CFG)
+def test_samples_agree_with_a_loop_over_time():
+    ppo, model, batch, _ = updated_ppo(CFG)
     rollout, cfg = ppo.rollout, CFG
 
     def value_of(critic_obs):
@@ -140,7 +140,7 @@ def test_samples_equal_those_of_a_loop_over_time():
     close = {"atol": 1e-5, "rtol": 1e-4}
     torch.testing.assert_close(batch["advantage"], (advantage - advantage.mean()) / advantage.std(), **close)
     returns = advantage + values[:-1].flatten()
-    torch.testing.assert_close(ppo.model.value_moments.scaling().restore(batch["target"]), returns, **close)
+    torch.testing.assert_close(ppo.model.value_moments.scaling().denormalise(batch["target"]), returns, **close)
     torch.testing.assert_close(batch["features"], model.features(rollout.obs[:-1]).flatten(0, 1), **close)
     torch.testing.assert_close(
         batch["critic_features"], model.critic_features(rollout.critic_obs[:-1]).flatten(0, 1), **close
@@ -151,7 +151,7 @@ def test_samples_equal_those_of_a_loop_over_time():
     torch.testing.assert_close(batch["log_prob"], log_prob, **close)
 
 
-def test_many_steps_equal_adam():
+def test_flat_adam_agrees_with_torch_over_many_steps():
     torch.manual_seed(0)
     model = ActorCritic(5, 3, (7, 4), num_critic_obs=6)
     theirs = [param.detach().clone().requires_grad_() for param in model.actor.parameters()]
@@ -168,29 +168,29 @@ def test_many_steps_equal_adam():
                 torch.testing.assert_close(mine.data, param.data, atol=2e-6 * (step + 1) ** 0.5, rtol=1e-5)
     gaps = torch.ones_like(flat.value)
     for segment in flat.segments:
-        segment.own(gaps).zero_()
+        segment.view(gaps).zero_()
     assert gaps.sum() > 100.0
     assert not (gaps * flat.value).any()
 
 
-def test_a_networks_passes_equal_autograd_in_double_precision_and_nearly_so_in_half():
+def test_forward_and_backward_agree_with_autograd_in_float32_and_bfloat16():
     torch.manual_seed(0)
     model = ActorCritic(8, 3, (32, 16))
     flat = FlatParameters(model, "elu")
     layers = flat.actor.layers
-    x, slope = torch.randn(64, 8), torch.randn(64, 3)
-    expected = torch.autograd.grad(model.actor(x), list(model.actor.parameters()), slope)
-    for dtype, most in ((torch.float32, 1e-5), (torch.bfloat16, 2e-2)):
-        output, seen = layers.forward(x, dtype)
-        assert [each.dtype for each in seen] == [dtype, dtype, torch.float32]
+    x, grad = torch.randn(64, 8), torch.randn(64, 3)
+    expected = torch.autograd.grad(model.actor(x), list(model.actor.parameters()), grad)
+    for dtype, tolerance in ((torch.float32, 1e-5), (torch.bfloat16, 2e-2)):
+        output, layer_inputs = layers.forward(x, dtype)
+        assert [each.dtype for each in layer_inputs] == [dtype, dtype, torch.float32]
         scale = model.actor(x).detach().abs().max()
-        assert (output - model.actor(x)).abs().max() < most * scale
-        for found, right in zip(layers.backward(seen, slope, dtype), expected, strict=True):
-            assert found.dtype == torch.float32
-            assert (found - right).norm() < most * right.norm()
+        assert (output - model.actor(x)).abs().max() < tolerance * scale
+        for gradient, right in zip(layers.backward(layer_inputs, grad, dtype), expected, strict=True):
+            assert gradient.dtype == torch.float32
+            assert (gradient - right).norm() < tolerance * right.norm()
 
 
-def test_half_precision_starts_from_a_ratio_of_one_and_learns():
+def test_bfloat16_starts_from_a_ratio_of_one_and_learns():
     torch.manual_seed(0)
     cfg = dataclasses.replace(CFG, precision="bfloat16", epochs=1, minibatches=1, hidden=(32, 32))
     ppo = Ppo(PushTask(64), cfg)
@@ -208,7 +208,7 @@ def test_half_precision_starts_from_a_ratio_of_one_and_learns():
 # ---------------------------------------------------------------- compilation
 
 
-def test_a_compiled_minibatch_equals_an_eager_one():
+def test_compiled_minibatch_agrees_with_eager():
     torch.manual_seed(0)
     eager = Ppo(PushTask(WORLDS), dataclasses.replace(CFG, hidden=(8,)))
     fill(eager, slice(None), WORLDS)
@@ -216,15 +216,15 @@ def test_a_compiled_minibatch_equals_an_eager_one():
     compiled = Ppo(PushTask(WORLDS), dataclasses.replace(CFG, hidden=(8,), compile="on"))
     compiled.load_state_dict(eager.state_dict())
     for ppo in (eager, compiled):
-        ppo.sampler.old_log_std.copy_(eager.rollout.log_std)
+        ppo.packer.old_log_std.copy_(eager.rollout.log_std)
         for samples in torch.arange(ppo.batch_size).chunk(4):
-            ppo.minibatch_step(eager.sampler.rows[samples])
+            ppo.minibatch_step(eager.packer.rows[samples])
     assert compiled.compiler.enabled
     torch.testing.assert_close(compiled.flat.value, eager.flat.value, atol=1e-6, rtol=1e-5)
     assert compiled.statistics() == pytest.approx(eager.statistics(), rel=1e-4, abs=1e-6)
 
 
-def test_without_a_compiler_training_goes_on_and_says_so_once(capsys, monkeypatch):
+def test_failed_compilation_runs_eagerly_and_warns_once(capsys, monkeypatch):
     def trained(mode):
         torch.manual_seed(0)
         ppo = Ppo(PushTask(WORLDS), dataclasses.replace(CFG, compile=mode))

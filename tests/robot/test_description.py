@@ -37,7 +37,7 @@ def test_paw_is_merged_into_the_inner_shank_by_the_parallel_axis_theorem(descrip
     assert shank.inertia[0, 2] == pytest.approx(-6.7e-5 + 3.9283e-5, rel=1e-3)
 
 
-def test_products_of_inertia_change_sign_with_each_mirror(description):
+def test_mirrored_legs_have_products_of_inertia_of_opposite_sign(description):
     products = [description.link(f"{leg}_housing").inertia[0, 1] for leg in ("FL", "FR", "BL", "BR")]
     assert products == [-0.000296, 0.000296, 0.000296, -0.000296]
 
@@ -79,7 +79,7 @@ def test_default_pose(description):
     assert np.degrees(description.pose("default")) == pytest.approx([0.0, 45.0, 45.0] * 4)
 
 
-def test_the_projects_own_is_read_once_and_nobody_writes_into_it():
+def test_default_description_is_cached_and_read_only():
     own = load_description()
     assert load_description() is own and load_description(own.path) is not own
     meshes = [shape.mesh for link in own.links for shape in link.visuals if shape.mesh]

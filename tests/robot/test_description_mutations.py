@@ -89,7 +89,7 @@ def load(assets, urdf, text):
         return None
 
 
-def assert_is_a_robot(robot):
+def assert_valid_robot(robot):
     """Say what a person with scales and a ruler would ask of a legged robot."""
     for link in robot.links:
         assert 1e-3 <= link.mass <= 100.0
@@ -115,18 +115,18 @@ def assert_is_a_robot(robot):
     assert 0.0 < robot.knee_damping <= 10.0 and 0.0 < robot.knee_damping_limit <= 1e3
 
 
-def test_numbers_of_another_unit_or_exponent_are_refused_or_still_a_robot(assets):
+def test_numbers_in_other_units_are_refused_or_give_a_valid_robot(assets):
     refused = 0
     for magnitude in magnitudes():
         for factor in FACTORS:
             robot = load(assets, *change_everywhere(magnitude, lambda value, factor=factor: value * factor))
             refused += robot is None
             if robot is not None:
-                assert_is_a_robot(robot)
+                assert_valid_robot(robot)
     assert refused > 0.7 * len(magnitudes()) * len(FACTORS)
 
 
-def test_numbers_that_are_not_finite_are_refused(assets):
+def test_refuses_non_finite_numbers(assets):
     for magnitude in magnitudes():
         for value in NOT_FINITE:
             assert load(assets, *change_everywhere(magnitude, lambda _, value=value: value)) is None, magnitude
@@ -134,7 +134,7 @@ def test_numbers_that_are_not_finite_are_refused(assets):
 
 @settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_one_changed_place_of_the_json_is_refused_or_harmless(assets, data):
+def test_one_change_of_the_json_is_refused_or_harmless(assets, data):
     tree = json.loads(json.dumps(JSON))
     table, key = data.draw(st.sampled_from(list(places(tree))))
     old = table[key]
@@ -148,12 +148,12 @@ def test_one_changed_place_of_the_json_is_refused_or_harmless(assets, data):
         table[f"{key} again"] = old
     robot = load(assets, URDF, json.dumps(tree))
     if robot is not None:
-        assert_is_a_robot(robot)
+        assert_valid_robot(robot)
 
 
 @settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_one_changed_place_of_the_urdf_is_refused_or_harmless(assets, data):
+def test_one_change_of_the_urdf_is_refused_or_harmless(assets, data):
     root = ElementTree.fromstring(URDF)
     parents = [(parent, index) for parent in root.iter() for index in range(len(parent))]
     parent, index = data.draw(st.sampled_from(parents))
@@ -173,4 +173,4 @@ def test_one_changed_place_of_the_urdf_is_refused_or_harmless(assets, data):
         holder[name] = " ".join(repr(new if i == which else value) for i, value in enumerate(values))
     robot = load(assets, ElementTree.tostring(root, encoding="unicode"), json.dumps(JSON))
     if robot is not None:
-        assert_is_a_robot(robot)
+        assert_valid_robot(robot)

@@ -217,7 +217,7 @@ TOKENS = rb'nan 1e999 -1 0 < > &lt; &x; " { ] null \ud800'.split() + [b"\xff", b
 
 @settings(max_examples=400, deadline=2000, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_damaged_files_load_or_are_refused(assets, data):
+def test_damaged_files_load_or_raise_description_error(assets, data):
     file = data.draw(st.sampled_from([URDF, JSON, "meshes/shank.obj"]))
     original = (DEFAULT_DESCRIPTION.parent / file).read_bytes()
     start = data.draw(st.integers(0, len(original)))

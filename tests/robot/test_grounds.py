@@ -16,7 +16,7 @@ def test_platform_steps_within_one_cell_behind_its_edge(height):
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_uneven_ground_keeps_its_amplitude_its_slopes_and_a_level_start(seed):
+def test_uneven_ground_has_bounded_slopes_and_a_level_start(seed):
     field = grounds.uneven(0.05, seed, flat_radius=0.6)
     z = heights(field)
     x = np.linspace(-2.0, 2.0, z.shape[0])
@@ -35,14 +35,14 @@ def test_uneven_ground_has_its_correlation_length():
     assert np.mean(pairs) == pytest.approx(np.exp(-1.0), abs=0.08)
 
 
-def test_uneven_ground_repeats_with_its_seed_only():
+def test_uneven_ground_is_reproducible_by_seed():
     first = heights(grounds.uneven(seed=3))
     assert np.array_equal(first, heights(grounds.uneven(seed=3)))
     assert np.abs(first - heights(grounds.uneven(seed=4))).max() > 0.02
 
 
 @pytest.mark.parametrize("field", [grounds.platform(0.1), grounds.uneven()])
-def test_grounds_are_fine_and_wide_enough_to_jump_two_metres(field):
+def test_default_grounds_resolve_a_paw_and_span_two_metres(field):
     assert (field.hx, field.hy) == (2.0, 2.0)
     assert 2.0 * field.hx / (field.ncol - 1) <= 0.0251
     assert field.nrow == field.ncol
@@ -65,7 +65,7 @@ def test_finer_cells_divide_the_size():
         (lambda: grounds.uneven(flat_radius=2.0), "flat_radius must lie between 0 and 2 m"),
     ],
 )
-def test_impossible_grounds_are_refused(build, message):
+def test_refuses_impossible_grounds(build, message):
     with pytest.raises(ValueError, match=message):
         build()
 
@@ -111,7 +111,7 @@ def test_robots_thrown_across_an_edge_stay_finite_and_above_ground():
     for _ in range(90):
         sim.step()
         assert np.abs(sim.base_velocity()).max() < 8.0
-    assert not sim.solver.invalid.numpy().any()
+    assert not sim.solver.diverged.numpy().any()
     paws = paw_centres(sim)
     upper = paws[..., 0] < 0.3 - PAW_RADIUS
     assert paws[upper][:, 2].min() > PAW_RADIUS - 5e-3

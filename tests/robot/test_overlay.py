@@ -23,7 +23,7 @@ VALUES = {
 RANGES = {"base_mass": (-0.1, 0.1), "joint_offset": (-0.2, 0.2), "latency": (3.0, 5.0)}
 
 
-def test_an_overlay_comes_back_from_its_file(tmp_path):
+def test_load_overlay_inverts_save(tmp_path):
     overlay = RobotOverlay(VALUES, RANGES, "a bench")
     overlay.save(tmp_path / "robot.json")
     found = load_overlay(tmp_path / "robot.json")
@@ -50,7 +50,7 @@ def test_an_overlay_comes_back_from_its_file(tmp_path):
         ({"randomization": {"gains": [1.1, 0.9]}}, "two rising numbers"),
     ],
 )
-def test_a_bad_overlay_is_refused_in_one_line(tmp_path, change, words):
+def test_refuses_bad_overlay_in_one_line(tmp_path, change, words):
     file = tmp_path / "robot.json"
     file.write_text(json.dumps(RobotOverlay(VALUES).to_json() | change))
     with pytest.raises(InputError, match=words) as told:
@@ -58,12 +58,12 @@ def test_a_bad_overlay_is_refused_in_one_line(tmp_path, change, words):
     assert str(told.value).startswith(str(file)) and "\n" not in str(told.value)
 
 
-def test_an_overlay_may_give_every_range_of_randomisation():
+def test_overlay_accepts_every_row_of_randomization_cfg():
     assert set(RANDOMIZED) == {name for name, value in vars(RandomizationCfg.off()).items() if value is None}
 
 
 @pytest.mark.parametrize("solver", ["jumper", "mujoco"])
-def test_a_simulation_is_of_the_overlay(solver):
+def test_simulation_uses_overlay_values(solver):
     sim = Simulation(2, solver=solver, visuals=False, robot=RobotOverlay(VALUES))
     plain = Simulation(2, visuals=False)
     mass, old = (s.model.body_mass.numpy().reshape(2, int(BODIES)) for s in (sim, plain))
@@ -81,7 +81,7 @@ def test_a_simulation_is_of_the_overlay(solver):
         assert np.isclose(table, 0.7).sum() >= 16  # both coefficients of four paws in two worlds
 
 
-def test_an_environment_draws_around_the_overlay_and_saves_it():
+def test_environment_randomises_around_overlay_and_saves_it():
     overlay = RobotOverlay(VALUES, RANGES)
     task = for_robot(make_task("vertical-jump"), overlay)
     assert task.randomization.base_mass == (-0.1, 0.1)
@@ -98,7 +98,7 @@ def test_an_environment_draws_around_the_overlay_and_saves_it():
     assert set(env.parameters.latency.numpy()) <= {1, 2}
 
 
-def test_the_training_reads_the_overlay_before_its_flags(tmp_path):
+def test_training_flags_override_overlay(tmp_path):
     RobotOverlay(VALUES, RANGES).save(tmp_path / "robot.json")
     assert overlay_in(["--seed", "1"]) is None
     assert overlay_in(["--robot", str(tmp_path / "robot.json")]).values["base_mass"] == (7.0,)

@@ -61,7 +61,7 @@ def test_configuration_refuses_knees_out_of_reach(robot):
         shank.translation = original
 
 
-def test_closed_velocity_is_the_rate_of_the_configuration(moving, robot):
+def test_closed_velocity_matches_differences_of_configurations(moving, robot):
     q, v = moving
     step = 1e-6
     ahead, behind = (
@@ -71,7 +71,7 @@ def test_closed_velocity_is_the_rate_of_the_configuration(moving, robot):
     assert v[robot.knee_v] == pytest.approx(rates, abs=1e-7)
 
 
-def test_paws_move_at_the_rate_of_their_positions(moving, robot):
+def test_paw_velocities_match_differences_of_positions(moving, robot):
     q, v = moving
     step = 1e-6
     ahead, behind = (robot.paw_positions(pin.integrate(robot.model, q, sign * step * v)) for sign in (1, -1))
@@ -88,7 +88,7 @@ def test_robot_at_rest_falls_freely(robot):
     assert acceleration[6:] == pytest.approx(np.zeros(20), abs=1e-7)
 
 
-def test_energy_grows_at_the_power_of_the_motors(moving, robot):
+def test_energy_changes_by_motor_power(moving, robot):
     q, v = moving
     torques = np.linspace(-10.0, 10.0, 12)
     acceleration = robot.forward_dynamics(q, v, torques)

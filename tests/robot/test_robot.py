@@ -63,7 +63,7 @@ def test_labels_and_layout(model):
     assert model.joint_qd_start.numpy()[:25].tolist() == [0, *range(6, 26), 26, 29, 32, 35]
 
 
-def test_masses_and_inertias_are_those_described(model, description):
+def test_masses_and_inertias_match_description(model, description):
     masses = model.body_mass.numpy().reshape(2, 21)
     assert masses.sum(axis=1) == pytest.approx([14.5, 14.5], rel=1e-6)
     inertia = np.array([link.inertia for link in description.links])
@@ -94,7 +94,7 @@ def test_default_pose_stands_on_closed_legs(model):
     assert inner[:, 1] == pytest.approx(SIDE * (np.array([0.105, 0.105, 0.15, 0.15]) + 0.0602), abs=1e-6)
 
 
-def test_loop_coordinates_are_the_shanks_relative_rotations(model):
+def test_loop_coordinates_are_relative_rotations_of_shanks(model):
     joint_q = model.joint_q.numpy()[:COORDS]
     _, rotations = body_poses(model, joint_q)
     for leg in range(4):
@@ -142,7 +142,7 @@ def test_standing_height_with_the_legs_swung_outward(model, description):
     assert paws[:, 2] == pytest.approx(np.full(4, 0.025), abs=1e-6)
 
 
-def test_leg_geometry_is_read_off_the_joint_origins(description):
+def test_leg_geometry_matches_joint_origins(description):
     front_left = leg_geometry(description)[0]
     assert front_left == {
         "hip": (0.1433, 0.105, 0.0), "front": 1.0, "side": 1.0, "outer_x": 0.1417, "inner_x": 0.0517,
@@ -160,7 +160,7 @@ def test_leg_geometry_array_in_both_precisions(description, package, bits):
     assert legs["hip"][:, 1] == pytest.approx([0.105, -0.105, 0.15, -0.15], rel=1e-6)
 
 
-def test_only_the_paws_meet_the_ground():
+def test_only_paws_collide_with_the_ground():
     solver = mujoco_solver(build_model(1, visuals=False, device="cpu"))
     kind, affinity = solver.mj_model.geom_contype, solver.mj_model.geom_conaffinity
     meets = (kind[:, None] & affinity[None, :]) | (kind[None, :] & affinity[:, None])
@@ -286,7 +286,7 @@ def test_robot_on_a_heightfield():
     assert solver.mjw_data.contact.dist.numpy()[:contacts].min() == pytest.approx(-0.001, abs=2e-4)
 
 
-def test_free_flight_has_no_ground():
+def test_no_ground_on_request():
     assert "ground" not in build_model(1, ground=None, visuals=False, device="cpu").shape_label
 
 

@@ -1,4 +1,4 @@
-"""The map to walk on: what each kind of tile is, and where it stands, against NumPy and the kernels' own surface."""
+"""Terrain map: heights of each kind of tile, and their placement, against NumPy and the kernels' surface."""
 
 import numpy as np
 import pytest
@@ -26,7 +26,7 @@ def test_rim_is_at_zero_and_the_start_is_level(kind):
     assert kind == "flat" or np.abs(z).max() > 0.04
 
 
-def test_slopes_have_their_angle():
+def test_slopes_have_configured_angle():
     z = tile("slope")
     assert z[20, 30] - z[20, 31] == pytest.approx(0.1 * np.tan(np.radians(15.0)))
     assert z[20, 20] == pytest.approx((2.0 - 0.3 - 0.5) * np.tan(np.radians(15.0)))
@@ -35,7 +35,7 @@ def test_slopes_have_their_angle():
 
 
 @pytest.mark.parametrize(("difficulty", "step"), [(0.0, 0.03), (1.0, 0.10)])
-def test_stairs_have_steps_of_one_height(difficulty, step):
+def test_stairs_have_equal_steps(difficulty, step):
     z = tile("stairs", difficulty)
     assert set(np.round(np.unique(z) / step, 5)) == {0.0, 1.0, 2.0}
     np.testing.assert_array_equal(tile("pit", difficulty), -z)
@@ -43,14 +43,14 @@ def test_stairs_have_steps_of_one_height(difficulty, step):
 
 
 @pytest.mark.parametrize("kind", ["uneven", "waves"])
-def test_random_ground_keeps_its_amplitude_and_seed(kind):
+def test_random_ground_has_amplitude_and_is_reproducible(kind):
     z = tile(kind, 0.6)
     assert np.abs(z).max() == pytest.approx(0.6 * 0.05)
     np.testing.assert_array_equal(z, tile(kind, 0.6))
     assert np.abs(z - tile(kind, 0.6, seed=1)).max() > 0.01
 
 
-def test_tiles_stand_where_the_map_says():
+def test_map_places_tiles_by_row_and_column():
     field = terrain_map(CFG)
     z, edge = heights(field), 10
     assert z.shape == (8 * 40 + 1 + 2 * edge, 2 * 40 + 1 + 2 * edge)
@@ -67,7 +67,7 @@ def test_tiles_stand_where_the_map_says():
     assert found[1, 1] == pytest.approx(-slope, abs=1e-4) and found[2, 2] == pytest.approx(-slope, abs=1e-4)
 
 
-def test_single_tile_is_of_full_difficulty():
+def test_single_tile_has_full_difficulty():
     field = single_tile(CFG, "stairs")
     np.testing.assert_allclose(heights(field), tile("stairs"), atol=1e-6)
     assert (field.hx, field.hy) == (2.0, 2.0)
@@ -78,12 +78,12 @@ def test_single_tile_is_of_full_difficulty():
     [{"rows": -1}, {"tile": 0.0}, {"cell": 0.5}, {"start": 4.0}, {"slope": 70.0}, {"step": (0.1, 0.05)},
      {"uneven": -0.1}, {"border": float("inf")}],
 )  # fmt: skip
-def test_map_that_cannot_be_is_refused(settings):
+def test_refuses_impossible_map(settings):
     with pytest.raises(InputError, match="terrain"):
         TerrainCfg(**settings)
 
 
-def test_map_without_rows_and_unknown_kinds_are_refused():
+def test_refuses_map_without_rows_and_unknown_kinds():
     with pytest.raises(InputError, match="at least one row"):
         terrain_map(TerrainCfg.none())
     with pytest.raises(InputError, match="terrain must be one of flat, uneven"):

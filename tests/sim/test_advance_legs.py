@@ -1,4 +1,4 @@
-"""A thread a leg (for GPUs) does what a thread a world does; on the CPU blocks of four take turns."""
+"""Physics with a thread per leg (for GPUs) against a thread per world; on the CPU threads of a block take turns."""
 
 import numpy as np
 import pytest
@@ -71,7 +71,7 @@ GROUNDS = {
 
 
 @pytest.mark.parametrize("kind", GROUNDS)
-def test_equals_a_thread_a_world(kind):
+def test_thread_per_leg_matches_thread_per_world(kind):
     model = build_model(N, ground=GROUNDS[kind]["ground"], friction=0.5)
     q, qd, force = states(model, 0.34)
     legs, world = (JumperDynamics(model, double=True, block=GROUNDS[kind].get("block")) for _ in range(2))
@@ -94,7 +94,7 @@ def test_equals_a_thread_a_world(kind):
         np.testing.assert_allclose(*moved, atol=1.0e-9)
 
 
-def test_stops_equal_a_thread_a_worlds():
+def test_stops_match_thread_per_world():
     model = build_model(N, friction=0.5)
     q, qd, force = squatting(model)
     legs, world = (JumperDynamics(model, double=True) for _ in range(2))
@@ -110,13 +110,13 @@ def test_stops_equal_a_thread_a_worlds():
     assert (~pressed & paws).any()
 
 
-def test_a_world_that_came_apart_is_parked():
+def test_diverged_world_is_frozen():
     model = build_model(N)
     dynamics = JumperDynamics(model, double=True)
     q, qd, force = states(model, 0.34)
     qd[4, 3] = np.nan
     found = advance(dynamics, q, qd, force, by_legs=True)
-    np.testing.assert_array_equal(np.flatnonzero(dynamics.work.invalid.numpy()), [4])
+    np.testing.assert_array_equal(np.flatnonzero(dynamics.work.diverged.numpy()), [4])
     np.testing.assert_allclose(found[0].reshape(N, 43)[4], model.joint_q.numpy().reshape(N, 43)[4], atol=1.0e-7)
     np.testing.assert_array_equal(found[1].reshape(N, 38)[4], 0.0)
     np.testing.assert_array_equal(found[2][:, 4], 0.0)
@@ -127,7 +127,7 @@ def test_a_world_that_came_apart_is_parked():
         np.testing.assert_array_equal(a.reshape(N, -1)[others], b.reshape(N, -1)[others])
 
 
-def test_stops_at_the_tolerance_and_tells_it():
+def test_contact_iteration_ends_at_tolerance_and_reports_residual():
     model = build_model(N)
     dynamics = JumperDynamics(model, double=True)
     q, qd, force = states(model, 0.34)

@@ -1,4 +1,4 @@
-"""What users add to every world: sites and shapes on the links, obstacles, and what the solver cannot simulate."""
+"""User additions to every world: sites and shapes on links, obstacles, and refusal of other parts."""
 
 import warnings
 
@@ -73,7 +73,7 @@ def coupling(builder):
     builder.set_joint_mimic(builder.joint_label.index("FR_outer"), builder.joint_label.index("FL_outer"))
 
 
-def test_robots_layout_is_kept():
+def test_extras_keep_the_robots_layout():
     plain = build_model(2, visuals=False, device="cpu")
     model = build_model(2, visuals=False, device="cpu", extras=lambda b: (corner_site(b), mast(b), wall(b), bumper(b)))
     assert model.body_label == plain.body_label and model.joint_label == plain.joint_label
@@ -107,7 +107,7 @@ def test_imu_on_a_site_of_a_standing_robot_measures_gravity(solver):
     assert sensor.gyroscope.numpy()[0] == pytest.approx(np.zeros(3), abs=0.02)
 
 
-def test_imu_on_a_falling_and_turning_robot_measures_the_way_round():
+def test_imu_on_a_falling_and_rotating_robot_measures_centripetal_acceleration():
     sim = Simulation(1, ground=None, visuals=False, device="cpu", extras=corner_site)
     sensor = SensorIMU(sim.model, sites="*/corner", request_state_attributes=False)
     observables = sim.solver.observables(kinds=sensor.solver_observable_kinds)
@@ -166,7 +166,7 @@ def test_visual_shape_is_shown_in_every_world():
     viewer.end_frame()
 
 
-def test_sites_and_visual_shapes_change_no_motion_and_nothing_is_warned_of():
+def test_sites_and_visual_shapes_change_no_motion_and_give_no_warning():
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         plain, extended = (
@@ -183,7 +183,7 @@ def test_sites_and_visual_shapes_change_no_motion_and_nothing_is_warned_of():
     [(ball, "body 'world_0/ball'"), (arm, "body 'world_0/forearm'"), (leash, "joint 'world_0/leash'"),
      (grain, "2 particles"), (coupling, "2 mimic joints")],
 )  # fmt: skip
-def test_what_moves_by_itself_is_refused_by_the_solver(extras, what):
+def test_solver_refuses_bodies_joints_and_particles(extras, what):
     model = build_model(2, visuals=False, device="cpu", extras=extras)
     with pytest.raises(NotThisRobotError, match=f"{what}.*this robot alone") as refusal:
         SolverJumper(model)
@@ -197,7 +197,7 @@ def test_simulation_refuses_another_body_on_either_solver(solver):
 
 
 @pytest.mark.parametrize(("extras", "name"), [(wall, "wall"), (bumper, "bumper")])
-def test_collisions_that_are_not_simulated_are_said_once(extras, name):
+def test_solver_warns_once_of_ignored_collisions(extras, name):
     model = build_model(2, visuals=False, device="cpu", extras=extras)
     with pytest.warns(UserWarning, match=f"ignores the collisions of 2 shapes, such as 'world_0/{name}'") as said:
         solver = SolverJumper(model)

@@ -1,4 +1,4 @@
-"""Springs between the knees: their forces do the work that their energy says, in both solvers, and lose none of it."""
+"""Springs between the knees: torques against energy, conservation of energy, and agreement of both solvers."""
 
 import numpy as np
 import pinocchio as pin
@@ -41,7 +41,7 @@ def flight(n: int, springs: bool = True, double: bool = True) -> Flight:
     return found
 
 
-def test_torques_are_those_that_the_energy_has_by_the_angles():
+def test_spring_torques_are_the_gradient_of_energy():
     # the change of generalized momentum over a short step, with springs less without, is their torque: power matches
     n, dt, h = 40, 1.0e-6, 1.0e-5
     states = random_states(n, 3)
@@ -64,7 +64,7 @@ def kinetic(reference: Reference, states, i: int) -> float:
     return reference.energy(states, i) - pin.computePotentialEnergy(robot.model, robot.data, q)
 
 
-def test_energy_swings_between_springs_and_legs_and_none_is_lost():
+def test_springs_conserve_energy():
     # from a little longer than at rest, inside the stops; what a step loses falls with its length
     n, seconds, parts = 2, 0.4, 8
     states = random_states(n, 5, body_rate=0.0, joint_rate=0.0)
@@ -85,7 +85,7 @@ def test_energy_swings_between_springs_and_legs_and_none_is_lost():
 
 
 @pytest.mark.parametrize("stiffness", [0.0, STIFFNESS])
-def test_both_solvers_move_alike(stiffness):
+def test_springs_move_alike_on_both_solvers(stiffness):
     # a robot that hangs in the air with weak motors: the springs stretch its legs
     angles = {}
     for solver in ("jumper", "mujoco"):
@@ -100,7 +100,7 @@ def test_both_solvers_move_alike(stiffness):
     np.testing.assert_allclose(angles["mujoco"], angles["jumper"], atol=0.02)
 
 
-def test_what_no_spring_is_is_refused():
+def test_refuses_bad_springs():
     with pytest.raises(InputError, match="spring_stiffness must be in 0 to 10000 N/m"):
         with_springs(-1.0, 0.17)
     with pytest.raises(InputError, match="spring_length must be in 0 to 1 m"):

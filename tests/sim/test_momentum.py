@@ -1,4 +1,4 @@
-"""Momentum that is kept: exactly in free flight, and left alone where something pushes on the robot."""
+"""Projection of momentum: exact in free flight, none where a contact or a wrench acts on the robot."""
 
 import numpy as np
 import pytest
@@ -38,7 +38,7 @@ def flights():
     return {keep: moving_legs(keep, height=5.0) for keep in (False, True)}
 
 
-def test_momentum_stays_or_grows_by_gravity_alone(flights):
+def test_momentum_changes_by_gravity_alone_in_flight(flights):
     sim, kept = flights[True]
     mass = sim.model.body_mass.numpy()[:21].sum()
     time = np.arange(STEPS + 1) / 60.0
@@ -50,7 +50,7 @@ def test_momentum_stays_or_grows_by_gravity_alone(flights):
     assert np.abs(angular).max() > 0.2 and drift > 1e-3
 
 
-def test_bodies_are_those_of_the_corrected_coordinates(flights):
+def test_bodies_match_projected_coordinates(flights):
     sim = flights[True][0]
     written = sim.state.body_qd.numpy().copy()
     sim.physics.write_bodies()
@@ -58,7 +58,7 @@ def test_bodies_are_those_of_the_corrected_coordinates(flights):
 
 
 @pytest.mark.parametrize("where", [{"height": 0.0, "reach": 0.03}, {"height": 5.0, "push": 0.5}])
-def test_nothing_is_corrected_where_something_pushes(where):
+def test_momentum_is_not_projected_under_contact_or_push(where):
     found = [moving_legs(keep, **where)[0].joint_qd() for keep in (False, True)]
     assert np.abs(found[0][:, 6:]).max() > 0.1
     np.testing.assert_array_equal(*found)

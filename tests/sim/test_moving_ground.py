@@ -94,7 +94,7 @@ def test_a_paw_force_pushes_the_block_against_friction(speed, paw_impulse, expec
     assert out.numpy()[0] == pytest.approx([expected, 0.0, 0.0], abs=1e-6)
 
 
-def test_standing_robot_leaves_a_block_at_rest_where_it_is():
+def test_block_stays_at_rest_under_a_standing_robot():
     sim = on_block(2, settle=0, mass=np.array([5.0, 20.0]))
     for _ in range(60):
         sim.step()
@@ -124,7 +124,7 @@ def test_robot_and_block_accelerate_together_under_a_force():
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
-def test_block_gains_what_paws_and_floor_give_in_every_step(friction):
+def test_block_momentum_matches_paw_and_floor_impulses(friction):
     masses = np.array([5.0, 10.0, 40.0, 5.0])
     sim = on_block(4, settle=0, mass=masses, friction=friction, half=(3.0, 3.0))
     thrown(sim, 21, height=(0.5, 0.7), speed=1.0)
@@ -210,7 +210,7 @@ def test_robots_thrown_on_light_blocks_converge_and_stay_finite():
         sim.step()
         assert sim.solver.residual.numpy().max() <= TOLERANCE
         assert np.linalg.norm(sim.solver.block_velocity(), axis=1).max() < 10.0
-    assert not sim.solver.invalid.numpy().any()
+    assert not sim.solver.diverged.numpy().any()
 
 
 def test_paws_push_the_side_of_a_block():
@@ -260,7 +260,7 @@ def test_surface_and_distance_of_a_block():
     assert found[1, :, 1] == pytest.approx([0.15, 0.06, 0.14, 0.02], abs=1e-6)
 
 
-def test_shin_in_a_block_is_a_collision():
+def test_shank_in_a_block_is_a_collision():
     # the front shanks lean forward over a block in world 0; in world 1 the block is elsewhere
     block = BlockCfg(center=np.array([[0.69, 0.0], [3.0, 0.0]]), half=(0.4, 0.5), height=0.15)
     sim = simulation(2, block=block)
@@ -293,7 +293,7 @@ def test_blocks_return_to_their_starts():
     assert np.array_equal(sim.solver.block_position(), starts)
 
 
-def test_block_of_a_broken_world_returns_to_its_start():
+def test_block_of_a_diverged_world_returns_to_its_start():
     sim = on_block(2, settle=2, mass=5.0, friction=0.0)
     set_block_velocity(sim, [[1.0, 0.0], [1.0, 0.0]])
     sim.step()
@@ -303,12 +303,12 @@ def test_block_of_a_broken_world_returns_to_its_start():
     sim.state.joint_qd.assign(rates.ravel())
     sim.step()
     sim.step()
-    assert sim.solver.invalid.numpy().tolist() == [1, 0]
+    assert sim.solver.diverged.numpy().tolist() == [1, 0]
     assert np.array_equal(sim.solver.block_position()[0], [0.0, 0.0])
     assert np.isfinite(sim.solver.block_velocity()).all()
 
 
-def test_double_precision_moves_the_block_alike():
+def test_block_moves_alike_in_double_precision():
     sim = on_block(2, settle=30, mass=np.array([5.0, 20.0]), friction=0.1)
     qd = sim.joint_qd().copy()
     qd[:, 0] = 1.0
@@ -330,7 +330,7 @@ def test_double_precision_moves_the_block_alike():
     assert blocks["center"] == pytest.approx(sim.solver.block_position(), abs=1e-4)
 
 
-def test_what_does_not_know_blocks_says_so():
+def test_refuses_blocks_where_they_are_not_supported():
     block = BlockCfg(center=(1.0, 0.0))
     with pytest.raises(ValueError, match="needs solver='jumper'"):
         simulation(1, solver="mujoco", block=block)
@@ -353,7 +353,7 @@ def test_what_does_not_know_blocks_says_so():
         ({"center": (np.inf, 0.0)}, "center must be finite"),
     ],
 )
-def test_impossible_blocks_are_refused(values, message):
+def test_refuses_impossible_blocks(values, message):
     with pytest.raises(ValueError, match=message):
         BlockCfg(**({"center": (0.0, 0.0)} | values))
 
@@ -365,7 +365,7 @@ def test_block_values_need_one_row_per_world():
 
 
 @pytest.mark.parametrize("begin", ["reset", "evaluation_reset"])
-def test_a_new_episode_puts_the_block_back(begin):
+def test_new_episode_resets_the_block(begin):
     block = BlockCfg(center=(1.0, 0.0), half=(0.3, 0.3), height=0.05, mass=10.0, friction=0.4)
     env = Env(make_task("horizontal-jump"), 2, device="cpu", block=block)
     start = env.sim.solver.block_position()

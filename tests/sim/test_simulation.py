@@ -1,4 +1,4 @@
-"""Putting worlds back, and the velocity of the base, on both solvers."""
+"""Resets, targets and base velocity of the simulation, on both solvers."""
 
 import numpy as np
 import pytest
@@ -51,7 +51,7 @@ def break_world(sim, world):
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_reset_simulation_is_bitwise_a_fresh_one(solver):
+def test_reset_simulation_matches_a_new_one_bitwise(solver):
     sim = simulation(2, solver)
     fresh = snapshot(sim)
     first = jump(sim)
@@ -83,7 +83,7 @@ def test_reset_leaves_other_worlds_alone(solver, kind):
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_broken_world_recovers_by_a_reset(solver):
+def test_reset_recovers_diverged_world(solver):
     sim = simulation(2, solver)
     first = jump(sim)
     sim.reset()
@@ -93,7 +93,7 @@ def test_broken_world_recovers_by_a_reset(solver):
     if solver == "mujoco":
         assert np.isnan(sim.joint_q()[1]).any()
     else:
-        assert sim.solver.invalid.numpy()[1] == 1
+        assert sim.solver.diverged.numpy()[1] == 1
     sim.reset(np.array([False, True]))
     again = jump(sim)
     assert np.array_equal(again[:, 1], first[:, 1])
@@ -110,7 +110,7 @@ def test_standing_robot_stays_standing_after_a_reset(solver):
     assert sim.joint_q()[:, 2] == pytest.approx(height, abs=0.06)  # it sags on its motors, and no more
 
 
-def test_filter_and_physics_in_a_captured_graph_do_what_single_calls_do():
+def test_captured_filter_and_physics_match_single_calls():
     one, held = simulation(2, "jumper"), simulation(2, "jumper")
     start = one.joint_q()[0, 2]
 
@@ -152,7 +152,7 @@ def test_captured_reset_reads_its_mask_at_every_replay(solver):
         assert np.array_equal(sim.joint_q(), expected)
 
 
-def test_reset_puts_blocks_back():
+def test_reset_returns_blocks_to_their_starts():
     sim = simulation(2, "jumper", block=BlockCfg(center=(0.2, 0.0), mass=1.0, friction=0.0))
     start = sim.solver.block_position()
     jump(sim, 12)
@@ -168,7 +168,7 @@ def test_reset_puts_blocks_back():
     [[True], [[True, False]], [0, 1], np.array([1.0, 0.0]), torch.tensor([0, 1]), "ab", [True, None], [[True], []]],
     ids=repr,
 )
-def test_reset_refuses_what_is_no_mask(mask):
+def test_reset_refuses_bad_mask(mask):
     sim = simulation(2, "jumper")
     with pytest.raises(ValueError, match=r"mask must be bool of shape \(2,\)") as refusal:
         sim.reset(mask)
@@ -185,7 +185,7 @@ def spinning(solver):
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
-def test_base_velocity_is_the_way_that_the_base_goes(solver):
+def test_base_velocity_matches_differences_of_position(solver):
     sim = spinning(solver)
     for _ in range(5):
         before = sim.joint_q()[:, :3].astype(float)
@@ -215,7 +215,7 @@ def test_base_velocity_in_a_captured_graph():
     assert np.abs(np.diff(seen, axis=0)).min(axis=(1, 2)).max() > 0.0
 
 
-def test_targets_are_checked_and_may_be_alike_for_all_worlds():
+def test_set_targets_checks_and_broadcasts():
     sim, angles = Simulation(3, visuals=False, device="cpu"), np.arange(36.0).reshape(12, 3) / 36.0
     for given in (angles, torch.tensor(angles), angles.tolist()):
         sim.set_targets(given)

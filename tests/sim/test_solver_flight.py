@@ -43,7 +43,7 @@ def forced():
 
 
 @pytest.mark.parametrize(("double", "dt", "tolerance"), [(False, 1e-3, 1e-4), (True, 1e-6, 1e-9)], ids=["f32", "f64"])
-def test_accelerations_equal_pinocchios(forced, double, dt, tolerance):
+def test_accelerations_match_pinocchio(forced, double, dt, tolerance):
     model, states, torque, expected = forced
     after = Flight(model, double=double).run(states, dt, torque=torque)
     found = np.empty_like(expected)
@@ -102,7 +102,7 @@ def reference_paws(states):
 
 
 @pytest.mark.parametrize(("double", "tolerance"), [(False, 1e-6), (True, 1e-12)], ids=["f32", "f64"])
-def test_paw_position_and_jacobian_equal_pinocchios(double, tolerance):
+def test_paw_position_and_jacobian_match_pinocchio(double, tolerance):
     states = random_states(100, 4)
     kernel, modules = paw_map_kernel(double)
     geometry = leg_geometry_array(load_description(), modules.geometry, "cpu")
@@ -160,7 +160,7 @@ def test_energy_and_momentum_drift_in_flight_halves_with_the_step(gentle, gravit
 
 
 @pytest.mark.parametrize("loss", ["knees", "motors"])
-def test_passive_losses_take_the_power_they_should(loss):
+def test_passive_losses_dissipate_expected_power(loss):
     # knees: 0.1 N m s/rad up to 1 N m; motors: 0.02 N m against the motion
     n, dt = 20, 1e-6
     states, model = random_states(n, 7), bare_model(n)
@@ -180,7 +180,7 @@ def test_passive_losses_take_the_power_they_should(loss):
         assert found == pytest.approx(expected, rel=1e-3)
 
 
-def test_losses_never_give_energy(gentle):
+def test_losses_never_add_energy(gentle):
     n = len(gentle.pos)
     model = bare_model(n)
     for array, dofs, value in ((model.joint_damping, KNEE_V, 0.1), (model.joint_friction, MOTOR_V, 0.02)):

@@ -41,7 +41,7 @@ def trajectory(sim, steps=30):
     return np.array(motion)
 
 
-def test_plain_model_is_refused():
+def test_refuses_empty_model():
     builder = newton.ModelBuilder()
     body = builder.add_body(label="box")
     builder.add_shape_box(body, hx=0.1, hy=0.1, hz=0.1)
@@ -50,14 +50,14 @@ def test_plain_model_is_refused():
 
 
 @pytest.mark.parametrize("labels", ["body_label", "joint_label"])
-def test_robot_with_another_label_is_refused(labels):
+def test_refuses_robot_with_another_label(labels):
     model = build_model(2, visuals=False, device="cpu")
     getattr(model, labels)[30] = "world_1/wheel"
     with pytest.raises(NotThisRobotError, match="'wheel'"):
         SolverJumper(model)
 
 
-def test_robot_without_a_paw_is_refused():
+def test_refuses_robot_without_a_paw():
     model = build_model(1, visuals=False, device="cpu")
     index = next(i for i, label in enumerate(model.shape_label) if label.endswith("BL_paw"))
     model.shape_label[index] = "world_0/BL_wheel"
@@ -66,7 +66,7 @@ def test_robot_without_a_paw_is_refused():
 
 
 @pytest.mark.parametrize(("argument", "value"), [("max_sweeps", 0), ("tolerance", 0.0), ("tolerance", float("nan"))])
-def test_bad_settings_are_refused(argument, value):
+def test_refuses_bad_settings(argument, value):
     with pytest.raises(ValueError, match=argument):
         SolverJumper(build_model(1, visuals=False, device="cpu"), **{argument: value})
 
@@ -76,7 +76,7 @@ BAD_SUBSTEPS = [0, -1, 1.5, float("nan")]
 
 
 @pytest.mark.parametrize("dt", BAD_DT)
-def test_steps_of_no_time_are_refused_and_change_nothing(pair, dt):
+def test_refuses_bad_dt_without_side_effects(pair, dt):
     sim, _ = pair
     before = sim.joint_q().copy()
     with pytest.raises(ValueError, match="dt must be"):
@@ -87,7 +87,7 @@ def test_steps_of_no_time_are_refused_and_change_nothing(pair, dt):
 
 
 @pytest.mark.parametrize("substeps", BAD_SUBSTEPS)
-def test_other_than_whole_positive_numbers_of_steps_are_refused(pair, substeps):
+def test_refuses_bad_substeps(pair, substeps):
     sim, _ = pair
     before = sim.joint_q().copy()
     with pytest.raises(ValueError, match="substeps must be"):
@@ -129,7 +129,7 @@ def pair():
 
 
 @pytest.mark.parametrize("change", CHANGES, ids=[f"{c[0]}-{c[4].name}" for c in CHANGES])
-def test_notified_change_acts_on_its_own_world_alone(pair, change):
+def test_notified_change_affects_only_its_world(pair, change):
     sim, before = pair
     name, rows, which, factor, flag = change
     array = getattr(sim.model, name)
@@ -162,7 +162,7 @@ def test_gravity_of_each_world():
     assert sim.joint_qd()[:, :3] == pytest.approx(np.array([[0.0, 0.0, -9.81], [1.0, 2.0, -3.0]]) * DT, abs=1e-6)
 
 
-def test_reset_of_the_solver_alone_leaves_the_state():
+def test_solver_reset_with_flag_none_keeps_the_state():
     sim = simulation(2)
     trajectory(sim, steps=25)
     moved = sim.joint_q().copy()
@@ -172,7 +172,7 @@ def test_reset_of_the_solver_alone_leaves_the_state():
     assert not sim.paw_force.numpy().any()
 
 
-def test_world_with_nan_is_parked_and_disturbs_no_other():
+def test_diverged_world_is_frozen_and_disturbs_no_other():
     sims = [simulation(3), simulation(3)]
     for sim in sims:
         launch(sim)
@@ -186,7 +186,7 @@ def test_world_with_nan_is_parked_and_disturbs_no_other():
     for _ in range(20):
         broken.step()
         intact.step()
-    assert broken.solver.invalid.numpy().tolist() == [0, 1, 0]
+    assert broken.solver.diverged.numpy().tolist() == [0, 1, 0]
     assert broken.joint_q()[1] == pytest.approx(broken.model.joint_q.numpy().reshape(3, COORDS)[1], abs=1e-6)
     assert not broken.joint_qd()[1].any()
     for world in (0, 2):
@@ -197,7 +197,7 @@ def test_world_with_nan_is_parked_and_disturbs_no_other():
         sim.solver.reset(sim.state, mask)
         sim.step()
         sim.step()
-    assert not broken.solver.invalid.numpy().any()
+    assert not broken.solver.diverged.numpy().any()
     assert np.array_equal(broken.joint_q(), intact.joint_q())
 
 
@@ -207,7 +207,7 @@ def test_runs_repeat_bit_for_bit(pair):
     assert np.array_equal(trajectory(simulation(2)), before)
 
 
-def test_explicit_torques_move_as_the_motors_do():
+def test_explicit_torques_match_closed_loop_motors():
     driven, explicit = simulation(2), simulation(2)
     for sim in (driven, explicit):
         launch(sim)
@@ -229,7 +229,7 @@ def test_explicit_torques_move_as_the_motors_do():
     assert largest > 10.0
 
 
-def test_step_leaves_its_input_alone():
+def test_step_does_not_write_its_input():
     sim = simulation(2)
     launch(sim)
     out = sim.model.state()
@@ -242,7 +242,7 @@ def test_step_leaves_its_input_alone():
     assert np.array_equal(sim.joint_q().ravel(), out.joint_q.numpy())
 
 
-def test_bodies_are_those_of_newtons_kinematics(pair):
+def test_bodies_match_newton_kinematics(pair):
     sim, _ = pair
     trajectory(sim, steps=15)
     state = sim.model.state()

@@ -1,4 +1,4 @@
-"""Hard stops: robots that rest on them, their law against a quadratic program, and the energy they take."""
+"""Hard stops: robots that rest on them, impulses against a quadratic program, and dissipated energy."""
 
 import math
 
@@ -28,7 +28,7 @@ from solver_helpers import BODIES, DOFS, MOTOR_V, Reference, States, random_stat
 
 DT = 1.0 / 480.0
 BOUNDED = np.vstack([np.eye(12), np.kron(np.eye(4), [0.0, 1.0, 1.0])])
-"""What stops bound: the motors, and each leg's outer + inner."""
+"""Quantities with stops: the motors, and each leg's outer + inner."""
 LOWER = np.radians([-50.0, -30.0, -30.0] * 4 + [0.0] * 4).astype(np.float32).astype(float)
 UPPER = np.radians([110.0, 140.0, 140.0] * 4 + [240.0] * 4).astype(np.float32).astype(float)
 STRENGTH = DT * LIMIT_STIFFNESS + LIMIT_DAMPING
@@ -113,8 +113,8 @@ def at_the_stops(n, seed, joint_rate=8.0):
     return states
 
 
-class Steps:
-    """Single steps in double precision, with the stops or with none."""
+class StopSteps:
+    """Single steps in double precision, with or without stops."""
 
     def __init__(self, num_worlds, *, stops):
         self.n, self.model = num_worlds, build_model(num_worlds, visuals=False, device="cpu")
@@ -156,7 +156,7 @@ def repeated(states, times):
     return States(*(np.repeat(values, times, axis=0) for values in vars(states).values()))
 
 
-def test_stops_are_the_solution_of_a_quadratic_program():
+def test_stops_solve_a_quadratic_program():
     """In flight the rates are affine in the torques, so that stops without contact are a least-squares problem.
 
     With torques f >= 0 of both stops of each quantity, speeds s = s_free + J A J' f away from them and the law
@@ -165,10 +165,10 @@ def test_stops_are_the_solution_of_a_quadratic_program():
     n = 40
     states = at_the_stops(n, 21)
     states.pos[:, 2] = 3.0
-    stopping = Steps(n, stops=True)
+    stopping = StopSteps(n, stops=True)
     found, (lower, upper) = stopping.run(states).rates, stopping.bounds()
     units = np.tile(np.vstack([np.zeros(12), np.eye(12)]), (n, 1))
-    free = Steps(13 * n, stops=False).run(repeated(states, 13), units).rates.reshape(n, 13, 12)
+    free = StopSteps(13 * n, stops=False).run(repeated(states, 13), units).rates.reshape(n, 13, 12)
     toward = np.vstack([BOUNDED, -BOUNDED])
     several = surprised = 0
     for i in range(n):
@@ -187,7 +187,7 @@ def test_stops_are_the_solution_of_a_quadratic_program():
 
 
 @pytest.mark.parametrize("falling", [False, True])
-def test_stops_give_back_no_more_energy_than_they_hold(falling):
+def test_stops_return_no_more_energy_than_they_store(falling):
     """One step with stops and contact leaves no more kinetic and spring energy than the same one without them."""
     n = 64
     states = at_the_stops(n, 22, joint_rate=15.0)
@@ -198,10 +198,10 @@ def test_stops_give_back_no_more_energy_than_they_hold(falling):
         sim = simulation(n)
         write_state(sim, states.joint_q().reshape(n, -1))
         states.pos[:, 2] += PAW_RADIUS + 1.0e-4 - paw_centres(sim)[..., 2].min(axis=1)
-    stopping = Steps(n, stops=True)
+    stopping = StopSteps(n, stops=True)
     ended = stopping.run(states)
     states.pos[:, 2] += 3.0
-    freely = Steps(n, stops=False).run(states)
+    freely = StopSteps(n, stops=False).run(states)
     freely.pos[:] = ended.pos
     reference = Reference(stopping.model)
 

@@ -1,4 +1,4 @@
-"""Steps on Warp's tape against central differences in double precision: robots that stick, slide, press stops, fly."""
+"""Gradients of steps on Warp's tape against central differences in double precision."""
 
 import math
 
@@ -18,8 +18,8 @@ SLOTS = [*range(7), *(7 + 5 * leg + j for leg in range(4) for j in (0, 1, 3))]
 DOFS = [*range(6), *(6 + 5 * leg + j for leg in range(4) for j in (0, 1, 3))]
 
 
-class Steps:
-    """The inputs of some steps in double precision, and the gradient of a random sum over the last state."""
+class TapeSteps:
+    """Inputs of some steps in double precision, and the gradient of a random weighted sum of the last state."""
 
     def __init__(self):
         self.dynamics = JumperDynamics(build_model(N, visuals=False, requires_grad=True, device="cpu"), double=True)
@@ -69,7 +69,7 @@ class Steps:
 
 @pytest.fixture(scope="module")
 def steps():
-    return Steps()
+    return TapeSteps()
 
 
 def gradient(arrays, name):
@@ -98,7 +98,7 @@ def test_gradients_match_central_differences(steps, name, h, rel):
         assert (found * way).sum() == pytest.approx((sides[0] - sides[1]) / (2.0 * h), rel=rel)
 
 
-def test_gradients_add_up_until_they_are_zeroed(steps):
+def test_gradients_accumulate_until_zeroed(steps):
     tape, arrays, ends = steps.record(steps.values)
     steps.backward(tape, ends)
     once = {name: gradient(arrays, name) for name in arrays}
@@ -109,7 +109,7 @@ def test_gradients_add_up_until_they_are_zeroed(steps):
     assert not any(gradient(arrays, name).any() for name in arrays)
 
 
-def test_the_solver_records_its_steps_and_the_model_that_they_read():
+def test_tape_records_solver_steps_and_packed_model():
     """In single precision: a force on a flying robot's base, and its mass."""
     model = build_model(1, visuals=False, requires_grad=True, ground=None, device="cpu")
     solver, control, before, after = SolverJumper(model), model.control(), model.state(), model.state()

@@ -6,11 +6,11 @@ import torch
 from torch.func import jacrev
 
 from jumper_warp.policies.policy import Policy
-from jumper_warp.trajectory.gauss_newton import Anchor, Network, Tape, gauss_newton_step, world_rows
+from jumper_warp.trajectory.gauss_newton import Anchor, Network, Tape, gauss_newton_step, per_world_gradients
 from tests.policies.test_policy import make_interface
 
 
-def small(num_obs=3, hidden=(4, 5), num_actions=2):
+def small_policy(num_obs=3, hidden=(4, 5), num_actions=2):
     torch.manual_seed(0)
     sizes = (num_obs, *hidden, num_actions)
     layers = [(0.5 * torch.randn(b, a), 0.1 * torch.randn(b)) for a, b in pairwise(sizes)]
@@ -19,28 +19,28 @@ def small(num_obs=3, hidden=(4, 5), num_actions=2):
     return policy, Network(policy, dtype=torch.float64)
 
 
-def test_network_acts_as_the_policy():
-    policy, network = small()
+def test_network_matches_policy():
+    policy, network = small_policy()
     obs = 5.0 * torch.randn(20, 3)
     torch.testing.assert_close(network.act(obs.double()).float(), policy.act(obs))
 
 
-def test_rows_are_the_derivatives_of_each_world():
-    _, network = small()
+def test_per_world_gradients_match_autograd():
+    _, network = small_policy()
     obs, tape = torch.randn(4, 3, dtype=torch.float64), Tape()
 
-    def numbers(weights, tape=None):
+    def losses(weights, tape=None):
         first = network.act(obs, weights, tape)
-        again = network.act(obs + first.sum(1, keepdim=True), weights, tape)  # the second step sees the first
+        again = network.act(obs + first.sum(1, keepdim=True), weights, tape)  # the second step depends on the first
         return (first * again).sum(1)
 
-    total = numbers(network.weights, tape).sum()
-    expected = jacrev(numbers)(network.weights)
-    torch.testing.assert_close(world_rows(total, tape), expected, rtol=1.0e-10, atol=1.0e-12)
+    total = losses(network.weights, tape).sum()
+    expected = jacrev(losses)(network.weights)
+    torch.testing.assert_close(per_world_gradients(total, tape), expected, rtol=1.0e-10, atol=1.0e-12)
 
 
-def test_step_solves_its_equation():
-    _, network = small()
+def test_step_matches_dense_solution():
+    _, network = small_policy()
     weights, size = network.weights, len(network.weights)
     anchor = Anchor(network, torch.randn(9, 3, dtype=torch.float64), torch.rand(9, dtype=torch.float64) + 0.1)
     moved = weights + 0.05 * torch.randn(size, dtype=torch.float64)
@@ -48,9 +48,9 @@ def test_step_solves_its_equation():
     importance = torch.rand(6, dtype=torch.float64)
     step = gauss_newton_step(moved, [rows[:2], rows[2:]], [misses[:2], misses[2:]], [importance[:2], importance[2:]],
                              anchor, 0.5, 200, 1.0e-9)  # fmt: skip
-    off = anchor.off(moved).flatten()
-    change = jacrev(lambda w: anchor.off(w).flatten())(moved)
+    residuals = anchor.residuals(moved).flatten()
+    change = jacrev(lambda w: anchor.residuals(w).flatten())(moved)
     matrix = rows.T @ (importance[:, None] * rows) + change.T @ change + 0.5 * torch.eye(size, dtype=torch.float64)
-    right = -rows.T @ (importance * misses) - change.T @ off
+    right = -rows.T @ (importance * misses) - change.T @ residuals
     torch.testing.assert_close(step, torch.linalg.solve(matrix, right), rtol=1.0e-6, atol=1.0e-6 * float(step.norm()))
     assert anchor.cost(moved) > 0.0 == anchor.cost(weights)

@@ -1,3 +1,5 @@
+"""Trajectory optimisation: knots, terms of jumps against the simulation, and descents with known minima."""
+
 import math
 
 import numpy as np
@@ -27,16 +29,16 @@ def problem(objective=None, constraints=(), **settings) -> Problem:
 
 @pytest.fixture(scope="module")
 def jump():
-    made = problem()
+    jump_problem = problem()
     x = torch.as_tensor(SQUAT_AND_PUSH.reshape(1, -1))
     with torch.no_grad():
-        return made, x, made.motion(x)
+        return jump_problem, x, jump_problem.motion(x)
 
 
 # ---------------------------------------------------------------- knots
 
 
-def test_targets_are_interpolated_actions():
+def test_knots_interpolate_actions():
     x = np.zeros((1, len(KNOTS)))
     x[0, 4:8] = [1.0, -0.5, 0.25, 0.0]  # front outer, front inner, hind outer, hind inner at step 8
     targets = KNOTS.targets(torch.as_tensor(x))[..., 0].numpy()
@@ -47,7 +49,7 @@ def test_targets_are_interpolated_actions():
     assert np.degrees(targets[30]) == pytest.approx(rest)
 
 
-def test_all_motors_can_be_free():
+def test_asymmetric_knots_set_all_motors():
     knots = Knots((0.0, 3.0), steps=5, symmetric=False)
     x = np.random.default_rng(0).uniform(-1.0, 1.0, (2, len(knots)))
     targets = knots.targets(torch.as_tensor(x)).numpy()
@@ -56,7 +58,7 @@ def test_all_motors_can_be_free():
 
 
 @pytest.mark.parametrize("at", [(1.0, 3.0), (0.0, 3.0, 3.0), (0.0, 5.0), (0.0,)])
-def test_knots_that_cannot_be_are_refused(at):
+def test_refuses_bad_knots(at):
     with pytest.raises(InputError, match="knots must rise"):
         Knots(at, steps=5)
 
@@ -64,13 +66,13 @@ def test_knots_that_cannot_be_are_refused(at):
 # ---------------------------------------------------------------- jumps
 
 
-def test_air_time_is_that_of_a_projectile():
+def test_air_time_matches_projectile():
     up, drop = torch.tensor([3.0, 0.0, -1.0], dtype=torch.float64), torch.tensor([0.2, 0.45, 0.3], dtype=torch.float64)
     time = jumps.air_time(up, drop, 9.81)
     assert (drop + up * time - 0.5 * 9.81 * time**2).numpy() == pytest.approx(0.0, abs=1e-12)
 
 
-def test_flight_of_a_jump_does_not_depend_on_the_row_after_takeoff(jump):
+def test_momentum_in_flight_follows_a_parabola(jump):
     """The parabola through any row in the air is the same, but for the step's error."""
     _, _, motion = jump
     row, off = motion.takeoff(0.25)
@@ -83,10 +85,16 @@ def test_flight_of_a_jump_does_not_depend_on_the_row_after_takeoff(jump):
     assert later.spin.numpy() == pytest.approx(now.spin.numpy(), abs=0.02)
 
 
-def test_simulation_that_is_given_the_targets_does_the_same(jump):
-    made, x, motion = jump
-    sim = Simulation(1, motors=made.motors, command_filter=made.command_filter, friction=made.friction, device="cpu")
-    targets, heights = made.knots.targets(x)[..., 0].numpy(), []
+def test_motion_matches_simulation(jump):
+    jump_problem, x, motion = jump
+    sim = Simulation(
+        1,
+        motors=jump_problem.motors,
+        command_filter=jump_problem.command_filter,
+        friction=jump_problem.friction,
+        device="cpu",
+    )
+    targets, heights = jump_problem.knots.targets(x)[..., 0].numpy(), []
     for target in targets:
         sim.target.assign(target[:, None].astype(np.float32))
         sim.step()
@@ -96,13 +104,13 @@ def test_simulation_that_is_given_the_targets_does_the_same(jump):
     assert -float(jumps.highest()(motion)) == pytest.approx(max(heights), abs=3e-3)
 
 
-def test_work_is_that_of_every_physics_step(jump):
-    made, x, motion = jump
+def test_positive_work_matches_sum_over_physics_steps(jump):
+    jump_problem, x, motion = jump
     fine = Rollout(
-        build_model(1, visuals=False, friction=made.friction), made.motors, made.command_filter, double=True,
-        tolerance=made.tolerance, every=1, threads=1,
+        build_model(1, visuals=False, friction=jump_problem.friction), jump_problem.motors,
+        jump_problem.command_filter, double=True, tolerance=jump_problem.tolerance, every=1, threads=1,
     )  # fmt: skip
-    exact = fine.run(made.knots.targets(x).numpy(), *fine.standing())
+    exact = fine.run(jump_problem.knots.targets(x).numpy(), *fine.standing())
     rate, torque = exact.qd.numpy()[:, 6:, 0], exact.torque.numpy()[:, :, 0]
     power = torque * 0.5 * (rate[1:] + rate[:-1])
     work = fine.dt * np.maximum(power, 0.0).sum()
@@ -110,14 +118,14 @@ def test_work_is_that_of_every_physics_step(jump):
     assert float(motion.positive_work[-1, 0]) == pytest.approx(work, rel=0.03)
 
 
-def test_a_second_hop_is_not_the_apex():
-    """A small hop, a squat in the air, and a jump: the apex is that of the hop."""
-    made = problem()
-    made.knots = Knots((0.0, 7.0, 8.0, 30.0, 31.0), steps=56)
+def test_highest_ignores_a_second_hop():
+    """After a small hop, a squat in the air and a jump, the apex is the hop's."""
+    jump_problem = problem()
+    jump_problem.knots = Knots((0.0, 7.0, 8.0, 30.0, 31.0), steps=56)
     x = torch.full((1, 5, 4), -1.0, dtype=torch.float64)
     x[:, 2:4], x[:, 4] = 0.5, -0.5
     with torch.no_grad():
-        motion = made.motion(x.reshape(1, -1))
+        motion = jump_problem.motion(x.reshape(1, -1))
     height, row = motion.q[:, 0, 2].numpy(), int(motion.takeoff(0.25)[0])
     again = row + int(motion.down[row:, :, 0].any(dim=1).int().argmax())
     assert row < 15 and height[again:].max() > height[:again].max() + 0.05
@@ -137,15 +145,14 @@ TERMS = {
 }
 
 
-def test_gradients_are_those_of_central_differences():
+def test_gradients_match_central_differences():
     rng, h = np.random.default_rng(1), 1.0e-6
     x = SQUAT_AND_PUSH.reshape(1, -1) + 0.02 * rng.normal(size=(1, len(KNOTS)))
     directions = rng.normal(size=(3, len(KNOTS)))
     ends = torch.as_tensor(np.concatenate([x + h * directions, x - h * directions]))
     whole = problem(TERMS["farthest"], list(TERMS.values()), tolerance=1e-13)
     with torch.no_grad():
-        found = whole.evaluate(ends).constraints
-    ahead, behind = found.split(3)
+        ahead, behind = whole.evaluate(ends).constraints.split(3)
     expected = ((ahead - behind) / (2.0 * h)).numpy()
     for i, name in enumerate(TERMS):
         _, gradient = whole.gradient(torch.as_tensor(x), lambda values, i=i: values.constraints[:, i])
@@ -158,7 +165,7 @@ def test_gradients_are_those_of_central_differences():
 
 
 class Bowl:
-    """A problem whose solution is known: the point of a half space that is nearest to a goal, in a narrow valley."""
+    """Problem with a known solution: the point of a half space nearest to a goal, in a narrow valley."""
 
     def __init__(self):
         self.knots, self.double, self.world_steps, self.reverse_steps = range(2), True, 0, 0
@@ -169,9 +176,9 @@ class Bowl:
         return self
 
     def evaluate(self, x):
-        away = x - self.goal
+        offset = x - self.goal
         self.world_steps += len(x)
-        return Values(away[:, 0] ** 2 + 20.0 * away[:, 1] ** 2, (x.sum(1) - 0.5)[:, None])
+        return Values(offset[:, 0] ** 2 + 20.0 * offset[:, 1] ** 2, (x.sum(1) - 0.5)[:, None])
 
     def gradient(self, x, merit):
         x = x.detach().requires_grad_()
@@ -186,29 +193,29 @@ NEAREST = np.array([0.6 - 20.0 * 0.5 / 21.0, 0.4 - 0.5 / 21.0])
 
 def test_descent_finds_the_constrained_minimum():
     begin = np.array([[-0.9, 0.9], [0.9, -0.9], [-0.5, -0.5]])
-    found = minimise(Bowl(), begin, iterations=120)
-    assert found.x == pytest.approx(np.tile(NEAREST, (3, 1)), abs=3e-3)
-    assert (found.violation <= 1e-3).all() and found.history[-1]["reverse_steps"] > 300
+    result = minimise(Bowl(), begin, iterations=120)
+    assert result.x == pytest.approx(np.tile(NEAREST, (3, 1)), abs=3e-3)
+    assert (result.violation <= 1e-3).all() and result.history[-1]["reverse_steps"] > 300
     again = minimise(Bowl(), begin, iterations=120)
-    assert np.array_equal(found.x, again.x)
+    assert np.array_equal(result.x, again.x)
 
 
 def test_descent_stays_in_the_box():
     bowl = Bowl()
     bowl.goal = torch.tensor([3.0, -0.2], dtype=torch.float64)
     bowl.evaluate = lambda x: Values((x - bowl.goal).square().sum(1), x.new_zeros(len(x), 0))
-    found = minimise(bowl, np.zeros((1, 2)), iterations=40)
-    assert found.x[0] == pytest.approx([1.0, -0.2], abs=1e-4)
+    result = minimise(bowl, np.zeros((1, 2)), iterations=40)
+    assert result.x[0] == pytest.approx([1.0, -0.2], abs=1e-4)
 
 
-def test_smoothed_descent_comes_near_from_afar():
+def test_smoothed_descent_approaches_the_minimum():
     begin = np.random.default_rng(0).uniform(-1.0, 1.0, (64, 2))
-    stages = (Stage(8, 60, 0.05, 0.05, least=1.0), Stage(2, 100, 0.03, 0.03, penalty=100.0))
-    found = smoothed(Bowl(), begin, stages=stages)
-    assert found.shape == (2, 2) and found == pytest.approx(np.tile(NEAREST, (2, 1)), abs=0.03)
+    stages = (Stage(8, 60, 0.05, 0.05, final_fraction=1.0), Stage(2, 100, 0.03, 0.03, penalty=100.0))
+    result = smoothed(Bowl(), begin, stages=stages)
+    assert result.shape == (2, 2) and result == pytest.approx(np.tile(NEAREST, (2, 1)), abs=0.03)
 
 
-def test_multipliers_keep_a_smoothed_descent_within_its_constraints():
+def test_multipliers_enforce_constraints_of_smoothed_descent():
     begin = torch.tensor([[0.5, 0.3]], dtype=torch.float64)
     violation = {}
     for dual in (0.0, 0.5):
@@ -217,84 +224,84 @@ def test_multipliers_keep_a_smoothed_descent_within_its_constraints():
     assert violation[0.0] > 0.1 and abs(violation[0.5]) < 0.02
 
 
-def test_starts_with_multipliers_end_at_their_best_within_the_constraints():
+def test_stage_with_slack_ends_at_best_feasible_points():
     begin = torch.tensor([[0.5, 0.3]], dtype=torch.float64)
     stage = Stage(1, 300, 0.02, 0.02, penalty=1.0, dual=0.5, slack=0.5)
-    found = descend(Bowl(), begin, stage, np.random.default_rng(0))
-    assert float(found.sum() - 0.5) < 5e-3
-    assert found[0].numpy() == pytest.approx(NEAREST, abs=0.05)
+    result = descend(Bowl(), begin, stage, np.random.default_rng(0))
+    assert float(result.sum() - 0.5) < 5e-3
+    assert result[0].numpy() == pytest.approx(NEAREST, abs=0.05)
 
 
 class Edge(Bowl):
-    """The valley ends at 0.45: beyond it everything is bad and nothing says where to go."""
+    """The valley ends at 0.45: beyond it the objective is large and constant."""
 
     def evaluate(self, x):
         values = super().evaluate(x)
         return Values(torch.where(x[:, 0] > 0.45, 5.0, values.objective), values.constraints - 1.0)
 
 
-def test_starts_that_fell_off_an_edge_go_back():
+def test_starts_return_to_their_best_point_after_an_edge():
     begin = torch.tensor([[0.3, 0.4], [-0.5, 0.3]], dtype=torch.float64)
     ends = {}
     for slack in (math.inf, 0.1):
-        stage = Stage(2, 120, 0.05, 0.01, least=1.0, slack=slack)
+        stage = Stage(2, 120, 0.05, 0.01, final_fraction=1.0, slack=slack)
         ends[slack] = Edge().evaluate(descend(Edge(), begin, stage, np.random.default_rng(0))).objective
     assert (ends[math.inf] == 5.0).any()
     first = Edge().evaluate(begin).objective
     assert (ends[0.1] <= first).all() and ends[0.1][1] < first[1] - 1.0
 
 
-def test_starts_that_go_back_go_on_with_smaller_steps():
+def test_returned_starts_take_smaller_steps():
     begin, merit = torch.tensor([[0.2, 0.3]], dtype=torch.float64), {}
-    for calmer in (1.0, 0.5):
-        stage = Stage(1, 100, 0.3, 0.01, least=1.0, slack=0.001, look=2, calmer=calmer)
-        merit[calmer] = float(Edge().evaluate(descend(Edge(), begin, stage, np.random.default_rng(0))).objective)
+    for scale in (1.0, 0.5):
+        stage = Stage(1, 100, 0.3, 0.01, final_fraction=1.0, slack=0.001, check_every=2, return_scale=scale)
+        merit[scale] = float(Edge().evaluate(descend(Edge(), begin, stage, np.random.default_rng(0))).objective)
     assert merit[0.5] < 0.0226 < 0.1 < merit[1.0]  # (0.6 - 0.45)^2
 
 
-def test_crossings_have_the_beginning_of_one_and_the_end_of_another():
+def test_crossings_join_a_beginning_with_another_end():
     knots = Knots(tuple(map(float, range(12))), steps=12)
     rows = torch.arange(12.0)[:, None] + torch.tensor([0.0, 100.0, 200.0])[:, None, None]  # knot + 100 x parent
     whole = crossed(knots, rows.expand(3, 12, 4).flatten(1), 66, np.random.default_rng(0)).reshape(198, 12, 4)
     assert (whole == whole[..., :1]).all()
     parent, knot = torch.div(whole[..., 0], 100.0, rounding_mode="floor"), whole[..., 0] % 100.0
     assert (parent[:, 0] == torch.arange(3.0).repeat(66)).all()
-    assert (parent[:, 0] != parent[:, -1]).all()  # of two, never of one
+    assert (parent[:, 0] != parent[:, -1]).all()  # two different parents
     assert ((parent.diff(dim=1) != 0.0).sum(1) == 1).all()
-    own = parent == parent[:, :1]
-    assert (knot[own] == torch.arange(12.0).expand(198, 12)[own]).all()
+    beginning = parent == parent[:, :1]
+    assert (knot[beginning] == torch.arange(12.0).expand(198, 12)[beginning]).all()
     assert 0 < (knot - torch.arange(12.0)).abs().max() <= SHIFT
 
 
-def test_search_crosses_its_starts():
+def test_smoothed_search_uses_crossings():
     begin = np.array([[0.0, 0.0, 0.0, 0.0, 0.9, 0.9, 0.9, 0.9], [0.9, 0.9, 0.9, 0.9, 0.0, 0.0, 0.0, 0.0]])
 
     class Ends(Bowl):
-        """Best where all knots are 0, which are one's beginning and the other's end."""
+        """Best where all knots are 0: the beginning of one start and the end of the other."""
 
         def evaluate(self, x):
             return Values(x.square().sum(1), x.new_zeros(len(x), 0))
 
     bowl = Ends()
     bowl.knots = Knots((0.0, 1.0), steps=2)
-    found = smoothed(bowl, begin, stages=(Stage(1, 1, 1e-6, 1e-6, crossings=16),))
-    assert np.abs(found).max() < 1e-3
+    result = smoothed(bowl, begin, stages=(Stage(1, 1, 1e-6, 1e-6, crossings=16),))
+    assert np.abs(result).max() < 1e-3
 
 
-def test_a_jump_gets_higher_within_its_constraints():
+def test_descent_raises_a_jump_within_its_constraints():
     limit = math.radians(10.0)
-    made = problem(constraints=(jumps.clear(), jumps.upright(limit)))
+    jump_problem = problem(constraints=(jumps.clear(), jumps.upright(limit)))
     begin = SQUAT_AND_PUSH.reshape(1, -1)
     with torch.no_grad():
-        before = made.evaluate(torch.as_tensor(begin))
-    found = minimise(made, begin, iterations=6, step=0.05)
-    assert found.objective[0] < float(before.objective) - 0.02
+        before = jump_problem.evaluate(torch.as_tensor(begin))
+    result = minimise(jump_problem, begin, iterations=6, step=0.05)
+    assert result.objective[0] < float(before.objective) - 0.02
     with torch.no_grad():
-        after = made.evaluate(torch.as_tensor(found.x))
-    assert float(after.objective) == pytest.approx(found.objective[0], abs=1e-9)
+        after = jump_problem.evaluate(torch.as_tensor(result.x))
+    assert float(after.objective) == pytest.approx(result.objective[0], abs=1e-9)
     assert float(after.constraints.max()) <= 1e-3
 
 
-def test_starts_of_another_shape_are_refused():
+def test_refuses_starts_of_another_shape():
     with pytest.raises(InputError, match="starts must have shape"):
         minimise(problem(), np.zeros((2, 3)))

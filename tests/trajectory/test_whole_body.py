@@ -1,4 +1,4 @@
-"""Places and momenta of the links against those of the simulation's own links."""
+"""Kinematics, momentum and clearance against the simulation's kernels."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ MOTORS = [5 * leg + joint for leg in range(4) for joint in (0, 1, 3)]
 
 @pytest.fixture(scope="module")
 def links():
-    """Return the robot, random states of it, and poses and twists of all links by the simulation's kernels."""
+    """Return model, body, q (N, 19), qd (N, 18), and poses (N, 21, 7) and twists (N, 21, 6) of the kernels."""
     rng, model = np.random.default_rng(0), build_model(N, visuals=False)
     joint_q, joint_qd = np.zeros((N, 43)), np.zeros((N, 38))
     angles = rng.uniform(0.2, 1.5, (N, 4, 3)) * [0.2, 1.0, 1.0]
@@ -36,17 +36,17 @@ def links():
     return model, WholeBody(Rollout(model, double=True)), q, qd, pose, twist
 
 
-def test_links_are_where_the_simulation_has_them(links):
+def test_link_poses_match_simulation(links):
     _, body, q, qd, pose, _ = links
     frames = body.legs(q, qd)
     turn = Rotation.from_quat(pose[:, 1:, 3:].reshape(-1, 4)).as_matrix().reshape(N, 20, 3, 3)
     assert frames.pos.flatten(1, 2).numpy() == pytest.approx(pose[:, 1:, :3], abs=1e-6)
-    assert frames.turn.flatten(1, 2).numpy() == pytest.approx(turn, abs=1e-6)
+    assert frames.rotation.flatten(1, 2).numpy() == pytest.approx(turn, abs=1e-6)
     places, ankles = body.points(q)
     assert torch.allclose(places, frames.pos, atol=1e-12) and torch.allclose(ankles, frames.ankle, atol=1e-12)
 
 
-def test_momentum_is_the_sum_over_the_links(links):
+def test_momentum_matches_sum_over_links(links):
     model, body, q, qd, pose, twist = links
     mass = model.body_mass.numpy().reshape(N, 21, 1).astype(float)
     turn = Rotation.from_quat(pose[..., 3:].reshape(-1, 4)).as_matrix().reshape(N, 21, 3, 3)
@@ -57,16 +57,16 @@ def test_momentum_is_the_sum_over_the_links(links):
     spin = ((inertia @ twist[..., 3:, None])[..., 0] + mass * np.cross(arm, moving)).sum(1)
     square = (arm**2).sum(-1)[..., None, None] * np.eye(3) - arm[..., None] * arm[..., None, :]
     whole = (inertia + mass[..., None] * square).sum(1)
-    found = body.momentum(q, qd)
-    for mine, theirs in zip(found, (com, vel, spin, whole), strict=True):
+    momentum = body.momentum(q, qd)
+    for mine, theirs in zip(momentum, (com, vel, spin, whole), strict=True):
         assert mine.numpy() == pytest.approx(theirs, abs=1e-5)
     assert body.base_velocity(q, qd).numpy() == pytest.approx(
         twist[:, 0, :3] - np.cross(twist[:, 0, 3:], (turn[:, 0] @ model.body_com.numpy()[0])), abs=1e-5
     )
 
 
-def test_clearance_says_what_the_collision_kernels_say(links):
-    """Lowered until a kind of link is 1 mm over the ground, the kernel sees no contact of it, 1 mm under it one."""
+def test_clearance_matches_collision_kernel(links):
+    """The kernel reports no contact with a kind of link 1 mm above the ground, and contact 1 mm below."""
     model, body, q, _, _, _ = links
     flags = (collision.HOUSING_GROUND, collision.THIGH_GROUND, collision.KNEE_GROUND, collision.SHANK_GROUND)
     gaps = body.clearance(q).amin(1).numpy()
@@ -77,10 +77,10 @@ def test_clearance_says_what_the_collision_kernels_say(links):
             joint_q[:, :7] = q[:, :7].numpy()
             joint_q[:, 2] -= gaps[:, kind] + down
             joint_q[:, 7:][:, MOTORS] = q[:, 7:].numpy()
-            found, distance = wp.zeros(N, dtype=int), wp.zeros(N, dtype=float)
+            flags_out, distance = wp.zeros(N, dtype=int), wp.zeros(N, dtype=float)
             wp.launch(
                 collision.collision_kernel, dim=N,
                 inputs=[dynamics.robot.geometry, dynamics.robot.ground, wp.array(joint_q.ravel()), int(COORDS), 0.0],
-                outputs=[found, distance],
+                outputs=[flags_out, distance],
             )  # fmt: skip
-            assert ((found.numpy() & int(flag)) != 0).tolist() == [there] * N, (kind, down)
+            assert ((flags_out.numpy() & int(flag)) != 0).tolist() == [there] * N, (kind, down)

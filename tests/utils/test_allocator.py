@@ -15,18 +15,18 @@ def faults():
         del arrays
     return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
 
-assert ctypes.CDLL(None).mallopt(MMAP_THRESHOLD, 128 << 10) == 1  # as it is at first: larger blocks are given back
-given_back = faults()
-told = keep_freed_memory()
+assert ctypes.CDLL(None).mallopt(MMAP_THRESHOLD, 128 << 10) == 1  # the default: larger blocks are freed
+faults_before = faults()
+accepted = keep_freed_memory()
 faults()
-print(told, given_back, faults())
+print(accepted, faults_before, faults())
 """
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="glibc")
-def test_freed_memory_is_kept():
+def test_freed_memory_causes_no_page_faults_on_reuse():
     done = subprocess.run([sys.executable, "-c", CODE], capture_output=True, text=True, check=True)
-    told, given_back, kept = done.stdout.split()
-    assert told == "True"
-    assert int(given_back) > 50_000  # 3 x 80 MB are 58,594 pages
-    assert int(kept) < 1000
+    accepted, faults_before, faults_after = done.stdout.split()
+    assert accepted == "True"
+    assert int(faults_before) > 50_000  # 3 x 80 MB are 58,594 pages
+    assert int(faults_after) < 1000

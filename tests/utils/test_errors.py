@@ -9,14 +9,14 @@ ROOT = Path(__file__).resolve().parents[2]
 FILES = [*ROOT.glob("jumper_warp/**/*.py"), *ROOT.glob("experiments/*.py")]
 
 
-def test_message_is_one_line():
+def test_input_error_message_is_one_line():
     assert str(InputError("expected  a,\n\tgot b ")) == "expected a, got b"
     assert issubclass(InputError, ValueError)
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
-def test_refusals_are_input_errors(path):
-    """A bare ValueError would be taken for a fault, and a command would show its traceback."""
+def test_modules_raise_input_error_instead_of_value_error(path):
+    """No module raises a bare ValueError, for which a command would print a traceback."""
     tree = ast.parse(path.read_text())
     raised = [node.exc for node in ast.walk(tree) if isinstance(node, ast.Raise) and node.exc is not None]
     bases = [base for node in ast.walk(tree) if isinstance(node, ast.ClassDef) for base in node.bases]

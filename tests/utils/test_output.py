@@ -8,13 +8,12 @@ import numpy as np
 import pytest
 from rich.console import Console
 
-from jumper_warp.utils import output as figures
-from jumper_warp.utils import runtime
+from jumper_warp.utils import output, runtime
 
 
-def test_default_folder_is_outputs_name_and_second(tmp_path, monkeypatch):
+def test_default_output_folder_is_name_and_time(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    folder = figures.output_dir("jump")
+    folder = output.output_dir("jump")
     assert folder.is_dir()
     assert folder.parent.as_posix() == "outputs/jump"
     assert [len(part) for part in folder.name.split("_")] == [len("2026-01-31"), len("23-59-59")]
@@ -22,22 +21,22 @@ def test_default_folder_is_outputs_name_and_second(tmp_path, monkeypatch):
 
 def test_two_runs_never_share_a_default_folder(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
-    assert len({figures.output_dir("jump") for _ in range(3)}) == 3
+    assert len({output.output_dir("jump") for _ in range(3)}) == 3
 
 
-def test_given_folder_is_used_as_it_is(tmp_path):
-    assert figures.output_dir("jump", tmp_path / "a" / "b") == tmp_path / "a" / "b"
-    assert figures.output_dir("jump", tmp_path / "a" / "b").is_dir()
+def test_given_output_folder_is_used_unchanged(tmp_path):
+    assert output.output_dir("jump", tmp_path / "a" / "b") == tmp_path / "a" / "b"
+    assert output.output_dir("jump", tmp_path / "a" / "b").is_dir()
 
 
 @pytest.mark.parametrize("name", ["", "..", "a/b", "/tmp"])
-def test_name_that_is_no_path_component_is_refused(name):
+def test_refuses_a_name_that_is_not_one_path_component(name):
     with pytest.raises(ValueError, match="one path component"):
-        figures.output_dir(name)
+        output.output_dir(name)
 
 
-def test_figures_come_back_as_written(tmp_path):
-    given = {
+def test_metrics_file_holds_the_given_metrics(tmp_path):
+    metrics = {
         "apex [m]": 1.075,
         "worlds": 4096,
         "method": "open loop",
@@ -45,47 +44,47 @@ def test_figures_come_back_as_written(tmp_path):
         "gap": None,
         "torques": [18.0, 1],
     }
-    path = figures.write_metrics(tmp_path, given)
+    path = output.write_metrics(tmp_path, metrics)
     assert path == tmp_path / "metrics.json"
-    assert json.loads(path.read_text(encoding="utf-8")) == given
+    assert json.loads(path.read_text(encoding="utf-8")) == metrics
 
 
 def test_numpy_scalars_are_written_as_numbers(tmp_path):
-    path = figures.write_metrics(tmp_path, {"a": np.float32(0.5), "b": [np.int64(3)], "c": np.bool_(True)})
+    path = output.write_metrics(tmp_path, {"a": np.float32(0.5), "b": [np.int64(3)], "c": np.bool_(True)})
     assert json.loads(path.read_text()) == {"a": 0.5, "b": [3], "c": True}
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, np.float32("nan")])
 @pytest.mark.parametrize(("shape", "name"), [(lambda x: x, "'apex'"), (lambda x: [0.0, x], r"'apex\[1\]'")])
-def test_non_finite_figure_is_refused_by_name_and_nothing_is_written(tmp_path, bad, shape, name):
+def test_refuses_a_non_finite_metric_by_name_and_writes_nothing(tmp_path, bad, shape, name):
     with pytest.raises(ValueError, match=name):
-        figures.write_metrics(tmp_path, {"fine": 1.0, "apex": shape(bad)})
+        output.write_metrics(tmp_path, {"fine": 1.0, "apex": shape(bad)})
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.parametrize("nested", [{"x": 1}, [[1]], np.zeros(2), object()])
-def test_nested_figure_is_refused_by_name(tmp_path, nested):
+def test_refuses_a_nested_metric_by_name(tmp_path, nested):
     with pytest.raises(TypeError, match="apex"):
-        figures.write_metrics(tmp_path, {"apex": nested})
+        output.write_metrics(tmp_path, {"apex": nested})
 
 
-def test_old_figures_stay_whole_if_writing_fails(tmp_path, monkeypatch):
-    figures.write_metrics(tmp_path, {"apex": 1.0})
+def test_failed_write_keeps_the_old_metrics(tmp_path, monkeypatch):
+    output.write_metrics(tmp_path, {"apex": 1.0})
 
     def full_disk(*_):
         raise OSError(28, "no space left")
 
     monkeypatch.setattr(os, "replace", full_disk)
     with pytest.raises(OSError, match="no space left"):
-        figures.write_metrics(tmp_path, {"apex": 2.0})
+        output.write_metrics(tmp_path, {"apex": 2.0})
     assert json.loads((tmp_path / "metrics.json").read_text()) == {"apex": 1.0}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["metrics.json", "run.json"]
 
 
-def test_run_says_what_made_the_figures_and_nothing_of_the_environment(tmp_path, monkeypatch):
+def test_run_json_has_versions_and_command_but_no_environment_variables(tmp_path, monkeypatch):
     monkeypatch.setenv("SOME_TOKEN", "hush-4711")
     monkeypatch.setattr(sys, "argv", ["/home/someone/experiments/jump.py", "--torque", "18"])
-    figures.write_metrics(tmp_path, {})
+    output.write_metrics(tmp_path, {})
     text = (tmp_path / "run.json").read_text()
     run = json.loads(text)
     assert set(run) == {"commit", "dirty", "versions", "device", "command"}
@@ -109,7 +108,7 @@ def test_commit_is_none_outside_git_and_before_the_first_commit(tmp_path):
     assert runtime.git_commit(tmp_path) is None
 
 
-def test_commit_follows_head_and_tells_changes(tmp_path):
+def test_commit_is_head_and_detects_untracked_files(tmp_path):
     _git(tmp_path, "init")
     (tmp_path / "package").mkdir()
     (tmp_path / "package" / "file").write_text("1")
@@ -121,7 +120,7 @@ def test_commit_follows_head_and_tells_changes(tmp_path):
     assert runtime.git_commit(tmp_path / "package") == (head, True)
 
 
-def test_commit_of_another_projects_tree_is_not_taken_for_ours(tmp_path):
+def test_commit_is_none_for_an_untracked_folder_of_another_project(tmp_path):
     _git(tmp_path, "init")
     (tmp_path / ".gitignore").write_text(".venv\n")
     _git(tmp_path, "add", ".")
@@ -131,7 +130,7 @@ def test_commit_of_another_projects_tree_is_not_taken_for_ours(tmp_path):
     assert runtime.git_commit(installed) is None
 
 
-def test_device_report_is_one_line_with_the_facts():
+def test_device_report_is_one_line():
     console = Console(record=True, width=40, quiet=False)
     info = runtime.report_device("cpu", console)
     lines = console.export_text().splitlines()
@@ -140,7 +139,7 @@ def test_device_report_is_one_line_with_the_facts():
     assert lines[0].startswith("device cpu") and "no CUDA device" in lines[0] and "graph capture on" in lines[0]
 
 
-def test_versions_name_python_and_tell_a_missing_package(monkeypatch):
+def test_versions_include_python_and_none_for_a_missing_package(monkeypatch):
     monkeypatch.setattr(runtime, "PACKAGES", ("numpy", "no-such-package-here"))
     version = ".".join(map(str, sys.version_info[:3]))
     assert runtime.versions() == {"python": version, "numpy": np.__version__, "no-such-package-here": None}

@@ -1,4 +1,4 @@
-"""What a run remembers of a user's files."""
+"""Checksums of user files that a run depends on."""
 
 import hashlib
 import json.decoder
@@ -6,22 +6,22 @@ from pathlib import Path
 
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.saving import task_to_json
-from jumper_warp.utils.sources import changed_sources, source_sums
+from jumper_warp.utils.sources import changed_sources, source_checksums
 
 
-def test_files_outside_the_project_are_named_by_their_module():
+def test_source_checksums_cover_only_modules_outside_the_project():
     saved = {
         "task": [{"func": "json.decoder:JSONDecoder"}, "jumper_warp.kernels.jump.rewards:base_at_rest"],
         "say": "now: nothing",
         "n": 1,
     }
-    held = hashlib.sha256(Path(json.decoder.__file__).read_bytes()).hexdigest()
-    assert source_sums(saved) == {"json.decoder": held}
-    assert source_sums(["sys:path", "no.such.module:thing", None, 2.0]) == {}
-    assert source_sums(task_to_json(make_task("vertical-jump"))) == {}
+    checksum = hashlib.sha256(Path(json.decoder.__file__).read_bytes()).hexdigest()
+    assert source_checksums(saved) == {"json.decoder": checksum}
+    assert source_checksums(["sys:path", "no.such.module:thing", None, 2.0]) == {}
+    assert source_checksums(task_to_json(make_task("vertical-jump"))) == {}
 
 
-def test_changes_are_told_of_files_that_were_known():
+def test_changed_sources_reports_only_known_modules():
     (line,) = changed_sources({"mine": "a", "other": "b"}, {"mine": "c", "other": "b", "new": "d"})
     assert line.startswith("mine has changed since")
     assert changed_sources(None, {"mine": "c"}) == changed_sources({}, {}) == []

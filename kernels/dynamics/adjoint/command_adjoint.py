@@ -7,7 +7,7 @@ import warp as wp
 from ...actuation.command_filter import FilterParams, filter_leg
 from ...actuation.motors import MotorParams, motor_torque
 from ...scalar import real, vec3
-from ..trajectory import Actuation, Arrival, Commands, Timing, arrival, commanded, load_filter, row_vec3
+from ..trajectory import Actuation, Arrival, Commands, Timing, arrival, load_filter, policy_target, row_vec3
 from .gradients import LATENCY_GRADIENT, MOTOR_GRADIENT, Gradients, add_entry, add_motor, add_vec3
 
 wp.set_module_options({"enable_backward": False})
@@ -17,75 +17,76 @@ wp.set_module_options({"enable_backward": False})
 class MotorAdjoint:
     """Derivatives of a motor's torque."""
 
-    target: real  # by the target that it follows
-    angle: real
-    rate: real
-    constants: MotorParams
-    latency: real
+    target: real  # [N m/rad] by the target that it follows
+    angle: real  # [N m/rad]
+    rate: real  # [N m s/rad]
+    constants: MotorParams  # by each of them
+    latency: real  # [N m/s]
 
 
 @wp.struct
 class FilterAdjoint:
-    """Gradient by what a leg's filtered targets depend on."""
+    """Gradient by the inputs of a leg's command filter; vectors are lateral, outer, inner."""
 
-    target: vec3
-    angles: vec3
+    target: vec3  # by the raw targets
+    angles: vec3  # by the measured angles
     rates: vec3
-    constants: FilterParams
+    constants: FilterParams  # by each of them
 
 
 @wp.func
-def add_target(gradients: Gradients, step: int, motor: int, world: int, x: real):
-    """Add to the gradient by a motor's filtered target of a policy step, or by what it followed before the first."""
+def add_target(gradients: Gradients, step: int, motor: int, world: int, gradient: real):
+    """Add to the gradient by a motor's filtered target of a policy step, or, for step -1, by its initial target."""
     if step < 0:
-        wp.atomic_add(gradients.before, motor, world, x)  # no other thread does; so none waits for what was there
+        # atomic to avoid a load: no other thread writes here
+        wp.atomic_add(gradients.initial_target, motor, world, gradient)
     else:
-        wp.atomic_add(gradients.safe, step, motor, world, x)
+        wp.atomic_add(gradients.filtered_target, step, motor, world, gradient)
 
 
 @wp.func
 def motor_gradient(
-    params: MotorParams, late: real, commands: Commands, safe: wp.array3d(dtype=real), timing: Timing, dt: real,
-    step: int, motor: int, world: int, angle: real, rate: real,
+    params: MotorParams, delay: real, commands: Commands, filtered_target: wp.array3d(dtype=real), timing: Timing,
+    dt: real, step: int, motor: int, world: int, angle: real, rate: real,
 ) -> MotorAdjoint:  # fmt: skip
-    """Return the derivatives of a motor's torque in a step."""
-    found = MotorAdjoint()
-    arrived = arrival(step, timing.substeps, late)
-    newer = commanded(safe, commands.before, arrived.newer, motor, world)
+    """Return the derivatives of a motor's torque in a physics step of dt [s]; delay: latency in physics steps."""
+    adjoint = MotorAdjoint()
+    arrived = arrival(step, timing.substeps, delay)
+    newer = policy_target(filtered_target, commands.initial_target, arrived.newer, motor, world)
     older = newer
     target = newer
     if arrived.newer > arrived.older:
-        older = commanded(safe, commands.before, arrived.older, motor, world)
+        older = policy_target(filtered_target, commands.initial_target, arrived.older, motor, world)
         if arrived.weight != real(1.0):
             target = older + arrived.weight * (newer - older)
     by_target, by_angle, by_rate, by_motor = wp.grad(motor_torque)(target, angle, rate, params)
-    found.target = by_target
-    found.angle = by_angle
-    found.rate = by_rate
-    found.constants = by_motor
-    found.latency = -by_target * (newer - older) / dt
-    return found
+    adjoint.target = by_target
+    adjoint.angle = by_angle
+    adjoint.rate = by_rate
+    adjoint.constants = by_motor
+    adjoint.latency = -by_target * (newer - older) / dt
+    return adjoint
 
 
 @wp.func
-def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, x: real):
+def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, gradient: real):
     """Add a gradient by the target that a motor follows to those by the filtered targets it comes from."""
-    add_target(gradients, arrived.newer, motor, world, arrived.weight * x)
+    add_target(gradients, arrived.newer, motor, world, arrived.weight * gradient)
     if arrived.newer > arrived.older:
-        add_target(gradients, arrived.older, motor, world, (real(1.0) - arrived.weight) * x)
+        add_target(gradients, arrived.older, motor, world, (real(1.0) - arrived.weight) * gradient)
 
 
 @wp.func
-def add_motor_constants(sums: Any, shared: Any, motor: int, seed: real, found: MotorAdjoint):
+def add_motor_constants(sums: Any, shared: Any, motor: int, cotangent: real, adjoint: MotorAdjoint):
     """Add to the gradients by a motor's constants, and to `shared` by the latency; seed: gradient by its torque."""
-    add_motor(sums, shared, motor, seed, found.constants)
-    add_entry(shared, LATENCY_GRADIENT, seed * found.latency)
+    add_motor(sums, shared, motor, cotangent, adjoint.constants)
+    add_entry(shared, LATENCY_GRADIENT, cotangent * adjoint.latency)
 
 
 @wp.func
-def weighed_filter(target: vec3, angles: vec3, rates: vec3, params: FilterParams, seed: vec3) -> real:
-    """Return the weighed sum of a leg's filtered targets."""
-    return wp.dot(seed, filter_leg(target, angles, rates, params))
+def filter_adjoint_scalar(target: vec3, angles: vec3, rates: vec3, params: FilterParams, cotangent: vec3) -> real:
+    """Return cotangent . (filtered targets of a leg [rad])."""
+    return wp.dot(cotangent, filter_leg(target, angles, rates, params))
 
 
 @wp.func
@@ -93,23 +94,26 @@ def filter_gradient(
     commands: Commands, actuation: Actuation, step: int, leg: int, world: int, angles: vec3, rates: vec3,
     gradients: Gradients,
 ) -> FilterAdjoint:  # fmt: skip
-    """Return a leg's gradients for those by its filtered targets of a policy step."""
+    """Return the gradients by the filter's inputs, given those by a leg's filtered targets of a policy step.
+
+    angles [rad], rates [rad/s]: of the leg's motors at the start of the policy step.
+    """
     m = 3 * leg
-    found = FilterAdjoint()
-    seed = row_vec3(gradients.safe, step, m, world)
-    found.target = seed
+    adjoint = FilterAdjoint()
+    cotangent = row_vec3(gradients.filtered_target, step, m, world)
+    adjoint.target = cotangent
     if actuation.filtered != 0:
         offset = actuation.motors.offset
-        read = angles + vec3(offset[m, world], offset[m + 1, world], offset[m + 2, world])
+        measured = angles + vec3(offset[m, world], offset[m + 1, world], offset[m + 2, world])
         target = row_vec3(commands.target, step, m, world)
-        by_target, by_angles, by_rates, by_params, _seed = wp.grad(weighed_filter)(
-            target, read, rates, load_filter(actuation.limits, world), seed
+        by_target, by_angles, by_rates, by_params, _cotangent = wp.grad(filter_adjoint_scalar)(
+            target, measured, rates, load_filter(actuation.limits, world), cotangent
         )
-        found.target = by_target
-        found.angles = by_angles
-        found.rates = by_rates
-        found.constants = by_params
-    return found
+        adjoint.target = by_target
+        adjoint.angles = by_angles
+        adjoint.rates = by_rates
+        adjoint.constants = by_params
+    return adjoint
 
 
 @wp.func

@@ -1,14 +1,15 @@
-"""Gradients of a rollout by constants of legs and motors, for GPUs: steps side by side, once run backwards."""
+"""Gradients of a rollout by constants of legs and motors, for GPUs: all steps in parallel, from the multipliers."""
 
 import warp as wp
 
 from ...actuation.motors import MotorParams
 from ...scalar import real, vec3
-from ..step import Robot, StepSettings, load_leg
-from ..trajectory import Actuation, Commands, Rows, Timing, load_world_motor, row_vec3
+from ..step import RobotModel, StepSettings, load_leg
+from ..trajectory import Actuation, Commands, Timing, TrajectoryArrays, load_world_motor, row_vec3
+from .action_gradients import leg_action_gradient
 from .command_adjoint import add_motor_constants, add_offsets, motor_gradient
 from .gradients import Gradients, thread_sums
-from .leg_adjoint import add_leg_constants, held_base, leg_gradient
+from .leg_adjoint import add_leg_constants, base_factors, leg_factors
 from .leg_record import ANGLES, FILTER, RATES, LegRecord, get_base, get_base_weights, get_law, get_leg_weights, get_vec
 from .rollout_adjoint import generate_adjoints
 from .rollout_legs_adjoint import Span, first_entry
@@ -17,42 +18,42 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
 @wp.struct
-class Turn:
-    """A step of a span that one of the threads of a leg takes."""
+class SpanStep:
+    """A step of a span, as one of the threads of a leg takes it."""
 
-    step: int
+    step: int  # of the rollout
     entry: int  # of the record
-    weight: real  # 0 where a thread repeats the last step, as there are none left
+    weight: real  # 0 where there are no steps left and the thread repeats the last one
 
 
 @wp.func
-def turns_of(timing: Timing, span: Span, turns: int) -> int:
-    """Return how many steps each of `turns` threads takes, one after the other."""
-    return ((span.end - span.begin) * timing.every + turns - 1) / turns
+def steps_per_thread(timing: Timing, span: Span, threads_per_leg: int) -> int:
+    """Return how many steps each of `threads_per_leg` threads takes, one after the other."""
+    return ((span.end - span.begin) * timing.every + threads_per_leg - 1) / threads_per_leg
 
 
 @wp.func
-def turn_at(timing: Timing, span: Span, number: int) -> Turn:
-    """Return step `number` of a span."""
-    found = Turn()
+def span_step(timing: Timing, span: Span, k: int) -> SpanStep:
+    """Return the k-th step of a span."""
+    step = SpanStep()
     end = span.end * timing.every
-    found.step = span.begin * timing.every + number
-    found.weight = wp.where(found.step < end, real(1.0), real(0.0))
-    found.step = wp.min(found.step, end - 1)
-    row = found.step / timing.every
-    found.entry = first_entry(timing, span, row) + found.step - row * timing.every
-    return found
+    step.step = span.begin * timing.every + k
+    step.weight = wp.where(step.step < end, real(1.0), real(0.0))
+    step.step = wp.min(step.step, end - 1)
+    row = step.step / timing.every
+    step.entry = first_entry(timing, span, row) + step.step - row * timing.every
+    return step
 
 
 @wp.kernel
 def leg_constants_kernel(
     # in
-    turns: int,
-    robot: Robot,
+    threads_per_leg: int,
+    model: RobotModel,
     settings: StepSettings,
     timing: Timing,
-    rows: Rows,
-    seeds: Rows,
+    trajectory: TrajectoryArrays,
+    cotangent: TrajectoryArrays,
     span: Span,
     record: LegRecord,
     # in, out
@@ -62,68 +63,73 @@ def leg_constants_kernel(
 
     turns: threads that share the steps of a leg, 8 on a GPU, with a warp a world, and 1 on a CPU.
     """
-    place, turn, leg = wp.tid()
-    world = settings.first + place
+    index, thread, leg = wp.tid()
+    world = settings.first + index
     dt = settings.dt
-    own = load_leg(robot, world, leg)
-    sums = thread_sums(gradients, world, turn == 0, True, False)
-    for number in range(turns_of(timing, span, turns)):
-        at = turn_at(timing, span, number * turns + turn)
+    params = load_leg(model, world, leg)
+    sums = thread_sums(gradients, world, thread == 0, True, False)
+    for k in range(steps_per_thread(timing, span, threads_per_leg)):
+        at = span_step(timing, span, k * threads_per_leg + thread)
         sums.weight = at.weight
         i = at.entry
         base = get_base(record, i, world)
         law = get_law(record, i, world, leg)
-        held = held_base(record, world, i, dt, base, get_base_weights(record, i, world))
+        base_held = base_factors(record, world, i, dt, base, get_base_weights(record, i, world))
         weights = get_leg_weights(record, i, world, leg)
-        found = leg_gradient(robot, own, dt, world, leg, rows, seeds, at.step, i, record, base, law, held, weights)
-        add_leg_constants(sums, leg, law, found)
+        leg_held = leg_factors(record, trajectory, cotangent, world, at.step, i, leg, dt, law, weights)
+        gradient = leg_action_gradient(
+            model, params, world, leg, law.mu, base, get_vec(record, i, ANGLES, world, leg),
+            get_vec(record, i, RATES, world, leg), base_held, leg_held, dt,
+        )  # fmt: skip
+        add_leg_constants(sums, leg, law, gradient)
 
 
 @wp.kernel
 def motor_constants_kernel(
     # in
-    turns: int,
+    threads_per_leg: int,
     settings: StepSettings,
     timing: Timing,
     actuation: Actuation,
     commands: Commands,
-    safe: wp.array3d(dtype=real),
-    seeds: Rows,
+    filtered_target: wp.array3d(dtype=real),
+    cotangent: TrajectoryArrays,
     span: Span,
     record: LegRecord,
     # in, out
     gradients: Gradients,
 ):
-    """Add those by constants of motors, launched likewise.
+    """Add the gradients by constants of motors of the steps of a span; launched as `leg_constants_kernel`.
 
-    With those of the legs in one kernel, a GPU's threads would keep more at a time than its first cache holds.
+    Two kernels, since one would need more memory per thread than a GPU's L1 cache holds.
     """
-    place, turn, leg = wp.tid()
-    world = settings.first + place
+    index, thread, leg = wp.tid()
+    world = settings.first + index
     motors = wp.zeros(shape=(3,), dtype=MotorParams)
     for j in range(motors.shape[0]):
         motors[j] = load_world_motor(actuation, 3 * leg + j, world)
-    late = actuation.latency[world] / settings.dt
-    of_leg = thread_sums(gradients, world, turn == 0, True, False)
-    of_legs = thread_sums(gradients, world, turn == 0 and leg == 0, True, True)
-    for number in range(turns_of(timing, span, turns)):
-        at = turn_at(timing, span, number * turns + turn)
-        of_leg.weight = at.weight
-        of_legs.weight = at.weight
+    delay = actuation.latency[world] / settings.dt
+    leg_sums = thread_sums(gradients, world, thread == 0, True, False)
+    shared_sums = thread_sums(gradients, world, thread == 0 and leg == 0, True, True)
+    for k in range(steps_per_thread(timing, span, threads_per_leg)):
+        at = span_step(timing, span, k * threads_per_leg + thread)
+        leg_sums.weight = at.weight
+        shared_sums.weight = at.weight
         angles = get_vec(record, at.entry, ANGLES, world, leg)
         rates = get_vec(record, at.entry, RATES, world, leg)
         torque = settings.dt * get_leg_weights(record, at.entry, world, leg).rates
-        if seeds.torque.shape[0] > 0:
-            torque += row_vec3(seeds.torque, at.step, 3 * leg, world)
+        if cotangent.torque.shape[0] > 0:
+            torque += row_vec3(cotangent.torque, at.step, 3 * leg, world)
         for c in range(motors.shape[0]):
             by_motor = motor_gradient(
-                motors[c], late, commands, safe, timing, settings.dt, at.step, 3 * leg + c, world, angles[c], rates[c]
-            )
-            add_motor_constants(of_leg, of_legs, 3 * leg + c, torque[c], by_motor)
+                motors[c], delay, commands, filtered_target, timing, settings.dt, at.step, 3 * leg + c, world,
+                angles[c], rates[c],
+            )  # fmt: skip
+            add_motor_constants(leg_sums, shared_sums, 3 * leg + c, torque[c], by_motor)
         by_filter = vec3(real(0.0))
         if actuation.filtered != 0 and at.step - (at.step / timing.substeps) * timing.substeps == 0:
             by_filter = get_vec(record, at.entry, FILTER, world, leg)
-        add_offsets(of_leg, leg, by_filter)
+        add_offsets(leg_sums, leg, by_filter)
 
 
 ADJOINTS = generate_adjoints(__name__)

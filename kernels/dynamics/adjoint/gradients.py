@@ -10,7 +10,7 @@ from ...actuation.motors import MotorParams
 from ...actuation.springs import LegSpring
 from ...actuation.stops import StopParams
 from ...kinematics.geometry import LegGeometry
-from ...lanes import sum_legs, sum_turns
+from ...lanes import sum_legs, sum_step_threads
 from ...layout import (
     ARMATURE,
     BASE,
@@ -37,13 +37,14 @@ from ...scalar import real, vec3
 from ..inertia import MassMoments
 from ..leg_dynamics import LegMasses
 from ..trajectory import FILTER_HORIZON, FILTER_ROWS, FILTER_SPEED
+from .action_gradients import LegGradient
 
 wp.set_module_options({"enable_backward": False})
 
 # rows of a leg's geometry: hip (3), then the lengths in the order of `LegGeometry`, its signs left out
 GEOMETRY_ROWS = wp.constant(10)
 
-# rows of the gradient by what a world has throughout: the parameter table, then 12 a motor constant, then
+# rows of the gradient by a world's parameters: the parameter table, then 12 per motor constant, then
 MOTOR_GRADIENT = wp.constant(PARAMETER_ROWS)  # kp, kd, saturation, peak, cutoff_speed, no_load_speed, offset
 FADE_GRADIENT = wp.constant(MOTOR_GRADIENT + 84)  # 2: start and end
 LATENCY_GRADIENT = wp.constant(FADE_GRADIENT + 2)
@@ -54,39 +55,39 @@ GRADIENT_ROWS = wp.constant(GEOMETRY_GRADIENT + 40)
 
 @wp.struct
 class Gradients:
-    """Gradients of one number by everything that a rollout read, per world."""
+    """Gradient of one number per world by all inputs of a rollout; units: the number's per the input's."""
 
     q: wp.array2d(dtype=real)  # of row 0, (ROW_COORDS, num_worlds)
     qd: wp.array2d(dtype=real)  # (ROW_RATES, num_worlds)
     target: wp.array3d(dtype=real)  # (T, 12, num_worlds)
-    before: wp.array2d(dtype=real)  # (12, num_worlds), to be zeroed first
+    initial_target: wp.array2d(dtype=real)  # (12, num_worlds), to be zeroed first
     wrench: wp.array3d(dtype=real)  # (T, 6, num_worlds), likewise
-    safe: wp.array3d(dtype=real)  # of the filtered targets, (T, 12, num_worlds), likewise
+    filtered_target: wp.array3d(dtype=real)  # of the filtered targets, (T, 12, num_worlds), likewise
     parameters: wp.array2d(dtype=real)  # (GRADIENT_ROWS, num_worlds)
 
 
 @wp.struct
 class ThreadSums:
-    """Where the threads of a warp add what each of them found."""
+    """Destination of a thread's gradients by parameters, and over which threads of its warp they are summed first."""
 
     parameters: wp.array2d(dtype=real)  # (GRADIENT_ROWS, num_worlds)
     world: int
-    weight: real  # of what this thread found
-    adds: bool  # whether it adds the sum of what all of them found
-    turns: bool  # over those that have other steps of the same leg
-    legs: bool  # over those that have other legs
+    weight: real  # of this thread's contribution: 1, or 0 for a repeated step
+    writes: bool  # whether this thread adds the sum to `parameters`
+    over_steps: bool  # whether to sum over threads with other steps of the same leg
+    over_legs: bool  # whether to sum over threads with other legs
 
 
 @wp.func
-def thread_sums(gradients: Gradients, world: int, adds: bool, turns: bool, legs: bool) -> ThreadSums:
-    """Return where a thread adds, all that it finds counted; see `ThreadSums`."""
+def thread_sums(gradients: Gradients, world: int, writes: bool, over_steps: bool, over_legs: bool) -> ThreadSums:
+    """Return `ThreadSums` of weight 1 that add to `gradients.parameters`."""
     sums = ThreadSums()
     sums.parameters = gradients.parameters
     sums.world = world
     sums.weight = real(1.0)
-    sums.adds = adds
-    sums.turns = turns
-    sums.legs = legs
+    sums.writes = writes
+    sums.over_steps = over_steps
+    sums.over_legs = over_legs
     return sums
 
 
@@ -98,13 +99,13 @@ def add_entry(sums: wp.array(dtype=real), row: int, x: real):
 
 @wp.func
 def add_entry(sums: ThreadSums, row: int, x: real):  # noqa: F811
-    """Add what some threads found to a row of their world. Only one of them adds, and does not wait for it."""
+    """Add x, weighted and summed over threads as `sums` says, to a row of their world; one atomic addition."""
     total = sums.weight * x
-    if sums.turns:
-        total = sum_turns(total)
-    if sums.legs:
+    if sums.over_steps:
+        total = sum_step_threads(total)
+    if sums.over_legs:
         total = sum_legs(total)
-    if sums.adds:
+    if sums.writes:
         wp.atomic_add(sums.parameters, row, sums.world, total)
 
 
@@ -183,6 +184,16 @@ def add_geometry(sums: Any, leg: int, geo: LegGeometry):
 
 
 @wp.func
+def add_leg_parameters(sums: Any, leg: int, gradient: LegGradient):
+    """Add the gradient by a leg's parameters, its friction coefficients aside."""
+    add_geometry(sums, leg, gradient.geometry)
+    add_masses(sums, leg, gradient.masses)
+    add_joints(sums, leg, gradient.joints)
+    add_spring(sums, leg, gradient.spring)
+    add_stops(sums, leg, gradient.stops)
+
+
+@wp.func
 def add_com(sums: Any, mass: real, com: vec3, gradient: vec3):
     """Add a gradient by the base's centre of mass [m], the ratio of its first moment and its mass [kg]."""
     add_entry(sums, BASE, -wp.dot(gradient, com) / mass)
@@ -191,7 +202,7 @@ def add_com(sums: Any, mass: real, com: vec3, gradient: vec3):
 
 @wp.func
 def add_motor(sums: Any, shared: Any, motor: int, scale: real, p: MotorParams):
-    """Add `scale` times a gradient by a motor's constants, to `shared` what all motors have in common."""
+    """Add `scale` times a gradient by a motor's constants, to `shared` the constants that all motors share."""
     row = MOTOR_GRADIENT + motor
     add_entry(sums, row, scale * p.kp)
     add_entry(sums, row + 12, scale * p.kd)

@@ -1,37 +1,36 @@
-"""`step_adjoint` for GPUs: a thread a leg, the base's part made by each of the four, in three parts.
+"""`step_adjoint` for GPUs, with a thread per leg; each of a world's four computes the base's part. In three parts.
 
-What depends on the motion alone is made for many steps side by side (`replay_leg`), the inverse of the system of
-the contact laws' multipliers too. Only what must go from step to step backwards does so (`reverse_leg`). It leaves the
-multipliers, from which the gradients by parameters follow, again for many steps side by side (`add_leg_constants`).
+`replay_leg` recomputes the motion and inverts the system of the contact laws' multipliers, for many steps in parallel.
+`reverse_leg` goes backwards from step to step and records multipliers. The gradients by parameters follow from these,
+again for many steps in parallel (`add_leg_constants`).
 """
 
 import warp as wp
 
-from ...actuation.joint_forces import JointParams
-from ...actuation.springs import LegSpring
-from ...actuation.stops import StopParams, stop_rows
-from ...kinematics.geometry import LegGeometry
+from ...actuation.stops import stop_rates
 from ...lanes import any_world, mat_from_leg, sum_legs, sum_quat, sum_vec, vec_from_leg
-from ...layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
-from ...scalar import mat33, quat, real, vec3
-from ...state import BaseState, base_com
+from ...layout import GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
+from ...scalar import mat33, real, vec3
+from ...state import BaseState
 from ..base_dynamics import BaseSystem, add_leg, invert, motor_acceleration, solve_ang, solve_lin, sum_systems
-from ..base_motion import moved_base
+from ..base_motion import integrate_base
 from ..contact import SEPARATE, PawContact
 from ..contact_laws import PawLaw, contact_at, contact_point, paw_law
 from ..inertia import MassMoments
-from ..leg_dynamics import LegMasses
-from ..parameters import load_moments, load_spring, load_stops, load_vec3
-from ..step import LegParams, Robot, base_system, hold_base, leg_terms
-from ..trajectory import Rows, row_vec3
+from ..parameters import load_spring, load_stops, load_vec3
+from ..step import LegParams, RobotModel, base_system, hold_base, leg_terms
+from ..trajectory import TrajectoryArrays, row_vec3
+from .action_gradients import (
+    LegGradient,
+    base_action_gradient,
+    leg_action_gradient,
+    make_base_factors,
+    make_leg_factors,
+)
 from .gradients import (
     ThreadSums,
     add_entry,
-    add_geometry,
-    add_joints,
-    add_masses,
-    add_spring,
-    add_stops,
+    add_leg_parameters,
 )
 from .leg_record import (
     ANGLES,
@@ -56,59 +55,65 @@ from .leg_record import (
     put_solve,
     put_vec,
 )
-from .virtual_power import BaseFactors, LegFactors, add, base_action, leg_action, turned
+from .virtual_power import BaseFactors, LegFactors, add, rotation_adjoint_scalar
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
 @wp.struct
 class LegAdjoint:
-    """Gradient by the state of a world as a leg's thread holds it, and what a step adds for its motors and the base."""
+    """Gradient by a world's state and inputs as a leg's thread holds it; axes and order as those of the value."""
 
-    base: BaseState
-    angles: vec3
+    base: BaseState  # by the base's state at the start of the step, as the next two
+    angles: vec3  # by the motors' angles: lateral, outer, inner
     rates: vec3
     torque: vec3  # by the motors' torques in the step
-    force: vec3  # by the wrench on the base, summed over steps as what follows
+    force: vec3  # by the wrench on the base at its com, world axes; summed over steps as are the next four
     moment: vec3
-    body: MassMoments  # by the base link's
+    body: MassMoments  # by the base link's mass moments
     com: vec3  # by the base's centre of mass
-    gravity: vec3
+    gravity: vec3  # by gravity, world axes
 
 
 @wp.func
 def leg_law(c: PawContact, law: PawLaw, impulse: vec3, point: vec3) -> LegLaw:
-    """Return what is recorded of a paw's law; impulse [N s], point [m]: body axes."""
-    found = LegLaw()
-    found.mode = law.mode
-    found.mu_row = law.mu_row
-    found.mu = law.mu
-    found.impulse = impulse
-    found.point = point
-    found.jacobian = c.jacobian
-    found.to_lin = c.to_lin
-    found.to_ang = c.to_ang
-    found.by_velocity = law.by_velocity
-    return found
+    """Return the part of a paw's law that is recorded; impulse [N s], point [m] of contact: body axes."""
+    recorded = LegLaw()
+    recorded.mode = law.mode
+    recorded.mu_row = law.mu_row
+    recorded.mu = law.mu
+    recorded.impulse = impulse
+    recorded.point = point
+    recorded.jacobian = c.jacobian
+    recorded.to_lin = c.to_lin
+    recorded.to_ang = c.to_ang
+    recorded.by_velocity = law.by_velocity
+    return recorded
 
 
 @wp.func
 def replay_leg(
-    robot: Robot, own: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
-    first_impulse: wp.array2d(dtype=vec3), rows: Rows, step: int, i: int, record: LegRecord,
+    model: RobotModel, params: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
+    first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays, step: int, i: int, record: LegRecord,
 ):  # fmt: skip
-    """Make a step again from entry i of the record; see `replay_step`. All threads write the base, the same bits."""
+    """Recompute a step of the rollout from entry i of the record, and write the state at its end to entry i + 1.
+
+    To entry i go the inverse of the base's system, the leg's elimination, and its paw's law. force [N], moment [N m]:
+    on the base at its com, world axes. Every thread of a world writes the base, with the same bits; see `replay_step`.
+    """
     base = get_base(record, i, world)
     rates = get_vec(record, i, RATES, world, leg)
     angles = get_vec(record, i, ANGLES, world, leg)
-    g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
-    torque = row_vec3(rows.torque, step, 3 * leg, world)
-    stops = stop_rows(load_stops(robot.table, leg, world), angles, dt)
-    spring = load_spring(robot.table, leg, world)
-    terms = leg_terms(own, spring, angles, rates, torque, stops, int(rows.pressed[step, leg, world]), base.ang, g, dt)
+    g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
+    torque = row_vec3(trajectory.torque, step, 3 * leg, world)
+    stops = stop_rates(load_stops(model.table, leg, world), angles, dt)
+    spring = load_spring(model.table, leg, world)
+    terms = leg_terms(
+        params, spring, angles, rates, torque, stops, int(trajectory.pressed[step, leg, world]), base.ang, g, dt
+    )
     share = add_leg(BaseSystem(), terms.dynamics, terms.solve)
-    system = sum_systems(base_system(robot, world, base, g, force, moment), share)
-    inverse = hold_base(robot, world, invert(system))
+    system = sum_systems(base_system(model, world, base, g, force, moment), share)
+    inverse = hold_base(model, world, invert(system))
     solve = terms.solve
     put_inverse(record, i, world, inverse)
     paw = terms.paw
@@ -116,12 +121,12 @@ def replay_leg(
     push = vec3(real(0.0))
     twist = vec3(real(0.0))
     point = vec3(real(0.0))
-    impulse = wp.quat_rotate_inv(base.quat, rows.impulse[step, leg, world])
+    impulse = wp.quat_rotate_inv(base.quat, trajectory.impulse[step, leg, world])
     touches = wp.dot(impulse, impulse) > real(0.0)
     if touches:
-        c = contact_at(robot, leg, base, paw, solve, inverse, impulse)
+        c = contact_at(model, leg, base, paw, solve, inverse, impulse)
         joint = wp.transpose(c.jacobian) * impulse
-        point = contact_point(robot, leg, paw, c)
+        point = contact_point(model, leg, paw, c)
         push = impulse - wp.transpose(solve.to_lin) * joint
         twist = wp.cross(point, impulse) - wp.transpose(solve.to_ang) * joint
         solve.free += solve.inverse * (joint / dt)
@@ -130,19 +135,19 @@ def replay_leg(
     twist = dt * system.moment + sum_vec(twist)
     lin = solve_lin(inverse, push, twist)
     ang = solve_ang(inverse, push, twist)
-    ahead = rates + dt * motor_acceleration(solve, lin / dt, ang / dt)
-    put_vec(record, i + 1, RATES, world, leg, ahead)
-    put_vec(record, i + 1, ANGLES, world, leg, angles + dt * ahead)
+    new_rates = rates + dt * motor_acceleration(solve, lin / dt, ang / dt)
+    put_vec(record, i + 1, RATES, world, leg, new_rates)
+    put_vec(record, i + 1, ANGLES, world, leg, angles + dt * new_rates)
     old_lin = wp.quat_rotate_inv(base.quat, base.lin)
-    put_base(record, i + 1, world, moved_base(base, old_lin + lin, base.ang + ang, dt))
+    put_base(record, i + 1, world, integrate_base(base, old_lin + lin, base.ang + ang, dt))
     law = PawLaw()
     if touches:
-        before = old_lin + wp.cross(base.ang, point) + c.jacobian * rates
-        velocity = old_lin + lin + wp.cross(base.ang + ang, point) + c.jacobian * ahead
+        old_velocity = old_lin + wp.cross(base.ang, point) + c.jacobian * rates
+        velocity = old_lin + lin + wp.cross(base.ang + ang, point) + c.jacobian * new_rates
         old_impulse = first_impulse[leg, world]
         if step > 0:
-            old_impulse = rows.impulse[step - 1, leg, world]
-        law = paw_law(robot, world, leg, c, before, velocity, wp.quat_rotate_inv(base.quat, old_impulse))
+            old_impulse = trajectory.impulse[step - 1, leg, world]
+        law = paw_law(model, world, leg, c, old_velocity, velocity, wp.quat_rotate_inv(base.quat, old_impulse))
     if any_world(any_leg(law.mode != SEPARATE)):
         put_law_row(record, i, world, leg, inverted_laws(c, law, leg))
     put_law(record, i, world, leg, leg_law(c, law, impulse, point))
@@ -156,7 +161,7 @@ def any_leg(flag: bool) -> bool:
 
 @wp.func
 def law_block(c: PawContact, law: PawLaw, of: PawContact, of_law: PawLaw, leg: int, j: int) -> mat33:
-    """Return block (leg, j) of the system of the laws' multipliers; `of`, `of_law`: paw j, sent by its thread."""
+    """Return block (leg, j) of the system of the laws' multipliers; `of`, `of_law`: own paw, which thread j sends."""
     to_lin = mat_from_leg(of.to_lin * wp.transpose(of_law.by_velocity), j)
     to_ang = mat_from_leg(of.to_ang * wp.transpose(of_law.by_velocity), j)
     if law.mode == SEPARATE:
@@ -200,213 +205,156 @@ def inverted_laws(c: PawContact, law: PawLaw, leg: int) -> LawRow:
     a3 = reduce_block(a3, a2, scale * a3, 2, leg)
     a2 = reduce_block(none, a2, scale, 2, leg)
     scale = wp.inverse(wp.where(leg == 3, a3, eye))
-    found = LawRow()
-    found.a = reduce_block(a0, a3, scale * a0, 3, leg)
-    found.b = reduce_block(a1, a3, scale * a1, 3, leg)
-    found.c = reduce_block(a2, a3, scale * a2, 3, leg)
-    found.d = reduce_block(none, a3, scale, 3, leg)
-    return found
+    row = LawRow()
+    row.a = reduce_block(a0, a3, scale * a0, 3, leg)
+    row.b = reduce_block(a1, a3, scale * a1, 3, leg)
+    row.c = reduce_block(a2, a3, scale * a2, 3, leg)
+    row.d = reduce_block(none, a3, scale, 3, leg)
+    return row
 
 
 @wp.func
-def multiplier(row: LawRow, seed: vec3) -> vec3:
-    """Return the multiplier of a paw's law for the gradients by all paws' impulses; seed: 0 where separated."""
-    found = row.a * vec_from_leg(seed, 0) + row.b * vec_from_leg(seed, 1)
-    return -(found + row.c * vec_from_leg(seed, 2) + row.d * vec_from_leg(seed, 3))
+def multiplier(row: LawRow, impulse_cotangent: vec3) -> vec3:
+    """Return the multiplier of a paw's law, given each paw's gradient by its impulse, 0 where it is separated."""
+    total = row.a * vec_from_leg(impulse_cotangent, 0) + row.b * vec_from_leg(impulse_cotangent, 1)
+    return -(total + row.c * vec_from_leg(impulse_cotangent, 2) + row.d * vec_from_leg(impulse_cotangent, 3))
 
 
 @wp.func
-def held_base(record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights) -> BaseFactors:
-    """Return what is held of the base in a step."""
-    ahead = get_base(record, i + 1, world)
-    held = BaseFactors()
-    held.virtual_lin = weights.lin
-    held.virtual_ang = weights.ang
-    held.lin = wp.quat_rotate_inv(base.quat, ahead.lin)
-    held.ang = ahead.ang
-    held.lin_acc = (held.lin - wp.quat_rotate_inv(base.quat, base.lin)) / dt
-    held.ang_acc = (held.ang - base.ang) / dt
-    return held
+def base_factors(
+    record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights
+) -> BaseFactors:  # fmt: skip
+    """Return the base's constants in the step at entry i."""
+    return make_base_factors(base, get_base(record, i + 1, world), weights.lin, weights.ang, dt)
 
 
 @wp.func
-def held_leg(
-    record: LegRecord, rows: Rows, seeds: Rows, world: int, step: int, i: int, leg: int, dt: real, law: LegLaw,
-    weights: LegWeights,
+def leg_factors(
+    record: LegRecord, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, world: int, step: int, i: int,
+    leg: int, dt: real, law: LegLaw, weights: LegWeights,
 ) -> LegFactors:  # fmt: skip
-    """Return what is held of a leg in a step."""
-    held = LegFactors()
-    held.virtual_rates = weights.rates
-    held.rates = get_vec(record, i + 1, RATES, world, leg)
-    held.acc = (held.rates - get_vec(record, i, RATES, world, leg)) / dt
-    held.mode = law.mode
-    held.pressed = int(rows.pressed[step, leg, world])
-    if law.mode != SEPARATE:
-        held.impulse = law.impulse
-        held.law = weights.law
-        if seeds.impulse.shape[0] > 0:
-            held.push = seeds.impulse[step, leg, world]
-    return held
-
-
-@wp.struct
-class LegGradient:
-    """Gradient of a leg's part of the weighed equations."""
-
-    geometry: LegGeometry
-    masses: LegMasses
-    joints: JointParams
-    spring: LegSpring
-    stops: StopParams
-    mu: real
-    pos: vec3  # by the base's state
-    turn: quat
-    omega: vec3
-    gravity: vec3  # body axes
-    angles: vec3
-    rates: vec3
-
-
-@wp.func
-def leg_gradient(
-    robot: Robot, own: LegParams, dt: real, world: int, leg: int, rows: Rows, seeds: Rows, step: int, i: int,
-    record: LegRecord, base: BaseState, law: LegLaw, held: BaseFactors, weights: LegWeights,
-) -> LegGradient:  # fmt: skip
-    """Return the gradient of `leg_action` in a step."""
-    factors = held_leg(record, rows, seeds, world, step, i, leg, dt, law, weights)
-    g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
-    angles = get_vec(record, i, ANGLES, world, leg)
-    rates = get_vec(record, i, RATES, world, leg)
-    (geo, masses, joints, spring, stops, _ground, mu, pos, turn, omega, g_adj, angle_adj, rate_adj, _held, _leg,
-     _step) = (
-        wp.grad(leg_action)(
-            own.geometry, own.masses, own.joints, load_spring(robot.table, leg, world),
-            load_stops(robot.table, leg, world), robot.ground, law.mu, base.pos, base.quat, base.ang, g, angles, rates,
-            held, factors, dt,
-        )
+    """Return a leg's constants in the step of the rollout whose entry in the record is i."""
+    push = vec3(real(0.0))
+    if cotangent.impulse.shape[0] > 0:
+        push = cotangent.impulse[step, leg, world]
+    return make_leg_factors(
+        get_vec(record, i, RATES, world, leg), get_vec(record, i + 1, RATES, world, leg), weights.rates, law.mode,
+        int(trajectory.pressed[step, leg, world]), law.impulse, weights.law, push, dt,
     )  # fmt: skip
-    found = LegGradient()
-    found.geometry = geo
-    found.masses = masses
-    found.joints = joints
-    found.spring = spring
-    found.stops = stops
-    found.mu = mu
-    found.pos = pos
-    found.turn = turn
-    found.omega = omega
-    found.gravity = g_adj
-    found.angles = angle_adj
-    found.rates = rate_adj
-    return found
 
 
 @wp.struct
 class StepWeights:
-    """What a step's equations are weighed with, and the gradients by the velocities at its start that this leaves."""
+    """Multipliers of a step's equations, and the gradients by the velocities at its start that they leave."""
 
     base: BaseWeights
     leg: LegWeights
-    lin: vec3
-    ang: vec3
-    rates: vec3
+    lin: vec3  # by the base's linear velocity, body axes
+    ang: vec3  # by its angular velocity
+    rates: vec3  # by the motors' rates
 
 
 @wp.func
 def find_weights(
-    record: LegRecord, world: int, leg: int, seeds: Rows, step: int, i: int, base: BaseState, law: LegLaw,
-    lin_seed: vec3, ang_seed: vec3, rate_seed: vec3,
+    record: LegRecord, world: int, leg: int, cotangent: TrajectoryArrays, step: int, i: int, base: BaseState,
+    law: LegLaw, lin_cotangent: vec3, ang_cotangent: vec3, rate_cotangent: vec3,
 ) -> StepWeights:  # fmt: skip
-    """Return the multipliers of a step for the gradients by the velocities at its end; see `find_multipliers`."""
+    """Return the multipliers of a step, given the gradients by the velocities at its end; see `find_multipliers`.
+
+    lin_, ang_, rate_cotangent: by the base's velocities in the body axes of the step's start, and the motors' rates.
+    """
     inverse = get_inverse(record, i, world)
     solve = get_solve(record, i, world, leg)
-    found = StepWeights()
-    found.lin = lin_seed
-    found.ang = ang_seed
-    found.rates = rate_seed
-    push = lin_seed - sum_vec(wp.transpose(solve.to_lin) * rate_seed)
-    twist = ang_seed - sum_vec(wp.transpose(solve.to_ang) * rate_seed)
-    found.base.lin = solve_lin(inverse, push, twist)
-    found.base.ang = solve_ang(inverse, push, twist)
-    found.leg.rates = solve.inverse * rate_seed - solve.to_lin * found.base.lin - solve.to_ang * found.base.ang
+    weights = StepWeights()
+    weights.lin = lin_cotangent
+    weights.ang = ang_cotangent
+    weights.rates = rate_cotangent
+    push = lin_cotangent - sum_vec(wp.transpose(solve.to_lin) * rate_cotangent)
+    twist = ang_cotangent - sum_vec(wp.transpose(solve.to_ang) * rate_cotangent)
+    weights.base.lin = solve_lin(inverse, push, twist)
+    weights.base.ang = solve_ang(inverse, push, twist)
+    weights.leg.rates = (
+        solve.inverse * rate_cotangent - solve.to_lin * weights.base.lin - solve.to_ang * weights.base.ang
+    )
     touches = law.mode != SEPARATE
-    seed = vec3(real(0.0))
+    impulse_cotangent = vec3(real(0.0))
     if touches:
-        seed = found.base.lin + wp.cross(found.base.ang, law.point) + law.jacobian * found.leg.rates
-        if seeds.impulse.shape[0] > 0:
-            seed += wp.quat_rotate_inv(base.quat, seeds.impulse[step, leg, world])
+        impulse_cotangent = weights.base.lin + wp.cross(weights.base.ang, law.point) + law.jacobian * weights.leg.rates
+        if cotangent.impulse.shape[0] > 0:
+            impulse_cotangent += wp.quat_rotate_inv(base.quat, cotangent.impulse[step, leg, world])
     if any_world(any_leg(touches)):
         y = vec3(real(0.0))
-        found.leg.law = multiplier(get_law_row(record, i, world, leg), seed)
+        weights.leg.law = multiplier(get_law_row(record, i, world, leg), impulse_cotangent)
         if touches:
-            y = wp.transpose(law.by_velocity) * found.leg.law
+            y = wp.transpose(law.by_velocity) * weights.leg.law
         joint = wp.transpose(law.jacobian) * y
-        more_lin = sum_vec(law.to_lin * y)
-        more_ang = sum_vec(law.to_ang * y)
-        found.lin += sum_vec(y)
-        found.ang += sum_vec(wp.cross(law.point, y))
-        found.rates += joint
-        found.leg.rates += solve.inverse * joint - solve.to_lin * more_lin - solve.to_ang * more_ang
-        found.base.lin += more_lin
-        found.base.ang += more_ang
-    return found
+        law_lin = sum_vec(law.to_lin * y)
+        law_ang = sum_vec(law.to_ang * y)
+        weights.lin += sum_vec(y)
+        weights.ang += sum_vec(wp.cross(law.point, y))
+        weights.rates += joint
+        weights.leg.rates += solve.inverse * joint - solve.to_lin * law_lin - solve.to_ang * law_ang
+        weights.base.lin += law_lin
+        weights.base.ang += law_ang
+    return weights
 
 
 @wp.func
 def reverse_leg(
-    robot: Robot, own: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3, rows: Rows, seeds: Rows,
-    step: int, i: int, record: LegRecord, adj: LegAdjoint, keeps: bool,
+    model: RobotModel, params: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
+    trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, step: int, i: int, record: LegRecord, adj: LegAdjoint,
+    writes_record: bool,
 ) -> LegAdjoint:  # fmt: skip
-    """Run a step backwards, see `reverse_step`; if it `keeps`, it records what its equations are weighed with."""
+    """Return the gradient by the state at the start of a step from `adj`, that at its end; see `reverse_step`.
+
+    i: the step's entry in the record, `step`: its number in the rollout. force [N], moment [N m]: on the base at its
+    com, world axes. writes_record: whether this thread writes the step's multipliers to the record.
+    """
     base = get_base(record, i, world)
     law = get_law(record, i, world, leg)
     new_velocity = adj.base.lin + dt * adj.base.pos
-    quat_adj, ang_seed, _dt, _seed = wp.grad(turned)(
+    quat_adj, ang_cotangent, _dt, _quat_adj = wp.grad(rotation_adjoint_scalar)(
         base.quat, row_vec3(record.base, i + 1, 10, world), dt, adj.base.quat
     )
     weights = find_weights(
-        record, world, leg, seeds, step, i, base, law, wp.quat_rotate_inv(base.quat, new_velocity),
-        ang_seed + adj.base.ang, adj.rates + dt * adj.angles,
+        record, world, leg, cotangent, step, i, base, law, wp.quat_rotate_inv(base.quat, new_velocity),
+        ang_cotangent + adj.base.ang, adj.rates + dt * adj.angles,
     )  # fmt: skip
-    by_base = weights.base
+    base_weights = weights.base
     # the equations of motion
-    held = held_base(record, world, i, dt, base, by_base)
-    found = leg_gradient(robot, own, dt, world, leg, rows, seeds, step, i, record, base, law, held, weights.leg)
-    by_base.seeds.velocity = weights.lin
-    by_base.seeds.new_velocity = new_velocity
-    by_base.seeds.gravity = sum_vec(found.gravity)
-    gravity = load_vec3(robot.table, GRAVITY, world)
-    body, com, weight, force_adj, moment_adj, base_turn, lin_adj, base_omega, _base, _seeds, _base_step = wp.grad(
-        base_action
-    )(load_moments(robot.table, BASE, world), base_com(robot.table, world), gravity, force, moment, base.quat,
-      base.lin, base.ang, held, by_base.seeds, dt)  # fmt: skip
-    if keeps:
-        put_base_weights(record, i, world, by_base)
+    base_held = base_factors(record, world, i, dt, base, base_weights)
+    leg_held = leg_factors(record, trajectory, cotangent, world, step, i, leg, dt, law, weights.leg)
+    gradient = leg_action_gradient(
+        model, params, world, leg, law.mu, base, get_vec(record, i, ANGLES, world, leg),
+        get_vec(record, i, RATES, world, leg), base_held, leg_held, dt,
+    )  # fmt: skip
+    base_weights.cotangent.velocity = weights.lin
+    base_weights.cotangent.new_velocity = new_velocity
+    base_weights.cotangent.gravity = sum_vec(gradient.gravity)
+    by_base = base_action_gradient(model, world, force, moment, base, base_held, base_weights.cotangent, dt)
+    if writes_record:
+        put_base_weights(record, i, world, base_weights)
         put_leg_weights(record, i, world, leg, weights.leg)
     out = LegAdjoint()
-    out.base.pos = adj.base.pos + sum_vec(found.pos)
-    out.base.quat = quat_adj + base_turn + sum_quat(found.turn)
-    out.base.lin = lin_adj
-    out.base.ang = weights.ang + base_omega + sum_vec(found.omega)
-    out.angles = adj.angles + found.angles
-    out.rates = weights.rates + found.rates
+    out.base.pos = adj.base.pos + sum_vec(gradient.pos)
+    out.base.quat = quat_adj + by_base.quat + sum_quat(gradient.quat)
+    out.base.lin = by_base.lin
+    out.base.ang = weights.ang + by_base.omega + sum_vec(gradient.omega)
+    out.angles = adj.angles + gradient.angles
+    out.rates = weights.rates + gradient.rates
     out.torque = dt * weights.leg.rates
-    out.force = adj.force + force_adj
-    out.moment = adj.moment + moment_adj
-    out.body = add(adj.body, body)
-    out.com = adj.com + com
-    out.gravity = adj.gravity + weight
+    out.force = adj.force + by_base.force
+    out.moment = adj.moment + by_base.moment
+    out.body = add(adj.body, by_base.body)
+    out.com = adj.com + by_base.com
+    out.gravity = adj.gravity + by_base.gravity
     return out
 
 
 @wp.func
-def add_leg_constants(sums: ThreadSums, leg: int, law: LegLaw, found: LegGradient):
+def add_leg_constants(sums: ThreadSums, leg: int, law: LegLaw, gradient: LegGradient):
     """Add a step's gradients by the parameters of a leg."""
-    add_geometry(sums, leg, found.geometry)
-    add_masses(sums, leg, found.masses)
-    add_joints(sums, leg, found.joints)
-    add_spring(sums, leg, found.spring)
-    add_stops(sums, leg, found.stops)
+    add_leg_parameters(sums, leg, gradient)
     for row in range(2):  # one of the two coefficients
         mu_row = leg * LEG_ROWS + wp.where(row == 0, int(MU_STATIC), int(MU_DYNAMIC))
-        add_entry(sums, mu_row, wp.where(law.mode != SEPARATE and law.mu_row == mu_row, found.mu, real(0.0)))
+        add_entry(sums, mu_row, wp.where(law.mode != SEPARATE and law.mu_row == mu_row, gradient.mu, real(0.0)))

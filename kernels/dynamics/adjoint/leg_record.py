@@ -1,4 +1,4 @@
-"""What the reverse pass keeps of some steps where a thread has a leg: by fields, so that a warp reads neighbours."""
+"""Record of a few steps for the reverse pass with a thread per leg, world and leg last for coalesced access."""
 
 import warp as wp
 
@@ -7,7 +7,7 @@ from ...state import BaseState
 from ..base_dynamics import BaseInverse, LegSolve
 from ..contact import SEPARATE
 from ..trajectory import row_quat, row_vec3, store_row_vec3
-from .virtual_power import BaseSeeds
+from .virtual_power import BaseCotangent
 
 wp.set_module_options({"enable_backward": False})
 
@@ -42,27 +42,27 @@ class LegRecord:
 
 @wp.struct
 class BaseWeights:
-    """What the base's equations of motion in a step are weighed with, body axes."""
+    """Multipliers of the base's equations of motion in a step, body axes."""
 
-    lin: vec3  # virtual velocity
-    ang: vec3
-    seeds: BaseSeeds
+    lin: vec3  # virtual velocity, see `virtual_power`
+    ang: vec3  # virtual angular velocity
+    cotangent: BaseCotangent
 
 
 @wp.struct
 class LegWeights:
-    """What a leg's equations of motion and its paw's law are weighed with."""
+    """Multipliers of a leg's equations of motion and of its paw's contact law."""
 
     rates: vec3  # virtual rates of the motors
-    law: vec3
+    law: vec3  # multiplier of the contact law, body axes
 
 
 @wp.struct
 class MotorSlopes:
-    """Derivatives of the torques of a leg's motors, one by one."""
+    """Derivatives of the torque of each of a leg's motors (lateral, outer, inner), no cross terms."""
 
     target: vec3  # [N m/rad]
-    angle: vec3
+    angle: vec3  # [N m/rad]
     rate: vec3  # [N m s/rad]
 
 
@@ -72,18 +72,18 @@ class LegLaw:
 
     mode: int  # SEPARATE, STICK or SLIDE
     mu_row: int  # row of the friction coefficient in the parameter table
-    mu: real
+    mu: real  # friction coefficient
     impulse: vec3  # [N s], body axes
     point: vec3  # [m] where the paw touches, body axes, from the base's origin
     jacobian: mat33  # contact velocity per motor rate [m/rad]
-    to_lin: mat33  # base twist per impulse
-    to_ang: mat33
-    by_velocity: mat33  # the law's derivative
+    to_lin: mat33  # change of the base's linear velocity per impulse [1/kg]
+    to_ang: mat33  # change of its angular velocity per impulse [1/(kg m)]
+    by_velocity: mat33  # derivative of the law by the contact velocity, see `contact_laws.PawLaw`
 
 
 @wp.struct
 class LawRow:
-    """A paw's row of the inverse of the system of the laws' multipliers, a block for each paw."""
+    """A paw's row of the inverse of the system of the laws' multipliers, one 3x3 block per paw, in order of legs."""
 
     a: mat33
     b: mat33
@@ -293,9 +293,9 @@ def get_base_weights(record: LegRecord, entry: int, world: int) -> BaseWeights:
     weights = BaseWeights()
     weights.lin = row_vec3(record.base, entry, BASE_WEIGHTS, world)
     weights.ang = row_vec3(record.base, entry, BASE_WEIGHTS + 3, world)
-    weights.seeds.velocity = row_vec3(record.base, entry, BASE_WEIGHTS + 6, world)
-    weights.seeds.new_velocity = row_vec3(record.base, entry, BASE_WEIGHTS + 9, world)
-    weights.seeds.gravity = row_vec3(record.base, entry, BASE_WEIGHTS + 12, world)
+    weights.cotangent.velocity = row_vec3(record.base, entry, BASE_WEIGHTS + 6, world)
+    weights.cotangent.new_velocity = row_vec3(record.base, entry, BASE_WEIGHTS + 9, world)
+    weights.cotangent.gravity = row_vec3(record.base, entry, BASE_WEIGHTS + 12, world)
     return weights
 
 
@@ -304,6 +304,6 @@ def put_base_weights(record: LegRecord, entry: int, world: int, weights: BaseWei
     """Write the base's weights."""
     store_row_vec3(record.base, entry, BASE_WEIGHTS, world, weights.lin)
     store_row_vec3(record.base, entry, BASE_WEIGHTS + 3, world, weights.ang)
-    store_row_vec3(record.base, entry, BASE_WEIGHTS + 6, world, weights.seeds.velocity)
-    store_row_vec3(record.base, entry, BASE_WEIGHTS + 9, world, weights.seeds.new_velocity)
-    store_row_vec3(record.base, entry, BASE_WEIGHTS + 12, world, weights.seeds.gravity)
+    store_row_vec3(record.base, entry, BASE_WEIGHTS + 6, world, weights.cotangent.velocity)
+    store_row_vec3(record.base, entry, BASE_WEIGHTS + 9, world, weights.cotangent.new_velocity)
+    store_row_vec3(record.base, entry, BASE_WEIGHTS + 12, world, weights.cotangent.gravity)

@@ -1,19 +1,20 @@
-"""A step made again, and the multipliers of its equations of motion and contact laws; see `step_adjoint`."""
+"""A step recomputed, and the multipliers of its equations of motion and contact laws; see `step_adjoint`."""
 
 import warp as wp
 
-from ...actuation.stops import stop_rows
+from ...actuation.stops import stop_rates
 from ...layout import GRAVITY
 from ...scalar import real, vec3
 from ...state import BaseState
 from ..base_dynamics import BaseInverse, LegSolve, add_leg, invert, motor_acceleration, solve_ang, solve_lin
-from ..base_motion import moved_base
+from ..base_motion import integrate_base
 from ..contact import SEPARATE, PawContact
 from ..contact_laws import PawLaw, contact_at, contact_point, paw_law
 from ..leg_dynamics import PawKinematics
 from ..parameters import load_spring, load_stops, load_vec3
-from ..step import LegParams, Robot, base_system, hold_base, leg_terms
-from ..trajectory import Rows, row_vec3
+from ..step import LegParams, RobotModel, base_system, hold_base, leg_terms
+from ..trajectory import TrajectoryArrays, row_vec3
+from .action_gradients import make_base_factors, make_leg_factors
 from .virtual_power import BaseFactors, LegFactors
 
 wp.set_module_options({"enable_backward": False})
@@ -21,60 +22,61 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class StepRecord:
-    """What the reverse pass needs of the steps between two rows of a rollout, by world, step and leg."""
+    """Steps between two rows of a rollout, recomputed for the reverse pass; indices: world, step, leg."""
 
     base: wp.array2d(dtype=BaseState)  # (num_worlds, steps + 1)
     angles: wp.array3d(dtype=vec3)  # [rad], (num_worlds, steps + 1, 4)
     rates: wp.array3d(dtype=vec3)  # [rad/s], likewise
-    inverse: wp.array2d(dtype=BaseInverse)  # (num_worlds, steps)
-    legs: wp.array3d(dtype=LegSolve)  # (num_worlds, steps, 4)
-    paws: wp.array3d(dtype=PawKinematics)  # likewise
+    inverse: wp.array2d(dtype=BaseInverse)  # of the base's system, (num_worlds, steps)
+    legs: wp.array3d(dtype=LegSolve)  # `free` includes the paw's impulse, (num_worlds, steps, 4)
+    paws: wp.array3d(dtype=PawKinematics)  # (num_worlds, steps, 4)
 
 
 @wp.struct
-class StepPlace:
-    """A step that is made again and run backwards, and what acts on the base in it."""
+class ReplayedStep:
+    """Indices of a step that is recomputed and run backwards, and the wrench on the base in it."""
 
     dt: real  # [s]
     world: int
     step: int  # of the rollout
     entry: int  # of the record
     force: vec3  # [N] at the base's com, world axes
-    moment: vec3  # [N m]
+    moment: vec3  # [N m], world axes
 
 
 @wp.struct
 class LegReverse:
-    """Gradients by a leg's motors in a step, and its multipliers."""
+    """Scratch of a leg in the reverse pass: gradients by its motors (lateral, outer, inner), multipliers, contact."""
 
     angles: vec3  # by the angles at the end of the step, then at its start
-    rates: vec3
-    torque: vec3  # by the torques
+    rates: vec3  # by the rates, likewise
+    torque: vec3  # by the torques in the step
     virtual_rates: vec3  # multipliers of the motors' equations
-    law: PawLaw
-    seed: vec3  # by the paw's impulse, then the multiplier of its law
+    contact: PawContact  # of its paw at the solution
+    law: PawLaw  # of its paw's contact
+    multiplier: vec3  # of the paw's law; until `solve_laws` the gradient by its impulse
 
 
 @wp.struct
 class Multipliers:
-    """Gradients of the base's velocities at the end of a step, and what solving M for them gives; body axes."""
+    """Multipliers m of the base's equations in a step, and the gradients y in M m = y; body axes."""
 
-    lin_seed: vec3
-    ang_seed: vec3
-    lin: vec3
+    lin_cotangent: vec3  # y: by the base's linear velocity at the end of the step, contact laws included
+    ang_cotangent: vec3  # by its angular velocity
+    lin: vec3  # m
     ang: vec3
 
 
 @wp.func
 def solve_system(
-    record: StepRecord, at: StepPlace, lin_seed: vec3, ang_seed: vec3, legs: wp.array(dtype=LegReverse)
+    record: StepRecord, at: ReplayedStep, lin_cotangent: vec3, ang_cotangent: vec3, legs: wp.array(dtype=LegReverse)
 ) -> Multipliers:
-    """Solve M m = seeds, for the motors those by their rates; their m is written to `virtual_rates`."""
+    """Solve M m = y; y: lin_cotangent, ang_cotangent, and each leg's `rates`. The motors' m goes to `virtual_rates`."""
     m = Multipliers()
-    m.lin_seed = lin_seed
-    m.ang_seed = ang_seed
-    force = lin_seed
-    moment = ang_seed
+    m.lin_cotangent = lin_cotangent
+    m.ang_cotangent = ang_cotangent
+    force = lin_cotangent
+    moment = ang_cotangent
     for k in range(legs.shape[0]):
         solve = record.legs[at.world, at.entry, k]
         force -= wp.transpose(solve.to_lin) * legs[k].rates
@@ -90,38 +92,42 @@ def solve_system(
 
 @wp.func
 def replay_step(
-    robot: Robot, params: wp.array(dtype=LegParams), at: StepPlace, rows: Rows, record: StepRecord
+    model: RobotModel, params: wp.array(dtype=LegParams), at: ReplayedStep, trajectory: TrajectoryArrays,
+    record: StepRecord,
 ):  # fmt: skip
-    """Make a step again from its entry of the record, with known torques and impulses; writes the record."""
+    """Recompute a step from its entry of the record, with the torques, impulses and pressed stops of the trajectory.
+
+    Writes to `record` the leg and base terms of the step (entry `at.entry`) and the state at its end (the next entry).
+    """
     dt, world, step, i = at.dt, at.world, at.step, at.entry
     base = record.base[world, i]
-    g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
-    system = base_system(robot, world, base, g, at.force, at.moment)
+    g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
+    system = base_system(model, world, base, g, at.force, at.moment)
     for k in range(record.legs.shape[2]):
-        torque = row_vec3(rows.torque, step, 3 * k, world)
-        pressed = int(rows.pressed[step, k, world])
+        torque = row_vec3(trajectory.torque, step, 3 * k, world)
+        pressed = int(trajectory.pressed[step, k, world])
         angles = record.angles[world, i, k]
-        stops = stop_rows(load_stops(robot.table, k, world), angles, dt)
-        spring = load_spring(robot.table, k, world)
+        stops = stop_rates(load_stops(model.table, k, world), angles, dt)
+        spring = load_spring(model.table, k, world)
         rates = record.rates[world, i, k]
         terms = leg_terms(params[k], spring, angles, rates, torque, stops, pressed, base.ang, g, dt)
         record.legs[world, i, k] = terms.solve
         record.paws[world, i, k] = terms.paw
         system = add_leg(system, terms.dynamics, terms.solve)
-    inverse = hold_base(robot, world, invert(system))
+    inverse = hold_base(model, world, invert(system))
     record.inverse[world, i] = inverse
     force_impulse = dt * system.force
     moment_impulse = dt * system.moment
     for k in range(record.legs.shape[2]):
-        impulse = wp.quat_rotate_inv(base.quat, rows.impulse[step, k, world])
+        impulse = wp.quat_rotate_inv(base.quat, trajectory.impulse[step, k, world])
         if wp.dot(impulse, impulse) > real(0.0):
             solve = record.legs[world, i, k]
             paw = record.paws[world, i, k]
-            contact = contact_at(robot, k, base, paw, solve, inverse, impulse)
+            contact = contact_at(model, k, base, paw, solve, inverse, impulse)
             joint = wp.transpose(contact.jacobian) * impulse
             force_impulse += impulse - wp.transpose(solve.to_lin) * joint
             moment_impulse += (
-                wp.cross(contact_point(robot, k, paw, contact), impulse) - wp.transpose(solve.to_ang) * joint
+                wp.cross(contact_point(model, k, paw, contact), impulse) - wp.transpose(solve.to_ang) * joint
             )
             solve.free += solve.inverse * (joint / dt)
             record.legs[world, i, k] = solve
@@ -131,7 +137,7 @@ def replay_step(
         rates = record.rates[world, i, k] + dt * motor_acceleration(record.legs[world, i, k], lin / dt, ang / dt)
         record.rates[world, i + 1, k] = rates
         record.angles[world, i + 1, k] = record.angles[world, i, k] + dt * rates
-    record.base[world, i + 1] = moved_base(base, wp.quat_rotate_inv(base.quat, base.lin) + lin, base.ang + ang, dt)
+    record.base[world, i + 1] = integrate_base(base, wp.quat_rotate_inv(base.quat, base.lin) + lin, base.ang + ang, dt)
 
 
 @wp.func
@@ -166,23 +172,22 @@ def solve_linear(a: wp.array2d(dtype=real), b: wp.array(dtype=real), n: int):
 
 
 @wp.func
-def solve_laws(
-    contacts: wp.array(dtype=PawContact), legs: wp.array(dtype=LegReverse), matrix: wp.array2d(dtype=real),
-    vector: wp.array(dtype=real),
-):  # fmt: skip
-    """Replace the gradients of the paws' impulses in `seed` by the multipliers of their laws.
-
-    matrix, vector: of shape (12, 12) and (12,), overwritten.
-    """
+def solve_laws(legs: wp.array(dtype=LegReverse)):
+    """Replace the gradients by the paws' impulses in `multiplier` by the multipliers of their laws."""
+    matrix = wp.zeros(shape=(12, 12), dtype=real)
+    vector = wp.zeros(shape=(12,), dtype=real)
     row = int(0)
     for k in range(legs.shape[0]):
         if legs[k].law.mode != SEPARATE:
             col = int(0)
             for j in range(legs.shape[0]):
                 if legs[j].law.mode != SEPARATE:
-                    block = contacts[k].from_lin * contacts[j].to_lin + contacts[k].from_ang * contacts[j].to_ang
+                    block = (
+                        legs[k].contact.from_lin * legs[j].contact.to_lin
+                        + legs[k].contact.from_ang * legs[j].contact.to_ang
+                    )
                     if k == j:
-                        block = contacts[k].total
+                        block = legs[k].contact.total
                     block = block * wp.transpose(legs[j].law.by_velocity)
                     if k == j:
                         block = block + wp.transpose(legs[k].law.by_impulse)
@@ -191,129 +196,120 @@ def solve_laws(
                             matrix[row + r, col + s] = block[r, s]
                     col += 3
             for r in range(3):
-                vector[row + r] = -legs[k].seed[r]
+                vector[row + r] = -legs[k].multiplier[r]
             row += 3
     solve_linear(matrix, vector, row)
     row = int(0)
     for k in range(legs.shape[0]):
-        legs[k].seed = vec3(real(0.0))
+        legs[k].multiplier = vec3(real(0.0))
         if legs[k].law.mode != SEPARATE:
-            legs[k].seed = vec3(vector[row], vector[row + 1], vector[row + 2])
+            legs[k].multiplier = vec3(vector[row], vector[row + 1], vector[row + 2])
             row += 3
 
 
 @wp.func
-def load_laws(
-    robot: Robot, at: StepPlace, first_impulse: wp.array2d(dtype=vec3), rows: Rows, record: StepRecord, m: Multipliers,
-    seeds: Rows, legs: wp.array(dtype=LegReverse), contacts: wp.array(dtype=PawContact),
+def write_laws(
+    model: RobotModel, at: ReplayedStep, first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays,
+    record: StepRecord, m: Multipliers, cotangent: TrajectoryArrays, legs: wp.array(dtype=LegReverse),
 ) -> bool:  # fmt: skip
-    """Write the paws' laws at the solution, and the gradients by their impulses; returns whether any touches."""
+    """Write the paws' contacts and laws at the solution, and the gradients by their impulses, to `legs`.
+
+    Returns whether any paw touches. first_impulse: as `Commands.impulse`; cotangent: gradient by the trajectory.
+    """
     world, i = at.world, at.entry
     base = record.base[world, i]
-    ahead = record.base[world, i + 1]
-    lin = wp.quat_rotate_inv(base.quat, ahead.lin)
-    ang = ahead.ang
+    end = record.base[world, i + 1]
+    lin = wp.quat_rotate_inv(base.quat, end.lin)
+    ang = end.ang
     old_lin = wp.quat_rotate_inv(base.quat, base.lin)
     touching = bool(False)
     for k in range(legs.shape[0]):
         legs[k].law = PawLaw()
-        impulse = wp.quat_rotate_inv(base.quat, rows.impulse[at.step, k, world])
+        impulse = wp.quat_rotate_inv(base.quat, trajectory.impulse[at.step, k, world])
         if wp.dot(impulse, impulse) > real(0.0):
             paw = record.paws[world, i, k]
-            c = contact_at(robot, k, base, paw, record.legs[world, i, k], record.inverse[world, i], impulse)
-            point = contact_point(robot, k, paw, c)
-            before = old_lin + wp.cross(base.ang, point) + c.jacobian * record.rates[world, i, k]
+            c = contact_at(model, k, base, paw, record.legs[world, i, k], record.inverse[world, i], impulse)
+            point = contact_point(model, k, paw, c)
+            old_velocity = old_lin + wp.cross(base.ang, point) + c.jacobian * record.rates[world, i, k]
             velocity = lin + wp.cross(ang, point) + c.jacobian * record.rates[world, i + 1, k]
             old_impulse = first_impulse[k, world]
             if at.step > 0:
-                old_impulse = rows.impulse[at.step - 1, k, world]
+                old_impulse = trajectory.impulse[at.step - 1, k, world]
             old_impulse = wp.quat_rotate_inv(base.quat, old_impulse)
-            law = paw_law(robot, world, k, c, before, velocity, old_impulse)
-            seed = m.lin + wp.cross(m.ang, point) + c.jacobian * legs[k].virtual_rates
-            if seeds.impulse.shape[0] > 0:
-                seed += wp.quat_rotate_inv(base.quat, seeds.impulse[at.step, k, world])
-            contacts[k] = c
+            law = paw_law(model, world, k, c, old_velocity, velocity, old_impulse)
+            impulse_cotangent = m.lin + wp.cross(m.ang, point) + c.jacobian * legs[k].virtual_rates
+            if cotangent.impulse.shape[0] > 0:
+                impulse_cotangent += wp.quat_rotate_inv(base.quat, cotangent.impulse[at.step, k, world])
+            legs[k].contact = c
             legs[k].law = law
-            legs[k].seed = seed
+            legs[k].multiplier = impulse_cotangent
             touching = touching or law.mode != SEPARATE
     return touching
 
 
 @wp.func
 def add_laws(
-    robot: Robot, at: StepPlace, record: StepRecord, before: Multipliers, legs: wp.array(dtype=LegReverse),
-    contacts: wp.array(dtype=PawContact),
+    model: RobotModel, at: ReplayedStep, record: StepRecord, multipliers: Multipliers, legs: wp.array(dtype=LegReverse),
 ) -> Multipliers:  # fmt: skip
-    """Return the multipliers with the share of the contact laws, whose own are known; the legs' are replaced."""
-    m = before
-    more_lin = vec3(real(0.0))
-    more_ang = vec3(real(0.0))
+    """Return the multipliers with the contact laws' part added, from the laws' own in `legs`; updates the legs' too."""
+    m = multipliers
+    law_lin = vec3(real(0.0))
+    law_ang = vec3(real(0.0))
     for k in range(legs.shape[0]):
         if legs[k].law.mode != SEPARATE:
-            c = contacts[k]
-            y = wp.transpose(legs[k].law.by_velocity) * legs[k].seed
+            c = legs[k].contact
+            y = wp.transpose(legs[k].law.by_velocity) * legs[k].multiplier
             joint = wp.transpose(c.jacobian) * y
-            more_lin += c.to_lin * y
-            more_ang += c.to_ang * y
-            m.lin_seed += y
-            m.ang_seed += wp.cross(contact_point(robot, k, record.paws[at.world, at.entry, k], c), y)
+            law_lin += c.to_lin * y
+            law_ang += c.to_ang * y
+            m.lin_cotangent += y
+            m.ang_cotangent += wp.cross(contact_point(model, k, record.paws[at.world, at.entry, k], c), y)
             legs[k].rates = legs[k].rates + joint
             legs[k].virtual_rates = legs[k].virtual_rates + record.legs[at.world, at.entry, k].inverse * joint
-    m.lin += more_lin
-    m.ang += more_ang
+    m.lin += law_lin
+    m.ang += law_ang
     for k in range(legs.shape[0]):
         solve = record.legs[at.world, at.entry, k]
-        legs[k].virtual_rates = legs[k].virtual_rates - solve.to_lin * more_lin - solve.to_ang * more_ang
+        legs[k].virtual_rates = legs[k].virtual_rates - solve.to_lin * law_lin - solve.to_ang * law_ang
     return m
 
 
 @wp.func
 def find_multipliers(
-    robot: Robot, at: StepPlace, first_impulse: wp.array2d(dtype=vec3), rows: Rows, seeds: Rows, record: StepRecord,
-    lin_seed: vec3, ang_seed: vec3, legs: wp.array(dtype=LegReverse), contacts: wp.array(dtype=PawContact),
-    matrix: wp.array2d(dtype=real), vector: wp.array(dtype=real),
+    model: RobotModel, at: ReplayedStep, first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays,
+    cotangent: TrajectoryArrays, record: StepRecord, lin_cotangent: vec3, ang_cotangent: vec3,
+    legs: wp.array(dtype=LegReverse),
 ) -> Multipliers:  # fmt: skip
-    """Return the multipliers of a step's equations for the gradients by the velocities at its end, body axes.
+    """Return the multipliers of a step's equations, given the gradients by the velocities at its end.
 
-    legs: `rates` are those of the motors; to them the share of the contact laws is added.
+    See `step_adjoint` for the equations. lin_cotangent, ang_cotangent: by the base's, body axes. legs: `rates` are
+    those by the motors' rates, to which the contact laws' part is added; multipliers, contacts and laws are written.
     """
-    m = solve_system(record, at, lin_seed, ang_seed, legs)
-    if load_laws(robot, at, first_impulse, rows, record, m, seeds, legs, contacts):
-        solve_laws(contacts, legs, matrix, vector)
-        m = add_laws(robot, at, record, m, legs, contacts)
+    m = solve_system(record, at, lin_cotangent, ang_cotangent, legs)
+    if write_laws(model, at, first_impulse, trajectory, record, m, cotangent, legs):
+        solve_laws(legs)
+        m = add_laws(model, at, record, m, legs)
     return m
 
 
 @wp.func
-def held_base(at: StepPlace, record: StepRecord, m: Multipliers) -> BaseFactors:
-    """Return what is held of the base."""
+def base_factors(at: ReplayedStep, record: StepRecord, m: Multipliers) -> BaseFactors:
+    """Return the base's constants in a step."""
     base = record.base[at.world, at.entry]
-    ahead = record.base[at.world, at.entry + 1]
-    held = BaseFactors()
-    held.virtual_lin = m.lin
-    held.virtual_ang = m.ang
-    held.lin = wp.quat_rotate_inv(base.quat, ahead.lin)
-    held.ang = ahead.ang
-    held.lin_acc = (held.lin - wp.quat_rotate_inv(base.quat, base.lin)) / at.dt
-    held.ang_acc = (held.ang - base.ang) / at.dt
-    return held
+    return make_base_factors(base, record.base[at.world, at.entry + 1], m.lin, m.ang, at.dt)
 
 
 @wp.func
-def held_leg(
-    at: StepPlace, k: int, rows: Rows, seeds: Rows, record: StepRecord, legs: wp.array(dtype=LegReverse),
-    contacts: wp.array(dtype=PawContact),
+def leg_factors(
+    at: ReplayedStep, k: int, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord,
+    legs: wp.array(dtype=LegReverse),
 ) -> LegFactors:  # fmt: skip
-    """Return what is held of a leg."""
-    held = LegFactors()
-    held.virtual_rates = legs[k].virtual_rates
-    held.rates = record.rates[at.world, at.entry + 1, k]
-    held.acc = (held.rates - record.rates[at.world, at.entry, k]) / at.dt
-    held.mode = legs[k].law.mode
-    held.pressed = int(rows.pressed[at.step, k, at.world])
-    if held.mode != SEPARATE:
-        held.impulse = contacts[k].impulse
-        held.law = legs[k].seed
-        if seeds.impulse.shape[0] > 0:
-            held.push = seeds.impulse[at.step, k, at.world]
-    return held
+    """Return the constants of leg k in a step."""
+    push = vec3(real(0.0))
+    if cotangent.impulse.shape[0] > 0:
+        push = cotangent.impulse[at.step, k, at.world]
+    return make_leg_factors(
+        record.rates[at.world, at.entry, k], record.rates[at.world, at.entry + 1, k], legs[k].virtual_rates,
+        legs[k].law.mode, int(trajectory.pressed[at.step, k, at.world]), legs[k].contact.impulse, legs[k].multiplier,
+        push, at.dt,
+    )  # fmt: skip

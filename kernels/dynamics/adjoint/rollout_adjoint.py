@@ -1,7 +1,7 @@
-"""The reverse pass of a rollout, all its steps in a launch, a thread a world.
+"""The reverse pass of a rollout: all its steps in one launch, with one thread per world.
 
-From row to row, backwards: the steps between two rows are made again, with the impulses that the rollout found, and
-then run backwards one by one (`step_adjoint`, `virtual_power`).
+The rows are visited backwards: the steps between two rows are recomputed with the impulses of the rollout, then run
+backwards one by one (`step_adjoint`, `virtual_power`).
 """
 
 import warp as wp
@@ -10,15 +10,14 @@ from ...actuation.motors import MotorParams, motor_torque
 from ...layout import BASE
 from ...scalar import quat, real, vec3
 from ...state import BaseState, base_com
-from ..contact import PawContact
 from ..parameters import load_moments, load_spring, load_stops
-from ..step import LegParams, Robot, StepSettings, load_leg
+from ..step import LegParams, RobotModel, StepSettings, load_leg
 from ..trajectory import (
     Actuation,
     Arrival,
     Commands,
-    Rows,
     Timing,
+    TrajectoryArrays,
     arrival,
     load_filter,
     load_row_base,
@@ -34,115 +33,122 @@ from .command_adjoint import (
     add_motor_constants,
     add_offsets,
     add_targets,
+    filter_adjoint_scalar,
     filter_gradient,
     motor_gradient,
-    weighed_filter,
 )
 from .gradients import GRADIENT_ROWS, Gradients, add_com, add_filter
-from .multipliers import LegReverse, StepPlace, StepRecord, replay_step
+from .multipliers import LegReverse, ReplayedStep, StepRecord, replay_step
 from .step_adjoint import reverse_step
-from .virtual_power import BaseFactors, BaseSeeds, LegFactors, base_action, leg_action, turned
+from .virtual_power import BaseCotangent, BaseFactors, LegFactors, base_action, leg_action, rotation_adjoint_scalar
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.func
-def weighed_row(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3, seed: BaseState) -> real:
-    """Return the weighed state of the base that a row holds."""
+def row_adjoint_scalar(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3, cotangent: BaseState) -> real:
+    """Return cotangent . (the base's state that a row holds, see `row_base`)."""
     base = row_base(pos, orientation, com_lin, ang, com)
     return (
-        wp.dot(seed.pos, base.pos)
-        + wp.dot(seed.quat, base.quat)
-        + wp.dot(seed.lin, base.lin)
-        + wp.dot(seed.ang, base.ang)
+        wp.dot(cotangent.pos, base.pos)
+        + wp.dot(cotangent.quat, base.quat)
+        + wp.dot(cotangent.lin, base.lin)
+        + wp.dot(cotangent.ang, base.ang)
     )
 
 
 @wp.func
-def weighed_store(orientation: quat, lin: vec3, omega: vec3, com: vec3, lin_seed: vec3, ang_seed: vec3) -> real:
-    """Return the weighed velocities that a row holds of a state of the base."""
+def store_adjoint_scalar(
+    orientation: quat, lin: vec3, omega: vec3, com: vec3, lin_cotangent: vec3, ang_cotangent: vec3
+) -> real:
+    """Return the cotangents . (the velocities that a row stores of a base state, see `store_row_base`)."""
     ang = wp.quat_rotate(orientation, omega)
-    return wp.dot(ang_seed, ang) + wp.dot(lin_seed, lin + wp.cross(ang, wp.quat_rotate(orientation, com)))
+    return wp.dot(ang_cotangent, ang) + wp.dot(lin_cotangent, lin + wp.cross(ang, wp.quat_rotate(orientation, com)))
 
 
 @wp.struct
-class RowSeeds:
-    """Gradient by the base's entries of a row."""
+class RowCotangent:
+    """Gradient by the base's entries of a row, in their order and axes, see `TrajectoryArrays`."""
 
     pos: vec3
     quat: quat
-    lin: vec3
-    ang: vec3
-    com: vec3  # by the base's centre of mass, of all rows that were passed
+    lin: vec3  # by the com's velocity, world axes
+    ang: vec3  # by the angular velocity, world axes
+    com: vec3  # by the base's centre of mass, summed over rows
 
 
 @wp.func
-def leave_row(rows: Rows, robot: Robot, row: int, world: int, adj: BaseState, com_before: vec3) -> RowSeeds:
-    """Return the gradient by a row's entries for that by the base's state which is read from it."""
-    com = base_com(robot.table, world)
-    pos, orientation, lin, ang, com_adj, _seed = wp.grad(weighed_row)(
-        row_vec3(rows.q, row, 0, world), row_quat(rows.q, row, 3, world), row_vec3(rows.qd, row, 0, world),
-        row_vec3(rows.qd, row, 3, world), com, adj,
+def load_row_base_adjoint(
+    trajectory: TrajectoryArrays, model: RobotModel, row: int, world: int, adj: BaseState, later_com: vec3
+) -> RowCotangent:
+    """Return the gradient by a row's entries from `adj`, that by the base's state read from it.
+
+    later_com: gradient by the base's centre of mass of the rows after it.
+    """
+    com = base_com(model.table, world)
+    pos, orientation, lin, ang, com_adj, _cotangent = wp.grad(row_adjoint_scalar)(
+        row_vec3(trajectory.q, row, 0, world), row_quat(trajectory.q, row, 3, world),
+        row_vec3(trajectory.qd, row, 0, world), row_vec3(trajectory.qd, row, 3, world), com, adj,
     )  # fmt: skip
-    seeds = RowSeeds()
-    seeds.pos = pos
-    seeds.quat = orientation
-    seeds.lin = lin
-    seeds.ang = ang
-    seeds.com = com_before + com_adj
-    return seeds
+    cotangent = RowCotangent()
+    cotangent.pos = pos
+    cotangent.quat = orientation
+    cotangent.lin = lin
+    cotangent.ang = ang
+    cotangent.com = later_com + com_adj
+    return cotangent
 
 
 @wp.func
-def add_row_seeds(into: RowSeeds, seeds: Rows, row: int, world: int) -> RowSeeds:
-    """Return the gradient by a row's entries with that of the number itself added."""
+def add_row_cotangent(into: RowCotangent, cotangent: TrajectoryArrays, row: int, world: int) -> RowCotangent:
+    """Return the gradient by a row's base entries, `into` plus the direct one in `cotangent`."""
     s = into
-    if seeds.q.shape[0] > 0:
-        s.pos += row_vec3(seeds.q, row, 0, world)
-        s.quat += row_quat(seeds.q, row, 3, world)
-    if seeds.qd.shape[0] > 0:
-        s.lin += row_vec3(seeds.qd, row, 0, world)
-        s.ang += row_vec3(seeds.qd, row, 3, world)
+    if cotangent.q.shape[0] > 0:
+        s.pos += row_vec3(cotangent.q, row, 0, world)
+        s.quat += row_quat(cotangent.q, row, 3, world)
+    if cotangent.qd.shape[0] > 0:
+        s.lin += row_vec3(cotangent.qd, row, 0, world)
+        s.ang += row_vec3(cotangent.qd, row, 3, world)
     return s
 
 
 @wp.struct
-class RowState:
-    """Gradient by the base's state which a row was written from."""
+class RowBaseAdjoint:
+    """Gradient by the base's state that a row was written from."""
 
     base: BaseState
-    com: vec3  # by the base's centre of mass, of all rows that were passed
+    com: vec3  # by the base's centre of mass, summed over rows
 
 
 @wp.func
-def enter_row(robot: Robot, world: int, base: BaseState, seeds: RowSeeds) -> RowState:
-    """Return the gradient by the base's state which a row was written from, for that by the row's entries."""
-    com = base_com(robot.table, world)
-    orientation, lin, ang, com_adj, _lin, _ang = wp.grad(weighed_store)(
-        base.quat, base.lin, base.ang, com, seeds.lin, seeds.ang
+def store_row_base_adjoint(model: RobotModel, world: int, base: BaseState, cotangent: RowCotangent) -> RowBaseAdjoint:
+    """Return the gradient by the base's state that a row was written from, given that by the row's entries."""
+    com = base_com(model.table, world)
+    orientation, lin, ang, com_adj, _lin, _ang = wp.grad(store_adjoint_scalar)(
+        base.quat, base.lin, base.ang, com, cotangent.lin, cotangent.ang
     )
-    adj = RowState()
-    adj.base.pos = seeds.pos
-    adj.base.quat = seeds.quat + orientation
+    adj = RowBaseAdjoint()
+    adj.base.pos = cotangent.pos
+    adj.base.quat = cotangent.quat + orientation
     adj.base.lin = lin
     adj.base.ang = ang
-    adj.com = seeds.com + com_adj
+    adj.com = cotangent.com + com_adj
     return adj
 
 
 @wp.func
-def add_motor_rows(legs: wp.array(dtype=LegReverse), seeds: Rows, row: int, world: int):
-    """Add the gradient of the number itself by a row's angles and rates."""
+def add_motor_rows(legs: wp.array(dtype=LegReverse), cotangent: TrajectoryArrays, row: int, world: int):
+    """Add the direct gradient by a row's angles and rates, in `cotangent`, to `legs`."""
     for k in range(legs.shape[0]):
-        if seeds.q.shape[0] > 0:
-            legs[k].angles = legs[k].angles + row_vec3(seeds.q, row, 7 + 3 * k, world)
-        if seeds.qd.shape[0] > 0:
-            legs[k].rates = legs[k].rates + row_vec3(seeds.qd, row, 6 + 3 * k, world)
+        if cotangent.q.shape[0] > 0:
+            legs[k].angles = legs[k].angles + row_vec3(cotangent.q, row, 7 + 3 * k, world)
+        if cotangent.qd.shape[0] > 0:
+            legs[k].rates = legs[k].rates + row_vec3(cotangent.qd, row, 6 + 3 * k, world)
 
 
 @wp.func
 def load_parts(
-    robot: Robot,
+    model: RobotModel,
     actuation: Actuation,
     world: int,
     params: wp.array(dtype=LegParams),
@@ -150,15 +156,15 @@ def load_parts(
 ):
     """Write the parameters of a world's legs and motors."""
     for k in range(params.shape[0]):
-        params[k] = load_leg(robot, world, k)
+        params[k] = load_leg(model, world, k)
     for i in range(motors.shape[0]):
         motors[i] = load_world_motor(actuation, i, world)
 
 
 @wp.func
-def place_in(commands: Commands, t: int, dt: real, world: int) -> StepPlace:
-    """Return the place of the steps in a policy step, with the wrench on the base."""
-    at = StepPlace()
+def replayed_step(commands: Commands, t: int, dt: real, world: int) -> ReplayedStep:
+    """Return the constants of the steps of policy step t; `step` and `entry` are to be set."""
+    at = ReplayedStep()
     at.dt = dt
     at.world = world
     at.force = row_vec3(commands.wrench, t, 0, world)
@@ -168,19 +174,19 @@ def place_in(commands: Commands, t: int, dt: real, world: int) -> StepPlace:
 
 @wp.func
 def replay_row(
-    robot: Robot, params: wp.array(dtype=LegParams), place: StepPlace, rows: Rows, row: int, every: int, com: vec3,
-    record: StepRecord,
+    model: RobotModel, params: wp.array(dtype=LegParams), policy_step: ReplayedStep, trajectory: TrajectoryArrays,
+    row: int, every: int, com: vec3, record: StepRecord,
 ):  # fmt: skip
-    """Make the steps from a row to the next one again."""
-    at = place
-    record.base[at.world, 0] = load_row_base(rows, row, at.world, com)
+    """Recompute the `every` steps after a row into the record."""
+    at = policy_step
+    record.base[at.world, 0] = load_row_base(trajectory, row, at.world, com)
     for k in range(record.angles.shape[2]):
-        record.angles[at.world, 0, k] = row_vec3(rows.q, row, 7 + 3 * k, at.world)
-        record.rates[at.world, 0, k] = row_vec3(rows.qd, row, 6 + 3 * k, at.world)
+        record.angles[at.world, 0, k] = row_vec3(trajectory.q, row, 7 + 3 * k, at.world)
+        record.rates[at.world, 0, k] = row_vec3(trajectory.qd, row, 6 + 3 * k, at.world)
     for i in range(every):
         at.step = row * every + i
         at.entry = i
-        replay_step(robot, params, at, rows, record)
+        replay_step(model, params, at, trajectory, record)
 
 
 @wp.func
@@ -192,146 +198,149 @@ def add_wrench(gradients: Gradients, t: int, world: int, force: vec3, moment: ve
 
 @wp.func
 def add_motor_adjoint(
-    found: MotorAdjoint, arrived: Arrival, at: StepPlace, motor: int, seeds: Rows, gradients: Gradients,
-    legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
+    by_motor: MotorAdjoint, arrived: Arrival, at: ReplayedStep, motor: int, cotangent: TrajectoryArrays,
+    gradients: Gradients, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
 ):  # fmt: skip
-    """Add the gradients by what a motor's torque in a step depends on."""
+    """Add the gradients by the inputs of a motor's torque in a step: targets, constants, angle and rate."""
     k = motor / 3
     c = motor - 3 * k
-    seed = legs[k].torque[c]
-    if seeds.torque.shape[0] > 0:
-        seed += seeds.torque[at.step, motor, at.world]
-    add_targets(gradients, arrived, motor, at.world, seed * found.target)
-    add_motor_constants(sums, sums, motor, seed, found)
+    torque_cotangent = legs[k].torque[c]
+    if cotangent.torque.shape[0] > 0:
+        torque_cotangent += cotangent.torque[at.step, motor, at.world]
+    add_targets(gradients, arrived, motor, at.world, torque_cotangent * by_motor.target)
+    add_motor_constants(sums, sums, motor, torque_cotangent, by_motor)
     angles = legs[k].angles
     rates = legs[k].rates
-    angles[c] += seed * found.angle
-    rates[c] += seed * found.rate
+    angles[c] += torque_cotangent * by_motor.angle
+    rates[c] += torque_cotangent * by_motor.rate
     legs[k].angles = angles
     legs[k].rates = rates
 
 
 @wp.func
 def add_filter_adjoint(
-    found: FilterAdjoint, t: int, k: int, world: int, gradients: Gradients, legs: wp.array(dtype=LegReverse),
+    by_motor: FilterAdjoint, t: int, k: int, world: int, gradients: Gradients, legs: wp.array(dtype=LegReverse),
     sums: wp.array(dtype=real),
 ):  # fmt: skip
-    """Add the gradients by what a leg's filtered targets of a policy step depend on."""
-    store_row_vec3(gradients.target, t, 3 * k, world, found.target)
-    add_offsets(sums, k, found.angles)
-    add_filter(sums, found.constants)
-    legs[k].angles = legs[k].angles + found.angles
-    legs[k].rates = legs[k].rates + found.rates
+    """Add the gradients by the inputs of a leg's filter in policy step t: raw targets, constants, angles and rates."""
+    store_row_vec3(gradients.target, t, 3 * k, world, by_motor.target)
+    add_offsets(sums, k, by_motor.angles)
+    add_filter(sums, by_motor.constants)
+    legs[k].angles = legs[k].angles + by_motor.angles
+    legs[k].rates = legs[k].rates + by_motor.rates
 
 
 @wp.func
-def store_start(
-    gradients: Gradients, world: int, entries: RowSeeds, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real)
-):
-    """Write the gradients by the first row and by the parameters."""
-    for i in range(sums.shape[0]):
-        gradients.parameters[i, world] = sums[i]
+def store_base_entries(gradients: Gradients, world: int, entries: RowCotangent):
+    """Write the gradient by a row's base entries."""
     for i in range(3):
         gradients.q[i, world] = entries.pos[i]
         gradients.qd[i, world] = entries.lin[i]
         gradients.qd[3 + i, world] = entries.ang[i]
     for i in range(4):
         gradients.q[3 + i, world] = entries.quat[i]
-    for k in range(legs.shape[0]):
-        angles = legs[k].angles
-        rates = legs[k].rates
-        for i in range(3):
-            gradients.q[7 + 3 * k + i, world] = angles[i]
-            gradients.qd[6 + 3 * k + i, world] = rates[i]
+
+
+@wp.func
+def store_motor_entries(gradients: Gradients, world: int, leg: int, angles: vec3, rates: vec3):
+    """Write the gradient by a row's entries of one leg: angles and rates of its motors."""
+    for i in range(3):
+        gradients.q[7 + 3 * leg + i, world] = angles[i]
+        gradients.qd[6 + 3 * leg + i, world] = rates[i]
 
 
 @wp.kernel
 def reverse_kernel(
     # in
-    robot: Robot,
+    model: RobotModel,
     settings: StepSettings,
     timing: Timing,
     actuation: Actuation,
     commands: Commands,
-    safe: wp.array3d(dtype=real),
-    rows: Rows,
-    seeds: Rows,
+    filtered_target: wp.array3d(dtype=real),
+    trajectory: TrajectoryArrays,
+    cotangent: TrajectoryArrays,
     # out
     record: StepRecord,
     gradients: Gradients,
 ):
-    """Add the gradient of a number, given that by the trajectory in `seeds`, to `gradients`; one thread per world."""
+    """Add the gradient of a scalar to `gradients`, given its gradient by the trajectory; one thread per world."""
     world = settings.first + wp.tid()
     legs = wp.zeros(shape=(4,), dtype=LegReverse)
-    contacts = wp.zeros(shape=(4,), dtype=PawContact)
-    matrix = wp.zeros(shape=(12, 12), dtype=real)
-    vector = wp.zeros(shape=(12,), dtype=real)
     sums = wp.zeros(shape=(GRADIENT_ROWS,), dtype=real)
     params = wp.zeros(shape=(4,), dtype=LegParams)
     motors = wp.zeros(shape=(12,), dtype=MotorParams)
-    load_parts(robot, actuation, world, params, motors)
-    late = actuation.latency[world] / settings.dt
+    load_parts(model, actuation, world, params, motors)
+    delay = actuation.latency[world] / settings.dt
     last = timing.steps * timing.substeps / timing.every
-    entries = add_row_seeds(RowSeeds(), seeds, last, world)
-    add_motor_rows(legs, seeds, last, world)
-    com = base_com(robot.table, world)
+    entries = add_row_cotangent(RowCotangent(), cotangent, last, world)
+    add_motor_rows(legs, cotangent, last, world)
+    com = base_com(model.table, world)
     for back in range(last):
         row = last - 1 - back
         t = row * timing.every / timing.substeps
-        at = place_in(commands, t, settings.dt, world)
-        replay_row(robot, params, at, rows, row, timing.every, com, record)
-        end = enter_row(robot, world, record.base[world, timing.every], entries)
+        at = replayed_step(commands, t, settings.dt, world)
+        replay_row(model, params, at, trajectory, row, timing.every, com, record)
+        end = store_row_base_adjoint(model, world, record.base[world, timing.every], entries)
         adj = end.base
         for j in range(timing.every):
             at.entry = timing.every - 1 - j
             at.step = row * timing.every + at.entry
             by_step = reverse_step(
-                robot, params, at, commands.impulse, rows, seeds, record, adj, legs, contacts, matrix, vector, sums
-            )
+                model, params, at, commands.impulse, trajectory, cotangent, record, adj, legs, sums,
+            )  # fmt: skip
             adj = by_step.base
             add_wrench(gradients, t, world, by_step.force, by_step.moment)
-            arrived = arrival(at.step, timing.substeps, late)
+            arrived = arrival(at.step, timing.substeps, delay)
             for i in range(motors.shape[0]):
                 angle = record.angles[world, at.entry, i / 3][i % 3]
                 rate = record.rates[world, at.entry, i / 3][i % 3]
-                found = motor_gradient(motors[i], late, commands, safe, timing, at.dt, at.step, i, world, angle, rate)
-                add_motor_adjoint(found, arrived, at, i, seeds, gradients, legs, sums)
-        entries = add_row_seeds(leave_row(rows, robot, row, world, adj, end.com), seeds, row, world)
+                by_motor = motor_gradient(
+                    motors[i], delay, commands, filtered_target, timing, at.dt, at.step, i, world, angle, rate
+                )
+                add_motor_adjoint(by_motor, arrived, at, i, cotangent, gradients, legs, sums)
+        entries = add_row_cotangent(
+            load_row_base_adjoint(trajectory, model, row, world, adj, end.com), cotangent, row, world
+        )
         if row * timing.every == t * timing.substeps:
             for k in range(legs.shape[0]):
                 by_filter = filter_gradient(
                     commands, actuation, t, k, world, record.angles[world, 0, k], record.rates[world, 0, k], gradients
                 )
                 add_filter_adjoint(by_filter, t, k, world, gradients, legs, sums)
-        add_motor_rows(legs, seeds, row, world)
-    add_com(sums, robot.table[BASE, world], com, entries.com)
-    store_start(gradients, world, entries, legs, sums)
+        add_motor_rows(legs, cotangent, row, world)
+    add_com(sums, model.table[BASE, world], com, entries.com)
+    for i in range(sums.shape[0]):
+        gradients.parameters[i, world] = sums[i]
+    store_base_entries(gradients, world, entries)
+    for k in range(legs.shape[0]):
+        store_motor_entries(gradients, world, k, legs[k].angles, legs[k].rates)
 
 
 @wp.func
-def everything(
-    factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, robot: Robot, actuation: Actuation, numbers: Rows,
-    state: BaseState, world: int,
+def adjoint_roots(
+    factors: LegFactors, base: BaseFactors, base_cotangent: BaseCotangent, model: RobotModel, actuation: Actuation,
+    trajectory: TrajectoryArrays, state: BaseState, world: int,
 ) -> real:  # fmt: skip
-    """Return the sum of all functions whose gradients the reverse pass takes; see `generate_adjoints`."""
-    params = load_leg(robot, world, 0)
-    v = row_vec3(numbers.q, 0, 0, world)
-    q = row_quat(numbers.q, 0, 3, world)
-    x = numbers.q[0, 0, world]
-    spring = load_spring(robot.table, 0, world)
-    stops = load_stops(robot.table, 0, world)
+    """Return the sum of all functions that the reverse pass differentiates; see `generate_adjoints`."""
+    params = load_leg(model, world, 0)
+    v = row_vec3(trajectory.q, 0, 0, world)
+    q = row_quat(trajectory.q, 0, 3, world)
+    x = trajectory.q[0, 0, world]
+    spring = load_spring(model.table, 0, world)
+    stops = load_stops(model.table, 0, world)
     leg = leg_action(
-        params.geometry, params.masses, params.joints, spring, stops, robot.ground, x, v, q, v, v, v, v, base, factors,
+        params.geometry, params.masses, params.joints, spring, stops, model.ground, x, v, q, v, v, v, v, base, factors,
         x,
     )  # fmt: skip
     return (
         leg
-        + base_action(load_moments(robot.table, BASE, world), v, v, v, v, q, v, v, base, base_seeds, x)
-        + turned(q, v, x, q)
+        + base_action(load_moments(model.table, BASE, world), v, v, v, v, q, v, v, base, base_cotangent, x)
+        + rotation_adjoint_scalar(q, v, x, q)
         + motor_torque(x, x, x, load_world_motor(actuation, 0, world))
-        + weighed_filter(v, v, v, load_filter(actuation.limits, world), v)
-        + weighed_row(v, q, v, v, v, state)
-        + weighed_store(q, v, v, v, v, v)
+        + filter_adjoint_scalar(v, v, v, load_filter(actuation.limits, world), v)
+        + row_adjoint_scalar(v, q, v, v, v, state)
+        + store_adjoint_scalar(q, v, v, v, v, v)
     )
 
 
@@ -344,13 +353,13 @@ def generate_adjoints(module: str) -> wp.Kernel:
 
     @wp.kernel(enable_backward=True, module=wp.get_module(module))
     def adjoints_kernel(
-        factors: LegFactors, base: BaseFactors, base_seeds: BaseSeeds, robot: Robot, actuation: Actuation,
-        numbers: Rows, state: BaseState, sums: wp.array(dtype=real),
+        factors: LegFactors, base: BaseFactors, base_cotangent: BaseCotangent, model: RobotModel, actuation: Actuation,
+        trajectory: TrajectoryArrays, state: BaseState, sums: wp.array(dtype=real),
     ):  # fmt: skip
         world = wp.tid()
         launched = int(0)  # Warp makes the adjoints anyway, and the compiler drops this kernel's own code
         if launched > 0:
-            sums[world] = everything(factors, base, base_seeds, robot, actuation, numbers, state, world)
+            sums[world] = adjoint_roots(factors, base, base_cotangent, model, actuation, trajectory, state, world)
 
     return adjoints_kernel
 

@@ -1,7 +1,7 @@
-"""`rollout_adjoint` for GPUs: four threads a world, a thread a leg; a few rows at a time, from the last to the first.
+"""`rollout_adjoint` for GPUs, with four threads per world, one per leg; a span of rows at a time, last to first.
 
-Four launches take the steps between these rows: they are made again, each row by threads of its own, run backwards one
-by one, and then twice more side by side for the gradients by parameters (`constants_adjoint`).
+Each span takes four launches: its steps are recomputed, all rows in parallel; run backwards one by one; and then twice
+visited in parallel for the gradients by parameters (`constants_adjoint`).
 """
 
 import warp as wp
@@ -11,13 +11,13 @@ from ...lanes import sync_lanes
 from ...layout import BASE, GRAVITY
 from ...scalar import quat, real, vec3
 from ...state import base_com
-from ..step import Robot, StepSettings, load_leg
+from ..step import RobotModel, StepSettings, load_leg
 from ..trajectory import (
     Actuation,
     Arrival,
     Commands,
-    Rows,
     Timing,
+    TrajectoryArrays,
     arrival,
     load_row_base,
     load_world_motor,
@@ -40,22 +40,31 @@ from .leg_record import (
     put_slopes,
     put_vec,
 )
-from .rollout_adjoint import RowSeeds, add_row_seeds, add_wrench, enter_row, generate_adjoints, leave_row
+from .rollout_adjoint import (
+    RowCotangent,
+    add_row_cotangent,
+    add_wrench,
+    generate_adjoints,
+    load_row_base_adjoint,
+    store_base_entries,
+    store_motor_entries,
+    store_row_base_adjoint,
+)
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
 @wp.struct
 class Span:
-    """The rows whose steps a launch takes."""
+    """Range of rows whose steps a launch takes."""
 
-    begin: int
+    begin: int  # first row
     end: int  # excluded
 
 
 @wp.func
 def first_entry(timing: Timing, span: Span, row: int) -> int:
-    """Return the record's entry of the first step after a row; that of its end follows the last one."""
+    """Return the record's entry of the first step after a row; each row has `every` + 1, the last for its end."""
     return (row - span.begin) * (timing.every + 1)
 
 
@@ -63,79 +72,68 @@ def first_entry(timing: Timing, span: Span, row: int) -> int:
 def replay_legs_kernel(
     # in
     count: int,
-    robot: Robot,
+    model: RobotModel,
     settings: StepSettings,
     timing: Timing,
     actuation: Actuation,
     commands: Commands,
-    safe: wp.array3d(dtype=real),
-    rows: Rows,
+    filtered_target: wp.array3d(dtype=real),
+    trajectory: TrajectoryArrays,
     span: Span,
     # out
     record: LegRecord,
 ):
-    """Make the steps after each row again; launch over (rows of the span, count rounded up to a multiple of 8, 4).
+    """Recompute the steps after each row; launch over (rows of the span, count rounded up to a multiple of 8, 4).
 
     Threads beyond the last world repeat it, and write the same bits.
     """
-    offset, place, leg = wp.tid()
-    world = settings.first + wp.min(place, count - 1)
+    offset, index, leg = wp.tid()
+    world = settings.first + wp.min(index, count - 1)
     row = span.begin + offset
-    at = first_entry(timing, span, row)
+    start_entry = first_entry(timing, span, row)
     first = row * timing.every
     t = first / timing.substeps
-    own = load_leg(robot, world, leg)
+    params = load_leg(model, world, leg)
     force = row_vec3(commands.wrench, t, 0, world)
     moment = row_vec3(commands.wrench, t, 3, world)
-    put_base(record, at, world, load_row_base(rows, row, world, base_com(robot.table, world)))
-    put_vec(record, at, ANGLES, world, leg, row_vec3(rows.q, row, 7 + 3 * leg, world))
-    put_vec(record, at, RATES, world, leg, row_vec3(rows.qd, row, 6 + 3 * leg, world))
+    put_base(record, start_entry, world, load_row_base(trajectory, row, world, base_com(model.table, world)))
+    put_vec(record, start_entry, ANGLES, world, leg, row_vec3(trajectory.q, row, 7 + 3 * leg, world))
+    put_vec(record, start_entry, RATES, world, leg, row_vec3(trajectory.qd, row, 6 + 3 * leg, world))
     sync_lanes()
     motors = wp.zeros(shape=(3,), dtype=MotorParams)
     for c in range(motors.shape[0]):
         motors[c] = load_world_motor(actuation, 3 * leg + c, world)
-    late = actuation.latency[world] / settings.dt
+    delay = actuation.latency[world] / settings.dt
     for i in range(timing.every):
         step = first + i
-        replay_leg(robot, own, settings.dt, world, leg, force, moment, commands.impulse, rows, step, at + i, record)
+        replay_leg(
+            model, params, settings.dt, world, leg, force, moment, commands.impulse, trajectory, step, start_entry + i,
+            record,
+        )  # fmt: skip
         sync_lanes()
-        angles = get_vec(record, at + i, ANGLES, world, leg)
-        rates = get_vec(record, at + i, RATES, world, leg)
+        angles = get_vec(record, start_entry + i, ANGLES, world, leg)
+        rates = get_vec(record, start_entry + i, RATES, world, leg)
         slopes = MotorSlopes()
         for c in range(motors.shape[0]):
             by_motor = motor_gradient(
-                motors[c], late, commands, safe, timing, settings.dt, step, 3 * leg + c, world, angles[c], rates[c]
-            )
+                motors[c], delay, commands, filtered_target, timing, settings.dt, step, 3 * leg + c, world, angles[c],
+                rates[c],
+            )  # fmt: skip
             slopes.target[c] = by_motor.target
             slopes.angle[c] = by_motor.angle
             slopes.rate[c] = by_motor.rate
-        put_slopes(record, at + i, world, leg, slopes)
+        put_slopes(record, start_entry + i, world, leg, slopes)
 
 
 @wp.func
-def load_entries(gradients: Gradients, world: int) -> RowSeeds:
+def load_entries(gradients: Gradients, world: int) -> RowCotangent:
     """Return the gradient by the base's entries of the row after a span."""
-    entries = RowSeeds()
+    entries = RowCotangent()
     entries.pos = vec3(gradients.q[0, world], gradients.q[1, world], gradients.q[2, world])
     entries.quat = quat(gradients.q[3, world], gradients.q[4, world], gradients.q[5, world], gradients.q[6, world])
     entries.lin = vec3(gradients.qd[0, world], gradients.qd[1, world], gradients.qd[2, world])
     entries.ang = vec3(gradients.qd[3, world], gradients.qd[4, world], gradients.qd[5, world])
     return entries
-
-
-@wp.func
-def store_entries(gradients: Gradients, world: int, leg: int, entries: RowSeeds, adj: LegAdjoint):
-    """Write the gradient by a span's first row; leg 0 writes the base's."""
-    for i in range(3):
-        gradients.q[7 + 3 * leg + i, world] = adj.angles[i]
-        gradients.qd[6 + 3 * leg + i, world] = adj.rates[i]
-        if leg == 0:
-            gradients.q[i, world] = entries.pos[i]
-            gradients.qd[i, world] = entries.lin[i]
-            gradients.qd[3 + i, world] = entries.ang[i]
-    if leg == 0:
-        for i in range(4):
-            gradients.q[3 + i, world] = entries.quat[i]
 
 
 @wp.func
@@ -150,18 +148,18 @@ def load_motor_entries(gradients: Gradients, world: int, leg: int) -> LegAdjoint
 
 @wp.func
 def reverse_motors(
-    old: LegAdjoint, slopes: MotorSlopes, arrived: Arrival, seeds: Rows, step: int, leg: int, world: int,
-    gradients: Gradients, writes: bool,
+    old: LegAdjoint, slopes: MotorSlopes, arrived: Arrival, cotangent: TrajectoryArrays, step: int, leg: int,
+    world: int, gradients: Gradients, writes: bool,
 ) -> LegAdjoint:  # fmt: skip
-    """Return the gradient with that by the motors' angles and rates; if it `writes`, add those by their targets."""
+    """Return the gradient with that by the motors' angles and rates; if it `writes`, add that by their targets."""
     adj = old
-    seed = adj.torque
-    if seeds.torque.shape[0] > 0:
-        seed += row_vec3(seeds.torque, step, 3 * leg, world)
-    adj.angles += wp.cw_mul(seed, slopes.angle)
-    adj.rates += wp.cw_mul(seed, slopes.rate)
+    torque_cotangent = adj.torque
+    if cotangent.torque.shape[0] > 0:
+        torque_cotangent += row_vec3(cotangent.torque, step, 3 * leg, world)
+    adj.angles += wp.cw_mul(torque_cotangent, slopes.angle)
+    adj.rates += wp.cw_mul(torque_cotangent, slopes.rate)
     if writes:
-        by_target = wp.cw_mul(seed, slopes.target)
+        by_target = wp.cw_mul(torque_cotangent, slopes.target)
         for c in range(wp.static(3)):
             add_targets(gradients, arrived, 3 * leg + c, world, by_target[c])
     return adj
@@ -171,14 +169,14 @@ def reverse_motors(
 def reverse_legs_kernel(
     # in
     count: int,
-    robot: Robot,
+    model: RobotModel,
     settings: StepSettings,
     timing: Timing,
     actuation: Actuation,
     commands: Commands,
-    safe: wp.array3d(dtype=real),
-    rows: Rows,
-    seeds: Rows,
+    filtered_target: wp.array3d(dtype=real),
+    trajectory: TrajectoryArrays,
+    cotangent: TrajectoryArrays,
     span: Span,
     # in, out
     record: LegRecord,
@@ -189,23 +187,23 @@ def reverse_legs_kernel(
     gradients.q and qd hold the gradient by the row after the span, and then that by its first row. Of those by
     parameters the base's and the filter's are added. Threads beyond the last world repeat it, and write nothing.
     """
-    place, leg = wp.tid()
-    world = settings.first + wp.min(place, count - 1)
+    index, leg = wp.tid()
+    world = settings.first + wp.min(index, count - 1)
     dt = settings.dt
-    own = load_leg(robot, world, leg)
-    late = actuation.latency[world] / dt
+    params = load_leg(model, world, leg)
+    delay = actuation.latency[world] / dt
     entries = load_entries(gradients, world)
     adj = load_motor_entries(gradients, world, leg)
-    of_leg = thread_sums(gradients, world, place < count, False, False)
-    of_legs = thread_sums(gradients, world, place < count and leg == 0, False, True)
+    leg_sums = thread_sums(gradients, world, index < count, False, False)
+    shared_sums = thread_sums(gradients, world, index < count and leg == 0, False, True)
     for back in range(span.end - span.begin):
         row = span.end - 1 - back
-        at = first_entry(timing, span, row)
+        start_entry = first_entry(timing, span, row)
         first = row * timing.every
         t = first / timing.substeps
         force = row_vec3(commands.wrench, t, 0, world)
         moment = row_vec3(commands.wrench, t, 3, world)
-        end = enter_row(robot, world, get_base(record, at + timing.every, world), entries)
+        end = store_row_base_adjoint(model, world, get_base(record, start_entry + timing.every, world), entries)
         adj.base = end.base
         adj.force = vec3(real(0.0))
         adj.moment = vec3(real(0.0))
@@ -213,36 +211,40 @@ def reverse_legs_kernel(
             i = timing.every - 1 - j
             step = first + i
             adj = reverse_leg(
-                robot, own, dt, world, leg, force, moment, rows, seeds, step, at + i, record, adj, place < count
-            )
-            arrived = arrival(step, timing.substeps, late)
-            slopes = get_slopes(record, at + i, world, leg)
-            adj = reverse_motors(adj, slopes, arrived, seeds, step, leg, world, gradients, place < count)
-        entries = add_row_seeds(leave_row(rows, robot, row, world, adj.base, end.com), seeds, row, world)
-        if place < count:
+                model, params, dt, world, leg, force, moment, trajectory, cotangent, step, start_entry + i, record, adj,
+                index < count,
+            )  # fmt: skip
+            arrived = arrival(step, timing.substeps, delay)
+            slopes = get_slopes(record, start_entry + i, world, leg)
+            adj = reverse_motors(adj, slopes, arrived, cotangent, step, leg, world, gradients, index < count)
+        entries = add_row_cotangent(
+            load_row_base_adjoint(trajectory, model, row, world, adj.base, end.com), cotangent, row, world
+        )
+        if index < count:
             if leg == 0:
                 add_wrench(gradients, t, world, adj.force, adj.moment)
         if first == t * timing.substeps:
             by_filter = filter_gradient(
-                commands, actuation, t, leg, world, get_vec(record, at, ANGLES, world, leg),
-                get_vec(record, at, RATES, world, leg), gradients,
+                commands, actuation, t, leg, world, get_vec(record, start_entry, ANGLES, world, leg),
+                get_vec(record, start_entry, RATES, world, leg), gradients,
             )  # fmt: skip
-            add_filter(of_legs, by_filter.constants)
-            if place < count:
-                put_vec(record, at, FILTER, world, leg, by_filter.angles)
+            add_filter(shared_sums, by_filter.constants)
+            if index < count:
+                put_vec(record, start_entry, FILTER, world, leg, by_filter.angles)
                 store_row_vec3(gradients.target, t, 3 * leg, world, by_filter.target)
             adj.angles += by_filter.angles
             adj.rates += by_filter.rates
-        if seeds.q.shape[0] > 0:
-            adj.angles += row_vec3(seeds.q, row, 7 + 3 * leg, world)
-        if seeds.qd.shape[0] > 0:
-            adj.rates += row_vec3(seeds.qd, row, 6 + 3 * leg, world)
-    if place < count:
-        store_entries(gradients, world, leg, entries, adj)
+        if cotangent.q.shape[0] > 0:
+            adj.angles += row_vec3(cotangent.q, row, 7 + 3 * leg, world)
+        if cotangent.qd.shape[0] > 0:
+            adj.rates += row_vec3(cotangent.qd, row, 6 + 3 * leg, world)
+    if index < count:
+        store_motor_entries(gradients, world, leg, adj.angles, adj.rates)
         if leg == 0:
-            add_moments(of_leg, BASE, adj.body)
-            add_com(of_leg, robot.table[BASE, world], base_com(robot.table, world), adj.com + entries.com)
-            add_vec3(of_leg, GRAVITY, adj.gravity)
+            store_base_entries(gradients, world, entries)
+            add_moments(leg_sums, BASE, adj.body)
+            add_com(leg_sums, model.table[BASE, world], base_com(model.table, world), adj.com + entries.com)
+            add_vec3(leg_sums, GRAVITY, adj.gravity)
 
 
 ADJOINTS = generate_adjoints(__name__)

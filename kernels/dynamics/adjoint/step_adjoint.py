@@ -14,140 +14,102 @@ which the forward pass found.
 import warp as wp
 
 from ...layout import BASE, GRAVITY
-from ...scalar import quat, real, vec3
+from ...scalar import real, vec3
 from ...state import BaseState, base_com
-from ..contact import SEPARATE, PawContact
-from ..parameters import load_moments, load_spring, load_stops, load_vec3
-from ..step import LegParams, Robot
-from ..trajectory import Rows
+from ..contact import SEPARATE
+from ..step import LegParams, RobotModel
+from ..trajectory import TrajectoryArrays
+from .action_gradients import LegGradient, base_action_gradient, leg_action_gradient
 from .gradients import (
     add_com,
     add_entry,
-    add_geometry,
-    add_joints,
-    add_masses,
+    add_leg_parameters,
     add_moments,
-    add_spring,
-    add_stops,
     add_vec3,
 )
-from .multipliers import LegReverse, StepPlace, StepRecord, find_multipliers, held_base, held_leg
-from .virtual_power import BaseFactors, BaseSeeds, LegFactors, base_action, leg_action, turned
+from .multipliers import LegReverse, ReplayedStep, StepRecord, base_factors, find_multipliers, leg_factors
+from .virtual_power import BaseCotangent, rotation_adjoint_scalar
 
 wp.set_module_options({"enable_backward": False})
-
-
-@wp.struct
-class BasePart:
-    """A leg's part of the gradient by the base's state at the start of a step, and by gravity in body axes."""
-
-    pos: vec3
-    turn: quat
-    omega: vec3
-    gravity: vec3
-
-
-@wp.func
-def reverse_leg_part(
-    robot: Robot, params: LegParams, at: StepPlace, k: int, record: StepRecord, g: vec3, base: BaseFactors,
-    held: LegFactors, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
-) -> BasePart:  # fmt: skip
-    """Add the gradients of a leg's weighed equations to those by its motors and its parameters."""
-    world, i = at.world, at.entry
-    start = record.base[world, i]
-    law = legs[k].law
-    mu = real(0.0)
-    if law.mode != SEPARATE:
-        mu = law.mu
-    (geo, masses, joints, spring, stops, _ground, mu_adj, pos, turn, omega, g_part, angles, rates, _held, _leg,
-     _step) = (
-        wp.grad(leg_action)(
-            params.geometry, params.masses, params.joints, load_spring(robot.table, k, world),
-            load_stops(robot.table, k, world), robot.ground, mu, start.pos, start.quat, start.ang, g,
-            record.angles[world, i, k], record.rates[world, i, k], base, held, at.dt,
-        )
-    )  # fmt: skip
-    add_geometry(sums, k, geo)
-    add_masses(sums, k, masses)
-    add_joints(sums, k, joints)
-    add_spring(sums, k, spring)
-    add_stops(sums, k, stops)
-    if law.mode != SEPARATE:
-        add_entry(sums, law.mu_row, mu_adj)
-    legs[k].angles = legs[k].angles + angles
-    legs[k].rates = legs[k].rates + rates
-    legs[k].torque = at.dt * legs[k].virtual_rates
-    part = BasePart()
-    part.pos = pos
-    part.turn = turn
-    part.omega = omega
-    part.gravity = g_part
-    return part
 
 
 @wp.struct
 class StepAdjoint:
     """Gradient by the base's state at the start of a step, and by the wrench on it."""
 
-    base: BaseState
-    force: vec3
+    base: BaseState  # axes as those of the state
+    force: vec3  # by the force at the com, world axes
     moment: vec3
 
 
 @wp.func
+def add_leg_gradient(
+    gradient: LegGradient, k: int, dt: real, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real)
+):
+    """Add a leg's gradient by its motors to `legs`, by its parameters to `sums`, and write that by its torques."""
+    add_leg_parameters(sums, k, gradient)
+    if legs[k].law.mode != SEPARATE:
+        add_entry(sums, legs[k].law.mu_row, gradient.mu)
+    legs[k].angles = legs[k].angles + gradient.angles
+    legs[k].rates = legs[k].rates + gradient.rates
+    legs[k].torque = dt * legs[k].virtual_rates
+
+
+@wp.func
 def reverse_step(
-    robot: Robot, params: wp.array(dtype=LegParams), at: StepPlace, first_impulse: wp.array2d(dtype=vec3), rows: Rows,
-    seeds: Rows, record: StepRecord, adj: BaseState, legs: wp.array(dtype=LegReverse),
-    contacts: wp.array(dtype=PawContact), matrix: wp.array2d(dtype=real), vector: wp.array(dtype=real),
-    sums: wp.array(dtype=real),
+    model: RobotModel, params: wp.array(dtype=LegParams), at: ReplayedStep, first_impulse: wp.array2d(dtype=vec3),
+    trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord, adj: BaseState,
+    legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
 ) -> StepAdjoint:  # fmt: skip
     """Run a step backwards: from the gradient by the state at its end to that by the state at its start.
 
-    adj: gradient by the base's state; `angles` and `rates` of the legs are replaced in place, and `torque` is written.
+    adj: gradient by the base's state at the end. legs (4,): `angles` and `rates` are replaced in place, `torque` is
+    written, the rest overwritten. first_impulse: as `Commands.impulse`. sums (GRADIENT_ROWS,): gradient by parameters,
+    added to. trajectory, cotangent: of the rollout, and the gradient by it. record: the step as `replay_step` made it.
     """
     dt, world = at.dt, at.world
     base = record.base[world, at.entry]
-    ahead = record.base[world, at.entry + 1]
     # integration of the coordinates
     new_velocity = adj.lin + dt * adj.pos
-    quat_adj, ang_seed, _dt, _seed = wp.grad(turned)(base.quat, ahead.ang, dt, adj.quat)
+    quat_adj, ang_cotangent, _dt, _quat_adj = wp.grad(rotation_adjoint_scalar)(
+        base.quat, record.base[world, at.entry + 1].ang, dt, adj.quat
+    )
     for k in range(legs.shape[0]):
         legs[k].rates = legs[k].rates + dt * legs[k].angles
     m = find_multipliers(
-        robot, at, first_impulse, rows, seeds, record, wp.quat_rotate_inv(base.quat, new_velocity), ang_seed + adj.ang,
-        legs, contacts, matrix, vector,
+        model, at, first_impulse, trajectory, cotangent, record, wp.quat_rotate_inv(base.quat, new_velocity),
+        ang_cotangent + adj.ang, legs,
     )  # fmt: skip
     # the equations of motion
-    held = held_base(at, record, m)
-    gravity = load_vec3(robot.table, GRAVITY, world)
-    g = wp.quat_rotate_inv(base.quat, gravity)
+    base_held = base_factors(at, record, m)
     out = StepAdjoint()
     out.base.pos = adj.pos
     out.base.quat = quat_adj
-    out.base.ang = m.ang_seed
+    out.base.ang = m.ang_cotangent
     g_adj = vec3(real(0.0))
     for k in range(legs.shape[0]):
-        leg = held_leg(at, k, rows, seeds, record, legs, contacts)
-        part = reverse_leg_part(robot, params[k], at, k, record, g, held, leg, legs, sums)
-        out.base.pos += part.pos
-        out.base.quat += part.turn
-        out.base.ang += part.omega
-        g_adj += part.gravity
-    weights = BaseSeeds()
-    weights.velocity = m.lin_seed
-    weights.new_velocity = new_velocity
-    weights.gravity = g_adj
-    body, com, weight, force_adj, moment_adj, turn, lin_adj, omega, _base, _seeds, _dt_base = wp.grad(
-        base_action
-    )(load_moments(robot.table, BASE, world), base_com(robot.table, world), gravity, at.force, at.moment, base.quat,
-        base.lin, base.ang, held, weights, dt,
-    )  # fmt: skip
-    add_moments(sums, BASE, body)
-    add_com(sums, robot.table[BASE, world], base_com(robot.table, world), com)
-    add_vec3(sums, GRAVITY, weight)
-    out.force = force_adj
-    out.moment = moment_adj
-    out.base.quat += turn
-    out.base.lin = lin_adj
-    out.base.ang += omega
+        leg_held = leg_factors(at, k, trajectory, cotangent, record, legs)
+        mu = wp.where(legs[k].law.mode != SEPARATE, legs[k].law.mu, real(0.0))
+        gradient = leg_action_gradient(
+            model, params[k], world, k, mu, base, record.angles[world, at.entry, k], record.rates[world, at.entry, k],
+            base_held, leg_held, dt,
+        )  # fmt: skip
+        add_leg_gradient(gradient, k, dt, legs, sums)
+        out.base.pos += gradient.pos
+        out.base.quat += gradient.quat
+        out.base.ang += gradient.omega
+        g_adj += gradient.gravity
+    velocities = BaseCotangent()
+    velocities.velocity = m.lin_cotangent
+    velocities.new_velocity = new_velocity
+    velocities.gravity = g_adj
+    by_base = base_action_gradient(model, world, at.force, at.moment, base, base_held, velocities, dt)
+    add_moments(sums, BASE, by_base.body)
+    add_com(sums, model.table[BASE, world], base_com(model.table, world), by_base.com)
+    add_vec3(sums, GRAVITY, by_base.gravity)
+    out.force = by_base.force
+    out.moment = by_base.moment
+    out.base.quat += by_base.quat
+    out.base.lin = by_base.lin
+    out.base.ang += by_base.omega
     return out

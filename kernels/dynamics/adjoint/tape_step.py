@@ -4,7 +4,7 @@
 
 Backwards, `integrate_kernel` hands the gradient by the velocities at the end of the step to `find_multipliers`, and
 `power_kernel` is the scalar whose derivatives by all that the step read are those of the step: the virtual power of its
-equations of motion, weighed with these multipliers (see `step_adjoint`).
+equations of motion, weighted with these multipliers (see `step_adjoint`).
 """
 
 import warp as wp
@@ -12,38 +12,38 @@ import warp as wp
 from ...layout import BASE, GRAVITY
 from ...scalar import mat43, real, vec3
 from ...state import base_com, leg_coord, leg_dof, load_base, load_motors, store_base, store_motors
-from ..base_motion import moved_base
+from ..base_motion import integrate_base
 from ..contact import BlockLaw, PawContact
 from ..drive import Drive, Workspace, base_wrench
 from ..parameters import load_joint_params, load_masses, load_moments, load_spring, load_stops, load_vec3
-from ..step import LegParams, Robot, StepSettings, load_leg
-from ..trajectory import Rows, store_row_vec3
+from ..step import LegParams, RobotModel, StepSettings, load_leg
+from ..trajectory import TrajectoryArrays, store_row_vec3
 from ..world.world_step import LegStep, solve_step
-from .multipliers import LegReverse, StepPlace, StepRecord, find_multipliers, held_base, held_leg, replay_step
-from .virtual_power import BaseFactors, BaseSeeds, LegFactors, base_action, leg_action
+from .multipliers import LegReverse, ReplayedStep, StepRecord, base_factors, find_multipliers, leg_factors, replay_step
+from .virtual_power import BaseCotangent, BaseFactors, LegFactors, base_action, leg_action
 
 
 @wp.struct
 class SolvedStep:
-    """A step on the tape, arrays by world or by (leg, world): its solution, and what the reverse pass finds of it."""
+    """A step on the tape, arrays by world or by (leg, world): its solution, and multipliers of the reverse pass."""
 
-    rows: Rows  # torques, impulses and pressed stops, shape (1, ..., num_worlds)
-    before: wp.array2d(dtype=vec3)  # [N s] on each paw in the step before, world axes
+    trajectory: TrajectoryArrays  # torques, impulses and pressed stops, shape (1, ..., num_worlds)
+    old_impulse: wp.array2d(dtype=vec3)  # [N s] on each paw in the step before, world axes
     lin: wp.array(dtype=vec3)  # [m/s] of the base at the end of the step, in the body axes of its start
     ang: wp.array(dtype=vec3)  # [rad/s]
     rates: wp.array2d(dtype=vec3)  # [rad/s] of the motors
     base: wp.array(dtype=BaseFactors)
-    seeds: wp.array(dtype=BaseSeeds)
-    ang_seed: wp.array(dtype=vec3)  # weight of the base's angular velocity at the start
+    cotangent: wp.array(dtype=BaseCotangent)
+    ang_cotangent: wp.array(dtype=vec3)  # gradient by the base's angular velocity at the start
     legs: wp.array2d(dtype=LegFactors)
-    rate_seed: wp.array2d(dtype=vec3)  # weight of the motors' rates at the start
+    rate_cotangent: wp.array2d(dtype=vec3)  # gradient by the motors' rates at the start
     mu_row: wp.array2d(dtype=int)  # row of the friction coefficient in the parameter table
 
 
 @wp.kernel(enable_backward=False)
 def solve_kernel(
     # in
-    robot: Robot,
+    model: RobotModel,
     settings: StepSettings,
     drive: Drive,
     joint_q: wp.array(dtype=real),
@@ -55,7 +55,7 @@ def solve_kernel(
 ):
     """Solve every world's contacts and stops; one thread per world."""
     world = wp.tid()
-    base = load_base(joint_q, joint_qd, base_com(robot.table, world), world)
+    base = load_base(joint_q, joint_qd, base_com(model.table, world), world)
     legs = wp.zeros(shape=(4,), dtype=LegStep)
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
     for k in range(legs.shape[0]):
@@ -63,19 +63,19 @@ def solve_kernel(
         legs[k].angles = load_motors(joint_q, leg_coord(world, k))
         legs[k].rates = load_motors(joint_qd, leg_dof(world, k))
         legs[k].torque = torque
-        store_row_vec3(solved.rows.torque, 0, 3 * k, world, torque)
-        solved.before[k, world] = work.impulse[k, world]
+        store_row_vec3(solved.trajectory.torque, 0, 3 * k, world, torque)
+        solved.old_impulse[k, world] = work.impulse[k, world]
     wrench = base_wrench(drive.joint_f, drive.body_f, world)
     force = vec3(wrench[0], wrench[1], wrench[2])
     moment = vec3(wrench[3], wrench[4], wrench[5])
-    found = solve_step(robot, settings, world, base, force, moment, BlockLaw(), work.impulse, legs, contacts)
-    solved.lin[world] = found.lin
-    solved.ang[world] = found.ang
+    solution = solve_step(model, settings, world, base, force, moment, BlockLaw(), work.impulse, legs, contacts)
+    solved.lin[world] = solution.lin
+    solved.ang[world] = solution.ang
     for k in range(legs.shape[0]):
         impulse = wp.quat_rotate(base.quat, contacts[k].impulse)
-        solved.rates[k, world] = legs[k].end
-        solved.rows.impulse[0, k, world] = impulse
-        solved.rows.pressed[0, k, world] = wp.uint8(legs[k].pressed)
+        solved.rates[k, world] = legs[k].new_rates
+        solved.trajectory.impulse[0, k, world] = impulse
+        solved.trajectory.pressed[0, k, world] = wp.uint8(legs[k].pressed)
         work.impulse[k, world] = impulse
         work.contact_force[k, world] = impulse / settings.dt
 
@@ -83,7 +83,7 @@ def solve_kernel(
 @wp.kernel
 def power_kernel(
     # in
-    robot: Robot,
+    model: RobotModel,
     dt: real,
     joint_q: wp.array(dtype=real),
     joint_qd: wp.array(dtype=real),
@@ -93,32 +93,32 @@ def power_kernel(
     # out
     power: wp.array2d(dtype=real),
 ):
-    """Weigh the equations of motion, (4, num_worlds), those of the base with leg 0's; one thread per (leg, world)."""
+    """Write the virtual power of each leg (4, num_worlds), the base's with leg 0's; one thread per (leg, world)."""
     k, world = wp.tid()
-    com = base_com(robot.table, world)
+    com = base_com(model.table, world)
     base = load_base(joint_q, joint_qd, com, world)
-    gravity = load_vec3(robot.table, GRAVITY, world)
+    gravity = load_vec3(model.table, GRAVITY, world)
     g = wp.quat_rotate_inv(base.quat, gravity)
-    held = solved.base[world]
+    base_held = solved.base[world]
     leg = solved.legs[k, world]
     rates = load_motors(joint_qd, leg_dof(world, k))
     total = leg_action(
-        robot.geometry[k], load_masses(robot.table, k, world), load_joint_params(robot.table, k, world),
-        load_spring(robot.table, k, world), load_stops(robot.table, k, world), robot.ground,
-        robot.table[solved.mu_row[k, world], world], base.pos, base.quat, base.ang, g,
-        load_motors(joint_q, leg_coord(world, k)), rates, held, leg, dt,
+        model.geometry[k], load_masses(model.table, k, world), load_joint_params(model.table, k, world),
+        load_spring(model.table, k, world), load_stops(model.table, k, world), model.ground,
+        model.table[solved.mu_row[k, world], world], base.pos, base.quat, base.ang, g,
+        load_motors(joint_q, leg_coord(world, k)), rates, base_held, leg, dt,
     )  # fmt: skip
-    total += wp.dot(solved.rate_seed[k, world], rates)
+    total += wp.dot(solved.rate_cotangent[k, world], rates)
     total += dt * wp.dot(leg.virtual_rates, load_motors(joint_f, leg_dof(world, k)))
     if k == 0:
         wrench = base_wrench(joint_f, body_f, world)
         force = vec3(wrench[0], wrench[1], wrench[2])
         moment = vec3(wrench[3], wrench[4], wrench[5])
         total += base_action(
-            load_moments(robot.table, BASE, world), com, gravity, force, moment, base.quat, base.lin, base.ang, held,
-            solved.seeds[world], dt,
+            load_moments(model.table, BASE, world), com, gravity, force, moment, base.quat, base.lin, base.ang,
+            base_held, solved.cotangent[world], dt,
         )  # fmt: skip
-        total += wp.dot(solved.ang_seed[world], base.ang)
+        total += wp.dot(solved.ang_cotangent[world], base.ang)
     power[k, world] = total
 
 
@@ -133,7 +133,7 @@ class EndVelocities:
 
 @wp.func
 def end_velocities(
-    robot: Robot, dt: real, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real),
+    model: RobotModel, dt: real, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real),
     joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), solved: SolvedStep, record: StepRecord,
     power: wp.array2d(dtype=real), world: int,
 ) -> EndVelocities:  # fmt: skip
@@ -148,40 +148,37 @@ def end_velocities(
 
 @wp.func_grad(end_velocities)
 def adj_end_velocities(
-    robot: Robot, dt: real, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real),
+    model: RobotModel, dt: real, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real),
     joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), solved: SolvedStep, record: StepRecord,
     power: wp.array2d(dtype=real), world: int, adj_ret: EndVelocities,
 ):  # fmt: skip
-    """Write what `power_kernel` weighs the equations of motion with, and set its gradient to 1."""
+    """Write the multipliers that `power_kernel` reads to `solved`, and set the gradient by its `power` to 1."""
     params = wp.zeros(shape=(4,), dtype=LegParams)
     legs = wp.zeros(shape=(4,), dtype=LegReverse)
-    contacts = wp.zeros(shape=(4,), dtype=PawContact)
-    matrix = wp.zeros(shape=(12, 12), dtype=real)
-    vector = wp.zeros(shape=(12,), dtype=real)
     wrench = base_wrench(joint_f, body_f, world)
-    at = StepPlace()
+    at = ReplayedStep()
     at.dt = dt
     at.world = world
     at.force = vec3(wrench[0], wrench[1], wrench[2])
     at.moment = vec3(wrench[3], wrench[4], wrench[5])
-    record.base[world, 0] = load_base(joint_q, joint_qd, base_com(robot.table, world), world)
+    record.base[world, 0] = load_base(joint_q, joint_qd, base_com(model.table, world), world)
     for k in range(legs.shape[0]):
-        params[k] = load_leg(robot, world, k)
+        params[k] = load_leg(model, world, k)
         record.angles[world, 0, k] = load_motors(joint_q, leg_coord(world, k))
         record.rates[world, 0, k] = load_motors(joint_qd, leg_dof(world, k))
         legs[k].rates = vec3(adj_ret.rates[k, 0], adj_ret.rates[k, 1], adj_ret.rates[k, 2])
-    replay_step(robot, params, at, solved.rows, record)
+    replay_step(model, params, at, solved.trajectory, record)
     m = find_multipliers(
-        robot, at, solved.before, solved.rows, Rows(), record, adj_ret.lin, adj_ret.ang, legs, contacts, matrix, vector
-    )
-    seeds = BaseSeeds()
-    seeds.velocity = m.lin_seed
-    solved.base[world] = held_base(at, record, m)
-    solved.seeds[world] = seeds
-    solved.ang_seed[world] = m.ang_seed
+        model, at, solved.old_impulse, solved.trajectory, TrajectoryArrays(), record, adj_ret.lin, adj_ret.ang, legs,
+    )  # fmt: skip
+    cotangent = BaseCotangent()
+    cotangent.velocity = m.lin_cotangent
+    solved.base[world] = base_factors(at, record, m)
+    solved.cotangent[world] = cotangent
+    solved.ang_cotangent[world] = m.ang_cotangent
     for k in range(legs.shape[0]):
-        solved.legs[k, world] = held_leg(at, k, solved.rows, Rows(), record, legs, contacts)
-        solved.rate_seed[k, world] = legs[k].rates
+        solved.legs[k, world] = leg_factors(at, k, solved.trajectory, TrajectoryArrays(), record, legs)
+        solved.rate_cotangent[k, world] = legs[k].rates
         solved.mu_row[k, world] = legs[k].law.mu_row
         wp.adjoint[power][k, world] += real(1.0)
 
@@ -189,7 +186,7 @@ def adj_end_velocities(
 @wp.kernel
 def integrate_kernel(
     # in
-    robot: Robot,
+    model: RobotModel,
     dt: real,
     joint_q: wp.array(dtype=real),
     joint_qd: wp.array(dtype=real),
@@ -204,10 +201,10 @@ def integrate_kernel(
 ):
     """Move the coordinates with the velocities at the end of the step; one thread per world."""
     world = wp.tid()
-    com = base_com(robot.table, world)
+    com = base_com(model.table, world)
     base = load_base(joint_q, joint_qd, com, world)
-    end = end_velocities(robot, dt, joint_q, joint_qd, joint_f, body_f, solved, record, power, world)
-    store_base(joint_q_out, joint_qd_out, com, world, moved_base(base, end.lin, end.ang, dt))
+    end = end_velocities(model, dt, joint_q, joint_qd, joint_f, body_f, solved, record, power, world)
+    store_base(joint_q_out, joint_qd_out, com, world, integrate_base(base, end.lin, end.ang, dt))
     for k in range(4):
         rates = vec3(end.rates[k, 0], end.rates[k, 1], end.rates[k, 2])
         angles = load_motors(joint_q, leg_coord(world, k)) + dt * rates

@@ -1,18 +1,34 @@
-"""The step's equations of motion, weighed: one number whose derivatives are what the reverse pass adds up.
+"""Virtual power of a step's equations of motion: one scalar whose partial derivatives the reverse pass adds up.
 
-A step solves M (v' - v) = dt f + J^T p. With multipliers m, one for each velocity, the number is
+A step solves M (v' - v) = dt f + J^T p for the new velocities v' (f: forces, p: contact impulses). For multipliers m,
+one per velocity, the scalar is
 
-    m . (dt f + J^T p - M (v' - v)),
+    m . (dt f + J^T p - M (v' - v)),    with m, v', p and the accelerations (v' - v) / dt constant.
 
-in which v', p and m are held. It is a sum over the links of d'Alembert's virtual power, the inertia forces of each link
-at the accelerations of the step on the virtual velocities m, so no matrix is formed, let alone inverted.
+By d'Alembert's principle the inertia part is a sum over links, so that no matrix is formed. m gives each link's frame a
+virtual velocity v* and a virtual angular velocity w*, and the link contributes -dt P with
+
+    P = v* . f + w* . n,
+    f = m a + w' x s + w x (w x s),         s = m c, the first mass moment
+    n = s x a + I w' + w x (I w),
+
+where a is the frame's acceleration less gravity, w and w' its angular velocity and acceleration, all in its own axes.
+With u = w x s, h = I w, and their adjoints u* = v* x w, h* = w* x w, the partial derivatives are
+
+    by v*: f          by a:  m v* + w* x s        by w: u x v* + s x u* + h x w* + I h*
+    by w*: n          by w': s x v* + I w*        by m: v* . a
+    by s:  v* x w' + u* x w + a x w*
+    by S:  (w* . w' + h* . w) 1 - sym(w*, w') - sym(h*, w),   as I = tr(S) 1 - S and d(a^T S b) = sym(a, b) : dS.
+
+`adj_inertia_power` and `adj_link_motion` are written by hand; Warp generates all other adjoints. A multiplier has the
+unit of the differentiated number per momentum.
 """
 
 import warp as wp
 
 from ...actuation.joint_forces import JointParams, joint_forces
 from ...actuation.springs import LegSpring, spring_torque
-from ...actuation.stops import StopParams, StopRows, stop_rows
+from ...actuation.stops import StopParams, StopRates, stop_rates
 from ...kinematics.five_bar import FiveBar, five_bar_bias
 from ...kinematics.geometry import LegGeometry
 from ...scalar import quat, real, vec2, vec3, vec6
@@ -26,9 +42,9 @@ from ..leg_dynamics import LegMasses, PawKinematics, leg_pose, paw_kinematics
 
 @wp.struct
 class BaseFactors:
-    """What is held of the base: virtual velocities (multipliers), accelerations and new velocities, body axes."""
+    """Constants of the base in the scalar: multipliers, accelerations, new velocities; body axes of its start."""
 
-    virtual_lin: vec3
+    virtual_lin: vec3  # multipliers of the base's equations
     virtual_ang: vec3
     lin_acc: vec3  # [m/s^2] over the step, contact included
     ang_acc: vec3  # [rad/s^2]
@@ -38,32 +54,32 @@ class BaseFactors:
 
 @wp.struct
 class LegFactors:
-    """What is held of a leg: multipliers, accelerations and new rates of its motors, and its paw's contact."""
+    """Constants of a leg in the scalar; vectors are lateral, outer, inner, or those of its paw's contact."""
 
-    virtual_rates: vec3
+    virtual_rates: vec3  # multipliers of the motors' equations
     acc: vec3  # [rad/s^2] over the step, contact included
     rates: vec3  # [rad/s] at the end of the step
     mode: int  # SEPARATE, STICK or SLIDE
-    pressed: int  # set of hard stops
+    pressed: int  # set of pressed hard stops, see `stops`
     impulse: vec3  # [N s] on the paw, body axes
     law: vec3  # multiplier of the contact law
-    push: vec3  # weight of the impulse, world axes
+    push: vec3  # cotangent of the impulse, world axes
 
 
 @wp.struct
 class FrameMotion:
-    """A frame's virtual velocity and its motion, in its own axes; acceleration less gravity."""
+    """Motion and virtual velocity of a link's frame, in its own axes."""
 
     virtual_lin: vec3
     virtual_ang: vec3
-    acc: vec3  # [m/s^2]
+    acc: vec3  # [m/s^2] of its origin, less gravity
     ang: vec3  # [rad/s]
     ang_acc: vec3  # [rad/s^2]
 
 
 @wp.func
 def add(a: FrameMotion, b: FrameMotion) -> FrameMotion:
-    """Return a + b, for the adjoints below."""
+    """Return a + b; Warp calls it for `wp.adjoint[frame] += ...`."""
     c = FrameMotion()
     c.virtual_lin = a.virtual_lin + b.virtual_lin
     c.virtual_ang = a.virtual_ang + b.virtual_ang
@@ -84,8 +100,8 @@ def add(a: MassMoments, b: MassMoments) -> MassMoments:  # noqa: F811
 
 
 @wp.func
-def mixed(a: vec3, b: vec3) -> vec6:
-    """Return the derivative of a^T S b by packed second moments S."""
+def second_moment_product(a: vec3, b: vec3) -> vec6:
+    """Return sym(a, b), the derivative of a^T S b by packed second moments S (xx yy zz xy xz yz)."""
     return vec6(
         a[0] * b[0], a[1] * b[1], a[2] * b[2],
         a[0] * b[1] + a[1] * b[0], a[0] * b[2] + a[2] * b[0], a[1] * b[2] + a[2] * b[1],
@@ -94,7 +110,7 @@ def mixed(a: vec3, b: vec3) -> vec6:
 
 @wp.func
 def inertia_power(body: MassMoments, frame: FrameMotion) -> real:
-    """Return the virtual power [W] of a rigid body's inertia and weight; moments about the frame, in its axes."""
+    """Return P of a rigid body, see the module; body: mass moments about the frame's origin, in its axes."""
     acc, ang, ang_acc = frame.acc, frame.ang, frame.ang_acc
     force = body.mass * acc + wp.cross(ang_acc, body.first) + wp.cross(ang, wp.cross(ang, body.first))
     moment = (
@@ -107,30 +123,32 @@ def inertia_power(body: MassMoments, frame: FrameMotion) -> real:
 
 @wp.func_grad(inertia_power)
 def adj_inertia_power(body: MassMoments, frame: FrameMotion, adj_ret: real):
-    """Add the gradient of `inertia_power`."""
+    """Add `adj_ret` times the partial derivatives of `inertia_power`; u, h as in the docstring of the module."""
     acc, ang, ang_acc = frame.acc, frame.ang, frame.ang_acc
     lin_v, ang_v, first = frame.virtual_lin, frame.virtual_ang, body.first
-    swing = wp.cross(ang, first)
-    spin = inertia_mul(body.second, ang)
-    by_swing = wp.cross(lin_v, ang)
-    by_spin = wp.cross(ang_v, ang)
-    by_frame = FrameMotion()
-    by_frame.virtual_lin = adj_ret * (body.mass * acc + wp.cross(ang_acc, first) + wp.cross(ang, swing))
-    by_frame.virtual_ang = adj_ret * (wp.cross(first, acc) + inertia_mul(body.second, ang_acc) + wp.cross(ang, spin))
-    by_frame.acc = adj_ret * (body.mass * lin_v + wp.cross(ang_v, first))
-    by_frame.ang_acc = adj_ret * (wp.cross(first, lin_v) + inertia_mul(body.second, ang_v))
-    by_frame.ang = adj_ret * (
-        wp.cross(swing, lin_v) + wp.cross(first, by_swing) + wp.cross(spin, ang_v) + inertia_mul(body.second, by_spin)
+    u = wp.cross(ang, first)
+    h = inertia_mul(body.second, ang)
+    adj_u = wp.cross(lin_v, ang)
+    adj_h = wp.cross(ang_v, ang)
+    adj_frame = FrameMotion()
+    adj_frame.virtual_lin = adj_ret * (body.mass * acc + wp.cross(ang_acc, first) + wp.cross(ang, u))
+    adj_frame.virtual_ang = adj_ret * (wp.cross(first, acc) + inertia_mul(body.second, ang_acc) + wp.cross(ang, h))
+    adj_frame.acc = adj_ret * (body.mass * lin_v + wp.cross(ang_v, first))
+    adj_frame.ang_acc = adj_ret * (wp.cross(first, lin_v) + inertia_mul(body.second, ang_v))
+    adj_frame.ang = adj_ret * (
+        wp.cross(u, lin_v) + wp.cross(first, adj_u) + wp.cross(h, ang_v) + inertia_mul(body.second, adj_h)
     )
-    by_body = MassMoments()
-    by_body.mass = adj_ret * wp.dot(lin_v, acc)
-    by_body.first = adj_ret * (wp.cross(lin_v, ang_acc) + wp.cross(by_swing, ang) + wp.cross(acc, ang_v))
-    turn = wp.dot(ang_v, ang_acc) + wp.dot(by_spin, ang)
-    by_body.second = adj_ret * (
-        vec6(turn, turn, turn, real(0.0), real(0.0), real(0.0)) - mixed(ang_v, ang_acc) - mixed(by_spin, ang)
+    adj_body = MassMoments()
+    adj_body.mass = adj_ret * wp.dot(lin_v, acc)
+    adj_body.first = adj_ret * (wp.cross(lin_v, ang_acc) + wp.cross(adj_u, ang) + wp.cross(acc, ang_v))
+    adj_trace = wp.dot(ang_v, ang_acc) + wp.dot(adj_h, ang)
+    adj_body.second = adj_ret * (
+        vec6(adj_trace, adj_trace, adj_trace, real(0.0), real(0.0), real(0.0))
+        - second_moment_product(ang_v, ang_acc)
+        - second_moment_product(adj_h, ang)
     )
-    wp.adjoint[body] += by_body
-    wp.adjoint[frame] += by_frame
+    wp.adjoint[body] += adj_body
+    wp.adjoint[frame] += adj_frame
 
 
 @wp.func
@@ -153,19 +171,20 @@ def planar_cross(a: vec3, b: vec3) -> real:
 
 @wp.func
 def link_motion(
-    housing: FrameMotion, origin: vec3, vel: vec2, acc: vec2, virtual: vec2, turn: vec3, cosine: real, sine: real
+    housing: FrameMotion, origin: vec3, vel: vec2, acc: vec2, virtual: vec2, about_y: vec3, cosine: real, sine: real
 ) -> FrameMotion:
     """Return the motion of a link's frame in the housing, in the link's axes.
 
-    vel [m/s], acc [m/s^2], virtual: of its origin in the housing's plane. turn: rate [rad/s], acceleration [rad/s^2]
-    and virtual rate about y. cosine, sine: of its angle about y.
+    origin [m], vel [m/s], acc [m/s^2], virtual: of the link frame's origin, in housing axes; the last three in the
+    five-bar's plane (x, z). about_y: rate [rad/s], acceleration [rad/s^2] and virtual rate about y. cosine, sine: of
+    the link's angle about y.
     """
     w = housing.ang
     link = FrameMotion()
     link.virtual_lin = rotate_y(
         housing.virtual_lin + wp.cross(housing.virtual_ang, origin) + planar(virtual), cosine, -sine
     )
-    link.virtual_ang = rotate_y(housing.virtual_ang, cosine, -sine) + vec3(real(0.0), turn[2], real(0.0))
+    link.virtual_ang = rotate_y(housing.virtual_ang, cosine, -sine) + vec3(real(0.0), about_y[2], real(0.0))
     link.acc = rotate_y(
         housing.acc
         + wp.cross(housing.ang_acc, origin)
@@ -174,66 +193,70 @@ def link_motion(
         cosine,
         -sine,
     )
-    link.ang = rotate_y(w, cosine, -sine) + vec3(real(0.0), turn[0], real(0.0))
-    link.ang_acc = rotate_y(housing.ang_acc + vec3(-w[2] * turn[0], turn[1], w[0] * turn[0]), cosine, -sine)
+    link.ang = rotate_y(w, cosine, -sine) + vec3(real(0.0), about_y[0], real(0.0))
+    link.ang_acc = rotate_y(housing.ang_acc + vec3(-w[2] * about_y[0], about_y[1], w[0] * about_y[0]), cosine, -sine)
     return link
 
 
 @wp.func_grad(link_motion)
 def adj_link_motion(
-    housing: FrameMotion, origin: vec3, vel: vec2, acc: vec2, virtual: vec2, turn: vec3, cosine: real, sine: real,
+    housing: FrameMotion, origin: vec3, vel: vec2, acc: vec2, virtual: vec2, about_y: vec3, cosine: real, sine: real,
     adj_ret: FrameMotion,
 ):  # fmt: skip
-    """Add the gradient of `link_motion`."""
+    """Add the gradient of `link_motion`, given `adj_ret` by its result; adj_*: gradients in housing axes."""
     w = housing.ang
-    # values before they are turned into the link's axes
-    swing = wp.cross(w, origin) + real(2.0) * planar(vel)
+    # in housing axes
+    relative_vel = wp.cross(w, origin) + real(2.0) * planar(vel)
     lin_v = housing.virtual_lin + wp.cross(housing.virtual_ang, origin) + planar(virtual)
-    whole_acc = housing.acc + wp.cross(housing.ang_acc, origin) + wp.cross(w, swing) + planar(acc)
-    whole_ang_acc = housing.ang_acc + vec3(-w[2] * turn[0], turn[1], w[0] * turn[0])
-    by_lin_v = rotate_y(adj_ret.virtual_lin, cosine, sine)
-    by_ang_v = rotate_y(adj_ret.virtual_ang, cosine, sine)
-    by_acc = rotate_y(adj_ret.acc, cosine, sine)
-    by_ang = rotate_y(adj_ret.ang, cosine, sine)
-    by_ang_acc = rotate_y(adj_ret.ang_acc, cosine, sine)
-    by_swing = wp.cross(by_acc, w)
-    by_housing = FrameMotion()
-    by_housing.virtual_lin = by_lin_v
-    by_housing.virtual_ang = by_ang_v + wp.cross(origin, by_lin_v)
-    by_housing.acc = by_acc
-    by_housing.ang_acc = by_ang_acc + wp.cross(origin, by_acc)
-    by_housing.ang = (
-        by_ang
-        + wp.cross(swing, by_acc)
-        + wp.cross(origin, by_swing)
-        + turn[0] * vec3(by_ang_acc[2], real(0.0), -by_ang_acc[0])
+    frame_acc = housing.acc + wp.cross(housing.ang_acc, origin) + wp.cross(w, relative_vel) + planar(acc)
+    frame_ang_acc = housing.ang_acc + vec3(-w[2] * about_y[0], about_y[1], w[0] * about_y[0])
+    adj_lin_v = rotate_y(adj_ret.virtual_lin, cosine, sine)
+    adj_ang_v = rotate_y(adj_ret.virtual_ang, cosine, sine)
+    adj_acc = rotate_y(adj_ret.acc, cosine, sine)
+    adj_ang = rotate_y(adj_ret.ang, cosine, sine)
+    adj_ang_acc = rotate_y(adj_ret.ang_acc, cosine, sine)
+    adj_relative_vel = wp.cross(adj_acc, w)
+    adj_housing = FrameMotion()
+    adj_housing.virtual_lin = adj_lin_v
+    adj_housing.virtual_ang = adj_ang_v + wp.cross(origin, adj_lin_v)
+    adj_housing.acc = adj_acc
+    adj_housing.ang_acc = adj_ang_acc + wp.cross(origin, adj_acc)
+    adj_housing.ang = (
+        adj_ang
+        + wp.cross(relative_vel, adj_acc)
+        + wp.cross(origin, adj_relative_vel)
+        + about_y[0] * vec3(adj_ang_acc[2], real(0.0), -adj_ang_acc[0])
     )
-    wp.adjoint[housing] += by_housing
+    wp.adjoint[housing] += adj_housing
     wp.adjoint[origin] += (
-        wp.cross(by_lin_v, housing.virtual_ang) + wp.cross(by_acc, housing.ang_acc) + wp.cross(by_swing, w)
+        wp.cross(adj_lin_v, housing.virtual_ang) + wp.cross(adj_acc, housing.ang_acc) + wp.cross(adj_relative_vel, w)
     )
-    wp.adjoint[vel] += real(2.0) * vec2(by_swing[0], by_swing[2])
-    wp.adjoint[acc] += vec2(by_acc[0], by_acc[2])
-    wp.adjoint[virtual] += vec2(by_lin_v[0], by_lin_v[2])
-    wp.adjoint[turn] += vec3(
-        adj_ret.ang[1] + by_ang_acc[2] * w[0] - by_ang_acc[0] * w[2], by_ang_acc[1], adj_ret.virtual_ang[1]
+    wp.adjoint[vel] += real(2.0) * vec2(adj_relative_vel[0], adj_relative_vel[2])
+    wp.adjoint[acc] += vec2(adj_acc[0], adj_acc[2])
+    wp.adjoint[virtual] += vec2(adj_lin_v[0], adj_lin_v[2])
+    wp.adjoint[about_y] += vec3(
+        adj_ret.ang[1] + adj_ang_acc[2] * w[0] - adj_ang_acc[0] * w[2], adj_ang_acc[1], adj_ret.virtual_ang[1]
     )
-    along = planar_dot(adj_ret.virtual_lin, lin_v) + planar_dot(adj_ret.virtual_ang, housing.virtual_ang)
-    along += (
-        planar_dot(adj_ret.acc, whole_acc) + planar_dot(adj_ret.ang, w) + planar_dot(adj_ret.ang_acc, whole_ang_acc)
+    adj_cosine = planar_dot(adj_ret.virtual_lin, lin_v) + planar_dot(adj_ret.virtual_ang, housing.virtual_ang)
+    adj_cosine += (
+        planar_dot(adj_ret.acc, frame_acc) + planar_dot(adj_ret.ang, w) + planar_dot(adj_ret.ang_acc, frame_ang_acc)
     )
-    across = planar_cross(adj_ret.virtual_lin, lin_v) + planar_cross(adj_ret.virtual_ang, housing.virtual_ang)
-    across += planar_cross(adj_ret.acc, whole_acc) + planar_cross(adj_ret.ang, w)
-    across += planar_cross(adj_ret.ang_acc, whole_ang_acc)
-    wp.adjoint[cosine] += along
-    wp.adjoint[sine] += across
+    adj_sine = planar_cross(adj_ret.virtual_lin, lin_v) + planar_cross(adj_ret.virtual_ang, housing.virtual_ang)
+    adj_sine += planar_cross(adj_ret.acc, frame_acc) + planar_cross(adj_ret.ang, w)
+    adj_sine += planar_cross(adj_ret.ang_acc, frame_ang_acc)
+    wp.adjoint[cosine] += adj_cosine
+    wp.adjoint[sine] += adj_sine
 
 
 @wp.func
 def housing_motion(
     geo: LegGeometry, rate: real, omega: vec3, g: vec3, c: real, s: real, base: BaseFactors, leg: LegFactors
 ) -> FrameMotion:
-    """Return the motion of a leg's housing; rate [rad/s]: of its lateral motor, c, s: cosine and sine of its turn."""
+    """Return the motion of a leg's housing frame.
+
+    rate [rad/s]: of the lateral motor. omega [rad/s], g [m/s^2]: of the base, body axes. c, s: cosine and sine of the
+    housing's rotation about body x.
+    """
     zero = real(0.0)
     lateral_rate = geo.side * rate
     base_ang = rotate_x(omega, c, -s)
@@ -252,10 +275,10 @@ def housing_motion(
 
 @wp.func
 def passive_power(
-    joints: JointParams, loop: FiveBar, front: real, rates: vec3, rows: StopRows, leg: LegFactors, dt: real
+    joints: JointParams, loop: FiveBar, front: real, rates: vec3, stop_rates: StopRates, leg: LegFactors, dt: real
 ) -> real:
-    """Return the virtual power [W] of friction, damping, pressed stops and the motors' inertia."""
-    passive = joint_forces(joints, loop, front, rates, rows, leg.pressed, dt)
+    """Return the virtual power of friction, damping, pressed stops and the motors' armature, see `joint_forces`."""
+    passive = joint_forces(joints, loop, front, rates, stop_rates, leg.pressed, dt)
     implicit = passive.inertia * leg.acc + wp.cw_mul(joints.armature, leg.acc)
     return wp.dot(leg.virtual_rates, passive.torque - implicit)
 
@@ -265,7 +288,10 @@ def contact_action(
     geo: LegGeometry, ground: Ground, mu: real, pos: vec3, orientation: quat, paw: PawKinematics, base: BaseFactors,
     leg: LegFactors, dt: real,
 ) -> real:  # fmt: skip
-    """Return the part of a paw's contact: its impulse's virtual power, its weighed law, and the weighed impulse."""
+    """Return a paw's part of the scalar: impulse . virtual velocity + multiplier . law + cotangent . impulse.
+
+    pos [m], orientation (xyzw): of the base, world; paw: body axes.
+    """
     centre = pos + wp.quat_rotate(orientation, paw.position)
     normal = wp.quat_rotate_inv(orientation, floor_normal(ground, centre))
     gap = floor_distance(ground, centre) - geo.paw_radius
@@ -286,9 +312,10 @@ def leg_action(
     mu: real, pos: vec3, orientation: quat, omega: vec3, g: vec3, angles: vec3, rates: vec3, base: BaseFactors,
     leg: LegFactors, dt: real,
 ) -> real:  # fmt: skip
-    """Return a leg's part of the weighed equations, its paw's contact included, motor torques left out.
+    """Return a leg's part of the scalar: links, passive forces, spring and contact; its motors' torques are left out.
 
-    pos, orientation: of the base. omega: its angular velocity [rad/s], g: gravity [m/s^2], both in body axes.
+    mu: friction coefficient. pos [m], orientation (xyzw): of the base, world. omega: its angular velocity [rad/s], g:
+    gravity [m/s^2], both in body axes. angles [rad], rates [rad/s]: lateral, outer, inner, at the start of the step.
     """
     zero = real(0.0)
     pose = leg_pose(geo, angles)
@@ -301,11 +328,12 @@ def leg_action(
     still = vec2(zero)
     outer_thigh = link_motion(
         housing, vec3(geo.outer_x, geo.plane_y, zero), still, still, still,
-        vec3(bias.outer_thigh_rate, -f * outer_acc, -f * outer_virtual), loop.outer_turn[1], -f * loop.outer_turn[0],
+        vec3(bias.outer_thigh_rate, -f * outer_acc, -f * outer_virtual), loop.outer_sin_cos[1],
+        -f * loop.outer_sin_cos[0],
     )  # fmt: skip
     inner_thigh = link_motion(
         housing, vec3(geo.inner_x, geo.plane_y, zero), still, still, still,
-        vec3(bias.inner_thigh_rate, f * inner_acc, f * inner_virtual), loop.inner_turn[1], f * loop.inner_turn[0],
+        vec3(bias.inner_thigh_rate, f * inner_acc, f * inner_virtual), loop.inner_sin_cos[1], f * loop.inner_sin_cos[0],
     )  # fmt: skip
     knee_y = geo.plane_y + geo.knee_y
     outer_shank = link_motion(
@@ -337,7 +365,7 @@ def leg_action(
         + inertia_power(masses.outer_shank, outer_shank)
         + inertia_power(masses.inner_shank, inner_shank)
     )
-    action = dt * (passive_power(joints, loop, f, rates, stop_rows(stops, angles, dt), leg, dt) - power)
+    action = dt * (passive_power(joints, loop, f, rates, stop_rates(stops, angles, dt), leg, dt) - power)
     if spring.stiffness != zero:
         action += dt * wp.dot(leg.virtual_rates, spring_torque(spring, loop))
     if leg.mode != SEPARATE:
@@ -346,8 +374,8 @@ def leg_action(
 
 
 @wp.struct
-class BaseSeeds:
-    """Weights of what else depends on the base's orientation and velocity."""
+class BaseCotangent:
+    """Cotangents of further quantities that depend on the base's orientation and velocity."""
 
     velocity: vec3  # of its linear velocity at the start of the step, body axes
     new_velocity: vec3  # of its linear velocity at the end of the step, world axes
@@ -357,11 +385,12 @@ class BaseSeeds:
 @wp.func
 def base_action(
     body: MassMoments, com: vec3, gravity: vec3, force: vec3, moment: vec3, orientation: quat, lin: vec3, omega: vec3,
-    base: BaseFactors, seeds: BaseSeeds, dt: real,
+    base: BaseFactors, cotangent: BaseCotangent, dt: real,
 ) -> real:  # fmt: skip
-    """Return the base link's part of the weighed equations, and what else depends on its orientation and velocity.
+    """Return the base link's part of the scalar, plus `cotangent` . (gravity in body axes and the base's velocities).
 
-    gravity [m/s^2], force [N], moment [N m] at the com, lin [m/s]: world axes; omega [rad/s]: body axes.
+    gravity [m/s^2], external force [N] and moment [N m] at the com, lin [m/s]: world axes; com [m], omega [rad/s]: body
+    axes; orientation: xyzw.
     """
     g = wp.quat_rotate_inv(orientation, gravity)
     frame = FrameMotion()
@@ -375,13 +404,13 @@ def base_action(
     power = wp.dot(base.virtual_lin, push) + wp.dot(base.virtual_ang, twist) - inertia_power(body, frame)
     return (
         dt * power
-        + wp.dot(seeds.gravity, g)
-        + wp.dot(seeds.velocity, wp.quat_rotate_inv(orientation, lin))
-        + wp.dot(seeds.new_velocity, wp.quat_rotate(orientation, base.lin))
+        + wp.dot(cotangent.gravity, g)
+        + wp.dot(cotangent.velocity, wp.quat_rotate_inv(orientation, lin))
+        + wp.dot(cotangent.new_velocity, wp.quat_rotate(orientation, base.lin))
     )
 
 
 @wp.func
-def turned(orientation: quat, ang: vec3, dt: real, seed: quat) -> real:
-    """Return the weighed orientation after dt [s] at an angular velocity [rad/s], body axes."""
-    return wp.dot(seed, wp.normalize(orientation * exp_rotation(dt * ang)))
+def rotation_adjoint_scalar(orientation: quat, ang: vec3, dt: real, cotangent: quat) -> real:
+    """Return cotangent . (orientation (xyzw) after dt [s] at an angular velocity [rad/s] in body axes)."""
+    return wp.dot(cotangent, wp.normalize(orientation * exp_rotation(dt * ang)))

@@ -1,4 +1,4 @@
-"""`rollout` for GPUs: four threads a world, a thread a leg."""
+"""`rollout` for GPUs: four threads per world, one per leg."""
 
 import warp as wp
 
@@ -7,12 +7,12 @@ from ...layout import DOFS
 from ...scalar import real
 from ...state import base_com
 from ..drive import Drive, LegDrive
-from ..step import Robot, StepSettings, load_leg
+from ..step import RobotModel, StepSettings, load_leg
 from ..trajectory import (
     Actuation,
     Commands,
-    Rows,
     Timing,
+    TrajectoryArrays,
     arrival,
     filter_commands,
     leg_torque,
@@ -30,54 +30,54 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 def rollout_legs_kernel(
     # in
     count: int,
-    robot: Robot,
+    model: RobotModel,
     settings: StepSettings,
     timing: Timing,
     actuation: Actuation,
     commands: Commands,
     drive: Drive,
     # out
-    safe: wp.array3d(dtype=real),
-    rows: Rows,
+    filtered_target: wp.array3d(dtype=real),
+    trajectory: TrajectoryArrays,
 ):
     """Do what `rollout_kernel` does, to the contact tolerance; launch over (count rounded up to a multiple of 8, 4).
 
     count: worlds, from `settings.first` on.
     """
-    place, leg = wp.tid()
-    world = settings.first + wp.min(place, count - 1)  # threads beyond the last world repeat it
-    com = base_com(robot.table, world)
-    late = actuation.latency[world] / settings.dt
-    own = load_leg(robot, world, leg)
+    index, leg = wp.tid()
+    world = settings.first + wp.min(index, count - 1)  # threads beyond the last world repeat it
+    com = base_com(model.table, world)
+    delay = actuation.latency[world] / settings.dt
+    params = load_leg(model, world, leg)
     s = LegState()
     s.impulse = commands.impulse[leg, world]
     for step in range(timing.steps * timing.substeps):
         t = step / timing.substeps
         row = step / timing.every
         if step == row * timing.every:
-            s.base = load_row_base(rows, row, world, com)
-            s.angles = row_vec3(rows.q, row, 7 + 3 * leg, world)
-            s.rates = row_vec3(rows.qd, row, 6 + 3 * leg, world)
+            s.base = load_row_base(trajectory, row, world, com)
+            s.angles = row_vec3(trajectory.q, row, 7 + 3 * leg, world)
+            s.rates = row_vec3(trajectory.qd, row, 6 + 3 * leg, world)
         if step == t * timing.substeps:
-            filter_commands(commands, actuation, t, leg, world, s.angles, s.rates, safe)
+            filter_commands(commands, actuation, t, leg, world, s.angles, s.rates, filtered_target)
             if leg == 0:
                 for i in range(6):
                     drive.joint_f[world * DOFS + i] = commands.wrench[t, i, world]
             sync_lanes()
-        arrived = arrival(step, timing.substeps, late)
+        arrived = arrival(step, timing.substeps, delay)
         motors = LegDrive()
-        torque = leg_torque(commands, actuation, safe, arrived, leg, world, s.angles, s.rates)
+        torque = leg_torque(commands, actuation, filtered_target, arrived, leg, world, s.angles, s.rates)
         motors.extra = torque
         s.step = 0
         s.sets = 0
         while any_world(s.step == 0):
-            s = advance_leg(robot, settings, drive, own, motors, world, leg, s, False)
-        store_row_vec3(rows.torque, step, 3 * leg, world, torque)
-        rows.impulse[step, leg, world] = s.impulse
-        rows.pressed[step, leg, world] = wp.uint8(s.used)
+            s = advance_leg(model, settings, drive, params, motors, world, leg, s, False)
+        store_row_vec3(trajectory.torque, step, 3 * leg, world, torque)
+        trajectory.impulse[step, leg, world] = s.impulse
+        trajectory.pressed[step, leg, world] = wp.uint8(s.used)
         if step + 1 == (row + 1) * timing.every:
             if leg == 0:
-                store_row_base(rows, row + 1, world, com, s.base)
-            store_row_vec3(rows.q, row + 1, 7 + 3 * leg, world, s.angles)
-            store_row_vec3(rows.qd, row + 1, 6 + 3 * leg, world, s.rates)
+                store_row_base(trajectory, row + 1, world, com, s.base)
+            store_row_vec3(trajectory.q, row + 1, 7 + 3 * leg, world, s.angles)
+            store_row_vec3(trajectory.qd, row + 1, 6 + 3 * leg, world, s.rates)
             sync_lanes()

@@ -1,7 +1,7 @@
-"""The kernel that advances every world by several steps in one launch, a thread a world: the CPU's.
+"""The kernel that advances every world by several steps in one launch, with one thread per world: the CPU's.
 
-On one CPU thread `advance_legs`, with a thread a leg, takes 4.1 to 4.8 times as long a policy step (64 and 512 worlds,
-standing and jumping).
+On one CPU thread `advance_legs`, with a thread per leg, takes 4.1 to 4.8 times as long per policy step (64 and 512
+worlds, standing and jumping).
 """
 
 import warp as wp
@@ -9,10 +9,10 @@ import warp as wp
 from ...scalar import real, vec3
 from ...state import BaseState, base_com, leg_coord, leg_dof, load_base, load_motors, store_base, store_motors
 from ...terrain.ground import has_block, move_block
-from ..base_motion import moved_base
+from ..base_motion import integrate_base
 from ..contact import ContactState, PawContact, block_velocity, push_on_block
 from ..drive import Drive, Workspace, applied_torque, base_wrench, freeze_diverged_world, load_leg_drive
-from ..step import Robot, StepSettings, block_law, finite_base
+from ..step import RobotModel, StepSettings, block_law, finite_base
 from .world_step import LegStep, solve_step
 
 wp.set_module_options({"enable_backward": False})
@@ -20,12 +20,14 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def advance_once(
-    robot: Robot, settings: StepSettings, drive: Drive, work: Workspace, world: int, step: int, base: BaseState,
-    legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact), peaks: wp.array(dtype=real),
+    model: RobotModel, settings: StepSettings, drive: Drive, work: Workspace, world: int, step: int, base: BaseState,
+    legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact),
 ) -> BaseState:  # fmt: skip
-    """Advance one world by one step; the angles and rates of the legs' motors are updated in place.
+    """Advance one world by `settings.dt`; overwrites `legs` and `contacts`, returns the new base state.
 
-    legs, contacts: as in `solve_step`. peaks [N^2 s^2]: largest impulse on each paw, squared, (4,).
+    step: of the launch, counted from 0; the last one writes torques and paw forces to `work`. legs, contacts: scratch
+    of the thread, shape (4,), see `solve_step`; of the legs the motors' angles and rates are input, and then those at
+    the end of the step. A block moves in `model.ground`; `work` gets the paws' impulses and the largest values.
     """
     dt = settings.dt
     last = step == settings.substeps - 1
@@ -38,25 +40,25 @@ def advance_once(
     wrench = base_wrench(drive.joint_f, drive.body_f, world)
     force = vec3(wrench[0], wrench[1], wrench[2])
     moment = vec3(wrench[3], wrench[4], wrench[5])
-    block = block_law(robot, world, base, dt)
-    solved = solve_step(robot, settings, world, base, force, moment, block, work.impulse, legs, contacts)
-    if has_block(robot.ground, world):
+    block = block_law(model, world, base, dt)
+    solved = solve_step(model, settings, world, base, force, moment, block, work.impulse, legs, contacts)
+    if has_block(model.ground, world):
         push = push_on_block(contacts)
-        move_block(robot.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push)), dt)
-    record_contacts(work, world, base, contacts, solved.contact, dt, last, peaks)
+        move_block(model.ground, world, wp.quat_rotate(base.quat, block_velocity(block, push)), dt)
+    record_contacts(work, world, base, contacts, solved.contact, dt, last, legs)
     for k in range(legs.shape[0]):
-        end = legs[k].end
+        end = legs[k].new_rates
         legs[k].rates = end
         legs[k].angles = legs[k].angles + dt * end
-    return moved_base(base, solved.lin, solved.ang, dt)
+    return integrate_base(base, solved.lin, solved.ang, dt)
 
 
 @wp.func
 def record_contacts(
     work: Workspace, world: int, base: BaseState, contacts: wp.array(dtype=PawContact), solved: ContactState, dt: real,
-    last: bool, peaks: wp.array(dtype=real),
+    last: bool, legs: wp.array(dtype=LegStep),
 ):  # fmt: skip
-    """Write the paws' impulses, forces in the last step, and keep the largest; peaks: as in `advance_once`."""
+    """Write the paws' impulses [N s] and, if `last`, forces [N] to `work`, world axes, and keep the largest values."""
     total = vec3(real(0.0))
     for k in range(contacts.shape[0]):
         impulse = wp.quat_rotate(base.quat, contacts[k].impulse)
@@ -64,7 +66,7 @@ def record_contacts(
         force = impulse / dt
         if last:
             work.contact_force[k, world] = force
-        peaks[k] = wp.max(peaks[k], wp.dot(contacts[k].impulse, contacts[k].impulse))
+        legs[k].peak_sq = wp.max(legs[k].peak_sq, wp.dot(contacts[k].impulse, contacts[k].impulse))
         total += force
     work.peak_force[world] = wp.max(work.peak_force[world], wp.length(total))
     work.sweeps[world] = wp.max(work.sweeps[world], solved.sweeps)
@@ -74,7 +76,7 @@ def record_contacts(
 @wp.kernel
 def advance_kernel(
     # in
-    robot: Robot,
+    model: RobotModel,
     settings: StepSettings,
     drive: Drive,
     joint_q: wp.array(dtype=real),
@@ -90,14 +92,13 @@ def advance_kernel(
     Writes the base and motor coordinates; the passive ones follow in `full_state`.
     """
     world = settings.first + wp.tid()
-    if work.invalid[world] != 0:
-        freeze_diverged_world(robot, work, world, joint_q_out, joint_qd_out)
+    if work.diverged[world] != 0:
+        freeze_diverged_world(model, work, world, joint_q_out, joint_qd_out)
         return
-    com = base_com(robot.table, world)
+    com = base_com(model.table, world)
     base = load_base(joint_q, joint_qd, com, world)
     legs = wp.zeros(shape=(4,), dtype=LegStep)
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
-    peaks = wp.zeros(shape=(4,), dtype=real)
     for k in range(legs.shape[0]):
         legs[k].angles = load_motors(joint_q, leg_coord(world, k))
         legs[k].rates = load_motors(joint_qd, leg_dof(world, k))
@@ -105,16 +106,16 @@ def advance_kernel(
     work.sweeps[world] = 0
     work.peak_force[world] = real(0.0)
     for step in range(settings.substeps):
-        base = advance_once(robot, settings, drive, work, world, step, base, legs, contacts, peaks)
+        base = advance_once(model, settings, drive, work, world, step, base, legs, contacts)
     total = real(0.0)
     for k in range(legs.shape[0]):
         angles = legs[k].angles
         rates = legs[k].rates
-        work.peak_paw_force[k, world] = wp.sqrt(peaks[k]) / settings.dt
+        work.peak_paw_force[k, world] = wp.sqrt(legs[k].peak_sq) / settings.dt
         store_motors(joint_q_out, leg_coord(world, k), angles)
         store_motors(joint_qd_out, leg_dof(world, k), rates)
         total += wp.dot(angles, angles) + wp.dot(rates, rates)
     store_base(joint_q_out, joint_qd_out, com, world, base)
     if not (finite_base(base) and wp.isfinite(total)):
-        work.invalid[world] = 1
-        freeze_diverged_world(robot, work, world, joint_q_out, joint_qd_out)
+        work.diverged[world] = 1
+        freeze_diverged_world(model, work, world, joint_q_out, joint_qd_out)

@@ -1,6 +1,6 @@
-"""Rollouts: policy steps of command filter, latency, motors and physics, several in a launch, a thread a world.
+"""Rollouts: policy steps of command filter, latency, motors and physics in one launch, with one thread per world.
 
-A rollout has T policy steps of S physics steps. It keeps what the reverse pass starts from: a row of the state every
+A rollout has T policy steps of S physics steps. It records what the reverse pass needs: a row of the state every
 `every` physics steps, and each paw's impulse in each of them.
 """
 
@@ -11,12 +11,12 @@ from ...scalar import real
 from ...state import BaseState, base_com, leg_dof, store_motors
 from ..contact import PawContact
 from ..drive import Drive, Workspace
-from ..step import Robot, StepSettings
+from ..step import RobotModel, StepSettings
 from ..trajectory import (
     Actuation,
     Commands,
-    Rows,
     Timing,
+    TrajectoryArrays,
     arrival,
     filter_commands,
     leg_torque,
@@ -34,7 +34,7 @@ wp.set_module_options({"enable_backward": False})
 @wp.kernel
 def rollout_kernel(
     # in
-    robot: Robot,
+    model: RobotModel,
     settings: StepSettings,
     timing: Timing,
     actuation: Actuation,
@@ -43,20 +43,19 @@ def rollout_kernel(
     # in, out
     work: Workspace,
     # out
-    safe: wp.array3d(dtype=real),
-    rows: Rows,
+    filtered_target: wp.array3d(dtype=real),
+    trajectory: TrajectoryArrays,
 ):
     """Run a rollout from the state in row 0; one thread per world.
 
-    settings.substeps is 1; drive.joint_f and drive.wrench are overwritten. safe [rad], (T, 12, num_worlds): filtered
-    targets.
+    settings.substeps is 1; drive.joint_f and drive.wrench are overwritten. filtered_target [rad]: (T, 12,
+    num_worlds).
     """
     world = settings.first + wp.tid()
-    com = base_com(robot.table, world)
+    com = base_com(model.table, world)
     legs = wp.zeros(shape=(4,), dtype=LegStep)
     contacts = wp.zeros(shape=(4,), dtype=PawContact)
-    peaks = wp.zeros(shape=(4,), dtype=real)
-    late = actuation.latency[world] / settings.dt
+    delay = actuation.latency[world] / settings.dt
     for k in range(legs.shape[0]):
         work.impulse[k, world] = commands.impulse[k, world]
     base = BaseState()
@@ -64,26 +63,26 @@ def rollout_kernel(
         t = step / timing.substeps
         row = step / timing.every
         if step == row * timing.every:
-            base = load_row_base(rows, row, world, com)
+            base = load_row_base(trajectory, row, world, com)
             for k in range(legs.shape[0]):
-                legs[k].angles = row_vec3(rows.q, row, 7 + 3 * k, world)
-                legs[k].rates = row_vec3(rows.qd, row, 6 + 3 * k, world)
+                legs[k].angles = row_vec3(trajectory.q, row, 7 + 3 * k, world)
+                legs[k].rates = row_vec3(trajectory.qd, row, 6 + 3 * k, world)
         if step == t * timing.substeps:
             for k in range(legs.shape[0]):
-                filter_commands(commands, actuation, t, k, world, legs[k].angles, legs[k].rates, safe)
+                filter_commands(commands, actuation, t, k, world, legs[k].angles, legs[k].rates, filtered_target)
             for i in range(6):
                 drive.joint_f[world * DOFS + i] = commands.wrench[t, i, world]
-        arrived = arrival(step, timing.substeps, late)
+        arrived = arrival(step, timing.substeps, delay)
         for k in range(legs.shape[0]):
-            torque = leg_torque(commands, actuation, safe, arrived, k, world, legs[k].angles, legs[k].rates)
-            store_row_vec3(rows.torque, step, 3 * k, world, torque)
+            torque = leg_torque(commands, actuation, filtered_target, arrived, k, world, legs[k].angles, legs[k].rates)
+            store_row_vec3(trajectory.torque, step, 3 * k, world, torque)
             store_motors(drive.joint_f, leg_dof(world, k), torque)
-        base = advance_once(robot, settings, drive, work, world, 0, base, legs, contacts, peaks)
+        base = advance_once(model, settings, drive, work, world, 0, base, legs, contacts)
         for k in range(legs.shape[0]):
-            rows.impulse[step, k, world] = work.impulse[k, world]
-            rows.pressed[step, k, world] = wp.uint8(legs[k].pressed)
+            trajectory.impulse[step, k, world] = work.impulse[k, world]
+            trajectory.pressed[step, k, world] = wp.uint8(legs[k].pressed)
         if step + 1 == (row + 1) * timing.every:
-            store_row_base(rows, row + 1, world, com, base)
+            store_row_base(trajectory, row + 1, world, com, base)
             for k in range(legs.shape[0]):
-                store_row_vec3(rows.q, row + 1, 7 + 3 * k, world, legs[k].angles)
-                store_row_vec3(rows.qd, row + 1, 6 + 3 * k, world, legs[k].rates)
+                store_row_vec3(trajectory.q, row + 1, 7 + 3 * k, world, legs[k].angles)
+                store_row_vec3(trajectory.qd, row + 1, 6 + 3 * k, world, legs[k].rates)

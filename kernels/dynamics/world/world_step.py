@@ -1,16 +1,16 @@
-"""The velocities at the end of a step of one world: legs eliminated, contacts and hard stops settled together."""
+"""The velocities at the end of a step of one world: legs eliminated, contacts and hard stops solved together."""
 
 import warp as wp
 
 from ...actuation.stops import (
     MAX_SETS,
     SLACK,
-    StopRows,
+    StopRates,
     change_one,
     one_by_one,
     pressed_stops,
     revised_stops,
-    stop_rows,
+    stop_rates,
 )
 from ...layout import GRAVITY
 from ...scalar import real, vec3
@@ -19,70 +19,72 @@ from ..base_dynamics import LegSolve, add_leg, invert, motor_acceleration, solve
 from ..contact import BlockLaw, ContactState, PawContact, solve_contacts
 from ..leg_dynamics import PawKinematics
 from ..parameters import load_spring, load_stops, load_vec3
-from ..step import Robot, StepSettings, base_system, hold_base, leg_terms, load_leg, paw_contact
+from ..step import RobotModel, StepSettings, base_system, hold_base, leg_terms, load_leg, paw_contact
 
 wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
 class LegStep:
-    """A leg's motors (lateral, outer, inner), and what a step writes of the leg."""
+    """A leg in a step: input (angles, rates, torque), scratch and results; vectors are lateral, outer, inner."""
 
     angles: vec3  # [rad] at the start of the step
-    rates: vec3  # [rad/s]
-    torque: vec3  # [N m]
-    end: vec3  # [rad/s] at the end of the step
-    rows: StopRows
-    pressed: int  # set of hard stops
+    rates: vec3  # [rad/s] at the start of the step
+    torque: vec3  # [N m] of the motors
+    new_rates: vec3  # [rad/s] at the end of the step
+    stop_rates: StopRates
+    pressed: int  # set of pressed hard stops, see `stops`
     solve: LegSolve
     paw: PawKinematics
+    peak_sq: real  # [N^2 s^2] square of the largest impulse on the paw, over the steps of a launch
 
 
 @wp.struct
 class StepSolution:
-    """Velocities of the base at the end of a step, in the body axes of its start, and how contact came to them."""
+    """Velocities of the base at the end of a step, in the body axes of its start, and statistics."""
 
     lin: vec3  # [m/s]
     ang: vec3  # [rad/s]
-    contact: ContactState
+    contact: ContactState  # of the last solution
     sets: int  # of pressed stops that were tried
 
 
 @wp.func
 def solve_with_stops(
-    robot: Robot, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
+    model: RobotModel, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
     impulse: wp.array2d(dtype=vec3), legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact),
 ) -> StepSolution:  # fmt: skip
     """Solve a step with given sets of pressed stops; see `solve_step`."""
     dt = settings.dt
-    g = wp.quat_rotate_inv(base.quat, load_vec3(robot.table, GRAVITY, world))
-    system = base_system(robot, world, base, g, force, moment)
+    g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
+    system = base_system(model, world, base, g, force, moment)
     for k in range(legs.shape[0]):
-        own = load_leg(robot, world, k)
-        spring = load_spring(robot.table, k, world)
+        params = load_leg(model, world, k)
+        spring = load_spring(model.table, k, world)
         terms = leg_terms(
-            own, spring, legs[k].angles, legs[k].rates, legs[k].torque, legs[k].rows, legs[k].pressed, base.ang, g, dt
-        )
+            params, spring, legs[k].angles, legs[k].rates, legs[k].torque, legs[k].stop_rates, legs[k].pressed,
+            base.ang, g, dt,
+        )  # fmt: skip
         legs[k].solve = terms.solve
         legs[k].paw = terms.paw
         system = add_leg(system, terms.dynamics, terms.solve)
-    inverse = hold_base(robot, world, invert(system))
+    inverse = hold_base(model, world, invert(system))
     lin_acc = solve_lin(inverse, system.force, system.moment)
     ang_acc = solve_ang(inverse, system.force, system.moment)
     lin = wp.quat_rotate_inv(base.quat, base.lin) + dt * lin_acc
     ang = base.ang + dt * ang_acc
     for k in range(legs.shape[0]):
         end = legs[k].rates + dt * motor_acceleration(legs[k].solve, lin_acc, ang_acc)
-        legs[k].end = end
+        legs[k].new_rates = end
         contacts[k] = paw_contact(
-            robot, world, k, base, lin, ang, end, legs[k].rates, impulse[k, world], legs[k].pressed, legs[k].paw,
+            model, world, k, base, lin, ang, end, legs[k].rates, impulse[k, world], legs[k].pressed, legs[k].paw,
             legs[k].solve, inverse, block, dt,
         )  # fmt: skip
     change = solve_contacts(contacts, block, settings.max_sweeps, settings.tolerance)
     for k in range(legs.shape[0]):
         solve = legs[k].solve
         push = solve.inverse * (wp.transpose(contacts[k].jacobian) * contacts[k].impulse)
-        legs[k].end = legs[k].end + (push - solve.to_lin * change.lin - solve.to_ang * change.ang)
+        legs[k].new_rates = legs[k].new_rates + (push - solve.to_lin * change.lin - solve.to_ang * change.ang)
     solution = StepSolution()
     solution.lin = lin + change.lin
     solution.ang = ang + change.ang
@@ -92,22 +94,22 @@ def solve_with_stops(
 
 @wp.func
 def revise_stops(legs: wp.array(dtype=LegStep), slack: real, sets: int) -> bool:
-    """Change the sets of pressed stops to what the rates that they led to ask for; returns whether they changed."""
+    """Replace each leg's set of pressed stops by the one its new rates require; returns whether any changed."""
     changed = bool(False)
     for k in range(legs.shape[0]):
         pressed = legs[k].pressed
-        wanted = revised_stops(legs[k].rows, legs[k].end, slack, pressed, sets)
-        if wanted != pressed and not (changed and one_by_one(sets)):
+        required = revised_stops(legs[k].stop_rates, legs[k].new_rates, slack, pressed, sets)
+        if required != pressed and not (changed and one_by_one(sets)):
             if one_by_one(sets):
-                wanted = change_one(pressed, wanted)
-            legs[k].pressed = wanted
+                required = change_one(pressed, required)
+            legs[k].pressed = required
             changed = True
     return changed
 
 
 @wp.func
 def solve_step(
-    robot: Robot, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
+    model: RobotModel, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
     impulse: wp.array2d(dtype=vec3), legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact),
 ) -> StepSolution:  # fmt: skip
     """Solve a step of one world, and write every leg's pressed stops, contact and motor rates at the end of the step.
@@ -120,15 +122,15 @@ def solve_step(
     """
     dt = settings.dt
     for k in range(legs.shape[0]):
-        rows = stop_rows(load_stops(robot.table, k, world), legs[k].angles, dt)
-        legs[k].rows = rows
-        legs[k].pressed = pressed_stops(rows, legs[k].rates, real(0.0), 0)
+        bounds = stop_rates(load_stops(model.table, k, world), legs[k].angles, dt)
+        legs[k].stop_rates = bounds
+        legs[k].pressed = pressed_stops(bounds, legs[k].rates, real(0.0), 0)
     slack = SLACK * settings.tolerance
     solution = StepSolution()
     sets = int(0)
     working = bool(True)
     while working:
-        solution = solve_with_stops(robot, settings, world, base, force, moment, block, impulse, legs, contacts)
+        solution = solve_with_stops(model, settings, world, base, force, moment, block, impulse, legs, contacts)
         sets += 1
         working = sets < MAX_SETS and revise_stops(legs, slack, sets)
     solution.sets = sets

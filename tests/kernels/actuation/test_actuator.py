@@ -52,7 +52,7 @@ def test_driving_torque_is_flat_then_linear_to_zero_at_no_load(vel, torque):
 
 
 @pytest.mark.parametrize(("vel", "torque"), [(0.0, 18.0), (24.0, 18.0), (25.0, 18.0), (30.0, 12.0), (40.0, 0.0)])
-def test_saturation_below_the_peak_holds_until_the_motor_gives_less(vel, torque):
+def test_saturation_below_peak_limits_torque_until_the_envelope_does(vel, torque):
     # the motor gives 24 (40 - v) / 20 N m beyond the cutoff: 18 at 25 rad/s
     assert actuator.motor_torque(1.0, 0.0, vel, make_motor(peak=24.0)) == pytest.approx(torque, abs=1e-5)
 
@@ -204,7 +204,7 @@ def test_gradients_equal_central_differences():
         assert np.sum(varied.grad.numpy() * direction) == pytest.approx(numeric, rel=1e-6), name
 
 
-def test_saturation_is_cut_to_what_the_motor_gives():
+def test_saturation_is_clamped_to_peak_torque():
     # peak: 18 N m lateral, 24.8 N m transversal
     full = jumping_motors(24.8)
     assert (full.lateral.saturation, full.transversal.saturation) == (18.0, 24.8)
@@ -229,7 +229,7 @@ def test_arrays_repeat_lateral_and_transversal_constants():
         (dict(no_load_speed=20.0), "no_load_speed"),
     ],
 )
-def test_impossible_motor_is_refused(bad, message):
+def test_refuses_invalid_motor(bad, message):
     good = dict(kp=17.0, kd=0.8, saturation=18.0, peak=24.8, cutoff_speed=20.0, no_load_speed=40.0)
     with pytest.raises(ValueError, match=message):
         MotorKindCfg(**(good | bad))

@@ -115,7 +115,7 @@ def test_filters_are_the_published_ones():
 @pytest.mark.parametrize("command", [math.inf, -math.inf, 3.0e38])
 @pytest.mark.parametrize("params", [JUMP, WALK], ids=["jump", "walk"])
 @pytest.mark.parametrize("pos", [(0.0, 45.0, 45.0), (15.0, 140.0, 100.0), (-30.0, -90.0, 90.0)])
-def test_endless_command_becomes_finite(command, params, pos):
+def test_infinite_command_becomes_finite(command, params, pos):
     assert np.all(np.abs(safe_leg((command,) * 3, pos, (0.0, 0.0, 0.0), params)) <= 720.1)
 
 
@@ -126,7 +126,7 @@ speed = st.floats(-2000.0, 2000.0, width=32)
 
 
 @given(raw=st.tuples(angle, angle), pos=st.tuples(angle, angle), vel=st.tuples(speed, speed))
-def test_transversal_commands_give_way_to_the_sum_equally(raw, pos, vel):
+def test_sum_limit_corrects_both_transversal_commands_equally(raw, pos, vel):
     wide = LimitsCfg(-1.0e4, 1.0e4)
     only_sum = filter_params(FilterCfg(wide, wide, sum=LimitsCfg(0.0, 240.0, 35.0, 45.0), horizon=0.1))
     _, outer, inner = safe_leg((0.0, *raw), (0.0, *pos), (0.0, *vel), only_sum)
@@ -146,14 +146,14 @@ def test_outside_or_toward_the_limit_in_its_hard_zone_the_command_ends_within(ra
 
 
 @given(raw=st.tuples(angle, angle, angle), pos=st.floats(60.0, 80.0, width=32), vel=st.floats(-200.0, 200.0, width=32))
-def test_far_from_the_limits_nothing_is_touched(raw, pos, vel):
+def test_commands_far_from_the_limits_pass_unchanged(raw, pos, vel):
     # 60 deg of margin and more at 200 deg/s at most, 75 deg of the sum at 400: beyond the horizon
     walk = (0.0, pos, pos)
     assert safe_leg(raw, walk, (0.0, vel, vel), WALK) == pytest.approx(raw, abs=1e-3)
 
 
 @given(raw=st.tuples(angle, angle), pos=angle, vel=speed)
-def test_a_greater_command_never_gives_a_smaller_target(raw, pos, vel):
+def test_filter_is_monotonic_in_the_command(raw, pos, vel):
     low, high = sorted(raw)
     # without hard zones: these judge by the command's direction, which lets one away from the limit pass untouched
     safe = [safe_leg((command, 45.0, 45.0), (pos, 45.0, 45.0), (vel, 0.0, 0.0), WALK)[0] for command in (low, high)]
@@ -279,14 +279,14 @@ def worst_overshoot(low, high, filtered):
     return np.degrees(overshoot.numpy()).max(axis=1)
 
 
-def test_wildest_actions_overshoot_little_with_the_filter_only():
+def test_filter_bounds_overshoot_of_extreme_actions():
     # a free joint of 0.02 kg m^2; commands are bounded by the actions: 45 +- 90 deg transversal, +-15 deg lateral
     low, high = (-15.0, -45.0, -45.0), (15.0, 135.0, 135.0)
     assert np.all(worst_overshoot(low, high, filtered=True) < [0.1, 10.0, 10.0, 20.0])
     assert np.all(worst_overshoot(low, high, filtered=False)[1:] > [20.0, 20.0, 90.0])
 
 
-def test_commands_far_beyond_the_limits_overshoot_less_than_they_ask():
+def test_filter_reduces_overshoot_of_commands_beyond_the_limits():
     low, high = (-180.0,) * 3, (180.0,) * 3
     assert np.all(worst_overshoot(low, high, filtered=True) < [30.0, 21.0, 21.0, 60.0])
     assert np.all(worst_overshoot(low, high, filtered=False) > [120.0, 120.0, 120.0, 300.0])
@@ -302,6 +302,6 @@ def test_commands_far_beyond_the_limits_overshoot_less_than_they_ask():
         (lambda: FilterCfg(LimitsCfg(0, 1), LimitsCfg(0, 1), LimitsCfg(0, 1), horizon=0.0), "horizon"),
     ],
 )
-def test_impossible_filter_is_refused(make, message):
+def test_refuses_invalid_filter(make, message):
     with pytest.raises(ValueError, match=message):
         make()

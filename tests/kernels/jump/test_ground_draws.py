@@ -264,7 +264,7 @@ def hold(env, steps=20):
     action = torch.from_numpy((angles - DEFAULT_ANGLE) / scale).float()
     for _ in range(steps):
         env.step(action)
-        assert not env.done.any() and not env.robot.invalid.numpy().any()
+        assert not env.done.any() and not env.robot.diverged.numpy().any()
     env.sim.physics.write_bodies()
 
 

@@ -181,7 +181,7 @@ def rollout():
         after = robot_of(env)
         logged.append(env.skills[0].term_value.numpy().copy())
         expected.append(expected_terms(TASK, before, after, action.clamp(-1.0, 1.0).numpy().T))
-        env._begin(env._part(), env.episodes.done)
+        env._reset_worlds(env._part(), env.episodes.done)
     return np.array(logged), np.array(expected)
 
 

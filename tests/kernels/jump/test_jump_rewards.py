@@ -52,10 +52,15 @@ ALWAYS_PAID = [
     (
         "horizontal_velocity",
         {"lin_vel": (0.03, -0.04, 7.0)},
-        {"speed_scale": 0.05, "waiting_scale": 0.25},
+        {"std": 0.05, "waiting_scale": 0.25},
         [E(-1.0), 2.0 * E(-1.0)],
     ),
-    ("orientation", {"gravity": (0.06, -0.08, -0.995)}, {"std": 0.1, "waiting_scale": 0.25}, [E(-1.0), E(-1.0)]),
+    (
+        "orientation",
+        {"projected_gravity": (0.06, -0.08, -0.995)},
+        {"std": 0.1, "waiting_scale": 0.25},
+        [E(-1.0), E(-1.0)],
+    ),
     ("angular_velocity", {"ang_vel": (2.0, -1.0, 2.0)}, {"std": 3.0, "waiting_scale": 0.25}, [E(-1.0), E(-1.0)]),
     # transversal angles 0.5 and 0.9 in equal number: variance 0.04; |lateral| = sqrt(4) * 0.1
     (

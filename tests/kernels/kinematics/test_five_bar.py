@@ -188,28 +188,28 @@ def assert_close(got, want, tolerance):
 
 
 @pytest.mark.parametrize(("angle", "depth"), [(0.0, 0.4716), (45.0, 0.3718), (57.0, 0.3260)])
-def test_symmetric_leg_reaches_hand_figure_below_the_axes(build, angle, depth):
+def test_ankle_of_symmetric_leg_by_hand(build, angle, depth):
     motors = np.radians([[angle, angle, 0.0, 0.0]])
     for leg, geo in enumerate(leg_geometry(load_description())):
         ankle = build(leg, motors)["ankle"][0]
         assert ankle == pytest.approx([0.5 * (geo["outer_x"] + geo["inner_x"]), -depth], abs=5.0e-5)
 
 
-def test_symmetric_leg_rises_at_hand_figure_per_radian(build):
+def test_jacobian_of_symmetric_leg_by_hand(build):
     # depth = 0.175 cos a + sqrt(0.09 - w^2), w = 0.045 + 0.175 sin a; at 45 degrees w = 0.168744, sqrt = 0.248046
     fields = build(0, np.radians([[45.0, 45.0, 0.0, 0.0]]))
     rise = fields["ankle_do"][0, 1] + fields["ankle_di"][0, 1]
     assert rise == pytest.approx(0.123744 + 0.168744 * 0.123744 / 0.248046, abs=2.0e-6)
 
 
-def test_parallel_thighs_carry_ankle_on_a_circle(build):
+def test_parallel_thighs_move_ankle_on_a_circle(build):
     # outer = -inner keeps knees 0.09 apart and level: the ankle moves as the thigh tips do, 0.175 m/rad
     fields = build(0, np.array([[0.0, 0.0, 1.0, -1.0]]))
     assert fields["ankle_do"][0] - fields["ankle_di"][0] == pytest.approx([0.175, 0.0], abs=1.0e-6)
     assert fields["ankle_acc"][0] == pytest.approx([0.0, 0.175], abs=1.0e-6)
 
 
-def test_coinciding_knees_give_finite_numbers(build):
+def test_coinciding_knees_give_finite_values(build):
     angle = -math.asin(0.045 / 0.175)
     fields = build(0, np.array([[angle, angle, 10.0, -10.0]]))
     assert all(np.isfinite(value).all() for value in fields.values())

@@ -141,7 +141,7 @@ def reached_by_pinocchio(robot, q):
 # --- Forward: hand figures and derivatives ---
 
 
-def test_default_pose_puts_paws_at_hand_figures(build):
+def test_paw_positions_of_default_pose_by_hand(build):
     motors = np.tile(np.radians([0.0, 45.0, 45.0]), 4)[:, None]
     ankle = build.legs_at(motors)[0][:, 0]
     # x: 0.1433 + (0.1417 + 0.0517) / 2; y: hip + 0.05945 + 0.00075; z: five-bar at 45 degrees
@@ -170,7 +170,7 @@ def test_jacobian_matches_central_differences(double):
 # --- Position: reachable targets ---
 
 
-def test_pose_found_puts_both_shank_ends_on_the_paw_in_pinocchio(build, robot):
+def test_inverse_kinematics_closes_the_loop_in_pinocchio(build, robot):
     tolerance = 1.0e-12 if build.double else 5.0e-6
     base_pos, base_quat = random_bases(ROBOTS)
     want = np.empty((4, ROBOTS, 3))
@@ -196,7 +196,7 @@ def test_every_paw_position_within_limits_is_reached(build):
     np.testing.assert_allclose(build.legs_at(motors)[0], paws, atol=1.0e-12 if build.double else 1.0e-6)
 
 
-def test_angles_come_back_from_a_normal_stance(build):
+def test_inverse_kinematics_inverts_forward_kinematics_of_a_stance(build):
     # knees outward: both knees bent, as for every thigh at 10 degrees or more
     rng = np.random.default_rng(3)
     want = np.radians(rng.uniform(10.0, 100.0, (12, 500)))
@@ -265,7 +265,7 @@ def test_reachable_flag_agrees_with_a_zero_distance(build):
         np.testing.assert_array_equal(reachable == 1, residual < 1.0e-5)
 
 
-def test_target_below_a_stretched_leg_is_answered_by_the_stretched_leg(build):
+def test_target_below_reach_gives_stretched_leg(build):
     # 0.1 m below the deepest point, 0.4716 below the axes in a plane 0.0602 beside the hip
     geo = leg_geometry(load_description())[0]
     below = np.array(geo["hip"]) + [0.0967, 0.0602, -0.5716]
@@ -295,7 +295,7 @@ def test_target_far_below_stretches_the_legs_under_the_hips(build, depth):
     np.testing.assert_allclose(motors[2::3], 0.0, atol=math.radians(2.0))
 
 
-def test_target_that_is_not_finite_puts_the_ankle_0_3_below_the_axes(build):
+def test_non_finite_target_puts_the_ankle_0_3_below_the_axes(build):
     motors = build.solve(np.full((4, 1, 3), math.nan))[0]
     ankle = build.legs_at(motors)[0][:, 0]
     want = [[0.24, 0.1652, -0.3], [0.24, -0.1652, -0.3], [-0.24, 0.2102, -0.3], [-0.24, -0.2102, -0.3]]
@@ -304,7 +304,7 @@ def test_target_that_is_not_finite_puts_the_ankle_0_3_below_the_axes(build):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1.0e30, -1.0e30, 0.0])
 @pytest.mark.parametrize("axes", [[0], [1], [2], [0, 1, 2]])
-def test_bad_targets_give_finite_poses_and_no_flag(build, value, axes):
+def test_non_finite_targets_give_finite_unreachable_poses(build, value, axes):
     targets = np.array([leg["hip"] for leg in leg_geometry(load_description())])[:, None]
     targets[:, :, axes] = value  # value 0: the centre of the body and points level with the hips
     motors, knees, reachable, residual = build.solve(targets)
@@ -313,7 +313,7 @@ def test_bad_targets_give_finite_poses_and_no_flag(build, value, axes):
     assert not np.isnan(residual).any() and (residual > 0.05).all()
 
 
-def test_base_that_is_not_finite_gives_finite_poses_and_no_flag(build):
+def test_non_finite_base_gives_finite_unreachable_poses(build):
     motors, knees, reachable, _ = build.solve(np.zeros((4, 1, 3)), np.full((1, 3), math.nan), [[0.0, 0.0, 0.0, 1.0]])
     assert np.isfinite(motors).all() and np.isfinite(knees).all()
     assert not reachable.any()

@@ -63,7 +63,7 @@ class Events(Probe):
                   self.parameters]  # fmt: skip
         wp.launch(skill.kernels["event"], (skill.num_events, LANES, N), inputs, device="cpu")
 
-    def counted(self):
+    def event_counts(self):
         """Return how often the counting events ran at the start, and at resets."""
         found = self.parameters.latency.numpy()
         return found % 1000, found // 1000
@@ -83,17 +83,17 @@ def counting():
 
 def test_each_stage_runs_its_own_events(counting):
     counting.run(STARTUP)
-    assert [set(found) for found in counting.counted()] == [{1}, {0}]
+    assert [set(found) for found in counting.event_counts()] == [{1}, {0}]
     counting.run(AT_RESET)
     counting.run(AT_STEP)
     counting.run(AT_RESET)
-    assert [set(found) for found in counting.counted()] == [{1}, {2}]
+    assert [set(found) for found in counting.event_counts()] == [{1}, {2}]
 
 
 def test_a_reset_runs_in_the_masked_worlds_only(counting):
     mask = np.arange(N) % 3 == 0
     counting.run(AT_RESET, mask)
-    np.testing.assert_array_equal(counting.counted()[1], mask)
+    np.testing.assert_array_equal(counting.event_counts()[1], mask)
 
 
 def test_worlds_of_another_skill_are_passed_over(counting):
@@ -101,7 +101,7 @@ def test_worlds_of_another_skill_are_passed_over(counting):
     counting.episodes.skill.assign(away.astype(int))
     for stage in (STARTUP, AT_RESET, AT_STEP):
         counting.run(stage)
-    started, begun = counting.counted()
+    started, begun = counting.event_counts()
     np.testing.assert_array_equal(started, ~away)
     np.testing.assert_array_equal(begun, ~away)
 
@@ -110,7 +110,7 @@ def test_numbers_of_an_event_change_while_it_runs(counting):
     counting.run(STARTUP)
     counting.skill.set("events", "start", times=7.0)
     counting.run(STARTUP)
-    assert set(counting.counted()[0]) == {8}
+    assert set(counting.event_counts()[0]) == {8}
 
 
 # ---------------------------------------------------------------- intervals

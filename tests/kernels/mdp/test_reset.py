@@ -110,7 +110,7 @@ def test_a_reset_begins_episodes_in_the_masked_worlds_and_touches_no_other(stage
     after = values_of(stage.robot, RobotArrays)
     unchanged(before, after, ~SOME)
     unchanged(worlds, values_of(stage.episodes, EpisodeArrays), ~SOME, but=("diverged",))
-    np.testing.assert_array_equal(stage.world("fresh"), SOME)
+    np.testing.assert_array_equal(stage.world("history_reset"), SOME)
     np.testing.assert_array_equal(stage.world("diverged"), ~SOME)
     np.testing.assert_array_equal(stage.read("value"), np.where(SOME, 2.5, 1.5))
     np.testing.assert_array_equal(stage.read("steps"), np.where(SOME, 0, 9))
@@ -132,7 +132,7 @@ def test_worlds_of_another_skill_are_passed_over(stage):
     stage.give(1.0, 1, np.ones((N, 4)), np.zeros(N))
     unchanged(before, values_of(stage.robot, RobotArrays), SOME)
     np.testing.assert_array_equal(stage.read("value"), np.where(SOME, 7.0, 1.0))
-    np.testing.assert_array_equal(stage.world("fresh"), ~SOME)
+    np.testing.assert_array_equal(stage.world("history_reset"), ~SOME)
 
 
 def test_draws_of_a_beginning_follow_seed_and_clock():
@@ -178,7 +178,7 @@ def test_a_command_that_is_due_is_drawn_and_moves_nothing(stage):
     before = values_of(stage.robot, RobotArrays)
     stage.reset(0.0)
     unchanged(before, values_of(stage.robot, RobotArrays), np.ones(N, dtype=bool))
-    np.testing.assert_array_equal(stage.world("fresh"), np.where(due, COMMANDED, 0))
+    np.testing.assert_array_equal(stage.world("history_reset"), np.where(due, COMMANDED, 0))
     np.testing.assert_array_equal(stage.read("counts"), np.where(due, 12, 0))
     other = stage.read("other")
     assert (other[~due] == -1.0).all() and other[due].min() >= 0.0 and len(np.unique(other[due])) == due.sum()
@@ -213,7 +213,7 @@ def test_a_command_from_outside_begins_an_episode_with_its_heading(stage):
     np.testing.assert_array_equal(stage.read("value"), np.where(SOME, values[:, 0], 1.5))
     np.testing.assert_array_equal(stage.read("other"), np.where(SOME, headings, 3.0))
     np.testing.assert_array_equal(stage.read("steps"), np.where(SOME, 0, 9))
-    np.testing.assert_array_equal(stage.world("fresh"), SOME)
+    np.testing.assert_array_equal(stage.world("history_reset"), SOME)
     np.testing.assert_array_equal(stage.world("diverged"), ~SOME)
 
 
@@ -226,13 +226,13 @@ def test_a_command_from_outside_within_an_episode_comes_in_the_robots_heading(st
     expected = np.where(SOME, np.arctan2(yaw[:, 1], yaw[:, 0]), 3.0)
     np.testing.assert_allclose(stage.read("other"), expected, atol=1e-5)
     assert (stage.read("steps") == 9).all()
-    np.testing.assert_array_equal(stage.world("fresh"), np.where(SOME, COMMANDED, 0))
+    np.testing.assert_array_equal(stage.world("history_reset"), np.where(SOME, COMMANDED, 0))
 
 
 def test_a_command_before_the_first_step_leaves_a_beginning_one(stage):
     stage.episodes.history_reset.fill_(BEGUN)
     stage.give(SOME, 0, np.zeros((N, 4)), np.zeros(N))
-    assert (stage.world("fresh") == BEGUN).all()
+    assert (stage.world("history_reset") == BEGUN).all()
 
 
 # ---------------------------------------------------------------- standing up, the clock
@@ -283,7 +283,7 @@ def test_forgetting_touches_the_masked_worlds_only(stage):
 
 
 ZERO = ("torque", "prev_torque", "action", "prev_action", "prev_prev_action", "impulse", "paw_force", "peak_force",
-        "contact_time", "air_time", "touchdown_speed", "paw_height", "invalid", "collisions")  # fmt: skip
+        "contact_time", "air_time", "touchdown_speed", "paw_height", "diverged", "collisions")  # fmt: skip
 FORGOTTEN = (*ZERO, "target", "filtered_target", "prev_rate", "prev_lin_vel", "paw_pos", "paw_vel")
 
 

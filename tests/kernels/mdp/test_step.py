@@ -157,8 +157,8 @@ def test_the_first_termination_that_holds_ends_the_episode(probe, other, termina
 
 def break_world(probe, how, world):
     """Make a world one whose state is not that of a robot."""
-    if how == "invalid":
-        write(probe.robot.invalid, world, 1)
+    if how == "diverged":
+        write(probe.robot.diverged, world, 1)
     elif how == "action":
         write(probe.episodes.bad_action, world, 1)
     elif how == "fast":
@@ -167,7 +167,7 @@ def break_world(probe, how, world):
         write(probe.robot.joint_q, 43 * world + 8, np.nan)
 
 
-@pytest.mark.parametrize("how", ["invalid", "action", "fast", "nan"])
+@pytest.mark.parametrize("how", ["diverged", "action", "fast", "nan"])
 @pytest.mark.parametrize("other", [0.0, 2.0e3])
 def test_a_broken_world_ends_as_one_that_came_apart_and_pays_nothing(probe, how, other):
     probe.write(value=1.0, other=other)
@@ -224,7 +224,7 @@ def test_anything_else_breaks_the_row(probe, failure):
 
 def test_a_broken_world_is_no_success(probe):
     write(probe.episodes.streak, slice(None), 2)
-    break_world(probe, "invalid", 0)
+    break_world(probe, "diverged", 0)
     end(probe)
     assert probe.world("level").tolist() == [0] + [1] * (N - 1)
 

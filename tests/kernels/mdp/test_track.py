@@ -47,7 +47,7 @@ def robots(sim):
 
 def track(robot, sim, ground=None, settings=None, worlds=None):
     """Launch the stage on some robots."""
-    n, made = robot.invalid.shape[0], sim.physics.dynamics.robot
+    n, made = robot.diverged.shape[0], sim.physics.dynamics.robot
     settings = contact_force(0.1) if settings is None else settings
     inputs = [made.geometry, made.ground if ground is None else ground, settings, worlds or new_worlds(n), robot]
     wp.launch(track_kernel, (4, n), inputs, device="cpu")
@@ -94,7 +94,7 @@ def seen_kernel(
 
 def seen(robot, sim):
     """Return which paws are down, which came down in this step, their number, and the collision flags."""
-    n, ground = robot.invalid.shape[0], sim.physics.dynamics.robot.ground
+    n, ground = robot.diverged.shape[0], sim.physics.dynamics.robot.ground
     arrays = [wp.zeros(n, dtype=kind, device="cpu") for kind in (wp.vec4, wp.vec4, int, int)]
     wp.launch(seen_kernel, n, [robot, ground, *arrays], device="cpu")
     return [values.numpy() for values in arrays]
@@ -102,7 +102,7 @@ def seen(robot, sim):
 
 def push_paws(robot, down, force=50.0):
     """Press some paws, (4,) or (4, n) bool, with a force in any direction [N]."""
-    forces = np.zeros((4, robot.invalid.shape[0], 3))
+    forces = np.zeros((4, robot.diverged.shape[0], 3))
     forces += force * np.array([0.6, 0.0, 0.8]) * np.reshape(down, (4, -1))[:, :, None]
     robot.paw_force.assign(forces)
 

@@ -3,17 +3,18 @@ import math
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.heights import HeightLog, jump_metrics, view_of
+from jumper_warp.evaluation.heights import HeightLog, apex_metrics, side_camera
 from jumper_warp.viz.snapshot import FIELD_OF_VIEW
 
 
-def step_of(jumps, **changes):
+def make_arrays(jumps, **changes):
+    """Return the arrays of `JumpLog.read_env` of robots in stance, with some changed."""
     count = len(jumps.goals)
     arrays = {
         "phase": np.zeros(count, dtype=int), "phase_steps": np.zeros(count, dtype=int),
         "termination": np.full(count, -1), "max_height": np.zeros(count), "peak_tilt": np.zeros(count),
-        "base_vel": np.zeros((count, 3)), "steps": np.full(count, 40), "command_step": np.full(count, 30),
-        "base_pos": np.zeros((count, 3)),
+        "base_vel": np.zeros((count, 3)), "steps": np.full(count, 40),
+        "command_step": np.full(count, 30), "base_pos": np.zeros((count, 3)),
         "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), "start": np.zeros((count, 3)),
         "heading": np.zeros(count), "goal": np.zeros((count, 3)), "touched_down": np.zeros(count, dtype=int),
         "up": np.zeros(count), "paws_down": np.ones((count, 4), dtype=bool),
@@ -21,22 +22,21 @@ def step_of(jumps, **changes):
     return arrays | {name: np.array(value) for name, value in changes.items()}
 
 
-def test_metrics_by_hand():
+def test_apex_metrics_match_hand_computed_values():
     jumps = HeightLog(np.array([0.5, 0.8, 1.1, 1.2]), ("success", "came_apart", "collided"))
     landed = {"phase": [2, 0, 2, 0], "phase_steps": [60, 0, 60, 0]}
     heights = {"max_height": [0.52, 1.0e13, 1.06, 0.4], "peak_tilt": [0.1, 3.0, 0.2, 0.0]}
     half = [math.radians(0.5 * angle) for angle in (10.0, 90.0, -26.0, 0.0)]
-    places = {
+    base_poses = {
         "base_pos": [[0.06, -0.08, 0.3], [9.0, 0.0, 0.0], [0.0, 0.3, 0.3], [0.0] * 3],
         "base_quat": [[0.0, 0.0, math.sin(angle), math.cos(angle)] for angle in half],
     }
     speeds = {"base_vel": [[0.0, 0.03, 0.04], [9.0] * 3, [0.0, 0.0, -0.2], [0.0] * 3]}
-    assert not jumps.update(
-        step_of(jumps, termination=[0, 1, 0, -1], **landed, **heights, **speeds, **places), 1.0 / 60.0
-    )
+    first = make_arrays(jumps, ending=[0, 1, 0, -1], **landed, **heights, **speeds, **base_poses)
+    assert not jumps.update(first, 1.0 / 60.0)
     later = {"max_height": [9.0, 9.0, 9.0, 0.9], "peak_tilt": [3.0] * 4}
-    assert jumps.update(step_of(jumps, termination=[2, 2, 2, 2], **later), 1.0 / 60.0)
-    metrics = jump_metrics(jumps, (0.5, 1.1))
+    assert jumps.update(make_arrays(jumps, ending=[2, 2, 2, 2], **later), 1.0 / 60.0)
+    metrics = apex_metrics(jumps, (0.5, 1.1))
     expected = {
         "jumps": 4,
         "mean_abs_error_m": (0.02 + 0.04 + 0.3) / 3,
@@ -64,41 +64,41 @@ def test_metrics_by_hand():
     assert {name: metrics[name] for name in expected} == pytest.approx(expected, abs=1e-9)
 
 
-def test_jump_that_never_ends_is_a_failure():
+def test_unfinished_jump_fails_with_no_end():
     jumps = HeightLog(np.array([0.5]), ("success",))
-    assert not jumps.update(step_of(jumps), 1.0 / 60.0)
-    metrics = jump_metrics(jumps, (0.5, 1.1))
+    assert not jumps.update(make_arrays(jumps), 1.0 / 60.0)
+    metrics = apex_metrics(jumps, (0.5, 1.1))
     assert metrics["success_rate"] == 0.0 and metrics["failed_by_no_end"] == 1
     assert metrics["max_landing_tilt_deg"] is None
 
 
-def test_columns_have_a_row_a_jump_and_none_where_there_is_no_number():
+def test_columns_have_one_row_per_jump_and_none_for_nan():
     jumps = HeightLog(np.array([0.5, 0.8]), ("success", "came_apart"))
     landed = {"phase": [2, 0], "phase_steps": [60, 0]}
-    jumps.update(step_of(jumps, termination=[0, 1], max_height=[0.52, np.nan], **landed), 1.0 / 60.0)
+    jumps.update(make_arrays(jumps, ending=[0, 1], max_height=[0.52, np.nan], **landed), 1.0 / 60.0)
     assert jumps.columns() == {
         "target_m": [0.5, 0.8], "apex_m": [pytest.approx(0.52), None], "error_m": [pytest.approx(0.02), None],
         "end": ["success", "came_apart"],
     }  # fmt: skip
 
 
-def test_jump_is_early_if_it_has_begun_when_the_command_comes():
+def test_jump_in_progress_at_command_is_early():
     jumps = HeightLog(np.array([0.5, 0.8, 1.0]), ("success", "came_apart"))
     for step, phase in ((29, [0, 1, 0]), (30, [0, 1, 0]), (31, [1, 2, 0])):
-        jumps.update(step_of(jumps, steps=[step] * 3, phase=phase), 1.0 / 60.0)
+        jumps.update(make_arrays(jumps, steps=[step] * 3, phase=phase), 1.0 / 60.0)
     assert jumps.early[:, 0].tolist() == [False, True, False]
 
 
-def test_a_jump_to_another_height_is_a_miss_and_no_fall():
+def test_landing_from_wrong_height_counts_as_miss_not_fall():
     jumps = HeightLog(np.array([0.5, 0.6, 0.7]), ("wrong_height", "collided", "success"))
-    jumps.update(step_of(jumps, termination=[0, 1, -1], phase=[2, 2, 2], phase_steps=[0, 3, 60]), 1.0 / 60.0)
-    metrics = jump_metrics(jumps, (0.5, 1.1))
+    jumps.update(make_arrays(jumps, ending=[0, 1, -1], phase=[2, 2, 2], phase_steps=[0, 3, 60]), 1.0 / 60.0)
+    metrics = apex_metrics(jumps, (0.5, 1.1))
     assert [metrics[name] for name in ("success_rate", "fall_rate", "miss_rate")] == pytest.approx([1 / 3] * 3)
 
 
 @pytest.mark.parametrize("apex", [0.5, 1.0, 3.6])
-def test_pictures_show_a_jump_from_the_ground_to_its_apex(apex):
-    eye, target, (width, height) = view_of(apex)
+def test_side_camera_shows_ground_and_apex(apex):
+    eye, target, (width, height) = side_camera(apex)
     axis = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
     for z in (0.0, apex + 0.2):
         ray = np.subtract((0.0, 0.0, z), eye)

@@ -1,0 +1,106 @@
+"""Held squats: log and metrics of paw forces and motor torques before the command to jump."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.jumps import jump_commands
+from jumper_warp.evaluation.log import EvaluationLog, Metrics, mean, mean_and_max
+
+CONTACT_FORCE = 0.1  # [N] Smallest force on a paw that is on the ground
+
+
+@dataclass
+class SquatLog(EvaluationLog):
+    """Log of robots that squat and wait, one per world; samples after an episode's end are ignored."""
+
+    goals: np.ndarray  # [m] (num_envs, 3) Goals of the jumps: x, y relative to start and heading, and apex height z
+    hold: float = 3.0  # [s] Simulated time, within which the jump is not commanded
+    window: float = 1.0  # [s] Window at its end over which forces and torques are evaluated
+    row_name = "squat"
+
+    def __post_init__(self) -> None:
+        """Begin with nothing recorded."""
+        self.count, self.step_dt = len(self.goals), 1.0 / 60.0
+        self.ended = np.zeros(self.count, dtype=bool)  # whether each episode has ended
+        # in each policy step, (num_envs, 4), (num_envs, 4), (num_envs, 12)
+        self.peaks: list[np.ndarray] = []  # [N] largest force on each paw, of all its physics steps
+        self.forces: list[np.ndarray] = []  # [N] force on each paw at the end of it
+        self.torques: list[np.ndarray] = []  # [N m] of the motors
+
+    @property
+    def seconds(self) -> float:
+        """[s] Simulated time."""
+        return self.hold
+
+    def begin(self, env: Env) -> None:
+        """Reset every robot to the default pose, with its goal and a command after the simulated time."""
+        self.step_dt = env.step_dt
+        env.evaluation_reset(jump_commands(self.goals, self.hold + 1.0, env.step_dt))
+
+    def read_env(self, env: Any) -> dict[str, np.ndarray]:
+        """Return paw forces [N], motor torques [N m] and terminations."""
+        return {
+            "peak": env.sim.physics.peak_paw_force.numpy().T.copy(),
+            "force": np.linalg.norm(env.sim.paw_force.numpy(), axis=2).T.copy(),
+            "torque": env.sim.torque.numpy().T.copy(), "termination": env.episodes.termination.numpy().copy(),
+        }  # fmt: skip
+
+    def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
+        """Record a policy step from the arrays of `read_env`; return whether all episodes have ended."""
+        self.ended |= arrays["termination"] >= 0
+        for history, name in ((self.peaks, "peak"), (self.forces, "force"), (self.torques, "torque")):
+            history.append(arrays[name])
+        return bool(self.ended.all())
+
+    def in_window(self, values: list[np.ndarray]) -> np.ndarray:
+        """Return the values within the window of the robots that still hold, (steps, robots, ...)."""
+        return np.array(values[-round(self.window / self.step_dt) :])[:, ~self.ended]
+
+    @property
+    def force_range(self) -> np.ndarray:
+        """[N] (robots,) Largest minus smallest force on a paw within the window, maximum over the four paws."""
+        return (self.in_window(self.peaks).max(axis=0) - self.in_window(self.forces).min(axis=0)).max(axis=1)
+
+    @property
+    def torque_ripple(self) -> np.ndarray:
+        """[N m] (robots,) Standard deviation of a motor's torque within the window, RMS over motors."""
+        return np.sqrt(self.in_window(self.torques).var(axis=0).mean(axis=1))
+
+    def columns(self) -> dict[str, list]:
+        """Return force range and torque ripple of every robot that squats."""
+        return {"paw_force_range_n": self.force_range.tolist(), "torque_ripple_nm": self.torque_ripple.tolist()}
+
+    def series(self, worlds: Sequence[int]) -> dict[str, float]:
+        """Return the force on every paw of some worlds."""
+        names = ("front left", "front right", "back left", "back right")
+        return {
+            f"force/{name} of {world} [N]": float(self.forces[-1][world, paw])
+            for world in worlds
+            for paw, name in enumerate(names)
+        }
+
+
+def squat_goals(count: int, reach: tuple[float, float], *, up: bool) -> np.ndarray:
+    """Return evenly spaced goals [m] for `SquatLog`, (count, 3), between limits; up: apex heights, else ahead."""
+    goals = np.zeros((count, 3))
+    goals[:, 2 if up else 0] = np.linspace(*reach, count)
+    return goals
+
+
+def squat_metrics(squats: SquatLog) -> Metrics:
+    """Return the metrics of held squats; forces and torques are those of the robots that hold to the end."""
+    spread, ripple = squats.force_range, squats.torque_ripple
+    return {
+        "squats": len(squats.ended),
+        "holding_rate": float((~squats.ended).mean()),
+        **mean_and_max("paw_force_range_n", spread),
+        "median_paw_force_range_n": float(np.median(spread)) if len(spread) else None,
+        "lost_paw_share": mean((squats.in_window(squats.forces) < CONTACT_FORCE).ravel()),
+        **mean_and_max("torque_ripple_nm", ripple),
+    }

@@ -1,0 +1,85 @@
+"""Table of evaluations: flags, terminations and metrics by the key in `TaskCfg.evaluation_suite`."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import Any, Literal, Protocol
+
+from jumper_warp.evaluation import heights, landings
+from jumper_warp.evaluation.attitude import AttitudeFlags, AttitudePlayFlags
+from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodePlayFlags
+from jumper_warp.evaluation.heights import HeightFlags, HeightPlayFlags
+from jumper_warp.evaluation.landings import LandingFlags, LandingPlayFlags
+from jumper_warp.evaluation.log import EvaluationLog, Metrics
+from jumper_warp.evaluation.velocities import VelocityFlags, VelocityPlayFlags
+from jumper_warp.policies.spec import PolicyError
+from jumper_warp.tasks.cfg import TaskCfg
+
+
+class EvaluationFlags(Protocol):
+    """Flags of `jumper evaluate` for a kind of task; a frozen dataclass."""
+
+    def log(self, task: TaskCfg, seed: int) -> EvaluationLog:
+        """Return the log that gives the commands, one episode per world."""
+        ...
+
+    def metrics(self, log: Any) -> Metrics:
+        """Return the metrics of a finished log of `log`."""
+        ...
+
+
+class PlayFlags(Protocol):
+    """Flags of `jumper play` for a kind of task; a frozen dataclass."""
+
+    @property
+    def length(self) -> float:
+        """[s] Default length of the recording."""
+        ...
+
+    def log(self, task: TaskCfg) -> EvaluationLog:
+        """Return the log that gives the commands, one episode per world."""
+        ...
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How `jumper evaluate`, `play` and `finetune` handle the policies of a task."""
+
+    flags: EvaluationFlags  # Default flags of `jumper evaluate`
+    play: PlayFlags  # Default flags of `jumper play`
+    prepare_task: Callable[[TaskCfg], TaskCfg] = lambda task: task
+    """Returns the task with the terminations that the evaluation uses."""
+    finetune_target: Literal["apex", "landing"] | None = None
+    """Error that `jumper finetune` reduces; None: these policies cannot be fine-tuned."""
+
+
+HEIGHT = Evaluation(HeightFlags(), HeightPlayFlags(), heights.with_success_last, "apex")
+PLACE = Evaluation(LandingFlags(), LandingPlayFlags(), landings.with_landing_terminations, "landing")
+EVALUATIONS: dict[str, Evaluation] = {
+    "apex_height": HEIGHT,
+    "landing_position": PLACE,
+    "apex_height_mars": replace(
+        HEIGHT, flags=HeightFlags(lower=1.0, upper=3.3, in_range=(1.0, 2.9)), play=HeightPlayFlags((1.5, 2.3, 3.0), 6.0)
+    ),
+    "landing_position_mars": replace(
+        PLACE, flags=LandingFlags(x=(0.5, 4.2), in_range=(0.5, 3.9)),
+        play=LandingPlayFlags(default_goals=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))),
+    ),
+    "omnidirectional": replace(
+        PLACE, flags=LandingFlags(x=(-0.7, 0.7), y=(-0.7, 0.7), in_range=(0.0, 0.7)), finetune_target=None,
+        play=LandingPlayFlags(default_goals=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
+    ),
+    "velocity": Evaluation(VelocityFlags(), VelocityPlayFlags(), TaskCfg.on_level_ground),
+    "attitude": Evaluation(AttitudeFlags(), AttitudePlayFlags()),
+    "episode": Evaluation(EpisodeFlags(), EpisodePlayFlags()),
+}  # fmt: skip
+"""Evaluations by key; a user's module may add its own."""
+
+
+def evaluation_of(task: TaskCfg) -> Evaluation:
+    """Return the evaluation of a task. Raises PolicyError: its key is unknown."""
+    if task.evaluation_suite not in EVALUATIONS:
+        known = f"there are {[*EVALUATIONS]}"
+        raise PolicyError(f"{task.name} asks for the evaluation {task.evaluation_suite!r:.60}; {known}")
+    return EVALUATIONS[task.evaluation_suite]

@@ -1,0 +1,130 @@
+"""Errors of many jumps at once (apex height or landing position), and their derivatives by the policy's weights.
+
+Whole jumps are simulated with physics, motors, latency, command filter and network, as in an evaluation. Derivatives
+reach from the apex back to the command; contact after the apex is left out. The value of a landing error is where the
+robot comes to rest, its derivative that of the landing point of the ballistic flight from the apex.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import numpy as np
+import torch
+
+from jumper_warp.diff.closed_loop import ClosedLoop, LoopState
+from jumper_warp.envs.env import Env
+from jumper_warp.evaluation.jumps import LANDED, REST_TIME
+from jumper_warp.trajectory.gauss_newton import Network, Tape, world_rows
+
+LANDING_HEIGHT = 0.30  # [m] Base height at which the ballistic flight lands
+LATEST = 2.5  # [s] Time after the last command at which all jumps are past their apex
+HUBER = 0.02  # [m] Threshold of the Huber weight: larger errors, of jumps that a weak robot cannot make, count less
+
+
+class JumpErrors(NamedTuple):
+    """Errors of one group of n jumps; m = n for apex heights, m = 2n for landing positions (all x, then all y)."""
+
+    value: torch.Tensor  # (m,) [m] Errors, 0 where not valid
+    jacobian: torch.Tensor  # (m, weights) [m] Derivatives by the network's weights; empty if not requested
+    valid: torch.Tensor  # (m,) Whether the jump took off and its error is finite
+
+
+@dataclass
+class JumpGroup:
+    """Jumps of one environment with fixed commands."""
+
+    name: str
+    env: Env
+    std: float  # [m] Standard deviation that weights the errors
+    commands: np.ndarray  # (n, 4) Commands of `jump_commands`
+    to_height: bool  # Whether the error is that of the apex height, else of the landing position
+    loop: ClosedLoop = field(init=False)
+
+    def __post_init__(self) -> None:
+        """Save the environment's state, so that every run samples the same robots."""
+        self._initial_state = self.env.state_dict()
+        self.loop = ClosedLoop(self.env)
+
+    def begin(self) -> None:
+        """Reset all robots to the initial state and set their commands."""
+        self.env.load_state_dict(self._initial_state)
+        self.env.evaluation_reset(self.commands)
+        self.loop.read_parameters()
+
+    def importance(self, errors: JumpErrors) -> torch.Tensor:
+        """Return the weights of the errors in the cost, (m,): Huber weight over `std` squared and number of errors."""
+        huber = (HUBER / errors.value.abs().clamp(min=1.0e-9)).clamp(max=1.0)
+        return torch.where(errors.valid, huber, 0.0) / (self.std**2 * len(errors.value))
+
+
+def apex_heights(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np.ndarray]) -> list[torch.Tensor]:
+    """Return the base heights at the apex [m] as a list of one tensor (n,); arrays: the last of `env.task_arrays`."""
+    heights = torch.stack([state.q[2] for state in states])
+    reached = torch.as_tensor(arrays["max_height"], dtype=heights.dtype, device=heights.device)
+    row = (heights.detach() - reached).abs().argmin(0, keepdim=True)
+    return [heights.gather(0, row)[0]]
+
+
+def ballistic_landing(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np.ndarray]) -> list[torch.Tensor]:
+    """Return x and y [m], (n,) each, of the landing point of the ballistic flight from the apex."""
+    reached = torch.as_tensor(arrays["max_height"], device=states[0].q.device)
+    row = (torch.stack([state.q[2].detach() for state in states]) - reached).abs().argmin(0)
+    motions = [loop.motion(state) for state in states]
+    pos, vel = (torch.stack([getattr(motion, name) for motion in motions]) for name in ("pos", "lin_vel"))
+    worlds = torch.arange(len(row), device=row.device)
+    pos, vel = pos[row, worlds], vel[row, worlds]
+    g = loop.task.gravity
+    fall = (vel[:, 2] + (vel[:, 2].square() + 2.0 * g * (pos[:, 2] - LANDING_HEIGHT).clamp(min=0.0)).sqrt()) / g
+    return [pos[:, i] + fall * vel[:, i] for i in range(2)]
+
+
+def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> JumpErrors:
+    """Run the jumps of a group with a network as policy, and return their errors; derivatives: also the Jacobian."""
+    env, loop, to_height = group.env, group.loop, group.to_height
+    group.begin()
+    begin, last = int(group.commands[:, 3].min()), int(group.commands[:, 3].max()) + round(LATEST / env.step_dt)
+    with torch.no_grad():
+        for _ in range(begin):
+            env.step(network.act(env.obs))
+    state, states, tape = loop.state(), [], Tape()
+    arrays: dict[str, np.ndarray] = {}
+    for _ in range(begin, last):
+        if derivatives:
+            state, _ = loop.step(state, network.act(loop.seen(state), tape=tape))
+        else:
+            env.step(network.act(env.obs))
+            state = loop.state()
+        states.append(state)
+        arrays = env.task_arrays()
+        if (arrays["apex_passed"] > 0)[arrays["phase"] > 0].all() and (arrays["phase"] > 0).all():
+            break
+    valid = torch.as_tensor(arrays["phase"] > 0, device=env.device)
+    if to_height:
+        errors = [arrays["max_height"] - group.commands[:, 2]]
+    else:
+        errors = _landing_errors(env, network)
+    value = torch.as_tensor(np.concatenate(errors), dtype=loop.dtype, device=env.device)
+    valid = valid.repeat(len(errors)) & value.isfinite()
+    jacobian = value.new_zeros(0)
+    if derivatives:
+        outcomes = (apex_heights if to_height else ballistic_landing)(loop, states, arrays)
+        jacobian = torch.cat([world_rows(outcome.sum(), tape) for outcome in outcomes]).nan_to_num(0.0, 0.0, 0.0)
+    return JumpErrors(torch.where(valid, value, 0.0), jacobian, valid)
+
+
+def _landing_errors(env: Env, network: Network) -> list[np.ndarray]:
+    """Continue until a second after touchdown, and return the distances to the goals [m], x and y, (n,) each.
+
+    On Mars the fall before it takes up to 1.4 s.
+    """
+    rest = round(REST_TIME / env.step_dt)
+    with torch.no_grad():
+        for _ in range(3 * rest):
+            arrays = env.task_arrays()
+            if ((arrays["phase"] == LANDED) & (arrays["phase_steps"] >= rest)).all():
+                break
+            env.step(network.act(env.obs))
+    arrays = env.task_arrays()
+    return [arrays["base_pos"][:, i] - arrays["goal"][:, i] for i in range(2)]

@@ -1,0 +1,275 @@
+"""Jumps to landing positions: log, metrics, and flags of `jumper evaluate` and `play`.
+
+The error of a jump is the horizontal distance between base and goal a second after touchdown, or where the jump failed
+before. Second hops and steps after touchdown are reported separately.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+import tyro
+
+from jumper_warp.evaluation.film import PICTURE_SIZE, Film, Filmstrip, keyframes, side_view
+from jumper_warp.evaluation.heights import MAX_ROBOTS
+from jumper_warp.evaluation.jumps import REST_SPEED, REST_TIME, TAKEOFF_SPEED, JumpFlags, JumpLog, stance_metrics
+from jumper_warp.evaluation.log import (
+    COLLIDED,
+    DIVERGED,
+    SUCCESS,
+    Metrics,
+    failed_by,
+    finite,
+    mean,
+    mean_and_max,
+    termination_names,
+    with_terminations,
+    within,
+)
+from jumper_warp.kernels.jump import terminations
+from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.terms import TerminationTerm
+from jumper_warp.utils.errors import InputError
+
+Position2D = tuple[float, float]
+SUCCESS_TOLERANCE = 0.1
+"""[m] Largest error of a successful jump."""
+LANDING_TERMINATIONS = (DIVERGED, "low_base", COLLIDED, "no_jump", SUCCESS)
+"""Terminations that end a jump of an evaluation, in order of precedence: success last, so that it hides no fall. The
+other terminations of a task only shape the training."""
+FALLS = (DIVERGED, "low_base", COLLIDED)
+MISSED = "missed"
+"""Outcome of a jump that landed, but beyond SUCCESS_TOLERANCE."""
+EARLY = "early"
+"""Outcome of a landed jump that began before its command."""
+AT_REST_AT_END = "below_0_1_m_s_at_the_end_rate"
+"""Metric: share of landed jumps whose base was at rest (`REST_SPEED`) when the jump was over."""
+JUMP_SECONDS, NEXT_JUMP_SECONDS = 3.5, 2.5
+"""[s] Length of a recording of one jump, and addition for each further jump."""
+SHOWN_DISTANCE = 1.0
+"""[m] The filmstrip shows the jump whose goal is nearest to this distance."""
+
+
+def with_landing_terminations(task: TaskCfg) -> TaskCfg:
+    """Return the task with the terminations of an evaluation, LANDING_TERMINATIONS."""
+    return with_terminations(task, LANDING_TERMINATIONS)
+
+
+def with_second_takeoff(task: TaskCfg) -> TaskCfg:
+    """Return the task with LANDING_TERMINATIONS, then a second takeoff, as in the authors' configuration."""
+    task = with_landing_terminations(task)
+    takeoff = TerminationTerm(terminations.second_takeoff, speed=TAKEOFF_SPEED)
+    return replace(task, terminations=(*task.terminations[:-1], takeoff, task.terminations[-1]))
+
+
+class LandingLog(JumpLog):
+    """Log of jumps to landing positions; success: begun on command and landed within SUCCESS_TOLERANCE."""
+
+    spacing = 3.0
+
+    @property
+    def goal_positions(self) -> np.ndarray:
+        """[m] (..., 2) Goals ahead and to the left of where the jump starts."""
+        return self.goals[..., :2]
+
+    @property
+    def seconds(self) -> float:
+        """[s] Maximum simulated time: each jump waits, squats and flies for at most 3.5 s."""
+        return 1.0 + self.goals.shape[1] * (3.5 + self.rest) + float(np.max(self.delay))
+
+    @property
+    def offset(self) -> np.ndarray:
+        """[m] (..., 2) Signed error at the end, goal to base, ahead and to the left of the jump's heading."""
+        x, y = np.moveaxis(self.end_position - self.goal_world, -1, 0)
+        cos, sin = np.cos(-self.heading), np.sin(-self.heading)
+        return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
+
+    @property
+    def landing(self) -> np.ndarray:
+        """[m] (..., 2) Base position at the end, in the frame of `goal_positions`."""
+        return self.goal_positions + self.offset
+
+    @property
+    def error(self) -> np.ndarray:
+        """[m] Horizontal distance of the base from the goal at the end; NaN where the simulation diverged."""
+        invalid = self.diverged | ~np.isfinite(self.end_position).all(axis=-1)
+        return np.where(invalid, np.nan, self.goal_distance(self.end_position))
+
+    def goal_distance(self, position: np.ndarray) -> np.ndarray:
+        """Return the distances [m] of positions (num_envs, jumps in a row, 2), world frame, from the goals."""
+        return np.linalg.norm(position - self.goal_world, axis=-1)
+
+    @property
+    def success(self) -> np.ndarray:
+        """Whether the jump began on command and landed within SUCCESS_TOLERANCE of its goal."""
+        return self.landed & (np.nan_to_num(self.error, nan=np.inf) <= SUCCESS_TOLERANCE) & ~self.early
+
+    @property
+    def outcomes(self) -> np.ndarray:
+        """Outcome of each jump: SUCCESS, MISSED or EARLY if landed without success, else what ended it."""
+        missed = np.where(self.landed & ~self.success, np.where(self.early, EARLY, MISSED), self.ends)
+        return np.where(self.success, SUCCESS, missed)
+
+    def columns(self) -> dict[str, list]:
+        """Return goals, headings, landing positions, errors and outcomes, one value per jump, world after world."""
+        numbers = {f"goal_{axis}_m": self.goal_positions[..., i] for i, axis in enumerate("xy")}
+        numbers |= {"heading_deg": np.degrees(self.heading)}
+        numbers |= {f"landing_{axis}_m": self.landing[..., i] for i, axis in enumerate("xy")}
+        numbers |= {"error_m": self.error}
+        ends = {"end": self.outcomes.ravel().tolist()}
+        return {name: finite(values.ravel()) for name, values in numbers.items()} | ends
+
+    def series(self, worlds: Sequence[int]) -> dict[str, float]:
+        """Return the base's height and its distance from the current goal [m] of some worlds."""
+        distance = np.linalg.norm((self.arrays["base_pos"] - self.arrays["goal"])[:, :2], axis=1)
+        return super().series(worlds) | {f"distance/goal of {world} [m]": distance[world] for world in worlds}
+
+    def goal_markers(self, worlds: Sequence[int]) -> np.ndarray:
+        """Return the commanded goals [m], world frame, (worlds, jumps in a row, 3), z = 0."""
+        target = self.goal_world[list(worlds)]
+        return np.concatenate([target, np.zeros_like(target[..., :1])], axis=-1)
+
+    def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
+        """Return the goals [m] of some worlds."""
+        return {"goals_m": self.goal_positions[list(worlds)].tolist()}
+
+    def filmstrip(self, film: Film) -> Filmstrip:
+        """Return a filmstrip of the world whose first goal is nearest to SHOWN_DISTANCE."""
+        distance = np.linalg.norm(self.goal_positions[film.worlds, 0], axis=1)
+        index = int(np.argmin(np.abs(distance - SHOWN_DISTANCE)))
+        base = film.base_positions(index)
+        if self.goal_positions.shape[1] == 1:
+            delay = np.broadcast_to(self.delay, film.env.num_envs)[film.worlds[index]]
+            frames = keyframes(base[:, 2], round(delay / film.env.step_dt) - 1)
+        else:
+            frames = np.linspace(0, len(base) - 1, 9).round().astype(int).tolist()
+        end_positions = self.end_position[film.worlds[index]]
+        eye, target = side_view(base[0, :2], end_positions[np.isfinite(end_positions[:, 0])][-1])
+        captions = [f"{(frame + 1) * film.env.step_dt:.2f} s" for frame in frames]
+        return Filmstrip(index, frames, captions, eye, target, PICTURE_SIZE)
+
+
+def landing_metrics(landings: LandingLog, inside: np.ndarray | None = None) -> Metrics:
+    """Return the metrics of all commanded jumps of a log.
+
+    Errors include failed jumps, but not those whose simulation diverged, which `came_apart` counts. `ahead` and `left`
+    are signed. Tilts, turns, hops and steps are over landed jumps, `still_landing_rate` over all jumps and
+    `second_takeoff_rate` over those that touched down. `fall_rate` and `miss_rate` count disjoint jumps: a miss has
+    landed on its paws, but away from its goal.
+
+    inside: mask of the jumps that the `in_range` metrics count, shaped like `landings.end`; None: no such metrics.
+    """
+    begun, error, success, landed = landings.begun, landings.error, landings.success, landings.landed
+    offset = np.where(np.isnan(error)[..., None], np.nan, landings.offset)
+    at_rest = "at_rest_within_1_s_rate" if landings.rest == REST_TIME else AT_REST_AT_END
+    metrics: Metrics = {
+        "jumps": int(begun.sum()),
+        **mean_and_max("error_m", error),
+        **mean_and_max("error_of_successes_m", error[success]),
+        "mean_error_ahead_m": mean(offset[..., 0]),
+        "mean_error_left_m": mean(offset[..., 1]),
+        "success_rate": mean(success[begun]),
+        "single_jump_success_rate": mean((success & ~landings.hopped)[begun]),
+        "step_free_success_rate": mean((success & ~landings.stepped)[begun]),
+        "landing_rate": mean(landed[begun]),
+        "second_hop_rate": mean(landings.hopped[landed]),
+        "step_rate": mean(landings.stepped[landed]),
+        "mean_error_at_touchdown_m": mean(landings.goal_distance(landings.touchdown)[landed]),
+        "mean_error_0_3_s_after_touchdown_m": mean(landings.goal_distance(landings.position_soon)[landed]),
+        **stance_metrics(landings),
+        "second_takeoff_rate": mean((landings.takeoffs > 0)[np.isfinite(landings.touchdown).all(axis=-1)]),
+        at_rest: mean((landings.rest_speed < REST_SPEED)[landed]),
+        "mean_landing_tilt_deg": mean(np.degrees(landings.tilt[landed])),
+        "fall_rate": mean(np.isin(landings.ends, FALLS)[begun]),
+        "miss_rate": mean((landings.outcomes == MISSED)[begun]),
+        "early_rate": mean(landings.early[begun]),
+        DIVERGED: int(landings.diverged.sum()),
+    }
+    if inside is not None:
+        inside = begun & inside
+        metrics |= {
+            "mean_error_in_range_m": mean(error[inside]),
+            "success_rate_in_range": mean(success[inside]),
+            "still_landing_rate_in_range": mean(landings.still[inside]),
+        }
+    return metrics | failed_by(landings.outcomes[begun & ~success])
+
+
+def trained_range(task: TaskCfg) -> dict[str, float]:
+    """Return the range of goal distances straight ahead [m] over all levels of a task's training."""
+    lower, upper = zip(*((level.goal_lower[0], level.goal_upper[0]) for level in task.levels), strict=True)
+    return {"trained_lower_m": max(min(lower), 0.0), "trained_upper_m": max(upper)}
+
+
+def random_headings(count: int, seed: int) -> np.ndarray:
+    """Return random headings [rad] over the full circle, (count,)."""
+    return np.random.default_rng(seed).uniform(-math.pi, math.pi, count)
+
+
+@dataclass(frozen=True)
+class LandingFlags(JumpFlags):
+    """Jumps to places from standing still."""
+
+    x: tuple[float, float] = (0.3, 1.5)
+    """[m] Goals ahead, evenly spaced between these."""
+    y: tuple[float, float] = (0.0, 0.0)
+    """[m] Goals to the left, drawn between these."""
+    heading: Literal["any"] | float = "any"
+    """[deg] Heading of all robots, or any: drawn from the full circle."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in ("x", "y"):
+            low, high = getattr(self, name)
+            if not -10.0 < low <= high < 10.0:
+                raise InputError(f"{name} must be in (-10, 10) m and rise, got {low}, {high}")
+        if self.heading != "any" and not math.isfinite(self.heading):
+            raise InputError(f"heading must be finite or any, got {self.heading}")
+
+    def log(self, task: TaskCfg, seed: int) -> LandingLog:
+        """Return the log of single jumps with these goals and headings, one per world."""
+        rng = np.random.default_rng(seed)
+        goals = np.stack([np.linspace(*self.x, self.jumps), rng.uniform(*self.y, self.jumps)], axis=1)
+        headings = random_headings(self.jumps, seed) if self.heading == "any" else math.radians(self.heading)
+        return LandingLog(goals[:, None], termination_names(task), headings)
+
+    def metrics(self, log: LandingLog) -> Metrics:
+        """Return `landing_metrics` and the range of its `in_range` metrics."""
+        inside = within(np.linalg.norm(log.goal_positions, axis=-1), self.in_range)
+        return landing_metrics(log, inside) | {"range_lower_m": self.in_range[0], "range_upper_m": self.in_range[1]}
+
+
+@dataclass(frozen=True)
+class LandingPlayFlags:
+    """Jumps to places that are recorded."""
+
+    goal: tyro.conf.UseAppendAction[tuple[Position2D, ...]] = ()
+    """[m] Where to land, ahead and to the left; once for each robot (default: three robots, each to another place)."""
+    then: tyro.conf.UseAppendAction[tuple[Position2D, ...]] = ()
+    """[m] Where all robots jump next, a second after touchdown, from where they are by then; once for each jump."""
+    default_goals: tyro.conf.Suppress[tuple[Position2D, ...]] = ((0.5, 0.0), (0.9, 0.0), (1.3, 0.0))
+    """[m] Goals if there are none; flags that are given several times would be added to a default."""
+
+    def __post_init__(self) -> None:
+        for name in ("goal", "then"):
+            places = getattr(self, name)
+            if len(places) > MAX_ROBOTS or not all(-10.0 < value < 10.0 for place in places for value in place):
+                raise InputError(f"{name} takes up to {MAX_ROBOTS} places in (-10, 10) m, got {places}")
+
+    @property
+    def goals(self) -> tuple[Position2D, ...]:
+        """[m] First goals, one per robot."""
+        return self.goal or self.default_goals
+
+    @property
+    def length(self) -> float:
+        """[s] Length of the recording."""
+        return JUMP_SECONDS + NEXT_JUMP_SECONDS * len(self.then)
+
+    def log(self, task: TaskCfg) -> LandingLog:
+        """Return the log of the jumps, one sequence per robot."""
+        return LandingLog(np.array([[goal, *self.then] for goal in self.goals]), termination_names(task))

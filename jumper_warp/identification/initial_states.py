@@ -1,0 +1,241 @@
+"""Initial states of motions: the prior that the first rows give, and the stance of a robot whose paws rest."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from jumper_warp.identification.motions import DEGREES, NoiseLevels, RecordedMotion
+from jumper_warp.robot.description import LEGS, RobotDescription, leg_dimensions
+from jumper_warp.robot.values import RobotValues
+from jumper_warp.utils.rotations import CONJUGATE, from_vector, multiply, rotate
+
+HANGING_HEIGHT = 1.0
+"""[m] Height of a held base whose position is not measured."""
+STEP = 1.0e-6
+"""[rad] Step of the differences of paw positions."""
+NORMAL_WEIGHT = 1.0e3
+"""[1] Weight of the paws' velocities off the ground against those along it."""
+LEVELLING_STEPS = 6
+"""Newton steps after which all paws lie in one plane to rounding."""
+FIRST_ROWS = 8
+"""Rows from which a motion's initial state is measured."""
+QUIET_ROWS = 2
+QUIET = 0.2
+"""[rad/s] Mean rate over the first `QUIET_ROWS` below which a standing robot has all paws on the ground."""
+TRUST = 3.0
+"""Standard deviations of the noise by which an initial state may differ from its measurement, so that the measurement
+hardly counts twice."""
+
+
+@dataclass
+class InitialStates:
+    """States at the first row of a motion, N worlds."""
+
+    position: np.ndarray
+    """(N, 3) [m] Of the base's origin, world frame."""
+    quaternion: np.ndarray
+    """(N, 4) xyzw, base to world."""
+    velocity: np.ndarray
+    """(N, 3) [m/s] Of the base's origin, world frame."""
+    spin: np.ndarray
+    """(N, 3) [rad/s] World frame."""
+    angle: np.ndarray
+    """(N, 12) [rad] True motor angles."""
+    rate: np.ndarray
+    """(N, 12) [rad/s]"""
+
+
+class InitialStatePrior:
+    """Prior of a motion's initial state, from its first rows; the state has I normalised coordinates.
+
+    Coordinates are deviations from the measured state, in prior standard deviations: readings and rates of 12 motors,
+    the base's rotation vector, and for a free base its position, velocity and spin (world frame).
+    """
+
+    def __init__(self, motion: RecordedMotion, noise: NoiseLevels, description: RobotDescription):
+        """Estimate the state of the first row, and its standard deviations, from the first rows and the stance."""
+        self.free, self.description = motion.base == "free", description
+        self.size = 36 if self.free else 27
+        """I, the number of coordinates."""
+        rows = min(FIRST_ROWS, len(motion.time))
+        angle_noise, rate_noise = DEGREES * noise.angle, DEGREES * noise.rate
+        angle, angle_std = first_values(motion.angle, motion.target[0], TRUST * angle_noise, 10.0 * DEGREES)
+        rate, rate_std = first_values(motion.rate, np.zeros(12), TRUST * rate_noise, 1.0)
+        if motion.rate is None and motion.angle is not None:
+            rate, rate_std = slope(motion.time[:rows], motion.angle[:rows]), np.full(12, 1.0)
+        level, position = np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, HANGING_HEIGHT])
+        quaternion, _ = first_values(motion.quaternion, level, 0.0, 0.0)
+        quaternion = quaternion / np.linalg.norm(quaternion)
+        tilt_std = np.full(3, math.radians(2.0 if motion.quaternion is not None else 5.0))
+        velocity, base_std = np.zeros(3), []
+        self.standing = self.resting = False
+        if self.free:
+            ground = stance(description, angle[None], rate[None])
+            position[2] = ground.height[0]
+            position, position_std = first_values(motion.position, position, 0.02, 0.05)
+            up = rotate(quaternion * CONJUGATE, np.array([0.0, 0.0, 1.0]))
+            height_fits = abs(position[2] - ground.height[0]) < 0.03
+            near = height_fits and float(up @ ground.up[0]) > math.cos(math.radians(6.0))
+            self.standing = near and ground.gap[0] < 0.02
+            if motion.position is not None:
+                velocity = slope(motion.time[:rows], motion.position[:rows])
+            base_std = [position_std, np.full(3, 0.3), np.full(3, 1.0)]
+            if self.standing:  # contact constrains the base better than its sensors do
+                tilt_std = np.array([0.2 * DEGREES, 0.2 * DEGREES, tilt_std[2]])
+                base_std = [np.array([0.02, 0.02, 0.001]), np.full(3, 0.05), np.full(3, 0.3)]
+                self.resting = quiet(motion.rate)
+                self._levelling = levelling(description, angle)
+        mean = (position, quaternion, velocity, np.zeros(3), angle, rate)
+        self._mean = InitialStates(*(values[None] for values in mean))
+        self._std = np.concatenate([angle_std, rate_std, tilt_std, *base_std])
+
+    def states(self, z: np.ndarray, robots: RobotValues) -> InitialStates:
+        """Return the states of normalised coordinates (N, I); true angles are readings less the robots' offsets.
+
+        A standing robot has all paws on the ground, before the coordinates of its base are added.
+        """
+        mean, deviation = self._mean, z * self._std
+        state = InitialStates(*(np.repeat(getattr(mean, name), len(z), axis=0) for name in vars(mean)))
+        state.angle = state.angle + deviation[:, :12] - robots.offset
+        state.rate = state.rate + deviation[:, 12:24]
+        if self.resting:
+            state.angle, state.rate = levelled(self.description, state.angle, state.rate, self._levelling)
+        if self.standing:
+            ground = stance(self.description, state.angle, state.rate)
+            up = rotate(state.quaternion, ground.up)  # rotated to the vertical, about a level axis
+            half = np.stack([up[:, 1], -up[:, 0], np.zeros(len(z)), 1.0 + up[:, 2]], axis=1)
+            state.quaternion = multiply(half / np.linalg.norm(half, axis=1, keepdims=True), state.quaternion)
+            state.position[:, 2] = ground.height
+            state.velocity, state.spin = (rotate(state.quaternion, v) for v in (ground.velocity, ground.spin))
+        state.quaternion = multiply(from_vector(deviation[:, 24:27]), state.quaternion)
+        if self.free:
+            state.position = state.position + deviation[:, 27:30]
+            state.velocity = state.velocity + deviation[:, 30:33]
+            state.spin = state.spin + deviation[:, 33:36]
+        return state
+
+
+def quiet(rate: np.ndarray | None) -> bool:
+    """Return whether the joints hardly move in the first rows of measured rates (n, 12) [rad/s]."""
+    if rate is None or np.isnan(rate[:QUIET_ROWS]).all(axis=0).any():
+        return False
+    return bool((np.abs(np.nanmean(rate[:QUIET_ROWS], axis=0)) < QUIET).all())
+
+
+def first_values(
+    values: np.ndarray | None, default: np.ndarray, measured_std: float, default_std: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the first measured value of each column, else its default, and their standard deviations, (columns,)."""
+    if values is None:
+        return default.copy(), np.full(len(default), default_std)
+    first = default.copy()
+    measured = np.isfinite(values[:FIRST_ROWS]).any(axis=0)
+    for i in np.flatnonzero(measured):
+        column = values[:FIRST_ROWS, i]
+        first[i] = column[np.isfinite(column)][0]
+    return first, np.where(measured, measured_std, default_std)
+
+
+def slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the slope of each column by least squares, 0 where fewer than three values are measured."""
+    slopes = np.zeros(values.shape[1])
+    for i in range(values.shape[1]):
+        measured = np.isfinite(values[:, i])
+        if measured.sum() >= 3:
+            slopes[i] = np.polyfit(time[measured] - time[0], values[measured, i], 1)[0]
+    return slopes
+
+
+class Stance(NamedTuple):
+    """Pose and velocity of a base over four resting paws, N robots."""
+
+    height: np.ndarray
+    """(N,) [m] Of the base's origin."""
+    up: np.ndarray
+    """(N, 3) World z in the base frame."""
+    gap: np.ndarray
+    """(N,) [m] Largest distance of a paw from the plane that fits the four best."""
+    velocity: np.ndarray
+    """(N, 3) [m/s] Of the base's origin, base frame, that lets the paws rest."""
+    spin: np.ndarray
+    """(N, 3) [rad/s] Likewise."""
+
+
+def paw_positions(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
+    """Return the centres of the paws [m], base frame, (N, 4, 3), at motor angles (N, 12) [rad].
+
+    Angles at which a loop cannot close are moved to the nearest at which it can.
+    """
+    paws = np.zeros((len(angle), 4, 3))
+    for k, name in enumerate(LEGS):
+        leg = leg_dimensions(description, name)
+        lateral, outer, inner = angle[:, 3 * k], angle[:, 3 * k + 1], angle[:, 3 * k + 2]
+        outer_x, outer_z = leg.outer_x + leg.front * leg.thigh * np.sin(outer), -leg.thigh * np.cos(outer)
+        inner_x, inner_z = leg.inner_x - leg.front * leg.thigh * np.sin(inner), -leg.thigh * np.cos(inner)
+        across, up = outer_x - inner_x, outer_z - inner_z
+        distance = np.maximum(np.hypot(across, up), 1.0e-6)
+        rise = np.sqrt(np.maximum(leg.shank**2 - 0.25 * distance**2, 1.0e-9)) / distance
+        x = 0.5 * (outer_x + inner_x) + leg.front * rise * up
+        z = 0.5 * (outer_z + inner_z) - leg.front * rise * across
+        y = leg.plane_y + leg.knee_y
+        sine, cosine = leg.side * np.sin(lateral), np.cos(lateral)
+        paws[:, k] = np.array(leg.hip) + np.stack([x, cosine * y - sine * z, sine * y + cosine * z], axis=1)
+    return paws
+
+
+def stance(description: RobotDescription, angle: np.ndarray, rate: np.ndarray) -> Stance:
+    """Return the base over paws at rest on level ground, at motor angles [rad] and rates [rad/s], (N, 12)."""
+    paws = paw_positions(description, angle)
+    ahead, behind = (paw_positions(description, angle + sign * STEP * rate) for sign in (1.0, -1.0))
+    paw_velocity = (ahead - behind) / (2 * STEP)
+    radius = leg_dimensions(description, LEGS[0]).paw_radius
+    design = np.concatenate([paws[..., :2], np.ones((*paws.shape[:2], 1))], axis=2)
+    plane = np.linalg.solve(np.swapaxes(design, 1, 2) @ design, np.swapaxes(design, 1, 2) @ paws[..., 2:])[..., 0]
+    size = np.sqrt(1.0 + plane[:, 0] ** 2 + plane[:, 1] ** 2)
+    up = np.stack([-plane[:, 0], -plane[:, 1], np.ones(len(plane))], axis=1) / size[:, None]
+    distance = np.einsum("nki,ni->nk", paws, up) - (plane[:, 2] / size)[:, None]
+    points = paws - radius * up[:, None]
+    cross = np.zeros((*paws.shape[:2], 3, 6))
+    cross[..., :3] = np.eye(3)
+    # v + spin x p: columns of the spin are axis x p
+    for i in range(3):
+        cross[..., 3 + i] = np.cross(np.eye(3)[i], points)
+    # the velocity off the ground counts most
+    frame = np.eye(3) + NORMAL_WEIGHT * up[:, :, None] * up[:, None]
+    cross, paw_velocity = frame[:, None] @ cross, np.einsum("nij,nkj->nki", frame, paw_velocity)
+    rows, target = cross.reshape(len(paws), 12, 6), -paw_velocity.reshape(len(paws), 12, 1)
+    twist = np.linalg.solve(np.swapaxes(rows, 1, 2) @ rows, np.swapaxes(rows, 1, 2) @ target)[..., 0]
+    return Stance(radius - plane[:, 2] / size, up, np.abs(distance).max(axis=1), twist[:, :3], twist[:, 3:])
+
+
+def unevenness(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
+    """Return the distance of the fourth paw from the plane of the others [m], (N,), at motor angles (N, 12) [rad]."""
+    paws = paw_positions(description, angle)
+    across, along, other = (paws[:, k] - paws[:, 0] for k in (1, 2, 3))
+    normal = np.cross(across, along)
+    return np.einsum("ni,ni->n", other, normal) / np.linalg.norm(normal, axis=1)
+
+
+def levelling(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
+    """Return the smallest change of motor angles per unevenness, (12,) [rad/m], at angles (12,) [rad]."""
+    ahead, behind = (unevenness(description, angle + sign * STEP * np.eye(12)) for sign in (1.0, -1.0))
+    slope = (ahead - behind) / (2.0 * STEP)
+    return slope / (slope @ slope)
+
+
+def levelled(
+    description: RobotDescription, angle: np.ndarray, rate: np.ndarray, change: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return motor angles [rad] and rates [rad/s], (N, 12), at which all paws lie and stay in one plane.
+
+    change: direction along which angles and rates are corrected, (12,) [rad/m], see `levelling`.
+    """
+    for _ in range(LEVELLING_STEPS):
+        angle = angle - unevenness(description, angle)[:, None] * change
+    ahead, behind = (unevenness(description, angle + sign * STEP * rate) for sign in (1.0, -1.0))
+    slope = (unevenness(description, angle + STEP * change) - unevenness(description, angle - STEP * change)) / 2.0
+    return angle, rate - (0.5 * (ahead - behind) / slope)[:, None] * change

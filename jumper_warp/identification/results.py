@@ -1,0 +1,222 @@
+"""Result of an identification: values, intervals, and the fit of each motion and channel."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+
+from jumper_warp.identification.least_squares import LeastSquares, NormalEquations, Point
+from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement
+from jumper_warp.identification.residuals import MotionResiduals
+from jumper_warp.identification.uncertainty import Direction, mismatch_factor, systematic_std, weak_directions
+from jumper_warp.robot.values import RobotValues
+
+CONFIDENCE = 1.959964
+"""Standard deviations on either side of a 95 % interval."""
+LARGEST_CHI2 = 10.0
+"""χ² above which the values cannot be trusted; other physics, where base and units are right, give 3 to 5."""
+LARGEST_PRIOR_ERROR = 3.0
+"""Standard deviations between a prior measurement and the identified robot above which one of both is wrong."""
+
+
+@dataclass(frozen=True)
+class DescentStep:
+    """Log entry of one step of the optimisation."""
+
+    stage: int
+    """Counts from 1; 0: CMA-ES."""
+    chi2: float
+    """[1] Cost over the number of measured values."""
+    damping: float
+    """[1] Infinite if the point stayed."""
+    world_steps: int
+    """Physics steps of all worlds so far."""
+    seconds: float
+    """[s] Wall time so far."""
+
+
+class Effort(NamedTuple):
+    """Cost of an optimisation."""
+
+    seconds: float
+    """[s] Wall time."""
+    cpu_seconds: float
+    """[s] CPU time."""
+    world_steps: int
+    """Physics steps of all worlds."""
+
+
+@dataclass(frozen=True)
+class Fit:
+    """Fit of one channel of one motion."""
+
+    motion: str
+    channel: str
+    chi2: float
+    """[1] Mean squared weighed residual."""
+    nominal_chi2: float
+    """[1] The same of the described robot at the nominal initial state."""
+    rms: float
+    """Root mean square error [SI unit of the channel]."""
+
+
+@dataclass(frozen=True)
+class Identification:
+    """Result of an identification: an estimate, its uncertainty and its fit."""
+
+    parameters: ParameterSet
+    z: np.ndarray
+    """(P,) Parameters, normalised."""
+    covariance: np.ndarray
+    """(P, P) Normalised, from noise and priors alone."""
+    mismatch: float
+    """[1] Smallest factor by which the model's errors widen all intervals; 1 if the model fits."""
+    systematic: np.ndarray
+    """(P,) Standard deviations, normalised, from contradictions between channels and motions; 0 if the model fits."""
+    chi2: float
+    """[1] Mean squared weighed residual of the data."""
+    nominal_chi2: float
+    """[1] The same of the described robot at the nominal initial states."""
+    count: int
+    """Number of measured values."""
+    fits: tuple[Fit, ...]
+    """By motion and channel."""
+    directions: tuple[Direction, ...]
+    """Combinations of parameters that the data leaves open."""
+    steps: tuple[DescentStep, ...]
+    dt: float
+    """[s] Physics step."""
+    effort: Effort
+    prior_measurements: tuple[PriorMeasurement, ...]
+    """Measurements of the robot besides the motions."""
+    motions: tuple[MotionResiduals, ...]
+    starts: tuple[np.ndarray, ...]
+    """(I,) Coordinates of each motion's initial state."""
+
+    @property
+    def values(self) -> np.ndarray:
+        """Values [unit of each parameter], (P,)."""
+        return self.parameters.values(self.z)
+
+    @property
+    def std(self) -> np.ndarray:
+        """Standard deviations relative to the prior's, with the model's errors, at most 1, (P,)."""
+        noise = self.mismatch * np.sqrt(np.diag(self.covariance))
+        return np.minimum(np.hypot(noise, self.systematic), 1.0)
+
+    @property
+    def intervals(self) -> np.ndarray:
+        """95 % intervals [unit of each parameter], within the bounds, (P, 2)."""
+        low, high = self.parameters.bounds()
+        reach = CONFIDENCE * self.std
+        edges = (np.clip(self.z - reach, low, high), np.clip(self.z + reach, low, high))
+        return np.stack([self.parameters.values(edge) for edge in edges], axis=1)
+
+    @property
+    def identified(self) -> np.ndarray:
+        """Whether the standard deviation is below half the prior's, (P,) bool."""
+        return self.std < 0.5
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """One line for each misfit of motions or prior measurements, with its likely cause."""
+        lines = []
+        if not self.chi2 <= LARGEST_CHI2:
+            worst = max(self.fits, key=lambda fit: fit.chi2)
+            base = next(motion.motion.base for motion in self.motions if motion.motion.name == worst.motion)
+            other = {
+                "free": "free on the ground; if the robot hung from a stand: --base fixed",
+                "fixed": "fixed; if the robot was on the ground: --base free",
+            }[base]
+            lines.append(
+                f"χ² {self.chi2:.4g} is far above 1, do not trust what was found: {worst.motion} fits worst "
+                f"({worst.channel} {worst.chi2:.4g}), its base is taken as {other}; else check signs, units, gains and "
+                "torque limit"
+            )
+        for prior in self.prior_measurements:
+            identified = float(prior.measure(self.robots())[0])
+            error = abs(identified - prior.value) / prior.std
+            if error > LARGEST_PRIOR_ERROR:
+                lines.append(
+                    f"{prior.name} is given as {prior.value:.5g} ± {prior.std:.2g} but found as {identified:.5g}, "
+                    f"{error:.1f} deviations apart: check it, intervals do not hold if it is wrong"
+                )
+        return tuple(lines)
+
+    def robots(self, count: int = 1) -> RobotValues:
+        """Return `count` copies of the identified robot."""
+        return self.parameters.robots(np.repeat(self.z[None], count, axis=0))
+
+
+class ChannelError(NamedTuple):
+    """Errors of one channel of one motion."""
+
+    motion: str
+    channel: str
+    cost: float
+    """Sum of squared weighed residuals."""
+    count: int
+    """Number of measured values."""
+    rms: float
+    """Root mean square error [SI unit of the channel]."""
+
+
+def channel_errors(problem: LeastSquares, point: Point) -> list[ChannelError]:
+    """Return the errors of all channels of all motions at a point."""
+    errors = []
+    for motion, start in zip(problem.motions, point.starts, strict=True):
+        table = np.full(motion.valid.shape, math.nan)
+        table[motion.valid] = motion.residuals(problem.replay, point.z[None], start[None])[:, 0]
+        for name, columns in motion.channels:
+            values = table[:, columns][motion.valid[:, columns]]
+            if len(values):
+                rms = math.sqrt(float(np.mean(values**2))) * motion.sigma[columns][0]
+                errors.append(ChannelError(motion.motion.name, name, float(values @ values), len(values), rms))
+    return errors
+
+
+def summarise(
+    problem: LeastSquares,
+    point: Point,
+    normal: NormalEquations,
+    steps: Sequence[DescentStep],
+    effort: Callable[[], Effort],
+) -> Identification:
+    """Return the identification that ended at a point, given the normal equations there; effort: read at the end."""
+    nominal, errors = (channel_errors(problem, at) for at in (problem.nominal_point(), point))
+    fits = [
+        Fit(error.motion, error.channel, error.cost / error.count, old.cost / old.count, error.rms)
+        for error, old in zip(errors, nominal, strict=True)
+    ]
+    information = normal.information()
+    tables = []
+    for motion, residual in zip(problem.motions, problem.residuals(point), strict=True):
+        table = np.full(motion.valid.shape, math.nan)
+        table[motion.valid] = residual
+        tables.append(table)
+    covariance = np.linalg.inv(information + np.eye(len(information)))
+    mismatch = mismatch_factor(tables)
+    columns = [np.nonzero(motion.valid)[1] for motion in problem.motions]
+    systematic = systematic_std(normal, columns, covariance) if mismatch > 1.0 else np.zeros(len(point.z))
+    return Identification(
+        parameters=problem.parameters,
+        z=point.z,
+        covariance=covariance,
+        mismatch=mismatch,
+        systematic=systematic,
+        chi2=sum(error.cost for error in errors) / problem.count,
+        nominal_chi2=sum(error.cost for error in nominal) / problem.count,
+        count=problem.count,
+        fits=tuple(fits),
+        directions=weak_directions(problem.parameters, information),
+        steps=tuple(steps),
+        dt=max(motion.dt for motion in problem.motions),
+        effort=effort(),
+        prior_measurements=tuple(problem.prior_measurements),
+        motions=tuple(problem.motions),
+        starts=tuple(point.starts),
+    )

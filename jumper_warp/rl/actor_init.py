@@ -1,0 +1,139 @@
+"""Initialisation of a training's actor from a policy instead of random weights."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import torch
+
+from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.mirror import Symmetry, Weights, contract_layers, nearest_expanded_layers
+from jumper_warp.rl.networks import VARIANCE_EPS, ActorCritic, linear_layers
+from jumper_warp.utils.errors import InputError
+
+PRIOR_ITERATIONS = 100
+"""The policy's observation statistics weigh as much as the samples of this many iterations. New samples change them
+slowly, so that the actor's input does not jump."""
+
+SYMMETRY_TOLERANCE = 0.05
+"""Largest distance of a layer's weights from the mirror-symmetric form, relative to their norm, that is projected."""
+
+
+class ActorInit(NamedTuple):
+    """Initial weights and observation statistics of an actor."""
+
+    layers: Weights  # weight and bias of each layer
+    mean: torch.Tensor  # (num_obs,) mean of raw observations
+    std: torch.Tensor  # (num_obs,) standard deviation that observations are divided by
+    change: str = ""  # how the policy was made mirror-symmetric, for the log; empty if it was not changed
+
+
+def make_actor_init(
+    layers: Weights, mean: torch.Tensor, std: torch.Tensor, activation: str, cfg: PpoCfg,
+    symmetry: Symmetry | None = None,
+) -> ActorInit:  # fmt: skip
+    """Return the actor initialisation with which a training with settings `cfg` acts as a given policy.
+
+    With `symmetry`, a policy g that is nearly mirror-symmetric is projected to the nearest symmetric one; any other
+    becomes (g(x) + N g(M x)) / 2, in the notation of `jumper_warp.rl.mirror`.
+
+    layers, activation: the policy as a plain network; mean, std: (num_obs,) its observation statistics; symmetry: of a
+    training with symmetry actor.
+
+    Raises InputError: hidden layers or activation differ from the settings, or a standard deviation is below
+    sqrt(VARIANCE_EPS).
+    """
+    if activation != cfg.activation:
+        raise InputError(
+            f"init_policy: the policy has activation {activation}, these settings make {cfg.activation}: "
+            f"give --ppo.activation {activation}"
+        )
+    policy_widths = [len(bias) for _, bias in layers[:-1]]
+    contracted = None if symmetry is None else _contracted_layers(layers, mean, std, symmetry)
+    required = [len(bias) for _, bias in (contracted or layers)[:-1]]
+    if required != list(cfg.hidden):
+        settings_widths = [width if contracted is None else 2 * width for width in cfg.hidden]
+        raise InputError(
+            f"init_policy: the policy has hidden layers {_joined(policy_widths)}, these settings make "
+            f"{_joined(settings_widths)}: give --ppo.hidden {_joined(required, ' ')}"
+        )
+    least = VARIANCE_EPS**0.5
+    if not (std.double().square() > 0.999 * VARIANCE_EPS).all():
+        raise InputError(f"init_policy: the policy divides an observation by {std.min():.3g}, least is {least:.3g}")
+    if contracted is not None and symmetry is not None:
+        return ActorInit(contracted, mean, std, "" if _is_symmetric(layers, symmetry) else "made mirror-symmetric")
+    if symmetry is None:
+        return ActorInit(layers, mean, std)
+    return _averaged(layers, mean, std, symmetry)
+
+
+@torch.no_grad()
+def apply_actor_init(actor_init: ActorInit, model: ActorCritic, samples: int) -> None:
+    """Copy the weights and observation statistics into a model, in place; noise and critic are unchanged.
+
+    samples: samples of all worlds in an iteration. Raises InputError: layers have other shapes; nothing is changed.
+    """
+    layers = linear_layers(model.actor)
+    policy_shapes, shapes = ([tuple(weight.shape) for weight, _ in each] for each in (actor_init.layers, layers))
+    if policy_shapes != shapes:
+        raise InputError(
+            f"init_policy: the policy's weights are of shapes {_joined(policy_shapes)}, "
+            f"the training's {_joined(shapes)}"
+        )
+    for (weight, bias), (new_weight, new_bias) in zip(layers, actor_init.layers, strict=True):
+        weight.copy_(new_weight)
+        bias.copy_(new_bias)
+    moments = model.obs_moments
+    moments.mean.copy_(actor_init.mean)
+    moments.var.copy_((actor_init.std.double().square() - VARIANCE_EPS).clamp(min=0.0))
+    moments.count.fill_(PRIOR_ITERATIONS * samples)
+
+
+def _contracted_layers(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> Weights | None:
+    """Return the layers of f (`contract_layers`); None if layers or statistics are not nearly symmetric."""
+    widths = [len(bias) for _, bias in layers[:-1]]
+    mean_symmetric = torch.allclose(symmetry.obs.apply(mean), mean, atol=1e-5)
+    symmetric = mean_symmetric and torch.allclose(std[symmetry.obs.order], std)
+    if not symmetric or not widths or any(width % 2 for width in widths):
+        return None
+    nearest = nearest_expanded_layers(layers, symmetry)
+    pairs = zip(layers, nearest, strict=True)
+    near = all((one - other).norm() <= SYMMETRY_TOLERANCE * one.norm() for (one, _), (other, _) in pairs)
+    return contract_layers(nearest, symmetry) if near else None
+
+
+def _is_symmetric(layers: Weights, symmetry: Symmetry) -> bool:
+    """Return whether the layers have the form of `expand_layers`."""
+    try:
+        contract_layers(layers, symmetry)
+    except InputError:
+        return False
+    return True
+
+
+def _averaged(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> ActorInit:
+    """Return g as the network f of a symmetric actor, with symmetric observation statistics."""
+    new_mean, new_var = symmetry.obs.symmetrise_moments(mean.double(), std.double().square())
+    rescaled = rescale_inputs(layers, mean, std, new_mean, new_var.sqrt())
+    new_layers = [(weight.to(mean.dtype), bias.to(mean.dtype)) for weight, bias in rescaled]
+    change = "its actions averaged with their mirror images"
+    return ActorInit(new_layers, new_mean.to(mean.dtype), new_var.sqrt().to(std.dtype), change)
+
+
+def rescale_inputs(
+    layers: Weights, mean: torch.Tensor, std: torch.Tensor, new_mean: torch.Tensor, new_std: torch.Tensor
+) -> Weights:
+    """Return layers, float64, with the same output for observations normalised by new_mean and new_std (num_obs,).
+
+    Only the first layer changes: W (x - mean) / std stays the same for all x within the limits.
+    """
+    (weight, bias), *others = ((weight.double(), bias.double()) for weight, bias in layers)
+    mean, std = mean.double(), std.double()
+    first = weight * (new_std.double() / std), bias + weight @ ((new_mean.double() - mean) / std)
+    return [first, *others]
+
+
+def _joined(values: Iterable[object], separator: str = ", ") -> str:
+    """Return values as text."""
+    return separator.join(map(str, values))
