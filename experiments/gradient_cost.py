@@ -59,8 +59,8 @@ def main(args: Args) -> dict:
         / float(np.abs(exact[key].numpy()).max())
         for key in ("targets", "q", "qd", "table", "saturation")
     }
-    trajectory = differentiable.forward()
-    saved = (trajectory.q, trajectory.qd, trajectory.torque, trajectory.impulse, trajectory.pressed, trajectory.safe)
+    first = differentiable.forward()
+    saved = (first.q, first.qd, first.torque, first.impulse, first.pressed, first.filtered_target)
     times = {"plain": [], "forward": [], "gradient": []}
     for _ in range(args.repeats):
         for kind, run in (("plain", plain.run), ("forward", differentiable.forward), ("gradient", differentiable.run)):
@@ -75,7 +75,7 @@ def main(args: Args) -> dict:
         "forward_ratio": best["forward"] / best["plain"],
         **{f"{kind}_us_a_step": 1.0e6 * value / steps for kind, value in best.items()},
         "kept_bytes_a_policy_step": sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in saved) / worlds / TICKS,
-        "height_difference_m": float(np.abs(plain.heights() - trajectory.q.numpy()[-1, 2]).max()),
+        "height_difference_m": float(np.abs(plain.heights() - first.q.numpy()[-1, 2]).max()),
         **{f"error_{key}": error for key, error in errors.items()},
     }
     if device.is_cuda:

@@ -64,8 +64,8 @@ def main(args: Args) -> dict[str, Any]:
     """Run the parts of the experiment and return their metrics."""
     configure_device("cpu", args.threads)
     folder, parameters = output_dir("identification", args.out), jumper_parameters()
-    replay = Replay(device="cpu", threads=args.threads)
-    ours = partial(replay_plan, Replay(device="cpu", threads=1))
+    replay = MotionReplay(device="cpu", threads=args.threads)
+    ours = partial(replay_plan, MotionReplay(device="cpu", threads=1))
     fine_steps = max(1, round(1.0 / 480.0 / args.fine_dt))
     simulate_finely, replay_finely = (partial(ours, refine=n) for n in (REFINE, fine_steps))
     values: dict[str, Any] = {"parameters": len(parameters), "seconds_of_data": 1.25 * len(KINDS)}
