@@ -1,6 +1,6 @@
 """Turning in free flight: a policy turns the floating robot by 90 degrees about each axis, each way, and about others.
 
-    python experiments/attitude.py --policy attitude --turns 60 --out outputs/attitude
+    python experiments/attitude.py --policy attitude --num-turns 60 --out outputs/attitude
     python experiments/attitude.py --policy logs/attitude/<run> --randomize --angle 60
 
 Robots float at rest in the default pose, in zero gravity, and are told to turn once. A turn is settled from when the
@@ -17,13 +17,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.turns import DIRECTIONS, TurnFlags, Turns, axis_metrics, turn_metrics, turns_about_any
 from support.momentum import MomentumWatch, rotational_inertia
+from support.scripts import parse_flags
 
 HARDWARE = {"mean_settling_s": 2.6}
 """The authors' robot, 90 degrees."""
@@ -39,7 +39,7 @@ class Args(EvaluationArgs, TurnFlags):
     """Whether the momentum of free flight is kept exactly, whatever the training had."""
     refine: int = 1
     """How many times finer the physics step is than that of the training."""
-    record: int = 6
+    num_recorded: int = 6
     """Number of turns to record for the Rerun viewer and, the first of them, as a filmstrip; 0: none."""
 
     def __post_init__(self) -> None:
@@ -70,18 +70,18 @@ def plot(run: EvaluationRun, turns: Turns, title: str) -> None:
 def main(args: Args) -> dict:
     """Run the test and return its figures."""
     run = EvaluationRun.of("attitude", args, ("attitude",))
-    env = run.env(args.turns, lambda task: replace(task, keep_momentum=args.keep_momentum), refine=args.refine)
+    env = run.env(args.num_turns, lambda task: replace(task, keep_momentum=args.keep_momentum), refine=args.refine)
     run.told |= {"physics_step_s": env.physics_dt, "keep_momentum": args.keep_momentum}
     turns, watch = args.log(run.task, args.seed), MomentumWatch(env)
     inertia = rotational_inertia(env.sim)
     run.follow(env, turns, film="turns", watch=watch)
     values = turn_metrics(turns) | axis_metrics(turns) | watch.metrics(turns.apart, inertia)
-    plot(run, turns, f"{args.turns} turns by {args.angle:g} degrees, {run.title}")
-    others = Turns(turns_about_any(args.turns, args.angle, args.seed), args.tolerance, args.seconds)
+    plot(run, turns, f"{args.num_turns} turns by {args.angle:g} degrees, {run.title}")
+    others = Turns(turns_about_any(args.num_turns, args.angle, args.seed), args.tolerance, args.seconds)
     run.follow(env, others)
     values |= {f"any_axis_{name}": value for name, value in turn_metrics(others).items()}
     return run.report(values, HARDWARE)
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

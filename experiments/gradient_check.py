@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import drawn
 from support.gradients import INNER, OUTER, TICKS, GradientJump, apex, check, schedule
-from support.scripts import DeviceArgs, prepare, report
+from support.scripts import DeviceArgs, parse_flags, prepare, report
 
 WEAK_PUSH = (20.0, 20.0)
 """[deg] The push-off that the ascent starts from."""
@@ -98,4 +97,4 @@ def main(args: DeviceArgs) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(DeviceArgs)))
+    run_command(lambda: main(parse_flags(DeviceArgs)))

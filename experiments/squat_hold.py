@@ -1,7 +1,7 @@
 """Squats that are held: how quietly a policy waits for the command to jump.
 
     python experiments/squat_hold.py --policy vertical_jump --out outputs/hold
-    python experiments/squat_hold.py --policy horizontal_jump --squats 500 --randomize
+    python experiments/squat_hold.py --policy horizontal_jump --num-squats 500 --randomize
 
 Robots stand, get a goal but no command, and squat. In the last second it is looked at how much the force on each paw
 varies, of all physics steps for the largest and of policy steps for the smallest, and how much the torques of the
@@ -13,13 +13,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import drawn
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.utils.errors import InputError
 from support.holds import Holds, hold_goals, hold_metrics
+from support.scripts import parse_flags
 
 
 @dataclass(frozen=True)
@@ -28,19 +28,20 @@ class Args(EvaluationArgs):
 
     policy: str = "vertical_jump"
     """Name or folder of a policy that jumps, a run's folder, or a checkpoint."""
-    squats: int = 100
+    num_squats: int = 100
     """Number of robots."""
-    hold: float = 3.0
-    """[s] How long they wait."""
+    hold_time: float = 3.0
+    """[s] How long each robot holds its squat."""
     height: tuple[float, float] = (0.6, 1.1)
-    """[m] Lowest and highest goal of a policy that jumps to heights."""
+    """[m] Lowest and highest goal, for a policy that jumps to heights."""
     distance: tuple[float, float] = (0.3, 1.5)
-    """[m] Nearest and farthest of one that jumps to places."""
+    """[m] Nearest and farthest goal, for a policy that jumps to places."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.squats < 1 or not 1.5 <= self.hold <= 30.0:
-            raise InputError(f"need at least one squat, and hold in 1.5 to 30 s, got {self.squats}, {self.hold}")
+        if self.num_squats < 1 or not 1.5 <= self.hold_time <= 30.0:
+            given = f"{self.num_squats}, {self.hold_time}"
+            raise InputError(f"need at least one squat, and hold_time in 1.5 to 30 s, got {given}")
         for name in ("height", "distance"):
             low, high = getattr(self, name)
             if not 0.0 < low <= high < 10.0:
@@ -63,14 +64,14 @@ def plot(run: EvaluationRun, holds: Holds) -> None:
 def main(args: Args) -> dict:
     """Hold squats and return the figures."""
     run = EvaluationRun.of("squat_hold", args, (*HEIGHTS, *PLACES))
-    env = run.env(args.squats)
+    env = run.env(args.num_squats)
     up = run.task.evaluation in HEIGHTS
-    goals = hold_goals(args.squats, args.height if up else args.distance, up=up)
-    holds = run.follow(env, Holds(goals, args.hold), film="holds")
+    goals = hold_goals(args.num_squats, args.height if up else args.distance, up=up)
+    holds = run.follow(env, Holds(goals, args.hold_time), film="holds")
     if not holds.over.all():
         plot(run, holds)
-    return run.report({"hold_s": args.hold} | hold_metrics(holds), {})
+    return run.report({"hold_s": args.hold_time} | hold_metrics(holds), {})
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

@@ -69,11 +69,11 @@ class Jumps:
 
 Jump = Literal["vertical-jump", "horizontal-jump", "omnidirectional-jump", "horizontal-jump-mars-loose"]
 JUMPS: dict[Jump, Jumps] = {
-    "vertical-jump": Jumps(1000, {"lower": 0.5, "upper": 1.05}, (0.6, 1.05)),
-    "horizontal-jump": Jumps(800, {"x": (0.3, 1.5)}, (0.3, 1.5)),
-    "omnidirectional-jump": Jumps(1000, {"x": (-0.8, 1.2), "y": (-0.8, 0.8)}, (0.3, 1.2)),
+    "vertical-jump": Jumps(1000, {"height_range": (0.5, 1.05)}, (0.6, 1.05)),
+    "horizontal-jump": Jumps(800, {"goal_x": (0.3, 1.5)}, (0.3, 1.5)),
+    "omnidirectional-jump": Jumps(1000, {"goal_x": (-0.8, 1.2), "goal_y": (-0.8, 0.8)}, (0.3, 1.2)),
     "horizontal-jump-mars-loose": Jumps(
-        1000, {"x": (0.5, 4.2)}, (0.5, 4.2), "--start-from horizontal_jump --ppo.init-std 0.3"
+        1000, {"goal_x": (0.5, 4.2)}, (0.5, 4.2), "--start-from horizontal_jump --ppo.init-std 0.3"
     ),
 }
 
@@ -87,7 +87,7 @@ def settings(undone: Undone, arguments: list[str]) -> tuple[Any, TaskCfg]:
 def trained(undone: Undone, arguments: list[str]) -> Path:
     """Return the last checkpoint of a training, made unless it is there. Raises InputError: it has other settings."""
     (parsed, task), name = settings(undone, arguments), f"{CHECKPOINTS}/iteration_{{:06d}}.pt"
-    if found := sorted(Path(parsed.cfg.log_root).glob(f"*/*/{name.format(parsed.cfg.iterations)}")):
+    if found := sorted(Path(parsed.cfg.log_root).glob(f"*/*/{name.format(parsed.cfg.max_iterations)}")):
         config = json.loads((found[-1].parents[1] / CONFIG).read_text())
         wanted = json.loads(json.dumps(asdict(parsed.cfg), default=str))
         other = {key for key in wanted.keys() - ELSEWHERE if wanted[key] != config["train"].get(key)}
@@ -105,15 +105,15 @@ def measured(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, A
     run, ends = EvaluationRun(checkpoint), make_task(args.task).terminations
     run.prepare("departures", Conditions(device=args.device, threads=args.threads), folder)
     tests = {}
-    for test, count in zip(TESTS, args.jumps, strict=True):
+    for test, count in zip(TESTS, args.num_jumps, strict=True):
         drawn_robots = test == "randomized"
         conditions = replace(run.conditions, randomize=drawn_robots, noise=drawn_robots)
-        flags: Any = replace(cast(Any, run.evaluation.flags), jumps=count, **JUMPS[args.task].goals)
+        flags: Any = replace(cast(Any, run.evaluation.flags), num_jumps=count, **JUMPS[args.task].goals)
         env = run.env(count, lambda task: run.evaluation.for_evaluation(replace(task, terminations=ends)), conditions)
         values = flags.metrics(run.follow(env, flags.log(env.task, 0)))
         values["error_m"] = values.get("mean_abs_error_m", values.get("mean_error_m"))
-        goals = hold_goals(args.squats, JUMPS[args.task].squats, up=run.task.evaluation in HEIGHTS)
-        values |= hold_metrics(run.follow(run.env(args.squats, conditions=conditions), Holds(goals, HOLD)))
+        goals = hold_goals(args.num_squats, JUMPS[args.task].squats, up=run.task.evaluation in HEIGHTS)
+        values |= hold_metrics(run.follow(run.env(args.num_squats, conditions=conditions), Holds(goals, HOLD)))
         tests[test] = {name: value for name, value in values.items() if isinstance(value, bool | int | float | None)}
     return tests
 

@@ -98,12 +98,12 @@ def timed_training(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Curve:
     args: envs, device, randomize, jumps, seconds, every and heights, as `experiments/learning_curves.py` has them.
     """
     torch.manual_seed(seed)
-    env = Env(task, args.envs, seed=seed, device=args.device, randomize=args.randomize, noise=args.randomize)
+    env = Env(task, args.num_envs, seed=seed, device=args.device, randomize=args.randomize, noise=args.randomize)
     ppo = Ppo(env, cfg)
     warm_up(env, ppo)
-    ready, judge = process_age(), make_judge(task, args.jumps, args.device)
+    ready, judge = process_age(), make_judge(task, args.num_jumps, args.device)
     success(ppo, judge)
-    curve = learning_curve(env, ppo, judge, args.seconds, args.every, args.heights)
+    curve = learning_curve(env, ppo, judge, args.seconds, args.eval_interval, args.height_range)
     curve.ready = ready
     return curve
 

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError
 from jumper_warp.cli.main import parse as parse_flags
+from jumper_warp.cli.renamed_flags import join_height_range
 
 if TYPE_CHECKING:
     from jumper_warp.evaluation.registry import Evaluation
@@ -83,6 +84,8 @@ def parse(
     Raises UsageError: a flag is not one of the policy's task, or a setting is out of range.
     """
     flags, about = flags_of(opened.evaluation), kind.__doc__
+    if hasattr(flags, "height_range"):
+        args = join_height_range(args, flags.height_range)
     cfg, unknown = parse_flags(
         kind[type(flags)],
         f"{command} {opened.source}",

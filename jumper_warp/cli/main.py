@@ -117,9 +117,12 @@ def parse(kind: Any, command: str, args: Sequence[str], **settings: Any) -> Any:
     """
     import tyro
 
+    from jumper_warp.cli.renamed_flags import use_new_names
+
     about = settings.pop("description", kind.__doc__)
     description = f"{about}\n\n{TASK_MODULE_HELP}"
-    return tyro.cli(kind, prog=f"jumper {command}", description=description, args=list(args), **settings)
+    args = use_new_names(args, settings.get("default", kind))
+    return tyro.cli(kind, prog=f"jumper {command}", description=description, args=args, **settings)
 
 
 def run_command(command: Callable[[], object]) -> None:

@@ -126,7 +126,7 @@ def episode_metrics(episodes: Episodes) -> Metrics:
 def check_episodes(count: int, command: tuple[float, ...], seconds: float) -> None:
     """Raise InputError unless this can be asked of a number of worlds."""
     if count < 1:
-        raise InputError(f"episodes must be at least 1, got {count}")
+        raise InputError(f"num_episodes must be at least 1, got {count}")
     if len(command) > MOST_NUMBERS or not all(math.isfinite(value) for value in command):
         raise InputError(f"command takes up to {MOST_NUMBERS} finite numbers, got {command}")
     if not 0.0 < seconds <= MOST_SECONDS:
@@ -143,20 +143,20 @@ def filled(command: tuple[float, ...], count: int, task: TaskCfg) -> np.ndarray:
 class EpisodeFlags:
     """Episodes from standing still."""
 
-    episodes: int = 200
+    num_episodes: int = 200
     """Number of episodes."""
     command: tuple[float, ...] = ()
     """Up to four numbers, as the task's command takes them; those left out are 0."""
     seconds: float = 10.0
-    """[s] Length at most."""
+    """[s] Largest length of an episode."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
-        check_episodes(self.episodes, self.command, self.seconds)
+        check_episodes(self.num_episodes, self.command, self.seconds)
 
     def log(self, task: TaskCfg, seed: int) -> Episodes:
         """Return episodes with this command."""
-        return Episodes(filled(self.command, self.episodes, task), task, self.seconds)
+        return Episodes(filled(self.command, self.num_episodes, task), task, self.seconds)
 
     def metrics(self, log: Episodes) -> Metrics:
         """Return `episode_metrics`."""

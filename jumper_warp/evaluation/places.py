@@ -214,17 +214,17 @@ def random_headings(count: int, seed: int) -> np.ndarray:
 class PlaceFlags(JumpFlags):
     """Jumps to places from standing still."""
 
-    x: Place = (0.3, 1.5)
-    """[m] Goals ahead, evenly spaced between these."""
-    y: Place = (0.0, 0.0)
-    """[m] Goals to the left, drawn between these."""
+    goal_x: Place = (0.3, 1.5)
+    """[m] Smallest and largest distance of the goal ahead; goals are evenly spaced."""
+    goal_y: Place = (0.0, 0.0)
+    """[m] Smallest and largest distance of the goal to the left; goals are drawn."""
     heading: Literal["any"] | float = "any"
     """[deg] Heading of all robots, or any: drawn from the full circle."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
         super().__post_init__()
-        for name in ("x", "y"):
+        for name in ("goal_x", "goal_y"):
             low, high = getattr(self, name)
             if not -10.0 < low <= high < 10.0:
                 raise InputError(f"{name} must be in (-10, 10) m and rise, got {low}, {high}")
@@ -234,14 +234,14 @@ class PlaceFlags(JumpFlags):
     def log(self, task: TaskCfg, seed: int) -> PlaceLog:
         """Return single jumps with these goals and headings."""
         rng = np.random.default_rng(seed)
-        places = np.stack([np.linspace(*self.x, self.jumps), rng.uniform(*self.y, self.jumps)], axis=1)
-        headings = random_headings(self.jumps, seed) if self.heading == "any" else math.radians(self.heading)
-        return PlaceLog(places[:, None], termination_names(task), headings)
+        x, y = np.linspace(*self.goal_x, self.num_jumps), rng.uniform(*self.goal_y, self.num_jumps)
+        headings = random_headings(self.num_jumps, seed) if self.heading == "any" else math.radians(self.heading)
+        return PlaceLog(np.stack([x, y], axis=1)[:, None], termination_names(task), headings)
 
     def metrics(self, log: PlaceLog) -> Metrics:
         """Return `landing_metrics`, with the range."""
-        inside = within(np.linalg.norm(log.places, axis=-1), self.in_range)
-        return landing_metrics(log, inside) | {"range_lower_m": self.in_range[0], "range_upper_m": self.in_range[1]}
+        inside, (lower, upper) = within(np.linalg.norm(log.places, axis=-1), self.success_range), self.success_range
+        return landing_metrics(log, inside) | {"range_lower_m": lower, "range_upper_m": upper}
 
 
 @dataclass(frozen=True)
@@ -249,15 +249,15 @@ class PlaceGoals:
     """Jumps to places that are recorded."""
 
     goal: tyro.conf.UseAppendAction[tuple[Place, ...]] = ()
-    """[m] Where to land, ahead and to the left; once for each robot (default: three robots, each to another place)."""
-    then: tyro.conf.UseAppendAction[tuple[Place, ...]] = ()
-    """[m] Where all robots jump next, a second after touchdown, from where they are by then; once for each jump."""
+    """[m] Goal of a robot, ahead and to the left; give it once for each robot (default: three goals)."""
+    next_goals: tyro.conf.UseAppendAction[tuple[Place, ...]] = ()
+    """[m] Goal of all robots' next jump, ahead and to the left, a second after touchdown; give it once a jump."""
     unless_told: tyro.conf.Suppress[tuple[Place, ...]] = ((0.5, 0.0), (0.9, 0.0), (1.3, 0.0))
     """[m] Goals if there are none; flags that are given several times would be added to a default."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a place is out of range, or their number."""
-        for name in ("goal", "then"):
+        for name in ("goal", "next_goals"):
             places = getattr(self, name)
             if len(places) > MAX_ROBOTS or not all(-10.0 < value < 10.0 for place in places for value in place):
                 raise InputError(f"{name} takes up to {MAX_ROBOTS} places in (-10, 10) m, got {places}")
@@ -270,8 +270,8 @@ class PlaceGoals:
     @property
     def length(self) -> float:
         """[s] Of the recording."""
-        return SECONDS + SECONDS_MORE * len(self.then)
+        return SECONDS + SECONDS_MORE * len(self.next_goals)
 
     def log(self, task: TaskCfg) -> PlaceLog:
         """Return one row of jumps a robot."""
-        return PlaceLog(np.array([[goal, *self.then] for goal in self.goals]), termination_names(task))
+        return PlaceLog(np.array([[goal, *self.next_goals] for goal in self.goals]), termination_names(task))

@@ -43,9 +43,9 @@ def check(good: bool, message: str) -> None:
 class Suite(EvaluationArgs):
     """Flags of a suite, and its measurement."""
 
-    jumps: int = 200
+    num_jumps: int = 200
     """Number of jumps (where there are several scenes, bins or goals on a grid, of each)."""
-    rest: float = REST_TIME
+    rest_time: float = REST_TIME
     """[s] From touchdown until a jump is over."""
 
     name: ClassVar[str]
@@ -59,8 +59,8 @@ class Suite(EvaluationArgs):
     def __post_init__(self) -> None:
         super().__post_init__()
         jumps, rest = self.least
-        check(self.jumps >= jumps, f"need at least {jumps} jump{'s' * (jumps > 1)}, got {self.jumps}")
-        check(rest <= self.rest <= 10.0, f"rest must be in [{rest:g}, 10] s, got {self.rest}")
+        check(self.num_jumps >= jumps, f"need at least {jumps} jump{'s' * (jumps > 1)}, got {self.num_jumps}")
+        check(rest <= self.rest_time <= 10.0, f"rest_time must be in [{rest:g}, 10] s, got {self.rest_time}")
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Follow jumps, draw them, and return the metrics."""
@@ -90,7 +90,7 @@ class Suite(EvaluationArgs):
         """
         env = run.env(len(places)) if env is None else env
         headings = random_headings(len(places), self.seed) if headings is None else headings
-        return run.follow(env, PlaceLog(places, termination_names(env.task), headings, delay, self.rest), **follow)
+        return run.follow(env, PlaceLog(places, termination_names(env.task), headings, delay, self.rest_time), **follow)
 
     def pushed_in_flight(self, run: EvaluationRun, measure: Callable[[Conditions], Metrics], *names: str) -> Metrics:
         """Return some metrics of a randomised test in which robots are pushed in flight too."""
@@ -112,9 +112,9 @@ class HeightSweep(Suite):
     """
 
     policy: str = "vertical_jump"
-    heights: tuple[float, float] = (0.5, 1.2)
+    height_range: tuple[float, float] = (0.5, 1.2)
     """[m] Lowest and highest commanded base height."""
-    record: int = 5
+    num_recorded: int = 5
 
     name: ClassVar = "sweep"
     evaluations: ClassVar = HEIGHTS
@@ -123,16 +123,17 @@ class HeightSweep(Suite):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(0.0 < self.heights[0] <= self.heights[1] < 10.0, f"heights must be in (0, 10) m, got {self.heights}")
+        low, high = self.height_range
+        check(0.0 < low <= high < 10.0, f"height_range must be in (0, 10) m, got {self.height_range}")
 
     def follow(self, run: EvaluationRun, env: Env, film: str = "") -> HeightLog:
         """Return the jumps."""
-        heights = np.linspace(*self.heights, self.jumps)
-        return run.follow(env, HeightLog(heights, termination_names(env.task), self.rest), film=film)
+        heights = np.linspace(*self.height_range, self.num_jumps)
+        return run.follow(env, HeightLog(heights, termination_names(env.task), self.rest_time), film=film)
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Follow jumps and open-loop jumps, draw them, and return the metrics."""
-        env = run.env(self.jumps, for_sweep)
+        env = run.env(self.num_jumps, for_sweep)
         fresh = env.state_dict()
         jumps = self.follow(run, env, "jumps")
         limit = open_loop_limits(env, fresh)
@@ -141,14 +142,14 @@ class HeightSweep(Suite):
             draw_sweep(axis, jumps.commanded, jumps.apex, jumps.reached, SUCCESS_TOLERANCE, ("reached", "missed"))
             axis.legend(loc="lower right")
             axis.set(xlabel="commanded base height [m]", ylabel="highest base height [m]")
-            axis.set_title(f"{self.jumps} jumps, {run.title}", wrap=True)
+            axis.set_title(f"{self.num_jumps} jumps, {run.title}", wrap=True)
 
         def pushed(conditions: Conditions) -> Metrics:
-            return sweep_metrics(self.follow(run, run.env(self.jumps, for_sweep, conditions)), HEIGHTS_IN_RANGE)
+            return sweep_metrics(self.follow(run, run.env(self.num_jumps, for_sweep, conditions)), HEIGHTS_IN_RANGE)
 
         names = ("mean_abs_error_m", "success_rate", "success_rate_in_range", "fall_rate", "miss_rate", "landing_rate")
         values = sweep_metrics(jumps, HEIGHTS_IN_RANGE) | limit_metrics(jumps, limit)
-        return {"rest_s": self.rest} | values | self.pushed_in_flight(run, pushed, *names)
+        return {"rest_s": self.rest_time} | values | self.pushed_in_flight(run, pushed, *names)
 
 
 @dataclass(frozen=True)
@@ -163,13 +164,13 @@ class DistanceSweep(Suite):
     flight too.
     """
 
-    distances: tuple[float, float] = (0.3, 1.5)
-    """[m] Of the nearest and the farthest goal."""
-    aside: float = 0.0
-    """[m] Goals lie up to this far to either side, drawn."""
+    distance_range: tuple[float, float] = (0.3, 1.5)
+    """[m] Distance of the nearest and of the farthest goal."""
+    max_lateral_offset: float = 0.0
+    """[m] Largest offset of a goal to either side; offsets are drawn."""
     end_at_second_takeoff: bool = False
     """A second takeoff after landing ends a jump, as a failure, as in the authors' configuration."""
-    record: int = 5
+    num_recorded: int = 5
 
     name: ClassVar = "sweep"
     paper: ClassVar = {"mean_error_m": 0.026, "success_rate": 0.97, "success_rate_in_range": 1.0}
@@ -177,14 +178,16 @@ class DistanceSweep(Suite):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        (near, far), goals = self.distances, f"{self.distances}, {self.aside} aside"
-        check(0.0 < near < far < 10.0 and 0.0 <= self.aside < 10.0, f"goals must be within 10 m and rise, got {goals}")
+        (near, far), side = self.distance_range, self.max_lateral_offset
+        good = 0.0 < near < far < 10.0 and 0.0 <= side < 10.0
+        check(good, f"goals must be within 10 m and rise, got {self.distance_range}, {side} to either side")
 
     def follow(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> PlaceLog:
         """Return the jumps in some conditions."""
-        aside = np.random.default_rng(self.seed + 1).uniform(-self.aside, self.aside, self.jumps)
-        places = np.stack([np.linspace(*self.distances, self.jumps), aside], axis=1)[:, None]
-        env = run.env(self.jumps, ended_by_takeoff if self.end_at_second_takeoff else for_evaluation, conditions)
+        side, rng = self.max_lateral_offset, np.random.default_rng(self.seed + 1)
+        x, y = np.linspace(*self.distance_range, self.num_jumps), rng.uniform(-side, side, self.num_jumps)
+        places = np.stack([x, y], axis=1)[:, None]
+        env = run.env(self.num_jumps, ended_by_takeoff if self.end_at_second_takeoff else for_evaluation, conditions)
         return self.jump(run, places, env, film=film)
 
     @staticmethod
@@ -203,9 +206,10 @@ class DistanceSweep(Suite):
             commanded, reached = landings.places[..., 0], landings.landing[..., 0]
             draw_sweep(axis, commanded, reached, landings.success, SUCCESS_TOLERANCE, ("landed there", "failed"))
             axis.set(xlabel="commanded distance [m]", ylabel="distance of the base at the end [m]")
-            axis.set(xlim=(self.distances[0] - 0.05, self.distances[1] + 0.05))
-            axis.set_title(f"{self.jumps} jumps, {run.title}", wrap=True)
-        values = {"rest_s": self.rest, "end_at_second_takeoff": self.end_at_second_takeoff, **self.metrics(landings)}
+            axis.set(xlim=(self.distance_range[0] - 0.05, self.distance_range[1] + 0.05))
+            axis.set_title(f"{self.num_jumps} jumps, {run.title}", wrap=True)
+        values = {"rest_s": self.rest_time, "end_at_second_takeoff": self.end_at_second_takeoff}
+        values |= self.metrics(landings)
         pushed = self.pushed_in_flight(
             run, lambda conditions: self.metrics(self.follow(run, conditions)), "mean_error_m", "success_rate",
             "success_rate_in_range", "fall_rate", "miss_rate", "still_landing_rate", "max_landing_tilt_deg",

@@ -204,22 +204,22 @@ def grid(per_axis: int, reach: Sequence[float]) -> np.ndarray:
 class VelocityFlags:
     """Constant commands on a grid of all three velocities at once."""
 
-    per_axis: int = 8
-    """Commands along each axis of the grid; one robot for each of all three."""
-    reach: tuple[float, float, float] = (0.8, 0.8, 0.8)
-    """[m/s], [m/s], [rad/s] The grid goes from minus to plus this: ahead, to the left, about z."""
+    commands_per_axis: int = 8
+    """Number of commands along each of the three axes of the grid; one robot for each combination."""
+    max_velocity: tuple[float, float, float] = (0.8, 0.8, 0.8)
+    """[m/s], [m/s], [rad/s] Largest command ahead, to the left and about z; the grid goes from minus to plus this."""
     seconds: float = 10.0
-    """[s] Length; the first second does not count for the error."""
+    """[s] Length of each walk; the first second does not count for the error."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
-        check_walks(self.per_axis**3, self.seconds, *self.reach)
-        if self.per_axis < 2:
-            raise InputError(f"per_axis must be at least 2, got {self.per_axis}")
+        check_walks(self.commands_per_axis**3, self.seconds, *self.max_velocity)
+        if self.commands_per_axis < 2:
+            raise InputError(f"commands_per_axis must be at least 2, got {self.commands_per_axis}")
 
     def log(self, task: TaskCfg, seed: int) -> Walks:
         """Return walks with these commands."""
-        return Walks(grid(self.per_axis, self.reach), task, self.seconds)
+        return Walks(grid(self.commands_per_axis, self.max_velocity), task, self.seconds)
 
     def metrics(self, log: Walks) -> Metrics:
         """Return `tracking_metrics`."""
@@ -231,13 +231,13 @@ class VelocityGoals:
     """A walk that is recorded: commands one after the other."""
 
     velocity: tyro.conf.UseAppendAction[tuple[Velocity, ...]] = ()
-    """[m/s], [m/s], [rad/s] Ahead, to the left and about z; once for each command (default: a walk of six)."""
+    """[m/s], [m/s], [rad/s] Ahead, to the left, about z; give it once for each command (default: six commands)."""
     unless_told: tyro.conf.Suppress[tuple[Velocity, ...]] = (
         (0.8, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0), (0.6, 0.3, 0.6), (0.0, 0.0, 0.0),
     )  # fmt: skip
     """Commands if there are none; flags that are given several times would be added to a default."""
-    each: float = 2.5
-    """[s] From command to command."""
+    command_interval: float = 2.5
+    """[s] Time from one command to the next."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a setting is out of range."""
@@ -251,12 +251,12 @@ class VelocityGoals:
     @property
     def length(self) -> float:
         """[s] Of the recording."""
-        return self.each * len(self.velocities)
+        return self.command_interval * len(self.velocities)
 
     def log(self, task: TaskCfg) -> Walks:
         """Return one robot's walk."""
         commands = np.array(self.velocities, dtype=float)[None]
-        return Walks(commands, task, self.length, times=self.each * np.arange(commands.shape[1]))
+        return Walks(commands, task, self.length, times=self.command_interval * np.arange(commands.shape[1]))
 
 
 def check_walks(robots: int, seconds: float, *commands: float) -> None:

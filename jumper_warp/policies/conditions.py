@@ -28,7 +28,7 @@ SHORTEST_LATENCY = 500.0 * PHYSICS_DT
 
 @dataclass(frozen=True)
 class Conditions:
-    """What a policy is tried in."""
+    """Conditions in which a policy is evaluated."""
 
     solver: Literal["jumper", "mujoco"] = "jumper"
     """Physics: the dedicated solver, or Newton's SolverMuJoCo."""
@@ -37,7 +37,7 @@ class Conditions:
     noise: bool = False
     """Add the training's observation noise."""
     seed: int = 0
-    """Of randomisation and noise, 0 to 2147483647."""
+    """Seed of randomisation and noise, 0 to 2147483647."""
     device: str | None = None
     """Warp device (default: a GPU if there is one)."""
     threads: int | None = None
@@ -47,13 +47,13 @@ class Conditions:
     push_in_flight: bool = False
     """Pushes of a randomised test act in flight too, and not only while a paw is down."""
     latency: float | None = None
-    """[ms] From action to motor, to the nearest physics step (default: none, or drawn if randomised)."""
-    gains: tuple[float, float] | None = None
+    """[ms] Latency from action to motor, to the nearest physics step (default: none, or drawn if randomised)."""
+    gain_scale: tuple[float, float] | None = None
     """[1] Scales of kp and kd of all motors (default: 1, or drawn if randomised)."""
     friction: float | None = None
-    """[1] Of the paws, static and dynamic (default: nominal, or drawn if randomised)."""
+    """[1] Friction of the paws, static and dynamic (default: nominal, or drawn if randomised)."""
     gravity: float | None = None
-    """[m/s^2] Downward (default: that of the task)."""
+    """[m/s^2] Gravity, downward (default: the task's)."""
 
     def __post_init__(self) -> None:
         """Raises InputError: a value out of range, a latency of no step, or pushes in flight where there are none."""
@@ -70,7 +70,7 @@ class Conditions:
     @property
     def fixed(self) -> dict[str, Any]:
         """Parameters that are neither nominal nor drawn."""
-        given = {name: getattr(self, name) for name in ("latency", "gains", "friction")}
+        given = {"latency": self.latency, "gains": self.gain_scale, "friction": self.friction}
         return {name: value for name, value in given.items() if value is not None}
 
     def overlay(self, config: dict[str, Any]) -> RobotOverlay | None:

@@ -235,7 +235,7 @@ class Run:
             ending = is_last_iteration(self.iteration, cfg, 0.0 < cfg.max_seconds <= self.seconds)
             if ending:
                 seconds = f"--max-seconds {cfg.max_seconds:g}"
-                limit = f"--iterations {cfg.iterations}" if self.iteration >= cfg.iterations else seconds
+                limit = f"--max-iterations {cfg.max_iterations}" if self.iteration >= cfg.max_iterations else seconds
                 log.say(f"nothing is left to train after iteration {self.iteration}: give more than {limit}")
             while not ending:
                 watch.start()
@@ -259,7 +259,7 @@ class Run:
         if self.rank.index != 0:
             return _Silent()
         cfg = self.cfg
-        return TrainingLog(self.folder, self.config, cfg.iterations, cfg.tensorboard, cfg.wandb, self.iteration)
+        return TrainingLog(self.folder, self.config, cfg.max_iterations, cfg.tensorboard, cfg.wandb, self.iteration)
 
     def _begin_counting(self) -> None:
         """Count the run's time from here on, when the device has done what it was asked to."""
@@ -274,11 +274,11 @@ class Run:
     def _progress(self) -> float:
         """Return how much of the training is over, by iterations or by time, whichever is further."""
         timed = self.cfg.max_seconds > 0.0
-        return max(self.iteration / self.cfg.iterations, self._elapsed() / self.cfg.max_seconds if timed else 0.0)
+        return max(self.iteration / self.cfg.max_iterations, self._elapsed() / self.cfg.max_seconds if timed else 0.0)
 
     def _left(self, seconds: float) -> float:
         """Return how long the rest takes [s] at so many seconds an iteration."""
-        left = (self.cfg.iterations - self.iteration) * seconds
+        left = (self.cfg.max_iterations - self.iteration) * seconds
         if self.cfg.max_seconds > 0.0:
             left = min(left, max(self.cfg.max_seconds - self._elapsed(), 0.0))
         return left
@@ -312,7 +312,7 @@ class Run:
         state["config"] = json.dumps(self.config)
         folder = self.folder / CHECKPOINTS
         try:
-            path = save_checkpoint(folder, state, self.figures.get(self.cfg.best_by), self.cfg.keep)
+            path = save_checkpoint(folder, state, self.figures.get(self.cfg.best_by), self.cfg.max_checkpoints)
         except OSError as error:
             if ending:
                 raise CheckpointError(f"{folder}: not saved: {error.strerror}") from error
@@ -331,7 +331,7 @@ class Run:
 
 def is_last_iteration(iteration: int, cfg: TrainCfg, end_early: bool) -> bool:
     """Return whether a run with so many iterations behind it is at its end."""
-    return end_early or iteration >= cfg.iterations
+    return end_early or iteration >= cfg.max_iterations
 
 
 class _Silent:
@@ -372,5 +372,5 @@ def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl | None, rank: R
     torch.manual_seed(cfg.seed + rank.index)
     env.reset()
     adapter = as_rsl_rl(env, cfg.ppo.num_steps)
-    train_rsl_rl(adapter, cfg.ppo, cfg.iterations, cfg.save_interval, cfg.seed, folder)
-    return TrainResult(folder, cfg.iterations, time.perf_counter() - begin, {})
+    train_rsl_rl(adapter, cfg.ppo, cfg.max_iterations, cfg.save_interval, cfg.seed, folder)
+    return TrainResult(folder, cfg.max_iterations, time.perf_counter() - begin, {})

@@ -30,7 +30,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from landing_helpers import still_policy
 
-TRAIN = ["train", "vertical-jump", "--num-envs", "16", "--iterations", "2", "--no-tensorboard", "--device", "cpu"]
+TRAIN = ["train", "vertical-jump", "--num-envs", "16", "--max-iterations", "2", "--no-tensorboard", "--device", "cpu"]
 TRAIN += "--ppo.num-steps 4 --ppo.minibatches 2 --ppo.hidden 16 8 --env.curriculum.promote-after 2".split()
 
 
@@ -104,7 +104,7 @@ def test_every_command_has_help(capsys, command):
     [
         (["fly"], "no command 'fly'; there are train, finetune, play, evaluate, export, sysid, list"),
         (["train", "swim"], "unknown task 'swim'; there are vertical-jump"),
-        (["train", "--iterations", "3"], "the task comes first"),
+        (["train", "--max-iterations", "3"], "the task comes first"),
         ([*TRAIN, "--task", "other"], "give the task once"),
         (
             [*TRAIN, "--env.rewards.jump-height.weight", "nan"],
@@ -113,7 +113,7 @@ def test_every_command_has_help(capsys, command):
         ([*TRAIN, "--env.terminations.tilted.angle", "inf"], "tilted: parameter 'angle' must be a finite number"),
         (["list", "--task-module"], "--task-module needs a FILE.py or the name of a module"),
         (["list", "--task-module="], "--task-module needs a FILE.py or the name of a module"),
-        (["train", "--task-module", "--iterations", "3"], "--task-module needs a FILE.py"),
+        (["train", "--task-module", "--max-iterations", "3"], "--task-module needs a FILE.py"),
         (["list", "--task-module", "missing.py"], "no file 'missing.py'"),
         (["play", "vertical_jump", "--task-module", "not_a_module"], "no module 'not_a_module'"),
         ([*TRAIN, "--device", "abacus"], "no device 'abacus'"),
@@ -333,18 +333,18 @@ def test_terms_whose_names_make_the_same_flag_are_refused():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: HeightFlags(jumps=0), "jumps must be at least 1"),
-        (lambda: PlaceFlags(jumps=0), "jumps must be at least 1"),
-        (lambda: HeightFlags(lower=1.0, upper=0.5), "heights must be"),
-        (lambda: HeightFlags(lower=0.0), "heights must be"),
-        (lambda: PlaceFlags(x=(1.0, 0.5)), "x must be in"),
+        (lambda: HeightFlags(num_jumps=0), "num_jumps must be at least 1"),
+        (lambda: PlaceFlags(num_jumps=0), "num_jumps must be at least 1"),
+        (lambda: HeightFlags(height_range=(1.0, 0.5)), "height_range must be"),
+        (lambda: HeightFlags(height_range=(0.0, 1.2)), "height_range must be"),
+        (lambda: PlaceFlags(goal_x=(1.0, 0.5)), "goal_x must be in"),
         (lambda: PlaceFlags(heading=float("inf")), "heading must be finite or any"),
-        (lambda: HeightFlags(in_range=(1.0, 0.5)), "in_range must be in"),
-        (lambda: PlaceFlags(in_range=(1.0, 0.5)), "in_range must be in"),
+        (lambda: HeightFlags(success_range=(1.0, 0.5)), "success_range must be in"),
+        (lambda: PlaceFlags(success_range=(1.0, 0.5)), "success_range must be in"),
         (lambda: HeightGoals(height=()), "height takes 1 to 64"),
         (lambda: HeightGoals(height=(-1.0,)), "height takes 1 to 64"),
         (lambda: PlaceGoals(goal=((float("nan"), 0.0),)), "goal takes up to 64"),
-        (lambda: PlaceGoals(then=((0.5, 0.0),) * 65), "then takes up to 64"),
+        (lambda: PlaceGoals(next_goals=((0.5, 0.0),) * 65), "next_goals takes up to 64"),
         (lambda: PlayCfg(HeightGoals(), seconds=0.0), "seconds must be in"),
     ],
 )
@@ -366,7 +366,7 @@ def test_exported_policy_is_that_of_the_run(trained_run):
 
 
 def test_evaluation_reports_and_keeps_figures(trained_run, tmp_path, capsys):
-    args = ["--jumps", "3", "--noise", "--device", "cpu", "--out", str(tmp_path), "--keep"]
+    args = ["--num-jumps", "3", "--noise", "--device", "cpu", "--out", str(tmp_path), "--save-to-policy"]
     code, out, _ = run(capsys, "evaluate", str(trained_run / "policy"), *args)
     figures = json.loads((tmp_path / "metrics.json").read_text())
     assert code == 0 and "success_rate_in_range" in out
@@ -388,7 +388,7 @@ def test_play_records_every_step_of_every_robot(trained_run, tmp_path, capsys):
 
 
 def test_evaluation_of_jumps_to_places(still, tmp_path, capsys):
-    args = ["--jumps", "3", "--x", "0.4", "0.8", "--heading", "90", "--device", "cpu", "--out", str(tmp_path)]
+    args = ["--num-jumps", "3", "--goal-x", "0.4", "0.8", "--heading", "90", "--device", "cpu", "--out", str(tmp_path)]
     code, out, _ = run(capsys, "evaluate", still, *args)
     figures = json.loads((tmp_path / "metrics.json").read_text())
     assert code == 0 and "success_rate_in_range" in out
@@ -400,7 +400,7 @@ def test_evaluation_of_jumps_to_places(still, tmp_path, capsys):
 
 
 def test_play_of_jumps_to_places_records_the_distance_and_marks_the_goals(still, tmp_path, capsys):
-    goals = ["--goal", "0.8", "0.2", "--goal", "0.5", "0", "--then", "0.75", "-0.2", "--seconds", "0.25"]
+    goals = ["--goal", "0.8", "0.2", "--goal", "0.5", "0", "--next-goals", "0.75", "-0.2", "--seconds", "0.25"]
     code, out, _ = run(capsys, "play", still, *goals, "--device", "cpu", "--out", str(tmp_path))
     assert code == 0 and out.count("not_begun") == 2
     found = {name.split("/")[-1]: values for name, values in curves(tmp_path / "jump.rrd").items()}
@@ -413,11 +413,10 @@ def test_play_of_jumps_to_places_records_the_distance_and_marks_the_goals(still,
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["evaluate", "--upper", "1.0"], "--upper is not for policies of horizontal-jump"),
-        (["evaluate", "--lower", "0.5"], "--lower is not for policies of horizontal-jump"),  # its own default
+        (["evaluate", "--height-range", "0.5", "1.2"], "--height-range is not for policies of horizontal"),  # default
         (["play", "--height", "0.9"], "--height is not for policies of horizontal-jump"),
         (["play", "--height", "0.6", "0.9", "1.1"], "--height is not for policies of horizontal-jump"),
-        (["evaluate", "--x", "0.8", "0.4"], "x must be in"),
+        (["evaluate", "--goal-x", "0.8", "0.4"], "goal_x must be in"),
     ],
 )
 def test_flags_of_another_task_and_no_ranges_are_one_line(still, capsys, args, message):
@@ -485,7 +484,7 @@ def test_truncated_checkpoint_is_one_line(trained_run, tmp_path, capsys):
 
 
 def test_run_keeps_no_figures(trained_run, capsys):
-    code, _, err = run(capsys, "evaluate", str(trained_run), "--keep", "--device", "cpu")
+    code, _, err = run(capsys, "evaluate", str(trained_run), "--save-to-policy", "--device", "cpu")
     assert code == 2 and "export it first" in err[-1]
 
 

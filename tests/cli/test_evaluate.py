@@ -43,7 +43,7 @@ def test_task_with_an_unknown_evaluation_is_refused():
 
 
 def test_places_are_spread_ahead_and_drawn_aside_and_headings_too():
-    flags = PlaceFlags(jumps=5, y=(-0.2, 0.1))
+    flags = PlaceFlags(num_jumps=5, goal_y=(-0.2, 0.1))
     log = flags.log(TASK, seed=3)
     assert log.places[:, 0, 0] == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.5])
     aside = log.places[:, 0, 1]
@@ -54,18 +54,17 @@ def test_places_are_spread_ahead_and_drawn_aside_and_headings_too():
 
 
 def test_one_heading_is_that_of_all_in_radians():
-    assert PlaceFlags(jumps=2, x=(0.3, 0.4), y=(0.0, 0.0), heading=90.0).log(TASK, 0).headings == pytest.approx(
-        0.5 * math.pi
-    )
+    flags = PlaceFlags(num_jumps=2, goal_x=(0.3, 0.4), heading=90.0)
+    assert flags.log(TASK, 0).headings == pytest.approx(0.5 * math.pi)
 
 
 @pytest.mark.parametrize(
     ("task", "args", "flag"),
     [
-        ("vertical-jump", ["--x", "0.3", "0.5"], "--x"),
+        ("vertical-jump", ["--goal-x", "0.3", "0.5"], "--goal-x"),
         ("vertical-jump", ["--heading", "any"], "--heading"),
-        ("horizontal-jump", ["--upper", "1.0"], "--upper"),
-        ("horizontal-jump", ["--episodes", "3"], "--episodes"),
+        ("horizontal-jump", ["--height-range", "0.5", "1.0"], "--height-range"),
+        ("horizontal-jump", ["--num-episodes", "3"], "--num-episodes"),
     ],
 )
 def test_flags_of_another_task_are_refused(policies, task, args, flag):
@@ -90,7 +89,7 @@ def test_help_shows_the_flags_of_the_policy_only(policies, capsys, command):
             command.run([str(policies / task), "--help"], [])
         assert end.value.code == 0
         shown[task] = capsys.readouterr().out
-    flags = {evaluate: ("--upper", "--heading"), play: ("--height", "--goal")}[command]
+    flags = {evaluate: ("--height-range", "--heading"), play: ("--height", "--goal")}[command]
     for task, there, missing in (("vertical-jump", *flags), ("horizontal-jump", *reversed(flags))):
         assert there in shown[task] and missing not in shown[task] and "--solver" in shown[task]
 
@@ -104,7 +103,7 @@ def test_policy_comes_first(command, args):
 
 def test_range_of_places_counts_distances():
     goals = [[0.3, 0.0], [0.0, -0.3], [0.6, 0.6]]
-    flags = PlaceFlags(jumps=3, x=(0.0, 0.0), y=(0.0, 0.0), heading=0.0, in_range=(0.3, 0.5))
+    flags = PlaceFlags(num_jumps=3, goal_x=(0.0, 0.0), goal_y=(0.0, 0.0), heading=0.0, success_range=(0.3, 0.5))
     landings = flags.log(TASK, 0)
     landings.places[:, 0] = goals
     landings.place[:, 0], landings.target[:, 0] = goals, goals
@@ -116,7 +115,8 @@ def test_range_of_places_counts_distances():
 
 
 def test_heights_are_spread_evenly():
-    assert HeightFlags(jumps=3, lower=0.6, upper=1.0).log(TASK, 0).commanded[:, 0] == pytest.approx([0.6, 0.8, 1.0])
+    log = HeightFlags(num_jumps=3, height_range=(0.6, 1.0)).log(TASK, 0)
+    assert log.commanded[:, 0] == pytest.approx([0.6, 0.8, 1.0])
 
 
 def test_csv_has_a_line_a_jump_and_nothing_where_there_is_no_number():

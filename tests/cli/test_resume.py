@@ -14,8 +14,9 @@ from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
 from jumper_warp.robot.overlay import with_springs
 
 SMALL = ["--ppo.num-steps", "2", "--ppo.minibatches", "2", "--ppo.hidden", "8"]
-OWN = ["--num-envs", "4", "--iterations", "1", "--seed", "3", "--save-interval", "7", "--no-noise", "--no-randomize",
-       "--history", "1", "--env.gravity", "3.71", "--env.rewards.rest.weight", "-0.5", "--ppo.gamma=0.9"]  # fmt: skip
+OWN = ["--num-envs", "4", "--max-iterations", "1", "--seed", "3", "--save-interval", "7", "--no-noise",
+       "--no-randomize", "--history", "1", "--env.gravity", "3.71", "--env.rewards.rest.weight", "-0.5",
+       "--ppo.gamma=0.9"]  # fmt: skip
 HERE = ["--device", "cpu", "--no-tensorboard"]
 
 
@@ -53,12 +54,12 @@ def changed(told):
 
 
 def test_a_run_goes_on_with_its_own_settings(capsys, run, begun):
-    code, folder, told = train(capsys, "--resume", "latest", "--log-root", str(run.parents[1]), "--iterations", "2")
-    assert (code, folder) == (0, str(run)) and changed(told) == ["iterations 1 -> 2"]
+    code, folder, told = train(capsys, "--resume", "latest", "--log-root", str(run.parents[1]), "--max-iterations", "2")
+    assert (code, folder) == (0, str(run)) and changed(told) == ["max-iterations 1 -> 2"]
     before, after = config(begun), config(run)
     assert after["env"] == before["env"] and (after["env"]["noise"], after["env"]["randomize"]) == (False, False)
     assert after["env"]["task"]["gravity"] == 3.71 and after["env"]["robot"]["values"]["spring_stiffness"] == [600.0]
-    session = ("iterations", "resume", "log_root")
+    session = ("max_iterations", "resume", "log_root")
     assert all(after["train"][name] == value for name, value in before["train"].items() if name not in session)
     assert (run / "checkpoints" / "iteration_000002.pt").is_file()
 
@@ -66,9 +67,9 @@ def test_a_run_goes_on_with_its_own_settings(capsys, run, begun):
 def test_flags_change_the_settings_and_each_change_is_told(capsys, run):
     flags = ["--env.gravity", "9.81", "--env.rewards.rest.weight", "-0.25", "--ppo.gamma", "0.95", "--noise"]
     flags += ["--env.reset.tilt", "2"]
-    code, _, told = train(capsys, "--resume", str(run), "--iterations", "2", *flags)
+    code, _, told = train(capsys, "--resume", str(run), "--max-iterations", "2", *flags)
     assert code == 0 and changed(told) == [
-        "iterations 1 -> 2", "ppo.gamma 0.9 -> 0.95", "noise False -> True", "env.reset.tilt 5.0 -> 2.0",
+        "max-iterations 1 -> 2", "ppo.gamma 0.9 -> 0.95", "noise False -> True", "env.reset.tilt 5.0 -> 2.0",
         "env.rewards.rest.weight -0.5 -> -0.25", "env.gravity 3.71 -> 9.81",
     ]  # fmt: skip
     after = config(run)
@@ -79,7 +80,7 @@ def test_flags_change_the_settings_and_each_change_is_told(capsys, run):
 def test_settings_of_the_session_are_not_those_of_the_run(run):
     args = parse_train(["vertical-jump", "--resume", str(run)])[0].cfg
     assert (args.device, args.tensorboard, args.threads, args.resume) == (None, True, None, str(run))
-    assert (args.seed, args.save_interval, args.num_envs, args.iterations) == (3, 7, 4, 1)
+    assert (args.seed, args.save_interval, args.num_envs, args.max_iterations) == (3, 7, 4, 1)
 
 
 def test_the_robot_of_a_flag_takes_the_place_of_the_runs(run, tmp_path):
@@ -111,13 +112,13 @@ def test_what_an_older_run_does_not_tell_has_the_flags_defaults(capsys, run):
     resave(run, lacks=("noise", "randomize"))
     args, task = parse_train(["vertical-jump", "--resume", str(run)])
     assert (args.noise, args.randomize, task.gravity) == (True, True, 3.71)
-    told = train(capsys, "--resume", str(run), "--iterations", "2", "--no-randomize")[2]
-    assert changed(told) == ["iterations 1 -> 2", "randomize None -> False", "noise None -> True"]
+    told = train(capsys, "--resume", str(run), "--max-iterations", "2", "--no-randomize")[2]
+    assert changed(told) == ["max-iterations 1 -> 2", "randomize None -> False", "noise None -> True"]
 
 
 def test_nothing_left_to_train_names_the_flag(capsys, run):
     code, _, told = train(capsys, "--resume", str(run))
-    assert code == 0 and told[-1] == "nothing is left to train after iteration 1: give more than --iterations 1"
+    assert code == 0 and told[-1] == "nothing is left to train after iteration 1: give more than --max-iterations 1"
 
 
 def test_settings_that_do_not_fit_the_checkpoint_are_named(capsys, run):

@@ -34,7 +34,7 @@ def overlay(tmp_path_factory):
 
 @pytest.mark.parametrize("command", ["evaluate", "play"])
 def test_a_policy_jumps_less_high_with_the_heavier_robot(overlay, tmp_path, command):
-    count = ["--jumps", "3", "--lower", "0.7"] if command == "evaluate" else ["--height", "1.1"]
+    count = ["--num-jumps", "3", "--height-range", "0.7", "1.2"] if command == "evaluate" else ["--height", "1.1"]
     found, apex = {}, {}
     for name, flags in (("described", []), ("identified", ["--robot", str(overlay)])):
         main([command, "vertical_jump", *count, *flags, "--out", str(tmp_path / name), "--device", "cpu"])

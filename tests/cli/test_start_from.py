@@ -11,7 +11,7 @@ from jumper_warp.cli.train import command_line
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.rl.checkpoint import load_checkpoint
 
-TRAIN = ["train", "horizontal-jump-mars", "--num-envs", "4", "--iterations", "1", "--device", "cpu", "--no-tensorboard"]
+TRAIN = "train horizontal-jump-mars --num-envs 4 --max-iterations 1 --device cpu --no-tensorboard".split()
 TRAIN += ["--ppo.num-steps", "2", "--ppo.minibatches", "1", "--ppo.epochs", "1", "--ppo.init-std", "0.3"]
 TRAIN += [part for name in ("lr", "min-lr", "max-lr") for part in (f"--ppo.{name}", "1e-9")]
 
@@ -48,14 +48,14 @@ def test_training_begins_with_a_run(begun, tmp_path, capsys):
 def test_a_repeated_command_resumes_the_run_that_it_began(tmp_path, capsys):
     told = []
     for iterations in ("1", "2"):
-        flags = ["--start-from", "slippery_jump", "--resume", "latest-or-new", "--iterations", iterations]
+        flags = ["--start-from", "slippery_jump", "--resume", "latest-or-new", "--max-iterations", iterations]
         cli.main([*TRAIN, *flags, "--log-root", str(tmp_path)])
         told.append(capsys.readouterr().err)
     (folder,) = (tmp_path / "horizontal-jump-mars").iterdir()
     assert "starts from slippery_jump" in told[0] and "resumed" not in told[0]
     assert f"resumed {folder / 'checkpoints' / 'iteration_000001.pt'}" in told[1] and "starts from" not in told[1]
     config = json.loads((folder / "config.json").read_text())["train"]
-    assert (config["iterations"], config["start_from"]) == (2, "slippery_jump")
+    assert (config["max_iterations"], config["start_from"]) == (2, "slippery_jump")
     assert (folder / "checkpoints" / "iteration_000002.pt").is_file()
 
 

@@ -36,7 +36,7 @@ def recorded(tmp_path_factory):
     folder = tmp_path_factory.mktemp("sysid")
     truth = RobotOverlay({"offset": tuple(np.radians(np.linspace(-1.0, 1.0, 12))), "latency": (0.003,)})
     truth.save(folder / "truth.json")
-    flags = ["--candidates", "1", "--seconds", "0.5", "--robot", str(folder / "truth.json")]
+    flags = ["--num-candidates", "1", "--seconds", "0.5", "--robot", str(folder / "truth.json")]
     main(["sysid", "excite", *PARAMS, *flags, "--out", str(folder / "motions")])
     return folder
 
@@ -78,7 +78,7 @@ def test_the_walk_through_weighs_the_robot_that_it_records():
 
 
 def test_a_mass_that_the_motions_contradict_is_told(recorded, capsys):
-    args = ["--params", "masses", "--mass", "20", "--mass-deviation", "0.5", "--out", str(recorded / "heavy")]
+    args = ["--params", "masses", "--mass", "20", "--mass-std", "0.5", "--out", str(recorded / "heavy")]
     main(["sysid", str(recorded / "motions" / "2_standing_chirp.npz"), *args])
     assert "misfit: total mass is given as 20 ± 0.5 but found as" in capsys.readouterr().out
 
@@ -104,7 +104,7 @@ def test_angles_of_the_other_sign_are_refused_without_warnings(recorded, capsys)
 def test_evolution_is_the_other_method(recorded):
     pytest.importorskip("cma")
     out = recorded / "evolved"
-    more = ["--method", "cma", "--max-seconds", "3", "--without", "offsets"]
+    more = ["--method", "cma", "--max-seconds", "3", "--exclude", "offsets"]
     main(["sysid", str(recorded / "motions" / "0_hung_chirp.npz"), *PARAMS, *more, "--out", str(out)])
     assert load_overlay(out / "identified.json").values["latency"][0] == pytest.approx(0.003, abs=1.0e-3)
 
@@ -125,7 +125,7 @@ def test_a_motor_is_characterised_from_a_bench(tmp_path):
         (["nowhere.npz"], "nowhere.npz"),
         (["."], "no npz, csv or parquet file"),
         (["x.npz", "--params", "gears"], "unknown group of parameters 'gears'"),
-        (["x.npz", "--without", "kd,kq"], "no parameter 'kq' to leave out"),
+        (["x.npz", "--exclude", "kd,kq"], "no parameter 'kq' to leave out"),
         (["x.npz", "--mass", "14500"], "must be in 7.25 to 29 kg (the robot is described with 14.5 kg), got 14500 kg"),
         (["x.npz", "--noise.angle", "0"], "noise angle must be positive"),
     ],

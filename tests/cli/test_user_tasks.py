@@ -85,7 +85,7 @@ def low_jump():
 register_task("tame-jump", tame_jump, ppo=PpoCfg(gamma=0.9), aliases=("Tame",))
 register_task("low-jump", low_jump, ppo=PpoCfg(gamma=0.9))
 '''
-TRAIN = ["--num-envs", "4", "--iterations", "1", "--no-tensorboard", "--device", "cpu", "--ppo.num-steps", "2"]
+TRAIN = ["--num-envs", "4", "--max-iterations", "1", "--no-tensorboard", "--device", "cpu", "--ppo.num-steps", "2"]
 TRAIN += ["--ppo.minibatches", "2", "--ppo.hidden", "8", "--env.rewards.rest.height", "0.4"]
 
 
@@ -211,10 +211,10 @@ def test_command_that_goes_on_names_the_module(path):
 def test_training_is_resumed(capsys, runs, path, tmp_path):
     folder = tmp_path / "tame-jump" / "run"
     shutil.copytree(runs["tame-jump"], folder)
-    args = ["--device", "cpu", "--iterations", "2", "--resume", str(folder)]
+    args = ["--device", "cpu", "--max-iterations", "2", "--resume", str(folder)]
     code, _, err = run(capsys, "train", "tame-jump", "--task-module", path, *args)
     assert code == 0, err
-    assert "iterations 1 -> 2" in err and sum(" -> " in line for line in err) == 1
+    assert "max-iterations 1 -> 2" in err and sum(" -> " in line for line in err) == 1
     assert not any("has changed since" in line for line in err)
     config = json.loads((folder / "config.json").read_text())
     assert config["env"]["task"]["rewards"][0]["height"] == 0.4 and config["train"]["num_envs"] == 4
@@ -226,11 +226,11 @@ def test_a_changed_file_is_told_and_settings_stay_those_of_the_run(capsys, runs,
     shutil.copytree(runs["tame-jump"], folder)
     edited.parent.mkdir()
     edited.write_text(TASK.replace("view.height / height", "view.height / (2.0 * height)"))
-    args = ["--device", "cpu", "--iterations", "2", "--resume", str(folder)]
+    args = ["--device", "cpu", "--max-iterations", "2", "--resume", str(folder)]
     code, _, err = run(capsys, "train", "tame-jump", "--task-module", str(edited), *args)
     assert code == 0, err
     told = "my_jumps has changed since: its functions are those of now, settings those of the run"
-    assert err.count(told) == 1 and "iterations 1 -> 2" in err
+    assert err.count(told) == 1 and "max-iterations 1 -> 2" in err
     config = json.loads((folder / "config.json").read_text())
     assert config["sources"] == {"my_jumps": hashlib.sha256(edited.read_bytes()).hexdigest()}
     assert config["env"]["task"]["rewards"][0]["height"] == 0.4
@@ -282,7 +282,7 @@ def test_a_mistake_in_a_users_file_is_told_in_one_line(right, wrong, told, tmp_p
     line = next(i for i, row in enumerate(text.splitlines(), 1) if "RewardTerm(level" in row)
     monkeypatch.delitem(sys.modules, "own_faults", raising=False)
     before = dict(TASKS)
-    args = [*"--device cpu --num-envs 4 --iterations 1".split(), "--log-root", str(tmp_path)]
+    args = [*"--device cpu --num-envs 4 --max-iterations 1".split(), "--log-root", str(tmp_path)]
     try:
         code, _, err = run(capsys, "train", "own-faults", "--task-module", str(path), *args)
     finally:

@@ -101,7 +101,7 @@ def test_nominal_conditions_leave_the_task_alone_but_for_margins():
 
 
 def test_fixed_parameters_are_all_that_changes_of_a_nominal_robot():
-    conditions = Conditions(latency=8.0, gains=(0.6, 1.0), friction=0.4)
+    conditions = Conditions(latency=8.0, gain_scale=(0.6, 1.0), friction=0.4)
     task = places.for_evaluation(JUMP)
     nominal = make_env(2, task=task, auto_reset=False)
     env = make_env(2, task=conditions.applied(task), randomize=conditions.draws, auto_reset=False)
@@ -130,7 +130,7 @@ def test_a_fixed_parameter_that_is_nominal_changes_no_bit():
 
 
 def test_randomised_conditions_draw_the_rest():
-    drawn = Conditions(randomize=True, gains=(0.6, 1.0), latency=50.0).applied(JUMP).randomization
+    drawn = Conditions(randomize=True, gain_scale=(0.6, 1.0), latency=50.0).applied(JUMP).randomization
     assert (drawn.gains, drawn.damping_gains, drawn.latency) == ((0.6, 0.6), (1.0, 1.0), (50.0, 50.0))
     assert drawn.base_mass == RandomizationCfg().base_mass
 
@@ -145,8 +145,8 @@ def test_randomised_conditions_draw_the_rest():
         ),
         (lambda: Conditions(seed=-1), r"seed must be in 0 \.\. 2147483647, got -1"),
         (lambda: EvaluationArgs(latency=-1.0), "latency must not be negative"),
-        (lambda: Conditions(gains=(0.0, 1.0)), "gains must be above 0"),
-        (lambda: EvaluationArgs(gains=(1.0, -1.0)), "damping_gains must be above 0"),
+        (lambda: Conditions(gain_scale=(0.0, 1.0)), "gains must be above 0"),
+        (lambda: EvaluationArgs(gain_scale=(1.0, -1.0)), "damping_gains must be above 0"),
         (lambda: Conditions(friction=-0.1), "friction must not be negative"),
         (lambda: EvaluationArgs(push_in_flight=True), "push_in_flight needs randomize"),
     ],
@@ -166,7 +166,7 @@ def test_latency_is_told_as_it_was_simulated():
 
 def test_run_tells_the_latency_it_simulated_over_several_policy_steps(tmp_path):
     save_policy(tmp_path / "still", still_policy("horizontal-jump"))
-    args = EvaluationArgs(policy=str(tmp_path / "still"), latency=40.0, record=0, out=tmp_path, device="cpu")
+    args = EvaluationArgs(policy=str(tmp_path / "still"), latency=40.0, num_recorded=0, out=tmp_path, device="cpu")
     run = EvaluationRun.of("test", args)
     env = run.env(2)
     asked = places.PlaceLog(np.array([[[0.5, 0.0]]] * 2), tuple(term.name for term in env.task.terminations))

@@ -14,7 +14,8 @@ from jumper_warp.policies.runs import open_policy
 from jumper_warp.trajectory.gauss_newton import Network
 from jumper_warp.utils.errors import InputError
 
-FEW = {"goals": 4, "late": 0, "randomized": 0, "heights": (0.8, 1.05), "iterations": 1, "device": "cpu"}
+FEW = {"num_goals": 4, "num_delayed": 0, "num_randomized": 0, "height_range": (0.8, 1.05)}
+FEW |= {"iterations": 1, "device": "cpu"}
 
 
 @pytest.fixture(scope="module")
@@ -62,12 +63,12 @@ def test_the_same_seed_gives_the_same_bits(tuned):
 
 def test_command_writes_a_policy_that_can_be_opened(tmp_path, capsys):
     out = tmp_path / "tuned"
-    flags = "--goals 2 --late 0 --randomized 0 --iterations 1 --device cpu".split()
+    flags = "--num-goals 2 --num-delayed 0 --num-randomized 0 --iterations 1 --device cpu".split()
     main(["finetune", "vertical_jump", *flags, "--out", str(out)])
     assert capsys.readouterr().out.splitlines()[-1] == str(out)
     policy = open_policy(out)
     assert not torch.equal(policy.layers[0][0], open_policy("vertical_jump").layers[0][0])
-    assert policy.config["finetuned"]["settings"]["goals"] == 2
+    assert policy.config["finetuned"]["settings"]["num_goals"] == 2
     assert len(json.loads((out / "finetuning.json").read_text())["steps"]) == 2
     with pytest.raises(SystemExit) as end:
         main(["finetune", "vertical_jump", "--out", str(out)])
@@ -77,7 +78,7 @@ def test_command_writes_a_policy_that_can_be_opened(tmp_path, capsys):
 
 def test_misses_on_mars_are_those_of_robots_at_rest():
     policy = open_policy("mars_horizontal_jump")
-    (group,) = make_groups(policy, FinetuneCfg(**FEW | {"distances": (1.0, 4.0)}))
+    (group,) = make_groups(policy, FinetuneCfg(**FEW | {"distance_range": (1.0, 4.0)}))
     assert not group.to_height
     found = follow(group, Network(policy), derivatives=False)
     arrays = group.env.task_arrays()
@@ -95,7 +96,8 @@ def test_a_policy_sees_its_goals_shifted():
 
 def test_aim_brings_a_policy_that_jumps_too_far_back_to_its_goals():
     """A policy with its goals 40 mm farther away than in training ends nearer to them than it did then."""
-    policy, cfg = open_policy("slippery_jump"), FinetuneCfg(**FEW | {"goals": 8, "iterations": 0})  # no aim was taken
+    policy = open_policy("slippery_jump")  # no aim was taken
+    cfg = FinetuneCfg(**FEW | {"num_goals": 8, "iterations": 0})
     own = follow(make_groups(policy, cfg)[0], Network(policy), derivatives=False).value
     aimed, record = finetune(with_aim(policy, 0.04), cfg, say=lambda line: None)
     first, *_, last = record["aims"]
@@ -107,7 +109,8 @@ def test_aim_brings_a_policy_that_jumps_too_far_back_to_its_goals():
 
 
 @pytest.mark.parametrize(
-    "change", [{"goals": 1}, {"late": -1}, {"iterations": -1}, {"heights": (0.9, 0.5)}, {"action_std": 0.0}]
+    "change",
+    [{"num_goals": 1}, {"num_delayed": -1}, {"iterations": -1}, {"height_range": (0.9, 0.5)}, {"action_std": 0.0}],
 )
 def test_impossible_settings_are_refused(change):
     with pytest.raises(InputError):

@@ -46,7 +46,7 @@ def simulated_apex(kp, kd):
     ("gains", "about"), [(None, OPEN_LOOP_APEX), ((0.6, 1.0), 0.757)], ids=["nominal", "weak"]
 )  # 0.757 m was found from outside
 def test_limit_is_the_apex_of_the_open_loop_jump(gains, about):
-    found = open_loop_limits(*begun(Conditions(gains=gains), 2))
+    found = open_loop_limits(*begun(Conditions(gain_scale=gains), 2))
     assert found == pytest.approx([simulated_apex(*(gains or (1.0, 1.0)))] * 2, abs=0.002)
     assert found == pytest.approx([about] * 2, abs=0.005)
 

@@ -137,9 +137,9 @@ def test_grid_and_steps_are_where_they_should_be():
 
 @pytest.mark.parametrize(
     "make",
-    [lambda: VelocityFlags(per_axis=1), lambda: VelocityFlags(per_axis=40), lambda: VelocityFlags(seconds=0.0),
-     lambda: VelocityFlags(reach=(11.0, 0.0, 0.0)), lambda: VelocityGoals(velocity=((11.0, 0.0, 0.0),)),
-     lambda: VelocityGoals(each=-1.0)],
+    [lambda: VelocityFlags(commands_per_axis=1), lambda: VelocityFlags(commands_per_axis=40),
+     lambda: VelocityFlags(seconds=0.0), lambda: VelocityFlags(max_velocity=(11.0, 0.0, 0.0)),
+     lambda: VelocityGoals(velocity=((11.0, 0.0, 0.0),)), lambda: VelocityGoals(command_interval=-1.0)],
 )  # fmt: skip
 def test_settings_out_of_range_are_refused(make):
     with pytest.raises(InputError):
@@ -149,7 +149,7 @@ def test_settings_out_of_range_are_refused(make):
 def test_played_velocities_come_one_after_the_other():
     one, two = ((0.5, 0.0, 0.3),), ((0.5, 0.0, 0.3), (0.0, -0.2, 0.0))
     np.testing.assert_array_equal(VelocityGoals(velocity=one).log(TASK).commands, [one])
-    goals = VelocityGoals(velocity=two, each=2.0)
+    goals = VelocityGoals(velocity=two, command_interval=2.0)
     assert goals.length == 4.0 and goals.log(TASK).times.tolist() == [0.0, 2.0]
     np.testing.assert_array_equal(goals.log(TASK).commands, [two])
     assert VelocityGoals().log(TASK).commands.shape == (1, 6, 3)

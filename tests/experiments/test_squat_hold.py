@@ -43,7 +43,7 @@ def test_robots_that_do_not_hold_have_no_forces():
 
 @pytest.mark.parametrize("policy", ["vertical_jump", "horizontal_jump", "slippery_waiting_jump"])
 def test_shipped_policies_hold_their_squats(policy, tmp_path):
-    args = squat_hold.Args(policy=policy, squats=2, record=0, out=tmp_path, device="cpu")
+    args = squat_hold.Args(policy=policy, num_squats=2, num_recorded=0, out=tmp_path, device="cpu")
     values = squat_hold.main(args)
     assert values == json.loads((tmp_path / "metrics.json").read_text())
     assert values["holding_rate"] == 1.0 and values["lost_paw_share"] == 0.0
@@ -53,6 +53,6 @@ def test_shipped_policies_hold_their_squats(policy, tmp_path):
 
 def test_what_cannot_be_is_refused():
     with pytest.raises(InputError, match="need at least one squat"):
-        squat_hold.Args(hold=0.5)
+        squat_hold.Args(hold_time=0.5)
     with pytest.raises(InputError, match="height must be in"):
         squat_hold.Args(height=(1.0, 0.5))

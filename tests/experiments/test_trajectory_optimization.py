@@ -12,7 +12,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def test_experiment_tells_what_its_targets_do(tmp_path):
     """A short search: the figures are those of a replay of the targets that it wrote."""
-    args = experiment.Args(jumps=("highest",), samples=48, effort=0.01, polish=1, out=tmp_path, device="cpu")
+    args = experiment.Args(jumps=("highest",), samples=48, effort=0.01, final_iterations=1, out=tmp_path, device="cpu")
     values = experiment.main(args)
     saved = np.load(tmp_path / "highest.npz", allow_pickle=False)
     replay = JUMPS["highest"].replay(saved["targets"])
@@ -77,7 +77,7 @@ def test_run_ups_lean_back_before_they_push():
     assert motion.takeoff(0.25)[1].float().mean() > 0.5
 
 
-@pytest.mark.parametrize("flags", [{"jumps": ("wings",)}, {"effort": 0.0}, {"samples": 3}, {"polish": 0}])
+@pytest.mark.parametrize("flags", [{"jumps": ("wings",)}, {"effort": 0.0}, {"samples": 3}, {"final_iterations": 0}])
 def test_flags_that_cannot_be_are_told_in_a_line(flags, capsys):
     with pytest.raises(SystemExit):
         run_command(lambda: experiment.Args(**flags))

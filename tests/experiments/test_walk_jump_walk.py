@@ -19,7 +19,7 @@ KEYS = (
 def test_two_robots_do_the_papers_test(tmp_path, monkeypatch):
     monkeypatch.setattr(walk_jump_walk, "WALKS", (1, 1, 1))
     monkeypatch.setattr(walk_jump_walk, "EACH", 1.5)
-    values = walk_jump_walk.main(walk_jump_walk.Args(robots=2, record=1, out=tmp_path, device="cpu"))
+    values = walk_jump_walk.main(walk_jump_walk.Args(num_robots=2, num_recorded=1, out=tmp_path, device="cpu"))
     figures = json.loads((tmp_path / "metrics.json").read_text())
     assert figures == values and set(KEYS) <= set(figures)
     assert (figures["success_rate"], figures["robots"], figures["jumps_made"]) == (1.0, 2, 4)
@@ -38,12 +38,12 @@ def test_scripts_are_those_of_the_test():
         kinds = [step.kind for step in script]
         assert len(script) == 10 and {"jump_up", "jump_to"} <= set(kinds)
         assert all(np.abs(step.values).max() <= 0.8 for step in script if step.kind == "walk")
-    args = walk_jump_walk.Args(robots=3, course=True, seed=5)
+    args = walk_jump_walk.Args(num_robots=3, course=True, seed=5)
     assert walk_jump_walk.scripts(args) == walk_jump_walk.scripts(args)
 
 
 def test_what_cannot_be_is_refused(tmp_path):
     with pytest.raises(InputError, match="robots"):
-        walk_jump_walk.Args(robots=0)
+        walk_jump_walk.Args(num_robots=0)
     with pytest.raises(PolicyError, match="evaluated by velocity"):
         walk_jump_walk.main(walk_jump_walk.Args(policy="vertical_jump", out=tmp_path, device="cpu"))

@@ -27,7 +27,7 @@ def policies(tmp_path_factory):
 
 def test_robots_that_stand_still_follow_nothing(policies, tmp_path):
     args = walking_tracking.Args(
-        policy=str(policies / "velocity-flat"), per_axis=2, record=0, out=tmp_path, device="cpu"
+        policy=str(policies / "velocity-flat"), commands_per_axis=2, num_recorded=0, out=tmp_path, device="cpu"
     )
     values = walking_tracking.main(args)
     figures = json.loads((tmp_path / "metrics.json").read_text())
@@ -42,7 +42,7 @@ def test_robots_that_stand_still_follow_nothing(policies, tmp_path):
 
 def test_robots_that_stand_still_come_nowhere_on_any_ground(policies, tmp_path):
     args = walking_terrain.Args(
-        policy=str(policies / "velocity-flat"), robots=3, terrains=("flat", "stairs"), record=1, out=tmp_path,
+        policy=str(policies / "velocity-flat"), num_robots=3, terrains=("flat", "stairs"), num_recorded=1, out=tmp_path,
         device="cpu",
     )  # fmt: skip
     figures = walking_terrain.main(args)
@@ -70,7 +70,7 @@ def test_policy_of_another_task_and_settings_out_of_range_are_refused(policies, 
         walking_tracking.main(
             walking_tracking.Args(policy=str(policies / "horizontal-jump"), out=tmp_path, device="cpu")
         )
-    with pytest.raises(InputError, match="per_axis"):
-        walking_tracking.Args(per_axis=1)
+    with pytest.raises(InputError, match="commands_per_axis"):
+        walking_tracking.Args(commands_per_axis=1)
     with pytest.raises(InputError, match="speed"):
         walking_terrain.Args(speed=0.9)

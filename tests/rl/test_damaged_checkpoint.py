@@ -28,7 +28,7 @@ class Saved:
     def __init__(self, folder):
         self.env = make_env(2, seed=1, randomize=True, noise=True)
         self.cfg = TrainCfg(
-            task="jump", num_envs=2, iterations=1, device="cpu", log_root=folder, tensorboard=False, ppo=PPO
+            task="jump", num_envs=2, max_iterations=1, device="cpu", log_root=folder, tensorboard=False, ppo=PPO
         )
         self.path = train(self.cfg, lambda *_: self.env).folder / CHECKPOINTS / "iteration_000001.pt"
         self.data, self.state = self.path.read_bytes(), load_checkpoint(self.path)
@@ -42,7 +42,7 @@ class Saved:
 
     def resume(self):
         """Return what is wrong with the checkpoint, or None after an iteration from it."""
-        cfg = TrainCfg(**{**vars(self.cfg), "iterations": 100, "resume": str(self.path)})
+        cfg = TrainCfg(**{**vars(self.cfg), "max_iterations": 100, "resume": str(self.path)})
         try:
             run = Run(cfg, self.env, ALONE)
         except CheckpointError as error:

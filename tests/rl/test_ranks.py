@@ -28,7 +28,7 @@ def test_torchs_threads_stay_where_the_environment_names_them(one_thread, monkey
 def test_torch_has_as_many_threads_as_a_training_asks_for(one_thread, monkeypatch, tmp_path):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     cfg = TrainCfg(
-        task="push", num_envs=32, iterations=1, device="cpu", log_root=tmp_path, tensorboard=False, ppo=SMALL
+        task="push", num_envs=32, max_iterations=1, device="cpu", log_root=tmp_path, tensorboard=False, ppo=SMALL
     )
     for threads in (1, 3):
         train(dataclasses.replace(cfg, threads=threads), PushTask)

@@ -165,7 +165,7 @@ def test_checkpoint_of_a_symmetric_actor_resumes_and_becomes_a_plain_policy(tmp_
 def test_task_without_mirror_image_is_refused_in_one_line(capsys, monkeypatch):
     monkeypatch.setitem(TASKS, "hold-height", TaskEntry("hold_height:hold_height"))
     with pytest.raises(SystemExit):
-        main(["train", "hold-height", "--ppo.symmetry", "actor", "--num-envs", "8", "--iterations", "1"])
+        main(["train", "hold-height", "--ppo.symmetry", "actor", "--num-envs", "8", "--max-iterations", "1"])
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and "hold-height policy: the mirror image of" in lines[0]
 

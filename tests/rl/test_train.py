@@ -64,11 +64,11 @@ def test_each_logged_iteration_is_told(cfg, capsys):
 
 def resume_after(cfg, seconds, limit):
     """Resume a checkpoint that tells of so many seconds (None: of none) under a time limit; return run and result."""
-    half = train(dataclasses.replace(cfg, iterations=2), make_env)
+    half = train(dataclasses.replace(cfg, max_iterations=2), make_env)
     state = final_state(half)
     assert 0.0 < state.pop("seconds") <= half.seconds
     save_checkpoint(half.folder / CHECKPOINTS, state if seconds is None else {**state, "seconds": seconds})
-    cfg = dataclasses.replace(cfg, iterations=100_000, max_seconds=limit, resume=str(half.folder))
+    cfg = dataclasses.replace(cfg, max_iterations=100_000, max_seconds=limit, resume=str(half.folder))
     run = Run(cfg, make_env(cfg.num_envs, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
     with Stop() as stop:
         return run, run.iterate(stop)
@@ -98,7 +98,7 @@ def test_a_checkpoint_with_an_unreadable_time_is_refused_in_one_line(cfg):
 def test_latest_passes_over_a_damaged_checkpoint(cfg, capsys):
     result = train(cfg, make_env)
     (result.folder / CHECKPOINTS / "iteration_000004.pt").write_bytes(b"cut")
-    resumed = train(dataclasses.replace(cfg, resume="latest", iterations=3), make_env)
+    resumed = train(dataclasses.replace(cfg, resume="latest", max_iterations=3), make_env)
     assert (resumed.folder, resumed.iteration) == (result.folder, 3)
     told = capsys.readouterr().err
     assert "passed over" in told
@@ -147,7 +147,7 @@ def test_a_signal_ends_the_iteration_saves_and_tells_how_to_go_on(cfg, number, c
 
     before = signal.getsignal(number)
     with pytest.raises(SystemExit) as caught:
-        train(dataclasses.replace(cfg, iterations=100), lambda n, seed, device: Signalled(n, seed, device))
+        train(dataclasses.replace(cfg, max_iterations=100), lambda n, seed, device: Signalled(n, seed, device))
     assert caught.value.code == 130
     assert signal.getsignal(number) is before
     (path,) = cfg.log_root.glob("push/*/checkpoints/iteration_000003.pt")
@@ -168,7 +168,7 @@ def test_the_second_interrupt_does_not_wait(cfg):
 
 def test_the_time_limit_ends_and_saves(cfg):
     begin = time.perf_counter()
-    result = train(dataclasses.replace(cfg, iterations=100_000, max_seconds=0.5), make_env)
+    result = train(dataclasses.replace(cfg, max_iterations=100_000, max_seconds=0.5), make_env)
     assert time.perf_counter() - begin < 10.0
     assert 0.5 <= result.seconds < 5.0
     assert final_state(result)["iteration"] == result.iteration
@@ -224,7 +224,7 @@ def test_every_process_takes_up_its_own_worlds(cfg):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"iterations": 0}, "iterations must be at least 1, got 0"),
+        ({"max_iterations": 0}, "max_iterations must be at least 1, got 0"),
         ({"max_seconds": -1.0}, "max_seconds must be finite and not negative, got -1.0"),
         ({"max_seconds": math.nan}, "max_seconds must be finite and not negative, got nan"),
         ({"max_seconds": math.inf}, "max_seconds must be finite and not negative, got inf"),
@@ -273,11 +273,11 @@ def test_every_logged_figure_can_be_the_score(cfg):
 
 
 def test_the_largest_seed_trains(cfg):
-    assert train(dataclasses.replace(cfg, seed=2**31 - 1, iterations=1), make_env).iteration == 1
+    assert train(dataclasses.replace(cfg, seed=2**31 - 1, max_iterations=1), make_env).iteration == 1
 
 
 def test_a_folder_of_logs_may_be_a_text(cfg):
-    result = train(dataclasses.replace(cfg, log_root=str(cfg.log_root), iterations=1), make_env)
+    result = train(dataclasses.replace(cfg, log_root=str(cfg.log_root), max_iterations=1), make_env)
     assert result.folder.parent == cfg.log_root / "push"
 
 
@@ -335,7 +335,7 @@ def test_rsl_rl_counts_steps_and_gets_metrics_once_per_iteration():
 
 
 def test_rsl_rl_trains(cfg, tmp_path):
-    result = train(dataclasses.replace(cfg, trainer="rsl-rl", iterations=2), make_env, as_rsl_rl=RslRlVecEnv)
+    result = train(dataclasses.replace(cfg, trainer="rsl-rl", max_iterations=2), make_env, as_rsl_rl=RslRlVecEnv)
     assert (result.folder / "model_1.pt").exists()
     assert (result.folder / CONFIG).exists()
 

@@ -12,7 +12,7 @@ from toy_task import SMALL, PushTask, push_cfg
 
 @pytest.fixture
 def cfg(tmp_path):
-    return push_cfg(tmp_path / "logs", iterations=100)
+    return push_cfg(tmp_path / "logs", max_iterations=100)
 
 
 def saved_seconds(result):
@@ -55,7 +55,7 @@ def test_the_time_limit_counts_from_the_end_of_the_first_iteration(cfg, monkeypa
 def test_what_is_left_follows_the_pace_after_the_first_iteration_and_the_limit(
     cfg, monkeypatch, capsys, seconds, limit, left
 ):
-    limited = dataclasses.replace(cfg, iterations=103, max_seconds=limit, log_interval=3)
+    limited = dataclasses.replace(cfg, max_iterations=103, max_seconds=limit, log_interval=3)
     with pytest.raises(IndexError):
         train_clocked(monkeypatch, limited, [9000.0, *[seconds] * 3 * 16])
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("iteration 3/103: ")]

@@ -16,7 +16,7 @@ NUMBERS = {"Perf/fps": 1234.0, "Metrics/success": 0.5}
 
 @pytest.fixture
 def cfg(tmp_path):
-    return push_cfg(tmp_path / "logs", iterations=6, log_interval=1)
+    return push_cfg(tmp_path / "logs", max_iterations=6, log_interval=1)
 
 
 @contextlib.contextmanager
@@ -122,7 +122,7 @@ def test_a_terminal_that_is_gone_stops_nothing(tmp_path, monkeypatch):
 
 
 def test_a_resumed_run_drops_a_half_line_and_later_iterations(cfg, capsys):
-    half = train(dataclasses.replace(cfg, iterations=4), PushTask)
+    half = train(dataclasses.replace(cfg, max_iterations=4), PushTask)
     path = half.folder / FIGURES
     kept = path.read_text().splitlines()[:2]
     path.write_bytes(path.read_bytes()[:-30])
@@ -155,7 +155,7 @@ def test_a_file_of_figures_is_whole_again(tmp_path, content, kept):
 
 def test_events_of_iterations_after_the_resumed_one_are_hidden(cfg):
     cfg = dataclasses.replace(cfg, tensorboard=True)
-    half = train(dataclasses.replace(cfg, iterations=4), PushTask)
+    half = train(dataclasses.replace(cfg, max_iterations=4), PushTask)
     train(dataclasses.replace(cfg, resume=str(half.folder / CHECKPOINTS / "iteration_000002.pt")), PushTask)
     assert steps(half.folder) == [1, 2, 3, 4, 5, 6]
 
