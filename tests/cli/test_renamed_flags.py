@@ -29,14 +29,14 @@ from support.soak import SoakArgs
         (SoakArgs, ["--no-filter"], ["--no-command-filter"]),
     ],
 )
-def test_old_flag_becomes_the_new_one_and_prints_it(cfg, old, new, capsys):
+def test_old_flag_becomes_the_new_flag_and_prints_it(cfg, old, new, capsys):
     assert use_new_names(old, cfg) == new
     (line,) = capsys.readouterr().err.splitlines()
     assert re.fullmatch(r"jumper: --[a-z-]+ is now --[a-z-]+", line)
     assert use_new_names(new, cfg) == new and not capsys.readouterr().err
 
 
-def test_flag_of_the_same_name_in_a_users_own_task_is_left_alone(capsys):
+def test_keeps_flag_of_a_users_task_with_an_old_name(capsys):
     @dataclass
     class OwnFlags:
         jumps: int = 1
@@ -46,7 +46,7 @@ def test_flag_of_the_same_name_in_a_users_own_task_is_left_alone(capsys):
 
 
 @pytest.mark.parametrize("old", ["--keep", "--keep=4", "--no-keep"])
-def test_old_and_new_flag_together_are_refused_in_one_line(old):
+def test_refuses_old_and_new_flag_together(old):
     with pytest.raises(InputError, match=r"^--keep is now --max-checkpoints: give only --max-checkpoints$"):
         use_new_names([old, "--max_checkpoints", "5"], TrainArgs())
 
@@ -64,12 +64,12 @@ def test_lower_and_upper_become_a_height_range(capsys):
 
 
 @pytest.mark.parametrize("flag", ["--iter", "--max-iter", "--kee", "--low"])
-def test_beginning_of_a_flag_is_refused(flag, capsys):
+def test_refuses_abbreviated_flags(flag, capsys):
     code, _, err = run(capsys, "train", "vertical-jump", flag, "3")
     assert code == 2 and "Unrecognized options" in "\n".join(err) and "is now" not in "\n".join(err)
 
 
-def test_command_takes_the_old_flag_and_refuses_both(capsys):
+def test_command_accepts_old_flag_and_refuses_both(capsys):
     renamed = "jumper: --keep is now --max-checkpoints"
     code, _, err = run(capsys, "train", "vertical-jump", "--keep", "0")
     assert (code, err) == (2, [renamed, "jumper: max_checkpoints must be at least 1, got 0"])
@@ -77,7 +77,7 @@ def test_command_takes_the_old_flag_and_refuses_both(capsys):
     assert (code, err) == (2, [f"{renamed}: give only --max-checkpoints"])
 
 
-def test_script_takes_the_old_flag(capsys, monkeypatch):
+def test_script_accepts_old_flags(capsys, monkeypatch):
     monkeypatch.setattr("sys.argv", ["soak_test.py", "--envs", "8", "--no-filter"])
     args = parse_flags(SoakArgs)
     assert (args.num_envs, args.command_filter) == (8, False)

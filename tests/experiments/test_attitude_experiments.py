@@ -65,13 +65,13 @@ def test_a_policy_takes_off_to_its_heights_and_lands(run, tmp_path):
 
 
 def test_what_cannot_be_is_refused(tmp_path):
-    with pytest.raises(InputError, match="turns must be at least 6"):
+    with pytest.raises(InputError, match="num_turns must be at least 6"):
         attitude.Args(num_turns=3)
-    with pytest.raises(InputError, match="late in 0 to 100 ms"):
+    with pytest.raises(InputError, match="max_leg_delay in 0 to 100 ms"):
         flight_attitude.Args(max_leg_delay=200.0)
     with pytest.raises(InputError, match="takeoff by a policy needs one"):
         flight_attitude.Args(takeoff="policy")
-    with pytest.raises(InputError, match="heights must be in"):
+    with pytest.raises(InputError, match="height_range must be in"):
         flight_attitude.Args(height_range=(2.0, 1.0))
     with pytest.raises(PolicyError, match="evaluated by attitude"):
         attitude.main(attitude.Args(policy="vertical_jump", out=tmp_path, device="cpu"))

@@ -332,7 +332,7 @@ def test_script_refuses_a_policy_of_another_task_in_one_line_with_code_2(policy)
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: EvaluationArgs(record=-1), "num_recorded must not be negative"),
+        (lambda: EvaluationArgs(num_recorded=-1), "num_recorded must not be negative"),
         (lambda: DistanceSweep(num_jumps=2), "at least 3 jumps"),
         (lambda: Grid(rows=0), "at least one column and row"),
         (lambda: Consecutive(rest_time=0.0), "rest_time must be in"),
