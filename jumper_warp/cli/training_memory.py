@@ -60,11 +60,10 @@ def learning_need(cfg: PpoCfg, num_obs: int, num_critic_obs: int) -> MemoryNeed:
     sizes = ((num_obs, *cfg.hidden, NUM_ACTIONS), (critic_obs, *cfg.hidden, 1))
     weights = sum((a + 1) * b for each in sizes for a, b in pairwise(each))
     sample_bytes = FLOAT_BYTES * (num_obs + critic_obs + 2 * NUM_ACTIONS + 4 + MAX_PADDING)
-    rows = cfg.num_steps * (row * (1.0 + 1.0 / cfg.minibatches) + INDEX_BYTES * cfg.epochs)
-    passing = FLOAT_BYTES * cfg.num_steps * (2 * critic_obs + 2 * max(cfg.hidden))
-    return MemoryNeed(
-        4 * FLOAT_BYTES * weights, rollout_bytes(cfg.num_steps, num_obs, critic_obs) + int(rows) + passing
-    )
+    samples = cfg.num_steps * (sample_bytes * (1.0 + 1.0 / cfg.minibatches) + INDEX_BYTES * cfg.epochs)
+    critic_pass = FLOAT_BYTES * cfg.num_steps * (2 * critic_obs + 2 * max(cfg.hidden))
+    per_world = rollout_bytes(cfg.num_steps, num_obs, critic_obs) + int(samples) + critic_pass
+    return MemoryNeed(4 * FLOAT_BYTES * weights, per_world)
 
 
 def rollout_bytes(num_steps: int, num_obs: int, num_critic_obs: int) -> int:
