@@ -12,7 +12,7 @@ from typing import Any, get_type_hints
 from jumper_warp.utils.errors import InputError
 
 RENAMED = {
-    "aside": "max-lateral-offset", "candidates": "num-candidates",
+    "aside": "max-lateral-offset", "best-by": "best-metric", "candidates": "num-candidates",
     "distances": "distance-range", "each": "command-interval", "envs": "num-envs", "episode": "episode-steps",
     "episodes": "num-episodes", "every": "eval-interval", "exact": "no-noise", "filter": "command-filter",
     "first": "min-distance", "flights": "num-flights", "gains": "gain-scale gain-preset", "goals": "num-goals",
@@ -21,11 +21,14 @@ RENAMED = {
     "keep": "max-checkpoints save-to-policy", "kept-seeds": "baseline-seeds", "landing": "landing-policy",
     "last": "max-distance", "late": "num-delayed max-leg-delay", "late-std": "delayed-std", "length": "rest-length",
     "mass-deviation": "mass-std", "others": "num-mismatched", "per-axis": "commands-per-axis",
-    "polish": "final-iterations", "randomized": "num-randomized", "reach": "max-velocity", "record": "num-recorded",
-    "rest": "rest-time", "robots": "num-robots", "row": "jumps-per-trial", "seeds": "num-matched", "sets": "num-sets",
-    "squat": "squat-angle", "squats": "num-squats squat-angles", "step": "step-height", "steps": "num-steps",
-    "then": "next-goals", "torque": "torque-limit record-torque", "train": "train-flags", "trials": "num-trials",
-    "turns": "num-turns", "without": "exclude", "worlds": "num-gradient-envs num-envs", "x": "goal-x", "y": "goal-y",
+    "polish": "final-iterations", "ppo.asymmetric": "ppo.asymmetric-critic",
+    "ppo.final-entropy": "ppo.final-entropy-coef", "ppo.final-kl": "ppo.final-desired-kl",
+    "randomized": "num-randomized", "reach": "max-velocity", "record": "num-recorded", "rest": "rest-time",
+    "robots": "num-robots", "row": "jumps-per-trial", "seeds": "num-matched", "sets": "num-sets",
+    "squat": "squat-angle", "squats": "num-squats squat-angles", "start-from": "init-policy", "step": "step-height",
+    "steps": "num-steps", "then": "next-goals", "torque": "torque-limit record-torque", "train": "train-flags",
+    "trials": "num-trials", "turns": "num-turns", "without": "exclude", "worlds": "num-gradient-envs num-envs",
+    "x": "goal-x", "y": "goal-y",
 }  # fmt: skip
 """Old name to new name, or names for different commands with a space between; the first that a command has counts."""
 
@@ -46,8 +49,8 @@ def flag_names(cfg: Any) -> set[str]:
 
 def name_of(arg: str) -> str:
     """Return the name of a flag without dashes, `no-` and value, words with dashes between; "" if it is none."""
-    match = re.match(r"--(?:no-)?([^=]+)", arg)
-    return match[1].replace("_", "-") if match else ""
+    match = re.match(r"--([^=]+)", arg)
+    return re.sub(r"(^|\.)no-", r"\1", match[1].replace("_", "-")) if match else ""
 
 
 def use_new_names(args: Sequence[str], cfg: Any) -> list[str]:
@@ -67,7 +70,9 @@ def use_new_names(args: Sequence[str], cfg: Any) -> list[str]:
         if name_of(f"--{new}") in given:
             raise InputError(f"--{old} is now --{new}: give only --{new}")
         flag, equals, value = args[i].partition("=")
-        new_args[i] = f"--{'no-' * flag.startswith('--no-')}{new}{equals}{value}"
+        negated = re.search(r"(--|\.)no-", flag.replace("_", "-")) is not None
+        new_flag = re.sub(r"([^.]+)$", r"no-\1", new) if negated else new
+        new_args[i] = f"--{new_flag}{equals}{value}"
         renamed[old] = new
     for old, new in renamed.items():
         print(f"jumper: --{old} is now --{new}", file=sys.stderr)

@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 import tyro
 
 from jumper_warp.cli.main import TASK_MODULE, TASK_MODULE_HELP, USAGE_ERROR, UsageError, parse
+from jumper_warp.cli.renamed_flags import use_new_names
 from jumper_warp.registry import find_task, make_task, task_names
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.utils.errors import InputError
@@ -181,6 +182,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
 
     Raises as `parse_train`, `jumper_warp.policies.warm_start.start_from` and `jumper_warp.rl.runner.train`.
     """
+    args = [*args[:1], *use_new_names(args[1:], TrainArgs())]
     parsed, task = parse_train(args)
     from jumper_warp.rl.runner import train
     from jumper_warp.tasks.mirror import mirror_of

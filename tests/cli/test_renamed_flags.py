@@ -1,7 +1,7 @@
 """Flags that were renamed work under their old names, and print the new ones."""
 
 import re
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import pytest
@@ -89,6 +89,18 @@ def test_script_accepts_old_flags(capsys, monkeypatch):
 def test_documentation_lists_all_renamed_flags():
     text = (Path(__file__).parents[2] / "docs" / "renames.md").read_text(encoding="utf-8")
     rows = [line.split("|") for line in text.split("\n## ")[1].splitlines() if line.startswith("|")]
-    old, new = (set(re.findall(r"--([a-z][a-z-]*)", " ".join(row[column] for row in rows))) for column in (2, 3))
+    old, new = (set(re.findall(r"--([a-z][a-z.-]*)", " ".join(row[column] for row in rows))) for column in (2, 3))
     assert old == RENAMED.keys() | {"lower", "upper"}
     assert new == {name for names in RENAMED.values() for name in names.split()}
+
+
+def test_negated_flag_of_a_group_keeps_its_negation():
+    @dataclass
+    class Ppo:
+        asymmetric_critic: bool = True
+
+    @dataclass
+    class Train:
+        ppo: Ppo = field(default_factory=Ppo)
+
+    assert use_new_names(["--ppo.no-asymmetric"], Train) == ["--ppo.no-asymmetric-critic"]
