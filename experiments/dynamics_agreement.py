@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.robot.overlay import load_overlay
@@ -40,9 +39,9 @@ class Args:
     robot: Path | None = None
     """Robot overlay (docs/robot_overlays.md; default: the robot as described)."""
     states: int = 200
-    """Random states."""
+    """Number of random states."""
     seed: int = 0
-    """Of the states."""
+    """Seed of the states."""
     out: Path | None = None
     """Folder for metrics.json (default: outputs/dynamics_agreement/<time>)."""
 
@@ -78,4 +77,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))
