@@ -23,6 +23,7 @@ from jumper_warp.evaluation.attitude import DIRECTIONS, AttitudeFlags, AttitudeL
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from support.momentum import MomentumRecorder, rotational_inertia
+from support.scripts import parse_flags
 
 HARDWARE = {"mean_settling_s": 2.6}  # Settling time of the authors' robot, 90 degrees
 COLORS = ("tab:red", "tab:green", "tab:blue")

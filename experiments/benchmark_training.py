@@ -21,7 +21,7 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
-from support.scripts import ThreadArgs, report, parse_flags
+from support.scripts import ThreadArgs, parse_flags, report
 from support.speed import time_parts, time_ppo, time_rsl_rl
 from support.timing import baseline_ratios
 from support.variants import VARIANTS, variant

@@ -26,7 +26,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.departure_runs import BASELINE, JUMP_TASKS, TESTS, WIDTH, JumpTask, evaluate, parse, report, train_or_load
 from support.departures import DEPARTURES, Ablation, ablation_flags
-from support.scripts import ThreadArgs, prepare, parse_flags
+from support.scripts import ThreadArgs, parse_flags, prepare
 
 
 @dataclass(frozen=True)

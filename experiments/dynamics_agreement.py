@@ -22,6 +22,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
 from support.agreement import jumper_quantities, pinocchio_quantities, random_states
+from support.scripts import parse_flags
 
 UNITS = {
     "base_acceleration": "m/s^2",

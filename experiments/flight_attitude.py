@@ -22,6 +22,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.run import EvaluationArgs
 from jumper_warp.utils.errors import InputError
 from support.flights import FlightLog, FlightRun, extension_delays, flight_metrics, plot_flights
+from support.scripts import parse_flags
 
 
 @dataclass(frozen=True)
@@ -58,7 +59,11 @@ def main(args: Args) -> dict:
     """Run the flights with and without turning, and return the metrics."""
     run = FlightRun(args, args.landing_policy, args.jump_task)
     env, heights = run.env(args.num_flights), np.linspace(*args.height_range, args.num_flights)
-    late = extension_delays(args.num_flights, 1.0e-3 * args.max_leg_delay, args.seed) if args.takeoff == "open-loop" else None
+    late = (
+        extension_delays(args.num_flights, 1.0e-3 * args.max_leg_delay, args.seed)
+        if args.takeoff == "open-loop"
+        else None
+    )
     flights = {
         name: run.fly(env, FlightLog(heights, late, turns=name == "turning"), name) for name in ("turning", "without")
     }

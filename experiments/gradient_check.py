@@ -18,7 +18,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.diff.rollout import Trajectory
 from jumper_warp.evaluation.plots import figure
 from support.gradients import INNER, OUTER, TICKS, GradientJump, GradientPair, apex, check, schedule
-from support.scripts import DeviceArgs, prepare, report, parse_flags
+from support.scripts import DeviceArgs, parse_flags, prepare, report
 
 WEAK_PUSH = (20.0, 20.0)  # [deg] Commands of the push-off that the ascent starts from
 ASCENT_STEPS = 20

@@ -35,8 +35,8 @@ Experiment = Literal["same", "fine", "rough", "mujoco", "methods", "policy"]
 class Args:
     """Flags."""
 
-    num_robots: int = 20
-    """Robots that are identified on the simulator that recorded them."""
+    num_matched: int = 20
+    """Number of robots that are identified with the simulator that recorded them."""
     num_mismatched: int = 1
     """Robots of each part whose truth is not that of the model: fine, rough, mujoco. Metrics are of the first."""
     parts: tuple[Experiment, ...] = get_args(Experiment)

@@ -26,7 +26,7 @@ from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.learning import TEST_HEIGHTS, LearningCurve, curve_metrics, plot_curves, train_and_time
-from support.scripts import DeviceArgs, prepare, parse_flags
+from support.scripts import DeviceArgs, parse_flags, prepare
 from support.variants import DEFAULT, variant
 
 TASK = "vertical-jump"

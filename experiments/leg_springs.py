@@ -70,7 +70,8 @@ def main(args: Args) -> dict:
                               "spring_length_m": args.rest_length, "stiffness_n_m": list(args.stiffness)}  # fmt: skip
     planet = {EARTH: "Earth", MARS: "Mars"}.get(args.gravity, f"{args.gravity:g} m/s^2")
     table = Table(
-        "stiffness [N/m]", title=f"open-loop apex in m, {planet}, {args.torque_limit:g} N m, springs {args.rest_length:g} m"
+        "stiffness [N/m]",
+        title=f"open-loop apex in m, {planet}, {args.torque_limit:g} N m, springs {args.rest_length:g} m",
     )
     rows = [[f"{stiffness:g}"] for stiffness in args.stiffness]
     with figure(folder / "springs.png", figsize=(7, 4.5)) as axis:

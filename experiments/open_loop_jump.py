@@ -30,7 +30,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from jumper_warp.viz.snapshot import Camera, contact_sheet
 from support.open_loop import SQUAT, plot_trace, simulate_jump, trace_metrics
-from support.scripts import DeviceArgs, prepare, parse_flags
+from support.scripts import DeviceArgs, parse_flags, prepare
 
 HARDWARE_APEX = 1.075  # [m] Paper, open loop on the robot at 18 N m
 STRIP_TIMES = (0.9, 2.2, 2.32, 2.45, 2.7, 2.95, 3.15, 3.8)

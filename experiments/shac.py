@@ -29,7 +29,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.gradient_variance import measure_stats, plot_variances, print_variances, variance_metrics
 from support.learning import LearningCurve, curve_metrics, make_eval_env, plot_curves, train_and_evaluate
-from support.scripts import DeviceArgs, prepare, parse_flags
+from support.scripts import DeviceArgs, parse_flags, prepare
 
 TASK = "vertical-jump"
 
@@ -64,7 +64,11 @@ class Args(DeviceArgs):
     """Number of environments whose gradients are measured."""
 
     def __post_init__(self) -> None:
-        if not self.seeds or not self.trainers or min((self.eval_interval, *self.horizons, self.num_gradient_envs - 1)) <= 0:
+        if (
+            not self.seeds
+            or not self.trainers
+            or min((self.eval_interval, *self.horizons, self.num_gradient_envs - 1)) <= 0
+        ):
             raise InputError("need seeds, trainers, at least 2 worlds, and positive times and horizons")
 
 

@@ -31,7 +31,9 @@ def main(args: SoakArgs) -> dict:
         sim = Simulation(args.num_envs, command_filter=command_filter, visuals=False, device=args.device)
         metrics = soak_simulation(sim, args)
     else:
-        env = Env(hardest(make_task(args.task)), args.num_envs, seed=args.seed, device=args.device, threads=args.threads)
+        env = Env(
+            hardest(make_task(args.task)), args.num_envs, seed=args.seed, device=args.device, threads=args.threads
+        )
         metrics = soak_env(env, args) | {"task": args.task}
     report(folder, metrics | {"envs": args.num_envs, "filter": args.command_filter, "seed": args.seed})
     return metrics

@@ -18,6 +18,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.utils.errors import InputError
+from support.scripts import parse_flags
 from support.squats import SquatLog, squat_goals, squat_metrics
 
 

@@ -21,6 +21,7 @@ from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import VelocityLog, check_velocity_settings
 from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile
 from jumper_warp.utils.errors import InputError
+from support.scripts import parse_flags
 from support.walks import walked_share
 
 SECONDS = 10.0  # [s] Time of each walk

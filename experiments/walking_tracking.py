@@ -34,6 +34,7 @@ from support.walks import (
     sped_up_walks,
     speed_metrics,
 )  # fmt: skip
+from support.scripts import parse_flags
 
 GAIT_SPEED = 0.8  # [m/s] Speed of the straight walk whose gait is measured
 

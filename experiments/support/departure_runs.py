@@ -105,7 +105,9 @@ def evaluate(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, A
         values = flags.metrics(run.run_episodes(env, flags.log(env.task, 0)))
         values["error_m"] = values.get("mean_abs_error_m", values.get("mean_error_m"))
         goals = squat_goals(args.num_squats, JUMP_TASKS[args.task].squats, up=run.task.evaluation in HEIGHTS)
-        values |= squat_metrics(run.run_episodes(run.env(args.num_squats, conditions=conditions), SquatLog(goals, HOLD)))
+        values |= squat_metrics(
+            run.run_episodes(run.env(args.num_squats, conditions=conditions), SquatLog(goals, HOLD))
+        )
         tests[test] = {name: value for name, value in values.items() if isinstance(value, bool | int | float | None)}
     return tests
 

@@ -172,11 +172,11 @@ def sysid(cfg: SysidCfg) -> None:
         row = (parameter.name, parameter.unit, f"{parameter.nominal:.5g}", f"{value:.5g}", f"{low:.5g} … {high:.5g}")
         table.add_row(*row, style=None if sure else "dim")
     Console().print(table)
-    wider = f"; intervals {found.mismatch:.3g} times wider for the model's errors" if found.mismatch != 1.0 else ""
-    print(f"χ² {found.chi2:.4g} (described {found.nominal_chi2:.4g}), {found.effort.seconds:.1f} s{wider}")
-    for words in dict.fromkeys(direction.words for direction in found.directions):
+    wider = f"; intervals {result.mismatch:.3g} times wider for the model's errors" if result.mismatch != 1.0 else ""
+    print(f"χ² {result.chi2:.4g} (described {result.nominal_chi2:.4g}), {result.effort.seconds:.1f} s{wider}")
+    for words in dict.fromkeys(direction.words for direction in result.directions):
         print(f"open: {words}")
-    for line in found.warnings:
+    for line in result.warnings:
         print(f"misfit: {line}")
     print(folder / "report.html")
 
@@ -220,7 +220,7 @@ def characterise(cfg: ActuatorCfg) -> None:
 
     result = characterise_motor(load_bench(cfg.bench), cfg.motor, cfg.torque_noise)
     folder = output_dir("actuator", cfg.out)
-    write_atomically(folder / "actuator.json", json_bytes(found.to_json()))
-    for name, (value, low, high, unit) in found.rows().items():
+    write_atomically(folder / "actuator.json", json_bytes(result.to_json()))
+    for name, (value, low, high, unit) in result.rows().items():
         print(f"{name:<16}{value:10.5g} {unit:<6} 95 % {low:.5g} … {high:.5g}")
     print(folder / "actuator.json")

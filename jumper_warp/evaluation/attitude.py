@@ -207,7 +207,7 @@ class AttitudeFlags:
 
     def log(self, task: TaskCfg, seed: int) -> AttitudeLog:
         """Return the log of the turns, one per world."""
-        return AttitudeLog(axis_turns(self.turns, self.angle), self.tolerance, self.seconds)
+        return AttitudeLog(axis_turns(self.num_turns, self.angle), self.tolerance, self.seconds)
 
     def metrics(self, log: AttitudeLog) -> Metrics:
         """Return `turn_metrics` and `axis_metrics`."""

@@ -60,14 +60,15 @@ EVALUATIONS: dict[str, Evaluation] = {
     "height": HEIGHT,
     "place": PLACE,
     "height-mars": replace(
-        HEIGHT, flags=HeightFlags(height_range=(1.0, 3.3), success_range=(1.0, 2.9)), play=HeightPlayFlags((1.5, 2.3, 3.0), 6.0)
+        HEIGHT, flags=HeightFlags(height_range=(1.0, 3.3), success_range=(1.0, 2.9)),
+        play=HeightPlayFlags((1.5, 2.3, 3.0), 6.0),
     ),
     "place-mars": replace(
-        PLACE, flags=LandingFlags(x=(0.5, 4.2), success_range=(0.5, 3.9)),
+        PLACE, flags=LandingFlags(goal_x=(0.5, 4.2), success_range=(0.5, 3.9)),
         play=LandingPlayFlags(default_goals=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))),
     ),
     "around": replace(
-        PLACE, flags=LandingFlags(x=(-0.7, 0.7), goal_y=(-0.7, 0.7), success_range=(0.0, 0.7)), finetune_target=None,
+        PLACE, flags=LandingFlags(goal_x=(-0.7, 0.7), goal_y=(-0.7, 0.7), success_range=(0.0, 0.7)), finetune_target=None,
         play=LandingPlayFlags(default_goals=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
     ),
     "velocity": Evaluation(VelocityFlags(), VelocityPlayFlags(), TaskCfg.on_level_ground),

@@ -214,10 +214,10 @@ def random_headings(count: int, seed: int) -> np.ndarray:
 class LandingFlags(JumpFlags):
     """Jumps to places from standing still."""
 
-    x: tuple[float, float] = (0.3, 1.5)
-    """[m] Goals ahead, evenly spaced between these."""
-    y: tuple[float, float] = (0.0, 0.0)
-    """[m] Goals to the left, drawn between these."""
+    goal_x: tuple[float, float] = (0.3, 1.5)
+    """[m] Smallest and largest distance of the goal ahead; goals are evenly spaced."""
+    goal_y: tuple[float, float] = (0.0, 0.0)
+    """[m] Smallest and largest distance of the goal to the left; goals are sampled."""
     heading: Literal["any"] | float = "any"
     """[deg] Heading of all robots, or any: drawn from the full circle."""
 
@@ -240,7 +240,8 @@ class LandingFlags(JumpFlags):
     def metrics(self, log: LandingLog) -> Metrics:
         """Return `landing_metrics` and the range of its `in_range` metrics."""
         inside = within(np.linalg.norm(log.goal_positions, axis=-1), self.success_range)
-        return landing_metrics(log, inside) | {"range_lower_m": self.success_range[0], "range_upper_m": self.success_range[1]}
+        lower, upper = self.success_range
+        return landing_metrics(log, inside) | {"range_lower_m": lower, "range_upper_m": upper}
 
 
 @dataclass(frozen=True)

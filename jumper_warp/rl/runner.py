@@ -255,7 +255,9 @@ class TrainingRun:
     def _progress(self) -> float:
         """Return the progress of the training from 0 to 1, the maximum by iterations and by time."""
         has_limit = self.cfg.max_seconds > 0.0
-        return max(self.iteration / self.cfg.max_iterations, self._elapsed() / self.cfg.max_seconds if has_limit else 0.0)
+        return max(
+            self.iteration / self.cfg.max_iterations, self._elapsed() / self.cfg.max_seconds if has_limit else 0.0
+        )
 
     def _remaining(self, seconds: float) -> float:
         """Return the estimated time to the end [s]; seconds: duration of an iteration [s]."""

@@ -18,8 +18,7 @@ from jumper_warp.cli.task_flags import flag_name, flags_of, with_flags
 from jumper_warp.cli.train import TrainArgs, parse_settings, parse_train
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.commands import PlayCfg, viewer_command
-from jumper_warp.evaluation.heights import HeightFlags, HeightPlayFlags
-from jumper_warp.evaluation.landings import LandingFlags, LandingPlayFlags
+from jumper_warp.evaluation.heights import HeightFlags
 from jumper_warp.policies.folder import load_policy, save_policy
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.runs import open_policy
@@ -334,18 +333,18 @@ def test_refuses_terms_with_the_same_flag():
     ("make", "message"),
     [
         (lambda: HeightFlags(num_jumps=0), "num_jumps must be at least 1"),
-        (lambda: PlaceFlags(num_jumps=0), "num_jumps must be at least 1"),
+        (lambda: LandingFlags(num_jumps=0), "num_jumps must be at least 1"),
         (lambda: HeightFlags(height_range=(1.0, 0.5)), "height_range must be"),
         (lambda: HeightFlags(height_range=(0.0, 1.2)), "height_range must be"),
-        (lambda: PlaceFlags(goal_x=(1.0, 0.5)), "goal_x must be in"),
-        (lambda: PlaceFlags(heading=float("inf")), "heading must be finite or any"),
+        (lambda: LandingFlags(goal_x=(1.0, 0.5)), "goal_x must be in"),
+        (lambda: LandingFlags(heading=float("inf")), "heading must be finite or any"),
         (lambda: HeightFlags(success_range=(1.0, 0.5)), "success_range must be in"),
-        (lambda: PlaceFlags(success_range=(1.0, 0.5)), "success_range must be in"),
-        (lambda: HeightGoals(height=()), "height takes 1 to 64"),
-        (lambda: HeightGoals(height=(-1.0,)), "height takes 1 to 64"),
-        (lambda: PlaceGoals(goal=((float("nan"), 0.0),)), "goal takes up to 64"),
-        (lambda: PlaceGoals(next_goals=((0.5, 0.0),) * 65), "next_goals takes up to 64"),
-        (lambda: PlayCfg(HeightGoals(), seconds=0.0), "seconds must be in"),
+        (lambda: LandingFlags(success_range=(1.0, 0.5)), "success_range must be in"),
+        (lambda: HeightPlayFlags(height=()), "height takes 1 to 64"),
+        (lambda: HeightPlayFlags(height=(-1.0,)), "height takes 1 to 64"),
+        (lambda: LandingPlayFlags(goal=((float("nan"), 0.0),)), "goal takes up to 64"),
+        (lambda: LandingPlayFlags(next_goals=((0.5, 0.0),) * 65), "next_goals takes up to 64"),
+        (lambda: PlayCfg(HeightPlayFlags(), seconds=0.0), "seconds must be in"),
     ],
 )
 def test_refuses_settings_out_of_range(make, message):

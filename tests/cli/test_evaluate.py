@@ -8,7 +8,7 @@ from jumper_warp.cli import evaluate, play
 from jumper_warp.evaluation.commands import csv_text
 from jumper_warp.evaluation.evaluations import EVALUATIONS, evaluation_of
 from jumper_warp.evaluation.heights import HeightFlags, HeightLog
-from jumper_warp.evaluation.landings import LANDING_TERMINATIONS, LandingFlags
+from jumper_warp.evaluation.landings import LANDING_TERMINATIONS
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import TASKS, make_task
@@ -43,7 +43,7 @@ def test_refuses_unknown_evaluation():
 
 
 def test_goals_are_evenly_spaced_ahead_and_sampled_to_the_side():
-    flags = PlaceFlags(num_jumps=5, goal_y=(-0.2, 0.1))
+    flags = LandingFlags(num_jumps=5, goal_y=(-0.2, 0.1))
     log = flags.log(TASK, seed=3)
     assert log.places[:, 0, 0] == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.5])
     lateral = log.places[:, 0, 1]
@@ -54,7 +54,7 @@ def test_goals_are_evenly_spaced_ahead_and_sampled_to_the_side():
 
 
 def test_heading_flag_in_degrees_sets_all_headings():
-    flags = PlaceFlags(num_jumps=2, goal_x=(0.3, 0.4), heading=90.0)
+    flags = LandingFlags(num_jumps=2, goal_x=(0.3, 0.4), heading=90.0)
     assert flags.log(TASK, 0).headings == pytest.approx(0.5 * math.pi)
 
 
@@ -103,7 +103,7 @@ def test_policy_must_be_the_first_argument(command, args):
 
 def test_success_range_selects_goals_by_distance():
     goals = [[0.3, 0.0], [0.0, -0.3], [0.6, 0.6]]
-    flags = PlaceFlags(num_jumps=3, goal_x=(0.0, 0.0), goal_y=(0.0, 0.0), heading=0.0, success_range=(0.3, 0.5))
+    flags = LandingFlags(num_jumps=3, goal_x=(0.0, 0.0), goal_y=(0.0, 0.0), heading=0.0, success_range=(0.3, 0.5))
     landings = flags.log(TASK, 0)
     landings.goal_positions[:, 0] = goals
     landings.place[:, 0], landings.target[:, 0] = goals, goals

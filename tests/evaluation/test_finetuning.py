@@ -96,7 +96,10 @@ def test_shift_goal_observation_equals_shifted_goal():
 
 def test_correct_aim_removes_constant_overshoot():
     """A policy whose observed goals are 40 mm too far ends nearer to its goals than the original one."""
-    policy, cfg = open_policy("slippery_jump"), FinetuneCfg(**FEW | {"num_goals": 8, "iterations": 0})  # no aim was taken
+    policy, cfg = (
+        open_policy("slippery_jump"),
+        FinetuneCfg(**FEW | {"num_goals": 8, "iterations": 0}),
+    )  # no aim was taken
     untouched = jump_errors(make_groups(policy, cfg)[0], Network(policy), derivatives=False).value
     aimed, record = finetune(shift_goal_observation(policy, 0.04), cfg, log=lambda line: None)
     first, *_, last = record["aims"]

@@ -23,7 +23,7 @@ def run(tmp_path_factory):
 
 def test_turns_about_all_axes_are_measured(run, tmp_path):
     args = attitude.Args(
-        policy=str(run), num_num_turns=6, seconds=0.2, num_recorded=1, refine=2, out=tmp_path, device="cpu"
+        policy=str(run), num_turns=6, seconds=0.2, num_recorded=1, refine=2, out=tmp_path, device="cpu"
     )
     values = attitude.main(args)
     assert json.loads((tmp_path / "metrics.json").read_text()) == values
@@ -34,7 +34,9 @@ def test_turns_about_all_axes_are_measured(run, tmp_path):
 
 
 def test_flights_run_with_and_without_turning(run, tmp_path):
-    args = flight_attitude.Args(policy=str(run), num_flights=2, max_leg_delay=10.0, num_recorded=1, out=tmp_path, device="cpu")
+    args = flight_attitude.Args(
+        policy=str(run), num_flights=2, max_leg_delay=10.0, num_recorded=1, out=tmp_path, device="cpu"
+    )
     values = flight_attitude.main(args)
     assert json.loads((tmp_path / "metrics.json").read_text()) == values
     assert values["mean_apex_m"] > 2.5 and values["mean_takeoff_spin_rad_s"] > 0.1
@@ -45,7 +47,7 @@ def test_flights_run_with_and_without_turning(run, tmp_path):
 
 def test_policy_takes_off_to_commanded_heights_and_lands(run, tmp_path):
     args = flight_attitude.Args(
-        policy=str(run), takeoff="policy", landing_policy="mars_vertical_jump", height_range=(1.5, 2.0), num_num_flights=2,
+        policy=str(run), takeoff="policy", landing_policy="mars_vertical_jump", height_range=(1.5, 2.0), num_flights=2,
         num_recorded=0, out=tmp_path, device="cpu",
     )  # fmt: skip
     values = flight_attitude.main(args)

@@ -145,7 +145,9 @@ def test_scripted_jump_reaches_the_open_loop_height_and_lands(sweep_env, begin, 
 
 
 def test_sweep_of_a_run_writes_metrics_plot_recording_and_filmstrip(trained, tmp_path):
-    values = HeightSweep(policy=str(trained[2]), num_jumps=3, num_recorded=2, randomize=True, out=tmp_path, device="cpu").run()
+    values = HeightSweep(
+        policy=str(trained[2]), num_jumps=3, num_recorded=2, randomize=True, out=tmp_path, device="cpu"
+    ).run()
     saved = json.loads((tmp_path / "metrics.json").read_text())
     assert saved == values
     assert {

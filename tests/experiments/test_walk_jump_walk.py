@@ -38,12 +38,12 @@ def test_scripts_have_specified_commands():
         kinds = [step.kind for step in script]
         assert len(script) == 10 and {"jump_up", "jump_to"} <= set(kinds)
         assert all(np.abs(step.values).max() <= 0.8 for step in script if step.kind == "walk")
-    args = walk_jump_walk.Args(num_num_robots=3, course=True, seed=5)
+    args = walk_jump_walk.Args(num_robots=3, course=True, seed=5)
     assert walk_jump_walk.scripts(args) == walk_jump_walk.scripts(args)
 
 
 def test_refuses_invalid_flags(tmp_path):
     with pytest.raises(InputError, match="robots"):
-        walk_jump_walk.Args(num_num_robots=0)
+        walk_jump_walk.Args(num_robots=0)
     with pytest.raises(PolicyError, match="evaluated by velocity"):
         walk_jump_walk.main(walk_jump_walk.Args(policy="vertical_jump", out=tmp_path, device="cpu"))

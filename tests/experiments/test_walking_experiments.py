@@ -42,7 +42,7 @@ def test_standing_policy_has_rmse_of_command(policies, tmp_path):
 
 def test_standing_policy_has_zero_success_on_terrains(policies, tmp_path):
     args = walking_terrain.Args(
-        policy=str(policies / "velocity-flat"), num_num_robots=3, terrains=("flat", "stairs"), num_recorded=1, out=tmp_path,
+        policy=str(policies / "velocity-flat"), num_robots=3, terrains=("flat", "stairs"), num_recorded=1, out=tmp_path,
         device="cpu",
     )  # fmt: skip
     metrics = walking_terrain.main(args)

@@ -36,28 +36,52 @@ def test_waiting_policy_lands_on_slippery_ground(tmp_path):
 
 
 def test_mars_horizontal_policy_reaches_its_distances(tmp_path):
-    args = {"policy": "mars_horizontal_jump", "num_jumps": 8, "distance_range": (0.5, 5.0), "num_recorded": 0, "device": "cpu"}
+    args = {
+        "policy": "mars_horizontal_jump",
+        "num_jumps": 8,
+        "distance_range": (0.5, 5.0),
+        "num_recorded": 0,
+        "device": "cpu",
+    }
     values = DistanceSweep(out=tmp_path, **args).run()
     assert values["success_rate"] == 1.0 and values["step_free_success_rate"] == 1.0
     assert values["mean_error_m"] < 0.02 and values["gravity_m_s2"] == 3.71
 
 
 def test_mars_policy_with_springs_reaches_its_distances(tmp_path):
-    args = {"policy": "mars_springs_jump", "num_jumps": 8, "distance_range": (0.5, 6.0), "num_recorded": 0, "device": "cpu"}
+    args = {
+        "policy": "mars_springs_jump",
+        "num_jumps": 8,
+        "distance_range": (0.5, 6.0),
+        "num_recorded": 0,
+        "device": "cpu",
+    }
     values = DistanceSweep(out=tmp_path, **args).run()
     assert values["success_rate"] == 1.0 and values["single_jump_success_rate"] == 1.0
     assert values["mean_error_m"] < 0.025  # 0.014 m of 200 jumps
 
 
 def test_mars_vertical_policy_reaches_its_heights_and_keeps_its_heading(tmp_path):
-    args = {"policy": "mars_vertical_jump", "num_jumps": 8, "height_range": (0.9, 3.6), "num_recorded": 0, "device": "cpu"}
+    args = {
+        "policy": "mars_vertical_jump",
+        "num_jumps": 8,
+        "height_range": (0.9, 3.6),
+        "num_recorded": 0,
+        "device": "cpu",
+    }
     values = HeightSweep(out=tmp_path, **args).run()
     assert values["success_rate"] == 1.0 and values["largest_reached_m"] > 3.5
     assert values["mean_abs_error_m"] < 0.02 and values["mean_turn_deg"] < 15.0  # 0.011 m, 4.6 degrees of 200 jumps
 
 
 def test_mars_vertical_policy_with_stock_filter_reaches_its_heights_and_lands(tmp_path):
-    args = {"policy": "mars_vertical_jump_stock", "num_jumps": 8, "height_range": (0.8, 2.9), "num_recorded": 0, "device": "cpu"}
+    args = {
+        "policy": "mars_vertical_jump_stock",
+        "num_jumps": 8,
+        "height_range": (0.8, 2.9),
+        "num_recorded": 0,
+        "device": "cpu",
+    }
     values = HeightSweep(out=tmp_path, **args).run()
     assert values["success_rate"] == 1.0 and values["mean_abs_error_m"] < 0.015  # 0.0055 m of 200 jumps
     assert values["fall_rate"] == 0.0 and values["at_rest_within_1_s_rate"] == 1.0
