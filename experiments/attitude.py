@@ -1,6 +1,6 @@
 """Turns in free flight: a policy turns the floating robot by 90 degrees about each body axis and about random axes.
 
-    python experiments/attitude.py --policy attitude --turns 60 --out outputs/attitude
+    python experiments/attitude.py --policy attitude --num-turns 60 --out outputs/attitude
     python experiments/attitude.py --policy logs/attitude/<run> --randomize --angle 60
 
 Robots float at rest in the default pose, in zero gravity, and one turn is commanded. The settling time is that from
@@ -17,13 +17,13 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.attitude import DIRECTIONS, AttitudeFlags, AttitudeLog, random_turns, turn_metrics
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from support.momentum import MomentumRecorder, rotational_inertia
+from support.scripts import parse_flags
 
 HARDWARE = {"mean_settling_s": 2.6}  # Settling time of the authors' robot, 90 degrees
 COLORS = ("tab:red", "tab:green", "tab:blue")
@@ -38,7 +38,7 @@ class Args(EvaluationArgs, AttitudeFlags):
     """Whether the momentum of free flight is kept exactly, whatever the training had."""
     refine: int = 1
     """How many times finer the physics step is than that of the training."""
-    record: int = 6
+    num_recorded: int = 6
     """Number of turns to record for the Rerun viewer and, the first of them, as a filmstrip; 0: none."""
 
     def __post_init__(self) -> None:
@@ -69,18 +69,18 @@ def plot_turns(run: EvaluationRun, turns: AttitudeLog, title: str) -> None:
 def main(args: Args) -> dict:
     """Run both tests and return the metrics."""
     run = EvaluationRun.from_args("attitude", args, ("attitude",))
-    env = run.env(args.turns, lambda task: replace(task, keep_momentum=args.keep_momentum), refine=args.refine)
+    env = run.env(args.num_turns, lambda task: replace(task, keep_momentum=args.keep_momentum), refine=args.refine)
     run.setup_metrics |= {"physics_step_s": env.physics_dt, "keep_momentum": args.keep_momentum}
     turns, momentum = args.log(run.task, args.seed), MomentumRecorder(env)
     inertia = rotational_inertia(env.sim)
     run.run_episodes(env, turns, film="turns", on_step=momentum)
     values = args.metrics(turns) | momentum.metrics(turns.diverged, inertia)
-    plot_turns(run, turns, f"{args.turns} turns by {args.angle:g} degrees, {run.title}")
-    others = AttitudeLog(random_turns(args.turns, args.angle, args.seed), args.tolerance, args.seconds)
+    plot_turns(run, turns, f"{args.num_turns} turns by {args.angle:g} degrees, {run.title}")
+    others = AttitudeLog(random_turns(args.num_turns, args.angle, args.seed), args.tolerance, args.seconds)
     run.run_episodes(env, others)
     values |= {f"any_axis_{name}": value for name, value in turn_metrics(others).items()}
     return run.report(values, HARDWARE)
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

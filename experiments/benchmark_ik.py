@@ -10,7 +10,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import tyro
 import warp as wp
 
 from jumper_warp.cli.main import run_command
@@ -18,7 +17,7 @@ from jumper_warp.robot.description import load_description
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from support.inverse_kinematics import InverseKinematics, random_motors
-from support.scripts import DeviceArgs, report
+from support.scripts import DeviceArgs, parse_flags, report
 from support.timing import median_time
 
 
@@ -63,4 +62,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import tyro
 import warp as wp
 
 from jumper_warp.cli.main import run_command
@@ -22,7 +21,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.threads import checked_threads
-from support.scripts import DeviceArgs, report
+from support.scripts import DeviceArgs, parse_flags, report
 from support.speed import time_solver, time_threads
 from support.timing import baseline_ratios
 
@@ -70,4 +69,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
 import warp as wp
 
 from jumper_warp.cli.main import run_command
@@ -22,7 +21,7 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
-from support.scripts import ThreadArgs, report
+from support.scripts import ThreadArgs, parse_flags, report
 from support.speed import time_parts, time_ppo, time_rsl_rl
 from support.timing import baseline_ratios
 from support.variants import VARIANTS, variant
@@ -92,4 +91,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

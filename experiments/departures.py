@@ -19,7 +19,6 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import tyro
 from rich.console import Console
 
 from jumper_warp.cli.main import run_command
@@ -27,7 +26,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.departure_runs import BASELINE, JUMP_TASKS, TESTS, WIDTH, JumpTask, evaluate, parse, report, train_or_load
 from support.departures import DEPARTURES, Ablation, ablation_flags
-from support.scripts import ThreadArgs, prepare
+from support.scripts import ThreadArgs, parse_flags, prepare
 
 
 @dataclass(frozen=True)
@@ -37,21 +36,21 @@ class Args(ThreadArgs):
     task: JumpTask = "vertical-jump"
     """Whose departures."""
     only: tuple[str, ...] = ()
-    """Names of those that are undone (default: all)."""
+    """Names of the departures to undo (default: all)."""
     iterations: int | None = None
-    """Of each training (default: 800 or 1000, when the task with all departures has learned)."""
-    envs: int = 8192
+    """Iterations of each training (default: 800 or 1000, when the task with all departures has learned)."""
+    num_envs: int = 8192
     """Number of environments."""
     seeds: tuple[int, ...] = (1,)
-    """Of the trainings without one of them."""
-    kept_seeds: tuple[int, ...] = (1, 2, 3)
-    """Of those with all."""
-    jumps: tuple[int, int] = (200, 1000)
-    """Nominal and randomised."""
-    squats: int = 100
-    """Robots that wait."""
-    train: str = ""
-    """More flags of `jumper train`, for all trainings: --train="--ppo.gamma 0.98"."""
+    """Seeds of the trainings without one departure."""
+    baseline_seeds: tuple[int, ...] = (1, 2, 3)
+    """Seeds of the trainings with all departures."""
+    num_jumps: tuple[int, int] = (200, 1000)
+    """Numbers of nominal and of randomised jumps."""
+    num_squats: int = 100
+    """Number of robots that hold a squat."""
+    train_flags: str = ""
+    """More flags of `jumper train`, for all trainings: --train-flags="--ppo.gamma 0.98"."""
     measure: bool = True
     """Make the jumps after each training."""
 
@@ -59,8 +58,8 @@ class Args(ThreadArgs):
         unknown = set(self.only) - {BASELINE, *DEPARTURES[self.task]}
         if unknown:
             raise InputError(f"departures of {self.task} are {', '.join(DEPARTURES[self.task])}, not {min(unknown)}")
-        if self.length < 1 or self.envs < 1 or min(self.jumps) < 1 or self.squats < 1:
-            raise InputError("iterations, envs, jumps and squats must be at least 1")
+        if self.length < 1 or self.num_envs < 1 or min(self.num_jumps) < 1 or self.num_squats < 1:
+            raise InputError("iterations, num_envs, num_jumps and num_squats must be at least 1")
 
     @property
     def length(self) -> int:
@@ -70,15 +69,15 @@ class Args(ThreadArgs):
     def trainings(self) -> Iterator[tuple[str, int, Ablation]]:
         """Yield name, seed and ablation of every training."""
         for name in self.only or (BASELINE, *DEPARTURES[self.task]):
-            for seed in self.kept_seeds if name == BASELINE else self.seeds:
+            for seed in self.baseline_seeds if name == BASELINE else self.seeds:
                 yield name, seed, DEPARTURES[self.task].get(name, "")
 
     def command(self, ablation: Ablation, seed: int, folder: Path) -> list[str]:
         """Return the arguments of `jumper train` for an ablation; folder: of its log."""
-        flags = f"--num-envs {self.envs} --iterations {self.length} --seed {seed} --no-tensorboard"
+        flags = f"--num-envs {self.num_envs} --max-iterations {self.length} --seed {seed} --no-tensorboard"
         flags += "" if self.device is None else f" --device {self.device}"
         flags += "" if self.threads is None else f" --threads {self.threads}"
-        flags = f"{flags} {JUMP_TASKS[self.task].begin} {self.train} {ablation_flags(ablation)}"
+        flags = f"{flags} {JUMP_TASKS[self.task].begin} {self.train_flags} {ablation_flags(ablation)}"
         return [self.task, *shlex.split(flags), "--log-root", str(folder)]
 
 
@@ -87,7 +86,7 @@ def main(args: Args) -> dict[str, Any]:
     for name, seed, ablation in args.trainings():  # a wrong flag is refused before any training
         parse(ablation, args.command(ablation, seed, Path(name)))
     folder, results, table = prepare("departures", args, args.threads), {}, None
-    values: dict[str, Any] = {"task": args.task, "iterations": args.length, "envs": args.envs}
+    values: dict[str, Any] = {"task": args.task, "iterations": args.length, "envs": args.num_envs}
     for name, seed, ablation in args.trainings():
         checkpoint = train_or_load(ablation, args.command(ablation, seed, folder / f"{name}_{seed}"))
         if not args.measure:
@@ -104,4 +103,4 @@ def main(args: Args) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

@@ -5,10 +5,9 @@
 Runs the suite `grid`, as `jumper evaluate horizontal_jump --suite grid` does.
 """
 
-import tyro
-
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.suites import Grid
+from support.scripts import parse_flags
 
 if __name__ == "__main__":
-    run_command(lambda: tyro.cli(Grid).run())
+    run_command(lambda: parse_flags(Grid).run())

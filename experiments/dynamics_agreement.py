@@ -14,7 +14,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.robot.overlay import load_overlay
@@ -23,6 +22,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
 from support.agreement import jumper_quantities, pinocchio_quantities, random_states
+from support.scripts import parse_flags
 
 UNITS = {
     "base_acceleration": "m/s^2",
@@ -40,9 +40,9 @@ class Args:
     robot: Path | None = None
     """Robot overlay (docs/robot_overlays.md; default: the robot as described)."""
     states: int = 200
-    """Random states."""
+    """Number of random states."""
     seed: int = 0
-    """Of the states."""
+    """Seed of the states."""
     out: Path | None = None
     """Folder for metrics.json (default: outputs/dynamics_agreement/<time>)."""
 
@@ -78,4 +78,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

@@ -13,13 +13,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.diff.rollout import Trajectory
 from jumper_warp.evaluation.plots import figure
 from support.gradients import INNER, OUTER, TICKS, GradientJump, GradientPair, apex, check, schedule
-from support.scripts import DeviceArgs, prepare, report
+from support.scripts import DeviceArgs, parse_flags, prepare, report
 
 WEAK_PUSH = (20.0, 20.0)  # [deg] Commands of the push-off that the ascent starts from
 ASCENT_STEPS = 20
@@ -96,4 +95,4 @@ def main(args: DeviceArgs) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(DeviceArgs)))
+    run_command(lambda: main(parse_flags(DeviceArgs)))

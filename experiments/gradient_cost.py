@@ -1,7 +1,7 @@
 """Cost of the gradient of a jump, relative to its simulation by the solver's own kernel.
 
     python experiments/gradient_cost.py --out outputs/gradient_cost
-    python experiments/gradient_cost.py --device cuda --worlds 4096
+    python experiments/gradient_cost.py --device cuda --num-envs 4096
 
 The same jump (squat, push-off, flight; 36 policy steps of 8 physics steps) is run by the solver's kernel with the
 command filter, and as a rollout with its reverse pass, which differentiates by all parameters, targets and the initial
@@ -14,7 +14,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import tyro
 import warp as wp
 
 from jumper_warp.cli.main import run_command
@@ -24,7 +23,7 @@ from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from support.gradient_runs import GradientRun, PlainJump
 from support.gradients import PUSH, TICKS, schedule
-from support.scripts import DeviceArgs, report
+from support.scripts import DeviceArgs, parse_flags, report
 from support.timing import device_memory, wall_time
 
 
@@ -32,23 +31,23 @@ from support.timing import device_memory, wall_time
 class Args(DeviceArgs):
     """Flags."""
 
-    worlds: int | None = None
-    """Worlds (default: 64 on a CPU, 4096 on a GPU)."""
+    num_envs: int | None = None
+    """Number of environments (default: 64 on a CPU, 4096 on a GPU)."""
     repeats: int = 7
     """Timed repetitions; the fastest counts, and the two kinds take turns."""
     double: bool = False
     """Whether to compute in double precision."""
 
     def __post_init__(self) -> None:
-        if self.repeats < 1 or (self.worlds is not None and self.worlds < 1):
-            raise InputError("worlds and repeats must be at least 1")
+        if self.repeats < 1 or (self.num_envs is not None and self.num_envs < 1):
+            raise InputError("num_envs and repeats must be at least 1")
 
 
 def main(args: Args) -> dict:
     """Run the comparison and return its metrics."""
     name, device = configure_device(args.device, 1).name, wp.get_device(args.device)
     folder = output_dir("gradient_cost", args.out)
-    worlds = args.worlds or (4096 if device.is_cuda else 64)
+    worlds = args.num_envs or (4096 if device.is_cuda else 64)
     exact = GradientRun(1, True, args.device).run()
     before = device_memory(device) if device.is_cuda else 0
     differentiable = GradientRun(worlds, args.double, args.device)
@@ -59,8 +58,8 @@ def main(args: Args) -> dict:
         / float(np.abs(exact[key].numpy()).max())
         for key in ("targets", "q", "qd", "table", "saturation")
     }
-    trajectory = differentiable.forward()
-    saved = (trajectory.q, trajectory.qd, trajectory.torque, trajectory.impulse, trajectory.pressed, trajectory.safe)
+    first = differentiable.forward()
+    saved = (first.q, first.qd, first.torque, first.impulse, first.pressed, first.filtered_target)
     times = {"plain": [], "forward": [], "gradient": []}
     for _ in range(args.repeats):
         for kind, run in (("plain", plain.run), ("forward", differentiable.forward), ("gradient", differentiable.run)):
@@ -75,7 +74,7 @@ def main(args: Args) -> dict:
         "forward_ratio": best["forward"] / best["plain"],
         **{f"{kind}_us_a_step": 1.0e6 * value / steps for kind, value in best.items()},
         "kept_bytes_a_policy_step": sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in saved) / worlds / TICKS,
-        "height_difference_m": float(np.abs(plain.heights() - trajectory.q.numpy()[-1, 2]).max()),
+        "height_difference_m": float(np.abs(plain.heights() - first.q.numpy()[-1, 2]).max()),
         **{f"error_{key}": error for key, error in errors.items()},
     }
     if device.is_cuda:
@@ -85,4 +84,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

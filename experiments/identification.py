@@ -1,6 +1,6 @@
 """Identification of known robots: by this project, with a finer step or SolverMuJoCo as truth, and by other methods.
 
-    python experiments/identification.py --seeds 20 --out outputs/identification
+    python experiments/identification.py --num-matched 20 --out outputs/identification
 
 Robots are sampled from the priors and execute two hung chirps, a standing chirp and a small jump of 1.25 s, recorded
 with noise (0.05 deg, 1 deg/s at 240 Hz; 5 mm, 0.5 deg at 120 Hz) and weighed (20 g). Initial states are unknown. A jump
@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
-import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.identification.parameters import jumper_parameters
@@ -26,7 +25,7 @@ from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from support.identification_methods import compare_methods
 from support.known_robots import make_case, plot_cases, policy_errors, run_case
-from support.scripts import report
+from support.scripts import parse_flags, report
 
 REFINE = 16  # Physics steps of the finer truth per step of the model
 Experiment = Literal["same", "fine", "rough", "mujoco", "methods", "policy"]
@@ -36,9 +35,9 @@ Experiment = Literal["same", "fine", "rough", "mujoco", "methods", "policy"]
 class Args:
     """Flags."""
 
-    seeds: int = 20
-    """Robots that are identified on the simulator that recorded them."""
-    others: int = 1
+    num_matched: int = 20
+    """Number of robots that are identified with the simulator that recorded them."""
+    num_mismatched: int = 1
     """Robots of each part whose truth is not that of the model: fine, rough, mujoco. Metrics are of the first."""
     parts: tuple[Experiment, ...] = get_args(Experiment)
     """What is run."""
@@ -46,32 +45,31 @@ class Args:
     """[s] Physics step of the model that identifies the robot recorded at a sixteenth of 1/480 s; "rough": 1/480."""
     policy: str = "vertical_jump"
     """Policy whose jumps the identified robot is to predict."""
-    jumps: int = 64
-    """Number of these."""
+    num_jumps: int = 64
+    """Number of jumps to predict."""
     out: Path | None = None
     """Folder for metrics and plots (default: outputs/identification/<time>)."""
     threads: int | None = None
     """CPU threads (default: all cores)."""
 
     def __post_init__(self) -> None:
-        if self.seeds < 1 or self.others < 1 or self.jumps < 3:
-            raise InputError(
-                f"need at least 1 seed, 1 other and 3 jumps, got {self.seeds}, {self.others}, {self.jumps}"
-            )
+        if self.num_matched < 1 or self.num_mismatched < 1 or self.num_jumps < 3:
+            given = f"{self.num_matched}, {self.num_mismatched}, {self.num_jumps}"
+            raise InputError(f"need at least 1 robot of either kind and 3 jumps, got {given}")
 
 
 def main(args: Args) -> dict[str, Any]:
     """Run the parts of the experiment and return their metrics."""
     configure_device("cpu", args.threads)
     folder, parameters = output_dir("identification", args.out), jumper_parameters()
-    replay = Replay(device="cpu", threads=args.threads)
-    ours = partial(replay_plan, Replay(device="cpu", threads=1))
+    replay = MotionReplay(device="cpu", threads=args.threads)
+    ours = partial(replay_plan, MotionReplay(device="cpu", threads=1))
     fine_steps = max(1, round(1.0 / 480.0 / args.fine_dt))
     simulate_finely, replay_finely = (partial(ours, refine=n) for n in (REFINE, fine_steps))
     values: dict[str, Any] = {"parameters": len(parameters), "seconds_of_data": 1.25 * len(KINDS)}
 
     cases = []
-    for seed in range(args.seeds if {"same", "methods", "policy"} & set(args.parts) else 0):
+    for seed in range(args.num_matched if {"same", "methods", "policy"} & set(args.parts) else 0):
         case = make_case(parameters, seed, ours, replay)
         cases.append((case, *run_case(parameters, case, replay, ours)))
         print(f"seed {seed}:", {name: round(value, 4) for name, value in cases[-1][1].items()}, flush=True)
@@ -85,7 +83,7 @@ def main(args: Args) -> dict[str, Any]:
     for part, (simulate, model, dt) in others.items():
         if part in args.parts:
             results = []
-            for seed in range(100, 100 + args.others):
+            for seed in range(100, 100 + args.num_mismatched):
                 case = make_case(parameters, seed, simulate, replay)
                 results.append(run_case(parameters, case, replay, model, dt)[0])
                 print(part, {name: round(value, 4) for name, value in results[-1].items()}, flush=True)
@@ -94,7 +92,7 @@ def main(args: Args) -> dict[str, Any]:
     if "methods" in args.parts:
         values |= compare_methods(parameters, cases[0][0], replay, ours, cases[0][2].effort.seconds)
     if "policy" in args.parts:
-        values |= policy_errors(args.policy, args.jumps, cases[0][0], cases[0][2], folder)
+        values |= policy_errors(args.policy, args.num_jumps, cases[0][0], cases[0][2], folder)
     if rows:
         plot_cases(rows, folder / "identification.png")
     report(folder, values)
@@ -102,4 +100,4 @@ def main(args: Args) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

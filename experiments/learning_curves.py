@@ -1,8 +1,8 @@
 """Learning curves of the vertical jump: success over wall time and over steps, for seeds and trainer variants.
 
     python experiments/learning_curves.py --seconds 60 --seeds 0 1 2 --variants default compiled_bfloat16
-    python experiments/learning_curves.py --device cpu --envs 2048 --history 1 --variants small --heights 0.5 0.9 \
-        --seconds 450 --every 30                                        # two cores of a CPU
+    python experiments/learning_curves.py --device cpu --num-envs 2048 --history 1 --variants small \
+        --height-range 0.5 0.9 --seconds 450 --eval-interval 30                 # two cores of a CPU
 
 Trainings start from random weights, one after the other, each in a separate process. Every few seconds of training time
 the policy is evaluated on jumps to heights of 0.5 to 1.1 m. Reported are the training times to success rates up to
@@ -18,7 +18,6 @@ from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Any
 
-import tyro
 import warp as wp
 
 from jumper_warp.cli.main import run_command
@@ -27,7 +26,7 @@ from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.learning import TEST_HEIGHTS, LearningCurve, curve_metrics, plot_curves, train_and_time
-from support.scripts import DeviceArgs, prepare
+from support.scripts import DeviceArgs, parse_flags, prepare
 from support.variants import DEFAULT, variant
 
 TASK = "vertical-jump"
@@ -39,17 +38,17 @@ class Args(DeviceArgs):
 
     seconds: float = 60.0
     """[s] Time of each training, its evaluations not counted."""
-    every: float = 2.0
+    eval_interval: float = 2.0
     """[s] Training time between two evaluations."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Of weights, noise and worlds."""
+    """Seeds of weights, noise and worlds."""
     variants: tuple[str, ...] = (DEFAULT,)
-    """Of the trainer."""
-    envs: int = 8192
+    """Variants of the trainer (`support.variants`)."""
+    num_envs: int = 8192
     """Number of environments."""
-    jumps: int = 200
+    num_jumps: int = 200
     """Jumps of an evaluation."""
-    heights: tuple[float, float] = TEST_HEIGHTS
+    height_range: tuple[float, float] = TEST_HEIGHTS
     """[m] Lowest and highest of them."""
     history: int | None = None
     """Policy steps that the policy sees, as `jumper train --history` (default: as the task says)."""
@@ -61,8 +60,8 @@ class Args(DeviceArgs):
             variant(trainer_settings(TASK), name)
         if not self.variants or not self.seeds or min(self.seeds) < 0:
             raise InputError("at least one variant and one seed of 0 or more are needed")
-        if self.seconds <= 0.0 or self.every <= 0.0:
-            raise InputError(f"seconds and every must be positive, got {self.seconds} and {self.every}")
+        if self.seconds <= 0.0 or self.eval_interval <= 0.0:
+            raise InputError(f"seconds and eval_interval must be positive, got {self.seconds} and {self.eval_interval}")
 
 
 def train(args: Args, name: str, seed: int) -> LearningCurve:
@@ -81,8 +80,8 @@ def train_in_process(args: Args, name: str, seed: int) -> LearningCurve:
 def main(args: Args) -> dict[str, Any]:
     """Train every variant with every seed and return the metrics."""
     folder = prepare("learning_curves", args)
-    values: dict[str, Any] = {"seconds": args.seconds, "envs": args.envs, "randomize": args.randomize}
-    values |= {"seeds": list(args.seeds), "heights_m": list(args.heights), "history": args.history}
+    values: dict[str, Any] = {"seconds": args.seconds, "envs": args.num_envs, "randomize": args.randomize}
+    values |= {"seeds": list(args.seeds), "heights_m": list(args.height_range), "history": args.history}
     curves: dict[str, list[LearningCurve]] = {name: [] for name in args.variants}
     for name, seed in itertools.product(args.variants, args.seeds):
         curve = train_in_process(args, name, seed)
@@ -96,4 +95,4 @@ def main(args: Args) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

@@ -1,7 +1,7 @@
 """Effect of springs between the knees of each leg on the open-loop jump, over stiffness and squat.
 
     python experiments/leg_springs.py --out outputs/springs
-    python experiments/leg_springs.py --gravity 3.71 --torque 24.8 --kp 20 --length 0.17
+    python experiments/leg_springs.py --gravity 3.71 --torque-limit 24.8 --kp 20 --rest-length 0.17
 
 Every robot makes the jump of `open_loop_jump.py` (squat, hold, full extension) with another stiffness and squat; the
 highest jump of each stiffness is reported. A stretched spring pulls the knees together: up to 90 degrees it extends the
@@ -16,7 +16,6 @@ import time
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -27,7 +26,7 @@ from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.robot.overlay import with_springs
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
-from support.scripts import DeviceArgs, prepare
+from support.scripts import DeviceArgs, parse_flags, prepare
 from support.spring_jumps import FILTERS, SpringJumps
 
 
@@ -36,12 +35,12 @@ class Args(DeviceArgs):
     """Flags."""
 
     stiffness: tuple[float, ...] = (0.0, 125.0, 250.0, 375.0, 500.0, 625.0, 750.0, 875.0, 1000.0, 1250.0, 1500.0)
-    """[N/m] Of the springs that are tried; 0: none."""
-    length: float = 0.17
-    """[m] At rest."""
-    squats: tuple[float, ...] = (60.0, 75.0, 90.0, 105.0, 120.0, 135.0)
-    """[deg] Transversal angles commanded for the squats that are tried."""
-    torque: float = 18.0
+    """[N/m] Stiffnesses of the springs to try; 0: no springs."""
+    rest_length: float = 0.17
+    """[m] Rest length of the springs."""
+    squat_angles: tuple[float, ...] = (60.0, 75.0, 90.0, 105.0, 120.0, 135.0)
+    """[deg] Transversal angles to command for the squat."""
+    torque_limit: float = 18.0
     """[N m] Torque saturation of the motors; lateral motors give 18 at most."""
     kp: float = 17.0
     """[N m/rad] Position gain of the transversal motors."""
@@ -51,35 +50,36 @@ class Args(DeviceArgs):
     """Motor command filter: that of the vertical jump, the loose one, or each in turn."""
 
     def __post_init__(self) -> None:
-        if not self.stiffness or not self.squats:
+        if not self.stiffness or not self.squat_angles:
             raise InputError("need at least one stiffness and one squat")
         for stiffness in self.stiffness:
-            with_springs(stiffness, self.length)
+            with_springs(stiffness, self.rest_length)
 
     def jumps(self, name: str) -> SpringJumps:
         """Return the jumps with the command filter of a name in FILTERS."""
-        motors = jumping_motors(self.torque)
+        motors = jumping_motors(self.torque_limit)
         motors = replace(motors, transversal=replace(motors.transversal, kp=self.kp))
-        return SpringJumps(motors, name, self.gravity, self.length, self.device)
+        return SpringJumps(motors, name, self.gravity, self.rest_length, self.device)
 
 
 def main(args: Args) -> dict:
     """Run the jumps of all springs, plot apex over stiffness, and return the metrics."""
     start = time.perf_counter()
     folder = prepare("leg_springs", args)
-    values: dict[str, Any] = {"gravity_m_s2": args.gravity, "torque_limit_nm": args.torque, "kp_nm_rad": args.kp,
-                              "spring_length_m": args.length, "stiffness_n_m": list(args.stiffness)}  # fmt: skip
+    values: dict[str, Any] = {"gravity_m_s2": args.gravity, "torque_limit_nm": args.torque_limit, "kp_nm_rad": args.kp,
+                              "spring_length_m": args.rest_length, "stiffness_n_m": list(args.stiffness)}  # fmt: skip
     planet = {EARTH: "Earth", MARS: "Mars"}.get(args.gravity, f"{args.gravity:g} m/s^2")
     table = Table(
-        "stiffness [N/m]", title=f"open-loop apex in m, {planet}, {args.torque:g} N m, springs {args.length:g} m"
+        "stiffness [N/m]",
+        title=f"open-loop apex in m, {planet}, {args.torque_limit:g} N m, springs {args.rest_length:g} m",
     )
     rows = [[f"{stiffness:g}"] for stiffness in args.stiffness]
     with figure(folder / "springs.png", figsize=(7, 4.5)) as axis:
         for name in FILTERS if args.filter == "both" else (args.filter,):
             jumps = args.jumps(name)
-            apexes = jumps.apexes(args.stiffness, args.squats)
+            apexes = jumps.apexes(args.stiffness, args.squat_angles)
             best, top = apexes.max(axis=1), int(apexes.max(axis=1).argmax())
-            squats = [args.squats[i] for i in apexes.argmax(axis=1)]
+            squats = [args.squat_angles[i] for i in apexes.argmax(axis=1)]
             values |= {f"{name}_apex_m": best.tolist(), f"{name}_squat_command_deg": squats,
                        f"{name}_highest_stiffness_n_m": args.stiffness[top]}  # fmt: skip
             recorded = jumps.record(args.stiffness[top], squats[top], folder)
@@ -99,4 +99,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

@@ -16,13 +16,14 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
 import warp as wp
 
+from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.output import output_dir, write_metrics
+from support.scripts import parse_flags
 
 
 @dataclass(frozen=True)
@@ -30,9 +31,9 @@ class Args:
     """Memory of each world."""
 
     solver: SolverName = "jumper"
-    """Physics."""
+    """Physics solver."""
     task: str = "vertical-jump"
-    """Task."""
+    """Name of the task."""
     envs: tuple[int, ...] = (256, 2048)
     """Numbers of worlds; a single one is measured in this process."""
     out: Path | None = None
@@ -74,4 +75,4 @@ def main(args: Args) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    run_command(lambda: main(parse_flags(Args)))

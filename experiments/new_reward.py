@@ -14,13 +14,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import torch
-import tyro
 import warp as wp
 
 from jumper_warp import Env, make_task, mdp
+from jumper_warp.cli.main import run_command
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.runner import train
 from jumper_warp.utils.output import output_dir, write_metrics
+from support.scripts import parse_flags
 
 
 @wp.func
@@ -46,11 +47,11 @@ def make_env(num_envs: int, seed: int, device: torch.device) -> Env:
 class Args:
     """Flags."""
 
-    envs: int = 256
+    num_envs: int = 256
     """Number of environments."""
     iterations: int = 5
     """Training iterations."""
-    steps: int = 32
+    num_steps: int = 32
     """Policy steps of each environment in an iteration."""
     out: Path | None = None
     """Folder for the run and metrics.json (default: outputs/new_reward/<time>)."""
@@ -62,9 +63,9 @@ def main(args: Args) -> dict:
     """Train for a few iterations and return the logged value of the new term."""
     wp.config.log_level = wp.LOG_WARNING
     folder = output_dir("new_reward", args.out)
-    ppo = PpoCfg(num_steps=args.steps)
-    cfg = TrainCfg(num_envs=args.envs, iterations=args.iterations, log_interval=1, log_root=folder / "logs", ppo=ppo,
-                   device=args.device, tensorboard=False)  # fmt: skip
+    ppo = PpoCfg(num_steps=args.num_steps)
+    cfg = TrainCfg(num_envs=args.num_envs, max_iterations=args.iterations, log_interval=1, log_root=folder / "logs",
+                   ppo=ppo, device=args.device, tensorboard=False)  # fmt: skip
     result = train(cfg, make_env)
     values = {
         "even_load_per_episode": result.metrics["Episode_Reward/even_load"],
@@ -77,4 +78,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Args))
+    run_command(lambda: main(parse_flags(Args)))

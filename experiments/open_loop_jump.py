@@ -1,6 +1,6 @@
 """The open-loop jump of the paper: squat, hold, then command full extension, through filter and motors.
 
-    python experiments/open_loop_jump.py --solver jumper --torque 18 --out outputs/jump
+    python experiments/open_loop_jump.py --solver jumper --torque-limit 18 --out outputs/jump
 
 The hardware reached 1.075 m at 18 N m with the gains and filter of the policies. With 24.8 N m, stiffer gains and a
 looser filter, neither of which it states, the paper's simulation gives 1.42 m: `--torque 24.8 --loose --kp 20`. Springs
@@ -16,7 +16,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.commands import print_metrics
@@ -31,7 +30,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from jumper_warp.viz.snapshot import Camera, contact_sheet
 from support.open_loop import SQUAT, plot_trace, simulate_jump, trace_metrics
-from support.scripts import DeviceArgs, prepare
+from support.scripts import DeviceArgs, parse_flags, prepare
 
 HARDWARE_APEX = 1.075  # [m] Paper, open loop on the robot at 18 N m
 STRIP_TIMES = (0.9, 2.2, 2.32, 2.45, 2.7, 2.95, 3.15, 3.8)
@@ -46,7 +45,7 @@ class Args(DeviceArgs):
 
     solver: Literal["jumper", "mujoco"] = "jumper"
     """Physics: the dedicated solver, or Newton's SolverMuJoCo."""
-    torque: float = 18.0
+    torque_limit: float = 18.0
     """[N m] Torque saturation of the motors; lateral motors give 18 at most."""
     kp: float = 17.0
     """[N m/rad] Position gain of the transversal motors."""
@@ -54,7 +53,7 @@ class Args(DeviceArgs):
     """[m/s^2] Downward."""
     loose: bool = False
     """A looser filter, as for the paper's 1.42 m."""
-    squat: float = SQUAT
+    squat_angle: float = SQUAT
     """[deg] Transversal angle commanded for the squat."""
     spring: tuple[float, float] | None = None
     """[N/m] [m] Stiffness and rest length of springs between the knees of each leg (default: none)."""
@@ -81,28 +80,28 @@ def main(args: Args) -> dict:
     """Simulate the jump, write its plots and recording, and return the metrics."""
     start = time.perf_counter()
     folder = prepare("open_loop_jump", args)
-    variant = {"solver": args.solver, "gravity_m_s2": args.gravity, "torque_limit_nm": args.torque,
-               "kp_nm_rad": args.kp, "loose_filter": args.loose, "squat_command_deg": args.squat}  # fmt: skip
+    variant = {"solver": args.solver, "gravity_m_s2": args.gravity, "torque_limit_nm": args.torque_limit,
+               "kp_nm_rad": args.kp, "loose_filter": args.loose, "squat_command_deg": args.squat_angle}  # fmt: skip
     robot = None if args.robot is None else load_overlay(args.robot)
     if args.spring is not None:
         robot = with_springs(*args.spring)
         variant |= {"spring_stiffness_n_m": args.spring[0], "spring_length_m": args.spring[1]}
     if args.robot is not None:
         variant["robot"] = str(args.robot)
-    motors = jumping_motors(args.torque)
+    motors = jumping_motors(args.torque_limit)
     motors = replace(motors, transversal=replace(motors.transversal, kp=args.kp))
     command_filter = loose_filter() if args.loose else vertical_jump_filter()
     sim = Simulation(
         1, solver=args.solver, motors=motors, command_filter=command_filter, gravity=args.gravity, robot=robot,
         device=args.device,
     )  # fmt: skip
-    trace, recorder, frames = simulate_jump(sim, variant, args.squat)
+    trace, recorder, frames = simulate_jump(sim, variant, args.squat_angle)
     save_filmstrip(frames, folder / "jump_strip.png")
     values: dict[str, Any] = {**variant, **trace_metrics(trace), "hardware_apex_height_m": None}
-    if args.torque == 18.0 and args.gravity == EARTH and not args.loose and robot is None:
+    if args.torque_limit == 18.0 and args.gravity == EARTH and not args.loose and robot is None:
         values["hardware_apex_height_m"] = HARDWARE_APEX
     write_metrics(folder, values)
-    title = f"Open-loop jump, {SOLVER_TITLES[args.solver]}, {args.torque:g} N m"
+    title = f"Open-loop jump, {SOLVER_TITLES[args.solver]}, {args.torque_limit:g} N m"
     plot_trace(folder / "jump.png", trace, title, HARDWARE_APEX)
     recorder.save_rrd(folder / "jump.rrd")
     print_metrics({name: value for name, value in values.items() if not name.startswith(PER_MOTOR)})
@@ -111,4 +110,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

@@ -21,6 +21,7 @@ from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, format_value
 from jumper_warp.evaluation.suites import suites_for
 from jumper_warp.utils.output import output_dir, write_metrics
+from support.scripts import parse_flags
 
 
 @dataclass(frozen=True)
@@ -51,4 +52,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

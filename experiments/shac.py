@@ -1,7 +1,7 @@
 """Comparison of SHAC and PPO on the nominal vertical jump, and noise of gradients through contact.
 
-    python experiments/shac.py --envs 4096 --seconds 120 --out outputs/shac          # on a GPU
-    python experiments/shac.py --envs 128 --seconds 300 --hidden 64 64 --history 1 --seeds 0     # on a CPU
+    python experiments/shac.py --num-envs 4096 --seconds 120 --out outputs/shac          # on a GPU
+    python experiments/shac.py --num-envs 128 --seconds 300 --hidden 64 64 --history 1 --seeds 0     # on a CPU
 
 First the variance of the policy gradient between worlds is measured over the length of the window, through the physics
 and by the score function of PPO, for random and for trained weights. Then both train. Every few seconds of training
@@ -15,7 +15,6 @@ from pathlib import Path
 from typing import Any, Literal, cast
 
 import torch
-import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.diff.differentiable_env import DifferentiableEnv
@@ -30,7 +29,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.gradient_variance import measure_stats, plot_variances, print_variances, variance_metrics
 from support.learning import LearningCurve, curve_metrics, make_eval_env, plot_curves, train_and_evaluate
-from support.scripts import DeviceArgs, prepare
+from support.scripts import DeviceArgs, parse_flags, prepare
 
 TASK = "vertical-jump"
 
@@ -41,14 +40,14 @@ class Args(DeviceArgs):
 
     seconds: float = 120.0
     """[s] Time of each training, its evaluations not counted; 0: none."""
-    every: float = 5.0
+    eval_interval: float = 5.0
     """[s] Training time between two evaluations."""
     seeds: tuple[int, ...] = (0, 1, 2)
-    """Of weights, noise and worlds."""
+    """Seeds of weights, noise and worlds."""
     trainers: tuple[Literal["ppo", "shac"], ...] = ("ppo", "shac")
-    """Compared."""
-    envs: int = 4096
-    """Worlds of a training."""
+    """Trainers to compare."""
+    num_envs: int = 4096
+    """Number of environments of a training."""
     window: int = 16
     """Policy steps of SHAC's windows; PPO's are those of the task."""
     init_std: float = 0.3
@@ -57,15 +56,19 @@ class Args(DeviceArgs):
     """Widths of the hidden layers of both."""
     history: int | None = None
     """Policy steps that the policies of trainings see, as `jumper train --history` (default: as the task says)."""
-    jumps: int = 200
-    """Jumps of an evaluation."""
+    num_jumps: int = 200
+    """Number of jumps of an evaluation."""
     horizons: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64)
     """Policy steps of the windows whose gradients are measured."""
-    worlds: int = 256
-    """Worlds of that."""
+    num_gradient_envs: int = 256
+    """Number of environments whose gradients are measured."""
 
     def __post_init__(self) -> None:
-        if not self.seeds or not self.trainers or min((self.every, *self.horizons, self.worlds - 1)) <= 0:
+        if (
+            not self.seeds
+            or not self.trainers
+            or min((self.eval_interval, *self.horizons, self.num_gradient_envs - 1)) <= 0
+        ):
             raise InputError("need seeds, trainers, at least 2 worlds, and positive times and horizons")
 
 
@@ -78,15 +81,15 @@ def make_env(args: Args, num_envs: int, seed: int = 0, *, history: int | None = 
 def train(args: Args, algorithm: str, seed: int) -> LearningCurve:
     """Train with "ppo" or "shac" and a seed, and return the learning curve."""
     torch.manual_seed(seed)
-    env, settings = make_env(args, args.envs, seed, history=args.history), trainer_settings(TASK)
-    eval_env = make_eval_env(env.tasks[0], args.jumps, args.device)
+    env, settings = make_env(args, args.num_envs, seed, history=args.history), trainer_settings(TASK)
+    eval_env = make_eval_env(env.tasks[0], args.num_jumps, args.device)
     settings = replace(settings, hidden=args.hidden)
     if algorithm == "shac":
         differentiable = cast(DifferentiableVecEnv, DifferentiableEnv(env))
         settings = replace(settings, num_steps=args.window, init_std=args.init_std)
         trainer = Shac(differentiable, settings, ShacCfg())
-        return train_and_evaluate(differentiable, trainer, eval_env, args.seconds, args.every)
-    return train_and_evaluate(env, Ppo(env, settings), eval_env, args.seconds, args.every)
+        return train_and_evaluate(differentiable, trainer, eval_env, args.seconds, args.eval_interval)
+    return train_and_evaluate(env, Ppo(env, settings), eval_env, args.seconds, args.eval_interval)
 
 
 def compare(args: Args, folder: Path) -> dict[str, Any]:
@@ -104,8 +107,8 @@ def compare(args: Args, folder: Path) -> dict[str, Any]:
 def main(args: Args) -> dict[str, Any]:
     """Measure gradient noise, train, plot both, and return the metrics."""
     folder = prepare("shac", args)
-    values: dict[str, Any] = {"envs": args.envs, "window": args.window, "worlds": args.worlds}
-    stats = measure_stats(lambda: make_env(args, args.worlds), args.horizons)
+    values: dict[str, Any] = {"envs": args.num_envs, "window": args.window, "worlds": args.num_gradient_envs}
+    stats = measure_stats(lambda: make_env(args, args.num_gradient_envs), args.horizons)
     plot_variances(stats, args.horizons, folder / "variance.png")
     print_variances(stats, args.horizons)
     values |= {"horizons": list(args.horizons)} | variance_metrics(stats)
@@ -116,4 +119,4 @@ def main(args: Args) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

@@ -1,7 +1,7 @@
 """Soak test: random actions for a long time, to see whether any world becomes non-finite.
 
-    python experiments/soak_test.py --envs 4096 --steps 2500 --out outputs/soak
-    python experiments/soak_test.py --envs 16384 --steps 61036 --task velocity-rough   # a billion, whole environments
+    python experiments/soak_test.py --num-envs 4096 --steps 2500 --out outputs/soak
+    python experiments/soak_test.py --num-envs 16384 --steps 61036 --task velocity-rough   # a billion steps
 
 Actions are random target angles of all motors within the limits of the jump. Worlds are reset after `episode` steps;
 masses and paw friction differ between worlds. With `--task` a whole randomised environment of any task takes random
@@ -12,14 +12,13 @@ for which an action is held are one graph.
 from __future__ import annotations
 
 import torch
-import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
-from support.scripts import prepare, report
+from support.scripts import parse_flags, prepare, report
 from support.soak import SoakArgs, hardest, soak_env, soak_simulation
 
 
@@ -28,15 +27,17 @@ def main(args: SoakArgs) -> dict:
     folder = prepare("soak_test", args, args.threads)
     torch.manual_seed(args.seed)
     if args.task is None:
-        command_filter = vertical_jump_filter() if args.filter else None
-        sim = Simulation(args.envs, command_filter=command_filter, visuals=False, device=args.device)
+        command_filter = vertical_jump_filter() if args.command_filter else None
+        sim = Simulation(args.num_envs, command_filter=command_filter, visuals=False, device=args.device)
         metrics = soak_simulation(sim, args)
     else:
-        env = Env(hardest(make_task(args.task)), args.envs, seed=args.seed, device=args.device, threads=args.threads)
+        env = Env(
+            hardest(make_task(args.task)), args.num_envs, seed=args.seed, device=args.device, threads=args.threads
+        )
         metrics = soak_env(env, args) | {"task": args.task}
-    report(folder, metrics | {"envs": args.envs, "filter": args.filter, "seed": args.seed})
+    report(folder, metrics | {"envs": args.num_envs, "filter": args.command_filter, "seed": args.seed})
     return metrics
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(SoakArgs)))
+    run_command(lambda: main(parse_flags(SoakArgs)))

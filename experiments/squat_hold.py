@@ -1,7 +1,7 @@
 """Held squats: variation of paw forces and motor torques while a policy waits for the command to jump.
 
     python experiments/squat_hold.py --policy vertical_jump --out outputs/hold
-    python experiments/squat_hold.py --policy horizontal_jump --squats 500 --randomize
+    python experiments/squat_hold.py --policy horizontal_jump --num-squats 500 --randomize
 
 Robots stand, get a goal but no command, and squat. Evaluated over the last second are the range of the force on each
 paw (largest value over physics steps, smallest over policy steps) and the ripple of the motor torques. Randomised
@@ -13,12 +13,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.utils.errors import InputError
+from support.scripts import parse_flags
 from support.squats import SquatLog, squat_goals, squat_metrics
 
 
@@ -28,20 +28,21 @@ class Args(EvaluationArgs):
 
     policy: str = "vertical_jump"
     """Name or folder of a policy that jumps, a run's folder, or a checkpoint."""
-    squats: int = 100
+    num_squats: int = 100
     """Number of robots."""
-    hold: float = 3.0
-    """[s] How long they wait."""
-    height: tuple[float, float] = (0.6, 1.1)
-    """[m] Lowest and highest goal of a policy that jumps to heights."""
-    distance: tuple[float, float] = (0.3, 1.5)
-    """[m] Nearest and farthest of one that jumps to places."""
+    hold_time: float = 3.0
+    """[s] How long each robot holds its squat."""
+    height_range: tuple[float, float] = (0.6, 1.1)
+    """[m] Lowest and highest goal, for a policy that jumps to heights."""
+    distance_range: tuple[float, float] = (0.3, 1.5)
+    """[m] Nearest and farthest goal, for a policy that jumps to places."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.squats < 1 or not 1.5 <= self.hold <= 30.0:
-            raise InputError(f"need at least one squat, and hold in 1.5 to 30 s, got {self.squats}, {self.hold}")
-        for name in ("height", "distance"):
+        if self.num_squats < 1 or not 1.5 <= self.hold_time <= 30.0:
+            given = f"{self.num_squats}, {self.hold_time}"
+            raise InputError(f"need at least one squat, and hold_time in 1.5 to 30 s, got {given}")
+        for name in ("height_range", "distance_range"):
             low, high = getattr(self, name)
             if not 0.0 < low <= high < 10.0:
                 raise InputError(f"{name} must be in (0, 10) m and rise, got {low}, {high}")
@@ -63,14 +64,14 @@ def plot_squats(run: EvaluationRun, squats: SquatLog) -> None:
 def main(args: Args) -> dict:
     """Run the squats and return the metrics."""
     run = EvaluationRun.from_args("squat_hold", args, (*HEIGHTS, *PLACES))
-    env = run.env(args.squats)
+    env = run.env(args.num_squats)
     up = run.task.evaluation_suite in HEIGHTS
-    goals = squat_goals(args.squats, args.height if up else args.distance, up=up)
-    squats = run.run_episodes(env, SquatLog(goals, args.hold), film="holds")
+    goals = squat_goals(args.num_squats, args.height_range if up else args.distance_range, up=up)
+    squats = run.run_episodes(env, SquatLog(goals, args.hold_time), film="holds")
     if not squats.ended.all():
         plot_squats(run, squats)
-    return run.report({"hold_s": args.hold} | squat_metrics(squats), {})
+    return run.report({"hold_s": args.hold_time} | squat_metrics(squats), {})
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

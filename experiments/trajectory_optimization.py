@@ -24,7 +24,6 @@ from typing import Any
 
 import numpy as np
 import torch
-import tyro
 from rich.console import Console
 from rich.table import Table
 
@@ -33,7 +32,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.motion_replay import MotionReplay, plot_replays
 from support.optimized_jumps import FINE, JUMPS, LIMITED, around, optimise
-from support.scripts import ThreadArgs, prepare
+from support.scripts import ThreadArgs, parse_flags, prepare
 
 KNOWN = JUMPS | LIMITED
 
@@ -43,21 +42,21 @@ class Args(ThreadArgs):
     """Flags."""
 
     jumps: tuple[str, ...] = tuple(JUMPS)
-    """What is optimised."""
+    """Names of the jumps to optimise."""
     samples: int | None = None
     """Random candidates (default: those of each jump)."""
     effort: float = 1.0
-    """[1] Scales the iterations."""
-    polish: int | None = None
+    """[1] Factor on the number of iterations."""
+    final_iterations: int | None = None
     """Iterations of the last descent (default: those of each jump)."""
     seed: int = 0
-    """Of random candidates and displacements."""
+    """Seed of random candidates and displacements."""
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.jumps if name not in KNOWN]
         if unknown or not self.jumps:
             raise InputError(f"no jump {(unknown or [''])[0]!r:.40}; there are {', '.join(KNOWN)}")
-        if not self.effort > 0.0 or (self.polish is not None and self.polish < 1):
+        if not self.effort > 0.0 or (self.final_iterations is not None and self.final_iterations < 1):
             raise InputError("need an iteration of the last descent, and an effort above 0")
         if self.samples is not None and self.samples < 48:
             raise InputError(f"need at least 48 samples, got {self.samples}")
@@ -71,7 +70,9 @@ def run_jump(name: str, args: Args, folder: Path, best: dict[str, np.ndarray]) -
     begin = jump.draw(knots, args.samples or jump.samples, rng)
     if jump.after in best:
         begin = np.concatenate([begin, around(best[jump.after], knots, rng)])
-    progress, steps = optimise(jump.scaled(args.effort), begin, args.seed, args.polish or jump.polish, **settings)
+    progress, steps = optimise(
+        jump.scaled(args.effort), begin, args.seed, args.final_iterations or jump.polish, **settings
+    )
     x = best[name] = progress.x[progress.best]
     targets = knots.targets(torch.as_tensor(x[None]))[..., 0].numpy()
     np.savez(folder / f"{name}.npz", targets=targets, knots=x.reshape(len(knots.at), -1), at=np.array(knots.at))
@@ -109,4 +110,4 @@ def main(args: Args) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

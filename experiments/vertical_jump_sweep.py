@@ -1,15 +1,14 @@
 """The paper's test of the vertical jump: a policy jumps to heights spread evenly over 0.5 to 1.2 m, each once.
 
-    python experiments/vertical_jump_sweep.py --policy vertical_jump --jumps 200 --out outputs/sweep
-    python experiments/vertical_jump_sweep.py --gains 0.6 1 --heights 0.55 1.05   # weak motors
+    python experiments/vertical_jump_sweep.py --policy vertical_jump --num-jumps 200 --out outputs/sweep
+    python experiments/vertical_jump_sweep.py --gain-scale 0.6 1 --height-range 0.55 1.05   # weak motors
 
 Runs the suite `sweep` of policies that jump to heights, as `jumper evaluate vertical_jump --suite sweep` does.
 """
 
-import tyro
-
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.sweeps import HeightSweep
+from support.scripts import parse_flags
 
 if __name__ == "__main__":
-    run_command(lambda: tyro.cli(HeightSweep).run())
+    run_command(lambda: parse_flags(HeightSweep).run())

@@ -1,6 +1,6 @@
 """The paper's test of several policies on one robot: walk, jump up, walk, jump ahead, walk.
 
-    python experiments/walk_jump_walk.py --robots 200 --out outputs/walk_jump_walk
+    python experiments/walk_jump_walk.py --num-robots 200 --out outputs/walk_jump_walk
 
 Every robot walks by random commands, sampled every two seconds within 0.8 m/s and 0.8 rad/s, jumps to 0.75 m, walks,
 jumps 0.85 m ahead, and walks. `--course` gives every robot ten random commands instead: to walk, turn, jump up, jump to
@@ -15,7 +15,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_course
@@ -24,6 +23,7 @@ from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.utils.errors import InputError
+from support.scripts import parse_flags
 from support.walks import PAPER
 
 REACH, EACH = 0.8, 2.0  # [m/s] and [rad/s] Limit of the commanded velocities; [s] time of each command
@@ -44,8 +44,8 @@ class Args(EvaluationArgs):
     """Policy that jumps to heights."""
     jump_to: str = "horizontal_jump"
     """Policy that jumps to places."""
-    robots: int = 200
-    """Number of robots, each with commands of its own."""
+    num_robots: int = 200
+    """Number of robots; each has its own commands."""
     course: bool = False
     """Ten random commands a robot instead of the paper's test."""
     blocks: bool = True
@@ -53,8 +53,8 @@ class Args(EvaluationArgs):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 1 <= self.robots <= 20_000:
-            raise InputError(f"robots must be in 1 to 20000, got {self.robots}")
+        if not 1 <= self.num_robots <= 20_000:
+            raise InputError(f"num_robots must be in 1 to 20000, got {self.num_robots}")
 
 
 def random_walks(rng: np.random.Generator, count: int) -> list[ScriptStep]:
@@ -91,19 +91,19 @@ def random_script(rng: np.random.Generator, blocks: bool = True) -> list[ScriptS
 def scripts(args: Args) -> list[list[ScriptStep]]:
     """Return one script per robot."""
     rng, blocks = np.random.default_rng(args.seed), args.blocks and args.solver == "jumper"
-    return [random_script(rng, blocks) if args.course else paper_script(rng) for _ in range(args.robots)]
+    return [random_script(rng, blocks) if args.course else paper_script(rng) for _ in range(args.num_robots)]
 
 
 def main(args: Args) -> dict:
     """Run the test, plot one robot's course, and return the metrics."""
     name = "course" if args.course else "walk_jump_walk"
     run = SkillRun.from_args(name, args, SkillNames(args.policy, args.jump_up, args.jump_to))
-    course = CourseLog(scripts(args), random_headings(args.robots, args.seed))
-    run.run_episodes(run.env(args.robots, block=course.block), course, film=name)
+    course = CourseLog(scripts(args), random_headings(args.num_robots, args.seed))
+    run.run_episodes(run.env(args.num_robots, block=course.block), course, film=name)
     title = f"walk, jump, walk: robot 0 of {course.count}, {run.title}"
     plot_course(run.folder / "course.png", course, 0, title)
     return run.report(course_metrics(course), {} if args.course else PAPER)
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

@@ -1,6 +1,6 @@
 """Distance that a walking policy covers on uneven ground, slopes and steps that it does not observe.
 
-    python experiments/walking_terrain.py --policy walking_rough --robots 500 --out outputs/terrain
+    python experiments/walking_terrain.py --policy walking_rough --num-robots 500 --out outputs/terrain
 
 Robots start in the middle of a tile with random headings and are commanded to walk straight ahead at 0.5 m/s for 10 s.
 The success rate of a terrain is the mean share of the commanded distance that they walk before they fall. Slopes and
@@ -13,7 +13,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.landings import random_headings
@@ -22,6 +21,7 @@ from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import VelocityLog, check_velocity_settings
 from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile
 from jumper_warp.utils.errors import InputError
+from support.scripts import parse_flags
 from support.walks import walked_share
 
 SECONDS = 10.0  # [s] Time of each walk
@@ -32,24 +32,24 @@ class Args(EvaluationArgs):
     """Flags."""
 
     policy: str = "walking_rough"
-    robots: int = 500
+    num_robots: int = 500
     """Robots on each terrain."""
     terrains: tuple[str, ...] = KINDS
-    """Which to walk on."""
+    """Terrains to walk on."""
     speed: float = 0.5
     """[m/s] Commanded, straight ahead."""
     uneven: float = 0.05
     """[m] Largest height or depth of random ground."""
     slope: float = 10.0
-    """[deg]"""
-    step: float = 0.06
+    """[deg] Inclination of slopes."""
+    step_height: float = 0.06
     """[m] Height of steps."""
-    record: int = 1
+    num_recorded: int = 1
     """Number of robots to record on each terrain for the Rerun viewer; 0: none."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check_velocity_settings(self.robots, SECONDS, self.speed)
+        check_velocity_settings(self.num_robots, SECONDS, self.speed)
         if not 0.0 < self.speed <= 0.6:
             raise InputError(f"speed must be in (0, 0.6] m/s, so that the walk ends on the tile, got {self.speed}")
 
@@ -57,21 +57,21 @@ class Args(EvaluationArgs):
 def main(args: Args) -> dict:
     """Run the walks on every terrain, plot the shares, and return the metrics."""
     run = EvaluationRun.from_args("walking_terrain", args, ("velocity",))
-    commands, metrics, shares = np.tile([args.speed, 0.0, 0.0], (args.robots, 1, 1)), {}, {}
-    terrain = TerrainCfg(tile=14.0, uneven=args.uneven, slope=args.slope, step=(args.step, args.step))
+    commands, metrics, shares = np.tile([args.speed, 0.0, 0.0], (args.num_robots, 1, 1)), {}, {}
+    terrain = TerrainCfg(tile=14.0, uneven=args.uneven, slope=args.slope, step=(args.step_height, args.step_height))
     for kind in args.terrains:
         ground = single_tile(terrain, kind)
-        env = run.env(args.robots, ground=ground)
-        log = VelocityLog(commands, env.task, SECONDS, headings=random_headings(args.robots, args.seed))
+        env = run.env(args.num_robots, ground=ground)
+        log = VelocityLog(commands, env.task, SECONDS, headings=random_headings(args.num_robots, args.seed))
         walks = run.run_episodes(env, log, film=kind, film_scene={"ground": ground})
         shares[kind] = walked_share(walks)
         metrics[f"success_rate_{kind}"] = float(shares[kind].mean())
         metrics[f"fall_rate_{kind}"] = float(walks.fallen.mean())
     with figure(run.folder / "terrain.png", figsize=(7, 4)) as axis:
         axis.boxplot([shares[kind] for kind in args.terrains], tick_labels=list(args.terrains), whis=(5, 95))
-        axis.set(ylabel="share of the way", title=f"{args.robots} robots each, {run.title}", ylim=(0.0, 1.05))
-    return run.report({"robots": args.robots, "speed_m_s": args.speed} | metrics, {})
+        axis.set(ylabel="share of the way", title=f"{args.num_robots} robots each, {run.title}", ylim=(0.0, 1.05))
+    return run.report({"robots": args.num_robots, "speed_m_s": args.speed} | metrics, {})
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

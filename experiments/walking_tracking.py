@@ -1,6 +1,6 @@
 """Velocity tracking of a walking policy: grid of commands, changed commands, top speed, velocity kicks, and gait.
 
-    python experiments/walking_tracking.py --policy walking_flat --per-axis 13 --out outputs/walking
+    python experiments/walking_tracking.py --policy walking_flat --commands-per-axis 13 --out outputs/walking
 
 One robot for each point of a grid, from minus to plus 0.8 m/s, 0.8 m/s and 0.8 rad/s, all three at once, walks for
 10 s; the first second does not count. Then as many robots get another command while they walk, 0.8 m/s away from the
@@ -16,7 +16,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import tyro
 
 from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import figure
@@ -24,6 +23,7 @@ from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import AXES, VelocityLog, check_velocity_settings, command_grid, tracking_metrics
 from jumper_warp.utils.errors import InputError
 from support.gaits import GaitRecorder
+from support.scripts import parse_flags
 from support.walks import (
     HOLD,
     PAPER,
@@ -44,16 +44,16 @@ class Args(EvaluationArgs):
     """Flags."""
 
     policy: str = "walking_flat"
-    per_axis: int = 13
-    """Commands along each axis of the grid; one robot for each of all three, and as many in the other tests."""
-    record: int = 1
+    commands_per_axis: int = 13
+    """Number of commands along each of the three axes; one robot for each combination, and as many in other tests."""
+    num_recorded: int = 1
     """Number of robots to record for the Rerun viewer, redirected while they walk; 0: none."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.per_axis < 2:
-            raise InputError(f"per_axis must be at least 2, got {self.per_axis}")
-        check_velocity_settings(self.per_axis**3, 10.0)
+        if self.commands_per_axis < 2:
+            raise InputError(f"commands_per_axis must be at least 2, got {self.commands_per_axis}")
+        check_velocity_settings(self.commands_per_axis**3, 10.0)
 
 
 def plot_tracking(run: EvaluationRun, walks: VelocityLog, settling: np.ndarray) -> None:
@@ -78,8 +78,8 @@ def plot_tracking(run: EvaluationRun, walks: VelocityLog, settling: np.ndarray) 
 def main(args: Args) -> dict:
     """Run all tests, plot the tracking, and return the metrics."""
     run, rng = EvaluationRun.from_args("walking_tracking", args, ("velocity",)), np.random.default_rng(args.seed)
-    env = run.env(args.per_axis**3)
-    walks = run.run_episodes(env, VelocityLog(command_grid(args.per_axis, 3 * (REACH,)), env.task))
+    env = run.env(args.commands_per_axis**3)
+    walks = run.run_episodes(env, VelocityLog(command_grid(args.commands_per_axis, 3 * (REACH,)), env.task))
     redirected = run.run_episodes(env, redirected_walks(env, rng), film="walk")
     settling = settling_times(redirected)
     fast, direction = sped_up_walks(env)
@@ -101,4 +101,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(tyro.cli(Args)))
+    run_command(lambda: main(parse_flags(Args)))

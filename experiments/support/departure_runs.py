@@ -61,11 +61,11 @@ class DepartureCfg:
 
 JumpTask = Literal["vertical-jump", "horizontal-jump", "omnidirectional-jump", "horizontal-jump-mars-loose"]
 JUMP_TASKS: dict[JumpTask, DepartureCfg] = {
-    "vertical-jump": DepartureCfg(1000, {"lower": 0.5, "upper": 1.05}, (0.6, 1.05)),
-    "horizontal-jump": DepartureCfg(800, {"x": (0.3, 1.5)}, (0.3, 1.5)),
-    "omnidirectional-jump": DepartureCfg(1000, {"x": (-0.8, 1.2), "y": (-0.8, 0.8)}, (0.3, 1.2)),
+    "vertical-jump": DepartureCfg(1000, {"height_range": (0.5, 1.05)}, (0.6, 1.05)),
+    "horizontal-jump": DepartureCfg(800, {"goal_x": (0.3, 1.5)}, (0.3, 1.5)),
+    "omnidirectional-jump": DepartureCfg(1000, {"goal_x": (-0.8, 1.2), "goal_y": (-0.8, 0.8)}, (0.3, 1.2)),
     "horizontal-jump-mars-loose": DepartureCfg(
-        1000, {"x": (0.5, 4.2)}, (0.5, 4.2), "--init-policy horizontal_jump --ppo.init-std 0.3"
+        1000, {"goal_x": (0.5, 4.2)}, (0.5, 4.2), "--init-policy horizontal_jump --ppo.init-std 0.3"
     ),
 }
 
@@ -79,7 +79,7 @@ def parse(ablation: Ablation, arguments: list[str]) -> tuple[Any, TaskCfg]:
 def train_or_load(ablation: Ablation, arguments: list[str]) -> Path:
     """Return the last checkpoint of a training, which is run unless it exists. Raises InputError: other settings."""
     (parsed, task), name = parse(ablation, arguments), f"{CHECKPOINTS}/iteration_{{:06d}}.pt"
-    if checkpoints := sorted(Path(parsed.cfg.log_root).glob(f"*/*/{name.format(parsed.cfg.iterations)}")):
+    if checkpoints := sorted(Path(parsed.cfg.log_root).glob(f"*/*/{name.format(parsed.cfg.max_iterations)}")):
         config = json.loads((checkpoints[-1].parents[1] / CONFIG).read_text())
         requested = json.loads(json.dumps(asdict(parsed.cfg), default=str))
         other = {key for key in requested.keys() - ELSEWHERE if requested[key] != config["train"].get(key)}
@@ -97,15 +97,17 @@ def evaluate(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, A
     run, ends = EvaluationRun(checkpoint), make_task(args.task).terminations
     run.prepare("departures", Conditions(device=args.device, threads=args.threads), folder)
     tests = {}
-    for test, count in zip(TESTS, args.jumps, strict=True):
+    for test, count in zip(TESTS, args.num_jumps, strict=True):
         randomize = test == "randomized"
         conditions = replace(run.conditions, randomize=randomize, noise=randomize)
-        flags: Any = replace(cast(Any, run.evaluation.flags), jumps=count, **JUMP_TASKS[args.task].goals)
+        flags: Any = replace(cast(Any, run.evaluation.flags), num_jumps=count, **JUMP_TASKS[args.task].goals)
         env = run.env(count, lambda task: run.evaluation.prepare_task(replace(task, terminations=ends)), conditions)
         values = flags.metrics(run.run_episodes(env, flags.log(env.task, 0)))
         values["error_m"] = values.get("mean_abs_error_m", values.get("mean_error_m"))
-        goals = squat_goals(args.squats, JUMP_TASKS[args.task].squats, up=run.task.evaluation_suite in HEIGHTS)
-        values |= squat_metrics(run.run_episodes(run.env(args.squats, conditions=conditions), SquatLog(goals, HOLD)))
+        goals = squat_goals(args.num_squats, JUMP_TASKS[args.task].squats, up=run.task.evaluation_suite in HEIGHTS)
+        values |= squat_metrics(
+            run.run_episodes(run.env(args.num_squats, conditions=conditions), SquatLog(goals, HOLD))
+        )
         tests[test] = {name: value for name, value in values.items() if isinstance(value, bool | int | float | None)}
     return tests
 

@@ -248,7 +248,7 @@ class FlightRun(Run):
         if takes_off.evaluation_suite not in HEIGHTS:
             raise PolicyError(f"this needs a jump to heights, got {takes_off.name}")
         self.tasks = takes_off, turning
-        self.prepare("flight_attitude", conditions_of(args), args.out, record=args.record)
+        self.prepare("flight_attitude", conditions_of(args), args.out, record=args.num_recorded)
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
         """Return the function that gives the actions of both skills, (2, num_envs, 12)."""

@@ -18,7 +18,7 @@ from jumper_warp.evaluation.plots import figure
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.rl.networks import ActorCritic, linear_layers
-from jumper_warp.trajectory.gauss_newton import Network, Tape, world_rows
+from jumper_warp.trajectory.gauss_newton import Network, Tape, per_world_gradients
 
 NOISE = 0.2  # [1] Standard deviation of the actions in windows
 ESTIMATORS = ("physics", "score")
@@ -70,10 +70,10 @@ def gradients(env: DifferentiableEnv, network: Network, horizon: int, std: float
         scores.append(-0.5 * alive * ((action.detach() - score_mean) / std).square().sum(1))
         rewards.append(alive * env.step_with_gradient(action))
         alive = alive * (1.0 - env.done)
-    by_physics = world_rows(torch.stack(rewards).sum(), tape)
+    by_physics = per_world_gradients(torch.stack(rewards).sum(), tape)
     to_go = torch.stack(rewards).detach().flip(0).cumsum(0).flip(0)
     advantage = to_go - to_go.mean(1, keepdim=True)
-    return by_physics, world_rows((torch.stack(scores) * advantage).sum(), score_tape)
+    return by_physics, per_world_gradients((torch.stack(scores) * advantage).sum(), score_tape)
 
 
 def policies() -> dict[str, Policy]:

@@ -17,7 +17,7 @@ from jumper_warp.identification.residuals import MotionResiduals
 from support.known_robots import Case, Simulate, prediction_errors
 
 
-def make_problem(parameters: ParameterSet, case: Case, replay: Replay) -> LeastSquares:
+def make_problem(parameters: ParameterSet, case: Case, replay: MotionReplay) -> LeastSquares:
     """Return the least-squares problem of a case, with the initial states of the recorded motions as start."""
     whole = [MotionResiduals(motion, parameters, NoiseLevels(), replay.description) for motion in case.motions]
     return LeastSquares(parameters, whole, replay, [case.mass])
@@ -30,7 +30,7 @@ def chi2_at(problem: LeastSquares, point: Point) -> float:
 
 def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
     """Return the best point of SciPy's trust-region method within `seconds`, with differences over parallel worlds."""
-    begin, size, ends = problem.expected(), len(problem.parameters), time.perf_counter() + seconds
+    begin, size, ends = problem.nominal_point(), len(problem.parameters), time.perf_counter() + seconds
     edges = np.cumsum([size, *(len(start) for start in begin.starts)])
     best = (np.inf, begin)
 
@@ -44,7 +44,7 @@ def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
     def residuals(x: np.ndarray) -> np.ndarray:
         nonlocal best
         point = to_point(x)
-        residual = np.concatenate([*problem.residuals(point), [problem.known(point.z)[0][0]], x])
+        residual = np.concatenate([*problem.residuals(point), [problem.prior_residuals(point.z)[0][0]], x])
         cost = float(residual @ residual)
         if cost < best[0]:
             best = (cost, point)
@@ -61,7 +61,7 @@ def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
             rows = table[row : row + len(block)]
             rows[:, :size], rows[:, first : first + len(start)] = block[:, :size], block[:, size:]
             row += len(block)
-        table[row, :size] = problem.known(point.z)[0][1]
+        table[row, :size] = problem.prior_residuals(point.z)[0][1]
         table[row + 1 :] = np.eye(len(x))
         return table
 
@@ -78,10 +78,10 @@ def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
     return best[1]
 
 
-def compare_methods(parameters: ParameterSet, case: Case, replay: Replay, ours: Simulate, seconds: float) -> dict:
+def compare_methods(parameters: ParameterSet, case: Case, replay: MotionReplay, ours: Simulate, seconds: float) -> dict:
     """Return χ² and held-out errors of CMA-ES and SciPy, each run for `seconds`."""
     problem = make_problem(parameters, case, replay)
-    evolved = identify_by_evolution(case.motions, parameters, knowledge=[case.mass], max_seconds=seconds)
+    evolved = identify_by_evolution(case.motions, parameters, prior_measurements=[case.mass], max_seconds=seconds)
     points = {"cma": Point(evolved.z, list(evolved.starts)), "scipy": scipy_fit(problem, seconds)}
     metrics = {"methods_wall_s": seconds, "cma_million_world_steps": evolved.effort.world_steps / 1.0e6}
     for name, point in points.items():

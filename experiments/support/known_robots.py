@@ -43,7 +43,7 @@ class Case:
 Simulate = Callable[[Plan, RobotValues], Record]
 
 
-def make_case(parameters: ParameterSet, seed: int, simulate: Simulate, replay: Replay) -> Case:
+def make_case(parameters: ParameterSet, seed: int, simulate: Simulate, replay: MotionReplay) -> Case:
     """Return a random robot with its recorded motions; simulate: records a plan on it; replay: checks safety."""
     rng = np.random.default_rng(seed)
     z = np.clip(SPREAD * rng.normal(size=len(parameters)), -MOST, MOST)
@@ -56,9 +56,9 @@ def make_case(parameters: ParameterSet, seed: int, simulate: Simulate, replay: R
         plan = sample_plan(KINDS[len(plans)], rng)
         if not unsafe_reason(plan, replay_plan(replay, plan, nominal)):
             plans.append(plan)
-    motions = [measured(p, f"{i} {p.kind}", simulate(p, robots), robots, rng) for i, p in enumerate(plans)]
-    held_out = plot_plan("small jump", rng, torque_limit=HELD_OUT_TORQUE)
-    mass = weighed(float(total_mass(robots)[0] + SCALE_STD * rng.normal()), SCALE_STD)
+    motions = [measure(p, f"{i} {p.kind}", simulate(p, robots), robots, rng) for i, p in enumerate(plans)]
+    held_out = sample_plan("small jump", rng, torque_limit=HELD_OUT_TORQUE)
+    mass = weighed_mass(float(total_mass(robots)[0] + SCALE_STD * rng.normal()), SCALE_STD)
     return Case(z, robots, motions, mass, held_out, simulate(held_out, robots))
 
 
@@ -79,7 +79,7 @@ def accuracy(parameters: ParameterSet, case: Case, result: Identification) -> di
         error = np.abs(values[chosen] - true[chosen])
         return float((error / np.abs(true[chosen]) if relative else error).max())
 
-    error = np.abs(result.z - case.truth) / np.maximum(result.deviations, 1.0e-9)
+    error = np.abs(result.z - case.truth) / np.maximum(result.std, 1.0e-9)
     return {
         "kp_worst_percent": 100.0 * worst("kp", True),
         "kd_worst_percent": 100.0 * worst("kd", True),
@@ -94,20 +94,21 @@ def accuracy(parameters: ParameterSet, case: Case, result: Identification) -> di
 
 
 def run_case(
-    parameters: ParameterSet, case: Case, replay: Replay, ours: Simulate, dt: float | None = None
+    parameters: ParameterSet, case: Case, replay: MotionReplay, ours: Simulate, dt: float | None = None
 ) -> tuple[dict[str, float], Identification]:
     """Identify a robot, and return its metrics and the result.
 
     ours: simulates a plan with the model; dt [s]: physics step of the model.
     """
-    result = identify(case.motions, parameters, knowledge=[case.mass], replay=replay, dt=dt)
+    result = identify(case.motions, parameters, prior_measurements=[case.mass], replay=replay, dt=dt)
     (nominal_deg, nominal_mm), (deg, mm) = (
         prediction_errors(case, robots, ours)
         for robots in (parameters.robots(np.zeros((1, len(parameters)))), result.robots())
     )
     metrics = accuracy(parameters, case, result) | {
         "chi2": result.chi2, "nominal_chi2": result.nominal_chi2, "identified": float(result.identified.sum()),
-        "wall_s": result.seconds, "cpu_s": result.cpu_seconds, "million_world_steps": result.world_steps / 1.0e6,
+        "wall_s": result.effort.seconds, "cpu_s": result.effort.cpu_seconds,
+        "million_world_steps": result.effort.world_steps / 1.0e6,
         "held_out_nominal_deg": nominal_deg, "held_out_deg": deg, "held_out_ratio": nominal_deg / deg,
         "held_out_nominal_mm": nominal_mm, "held_out_mm": mm, "held_out_height_ratio": nominal_mm / mm,
     }  # fmt: skip
@@ -117,7 +118,8 @@ def run_case(
 def policy_errors(name: str, jumps: int, case: Case, result: Identification, folder: Path) -> dict[str, float]:
     """Return the errors of the described and the identified robot in predicting a policy's jumps on the true one."""
     quantities = tuple(dict.fromkeys(parameter.quantity for parameter in result.parameters))
-    overlays = {"true": overlay_of(case.robots, quantities, source="truth"), "identified": result.overlay("identified")}
+    identified = identified_overlay(result, "identified")
+    overlays = {"true": overlay_of(case.robots, quantities, source="truth"), "identified": identified}
     apex, success = {}, {}
     for robot in ("true", "identified", "described"):
         if robot in overlays:

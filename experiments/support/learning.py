@@ -95,12 +95,12 @@ def train_and_time(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Learning
     args: `Args` of `experiments/learning_curves.py`.
     """
     torch.manual_seed(seed)
-    env = Env(task, args.envs, seed=seed, device=args.device, randomize=args.randomize, noise=args.randomize)
+    env = Env(task, args.num_envs, seed=seed, device=args.device, randomize=args.randomize, noise=args.randomize)
     trainer = Ppo(env, cfg)
     warm_up(env, trainer)
-    ready, eval_env = process_age(), make_eval_env(task, args.jumps, args.device)
+    ready, eval_env = process_age(), make_eval_env(task, args.num_jumps, args.device)
     success_rate(trainer, eval_env)
-    curve = train_and_evaluate(env, trainer, eval_env, args.seconds, args.every, args.heights)
+    curve = train_and_evaluate(env, trainer, eval_env, args.seconds, args.eval_interval, args.height_range)
     curve.ready = ready
     return curve
 

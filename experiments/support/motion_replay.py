@@ -123,8 +123,8 @@ class MotionReplay:
                 self.touched += 1
 
     @cached_property
-    def motion(self) -> Motion:
-        """Return the replay as a `Motion`, the argument of objectives and constraints."""
+    def motion(self) -> SimulatedMotion:
+        """Return the replay as a `SimulatedMotion`, the argument of objectives and constraints."""
         q, qd = (np.stack(column) for column in zip(*self.states, strict=True))
         parts = q, qd, self.torque[..., None], np.stack(self.impulses), self.targets[..., None]
         device = str(self.problem.rollout(1).device)

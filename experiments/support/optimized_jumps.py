@@ -152,7 +152,7 @@ UPWARD = (
     (COARSE, Stage(12, 100, rate=0.04, noise=0.04)),
     (FINE, Stage(4, 100, rate=0.02, noise=0.02, penalty=100.0)),
 )
-CALM: dict[str, Any] = {"slack": 0.03, "look": 5, "calmer": 0.7}
+CALM: dict[str, Any] = {"slack": 0.03, "check_every": 5, "return_scale": 0.7}
 """Settings of stages that often return to the best motion and continue with smaller steps."""
 CALMEST: dict[str, Any] = CALM | {"slack": 0.02}
 FORWARD = (
@@ -223,9 +223,8 @@ def optimise(
     costs: list[torch.Tensor] = []
     candidates = begin
     for number, (how, stage) in enumerate(jump.stages):
-        candidates = smoothed(
-            problems[str(how)], candidates, stages=(stage,), seed=seed + number, tell=lambda _, last: costs.append(last)
-        )
+        problem, record = problems[str(how)], lambda _, last: costs.append(last)
+        candidates = smoothed(problem, candidates, stages=(stage,), seed=seed + number, callback=record)
         best = float(costs[-1][0])
         print(f"{jump.label}, part {number + 1}: {len(candidates)} starts, cost with penalties {best:.3f}", flush=True)
     progress = minimise(problems[str(FINE)], candidates, iterations=polish, step=0.01, seed=seed)

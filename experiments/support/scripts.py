@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
+import tyro
+
+from jumper_warp.cli.renamed_flags import use_new_names
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
+
+Args = TypeVar("Args")
 
 
 @dataclass(frozen=True)
@@ -27,6 +33,11 @@ class ThreadArgs(DeviceArgs):
 
     threads: int | None = None
     """CPU threads that share the worlds (default: all cores); they change no result."""
+
+
+def parse_flags(kind: type[Args]) -> Args:
+    """Return a script's flags from the command line. Raises InputError: a flag is given by its old and new name."""
+    return tyro.cli(kind, args=use_new_names(sys.argv[1:], kind))
 
 
 def prepare(name: str, args: DeviceArgs, threads: int | None = None) -> Path:

@@ -24,27 +24,27 @@ from support.scripts import ThreadArgs
 class SoakArgs(ThreadArgs):
     """Flags of a soak test."""
 
-    envs: int = 1024
+    num_envs: int = 1024
     """Number of environments."""
     steps: int = 10_000
-    """Policy steps of each; with 1024 environments 10 million in all."""
-    hold: int = 10
-    """Policy steps for which an action is held."""
-    episode: int = 300
-    """Policy steps after which all worlds start again; of whole environments, after which the host looks at them."""
+    """Number of policy steps of each environment; with 1024 environments 10 million in all."""
+    hold_steps: int = 10
+    """Number of policy steps for which an action is held."""
+    episode_steps: int = 300
+    """Number of policy steps after which all worlds restart or, with --task, after which the host checks them."""
     lateral: float = 15.0
     """[deg] Largest lateral target."""
     transversal: tuple[float, float] = (-30.0, 140.0)
     """[deg] Least and largest transversal target."""
-    filter: bool = False
-    """Whether the motor command filter guards the targets."""
+    command_filter: bool = False
+    """Pass the targets through the motor command filter."""
     task: str | None = None
-    """Name of a task whose environment is tried, with limits and filter of its own, instead of the simulation alone."""
+    """Name of a task whose environment is tested, with its limits and filter (default: the simulation alone)."""
     seed: int = 0
-    """Of actions, masses and friction."""
+    """Seed of actions, masses and friction."""
 
     def __post_init__(self) -> None:
-        for name in ("envs", "steps", "hold", "episode"):
+        for name in ("num_envs", "steps", "hold_steps", "episode_steps"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
 
@@ -73,10 +73,10 @@ def simulation_steps(sim: Simulation, args: SoakArgs) -> Iterator[torch.Tensor]:
         target.new_tensor([row] * 4).reshape(12, 1) for row in ([-lateral, low, low], [lateral, high, high])
     )
     for step in range(args.steps):
-        if step % args.hold == 0:
+        if step % args.hold_steps == 0:
             target.copy_(lower + (upper - lower) * torch.rand_like(target))
         sim.step()
-        last = (step + 1) % args.episode == 0 or step + 1 == args.steps
+        last = (step + 1) % args.episode_steps == 0 or step + 1 == args.steps
         yield (diverged != 0) & last
         if last:  # flagged worlds are counted once
             sim.reset()
@@ -134,7 +134,7 @@ def soak_simulation(sim: Simulation, args: SoakArgs) -> dict:
     counters, start = SoakCounters(sim), time.perf_counter()
     for step, flagged in enumerate(simulation_steps(sim, args)):
         counters.update(flagged)
-        if (step + 1) % args.episode == 0 and counters.read().rows:
+        if (step + 1) % args.episode_steps == 0 and counters.read().rows:
             raise RuntimeError(f"a world holds values that are not finite but was not flagged, step {step}")
     return soak_metrics(counters, args.steps * sim.num_worlds, time.perf_counter() - start)
 
@@ -152,18 +152,18 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
 
     def step_held() -> None:
         action.uniform_(-1.0, 1.0)
-        for _ in range(args.hold):
+        for _ in range(args.hold_steps):
             env.step(action)
             counters.update(termination == diverged, env.obs, env.critic_obs, env.reward)
 
-    run, rounds = CapturedProcedure(step_held, env.device.type == "cuda"), -(-args.steps // args.hold)
-    check_interval = max(args.episode // args.hold, 1)
+    run, rounds = CapturedProcedure(step_held, env.device.type == "cuda"), -(-args.steps // args.hold_steps)
+    check_interval = max(args.episode_steps // args.hold_steps, 1)
     start = time.perf_counter()
     for i in range(rounds):
         run()
         if (i + 1) % check_interval == 0 and (rows := counters.read().rows):
-            raise RuntimeError(f"{rows} rows hold values that are not finite, by step {(i + 1) * args.hold}")
-    return soak_metrics(counters, rounds * args.hold * env.num_envs, time.perf_counter() - start)
+            raise RuntimeError(f"{rows} rows hold values that are not finite, by step {(i + 1) * args.hold_steps}")
+    return soak_metrics(counters, rounds * args.hold_steps * env.num_envs, time.perf_counter() - start)
 
 
 def soak_metrics(counters: SoakCounters, count: int, wall: float) -> dict:

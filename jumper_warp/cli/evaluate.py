@@ -1,6 +1,6 @@
-"""`jumper evaluate POLICY [--suite NAME]`: a policy is tried many times, in the way of its task, or of a suite.
+"""`jumper evaluate POLICY [--suite NAME]`: measure a policy over many trials, or in a test suite.
 
-The policy comes first: what it is decides which flags there are.
+The policy comes first: its task decides which flags there are.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError
 from jumper_warp.cli.main import parse as parse_flags
+from jumper_warp.cli.renamed_flags import join_height_range
 
 if TYPE_CHECKING:
     from jumper_warp.evaluation.evaluations import Evaluation
@@ -23,17 +24,17 @@ usage: jumper {command} POLICY [flags]
 
   POLICY    name or folder of a policy, a training run's folder, or a checkpoint; `jumper list` shows the project's
 
-Flags differ between tasks: jumper {command} POLICY --help shows those of one."""
+Flags depend on the task: jumper {command} POLICY --help lists them."""
 ABOUT = """\
-Try a policy many times and report how well it did: metrics.json, and a list of all that was tried.
+Measure a policy over many trials; writes metrics.json and a CSV file with one row for each trial.
 jumper evaluate POLICY --suite NAME [flags] runs a test of jumps instead, such as sweep, grid, ring or max."""
 SUITE = "--suite"
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Evaluate as the arguments say; modules: that the user has named, for tasks that are not the project's.
+    """Run `jumper evaluate` with the given arguments; modules: the user's, for tasks outside the project.
 
-    Raises UsageError or OSError with one line: the policy or a flag cannot be used. Exits where tyro does.
+    Raises UsageError or OSError: the policy or a flag is invalid. Exits as tyro does.
     """
     policy = policy_of("evaluate", ABOUT, args)
     from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
@@ -46,20 +47,20 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 
 def run_suite(opened: EvaluationRun, args: Sequence[str]) -> None:
-    """Run the suite that the arguments name. Raises UsageError: the policy's task has none of that name."""
+    """Run the suite that follows --suite. Raises UsageError: the policy's task has no suite of this name."""
     from jumper_warp.evaluation.suites import suites_for
 
     flag = args.index(SUITE)
     suites, name = suites_for(opened.task.evaluation_suite), "".join(args[flag + 1 : flag + 2])
     if name not in suites:
-        there = ", ".join(suites) or "none"
-        raise UsageError(f"no suite {name!r:.60} for policies of {opened.task.name}; there are {there}")
+        available = ", ".join(suites) or "none"
+        raise UsageError(f"no suite {name!r:.60} for policies of {opened.task.name}; there are {available}")
     command, default = f"evaluate {opened.source} {SUITE} {name}", suites[name](policy=str(opened.source))
     parse_flags(suites[name], command, [*args[1:flag], *args[flag + 2 :]], default=default).run(opened.modules)
 
 
 def policy_of(command: str, about: str, args: Sequence[str]) -> str:
-    """Return the policy, which comes first; exits after the help that is the same for all. Raises UsageError."""
+    """Return the first argument, the policy; prints the general help and exits if it is --help. Raises UsageError."""
     if args and args[0] in ("-h", "--help"):
         print(f"{HELP.format(command=command, about=about)}\n\n{TASK_MODULE_HELP}")
         raise SystemExit(0)
@@ -69,7 +70,7 @@ def policy_of(command: str, about: str, args: Sequence[str]) -> str:
 
 
 def open_run(policy: str, modules: Sequence[ModuleType]) -> EvaluationRun:
-    """Return a policy under evaluation. Raises PolicyError or CheckpointError: it cannot be used."""
+    """Open a policy for evaluation. Raises PolicyError or CheckpointError: it cannot be used."""
     from jumper_warp.evaluation.run import EvaluationRun
 
     return EvaluationRun(policy, modules)
@@ -78,11 +79,14 @@ def open_run(policy: str, modules: Sequence[ModuleType]) -> EvaluationRun:
 def parse(
     command: str, opened: EvaluationRun, args: Sequence[str], kind: Any, flags_of: Callable[[Evaluation], Any]
 ) -> Any:
-    """Return the settings of a kind, with the flags of the policy's evaluation; exits where tyro does.
+    """Parse the flags of a command on an opened policy into settings; exits as tyro does.
 
+    kind: generic dataclass of the settings. flags_of: returns the flags of the task's evaluation, with their defaults.
     Raises UsageError: a flag is not one of the policy's task, or a setting is out of range.
     """
     flags, about = flags_of(opened.evaluation), kind.__doc__
+    if hasattr(flags, "height_range"):
+        args = join_height_range(args, flags.height_range)
     cfg, unknown = parse_flags(
         kind[type(flags)],
         f"{command} {opened.source}",

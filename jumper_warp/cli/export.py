@@ -1,4 +1,4 @@
-"""`jumper export`: a run's policy as a folder, or a policy as one ONNX file."""
+"""`jumper export`: save the policy of a training run as a folder, or a policy as one ONNX file."""
 
 from __future__ import annotations
 
@@ -14,28 +14,28 @@ from jumper_warp.cli.main import parse
 
 @dataclass(frozen=True)
 class ExportCfg:
-    """Turn a training run into a policy's folder, or a policy into one ONNX file."""
+    """Save the policy of a training run as a folder, or a policy as one ONNX file."""
 
     source: tyro.conf.Positional[str]
-    """A run's folder, a checkpoint, or a policy's name or folder."""
+    """Folder of a run, checkpoint, or name or folder of a policy."""
     out: Path | None = None
-    """A file that ends in .onnx, or the folder of the new policy (default: policy/ in the run, or <task>.onnx)."""
+    """File name that ends in .onnx, or folder of the new policy (default: policy/ in the run, or <task>.onnx)."""
     newest: bool = False
-    """Of a run, take the newest checkpoint, not the best."""
+    """Export the newest checkpoint of a run, not the best."""
     overwrite: bool = False
-    """Replace a policy that is there already, figures and README included."""
+    """Replace an existing policy with its metrics and README."""
     blend: tuple[str, float] | None = None
-    """Another policy and its share, 0 to 1, of the mean of both networks' weights; useful where one was trained on from
-    the other."""
+    """Another policy and its weight, 0 to 1, in the mean of both networks' weights; useful if one was trained further
+    from the other."""
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Export as the arguments say; raises as `export`. A policy's own interface is enough: no module is needed."""
+    """Run `jumper export` with the given arguments; raises as `export`. modules: not needed."""
     export(parse(ExportCfg, "export", args))
 
 
 def export(cfg: ExportCfg) -> Path:
-    """Write what the configuration asks for, print where, and return the path.
+    """Write the policy's folder or ONNX file, print its path and return it.
 
     Raises PolicyError: the source cannot be used, two policies cannot be blended, the folder has a file's name, or it
     exists and is not to be overwritten. CheckpointError: the checkpoint cannot be used.

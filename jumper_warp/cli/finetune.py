@@ -1,4 +1,4 @@
-"""`jumper finetune POLICY`: a jumping policy's misses are made smaller by gradients through physics and network."""
+"""`jumper finetune POLICY`: reduce a jumping policy's errors by gradients through physics and network."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ ABOUT = "Make a jumping policy miss its heights or places by less, by gradients 
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Fine-tune as the arguments say; modules: that the user has named, for tasks that are not the project's.
+    """Run `jumper finetune` with the given arguments; modules: the user's, for tasks outside the project.
 
-    Raises UsageError, InputError or OSError with one line: the policy or a flag cannot be used.
+    Raises UsageError, InputError or OSError: the policy or a flag is invalid.
     """
     name = policy_of("finetune", ABOUT, args)
     from jumper_warp.evaluation.finetuning import FinetuneArgs, finetune

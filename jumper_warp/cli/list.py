@@ -1,4 +1,4 @@
-"""`jumper list`: the tasks, with where they come from, and the project's policies."""
+"""`jumper list`: list the tasks, with their origin, and the project's policies."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ from jumper_warp.cli.main import parse
 
 @dataclass(frozen=True)
 class ListCfg:
-    """Show the tasks, with where they come from, and the project's policies."""
+    """List the tasks, with their origin, and the project's policies."""
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Print the list; modules: that the user has named, whose tasks are registered by now."""
+    """Print the list; modules: the user's, whose tasks are registered already."""
     parse(ListCfg, "list", args)
     from jumper_warp.policies.folder import list_policies
     from jumper_warp.registry import TASKS, installed_tasks, load_installed, package_of

@@ -1,6 +1,6 @@
 """The command `jumper`: train, finetune, play, evaluate, export, sysid, list. `jumper COMMAND --help` shows the flags.
 
-Only what a command needs is imported, so that help and mistakes answer at once.
+A command imports only what it needs, so that help and usage errors print at once.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ COMMANDS = {
 }
 """Each is a module of `jumper_warp.cli` with run(args, modules)."""
 CODEGEN = re.compile(r'Error while parsing function "(\w+)" at (.+):\d+:')
-"""Names a function, and its file, in what Warp says of a kernel that it cannot compile; the last one is at fault."""
+"""Function and file in Warp's message about a kernel that does not compile; the last match is at fault."""
 TASK_MODULE = "--task-module"
 TASK_MODULE_HELP = f"""\
 Every command takes {TASK_MODULE} FILE_OR_MODULE, any number of times: a FILE.py or an installed module
@@ -38,18 +38,21 @@ that registers tasks of your own, and has the functions that saved ones name."""
 
 
 class UsageError(InputError):
-    """A command that cannot be understood. The message is one line."""
+    """Invalid command line; the message is one line."""
 
 
 def usage() -> str:
-    """Return the overview of all commands."""
+    """Return the help text that lists all commands."""
     lines = ["usage: jumper COMMAND [arguments]", ""]
     lines += [f"  {name:<10}{about}" for name, about in COMMANDS.items()]
     return "\n".join([*lines, "", TASK_MODULE_HELP, "", "jumper COMMAND --help shows the arguments of one."])
 
 
 def main(argv: Sequence[str] | None = None) -> None:
-    """Run the command; exits with 2 and one line on standard error if its input cannot be used."""
+    """Run a `jumper` command; exits with code 2 and one line on standard error if its input is invalid.
+
+    argv: the arguments after `jumper` (default: those of the process).
+    """
     args = list(sys.argv[1:] if argv is None else argv)
     if not args:
         print(usage(), file=sys.stderr)
@@ -61,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def dispatch(args: Sequence[str]) -> None:
-    """Run the command that comes first; raises UsageError if there is none of that name, and as the command does."""
+    """Run the command named by the first argument. Raises UsageError for an unknown one, and as the command does."""
     name = args[0]
     if name not in COMMANDS:
         raise UsageError(f"no command {name!r:.60}; there are {', '.join(COMMANDS)}")
@@ -74,14 +77,14 @@ def dispatch(args: Sequence[str]) -> None:
             modules += (load_task_module(file) for file in files)
         importlib.import_module(f"jumper_warp.cli.{name}").run(rest, modules)
     except Exception as error:
-        own = {os.path.abspath(path) for path in (*files, *(module.__file__ for module in modules)) if path}
-        if fault := fault_in(own, error):
+        user_files = {os.path.abspath(path) for path in (*files, *(module.__file__ for module in modules)) if path}
+        if fault := fault_in(user_files, error):
             raise InputError(fault) from error
         raise
 
 
 def fault_in(files: Collection[str], error: Exception) -> str | None:
-    """Return what is wrong in a user's own files in one line, or None if an exception comes from elsewhere."""
+    """Return one line about an exception raised in one of the user's files; None if it was raised elsewhere."""
     functions = CODEGEN.findall(str(error))
     if functions and os.path.abspath(functions[-1][1]) in files:
         name, path = functions[-1]
@@ -93,17 +96,17 @@ def fault_in(files: Collection[str], error: Exception) -> str | None:
 
 
 def split_task_modules(args: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Return the arguments without those that name modules, and these modules.
+    """Split the arguments into those without --task-module, and the names of the modules that it gives.
 
     Raises UsageError: a name is missing.
     """
-    rest, names, given = [], [], iter(args)
-    for arg in given:
+    rest, names, remaining = [], [], iter(args)
+    for arg in remaining:
         flag, equals, name = arg.partition("=")
         if flag.replace("_", "-") != TASK_MODULE:
             rest.append(arg)
             continue
-        name = name if equals else next(given, "")
+        name = name if equals else next(remaining, "")
         if not name or name.startswith("-"):
             raise UsageError(f"{TASK_MODULE} needs a FILE.py or the name of a module")
         names.append(name)
@@ -111,29 +114,31 @@ def split_task_modules(args: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def parse(kind: Any, command: str, args: Sequence[str], **settings: Any) -> Any:
-    """Return a command's settings from its arguments; exits with USAGE_ERROR if they are not understood.
+    """Parse a command's arguments into its settings; exits with USAGE_ERROR if they are invalid.
 
-    settings: of `tyro.cli`; its description is that of the kind unless given.
+    kind: dataclass of the settings. settings: keyword arguments of `tyro.cli`; description: of kind by default.
     """
     import tyro
 
+    from jumper_warp.cli.renamed_flags import use_new_names
+
     about = settings.pop("description", kind.__doc__)
     description = f"{about}\n\n{TASK_MODULE_HELP}"
-    return tyro.cli(kind, prog=f"jumper {command}", description=description, args=list(args), **settings)
+    args = use_new_names(args, settings.get("default", kind))
+    return tyro.cli(kind, prog=f"jumper {command}", description=description, args=args, **settings)
 
 
 def run_command(command: Callable[[], object]) -> None:
-    """Call a command or an experiment; exits with 2 and one line on standard error if its input cannot be used.
+    """Call a command or an experiment; exits with code 2 and one line on standard error if its input is invalid.
 
-    That is what an `InputError` tells, or the operating system about a file. Any other exception is a fault, and
-    passes with its traceback.
+    InputError, and OSError about a file, are printed as one line; any other exception propagates.
     """
     try:
         command()
         sys.stdout.flush()
     except KeyboardInterrupt:
         raise SystemExit(INTERRUPTED) from None
-    except BrokenPipeError:  # who reads has seen enough, as `head` has
+    except BrokenPipeError:  # the reader closed the pipe, as `head` does
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
     except (InputError, OSError) as error:
         if isinstance(error, OSError) and error.filename is None:

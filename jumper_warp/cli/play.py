@@ -1,6 +1,6 @@
-"""`jumper play POLICY`: a policy acts, as a recording for the Rerun viewer. `jumper play --script FILE`: several do.
+"""`jumper play POLICY` records a policy for the Rerun viewer, `jumper play --script FILE` several in sequence.
 
-The policy comes first: what it is decides which flags there are. A script says what one robot does with several.
+The policy comes first: its task decides which flags there are. A script lists the commands to one robot.
 """
 
 from __future__ import annotations
@@ -12,15 +12,15 @@ from jumper_warp.cli.evaluate import open_run, parse, policy_of
 from jumper_warp.cli.main import parse as parse_flags
 
 ABOUT = """\
-Let a policy act and record it for the Rerun viewer; --viewer rerun opens the recording.
-jumper play --script FILE.json [flags] lets one robot walk and jump with several policies, as the script says."""
+Run a policy and record it for the Rerun viewer; --viewer rerun opens the recording.
+jumper play --script FILE.json [flags] makes one robot walk and jump with several policies."""
 SCRIPT = "--script"
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Play as the arguments say; modules: that the user has named, for tasks that are not the project's.
+    """Run `jumper play` with the given arguments; modules: the user's, for tasks outside the project.
 
-    Raises UsageError or OSError with one line: the policy or a flag cannot be used. Exits where tyro does.
+    Raises UsageError or OSError: the policy or a flag is invalid. Exits as tyro does.
     """
     if args and args[0].startswith("-") and any(arg.partition("=")[0] == SCRIPT for arg in args):
         from jumper_warp.evaluation.commands import ScriptCfg, play_script

@@ -1,4 +1,4 @@
-"""The settings of the run that `jumper train --resume` continues."""
+"""Read the settings of a training run that `jumper train --resume` continues."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 
 def loaded_modules() -> list[ModuleType]:
-    """Return all modules that are imported by now; a task that was made has its functions in these."""
+    """Return all imported modules; those of a registered task's functions are among them."""
     return [module for module in sys.modules.values() if isinstance(module, ModuleType)]
 
 
 def settings_of_run(checkpoint: Checkpoint, cfg: TrainCfg) -> tuple[dict[str, Any], TaskCfg]:
-    """Return the settings of a checkpoint's run, by the fields of `jumper_warp.cli.train.TrainArgs`, and its task.
+    """Return the settings of a checkpoint's run, by field of `jumper_warp.cli.train.TrainArgs`, and its task.
 
-    cfg: Settings that the run does not have, and those of the session, see SESSION.
+    cfg: defaults for settings that the run lacks and for those of the session, see SESSION.
 
     Raises CheckpointError: the run is of another task or version, or its settings cannot be used.
     """
@@ -61,11 +61,11 @@ def _config(checkpoint: Checkpoint, task: str) -> dict[str, Any]:
 
 
 def with_saved(settings: Any, saved: dict[str, Any]) -> Any:
-    """Return a dataclass of settings with those that were saved. Raises ValueError or TypeError: one cannot be used."""
+    """Return a dataclass with the saved values of its fields. Raises ValueError or TypeError: a value is invalid."""
     new = {}
-    for name, own in vars(settings).items():
+    for name, default in vars(settings).items():
         if name in saved:
             value = saved[name]
-            value = with_saved(own, value) if dataclasses.is_dataclass(own) else value
+            value = with_saved(default, value) if dataclasses.is_dataclass(default) else value
             new[name] = tuple(value) if isinstance(value, list) else value
     return dataclasses.replace(settings, **new)

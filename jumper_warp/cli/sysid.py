@@ -1,4 +1,4 @@
-"""`jumper sysid DATA ...`: parameters of the robot from recorded motions; `excite` plans and records such motions."""
+"""`jumper sysid DATA ...`: identify the robot's parameters from recorded motions, plan such motions, fit one motor."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ usage: jumper sysid DATA ... [flags]
        jumper sysid actuator BENCH [flags]
 
   DATA      recorded motions: npz, csv or parquet files, or folders of them
-  excite    plan safe motions that tell much, and record them on a simulated robot
+  excite    plan safe, informative motions and record them on a simulated robot
   actuator  limits, friction and latency of one motor from a test bench
 
 The result identified.json is for --robot of jumper train, evaluate and play.
@@ -36,32 +36,32 @@ class SysidCfg:
     """Identify parameters of the robot from recorded motions: writes identified.json, report.html and report.json."""
 
     data: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Files of motions, or folders of them."""
+    """Files of recorded motions, or folders of them."""
     params: str = "motors,masses,friction,latency,offsets"
-    """Groups of parameters, separated by commas."""
-    without: str = ""
-    """Parameters, or groups of them, that are left as described, separated by commas."""
+    """Groups of parameters to identify, separated by commas."""
+    exclude: str = ""
+    """Parameters, or groups of them, that keep their described values, separated by commas."""
     mass: float | None = None
-    """[kg] What the whole robot weighs on a scale: without it or torques, masses and gains share a factor. Of motions
-    that `excite` recorded it tells the mass."""
-    mass_deviation: float = 0.02
-    """[kg] Of the scale."""
+    """[kg] Mass of the whole robot on a scale: without it or torques, masses and gains share a factor. `excite` prints
+    the mass of the robot that it records."""
+    mass_std: float = 0.02
+    """[kg] Standard deviation of the scale."""
     dt: float | None = None
     """[s] Largest physics step (default: 1/480)."""
     method: Literal["lm", "cma"] = "lm"
     """Staged Levenberg-Marquardt over parallel worlds, or CMA-ES."""
     max_seconds: float = 60.0
-    """[s] Time that CMA-ES takes."""
+    """[s] Time limit of CMA-ES."""
     noise: NoiseLevels = field(default_factory=NoiseLevels)
-    """Of the sensors."""
+    """Noise of the sensors, standard deviations."""
     base: Literal["", "free", "fixed"] = ""
     """Whether the base was free or fixed in all motions (default: as their files say)."""
-    gains: Literal["", "jumping", "walking"] = ""
-    """Gains that the controllers were set to (default: as the files say, else jumping)."""
+    gain_preset: Literal["", "jumping", "walking"] = ""
+    """Preset of gains that the controllers were set to (default: as the files say, else jumping)."""
     torque_limit: float = 0.0
-    """[N m] That the controllers were set to (default: as the files say, else 18)."""
+    """[N m] Torque limit that the controllers were set to (default: as the files say, else 18)."""
     torque_constant: float = 0.0
-    """[N m/A] Torque at the joint per current, for files with currents."""
+    """[N m/A] Torque at the joint over current, for files with currents."""
     out: Path | None = None
     """Folder for the results (default: outputs/sysid/<time>)."""
     device: str | None = None
@@ -72,37 +72,38 @@ class SysidCfg:
 
 @dataclass(frozen=True)
 class ExciteCfg:
-    """Plan safe motions that tell much of the parameters, record them on a simulated robot, and write them as npz."""
+    """Plan safe, informative motions, record them on a simulated robot, and write them as npz."""
 
     params: str = "motors,masses,friction,latency,offsets"
-    """Groups of parameters that the motions are to tell of."""
-    candidates: int = 4
-    """Random motions of each kind, of which the one that tells most is taken."""
+    """Groups of parameters that the motions are to identify."""
+    num_candidates: int = 4
+    """Number of random motions of each kind, of which the most informative one is taken."""
     seconds: float = 1.25
-    """[s] Of each motion."""
-    sets: int = 1
-    """How often the set of two hung chirps, a standing chirp and a small jump is planned."""
+    """[s] Length of each motion."""
+    num_sets: int = 1
+    """Number of sets to plan, each of two hung chirps, a standing chirp and a small jump."""
     solver: Literal["jumper", "mujoco"] = "jumper"
-    """Physics of the robot that is recorded."""
+    """Physics solver of the robot that is recorded."""
     robot: Path | None = None
     """Overlay of the robot that is recorded (default: as described)."""
     noise: NoiseLevels = field(default_factory=NoiseLevels)
-    """Of the sensors."""
-    exact: bool = False
+    """Noise of the sensors, standard deviations."""
+    no_noise: tyro.conf.FlagCreatePairsOff[bool] = False
     """Record without noise."""
-    torque: bool = False
-    """Record the motors' torques too."""
+    record_torque: bool = False
+    """Also record the motors' torques."""
     seed: int = 0
-    """Of motions and noise."""
+    """Seed of motions and noise."""
     out: Path | None = None
     """Folder for the motions and excite.json (default: outputs/excite/<time>)."""
     threads: int | None = None
     """CPU threads (default: all cores)."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a number out of range."""
-        if not (1 <= self.candidates <= 1000 and 1 <= self.sets <= 100):
-            raise InputError(f"candidates and sets must be at least 1, got {self.candidates}, {self.sets}")
+        """Raises InputError: a number is out of range."""
+        if not (1 <= self.num_candidates <= 1000 and 1 <= self.num_sets <= 100):
+            given = f"{self.num_candidates}, {self.num_sets}"
+            raise InputError(f"num_candidates must be in 1 to 1000 and num_sets in 1 to 100, got {given}")
 
 
 @dataclass(frozen=True)
@@ -112,20 +113,20 @@ class ActuatorCfg:
     bench: Annotated[Path, tyro.conf.Positional]
     """CSV file with columns test, time [s], command [N m], speed [rad/s], torque [N m]; see docs/identification.md."""
     motor: Literal["lateral", "transversal"] = "transversal"
-    """Kind of motor, whose described constants are the prior."""
+    """Kind of motor; its described constants are the prior."""
     torque_noise: float = 0.1
-    """[N m] Of the bench's torque sensor."""
+    """[N m] Noise of the bench's torque sensor, standard deviation."""
     out: Path | None = None
     """Folder for the results (default: outputs/actuator/<time>)."""
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Identify, excite or characterise as the arguments say.
+    """Run `jumper sysid` with the given arguments: identify parameters, plan motions (excite), or fit one motor.
 
     Raises InputError or OSError with one line: data or a flag cannot be used. Exits where tyro does.
     """
     if not args:
-        raise UsageError("data comes first: jumper sysid DATA ... [flags]; jumper sysid --help tells more")
+        raise UsageError("data comes first: jumper sysid DATA ... [flags]; jumper sysid --help lists the flags")
     if args[0] in ("-h", "--help"):
         print(HELP)
         raise SystemExit(0)
@@ -137,13 +138,13 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         sysid(parse(SysidCfg, "sysid", args))
 
 
-def names(text: str) -> list[str]:
-    """Return names that commas separate."""
+def split_names(text: str) -> list[str]:
+    """Return the names of a list separated by commas."""
     return [name for name in text.split(",") if name]
 
 
 def sysid(cfg: SysidCfg) -> None:
-    """Identify, write and print the results; raises as `run`."""
+    """Identify the parameters, write the report and print a table of the results; raises as `run`."""
     from rich.console import Console
     from rich.table import Table
 
@@ -153,35 +154,35 @@ def sysid(cfg: SysidCfg) -> None:
     from jumper_warp.utils.runtime import configure_device
 
     cfg.noise.check()
-    parameters = jumper_parameters(names(cfg.params)).without(names(cfg.without))
+    parameters = jumper_parameters(split_names(cfg.params)).without(split_names(cfg.exclude))
     settings: dict[str, Any] = {name: getattr(cfg, name) for name in ("noise", "dt", "device", "threads")}
-    settings["prior_measurements"] = [] if cfg.mass is None else [weighed_mass(cfg.mass, cfg.mass_deviation)]
-    given = {name: getattr(cfg, name) for name in ("base", "gains", "torque_limit", "torque_constant")}
-    motions = load_motions(cfg.data, **given)
+    settings["prior_measurements"] = [] if cfg.mass is None else [weighed_mass(cfg.mass, cfg.mass_std)]
+    given = {name: getattr(cfg, name) for name in ("base", "torque_limit", "torque_constant")}
+    motions = load_motions(cfg.data, gains=cfg.gain_preset, **given)
     configure_device(cfg.device, cfg.threads)
     if cfg.method == "cma":
-        found = identify_by_evolution(motions, parameters, max_seconds=cfg.max_seconds, **settings)
+        result = identify_by_evolution(motions, parameters, max_seconds=cfg.max_seconds, **settings)
     else:
-        found = identify(motions, parameters, **settings)
+        result = identify(motions, parameters, **settings)
     folder = output_dir("sysid", cfg.out)
-    write_results(found, folder, f"jumper sysid of {', '.join(motion.name for motion in motions)}")
+    write_results(result, folder, f"jumper sysid of {', '.join(motion.name for motion in motions)}")
     table = Table("parameter", "unit", "described", "found", "95 %", box=None)
-    rows = zip(found.parameters, found.values, found.intervals, found.identified, strict=True)
+    rows = zip(result.parameters, result.values, result.intervals, result.identified, strict=True)
     for parameter, value, (low, high), sure in rows:
         row = (parameter.name, parameter.unit, f"{parameter.nominal:.5g}", f"{value:.5g}", f"{low:.5g} … {high:.5g}")
         table.add_row(*row, style=None if sure else "dim")
     Console().print(table)
-    wider = f"; intervals {found.mismatch:.3g} times wider for the model's errors" if found.mismatch != 1.0 else ""
-    print(f"χ² {found.chi2:.4g} (described {found.nominal_chi2:.4g}), {found.effort.seconds:.1f} s{wider}")
-    for words in dict.fromkeys(direction.words for direction in found.directions):
+    wider = f"; intervals {result.mismatch:.3g} times wider for the model's errors" if result.mismatch != 1.0 else ""
+    print(f"χ² {result.chi2:.4g} (described {result.nominal_chi2:.4g}), {result.effort.seconds:.1f} s{wider}")
+    for words in dict.fromkeys(direction.words for direction in result.directions):
         print(f"open: {words}")
-    for line in found.warnings:
+    for line in result.warnings:
         print(f"misfit: {line}")
     print(folder / "report.html")
 
 
 def excite(cfg: ExciteCfg) -> None:
-    """Plan, record and write motions; raises as `run`."""
+    """Plan motions, record them on a simulated robot and write them; raises as `run`."""
     import numpy as np
 
     from jumper_warp.identification.excitation import Scorer, choose, record_motions
@@ -193,15 +194,15 @@ def excite(cfg: ExciteCfg) -> None:
     from jumper_warp.utils.runtime import configure_device
 
     cfg.noise.check()
-    parameters = jumper_parameters(names(cfg.params))
+    parameters = jumper_parameters(split_names(cfg.params))
     robots = RobotValues.nominal(1) if cfg.robot is None else load_overlay(cfg.robot).robots()
     configure_device("cpu", cfg.threads)
     scorer = Scorer(parameters, cfg.noise, MotionReplay(device="cpu", threads=cfg.threads))
-    chosen = choose(scorer, KINDS * cfg.sets, candidates=cfg.candidates, seconds=cfg.seconds, seed=cfg.seed)
-    rng = None if cfg.exact else np.random.default_rng([cfg.seed, 1])
+    chosen = choose(scorer, KINDS * cfg.num_sets, candidates=cfg.num_candidates, seconds=cfg.seconds, seed=cfg.seed)
+    rng = None if cfg.no_noise else np.random.default_rng([cfg.seed, 1])
     folder = output_dir("excite", cfg.out)
     motions = record_motions(
-        chosen, folder, robots=robots, noise=cfg.noise, solver=cfg.solver, rng=rng, torque=cfg.torque
+        chosen, folder, robots=robots, noise=cfg.noise, solver=cfg.solver, rng=rng, torque=cfg.record_torque
     )
     for motion, gain in zip(motions, chosen.gain, strict=True):
         print(f"{motion.name}: {len(motion.time) / 240.0:.2f} s, information up to here {gain:.1f} nat")
@@ -217,9 +218,9 @@ def characterise(cfg: ActuatorCfg) -> None:
     from jumper_warp.identification.actuators import characterise_motor, load_bench
     from jumper_warp.utils.output import output_dir
 
-    found = characterise_motor(load_bench(cfg.bench), cfg.motor, cfg.torque_noise)
+    result = characterise_motor(load_bench(cfg.bench), cfg.motor, cfg.torque_noise)
     folder = output_dir("actuator", cfg.out)
-    write_atomically(folder / "actuator.json", json_bytes(found.to_json()))
-    for name, (value, low, high, unit) in found.rows().items():
+    write_atomically(folder / "actuator.json", json_bytes(result.to_json()))
+    for name, (value, low, high, unit) in result.rows().items():
         print(f"{name:<16}{value:10.5g} {unit:<6} 95 % {low:.5g} … {high:.5g}")
     print(folder / "actuator.json")

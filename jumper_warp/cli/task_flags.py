@@ -1,4 +1,4 @@
-"""A task's settings as flags of the command line, whatever the task; functions are left as the task has them.
+"""Command-line flags for the settings of any task; its functions have no flags.
 
     --env.rewards.jump-height.weight 30 --env.observations.actor.lin-vel.noise 0.1 --env.reset.tilt 3
 
@@ -25,11 +25,11 @@ from jumper_warp.tasks.terms import Term
 from jumper_warp.utils.errors import InputError
 
 NO_SOURCE = __package__
-"""Module of the classes made here. Tyro looks for their source there: in an empty file, so that it takes no seconds."""
+"""Module of the dataclasses made here: tyro searches its source, which is empty and therefore fast to parse."""
 
 
 class Flag(NamedTuple):
-    """A setting, or a group of them."""
+    """A setting or a group of settings, as a field of a dataclass for tyro."""
 
     kind: Any
     """Its type, for tyro."""
@@ -38,19 +38,19 @@ class Flag(NamedTuple):
 
 
 def flags_of(task: TaskCfg) -> Any:
-    """Return a task's settings as a dataclass that tyro makes flags of. Raises InputError: two flags are the same."""
+    """Return a task's settings as an instance of a dataclass for tyro. Raises InputError: two flags have one name."""
     flags = _flag_of_dataclass(task, task.name)
     return flags and flags.value
 
 
 def flag_name(name: str) -> str:
-    """Return a name of the task as a flag has it."""
+    """Return the name of a setting in the spelling of flags: lower case, with dashes."""
     return re.sub(r"[^0-9A-Za-z]+", "-", name).strip("-").lower()
 
 
 @functools.cache
 def field_docs(kind: type) -> dict[str, str]:
-    """Return what the strings below the fields of a dataclass tell, by field; nothing where there is no source."""
+    """Return the docstrings of a dataclass's fields by field name; empty where there is no source."""
     docs = {}
     for base in reversed(kind.__mro__[:-1]):
         try:
@@ -64,7 +64,7 @@ def field_docs(kind: type) -> dict[str, str]:
 
 
 def _flag(value: Any, hint: Any, where: str) -> Flag | None:
-    """Return the flag or flags of a part of a task; None if it has none."""
+    """Return the flag or group of flags of a part of a task; None if it has no flags."""
     if isinstance(value, Term):
         return _flag_of_term(value, where)
     if isinstance(value, Reset):
@@ -73,13 +73,13 @@ def _flag(value: Any, hint: Any, where: str) -> Flag | None:
         return _flag_of_dataclass(value, where)
     if parts := _parts(value):
         flags = {name: _flag(part, Any, f"{where} {name}") for name, part in parts.items()}
-        found = {name: flag for name, flag in flags.items() if flag is not None}
-        return _group(None, found, where) if found else None
+        present = {name: flag for name, flag in flags.items() if flag is not None}
+        return _group(None, present, where) if present else None
     return Flag(hint, value) if _is_number(value, hint) else None
 
 
 def _flag_of_dataclass(value: Any, where: str) -> Flag | None:
-    """Return the flags of the fields of a dataclass; those that hold functions and names have none."""
+    """Return the flags of a dataclass's fields; fields that hold functions or names have none."""
     hints, docs, flags = get_type_hints(type(value)), field_docs(type(value)), {}
     for name, part in _parts(value).items():
         flag = _flag(part, hints[name], f"{where} {name}")
@@ -89,7 +89,7 @@ def _flag_of_dataclass(value: Any, where: str) -> Flag | None:
 
 
 def _flag_of_term(term: Term, where: str) -> Flag | None:
-    """Return the flags of a term's numbers, and of the options that are whole numbers."""
+    """Return the flags of a term's numbers and integer options."""
     settings = {**term.settings, **term.options}
     numbers = term.numbers | {key: option for key, option in term.options.items() if type(option) is int}
     kinds = {int: int, tuple: tuple[float, float]}
@@ -98,7 +98,7 @@ def _flag_of_term(term: Term, where: str) -> Flag | None:
 
 
 def _group(about: str | None, flags: dict[str, Flag], where: str) -> Flag:
-    """Return settings as one frozen dataclass, whose members have the names of flags."""
+    """Return flags as one group, an instance of a frozen dataclass. Raises InputError: two flags have one name."""
     names = [flag_name(name) for name in flags]
     if len(set(names)) < len(names) or "" in names:
         raise InputError(f"{where}: the names of {', '.join(flags)} make the same flags")
@@ -113,28 +113,25 @@ def _group(about: str | None, flags: dict[str, Flag], where: str) -> Flag:
 
 
 def _members(group: Any) -> dict[str, Any]:
-    """Return the settings of a group by their flags."""
+    """Return the values of a group by flag name."""
     return {spec.metadata["flag"]: getattr(group, spec.name) for spec in dataclasses.fields(group)}
 
 
 def with_flags(value: Any, flags: Any) -> Any:
-    """Return a task, or a part of one, with the values of its `flags_of`. Raises ValueError as `TaskCfg` does."""
+    """Return a task, or a part of it, with the values of flags from `flags_of`. Raises ValueError as `TaskCfg`."""
     if isinstance(value, Reset):
         return dataclasses.replace(value, settings=with_flags(value.settings, flags))
     if not (parts := _parts(value)):
         return flags
-    given = _members(flags)
-    new = {name: with_flags(part, given[flag_name(name)]) for name, part in parts.items() if flag_name(name) in given}
+    values = _members(flags)
+    new = {name: with_flags(part, values[flag_name(name)]) for name, part in parts.items() if flag_name(name) in values}
     if isinstance(value, Term):
         return value.replace(**{key: number for key, number in new.items() if number != parts[key]})
     return tuple((parts | new).values()) if isinstance(value, tuple) else dataclasses.replace(value, **new)
 
 
 def _parts(value: Any) -> dict[str, Any]:
-    """Return a term's numbers and options, a dataclass's fields, or a tuple's terms by name or dataclasses by number.
-
-    Of anything else nothing.
-    """
+    """Return the parts of a term, dataclass or tuple of either, by name or index; empty for any other value."""
     if isinstance(value, Term):
         return {**value.numbers, **value.options}
     if dataclasses.is_dataclass(value) and not isinstance(value, type):
@@ -145,7 +142,7 @@ def _parts(value: Any) -> dict[str, Any]:
 
 
 def _is_number(value: Any, hint: Any) -> bool:
-    """Return whether a setting is a number, a choice, a few of them, or none: all but functions, structs and names."""
+    """Return whether a setting holds numbers or a choice, or is optional: not a function, struct or name."""
     if isinstance(value, str):
         return hint is not str
     if isinstance(value, tuple):
@@ -156,5 +153,5 @@ def _is_number(value: Any, hint: Any) -> bool:
 
 
 def _first_paragraph(doc: str | None) -> str | None:
-    """Return the beginning of a docstring in one line."""
+    """Return the first paragraph of a docstring in one line; None if it is empty."""
     return " ".join(inspect.cleandoc(doc or "").split("\n\n")[0].split()) or None

@@ -1,4 +1,4 @@
-"""`jumper train TASK`: every setting of training and task as a flag."""
+"""`jumper train TASK`: train a policy; every setting of training and task has a flag."""
 
 from __future__ import annotations
 
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 import tyro
 
 from jumper_warp.cli.main import TASK_MODULE, TASK_MODULE_HELP, USAGE_ERROR, UsageError, parse
+from jumper_warp.cli.renamed_flags import use_new_names
 from jumper_warp.registry import find_task, make_task, task_names
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.utils.errors import InputError
@@ -39,14 +40,14 @@ class TrainArgs:
     solver: Literal["jumper", "mujoco"] = "jumper"
     """Physics: the dedicated solver, or Newton's SolverMuJoCo."""
     randomize: bool = True
-    """Draw masses, friction, motors, latency and pushes for each world; single rows are under --env.randomization."""
+    """Randomise masses, friction, motors, latency and pushes for each world; ranges are under --env.randomization."""
     noise: bool = True
     """Add noise to observations."""
     history: int | None = None
-    """Policy steps of which the policy sees the velocities, gravity, angles and actions (default: as the task says).
-    1 is a third of the numbers, learns sooner on few worlds, and is enough where nothing is drawn and noise is off."""
+    """Policy steps of velocities, gravity, angles and actions in the observation (default: the task's). With 1 it has
+    a third of the size, learns faster on few worlds, and is enough without randomisation and noise."""
     robot: Path | None = None
-    """Robot overlay, as `jumper sysid` writes it; its ranges of randomisation replace the task's, and flags both."""
+    """Robot overlay, as `jumper sysid` writes it; its randomisation ranges override the task's, flags override both."""
     robot_of_run: Annotated[Any, tyro.conf.Suppress] = None
     """Robot overlay of the run that is resumed."""
     checkpoint: Annotated[Any, tyro.conf.Suppress] = None
@@ -54,9 +55,9 @@ class TrainArgs:
 
 
 def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
-    """Return the settings, and the task with its settings; exits after help or usage, and where tyro does.
+    """Parse the arguments of `jumper train` into settings and the task; exits after help or usage, and as tyro does.
 
-    Those of a run that is resumed are its own, where no flag changes them.
+    A resumed run has its saved settings where no flag overrides them.
 
     Raises InputError: the task is missing, unknown or given twice, a setting is out of range, or there is no such run.
     """
@@ -71,12 +72,14 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
         raise UsageError(f"the task comes first: jumper train TASK [flags]; tasks: {names}")
     name, entry = find_task(args[0])
     default, task = TrainArgs(TrainCfg(task=name, ppo=entry.ppo, best_metric=entry.best_metric)), make_task(name)
-    given = {name: value_of(f"--{name.replace('_', '-')}", args[1:]) for name in ("resume", "log_root", "init_policy")}
-    if given["resume"]:
+    session = {
+        name: value_of(f"--{name.replace('_', '-')}", args[1:]) for name in ("resume", "log_root", "init_policy")
+    }
+    if session["resume"]:
         from jumper_warp.cli.resumed import settings_of_run
         from jumper_warp.rl.resume import find_checkpoint
 
-        named = dataclasses.replace(default.cfg, **{k: v for k, v in given.items() if v})
+        named = dataclasses.replace(default.cfg, **{k: v for k, v in session.items() if v})
         if checkpoint := find_checkpoint(named):
             settings, task = settings_of_run(checkpoint, default.cfg)
             default = dataclasses.replace(default, **settings)
@@ -89,30 +92,30 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
 
 
 def parse_settings(task: TaskCfg, default: TrainArgs, args: Sequence[str]) -> tuple[Any, TaskCfg]:
-    """Return the settings, and the task with those of `--env`; exits where tyro does. Raises InputError as the task."""
+    """Parse arguments into the settings and the task changed by `--env`; exits as tyro does. Raises InputError."""
     from jumper_warp.cli.task_flags import flags_of, with_flags
 
     flags = flags_of(task)
     made: dict[str, Any] = {"bases": (TrainArgs,), "frozen": True, "namespace": {"__module__": __name__}}
     kind: Any = dataclasses.make_dataclass("TaskTrainArgs", [("env", type(flags), flags)], **made)
-    given = {spec.name: getattr(default, spec.name) for spec in dataclasses.fields(default)}
+    defaults = {spec.name: getattr(default, spec.name) for spec in dataclasses.fields(default)}
     about = f"Train a policy on {task.name}."
-    parsed = parse(kind, f"train {task.name}", args, default=kind(**given), description=about)
+    parsed = parse(kind, f"train {task.name}", args, default=kind(**defaults), description=about)
     return parsed, with_flags(task, parsed.env)
 
 
 def value_of(name: str, args: Sequence[str]) -> str | None:
-    """Return the value of a flag before the flags are parsed, the last one that is given; None: there is none."""
-    found = None
+    """Return the last value of a flag in unparsed arguments; None if it is not given."""
+    value = None
     for arg, following in itertools.zip_longest(args, args[1:]):
-        flag, equals, value = arg.partition("=")
+        flag, equals, text = arg.partition("=")
         if flag.replace("_", "-") == name:
-            found = value if equals else following
-    return found
+            value = text if equals else following
+    return value
 
 
 def overlay_in(args: Sequence[str]) -> RobotOverlay | None:
-    """Return the overlay that the flag --robot names; None without. Raises InputError or OSError: it cannot be used."""
+    """Return the robot overlay of the flag --robot, None without it. Raises InputError or OSError: it is invalid."""
     path = value_of("--robot", args)
     if path is None:
         return None
@@ -122,14 +125,14 @@ def overlay_in(args: Sequence[str]) -> RobotOverlay | None:
 
 
 def for_robot(task: TaskCfg, overlay: RobotOverlay | None) -> TaskCfg:
-    """Return the task with an overlay's ranges of randomisation. Raises InputError: one that no robot can have."""
+    """Return the task with an overlay's randomisation ranges. Raises InputError: a range is impossible."""
     if overlay is None:
         return task
     return dataclasses.replace(task, randomization=dataclasses.replace(task.randomization, **overlay.randomization))
 
 
 def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
-    """Return what makes the environment of a training."""
+    """Return the function that makes a training's environment from num_envs, seed and device."""
     from jumper_warp.cli.training_memory import check_memory
     from jumper_warp.envs.env import Env
     from jumper_warp.robot.overlay import load_overlay
@@ -150,17 +153,17 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
 
 
 def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
-    """Return what was typed, without `--resume` and `--init-policy`, to which one more `--resume` can be added.
+    """Return the command line without `--resume` and `--init-policy`, for a later resume.
 
-    Modules are named by their file, those of a package by their name.
+    Modules are given by their file, those of a package by their name.
     """
-    kept, given = [], iter(args)
-    for arg in given:
+    kept, remaining = [], iter(args)
+    for arg in remaining:
         flag, equals, _ = arg.partition("=")
         if flag.replace("_", "-") not in ("--resume", "--init-policy"):
             kept.append(arg)
         elif not equals:
-            next(given, None)
+            next(remaining, None)
     for module in modules:
         name = module.__name__ if "." in module.__name__ or not module.__file__ else module.__file__
         kept += [TASK_MODULE, name]
@@ -168,7 +171,7 @@ def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
 
 
 def check_saving(task: TaskCfg) -> None:
-    """Raise InputError unless the task could be read back from what is saved with its policies."""
+    """Raise InputError unless the task, saved as JSON and read back, is unchanged."""
     from jumper_warp.cli.resumed import loaded_modules
     from jumper_warp.tasks.saving import task_from_json, task_to_json
 
@@ -177,10 +180,11 @@ def check_saving(task: TaskCfg) -> None:
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
-    """Train as the arguments say; modules: that the user has named, whose tasks are registered by now.
+    """Run `jumper train` with the given arguments; modules: the user's, whose tasks are registered already.
 
     Raises as `parse_train`, `jumper_warp.policies.warm_start.actor_init_from_policy` and `jumper_warp.rl.runner.train`.
     """
+    args = [*args[:1], *use_new_names(args[1:], TrainArgs())]
     parsed, task = parse_train(args)
     from jumper_warp.rl.runner import train
     from jumper_warp.tasks.mirror import mirror_of

@@ -188,18 +188,18 @@ def axis_metrics(turns: AttitudeLog) -> Metrics:
 class AttitudeFlags:
     """Turns about the body's axes, each way, from rest in the default pose."""
 
-    turns: int = 60
+    num_turns: int = 60
     """Number of turns."""
     angle: float = 90.0
-    """[deg] Of every turn."""
+    """[deg] Angle of every turn."""
     tolerance: float = 5.0
     """[deg] Error up to which a robot is at its goal."""
     seconds: float = 5.0
-    """[s] Of which every turn is followed."""
+    """[s] Length of every turn's episode."""
 
     def __post_init__(self) -> None:
-        if self.turns < len(DIRECTIONS):
-            raise InputError(f"turns must be at least {len(DIRECTIONS)}, got {self.turns}")
+        if self.num_turns < len(DIRECTIONS):
+            raise InputError(f"num_turns must be at least {len(DIRECTIONS)}, got {self.num_turns}")
         if not 0.0 < self.angle <= 180.0 or not 0.0 < self.tolerance <= 180.0:
             raise InputError(f"angle and tolerance must be in (0, 180] degrees, got {self.angle}, {self.tolerance}")
         if not 0.1 <= self.seconds <= 60.0:
@@ -207,7 +207,7 @@ class AttitudeFlags:
 
     def log(self, task: TaskCfg, seed: int) -> AttitudeLog:
         """Return the log of the turns, one per world."""
-        return AttitudeLog(axis_turns(self.turns, self.angle), self.tolerance, self.seconds)
+        return AttitudeLog(axis_turns(self.num_turns, self.angle), self.tolerance, self.seconds)
 
     def metrics(self, log: AttitudeLog) -> Metrics:
         """Return `turn_metrics` and `axis_metrics`."""
@@ -219,7 +219,7 @@ class AttitudePlayFlags:
     """Turns that are recorded, about the body's axes, each way."""
 
     angle: float = 90.0
-    """[deg] Of every turn."""
+    """[deg] Angle of every turn."""
 
     length = 4.0
 

@@ -36,11 +36,11 @@ class EvaluateCfg(Generic[Flags]):
     flags: Annotated[Flags, tyro.conf.arg(name="")]
     """Flags of the task's kind, `jumper_warp.evaluation.evaluations.EvaluationFlags`."""
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
-    """What the policy is tried in."""
+    """Conditions of the evaluation."""
     out: Path | None = None
-    """Folder for metrics.json and a list of all that was tried (default: outputs/evaluate/<time>)."""
-    keep: bool = False
-    """Also put the figures into the policy's folder."""
+    """Folder for metrics.json and a CSV file with one row for each trial (default: outputs/evaluate/<time>)."""
+    save_to_policy: bool = False
+    """Also save the metrics into the policy's folder."""
 
 
 def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
@@ -48,7 +48,7 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
 
     Raises PolicyError: the policy cannot be used or cannot store metrics; OSError: the folder cannot be created.
     """
-    if cfg.keep and is_run(run.source):
+    if cfg.save_to_policy and is_run(run.source):
         raise PolicyError(f"{run.source}: a run keeps no figures; export it first")
     run.prepare("evaluate", cfg.conditions, cfg.out)
     log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.seed)
@@ -62,7 +62,7 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     write_metrics(run.folder, metrics)
     rows = f"{log.row_name}s.csv"
     (run.folder / rows).write_text(csv_text(log))
-    if cfg.keep:
+    if cfg.save_to_policy:
         files = {name: (run.folder / name).read_bytes() for name in ("metrics.json", "run.json", rows)}
         add_files(find_policy(run.source), files)
     print_metrics(metrics)

@@ -137,19 +137,19 @@ def tile_command(command: tuple[float, ...], count: int, task: TaskCfg) -> np.nd
 class EpisodeFlags:
     """Episodes from standing still."""
 
-    episodes: int = 200
+    num_episodes: int = 200
     """Number of episodes."""
     command: tuple[float, ...] = ()
     """Up to four numbers, as the task's command takes them; those left out are 0."""
     seconds: float = 10.0
-    """[s] Length at most."""
+    """[s] Largest length of an episode."""
 
     def __post_init__(self) -> None:
-        check_episodes(self.episodes, self.command, self.seconds)
+        check_episodes(self.num_episodes, self.command, self.seconds)
 
     def log(self, task: TaskCfg, seed: int) -> EpisodeLog:
         """Return the log of episodes with this command."""
-        return EpisodeLog(tile_command(self.command, self.episodes, task), task, self.seconds)
+        return EpisodeLog(tile_command(self.command, self.num_episodes, task), task, self.seconds)
 
     def metrics(self, log: EpisodeLog) -> Metrics:
         """Return `episode_metrics`."""

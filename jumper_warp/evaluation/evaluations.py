@@ -60,14 +60,16 @@ EVALUATIONS: dict[str, Evaluation] = {
     "apex_height": HEIGHT,
     "landing_position": PLACE,
     "apex_height_mars": replace(
-        HEIGHT, flags=HeightFlags(lower=1.0, upper=3.3, in_range=(1.0, 2.9)), play=HeightPlayFlags((1.5, 2.3, 3.0), 6.0)
+        HEIGHT, flags=HeightFlags(height_range=(1.0, 3.3), success_range=(1.0, 2.9)),
+        play=HeightPlayFlags((1.5, 2.3, 3.0), 6.0),
     ),
     "landing_position_mars": replace(
-        PLACE, flags=LandingFlags(x=(0.5, 4.2), in_range=(0.5, 3.9)),
+        PLACE, flags=LandingFlags(goal_x=(0.5, 4.2), success_range=(0.5, 3.9)),
         play=LandingPlayFlags(default_goals=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))),
     ),
     "omnidirectional": replace(
-        PLACE, flags=LandingFlags(x=(-0.7, 0.7), y=(-0.7, 0.7), in_range=(0.0, 0.7)), finetune_target=None,
+        PLACE, flags=LandingFlags(goal_x=(-0.7, 0.7), goal_y=(-0.7, 0.7), success_range=(0.0, 0.7)),
+        finetune_target=None,
         play=LandingPlayFlags(default_goals=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
     ),
     "velocity": Evaluation(VelocityFlags(), VelocityPlayFlags(), TaskCfg.on_level_ground),

@@ -47,41 +47,41 @@ AIM_ROUNDS = 3
 class FinetuneCfg:
     """How a policy is fine-tuned."""
 
-    goals: int = 64
-    """Jumps of the nominal robot, spread evenly over the goals."""
-    late: int = 32
-    """Jumps of the nominal robot with latencies that are drawn over those of the training."""
-    randomized: int = 64
-    """Jumps of robots as drawn in the training, with noise, latency and pushes."""
-    heights: tuple[float, float] = (0.5, 1.075)
+    num_goals: int = 64
+    """Number of jumps of the nominal robot, spread evenly over the goals."""
+    num_delayed: int = 32
+    """Number of jumps of the nominal robot with latencies drawn from the training's range."""
+    num_randomized: int = 64
+    """Number of jumps of robots randomised as in the training, with noise, latency and pushes."""
+    height_range: tuple[float, float] = (0.5, 1.075)
     """[m] Lowest and highest commanded base height, of jumps to heights."""
-    distances: tuple[float, float] = (0.3, 1.4)
+    distance_range: tuple[float, float] = (0.3, 1.4)
     """[m] Nearest and farthest goal straight ahead, of jumps to places."""
     iterations: int = 6
     """Gauss-Newton steps; 0 for places: the aim alone."""
     miss_std: float = 0.001
-    """[m] Miss of the nominal robot that costs as much as a change of the actions by `action_std`."""
-    late_std: float = 0.003
-    """[m] The same with latencies."""
+    """[m] Miss of the nominal robot that costs as much as a change of the actions by --action-std."""
+    delayed_std: float = 0.003
+    """[m] Miss with latencies that costs as much."""
     randomized_std: float = 0.01
-    """[m] The same of drawn robots."""
+    """[m] Miss of a randomised robot that costs as much."""
     action_std: float = 0.02
-    """[1] Change of the actions, root of the sum of squares over the motors, from the policy as it came."""
+    """[1] Change of the actions against the given policy, root of the sum of squares over the motors."""
     landing_std: float = 0.005
-    """[1] The same after touchdown."""
+    """[1] Change of the actions after touchdown that costs as much."""
     seed: int = 0
-    """Of commands, latencies and robots."""
+    """Seed of commands, latencies and robots."""
     device: str | None = None
     """Warp device (default: a GPU if there is one)."""
     threads: int | None = None
     """CPU threads that share the worlds (default: all cores); they change no result."""
 
     def __post_init__(self) -> None:
-        if self.goals < 2 or min(self.late, self.randomized, self.iterations) < 0:
+        if self.num_goals < 2 or min(self.num_delayed, self.num_randomized, self.iterations) < 0:
             raise InputError("fine-tuning needs at least 2 goals, and no negative number of jumps or steps")
-        for name in ("miss_std", "late_std", "randomized_std", "action_std", "landing_std"):
+        for name in ("miss_std", "delayed_std", "randomized_std", "action_std", "landing_std"):
             check_positive(name, getattr(self, name))
-        for name in ("heights", "distances"):
+        for name in ("height_range", "distance_range"):
             low, high = getattr(self, name)
             if not 0.0 < low < high < 10.0:
                 raise InputError(f"{name} must be in (0, 10) m and rise, got {low}, {high}")
@@ -110,9 +110,9 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
         return replace(on_level_ground(task), randomization=ranges, events=())
 
     kinds: tuple[tuple[str, int, float, bool, Callable[[TaskCfg], TaskCfg]], ...] = (
-        ("nominal", cfg.goals, cfg.miss_std, False, on_level_ground),
-        ("late", cfg.late, cfg.late_std, True, with_latencies),
-        ("randomized", cfg.randomized, cfg.randomized_std, True, on_level_ground),
+        ("nominal", cfg.num_goals, cfg.miss_std, False, on_level_ground),
+        ("late", cfg.num_delayed, cfg.delayed_std, True, with_latencies),
+        ("randomized", cfg.num_randomized, cfg.randomized_std, True, on_level_ground),
     )
     for name, count, std, draws, change in kinds:
         if count:
@@ -124,7 +124,9 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
             if target is None:
                 raise InputError(f"fine-tuning is for jumps to heights and places, not for {env.task.name}")
             goals, to_height = np.zeros((count, 3)), target == "apex"
-            goals[:, 2 if to_height else 0] = np.linspace(*(cfg.heights if to_height else cfg.distances), count)
+            goals[:, 2 if to_height else 0] = np.linspace(
+                *(cfg.height_range if to_height else cfg.distance_range), count
+            )
             delays = rng.uniform(*DELAYS, count)
             groups.append(JumpGroup(name, env, std, jump_commands(goals, delays, env.step_dt), to_height))
     return groups

@@ -211,24 +211,22 @@ def sweep_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
 class HeightFlags(JumpFlags):
     """Jumps to evenly spaced heights."""
 
-    in_range: tuple[float, float] = field(default=(0.5, 1.1), kw_only=True)
-    lower: float = 0.5
-    """[m] Lowest commanded base height."""
-    upper: float = 1.2
-    """[m] Highest."""
+    success_range: tuple[float, float] = field(default=(0.5, 1.1), kw_only=True)
+    height_range: tuple[float, float] = (0.5, 1.2)
+    """[m] Lowest and highest commanded base height."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if not 0.0 < self.lower <= self.upper < 10.0:
-            raise InputError(f"heights must be in (0, 10) m and rise, got {self.lower}, {self.upper}")
+        if not 0.0 < self.height_range[0] <= self.height_range[1] < 10.0:
+            raise InputError(f"height_range must be in (0, 10) m and rise, got {self.height_range}")
 
     def log(self, task: TaskCfg, seed: int) -> HeightLog:
         """Return the log of jumps to these heights, one per world."""
-        return HeightLog(np.linspace(self.lower, self.upper, self.jumps), termination_names(task))
+        return HeightLog(np.linspace(*self.height_range, self.num_jumps), termination_names(task))
 
     def metrics(self, log: HeightLog) -> Metrics:
         """Return `apex_metrics`."""
-        return apex_metrics(log, self.in_range)
+        return apex_metrics(log, self.success_range)
 
 
 @dataclass(frozen=True)

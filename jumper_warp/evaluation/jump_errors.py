@@ -16,7 +16,7 @@ import torch
 from jumper_warp.diff.closed_loop import ClosedLoop, LoopState
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import LANDED, REST_TIME
-from jumper_warp.trajectory.gauss_newton import Network, Tape, world_rows
+from jumper_warp.trajectory.gauss_newton import Network, Tape, per_world_gradients
 
 LANDING_HEIGHT = 0.30  # [m] Base height at which the ballistic flight lands
 LATEST = 2.5  # [s] Time after the last command at which all jumps are past their apex
@@ -92,7 +92,7 @@ def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> Jum
     arrays: dict[str, np.ndarray] = {}
     for _ in range(begin, last):
         if derivatives:
-            state, _ = loop.step(state, network.act(loop.seen(state), tape=tape))
+            state, _ = loop.step(state, network.act(loop.observation(state), tape=tape))
         else:
             env.step(network.act(env.obs))
             state = loop.state()
@@ -110,7 +110,8 @@ def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> Jum
     jacobian = value.new_zeros(0)
     if derivatives:
         outcomes = (apex_heights if to_height else ballistic_landing)(loop, states, arrays)
-        jacobian = torch.cat([world_rows(outcome.sum(), tape) for outcome in outcomes]).nan_to_num(0.0, 0.0, 0.0)
+        rows = [per_world_gradients(outcome.sum(), tape) for outcome in outcomes]
+        jacobian = torch.cat(rows).nan_to_num(0.0, 0.0, 0.0)
     return JumpErrors(torch.where(valid, value, 0.0), jacobian, valid)
 
 

@@ -239,16 +239,16 @@ def stance_metrics(jumps: JumpLog) -> Metrics:
 class JumpFlags:
     """Jumps from standing still."""
 
-    jumps: int = 200
+    num_jumps: int = 200
     """Number of jumps."""
-    in_range: tuple[float, float] = field(default=(0.3, 1.4), kw_only=True)
-    """[m] Distances or heights that the success rate in range counts."""
+    success_range: tuple[float, float] = field(default=(0.3, 1.4), kw_only=True)
+    """[m] Smallest and largest distance or height counted by `success_rate_in_range`."""
 
     def __post_init__(self) -> None:
-        if self.jumps < 1:
-            raise InputError(f"jumps must be at least 1, got {self.jumps}")
-        if not 0.0 <= self.in_range[0] <= self.in_range[1] < 10.0:
-            raise InputError(f"in_range must be in [0, 10) m and rise, got {self.in_range[0]}, {self.in_range[1]}")
+        if self.num_jumps < 1:
+            raise InputError(f"num_jumps must be at least 1, got {self.num_jumps}")
+        if not 0.0 <= self.success_range[0] <= self.success_range[1] < 10.0:
+            raise InputError(f"success_range must be in [0, 10) m and rise, got {self.success_range}")
 
 
 def yaw_of(quat: np.ndarray) -> np.ndarray:

@@ -214,16 +214,16 @@ def random_headings(count: int, seed: int) -> np.ndarray:
 class LandingFlags(JumpFlags):
     """Jumps to places from standing still."""
 
-    x: tuple[float, float] = (0.3, 1.5)
-    """[m] Goals ahead, evenly spaced between these."""
-    y: tuple[float, float] = (0.0, 0.0)
-    """[m] Goals to the left, drawn between these."""
+    goal_x: tuple[float, float] = (0.3, 1.5)
+    """[m] Smallest and largest distance of the goal ahead; goals are evenly spaced."""
+    goal_y: tuple[float, float] = (0.0, 0.0)
+    """[m] Smallest and largest distance of the goal to the left; goals are sampled."""
     heading: Literal["any"] | float = "any"
     """[deg] Heading of all robots, or any: drawn from the full circle."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        for name in ("x", "y"):
+        for name in ("goal_x", "goal_y"):
             low, high = getattr(self, name)
             if not -10.0 < low <= high < 10.0:
                 raise InputError(f"{name} must be in (-10, 10) m and rise, got {low}, {high}")
@@ -233,14 +233,15 @@ class LandingFlags(JumpFlags):
     def log(self, task: TaskCfg, seed: int) -> LandingLog:
         """Return the log of single jumps with these goals and headings, one per world."""
         rng = np.random.default_rng(seed)
-        goals = np.stack([np.linspace(*self.x, self.jumps), rng.uniform(*self.y, self.jumps)], axis=1)
-        headings = random_headings(self.jumps, seed) if self.heading == "any" else math.radians(self.heading)
+        goals = np.stack([np.linspace(*self.goal_x, self.num_jumps), rng.uniform(*self.goal_y, self.num_jumps)], axis=1)
+        headings = random_headings(self.num_jumps, seed) if self.heading == "any" else math.radians(self.heading)
         return LandingLog(goals[:, None], termination_names(task), headings)
 
     def metrics(self, log: LandingLog) -> Metrics:
         """Return `landing_metrics` and the range of its `in_range` metrics."""
-        inside = within(np.linalg.norm(log.goal_positions, axis=-1), self.in_range)
-        return landing_metrics(log, inside) | {"range_lower_m": self.in_range[0], "range_upper_m": self.in_range[1]}
+        inside = within(np.linalg.norm(log.goal_positions, axis=-1), self.success_range)
+        lower, upper = self.success_range
+        return landing_metrics(log, inside) | {"range_lower_m": lower, "range_upper_m": upper}
 
 
 @dataclass(frozen=True)
@@ -249,13 +250,13 @@ class LandingPlayFlags:
 
     goal: tyro.conf.UseAppendAction[tuple[Position2D, ...]] = ()
     """[m] Where to land, ahead and to the left; once for each robot (default: three robots, each to another place)."""
-    then: tyro.conf.UseAppendAction[tuple[Position2D, ...]] = ()
+    next_goals: tyro.conf.UseAppendAction[tuple[Position2D, ...]] = ()
     """[m] Where all robots jump next, a second after touchdown, from where they are by then; once for each jump."""
     default_goals: tyro.conf.Suppress[tuple[Position2D, ...]] = ((0.5, 0.0), (0.9, 0.0), (1.3, 0.0))
     """[m] Goals if there are none; flags that are given several times would be added to a default."""
 
     def __post_init__(self) -> None:
-        for name in ("goal", "then"):
+        for name in ("goal", "next_goals"):
             places = getattr(self, name)
             if len(places) > MAX_ROBOTS or not all(-10.0 < value < 10.0 for place in places for value in place):
                 raise InputError(f"{name} takes up to {MAX_ROBOTS} places in (-10, 10) m, got {places}")
@@ -268,8 +269,8 @@ class LandingPlayFlags:
     @property
     def length(self) -> float:
         """[s] Length of the recording."""
-        return JUMP_SECONDS + NEXT_JUMP_SECONDS * len(self.then)
+        return JUMP_SECONDS + NEXT_JUMP_SECONDS * len(self.next_goals)
 
     def log(self, task: TaskCfg) -> LandingLog:
         """Return the log of the jumps, one sequence per robot."""
-        return LandingLog(np.array([[goal, *self.then] for goal in self.goals]), termination_names(task))
+        return LandingLog(np.array([[goal, *self.next_goals] for goal in self.goals]), termination_names(task))

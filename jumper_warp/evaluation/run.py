@@ -51,15 +51,15 @@ class EvaluationArgs(Conditions):
     noise: tyro.conf.Suppress[tyro.conf.Fixed[bool]] = False
     policy: str = "horizontal_jump"
     """Name or folder of a policy, a run's folder, or a checkpoint."""
-    record: int = 1
+    num_recorded: int = 1
     """Number of jumps to record for the Rerun viewer and, one of them, as a filmstrip; 0: none."""
     out: Path | None = None
     """Folder for figures, plots, recordings and filmstrips (default: outputs/<name>/<time>)."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        if self.record < 0:
-            raise InputError(f"record must not be negative, got {self.record}")
+        if self.num_recorded < 0:
+            raise InputError(f"num_recorded must not be negative, got {self.num_recorded}")
         checked_threads(self.threads)
 
 
@@ -104,7 +104,7 @@ class Run(ABC):
         words = [SOLVER_TITLES[conditions.solver], "randomised" if conditions.randomize else "nominal"]
         if conditions.latency is not None and self._latency:
             words.append(f"latency {latency_text(self._latency[0], self._physics_dt)}")
-        words += [] if conditions.gains is None else ["kp x {:g}, kd x {:g}".format(*conditions.gains)]
+        words += [] if conditions.gain_scale is None else ["kp x {:g}, kd x {:g}".format(*conditions.gain_scale)]
         words += [] if conditions.friction is None else [f"friction {conditions.friction:g}"]
         words += [] if conditions.robot is None else [f"robot of {conditions.robot.name}"]
         return ", ".join(words + (["pushed in flight too"] if conditions.push_in_flight else []))
@@ -116,7 +116,7 @@ class Run(ABC):
         values |= {name: getattr(conditions, name) for name in ("solver", "randomize", "seed")}
         if conditions.randomize:
             values["push_in_flight"] = conditions.push_in_flight
-        values |= {} if conditions.gains is None else {"gains": list(conditions.gains)}
+        values |= {} if conditions.gain_scale is None else {"gains": list(conditions.gain_scale)}
         values |= {} if conditions.friction is None else {"friction": conditions.friction}
         values |= {} if conditions.robot is None else {"robot": str(conditions.robot)}
         if self._latency:
@@ -213,7 +213,7 @@ class EvaluationRun(Run):
                 f"this needs a policy that is evaluated by {' or '.join(evaluations)}, "
                 f"{args.policy} is of {run.task.name}, by {run.task.evaluation_suite}"
             )
-        run.prepare(name, conditions_of(args), args.out, record=args.record)
+        run.prepare(name, conditions_of(args), args.out, record=args.num_recorded)
         run.setup_metrics = {"task": run.task.name} if len(evaluations) > 1 else {}
         return run
 
@@ -253,7 +253,7 @@ class SkillRun(Run):
     def from_args(cls, name: str, args: EvaluationArgs, names: SkillNames) -> SkillRun:
         """Return the prepared evaluation of an experiment. Raises PolicyError, CheckpointError or InputError."""
         run = cls(names)
-        run.prepare(name, conditions_of(args), args.out, record=args.record)
+        run.prepare(name, conditions_of(args), args.out, record=args.num_recorded)
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:

@@ -69,7 +69,7 @@ class Grid(Suite):
     In range are goals less than 1.4 m ahead, where the paper's jumps all succeed.
     """
 
-    jumps: int = 2
+    num_jumps: int = 2
     columns: int = 22
     """Number of distances ahead."""
     rows: int = 5
@@ -86,7 +86,7 @@ class Grid(Suite):
     def goals(self) -> np.ndarray:
         """[m] Goals ahead and to the left, (columns * rows * jumps, 1, 2)."""
         x, y = np.meshgrid(np.linspace(*AHEAD, self.columns), np.linspace(*ASIDE, self.rows), indexing="ij")
-        return np.repeat(np.stack([x.ravel(), y.ravel()], axis=1), self.jumps, axis=0)[:, None]
+        return np.repeat(np.stack([x.ravel(), y.ravel()], axis=1), self.num_jumps, axis=0)[:, None]
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Run the jumps, plot the landing positions, and return the metrics."""
@@ -102,7 +102,7 @@ class Ring(Suite):
 
     policy: str = "omnidirectional_jump"
     radius: float = 0.5
-    """[m] Of the ring."""
+    """[m] Radius of the ring."""
 
     name: ClassVar = "ring"
     least: ClassVar = (len(SECTORS), 0.1)
@@ -113,10 +113,10 @@ class Ring(Suite):
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Run the jumps, plot the landing positions, and return the metrics, also for each quarter of the ring."""
-        angle = np.linspace(0.0, 2.0 * np.pi, self.jumps, endpoint=False)
+        angle = np.linspace(0.0, 2.0 * np.pi, self.num_jumps, endpoint=False)
         goals = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
         landings = self.run_landings(run, goals, film="jumps")
-        title = f"{self.jumps} jumps over {self.radius:g} m, {run.title}"
+        title = f"{self.num_jumps} jumps over {self.radius:g} m, {run.title}"
         plot_landings(run.folder / "landings.png", {title: landings}, (6.0, 6.5))
         sector = np.round(np.arctan2(goals[..., 1], goals[..., 0]) / (0.5 * np.pi)).astype(int) % len(SECTORS)
         fell, missed = np.isin(landings.ends, FALLS), landings.outcomes == MISSED
@@ -138,33 +138,34 @@ class Consecutive(Suite):
     `success_rate_in_range` is all goals.
     """
 
-    jumps: int = 20
-    """Number of times that each pair is jumped."""
-    trials: int = 100
-    """Number of long rows."""
-    row: int = 10
-    """Number of jumps in one."""
+    num_jumps: int = 20
+    """Number of trials of each pair."""
+    num_trials: int = 100
+    """Number of trials with many jumps in a row."""
+    jumps_per_trial: int = 10
+    """Number of jumps in each of these trials."""
 
     name: ClassVar = "consecutive"
     paper: ClassVar = {"mean_error_m": 0.0054}
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(min(self.trials, self.row) >= 1, f"need at least one trial and row, got {self.trials}, {self.row}")
+        given = (self.num_trials, self.jumps_per_trial)
+        check(min(given) >= 1, f"need at least one trial and one jump in it, got {given[0]}, {given[1]}")
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Run pairs and long rows, plot the paths of the bases, and return the metrics."""
         rng = np.random.default_rng(self.seed)
-        pairs = np.repeat(np.array(list(PAIRS.values())), self.jumps, axis=0)
-        rows = rng.uniform(ROW_LOWER, ROW_UPPER, (self.trials, self.row, 2))
+        pairs = np.repeat(np.array(list(PAIRS.values())), self.num_jumps, axis=0)
+        rows = rng.uniform(ROW_LOWER, ROW_UPPER, (self.num_trials, self.jumps_per_trial, 2))
         logs, paths = [], []
         for name, goals in (("pairs", pairs), ("row", rows)):
             base_paths, delay = BasePaths(), rng.uniform(*DELAYS, len(goals))
             logs.append(self.run_landings(run, goals, delay=delay, film=name, on_step=base_paths))
             paths.append(base_paths.in_start_frame(logs[-1].headings))
-        parts = dict(zip((*PAIRS, f"{self.row} in a row"), (*np.split(paths[0], 2), paths[1]), strict=True))
+        parts = dict(zip((*PAIRS, f"{self.jumps_per_trial} in a row"), (*np.split(paths[0], 2), paths[1]), strict=True))
         plot_paths(run.folder / "paths.png", parts, PAIRS, run.title)
-        return {"rest_s": self.rest} | consecutive_metrics(*logs)
+        return {"rest_s": self.rest_time} | consecutive_metrics(*logs)
 
 
 def consecutive_metrics(pairs: LandingLog, row: LandingLog) -> dict[str, Any]:
@@ -200,7 +201,7 @@ class Platform(Suite):
     `success_rate_in_range` is all goals. SolverMuJoCo has no sliding block: with it that scene is left out.
     """
 
-    jumps: int = 100
+    num_jumps: int = 100
     edge: float = 0.40
     """[m] From the start to the platform's edge, moved back to a multiple of 0.02 m, and to the block's near side."""
 
@@ -226,10 +227,10 @@ class Platform(Suite):
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Run the jumps of all scenes, plot them, and return the metrics of each scene by prefix, and their means."""
         rng = np.random.default_rng(self.seed)
-        goals, values = rng.uniform(GROUND_LOWER, GROUND_UPPER, (self.jumps, 2)), {}
+        goals, values = rng.uniform(GROUND_LOWER, GROUND_UPPER, (self.num_jumps, 2)), {}
         done: dict[str, LandingLog] = {}
         for name, scene, headings in self.scenes(goals, rng):
-            env = run.env(self.jumps, **scene)
+            env = run.env(self.num_jumps, **scene)
             done[name] = self.run_landings(run, goals[:, None], env, headings=headings, film=name, film_scene=scene)
             values |= {f"{name}_{metric}": value for metric, value in landing_metrics(done[name]).items()}
             if "block" in scene:
@@ -242,7 +243,7 @@ class Platform(Suite):
         tilts = [values[f"{scene}_max_landing_tilt_deg"] for scene in done]
         summary["success_rate_in_range"] = summary["success_rate"]
         summary["max_landing_tilt_deg"] = max((tilt for tilt in tilts if tilt is not None), default=None)
-        return {"jumps": self.jumps * len(done), "edge_m": self.edge, **summary, **values}
+        return {"jumps": self.num_jumps * len(done), "edge_m": self.edge, **summary, **values}
 
 
 @dataclass(frozen=True)
@@ -257,34 +258,34 @@ class Farthest(Suite):
     the paper's 1.25 m compares with `hop_free_distance_m`.
     """
 
-    jumps: int = 100
-    first: float = 1.0
-    """[m] Middle of the first bin."""
-    last: float = 2.5
-    """[m] No bin beyond."""
+    num_jumps: int = 100
+    min_distance: float = 1.0
+    """[m] Distance at the middle of the first bin."""
+    max_distance: float = 2.5
+    """[m] Distance at the middle of the last bin."""
     direction: float = 0.0
-    """[deg] Of the goals from the robot: 0 ahead, 90 to the left, 180 back."""
+    """[deg] Direction of the goals from the robot: 0 ahead, 90 to the left, 180 back."""
 
     name: ClassVar = "max"
     paper: ClassVar = {"hop_free_distance_m": 1.25}
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        good, limits = 0.1 <= self.first <= self.last <= LIMIT, f"0.1 <= first <= last <= {LIMIT:g} m"
-        check(good, f"need {limits}, got {self.first} and {self.last}")
+        near, far, limits = self.min_distance, self.max_distance, f"0.1 <= min_distance <= max_distance <= {LIMIT:g} m"
+        check(0.1 <= near <= far <= LIMIT, f"need {limits}, got {near} and {far}")
         check(-180.0 <= self.direction <= 180.0, f"direction must be in -180..180 deg, got {self.direction}")
 
     def goals(self, middle: float) -> np.ndarray:
         """Return the goals [m] of the bin around a distance [m], (jumps, 1, 2)."""
-        distance = middle + BIN * (np.linspace(0.0, 1.0, self.jumps) - 0.5 if self.jumps > 1 else np.zeros(1))
+        distance = middle + BIN * (np.linspace(0.0, 1.0, self.num_jumps) - 0.5 if self.num_jumps > 1 else np.zeros(1))
         angle = math.radians(self.direction)
         return distance[:, None, None] * np.array([math.cos(angle), math.sin(angle)])
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Run bins of growing distance until success is below GIVEN_UP, plot them, and return the metrics."""
-        env, bins = run.env(self.jumps), {}
-        for number in range(round((self.last - self.first) / BIN) + 1):
-            middle = round(self.first + number * BIN, 6)
+        env, bins = run.env(self.num_jumps), {}
+        for number in range(round((self.max_distance - self.min_distance) / BIN) + 1):
+            middle = round(self.min_distance + number * BIN, 6)
             bins[middle] = self.run_landings(run, self.goals(middle), env, film=f"jump_{middle:.1f}_m")
             success = bins[middle].success.mean()
             print(f"{middle:.1f} m: {success:.1%} success", flush=True)

@@ -44,9 +44,9 @@ def check(good: bool, message: str) -> None:
 class Suite(EvaluationArgs, ABC):
     """A test of jumping policies: its flags, and what it measures."""
 
-    jumps: int = 200
+    num_jumps: int = 200
     """Number of jumps (where there are several scenes, bins or goals on a grid, of each)."""
-    rest: float = REST_TIME
+    rest_time: float = REST_TIME
     """[s] From touchdown until a jump is over."""
 
     name: ClassVar[str]
@@ -60,8 +60,8 @@ class Suite(EvaluationArgs, ABC):
     def __post_init__(self) -> None:
         super().__post_init__()
         jumps, rest = self.least
-        check(self.jumps >= jumps, f"need at least {jumps} jump{'s' * (jumps > 1)}, got {self.jumps}")
-        check(rest <= self.rest <= 10.0, f"rest must be in [{rest:g}, 10] s, got {self.rest}")
+        check(self.num_jumps >= jumps, f"need at least {jumps} jump{'s' * (jumps > 1)}, got {self.num_jumps}")
+        check(rest <= self.rest_time <= 10.0, f"rest_time must be in [{rest:g}, 10] s, got {self.rest_time}")
 
     @abstractmethod
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
@@ -91,7 +91,7 @@ class Suite(EvaluationArgs, ABC):
         """
         env = run.env(len(places)) if env is None else env
         headings = random_headings(len(places), self.seed) if headings is None else headings
-        log = LandingLog(places, termination_names(env.task), headings, delay, self.rest)
+        log = LandingLog(places, termination_names(env.task), headings, delay, self.rest_time)
         return run.run_episodes(env, log, **options)
 
     def pushed_in_flight(self, run: EvaluationRun, measure: Callable[[Conditions], Metrics], *names: str) -> Metrics:
@@ -117,9 +117,9 @@ class HeightSweep(Suite):
     """
 
     policy: str = "vertical_jump"
-    heights: tuple[float, float] = (0.5, 1.2)
+    height_range: tuple[float, float] = (0.5, 1.2)
     """[m] Lowest and highest commanded base height."""
-    record: int = 5
+    num_recorded: int = 5
 
     name: ClassVar = "sweep"
     evaluations: ClassVar = HEIGHTS
@@ -128,16 +128,17 @@ class HeightSweep(Suite):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        check(0.0 < self.heights[0] <= self.heights[1] < 10.0, f"heights must be in (0, 10) m, got {self.heights}")
+        low, high = self.height_range
+        check(0.0 < low <= high < 10.0, f"height_range must be in (0, 10) m, got {self.height_range}")
 
     def run_jumps(self, run: EvaluationRun, env: Env, film: str = "") -> HeightLog:
         """Run one jump per height and return the log; film: name of the recording."""
-        heights = np.linspace(*self.heights, self.jumps)
-        return run.run_episodes(env, HeightLog(heights, termination_names(env.task), self.rest), film=film)
+        heights = np.linspace(*self.height_range, self.num_jumps)
+        return run.run_episodes(env, HeightLog(heights, termination_names(env.task), self.rest_time), film=film)
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Run the jumps and the open-loop jumps of the same robots, plot both, and return the metrics."""
-        env = run.env(self.jumps, with_sweep_terminations)
+        env = run.env(self.num_jumps, with_sweep_terminations)
         initial_state = env.state_dict()
         jumps = self.run_jumps(run, env, "jumps")
         limit = open_loop_limits(env, initial_state)
@@ -146,15 +147,15 @@ class HeightSweep(Suite):
             plot_sweep(axis, jumps.commanded, jumps.apex, jumps.reached, SUCCESS_TOLERANCE, ("reached", "missed"))
             axis.legend(loc="lower right")
             axis.set(xlabel="commanded base height [m]", ylabel="highest base height [m]")
-            axis.set_title(f"{self.jumps} jumps, {run.title}", wrap=True)
+            axis.set_title(f"{self.num_jumps} jumps, {run.title}", wrap=True)
 
         def pushed(conditions: Conditions) -> Metrics:
-            pushed_env = run.env(self.jumps, with_sweep_terminations, conditions)
+            pushed_env = run.env(self.num_jumps, with_sweep_terminations, conditions)
             return sweep_metrics(self.run_jumps(run, pushed_env), HEIGHTS_IN_RANGE)
 
         names = ("mean_abs_error_m", "success_rate", "success_rate_in_range", "fall_rate", "miss_rate", "landing_rate")
         values = sweep_metrics(jumps, HEIGHTS_IN_RANGE) | limit_metrics(jumps, limit)
-        return {"rest_s": self.rest} | values | self.pushed_in_flight(run, pushed, *names)
+        return {"rest_s": self.rest_time} | values | self.pushed_in_flight(run, pushed, *names)
 
 
 @dataclass(frozen=True)
@@ -169,13 +170,13 @@ class DistanceSweep(Suite):
     flight too.
     """
 
-    distances: tuple[float, float] = (0.3, 1.5)
-    """[m] Of the nearest and the farthest goal."""
-    aside: float = 0.0
-    """[m] Goals lie up to this far to either side, drawn."""
+    distance_range: tuple[float, float] = (0.3, 1.5)
+    """[m] Distance of the nearest and of the farthest goal."""
+    max_lateral_offset: float = 0.0
+    """[m] Largest offset of a goal to either side; offsets are drawn."""
     end_at_second_takeoff: bool = False
     """A second takeoff after landing ends a jump, as a failure, as in the authors' configuration."""
-    record: int = 5
+    num_recorded: int = 5
 
     name: ClassVar = "sweep"
     paper: ClassVar = {"mean_error_m": 0.026, "success_rate": 0.97, "success_rate_in_range": 1.0}
@@ -183,15 +184,18 @@ class DistanceSweep(Suite):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        (near, far), goals = self.distances, f"{self.distances}, {self.aside} aside"
-        check(0.0 < near < far < 10.0 and 0.0 <= self.aside < 10.0, f"goals must be within 10 m and rise, got {goals}")
+        (near, far), side = self.distance_range, self.max_lateral_offset
+        good = 0.0 < near < far < 10.0 and 0.0 <= side < 10.0
+        check(good, f"goals must be within 10 m and rise, got {self.distance_range}, {side} to either side")
 
     def run_jumps(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> LandingLog:
         """Run one jump per distance under some conditions and return the log; film: name of the recording."""
-        aside = np.random.default_rng(self.seed + 1).uniform(-self.aside, self.aside, self.jumps)
-        goals = np.stack([np.linspace(*self.distances, self.jumps), aside], axis=1)[:, None]
+        aside = np.random.default_rng(self.seed + 1).uniform(
+            -self.max_lateral_offset, self.max_lateral_offset, self.num_jumps
+        )
+        goals = np.stack([np.linspace(*self.distance_range, self.num_jumps), aside], axis=1)[:, None]
         change = with_second_takeoff if self.end_at_second_takeoff else with_landing_terminations
-        return self.run_landings(run, goals, run.env(self.jumps, change, conditions), film=film)
+        return self.run_landings(run, goals, run.env(self.num_jumps, change, conditions), film=film)
 
     @staticmethod
     def metrics(landings: LandingLog) -> Metrics:
@@ -209,9 +213,10 @@ class DistanceSweep(Suite):
             commanded, reached = landings.goal_positions[..., 0], landings.landing[..., 0]
             plot_sweep(axis, commanded, reached, landings.success, SUCCESS_TOLERANCE, ("landed there", "failed"))
             axis.set(xlabel="commanded distance [m]", ylabel="distance of the base at the end [m]")
-            axis.set(xlim=(self.distances[0] - 0.05, self.distances[1] + 0.05))
-            axis.set_title(f"{self.jumps} jumps, {run.title}", wrap=True)
-        values = {"rest_s": self.rest, "end_at_second_takeoff": self.end_at_second_takeoff, **self.metrics(landings)}
+            axis.set(xlim=(self.distance_range[0] - 0.05, self.distance_range[1] + 0.05))
+            axis.set_title(f"{self.num_jumps} jumps, {run.title}", wrap=True)
+        values = {"rest_s": self.rest_time, "end_at_second_takeoff": self.end_at_second_takeoff}
+        values |= self.metrics(landings)
         pushed = self.pushed_in_flight(
             run, lambda conditions: self.metrics(self.run_jumps(run, conditions)), "mean_error_m", "success_rate",
             "success_rate_in_range", "fall_rate", "miss_rate", "still_landing_rate", "max_landing_tilt_deg",

@@ -203,21 +203,21 @@ def command_grid(per_axis: int, reach: Sequence[float]) -> np.ndarray:
 class VelocityFlags:
     """Constant commands on a grid of all three velocities at once."""
 
-    per_axis: int = 8
-    """Commands along each axis of the grid; one robot for each of all three."""
-    reach: tuple[float, float, float] = (0.8, 0.8, 0.8)
-    """[m/s], [m/s], [rad/s] The grid goes from minus to plus this: ahead, to the left, about z."""
+    commands_per_axis: int = 8
+    """Number of commands along each of the three axes of the grid; one robot for each combination."""
+    max_velocity: tuple[float, float, float] = (0.8, 0.8, 0.8)
+    """[m/s], [m/s], [rad/s] Largest command ahead, to the left and about z; the grid goes from minus to plus this."""
     seconds: float = 10.0
-    """[s] Length; the first second does not count for the error."""
+    """[s] Length of each walk; the first second does not count for the error."""
 
     def __post_init__(self) -> None:
-        check_velocity_settings(self.per_axis**3, self.seconds, *self.reach)
-        if self.per_axis < 2:
-            raise InputError(f"per_axis must be at least 2, got {self.per_axis}")
+        check_velocity_settings(self.commands_per_axis**3, self.seconds, *self.max_velocity)
+        if self.commands_per_axis < 2:
+            raise InputError(f"commands_per_axis must be at least 2, got {self.commands_per_axis}")
 
     def log(self, task: TaskCfg, seed: int) -> VelocityLog:
         """Return the log of walks, one command of the grid per robot."""
-        return VelocityLog(command_grid(self.per_axis, self.reach), task, self.seconds)
+        return VelocityLog(command_grid(self.commands_per_axis, self.max_velocity), task, self.seconds)
 
     def metrics(self, log: VelocityLog) -> Metrics:
         """Return `tracking_metrics`."""
@@ -234,8 +234,8 @@ class VelocityPlayFlags:
         (0.8, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0), (0.6, 0.3, 0.6), (0.0, 0.0, 0.0),
     )  # fmt: skip
     """Commands if there are none; flags that are given several times would be added to a default."""
-    each: float = 2.5
-    """[s] From command to command."""
+    command_interval: float = 2.5
+    """[s] Time from one command to the next."""
 
     def __post_init__(self) -> None:
         check_velocity_settings(1, self.length, *(value for command in self.velocity for value in command))
@@ -248,12 +248,12 @@ class VelocityPlayFlags:
     @property
     def length(self) -> float:
         """[s] Length of the recording."""
-        return self.each * len(self.velocities)
+        return self.command_interval * len(self.velocities)
 
     def log(self, task: TaskCfg) -> VelocityLog:
         """Return the log of one robot's walk."""
         commands = np.array(self.velocities, dtype=float)[None]
-        return VelocityLog(commands, task, self.length, times=self.each * np.arange(commands.shape[1]))
+        return VelocityLog(commands, task, self.length, times=self.command_interval * np.arange(commands.shape[1]))
 
 
 def check_velocity_settings(robots: int, seconds: float, *commands: float) -> None:

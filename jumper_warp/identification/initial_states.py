@@ -11,7 +11,7 @@ import numpy as np
 from jumper_warp.identification.motions import DEGREES, NoiseLevels, RecordedMotion
 from jumper_warp.robot.description import LEGS, RobotDescription, leg_dimensions
 from jumper_warp.robot.values import RobotValues
-from jumper_warp.utils.rotations import CONJUGATE, from_vector, multiply, rotate
+from jumper_warp.utils.rotations import CONJUGATE, from_rotation_vector, multiply, rotate
 
 HANGING_HEIGHT = 1.0
 """[m] Height of a held base whose position is not measured."""
@@ -111,7 +111,7 @@ class InitialStatePrior:
             state.quaternion = multiply(half / np.linalg.norm(half, axis=1, keepdims=True), state.quaternion)
             state.position[:, 2] = ground.height
             state.velocity, state.spin = (rotate(state.quaternion, v) for v in (ground.velocity, ground.spin))
-        state.quaternion = multiply(from_vector(deviation[:, 24:27]), state.quaternion)
+        state.quaternion = multiply(from_rotation_vector(deviation[:, 24:27]), state.quaternion)
         if self.free:
             state.position = state.position + deviation[:, 27:30]
             state.velocity = state.velocity + deviation[:, 30:33]

@@ -18,7 +18,7 @@ from jumper_warp.robot.motors import MotorCfg
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import Simulation, SolverName, motor_values
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.rotations import from_vector, multiply
+from jumper_warp.utils.rotations import from_rotation_vector, multiply
 
 Kind = Literal["hung chirp", "standing chirp", "small jump"]
 KINDS: tuple[Kind, ...] = ("hung chirp", "hung chirp", "standing chirp", "small jump")
@@ -163,7 +163,7 @@ def simulate_plan(
             if held:
                 _reset_base(sim, held_pose)
     table = np.array(rows_read)[:, :, None]
-    valid = np.array([bool(np.isfinite(table).all()) and sim.physics.invalid.numpy()[0] == 0])
+    valid = np.array([bool(np.isfinite(table).all()) and sim.physics.diverged.numpy()[0] == 0])
     return Record(table[:, :12], table[:, 12:24], table[:, 24:36], table[:, 36:39], table[:, 39:43], valid)
 
 
@@ -222,7 +222,7 @@ def measure(
     quaternion = record.quaternion[:, :, 0]
     if rng is not None:
         values = {key: x + levels[key][0] * rng.normal(size=x.shape) for key, x in values.items()}
-        quaternion = multiply(from_vector(levels["orientation"][0] * rng.normal(size=(rows, 3))), quaternion)
+        quaternion = multiply(from_rotation_vector(levels["orientation"][0] * rng.normal(size=(rows, 3))), quaternion)
     unmeasured = (np.arange(rows) % base_every != 0)[:, None]
     values["position"], quaternion = (np.where(unmeasured, math.nan, x) for x in (values["position"], quaternion))
     if not torque:

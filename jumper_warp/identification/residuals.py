@@ -17,7 +17,7 @@ from jumper_warp.identification.replay import MotionReplay, Record
 from jumper_warp.robot.description import MOTOR_JOINTS, RobotDescription
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.rotations import CONJUGATE, multiply, to_vector
+from jumper_warp.utils.rotations import CONJUGATE, multiply, to_rotation_vector
 
 LONGEST_GAP = 0.1
 """[s] Longest time between two rows of a motion."""
@@ -198,7 +198,7 @@ class MotionResiduals:
                 simulated = simulated / np.linalg.norm(simulated, axis=-1, keepdims=True)
                 measured = np.nan_to_num(np.asarray(self.motion.quaternion)) + np.array([0.0, 0.0, 0.0, 1.0e-12])
                 measured = measured / np.linalg.norm(measured, axis=-1, keepdims=True) * CONJUGATE
-                columns.append(np.moveaxis(to_vector(multiply(simulated, measured[:, None])), 1, 2))
+                columns.append(np.moveaxis(to_rotation_vector(multiply(simulated, measured[:, None])), 1, 2))
             else:
                 values = at_rows(getattr(record, name))
                 columns.append(values + robots.offset.T if name == "angle" else values)

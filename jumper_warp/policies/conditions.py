@@ -47,13 +47,13 @@ class Conditions:
     push_in_flight: bool = False
     """Pushes of a randomised test act in flight too, and not only while a paw is down."""
     latency: float | None = None
-    """[ms] From action to motor, to the nearest physics step (default: none, or drawn if randomised)."""
-    gains: tuple[float, float] | None = None
+    """[ms] Latency from action to motor, to the nearest physics step (default: none, or drawn if randomised)."""
+    gain_scale: tuple[float, float] | None = None
     """[1] Scales of kp and kd of all motors (default: 1, or drawn if randomised)."""
     friction: float | None = None
-    """[1] Of the paws, static and dynamic (default: nominal, or drawn if randomised)."""
+    """[1] Friction of the paws, static and dynamic (default: nominal, or drawn if randomised)."""
     gravity: float | None = None
-    """[m/s^2] Downward (default: that of the task)."""
+    """[m/s^2] Gravity, downward (default: the task's)."""
 
     def __post_init__(self) -> None:
         """Raise InputError if a value is out of range, or push_in_flight is set without randomize."""

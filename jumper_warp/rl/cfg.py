@@ -148,7 +148,7 @@ class TrainCfg:
     """Name of the task; also the name of the folder of its runs."""
     num_envs: int = 8192
     """Worlds, over all processes."""
-    iterations: int = 2800
+    max_iterations: int = 2800
     """Iterations that the run has at its end, those before a resume included."""
     max_seconds: float = 0.0
     """Wall-clock limit [s]; 0: none. What counts is the time from the end of each process's first iteration to the end
@@ -167,7 +167,7 @@ class TrainCfg:
     """Iterations between two logged ones."""
     save_interval: int = 100
     """Iterations between two checkpoints."""
-    keep: int = 3
+    max_checkpoints: int = 3
     """How many of the newest checkpoints stay; the best stays anyway."""
     best_metric: str = "Metrics/success"
     """The logged figure that makes a checkpoint the best; higher is better."""
@@ -192,7 +192,7 @@ class TrainCfg:
     def __post_init__(self) -> None:
         """Raises ValueError: a setting is out of range."""
         object.__setattr__(self, "log_root", Path(self.log_root))
-        for name in ("num_envs", "iterations", "log_interval", "save_interval", "keep"):
+        for name in ("num_envs", "max_iterations", "log_interval", "save_interval", "max_checkpoints"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
         check_not_negative("max_seconds", self.max_seconds)

@@ -215,7 +215,7 @@ class TrainingRun:
             is_last = is_last_iteration(self.iteration, cfg, 0.0 < cfg.max_seconds <= self.seconds)
             if is_last:
                 seconds = f"--max-seconds {cfg.max_seconds:g}"
-                limit = f"--iterations {cfg.iterations}" if self.iteration >= cfg.iterations else seconds
+                limit = f"--max-iterations {cfg.max_iterations}" if self.iteration >= cfg.max_iterations else seconds
                 log.print_line(f"nothing is left to train after iteration {self.iteration}: give more than {limit}")
             while not is_last:
                 watch.start()
@@ -240,7 +240,7 @@ class TrainingRun:
         if self.rank.index != 0:
             return _NoLog()
         cfg = self.cfg
-        return TrainingLog(self.folder, self.config, cfg.iterations, cfg.tensorboard, cfg.wandb, self.iteration)
+        return TrainingLog(self.folder, self.config, cfg.max_iterations, cfg.tensorboard, cfg.wandb, self.iteration)
 
     def _start_clock(self) -> None:
         """Start counting the training time, after synchronising with the device."""
@@ -255,11 +255,13 @@ class TrainingRun:
     def _progress(self) -> float:
         """Return the progress of the training from 0 to 1, the maximum by iterations and by time."""
         has_limit = self.cfg.max_seconds > 0.0
-        return max(self.iteration / self.cfg.iterations, self._elapsed() / self.cfg.max_seconds if has_limit else 0.0)
+        return max(
+            self.iteration / self.cfg.max_iterations, self._elapsed() / self.cfg.max_seconds if has_limit else 0.0
+        )
 
     def _remaining(self, seconds: float) -> float:
         """Return the estimated time to the end [s]; seconds: duration of an iteration [s]."""
-        remaining = (self.cfg.iterations - self.iteration) * seconds
+        remaining = (self.cfg.max_iterations - self.iteration) * seconds
         if self.cfg.max_seconds > 0.0:
             remaining = min(remaining, max(self.cfg.max_seconds - self._elapsed(), 0.0))
         return remaining
@@ -293,7 +295,7 @@ class TrainingRun:
         state["config"] = json.dumps(self.config)
         folder = self.folder / CHECKPOINTS
         try:
-            path = save_checkpoint(folder, state, self.metrics.get(self.cfg.best_metric), self.cfg.keep)
+            path = save_checkpoint(folder, state, self.metrics.get(self.cfg.best_metric), self.cfg.max_checkpoints)
         except OSError as error:
             if is_last:
                 raise CheckpointError(f"{folder}: not saved: {error.strerror}") from error
@@ -312,7 +314,7 @@ class TrainingRun:
 
 def is_last_iteration(iteration: int, cfg: TrainCfg, end_early: bool) -> bool:
     """Return whether a run ends after `iteration` iterations; end_early: a stop request or the time limit."""
-    return end_early or iteration >= cfg.iterations
+    return end_early or iteration >= cfg.max_iterations
 
 
 class _NoLog:
@@ -354,5 +356,5 @@ def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl | None, rank: R
     torch.manual_seed(cfg.seed + rank.index)
     env.reset()
     adapter = as_rsl_rl(env, cfg.ppo.num_steps)
-    train_rsl_rl(adapter, cfg.ppo, cfg.iterations, cfg.save_interval, cfg.seed, folder)
-    return TrainResult(folder, cfg.iterations, time.perf_counter() - begin, {})
+    train_rsl_rl(adapter, cfg.ppo, cfg.max_iterations, cfg.save_interval, cfg.seed, folder)
+    return TrainResult(folder, cfg.max_iterations, time.perf_counter() - begin, {})

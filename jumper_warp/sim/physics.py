@@ -42,7 +42,7 @@ class Physics(ABC):
     solver: newton.solvers.SolverBase
     dynamics: JumperDynamics
     """Geometry, ground and friction ratio; on other solvers for kinematics only."""
-    invalid: wp.array
+    diverged: wp.array
     """(num_worlds,) int, 1: the world diverged."""
     impulse: wp.array
     """(4, num_worlds) vec3 [N s] Contact impulses that start the next contact iteration."""

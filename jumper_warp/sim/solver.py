@@ -96,7 +96,7 @@ class SolverJumper(SolverBase):
     Shapes of the model other than paws and ground do not collide; a warning names the first that would. Sites and
     shapes that do not collide serve sensors and viewers.
 
-    A diverged (non-finite) world is flagged in `invalid` and frozen at rest in the model's reference pose until
+    A diverged (non-finite) world is flagged in `diverged` and frozen at rest in the model's reference pose until
     `reset` clears it.
     """
 
@@ -138,7 +138,7 @@ class SolverJumper(SolverBase):
         """Largest velocity change [m/s] of the last contact sweep, worst step of the last call, (num_worlds,)."""
         self.sweeps: wp.array = work.sweeps
         """Most contact sweeps of a step in the last call, on a GPU rounds of all paws at once, shape (num_worlds,)."""
-        self.invalid: wp.array = work.invalid
+        self.diverged: wp.array = work.diverged
         """1: the world diverged and waits for `reset`, shape (num_worlds,)."""
         self._differentiable = DifferentiableStep(self.dynamics, max_sweeps, min(tolerance, DIFFERENTIABLE_TOLERANCE))
         self._default_control = model.control(clone_variables=False)
@@ -293,7 +293,7 @@ class SolverJumper(SolverBase):
             self.dynamics.pack_gravity()
 
     def reset(self, state: State, world_mask: wp.array | None = None, flags: StateFlags | int | None = None) -> None:
-        """Clear contact history and the invalid flag of the masked worlds, and put them in the reference pose.
+        """Clear contact history and the `diverged` flag of the masked worlds, and put them in the reference pose.
 
         Blocks return to their starts.
         With `flags=StateFlags.NONE` the state is left alone, for callers that write their own.

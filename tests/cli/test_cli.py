@@ -30,7 +30,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from landing_helpers import still_policy
 
-TRAIN = ["train", "vertical-jump", "--num-envs", "16", "--iterations", "2", "--no-tensorboard", "--device", "cpu"]
+TRAIN = ["train", "vertical-jump", "--num-envs", "16", "--max-iterations", "2", "--no-tensorboard", "--device", "cpu"]
 TRAIN += "--ppo.num-steps 4 --ppo.minibatches 2 --ppo.hidden 16 8 --env.curriculum.promote-after 2".split()
 
 
@@ -75,16 +75,16 @@ def test_help_imports_nothing_heavy(args, none_of):
         f"try: main({args})\n"
         f"except SystemExit as end: print(end.code, [m for m in {none_of} if m in sys.modules])"
     )
-    answer = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert answer.stdout.splitlines()[-1] == f"{2 if args == ['train'] else 0} []"
+    process = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert process.stdout.splitlines()[-1] == f"{2 if args == ['train'] else 0} []"
 
 
-def test_installed_command_is_a_function_that_is_there():
+def test_console_script_resolves_to_main():
     scripts = tomllib.loads((Path(__file__).parents[2] / "pyproject.toml").read_text())["project"]["scripts"]
     assert EntryPoint("jumper", scripts["jumper"], "console_scripts").load() is cli.main
 
 
-def test_help_names_every_command_and_the_flag_for_tasks_of_ones_own(capsys):
+def test_help_lists_all_commands_and_task_module_flag(capsys):
     code, out, _ = run(capsys, "--help")
     assert code == 0 and "--task-module FILE_OR_MODULE" in out
     assert all(f"  {command} " in out for command in ("train", "play", "evaluate", "export", "list"))
@@ -93,7 +93,7 @@ def test_help_names_every_command_and_the_flag_for_tasks_of_ones_own(capsys):
 @pytest.mark.parametrize(
     "command", [["train"], ["train", "vertical-jump"], ["play"], ["evaluate"], ["export"], ["list"]]
 )
-def test_every_command_has_help(capsys, command):
+def test_each_command_prints_help(capsys, command):
     code, out, _ = run(capsys, *command, "--help")
     assert code == 0
     assert "usage: jumper" in out and "--task-module FILE_OR_MODULE" in out
@@ -104,7 +104,7 @@ def test_every_command_has_help(capsys, command):
     [
         (["fly"], "no command 'fly'; there are train, finetune, play, evaluate, export, sysid, list"),
         (["train", "swim"], "unknown task 'swim'; there are vertical-jump"),
-        (["train", "--iterations", "3"], "the task comes first"),
+        (["train", "--max-iterations", "3"], "the task comes first"),
         ([*TRAIN, "--task", "other"], "give the task once"),
         (
             [*TRAIN, "--env.rewards.jump-height.weight", "nan"],
@@ -113,7 +113,7 @@ def test_every_command_has_help(capsys, command):
         ([*TRAIN, "--env.terminations.tilted.angle", "inf"], "tilted: parameter 'angle' must be a finite number"),
         (["list", "--task-module"], "--task-module needs a FILE.py or the name of a module"),
         (["list", "--task-module="], "--task-module needs a FILE.py or the name of a module"),
-        (["train", "--task-module", "--iterations", "3"], "--task-module needs a FILE.py"),
+        (["train", "--task-module", "--max-iterations", "3"], "--task-module needs a FILE.py"),
         (["list", "--task-module", "missing.py"], "no file 'missing.py'"),
         (["play", "vertical_jump", "--task-module", "not_a_module"], "no module 'not_a_module'"),
         ([*TRAIN, "--device", "abacus"], "no device 'abacus'"),
@@ -125,19 +125,19 @@ def test_every_command_has_help(capsys, command):
         (["finetune", "vertical_jump", "--out", "x.onnx"], "whose name cannot end in .onnx"),
     ],
 )
-def test_unusable_input_is_one_line_and_code_2(capsys, tmp_path, monkeypatch, args, message):
+def test_invalid_input_prints_one_line_and_exits_with_2(capsys, tmp_path, monkeypatch, args, message):
     monkeypatch.chdir(tmp_path)
     code, out, err = run(capsys, *args)
     assert (code, out) == (2, "")
     assert len(err) == 1 and err[0].startswith("jumper: ") and message in err[0]
 
 
-def test_bare_command_shows_usage_with_code_2(capsys):
+def test_no_arguments_prints_usage_and_exits_with_2(capsys):
     code, out, err = run(capsys)
     assert (code, out) == (2, "") and err[0].startswith("usage: jumper COMMAND")
 
 
-def test_training_of_nothing_shows_usage_and_the_tasks_with_code_2(capsys):
+def test_train_without_task_lists_tasks_and_exits_with_2(capsys):
     code, out, err = run(capsys, "train")
     assert (code, out) == (2, "") and err[0] == "usage: jumper train TASK [flags]"
     assert all(name in "\n".join(err) for name in TASKS)
@@ -152,13 +152,13 @@ def test_training_of_nothing_shows_usage_and_the_tasks_with_code_2(capsys):
         lambda *_: (_ for _ in ()).throw(OSError("no file of ours")),
     ],
 )
-def test_fault_inside_a_library_is_not_hidden(monkeypatch, fault):
+def test_unexpected_exceptions_propagate(monkeypatch, fault):
     monkeypatch.setattr("jumper_warp.cli.list.run", fault)
     with pytest.raises((ValueError, KeyError, OSError)):
         cli.main(["list"])
 
 
-def test_refusal_is_told_by_its_type_wherever_it_was_raised(capsys, monkeypatch):
+def test_input_error_prints_one_line(capsys, monkeypatch):
     def refuse(*_):
         raise InputError("expected a,\n  got b")
 
@@ -166,13 +166,13 @@ def test_refusal_is_told_by_its_type_wherever_it_was_raised(capsys, monkeypatch)
     assert run(capsys, "list") == (2, "", ["jumper: expected a, got b"])
 
 
-def test_file_that_is_missing_is_one_line(capsys, monkeypatch):
+def test_missing_file_prints_one_line(capsys, monkeypatch):
     monkeypatch.setattr("jumper_warp.cli.list.run", lambda *_: open("/no/such/file"))
     code, _, err = run(capsys, "list")
     assert code == 2 and len(err) == 1 and "'/no/such/file'" in err[0]
 
 
-def test_interrupt_exits_with_130(capsys, monkeypatch):
+def test_keyboard_interrupt_exits_with_130(capsys, monkeypatch):
     def interrupted(*_):
         raise KeyboardInterrupt
 
@@ -184,14 +184,14 @@ def test_interrupt_exits_with_130(capsys, monkeypatch):
 
 
 def flag_of(name):
-    """Flag of a number of a term by its dotted name."""
+    """Return the flag of a term's parameter from its dotted name."""
     section, term, key = name.split(".")
     middle = "" if section in ("advance", "curriculum") else f".{flag_name(term)}"
     return f"--env.{section}{middle}.{flag_name(key)}"
 
 
 @pytest.mark.parametrize("name", ["vertical-jump", "horizontal-jump", "hold-height"])
-def test_every_number_of_every_term_has_a_flag_that_reaches_the_kernels(name):
+def test_flag_sets_each_term_parameter(name):
     task = hold_height() if name == "hold-height" else make_task(name)
     drawn = tuple(f"events.{term.name}." for term in task.randomization.events())  # has flags of its own
     args, expected = [], {}
@@ -206,12 +206,12 @@ def test_every_number_of_every_term_has_a_flag_that_reaches_the_kernels(name):
 
 
 def parsed(task, args):
-    """Task with the flags of a command line."""
+    """Return the task with settings changed by flags."""
     return parse_settings(task, TrainArgs(), args)[1]
 
 
 def leaves(value, path=""):
-    """Every number, and the flag that it should have, of settings that are no terms."""
+    """Yield the expected flag and the value of each setting that belongs to no term."""
     if dataclasses.is_dataclass(value):
         for spec in dataclasses.fields(value):
             yield from leaves(getattr(value, spec.name), f"{path}.{flag_name(spec.name)}")
@@ -223,36 +223,36 @@ def leaves(value, path=""):
 
 
 @pytest.mark.parametrize("name", ["horizontal-jump", "hold-height"])
-def test_every_other_setting_has_a_flag(name):
+def test_flag_exists_for_each_setting_outside_terms(name):
     task = hold_height() if name == "hold-height" else make_task(name)
     parts = {
         "reset": task.reset.settings, "levels": task.levels, "motors": task.motors, "randomization": task.randomization,
         "command-filter": task.command_filter, "action-scale": task.action_scale, "contact-force": task.contact_force,
         "reward-floor": task.reward_floor,
     }  # fmt: skip
-    found = dict(leaf for part, value in parts.items() for leaf in leaves(value, f".{part}"))
+    settings = dict(leaf for part, value in parts.items() for leaf in leaves(value, f".{part}"))
     args = []
-    for flag, value in found.items():
+    for flag, value in settings.items():
         if isinstance(value, bool):
             args.append(flag if value else f"{flag[: flag.rindex('.') + 1]}no-{flag[flag.rindex('.') + 1 :]}")
         else:
             args += [flag, *(map(str, value) if isinstance(value, tuple) else [str(value)])]
-    assert parsed(task, args) == task and len(found) > 40
+    assert parsed(task, args) == task and len(settings) > 40
 
 
-def test_fields_of_a_task_without_a_flag_are_its_code_and_its_names():
+def test_task_fields_without_flags_hold_functions_or_names():
     flags = {spec.metadata["flag"] for spec in dataclasses.fields(flags_of(hold_height()))}
     names = {flag_name(spec.name) for spec in dataclasses.fields(TaskCfg)}
     assert names - flags == {"name", "state", "command", "evaluation_suite", "metrics"} and not flags - names
 
 
 @pytest.mark.parametrize("name", [*TASKS, "hold-height"])
-def test_flags_left_alone_leave_the_task_alone(name):
+def test_default_flags_do_not_change_the_task(name):
     task = hold_height() if name == "hold-height" else make_task(name)
     assert with_flags(task, flags_of(task)) == task == parsed(task, [])
 
 
-def test_flags_change_training_and_task():
+def test_flags_set_training_and_task_settings():
     flags = (
         "--env.rewards.jump-height.weight 25 --env.rewards.jump-height.std-fine 0.2"
         " --env.terminations.wrong-height.tolerance 0.07 --env.advance.takeoff-speed 0.5"
@@ -279,7 +279,7 @@ def test_flags_change_training_and_task():
     assert (args.solver, args.noise, args.randomize) == ("mujoco", False, True)
 
 
-def test_history_is_how_many_steps_of_what_noise_blurs_the_policy_sees():
+def test_history_flag_sets_history_of_noisy_observations():
     _, task = parse_train(["vertical-jump", "--history", "2"])
     steps = {term.name: term.options["history"] for term in task.observations.actor}
     assert [steps[name] for name in ("lin_vel", "ang_vel", "gravity", "angle", "last_action")] == [2] * 5
@@ -289,7 +289,7 @@ def test_history_is_how_many_steps_of_what_noise_blurs_the_policy_sees():
         parse_train(["vertical-jump", "--history", "0"])
 
 
-def test_flags_reach_the_arrays_that_kernels_read():
+def test_flags_set_device_arrays():
     flags = "--env.rewards.jump-height.weight 25 --env.terminations.tilted.angle 0.4"
     flags += " --env.observations.actor.lin-vel.noise 0.3"
     flags += " --env.reset.tilt 9 --env.levels.0.base-height 0.3 0.31 --env.contact-force 0.7 --env.action-scale 10 80"
@@ -315,16 +315,16 @@ def test_flags_reach_the_arrays_that_kernels_read():
         ("velocity-flat", WALKING),
     ],
 )
-def test_training_has_the_settings_of_its_task(name, ppo):
+def test_default_ppo_settings_depend_on_the_task(name, ppo):
     assert parse_train([name])[0].cfg.ppo == ppo
 
 
-def test_best_checkpoint_is_chosen_by_the_figure_of_the_task():
+def test_default_best_checkpoint_metric_depends_on_the_task():
     names = {name: parse_train([name])[0].cfg.best_metric for name in ("vertical-jump", "velocity-rough")}
     assert names == {"vertical-jump": "Metrics/success", "velocity-rough": "Metrics/score"}
 
 
-def test_terms_whose_names_make_the_same_flag_are_refused():
+def test_refuses_terms_with_the_same_flag():
     task = make_task("vertical-jump")
     rest = next(term for term in task.rewards if term.name == "rest")
     task = dataclasses.replace(task, rewards=(rest, rest.replace(name="Rest_")))
@@ -335,22 +335,22 @@ def test_terms_whose_names_make_the_same_flag_are_refused():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: HeightFlags(jumps=0), "jumps must be at least 1"),
-        (lambda: LandingFlags(jumps=0), "jumps must be at least 1"),
-        (lambda: HeightFlags(lower=1.0, upper=0.5), "heights must be"),
-        (lambda: HeightFlags(lower=0.0), "heights must be"),
-        (lambda: LandingFlags(x=(1.0, 0.5)), "x must be in"),
+        (lambda: HeightFlags(num_jumps=0), "num_jumps must be at least 1"),
+        (lambda: LandingFlags(num_jumps=0), "num_jumps must be at least 1"),
+        (lambda: HeightFlags(height_range=(1.0, 0.5)), "height_range must be"),
+        (lambda: HeightFlags(height_range=(0.0, 1.2)), "height_range must be"),
+        (lambda: LandingFlags(goal_x=(1.0, 0.5)), "goal_x must be in"),
         (lambda: LandingFlags(heading=float("inf")), "heading must be finite or any"),
-        (lambda: HeightFlags(in_range=(1.0, 0.5)), "in_range must be in"),
-        (lambda: LandingFlags(in_range=(1.0, 0.5)), "in_range must be in"),
+        (lambda: HeightFlags(success_range=(1.0, 0.5)), "success_range must be in"),
+        (lambda: LandingFlags(success_range=(1.0, 0.5)), "success_range must be in"),
         (lambda: HeightPlayFlags(height=()), "height takes 1 to 64"),
         (lambda: HeightPlayFlags(height=(-1.0,)), "height takes 1 to 64"),
         (lambda: LandingPlayFlags(goal=((float("nan"), 0.0),)), "goal takes up to 64"),
-        (lambda: LandingPlayFlags(then=((0.5, 0.0),) * 65), "then takes up to 64"),
+        (lambda: LandingPlayFlags(next_goals=((0.5, 0.0),) * 65), "next_goals takes up to 64"),
         (lambda: PlayCfg(HeightPlayFlags(), seconds=0.0), "seconds must be in"),
     ],
 )
-def test_impossible_settings_are_refused(make, message):
+def test_refuses_settings_out_of_range(make, message):
     with pytest.raises(InputError, match=message):
         make()
 
@@ -358,7 +358,7 @@ def test_impossible_settings_are_refused(make, message):
 # ---------------------------------------------------------------------- from training to a recording
 
 
-def test_exported_policy_is_that_of_the_run(trained_run):
+def test_exported_policy_equals_the_policy_of_the_run(trained_run):
     policy, same = load_policy(trained_run / "policy"), open_policy(trained_run)
     assert policy.interface == same.interface and policy.interface.sizes == (147, 16, 8, 12)
     assert all(np.array_equal(policy.tensors()[name], tensor) for name, tensor in same.tensors().items())
@@ -367,76 +367,75 @@ def test_exported_policy_is_that_of_the_run(trained_run):
     assert (trained_run / "policy" / "learning_curve.jsonl").read_text().count("\n") >= 1
 
 
-def test_evaluation_reports_and_keeps_figures(trained_run, tmp_path, capsys):
-    args = ["--jumps", "3", "--noise", "--device", "cpu", "--out", str(tmp_path), "--keep"]
+def test_evaluate_writes_metrics_and_saves_them_to_the_policy(trained_run, tmp_path, capsys):
+    args = ["--num-jumps", "3", "--noise", "--device", "cpu", "--out", str(tmp_path), "--save-to-policy"]
     code, out, _ = run(capsys, "evaluate", str(trained_run / "policy"), *args)
-    figures = json.loads((tmp_path / "metrics.json").read_text())
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert code == 0 and "success_rate_in_range" in out
-    assert (figures["jumps"], figures["noise"], figures["success_rate"]) == (3, True, 0.0)
+    assert (metrics["jumps"], metrics["noise"], metrics["success_rate"]) == (3, True, 0.0)
     rows = (tmp_path / "jumps.csv").read_text().splitlines()
     assert [row.split(",")[0] for row in rows] == ["target_m", "0.500000", "0.850000", "1.200000"]
-    assert json.loads((trained_run / "policy" / "metrics.json").read_text()) == figures
+    assert json.loads((trained_run / "policy" / "metrics.json").read_text()) == metrics
     assert load_policy(trained_run / "policy")
 
 
-def test_play_records_every_step_of_every_robot(trained_run, tmp_path, capsys):
+def test_play_records_each_step_of_each_robot(trained_run, tmp_path, capsys):
     args = ["--height", "0.6", "0.9", "--seconds", "0.25", "--device", "cpu", "--out", str(tmp_path)]
     code, out, _ = run(capsys, "play", str(trained_run), *args)
     assert code == 0 and "0.900" in out
-    found = {name.split("/")[-1]: values for name, values in curves(tmp_path / "jump.rrd").items()}
-    assert [len(found[f"base of {world} [m]"]) for world in (0, 1)] == [15, 15]
-    assert found["target of 1 [m]"] == pytest.approx([0.9] * 15)
-    assert 0.2 < found["base of 0 [m]"][0] < 0.5
+    series = {name.split("/")[-1]: values for name, values in curves(tmp_path / "jump.rrd").items()}
+    assert [len(series[f"base of {world} [m]"]) for world in (0, 1)] == [15, 15]
+    assert series["target of 1 [m]"] == pytest.approx([0.9] * 15)
+    assert 0.2 < series["base of 0 [m]"][0] < 0.5
 
 
-def test_evaluation_of_jumps_to_places(still, tmp_path, capsys):
-    args = ["--jumps", "3", "--x", "0.4", "0.8", "--heading", "90", "--device", "cpu", "--out", str(tmp_path)]
+def test_evaluate_horizontal_jumps(still, tmp_path, capsys):
+    args = ["--num-jumps", "3", "--goal-x", "0.4", "0.8", "--heading", "90", "--device", "cpu", "--out", str(tmp_path)]
     code, out, _ = run(capsys, "evaluate", still, *args)
-    figures = json.loads((tmp_path / "metrics.json").read_text())
+    metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert code == 0 and "success_rate_in_range" in out
-    assert (figures["jumps"], figures["task"], figures["failed_by_no_jump"]) == (3, "horizontal-jump", 3)
-    assert figures["mean_error_m"] == pytest.approx(0.6, abs=0.02)
+    assert (metrics["jumps"], metrics["task"], metrics["failed_by_no_jump"]) == (3, "horizontal-jump", 3)
+    assert metrics["mean_error_m"] == pytest.approx(0.6, abs=0.02)
     rows = [row.split(",") for row in (tmp_path / "jumps.csv").read_text().splitlines()]
     assert [row[0] for row in rows] == ["goal_x_m", "0.400000", "0.600000", "0.800000"]
     assert [float(row[2]) for row in rows[1:]] == pytest.approx([90.0] * 3, abs=1e-4)
 
 
-def test_play_of_jumps_to_places_records_the_distance_and_marks_the_goals(still, tmp_path, capsys):
-    goals = ["--goal", "0.8", "0.2", "--goal", "0.5", "0", "--then", "0.75", "-0.2", "--seconds", "0.25"]
+def test_play_horizontal_jumps_records_distances_and_goal_markers(still, tmp_path, capsys):
+    goals = ["--goal", "0.8", "0.2", "--goal", "0.5", "0", "--next-goals", "0.75", "-0.2", "--seconds", "0.25"]
     code, out, _ = run(capsys, "play", still, *goals, "--device", "cpu", "--out", str(tmp_path))
     assert code == 0 and out.count("not_begun") == 2
-    found = {name.split("/")[-1]: values for name, values in curves(tmp_path / "jump.rrd").items()}
+    series = {name.split("/")[-1]: values for name, values in curves(tmp_path / "jump.rrd").items()}
     entities = {str(chunk.entity_path) for chunk in RrdReader(tmp_path / "jump.rrd").stream().to_chunks()}
-    assert found["goal of 0 [m]"] == pytest.approx([np.hypot(0.8, 0.2)] * 15, abs=0.02)
-    assert found["goal of 1 [m]"] == pytest.approx([0.5] * 15, abs=0.02)
+    assert series["goal of 0 [m]"] == pytest.approx([np.hypot(0.8, 0.2)] * 15, abs=0.02)
+    assert series["goal of 1 [m]"] == pytest.approx([0.5] * 15, abs=0.02)
     assert {"/scene/goal_0_0", "/scene/goal_1_0"} <= entities
 
 
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["evaluate", "--upper", "1.0"], "--upper is not for policies of horizontal-jump"),
-        (["evaluate", "--lower", "0.5"], "--lower is not for policies of horizontal-jump"),  # its own default
+        (["evaluate", "--height-range", "0.5", "1.2"], "--height-range is not for policies of horizontal"),  # default
         (["play", "--height", "0.9"], "--height is not for policies of horizontal-jump"),
         (["play", "--height", "0.6", "0.9", "1.1"], "--height is not for policies of horizontal-jump"),
-        (["evaluate", "--x", "0.8", "0.4"], "x must be in"),
+        (["evaluate", "--goal-x", "0.8", "0.4"], "goal_x must be in"),
     ],
 )
-def test_flags_of_another_task_and_no_ranges_are_one_line(still, capsys, args, message):
+def test_refuses_flags_of_other_tasks_and_falling_ranges(still, capsys, args, message):
     code, _, err = run(capsys, args[0], still, *args[1:], "--device", "cpu")
     assert code == 2 and message in err[-1]
 
 
-def test_play_of_a_velocity_walks_as_long_as_is_asked(tmp_path, capsys):
+def test_play_walks_for_the_given_time(tmp_path, capsys):
     args = ["--velocity", "0.5", "0", "0.3", "--seconds", "0.25", "--device", "cpu", "--out", str(tmp_path)]
     code, out, _ = run(capsys, "play", "walking_flat", *args)
     assert code == 0 and "walked" in out and "0.500" in out and "0.300" in out
-    found = curves(tmp_path / "robot.rrd")
-    (wanted,) = (values for name, values in found.items() if "yaw_rate/command of 0" in name)
-    assert wanted == pytest.approx([0.3] * 15)
+    series = curves(tmp_path / "robot.rrd")
+    (yaw_rate_command,) = (values for name, values in series.items() if "yaw_rate/command of 0" in name)
+    assert yaw_rate_command == pytest.approx([0.3] * 15)
 
 
-def test_play_of_a_script_records_what_the_robot_did(tmp_path, capsys):
+def test_play_script_writes_recording_plot_and_metrics(tmp_path, capsys):
     script = tmp_path / "script.json"
     script.write_text('[{"walk": [0.5, 0, 0.3], "seconds": 0.2}, {"stand": 0.1}]')
     code, out, _ = run(capsys, "play", "--script", str(script), "--device", "cpu", "--out", str(tmp_path / "out"))
@@ -454,7 +453,7 @@ def test_play_of_a_script_records_what_the_robot_did(tmp_path, capsys):
         (["--height", "0.9"], "the policy comes first"),
     ],
 )
-def test_script_that_cannot_be_played_is_one_line(tmp_path, capsys, args, message):
+def test_play_refuses_invalid_scripts(tmp_path, capsys, args, message):
     (tmp_path / "script.json").write_text('[{"fly": 1}]')
     args = [str(tmp_path / "script.json") if arg == "SCRIPT" else arg for arg in args]
     code, _, err = run(capsys, "play", *args, "--device", "cpu")
@@ -462,7 +461,7 @@ def test_script_that_cannot_be_played_is_one_line(tmp_path, capsys, args, messag
 
 
 @pytest.mark.parametrize("command", ["evaluate", "play"])
-def test_folder_that_cannot_be_made_is_told_before_anything_is_simulated(tmp_path, capsys, command):
+def test_refuses_output_folder_before_simulating(tmp_path, capsys, command):
     policy = still_policy("horizontal-jump")
     names = ("other", *policy.interface.observation_names[1:])  # whose environment is refused
     policy.interface = dataclasses.replace(policy.interface, observation_names=names)
@@ -474,7 +473,7 @@ def test_folder_that_cannot_be_made_is_told_before_anything_is_simulated(tmp_pat
     assert code == 2 and "File exists" in err[-1]
 
 
-def test_truncated_checkpoint_is_one_line(trained_run, tmp_path, capsys):
+def test_export_refuses_truncated_checkpoint(trained_run, tmp_path, capsys):
     folder = tmp_path / "checkpoints"
     folder.mkdir()
     for path in (trained_run / "checkpoints").iterdir():
@@ -486,20 +485,20 @@ def test_truncated_checkpoint_is_one_line(trained_run, tmp_path, capsys):
         open_policy(tmp_path)
 
 
-def test_run_keeps_no_figures(trained_run, capsys):
-    code, _, err = run(capsys, "evaluate", str(trained_run), "--keep", "--device", "cpu")
+def test_refuses_to_save_metrics_to_a_training_run(trained_run, capsys):
+    code, _, err = run(capsys, "evaluate", str(trained_run), "--save-to-policy", "--device", "cpu")
     assert code == 2 and "export it first" in err[-1]
 
 
-def test_viewer_listens_on_loopback_only(tmp_path):
+def test_viewer_binds_to_loopback(tmp_path):
     command = viewer_command(tmp_path / "jump.rrd")
     assert command[-2:] == ["--bind", "127.0.0.1"]
 
 
-def test_a_reader_that_is_gone_is_no_fault():
+def test_closed_output_pipe_exits_with_0():
     reader, writer = os.pipe()
     os.close(reader)
     code = "from jumper_warp.cli.main import main; main(['list'])"
-    ended = subprocess.run([sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE, text=True)
+    process = subprocess.run([sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE, text=True)
     os.close(writer)
-    assert ended.returncode == 0 and ended.stderr == ""
+    assert process.returncode == 0 and process.stderr == ""

@@ -27,7 +27,7 @@ def policies(tmp_path_factory):
     return folder
 
 
-def test_every_task_is_measured_by_a_success_that_comes_after_all_falls():
+def test_jump_evaluations_check_success_after_failures():
     kinds = {name: evaluation_of(make_task(name)) for name in TASKS if name.endswith("-jump")}
     assert [kinds[name] is EVALUATIONS[key] for name, key in (
         ("vertical-jump", "apex_height"), ("horizontal-jump", "landing_position"),
@@ -38,76 +38,73 @@ def test_every_task_is_measured_by_a_success_that_comes_after_all_falls():
         assert ends[-1] == "success" and (name == "vertical-jump" or set(ends) == set(LANDING_TERMINATIONS))
 
 
-def test_task_with_an_unknown_evaluation_is_refused():
-    with pytest.raises(
-        PolicyError, match=r"horizontal-jump asks for the evaluation 'walk'; there are \['apex_height', 'l"
-    ):
-        evaluation_of(replace(TASK, evaluation_suite="walk"))
+def test_refuses_unknown_evaluation():
+    with pytest.raises(PolicyError, match=r"horizontal-jump asks for the evaluation 'walk'; there are \['height', 'pl"):
+        evaluation_of(replace(TASK, evaluation="walk"))
 
 
-def test_places_are_spread_ahead_and_drawn_aside_and_headings_too():
-    flags = LandingFlags(jumps=5, y=(-0.2, 0.1))
+def test_goals_are_evenly_spaced_ahead_and_sampled_to_the_side():
+    flags = LandingFlags(num_jumps=5, goal_y=(-0.2, 0.1))
     log = flags.log(TASK, seed=3)
-    assert log.goal_positions[:, 0, 0] == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.5])
-    aside = log.goal_positions[:, 0, 1]
-    assert -0.2 <= aside.min() < aside.max() <= 0.1
+    assert log.places[:, 0, 0] == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.5])
+    lateral = log.places[:, 0, 1]
+    assert -0.2 <= lateral.min() < lateral.max() <= 0.1
     assert len(set(log.headings)) == 5 and np.abs(log.headings).max() <= math.pi
     assert np.array_equal(flags.log(TASK, seed=3).goal_positions, log.goal_positions)
     assert not np.array_equal(flags.log(TASK, seed=4).headings, log.headings)
 
 
-def test_one_heading_is_that_of_all_in_radians():
-    assert LandingFlags(jumps=2, x=(0.3, 0.4), y=(0.0, 0.0), heading=90.0).log(TASK, 0).headings == pytest.approx(
-        0.5 * math.pi
-    )
+def test_heading_flag_in_degrees_sets_all_headings():
+    flags = LandingFlags(num_jumps=2, goal_x=(0.3, 0.4), heading=90.0)
+    assert flags.log(TASK, 0).headings == pytest.approx(0.5 * math.pi)
 
 
 @pytest.mark.parametrize(
     ("task", "args", "flag"),
     [
-        ("vertical-jump", ["--x", "0.3", "0.5"], "--x"),
+        ("vertical-jump", ["--goal-x", "0.3", "0.5"], "--goal-x"),
         ("vertical-jump", ["--heading", "any"], "--heading"),
-        ("horizontal-jump", ["--upper", "1.0"], "--upper"),
-        ("horizontal-jump", ["--episodes", "3"], "--episodes"),
+        ("horizontal-jump", ["--height-range", "0.5", "1.0"], "--height-range"),
+        ("horizontal-jump", ["--num-episodes", "3"], "--num-episodes"),
     ],
 )
-def test_flags_of_another_task_are_refused(policies, task, args, flag):
+def test_refuses_flags_of_other_tasks(policies, task, args, flag):
     with pytest.raises(InputError, match=f"{flag} is not for policies of {task}; jumper evaluate .* --help shows"):
         evaluate.run([str(policies / task), *args], [])
 
 
 @pytest.mark.parametrize(
-    ("task", "suite", "there"),
+    ("task", "suite", "available"),
     [("vertical-jump", ["grid"], "sweep"), ("horizontal-jump", [], "sweep, grid, ring, consecutive, platform, max")],
 )
-def test_suite_of_another_task_is_refused(policies, task, suite, there):
-    with pytest.raises(InputError, match=f"no suite '.*' for policies of {task}; there are {there}$"):
+def test_refuses_suites_of_other_tasks(policies, task, suite, available):
+    with pytest.raises(InputError, match=f"no suite '.*' for policies of {task}; there are {available}$"):
         evaluate.run([str(policies / task), "--suite", *suite], [])
 
 
 @pytest.mark.parametrize("command", [evaluate, play])
-def test_help_shows_the_flags_of_the_policy_only(policies, capsys, command):
+def test_help_lists_only_flags_of_the_policys_task(policies, capsys, command):
     shown = {}
     for task in ("vertical-jump", "horizontal-jump"):
         with pytest.raises(SystemExit) as end:
             command.run([str(policies / task), "--help"], [])
         assert end.value.code == 0
         shown[task] = capsys.readouterr().out
-    flags = {evaluate: ("--upper", "--heading"), play: ("--height", "--goal")}[command]
-    for task, there, missing in (("vertical-jump", *flags), ("horizontal-jump", *reversed(flags))):
-        assert there in shown[task] and missing not in shown[task] and "--solver" in shown[task]
+    flags = {evaluate: ("--height-range", "--heading"), play: ("--height", "--goal")}[command]
+    for task, present, absent in (("vertical-jump", *flags), ("horizontal-jump", *reversed(flags))):
+        assert present in shown[task] and absent not in shown[task] and "--solver" in shown[task]
 
 
 @pytest.mark.parametrize("command", [evaluate, play])
 @pytest.mark.parametrize("args", [[], ["--height", "0.9", "vertical_jump"]])
-def test_policy_comes_first(command, args):
+def test_policy_must_be_the_first_argument(command, args):
     with pytest.raises(InputError, match=r"the policy comes first: jumper (play|evaluate) POLICY"):
         command.run(args, [])
 
 
-def test_range_of_places_counts_distances():
+def test_success_range_selects_goals_by_distance():
     goals = [[0.3, 0.0], [0.0, -0.3], [0.6, 0.6]]
-    flags = LandingFlags(jumps=3, x=(0.0, 0.0), y=(0.0, 0.0), heading=0.0, in_range=(0.3, 0.5))
+    flags = LandingFlags(num_jumps=3, goal_x=(0.0, 0.0), goal_y=(0.0, 0.0), heading=0.0, success_range=(0.3, 0.5))
     landings = flags.log(TASK, 0)
     landings.goal_positions[:, 0] = goals
     landings.place[:, 0], landings.target[:, 0] = goals, goals
@@ -118,11 +115,12 @@ def test_range_of_places_counts_distances():
     assert (metrics["range_lower_m"], metrics["range_upper_m"]) == (0.3, 0.5)
 
 
-def test_heights_are_spread_evenly():
-    assert HeightFlags(jumps=3, lower=0.6, upper=1.0).log(TASK, 0).commanded[:, 0] == pytest.approx([0.6, 0.8, 1.0])
+def test_height_goals_are_evenly_spaced():
+    log = HeightFlags(num_jumps=3, height_range=(0.6, 1.0)).log(TASK, 0)
+    assert log.commanded[:, 0] == pytest.approx([0.6, 0.8, 1.0])
 
 
-def test_csv_has_a_line_a_jump_and_nothing_where_there_is_no_number():
+def test_csv_has_one_row_per_jump_and_empty_cells_for_nan():
     jumps = HeightLog(np.array([0.5, 0.8]), ("success", "came_apart", "low_base"))
     jumps.end[:, 0], jumps.apex[:, 0], jumps.heading[:] = [0, 1], [0.52, np.nan], 0.0
     assert csv_text(jumps).splitlines() == [

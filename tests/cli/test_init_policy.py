@@ -1,4 +1,4 @@
-"""`jumper train --init-policy`."""
+"""`jumper train --init-policy` initializes a new training with a policy."""
 
 import json
 
@@ -11,51 +11,51 @@ from jumper_warp.cli.train import command_line
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.rl.checkpoint import load_checkpoint
 
-TRAIN = ["train", "horizontal-jump-mars", "--num-envs", "4", "--iterations", "1", "--device", "cpu", "--no-tensorboard"]
+TRAIN = "train horizontal-jump-mars --num-envs 4 --max-iterations 1 --device cpu --no-tensorboard".split()
 TRAIN += ["--ppo.num-steps", "2", "--ppo.minibatches", "1", "--ppo.epochs", "1", "--ppo.init-std", "0.3"]
 TRAIN += [part for name in ("lr", "min-lr", "max-lr") for part in (f"--ppo.{name}", "1e-9")]
 
 
 @pytest.fixture(scope="module")
 def begun(tmp_path_factory):
-    """Folder of a training of one iteration without a step that counts, which began with a shipped policy."""
+    """Folder of a training from a shipped policy: one iteration with a negligible learning rate."""
     root = tmp_path_factory.mktemp("logs")
     cli.main([*TRAIN, "--init-policy", "slippery_jump", "--log-root", str(root)])
     (folder,) = (root / "horizontal-jump-mars").iterdir()
     return folder
 
 
-def test_training_begins_with_the_policy(begun):
-    policy, found = open_policy("slippery_jump"), open_policy(begun)
-    for (weight, bias), (same_weight, same_bias) in zip(policy.layers, found.layers, strict=True):
+def test_training_starts_with_the_weights_of_the_policy(begun):
+    policy, trained = open_policy("slippery_jump"), open_policy(begun)
+    for (weight, bias), (same_weight, same_bias) in zip(policy.layers, trained.layers, strict=True):
         torch.testing.assert_close(same_weight, weight, atol=1e-6, rtol=0.0)
         torch.testing.assert_close(same_bias, bias, atol=1e-6, rtol=0.0)
-    drift = (found.mean - policy.mean).abs() / policy.std
+    drift = (trained.mean - policy.mean).abs() / policy.std
     assert 0.0 < drift.max() < 0.2
-    assert found.config["train"]["init_policy"] == "slippery_jump"
-    assert found.config["train"]["ppo"]["init_std"] == 0.3
+    assert trained.config["train"]["init_policy"] == "slippery_jump"
+    assert trained.config["train"]["ppo"]["init_std"] == 0.3
     log_std = load_checkpoint(begun / "checkpoints" / "iteration_000001.pt")["ppo"]["model"]["log_std"]
     torch.testing.assert_close(log_std.exp(), torch.full((12,), 0.3), atol=1e-6, rtol=0.0)
 
 
-def test_training_begins_with_a_run(begun, tmp_path, capsys):
+def test_training_starts_from_a_run(begun, tmp_path, capsys):
     cli.main([*TRAIN, "--init-policy", str(begun), "--log-root", str(tmp_path)])
     assert f"starts from {begun}" in capsys.readouterr().err.splitlines()
     (folder,) = (tmp_path / "horizontal-jump-mars").iterdir()
     assert json.loads((folder / "config.json").read_text())["train"]["init_policy"] == str(begun)
 
 
-def test_a_repeated_command_resumes_the_run_that_it_began(tmp_path, capsys):
-    told = []
+def test_latest_or_new_resumes_the_run_that_it_started(tmp_path, capsys):
+    outputs = []
     for iterations in ("1", "2"):
-        flags = ["--init-policy", "slippery_jump", "--resume", "latest-or-new", "--iterations", iterations]
+        flags = ["--init-policy", "slippery_jump", "--resume", "latest-or-new", "--max-iterations", iterations]
         cli.main([*TRAIN, *flags, "--log-root", str(tmp_path)])
-        told.append(capsys.readouterr().err)
+        outputs.append(capsys.readouterr().err)
     (folder,) = (tmp_path / "horizontal-jump-mars").iterdir()
-    assert "starts from slippery_jump" in told[0] and "resumed" not in told[0]
-    assert f"resumed {folder / 'checkpoints' / 'iteration_000001.pt'}" in told[1] and "starts from" not in told[1]
+    assert "starts from slippery_jump" in outputs[0] and "resumed" not in outputs[0]
+    assert f"resumed {folder / 'checkpoints' / 'iteration_000001.pt'}" in outputs[1] and "starts from" not in outputs[1]
     config = json.loads((folder / "config.json").read_text())["train"]
-    assert (config["iterations"], config["init_policy"]) == (2, "slippery_jump")
+    assert (config["max_iterations"], config["init_policy"]) == (2, "slippery_jump")
     assert (folder / "checkpoints" / "iteration_000002.pt").is_file()
 
 
@@ -69,12 +69,12 @@ def test_a_repeated_command_resumes_the_run_that_it_began(tmp_path, capsys):
         (["--init-policy", "slippery_jump", "--trainer", "rsl-rl", "--ppo.symmetry", "off"], "not offered"),
     ],
 )
-def test_what_cannot_be_started_from_is_told_in_one_line(more, message, capsys, tmp_path):
-    code, _, told = run(capsys, *TRAIN, *more, "--log-root", str(tmp_path))
-    assert code == 2 and message in " ".join(told)
+def test_refuses_unsuitable_initial_policies(more, message, capsys, tmp_path):
+    code, _, err = run(capsys, *TRAIN, *more, "--log-root", str(tmp_path))
+    assert code == 2 and message in " ".join(err)
     assert not list(tmp_path.iterdir())
 
 
-def test_command_that_goes_on_does_not_start_again():
+def test_saved_command_line_omits_start_from():
     args = ["push", "--init-policy", "pusher", "--seed", "3", "--init_policy=x", "--resume", "latest"]
     assert command_line(args, []) == "jumper train push --seed 3"

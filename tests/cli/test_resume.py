@@ -1,4 +1,4 @@
-"""`jumper train --resume`: a run goes on with its own settings, and flags change them."""
+"""`jumper train --resume` uses the settings saved with the run; flags override them."""
 
 import json
 import shutil
@@ -14,25 +14,25 @@ from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
 from jumper_warp.robot.overlay import with_springs
 
 SMALL = ["--ppo.num-steps", "2", "--ppo.minibatches", "2", "--ppo.hidden", "8"]
-OWN = ["--num-envs", "4", "--iterations", "1", "--seed", "3", "--save-interval", "7", "--no-noise", "--no-randomize",
-       "--history", "1", "--env.gravity", "3.71", "--env.rewards.base-at-rest.weight", "-0.5",
+SAVED = ["--num-envs", "4", "--max-iterations", "1", "--seed", "3", "--save-interval", "7", "--no-noise",
+       "--no-randomize", "--history", "1", "--env.gravity", "3.71", "--env.rewards.base-at-rest.weight", "-0.5",
        "--ppo.gamma=0.9"]  # fmt: skip
 HERE = ["--device", "cpu", "--no-tensorboard"]
 
 
 def train(capsys, *args):
-    """Return exit code, the folder that was told, and the lines of standard error."""
+    """Return exit code, the printed folder of the run, and the lines of standard error."""
     code, out, err = command(capsys, "train", "vertical-jump", *HERE, *args)
     return code, out.strip(), err
 
 
 @pytest.fixture(scope="module")
 def begun(tmp_path_factory):
-    """Folder of a run whose settings are its own."""
+    """Folder of a training run with settings that differ from the defaults."""
     root = tmp_path_factory.mktemp("logs")
     springs = root / "springs.json"
     with_springs(600.0, 0.1).save(springs)
-    cli.main(["train", "vertical-jump", *HERE, *SMALL, *OWN, "--robot", str(springs), "--log-root", str(root)])
+    cli.main(["train", "vertical-jump", *HERE, *SMALL, *SAVED, "--robot", str(springs), "--log-root", str(root)])
     springs.unlink()  # a run knows its robot
     (folder,) = (root / "vertical-jump").iterdir()
     return folder
@@ -40,7 +40,7 @@ def begun(tmp_path_factory):
 
 @pytest.fixture
 def run(begun, tmp_path):
-    """A copy of it."""
+    """Copy of the run that a test may change."""
     return shutil.copytree(begun, tmp_path / "logs" / "vertical-jump" / "run")
 
 
@@ -48,50 +48,50 @@ def config(folder):
     return json.loads((folder / "config.json").read_text())
 
 
-def changed(told):
-    """Lines on what differs from the run that is resumed."""
-    return [line for line in told if " -> " in line]
+def changed_settings(lines):
+    """Return the lines that print a setting changed against the resumed run."""
+    return [line for line in lines if " -> " in line]
 
 
-def test_a_run_goes_on_with_its_own_settings(capsys, run, begun):
-    code, folder, told = train(capsys, "--resume", "latest", "--log-root", str(run.parents[1]), "--iterations", "2")
-    assert (code, folder) == (0, str(run)) and changed(told) == ["iterations 1 -> 2"]
+def test_resume_uses_the_settings_of_the_run(capsys, run, begun):
+    code, folder, err = train(capsys, "--resume", "latest", "--log-root", str(run.parents[1]), "--max-iterations", "2")
+    assert (code, folder) == (0, str(run)) and changed_settings(err) == ["max-iterations 1 -> 2"]
     before, after = config(begun), config(run)
     assert after["env"] == before["env"] and (after["env"]["noise"], after["env"]["randomize"]) == (False, False)
     assert after["env"]["task"]["gravity"] == 3.71 and after["env"]["robot"]["values"]["spring_stiffness"] == [600.0]
-    session = ("iterations", "resume", "log_root")
+    session = ("max_iterations", "resume", "log_root")
     assert all(after["train"][name] == value for name, value in before["train"].items() if name not in session)
     assert (run / "checkpoints" / "iteration_000002.pt").is_file()
 
 
-def test_flags_change_the_settings_and_each_change_is_told(capsys, run):
+def test_flags_override_saved_settings_and_print_each_change(capsys, run):
     flags = ["--env.gravity", "9.81", "--env.rewards.base-at-rest.weight", "-0.25", "--ppo.gamma", "0.95", "--noise"]
     flags += ["--env.reset.tilt", "2"]
-    code, _, told = train(capsys, "--resume", str(run), "--iterations", "2", *flags)
-    assert code == 0 and changed(told) == [
-        "iterations 1 -> 2", "ppo.gamma 0.9 -> 0.95", "noise False -> True", "env.reset.tilt 5.0 -> 2.0",
-        "env.rewards.base-at-rest.weight -0.5 -> -0.25", "env.gravity 3.71 -> 9.81",
+    code, _, err = train(capsys, "--resume", str(run), "--max-iterations", "2", *flags)
+    assert code == 0 and changed_settings(err) == [
+        "max-iterations 1 -> 2", "ppo.gamma 0.9 -> 0.95", "noise False -> True", "env.reset.tilt 5.0 -> 2.0",
+        "env.rewards.rest.weight -0.5 -> -0.25", "env.gravity 3.71 -> 9.81",
     ]  # fmt: skip
     after = config(run)
     assert after["env"]["task"]["gravity"] == 9.81 and after["train"]["ppo"]["gamma"] == 0.95
     assert after["train"]["num_envs"] == 4
 
 
-def test_settings_of_the_session_are_not_those_of_the_run(run):
+def test_session_settings_are_not_restored(run):
     args = parse_train(["vertical-jump", "--resume", str(run)])[0].cfg
     assert (args.device, args.tensorboard, args.threads, args.resume) == (None, True, None, str(run))
-    assert (args.seed, args.save_interval, args.num_envs, args.iterations) == (3, 7, 4, 1)
+    assert (args.seed, args.save_interval, args.num_envs, args.max_iterations) == (3, 7, 4, 1)
 
 
-def test_the_robot_of_a_flag_takes_the_place_of_the_runs(run, tmp_path):
+def test_robot_flag_overrides_the_robot_of_the_run(run, tmp_path):
     with_springs(700.0, 0.1).save(tmp_path / "stiffer.json")
-    given = parse_train(["vertical-jump", "--resume", str(run), "--robot", str(tmp_path / "stiffer.json")])
-    for (args, task), stiffness in ((parse_train(["vertical-jump", "--resume", str(run)]), 600.0), (given, 700.0)):
+    overridden = parse_train(["vertical-jump", "--resume", str(run), "--robot", str(tmp_path / "stiffer.json")])
+    for (args, task), stiffness in ((parse_train(["vertical-jump", "--resume", str(run)]), 600.0), (overridden, 700.0)):
         saved = env_maker(task, args)(2, 0, torch.device("cpu")).config()["robot"]
         assert saved["values"]["spring_stiffness"] == [stiffness]
 
 
-def test_solver_of_the_run_is_kept(run):
+def test_solver_of_the_run_is_restored(run):
     resave(run, env={"solver": "SolverMuJoCo"})
     args = parse_train(["vertical-jump", "--resume", str(run)])[0]
     assert (args.solver, args.history) == ("mujoco", None)
@@ -99,7 +99,7 @@ def test_solver_of_the_run_is_kept(run):
 
 
 def resave(run, train=None, env=None, lacks=()):
-    """Save the run's checkpoint with other settings; lacks: those of the environment that are not told."""
+    """Save the run's checkpoint with other settings; lacks: environment settings to leave out."""
     path = run / "checkpoints" / "iteration_000001.pt"
     state = load_checkpoint(path)
     saved = json.loads(state["config"])
@@ -108,46 +108,46 @@ def resave(run, train=None, env=None, lacks=()):
     save_checkpoint(path.parent, state | {"config": json.dumps(saved)})
 
 
-def test_what_an_older_run_does_not_tell_has_the_flags_defaults(capsys, run):
+def test_settings_missing_from_the_run_have_defaults(capsys, run):
     resave(run, lacks=("noise", "randomize"))
     args, task = parse_train(["vertical-jump", "--resume", str(run)])
     assert (args.noise, args.randomize, task.gravity) == (True, True, 3.71)
-    told = train(capsys, "--resume", str(run), "--iterations", "2", "--no-randomize")[2]
-    assert changed(told) == ["iterations 1 -> 2", "randomize None -> False", "noise None -> True"]
+    err = train(capsys, "--resume", str(run), "--max-iterations", "2", "--no-randomize")[2]
+    assert changed_settings(err) == ["max-iterations 1 -> 2", "randomize None -> False", "noise None -> True"]
 
 
-def test_nothing_left_to_train_names_the_flag(capsys, run):
-    code, _, told = train(capsys, "--resume", str(run))
-    assert code == 0 and told[-1] == "nothing is left to train after iteration 1: give more than --iterations 1"
+def test_finished_run_names_the_flag_that_extends_it(capsys, run):
+    code, _, err = train(capsys, "--resume", str(run))
+    assert code == 0 and err[-1] == "nothing is left to train after iteration 1: give more than --max-iterations 1"
 
 
-def test_settings_that_do_not_fit_the_checkpoint_are_named(capsys, run):
-    code, _, told = train(capsys, "--resume", str(run), "--num-envs", "8")
-    assert code == 2 and "does not fit these settings: " in told[-1] and told[-1].endswith("(num-envs 4 -> 8)")
+def test_refuses_settings_that_do_not_fit_the_checkpoint(capsys, run):
+    code, _, err = train(capsys, "--resume", str(run), "--num-envs", "8")
+    assert code == 2 and "does not fit these settings: " in err[-1] and err[-1].endswith("(num-envs 4 -> 8)")
 
 
-def test_a_run_of_another_task_is_refused(capsys, run):
-    _, _, told = command(capsys, "train", "horizontal-jump", "--resume", str(run))
-    assert "of a run of vertical-jump, not of horizontal-jump" in told[-1]
+def test_refuses_run_of_another_task(capsys, run):
+    _, _, err = command(capsys, "train", "horizontal-jump", "--resume", str(run))
+    assert "of a run of vertical-jump, not of horizontal-jump" in err[-1]
 
 
-def test_unreadable_settings_are_refused(capsys, run):
+def test_refuses_invalid_saved_settings(capsys, run):
     resave(run, train={"num_envs": "many"})
-    code, _, told = train(capsys, "--resume", str(run))
-    assert code == 2 and len(told) == 1 and "settings in its configuration" in told[0]
+    code, _, err = train(capsys, "--resume", str(run))
+    assert code == 2 and len(err) == 1 and "settings in its configuration" in err[0]
 
 
 @pytest.mark.parametrize("name", ["nope", "nope/checkpoints", "nope/iteration_000001.pt", "."])
-def test_no_run_is_told_in_one_line(capsys, tmp_path, monkeypatch, name):
+def test_refuses_paths_without_a_run(capsys, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
-    code, out, told = train(capsys, "--resume", name)
+    code, out, err = train(capsys, "--resume", name)
     assert (code, out) == (2, "")
-    assert told == [f"jumper: {name}: no run to resume; give a run's folder, one of its checkpoints, or latest"]
+    assert err == [f"jumper: {name}: no run to resume; give a run's folder, one of its checkpoints, or latest"]
 
 
-def test_what_cannot_be_understood_is_not_a_run(capsys):
+def test_resume_without_value_exits_with_2(capsys):
     assert train(capsys, "--resume")[0] == 2
 
 
-def test_a_new_training_has_the_tasks_settings():
+def test_new_training_has_default_task_settings():
     assert parse_train(["vertical-jump"])[1] == make_task("vertical-jump")

@@ -1,4 +1,4 @@
-"""The flag --robot: training, evaluation and play are of the robot that an overlay tells."""
+"""The flag --robot applies a robot overlay to training, evaluation and play."""
 
 import json
 
@@ -16,7 +16,7 @@ from jumper_warp.registry import make_task
 from jumper_warp.robot.overlay import RobotOverlay
 
 HEAVY = 3.0
-"""[kg] Added to the base."""
+"""[kg] Mass added to the base."""
 
 
 def base_mass(env):
@@ -33,14 +33,14 @@ def overlay(tmp_path_factory):
 
 
 @pytest.mark.parametrize("command", ["evaluate", "play"])
-def test_a_policy_jumps_less_high_with_the_heavier_robot(overlay, tmp_path, command):
-    count = ["--jumps", "3", "--lower", "0.7"] if command == "evaluate" else ["--height", "1.1"]
-    found, apex = {}, {}
+def test_heavier_robot_jumps_less_high(overlay, tmp_path, command):
+    count = ["--num-jumps", "3", "--height-range", "0.7", "1.2"] if command == "evaluate" else ["--height", "1.1"]
+    metrics, apex = {}, {}
     for name, flags in (("described", []), ("identified", ["--robot", str(overlay)])):
         main([command, "vertical_jump", *count, *flags, "--out", str(tmp_path / name), "--device", "cpu"])
-        found[name] = json.loads((tmp_path / name / "metrics.json").read_text())
+        metrics[name] = json.loads((tmp_path / name / "metrics.json").read_text())
         if command == "play":
-            apex[name] = np.ravel(found[name]["apex_m"])[0]
+            apex[name] = np.ravel(metrics[name]["apex_m"])[0]
         else:
             table = np.genfromtxt(
                 tmp_path / name / "jumps.csv", delimiter=",", names=True, dtype=None, encoding="utf-8"
@@ -48,10 +48,10 @@ def test_a_policy_jumps_less_high_with_the_heavier_robot(overlay, tmp_path, comm
             apex[name] = np.mean(table["apex_m"])
     assert apex["identified"] < apex["described"] - 0.02
     if command == "evaluate":
-        assert found["identified"]["robot"] == str(overlay) and "robot" not in found["described"]
+        assert metrics["identified"]["robot"] == str(overlay) and "robot" not in metrics["described"]
 
 
-def test_experiments_take_the_flag_too(overlay):
+def test_experiments_accept_the_robot_flag(overlay):
     args = tyro.cli(EvaluationArgs, args=["--robot", str(overlay), "--policy", "vertical_jump", "--device", "cpu"])
     masses = [
         base_mass(env_of_policy(open_policy(args.policy), 1, conditions_of(a)))
@@ -60,7 +60,7 @@ def test_experiments_take_the_flag_too(overlay):
     assert masses[0] - masses[1] == pytest.approx(HEAVY, abs=1e-5)
 
 
-def test_the_torque_limit_that_is_reported_is_the_overlays(tmp_path):
+def test_torque_limit_metric_includes_the_overlay(tmp_path):
     RobotOverlay({"saturation": 4 * (0.5, 0.9, 0.9)}).save(tmp_path / "weak.json")
     args = EvaluationArgs(robot=tmp_path / "weak.json", device="cpu")
     policy = open_policy("vertical_jump")
@@ -70,7 +70,7 @@ def test_the_torque_limit_that_is_reported_is_the_overlays(tmp_path):
 
 @pytest.mark.parametrize("command", [("evaluate", "vertical_jump"), ("train", "vertical-jump")])
 @pytest.mark.parametrize("change", [{"value": {"kp": 12 * [1.1]}}, {"randomization": {"gain": [0.9, 1.1]}}])
-def test_a_misspelt_overlay_is_refused_in_one_line_that_names_the_file(command, change, tmp_path, capsys):
+def test_refuses_misspelt_overlay_and_names_the_file(command, change, tmp_path, capsys):
     file = tmp_path / "robot.json"
     file.write_text(json.dumps(RobotOverlay({}).to_json() | change))
     with pytest.raises(SystemExit) as end:
@@ -79,7 +79,7 @@ def test_a_misspelt_overlay_is_refused_in_one_line_that_names_the_file(command, 
     assert end.value.code == 2 and str(file) in error and ("'value'" in error or "'gain'" in error)
 
 
-def test_a_training_is_of_the_robot_and_says_so_in_its_configuration(overlay):
+def test_training_uses_and_saves_the_overlay(overlay):
     flags = ["--robot", str(overlay)]
     task = for_robot(make_task("vertical-jump"), overlay_in(flags))
     args = tyro.cli(TrainArgs, args=[*flags, "--no-randomize"])

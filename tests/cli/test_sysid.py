@@ -21,8 +21,8 @@ from synthetic_bench import synthetic_bench
 PARAMS = ["--params", "latency,offsets"]
 
 
-def write_table(path, motion, sign=1.0):
-    """Write targets and angles, times a sign, as a table without settings."""
+def write_csv_table(path, motion, sign=1.0):
+    """Write targets and angles as a CSV table without settings; sign: factor on the angles."""
     names = [f"{channel}/{joint}" for channel in ("target", "angle") for joint in MOTOR_JOINTS]
     with path.open("w", newline="") as file:
         csv.writer(file).writerows(
@@ -32,33 +32,33 @@ def write_table(path, motion, sign=1.0):
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """Return the folder of short motions of a robot whose sensors are off and whose targets come late."""
+    """Folder of short recorded motions of a robot with sensor offsets and latency."""
     folder = tmp_path_factory.mktemp("sysid")
     truth = RobotOverlay({"offset": tuple(np.radians(np.linspace(-1.0, 1.0, 12))), "latency": (0.003,)})
     truth.save(folder / "truth.json")
-    flags = ["--candidates", "1", "--seconds", "0.5", "--robot", str(folder / "truth.json")]
+    flags = ["--num-candidates", "1", "--seconds", "0.5", "--robot", str(folder / "truth.json")]
     main(["sysid", "excite", *PARAMS, *flags, "--out", str(folder / "motions")])
     return folder
 
 
-def test_excite_records_motions_and_tells_what_to_expect(recorded):
+def test_excite_writes_motions_and_expected_accuracy(recorded):
     files = sorted((recorded / "motions").glob("*.npz"))
     assert [file.stem for file in files] == ["0_hung_chirp", "1_hung_chirp", "2_standing_chirp", "3_small_jump"]
     assert [load_motion(file).base for file in files] == ["fixed", "fixed", "free", "free"]
-    told = json.loads((recorded / "motions" / "excite.json").read_text())
-    assert np.all(np.diff(told["gain_nat"]) > 0.0)
-    assert told["mass_kg"] == pytest.approx(14.5)
-    assert told["parameters"]["latency"]["expected_deviation"] < 2.0e-4
-    assert told["parameters"]["offset/FL_outer"]["of_prior"] < 0.2
+    plan = json.loads((recorded / "motions" / "excite.json").read_text())
+    assert np.all(np.diff(plan["gain_nat"]) > 0.0)
+    assert plan["mass_kg"] == pytest.approx(14.5)
+    assert plan["parameters"]["latency"]["expected_deviation"] < 2.0e-4
+    assert plan["parameters"]["offset/FL_outer"]["of_prior"] < 0.2
 
 
-def test_sysid_writes_an_overlay_and_a_report_that_needs_nothing_else(recorded, capsys):
-    out = recorded / "found"
+def test_sysid_writes_overlay_and_self_contained_report(recorded, capsys):
+    out = recorded / "identified"
     main(["sysid", str(recorded / "motions"), *PARAMS, "--out", str(out)])
-    found, truth = load_overlay(out / "identified.json"), load_overlay(recorded / "truth.json")
-    assert found.values["latency"][0] == pytest.approx(0.003, abs=1.0e-4)
-    np.testing.assert_allclose(found.values["offset"], truth.values["offset"], atol=np.radians(0.25))
-    low, high = found.randomization["latency"]
+    overlay, truth = load_overlay(out / "identified.json"), load_overlay(recorded / "truth.json")
+    assert overlay.values["latency"][0] == pytest.approx(0.003, abs=1.0e-4)
+    np.testing.assert_allclose(overlay.values["offset"], truth.values["offset"], atol=np.radians(0.25))
+    low, high = overlay.randomization["latency"]
     assert 2.8 < low < 3.0 < high < 3.2
     report = json.loads((out / "report.json").read_text())
     assert 0.9 < report["chi2"] < 1.1 and report["nominal_chi2"] > 10.0
@@ -66,33 +66,33 @@ def test_sysid_writes_an_overlay_and_a_report_that_needs_nothing_else(recorded, 
     assert page.count("data:image/png;base64,") == 6 and "offset/BR_inner" in page
     links = re.findall(r"(?:src|href)\s*=\s*[\"']?([^\"'\s>]*)", page)
     assert links and all(link.startswith("data:") for link in links) and "<script" not in page
-    told = capsys.readouterr().out
-    assert "χ²" in told and "misfit" not in told and report["doubts"] == []
+    printed = capsys.readouterr().out
+    assert "χ²" in printed and "misfit" not in printed and report["doubts"] == []
 
 
-def test_the_walk_through_weighs_the_robot_that_it_records():
+def test_documentation_gives_the_mass_of_the_described_robot():
     page = (Path(__file__).parents[2] / "docs" / "identification.md").read_text()
     described = float(total_mass(RobotValues.nominal(1))[0])
-    given = [float(mass) for mass in re.findall(r"--mass ([0-9.]+)", page)]
-    assert given and all(mass == pytest.approx(described, abs=0.002) for mass in given)
+    masses = [float(mass) for mass in re.findall(r"--mass ([0-9.]+)", page)]
+    assert masses and all(mass == pytest.approx(described, abs=0.002) for mass in masses)
 
 
-def test_a_mass_that_the_motions_contradict_is_told(recorded, capsys):
-    args = ["--params", "masses", "--mass", "20", "--mass-deviation", "0.5", "--out", str(recorded / "heavy")]
+def test_prints_misfit_of_a_wrong_mass(recorded, capsys):
+    args = ["--params", "masses", "--mass", "20", "--mass-std", "0.5", "--out", str(recorded / "heavy")]
     main(["sysid", str(recorded / "motions" / "2_standing_chirp.npz"), *args])
     assert "misfit: total mass is given as 20 ± 0.5 but found as" in capsys.readouterr().out
 
 
-def test_a_hung_robot_that_is_taken_as_free_is_told_of_its_base(recorded, capsys):
-    write_table(recorded / "hung.csv", load_motion(recorded / "motions" / "0_hung_chirp.npz"))
+def test_prints_misfit_of_a_hung_robot_taken_as_free(recorded, capsys):
+    write_csv_table(recorded / "hung.csv", load_motion(recorded / "motions" / "0_hung_chirp.npz"))
     main(["sysid", str(recorded / "hung.csv"), *PARAMS, "--out", str(recorded / "as_free")])
-    told = [line for line in capsys.readouterr().out.splitlines() if line.startswith("misfit")]
-    assert len(told) == 1 and "hung fits worst" in told[0] and "--base fixed" in told[0]
+    misfits = [line for line in capsys.readouterr().out.splitlines() if line.startswith("misfit")]
+    assert len(misfits) == 1 and "hung fits worst" in misfits[0] and "--base fixed" in misfits[0]
     assert "--base fixed" in (recorded / "as_free" / "report.html").read_text()
 
 
-def test_angles_of_the_other_sign_are_refused_without_warnings(recorded, capsys):
-    write_table(recorded / "flipped.csv", load_motion(recorded / "motions" / "2_standing_chirp.npz"), -1.0)
+def test_refuses_negated_angles_without_warnings(recorded, capsys):
+    write_csv_table(recorded / "flipped.csv", load_motion(recorded / "motions" / "2_standing_chirp.npz"), -1.0)
     with warnings.catch_warnings(), pytest.raises(SystemExit) as end:
         warnings.simplefilter("error")
         main(["sysid", str(recorded / "flipped.csv"), *PARAMS])
@@ -101,21 +101,21 @@ def test_angles_of_the_other_sign_are_refused_without_warnings(recorded, capsys)
     assert "flipped: angles of FL_outer, FL_inner, FR_outer" in error and "negate angle" in error
 
 
-def test_evolution_is_the_other_method(recorded):
+def test_cma_method_identifies_latency(recorded):
     pytest.importorskip("cma")
     out = recorded / "evolved"
-    more = ["--method", "cma", "--max-seconds", "3", "--without", "offsets"]
+    more = ["--method", "cma", "--max-seconds", "3", "--exclude", "offsets"]
     main(["sysid", str(recorded / "motions" / "0_hung_chirp.npz"), *PARAMS, *more, "--out", str(out)])
     assert load_overlay(out / "identified.json").values["latency"][0] == pytest.approx(0.003, abs=1.0e-3)
 
 
-def test_a_motor_is_characterised_from_a_bench(tmp_path):
+def test_actuator_fits_friction_from_bench_data(tmp_path):
     bench = synthetic_bench(described_constants("transversal") | {"friction": 0.3}, np.random.default_rng(0))
     rows = zip(*(getattr(bench, name) for name in COLUMNS), strict=True)
     (tmp_path / "bench.csv").write_text("\n".join([",".join(COLUMNS), *(",".join(map(str, row)) for row in rows)]))
     main(["sysid", "actuator", str(tmp_path / "bench.csv"), "--out", str(tmp_path)])
-    found = json.loads((tmp_path / "actuator.json").read_text())["constants"]["friction"]
-    assert found["value"] == pytest.approx(0.3, abs=0.02) and found["identified"]
+    friction = json.loads((tmp_path / "actuator.json").read_text())["constants"]["friction"]
+    assert friction["value"] == pytest.approx(0.3, abs=0.02) and friction["identified"]
 
 
 @pytest.mark.parametrize(
@@ -125,12 +125,12 @@ def test_a_motor_is_characterised_from_a_bench(tmp_path):
         (["nowhere.npz"], "nowhere.npz"),
         (["."], "no npz, csv or parquet file"),
         (["x.npz", "--params", "gears"], "unknown group of parameters 'gears'"),
-        (["x.npz", "--without", "kd,kq"], "no parameter 'kq' to leave out"),
+        (["x.npz", "--exclude", "kd,kq"], "no parameter 'kq' to leave out"),
         (["x.npz", "--mass", "14500"], "must be in 7.25 to 29 kg (the robot is described with 14.5 kg), got 14500 kg"),
         (["x.npz", "--noise.angle", "0"], "noise angle must be positive"),
     ],
 )
-def test_mistakes_are_told_in_one_line(args, words, tmp_path, monkeypatch, capsys):
+def test_invalid_input_prints_one_line(args, words, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SystemExit) as end:
         main(["sysid", *args])

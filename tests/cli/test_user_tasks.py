@@ -1,4 +1,4 @@
-"""A task of one's own, in a file that nothing of the package knows, from training to a recording."""
+"""A user's task in a separate file, from training to a recording."""
 
 import hashlib
 import json
@@ -85,26 +85,26 @@ def low_jump():
 register_task("tame-jump", tame_jump, ppo=PpoCfg(gamma=0.9), aliases=("Tame",))
 register_task("low-jump", low_jump, ppo=PpoCfg(gamma=0.9))
 '''
-TRAIN = ["--num-envs", "4", "--iterations", "1", "--no-tensorboard", "--device", "cpu", "--ppo.num-steps", "2"]
-TRAIN += ["--ppo.minibatches", "2", "--ppo.hidden", "8", "--env.rewards.base-at-rest.height", "0.4"]
+TRAIN = ["--num-envs", "4", "--max-iterations", "1", "--no-tensorboard", "--device", "cpu", "--ppo.num-steps", "2"]
+TRAIN += ["--ppo.minibatches", "2", "--ppo.hidden", "8", "--env.rewards.rest.height", "0.4"]
 
 
-def forget():
-    """Let the file never have been loaded."""
+def unload_tasks():
+    """Unregister the user's tasks and remove their module."""
     sys.modules.pop("my_jumps", None)
     for name in ("tame-jump", "low-jump"):
         TASKS.pop(name, None)
 
 
 @pytest.fixture(autouse=True)
-def forgotten():
+def unloaded_after_test():
     yield
-    forget()
+    unload_tasks()
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
-    """The file of the tasks."""
+    """File that defines the user's tasks."""
     path = tmp_path_factory.mktemp("user") / "my_jumps.py"
     path.write_text(TASK)
     return str(path)
@@ -117,7 +117,7 @@ def runs(path, tmp_path_factory):
     for name in ("tame-jump", "low-jump"):
         cli.main(["train", "--task-module", path, name, *TRAIN, "--log-root", str(root)])
         (folders[name],) = (root / name).iterdir()
-    forget()
+    unload_tasks()
     return folders
 
 
@@ -125,7 +125,7 @@ def play(source, *args):
     return ["play", str(source), "--height", "0.6", "--seconds", "0.1", "--device", "cpu", *args]
 
 
-def test_modules_are_told_from_the_other_arguments():
+def test_task_modules_are_split_from_other_arguments():
     args = ["a", "--task-module", "x.py", "--b", "--task-module=pack.age", "--task_module", "y.py", "c"]
     assert split_task_modules(args) == (["a", "--b", "c"], ["x.py", "pack.age", "y.py"])
 
@@ -138,7 +138,7 @@ def test_list_shows_tasks_aliases_origins_and_policies(capsys, path):
     assert "policy vertical_jump" in lines
 
 
-def test_list_shows_installed_tasks_and_what_is_wrong_with_others(capsys, tmp_path, monkeypatch):
+def test_list_shows_installed_tasks_and_errors_of_others(capsys, tmp_path, monkeypatch):
     info = tmp_path / "their_tasks-1.0.dist-info"
     info.mkdir()
     (info / "METADATA").write_text("Metadata-Version: 2.1\nName: their-tasks\nVersion: 1.0\n")
@@ -151,7 +151,7 @@ def test_list_shows_installed_tasks_and_what_is_wrong_with_others(capsys, tmp_pa
     assert "bad-jump  of package their-tasks is left out: ZeroDivisionError" in out and "policy  vertical_jump" in out
 
 
-def test_help_of_a_task_has_its_own_flags(capsys, path):
+def test_help_lists_flags_of_the_users_task(capsys, path):
     code, out, _ = run(capsys, "train", "Tame", "--task-module", path, "--help")
     assert code == 0 and "--env.rewards.base-at-rest.height FLOAT" in out and "--env.events.slow.lower FLOAT" in out
     assert "--ppo.gamma FLOAT" in out and "(default: 0.9)" in out
@@ -164,7 +164,7 @@ def test_training_saves_functions_by_module_and_name(runs):
     assert config["train"]["ppo"]["gamma"] == 0.9 and config["train"]["task"] == "tame-jump"
 
 
-def test_run_is_exported_without_the_module(capsys, runs, tmp_path):
+def test_export_does_not_need_the_module(capsys, runs, tmp_path):
     code, _, err = run(capsys, "export", str(runs["low-jump"]), "--out", str(tmp_path / "policy"))
     assert (code, err) == (0, []) and "my_jumps" not in sys.modules
     policy = load_policy(tmp_path / "policy")
@@ -172,25 +172,25 @@ def test_run_is_exported_without_the_module(capsys, runs, tmp_path):
     assert run(capsys, "export", str(tmp_path / "policy"), "--out", str(tmp_path / "low.onnx"))[0] == 0
 
 
-def test_functions_of_a_training_are_not_asked_for_in_play(capsys, runs, tmp_path):
+def test_play_does_not_need_training_functions(capsys, runs, tmp_path):
     code, _, err = run(capsys, *play(runs["tame-jump"], "--out", str(tmp_path)))
     assert code == 0, err
     assert (tmp_path / "jump.rrd").is_file() and "my_jumps" not in sys.modules
 
 
-def test_function_that_runs_in_play_asks_for_its_module(capsys, runs, path, tmp_path):
+def test_play_refuses_missing_termination_function(capsys, runs, path, tmp_path):
     code, _, err = run(capsys, *play(runs["low-jump"]))
     assert code == 2 and len(err) == 1 and "needs 'my_jumps:too_high': name the file" in err[0]
     assert "--task-module" in err[0] and "my_jumps" not in sys.modules
     assert run(capsys, *play(runs["low-jump"], "--task-module", path, "--out", str(tmp_path)))[0] == 0
 
 
-def test_events_are_asked_for_where_they_run(capsys, runs):
+def test_play_with_randomization_refuses_missing_event_function(capsys, runs):
     code, _, err = run(capsys, *play(runs["tame-jump"], "--randomize"))
     assert code == 2 and "task.events[0] needs 'my_jumps:slow'" in err[-1]
 
 
-def test_reward_of_a_user_does_not_become_the_projects(runs, path):
+def test_restored_task_uses_the_users_reward_function(runs, path):
     config = open_policy(runs["tame-jump"]).config
     with pytest.raises(PolicyError, match=r"task.rewards\[0\] needs 'my_jumps:base_at_rest'"):
         restored_task(config, leave_out=())
@@ -200,7 +200,7 @@ def test_reward_of_a_user_does_not_become_the_projects(runs, path):
     assert task == make_task("tame-jump").with_terms("rewards", base_at_rest={"height": 0.4})
 
 
-def test_command_that_goes_on_names_the_module(path):
+def test_saved_command_line_includes_task_modules(path):
     import json.decoder as module
 
     args = ["tame-jump", "--seed", "3", "--resume", "latest", "--resume=x"]
@@ -208,37 +208,37 @@ def test_command_that_goes_on_names_the_module(path):
     assert command_line(args, [load_task_module(path), module]) == expected
 
 
-def test_training_is_resumed(capsys, runs, path, tmp_path):
+def test_resume_restores_the_users_task(capsys, runs, path, tmp_path):
     folder = tmp_path / "tame-jump" / "run"
     shutil.copytree(runs["tame-jump"], folder)
-    args = ["--device", "cpu", "--iterations", "2", "--resume", str(folder)]
+    args = ["--device", "cpu", "--max-iterations", "2", "--resume", str(folder)]
     code, _, err = run(capsys, "train", "tame-jump", "--task-module", path, *args)
     assert code == 0, err
-    assert "iterations 1 -> 2" in err and sum(" -> " in line for line in err) == 1
+    assert "max-iterations 1 -> 2" in err and sum(" -> " in line for line in err) == 1
     assert not any("has changed since" in line for line in err)
     config = json.loads((folder / "config.json").read_text())
     assert config["env"]["task"]["rewards"][0]["height"] == 0.4 and config["train"]["num_envs"] == 4
     assert (folder / "checkpoints" / "iteration_000002.pt").is_file()
 
 
-def test_a_changed_file_is_told_and_settings_stay_those_of_the_run(capsys, runs, path, tmp_path):
+def test_resume_warns_about_a_changed_file_and_keeps_settings(capsys, runs, path, tmp_path):
     folder, edited = tmp_path / "tame-jump" / "run", tmp_path / "edited" / "my_jumps.py"
     shutil.copytree(runs["tame-jump"], folder)
     edited.parent.mkdir()
-    edited.write_text(TASK.replace("robot.height / height", "robot.height / (2.0 * height)"))
-    args = ["--device", "cpu", "--iterations", "2", "--resume", str(folder)]
+    edited.write_text(TASK.replace("view.height / height", "view.height / (2.0 * height)"))
+    args = ["--device", "cpu", "--max-iterations", "2", "--resume", str(folder)]
     code, _, err = run(capsys, "train", "tame-jump", "--task-module", str(edited), *args)
     assert code == 0, err
-    told = "my_jumps has changed since: its present functions are used, with the run's settings"
-    assert err.count(told) == 1 and "iterations 1 -> 2" in err
+    warning = "my_jumps has changed since: its functions are those of now, settings those of the run"
+    assert err.count(warning) == 1 and "max-iterations 1 -> 2" in err
     config = json.loads((folder / "config.json").read_text())
     assert config["sources"] == {"my_jumps": hashlib.sha256(edited.read_bytes()).hexdigest()}
     assert config["env"]["task"]["rewards"][0]["height"] == 0.4
 
 
-def test_task_whose_functions_could_not_be_found_again_is_not_trained(capsys, tmp_path):
-    lost = TASK.replace("RewardTerm(base_at_rest", "RewardTerm(kept")
-    lost = lost.replace("def tame_jump", "kept, base_at_rest = base_at_rest, None\n\n\ndef tame_jump")
+def test_train_refuses_functions_that_cannot_be_saved(capsys, tmp_path):
+    lost = TASK.replace("RewardTerm(rest", "RewardTerm(kept")
+    lost = lost.replace("def tame_jump", "kept, rest = rest, None\n\n\ndef tame_jump")
     (tmp_path / "my_jumps.py").write_text(lost)
     args = ["train", "tame-jump", "--task-module", str(tmp_path / "my_jumps.py"), *TRAIN, "--log-root", str(tmp_path)]
     code, out, err = run(capsys, *args)
@@ -246,7 +246,7 @@ def test_task_whose_functions_could_not_be_found_again_is_not_trained(capsys, tm
     assert not (tmp_path / "tame-jump").exists()
 
 
-def test_all_of_the_projects_tasks_can_be_trained():
+def test_registered_tasks_can_be_saved():
     for name in TASKS:
         check_saving(make_task(name))
     with pytest.raises(TaskError):
@@ -255,7 +255,7 @@ def test_all_of_the_projects_tasks_can_be_trained():
 
 @pytest.mark.parametrize("task", [{"version": 2, "name": "vertical-jump"}, {"name": "vertical-jump", "terms": []}])
 @pytest.mark.parametrize("command", ["train", "export", "play"])
-def test_run_of_an_older_version_is_refused_with_the_commit_that_reads_it(capsys, tmp_path, task, command):
+def test_refuses_run_of_an_older_version(capsys, tmp_path, task, command):
     config = {"train": {"task": "vertical-jump", "ppo": {}}, "env": {"task": task}}
     state = {"iteration": 7, "ppo": {}, "env": {}, "rng": {}, "others": [], "config": json.dumps(config)}
     save_checkpoint(tmp_path / "run" / "checkpoints", state)
@@ -266,14 +266,14 @@ def test_run_of_an_older_version_is_refused_with_the_commit_that_reads_it(capsys
 
 
 @pytest.mark.parametrize(
-    ("right", "wrong", "told"),
+    ("right", "wrong", "message"),
     [
         ("import warp as wp\n", "import warp as wp\nimport not_there\n", "own_faults.py:6: ModuleNotFoundError"),
         ("weight=2.0, ", "", "own_faults.py:{line}: TypeError: RewardTerm.__init__() missing"),
         ("tilt(robot)", "tilt(robot.quad)", "own_faults.py, function level: `quad` is not an attribute of 'robot'"),
     ],
 )
-def test_a_mistake_in_a_users_file_is_told_in_one_line(right, wrong, told, tmp_path, monkeypatch, capsys):
+def test_error_in_a_users_file_prints_one_line(right, wrong, message, tmp_path, monkeypatch, capsys):
     text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
     text = re.search(r"```python\n(# my_task\.py.*?)```", text, re.DOTALL)[1].replace("level-jump", "own-faults")
     assert right in text
@@ -282,7 +282,7 @@ def test_a_mistake_in_a_users_file_is_told_in_one_line(right, wrong, told, tmp_p
     line = next(i for i, row in enumerate(text.splitlines(), 1) if "RewardTerm(level" in row)
     monkeypatch.delitem(sys.modules, "own_faults", raising=False)
     before = dict(TASKS)
-    args = [*"--device cpu --num-envs 4 --iterations 1".split(), "--log-root", str(tmp_path)]
+    args = [*"--device cpu --num-envs 4 --max-iterations 1".split(), "--log-root", str(tmp_path)]
     try:
         code, _, err = run(capsys, "train", "own-faults", "--task-module", str(path), *args)
     finally:
@@ -290,4 +290,4 @@ def test_a_mistake_in_a_users_file_is_told_in_one_line(right, wrong, told, tmp_p
         TASKS.update(before)
         sys.modules.pop("own_faults", None)
     lines = [row for row in err if row.startswith("jumper:")]
-    assert code == 2 and len(lines) == 1 and told.format(line=line) in lines[0]
+    assert code == 2 and len(lines) == 1 and message.format(line=line) in lines[0]

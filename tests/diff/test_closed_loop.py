@@ -26,7 +26,9 @@ def policy(name="vertical_jump"):
 @cache
 def jumps():
     """Return two nominal robots that are commanded to jump at once."""
-    group = make_groups(policy(), FinetuneCfg(goals=2, late=0, randomized=0, heights=(0.85, 0.95), device="cpu"))[0]
+    group = make_groups(
+        policy(), FinetuneCfg(num_goals=2, num_delayed=0, num_randomized=0, height_range=(0.85, 0.95), device="cpu")
+    )[0]
     group.commands[:, 3] = 0.0
     return group
 

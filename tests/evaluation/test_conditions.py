@@ -108,7 +108,7 @@ def test_nominal_conditions_change_only_margins():
 
 
 def test_conditions_change_only_the_fixed_parameters():
-    conditions = Conditions(latency=8.0, gains=(0.6, 1.0), friction=0.4)
+    conditions = Conditions(latency=8.0, gain_scale=(0.6, 1.0), friction=0.4)
     task = landings.with_landing_terminations(JUMP)
     nominal = make_env(2, task=task, auto_reset=False)
     env = make_env(2, task=conditions.applied(task), randomize=conditions.draws, auto_reset=False)
@@ -137,7 +137,7 @@ def test_fixing_a_parameter_at_its_nominal_value_is_bitwise_neutral():
 
 
 def test_randomised_conditions_keep_fixed_parameters():
-    drawn = Conditions(randomize=True, gains=(0.6, 1.0), latency=50.0).applied(JUMP).randomization
+    drawn = Conditions(randomize=True, gain_scale=(0.6, 1.0), latency=50.0).applied(JUMP).randomization
     assert (drawn.gains, drawn.damping_gains, drawn.latency) == ((0.6, 0.6), (1.0, 1.0), (50.0, 50.0))
     assert drawn.base_mass == RandomizationCfg().base_mass
 
@@ -152,8 +152,8 @@ def test_randomised_conditions_keep_fixed_parameters():
         ),
         (lambda: Conditions(seed=-1), r"seed must be in 0 \.\. 2147483647, got -1"),
         (lambda: EvaluationArgs(latency=-1.0), "latency must not be negative"),
-        (lambda: Conditions(gains=(0.0, 1.0)), "gains must be above 0"),
-        (lambda: EvaluationArgs(gains=(1.0, -1.0)), "damping_gains must be above 0"),
+        (lambda: Conditions(gain_scale=(0.0, 1.0)), "gains must be above 0"),
+        (lambda: EvaluationArgs(gain_scale=(1.0, -1.0)), "damping_gains must be above 0"),
         (lambda: Conditions(friction=-0.1), "friction must not be negative"),
         (lambda: EvaluationArgs(push_in_flight=True), "push_in_flight needs randomize"),
     ],
@@ -173,7 +173,7 @@ def test_latency_text_rounds_to_physics_steps():
 
 def test_run_reports_simulated_latency(tmp_path):
     save_policy(tmp_path / "still", still_policy("horizontal-jump"))
-    args = EvaluationArgs(policy=str(tmp_path / "still"), latency=40.0, record=0, out=tmp_path, device="cpu")
+    args = EvaluationArgs(policy=str(tmp_path / "still"), latency=40.0, num_recorded=0, out=tmp_path, device="cpu")
     run = EvaluationRun.from_args("test", args)
     env = run.env(2)
     log = landings.LandingLog(np.array([[[0.5, 0.0]]] * 2), tuple(term.name for term in env.task.terminations))

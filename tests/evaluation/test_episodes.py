@@ -88,7 +88,7 @@ def test_update_returns_true_when_all_episodes_ended():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: EpisodeFlags(episodes=0), "episodes must be at least 1"),
+        (lambda: EpisodeFlags(num_episodes=0), "num_episodes must be at least 1"),
         (lambda: EpisodeFlags(command=(0.0,) * 5), "command takes up to 4 finite numbers"),
         (lambda: EpisodePlayFlags(command=(float("nan"),)), "command takes up to 4 finite numbers"),
         (lambda: EpisodeFlags(seconds=0.0), r"seconds must be in \(0, 600\]"),
@@ -112,7 +112,7 @@ def policy(tmp_path_factory):
 
 def test_policy_of_any_task_is_evaluated(policy, tmp_path):
     evaluate.run(
-        [policy, *"--episodes 3 --command 0.5 0 0 30 --seconds 4 --device cpu --out".split(), str(tmp_path)], []
+        [policy, *"--num-episodes 3 --command 0.5 0 0 30 --seconds 4 --device cpu --out".split(), str(tmp_path)], []
     )
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert (metrics["task"], metrics["episodes"], metrics["ended_by_no_jump"]) == ("any-task", 3, 3)

@@ -14,7 +14,8 @@ from jumper_warp.policies.runs import open_policy
 from jumper_warp.trajectory.gauss_newton import Network
 from jumper_warp.utils.errors import InputError
 
-FEW = {"goals": 4, "late": 0, "randomized": 0, "heights": (0.8, 1.05), "iterations": 1, "device": "cpu"}
+FEW = {"num_goals": 4, "num_delayed": 0, "num_randomized": 0, "height_range": (0.8, 1.05)}
+FEW |= {"iterations": 1, "device": "cpu"}
 
 
 @pytest.fixture(scope="module")
@@ -62,12 +63,12 @@ def test_finetuning_is_bitwise_reproducible(tuned):
 
 def test_finetune_command_writes_a_loadable_policy(tmp_path, capsys):
     out = tmp_path / "tuned"
-    flags = "--goals 2 --late 0 --randomized 0 --iterations 1 --device cpu".split()
+    flags = "--num-goals 2 --num-delayed 0 --num-randomized 0 --iterations 1 --device cpu".split()
     main(["finetune", "vertical_jump", *flags, "--out", str(out)])
     assert capsys.readouterr().out.splitlines()[-1] == str(out)
     policy = open_policy(out)
     assert not torch.equal(policy.layers[0][0], open_policy("vertical_jump").layers[0][0])
-    assert policy.config["finetuned"]["settings"]["goals"] == 2
+    assert policy.config["finetuned"]["settings"]["num_goals"] == 2
     assert len(json.loads((out / "finetuning.json").read_text())["steps"]) == 2
     with pytest.raises(SystemExit) as end:
         main(["finetune", "vertical_jump", "--out", str(out)])
@@ -77,7 +78,7 @@ def test_finetune_command_writes_a_loadable_policy(tmp_path, capsys):
 
 def test_landing_errors_on_mars_are_measured_at_rest():
     policy = open_policy("mars_horizontal_jump")
-    (group,) = make_groups(policy, FinetuneCfg(**FEW | {"distances": (1.0, 4.0)}))
+    (group,) = make_groups(policy, FinetuneCfg(**FEW | {"distance_range": (1.0, 4.0)}))
     assert not group.to_height
     errors = jump_errors(group, Network(policy), derivatives=False)
     arrays = group.env.task_arrays()
@@ -95,7 +96,10 @@ def test_shift_goal_observation_equals_shifted_goal():
 
 def test_correct_aim_removes_constant_overshoot():
     """A policy whose observed goals are 40 mm too far ends nearer to its goals than the original one."""
-    policy, cfg = open_policy("slippery_jump"), FinetuneCfg(**FEW | {"goals": 8, "iterations": 0})  # no aim was taken
+    policy, cfg = (
+        open_policy("slippery_jump"),
+        FinetuneCfg(**FEW | {"num_goals": 8, "iterations": 0}),
+    )  # no aim was taken
     untouched = jump_errors(make_groups(policy, cfg)[0], Network(policy), derivatives=False).value
     aimed, record = finetune(shift_goal_observation(policy, 0.04), cfg, log=lambda line: None)
     first, *_, last = record["aims"]
@@ -107,7 +111,8 @@ def test_correct_aim_removes_constant_overshoot():
 
 
 @pytest.mark.parametrize(
-    "change", [{"goals": 1}, {"late": -1}, {"iterations": -1}, {"heights": (0.9, 0.5)}, {"action_std": 0.0}]
+    "change",
+    [{"num_goals": 1}, {"num_delayed": -1}, {"iterations": -1}, {"height_range": (0.9, 0.5)}, {"action_std": 0.0}],
 )
 def test_refuses_invalid_settings(change):
     with pytest.raises(InputError):

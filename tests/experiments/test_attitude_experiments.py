@@ -16,13 +16,15 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def run(tmp_path_factory):
     """A run of one iteration."""
     root = tmp_path_factory.mktemp("logs")
-    args = "--num-envs 8 --iterations 1 --ppo.num-steps 4 --ppo.minibatches 1 --ppo.hidden 8 --device cpu --log-root"
-    cli(["train", "attitude", *args.split(), str(root)])
+    args = "--num-envs 8 --max-iterations 1 --ppo.num-steps 4 --ppo.minibatches 1 --ppo.hidden 8 --device cpu"
+    cli(["train", "attitude", *args.split(), "--log-root", str(root)])
     return next((root / "attitude").iterdir())
 
 
 def test_turns_about_all_axes_are_measured(run, tmp_path):
-    args = attitude.Args(policy=str(run), turns=6, seconds=0.2, record=1, refine=2, out=tmp_path, device="cpu")
+    args = attitude.Args(
+        policy=str(run), num_turns=6, seconds=0.2, num_recorded=1, refine=2, out=tmp_path, device="cpu"
+    )
     values = attitude.main(args)
     assert json.loads((tmp_path / "metrics.json").read_text()) == values
     assert values["physics_step_s"] == pytest.approx(1.0 / 960.0)
@@ -32,7 +34,9 @@ def test_turns_about_all_axes_are_measured(run, tmp_path):
 
 
 def test_flights_run_with_and_without_turning(run, tmp_path):
-    args = flight_attitude.Args(policy=str(run), flights=2, late=10.0, record=1, out=tmp_path, device="cpu")
+    args = flight_attitude.Args(
+        policy=str(run), num_flights=2, max_leg_delay=10.0, num_recorded=1, out=tmp_path, device="cpu"
+    )
     values = flight_attitude.main(args)
     assert json.loads((tmp_path / "metrics.json").read_text()) == values
     assert values["mean_apex_m"] > 2.5 and values["mean_takeoff_spin_rad_s"] > 0.1
@@ -43,8 +47,8 @@ def test_flights_run_with_and_without_turning(run, tmp_path):
 
 def test_policy_takes_off_to_commanded_heights_and_lands(run, tmp_path):
     args = flight_attitude.Args(
-        policy=str(run), takeoff="policy", landing="mars_vertical_jump", heights=(1.5, 2.0), flights=2, record=0,
-        out=tmp_path, device="cpu",
+        policy=str(run), takeoff="policy", landing_policy="mars_vertical_jump", height_range=(1.5, 2.0), num_flights=2,
+        num_recorded=0, out=tmp_path, device="cpu",
     )  # fmt: skip
     values = flight_attitude.main(args)
     assert (
@@ -62,13 +66,13 @@ def test_policy_takes_off_to_commanded_heights_and_lands(run, tmp_path):
 
 def test_refuses_invalid_flags(tmp_path):
     with pytest.raises(InputError, match="turns must be at least 6"):
-        attitude.Args(turns=3)
+        attitude.Args(num_turns=3)
     with pytest.raises(InputError, match="late in 0 to 100 ms"):
-        flight_attitude.Args(late=200.0)
+        flight_attitude.Args(max_leg_delay=200.0)
     with pytest.raises(InputError, match="takeoff by a policy needs one"):
         flight_attitude.Args(takeoff="policy")
-    with pytest.raises(InputError, match="heights must be in"):
-        flight_attitude.Args(heights=(2.0, 1.0))
+    with pytest.raises(InputError, match="height_range must be in"):
+        flight_attitude.Args(height_range=(2.0, 1.0))
     with pytest.raises(PolicyError, match="evaluated by attitude"):
         attitude.main(attitude.Args(policy="vertical_jump", out=tmp_path, device="cpu"))
     with pytest.raises(PolicyError, match="needs a policy that turns in flight"):

@@ -93,8 +93,8 @@ def test_documented_departures_list_their_flags():
 
 def test_trainings_are_cached_and_evaluated_with_task_terminations(tmp_path, capsys, monkeypatch):
     args = departures.Args(
-        only=("jumping_early",), iterations=1, envs=4, jumps=(2, 3), squats=2, out=tmp_path,
-        measure=False, train="--ppo.compile off --ppo.num-steps 8 --ppo.minibatches 1", device="cpu", threads=1,
+        only=("jumping_early",), iterations=1, num_envs=4, num_jumps=(2, 3), num_squats=2, out=tmp_path,
+        measure=False, train_flags="--ppo.compile off --ppo.num-steps 8 --ppo.minibatches 1", device="cpu", threads=1,
     )  # fmt: skip
     assert set(departures.main(args)) == {"task", "iterations", "envs"}
     assert not (tmp_path / "metrics.json").exists()
@@ -115,20 +115,20 @@ def test_trainings_are_cached_and_evaluated_with_task_terminations(tmp_path, cap
     assert "error [mm]" in capsys.readouterr().out
     assert {"departures.png", "departures.txt"} <= {path.name for path in tmp_path.iterdir()}
     with pytest.raises(InputError, match="other settings"):
-        departures.main(replace(args, train=args.train + " --ppo.gamma 0.9"))
+        departures.main(replace(args, train_flags=args.train_flags + " --ppo.gamma 0.9"))
     with pytest.raises(InputError, match="other settings"):
-        departures.main(replace(args, train=args.train + " --env.self-collision-margin 0.001"))
+        departures.main(replace(args, train_flags=args.train_flags + " --env.self-collision-margin 0.001"))
 
 
 def test_training_with_max_seconds_saves_checkpoint(tmp_path):
     flags = "--ppo.compile off --ppo.num-steps 8 --ppo.minibatches 1 --max-seconds 0.001"
-    args = departures.Args(only=("drift",), iterations=1000, envs=4, train=flags, device="cpu", threads=1)
+    args = departures.Args(only=("drift",), iterations=1000, num_envs=4, train_flags=flags, device="cpu", threads=1)
     checkpoint = train_or_load("", args.command("", 1, tmp_path))
     assert checkpoint.is_file() and int(checkpoint.stem.removeprefix("iteration_")) < 1000
 
 
 def test_baseline_is_trained_with_kept_seeds():
-    args = departures.Args(only=("kept", "drift"), seeds=(1,), kept_seeds=(2, 3))
+    args = departures.Args(only=("kept", "drift"), seeds=(1,), baseline_seeds=(2, 3))
     flags = [(name, seed, ablation) for name, seed, ablation in args.trainings()]
     assert flags == [("kept", 2, ""), ("kept", 3, ""), ("drift", 1, DEPARTURES["vertical-jump"]["drift"])]
     assert len(list(departures.Args().trainings())) == 3 + len(DEPARTURES["vertical-jump"])
@@ -140,5 +140,5 @@ def test_refuses_invalid_flags_before_training(tmp_path):
     with pytest.raises(InputError, match="at least 1"):
         departures.Args(iterations=0)
     with pytest.raises(SystemExit):
-        departures.main(departures.Args(train="--no-such-flag 1", out=tmp_path / "none"))
+        departures.main(departures.Args(train_flags="--no-such-flag 1", out=tmp_path / "none"))
     assert not (tmp_path / "none").exists()

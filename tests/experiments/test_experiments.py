@@ -35,7 +35,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def trained(tmp_path_factory):
     """Folder, metrics and run of a short training with the reward of `new_reward.py`."""
     folder = tmp_path_factory.mktemp("new_reward")
-    values = new_reward.main(new_reward.Args(envs=16, iterations=2, steps=48, out=folder, device="cpu"))
+    values = new_reward.main(new_reward.Args(num_envs=16, iterations=2, num_steps=48, out=folder, device="cpu"))
     (run,) = (folder / "logs" / "vertical-jump").iterdir()
     return folder, values, run
 
@@ -145,7 +145,9 @@ def test_scripted_jump_reaches_the_open_loop_height_and_lands(sweep_env, begin, 
 
 
 def test_sweep_of_a_run_writes_metrics_plot_recording_and_filmstrip(trained, tmp_path):
-    values = HeightSweep(policy=str(trained[2]), jumps=3, record=2, randomize=True, out=tmp_path, device="cpu").run()
+    values = HeightSweep(
+        policy=str(trained[2]), num_jumps=3, num_recorded=2, randomize=True, out=tmp_path, device="cpu"
+    ).run()
     saved = json.loads((tmp_path / "metrics.json").read_text())
     assert saved == values
     assert {
@@ -176,8 +178,8 @@ def test_learning_curves_report_time_to_success_rates(tmp_path, monkeypatch):
 
     monkeypatch.setattr(learning_curves, "train_in_process", train)
     args = learning_curves.Args(
-        seconds=0.3, every=0.2, seeds=(0, 1), variants=("eager_float32",), envs=8, jumps=2, history=1,
-        heights=(0.5, 0.9), out=tmp_path, device="cpu",
+        seconds=0.3, eval_interval=0.2, seeds=(0, 1), variants=("eager_float32",), num_envs=8, num_jumps=2, history=1,
+        height_range=(0.5, 0.9), out=tmp_path, device="cpu",
     )  # fmt: skip
     values = learning_curves.main(args)
     assert values == json.loads((tmp_path / "metrics.json").read_text())
@@ -214,7 +216,7 @@ def test_benchmark_reports_solver_environment_and_both_trainers(tmp_path):
 
 def test_soak_reports_no_invalid_worlds(tmp_path):
     for task in (None, "horizontal-jump"):
-        args = SoakArgs(envs=8, steps=40, episode=20, task=task, out=tmp_path, device="cpu")
+        args = SoakArgs(num_envs=8, steps=40, episode_steps=20, task=task, out=tmp_path, device="cpu")
         values = soak_test.main(args)
         saved = json.loads((tmp_path / "metrics.json").read_text())
         assert saved == values | {"envs": 8, "filter": False, "seed": 0}
@@ -225,7 +227,9 @@ def test_soak_reports_no_invalid_worlds(tmp_path):
 def test_soak_counts_diverged_worlds(tmp_path, monkeypatch):
     step = soak_test.Env.step
     monkeypatch.setattr(soak_test.Env, "step", lambda env, action: step(env, torch.full_like(action, torch.nan)))
-    args = SoakArgs(envs=4, steps=5, hold=5, episode=100, task="vertical-jump", out=tmp_path, device="cpu")
+    args = SoakArgs(
+        num_envs=4, steps=5, hold_steps=5, episode_steps=100, task="vertical-jump", out=tmp_path, device="cpu"
+    )
     assert soak_test.main(args)["non_finite_worlds"] == 20
 
 
@@ -237,7 +241,7 @@ def test_soak_raises_on_non_finite_reward(tmp_path, monkeypatch):
         env.reward[2] = torch.nan
 
     monkeypatch.setattr(soak_test.Env, "step", step_with_nan)
-    args = SoakArgs(envs=4, steps=40, episode=20, task="vertical-jump", out=tmp_path, device="cpu")
+    args = SoakArgs(num_envs=4, steps=40, episode_steps=20, task="vertical-jump", out=tmp_path, device="cpu")
     with pytest.raises(RuntimeError, match="20 rows hold values that are not finite, by step 20"):
         soak_test.main(args)
 
@@ -304,7 +308,7 @@ def test_solver_benchmark_compares_thread_counts(tmp_path):
 
 
 def test_gradient_cost_reports_gradient_error_and_saved_bytes(tmp_path):
-    values = gradient_cost.main(gradient_cost.Args(worlds=2, repeats=1, out=tmp_path, device="cpu"))
+    values = gradient_cost.main(gradient_cost.Args(num_envs=2, repeats=1, out=tmp_path, device="cpu"))
     assert values == json.loads((tmp_path / "metrics.json").read_text())
     assert values["height_difference_m"] == 0.0 and values["kept_bytes_a_policy_step"] <= 2000.0
     expected = values["gradient_us_a_step"] / values["plain_us_a_step"]
@@ -315,8 +319,8 @@ def test_gradient_cost_reports_gradient_error_and_saved_bytes(tmp_path):
 
 def test_shac_experiment_reports_curves_and_gradient_noise(tmp_path):
     args = shac.Args(
-        seconds=0.1, every=0.1, seeds=(0,), envs=8, window=2, hidden=(8,), jumps=3, horizons=(1, 2), worlds=4,
-        out=tmp_path, device="cpu",
+        seconds=0.1, eval_interval=0.1, seeds=(0,), num_envs=8, window=2, hidden=(8,), num_jumps=3, horizons=(1, 2),
+        num_gradient_envs=4, out=tmp_path, device="cpu",
     )  # fmt: skip
     values = shac.main(args)
     assert values == json.loads((tmp_path / "metrics.json").read_text())

@@ -5,7 +5,7 @@ import pytest
 
 from jumper_warp.identification.parameters import jumper_parameters
 from jumper_warp.identification.recording import replay_plan
-from jumper_warp.identification.replay import Replay
+from jumper_warp.identification.replay import MotionReplay
 from support.identification_methods import chi2_at, make_problem
 from support.known_robots import MOST, make_case, prediction_errors
 
@@ -13,8 +13,8 @@ from support.known_robots import MOST, make_case, prediction_errors
 @pytest.fixture(scope="module")
 def sampled_case():
     """Parameters, a case of one known robot, the batched replay, and the function that simulates a plan."""
-    parameters, one = jumper_parameters(), Replay(device="cpu", threads=1)
-    many = Replay(device="cpu", threads=1)
+    parameters, one = jumper_parameters(), MotionReplay(device="cpu", threads=1)
+    many = MotionReplay(device="cpu", threads=1)
 
     def simulate(plan, robots):
         return replay_plan(one, plan, robots)
@@ -40,7 +40,7 @@ def test_true_parameters_lower_chi2_of_measurements(sampled_case):
     """Initial states are at their expected values, not the true ones."""
     parameters, case, many, _ = sampled_case
     problem = make_problem(parameters, case, many)
-    point = problem.expected()
+    point = problem.nominal_point()
     described = chi2_at(problem, point)
     point.z[:] = case.truth
     assert chi2_at(problem, point) < 0.02 * described

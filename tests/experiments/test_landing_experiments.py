@@ -67,7 +67,7 @@ def test_sweep_metrics_count_ranges_by_distance():
 
 
 def test_grid_repeats_every_goal():
-    goals = Grid(columns=3, rows=2, jumps=2).goals
+    goals = Grid(columns=3, rows=2, num_jumps=2).goals
     assert goals.shape == (12, 1, 2)
     assert goals[:4, 0].tolist() == [[0.35, -0.35], [0.35, -0.35], [0.35, 0.35], [0.35, 0.35]]
     assert goals[-1, 0].tolist() == [1.4, 0.35]
@@ -142,8 +142,8 @@ def bin_log(middle, *, clean, stepped=0, hopped=0):
 @pytest.mark.parametrize(("direction", "unit"), [(0.0, (1.0, 0.0)), (90.0, (0.0, 1.0)), (180.0, (-1.0, 0.0))])
 def test_bin_goals_lie_in_commanded_direction(direction, unit):
     expected = np.array([0.75, 0.775, 0.8, 0.825, 0.85])[:, None, None] * np.array(unit)
-    np.testing.assert_allclose(Farthest(jumps=5, direction=direction).goals(0.8), expected, atol=1e-12)
-    one = Farthest(jumps=1, direction=direction).goals(0.8)
+    np.testing.assert_allclose(Farthest(num_jumps=5, direction=direction).goals(0.8), expected, atol=1e-12)
+    one = Farthest(num_jumps=1, direction=direction).goals(0.8)
     np.testing.assert_allclose(one, 0.8 * np.array(unit)[None, None], atol=1e-12)
 
 
@@ -265,15 +265,15 @@ def test_second_jump_goal_is_relative_to_end_of_first(hops):
 @pytest.mark.parametrize(
     ("suite", "settings", "files"),
     [
-        (DistanceSweep, {"jumps": 3}, ("sweep.png", "jumps.rrd", "jumps.png")),
-        (Grid, {"columns": 2, "rows": 2, "jumps": 1}, ("grid.png", "jumps.rrd")),
-        (Consecutive, {"jumps": 1, "trials": 2, "row": 3}, ("paths.png", "pairs.rrd", "row.rrd")),
-        (Platform, {"jumps": 2}, ("landings.png", "platform.rrd", "uneven.png", "block.rrd")),
-        (Farthest, {"jumps": 3}, ("max_jump.png", "jump_1.0_m.rrd")),
+        (DistanceSweep, {"num_jumps": 3}, ("sweep.png", "jumps.rrd", "jumps.png")),
+        (Grid, {"columns": 2, "rows": 2, "num_jumps": 1}, ("grid.png", "jumps.rrd")),
+        (Consecutive, {"num_jumps": 1, "num_trials": 2, "jumps_per_trial": 3}, ("paths.png", "pairs.rrd", "row.rrd")),
+        (Platform, {"num_jumps": 2}, ("landings.png", "platform.rrd", "uneven.png", "block.rrd")),
+        (Farthest, {"num_jumps": 3}, ("max_jump.png", "jump_1.0_m.rrd")),
     ],
 )
 def test_suite_writes_metrics_plot_and_recording(suite, settings, files, policy, tmp_path):
-    values = suite(policy=policy, record=1, out=tmp_path, device="cpu", **settings).run()
+    values = suite(policy=policy, num_recorded=1, out=tmp_path, device="cpu", **settings).run()
     saved = json.loads((tmp_path / "metrics.json").read_text())
     assert saved == values and saved.keys() >= SHARED
     assert (saved["success_rate"], saved["torque_limit_nm"]) == (0.0, 18.0)
@@ -284,14 +284,14 @@ def test_suite_writes_metrics_plot_and_recording(suite, settings, files, policy,
 def test_paper_tests_report_metrics_with_paper_values(policy, tmp_path, monkeypatch):
     small = dataclasses.make_dataclass("Small", [("columns", int, 1), ("rows", int, 1)], bases=(Grid,), frozen=True)
     monkeypatch.setattr(paper_tests, "suites_for", lambda evaluation: {"grid": small})
-    values = paper_tests.main(paper_tests.Args(policies=(policy,), record=0, out=tmp_path, device="cpu"))
+    values = paper_tests.main(paper_tests.Args(policies=(policy,), num_recorded=0, out=tmp_path, device="cpu"))
     assert values == json.loads((tmp_path / "metrics.json").read_text())
     assert set(values) == {f"still_grid_{name}" for name in Grid.paper} and values["still_grid_success_rate"] == 0.0
     assert (tmp_path / "still_grid" / "grid.png").is_file()
 
 
 def test_standing_policy_has_error_of_full_distance(policy, tmp_path):
-    values = DistanceSweep(policy=policy, jumps=4, record=0, randomize=True, out=tmp_path, device="cpu").run()
+    values = DistanceSweep(policy=policy, num_jumps=4, num_recorded=0, randomize=True, out=tmp_path, device="cpu").run()
     assert values["mean_error_m"] == pytest.approx(0.9, abs=0.05)
     assert values["randomize"] and values["landing_rate"] == 0.0
     assert (values["trained_lower_m"], values["trained_upper_m"]) == (0.2, 2.2)
@@ -302,7 +302,7 @@ def test_sweep_without_recording_needs_no_viewer(policy, tmp_path):
         "import sys\n"
         "for name in ('rerun', 'trimesh', 'pin', 'pinocchio'): sys.modules[name] = None\n"
         "from jumper_warp.cli.main import main\n"
-        "flags = '--suite sweep --jumps 3 --record 0 --device cpu --out'.split()\n"
+        "flags = '--suite sweep --num-jumps 3 --num-recorded 0 --device cpu --out'.split()\n"
         f"main(['evaluate', {policy!r}, *flags, {str(tmp_path)!r}])"
     )
     root = Path(__file__).parents[2]
@@ -334,13 +334,13 @@ def test_script_refuses_a_policy_of_another_task_in_one_line_with_code_2(policy)
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: EvaluationArgs(record=-1), "record must not be negative"),
-        (lambda: DistanceSweep(jumps=2), "at least 3 jumps"),
+        (lambda: EvaluationArgs(num_recorded=-1), "num_recorded must not be negative"),
+        (lambda: DistanceSweep(num_jumps=2), "at least 3 jumps"),
         (lambda: Grid(rows=0), "at least one column and row"),
-        (lambda: Consecutive(rest=0.0), "rest must be in"),
+        (lambda: Consecutive(rest_time=0.0), "rest_time must be in"),
         (lambda: Platform(edge=0.2), "edge must be from 0.3 m to below 0.8 m"),
-        (lambda: Farthest(jumps=0), "at least 1 jump, got 0"),
-        (lambda: Farthest(first=3.0), "0.1 <= first <= last <= 9 m, got 3.0 and 2.5"),
+        (lambda: Farthest(num_jumps=0), "at least 1 jump, got 0"),
+        (lambda: Farthest(min_distance=3.0), "0.1 <= min_distance <= max_distance <= 9 m, got 3.0 and 2.5"),
         (lambda: Farthest(direction=200.0), "direction must be in -180..180 deg, got 200"),
     ],
 )

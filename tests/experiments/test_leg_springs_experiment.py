@@ -11,7 +11,7 @@ from jumper_warp.utils.errors import InputError
 
 
 def test_springs_let_the_robot_jump_higher(tmp_path):
-    args = leg_springs.Args(stiffness=(0.0, 500.0), squats=(120.0,), filter="stock", out=tmp_path, device="cpu")
+    args = leg_springs.Args(stiffness=(0.0, 500.0), squat_angles=(120.0,), filter="stock", out=tmp_path, device="cpu")
     values = leg_springs.main(args)
     assert json.loads((tmp_path / "metrics.json").read_text()) == values
     without, with_springs = values["stock_apex_m"]
@@ -29,4 +29,4 @@ def test_refuses_invalid_flags():
     with pytest.raises(InputError, match="spring_stiffness must be in"):
         leg_springs.Args(stiffness=(-1.0,))
     with pytest.raises(InputError, match="at least one"):
-        leg_springs.Args(squats=())
+        leg_springs.Args(squat_angles=())

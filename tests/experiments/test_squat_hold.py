@@ -43,7 +43,7 @@ def test_squat_metrics_are_none_if_no_robot_holds():
 
 @pytest.mark.parametrize("policy", ["vertical_jump", "horizontal_jump", "slippery_waiting_jump"])
 def test_shipped_policies_hold_their_squats(policy, tmp_path):
-    args = squat_hold.Args(policy=policy, squats=2, record=0, out=tmp_path, device="cpu")
+    args = squat_hold.Args(policy=policy, num_squats=2, num_recorded=0, out=tmp_path, device="cpu")
     values = squat_hold.main(args)
     assert values == json.loads((tmp_path / "metrics.json").read_text())
     assert values["holding_rate"] == 1.0 and values["lost_paw_share"] == 0.0
@@ -53,6 +53,6 @@ def test_shipped_policies_hold_their_squats(policy, tmp_path):
 
 def test_refuses_invalid_flags():
     with pytest.raises(InputError, match="need at least one squat"):
-        squat_hold.Args(hold=0.5)
+        squat_hold.Args(hold_time=0.5)
     with pytest.raises(InputError, match="height must be in"):
-        squat_hold.Args(height=(1.0, 0.5))
+        squat_hold.Args(height_range=(1.0, 0.5))

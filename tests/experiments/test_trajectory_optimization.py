@@ -12,7 +12,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def test_reported_metrics_equal_replay_of_saved_targets(tmp_path):
     """A short search: the metrics are those of a replay of the targets that it wrote."""
-    args = experiment.Args(jumps=("highest",), samples=48, effort=0.01, polish=1, out=tmp_path, device="cpu")
+    args = experiment.Args(jumps=("highest",), samples=48, effort=0.01, final_iterations=1, out=tmp_path, device="cpu")
     values = experiment.main(args)
     saved = np.load(tmp_path / "highest.npz", allow_pickle=False)
     replay = JUMPS["highest"].replay(saved["targets"])

@@ -19,7 +19,7 @@ KEYS = (
 def test_walk_jump_walk_with_two_robots_succeeds(tmp_path, monkeypatch):
     monkeypatch.setattr(walk_jump_walk, "WALKS", (1, 1, 1))
     monkeypatch.setattr(walk_jump_walk, "EACH", 1.5)
-    values = walk_jump_walk.main(walk_jump_walk.Args(robots=2, record=1, out=tmp_path, device="cpu"))
+    values = walk_jump_walk.main(walk_jump_walk.Args(num_robots=2, num_recorded=1, out=tmp_path, device="cpu"))
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert metrics == values and set(KEYS) <= set(metrics)
     assert (metrics["success_rate"], metrics["robots"], metrics["jumps_made"]) == (1.0, 2, 4)
@@ -38,12 +38,12 @@ def test_scripts_have_specified_commands():
         kinds = [step.kind for step in script]
         assert len(script) == 10 and {"jump_up", "jump_to"} <= set(kinds)
         assert all(np.abs(step.values).max() <= 0.8 for step in script if step.kind == "walk")
-    args = walk_jump_walk.Args(robots=3, course=True, seed=5)
+    args = walk_jump_walk.Args(num_robots=3, course=True, seed=5)
     assert walk_jump_walk.scripts(args) == walk_jump_walk.scripts(args)
 
 
 def test_refuses_invalid_flags(tmp_path):
     with pytest.raises(InputError, match="robots"):
-        walk_jump_walk.Args(robots=0)
+        walk_jump_walk.Args(num_robots=0)
     with pytest.raises(PolicyError, match="evaluated by velocity"):
         walk_jump_walk.main(walk_jump_walk.Args(policy="vertical_jump", out=tmp_path, device="cpu"))

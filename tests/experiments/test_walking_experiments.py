@@ -27,7 +27,7 @@ def policies(tmp_path_factory):
 
 def test_standing_policy_has_rmse_of_command(policies, tmp_path):
     args = walking_tracking.Args(
-        policy=str(policies / "velocity-flat"), per_axis=2, record=0, out=tmp_path, device="cpu"
+        policy=str(policies / "velocity-flat"), commands_per_axis=2, num_recorded=0, out=tmp_path, device="cpu"
     )
     values = walking_tracking.main(args)
     metrics = json.loads((tmp_path / "metrics.json").read_text())
@@ -42,7 +42,7 @@ def test_standing_policy_has_rmse_of_command(policies, tmp_path):
 
 def test_standing_policy_has_zero_success_on_terrains(policies, tmp_path):
     args = walking_terrain.Args(
-        policy=str(policies / "velocity-flat"), robots=3, terrains=("flat", "stairs"), record=1, out=tmp_path,
+        policy=str(policies / "velocity-flat"), num_robots=3, terrains=("flat", "stairs"), num_recorded=1, out=tmp_path,
         device="cpu",
     )  # fmt: skip
     metrics = walking_terrain.main(args)
@@ -70,7 +70,7 @@ def test_refuses_policy_of_other_task_and_invalid_settings(policies, tmp_path):
         walking_tracking.main(
             walking_tracking.Args(policy=str(policies / "horizontal-jump"), out=tmp_path, device="cpu")
         )
-    with pytest.raises(InputError, match="per_axis"):
-        walking_tracking.Args(per_axis=1)
+    with pytest.raises(InputError, match="commands_per_axis"):
+        walking_tracking.Args(commands_per_axis=1)
     with pytest.raises(InputError, match="speed"):
         walking_terrain.Args(speed=0.9)

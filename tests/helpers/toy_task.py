@@ -19,7 +19,7 @@ SMALL = PpoCfg(num_steps=16, hidden=(32, 32), minibatches=4)
 def push_cfg(folder: Path, **changes) -> TrainCfg:
     """Return the settings of a short training on the task, which logs to a folder."""
     cfg = TrainCfg(
-        task="push", num_envs=32, iterations=4, device="cpu", log_root=folder, log_interval=2, save_interval=2,
+        task="push", num_envs=32, max_iterations=4, device="cpu", log_root=folder, log_interval=2, save_interval=2,
         tensorboard=False, ppo=SMALL,
     )  # fmt: skip
     return dataclasses.replace(cfg, **changes)

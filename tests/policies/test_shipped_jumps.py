@@ -3,15 +3,17 @@
 from jumper_warp.evaluation.suites import Platform, Ring
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep
 
+QUIET = {"num_recorded": 0, "device": "cpu"}
+
 
 def test_omnidirectional_policy_reaches_goals_in_all_directions(tmp_path):
-    values = Ring(jumps=16, radius=0.8, record=0, out=tmp_path, device="cpu").run()
+    values = Ring(num_jumps=16, radius=0.8, num_recorded=0, out=tmp_path, device="cpu").run()
     assert values["success_rate"] == 1.0 and values["still_landing_rate"] == 1.0
     assert values["mean_error_m"] < 0.006  # 0.0031 m of 200 jumps
 
 
 def test_sighted_policy_lands_on_blocks_that_a_blind_one_hits(tmp_path):
-    flags = {"jumps": 8, "edge": 0.35, "record": 0, "device": "cpu"}
+    flags = {"num_jumps": 8, "edge": 0.35, "num_recorded": 0, "device": "cpu"}
     sighted = Platform(policy="sighted_jump", out=tmp_path / "sighted", **flags).run()
     blind = Platform(policy="horizontal_jump", out=tmp_path / "blind", **flags).run()
     assert sighted["block_success_rate"] == 1.0 and sighted["platform_success_rate"] == 1.0
@@ -19,7 +21,7 @@ def test_sighted_policy_lands_on_blocks_that_a_blind_one_hits(tmp_path):
 
 
 def test_slippery_policy_lands_where_the_default_one_falls(tmp_path):
-    flags = {"jumps": 12, "friction": 0.3, "record": 0, "device": "cpu"}
+    flags = {"num_jumps": 12, "friction": 0.3, "num_recorded": 0, "device": "cpu"}
     ready, other = (
         DistanceSweep(policy=name, out=tmp_path / name, **flags).run() for name in ("slippery_jump", "horizontal_jump")
     )
@@ -28,34 +30,58 @@ def test_slippery_policy_lands_where_the_default_one_falls(tmp_path):
 
 
 def test_waiting_policy_lands_on_slippery_ground(tmp_path):
-    args = {"policy": "slippery_waiting_jump", "jumps": 12, "friction": 0.4, "record": 0, "device": "cpu"}
+    args = {"policy": "slippery_waiting_jump", "num_jumps": 12, "friction": 0.4, "num_recorded": 0, "device": "cpu"}
     values = DistanceSweep(out=tmp_path, **args).run()
     assert values["success_rate"] == 1.0 and values["mean_error_m"] < 0.015  # 0.0087 m of 1000 jumps
 
 
 def test_mars_horizontal_policy_reaches_its_distances(tmp_path):
-    args = {"policy": "mars_horizontal_jump", "jumps": 8, "distances": (0.5, 5.0), "record": 0, "device": "cpu"}
+    args = {
+        "policy": "mars_horizontal_jump",
+        "num_jumps": 8,
+        "distance_range": (0.5, 5.0),
+        "num_recorded": 0,
+        "device": "cpu",
+    }
     values = DistanceSweep(out=tmp_path, **args).run()
     assert values["success_rate"] == 1.0 and values["step_free_success_rate"] == 1.0
     assert values["mean_error_m"] < 0.02 and values["gravity_m_s2"] == 3.71
 
 
 def test_mars_policy_with_springs_reaches_its_distances(tmp_path):
-    args = {"policy": "mars_springs_jump", "jumps": 8, "distances": (0.5, 6.0), "record": 0, "device": "cpu"}
+    args = {
+        "policy": "mars_springs_jump",
+        "num_jumps": 8,
+        "distance_range": (0.5, 6.0),
+        "num_recorded": 0,
+        "device": "cpu",
+    }
     values = DistanceSweep(out=tmp_path, **args).run()
     assert values["success_rate"] == 1.0 and values["single_jump_success_rate"] == 1.0
     assert values["mean_error_m"] < 0.025  # 0.014 m of 200 jumps
 
 
 def test_mars_vertical_policy_reaches_its_heights_and_keeps_its_heading(tmp_path):
-    args = {"policy": "mars_vertical_jump", "jumps": 8, "heights": (0.9, 3.6), "record": 0, "device": "cpu"}
+    args = {
+        "policy": "mars_vertical_jump",
+        "num_jumps": 8,
+        "height_range": (0.9, 3.6),
+        "num_recorded": 0,
+        "device": "cpu",
+    }
     values = HeightSweep(out=tmp_path, **args).run()
     assert values["success_rate"] == 1.0 and values["largest_reached_m"] > 3.5
     assert values["mean_abs_error_m"] < 0.02 and values["mean_turn_deg"] < 15.0  # 0.011 m, 4.6 degrees of 200 jumps
 
 
 def test_mars_vertical_policy_with_stock_filter_reaches_its_heights_and_lands(tmp_path):
-    args = {"policy": "mars_vertical_jump_stock", "jumps": 8, "heights": (0.8, 2.9), "record": 0, "device": "cpu"}
+    args = {
+        "policy": "mars_vertical_jump_stock",
+        "num_jumps": 8,
+        "height_range": (0.8, 2.9),
+        "num_recorded": 0,
+        "device": "cpu",
+    }
     values = HeightSweep(out=tmp_path, **args).run()
     assert values["success_rate"] == 1.0 and values["mean_abs_error_m"] < 0.015  # 0.0055 m of 200 jumps
     assert values["fall_rate"] == 0.0 and values["at_rest_within_1_s_rate"] == 1.0

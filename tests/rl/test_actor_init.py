@@ -49,7 +49,7 @@ def actor_init_of(model, cfg=SMALL, activation="elu"):
 @pytest.fixture
 def cfg(tmp_path):
     ppo = dataclasses.replace(SMALL, lr=1e-9, min_lr=1e-9, max_lr=1e-9)
-    return push_cfg(tmp_path, iterations=1, log_interval=1, ppo=ppo, init_policy="pusher")
+    return push_cfg(tmp_path, max_iterations=1, log_interval=1, ppo=ppo, init_policy="pusher")
 
 
 def make_env(num_envs, seed, device):
@@ -231,7 +231,7 @@ def test_training_starts_from_a_policy_and_logs_its_name(cfg, capsys, trainer, e
 def test_resume_uses_the_checkpoint_and_keeps_the_initial_policys_name(cfg, capsys):
     first = train(cfg, make_env, actor_init=actor_init_of(actor()))
     capsys.readouterr()
-    resumed = dataclasses.replace(cfg, init_policy=None, resume=str(first.folder), iterations=2)
+    resumed = dataclasses.replace(cfg, init_policy=None, resume=str(first.folder), max_iterations=2)
     second = train(resumed, make_env)
     assert "starts from" not in capsys.readouterr().err
     assert model_of(second)["obs_moments.count"] == (PRIOR_ITERATIONS + 2) * 32 * SMALL.num_steps
@@ -247,7 +247,7 @@ def test_resumes_a_checkpoint_that_started_from_random_weights(cfg, before):
     config = json.loads(state["config"])
     assert config["train"].pop("init_policy", 0) is None
     save_checkpoint(path.parent, {**state, "config": json.dumps(config) if before else state["config"]})
-    result = train(dataclasses.replace(cfg, init_policy=None, resume=str(first.folder), iterations=2), make_env)
+    result = train(dataclasses.replace(cfg, init_policy=None, resume=str(first.folder), max_iterations=2), make_env)
     assert json.loads((result.folder / CONFIG).read_text())["train"]["init_policy"] is None
 
 

@@ -29,7 +29,7 @@ class Saved:
     def __init__(self, folder):
         self.env = make_env(2, seed=1, randomize=True, noise=True)
         self.cfg = TrainCfg(
-            task="jump", num_envs=2, iterations=1, device="cpu", log_root=folder, tensorboard=False, ppo=PPO
+            task="jump", num_envs=2, max_iterations=1, device="cpu", log_root=folder, tensorboard=False, ppo=PPO
         )
         self.path = train(self.cfg, lambda *_: self.env).folder / CHECKPOINTS / "iteration_000001.pt"
         self.data, self.state = self.path.read_bytes(), load_checkpoint(self.path)
@@ -43,7 +43,7 @@ class Saved:
 
     def resume(self):
         """Resume and run one iteration; return the error message, or None."""
-        cfg = TrainCfg(**{**vars(self.cfg), "iterations": 100, "resume": str(self.path)})
+        cfg = TrainCfg(**{**vars(self.cfg), "max_iterations": 100, "resume": str(self.path)})
         try:
             run = TrainingRun(cfg, self.env, SINGLE_RANK)
         except CheckpointError as error:

@@ -8,7 +8,7 @@ from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.runner import train
 
 CFG = TrainCfg(
-    task="vertical-jump", num_envs=128, iterations=50, device="cpu", seed=1, log_interval=10, tensorboard=False,
+    task="vertical-jump", num_envs=128, max_iterations=50, device="cpu", seed=1, log_interval=10, tensorboard=False,
     ppo=PpoCfg(num_steps=32, hidden=(64, 64), minibatches=4),
 )  # fmt: skip
 

@@ -28,7 +28,7 @@ def test_omp_num_threads_overrides_torchs_threads(one_thread, monkeypatch):
 def test_torch_uses_the_threads_of_the_training_settings(one_thread, monkeypatch, tmp_path):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     cfg = TrainCfg(
-        task="push", num_envs=32, iterations=1, device="cpu", log_root=tmp_path, tensorboard=False, ppo=SMALL
+        task="push", num_envs=32, max_iterations=1, device="cpu", log_root=tmp_path, tensorboard=False, ppo=SMALL
     )
     for threads in (1, 3):
         train(dataclasses.replace(cfg, threads=threads), PushTask)

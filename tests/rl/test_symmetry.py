@@ -165,7 +165,7 @@ def test_checkpoint_of_a_symmetric_actor_opens_as_a_plain_policy_and_resumes(tmp
 def test_refuses_symmetry_for_a_task_without_mirror_map_in_one_line(capsys, monkeypatch):
     monkeypatch.setitem(TASKS, "hold-height", TaskEntry("hold_height:hold_height"))
     with pytest.raises(SystemExit):
-        main(["train", "hold-height", "--ppo.symmetry", "actor", "--num-envs", "8", "--iterations", "1"])
+        main(["train", "hold-height", "--ppo.symmetry", "actor", "--num-envs", "8", "--max-iterations", "1"])
     lines = capsys.readouterr().err.splitlines()
     assert len(lines) == 1 and "hold-height policy: the mirror image of" in lines[0]
 

@@ -64,11 +64,11 @@ def test_logged_iterations_are_printed(cfg, capsys):
 
 def resume_after(cfg, seconds, limit):
     """Resume a checkpoint with `seconds` of training time (None: not saved) and a time limit; return run and result."""
-    half = train(dataclasses.replace(cfg, iterations=2), make_env)
+    half = train(dataclasses.replace(cfg, max_iterations=2), make_env)
     state = final_state(half)
     assert 0.0 < state.pop("seconds") <= half.seconds
     save_checkpoint(half.folder / CHECKPOINTS, state if seconds is None else {**state, "seconds": seconds})
-    cfg = dataclasses.replace(cfg, iterations=100_000, max_seconds=limit, resume=str(half.folder))
+    cfg = dataclasses.replace(cfg, max_iterations=100_000, max_seconds=limit, resume=str(half.folder))
     run = TrainingRun(cfg, make_env(cfg.num_envs, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
     with StopRequest() as stop:
         return run, run.iterate(stop)
@@ -100,7 +100,7 @@ def test_refuses_a_checkpoint_with_a_malformed_time_in_one_line(cfg):
 def test_resume_latest_skips_a_damaged_checkpoint(cfg, capsys):
     result = train(cfg, make_env)
     (result.folder / CHECKPOINTS / "iteration_000004.pt").write_bytes(b"cut")
-    resumed = train(dataclasses.replace(cfg, resume="latest", iterations=3), make_env)
+    resumed = train(dataclasses.replace(cfg, resume="latest", max_iterations=3), make_env)
     assert (resumed.folder, resumed.iteration) == (result.folder, 3)
     stderr = capsys.readouterr().err
     assert "skipped: " in stderr
@@ -149,7 +149,7 @@ def test_signal_finishes_the_iteration_saves_and_prints_the_resume_command(cfg, 
 
     before = signal.getsignal(number)
     with pytest.raises(SystemExit) as caught:
-        train(dataclasses.replace(cfg, iterations=100), lambda n, seed, device: Signalled(n, seed, device))
+        train(dataclasses.replace(cfg, max_iterations=100), lambda n, seed, device: Signalled(n, seed, device))
     assert caught.value.code == 130
     assert signal.getsignal(number) is before
     (path,) = cfg.log_root.glob("push/*/checkpoints/iteration_000003.pt")
@@ -170,7 +170,7 @@ def test_second_interrupt_raises_immediately(cfg):
 
 def test_time_limit_ends_the_training_with_a_checkpoint(cfg):
     begin = time.perf_counter()
-    result = train(dataclasses.replace(cfg, iterations=100_000, max_seconds=0.5), make_env)
+    result = train(dataclasses.replace(cfg, max_iterations=100_000, max_seconds=0.5), make_env)
     assert time.perf_counter() - begin < 10.0
     assert 0.5 <= result.seconds < 5.0
     assert final_state(result)["iteration"] == result.iteration
@@ -226,7 +226,7 @@ def test_each_rank_resumes_its_own_worlds(cfg):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"iterations": 0}, "iterations must be at least 1, got 0"),
+        ({"max_iterations": 0}, "max_iterations must be at least 1, got 0"),
         ({"max_seconds": -1.0}, "max_seconds must be finite and not negative, got -1.0"),
         ({"max_seconds": math.nan}, "max_seconds must be finite and not negative, got nan"),
         ({"max_seconds": math.inf}, "max_seconds must be finite and not negative, got inf"),
@@ -275,11 +275,11 @@ def test_every_logged_metric_can_be_the_best_metric(cfg):
 
 
 def test_trains_with_the_largest_seed(cfg):
-    assert train(dataclasses.replace(cfg, seed=2**31 - 1, iterations=1), make_env).iteration == 1
+    assert train(dataclasses.replace(cfg, seed=2**31 - 1, max_iterations=1), make_env).iteration == 1
 
 
 def test_log_root_may_be_a_string(cfg):
-    result = train(dataclasses.replace(cfg, log_root=str(cfg.log_root), iterations=1), make_env)
+    result = train(dataclasses.replace(cfg, log_root=str(cfg.log_root), max_iterations=1), make_env)
     assert result.folder.parent == cfg.log_root / "push"
 
 
@@ -337,7 +337,7 @@ def test_rsl_rl_adapter_counts_steps_and_logs_metrics_once_per_iteration():
 
 
 def test_train_with_rsl_rl_writes_model_and_config(cfg, tmp_path):
-    result = train(dataclasses.replace(cfg, trainer="rsl-rl", iterations=2), make_env, as_rsl_rl=RslRlVecEnv)
+    result = train(dataclasses.replace(cfg, trainer="rsl-rl", max_iterations=2), make_env, as_rsl_rl=RslRlVecEnv)
     assert (result.folder / "model_1.pt").exists()
     assert (result.folder / CONFIG).exists()
 

@@ -12,7 +12,7 @@ from toy_task import SMALL, PushTask, push_cfg
 
 @pytest.fixture
 def cfg(tmp_path):
-    return push_cfg(tmp_path / "logs", iterations=100)
+    return push_cfg(tmp_path / "logs", max_iterations=100)
 
 
 def saved_seconds(result):
@@ -53,7 +53,7 @@ def test_time_limit_counts_from_the_end_of_the_first_iteration(cfg, monkeypatch)
     [(1.0, 0.0, "27 min"), (3.0, 0.0, "1 h 20 min"), (1.0, 90.0, "58 s"), (0.01, 0.0, "16 s")],
 )
 def test_remaining_time_follows_iteration_time_and_time_limit(cfg, monkeypatch, capsys, seconds, limit, left):
-    limited = dataclasses.replace(cfg, iterations=103, max_seconds=limit, log_interval=3)
+    limited = dataclasses.replace(cfg, max_iterations=103, max_seconds=limit, log_interval=3)
     with pytest.raises(IndexError):
         train_clocked(monkeypatch, limited, [9000.0, *[seconds] * 3 * 16])
     (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("iteration 3/103: ")]

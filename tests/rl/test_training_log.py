@@ -16,7 +16,7 @@ NUMBERS = {"Perf/fps": 1234.0, "Metrics/success": 0.5}
 
 @pytest.fixture
 def cfg(tmp_path):
-    return push_cfg(tmp_path / "logs", iterations=6, log_interval=1)
+    return push_cfg(tmp_path / "logs", max_iterations=6, log_interval=1)
 
 
 @contextlib.contextmanager
@@ -122,7 +122,7 @@ def test_broken_pipe_does_not_stop_logging(tmp_path, monkeypatch):
 
 
 def test_resumed_run_drops_partial_lines_and_later_iterations(cfg, capsys):
-    half = train(dataclasses.replace(cfg, iterations=4), PushTask)
+    half = train(dataclasses.replace(cfg, max_iterations=4), PushTask)
     path = half.folder / METRICS_FILE
     kept = path.read_text().splitlines()[:2]
     path.write_bytes(path.read_bytes()[:-30])
@@ -155,7 +155,7 @@ def test_metrics_file_is_repaired_on_opening(tmp_path, content, kept):
 
 def test_resume_hides_tensorboard_events_of_later_iterations(cfg):
     cfg = dataclasses.replace(cfg, tensorboard=True)
-    half = train(dataclasses.replace(cfg, iterations=4), PushTask)
+    half = train(dataclasses.replace(cfg, max_iterations=4), PushTask)
     train(dataclasses.replace(cfg, resume=str(half.folder / CHECKPOINTS / "iteration_000002.pt")), PushTask)
     assert steps(half.folder) == [1, 2, 3, 4, 5, 6]
 

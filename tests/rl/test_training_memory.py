@@ -7,7 +7,7 @@ import torch
 from experiments.measure_memory import array_bytes
 from jump_helpers import make_env
 from jumper_warp.cli import training_memory
-from jumper_warp.cli.training_memory import STANDING, check_memory, free_main_memory, learning_need, rollout_bytes
+from jumper_warp.cli.training_memory import ENV_BYTES, check_memory, free_main_memory, learning_need, rollout_bytes
 from jumper_warp.registry import TASKS, make_task, trainer_settings
 from jumper_warp.rl.ppo import Ppo
 from toy_task import SMALL
@@ -33,7 +33,7 @@ def envs():
 
 def test_memory_per_world_agrees_with_the_environments_arrays(envs):
     (_, bytes_of_8), (_, bytes_of_40) = envs
-    assert (bytes_of_40 - bytes_of_8) / 32.0 == pytest.approx(STANDING["jumper"], rel=0.05)
+    assert (bytes_of_40 - bytes_of_8) / 32.0 == pytest.approx(ENV_BYTES["jumper"], rel=0.05)
 
 
 @pytest.mark.parametrize("asymmetric_critic", [True, False])

@@ -1,0 +1,96 @@
+"""Flags that were renamed: for one release the old ones work and print the new ones (docs/renames.md)."""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import re
+import sys
+from collections.abc import Sequence
+from typing import Any, get_type_hints
+
+from jumper_warp.utils.errors import InputError
+
+RENAMED = {
+    "aside": "max-lateral-offset", "best-by": "best-metric", "candidates": "num-candidates",
+    "distances": "distance-range", "each": "command-interval", "envs": "num-envs", "episode": "episode-steps",
+    "episodes": "num-episodes", "every": "eval-interval", "exact": "no-noise", "filter": "command-filter",
+    "first": "min-distance", "flights": "num-flights", "gains": "gain-scale gain-preset", "goals": "num-goals",
+    "heights": "height-range", "hold": "hold-time hold-steps", "in-range": "success-range",
+    "iterations": "max-iterations", "jump": "jump-task", "jumps": "num-jumps",
+    "keep": "max-checkpoints save-to-policy", "kept-seeds": "baseline-seeds", "landing": "landing-policy",
+    "last": "max-distance", "late": "num-delayed max-leg-delay", "late-std": "delayed-std", "length": "rest-length",
+    "mass-deviation": "mass-std", "others": "num-mismatched", "per-axis": "commands-per-axis",
+    "polish": "final-iterations", "ppo.asymmetric": "ppo.asymmetric-critic",
+    "ppo.final-entropy": "ppo.final-entropy-coef", "ppo.final-kl": "ppo.final-desired-kl",
+    "randomized": "num-randomized", "reach": "max-velocity", "record": "num-recorded", "rest": "rest-time",
+    "robots": "num-robots", "row": "jumps-per-trial", "seeds": "num-matched", "sets": "num-sets",
+    "squat": "squat-angle", "squats": "num-squats squat-angles", "start-from": "init-policy", "step": "step-height",
+    "steps": "num-steps", "then": "next-goals", "torque": "torque-limit record-torque", "train": "train-flags",
+    "trials": "num-trials", "turns": "num-turns", "without": "exclude", "worlds": "num-gradient-envs num-envs",
+    "x": "goal-x", "y": "goal-y",
+}  # fmt: skip
+"""Old name to new name, or names for different commands with a space between; the first that a command has counts."""
+
+
+def flag_names(cfg: Any) -> set[str]:
+    """Return the flags, without dashes, that tyro makes of a dataclass or of an instance as its default."""
+    names, hints = set(), get_type_hints(cfg if isinstance(cfg, type) else type(cfg), include_extras=True)
+    for spec in dataclasses.fields(cfg):
+        part, name = getattr(cfg, spec.name, spec.default_factory), spec.name.replace("_", "-")
+        if dataclasses.is_dataclass(part):
+            marks = getattr(hints[spec.name], "__metadata__", ())
+            prefix = "" if any(getattr(mark, "name", None) == "" for mark in marks) else f"{name}."
+            names |= {prefix + nested for nested in flag_names(part)}
+        else:
+            names.add(name)
+    return names
+
+
+def name_of(arg: str) -> str:
+    """Return the name of a flag without dashes, `no-` and value, words with dashes between; "" if it is none."""
+    match = re.match(r"--([^=]+)", arg)
+    return re.sub(r"(^|\.)no-", r"\1", match[1].replace("_", "-")) if match else ""
+
+
+def use_new_names(args: Sequence[str], cfg: Any) -> list[str]:
+    """Return the arguments with the new names of renamed flags; prints a line on standard error for each old one.
+
+    cfg: the dataclass that the arguments are for, or an instance. A flag that it has is left alone.
+    Raises InputError: a flag is given under both names.
+    """
+    given, new_args = [name_of(arg) for arg in args], list(args)
+    if RENAMED.keys().isdisjoint(given):
+        return new_args
+    current, renamed = flag_names(cfg), {}
+    for i, old in enumerate(given):
+        new = next((name for name in RENAMED.get(old, "").split() if name in current), None)
+        if new is None or old in current:
+            continue
+        if name_of(f"--{new}") in given:
+            raise InputError(f"--{old} is now --{new}: give only --{new}")
+        flag, equals, value = args[i].partition("=")
+        negated = re.search(r"(--|\.)no-", flag.replace("_", "-")) is not None
+        new_flag = re.sub(r"([^.]+)$", r"no-\1", new) if negated else new
+        new_args[i] = f"--{new_flag}{equals}{value}"
+        renamed[old] = new
+    for old, new in renamed.items():
+        print(f"jumper: --{old} is now --{new}", file=sys.stderr)
+    return new_args
+
+
+def join_height_range(args: Sequence[str], default: tuple[float, float]) -> list[str]:
+    """Return the arguments with --height-range for --lower and --upper; default [m]: the range where one is missing.
+
+    Raises InputError: both kinds are given.
+    """
+    if not any(re.match("--(lower|upper)(=|$)", arg) for arg in args):
+        return list(args)
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--lower", default=str(default[0]))
+    parser.add_argument("--upper", default=str(default[1]))
+    ends, new_args = parser.parse_known_args(args)
+    if "--height-range" in (arg.replace("_", "-") for arg in new_args):
+        raise InputError("--lower and --upper are now --height-range: give only --height-range")
+    print("jumper: --lower and --upper are now --height-range LOWER UPPER", file=sys.stderr)
+    return [*new_args, "--height-range", ends.lower, ends.upper]
