@@ -86,7 +86,7 @@ def check_memory(task: TaskCfg, ppo: PpoCfg, solver: SolverName, num_envs: int, 
 
     Raises InputError with the estimate, the free memory, and a number of worlds that fits.
     """
-    num_obs, num_critic_obs = (max(end for _, end in task.layout(group).values()) for group in ("policy", "critic"))
+    num_obs, num_critic_obs = (max(end for _, end in task.layout(group).values()) for group in ("actor", "critic"))
     learning = learning_need(ppo, num_obs, num_critic_obs)
     main_free = free_main_memory() // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     build_bytes = BUILD_BYTES[solver]

@@ -326,8 +326,8 @@ def test_default_best_checkpoint_metric_depends_on_the_task():
 
 def test_refuses_terms_with_the_same_flag():
     task = make_task("vertical-jump")
-    rest = next(term for term in task.rewards if term.name == "rest")
-    task = dataclasses.replace(task, rewards=(rest, rest.replace(name="Rest_")))
+    rest = next(term for term in task.rewards if term.name == "base_at_rest")
+    task = dataclasses.replace(task, rewards=(rest, rest.replace(name="Base_at_rest_")))
     with pytest.raises(InputError, match="make the same flags"):
         flags_of(task)
 

@@ -70,7 +70,7 @@ def test_flags_override_saved_settings_and_print_each_change(capsys, run):
     code, _, err = train(capsys, "--resume", str(run), "--max-iterations", "2", *flags)
     assert code == 0 and changed_settings(err) == [
         "max-iterations 1 -> 2", "ppo.gamma 0.9 -> 0.95", "noise False -> True", "env.reset.tilt 5.0 -> 2.0",
-        "env.rewards.rest.weight -0.5 -> -0.25", "env.gravity 3.71 -> 9.81",
+        "env.rewards.base-at-rest.weight -0.5 -> -0.25", "env.gravity 3.71 -> 9.81",
     ]  # fmt: skip
     after = config(run)
     assert after["env"]["task"]["gravity"] == 9.81 and after["train"]["ppo"]["gamma"] == 0.95

@@ -86,7 +86,7 @@ register_task("tame-jump", tame_jump, ppo=PpoCfg(gamma=0.9), aliases=("Tame",))
 register_task("low-jump", low_jump, ppo=PpoCfg(gamma=0.9))
 '''
 TRAIN = ["--num-envs", "4", "--max-iterations", "1", "--no-tensorboard", "--device", "cpu", "--ppo.num-steps", "2"]
-TRAIN += ["--ppo.minibatches", "2", "--ppo.hidden", "8", "--env.rewards.rest.height", "0.4"]
+TRAIN += ["--ppo.minibatches", "2", "--ppo.hidden", "8", "--env.rewards.base-at-rest.height", "0.4"]
 
 
 def unload_tasks():
@@ -237,8 +237,8 @@ def test_resume_warns_about_a_changed_file_and_keeps_settings(capsys, runs, path
 
 
 def test_train_refuses_functions_that_cannot_be_saved(capsys, tmp_path):
-    lost = TASK.replace("RewardTerm(rest", "RewardTerm(kept")
-    lost = lost.replace("def tame_jump", "kept, rest = rest, None\n\n\ndef tame_jump")
+    lost = TASK.replace("RewardTerm(base_at_rest", "RewardTerm(kept")
+    lost = lost.replace("def tame_jump", "kept, base_at_rest = base_at_rest, None\n\n\ndef tame_jump")
     (tmp_path / "my_jumps.py").write_text(lost)
     args = ["train", "tame-jump", "--task-module", str(tmp_path / "my_jumps.py"), *TRAIN, "--log-root", str(tmp_path)]
     code, out, err = run(capsys, *args)

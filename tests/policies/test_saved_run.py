@@ -58,7 +58,7 @@ def test_refuses_an_invalid_observation_layout(change, message):
 @pytest.fixture
 def saved():
     """A modified vertical-jump task, and its configuration as read from a JSON file."""
-    task = make_task("vertical-jump").with_terms("rewards", jump_height={"weight": 7.0, "fine": 0.2})
+    task = make_task("vertical-jump").with_terms("rewards", jump_height={"weight": 7.0, "std_fine": 0.2})
     randomization = dataclasses.replace(task.randomization, latency=None, gains=(0.9, 1.1))
     curriculum = task.curriculum.replace(promote_after=3)
     task = dataclasses.replace(
