@@ -23,6 +23,7 @@ from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import AXES, VelocityLog, check_velocity_settings, command_grid, tracking_metrics
 from jumper_warp.utils.errors import InputError
 from support.gaits import GaitRecorder
+from support.scripts import parse_flags
 from support.walks import (
     HOLD,
     PAPER,
@@ -34,7 +35,6 @@ from support.walks import (
     sped_up_walks,
     speed_metrics,
 )  # fmt: skip
-from support.scripts import parse_flags
 
 GAIT_SPEED = 0.8  # [m/s] Speed of the straight walk whose gait is measured
 

@@ -8,7 +8,7 @@ from jumper_warp.cli import evaluate, play
 from jumper_warp.evaluation.commands import csv_text
 from jumper_warp.evaluation.evaluations import EVALUATIONS, evaluation_of
 from jumper_warp.evaluation.heights import HeightFlags, HeightLog
-from jumper_warp.evaluation.landings import LANDING_TERMINATIONS
+from jumper_warp.evaluation.landings import LANDING_TERMINATIONS, LandingFlags
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import TASKS, make_task

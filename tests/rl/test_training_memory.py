@@ -7,7 +7,7 @@ import torch
 from experiments.measure_memory import array_bytes
 from jump_helpers import make_env
 from jumper_warp.cli import training_memory
-from jumper_warp.cli.training_memory import check_memory, free_main_memory, learning_need, rollout_bytes
+from jumper_warp.cli.training_memory import ENV_BYTES, check_memory, free_main_memory, learning_need, rollout_bytes
 from jumper_warp.registry import TASKS, make_task, trainer_settings
 from jumper_warp.rl.ppo import Ppo
 from toy_task import SMALL
