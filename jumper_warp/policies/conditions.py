@@ -70,7 +70,7 @@ class Conditions:
     @property
     def fixed(self) -> dict[str, Any]:
         """Parameters with a value given here, which are neither nominal nor randomised."""
-        values = {name: getattr(self, name) for name in ("latency", "gains", "friction")}
+        values = {"latency": self.latency, "gains": self.gain_scale, "friction": self.friction}
         return {name: value for name, value in values.items() if value is not None}
 
     def overlay(self, config: dict[str, Any]) -> RobotOverlay | None:
