@@ -5,7 +5,7 @@
 
 Trainings differ only in the departure that is undone (`support.departures`): they are equally long, randomised, and
 start from random weights (on Mars from the policy of Earth). The task with all departures, `kept`, is trained with each
-seed of `--kept-seeds`, to show the spread between seeds. Each policy then makes nominal and randomised jumps as in
+seed of `--baseline-seeds`, to show the spread between seeds. Each policy then makes nominal and randomised jumps as in
 `jumper evaluate`, where a fall or a collision after the landing is a failure, and nominal and randomised robots hold
 their squats for 3 s. Jumps are ended by the terminations of the task, regardless of those of the training. A training
 that is already in `--out` is loaded, so that an interrupted run continues; `--no-measure` only trains.
@@ -34,7 +34,7 @@ class Args(ThreadArgs):
     """Flags."""
 
     task: JumpTask = "vertical-jump"
-    """Whose departures."""
+    """Task whose departures are undone."""
     only: tuple[str, ...] = ()
     """Names of the departures to undo (default: all)."""
     iterations: int | None = None

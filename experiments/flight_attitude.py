@@ -5,10 +5,10 @@
 
 Robots squat and extend their legs (24.8 N m, kp 20, 3.71 m/s^2), some legs a few milliseconds later than others, so
 that they take off tilted and rotating. In flight a policy trained to turn in zero gravity takes over, with the level
-orientation as its goal. 0.35 s before the landing the jump takes over again: the policy `--landing`, or the default
-pose. A landing succeeds if only paws touch the ground and the base is within 30 degrees of level 1.5 s later. The same
-takeoffs without turning are the comparison. With `--takeoff policy` the landing policy also takes off, half a second
-after the start.
+orientation as its goal. 0.35 s before the landing the jump takes over again: the policy `--landing-policy`, or the
+default pose. A landing succeeds if only paws touch the ground and the base is within 30 degrees of level 1.5 s later.
+The same takeoffs without turning are the comparison. With `--takeoff policy` the landing policy also takes off, half a
+second after the start.
 """
 
 from __future__ import annotations
@@ -59,11 +59,8 @@ def main(args: Args) -> dict:
     """Run the flights with and without turning, and return the metrics."""
     run = FlightRun(args, args.landing_policy, args.jump_task)
     env, heights = run.env(args.num_flights), np.linspace(*args.height_range, args.num_flights)
-    late = (
-        extension_delays(args.num_flights, 1.0e-3 * args.max_leg_delay, args.seed)
-        if args.takeoff == "open-loop"
-        else None
-    )
+    max_delay = 1.0e-3 * args.max_leg_delay
+    late = extension_delays(args.num_flights, max_delay, args.seed) if args.takeoff == "open-loop" else None
     flights = {
         name: run.fly(env, FlightLog(heights, late, turns=name == "turning"), name) for name in ("turning", "without")
     }

@@ -38,9 +38,9 @@ class Args:
     num_matched: int = 20
     """Number of robots that are identified with the simulator that recorded them."""
     num_mismatched: int = 1
-    """Robots of each part whose truth is not that of the model: fine, rough, mujoco. Metrics are of the first."""
+    """Number of robots recorded on another simulator, for each of the parts fine, rough, mujoco; metrics: the first."""
     parts: tuple[Experiment, ...] = get_args(Experiment)
-    """What is run."""
+    """Parts to run."""
     fine_dt: float = 1.0 / 3840.0
     """[s] Physics step of the model that identifies the robot recorded at a sixteenth of 1/480 s; "rough": 1/480."""
     policy: str = "vertical_jump"

@@ -47,9 +47,9 @@ class Args(DeviceArgs):
     num_envs: int = 8192
     """Number of environments."""
     num_jumps: int = 200
-    """Jumps of an evaluation."""
+    """Number of jumps of an evaluation."""
     height_range: tuple[float, float] = TEST_HEIGHTS
-    """[m] Lowest and highest of them."""
+    """[m] Lowest and highest commanded base height."""
     history: int | None = None
     """Policy steps that the policy sees, as `jumper train --history` (default: as the task says)."""
     randomize: bool = False

@@ -69,10 +69,8 @@ def main(args: Args) -> dict:
     values: dict[str, Any] = {"gravity_m_s2": args.gravity, "torque_limit_nm": args.torque_limit, "kp_nm_rad": args.kp,
                               "spring_length_m": args.rest_length, "stiffness_n_m": list(args.stiffness)}  # fmt: skip
     planet = {EARTH: "Earth", MARS: "Mars"}.get(args.gravity, f"{args.gravity:g} m/s^2")
-    table = Table(
-        "stiffness [N/m]",
-        title=f"open-loop apex in m, {planet}, {args.torque_limit:g} N m, springs {args.rest_length:g} m",
-    )
+    title = f"open-loop apex in m, {planet}, {args.torque_limit:g} N m, springs {args.rest_length:g} m"
+    table = Table("stiffness [N/m]", title=title)
     rows = [[f"{stiffness:g}"] for stiffness in args.stiffness]
     with figure(folder / "springs.png", figsize=(7, 4.5)) as axis:
         for name in FILTERS if args.filter == "both" else (args.filter,):

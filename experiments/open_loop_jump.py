@@ -3,9 +3,10 @@
     python experiments/open_loop_jump.py --solver jumper --torque-limit 18 --out outputs/jump
 
 The hardware reached 1.075 m at 18 N m with the gains and filter of the policies. With 24.8 N m, stiffer gains and a
-looser filter, neither of which it states, the paper's simulation gives 1.42 m: `--torque 24.8 --loose --kp 20`. Springs
-between the knees of each leg, as in the authors' sequel, are `--spring 1000 0.17`. Beyond 90 degrees they fold the legs
-further: `--squat` sets the depth. `--robot` takes a robot with other parameters, for example with a load on its base.
+looser filter, neither of which it states, the paper's simulation gives 1.42 m: `--torque-limit 24.8 --loose --kp 20`.
+Springs between the knees of each leg, as in the authors' sequel, are `--spring 1000 0.17`. Beyond 90 degrees they fold
+the legs further: `--squat-angle` sets the depth. `--robot` takes a robot with other parameters, for example with a load
+on its base.
 """
 
 from __future__ import annotations

@@ -64,11 +64,8 @@ class Args(DeviceArgs):
     """Number of environments whose gradients are measured."""
 
     def __post_init__(self) -> None:
-        if (
-            not self.seeds
-            or not self.trainers
-            or min((self.eval_interval, *self.horizons, self.num_gradient_envs - 1)) <= 0
-        ):
+        positive = min((self.eval_interval, *self.horizons, self.num_gradient_envs - 1)) > 0
+        if not self.seeds or not self.trainers or not positive:
             raise InputError("need seeds, trainers, at least 2 worlds, and positive times and horizons")
 
 

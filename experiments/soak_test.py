@@ -3,10 +3,10 @@
     python experiments/soak_test.py --num-envs 4096 --steps 2500 --out outputs/soak
     python experiments/soak_test.py --num-envs 16384 --steps 61036 --task velocity-rough   # a billion steps
 
-Actions are random target angles of all motors within the limits of the jump. Worlds are reset after `episode` steps;
-masses and paw friction differ between worlds. With `--task` a whole randomised environment of any task takes random
-actions, and its episodes end and begin as in training; a map of grounds has only its hardest row. On a GPU the steps
-for which an action is held are one graph.
+Actions are random target angles of all motors within the limits of the jump. Worlds are reset every
+`--episode-steps`; masses and paw friction differ between worlds. With `--task` a whole randomised environment of any
+task takes random actions, and its episodes end and begin as in training; a map of grounds has only its hardest row. On
+a GPU the steps for which an action is held are one graph.
 """
 
 from __future__ import annotations
@@ -31,9 +31,8 @@ def main(args: SoakArgs) -> dict:
         sim = Simulation(args.num_envs, command_filter=command_filter, visuals=False, device=args.device)
         metrics = soak_simulation(sim, args)
     else:
-        env = Env(
-            hardest(make_task(args.task)), args.num_envs, seed=args.seed, device=args.device, threads=args.threads
-        )
+        task = hardest(make_task(args.task))
+        env = Env(task, args.num_envs, seed=args.seed, device=args.device, threads=args.threads)
         metrics = soak_env(env, args) | {"task": args.task}
     report(folder, metrics | {"envs": args.num_envs, "filter": args.command_filter, "seed": args.seed})
     return metrics

@@ -32,9 +32,9 @@ class Args(EvaluationArgs):
     """Number of robots."""
     hold_time: float = 3.0
     """[s] How long each robot holds its squat."""
-    height_range: tuple[float, float] = (0.6, 1.1)
+    height: tuple[float, float] = (0.6, 1.1)
     """[m] Lowest and highest goal, for a policy that jumps to heights."""
-    distance_range: tuple[float, float] = (0.3, 1.5)
+    distance: tuple[float, float] = (0.3, 1.5)
     """[m] Nearest and farthest goal, for a policy that jumps to places."""
 
     def __post_init__(self) -> None:
@@ -42,7 +42,7 @@ class Args(EvaluationArgs):
         if self.num_squats < 1 or not 1.5 <= self.hold_time <= 30.0:
             given = f"{self.num_squats}, {self.hold_time}"
             raise InputError(f"need at least one squat, and hold_time in 1.5 to 30 s, got {given}")
-        for name in ("height_range", "distance_range"):
+        for name in ("height", "distance"):
             low, high = getattr(self, name)
             if not 0.0 < low <= high < 10.0:
                 raise InputError(f"{name} must be in (0, 10) m and rise, got {low}, {high}")
@@ -66,7 +66,7 @@ def main(args: Args) -> dict:
     run = EvaluationRun.from_args("squat_hold", args, (*HEIGHTS, *PLACES))
     env = run.env(args.num_squats)
     up = run.task.evaluation_suite in HEIGHTS
-    goals = squat_goals(args.num_squats, args.height_range if up else args.distance_range, up=up)
+    goals = squat_goals(args.num_squats, args.height if up else args.distance, up=up)
     squats = run.run_episodes(env, SquatLog(goals, args.hold_time), film="holds")
     if not squats.ended.all():
         plot_squats(run, squats)

@@ -70,9 +70,8 @@ def run_jump(name: str, args: Args, folder: Path, best: dict[str, np.ndarray]) -
     begin = jump.draw(knots, args.samples or jump.samples, rng)
     if jump.after in best:
         begin = np.concatenate([begin, around(best[jump.after], knots, rng)])
-    progress, steps = optimise(
-        jump.scaled(args.effort), begin, args.seed, args.final_iterations or jump.polish, **settings
-    )
+    last = args.final_iterations or jump.polish
+    progress, steps = optimise(jump.scaled(args.effort), begin, args.seed, last, **settings)
     x = best[name] = progress.x[progress.best]
     targets = knots.targets(torch.as_tensor(x[None]))[..., 0].numpy()
     np.savez(folder / f"{name}.npz", targets=targets, knots=x.reshape(len(knots.at), -1), at=np.array(knots.at))

@@ -157,8 +157,8 @@ def sysid(cfg: SysidCfg) -> None:
     parameters = jumper_parameters(split_names(cfg.params)).without(split_names(cfg.exclude))
     settings: dict[str, Any] = {name: getattr(cfg, name) for name in ("noise", "dt", "device", "threads")}
     settings["prior_measurements"] = [] if cfg.mass is None else [weighed_mass(cfg.mass, cfg.mass_std)]
-    given = {name: getattr(cfg, name) for name in ("base", "torque_limit", "torque_constant")}
-    motions = load_motions(cfg.data, gains=cfg.gain_preset, **given)
+    recorded_with = {name: getattr(cfg, name) for name in ("base", "torque_limit", "torque_constant")}
+    motions = load_motions(cfg.data, gains=cfg.gain_preset, **recorded_with)
     configure_device(cfg.device, cfg.threads)
     if cfg.method == "cma":
         result = identify_by_evolution(motions, parameters, max_seconds=cfg.max_seconds, **settings)
@@ -208,8 +208,8 @@ def excite(cfg: ExciteCfg) -> None:
         print(f"{motion.name}: {len(motion.time) / 240.0:.2f} s, information up to here {gain:.1f} nat")
     mass = float(total_mass(robots)[0])
     write_atomically(folder / "excite.json", json_bytes({"mass_kg": mass} | chosen.to_json()))
-    sure = int((chosen.std < 0.5).sum())
-    print(f"{sure} of {len(parameters)} parameters are expected to be identified; motions in {folder}")
+    num_identified = int((chosen.std < 0.5).sum())
+    print(f"{num_identified} of {len(parameters)} parameters are expected to be identified; motions in {folder}")
     print(f"the recorded robot weighs {mass:.3f} kg: jumper sysid {folder} --mass {mass:.3f}")
 
 

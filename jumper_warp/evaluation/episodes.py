@@ -120,7 +120,7 @@ def episode_metrics(episodes: EpisodeLog) -> Metrics:
 def check_episodes(count: int, command: tuple[float, ...], seconds: float) -> None:
     """Raise InputError unless number of episodes, command and length [s] are within their limits."""
     if count < 1:
-        raise InputError(f"episodes must be at least 1, got {count}")
+        raise InputError(f"num_episodes must be at least 1, got {count}")
     if len(command) > MAX_COMMAND_SIZE or not all(math.isfinite(value) for value in command):
         raise InputError(f"command takes up to {MAX_COMMAND_SIZE} finite numbers, got {command}")
     if not 0.0 < seconds <= MAX_SECONDS:

@@ -68,8 +68,8 @@ EVALUATIONS: dict[str, Evaluation] = {
         play=LandingPlayFlags(default_goals=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))),
     ),
     "omnidirectional": replace(
-        PLACE, flags=LandingFlags(goal_x=(-0.7, 0.7), goal_y=(-0.7, 0.7), success_range=(0.0, 0.7)),
-        finetune_target=None,
+        PLACE, finetune_target=None,
+        flags=LandingFlags(goal_x=(-0.7, 0.7), goal_y=(-0.7, 0.7), success_range=(0.0, 0.7)),
         play=LandingPlayFlags(default_goals=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
     ),
     "velocity": Evaluation(VelocityFlags(), VelocityPlayFlags(), TaskCfg.on_level_ground),

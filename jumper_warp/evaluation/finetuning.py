@@ -124,9 +124,8 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
             if target is None:
                 raise InputError(f"fine-tuning is for jumps to heights and places, not for {env.task.name}")
             goals, to_height = np.zeros((count, 3)), target == "apex"
-            goals[:, 2 if to_height else 0] = np.linspace(
-                *(cfg.height_range if to_height else cfg.distance_range), count
-            )
+            low, high = cfg.height_range if to_height else cfg.distance_range
+            goals[:, 2 if to_height else 0] = np.linspace(low, high, count)
             delays = rng.uniform(*DELAYS, count)
             groups.append(JumpGroup(name, env, std, jump_commands(goals, delays, env.step_dt), to_height))
     return groups

@@ -249,9 +249,9 @@ class LandingPlayFlags:
     """Jumps to places that are recorded."""
 
     goal: tyro.conf.UseAppendAction[tuple[Position2D, ...]] = ()
-    """[m] Where to land, ahead and to the left; once for each robot (default: three robots, each to another place)."""
+    """[m] Goal of a robot, ahead and to the left; give it once for each robot (default: three goals)."""
     next_goals: tyro.conf.UseAppendAction[tuple[Position2D, ...]] = ()
-    """[m] Where all robots jump next, a second after touchdown, from where they are by then; once for each jump."""
+    """[m] Goal of all robots' next jump, ahead and to the left, a second after touchdown; give it once a jump."""
     default_goals: tyro.conf.Suppress[tuple[Position2D, ...]] = ((0.5, 0.0), (0.9, 0.0), (1.3, 0.0))
     """[m] Goals if there are none; flags that are given several times would be added to a default."""
 

@@ -190,10 +190,9 @@ class DistanceSweep(Suite):
 
     def run_jumps(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> LandingLog:
         """Run one jump per distance under some conditions and return the log; film: name of the recording."""
-        aside = np.random.default_rng(self.seed + 1).uniform(
-            -self.max_lateral_offset, self.max_lateral_offset, self.num_jumps
-        )
-        goals = np.stack([np.linspace(*self.distance_range, self.num_jumps), aside], axis=1)[:, None]
+        side, rng = self.max_lateral_offset, np.random.default_rng(self.seed + 1)
+        x, y = np.linspace(*self.distance_range, self.num_jumps), rng.uniform(-side, side, self.num_jumps)
+        goals = np.stack([x, y], axis=1)[:, None]
         change = with_second_takeoff if self.end_at_second_takeoff else with_landing_terminations
         return self.run_landings(run, goals, run.env(self.num_jumps, change, conditions), film=film)
 

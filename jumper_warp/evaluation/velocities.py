@@ -229,7 +229,7 @@ class VelocityPlayFlags:
     """A walk that is recorded: commands one after the other."""
 
     velocity: tyro.conf.UseAppendAction[tuple[Velocity, ...]] = ()
-    """[m/s], [m/s], [rad/s] Ahead, to the left and about z; once for each command (default: a walk of six)."""
+    """[m/s], [m/s], [rad/s] Ahead, to the left, about z; give it once for each command (default: six commands)."""
     default_velocities: tyro.conf.Suppress[tuple[Velocity, ...]] = (
         (0.8, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0), (0.6, 0.3, 0.6), (0.0, 0.0, 0.0),
     )  # fmt: skip

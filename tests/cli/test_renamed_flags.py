@@ -20,7 +20,7 @@ from support.soak import SoakArgs
     ("cfg", "old", "new"),
     [
         (TrainArgs(), ["--keep", "5"], ["--max-checkpoints", "5"]),
-        (TrainArgs(), ["--max-iterations=5"], ["--max-iterations=5"]),
+        (TrainArgs(), ["--iterations=5"], ["--max-iterations=5"]),
         (HeightSweep(), ["--gains", "0.6", "1"], ["--gain-scale", "0.6", "1"]),
         (SysidCfg, ["x.npz", "--gains", "walking"], ["x.npz", "--gain-preset", "walking"]),
         (SysidCfg, ["x.npz", "--mass_deviation", "0.1"], ["x.npz", "--mass-std", "0.1"]),

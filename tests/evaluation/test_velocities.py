@@ -138,9 +138,8 @@ def test_command_grid_and_step_commands_cover_their_ranges():
 @pytest.mark.parametrize(
     "make",
     [lambda: VelocityFlags(commands_per_axis=1), lambda: VelocityFlags(commands_per_axis=40),
-     lambda: VelocityFlags(seconds=0.0),
-     lambda: VelocityFlags(max_velocity=(11.0, 0.0, 0.0)), lambda: VelocityPlayFlags(velocity=((11.0, 0.0, 0.0),)),
-     lambda: VelocityPlayFlags(each=-1.0)],
+     lambda: VelocityFlags(seconds=0.0), lambda: VelocityFlags(max_velocity=(11.0, 0.0, 0.0)),
+     lambda: VelocityPlayFlags(velocity=((11.0, 0.0, 0.0),)), lambda: VelocityPlayFlags(command_interval=-1.0)],
 )  # fmt: skip
 def test_refuses_settings_out_of_range(make):
     with pytest.raises(InputError):

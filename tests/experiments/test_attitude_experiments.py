@@ -65,9 +65,9 @@ def test_policy_takes_off_to_commanded_heights_and_lands(run, tmp_path):
 
 
 def test_refuses_invalid_flags(tmp_path):
-    with pytest.raises(InputError, match="turns must be at least 6"):
+    with pytest.raises(InputError, match="num_turns must be at least 6"):
         attitude.Args(num_turns=3)
-    with pytest.raises(InputError, match="late in 0 to 100 ms"):
+    with pytest.raises(InputError, match="max_leg_delay in 0 to 100 ms"):
         flight_attitude.Args(max_leg_delay=200.0)
     with pytest.raises(InputError, match="takeoff by a policy needs one"):
         flight_attitude.Args(takeoff="policy")

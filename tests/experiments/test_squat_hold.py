@@ -55,4 +55,4 @@ def test_refuses_invalid_flags():
     with pytest.raises(InputError, match="need at least one squat"):
         squat_hold.Args(hold_time=0.5)
     with pytest.raises(InputError, match="height must be in"):
-        squat_hold.Args(height_range=(1.0, 0.5))
+        squat_hold.Args(height=(1.0, 0.5))

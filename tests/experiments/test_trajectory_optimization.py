@@ -77,7 +77,7 @@ def test_run_ups_lean_back_before_they_push():
     assert motion.takeoff(0.25)[1].float().mean() > 0.5
 
 
-@pytest.mark.parametrize("flags", [{"jumps": ("wings",)}, {"effort": 0.0}, {"samples": 3}, {"polish": 0}])
+@pytest.mark.parametrize("flags", [{"jumps": ("wings",)}, {"effort": 0.0}, {"samples": 3}, {"final_iterations": 0}])
 def test_invalid_flags_give_one_line_error(flags, capsys):
     with pytest.raises(SystemExit):
         run_command(lambda: experiment.Args(**flags))
