@@ -293,7 +293,8 @@ class Rollout:
             setattr(rows, name, getattr(trajectory, name))
         gradients = modules.gradients.Gradients()
         shapes = {"q": (19,), "qd": (18,), "target": (count, 12), "initial_target": (12,),
-                  "wrench": (count, 6), "filtered_target": (count, 12), "parameters": (int(modules.gradients.GRADIENT_ROWS),)}  # fmt: skip
+                  "wrench": (count, 6), "filtered_target": (count, 12),
+                  "parameters": (int(modules.gradients.GRADIENT_ROWS),)}  # fmt: skip
         for name, shape in shapes.items():
             setattr(gradients, name, self._zeros(*shape, n))
         if filtered_target is not None:
@@ -317,7 +318,7 @@ class Rollout:
         return by_inputs | {"initial_target": gradients.initial_target} | self._split_parameters(gradients.parameters)
 
     def _cotangents(self, trajectory: Trajectory, given: dict[str, wp.array | None]) -> Any:
-        """Return the kernels' `TrajectoryArrays` of a gradient by a trajectory. Raises InputError: another shape or type."""
+        """Return the gradient by a trajectory as `TrajectoryArrays`. Raises InputError: another shape or type."""
         cotangents = self.dynamics.modules.trajectory.TrajectoryArrays()
         for name, array in given.items():
             like = getattr(trajectory, name)
