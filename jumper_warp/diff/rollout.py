@@ -317,7 +317,7 @@ class Rollout:
         return by_inputs | {"initial_target": gradients.initial_target} | self._split_parameters(gradients.parameters)
 
     def _cotangents(self, trajectory: Trajectory, given: dict[str, wp.array | None]) -> Any:
-        """Return the kernels' `TrajectoryArrays` of a gradient by a trajectory. Raises InputError: another shape or type."""
+        """Return the gradient by a trajectory as `TrajectoryArrays`. Raises InputError: another shape or type."""
         cotangents = self.dynamics.modules.trajectory.TrajectoryArrays()
         for name, array in given.items():
             like = getattr(trajectory, name)
