@@ -107,7 +107,7 @@ def test_range_of_places_counts_distances():
     flags = LandingFlags(jumps=3, x=(0.0, 0.0), y=(0.0, 0.0), heading=0.0, in_range=(0.3, 0.5))
     landings = flags.log(TASK, 0)
     landings.goal_positions[:, 0] = goals
-    landings.place[:, 0], landings.target[:, 0] = goals, goals
+    landings.end_position[:, 0], landings.goal_world[:, 0] = goals, goals
     landings.heading[:], landings.yaw[:], landings.tilt[:] = 0.0, 0.0, 0.0
     landings.end[:, 0] = [*[LANDING_TERMINATIONS.index("success")] * 2, LANDING_TERMINATIONS.index("low_base")]
     metrics = flags.metrics(landings)
