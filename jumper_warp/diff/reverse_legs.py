@@ -28,8 +28,8 @@ class LegThreadReverse:
     def run(self, settings: Any, motion: list[Any], cotangents: Any, gradients: Any) -> None:
         """Add to the kernels' `Gradients`, whose q and qd hold the cotangents of the last row.
 
-        settings: `StepSettings`. motion: `Timing`, `Actuation`, `Commands`, filtered targets, `Rows` of the rollout.
-        cotangents: `Rows`, the gradient of the loss by those of the rollout.
+        settings: `StepSettings`. motion: `Timing`, `Actuation`, `Commands`, filtered targets, `TrajectoryArrays`.
+        cotangents: `TrajectoryArrays`, the gradient of the loss by those of the rollout.
         """
         robot, record, num = self._dynamics.robot, self._record, self._num
         legs, constants = self._modules.rollout_legs_adjoint, self._modules.constants_adjoint

@@ -235,8 +235,8 @@ class Rollout:
         commands = self.dynamics.modules.trajectory.Commands()
         commands.target = self._input("targets", targets, (count, 12))
         q, qd = self._input("q", q, (19,)), self._input("qd", qd, (18,))
-        first = initial_target
-        commands.initial_target = q[7:] if first is None else self._input("initial_target", first, (12,))
+        initial = q[7:] if initial_target is None else self._input("initial_target", initial_target, (12,))
+        commands.initial_target = initial
         commands.wrench = self._zeros(count, 6, self.num_worlds) if wrench is None else (
             self._input("wrench", wrench, (count, 6))
         )  # fmt: skip
@@ -292,9 +292,8 @@ class Rollout:
         for name in ("q", "qd", "torque", "impulse", "pressed"):
             setattr(rows, name, getattr(trajectory, name))
         gradients = modules.gradients.Gradients()
-        shapes = {"q": (19,), "qd": (18,), "target": (count, 12), "initial_target": (12,),
-                  "wrench": (count, 6), "filtered_target": (count, 12),
-                  "parameters": (int(modules.gradients.GRADIENT_ROWS),)}  # fmt: skip
+        shapes = {"q": (19,), "qd": (18,), "target": (count, 12), "initial_target": (12,), "wrench": (count, 6),
+                  "filtered_target": (count, 12), "parameters": (int(modules.gradients.GRADIENT_ROWS),)}  # fmt: skip
         for name, shape in shapes.items():
             setattr(gradients, name, self._zeros(*shape, n))
         if filtered_target is not None:

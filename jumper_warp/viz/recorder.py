@@ -1,4 +1,4 @@
-"""Recording a simulation as it runs."""
+"""Recorder of a running simulation."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -34,9 +34,9 @@ class Recorder:
     ) -> None:
         """Record some worlds of a model, whose bodies and shapes are read once.
 
-        spacing: distance [m] along y by which each world is drawn beside the one before it; zero keeps the true
-        positions, as a heightfield needs. notes: saved along; must be JSON.
-        Raises ValueError: a world has no bodies, or a visible shape cannot be drawn.
+        spacing [m]: distance along y at which worlds are shown side by side; zero keeps the true positions, as a
+        heightfield needs. notes: metadata, must be JSON.
+        Raises InputError: a world has no bodies, or a visible shape cannot be drawn.
         """
         world_of_body = model.body_world.numpy()
         for world in worlds:
@@ -72,7 +72,7 @@ class Recorder:
         `group/quantity [unit]` to value, the same names in every frame. contact_points [m] and contact_forces [N] on
         the robot: world frame, (num_worlds, contacts_per_world, 3) or (contacts, 3) for one world, the same number in
         every frame.
-        Raises ValueError: time does not increase, a shape is wrong, or a name is malformed, new or missing.
+        Raises InputError: time does not increase, a shape is wrong, or a name is malformed, new or missing.
         """
         if self._times and not time > self._times[-1]:
             raise InputError(f"time must increase, got {time} s after {self._times[-1]} s")
@@ -86,6 +86,7 @@ class Recorder:
         self._contacts.append(contacts)
 
     def _append_series(self, series: Mapping[str, float]) -> None:
+        """Append the values of a frame to the time series. Raises InputError: a name is malformed, new or missing."""
         values = {name: float(value) for name, value in series.items()}
         if self._series is None:
             malformed = [name for name in series if not SERIES_NAME.fullmatch(name)]
@@ -116,10 +117,7 @@ class Recorder:
         return points, forces
 
     def recording(self) -> Recording:
-        """Return what was recorded so far.
-
-        Raises ValueError: there is no frame.
-        """
+        """Return the recording so far. Raises InputError: there is no frame."""
         if not self._times:
             raise InputError("nothing was recorded")
         return Recording(
@@ -136,9 +134,9 @@ class Recorder:
         )
 
     def save_npz(self, path: Path) -> Path:
-        """Write what was recorded so far as a NumPy archive; `load_npz` reads it."""
+        """Write the recording so far as a NumPy archive, which `load_npz` reads; return its path."""
         return self.recording().save_npz(path)
 
     def save_rrd(self, path: Path) -> Path:
-        """Write what was recorded so far for the Rerun viewer."""
+        """Write the recording so far as a file of the Rerun viewer; return its path."""
         return write_rrd(self.recording(), Path(path))

@@ -1,6 +1,6 @@
 """Recordings of rollouts: body poses, named series and contact forces over time, with the shapes to draw them.
 
-A recording stands on its own: what was seen can be drawn without the model that made it.
+A recording is self-contained: it can be shown without the model.
 """
 
 import io
@@ -39,7 +39,7 @@ class Recording:
     times: np.ndarray
     """(num_frames,) float64 [s], increasing."""
     worlds: tuple[int, ...]
-    """Which of the model's worlds these are."""
+    """Indices of the recorded worlds in the model."""
     bodies: tuple[str, ...]
     """Names of the recorded bodies, `world_<i>/<link>`, one world after the other."""
     poses: np.ndarray
@@ -51,11 +51,11 @@ class Recording:
     contact_forces: np.ndarray
     """The same shape, float32 [N], world frame, on the robot."""
     spacing: float = 0.0
-    """Distance along y by which each world is drawn beside the one before it [m]; the data are not moved."""
+    """[m] Distance along y at which worlds are shown side by side; the stored poses are not moved."""
     shapes: tuple[ShapeMesh, ...] = ()
-    """What to draw; `body` is here an index of `bodies`."""
+    """Meshes to show; `body` is an index of `bodies`."""
     notes: dict[str, Any] = field(default_factory=dict)
-    """Anything that JSON holds: seed, gains, commit."""
+    """Metadata as JSON: seed, gains, commit."""
 
     def save_npz(self, path: Path) -> Path:
         """Write the recording to one NumPy archive without pickles, whole or not at all; return its path."""
@@ -81,7 +81,7 @@ class Recording:
 
 
 def load_npz(path: Path) -> Recording:
-    """Read what `Recording.save_npz` wrote.
+    """Return the recording that `Recording.save_npz` wrote.
 
     Raises RecordingError: the file is missing, damaged, of another kind or of another version.
     """
@@ -98,6 +98,7 @@ def load_npz(path: Path) -> Recording:
 
 
 def _from_archive(header: dict[str, Any], archive: Mapping[str, np.ndarray]) -> Recording:
+    """Return the recording of a NumPy archive and its parsed header."""
     shapes = tuple(
         ShapeMesh(
             shape["name"], shape["body"], tuple(shape["color"]), *(archive[f"shape{index}_{part}"] for part in SURFACE)

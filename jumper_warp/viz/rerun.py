@@ -53,6 +53,7 @@ def write_rrd(recording: "Recording", path: Path) -> Path:
 
 
 def _import_rerun() -> ModuleType:
+    """Return the module `rerun`. Raises ImportError with a hint: it is not installed."""
     try:
         import rerun
     except ImportError as error:
@@ -91,6 +92,7 @@ def _log_contacts(
 
 
 def _mesh(rr: ModuleType, shape: ShapeMesh) -> Any:
+    """Return a shape as `Mesh3D` of Rerun."""
     color = [round(255 * min(max(channel, 0.0), 1.0)) for channel in shape.color]
     return rr.Mesh3D(
         vertex_positions=shape.vertices,
@@ -101,6 +103,7 @@ def _mesh(rr: ModuleType, shape: ShapeMesh) -> Any:
 
 
 def _log_series(rr: ModuleType, stream: Any, recording: "Recording") -> None:
+    """Log every time series in one call."""
     times = [rr.TimeColumn(TIMELINE, duration=recording.times)]
     for name, values in recording.series.items():
         group, quantity = name.split("/", 1)

@@ -1,4 +1,4 @@
-"""Triangle meshes of what a Newton model shows: one mesh per visible shape."""
+"""Triangle meshes of the visible shapes of a Newton model."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -114,7 +114,7 @@ def _checker(label: str, size: np.ndarray) -> list[tuple[str, tuple[float, float
 def _placed(
     name: str, body: int, color: tuple[float, float, float], mesh: trimesh.Trimesh, placement: np.ndarray
 ) -> ShapeMesh:
-    """Move a mesh from the shape's frame to the body's. placement: pos [m] and quat xyzw, (7,)."""
+    """Return a mesh moved from the shape's frame to the body's; placement: pos [m] and quat xyzw, (7,)."""
     x, y, z, w = placement[3:]
     matrix = trimesh.transformations.quaternion_matrix([w, x, y, z])
     matrix[:3, 3] = placement[:3]

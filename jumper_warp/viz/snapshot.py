@@ -15,9 +15,9 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model, State
 
 EYE = (1.1, 1.4, 0.6)
-"""Default position of the eye [m], world frame: ahead of the robot, on its left."""
+"""[m] Default camera position, world frame: ahead of the robot, on its left."""
 TARGET = (0.0, 0.0, 0.25)
-"""Default point that it looks at [m]."""
+"""[m] Default target point of the camera."""
 SIZE = (640, 480)
 """Default width and height [px]."""
 FIELD_OF_VIEW = math.radians(40.0)
