@@ -123,7 +123,7 @@ def test_a_simulation_has_the_same_bits_on_any_number_of_threads(filtered):
 def test_a_training_has_the_same_bits_on_any_number_of_threads(tmp_path, one_thread):
     def trained(threads):
         cfg = TrainCfg(
-            num_envs=N, iterations=3, device="cpu", threads=threads, log_root=tmp_path / str(threads),
+            num_envs=N, max_iterations=3, device="cpu", threads=threads, log_root=tmp_path / str(threads),
             tensorboard=False, ppo=PpoCfg(num_steps=8, minibatches=4, epochs=2, hidden=(32, 32)),
         )  # fmt: skip
         sizes = []
