@@ -252,7 +252,7 @@ def test_a_seed_brings_every_world_back_to_its_first_task():
     env = jumper(2, task=[TASK, dataclasses.replace(TASK, name="other")], skill=np.array([1, 0]))
     env.reset()
     env.episodes.skill.zero_()
-    env.requested_task(1)
+    env.request(1)
     env.reset(seed=5)
     assert env.episodes.skill.numpy().tolist() == [1, 0]
     assert env.episodes.requested_task.numpy().tolist() == [-1, -1]

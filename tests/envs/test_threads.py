@@ -58,7 +58,7 @@ def story(threads, steps=240, task=JUMP, **arguments):
     found = []
     for step, action in enumerate(random_actions(N, steps)):
         if len(env.tasks) > 1 and step % 40 == 10:
-            env.requested_task(0)
+            env.request(0)
         env.step(action.repeat(len(env.tasks), 1, 1) if len(env.tasks) > 1 else action)
         rows = [*env._step.obs.values(), *env.skills[0].final_obs.values(), env.reward, env.done, env.timeout]
         found.append(torch.cat([row.reshape(N, -1) for row in rows], dim=1))
