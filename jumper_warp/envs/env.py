@@ -282,7 +282,7 @@ class Env(Stages):
     def task_arrays(self, skill: int = 0) -> dict[str, np.ndarray]:
         """Return every world's state of a task, one array of shape (num_envs, ...) a field (waits for the device).
 
-        Besides the fields of the task's state: base_pos [m], base_vel [m/s], base_quat (xyzw), done, ending, level.
+        Besides the fields of the task: base_pos [m], base_vel [m/s], base_quat (xyzw), done, termination, level.
         """
         state = records(self.skills[skill].states)
         arrays = {name: np.array(state[name]) for name in state.dtype.names or ()}

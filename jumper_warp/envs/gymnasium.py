@@ -25,7 +25,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
 
     Infos of a step in which episodes ended, besides masks `_final_obs` and `_final_info` of the worlds concerned:
         final_obs: (num_envs,) the old episode's last observations, None elsewhere.
-        final_info: `ending`, (num_envs,) index in `endings` of the termination.
+        final_info: `termination`, (num_envs,) index in `endings` of the termination.
     With tensors=True, actions and all that is returned are torch tensors on the environment's device, and nothing waits
     for it. Infos of every step then have both, `final_obs` with a row for every world.
     """
@@ -48,7 +48,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         self.env, self.num_envs = env, env.num_envs
         self.endings = tuple(term.name for term in env.task.terminations)
         self._all_groups, self._tensors, self._began = all_groups, tensors, False
-        self._ending = wp.to_torch(env.episodes.termination)
+        self._termination = wp.to_torch(env.episodes.termination)
         widths = {"actor": env.num_obs, "critic": env.num_critic_obs}
         boxes = {group: Box(-RAW_LIMIT, RAW_LIMIT, (width,)) for group, width in widths.items()}
         self.single_observation_space = Dict([*boxes.items()]) if all_groups else boxes["actor"]
@@ -86,15 +86,15 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         terminated, truncated = (self._given(flag.clone()) for flag in (step.terminated, step.truncated))
         ended, infos = terminated | truncated, {}
         if self._tensors or ended.any():
-            final, termination = self._shown(step.extras["final_obs"]), self._given(self._ending.clone())
+            final, termination = self._shown(step.extras["final_obs"]), self._given(self._termination.clone())
             infos["final_obs"], infos["_final_obs"] = final if self._tensors else self._rows(final, ended), ended
-            infos["final_info"] = {"termination": termination, "_ending": _copy(ended)}
+            infos["final_info"] = {"termination": termination, "_termination": _copy(ended)}
             infos["_final_info"] = _copy(ended)
         return self._shown(step.obs), self._given(reward), terminated, truncated, infos
 
     def close_extras(self, **kwargs: Any) -> None:
         """Let the environment go; its memory is free when nobody else holds it."""
-        del self.env, self._ending
+        del self.env, self._termination
 
     def _check_open(self) -> None:
         if self.closed:

@@ -115,7 +115,7 @@ def test_gymnasium_gets_copies(tensors):
         infos["_final_obs"],
         infos["_final_info"],
         infos["final_info"]["termination"],
-        infos["final_info"]["_ending"],
+        infos["final_info"]["_termination"],
     ]
     given += [infos["final_obs"]] if tensors else [row for row in infos["final_obs"] if row is not None]
     shown = [value.clone() if tensors else value.copy() for value in given]
@@ -178,7 +178,7 @@ def test_final_infos_tell_why_an_episode_ended():
     seen = set()
     for _, _, terminated, truncated, infos in played(envs):
         for world in np.flatnonzero(terminated | truncated):
-            assert infos["_final_info"][world] and infos["final_info"]["_ending"][world]
+            assert infos["_final_info"][world] and infos["final_info"]["_termination"][world]
             name = envs.endings[infos["final_info"]["termination"][world]]
             assert (name in ("too_long", "success")) == truncated[world]
             seen.add(name)
@@ -252,7 +252,7 @@ def test_a_seed_brings_every_world_back_to_its_first_task():
     env = jumper(2, task=[TASK, dataclasses.replace(TASK, name="other")], skill=np.array([1, 0]))
     env.reset()
     env.episodes.skill.zero_()
-    env.requested_task(1)
+    env.request(1)
     env.reset(seed=5)
     assert env.episodes.skill.numpy().tolist() == [1, 0]
     assert env.episodes.requested_task.numpy().tolist() == [-1, -1]

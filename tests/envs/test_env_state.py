@@ -47,7 +47,7 @@ def train_jump(cfg):
 @pytest.fixture
 def cfg(tmp_path):
     return TrainCfg(
-        task="jump", num_envs=N, iterations=4, device="cpu", log_root=tmp_path, log_interval=4, save_interval=2,
+        task="jump", num_envs=N, max_iterations=4, device="cpu", log_root=tmp_path, log_interval=4, save_interval=2,
         tensorboard=False, ppo=PPO,
     )  # fmt: skip
 
@@ -68,7 +68,7 @@ def test_a_resumed_training_goes_on_bit_for_bit(cfg):
 
 
 def test_the_same_seed_trains_the_same_and_another_does_not(cfg):
-    cfg = dataclasses.replace(cfg, iterations=3)
+    cfg = dataclasses.replace(cfg, max_iterations=3)
     first, again, other = (train_jump(dataclasses.replace(cfg, seed=seed)) for seed in (1, 1, 2))
     assert all(torch.equal(a, b) for a, b in zip(first[0].rewards, again[0].rewards, strict=True))
     assert equal(first[1]["ppo"], again[1]["ppo"]) and equal(first[1]["env"], again[1]["env"])
@@ -182,7 +182,7 @@ def test_a_state_that_does_not_fit_is_refused_and_nothing_changes(change, messag
         ("env.level", 2**31 - 1, "saved env.level must be at most [1-9], got 2147483647"),
         ("env.skill", 1, "saved env.skill must be at most 0, got 1"),
         ("env.skill", -1, "saved env.skill must not be below 0, got -1"),
-        ("env.step_count", 0, "saved env.clock must not be below 16, got 0"),
+        ("env.step_count", 0, "saved env.step_count must not be below 16, got 0"),
         ("parameters.latency", 49, "saved parameters.latency must be at most 48, got 49"),
         ("parameters.observation_latency", -1, "saved parameters.observation_latency must not be below 0, got -1"),
     ],

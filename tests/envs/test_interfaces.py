@@ -165,7 +165,7 @@ def test_worlds_that_are_none_are_refused(env, worlds, message):
     commands = np.zeros((N, 3))
     refused(env, message, env.evaluation_reset, commands, 0.0, worlds)
     refused(env, message, env.command, commands, worlds)
-    refused(env, message, env.requested_task, 0, worlds)
+    refused(env, message, env.request, 0, worlds)
 
 
 @pytest.mark.parametrize(("headings", "message"), WRONG_HEADINGS)

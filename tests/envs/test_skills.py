@@ -115,7 +115,7 @@ def followed(env, actions, request_at=None, skill=0, worlds=ASKED):
     trace, skills = [], []
     for step, action in enumerate(actions):
         if step == request_at:
-            env.requested_task(skill, worlds)
+            env.request(skill, worlds)
         env.step(action.repeat(len(env.skills), 1, 1))
         trace.append(coordinates(env).copy())
         skills.append(env.episodes.skill.numpy().copy())
@@ -181,7 +181,7 @@ def test_motors_filter_and_scales_become_those_of_the_new_skill_and_drawn_ratios
     action[:, :, ::3] = 1.0  # lateral
     env.step(action)
     np.testing.assert_allclose(env.robot.filtered_target.numpy()[::3], 40.0 * DEG, rtol=1e-6)
-    env.requested_task(0, ASKED)
+    env.request(0, ASKED)
     env.step(action)
     assert not env.done.any()
     held = env.robot.filtered_target.numpy() - env.robot.default_angle.numpy()[:, None]
@@ -266,8 +266,8 @@ def test_a_command_that_came_with_the_request_is_given_as_the_skill_takes_over()
     followed(env, torch.zeros((3, N, 12)))
     commands = np.zeros((N, 3))
     commands[:, 2] = np.linspace(0.6, 0.9, N)
-    env.requested_task(0, ASKED, commands)
-    env.requested_task(0, np.arange(N) == 7)
+    env.request(0, ASKED, commands)
+    env.request(0, np.arange(N) == 7)
     followed(env, torch.zeros((1, N, 12)))
     states = env.skills[0].states.numpy()
     np.testing.assert_allclose(states["goal"][ASKED, 2], commands[ASKED, 2], rtol=1e-6)
@@ -276,7 +276,7 @@ def test_a_command_that_came_with_the_request_is_given_as_the_skill_takes_over()
     np.testing.assert_allclose(env.skills[0].obs["actor"][ASKED, first], commands[ASKED, 2], rtol=1e-6)
     assert not env.episodes.has_command.numpy()[ASKED].any() and (env.episodes.skill.numpy()[8:] == 1).all()
     with pytest.raises(ValueError, match=r"16 rows or one for all, got shape \(3, 2\)"):
-        env.requested_task(0, ASKED, np.zeros((3, 2)))
+        env.request(0, ASKED, np.zeros((3, 2)))
 
 
 @pytest.mark.parametrize("begin", ["reset", "evaluation_reset", "ended"])
@@ -284,7 +284,7 @@ def test_new_episodes_begin_in_the_first_skill_and_forget_requests(begin):
     """Worlds of the last case end by themselves; its others stay as they are."""
     env, fresh = (make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD), randomize=False) for _ in range(2))
     followed(env, torch.zeros((3, N, 12)), request_at=1)
-    env.requested_task(1, np.arange(N) == 4, np.ones((N, 1)))
+    env.request(1, np.arange(N) == 4, np.ones((N, 1)))
     new = np.full(N, True)
     if begin == "reset":
         env.reset()
@@ -295,7 +295,7 @@ def test_new_episodes_begin_in_the_first_skill_and_forget_requests(begin):
         records = env.skills[0].states.numpy().copy()
         records["steps"][3] = 10_000  # too long
         env.skills[0].states.assign(records)
-        env.requested_task(1, new)
+        env.request(1, new)
         followed(env, torch.zeros((1, N, 12)))
         assert env.done[3]
     assert (env.episodes.skill.numpy()[new] == 1).all() and (env.episodes.requested_task.numpy()[new] == -1).all()

@@ -58,7 +58,7 @@ def story(threads, steps=240, task=JUMP, **arguments):
     found = []
     for step, action in enumerate(random_actions(N, steps)):
         if len(env.tasks) > 1 and step % 40 == 10:
-            env.requested_task(0)
+            env.request(0)
         env.step(action.repeat(len(env.tasks), 1, 1) if len(env.tasks) > 1 else action)
         rows = [*env._step.obs.values(), *env.skills[0].final_obs.values(), env.reward, env.done, env.timeout]
         found.append(torch.cat([row.reshape(N, -1) for row in rows], dim=1))
@@ -123,7 +123,7 @@ def test_a_simulation_has_the_same_bits_on_any_number_of_threads(filtered):
 def test_a_training_has_the_same_bits_on_any_number_of_threads(tmp_path, one_thread):
     def trained(threads):
         cfg = TrainCfg(
-            num_envs=N, iterations=3, device="cpu", threads=threads, log_root=tmp_path / str(threads),
+            num_envs=N, max_iterations=3, device="cpu", threads=threads, log_root=tmp_path / str(threads),
             tensorboard=False, ppo=PpoCfg(num_steps=8, minibatches=4, epochs=2, hidden=(32, 32)),
         )  # fmt: skip
         sizes = []

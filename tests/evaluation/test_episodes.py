@@ -42,10 +42,10 @@ def episodes():
     log, env = EpisodeFlags(4, command=(0.5, 0.1)).log(TASK, 0), StubEnv()
     log.begin(env)
     assert env.commands.tolist() == [[0.5, 0.1, 0.0, 0.0]] * 4
-    env.set(ending=[0, -1, -1, ENDS.index("came_apart")])
+    env.set(termination=[0, -1, -1, ENDS.index("came_apart")])
     env.set(base_pos=[[1.5, 0.0, 0.4], [1.0, 0.1, 0.2], [1.0, 0.0, 0.3], [np.nan, 0.0, 9.0]])
     assert not log.record_step(env)
-    env.set(ending=[ENDS.index("tilted"), ENDS.index("low_base"), -1, -1])
+    env.set(termination=[ENDS.index("tilted"), ENDS.index("low_base"), -1, -1])
     env.set(base_pos=[[9.0, 9.0, 9.0], [1.0, 0.4, 0.0], [1.0, 0.0, 0.3], [9.0, 9.0, 9.0]])
     assert not log.record_step(env)
     return log

@@ -32,10 +32,10 @@ def test_apex_metrics_match_hand_computed_values():
         "base_quat": [[0.0, 0.0, math.sin(angle), math.cos(angle)] for angle in half],
     }
     speeds = {"base_vel": [[0.0, 0.03, 0.04], [9.0] * 3, [0.0, 0.0, -0.2], [0.0] * 3]}
-    first = make_arrays(jumps, ending=[0, 1, 0, -1], **landed, **heights, **speeds, **base_poses)
+    first = make_arrays(jumps, termination=[0, 1, 0, -1], **landed, **heights, **speeds, **base_poses)
     assert not jumps.update(first, 1.0 / 60.0)
     later = {"max_height": [9.0, 9.0, 9.0, 0.9], "peak_tilt": [3.0] * 4}
-    assert jumps.update(make_arrays(jumps, ending=[2, 2, 2, 2], **later), 1.0 / 60.0)
+    assert jumps.update(make_arrays(jumps, termination=[2, 2, 2, 2], **later), 1.0 / 60.0)
     metrics = apex_metrics(jumps, (0.5, 1.1))
     expected = {
         "jumps": 4,
@@ -75,7 +75,7 @@ def test_unfinished_jump_fails_with_no_end():
 def test_columns_have_one_row_per_jump_and_none_for_nan():
     jumps = HeightLog(np.array([0.5, 0.8]), ("success", "came_apart"))
     landed = {"phase": [2, 0], "phase_steps": [60, 0]}
-    jumps.update(make_arrays(jumps, ending=[0, 1], max_height=[0.52, np.nan], **landed), 1.0 / 60.0)
+    jumps.update(make_arrays(jumps, termination=[0, 1], max_height=[0.52, np.nan], **landed), 1.0 / 60.0)
     assert jumps.columns() == {
         "target_m": [0.5, 0.8], "apex_m": [pytest.approx(0.52), None], "error_m": [pytest.approx(0.02), None],
         "end": ["success", "came_apart"],
@@ -91,7 +91,7 @@ def test_jump_in_progress_at_command_is_early():
 
 def test_landing_from_wrong_height_counts_as_miss_not_fall():
     jumps = HeightLog(np.array([0.5, 0.6, 0.7]), ("wrong_height", "collided", "success"))
-    jumps.update(make_arrays(jumps, ending=[0, 1, -1], phase=[2, 2, 2], phase_steps=[0, 3, 60]), 1.0 / 60.0)
+    jumps.update(make_arrays(jumps, termination=[0, 1, -1], phase=[2, 2, 2], phase_steps=[0, 3, 60]), 1.0 / 60.0)
     metrics = apex_metrics(jumps, (0.5, 1.1))
     assert [metrics[name] for name in ("success_rate", "fall_rate", "miss_rate")] == pytest.approx([1 / 3] * 3)
 

@@ -88,7 +88,7 @@ def five_jumps():
         base_pos=[[0.03, 0.96, 0.3], [-0.2, 0.8, 0.3], [1e9, 0.0, 0.0], [0.0, 0.9, 0.1], [0.0, 0.0, 0.3]],
         base_quat=[quat_about_z(QUARTER + 0.1), quat_about_z(QUARTER - 0.3), *([[0.0, 0.0, 0.0, 1.0]] * 3)],
         base_vel=[[0.0, 0.06, 0.0], [0.2, 0.0, 0.0], *([[0.0] * 3] * 3)],
-        phase=[2, 2, 1, 2, 0], phase_steps=[60, 60, 3, 20, 9], ending=[0, -1, 1, COLLIDED, NO_JUMP],
+        phase=[2, 2, 1, 2, 0], phase_steps=[60, 60, 3, 20, 9], termination=[0, -1, 1, COLLIDED, NO_JUMP],
         peak_tilt=[0.1, 0.2, 3.0, 1.0, 0.0], max_height=[0.6, 0.5, 9.0, 0.7, 0.3],
     )  # fmt: skip
     assert landings.record_step(env)
@@ -148,7 +148,7 @@ def test_log_does_not_change_after_all_jumps_ended():
     landings = five_jumps()
     before = landings.landing.copy()
     later = StubEnv(5)
-    later.set(ending=COLLIDED, base_pos=7.0)
+    later.set(termination=COLLIDED, base_pos=7.0)
     assert landings.record_step(later)
     assert np.array_equal(landings.landing, before) and landings.success.sum() == 1
 
@@ -244,11 +244,11 @@ def test_second_takeoff_needs_upward_speed_and_no_contact(phases, takeoffs):
 def test_longer_rest_time_counts_later_falls():
     landings, env = LandingLog(np.zeros((2, 1, 2)), TERMINATIONS, rest=3.0), StubEnv(2)
     landings.begin(env)
-    env.set(phase=2, phase_steps=60, ending=0)
+    env.set(phase=2, phase_steps=60, termination=0)
     assert not landings.record_step(env)
-    env.set(phase_steps=120, ending=[0, 2])
+    env.set(phase_steps=120, termination=[0, 2])
     assert not landings.record_step(env)
-    env.set(phase_steps=180, ending=0)
+    env.set(phase_steps=180, termination=0)
     assert landings.record_step(env)
     assert landings.outcomes[:, 0].tolist() == ["success", "low_base"]
     metrics = landing_metrics(landings)
@@ -282,7 +282,7 @@ def two_in_a_row():
     """Return the log of two rows of jumps, one successful and one whose first jump collides, and the environment."""
     landings, env = LandingLog(np.array([[[0.8, 0.2], [0.7, 0.0]]] * 2), TERMINATIONS, rest=0.5), StubEnv(2)
     landings.begin(env)
-    env.set(base_pos=[0.8, 0.15, 0.3], phase=2, phase_steps=[29, 10], ending=[-1, COLLIDED])
+    env.set(base_pos=[0.8, 0.15, 0.3], phase=2, phase_steps=[29, 10], termination=[-1, COLLIDED])
     assert not landings.record_step(env) and not env.commanded
     env.set(phase_steps=30)
     assert not landings.record_step(env)
@@ -298,7 +298,7 @@ def test_next_jump_is_commanded_only_after_rest_of_landed_jump():
 
 def test_next_jump_error_is_relative_to_its_own_goal():
     landings, env = two_in_a_row()
-    env.set(base_pos=[[1.48, 0.15, 0.3], [0.0, 0.0, 0.0]], phase=2, phase_steps=30, ending=0)
+    env.set(base_pos=[[1.48, 0.15, 0.3], [0.0, 0.0, 0.0]], phase=2, phase_steps=30, termination=0)
     assert landings.record_step(env)
     assert landings.error[0] == pytest.approx([0.05, 0.02])
     assert landings.outcomes.tolist() == [["success", "success"], ["collided", "not_begun"]]

@@ -18,7 +18,7 @@ class Trainer:
     def __init__(self):
         self.progress = []
 
-    def prepare(self):
+    def compile(self):
         pass
 
     def set_progress(self, progress):

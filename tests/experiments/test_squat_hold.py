@@ -36,7 +36,7 @@ def test_squat_metrics_match_hand_computed_values():
 
 
 def test_squat_metrics_are_none_if_no_robot_holds():
-    metrics = squat_metrics(squat_log([np.ones(4)] * 2, ending=np.zeros(3)))
+    metrics = squat_metrics(squat_log([np.ones(4)] * 2, termination=np.zeros(3)))
     assert metrics["holding_rate"] == 0.0
     assert all(value is None for name, value in metrics.items() if name not in ("squats", "holding_rate"))
 
