@@ -9,7 +9,7 @@ import pytest
 from jumper_warp.identification.excitation import Scorer
 from jumper_warp.identification.identify import identify
 from jumper_warp.identification.initial_states import paw_positions, stance, unevenness
-from jumper_warp.identification.least_squares import gram
+from jumper_warp.identification.least_squares import transposed_product
 from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import Parameter, ParameterSet, jumper_parameters, total_mass, weighed_mass
 from jumper_warp.identification.recording import KINDS, measure, replay_plan, sample_plan, simulate_plan
@@ -135,7 +135,7 @@ def test_first_part_of_a_motion_has_the_residuals_of_the_whole(standing, replay)
 def test_gram_matches_numpy():
     rng = np.random.default_rng(0)
     left, right = rng.normal(size=(101, 7)), rng.normal(size=(101, 3))
-    np.testing.assert_allclose(gram(left, right), left.T @ right, atol=1e-12)
+    np.testing.assert_allclose(transposed_product(left, right), left.T @ right, atol=1e-12)
 
 
 def few_parameters():
