@@ -144,8 +144,8 @@ def summary(result: Identification) -> str:
     text = (
         f"{int(result.identified.sum())} of {len(result.parameters)} parameters are identified from {result.count} "
         f"measured values. Mean squared weighed residual {result.chi2:.3f} (as described {result.nominal_chi2:.4g}). "
-        f"{result.effort.seconds:.1f} s, {result.effort.cpu_seconds:.1f} s of CPU, {result.effort.world_steps / 1e6:.2f} million physics steps of "
-        f"{1e3 * result.dt:.3g} ms."
+        f"{result.effort.seconds:.1f} s, {result.effort.cpu_seconds:.1f} s of CPU, "
+        f"{result.effort.world_steps / 1e6:.2f} million physics steps of {1e3 * result.dt:.3g} ms."
     )
     if result.mismatch > 1.0:
         text += (
