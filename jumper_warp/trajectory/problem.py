@@ -103,7 +103,7 @@ class SimulatedMotion:
 
     @cached_property
     def points(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Links' origins (steps + 1, num, 4, 5, 3) and paws' centres (steps + 1, num, 4, 3) [m], see `WholeBody.points`."""
+        """Links' origins (steps + 1, num, 4, 5, 3) and paws' centres (steps + 1, num, 4, 3) [m]: `WholeBody.points`."""
         return self.body.points(self.q)
 
     @property

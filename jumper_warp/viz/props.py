@@ -1,4 +1,4 @@
-"""What a recording shows beside the robots: marks on the ground, and blocks that move."""
+"""Additions to a recording: goal markers on the ground and moving blocks."""
 
 from __future__ import annotations
 
@@ -11,17 +11,18 @@ import trimesh
 from jumper_warp.viz.recording import Recording
 from jumper_warp.viz.shapes import ShapeMesh
 
-MARK_RADIUS = 0.04
-"""[m]"""
-MARK_LIFT = 0.003
-"""[m] Above the ground, so that it is seen."""
-MARK_CORNERS = 24
-MARK_COLOR = (0.85, 0.15, 0.15)
-BLOCK_COLOR = (0.55, 0.45, 0.35)
+MARK_RADIUS = 0.04  # [m]
+MARK_LIFT = 0.003  # [m] height above the goal, so that the ground does not hide the disc
+MARK_CORNERS = 24  # of the polygon that approximates the disc
+MARK_COLOR = (0.85, 0.15, 0.15)  # RGB, each in [0, 1]
+BLOCK_COLOR = (0.55, 0.45, 0.35)  # RGB, each in [0, 1]
 
 
 def with_goal_markers(recording: Recording, places: np.ndarray) -> Recording:
-    """Return the recording with a disc at each place, (recorded worlds, places a world, 3) [m], that is a number."""
+    """Return the recording with a red disc at each place that is finite.
+
+    places: (recorded worlds, places of a world, 3) [m], world frame.
+    """
     angle = np.linspace(0.0, 2.0 * math.pi, MARK_CORNERS, endpoint=False)
     rim = MARK_RADIUS * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
     disc = np.concatenate([np.zeros((1, 3)), rim]) + (0.0, 0.0, MARK_LIFT)
@@ -29,8 +30,8 @@ def with_goal_markers(recording: Recording, places: np.ndarray) -> Recording:
     triangles = np.stack([np.zeros_like(corner), 1 + corner, 1 + (corner + 1) % MARK_CORNERS], axis=1).astype(np.int32)
     normals = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (len(disc), 1))
     marks = []
-    for rank, of_world in enumerate(places):
-        for number, place in enumerate(of_world):
+    for rank, world_places in enumerate(places):
+        for number, place in enumerate(world_places):
             if np.isfinite(place).all():
                 vertices = (disc + place + (0.0, rank * recording.spacing, 0.0)).astype(np.float32)
                 marks.append(ShapeMesh(f"goal_{rank}_{number}", -1, MARK_COLOR, vertices, normals, triangles))
@@ -38,10 +39,10 @@ def with_goal_markers(recording: Recording, places: np.ndarray) -> Recording:
 
 
 def with_blocks(recording: Recording, centers: np.ndarray, half: np.ndarray, height: np.ndarray) -> Recording:
-    """Return the recording with a moving block in each world, standing on z = 0.
+    """Return the recording with a moving block, body `world_<i>/block`, in each world, standing on z = 0.
 
-    centers: [m] x and y, world frame, (frames, recorded worlds, 2). half: [m] half extents along x and y, (recorded
-    worlds, 2). height: [m] (recorded worlds,).
+    centers: x and y [m], world frame, (frames, recorded worlds, 2). half: half extents along x and y [m], (recorded
+    worlds, 2). height: [m], (recorded worlds,).
     """
     poses, names, shapes = [recording.poses], list(recording.bodies), list(recording.shapes)
     for rank, world in enumerate(recording.worlds):
