@@ -151,7 +151,7 @@ SMOOTH: dict[str, Smooth] = {
 
 
 def smooth_reward(task: Any, context: RewardContext) -> torch.Tensor:
-    """Return the weighted sum (n,) of the task's rewards in `SMOOTH`; terms with `scale_by_dt` times the policy step."""
+    """Return the weighted sum (n,) of rewards in `SMOOTH`; those with `scale_by_dt` times the policy step."""
     total = torch.zeros_like(context.goal)
     for term in task.rewards:
         if term.func.key in SMOOTH:

@@ -89,14 +89,10 @@ class Scorer:
 class Excitation:
     """Chosen motions and their expected information."""
 
-    plans: tuple[Plan, ...]
-    """Motions, in the order in which they were chosen."""
-    gain: tuple[float, ...]
-    """[nat] Total information gained over the prior, 1/2 ln det, after each motion."""
-    std: np.ndarray
-    """(P,) Expected standard deviations after all motions, relative to the prior's."""
-    refused: tuple[str, ...]
-    """`kind: reason` of each unsafe candidate."""
+    plans: tuple[Plan, ...]  # motions, in the order in which they were chosen
+    gain: tuple[float, ...]  # [nat] Total information gained over the prior, 1/2 ln det, after each motion
+    std: np.ndarray  # (P,) Expected standard deviations after all motions, relative to the prior's
+    refused: tuple[str, ...]  # `kind: reason` of each unsafe candidate
     parameters: ParameterSet
 
     def to_json(self) -> dict[str, Any]:

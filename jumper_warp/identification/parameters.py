@@ -29,21 +29,14 @@ class Parameter:
     """
 
     name: str
-    quantity: str
-    """A field of `RobotValues`."""
-    places: tuple[int, ...]
-    """Columns of the quantity that take this value, such as motor indices."""
+    quantity: str  # a field of `RobotValues`
+    places: tuple[int, ...]  # columns of the quantity that take this value, such as motor indices
     unit: str
-    nominal: float
-    """[unit] Mean of the prior."""
-    prior: float
-    """[unit] Standard deviation of the prior; for a ratio, of ln(value / nominal) [1]."""
-    bounds: tuple[float, float]
-    """[unit]"""
-    scale: Literal["ratio", "absolute"] = "ratio"
-    """Whether the prior is normal in ln(value / nominal) or in the value."""
-    group: str = ""
-    """One of `GROUPS`."""
+    nominal: float  # [unit] Mean of the prior
+    prior: float  # [unit] Standard deviation of the prior; for a ratio, of ln(value / nominal) [1]
+    bounds: tuple[float, float]  # [unit] lower and upper
+    scale: Literal["ratio", "absolute"] = "ratio"  # whether the prior is normal in ln(value / nominal) or in the value
+    group: str = ""  # one of `GROUPS`
 
     def __post_init__(self) -> None:
         """Raise InputError: bounds that exclude the nominal value, or (ratio) 0 and below, or a prior not positive."""
@@ -250,12 +243,9 @@ class PriorMeasurement:
     """Measurement of the robot other than its motions, such as its weighed mass; counts as one more residual."""
 
     name: str
-    measure: Callable[[RobotValues], np.ndarray]
-    """Returns the modelled quantity of N robots, (N,)."""
-    value: float
-    """Measured value, in the quantity's unit."""
-    std: float
-    """Standard deviation of the measurement, in the same unit."""
+    measure: Callable[[RobotValues], np.ndarray]  # returns the modelled quantity of N robots, (N,)
+    value: float  # measured value, in the quantity's unit
+    std: float  # standard deviation of the measurement, in the same unit
 
 
 def total_mass(robots: RobotValues) -> np.ndarray:

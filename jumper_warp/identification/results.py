@@ -27,16 +27,11 @@ LARGEST_PRIOR_ERROR = 3.0
 class DescentStep:
     """Log entry of one step of the optimisation."""
 
-    stage: int
-    """Number of the stage, from 1; 0: CMA-ES."""
-    chi2: float
-    """[1] Cost over the number of measured values."""
-    damping: float
-    """[1] Levenberg-Marquardt damping of the step; infinite if no step lowered the cost."""
-    world_steps: int
-    """Physics steps of all worlds so far."""
-    seconds: float
-    """[s] Wall time so far."""
+    stage: int  # number of the stage, from 1; 0: CMA-ES
+    chi2: float  # [1] Cost over the number of measured values
+    damping: float  # [1] Levenberg-Marquardt damping of the step; infinite if no step lowered the cost
+    world_steps: int  # physics steps of all worlds so far
+    seconds: float  # [s] Wall time so far
 
 
 class Effort(NamedTuple):
@@ -53,12 +48,9 @@ class Fit:
 
     motion: str
     channel: str
-    chi2: float
-    """[1] Mean squared residual over the noise."""
-    nominal_chi2: float
-    """[1] χ² of the described robot at the nominal initial state."""
-    rms: float
-    """Root mean square error [SI unit of the channel]."""
+    chi2: float  # [1] Mean squared residual over the noise
+    nominal_chi2: float  # [1] χ² of the described robot at the nominal initial state
+    rms: float  # root mean square error [SI unit of the channel]
 
 
 @dataclass(frozen=True)
@@ -66,33 +58,22 @@ class Identification:
     """Result of an identification of P parameters: estimate, uncertainty and fit."""
 
     parameters: ParameterSet
-    z: np.ndarray
-    """(P,) Identified parameters, normalised."""
-    covariance: np.ndarray
-    """(P, P) Covariance of z from noise and priors alone."""
-    mismatch: float
-    """[1] Smallest factor by which the model's errors widen all intervals; 1 if the model fits."""
+    z: np.ndarray  # (P,) Identified parameters, normalised
+    covariance: np.ndarray  # (P, P) Covariance of z from noise and priors alone
+    mismatch: float  # [1] Smallest factor by which the model's errors widen all intervals; 1 if the model fits
     systematic: np.ndarray
     """(P,) Standard deviations of z from contradictions between channels and motions; 0 if the model fits."""
-    chi2: float
-    """[1] Mean squared residual of the data over the noise."""
-    nominal_chi2: float
-    """[1] χ² of the described robot at the nominal initial states."""
-    count: int
-    """Number of measured values."""
-    fits: tuple[Fit, ...]
-    """Fit of each channel of each motion."""
-    directions: tuple[Direction, ...]
-    """Combinations of parameters that the data leaves open."""
+    chi2: float  # [1] Mean squared residual of the data over the noise
+    nominal_chi2: float  # [1] χ² of the described robot at the nominal initial states
+    count: int  # number of measured values
+    fits: tuple[Fit, ...]  # fit of each channel of each motion
+    directions: tuple[Direction, ...]  # combinations of parameters that the data leaves open
     steps: tuple[DescentStep, ...]
-    dt: float
-    """[s] Physics step."""
+    dt: float  # [s] Physics step
     effort: Effort
-    prior_measurements: tuple[PriorMeasurement, ...]
-    """Measurements of the robot other than motions, such as its mass."""
+    prior_measurements: tuple[PriorMeasurement, ...]  # measurements of the robot other than motions, such as its mass
     motions: tuple[MotionResiduals, ...]
-    starts: tuple[np.ndarray, ...]
-    """Identified coordinates (I,) of each motion's initial state."""
+    starts: tuple[np.ndarray, ...]  # identified coordinates (I,) of each motion's initial state
 
     @property
     def values(self) -> np.ndarray:

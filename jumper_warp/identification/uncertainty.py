@@ -46,8 +46,7 @@ class Direction:
     """[1] Fisher information of the data along the direction over the prior's; 0: only the prior determines it."""
     weights: tuple[tuple[str, float], ...]
     """(parameter name, component) of up to six largest components of the unit vector in normalised parameters."""
-    words: str
-    """Description in English, with a measurement that would determine the combination."""
+    words: str  # description in English, with a measurement that would determine the combination
 
 
 def mismatch_factor(tables: Sequence[np.ndarray]) -> float:

@@ -30,12 +30,9 @@ FEASIBLE = 1.0e-3  # [1] constraints up to this value count as satisfied
 class Progress:
     """Best candidates of a descent so far."""
 
-    x: np.ndarray
-    """(starts, n) Best feasible candidate of each start, or the least infeasible one if none was feasible."""
-    objective: np.ndarray
-    """(starts,) Objective of `x`; infinite if no candidate was feasible."""
-    violation: np.ndarray
-    """(starts,) Largest constraint of `x`, at least 0."""
+    x: np.ndarray  # (starts, n) Best feasible candidate of each start, or the least infeasible one if none was feasible
+    objective: np.ndarray  # (starts,) Objective of `x`; infinite if no candidate was feasible
+    violation: np.ndarray  # (starts,) Largest constraint of `x`, at least 0
     history: list[dict[str, float]] = field(default_factory=list)
     """By iteration: seconds, world_steps, reverse_steps (see `Problem`) and objective, the lowest feasible one."""
 

@@ -35,26 +35,17 @@ class RecordingError(InputError):
 class Recording:
     """One rollout of one or a few worlds, with a fixed set of bodies, series and contacts."""
 
-    times: np.ndarray
-    """(num_frames,) float64 [s], increasing."""
-    worlds: tuple[int, ...]
-    """Indices of the recorded worlds in the model."""
-    bodies: tuple[str, ...]
-    """Names of the recorded bodies, `world_<i>/<link>`, one world after the other."""
-    poses: np.ndarray
-    """(num_frames, num_bodies, 7) float32: origin [m] and quaternion xyzw, body to world."""
-    series: dict[str, np.ndarray]
-    """(num_frames,) float64 by name, `group/quantity [unit]`."""
-    contact_points: np.ndarray
-    """(num_frames, num_worlds, contacts_per_world, 3) float32 [m], world frame."""
+    times: np.ndarray  # (num_frames,) float64 [s], increasing
+    worlds: tuple[int, ...]  # indices of the recorded worlds in the model
+    bodies: tuple[str, ...]  # names of the recorded bodies, `world_<i>/<link>`, one world after the other
+    poses: np.ndarray  # (num_frames, num_bodies, 7) float32: origin [m] and quaternion xyzw, body to world
+    series: dict[str, np.ndarray]  # (num_frames,) float64 by name, `group/quantity [unit]`
+    contact_points: np.ndarray  # (num_frames, num_worlds, contacts_per_world, 3) float32 [m], world frame
     contact_forces: np.ndarray
     """(num_frames, num_worlds, contacts_per_world, 3) float32 [N], force on the robot, world frame."""
-    spacing: float = 0.0
-    """[m] Distance along y between the drawings of consecutive worlds; the data are not moved."""
-    shapes: tuple[ShapeMesh, ...] = ()
-    """Meshes to draw; their `body` is an index of `bodies`, -1 for the world."""
-    notes: dict[str, Any] = field(default_factory=dict)
-    """Metadata of JSON types, such as seed, gains and commit."""
+    spacing: float = 0.0  # [m] Distance along y between the drawings of consecutive worlds; the data are not moved
+    shapes: tuple[ShapeMesh, ...] = ()  # meshes to draw; their `body` is an index of `bodies`, -1 for the world
+    notes: dict[str, Any] = field(default_factory=dict)  # metadata of JSON types, such as seed, gains and commit
 
     def save_npz(self, path: Path) -> Path:
         """Write the recording atomically to one NumPy archive without pickles; return its path. Raises OSError."""

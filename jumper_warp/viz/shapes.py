@@ -21,16 +21,11 @@ class ShapeMesh:
     """Triangle mesh and color of one shape."""
 
     name: str
-    body: int
-    """Index of the body in the model; -1: fixed to the world."""
-    color: tuple[float, float, float]
-    """RGB, each in [0, 1]."""
-    vertices: np.ndarray
-    """(num_vertices, 3) float32 [m], in the body's frame; in the world frame if fixed to the world."""
-    normals: np.ndarray
-    """(num_vertices, 3) float32, outward unit normals in the same frame."""
-    triangles: np.ndarray
-    """(num_triangles, 3) int32, indices of vertices."""
+    body: int  # index of the body in the model; -1: fixed to the world
+    color: tuple[float, float, float]  # RGB, each in [0, 1]
+    vertices: np.ndarray  # (num_vertices, 3) float32 [m], in the body's frame; in the world frame if fixed to the world
+    normals: np.ndarray  # (num_vertices, 3) float32, outward unit normals in the same frame
+    triangles: np.ndarray  # (num_triangles, 3) int32, indices of vertices
 
 
 def shape_meshes(model: Model, worlds: tuple[int, ...]) -> list[ShapeMesh]:
