@@ -231,7 +231,8 @@ class Rollout:
         commands = self.dynamics.modules.trajectory.Commands()
         commands.target = self._input("targets", targets, (count, 12))
         q, qd = self._input("q", q, (19,)), self._input("qd", qd, (18,))
-        commands.before = q[7:] if initial_target is None else self._input("initial_target", initial_target, (12,))
+        initial = q[7:] if initial_target is None else self._input("initial_target", initial_target, (12,))
+        commands.initial_target = initial
         commands.wrench = self._zeros(count, 6, self.num_worlds) if wrench is None else (
             self._input("wrench", wrench, (count, 6))
         )  # fmt: skip
@@ -287,12 +288,12 @@ class Rollout:
         for name in ("q", "qd", "torque", "impulse", "pressed"):
             setattr(rows, name, getattr(trajectory, name))
         gradients = modules.gradients.Gradients()
-        shapes = {"q": (19,), "qd": (18,), "target": (count, 12), "before": (12,), "wrench": (count, 6),
-                  "safe": (count, 12), "parameters": (int(modules.gradients.GRADIENT_ROWS),)}  # fmt: skip
+        shapes = {"q": (19,), "qd": (18,), "target": (count, 12), "initial_target": (12,), "wrench": (count, 6),
+                  "filtered_target": (count, 12), "parameters": (int(modules.gradients.GRADIENT_ROWS),)}  # fmt: skip
         for name, shape in shapes.items():
             setattr(gradients, name, self._zeros(*shape, n))
         if filtered_target is not None:
-            wp.copy(gradients.safe, filtered_target)  # the reverse pass adds to it
+            wp.copy(gradients.filtered_target, filtered_target)  # the reverse pass adds to it
         motion = [self._timing(count), self._actuation, commands, trajectory.filtered_target, rows]
         if self.by_legs:
             last: Any
@@ -307,9 +308,9 @@ class Rollout:
                 self._record = self.dynamics.step_record(self.every)
             self._launch(modules.rollout_adjoint.reverse_kernel, [*motion, cotangents], [self._record, gradients])
         if trajectory.from_start:
-            wp.map(wp.add, gradients.q[7:], gradients.before, out=gradients.q[7:])
+            wp.map(wp.add, gradients.q[7:], gradients.initial_target, out=gradients.q[7:])
         by_inputs = {"targets": gradients.target, "q": gradients.q, "qd": gradients.qd, "wrench": gradients.wrench}
-        return by_inputs | {"initial_target": gradients.before} | self._split_parameters(gradients.parameters)
+        return by_inputs | {"initial_target": gradients.initial_target} | self._split_parameters(gradients.parameters)
 
     def _cotangents(self, trajectory: Trajectory, by_outputs: dict[str, wp.array | None]) -> Any:
         """Return the kernels' `Rows` of gradients by arrays of a trajectory; empty arrays for None and filtered_target.
@@ -349,7 +350,7 @@ class Rollout:
     def _rows(self, count: int) -> Any:
         """Return the kernels' `Rows`, the arrays of a `Trajectory` of `count` policy steps, uninitialised."""
         steps, n = count * self.substeps, self.num_worlds
-        rows = self.dynamics.modules.trajectory.Rows()
+        rows = self.dynamics.modules.trajectory.TrajectoryArrays()
         rows.q, rows.qd = (self._empty(steps // self.every + 1, size, n) for size in (19, 18))
         rows.torque = self._empty(steps, 12, n)
         rows.impulse = self._empty(steps, 4, n, dtype=self.dynamics.modules.scalar.vec3)

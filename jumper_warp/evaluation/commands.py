@@ -49,7 +49,7 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     Raises PolicyError: the policy cannot be used or cannot store metrics; OSError: the folder cannot be created.
     """
     if cfg.save_to_policy and is_run(run.source):
-        raise PolicyError(f"{run.source}: a run keeps no figures; export it first")
+        raise PolicyError(f"{run.source}: a run keeps no metrics; export it first")
     run.prepare("evaluate", cfg.conditions, cfg.out)
     log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.seed)
     run.run_episodes(run.env(log.count), log)

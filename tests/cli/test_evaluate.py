@@ -46,8 +46,8 @@ def test_refuses_unknown_evaluation():
 def test_goals_are_evenly_spaced_ahead_and_sampled_to_the_side():
     flags = LandingFlags(num_jumps=5, goal_y=(-0.2, 0.1))
     log = flags.log(TASK, seed=3)
-    assert log.places[:, 0, 0] == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.5])
-    lateral = log.places[:, 0, 1]
+    assert log.goal_positions[:, 0, 0] == pytest.approx([0.3, 0.6, 0.9, 1.2, 1.5])
+    lateral = log.goal_positions[:, 0, 1]
     assert -0.2 <= lateral.min() < lateral.max() <= 0.1
     assert len(set(log.headings)) == 5 and np.abs(log.headings).max() <= math.pi
     assert np.array_equal(flags.log(TASK, seed=3).goal_positions, log.goal_positions)
@@ -107,7 +107,7 @@ def test_success_range_selects_goals_by_distance():
     flags = LandingFlags(num_jumps=3, goal_x=(0.0, 0.0), goal_y=(0.0, 0.0), heading=0.0, success_range=(0.3, 0.5))
     landings = flags.log(TASK, 0)
     landings.goal_positions[:, 0] = goals
-    landings.place[:, 0], landings.target[:, 0] = goals, goals
+    landings.end_position[:, 0], landings.goal_world[:, 0] = goals, goals
     landings.heading[:], landings.yaw[:], landings.tilt[:] = 0.0, 0.0, 0.0
     landings.end[:, 0] = [*[LANDING_TERMINATIONS.index("success")] * 2, LANDING_TERMINATIONS.index("low_base")]
     metrics = flags.metrics(landings)

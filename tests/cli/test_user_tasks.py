@@ -225,11 +225,11 @@ def test_resume_warns_about_a_changed_file_and_keeps_settings(capsys, runs, path
     folder, edited = tmp_path / "tame-jump" / "run", tmp_path / "edited" / "my_jumps.py"
     shutil.copytree(runs["tame-jump"], folder)
     edited.parent.mkdir()
-    edited.write_text(TASK.replace("view.height / height", "view.height / (2.0 * height)"))
+    edited.write_text(TASK.replace("robot.height / height", "robot.height / (2.0 * height)"))
     args = ["--device", "cpu", "--max-iterations", "2", "--resume", str(folder)]
     code, _, err = run(capsys, "train", "tame-jump", "--task-module", str(edited), *args)
     assert code == 0, err
-    warning = "my_jumps has changed since: its functions are those of now, settings those of the run"
+    warning = "my_jumps has changed since: its present functions are used, with the run's settings"
     assert err.count(warning) == 1 and "max-iterations 1 -> 2" in err
     config = json.loads((folder / "config.json").read_text())
     assert config["sources"] == {"my_jumps": hashlib.sha256(edited.read_bytes()).hexdigest()}

@@ -42,9 +42,8 @@ def simulated_apex(kp, kd):
     return max(heights[STAND + RAMP + HOLD :])
 
 
-@pytest.mark.parametrize(
-    ("gains", "about"), [(None, OPEN_LOOP_APEX), ((0.6, 1.0), 0.757)], ids=["nominal", "weak"]
-)  # 0.757 m: from an independent simulation
+# 0.757 m: from an independent simulation
+@pytest.mark.parametrize(("gains", "about"), [(None, OPEN_LOOP_APEX), ((0.6, 1.0), 0.757)], ids=["nominal", "weak"])
 def test_open_loop_limit_equals_simulated_apex(gains, about):
     apexes = open_loop_limits(*initial_env(Conditions(gain_scale=gains), 2))
     assert apexes == pytest.approx([simulated_apex(*(gains or (1.0, 1.0)))] * 2, abs=0.002)

@@ -149,7 +149,7 @@ def test_refuses_settings_out_of_range(make):
 def test_play_flags_command_velocities_in_sequence():
     one, two = ((0.5, 0.0, 0.3),), ((0.5, 0.0, 0.3), (0.0, -0.2, 0.0))
     np.testing.assert_array_equal(VelocityPlayFlags(velocity=one).log(TASK).commands, [one])
-    goals = VelocityPlayFlags(velocity=two, each=2.0)
+    goals = VelocityPlayFlags(velocity=two, command_interval=2.0)
     assert goals.length == 4.0 and goals.log(TASK).times.tolist() == [0.0, 2.0]
     np.testing.assert_array_equal(goals.log(TASK).commands, [two])
     assert VelocityPlayFlags().log(TASK).commands.shape == (1, 6, 3)

@@ -150,13 +150,7 @@ def test_sweep_of_a_run_writes_metrics_plot_recording_and_filmstrip(trained, tmp
     ).run()
     saved = json.loads((tmp_path / "metrics.json").read_text())
     assert saved == values
-    assert {
-        "mean_abs_error_m",
-        "success_rate",
-        "success_rate_in_range",
-        "success_rate_0_6_1_1",
-        "jumps",
-    } <= saved.keys()
+    assert {"mean_abs_error_m", "success_rate", "success_rate_in_range", "success_rate_0_6_1_1"} <= saved.keys()
     assert {"landing_rate", "largest_tilt_deg", "largest_reached_m"} <= saved.keys()
     assert {"still_landing_rate", "max_drift_m", "max_turn_deg", "miss_rate", "max_landing_tilt_deg"} <= saved.keys()
     assert {"reachable_share", "success_rate_reachable", "pushed_in_flight_success_rate"} <= saved.keys()

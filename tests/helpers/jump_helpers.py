@@ -23,8 +23,7 @@ from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, STEP_DT, SUBSTEPS, array, ne
 
 DEG = np.pi / 180.0
 NUM_START_MODES = ("standing", "default", "in_flight", "touchdown", "after_landing", "pushing")
-OF_WORLD = ("level", "streak")
-"""What a world keeps from episode to episode."""
+OF_WORLD = ("level", "streak")  # What a world keeps from episode to episode
 
 
 class Table:

@@ -12,11 +12,9 @@ from jumper_warp.envs.env import Env
 from jumper_warp.kernels.collision.robot import collision_kernel
 from solver_helpers import Reference, States, paw_joint
 
-PLACES = ("horizontal-jump", "omnidirectional-jump")
-"""Names of the tasks of jumps to landing positions."""
+PLACES = ("horizontal-jump", "omnidirectional-jump")  # Names of the tasks of jumps to landing positions
 PAW_RADIUS = 0.025  # [m]
-ANKLE = np.array([0.0, 0.0, -0.3])
-"""[m] Position of a paw's centre in the frame of the joint that carries it."""
+ANKLE = np.array([0.0, 0.0, -0.3])  # [m] Position of a paw's centre in the frame of the joint that carries it
 
 
 class Starts:

@@ -38,10 +38,8 @@ BEYOND = {
     "damping_gains": None, "resample_at": "reset", "zero_latency_probability": 0.0,
 }  # fmt: skip
 """Settings that the table does not contain, for jumping."""
-HELD = {"push_interval": None, "push_probability": 1.0}
-"""A push in every episode, from its beginning to its end."""
-ALL = PAPER | {"observation_latency": (0.0, 16.0)}
-"""Every row."""
+HELD = {"push_interval": None, "push_probability": 1.0}  # A push in every episode, from its beginning to its end
+ALL = PAPER | {"observation_latency": (0.0, 16.0)}  # Every row
 
 
 def randomized(cfg, num_envs=N, **arguments):

@@ -16,10 +16,8 @@ COORDS, DOFS, BODIES = 43, 38, 21
 MOTORS = np.array([5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
 KNEES = np.array([5 * leg + joint for leg in range(4) for joint in (2, 4)])
 MOTOR_Q, MOTOR_V, KNEE_V = 7 + MOTORS, 6 + MOTORS, 6 + KNEES
-SHANKS = np.array([5, 10, 15, 20])
-"""Bodies that carry the paws."""
-OPEN_STOPS = 0.35
-"""[rad] Random states keep this far from the stops."""
+SHANKS = np.array([5, 10, 15, 20])  # Bodies that carry the paws
+OPEN_STOPS = 0.35  # [rad] Random states keep this far from the stops
 
 
 @dataclasses.dataclass
