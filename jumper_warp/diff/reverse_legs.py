@@ -28,7 +28,8 @@ class LegThreadReverse:
         """Add the rollout's gradients to `gradients` (`Gradients`); its q and qd must hold the last row's cotangents.
 
         All arguments are structs of the kernels. settings: `StepSettings`. motion: [`Timing`, `Actuation`, `Commands`,
-        filtered targets (T, 12, num_worlds), `Rows`] of the rollout. cotangents: `Rows`, the loss's gradient by `Rows`.
+        filtered targets (T, 12, num_worlds), `TrajectoryArrays`] of the rollout. cotangents: `TrajectoryArrays`, the
+        gradient of the loss by the rollout's.
         """
         robot, record, num = self._dynamics.robot, self._record, self._num
         legs, constants = self._modules.rollout_legs_adjoint, self._modules.constants_adjoint

@@ -284,7 +284,7 @@ class Rollout:
             raise InputError(f"this rollout makes trajectories {rows_of}, got {trajectory.q.shape}")
         by_outputs = {"q": q, "qd": qd, "torque": torque, "impulse": impulse, "filtered_target": filtered_target}
         cotangents = self._cotangents(trajectory, by_outputs)
-        rows = modules.trajectory.Rows()
+        rows = modules.trajectory.TrajectoryArrays()
         for name in ("q", "qd", "torque", "impulse", "pressed"):
             setattr(rows, name, getattr(trajectory, name))
         gradients = modules.gradients.Gradients()
@@ -313,11 +313,11 @@ class Rollout:
         return by_inputs | {"initial_target": gradients.initial_target} | self._split_parameters(gradients.parameters)
 
     def _cotangents(self, trajectory: Trajectory, by_outputs: dict[str, wp.array | None]) -> Any:
-        """Return the kernels' `Rows` of gradients by arrays of a trajectory; empty arrays for None and filtered_target.
+        """Return gradients by arrays of a trajectory as `TrajectoryArrays`; empty for None and filtered_target.
 
         Raises InputError: another shape or type than the trajectory's array.
         """
-        cotangents = self.dynamics.modules.trajectory.Rows()
+        cotangents = self.dynamics.modules.trajectory.TrajectoryArrays()
         for name, array in by_outputs.items():
             like = getattr(trajectory, name)
             alike = isinstance(array, wp.array) and array.shape == like.shape and array.dtype == like.dtype
@@ -348,7 +348,7 @@ class Rollout:
         return timing
 
     def _rows(self, count: int) -> Any:
-        """Return the kernels' `Rows`, the arrays of a `Trajectory` of `count` policy steps, uninitialised."""
+        """Return uninitialised `TrajectoryArrays` for a `Trajectory` of `count` policy steps."""
         steps, n = count * self.substeps, self.num_worlds
         rows = self.dynamics.modules.trajectory.TrajectoryArrays()
         rows.q, rows.qd = (self._empty(steps // self.every + 1, size, n) for size in (19, 18))

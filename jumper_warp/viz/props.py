@@ -18,10 +18,10 @@ MARK_COLOR = (0.85, 0.15, 0.15)  # RGB, each in [0, 1]
 BLOCK_COLOR = (0.55, 0.45, 0.35)  # RGB, each in [0, 1]
 
 
-def with_goal_markers(recording: Recording, places: np.ndarray) -> Recording:
-    """Return the recording with a red disc at each place that is finite.
+def with_goal_markers(recording: Recording, goals: np.ndarray) -> Recording:
+    """Return the recording with a red disc at each finite goal.
 
-    places: (recorded worlds, places of a world, 3) [m], world frame.
+    goals: (recorded worlds, goals by world, 3) [m], world frame.
     """
     angle = np.linspace(0.0, 2.0 * math.pi, MARK_CORNERS, endpoint=False)
     rim = MARK_RADIUS * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
@@ -30,10 +30,10 @@ def with_goal_markers(recording: Recording, places: np.ndarray) -> Recording:
     triangles = np.stack([np.zeros_like(corner), 1 + corner, 1 + (corner + 1) % MARK_CORNERS], axis=1).astype(np.int32)
     normals = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (len(disc), 1))
     marks = []
-    for rank, world_places in enumerate(places):
-        for number, place in enumerate(world_places):
-            if np.isfinite(place).all():
-                vertices = (disc + place + (0.0, rank * recording.spacing, 0.0)).astype(np.float32)
+    for rank, world_goals in enumerate(goals):
+        for number, goal in enumerate(world_goals):
+            if np.isfinite(goal).all():
+                vertices = (disc + goal + (0.0, rank * recording.spacing, 0.0)).astype(np.float32)
                 marks.append(ShapeMesh(f"goal_{rank}_{number}", -1, MARK_COLOR, vertices, normals, triangles))
     return replace(recording, shapes=(*recording.shapes, *marks))
 
