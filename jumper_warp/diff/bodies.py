@@ -11,7 +11,10 @@ PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def moment_rows(body: int) -> slice:
-    """Return the rows of the parameter table with the mass moments of a body; bodies are numbered as in the model."""
+    """Return a body's ten rows of the parameter table: mass, 3 first and 6 second moments, see `PAIRS`.
+
+    body: 0 is the base; then 5 links of each leg FL, FR, BL, BR, as in the model.
+    """
     leg, link = divmod(body - 1, int(LEG_BODIES))
     first = int(BASE) if body == 0 else leg * int(LEG_ROWS) + link * MOMENT_ROWS
     return slice(first, first + MOMENT_ROWS)
@@ -22,7 +25,7 @@ def body_gradients(table: np.ndarray, gradient: np.ndarray) -> dict[str, np.ndar
 
     table, gradient: parameter table and gradient by it, (321, num_worlds). The table holds first moments m c and second
     moments S = 1/2 tr(I) 1 - I + m c c^T (parallel axes). Returned: mass (21, num_worlds), com (21, 3, num_worlds),
-    inertia (21, 6, num_worlds): xx, yy, zz, xy, xz, yz, an off-diagonal one changing both of its entries.
+    inertia (21, 6, num_worlds) in the order of `PAIRS`; an off-diagonal entry stands for both symmetric entries.
     """
     worlds = table.shape[1]
     mass = np.zeros((int(BODIES), worlds))

@@ -18,27 +18,19 @@ from jumper_warp.diff.snapshot import Snapshot
 from jumper_warp.diff.torch_rollout import simulate
 from jumper_warp.utils.errors import InputError
 
-DOWN = (0.0, 0.0, -1.0)
-"""Direction of gravity, world axes."""
+DOWN = (0.0, 0.0, -1.0)  # direction of gravity, world axes
 
 
 class LoopState(NamedTuple):
     """State at the beginning of a policy step, worlds last, in the layout of `jumper_warp.diff.rollout.Trajectory`."""
 
-    q: torch.Tensor
-    """(19, num_worlds) [m], xyzw, [rad]"""
-    qd: torch.Tensor
-    """(18, num_worlds) [m/s], [rad/s]"""
-    initial_target: torch.Tensor
-    """(12, num_worlds) [rad] Filtered targets of the last policy step."""
-    impulse: torch.Tensor
-    """(4, num_worlds, 3) [N s] Contact impulses in the last physics step; has no gradient."""
-    action: torch.Tensor
-    """(12, num_worlds) Of the last policy step, within ±1."""
-    torque: torch.Tensor
-    """(12, num_worlds) [N m] Of the last physics step."""
-    history: torch.Tensor
-    """(columns, num_worlds) Earlier frames of the policy's terms with a history, oldest first."""
+    q: torch.Tensor  # (19, num_worlds) base origin [m], orientation xyzw, motor angles [rad]
+    qd: torch.Tensor  # (18, num_worlds) velocity of the base's COM [m/s], angular velocity, motor rates [rad/s]
+    initial_target: torch.Tensor  # (12, num_worlds) [rad] filtered targets of the last policy step
+    impulse: torch.Tensor  # (4, num_worlds, 3) [N s] contact impulses in the last physics step; has no gradient
+    action: torch.Tensor  # (12, num_worlds) actions of the last policy step, within ±1
+    torque: torch.Tensor  # (12, num_worlds) [N m] motor torques in the last physics step
+    history: torch.Tensor  # (columns, num_worlds) earlier frames of the policy's terms with a history, oldest first
 
     def detach(self) -> LoopState:
         """Return the state without gradients."""
@@ -48,50 +40,43 @@ class LoopState(NamedTuple):
 class RobotState(NamedTuple):
     """Base and motors as observations and rewards use them, worlds first."""
 
-    pos: torch.Tensor
-    """(num_worlds, 3) [m] Base origin, world axes."""
-    quat: torch.Tensor
-    """(num_worlds, 4) xyzw, body to world."""
-    lin_vel: torch.Tensor
-    """(num_worlds, 3) [m/s] Base origin, world axes."""
-    ang_vel: torch.Tensor
-    """(num_worlds, 3) [rad/s] Body axes."""
-    gravity: torch.Tensor
-    """(num_worlds, 3) Direction of gravity, body axes."""
-    angle: torch.Tensor
-    """(num_worlds, 12) [rad]"""
-    rate: torch.Tensor
-    """(num_worlds, 12) [rad/s]"""
+    pos: torch.Tensor  # (num_worlds, 3) [m] base origin, world axes
+    quat: torch.Tensor  # (num_worlds, 4) xyzw, body to world
+    lin_vel: torch.Tensor  # (num_worlds, 3) [m/s] base origin, world axes
+    ang_vel: torch.Tensor  # (num_worlds, 3) [rad/s] body axes
+    gravity: torch.Tensor  # (num_worlds, 3) [1] unit vector along gravity, body axes
+    angle: torch.Tensor  # (num_worlds, 12) [rad] true motor angles; legs FL, FR, BL, BR, each lateral, outer, inner
+    rate: torch.Tensor  # (num_worlds, 12) [rad/s] motor rates
 
 
 def rotate_inverse(quat: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-    """Return world vectors (n, 3) in the body axes of orientations (n, 4), xyzw."""
+    """Return world vectors v (n, 3) in the body axes of orientations quat (n, 4), xyzw, body to world."""
     u, w = -quat[:, :3], quat[:, 3:]
     twice = 2.0 * torch.linalg.cross(u, v)
     return v + w * twice + torch.linalg.cross(u, twice)
 
 
 def rotate(quat: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-    """Return body vectors (n, 3) in world axes, given orientations (n, 4), xyzw."""
+    """Return body vectors v (n, 3) in world axes, given orientations quat (n, 4), xyzw, body to world."""
     return rotate_inverse(quat * quat.new_tensor([-1.0, -1.0, -1.0, 1.0]), v)
 
 
 def heading_of(quat: torch.Tensor) -> torch.Tensor:
-    """Return the yaw [rad] (n,) of orientations (n, 4), xyzw: the heading of body x in the world plane."""
+    """Return the yaw [rad] (n,) of orientations (n, 4), xyzw: the direction of body x in the world's xy plane."""
     ahead = rotate(quat, quat.new_tensor([1.0, 0.0, 0.0]).expand(len(quat), 3))
     return torch.atan2(ahead[:, 1], ahead[:, 0])
 
 
 def with_gradient_of(value: torch.Tensor, computed: torch.Tensor) -> torch.Tensor:
-    """Return `value` with the derivatives of `computed`, of the same shape."""
+    """Return the numbers of `value` with the derivatives of `computed`, of the same shape."""
     return value + (computed - computed.detach())
 
 
 class ClosedLoop:
     """Differentiable policy steps and observations of the robots of an environment.
 
-    `advance` and `observe` are functions of tensors, in single or double precision; `step` also steps the environment
-    and returns its values with derivatives.
+    `advance` and `observe` are functions of tensors, in single or double precision; `step` also steps the
+    environment and returns its values with derivatives.
     """
 
     def __init__(self, env: Any, *, double: bool = False) -> None:
@@ -128,13 +113,13 @@ class ClosedLoop:
         lateral, transversal = (math.radians(scale) for scale in task.action_scale)
         like = {"dtype": self.dtype, "device": env.device}
         self.scale = torch.tensor(4 * [lateral, transversal, transversal], **like)
-        """(12,) [rad] Of an action of 1."""
+        """(12,) [rad] Change of the motor targets by an action of 1."""
         self.default = robots.default_angle.to(**like)
-        """(12,) [rad] Motor angles of a zero action."""
+        """(12,) [rad] Motor targets at a zero action."""
         self.read_parameters()
 
     def read_parameters(self) -> dict[str, torch.Tensor]:
-        """Copy the robots' masses, motors, friction and latency into the rollout; return them by name."""
+        """Copy the robots' parameters into the rollout; return copies by name, shapes as in `Rollout.parameters`."""
         robots: Snapshot = self.env.snapshot()
         parameters = {name: tensor.to(self.dtype, copy=True) for name, tensor in robots.parameters.items()}
         for name, tensor in parameters.items():
@@ -144,31 +129,34 @@ class ClosedLoop:
         return parameters
 
     def state(self) -> LoopState:
-        """Return the environment's state, without gradients."""
-        now: Snapshot = self.env.snapshot()
+        """Return a copy of the environment's present state, without gradients."""
+        env: Snapshot = self.env.snapshot()
         history = self._history_of(self.env.obs)
-        parts = (now.q, now.qd, now.initial_target, now.impulse, now.action, now.torque, history)
+        parts = (env.q, env.qd, env.initial_target, env.impulse, env.action, env.torque, history)
         return LoopState(*(part.to(self.dtype, copy=True).contiguous() for part in parts))
 
     def _history_of(self, obs: torch.Tensor) -> torch.Tensor:
-        """Return `LoopState.history` from the policy's observation (num_worlds, columns)."""
+        """Return `LoopState.history` from the policy's observation (num_worlds, columns of the actor)."""
         ends = [(first, end - term.width) for term, first, end in self._history_terms]
         return torch.cat([obs[:, first:last] for first, last in ends] or [obs[:, :0]], 1).T
 
     def _histories(self, state: LoopState) -> list[torch.Tensor]:
-        """Return the earlier frames of each term with a history, (num_worlds, columns)."""
+        """Return the earlier frames of each of `_history_terms`, (num_worlds, term's frames * width) each."""
         counts = [end - first - term.width for term, first, end in self._history_terms]
         return list(state.history.T.split(counts, 1)) if counts else []
 
     def _next_history(self, state: LoopState) -> torch.Tensor:
-        """Return the history of the next state: the oldest frame is dropped and this state's frame added."""
+        """Return the next `LoopState.history`: each term drops its oldest frame and appends its frame at `state`."""
         motion, frames = self.motion(state), []
         for (term, _, _), past in zip(self._history_terms, self._histories(state), strict=True):
             frames += [past[:, term.width :], self._frame(term, motion, state, past[:, : term.width])]
         return torch.cat(frames, 1).T if frames else state.history
 
     def _frame(self, term: Any, motion: RobotState, state: LoopState, observed: torch.Tensor) -> torch.Tensor:
-        """Return a term's observation of a state, (num_worlds, width); observed: the environment's."""
+        """Return a term's scaled and clipped observation at a state, (num_worlds, width).
+
+        motion: of the state. observed: the environment's observation of the term, (num_worlds, width).
+        """
         scale, clip = term.numbers["scale"], term.numbers["clip"]
         return scale * SMOOTH_TERMS[term.func.key](self, motion, state, observed / scale).clamp(-clip, clip)
 
@@ -179,11 +167,10 @@ class ClosedLoop:
         wrench: torch.Tensor | None = None,
         parameters: dict[str, torch.Tensor] | None = None,
     ) -> LoopState:
-        """Return the state after one policy step.
+        """Return the state after one policy step; latencies must be at most a policy step.
 
-        action: (num_worlds, 12), clamped to ±1; latencies are at most a policy step. wrench: (6, num_worlds) [N],
-        [N m] on the base. parameters: of `read_parameters`, which the reverse pass restores; by default the rollout's
-        present ones.
+        action: (num_worlds, 12), clamped to ±1. wrench: force [N] and moment [N m] on the base, (6, num_worlds).
+        parameters: from `read_parameters`, restored for the reverse pass; by default the rollout's present parameters.
         """
         clamped = action.clamp(-1.0, 1.0).T
         targets = clamped * self.scale[:, None] + self.default[:, None]
@@ -204,10 +191,9 @@ class ClosedLoop:
         return RobotState(q[:, :3], quat, lin_vel, rotate_inverse(quat, ang), gravity, q[:, 7:], qd[:, 6:])
 
     def observe(self, state: LoopState, observed: torch.Tensor, group: str = "actor") -> torch.Tensor:
-        """Return the observation of a group at a state, (num_worlds, columns), without noise.
+        """Return the observation of a group, "actor" or "critic", at a state, (num_worlds, columns), without noise.
 
-        observed: the environment's, (num_worlds, columns), for columns that do not depend on the robot's state, such as
-        commands.
+        observed: the environment's observation of the group, for columns without derivatives, such as commands.
         """
         motion, columns, histories = self.motion(state), [], iter(self._histories(state))
         for term, first, end in self._columns[group]:
@@ -219,21 +205,19 @@ class ClosedLoop:
         return torch.cat(columns, 1)
 
     def step(self, state: LoopState, action: torch.Tensor) -> tuple[LoopState, LoopState]:
-        """Step the environment; return the next state, and the rollout's state before any reset.
+        """Step the environment; return (next state after resets, state of the rollout before resets).
 
-        The next state has the environment's values with derivatives; a world with a new episode has no gradient.
-        action: (num_worlds, 12); state: the environment's present one, from `state` or the last `step`.
+        The next state has the environment's values with derivatives; a world that was reset has no gradient. action:
+        (num_worlds, 12). state: the environment's present state, from the method `state` or the last `step`.
         """
         env = self.env
         parameters = self.read_parameters() if self.randomizes else None
         env.step(action.detach())
-        wrench = None
-        if self.randomizes:
-            wrench = env.snapshot().wrench.to(self.dtype).contiguous()
-        simulated, now = self.advance(state, action, wrench, parameters), self.state()
+        wrench = env.snapshot().wrench.to(self.dtype).contiguous() if self.randomizes else None
+        simulated, after = self.advance(state, action, wrench, parameters), self.state()
         reset = env.done > 0.0 if env.auto_reset else torch.zeros_like(env.done, dtype=torch.bool)
         parts = []
-        for name, value, computed in zip(LoopState._fields, now, simulated, strict=True):
+        for name, value, computed in zip(LoopState._fields, after, simulated, strict=True):
             mask = reset[None, :, None] if name == "impulse" else reset[None]
             parts.append(torch.where(mask, value, with_gradient_of(value, computed)))
         if self.randomizes:
@@ -241,12 +225,15 @@ class ClosedLoop:
         return LoopState(*parts), simulated
 
     def observation(self, state: LoopState) -> torch.Tensor:
-        """Return the environment's observation, with its noise, and its derivatives by the state."""
+        """Return the environment's observation (num_worlds, columns), noise included, with derivatives by the state."""
         return with_gradient_of(self.env.obs.to(self.dtype), self.observe(state, self.env.obs))
 
 
 def _goal_offset(loop: ClosedLoop, motion: RobotState, state: LoopState, observed: torch.Tensor) -> torch.Tensor:
-    """Return the observed offset to the goal (n, 2) [m], body yaw frame, as a function of the base's position."""
+    """Return the observed offset from base to goal (n, 2) [m], body yaw frame, with derivatives by the base's pose.
+
+    A goal observed at (0, 0) has no derivative.
+    """
     heading = heading_of(motion.quat)
     cos, sin = torch.cos(heading), torch.sin(heading)
     axes = torch.stack([torch.stack([cos, sin], 1), torch.stack([-sin, cos], 1)], 1)
@@ -256,7 +243,7 @@ def _goal_offset(loop: ClosedLoop, motion: RobotState, state: LoopState, observe
 
 
 def _height_errors(loop: ClosedLoop, motion: RobotState, state: LoopState, observed: torch.Tensor) -> torch.Tensor:
-    """Return the observed height errors (n, 2), the ballistic one with derivatives."""
+    """Return the observed height errors (n, 2) [m]; the second, of the ballistic apex, with derivatives."""
     apex = motion.pos[:, 2] + motion.lin_vel[:, 2].clamp(min=0.0).square() / (2.0 * loop.task.gravity)
     return torch.stack([observed[:, 0], with_gradient_of(observed[:, 1], apex)], 1)
 
@@ -272,6 +259,7 @@ SMOOTH_TERMS: dict[str, Callable[..., torch.Tensor]] = {
     "rate": lambda loop, motion, state, observed: motion.rate,
     "last_action": lambda loop, motion, state, observed: state.action.T,
 }
-"""Differentiable observation terms by name; the height is above level ground."""
-STATE_TERMS = frozenset(SMOOTH_TERMS) - {"goal", "height_errors"}
-"""Terms that depend on the robot's state alone."""
+"""Differentiable observation terms by name of the term's function, unscaled, (num_worlds, width) each.
+
+Arguments: loop, `RobotState`, `LoopState` and the environment's unscaled observation. Height: above level ground."""
+STATE_TERMS = frozenset(SMOOTH_TERMS) - {"goal", "height_errors"}  # terms that depend on the robot's state alone

@@ -1,4 +1,4 @@
-"""Environment whose observations and rewards have derivatives by earlier actions."""
+"""Environment whose observations and rewards have derivatives by the actions of a window of policy steps."""
 
 from __future__ import annotations
 
@@ -11,18 +11,20 @@ from jumper_warp.diff.closed_loop import ClosedLoop, LoopState, with_gradient_of
 from jumper_warp.diff.smooth_rewards import SMOOTH, make_context, smooth_reward
 from jumper_warp.utils.errors import InputError
 
-WORLD_NORM = 100.0
-"""Largest norm of a world's gradient between policy steps."""
+WORLD_NORM = 100.0  # default of `DifferentiableEnv.world_norm`
 
 
 class DifferentiableEnv:
-    """Environment with gradients, see `jumper_warp.envs.vec_env.DifferentiableVecEnv`; delegates to the wrapped one."""
+    """Environment with gradients, see `jumper_warp.envs.vec_env.DifferentiableVecEnv`.
+
+    All other attributes are those of the wrapped environment.
+    """
 
     def __init__(self, env: Any, world_norm: float = WORLD_NORM) -> None:
         """Wrap a `jumper_warp.envs.env.Env`.
 
-        world_norm: largest norm of the gradient by each part of a world's state that is passed to the step before.
-        Raises InputError: as `ClosedLoop`, or no reward has a derivative.
+        world_norm: norm to which the gradient by each part of `LoopState` is clipped, by world and policy step. Raises
+        InputError: as `ClosedLoop`, or no reward has a derivative.
         """
         self.env, self.loop, self.world_norm = env, ClosedLoop(env), world_norm
         if not any(term.func.key in SMOOTH for term in self.loop.task.rewards):
@@ -31,34 +33,33 @@ class DifferentiableEnv:
         self._final: LoopState
 
     def __getattr__(self, name: str) -> Any:
-        """Return an attribute of the wrapped environment."""
+        """Return an attribute of the wrapped environment that this class does not define."""
         return getattr(self.env, name)
 
     def begin_window(self) -> None:
-        """Start a window: the present state becomes a constant."""
+        """Start a window: the present state becomes a constant, so that gradients end here."""
         self._state = self.loop.state()
 
     def observe(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return `obs` and `critic_obs` with their derivatives."""
+        """Return `obs` and `critic_obs`, (num_envs, columns) each, with derivatives by the window's earlier actions."""
         return self._observe_both(self._state, self.env.obs, self.env.critic_obs)
 
     def observe_final(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return `final_obs` and `final_critic_obs` of the last step with their derivatives."""
+        """Return `final_obs` and `final_critic_obs` of the last step, before resets, with derivatives as `observe`."""
         return self._observe_both(self._final, self.env.final_obs, self.env.final_critic_obs)
 
     def _observe_both(
         self, state: LoopState, obs: torch.Tensor, critic_obs: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return observations of both networks with their derivatives by a state."""
-        observe = self.loop.observe
-        return with_gradient_of(obs, observe(state, obs)), with_gradient_of(
-            critic_obs, observe(state, critic_obs, "critic")
-        )
+        """Return the values obs and critic_obs with their derivatives by `state`."""
+        critic = self.loop.observe(state, critic_obs, "critic")
+        return with_gradient_of(obs, self.loop.observe(state, obs)), with_gradient_of(critic_obs, critic)
 
     def step_with_gradient(self, action: torch.Tensor) -> torch.Tensor:
-        """Step the environment; return the reward (num_envs,) with the derivatives of its smooth terms.
+        """Step the environment; return the reward (num_envs,) with the derivatives of its terms in `SMOOTH`.
 
-        The last reward of an episode has none. Call `begin_window` first, and no other `step` in a window.
+        action: (num_envs, 12), clamped to ±1. The last reward of an episode has no derivative. Call `begin_window`
+        first, and no `step` within a window.
         """
         env, old = self.env, self._state
         state, final = self.loop.step(old, action)
@@ -69,7 +70,7 @@ class DifferentiableEnv:
         return with_gradient_of(env.reward.clone(), smooth)
 
     def _clip_gradient(self, part: torch.Tensor) -> torch.Tensor:
-        """Return a part of the state whose gradient is clipped to a norm in each world; NaN becomes 0."""
+        """Return a copy of a part of `LoopState` whose gradient is clipped by `clip_norm`."""
         if not part.requires_grad:
             return part
         part = part * 1.0  # a new tensor, whose gradient sums all uses
@@ -78,7 +79,7 @@ class DifferentiableEnv:
 
 
 def clip_norm(max_norm: float) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return a hook that clips the gradient of each world (last axis) to a norm, and a non-finite one to 0."""
+    """Return a hook that clips the norm of each world's gradient, (rows, num_worlds), and zeroes one not finite."""
 
     def clip(grad: torch.Tensor) -> torch.Tensor:
         grad = torch.where(grad.isfinite().all(0, keepdim=True), grad, 0.0)

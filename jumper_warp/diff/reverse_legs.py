@@ -1,4 +1,4 @@
-"""Reverse pass of a rollout with a thread per leg: four launches for every few rows."""
+"""Reverse pass of a rollout with a thread per leg: four launches for every `SPAN` rows."""
 
 from __future__ import annotations
 
@@ -8,15 +8,14 @@ import warp as wp
 
 from jumper_warp.sim.dynamics import JumperDynamics
 
-SPAN = 4
-"""Rows that one set of launches reverses."""
+SPAN = 4  # rows that one set of launches reverses
 
 
 class LegThreadReverse:
     """Launches the kernels of `jumper_warp.kernels.dynamics.adjoint.rollout_legs_adjoint` and `constants_adjoint`."""
 
     def __init__(self, dynamics: JumperDynamics, every: int):
-        """Allocate the record of `SPAN` rows; every: physics steps between rows."""
+        """Allocate the kernels' record of `SPAN` rows; every: physics steps between rows of a trajectory."""
         self._dynamics, self._modules = dynamics, dynamics.modules
         self._device, self._num = dynamics.model.device, dynamics.model.world_count
         module, shape = self._modules.leg_record, {"dtype": dynamics.real, "device": self._device}
@@ -26,10 +25,11 @@ class LegThreadReverse:
         self._record.legs = wp.zeros((entries, int(module.LEG_FIELDS), self._num, 4), **shape)
 
     def run(self, settings: Any, motion: list[Any], cotangents: Any, gradients: Any) -> None:
-        """Add to the kernels' `Gradients`, whose q and qd hold the cotangents of the last row.
+        """Add the rollout's gradients to `gradients` (`Gradients`); its q and qd must hold the last row's cotangents.
 
-        settings: `StepSettings`. motion: `Timing`, `Actuation`, `Commands`, filtered targets, `TrajectoryArrays`.
-        cotangents: `TrajectoryArrays`, the gradient of the loss by those of the rollout.
+        All arguments are structs of the kernels. settings: `StepSettings`. motion: [`Timing`, `Actuation`, `Commands`,
+        filtered targets (T, 12, num_worlds), `TrajectoryArrays`] of the rollout. cotangents: `TrajectoryArrays`, the
+        gradient of the loss by the rollout's.
         """
         robot, record, num = self._dynamics.robot, self._record, self._num
         legs, constants = self._modules.rollout_legs_adjoint, self._modules.constants_adjoint
@@ -37,7 +37,7 @@ class LegThreadReverse:
         turns = 8 if self._device.is_cuda else 1  # a GPU warp holds eight worlds, or eight steps of one world
         threads = -(-num // 8) * 8
 
-        def launch(kernel: wp.Kernel, dim: tuple[int, ...], *inputs: Any) -> None:
+        def launch(kernel: wp.Kernel, dim: tuple[int, ...], *inputs: Any) -> None:  # over dim and the four legs
             wp.launch(kernel, dim=(*dim, 4), inputs=list(inputs), device=self._device, block_dim=4 * turns)
 
         for end in range(rows.q.shape[0] - 1, 0, -SPAN):

@@ -1,8 +1,8 @@
 """Batched rollouts with gradients: forward and reverse passes through filter, latency, motors and physics.
 
-A forward pass is one launch for all worlds, as is a reverse pass (on a CPU one per thread); on a GPU the reverse pass
-is four launches per few policy steps (`reverse_legs`). Between the passes only a row of the state every few physics
-steps and the paws' impulses are stored; see `jumper_warp.kernels.dynamics.adjoint.step_adjoint`.
+A forward pass is one launch for all worlds (on a CPU one launch for each thread), as is a reverse pass; on a GPU the
+reverse pass is four launches for every few rows (`reverse_legs`). Between the passes only a row of the state every few
+physics steps, motor torques and the paws' impulses are stored; see `jumper_warp.kernels.dynamics.adjoint.step_adjoint`.
 """
 
 from __future__ import annotations
@@ -36,29 +36,28 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
 from jumper_warp.utils.threads import checked_threads, run_in_parallel
 
-MAX_SWEEPS = 200
-"""Sweeps of the contact iteration in a step, at most."""
-TOLERANCE = 1.0e-6
-"""[m/s] Of the contact iteration in single precision; gradients inherit its error."""
-TOLERANCE_DOUBLE = 1.0e-13
-"""[m/s] Of the contact iteration in double precision."""
+MAX_SWEEPS = 200  # largest number of sweeps of the contact iteration in a physics step
+TOLERANCE = 1.0e-6  # [m/s] of the contact iteration in single precision; gradients inherit its error
+TOLERANCE_DOUBLE = 1.0e-13  # [m/s] of the contact iteration in double precision
 LATENCY_RANGE = (0.0, 0.1)
 """[s] Allowed values of `Rollout.parameters["latency"]`."""
 GEOMETRY_NAMES = (
     "hip_x", "hip_y", "hip_z", "outer_x", "inner_x", "plane_y", "knee_y", "thigh", "shank", "paw_radius",
 )  # fmt: skip
-"""Rows of the gradient by a leg's geometry [m], see `jumper_warp.kernels.kinematics.geometry`."""
+"""Lengths [m] of a leg, in the order of `Rollout.geometry`; see `jumper_warp.kernels.kinematics.geometry`."""
 
 
 @dataclass(frozen=True)
 class Trajectory:
     """Trajectory of T policy steps of S physics steps, with a row every `every` physics steps, K = T S / every.
 
-    Arrays have the rollout's precision, worlds last; a cotangent of a trajectory has the same shapes.
+    Arrays have the rollout's precision, worlds last. A cotangent, the gradient of a loss by an array, has its shape.
+    Motors and paws are ordered by leg FL, FR, BL, BR; motors of a leg: lateral, outer, inner.
     """
 
     q: wp.array
-    """(K + 1, 19, num_worlds) Position [m] and orientation (xyzw) of the base, motor angles [rad]; row 0: start."""
+    """(K + 1, 19, num_worlds) Origin [m] and orientation (xyzw) of the base, world frame, motor angles [rad]; row 0 is
+    the start."""
     qd: wp.array
     """(K + 1, 18, num_worlds) Velocity of the base's centre of mass [m/s], its angular velocity [rad/s], world frame,
     motor rates [rad/s]."""
@@ -73,35 +72,32 @@ class Trajectory:
     commands: Any
     """The kernels' `Commands` of the rollout."""
     from_start: bool = False
-    """Whether `initial_target` was the initial angles by default, so that the gradient by q includes its own."""
+    """True: `initial_target` was left out, so that the gradient by q includes the gradient by initial_target."""
 
     def end(self) -> dict[str, Any]:
-        """Return the arguments of `Rollout.run` that continue from here: q, qd, initial_target, impulse."""
-        last = self.impulse.shape[0] - 1
-        return {
-            "q": self.q[-1],
-            "qd": self.qd[-1],
-            "initial_target": self.filtered_target[-1],
-            "impulse": self.impulse[last],
-        }
+        """Return the arguments of `Rollout.run` that continue after the last row: q, qd, initial_target, impulse."""
+        state = {"q": self.q[-1], "qd": self.qd[-1], "initial_target": self.filtered_target[-1]}
+        return state | {"impulse": self.impulse[self.impulse.shape[0] - 1]}
 
 
 class Rollout:
     """Forward and reverse simulation of worlds over policy steps, in single or double precision.
 
     Gradients are exact at the contact modes and branches of filter and motors of the forward pass
-    (`adjoint.step_adjoint`). The worlds' parameters are in `parameters`, which may be written between a reverse pass
-    and the next rollout.
+    (`adjoint.step_adjoint`). The worlds' parameters are the arrays in `parameters`; write to them only between a
+    reverse pass and the next forward pass.
 
     Args:
         model: The robot's worlds, as `jumper_warp.robot.model.build_model` returns it, without moving blocks.
         motors: By default the jumping gains at 18 N m.
-        command_filter: None leaves the targets as they are.
-        description: The model's, by default the project's.
-        dt: Physics step [s], `substeps` of which are in a policy step.
+        command_filter: Filter of motor targets; None: the targets are not filtered.
+        description: Robot description of the model, by default the project's.
+        double: Whether to compute in double precision.
+        dt: Physics step [s].
+        substeps: Physics steps in a policy step.
         every: Physics steps between rows of a trajectory, a divisor of `substeps`; by default `substeps`.
-        tolerance: Of the contact iteration [m/s], by default `TOLERANCE` or `TOLERANCE_DOUBLE`.
-        threads: CPU threads that share the worlds; results do not depend on them. As in `Simulation`.
+        tolerance: Tolerance of the contact iteration [m/s], by default `TOLERANCE` or `TOLERANCE_DOUBLE`.
+        threads: Number of CPU threads, as in `Simulation`; results do not depend on it.
 
     Raises:
         NotThisRobotError: the model is another robot's.
@@ -148,7 +144,7 @@ class Rollout:
         `MotorKindCfg` and the sensors' `offset` [rad], `fade` [rad/s] (2, n), `latency` [s] (n,), and the filter's
         constants (14, n), rows as in `jumper_warp.robot.motors.FILTER_NAMES`, in rad."""
         self.writes = dict.fromkeys([*self.parameters, "geometry"], 0)
-        """Number of times that `simulate` has changed each parameter."""
+        """Number of times that `simulate` has written each parameter, by name."""
         self.by_legs = self.device.is_cuda
         """Whether kernels use a thread per leg (default on a GPU) or per world (default on a CPU)."""
         self.slices = slices_of(self.num_worlds, 1 if self.device.is_cuda else checked_threads(threads))
@@ -159,7 +155,7 @@ class Rollout:
         self._launched: set[str] = set()
 
     def _make_actuation(self, cfg: MotorCfg, command_filter: FilterCfg | None) -> Any:
-        """Return the kernels' `Actuation` of motors, without latency."""
+        """Return the kernels' `Actuation` of all worlds' motors and command filter, with zero latency."""
         modules, n = self.dynamics.modules, self.num_worlds
         actuation = modules.trajectory.Actuation()
         actuation.motors = motor_arrays(cfg, n, module=modules.motors, device=self.device)
@@ -170,13 +166,13 @@ class Rollout:
         return actuation
 
     def standing(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return q (19, num_worlds) and qd (18, num_worlds) of the model's pose, at rest, in single precision."""
+        """Return q (19, num_worlds) and qd (18, num_worlds) of the model's initial pose at rest, see `Trajectory`."""
         return compact(self.dynamics.model.joint_q.numpy(), np.zeros(38 * self.num_worlds), self.num_worlds)
 
     def hold(self, worlds: Any = True) -> None:
-        """Hold the bases of some worlds at their initial position and velocity.
+        """Hold the bases at their initial pose and velocity in some worlds; release those of the others.
 
-        worlds: bool, (num_worlds,) or one for all. Raises InputError for another shape.
+        worlds: bool, (num_worlds,) or one for all. Raises InputError: another shape.
         """
         if np.shape(worlds) not in ((), (self.num_worlds,)):
             raise InputError(f"worlds must be one bool, or ({self.num_worlds},), got {np.shape(worlds)}")
@@ -184,12 +180,12 @@ class Rollout:
         self.dynamics.robot.held = wp.array(held, dtype=int, device=self.device)
 
     def geometry(self) -> np.ndarray:
-        """Return the legs' lengths [m], (4, 10), see `GEOMETRY_NAMES`; all worlds have the same."""
+        """Return the legs' lengths [m], (4 legs, 10 `GEOMETRY_NAMES`), which all worlds share."""
         legs = self.dynamics.robot.geometry.numpy()
         return np.column_stack([legs["hip"], *(legs[name] for name in GEOMETRY_NAMES[3:])]).astype(np.float64)
 
     def set_geometry(self, lengths: np.ndarray) -> None:
-        """Write the legs' lengths [m], (4, 10). Raises InputError for another shape or what is not finite."""
+        """Write the legs' lengths (4, 10) [m], see `geometry`. Raises InputError: another shape, or not finite."""
         if np.shape(lengths) != (4, len(GEOMETRY_NAMES)):
             raise InputError(f"geometry must have shape (4, {len(GEOMETRY_NAMES)}), got {np.shape(lengths)}")
         if not np.isfinite(lengths).all():
@@ -210,18 +206,18 @@ class Rollout:
         wrench: Any = None,
         impulse: wp.array | None = None,
     ) -> Trajectory:
-        """Return the trajectory of all worlds. Arrays are of Warp or NumPy; without the last axis for equal worlds.
+        """Return the trajectory of all worlds over T policy steps.
 
-        Args:
-            targets: Raw motor targets [rad] of T policy steps, (T, 12, num_worlds).
-            q: Initial row, (19, num_worlds), as in `Trajectory.q`.
-            qd: Initial row, (18, num_worlds).
-            initial_target: Targets [rad] until the first ones arrive, (12, num_worlds); matters with a latency. By
-                default the initial angles; the gradient by q then includes that by initial_target.
+        Args (arrays of Warp or NumPy; a NumPy array without the last axis holds for all worlds):
+            targets: Motor targets before the command filter [rad], (T, 12, num_worlds).
+            q: Initial coordinates, (19, num_worlds), as in `Trajectory.q`.
+            qd: Initial rates, (18, num_worlds), as in `Trajectory.qd`.
+            initial_target: Filtered targets [rad] in use until the first target arrives, (12, num_worlds); matters with
+                a latency. By default the initial angles; the gradient by q then includes this one.
             wrench: Force [N] and moment [N m] on the base at its com, world axes, in each policy step,
                 (T, 6, num_worlds).
-            impulse: Contact impulses of the step before, as in `Trajectory.impulse`, (4, num_worlds) vec3; zero by
-                default. The contact iteration starts from them; loaded paws that hardly slip have static friction.
+            impulse: Contact impulses of the previous physics step, as in `Trajectory.impulse`, (4, num_worlds) vec3; by
+                default zero. They start the contact iteration; loaded paws that hardly slip have static friction.
 
         Raises:
             InputError: an array of another shape or type, NumPy values that are not finite, or, on a CPU, a latency
@@ -273,12 +269,12 @@ class Rollout:
     ) -> dict[str, wp.array]:
         """Return the gradient of each world's loss by the inputs of the rollout, given its gradient by the trajectory.
 
-        q, qd, torque, impulse, filtered_target: cotangents, the gradient of the loss by these arrays of the trajectory,
-        with the same shapes and types; None: zero. The parameters must be those of the forward pass.
+        q, qd, torque, impulse, filtered_target: cotangents, the gradients of the loss by these arrays of `trajectory`,
+        of the same shapes and types; None: zero. The parameters must be those of the forward pass.
 
-        Returned by name, worlds last: targets, q, qd (initial row), initial_target, wrench, the entries of
-        `parameters`, and `geometry` (4, 10, num_worlds) by the legs' lengths [m], see `GEOMETRY_NAMES`. The gradient by
-        the initial quaternion assumes that it is normalised first.
+        Returned by name, worlds last: targets, q, qd (initial rows), initial_target, wrench, the entries of
+        `parameters`, and `geometry` (4, 10, num_worlds) by the legs' lengths [m]. The gradient by the initial
+        quaternion assumes that it is normalised first. Raises InputError: another rollout's trajectory or other shapes.
         """
         n, modules = self.num_worlds, self.dynamics.modules
         commands = trajectory.commands
@@ -286,8 +282,8 @@ class Rollout:
         rows_of = (count * self.substeps // self.every + 1, 19, n)
         if trajectory.q.shape != rows_of or trajectory.q.dtype != self.real:
             raise InputError(f"this rollout makes trajectories {rows_of}, got {trajectory.q.shape}")
-        given = {"q": q, "qd": qd, "torque": torque, "impulse": impulse, "filtered_target": filtered_target}
-        cotangents = self._cotangents(trajectory, given)
+        by_outputs = {"q": q, "qd": qd, "torque": torque, "impulse": impulse, "filtered_target": filtered_target}
+        cotangents = self._cotangents(trajectory, by_outputs)
         rows = modules.trajectory.TrajectoryArrays()
         for name in ("q", "qd", "torque", "impulse", "pressed"):
             setattr(rows, name, getattr(trajectory, name))
@@ -316,10 +312,13 @@ class Rollout:
         by_inputs = {"targets": gradients.target, "q": gradients.q, "qd": gradients.qd, "wrench": gradients.wrench}
         return by_inputs | {"initial_target": gradients.initial_target} | self._split_parameters(gradients.parameters)
 
-    def _cotangents(self, trajectory: Trajectory, given: dict[str, wp.array | None]) -> Any:
-        """Return the gradient by a trajectory as `TrajectoryArrays`. Raises InputError: another shape or type."""
+    def _cotangents(self, trajectory: Trajectory, by_outputs: dict[str, wp.array | None]) -> Any:
+        """Return gradients by arrays of a trajectory as `TrajectoryArrays`; empty for None and filtered_target.
+
+        Raises InputError: another shape or type than the trajectory's array.
+        """
         cotangents = self.dynamics.modules.trajectory.TrajectoryArrays()
-        for name, array in given.items():
+        for name, array in by_outputs.items():
             like = getattr(trajectory, name)
             alike = isinstance(array, wp.array) and array.shape == like.shape and array.dtype == like.dtype
             if array is not None and not alike:
@@ -334,7 +333,7 @@ class Rollout:
         return cotangents
 
     def _split_parameters(self, gradient: Any) -> dict[str, wp.array]:
-        """Return the rows of a gradient by parameters, by name, with the shapes of `parameters` and `geometry`."""
+        """Return views of gradient (GRADIENT_ROWS, num_worlds) by name, shaped as `parameters` and `geometry`."""
         names, first = {}, 0
         for name, array in self.parameters.items():
             count = 1 if array.ndim == 1 else array.shape[0]
@@ -343,13 +342,13 @@ class Rollout:
         return names | {"geometry": gradient[first:].reshape((4, len(GEOMETRY_NAMES), self.num_worlds))}
 
     def _timing(self, count: int) -> Any:
-        """Return the kernels' `Timing` of `count` policy steps."""
+        """Return the kernels' `Timing` of a rollout of `count` policy steps."""
         timing = self.dynamics.modules.trajectory.Timing()
         timing.steps, timing.substeps, timing.every = count, self.substeps, self.every
         return timing
 
     def _rows(self, count: int) -> Any:
-        """Return the kernels' `TrajectoryArrays` of `count` policy steps, uninitialised."""
+        """Return uninitialised `TrajectoryArrays` for a `Trajectory` of `count` policy steps."""
         steps, n = count * self.substeps, self.num_worlds
         rows = self.dynamics.modules.trajectory.TrajectoryArrays()
         rows.q, rows.qd = (self._empty(steps // self.every + 1, size, n) for size in (19, 18))
@@ -359,7 +358,7 @@ class Rollout:
         return rows
 
     def _launch_legs(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        """Launch a kernel over all worlds with a thread per leg."""
+        """Launch a kernel over all worlds, padded to a multiple of 8, with a thread for each leg."""
         n = self.num_worlds
         inputs = [n, self.dynamics.robot, self._new_settings(), *inputs]
         wp.launch(
@@ -368,7 +367,7 @@ class Rollout:
         )  # fmt: skip
 
     def _launch(self, kernel: wp.Kernel, inputs: list, outputs: list) -> None:
-        """Launch a kernel over all worlds with a thread per world; on a CPU in concurrent slices."""
+        """Launch a kernel over all worlds with a thread for each world; on a CPU concurrently over `slices`."""
 
         def launch(worlds: WorldRange) -> None:
             settings = self._new_settings()  # copies of a Warp struct share memory, and slices run concurrently
@@ -379,12 +378,15 @@ class Rollout:
             )  # fmt: skip
 
         jobs: list[Callable[[], None]] = [partial(launch, worlds) for worlds in self.slices]
-        # Warp loads a kernel at its first launch; of two threads that do so at once one would launch nothing
+        # Warp loads a kernel at its first launch; if two threads do so at once, one of them launches nothing
         run_in_parallel(jobs, len(jobs) if kernel.key in self._launched else 1)
         self._launched.add(kernel.key)
 
     def _input(self, name: str, values: Any, shape: tuple[int, ...]) -> wp.array:
-        """Return values as an array (*shape, num_worlds). Raises InputError: wrong shape or type, or not finite."""
+        """Return an argument `name` of `run` as a Warp array (*shape, num_worlds); NumPy values may lack the last axis.
+
+        Raises InputError: another shape or type, or NumPy values that are not finite.
+        """
         full = (*shape, self.num_worlds)
         if isinstance(values, wp.array):
             if values.shape != full or values.dtype != self.real:
@@ -402,11 +404,11 @@ class Rollout:
         return self.array(values)
 
     def array(self, values: Any) -> wp.array:
-        """Return values as an array of the rollout's precision on its device."""
+        """Return a copy of values as a Warp array of the rollout's precision on its device."""
         return wp.array(values, dtype=self.real, device=self.device)
 
     def vectors(self, values: Any) -> wp.array:
-        """Return vectors (..., 3) as an array of the kernels' vec3."""
+        """Return a copy of vectors (..., 3) as a Warp array (...) of the kernels' vec3, as in `Trajectory.impulse`."""
         return wp.array(np.ascontiguousarray(values), dtype=self.dynamics.modules.scalar.vec3, device=self.device)
 
     def _zeros(self, *shape: int, dtype: Any = None) -> wp.array:
@@ -417,7 +419,10 @@ class Rollout:
 
 
 def compact(joint_q: np.ndarray, joint_qd: np.ndarray, num_worlds: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Return q (19, num_worlds) and qd (18, num_worlds) of (43,) coordinates and (38,) rates of Newton a world."""
+    """Return q (19, num_worlds) and qd (18, num_worlds), as in `Trajectory`, from Newton's coordinates and rates.
+
+    joint_q: 43 values for each world; joint_qd: 38 for each world; both of any shape, world by world.
+    """
     joint_q, joint_qd = np.reshape(joint_q, (num_worlds, 43)), np.reshape(joint_qd, (num_worlds, 38))
     q = np.concatenate([joint_q[:, :7], motor_values(joint_q[:, 7:])], axis=1)
     return q.T, np.concatenate([joint_qd[:, :6], motor_values(joint_qd[:, 6:])], axis=1).T

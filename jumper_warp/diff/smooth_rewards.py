@@ -16,47 +16,32 @@ import torch
 from jumper_warp.diff.closed_loop import ClosedLoop, LoopState, RobotState
 
 STANCE, FLIGHT, LANDED = 0, 1, 2
-LANDING, RECOVERED = 18, 30
-"""Policy steps after touchdown that count as landing, and after which the robot should rest."""
+LANDING, RECOVERED = 18, 30  # policy steps after touchdown that count as landing, and after which robots should rest
 
 
 class RewardContext(NamedTuple):
-    """Inputs of the rewards of a policy step, n worlds."""
+    """Inputs of the rewards of a policy step, n worlds; phases and flags are those at the end of the step."""
 
-    motion: RobotState
-    """At the end of the step."""
-    prev_motion: RobotState
-    """At its beginning."""
-    state: LoopState
-    """At the end of the step."""
-    prev_state: LoopState
-    """At its beginning."""
-    phase: torch.Tensor
-    """(n,) `STANCE`, `FLIGHT` or `LANDED`, at the end of the step."""
-    jump_due: torch.Tensor
-    """(n,) bool, a commanded jump has not begun."""
-    landing: torch.Tensor
-    """(n,) bool, touchdown was within the last 0.3 s."""
-    resting: torch.Tensor
-    """(n,) bool, the robot should stand still."""
-    rising: torch.Tensor
-    """(n,) bool, in flight before the apex."""
-    at_apex: torch.Tensor
-    """(n,) bool, the apex was passed in this step."""
-    goal: torch.Tensor
-    """(n,) [m] Commanded height."""
-    default: torch.Tensor
-    """(12,) [rad] Motor angles of the default pose."""
-    gravity: float
-    """[m/s^2] Downward."""
-    step_dt: float
-    """[s] Policy step."""
+    motion: RobotState  # at the end of the step
+    prev_motion: RobotState  # at the beginning of the step
+    state: LoopState  # at the end of the step
+    prev_state: LoopState  # at the beginning of the step
+    phase: torch.Tensor  # (n,) `STANCE`, `FLIGHT` or `LANDED`
+    jump_due: torch.Tensor  # (n,) bool, a jump is commanded and has not begun
+    landing: torch.Tensor  # (n,) bool, touchdown was within the last `LANDING` steps (0.3 s)
+    resting: torch.Tensor  # (n,) bool, the robot should stand still: no command yet, or `RECOVERED` after touchdown
+    rising: torch.Tensor  # (n,) bool, in flight before the apex
+    at_apex: torch.Tensor  # (n,) bool, the apex was passed in this step
+    goal: torch.Tensor  # (n,) [m] commanded apex height of the base
+    default: torch.Tensor  # (12,) [rad] motor angles of the default pose
+    gravity: float  # [m/s^2] downward, positive
+    step_dt: float  # [s] policy step
 
 
 def make_context(
     loop: ClosedLoop, state: LoopState, prev_state: LoopState, arrays: Mapping[str, np.ndarray]
 ) -> RewardContext:
-    """Return the rewards' inputs of a policy step; arrays: `Env.task_arrays` at its end, before any reset."""
+    """Return the rewards' inputs of a policy step from prev_state to state; arrays: `Env.task_arrays` before resets."""
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(np.ascontiguousarray(values), device=state.q.device)
@@ -74,86 +59,99 @@ def make_context(
 
 
 def gaussian(squared: torch.Tensor, std: float) -> torch.Tensor:
-    """Return exp(-x^2 / std^2), given x^2."""
+    """Return exp(-squared / std^2), of the shape of `squared`; std: width in the unit of the error."""
     return torch.exp(-squared / std**2)
 
 
 def row_norm(x: torch.Tensor) -> torch.Tensor:
-    """Return the norms of the rows of x (n, k), (n,), with a finite derivative at 0."""
+    """Return the norm (n,) of each row of x (n, k), with a finite derivative at 0."""
     return (x.square().sum(1) + 1.0e-12).sqrt()
 
 
-def ballistic_apex(m: RewardContext) -> torch.Tensor:
-    """Return the apex height [m] of the base's ballistic path through the present state, (n,)."""
-    return m.motion.pos[:, 2] + m.motion.lin_vel[:, 2].square() / (2.0 * m.gravity)
+def ballistic_apex(ctx: RewardContext) -> torch.Tensor:
+    """Return the apex height [m] of the base's ballistic path through the state at the end of the step, (n,)."""
+    return ctx.motion.pos[:, 2] + ctx.motion.lin_vel[:, 2].square() / (2.0 * ctx.gravity)
 
 
-def height_kernel(m: RewardContext, p: Mapping[str, float]) -> torch.Tensor:
-    """Return the closeness of the ballistic apex to the goal, (n,), at most 5."""
-    error = ballistic_apex(m) - m.goal
+def height_closeness(ctx: RewardContext, const: Mapping[str, float]) -> torch.Tensor:
+    """Return the closeness [1] of the ballistic apex to the commanded height, (n,), at most 5.
+
+    Constants: std_fine, scale_sharp, std_wide [m].
+    """
+    error = ballistic_apex(ctx) - ctx.goal
     return (
-        gaussian(error.square(), p["std_fine"])
-        + 3.0 * torch.exp(-error.abs() / p["scale_sharp"])
-        + gaussian(error.square(), p["std_wide"])
+        gaussian(error.square(), const["std_fine"])
+        + 3.0 * torch.exp(-error.abs() / const["scale_sharp"])
+        + gaussian(error.square(), const["std_wide"])
     )
 
 
-def waiting_scale(m: RewardContext, p: Mapping[str, float]) -> torch.Tensor:
-    """Return the scale of a reward, (n,): below 1 while a commanded jump has not begun."""
-    return torch.where(m.jump_due, p["waiting_scale"], 1.0)
+def waiting_scale(ctx: RewardContext, const: Mapping[str, float]) -> torch.Tensor:
+    """Return the factor of a reward, (n,): the constant `waiting_scale` while a jump is due, else 1."""
+    return torch.where(ctx.jump_due, const["waiting_scale"], 1.0)
 
 
-def posture(m: RewardContext, p: Mapping[str, float], shift: float) -> torch.Tensor:
-    """Return the closeness of the angles to the default pose, (n,), transversal motors shifted by `shift` [rad]."""
-    shifts = m.default.new_tensor(4 * [0.0, shift, shift])
-    return gaussian((m.motion.angle - m.default - shifts).square().mean(1), p["std"])
+def posture(ctx: RewardContext, const: Mapping[str, float], shift: float) -> torch.Tensor:
+    """Return the closeness [1] of the angles to the default pose, (n,); shift [rad]: added to transversal motors.
+
+    Constants: std [rad].
+    """
+    shifts = ctx.default.new_tensor(4 * [0.0, shift, shift])
+    return gaussian((ctx.motion.angle - ctx.default - shifts).square().mean(1), const["std"])
 
 
-def symmetry(m: RewardContext, p: Mapping[str, float]) -> torch.Tensor:
-    """Return the closeness of the transversal angles to each other and of the lateral ones to 0, (n,)."""
-    legs = m.motion.angle.view(-1, 4, 3)
+def symmetry(ctx: RewardContext, const: Mapping[str, float]) -> torch.Tensor:
+    """Return the closeness [1] of transversal angles to each other, times that of lateral angles to 0, (n,).
+
+    Constants: std_variance [rad^2], std_lateral [rad], waiting_scale [1].
+    """
+    legs = ctx.motion.angle.view(-1, 4, 3)
     spread = legs[:, :, 1:].flatten(1).var(1, correction=0)
     return (
-        gaussian(spread.square(), p["std_variance"])
-        * gaussian(legs[:, :, 0].square().sum(1), p["std_lateral"])
-        * waiting_scale(m, p)
+        gaussian(spread.square(), const["std_variance"])
+        * gaussian(legs[:, :, 0].square().sum(1), const["std_lateral"])
+        * waiting_scale(ctx, const)
     )
 
 
-def squared_tilt(m: RewardContext) -> torch.Tensor:
-    """Return the squared sine of the tilt, (n,)."""
-    return m.motion.gravity[:, :2].square().sum(1)
+def squared_tilt(ctx: RewardContext) -> torch.Tensor:
+    """Return the squared sine of the base's tilt, (n,)."""
+    return ctx.motion.gravity[:, :2].square().sum(1)
 
 
-Smooth = Callable[[RewardContext, Mapping[str, float]], torch.Tensor]
+Smooth = Callable[[RewardContext, Mapping[str, float]], torch.Tensor]  # context and term's constants to (n,)
 SMOOTH: dict[str, Smooth] = {
-    "jump_height": lambda m, p: m.at_apex * height_kernel(m, p),
-    "estimated_jump_height": lambda m, p: m.rising * height_kernel(m, p),
-    "horizontal_velocity": lambda m, p: (
-        torch.exp(-row_norm(m.motion.lin_vel[:, :2]) / p["speed_scale"]) * torch.where(m.phase == STANCE, 1.0, 2.0)
-    ) * waiting_scale(m, p),
-    "orientation": lambda m, p: gaussian(squared_tilt(m), p["std"]) * waiting_scale(m, p),
-    "angular_velocity": lambda m, p: gaussian(m.motion.ang_vel.square().sum(1), p["std"]) * waiting_scale(m, p),
+    "jump_height": lambda ctx, const: ctx.at_apex * height_closeness(ctx, const),
+    "estimated_jump_height": lambda ctx, const: ctx.rising * height_closeness(ctx, const),
+    "horizontal_velocity": lambda ctx, const: (
+        torch.exp(-row_norm(ctx.motion.lin_vel[:, :2]) / const["speed_scale"])
+        * torch.where(ctx.phase == STANCE, 1.0, 2.0)
+    ) * waiting_scale(ctx, const),
+    "orientation": lambda ctx, const: gaussian(squared_tilt(ctx), const["std"]) * waiting_scale(ctx, const),
+    "angular_velocity": lambda ctx, const: gaussian(ctx.motion.ang_vel.square().sum(1), const["std"])
+    * waiting_scale(ctx, const),
     "joint_symmetry": symmetry,
-    "ground_posture": lambda m, p: (m.phase != FLIGHT) * posture(m, p, p["shift"]) * waiting_scale(m, p),
-    "air_posture": lambda m, p: (m.phase == FLIGHT) * posture(m, p, 0.0),
-    "post_landing_posture": lambda m, p: m.landing * posture(m, p, p["shift"]),
-    "base_at_rest": lambda m, p: m.resting * gaussian(m.motion.lin_vel.square().sum(1), p["std_lin_vel"])
-    * gaussian(m.motion.ang_vel.square().sum(1), p["std_ang_vel"]),
-    "landing_tilt": lambda m, p: (m.phase == LANDED) * squared_tilt(m) / np.sin(p["angle"]) ** 2,
-    "catch_landing": lambda m, p: m.landing * (-m.motion.lin_vel[:, 2]).clamp(0.0, 1.0),
-    "damp_landing": lambda m, p: m.landing * m.motion.rate.view(-1, 4, 3)[:, :, 1:].flatten(1).clamp(0.0, 1.0).mean(1),
-    "motor_torque_sq": lambda m, p: m.state.torque.square().sum(0),
-    "joint_acceleration": lambda m, p: ((m.motion.rate - m.prev_motion.rate) / m.step_dt).square().sum(1),
-    "action_rate": lambda m, p: (m.state.action - m.prev_state.action).square().sum(0),
-    "resting_action_rate": lambda m, p: m.resting * (m.state.action - m.prev_state.action).square().sum(0),
-    "torque_ripple": lambda m, p: m.resting * (m.state.torque - m.prev_state.torque).square().sum(0),
+    "ground_posture": lambda ctx, const: (ctx.phase != FLIGHT) * posture(ctx, const, const["shift"])
+    * waiting_scale(ctx, const),
+    "air_posture": lambda ctx, const: (ctx.phase == FLIGHT) * posture(ctx, const, 0.0),
+    "post_landing_posture": lambda ctx, const: ctx.landing * posture(ctx, const, const["shift"]),
+    "base_at_rest": lambda ctx, const: ctx.resting * gaussian(ctx.motion.lin_vel.square().sum(1), const["std_lin_vel"])
+    * gaussian(ctx.motion.ang_vel.square().sum(1), const["std_ang_vel"]),
+    "landing_tilt": lambda ctx, const: (ctx.phase == LANDED) * squared_tilt(ctx) / np.sin(const["angle"]) ** 2,
+    "catch_landing": lambda ctx, const: ctx.landing * (-ctx.motion.lin_vel[:, 2]).clamp(0.0, 1.0),
+    "damp_landing": lambda ctx, const: ctx.landing
+    * ctx.motion.rate.view(-1, 4, 3)[:, :, 1:].flatten(1).clamp(0.0, 1.0).mean(1),
+    "motor_torque_sq": lambda ctx, const: ctx.state.torque.square().sum(0),
+    "joint_acceleration": lambda ctx, const: ((ctx.motion.rate - ctx.prev_motion.rate) / ctx.step_dt).square().sum(1),
+    "action_rate": lambda ctx, const: (ctx.state.action - ctx.prev_state.action).square().sum(0),
+    "resting_action_rate": lambda ctx, const: ctx.resting * (ctx.state.action - ctx.prev_state.action).square().sum(0),
+    "torque_ripple": lambda ctx, const: ctx.resting * (ctx.state.torque - ctx.prev_state.torque).square().sum(0),
 }  # fmt: skip
-"""Smooth reward terms by name of the term's function, each (n,)."""
+"""Unweighted smooth reward terms (n,) by name of the environment term's function; const: the term's constants."""
 
 
 def smooth_reward(task: Any, context: RewardContext) -> torch.Tensor:
-    """Return the weighted sum of the rewards that are in `SMOOTH`, (n,), scaled by the policy step."""
+    """Return the weighted sum (n,) of rewards in `SMOOTH`; those with `scale_by_dt` times the policy step."""
     total = torch.zeros_like(context.goal)
     for term in task.rewards:
         if term.func.key in SMOOTH:

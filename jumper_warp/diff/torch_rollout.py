@@ -15,28 +15,21 @@ from jumper_warp.diff.rollout import LATENCY_RANGE, Rollout, Trajectory
 from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
 
-COMMANDS = ("targets", "q", "qd", "initial_target", "wrench", "impulse")
-"""Arguments of `Rollout.run`."""
-OUTPUTS = ("q", "qd", "torque", "impulse", "filtered_target")
-"""Differentiable arrays of a `Trajectory`."""
+COMMANDS = ("targets", "q", "qd", "initial_target", "wrench", "impulse")  # arguments of `Rollout.run`
+OUTPUTS = ("q", "qd", "torque", "impulse", "filtered_target")  # differentiable arrays of a `Trajectory`
 
 
 class TorchTrajectory(NamedTuple):
-    """A `Trajectory` as tensors with gradients; they must not be changed in place."""
+    """A `Trajectory` as tensors with gradients, of T policy steps of S physics steps; do not change them in place."""
 
-    q: torch.Tensor
-    """(K + 1, 19, num_worlds)"""
-    qd: torch.Tensor
-    """(K + 1, 18, num_worlds)"""
-    torque: torch.Tensor
-    """(T S, 12, num_worlds) [N m]"""
-    impulse: torch.Tensor
-    """(T S, 4, num_worlds, 3) [N s]; divide by the physics step for the force."""
-    filtered_target: torch.Tensor
-    """(T, 12, num_worlds) [rad]"""
+    q: torch.Tensor  # (K + 1, 19, num_worlds) as in `Trajectory`: base origin [m], quaternion xyzw, motor angles [rad]
+    qd: torch.Tensor  # (K + 1, 18, num_worlds) velocity of the base's COM [m/s], angular velocity, motor rates [rad/s]
+    torque: torch.Tensor  # (T S, 12, num_worlds) [N m] motor torques
+    impulse: torch.Tensor  # (T S, 4, num_worlds, 3) [N s] on the paws, world frame; force: over the physics step
+    filtered_target: torch.Tensor  # (T, 12, num_worlds) [rad] targets after the command filter
 
     def end(self) -> dict[str, torch.Tensor]:
-        """Return the arguments of `simulate` that continue from here; `impulse` has no gradient."""
+        """Return the arguments of `simulate` that continue after the last row; `impulse` has no gradient."""
         state = {"q": self.q[-1], "qd": self.qd[-1], "initial_target": self.filtered_target[-1]}
         return state | {"impulse": self.impulse[-1].detach()}
 
@@ -55,14 +48,14 @@ def simulate(
 ) -> TorchTrajectory:
     """Return the trajectory of a rollout, differentiable once by all tensors except `impulse`.
 
-    Shapes are those of `Rollout.run`, with or without the axis of worlds. parameters: entries of `Rollout.parameters`,
-    which are written to the rollout and stay there, or `geometry` (4, 10) [m], the legs' lengths of all worlds; a
-    parameter has a gradient from the calls that it is passed to. trusted: do not check the values; otherwise on a GPU
-    only the latency is checked, which waits for the device.
+    Arguments and shapes are those of `Rollout.run`, with or without the axis of worlds. parameters: entries of
+    `Rollout.parameters`, or `geometry` (4, 10) [m], the legs' lengths of all worlds; they are written to the rollout
+    and stay there, and have gradients only from the calls that they are passed to. trusted: do not check the values;
+    otherwise on a GPU only the latency is checked, which waits for the device.
 
-    A policy in the loop runs one policy step per call, each from `end()` of the last. Raises InputError: unknown
-    parameter, not a tensor, wrong shape, not finite, or a latency outside of `LATENCY_RANGE`. The reverse pass raises
-    it for a parameter that a later call has changed and that was not passed to this one.
+    A policy in the loop runs one policy step per call, each from `end()` of the previous one. Raises InputError:
+    unknown parameter, not a tensor, wrong shape, not finite, or a latency outside of `LATENCY_RANGE`. The reverse pass
+    raises it for a parameter that a later call has changed and that was not passed to this call.
     """
     named = {"targets": targets, "q": q, "qd": qd, "initial_target": initial_target, "wrench": wrench} | parameters
     given: dict[str, Any] = {
@@ -101,7 +94,7 @@ def simulate(
 
 
 def _check_numbers(given: dict[str, torch.Tensor]) -> None:
-    """Raise InputError: a latency out of range; on a CPU also commands not finite or parameters NaN."""
+    """Raise InputError: a latency out of range; on a CPU also commands that are not finite or parameters with NaN."""
     if "latency" in given:
         check_within("latency [s]", given["latency"].detach().cpu().numpy(), LATENCY_RANGE)
     for name, tensor in given.items():
@@ -111,11 +104,11 @@ def _check_numbers(given: dict[str, torch.Tensor]) -> None:
 
 
 class _Simulate(torch.autograd.Function):
-    """Autograd function of `Rollout.run` and `Rollout.backward`."""
+    """Autograd function with `Rollout.run` as its forward and `Rollout.backward` as its backward pass."""
 
     @staticmethod
     def forward(ctx: Any, rollout: Rollout, names: tuple[str, ...], impulse: Any, *tensors: torch.Tensor) -> tuple:
-        """Run the rollout."""
+        """Write the parameters, run the rollout and return the tensors `OUTPUTS`; names: of `tensors`, in order."""
         with _stream(rollout):
             given = dict(zip(names, tensors, strict=True))
             _write_parameters(rollout, given)
@@ -132,7 +125,7 @@ class _Simulate(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: torch.Tensor | None) -> tuple:
-        """Run the reverse pass with the parameters of the forward pass."""
+        """Run the reverse pass with the parameters of the forward pass; grads: by `OUTPUTS`, None for zero."""
         rollout, trajectory = ctx.rollout, ctx.trajectory
         given = dict(zip(ctx.names, ctx.saved_tensors, strict=False))
         changed = {name for name, count in rollout.writes.items() if ctx.writes[name] != count}
@@ -150,14 +143,14 @@ class _Simulate(torch.autograd.Function):
 
 
 def _cotangent(trajectory: Trajectory, name: str, grad: torch.Tensor | None) -> wp.array | None:
-    """Return the gradient by an output of the trajectory as a Warp array; None: zero."""
+    """Return the gradient by the trajectory's array `name` as a Warp array of its type; None (zero) stays None."""
     if grad is None:
         return None
     return wp.from_torch(grad.detach().contiguous(), dtype=getattr(trajectory, name).dtype)
 
 
 def _write_parameters(rollout: Rollout, given: dict[str, torch.Tensor], new: Container[str] | None = None) -> None:
-    """Write the given parameters to the rollout; new: names of those to count as changed, by default all."""
+    """Write the parameters among `given` to the rollout; new: names to count in `Rollout.writes`, by default all."""
     for name, tensor in given.items():
         if name in rollout.writes and (new is None or name in new):
             rollout.writes[name] += 1
@@ -171,8 +164,8 @@ def _write_parameters(rollout: Rollout, given: dict[str, torch.Tensor], new: Con
 def _stream(rollout: Rollout) -> Iterator[None]:
     """Make Warp use PyTorch's stream within the context.
 
-    Warp drops a stream, even its own, when a `wp.Stream` that wraps it is deleted, and then captures no graph on it. So
-    nothing is wrapped where PyTorch already uses Warp's stream, as it does with an environment.
+    Warp drops a stream, even its own, when a `wp.Stream` that wraps it is deleted, and then cannot capture a graph on
+    it. So nothing is wrapped if PyTorch already uses Warp's stream, as it does with an environment.
     """
     device = rollout.device
     if not device.is_cuda or torch.cuda.current_stream().cuda_stream == wp.get_stream(device).cuda_stream:

@@ -28,34 +28,32 @@ from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 
 COLUMNS = ("test", "time", "command", "speed", "torque")
-"""Columns of a bench's data: number of the test, [s], commanded [N m], output speed [rad/s], measured torque [N m]."""
+"""Columns of a bench's CSV: test number, time [s], commanded torque [N m], output speed [rad/s] and torque [N m]."""
 STANDSTILL = 0.01
-"""[rad/s] Speed below which friction falls linearly to zero, as in the simulation."""
+"""[rad/s] Output speed below which friction falls linearly to zero, as in the simulation."""
 PRIORS = {
     "saturation": (0.5, "N m"), "peak": (0.3, "N m"), "cutoff_speed": (0.3, "rad/s"), "no_load_speed": (0.3, "rad/s"),
     "fade_start": (0.2, "rad/s"), "fade_end": (0.2, "rad/s"), "friction": (1.5, "N m"), "latency": (2.0, "s"),
     "time_constant": (2.0, "s"),
 }  # fmt: skip
-"""Standard deviation of the prior's logarithm, and unit, of each constant."""
+"""Constants of a motor by name: standard deviation of ln(value / described value) in the prior, and unit of the value.
+
+saturation: limit on the commanded torque; peak: torque limit below cutoff_speed, from where it falls linearly to 0 at
+no_load_speed; fade_start, fade_end: speeds between which all torque fades to 0; time_constant: of the current loop."""
 
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """Recording of a test bench; command and speed of a test's first row also hold before it."""
+    """Recording of a test bench, n rows; command and speed of a test's first row also hold before that row."""
 
-    test: np.ndarray
-    """(n,) int"""
-    time: np.ndarray
-    """(n,) [s], rising within a test."""
-    command: np.ndarray
-    """(n,) [N m], held until the next row."""
-    speed: np.ndarray
-    """(n,) [rad/s]"""
-    torque: np.ndarray
-    """(n,) [N m]"""
+    test: np.ndarray  # (n,) number of the test that a row belongs to
+    time: np.ndarray  # (n,) [s], rising within a test
+    command: np.ndarray  # (n,) [N m] commanded torque, held until the next row
+    speed: np.ndarray  # (n,) [rad/s] of the output shaft
+    torque: np.ndarray  # (n,) [N m] measured at the output shaft
 
     def __post_init__(self) -> None:
-        """Raises InputError: columns of different lengths, not finite, or times that do not rise."""
+        """Raise InputError: unequal columns, below 10 rows, not finite, falling times, or speeds above 300 rad/s."""
         n = len(self.time)
         for name in COLUMNS:
             values = getattr(self, name)
@@ -63,17 +61,16 @@ class Bench:
                 raise InputError(f"bench: {name} must be one column of at least 10 rows, got shape {values.shape}")
             if not np.isfinite(values).all():
                 raise InputError(f"bench: {name} is not finite in row {int(np.argmin(np.isfinite(values)))}")
-        same = np.diff(self.test) == 0
-        if (np.diff(self.time)[same] <= 0.0).any():
+        if (np.diff(self.time)[np.diff(self.test) == 0] <= 0.0).any():
             raise InputError("bench: time must rise within each test")
         if np.abs(self.speed).max() > 300.0:
             raise InputError(f"bench: speed reaches {np.abs(self.speed).max():.4g} rad/s: is it in rpm or deg/s?")
 
 
 def load_bench(path: Path) -> Bench:
-    """Return the recording in a CSV file whose first line has the names COLUMNS.
+    """Return the recording in a CSV file whose first line names at least the columns `COLUMNS`, in any order.
 
-    Raises InputError: a missing column, or rows that are not numbers; OSError: it cannot be read.
+    Raises InputError: a missing column, rows that are not numbers, or as `Bench`; OSError: the file cannot be read.
     """
     rows = csv_rows(Path(path))
     names = [name.strip() for name in rows[0]] if rows else []
@@ -91,7 +88,10 @@ def load_bench(path: Path) -> Bench:
 
 
 def torque_law(constants: Mapping[str, float], command: np.ndarray, speed: np.ndarray) -> np.ndarray:
-    """Return the steady output torque [N m] for commands [N m] and speeds [rad/s] of one shape."""
+    """Return the steady output torque [N m] for commanded torques [N m] and output speeds [rad/s], all of one shape.
+
+    constants: by the names and units of `PRIORS`. A positive torque accelerates a positive speed.
+    """
     driving_speed = np.sign(command) * speed
     headroom = (constants["no_load_speed"] - driving_speed) / (constants["no_load_speed"] - constants["cutoff_speed"])
     limit = np.minimum(constants["saturation"], constants["peak"] * np.clip(headroom, 0.0, 1.0))
@@ -102,7 +102,7 @@ def torque_law(constants: Mapping[str, float], command: np.ndarray, speed: np.nd
 
 
 def bench_torque(constants: Mapping[str, float], bench: Bench) -> np.ndarray:
-    """Return the torques [N m] that a bench would measure of a motor, (n,)."""
+    """Return the noiseless torques [N m] that `bench` would measure of a motor, (n,); constants: as in `PRIORS`."""
     torque = np.zeros(len(bench.time))
     for test in np.unique(bench.test):
         rows = np.flatnonzero(bench.test == test)
@@ -129,12 +129,12 @@ class Actuator:
     intervals: Mapping[str, tuple[float, float]]
     """95 % intervals, wider where the law does not fit the data."""
     open: tuple[str, ...]
-    """Constants whose standard deviation is above half the prior's."""
+    """Names of the constants whose standard deviation is above half the prior's: not identified."""
     chi2: float
-    """[1] Mean squared weighed residual."""
+    """[1] Mean over rows of (torque error / torque noise)^2; 1 if the law fits to the noise."""
 
     def rows(self) -> dict[str, tuple[float, float, float, str]]:
-        """Return (value, low, high, unit) of each constant by name."""
+        """Return (value, low, high, unit) by name of the constant; low and high bound the 95 % interval."""
         return {name: (value, *self.intervals[name], PRIORS[name][1]) for name, value in self.constants.items()}
 
     def to_json(self) -> dict[str, Any]:
@@ -147,7 +147,10 @@ class Actuator:
 
 
 def described_constants(kind: Literal["lateral", "transversal"]) -> dict[str, float]:
-    """Return the described constants of a kind of motor, by the names of `PRIORS`."""
+    """Return a motor's constants before identification, by the names and in the units of `PRIORS`.
+
+    Speeds, peak and friction are the robot description's.
+    """
     motor = load_description().motors[0 if kind == "lateral" else 1]
     return {
         "saturation": 18.0, "peak": motor.peak_torque, "cutoff_speed": motor.cutoff_speed,
@@ -159,24 +162,24 @@ def described_constants(kind: Literal["lateral", "transversal"]) -> dict[str, fl
 def characterise_motor(
     bench: Bench, kind: Literal["lateral", "transversal"] = "transversal", torque_noise: float = 0.1
 ) -> Actuator:
-    """Return the least-squares constants of a motor from a bench's data; torque_noise [N m]: of its sensor.
+    """Return the least-squares constants of a motor from a bench's data.
 
-    Raises InputError: noise that is not positive, or data without torque.
+    kind: motor whose described constants are the prior's means. torque_noise [N m]: standard deviation of the torque
+    sensor. Raises InputError: noise that is not positive, or a command that never changes.
     """
     check_positive("torque noise", torque_noise)
     if np.ptp(bench.command) == 0.0:
         raise InputError("bench: the command never changes, which tells nothing of the motor")
-    nominal = described_constants(kind)
-    names = list(PRIORS)
+    nominal, names = described_constants(kind), list(PRIORS)
     prior_std = np.array([PRIORS[name][0] for name in names])
 
-    def constants(z: np.ndarray) -> dict[str, float]:
+    def constants(z: np.ndarray) -> dict[str, float]:  # z: (9,) logarithms in standard deviations of their priors
         values = {name: nominal[name] * math.exp(p * x) for name, p, x in zip(names, prior_std, z, strict=True)}
         values["no_load_speed"] = max(values["no_load_speed"], 1.001 * values["cutoff_speed"])
         values["fade_end"] = max(values["fade_end"], 1.001 * values["fade_start"])
         return values
 
-    def residuals(z: np.ndarray) -> np.ndarray:
+    def residuals(z: np.ndarray) -> np.ndarray:  # (n + 9,): torque errors over their noise, and the prior's residuals z
         return np.concatenate([(bench_torque(constants(z), bench) - bench.torque) / torque_noise, z])
 
     starts = [np.zeros(len(names))]
@@ -185,7 +188,6 @@ def characterise_motor(
     fits = [least_squares(residuals, start, diff_step=1.0e-5, x_scale="jac", max_nfev=100) for start in starts]
     best = min(fits, key=lambda fit: fit.cost)
     errors = best.fun[: len(bench.time)]
-    chi2 = float(np.mean(errors**2))
     factor = mismatch_factor([errors[bench.test == test][:, None] for test in np.unique(bench.test)])
     std = np.minimum(factor * np.sqrt(np.diag(np.linalg.inv(best.jac.T @ best.jac))), 1.0)
     values = constants(best.x)
@@ -194,4 +196,4 @@ def characterise_motor(
         for (name, value), p, d in zip(values.items(), prior_std, std, strict=True)
     }
     unknown = tuple(name for name, d in zip(names, std, strict=True) if d > 0.5)
-    return Actuator(kind, values, intervals, unknown, chi2)
+    return Actuator(kind, values, intervals, unknown, chi2=float(np.mean(errors**2)))

@@ -20,18 +20,17 @@ from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.errors import InputError
 
-MAX_JOINT_SPEED = 25.0
-"""[rad/s] Of a safe motion: two thirds of the slowest motor's no-load speed."""
-MAX_TILT = 20.0
-"""[deg] Of the base in a safe motion."""
-MIN_HEIGHT, MAX_HEIGHT = 0.15, 0.65
-"""[m] Of a free base in a safe motion."""
-MARGIN = 5.0
-"""[deg] Between the angles of a safe motion and the filter's limits."""
+MAX_JOINT_SPEED = 25.0  # [rad/s] of a safe motion: two thirds of the slowest motor's no-load speed
+MAX_TILT = 20.0  # [deg] of the base in a safe motion
+MIN_HEIGHT, MAX_HEIGHT = 0.15, 0.65  # [m] of a free base's origin above the ground in a safe motion
+MARGIN = 5.0  # [deg] between the angles of a safe motion and the filter's limits
 
 
 def unsafe_reason(plan: Plan, record: Record, limits: FilterCfg | None = None) -> str:
-    """Return why the record of a plan is unsafe, empty if it is safe; limits: of angles, by default for walking."""
+    """Return the reason why the motion in a plan's record is unsafe, or an empty string if it is safe.
+
+    record: of one world. limits: on motor angles, by default the walking filter's.
+    """
     limits = walking_filter() if limits is None else limits
     angle, rate = record.angle[..., 0] / DEGREES, np.abs(record.rate[..., 0]).max()
     legs = angle.reshape(-1, 4, 3)
@@ -41,7 +40,7 @@ def unsafe_reason(plan: Plan, record: Record, limits: FilterCfg | None = None) -
         ("sum of transversal angles", legs[..., 1] + legs[..., 2], limits.sum),
     )
     if not record.valid[0]:
-        return "the simulation breaks"
+        return "the simulation diverges"
     for name, values, limit in checks:
         if values.min() < limit.lower + MARGIN or values.max() > limit.upper - MARGIN:
             return f"the {name} comes within {MARGIN:g} deg of its limits"
@@ -60,20 +59,23 @@ def unsafe_reason(plan: Plan, record: Record, limits: FilterCfg | None = None) -
 
 
 class Scorer:
-    """Scores motions by their information about parameters, on the described robot."""
+    """Simulates planned motions of the described robot and returns their Fisher information about parameters."""
 
     def __init__(self, parameters: ParameterSet, noise: NoiseLevels | None = None, replay: MotionReplay | None = None):
-        """Prepare; replay: worlds to use, by default of the project's description."""
+        """Score by `parameters` and sensor `noise`; replay: simulation, by default of the project's description."""
         self.parameters, self.noise = parameters, noise or NoiseLevels()
         self.replay = replay or MotionReplay()
         self._nominal = parameters.robots(np.zeros((1, len(parameters))))
 
     def record(self, plan: Plan) -> Record:
-        """Return the described robot's motion in a plan, from rest in the pose of the first targets."""
+        """Return the described robot's motion in a plan, one world, from rest in the pose of the first targets."""
         return replay_plan(self.replay, plan, self._nominal)
 
     def information(self, plan: Plan, record: Record) -> np.ndarray:
-        """Return the Fisher information of a motion about the parameters, normalised, (P, P)."""
+        """Return the Fisher information (P, P) of a motion about the normalised parameters.
+
+        The initial state is marginalised.
+        """
         motion = measure(plan, plan.kind, record, self._nominal, None, base_every=1)
         problem = MotionResiduals(motion, self.parameters, self.noise, self.replay.description)
         size = len(self.parameters)
@@ -87,18 +89,14 @@ class Scorer:
 class Excitation:
     """Chosen motions and their expected information."""
 
-    plans: tuple[Plan, ...]
-    """In the order of the motions."""
-    gain: tuple[float, ...]
-    """[nat] Information about the parameters after each motion."""
-    std: np.ndarray
-    """(P,) Expected standard deviations after all motions, relative to the prior's."""
-    refused: tuple[str, ...]
-    """Reasons for which candidates were unsafe."""
+    plans: tuple[Plan, ...]  # motions, in the order in which they were chosen
+    gain: tuple[float, ...]  # [nat] Total information gained over the prior, 1/2 ln det, after each motion
+    std: np.ndarray  # (P,) Expected standard deviations after all motions, relative to the prior's
+    refused: tuple[str, ...]  # `kind: reason` of each unsafe candidate
     parameters: ParameterSet
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of `excite.json` except the robot's mass."""
+        """Return the content of `excite.json` except the robot's mass: gain_nat, refused, and parameters by name."""
         expected = {
             p.name: {"unit": p.unit, "expected_deviation": p.std(0.0, float(d)), "of_prior": float(d)}
             for p, d in zip(self.parameters, self.std, strict=True)
@@ -109,9 +107,10 @@ class Excitation:
 def choose(
     scorer: Scorer, kinds: Sequence[Kind] = KINDS, *, candidates: int = 4, seconds: float = 1.25, seed: int = 0
 ) -> Excitation:
-    """Return one safe motion of each kind: of several candidates the one that adds most information to those before.
+    """Return one safe motion for each entry of `kinds`, the most informative of several random candidates.
 
-    Raises InputError: no candidate of a kind is safe.
+    A candidate's score is the information of all motions chosen earlier and of itself. candidates: number tried by
+    motion; seconds [s]: duration of a motion. Raises InputError: no candidate of a kind is safe.
     """
     rng, size = np.random.default_rng(seed), len(scorer.parameters)
     information, plans, gains, refused = np.eye(size), [], [], []
@@ -147,9 +146,9 @@ def record_motions(
     rng: np.random.Generator | None = None,
     torque: bool = False,
 ) -> list[RecordedMotion]:
-    """Record chosen motions on a simulated robot, write them as `<number>_<kind>.npz`, and return them.
+    """Record chosen motions on a simulated robot, write each to `folder` as `<number>_<kind>.npz`, and return them.
 
-    robots: the robot, N = 1. noise, rng, torque: see `measure`. Raises OSError.
+    robots: the robot, N = 1. solver: physics solver. noise, rng, torque: see `measure`. Raises OSError.
     """
     motions = []
     for i, plan in enumerate(chosen.plans):

@@ -23,28 +23,22 @@ from jumper_warp.identification.results import DescentStep, Effort, Identificati
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.utils.errors import InputError
 
-COARSE_DT = 1.0 / 480.0
-"""[s] Shortest physics step of all stages but the last one."""
-POPULATION = 128
-"""Candidates of a generation of CMA-ES."""
-FIRST_STD = 0.3
-"""Initial step size of CMA-ES, in standard deviations of the priors."""
+COARSE_DT = 1.0 / 480.0  # [s] lower bound of the physics step in all stages but the last one
+POPULATION = 128  # candidates in a generation of CMA-ES
+FIRST_STD = 0.3  # initial step size of CMA-ES, in standard deviations of the priors
 PIECES_DECREASE, STAGE_DECREASE = 0.1, 0.02
-"""Relative decrease of the cost below which the stage on pieces, and the stages on motions, end."""
+"""[1] Relative decrease of the cost below which the stage on pieces, and the stages on whole motions, end."""
 CONVERGED = 0.5
-"""Decrease of the cost, in mean squared residuals, below which the optimisation ends: 1 is the cost of one standard
-deviation."""
+"""Decrease of the cost, in mean squared residuals, below which the last stage ends; 1 is one standard deviation."""
 GOOD_STEP = 0.3
-"""Fraction of the predicted decrease with which a step is good enough to reuse the Jacobian."""
+"""Actual over predicted decrease of the cost above which a step is good enough to reuse the Jacobian."""
 HORIZONS = (0.4, 0.7, 1.0)
-"""Fractions of a motion on the ground that are fitted in turn: a paw's stroke depends on everything before it."""
-ATTEMPTS = 2
-"""Passes over all motions, at most."""
+"""Fractions of a motion on the ground that are fitted in turn, as a paw's motion depends on all earlier contacts."""
+ATTEMPTS = 2  # largest number of passes over all motions
 STUCK = 20.0
-"""Shortfall of the last step, in mean squared residuals, above which kinks of contact hold the optimisation: the
-motions are then added one after another again, from the parameters reached."""
-MAX_STEPS = 40
-"""Steps of a stage, at most."""
+"""Predicted minus actual decrease of the last step, in mean squared residuals, above which contact kinks block it: the
+motions are then added one after another again, starting from the fitted parameters."""
+MAX_STEPS = 40  # largest number of Levenberg-Marquardt steps in a stage
 
 
 def identify(
@@ -61,9 +55,9 @@ def identify(
 ) -> Identification:
     """Return the identification of the parameters with the least cost, by staged Levenberg-Marquardt.
 
-    prior_measurements: of the robot besides the motions. dt [s]: largest physics step, by default 1/480. replay: worlds
-    of an earlier call to reuse; its description is used then. threads: CPU threads. Raises InputError: no motions, or
-    motions with gaps, without measurements or at which the simulation diverges.
+    prior_measurements: such as a weighed mass. dt [s]: largest physics step, by default 1/480. replay: simulation to
+    reuse from an earlier call; it overrides description, device and threads (of the CPU). Raises InputError: no
+    motions, or motions with gaps, without measurements or in which the simulation diverges.
     """
     if not motions:
         raise InputError("there must be at least one motion")
@@ -94,8 +88,9 @@ def identify_by_evolution(
     device: wp.DeviceLike = None,
     threads: int | None = None,
 ) -> Identification:
-    """Return the identification by CMA-ES within `max_seconds`, initial states as first measured; see `identify`.
+    """Return the identification by CMA-ES; initial states stay at their first measurement.
 
+    max_seconds [s]: wall time of the search. population: candidates in a generation. Other arguments as in `identify`.
     Raises InputError: as `identify`, or `cma` is not installed.
     """
     try:
@@ -126,33 +121,33 @@ def identify_by_evolution(
 
 
 class Descent:
-    """Log of an optimisation: its steps, time and physics steps; `minimise` takes the steps of one stage."""
+    """Runs the stages of a Levenberg-Marquardt optimisation (`minimise`) and logs its steps, time and physics steps."""
 
     def __init__(self, replay: MotionReplay):
-        """Start the clocks; replay: worlds whose physics steps are counted."""
+        """Start the clocks at stage 0, with an empty log; replay: simulation whose physics steps are counted."""
         self.replay, self.steps, self.stage = replay, [], 0
         self.shortfall = 0.0
         """Predicted minus actual decrease of the cost in the last step."""
         self._begin = (time.perf_counter(), time.process_time(), replay.world_steps)
 
     def effort(self) -> Effort:
-        """Return time and physics steps since the beginning."""
+        """Return wall time, CPU time and physics steps since the object was made."""
         seconds, cpu, steps = self._begin
         return Effort(time.perf_counter() - seconds, time.process_time() - cpu, self.replay.world_steps - steps)
 
     def record_step(self, problem: LeastSquares, trial: Trial) -> None:
-        """Append a step to the log."""
-        effort = self.effort()
-        chi2 = trial.cost / problem.count
+        """Append the result of a Levenberg-Marquardt step to the log `steps`."""
+        chi2, effort = trial.cost / problem.count, self.effort()
         self.steps.append(DescentStep(self.stage, chi2, trial.damping, effort.world_steps, effort.seconds))
 
     def minimise(
         self, problem: LeastSquares, point: Point, normal: NormalEquations, decrease: float | None = None
     ) -> tuple[Point, NormalEquations]:
-        """Return the point that Levenberg-Marquardt steps reach, and the normal equations there.
+        """Return the point after one stage of Levenberg-Marquardt steps, and the normal equations there.
 
-        Steps end when one lowers the cost by less than `decrease` relative to it; None: when one with a new Jacobian
-        lowers it by less than `CONVERGED`. A Jacobian is reused with Broyden's update while steps are `GOOD_STEP`.
+        decrease: the stage ends at the first step that lowers the cost by less than this fraction; None: at the first
+        step with a new Jacobian that lowers it by less than `CONVERGED`. While steps are `GOOD_STEP`, Broyden's update
+        replaces a new Jacobian.
         """
         new_jacobian, self.stage = decrease is not None, self.stage + 1
         for _ in range(MAX_STEPS):
@@ -177,10 +172,10 @@ def descend(
     pieces: Sequence[MotionResiduals],
     prior_measurements: Sequence[PriorMeasurement],
 ) -> tuple[LeastSquares, Point, NormalEquations]:
-    """Return the problem of all motions, its minimum, and the normal equations there.
+    """Return the least-squares problem of all motions, its minimum, and the normal equations there, after all stages.
 
-    coarse, whole: all motions, with the physics steps of the first stages and of the last one. pieces: motions in short
-    pieces for a first stage, or none. Raises InputError: the simulation diverges at a motion.
+    coarse, whole: all motions, with the physics steps of the first stages and of the last stage. pieces: short pieces
+    of the motions for a first stage, empty to skip it. Raises InputError: the simulation diverges in a motion.
     """
     replay, z = descent.replay, np.zeros(len(parameters))
     if pieces:
@@ -208,16 +203,16 @@ def add_motions(
     prior_measurements: Sequence[PriorMeasurement],
     z: np.ndarray,
 ) -> tuple[Point, list[Linearised]]:
-    """Return the robust minimum over all motions, added one after another from parameters z, and the Jacobians there.
+    """Return the minimum of the robust cost over all motions and the Jacobians there, adding motions one by one.
 
-    Motions with a held base come first: their legs do not interact. The others follow, the one with the least misfit
-    next. Outliers count less (a paw that strikes 1 ms late spoils all residuals of that moment).
+    z: parameters to start from, (P,), normalised. Motions with a held base come first, as their legs do not interact;
+    then always the motion with the least misfit. The robust cost limits outliers, such as a paw that strikes 1 ms late.
     """
     point, added, linearised = Point(z, []), [], []
     while len(added) < len(motions):
-        left = [i for i in range(len(motions)) if i not in added]
-        held = [i for i in left if not motions[i].free]
-        new = held or [min(left, key=lambda i: misfit(motions[i], descent.replay, point.z))]
+        remaining = [i for i in range(len(motions)) if i not in added]
+        held = [i for i in remaining if not motions[i].free]
+        new = held or [min(remaining, key=lambda i: misfit(motions[i], descent.replay, point.z))]
         point = Point(point.z, point.starts + [np.zeros(motions[i].start_size) for i in new])
         for fraction in (1.0,) if held else HORIZONS:
             fitted = [motions[i] for i in added] + [motions[i].first_part(fraction) for i in new]
@@ -231,7 +226,7 @@ def add_motions(
 
 
 def misfit(motion: MotionResiduals, replay: MotionReplay, z: np.ndarray) -> float:
-    """Return the mean of ln(1 + r^2) of a motion's residuals at parameters z and the nominal initial state."""
+    """Return the mean of ln(1 + r^2) over a motion's residuals r at parameters z (P,) and the nominal initial state."""
     residuals = motion.residuals(replay, z[None], np.zeros((1, motion.start_size)))
     with np.errstate(over="ignore"):
         return float(np.mean(np.log1p(np.nan_to_num(residuals, posinf=1.0e100) ** 2)))

@@ -1,4 +1,4 @@
-"""Initial states of motions: the prior that the first rows give, and the stance of a robot whose paws rest."""
+"""Initial states of motions: a prior from the first measured rows, and the stance of a robot with resting paws."""
 
 from __future__ import annotations
 
@@ -16,57 +16,48 @@ from jumper_warp.utils.rotations import CONJUGATE, from_rotation_vector, multipl
 HANGING_HEIGHT = 1.0
 """[m] Height of a held base whose position is not measured."""
 STEP = 1.0e-6
-"""[rad] Step of the differences of paw positions."""
+"""[s] Time step, or [rad] angle step, of central differences of paw positions."""
 NORMAL_WEIGHT = 1.0e3
-"""[1] Weight of the paws' velocities off the ground against those along it."""
-LEVELLING_STEPS = 6
-"""Newton steps after which all paws lie in one plane to rounding."""
-FIRST_ROWS = 8
-"""Rows from which a motion's initial state is measured."""
+"""[1] Weight of the paws' velocities normal to the ground against those along the ground."""
+LEVELLING_STEPS = 6  # Newton steps after which all paws lie in one plane to rounding
+FIRST_ROWS = 8  # rows from which a motion's initial state is measured
 QUIET_ROWS = 2
 QUIET = 0.2
 """[rad/s] Mean rate over the first `QUIET_ROWS` below which a standing robot has all paws on the ground."""
 TRUST = 3.0
-"""Standard deviations of the noise by which an initial state may differ from its measurement, so that the measurement
-hardly counts twice."""
+"""[1] Prior std of a measured initial state over the sensor's noise: large, as the same reading is also a residual."""
 
 
 @dataclass
 class InitialStates:
-    """States at the first row of a motion, N worlds."""
+    """States at the first row of a motion, N worlds; motors by leg FL, FR, BL, BR, each lateral, outer, inner."""
 
-    position: np.ndarray
-    """(N, 3) [m] Of the base's origin, world frame."""
-    quaternion: np.ndarray
-    """(N, 4) xyzw, base to world."""
-    velocity: np.ndarray
-    """(N, 3) [m/s] Of the base's origin, world frame."""
-    spin: np.ndarray
-    """(N, 3) [rad/s] World frame."""
-    angle: np.ndarray
-    """(N, 12) [rad] True motor angles."""
-    rate: np.ndarray
-    """(N, 12) [rad/s]"""
+    position: np.ndarray  # (N, 3) [m] of the base's origin, world frame
+    quaternion: np.ndarray  # (N, 4) xyzw, base to world
+    velocity: np.ndarray  # (N, 3) [m/s] of the base's origin, world frame
+    spin: np.ndarray  # (N, 3) [rad/s] angular velocity of the base, world frame
+    angle: np.ndarray  # (N, 12) [rad] true motor angles, without sensor offsets
+    rate: np.ndarray  # (N, 12) [rad/s] motor rates
 
 
 class InitialStatePrior:
-    """Prior of a motion's initial state, from its first rows; the state has I normalised coordinates.
+    """Prior of a motion's initial state, from its first rows; the state has I = 27 or 36 normalised coordinates.
 
-    Coordinates are deviations from the measured state, in prior standard deviations: readings and rates of 12 motors,
-    the base's rotation vector, and for a free base its position, velocity and spin (world frame).
+    Coordinates are deviations from the measured state, in prior standard deviations: 12 motor readings, 12 rates, the
+    base's rotation vector (3), and for a free base its position, velocity and spin (3 each, world frame).
     """
 
     def __init__(self, motion: RecordedMotion, noise: NoiseLevels, description: RobotDescription):
         """Estimate the state of the first row, and its standard deviations, from the first rows and the stance."""
         self.free, self.description = motion.base == "free", description
         self.size = 36 if self.free else 27
-        """I, the number of coordinates."""
+        """Number I of coordinates."""
         rows = min(FIRST_ROWS, len(motion.time))
         angle_noise, rate_noise = DEGREES * noise.angle, DEGREES * noise.rate
         angle, angle_std = first_values(motion.angle, motion.target[0], TRUST * angle_noise, 10.0 * DEGREES)
         rate, rate_std = first_values(motion.rate, np.zeros(12), TRUST * rate_noise, 1.0)
         if motion.rate is None and motion.angle is not None:
-            rate, rate_std = slope(motion.time[:rows], motion.angle[:rows]), np.full(12, 1.0)
+            rate, rate_std = column_slopes(motion.time[:rows], motion.angle[:rows]), np.full(12, 1.0)
         level, position = np.array([0.0, 0.0, 0.0, 1.0]), np.array([0.0, 0.0, HANGING_HEIGHT])
         quaternion, _ = first_values(motion.quaternion, level, 0.0, 0.0)
         quaternion = quaternion / np.linalg.norm(quaternion)
@@ -82,21 +73,21 @@ class InitialStatePrior:
             near = height_fits and float(up @ ground.up[0]) > math.cos(math.radians(6.0))
             self.standing = near and ground.gap[0] < 0.02
             if motion.position is not None:
-                velocity = slope(motion.time[:rows], motion.position[:rows])
+                velocity = column_slopes(motion.time[:rows], motion.position[:rows])
             base_std = [position_std, np.full(3, 0.3), np.full(3, 1.0)]
             if self.standing:  # contact constrains the base better than its sensors do
                 tilt_std = np.array([0.2 * DEGREES, 0.2 * DEGREES, tilt_std[2]])
                 base_std = [np.array([0.02, 0.02, 0.001]), np.full(3, 0.05), np.full(3, 0.3)]
-                self.resting = quiet(motion.rate)
-                self._levelling = levelling(description, angle)
+                self.resting = motors_at_rest(motion.rate)
+                self._levelling = levelling_direction(description, angle)
         mean = (position, quaternion, velocity, np.zeros(3), angle, rate)
         self._mean = InitialStates(*(values[None] for values in mean))
         self._std = np.concatenate([angle_std, rate_std, tilt_std, *base_std])
 
     def states(self, z: np.ndarray, robots: RobotValues) -> InitialStates:
-        """Return the states of normalised coordinates (N, I); true angles are readings less the robots' offsets.
+        """Return the states of N worlds at normalised coordinates z (N, I); true angles are readings minus offsets.
 
-        A standing robot has all paws on the ground, before the coordinates of its base are added.
+        A standing robot's base is placed so that all paws are on the ground; its base coordinates are added afterwards.
         """
         mean, deviation = self._mean, z * self._std
         state = InitialStates(*(np.repeat(getattr(mean, name), len(z), axis=0) for name in vars(mean)))
@@ -119,8 +110,11 @@ class InitialStatePrior:
         return state
 
 
-def quiet(rate: np.ndarray | None) -> bool:
-    """Return whether the joints hardly move in the first rows of measured rates (n, 12) [rad/s]."""
+def motors_at_rest(rate: np.ndarray | None) -> bool:
+    """Return whether all 12 mean rates over the first `QUIET_ROWS` of rates (n, 12) [rad/s] are below `QUIET`.
+
+    False without rates, or if a motor has none in these rows.
+    """
     if rate is None or np.isnan(rate[:QUIET_ROWS]).all(axis=0).any():
         return False
     return bool((np.abs(np.nanmean(rate[:QUIET_ROWS], axis=0)) < QUIET).all())
@@ -129,7 +123,10 @@ def quiet(rate: np.ndarray | None) -> bool:
 def first_values(
     values: np.ndarray | None, default: np.ndarray, measured_std: float, default_std: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first measured value of each column, else its default, and their standard deviations, (columns,)."""
+    """Return the first value of each column and its standard deviation, (columns,) each; unmeasured: the default's.
+
+    values: (n, columns), NaN where not measured, or None; only the first `FIRST_ROWS` count. default: (columns,).
+    """
     if values is None:
         return default.copy(), np.full(len(default), default_std)
     first = default.copy()
@@ -140,8 +137,11 @@ def first_values(
     return first, np.where(measured, measured_std, default_std)
 
 
-def slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Return the slope of each column by least squares, 0 where fewer than three values are measured."""
+def column_slopes(time: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Return the least-squares slope [1/s] of each column of values (n, columns) over time (n,) [s].
+
+    0 where fewer than three values are measured (not NaN).
+    """
     slopes = np.zeros(values.shape[1])
     for i in range(values.shape[1]):
         measured = np.isfinite(values[:, i])
@@ -153,22 +153,17 @@ def slope(time: np.ndarray, values: np.ndarray) -> np.ndarray:
 class Stance(NamedTuple):
     """Pose and velocity of a base over four resting paws, N robots."""
 
-    height: np.ndarray
-    """(N,) [m] Of the base's origin."""
-    up: np.ndarray
-    """(N, 3) World z in the base frame."""
-    gap: np.ndarray
-    """(N,) [m] Largest distance of a paw from the plane that fits the four best."""
-    velocity: np.ndarray
-    """(N, 3) [m/s] Of the base's origin, base frame, that lets the paws rest."""
-    spin: np.ndarray
-    """(N, 3) [rad/s] Likewise."""
+    height: np.ndarray  # (N,) [m] of the base's origin above the ground
+    up: np.ndarray  # (N, 3) unit vector of world z, base frame
+    gap: np.ndarray  # (N,) [m] largest distance of a paw from the least-squares plane through the four paws
+    velocity: np.ndarray  # (N, 3) [m/s] of the base's origin, base frame, which minimises the paws' velocities
+    spin: np.ndarray  # (N, 3) [rad/s] of the base, base frame, which minimises the paws' velocities
 
 
 def paw_positions(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
-    """Return the centres of the paws [m], base frame, (N, 4, 3), at motor angles (N, 12) [rad].
+    """Return the paws' centres [m], base frame, (N, 4 legs FL, FR, BL, BR, 3), at motor angles (N, 12) [rad].
 
-    Angles at which a loop cannot close are moved to the nearest at which it can.
+    Where the knees are too far apart for the five-bar to close, the paw is midway between them.
     """
     paws = np.zeros((len(angle), 4, 3))
     for k, name in enumerate(LEGS):
@@ -188,7 +183,7 @@ def paw_positions(description: RobotDescription, angle: np.ndarray) -> np.ndarra
 
 
 def stance(description: RobotDescription, angle: np.ndarray, rate: np.ndarray) -> Stance:
-    """Return the base over paws at rest on level ground, at motor angles [rad] and rates [rad/s], (N, 12)."""
+    """Return pose and velocity of bases over paws at rest on level ground; angle [rad], rate [rad/s]: (N, 12)."""
     paws = paw_positions(description, angle)
     ahead, behind = (paw_positions(description, angle + sign * STEP * rate) for sign in (1.0, -1.0))
     paw_velocity = (ahead - behind) / (2 * STEP)
@@ -213,29 +208,32 @@ def stance(description: RobotDescription, angle: np.ndarray, rate: np.ndarray) -
 
 
 def unevenness(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
-    """Return the distance of the fourth paw from the plane of the others [m], (N,), at motor angles (N, 12) [rad]."""
+    """Return the signed distance [m] (N,) of paw BR from the plane of the other three, at motor angles (N, 12) [rad].
+
+    Positive along (FR - FL) x (BL - FL), which points down.
+    """
     paws = paw_positions(description, angle)
-    across, along, other = (paws[:, k] - paws[:, 0] for k in (1, 2, 3))
-    normal = np.cross(across, along)
-    return np.einsum("ni,ni->n", other, normal) / np.linalg.norm(normal, axis=1)
+    to_fr, to_bl, to_br = (paws[:, k] - paws[:, 0] for k in (1, 2, 3))
+    normal = np.cross(to_fr, to_bl)
+    return np.einsum("ni,ni->n", to_br, normal) / np.linalg.norm(normal, axis=1)
 
 
-def levelling(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
-    """Return the smallest change of motor angles per unevenness, (12,) [rad/m], at angles (12,) [rad]."""
+def levelling_direction(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
+    """Return the smallest change of motor angles by `unevenness`, (12,) [rad/m], at angles (12,) [rad]."""
     ahead, behind = (unevenness(description, angle + sign * STEP * np.eye(12)) for sign in (1.0, -1.0))
     slope = (ahead - behind) / (2.0 * STEP)
     return slope / (slope @ slope)
 
 
 def levelled(
-    description: RobotDescription, angle: np.ndarray, rate: np.ndarray, change: np.ndarray
+    description: RobotDescription, angle: np.ndarray, rate: np.ndarray, direction: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return motor angles [rad] and rates [rad/s], (N, 12), at which all paws lie and stay in one plane.
+    """Return motor angles [rad] and rates [rad/s], (N, 12), corrected so that all paws lie and stay in one plane.
 
-    change: direction along which angles and rates are corrected, (12,) [rad/m], see `levelling`.
+    direction: of the correction of angles and rates, (12,) [rad/m], from `levelling_direction`.
     """
     for _ in range(LEVELLING_STEPS):
-        angle = angle - unevenness(description, angle)[:, None] * change
+        angle = angle - unevenness(description, angle)[:, None] * direction
     ahead, behind = (unevenness(description, angle + sign * STEP * rate) for sign in (1.0, -1.0))
-    slope = (unevenness(description, angle + STEP * change) - unevenness(description, angle - STEP * change)) / 2.0
-    return angle, rate - (0.5 * (ahead - behind) / slope)[:, None] * change
+    plus, minus = (unevenness(description, angle + sign * STEP * direction) for sign in (1.0, -1.0))
+    return angle, rate - (0.5 * (ahead - behind) / ((plus - minus) / 2.0))[:, None] * direction

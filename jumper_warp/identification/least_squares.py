@@ -15,58 +15,43 @@ from jumper_warp.identification.residuals import DIFFERENCE, Linearised, MotionR
 from jumper_warp.utils.errors import InputError
 
 DAMPINGS = np.array([0.0, 1.0e-3, 1.0e-2, 1.0e-1, 1.0])
-"""[1] Damping relative to the diagonal of the normal matrix; each step tries all of them."""
-ROBUST = 3.0
-"""Width of the Cauchy loss of a robust problem, in typical residuals."""
-PROBE = 0.3
-"""Fraction of a step after which the curvature of the residuals is measured."""
-BLOCK = 16
-"""Rows that `gram` multiplies at once."""
+"""[1] Dampings relative to the diagonal of the normal matrix; each step tries all of them."""
+CAUCHY_WIDTH = 3.0  # width of the Cauchy loss of a robust problem, in typical residuals
+PROBE = 0.3  # fraction of a step after which the curvature of the residuals is measured
+BLOCK = 16  # rows that `transposed_product` multiplies at once
 CHANGE = 0.01
-"""Step of a difference, in the unknown's posterior standard deviations, the others known: small against the accuracy,
-large against the kinks of friction and contact."""
-LARGEST_CHANGE = 0.01
-"""Largest step of a difference, in standard deviations of the prior."""
+"""Step of a finite difference, in the unknown's posterior standard deviations if all others were known: small against
+the accuracy, large against the kinks of friction and contact."""
+LARGEST_CHANGE = 0.01  # largest step of a finite difference, in standard deviations of the prior
 
 
 @dataclass
 class Point:
     """Values of all unknowns, normalised by their priors."""
 
-    z: np.ndarray
-    """(P,) Parameters."""
-    starts: list[np.ndarray]
-    """(I,) Coordinates of each motion's initial state."""
+    z: np.ndarray  # (P,) parameters
+    starts: list[np.ndarray]  # by motion: (I,) coordinates of the initial state
 
 
 @dataclass
 class NormalEquations:
-    """Normal equations at a point. Initial states of different motions are coupled only through the parameters."""
+    """Normal equations at a point. Initial states of different motions are coupled only through the parameters.
 
-    cost: float
-    """Sum of squares of residuals, prior measurements and priors."""
-    data_cost: float
-    """Sum of squares of the residuals alone."""
-    gradient: np.ndarray
-    """(P,) By the parameters."""
-    matrix: np.ndarray
-    """(P, P) Of the parameters, without the prior's identity."""
-    start_gradients: list[np.ndarray]
-    """(I,) By each motion's initial state."""
-    start_matrices: list[np.ndarray]
-    """(I, I) Of each motion's initial state, with the prior's identity."""
-    cross_matrices: list[np.ndarray]
-    """(P, I) Of the parameters and each motion's initial state."""
-    linearised: list[Linearised]
-    """Of each motion."""
-    weights: list[np.ndarray]
-    """(m,) Of the residuals of each motion."""
+    Gradients and matrices are those of half the cost. P parameters; each motion has I coordinates and m residuals.
+    """
+
+    cost: float  # sum of squares (robust: of losses) of residuals, prior measurements and priors
+    data_cost: float  # part of the cost from the residuals alone
+    gradient: np.ndarray  # (P,) by the parameters
+    matrix: np.ndarray  # (P, P) Gauss-Newton matrix of the parameters, without the prior's identity
+    start_gradients: list[np.ndarray]  # by motion: (I,) by its initial state
+    start_matrices: list[np.ndarray]  # by motion: (I, I) of its initial state, with the prior's identity
+    cross_matrices: list[np.ndarray]  # by motion: (P, I) of the parameters and its initial state
+    linearised: list[Linearised]  # by motion: residuals and Jacobian
+    weights: list[np.ndarray]  # by motion: (m,) weights of the residuals, 1 unless the problem is robust
 
     def information(self) -> np.ndarray:
-        """Return the Fisher information about the parameters without their priors, (P, P), in prior units.
-
-        Initial states are marginalised.
-        """
+        """Return the data's Fisher information (P, P) about the normalised parameters, initial states marginalised."""
         information = self.matrix.copy()
         for cross, start_matrix in zip(self.cross_matrices, self.start_matrices, strict=True):
             information -= cross @ np.linalg.solve(start_matrix, cross.T)
@@ -75,7 +60,11 @@ class NormalEquations:
     def solve(
         self, damping: float, free: np.ndarray, gradient: np.ndarray, start_gradients: Sequence[np.ndarray]
     ) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Return the damped step of parameters (P,), zero except at `free`, and of each initial state, (I,)."""
+        """Return the damped step of the parameters (P,), zero except at `free`, and of initial states, (I,) by motion.
+
+        damping [1]: relative to the diagonal. free: indices of parameters that may move. gradient (P,) and
+        start_gradients ((I,) by motion): right-hand sides.
+        """
         matrix = self.matrix[np.ix_(free, free)] + np.eye(len(free))
         matrix += damping * np.diag(np.diag(matrix))
         slope = gradient[free].copy()
@@ -93,10 +82,10 @@ class NormalEquations:
         return move, [-eliminated[:, -1] - eliminated[:, :-1] @ move[free] for eliminated in solved]
 
 
-def gram(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return left.T @ right of tall arrays, (m, a) and (m, b), summed in blocks of `BLOCK` rows.
+def transposed_product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
+    """Return left.T @ right (a, b) of tall arrays (m, a) and (m, b), summed in blocks of `BLOCK` rows.
 
-    BLAS multiplies blocks this small on one thread, so that the bits do not depend on the number of threads.
+    BLAS multiplies blocks this small on one thread, so that results do not depend on the number of threads.
     """
     product = np.zeros((left.shape[1], right.shape[1]))
     for row in range(0, len(left), BLOCK):
@@ -107,24 +96,20 @@ def gram(left: np.ndarray, right: np.ndarray) -> np.ndarray:
 class Trial(NamedTuple):
     """Result of a Levenberg-Marquardt step."""
 
-    point: Point
-    cost: float
-    """At the point."""
-    damping: float
-    """[1] Of `DAMPINGS`; infinite if the point stays."""
-    predicted_decrease: float
-    """Decrease of the cost by the undamped step if the residuals were linear."""
-    residuals: list[np.ndarray]
-    """(m,) Of each motion, at the point."""
+    point: Point  # after the step
+    cost: float  # at the point
+    damping: float  # [1] the best of `DAMPINGS`; infinite if no step lowers the cost and the point stays
+    predicted_decrease: float  # decrease of the cost by the undamped step if the residuals were linear
+    residuals: list[np.ndarray]  # by motion: (m,) at the point
 
 
 def replace_residuals(linearised: Sequence[Linearised], residuals: Sequence[np.ndarray]) -> list[Linearised]:
-    """Return the Jacobians of all motions with residuals (m,) of another point, or of another physics step."""
+    """Return copies of `linearised` with the same Jacobians and new residuals, (m,) by motion."""
     return [Linearised(residual, old.jacobian) for residual, old in zip(residuals, linearised, strict=True)]
 
 
 class LeastSquares:
-    """Least-squares problem of motions, parameters with priors and prior measurements, evaluated in parallel worlds."""
+    """Least-squares problem of motions, prior measurements and parameters with priors, evaluated in parallel worlds."""
 
     def __init__(
         self,
@@ -134,14 +119,9 @@ class LeastSquares:
         prior_measurements: Sequence[PriorMeasurement] = (),
         robust: bool = False,
     ):
-        """Lay out the unknowns; robust: outliers count less, as where a paw strikes a moment too late."""
-        self.parameters, self.motions, self.replay, self.prior_measurements = (
-            parameters,
-            motions,
-            replay,
-            prior_measurements,
-        )
-        self.robust = robust
+        """Lay out the unknowns; robust: Cauchy loss of residuals, so that outliers such as late contacts count less."""
+        self.parameters, self.motions, self.replay = parameters, motions, replay
+        self.prior_measurements, self.robust = prior_measurements, robust
         self._typical = math.inf
         self.count = sum(int(motion.valid.sum()) for motion in motions)
         """Number of measured values."""
@@ -153,22 +133,24 @@ class LeastSquares:
         return Point(np.zeros(len(self.parameters)), [np.zeros(motion.start_size) for motion in self.motions])
 
     def normal(self, point: Point, known: Sequence[Linearised] = ()) -> NormalEquations:
-        """Return the normal equations at a point; known: Jacobians there that the first motions have already.
+        """Return the normal equations at a point; known: residuals and Jacobians of the first motions, not recomputed.
 
-        Raises InputError: the simulation diverges there.
+        Raises InputError: the simulation diverges in a motion.
         """
         linearised = list(known)
         for motion, start, change in list(zip(self.motions, point.starts, self._change, strict=True))[len(known) :]:
             linear = motion.linearise(self.replay, point.z, start, change)
             if not np.isfinite(linear.residual).all() or not np.isfinite(linear.jacobian).all():
-                raise InputError(
-                    f"motion {motion.motion.name}: the model breaks in it; check targets, units, signs and base"
-                )
+                name = motion.motion.name
+                raise InputError(f"motion {name}: the simulation diverges; check targets, units, signs and base")
             linearised.append(linear)
         return self.assemble(point, linearised)
 
     def assemble(self, point: Point, linearised: Sequence[Linearised]) -> NormalEquations:
-        """Return the normal equations at a point, given residuals and Jacobians of all motions there."""
+        """Return the normal equations at a point; linearised: residuals and Jacobians of all motions there.
+
+        Also sets the steps of the next finite differences, and of a robust problem the typical residual.
+        """
         size = len(self.parameters)
         prior_cost = float(point.z @ point.z) + sum(float(start @ start) for start in point.starts)
         normal = NormalEquations(
@@ -179,7 +161,7 @@ class LeastSquares:
             self._typical = max(1.0, float(np.median(np.abs(every))) / 0.6745)
         for linear, start, change in zip(linearised, point.starts, self._change, strict=True):
             weight = self._weight(linear.residual)
-            square = gram(weight[:, None] * linear.jacobian, linear.jacobian)
+            square = transposed_product(weight[:, None] * linear.jacobian, linear.jacobian)
             slope = np.einsum("mi,m->i", linear.jacobian, weight * linear.residual)
             normal.weights.append(weight)
             change[:] = np.clip(CHANGE / np.sqrt(1.0 + np.diag(square)), DIFFERENCE, LARGEST_CHANGE)
@@ -197,9 +179,9 @@ class LeastSquares:
         return normal
 
     def broyden_update(self, normal: NormalEquations, old: Point, trial: Trial) -> NormalEquations:
-        """Return the normal equations after a step, with Broyden's update of the Jacobians.
+        """Return the normal equations at `trial`, with Broyden's update of the Jacobians of `normal` at `old`.
 
-        Its norm weighs the unknowns by their curvature.
+        The update's norm weighs the unknowns by their curvature.
         """
         linearised, new = [], trial.point
         parts = zip(normal.linearised, trial.residuals, old.starts, new.starts, normal.start_matrices, strict=True)
@@ -212,23 +194,23 @@ class LeastSquares:
         return self.assemble(new, linearised)
 
     def residuals(self, point: Point) -> list[np.ndarray]:
-        """Return the residuals (m,) of each motion at a point."""
+        """Return the residuals of each motion at a point, (m,) by motion."""
         starts = [start[None] for start in point.starts]
         return [residuals[:, 0] for residuals in self._costs(point.z[None], starts)[1]]
 
     def _weight(self, residual: np.ndarray) -> np.ndarray:
-        """Return the weights (m,) of residuals (m,)."""
-        return 1.0 / (1.0 + (residual / (ROBUST * self._typical)) ** 2) if self.robust else np.ones_like(residual)
+        """Return the weights (m,) in the normal equations of residuals (m,): 1, or those of the Cauchy loss."""
+        return 1.0 / (1.0 + (residual / (CAUCHY_WIDTH * self._typical)) ** 2) if self.robust else np.ones_like(residual)
 
     def _loss(self, residual: np.ndarray) -> np.ndarray:
-        """Return the loss of each residual: its square, or the Cauchy loss of a robust problem."""
+        """Return the loss of each residual, of any shape: its square, or the Cauchy loss of a robust problem."""
         if not self.robust:
             return residual**2
-        limit = ROBUST * self._typical
+        limit = CAUCHY_WIDTH * self._typical
         return limit**2 * np.log1p((residual / limit) ** 2)
 
     def prior_residuals(self, z: np.ndarray) -> list[tuple[float, np.ndarray]]:
-        """Return the weighed residual of each prior measurement at parameters (P,), and its gradient (P,)."""
+        """Return (residual over its standard deviation, gradient (P,)) of each prior measurement at parameters (P,)."""
         step = 1.0e-6
         robots = self.parameters.robots(np.concatenate([z[None], z + step * np.eye(len(z))]), self.replay.description)
         residuals = []
@@ -238,11 +220,11 @@ class LeastSquares:
         return residuals
 
     def costs(self, z: np.ndarray, starts: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the cost (K,) of K points, (K, P) and (K, I) of each motion; infinite where a world diverges."""
+        """Return the costs (K,) of K points z (K, P) and starts, (K, I) by motion; infinite where a world diverges."""
         return self._costs(z, starts)[0]
 
     def _costs(self, z: np.ndarray, starts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Return the cost (K,) of K points, and the residuals of each motion, (m, K)."""
+        """Return `costs` (K,) of K points, and the residuals, (m, K) by motion."""
         cost = np.sum(z**2, axis=1) + sum(np.sum(start**2, axis=1) for start in starts)
         robots, residuals = self.parameters.robots(z, self.replay.description), []
         for prior in self.prior_measurements:
@@ -255,7 +237,7 @@ class LeastSquares:
         return np.where(np.isfinite(cost), cost, math.inf), residuals
 
     def step(self, point: Point, normal: NormalEquations, geodesic: bool = True) -> Trial:
-        """Return the best point over all `DAMPINGS`; the point stays, with infinite damping, if none is better.
+        """Return the result of the best step over all `DAMPINGS`; the point stays if no step lowers the cost.
 
         geodesic: also try each step with geodesic acceleration, which follows the curvature of the residuals.
         """
@@ -274,11 +256,11 @@ class LeastSquares:
         return trial
 
     def _free(self, z: np.ndarray, gradient: np.ndarray) -> np.ndarray:
-        """Return the indices of the parameters that may move: not at a bound, or the gradient points away from it."""
+        """Return the indices of the parameters that may move: not at a bound, or descent leads away from it."""
         return np.flatnonzero(~((z <= self._low) & (gradient > 0.0) | (z >= self._high) & (gradient < 0.0)))
 
     def _best_trial(self, z: np.ndarray, starts: list[np.ndarray], predicted: float) -> Trial:
-        """Return the best of K points, (K, P) and (K, I) of each motion."""
+        """Return the result at the best of K points z (K, P), starts (K, I) by motion; predicted: cost decrease."""
         costs, residuals = self._costs(z, starts)
         best = int(np.argmin(costs))
         moved = Point(z[best], [start[best] for start in starts])
@@ -288,10 +270,10 @@ class LeastSquares:
     def _accelerated(
         self, point: Point, normal: NormalEquations, free: np.ndarray, plain: list[tuple[np.ndarray, list[np.ndarray]]]
     ) -> list[tuple[np.ndarray, list[np.ndarray]]]:
-        """Return the plain steps (P,), (I,) of each damping with geodesic acceleration.
+        """Return the steps with geodesic acceleration; plain: step by damping, parameters (P,) and (I,) by motion.
 
-        Parallel worlds measure the curvature of the residuals at the fraction `PROBE` of each step. A step stays plain
-        where the acceleration would be longer than it.
+        Parallel worlds measure the curvature of the residuals at the fraction `PROBE` of each step. A step is returned
+        unchanged if its acceleration is longer than the step, or a world diverges.
         """
         size = len(point.z)
         ahead = np.clip(point.z + PROBE * np.array([move for move, _ in plain]), self._low, self._high)
@@ -303,7 +285,7 @@ class LeastSquares:
             with np.errstate(invalid="ignore", over="ignore"):
                 straight = np.einsum("mi,ki->mk", linear.jacobian, both)
                 curvature = (residual - linear.residual[:, None] - straight) / PROBE**2
-                slope = gram(linear.jacobian, weight[:, None] * curvature)
+                slope = transposed_product(linear.jacobian, weight[:, None] * curvature)
             gradient += slope[:size]
             start_gradients.append(slope[size:])
         accelerated = []

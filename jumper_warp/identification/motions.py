@@ -21,7 +21,7 @@ from jumper_warp.utils.files import write_atomically
 
 PER_MOTOR = ("target", "angle", "rate", "torque")
 CHANNELS = ("angle", "rate", "torque", "position", "quaternion")
-"""Channels of measurements."""
+"""Names of measured channels; each is a field of `RecordedMotion`."""
 DEGREES = math.pi / 180.0
 UNITS = {
     "time": {"s": 1.0, "ms": 1.0e-3},
@@ -34,8 +34,8 @@ UNITS = {
     "quaternion": {"": 1.0, "1": 1.0},
 }
 """Factor of each unit to the first one of its quantity, which is the default."""
-LARGEST = {"target": 13.0, "angle": 13.0, "rate": 300.0, "torque": 1000.0, "position": 100.0}
-"""Largest plausible value [rad, rad/s, N m, m]; larger ones are probably in another unit."""
+LARGEST_PLAUSIBLE = {"target": 13.0, "angle": 13.0, "rate": 300.0, "torque": 1000.0, "position": 100.0}
+"""Absolute value [rad, rad/s, N m, m] by channel above which the data are probably in another unit."""
 EXAMPLE = (
     "such as time, target/FL_outer, angle/FL_outer [deg], rate/FL_outer, torque/FL_outer, position/x, quaternion/w"
 )
@@ -64,18 +64,21 @@ class NoiseLevels:
 
 @dataclass(frozen=True, eq=False)
 class RecordedMotion:
-    """Recorded targets and measurements of one motion. NaN: not measured in a row; None: channel not measured."""
+    """Recorded targets and measurements of one motion, n rows. NaN: not measured in a row; None: channel not measured.
+
+    The 12 motors are ordered by leg FL, FR, BL, BR, each lateral, outer, inner.
+    """
 
     name: str
-    """Of the file, without suffix."""
+    """Name of the file without suffix."""
     time: np.ndarray
     """(n,) [s], rising."""
     target: np.ndarray
     """(n, 12) [rad] Sent to the motors (after the command filter), each held until the next row."""
     angle: np.ndarray | None = None
-    """(n, 12) [rad] Readings of the sensors."""
+    """(n, 12) [rad] Readings of the motors' angle sensors, including their offsets."""
     rate: np.ndarray | None = None
-    """(n, 12) [rad/s]"""
+    """(n, 12) [rad/s] Motor rates."""
     torque: np.ndarray | None = None
     """(n, 12) [N m] At the joints: measured, or current times torque constant times gear ratio."""
     position: np.ndarray | None = None
@@ -85,14 +88,14 @@ class RecordedMotion:
     base: Literal["free", "fixed"] = "free"
     """"free": the robot stands or jumps on the ground; "fixed": it hangs from a stand, paws in the air."""
     gains: Literal["jumping", "walking"] = "jumping"
-    """Gains of the controllers, of those in the description."""
+    """Set of the robot description's motor gains that the controllers used."""
     torque_limit: float = 18.0
-    """[N m] Of the controllers."""
+    """[N m] Limit on the controllers' torque."""
     notes: Mapping[str, Any] = field(default_factory=dict)
     """Free-form metadata, saved with the motion."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: a channel of another shape, not finite, or out of range."""
+        """Raise InputError: a channel of another shape, not finite, or out of range, or a bad setting."""
         n, what = len(self.time), f"motion {self.name}"
         if n < 3 or self.time.ndim != 1:
             raise InputError(f"{what}: time must be one column of at least 3 rows, got shape {self.time.shape}")
@@ -109,7 +112,7 @@ class RecordedMotion:
                 row = int(np.argwhere(~np.isfinite(values) if name == "target" else np.isinf(values))[0][0])
                 raise InputError(f"{what}: {name} is not finite in row {row}")
             largest = np.nanmax(np.abs(values)) if not np.isnan(values).all() else 0.0
-            if largest > LARGEST.get(name, math.inf):
+            if largest > LARGEST_PLAUSIBLE.get(name, math.inf):
                 unit = next(iter(UNITS[name]))
                 raise InputError(f"{what}: {name} reaches {largest:.4g} {unit}: is its unit given in the name?")
         self._check_settings()
@@ -134,7 +137,7 @@ class RecordedMotion:
         return float(self.time[-1] - self.time[0])
 
     def columns(self) -> dict[str, Any]:
-        """Return all measured arrays by name."""
+        """Return all fields that are arrays by name: time, target and the measured channels."""
         return {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
 
     def save(self, path: Path) -> None:
@@ -147,9 +150,9 @@ class RecordedMotion:
 
 
 def load_motions(data: Sequence[Path], **settings: Any) -> list[RecordedMotion]:
-    """Return the motions of files, and of all files in folders, sorted by name.
+    """Return the motions of the files `data`; a folder stands for all its npz, CSV and Parquet files, sorted by name.
 
-    settings: of `load_motion`. Raises InputError as `load_motion`, and if there is no file.
+    settings: keyword arguments of `load_motion`. Raises InputError as `load_motion`, and if there is no file.
     """
     files: list[Path] = []
     for path in data:
@@ -162,7 +165,7 @@ def load_motions(data: Sequence[Path], **settings: Any) -> list[RecordedMotion]:
 def load_motion(
     path: Path, *, base: str = "", gains: str = "", torque_limit: float = 0.0, torque_constant: float = 0.0
 ) -> RecordedMotion:
-    """Return the motion of a file; base, gains and torque_limit [N m] override the file's settings.
+    """Return the motion of a file; base, gains and torque_limit [N m] override the file's settings unless "" or 0.
 
     npz: arrays named as the fields of `RecordedMotion`, settings as JSON in `settings`. CSV and Parquet: columns named
     `time`, `target/FL_lateral`, `position/x`, `quaternion/w` and so on, each with its unit in brackets if it is not the
@@ -194,7 +197,7 @@ def load_motion(
 
 
 def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return channels and settings of an npz file. Raises InputError or OSError."""
+    """Return (arrays by channel in SI units, settings by name) of an npz file. Raises InputError or OSError."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -217,7 +220,7 @@ def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def parse_settings(path: Path, text: str) -> dict[str, Any]:
-    """Return the settings in a JSON text. Raises InputError: not a JSON object."""
+    """Return the settings in a JSON text; path: file named in errors. Raises InputError: not a JSON object."""
     try:
         settings = json.loads(text)
     except json.JSONDecodeError as error:
@@ -228,7 +231,7 @@ def parse_settings(path: Path, text: str) -> dict[str, Any]:
 
 
 def csv_rows(path: Path) -> list[list[str]]:
-    """Return the cells of a CSV file. Raises InputError or OSError."""
+    """Return the cells of a CSV file as text, by row. Raises InputError (not CSV) or OSError."""
     try:
         with path.open(newline="", encoding="utf-8") as file:
             return list(csv.reader(file))
@@ -237,7 +240,7 @@ def csv_rows(path: Path) -> list[list[str]]:
 
 
 def read_csv(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return channels and settings of a CSV file. Raises InputError or OSError."""
+    """Return (arrays by channel in SI units, settings by name) of a CSV file. Raises InputError or OSError."""
     rows = csv_rows(path)
     if len(rows) < 2:
         raise InputError(f"{path}: expected a line of names and rows of numbers")
@@ -249,11 +252,11 @@ def read_csv(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
             columns.append([float(cell) if cell.strip() else math.nan for cell in row])
         except ValueError:
             raise InputError(f"{path} line {number}: expected numbers, found {first_non_number(row)!r:.40}") from None
-    return channels_of(path, names, np.array(columns)), settings_beside(path)
+    return channels_of(path, names, np.array(columns)), sidecar_settings(path)
 
 
 def first_non_number(row: list[str]) -> str:
-    """Return the first cell that is not a number, empty if all are."""
+    """Return the first cell of a CSV row that is neither a number nor empty; "" if there is none."""
     for cell in row:
         try:
             float(cell or "nan")
@@ -263,7 +266,10 @@ def first_non_number(row: list[str]) -> str:
 
 
 def read_parquet(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return channels and settings of a Parquet file. Raises InputError, also without pyarrow, or OSError."""
+    """Return (arrays by channel in SI units, settings by name) of a Parquet file.
+
+    Raises InputError: not such a file, or pyarrow is not installed; OSError.
+    """
     try:
         import pyarrow
         import pyarrow.parquet
@@ -279,17 +285,24 @@ def read_parquet(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         columns = [column.to_numpy(zero_copy_only=False).astype(np.float64) for column in table.columns]
     except (TypeError, ValueError):
         raise InputError(f"{path}: all columns must hold numbers") from None
-    return channels_of(path, list(table.column_names), np.stack(columns, axis=1)), settings_beside(path)
+    return channels_of(path, list(table.column_names), np.stack(columns, axis=1)), sidecar_settings(path)
 
 
-def settings_beside(path: Path) -> dict[str, Any]:
-    """Return the settings in the JSON file beside a table, empty without one. Raises InputError or OSError."""
+def sidecar_settings(path: Path) -> dict[str, Any]:
+    """Return the settings in the JSON file next to a table, `walk.json` for `walk.csv`; empty if it does not exist.
+
+    Raises InputError or OSError.
+    """
     file = path.with_suffix(".json")
     return parse_settings(file, file.read_text(encoding="utf-8")) if file.exists() else {}
 
 
 def channels_of(path: Path, names: list[str], table: np.ndarray) -> dict[str, np.ndarray]:
-    """Return channels from the columns of a table, (n, columns), in SI units. Raises InputError."""
+    """Return arrays by channel, (n,) for time, else (n, 3, 4 or 12), in SI units; unmeasured columns are NaN.
+
+    names: of the columns, such as `angle/FL_outer [deg]`. table: (n, columns). Raises InputError: an unknown name or
+    unit, a column twice, or time or targets that are missing.
+    """
     parts = {
         "time": [""], "position": list("xyz"), "quaternion": list("xyzw"),
         **{channel: list(MOTOR_JOINTS) for channel in (*PER_MOTOR, "current")},
@@ -320,4 +333,4 @@ def channels_of(path: Path, names: list[str], table: np.ndarray) -> dict[str, np
 
 
 READERS = {".npz": read_npz, ".csv": read_csv, ".parquet": read_parquet}
-"""Reader of each kind of file."""
+"""Reader by suffix of the file: returns channels and settings of a path."""

@@ -15,38 +15,31 @@ from jumper_warp.robot.values import LATERAL, LINK_KINDS, MOTOR_QUANTITIES, PAW_
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 
-GROUPS = ("motors", "masses", "friction", "latency", "offsets")
+GROUPS = ("motors", "masses", "friction", "latency", "offsets")  # of parameters, see `jumper_parameters`
 BASE_ONLY = ("base_mass", "base_com", "base_inertia", "paw_friction")
-"""Quantities that do not matter while the base is held and the paws hang free."""
+"""Quantities without effect on the motion while the base is held and the paws hang free."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """Unknown parameter: the value of some entries of a quantity of `RobotValues`.
+    """Unknown parameter: one value that is written to some columns of a quantity of `RobotValues`.
 
-    The optimiser works on z = (value - nominal) / prior, or for a ratio on z = ln(value / nominal) / prior, whose prior
-    is a normal distribution of mean 0 and standard deviation 1.
+    The optimiser works on z = (value - nominal) / prior, or for a ratio on z = ln(value / nominal) / prior; the prior
+    of z is a normal distribution of mean 0 and standard deviation 1.
     """
 
     name: str
-    quantity: str
-    """A field of `RobotValues`."""
-    places: tuple[int, ...]
-    """Entries of the quantity that take this value."""
+    quantity: str  # a field of `RobotValues`
+    places: tuple[int, ...]  # columns of the quantity that take this value, such as motor indices
     unit: str
-    nominal: float
-    """[unit] Mean of the prior."""
-    prior: float
-    """[unit] Standard deviation of the prior; for a ratio, of ln(value / nominal) [1]."""
-    bounds: tuple[float, float]
-    """[unit]"""
-    scale: Literal["ratio", "absolute"] = "ratio"
-    """Whether the prior is normal in ln(value / nominal) or in the value."""
-    group: str = ""
-    """One of `GROUPS`."""
+    nominal: float  # [unit] Mean of the prior
+    prior: float  # [unit] Standard deviation of the prior; for a ratio, of ln(value / nominal) [1]
+    bounds: tuple[float, float]  # [unit] lower and upper
+    scale: Literal["ratio", "absolute"] = "ratio"  # whether the prior is normal in ln(value / nominal) or in the value
+    group: str = ""  # one of `GROUPS`
 
     def __post_init__(self) -> None:
-        """Raises InputError: bounds that do not hold the nominal value, or a prior that is not positive."""
+        """Raise InputError: bounds that exclude the nominal value, or (ratio) 0 and below, or a prior not positive."""
         low, high = self.bounds
         if not (math.isfinite(low) and math.isfinite(high) and low <= self.nominal <= high and low < high):
             raise InputError(f"parameter {self.name}: bounds {self.bounds} must be finite and hold {self.nominal}")
@@ -57,71 +50,71 @@ class Parameter:
 
     @property
     def leg(self) -> int | None:
-        """Leg of the only motor that it acts on; None if it acts on more."""
+        """Index of the leg (FL, FR, BL, BR) whose single motor the parameter acts on; None if it acts on more."""
         return self.places[0] // 3 if self.quantity in MOTOR_QUANTITIES and len(self.places) == 1 else None
 
     @property
     def z_per_growth(self) -> float:
-        """Change of z per relative change of the nominal value."""
+        """Derivative of z by the relative change of the value, at the nominal value."""
         return (1.0 if self.scale == "ratio" else self.nominal) / self.prior
 
     def value(self, z: np.ndarray) -> np.ndarray:
-        """Return the value [unit] at normalised coordinates z, of any shape."""
+        """Return the values [unit] at normalised coordinates z, in the shape of z."""
         if self.scale == "ratio":
             return self.nominal * np.exp(self.prior * z)
         return self.nominal + self.prior * z
 
     def normalised(self, value: np.ndarray | float) -> np.ndarray:
-        """Return the normalised coordinates z of values [unit], of any shape."""
+        """Return the normalised coordinates z of values [unit], in the shape of `value`; inverse of `value`."""
         if self.scale == "ratio":
             return np.log(np.asarray(value) / self.nominal) / self.prior
         return (np.asarray(value) - self.nominal) / self.prior
 
     def std(self, z: float, z_std: float) -> float:
-        """Return the standard deviation [unit] of the value at z, given that of z."""
+        """Return the standard deviation [unit] of the value at z, given the standard deviation z_std of z."""
         return z_std * self.prior * (float(self.value(np.array(z))) if self.scale == "ratio" else 1.0)
 
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """Parameters of an identification, in order."""
+    """The P parameters of an identification, in the order of the vector z; iterable."""
 
     parameters: tuple[Parameter, ...]
 
     def __post_init__(self) -> None:
-        """Raises InputError: none, or two of one name."""
+        """Raise InputError: no parameters, or two parameters of one name."""
         names = self.names
         if not names:
             raise InputError("there must be at least one parameter")
         if len(set(names)) < len(names):
             raise InputError(f"every parameter needs a name of its own, got {max(names, key=names.count)!r} twice")
 
-    def __len__(self) -> int:
+    def __len__(self) -> int:  # number P of parameters
         return len(self.parameters)
 
-    def __iter__(self) -> Iterator[Parameter]:
+    def __iter__(self) -> Iterator[Parameter]:  # the parameters in order
         return iter(self.parameters)
 
     @property
     def names(self) -> list[str]:
-        """Names of the parameters."""
+        """Names of the parameters in order."""
         return [parameter.name for parameter in self.parameters]
 
     def bounds(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return the bounds in normalised coordinates, (P,) each."""
+        """Return lower and upper bounds in normalised coordinates, (P,) each."""
         low, high = ([float(p.normalised(p.bounds[i])) for p in self.parameters] for i in (0, 1))
         return np.array(low), np.array(high)
 
     def values(self, z: np.ndarray) -> np.ndarray:
-        """Return values [unit] of normalised coordinates, (..., P) to (..., P)."""
+        """Return values [unit of each parameter] (..., P) at normalised coordinates z (..., P)."""
         return np.stack([p.value(z[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
 
     def normalised(self, values: np.ndarray) -> np.ndarray:
-        """Return normalised coordinates of values [unit], (..., P) to (..., P)."""
+        """Return normalised coordinates z (..., P) of values [unit of each parameter] (..., P)."""
         return np.stack([p.normalised(values[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
 
     def robots(self, z: np.ndarray, description: RobotDescription | None = None) -> RobotValues:
-        """Return the robots at normalised coordinates (N, P); other values are as described."""
+        """Return N robots with parameters at normalised coordinates z (N, P); other values are the description's."""
         z = np.atleast_2d(z)
         robots, values = RobotValues.nominal(len(z), description), self.values(z)
         for i, parameter in enumerate(self.parameters):
@@ -129,7 +122,7 @@ class ParameterSet:
         return robots
 
     def without(self, names: Iterable[str]) -> ParameterSet:
-        """Return the set without the named parameters, groups or quantities.
+        """Return the set without the parameters whose name, group or quantity is in `names`.
 
         Raises InputError: a name that is none of these.
         """
@@ -141,9 +134,9 @@ class ParameterSet:
         return ParameterSet(tuple(p for p in self.parameters if not left_out & {p.name, p.group, p.quantity}))
 
     def changed(self, **changes: dict) -> ParameterSet:
-        """Return the set with changed fields by parameter name, such as `kp={"prior": 0.1}`.
+        """Return the set with some fields replaced, by parameter name: `latency={"prior": 0.001}`.
 
-        Raises InputError for an unknown name.
+        Raises InputError: an unknown name, or fields as in `Parameter`.
         """
         unknown = set(changes) - set(self.names)
         if unknown:
@@ -154,14 +147,14 @@ class ParameterSet:
 def jumper_parameters(groups: Sequence[str] = GROUPS, description: RobotDescription | None = None) -> ParameterSet:
     """Return the robot's parameters of some groups, by default all 79.
 
-    motors: gains and armature of each motor, torque limit, cutoff and no-load speed by kind; masses: of the base, its
-    com and inertia, ratios by kind of link; friction: of each motor, knees and paws; latency; offsets: of each sensor.
-    Raises InputError for an unknown group.
+    motors: kp, kd, armature by motor; torque limit, cutoff and no-load speed by kind of motor. masses: mass, com and
+    inertia of the base, mass ratio by kind of link. friction: of each motor, the knees and the paws. latency: of the
+    targets. offsets: of the 12 angle sensors. Raises InputError: an unknown group or none.
     """
     unknown = [group for group in groups if group not in GROUPS]
     if unknown or not groups:
-        what = f"unknown group of parameters {unknown[0]!r:.60}" if unknown else "no group of parameters"
-        raise InputError(f"{what}; there are {', '.join(GROUPS)}")
+        problem = f"unknown group of parameters {unknown[0]!r:.60}" if unknown else "no group of parameters"
+        raise InputError(f"{problem}; there are {', '.join(GROUPS)}")
     robot = load_description() if description is None else description
     every = (*motor_parameters(robot), *mass_parameters(robot), *friction_parameters(robot))
     every += (
@@ -178,7 +171,7 @@ def jumper_parameters(groups: Sequence[str] = GROUPS, description: RobotDescript
 def ratio(
     name: str, quantity: str, places: Sequence[int], unit: str, nominal: float, prior: float, group: str
 ) -> Parameter:
-    """Return a positive parameter known to a factor exp(prior), with bounds at five standard deviations or tenfold."""
+    """Return a positive parameter with prior std `prior` [1] of ln(value / nominal); bounds: 5 std, at most tenfold."""
     wide = math.exp(min(5.0 * prior, math.log(10.0)))
     return Parameter(name, quantity, tuple(places), unit, nominal, prior, (nominal / wide, nominal * wide), group=group)
 
@@ -186,17 +179,17 @@ def ratio(
 def relative(
     name: str, quantity: str, places: Sequence[int], unit: str, nominal: float, prior: float, group: str
 ) -> Parameter:
-    """Return a positive parameter with a relative standard deviation `prior`, and bounds at five of them.
+    """Return a positive parameter with prior std `prior` [1] of value / nominal; bounds: 5 std, at least a tenth.
 
-    Equations of motion are linear in masses, gains and armature, so that combinations which the motions do not
-    determine lie along straight lines, which steps of the optimiser follow.
+    Equations of motion are linear in masses, gains and armature: combinations that the motions do not determine lie
+    along straight lines of z, which steps of the optimiser follow.
     """
     low, high = nominal * max(1.0 - 5.0 * prior, 0.1), nominal * (1.0 + 5.0 * prior)
     return Parameter(name, quantity, tuple(places), unit, nominal, prior * nominal, (low, high), "absolute", group)
 
 
 def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return the parameters of gains, armature, and limits of the motors."""
+    """Return the group motors: kp, kd, armature of 12 motors; torque limit and speeds by kind of motor."""
     parameters = []
     for quantity, prior in (("kp", 0.2), ("kd", 0.2)):
         parameters += [
@@ -217,7 +210,7 @@ def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
 
 
 def mass_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return the parameters of masses, centre of mass and inertia."""
+    """Return the group masses: mass, com and inertia of the base, and mass ratios by kind of link."""
     base = robot.links[0]
     parameters = [relative("base_mass", "base_mass", (0,), "kg", base.mass, 0.15, "masses")]
     for i, axis in enumerate("xyz"):
@@ -233,7 +226,7 @@ def mass_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
 
 
 def friction_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return the parameters of friction of motors, knees and paws."""
+    """Return the group friction: Coulomb friction of 12 motors, damping of the knees, friction of the paws."""
     parameters = [
         ratio(
             f"motor_friction/{joint}", "motor_friction", (i,), "N m", robot.motors[i].coulomb_friction, 0.6, "friction"
@@ -247,15 +240,12 @@ def friction_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
 
 @dataclass(frozen=True)
 class PriorMeasurement:
-    """A measurement of the robot besides its motions, such as its weighed mass."""
+    """Measurement of the robot other than its motions, such as its weighed mass; counts as one more residual."""
 
     name: str
-    measure: Callable[[RobotValues], np.ndarray]
-    """Returns the quantity of N robots, (N,)."""
-    value: float
-    """Measured, in the quantity's unit."""
-    std: float
-    """Standard deviation of the measurement, in the same unit."""
+    measure: Callable[[RobotValues], np.ndarray]  # returns the modelled quantity of N robots, (N,)
+    value: float  # measured value, in the quantity's unit
+    std: float  # standard deviation of the measurement, in the same unit
 
 
 def total_mass(robots: RobotValues) -> np.ndarray:
@@ -265,7 +255,7 @@ def total_mass(robots: RobotValues) -> np.ndarray:
 
 
 def weighed_mass(mass: float, std: float = 0.02) -> PriorMeasurement:
-    """Return a measurement of the whole robot's mass [kg]; std [kg]: of the scale.
+    """Return a measurement of the whole robot's mass [kg]; std [kg]: standard deviation of the scale.
 
     Raises InputError: std is not positive, or the mass is not within 0.5 to 2 times the described one.
     """

@@ -22,26 +22,20 @@ from jumper_warp.utils.rotations import from_rotation_vector, multiply
 
 Kind = Literal["hung chirp", "standing chirp", "small jump"]
 KINDS: tuple[Kind, ...] = ("hung chirp", "hung chirp", "standing chirp", "small jump")
-"""One set of motions."""
-TICK = 1.0 / 60.0
-"""[s] Between targets."""
-SAMPLES = 4
-"""Rows of a motion per tick: 240 Hz."""
-REST = 0.75
-"""[s] Time in the first pose before a motion is recorded, in which the robot comes to rest."""
-HELD_MASS = 1.0e4
-"""[kg] Of a held base in a simulation, which also resets its pose after each step."""
+"""Kinds of the motions in one set."""
+TICK = 1.0 / 60.0  # [s] between targets
+SAMPLES = 4  # rows of a motion per tick: 240 Hz
+REST = 0.75  # [s] in the first pose before a motion is recorded, in which the robot comes to rest
+HELD_MASS = 1.0e4  # [kg] of a held base in `simulate_plan`, which also resets its pose after each step
 
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Motor targets of a motion."""
+    """Planned motor targets of a motion; motors by leg FL, FR, BL, BR, each lateral, outer, inner."""
 
     kind: Kind
-    target: np.ndarray
-    """(ticks, 12) [rad]"""
-    torque_limit: float
-    """[N m]"""
+    target: np.ndarray  # (ticks, 12) [rad] at 60 Hz
+    torque_limit: float  # [N m] of the motor controllers
 
     @property
     def base(self) -> Literal["free", "fixed"]:
@@ -50,12 +44,15 @@ class Plan:
 
     @property
     def rows(self) -> np.ndarray:
-        """Targets of the rows at 240 Hz, (SAMPLES ticks, 12)."""
+        """Targets [rad] of the rows at 240 Hz, (SAMPLES * ticks, 12)."""
         return np.repeat(self.target, SAMPLES, axis=0)
 
 
 def sample_plan(kind: Kind, rng: np.random.Generator, seconds: float = 1.25, torque_limit: float = 12.0) -> Plan:
-    """Return random targets for a motion of a kind. Raises InputError: unknown kind, or not 0.5 to 60 s long."""
+    """Return random targets for a motion of a kind, `seconds` [s] long; torque_limit [N m].
+
+    Raises InputError: an unknown kind, or a duration outside 0.5 to 60 s.
+    """
     ticks = round(seconds / TICK)
     if ticks < 30 or not seconds < 60.0:
         raise InputError(f"a motion must take 0.5 to 60 s, got {seconds:g}")
@@ -69,13 +66,13 @@ def sample_plan(kind: Kind, rng: np.random.Generator, seconds: float = 1.25, tor
 
 
 def chirp_targets(ticks: int, rng: np.random.Generator, hung: bool) -> np.ndarray:
-    """Return targets [deg] (ticks, 12) of a chirp, each motor in its own phase; smaller and slower if not hung."""
+    """Return targets [deg] (ticks, 12) of a chirp with a random phase by motor; smaller and slower unless `hung`."""
     time = TICK * np.arange(ticks)
     slow, fast = rng.uniform(0.3, 0.8), rng.uniform(5.0, 9.0) if hung else rng.uniform(2.5, 4.5)
     cycles = slow * time + 0.5 * (fast - slow) * time**2 / time[-1]
     middle = rng.uniform(40.0, 55.0) if hung else rng.uniform(45.0, 60.0)
     target = np.zeros((ticks, 12))
-    ramp = np.minimum(time / 0.1, 1.0)  # from rest
+    ramp = np.minimum(time / 0.1, 1.0)  # amplitude, 0 to 1 within 0.1 s
     for motor in range(12):
         lateral = motor % 3 == 0
         size = (rng.uniform(6.0, 11.0) if lateral else rng.uniform(9.0, 15.0)) if hung else (
@@ -88,9 +85,9 @@ def chirp_targets(ticks: int, rng: np.random.Generator, hung: bool) -> np.ndarra
 
 
 def jump_targets(ticks: int, rng: np.random.Generator) -> np.ndarray:
-    """Return targets [deg] (ticks, 12) of a squat, a push-off and a landing, with a random offset for each motor."""
+    """Return targets [deg] (ticks, 12) of a squat, a push-off and a landing, with a random offset of each motor."""
     squat, push, land = rng.uniform(75.0, 95.0), rng.uniform(5.0, 25.0), rng.uniform(50.0, 65.0)
-    down, hold, up = 22, rng.integers(6, 12), rng.integers(9, 13)
+    down, hold, up = 22, rng.integers(6, 12), rng.integers(9, 13)  # [ticks] of squatting, waiting, push-off
     target = np.zeros((ticks, 12))
     for tick in range(ticks):
         if tick < down + hold:
@@ -103,7 +100,7 @@ def jump_targets(ticks: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def initial_state(replay: MotionReplay, plan: Plan, robots: RobotValues) -> InitialStates:
-    """Return one robot at rest in the pose of the first targets, paws on the ground or the base held."""
+    """Return the state of one robot at rest in the pose of the first targets; a free robot starts 1 mm in the air."""
     angle, rest = plan.target[:1] - robots.offset, np.zeros((1, 12))
     height, quaternion = HANGING_HEIGHT, np.array([[0.0, 0.0, 0.0, 1.0]])
     if plan.base == "free":
@@ -114,10 +111,8 @@ def initial_state(replay: MotionReplay, plan: Plan, robots: RobotValues) -> Init
 
 def replay_plan(replay: MotionReplay, plan: Plan, robots: RobotValues, refine: int = 1) -> Record:
     """Return the replay of a plan by one robot, from rest, rows at 240 Hz; refine: physics steps per 1/480 s."""
-    period = TICK / SAMPLES
-    stride = 2 * refine
-    rest = round(REST / period)
-    rows = plan.rows
+    period, stride = TICK / SAMPLES, 2 * refine
+    rest, rows = round(REST / period), plan.rows
     target = np.repeat(np.concatenate([np.repeat(rows[:1], rest, axis=0), rows]), stride, axis=0)
     record = replay.run(
         robots, initial_state(replay, plan, robots), target, rows=rest + len(rows), stride=stride, dt=period / stride,
@@ -130,9 +125,9 @@ def replay_plan(replay: MotionReplay, plan: Plan, robots: RobotValues, refine: i
 def simulate_plan(
     plan: Plan, robots: RobotValues | None = None, *, solver: SolverName = "jumper", dt: float = 1.0 / 480.0
 ) -> Record:
-    """Return the simulation of a plan by one robot, from rest, rows at 240 Hz, on one of the two solvers.
+    """Return the simulated motion of one robot under a plan, from rest, rows at 240 Hz, by `Simulation` with a solver.
 
-    Raises InputError: dt [s] does not divide 1/240 s.
+    robots: N = 1, by default as described. dt [s]: physics step. Raises InputError: dt does not divide 1/240 s.
     """
     period = TICK / SAMPLES
     stride = round(period / dt)
@@ -141,8 +136,7 @@ def simulate_plan(
     robots = RobotValues.nominal(1) if robots is None else robots
     held = plan.base == "fixed"
     sim = _make_simulation(plan, solver, robots, dt, held)
-    rows = plan.rows
-    rest = round(REST / period)
+    rows, rest = plan.rows, round(REST / period)
     target = np.concatenate([np.repeat(rows[:1], rest, axis=0), rows])
     delay = float(robots.latency[0, 0]) / dt  # in physics steps
     delayed_target = wp.zeros((12, 1), dtype=float, device=sim.device)
@@ -189,7 +183,7 @@ def _make_simulation(plan: Plan, solver: SolverName, robots: RobotValues, dt: fl
 
 
 def _reset_base(sim: Simulation, pose: np.ndarray) -> None:
-    """Reset the base to a pose (7,), at rest."""
+    """Reset the base of world 0 to a pose (7,), position [m] and quaternion xyzw in the world frame, at rest."""
     q, qd = sim.state.joint_q.numpy(), sim.state.joint_qd.numpy()
     q[:7], qd[:6] = pose, 0.0
     sim.state.joint_q.assign(q)
@@ -207,9 +201,10 @@ def measure(
     torque: bool = False,
     base_every: int = 2,
 ) -> RecordedMotion:
-    """Return the recording of a motion by sensors: angles and rates at 240 Hz, the base every `base_every` rows.
+    """Return the sensors' recording of a simulated motion: motors at 240 Hz, the base's pose every `base_every` rows.
 
-    rng: of the noise; None: no noise. torque: whether the motors' torques are recorded.
+    name: of the motion. record: true motion of world 0; robots: its sensor offsets. rng: random numbers of the noise,
+    None for no noise. noise: its standard deviations. torque: whether motor torques are recorded.
     """
     levels = channel_noise(noise or NoiseLevels())
     rows = len(plan.rows)

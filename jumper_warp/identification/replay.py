@@ -21,35 +21,28 @@ from jumper_warp.sim.slices import WorldRange
 from jumper_warp.utils.rotations import rotate
 from jumper_warp.utils.threads import checked_threads
 
-TOLERANCE = 1.0e-10
-"""[m/s] Of the contact iteration; differences of replays inherit its error."""
+TOLERANCE = 1.0e-10  # [m/s] of the contact iteration; finite differences of replays inherit its error
 
 
 @dataclass
 class Record:
-    """True motion in a replay, without sensor errors: R rows, N worlds."""
+    """True motion in a replay, without sensor errors: R rows, N worlds; motors by leg FL, FR, BL, BR."""
 
-    angle: np.ndarray
-    """(R, 12, N) [rad]"""
-    rate: np.ndarray
-    """(R, 12, N) [rad/s]"""
-    torque: np.ndarray
-    """(R, 12, N) [N m]"""
-    position: np.ndarray
-    """(R, 3, N) [m]"""
-    quaternion: np.ndarray
-    """(R, 4, N) xyzw"""
-    valid: np.ndarray
-    """(N,) bool, whether the world stayed finite."""
+    angle: np.ndarray  # (R, 12, N) [rad] motor angles; of each leg lateral, outer, inner
+    rate: np.ndarray  # (R, 12, N) [rad/s] motor rates
+    torque: np.ndarray  # (R, 12, N) [N m] motor torques in the physics step after the row
+    position: np.ndarray  # (R, 3, N) [m] of the base's origin, world frame
+    quaternion: np.ndarray  # (R, 4, N) xyzw, base to world
+    valid: np.ndarray  # (N,) bool, whether the world stayed finite; the other worlds stay at their first row
 
 
 class MotionReplay:
-    """Parallel worlds that replay motor targets; keeps a `Rollout` for each number of worlds and physics step."""
+    """Replays motor targets in parallel worlds; caches a `Rollout` for each number of worlds and physics step."""
 
     def __init__(
         self, *, description: RobotDescription | None = None, device: wp.DeviceLike = None, threads: int | None = None
     ):
-        """Prepare; threads: CPU threads."""
+        """Prepare; description: of the robot, by default the project's; threads: of the CPU."""
         self.description = load_description() if description is None else description
         self.world_steps = 0
         """Physics steps of all worlds so far."""
@@ -70,11 +63,11 @@ class MotionReplay:
         gains: Literal["jumping", "walking"] = "jumping",
         torque_limit: float = 18.0,
     ) -> Record:
-        """Return the motion of N worlds with their `robots` and initial states, without contact history.
+        """Return the motion of N worlds, one for each of `robots` and `starts`, without initial contact impulses.
 
-        target: motor targets [rad] of every physics step of dt [s], (lead + steps, 12); the first `lead` are sent
-        before the start and matter with a latency. rows: number of rows, `stride` physics steps apart; row 0 is the
-        start. base: "fixed" holds the base at its initial pose. gains, torque_limit [N m]: of the described motors,
+        target: motor targets [rad], one row for each physics step of dt [s], (lead + steps, 12); the first `lead` are
+        sent before the start and act late by the latency. rows: number of rows, `stride` physics steps apart; row 0 is
+        the start. base: "fixed" holds the base at its initial pose. gains, torque_limit [N m]: of the described motors,
         which the ratios of `robots` scale.
         """
         count, steps = len(starts.angle), (rows - 1) * stride + 1  # the last row's torques take one more step
@@ -86,7 +79,7 @@ class MotionReplay:
         com_velocity = starts.velocity + np.cross(starts.spin, rotate(starts.quaternion, robots.base_com))
         q = np.concatenate([starts.position, starts.quaternion, starts.angle], axis=1)
         qd = np.concatenate([com_velocity, starts.spin, starts.rate], axis=1)
-        arrived = delayed(target, robots.latency[:, 0] / dt, lead, steps)
+        arrived = delayed_targets(target, robots.latency[:, 0] / dt, lead, steps)
         trajectory = rollout.run(*(rollout.array(np.ascontiguousarray(values)) for values in (arrived, q.T, qd.T)))
         self.world_steps += count * (steps - 1)
         q, qd, torque = (getattr(trajectory, name).numpy()[:steps:stride] for name in ("q", "qd", "torque"))
@@ -96,7 +89,7 @@ class MotionReplay:
         return Record(q[:, 7:], qd[:, 6:], torque, q[:, :3], q[:, 3:7], valid)
 
     def _rollout(self, count: int, dt: float) -> tuple[Rollout, np.ndarray]:
-        """Return the rollout of `count` worlds, and the parameter table of the described robot, (321, 1)."""
+        """Return the cached rollout of `count` worlds, and the described robot's parameter table, (321, 1)."""
         if (count, dt) not in self._rollouts:
             model = build_model(count, description=self.description, visuals=False, device=self._device)
             rollout = Rollout(
@@ -110,11 +103,11 @@ class MotionReplay:
         return self._rollouts[count, dt]
 
 
-def delayed(target: np.ndarray, latency: np.ndarray, lead: int, steps: int) -> np.ndarray:
-    """Return the targets that arrive in each step, (steps, 12, N), from the sent ones (S, 12).
+def delayed_targets(target: np.ndarray, latency: np.ndarray, lead: int, steps: int) -> np.ndarray:
+    """Return the targets that act in each physics step, (steps, 12, N), from the sent targets (S, 12).
 
-    latency [steps], (N,), may be fractional: a target is the mean over the step, so that it is continuous in the
-    latency. lead: rows of `target` before the first step.
+    latency: (N,) [physics steps], may be fractional: a step uses the mean target over its duration, which is continuous
+    in the latency. lead: rows of `target` before the first step.
     """
     delay, world = np.unique(latency, return_inverse=True)
     whole = np.floor(delay).astype(int)
@@ -125,7 +118,7 @@ def delayed(target: np.ndarray, latency: np.ndarray, lead: int, steps: int) -> n
 
 
 def write_motors(parameters: dict[str, wp.array], motors: MotorCfg, robots: RobotValues) -> None:
-    """Write the motor constants of N robots into a rollout's parameters."""
+    """Write gains, limits and sensor offsets of N robots' motors into `Rollout.parameters`, (12, N) each."""
     kinds = [motors.lateral, motors.transversal, motors.transversal] * 4
     ratios = {"kp": robots.kp, "kd": robots.kd, "saturation": robots.saturation, "peak": np.ones_like(robots.kp)}
     for name, ratio in ratios.items():
@@ -135,7 +128,7 @@ def write_motors(parameters: dict[str, wp.array], motors: MotorCfg, robots: Robo
 
 
 def parameter_table(nominal: np.ndarray, robots: RobotValues) -> np.ndarray:
-    """Return the parameter table of N robots, (321, N), given the described robot's, (321, 1)."""
+    """Return N robots' parameter table (321, N), rows as in `kernels.layout`; nominal: as described, (321, 1)."""
     table = np.repeat(nominal, len(robots.base_mass), axis=1)
     mass, com = robots.base_mass[:, 0], robots.base_com.T
     nominal_mass, nominal_moment = table[layout.BASE], table[layout.BASE + 1 : layout.BASE + 4]

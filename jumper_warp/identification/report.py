@@ -22,12 +22,12 @@ from jumper_warp.utils.files import write_atomically
 
 UNITS = {"angle": ("deg", 180.0 / math.pi), "rate": ("rad/s", 1.0), "torque": ("N m", 1.0), "position": ("m", 1.0),
          "orientation": ("deg", 180.0 / math.pi)}  # fmt: skip
-"""Unit of a channel in the report, and its factor to SI units."""
+"""(unit in the report, factor from SI to this unit) by channel."""
 RATIO_ROWS = {
     "link_mass": "link_mass", "kp": "gains", "kd": "damping_gains", "armature": "armature",
     "no_load_speed": "no_load_speed", "cutoff_speed": "cutoff_speed",
 }  # fmt: skip
-"""Row of `RandomizationCfg` that scales a quantity."""
+"""Row of `RandomizationCfg` that scales a quantity of `RobotValues`, by quantity."""
 TITLE = "System identification"
 STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 68rem; margin: 2rem auto; padding: 0 1rem; color: #222; }
@@ -39,7 +39,7 @@ th:first-child, td:first-child { text-align: left; }
 
 
 def to_json(result: Identification) -> dict[str, Any]:
-    """Return the content of `report.json`."""
+    """Return the content of `report.json`: parameters, fit, open combinations of parameters, steps and effort."""
     rows = []
     for i, parameter in enumerate(result.parameters):
         low, high = result.intervals[i]
@@ -74,25 +74,31 @@ def to_json(result: Identification) -> dict[str, Any]:
 
 
 def write_results(result: Identification, folder: Path, source: str) -> None:
-    """Write `identified.json` (an overlay), `report.json` and `report.html`. Raises OSError."""
+    """Write `identified.json` (a robot overlay), `report.json` and `report.html` to a folder. Raises OSError.
+
+    source: origin of the data, saved in the overlay.
+    """
     identified_overlay(result, source).save(folder / "identified.json")
     write_atomically(folder / "report.json", (json.dumps(to_json(result), indent=2) + "\n").encode())
     write_html(result, folder)
 
 
 def identified_overlay(result: Identification, source: str = "") -> RobotOverlay:
-    """Return the identified robot as an overlay, with the intervals as ranges of randomisation."""
+    """Return the identified robot as an overlay, with 95 % intervals as ranges of randomisation; source: its origin."""
     quantities = tuple(dict.fromkeys(parameter.quantity for parameter in result.parameters))
     return overlay_of(result.robots(), quantities, randomization=randomization_ranges(result), source=source)
 
 
 def randomization_ranges(result: Identification) -> dict[str, tuple[float, float]]:
-    """Return rows of `RandomizationCfg` that contain all intervals, relative to the identified values."""
+    """Return (low, high) by row of `RandomizationCfg`, in its units, so that the 95 % intervals of all parameters fit.
+
+    Ratios, masses [kg], com [m] and offsets [deg] are relative to the identified values; friction and latency [ms] not.
+    """
     rows: dict[str, tuple[float, float]] = {}
 
     def widen(row: str, low: float, high: float) -> None:
-        old = rows.get(row, (low, high))
-        rows[row] = (min(low, old[0]), max(high, old[1]))
+        old_low, old_high = rows.get(row, (low, high))
+        rows[row] = (min(low, old_low), max(high, old_high))
 
     for parameter, value, (low, high) in zip(result.parameters, result.values, result.intervals, strict=True):
         quantity, value, low, high = parameter.quantity, float(value), float(low), float(high)
@@ -115,7 +121,7 @@ def randomization_ranges(result: Identification) -> dict[str, tuple[float, float
 
 
 def write_html(result: Identification, folder: Path) -> None:
-    """Write `report.html`. Raises OSError."""
+    """Write `report.html` to a folder, with embedded plots. Raises OSError."""
     parts = [
         f"<h1>{TITLE}</h1>",
         summary(result),
@@ -134,13 +140,12 @@ def write_html(result: Identification, folder: Path) -> None:
 
 
 def summary(result: Identification) -> str:
-    """Return the first paragraph of the report: counts, χ², effort and warnings."""
-    sure, count = int(result.identified.sum()), len(result.parameters)
+    """Return the first HTML paragraphs of the report: counts, χ², effort and warnings."""
     text = (
-        f"{sure} of {count} parameters are identified from {result.count} measured values. Mean squared weighed "
-        f"residual {result.chi2:.3f} (as described {result.nominal_chi2:.4g}). {result.effort.seconds:.1f} s, "
-        f"{result.effort.cpu_seconds:.1f} s of CPU, {result.effort.world_steps / 1e6:.2f} million physics steps of "
-        f"{1e3 * result.dt:.3g} ms."
+        f"{int(result.identified.sum())} of {len(result.parameters)} parameters are identified from {result.count} "
+        f"measured values. Mean squared weighed residual {result.chi2:.3f} (as described {result.nominal_chi2:.4g}). "
+        f"{result.effort.seconds:.1f} s, {result.effort.cpu_seconds:.1f} s of CPU, "
+        f"{result.effort.world_steps / 1e6:.2f} million physics steps of {1e3 * result.dt:.3g} ms."
     )
     if result.mismatch > 1.0:
         text += (
@@ -152,59 +157,59 @@ def summary(result: Identification) -> str:
 
 
 def open_directions(result: Identification) -> str:
-    """Return the list of combinations of parameters that the data leaves open."""
+    """Return an HTML list of the combinations of parameters that the data leaves open."""
     if not result.directions:
         return "<p>The data determines every combination of the parameters.</p>"
     lines = "".join(f"<li>{html.escape(words)}</li>" for words in dict.fromkeys(d.words for d in result.directions))
     return f"<h2>What the data leaves open</h2><ul>{lines}</ul>"
 
 
-def table(heads: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> str:
-    """Return an HTML table; rows: CSS class (may be empty) and cells of each."""
-    text = "<table><tr>" + "".join(f"<th>{head}</th>" for head in heads) + "</tr>"
-    for kind, cells in rows:
-        text += f"<tr{kind and ' class='}{kind}>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells) + "</tr>"
-    return text + "</table>"
+def html_table(heads: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> str:
+    """Return an HTML table; heads: HTML of the head cells; rows: (CSS class or "", texts of the cells)."""
+    page = "<table><tr>" + "".join(f"<th>{head}</th>" for head in heads) + "</tr>"
+    for css, cells in rows:
+        page += f"<tr{css and ' class='}{css}>" + "".join(f"<td>{html.escape(cell)}</td>" for cell in cells) + "</tr>"
+    return page + "</table>"
 
 
 def parameter_table(result: Identification) -> str:
-    """Return the HTML table of all parameters with their intervals."""
+    """Return the HTML table of all parameters with their 95 % intervals; rows that are not identified are grey."""
     rows = []
-    for parameter, value, (low, high), sure in zip(
+    for parameter, value, (low, high), identified in zip(
         result.parameters, result.values, result.intervals, result.identified, strict=True
     ):
         cells = (parameter.name, parameter.unit, *(f"{x:.5g}" for x in (parameter.nominal, value, low, high)))
-        rows.append(("" if sure else "open", cells))
+        rows.append(("" if identified else "open", cells))
     heads = ("parameter", "unit", "described", "found", "from", "to (95 %)")
-    return table(heads, rows) + "<p class=open>Grey: the prior says more than the data.</p>"
+    return html_table(heads, rows) + "<p class=open>Grey: the prior says more than the data.</p>"
 
 
 def fit_table(result: Identification) -> str:
-    """Return the HTML table of the fit of each channel."""
+    """Return the HTML table of χ² and rms error of each motion and channel."""
     rows = []
     for fit in result.fits:
         unit, factor = UNITS[fit.channel]
         values = (f"{fit.nominal_chi2:.4g}", f"{fit.chi2:.3f}", f"{factor * fit.rms:.3g} {unit}")
         rows.append(("", (fit.motion, fit.channel, *values)))
-    return table(("motion", "channel", "described χ²", "found χ²", "rms error"), rows)
+    return html_table(("motion", "channel", "described χ²", "found χ²", "rms error"), rows)
 
 
 def image(figure: Any) -> str:
-    """Return a figure as an HTML image with embedded data."""
+    """Return a Matplotlib figure as an HTML image with embedded PNG data."""
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=110, bbox_inches="tight")
     return f'<img alt="" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
 
 
 def new_figure(width: float, height: float) -> Any:
-    """Return an empty figure without a window, of a size in inches."""
+    """Return an empty Matplotlib figure without a window; width, height [inch]."""
     from matplotlib.figure import Figure
 
     return Figure(figsize=(width, height), layout="constrained")
 
 
 def parameter_plot(result: Identification) -> Any:
-    """Return a figure of all parameters with their intervals, in standard deviations of their priors."""
+    """Return a figure of all parameters with their 95 % intervals, in standard deviations of their priors."""
     figure = new_figure(10.0, 3.2)
     axis = figure.subplots()
     place = np.arange(len(result.z))
@@ -219,7 +224,7 @@ def parameter_plot(result: Identification) -> Any:
 
 
 def progress_plot(result: Identification) -> Any:
-    """Return a figure of χ² over the steps of the optimisation."""
+    """Return a figure of χ² over the physics steps of the optimisation, a line for each stage."""
     figure = new_figure(6.0, 2.6)
     axis = figure.subplots()
     for stage in sorted({step.stage for step in result.steps}):
@@ -232,7 +237,10 @@ def progress_plot(result: Identification) -> Any:
 
 
 def motion_plot(result: Identification, motion: MotionResiduals, start: np.ndarray) -> Any:
-    """Return a figure of one motion: measurement and model of three motors above, residuals of channels below."""
+    """Return a figure of one motion; start: coordinates of its initial state, (I,).
+
+    Above: measured and simulated values of the first channel at three motors (or axes). Below: residuals of channels.
+    """
     figure = new_figure(10.0, 4.6)
     axes = figure.subplots(2, 3, sharex=True)
     replay = MotionReplay(description=motion.description, threads=1)
@@ -256,6 +264,6 @@ def motion_plot(result: Identification, motion: MotionResiduals, start: np.ndarr
 
 
 def shown_channels(channels: Sequence[tuple[str, slice]]) -> list[tuple[str, slice]]:
-    """Return the first three channels in the order of the report, whose residuals are plotted."""
+    """Return the first three of channels (name, columns) in the order of the report, whose residuals are plotted."""
     order = {name: i for i, name in enumerate(("angle", "rate", "torque", "position", "orientation"))}
     return sorted(channels, key=lambda channel: order[channel[0]])[:3]

@@ -1,4 +1,4 @@
-"""Weighed residuals of a recorded motion against its replay, and their Jacobian by differences in parallel worlds."""
+"""Residuals of a recorded motion against its replay, over the noise, and their Jacobian by parallel differences."""
 
 from __future__ import annotations
 
@@ -19,38 +19,33 @@ from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.rotations import CONJUGATE, multiply, to_rotation_vector
 
-LONGEST_GAP = 0.1
-"""[s] Longest time between two rows of a motion."""
-LONGEST_LATENCY = 0.05
-"""[s] Targets up to this long before the first row act in the motion."""
+LONGEST_GAP = 0.1  # [s] longest allowed time between two rows of a motion
+LONGEST_LATENCY = 0.05  # [s] targets sent up to this long before the first row can act in the motion
 SETTLING = 0.02
-"""[s] Initial rows that are ignored where a robot on the ground is not at rest: paws that do not stand on it exactly
-strike it, at times that depend on micrometres."""
+"""[s] Initial time without residuals if a robot on the ground is not at rest: its paws strike the ground at times that
+depend on micrometres."""
 FAR_APART = math.radians(20.0)
-"""[rad] Root mean square between angles and targets above which their signs are compared."""
-PIECE = 0.25
-"""[s] Length of the pieces that motions without a held base are first cut into."""
+"""[rad] Root mean square of angle minus target above which `check_signs` compares their signs."""
+PIECE = 0.25  # [s] length of the pieces that motions on the ground are first cut into
 DIFFERENCE = 1.0e-5
-"""Change of an unknown for its column of the Jacobian, in standard deviations of its prior."""
+"""Default step of finite differences by an unknown, in standard deviations of its prior."""
 FIXED_AT_REST = (24, 25, 29, 32, 33, 34)
-"""Coordinates of an initial state at rest that contact determines: tilt, height, vertical velocity, spin but yaw."""
+"""Coordinates of a resting initial state that contact determines: roll, pitch, height, z velocity, roll, pitch rate."""
 
 
 class NothingMeasured(InputError):
-    """A motion without any measurement to compare with a replay."""
+    """A motion has no measurement to compare with a replay."""
 
 
 class Linearised(NamedTuple):
-    """Residuals and Jacobian of one motion."""
+    """Residuals of one motion over their noise, and their Jacobian by the normalised unknowns."""
 
-    residual: np.ndarray
-    """(m,)"""
-    jacobian: np.ndarray
-    """(m, P + I)"""
+    residual: np.ndarray  # (m,)
+    jacobian: np.ndarray  # (m, P + I) by the P parameters and the I coordinates of the initial state
 
 
 class MotionResiduals:
-    """Residuals of a motion on the grid of physics steps.
+    """The m residuals of a recorded motion: simulated minus measured values, over the noise.
 
     Unknowns are normalised: P parameters and the I coordinates of an initial state, see `InitialStatePrior`.
     """
@@ -66,7 +61,7 @@ class MotionResiduals:
     ):
         """Prepare a motion; dt [s]: largest physics step, by default 1/480; span: first row and one past the last.
 
-        Raises InputError: angles of the wrong sign, gaps, or nothing to compare.
+        Raises InputError: angles of the wrong sign, gaps, or dt out of range; NothingMeasured.
         """
         check_signs(motion)
         whole, (first, end) = motion, span or (0, len(motion.time))
@@ -88,7 +83,10 @@ class MotionResiduals:
         self.jacobian_worlds = self._plan_jacobian()
 
     def _make_grid(self, dt: float | None) -> float:
-        """Place the rows on a grid of physics steps; returns the median time between rows [s]."""
+        """Place the rows on a grid of physics steps (dt [s] at most); return the median time between rows [s].
+
+        Sets stride, dt, rows and the row's position on the grid. Raises InputError: a gap above `LONGEST_GAP`.
+        """
         motion = self.motion
         gaps = np.diff(motion.time)
         if gaps.max() > LONGEST_GAP:
@@ -106,7 +104,7 @@ class MotionResiduals:
         return period
 
     def _collect_measurements(self, noise: NoiseLevels) -> None:
-        """Collect the measurements in columns, NaN where a row has none."""
+        """Set `measured` and `valid` (n, columns), `sigma` (columns,) [SI] and `channels`, (name, columns) each."""
         motion, columns = self.motion, []
         self.channels: list[tuple[str, slice]] = []
         sigma, legs, first = [], [], 0
@@ -126,7 +124,7 @@ class MotionResiduals:
         self.sigma, self._leg = np.array(sigma), np.array(legs)
 
     def first_part(self, fraction: float) -> MotionResiduals:
-        """Return the residuals of the first `fraction` of the rows, with the same prior of the initial state."""
+        """Return the residuals of the first fraction (0 to 1) of the rows, with the same prior of the initial state."""
         if fraction >= 1.0:
             return self
         part = copy.copy(self)
@@ -139,9 +137,9 @@ class MotionResiduals:
     def linearise(
         self, replay: MotionReplay, z: np.ndarray, start: np.ndarray, change: np.ndarray | float = DIFFERENCE
     ) -> Linearised:
-        """Return residuals and Jacobian at one point, (P,) and (I,), by one-sided differences in parallel worlds.
+        """Return residuals and Jacobian at parameters z (P,) and initial state start (I,), by one-sided differences.
 
-        change: of each unknown, (P + I,). The Jacobian is NaN where a world diverges.
+        change: step by unknown, (P + I,) or one for all. The whole Jacobian is NaN if any world diverges.
         """
         change = np.broadcast_to(change, len(z) + len(start))
         many_z, many_start = (np.repeat(x[None], len(self.jacobian_worlds) + 1, axis=0) for x in (z, start))
@@ -165,7 +163,7 @@ class MotionResiduals:
         return Linearised(residuals[:, 0], jacobian)
 
     def residuals(self, replay: MotionReplay, z: np.ndarray, start: np.ndarray) -> np.ndarray:
-        """Return weighed residuals (m, N) of N points, (N, P) and (N, I); infinite where a world diverges."""
+        """Return residuals over their noise (m, N) at z (N, P) and start (N, I); infinite where a world diverges."""
         record, robots = self.run(replay, z, start)
         error = self.sensor_readings(record, robots) - self.measured[:, :, None]
         residuals = (error / self.sigma[:, None])[self.valid]
@@ -173,7 +171,7 @@ class MotionResiduals:
         return residuals
 
     def run(self, replay: MotionReplay, z: np.ndarray, start: np.ndarray) -> tuple[Record, RobotValues]:
-        """Return the replay and the robots of N points, (N, P) and (N, I)."""
+        """Return the replay of N worlds and their robots at parameters z (N, P) and initial states start (N, I)."""
         robots = self.parameters.robots(z, self.description)
         motion = self.motion
         record = replay.run(
@@ -183,7 +181,10 @@ class MotionResiduals:
         return record, robots
 
     def sensor_readings(self, record: Record, robots: RobotValues) -> np.ndarray:
-        """Return the sensors' readings of a replay, (n, columns, N); orientation as its error to the measurement."""
+        """Return the sensors' readings [SI] in a replay at the measured rows, (n, columns, N), columns as `channels`.
+
+        Orientation is the rotation vector from the measured to the simulated orientation, world frame.
+        """
         low = np.minimum(self._grid_row.astype(int), len(record.angle) - 1)
         high = np.minimum(low + 1, len(record.angle) - 1)
         fraction = (self._grid_row - low)[:, None, None]
@@ -205,9 +206,9 @@ class MotionResiduals:
         return np.concatenate(columns, axis=1)
 
     def _plan_jacobian(self) -> list[list[tuple[int, int | None]]]:
-        """Return the columns (index, leg or None) that each world of the Jacobian changes.
+        """Return the unknowns that each world of the Jacobian changes, as (index, leg or None for all legs).
 
-        While the base is held the legs do not interact: unknowns of four legs share a world.
+        While the base is held the legs do not interact: the same unknown of the four legs shares a world.
         """
         size, single, shared = len(self.parameters), [], {}
         fixed = FIXED_AT_REST if self.initial.resting else ()
@@ -230,7 +231,7 @@ class MotionResiduals:
 
 
 def channel_noise(noise: NoiseLevels) -> dict[str, tuple[float, int]]:
-    """Return the standard deviation [SI] and the number of columns of each channel of the residuals.
+    """Return (standard deviation [SI], number of columns) by channel of the residuals.
 
     Raises InputError: a level is not positive and finite.
     """
@@ -245,10 +246,10 @@ def channel_noise(noise: NoiseLevels) -> dict[str, tuple[float, int]]:
 
 
 def check_signs(motion: RecordedMotion) -> None:
-    """Raise InputError: a motor's angles are far from its targets, and less than half as far from the negated ones.
+    """Raise InputError: a motor's angles are far from its targets, but less than half as far from the negated targets.
 
-    In motions of `recording` they are more than four times as far with the right signs, and less than a quarter as far
-    with the wrong ones: rounding does not matter. Motors that stay near 0 pass.
+    In motions of `recording` the distance to the negated targets is over four times that to the targets, so a factor of
+    two separates both signs. Motors that stay near 0 pass.
     """
     if motion.angle is None:
         return
@@ -264,7 +265,7 @@ def check_signs(motion: RecordedMotion) -> None:
 
 
 def rows_of(motion: RecordedMotion, first: int, end: int) -> RecordedMotion:
-    """Return the motion's rows from `first` to `end` - 1."""
+    """Return the motion with its rows from `first` to `end` - 1 alone."""
     if (first, end) == (0, len(motion.time)):
         return motion
     return replace(motion, **{name: values[first:end] for name, values in motion.columns().items()})
@@ -277,7 +278,10 @@ def pieces_of(
     description: RobotDescription,
     dt: float | None,
 ) -> list[MotionResiduals]:
-    """Return a motion in pieces of about `PIECE`, except those without measurements."""
+    """Return the residuals of consecutive pieces of a motion, about `PIECE` long; unmeasured pieces are left out.
+
+    dt [s]: as in `MotionResiduals`.
+    """
     rows = len(motion.time)
     number = max(1, min(round(motion.duration / PIECE), rows // 4))
     edges = [round(rows * i / number) for i in range(number + 1)]
@@ -291,7 +295,10 @@ def pieces_of(
 
 
 def grid_steps(period: float, dt: float | None) -> tuple[int, float]:
-    """Return the physics steps in a sample period [s], and the step [s]: at most dt, by default 1/480 s."""
+    """Return (physics steps in a period [s], step [s]), the step at most dt, by default 1/480 s.
+
+    Raises InputError: dt outside 1e-6 to 0.01 s.
+    """
     longest = 1.0 / 480.0 if dt is None else dt
     if not 1.0e-6 <= longest <= 0.01:
         raise InputError(f"dt must lie in 1e-6 to 0.01 s, got {dt}")

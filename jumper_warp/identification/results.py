@@ -18,36 +18,28 @@ from jumper_warp.robot.values import RobotValues
 CONFIDENCE = 1.959964
 """Standard deviations on either side of a 95 % interval."""
 LARGEST_CHI2 = 10.0
-"""χ² above which the values cannot be trusted; other physics, where base and units are right, give 3 to 5."""
+"""χ² above which a warning is given; simulations with other physics but right base and units give 3 to 5."""
 LARGEST_PRIOR_ERROR = 3.0
-"""Standard deviations between a prior measurement and the identified robot above which one of both is wrong."""
+"""Standard deviations between a prior measurement and the identified robot above which a warning is given."""
 
 
 @dataclass(frozen=True)
 class DescentStep:
     """Log entry of one step of the optimisation."""
 
-    stage: int
-    """Counts from 1; 0: CMA-ES."""
-    chi2: float
-    """[1] Cost over the number of measured values."""
-    damping: float
-    """[1] Infinite if the point stayed."""
-    world_steps: int
-    """Physics steps of all worlds so far."""
-    seconds: float
-    """[s] Wall time so far."""
+    stage: int  # number of the stage, from 1; 0: CMA-ES
+    chi2: float  # [1] Cost over the number of measured values
+    damping: float  # [1] Levenberg-Marquardt damping of the step; infinite if no step lowered the cost
+    world_steps: int  # physics steps of all worlds so far
+    seconds: float  # [s] Wall time so far
 
 
 class Effort(NamedTuple):
-    """Cost of an optimisation."""
+    """Computing effort of an optimisation."""
 
-    seconds: float
-    """[s] Wall time."""
-    cpu_seconds: float
-    """[s] CPU time."""
-    world_steps: int
-    """Physics steps of all worlds."""
+    seconds: float  # [s] wall time
+    cpu_seconds: float  # [s] CPU time of all threads
+    world_steps: int  # physics steps, summed over worlds
 
 
 @dataclass(frozen=True)
@@ -56,46 +48,32 @@ class Fit:
 
     motion: str
     channel: str
-    chi2: float
-    """[1] Mean squared weighed residual."""
-    nominal_chi2: float
-    """[1] The same of the described robot at the nominal initial state."""
-    rms: float
-    """Root mean square error [SI unit of the channel]."""
+    chi2: float  # [1] Mean squared residual over the noise
+    nominal_chi2: float  # [1] χ² of the described robot at the nominal initial state
+    rms: float  # root mean square error [SI unit of the channel]
 
 
 @dataclass(frozen=True)
 class Identification:
-    """Result of an identification: an estimate, its uncertainty and its fit."""
+    """Result of an identification of P parameters: estimate, uncertainty and fit."""
 
     parameters: ParameterSet
-    z: np.ndarray
-    """(P,) Parameters, normalised."""
-    covariance: np.ndarray
-    """(P, P) Normalised, from noise and priors alone."""
-    mismatch: float
-    """[1] Smallest factor by which the model's errors widen all intervals; 1 if the model fits."""
+    z: np.ndarray  # (P,) Identified parameters, normalised
+    covariance: np.ndarray  # (P, P) Covariance of z from noise and priors alone
+    mismatch: float  # [1] Smallest factor by which the model's errors widen all intervals; 1 if the model fits
     systematic: np.ndarray
-    """(P,) Standard deviations, normalised, from contradictions between channels and motions; 0 if the model fits."""
-    chi2: float
-    """[1] Mean squared weighed residual of the data."""
-    nominal_chi2: float
-    """[1] The same of the described robot at the nominal initial states."""
-    count: int
-    """Number of measured values."""
-    fits: tuple[Fit, ...]
-    """By motion and channel."""
-    directions: tuple[Direction, ...]
-    """Combinations of parameters that the data leaves open."""
+    """(P,) Standard deviations of z from contradictions between channels and motions; 0 if the model fits."""
+    chi2: float  # [1] Mean squared residual of the data over the noise
+    nominal_chi2: float  # [1] χ² of the described robot at the nominal initial states
+    count: int  # number of measured values
+    fits: tuple[Fit, ...]  # fit of each channel of each motion
+    directions: tuple[Direction, ...]  # combinations of parameters that the data leaves open
     steps: tuple[DescentStep, ...]
-    dt: float
-    """[s] Physics step."""
+    dt: float  # [s] Physics step
     effort: Effort
-    prior_measurements: tuple[PriorMeasurement, ...]
-    """Measurements of the robot besides the motions."""
+    prior_measurements: tuple[PriorMeasurement, ...]  # measurements of the robot other than motions, such as its mass
     motions: tuple[MotionResiduals, ...]
-    starts: tuple[np.ndarray, ...]
-    """(I,) Coordinates of each motion's initial state."""
+    starts: tuple[np.ndarray, ...]  # identified coordinates (I,) of each motion's initial state
 
     @property
     def values(self) -> np.ndarray:
@@ -104,13 +82,13 @@ class Identification:
 
     @property
     def std(self) -> np.ndarray:
-        """Standard deviations relative to the prior's, with the model's errors, at most 1, (P,)."""
+        """Standard deviations of z (the prior's is 1), including errors of the model, at most 1, (P,)."""
         noise = self.mismatch * np.sqrt(np.diag(self.covariance))
         return np.minimum(np.hypot(noise, self.systematic), 1.0)
 
     @property
     def intervals(self) -> np.ndarray:
-        """95 % intervals [unit of each parameter], within the bounds, (P, 2)."""
+        """Lower and upper end of the 95 % intervals [unit of each parameter], within the bounds, (P, 2)."""
         low, high = self.parameters.bounds()
         reach = CONFIDENCE * self.std
         edges = (np.clip(self.z - reach, low, high), np.clip(self.z + reach, low, high))
@@ -118,7 +96,7 @@ class Identification:
 
     @property
     def identified(self) -> np.ndarray:
-        """Whether the standard deviation is below half the prior's, (P,) bool."""
+        """Whether each standard deviation is below half the prior's, (P,) bool."""
         return self.std < 0.5
 
     @property
@@ -128,13 +106,13 @@ class Identification:
         if not self.chi2 <= LARGEST_CHI2:
             worst = max(self.fits, key=lambda fit: fit.chi2)
             base = next(motion.motion.base for motion in self.motions if motion.motion.name == worst.motion)
-            other = {
+            hint = {
                 "free": "free on the ground; if the robot hung from a stand: --base fixed",
                 "fixed": "fixed; if the robot was on the ground: --base free",
             }[base]
             lines.append(
                 f"χ² {self.chi2:.4g} is far above 1, do not trust what was found: {worst.motion} fits worst "
-                f"({worst.channel} {worst.chi2:.4g}), its base is taken as {other}; else check signs, units, gains and "
+                f"({worst.channel} {worst.chi2:.4g}), its base is taken as {hint}; else check signs, units, gains and "
                 "torque limit"
             )
         for prior in self.prior_measurements:
@@ -155,18 +133,15 @@ class Identification:
 class ChannelError(NamedTuple):
     """Errors of one channel of one motion."""
 
-    motion: str
-    channel: str
-    cost: float
-    """Sum of squared weighed residuals."""
-    count: int
-    """Number of measured values."""
-    rms: float
-    """Root mean square error [SI unit of the channel]."""
+    motion: str  # name of the motion
+    channel: str  # name of the channel
+    cost: float  # [1] sum of squared residuals over the noise
+    count: int  # number of measured values
+    rms: float  # root mean square error [SI unit of the channel]
 
 
 def channel_errors(problem: LeastSquares, point: Point) -> list[ChannelError]:
-    """Return the errors of all channels of all motions at a point."""
+    """Return the errors at a point of each channel of each motion that has measured values."""
     errors = []
     for motion, start in zip(problem.motions, point.starts, strict=True):
         table = np.full(motion.valid.shape, math.nan)
@@ -186,7 +161,10 @@ def summarise(
     steps: Sequence[DescentStep],
     effort: Callable[[], Effort],
 ) -> Identification:
-    """Return the identification that ended at a point, given the normal equations there; effort: read at the end."""
+    """Return the result of an identification that ended at `point` with the normal equations `normal`.
+
+    steps: log of the optimisation. effort: called after all evaluations.
+    """
     nominal, errors = (channel_errors(problem, at) for at in (problem.nominal_point(), point))
     fits = [
         Fit(error.motion, error.channel, error.cost / error.count, old.cost / old.count, error.rms)

@@ -11,14 +11,13 @@ from jumper_warp.identification.least_squares import NormalEquations
 from jumper_warp.identification.parameters import Parameter, ParameterSet
 
 WEAK = 3.0
-"""Information relative to the prior's below which a direction counts as open; at 3 the data halves the prior's
-standard deviation."""
+"""[1] Data information over prior information below which a direction is open: at 3 the std is half the prior's."""
 TORQUE_SCALE = (
     "base_mass", "link_mass", "kp", "kd", "saturation", "armature", "motor_friction", "knee_damping",
 )  # fmt: skip
-"""Quantities that may all grow by the same factor without any effect on angles."""
+"""Quantities of `RobotValues` that may all grow by the same factor without any effect on motor angles."""
 MAX_LAGS = 200
-"""Rows over which autocorrelations are summed, at most."""
+"""Largest lag [rows] of the summed autocorrelations."""
 ADVICE = {
     "no_load_speed": "no motor comes close to its no-load speed: add a fast motion, or measure torque against speed",
     "cutoff_speed": "no motor exceeds its cutoff speed at full torque: add a fast motion, or a test bench",
@@ -28,15 +27,15 @@ ADVICE = {
     "base_mass": "the base is held or not measured: add a motion on the ground, or a weighed mass",
     "base_inertia": "the base hardly turns: add a motion on the ground that tilts it",
     "motor_friction": "the motors hardly move slowly: add a slow motion in the air",
-    "armature": "armature and the inertia of the links are not told apart: add a fast motion, or torques",
-    "link_mass": "masses of neighbouring links are not told apart: weigh a leg's links",
+    "armature": "armature and the inertia of the links cannot be separated: add a fast motion, or torques",
+    "link_mass": "masses of neighbouring links cannot be separated: weigh a leg's links",
     "knee_damping": "the knees' damping hides behind the gains: add a motion with the motors off",
-    "kd": "damping by the motors and other losses are not told apart: add torques",
-    "kp": "gains are not told apart from what the legs carry: add a weighed mass or torques",
+    "kd": "damping by the motors and other losses cannot be separated: add torques",
+    "kp": "gains cannot be separated from what the legs carry: add a weighed mass or torques",
     "latency": "the targets hardly change: add steps or a faster motion",
     "offset": "the motions do not tell the sensors' zeros: add the pose of the base, or another pose of the legs",
 }
-"""Measurement that determines a quantity which the data leaves open."""
+"""Reason why the data leaves a quantity open, and the measurement that would determine it, by quantity."""
 
 
 @dataclass(frozen=True)
@@ -44,19 +43,17 @@ class Direction:
     """A combination of parameters that the data leaves open."""
 
     information: float
-    """[1] Of the data, relative to the prior's; 0: only the prior determines it."""
+    """[1] Fisher information of the data along the direction over the prior's; 0: only the prior determines it."""
     weights: tuple[tuple[str, float], ...]
-    """Largest components of the unit vector in normalised parameters, by name of the parameter."""
-    words: str
-    """Description, with a measurement that would determine it."""
+    """(parameter name, component) of up to six largest components of the unit vector in normalised parameters."""
+    words: str  # description in English, with a measurement that would determine the combination
 
 
 def mismatch_factor(tables: Sequence[np.ndarray]) -> float:
-    """Return the factor by which the model's errors widen the intervals from noise alone, at least 1.
+    """Return the factor [1] by which errors of the model widen intervals that assume noise alone, at least 1.
 
-    tables: weighed residuals of each motion, (n, columns), NaN where nothing is measured. An error that lasts counts
-    again in each row: with mean square chi2 and a sum of autocorrelations tau, the information is smaller by chi2 tau
-    than with white noise of the stated size.
+    tables: residuals of each motion over their noise, (n rows, columns), NaN where nothing is measured. Residuals with
+    mean square chi2 and correlation time tau [rows] carry 1 / (chi2 tau) of the information of white noise.
     """
     squares = np.concatenate([table[np.isfinite(table)] for table in tables]) ** 2
     chi2 = float(np.mean(squares))
@@ -87,7 +84,8 @@ def systematic_std(normal: NormalEquations, columns: Sequence[np.ndarray], covar
     (CR3: Bell & McCaffrey 2002). The variances of channels and motions are added, as an error may be alike in all
     channels of a motion.
 
-    columns: column of each of a motion's residuals, (m,). covariance: (P, P), normalised.
+    columns: by motion, the measurement column (such as a motor's angle) of each residual, (m,). covariance: (P, P), of
+    normalised parameters.
     """
     size, information = len(covariance), np.linalg.inv(covariance)
     channels: list[np.ndarray] = []
@@ -98,25 +96,28 @@ def systematic_std(normal: NormalEquations, columns: Sequence[np.ndarray], covar
         marginal = linear.jacobian[:, :size] - linear.jacobian[:, size:] @ np.linalg.solve(start_matrix, cross.T)
         jacobian, residual = root[:, None] * marginal, root * linear.residual
         for i in np.unique(column):
-            channels.append(_change_without(information, jacobian[column == i], residual[column == i]))
-        motions.append(_change_without(information, jacobian, residual))
+            channels.append(_leave_out_change(information, jacobian[column == i], residual[column == i]))
+        motions.append(_leave_out_change(information, jacobian, residual))
     return np.sqrt(_jackknife_variance(channels) + _jackknife_variance(motions))
 
 
-def _change_without(information: np.ndarray, jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Return the change (P,) of the parameters if residuals (m,) are left out; information: of all data, (P, P)."""
+def _leave_out_change(information: np.ndarray, jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:
+    """Return the first-order change (P,) of the fitted parameters if residuals (m,) with Jacobian (m, P) are left out.
+
+    information: Fisher information of all data and priors, (P, P).
+    """
     return np.linalg.solve(information - jacobian.T @ jacobian, jacobian.T @ residual)
 
 
 def _jackknife_variance(changes: Sequence[np.ndarray]) -> np.ndarray:
-    """Return the jackknife's variance (P,) from the changes (P,) without each cluster; 0 for a single one."""
+    """Return the jackknife variance (P,) from the change (P,) by leaving out each cluster; 0 for a single cluster."""
     return (len(changes) - 1.0) / len(changes) * np.sum(np.square(changes), axis=0)
 
 
 def weak_directions(parameters: ParameterSet, information: np.ndarray) -> tuple[Direction, ...]:
-    """Return the combinations of parameters that the data leaves open, the most uncertain first.
+    """Return the combinations of parameters that the data leaves open (information below `WEAK`), most uncertain first.
 
-    information: of the data about the parameters, (P, P), normalised.
+    information: Fisher information of the data about the normalised parameters, without priors, (P, P).
     """
     values, vectors = np.linalg.eigh(information)
     directions = []
@@ -128,29 +129,35 @@ def weak_directions(parameters: ParameterSet, information: np.ndarray) -> tuple[
         weights = tuple(
             (parameters.parameters[i].name, float(sign * vector[i])) for i in order[:6] if abs(vector[i]) > 0.15
         )
-        directions.append(Direction(max(float(value), 0.0), weights, in_words(parameters, vector)))
+        directions.append(Direction(max(float(value), 0.0), weights, describe_direction(parameters, vector)))
     return tuple(directions)
 
 
-def in_words(parameters: ParameterSet, vector: np.ndarray) -> str:
-    """Return a description of a direction (P,) that the data leaves open, and what measurement would help."""
+def describe_direction(parameters: ParameterSet, vector: np.ndarray) -> str:
+    """Return an English description of an open direction, with advice on a measurement that would determine it.
+
+    vector: unit vector in normalised parameters, (P,).
+    """
     scale = np.array([p.z_per_growth if p.quantity in TORQUE_SCALE else 0.0 for p in parameters])
     size = np.linalg.norm(scale)
     if np.count_nonzero(scale) > 1 and size > 0.0 and abs(scale @ vector) / size > 0.6:
         parts = sorted({p.quantity for p in parameters if p.quantity in TORQUE_SCALE}, key=TORQUE_SCALE.index)
-        return f"{', '.join(plain(part) for part in parts)} share a scale: add a weighed mass, or torques"
-    shares: dict[str, float] = {}
+        return f"{', '.join(english_name(part) for part in parts)} share a scale: add a weighed mass, or torques"
+    fractions: dict[str, float] = {}
     for parameter, component in zip(parameters, vector, strict=True):
-        shares[parameter.quantity] = shares.get(parameter.quantity, 0.0) + float(component) ** 2
-    quantities = sorted(shares, key=shares.__getitem__, reverse=True)
-    quantities = [quantity for quantity in quantities if shares[quantity] > 0.15][:3] or quantities[:1]
-    names = members(parameters.parameters, vector, quantities[0])
-    what = " and ".join(plain(quantity) for quantity in quantities)
-    return f"{what}{names}: {ADVICE.get(quantities[0], 'the data says nothing of it')}"
+        fractions[parameter.quantity] = fractions.get(parameter.quantity, 0.0) + float(component) ** 2
+    quantities = sorted(fractions, key=fractions.__getitem__, reverse=True)
+    quantities = [quantity for quantity in quantities if fractions[quantity] > 0.15][:3] or quantities[:1]
+    names = largest_members(parameters.parameters, vector, quantities[0])
+    subject = " and ".join(english_name(quantity) for quantity in quantities)
+    return f"{subject}{names}: {ADVICE.get(quantities[0], 'the data does not determine it')}"
 
 
-def members(parameters: Sequence[Parameter], vector: np.ndarray, quantity: str) -> str:
-    """Return the names of the parameters of a quantity in a direction (P,), in brackets; empty if there is only one."""
+def largest_members(parameters: Sequence[Parameter], vector: np.ndarray, quantity: str) -> str:
+    """Return ` (FL_outer, ...)`: up to four parameters of a quantity with the largest components of `vector` (P,).
+
+    Empty if the quantity has only one parameter or all its components are below 0.3.
+    """
     components = [
         (abs(c), p.name.partition("/")[2]) for p, c in zip(parameters, vector, strict=True) if p.quantity == quantity
     ]
@@ -158,8 +165,8 @@ def members(parameters: Sequence[Parameter], vector: np.ndarray, quantity: str) 
     return f" ({', '.join(names[:4])})" if names and len(components) > 1 else ""
 
 
-def plain(quantity: str) -> str:
-    """Return the English name of a quantity."""
+def english_name(quantity: str) -> str:
+    """Return the English name of a quantity of `RobotValues`, such as `torque limit` for `saturation`."""
     words = {"kp": "proportional gain", "kd": "derivative gain", "base_com": "centre of mass of the base",
              "offset": "sensor offset", "saturation": "torque limit"}  # fmt: skip
     return words.get(quantity, quantity.replace("_", " "))

@@ -16,38 +16,29 @@ import torch
 from jumper_warp.trajectory.problem import Problem, Values
 from jumper_warp.utils.errors import InputError
 
-LENGTHS = (2.0, 1.0, 0.5, 0.2, 0.06, 0.02)
-"""[1] Step lengths along the direction that are tried in parallel."""
-RANDOM = 2
-"""Random steps that are tried with them."""
-MEMORY = 8
-"""Pairs of steps and gradient changes that BFGS keeps."""
-MAX_STEP, MIN_STEP = 0.5, 1.0e-3
-"""[1] Bounds of the largest entry of a step of length 1."""
-OUTER = 15
-"""Iterations between updates of the multipliers."""
+LENGTHS = (2.0, 1.0, 0.5, 0.2, 0.06, 0.02)  # [1] step lengths along the direction that are tried in parallel
+RANDOM = 2  # random steps by start that are tried in parallel too
+MEMORY = 8  # pairs of steps and gradient changes that BFGS keeps
+MAX_STEP, MIN_STEP = 0.5, 1.0e-3  # [1] bounds of the largest entry of a step of length 1
+OUTER = 15  # iterations between updates of the multipliers
 PENALTY, GROWTH, MAX_PENALTY = 20.0, 2.0, 2.0e4
-"""[1] Initial penalty of squared constraints, its growth where they do not shrink, its bound."""
-FEASIBLE = 1.0e-3
-"""[1] Constraints up to this value count as satisfied."""
+"""[1] Initial weight of squared constraints, its factor if they did not halve since the last update, and its limit."""
+FEASIBLE = 1.0e-3  # [1] constraints up to this value count as satisfied
 
 
 @dataclass
 class Progress:
     """Best candidates of a descent so far."""
 
-    x: np.ndarray
-    """(starts, n) Best feasible candidate of each start, else the least infeasible one."""
-    objective: np.ndarray
-    """(starts,) Of `x`; infinite where no candidate was feasible."""
-    violation: np.ndarray
-    """(starts,) Largest constraint of `x`, at least 0."""
+    x: np.ndarray  # (starts, n) Best feasible candidate of each start, or the least infeasible one if none was feasible
+    objective: np.ndarray  # (starts,) Objective of `x`; infinite if no candidate was feasible
+    violation: np.ndarray  # (starts,) Largest constraint of `x`, at least 0
     history: list[dict[str, float]] = field(default_factory=list)
-    """Per iteration: seconds, simulated and reverse policy steps, best feasible objective."""
+    """By iteration: seconds, world_steps, reverse_steps (see `Problem`) and objective, the lowest feasible one."""
 
     @property
     def best(self) -> int:
-        """Index of the best start."""
+        """Index of the start with the lowest feasible objective, or the smallest violation if none is feasible."""
         return int(np.argmin(np.where(np.isfinite(self.objective), self.objective, 1.0e12 + self.violation)))
 
 
@@ -61,10 +52,10 @@ def minimise(
     step: float = 0.1,
     seed: int = 0,
 ) -> Progress:
-    """Return the best candidates that the descent reaches from starts (starts, n), within `lower` and `upper`.
+    """Return the best candidates of a descent from `begin` (starts, n = len(problem.knots)), within lower and upper.
 
-    An iteration takes one gradient and `len(LENGTHS) + RANDOM` simulations per start. step [1]: largest entry of the
-    first steps. Raises InputError: starts of another shape.
+    An iteration takes one gradient and `len(LENGTHS) + RANDOM` simulations for each start. step [1]: largest entry of
+    the first steps. seed: of the random steps. Raises InputError: `begin` has another shape.
     """
     if begin.ndim != 2 or begin.shape[1] != len(problem.knots) or len(begin) < 1:
         raise InputError(f"starts must have shape (starts, {len(problem.knots)}), got {begin.shape}")
@@ -85,7 +76,7 @@ def minimise(
 
 
 class _Descent:
-    """State of the descent of all starts; tensors (starts, ...)."""
+    """State of the descent of all starts; arguments as in `minimise`, tensors (starts, ...)."""
 
     def __init__(self, problem: Problem, begin: np.ndarray, lower: float, upper: float, step: float, seed: int):
         real = torch.float64 if problem.double else torch.float32
@@ -102,7 +93,7 @@ class _Descent:
         self.progress = Progress(begin.copy(), np.full(len(begin), np.inf), np.full(len(begin), np.inf))
 
     def merit(self, values: Values, repeat: int = 1) -> torch.Tensor:
-        """Return the augmented Lagrangian (n,) of candidates, `repeat` of each start."""
+        """Return the augmented Lagrangian (starts * repeat,) of candidates, `repeat` consecutive ones by start."""
         if self.multipliers is None:
             self.multipliers = self.x.new_zeros(len(self.x), values.constraints.shape[1])
         penalty = self.penalty[:, None].repeat_interleave(repeat, 0)
@@ -111,7 +102,7 @@ class _Descent:
         return values.objective + 0.5 * (penalty * (pressed.square() - shift.square())).sum(1)
 
     def iterate(self, number: int) -> None:
-        """Take one step of every start."""
+        """Take one step of every start; number: of the iteration, every `OUTER` of which update the multipliers."""
         values, gradient = self.problem.gradient(self.x, self.merit)
         self._keep_best(self.x, values, 1)
         if number and number % OUTER == 0:
@@ -147,7 +138,7 @@ class _Descent:
         self.step = (self.step * torch.where(better, factor, 0.3)).clamp(MIN_STEP, MAX_STEP)
 
     def _add_pair(self, gradient: torch.Tensor) -> None:
-        """Add the last step and the change of the gradient to the BFGS pairs, where the curvature is positive."""
+        """Append the last step and change of the gradient to the BFGS pairs, with 1 / product, 0 if not convex."""
         if self.previous is None:
             return
         moved, change = self.x - self.previous[0], gradient - self.previous[1]
@@ -159,17 +150,17 @@ class _Descent:
         """Return descent directions (starts, n) by the two loops of L-BFGS, zero where they would leave the box."""
         out = ((self.x <= self.lower) & (gradient > 0.0)) | ((self.x >= self.upper) & (gradient < 0.0))
         free = torch.where(out, 0.0, gradient)
-        d, shares = free, []
+        d, alphas = free, []  # names as in the book's algorithm 7.4
         for moved, change, inverse in reversed(self.pairs):
-            share = inverse * (moved * d).sum(1)
-            d = d - share[:, None] * change
-            shares.append(share)
+            alpha = inverse * (moved * d).sum(1)
+            d = d - alpha[:, None] * change
+            alphas.append(alpha)
         scale = torch.ones_like(self.step)
         for moved, change, inverse in self.pairs:
             scale = torch.where(inverse > 0.0, (moved * change).sum(1) / change.square().sum(1).clamp_min(1e-30), scale)
         d = scale[:, None] * d
-        for (moved, change, inverse), share in zip(self.pairs, reversed(shares), strict=True):
-            d = d + (share - inverse * (change * d).sum(1))[:, None] * moved
+        for (moved, change, inverse), alpha in zip(self.pairs, reversed(alphas), strict=True):
+            d = d + (alpha - inverse * (change * d).sum(1))[:, None] * moved
         d = torch.where(out, 0.0, -d)
         uphill = (d * free).sum(1) >= 0.0
         d = torch.where(uphill[:, None], -free, d)
@@ -179,7 +170,7 @@ class _Descent:
         return torch.where(plain[:, None], d * (self.step / largest)[:, None], d)
 
     def _update_multipliers(self, values: Values) -> None:
-        """Update the multipliers, and raise penalties where constraints did not shrink."""
+        """Update the multipliers; multiply penalties by `GROWTH` where the largest violation did not halve."""
         assert self.multipliers is not None
         worst = values.constraints.clamp_min(0.0).amax(1) if values.constraints.shape[1] else self.violation * 0.0
         self.multipliers = (self.multipliers + self.penalty[:, None] * values.constraints).clamp_min(0.0)
@@ -188,7 +179,7 @@ class _Descent:
         self.violation = worst
 
     def _keep_best(self, x: torch.Tensor, values: Values, count: int) -> None:
-        """Update `progress` with candidates (starts * count, n), `count` of each start."""
+        """Update `progress` with candidates x (starts * count, n), `count` consecutive ones by start."""
         objective = values.objective.cpu().numpy().reshape(-1, count)
         constraints = values.constraints.cpu().numpy()
         worst = (constraints.max(axis=1, initial=0.0)).reshape(-1, count)

@@ -1,13 +1,13 @@
 """Gauss-Newton steps on the weights of a policy's network, in a trust region around its original actions.
 
-With errors e, weighed with W, their Jacobian J by the weights, and the network's actions a over given observations, a
-step d solves by conjugate gradients
+With errors e, their importance W, their Jacobian J by the network's weights, the network's actions a over recorded
+observations, original actions a0 and damping c, a step d solves by conjugate gradients
 
     (J^T W J + A^T S A + c I) d = -(J^T W e + A^T S (a - a0)),
 
 where A is the derivative of a by the weights and S = 1 / (m s^2), with m observations and s the allowed change of the
-actions. The second terms are Gauss-Newton's of the mean squared change of the actions, which is up to a factor the KL
-divergence from the original policy, and A^T S A the metric of the natural gradient.
+actions. The terms with S are the Gauss-Newton terms of the mean squared change of the actions, which is proportional to
+the KL divergence from the original policy; A^T S A is the metric of the natural gradient.
 """
 
 from __future__ import annotations
@@ -25,27 +25,27 @@ from jumper_warp.utils.normalise import normalise
 ACTIVATIONS = {"elu": functional.elu, "relu": functional.relu, "tanh": torch.tanh}
 
 Tape = list[list[tuple[torch.Tensor, torch.Tensor]]]
-"""Input (worlds, in) and pre-activation output (worlds, out) of every layer, by policy step and layer."""
+"""Tape[step][layer]: input (worlds, in) and pre-activation output (worlds, out) of a layer in a policy step."""
 
 
 class Actor(Protocol):
-    """A policy's weights, normaliser and interface, as `jumper_warp.policies.policy.Policy` has them."""
+    """Policy whose network is optimised, such as `jumper_warp.policies.policy.Policy`."""
 
-    mean: torch.Tensor
-    std: torch.Tensor
-    interface: Any
+    mean: torch.Tensor  # (num_obs,) of the observations' normaliser
+    std: torch.Tensor  # (num_obs,) of the observations' normaliser
+    interface: Any  # has the network's `activation`, `observation_limit` and `normalised_limit`
 
     @property
     def layers(self) -> Sequence[tuple[torch.Tensor, torch.Tensor]]:
-        """Weight and bias of each layer."""
+        """Weight (out, in) and bias (out,) of each layer."""
         ...
 
 
 class Network:
-    """A policy's network as a function of the vector of its weights."""
+    """A policy's network as a function of the flat vector of all its weights and biases, `weights`."""
 
     def __init__(self, policy: Actor, dtype: torch.dtype = torch.float32, device: torch.device | str = "cpu") -> None:
-        """Copy weights and normaliser."""
+        """Copy weights and normaliser of a policy; later changes of the policy have no effect."""
         interface = policy.interface
         self.limits = interface.observation_limit, interface.normalised_limit
         self.mean, self.std = (tensor.to(device, dtype, copy=True) for tensor in (policy.mean, policy.std))
@@ -55,7 +55,7 @@ class Network:
         self.weights = torch.cat(parts).to(device, dtype, copy=True)
 
     def layers(self, weights: torch.Tensor) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        """Return weight (out, in) and bias (out,) of each layer as views of a weight vector."""
+        """Return weight (out, in) and bias (out,) of each layer as views of a weight vector (num_weights,)."""
         parts = weights.split([math.prod(shape) for shape in self.shapes])
         views = [part.view(shape) for part, shape in zip(parts, self.shapes, strict=True)]
         return list(zip(views[::2], views[1::2], strict=True))
@@ -63,7 +63,7 @@ class Network:
     def act(self, obs: torch.Tensor, weights: torch.Tensor | None = None, tape: Tape | None = None) -> torch.Tensor:
         """Return actions (n, 12), clamped to ±1, for raw observations (n, num_obs).
 
-        weights: by default the network's. tape: gets one entry with inputs and outputs of the layers.
+        weights: (num_weights,), by default the network's. tape: gets one more entry, inputs and outputs of layers.
         """
         limit, normalised = self.limits
         x = normalise(obs.clamp(-limit, limit), self.mean, self.std, normalised)
@@ -80,9 +80,10 @@ class Network:
 
 
 def per_world_gradients(total: torch.Tensor, tape: Tape) -> torch.Tensor:
-    """Return the gradient of each world's loss by the weights, (worlds, weights), in the order of `Network.weights`.
+    """Return the gradient of each world's loss by the weights, (worlds, num_weights), ordered as `Network.weights`.
 
-    total: the sum of the losses of all worlds, each a function of that world's steps alone; its graph is kept.
+    total: scalar sum of the losses of all worlds, each a function of that world's steps alone; its graph is kept.
+    tape: of all policy steps, filled by `Network.act`.
     """
     outs = [out for layers in tape for _, out in layers]
     by_out = torch.autograd.grad(total, outs, retain_graph=True, allow_unused=True)
@@ -90,7 +91,7 @@ def per_world_gradients(total: torch.Tensor, tape: Tape) -> torch.Tensor:
     for layer in range(depth):
         steps = [(layers[layer][0].detach(), by) for layers, by in zip(tape, by_out[layer::depth], strict=True)
                  if by is not None]  # fmt: skip
-        ins, by_outs = (torch.stack(each) for each in zip(*steps, strict=True))
+        ins, by_outs = (torch.stack(tensors) for tensors in zip(*steps, strict=True))
         parts += [torch.einsum("tno,tni->noi", by_outs, ins).flatten(1), by_outs.sum(0)]
     return torch.cat(parts, 1)
 
@@ -98,9 +99,9 @@ def per_world_gradients(total: torch.Tensor, tape: Tape) -> torch.Tensor:
 def conjugate_gradients(
     apply: Callable[[torch.Tensor], torch.Tensor], right: torch.Tensor, iterations: int, accuracy: float
 ) -> torch.Tensor:
-    """Return x with A x = right, for the positive definite A that `apply` multiplies by.
+    """Return x (n,) with A x = right (n,) for a positive definite matrix A; apply: returns A v for v (n,).
 
-    Ends after so many iterations, or where the residual's norm is the accuracy times that of `right`.
+    Stops after `iterations`, or when the residual's norm is below `accuracy` times the norm of `right`.
     """
     x, residual = torch.zeros_like(right), right.clone()
     direction, size = residual.clone(), residual @ residual
@@ -118,13 +119,13 @@ def conjugate_gradients(
 
 
 class Anchor:
-    """Trust region: observations at which a network should keep its original actions."""
+    """Penalty on changes of a network's actions at recorded observations, which forms a trust region."""
 
     def __init__(self, network: Network, obs: torch.Tensor, action_std: torch.Tensor) -> None:
-        """Record the network's present actions.
+        """Record the network's actions at raw observations obs (m, num_obs) as the original actions.
 
-        obs: (m, num_obs), raw. action_std: (m,) norm of the change of the actions [1] that costs as much as a weighed
-        error of 1 if it occurs at all observations.
+        action_std: (m,) allowed change s of the actions, as the norm over motors [1]; if it occurs at all observations,
+        `cost` is 1/2, as for a weighed error of 1.
         """
         self.network, self.obs = network, obs
         self.scale = 1.0 / (action_std[:, None] * math.sqrt(len(obs)))
@@ -132,7 +133,7 @@ class Anchor:
             self.actions = network.act(obs)
 
     def residuals(self, weights: torch.Tensor) -> torch.Tensor:
-        """Return the weighed changes of the actions, (m, 12)."""
+        """Return changes of the actions over action_std sqrt(m), (m, 12), at a weight vector (num_weights,)."""
         return self.scale * (self.network.act(self.obs, weights) - self.actions)
 
     def cost(self, weights: torch.Tensor) -> float:
@@ -156,16 +157,17 @@ def gauss_newton_step(
     iterations: int = 40,
     accuracy: float = 1.0e-3,
 ) -> torch.Tensor:
-    """Return the step d (weights,) of the module's equation, solved by `conjugate_gradients`.
+    """Return the step d (num_weights,) from `weights` that solves the module's equation by `conjugate_gradients`.
 
-    jacobians: J of each group of worlds, (n, weights); errors: e, (n,); importance: the diagonal of W, (n,).
+    By group of worlds: jacobians: J, (n, num_weights); errors: e, (n,); importance: the diagonal of W, (n,).
+    damping: c [1]. iterations, accuracy: limits of the conjugate gradients.
     """
     change, back = vjp(anchor.residuals, weights)[:2]
     right = -back(change)[0]
     for jacobian, error, weight in zip(jacobians, errors, importance, strict=True):
         right = right - jacobian.T @ (weight * error)
 
-    def apply(v: torch.Tensor) -> torch.Tensor:
+    def apply(v: torch.Tensor) -> torch.Tensor:  # product of the equation's matrix and v
         out = damping * v + back(jvp(anchor.residuals, (weights,), (v,))[1])[0]
         for jacobian, weight in zip(jacobians, importance, strict=True):
             out = out + jacobian.T @ (weight * (jacobian @ v))

@@ -1,4 +1,8 @@
-"""Objectives and constraints of jumps, for `jumper_warp.trajectory.problem.Problem`."""
+"""Objectives and constraints of jumps, for `jumper_warp.trajectory.problem.Problem`.
+
+Each function returns a `Term`: for a motion of `num` worlds an objective (num,) to minimise, or constraints (..., num)
+that are satisfied where <= 0, scaled to about 1. speed [m/s]: upward speed of the base that defines takeoff.
+"""
 
 from __future__ import annotations
 
@@ -8,44 +12,44 @@ import torch
 
 from jumper_warp.trajectory.problem import SimulatedMotion, Term
 
-MARGIN = 0.004
-"""[m] Clearance of links over the ground."""
+MARGIN = 0.004  # [m] default clearance of links over the ground
 
 
 def air_time(up: torch.Tensor, drop: torch.Tensor, gravity: float) -> torch.Tensor:
-    """Return the time [s] until a projectile has fallen by `drop` [m]; the time to its apex if it never does.
+    """Return the time [s] until a projectile has fallen by `drop` [m]; about the time to its apex if it never does.
 
-    up [m/s]: upward speed. The square root is constant below 1e-4 m^2/s^2, so that gradients are finite.
+    up: upward speed [m/s], of the shape of drop. gravity [m/s^2]: positive. The root is constant below 1e-4 m^2/s^2, so
+    that gradients are finite.
     """
     root = up.square() + 2.0 * gravity * drop
     return (up + root.clamp_min(1.0e-4).sqrt()) / gravity
 
 
 def flight(motion: SimulatedMotion, speed: float, height: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return distance [m] and air time [s] of the flight of the centre of mass, (num,) each.
+    """Return distance along x [m] and air time [s] of the flight of the centre of mass (COM), (num,) each.
 
-    The flight is a parabola from takeoff down to the height of the centre of mass with the base at `height` [m] in the
-    initial posture; the distance counts from the start. speed [m/s]: upward speed that defines takeoff.
+    The flight is a parabola from takeoff to the COM's height with the base at `height` [m] in the initial posture; the
+    distance is measured from the COM's initial position.
     """
 
     def distance_and_time() -> tuple[torch.Tensor, torch.Tensor]:
-        now, start = motion.momentum_at_takeoff(speed), motion.start
+        takeoff, start = motion.momentum_at_takeoff(speed), motion.start
         landing = height + start.com[:, 2] - motion.q[0, :, 2]
-        time = air_time(now.vel[:, 2], now.com[:, 2] - landing, motion.gravity)
-        return now.com[:, 0] - start.com[:, 0] + time * now.vel[:, 0], time
+        time = air_time(takeoff.vel[:, 2], takeoff.com[:, 2] - landing, motion.gravity)
+        return takeoff.com[:, 0] - start.com[:, 0] + time * takeoff.vel[:, 0], time
 
     return motion.once(("flight", speed, height), distance_and_time)
 
 
 def farthest(speed: float = 0.25, height: float = 0.30) -> Term:
-    """Objective: minus the distance of the flight [m], (num,), see `flight`."""
+    """Return the objective: minus the distance [m] of `flight` to a landing with the base at `height` [m]."""
     return lambda motion: -flight(motion, speed, height)[0]
 
 
 def highest() -> Term:
-    """Objective: minus the apex height of the base [m] between takeoff and the first touchdown, (num,).
+    """Return the objective: minus the base's apex height [m] between takeoff (0.25 m/s) and the first touchdown.
 
-    The apex lies on the parabola through position and velocity of the highest row.
+    The apex lies on the parabola through position and velocity of the base in its highest row.
     """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
@@ -62,7 +66,7 @@ def highest() -> Term:
 
 
 def positive_work() -> Term:
-    """Objective: the motors' positive work until takeoff [100 J], (num,)."""
+    """Return the objective: the motors' positive work until takeoff (0.25 m/s), in units of 100 J."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         row = motion.takeoff(0.25)[0]
@@ -72,58 +76,61 @@ def positive_work() -> Term:
 
 
 def before_takeoff(motion: SimulatedMotion, speed: float) -> torch.Tensor:
-    """Return which rows are before takeoff, bool (steps + 1, num)."""
+    """Return whether each row is before takeoff, bool (steps + 1, num)."""
     row = motion.takeoff(speed)[0]
     return torch.arange(motion.q.shape[0], device=row.device)[:, None] < row
 
 
 def pitch_of(quat: torch.Tensor) -> torch.Tensor:
-    """Return the pitch [rad], nose down positive, of quaternions xyzw (..., 4) that rotate about y alone."""
+    """Return the pitch [rad] (...), nose down positive, of quaternions xyzw (..., 4) that rotate about y alone."""
     return 2.0 * torch.atan2(quat[..., 1], quat[..., 3])
 
 
-def landing_pitch(most: float, speed: float = 0.25, height: float = 0.30) -> Term:
-    """Constraint: the predicted pitch at the end of the flight, in the initial posture, is within ±`most` [rad]."""
+def landing_pitch(limit: float, speed: float = 0.25, height: float = 0.30) -> Term:
+    """Return the constraint: the predicted pitch at the end of `flight` is within ±`limit` [rad].
+
+    The pitch rate is the angular momentum at takeoff over the pitch inertia of the initial posture.
+    """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
-        now, time, row = motion.momentum_at_takeoff(speed), flight(motion, speed, height)[1], motion.takeoff(speed)[0]
-        spin = now.spin[:, 1] / motion.start.inertia[:, 1, 1]
-        pitch = pitch_of(motion.q[row, torch.arange(motion.num, device=row.device), 3:7]) + spin * time
-        return torch.stack([pitch - most, -most - pitch])
+        (row, _), (_, time) = motion.takeoff(speed), flight(motion, speed, height)
+        rate = motion.momentum_at_takeoff(speed).spin[:, 1] / motion.start.inertia[:, 1, 1]
+        pitch = pitch_of(motion.q[row, torch.arange(motion.num, device=row.device), 3:7]) + rate * time
+        return torch.stack([pitch - limit, -limit - pitch])
 
     return term
 
 
-def stays(most: float, speed: float = 0.25) -> Term:
-    """Constraint: before takeoff the base stays within `most` [m] of its start in the plane."""
-    drift = drifts(most)
+def stays(limit: float, speed: float = 0.25) -> Term:
+    """Return the constraint: until takeoff the base's horizontal distance from its start is at most `limit` [m]."""
+    drift = drifts(limit)
     return lambda motion: torch.where(before_takeoff(motion, speed), drift(motion), 0.0)
 
 
-def leans_back(most: float, speed: float = 0.25) -> Term:
-    """Objective: minus the distance that the base moves back before takeoff [m], at most `most`, (num,)."""
+def leans_back(limit: float, speed: float = 0.25) -> Term:
+    """Return the objective: minus the base's largest distance [m] behind its start before takeoff, up to `limit`."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         back = motion.q[0, :, 0] - motion.q[..., 0]
-        return -torch.where(before_takeoff(motion, speed), back, 0.0).amax(0).clamp_max(most)
+        return -torch.where(before_takeoff(motion, speed), back, 0.0).amax(0).clamp_max(limit)
 
     return term
 
 
-def drifts(most: float) -> Term:
-    """Constraint: in all rows the base is within `most` [m] of its start in the plane."""
+def drifts(limit: float) -> Term:
+    """Return the constraint: in every row the base's horizontal distance from its start is at most `limit` [m]."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         offset = motion.q[..., :2] - motion.q[0, :, :2]
-        return (offset.square().sum(-1) + 1.0e-12).sqrt() - most
+        return (offset.square().sum(-1) + 1.0e-12).sqrt() - limit
 
     return term
 
 
 def clear(margin: float = MARGIN, speed: float | None = None) -> Term:
-    """Constraint: housings, thighs, knees and shanks clear the ground by a margin [m].
+    """Return the constraint: housings, thighs, knees and shanks clear the ground by `margin` [m], scaled to 0.1 m.
 
-    speed [m/s]: only before takeoff, see `SimulatedMotion.takeoff`; None: always.
+    speed [m/s]: only the rows before this takeoff count; None: all rows.
     """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
@@ -133,12 +140,12 @@ def clear(margin: float = MARGIN, speed: float | None = None) -> Term:
     return term
 
 
-def no_run_up(most: float = 0.04, speed: float = 0.25) -> Term:
-    """Constraint: before takeoff hind paws on the ground are less than `most` [m] ahead of their start."""
+def no_run_up(limit: float = 0.04, speed: float = 0.25) -> Term:
+    """Return the constraint: before takeoff hind paws on the ground are at most `limit` [m] ahead of their start."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
-        paws = motion.ankles[..., 2:, 0]
-        ahead = paws[1:].amax(-1) - paws[0].amax(-1) - most
+        hind_x = motion.ankles[..., 2:, 0]  # paws BL, BR
+        ahead = hind_x[1:].amax(-1) - hind_x[0].amax(-1) - limit
         counts = motion.down[:, 2:].any(1) & before_takeoff(motion, speed)[:-1]
         return torch.where(counts, ahead, 0.0)
 
@@ -146,7 +153,10 @@ def no_run_up(most: float = 0.04, speed: float = 0.25) -> Term:
 
 
 def takes_off(speed: float = 0.25, lift: float = 0.01) -> Term:
-    """Constraint: the robot takes off; else its paws are below `lift` [m] at the end, which gives a gradient."""
+    """Return the constraint: the robot takes off; else the lowest paw must rise to `lift` [m] in the last row.
+
+    The second condition has a gradient; its value is scaled to 0.1 m and stays above 0.
+    """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         lowest = (motion.ankles[-1, ..., 2] - motion.body.paw_radius).amin(-1)
@@ -156,60 +166,61 @@ def takes_off(speed: float = 0.25, lift: float = 0.01) -> Term:
     return term
 
 
-def upright(most: float, at_end: bool = True) -> Term:
-    """Constraint: the tilt of the base is within `most` [rad], in the last row or in all."""
+def upright(limit: float, at_end: bool = True) -> Term:
+    """Return the constraint: the base's tilt is at most `limit` [rad], in the last row or (not at_end) in all rows."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         quat = motion.q[-1:, :, 3:7] if at_end else motion.q[..., 3:7]
         x, y = quat[..., 0], quat[..., 1]
-        sine = 2.0 * (x.square() + y.square() + 1e-12).sqrt()
-        return sine - 2.0 * math.sin(0.5 * most)
+        return 2.0 * (x.square() + y.square() + 1e-12).sqrt() - 2.0 * math.sin(0.5 * limit)
 
     return term
 
 
 def reaches(height: float) -> Term:
-    """Constraint: the apex of the base is at least `height` [m], see `highest`."""
+    """Return the constraint: the base's apex, see `highest`, is at least at `height` [m]."""
     return lambda motion: height + highest()(motion)
 
 
 def touchdowns(motion: SimulatedMotion, speed: float = 0.25) -> torch.Tensor:
-    """Return whether each paw has touched down since takeoff, bool (steps + 1, 4, num)."""
+    """Return whether each paw has touched down since takeoff, bool (steps + 1, 4 paws FL, FR, BL, BR, num)."""
     row, _ = motion.takeoff(speed)
     later = torch.arange(motion.q.shape[0], device=row.device)[:, None, None] > row
     down = torch.cat([torch.zeros_like(motion.down[:1]), motion.down])
     return (down & later).int().cummax(0).values.bool()
 
 
-def soft(most: float, speed: float = 0.25) -> Term:
-    """Constraint: after takeoff the base's upward acceleration per policy step is below `most` [g], scaled to 10 g."""
+def soft(limit: float, speed: float = 0.25) -> Term:
+    """Return the constraint: after takeoff the base accelerates upward by at most `limit` [g], scaled to 10 g.
+
+    The acceleration is the mean over a policy step.
+    """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         up = motion.base_velocity[..., 2]
         acceleration = (up[1:] - up[:-1]) / (motion.substeps * motion.dt * motion.gravity)
         later = torch.arange(len(up), device=up.device)[1:, None] > motion.takeoff(speed)[0]
-        return torch.where(later, 0.1 * (acceleration - most), -1.0)
+        return torch.where(later, 0.1 * (acceleration - limit), -1.0)
 
     return term
 
 
-def lifted(free: float = 0.001) -> Term:
-    """Objective: height times duration of paws lifted after touchdown [10 mm s], (num,).
+def lifted(dead_band: float = 0.001) -> Term:
+    """Return the objective: height of paws lifted after touchdown, summed over paws and time, in units of 10 mm s.
 
-    Heights up to `free` [m] do not count. Paws in the air at the end of the motion add their height there.
+    Heights are counted above `dead_band` [m]. Each paw's height in the last row is added in units of 10 mm.
     """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
-        height = (motion.ankles[..., 2] - motion.body.paw_radius - free).clamp_min(0.0).movedim(2, 1)
-        counts = touchdowns(motion)
+        height = (motion.ankles[..., 2] - motion.body.paw_radius - dead_band).clamp_min(0.0).movedim(2, 1)
         step = motion.substeps * motion.dt
-        return 100.0 * (step * torch.where(counts, height, 0.0).sum((0, 1)) + height[-1].sum(0))
+        return 100.0 * (step * torch.where(touchdowns(motion), height, 0.0).sum((0, 1)) + height[-1].sum(0))
 
     return term
 
 
 def rest() -> Term:
-    """Objective: squared speed [m^2/s^2] plus a tenth of squared angular velocity [rad^2/s^2] at the end, (num,)."""
+    """Return the objective: squared speed [m^2/s^2] + squared angular velocity [rad^2/s^2] / 10 in the last row."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         last = motion.qd[-1]
@@ -218,6 +229,6 @@ def rest() -> Term:
     return term
 
 
-def still(free: float = 0.001) -> Term:
-    """Objective: `lifted` plus half of `rest`, (num,)."""
-    return lambda motion: lifted(free)(motion) + 0.5 * rest()(motion)
+def still(dead_band: float = 0.001) -> Term:
+    """Return the objective: `lifted` plus half of `rest`, for a motion that ends at rest on planted paws."""
+    return lambda motion: lifted(dead_band)(motion) + 0.5 * rest()(motion)

@@ -27,8 +27,7 @@ from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.trajectory.whole_body import Momentum, WholeBody
 from jumper_warp.utils.errors import InputError
 
-CONTACT_FORCE = 0.1
-"""[N] Force above which a paw is in contact."""
+CONTACT_FORCE = 0.1  # [N] force above which a paw is in contact
 
 
 @dataclass(frozen=True)
@@ -40,25 +39,25 @@ class Knots:
     steps: int
     """Policy steps of the motion."""
     scale: tuple[float, float] = (15.0, 90.0)
-    """[deg] Of an action of 1, lateral and transversal motors."""
+    """[deg] Change of the target by an action of 1: lateral motors, transversal motors."""
     middle: tuple[float, float] = (0.0, 45.0)
-    """[deg] Of an action of 0."""
+    """[deg] Target at an action of 0: lateral motors, transversal motors."""
     symmetric: bool = True
-    """True: left and right are equal and lateral motors at 0; False: all twelve motors are free."""
+    """True: left and right legs are equal and lateral motors at 0; False: all twelve motors are free."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: knots that do not rise from 0, or beyond the motion."""
+        """Raise InputError: knots that do not rise from 0, or end after the motion."""
         rise = len(self.at) > 1 and self.at[0] == 0.0 and bool(np.all(np.diff(self.at) > 0.0))
         if not rise or not max(self.at) < self.steps:
             raise InputError(f"knots must rise from 0 and end before step {self.steps}, got {self.at}")
 
     @property
     def motors(self) -> int:
-        """Number of actions of a knot: front outer, front inner, hind outer, hind inner; or all motors."""
+        """Actions of a knot: 4 (front outer, front inner, hind outer, hind inner) if symmetric, else all 12 motors."""
         return 4 if self.symmetric else 12
 
     def __len__(self) -> int:
-        """Return the number of variables of a candidate."""
+        """Return the number of variables of a candidate: knots times `motors`."""
         return len(self.at) * self.motors
 
     @cached_property
@@ -67,7 +66,7 @@ class Knots:
         return np.stack([np.interp(np.arange(self.steps), self.at, unit) for unit in np.eye(len(self.at))], axis=1)
 
     def targets(self, x: torch.Tensor) -> torch.Tensor:
-        """Return targets [rad] (steps, 12, n) of candidates (n, len(self))."""
+        """Return motor targets [rad] (steps, 12, n) of candidates x (n, len(self)), within ±1, knot by knot."""
         weights = torch.as_tensor(self.weights, dtype=x.dtype, device=x.device)
         actions = torch.einsum("tk,nkm->tmn", weights, x.unflatten(1, (len(self.at), self.motors)))
         if self.symmetric:
@@ -82,72 +81,69 @@ class Knots:
 
 
 class SimulatedMotion:
-    """Motion of `num` worlds with derived quantities, which are computed once; row 0 is the start.
+    """Motion of `num` worlds with derived quantities, which are computed once.
 
-    Rows are policy steps, coordinates last.
+    Row 0 is the start, row i the end of policy step i; coordinates are last. Positions and velocities: world frame.
     """
 
     def __init__(self, trajectory: TorchTrajectory, body: WholeBody, rollout: Rollout, gravity: float, start: Momentum):
         self.trajectory, self.body, self.gravity, self.start = trajectory, body, gravity, start
-        """gravity [m/s^2]: downward; start: momentum at the start, without gradients."""
+        """gravity [m/s^2]: downward, positive; start: momentum in row 0, without gradients."""
         self._cache: dict[Any, Any] = {}
         self.dt, self.substeps = rollout.dt, rollout.substeps
         self.q, self.qd = trajectory.q.movedim(1, -1), trajectory.qd.movedim(1, -1)
-        """(steps + 1, num, 19) and (steps + 1, num, 18), see `Trajectory`."""
+        """(steps + 1, num, 19) and (steps + 1, num, 18), coordinates and rates as in `Trajectory`."""
         self.num = self.q.shape[1]
 
     def once(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return `make()`, computed once per key and shared by terms."""
+        """Return `make()`, computed at the first call with this hashable key and cached for all terms."""
         if key not in self._cache:
             self._cache[key] = make()
         return self._cache[key]
 
     @cached_property
     def points(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Positions of the legs' joints and ankles [m], (steps + 1, num, ...), see `WholeBody.points`."""
+        """Links' origins (steps + 1, num, 4, 5, 3) and paws' centres (steps + 1, num, 4, 3) [m]: `WholeBody.points`."""
         return self.body.points(self.q)
 
     @property
     def ankles(self) -> torch.Tensor:
-        """Centres of the paws [m], (steps + 1, num, 4, 3)."""
+        """Centres of the paws FL, FR, BL, BR [m], (steps + 1, num, 4, 3)."""
         return self.points[1]
 
     @cached_property
     def clearance(self) -> torch.Tensor:
-        """Distances of links from the ground [m], (steps + 1, num, 4, 4), see `WholeBody.clearance`."""
+        """Heights of links above the ground [m], (steps + 1, num, 4 legs, 4), see `WholeBody.clearance`."""
         return self.body.clearance_of(self.q, *self.points)
 
     @cached_property
     def down(self) -> torch.Tensor:
-        """Whether each paw is in contact at the end of each policy step, bool (steps, 4, num)."""
+        """Whether each paw is in contact in the last physics step of each policy step, bool (steps, 4, num)."""
         impulse = self.trajectory.impulse.detach()[self.substeps - 1 :: self.substeps]
         return torch.linalg.vector_norm(impulse, dim=-1) > CONTACT_FORCE * self.dt
 
     @cached_property
     def positive_work(self) -> torch.Tensor:
-        """Positive work of the motors [J] until each policy step, (steps, num).
+        """Positive work of all motors [J] until the end of each policy step, (steps, num).
 
-        Torques are those of every physics step, rates interpolated within the policy step.
+        Torques are those of each physics step; rates are interpolated linearly within the policy step.
         """
         torque = self.trajectory.torque.unflatten(0, (-1, self.substeps))
         ends = self.qd[..., 6:].movedim(-1, 1)
-        share = (torch.arange(self.substeps, device=torque.device) + 0.5) / self.substeps
-        share = share.to(torque.dtype)[:, None, None]
-        rate = ends[:-1, None] + share * (ends[1:] - ends[:-1])[:, None]
+        fraction = (torch.arange(self.substeps, device=torque.device) + 0.5) / self.substeps
+        rate = ends[:-1, None] + fraction.to(torque.dtype)[:, None, None] * (ends[1:] - ends[:-1])[:, None]
         return (self.dt * (torque * rate).clamp_min(0.0)).sum((1, 2)).cumsum(0)
 
     def takeoff(self, speed: float) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the row of takeoff (num,), the last row where there is none, and whether there is one, bool (num,).
+        """Return (row of takeoff (num,), whether the robot takes off, bool (num,)); without takeoff, the last row.
 
-        Takeoff as in the jumps' tasks: no paw in contact and the base rising faster than `speed` [m/s].
+        Takeoff as in the jump tasks: the first row with no paw in contact and the base rising faster than speed [m/s].
         """
         return self.once(("takeoff", speed), lambda: self._takeoff(speed))
 
-    def _takeoff(self, speed: float) -> tuple[torch.Tensor, torch.Tensor]:
-        free = ~self.down.any(dim=1) & (self.base_velocity[1:, :, 2].detach() > speed)
-        steps = free.shape[0]
-        row = torch.where(free.any(0), free.int().argmax(0) + 1, steps)
-        return row, free.any(0)
+    def _takeoff(self, speed: float) -> tuple[torch.Tensor, torch.Tensor]:  # `takeoff` without the cache
+        airborne = ~self.down.any(dim=1) & (self.base_velocity[1:, :, 2].detach() > speed)
+        return torch.where(airborne.any(0), airborne.int().argmax(0) + 1, len(airborne)), airborne.any(0)
 
     @cached_property
     def base_velocity(self) -> torch.Tensor:
@@ -155,12 +151,12 @@ class SimulatedMotion:
         return self.body.base_velocity(self.q, self.qd)
 
     def momentum_at(self, row: torch.Tensor) -> Momentum:
-        """Return the momentum at a row of each world, (num,)."""
+        """Return the momentum of each world, (num, ...), in the world's row of `row` (num,)."""
         worlds = torch.arange(self.num, device=row.device)
         return self.body.momentum(self.q[row, worlds], self.qd[row, worlds])
 
     def momentum_at_takeoff(self, speed: float) -> Momentum:
-        """Return the momentum at takeoff, see `takeoff`."""
+        """Return the momentum of each world at `takeoff`; speed [m/s]."""
         return self.once(("momentum", speed), lambda: self.momentum_at(self.takeoff(speed)[0]))
 
 
@@ -171,28 +167,23 @@ Term = Callable[[SimulatedMotion], torch.Tensor]
 class Values(NamedTuple):
     """Objective and constraints of n candidates."""
 
-    objective: torch.Tensor
-    """(n,)"""
-    constraints: torch.Tensor
-    """(n, m) Satisfied where <= 0."""
+    objective: torch.Tensor  # (n,) to minimise
+    constraints: torch.Tensor  # (n, m) satisfied where <= 0
 
 
 class _Worlds(NamedTuple):
-    """Rollout and start of n candidates, standing in the default pose."""
+    """Rollout and initial state of n candidates, standing in the default pose."""
 
     rollout: Rollout
     body: WholeBody
-    q: torch.Tensor
-    """(19, n)"""
-    qd: torch.Tensor
-    """(18, n)"""
-    start: Momentum
-    """At the start."""
+    q: torch.Tensor  # (19, n) initial coordinates, as in `Trajectory.q`
+    qd: torch.Tensor  # (18, n) initial rates, zero
+    start: Momentum  # in the initial state
 
 
 @dataclass
 class Problem:
-    """Optimisation problem of a motion that starts from standing in the default pose."""
+    """Optimisation problem of motor targets, for a motion that starts from standing in the default pose."""
 
     knots: Knots
     objective: Term
@@ -200,32 +191,32 @@ class Problem:
     motors: MotorCfg = field(default_factory=jumping_motors)
     command_filter: FilterCfg | None = None
     friction: float = 0.85
-    """[1] Of the paws."""
+    """[1] Friction coefficient of the paws."""
     gravity: float = EARTH
-    """[m/s^2] Downward."""
+    """[m/s^2] Downward, positive."""
     substeps: int = SUBSTEPS
-    """Physics steps in a policy step; fewer are faster and coarser."""
+    """Physics steps in a policy step of 1/60 s; fewer are faster and coarser."""
     double: bool = True
     """Whether to compute in double precision."""
     tolerance: float | None = 1.0e-9
-    """[m/s] Of the contact iteration."""
+    """[m/s] Tolerance of the contact iteration."""
     device: Any = None
     threads: int | None = None
     world_steps: int = field(default=0, init=False)
-    """Simulated policy steps so far, worlds times steps."""
+    """Number of simulated policy steps so far, worlds times steps."""
     reverse_steps: int = field(default=0, init=False)
-    """Policy steps of reverse passes so far, worlds times steps."""
+    """Number of policy steps of reverse passes so far, worlds times steps."""
 
     def __post_init__(self) -> None:
-        """Start without worlds."""
+        """Start with an empty cache of worlds, by number of candidates."""
         self._worlds: dict[int, _Worlds] = {}
 
     def rollout(self, num_worlds: int) -> Rollout:
-        """Return the rollout of a number of worlds, made at first use."""
+        """Return the rollout of `num_worlds` worlds, built at first use and cached."""
         return self._worlds_of(num_worlds).rollout
 
     def _worlds_of(self, num_worlds: int) -> _Worlds:
-        """Return rollout and start of a number of worlds, made at first use."""
+        """Return rollout and initial state of `num_worlds` worlds, built at first use and cached."""
         if num_worlds not in self._worlds:
             model = build_model(
                 num_worlds, visuals=False, friction=self.friction, gravity=self.gravity, device=self.device
@@ -240,23 +231,23 @@ class Problem:
         return self._worlds[num_worlds]
 
     def motion(self, x: torch.Tensor) -> SimulatedMotion:
-        """Return the simulated motion of candidates (n, len(knots)), differentiable by x."""
+        """Return the simulated motion of candidates x (n, len(knots)), one world each, differentiable by x."""
         rollout, body, q, qd, start = self._worlds_of(len(x))
         targets = self.knots.targets(x)
         self.world_steps += targets.shape[0] * len(x)
         return SimulatedMotion(simulate(rollout, targets, q, qd, trusted=True), body, rollout, self.gravity, start)
 
     def motion_of(self, trajectory: TorchTrajectory) -> SimulatedMotion:
-        """Return the motion of a trajectory of one world from another simulation of the same robot."""
+        """Return the motion of a one-world trajectory from another simulation of the same robot, for `values`."""
         rollout, body, _, _, start = self._worlds_of(1)
         return SimulatedMotion(trajectory, body, rollout, self.gravity, start)
 
     def evaluate(self, x: torch.Tensor) -> Values:
-        """Return objective and constraints of candidates (n, len(knots)), see `values`."""
+        """Return objective and constraints of candidates x (n, len(knots)), see `values`."""
         return self.values(self.motion(x))
 
     def values(self, motion: SimulatedMotion) -> Values:
-        """Return objective and constraints of a motion; a diverged world has an infinite objective."""
+        """Return objective and constraints of a motion; a diverged world has an infinite objective, constraints 0."""
         objective = self.objective(motion)
         rows = [term(motion).reshape(-1, motion.num) for term in self.constraints]
         constraints = torch.cat(rows).T if rows else objective.new_zeros(motion.num, 0)
@@ -264,9 +255,9 @@ class Problem:
         return Values(torch.where(diverged, torch.inf, objective), torch.where(diverged[:, None], 0.0, constraints))
 
     def gradient(self, x: torch.Tensor, merit: Callable[[Values], torch.Tensor]) -> tuple[Values, torch.Tensor]:
-        """Return the values of candidates and the gradient of their merit, (n, len(knots)), zero where they diverge.
+        """Return the values of candidates x (n, len(knots)) and the gradient of their merit, of the same shape.
 
-        merit: function of `Values` to minimise, returns (n,).
+        merit: returns (n,) to minimise, given `Values`. The gradient is zero for candidates that diverge.
         """
         x = x.detach().requires_grad_()
         values = self.evaluate(x)

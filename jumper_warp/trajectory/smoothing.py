@@ -18,20 +18,13 @@ import torch
 
 from jumper_warp.trajectory.problem import Knots, Problem, Values
 
-FIRST, SECOND = 0.9, 0.98
-"""Adam's decay of the means of gradients and of their squares."""
-LARGEST_GRADIENT = 0.3
-"""[1] Norm to which gradients are clipped."""
-EPSILON = 1.0e-3
-"""[1] Adam's epsilon."""
-BATCH = 256
-"""Candidates that one rollout simulates."""
-SHIFT = 2
-"""Knots by which the end of a crossing is shifted in time, at most."""
-EXACT = 3.0
-"""[1] Weight of the largest violation in the exact penalty; larger than the multipliers."""
-MAX_VIOLATION = 0.05
-"""[1] Clip of the violations that raise multipliers."""
+FIRST, SECOND = 0.9, 0.98  # Adam's decay rates of the means of gradients and of squared gradients
+LARGEST_GRADIENT = 0.3  # [1] norm to which the gradient of each start is clipped
+EPSILON = 1.0e-3  # [1] Adam's epsilon
+BATCH = 256  # candidates that one rollout simulates
+SHIFT = 2  # largest time shift of the end of a crossing [knots]
+EXACT = 3.0  # [1] weight of the largest violation in the exact penalty; larger than the multipliers
+MAX_VIOLATION = 0.05  # [1] clip of the violations that raise multipliers
 
 
 @dataclass(frozen=True)
@@ -39,13 +32,13 @@ class Stage:
     """Settings of one stage of a smoothed descent."""
 
     keep: int
-    """Number of best starts of the stage before that are kept."""
+    """Number of best starts that enter the stage."""
     iterations: int
     """Gradient steps of the stage."""
     rate: float
     """[1] Initial learning rate."""
     noise: float
-    """[1] Initial standard deviation of the displacements."""
+    """[1] Initial standard deviation of the random displacements of actions."""
     final_fraction: float = 0.0
     """[1] Fraction of rate and noise at the end of the stage; they fall linearly."""
     penalty: float = 20.0
@@ -53,17 +46,17 @@ class Stage:
     dual: float = 0.0
     """[1] Rate at which violations raise the multipliers of constraints; 0: no multipliers."""
     slack: float = inf
-    """[1] A start whose merit exceeds its best by more than this returns to its best point; the stage then ends with
-    the best points. Infinite: starts never return."""
+    """[1] A start whose merit exceeds its best by more than this returns to its best point, and the stage returns the
+    best points. Infinite: starts never return, and the stage returns the last points."""
     check_every: int = 20
     """Iterations between evaluations of the undisplaced starts, after which they can return."""
     return_scale: float = 1.0
-    """[1] Factor of a start's later steps and displacements each time that it returns."""
+    """[1] Factor on a start's later steps and displacements at each return."""
     crossings: int = 0
-    """Crossings per start that are tried in its place before the stage, see `crossed`."""
+    """Number of crossings by start, of which the best replaces the start before the stage, see `crossed`."""
 
     def merit(self, values: Values) -> torch.Tensor:
-        """Return the merit (n,) of undisplaced candidates: `exact` with multipliers, else `penalised`."""
+        """Return the merit (n,), lower is better, of undisplaced candidates: `exact` if `dual`, else `penalised`."""
         return exact(values) if self.dual else penalised(values, self.penalty)
 
 
@@ -76,17 +69,17 @@ STAGES = (
 
 
 def penalised(values: Values, penalty: float = 20.0) -> torch.Tensor:
-    """Return the objective plus the penalty of squared violations, (n,)."""
+    """Return the objective plus `penalty` times the sum of squared violations, (n,)."""
     return values.objective + penalty * values.constraints.clamp_min(0.0).square().sum(1)
 
 
 def exact(values: Values) -> torch.Tensor:
-    """Return the exact penalty function (n,): the objective plus the weighted largest violation."""
+    """Return the exact penalty function (n,): the objective plus `EXACT` times the largest violation."""
     return values.objective + EXACT * values.constraints.clamp_min(0.0).amax(1)
 
 
 def merit_of(problem: Problem, x: torch.Tensor, merit: Callable[[Values], torch.Tensor]) -> torch.Tensor:
-    """Return the merit (n,) of candidates (n, len(problem.knots)); NaN becomes infinite."""
+    """Return the merit (n,), lower is better, of candidates x (n, len(problem.knots)); NaN becomes infinite."""
     with torch.no_grad():
         merits = torch.cat([merit(problem.evaluate(part)) for part in x.split(BATCH)])
     return torch.nan_to_num(merits, torch.inf)
@@ -95,24 +88,24 @@ def merit_of(problem: Problem, x: torch.Tensor, merit: Callable[[Values], torch.
 def sort_by_merit(
     problem: Problem, x: torch.Tensor, merit: Callable[[Values], torch.Tensor] = penalised
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return candidates (n, len(problem.knots)) from best to worst, and their merit (n,)."""
+    """Return candidates x (n, len(problem.knots)) sorted from lowest to highest merit, and their merit (n,)."""
     merits = merit_of(problem, x, merit)
     order = torch.argsort(merits, stable=True)
     return x[order], merits[order]
 
 
 def lagrangian(values: Values, multipliers: torch.Tensor, penalty: float) -> torch.Tensor:
-    """Return the augmented Lagrangian (n,); with multipliers (n, m) of 0 it equals `penalised`."""
+    """Return the augmented Lagrangian (n,) of n candidates; with multipliers (n, m) of 0 it equals `penalised`."""
     pressed = (multipliers + 2.0 * penalty * values.constraints).clamp_min(0.0)
     return values.objective + (pressed.square() - multipliers.square()).sum(1) / (4.0 * penalty)
 
 
-def crossed(knots: Knots, x: torch.Tensor, each: int, rng: np.random.Generator) -> torch.Tensor:
-    """Return crossings (each, n, len(knots)): the beginning of a row of x (n, len(knots)) and the end of another.
+def crossed(knots: Knots, x: torch.Tensor, count: int, rng: np.random.Generator) -> torch.Tensor:
+    """Return `count` random crossings of each start x (n, len(knots)) with another start, (count, n, len(knots)).
 
-    The end is shifted by up to SHIFT knots.
+    A crossing has the start's first knots, and the other start's last knots, shifted in time by up to `SHIFT` knots.
     """
-    whole, rows, shape = x.unflatten(1, (len(knots.at), -1)), np.arange(len(knots.at)), (each, len(x), 1)
+    whole, rows, shape = x.unflatten(1, (len(knots.at), -1)), np.arange(len(knots.at)), (count, len(x), 1)
     first = np.arange(len(x))[None, :, None]
     second = (first + rng.integers(1, max(2, len(x)), shape)) % len(x)
     ends = rows >= rng.integers(1, len(rows), shape)
@@ -121,7 +114,7 @@ def crossed(knots: Knots, x: torch.Tensor, each: int, rng: np.random.Generator) 
 
 
 def _best_crossed(problem: Problem, x: torch.Tensor, stage: Stage, rng: np.random.Generator) -> torch.Tensor:
-    """Return starts from best to worst, each replaced by its best crossing where that is better."""
+    """Return starts x (n, len(knots)) sorted by merit, each replaced by its best crossing if that is better."""
     tried = torch.cat([x[None], crossed(problem.knots, x, stage.crossings, rng)])
     merits = merit_of(problem, tried.flatten(0, 1), stage.merit).unflatten(0, tried.shape[:2])
     best, chosen = merits.min(0)
@@ -129,7 +122,7 @@ def _best_crossed(problem: Problem, x: torch.Tensor, stage: Stage, rng: np.rando
 
 
 def _first_multipliers(problem: Problem, x: torch.Tensor, stage: Stage) -> torch.Tensor:
-    """Return initial multipliers (n, m) with the gradient of the penalty; without `dual` zeros, (n, 1)."""
+    """Return multipliers (n, m) that give the penalty's gradient at x (n, len(knots)); without `dual`, zeros (n, 1)."""
     if not stage.dual:
         return x.new_zeros(len(x), 1)
     with torch.no_grad():
@@ -137,14 +130,14 @@ def _first_multipliers(problem: Problem, x: torch.Tensor, stage: Stage) -> torch
 
 
 class _BestPoints:
-    """Best point and merit of each start so far."""
+    """Best point x (n, len(knots)) and lowest merit (n,) of each start so far."""
 
-    def __init__(self, problem: Problem, x: torch.Tensor, stage: Stage):
+    def __init__(self, problem: Problem, x: torch.Tensor, stage: Stage):  # x: starts
         self.problem, self.stage = problem, stage
         self.x, self.merit = x, merit_of(problem, x, stage.merit)
 
     def update(self, x: torch.Tensor, slack: float) -> torch.Tensor:
-        """Keep starts x (n, len(knots)) that improve; returns which are worse by more than `slack`, bool (n, 1)."""
+        """Keep points x (n, len(knots)) that improve; return which exceed the best by over `slack`, bool (n, 1)."""
         merit = merit_of(self.problem, x, self.stage.merit)
         better = merit < self.merit
         self.x, self.merit = torch.where(better[:, None], x, self.x), torch.where(better, merit, self.merit)
@@ -152,7 +145,7 @@ class _BestPoints:
 
 
 def descend(problem: Problem, x: torch.Tensor, stage: Stage, rng: np.random.Generator) -> torch.Tensor:
-    """Return the starts (n, len(knots)) after one stage."""
+    """Return starts x (n, len(knots)) after one stage of smoothed descent: last points, or with `slack` the best."""
     mean, square = torch.zeros_like(x), torch.zeros_like(x)
     best = _BestPoints(problem, x, stage) if stage.slack < inf else None
     multipliers, scale = _first_multipliers(problem, x, stage), x.new_ones(len(x), 1)
@@ -161,9 +154,8 @@ def descend(problem: Problem, x: torch.Tensor, stage: Stage, rng: np.random.Gene
         displacement = torch.as_tensor(rng.normal(size=tuple(x.shape)), dtype=x.dtype, device=x.device)
         at = (x + decay * scale * stage.noise * displacement).clamp(-1.0, 1.0)
         values, gradient = problem.gradient(at, lambda values, y=multipliers: lagrangian(values, y, stage.penalty))
-        multipliers = (multipliers + stage.dual * values.constraints.clamp(-MAX_VIOLATION, MAX_VIOLATION)).clamp_min(
-            0.0
-        )
+        violations = values.constraints.clamp(-MAX_VIOLATION, MAX_VIOLATION)
+        multipliers = (multipliers + stage.dual * violations).clamp_min(0.0)
         gradient *= (LARGEST_GRADIENT / gradient.norm(dim=1, keepdim=True).clamp_min(1.0e-9)).clamp_max(1.0)
         mean = FIRST * mean + (1.0 - FIRST) * gradient
         square = SECOND * square + (1.0 - SECOND) * gradient.square()
@@ -187,10 +179,10 @@ def smoothed(
     seed: int = 0,
     callback: Callable[[int, torch.Tensor], None] | None = None,
 ) -> np.ndarray:
-    """Return the candidates after all stages, best first, as many as the last stage keeps.
+    """Return the candidates after all stages, lowest merit first, (keep of the last stage, len(problem.knots)).
 
     begin: candidates (n, len(problem.knots)), of which the first stage keeps the best. callback: called after each
-    stage with its number and the merit of its candidates, (n,).
+    stage with its index and the merits (keep,) of its candidates.
     """
     real = torch.float64 if problem.double else torch.float32
     x = torch.as_tensor(begin, dtype=real, device=str(problem.rollout(min(len(begin), BATCH)).device))

@@ -19,43 +19,34 @@ from jumper_warp.kernels.layout import BODIES
 
 FRONT = (1.0, 1.0, -1.0, -1.0)
 SIDE = (1.0, -1.0, 1.0, -1.0)
-"""Signs of the legs: front +1, hind -1; left +1, right -1."""
-OUTER, INNER = 0, 1
-"""Transversal motors of a leg."""
-LINKS = 5
-"""Links of a leg: housing, outer thigh, outer shank, inner thigh, inner shank."""
+"""Signs of the legs FL, FR, BL, BR: front +1, hind -1; left +1, right -1."""
+OUTER, INNER = 0, 1  # indices of a leg's two transversal motors, thighs or shanks
 
 
 class LegFrames(NamedTuple):
-    """Poses and velocities of the links of four legs, world frame; axes (..., leg, link, ...)."""
+    """Poses and velocities of the links of four legs, world frame; axes (..., leg, link, ...).
 
-    pos: torch.Tensor
-    """(..., 4, 5, 3) [m] Origins: hip, outer transversal axis, outer knee, inner axis, inner knee."""
-    rotation: torch.Tensor
-    """(..., 4, 5, 3, 3) Link to world."""
-    vel: torch.Tensor
-    """(..., 4, 5, 3) [m/s] Of the origins."""
-    ang: torch.Tensor
-    """(..., 4, 5, 3) [rad/s]"""
-    ankle: torch.Tensor
-    """(..., 4, 3) [m] Centres of the paws."""
+    Legs FL, FR, BL, BR; links housing, outer thigh, outer shank, inner thigh, inner shank.
+    """
+
+    pos: torch.Tensor  # (..., 4, 5, 3) [m] origins: hip, outer transversal axis, outer knee, inner axis, inner knee
+    rotation: torch.Tensor  # (..., 4, 5, 3, 3) link to world
+    vel: torch.Tensor  # (..., 4, 5, 3) [m/s] of the origins
+    ang: torch.Tensor  # (..., 4, 5, 3) [rad/s] angular velocities
+    ankle: torch.Tensor  # (..., 4, 3) [m] centres of the paws
 
 
 class Momentum(NamedTuple):
-    """Momentum of the whole robot, world frame."""
+    """Centre of mass, its velocity, angular momentum and inertia of the whole robot, world frame."""
 
-    com: torch.Tensor
-    """(..., 3) [m] Centre of mass."""
-    vel: torch.Tensor
-    """(..., 3) [m/s] Velocity of the centre of mass."""
-    spin: torch.Tensor
-    """(..., 3) [kg m^2/s] Angular momentum about the centre of mass."""
-    inertia: torch.Tensor
-    """(..., 3, 3) [kg m^2] Of the posture, about the centre of mass."""
+    com: torch.Tensor  # (..., 3) [m] centre of mass
+    vel: torch.Tensor  # (..., 3) [m/s] velocity of the centre of mass
+    spin: torch.Tensor  # (..., 3) [kg m^2/s] angular momentum about the centre of mass
+    inertia: torch.Tensor  # (..., 3, 3) [kg m^2] of the present posture, about the centre of mass
 
 
 def rotation_matrices(quat: torch.Tensor) -> torch.Tensor:
-    """Return rotation matrices (..., 3, 3) of quaternions xyzw (..., 4), normalised first."""
+    """Return rotation matrices (..., 3, 3) of quaternions xyzw (..., 4), which are normalised first."""
     x, y, z, w = torch.nn.functional.normalize(quat, dim=-1).unbind(-1)
     rows = (
         1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w),
@@ -66,32 +57,32 @@ def rotation_matrices(quat: torch.Tensor) -> torch.Tensor:
 
 
 def _rotation_x(cos: torch.Tensor, sin: torch.Tensor) -> torch.Tensor:
-    """Return rotation matrices (..., 3, 3) about x."""
+    """Return rotation matrices (..., 3, 3) about x, given cosine and sine of the angle (...)."""
     one, zero = torch.ones_like(cos), torch.zeros_like(cos)
     return torch.stack([one, zero, zero, zero, cos, -sin, zero, sin, cos], dim=-1).unflatten(-1, (3, 3))
 
 
 def _rotation_y(cos: torch.Tensor, sin: torch.Tensor) -> torch.Tensor:
-    """Return rotation matrices (..., 3, 3) about y."""
+    """Return rotation matrices (..., 3, 3) about y, given cosine and sine of the angle (...)."""
     one, zero = torch.ones_like(cos), torch.zeros_like(cos)
     return torch.stack([cos, zero, sin, zero, one, zero, -sin, zero, cos], dim=-1).unflatten(-1, (3, 3))
 
 
 def _apply(rotation: torch.Tensor, vector: torch.Tensor) -> torch.Tensor:
-    """Return rotated vectors (..., 3)."""
+    """Return vectors (..., 3) rotated by matrices (..., 3, 3)."""
     return (rotation @ vector.unsqueeze(-1)).squeeze(-1)
 
 
 def _cross(a: torch.Tensor, b: torch.Tensor) -> torch.Tensor:
-    """Return cross products (..., 3), broadcast."""
+    """Return cross products a x b (..., 3); a and b are broadcast."""
     return torch.linalg.cross(*torch.broadcast_tensors(a, b))
 
 
 class WholeBody:
-    """Kinematics and momentum of the robot of a rollout, with the masses of its first world."""
+    """Differentiable kinematics and momentum of the robot of a rollout, with the masses of its world 0."""
 
     def __init__(self, rollout: Rollout):
-        """Copy lengths and masses of a rollout; later changes have no effect."""
+        """Copy lengths and masses of a rollout; later changes of the rollout have no effect."""
         self._real = torch.float64 if rollout.real is wp.float64 else torch.float32
         device = str(rollout.device)
         lengths = torch.as_tensor(rollout.geometry(), dtype=self._real, device=device)
@@ -99,7 +90,7 @@ class WholeBody:
         self._outer_x, self._inner_x, self._plane_y, self._knee_y, self._thigh, self._shank, self.paw_radius = lengths[
             :, 3:
         ].unbind(1)
-        """(4,) [m] each, in the order of `jumper_warp.diff.rollout.GEOMETRY_NAMES`."""
+        """Lengths [m] of the four legs, (4,) each, as `jumper_warp.diff.rollout.GEOMETRY_NAMES`."""
         self._front = lengths.new_tensor(FRONT)
         self._side = lengths.new_tensor(SIDE)
         self._flip = torch.stack([self._front, -self._front], dim=-1)
@@ -109,17 +100,19 @@ class WholeBody:
         self._mass, self._first = moments[:, 0], moments[:, 1:4]
         xx, yy, zz, xy, xz, yz = moments[:, 4:10].unbind(1)
         self._second = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], dim=1).unflatten(1, (3, 3))
-        self.mass = float(self._mass.sum())
-        """[kg]"""
+        self.mass = float(self._mass.sum())  # [kg] of the whole robot
 
     def _base(self, q: torch.Tensor, qd: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return rotation (..., 3, 3), position [m], velocity [m/s] and angular velocity [rad/s] of the base."""
+        """Return the base's rotation (..., 3, 3), origin [m], its velocity [m/s], and angular velocity [rad/s].
+
+        Arguments q (..., 19), qd (..., 18). Vectors: (..., 3), world frame.
+        """
         rotation, ang = rotation_matrices(q[..., 3:7]), qd[..., 3:6]
         vel = qd[..., :3] - _cross(ang, _apply(rotation, (self._first[0] / self._mass[0]).expand_as(ang)))
         return rotation, q[..., :3], vel, ang
 
     def base_velocity(self, q: torch.Tensor, qd: torch.Tensor) -> torch.Tensor:
-        """Return the velocity [m/s] of the base's origin, (..., 3)."""
+        """Return the velocity [m/s] of the base's origin, world frame, (..., 3). q: (..., 19), qd: (..., 18)."""
         return self._base(q, qd)[2]
 
     def legs(self, q: torch.Tensor, qd: torch.Tensor) -> LegFrames:
@@ -150,10 +143,10 @@ class WholeBody:
         )  # fmt: skip
 
     def _planar(self, angle: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return positions of the five-bar in the housing frame, given outer and inner angles [rad] (..., 4, 2).
+        """Return positions of the five-bars in their housing frames, given outer and inner angles [rad] (..., 4, 2).
 
-        Returned: origins (..., 4, 4, 3) [m] of outer and inner thigh and shank, ankles (..., 4, 3) [m], and
-        unit vectors along the shanks (..., 4, 2, 2): outer and inner, x and z.
+        Returned: origins (..., 4, 4, 3) [m] of outer thigh, outer shank, inner thigh, inner shank; ankles (..., 4, 3)
+        [m]; unit vectors along the shanks (..., 4, 2, 2): outer and inner, x and z.
         """
         zero = torch.zeros_like(angle[..., 0])
         axis = torch.stack([self._outer_x, self._inner_x], dim=-1)
@@ -174,10 +167,10 @@ class WholeBody:
     def _planar_rates(
         self, angle: torch.Tensor, rate: torch.Tensor, shank_dir: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
-        """Return velocities of the origins [m/s], and cosines, sines and rates [rad/s] of the links' rotation about y.
+        """Return velocities of the origins of `_planar`, and cosines, sines and rates of the links' rotation about y.
 
-        angle, rate: (..., 4, 2); shank_dir: (..., 4, 2, 2), see `_planar`. Returned: (..., 4, 4, 3), and (..., 4, 4)
-        three times.
+        angle [rad], rate [rad/s]: (..., 4, 2); shank_dir: (..., 4, 2, 2), see `_planar`. Returned, in the housing
+        frame: velocities (..., 4, 4, 3) [m/s]; cosines, sines and rates [rad/s], (..., 4, 4) each.
         """
         sin, cos, thigh, shank = angle.sin(), angle.cos(), self._thigh[:, None], self._shank[:, None]
         knee_vx, knee_vz = self._flip * thigh * cos * rate, thigh * sin * rate
@@ -192,7 +185,7 @@ class WholeBody:
         rest = torch.stack([zero, zero, zero], dim=-1)
         outer, inner = (torch.stack([knee_vx[..., i], zero, knee_vz[..., i]], dim=-1) for i in (OUTER, INNER))
 
-        def links(thighs: torch.Tensor, shanks: torch.Tensor) -> torch.Tensor:
+        def links(thighs: torch.Tensor, shanks: torch.Tensor) -> torch.Tensor:  # interleave outer and inner links
             return torch.stack([thighs, shanks], dim=-1).flatten(-2)
 
         return (
@@ -201,11 +194,11 @@ class WholeBody:
         )  # fmt: skip
 
     def momentum(self, q: torch.Tensor, qd: torch.Tensor) -> Momentum:
-        """Return centre of mass and momentum of the whole robot. q: (..., 19), qd: (..., 18)."""
+        """Return centre of mass and momentum of the whole robot, world frame. q: (..., 19), qd: (..., 18)."""
         base_rotation, base_pos, base_vel, base_ang = self._base(q, qd)
         legs = self.legs(q, qd)
 
-        def links(base: torch.Tensor, legs_part: torch.Tensor, axes: int) -> torch.Tensor:
+        def links(base: torch.Tensor, legs_part: torch.Tensor, axes: int) -> torch.Tensor:  # base and 20 leg links
             first = base.dim() - axes
             return torch.cat([base.unsqueeze(first), legs_part.flatten(first, first + 1)], dim=first)
 
@@ -234,10 +227,7 @@ class WholeBody:
         return Momentum(com, com_vel, spin.sum(-2), _inertia(outer.sum(-3)))
 
     def points(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return origins [m] of the legs' links, as `LegFrames.pos` (..., 4, 5, 3), and ankles [m] (..., 4, 3).
-
-        q: (..., 19).
-        """
+        """Return `LegFrames.pos` (..., 4, 5, 3) and `LegFrames.ankle` (..., 4, 3) [m], world frame. q: (..., 19)."""
         rotation = rotation_matrices(q[..., 3:7]).unsqueeze(-3)
         angle = q[..., 7:].unflatten(-1, (4, 3))
         origins, ankle = self._planar(angle[..., 1:])[:2]
@@ -250,21 +240,20 @@ class WholeBody:
         return world[..., :5, :], world[..., 5, :]
 
     def clearance(self, q: torch.Tensor) -> torch.Tensor:
-        """Return the distances [m] of each leg's links without paw from level ground, (..., 4, 4).
+        """Return the heights [m] of each leg's links above level ground, negative inside, (..., 4 legs, 4 kinds).
 
-        Last axis: housing, thighs, knees, shanks; each the minimum over `jumper_warp.kernels.collision.robot`.
+        Kinds: housing, thighs, knees, shanks without paw; each is the minimum over the shapes of this kind in
+        `jumper_warp.kernels.collision.robot`. q: (..., 19).
         """
-        pos, ankle = self.points(q)
-        return self.clearance_of(q, pos, ankle)
+        return self.clearance_of(q, *self.points(q))
 
     def clearance_of(self, q: torch.Tensor, pos: torch.Tensor, ankle: torch.Tensor) -> torch.Tensor:
-        """Return `clearance`, given the result of `points`."""
+        """Return `clearance` (..., 4, 4) [m], given q (..., 19) and the result `pos`, `ankle` of `points`."""
         height, ankle = pos[..., 2], ankle[..., 2]
         tip = height[..., 0] + rotation_matrices(q[..., 3:7])[..., 2, 0, None] * self._front * float(HOUSING_LENGTH)
         axes, knees = height[..., 1::2], height[..., 2::2]
-        lowest = knees + float(SHANK_FREE) * (
-            ankle[..., None] - knees
-        )  # one end of a straight link is the lowest point
+        # one end of a straight link is its lowest point
+        lowest = knees + float(SHANK_FREE) * (ankle[..., None] - knees)
         distances = (
             torch.minimum(height[..., 0], tip) - float(HOUSING_RADIUS),
             torch.minimum(axes, 0.5 * (axes + knees)).amin(-1) - float(THIGH_RADIUS),
@@ -275,6 +264,6 @@ class WholeBody:
 
 
 def _inertia(second: torch.Tensor) -> torch.Tensor:
-    """Return inertias (..., 3, 3) of second moments (..., 3, 3)."""
+    """Return inertias (..., 3, 3) [kg m^2] of second moments of mass, the integral of r r^T dm, (..., 3, 3)."""
     trace = second.diagonal(dim1=-2, dim2=-1).sum(-1)
     return trace[..., None, None] * torch.eye(3, dtype=second.dtype, device=second.device) - second

@@ -15,7 +15,7 @@ from jumper_warp.viz.shapes import ShapeMesh, shape_meshes
 
 
 class Recorder:
-    """Collects the frames of a rollout of a Newton model.
+    """Collects frames (body poses, series, contact forces) of a running Newton model into a `Recording`.
 
     ```python
     recorder = Recorder(model)
@@ -32,10 +32,10 @@ class Recorder:
         spacing: float = 0.0,
         notes: Mapping[str, Any] | None = None,
     ) -> None:
-        """Record some worlds of a model, whose bodies and shapes are read once.
+        """Prepare to record some worlds of a model; its bodies and shapes are read once, here.
 
-        spacing [m]: distance along y at which worlds are shown side by side; zero keeps the true positions, as a
-        heightfield needs. notes: metadata, must be JSON.
+        spacing: distance [m] along y between the drawings of consecutive worlds; zero keeps the true positions, as a
+        heightfield needs. notes: metadata of JSON types, saved with the recording.
         Raises InputError: a world has no bodies, or a visible shape cannot be drawn.
         """
         world_of_body = model.body_world.numpy()
@@ -66,12 +66,12 @@ class Recorder:
         contact_points: np.ndarray | None = None,
         contact_forces: np.ndarray | None = None,
     ) -> None:
-        """Add a frame at a time [s] later than the frame before.
+        """Add a frame at a time [s] after the previous frame's.
 
-        body_poses: of all bodies of the model, as in `state.body_q`: (body_count, 7), pos [m] and quat xyzw. series:
-        `group/quantity [unit]` to value, the same names in every frame. contact_points [m] and contact_forces [N] on
-        the robot: world frame, (num_worlds, contacts_per_world, 3) or (contacts, 3) for one world, the same number in
-        every frame.
+        body_poses: of all bodies of the model, as in `state.body_q`: (body_count, 7), position [m] and quaternion xyzw.
+        series: values by name, `group/quantity [unit]`, the same names in every frame. contact_points [m] and
+        contact_forces [N] on the robot: world frame, (num_worlds, contacts_per_world, 3), or (contacts, 3) for one
+        world, the same number in every frame.
         Raises InputError: time does not increase, a shape is wrong, or a name is malformed, new or missing.
         """
         if self._times and not time > self._times[-1]:
@@ -86,7 +86,7 @@ class Recorder:
         self._contacts.append(contacts)
 
     def _append_series(self, series: Mapping[str, float]) -> None:
-        """Append the values of a frame to the time series. Raises InputError: a name is malformed, new or missing."""
+        """Append a frame's values by name. Raises InputError: a malformed, new or missing name."""
         values = {name: float(value) for name, value in series.items()}
         if self._series is None:
             malformed = [name for name in series if not SERIES_NAME.fullmatch(name)]
@@ -100,7 +100,10 @@ class Recorder:
             self._series[name].append(value)
 
     def _checked_contacts(self, points: np.ndarray | None, forces: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Return copies of a frame's contacts, (num_worlds, contacts_per_world, 3) each."""
+        """Return float32 copies of a frame's contacts, (num_worlds, contacts_per_world, 3) each; none if both are None.
+
+        Raises InputError: only one is given, or a shape is wrong or differs from earlier frames.
+        """
         if (points is None) != (forces is None):
             raise InputError("contact_points and contact_forces come together")
         if points is None:
@@ -117,7 +120,7 @@ class Recorder:
         return points, forces
 
     def recording(self) -> Recording:
-        """Return the recording so far. Raises InputError: there is no frame."""
+        """Return a recording of all frames so far. Raises InputError: there is no frame."""
         if not self._times:
             raise InputError("nothing was recorded")
         return Recording(
@@ -134,9 +137,9 @@ class Recorder:
         )
 
     def save_npz(self, path: Path) -> Path:
-        """Write the recording so far as a NumPy archive, which `load_npz` reads; return its path."""
+        """Write all frames so far as a NumPy archive, which `load_npz` reads; return its path."""
         return self.recording().save_npz(path)
 
     def save_rrd(self, path: Path) -> Path:
-        """Write the recording so far as a file of the Rerun viewer; return its path."""
+        """Write all frames so far as a file of the Rerun viewer; return its path."""
         return write_rrd(self.recording(), Path(path))

@@ -1,6 +1,6 @@
 """Recordings of rollouts: body poses, named series and contact forces over time, with the shapes to draw them.
 
-A recording is self-contained: it can be shown without the model.
+A recording is self-contained: it can be drawn without the Newton model.
 """
 
 import io
@@ -21,44 +21,34 @@ from jumper_warp.viz.shapes import ShapeMesh
 
 FORMAT = "jumper-warp recording"
 VERSION = 1
-ARRAYS = ("times", "poses", "contact_points", "contact_forces")
-SURFACE = ("vertices", "normals", "triangles")
-"""Arrays of a recording, and of each of its shapes."""
+ARRAYS = ("times", "poses", "contact_points", "contact_forces")  # fields of `Recording` that are arrays
+SURFACE = ("vertices", "normals", "triangles")  # fields of `ShapeMesh` that are arrays
 SERIES_NAME = re.compile(r"[^/\[\]]+/[^/\[\]]+ \[[^\[\]]+\]")
-"""Names of series: `group/quantity [unit]`, with 1 as the unit of a pure number."""
+"""Pattern of a series' name, `group/quantity [unit]`; the unit of a pure number is 1."""
 
 
 class RecordingError(InputError):
-    """A file that is not a recording, or not a whole one. The message is one line and names the file."""
+    """A file is not a complete recording. The message is one line and names the file."""
 
 
 @dataclass(frozen=True)
 class Recording:
     """One rollout of one or a few worlds, with a fixed set of bodies, series and contacts."""
 
-    times: np.ndarray
-    """(num_frames,) float64 [s], increasing."""
-    worlds: tuple[int, ...]
-    """Indices of the recorded worlds in the model."""
-    bodies: tuple[str, ...]
-    """Names of the recorded bodies, `world_<i>/<link>`, one world after the other."""
-    poses: np.ndarray
-    """(num_frames, num_bodies, 7) float32: origin [m] and quaternion xyzw, body to world."""
-    series: dict[str, np.ndarray]
-    """`group/quantity [unit]` to (num_frames,) float64."""
-    contact_points: np.ndarray
-    """(num_frames, num_worlds, contacts_per_world, 3) float32 [m], world frame."""
+    times: np.ndarray  # (num_frames,) float64 [s], increasing
+    worlds: tuple[int, ...]  # indices of the recorded worlds in the model
+    bodies: tuple[str, ...]  # names of the recorded bodies, `world_<i>/<link>`, one world after the other
+    poses: np.ndarray  # (num_frames, num_bodies, 7) float32: origin [m] and quaternion xyzw, body to world
+    series: dict[str, np.ndarray]  # (num_frames,) float64 by name, `group/quantity [unit]`
+    contact_points: np.ndarray  # (num_frames, num_worlds, contacts_per_world, 3) float32 [m], world frame
     contact_forces: np.ndarray
-    """The same shape, float32 [N], world frame, on the robot."""
-    spacing: float = 0.0
-    """[m] Distance along y at which worlds are shown side by side; the stored poses are not moved."""
-    shapes: tuple[ShapeMesh, ...] = ()
-    """Meshes to show; `body` is an index of `bodies`."""
-    notes: dict[str, Any] = field(default_factory=dict)
-    """Metadata as JSON: seed, gains, commit."""
+    """(num_frames, num_worlds, contacts_per_world, 3) float32 [N], force on the robot, world frame."""
+    spacing: float = 0.0  # [m] Distance along y between the drawings of consecutive worlds; the data are not moved
+    shapes: tuple[ShapeMesh, ...] = ()  # meshes to draw; their `body` is an index of `bodies`, -1 for the world
+    notes: dict[str, Any] = field(default_factory=dict)  # metadata of JSON types, such as seed, gains and commit
 
     def save_npz(self, path: Path) -> Path:
-        """Write the recording to one NumPy archive without pickles, whole or not at all; return its path."""
+        """Write the recording atomically to one NumPy archive without pickles; return its path. Raises OSError."""
         header = {
             "format": FORMAT,
             "version": VERSION,
@@ -81,9 +71,9 @@ class Recording:
 
 
 def load_npz(path: Path) -> Recording:
-    """Return the recording that `Recording.save_npz` wrote.
+    """Return the recording in a file of `Recording.save_npz`.
 
-    Raises RecordingError: the file is missing, damaged, of another kind or of another version.
+    Raises RecordingError (an InputError): the file is missing, damaged, of another kind or of another version.
     """
     try:
         with np.load(path, allow_pickle=False) as archive:
@@ -98,7 +88,7 @@ def load_npz(path: Path) -> Recording:
 
 
 def _from_archive(header: dict[str, Any], archive: Mapping[str, np.ndarray]) -> Recording:
-    """Return the recording of a NumPy archive and its parsed header."""
+    """Return the recording in a NumPy archive; header: its decoded JSON entry `header`."""
     shapes = tuple(
         ShapeMesh(
             shape["name"], shape["body"], tuple(shape["color"]), *(archive[f"shape{index}_{part}"] for part in SURFACE)

@@ -1,7 +1,7 @@
 """Recordings as files of the Rerun viewer: `rerun FILE.rrd` shows them.
 
 Entities:
-    scene/<shape>                 ground and whatever else is fixed to the world
+    scene/<shape>                 ground and other shapes that are fixed to the world
     scene/world_<i>/<link>        pose of a link over time
     scene/world_<i>/<link>/<shape>
     scene/world_<i>/contact_forces
@@ -22,38 +22,35 @@ from jumper_warp.viz.shapes import ShapeMesh
 if TYPE_CHECKING:
     from jumper_warp.viz.recording import Recording
 
-TIMELINE = "time"
-"""Name of the only timeline; durations [s]."""
-FORCE_SCALE = 1.0e-3
-"""Length of a contact arrow per force [m/N]."""
-ARROW_RADIUS = 0.006
-"""[m]"""
-ARROW_COLOR = (220, 60, 40)
+TIMELINE = "time"  # name of the only timeline; durations [s]
+FORCE_SCALE = 1.0e-3  # [m/N] length of a contact arrow over its force
+ARROW_RADIUS = 0.006  # [m]
+ARROW_COLOR = (220, 60, 40)  # RGB, each 0 to 255
 EYE_OFFSET = np.array([1.3, 1.7, 0.6])
-"""From the point looked at to the eye [m], for a robot that stays in place."""
+"""[m] Vector from the target of the view to the eye, world frame, for a robot that stays in place."""
 
 
 def write_rrd(recording: "Recording", path: Path) -> Path:
-    """Write a recording for the Rerun viewer, whole or not at all; return the path.
+    """Write a recording atomically as a Rerun file (.rrd); return the path.
 
-    Raises ImportError: rerun-sdk is not installed.
+    Raises ImportError: rerun-sdk is not installed; OSError.
     """
     rr = _import_rerun()
-    aside = path.with_name(f".{path.name}.{os.getpid()}")
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
     stream = rr.RecordingStream("jumper-warp")
     try:
-        stream.save(aside, default_blueprint=_blueprint(recording))
+        stream.save(temporary, default_blueprint=_blueprint(recording))
         _log_scene(rr, stream, recording)
         _log_series(rr, stream, recording)
         stream.disconnect()  # closes the file
-        os.replace(aside, path)
+        os.replace(temporary, path)
     finally:
-        aside.unlink(missing_ok=True)
+        temporary.unlink(missing_ok=True)
     return path
 
 
 def _import_rerun() -> ModuleType:
-    """Return the module `rerun`. Raises ImportError with a hint: it is not installed."""
+    """Return the module rerun. Raises ImportError, with the command that installs it."""
     try:
         import rerun
     except ImportError as error:
@@ -62,7 +59,7 @@ def _import_rerun() -> ModuleType:
 
 
 def _log_scene(rr: ModuleType, stream: Any, recording: "Recording") -> None:
-    """Log the shapes once, and the poses and contact forces of the whole episode in one call per entity."""
+    """Log the shapes once, and the poses and contact forces of all frames with one call for each entity."""
     times = [rr.TimeColumn(TIMELINE, duration=recording.times)]
     stream.log("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
     for shape in recording.shapes:
@@ -81,7 +78,7 @@ def _log_scene(rr: ModuleType, stream: Any, recording: "Recording") -> None:
 def _log_contacts(
     rr: ModuleType, stream: Any, entity: str, times: list[Any], recording: "Recording", rank: int
 ) -> None:
-    """Log the contact forces of one world as arrows. rank: index of the world in the recording."""
+    """Log one world's contact forces as arrows of an entity; times: Rerun's time columns; rank: index in `worlds`."""
     points, forces = recording.contact_points[:, rank], recording.contact_forces[:, rank]
     frames, contacts = points.shape[:2]
     if contacts == 0:
@@ -92,7 +89,7 @@ def _log_contacts(
 
 
 def _mesh(rr: ModuleType, shape: ShapeMesh) -> Any:
-    """Return a shape as `Mesh3D` of Rerun."""
+    """Return a shape as Rerun's mesh, in the body's frame, with an opaque color."""
     color = [round(255 * min(max(channel, 0.0), 1.0)) for channel in shape.color]
     return rr.Mesh3D(
         vertex_positions=shape.vertices,
@@ -103,7 +100,7 @@ def _mesh(rr: ModuleType, shape: ShapeMesh) -> Any:
 
 
 def _log_series(rr: ModuleType, stream: Any, recording: "Recording") -> None:
-    """Log every time series in one call."""
+    """Log each series as a scalar over time, entity `series/<group>/<quantity [unit]>`."""
     times = [rr.TimeColumn(TIMELINE, duration=recording.times)]
     for name, values in recording.series.items():
         group, quantity = name.split("/", 1)
@@ -113,7 +110,7 @@ def _log_series(rr: ModuleType, stream: Any, recording: "Recording") -> None:
 
 
 def _blueprint(recording: "Recording") -> Any:
-    """Return the layout: scene on the left, one plot per group of series on the right."""
+    """Return the viewer's layout: scene on the left, on the right a plot for each group of series."""
     import rerun as rr
     import rerun.blueprint as rrb
 
@@ -132,7 +129,7 @@ def _blueprint(recording: "Recording") -> Any:
 
 
 def _viewpoint(recording: "Recording") -> tuple[np.ndarray, np.ndarray]:
-    """Return the point to look at and the eye [m], so that the whole motion is in view."""
+    """Return target and eye of the view [m], world frame, (3,) each, so that all worlds' motions are visible."""
     pos = recording.poses[..., :3].reshape(len(recording.times), len(recording.worlds), -1, 3)
     pos = pos + recording.spacing * np.arange(len(recording.worlds))[:, None, None] * np.array([0.0, 1.0, 0.0])
     points = pos.reshape(-1, 3)

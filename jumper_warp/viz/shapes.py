@@ -11,35 +11,27 @@ from newton import GeoType
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
 
-PLANE_EXTENT = 10.0
-"""Half the side of the patch drawn for an infinite plane [m]."""
-CHECKER_CELL = 0.5
-"""Side of one field of that patch [m]."""
-CHECKER_COLORS = ((0.80, 0.81, 0.83), (0.70, 0.71, 0.74))
-"""RGB of its light and dark fields."""
+PLANE_EXTENT = 10.0  # [m] half the side of the square drawn for an infinite plane
+CHECKER_CELL = 0.5  # [m] side of one field of a drawn plane
+CHECKER_COLORS = ((0.80, 0.81, 0.83), (0.70, 0.71, 0.74))  # RGB of light and dark fields, each in [0, 1]
 
 
 @dataclass(frozen=True)
 class ShapeMesh:
-    """The surface of one shape."""
+    """Triangle mesh and color of one shape."""
 
     name: str
-    body: int
-    """Index of the body in the model; -1: fixed to the world."""
-    color: tuple[float, float, float]
-    """RGB, each in [0, 1]."""
-    vertices: np.ndarray
-    """(num_vertices, 3) float32 [m], in the body's frame; in the world frame if fixed to the world."""
-    normals: np.ndarray
-    """(num_vertices, 3) float32, outward unit normals in the same frame."""
-    triangles: np.ndarray
-    """(num_triangles, 3) int32, indices of vertices."""
+    body: int  # index of the body in the model; -1: fixed to the world
+    color: tuple[float, float, float]  # RGB, each in [0, 1]
+    vertices: np.ndarray  # (num_vertices, 3) float32 [m], in the body's frame; in the world frame if fixed to the world
+    normals: np.ndarray  # (num_vertices, 3) float32, outward unit normals in the same frame
+    triangles: np.ndarray  # (num_triangles, 3) int32, indices of vertices
 
 
 def shape_meshes(model: Model, worlds: tuple[int, ...]) -> list[ShapeMesh]:
-    """Return the meshes of the visible shapes of some worlds, and of those that all worlds share.
+    """Return the meshes of the visible shapes of some worlds, and of visible shapes shared by all worlds (ground).
 
-    Raises ValueError: a visible shape is of a kind that has no mesh here (a cone or a splat).
+    worlds: indices in the model. Raises InputError: a visible shape of a kind that cannot be drawn (a cone or a splat).
     """
     kinds = model.shape_type.numpy()
     scales = model.shape_scale.numpy().astype(float)
@@ -62,7 +54,10 @@ def shape_meshes(model: Model, worlds: tuple[int, ...]) -> list[ShapeMesh]:
 
 
 def _surface(kind: GeoType, scale: np.ndarray, source: Any, label: str) -> trimesh.Trimesh:
-    """Return the mesh of one shape in its own frame. scale: Newton's three size parameters [m]."""
+    """Return the mesh of one shape in the shape's frame. Raises InputError: a kind that cannot be drawn.
+
+    scale: Newton's three size parameters [m], or of a mesh [1]. source: mesh or heightfield. label: for the error.
+    """
     if kind == GeoType.SPHERE:
         return trimesh.creation.icosphere(subdivisions=3, radius=scale[0])
     if kind == GeoType.CAPSULE:
@@ -81,7 +76,7 @@ def _surface(kind: GeoType, scale: np.ndarray, source: Any, label: str) -> trime
 
 
 def _heightfield(field: newton.Heightfield, scale: np.ndarray) -> trimesh.Trimesh:
-    """Return the upper surface of a heightfield; rows follow y, columns x."""
+    """Return the upper surface of a heightfield in the shape's frame; rows follow y, columns x. scale: (3,) [1]."""
     x = np.linspace(-field.hx, field.hx, field.ncol)
     y = np.linspace(-field.hy, field.hy, field.nrow)
     heights = field.min_z + np.asarray(field.data) * (field.max_z - field.min_z)
@@ -94,7 +89,10 @@ def _heightfield(field: newton.Heightfield, scale: np.ndarray) -> trimesh.Trimes
 
 
 def _checker(label: str, size: np.ndarray) -> list[tuple[str, tuple[float, float, float], trimesh.Trimesh]]:
-    """Return the light and the dark fields of a plane. size: width along x and length along y [m], 0 if infinite."""
+    """Return (name, RGB, mesh) of the light and of the dark fields of a plane, in the shape's frame.
+
+    label: of the shape. size: width along x and length along y [m], 0 if infinite.
+    """
     half = np.where(size[:2] > 0.0, 0.5 * size[:2], PLANE_EXTENT)
     cells = np.maximum(1, np.round(2.0 * half / CHECKER_CELL)).astype(int)
     step = 2.0 * half / cells
@@ -114,7 +112,10 @@ def _checker(label: str, size: np.ndarray) -> list[tuple[str, tuple[float, float
 def _placed(
     name: str, body: int, color: tuple[float, float, float], mesh: trimesh.Trimesh, placement: np.ndarray
 ) -> ShapeMesh:
-    """Return a mesh moved from the shape's frame to the body's; placement: pos [m] and quat xyzw, (7,)."""
+    """Return a mesh in the shape's frame as a `ShapeMesh` in the body's frame.
+
+    placement: pose of the shape in the body's frame, position [m] and quaternion xyzw, (7,).
+    """
     x, y, z, w = placement[3:]
     matrix = trimesh.transformations.quaternion_matrix([w, x, y, z])
     matrix[:3, 3] = placement[:3]

@@ -1,4 +1,4 @@
-"""Pictures of a Newton model, ray-traced without a display."""
+"""Images of a Newton model, ray-traced without a display."""
 
 import math
 from collections.abc import Sequence
@@ -14,26 +14,18 @@ from newton.sensors import SensorCamera
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model, State
 
-EYE = (1.1, 1.4, 0.6)
-"""[m] Default camera position, world frame: ahead of the robot, on its left."""
-TARGET = (0.0, 0.0, 0.25)
-"""[m] Default target point of the camera."""
-SIZE = (640, 480)
-"""Default width and height [px]."""
-FIELD_OF_VIEW = math.radians(40.0)
-"""Vertical angle of view [rad]."""
-LIGHT_DIRECTION = (-0.35, -0.45, -0.82)
-"""Where the light shines, world frame; over the default eye's shoulder."""
-AMBIENT = (0.55, 0.56, 0.60)
-"""Linear RGB from above and from below, so that the shaded sides stay readable."""
-SKY = 0xFFF5F0EC
-"""Color behind everything: alpha, blue, green, red."""
-SAMPLES = 4
-"""Rays per pixel."""
+EYE = (1.1, 1.4, 0.6)  # [m] default position of the eye, world frame: ahead of the robot, on its left
+TARGET = (0.0, 0.0, 0.25)  # [m] default point at the centre of the image, world frame
+SIZE = (640, 480)  # [px] default width and height
+FIELD_OF_VIEW = math.radians(40.0)  # [rad] vertical angle of view
+LIGHT_DIRECTION = (-0.35, -0.45, -0.82)  # direction of the light rays, world frame; from behind the default eye
+AMBIENT = (0.55, 0.56, 0.60)  # linear RGB of the ambient light, so that shaded sides stay visible
+SKY = 0xFFF5F0EC  # background color: alpha, blue, green, red
+SAMPLES = 4  # rays per pixel
 
 
 class Camera:
-    """A fixed camera on a model; one picture per call."""
+    """A fixed camera that renders one world of a model."""
 
     def __init__(
         self,
@@ -43,9 +35,9 @@ class Camera:
         size: tuple[int, int] = SIZE,
         world: int = 0,
     ) -> None:
-        """Place the camera at `eye`, `target` in the middle of the picture [m], world frame; size: width, height [px].
+        """Place the camera at `eye` with `target` at the image centre [m], world frame; size: width, height [px].
 
-        Raises ValueError: eye and target coincide or lie on one vertical, or the model has no such world.
+        Raises InputError: eye and target are on one vertical line, or the model has no such world.
         """
         if not 0 <= world < model.world_count:
             raise InputError(f"world {world} is outside the model's {model.world_count} worlds")
@@ -65,7 +57,7 @@ class Camera:
         self._pixels: Any = self._sensor.allocate_image_color(1, *size)
 
     def picture(self, state: State) -> np.ndarray:
-        """Return the picture of a state, from its `body_q`: (height, width, 3) uint8, RGB."""
+        """Return an image of a state's body poses `body_q`, (height, width, 3) uint8, RGB, row 0 on top."""
         self._model.bvh_refit_shapes(state)
         self._sensor.update(state, self._pose, self._rays, color_image=self._pixels, world_indices=self._world)
         colors: Any = SensorCamera.Utils.to_rgba_from_color(self._pixels)
@@ -73,9 +65,9 @@ class Camera:
 
 
 def look_at(eye: Sequence[float], target: Sequence[float]) -> wp.transformf:
-    """Return the pose of a camera, looking along its -z with +y up, from eye to target [m], world z up.
+    """Return the pose of a camera at `eye` that looks at `target` [m], world frame; its -z points ahead, its +y up.
 
-    Raises ValueError: eye and target coincide or lie on one vertical.
+    Raises InputError: eye and target are on one vertical line.
     """
     ahead = np.asarray(target, dtype=float) - np.asarray(eye, dtype=float)
     right = np.cross(ahead, [0.0, 0.0, 1.0])
@@ -93,10 +85,10 @@ def look_at(eye: Sequence[float], target: Sequence[float]) -> wp.transformf:
 def contact_sheet(
     pictures: Sequence[np.ndarray], path: Path, captions: Sequence[str] | None = None, columns: int | None = None
 ) -> Path:
-    """Write pictures, (height, width, 3) uint8 of one size, side by side as one PNG file; return its path.
+    """Write pictures, (height, width, 3) uint8 of one size, row by row into one PNG file; return its path.
 
-    captions: one per picture, drawn in its upper left corner. columns: pictures per row, by default all. Raises
-    ValueError: no pictures, unequal sizes, or another number of captions.
+    captions: one for each picture, drawn in its upper left corner. columns: pictures in a row, by default all. Raises
+    InputError: no pictures, unequal sizes, or another number of captions.
     """
     if not pictures or len({picture.shape for picture in pictures}) != 1:
         raise InputError("a contact sheet needs pictures, all of one size")

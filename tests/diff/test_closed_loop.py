@@ -15,21 +15,21 @@ from jumper_warp.registry import make_task
 from jumper_warp.trajectory.gauss_newton import Network, Tape, per_world_gradients
 from jumper_warp.utils.errors import InputError
 
-G = 9.81
+G = 9.81  # [m/s^2]
 
 
 @cache
-def policy(name="vertical_jump"):
+def policy(name="vertical_jump"):  # a shipped policy, opened once
     return open_policy(name)
 
 
 @cache
 def jumps():
-    """Return two nominal robots that are commanded to jump at once."""
+    """Return a group of two nominal robots, commanded to jump to 0.85 and 0.95 m at once."""
     group = make_groups(
         policy(), FinetuneCfg(num_goals=2, num_delayed=0, num_randomized=0, height_range=(0.85, 0.95), device="cpu")
     )[0]
-    group.commands[:, 3] = 0.0
+    group.commands[:, 3] = 0.0  # [s] time of the command
     return group
 
 
@@ -49,29 +49,26 @@ def test_randomised_robots_match_the_environments_states_and_observations(name, 
         state, simulated = loop.step(state, network.act(env.obs))
         running = env.done == 0.0
         assert running.any()
-        for part, atol in (
-            ("q", 1.0e-4),
-            ("initial_target", 1.0e-6),
-            ("action", 0.0),
-            ("qd", 2.0e-2),
-            ("torque", 5.0e-2),
-        ):
+        # [m] and [rad], [rad], [1], [m/s] and [rad/s], [N m]
+        tolerances = {"q": 1.0e-4, "initial_target": 1.0e-6, "action": 0.0, "qd": 2.0e-2, "torque": 5.0e-2}
+        for part, atol in tolerances.items():
             torch.testing.assert_close(
                 getattr(simulated, part)[:, running], getattr(state, part)[:, running], rtol=0.0, atol=atol, msg=part
             )
         observed = env.obs.clone()
         for term in ("height", "lin_vel", "ang_vel", "gravity", "angle", "rate", "last_action"):
-            observed[:, slice(*loop.layout[term])] = 0.0
+            observed[:, slice(*loop.layout[term])] = 0.0  # must come from the state alone
         torch.testing.assert_close(loop.observe(state, observed), env.obs, rtol=0.0, atol=1.0e-5)
 
 
 def test_goal_offset_has_derivatives_by_the_bases_position():
+    """The offset in the body's yaw frame falls by the heading's unit vectors: R(yaw)^T times -1."""
     env = Env(make_task("horizontal-jump").on_level_ground(), 6, seed=3, noise=False, device="cpu")
     env.reset()
     loop = ClosedLoop(env)
     state = loop.state()
     observed = env.obs.clone()
-    observed[:, :2] = torch.tensor([0.7, -0.2])
+    observed[:, :2] = torch.tensor([0.7, -0.2])  # [m]
 
     def offset(x, y):
         q = torch.cat([x[None], y[None], state.q[2:]])
@@ -85,7 +82,10 @@ def test_goal_offset_has_derivatives_by_the_bases_position():
 
 
 def apexes(loop, network, state, observed, weights, steps=30, tape=None):
-    """Return each world's ballistic apex height [m] after `steps` policy steps, (num_worlds,)."""
+    """Return the ballistic apex height [m] (num_worlds,) after `steps` policy steps of a network with `weights`.
+
+    observed: the environment's observations, for the commands; tape: of `Network.act`.
+    """
     for _ in range(steps):
         state = loop.advance(state, network.act(loop.observe(state, observed), weights, tape))
     motion = loop.motion(state)
@@ -100,7 +100,7 @@ def test_apex_gradients_by_weights_match_central_differences():
     state, observed = loop.state(), group.env.obs.double()
     weights, tape = network.weights.clone().requires_grad_(), Tape()
     heights = apexes(loop, network, state, observed, weights, tape=tape)
-    assert (heights.detach() - torch.tensor([0.85, 0.95])).abs().max() < 0.05
+    assert (heights.detach() - torch.tensor([0.85, 0.95])).abs().max() < 0.05  # [m] from the commands
     rows = per_world_gradients(heights.sum(), tape)
     gradient = torch.autograd.grad(heights.sum(), weights)[0]
     torch.testing.assert_close(rows.sum(0), gradient, rtol=1.0e-9, atol=1.0e-9 * float(gradient.abs().max()))
@@ -118,7 +118,7 @@ def test_apex_gradients_by_weights_match_central_differences():
         )
 
 
-def test_refuses_environments_without_gradients():
+def test_closed_loop_refuses_observation_latency_and_another_solver():
     task = make_task("vertical-jump").on_level_ground()
     delayed = dataclasses.replace(
         task, randomization=dataclasses.replace(task.randomization, observation_latency=(0.0, 8))

@@ -16,11 +16,12 @@ from tests.helpers.rollout_helpers import DT, SUBSTEPS, defaults, push_off, roll
 
 
 def test_rollout_matches_simulation_bitwise():
+    """In states and torques; forces are compared to rounding, as impulses over the step of 1/480 s."""
     settings = {"command_filter": vertical_jump_filter(), "tolerance": 1.0e-5}
     simulation = Simulation(2, motors=jumping_motors(), visuals=False, **settings)
     model = build_model(2, visuals=False)
     of = Rollout(model, jumping_motors(), **settings)
-    targets = np.random.default_rng(0).uniform(0.2, 1.0, (12, 12, 2)).astype(np.float32)
+    targets = np.random.default_rng(0).uniform(0.2, 1.0, (12, 12, 2)).astype(np.float32)  # [rad] (steps, 12, worlds)
     trajectory = of.run(targets, *of.standing())
     for target in targets:
         simulation.target.assign(target)
@@ -32,7 +33,7 @@ def test_rollout_matches_simulation_bitwise():
     np.testing.assert_allclose(trajectory.impulse.numpy()[-1] * 480, simulation.paw_force.numpy(), rtol=1.0e-6)
 
 
-def test_threads_do_not_change_results():
+def test_threads_do_not_change_trajectories_and_gradients():
     model = build_model(40, visuals=False)
     results = []
     for threads in (1, 2):
@@ -48,10 +49,10 @@ def test_threads_do_not_change_results():
 
 
 def test_concurrent_slices_have_separate_settings(monkeypatch):
-    of, given = Rollout(build_model(40, visuals=False), threads=2), []
-    monkeypatch.setattr(wp, "launch", lambda kernel, **call: given.append(call["inputs"][1]))
+    of, launched = Rollout(build_model(40, visuals=False), threads=2), []
+    monkeypatch.setattr(wp, "launch", lambda kernel, **call: launched.append(call["inputs"][1]))
     of.run(push_off(1), *of.standing())
-    assert sorted(settings._ctype.first for settings in given) == [worlds.first for worlds in of.slices] != [0, 0]
+    assert sorted(settings._ctype.first for settings in launched) == [worlds.first for worlds in of.slices] != [0, 0]
 
 
 def test_rollout_continues_from_end():
@@ -62,9 +63,9 @@ def test_rollout_continues_from_end():
 
 
 def test_a_wrench_acts_in_double_precision():
-    """On a robot in the air with idle motors, doubling a force of 0.1 uN doubles the speed that it adds."""
+    """On a robot in the air with idle motors, doubling a force of 0.1 µN doubles the speed that it adds."""
     q, qd = squat()
-    q[2] = 1.0
+    q[2] = 1.0  # [m]
     of = rollout()
     run(of, defaults() | {"kp": np.zeros(12), "kd": np.zeros(12)})  # write the parameters
     speeds = []
@@ -73,25 +74,25 @@ def test_a_wrench_acts_in_double_precision():
         speeds.append(of.run(np.zeros((2, 12)), q, 0.0 * qd, wrench=wrench).qd.numpy()[-1, 0, 0])
     added = np.diff(speeds)
     assert added[1] == pytest.approx(added[0], rel=1.0e-5)
-    # at least the speed of a rigid robot of 14.5 kg: the legs do not follow fully
+    # more than the speed [m/s] of a rigid robot of 14.5 kg, as the legs lag behind; less than of 4 kg
     assert 1.0e-7 * 2 * SUBSTEPS * DT / 14.6 < added[0] < 1.0e-7 * 2 * SUBSTEPS * DT / 4.0
 
 
 def test_trajectory_stores_below_two_kilobytes_per_policy_step():
-    trajectory = rollout().run(push_off(8), *squat())
-    usual = Rollout(rollout().dynamics.model, double=True).run(push_off(8), *squat())
-    for made, steps in ((trajectory, 8), (usual, 8)):
+    """In double precision, with 4 and with the default physics steps in a policy step."""
+    for of in (rollout(), Rollout(rollout().dynamics.model, double=True)):
+        made = of.run(push_off(8), *squat())
         arrays = (made.q, made.qd, made.torque, made.impulse, made.pressed, made.filtered_target)
-        per_step = sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays) / (steps + 1)
-        assert per_step <= 2000.0
+        per_row = sum(array.size * wp.types.type_size_in_bytes(array.dtype) for array in arrays) / (8 + 1)
+        assert per_row <= 2000.0  # [byte]
 
 
-def tensors():
+def tensors():  # q (19,) and qd (18,) of `squat`
     q, qd = squat()
     return torch.tensor(q), torch.tensor(qd)
 
 
-def losses(trajectory):
+def losses(trajectory):  # sum of squared torques and vertical impulses over steps, motors, paws and worlds
     return 1.0e-3 * trajectory.torque.square().sum() + 0.01 * trajectory.impulse[..., 2].sum()
 
 
@@ -106,6 +107,7 @@ def test_torch_gradients_match_central_differences():
         return losses(trajectory) + trajectory.q[-1, 2].sum()
 
     loss(targets, kp, lengths).backward()
+    # FL_outer of step 4 [rad], kp of FL_outer [N m/rad], thigh of FL [m], each with its step
     for tensor, entry, h in ((targets, (4, 1), 1.0e-6), (kp, (1,), 1.0e-4), (lengths, (0, 7), 1.0e-7)):
         ends = []
         for side in (h, -h):
@@ -116,14 +118,14 @@ def test_torch_gradients_match_central_differences():
         assert tensor.grad[entry].item() == pytest.approx((ends[0] - ends[1]) / (2.0 * h), rel=1.0e-5)
 
 
-@pytest.mark.parametrize("late", [0.0, 0.011])
-def test_torch_gradients_step_by_step_match_the_whole(late):
-    """One call per step, as with a policy in the loop; a later run with other parameters changes no gradient.
+@pytest.mark.parametrize("seconds", [0.0, 0.011])
+def test_torch_gradients_step_by_step_match_the_whole(seconds):
+    """One call for each step, as with a policy in the loop; a later run with other parameters changes no gradient.
 
-    With a latency [s] a target acts in the next call, through `initial_target`.
+    With a latency (seconds) a target acts in the next call, through `initial_target`.
     """
     of, (q, qd) = rollout(), tensors()
-    results, latency = [], torch.full((1,), late, dtype=torch.float64)
+    results, latency = [], torch.full((1,), seconds, dtype=torch.float64)
     for stepwise in (False, True):
         targets = torch.tensor(push_off(8)).requires_grad_()
         kp = torch.full((12,), 70.0, dtype=torch.float64, requires_grad=True)
@@ -145,33 +147,33 @@ def test_torch_gradients_step_by_step_match_the_whole(late):
 
 
 def test_gradient_by_q_includes_default_initial_target():
-    """Motors follow the initial angles by default, so that the gradient by q includes both effects."""
-    of, (q, qd) = rollout.__wrapped__(), tensors()  # with its own parameters
-    targets, late, results = torch.tensor(push_off(6)), torch.tensor([0.006], dtype=torch.float64), []
+    """With a latency motors first follow the initial angles by default: the gradient by q includes both effects."""
+    of, (q, qd) = rollout.__wrapped__(), tensors()  # not cached: its parameters change
+    targets, latency, results = torch.tensor(push_off(6)), torch.tensor([0.006], dtype=torch.float64), []  # [s]
 
-    def height(q, **before):
-        return simulate(of, targets, q, qd, latency=late, **before).q[-1, 2].sum()
+    def height(q, **initial):  # [m] of the base at the end
+        return simulate(of, targets, q, qd, latency=latency, **initial).q[-1, 2].sum()
 
-    for before in (False, True):
+    for explicit in (False, True):
         start = q.clone().requires_grad_()
-        height(start, **({"initial_target": start[7:]} if before else {})).backward()
+        height(start, **({"initial_target": start[7:]} if explicit else {})).backward()
         results.append(start.grad)
     runs = [of.run(targets.numpy(), q.numpy(), qd.numpy(), initial_target=start) for start in (None, q[7:].numpy())]
-    seed = np.zeros(runs[0].q.shape)
-    seed[-1, 2] = 1.0
-    with_start, without = (of.backward(made, q=of.array(seed))["q"].numpy() for made in runs)
-    results.append(with_start)
-    for entry in (8, 9):
+    cotangent = np.zeros(runs[0].q.shape)
+    cotangent[-1, 2] = 1.0
+    by_default, by_q_alone = (of.backward(made, q=of.array(cotangent))["q"].numpy() for made in runs)
+    results.append(by_default)
+    for entry in (8, 9):  # FL_outer, FL_inner
         step = torch.zeros_like(q)
         step[entry] = 1.0e-8
         expected = (height(q + step) - height(q - step)).item() / 2.0e-8
         for gradient in results:
             assert gradient[entry].item() == pytest.approx(expected, rel=1.0e-4)
-        assert without[entry].item() != pytest.approx(expected, rel=1.0e-2)
+        assert by_q_alone[entry].item() != pytest.approx(expected, rel=1.0e-2)
 
 
-def test_reverse_pass_refuses_changed_outputs_and_parameters():
-    of, (q, qd) = rollout.__wrapped__(), tensors()  # with its own parameters
+def test_reverse_pass_refuses_changed_outputs_and_parameters_and_second_derivatives():
+    of, (q, qd) = rollout.__wrapped__(), tensors()  # not cached: its parameters change
     targets = torch.tensor(push_off(2)).requires_grad_()
     made = simulate(of, targets, q, qd)
     made.torque.div_(18.0)
@@ -216,20 +218,13 @@ def test_backward_refuses_other_shapes():
 
 
 @pytest.mark.parametrize(
-    "setting",
-    [
-        {"dt": 0.0},
-        {"dt": math.nan},
-        {"substeps": 0},
-        {"every": 3},
-        {"every": 0},
-        {"tolerance": -1.0},
-        {"tolerance": math.nan},
-    ],
-)
-def test_rollout_refuses_bad_settings(setting):
-    with pytest.raises(ValueError, match=next(iter(setting))):
-        Rollout(rollout().dynamics.model, **setting)
+    ("name", "value"),  # every: 3 does not divide 8 substeps
+    [("dt", 0.0), ("dt", math.nan), ("substeps", 0), ("every", 3), ("every", 0), ("tolerance", -1.0),
+     ("tolerance", math.nan)],
+)  # fmt: skip
+def test_rollout_refuses_bad_settings(name, value):
+    with pytest.raises(ValueError, match=name):
+        Rollout(rollout().dynamics.model, **{name: value})
 
 
 def test_rollout_refuses_bad_lengths_and_worlds_to_hold():
@@ -245,28 +240,30 @@ def test_simulate_refuses_unknown_parameters():
         simulate(rollout(), torch.zeros(2, 12), *tensors(), colour=torch.zeros(1))
 
 
-@pytest.mark.parametrize("late", [-0.05, 5.0, float("nan")])
-def test_refuses_latency_out_of_range(late):
+@pytest.mark.parametrize("seconds", [-0.05, 5.0, float("nan")])
+def test_refuses_latency_out_of_range(seconds):
     message = r"latency \[s\] must be in \[0, 0.1\], got "
     of = Rollout(build_model(2, visuals=False))
     with pytest.raises(ValueError, match=message):
-        simulate(of, torch.zeros(2, 12), *(torch.as_tensor(row) for row in of.standing()), latency=torch.tensor(late))
-    of.parameters["latency"].fill_(late)
+        simulate(
+            of, torch.zeros(2, 12), *(torch.as_tensor(row) for row in of.standing()), latency=torch.tensor(seconds)
+        )
+    of.parameters["latency"].fill_(seconds)
     with pytest.raises(ValueError, match=message):
         of.run(np.zeros((2, 12)), *of.standing())
 
 
-@pytest.mark.parametrize("late", [-0.05, -0.001, float("-inf"), float("nan")])
-def test_negative_latency_counts_as_zero(late, monkeypatch):
-    """Latencies are not checked, as on a GPU."""
+@pytest.mark.parametrize("seconds", [-0.05, -0.001, float("-inf"), float("nan")])
+def test_negative_latency_counts_as_zero(seconds, monkeypatch):
+    """Without checks of the latency, as on a GPU. With any latency, equal worlds stay equal."""
     monkeypatch.setattr("jumper_warp.diff.rollout.check_within", lambda *_: None)
     of, targets, ends = Rollout(build_model(4, visuals=False)), np.full((3, 12), 0.4), []
-    for latency in (0.0, late):
+    for latency in (0.0, seconds):
         of.parameters["latency"].fill_(latency)
         trajectory = of.run(targets, *of.standing())
         gradients = of.backward(trajectory, qd=wp.full_like(trajectory.qd, 1.0))
         ends.append((trajectory.q.numpy()[-1], gradients["targets"].numpy()))
-    if math.isfinite(late):
+    if math.isfinite(seconds):
         np.testing.assert_array_equal(ends[1][0], ends[0][0])
         np.testing.assert_array_equal(ends[1][1], ends[0][1])
     for values in ends[1]:
@@ -299,7 +296,7 @@ def test_simulate_refuses_other_types():
 
 
 @pytest.mark.parametrize("shape", [(1, 1, 3), (4, 2, 3), (4, 3)])
-def test_refuses_impulse_of_another_shape(shape):
+def test_refuses_impulse_of_another_shape_and_casts_single_precision(shape):
     of, (q, qd) = rollout(), tensors()
     with pytest.raises(ValueError, match=r"impulse must have shape \(4, 1, 3\)"):
         simulate(of, torch.zeros(2, 12), q, qd, impulse=torch.zeros(shape))
@@ -312,7 +309,7 @@ def test_refuses_impulse_of_another_shape(shape):
     assert torch.equal(single.q, simulate(of, torch.zeros(2, 12), q, qd).q)
 
 
-def test_backward_refuses_a_trajectory_of_another_rollout():
+def test_backward_refuses_another_rollouts_trajectory_and_other_types():
     trajectory = rollout().run(push_off(2), *squat())
     with pytest.raises(ValueError, match="this rollout makes trajectories"):
         rollout(2).backward(trajectory)
@@ -333,7 +330,7 @@ def blocks_of_threads():
 @pytest.mark.usefixtures("blocks_of_threads")
 @pytest.mark.parametrize("every", [4, 2])
 def test_thread_per_leg_matches_thread_per_world(every):
-    """With latency, fading motors, a wrench and worlds in the air; 11 worlds, not a multiple of 8."""
+    """With latency, fading motors, a wrench and worlds in the air; 11 worlds, not a multiple of 8; to 1e-9."""
     count = 11
     of = rollout(count, every=every)
     values = defaults() | {"latency": np.array(0.0061), "fade": np.array([4.0, 60.0])}

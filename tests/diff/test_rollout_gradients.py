@@ -40,7 +40,7 @@ from tests.helpers.rollout_helpers import (
     weights,
 )
 
-LEG = int(LEG_ROWS)
+LEG = int(LEG_ROWS)  # rows of a leg in the parameter table
 MU_ROWS = [leg * LEG + int(row) for leg in range(4) for row in (MU_DYNAMIC, MU_STATIC)]
 MASSES = [int(BASE), int(BASE) + 1, int(BASE) + 4, int(OUTER_THIGH) + LEG, int(INNER_SHANK) + 3, int(INNER_SHANK) + 6]
 JOINTS = [int(ARMATURE) + 1, int(FRICTION) + 1, int(DAMPING) + LEG, int(KNEE_DAMPING) + 2 * LEG]
@@ -79,7 +79,7 @@ def sprung() -> dict[str, np.ndarray]:
     return values
 
 
-CASES = {
+CASES = {  # inputs, name of the input, its entries, step of the differences in the entry's unit
     "targets": (jump, "targets", [(0, 1), (3, 0), (4, 4), (8, 7), (20, 8)], 2.0e-6),
     "position": (jump, "q", [0, 2, 3, 4, 5, 7, 8, 12, 18], 1.0e-7),
     "velocity": (jump, "qd", [0, 2, 3, 5, 6, 7, 14], 2.0e-6),
@@ -108,8 +108,8 @@ CASES = {
 def test_gradient_matches_differences(case):
     make, name, entries, h = CASES[case]
     values = make()
-    by, gradient_by = gradients(rollout(), values)
-    expected = differences(values, by, name, entries, h)
+    weights_by, gradient_by = gradients(rollout(), values)
+    expected = differences(values, weights_by, name, entries, h)
     scale = np.abs(expected).max()
     assert scale > 1.0e-6, "the sum does not depend on this input: the comparison means nothing"
     np.testing.assert_allclose([gradient_by[name][entry] for entry in entries], expected, rtol=0.0, atol=1.0e-6 * scale)
@@ -117,16 +117,16 @@ def test_gradient_matches_differences(case):
 
 def test_gradients_by_leg_lengths_match_differences():
     values = jump()
-    by, gradient_by = gradients(rollout(), values)
+    weights_by, gradient_by = gradients(rollout(), values)
     lengths = rollout().geometry()
     expected = np.zeros((2, 10))
-    for row, leg in enumerate((0, 3)):
+    for row, leg in enumerate((0, 3)):  # FL, BR
         for column in range(10):
             for side in (-1.0, 1.0):
                 moved = lengths.copy()
-                moved[leg, column] += side * 1.0e-7
+                moved[leg, column] += side * 1.0e-7  # [m]
                 rollout().set_geometry(moved)
-                expected[row, column] += side * weighted_sum(run(rollout(), values), by)[0] / 2.0e-7
+                expected[row, column] += side * weighted_sum(run(rollout(), values), weights_by)[0] / 2.0e-7
     rollout().set_geometry(lengths)
     assert np.abs(expected[:, GEOMETRY_NAMES.index("thigh")]).min() > 1.0
     np.testing.assert_allclose(
@@ -137,29 +137,28 @@ def test_gradients_by_leg_lengths_match_differences():
 def test_gradients_on_uneven_ground_match_differences():
     values = jump()
     values["q"] = values["q"].copy()
-    values["q"][2] += 0.012
-    of = rollout(ground="uneven")
-    by, gradient_by = gradients(of, values)
-    entries = [0, 1, 2, 3, 4, 8]
-    expected = differences(values, by, "q", entries, 1.0e-7, ground="uneven")
-    assert np.abs(expected[:2]).max() > 1.0e-2  # the place on the ground matters
+    values["q"][2] += 0.012  # [m]
+    weights_by, gradient_by = gradients(rollout(ground="uneven"), values)
+    entries = [0, 1, 2, 3, 4, 8]  # x, y, z, quaternion x and y, FL_outer
+    expected = differences(values, weights_by, "q", entries, 1.0e-7, ground="uneven")
+    assert np.abs(expected[:2]).max() > 1.0e-2  # the horizontal position matters
     np.testing.assert_allclose(gradient_by["q"][entries], expected, rtol=0.0, atol=2.0e-6 * np.abs(expected).max())
 
 
 def test_gradients_of_a_hung_robot_match_differences():
-    """A held base stays where it is, while the legs swing."""
+    """A held base keeps its pose, while the legs swing."""
     values = jump()
-    values["q"][2], values["qd"][:6] = 1.0, 0.0
+    values["q"][2], values["qd"][:6] = 1.0, 0.0  # 1 m above the ground, at rest
     for of in (rollout(), rollout(8)):
         of.hold()
     try:
-        by, gradient_by = gradients(rollout(), values)
-        expected = differences(values, by, "kp", [1, 8], 1.0e-4)
-        held = run(rollout(), values)
+        weights_by, gradient_by = gradients(rollout(), values)
+        expected = differences(values, weights_by, "kp", [1, 8], 1.0e-4)  # FL_outer, BL_inner
+        held = run(rollout(), values).q.numpy()
     finally:
         for of in (rollout(), rollout(8)):
             of.hold(False)
-    assert (held.q.numpy()[:, :7] == held.q.numpy()[0, :7]).all() and np.ptp(held.q.numpy()[:, 8]) > 0.5
+    assert (held[:, :7] == held[0, :7]).all() and np.ptp(held[:, 8]) > 0.5  # [rad] FL_outer
     np.testing.assert_allclose(gradient_by["kp"][[1, 8]], expected, rtol=1.0e-6)
 
 
@@ -168,9 +167,9 @@ def test_gradients_by_bodies_match_differences_of_their_moments():
     rng = np.random.default_rng(2)
     gradient = rng.normal(size=(int(GRAVITY) + 3, 1))
     table = rollout().parameters["table"].numpy()[:, :1].astype(float)
-    body = 5
+    body = 5  # inner shank of FL
 
-    def moments(mass, c, inertia):
+    def moments(mass, c, inertia):  # (10,) rows of the parameter table
         full = np.array([[inertia[0], inertia[3], inertia[4]], [inertia[3], inertia[1], inertia[5]],
                          [inertia[4], inertia[5], inertia[2]]])  # fmt: skip
         second = 0.5 * np.trace(full) * np.eye(3) - full + mass * np.outer(c, c)
@@ -179,75 +178,74 @@ def test_gradients_by_bodies_match_differences_of_their_moments():
     mass, c, inertia = 0.3, np.array([0.01, -0.02, -0.1]), np.array([3.0, 4.0, 2.0, 0.1, -0.2, 0.3]) * 1.0e-3
     table[moment_rows(body), 0] = moments(mass, c, inertia)
     gradient_by = body_gradients(table, gradient)
-    by = gradient[moment_rows(body), 0]
-    by_mass = (moments(mass + 1.0e-6, c, inertia) - moments(mass - 1.0e-6, c, inertia)) @ by / 2.0e-6
+    by_rows = gradient[moment_rows(body), 0]
+    by_mass = (moments(mass + 1.0e-6, c, inertia) - moments(mass - 1.0e-6, c, inertia)) @ by_rows / 2.0e-6
     assert gradient_by["mass"][body, 0] == pytest.approx(by_mass, rel=1.0e-7)
     for i in range(3):
         d = 1.0e-6 * np.eye(3)[i]
-        by_com = (moments(mass, c + d, inertia) - moments(mass, c - d, inertia)) @ by / 2.0e-6
+        by_com = (moments(mass, c + d, inertia) - moments(mass, c - d, inertia)) @ by_rows / 2.0e-6
         assert gradient_by["com"][body, i, 0] == pytest.approx(by_com, rel=1.0e-7)
     for i in range(6):
         d = 1.0e-6 * np.eye(6)[i]
-        by_inertia = (moments(mass, c, inertia + d) - moments(mass, c, inertia - d)) @ by / 2.0e-6
+        by_inertia = (moments(mass, c, inertia + d) - moments(mass, c, inertia - d)) @ by_rows / 2.0e-6
         assert gradient_by["inertia"][body, i, 0] == pytest.approx(by_inertia, rel=1.0e-7)
 
 
-def test_single_precision_gradients_are_those_of_double_precision():
-    """Worst seen: 2.4e-4 of the largest entry, of the height in flight."""
+def test_single_precision_gradients_match_double_precision():
+    """Of the height in flight, to 1e-3 of the largest entry; the largest measured difference is 2.4e-4."""
     values = defaults()
-    by = {"q": np.zeros((len(push_off()) + 1, 19, 1))}
-    by["q"][30, 2] = 1.0
-    _, double = gradients(rollout(), values, by)
-    _, single = gradients(rollout(double=False), values, by)
+    height = {"q": np.zeros((len(push_off()) + 1, 19, 1))}
+    height["q"][30, 2] = 1.0  # z after policy step 30
+    _, double = gradients(rollout(), values, height)
+    _, single = gradients(rollout(double=False), values, height)
     for name in ("targets", "q", "qd", "kp", "saturation", "table", "geometry"):
         np.testing.assert_allclose(single[name], double[name], rtol=0.0, atol=1.0e-3 * np.abs(double[name]).max())
 
 
-def one_step(**changes) -> dict[str, np.ndarray]:
-    """Return a single policy step in the squat, at rest, with `height` [m] added, `speed` [m/s] and friction."""
+def one_step(height: float = 0.0, speed: float = 0.0, friction: float | None = None) -> dict[str, np.ndarray]:
+    """Return the inputs of one policy step in the squat; height [m] is added to z, speed [m/s] is along x."""
     values = defaults() | {"qd": np.zeros(18), "targets": np.tile(squat()[0][7:], (1, 1)), "wrench": np.zeros((1, 6))}
-    values["q"][2] += changes.get("height", 0.0)
-    values["qd"][0] = changes.get("speed", 0.0)
-    if "friction" in changes:
-        values["table"][MU_ROWS] = changes["friction"]
+    values["q"][2] += height
+    values["qd"][0] = speed
+    if friction is not None:
+        values["table"][MU_ROWS] = friction
     return values
 
 
-def by_end(name: str, entry: int) -> dict[str, np.ndarray]:
-    """Return the weights of one entry of the state at the end of a policy step."""
-    by = {name: np.zeros((2, {"q": 19, "qd": 18}[name], 1))}
-    by[name][1, entry] = 1.0
-    return by
+def final_entry(name: str, entry: int) -> dict[str, np.ndarray]:
+    """Return weights that select one entry of q or qd at the end of a single policy step."""
+    weights_by = {name: np.zeros((2, {"q": 19, "qd": 18}[name], 1))}
+    weights_by[name][1, entry] = 1.0
+    return weights_by
 
 
 @pytest.mark.parametrize("touches", [False, True])
 def test_touchdown_gradient_matches_differences_on_either_side(touches):
     """A robot falls for four steps from rest, by g dt^2 (1 + 2 + 3 + 4), and lands if it starts closer to the ground.
 
-    In the air the final height follows the initial one exactly; on the ground the paws hold the base back.
+    In the air the final height changes as much as the initial one; on the ground the paws resist.
     """
     gap = 9.81 * DT * DT * 10.0 + 1.0e-4  # the squat starts 0.1 mm in the ground
     height = gap - 2.0e-5 if touches else gap + 2.0e-5
     values = one_step(height=height)
-    by, gradient_by = gradients(rollout(), values, by_end("q", 2))
-    expected = differences(values, by, "q", [2], 1.0e-6)[0]
+    weights_by, gradient_by = gradients(rollout(), values, final_entry("q", 2))
+    expected = differences(values, weights_by, "q", [2], 1.0e-6)[0]
     assert gradient_by["q"][2] == pytest.approx(expected, rel=1.0e-6)
     assert (gradient_by["q"][2] == pytest.approx(1.0, abs=1.0e-9)) != touches
 
 
 @pytest.mark.parametrize("slides", [False, True])
-def test_gradient_by_friction_is_zero_while_sticking(slides):
+def test_gradient_of_speed_by_friction_is_negative_while_sliding_and_zero_while_sticking(slides):
     values = one_step(speed=0.02, friction=0.05 if slides else 5.0)
-    _, gradient_by = gradients(rollout(), values, by_end("qd", 0))
+    _, gradient_by = gradients(rollout(), values, final_entry("qd", 0))
     by_friction = gradient_by["table"][MU_ROWS].sum()
-    assert by_friction < -1.0e-3 if slides else by_friction == 0.0  # more friction, less speed
+    assert by_friction < -1.0e-3 if slides else by_friction == 0.0  # [m/s]
 
 
-def test_gradients_do_not_depend_on_rows():
-    """Gradients with a row per policy step match those with a row per physics step."""
+def test_gradients_with_a_row_by_policy_step_match_those_by_physics_step():
     values = jump()
-    by = weights(run(rollout(), values), ("torque", "impulse"))
-    (_, few), (_, many) = gradients(rollout(), values, by), gradients(rollout(every=1), values, by)
+    weights_by = weights(run(rollout(), values), ("torque", "impulse"))
+    (_, few), (_, many) = (gradients(of, values, weights_by) for of in (rollout(), rollout(every=1)))
     for name, gradient in few.items():
         np.testing.assert_allclose(many[name], gradient, rtol=0.0, atol=1.0e-9 * np.abs(gradient).max() + 1.0e-30)
 

@@ -17,15 +17,16 @@ TASK = make_task("vertical-jump").on_level_ground()
 
 
 def height_reward(term, error):
-    """Return the documented reward of height errors [m]: Gaussian fine + 3 exponential sharp + Gaussian wide."""
+    """Return a term's weighted reward of height errors [m]: Gaussian fine + 3 exponential sharp + Gaussian wide."""
     fine, sharp, wide = (term.numbers[name] for name in ("std_fine", "scale_sharp", "std_wide"))
     kernels = np.exp(-((error / fine) ** 2)) + 3.0 * np.exp(-np.abs(error) / sharp) + np.exp(-((error / wide) ** 2))
     return term.numbers["weight"] * kernels
 
 
 def test_smooth_rewards_match_the_environments_terms():
-    """Worlds are at all phases of a jump. At the apex the environment rewards the highest policy step, the smooth term
-    the ballistic apex."""
+    """Thirty steps of 24 worlds pass through all phases of a jump, and every smooth term is nonzero once.
+
+    At the apex the environment rewards the highest policy step, the smooth term the ballistic apex."""
     env = Env(TASK, 24, seed=2, randomize=False, noise=False, device="cpu")
     env.reset()
     loop, network, paid = ClosedLoop(env), Network(open_policy("vertical_jump")), set()
@@ -43,8 +44,8 @@ def test_smooth_rewards_match_the_environments_terms():
                 at_apex = (running.numpy() == 1) & (arrays["at_apex"] == 1)
                 base, goal = context.motion, arrays["goal"][:, 2]
                 ballistic = (base.pos[:, 2] + base.lin_vel[:, 2] ** 2 / (2.0 * TASK.gravity)).numpy()
-                for mine, height in ((smooth.numpy(), ballistic), (values, arrays["max_height"])):
-                    np.testing.assert_allclose(mine[at_apex], height_reward(term, height - goal)[at_apex], rtol=2e-4)
+                for reward, height in ((smooth.numpy(), ballistic), (values, arrays["max_height"])):
+                    np.testing.assert_allclose(reward[at_apex], height_reward(term, height - goal)[at_apex], rtol=2e-4)
                 assert not smooth.numpy()[~at_apex & (running.numpy() == 1)].any()
                 # the highest policy step is the one before or after the apex
                 highest = torch.maximum(context.prev_motion.pos[:, 2], base.pos[:, 2]).numpy()
@@ -67,17 +68,16 @@ def test_smooth_rewards_match_the_environments_terms():
 
 
 def test_differentiable_env_matches_values_and_central_differences():
-    """Robots in flight take three steps; in single precision differences need 0.01 of an action."""
-    flights = TASK.reset.settings
-    flights = type(flights)(start_probability=StartProbability(in_flight=1.0), flight_time=(0.05, 0.3))
+    """Three robots in flight take three steps; in single precision differences need 0.01 of an action."""
+    flights = type(TASK.reset.settings)(start_probability=StartProbability(in_flight=1.0), flight_time=(0.05, 0.3))
     task = TASK.__class__(**{**vars_of(TASK), "reset": TASK.reset.__class__(TASK.reset.func, flights)})
     envs = [Env(task, 3, seed=5, randomize=False, noise=False, device="cpu") for _ in range(2)]
     for env in envs:
         env.reset()
     start, by_gradients = envs[1].state_dict(), DifferentiableEnv(envs[1])
-    actions = 0.3 * torch.sin(torch.arange(108.0)).view(3, 3, 12)
+    actions = 0.3 * torch.sin(torch.arange(108.0)).view(3, 3, 12)  # (steps, worlds, 12)
 
-    def rewards(actions):
+    def rewards(actions):  # (3 worlds,) sum over steps, with gradients
         envs[1].load_state_dict(start)
         by_gradients.begin_window()
         total = 0.0
@@ -88,13 +88,13 @@ def test_differentiable_env_matches_values_and_central_differences():
 
     variable = actions.clone().requires_grad_()
     total = rewards(variable)
-    plain = sum(envs[0].step(action).reward.clone() for action in actions)
-    torch.testing.assert_close(total.detach(), plain, rtol=0.0, atol=0.0)
+    expected = sum(envs[0].step(action).reward.clone() for action in actions)  # of a plain environment
+    torch.testing.assert_close(total.detach(), expected, rtol=0.0, atol=0.0)
     torch.testing.assert_close(envs[1].obs, envs[0].obs, rtol=0.0, atol=0.0)
     gradient = torch.autograd.grad(total.sum(), variable)[0]
     rough = [i for i, term in enumerate(task.rewards) if term.func.key not in SMOOTH]
 
-    def smooth_total(actions):
+    def smooth_total(actions):  # sum of the smooth terms' values over worlds and steps
         envs[1].load_state_dict(start)
         total = 0.0
         for action in actions:
@@ -104,7 +104,7 @@ def test_differentiable_env_matches_values_and_central_differences():
             total = total + values.sum()
         return total
 
-    for entry in ((0, 0, 1), (0, 2, 5), (1, 1, 0)):
+    for entry in ((0, 0, 1), (0, 2, 5), (1, 1, 0)):  # (step, world, motor)
         ends = []
         for side in (0.01, -0.01):
             moved = actions.clone()

@@ -9,7 +9,7 @@ import pytest
 from jumper_warp.identification.excitation import Scorer
 from jumper_warp.identification.identify import identify
 from jumper_warp.identification.initial_states import paw_positions, stance, unevenness
-from jumper_warp.identification.least_squares import gram
+from jumper_warp.identification.least_squares import transposed_product
 from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import Parameter, ParameterSet, jumper_parameters, total_mass, weighed_mass
 from jumper_warp.identification.recording import KINDS, measure, replay_plan, sample_plan, simulate_plan
@@ -20,16 +20,17 @@ from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import standing_configuration
 from jumper_warp.utils.errors import InputError
 
-DEGREE = math.pi / 180.0
+DEGREE = math.pi / 180.0  # [rad]
 
 
 @pytest.fixture(scope="module")
 def replay():
+    """Return a replay of the described robot on two CPU threads."""
     return MotionReplay(threads=2)
 
 
 def sample_z(parameters, seed=0):
-    """Return normalised parameters sampled from the priors, (P,)."""
+    """Return normalised parameters (P,) sampled with 0.7 of the priors' std, clipped to ±1.5; latency at 0.9."""
     z = np.clip(0.7 * np.random.default_rng(seed).normal(size=len(parameters)), -1.5, 1.5)
     if "latency" in parameters.names:
         z[parameters.names.index("latency")] = 0.9
@@ -41,19 +42,19 @@ def test_replay_matches_simulation_of_a_robot_with_all_parameters_changed(replay
     parameters = jumper_parameters()
     robots = parameters.robots(sample_z(parameters))
     plan = sample_plan(kind, np.random.default_rng(1), seconds=0.6)
-    ours, theirs = replay_plan(replay, plan, robots), simulate_plan(plan, robots=robots)
-    assert ours.valid.all() and np.ptp(ours.angle[:, 1, 0]) > 2.0 * DEGREE
-    np.testing.assert_allclose(ours.angle, theirs.angle, atol=0.01 * DEGREE)
-    np.testing.assert_allclose(ours.rate, theirs.rate, atol=0.02)
-    np.testing.assert_allclose(ours.position, theirs.position, atol=2.0e-5)
-    np.testing.assert_allclose(ours.torque, theirs.torque, atol=0.02)
+    replayed, simulated = replay_plan(replay, plan, robots), simulate_plan(plan, robots=robots)
+    assert replayed.valid.all() and np.ptp(replayed.angle[:, 1, 0]) > 2.0 * DEGREE  # FL_outer moves
+    np.testing.assert_allclose(replayed.angle, simulated.angle, atol=0.01 * DEGREE)
+    np.testing.assert_allclose(replayed.rate, simulated.rate, atol=0.02)  # [rad/s]
+    np.testing.assert_allclose(replayed.position, simulated.position, atol=2.0e-5)  # [m]
+    np.testing.assert_allclose(replayed.torque, simulated.torque, atol=0.02)  # [N m]
 
 
-def test_latency_delays_targets_by_fractions_of_a_step(replay):
+def test_torque_is_linear_in_a_latency_below_a_physics_step(replay):
     parameters = jumper_parameters(["latency"])
     plan = sample_plan("hung chirp", np.random.default_rng(0), seconds=0.5)
-    torques = []  # of the second tick
-    for steps in (0.0, 0.25, 0.5, 1.0):
+    torques = []  # [N m] of FL_outer in row 4, the first of the second target
+    for steps in (0.0, 0.25, 0.5, 1.0):  # latency in physics steps of 1/480 s
         robots = parameters.robots(parameters.normalised(np.array([[steps / 480.0]])))
         torques.append(replay_plan(replay, plan, robots).torque[4, 1, 0])
     punctual, quarter, half, late = torques
@@ -62,25 +63,27 @@ def test_latency_delays_targets_by_fractions_of_a_step(replay):
     assert punctual - half == pytest.approx(0.5 * (punctual - late), rel=1e-6)
 
 
-def test_stance_matches_the_model_and_minimises_paw_velocities():
+def test_stance_has_the_models_height():
     robot = load_description()
     height = stance(robot, robot.pose("nominal")[None], np.zeros((1, 12))).height[0]
-    assert height == pytest.approx(standing_configuration(robot, "nominal")[2], abs=1e-9)
+    assert height == pytest.approx(standing_configuration(robot, "nominal")[2], abs=1e-9)  # [m]
+
+
+def test_stance_velocity_minimises_paw_velocities():
+    robot = load_description()
     angle = robot.pose("nominal")[None] + 0.2 * np.random.default_rng(0).normal(size=(1, 12))
     rate = np.random.default_rng(1).normal(size=(1, 12))
     base = stance(robot, angle, rate)
-    # the base's velocity minimises the paws' velocities
-    paws = paw_positions(robot, angle) - 0.025 * base.up[:, None]
-    speed = (paw_positions(robot, angle + 1e-6 * rate) - paw_positions(robot, angle - 1e-6 * rate)) / 2e-6
-    left = base.velocity[:, None] + np.cross(base.spin[:, None], paws) + speed
-    assert np.linalg.norm(left) < np.linalg.norm(speed)
-    other = base.velocity[:, None] + 0.01 + np.cross(base.spin[:, None], paws) + speed
-    assert np.linalg.norm(left) < np.linalg.norm(other)
+    contacts = paw_positions(robot, angle) - 0.025 * base.up[:, None]  # [m]; 0.025: radius of a paw
+    relative = (paw_positions(robot, angle + 1e-6 * rate) - paw_positions(robot, angle - 1e-6 * rate)) / 2e-6
+    velocity = base.velocity[:, None] + np.cross(base.spin[:, None], contacts) + relative
+    assert np.linalg.norm(velocity) < np.linalg.norm(relative)  # smaller than with a base at rest
+    assert np.linalg.norm(velocity) < np.linalg.norm(velocity + 0.01)  # and with another base velocity [m/s]
 
 
 @pytest.fixture(scope="module")
 def standing(replay):
-    """Return the residuals of a short chirp on the ground, with offsets as parameters, and the true z (P,)."""
+    """Return the residuals of a 0.5 s chirp on the ground, with sensor offsets as parameters, and the true z (P,)."""
     parameters, rng = jumper_parameters(["offsets"]), np.random.default_rng(4)
     truth = sample_z(parameters)
     robots = parameters.robots(truth)
@@ -90,31 +93,27 @@ def standing(replay):
 
 
 def test_initial_states_of_a_standing_robot_keep_all_paws_on_the_ground(standing, replay):
-    problem, truth = standing
-    rng = np.random.default_rng(0)
+    (problem, truth), rng, robot = standing, np.random.default_rng(0), replay.description
     z = truth + 0.1 * rng.normal(size=(5, len(truth)))
     starts = problem.initial.states(rng.normal(size=(5, problem.start_size)), problem.parameters.robots(z))
-    robot = replay.description
     assert problem.initial.resting
-    for later in (0.0, 1.0e-4):  # and none of them leaves it at once
-        angle = starts.angle + later * starts.rate
-        assert np.abs(unevenness(robot, angle)).max() < (1e-12 if not later else 1e-9)
-    still = np.zeros((1, 12))
-    readings = problem.motion.angle[:1]
-    assert np.abs(unevenness(robot, readings)).max() > 1.0e-4
-    assert stance(robot, starts.angle, np.repeat(still, 5, axis=0)).gap.max() < 1e-12
+    for time, tolerance in ((0.0, 1e-12), (1.0e-4, 1e-9)):  # [s], [m]: no paw leaves the plane at once
+        assert np.abs(unevenness(robot, starts.angle + time * starts.rate)).max() < tolerance
+    assert np.abs(unevenness(robot, problem.motion.angle[:1])).max() > 1.0e-4  # [m] of the readings, with offsets
+    assert stance(robot, starts.angle, np.zeros((5, 12))).gap.max() < 1e-12  # [m]
 
 
 def test_residuals_of_a_standing_robot_are_linear_in_its_initial_state(standing, replay):
+    """Within the posterior of the initial state, their change differs by less than 5 % from Jacobian times step."""
     problem, truth = standing
     size, start = len(truth), np.zeros(problem.start_size)
-    for _ in range(2):  # to the start that fits the measurements
+    for _ in range(2):  # Gauss-Newton steps to the start that fits the measurements
         linear = problem.linearise(replay, truth, start, 1.0e-4)
         slope = linear.jacobian[:, size:]
         square = slope.T @ slope + np.eye(len(start))
         start = start - np.linalg.solve(square, slope.T @ linear.residual + start)
     unknown = sorted({column - size for world in problem.jacobian_worlds for column, _ in world if column >= size})
-    move = np.zeros(len(start))  # as far as the noise lets it lie elsewhere
+    move = np.zeros(len(start))  # sampled from the posterior of the coordinates that contact does not determine
     lower = np.linalg.cholesky(square[np.ix_(unknown, unknown)])
     move[unknown] = np.linalg.solve(lower.T, np.random.default_rng(1).normal(size=len(unknown)))
     both = problem.residuals(replay, np.repeat(truth[None], 2, axis=0), np.stack([start, start + move]))
@@ -123,23 +122,22 @@ def test_residuals_of_a_standing_robot_are_linear_in_its_initial_state(standing,
     assert np.linalg.norm(change - expected) < 0.05 * np.linalg.norm(expected)
 
 
-def test_first_part_of_a_motion_has_the_residuals_of_the_whole(standing, replay):
+def test_first_half_of_a_motion_has_the_first_residuals_of_the_whole(standing, replay):
     problem, truth = standing
-    begun = problem.first_part(0.5)
-    zero = np.zeros((1, problem.start_size))
-    whole, part = (p.residuals(replay, truth[None], zero)[:, 0] for p in (problem, begun))
-    assert len(part) == begun.valid.sum() < 0.6 * len(whole)
+    half, zero = problem.first_part(0.5), np.zeros((1, problem.start_size))
+    whole, part = (p.residuals(replay, truth[None], zero)[:, 0] for p in (problem, half))
+    assert len(part) == half.valid.sum() < 0.6 * len(whole)
     np.testing.assert_array_equal(part, whole[: len(part)])
 
 
 def test_gram_matches_numpy():
     rng = np.random.default_rng(0)
     left, right = rng.normal(size=(101, 7)), rng.normal(size=(101, 3))
-    np.testing.assert_allclose(gram(left, right), left.T @ right, atol=1e-12)
+    np.testing.assert_allclose(transposed_product(left, right), left.T @ right, atol=1e-12)
 
 
 def few_parameters():
-    """Return parameters of one leg's motors, and some that all legs share."""
+    """Return kp, kd and offset of leg FL's motors, base mass, latency and knee damping: 12 parameters."""
     wanted = {f"{name}/{joint}" for name in ("kp", "kd", "offset") for joint in ("FL_lateral", "FL_outer", "FL_inner")}
     wanted |= {"base_mass", "latency", "knee_damping"}
     return ParameterSet(tuple(p for p in jumper_parameters() if p.name in wanted))
@@ -147,7 +145,7 @@ def few_parameters():
 
 @pytest.fixture(scope="module")
 def identified(replay):
-    """Return the identification of two short motions, the true z (P,), and the motions."""
+    """Return the identification by two motions of 0.6 s and the exact mass, the true z (P,), and the motions."""
     parameters, rng = few_parameters(), np.random.default_rng(5)
     truth = sample_z(parameters, seed=2)
     robots = parameters.robots(truth)
@@ -158,21 +156,22 @@ def identified(replay):
     return identify(motions, parameters, prior_measurements=[mass], replay=small), truth, motions
 
 
-def test_known_parameters_are_identified_within_their_intervals(identified):
+def test_known_parameters_are_identified_within_four_standard_deviations(identified):
+    """With a fit at the noise's level: χ² near 1 and no mismatch."""
     result, truth, _ = identified
     assert result.nominal_chi2 > 20.0
     assert 0.93 < result.chi2 < 1.05
     assert result.mismatch == 1.0
     error = np.abs(result.z - truth) / np.sqrt(np.diag(result.covariance))
     assert np.sqrt(np.mean(error**2)) < 1.6 and error.max() < 4.0
-    values, true = result.values, result.parameters.values(truth)
-    for i, parameter in enumerate(result.parameters):
+    for parameter, value, true in zip(result.parameters, result.values, result.parameters.values(truth), strict=True):
         if parameter.quantity in ("kp", "kd"):
-            assert values[i] == pytest.approx(true[i], rel=0.02)
+            assert value == pytest.approx(true, rel=0.02)
     assert result.identified.sum() >= len(truth) - 1
 
 
 def test_jacobian_with_shared_worlds_matches_central_differences(replay):
+    """Of a hung robot, whose four legs share worlds; within 1 % of the column's norm."""
     parameters, rng = jumper_parameters(["motors"]), np.random.default_rng(3)
     plan = sample_plan("hung chirp", rng, seconds=0.5)
     robots = parameters.robots(sample_z(parameters))
@@ -191,27 +190,25 @@ def test_jacobian_with_shared_worlds_matches_central_differences(replay):
         assert error < 0.01 * np.linalg.norm(difference)
 
 
-def test_model_mismatch_widens_intervals(identified):
+def test_scaled_angles_double_the_mismatch(identified):
+    """Readings are scaled by 1.02, which no parameter can explain."""
     _, _, motions = identified
-    # the scale of an encoder is not a parameter
-    parameters = few_parameters().without(["latency"])
-    bent = [replace(motion, angle=1.02 * motion.angle) for motion in motions if motion.base == "fixed"]
-    small = MotionReplay(threads=2)
-    result = identify(bent, parameters, replay=small)
+    scaled = [replace(motion, angle=1.02 * motion.angle) for motion in motions if motion.base == "fixed"]
+    result = identify(scaled, few_parameters().without(["latency"]), replay=MotionReplay(threads=2))
     assert result.mismatch > 2.0
 
 
-def test_reports_that_masses_and_gains_share_a_scale(replay):
+def test_open_directions_report_that_masses_and_gains_share_a_scale():
     wanted = ("kp", "kd", "link_mass", "armature", "motor_friction", "knee_damping")
     parameters = ParameterSet(tuple(p for p in jumper_parameters() if p.quantity in wanted))
     scorer = Scorer(parameters, replay=MotionReplay(threads=2))
     plan = sample_plan("hung chirp", np.random.default_rng(0), seconds=0.6)
     information = scorer.information(plan, scorer.record(plan))
-    words = [direction.words for direction in weak_directions(parameters, information)]
-    assert any("share a scale: add a weighed mass" in line for line in words), words
+    lines = [direction.words for direction in weak_directions(parameters, information)]
+    assert any("share a scale: add a weighed mass" in line for line in lines), lines
 
 
-def test_refuses_bad_parameters_and_no_motions():
+def test_parameters_refuse_bad_priors_names_and_groups():
     good = dict(name="a", quantity="kp", places=(0,), unit="1", nominal=1.0, prior=0.1, bounds=(0.5, 2.0))
     Parameter(**good)
     for change in ({"bounds": (2.0, 3.0)}, {"prior": 0.0}, {"bounds": (-1.0, 2.0)}, {"bounds": (0.5, math.nan)}):
@@ -221,14 +218,20 @@ def test_refuses_bad_parameters_and_no_motions():
         ParameterSet((Parameter(**good), Parameter(**good)))
     with pytest.raises(InputError, match="unknown group of parameters 'gears'"):
         jumper_parameters(["gears"])
+
+
+def test_identify_refuses_no_motions():
     with pytest.raises(InputError, match="at least one motion"):
         identify([], jumper_parameters())
 
 
 def test_normalised_inverts_values():
     parameters = jumper_parameters()
-    assert len(parameters) == 79
-    z = np.random.default_rng(0).normal(size=(3, 79))
+    z = np.random.default_rng(0).normal(size=(3, len(parameters)))
     np.testing.assert_allclose(parameters.normalised(parameters.values(z)), z, atol=1e-9)
-    robots = parameters.robots(np.zeros((2, 79)))
-    assert total_mass(robots) == pytest.approx([load_description().mass] * 2)
+
+
+def test_all_79_parameters_at_their_prior_means_give_the_described_mass():
+    parameters = jumper_parameters()
+    assert len(parameters) == 79
+    assert total_mass(parameters.robots(np.zeros((2, 79)))) == pytest.approx([load_description().mass] * 2)

@@ -12,10 +12,12 @@ from jumper_warp.identification.residuals import check_signs
 from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.utils.errors import InputError
 
-ROWS = 12
+ROWS = 12  # of a motion
+TORQUE_CONSTANT = 1.5  # [N m/A] of the motors in tables
 
 
 def random_motion():
+    """Return a motion of random values at 240 Hz, with angles in every other row, without rates and positions."""
     rng = np.random.default_rng(0)
     angle = rng.normal(size=(ROWS, 12))
     angle[1::2] = math.nan
@@ -33,18 +35,19 @@ def random_motion():
 
 
 def table_of(motion):
-    """Return the columns of a motion by name, angles in degrees, currents instead of torques."""
+    """Return the columns (ROWS,) of a motion by name: time in ms, angles in degrees, currents instead of torques."""
     columns = {"time [ms]": 1000.0 * motion.time}
     for i, joint in enumerate(MOTOR_JOINTS):
         columns[f"target/{joint}"] = motion.target[:, i]
         columns[f"angle/{joint} [deg]"] = np.degrees(motion.angle[:, i])
-        columns[f"current/{joint} [A]"] = motion.torque[:, i] / 1.5
+        columns[f"current/{joint} [A]"] = motion.torque[:, i] / TORQUE_CONSTANT
     for i, axis in enumerate("xyzw"):
         columns[f"quaternion/{axis}"] = motion.quaternion[:, i]
     return columns
 
 
 def write_csv(path, columns, settings=None):
+    """Write columns by name as CSV, NaN as an empty cell, and settings as the JSON file next to it."""
     rows = [",".join(columns)]
     for row in zip(*columns.values(), strict=True):
         rows.append(",".join("" if math.isnan(x) else repr(float(x)) for x in row))
@@ -54,28 +57,29 @@ def write_csv(path, columns, settings=None):
 
 
 def assert_same(loaded, motion):
+    """Assert that a loaded motion equals a `random_motion` in values, missing channels, name and settings."""
     for name in ("time", "target", "angle", "torque", "quaternion"):
         np.testing.assert_allclose(getattr(loaded, name), getattr(motion, name), atol=1e-12)
     assert loaded.rate is None and loaded.position is None
     assert (loaded.name, loaded.base, loaded.torque_limit, loaded.gains) == ("walk", "fixed", 12.0, "jumping")
 
 
-def test_load_motion_reads_npz_csv_and_parquet(tmp_path):
+def test_load_motion_reads_npz_csv_and_parquet_and_overrides_settings(tmp_path):
     motion = random_motion()
     motion.save(tmp_path / "walk.npz")
     assert_same(load_motion(tmp_path / "walk.npz"), motion)
     columns = table_of(motion)
     write_csv(tmp_path / "walk.csv", columns, {"base": "fixed", "torque_limit": 12.0})
-    assert_same(load_motion(tmp_path / "walk.csv", torque_constant=1.5), motion)
-    assert load_motion(tmp_path / "walk.csv", torque_constant=1.5, base="free").base == "free"
+    assert_same(load_motion(tmp_path / "walk.csv", torque_constant=TORQUE_CONSTANT), motion)
+    assert load_motion(tmp_path / "walk.csv", torque_constant=TORQUE_CONSTANT, base="free").base == "free"
     pyarrow = pytest.importorskip("pyarrow")
     pyarrow.parquet = pytest.importorskip("pyarrow.parquet")
     pyarrow.parquet.write_table(pyarrow.table(columns), tmp_path / "walk.parquet")
-    assert_same(load_motion(tmp_path / "walk.parquet", torque_constant=1.5), motion)
+    assert_same(load_motion(tmp_path / "walk.parquet", torque_constant=TORQUE_CONSTANT), motion)
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "message"),  # change: of the columns c by name
     [
         (lambda c: c | {"angel/FL_outer": c["time [ms]"]}, "unknown column 'angel/FL_outer'"),
         (lambda c: c | {"rate/FL_outer [rpm]": c["time [ms]"]}, "expected a unit of rad/s, deg/s"),
@@ -88,21 +92,21 @@ def test_load_motion_reads_npz_csv_and_parquet(tmp_path):
         (lambda c: {k: v for k, v in c.items() if k.startswith(("time", "target"))}, "nothing is measured"),
     ],
 )
-def test_refuses_bad_table_in_one_line(tmp_path, change, words):
+def test_load_motion_refuses_a_bad_table_in_one_line(tmp_path, change, message):
     write_csv(tmp_path / "walk.csv", change(table_of(random_motion())))
-    with pytest.raises(InputError, match=words) as error:
-        load_motion(tmp_path / "walk.csv", torque_constant=1.5)
+    with pytest.raises(InputError, match=message) as error:
+        load_motion(tmp_path / "walk.csv", torque_constant=TORQUE_CONSTANT)
     assert "\n" not in str(error.value)
 
 
-def test_refuses_unreadable_files_and_settings(tmp_path):
+def test_load_motion_refuses_unreadable_files_and_unknown_settings(tmp_path):
     columns = table_of(random_motion())
     write_csv(tmp_path / "walk.csv", columns)
     with pytest.raises(InputError, match="current needs the torque constant"):
         load_motion(tmp_path / "walk.csv")
     write_csv(tmp_path / "walk.csv", columns, {"stand": "high"})
     with pytest.raises(InputError, match="no setting 'stand'"):
-        load_motion(tmp_path / "walk.csv", torque_constant=1.5)
+        load_motion(tmp_path / "walk.csv", torque_constant=TORQUE_CONSTANT)
     (tmp_path / "walk.npz").write_bytes(b"PK nothing")
     with pytest.raises(InputError, match="not an npz file"):
         load_motion(tmp_path / "walk.npz")
@@ -115,15 +119,14 @@ def test_refuses_unreadable_files_and_settings(tmp_path):
 
 def test_check_signs_names_motors_with_inverted_angles():
     motion = random_motion()
-    target = np.tile([0.05, 0.8, 0.8], (ROWS, 4)) + 0.05 * motion.target
-    lag = np.tile([-0.1, 0.2, -0.2], 4)
-    gaps = np.where(np.isfinite(motion.angle), 0.0, math.nan)
-    angle = target + lag + gaps
+    target = np.tile([0.05, 0.8, 0.8], (ROWS, 4)) + 0.05 * motion.target  # [rad] around a squat
+    lag = np.tile([-0.1, 0.2, -0.2], 4)  # [rad]
+    angle = target + lag + np.where(np.isfinite(motion.angle), 0.0, math.nan)
     right = replace(motion, target=target, angle=angle)
     check_signs(right)
     sign = np.ones(12)
-    sign[[1, 11]] = -1.0
+    sign[[1, 11]] = -1.0  # FL_outer, BR_inner
     for wrong in (replace(right, angle=sign * angle), replace(right, target=sign * target)):
         with pytest.raises(InputError, match="motion walk: angles of FL_outer, BR_inner have the sign opposite"):
             check_signs(wrong)
-    check_signs(replace(right, angle=math.nan * angle))
+    check_signs(replace(right, angle=math.nan * angle))  # nothing measured

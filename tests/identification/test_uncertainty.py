@@ -8,11 +8,14 @@ from jumper_warp.identification.residuals import Linearised
 from jumper_warp.identification.uncertainty import systematic_std
 
 PARAMETERS, ROWS, CHANNELS, MOTIONS = 5, 60, 4, 3
-CHANNEL = np.arange(CHANNELS).repeat(ROWS // CHANNELS)
+CHANNEL = np.arange(CHANNELS).repeat(ROWS // CHANNELS)  # (ROWS,) channel of each residual of a motion
 
 
 class Refit:
-    """Linear motions with `starts` initial coordinates each, whose errors are alike in a channel; priors of std 1."""
+    """Linear least-squares problem with an error that all rows of a channel share; unknowns have priors of std 1.
+
+    Unknowns: PARAMETERS parameters, and `starts` coordinates of the initial state of each motion.
+    """
 
     def __init__(self, starts: int, rng: np.random.Generator):
         self.starts = starts
@@ -21,7 +24,7 @@ class Refit:
         self.weights = [rng.uniform(0.2, 1.0, ROWS) for _ in range(MOTIONS)]
 
     def solve(self, kept):
-        """Return the fitted parameters (P,) and starts (MOTIONS, I) of the kept rows; kept: bool (MOTIONS, ROWS)."""
+        """Return parameters (PARAMETERS,) and starts (MOTIONS, starts) fitted to rows kept, bool (MOTIONS, ROWS)."""
         matrix = np.eye(PARAMETERS + MOTIONS * self.starts)
         slope = np.zeros(len(matrix))
         for i in range(MOTIONS):
@@ -34,7 +37,7 @@ class Refit:
         return solution[:PARAMETERS], solution[PARAMETERS:].reshape(MOTIONS, self.starts)
 
     def normal(self, z, starts):
-        """Return the normal equations at parameters and starts."""
+        """Return the normal equations at parameters z (PARAMETERS,) and starts (MOTIONS, starts)."""
         matrix, cross, start_matrices, linearised = np.zeros((PARAMETERS, PARAMETERS)), [], [], []
         for jacobian, data, weight, start in zip(self.jacobians, self.data, self.weights, starts, strict=True):
             square = jacobian.T @ (weight[:, None] * jacobian)
@@ -45,8 +48,9 @@ class Refit:
         return NormalEquations(0.0, 0.0, z, matrix, [], start_matrices, cross, linearised, self.weights)
 
 
-@pytest.mark.parametrize(("starts", "close"), [(0, 1e-9), (3, 0.15)])  # starts are not refitted
-def test_systematic_std_matches_refits_without_a_channel_or_a_motion(starts, close):
+@pytest.mark.parametrize(("starts", "rtol"), [(0, 1e-9), (3, 0.15)])  # exact without starts, which are not refitted
+def test_systematic_std_matches_refits_without_a_channel_or_a_motion(starts, rtol):
+    """The oracle is the jackknife over channels plus the jackknife over motions, each cluster refitted exactly."""
     refit = Refit(starts, np.random.default_rng(0))
     all_rows = np.ones((MOTIONS, ROWS), bool)
     best, best_starts = refit.solve(all_rows)
@@ -61,4 +65,4 @@ def test_systematic_std_matches_refits_without_a_channel_or_a_motion(starts, clo
                 kept[motion] &= ~rows
                 changes.append(refit.solve(kept)[0] - best)
         variance += (len(changes) - 1) / len(changes) * np.square(changes).sum(0)
-    np.testing.assert_allclose(std, np.sqrt(variance), rtol=close)
+    np.testing.assert_allclose(std, np.sqrt(variance), rtol=rtol)

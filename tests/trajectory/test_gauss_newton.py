@@ -11,6 +11,7 @@ from tests.policies.test_policy import make_interface
 
 
 def small_policy(num_obs=3, hidden=(4, 5), num_actions=2):
+    """Return a random policy of a few weights, seed 0, and its `Network` in double precision."""
     torch.manual_seed(0)
     sizes = (num_obs, *hidden, num_actions)
     layers = [(0.5 * torch.randn(b, a), 0.1 * torch.randn(b)) for a, b in pairwise(sizes)]
@@ -19,7 +20,7 @@ def small_policy(num_obs=3, hidden=(4, 5), num_actions=2):
     return policy, Network(policy, dtype=torch.float64)
 
 
-def test_network_matches_policy():
+def test_network_acts_as_its_policy():
     policy, network = small_policy()
     obs = 5.0 * torch.randn(20, 3)
     torch.testing.assert_close(network.act(obs.double()).float(), policy.act(obs))
@@ -29,7 +30,7 @@ def test_per_world_gradients_match_autograd():
     _, network = small_policy()
     obs, tape = torch.randn(4, 3, dtype=torch.float64), Tape()
 
-    def losses(weights, tape=None):
+    def losses(weights, tape=None):  # (4 worlds,)
         first = network.act(obs, weights, tape)
         again = network.act(obs + first.sum(1, keepdim=True), weights, tape)  # the second step depends on the first
         return (first * again).sum(1)
@@ -39,18 +40,27 @@ def test_per_world_gradients_match_autograd():
     torch.testing.assert_close(per_world_gradients(total, tape), expected, rtol=1.0e-10, atol=1.0e-12)
 
 
-def test_step_matches_dense_solution():
+def test_gauss_newton_step_matches_dense_solution():
+    """The oracle solves the module's equation with its matrix; both groups of worlds are stacked."""
     _, network = small_policy()
     weights, size = network.weights, len(network.weights)
     anchor = Anchor(network, torch.randn(9, 3, dtype=torch.float64), torch.rand(9, dtype=torch.float64) + 0.1)
     moved = weights + 0.05 * torch.randn(size, dtype=torch.float64)
-    rows, misses = torch.randn(6, size, dtype=torch.float64), torch.randn(6, dtype=torch.float64)
+    jacobian, errors = torch.randn(6, size, dtype=torch.float64), torch.randn(6, dtype=torch.float64)
     importance = torch.rand(6, dtype=torch.float64)
-    step = gauss_newton_step(moved, [rows[:2], rows[2:]], [misses[:2], misses[2:]], [importance[:2], importance[2:]],
-                             anchor, 0.5, 200, 1.0e-9)  # fmt: skip
+    step = gauss_newton_step(
+        moved, *([values[:2], values[2:]] for values in (jacobian, errors, importance)), anchor,
+        damping=0.5, iterations=200, accuracy=1.0e-9,
+    )  # fmt: skip
     residuals = anchor.residuals(moved).flatten()
     change = jacrev(lambda w: anchor.residuals(w).flatten())(moved)
-    matrix = rows.T @ (importance[:, None] * rows) + change.T @ change + 0.5 * torch.eye(size, dtype=torch.float64)
-    right = -rows.T @ (importance * misses) - change.T @ residuals
+    damping = 0.5 * torch.eye(size, dtype=torch.float64)
+    matrix = jacobian.T @ (importance[:, None] * jacobian) + change.T @ change + damping
+    right = -jacobian.T @ (importance * errors) - change.T @ residuals
     torch.testing.assert_close(step, torch.linalg.solve(matrix, right), rtol=1.0e-6, atol=1.0e-6 * float(step.norm()))
-    assert anchor.cost(moved) > 0.0 == anchor.cost(weights)
+
+
+def test_anchor_costs_only_changed_actions():
+    _, network = small_policy()
+    anchor = Anchor(network, torch.randn(9, 3, dtype=torch.float64), torch.ones(9, dtype=torch.float64))
+    assert anchor.cost(network.weights + 0.05) > 0.0 == anchor.cost(network.weights)

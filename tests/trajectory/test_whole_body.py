@@ -13,13 +13,16 @@ from jumper_warp.robot.model import build_model
 from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.trajectory.whole_body import WholeBody
 
-N = 6
-MOTORS = [5 * leg + joint for leg in range(4) for joint in (0, 1, 3)]
+N = 6  # worlds
+MOTORS = [5 * leg + joint for leg in range(4) for joint in (0, 1, 3)]  # lateral, outer, inner of Newton's leg joints
 
 
 @pytest.fixture(scope="module")
 def links():
-    """Return model, body, q (N, 19), qd (N, 18), and poses (N, 21, 7) and twists (N, 21, 6) of the kernels."""
+    """Return model, `WholeBody`, random q (N, 19) and qd (N, 18), and the kernels' poses (N, 21, 7), twists (N, 21, 6).
+
+    Poses: position [m] and quaternion xyzw of links; twists: COM velocity [m/s], angular velocity [rad/s]; world frame.
+    """
     rng, model = np.random.default_rng(0), build_model(N, visuals=False)
     joint_q, joint_qd = np.zeros((N, 43)), np.zeros((N, 38))
     angles = rng.uniform(0.2, 1.5, (N, 4, 3)) * [0.2, 1.0, 1.0]
@@ -36,46 +39,49 @@ def links():
     return model, WholeBody(Rollout(model, double=True)), q, qd, pose, twist
 
 
-def test_link_poses_match_simulation(links):
+def test_link_poses_match_the_kernels(links):
     _, body, q, qd, pose, _ = links
     frames = body.legs(q, qd)
-    turn = Rotation.from_quat(pose[:, 1:, 3:].reshape(-1, 4)).as_matrix().reshape(N, 20, 3, 3)
-    assert frames.pos.flatten(1, 2).numpy() == pytest.approx(pose[:, 1:, :3], abs=1e-6)
-    assert frames.rotation.flatten(1, 2).numpy() == pytest.approx(turn, abs=1e-6)
-    places, ankles = body.points(q)
-    assert torch.allclose(places, frames.pos, atol=1e-12) and torch.allclose(ankles, frames.ankle, atol=1e-12)
+    rotation = Rotation.from_quat(pose[:, 1:, 3:].reshape(-1, 4)).as_matrix().reshape(N, 20, 3, 3)
+    assert frames.pos.flatten(1, 2).numpy() == pytest.approx(pose[:, 1:, :3], abs=1e-6)  # [m]
+    assert frames.rotation.flatten(1, 2).numpy() == pytest.approx(rotation, abs=1e-6)
 
 
-def test_momentum_matches_sum_over_links(links):
+def test_points_match_leg_frames(links):
+    _, body, q, qd, _, _ = links
+    for points, expected in zip(body.points(q), (body.legs(q, qd).pos, body.legs(q, qd).ankle), strict=True):
+        assert torch.allclose(points, expected, atol=1e-12)  # [m]
+
+
+def test_momentum_and_base_velocity_match_link_twists(links):
+    """The oracle sums mass, momentum and inertia over the model's 21 links."""
     model, body, q, qd, pose, twist = links
     mass = model.body_mass.numpy().reshape(N, 21, 1).astype(float)
-    turn = Rotation.from_quat(pose[..., 3:].reshape(-1, 4)).as_matrix().reshape(N, 21, 3, 3)
-    center = pose[..., :3] + (turn @ model.body_com.numpy().reshape(N, 21, 3, 1))[..., 0]
+    rotation = Rotation.from_quat(pose[..., 3:].reshape(-1, 4)).as_matrix().reshape(N, 21, 3, 3)
+    center = pose[..., :3] + (rotation @ model.body_com.numpy().reshape(N, 21, 3, 1))[..., 0]
     com, vel = ((mass * x).sum(1) / mass.sum(1) for x in (center, twist[..., :3]))
-    inertia = turn @ model.body_inertia.numpy().reshape(N, 21, 3, 3) @ turn.swapaxes(-1, -2)
+    inertia = rotation @ model.body_inertia.numpy().reshape(N, 21, 3, 3) @ rotation.swapaxes(-1, -2)
     arm, moving = center - com[:, None], twist[..., :3] - vel[:, None]
     spin = ((inertia @ twist[..., 3:, None])[..., 0] + mass * np.cross(arm, moving)).sum(1)
     square = (arm**2).sum(-1)[..., None, None] * np.eye(3) - arm[..., None] * arm[..., None, :]
     whole = (inertia + mass[..., None] * square).sum(1)
-    momentum = body.momentum(q, qd)
-    for mine, theirs in zip(momentum, (com, vel, spin, whole), strict=True):
-        assert mine.numpy() == pytest.approx(theirs, abs=1e-5)
-    assert body.base_velocity(q, qd).numpy() == pytest.approx(
-        twist[:, 0, :3] - np.cross(twist[:, 0, 3:], (turn[:, 0] @ model.body_com.numpy()[0])), abs=1e-5
-    )
+    for value, expected in zip(body.momentum(q, qd), (com, vel, spin, whole), strict=True):
+        assert value.numpy() == pytest.approx(expected, abs=1e-5)  # [m], [m/s], [kg m^2/s], [kg m^2]
+    origin_velocity = twist[:, 0, :3] - np.cross(twist[:, 0, 3:], rotation[:, 0] @ model.body_com.numpy()[0])
+    assert body.base_velocity(q, qd).numpy() == pytest.approx(origin_velocity, abs=1e-5)  # [m/s]
 
 
 def test_clearance_matches_collision_kernel(links):
     """The kernel reports no contact with a kind of link 1 mm above the ground, and contact 1 mm below."""
     model, body, q, _, _, _ = links
     flags = (collision.HOUSING_GROUND, collision.THIGH_GROUND, collision.KNEE_GROUND, collision.SHANK_GROUND)
-    gaps = body.clearance(q).amin(1).numpy()
+    gaps = body.clearance(q).amin(1).numpy()  # (N, kinds) [m]
     dynamics = JumperDynamics(model)
     for kind, flag in enumerate(flags):
-        for down, there in ((-0.001, False), (0.001, True)):
+        for depth, touches in ((-0.001, False), (0.001, True)):  # [m] below the ground
             joint_q = np.zeros((N, int(COORDS)), dtype=np.float32)
             joint_q[:, :7] = q[:, :7].numpy()
-            joint_q[:, 2] -= gaps[:, kind] + down
+            joint_q[:, 2] -= gaps[:, kind] + depth
             joint_q[:, 7:][:, MOTORS] = q[:, 7:].numpy()
             flags_out, distance = wp.zeros(N, dtype=int), wp.zeros(N, dtype=float)
             wp.launch(
@@ -83,4 +89,4 @@ def test_clearance_matches_collision_kernel(links):
                 inputs=[dynamics.robot.geometry, dynamics.robot.ground, wp.array(joint_q.ravel()), int(COORDS), 0.0],
                 outputs=[flags_out, distance],
             )  # fmt: skip
-            assert ((flags_out.numpy() & int(flag)) != 0).tolist() == [there] * N, (kind, down)
+            assert ((flags_out.numpy() & int(flag)) != 0).tolist() == [touches] * N, (kind, depth)

@@ -1,3 +1,5 @@
+"""Meshes of a model's shapes: sizes, placement, colors, and shapes that are left out."""
+
 import math
 
 import newton
@@ -12,7 +14,7 @@ QUARTER_TURN = wp.quat(0.0, 0.0, math.sin(math.pi / 4), math.cos(math.pi / 4))  
 
 
 def build(add=lambda builder, body: None, add_ground=lambda scene: None):
-    """Return the meshes of world 0 of 2, with shapes from `add(builder, body)` on its one body, and a ground."""
+    """Return the meshes of world 0 of 2, with shapes from `add(builder, body)` on its one body, and `add_ground`."""
     builder = newton.ModelBuilder()
     body = builder.add_link(mass=1.0, inertia=wp.mat33(np.eye(3)), label="base")
     builder.add_articulation([builder.add_joint_free(body)])
@@ -23,16 +25,16 @@ def build(add=lambda builder, body: None, add_ground=lambda scene: None):
     return shapes.shape_meshes(scene.finalize(device="cpu"), (0,))
 
 
-def extent(mesh):
+def extent(mesh):  # (3,) [m] along x, y, z
     return mesh.vertices.max(axis=0) - mesh.vertices.min(axis=0)
 
 
-def volume(mesh):
+def volume(mesh):  # [m^3]
     return trimesh.Trimesh(mesh.vertices, mesh.triangles).volume
 
 
 @pytest.mark.parametrize(
-    ("add", "size", "content", "tolerance"),
+    ("add", "expected_extent", "expected_volume", "rel"),  # [m], [m^3] of the exact shape
     [
         (lambda b, i: b.add_shape_box(i, hx=0.1, hy=0.2, hz=0.3), (0.2, 0.4, 0.6), 0.048, 1e-6),
         (lambda b, i: b.add_shape_sphere(i, radius=0.1), (0.2, 0.2, 0.2), 4.18879e-3, 0.02),
@@ -42,20 +44,20 @@ def volume(mesh):
     ],
     ids=["box", "sphere", "capsule", "cylinder", "ellipsoid"],
 )
-def test_primitive_has_its_extent_and_volume(add, size, content, tolerance):
+def test_primitive_has_its_extent_and_volume_on_body_0(add, expected_extent, expected_volume, rel):
     (mesh,) = build(add)
-    assert extent(mesh) == pytest.approx(size, rel=0.01)
-    assert volume(mesh) == pytest.approx(content, rel=tolerance)
+    assert extent(mesh) == pytest.approx(expected_extent, rel=0.01)
+    assert volume(mesh) == pytest.approx(expected_volume, rel=rel)
     assert mesh.body == 0
 
 
-def test_normals_are_unit_and_point_outward():
+def test_normals_of_a_box_are_unit_and_point_outward():
     (mesh,) = build(lambda b, i: b.add_shape_box(i, hx=0.1, hy=0.2, hz=0.3))
     assert np.linalg.norm(mesh.normals, axis=1) == pytest.approx(1.0)
-    assert (np.sum(mesh.normals * mesh.vertices, axis=1) > 0.09).all()
+    assert (np.sum(mesh.normals * mesh.vertices, axis=1) > 0.09).all()  # [m]; the nearest faces are 0.1 m away
 
 
-def test_mesh_takes_its_scale_place_and_color():
+def test_mesh_shape_has_its_scale_pose_and_color():
     corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], dtype=np.float32)
     faces = np.array([[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]])
     source = newton.Mesh(corners, faces.ravel(), compute_inertia=False)
@@ -63,31 +65,31 @@ def test_mesh_takes_its_scale_place_and_color():
     (mesh,) = build(
         lambda b, i: b.add_shape_mesh(i, xform=place, mesh=source, scale=(1.0, 2.0, 3.0), color=(0.2, 0.4, 0.6))
     )
-    # x goes to y, y to -x
+    # a tetrahedron of edges 1, 2, 3 m, turned about z (x to y, y to -x) and moved by 10 m along x
     assert mesh.vertices.min(axis=0) == pytest.approx([8.0, 0.0, 0.0], abs=1e-5)
     assert mesh.vertices.max(axis=0) == pytest.approx([10.0, 1.0, 3.0], abs=1e-5)
     assert volume(mesh) == pytest.approx(1.0, rel=1e-5)
     assert mesh.color == pytest.approx((0.2, 0.4, 0.6))
 
 
-def test_infinite_plane_becomes_a_checkered_patch_facing_up():
+def test_infinite_plane_becomes_a_checkered_square_of_20_m_facing_up():
     light, dark = build(add_ground=lambda b: b.add_ground_plane(label="ground"))
     assert (light.name, dark.name) == ("ground_light", "ground_dark")
     assert light.body == dark.body == -1
     assert len(light.triangles) == len(dark.triangles) == 40 * 40  # half of 40 x 40 fields, two triangles each
     assert extent(light) == pytest.approx([20.0, 20.0, 0.0])
-    for half in (light, dark):
-        assert half.normals == pytest.approx(np.tile([0.0, 0.0, 1.0], (len(half.normals), 1)))
-        assert trimesh.Trimesh(half.vertices, half.triangles).area == pytest.approx(200.0, rel=1e-5)
+    for fields in (light, dark):
+        assert fields.normals == pytest.approx(np.tile([0.0, 0.0, 1.0], (len(fields.normals), 1)))
+        assert trimesh.Trimesh(fields.vertices, fields.triangles).area == pytest.approx(200.0, rel=1e-5)  # [m^2]
 
 
-def test_heightfield_keeps_its_heights_where_they_belong():
+def test_heightfield_has_its_heights_at_its_nodes_facing_up():
     heights = np.array([[0.0, 1.0, 2.0], [10.0, 11.0, 12.0]])  # rows follow y, columns x
     field = newton.Heightfield(data=heights, nrow=2, ncol=3, hx=3.0, hy=0.5)
     (mesh,) = build(add_ground=lambda b: b.add_shape_heightfield(heightfield=field, label="ground"))
     expected = {(-3, -0.5, 0), (0, -0.5, 1), (3, -0.5, 2), (-3, 0.5, 10), (0, 0.5, 11), (3, 0.5, 12)}
     assert {tuple(np.round(vertex, 5).tolist()) for vertex in mesh.vertices} == expected
-    assert len(mesh.triangles) == 4
+    assert len(mesh.triangles) == 4  # two for each of two cells
     assert (mesh.normals[:, 2] > 0.0).all()
 
 
@@ -99,6 +101,6 @@ def test_hidden_shapes_and_other_worlds_are_left_out():
     assert [mesh.name for mesh in build(add)] == ["seen"]
 
 
-def test_shape_that_cannot_be_drawn_is_refused_by_name():
+def test_shape_meshes_refuses_a_cone_by_name():
     with pytest.raises(ValueError, match="'hat' is a CONE"):
         build(lambda b, i: b.add_shape_cone(i, label="hat"))
