@@ -29,7 +29,6 @@ def settings_of_run(checkpoint: Checkpoint, cfg: TrainCfg) -> tuple[dict[str, An
     """Return the settings of a checkpoint's run, by field of `jumper_warp.cli.train.TrainArgs`, and its task.
 
     cfg: defaults for settings that the run lacks and for those of the session, see SESSION.
-
     Raises CheckpointError: the run is of another task or version, or its settings cannot be used.
     """
     saved = _config(checkpoint, cfg.task)

@@ -58,7 +58,6 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
     """Parse the arguments of `jumper train` into settings and the task; exits after help or usage, and as tyro does.
 
     A resumed run has its saved settings where no flag overrides them.
-
     Raises InputError: the task is missing, unknown or given twice, a setting is out of range, or there is no such run.
     """
     names = ", ".join(task_names())

@@ -142,7 +142,6 @@ def policy_from_onnx(data: bytes, interface: PolicyInterface, config: Mapping[st
     """Return the policy in the result of `onnx_bytes`, bitwise.
 
     interface, config: of the policy, from its config.json; the file's graph and metadata must agree with them.
-
     Raises PolicyError: the file is damaged, its weights are not valid for the interface, or its graph, opset or
     metadata differ from the result of `onnx_model`.
     """

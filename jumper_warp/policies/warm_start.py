@@ -25,7 +25,6 @@ def actor_init_from_policy(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> Ac
 
     source: as for `open_policy`. Observation and joints must agree; action scale, gains, torque limits and time steps
     may differ.
-
     Raises PolicyError or CheckpointError: there is no such policy, or it cannot be used. Raises InputError: its
     observation or its joints are not the task's, or as `make_actor_init`.
     """

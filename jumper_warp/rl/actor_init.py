@@ -40,7 +40,6 @@ def make_actor_init(
 
     layers, activation: the policy as a plain network; mean, std: (num_obs,) its observation statistics; symmetry: of a
     training with symmetry actor.
-
     Raises InputError: hidden layers or activation differ from the settings, or a standard deviation is below
     sqrt(VARIANCE_EPS).
     """

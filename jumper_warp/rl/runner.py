@@ -84,7 +84,6 @@ def train(
     command: command line printed for resuming, without `--resume` (default: `jumper train TASK`). as_rsl_rl: required
     by trainer rsl-rl. actor_init: of the policy that cfg.init_policy names, required with it. checkpoint: the loaded
     checkpoint that cfg.resume names (default: it is loaded here).
-
     Raises ValueError: a setting does not fit the environment or the machine. CheckpointError: no usable checkpoint to
     resume from, or the last one could not be saved. SystemExit with code INTERRUPTED: stopped by Ctrl-C or SIGTERM,
     after a checkpoint was saved.

@@ -64,7 +64,6 @@ def configure_device(device: str | None, threads: int | None = None) -> DeviceIn
     """Set the number of threads, silence Warp's module messages, and print and return the device's properties.
 
     device: a Warp device (default: the current one). threads: CPU threads of simulations, as in `set_threads`.
-
     Raises InputError: there is no such device, or the number of threads is invalid.
     """
     set_threads(threads)

@@ -93,14 +93,7 @@ def test_packed_rows_do_not_depend_on_the_chunk_size(rows):
 
 @pytest.mark.parametrize(
     "change",
-    [
-        {},
-        {"clip_value": False},
-        {"activation": "relu"},
-        {"activation": "tanh"},
-        {"clip": 0.02},
-        {"symmetry": "actor"},
-    ],
+    [{}, {"clip_value": False}, {"activation": "relu"}, {"activation": "tanh"}, {"clip": 0.02}, {"symmetry": "actor"}],
 )
 def test_update_agrees_with_autograd_and_adam(change):
     cfg = dataclasses.replace(CFG, **change)
