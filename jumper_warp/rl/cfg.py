@@ -99,7 +99,7 @@ class PpoCfg:
             raise InputError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation}")
 
     def batch_size(self, num_envs: int) -> int:
-        """Return the samples that num_envs worlds give in an iteration.
+        """Return the number of samples in an iteration of num_envs worlds, num_steps · num_envs.
 
         Raises ValueError: there is only one, which has no standard deviation, or the minibatches do not divide them.
         """
@@ -150,8 +150,8 @@ class TrainCfg:
     max_iterations: int = 2800
     """Iterations of the run in total, including iterations before a resume."""
     max_seconds: float = 0.0
-    """Limit of the training time [s]; 0: none. Training time is summed over resumes, from the end of the first iteration
-    after a start, so that building and compilation do not count; logging and saving do."""
+    """Limit of the training time [s] over all resumes; 0: none. A process counts its time from the end of its first
+    iteration, so that building and compilation do not count; logging and saving do."""
     seed: int = 1
     """Seed of weights, noise and worlds, 0 to 2^31 - 1; each process derives a different seed from it."""
     device: str | None = None

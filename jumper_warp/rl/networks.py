@@ -69,7 +69,7 @@ class Scaling(NamedTuple):
         return x * self.std + self.mean
 
     def features(self, obs: torch.Tensor, columns: int) -> torch.Tensor:
-        """Return sanitised observations (..., n) normalised, within ±NORMALISED_LIMIT, zero-padded to (..., columns)."""
+        """Return sanitised observations (..., n) normalised, clipped, and zero-padded to (..., columns)."""
         features = normalise(obs, self.mean, self.std, NORMALISED_LIMIT)
         return functional.pad(features, (0, columns - obs.shape[-1]))
 
@@ -105,7 +105,7 @@ def gaussian_kl(
 
 
 class RunningMoments(nn.Module):
-    """Running mean and variance of all samples so far, float64, saved as buffers; the initial scaling is the identity."""
+    """Running mean and variance of all samples so far, float64 buffers; the initial scaling is the identity."""
 
     mean: torch.Tensor  # shape of one sample
     var: torch.Tensor  # shape of one sample, population variance
@@ -141,7 +141,7 @@ class RunningMoments(nn.Module):
 def mlp(sizes: Sequence[int], activation: str, out_gain: float) -> nn.Sequential:
     """Return a multilayer perceptron with orthogonal weights and zero biases; no activation after the last layer.
 
-    sizes: widths of input, hidden layers and output. activation: a key of ACTIVATIONS. out_gain: scale of the last weight.
+    sizes: widths of input, hidden layers and output. activation: a key of ACTIVATIONS. out_gain: of the last weight.
     """
     layers: list[nn.Module] = []
     for index, (num_in, num_out) in enumerate(pairwise(sizes)):

@@ -49,7 +49,7 @@ class Collector:
     """Steps the environment with the current policy, and records the transitions in `rollout`."""
 
     def __init__(self, env: VecEnv, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, compiler: Compiler) -> None:
-        """model: has the observation statistics; flat: its parameters, with the actor; compiler: wraps the functions."""
+        """model: has the observation statistics; flat: parameters of `model`; compiler: compiles the functions."""
         self.env, self.cfg = env, cfg
         self._critic_obs = env.critic_obs if cfg.asymmetric_critic else env.obs
         self._final_critic_obs = env.final_critic_obs if cfg.asymmetric_critic else env.final_obs
