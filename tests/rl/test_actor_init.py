@@ -7,6 +7,7 @@ import json
 import pytest
 import torch
 from test_shac import SmoothPushTask
+from test_train import final_state, make_env
 
 from jumper_warp.rl.actor_init import PRIOR_ITERATIONS, apply_actor_init, make_actor_init
 from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
@@ -52,16 +53,6 @@ def cfg(tmp_path):
     """Settings of one iteration from the policy "pusher", with a negligible learning rate."""
     ppo = dataclasses.replace(SMALL, lr=1e-9, min_lr=1e-9, max_lr=1e-9)
     return push_cfg(tmp_path, max_iterations=1, log_interval=1, ppo=ppo, init_policy="pusher")
-
-
-def make_env(num_envs, seed, device):
-    """Return the task with episodes of one iteration."""
-    return PushTask(num_envs, seed, device, episode_length=SMALL.num_steps)
-
-
-def model_of(result):
-    """Return the model's state_dict in the last checkpoint of a `TrainResult`."""
-    return load_checkpoint(result.folder / CHECKPOINTS / f"iteration_{result.iteration:06d}.pt")["ppo"]["model"]
 
 
 # ---------------------------------------------------------------- layers of a symmetric actor
@@ -221,7 +212,7 @@ def test_training_starts_from_a_policy_and_logs_its_name(cfg, capsys, trainer, e
     cfg = dataclasses.replace(cfg, trainer=trainer, shac=dataclasses.replace(cfg.shac, lr=1e-9))
     model = actor()
     result = train(cfg, env, actor_init=actor_init_of(model))
-    model_state, stderr = model_of(result), capsys.readouterr().err.splitlines()
+    model_state, stderr = final_state(result)["ppo"]["model"], capsys.readouterr().err.splitlines()
     assert stderr[1] == "starts from pusher"
     torch.testing.assert_close(model_state["actor.0.weight"], model.actor[0].weight.data, atol=1e-6, rtol=0.0)
     torch.testing.assert_close(model_state["log_std"], torch.zeros(1), atol=1e-6, rtol=0.0)
@@ -237,7 +228,7 @@ def test_resume_uses_the_checkpoint_and_keeps_the_initial_policys_name(cfg, caps
     resumed = dataclasses.replace(cfg, init_policy=None, resume=str(first.folder), max_iterations=2)
     second = train(resumed, make_env)
     assert "starts from" not in capsys.readouterr().err
-    assert model_of(second)["obs_moments.count"] == (PRIOR_ITERATIONS + 2) * 32 * SMALL.num_steps
+    assert final_state(second)["ppo"]["model"]["obs_moments.count"] == (PRIOR_ITERATIONS + 2) * 32 * SMALL.num_steps
     assert json.loads((second.folder / CONFIG).read_text())["train"]["init_policy"] == "pusher"
 
 

@@ -1,5 +1,3 @@
-"""Separate observations of actor and critic: the toy task's critic also gets the distance from the origin."""
-
 import dataclasses
 
 import pytest

@@ -1,5 +1,3 @@
-"""Saving, choosing and refusing checkpoint files."""
-
 import json
 import os
 import pickle

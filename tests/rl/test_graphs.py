@@ -1,5 +1,3 @@
-"""A failed capture of a CUDA graph."""
-
 import pytest
 
 from jumper_warp.rl import graphs

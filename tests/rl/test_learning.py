@@ -1,5 +1,3 @@
-"""Short training of the vertical jump."""
-
 import dataclasses
 import json
 

@@ -1,5 +1,3 @@
-"""Distributions, running statistics and observation clean-up against torch, NumPy and hand numbers."""
-
 import numpy as np
 import pytest
 import torch

@@ -1,5 +1,3 @@
-"""PPO on the toy task: against rsl-rl's PPO and hand numbers, learning, divergence, ranks and saving."""
-
 import dataclasses
 
 import pytest

@@ -1,5 +1,3 @@
-"""CPU threads of torch in a training process."""
-
 import dataclasses
 
 import pytest

@@ -1,5 +1,3 @@
-"""Mirror-symmetric actors, with the mirror maps of the walking task and of the toy task (x to -x)."""
-
 import dataclasses
 import json
 

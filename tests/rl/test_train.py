@@ -1,5 +1,3 @@
-"""Trainings of the toy task: files, resuming, signals, failures, several processes, and rsl-rl."""
-
 import dataclasses
 import json
 import math

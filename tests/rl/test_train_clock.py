@@ -4,9 +4,9 @@ import dataclasses
 import time
 
 import pytest
+from test_train import final_state
 
-from jumper_warp.rl.checkpoint import load_checkpoint
-from jumper_warp.rl.runner import CHECKPOINTS, train
+from jumper_warp.rl.runner import train
 from toy_task import SMALL, PushTask, push_cfg
 
 
@@ -14,11 +14,6 @@ from toy_task import SMALL, PushTask, push_cfg
 def cfg(tmp_path):
     """Settings of up to 100 iterations of 16 steps; every second one is logged and saved."""
     return push_cfg(tmp_path / "logs", max_iterations=100)
-
-
-def saved_seconds(result):
-    """Return the training time [s] in the last checkpoint of a `TrainResult`."""
-    return load_checkpoint(result.folder / CHECKPOINTS / f"iteration_{result.iteration:06d}.pt")["seconds"]
 
 
 class ClockedTask(PushTask):
@@ -45,10 +40,10 @@ def test_time_limit_counts_from_the_end_of_the_first_iteration(cfg, monkeypatch)
     limited = dataclasses.replace(cfg, max_seconds=60.0)
     result = train_clocked(monkeypatch, limited, [500.0] + [1.0] * 79)  # 5 iterations of 16 steps; the first compiles
     assert (result.iteration, result.seconds) == (5, 515.0 + 4 * 16.0)
-    assert (result.metrics["Perf/elapsed_s"], saved_seconds(result)) == (64.0, 64.0)
+    assert (result.metrics["Perf/elapsed_s"], final_state(result)["seconds"]) == (64.0, 64.0)
     longer = dataclasses.replace(limited, max_seconds=80.0, resume=str(result.folder))
     resumed = train_clocked(monkeypatch, longer, [700.0] + [1.0] * 31)  # one warm-up iteration, and one of 16 s
-    assert (resumed.iteration, saved_seconds(resumed)) == (7, 80.0)
+    assert (resumed.iteration, final_state(resumed)["seconds"]) == (7, 80.0)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,3 @@
-"""Logging of a training: full disks, broken pipes, non-finite metrics, and resumed runs."""
-
 import contextlib
 import dataclasses
 import json

@@ -1,5 +1,3 @@
-"""Estimate of a training's memory against the arrays of environment and PPO, and refused trainings."""
-
 import dataclasses
 import os
 

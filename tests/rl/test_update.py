@@ -43,7 +43,7 @@ def reference_losses(model, part, old_log_std, cfg):
 def reference_update(model, batch, old_log_std, orders, cfg):
     """Run Adam steps with clipped gradients for all minibatches; return the optimiser and each minibatch's losses.
 
-    orders: (epochs, batch_size) indices of samples. Losses: as `reference_losses`, then gradient norms of actor, critic.
+    orders: (epochs, batch_size) indices of samples. Losses: `reference_losses`, then gradient norms of actor, critic.
     """
     actor, critic = [*model.actor.parameters(), model.log_std], list(model.critic.parameters())
     optimiser = torch.optim.Adam([*actor, *critic], lr=cfg.lr)
@@ -67,7 +67,7 @@ def reference_update(model, batch, old_log_std, orders, cfg):
 
 
 def updated_ppo(cfg, device="cpu"):
-    """Return PPO after an update on synthetic samples, the model before it, the samples, and orders (epochs, samples)."""
+    """Return PPO after an update on synthetic samples, the model before, the samples, their orders per epoch."""
     torch.manual_seed(0)
     ppo = Ppo(PushTask(WORLDS, device=device), cfg)
     fill(ppo, slice(None), WORLDS)
