@@ -40,6 +40,7 @@ class _GraphBuilder:
     """Collects the nodes and constants of an ONNX graph; every method returns the name of its output."""
 
     def __init__(self) -> None:
+        """Begin with an empty graph."""
         self.nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
 

@@ -47,9 +47,9 @@ class SkillPolicies:
         self.policies = [open_policy(source) for source in sources]
         self.tasks = [task_of_policy(policy) for policy in self.policies]
         suites = (("velocity",), ("apex_height",), ("landing_position", "omnidirectional"))
-        for task, names in zip(self.tasks, suites, strict=True):
-            if task.evaluation_suite not in names:
-                needed = " or ".join(names)
+        for task, accepted in zip(self.tasks, suites, strict=True):
+            if task.evaluation_suite not in accepted:
+                needed = " or ".join(accepted)
                 raise PolicyError(f"this needs a policy that is evaluated by {needed}, got one of {task.name}")
         self.skills, self.handovers = self._skills_and_handovers(Conditions())
 

@@ -26,8 +26,9 @@ class Stopwatch:
     """Measures the device time of the parts of an iteration (lap); it synchronises with the device only in `read`."""
 
     def __init__(self, device: torch.device) -> None:
+        """device: whose time is measured, by CUDA events on a GPU and the host's clock on a CPU."""
         self._cuda, self._since = device.type == "cuda", time.perf_counter()
-        self._laps: list[list[Any]] = []
+        self._laps: list[list[Any]] = []  # marks of each lap: CUDA events, or times [s]
 
     def start(self) -> None:
         """Begin a lap, and its first part."""

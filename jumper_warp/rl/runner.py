@@ -322,6 +322,7 @@ class _NoLog:
     """Stands in for `TrainingLog` on all ranks but 0, and discards everything."""
 
     def __enter__(self) -> _NoLog:
+        """Return this log."""
         return self
 
     def __exit__(self, *_: object) -> None:

@@ -11,7 +11,7 @@ def failing_capture(monkeypatch):
     def refuse(*_, **__):
         raise RuntimeError("operation not permitted when stream is capturing\nand more")
 
-    class Cuda:
+    class Cuda:  # every other attribute is a function that does nothing
         CUDAGraph, graph = object, staticmethod(refuse)
 
         def __getattr__(self, name):

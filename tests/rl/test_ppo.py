@@ -250,6 +250,7 @@ class NoHost(TorchDispatchMode):
     refused = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "equal")
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        """Run an operator of torch unless it is refused; boolean indices are, since their result's shape varies."""
         name = func.overloadpacket.__name__
         assert name not in self.refused, name
         if name in ("index", "index_put", "index_put_"):

@@ -170,12 +170,12 @@ def test_refuses_symmetry_for_a_task_without_mirror_map_in_one_line(capsys, monk
     with pytest.raises(SystemExit):
         main(["train", "hold-height", "--ppo.symmetry", "actor", "--num-envs", "8", "--max-iterations", "1"])
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and "hold-height policy: the mirror image of" in lines[0]
+    assert len(lines) == 1 and "hold-height actor: the mirror image of" in lines[0]
 
 
 def test_refuses_symmetry_for_an_env_without_mirror_map_or_of_another_size():
     class Plain(PushTask):
-        mirror = None
+        mirror = None  # the environment defines no mirror map
 
     class WrongSize(PushTask):
         def mirror(self, what):

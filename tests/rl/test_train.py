@@ -144,7 +144,7 @@ def test_resume_latest_raises_without_a_run(cfg):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signal_finishes_the_iteration_saves_and_prints_the_resume_command(cfg, number, capsys):
-    class SignallingTask(PushTask):
+    class SignallingTask(PushTask):  # sends the signal to this process
         def step(self, action):
             super().step(action)
             if self.steps == 40:  # in the third iteration of 16 steps
@@ -162,7 +162,7 @@ def test_signal_finishes_the_iteration_saves_and_prints_the_resume_command(cfg, 
 
 
 def test_second_interrupt_raises_immediately(cfg):
-    class InterruptingTask(PushTask):
+    class InterruptingTask(PushTask):  # sends Ctrl-C to this process at every step
         def step(self, action):
             super().step(action)
             os.kill(os.getpid(), signal.SIGINT)
@@ -180,7 +180,7 @@ def test_time_limit_ends_the_training_with_a_checkpoint(cfg):
 
 
 def test_failed_save_is_reported_and_training_continues(cfg, capsys):
-    class BlockingTask(PushTask):
+    class BlockingTask(PushTask):  # its metrics are read before each checkpoint
         def metrics(self):
             for folder in cfg.log_root.glob("push/*"):
                 (folder / CHECKPOINTS).touch()  # a file where the folder should go

@@ -20,6 +20,7 @@ class ClockedTask(PushTask):
     """Task whose steps advance the clock `now` by successive `durations` [s]; IndexError when they run out."""
 
     def __init__(self, *args, durations, **arguments):
+        """durations: of the steps, in order [s]; other arguments: as for `PushTask`."""
         super().__init__(*args, **arguments)
         self.durations, self.now = list(durations), 1000.0
 

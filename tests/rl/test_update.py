@@ -223,6 +223,7 @@ def test_compiled_minibatch_agrees_with_eager():
 
 def test_failed_compilation_runs_eagerly_and_warns_once(capsys, monkeypatch):
     def trained(mode):
+        """Return the parameters after one iteration with `PpoCfg.compile` set to mode."""
         torch.manual_seed(0)
         ppo = Ppo(PushTask(WORLDS), dataclasses.replace(CFG, compile=mode))
         ppo.env.reset()
