@@ -90,13 +90,18 @@ def of_tensor(change):
     return lambda value: change(value.clone()) if isinstance(value, torch.Tensor) else change(torch.zeros(3))
 
 
+def negated(x):
+    """Return -x, or the inverse of a bool tensor."""
+    return ~x if x.dtype == torch.bool else -x
+
+
 JUNK = [None, True, -1, 2**70, 1.5, float("inf"), "late", "", b"\0", [], {}, [1], {"a": 1}, {3: {}}, torch.zeros(0)]
 CHANGES = {
     "removed": lambda value: REMOVED,
     **{f"{junk!r}": (lambda value, junk=junk: junk) for junk in JUNK},
-    "nan": of_tensor(lambda x: torch.full_like(x, float("nan")) if x.is_floating_point() else -x),
+    "nan": of_tensor(lambda x: torch.full_like(x, float("nan")) if x.is_floating_point() else negated(x)),
     "infinite": of_tensor(lambda x: x + float("inf") if x.is_floating_point() else x + 100),
-    "negative": of_tensor(lambda x: -x.double().abs().sub(-1.0).to(x.dtype)),
+    "negative": of_tensor(lambda x: negated(x.double().abs().sub(-1.0).to(x.dtype))),
     "flat": of_tensor(lambda x: x.flatten()),
     "one less": of_tensor(lambda x: x.flatten()[:-1]),
     "one more axis": of_tensor(lambda x: x[None]),
