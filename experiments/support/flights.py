@@ -267,7 +267,7 @@ class FlightRun(Run):
         tasks, handovers = flight_skills(*(conditions.applied(task) for task in self.tasks))
         env = Env(
             tasks, count, seed=conditions.seed, device=conditions.device, solver=conditions.solver,
-            randomize=conditions.draws, noise=conditions.noise, auto_reset=False, threads=conditions.threads,
+            randomize=conditions.sets_parameters, noise=conditions.noise, auto_reset=False, threads=conditions.threads,
             handovers=handovers,
         )  # fmt: skip
         for policy in (self.turn, self.landing):

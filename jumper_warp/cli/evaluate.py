@@ -34,7 +34,7 @@ SUITE = "--suite"
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """Run `jumper evaluate` with the given arguments; modules: the user's, for tasks outside the project.
 
-    Raises UsageError or OSError: the policy or a flag is invalid. Exits as tyro does.
+    args: the policy, then flags. Raises InputError or OSError: the policy or a flag is invalid. Exits as tyro does.
     """
     policy = policy_of("evaluate", ABOUT, args)
     from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
@@ -47,7 +47,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 
 def run_suite(opened: EvaluationRun, args: Sequence[str]) -> None:
-    """Run the suite that follows --suite. Raises UsageError: the policy's task has no suite of this name."""
+    """Run the suite named after --suite in args (policy, then flags). Raises UsageError: there is no such suite."""
     from jumper_warp.evaluation.suites import suites_for
 
     flag = args.index(SUITE)
@@ -60,7 +60,10 @@ def run_suite(opened: EvaluationRun, args: Sequence[str]) -> None:
 
 
 def policy_of(command: str, about: str, args: Sequence[str]) -> str:
-    """Return the first argument, the policy; prints the general help and exits if it is --help. Raises UsageError."""
+    """Return the first argument, the policy; print the general help and exit with 0 if it is --help.
+
+    about: text for the help. Raises UsageError: the first argument is missing or another flag.
+    """
     if args and args[0] in ("-h", "--help"):
         print(f"{HELP.format(command=command, about=about)}\n\n{TASK_MODULE_HELP}")
         raise SystemExit(0)
@@ -81,21 +84,15 @@ def parse(
 ) -> Any:
     """Parse the flags of a command on an opened policy into settings; exits as tyro does.
 
-    kind: generic dataclass of the settings. flags_of: returns the flags of the task's evaluation, with their defaults.
-    Raises UsageError: a flag is not one of the policy's task, or a setting is out of range.
+    kind: generic dataclass of the settings, such as `EvaluateCfg`. flags_of: returns the defaults of the task's flags.
+    Raises UsageError: a flag belongs to other tasks only, or a setting is out of range.
     """
     flags, about = flags_of(opened.evaluation), kind.__doc__
     if hasattr(flags, "height_range"):
         args = join_height_range(args, flags.height_range)
-    cfg, unknown = parse_flags(
-        kind[type(flags)],
-        f"{command} {opened.source}",
-        args,
-        description=about,
-        default=kind(flags),
-        return_unknown_args=True,
-    )
+    program, settings = f"{command} {opened.source}", {"description": about, "default": kind(flags)}
+    cfg, unknown = parse_flags(kind[type(flags)], program, args, return_unknown_args=True, **settings)
     if unknown:
-        what = f"{unknown[0]} is not for policies of {opened.task.name}"
-        raise UsageError(f"{what}; jumper {command} {opened.source} --help shows what is")
+        message = f"{unknown[0]} is not for policies of {opened.task.name}"
+        raise UsageError(f"{message}; jumper {program} --help shows the flags that are")
     return cfg

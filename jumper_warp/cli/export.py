@@ -25,20 +25,19 @@ class ExportCfg:
     overwrite: bool = False
     """Replace an existing policy with its metrics and README."""
     blend: tuple[str, float] | None = None
-    """Another policy and its weight, 0 to 1, in the mean of both networks' weights; useful if one was trained further
-    from the other."""
+    """Name or folder of a second policy, and its fraction, 0 to 1, in the weighted mean of both networks."""
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Run `jumper export` with the given arguments; raises as `export`. modules: not needed."""
+    """Run `jumper export` with the given arguments; raises as `export`. modules: unused."""
     export(parse(ExportCfg, "export", args))
 
 
 def export(cfg: ExportCfg) -> Path:
     """Write the policy's folder or ONNX file, print its path and return it.
 
-    Raises PolicyError: the source cannot be used, two policies cannot be blended, the folder has a file's name, or it
-    exists and is not to be overwritten. CheckpointError: the checkpoint cannot be used.
+    Raises PolicyError: the source cannot be used, two policies cannot be blended, the folder has a file's suffix, or
+    exists and `overwrite` is not set. CheckpointError: the checkpoint cannot be used.
     """
     from jumper_warp.policies.blend import blend
     from jumper_warp.policies.folder import checked_folder, save_policy

@@ -28,9 +28,9 @@ COMMANDS = {
     "sysid": "Identify the robot's parameters from recorded motions.",
     "list": "Show the tasks and the project's policies.",
 }
-"""Each is a module of `jumper_warp.cli` with run(args, modules)."""
+"""Help text by command; each command is a module of `jumper_warp.cli` with run(args, modules)."""
 CODEGEN = re.compile(r'Error while parsing function "(\w+)" at (.+):\d+:')
-"""Function and file in Warp's message about a kernel that does not compile; the last match is at fault."""
+"""Function and file in Warp's message about a kernel that does not compile; the last match has the error."""
 TASK_MODULE = "--task-module"
 TASK_MODULE_HELP = f"""\
 Every command takes {TASK_MODULE} FILE_OR_MODULE, any number of times: a FILE.py or an installed module
@@ -64,7 +64,10 @@ def main(argv: Sequence[str] | None = None) -> None:
 
 
 def dispatch(args: Sequence[str]) -> None:
-    """Run the command named by the first argument. Raises UsageError for an unknown one, and as the command does."""
+    """Run the command named by the first argument; errors in the user's files become InputError.
+
+    Raises UsageError: there is no such command. Other exceptions are the command's.
+    """
     name = args[0]
     if name not in COMMANDS:
         raise UsageError(f"no command {name!r:.60}; there are {', '.join(COMMANDS)}")
@@ -78,13 +81,13 @@ def dispatch(args: Sequence[str]) -> None:
         importlib.import_module(f"jumper_warp.cli.{name}").run(rest, modules)
     except Exception as error:
         user_files = {os.path.abspath(path) for path in (*files, *(module.__file__ for module in modules)) if path}
-        if fault := fault_in(user_files, error):
-            raise InputError(fault) from error
+        if message := user_file_error(user_files, error):
+            raise InputError(message) from error
         raise
 
 
-def fault_in(files: Collection[str], error: Exception) -> str | None:
-    """Return one line about an exception raised in one of the user's files; None if it was raised elsewhere."""
+def user_file_error(files: Collection[str], error: Exception) -> str | None:
+    """Return a message with file and line of an exception raised in one of `files` (absolute paths), else None."""
     functions = CODEGEN.findall(str(error))
     if functions and os.path.abspath(functions[-1][1]) in files:
         name, path = functions[-1]
@@ -96,10 +99,7 @@ def fault_in(files: Collection[str], error: Exception) -> str | None:
 
 
 def split_task_modules(args: Sequence[str]) -> tuple[list[str], list[str]]:
-    """Split the arguments into those without --task-module, and the names of the modules that it gives.
-
-    Raises UsageError: a name is missing.
-    """
+    """Return the arguments without --task-module, and its values. Raises UsageError: a value is missing."""
     rest, names, remaining = [], [], iter(args)
     for arg in remaining:
         flag, equals, name = arg.partition("=")
@@ -114,9 +114,9 @@ def split_task_modules(args: Sequence[str]) -> tuple[list[str], list[str]]:
 
 
 def parse(kind: Any, command: str, args: Sequence[str], **settings: Any) -> Any:
-    """Parse a command's arguments into its settings; exits with USAGE_ERROR if they are invalid.
+    """Return a command's settings parsed from its arguments; exits with USAGE_ERROR if they are invalid.
 
-    kind: dataclass of the settings. settings: keyword arguments of `tyro.cli`; description: of kind by default.
+    kind: dataclass of the settings. settings: keyword arguments of `tyro.cli`; default description: kind's docstring.
     """
     import tyro
 

@@ -20,7 +20,8 @@ SCRIPT = "--script"
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """Run `jumper play` with the given arguments; modules: the user's, for tasks outside the project.
 
-    Raises UsageError or OSError: the policy or a flag is invalid. Exits as tyro does.
+    args: the policy, then flags, or flags with --script. Raises InputError or OSError: the policy, script or a flag is
+    invalid. Exits as tyro does.
     """
     if args and args[0].startswith("-") and any(arg.partition("=")[0] == SCRIPT for arg in args):
         from jumper_warp.evaluation.commands import ScriptCfg, play_script

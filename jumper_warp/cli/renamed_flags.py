@@ -34,40 +34,40 @@ RENAMED = {
 
 
 def flag_names(cfg: Any) -> set[str]:
-    """Return the flags, without dashes, that tyro makes of a dataclass or of an instance as its default."""
+    """Return the names, without leading dashes, of tyro's flags for a dataclass or an instance; nested ones dotted."""
     names, hints = set(), get_type_hints(cfg if isinstance(cfg, type) else type(cfg), include_extras=True)
     for spec in dataclasses.fields(cfg):
-        part, name = getattr(cfg, spec.name, spec.default_factory), spec.name.replace("_", "-")
-        if dataclasses.is_dataclass(part):
+        value, name = getattr(cfg, spec.name, spec.default_factory), spec.name.replace("_", "-")
+        if dataclasses.is_dataclass(value):
             marks = getattr(hints[spec.name], "__metadata__", ())
             prefix = "" if any(getattr(mark, "name", None) == "" for mark in marks) else f"{name}."
-            names |= {prefix + nested for nested in flag_names(part)}
+            names |= {prefix + nested for nested in flag_names(value)}
         else:
             names.add(name)
     return names
 
 
 def name_of(arg: str) -> str:
-    """Return the name of a flag without dashes, `no-` and value, words with dashes between; "" if it is none."""
+    """Return the name of a flag, as `ppo.init-std` of `--ppo.no-init_std=1`; "" if the argument is no flag."""
     match = re.match(r"--([^=]+)", arg)
     return re.sub(r"(^|\.)no-", r"\1", match[1].replace("_", "-")) if match else ""
 
 
 def use_new_names(args: Sequence[str], cfg: Any) -> list[str]:
-    """Return the arguments with the new names of renamed flags; prints a line on standard error for each old one.
+    """Return a copy of the arguments with renamed flags under their new names; prints each renaming on standard error.
 
-    cfg: the dataclass that the arguments are for, or an instance. A flag that it has is left alone.
+    cfg: dataclass of the arguments' settings, or an instance; a flag of it is never renamed.
     Raises InputError: a flag is given under both names.
     """
-    given, new_args = [name_of(arg) for arg in args], list(args)
-    if RENAMED.keys().isdisjoint(given):
+    arg_names, new_args = [name_of(arg) for arg in args], list(args)
+    if RENAMED.keys().isdisjoint(arg_names):
         return new_args
     current, renamed = flag_names(cfg), {}
-    for i, old in enumerate(given):
+    for i, old in enumerate(arg_names):
         new = next((name for name in RENAMED.get(old, "").split() if name in current), None)
         if new is None or old in current:
             continue
-        if name_of(f"--{new}") in given:
+        if name_of(f"--{new}") in arg_names:
             raise InputError(f"--{old} is now --{new}: give only --{new}")
         flag, equals, value = args[i].partition("=")
         negated = re.search(r"(--|\.)no-", flag.replace("_", "-")) is not None
@@ -80,9 +80,9 @@ def use_new_names(args: Sequence[str], cfg: Any) -> list[str]:
 
 
 def join_height_range(args: Sequence[str], default: tuple[float, float]) -> list[str]:
-    """Return the arguments with --height-range for --lower and --upper; default [m]: the range where one is missing.
+    """Return the arguments with --height-range LOWER UPPER in place of --lower and --upper.
 
-    Raises InputError: both kinds are given.
+    default: (lower, upper) [m], for a missing one. Raises InputError: --height-range is given too.
     """
     if not any(re.match("--(lower|upper)(=|$)", arg) for arg in args):
         return list(args)

@@ -21,22 +21,21 @@ if TYPE_CHECKING:
 
 
 def loaded_modules() -> list[ModuleType]:
-    """Return all imported modules; those of a registered task's functions are among them."""
+    """Return all imported modules, which include the modules of every registered task's functions."""
     return [module for module in sys.modules.values() if isinstance(module, ModuleType)]
 
 
 def settings_of_run(checkpoint: Checkpoint, cfg: TrainCfg) -> tuple[dict[str, Any], TaskCfg]:
     """Return the settings of a checkpoint's run, by field of `jumper_warp.cli.train.TrainArgs`, and its task.
 
-    cfg: defaults for settings that the run lacks and for those of the session, see SESSION.
-
+    cfg: task and defaults, for settings that the run lacks and settings in SESSION.
     Raises CheckpointError: the run is of another task or version, or its settings cannot be used.
     """
     saved = _config(checkpoint, cfg.task)
     try:
         env, train = saved["env"], {name: v for name, v in saved["train"].items() if name not in SESSION}
         settings = {name: env[name] for name in ("randomize", "noise") if name in env}
-        settings |= {"cfg": with_saved(cfg, train), "checkpoint": checkpoint}
+        settings |= {"cfg": with_saved_settings(cfg, train), "checkpoint": checkpoint}
         settings["solver"] = "mujoco" if env.get("solver") == "SolverMuJoCo" else "jumper"
         settings["robot_of_run"] = RobotOverlay.from_json(env["robot"]) if "robot" in env else None
         return settings, restored_task(saved, loaded_modules(), leave_out=())
@@ -45,7 +44,7 @@ def settings_of_run(checkpoint: Checkpoint, cfg: TrainCfg) -> tuple[dict[str, An
 
 
 def _config(checkpoint: Checkpoint, task: str) -> dict[str, Any]:
-    """Return a checkpoint's configuration. Raises CheckpointError: it is of another task or version."""
+    """Return a checkpoint's configuration. Raises CheckpointError: it has another task name or version, or none."""
     path = checkpoint.path
     try:
         saved = json.loads(checkpoint.state["config"])
@@ -60,12 +59,15 @@ def _config(checkpoint: Checkpoint, task: str) -> dict[str, Any]:
     return saved
 
 
-def with_saved(settings: Any, saved: dict[str, Any]) -> Any:
-    """Return a dataclass with the saved values of its fields. Raises ValueError or TypeError: a value is invalid."""
+def with_saved_settings(settings: Any, saved: dict[str, Any]) -> Any:
+    """Return a copy of a dataclass with the values in `saved`, by field, nested dicts for nested dataclasses.
+
+    Lists become tuples. Raises ValueError or TypeError: a value is invalid.
+    """
     new = {}
     for name, default in vars(settings).items():
         if name in saved:
             value = saved[name]
-            value = with_saved(default, value) if dataclasses.is_dataclass(default) else value
+            value = with_saved_settings(default, value) if dataclasses.is_dataclass(default) else value
             new[name] = tuple(value) if isinstance(value, list) else value
     return dataclasses.replace(settings, **new)

@@ -123,7 +123,7 @@ class ActuatorCfg:
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """Run `jumper sysid` with the given arguments: identify parameters, plan motions (excite), or fit one motor.
 
-    Raises InputError or OSError with one line: data or a flag cannot be used. Exits where tyro does.
+    modules: unused. Raises InputError or OSError: data or a flag is invalid. Exits as tyro does.
     """
     if not args:
         raise UsageError("data comes first: jumper sysid DATA ... [flags]; jumper sysid --help lists the flags")
@@ -139,7 +139,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 
 def split_names(text: str) -> list[str]:
-    """Return the names of a list separated by commas."""
+    """Return the names in a comma-separated text; empty ones are dropped."""
     return [name for name in text.split(",") if name]
 
 
@@ -168,9 +168,9 @@ def sysid(cfg: SysidCfg) -> None:
     write_results(result, folder, f"jumper sysid of {', '.join(motion.name for motion in motions)}")
     table = Table("parameter", "unit", "described", "found", "95 %", box=None)
     rows = zip(result.parameters, result.values, result.intervals, result.identified, strict=True)
-    for parameter, value, (low, high), sure in rows:
+    for parameter, value, (low, high), identified in rows:
         row = (parameter.name, parameter.unit, f"{parameter.nominal:.5g}", f"{value:.5g}", f"{low:.5g} … {high:.5g}")
-        table.add_row(*row, style=None if sure else "dim")
+        table.add_row(*row, style=None if identified else "dim")
     Console().print(table)
     wider = f"; intervals {result.mismatch:.3g} times wider for the model's errors" if result.mismatch != 1.0 else ""
     print(f"χ² {result.chi2:.4g} (described {result.nominal_chi2:.4g}), {result.effort.seconds:.1f} s{wider}")
@@ -182,7 +182,7 @@ def sysid(cfg: SysidCfg) -> None:
 
 
 def excite(cfg: ExciteCfg) -> None:
-    """Plan motions, record them on a simulated robot and write them; raises as `run`."""
+    """Plan motions, record them on a simulated robot, and write npz files and excite.json; raises as `run`."""
     import numpy as np
 
     from jumper_warp.identification.excitation import Scorer, choose, record_motions
@@ -214,7 +214,7 @@ def excite(cfg: ExciteCfg) -> None:
 
 
 def characterise(cfg: ActuatorCfg) -> None:
-    """Fit one motor, write and print the result; raises as `run`."""
+    """Fit one motor's constants, print them with 95 % intervals, and write actuator.json; raises as `run`."""
     from jumper_warp.identification.actuators import characterise_motor, load_bench
     from jumper_warp.utils.output import output_dir
 

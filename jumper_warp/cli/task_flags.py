@@ -2,8 +2,8 @@
 
     --env.rewards.jump-height.weight 30 --env.observations.actor.lin-vel.noise 0.1 --env.reset.tilt 3
 
-They are derived from the task itself. A term's number has the flag of its dotted name (`jumper_warp.tasks.params`),
-without the term where a section has only one, as `--env.curriculum.tolerance`; everything else has its field's.
+They are derived from the task. The flag of a term's number is its dotted name (`jumper_warp.tasks.params`), without the
+term's name in a section with one term, as `--env.curriculum.tolerance`; other settings have the name of their field.
 """
 
 from __future__ import annotations
@@ -25,20 +25,22 @@ from jumper_warp.tasks.terms import Term
 from jumper_warp.utils.errors import InputError
 
 NO_SOURCE = __package__
-"""Module of the dataclasses made here: tyro searches its source, which is empty and therefore fast to parse."""
+"""Module name of the dataclasses made here: tyro parses its source, which is fast since the file is empty."""
 
 
 class Flag(NamedTuple):
     """A setting or a group of settings, as a field of a dataclass for tyro."""
 
-    kind: Any
-    """Its type, for tyro."""
-    value: Any
-    about: str | None = None
+    kind: Any  # type of the setting, for tyro
+    value: Any  # default; of a group, an instance of its dataclass
+    about: str | None = None  # help text
 
 
 def flags_of(task: TaskCfg) -> Any:
-    """Return a task's settings as an instance of a dataclass for tyro. Raises InputError: two flags have one name."""
+    """Return a task's settings as an instance of a nested dataclass for tyro; inverted by `with_flags`.
+
+    Raises InputError: two flags have one name.
+    """
     flags = _flag_of_dataclass(task, task.name)
     return flags and flags.value
 
@@ -64,7 +66,7 @@ def field_docs(kind: type) -> dict[str, str]:
 
 
 def _flag(value: Any, hint: Any, where: str) -> Flag | None:
-    """Return the flag or group of flags of a part of a task; None if it has no flags."""
+    """Return the flag or group of flags of a part of a task, None if it has none; where: its path, for messages."""
     if isinstance(value, Term):
         return _flag_of_term(value, where)
     if isinstance(value, Reset):
@@ -113,12 +115,15 @@ def _group(about: str | None, flags: dict[str, Flag], where: str) -> Flag:
 
 
 def _members(group: Any) -> dict[str, Any]:
-    """Return the values of a group by flag name."""
+    """Return the values of a group, an instance of a dataclass by `_group`, by flag name."""
     return {spec.metadata["flag"]: getattr(group, spec.name) for spec in dataclasses.fields(group)}
 
 
 def with_flags(value: Any, flags: Any) -> Any:
-    """Return a task, or a part of it, with the values of flags from `flags_of`. Raises ValueError as `TaskCfg`."""
+    """Return a copy of a task, or a part of it, with the values in flags (result of `flags_of`, modified by tyro).
+
+    Raises InputError as `TaskCfg`.
+    """
     if isinstance(value, Reset):
         return dataclasses.replace(value, settings=with_flags(value.settings, flags))
     if not (parts := _parts(value)):

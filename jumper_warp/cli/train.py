@@ -57,8 +57,7 @@ class TrainArgs:
 def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
     """Parse the arguments of `jumper train` into settings and the task; exits after help or usage, and as tyro does.
 
-    A resumed run has its saved settings where no flag overrides them.
-
+    args: the task, then flags. With --resume the saved settings of the run are the defaults.
     Raises InputError: the task is missing, unknown or given twice, a setting is out of range, or there is no such run.
     """
     names = ", ".join(task_names())
@@ -92,7 +91,10 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
 
 
 def parse_settings(task: TaskCfg, default: TrainArgs, args: Sequence[str]) -> tuple[Any, TaskCfg]:
-    """Parse arguments into the settings and the task changed by `--env`; exits as tyro does. Raises InputError."""
+    """Return the settings parsed from `args`, and the task changed by its --env flags; exits as tyro does.
+
+    Raises InputError: a setting is out of range.
+    """
     from jumper_warp.cli.task_flags import flags_of, with_flags
 
     flags = flags_of(task)
@@ -105,7 +107,7 @@ def parse_settings(task: TaskCfg, default: TrainArgs, args: Sequence[str]) -> tu
 
 
 def value_of(name: str, args: Sequence[str]) -> str | None:
-    """Return the last value of a flag in unparsed arguments; None if it is not given."""
+    """Return the last value of a flag (name with dashes) in unparsed arguments; None if it is not given."""
     value = None
     for arg, following in itertools.zip_longest(args, args[1:]):
         flag, equals, text = arg.partition("=")
@@ -115,7 +117,10 @@ def value_of(name: str, args: Sequence[str]) -> str | None:
 
 
 def overlay_in(args: Sequence[str]) -> RobotOverlay | None:
-    """Return the robot overlay of the flag --robot, None without it. Raises InputError or OSError: it is invalid."""
+    """Return the robot overlay of the flag --robot in unparsed arguments, None without it.
+
+    Raises InputError or OSError: the overlay is invalid.
+    """
     path = value_of("--robot", args)
     if path is None:
         return None
@@ -125,21 +130,25 @@ def overlay_in(args: Sequence[str]) -> RobotOverlay | None:
 
 
 def for_robot(task: TaskCfg, overlay: RobotOverlay | None) -> TaskCfg:
-    """Return the task with an overlay's randomisation ranges. Raises InputError: a range is impossible."""
+    """Return a copy of the task with an overlay's randomisation ranges. Raises InputError: a range is invalid."""
     if overlay is None:
         return task
     return dataclasses.replace(task, randomization=dataclasses.replace(task.randomization, **overlay.randomization))
 
 
 def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
-    """Return the function that makes a training's environment from num_envs, seed and device."""
+    """Return the function that makes a training's environment from num_envs, seed and device.
+
+    Raises InputError or OSError: the overlay is invalid; the function raises InputError: memory is too small.
+    """
     from jumper_warp.cli.training_memory import check_memory
     from jumper_warp.envs.env import Env
     from jumper_warp.robot.overlay import load_overlay
 
     overlay = args.robot_of_run if args.robot is None else load_overlay(args.robot)
 
-    def make(num_envs: int, seed: int, device: torch.device) -> VecEnv:
+    def make_env(num_envs: int, seed: int, device: torch.device) -> VecEnv:
+        """Return the environment, differentiable for trainer shac."""
         check_memory(task, args.cfg.ppo, args.solver, num_envs, device)
         settings: dict[str, Any] = {name: getattr(args, name) for name in ("solver", "randomize", "noise")}
         env = Env(task, num_envs, seed=seed, device=str(device), robot=overlay, **settings)
@@ -149,13 +158,13 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
 
         return cast("VecEnv", DifferentiableEnv(env))
 
-    return make
+    return make_env
 
 
 def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
-    """Return the command line without `--resume` and `--init-policy`, for a later resume.
+    """Return the command line of a training without --resume and --init-policy, for a later resume.
 
-    Modules are given by their file, those of a package by their name.
+    args: after `jumper train`. modules: each becomes a --task-module with its file, or its name if it is in a package.
     """
     kept, remaining = [], iter(args)
     for arg in remaining:
@@ -176,12 +185,13 @@ def check_saving(task: TaskCfg) -> None:
     from jumper_warp.tasks.saving import task_from_json, task_to_json
 
     if task_from_json(json.loads(json.dumps(task_to_json(task))), loaded_modules()) != task:
-        raise InputError(f"{task.name} would not come back as it is from what is saved with its policies")
+        raise InputError(f"{task.name} differs from the original after it is saved as JSON and loaded")
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
-    """Run `jumper train` with the given arguments; modules: the user's, whose tasks are registered already.
+    """Run `jumper train` with the given arguments, and print the run's folder on rank 0.
 
+    modules: the user's, whose tasks are registered already.
     Raises as `parse_train`, `jumper_warp.policies.warm_start.actor_init_from_policy` and `jumper_warp.rl.runner.train`.
     """
     args = [*args[:1], *use_new_names(args[1:], TrainArgs())]
@@ -193,19 +203,19 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     check_saving(task)
     if parsed.cfg.ppo.symmetry != "off":
         mirror_of(task, "actor")  # raises InputError where a term has no known mirror image
-    start = None
+    actor_init = None
     if parsed.cfg.init_policy and not parsed.checkpoint:
         from jumper_warp.policies.warm_start import actor_init_from_policy
 
-        start = actor_init_from_policy(parsed.cfg.init_policy, task, parsed.cfg.ppo)
-    first = os.environ.get("RANK", "0") == "0"
-    if first:
+        actor_init = actor_init_from_policy(parsed.cfg.init_policy, task, parsed.cfg.ppo)
+    is_rank_0 = os.environ.get("RANK", "0") == "0"
+    if is_rank_0:
         configure_device(parsed.cfg.device, parsed.cfg.threads)
     as_rsl_rl = None
     if parsed.cfg.trainer == "rsl-rl":
         from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl
-    make_env = env_maker(task, parsed)
-    result = train(parsed.cfg, make_env, command_line(args, modules), as_rsl_rl, start, parsed.checkpoint)
-    if first:
+    make_env, command = env_maker(task, parsed), command_line(args, modules)
+    result = train(parsed.cfg, make_env, command, as_rsl_rl, actor_init, parsed.checkpoint)
+    if is_rank_0:
         print(result.folder)
     return result

@@ -1,4 +1,4 @@
-"""Estimate the memory of a training, and refuse it before anything is built if there is too little."""
+"""Estimate of a training's memory, and its check before anything is built."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jumper_warp.sim.simulation import SolverName
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 
-NUM_ACTIONS = 12
+NUM_ACTIONS = 12  # motors
 BUILD_BYTES: dict[SolverName, int] = {"jumper": 70_000, "mujoco": 112_000}
 """[byte] Main memory for each world while the environment is built (`experiments/measure_memory.py`)."""
 ENV_BYTES: dict[SolverName, int] = {"jumper": 25_750, "mujoco": 71_400}
@@ -51,10 +51,9 @@ class MemoryPool(NamedTuple):
 def learning_need(cfg: PpoCfg, num_obs: int, num_critic_obs: int) -> MemoryNeed:
     """Return the device memory of PPO's networks and rollouts [byte].
 
-    num_obs, num_critic_obs: observations of a world for the actor and for the critic.
-
+    num_obs, num_critic_obs: sizes of the observations of actor and critic.
     The peak is in the critic's pass over the whole rollout: the buffers, the samples as rows with their orders, the
-    normalised observations with a copy of them, and the two widest layers.
+    normalised observations and a copy of them, and two layers of the greatest width.
     """
     critic_obs = num_critic_obs if cfg.asymmetric_critic else num_obs
     sizes = ((num_obs, *cfg.hidden, NUM_ACTIONS), (critic_obs, *cfg.hidden, 1))
@@ -68,12 +67,12 @@ def learning_need(cfg: PpoCfg, num_obs: int, num_critic_obs: int) -> MemoryNeed:
 
 def rollout_bytes(num_steps: int, num_obs: int, num_critic_obs: int) -> int:
     """Return the size of `RolloutBuffer` for each world [byte], without log_std."""
-    each = num_obs + 2 * num_critic_obs + 2 * NUM_ACTIONS + 3  # and one more of what follows the last step
-    return FLOAT_BYTES * (num_steps * each + num_obs + num_critic_obs)
+    per_step = num_obs + 2 * num_critic_obs + 2 * NUM_ACTIONS + 3  # reward, done, timeout
+    return FLOAT_BYTES * (num_steps * per_step + num_obs + num_critic_obs)  # observations after the last step
 
 
 def free_main_memory() -> int:
-    """Return the available main memory [byte]; all of it on systems that do not report this."""
+    """Return the available main memory [byte]; the total memory on systems without /proc/meminfo."""
     try:
         lines = Path("/proc/meminfo").read_text().splitlines()
         return next(1024 * int(line.split()[1]) for line in lines if line.startswith("MemAvailable:"))
@@ -82,9 +81,9 @@ def free_main_memory() -> int:
 
 
 def check_memory(task: TaskCfg, ppo: PpoCfg, solver: SolverName, num_envs: int, device: torch.device) -> None:
-    """Refuse a training whose worlds in this process do not fit into memory.
+    """Raise InputError unless the `num_envs` worlds of this process fit into free memory.
 
-    Raises InputError with the estimate, the free memory, and a number of worlds that fits.
+    The message has the estimate, the free memory [GB], and a number of worlds that fits.
     """
     num_obs, num_critic_obs = (max(end for _, end in task.layout(group).values()) for group in ("actor", "critic"))
     learning = learning_need(ppo, num_obs, num_critic_obs)

@@ -19,16 +19,19 @@ from jumper_warp.utils.errors import InputError
 COMMAND_BOUND = 4.0 * math.pi
 """[rad] Motor targets are clipped to ± this before the filter."""
 LAST_ACTION = "last_action"
-"""Term of the observation that `DeployedPolicy` fills in itself."""
+"""Observation term that `DeployedPolicy` computes, so that readings must not contain it."""
 
 
 class DeployedPolicy:
-    """One policy on one robot. `targets` runs a policy step: `observe`, `act` and `filter_targets`."""
+    """One policy on one robot; `targets` runs a policy step: `observe`, `act` and `filter_targets`.
+
+    Arrays with one value per motor, (12,), have the legs FL, FR, BL, BR in this order; each lateral, outer, inner.
+    """
 
     def __init__(self, file: str | Path) -> None:
         """Load `policy.onnx`; its metadata becomes `interface`, a dict of the fields of `PolicyInterface`.
 
-        Raises ValueError: the metadata has no observation layout.
+        Raises InputError, a ValueError: the metadata has no observation layout.
         """
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1  # more threads slow down small networks
@@ -38,39 +41,41 @@ class DeployedPolicy:
         if not self.interface.get("observation_layout"):
             raise InputError(f"{file}: no observation_layout in its metadata: export the policy again")
         self.layout = self.interface["observation_layout"]
-        self.scale = np.array(self.interface["action_scale"], dtype=np.float32)
-        self.default = np.array(self.interface["default_joint_pos"], dtype=np.float32)
+        self.scale = np.array(self.interface["action_scale"], dtype=np.float32)  # (12,) [rad] for an action of 1
+        self.default = np.array(self.interface["default_joint_pos"], dtype=np.float32)  # (12,) [rad]
         self.reset()
 
     def reset(self) -> None:
         """Clear last action and history; call it whenever the robot restarts."""
         self.action = np.zeros(len(self.scale), dtype=np.float32)
-        self._frames: dict[str, np.ndarray] = {}
+        self._frames: dict[str, np.ndarray] = {}  # (history, columns) of each term by name, oldest frame first
 
     def targets(self, readings: Mapping[str, Any]) -> np.ndarray:
         """Return the motor targets until the next policy step [rad], (12,); call it every `policy_dt`.
 
-        readings: each observation term but last_action, by name; `angle` without subtracting the default pose.
-        Raises ValueError: readings are missing, unknown, or of another size.
+        readings: sensor values of each observation term but last_action, by name; `angle`: (12,) [rad], the default
+        pose not subtracted; `rate`: (12,) [rad/s]. Raises InputError: one is missing, unknown, or of another size.
         """
         action = self.act(self.observe(readings))
         return self.filter_targets(self.default + self.scale * action, readings["angle"], readings["rate"])
 
     def observe(self, readings: Mapping[str, Any]) -> np.ndarray:
-        """Return the observation, (num_obs,), and advance the history by a policy step; arguments as for `targets`."""
+        """Return the observation, (num_obs,), and append the readings to the history; arguments as for `targets`."""
         different = sorted(set(readings) ^ (set(self.layout) - {LAST_ACTION}))
         if different:
             raise InputError(f"readings missing or unknown: {', '.join(different)}")
         return np.concatenate([self._term(name, term, readings) for name, term in self.layout.items()])
 
     def _term(self, name: str, term: Mapping[str, Any], readings: Mapping[str, Any]) -> np.ndarray:
-        """Return the columns of an observation term (an entry of `layout`), oldest frame first, at first all equal."""
+        """Append a reading, clipped and scaled, to a term's history, and return the history (history * width,).
+
+        The oldest frame is first; the first reading after `reset` fills all frames. term: entry of `layout`.
+        """
         value = self.action if name == LAST_ACTION else np.atleast_1d(np.asarray(readings[name], dtype=np.float32))
         width = (term["end"] - term["first"]) // term["history"]
         if value.shape != (width,):
             raise InputError(f"{name} takes {width} numbers, got an array of shape {value.shape}")
-        if name == "angle":
-            value = value - self.default
+        value = value - self.default if name == "angle" else value
         value = np.float32(term["scale"]) * np.clip(value, -term["clip"], term["clip"])
         frames = self._frames.get(name)
         past = np.tile(value, (term["history"] - 1, 1)) if frames is None else frames[1:]
@@ -85,7 +90,7 @@ class DeployedPolicy:
     def filter_targets(self, target: np.ndarray, angle: Any, rate: Any) -> np.ndarray:
         """Return motor targets [rad], (12,), limited near the joint limits (`kernels/actuation/command_filter.py`).
 
-        target, angle: (12,) [rad]; rate: (12,) [rad/s].
+        Each angle is limited, then each leg's sum of outer and inner angle. target, angle: (12,) [rad]; rate: [rad/s].
         """
         settings = self.interface["command_filter"]
         target = np.clip(target, -COMMAND_BOUND, COMMAND_BOUND).reshape(4, 3)
@@ -103,10 +108,12 @@ class DeployedPolicy:
 def limit_command(
     command: np.ndarray, pos: np.ndarray, vel: np.ndarray, limits: Mapping[str, float], settings: Mapping[str, Any]
 ) -> np.ndarray:
-    """Return commands [rad], pulled into the limits the sooner the joint would reach them; all arrays have one shape.
+    """Return commands [rad] with a fraction, `weight`, of their excess over the joint limits removed.
 
-    command, pos: [rad]; vel: [rad/s]; limits: lower, upper, lower_zone and upper_zone [deg]; settings: horizon [s] and
-    speed_floor [deg/s].
+    weight: 1 - (time until the joint reaches a limit) / horizon, in [0, 1]. Within the zone of a limit it is 1 for
+    commands toward the limit, else 0; beyond a limit it is 1.
+    command, pos [rad], vel [rad/s]: arrays of one shape. limits: lower, upper, and the widths lower_zone, upper_zone
+    [deg]. settings: horizon [s] and speed_floor, the least speed for the time to a limit [deg/s].
     """
     lower, upper, lower_zone, upper_zone = (
         np.float32(math.radians(limits[name])) for name in ("lower", "upper", "lower_zone", "upper_zone")
@@ -123,7 +130,10 @@ def limit_command(
 
 
 class JumpCommand:
-    """State of the observation term `jump_command` of vertical jumps: 1 from `request` until the landing, else 0."""
+    """State of the observation term `jump_command` of vertical jumps: 1 from `request` until the landing, else 0.
+
+    requested: a jump is commanded; in_flight: the robot has taken off and not landed.
+    """
 
     def __init__(self, takeoff_speed: float = 0.75) -> None:
         """Start without a request; takeoff_speed: least upward speed [m/s] that counts as a takeoff."""
@@ -134,10 +144,13 @@ class JumpCommand:
         """Request a jump."""
         self.requested = True
 
-    def update(self, up: float, paws_down: int) -> float:
-        """Return `jump_command` for `targets`; up: vertical velocity of the base in the world frame [m/s]."""
+    def update(self, vertical_velocity: float, paws_down: int) -> float:
+        """Return `jump_command`, 0 or 1, once a policy step.
+
+        vertical_velocity: of the base, world frame, upward positive [m/s]. paws_down: number of paws on the ground.
+        """
         if self.in_flight and paws_down > 0:
             self.requested, self.in_flight = False, False
-        elif paws_down == 0 and up > self._takeoff_speed:
+        elif paws_down == 0 and vertical_velocity > self._takeoff_speed:
             self.in_flight = True
         return float(self.requested)

@@ -14,25 +14,25 @@ from jumper_warp.rl.actor_init import rescale_inputs
 
 
 def blend(policy: Policy, other: Policy, fraction: float) -> Policy:
-    """Return the policy with weights (1 - fraction) policy + fraction other, and the normaliser of `policy`.
+    """Return the policy with the weights (1 - fraction) * policy + fraction * other, and the normaliser of `policy`.
 
-    The other's first layer is first rescaled to that normaliser. The configuration is that of `policy`, with the
-    fraction and the other's commit and iteration under `blended`.
-
+    The first layer of `other` is rescaled to that normaliser before. The configuration is a copy of `policy.config`
+    with the entry `blended`: the keys share (the fraction), and commit and iteration of `other`.
     fraction: 0 gives `policy`, 1 gives `other` within the limits of normalised observations.
-    Raises PolicyError: their interfaces differ, or the fraction is not in [0, 1].
+    Raises PolicyError: the interfaces differ, or the fraction is not in [0, 1].
     """
     if not 0.0 <= fraction <= 1.0:
-        raise PolicyError(f"the share of a blend must be from 0 to 1, got {fraction}")
+        raise PolicyError(f"the fraction of a blend must be from 0 to 1, got {fraction}")
     if policy.interface != other.interface:
         raise PolicyError("policies of a blend must have the same interface: observation, action and network sizes")
     other_layers = rescale_inputs(other.layers, other.mean, other.std, policy.mean, policy.std)
 
-    def mix(mine: torch.Tensor, theirs: torch.Tensor) -> torch.Tensor:
-        return (1.0 - fraction) * mine.double() + fraction * theirs
+    def interpolate(tensor: torch.Tensor, other_tensor: torch.Tensor) -> torch.Tensor:
+        """Return the weighted mean of two tensors of one shape, float64."""
+        return (1.0 - fraction) * tensor.double() + fraction * other_tensor
 
     pairs = zip(policy.layers, other_layers, strict=True)
-    layers = [(mix(w, other_w), mix(b, other_b)) for (w, b), (other_w, other_b) in pairs]
+    layers = [(interpolate(w, other_w), interpolate(b, other_b)) for (w, b), (other_w, other_b) in pairs]
     origin = {key: other.config[key] for key in ("commit", "iteration") if key in other.config}
-    blended = {"share": fraction, **origin}
-    return Policy(layers, policy.mean, policy.std, policy.interface, policy.config | {"blended": blended})
+    config = policy.config | {"blended": {"share": fraction, **origin}}
+    return Policy(layers, policy.mean, policy.std, policy.interface, config)

@@ -23,17 +23,17 @@ if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
 
 SHORTEST_LATENCY = 500.0 * PHYSICS_DT
-"""[ms] Half a physics step; a shorter latency would be rounded to 0."""
+"""[ms] Half a physics step; a shorter latency would round to 0."""
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Test conditions of a policy."""
+    """Conditions of a test: physics, randomisation, and parameters with a fixed value; see `env_of_policy`."""
 
     solver: Literal["jumper", "mujoco"] = "jumper"
     """Physics: the dedicated solver, or Newton's SolverMuJoCo."""
     randomize: bool = False
-    """Draw masses, friction, motors, latency and pushes as in training."""
+    """Sample masses, friction, motors, latency and pushes as in training."""
     noise: bool = False
     """Add the training's observation noise."""
     seed: int = 0
@@ -43,15 +43,15 @@ class Conditions:
     threads: int | None = None
     """CPU threads that share the worlds (default: all cores); they change no result."""
     robot: Path | None = None
-    """Robot overlay, as `jumper sysid` writes it (default: that of the training, if it had one)."""
+    """Robot overlay, as `jumper sysid` writes it (default: the training's overlay, if it had one)."""
     push_in_flight: bool = False
-    """Pushes of a randomised test act in flight too, and not only while a paw is down."""
+    """Push the robot of a randomised test in flight too, not only while a paw is down."""
     latency: float | None = None
-    """[ms] Latency from action to motor, to the nearest physics step (default: none, or drawn if randomised)."""
+    """[ms] Latency from action to motor, to the nearest physics step (default: none, or sampled if randomised)."""
     gain_scale: tuple[float, float] | None = None
-    """[1] Scales of kp and kd of all motors (default: 1, or drawn if randomised)."""
+    """[1] Scales of kp and kd of all motors (default: 1, or sampled if randomised)."""
     friction: float | None = None
-    """[1] Friction of the paws, static and dynamic (default: nominal, or drawn if randomised)."""
+    """[1] Friction of the paws, static and dynamic (default: nominal, or sampled if randomised)."""
     gravity: float | None = None
     """[m/s^2] Gravity, downward (default: the task's)."""
 
@@ -63,20 +63,20 @@ class Conditions:
             raise InputError(f"latency must be 0 or at least {least}, got {self.latency:g} ms")
         if self.gravity is not None:
             check_gravity(self.gravity)
-        self._with_fixed(RandomizationCfg.off())
+        self._with_fixed_parameters(RandomizationCfg.off())  # raises if a value is out of range
         if self.push_in_flight and not self.randomize:
             raise InputError("push_in_flight needs randomize: without it there are no pushes")
 
     @property
-    def fixed(self) -> dict[str, Any]:
-        """Parameters with a value given here, which are neither nominal nor randomised."""
+    def fixed_parameters(self) -> dict[str, Any]:
+        """Values of the parameters latency, gains and friction that are not None here, by name in RandomizationCfg."""
         values = {"latency": self.latency, "gains": self.gain_scale, "friction": self.friction}
         return {name: value for name, value in values.items() if value is not None}
 
     def overlay(self, config: dict[str, Any]) -> RobotOverlay | None:
-        """Return the robot overlay: the one given here, else the one that `config` saves; None for the nominal robot.
+        """Return the robot overlay: `robot`, else the overlay in a policy's configuration, else None (nominal robot).
 
-        config: configuration of a policy. Raises InputError or OSError: the overlay cannot be used.
+        config: `Policy.config`. Raises InputError or OSError: the overlay cannot be used.
         """
         if self.robot is not None:
             return load_overlay(self.robot)
@@ -84,31 +84,34 @@ class Conditions:
         return None if saved is None else RobotOverlay.from_json(saved)
 
     def env_settings(self, config: dict[str, Any]) -> dict[str, Any]:
-        """Return keyword arguments of `Env`. Argument and errors as for `overlay`."""
+        """Return keyword arguments of `Env` for these conditions. Argument and errors as for `overlay`."""
         same = {name: getattr(self, name) for name in ("seed", "device", "solver", "noise", "threads")}
-        return {**same, "randomize": self.draws, "auto_reset": False, "robot": self.overlay(config)}
+        return {**same, "randomize": self.sets_parameters, "auto_reset": False, "robot": self.overlay(config)}
 
     @property
-    def draws(self) -> bool:
-        """Whether the environment sets robot parameters at resets."""
-        return self.randomize or bool(self.fixed)
+    def sets_parameters(self) -> bool:
+        """Whether the environment sets robot parameters at resets, to sampled or fixed values."""
+        return self.randomize or bool(self.fixed_parameters)
 
-    def _with_fixed(self, ranges: RandomizationCfg) -> RandomizationCfg:
-        """Return randomisation ranges with the `fixed` parameters set to their value."""
-        return ranges.with_fixed(**self.fixed)
+    def _with_fixed_parameters(self, ranges: RandomizationCfg) -> RandomizationCfg:
+        """Return a copy of randomisation ranges, in which each of `fixed_parameters` is always its value."""
+        return ranges.with_fixed(**self.fixed_parameters)
 
     def applied(self, task: TaskCfg) -> TaskCfg:
-        """Return a task with these conditions applied to its gravity, randomisation and events."""
+        """Return a copy of a task in these conditions: gravity, randomisation, events, and no margins.
+
+        With fixed parameters and no randomisation it is on level ground, without the task's events.
+        """
         task = (task if self.gravity is None else replace(task, gravity=self.gravity)).without_margins()
         trained = task.randomization
         if self.randomize:
             in_flight = trained.push_in_flight or self.push_in_flight
-            randomization = replace(self._with_fixed(trained.in_tests()), push_in_flight=in_flight)
+            randomization = replace(self._with_fixed_parameters(trained.in_tests()), push_in_flight=in_flight)
             return replace(task, randomization=randomization)
-        if not self.fixed:
+        if not self.fixed_parameters:
             return task
         nominal = RandomizationCfg.off().with_fixed(friction=trained.nominal_friction)
-        return replace(task, randomization=self._with_fixed(nominal), events=()).on_level_ground()
+        return replace(task, randomization=self._with_fixed_parameters(nominal), events=()).on_level_ground()
 
 
 def env_of_policy(
@@ -117,10 +120,9 @@ def env_of_policy(
 ) -> Env:  # fmt: skip
     """Return the environment of a policy's task in some test conditions.
 
-    It has no rewards, no critic observation, and events only if randomised, so that their functions are not needed.
-
-    policy: its configuration holds the task. change: modifies the task, if given. modules: user modules with functions
-    of the task. scene: more arguments of `Env`, such as its ground.
+    It has no rewards and no critic observation, and events only if randomised: their functions are not looked up.
+    policy: its configuration holds the task. change: returns a modified task before the conditions are applied.
+    modules: user modules in which the task's functions are looked up. scene: further arguments of `Env`.
     Raises PolicyError: the task cannot be restored, or its observation is not the policy's.
     """
     from jumper_warp.envs.env import Env

@@ -48,8 +48,8 @@ def save_policy(
 ) -> Path:
     """Write a policy's folder atomically, and return its path.
 
-    Commit and versions are added to the configuration if it has none. files: additional files by name, such as a
-    learning curve. overwrite: whether to replace an existing policy with all its files.
+    Commit and versions are added to the configuration if it has none. files: content of additional files by name.
+    overwrite: whether to replace an existing policy with all its files.
     Raises PolicyError: the folder exists and overwrite is not set, or it is not a policy's; or a name is malformed.
     """
     folder = checked_folder(folder)
@@ -99,15 +99,16 @@ def add_files(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def _write(folder: Path, files: Mapping[str, bytes], checksums: Mapping[str, str]) -> None:
-    """Write files, then the manifest with their SHA-256 besides `checksums`, those of the folder's other files."""
+    """Write files (name to content), then the manifest. Raises PolicyError: a name is malformed.
+
+    checksums: SHA-256 by name of the files that the folder has already; the manifest keeps them.
+    """
     for name in files:
         if not FILE_NAME.fullmatch(name) or name == MANIFEST:
             raise PolicyError(f"a policy cannot hold a file named {name!r:.60}")
-    checksums = {
-        **checksums,
-        **{name: hashlib.sha256(data).hexdigest() for name, data in files.items() if name != README},
-    }
-    manifest = {"format": FORMAT, "schema_version": SCHEMA_VERSION, "sha256": dict(sorted(checksums.items()))}
+    written = {name: hashlib.sha256(data).hexdigest() for name, data in files.items() if name != README}
+    sha256 = dict(sorted({**checksums, **written}.items()))
+    manifest = {"format": FORMAT, "schema_version": SCHEMA_VERSION, "sha256": sha256}
     for name, data in {**files, MANIFEST: json_bytes(manifest)}.items():
         write_atomically(folder / name, data)
 
@@ -118,9 +119,9 @@ def list_policies() -> tuple[str, ...]:
 
 
 def find_policy(name: str | Path) -> Path:
-    """Return the folder of a policy, given the name of one of the project's (- counts as _) or a folder.
+    """Return the folder of a policy: of the project's policy of this name (- counts as _), else `name` as a path.
 
-    Raises PolicyError: there is none.
+    Raises PolicyError: there is no such policy or folder.
     """
     text = str(name)
     project_folder = POLICIES / text.replace("-", "_")
@@ -194,10 +195,10 @@ def _read_bytes(path: Path) -> bytes:
 
 
 def _parse_json(path: Path, data: bytes) -> dict[str, Any]:
-    """Return a JSON object; path: for errors. Raises PolicyError: it is not one, or has NaN or invalid characters."""
+    """Return the JSON object in `data`; path: for messages. Raises PolicyError: it is none, or holds NaN."""
     try:
         content = json.loads(data)
-        json_bytes(content)  # refuses what could not be saved again
+        json_bytes(content)  # raises ValueError for content that could not be saved again
     except (ValueError, RecursionError) as error:
         raise PolicyError(f"{path}: not JSON ({type(error).__name__})") from error
     if not isinstance(content, dict):
@@ -206,7 +207,7 @@ def _parse_json(path: Path, data: bytes) -> dict[str, Any]:
 
 
 def default_readme(policy: Policy) -> str:
-    """Return the README of a policy's folder: its content and usage."""
+    """Return the text of README.md for a policy's folder: sizes, rate, files and commands."""
     interface = policy.interface
     rate = 1.0 / interface.policy_dt
     return (

@@ -40,16 +40,17 @@ class _GraphBuilder:
     """Collects the nodes and constants of an ONNX graph; every method returns the name of its output."""
 
     def __init__(self) -> None:
+        """Begin with an empty graph."""
         self.nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
 
     def constant(self, name: str, value: Any, dtype: type = np.float32) -> str:
-        """Add a constant (initialiser)."""
+        """Add a constant (initialiser); value: a number or an array."""
         self.constants.append(numpy_helper.from_array(np.asarray(value, dtype), name))
         return name
 
     def add(self, operator: str, inputs: list[str], output: str, **attributes: Any) -> str:
-        """Add a node."""
+        """Add a node; inputs: names of its inputs; output: name of its output and of the node."""
         self.nodes.append(helper.make_node(operator, inputs, [output], name=output, **attributes))
         return output
 
@@ -87,6 +88,7 @@ def onnx_model(policy: Policy, config: Mapping[str, Any] | None = None) -> onnx.
     zero = graph.constant("zero", 0.0)
 
     def clip(name: str, limit: float, output: str) -> str:
+        """Add a node that clips the tensor `name` to ± limit, with the name `output`."""
         bounds = [graph.constant(f"{output}_lower", -limit), graph.constant(f"{output}_upper", limit)]
         return graph.add("Clip", [name, *bounds], output)
 
@@ -116,7 +118,7 @@ def onnx_model(policy: Policy, config: Mapping[str, Any] | None = None) -> onnx.
 
 
 def metadata(policy: Policy, config: Mapping[str, Any]) -> dict[str, str]:
-    """Return the entries of the model's metadata.
+    """Return the entries of the ONNX model's metadata, texts by key.
 
     `jumper_warp` is JSON with the whole `PolicyInterface`; the other entries repeat parts of it, comma-separated and
     unrounded, under the names that common deployment tools read. The network has no memory: past frames are part of the
@@ -139,10 +141,9 @@ def onnx_bytes(policy: Policy, config: Mapping[str, Any] | None = None) -> bytes
 
 
 def policy_from_onnx(data: bytes, interface: PolicyInterface, config: Mapping[str, Any]) -> Policy:
-    """Return the policy in the result of `onnx_bytes`, bitwise.
+    """Return the policy whose weights an ONNX file holds; inverts `onnx_bytes` bitwise.
 
-    interface, config: of the policy, from its config.json; the file's graph and metadata must agree with them.
-
+    data: content of the file. interface, config: from config.json; graph and metadata must agree with them.
     Raises PolicyError: the file is damaged, its weights are not valid for the interface, or its graph, opset or
     metadata differ from the result of `onnx_model`.
     """
@@ -161,7 +162,7 @@ def policy_from_onnx(data: bytes, interface: PolicyInterface, config: Mapping[st
 
 
 def _read_tensors(initialisers: Iterable[TensorProto]) -> dict[str, torch.Tensor]:
-    """Return the tensors of normaliser and layers in initialisers, by the names of `Policy.tensors`.
+    """Return the tensors of normaliser and layers among initialisers, float32, by the names of `Policy.tensors`.
 
     Raises PolicyError: an initialiser is malformed.
     """

@@ -19,10 +19,10 @@ MAX_OUTPUT = 1.0e38
 
 
 class Policy(nn.Module):
-    """Actor network with its observation normaliser; `act` maps raw observations to actions."""
+    """Actor network with its observation normaliser; `act` maps raw observations to actions. Inherits `to(device)`."""
 
-    mean: torch.Tensor
-    std: torch.Tensor
+    mean: torch.Tensor  # (num_obs,) mean of raw observations
+    std: torch.Tensor  # (num_obs,) standard deviation that observations are divided by
 
     def __init__(
         self, layers: Weights, mean: torch.Tensor, std: torch.Tensor, interface: PolicyInterface,
@@ -61,7 +61,7 @@ class Policy(nn.Module):
         return linear_layers(self.actor)
 
     def tensors(self) -> dict[str, torch.Tensor]:
-        """Return all tensors, on the CPU, by the names under which they are saved."""
+        """Return all tensors on the CPU, by name: normaliser.mean, normaliser.std, actor.N.weight, actor.N.bias."""
         tensors = {"normaliser.mean": self.mean, "normaliser.std": self.std}
         for i, (weight, bias) in enumerate(self.layers):
             tensors |= {f"actor.{i}.weight": weight, f"actor.{i}.bias": bias}
@@ -72,9 +72,8 @@ class Policy(nn.Module):
         """Return the mean action clipped to ±1, (..., num_actions) float32, for raw observations.
 
         Entries of an observation that are not finite count as 0. There is no host synchronisation.
-
         obs: (..., num_obs) tensor on the policy's device, of any numeric type.
-        Raises ValueError: obs is not a tensor, or its last axis does not have num_obs entries.
+        Raises InputError, a ValueError: obs is not a tensor, or its last axis does not have num_obs entries.
         """
         if not isinstance(obs, torch.Tensor):
             raise InputError(f"the policy reads a torch tensor, got {type(obs).__name__}: torch.as_tensor makes one")
@@ -88,7 +87,7 @@ class Policy(nn.Module):
 
 
 def check_tensors(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface) -> None:
-    """Raise PolicyError unless names, shapes and values of tensors are valid for a policy of this interface."""
+    """Raise PolicyError unless names (as `Policy.tensors`), shapes and values of tensors are valid for an interface."""
     sizes = interface.sizes
     expected = {"normaliser.mean": (sizes[0],), "normaliser.std": (sizes[0],)}
     for i in range(len(sizes) - 1):

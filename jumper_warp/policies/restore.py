@@ -18,7 +18,10 @@ from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json
 def task_of_policy(
     policy: Policy, modules: Iterable[ModuleType] = (), *, leave_out: Collection[str] = OPTIONAL
 ) -> TaskCfg:
-    """Return a policy's task as `restored_task`; raises PolicyError also if its observation is not the policy's."""
+    """Return a policy's task by `restored_task`, with the same arguments and errors.
+
+    Raises PolicyError too if the task's observation is not the policy's.
+    """
     task = restored_task(policy.config, modules, leave_out=leave_out)
     if task.observation_names != policy.interface.observation_names:
         raise PolicyError("the policy's observation is not the one that this version of its task gives")
@@ -31,8 +34,7 @@ def restored_task(
     """Return the task in the entry `env.task` of a saved configuration.
 
     config: configuration of a policy or a run. modules: user modules in which functions from outside the project are
-    looked up. leave_out: sections to leave empty, whose functions are not looked up (default: those that only a
-    training needs).
+    looked up. leave_out: sections to leave empty (default: the sections that only a training needs).
     Raises PolicyError: the configuration has no task, or it cannot be restored.
     """
     try:

@@ -36,9 +36,10 @@ def is_run(source: str | Path) -> bool:
 
 
 def open_policy(source: str | Path, *, newest: bool = False) -> Policy:
-    """Return the policy of a name, a policy's folder, a checkpoint, or a run's best (or newest) checkpoint.
+    """Return a policy; source: name or folder of a policy, path of a checkpoint, or folder of a training run.
 
-    Raises PolicyError or CheckpointError: there is none, or it cannot be used.
+    newest: whether to use the newest checkpoint of a run, not the best.
+    Raises PolicyError or CheckpointError: there is no such policy, or it cannot be used.
     """
     if not is_run(source):
         return load_policy(source)
@@ -52,13 +53,13 @@ def open_policy(source: str | Path, *, newest: bool = False) -> Policy:
 
 @dataclass(frozen=True)
 class CheckpointContents:
-    """Typed contents of a training checkpoint that make up its policy."""
+    """Contents of a training checkpoint that make up its policy."""
 
     config: dict[str, Any]  # configuration of the policy: of the run, with commit, dirty and iteration
-    interface: dict[str, Any]  # description of observation and action, as `jumper_warp.tasks.interface` makes it
+    interface: dict[str, Any]  # result of `jumper_warp.tasks.interface.interface`: observation, joints, filter
     policy_dt: float  # [s]
     physics_dt: float  # [s]
-    activation: str
+    activation: str  # elu, relu or tanh
     hidden: tuple[int, ...]  # widths of the hidden layers of `layers`
     layers: Weights  # weight (out, in) and bias (out,) of each layer of the actor as a plain network
     mean: torch.Tensor  # (num_obs,) mean of raw observations
@@ -92,7 +93,7 @@ class CheckpointContents:
             raise CheckpointError(f"not of a training of this project ({reason})") from error
 
     def policy(self) -> Policy:
-        """Return the policy. Raises PolicyError: interface, layers and statistics do not fit each other."""
+        """Return the policy. Raises PolicyError: interface, layers and statistics contradict each other."""
         description = {**self.interface, "observation_limit": RAW_LIMIT, "normalised_limit": NORMALISED_LIMIT}
         network = {"hidden": self.hidden, "activation": self.activation}
         interface = make_interface(description, policy_dt=self.policy_dt, physics_dt=self.physics_dt, **network)
@@ -100,7 +101,7 @@ class CheckpointContents:
 
 
 def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
-    """Return the policy of a loaded checkpoint; errors name its path."""
+    """Return the policy of a loaded checkpoint. Raises PolicyError or CheckpointError, with its path."""
     try:
         return CheckpointContents.from_dict(state).policy()
     except PolicyError as error:
@@ -110,7 +111,7 @@ def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
 
 
 def _tensor(model: dict[str, Any], name: str) -> torch.Tensor:
-    """Return a dense tensor of a model's state. Raises LookupError or TypeError: there is none."""
+    """Return a dense tensor of a model's state_dict by name. Raises LookupError or TypeError: there is none."""
     tensor = model[name]
     if not isinstance(tensor, torch.Tensor) or tensor.layout != torch.strided:
         raise TypeError(f"{name} must be a dense tensor, got {type(tensor).__name__}")
@@ -118,14 +119,14 @@ def _tensor(model: dict[str, Any], name: str) -> torch.Tensor:
 
 
 def _actor_layers(model: dict[str, Any]) -> Weights:
-    """Return weight and bias of each of the actor's layers, first to last, from a model's state."""
+    """Return weight (out, in) and bias (out,) of the actor's layers, first to last, from a model's state_dict."""
     names = [key for key in model if key.startswith("actor.") and key.endswith(".weight")]
     names.sort(key=lambda key: int(key.split(".")[1]))
     return [(_tensor(model, name), _tensor(model, name.removesuffix("weight") + "bias")) for name in names]
 
 
 def _symmetry(model: dict[str, torch.Tensor]) -> Symmetry | None:
-    """Return the symmetry of a checkpoint's actor; None if it is a plain network."""
+    """Return the mirror maps of a symmetric actor from a model's state_dict; None if it is a plain network."""
     if not any(name.startswith("mirror_") for name in model):
         return None
     parts = ((model[f"mirror_{name}_order"], model[f"mirror_{name}_signs"], name) for name in Symmetry._fields)
@@ -151,7 +152,7 @@ def thinned_curve(metrics: bytes) -> bytes:
 
 
 def _curve_row(line: bytes) -> dict[str, Any]:
-    """Return the columns CURVE of a line of metrics; empty for a malformed line."""
+    """Return the entries CURVE of a line of metrics; empty for a malformed line."""
     try:
         row = json.loads(line)
         return {name: row[name] for name in CURVE if name in row}

@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
 
 WALK, JUMP_UP, JUMP_TO = range(3)
-"""Indices of the skills in the environment."""
+"""Indices of the skills: walking, jump to a height, jump to a position."""
 
 
 @dataclass(frozen=True)
@@ -27,33 +27,34 @@ class SkillNames:
     """Name or folder of the policy of each skill."""
 
     walk: str = "walking_flat"
-    """Follows velocities."""
+    """Follows commanded velocities."""
     jump_up: str = "vertical_jump"
-    """Jumps to a height."""
+    """Jumps to a commanded height."""
     jump_to: str = "horizontal_jump"
-    """Jumps to a position."""
+    """Jumps to a commanded position."""
 
 
 class SkillPolicies:
-    """Policies of the three skills, with the environment that they act in."""
+    """Policies of the three skills, in the order WALK, JUMP_UP, JUMP_TO, with the environment that they act in."""
 
     def __init__(self, names: SkillNames | None = None) -> None:
-        """Open the policies. Raises PolicyError or CheckpointError: one cannot be used, or has another kind of task."""
+        """Open the policies (default names: `SkillNames()`).
+
+        Raises PolicyError or CheckpointError: one cannot be used, or its task is not of this skill.
+        """
         self.names = SkillNames() if names is None else names
         sources = (self.names.walk, self.names.jump_up, self.names.jump_to)
         self.policies = [open_policy(source) for source in sources]
         self.tasks = [task_of_policy(policy) for policy in self.policies]
-        for task, kinds in zip(
-            self.tasks, (("velocity",), ("apex_height",), ("landing_position", "omnidirectional")), strict=True
-        ):
-            if task.evaluation_suite not in kinds:
-                raise PolicyError(
-                    f"this needs a policy that is evaluated by {' or '.join(kinds)}, got one of {task.name}"
-                )
+        suites = (("velocity",), ("apex_height",), ("landing_position", "omnidirectional"))
+        for task, accepted in zip(self.tasks, suites, strict=True):
+            if task.evaluation_suite not in accepted:
+                needed = " or ".join(accepted)
+                raise PolicyError(f"this needs a policy that is evaluated by {needed}, got one of {task.name}")
         self.skills, self.handovers = self._skills_and_handovers(Conditions())
 
     def _skills_and_handovers(self, conditions: Conditions) -> tuple[list[TaskCfg], list[Handover]]:
-        """Return the tasks in some conditions, and the handovers between them. Raises PolicyError."""
+        """Return the tasks in some conditions, and the handovers between them. Raises PolicyError: tasks do not fit."""
         walk, *jumps = (conditions.applied(task) for task in self.tasks)
         try:
             return skills_and_handovers(walk, tuple(jumps))
@@ -61,7 +62,10 @@ class SkillPolicies:
             raise PolicyError(str(error)) from error
 
     def env(self, count: int, conditions: Conditions, **scene: Any) -> Env:
-        """Return an environment of `count` robots that start walking; scene: more arguments of `Env`."""
+        """Return an environment of `count` robots that start with WALK, and move the policies to its device.
+
+        scene: further arguments of `Env`.
+        """
         from jumper_warp.envs.env import Env
 
         self.skills, self.handovers = self._skills_and_handovers(conditions)

@@ -62,7 +62,7 @@ class PolicyInterface:
     observation_layout: dict[str, Any] = field(default_factory=dict)
     """Terms by name, each with first and end column, scale, clip and history; empty if unknown."""
     observation_limit: float = 100.0  # raw observations are clamped to ± this; entries that are not finite count as 0
-    normalised_limit: float = 10.0  # normalised observations are clamped to ± this is_tuple standard deviations
+    normalised_limit: float = 10.0  # normalised observations are clamped to ± this many standard deviations
     quaternion_order: str = "xyzw"
 
     def __post_init__(self) -> None:
@@ -114,22 +114,24 @@ class PolicyInterface:
 
 
 def _parse_field(name: str, value: Any, hint: str) -> Any:
-    """Return a JSON value as the type that a type hint names, such as `tuple[float, ...]`, or raise PolicyError."""
+    """Return a JSON value in the type of a hint, such as `tuple[float, ...]`. Raises PolicyError: it has another.
+
+    Numbers beyond ±1e300 become infinite. name: of the field, for messages.
+    """
     kind = next(k for k in ("dict", "str", "float", "int") if k in hint)
     types = {"str": str, "float": (float, int), "int": int, "dict": dict}[kind]
     is_tuple = hint.startswith("tuple")
     values = value if is_tuple and isinstance(value, list) else [value]
     if is_tuple != isinstance(value, list) or not all(isinstance(v, types) and not isinstance(v, bool) for v in values):
-        raise PolicyError(
-            f"interface field {name} must be {'a list of ' if is_tuple else 'a '}{kind}, got {value!r:.60}"
-        )
+        expected = f"a list of {kind}" if is_tuple else f"a {kind}"
+        raise PolicyError(f"interface field {name} must be {expected}, got {value!r:.60}")
     if kind == "float":
         values = [float(v) if abs(v) < 1.0e300 else math.inf for v in values]
     return tuple(values) if is_tuple else values[0]
 
 
 def _check_filter(fields: dict[str, Any]) -> None:
-    """Raise PolicyError unless a command filter's fields are finite numbers, or nested such fields."""
+    """Raise PolicyError unless a command filter's fields are numbers within ±1e6, or dicts of such fields."""
     for name, value in fields.items():
         if not NAME.fullmatch(name):
             raise PolicyError(f"command_filter cannot hold {name!r:.60}")
@@ -163,10 +165,10 @@ def make_interface(
     hidden: tuple[int, ...],
     activation: str = "elu",
 ) -> PolicyInterface:
-    """Return the interface of policies of a task.
+    """Return the interface of policies for a task.
 
-    description: the task's, by `jumper_warp.tasks.interface`. policy_dt, physics_dt: [s]. hidden: widths of the hidden
-    layers. activation: elu, relu or tanh. Raises PolicyError: the parts do not fit each other.
+    description: result of `jumper_warp.tasks.interface.interface`. policy_dt, physics_dt: [s]. hidden: widths of the
+    hidden layers. activation: elu, relu or tanh. Raises PolicyError: a field is missing, unknown or invalid.
     """
     shape = {"policy_dt": policy_dt, "physics_dt": physics_dt, "hidden": list(hidden), "activation": activation}
     fields = dataclasses.fields(PolicyInterface)

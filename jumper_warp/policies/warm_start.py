@@ -21,11 +21,9 @@ from jumper_warp.utils.errors import InputError
 
 
 def actor_init_from_policy(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> ActorInit:
-    """Return the actor initialisation with which a training of a task acts as a policy.
+    """Return the initial actor for a training of `task` that acts as the policy `source` (see `open_policy`).
 
-    source: as for `open_policy`. Observation and joints must agree; action scale, gains, torque limits and time steps
-    may differ.
-
+    Observation and joints must agree; action scale, gains, torque limits and time steps may differ.
     Raises PolicyError or CheckpointError: there is no such policy, or it cannot be used. Raises InputError: its
     observation or its joints are not the task's, or as `make_actor_init`.
     """
@@ -45,16 +43,16 @@ def check_interface(policy: PolicyInterface, task: dict[str, Any]) -> None:
 
     task: its description by `jumper_warp.tasks.interface`.
     """
-    for what, policy_value, task_value in _compared_values(policy, task):
+    for quantity, policy_value, task_value in _compared_values(policy, task):
         if policy_value != task_value:
-            raise InputError(f"init_policy: {what}: the policy has {policy_value}, the task {task_value}")
+            raise InputError(f"init_policy: {quantity}: the policy has {policy_value}, the task {task_value}")
 
 
 def _compared_values(policy: PolicyInterface, task: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yield the name, the policy's value and the task's value of everything that must agree."""
-    for what, name in (("observation", "observation_names"), ("action", "joint_names")):
-        for column, names in enumerate(zip_longest(getattr(policy, name), task[name], fillvalue="none")):
-            yield f"{what} {column}", names[0], names[1]
+    """Yield each quantity that must agree: its name for messages, the policy's value and the task's value."""
+    for label, field in (("observation", "observation_names"), ("action", "joint_names")):
+        for column, names in enumerate(zip_longest(getattr(policy, field), task[field], fillvalue="none")):
+            yield f"{label} {column}", names[0], names[1]
     for name, term in policy.observation_layout.items():  # empty if unknown
         for key, value in term.items():
             yield f"{key} of {name}", value, task["observation_layout"].get(name, {}).get(key, "none")

@@ -13,17 +13,16 @@ from jumper_warp.rl.networks import VARIANCE_EPS, ActorCritic, linear_layers
 from jumper_warp.utils.errors import InputError
 
 PRIOR_ITERATIONS = 100
-"""The policy's observation statistics weigh as much as the samples of this many iterations. New samples change them
-slowly, so that the actor's input does not jump."""
+"""Weight of the policy's observation statistics [iterations of samples]; many, so that they change slowly."""
 
 SYMMETRY_TOLERANCE = 0.05
-"""Largest distance of a layer's weights from the mirror-symmetric form, relative to their norm, that is projected."""
+"""Largest distance from the mirror-symmetric form, relative to the norm of a layer's weights, that is projected."""
 
 
 class ActorInit(NamedTuple):
     """Initial weights and observation statistics of an actor."""
 
-    layers: Weights  # weight and bias of each layer
+    layers: Weights  # weight (out, in) and bias (out,) of each layer
     mean: torch.Tensor  # (num_obs,) mean of raw observations
     std: torch.Tensor  # (num_obs,) standard deviation that observations are divided by
     change: str = ""  # how the policy was made mirror-symmetric, for the log; empty if it was not changed
@@ -35,14 +34,11 @@ def make_actor_init(
 ) -> ActorInit:  # fmt: skip
     """Return the actor initialisation with which a training with settings `cfg` acts as a given policy.
 
-    With `symmetry`, a policy g that is nearly mirror-symmetric is projected to the nearest symmetric one; any other
+    With `symmetry`, a policy g that is nearly mirror-symmetric is projected to the nearest symmetric policy; any other
     becomes (g(x) + N g(M x)) / 2, in the notation of `jumper_warp.rl.mirror`.
-
-    layers, activation: the policy as a plain network; mean, std: (num_obs,) its observation statistics; symmetry: of a
-    training with symmetry actor.
-
-    Raises InputError: hidden layers or activation differ from the settings, or a standard deviation is below
-    sqrt(VARIANCE_EPS).
+    layers, activation: the policy as a plain network; mean, std: (num_obs,) its observation statistics; symmetry: the
+    task's mirror maps if cfg.symmetry is "actor", else None.
+    Raises InputError: hidden layers or activation differ from the settings, or std is below sqrt(VARIANCE_EPS).
     """
     if activation != cfg.activation:
         raise InputError(
@@ -72,7 +68,7 @@ def make_actor_init(
 def apply_actor_init(actor_init: ActorInit, model: ActorCritic, samples: int) -> None:
     """Copy the weights and observation statistics into a model, in place; noise and critic are unchanged.
 
-    samples: samples of all worlds in an iteration. Raises InputError: layers have other shapes; nothing is changed.
+    samples: num_steps · num_envs of an iteration. Raises InputError: layers have other shapes; nothing is changed.
     """
     layers = linear_layers(model.actor)
     policy_shapes, shapes = ([tuple(weight.shape) for weight, _ in each] for each in (actor_init.layers, layers))
@@ -91,7 +87,7 @@ def apply_actor_init(actor_init: ActorInit, model: ActorCritic, samples: int) ->
 
 
 def _contracted_layers(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> Weights | None:
-    """Return the layers of f (`contract_layers`); None if layers or statistics are not nearly symmetric."""
+    """Return the nearest symmetric actor's layers, of half the widths; None if layers or statistics are not close."""
     widths = [len(bias) for _, bias in layers[:-1]]
     mean_symmetric = torch.allclose(symmetry.obs.apply(mean), mean, atol=1e-5)
     symmetric = mean_symmetric and torch.allclose(std[symmetry.obs.order], std)
@@ -99,12 +95,12 @@ def _contracted_layers(layers: Weights, mean: torch.Tensor, std: torch.Tensor, s
         return None
     nearest = nearest_expanded_layers(layers, symmetry)
     pairs = zip(layers, nearest, strict=True)
-    near = all((one - other).norm() <= SYMMETRY_TOLERANCE * one.norm() for (one, _), (other, _) in pairs)
+    near = all((weight - w).norm() <= SYMMETRY_TOLERANCE * weight.norm() for (weight, _), (w, _) in pairs)
     return contract_layers(nearest, symmetry) if near else None
 
 
 def _is_symmetric(layers: Weights, symmetry: Symmetry) -> bool:
-    """Return whether the layers have the form of `expand_layers`."""
+    """Return whether the layers are a symmetric actor in the form of `expand_layers`."""
     try:
         contract_layers(layers, symmetry)
     except InputError:
@@ -113,7 +109,7 @@ def _is_symmetric(layers: Weights, symmetry: Symmetry) -> bool:
 
 
 def _averaged(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> ActorInit:
-    """Return g as the network f of a symmetric actor, with symmetric observation statistics."""
+    """Return the symmetric actor with the network f = g: the policy's layers, rescaled to symmetric statistics."""
     new_mean, new_var = symmetry.obs.symmetrise_moments(mean.double(), std.double().square())
     rescaled = rescale_inputs(layers, mean, std, new_mean, new_var.sqrt())
     new_layers = [(weight.to(mean.dtype), bias.to(mean.dtype)) for weight, bias in rescaled]
@@ -124,9 +120,9 @@ def _averaged(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: 
 def rescale_inputs(
     layers: Weights, mean: torch.Tensor, std: torch.Tensor, new_mean: torch.Tensor, new_std: torch.Tensor
 ) -> Weights:
-    """Return layers, float64, with the same output for observations normalised by new_mean and new_std (num_obs,).
+    """Return layers, float64, with the same output for observations normalised by new_mean and new_std.
 
-    Only the first layer changes: W (x - mean) / std stays the same for all x within the limits.
+    All statistics are (num_obs,). Only the first layer changes: W (x - mean) / std + b stays the same for all x.
     """
     (weight, bias), *others = ((weight.double(), bias.double()) for weight, bias in layers)
     mean, std = mean.double(), std.double()
@@ -135,5 +131,5 @@ def rescale_inputs(
 
 
 def _joined(values: Iterable[object], separator: str = ", ") -> str:
-    """Return values as text."""
+    """Return values as text with a separator between them."""
     return separator.join(map(str, values))

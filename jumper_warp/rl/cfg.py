@@ -1,4 +1,4 @@
-"""Settings of a training, which need no PyTorch to be read."""
+"""Settings of a training; this module does not import PyTorch."""
 
 from __future__ import annotations
 
@@ -11,72 +11,71 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import checked_threads
 
 ACTIVATIONS = ("elu", "relu", "tanh")
-"""Names of activations."""
+"""Names of the activations of hidden layers."""
 LATEST, LATEST_OR_NEW = "latest", "latest-or-new"
-"""Values of `TrainCfg.resume` that name no path."""
+"""Values of `TrainCfg.resume` that are not paths."""
 
 
 @dataclass(frozen=True)
 class PpoCfg:
-    """Settings of the algorithm; a task may have others as its defaults (`registry.TASKS`)."""
+    """Settings of PPO; a task can have its own defaults (`registry.TASKS`)."""
 
     num_steps: int = 32
     """Policy steps of each world per iteration."""
     epochs: int = 5
-    """Passes over the batch per iteration."""
+    """Passes over the batch of num_steps · num_envs samples per iteration."""
     minibatches: int = 8
-    """Optimiser steps per pass; divides the number of worlds times num_steps."""
+    """Optimiser steps per pass; divides num_steps · num_envs."""
     gamma: float = 0.985
     """Discount per policy step."""
     lam: float = 0.95
-    """Weight of longer advantage estimates, the λ of GAE."""
+    """λ of generalised advantage estimation (GAE)."""
     clip: float = 0.2
     """Clipping range of the probability ratio, and of the value in standard deviations of the return."""
     value_coef: float = 2.0
     """Weight of the value loss."""
     asymmetric_critic: bool = True
-    """Whether the critic sees what only a simulation knows, instead of the actor's observation."""
+    """Whether the critic observes simulation states that no sensor measures, instead of the actor's observation."""
     clip_value: bool = True
     """Whether the value loss is clipped."""
     normalise_value: bool = True
-    """Whether the critic predicts the return in its running standard deviations."""
+    """Whether the critic predicts returns normalised by their running mean and standard deviation."""
     entropy_coef: float = 0.0015
     """Weight of the entropy bonus."""
     final_entropy_coef: float | None = None
-    """What entropy_coef becomes, in a straight line over the second half of a training; None: it stays. Much noise
-    finds the way, little the finer policy."""
+    """Final entropy_coef, approached linearly over the second half of a training (default: constant entropy_coef)."""
     lr: float = 1.0e-3
-    """Adam's step size at the start."""
+    """Initial learning rate of Adam."""
     min_lr: float = 1.0e-6
-    """Its lower bound."""
+    """Lower bound of the learning rate."""
     max_lr: float = 1.0e-2
-    """Its upper bound."""
+    """Upper bound of the learning rate."""
     desired_kl: float = 0.01
-    """The step size falls above twice and rises below half of this divergence; 0 keeps it fixed."""
+    """Target KL divergence [nat]: above twice of it the learning rate falls, below half it rises; 0: fixed rate."""
     final_desired_kl: float = 0.002
-    """What desired_kl falls to, in a straight line over the second half of a training; smaller steps, finer policy."""
+    """Final desired_kl, approached linearly over the second half of a training."""
     max_grad_norm: float = 1.0
-    """Gradients of the actor and of the critic are each shortened to this norm."""
+    """Gradients of the actor and of the critic are each clipped to this norm."""
     init_std: float = 1.0
-    """Exploration noise at the start, in units of the action."""
+    """Initial standard deviation of the exploration noise, in units of the action."""
     reward_scale: float = 0.6
-    """Multiplies every reward."""
+    """Factor on every reward."""
     hidden: tuple[int, ...] = (256, 128, 128)
     """Widths of the hidden layers."""
     activation: str = "elu"
     """elu, relu or tanh."""
     symmetry: Literal["off", "actor"] = "off"
-    """Left-right symmetry of the policy: an actor that answers mirrored observations by mirrored actions whatever the
-    weights. For tasks whose observation has a known mirror image."""
+    """Left-right symmetry: with `actor`, mirrored observations give mirrored actions for any weights. The task must
+    define the mirror image of its observation."""
     tf32: bool = True
     """Whether matrix products on a GPU may round their factors to 10 mantissa bits."""
     precision: Literal["float32", "bfloat16"] = "float32"
-    """What the hidden layers compute in; the last layers, losses and statistics stay in float32."""
+    """Data type of the hidden layers; the last layers, losses and statistics are float32."""
     compile: Literal["auto", "on", "off"] = "auto"
-    """Whether torch.compile fuses what surrounds the matrix products: auto on a GPU alone, since a CPU gains nothing.
-    Needs a C++ compiler; what was compiled is kept in Inductor's cache on disk."""
+    """Whether torch.compile fuses elementwise operations; auto: on a GPU only, since a CPU gains nothing. It needs a
+    C++ compiler, and caches compiled code on disk."""
     graphs: bool = True
-    """Whether a GPU replays captured graphs."""
+    """Whether to capture an iteration as CUDA graphs and replay them; no effect on a CPU."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: a setting is out of range."""
@@ -100,7 +99,7 @@ class PpoCfg:
             raise InputError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation}")
 
     def batch_size(self, num_envs: int) -> int:
-        """Return the samples that num_envs worlds give in an iteration.
+        """Return the number of samples in an iteration of num_envs worlds, num_steps · num_envs.
 
         Raises ValueError: there is only one, which has no standard deviation, or the minibatches do not divide them.
         """
@@ -114,18 +113,18 @@ class PpoCfg:
 
 @dataclass(frozen=True)
 class ShacCfg:
-    """Settings of SHAC; steps of a window, discount, lambda, networks, reward scale and noise are those of PPO."""
+    """Settings of SHAC besides `PpoCfg`: num_steps, gamma, lam, networks, reward_scale and init_std."""
 
     lr: float = 1.0e-3
-    """Adam's step size of the actor, which falls to a tenth in a straight line."""
+    """Initial learning rate of the actor; falls linearly to a tenth of it."""
     critic_lr: float = 1.0e-3
-    """The same of the critic."""
+    """Learning rate of the critic, constant."""
     max_grad_norm: float = 1.0
-    """The actor's gradient is shortened to this norm."""
+    """The actor's gradient is clipped to this norm."""
     target_rate: float = 0.2
-    """Share by which the target critic follows the critic in an iteration."""
+    """Fraction of the difference to the critic that the target critic moves per iteration."""
     critic_epochs: int = 8
-    """Passes of the critic over a window."""
+    """Passes of the critic over a window of num_steps policy steps."""
     critic_minibatches: int = 4
     """Optimiser steps per pass."""
     entropy_coef: float = 0.0
@@ -149,45 +148,44 @@ class TrainCfg:
     num_envs: int = 8192
     """Worlds, over all processes."""
     max_iterations: int = 2800
-    """Iterations that the run has at its end, those before a resume included."""
+    """Iterations of the run in total, including iterations before a resume."""
     max_seconds: float = 0.0
-    """Wall-clock limit [s]; 0: none. What counts is the time from the end of each process's first iteration to the end
-    of its last, with logging and saving between, over all resumes: building, compiling and that iteration do not."""
+    """Limit of the training time [s] over all resumes; 0: none. A process counts its time from the end of its first
+    iteration, so that building and compilation do not count; logging and saving do."""
     seed: int = 1
-    """Of weights, noise and worlds, 0 to 2^31 - 1; every process derives its own."""
+    """Seed of weights, noise and worlds, 0 to 2^31 - 1; each process derives a different seed from it."""
     device: str | None = None
-    """A torch device; default: a GPU if there is one."""
+    """Torch device (default: a GPU if there is one)."""
     threads: int | None = None
-    """CPU threads of each process that share its worlds (default: all cores, shared out to the processes of a machine),
-    and of torch (default: half the cores but at least two), whose number OMP_NUM_THREADS overrides. Those of the worlds
-    change no result; torch's do in the last digits."""
+    """CPU threads of each process, for its worlds (default: an equal part of the cores) and for torch (default: half
+    the cores but at least two; OMP_NUM_THREADS overrides). Torch's number changes the last digits of results."""
     log_root: Path = Path("logs")
-    """A run is written to log_root/task/time of its start."""
+    """A run is written to the folder log_root/<task>/<start time>."""
     log_interval: int = 10
-    """Iterations between two logged ones."""
+    """Number of iterations per logged iteration."""
     save_interval: int = 100
-    """Iterations between two checkpoints."""
+    """Number of iterations per checkpoint."""
     max_checkpoints: int = 3
-    """How many of the newest checkpoints stay; the best stays anyway."""
+    """Number of newest checkpoints to keep; the best one is always kept."""
     best_metric: str = "Metrics/success"
-    """The logged figure that makes a checkpoint the best; higher is better."""
+    """Logged metric that selects the best checkpoint; higher is better."""
     resume: str | None = None
     """A checkpoint, a run's folder, `latest` for the task's latest run with a checkpoint, or `latest-or-new`, which
-    begins a new run if there is none. `jumper train` resumes with the settings of that run; flags override them. Not
-    saved are device, threads, log_root, tensorboard and wandb."""
+    starts a new run if there is none. `jumper train` uses the saved settings of that run except device, threads,
+    log_root, tensorboard and wandb; flags override them."""
     init_policy: str | None = None
-    """A policy's name or folder, a run's folder (its best checkpoint) or a checkpoint: a new training begins with that
-    policy's actor, its weights and its statistics of observations. The critic, the optimiser and the noise are new."""
+    """A policy's name or folder, a run's folder (its best checkpoint) or a checkpoint: a new training starts with its
+    actor weights and observation statistics; critic, optimiser and noise are new."""
     trainer: Literal["ppo", "shac", "rsl-rl"] = "ppo"
-    """This package's PPO; SHAC, which learns by gradients through the physics; or rsl-rl-lib's PPO for comparison."""
+    """This package's PPO; SHAC, with gradients through the physics; or rsl-rl-lib's PPO for comparison."""
     tensorboard: bool = True
     """Write TensorBoard events."""
     wandb: bool = False
     """Upload to Weights & Biases."""
     ppo: PpoCfg = field(default_factory=PpoCfg)
-    """Settings of the algorithm."""
+    """Settings of PPO; SHAC and rsl-rl use some of them."""
     shac: ShacCfg = field(default_factory=ShacCfg)
-    """Settings of SHAC besides."""
+    """Further settings of SHAC."""
 
     def __post_init__(self) -> None:
         """Raises ValueError: a setting is out of range."""

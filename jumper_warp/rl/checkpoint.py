@@ -94,15 +94,12 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
 
 
 def one_line_message(error: Exception) -> str:
-    """Return an error's message on one line of at most 300 characters; its type if the message is empty."""
+    """Return an error's message on one line of at most 300 characters; its type's name if it is empty."""
     return " ".join(str(error).split())[:300] or type(error).__name__
 
 
 def latest_checkpoint(folder: Path) -> Checkpoint:
-    """Return the last saved checkpoint that can be used.
-
-    Raises CheckpointError: there is none.
-    """
+    """Return the last saved checkpoint that can be loaded. Raises CheckpointError: there is none."""
     manifest = _read_manifest(folder)
     skipped: list[str] = []
     for name in reversed(manifest):

@@ -12,8 +12,8 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import available_threads
 
 NCCL = {"NCCL_NVLS_ENABLE": "0", "NCCL_GRAPH_REGISTER": "0"}
-"""Defaults of NCCL's environment variables: no NVLink multicast, which some machines do not allow, and no registration
-of buffers during graph capture, which would need the ranks to synchronise there."""
+"""Defaults of NCCL's environment variables: no NVLink multicast, which some machines forbid, and no registration of
+buffers during graph capture, which would synchronise the ranks."""
 
 
 def world_size() -> int:
@@ -28,7 +28,7 @@ def wait_for_ranks() -> None:
 
 
 def all_reduce_max(values: list[int]) -> list[int]:
-    """Return the elementwise maximum over all processes (blocking)."""
+    """Return the elementwise maximum over all processes of lists of one length (blocking)."""
     if world_size() == 1:
         return values
     vector = torch.tensor(values, device="cuda" if torch.distributed.get_backend() == "nccl" else "cpu")
@@ -78,7 +78,8 @@ class Rank(NamedTuple):
 def init_distributed(device: str | None = None, threads: int | None = None) -> Rank:
     """Select the device, join the process group under torchrun (RANK, LOCAL_RANK, WORLD_SIZE), and return the rank.
 
-    threads: torch's CPU threads, unless OMP_NUM_THREADS is set. Raises ValueError: there is no such device.
+    device: torch device (default: a GPU if there is one); several ranks use cuda:LOCAL_RANK.
+    threads: torch's CPU threads, unless OMP_NUM_THREADS is set. Raises InputError: there is no such device.
     """
     selected = torch.device(device or ("cuda" if torch.cuda.is_available() else "cpu"))
     if selected.type == "cuda" and not torch.cuda.is_available():
@@ -102,10 +103,7 @@ def init_distributed(device: str | None = None, threads: int | None = None) -> R
 
 
 def gather_states(state: dict[str, Any], rank: Rank) -> list[dict[str, Any]]:
-    """Return the states of all processes in rank 0, an empty list elsewhere.
-
-    States are sent as bytes and read with torch.load(weights_only=True).
-    """
+    """Return the states (nested dicts of tensors) of all ranks, in their order, on rank 0; an empty list elsewhere."""
     buffer = io.BytesIO()
     torch.save(state, buffer)
     data = torch.frombuffer(bytearray(buffer.getvalue()), dtype=torch.uint8).to(rank.device)

@@ -21,7 +21,7 @@ ADAM_EPS = 1.0e-8
 
 
 def aligned(count: int, to: int) -> int:
-    """Return `count` rounded up to a multiple of `to`."""
+    """Return the least multiple of `to` that is at least `count`."""
     return -(-count // to) * to
 
 
@@ -54,7 +54,7 @@ class FlatParameters:
     """
 
     def __init__(self, model: ActorCritic, activation: str) -> None:
-        """Move the parameters of a model into one vector, on the model's device."""
+        """Move the parameters of a model into one vector on its device; activation: of the hidden layers."""
         actor = [*model.actor.parameters(), model.log_std]
         self.params = [*actor, *model.critic.parameters()]
         input_weights = (model.actor[0].weight, model.critic[0].weight)
@@ -97,7 +97,7 @@ def flatten_aligned(gradients: list[torch.Tensor]) -> torch.Tensor:
 
 
 def _layers(params: list[torch.Tensor], activation: str) -> Layers:
-    """Return a network from its parameters in the order weight, bias of each layer."""
+    """Return a network from its parameters in the order weight (out, in), bias (out,) of each layer."""
     return Layers(tuple(params[::2]), tuple(params[1::2]), activation)
 
 
@@ -105,7 +105,7 @@ class AdamVectors(NamedTuple):
     """Parameters, gradient and state of Adam; all vectors are (size,) in the order of `FlatParameters.value`."""
 
     value: torch.Tensor  # (size,) parameters
-    gradient: torch.Tensor
+    gradient: torch.Tensor  # (size,) of the loss
     exp_avg: torch.Tensor  # (size,) first moment: running mean of the gradient
     exp_avg_sq: torch.Tensor  # (size,) second moment: running mean of the squared gradient
     step: torch.Tensor  # () number of steps so far
@@ -134,7 +134,7 @@ class FlatAdam:
         }
 
     def load_state_dict(self, state: dict[int, dict[str, Any]]) -> None:
-        """Load the result of `state_dict`; the step count of parameter 0 is used for all."""
+        """Load the result of `state_dict`; parameter 0's step count is used for all parameters."""
         for index, segment in enumerate(self.flat.segments):
             segment.view(self.exp_avg).copy_(state[index]["exp_avg"])
             segment.view(self.exp_avg_sq).copy_(state[index]["exp_avg_sq"])

@@ -27,12 +27,13 @@ class Compiler:
         self.enabled = enabled
 
     def __call__(self, function: Callable[..., Any]) -> Callable[..., Any]:
-        """Return the function, compiled at its first call."""
+        """Return a function with the same arguments and result, compiled at its first call."""
         if not self.enabled:
             return function
         compiled: Callable[..., Any] | None = None
 
         def call(*args: Any) -> Any:
+            """Call the compiled function; eagerly if compilation failed."""
             nonlocal compiled
             if compiled is not None:
                 return compiled(*args)
@@ -41,7 +42,7 @@ class Compiler:
             try:
                 tried = torch.compile(function, fullgraph=True, dynamic=False, backend=BACKEND, options=_options())
                 result = tried(*args)
-            except Exception as error:  # whatever a compiler, or none, does
+            except Exception as error:  # compilers raise many types
                 self.enabled = False
                 print(f"not compiled, training is slower: {_failure_reason(error)}", file=sys.stderr)
                 return function(*args)

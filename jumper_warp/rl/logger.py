@@ -19,32 +19,33 @@ from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
 from jumper_warp.utils.errors import InputError
 
 REWARDS = "Episode_Reward/"
-"""Part of the metric names of reward terms."""
+"""Part of the names of metrics that are means of reward terms."""
 
 
 class Stopwatch:
-    """Measures the device time between marks; it synchronises with the device only in `read`."""
+    """Measures the device time of the parts of an iteration (lap); it synchronises with the device only in `read`."""
 
     def __init__(self, device: torch.device) -> None:
+        """device: whose time is measured, by CUDA events on a GPU and the host's clock on a CPU."""
         self._cuda, self._since = device.type == "cuda", time.perf_counter()
-        self._laps: list[list[Any]] = []
+        self._laps: list[list[Any]] = []  # marks of each lap: CUDA events, or times [s]
 
     def start(self) -> None:
-        """Begin a lap."""
+        """Begin a lap, and its first part."""
         self._laps.append([])
         self.mark()
 
     def mark(self) -> None:
-        """End a part of the present lap."""
+        """End a part of the current lap, and begin the next one."""
         mark: Any = torch.cuda.Event(enable_timing=True) if self._cuda else time.perf_counter()
         if self._cuda:
             mark.record()
         self._laps[-1].append(mark)
 
     def read(self) -> tuple[list[float], float]:
-        """Return the mean time of each part since the last call [s], and the host time per lap [s].
+        """Return the mean time of each part [s] over the laps since the last call, and the host time per lap [s].
 
-        Synchronises with the device. The host time includes the time between laps.
+        Synchronises with the device. All laps have the same number of parts. The host time includes gaps between laps.
         """
         laps, self._laps = self._laps, []
         if self._cuda:
@@ -57,7 +58,7 @@ class Stopwatch:
 
 
 class TrainingLog:
-    """Context manager that logs metrics. A failure to write prints one warning, and does not stop the training."""
+    """Context manager that logs metrics. A failure to write prints one warning, and the training continues."""
 
     def __init__(
         self, folder: Path, config: dict[str, Any], total: int, tensorboard: bool = True, wandb: bool = False,
@@ -66,8 +67,8 @@ class TrainingLog:
         """folder: the run's existing folder. config: JSON-ready configuration of the run.
 
         total: iterations at the run's end. tensorboard: whether to write events. wandb: whether to upload to Weights &
-        Biases. iteration: iterations so far; logged lines of later ones are removed.
-        Raises ValueError: Weights & Biases is requested but not installed. OSError: the metrics file cannot be used.
+        Biases. iteration: iterations so far; logged lines of later iterations are removed.
+        Raises InputError: Weights & Biases is requested but not installed. OSError: the metrics file cannot be used.
         """
         self._console = _PipeSafeConsole(stderr=True)
         self._file = MetricsFile(folder / METRICS_FILE, iteration)
@@ -81,6 +82,7 @@ class TrainingLog:
         self._task = self._progress.add_task("training", total=total)
 
     def __enter__(self) -> TrainingLog:
+        """Show the progress bar; report lines that were removed from the metrics file."""
         self._progress.start()
         if self._file.dropped:
             self.print_line(f"{self._file.path}: dropped {self._file.dropped} lines, cut or of later iterations")
@@ -89,6 +91,7 @@ class TrainingLog:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        """Close all outputs."""
         self._progress.stop()
         for file in (self._file, self._events):
             with suppress(OSError):
@@ -98,8 +101,8 @@ class TrainingLog:
             self._wandb.finish()
 
     def print_line(self, line: str) -> None:
-        """Print a line above the progress bar."""
-        with suppress(OSError):  # there is nowhere to report it
+        """Print a line above the progress bar; an OSError is ignored, since there is nowhere to report it."""
+        with suppress(OSError):
             self._console.print(line, markup=False, highlight=False, soft_wrap=True)
 
     def log(self, iteration: int, metrics: dict[str, float], remaining: float) -> None:
@@ -139,14 +142,15 @@ class TrainingLog:
 
 
 class _PipeSafeConsole(Console):
-    """Console that becomes quiet on a broken pipe, where rich would end the process."""
+    """Console that stops printing on a broken pipe, where `rich.console.Console` would end the process."""
 
     def on_broken_pipe(self) -> None:
+        """Stop printing; called by rich."""
         self.quiet = True
 
 
 def _summary(metrics: dict[str, float]) -> str:
-    """Return throughput, return and success in one line."""
+    """Return steps per second, mean return and success rate as one line, as far as metrics has them."""
     parts = [f"{metrics['Perf/fps']:,.0f} steps/s"]
     if (total := metrics.get("Train/mean_return")) is not None:
         parts.append(f"return {total:.2f}")

@@ -14,7 +14,7 @@ METRICS_FILE = "metrics.jsonl"
 
 
 class MetricsFile:
-    """Appends lines of metrics atomically; lines that a full disk refused are appended later."""
+    """Appends lines of metrics atomically; lines that could not be written are appended with the next one."""
 
     def __init__(self, path: Path, iteration: int) -> None:
         """Open the file to continue after `iteration`; lines of later iterations and malformed lines are removed.

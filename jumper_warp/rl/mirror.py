@@ -22,6 +22,7 @@ from jumper_warp.utils.errors import InputError
 Weights = list[tuple[torch.Tensor, torch.Tensor]]
 """Weight (out, in) and bias (out,) of each layer of a network, first to last."""
 Vector = Sequence[float] | np.ndarray | torch.Tensor
+"""Numbers (n,) in any container."""
 
 
 class MirrorMap(NamedTuple):
@@ -65,9 +66,9 @@ class Symmetry(NamedTuple):
 
 
 def mirror_map(order: Vector, signs: Vector, name: str, device: Any = None) -> MirrorMap:
-    """Return the mirror map `signs * x[order]` of vectors called `name` in errors.
+    """Return the mirror map `signs * x[order]`; order, signs: (n,); name: of the vectors, for messages.
 
-    Raises ValueError: it is not its own inverse.
+    Raises InputError, a ValueError: it is not its own inverse.
     """
     index = torch.as_tensor(order, dtype=torch.int64, device=device)
     sign = torch.as_tensor(signs, dtype=torch.float32, device=device)
@@ -81,7 +82,7 @@ def mirror_map(order: Vector, signs: Vector, name: str, device: Any = None) -> M
 def symmetry_of(env: VecEnv) -> Symmetry:
     """Return the mirror maps of an environment's observation and action, on its device.
 
-    Raises ValueError: the environment defines none, or one is not its own inverse or has another size.
+    Raises InputError: the environment defines none, or a map is not its own inverse or has another size.
     """
     if not isinstance(env, MirroredVecEnv):
         raise InputError("symmetry needs an environment that defines mirror images of observation and action")
@@ -92,9 +93,9 @@ def symmetry_of(env: VecEnv) -> Symmetry:
 
 
 def expand_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return the layers of a plain network, of twice the widths, with the same output as the symmetric actor.
+    """Return the layers of a plain network, hidden widths doubled, with the same output as the symmetric actor.
 
-    layers: layers of f, with activations between. A symmetric policy is saved and exported in this form.
+    layers: of f, with activations between. A symmetric policy is saved and exported in this form.
     """
     obs, action = symmetry.obs.matrix(), symmetry.action.matrix()
     expanded = []
@@ -112,10 +113,9 @@ def expand_layers(layers: Weights, symmetry: Symmetry) -> Weights:
 
 
 def nearest_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return the layers, in the form of `expand_layers`, with the least squared distance to these.
+    """Return the layers in the form of `expand_layers` with the least squared distance to `layers`; same shapes.
 
-    layers: at least two, hidden ones of even widths. Blocks that must be equal are averaged, blocks that must be zero
-    are dropped; shapes stay.
+    layers: at least two, hidden layers of even widths. Blocks that must be equal are averaged, other blocks set to 0.
     """
     obs, action = symmetry.obs.matrix().to(layers[0][0]), symmetry.action.matrix().to(layers[0][0])
     halves = []
@@ -131,10 +131,9 @@ def nearest_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
 
 
 def contract_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return copies of the layers of f, of half the widths: the inverse of `expand_layers`.
+    """Return copies of the layers of f, hidden widths halved: the inverse of `expand_layers`.
 
-    Only the symmetric part of f's last bias can be recovered; the policy is the same. Raises InputError: the layers are
-    not in that form.
+    f's last bias is recovered up to a part that cancels in the policy. Raises InputError: layers have another form.
     """
     contracted = []
     for index, (weight, bias) in enumerate(layers):
@@ -146,9 +145,9 @@ def contract_layers(layers: Weights, symmetry: Symmetry) -> Weights:
     sizes_fit = (layers[0][0].shape[1], layers[-1][0].shape[0]) == (len(symmetry.obs.order), len(symmetry.action.order))
     again = expand_layers(contracted, symmetry) if sizes_fit else []
     if len(again) != len(layers) or not all(
-        one.shape == other.shape and torch.allclose(one, other, rtol=1e-6, atol=1e-6)
+        tensor.shape == result.shape and torch.allclose(tensor, result, rtol=1e-6, atol=1e-6)
         for layer, expanded in zip(layers, again, strict=True)
-        for one, other in zip(layer, expanded, strict=True)
+        for tensor, result in zip(layer, expanded, strict=True)
     ):
         raise InputError("the layers are not those of a mirror-symmetric actor")
     return contracted

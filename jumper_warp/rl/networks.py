@@ -36,14 +36,14 @@ class Moments(NamedTuple):
     """Mean, population variance and count of a batch; mean and variance have the shape of one sample."""
 
     mean: torch.Tensor
-    var: torch.Tensor  # population variance
+    var: torch.Tensor  # population variance (divided by count, not count - 1)
     count: int  # number of samples
 
     @staticmethod
     def from_samples(x: torch.Tensor, chunk_size: int | None = None) -> Moments:
         """Return the moments over the first axis of x (batch, ...).
 
-        chunk_size: rows at a time, in two passes, which takes a CPU a sixth of the time (default: all, in one pass).
+        chunk_size: rows at a time, in two passes, six times as fast on a CPU (default: all rows, in one pass).
         """
         if chunk_size is None:
             var, mean = torch.var_mean(x, dim=0, correction=0)
@@ -105,11 +105,11 @@ def gaussian_kl(
 
 
 class RunningMoments(nn.Module):
-    """Running mean and variance of all samples so far, float64; its scaling is the identity at the start."""
+    """Running mean and variance of all samples so far, float64 buffers; the initial scaling is the identity."""
 
-    mean: torch.Tensor
-    var: torch.Tensor
-    count: torch.Tensor
+    mean: torch.Tensor  # shape of one sample
+    var: torch.Tensor  # shape of one sample, population variance
+    count: torch.Tensor  # () number of samples
 
     def __init__(self, shape: Sequence[int] = ()) -> None:
         """shape: shape of one sample; () for a scalar."""
@@ -141,7 +141,7 @@ class RunningMoments(nn.Module):
 def mlp(sizes: Sequence[int], activation: str, out_gain: float) -> nn.Sequential:
     """Return a multilayer perceptron with orthogonal weights and zero biases; no activation after the last layer.
 
-    sizes: widths of input, hidden layers and output. activation: a key of ACTIVATIONS. out_gain: of the last layer.
+    sizes: widths of input, hidden layers and output. activation: a key of ACTIVATIONS. out_gain: of the last weight.
     """
     layers: list[nn.Module] = []
     for index, (num_in, num_out) in enumerate(pairwise(sizes)):
@@ -168,7 +168,7 @@ class ActorCritic(nn.Module):
         """num_obs, num_critic_obs (default: num_obs): sizes of the observations of actor and critic.
 
         hidden: widths of the hidden layers of both networks. activation: a key of ACTIVATIONS. init_std: initial
-        standard deviation of the noise on every action. symmetry: makes the policy mirror-symmetric; saved as buffers.
+        standard deviation of the noise on every action. symmetry: makes the policy mirror-symmetric (default: not).
         """
         super().__init__()
         num_critic_obs = num_obs if num_critic_obs is None else num_critic_obs
@@ -294,7 +294,7 @@ class ActorOutput(NamedTuple):
 
 
 def _activation_backward(activation: str, grad: torch.Tensor, output: torch.Tensor) -> torch.Tensor:
-    """Return the gradient by an activation's input, from the gradient by its output and the output itself."""
+    """Return the gradient by an activation's input from the gradient by its output and the output, of one shape."""
     if activation == "elu":
         return torch.addcmul(grad, grad, output.clamp(max=0.0))
     if activation == "relu":

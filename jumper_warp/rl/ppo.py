@@ -35,16 +35,16 @@ from jumper_warp.utils.state_checks import check_parts, check_tensor, check_valu
 
 
 class ActorLosses(NamedTuple):
-    """ActorTensors statistics of a minibatch, each ()."""
+    """Losses of the actor on a minibatch, each ()."""
 
-    surrogate: torch.Tensor
+    surrogate: torch.Tensor  # clipped surrogate loss, lower is better
     entropy: torch.Tensor  # entropy of the policy [nat]
     asymmetry: torch.Tensor  # mean square of f(x) - N f(M x), see `jumper_warp.rl.mirror`; 0 without symmetry
     kl: torch.Tensor  # KL(old ‖ new) [nat]
 
 
 class StepStatistics(NamedTuple):
-    """Statistics of an optimiser step, each (); losses and divergence before the step, as in `ActorLosses`."""
+    """Statistics of an optimiser step, each (); losses and divergence are from before the step (`ActorLosses`)."""
 
     surrogate: torch.Tensor
     value: torch.Tensor  # value loss before weighting [variances of the return]
@@ -66,7 +66,7 @@ class Ppo:
     def __init__(self, env: VecEnv, cfg: PpoCfg) -> None:
         """Build networks and buffers on the environment's device; the weights follow torch's CPU seed.
 
-        Raises ValueError as `PpoCfg.batch_size`, and as `symmetry_of` if symmetry is requested.
+        Raises InputError as `PpoCfg.batch_size`, and as `symmetry_of` if symmetry is requested.
         """
         self.batch_size = cfg.batch_size(env.num_envs)
         self.env, self.cfg = env, cfg
@@ -92,7 +92,7 @@ class Ppo:
         self._minibatch = self.packer.rows.new_zeros(self.batch_size // cfg.minibatches, self.packer.rows.shape[1])
         self._orders = torch.zeros(cfg.epochs, self.batch_size, dtype=torch.int64, device=env.device)
         counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
-        self._sums = torch.zeros(len(STATISTICS) + 1, **counts)  # and their number
+        self._sums = torch.zeros(len(STATISTICS) + 1, **counts)  # sums of the statistics, and the number of steps
         self._actor_gradient, self._critic_gradient = compiler(actor_gradient), compiler(critic_gradient)
         self._optimiser_step = compiler(optimiser_step)
         procedures: tuple[Callable[[], object], ...] = (self.collector.roll, self.batch, self._run_epochs)
@@ -115,7 +115,7 @@ class Ppo:
         self._optimise()
 
     def compile(self) -> None:
-        """Compile all functions by running them once; restores every state that they change."""
+        """Compile all functions by running them once; parameters, optimiser and counts are restored afterwards."""
         if not self.compiler.enabled:
             return
         modified = [*self.optimiser.vectors, self._sums, self.collector.episode, self.collector.finished]
@@ -182,7 +182,7 @@ class Ppo:
         return take_averages(STATISTICS, self._sums, self.collector.finished, self.lr, self.model.log_std)
 
     def state_dict(self) -> dict[str, Any]:
-        """Return networks, running statistics and optimiser as nested dicts of tensors."""
+        """Return networks with statistics (`model`), `optimiser`, `lr` and `episode` as nested dicts of tensors."""
         model = self.model.state_dict()
         return {
             "model": {name: value.clone(memory_format=torch.contiguous_format) for name, value in model.items()},
@@ -194,7 +194,7 @@ class Ppo:
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Load the result of `state_dict`.
 
-        Raises ValueError: a part is missing, unknown, of another shape or type, or not finite; nothing is changed.
+        Raises InputError: a part is missing, unknown, of another shape or type, or not finite; nothing is changed.
         """
         self._check_state(state)
         self.model.load_state_dict(state["model"])
@@ -244,12 +244,12 @@ def critic_gradient(
     """
     batch, dtype = layout.split(rows), DTYPES[cfg.precision]
     output, layer_inputs = critic.forward(layout.critic_features(rows), dtype)
-    change = output.squeeze(-1) - batch.value
+    value_change = output.squeeze(-1) - batch.value
     error = output.squeeze(-1) - batch.target
     loss, grad = error.square(), error
     if cfg.clip_value:
-        clipped_error = batch.value + change.clamp(-cfg.clip, cfg.clip) - batch.target
-        grad = torch.where(clipped_error.square() > loss, clipped_error * (change.abs() <= cfg.clip), error)
+        clipped_error = batch.value + value_change.clamp(-cfg.clip, cfg.clip) - batch.target
+        grad = torch.where(clipped_error.square() > loss, clipped_error * (value_change.abs() <= cfg.clip), error)
         loss = torch.maximum(loss, clipped_error.square())
     grad_output = grad * (2.0 * cfg.value_coef / rows.shape[0])
     out.copy_(flatten_aligned(critic.backward(layer_inputs, grad_output[:, None], dtype)))

@@ -35,10 +35,7 @@ DERIVED = ("interface", "num_envs", "seed")
 
 
 def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:
-    """Return the checkpoint that cfg.resume names; None for a new run.
-
-    Raises CheckpointError: there is no usable checkpoint.
-    """
+    """Return the checkpoint of `TrainCfg.resume`; None for a new run. Raises CheckpointError: it cannot be used."""
     if not cfg.resume:
         return None
     if cfg.resume in (LATEST, LATEST_OR_NEW):
@@ -59,7 +56,7 @@ def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:
 def rank_state(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
     """Return a rank's part of a checkpoint: `env`, `rng` and the per-rank part of `ppo`.
 
-    Raises ValueError: another number of processes saved the checkpoint, or a part is missing.
+    Raises InputError: another number of processes saved the checkpoint, or a part is missing.
     """
     others = state.get("others")
     if not isinstance(others, list):
@@ -104,7 +101,7 @@ def changed_user_files(state: dict[str, Any], config: dict[str, Any]) -> list[st
 
 
 def _settings(config: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings of a run by the name of their flag."""
+    """Return the settings in a run's configuration by flag name, without dashes in front."""
     train = {name: value for name, value in config["train"].items() if name not in (*SESSION, "task")}
     env = {name: value for name, value in config["env"].items() if name not in (*DERIVED, "task")}
     task = dict(config["env"].get("task", {}))
@@ -115,7 +112,7 @@ def _settings(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    """Return the leaves of nested objects by dotted name; entries of lists by their `name`."""
+    """Return the leaves of nested dicts by dotted name, as `ppo.num-steps`; entries of lists by their key `name`."""
     if isinstance(value, list) and any(isinstance(part, dict) for part in value):
         value = {part.get("name", str(i)): part for i, part in enumerate(value)}
     if not isinstance(value, dict):
@@ -125,7 +122,7 @@ def _flat(value: Any, name: str = "") -> dict[str, Any]:
 
 
 def saved_seconds(state: dict[str, Any]) -> float:
-    """Return the training time [s] that a checkpoint records, 0 without one. Raises ValueError: it is malformed."""
+    """Return the training time [s] in a checkpoint, 0 if it has none. Raises InputError: it is malformed."""
     seconds = state.get("seconds", 0.0)
     if type(seconds) not in (int, float) or not 0.0 <= seconds < math.inf:
         raise InputError(f"seconds must be a number, finite and not negative, got {seconds!r:.60}")
@@ -133,7 +130,7 @@ def saved_seconds(state: dict[str, Any]) -> float:
 
 
 def random_state() -> dict[str, torch.Tensor]:
-    """Return the states of torch's default generators: `cpu`, and `cuda` if there is a GPU."""
+    """Return the states of torch's default random generators: `cpu`, and `cuda` if there is a GPU."""
     state = {"cpu": torch.get_rng_state()}
     if torch.cuda.is_available():
         state["cuda"] = torch.cuda.get_rng_state()
@@ -143,7 +140,7 @@ def random_state() -> dict[str, torch.Tensor]:
 def set_random_state(state: dict[str, torch.Tensor]) -> None:
     """Restore the result of `random_state`; the GPU's state only where there is a GPU.
 
-    Raises ValueError: a part is missing or not a generator's state; nothing is changed.
+    Raises InputError: a part is missing or not a generator's state; nothing is changed.
     """
     current = random_state()
     if not isinstance(state, dict) or "cpu" not in state:

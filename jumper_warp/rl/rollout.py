@@ -35,6 +35,7 @@ def make_rollout_buffer(num_steps: int, env: VecEnv, num_critic_obs: int) -> Rol
     """Return a zeroed buffer on the environment's device; num_critic_obs: size of the critic's observation."""
 
     def zeros(*shape: int) -> torch.Tensor:
+        """Return zeros on the environment's device."""
         return torch.zeros(*shape, device=env.device)
 
     steps, worlds, actions = num_steps, env.num_envs, env.num_actions
@@ -48,7 +49,7 @@ class Collector:
     """Steps the environment with the current policy, and records the transitions in `rollout`."""
 
     def __init__(self, env: VecEnv, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, compiler: Compiler) -> None:
-        """flat: parameters of `model`."""
+        """model: has the observation statistics; flat: parameters of `model`; compiler: compiles the functions."""
         self.env, self.cfg = env, cfg
         self._critic_obs = env.critic_obs if cfg.asymmetric_critic else env.obs
         self._final_critic_obs = env.final_critic_obs if cfg.asymmetric_critic else env.final_obs
@@ -85,13 +86,13 @@ class Collector:
         self._record_step(self._steps[0])
 
     def _act_step(self, step: RolloutBuffer) -> None:
-        """Write observations, mean and action of the present state to `step`, one step of the buffer."""
+        """Write observations, mean and action for the environment's current state to `step` (`RolloutBuffer.at`)."""
         self._sample_action(
             self.env.obs, self._critic_obs, step, self._actor, self._scaling, DTYPES[self.cfg.precision]
         )
 
     def _record_step(self, step: RolloutBuffer) -> None:
-        """Write the result of the environment's last step to `step`, one step of the buffer."""
+        """Write the result of the environment's last step to `step` (`RolloutBuffer.at`)."""
         env, scale = self.env, self.cfg.reward_scale
         final_critic_obs, counts = self._final_critic_obs, (self.episode, self.finished)
         self._record(env.reward, env.done, env.timeout, final_critic_obs, step, *counts, scale)
@@ -105,9 +106,10 @@ def sample_action(
     scaling: Scaling,
     dtype: torch.dtype,
 ) -> None:
-    """Record raw observations (num_envs, n) in `step`, and write the policy's mean and a sampled action to it.
+    """Write observations, the policy's mean and a sampled action to `step`.
 
-    step.action holds standard normal noise on entry.
+    obs, critic_obs: (num_envs, n) raw. step: `RolloutBuffer.at`; its action holds standard normal noise on entry.
+    scaling: normalises obs. dtype: of the hidden layers.
     """
     step.obs.copy_(sanitise(obs))
     step.critic_obs.copy_(sanitise(critic_obs))
@@ -120,9 +122,10 @@ def record_transition(
     reward: torch.Tensor, done: torch.Tensor, timeout: torch.Tensor, final_critic_obs: torch.Tensor,
     step: RolloutBuffer, episode: torch.Tensor, finished: torch.Tensor, reward_scale: float,
 ) -> None:  # fmt: skip
-    """Record reward, done, timeout and the critic's final observation in `step`, and count returns and lengths.
+    """Write reward, done, timeout and the critic's final observation to `step`, and update returns and lengths.
 
-    episode: (2, num_envs), finished: (3, num_envs), as in `Collector`; both are updated in place.
+    reward, done, timeout: (num_envs,), unscaled; final_critic_obs: (num_envs, n). episode: (2, num_envs) and finished:
+    (3, num_envs), as in `Collector`, are updated in place with unscaled rewards.
     """
     reward = torch.nan_to_num(reward, nan=0.0, posinf=0.0, neginf=0.0)
     step.reward.copy_(reward * reward_scale)

@@ -12,9 +12,9 @@ from jumper_warp.rl.cfg import PpoCfg
 
 
 def rsl_rl_config(cfg: PpoCfg, save_interval: int, seed: int) -> dict[str, Any]:
-    """Return rsl-rl's configuration with the same settings; it has no value normalisation and no reward scale.
+    """Return rsl-rl's configuration with the same settings, but no value normalisation and no reward scale.
 
-    The environment must have the observation groups `policy` and `critic`. save_interval: iterations per checkpoint.
+    The environment must have the observation groups `actor` and `critic`. save_interval: iterations per checkpoint.
     """
     same = {name: getattr(cfg, name) for name in ("desired_kl", "gamma", "lam", "entropy_coef", "max_grad_norm")}
     network = {"class_name": "MLPModel", "hidden_dims": list(cfg.hidden), "activation": cfg.activation}

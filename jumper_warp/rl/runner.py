@@ -42,11 +42,10 @@ LEARNING = ("Loss/learning_rate", "Policy/mean_std", "Train/mean_return", "Train
 """Learning metrics besides the losses; Train/ only if an episode has ended."""
 INTERRUPTED = 130
 """Exit code of a training that a signal stopped."""
-
 MakeEnv = Callable[[int, int, torch.device], VecEnv]
-"""Function that makes an environment from the number of worlds, the seed and the device."""
+"""Makes an environment from the number of worlds, the seed and the device."""
 AsRslRl = Callable[[VecEnv, int], Any]
-"""Function that wraps an environment for rsl-rl; its second argument is the number of steps between metrics."""
+"""Wraps an environment for rsl-rl; the second argument is the number of policy steps between metrics."""
 
 
 class TrainResult(NamedTuple):
@@ -62,15 +61,18 @@ class StopRequest:
     """Context manager in which Ctrl-C or SIGTERM sets `requested`; a second Ctrl-C raises KeyboardInterrupt."""
 
     def __enter__(self) -> StopRequest:
+        """Install the signal handlers."""
         self.requested = False
         self._previous = {each: signal.signal(each, self._on_signal) for each in (signal.SIGINT, signal.SIGTERM)}
         return self
 
     def __exit__(self, *_: object) -> None:
+        """Restore the previous handlers."""
         for number, handler in self._previous.items():
             signal.signal(number, handler)
 
     def _on_signal(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal: set the request, and restore the default handler of Ctrl-C."""
         self.requested = True
         signal.signal(signal.SIGINT, signal.default_int_handler)
 
@@ -82,10 +84,9 @@ def train(
     """Train to the last iteration or the time limit, save, and return the result.
 
     command: command line printed for resuming, without `--resume` (default: `jumper train TASK`). as_rsl_rl: required
-    by trainer rsl-rl. actor_init: of the policy that cfg.init_policy names, required with it. checkpoint: the loaded
-    checkpoint that cfg.resume names (default: it is loaded here).
-
-    Raises ValueError: a setting does not fit the environment or the machine. CheckpointError: no usable checkpoint to
+    by trainer rsl-rl. actor_init: of the policy cfg.init_policy, required with it. checkpoint: the loaded checkpoint of
+    cfg.resume (default: it is loaded here).
+    Raises InputError: a setting does not fit the environment or the machine. CheckpointError: no usable checkpoint to
     resume from, or the last one could not be saved. SystemExit with code INTERRUPTED: stopped by Ctrl-C or SIGTERM,
     after a checkpoint was saved.
     """
@@ -115,7 +116,7 @@ def train(
 
 
 def _check_processes(cfg: TrainCfg, rank: Rank) -> None:
-    """Check that trainer, worlds and samples fit the number of processes. Raises ValueError."""
+    """Raise InputError unless trainer, number of worlds and batch size are valid for the number of processes."""
     if cfg.trainer != "ppo" and rank.size > 1:
         raise InputError(f"trainer {cfg.trainer} is offered for one process only")
     if cfg.num_envs % rank.size:
@@ -125,14 +126,14 @@ def _check_processes(cfg: TrainCfg, rank: Rank) -> None:
 
 
 def _check_best_metric(name: str, logged: set[str]) -> None:
-    """Check that a metric of this name is logged. Raises ValueError."""
+    """Raise InputError unless `name` is the name of a logged metric."""
     if name not in logged:
         examples = ", ".join(sorted(each for each in logged if each.startswith(("Metrics/", "Train/"))))
         raise InputError(f"best_metric must name a logged metric, such as {examples}, got {name!r:.60}")
 
 
 def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
-    """Return all settings with versions and commit, as JSON holds them."""
+    """Return the configuration of a run, JSON-ready: settings, environment, versions, commit, user files."""
     settings = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
     commit, env_config = git_commit(), env.config()
     return {
@@ -147,15 +148,15 @@ def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
 
 
 class TrainingRun:
-    """State of a training in this process: algorithm, environment, folder, iteration and time."""
+    """A training in this process: algorithm (`ppo`, a Ppo or Shac), environment, folder, iteration and time."""
 
     def __init__(
         self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, actor_init: ActorInit | None = None,
         checkpoint: Checkpoint | None = None,
     ) -> None:  # fmt: skip
-        """Build the algorithm, and load the checkpoint that cfg.resume names, else apply `actor_init` if given.
+        """Build the algorithm, and load the checkpoint of cfg.resume, else apply `actor_init` if given.
 
-        command, actor_init and checkpoint: as in `train`.
+        command, actor_init, checkpoint: as in `train`. Raises InputError or CheckpointError as `train`.
         """
         self.cfg, self.env, self.rank = cfg, env, rank
         self._command = command or f"jumper train {cfg.task}"
@@ -236,7 +237,7 @@ class TrainingRun:
         return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.metrics)
 
     def _open_log(self) -> TrainingLog | _NoLog:
-        """Return the log of rank 0, and one that discards everything elsewhere."""
+        """Return a `TrainingLog` on rank 0, a log that discards everything elsewhere."""
         if self.rank.index != 0:
             return _NoLog()
         cfg = self.cfg
@@ -253,7 +254,7 @@ class TrainingRun:
         return self.seconds if self._clock_start is None else time.perf_counter() - self._clock_start
 
     def _progress(self) -> float:
-        """Return the progress of the training from 0 to 1, the maximum by iterations and by time."""
+        """Return the progress of the training, 0 to 1: the greater fraction of max_iterations and max_seconds."""
         has_limit = self.cfg.max_seconds > 0.0
         return max(
             self.iteration / self.cfg.max_iterations, self._elapsed() / self.cfg.max_seconds if has_limit else 0.0
@@ -279,13 +280,13 @@ class TrainingRun:
         return stop.requested or over_time
 
     def _read_metrics(self, times: list[float], seconds: float) -> dict[str, float]:
-        """Return the metrics to log; times: of rollout and update [s]; seconds: of an iteration [s]."""
+        """Return the metrics to log; times: of rollout and update [s], as in PERF; seconds: of an iteration [s]."""
         steps = self.cfg.ppo.num_steps * self.cfg.num_envs
         perf = (steps / seconds, *times, self._elapsed())
         return {**self.ppo.statistics(), **self.env.metrics(), **dict(zip(PERF, perf, strict=True))}
 
     def _save(self, log: TrainingLog | _NoLog, is_last: bool, stop: StopRequest) -> None:
-        """Save a checkpoint in rank 0; a failure prints a warning, and raises CheckpointError only in the last."""
+        """Save a checkpoint on rank 0; a failure prints a warning, and raises CheckpointError at the last one."""
         seconds = self._elapsed()
         local = {"ppo": self.ppo.state_dict(), "env": self.env.state_dict(), "rng": resume.random_state()}
         others = self._other_ranks(local)
@@ -306,7 +307,7 @@ class TrainingRun:
             log.print_line(f"saved {path}{hint if stop.requested else ''}")
 
     def _other_ranks(self, local: dict[str, Any]) -> list[dict[str, Any]]:
-        """Return, in rank 0, the per-rank state of the other ranks: worlds, episode counts and random generators."""
+        """Return on rank 0 the states of the other ranks: env, ppo (only episode) and rng; an empty list elsewhere."""
         if distributed.world_size() == 1:
             return []
         return distributed.gather_states({**local, "ppo": {"episode": local["ppo"]["episode"].cpu()}}, self.rank)[1:]
@@ -318,25 +319,25 @@ def is_last_iteration(iteration: int, cfg: TrainCfg, end_early: bool) -> bool:
 
 
 class _NoLog:
-    """Log that discards everything, in all ranks but 0."""
+    """Stands in for `TrainingLog` on all ranks but 0, and discards everything."""
 
     def __enter__(self) -> _NoLog:
+        """Return this log."""
         return self
 
     def __exit__(self, *_: object) -> None:
-        pass
+        """Do nothing."""
 
     def print_line(self, line: str) -> None:
-        pass
+        """Do nothing."""
 
     def log(self, iteration: int, metrics: dict[str, float], remaining: float) -> None:
-        pass
+        """Do nothing."""
 
 
 def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
     """Return the folder of a new run, log_root/task/time; rank 0 creates it."""
-    name = datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
-    folder = cfg.log_root / cfg.task / name
+    folder = cfg.log_root / cfg.task / datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
     if rank.index == 0:
         folder.mkdir(parents=True)
     return folder

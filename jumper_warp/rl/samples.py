@@ -35,7 +35,7 @@ class Batch(NamedTuple):
 class RolloutMoments(NamedTuple):
     """Mean, variance and count over the samples of a rollout."""
 
-    advantage: Moments
+    advantage: Moments  # () each
     target: Moments  # () each
     obs: Moments  # (num_obs,)
     critic_obs: Moments  # (num_critic_obs,)
@@ -45,8 +45,8 @@ class Estimates(NamedTuple):
     """Values, advantages and returns of a rollout; batch = num_steps · num_envs, time-major."""
 
     value: torch.Tensor  # (batch,) the critic's output [standard deviations of the return]
-    advantage: torch.Tensor
-    target: torch.Tensor  # (batch,) returns; advantage and target are in scaled rewards
+    advantage: torch.Tensor  # (batch,) in scaled rewards
+    target: torch.Tensor  # (batch,) returns in scaled rewards
     moments: RolloutMoments  # moments over this rank's samples
 
 
@@ -65,7 +65,7 @@ class RowLayout(NamedTuple):
     a minibatch.
     """
 
-    num_obs: int
+    num_obs: int  # numbers of entries without padding
     num_critic_obs: int
     num_actions: int
 
@@ -84,7 +84,7 @@ class RowLayout(NamedTuple):
         return rows[:, self.widths[0] : sum(self.widths[:2])]
 
     def split(self, rows: torch.Tensor) -> Batch:
-        """Return views of rows (batch, columns) as a batch."""
+        """Return the parts of rows (batch, columns) as views, without padding."""
         sizes = (self.num_obs, self.widths[0] - self.num_obs, self.num_critic_obs, self.widths[1] - self.num_critic_obs,
                  self.num_actions, self.num_actions, 1, 1, 1, 1)  # fmt: skip
         starts = list(accumulate(sizes, initial=0))
@@ -93,7 +93,7 @@ class RowLayout(NamedTuple):
         return Batch(features, critic_features, action, mean, *(each[:, 0] for each in scalars))
 
     def pack(self, batch: Batch) -> torch.Tensor:
-        """Return a batch as rows (batch, columns)."""
+        """Return a batch as new rows (batch, columns), zero-padded; inverts `split`."""
         scalars = torch.stack([batch.log_prob, batch.value, batch.advantage, batch.target], dim=-1)
         groups = ([batch.features], [batch.critic_features], [batch.action, batch.mean, scalars])
         pieces: list[torch.Tensor] = []
@@ -173,7 +173,7 @@ class BatchPacker:
         self._pack(scalings, self._estimates(scalings), advantage_scaling=scalings.value)
 
     def _scalings(self) -> Scalings:
-        """Return the present normalisation of observations and values."""
+        """Return the current mean and standard deviation of observations and values."""
         model = self._model
         return Scalings(*(each.scaling() for each in (model.obs_moments, model.critic_moments, model.value_moments)))
 
@@ -182,18 +182,12 @@ class BatchPacker:
         return self._compute_values_and_gae(self._rollout, self._critic, scalings, self._cfg, self._chunk_size)
 
     def _pack(self, scalings: Scalings, estimates: Estimates, advantage_scaling: Scaling) -> None:
-        """Write the rollout with its estimates to `rows`."""
+        """Write the rollout with its estimates to `rows`; arguments as for `write_rows`."""
         target_scaling = self._model.value_moments.scaling() if self._cfg.normalise_value else None
         self._write_rows(
-            self.rows,
-            self.layout,
-            self._rollout,
-            scalings,
-            estimates,
-            advantage_scaling,
-            target_scaling,
+            self.rows, self.layout, self._rollout, scalings, estimates, advantage_scaling, target_scaling,
             self._chunk_size,
-        )
+        )  # fmt: skip
 
 
 def compute_values_and_gae(
@@ -201,7 +195,7 @@ def compute_values_and_gae(
 ) -> Estimates:
     """Return values, advantages and returns (num_steps · num_envs,) of a rollout, and moments of its samples.
 
-    A timeout adds the value of the final observation. chunk_size: samples that the critic takes at a time, None: all.
+    A timeout adds the discounted value of the final observation. chunk_size: samples the critic evaluates at a time.
     """
     columns, dtype = critic.weights[0].shape[1], DTYPES[cfg.precision]
 
@@ -224,7 +218,10 @@ def write_rows(
     rows: torch.Tensor, layout: RowLayout, buffer: RolloutBuffer, scalings: Scalings, estimates: Estimates,
     advantage_scaling: Scaling, target_scaling: Scaling | None, chunk_size: int | None,
 ) -> None:  # fmt: skip
-    """Write the samples of a rollout to rows (batch, columns of `layout`), `chunk_size` at a time (None: all)."""
+    """Write the samples of a rollout to rows (batch, columns of `layout`), `chunk_size` at a time (None: all).
+
+    scalings normalise observations, advantage_scaling and target_scaling (None: not) advantages and returns.
+    """
     target = estimates.target if target_scaling is None else target_scaling.normalise(estimates.target)
     steps = [x.flatten(0, 1) for x in (buffer.obs[:-1], buffer.critic_obs[:-1], buffer.action, buffer.mean)]
     pieces = [rows, *steps, estimates.value, advantage_scaling.normalise(estimates.advantage), target]
@@ -236,5 +233,5 @@ def write_rows(
 
 
 def _chunks(x: torch.Tensor, chunk_size: int | None) -> tuple[torch.Tensor, ...]:
-    """Return views of `chunk_size` rows each, or of all rows in one."""
+    """Return views of x (batch, ...) with `chunk_size` rows each, the last with the rest; None: all rows in one."""
     return x.split(chunk_size or x.shape[0])

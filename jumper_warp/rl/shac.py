@@ -33,9 +33,9 @@ class Window(NamedTuple):
     loss: torch.Tensor  # () actor loss, differentiable
     obs: torch.Tensor  # (num_steps, num_envs, num_obs)
     critic_obs: torch.Tensor  # (num_steps, num_envs, num_critic_obs)
-    reward: torch.Tensor  # (num_steps, num_envs) scaled
+    reward: torch.Tensor  # (num_steps, num_envs) times `PpoCfg.reward_scale`
     next_value: torch.Tensor  # (num_steps, num_envs) target critic's value after the step; 0 after a termination
-    done: torch.Tensor  # (num_steps, num_envs)
+    done: torch.Tensor  # (num_steps, num_envs) 1 where the episode ended
 
 
 class Shac:
@@ -50,9 +50,9 @@ class Shac:
             raise InputError("trainer shac needs an environment with gradients")
         self.env, self.cfg, self.shac = env, cfg, shac
         self.batch_size = cfg.num_steps * env.num_envs
-        critic_obs = env.num_critic_obs if cfg.asymmetric_critic else env.num_obs
+        num_critic_obs = env.num_critic_obs if cfg.asymmetric_critic else env.num_obs
         self.model = ActorCritic(
-            env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, critic_obs,
+            env.num_obs, env.num_actions, cfg.hidden, cfg.activation, cfg.init_std, num_critic_obs,
         ).to(env.device)  # fmt: skip
         self.target = copy.deepcopy(self.model.critic).requires_grad_(False)
         self._actor = [*self.model.actor.parameters(), self.model.log_std]
@@ -62,15 +62,15 @@ class Shac:
             "critic": torch.optim.Adam(self._critic, shac.critic_lr, (0.7, 0.95)),
         }
         self.lr = torch.tensor(shac.lr)
-        self.episode = torch.zeros(2, env.num_envs, device=env.device, dtype=torch.float64)
-        self._finished = torch.zeros(3, device=env.device, dtype=torch.float64)
-        self._sums = torch.zeros(len(STATISTICS) + 1, dtype=torch.float64)
+        self.episode = torch.zeros(2, env.num_envs, device=env.device, dtype=torch.float64)  # return, length so far
+        self._finished = torch.zeros(3, device=env.device, dtype=torch.float64)  # as `Collector.finished`, summed
+        self._sums = torch.zeros(len(STATISTICS) + 1, dtype=torch.float64)  # and the number of iterations
 
     def compile(self) -> None:
-        """Do nothing: there is nothing to compile."""
+        """Do nothing; present for the interface of `Ppo`."""
 
     def close(self) -> None:
-        """Do nothing: there are no graphs."""
+        """Do nothing; there are no CUDA graphs."""
 
     def iterate(self, mark: Callable[[], None] = lambda: None) -> None:
         """Run one iteration; mark: called after the actor's and after the critic's update."""
@@ -110,8 +110,7 @@ class Shac:
             total = total + ends * discount * value
             discount = torch.where(done > 0.0, 1.0, discount)
             self._count_episodes(reward.detach() / cfg.reward_scale, done)
-        entropy = model.log_std.sum()
-        loss = -total.mean() / cfg.num_steps - self.shac.entropy_coef * entropy
+        loss = -total.mean() / cfg.num_steps - self.shac.entropy_coef * model.log_std.sum()  # entropy up to a constant
         return Window(loss, *(torch.stack(x) for x in zip(*samples, strict=True)))
 
     def _target_value(self, critic_obs: torch.Tensor) -> torch.Tensor:
@@ -120,7 +119,7 @@ class Shac:
         return self.model.value_moments.scaling().denormalise(output)
 
     def _count_episodes(self, reward: torch.Tensor, done: torch.Tensor) -> None:
-        """Add a step (num_envs,) to the returns and lengths of the current and the finished episodes."""
+        """Add a step's reward and done, (num_envs,), to the returns and lengths of current and finished episodes."""
         running = self.episode + torch.stack([reward, torch.ones_like(reward)])
         self._finished += torch.cat([(running * done).sum(1), done.sum()[None].double()])
         self.episode = running * (1.0 - done)
@@ -155,7 +154,7 @@ class Shac:
         return sum(losses) / len(losses), sum(norms) / len(norms)
 
     def _optimiser_step(self, name: str, params: Sequence[torch.Tensor], loss: torch.Tensor, max_norm: float) -> float:
-        """Run an optimiser step unless the gradient is not finite; return the gradient's norm before clipping."""
+        """Run a step of an optimiser by name, none if the gradient is not finite; return its norm before clipping."""
         optimiser = self.optimisers[name]
         optimiser.zero_grad()
         loss.backward(inputs=params)
@@ -173,7 +172,7 @@ class Shac:
         return take_averages(STATISTICS, self._sums, self._finished, self.lr, self.model.log_std)
 
     def _parts(self) -> dict[str, torch.Tensor]:
-        """Return all tensors of the state by name, not copied; initialises missing optimiser states with zeros."""
+        """Return all tensors of the state by dotted name, not copied; missing optimiser states become zeros."""
         parts = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         parts |= {f"target.{name}": value for name, value in self.target.state_dict().items()}
         for name, optimiser in self.optimisers.items():
@@ -186,12 +185,12 @@ class Shac:
         return parts | {"lr": self.lr, "episode": self.episode}
 
     def state_dict(self) -> dict[str, Any]:
-        """Return networks, running statistics and optimisers as a dict of tensors; `model` is nested."""
+        """Return copies of the tensors in `_parts` by name; `model.` is a nested dict under the key `model`."""
         rest = {name: value.detach().clone() for name, value in self._parts().items() if not name.startswith("model.")}
         return {"model": {name: value.clone() for name, value in self.model.state_dict().items()}, **rest}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Load the result of `state_dict`. Raises ValueError: a part is missing, unknown, of another shape or type."""
+        """Load the result of `state_dict`. Raises InputError: a part is missing, unknown, of another shape or type."""
         flat = {f"model.{name}": value for name, value in state["model"].items()}
         flat |= {name: value for name, value in state.items() if name != "model"}
         parts = self._parts()

@@ -1,4 +1,4 @@
-"""Range checks of settings; each raises InputError with a one-line message."""
+"""Range checks of settings; each raises InputError, a ValueError, with a one-line message that begins with `name`."""
 
 from __future__ import annotations
 
@@ -14,59 +14,59 @@ NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}")
 FLOAT32_MAX = 3.4028234e38
 """Largest finite float32; settings are converted to float32 on a device."""
 MOST_SEED = 2**31 - 1
-"""Largest seed of the kernels' random streams."""
+"""Largest valid seed; the kernels' random streams take an int32."""
 LAST_OF_PREVIOUS_VERSION = "05fa856"
 """Last commit that reads policies, tasks and runs of the previous version."""
 
 
 def check_finite(name: str, *values: float) -> None:
-    """Raise ValueError if a value is NaN or infinite in float32."""
+    """Raise InputError if a value is NaN or infinite in float32."""
     for value in values:
         if not abs(value) <= FLOAT32_MAX:
             raise InputError(f"{name} must be finite, got {value}")
 
 
 def check_positive(name: str, *values: float) -> None:
-    """Raise ValueError unless all values are positive and finite."""
+    """Raise InputError unless all values are positive and finite in float32."""
     for value in values:
         if not 0.0 < value <= FLOAT32_MAX:
             raise InputError(f"{name} must be positive and finite, got {value}")
 
 
 def check_not_negative(name: str, *values: float) -> None:
-    """Raise ValueError unless all values are non-negative and finite."""
+    """Raise InputError unless all values are non-negative and finite in float32."""
     for value in values:
         if not 0.0 <= value <= FLOAT32_MAX:
             raise InputError(f"{name} must be finite and not negative, got {value}")
 
 
 def check_within(name: str, values: np.ndarray, bounds: tuple[float, float]) -> None:
-    """Raise ValueError if an entry of an array is outside (lower, upper) bounds, or NaN."""
+    """Raise InputError if an entry of an array is NaN or outside [lower, upper]; bounds: (lower, upper)."""
     outside = ~((values >= bounds[0]) & (values <= bounds[1]))
     if outside.any():
         raise InputError(f"{name} must be in [{bounds[0]:g}, {bounds[1]:g}], got {values[outside][0]:g}")
 
 
-def check_probabilities(what: str, cfg: Any, *names: str) -> None:
-    """Raise ValueError unless these fields of a configuration are in [0, 1]; what: its name, for the message."""
+def check_probabilities(section: str, cfg: Any, *names: str) -> None:
+    """Raise InputError unless the fields `names` of `cfg` are in [0, 1]; section: name of `cfg` in the message."""
     for name in names:
         if not 0.0 <= (value := getattr(cfg, name)) <= 1.0:
-            raise InputError(f"{what} {name} must be in [0, 1], got {value}")
+            raise InputError(f"{section} {name} must be in [0, 1], got {value}")
 
 
 def check_count(name: str, value: Any) -> None:
-    """Raise ValueError unless the value is an integer of at least 1."""
+    """Raise InputError unless the value is an integer of at least 1, and not a bool."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
         raise InputError(f"{name} must be a whole number of at least 1, got {value!r:.40}")
 
 
 def check_seed(value: Any) -> None:
-    """Raise ValueError unless the value is an integer from 0 to MOST_SEED."""
+    """Raise InputError unless the value is an integer from 0 to MOST_SEED, and not a bool."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value <= MOST_SEED:
         raise InputError(f"seed must be in 0 .. {MOST_SEED}, got {value!r:.40}")
 
 
 def version_error(version: str, known: int) -> str:
-    """Return the error message for a file of another version than `known`, with the commit that reads `known - 1`."""
+    """Return the message that a file has format version `version`, not `known`, with the commit for `known - 1`."""
     previous = f"commit {LAST_OF_PREVIOUS_VERSION} reads version {known - 1}"
     return f"has version {version}, this is version {known}; {previous}"

@@ -8,4 +8,5 @@ class InputError(ValueError):
     """
 
     def __init__(self, message: str) -> None:
+        """message: text in which runs of whitespace become one space."""
         super().__init__(" ".join(message.split()))

@@ -20,14 +20,14 @@ else:
 
 
 def records(structs: wp.array) -> NDArray[np.void]:
-    """Return an array of structs as a NumPy record array; synchronises with the device."""
+    """Return a copy of an array of structs as a NumPy record array of its shape; synchronises with the device."""
     return cast("NDArray[np.void]", structs.numpy())
 
 
 def load_kernels(kernels: Iterable[tuple[Kernel, int]], device: wp.Device) -> None:
     """Compile the modules of kernels in parallel, or load them from Warp's cache on disk.
 
-    kernels: with their block sizes at launch. Compiler errors propagate.
+    kernels: pairs of a kernel and its launch's threads per block (ignored on a CPU). Compiler errors propagate.
     """
     variants = {(kernel.module, block if device.is_cuda else None): None for kernel, block in kernels}
     loads = [partial(wp.force_load, device, [module], block, 0) for module, block in variants]

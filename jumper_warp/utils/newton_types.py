@@ -1,7 +1,4 @@
-"""Newton's Model, State and Control with arrays that are not optional, for type checkers.
-
-At run time they are Newton's classes.
-"""
+"""Newton's Model, State and Control with non-optional arrays, for type checkers; at run time, Newton's classes."""
 
 from __future__ import annotations
 
@@ -15,21 +12,21 @@ if TYPE_CHECKING:
     import warp as wp
 
     class State(newton.State):
-        """State of bodies and joints."""
+        """`newton.State`, with arrays that are not optional."""
 
-        joint_q: wp.array
-        joint_qd: wp.array
-        body_q: wp.array
-        body_qd: wp.array
-        body_f: wp.array
+        joint_q: wp.array  # (joint_coord_count,) float [m, rad or quaternion xyzw]
+        joint_qd: wp.array  # (joint_dof_count,) float [m/s or rad/s]
+        body_q: wp.array  # (body_count,) transform, world
+        body_qd: wp.array  # (body_count,) spatial vector, world: linear [m/s], angular [rad/s]
+        body_f: wp.array  # (body_count,) spatial vector, world: force [N], torque [N m]
 
     class Control(newton.Control):
-        """Control inputs of joints."""
+        """`newton.Control`, with an array that is not optional."""
 
-        joint_f: wp.array
+        joint_f: wp.array  # (joint_dof_count,) float [N or N m]
 
     class Model(newton.Model):
-        """Finalized model of bodies, joints and shapes."""
+        """`newton.Model`, with arrays that are not optional; Newton documents shapes and units."""
 
         body_com: wp.array
         body_inertia: wp.array

@@ -6,5 +6,5 @@ import torch
 
 
 def normalise(obs: torch.Tensor, mean: torch.Tensor, std: torch.Tensor, limit: float) -> torch.Tensor:
-    """Return observations (..., n) as standard deviations from the mean, clamped to ± limit; mean, std: (n,)."""
+    """Return (obs - mean) / std, clamped to ± limit, of shape (..., n); obs: (..., n); mean, std: (n,)."""
     return ((obs - mean) / std).clamp(-limit, limit)

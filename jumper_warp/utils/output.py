@@ -13,7 +13,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import json_bytes, write_atomically
 from jumper_warp.utils.runtime import device_info, source_versions
 
-Scalar = float | int | str | bool | None
+Scalar = float | int | str | bool | None  # type of a metric
 
 
 def output_dir(name: str, out: Path | None = None) -> Path:
@@ -21,7 +21,7 @@ def output_dir(name: str, out: Path | None = None) -> Path:
 
     name: of the experiment, one path component. out: the folder, which may exist (default:
     `outputs/<name>/<YYYY-mm-dd_HH-MM-SS>`, with a number appended if two runs start in the same second).
-    Raises ValueError: `name` is empty or has a path separator. FileExistsError: `out` is a file.
+    Raises InputError: `name` is empty or has a path separator. FileExistsError: `out` is a file.
     """
     if name in ("", "..") or Path(name).name != name:
         raise InputError(f"an experiment name is one path component, got {name!r}")
@@ -38,12 +38,11 @@ def output_dir(name: str, out: Path | None = None) -> Path:
 
 
 def write_metrics(folder: Path, metrics: Mapping[str, Scalar | list[Scalar]]) -> Path:
-    """Write `metrics.json` and `run.json` (commit, dirty, versions, device, command) atomically.
+    """Write `metrics.json` and `run.json` (commit, dirty, versions, device, command); return the path of metrics.json.
 
-    Return the path of `metrics.json`. Environment variables are not saved.
-
+    Each file is written atomically. Environment variables are not saved.
     folder: an existing folder. metrics: flat, with the unit in the name, as in `apex [m]`; NumPy scalars become Python
-    numbers. Raises ValueError: a metric is not finite. TypeError: a value has another type. Both name the metric.
+    numbers. Raises InputError: a metric is not finite. TypeError: a value has another type. Both name the metric.
     """
     python_metrics = {key: _to_python(key, value) for key, value in metrics.items()}
     command = [Path(sys.argv[0]).name, *sys.argv[1:]]
@@ -54,7 +53,7 @@ def write_metrics(folder: Path, metrics: Mapping[str, Scalar | list[Scalar]]) ->
 
 
 def _to_python(name: str, value: Any) -> Scalar | list[Scalar]:
-    """Return a metric as Python numbers, strings or a list of them, or raise an error that names it."""
+    """Return a metric as a Python scalar or list of scalars. Raises TypeError or InputError as `write_metrics`."""
     if not isinstance(name, str):
         raise TypeError(f"the name of a metric must be a string, got {name!r}")
     if isinstance(value, list):

@@ -1,11 +1,11 @@
-"""Rotations in NumPy: quaternions xyzw and rotation vectors."""
+"""Rotations in NumPy: unit quaternions xyzw and rotation vectors (axis times angle [rad])."""
 
 from __future__ import annotations
 
 import numpy as np
 
 CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
-"""Signs of the conjugate of a quaternion xyzw, the inverse of a unit quaternion."""
+"""(4,) Factors on a quaternion xyzw that give its conjugate, which is the inverse of a unit quaternion."""
 
 
 def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
@@ -15,7 +15,7 @@ def rotate(quaternion: np.ndarray, vector: np.ndarray) -> np.ndarray:
 
 
 def multiply(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return the product a b of quaternions xyzw (..., 4): the rotation b, then a."""
+    """Return the product a b of quaternions xyzw, each (..., 4): the rotation by b, then by a."""
     vector = a[..., 3:] * b[..., :3] + b[..., 3:] * a[..., :3] + np.cross(a[..., :3], b[..., :3])
     scalar = a[..., 3:] * b[..., 3:] - np.sum(a[..., :3] * b[..., :3], axis=-1, keepdims=True)
     return np.concatenate([vector, scalar], axis=-1)

@@ -45,7 +45,7 @@ def device_info(device: wp.DeviceLike = None) -> DeviceInfo:
 
 
 def report_device(device: wp.DeviceLike = None, console: Console | None = None) -> DeviceInfo:
-    """Print one line about the device to standard error, and return its properties."""
+    """Print one line about a device, and return its properties (default: current device, standard error)."""
     info = device_info(device)
     parts = [f"device {info.alias} ({info.name})"]
     if info.driver is None:
@@ -64,7 +64,6 @@ def configure_device(device: str | None, threads: int | None = None) -> DeviceIn
     """Set the number of threads, silence Warp's module messages, and print and return the device's properties.
 
     device: a Warp device (default: the current one). threads: CPU threads of simulations, as in `set_threads`.
-
     Raises InputError: there is no such device, or the number of threads is invalid.
     """
     set_threads(threads)
@@ -76,7 +75,7 @@ def configure_device(device: str | None, threads: int | None = None) -> DeviceIn
 
 
 def git_commit(folder: Path | None = None) -> Commit | None:
-    """Return the commit of the source tree in `folder` (default: this package's, cached at the first call).
+    """Return the commit of the source tree in `folder` (default: this package's folder, cached at the first call).
 
     None without git, outside a git tree, in a tree without commits, and if the enclosing tree does not track the
     folder, as for a package installed inside another project.
@@ -103,7 +102,7 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 
 def source_versions() -> dict[str, Any]:
-    """Return the commit of this package's source tree, whether it is dirty, and `versions`."""
+    """Return the dict of `commit` (hash or None), `dirty` (bool or None) and `versions` for this package."""
     commit = git_commit()
     return {"commit": commit and commit.hash, "dirty": commit and commit.dirty, "versions": versions()}
 

@@ -13,7 +13,7 @@ PROJECT_PREFIX = "jumper_warp."
 
 
 def source_checksums(saved: Any) -> dict[str, str]:
-    """Return the SHA-256 by module of the files outside the project that `saved` refers to as `module:name`.
+    """Return the SHA-256 by module name of the files outside the project that `saved` refers to as `module:name`.
 
     saved: nested dicts and lists, such as a task as JSON. Modules that are not loaded or have no file are left out.
     """

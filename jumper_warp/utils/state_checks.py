@@ -1,4 +1,4 @@
-"""Checks of a saved state; each raises InputError with a one-line message that names the part."""
+"""Checks of a saved state; each raises InputError, a ValueError, with a one-line message that begins with `where`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from jumper_warp.utils.errors import InputError
 
 
 def check_parts(value: Any, names: Iterable[Any], where: str) -> None:
-    """Raise ValueError unless `value` is a dictionary with exactly these keys; where: its name in messages."""
+    """Raise InputError unless `value` is a dictionary with exactly the keys `names`; where: its name in messages."""
     if not isinstance(value, dict):
         raise InputError(f"{where} must be a dictionary, got {type(value).__name__}")
     names = set(names)
@@ -22,13 +22,13 @@ def check_parts(value: Any, names: Iterable[Any], where: str) -> None:
 
 
 def _listed(names: list[str]) -> str:
-    """Return up to three names as text."""
+    """Return the first three names as text with the number of the others, or "nothing" for an empty list."""
     shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
     return shown or "nothing"
 
 
 def check_tensor(value: Any, like: torch.Tensor, where: str, dtypes: Iterable[torch.dtype] = ()) -> None:
-    """Raise ValueError unless `value` is a dense tensor with the shape of `like`, and its dtype or one of `dtypes`."""
+    """Raise InputError unless `value` is a dense tensor with the shape of `like`, and its dtype or one of `dtypes`."""
     if not isinstance(value, torch.Tensor) or value.layout != torch.strided:
         raise InputError(f"{where} must be a tensor, got {type(value).__name__}")
     if value.shape != like.shape:
@@ -38,7 +38,7 @@ def check_tensor(value: Any, like: torch.Tensor, where: str, dtypes: Iterable[to
 
 
 def check_values(value: torch.Tensor, where: str, minimum: float = -math.inf) -> None:
-    """Raise ValueError unless all entries of a tensor are finite and at minimum `minimum`."""
+    """Raise InputError unless all entries of a tensor are finite and at least `minimum`."""
     if not bool(value.isfinite().all()):
         raise InputError(f"{where} is not finite")
     if not bool((value >= minimum).all()):

@@ -16,13 +16,13 @@ _jobs: SimpleQueue[Callable[[], None]] = SimpleQueue()
 
 
 def available_threads() -> int:
-    """Return the number of CPU cores for this process, an equal part of them under torchrun."""
+    """Return the number of CPU cores for this process: its affinity, divided by torchrun's processes on the machine."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
     return max(1, cores // max(1, int(os.environ.get("LOCAL_WORLD_SIZE", "1"))))
 
 
 def checked_threads(threads: int | None) -> int:
-    """Return a valid number of threads; None: the default of `set_threads`. Raises ValueError: not positive."""
+    """Return a number of threads; None: the default of `set_threads`. Raises InputError: it is not positive."""
     if threads is None:
         return available_threads() if _default_threads is None else _default_threads
     if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
@@ -31,16 +31,13 @@ def checked_threads(threads: int | None) -> int:
 
 
 def set_threads(threads: int | None) -> None:
-    """Set the default number of threads of new simulations; None: `available_threads`.
-
-    Raises ValueError as `checked_threads`.
-    """
+    """Set the default number of threads of new simulations (None: `available_threads`); errors as `checked_threads`."""
     global _default_threads
     _default_threads = None if threads is None else checked_threads(threads)
 
 
 def run_in_parallel(jobs: Iterable[Callable[[], object]], threads: int) -> None:
-    """Run jobs on `threads` threads, the caller's included, and return when all have finished.
+    """Run jobs on `threads` threads, including the calling thread, and return when all have finished.
 
     If a job raises, jobs that have not started are skipped, and its exception is raised here.
     """
@@ -49,6 +46,7 @@ def run_in_parallel(jobs: Iterable[Callable[[], object]], threads: int) -> None:
     remaining, errors = iter(jobs), SimpleQueue()
 
     def work() -> None:
+        """Run remaining jobs, and put the exception that ended this, or None, into `errors`."""
         error = None
         try:
             for job in remaining:
@@ -71,6 +69,6 @@ def run_in_parallel(jobs: Iterable[Callable[[], object]], threads: int) -> None:
 
 
 def _run_jobs() -> None:
-    """Run jobs from the queue, for ever."""
+    """Run jobs from the queue in an endless loop, as a worker thread."""
     while True:
         _jobs.get()()

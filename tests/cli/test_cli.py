@@ -36,7 +36,7 @@ TRAIN += "--ppo.num-steps 4 --ppo.minibatches 2 --ppo.hidden 16 8 --env.curricul
 
 @pytest.fixture(scope="module")
 def trained_run(tmp_path_factory):
-    """Folder of a short training, and the policy exported from it."""
+    """Folder of a short training, with its exported policy in the folder `policy`."""
     root = tmp_path_factory.mktemp("logs")
     cli.main([*TRAIN, "--log-root", str(root)])
     (folder,) = (root / "vertical-jump").iterdir()
@@ -46,7 +46,7 @@ def trained_run(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def still(tmp_path_factory):
-    """Folder of a policy for jumps to places that holds the default pose."""
+    """Folder of a horizontal-jump policy that holds the default pose."""
     folder = tmp_path_factory.mktemp("policies") / "still"
     save_policy(folder, still_policy("horizontal-jump"))
     return str(folder)
@@ -149,7 +149,7 @@ def test_train_without_task_lists_tasks_and_exits_with_2(capsys):
         lambda *_: np.zeros(3).reshape(2),  # ValueError of a library
         lambda *_: json.loads("{"),
         lambda *_: {}["missing"],
-        lambda *_: (_ for _ in ()).throw(OSError("no file of ours")),
+        lambda *_: (_ for _ in ()).throw(OSError("no file name")),
     ],
 )
 def test_unexpected_exceptions_propagate(monkeypatch, fault):
@@ -159,10 +159,10 @@ def test_unexpected_exceptions_propagate(monkeypatch, fault):
 
 
 def test_input_error_prints_one_line(capsys, monkeypatch):
-    def refuse(*_):
+    def raise_input_error(*_):
         raise InputError("expected a,\n  got b")
 
-    monkeypatch.setattr("jumper_warp.cli.list.run", refuse)
+    monkeypatch.setattr("jumper_warp.cli.list.run", raise_input_error)
     assert run(capsys, "list") == (2, "", ["jumper: expected a, got b"])
 
 
@@ -173,10 +173,10 @@ def test_missing_file_prints_one_line(capsys, monkeypatch):
 
 
 def test_keyboard_interrupt_exits_with_130(capsys, monkeypatch):
-    def interrupted(*_):
+    def interrupt(*_):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("jumper_warp.cli.list.run", interrupted)
+    monkeypatch.setattr("jumper_warp.cli.list.run", interrupt)
     assert run(capsys, "list")[0] == 130
 
 
@@ -184,7 +184,7 @@ def test_keyboard_interrupt_exits_with_130(capsys, monkeypatch):
 
 
 def flag_of(name):
-    """Return the flag of a term's parameter from its dotted name."""
+    """Return the flag of a term's parameter by its dotted name, such as rewards.jump_height.weight."""
     section, term, key = name.split(".")
     middle = "" if section in ("advance", "curriculum") else f".{flag_name(term)}"
     return f"--env.{section}{middle}.{flag_name(key)}"
@@ -193,11 +193,11 @@ def flag_of(name):
 @pytest.mark.parametrize("name", ["vertical-jump", "horizontal-jump", "hold-height"])
 def test_flag_sets_each_term_parameter(name):
     task = hold_height() if name == "hold-height" else make_task(name)
-    drawn = tuple(f"events.{term.name}." for term in task.randomization.events())  # has flags of its own
+    sampled = tuple(f"events.{term.name}." for term in task.randomization.events())  # flags: --env.randomization
     args, expected = [], {}
     for name, i in task.params.names.items():
-        if not name.startswith(drawn):
-            expected[name] = task.params.values[i] + (not name.endswith(".most"))
+        if not name.startswith(sampled):
+            expected[name] = task.params.values[i] + (not name.endswith(".most"))  # other than the default
             args += [flag_of(name), f"{expected[name]:.17g}"]
     params = parsed(task, args).params
     for name, value in expected.items():
@@ -206,12 +206,12 @@ def test_flag_sets_each_term_parameter(name):
 
 
 def parsed(task, args):
-    """Return the task with settings changed by flags."""
+    """Return a copy of the task with settings changed by --env flags."""
     return parse_settings(task, TrainArgs(), args)[1]
 
 
 def leaves(value, path=""):
-    """Yield the expected flag and the value of each setting that belongs to no term."""
+    """Yield the expected flag and the value of each setting in nested dataclasses; path: dotted, of `value`."""
     if dataclasses.is_dataclass(value):
         for spec in dataclasses.fields(value):
             yield from leaves(getattr(value, spec.name), f"{path}.{flag_name(spec.name)}")
@@ -384,7 +384,7 @@ def test_play_records_each_step_of_each_robot(trained_run, tmp_path, capsys):
     code, out, _ = run(capsys, "play", str(trained_run), *args)
     assert code == 0 and "0.900" in out
     series = {name.split("/")[-1]: values for name, values in curves(tmp_path / "jump.rrd").items()}
-    assert [len(series[f"base of {world} [m]"]) for world in (0, 1)] == [15, 15]
+    assert [len(series[f"base of {world} [m]"]) for world in (0, 1)] == [15, 15]  # 0.25 s at 60 Hz
     assert series["target of 1 [m]"] == pytest.approx([0.9] * 15)
     assert 0.2 < series["base of 0 [m]"][0] < 0.5
 
@@ -395,7 +395,7 @@ def test_evaluate_horizontal_jumps(still, tmp_path, capsys):
     metrics = json.loads((tmp_path / "metrics.json").read_text())
     assert code == 0 and "success_rate_in_range" in out
     assert (metrics["jumps"], metrics["task"], metrics["failed_by_no_jump"]) == (3, "horizontal-jump", 3)
-    assert metrics["mean_error_m"] == pytest.approx(0.6, abs=0.02)
+    assert metrics["mean_error_m"] == pytest.approx(0.6, abs=0.02)  # the mean goal: the robot stays at its start
     rows = [row.split(",") for row in (tmp_path / "jumps.csv").read_text().splitlines()]
     assert [row[0] for row in rows] == ["goal_x_m", "0.400000", "0.600000", "0.800000"]
     assert [float(row[2]) for row in rows[1:]] == pytest.approx([90.0] * 3, abs=1e-4)
@@ -463,7 +463,7 @@ def test_play_refuses_invalid_scripts(tmp_path, capsys, args, message):
 @pytest.mark.parametrize("command", ["evaluate", "play"])
 def test_refuses_output_folder_before_simulating(tmp_path, capsys, command):
     policy = still_policy("horizontal-jump")
-    names = ("other", *policy.interface.observation_names[1:])  # whose environment is refused
+    names = ("other", *policy.interface.observation_names[1:])  # another name: no environment fits
     policy.interface = dataclasses.replace(policy.interface, observation_names=names)
     save_policy(tmp_path / "policy", policy)
     (tmp_path / "file").touch()

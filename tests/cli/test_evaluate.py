@@ -20,7 +20,7 @@ TASK = EVALUATIONS["place"].prepare_task(make_task("horizontal-jump"))
 
 @pytest.fixture(scope="module")
 def policies(tmp_path_factory):
-    """Folders of policies by task, which hold the default pose."""
+    """Folder with a policy's folder for each of two tasks, by task name; the policies hold the default pose."""
     folder = tmp_path_factory.mktemp("policies")
     for name in ("vertical-jump", "horizontal-jump"):
         save_policy(folder / name, still_policy(name))
@@ -84,15 +84,15 @@ def test_refuses_suites_of_other_tasks(policies, task, suite, available):
 
 @pytest.mark.parametrize("command", [evaluate, play])
 def test_help_lists_only_flags_of_the_policys_task(policies, capsys, command):
-    shown = {}
+    help_text = {}
     for task in ("vertical-jump", "horizontal-jump"):
         with pytest.raises(SystemExit) as end:
             command.run([str(policies / task), "--help"], [])
         assert end.value.code == 0
-        shown[task] = capsys.readouterr().out
+        help_text[task] = capsys.readouterr().out
     flags = {evaluate: ("--height-range", "--heading"), play: ("--height", "--goal")}[command]
     for task, present, absent in (("vertical-jump", *flags), ("horizontal-jump", *reversed(flags))):
-        assert present in shown[task] and absent not in shown[task] and "--solver" in shown[task]
+        assert present in help_text[task] and absent not in help_text[task] and "--solver" in help_text[task]
 
 
 @pytest.mark.parametrize("command", [evaluate, play])

@@ -1,4 +1,4 @@
-"""`jumper train --init-policy` initializes a new training with a policy."""
+"""`jumper train --init-policy` initialises the actor of a new training from a policy."""
 
 import json
 
@@ -18,7 +18,7 @@ TRAIN += [part for name in ("lr", "min-lr", "max-lr") for part in (f"--ppo.{name
 
 @pytest.fixture(scope="module")
 def begun(tmp_path_factory):
-    """Folder of a training from a shipped policy: one iteration with a negligible learning rate."""
+    """Folder of a training that started from slippery_jump: one iteration with a learning rate of 1e-9."""
     root = tmp_path_factory.mktemp("logs")
     cli.main([*TRAIN, "--init-policy", "slippery_jump", "--log-root", str(root)])
     (folder,) = (root / "horizontal-jump-mars").iterdir()
@@ -31,7 +31,7 @@ def test_training_starts_with_the_weights_of_the_policy(begun):
         torch.testing.assert_close(same_weight, weight, atol=1e-6, rtol=0.0)
         torch.testing.assert_close(same_bias, bias, atol=1e-6, rtol=0.0)
     drift = (trained.mean - policy.mean).abs() / policy.std
-    assert 0.0 < drift.max() < 0.2
+    assert 0.0 < drift.max() < 0.2  # [standard deviations]
     assert trained.config["train"]["init_policy"] == "slippery_jump"
     assert trained.config["train"]["ppo"]["init_std"] == 0.3
     log_std = load_checkpoint(begun / "checkpoints" / "iteration_000001.pt")["ppo"]["model"]["log_std"]

@@ -71,7 +71,7 @@ def test_refuses_abbreviated_flags(flag, capsys):
 
 def test_command_accepts_old_flag_and_refuses_both(capsys):
     renamed = "jumper: --keep is now --max-checkpoints"
-    code, _, err = run(capsys, "train", "vertical-jump", "--keep", "0")
+    code, _, err = run(capsys, "train", "vertical-jump", "--keep", "0")  # 0 fails before the training starts
     assert (code, err) == (2, [renamed, "jumper: max_checkpoints must be at least 1, got 0"])
     code, _, err = run(capsys, "train", "vertical-jump", "--keep", "2", "--max-checkpoints", "2")
     assert (code, err) == (2, [f"{renamed}: give only --max-checkpoints"])

@@ -21,7 +21,7 @@ HERE = ["--device", "cpu", "--no-tensorboard"]
 
 
 def train(capsys, *args):
-    """Return exit code, the printed folder of the run, and the lines of standard error."""
+    """Run `jumper train vertical-jump`; return exit code, standard output, and the lines of standard error."""
     code, out, err = command(capsys, "train", "vertical-jump", *HERE, *args)
     return code, out.strip(), err
 
@@ -33,23 +33,24 @@ def begun(tmp_path_factory):
     springs = root / "springs.json"
     with_springs(600.0, 0.1).save(springs)
     cli.main(["train", "vertical-jump", *HERE, *SMALL, *SAVED, "--robot", str(springs), "--log-root", str(root)])
-    springs.unlink()  # a run knows its robot
+    springs.unlink()  # the run saves its robot
     (folder,) = (root / "vertical-jump").iterdir()
     return folder
 
 
 @pytest.fixture
 def run(begun, tmp_path):
-    """Copy of the run that a test may change."""
+    """Copy of the run's folder that a test may change."""
     return shutil.copytree(begun, tmp_path / "logs" / "vertical-jump" / "run")
 
 
 def config(folder):
+    """Return the saved configuration of a run."""
     return json.loads((folder / "config.json").read_text())
 
 
 def changed_settings(lines):
-    """Return the lines that print a setting changed against the resumed run."""
+    """Return the lines `setting old -> new`, which `jumper train` prints for settings that differ from the run's."""
     return [line for line in lines if " -> " in line]
 
 
@@ -99,7 +100,7 @@ def test_solver_of_the_run_is_restored(run):
 
 
 def resave(run, train=None, env=None, lacks=()):
-    """Save the run's checkpoint with other settings; lacks: environment settings to leave out."""
+    """Save the run's checkpoint with changed settings of training and environment; lacks: names to leave out of env."""
     path = run / "checkpoints" / "iteration_000001.pt"
     state = load_checkpoint(path)
     saved = json.loads(state["config"])

@@ -20,12 +20,13 @@ HEAVY = 3.0
 
 
 def base_mass(env):
+    """Return the mass of the first robot's base [kg]."""
     return float(env.sim.model.body_mass.numpy()[0])
 
 
 @pytest.fixture(scope="module")
 def overlay(tmp_path_factory):
-    """Return the file of a robot with a heavier base and weaker motors."""
+    """File of a robot overlay with a base heavier by HEAVY and 0.8 of the gain kp."""
     file = tmp_path_factory.mktemp("robot") / "identified.json"
     values = {"base_mass": (float(RobotOverlay({}).robots().base_mass[0, 0]) + HEAVY,), "kp": 12 * (0.8,)}
     RobotOverlay(values, {"base_mass": (-0.1, 0.1)}).save(file)
@@ -46,7 +47,7 @@ def test_heavier_robot_jumps_less_high(overlay, tmp_path, command):
                 tmp_path / name / "jumps.csv", delimiter=",", names=True, dtype=None, encoding="utf-8"
             )
             apex[name] = np.mean(table["apex_m"])
-    assert apex["identified"] < apex["described"] - 0.02
+    assert apex["identified"] < apex["described"] - 0.02  # [m]
     if command == "evaluate":
         assert metrics["identified"]["robot"] == str(overlay) and "robot" not in metrics["described"]
 
@@ -65,7 +66,7 @@ def test_torque_limit_metric_includes_the_overlay(tmp_path):
     args = EvaluationArgs(robot=tmp_path / "weak.json", device="cpu")
     policy = open_policy("vertical_jump")
     nominal, weak = (torque_limit(env_of_policy(policy, 1, conditions_of(a))) for a in (EvaluationArgs(), args))
-    assert nominal == 18.0 and weak == pytest.approx(16.2)
+    assert nominal == 18.0 and weak == pytest.approx(16.2)  # [N m], transversal motors: 0.9 · 18
 
 
 @pytest.mark.parametrize("command", [("evaluate", "vertical_jump"), ("train", "vertical-jump")])

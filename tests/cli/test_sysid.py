@@ -22,7 +22,7 @@ PARAMS = ["--params", "latency,offsets"]
 
 
 def write_csv_table(path, motion, sign=1.0):
-    """Write targets and angles as a CSV table without settings; sign: factor on the angles."""
+    """Write times, targets and angles of a motion as a CSV table without settings; sign: factor on the angles."""
     names = [f"{channel}/{joint}" for channel in ("target", "angle") for joint in MOTOR_JOINTS]
     with path.open("w", newline="") as file:
         csv.writer(file).writerows(
@@ -32,7 +32,7 @@ def write_csv_table(path, motion, sign=1.0):
 
 @pytest.fixture(scope="module")
 def recorded(tmp_path_factory):
-    """Folder of short recorded motions of a robot with sensor offsets and latency."""
+    """Folder with the overlay truth.json (sensor offsets, latency of 3 ms) and its robot's recorded `motions`."""
     folder = tmp_path_factory.mktemp("sysid")
     truth = RobotOverlay({"offset": tuple(np.radians(np.linspace(-1.0, 1.0, 12))), "latency": (0.003,)})
     truth.save(folder / "truth.json")
@@ -47,25 +47,25 @@ def test_excite_writes_motions_and_expected_accuracy(recorded):
     assert [load_motion(file).base for file in files] == ["fixed", "fixed", "free", "free"]
     plan = json.loads((recorded / "motions" / "excite.json").read_text())
     assert np.all(np.diff(plan["gain_nat"]) > 0.0)
-    assert plan["mass_kg"] == pytest.approx(14.5)
-    assert plan["parameters"]["latency"]["expected_deviation"] < 2.0e-4
-    assert plan["parameters"]["offset/FL_outer"]["of_prior"] < 0.2
+    assert plan["mass_kg"] == pytest.approx(14.5)  # of the described robot
+    assert plan["parameters"]["latency"]["expected_deviation"] < 2.0e-4  # [s]
+    assert plan["parameters"]["offset/FL_outer"]["of_prior"] < 0.2  # expected over prior standard deviation
 
 
 def test_sysid_writes_overlay_and_self_contained_report(recorded, capsys):
     out = recorded / "identified"
     main(["sysid", str(recorded / "motions"), *PARAMS, "--out", str(out)])
     overlay, truth = load_overlay(out / "identified.json"), load_overlay(recorded / "truth.json")
-    assert overlay.values["latency"][0] == pytest.approx(0.003, abs=1.0e-4)
+    assert overlay.values["latency"][0] == pytest.approx(0.003, abs=1.0e-4)  # [s]
     np.testing.assert_allclose(overlay.values["offset"], truth.values["offset"], atol=np.radians(0.25))
     low, high = overlay.randomization["latency"]
-    assert 2.8 < low < 3.0 < high < 3.2
+    assert 2.8 < low < 3.0 < high < 3.2  # [ms]
     report = json.loads((out / "report.json").read_text())
     assert 0.9 < report["chi2"] < 1.1 and report["nominal_chi2"] > 10.0
     page = (out / "report.html").read_text()
     assert page.count("data:image/png;base64,") == 6 and "offset/BR_inner" in page
     links = re.findall(r"(?:src|href)\s*=\s*[\"']?([^\"'\s>]*)", page)
-    assert links and all(link.startswith("data:") for link in links) and "<script" not in page
+    assert links and all(link.startswith("data:") for link in links) and "<script" not in page  # embedded data only
     printed = capsys.readouterr().out
     assert "χ²" in printed and "misfit" not in printed and report["doubts"] == []
 

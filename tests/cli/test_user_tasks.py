@@ -98,13 +98,14 @@ def unload_tasks():
 
 @pytest.fixture(autouse=True)
 def unloaded_after_test():
+    """Unload the user's tasks after each test."""
     yield
     unload_tasks()
 
 
 @pytest.fixture(scope="module")
 def path(tmp_path_factory):
-    """File that defines the user's tasks."""
+    """Path, a string, of the file TASK, which defines the user's tasks."""
     path = tmp_path_factory.mktemp("user") / "my_jumps.py"
     path.write_text(TASK)
     return str(path)
@@ -112,7 +113,7 @@ def path(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def runs(path, tmp_path_factory):
-    """Folders of a short training of each task."""
+    """Folder of a short training of each of the user's tasks, by task name."""
     root, folders = tmp_path_factory.mktemp("logs"), {}
     for name in ("tame-jump", "low-jump"):
         cli.main(["train", "--task-module", path, name, *TRAIN, "--log-root", str(root)])
@@ -122,6 +123,7 @@ def runs(path, tmp_path_factory):
 
 
 def play(source, *args):
+    """Return the arguments of `jumper play` for a short recording of a policy or run."""
     return ["play", str(source), "--height", "0.6", "--seconds", "0.1", "--device", "cpu", *args]
 
 

@@ -14,17 +14,17 @@ from jumper_warp.policies.folder import find_policy, load_policy
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 PAGE = Path(__file__).parents[2] / "docs" / "deployment.md"
-COMMAND_STEP = 30
+COMMAND_STEP = 30  # policy step of the command to jump
 
 
 def without_history(policy, readings):
-    """Clear the policy's history before each step; return the readings."""
+    """Clear the policy's history before a step; return the readings unchanged."""
     policy._frames.clear()
     return readings
 
 
 def without_filter(policy, readings):
-    """Disable the policy's command filter; return the readings."""
+    """Disable the policy's command filter; return the readings unchanged."""
     policy.filter_targets = lambda target, angle, rate: target
     return readings
 
@@ -32,7 +32,7 @@ def without_filter(policy, readings):
 MISTAKES = {
     "no default pose": (lambda policy, r: r | {"angle": r["angle"] + policy.default}, 0.920),
     "default pose twice": (lambda policy, r: r | {"angle": r["angle"] - policy.default}, 0.392),
-    "no past": (without_history, 0.814),
+    "no history": (without_history, 0.814),
     "gravity upward": (lambda policy, r: r | {"gravity": -r["gravity"]}, 0.872),
     "gravity times 9.81": (lambda policy, r: r | {"gravity": 9.81 * r["gravity"]}, 0.949),
     "no filter": (without_filter, 0.904),
@@ -41,12 +41,13 @@ MISTAKES = {
 
 
 def onnx_of(name):
+    """Return the `DeployedPolicy` of a shipped policy."""
     return DeployedPolicy(find_policy(name) / "policy.onnx")
 
 
 @pytest.fixture(scope="module")
 def page():
-    """Globals of the page's Python code after running it, and its output lines under `printed`."""
+    """Dict of the names that the page's Python code defines when it runs, and its output lines under `printed`."""
     names, printed = {"print": lambda *values: printed.append(" ".join(map(str, values)))}, []
     for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL):
         exec(block, names)
@@ -54,9 +55,9 @@ def page():
 
 
 def test_documented_examples_reach_apex_and_goal(page):
-    assert page["apex"] == pytest.approx(0.9, abs=0.005)
+    assert page["apex"] == pytest.approx(0.9, abs=0.005)  # [m]
     assert page["printed"][0] == "apex 0.900 m"
-    assert np.linalg.norm(page["robot"].joint_q()[0, :2] - page["place"]) < 0.03
+    assert np.linalg.norm(page["robot"].joint_q()[0, :2] - page["place"]) < 0.03  # [m]
 
 
 def test_documented_example_prints_the_observation_layout(page):
@@ -67,7 +68,8 @@ def test_documented_example_prints_the_observation_layout(page):
 
 
 @pytest.mark.parametrize(
-    ("name", "goal", "heading"), [("vertical_jump", (0.0, 0.0, 0.9), 0.5), ("horizontal_jump", (0.8, 0.2, 0.0), 1.0)]
+    ("name", "goal", "heading"),  # goal: position and height [m], heading [rad]
+    [("vertical_jump", (0.0, 0.0, 0.9), 0.5), ("horizontal_jump", (0.8, 0.2, 0.0), 1.0)],
 )
 def test_observations_actions_and_targets_agree_with_the_environment(page, name, goal, heading):
     policy, deployed, command = load_policy(name), onnx_of(name), JumpCommand()
@@ -88,23 +90,23 @@ def test_observations_actions_and_targets_agree_with_the_environment(page, name,
         target = deployed.default + deployed.scale * action
         filtered = deployed.filter_targets(target, readings["angle"], readings["rate"])
         env_obs = env.obs[0].numpy().copy()
-        frame_difference = max(frame_difference, np.abs(velocity - env_obs[12:15]).max())
+        frame_difference = max(frame_difference, np.abs(velocity - env_obs[12:15]).max())  # newest lin_vel, body axes
         env.step(expected)
         assert deployed.action is action  # the last action of the next observation
-        deployed.action = expected[0].numpy()  # a policy may amplify differences of its last actions in flight
+        deployed.action = expected[0].numpy()  # else the policy may amplify differences of its last actions
         env_target = env.robot.filtered_target.numpy()[:, 0]
         pairs = ((obs, env_obs), (action, expected[0].numpy()), (filtered, env_target))
         errors = np.maximum(errors, [np.abs(a - b).max() for a, b in pairs])
     assert env.task_arrays()["phase"][0] == 2 and (command.requested, command.in_flight) == (False, False)
     assert errors.max() < 3.0e-5, errors  # [SI]; rounding of body axes in float32 and of ONNX's sums
-    assert frame_difference > 0.05  # velocities in world axes would have been detected
+    assert frame_difference > 0.05  # [m/s] so large that world axes would exceed the tolerance
 
 
 def jump(page, change=None, delay=0, ticks=180):
-    """Return apex [m] and number of takeoffs of the page's vertical jump.
+    """Return apex [m] and number of takeoffs of the page's vertical jump to 0.9 m.
 
     change: function of policy and readings that returns the readings to use; delay: policy steps by which the end of
-    the jump command is delayed.
+    the jump command is delayed; ticks: policy steps to simulate.
     """
     policy, command = onnx_of("vertical_jump"), JumpCommand()
     robot = page["Simulation"](1, motors=page["jumping_motors"](18.0, lateral_torque=10.0), friction=0.85, device="cpu")
@@ -129,10 +131,10 @@ def jump(page, change=None, delay=0, ticks=180):
 @pytest.mark.parametrize("mistake", MISTAKES)
 def test_documented_mistakes_give_the_documented_apex(page, mistake):
     change, apex = MISTAKES[mistake]
-    assert jump(page, change)[0] == pytest.approx(apex, abs=0.02)
+    assert jump(page, change)[0] == pytest.approx(apex, abs=0.02)  # [m]
 
 
-def test_short_delay_of_the_commands_end_changes_nothing(page):
+def test_short_delay_of_the_commands_end_keeps_apex_and_one_takeoff(page):
     apex, takeoffs = jump(page, delay=9, ticks=480)
     assert apex == pytest.approx(0.9, abs=0.005) and takeoffs == 1
 
@@ -148,11 +150,11 @@ def test_history_starts_with_the_first_reading_and_shifts_each_step(page):
         "wanted_height": 0.9, "jump_command": 0.0, "height": 0.3, "lin_vel": [1.0, 2.0, 3.0], "ang_vel": np.zeros(3),
         "gravity": [0.0, 0.0, -1.0], "angle": policy.default, "rate": np.zeros(12),
     }  # fmt: skip
-    np.testing.assert_array_equal(policy.observe(readings)[3:15], [1.0, 2.0, 3.0] * 4)
+    np.testing.assert_array_equal(policy.observe(readings)[3:15], [1.0, 2.0, 3.0] * 4)  # lin_vel, 4 frames
     policy.act(policy.observe(readings | {"lin_vel": [4.0, 5.0, 6.0]}))
     obs = policy.observe(readings | {"lin_vel": [7.0, 8.0, 9.0]})
     np.testing.assert_array_equal(obs[3:15], [1.0, 2.0, 3.0, 1.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0, 8.0, 9.0])
-    np.testing.assert_array_equal(obs[99:147], [*np.zeros(36), *policy.action])
+    np.testing.assert_array_equal(obs[99:147], [*np.zeros(36), *policy.action])  # last_action, 4 frames of 12
     policy.reset()
     np.testing.assert_array_equal(policy.observe(readings)[99:147], np.zeros(48))
 
@@ -167,15 +169,16 @@ def test_history_starts_with_the_first_reading_and_shifts_each_step(page):
 )
 def test_refuses_unknown_readings_and_wrong_sizes(change, message):
     policy = onnx_of("vertical_jump")
-    terms = {n: np.zeros((t["end"] - t["first"]) // t["history"]) for n, t in policy.layout.items()}
-    del terms["last_action"]
+    widths = {name: (term["end"] - term["first"]) // term["history"] for name, term in policy.layout.items()}
+    readings = {name: np.zeros(width) for name, width in widths.items() if name != "last_action"}
     with pytest.raises(ValueError, match=message):
-        policy.observe(terms | change)
+        policy.observe(readings | change)
 
 
 def test_jump_command_ends_with_the_landing():
-    command = JumpCommand()
+    command = JumpCommand(takeoff_speed=0.75)
     command.request()
+    # (vertical velocity [m/s], paws down): standing, too slow, a paw down, takeoff, flight, landing, next flight
     steps = [(0.0, 4), (0.7, 0), (0.8, 1), (0.8, 0), (-1.0, 0), (-1.0, 1), (0.9, 0)]
     assert [command.update(*step) for step in steps] == [1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0]
 

@@ -24,7 +24,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 def initial_env(conditions, worlds):
     """Return an environment that has begun no episode yet, and its state."""
     task = conditions.applied(with_sweep_terminations(make_task("vertical-jump")))
-    env = make_env(worlds, task=task, randomize=conditions.draws, auto_reset=False)
+    env = make_env(worlds, task=task, randomize=conditions.sets_parameters, auto_reset=False)
     return env, env.state_dict()
 
 

@@ -17,7 +17,7 @@ HORIZONTAL = open_policy("horizontal_jump")
 
 @pytest.fixture(scope="module")
 def other():
-    """The horizontal-jump policy with perturbed layers and another normaliser."""
+    """Horizontal-jump policy with perturbed layers and another normaliser."""
     torch.manual_seed(3)
     layers = [(weight + 0.05 * torch.randn_like(weight), bias + 0.1) for weight, bias in HORIZONTAL.layers]
     mean, std = HORIZONTAL.mean + 0.2 * HORIZONTAL.std, 1.5 * HORIZONTAL.std
@@ -26,6 +26,7 @@ def other():
 
 @pytest.fixture(scope="module")
 def obs():
+    """(200, 147) observations within 5 standard deviations of HORIZONTAL."""
     return HORIZONTAL.mean + HORIZONTAL.std * torch.randn(200, 147, generator=torch.manual_seed(1)).clamp(-5.0, 5.0)
 
 
@@ -39,8 +40,8 @@ def test_blend_interpolates_the_weights(other):
     same = Policy(other.layers, HORIZONTAL.mean, HORIZONTAL.std, other.interface)
     blended = blend(HORIZONTAL, same, 0.3).layers
     for blended_layer, layer, other_layer in zip(blended, HORIZONTAL.layers, same.layers, strict=True):
-        for tensor, one, two in zip(blended_layer, layer, other_layer, strict=True):
-            torch.testing.assert_close(tensor, 0.7 * one + 0.3 * two)
+        for result, tensor, other_tensor in zip(blended_layer, layer, other_layer, strict=True):
+            torch.testing.assert_close(result, 0.7 * tensor + 0.3 * other_tensor)
 
 
 def test_blend_records_fraction_and_origin_in_its_configuration(other):
@@ -49,7 +50,7 @@ def test_blend_records_fraction_and_origin_in_its_configuration(other):
 
 
 def test_blend_refuses_invalid_fractions_and_other_interfaces(other):
-    with pytest.raises(PolicyError, match=r"share of a blend must be from 0 to 1, got 1\.1"):
+    with pytest.raises(PolicyError, match=r"fraction of a blend must be from 0 to 1, got 1\.1"):
         blend(HORIZONTAL, other, 1.1)
     for policy in (open_policy("vertical_jump"), open_policy("walking_flat")):
         with pytest.raises(PolicyError, match="must have the same interface"):

@@ -19,6 +19,7 @@ from jumper_warp.rl.networks import ActorCritic, linear_layers
 
 
 def make_interface(num_obs=1, num_actions=1, hidden=(1,), **changes):
+    """Return an interface of these sizes with made-up values; changes: of its fields."""
     values = {
         "task": "vertical-jump",
         "observation_names": tuple(f"obs_{i}" for i in range(num_obs)),
@@ -42,7 +43,7 @@ def scalar_policy(out_weight=1.0):
 
 @pytest.fixture(scope="module")
 def model():
-    """Actor with running statistics of observations with various means and scales."""
+    """`ActorCritic` with statistics of 48 observations with various means and scales."""
     torch.manual_seed(3)
     model = ActorCritic(48, 12, (64, 32))
     model.obs_moments.update(torch.randn(1000, 48) * torch.linspace(0.1, 5.0, 48) + torch.linspace(-3.0, 3.0, 48))
@@ -53,15 +54,10 @@ def model():
 
 @pytest.fixture(scope="module")
 def trained(model):
-    interface = make_interface(48, 12, (64, 32))
-    moments = model.obs_moments
-    return Policy(
-        linear_layers(model.actor),
-        moments.mean,
-        moments.scaling().std,
-        interface,
-        {"env": {"seed": 5}, "commit": "abc"},
-    )
+    """Policy of `model`."""
+    mean, std = model.obs_moments.mean, model.obs_moments.scaling().std
+    config = {"env": {"seed": 5}, "commit": "abc"}
+    return Policy(linear_layers(model.actor), mean, std, make_interface(48, 12, (64, 32)), config)
 
 
 @pytest.fixture(scope="module")
@@ -75,11 +71,12 @@ def observations():
 
 @pytest.fixture
 def folder(trained, tmp_path):
+    """Saved folder of `trained`."""
     return save_policy(tmp_path / "jump", trained)
 
 
-def reseal(folder, name, data):
-    """Replace a file, and its checksum in the manifest."""
+def replace_file(folder, name, data):
+    """Write `data` to a file of a policy's folder, and its checksum to the manifest."""
     (folder / name).write_bytes(data)
     manifest = json.loads((folder / "manifest.json").read_text())
     manifest["sha256"][name] = hashlib.sha256(data).hexdigest()
@@ -87,24 +84,39 @@ def reseal(folder, name, data):
 
 
 def edit_json(folder, name, change):
-    """Apply `change` to a JSON file of a policy's folder, with a valid checksum."""
+    """Apply `change` in place to the object in a JSON file of a policy's folder, with a valid checksum."""
     content = json.loads((folder / name).read_text())
     change(content)
     data = json.dumps(content).encode()
     if name == "manifest.json":
         (folder / name).write_bytes(data)
     else:
-        reseal(folder, name, data)
+        replace_file(folder, name, data)
+
+
+def edit_manifest(change):
+    """Return a function that applies `change` to the manifest of a policy's folder."""
+    return lambda folder: edit_json(folder, "manifest.json", change)
+
+
+def edit_config(change):
+    """Return a function that applies `change` to the configuration in a policy's folder."""
+    return lambda folder: edit_json(folder, "config.json", change)
+
+
+def edit_onnx(change):
+    """Return a function that writes `change` of the content of policy.onnx, with a valid checksum."""
+    return lambda folder: replace_file(folder, "policy.onnx", change((folder / "policy.onnx").read_bytes()))
 
 
 # ---------------------------------------------------------------------- acting
 
 
-def test_action_agrees_with_hand_calculation():
+def test_action_agrees_with_hand_calculation():  # elu((3 - 1) / 2 - 2) = exp(-1) - 1
     assert scalar_policy().act(torch.tensor([[3.0]])).item() == pytest.approx(math.exp(-1.0) - 1.0, abs=1e-6)
 
 
-def test_action_is_clipped():
+def test_action_is_clipped_to_1():  # from 10 (exp(-1) - 1) = -6.3
     assert scalar_policy(10.0).act(torch.tensor([3.0])).item() == -1.0
 
 
@@ -171,7 +183,7 @@ def test_existing_policy_is_replaced_only_with_overwrite(folder, trained):
 
 
 def test_folder_without_a_policy_is_never_replaced(tmp_path, trained):
-    (tmp_path / "mine.txt").write_text("mine")
+    (tmp_path / "mine.txt").touch()
     with pytest.raises(PolicyError, match="no policy's"):
         save_policy(tmp_path, trained, overwrite=True)
     assert (tmp_path / "mine.txt").exists()
@@ -220,6 +232,7 @@ class Payload:
     """Object that creates a file when unpickled."""
 
     def __init__(self, path):
+        """path: of the file."""
         self.path = path
 
     def __reduce__(self):
@@ -227,6 +240,7 @@ class Payload:
 
 
 def flip_a_bit(folder):
+    """Flip the last bit of policy.onnx."""
     data = bytearray((folder / "policy.onnx").read_bytes())
     data[-1] ^= 1
     (folder / "policy.onnx").write_bytes(data)
@@ -235,16 +249,16 @@ def flip_a_bit(folder):
 def change_model(change):
     """Return a function that applies `change` to the ONNX model in a policy's folder, with a valid checksum."""
 
-    def damage(folder):
-        model = onnx.load(folder / "policy.onnx", load_external_data=False)
+    def changed_bytes(data):
+        model = onnx.load_model_from_string(data)
         change(model)
-        reseal(folder, "policy.onnx", model.SerializeToString())
+        return model.SerializeToString()
 
-    return damage
+    return edit_onnx(changed_bytes)
 
 
 def change_tensors(**changes):
-    """Return a function that replaces or adds initialisers by name in a policy folder's ONNX file."""
+    """Return a function that replaces or adds initialisers (name to array) in a policy folder's ONNX file."""
 
     def change(model):
         for name, value in changes.items():
@@ -255,43 +269,31 @@ def change_tensors(**changes):
     return change_model(change)
 
 
-def stored(model, name):
+def initialiser(model, name):
+    """Return the initialiser of an ONNX model with this name."""
     return next(tensor for tensor in model.graph.initializer if tensor.name == name)
 
 
-def keep_outside(model):
-    tensor = stored(model, "actor_0_weight")
+def make_external(model):
+    """Let the first weight refer to another file."""
+    tensor = initialiser(model, "actor_0_weight")
     tensor.data_location = onnx.TensorProto.EXTERNAL
     tensor.external_data.add(key="location", value="/etc/passwd")
 
 
 F32 = np.float32
 NOT_REPRODUCIBLE = "the graph or the metadata of the ONNX file is not what these weights and config.json make"
+NEWER = "has version 4, this is version 3"
 REFUSALS = {
     "manifest missing": (lambda f: (f / "manifest.json").unlink(), "manifest.json: cannot be read"),
     "manifest not JSON": (lambda f: (f / "manifest.json").write_text("{"), "manifest.json: not JSON"),
-    "manifest of something else": (
-        lambda f: edit_json(f, "manifest.json", lambda m: m.update(format="x")),
-        "not the manifest of",
-    ),
-    "manifest lacks a sum": (
-        lambda f: edit_json(f, "manifest.json", lambda m: m["sha256"].pop("policy.onnx")),
-        "lacks the checksums",
-    ),
-    "manifest names a file outside": (
-        lambda f: edit_json(f, "manifest.json", lambda m: m["sha256"].update({"../x": ""})),
-        "names a file",
-    ),
-    "manifest of the future": (
-        lambda f: edit_json(f, "manifest.json", lambda m: m.update(schema_version=4)),
-        "manifest.json: has version 4, this is version 3",
-    ),
-    "config of the future": (
-        lambda f: edit_json(f, "config.json", lambda c: c.update(schema_version=4)),
-        "config.json: has version 4, this is version 3",
-    ),
+    "manifest of another format": (edit_manifest(lambda m: m.update(format="x")), "not the manifest of"),
+    "manifest lacks a checksum": (edit_manifest(lambda m: m["sha256"].pop("policy.onnx")), "lacks the checksums"),
+    "manifest names a file outside": (edit_manifest(lambda m: m["sha256"].update({"../x": ""})), "names a file"),
+    "newer manifest": (edit_manifest(lambda m: m.update(schema_version=4)), f"manifest.json: {NEWER}"),
+    "newer config": (edit_config(lambda c: c.update(schema_version=4)), f"config.json: {NEWER}"),
     "older version": (
-        lambda f: edit_json(f, "manifest.json", lambda m: m.update(schema_version=2)),
+        edit_manifest(lambda m: m.update(schema_version=2)),
         "has version 2, this is version 3; commit 05fa856 reads version 2",
     ),
     "folder in place of a file": (
@@ -308,57 +310,47 @@ REFUSALS = {
         "policy.onnx: truncated or altered",
     ),
     "one bit": (flip_a_bit, "policy.onnx: truncated or altered"),
-    "empty but sealed": (lambda f: reseal(f, "policy.onnx", b""), "missing or unknown: actor.0.bias"),
-    "truncated but sealed": (
-        lambda f: reseal(f, "policy.onnx", (f / "policy.onnx").read_bytes()[:-4]),
-        "the ONNX file cannot be read",
-    ),
+    "empty, valid checksum": (edit_onnx(lambda data: b""), "missing or unknown: actor.0.bias"),
+    "truncated, valid checksum": (edit_onnx(lambda data: data[:-4]), "the ONNX file cannot be read"),
     "layer of another shape": (
         change_tensors(actor_1_weight=np.zeros((32, 65), F32)),
         r"asks for actor.1.weight of shape \(32, 64\), it has \(32, 65\)",
     ),
-    "block that is no matrix": (
+    "block with one axis": (
         change_tensors(actor_1_block=np.zeros(3, F32)),
         r"actor.1.block must be a matrix, it has shape \(3,\)",
     ),
-    "layer too many": (change_tensors(actor_3_weight=np.zeros((12, 12), F32)), "missing or unknown: actor.3.weight"),
-    "not finite": (change_tensors(actor_0_bias=np.full(64, np.nan, F32)), "actor.0.bias is not finite"),
-    "no deviation": (change_tensors(std=np.zeros(48, F32)), "std must be positive"),
-    "double precision": (change_tensors(std=np.ones(48)), "normaliser.std must hold floating-point numbers of 32 bits"),
+    "extra layer": (change_tensors(actor_3_weight=np.zeros((12, 12), F32)), "missing or unknown: actor.3.weight"),
+    "NaN": (change_tensors(actor_0_bias=np.full(64, np.nan, F32)), "actor.0.bias is not finite"),
+    "zero standard deviation": (change_tensors(std=np.zeros(48, F32)), "std must be positive"),
+    "float64": (change_tensors(std=np.ones(48)), "normaliser.std must hold floating-point numbers of 32 bits"),
     "fewer numbers than the shape": (
-        change_model(lambda m: stored(m, "actor_0_weight").dims.append(2)),
+        change_model(lambda m: initialiser(m, "actor_0_weight").dims.append(2)),
         "actor.0.weight does not hold as many numbers as its shape needs",
     ),
-    "name that is no text": (
-        lambda f: reseal(
-            f, "policy.onnx", (f / "policy.onnx").read_bytes().replace(b"actor_0_bias", b"actor_0_bia\xff")
-        ),
+    "name not UTF-8": (
+        edit_onnx(lambda data: data.replace(b"actor_0_bias", b"actor_0_bia\xff")),
         "missing or unknown: actor.0.bias",
     ),
-    "weights in another file": (change_model(keep_outside), NOT_REPRODUCIBLE),
+    "weights in another file": (change_model(make_external), NOT_REPRODUCIBLE),
     "another opset": (change_model(lambda m: setattr(m.opset_import[0], "version", 17)), NOT_REPRODUCIBLE),
     "another operator": (change_model(lambda m: setattr(m.graph.node[8], "op_type", "Relu")), NOT_REPRODUCIBLE),
     "another limit": (change_tensors(actions_upper=np.asarray(2.0, F32)), NOT_REPRODUCIBLE),
-    "constant too many": (change_tensors(more=np.zeros(1, F32)), NOT_REPRODUCIBLE),
+    "extra constant": (change_tensors(more=np.zeros(1, F32)), NOT_REPRODUCIBLE),
     "metadata of another interface": (change_model(lambda m: m.metadata_props.pop()), NOT_REPRODUCIBLE),
-    "config of another interface": (
-        lambda f: edit_json(f, "config.json", lambda c: c["interface"].update(policy_dt=0.02)),
-        NOT_REPRODUCIBLE,
-    ),
+    "config of another interface": (edit_config(lambda c: c["interface"].update(policy_dt=0.02)), NOT_REPRODUCIBLE),
     "other sizes in config": (
-        lambda f: edit_json(f, "config.json", lambda c: c["interface"].update(hidden=[64, 32, 8])),
-        "missing or unknown: actor.3",
+        edit_config(lambda c: c["interface"].update(hidden=[64, 32, 8])), "missing or unknown: actor.3",
     ),
     "interface lacks a field": (
-        lambda f: edit_json(f, "config.json", lambda c: c["interface"].pop("policy_dt")),
-        "missing or unknown: policy_dt",
+        edit_config(lambda c: c["interface"].pop("policy_dt")), "missing or unknown: policy_dt",
     ),
-    "interface of a wrong type": (
-        lambda f: edit_json(f, "config.json", lambda c: c["interface"].update(policy_dt="fast")),
-        "policy_dt must be a float",
+    "interface with another type": (
+        edit_config(lambda c: c["interface"].update(policy_dt="fast")), "policy_dt must be a float",
     ),
-    "no interface": (lambda f: edit_json(f, "config.json", lambda c: c.pop("interface")), "must be a JSON object"),
-}
+    "no interface": (edit_config(lambda c: c.pop("interface")), "must be a JSON object"),
+}  # fmt: skip
+"""A function that damages a policy's folder (of `trained`), and the error message, by name."""
 
 
 @pytest.mark.parametrize("case", REFUSALS)
@@ -372,7 +364,7 @@ def test_refuses_an_invalid_policy_folder_in_one_line(folder, case):
 
 def test_pickle_in_place_of_the_weights_is_not_executed(folder, tmp_path):
     trap = tmp_path / "executed"
-    reseal(folder, "policy.onnx", pickle.dumps(Payload(trap)))
+    replace_file(folder, "policy.onnx", pickle.dumps(Payload(trap)))
     with pytest.raises(PolicyError, match="cannot be read"):
         load_policy(folder)
     assert not trap.exists()
@@ -440,10 +432,8 @@ def test_onnx_metadata_has_the_interface_in_full_precision(folder, trained):
 
 @pytest.mark.parametrize("name", list_policies())
 def test_shipped_onnx_metadata_equals_the_interface(name):
-    (entry,) = (
-        entry for entry in onnx.load(find_policy(name) / "policy.onnx").metadata_props if entry.key == "jumper_warp"
-    )
-    full = json.loads(entry.value)
+    entries = {entry.key: entry.value for entry in onnx.load(find_policy(name) / "policy.onnx").metadata_props}
+    full = json.loads(entries["jumper_warp"])
     interface = json.loads(json.dumps(load_policy(name).interface.to_json()))
     assert {key: full[key] for key in interface} == interface and interface["observation_layout"]
     assert set(full) - set(interface) == {"commit", "dirty", "schema_version"}
@@ -463,12 +453,12 @@ def test_repeated_diagonal_block_is_stored_once(tmp_path):
     policy = Policy(layers, torch.randn(4), torch.rand(4) + 0.1, make_interface(4, 2, (32, 16)))
     folder = save_policy(tmp_path / "symmetric", policy)
     model = onnx.load(folder / "policy.onnx")
-    assert tuple(stored(model, "actor_1_block").dims) == (8, 16)
+    assert tuple(initialiser(model, "actor_1_block").dims) == (8, 16)
     assert "actor_1_weight" not in {tensor.name for tensor in model.graph.initializer}
     for layer, expected in zip(load_policy(folder).layers, policy.layers, strict=True):
         assert torch.equal(layer[0], expected[0]) and torch.equal(layer[1], expected[1])
     session, obs = onnxruntime.InferenceSession(str(folder / "policy.onnx")), torch.randn(5, 4)
     np.testing.assert_allclose(session.run(None, {"obs": obs.numpy()})[0], policy.act(obs).numpy(), atol=1e-5)
     layers[1][0][0, 16] = -0.0  # not bitwise the zero that the graph pads with
-    odd = save_policy(tmp_path / "odd", Policy(layers, policy.mean, policy.std, policy.interface))
-    assert stored(onnx.load(odd / "policy.onnx"), "actor_1_weight").dims == [16, 32]
+    whole = save_policy(tmp_path / "whole", Policy(layers, policy.mean, policy.std, policy.interface))
+    assert initialiser(onnx.load(whole / "policy.onnx"), "actor_1_weight").dims == [16, 32]

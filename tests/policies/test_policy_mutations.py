@@ -19,7 +19,7 @@ from jumper_warp.policies.onnx import onnx_bytes
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 
-SIZES = (5, 6, 4, 2)
+SIZES = (5, 6, 4, 2)  # observation, hidden layers, action
 FILES = ("config.json", "policy.onnx", "manifest.json", "README.md")
 VALUES = [
     None, True, 0, -1, 1, 2, 10**30, 1e-30, 1e30, 1e300, -1e300, math.nan, math.inf, -math.inf, 0.5, -0.5, "", "x",
@@ -32,6 +32,7 @@ COMMON = settings(max_examples=400, deadline=None, suppress_health_check=[Health
 
 
 def small_policy():
+    """Return a policy with random weights of SIZES."""
     torch.manual_seed(2)
     command_filter = {"sum": {"lower": 0.0, "upper": 240.0}, "horizon": 0.1}
     interface = make_interface(SIZES[0], SIZES[-1], SIZES[1:-1], command_filter=command_filter)
@@ -41,7 +42,7 @@ def small_policy():
 
 @pytest.fixture(scope="module")
 def original(tmp_path_factory):
-    """A saved policy's folder."""
+    """Folder of `small_policy`, which no test changes."""
     return save_policy(tmp_path_factory.mktemp("policies") / "original", small_policy())
 
 
@@ -53,7 +54,7 @@ def folder(original):
 
 
 def write(folder, content):
-    """Replace the folder's files with `content`, file name to bytes."""
+    """Replace all files of a folder by `content` (file name to bytes)."""
     for path in folder.iterdir():
         path.unlink()
     for name, data in content.items():
@@ -61,11 +62,12 @@ def write(folder, content):
 
 
 def content_of(folder):
+    """Return the bytes of FILES by name."""
     return {name: (folder / name).read_bytes() for name in FILES}
 
 
 def update_checksums(content):
-    """Update the manifest's checksums to the files in `content`."""
+    """Update the checksums in `content["manifest.json"]` to the other files in `content` (name to bytes)."""
     manifest = json.loads(content["manifest.json"])
     for name in manifest["sha256"]:
         manifest["sha256"][name] = hashlib.sha256(content[name]).hexdigest()
@@ -73,7 +75,7 @@ def update_checksums(content):
 
 
 def check(folder, saved):
-    """Return whether a folder loads; check that an error is one line, or that the policy acts and saves bitwise.
+    """Return whether a folder loads; assert that the error is one line, or that the policy acts and saves bitwise.
 
     saved: folder to save the policy to.
     """
@@ -96,7 +98,7 @@ def check(folder, saved):
 
 
 def change_one(tree, data):
-    """Change, scale, delete or add one entry of a JSON tree, in place."""
+    """Change, scale, delete or add one entry of nested dicts and lists, in place; data: Hypothesis chooses which."""
     table, key = data.draw(st.sampled_from(list(places(tree))))
     kind = data.draw(st.sampled_from(["value", "value", "value", "scale", "delete", "add"]))
     if kind == "delete":
@@ -117,25 +119,24 @@ def test_unchanged_policy_loads(original, tmp_path):
 
 @COMMON
 @given(data=st.data())
-def test_damaged_file_is_refused(original, folder, data):
+def test_damaged_file_with_a_checksum_is_refused(original, folder, data):
     content = content_of(original)
     name = data.draw(st.sampled_from(FILES))
     kind = data.draw(st.sampled_from(["delete", "truncate", "flip", "insert"]))
-    bytes_of = bytearray(content[name])
-    at = data.draw(st.integers(0, len(bytes_of) - 1))
+    damaged = bytearray(content[name])
+    at = data.draw(st.integers(0, len(damaged) - 1))
     if kind == "truncate":
-        del bytes_of[at:]
+        del damaged[at:]
     elif kind == "flip":
-        bytes_of[at] ^= data.draw(st.integers(1, 255))
+        damaged[at] ^= data.draw(st.integers(1, 255))
     else:
-        bytes_of[at:at] = data.draw(st.binary(min_size=1, max_size=8))
-    content[name] = bytes(bytes_of)
+        damaged[at:at] = data.draw(st.binary(min_size=1, max_size=8))
+    content[name] = bytes(damaged)
     if kind == "delete":
         del content[name]
     write(folder, content)
     loaded = check(folder, folder.parent / "saved")
-    # neither README nor manifest has a checksum
-    assert name in ("README.md", "manifest.json") or not loaded
+    assert name in ("README.md", "manifest.json") or not loaded  # these two have no checksum
 
 
 @COMMON
@@ -165,8 +166,8 @@ def test_changed_json_with_valid_checksums_loads_or_is_refused(original, folder,
     check(folder, folder.parent / "saved")
 
 
-def with_tensors(content, change):
-    """Apply `change` to the dict of initialiser arrays of the ONNX file in `content`, with a valid checksum."""
+def change_tensors(content, change):
+    """Replace the initialisers (name to array) of the ONNX file in `content` by `change` of them; update checksums."""
     model = onnx.load_model_from_string(content["policy.onnx"])
     arrays = {tensor.name: onnx.numpy_helper.to_array(tensor) for tensor in model.graph.initializer}
     del model.graph.initializer[:]
@@ -178,7 +179,7 @@ def with_tensors(content, change):
 @pytest.mark.parametrize("dtype", ["float64", "float16", "int64", "uint8", "bool", "complex64"])
 def test_refuses_weights_of_another_type(original, folder, dtype):
     content = content_of(original)
-    with_tensors(content, lambda arrays: {name: abs(array).astype(dtype) for name, array in arrays.items()})
+    change_tensors(content, lambda arrays: {name: abs(array).astype(dtype) for name, array in arrays.items()})
     write(folder, content)
     assert not check(folder, folder.parent / "saved")
 
@@ -187,13 +188,13 @@ def test_refuses_weights_of_another_type(original, folder, dtype):
 @pytest.mark.parametrize("part", ["actor_0_weight", "actor_1_bias", "actor_2_weight", "mean", "std"])
 def test_scaled_weights_load_or_are_refused(original, folder, part, scale):
     content = content_of(original)
-    with_tensors(content, lambda arrays: arrays | {part: np.float32(scale) * np.maximum(abs(arrays[part]), 1.0)})
+    change_tensors(content, lambda arrays: arrays | {part: np.float32(scale) * np.maximum(abs(arrays[part]), 1.0)})
     write(folder, content)
     check(folder, folder.parent / "saved")
 
 
 @pytest.mark.parametrize("activation", ["elu", "relu", "tanh"])
-def test_refuses_weights_that_could_overflow(activation):
+def test_refuses_weights_that_could_overflow_unless_the_activation_is_bounded(activation):
     policy = small_policy()
     layers = [(weight * 1e20, bias) for weight, bias in policy.layers]
     interface = PolicyInterface(**{**vars(policy.interface), "activation": activation})

@@ -14,24 +14,24 @@ from jumper_warp.tasks.jump.cfg import GroundCfg
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.tasks.terms import RewardTerm, TerminationTerm
 
-SHAPE = {"policy_dt": 1 / 60, "physics_dt": 1 / 480, "hidden": (256, 128, 128)}
+SHAPE = {"policy_dt": 1 / 60, "physics_dt": 1 / 480, "hidden": (256, 128, 128)}  # [s], [s], widths
 
 
 def test_interface_of_the_vertical_jump_has_the_robots_values():
     spec = make_interface(interface(make_task("vertical-jump")), **SHAPE)
     assert spec.sizes == (147, 256, 128, 128, 12)
     assert spec.joint_names[:4] == ("FL_lateral", "FL_outer", "FL_inner", "FR_lateral")
-    assert spec.action_scale[:3] == pytest.approx([0.261799, 1.570796, 1.570796], abs=1e-6)
-    assert spec.default_joint_pos[3:6] == pytest.approx([0.0, 0.785398, 0.785398], abs=1e-6)
-    assert spec.joint_stiffness == (17.0,) * 12
-    assert spec.joint_damping[:3] == (1.8, 0.8, 0.8)
-    assert spec.torque_limit[:3] == (10.0, 18.0, 18.0)
+    assert spec.action_scale[:3] == pytest.approx([0.261799, 1.570796, 1.570796], abs=1e-6)  # 15, 90, 90 degrees
+    assert spec.default_joint_pos[3:6] == pytest.approx([0.0, 0.785398, 0.785398], abs=1e-6)  # 0, 45, 45 degrees
+    assert spec.joint_stiffness == (17.0,) * 12  # [N m/rad]
+    assert spec.joint_damping[:3] == (1.8, 0.8, 0.8)  # [N m s/rad]
+    assert spec.torque_limit[:3] == (10.0, 18.0, 18.0)  # [N m]
     assert spec.command_filter["sum"] == {"lower": 0.0, "upper": 240.0, "lower_zone": 35.0, "upper_zone": 45.0}
     assert spec.observation_layout["lin_vel"] == {"first": 3, "end": 15, "scale": 1.0, "clip": 100.0, "history": 4}
     assert PolicyInterface.from_json(json.loads(json.dumps(spec.to_json()))) == spec
 
 
-def test_interface_has_scales_and_history():
+def test_observation_layout_has_scale_and_history_of_a_term():
     layout = make_interface(interface(hold_height.hold_height()), **SHAPE).observation_layout
     assert layout["height"] == {"first": 1, "end": 4, "scale": 5.0, "clip": 100.0, "history": 3}
 
@@ -61,15 +61,14 @@ def saved():
     task = make_task("vertical-jump").with_terms("rewards", jump_height={"weight": 7.0, "std_fine": 0.2})
     randomization = dataclasses.replace(task.randomization, latency=None, gains=(0.9, 1.1))
     curriculum = task.curriculum.replace(promote_after=3)
-    task = dataclasses.replace(
-        task, rewards=task.rewards[:1] + task.rewards[2:], levels=task.levels[:2], randomization=randomization,
-        curriculum=curriculum,
-    )  # fmt: skip
+    changes = {"rewards": task.rewards[:1] + task.rewards[2:], "levels": task.levels[:2], "curriculum": curriculum}
+    task = dataclasses.replace(task, randomization=randomization, **changes)
     return task, json.loads(json.dumps({"env": {"task": task_to_json(task)}}))
 
 
-def whole(config, *modules):
-    return restored_task(config, modules, leave_out=())
+def whole(config):
+    """Return the task in a configuration with all sections."""
+    return restored_task(config, leave_out=())
 
 
 def test_restored_task_equals_the_saved_one(saved):
@@ -111,16 +110,16 @@ def test_restores_a_termination_outside_the_default_task(saved, success):
 
 
 def with_ground(task, ground):
-    return dataclasses.replace(
-        task, reset=dataclasses.replace(task.reset, settings=dataclasses.replace(task.reset.settings, ground=ground))
-    )
+    """Return a copy of a jump task with these settings of the ground."""
+    settings = dataclasses.replace(task.reset.settings, ground=ground)
+    return dataclasses.replace(task, reset=dataclasses.replace(task.reset, settings=settings))
 
 
 def test_restores_ground_randomisation_with_none_as_default(saved):
     task, config = saved
-    drawn = with_ground(task, GroundCfg(platform=0.25, block=0.5, drop=(0.05, 0.1), clearance=0.2))
-    config["env"]["task"] = json.loads(json.dumps(task_to_json(drawn)))
-    assert whole(config) == drawn
+    uneven = with_ground(task, GroundCfg(platform=0.25, block=0.5, drop=(0.05, 0.1), clearance=0.2))
+    config["env"]["task"] = json.loads(json.dumps(task_to_json(uneven)))
+    assert whole(config) == uneven
     del config["env"]["task"]["reset"]["settings"]["ground"]
     assert whole(config) == task
 
@@ -164,7 +163,7 @@ def test_refuses_an_invalid_task_configuration(saved, change, message):
 
 def test_refuses_another_version_with_the_commit_that_reads_it(saved):
     _, config = saved
-    for version in (3, 5):
+    for version in (3, 5):  # the present one is 4
         config["env"]["task"]["version"] = version
         with pytest.raises(PolicyError, match=f"has version {version}, this is version 4; commit 05fa856"):
             restored_task(config)

@@ -15,7 +15,7 @@ from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 
-WIDE = {"symmetry": "off", "hidden": (512, 256, 256)}
+WIDE = {"symmetry": "off", "hidden": (512, 256, 256)}  # the plain form of a symmetric actor has twice the widths
 
 
 @pytest.mark.parametrize(
@@ -36,9 +36,9 @@ def test_initialised_actor_acts_as_the_shipped_policy(name, task, change):
     model = ActorCritic(sizes[0], sizes[-1], cfg.hidden, cfg.activation, cfg.init_std, symmetry=symmetry)
     apply_actor_init(actor_init_from_policy(name, task, cfg), model, samples=1000)
     obs = policy.mean + 2.0 * policy.std * torch.randn(500, sizes[0])
-    acted = policy.act(obs)
-    assert acted.std() > 0.1
-    torch.testing.assert_close(model.act(obs), acted, atol=1e-5, rtol=0.0)
+    expected = policy.act(obs)
+    assert expected.std() > 0.1
+    torch.testing.assert_close(model.act(obs), expected, atol=1e-5, rtol=0.0)
 
 
 @pytest.mark.parametrize(
@@ -62,10 +62,9 @@ def test_refuses_an_unknown_policy():
 
 
 def test_refuses_a_policy_with_another_history():
+    task, cfg = with_history(make_task("horizontal-jump"), 1), TASKS["horizontal-jump"].ppo
     with pytest.raises(InputError, match=r"init_policy: observation \d+: the policy has \w+"):
-        actor_init_from_policy(
-            "horizontal_jump", with_history(make_task("horizontal-jump"), 1), TASKS["horizontal-jump"].ppo
-        )
+        actor_init_from_policy("horizontal_jump", task, cfg)
 
 
 def test_symmetric_training_starts_from_the_projection_of_a_fine_tuned_policy():
@@ -80,6 +79,7 @@ def test_symmetric_training_starts_from_the_projection_of_a_fine_tuned_policy():
 
 
 def changed_layout(spec):
+    """Return the observation layout of an interface with 7 as the first term's scale, as changes of its fields."""
     layout = {name: dict(term) for name, term in spec.observation_layout.items()}
     next(iter(layout.values()))["scale"] = 7.0
     return {"observation_layout": layout}
@@ -89,18 +89,14 @@ def changed_layout(spec):
     ("change", "message"),
     [
         (changed_layout, r"scale of \w+: the policy has 7.0, the task 1.0"),
-        (
-            lambda spec: {"joint_names": spec.joint_names[1:] + spec.joint_names[:1]},
-            r"action 0: the policy has FL_outer, the task FL_lateral",
-        ),
-        (
-            lambda spec: {"default_joint_pos": (1.0, *spec.default_joint_pos[1:])},
-            "default angle .*: the policy has 1.0",
-        ),
+        (lambda spec: {"joint_names": spec.joint_names[1:] + spec.joint_names[:1]},
+         r"action 0: the policy has FL_outer, the task FL_lateral"),
+        (lambda spec: {"default_joint_pos": (1.0, *spec.default_joint_pos[1:])},
+         "default angle .*: the policy has 1.0"),
         (lambda spec: {"observation_limit": 5.0}, "limit of observations: the policy has 5.0, the task 100.0"),
         (lambda spec: {"normalised_limit": 5.0}, "in standard deviations: the policy has 5.0, the task 10.0"),
     ],
-)
+)  # fmt: skip
 def test_error_message_names_the_first_difference_of_the_interfaces(change, message):
     spec = open_policy("horizontal_jump").interface
     with pytest.raises(InputError, match=message):

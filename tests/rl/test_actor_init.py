@@ -7,6 +7,7 @@ import json
 import pytest
 import torch
 from test_shac import SmoothPushTask
+from test_train import final_state, make_env
 
 from jumper_warp.rl.actor_init import PRIOR_ITERATIONS, apply_actor_init, make_actor_init
 from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
@@ -19,11 +20,11 @@ from toy_task import SMALL, PushTask, push_cfg
 
 SYMMETRY = symmetry_of(PushTask(1))
 SYMMETRIC = dataclasses.replace(SMALL, symmetry="actor")
-OBS = 3.0 * torch.randn(50, 2, generator=torch.Generator().manual_seed(1))
+OBS = 3.0 * torch.randn(50, 2, generator=torch.Generator().manual_seed(1))  # position and velocity
 
 
 def actor(hidden=(32, 32), symmetry=None):
-    """Return a network with observation statistics and actions of various magnitudes."""
+    """Return an `ActorCritic` of the task with observation statistics and actions between and beyond ±1."""
     torch.manual_seed(7)
     model = ActorCritic(2, 1, hidden, symmetry=symmetry)
     with torch.no_grad():
@@ -36,11 +37,12 @@ def actor(hidden=(32, 32), symmetry=None):
 
 
 def layers_of(model):
+    """Return weight (out, in) and bias (out,) of each layer of the actor."""
     return [(layer.weight.detach(), layer.bias.detach()) for layer in model.actor if isinstance(layer, torch.nn.Linear)]
 
 
 def actor_init_of(model, cfg=SMALL, activation="elu"):
-    """Return the `ActorInit` of this actor, policy_symmetry as a plain network."""
+    """Return the `ActorInit` for training settings `cfg` from this actor as a plain network."""
     layers = layers_of(model) if model.symmetry is None else expand_layers(layers_of(model), model.symmetry)
     symmetry = SYMMETRY if cfg.symmetry == "actor" else None
     return make_actor_init(layers, *model.obs_moments.scaling(), activation, cfg, symmetry)
@@ -48,16 +50,9 @@ def actor_init_of(model, cfg=SMALL, activation="elu"):
 
 @pytest.fixture
 def cfg(tmp_path):
+    """Settings of one iteration from the policy "pusher", with a negligible learning rate."""
     ppo = dataclasses.replace(SMALL, lr=1e-9, min_lr=1e-9, max_lr=1e-9)
     return push_cfg(tmp_path, max_iterations=1, log_interval=1, ppo=ppo, init_policy="pusher")
-
-
-def make_env(num_envs, seed, device):
-    return PushTask(num_envs, seed, device, episode_length=SMALL.num_steps)
-
-
-def model_of(result):
-    return load_checkpoint(result.folder / CHECKPOINTS / f"iteration_{result.iteration:06d}.pt")["ppo"]["model"]
 
 
 # ---------------------------------------------------------------- layers of a symmetric actor
@@ -73,13 +68,14 @@ def test_contract_inverts_expand_of_symmetric_layers(hidden):
 
 
 def changed(layers, index, part):
+    """Return a copy of the layers with 0.01 added to the last entry of a weight (part 0) or bias (part 1)."""
     layers = [tuple(tensor.clone() for tensor in layer) for layer in layers]
     layers[index][part].view(-1)[-1] += 0.01
     return layers
 
 
 @pytest.mark.parametrize("index", [0, 1, 2])
-@pytest.mark.parametrize("part", [0, 1])
+@pytest.mark.parametrize("part", [0, 1], ids=["weight", "bias"])
 def test_contract_refuses_layers_that_are_not_symmetric(index, part):
     layers = expand_layers(layers_of(actor(symmetry=SYMMETRY)), SYMMETRY)
     with pytest.raises(InputError, match="not those of a mirror-symmetric actor"):
@@ -108,17 +104,18 @@ def test_nearest_expanded_layers_is_an_orthogonal_projection(hidden):
 
 
 def flat_difference(layers, others):
-    """Return all differences of weights and biases of two networks as one vector."""
+    """Return the differences of all weights and biases of two networks as one vector."""
     pairs = zip(itertools.chain.from_iterable(layers), itertools.chain.from_iterable(others), strict=True)
-    return torch.cat([(one - other).flatten() for one, other in pairs])
+    return torch.cat([(tensor - other).flatten() for tensor, other in pairs])
 
 
-# ---------------------------------------------------------------- beginning
+# ---------------------------------------------------------------- initial actor
 
 
 @pytest.mark.parametrize(
     ("policy_symmetry", "symmetry", "hidden"),
     [(None, "off", (32, 32)), (SYMMETRY, "off", (64, 64)), (SYMMETRY, "actor", (32, 32))],
+    ids=["plain policy", "symmetric policy, plain training", "symmetric policy, symmetric training"],
 )
 def test_initialised_actor_acts_as_the_policy(policy_symmetry, symmetry, hidden):
     model, cfg = actor(symmetry=policy_symmetry), dataclasses.replace(SMALL, symmetry=symmetry, hidden=hidden)
@@ -151,7 +148,7 @@ def test_refuses_settings_of_another_network_in_one_line(symmetric, change, mess
 
 
 def averaged(act, obs):
-    """Return a policy's action, averaged with the mirror image of its action for the mirrored observation."""
+    """Return (act(x) + N act(M x)) / 2 of a policy, in the notation of `jumper_warp.rl.mirror`."""
     return 0.5 * (act(obs) + SYMMETRY.action.apply(act(SYMMETRY.obs.apply(obs))))
 
 
@@ -169,9 +166,9 @@ def test_symmetric_training_starts_from_the_mirror_averaged_policy():
     torch.testing.assert_close(std[SYMMETRY.obs.order], std)
 
 
-def test_asymmetric_statistics_make_the_policy_asymmetric():
+def test_policy_with_asymmetric_statistics_is_averaged_with_its_mirror_image():
     model = actor(symmetry=SYMMETRY)
-    model.obs_moments.mean[1] = 0.1
+    model.obs_moments.mean[1] = 0.1  # a symmetric mean is 0
     start = actor_init_of(model, dataclasses.replace(SYMMETRIC, hidden=(64, 64)))
     assert "averaged" in start.change and not actor_init_of(actor(symmetry=SYMMETRY), SYMMETRIC).change
 
@@ -180,17 +177,14 @@ def test_nearly_symmetric_policy_is_projected_to_the_nearest_symmetric_one():
     exact = expand_layers(layers_of(actor(symmetry=SYMMETRY)), SYMMETRY)
     scaling = actor(symmetry=SYMMETRY).obs_moments.scaling()
     torch.manual_seed(2)
-    little, much = ([(w + share * w.std() * torch.randn_like(w), b) for w, b in exact] for share in (0.01, 0.5))
-    start = make_actor_init(little, *scaling, "elu", SYMMETRIC, SYMMETRY)
+    near, far = ([(w + noise * w.std() * torch.randn_like(w), b) for w, b in exact] for noise in (0.01, 0.5))
+    start = make_actor_init(near, *scaling, "elu", SYMMETRIC, SYMMETRY)
     assert start.change == "made mirror-symmetric"
-    for expected, result in zip(
-        nearest_expanded_layers(little, SYMMETRY), expand_layers(start.layers, SYMMETRY), strict=True
-    ):
+    nearest = nearest_expanded_layers(near, SYMMETRY)
+    for expected, result in zip(nearest, expand_layers(start.layers, SYMMETRY), strict=True):
         torch.testing.assert_close(result, expected)
-    with pytest.raises(
-        InputError, match=r"give --ppo\.hidden 64 64"
-    ):  # averaged with its mirror image, which keeps the full widths
-        make_actor_init(much, *scaling, "elu", SYMMETRIC, SYMMETRY)
+    with pytest.raises(InputError, match=r"give --ppo\.hidden 64 64"):  # the average with the image keeps full widths
+        make_actor_init(far, *scaling, "elu", SYMMETRIC, SYMMETRY)
 
 
 def test_refuses_a_standard_deviation_below_the_variance_epsilon():
@@ -218,11 +212,11 @@ def test_training_starts_from_a_policy_and_logs_its_name(cfg, capsys, trainer, e
     cfg = dataclasses.replace(cfg, trainer=trainer, shac=dataclasses.replace(cfg.shac, lr=1e-9))
     model = actor()
     result = train(cfg, env, actor_init=actor_init_of(model))
-    model_state, stderr = model_of(result), capsys.readouterr().err.splitlines()
+    model_state, stderr = final_state(result)["ppo"]["model"], capsys.readouterr().err.splitlines()
     assert stderr[1] == "starts from pusher"
     torch.testing.assert_close(model_state["actor.0.weight"], model.actor[0].weight.data, atol=1e-6, rtol=0.0)
     torch.testing.assert_close(model_state["log_std"], torch.zeros(1), atol=1e-6, rtol=0.0)
-    samples = 32 * SMALL.num_steps
+    samples = 32 * SMALL.num_steps  # of 32 worlds
     assert model_state["obs_moments.count"] == (PRIOR_ITERATIONS + 1) * samples
     assert 0.0 < (model_state["obs_moments.mean"] - model.obs_moments.mean).abs().max() < 0.05
     assert json.loads((result.folder / CONFIG).read_text())["train"]["init_policy"] == "pusher"
@@ -234,19 +228,19 @@ def test_resume_uses_the_checkpoint_and_keeps_the_initial_policys_name(cfg, caps
     resumed = dataclasses.replace(cfg, init_policy=None, resume=str(first.folder), max_iterations=2)
     second = train(resumed, make_env)
     assert "starts from" not in capsys.readouterr().err
-    assert model_of(second)["obs_moments.count"] == (PRIOR_ITERATIONS + 2) * 32 * SMALL.num_steps
+    assert final_state(second)["ppo"]["model"]["obs_moments.count"] == (PRIOR_ITERATIONS + 2) * 32 * SMALL.num_steps
     assert json.loads((second.folder / CONFIG).read_text())["train"]["init_policy"] == "pusher"
 
 
-@pytest.mark.parametrize("before", [True, False])
-def test_resumes_a_checkpoint_that_started_from_random_weights(cfg, before):
-    """before: whether the checkpoint predates the setting init_policy."""
+@pytest.mark.parametrize("lacks_setting", [True, False])
+def test_resumes_a_checkpoint_that_started_from_random_weights(cfg, lacks_setting):
+    """lacks_setting: whether the checkpoint's configuration has no entry init_policy."""
     first = train(dataclasses.replace(cfg, init_policy=None), make_env)
     path = first.folder / CHECKPOINTS / "iteration_000001.pt"
     state = load_checkpoint(path)
     config = json.loads(state["config"])
     assert config["train"].pop("init_policy", 0) is None
-    save_checkpoint(path.parent, {**state, "config": json.dumps(config) if before else state["config"]})
+    save_checkpoint(path.parent, {**state, "config": json.dumps(config) if lacks_setting else state["config"]})
     result = train(dataclasses.replace(cfg, init_policy=None, resume=str(first.folder), max_iterations=2), make_env)
     assert json.loads((result.folder / CONFIG).read_text())["train"]["init_policy"] is None
 

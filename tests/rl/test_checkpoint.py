@@ -17,18 +17,15 @@ from jumper_warp.utils.files import write_atomically
 
 
 def state(iteration):
+    """Return a checkpoint's state; its only tensor holds the iteration."""
     parts = {"ppo": {"weight": torch.full((3,), float(iteration))}, "env": {}, "rng": {}, "config": "{}"}
     return {"iteration": iteration, **parts}
-
-
-def weight(checkpoint):
-    return checkpoint["ppo"]["weight"].tolist()
 
 
 def test_load_returns_the_saved_state(tmp_path):
     path = save_checkpoint(tmp_path / "new", state(7))
     assert path.name == "iteration_000007.pt"
-    assert weight(load_checkpoint(path)) == [7.0, 7.0, 7.0]
+    assert load_checkpoint(path)["ppo"]["weight"].tolist() == [7.0, 7.0, 7.0]
     assert sorted(entry.name for entry in path.parent.iterdir()) == [path.name, MANIFEST]
 
 
@@ -60,20 +57,24 @@ def test_best_checkpoint_without_scores_is_the_newest(tmp_path):
 
 
 def flip(path):
+    """Flip a bit in the middle of a file."""
     data = bytearray(path.read_bytes())
     data[len(data) // 2] ^= 1
     path.write_bytes(data)
 
 
 def cut(path):
+    """Remove the last 100 bytes of a file."""
     path.write_bytes(path.read_bytes()[:-100])
 
 
-def forget(path):
+def empty_manifest(path):
+    """Remove all entries from the manifest beside a checkpoint."""
     (path.parent / MANIFEST).write_text("{}")
 
 
-def scramble_manifest(path):
+def break_manifest(path):
+    """Write a manifest whose entry for the checkpoint is a number."""
     (path.parent / MANIFEST).write_text('{"iteration_000002.pt": 3}')
 
 
@@ -83,8 +84,8 @@ def scramble_manifest(path):
         (flip, "differs from its checksum"),
         (cut, "differs from its checksum"),
         (os.remove, "no such checkpoint"),
-        (forget, "has no checksum"),
-        (scramble_manifest, "manifest.json: not readable"),
+        (empty_manifest, "has no checksum"),
+        (break_manifest, "manifest.json: not readable"),
         (lambda path: os.remove(path.parent / MANIFEST), "manifest.json: No such file"),
     ],
 )
@@ -97,6 +98,8 @@ def test_refuses_a_damaged_checkpoint_in_one_line(tmp_path, damage, message):
 
 
 class Payload:
+    """Object that creates the file `executed` in the current folder when unpickled."""
+
     def __reduce__(self):
         return os.system, ("touch executed",)
 
@@ -107,7 +110,7 @@ def test_loading_a_checkpoint_executes_no_code(tmp_path, monkeypatch):
     with pytest.raises(CheckpointError, match="not readable as tensors"):
         load_checkpoint(path)
     assert not (tmp_path / "executed").exists()
-    pickle.loads(pickle.dumps(Payload()))
+    pickle.loads(pickle.dumps(Payload()))  # ordinary unpickling does
     assert (tmp_path / "executed").exists()
 
 
@@ -136,13 +139,13 @@ def test_failed_atomic_write_keeps_the_old_file(tmp_path, monkeypatch):
     path = tmp_path / "file"
     write_atomically(path, b"old")
 
-    def full(*_):
+    def full_disk(*_):
         raise OSError(28, "No space left on device")
 
-    monkeypatch.setattr(os, "fsync", full)
+    monkeypatch.setattr(os, "fsync", full_disk)
     with pytest.raises(OSError, match="No space left") as caught:
         write_atomically(path, b"new")
-    assert caught.value.filename == str(path)  # by which the command line knows a refusal
+    assert caught.value.filename == str(path)  # run_command prints errors with a file name in one line
     assert path.read_bytes() == b"old"
     assert [entry.name for entry in tmp_path.iterdir()] == ["file"]
 
@@ -151,6 +154,6 @@ def test_latest_checkpoint_ignores_files_missing_from_the_manifest(tmp_path):
     first = save_checkpoint(tmp_path, state(1))
     manifest = (tmp_path / MANIFEST).read_text()
     save_checkpoint(tmp_path, state(2))
-    (tmp_path / MANIFEST).write_text(manifest)  # as after a cut between the two writes
+    (tmp_path / MANIFEST).write_text(manifest)  # as after an interruption between the two writes
     assert latest_checkpoint(tmp_path)[0] == first
     assert json.loads(manifest).keys() == {first.name}

@@ -20,13 +20,14 @@ from jumper_warp.rl.runner import CHECKPOINTS, TrainingRun, train
 PPO = PpoCfg(num_steps=4, hidden=(8, 4), minibatches=2, epochs=1)
 SINGLE_RANK = Rank(0, 1, torch.device("cpu"))
 REMOVED = float("nan")
-"""Result of a change that removes its part."""
+"""Returned by a function in CHANGES to remove the part (compared by identity)."""
 
 
 class Saved:
     """Checkpoint of a short training with its environment; damaged copies replace its file."""
 
     def __init__(self, folder):
+        """Train for one iteration; folder: for the run."""
         self.env = make_env(2, seed=1, randomize=True, noise=True)
         self.cfg = TrainCfg(
             task="jump", num_envs=2, max_iterations=1, device="cpu", log_root=folder, tensorboard=False, ppo=PPO
@@ -35,14 +36,14 @@ class Saved:
         self.data, self.state = self.path.read_bytes(), load_checkpoint(self.path)
 
     def sign(self, data):
-        """Write `data` as the checkpoint's file, with a valid checksum."""
+        """Write bytes as the checkpoint's file, with a valid checksum."""
         self.path.write_bytes(data)
         manifest = json.loads((self.path.parent / MANIFEST).read_text())
         manifest[self.path.name]["sha256"] = hashlib.sha256(data).hexdigest()
         (self.path.parent / MANIFEST).write_text(json.dumps(manifest))
 
     def resume(self):
-        """Resume and run one iteration; return the error message, or None."""
+        """Resume the run and train for one iteration; return the message of a CheckpointError, or None."""
         cfg = TrainCfg(**{**vars(self.cfg), "max_iterations": 100, "resume": str(self.path)})
         try:
             run = TrainingRun(cfg, self.env, SINGLE_RANK)
@@ -60,19 +61,19 @@ class Saved:
 
 @pytest.fixture(scope="module")
 def saved(tmp_path_factory, one_thread):
+    """`Saved` of a run on one thread."""
     return Saved(tmp_path_factory.mktemp("run"))
 
 
 def part_paths(state, start=()):
-    """Return the tuple of keys to each part of nested dictionaries and lists."""
+    """Return the tuple of keys to each part of nested dictionaries and lists; start: keys to `state` itself."""
     keys = state.keys() if isinstance(state, dict) else range(len(state)) if isinstance(state, list) else ()
-    return [start + (key,) for key in keys] + [
-        part_path for key in keys for part_path in part_paths(state[key], start + (key,))
-    ]
+    here = [(*start, key) for key in keys]
+    return here + [part_path for path in here for part_path in part_paths(state[path[-1]], path)]
 
 
 def changed(state, part_path, change):
-    """Return a copy of a state with one part changed, or removed if `change` returns REMOVED."""
+    """Return a copy of a state with `change` applied to the part at `part_path`; REMOVED removes it."""
     state = part = copy.deepcopy(state)
     for key in part_path[:-1]:
         part = part[key]
@@ -85,16 +86,18 @@ def changed(state, part_path, change):
 
 
 def of_tensor(change):
+    """Return a function that applies `change` to a copy of a tensor; other values count as torch.zeros(3)."""
     return lambda value: change(value.clone()) if isinstance(value, torch.Tensor) else change(torch.zeros(3))
 
 
 def negated(x):
+    """Return -x, or the inverse of a bool tensor."""
     return ~x if x.dtype == torch.bool else -x
 
 
 JUNK = [None, True, -1, 2**70, 1.5, float("inf"), "late", "", b"\0", [], {}, [1], {"a": 1}, {3: {}}, torch.zeros(0)]
 CHANGES = {
-    "gone": lambda value: REMOVED,
+    "removed": lambda value: REMOVED,
     **{f"{junk!r}": (lambda value, junk=junk: junk) for junk in JUNK},
     "nan": of_tensor(lambda x: torch.full_like(x, float("nan")) if x.is_floating_point() else negated(x)),
     "infinite": of_tensor(lambda x: x + float("inf") if x.is_floating_point() else x + 100),
@@ -107,11 +110,13 @@ CHANGES = {
     "whole": of_tensor(lambda x: torch.nan_to_num(x).long()),
     "complex": of_tensor(lambda x: x.to(torch.complex64)),
     "sparse": of_tensor(lambda x: x.float().to_sparse()),
-    "other key": lambda value: {**value, "besides": 1} if isinstance(value, dict) else {"besides": value},
+    "extra key": lambda value: {**value, "extra": 1} if isinstance(value, dict) else {"extra": value},
 }
+"""Functions of a part that return its replacement, by name."""
 
 
 def is_refusal(message, path):
+    """Return whether a message is one line that begins with the path, and at most 400 characters longer."""
     return "\n" not in message and message.startswith(f"{path}: ") and len(message) < len(str(path)) + 400
 
 
@@ -143,11 +148,8 @@ def test_changed_bytes_with_valid_checksum_are_resumed_or_refused_in_one_line(sa
 @settings(max_examples=30, deadline=None, derandomize=True, suppress_health_check=list(HealthCheck))
 @given(data=st.data())
 def test_policy_of_a_changed_checkpoint_is_opened_or_refused_in_one_line(saved, data):
-    read = [
-        part_path
-        for part_path in part_paths(saved.state)
-        if part_path[0] in ("iteration", "config") or "model" in part_path
-    ]
+    paths = part_paths(saved.state)
+    read = [path for path in paths if path[0] in ("iteration", "config") or "model" in path]  # parts of the policy
     change = CHANGES[data.draw(st.sampled_from(sorted(CHANGES)))]
     saved.save(changed(saved.state, data.draw(st.sampled_from(read)), change))
     try:
@@ -161,7 +163,7 @@ def test_unchanged_checkpoint_is_resumed(saved):
     assert saved.resume() is None
 
 
-INVALID_PARTS = [
+INVALID_PARTS = [  # keys to a part, its new value, and the error message
     (("iteration",), "late", "iteration must be int, got str"),
     (("iteration",), 7, "of iteration 7, manifest.json says 1"),
     (("rng", "cpu"), REMOVED, "rng lacks cpu"),
@@ -200,8 +202,8 @@ def test_refuses_an_empty_file_with_valid_checksum(saved):
 
 
 def test_error_message_names_missing_parts_of_another_rank(saved):
-    own = {"ppo": {"episode": saved.state["ppo"]["episode"]}, "env": saved.state["env"]}
-    saved.save({**saved.state, "others": [own]})
+    rank_1 = {"ppo": {"episode": saved.state["ppo"]["episode"]}, "env": saved.state["env"]}
+    saved.save({**saved.state, "others": [rank_1]})
     cfg = TrainCfg(**{**vars(saved.cfg), "resume": str(saved.path)})
     with pytest.raises(CheckpointError, match=r"others\.0 lacks rng, has nothing besides"):
         TrainingRun(cfg, saved.env, Rank(1, 2, torch.device("cpu")))

@@ -5,13 +5,13 @@ from jumper_warp.rl.graphs import CapturedProcedure
 
 
 @pytest.fixture
-def refusing(monkeypatch):
-    """Replaces torch.cuda by one on which every graph capture fails."""
+def failing_capture(monkeypatch):
+    """Replace torch in `graphs` by a stub in which every capture raises, and other calls of torch.cuda do nothing."""
 
     def refuse(*_, **__):
         raise RuntimeError("operation not permitted when stream is capturing\nand more")
 
-    class Cuda:
+    class Cuda:  # every other attribute is a function that does nothing
         CUDAGraph, graph = object, staticmethod(refuse)
 
         def __getattr__(self, name):
@@ -23,11 +23,11 @@ def refusing(monkeypatch):
     monkeypatch.setattr(graphs, "torch", Torch())
 
 
-@pytest.mark.usefixtures("refusing")
+@pytest.mark.usefixtures("failing_capture")
 def test_failed_capture_runs_eagerly_and_warns_once(capsys):
     calls = []
     captured = CapturedProcedure(lambda: calls.append(None), enabled=True)
-    for _ in range(4):
+    for _ in range(4):  # the second call tries to capture
         captured()
     assert len(calls) == 4
     assert capsys.readouterr().err.splitlines() == [

@@ -14,7 +14,7 @@ CFG = TrainCfg(
 
 
 def mean_returns(cfg: TrainCfg) -> list[float]:
-    """Return the mean return of every ten iterations of a training on the first level of the nominal vertical jump."""
+    """Return the mean episode return of each ten iterations, trained on the nominal vertical jump's first level."""
     task = make_task("vertical-jump")
     task = dataclasses.replace(task, levels=task.levels[:1])
     result = train(cfg, lambda n, seed, _: Env(task, n, seed=seed, device="cpu", randomize=False, noise=False))

@@ -8,12 +8,12 @@ from jumper_warp.rl.networks import ActorCritic, Moments, RunningMoments, gaussi
 
 def test_log_prob_and_kl_agree_with_torch():
     torch.manual_seed(0)
-    x, mean, other, log_std, other_std = (torch.randn(5, 3), torch.randn(5, 3), torch.randn(5, 3), *torch.randn(2, 3))
+    x, mean, new_mean, log_std, new_log_std = (*torch.randn(3, 5, 3), *torch.randn(2, 3))
     old = torch.distributions.Normal(mean, log_std.exp())
-    new = torch.distributions.Normal(other, other_std.exp())
+    new = torch.distributions.Normal(new_mean, new_log_std.exp())
     torch.testing.assert_close(gaussian_log_prob(x, mean, log_std), old.log_prob(x).sum(-1))
     divergence = torch.distributions.kl_divergence(old, new).sum(-1)
-    torch.testing.assert_close(gaussian_kl(mean, log_std, other, other_std), divergence)
+    torch.testing.assert_close(gaussian_kl(mean, log_std, new_mean, new_log_std), divergence)
 
 
 def test_running_moments_agree_with_numpy_over_all_batches():
@@ -30,26 +30,26 @@ def test_running_moments_agree_with_numpy_over_all_batches():
     np.testing.assert_allclose(moments.scaling().denormalise(scaled), batches[1], rtol=1e-5)
 
 
-@pytest.mark.parametrize("rows", [None, 1, 64, 200, 1000])
-def test_batch_moments_do_not_depend_on_the_chunk_size(rows):
+@pytest.mark.parametrize("chunk_size", [None, 1, 64, 200, 1000])  # of 200 samples
+def test_batch_moments_do_not_depend_on_the_chunk_size(chunk_size):
     batch = np.random.default_rng(0).normal(50.0, (1.0, 5.0), (200, 2)).astype(np.float32)
-    mean, var, _ = Moments.from_samples(torch.from_numpy(batch), rows)
+    mean, var, _ = Moments.from_samples(torch.from_numpy(batch), chunk_size)
     np.testing.assert_allclose(mean, batch.astype(float).mean(0), rtol=1e-6)
     np.testing.assert_allclose(var, batch.astype(float).var(0), rtol=1e-5)
 
 
-def test_running_moments_start_as_the_identity():
+def test_initial_running_moments_normalise_as_the_identity():
     x = torch.tensor([[3.0, -4.0]])
     torch.testing.assert_close(RunningMoments((2,)).scaling().normalise(x), x, rtol=1e-6, atol=0.0)
 
 
-def test_act_returns_the_clipped_mean():
+def test_act_returns_the_mean_clipped_to_1():
     model = ActorCritic(2, 1, (4,))
-    torch.nn.init.constant_(model.actor[-1].bias, 3.0)
+    torch.nn.init.constant_(model.actor[-1].bias, 3.0)  # observations of 0 give a mean of 3
     assert model.act(torch.zeros(5, 2)).tolist() == [[1.0]] * 5
 
 
-def test_sanitise_writes_to_out_and_leaves_its_input():
+def test_sanitise_zeros_non_finite_entries_clamps_to_100_and_leaves_its_input():
     obs, out = torch.tensor([float("nan"), float("inf"), 2.0, -1e13]), torch.full((2, 4), 7.0)
     sanitise(obs, out=out[1])
     assert out.tolist() == [[7.0] * 4, [0.0, 0.0, 2.0, -100.0]]

@@ -22,11 +22,12 @@ PLAIN = PpoCfg(
 
 
 def groups(obs, critic_obs):
+    """Return observations (num_envs, n) of actor and critic as rsl-rl's observation groups."""
     return TensorDict({"actor": obs, "critic": critic_obs}, batch_size=[obs.shape[0]])
 
 
 def as_rsl_rl(ppo):
-    """rsl-rl's PPO with the same weights and settings."""
+    """Return rsl-rl's PPO with the weights and settings of our PPO."""
     cfg, env, ours = ppo.cfg, ppo.env, ppo.model
     obs = groups(torch.zeros(env.num_envs, 2), torch.zeros(env.num_envs, 3))
     sets = {"actor": ["actor"], "critic": ["critic"]}
@@ -43,13 +44,14 @@ def as_rsl_rl(ppo):
 
 
 def copy_weights(ours, theirs):
+    """Copy actor, critic and noise of our model to rsl-rl's PPO."""
     theirs.actor.mlp.load_state_dict(ours.actor.state_dict())
     theirs.critic.mlp.load_state_dict(ours.critic.state_dict())
     theirs.actor.distribution.log_std_param.data.copy_(ours.log_std.data)
 
 
 def feed(theirs, rollout):
-    """Store our rollout in rsl-rl's PPO, as if it had acted itself."""
+    """Store our rollout in rsl-rl's PPO, and compute its returns."""
     for step in range(rollout.reward.shape[0]):
         obs = groups(rollout.obs[step], rollout.critic_obs[step])
         theirs.act(obs)
@@ -62,9 +64,9 @@ def feed(theirs, rollout):
 
 @pytest.fixture(scope="module")
 def pair():
-    """Our PPO and rsl-rl's after one update of the same weights on the same samples.
+    """Our PPO, its batch, rsl-rl's PPO, its losses and our statistics, after one update on the same samples.
 
-    The weights differ from those that acted, so that the probability ratio is not 1.
+    The weights differ from the weights that acted, so that the probability ratio is not 1.
     """
     torch.manual_seed(0)
     ppo = Ppo(PushTask(16), PLAIN)
@@ -100,27 +102,22 @@ def test_gradients_agree_with_rsl_rl(pair):
     their_actor = {**dict(theirs.actor.mlp.named_parameters()), "noise": theirs.actor.distribution.log_std_param}
     for name, param in ours.items():
         torch.testing.assert_close(param.grad, their_actor[name].grad, atol=1e-5, rtol=1e-5)
-    for a, b in zip(ppo.model.critic.parameters(), theirs.critic.mlp.parameters(), strict=True):
-        torch.testing.assert_close(a.grad, b.grad, atol=1e-5, rtol=1e-5)
+    for param, their_param in zip(ppo.model.critic.parameters(), theirs.critic.mlp.parameters(), strict=True):
+        torch.testing.assert_close(param.grad, their_param.grad, atol=1e-5, rtol=1e-5)
     assert ppo.flat.gradient.norm() > 0.1
 
 
 def test_adapted_learning_rate_agrees_with_rsl_rl(pair):
     ppo, _, theirs, _, statistics = pair
-    assert statistics["Loss/kl"] > 0.02
+    assert statistics["Loss/kl"] > 0.02  # above twice desired_kl, so the rate changes
     assert ppo.lr.item() == pytest.approx(theirs.learning_rate)
 
 
 def test_gae_agrees_with_hand_calculation():
-    # gamma 0.5, lambda 0.5; the second step ends an episode.
-    # delta: 1 + 0.5*4 - 2 = 1;  2 - 4 = -2;  3 + 0.5*8 - 6 = 1.  Advantage: 1 - 0.25*2 = 0.5; -2; 1.
-    advantage, returns = gae(
-        torch.tensor([[1.0], [2.0], [3.0]]),
-        torch.tensor([[0.0], [1.0], [0.0]]),
-        torch.tensor([[2.0], [4.0], [6.0], [8.0]]),
-        0.5,
-        0.5,
-    )
+    # The second step ends an episode. delta: 1 + 0.5*4 - 2 = 1;  2 - 4 = -2;  3 + 0.5*8 - 6 = 1.
+    # Advantage: 1 - 0.25*2 = 0.5; -2; 1. Return: advantage + value.
+    reward, done = torch.tensor([[1.0], [2.0], [3.0]]), torch.tensor([[0.0], [1.0], [0.0]])
+    advantage, returns = gae(reward, done, value=torch.tensor([[2.0], [4.0], [6.0], [8.0]]), gamma=0.5, lam=0.5)
     assert advantage.flatten().tolist() == [0.5, -2.0, 1.0]
     assert returns.flatten().tolist() == [2.5, 2.0, 7.0]
 
@@ -141,7 +138,7 @@ def test_timeout_uses_the_final_observation_of_the_old_episode():
     ppo = Ppo(PushTask(2), dataclasses.replace(PLAIN, num_steps=1))
     ppo.rollout.done.fill_(1.0)
     ppo.rollout.timeout.fill_(1.0)
-    ppo.rollout.critic_obs[1] = 7.0  # where the new episode begins
+    ppo.rollout.critic_obs[1] = 7.0  # first observation of the new episode
     ppo.rollout.final_critic_obs.copy_(torch.tensor([[[0.5, -0.5, 3.0], [2.0, 1.0, 0.0]]]))
     expected = PLAIN.gamma * ppo.model.value(ppo.rollout.final_critic_obs[0])
     torch.testing.assert_close(ppo.batch().target, expected.detach())
@@ -150,12 +147,12 @@ def test_timeout_uses_the_final_observation_of_the_old_episode():
 @pytest.mark.parametrize(
     ("lr", "kl", "expected"),
     [
-        (1e-3, 0.021, 1e-3 / 1.5),
-        (1e-3, 0.004, 1.5e-3),
-        (1e-3, 0.010, 1e-3),
-        (1e-3, 0.0, 1e-3),
-        (1.2e-5, 1.0, 1e-5),
-        (9e-3, 0.001, 1e-2),
+        (1e-3, 0.021, 1e-3 / 1.5),  # above 0.02
+        (1e-3, 0.004, 1.5e-3),  # below 0.005
+        (1e-3, 0.010, 1e-3),  # between
+        (1e-3, 0.0, 1e-3),  # no information
+        (1.2e-5, 1.0, 1e-5),  # lower bound
+        (9e-3, 0.001, 1e-2),  # upper bound
         (1e-3, float("nan"), 1e-3),
     ],
 )
@@ -170,6 +167,7 @@ def test_learning_rate_is_fixed_without_desired_kl():
 
 
 def trained(iterations):
+    """Return PPO after some iterations on 128 worlds, and the statistics of each iteration."""
     torch.manual_seed(1)
     ppo = Ppo(PushTask(128), SMALL)
     ppo.env.reset()
@@ -185,12 +183,12 @@ def test_training_learns_to_push_the_mass_to_the_origin():
     ppo, history = trained(30)
     returns = [metrics["Train/mean_return"] for metrics in history if "Train/mean_return" in metrics]
     assert returns[0] < 25.0
-    assert returns[-1] > 44.0  # of at most 50
+    assert returns[-1] > 44.0  # the maximum is 1 for each of 50 steps
     env = ppo.env
     env.reset()
     for _ in range(40):
         env.step(ppo.model.act(env.obs))
-    assert env.obs[:, 0].abs().max() < 0.2
+    assert env.obs[:, 0].abs().max() < 0.2  # distance from the origin
 
 
 def test_critic_learns_the_normalised_return():
@@ -208,6 +206,7 @@ class DivergingTask(PushTask):
     """Task whose worlds 0 to 2 diverge at every step."""
 
     def step(self, action):
+        """Step the task, and write NaN, infinity and 1e13 to observations (and the first two to rewards)."""
         super().step(action)
         bad = torch.tensor([float("nan"), float("inf"), 1.0e13])
         for array in (self.obs, self.final_obs, self.critic_obs, self.final_critic_obs):
@@ -227,7 +226,7 @@ def test_diverged_worlds_reach_neither_networks_nor_statistics():
         assert recorded.abs().max() <= 100.0
     assert all(value.isfinite().all() for value in ppo.model.state_dict().values())
     assert ppo.model.obs_moments.var.max() < 200.0  # one world in 128 at 100 gives 78
-    assert ppo.model.critic_moments.var[:2].max() < 200.0
+    assert ppo.model.critic_moments.var[:2].max() < 200.0  # likewise
     assert ppo.model.features(torch.full((1, 2), 1e30)).abs().max() <= 10.0
     assert ppo.model.critic_features(torch.full((1, 3), 1e30)).abs().max() <= 10.0
     assert ppo.statistics()["Loss/skipped"] == 0.0
@@ -246,11 +245,12 @@ def test_non_finite_gradient_changes_no_parameter():
 
 
 class NoHost(TorchDispatchMode):
-    """Refuses the operations that wait for a device's result or whose shape depends on it."""
+    """Mode in which an operation that waits for a result on the device, or has a shape from it, fails the test."""
 
     refused = ("_local_scalar_dense", "nonzero", "masked_select", "unique", "equal")
 
     def __torch_dispatch__(self, func, types, args=(), kwargs=None):
+        """Run an operator of torch unless it is refused; boolean indices are, since their result's shape varies."""
         name = func.overloadpacket.__name__
         assert name not in self.refused, name
         if name in ("index", "index_put", "index_put_"):
@@ -281,8 +281,9 @@ def test_update_of_two_ranks_agrees_with_one_rank_with_all_worlds(tmp_path):
     fill(whole, slice(None), 8)
     orders = [local_order(rank, 32).chunk(2) for rank in range(2)]
     parts = [
-        order // 4 * 8 + order % 4 + 4 * rank for pair in zip(*orders, strict=True) for rank, order in enumerate(pair)
-    ]
+        order // 4 * 8 + order % 4 + 4 * rank  # rank's sample of 4 worlds to the sample of all 8 worlds, time-major
+        for pair in zip(*orders, strict=True) for rank, order in enumerate(pair)
+    ]  # fmt: skip
     whole.order = lambda: torch.cat(parts)
     start = {name: value.clone() for name, value in whole.model.state_dict().items()}
     whole.update()
@@ -303,20 +304,21 @@ def test_iteration_all_reduces_moments_once_and_each_minibatch_gradient(monkeypa
     for ranks in (1, 2):
         sizes = []
 
-        def exchange(x, sizes=sizes):
+        def all_reduce_mean(x, sizes=sizes):
             sizes.append(x.numel())
-            return x  # as if the other rank had seen the same
+            return x  # as if the other rank had the same samples
 
         monkeypatch.setattr(networks, "world_size", lambda ranks=ranks: ranks)
-        monkeypatch.setattr(networks, "all_reduce_mean", exchange)
-        monkeypatch.setattr(ppo_module, "all_reduce_mean", exchange)
+        for module in (networks, ppo_module):
+            monkeypatch.setattr(module, "all_reduce_mean", all_reduce_mean)
         torch.manual_seed(0)
         ppos.append(Ppo(PushTask(16), cfg))
         ppos[-1].env.reset()
         ppos[-1].collect()
         ppos[-1].update()
     alone, one_of_two = ppos
-    assert sizes == [2 * (1 + 1 + 2 + 3)] + 12 * [alone.flat.all_reduced.numel()]
+    moments = 2 * (1 + 1 + 2 + 3)  # mean and variance of advantage, return, observation and critic's observation
+    assert sizes == [moments] + 12 * [alone.flat.all_reduced.numel()]  # 3 epochs of 4 minibatches
     torch.testing.assert_close(one_of_two.flat.value, alone.flat.value, atol=2e-5, rtol=1e-3)
     torch.testing.assert_close(one_of_two.model.obs_moments.var, alone.model.obs_moments.var, atol=1e-6, rtol=1e-3)
     assert one_of_two.model.obs_moments.count == 2 * alone.model.obs_moments.count
@@ -337,23 +339,21 @@ def test_counters_are_exact_beyond_the_range_of_float32():
     assert (lengths, number) == (2.0 * FLOAT32_COUNT_LIMIT + 15.0, FLOAT32_COUNT_LIMIT + 3.0)  # of three episodes
     assert ppo.collector.episode[1].tolist() == [1.0]
     assert ppo._sums[-1].item() == FLOAT32_COUNT_LIMIT + 1.0
-    entropy, skipped = (
-        ppo._sums[STATISTICS.index(name)].item() - FLOAT32_COUNT_LIMIT for name in ("entropy", "skipped")
-    )
+    sums = [ppo._sums[STATISTICS.index(name)].item() for name in ("entropy", "skipped")]
+    entropy, skipped = (value - FLOAT32_COUNT_LIMIT for value in sums)
     assert 0.0 < abs(entropy) < 10.0 and entropy != round(entropy) and skipped == 0.0
 
 
 def test_loads_episode_counts_in_float32():
-    ppo, _ = trained(2)
-    state = ppo.state_dict()
-    old = {**state, "episode": state["episode"].float()}
+    state = trained(2)[0].state_dict()
+    state["episode"] = state["episode"].float()
     other = Ppo(PushTask(128), SMALL)
-    other.load_state_dict(old)
-    assert torch.equal(other.collector.episode, old["episode"].double())
+    other.load_state_dict(state)
+    assert torch.equal(other.collector.episode, state["episode"].double())
 
 
 def noise_gradient(ppo, progress):
-    """Return the gradient by log_std at a progress of the training, on the same samples and weights."""
+    """Return the gradient by log_std, (num_actions,), at a progress 0 to 1; the learning rate is 0."""
     ppo.set_progress(progress)
     ppo.lr.zero_()
     ppo.minibatch_step(ppo.packer.rows)
@@ -397,7 +397,7 @@ def test_load_state_dict_resumes_bitwise():
         ({"activation": "gelu"}, "activation must be one of elu, relu, tanh, got gelu"),
         ({"clip": float("nan")}, "clip must be positive"),
         ({"reward_scale": float("inf")}, "reward_scale must be positive and finite, got inf"),
-        ({"init_std": 1e39}, "init_std must be positive and finite"),  # infinite in single precision
+        ({"init_std": 1e39}, "init_std must be positive and finite"),  # infinite in float32
         ({"entropy_coef": float("nan")}, "entropy_coef must be finite and not negative, got nan"),
         ({"value_coef": float("inf")}, "value_coef must be finite"),
         ({"desired_kl": float("nan")}, "desired_kl must be finite"),

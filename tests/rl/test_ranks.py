@@ -4,10 +4,9 @@ import pytest
 import torch
 
 from jumper_warp.rl import distributed
-from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.runner import train
 from jumper_warp.utils.threads import set_threads
-from toy_task import SMALL, PushTask
+from toy_task import PushTask, push_cfg
 
 
 @pytest.mark.parametrize(("cores", "threads"), [(1, 1), (2, 2), (3, 2), (4, 2), (16, 8)])
@@ -18,7 +17,7 @@ def test_torch_uses_half_the_cores_and_at_least_two(cores, threads, one_thread, 
     assert torch.get_num_threads() == threads
 
 
-def test_omp_num_threads_overrides_torchs_threads(one_thread, monkeypatch):
+def test_set_omp_num_threads_leaves_torchs_threads_unchanged(one_thread, monkeypatch):
     monkeypatch.setenv("OMP_NUM_THREADS", "3")
     torch.set_num_threads(1)
     distributed.init_distributed("cpu")
@@ -27,9 +26,7 @@ def test_omp_num_threads_overrides_torchs_threads(one_thread, monkeypatch):
 
 def test_torch_uses_the_threads_of_the_training_settings(one_thread, monkeypatch, tmp_path):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
-    cfg = TrainCfg(
-        task="push", num_envs=32, max_iterations=1, device="cpu", log_root=tmp_path, tensorboard=False, ppo=SMALL
-    )
+    cfg = push_cfg(tmp_path, max_iterations=1)
     for threads in (1, 3):
         train(dataclasses.replace(cfg, threads=threads), PushTask)
         assert torch.get_num_threads() == threads

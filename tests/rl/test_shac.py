@@ -9,27 +9,30 @@ from jumper_warp.rl.cfg import ShacCfg
 from jumper_warp.rl.runner import train
 from jumper_warp.rl.shac import Shac
 from jumper_warp.utils.errors import InputError
-from toy_task import SMALL, PushTask, push_cfg
+from toy_task import SMALL, PushTask, equal, push_cfg
 
 CFG = dataclasses.replace(SMALL, init_std=0.3, num_steps=8)
 
 
 class SmoothPushTask(PushTask):
-    """`PushTask` with a differentiable step."""
+    """`PushTask` as a `DifferentiableVecEnv`; `present` (num_envs, 2): position and velocity with gradient."""
 
     def begin_window(self) -> None:
+        """Detach the present state from earlier steps."""
         self.present = self.obs.clone()
 
     def observe(self):
+        """Return the observations of actor (num_envs, 2) and critic (num_envs, 3), with gradient."""
         return self.present, torch.cat([self.present, self.present[:, :1].abs()], 1)
 
     def observe_final(self):
+        """Return the observations after the last step, before a reset, as `observe`."""
         return self.last, torch.cat([self.last, self.last[:, :1].abs()], 1)
 
     def step_with_gradient(self, action):
-        present = self.present
-        velocity = present[:, 1] + 0.2 * action[:, 0].clamp(-1.0, 1.0)
-        position = present[:, 0] + 0.2 * velocity
+        """Step the task with actions (num_envs, 1), and return the rewards (num_envs,) with gradient."""
+        velocity = self.present[:, 1] + 0.2 * action[:, 0].clamp(-1.0, 1.0)
+        position = self.present[:, 0] + 0.2 * velocity
         reward = torch.exp(-position.square() - 0.1 * velocity.square())
         self.step(action.detach())
         self.last = torch.stack([position, velocity], 1)
@@ -38,6 +41,7 @@ class SmoothPushTask(PushTask):
 
 
 def shac(num_envs=32, seed=0, **changes):
+    """Return `Shac` on the reset task with episodes of 11 steps, windows of 8; changes: of CFG."""
     torch.manual_seed(seed)
     env = SmoothPushTask(num_envs, episode_length=11)
     env.reset()
@@ -45,33 +49,34 @@ def shac(num_envs=32, seed=0, **changes):
 
 
 def test_gradient_agrees_with_finite_differences_of_the_loss():
-    """Episodes end within the window; a first iteration makes the target critic non-trivial."""
+    """Oracle: central difference along the gradient. Episodes end within the window; the target critic is trained."""
     algorithm = shac(num_envs=8)
     algorithm.iterate()
     start, noise = algorithm.env.state_dict(), torch.get_rng_state()
 
     def loss():
+        """Return the loss of the same window, from the same state with the same noise."""
         algorithm.env.load_state_dict(start)
         torch.set_rng_state(noise)
         return algorithm.window().loss
 
     weights = [*algorithm.model.actor.parameters(), algorithm.model.log_std]
     gradients = torch.autograd.grad(loss(), weights)
-    length = torch.stack([gradient.norm() for gradient in gradients]).norm()
-    ends = []
-    for change in (1.0e-2, -2.0e-2):
+    norm = torch.stack([gradient.norm() for gradient in gradients]).norm()
+    losses = []
+    for move in (1.0e-2, -2.0e-2):  # to +1e-2 and -1e-2 along the unit gradient
         with torch.no_grad():
             for weight, gradient in zip(weights, gradients, strict=True):
-                weight += change * gradient / length
-            ends.append(float(loss()))
-    assert (ends[0] - ends[1]) / 2.0e-2 == pytest.approx(float(length), rel=0.01)
+                weight += move * gradient / norm
+            losses.append(float(loss()))
+    assert (losses[0] - losses[1]) / 2.0e-2 == pytest.approx(float(norm), rel=0.01)
 
 
 def test_loss_agrees_with_a_loop_over_worlds():
-    """Episodes end by timeout and, for a mass that starts fast, by termination; the loss is summed world by world."""
+    """Oracle: discounted sums world by world. Episodes end by timeout and, for a mass that starts fast, termination."""
     algorithm = shac(num_envs=6, num_steps=14, asymmetric_critic=False)
     env, model, gamma = algorithm.env, algorithm.model, algorithm.cfg.gamma
-    env.start[0] = torch.tensor([4.5, 3.0])  # lost in a step, again and again
+    env.start[0] = torch.tensor([4.5, 3.0])  # beyond the limit of 5 after one step of each episode
     env.reset()
     with torch.no_grad():
         model.actor[-1].bias += 0.2
@@ -80,7 +85,7 @@ def test_loss_agrees_with_a_loop_over_worlds():
     loss = float(algorithm.window().loss)
     env.load_state_dict(start)
     torch.set_rng_state(noise)
-    sums, powers, ends = torch.zeros(6), torch.zeros(6), {"cut": 0, "lost": 0}
+    sums, powers, ends = torch.zeros(6), torch.zeros(6), {"timeout": 0, "terminated": 0}
     with torch.no_grad():
         for step in range(14):
             mean = model.actor(model.features(env.obs))
@@ -90,10 +95,10 @@ def test_loss_agrees_with_a_loop_over_worlds():
                 sums[world] += gamma ** powers[world] * algorithm.cfg.reward_scale * env.reward[world]
                 powers[world] += 1
                 if env.done[world] > 0.0:
-                    cut = env.timeout[world] > 0.0
-                    sums[world] += gamma ** powers[world] * final[world] if cut else 0.0
+                    timeout = env.timeout[world] > 0.0
+                    sums[world] += gamma ** powers[world] * final[world] if timeout else 0.0
                     powers[world] = 0
-                    ends["cut" if cut else "lost"] += 1
+                    ends["timeout" if timeout else "terminated"] += 1
                 elif step == 13:
                     sums[world] += gamma ** powers[world] * after[world]
     assert min(ends.values()) > 0
@@ -113,25 +118,25 @@ def test_shac_learns_to_push_the_mass_to_the_origin():
     assert means[1] < 0.5 * means[0]
 
 
-def test_same_seed_and_resume_are_bitwise_identical():
+def test_same_seed_gives_the_same_weights_and_a_loaded_state_resumes_bitwise():
     first, second = shac(), shac()
     for algorithm in (first, second):
         torch.manual_seed(3)
         algorithm.iterate()
-    state, env = first.state_dict(), first.env.state_dict()
-    for name, value in second.state_dict()["model"].items():
-        assert torch.equal(value, state["model"][name]), name
-    fresh = shac(seed=9)
-    fresh.env.load_state_dict(env)
-    fresh.load_state_dict(state)
-    for algorithm in (first, fresh):
+    assert equal(first.state_dict()["model"], second.state_dict()["model"])
+    resumed = shac(seed=9)
+    resumed.env.load_state_dict(first.env.state_dict())
+    resumed.load_state_dict(first.state_dict())
+    for algorithm in (first, resumed):
         torch.manual_seed(4)
         algorithm.iterate()
-    after, again = first.state_dict(), fresh.state_dict()
-    for name, value in [*after["model"].items(), *((n, v) for n, v in after.items() if n != "model")]:
-        assert torch.equal(value, again["model"].get(name, again.get(name))), name
+    assert equal(first.state_dict(), resumed.state_dict())
+
+
+def test_refuses_a_state_without_learning_rate():
+    state = shac().state_dict()
     with pytest.raises(ValueError, match="lacks lr"):
-        fresh.load_state_dict({name: value for name, value in state.items() if name != "lr"})
+        shac().load_state_dict({name: value for name, value in state.items() if name != "lr"})
 
 
 def test_train_with_shac_runs_resumes_and_refuses_an_env_without_gradients(tmp_path):

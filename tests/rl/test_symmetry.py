@@ -28,11 +28,12 @@ CFG = PpoCfg(num_steps=8, epochs=2, minibatches=2, hidden=(16, 9), symmetry="act
 
 
 def mirrored(x, mirror):
+    """Return the mirror image of x (..., n) by a task's mirror map (order and signs as NumPy arrays)."""
     return torch.from_numpy(mirror.signs) * x[..., torch.from_numpy(mirror.order)]
 
 
 def walker(hidden=(32, 24)):
-    """Return a symmetric network with actions as large as its inputs."""
+    """Return a symmetric `ActorCritic` of the walking task with actions as large as its inputs."""
     torch.manual_seed(3)
     model = ActorCritic(NUM_OBS, 12, hidden, symmetry=WALKING)
     with torch.no_grad():
@@ -44,13 +45,13 @@ def walker(hidden=(32, 24)):
 def test_mirrored_observation_gives_the_mirrored_action():
     model, x = walker(), torch.randn(64, NUM_OBS)
     torch.testing.assert_close(model.mean(mirrored(x, OBS)), mirrored(model.mean(x), ACTION), atol=1e-5, rtol=1e-5)
-    assert (model.actor(mirrored(x, OBS)) - mirrored(model.actor(x), ACTION)).abs().max() > 0.1
+    assert (model.actor(mirrored(x, OBS)) - mirrored(model.actor(x), ACTION)).abs().max() > 0.1  # f alone is not
 
 
 def test_symmetric_observation_gives_a_symmetric_action():
     model, x = walker(), torch.randn(64, NUM_OBS)
     action = model.mean(0.5 * (x + mirrored(x, OBS)))
-    torch.testing.assert_close(action[:, :3], action[:, 3:6], atol=1e-5, rtol=1e-5)
+    torch.testing.assert_close(action[:, :3], action[:, 3:6], atol=1e-5, rtol=1e-5)  # motors of legs FL and FR
 
 
 def test_symmetric_forward_and_backward_agree_with_autograd():
@@ -63,11 +64,11 @@ def test_symmetric_forward_and_backward_agree_with_autograd():
     expected = torch.autograd.grad(mean, list(model.actor.parameters()), grad)
     wide = torch.nn.functional.pad(x, (0, actor.layers.weights[0].shape[1] - NUM_OBS))
     *outputs, layer_inputs = actor.forward(wide, torch.float32)
-    for result, right in zip(outputs, (mean, output - image), strict=True):
-        torch.testing.assert_close(result, right, atol=1e-5, rtol=1e-5)
+    for result, reference in zip(outputs, (mean, output - image), strict=True):
+        torch.testing.assert_close(result, reference, atol=1e-5, rtol=1e-5)
     first, *others = actor.backward(layer_inputs, grad, torch.float32)
-    for gradient, right in zip((first[:, :NUM_OBS], *others), expected, strict=True):
-        torch.testing.assert_close(gradient, right, atol=1e-4, rtol=1e-4)
+    for gradient, reference in zip((first[:, :NUM_OBS], *others), expected, strict=True):
+        torch.testing.assert_close(gradient, reference, atol=1e-4, rtol=1e-4)
 
 
 @pytest.mark.parametrize("hidden", [(), (16,), (32, 24)])
@@ -94,13 +95,13 @@ def test_symmetrised_moments_are_those_of_samples_and_images():
 
 
 @pytest.mark.parametrize(
-    "wrong",
-    [(np.array([1, 2, 0]), np.ones(3)), (np.array([1, 0]), np.array([1.0, -1.0])), (np.arange(2), np.ones(3)),
-     (np.array([0, 7]), np.ones(2))],
-)  # fmt: skip
-def test_refuses_a_mirror_map_that_is_not_its_own_inverse(wrong):
+    ("order", "signs"),
+    [([1, 2, 0], [1.0, 1.0, 1.0]), ([1, 0], [1.0, -1.0]), ([0, 1], [1.0, 1.0, 1.0]), ([0, 7], [1.0, 1.0])],
+    ids=["cycle", "signs", "sizes", "index"],
+)
+def test_refuses_a_mirror_map_that_is_not_its_own_inverse(order, signs):
     with pytest.raises(InputError, match="mirror image of action is not its own inverse"):
-        mirror_map(*wrong, "action")
+        mirror_map(np.array(order), np.array(signs), "action")
 
 
 # ---------------------------------------------------------------- training
@@ -138,7 +139,7 @@ def test_symmetric_update_traces_into_one_graph(monkeypatch):
         torch.testing.assert_close(on, off)
 
 
-def test_checkpoint_of_a_symmetric_actor_opens_as_a_plain_policy_and_resumes(tmp_path):
+def test_checkpoint_of_a_symmetric_actor_opens_as_a_plain_policy(tmp_path):
     task, cfg = make_task("velocity-flat"), dataclasses.replace(CFG, hidden=(8, 6))
     model = walker(cfg.hidden)
     model.obs_moments.update(torch.randn(100, NUM_OBS))
@@ -151,6 +152,8 @@ def test_checkpoint_of_a_symmetric_actor_opens_as_a_plain_policy_and_resumes(tmp
     torch.testing.assert_close(policy.act(obs), model.act(obs), atol=1e-5, rtol=1e-5)
     assert policy.interface.sizes == (NUM_OBS, 16, 12, 12)
 
+
+def test_symmetric_actor_resumes_only_with_the_same_symmetry():
     first, second = Ppo(PushTask(8), CFG), Ppo(PushTask(8), CFG)
     second.load_state_dict(first.state_dict())
     assert torch.equal(first.flat.value, second.flat.value)
@@ -167,18 +170,18 @@ def test_refuses_symmetry_for_a_task_without_mirror_map_in_one_line(capsys, monk
     with pytest.raises(SystemExit):
         main(["train", "hold-height", "--ppo.symmetry", "actor", "--num-envs", "8", "--max-iterations", "1"])
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and "hold-height policy: the mirror image of" in lines[0]
+    assert len(lines) == 1 and "hold-height actor: the mirror image of" in lines[0]
 
 
-def test_refuses_symmetry_for_an_env_without_mirror_map():
+def test_refuses_symmetry_for_an_env_without_mirror_map_or_of_another_size():
     class Plain(PushTask):
-        mirror = None
+        mirror = None  # the environment defines no mirror map
 
-    class Other(PushTask):
+    class WrongSize(PushTask):
         def mirror(self, what):
-            return [0], [1.0]
+            return [0], [1.0]  # one entry, observations have two
 
-    for env in (Plain, Other):
+    for env in (Plain, WrongSize):
         with pytest.raises(InputError, match="mirror image"):
             Ppo(env(4), CFG)
 

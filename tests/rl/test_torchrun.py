@@ -8,19 +8,22 @@ import sys
 from pathlib import Path
 
 import pytest
-import torch
 
 import elastic_task
 from jumper_warp.rl.checkpoint import load_checkpoint
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.runner import CHECKPOINTS
-from toy_task import free_port
+from toy_task import equal, free_port
 
 STEPS = elastic_task.STEPS
 
 
 def start(folder, nodes, *deaths, restarts=0):
-    """Start torchrun agents of a training with two processes on `nodes` nodes; `{node}` in `folder`: the node."""
+    """Return torchrun agents (Popen, one a node) of a training with two processes on one or two nodes.
+
+    folder: for the logs; {node} in it is replaced. deaths: arguments of elastic_task, processes that die. restarts:
+    allowed restarts.
+    """
     here = Path(elastic_task.__file__)
     paths = [str(here.parent), *filter(None, [os.environ.get("PYTHONPATH")])]
     env = os.environ | {"OMP_NUM_THREADS": "1", "GLOO_SOCKET_IFNAME": "lo", "PYTHONPATH": os.pathsep.join(paths)}
@@ -37,7 +40,7 @@ def start(folder, nodes, *deaths, restarts=0):
 
 
 def torchrun(folder, nodes, *deaths, restarts=0):
-    """Train with two processes on `nodes` nodes, and return the run's folder."""
+    """Train with two processes on `nodes` nodes, and return the run's folder; arguments as for `start`."""
     agents = start(folder, nodes, *deaths, restarts=restarts)
     stderr = [agent.communicate(timeout=240)[1] for agent in agents]
     assert [agent.returncode for agent in agents] == [0] * nodes, "\n".join(stderr)
@@ -46,36 +49,27 @@ def torchrun(folder, nodes, *deaths, restarts=0):
 
 
 def assert_same_training(run, other_run):
-    """Two runs have bitwise equal checkpoints, and equal logs."""
+    """Assert that two runs have bitwise equal last checkpoints, and the same logged iterations and KL divergences."""
     runs = (run, other_run)
-    one, other = (load_checkpoint(run / CHECKPOINTS / "iteration_000006.pt") for run in runs)
+    first, second = (load_checkpoint(run / CHECKPOINTS / "iteration_000006.pt") for run in runs)
     for part in ("ppo", "env", "rng", "others"):
-        assert_equal(one[part], other[part], part)
+        assert equal(first[part], second[part]), part
     lines = [[json.loads(line) for line in (run / METRICS_FILE).read_text().splitlines()] for run in runs]
     losses = [[(line["iteration"], line["Loss/kl"]) for line in log] for log in lines]
     assert losses[0] == losses[1] and [iteration for iteration, _ in losses[0]] == [1, 2, 3, 4, 5, 6]
 
 
-def assert_equal(one, other, where):
-    if isinstance(one, dict | list):
-        assert len(one) == len(other), where
-        for key in one if isinstance(one, dict) else range(len(one)):
-            assert_equal(one[key], other[key], f"{where}.{key}")
-    else:
-        assert torch.equal(one, other), where
-
-
 @pytest.fixture(scope="module")
 def one_node(tmp_path_factory):
+    """Folder of an uninterrupted run on one node."""
     return torchrun(tmp_path_factory.mktemp("one"), 1)
 
 
 def test_two_nodes_with_a_killed_process_agree_with_one_node(one_node, tmp_path):
     """A process is killed in the fifth iteration, after the second of three checkpoints."""
     run = torchrun(tmp_path, 2, f"0,1,{4 * STEPS + 5}", restarts=1)
-    assert [path.name for path in sorted((run / CHECKPOINTS).glob("*.pt"))] == [
-        f"iteration_00000{i}.pt" for i in (2, 4, 6)
-    ]
+    names = sorted(path.name for path in (run / CHECKPOINTS).glob("*.pt"))
+    assert names == [f"iteration_00000{i}.pt" for i in (2, 4, 6)]
     assert_same_training(run, one_node)
 
 

@@ -21,15 +21,18 @@ from toy_task import SMALL, PushTask, equal, free_port, push_cfg, train_rank, tr
 
 
 def make_env(num_envs, seed, device):
+    """Return the task with episodes of one iteration."""
     return PushTask(num_envs, seed, device, episode_length=SMALL.num_steps)
 
 
 @pytest.fixture
 def cfg(tmp_path):
+    """Settings of 4 iterations on 32 worlds; every second one is logged and saved."""
     return push_cfg(tmp_path / "logs")
 
 
 def final_state(result):
+    """Return the state in the last checkpoint of a `TrainResult`."""
     return load_checkpoint(result.folder / CHECKPOINTS / f"iteration_{result.iteration:06d}.pt")
 
 
@@ -44,10 +47,8 @@ def test_run_writes_config_metrics_and_checkpoints(cfg):
     assert [line["iteration"] for line in lines] == [2, 4]
     assert lines[-1]["Train/mean_length"] == 16.0
     assert {"Perf/fps", "Perf/collect_s", "Perf/update_s", "Loss/kl", "Metrics/success"} <= lines[0].keys()
-    assert json.loads((result.folder / CHECKPOINTS / MANIFEST).read_text()).keys() == {
-        "iteration_000002.pt",
-        "iteration_000004.pt",
-    }
+    manifest = json.loads((result.folder / CHECKPOINTS / MANIFEST).read_text())
+    assert manifest.keys() == {"iteration_000002.pt", "iteration_000004.pt"}
     assert json.loads(final_state(result)["config"]) == settings
 
 
@@ -63,7 +64,10 @@ def test_logged_iterations_are_printed(cfg, capsys):
 
 
 def resume_after(cfg, seconds, limit):
-    """Resume a checkpoint with `seconds` of training time (None: not saved) and a time limit; return run and result."""
+    """Resume a checkpoint of 2 iterations; return the `TrainingRun` and its result.
+
+    seconds: training time in the checkpoint [s], None: missing. limit: max_seconds [s].
+    """
     half = train(dataclasses.replace(cfg, max_iterations=2), make_env)
     state = final_state(half)
     assert 0.0 < state.pop("seconds") <= half.seconds
@@ -78,9 +82,8 @@ def test_resumed_run_continues_the_training_time(cfg):
     run, result = resume_after(cfg, 99.7, limit=100.0)
     assert result.iteration > 2 and result.seconds < 5.0
     assert final_state(result)["seconds"] >= result.metrics["Perf/elapsed_s"] >= 100.0
-    assert run.ppo._desired_kl.item() == pytest.approx(
-        cfg.ppo.final_desired_kl, rel=0.05
-    )  # desired_kl without the earlier time
+    final_kl = cfg.ppo.final_desired_kl  # progress counts the saved time, and is near 1
+    assert run.ppo._desired_kl.item() == pytest.approx(final_kl, rel=0.05)
 
 
 def test_resumed_run_past_its_time_limit_ends_immediately(cfg):
@@ -141,7 +144,7 @@ def test_resume_latest_raises_without_a_run(cfg):
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signal_finishes_the_iteration_saves_and_prints_the_resume_command(cfg, number, capsys):
-    class Signalled(PushTask):
+    class SignallingTask(PushTask):  # sends the signal to this process
         def step(self, action):
             super().step(action)
             if self.steps == 40:  # in the third iteration of 16 steps
@@ -149,7 +152,7 @@ def test_signal_finishes_the_iteration_saves_and_prints_the_resume_command(cfg, 
 
     before = signal.getsignal(number)
     with pytest.raises(SystemExit) as caught:
-        train(dataclasses.replace(cfg, max_iterations=100), lambda n, seed, device: Signalled(n, seed, device))
+        train(dataclasses.replace(cfg, max_iterations=100), SignallingTask)
     assert caught.value.code == 130
     assert signal.getsignal(number) is before
     (path,) = cfg.log_root.glob("push/*/checkpoints/iteration_000003.pt")
@@ -159,13 +162,13 @@ def test_signal_finishes_the_iteration_saves_and_prints_the_resume_command(cfg, 
 
 
 def test_second_interrupt_raises_immediately(cfg):
-    class Signalled(PushTask):
+    class InterruptingTask(PushTask):  # sends Ctrl-C to this process at every step
         def step(self, action):
             super().step(action)
             os.kill(os.getpid(), signal.SIGINT)
 
     with pytest.raises(KeyboardInterrupt):
-        train(cfg, lambda n, seed, device: Signalled(n, seed, device))
+        train(cfg, InterruptingTask)
 
 
 def test_time_limit_ends_the_training_with_a_checkpoint(cfg):
@@ -177,14 +180,14 @@ def test_time_limit_ends_the_training_with_a_checkpoint(cfg):
 
 
 def test_failed_save_is_reported_and_training_continues(cfg, capsys):
-    class Blocking(PushTask):
+    class BlockingTask(PushTask):  # its metrics are read before each checkpoint
         def metrics(self):
             for folder in cfg.log_root.glob("push/*"):
                 (folder / CHECKPOINTS).touch()  # a file where the folder should go
             return super().metrics()
 
     with pytest.raises(CheckpointError, match="not saved"):
-        train(cfg, lambda n, seed, device: Blocking(n, seed, device))
+        train(cfg, BlockingTask)
     assert "will try again" in capsys.readouterr().err
     (metrics,) = cfg.log_root.glob(f"push/*/{METRICS_FILE}")
     assert len(metrics.read_text().splitlines()) == 2
@@ -241,6 +244,7 @@ def test_refuses_settings_out_of_range(change, message):
 
 
 def must_not_be_built(num_envs, seed, device):
+    """Fail the test in place of making an environment."""
     pytest.fail("the environment was built")
 
 
@@ -257,13 +261,13 @@ def test_refuses_indivisible_batches_before_the_env_is_built(cfg, change, messag
 
 
 def test_refuses_an_unknown_best_metric_before_the_first_iteration(cfg):
-    class Unmoved(PushTask):
+    class UnsteppedTask(PushTask):
         def step(self, action):
             pytest.fail("an iteration began")
 
     message = r"best_metric must name a logged metric, such as Metrics/success, Train/mean_length, .*, got 'nonsense'"
     with pytest.raises(ValueError, match=message):
-        train(dataclasses.replace(cfg, best_metric="nonsense"), Unmoved)
+        train(dataclasses.replace(cfg, best_metric="nonsense"), UnsteppedTask)
     assert not cfg.log_root.exists()
 
 
@@ -290,7 +294,7 @@ def test_refuses_a_missing_device(cfg, monkeypatch):
 
 
 def test_rsl_rl_adapter_returns_copies():
-    env = PushTask(3, episode_length=2)  # ended by time in the second step, not in the first
+    env = PushTask(3, episode_length=2)  # timeout in the second step, not in the first
     env.reset()
     adapter = RslRlVecEnv(env, metrics_every=2)
     first = adapter.get_observations()
@@ -303,7 +307,7 @@ def test_rsl_rl_adapter_returns_copies():
 
 
 @pytest.mark.parametrize(("asymmetric_critic", "column"), [(True, 2), (False, 0)])
-def test_rsl_rl_critic_gets_its_own_observation(asymmetric_critic, column):
+def test_rsl_rl_critic_gets_its_own_observation_if_asymmetric(asymmetric_critic, column):
     env = PushTask(4, episode_length=50)
     env.reset()
     adapter = RslRlVecEnv(env, metrics_every=4)
@@ -329,7 +333,7 @@ def test_rsl_rl_adapter_counts_steps_and_logs_metrics_once_per_iteration():
         logs.append("log" in extras)
         lengths.append(adapter.episode_length_buf[0].item())
     assert logs == [False, True, False, True]
-    assert lengths == [1, 2, 0, 1]
+    assert lengths == [1, 2, 0, 1]  # an episode has 3 steps
     adapter.episode_length_buf = torch.tensor([5, 6, 7])
     assert adapter.episode_length_buf.tolist() == [5, 6, 7]
     adapter.reset()
@@ -353,4 +357,4 @@ def test_rsl_rl_learns_to_push_the_mass_to_the_origin():
     with torch.inference_mode():
         for _ in range(40):
             env.step(actor(TensorDict({"actor": env.obs}, batch_size=[128])))
-    assert env.obs[:, 0].abs().max() < 0.3
+    assert env.obs[:, 0].abs().max() < 0.3  # distance from the origin

@@ -11,17 +11,18 @@ from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from toy_task import PushTask, push_cfg
 
-NUMBERS = {"Perf/fps": 1234.0, "Metrics/success": 0.5}
+METRICS = {"Perf/fps": 1234.0, "Metrics/success": 0.5}  # steps per second, fraction
 
 
 @pytest.fixture
 def cfg(tmp_path):
+    """Settings of 6 iterations of 16 steps, all logged; every second one is saved."""
     return push_cfg(tmp_path / "logs", max_iterations=6, log_interval=1)
 
 
 @contextlib.contextmanager
 def full_disk(size=0):
-    """Limit every file of this process to `size` bytes: writes fail partway, as on a full disk."""
+    """Context in which this process cannot write files beyond `size` bytes: writes fail partway."""
     soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
     resource.setrlimit(resource.RLIMIT_FSIZE, (size, hard))
     try:
@@ -31,10 +32,12 @@ def full_disk(size=0):
 
 
 def iterations(path):
+    """Return the iteration of each line of a metrics file."""
     return [json.loads(line)["iteration"] for line in path.read_text().splitlines()]
 
 
-def steps(folder):
+def event_steps(folder):
+    """Return the iteration of each TensorBoard event of Loss/value."""
     events = EventAccumulator(str(folder))
     events.Reload()
     return [event.step for event in events.Scalars("Loss/value")]
@@ -53,71 +56,70 @@ def test_metrics_refused_by_a_full_disk_are_appended_later_in_order(tmp_path):
     assert iterations(path) == [1, 2, 3, 4]
 
 
-class Filling(PushTask):
-    """The disk is full while the metrics of the second and third iteration are logged."""
+class DiskFillingTask(PushTask):
+    """Task that makes the disk full while the metrics of the second and third iteration are logged."""
 
-    stack: contextlib.ExitStack
+    stack: contextlib.ExitStack  # holds `full_disk` while it applies
 
     def metrics(self):
+        """Return the metrics; at the end of the second iteration the disk becomes full."""
         if self.steps == 2 * 16:
             self.stack.enter_context(full_disk())
         return super().metrics()
 
     def step(self, action):
+        """Step the task; in the fourth iteration the disk has room again."""
         super().step(action)
         if self.steps == 3 * 16 + 1:
             self.stack.close()
 
 
-@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # of the thread of SummaryWriter
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # in SummaryWriter's thread
 @pytest.mark.parametrize("tensorboard", [False, True])
 def test_temporarily_full_disk_loses_no_metrics_and_warns_once(cfg, capsys, tensorboard):
     cfg = dataclasses.replace(cfg, tensorboard=tensorboard)
-    with contextlib.ExitStack() as Filling.stack:
-        result = train(cfg, Filling)
+    with contextlib.ExitStack() as DiskFillingTask.stack:
+        result = train(cfg, DiskFillingTask)
     assert iterations(result.folder / METRICS_FILE) == [1, 2, 3, 4, 5, 6]
     assert (result.folder / CHECKPOINTS / "iteration_000006.pt").exists()
     stderr = capsys.readouterr().err.splitlines()
     assert ["training continues" in line for line in stderr].count(True) == 1
     assert ["no TensorBoard events" in line for line in stderr].count(True) == int(tensorboard)
     if tensorboard:
-        assert steps(result.folder) == [1]
+        assert event_steps(result.folder) == [1]
 
 
 def test_non_finite_reward_term_is_reported_and_logged_as_null(tmp_path, capsys):
-    metrics = NUMBERS | {
-        "Episode_Reward/tilt": float("nan"),
-        "hop/Episode_Reward/fall": float("inf"),
-        "Loss/value": 1.0,
-    }
+    terms = {"Episode_Reward/tilt": float("nan"), "hop/Episode_Reward/fall": float("inf")}
+    metrics = METRICS | terms | {"Loss/value": 1.0}
     with TrainingLog(tmp_path, {}, 10, tensorboard=False) as log:
-        log.log(1, NUMBERS | {"Episode_Reward/tilt": 0.5}, 5.0)
+        log.log(1, METRICS | {"Episode_Reward/tilt": 0.5}, remaining=5.0)
         assert "reward term" not in capsys.readouterr().err
         for iteration in (2, 3):
-            log.log(iteration, metrics, 5.0)
+            log.log(iteration, metrics, remaining=5.0)
             stderr = capsys.readouterr().err
             assert "reward term tilt was not finite in some steps, where it counts as 0" in stderr
             assert "reward term hop/fall was not finite" in stderr and stderr.count("reward term") == 2
 
-    def refuse(text):
-        raise AssertionError(text)
+    def fail(constant):
+        raise AssertionError(constant)  # NaN or Infinity in the file
 
-    saved = [json.loads(line, parse_constant=refuse) for line in (tmp_path / METRICS_FILE).read_text().splitlines()]
+    saved = [json.loads(line, parse_constant=fail) for line in (tmp_path / METRICS_FILE).read_text().splitlines()]
     assert [line["iteration"] for line in saved] == [1, 2, 3]
     assert saved[1]["Episode_Reward/tilt"] is None and saved[1]["Loss/value"] == 1.0
 
 
 def test_broken_pipe_does_not_stop_logging(tmp_path, monkeypatch):
-    class Gone:
+    class BrokenPipe:
         def write(self, _):
             raise BrokenPipeError(32, "Broken pipe")
 
         flush = fileno = isatty = lambda self: 0
 
     with TrainingLog(tmp_path, {}, 10, tensorboard=False) as log:
-        log._console.file = Gone()
+        log._console.file = BrokenPipe()
         for iteration in (1, 2):
-            log.log(iteration, NUMBERS, 5.0)
+            log.log(iteration, METRICS, remaining=5.0)
     assert iterations(tmp_path / METRICS_FILE) == [1, 2]
 
 
@@ -139,9 +141,9 @@ def test_resumed_run_drops_partial_lines_and_later_iterations(cfg, capsys):
     ("content", "kept"),
     [
         (b'{"iteration": 1}\n{"iterat', [1]),
-        (b'{"iteration": 1}\n{"iteration": 2}', [1, 2]),  # whole but for the end of the line
+        (b'{"iteration": 1}\n{"iteration": 2}', [1, 2]),  # only the line break is missing
         (b'{"iteration": 1}\n{"iter{"iteration": 2}\n{"iteration": 2}\n', [1, 2]),
-        (b'{"iteration": 1}\n{"iteration": 3}\n{"iteration": 2}\n', [1, 2]),
+        (b'{"iteration": 1}\n{"iteration": 3}\n{"iteration": 2}\n', [1, 2]),  # 3 is after the resumed iteration 2
         (b'{"iteration": null}\n[1]\n7\n\xff\xfe\n\n', []),
         (b"", []),
     ],
@@ -157,7 +159,7 @@ def test_resume_hides_tensorboard_events_of_later_iterations(cfg):
     cfg = dataclasses.replace(cfg, tensorboard=True)
     half = train(dataclasses.replace(cfg, max_iterations=4), PushTask)
     train(dataclasses.replace(cfg, resume=str(half.folder / CHECKPOINTS / "iteration_000002.pt")), PushTask)
-    assert steps(half.folder) == [1, 2, 3, 4, 5, 6]
+    assert event_steps(half.folder) == [1, 2, 3, 4, 5, 6]
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,10 @@ WORLDS = 16
 
 
 def reference_losses(model, part, old_log_std, cfg):
-    """Return surrogate, value loss, entropy, asymmetry and KL divergence of a minibatch by torch.distributions."""
+    """Return surrogate, value loss, entropy, asymmetry and KL divergence, each (), by torch.distributions.
+
+    part: a minibatch, (samples, ...) by the fields of `Batch`. old_log_std: (num_actions,) of the policy that acted.
+    """
     output, image = model.actor(part["features"]), -model.actor(-part["features"])  # the task's mirror map is -x
     mean = 0.5 * (output + image) if cfg.symmetry == "actor" else output
     asymmetry = torch.nn.functional.mse_loss(output, image) if cfg.symmetry != "off" else torch.zeros(())
@@ -38,7 +41,10 @@ def reference_losses(model, part, old_log_std, cfg):
 
 
 def reference_update(model, batch, old_log_std, orders, cfg):
-    """Run clipped Adam steps for all minibatches in `orders`; return the optimiser and the losses of each minibatch."""
+    """Run Adam steps with clipped gradients for all minibatches; return the optimiser and each minibatch's losses.
+
+    orders: (epochs, batch_size) indices of samples. Losses: `reference_losses`, then gradient norms of actor, critic.
+    """
     actor, critic = [*model.actor.parameters(), model.log_std], list(model.critic.parameters())
     optimiser = torch.optim.Adam([*actor, *critic], lr=cfg.lr)
     history = []
@@ -61,7 +67,7 @@ def reference_update(model, batch, old_log_std, orders, cfg):
 
 
 def updated_ppo(cfg, device="cpu"):
-    """Return PPO after one update on synthetic samples, the model before it, the samples and their orders."""
+    """Return PPO after an update on synthetic samples, the model before, the samples, their orders per epoch."""
     torch.manual_seed(0)
     ppo = Ppo(PushTask(WORLDS, device=device), cfg)
     fill(ppo, slice(None), WORLDS)
@@ -75,8 +81,8 @@ def updated_ppo(cfg, device="cpu"):
     return ppo, before, batch, ppo._orders.clone()
 
 
-@pytest.mark.parametrize("rows", [1, 7, None])
-def test_packed_rows_do_not_depend_on_the_chunk_size(rows):
+@pytest.mark.parametrize("chunk_size", [1, 7, None])
+def test_packed_rows_do_not_depend_on_the_chunk_size(chunk_size):
     torch.manual_seed(0)
     ppo = Ppo(PushTask(WORLDS), CFG)
     fill(ppo, slice(None), WORLDS)
@@ -85,7 +91,7 @@ def test_packed_rows_do_not_depend_on_the_chunk_size(rows):
     at_once = ppo.packer.rows.clone()
     ppo.model.load_state_dict(fresh)
     ppo.packer.rows.zero_()
-    ppo.packer._chunk_size = rows
+    ppo.packer._chunk_size = chunk_size
     ppo.batch()
     torch.testing.assert_close(ppo.packer.rows, at_once, atol=1e-5, rtol=1e-5)
     assert at_once.abs().max() > 0.5
@@ -93,14 +99,7 @@ def test_packed_rows_do_not_depend_on_the_chunk_size(rows):
 
 @pytest.mark.parametrize(
     "change",
-    [
-        {},
-        {"clip_value": False},
-        {"activation": "relu"},
-        {"activation": "tanh"},
-        {"clip": 0.02},
-        {"symmetry": "actor"},
-    ],
+    [{}, {"clip_value": False}, {"activation": "relu"}, {"activation": "tanh"}, {"clip": 0.02}, {"symmetry": "actor"}],
 )
 def test_update_agrees_with_autograd_and_adam(change):
     cfg = dataclasses.replace(CFG, **change)
@@ -115,7 +114,7 @@ def test_update_agrees_with_autograd_and_adam(change):
     for name, mean in zip(names, means, strict=True):
         assert metrics[f"Loss/{name}"] == pytest.approx(mean, rel=1e-3, abs=1e-5), name
     assert metrics["Loss/learning_rate"] == pytest.approx(optimiser.param_groups[0]["lr"])
-    assert max(row[5] for row in history) > cfg.max_grad_norm  # some were clipped
+    assert max(row[5] for row in history) > cfg.max_grad_norm  # some gradients of the actor were clipped
     their_state = optimiser.state_dict()["state"]
     for index, state in ppo.optimiser.state_dict().items():
         for name in ("step", "exp_avg", "exp_avg_sq"):
@@ -126,26 +125,24 @@ def test_samples_agree_with_a_loop_over_time():
     ppo, model, batch, _ = updated_ppo(CFG)
     rollout, cfg = ppo.rollout, CFG
 
-    def value_of(critic_obs):
-        return model.value(critic_obs).detach()
-
-    values, following, advantages = value_of(rollout.critic_obs), torch.zeros(WORLDS), []
+    with torch.no_grad():
+        values, final_values = model.value(rollout.critic_obs), model.value(rollout.final_critic_obs)
+    next_advantage, advantages = torch.zeros(WORLDS), []
     for step in reversed(range(cfg.num_steps)):
         alive = 1 - rollout.done[step]
-        reward = rollout.reward[step] + cfg.gamma * rollout.timeout[step] * value_of(rollout.final_critic_obs[step])
+        reward = rollout.reward[step] + cfg.gamma * rollout.timeout[step] * final_values[step]
         delta = reward + cfg.gamma * alive * values[step + 1] - values[step]
-        following = delta + cfg.gamma * cfg.lam * alive * following
-        advantages.insert(0, following)
+        next_advantage = delta + cfg.gamma * cfg.lam * alive * next_advantage
+        advantages.insert(0, next_advantage)
     advantage = torch.stack(advantages).flatten()
     close = {"atol": 1e-5, "rtol": 1e-4}
     torch.testing.assert_close(batch["advantage"], (advantage - advantage.mean()) / advantage.std(), **close)
     returns = advantage + values[:-1].flatten()
     torch.testing.assert_close(ppo.model.value_moments.scaling().denormalise(batch["target"]), returns, **close)
     torch.testing.assert_close(batch["features"], model.features(rollout.obs[:-1]).flatten(0, 1), **close)
-    torch.testing.assert_close(
-        batch["critic_features"], model.critic_features(rollout.critic_obs[:-1]).flatten(0, 1), **close
-    )
-    head = model.value_head(model.critic_features(rollout.critic_obs[:-1])).flatten().detach()
+    critic_features = model.critic_features(rollout.critic_obs[:-1])
+    torch.testing.assert_close(batch["critic_features"], critic_features.flatten(0, 1), **close)
+    head = model.value_head(critic_features).flatten().detach()
     torch.testing.assert_close(batch["value"], head, **close)
     log_prob = gaussian_log_prob(rollout.action, rollout.mean, rollout.log_std).flatten()
     torch.testing.assert_close(batch["log_prob"], log_prob, **close)
@@ -164,13 +161,13 @@ def test_flat_adam_agrees_with_torch_over_many_steps():
         adam_step(ours.vectors)
         optimiser.step()
         if step in (0, 10, 1999):
-            for mine, param in zip(flat.params, theirs, strict=False):
-                torch.testing.assert_close(mine.data, param.data, atol=2e-6 * (step + 1) ** 0.5, rtol=1e-5)
-    gaps = torch.ones_like(flat.value)
+            for our_param, param in zip(flat.params, theirs, strict=False):
+                torch.testing.assert_close(our_param.data, param.data, atol=2e-6 * (step + 1) ** 0.5, rtol=1e-5)
+    padding = torch.ones_like(flat.value)
     for segment in flat.segments:
-        segment.view(gaps).zero_()
-    assert gaps.sum() > 100.0
-    assert not (gaps * flat.value).any()
+        segment.view(padding).zero_()
+    assert padding.sum() > 100.0
+    assert not (padding * flat.value).any()  # stays zero
 
 
 def test_forward_and_backward_agree_with_autograd_in_float32_and_bfloat16():
@@ -185,9 +182,9 @@ def test_forward_and_backward_agree_with_autograd_in_float32_and_bfloat16():
         assert [each.dtype for each in layer_inputs] == [dtype, dtype, torch.float32]
         scale = model.actor(x).detach().abs().max()
         assert (output - model.actor(x)).abs().max() < tolerance * scale
-        for gradient, right in zip(layers.backward(layer_inputs, grad, dtype), expected, strict=True):
+        for gradient, reference in zip(layers.backward(layer_inputs, grad, dtype), expected, strict=True):
             assert gradient.dtype == torch.float32
-            assert (gradient - right).norm() < tolerance * right.norm()
+            assert (gradient - reference).norm() < tolerance * reference.norm()
 
 
 def test_bfloat16_starts_from_a_ratio_of_one_and_learns():
@@ -197,7 +194,7 @@ def test_bfloat16_starts_from_a_ratio_of_one_and_learns():
     ppo.env.reset()
     ppo.collect()
     ppo.update()
-    assert abs(ppo.statistics()["Loss/kl"]) < 1e-6
+    assert abs(ppo.statistics()["Loss/kl"]) < 1e-6  # the first minibatch has the weights that acted
     for _ in range(30):
         ppo.collect()
         ppo.update()
@@ -226,6 +223,7 @@ def test_compiled_minibatch_agrees_with_eager():
 
 def test_failed_compilation_runs_eagerly_and_warns_once(capsys, monkeypatch):
     def trained(mode):
+        """Return the parameters after one iteration with `PpoCfg.compile` set to mode."""
         torch.manual_seed(0)
         ppo = Ppo(PushTask(WORLDS), dataclasses.replace(CFG, compile=mode))
         ppo.env.reset()
@@ -243,4 +241,5 @@ def test_failed_compilation_runs_eagerly_and_warns_once(capsys, monkeypatch):
 
 
 def broken_backend(graph, inputs):
+    """Backend of torch.compile without a compiler."""
     raise OSError("no compiler here")

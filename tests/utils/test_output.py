@@ -16,7 +16,7 @@ def test_default_output_folder_is_name_and_time(tmp_path, monkeypatch):
     folder = output.output_dir("jump")
     assert folder.is_dir()
     assert folder.parent.as_posix() == "outputs/jump"
-    assert [len(part) for part in folder.name.split("_")] == [len("2026-01-31"), len("23-59-59")]
+    assert [len(part) for part in folder.name.split("_")] == [len("2026-01-31"), len("23-59-59")]  # date_time
 
 
 def test_two_runs_never_share_a_default_folder(tmp_path, monkeypatch):
@@ -36,14 +36,7 @@ def test_refuses_a_name_that_is_not_one_path_component(name):
 
 
 def test_metrics_file_holds_the_given_metrics(tmp_path):
-    metrics = {
-        "apex [m]": 1.075,
-        "worlds": 4096,
-        "method": "open loop",
-        "passed": True,
-        "gap": None,
-        "torques": [18.0, 1],
-    }
+    metrics = {"apex [m]": 1.075, "worlds": 4096, "method": "open loop", "passed": True, "gap": None, "list": [18.0, 1]}
     path = output.write_metrics(tmp_path, metrics)
     assert path == tmp_path / "metrics.json"
     assert json.loads(path.read_text(encoding="utf-8")) == metrics
@@ -55,10 +48,10 @@ def test_numpy_scalars_are_written_as_numbers(tmp_path):
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, np.float32("nan")])
-@pytest.mark.parametrize(("shape", "name"), [(lambda x: x, "'apex'"), (lambda x: [0.0, x], r"'apex\[1\]'")])
-def test_refuses_a_non_finite_metric_by_name_and_writes_nothing(tmp_path, bad, shape, name):
+@pytest.mark.parametrize(("as_metric", "name"), [(lambda x: x, "'apex'"), (lambda x: [0.0, x], r"'apex\[1\]'")])
+def test_refuses_a_non_finite_metric_by_name_and_writes_nothing(tmp_path, bad, as_metric, name):
     with pytest.raises(ValueError, match=name):
-        output.write_metrics(tmp_path, {"fine": 1.0, "apex": shape(bad)})
+        output.write_metrics(tmp_path, {"fine": 1.0, "apex": as_metric(bad)})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -95,6 +88,7 @@ def test_run_json_has_versions_and_command_but_no_environment_variables(tmp_path
 
 
 def _git(folder, *arguments):
+    """Run git in a folder with a made-up author; return its output."""
     identity = ["-c", "user.name=A", "-c", "user.email=a@example.org", "-c", "commit.gpgsign=false"]
     done = subprocess.run(["git", *identity, *arguments], cwd=folder, check=True, capture_output=True, text=True)
     return done.stdout.strip()
@@ -135,7 +129,7 @@ def test_device_report_is_one_line():
     info = runtime.report_device("cpu", console)
     lines = console.export_text().splitlines()
     assert len(lines) == 1
-    assert info == ("cpu", info.name, None, False, True)
+    assert info == ("cpu", info.name, None, False, True)  # alias, name, driver, mempool, graphs
     assert lines[0].startswith("device cpu") and "no CUDA device" in lines[0] and "graph capture on" in lines[0]
 
 

@@ -10,11 +10,8 @@ from jumper_warp.utils.sources import changed_sources, source_checksums
 
 
 def test_source_checksums_cover_only_modules_outside_the_project():
-    saved = {
-        "task": [{"func": "json.decoder:JSONDecoder"}, "jumper_warp.kernels.jump.rewards:base_at_rest"],
-        "say": "now: nothing",
-        "n": 1,
-    }
+    functions = [{"func": "json.decoder:JSONDecoder"}, "jumper_warp.kernels.jump.rewards:base_at_rest"]
+    saved = {"task": functions, "text": "no module: nothing", "number": 1}
     checksum = hashlib.sha256(Path(json.decoder.__file__).read_bytes()).hexdigest()
     assert source_checksums(saved) == {"json.decoder": checksum}
     assert source_checksums(["sys:path", "no.such.module:thing", None, 2.0]) == {}
