@@ -17,7 +17,7 @@ def make_vector_env(
 ) -> GymVectorEnv:
     """Return a vector of environments; arguments: of `Env`; others: of `GymVectorEnv`.
 
-    Raises ValueError: an unknown task, or as these.
+    Raises InputError: an unknown task, or as these.
     """
     return GymVectorEnv(Env(make_task(task), num_envs, **arguments), all_groups=all_groups, tensors=tensors)
 

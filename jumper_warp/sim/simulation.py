@@ -148,7 +148,7 @@ class Simulation:
     def set_targets(self, angles: np.ndarray | torch.Tensor | Sequence) -> None:
         """Write raw motor targets [rad], (12, num_worlds), or (12,) for all worlds, to `target`.
 
-        Raises ValueError: another shape, or not finite.
+        Raises InputError: another shape, or not finite.
         """
         given: Any = angles
         values = np.asarray(given.detach().cpu() if hasattr(given, "detach") else given, dtype=np.float32)
@@ -169,7 +169,7 @@ class Simulation:
         Changes of the model stay. A captured graph may contain the call with a mask on the device, which is read at
         every replay.
 
-        mask: Which worlds, bool of shape (num_worlds,), by default all. Raises ValueError for anything else.
+        mask: Which worlds, bool of shape (num_worlds,), by default all. Raises InputError for anything else.
         """
         self._take_mask(mask)
         self.physics.forget(self._mask)
@@ -179,7 +179,7 @@ class Simulation:
         self._launch(restore_motors_kernel, self.num_worlds, [self._mask, self._standing], results)
 
     def _take_mask(self, mask: Sequence[bool] | np.ndarray | torch.Tensor | wp.array | None) -> None:
-        """Copy a mask of worlds to the device. Raises ValueError."""
+        """Copy a mask of worlds to the device. Raises InputError."""
         if mask is None:
             self._mask.fill_(True)
             return

@@ -40,7 +40,7 @@ DIFFERENTIABLE_TOLERANCE = 1.0e-6
 
 
 def check_step(dt: float, substeps: int = 1) -> None:
-    """Raise ValueError unless dt [s] is finite and above 0 and substeps a whole number of at least 1."""
+    """Raise InputError unless dt [s] is finite and above 0 and substeps a whole number of at least 1."""
     if not 0.0 < dt < math.inf:
         raise InputError(f"dt must be finite and above 0 [s], got {dt!r}")
     if not isinstance(substeps, Integral) or substeps < 1:
@@ -48,7 +48,7 @@ def check_step(dt: float, substeps: int = 1) -> None:
 
 
 def check_tolerance(tolerance: float) -> None:
-    """Raise ValueError unless the tolerance [m/s] of a contact iteration is finite and above 0."""
+    """Raise InputError unless the tolerance [m/s] of a contact iteration is finite and above 0."""
     if not 0.0 < tolerance < math.inf:
         raise InputError(f"tolerance must be finite and above 0 [m/s], got {tolerance!r}")
 
@@ -157,7 +157,7 @@ class SolverJumper(SolverBase):
     ) -> None:
         """Advance every world by dt [s]. `contacts` is not used: the solver finds the paws' contacts itself.
 
-        Raises ValueError for a dt that is not finite and positive.
+        Raises InputError for a dt that is not finite and positive.
         """
         self.validate_observables(observables, contacts)
         drive = self.dynamics.drive(*self._forces(state_in, control))
@@ -187,7 +187,7 @@ class SolverJumper(SolverBase):
         joints, loop joints and bodies, which the solver itself does not need. observables: of the whole call. worlds:
         which are advanced, by default all. `state_out` may be `state_in`.
 
-        Raises ValueError: dt is not finite and positive, or substeps no whole number of at least 1.
+        Raises InputError: dt is not finite and positive, or substeps no whole number of at least 1.
         """
         self.validate_observables(observables)
         drive = self.dynamics.drive(*self._forces(state_in, control), motors, target, previous, delay)
@@ -236,17 +236,17 @@ class SolverJumper(SolverBase):
             )
 
     def block_position(self) -> np.ndarray:
-        """Return the centres of the blocks [m], world frame, (num_worlds, 2). Raises ValueError without blocks."""
+        """Return the centres of the blocks [m], world frame, (num_worlds, 2). Raises InputError without blocks."""
         return self._block_values()["center"].copy()
 
     def block_velocity(self) -> np.ndarray:
-        """Return the velocities of the blocks [m/s], world frame, (num_worlds, 2). Raises ValueError without blocks."""
+        """Return the velocities of the blocks [m/s], world frame, (num_worlds, 2). Raises InputError without blocks."""
         return self._block_values()["velocity"].copy()
 
     def place_blocks(self, center: np.ndarray, worlds: Sequence[int] | None = None) -> None:
         """Place the blocks of some worlds, by default all, at rest at new starts [m], world frame, (2,) or (worlds, 2).
 
-        Raises ValueError without blocks.
+        Raises InputError without blocks.
         """
         values = self._block_values()
         values["start"][slice(None) if worlds is None else list(worlds)] = center
@@ -256,7 +256,7 @@ class SolverJumper(SolverBase):
     def reset_blocks(self, worlds: Sequence[int] | wp.array | None = None) -> None:
         """Reset the blocks of some worlds, by default all, to their starts, at rest.
 
-        `worlds`: indices, or a mask on the device, bool of shape (num_worlds,). Raises ValueError without blocks.
+        `worlds`: indices, or a mask on the device, bool of shape (num_worlds,). Raises InputError without blocks.
         """
         n, device = self._blocks().shape[0], self.model.device
         mask = worlds
@@ -267,11 +267,11 @@ class SolverJumper(SolverBase):
         wp.launch(rest_blocks_kernel, dim=n, inputs=[mask, self.dynamics.robot.ground], device=device)
 
     def _block_values(self) -> Any:
-        """Return the blocks as a structured array of NumPy. Raises ValueError without blocks."""
+        """Return the blocks as a structured array of NumPy. Raises InputError without blocks."""
         return self._blocks().numpy()
 
     def _blocks(self) -> wp.array:
-        """Return the kernels' `Block` of every world. Raises ValueError without blocks."""
+        """Return the kernels' `Block` of every world. Raises InputError without blocks."""
         blocks = self.dynamics.robot.ground.blocks
         if blocks.shape[0] == 0:
             raise InputError("the solver was made without a block")

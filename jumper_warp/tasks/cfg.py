@@ -57,7 +57,7 @@ class Command:
     """(robot, scene: Scene, state, level, rng: RngStream) -> state with a new command."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: one of resample_due and resample is missing."""
+        """Raise InputError: one of resample_due and resample is missing."""
         if (self.resample_due is None) != (self.resample is None):
             raise InputError("a command needs both resample_due and resample, or neither")
 
@@ -117,7 +117,7 @@ class TaskCfg:
     """Names of the observation groups."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: two terms share a name, one is for another task's state, or a setting is out of range."""
+        """Raise InputError: two terms share a name, one is for another task's state, or a setting is out of range."""
         for section in ("rewards", "terminations", "observations.actor", "observations.critic", "events"):
             names = [term.name for term in operator.attrgetter(section)(self)]
             if len(set(names)) < len(names):
@@ -149,7 +149,7 @@ class TaskCfg:
         return replace(self, self_collision_margin=0.0, obstacle_margin=0.0)
 
     def _check_functions(self) -> None:
-        """Raises ValueError: a function outside the tables takes other structs than those of this task."""
+        """Raise InputError: a function outside the tables takes other structs than those of this task."""
         if len({level.struct for level in self.levels}) > 1:
             raise InputError(f"{self.name}: all levels must be of one kind")
         state, level = self.state, self.level_type
@@ -205,7 +205,7 @@ class TaskCfg:
     def with_terms(self, section: str, **changes: dict[str, Any]) -> TaskCfg:
         """Return the task with other numbers or options in terms of a section, by name.
 
-        Raises ValueError for an unknown term or number.
+        Raises InputError for an unknown term or number.
         """
         terms: tuple[Term, ...] = getattr(self, section)
         unknown = set(changes) - {term.name for term in terms}

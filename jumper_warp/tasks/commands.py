@@ -74,7 +74,7 @@ def layout_of(task: TaskCfg) -> CommandLayout:
 
 
 def check_commands(commands: np.ndarray, task: TaskCfg, num_envs: int, worlds: np.ndarray) -> None:
-    """Raise ValueError unless commands are one row a world, or one for all, that the task's command takes.
+    """Raise InputError unless commands are one row a world, or one for all, that the task's command takes.
 
     worlds: (num_envs,) bool, for which the numbers have to be within their bounds.
     """

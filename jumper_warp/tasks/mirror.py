@@ -60,7 +60,7 @@ _SWAPPED: dict[Any, tuple[int, ...]] = {
 def mirror_of(task: TaskCfg, group: str) -> Mirror:
     """Return the mirror image of an observation group's rows.
 
-    Raises ValueError: a term is of none of these.
+    Raises InputError: a term is of none of these.
     """
     order: list[int] = []
     signs: list[int] = []

@@ -95,7 +95,7 @@ class RandomizationCfg:
     """When all but the pushes is sampled: once, or at every reset of a world."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a range falls, is not finite, or reaches what no robot can have."""
+        """Raise InputError: a range falls, is not finite, or reaches what no robot can have."""
         for name, value in vars(self).items():
             if not isinstance(value, tuple):
                 continue
@@ -150,7 +150,7 @@ class RandomizationCfg:
     ) -> RandomizationCfg:
         """Return the same with rows of one value: latency [ms], scales of kp and kd [1], friction of the paws [1].
 
-        Raises ValueError: a value out of range.
+        Raises InputError: a value out of range.
         """
         kp, kd = gains or (None, None)
         rows = {"latency": latency, "gains": kp, "damping_gains": kd, "dynamic_friction": friction,

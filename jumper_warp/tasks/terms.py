@@ -44,7 +44,7 @@ class Term:
         """func: with the signature that the class names. name: for logs and flags (default: the function's).
 
         given: numbers and options by name.
-        Raises ValueError: a number is missing, unknown or not finite, or the function is not one for such a term.
+        Raises InputError: a number is missing, unknown or not finite, or the function is not one for such a term.
         """
         kind = type(self).__name__
         if not isinstance(func, wp.Function):
@@ -77,7 +77,7 @@ class Term:
         self.num_params = len(params)
 
     def _check_types(self, where: str) -> None:
-        """Raise ValueError unless the function takes and returns what such a term's does."""
+        """Raise InputError unless the function takes and returns what such a term's does."""
         first = next(iter(self.func.input_types.values()), None)
         if first is not Any and first not in self.takes:
             takes = " or ".join(kind.key for kind in self.takes)

@@ -27,7 +27,7 @@ class TurnCfg:
     """What the kernels read."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a range or a probability is not one."""
+        """Raise InputError: a range or a probability is not one."""
         if not 0.0 <= self.angle[0] <= self.angle[1] <= 180.0:
             raise InputError(f"turn angle must be (lower, upper) within 0 to 180 degrees, got {self.angle}")
         check_probabilities("turn", self, "body_axis_probability")
@@ -58,7 +58,7 @@ class AttitudeResetCfg:
     """What the kernels read."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a pair is reversed, a number not finite or out of range."""
+        """Raise InputError: a pair is reversed, a number not finite or out of range."""
         check_ranges("reset", self, not_negative=("spin",))
         check_positive("reset episode", *self.episode)
         check_positive("reset height", self.height)

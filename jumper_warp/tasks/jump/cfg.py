@@ -44,7 +44,7 @@ class GroundCfg:
     """[1] Of block and floor."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: shares or lengths out of range, or a pair that is reversed, not positive or not finite."""
+        """Raise InputError: shares or lengths out of range, or a pair that is reversed, not positive or not finite."""
         if not (min(self.platform, self.block) >= 0.0 and self.platform + self.block <= 1.0):
             raise InputError(f"ground shares must be >= 0 and add up to at most 1, got {self.platform}, {self.block}")
         for name, value in vars(self).items():
@@ -83,7 +83,7 @@ class Level:
     """What the kernels read."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a range is not one."""
+        """Raise InputError: a range is not one."""
         pairs = [*zip(self.goal_lower, self.goal_upper, strict=True), self.base_height]
         if not all(-math.inf < low <= high < math.inf for low, high in pairs):
             raise InputError(f"a level's ranges must be finite and rise, got {self}")
@@ -123,7 +123,7 @@ class StartProbability:
     """During the push of a takeoff."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: one is negative, or they do not add up to 1."""
+        """Raise InputError: one is negative, or they do not add up to 1."""
         values = tuple(vars(self).values())
         if not min(values) >= 0.0 or not abs(sum(values) - 1.0) < 1.0e-6:
             raise InputError(f"start_probability must be >= 0 and add up to 1, got {vars(self)}")
@@ -200,7 +200,7 @@ class ResetCfg:
     """[s] From touchdown to the next goal."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a pair is reversed, a number not finite or out of range."""
+        """Raise InputError: a pair is reversed, a number not finite or out of range."""
         positive = ("command_delay", "long_wait", "next_jump_delay", "lean", "push_length", "push_acceleration")
         check_ranges("reset", self, skip=("start_probability", "ground", "balance_by"), not_negative=positive)
         check_probabilities("reset", self, "long_wait_probability")

@@ -42,7 +42,7 @@ class CommandCfg:
     """What the kernels read."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a range or a probability is not one."""
+        """Raise InputError: a range or a probability is not one."""
         check_finite("command reach", *self.first_range, *self.last_range)
         if not all(0.0 < low <= high for low, high in zip(self.first_range, self.last_range, strict=True)):
             raise InputError(f"command ranges must be positive and grow, got {self.first_range}, {self.last_range}")
@@ -108,7 +108,7 @@ class VelocityResetCfg:
     """What the kernels read."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a pair is reversed, a number not finite or out of range."""
+        """Raise InputError: a pair is reversed, a number not finite or out of range."""
         check_ranges("reset", self, skip=("terrain",), not_negative=vars(self))
         check_probabilities("reset", self, "default_pose_probability", "swing_probability")
 
