@@ -63,9 +63,9 @@ def check_model(model: Model) -> None:
         for i, name in enumerate(names):
             if name != expected[i % len(expected)]:
                 raise NotThisRobotError(f"{noun} {i} must be {expected[i % len(expected)]!r}, found {name!r}")
-    for name, size, expected_size in (("joint_q", model.joint_coord_count, 43), ("joint_qd", model.joint_dof_count, 38)):
-        if size != count * expected_size:
-            raise NotThisRobotError(f"{name} must hold {expected_size} values a world, found {size / count:g}")
+    for name, size, per_world in (("joint_q", model.joint_coord_count, 43), ("joint_qd", model.joint_dof_count, 38)):
+        if size != count * per_world:
+            raise NotThisRobotError(f"{name} must hold {per_world} values a world, found {size / count:g}")
     unsupported = {
         "particles": model.particle_count,
         "muscles": model.muscle_count,
@@ -145,7 +145,7 @@ class JumperDynamics:
     """Parameters, geometry and work arrays of the dedicated dynamics for every world of a model.
 
     `SolverJumper` uses it in single precision. Tests use it in double precision, as the reference for rounding errors
-    and gradients. q and qd are arrays of `real` in the layout of the model's `joint_q` (43 a world) and `joint_qd` (38).
+    and gradients. q, qd: flat arrays of `real` in the layout of `joint_q` (43 a world) and `joint_qd` (38 a world).
     """
 
     def __init__(
@@ -172,8 +172,9 @@ class JumperDynamics:
         self.static_friction_ratio = wp.full(self.num_worlds, 1.0, dtype=float, device=self.device)
         """Static over dynamic friction coefficient [1], shape (num_worlds,); call `pack_friction` after a change."""
         self.leg_springs = wp.zeros(self.num_worlds, dtype=wp.vec2, device=self.device)
-        """Stiffness [N/m] (0: no springs) and rest length [m] of the springs between knees, vec2 of shape (num_worlds,); call
-        `pack_springs` after a change."""
+        """Stiffness [N/m], 0: none, and rest length [m] of the springs between knees, vec2 of shape (num_worlds,).
+
+        Call `pack_springs` after a change."""
 
         self.robot = self.modules.step.RobotModel()
         self.robot.geometry = leg_geometry_array(self.description, self.modules.geometry, self.device)
@@ -190,7 +191,7 @@ class JumperDynamics:
         self.pack()
 
     def _workspace(self) -> Any:
-        """Return the kernels' `Workspace`, zeroed but for the reference pose `reference_q`, which comes from the model."""
+        """Return the kernels' `Workspace`, zeroed, with the model's `joint_q` as reference pose."""
         scalar, n = self.modules.scalar, self.num_worlds
         work = self.modules.drive.Workspace()
         for names, shape, dtype in (
@@ -206,7 +207,7 @@ class JumperDynamics:
         return work
 
     def step_record(self, steps: int) -> Any:
-        """Return the kernels' `StepRecord`, zeroed, with room for the number of steps that a reverse pass recomputes."""
+        """Return the kernels' `StepRecord`, zeroed, for the steps that a reverse pass recomputes."""
         record, n = self.modules.multipliers.StepRecord(), self.num_worlds
         for name, var in record._cls.vars.items():
             shape = (n, steps + (name in ("base", "angles", "rates")))
@@ -273,7 +274,7 @@ class JumperDynamics:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self.robot.table], device=self.device)
 
     def settings(self, dt: float, substeps: int, max_sweeps: int, tolerance: float) -> Any:
-        """Return the kernels' `StepSettings`; dt: physics step [s]; max_sweeps, tolerance [m/s]: of the contact iteration."""
+        """Return the kernels' `StepSettings`; dt [s]; max_sweeps and tolerance [m/s] end the contact iteration."""
         settings = self.modules.step.StepSettings()
         settings.dt, settings.substeps = dt, substeps
         settings.max_sweeps, settings.tolerance = max_sweeps, tolerance
@@ -283,7 +284,7 @@ class JumperDynamics:
         self, joint_f: wp.array, body_f: wp.array, motors: Any = None, target: wp.array | None = None,
         previous: wp.array | None = None, delay: wp.array | None = None,
     ) -> Any:  # fmt: skip
-        """Return the kernels' `Drive`: joint forces (num_worlds * 38,) and body wrenches (num_worlds * 21,), and motors.
+        """Return the kernels' `Drive`; joint_f: (num_worlds * 38,), body_f: wrenches (num_worlds * 21,), as in Newton.
 
         With motors (`MotorArrays`) they follow target [rad], (12, num_worlds); with delay [physics steps],
         (num_worlds,), they follow `previous`, shaped as target, until the target arrives.
@@ -334,10 +335,10 @@ class JumperDynamics:
     def project_momentum(
         self, q: wp.array, qd: wp.array, momenta: Any, body_f: wp.array, time: float, worlds: WorldRange | None = None
     ) -> None:
-        """Correct the base's velocity in qd, so that a robot in free flight keeps its momentum exactly.
+        """Correct the base's velocity in qd, so that gravity alone changes the momentum of a robot in free flight.
 
         Call it after `advance` by `time` [s]. momenta: before that call. body_f: wrenches during it; a robot with a
-        wrench or a contact stays uncorrected. worlds: range, by default all.
+        contact or a wrench on its base stays uncorrected. worlds: range, by default all.
         """
         first, count = worlds or (0, self.num_worlds)
         inputs = [first, self.robot, momenta, body_f, self.work.peak_force, self.work.diverged, time, q, qd]
