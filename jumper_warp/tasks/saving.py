@@ -1,6 +1,6 @@
 """Tasks as JSON, and back. Functions and types are saved as `module:name`.
 
-Reading looks names up in loaded modules alone: the project's and those that the user passes. It imports none for a name.
+Reading looks names up in the project's modules and those that the user passes; it imports no module for a name.
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def name_of(definition: Any) -> str:
 
 
 def json_value(value: Any) -> Any:
-    """Return a configuration as JSON data: dicts with "type", lists and scalars. Raises TaskError: it cannot be saved."""
+    """Return a configuration as JSON data: dicts with "type", lists, scalars. Raises TaskError: it cannot be saved."""
     if isinstance(value, Term):
         options = {key: json_value(option) for key, option in value.options.items()}
         named = {"type": name_of(type(value)), "func": name_of(value.func), "name": value.name}
@@ -114,7 +114,7 @@ class Finder:
         self.modules = {module.__name__: module for module in modules}
 
     def __call__(self, name: Any, where: str) -> Any:
-        """Return a Warp function, struct, dataclass or subclass of `Term`; where: place for messages. Raises TaskError."""
+        """Return a Warp function, struct, dataclass or subclass of `Term`; where: of messages. Raises TaskError."""
         if not isinstance(name, str) or name.count(":") != 1:
             raise TaskError(f"{where}: expected module:name, got {shown(name)}")
         module_name, _, attribute = name.partition(":")

@@ -5,8 +5,8 @@ to stand. The jump command is set at the handover, since walking stands more qui
 squat. Walking takes over once the robot has landed and rests, or after a failed landing. Each skill has its own
 observation, action scale, gains, torque limits and command filter.
 
-On request a jump hands over to turning in a long flight. Turning brings the base level, in the jump's heading, and hands
-back shortly before the landing.
+On request a jump hands over to turning in a long flight. Turning brings the base level, in the jump's heading, and
+hands back shortly before the landing.
 """
 
 from __future__ import annotations

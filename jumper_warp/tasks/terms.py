@@ -87,7 +87,7 @@ class Term:
             raise InputError(f"{where}: the function must return {self.returns[0].__name__}, it returns {returned}")
 
     def replace(self, **changes: Any) -> Any:
-        """Return the term with other numbers or options; raises ValueError as the constructor."""
+        """Return the term with changed function, name, numbers or options; raises InputError as the constructor."""
         return type(self)(**{"func": self.func, "name": self.name, **self.numbers, **self.options, **changes})
 
     @property
