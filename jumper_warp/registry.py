@@ -136,7 +136,7 @@ def _register(name: str, entry: TaskEntry) -> None:
 
 
 def find_task(name: str) -> tuple[str, TaskEntry]:
-    """Return (name, entry) of a task by name or alias, loading an installed one. Raises InputError: unknown or ambiguous."""
+    """Return (name, entry) of a task by name or alias, loading an installed one. Raises InputError: unknown."""
     for known, entry in TASKS.items():
         if name == known or name in entry.aliases:
             return known, entry
