@@ -46,7 +46,7 @@ def body_poses(model, joint_q):
 
 
 def far_ends(model, joint_q, link, length):
-    """Return positions (4, 3) [m], world frame, at -z * length [m] of the leg's link 0 to 4 (housing to inner shank)."""
+    """Return positions (4, 3) [m], world frame, of the points (0, 0, -length [m]) of link 0 to 4 of each leg."""
     positions, rotations = body_poses(model, joint_q)
     bodies = [1 + 5 * leg + link for leg in range(4)]
     return positions[bodies] + rotations[bodies].apply([0.0, 0.0, -length])
@@ -187,7 +187,7 @@ def test_contact_has_the_paw_friction_and_is_stiff():
 
 
 def standing_energy(angle):
-    """Return base height [m] and energy [J] with all thighs at an angle [rad], motors of 17 N m/rad commanded to 45 deg.
+    """Return base height [m] and energy [J] with all thighs at an angle [rad] and motors of 17 N m/rad held at 45 deg.
 
     In the leg's plane each shank leans by asin((0.045 + 0.175 sin q) / 0.3); heights follow from the paws upward.
     """
