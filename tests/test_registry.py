@@ -24,9 +24,11 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
 
-PROJECT_TASKS = ("vertical-jump", "horizontal-jump", "horizontal-jump-slippery", "horizontal-jump-sighted",
-                 "omnidirectional-jump", "vertical-jump-mars", "vertical-jump-mars-loose", "horizontal-jump-mars",
-                 "horizontal-jump-mars-loose", "velocity-flat", "velocity-rough", "velocity-trot", "attitude")  # fmt: skip
+PROJECT_TASKS = (
+    "vertical-jump", "horizontal-jump", "horizontal-jump-slippery", "horizontal-jump-sighted", "omnidirectional-jump",
+    "vertical-jump-mars", "vertical-jump-mars-loose", "horizontal-jump-mars", "horizontal-jump-mars-loose",
+    "velocity-flat", "velocity-rough", "velocity-trot", "attitude",
+)  # fmt: skip
 TASK_FILE = """\
 from dataclasses import replace
 

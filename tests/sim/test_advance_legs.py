@@ -37,7 +37,7 @@ def states(model, height, seed=0):
 
 
 def squatting(model):
-    """Return joint_q, joint_qd, joint_f of robots within 1 degree of the stops of outer + inner, paws near the ground."""
+    """Return joint_q, joint_qd, joint_f of robots near the stop of outer + inner, paws near the ground."""
     q, qd, force = states(model, 0.14)
     rng = np.random.default_rng(2)
     half = np.radians(120.0) + rng.uniform(-0.01, 0.01, (N, 4))  # half of outer + inner

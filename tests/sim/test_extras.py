@@ -147,7 +147,7 @@ def test_frame_transform_of_a_site_follows_the_link(solver):
         sim.step()
         sensor.update(sim.state)
         readings.append(sensor.transforms.numpy()[:, :3].copy())
-    # the FL ankle [m] in the body frame by hand: intersection of the shank circles, then rotation of the housing about x
+    # the FL ankle [m] in the body frame by hand: intersection of shank circles, then rotation of the housing about x
     lateral, outer, inner = sim.joint_q()[0, [7, 8, 10]].astype(float)
     tips = np.array([[0.1417 + 0.175 * np.sin(outer), -0.175 * np.cos(outer)],
                      [0.0517 - 0.175 * np.sin(inner), -0.175 * np.cos(inner)]])  # fmt: skip

@@ -13,7 +13,7 @@ STEPS = 45  # policy steps, 0.75 s
 
 
 def moving_legs(keep: bool, *, height: float, push: float = 0.0, reach: float = 0.4) -> tuple[Simulation, list]:
-    """Return a simulation after leg motion of `reach` [rad] from `height` [m], and its momenta after every policy step."""
+    """Return a simulation after leg motion of `reach` [rad] at `height` [m], and its momenta after every step."""
     sim = Simulation(N, motors=jumping_motors(), gravity=MARS, keep_momentum=keep, visuals=False, device="cpu")
     q, qd = sim.joint_q().copy(), sim.joint_qd().copy()
     q[:, 2] += height
