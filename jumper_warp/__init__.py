@@ -1,4 +1,4 @@
-"""Simulation and reinforcement learning for the quadruped Jumper; the names that are typed every day, on demand."""
+"""Simulation and reinforcement learning for the quadruped Jumper; `__all__` is imported lazily."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from jumper_warp.sim.simulation import Simulation as Simulation
     from jumper_warp.sim.solver import SolverJumper as SolverJumper
 
-_PLACES = {
+_MODULES = {
     "Env": "jumper_warp.envs.env",
     "Simulation": "jumper_warp.sim.simulation",
     "SolverJumper": "jumper_warp.sim.solver",
@@ -22,21 +22,22 @@ _PLACES = {
     "load_policy": "jumper_warp.policies.folder",
     "make_task": "jumper_warp.registry",
 }
-"""Modules of the names below; each is imported when a name of it is first used."""
+"""Module of each public name, imported at the name's first use."""
 __all__ = ["Env", "Simulation", "SolverJumper", "build_model", "load_policy", "make_task"]
 
-
-# On a CPU torch's threads stay awake for milliseconds after each operation, on cores that the simulation's need next.
-# libgomp reads this when torch is loaded; its own count of rounds is 300,000.
+# Torch's CPU threads spin for milliseconds after each operation, on cores that the simulation's threads need next.
+# libgomp reads this number of spin rounds when torch is loaded; its default is 300,000.
 if "OMP_WAIT_POLICY" not in os.environ:
     os.environ.setdefault("GOMP_SPINCOUNT", "20000")
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _PLACES:
+    """Import and return a public name. Raises AttributeError for any other name."""
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(importlib.import_module(_PLACES[name]), name)
+    return getattr(importlib.import_module(_MODULES[name]), name)
 
 
 def __dir__() -> list[str]:
-    return sorted({*globals(), *_PLACES})
+    """Return the names of this module and all public names, imported or not."""
+    return sorted({*globals(), *_MODULES})

@@ -1,4 +1,4 @@
-"""Gymnasium's names of the tasks: importing this registers them, `jumper_warp/VerticalJump-v0` for vertical-jump."""
+"""Registration of the tasks with Gymnasium at import: vertical-jump becomes `jumper_warp/VerticalJump-v0`."""
 
 from __future__ import annotations
 
@@ -15,25 +15,25 @@ from jumper_warp.utils.errors import InputError
 def make_vector_env(
     task: str, num_envs: int = 1, *, all_groups: bool = False, tensors: bool = False, **arguments: Any
 ) -> GymVectorEnv:
-    """Return a vector of environments; arguments: of `Env`; others: of `GymVectorEnv`.
+    """Return a vector environment of a task; arguments: of `Env`; all_groups, tensors: of `GymVectorEnv`.
 
-    Raises ValueError: an unknown task, or as these.
+    Raises InputError: an unknown task, or arguments that `Env` or `GymVectorEnv` refuses.
     """
     return GymVectorEnv(Env(make_task(task), num_envs, **arguments), all_groups=all_groups, tensors=tensors)
 
 
 def refuse_single_env(task: str, **arguments: Any) -> NoReturn:
-    """Stand where `gymnasium.make` looks. Raises InputError, which names what there is instead."""
+    """Raise InputError that recommends `gymnasium.make_vec`; `gymnasium.make` calls this entry point."""
     raise InputError(f"robots come as a vector: gymnasium.make_vec({env_id(task)!r}, num_envs=1), not gymnasium.make")
 
 
 def env_id(task: str) -> str:
-    """Return Gymnasium's name of a task."""
+    """Return Gymnasium's id of a task, `jumper_warp/VerticalJump-v0` for vertical-jump."""
     return f"jumper_warp/{''.join(word.capitalize() for word in task.split('-'))}-v0"
 
 
 def register_envs() -> None:
-    """Register the tasks that are not yet registered."""
+    """Register every task in `TASKS` that Gymnasium does not have yet."""
     for task in TASKS:
         if env_id(task) not in gymnasium.registry:
             gymnasium.register(

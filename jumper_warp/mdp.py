@@ -1,4 +1,4 @@
-"""The one import of whoever writes a reward, an observation or a whole task.
+"""The single import for user-defined rewards, observations and tasks.
 
     from dataclasses import replace
     import warp as wp
@@ -11,8 +11,8 @@
     jump = make_task("vertical-jump")
     jump = replace(jump, rewards=(*jump.rewards, mdp.RewardTerm(level, weight=2.0, scale=0.1)))
 
-Stock terms lie in the namespaces `rewards`, `terminations`, `observations` and `events`; the latter also holds what an
-event writes a world's parameters with. Motors and command filters of a task are those of `jumper_warp.robot.motors`.
+Stock terms are in the namespaces `rewards`, `terminations`, `observations` and `events`; `events` also has the
+functions with which an event writes a world's parameters. Motors and command filters are in `jumper_warp.robot.motors`.
 """
 
 from jumper_warp.kernels.attitude.state import AttitudeState
@@ -39,46 +39,10 @@ from jumper_warp.tasks.terms import (
 )
 
 __all__ = [
-    "FLIGHT",
-    "LANDED",
-    "STANCE",
-    "Advance",
-    "AttitudeState",
-    "Command",
-    "Curriculum",
-    "EventTerm",
-    "Ground",
-    "Handover",
-    "JumpState",
-    "ObservationTerm",
-    "ObservationsCfg",
-    "RandomizationCfg",
-    "Reset",
-    "RewardTerm",
-    "RngStream",
-    "RobotArrays",
-    "RobotParameters",
-    "RobotView",
-    "Scene",
-    "SkillSettings",
-    "StateMetric",
-    "TaskCfg",
-    "TerminationTerm",
-    "VelocityState",
-    "clamped_normal",
-    "commanded",
-    "events",
-    "fold_in",
-    "observations",
-    "rewards",
-    "surface",
-    "terminations",
-    "tilt",
-    "uniform",
-    "uniform_range",
-    "vec12",
-    "waiting",
-    "world_ground",
-    "write_default_pose",
-    "yaw_of",
-]
+    "FLIGHT", "LANDED", "STANCE", "Advance", "AttitudeState", "Command", "Curriculum", "EventTerm", "Ground",
+    "Handover", "JumpState", "ObservationTerm", "ObservationsCfg", "RandomizationCfg", "Reset", "RewardTerm",
+    "RngStream", "RobotArrays", "RobotParameters", "RobotView", "Scene", "SkillSettings", "StateMetric", "TaskCfg",
+    "TerminationTerm", "VelocityState", "clamped_normal", "commanded", "events", "fold_in", "observations", "rewards",
+    "surface", "terminations", "tilt", "uniform", "uniform_range", "vec12", "waiting", "world_ground",
+    "write_default_pose", "yaw_of",
+]  # fmt: skip

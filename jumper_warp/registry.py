@@ -1,7 +1,7 @@
-"""The tasks by name: how each is made, how its policies are trained, and where those of users come from.
+"""Registry of tasks by name, with their factory functions and training settings.
 
-Importing this module imports no task. A task of a user comes from a file or module that the user names, or from an
-installed package with an entry point of group `jumper_warp.tasks`; nothing else is ever imported for its sake.
+Importing this module imports no task. A user's task comes from a file or module that the user names, or from an
+installed package with an entry point of group `jumper_warp.tasks`; no other module is imported to find tasks.
 """
 
 from __future__ import annotations
@@ -25,28 +25,28 @@ if TYPE_CHECKING:
     from jumper_warp.tasks.cfg import TaskCfg
 
 GROUP = "jumper_warp.tasks"
-"""Of entry points: name of a task, and `module:function` that returns its `TaskCfg` or `TaskEntry`."""
+"""Group of entry points `TASK = module:function`, where the function returns a `TaskCfg` or `TaskEntry`."""
 
 
 @dataclass(frozen=True)
 class TaskEntry:
-    """How a task is made and trained."""
+    """Factory and training settings of a task."""
 
     make: Callable[[], TaskCfg] | str
-    """Returns the task; or where that function is, `module:function`, imported when the task is made."""
+    """Function that returns the task, or `module:function`, which is imported when the task is made."""
     ppo: PpoCfg = field(default_factory=PpoCfg)
-    """Settings of the algorithm unless told otherwise."""
-    aliases: tuple[str, ...] = ()
+    """Default settings of PPO for training."""
+    aliases: tuple[str, ...] = ()  # other names of the task
     best_metric: str = "Metrics/success"
-    """The logged figure that makes a checkpoint the best, unless told otherwise."""
+    """Default metric of the log whose largest value selects the best checkpoint."""
 
     @property
     def origin(self) -> str:
-        """Name of the module that makes the task."""
+        """Name of the module with the factory function."""
         return self.make.split(":")[0] if isinstance(self.make, str) else self.make.__module__
 
     def task(self, name: str) -> TaskCfg:
-        """Return the task; raises InputError: it is none, or not of this name."""
+        """Make and return the task. Raises InputError: the result is no TaskCfg, or has another name."""
         from jumper_warp.tasks.cfg import TaskCfg
 
         make = self.make
@@ -62,15 +62,15 @@ class TaskEntry:
 
 
 WALKING = PpoCfg(num_steps=24, gamma=0.985, entropy_coef=0.0025, init_std=0.4, symmetry="actor")
-"""How velocity tracking is trained."""
+"""Training of velocity tracking."""
 HEIGHTS = PpoCfg(gamma=0.99)
-"""How jumps to heights are trained."""
+"""Training of vertical jumps."""
 ON_MARS = replace(HEIGHTS, symmetry="actor")
-"""The same on Mars, where a little spin turns the robot far."""
+"""Training of vertical jumps on Mars, with symmetry: there a small angular velocity turns the robot far."""
 PLACES = PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")
-"""How jumps to places are trained."""
+"""Training of jumps to goal positions."""
 TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5, symmetry="actor")
-"""How turning in flight is trained."""
+"""Training of turning in flight."""
 
 TASKS: dict[str, TaskEntry] = {
     "vertical-jump": TaskEntry("jumper_warp.tasks.jump.vertical:vertical_jump", HEIGHTS, ("Olympus-Vertical-Jump",)),
@@ -97,45 +97,46 @@ TASKS: dict[str, TaskEntry] = {
     "velocity-trot": TaskEntry("jumper_warp.tasks.velocity.flat:velocity_trot", WALKING, best_metric="Metrics/score"),
     "attitude": TaskEntry("jumper_warp.tasks.attitude.flight:attitude_in_flight", TURNS, best_metric="Metrics/settled"),
 }  # fmt: skip
-"""The project's tasks, and those that were registered or asked for."""
+"""Tasks by name: the project's, registered ones, and loaded ones of installed packages."""
 
 
 def make_task(name: str) -> TaskCfg:
-    """Return a task by name or alias. Raises InputError: an unknown one, or one whose maker gives no such task."""
+    """Return a task by name or alias. Raises InputError: it is unknown, or its factory returns no such task."""
     name, entry = find_task(name)
     return entry.task(name)
 
 
 def trainer_settings(name: str) -> PpoCfg:
-    """Return how policies of a task, by name or alias, are trained unless told otherwise; raises as `make_task`."""
+    """Return the default training settings of a task by name or alias; raises InputError as `find_task`."""
     return find_task(name)[1].ppo
 
 
 def task_names() -> tuple[str, ...]:
-    """Return the names of all tasks; those of installed packages are not loaded for it."""
+    """Return the names of all tasks, including those of installed packages, which stay unloaded."""
     return tuple(dict.fromkeys([*TASKS, *sorted({point.name for point in installed_tasks()})]))
 
 
 def register_task(
     name: str, make: Callable[[], TaskCfg], *, ppo: PpoCfg | None = None, aliases: tuple[str, ...] = ()
 ) -> None:
-    """Let `make` be found by the name of its task, and by aliases; ppo: settings of the algorithm.
+    """Register the task that `make` returns under its name and aliases; ppo: default training settings.
 
-    Raises InputError: a name is taken.
+    Raises InputError: a name or alias is taken.
     """
     _register(name, TaskEntry(make, PpoCfg() if ppo is None else ppo, tuple(aliases)))
 
 
 def _register(name: str, entry: TaskEntry) -> None:
-    taken = {alias: other for other, known in TASKS.items() for alias in (other, *known.aliases)}
-    for each in (name, *entry.aliases):
-        if each in taken:
-            raise InputError(f"there is a task {each!r:.60} already, of {TASKS[taken[each]].origin}")
+    """Add an entry to `TASKS`. Raises InputError: its name or an alias is taken."""
+    owners = {alias: task for task, known in TASKS.items() for alias in (task, *known.aliases)}
+    for alias in (name, *entry.aliases):
+        if alias in owners:
+            raise InputError(f"there is a task {alias!r:.60} already, of {TASKS[owners[alias]].origin}")
     TASKS[name] = entry
 
 
 def find_task(name: str) -> tuple[str, TaskEntry]:
-    """Return a task's name and entry by name or alias; raises InputError for an unknown one."""
+    """Return (name, entry) of a task by name or alias, loading an installed one. Raises InputError: unknown."""
     for known, entry in TASKS.items():
         if name == known or name in entry.aliases:
             return known, entry
@@ -149,35 +150,35 @@ def find_task(name: str) -> tuple[str, TaskEntry]:
 
 
 def installed_tasks() -> tuple[EntryPoint, ...]:
-    """Return the tasks that installed packages offer, without loading them."""
+    """Return the entry points of installed packages' tasks, without loading them."""
     return tuple(entry_points(group=GROUP))
 
 
 def package_of(point: EntryPoint) -> str:
-    """Return the name of the package that offers a task."""
+    """Return the name of the package that has an entry point."""
     return point.dist.name if point.dist is not None else point.module
 
 
 def load_installed(point: EntryPoint) -> None:
-    """Load a task of an installed package, and register it.
+    """Load an installed package's task from its entry point, and register it.
 
     Raises InputError: it cannot be imported, or a name is taken.
     """
-    where = f"task {point.name!r:.60} of package {package_of(point)}"
+    subject = f"task {point.name!r:.60} of package {package_of(point)}"
     try:
         make: Callable[..., Any] = point.load()
     except (ImportError, AttributeError) as error:
-        raise InputError(f"{where} cannot be loaded: {type(error).__name__}: {error}") from error
+        raise InputError(f"{subject} cannot be loaded: {type(error).__name__}: {error}") from error
     if not callable(make):
-        raise InputError(f"{where}: {point.value} is no function")
-    made = make()
-    _register(point.name, made if isinstance(made, TaskEntry) else TaskEntry(make))
+        raise InputError(f"{subject}: {point.value} is no function")
+    result = make()
+    _register(point.name, result if isinstance(result, TaskEntry) else TaskEntry(make))
 
 
 def load_task_module(name: str) -> ModuleType:
-    """Import a FILE.py, or a module by name, so that the tasks that it registers are known.
+    """Import FILE.py, or a module by its name, which registers tasks; after an exception `TASKS` is unchanged.
 
-    Raises InputError: there is none, its name belongs to another module, or what it registers or defines is refused.
+    Raises InputError: it does not exist, its name is another module's, or it registers or defines an invalid task.
     OSError: the file cannot be read.
     """
     path, before = Path(name), dict(TASKS)
@@ -196,7 +197,7 @@ def load_task_module(name: str) -> ModuleType:
 
 
 def _load_file(path: Path) -> ModuleType:
-    """Import a file under its stem; one that was imported before is returned as it is."""
+    """Import a file as a module named by its stem, and return it; a loaded file is not run again. Raises InputError."""
     if not path.is_file():
         raise InputError(f"no file {str(path)!r:.200}")
     path, name = path.resolve(), path.stem
@@ -227,6 +228,6 @@ def _load_file(path: Path) -> ModuleType:
 
 
 def _is_elsewhere(name: str, path: Path) -> bool:
-    """Return whether importing a name would give another file than this."""
+    """Return whether `import name` would import a file other than `path`."""
     spec = importlib.util.find_spec(name)
     return spec is not None and spec.origin != str(path)

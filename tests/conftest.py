@@ -1,3 +1,5 @@
+"""Set-up of all tests: one OpenMP thread, kernels compiled once before the workers start, and a shared fixture."""
+
 import os
 import subprocess
 import sys
@@ -25,18 +27,18 @@ Simulation(2, solver="mujoco", visuals=False, device="cpu").step()
 
 
 def pytest_sessionstart(session):
-    """Compile what most files need before workers begin, who else would compile the same kernels at the same time."""
+    """Compile the kernels of most files before workers start, if there are several and the whole suite runs."""
     options = session.config.option
     if (getattr(options, "numprocesses", None) or 0) > 1 and not options.file_or_dir:
         with subprocess.Popen([sys.executable, "-c", MUJOCO]):
             for name in SHARED:
-                Env(hardest(make_task(name)), 2, device="cpu").compile()  # a whole map takes seconds, the kernels alike
+                Env(hardest(make_task(name)), 2, device="cpu").compile()  # with a small map
             Env(hold_height(), 2, device="cpu").compile()
 
 
 @pytest.fixture(scope="module")
 def one_thread():
-    """Torch computes on one thread: small networks lose more to waiting threads than they gain."""
+    """Limit torch to one thread during a module's tests, which is faster for small networks."""
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

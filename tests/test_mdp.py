@@ -1,4 +1,4 @@
-"""The public import of tasks: its names, and who may import the kernels behind it."""
+"""Module `mdp`: its public names, and that scripts and documents import it in place of kernels."""
 
 import re
 from pathlib import Path
@@ -17,8 +17,8 @@ def test_every_public_name_resolves_and_namespaces_hold_stock_functions():
         assert isinstance(term, wp.Function)
 
 
-def test_scripts_and_examples_import_no_kernels():
+def test_scripts_examples_and_documents_import_no_kernels():
     files = [*(ROOT / "experiments").glob("*.py"), ROOT / "tests/helpers/hold_height.py"]
     files += [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *(ROOT / "docs").glob("*.md")]
-    found = [file.name for file in files if re.search(r"(from|import) jumper_warp\.kernels", file.read_text())]
-    assert len(files) > 20 and found == []
+    importing = [file.name for file in files if re.search(r"(from|import) jumper_warp\.kernels", file.read_text())]
+    assert len(files) > 20 and importing == []

@@ -1,3 +1,5 @@
+"""Python examples and links of README.md and docs/gradients.md."""
+
 import re
 import sys
 from pathlib import Path
@@ -12,7 +14,7 @@ from jumper_warp.registry import TASKS, load_task_module, make_task
 README = Path(__file__).parents[1] / "README.md"
 
 
-def test_examples_of_the_readme_run_and_the_robot_squats(tmp_path, monkeypatch):
+def test_readme_examples_run_with_their_results(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     examples = re.findall(r"```python\n(.*?)```", README.read_text(encoding="utf-8"), re.DOTALL)
     assert len(examples) == 5
@@ -31,19 +33,19 @@ def test_examples_of_the_readme_run_and_the_robot_squats(tmp_path, monkeypatch):
     assert names["gradient"].shape == (10, 12) and abs(names["gradient"]).max() > 1.0e-4
 
 
-def test_the_example_of_gradients_runs_and_stiffer_motors_stand_higher():
+def test_gradient_in_the_docs_matches_a_forward_difference_in_stiffness():
     text = (README.parent / "docs" / "gradients.md").read_text(encoding="utf-8")
-    names = {}
+    names = {}  # of the example
     exec(re.search(r"```python\n(.*?)```", text, re.DOTALL)[1], names)
-    assert names["by_stiffness"].shape == (12, 64)
-    heights = names["jump"].q.numpy()[-1, 2]
+    assert names["by_stiffness"].shape == (12, 64)  # [m rad/(N m)] motors, worlds
+    heights = names["jump"].q.numpy()[-1, 2]  # [m] by world, at the end
     rollout = names["rollout"]
     rollout.parameters["kp"].assign(rollout.parameters["kp"].numpy() + 1.0e-4)
     higher = rollout.run(names["targets"], *rollout.standing()).q.numpy()[-1, 2]
     assert (higher - heights) / 1.0e-4 == pytest.approx(names["by_stiffness"].sum(axis=0), rel=1.0e-3)
 
 
-def test_the_task_of_the_readme_pays_a_standing_robot_for_a_level_base(tmp_path, monkeypatch):
+def test_readme_task_rewards_a_standing_robot_with_a_level_base(tmp_path, monkeypatch):
     text = README.read_text(encoding="utf-8")
     (tmp_path / "my_task.py").write_text(re.search(r"```python\n(# my_task\.py.*?)```", text, re.DOTALL)[1])
     before = dict(TASKS)
@@ -63,6 +65,6 @@ def test_the_task_of_the_readme_pays_a_standing_robot_for_a_level_base(tmp_path,
     assert env.skills[0].term_value.numpy()[row] == pytest.approx(np.full(4, 2.0 / 60.0), rel=0.05)
 
 
-def test_linked_files_exist():
+def test_files_linked_in_the_readme_exist():
     links = re.findall(r"\]\((?!https?:)([^)#]+)\)", README.read_text(encoding="utf-8"))
     assert links and all((README.parent / link).exists() for link in links), links

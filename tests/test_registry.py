@@ -1,3 +1,5 @@
+"""Registry of tasks: names, files and modules of users, entry points of packages, and lazy public names."""
+
 import dataclasses
 import subprocess
 import sys
@@ -22,9 +24,11 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
 
-OWN = ("vertical-jump", "horizontal-jump", "horizontal-jump-slippery", "horizontal-jump-sighted",
-       "omnidirectional-jump", "vertical-jump-mars", "vertical-jump-mars-loose", "horizontal-jump-mars",
-       "horizontal-jump-mars-loose", "velocity-flat", "velocity-rough", "velocity-trot", "attitude")  # fmt: skip
+PROJECT_TASKS = (
+    "vertical-jump", "horizontal-jump", "horizontal-jump-slippery", "horizontal-jump-sighted", "omnidirectional-jump",
+    "vertical-jump-mars", "vertical-jump-mars-loose", "horizontal-jump-mars", "horizontal-jump-mars-loose",
+    "velocity-flat", "velocity-rough", "velocity-trot", "attitude",
+)  # fmt: skip
 TASK_FILE = """\
 from dataclasses import replace
 
@@ -44,8 +48,8 @@ REGISTER = 'register_task("low-jump", low_jump, ppo=PpoCfg(gamma=0.9), aliases=(
 
 
 @pytest.fixture(autouse=True)
-def registered():
-    """Tasks and modules are afterwards as they were."""
+def restored_registry():
+    """Restore registered tasks and imported modules after each test."""
     tasks, modules = dict(TASKS), set(sys.modules)
     yield
     TASKS.clear()
@@ -56,6 +60,7 @@ def registered():
 
 
 def renamed(name):
+    """Return a factory of the vertical jump under another name."""
     return lambda: dataclasses.replace(make_task("vertical-jump"), name=name)
 
 
@@ -63,13 +68,13 @@ def renamed(name):
 
 
 def test_tasks_are_found_by_name_and_alias():
-    assert task_names()[: len(OWN)] == OWN
+    assert task_names()[: len(PROJECT_TASKS)] == PROJECT_TASKS
     assert make_task("Olympus-Vertical-Jump") == make_task("vertical-jump")
     assert find_task("Olympus-Horizontal-Jump")[0] == "horizontal-jump"
-    assert [make_task(name).name for name in OWN] == list(OWN)
+    assert [make_task(name).name for name in PROJECT_TASKS] == list(PROJECT_TASKS)
 
 
-def test_unknown_task_is_refused_with_those_that_there_are():
+def test_refusal_of_an_unknown_task_lists_the_known_tasks():
     with pytest.raises(InputError, match="unknown task 'swim'; there are vertical-jump, horizontal-jump"):
         make_task("swim")
 
@@ -80,7 +85,7 @@ def test_trainer_settings_are_those_of_the_task():
     assert trainer_settings("omnidirectional-jump") == PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")
 
 
-def test_registered_task_is_made_and_trained_as_told():
+def test_registered_task_has_its_name_alias_settings_and_origin():
     register_task("my-jump", renamed("my-jump"), ppo=PpoCfg(gamma=0.5), aliases=("Mine",))
     assert make_task("Mine").name == "my-jump" and trainer_settings("my-jump").gamma == 0.5
     assert "my-jump" in task_names() and TASKS["my-jump"].origin == __name__
@@ -94,16 +99,16 @@ def test_registered_task_is_made_and_trained_as_told():
 def test_name_that_is_taken_is_refused(name, aliases, taken):
     with pytest.raises(InputError, match=f"there is a task '{taken}.* already, of jumper_warp.tasks.jump"):
         register_task(name, renamed(name), aliases=aliases)
-    assert tuple(TASKS) == OWN
+    assert tuple(TASKS) == PROJECT_TASKS
 
 
-def test_task_that_calls_itself_otherwise_is_refused():
+def test_task_with_another_name_than_registered_is_refused():
     register_task("my-jump", renamed("vertical-jump"))
     with pytest.raises(InputError, match=r"'my-jump' of .* calls itself 'vertical-jump'"):
         make_task("my-jump")
 
 
-def test_maker_of_something_else_is_refused():
+def test_factory_that_returns_no_task_is_refused():
     register_task("my-jump", lambda: 3)
     with pytest.raises(InputError, match="expected a TaskCfg, got int"):
         make_task("my-jump")
@@ -164,7 +169,7 @@ def test_file_without_the_ending_of_python_is_refused(tmp_path):
     [("missing.py", "no file 'missing.py'"), ("missing/tasks", "no file"), ("no_such", "no module 'no_such'"),
      ("no_such.tasks", "no module 'no_such.tasks'"), (".", "no module"), ("jumper_warp.no_such", "no module")],
 )  # fmt: skip
-def test_what_is_not_there_is_refused(tmp_path, monkeypatch, name, message):
+def test_missing_file_or_module_is_refused(tmp_path, monkeypatch, name, message):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(InputError, match=message):
         load_task_module(name)
@@ -181,7 +186,7 @@ def test_what_is_not_there_is_refused(tmp_path, monkeypatch, name, message):
         ("def broken(:", "invalid syntax"),
     ],
 )
-def test_mistake_in_a_file_is_told_with_its_line_and_leaves_nothing(tmp_path, code, message):
+def test_refusal_of_a_faulty_file_names_the_line_and_registers_nothing(tmp_path, code, message):
     path = tmp_path / "my_tasks.py"
     text = (
         "from jumper_warp.kernels.jump import rewards\nfrom jumper_warp.tasks.terms import RewardTerm\n"
@@ -191,20 +196,20 @@ def test_mistake_in_a_file_is_told_with_its_line_and_leaves_nothing(tmp_path, co
     path.write_text(text + code + "\n")
     with pytest.raises(InputError, match=rf"my_tasks.py:{text.count(chr(10)) + 1}: .*{message}"):
         load_task_module(str(path))
-    assert "my_tasks" not in sys.modules and tuple(TASKS) == OWN
+    assert "my_tasks" not in sys.modules and tuple(TASKS) == PROJECT_TASKS
 
 
 @pytest.mark.parametrize(
     ("code", "kind"),
     [("1 / 0", ZeroDivisionError), ("import no_such_module", ModuleNotFoundError), ("int('x')", ValueError)],
 )
-def test_fault_in_a_file_keeps_its_traceback(tmp_path, code, kind):
+def test_exception_in_a_file_propagates_and_registers_nothing(tmp_path, code, kind):
     path = tmp_path / "my_tasks.py"
     path.write_text(TASK_FILE + REGISTER + code)
     with pytest.raises(kind) as caught:
         load_task_module(str(path))
     assert not isinstance(caught.value, InputError)
-    assert "my_tasks" not in sys.modules and tuple(TASKS) == OWN
+    assert "my_tasks" not in sys.modules and tuple(TASKS) == PROJECT_TASKS
 
 
 # ---------------------------------------------------------------------- installed packages
@@ -212,7 +217,7 @@ def test_fault_in_a_file_keeps_its_traceback(tmp_path, code, kind):
 
 @pytest.fixture
 def install(tmp_path, monkeypatch):
-    """Function that installs a package with entry points, by name of the task."""
+    """Function (package, points, code) that installs a package with entry points {task: "module:function"}."""
     monkeypatch.syspath_prepend(tmp_path)
 
     def install(package, points, code=TASK_FILE):
@@ -227,7 +232,7 @@ def install(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("function", ["low_jump", "entry"])
-def test_installed_task_is_loaded_when_it_is_asked_for_and_not_before(install, function):
+def test_installed_task_is_listed_but_loaded_only_when_made(install, function):
     install("their_tasks", {"low-jump": f"their_tasks:{function}"})
     assert "low-jump" in task_names() and make_task("vertical-jump")
     with pytest.raises(InputError, match=r"there are .*low-jump"):
@@ -261,14 +266,14 @@ def test_installed_task_that_cannot_be_loaded_is_refused(install, value, message
         make_task("low-jump")
 
 
-def test_task_of_two_packages_is_refused(install):
+def test_task_in_two_packages_is_refused(install):
     install("their_tasks", {"low-jump": "their_tasks:low_jump"})
     install("their_others", {"low-jump": "their_others:low_jump"})
     with pytest.raises(InputError, match="'low-jump' is in several packages: their_"):
         make_task("low-jump")
 
 
-def test_package_takes_no_name_of_the_project(install):
+def test_package_cannot_replace_a_task_of_the_project(install):
     install("their_tasks", {"vertical-jump": "their_tasks:low_jump"})
     assert make_task("vertical-jump").name == "vertical-jump" and "their_tasks" not in sys.modules
     (point,) = registry.installed_tasks()
@@ -279,10 +284,10 @@ def test_package_takes_no_name_of_the_project(install):
     )
 
 
-# ---------------------------------------------------------------------- what is exposed
+# ---------------------------------------------------------------------- public names
 
 
-def test_names_of_every_day_are_exposed_on_demand():
+def test_public_names_are_imported_lazily():
     code = (
         "import sys, jumper_warp\n"
         "assert not {'torch', 'warp', 'newton', 'numpy'} & set(sys.modules)\n"
@@ -299,6 +304,6 @@ def test_names_of_every_day_are_exposed_on_demand():
     ]  # fmt: skip
 
 
-def test_other_names_are_not_exposed():
+def test_unknown_name_raises_attribute_error():
     with pytest.raises(AttributeError, match="has no attribute 'JumpEnv'"):
         _ = jumper_warp.JumpEnv

@@ -34,13 +34,14 @@ print(kernels.OWNER, kernels.__file__, jumper_warp.kernels.scalar.__file__)
 
 
 def python(*args, folder, paths=()):
-    """Run Python in a folder, and return what it prints, by lines, and its errors."""
+    """Run Python in a folder with `paths` as PYTHONPATH; return its exit code, lines of stdout, and stderr."""
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(map(str, paths))}
     done = subprocess.run([sys.executable, *args], cwd=folder, env=environment, capture_output=True, text=True)
     return done.returncode, done.stdout.splitlines(), done.stderr
 
 
 def run(code, folder, *paths):
+    """Run Python code in a folder without error, with `paths` as PYTHONPATH, and return the lines that it prints."""
     returncode, printed, errors = python("-c", code, folder=folder, paths=paths)
     assert returncode == 0, errors
     return printed
@@ -48,7 +49,7 @@ def run(code, folder, *paths):
 
 @pytest.fixture(scope="module")
 def wheel(tmp_path_factory):
-    """Path of the built wheel."""
+    """Path of the wheel that is built from a copy of the source tree."""
     tree = tmp_path_factory.mktemp("tree")
     for name in SOURCES:
         copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
@@ -58,7 +59,7 @@ def wheel(tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def other_wheel(tmp_path_factory):
-    """Path of a wheel of another project, whose only package is `kernels`."""
+    """Path of the wheel of another project whose only package is `kernels`."""
     tree = tmp_path_factory.mktemp("other")
     (tree / "kernels").mkdir()
     (tree / "kernels" / "__init__.py").write_text("OWNER = 'other'\n")
@@ -74,10 +75,10 @@ def test_wheel_holds_one_package_and_all_assets(wheel):
         assert files and files <= names, sorted(files - names)[:5]
     others = {name.split("/")[0] for name in names} - {"jumper_warp"}
     assert len(others) == 1 and others.pop().endswith(".dist-info")
-    assert wheel.stat().st_size < 16e6
+    assert wheel.stat().st_size < 16e6  # bytes
 
 
-def test_wheel_finds_its_assets_from_another_folder(wheel, tmp_path):
+def test_installed_package_finds_assets_and_policies_from_another_folder(wheel, tmp_path):
     site, elsewhere = tmp_path / "site", tmp_path / "elsewhere"
     zipfile.ZipFile(wheel).extractall(site)
     elsewhere.mkdir()
@@ -87,7 +88,7 @@ def test_wheel_finds_its_assets_from_another_folder(wheel, tmp_path):
 
 
 @pytest.mark.parametrize("ours_first", [True, False])
-def test_another_package_named_kernels_is_installed_beside_ours(wheel, other_wheel, ours_first, tmp_path):
+def test_package_named_kernels_of_another_project_can_be_installed_too(wheel, other_wheel, ours_first, tmp_path):
     site = tmp_path / "site"
     for path in (wheel, other_wheel) if ours_first else (other_wheel, wheel):
         returncode, _, errors = python(*INSTALL, "--target", str(site), str(path), folder=tmp_path)
@@ -97,7 +98,7 @@ def test_another_package_named_kernels_is_installed_beside_ours(wheel, other_whe
     assert printed == " ".join(("other", *inside))
 
 
-def test_folder_of_the_kernels_is_not_imported_under_its_own_name():
+def test_kernels_folder_of_the_source_tree_refuses_import():
     returncode, _, errors = python("-c", "import kernels", folder=ROOT)
     assert returncode == 1
     assert errors.splitlines()[-1].startswith("ImportError: import jumper_warp.kernels: the folder kernels/ is not")

@@ -1,7 +1,4 @@
-"""Plausible ranges of the values of a robot description, which reveal mistakes of unit or exponent.
-
-The ranges cover legged robots from a toy to one that carries a person.
-"""
+"""Plausible ranges of a description's values, from a toy to a robot that carries a person; they reveal wrong units."""
 
 from __future__ import annotations
 
@@ -17,11 +14,11 @@ from jumper_warp.robot.parts import Joint, Link, Motor, RobotDescription, RobotD
 
 
 class Range(NamedTuple):
-    """A closed range of a quantity."""
+    """A closed range [low, high] of a quantity."""
 
-    low: float
-    high: float
-    unit: str
+    low: float  # in the unit
+    high: float  # in the unit
+    unit: str  # for messages; "" if dimensionless
 
 
 LINK_MASS = Range(1.0e-3, 100.0, "kg")
@@ -66,13 +63,14 @@ COLOR = Range(0.0, 1.0, "")
 class RangeCheck(NamedTuple):
     """Value of a description with its name and allowed range."""
 
-    name: str
-    value: float
+    name: str  # for messages
+    value: float  # in the range's unit
     range: Range
 
 
 def check_bounds(description: RobotDescription) -> None:
-    """Raise RobotDescriptionError for a value out of its range; the tree and the legs may still be unchecked."""
+    """Raise RobotDescriptionError for a value outside its plausible range; tree and legs need not be valid yet."""
+    # by link name: origins of its frame and joints, and loop anchors on it, each (3,) [m], link frame
     anchors: dict[str, list[np.ndarray]] = {link.name: [np.zeros(3)] for link in description.links}
     for joint in description.joints:
         anchors.get(joint.parent, []).append(joint.origin)
@@ -89,7 +87,7 @@ def check_bounds(description: RobotDescription) -> None:
 
 
 def refuse_outside(file: Path, part: str, checks: Iterable[RangeCheck]) -> None:
-    """Raise RobotDescriptionError for the first value outside its range, or NaN."""
+    """Raise RobotDescriptionError for the first value outside its range or NaN; file, part: place in the message."""
     for name, value, (low, high, unit) in checks:
         if not low <= value <= high:
             problem = f"expected {name} in {low:.4g} to {high:.4g}{unit and ' '}{unit}, found {value:.6g}"
@@ -97,12 +95,12 @@ def refuse_outside(file: Path, part: str, checks: Iterable[RangeCheck]) -> None:
 
 
 def point_checks(name: str, point: np.ndarray) -> Iterator[RangeCheck]:
-    """Return the checks of a point's coordinates in its link's frame."""
+    """Return the checks of the x, y, z of a point (3,) [m] in its link's frame; name: of the point, for messages."""
     return (RangeCheck(f"{axis} of {name}", float(value), PLACE) for axis, value in zip("xyz", point, strict=True))
 
 
 def joint_checks(joint: Joint) -> Iterator[RangeCheck]:
-    """Yield the checks of a joint."""
+    """Yield the checks of a joint's origin [m], stops [rad], effort [N m] and speed [rad/s]."""
     yield from point_checks("origin", joint.origin)
     yield RangeCheck("lower", joint.lower, STOP)
     yield RangeCheck("upper", joint.upper, STOP)
@@ -111,7 +109,7 @@ def joint_checks(joint: Joint) -> Iterator[RangeCheck]:
 
 
 def link_checks(link: Link, anchors: list[np.ndarray]) -> Iterator[RangeCheck]:
-    """Yield the checks of a link; anchors: origins of its frame and its joints [m], link frame."""
+    """Yield the checks of a link's mass, shapes, size and inertia; anchors: points (3,) [m] as in `check_bounds`."""
     yield RangeCheck("mass", link.mass, LINK_MASS)
     yield from point_checks("centre of mass", link.com)
     for shape in (*link.visuals, *link.collisions):
@@ -125,7 +123,7 @@ def link_checks(link: Link, anchors: list[np.ndarray]) -> Iterator[RangeCheck]:
 
 
 def shape_checks(shape: Shape) -> Iterator[RangeCheck]:
-    """Yield the checks of a shape."""
+    """Yield the checks of a shape's position, sizes, mesh coordinates [m] and color channels."""
     yield from point_checks(f"{shape.kind} position", shape.position)
     for size in shape.size:
         yield RangeCheck(f"{shape.kind} size", size, SHAPE_SIZE)
@@ -137,7 +135,7 @@ def shape_checks(shape: Shape) -> Iterator[RangeCheck]:
 
 
 def shape_corners(shape: Shape) -> np.ndarray:
-    """Return the corners (8, 3) [m], link frame, of a shape's bounding box along the shape's axes."""
+    """Return the corners (8, 3) [m], in the link frame, of the bounding box along the shape's own axes."""
     if shape.mesh is not None:
         low, high = shape.mesh.vertices.min(axis=0), shape.mesh.vertices.max(axis=0)
     else:
@@ -152,7 +150,7 @@ def shape_corners(shape: Shape) -> np.ndarray:
 
 
 def motor_checks(motor: Motor) -> Iterator[RangeCheck]:
-    """Yield the checks of a motor type."""
+    """Yield the checks of a motor type's constants, at the output of its gear, and of its two sets of gains."""
     yield RangeCheck("gear_ratio", motor.gear_ratio, GEAR_RATIO)
     yield RangeCheck("rotor_inertia", motor.rotor_inertia, ROTOR_INERTIA)
     yield RangeCheck("rotor_inertia behind the gear", motor.armature, ARMATURE)
@@ -167,7 +165,7 @@ def motor_checks(motor: Motor) -> Iterator[RangeCheck]:
 
 
 def common_checks(description: RobotDescription) -> Iterator[RangeCheck]:
-    """Yield the checks of the values that all legs share."""
+    """Yield the checks of knee damping and of the stops of outer + inner angle, which all legs share."""
     yield RangeCheck("knee_damping", description.knee_damping, KNEE_DAMPING)
     yield RangeCheck("knee_damping_limit", description.knee_damping_limit, KNEE_DAMPING_LIMIT)
     for name, angle in zip(("lower", "upper"), description.transversal_sum, strict=True):

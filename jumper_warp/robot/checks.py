@@ -21,22 +21,22 @@ INERTIA_TOLERANCE = 1.0e-9
 
 @dataclass(frozen=True)
 class LegDimensions:
-    """Constants of one leg; `jumper_warp.kernels.kinematics.geometry.LegGeometry` explains the fields."""
+    """Constants of one leg, as in the kernels' `LegGeometry`; housing frame: on the lateral axis, x forward, y left."""
 
-    hip: tuple[float, float, float]
-    front: float
-    side: float
-    outer_x: float
-    inner_x: float
-    plane_y: float
-    knee_y: float
-    thigh: float
-    shank: float
-    paw_radius: float
+    hip: tuple[float, float, float]  # [m] lateral axis, body frame
+    front: float  # +1 front leg, -1 back leg
+    side: float  # +1 left leg, -1 right leg
+    outer_x: float  # [m] axis of the outer thigh, housing x
+    inner_x: float  # [m] axis of the inner thigh, housing x
+    plane_y: float  # [m] both thigh axes, housing y
+    knee_y: float  # [m] offset of knees, ankle and paw from the thigh plane, along housing y
+    thigh: float  # [m] thigh axis to knee
+    shank: float  # [m] knee to ankle
+    paw_radius: float  # [m] sphere centred at the ankle
 
 
 def leg_dimensions(description: RobotDescription, leg: str) -> LegDimensions:
-    """Return the dimensions of a leg of a checked description, from its joint origins."""
+    """Return the dimensions of one leg ("FL", "FR", "BL" or "BR") of a checked description, from its joint origins."""
     lateral, outer, inner = (description.joint(f"{leg}_{name}").origin for name in ("lateral", "outer", "inner"))
     knee = description.joint(f"{leg}_outer_knee").origin
     return LegDimensions(
@@ -54,9 +54,10 @@ def leg_dimensions(description: RobotDescription, leg: str) -> LegDimensions:
 
 
 def knee_angles(leg: LegDimensions, outer: float, inner: float) -> tuple[float, float, float]:
-    """Return outer and inner knee angles [rad] that close the loop, and the ankle's z in the housing frame [m].
+    """Return the outer and inner knee angles [rad] that close the loop, and the ankle's z in the housing frame [m].
 
-    The ankle is the intersection of the two shank circles below the knees. Raises ValueError where they do not meet.
+    outer, inner: thigh angles [rad]. The ankle is the lower intersection of two circles of radius `shank` about the
+    knees; points below are (x, z) [m], housing frame. Raises InputError where the circles do not intersect.
     """
     outer_knee = np.array([leg.outer_x + leg.front * leg.thigh * math.sin(outer), -leg.thigh * math.cos(outer)])
     inner_knee = np.array([leg.inner_x - leg.front * leg.thigh * math.sin(inner), -leg.thigh * math.cos(inner)])
@@ -88,7 +89,7 @@ def check_description(description: RobotDescription) -> RobotDescription:
 
 
 def in_tree_order(description: RobotDescription) -> RobotDescription:
-    """Return the description with links and joints ordered by leg; refuse any other tree."""
+    """Return the description with its links and joints in the order of `tree_layout`; refuse any other tree."""
     file = description.urdf_path
     links = {link.name: link for link in description.links}
     joints = {joint.name: joint for joint in description.joints}
@@ -96,9 +97,9 @@ def in_tree_order(description: RobotDescription) -> RobotDescription:
     for joint in description.joints:
         for link in (joint.parent, joint.child):
             require(link in links, file, f"joint {joint.name}", f"unknown link {link!r:.60}")
-        other = parent_joint.setdefault(joint.child, joint).name
-        problem = f"expected one parent joint, found {other}, {joint.name}"
-        require(other == joint.name, file, f"link {joint.child}", problem)
+        first = parent_joint.setdefault(joint.child, joint).name
+        problem = f"expected one parent joint, found {first}, {joint.name}"
+        require(first == joint.name, file, f"link {joint.child}", problem)
     roots = [name for name in links if name not in parent_joint]
     problem = f"expected the one root link body, found {', '.join(roots) or 'a cycle'}"
     require(roots == ["body"], file, "", problem)
@@ -115,7 +116,7 @@ def in_tree_order(description: RobotDescription) -> RobotDescription:
 
 
 def tree_layout() -> dict[str, tuple[str, str]]:
-    """Return the names of the parent and child links of every joint, in tree order."""
+    """Return (parent link, child link) of every tree joint by its name, in tree order: leg by leg, outer bar first."""
     layout = {}
     for leg in LEGS:
         layout[f"{leg}_lateral"] = ("body", f"{leg}_housing")
@@ -126,7 +127,7 @@ def tree_layout() -> dict[str, tuple[str, str]]:
 
 
 def check_loops(description: RobotDescription) -> None:
-    """Refuse loops that do not join a leg's shanks, or whose anchors are off their axes."""
+    """Refuse loops that do not join a leg's two shanks at the same point of their -z axes."""
     file, links = description.path, {link.name for link in description.links}
     for leg, loop in zip(LEGS, description.loops, strict=True):
         part = f"loop {loop.name}"
@@ -141,7 +142,7 @@ def check_loops(description: RobotDescription) -> None:
 
 
 def close(actual: Any, expected: Any, tolerance: float = TOLERANCE) -> bool:
-    """Return whether all numbers deviate by at most a tolerance."""
+    """Return whether every entry of `actual` is within `tolerance` (same unit) of `expected`; the shapes broadcast."""
     return bool(np.abs(np.asarray(actual) - expected).max() <= tolerance)
 
 
@@ -157,14 +158,14 @@ def check_leg(description: RobotDescription, leg: str) -> None:
         problem = f"expected axis {axis}, found {joint.axis.tolist()}"
         require(close(joint.axis, axis), file, f"joint {joint.name}", problem)
     in_quarter = front * lateral.origin[0] > 0.0 and side * lateral.origin[1] > 0.0
-    farther = front * (outer.origin[0] - inner.origin[0]) > 0.0
-    planar = abs(outer.origin[2]) <= TOLERANCE and close(outer.origin[1:], inner.origin[1:])
+    outer_farther = front * (outer.origin[0] - inner.origin[0]) > 0.0
+    in_housing_plane = abs(outer.origin[2]) <= TOLERANCE and close(outer.origin[1:], inner.origin[1:])
     knee = outer_knee.origin
     on_axis = knee[2] < 0.0 and abs(knee[0]) <= TOLERANCE and close(knee, inner_knee.origin)
     for joint, holds, problem in (
         (lateral, in_quarter, "expected the hip in its own quarter of the body"),
-        (outer, farther, "expected farther from the body centre than its twin"),
-        (inner, planar, "expected both transversal axes at one y and at z 0"),
+        (outer, outer_farther, "expected farther from the body centre than its twin"),
+        (inner, in_housing_plane, "expected both transversal axes at one y and at z 0"),
         (outer_knee, on_axis, "expected both knees alike, on the thighs' -z axes"),
     ):
         require(holds, file, f"joint {joint.name}", problem)
@@ -180,7 +181,7 @@ def check_leg(description: RobotDescription, leg: str) -> None:
 
 
 def check_lengths(description: RobotDescription, leg: str) -> None:
-    """Refuse a leg with a length near 0 or implausibly large."""
+    """Refuse a leg with a length [m] outside `LENGTH`, or a paw radius outside `PAW_RADIUS`."""
     dimensions, urdf = leg_dimensions(description, leg), description.urdf_path
     axes = abs(dimensions.outer_x - dimensions.inner_x)
     for file, part, name, value, limits in (
@@ -195,8 +196,8 @@ def check_lengths(description: RobotDescription, leg: str) -> None:
 
 
 def check_mirror(description: RobotDescription, leg: str) -> None:
-    """Refuse a leg that does not mirror the front left one (hips may differ in y between front and back)."""
-    flip = np.array([1.0 if leg[0] == "F" else -1.0, 1.0 if leg[1] == "L" else -1.0, 1.0])
+    """Refuse a leg that is no mirror image of the front left one; the y of front and back hips may differ."""
+    flip = np.array([1.0 if leg[0] == "F" else -1.0, 1.0 if leg[1] == "L" else -1.0, 1.0])  # signs of x, y, z
     file = description.urdf_path
     for link in (link for link in description.links if link.name.startswith(leg)):
         twin = description.link(f"FL{link.name[2:]}")
@@ -211,13 +212,13 @@ def check_mirror(description: RobotDescription, leg: str) -> None:
         stops, twin_stops = ([j.lower, j.upper, j.effort, j.velocity] for j in (joint, twin))
         mirrored = close(joint.origin, flip * origin) and close(stops, twin_stops)
         require(mirrored, file, f"joint {joint.name}", f"expected to mirror {twin.name}")
-    own, expected = (leg_dimensions(description, name) for name in (leg, "FL"))
-    mirrored = close([own.shank, own.paw_radius], [expected.shank, expected.paw_radius])
+    lengths, expected = (leg_dimensions(description, name) for name in (leg, "FL"))
+    mirrored = close([lengths.shank, lengths.paw_radius], [expected.shank, expected.paw_radius])
     require(mirrored, file, f"link {leg}_inner_shank", "expected ankle and paw to mirror the FL leg")
 
 
 def check_motors(description: RobotDescription) -> None:
-    """Refuse motors that differ between legs, or from the effort and velocity limits of their joints."""
+    """Refuse motors whose type differs between legs, or whose limits differ from their joint's by over 0.1 %."""
     for index, (name, motor) in enumerate(zip(MOTOR_JOINTS, description.motors, strict=True)):
         kind = description.motors[index % 3].type
         problem = f"expected {kind} as on the FL leg, found {motor.type}"
@@ -230,7 +231,7 @@ def check_motors(description: RobotDescription) -> None:
 
 
 def check_poses(description: RobotDescription) -> None:
-    """Refuse poses outside the stops or where a loop cannot close, and a description without the default pose."""
+    """Refuse a pose outside the stops or whose loops cannot close, and a description without a pose named default."""
     file, leg = description.path, leg_dimensions(description, "FL")
     require("default" in description.poses, file, "poses", "expected a pose named default")
     for name, (lateral, transversal) in description.poses.items():

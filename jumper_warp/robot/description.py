@@ -1,4 +1,4 @@
-"""The robot description: a URDF for the tree, and a JSON file for what a URDF cannot say (loops, motors, poses).
+"""The robot description: a URDF for the tree, and a JSON file for loops, motors and poses, which a URDF cannot hold.
 
 Angles of the legs: lateral positive swings the paw outward; outer and inner thigh positive move the thigh tip away
 from its twin. Quaternions are xyzw.
@@ -33,15 +33,9 @@ from jumper_warp.robot.urdf import UrdfReader, file_inside, read_text
 from jumper_warp.utils.assets import ASSETS
 
 __all__ = [
-    "DEFAULT_DESCRIPTION",
-    "LEGS",
-    "MOTOR_JOINTS",
-    "RobotDescription",
-    "RobotDescriptionError",
-    "knee_angles",
-    "leg_dimensions",
-    "load_description",
-]
+    "DEFAULT_DESCRIPTION", "LEGS", "MOTOR_JOINTS", "RobotDescription", "RobotDescriptionError", "knee_angles",
+    "leg_dimensions", "load_description",
+]  # fmt: skip
 
 DEFAULT_DESCRIPTION = ASSETS / "jumper" / "jumper.json"
 
@@ -49,15 +43,15 @@ RAD_PER_S_PER_RPM = 2.0 * math.pi / 60.0
 
 
 def load_description(path: Path | None = None) -> RobotDescription:
-    """Return the checked robot description of a JSON file, by default the project's own, which is read once.
+    """Return the checked robot description of a JSON file; without a path the project's, which is read once and cached.
 
-    Raises RobotDescriptionError for whatever is missing, malformed or impossible.
+    Raises RobotDescriptionError for anything missing, malformed or implausible.
     """
-    return _own_description(DEFAULT_DESCRIPTION) if path is None else _read_description(Path(path))
+    return _cached_description(DEFAULT_DESCRIPTION) if path is None else _read_description(Path(path))
 
 
 def _read_description(path: Path) -> RobotDescription:
-    """Return the checked robot description of a JSON file."""
+    """Return the checked, read-only robot description of a JSON file and of the URDF that it names."""
     reader = JsonReader(path)
     urdf_file = file_inside(path, reader.get(reader.root, "urdf", "", str), "urdf")
     urdf_text = read_text(urdf_file)
@@ -79,11 +73,14 @@ def _read_description(path: Path) -> RobotDescription:
     return check_description(description)
 
 
-_own_description = functools.cache(_read_description)
+_cached_description = functools.cache(_read_description)
 
 
 class JsonReader:
-    """Reads the JSON part. Every method raises RobotDescriptionError on bad input."""
+    """Reads the JSON file of a description. Every method raises RobotDescriptionError on bad input.
+
+    Parameters: table, a JSON object; key, its entry; part, the place that an error message names ("" for the root).
+    """
 
     def __init__(self, file: Path):
         self.file = file
@@ -100,11 +97,11 @@ class JsonReader:
         self.require(isinstance(self.root, dict), "", "expected a JSON object")
 
     def require(self, holds: bool, part: str, problem: str) -> None:
-        """Refuse the file unless a condition holds."""
+        """Raise RobotDescriptionError for this file unless `holds`; problem: of the message."""
         require(holds, self.file, part, problem)
 
     def unique_keys(self, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        """Build an object, refusing a key that occurs twice."""
+        """Return the (key, value) pairs of a JSON object as a dict; refuse a key that occurs twice."""
         table = dict(pairs)
         if len(table) < len(pairs):
             double = Counter(key for key, _ in pairs).most_common(1)[0][0]
@@ -112,36 +109,36 @@ class JsonReader:
         return table
 
     def refuse_constant(self, name: str) -> None:
-        """Refuse NaN and Infinity."""
+        """Raise RobotDescriptionError; `json` calls it for the constants NaN and Infinity."""
         raise RobotDescriptionError(self.file, "", f"expected finite numbers, found {name}")
 
     def get(self, table: dict, key: str, part: str, kind: type) -> Any:
-        """Return an entry of a given JSON type."""
+        """Return the entry `key` of a JSON object; refuse one that is missing or not of the Python type `kind`."""
         value = table.get(key)
         found = "nothing" if value is None else type(value).__name__
         self.require(isinstance(value, kind), part, f"expected {key} to be a {kind.__name__}, found {found}")
         return value
 
     def number(self, value: Any, key: str, part: str) -> float:
-        """Return a finite number."""
+        """Return a JSON value as a float; refuse anything but a number below 1e9 in magnitude."""
         finite = isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1.0e9
         self.require(finite, part, f"expected {key} to be a finite number, found {value!r:.60}")
         return float(value)
 
     def positive(self, table: dict, key: str, part: str) -> float:
-        """Return a number above zero."""
+        """Return the entry `key`, a finite number above 0, in the unit of the file."""
         number = self.number(table.get(key), key, part)
         self.require(number > 0.0, part, f"expected {key} > 0, found {number}")
         return number
 
     def vector(self, table: dict, key: str, count: int, part: str) -> list[float]:
-        """Return a list of finite numbers."""
+        """Return the entry `key`, a list of `count` finite numbers."""
         values = self.get(table, key, part, list)
         self.require(len(values) == count, part, f"expected {count} numbers in {key}, found {len(values)}")
         return [self.number(value, key, part) for value in values]
 
     def range_deg(self, key: str) -> tuple[float, float]:
-        """Return a (lower, upper) range given in degrees, in radians."""
+        """Return the root's entry `key`, a pair [lower, upper] in degrees, as (lower, upper) in radians."""
         lower, upper = self.vector(self.root, key, 2, "")
         self.require(lower < upper, key, f"expected lower < upper, found {lower} and {upper}")
         return math.radians(lower), math.radians(upper)
@@ -152,22 +149,22 @@ class JsonReader:
             name: self.motor_type(name, self.get(self.root["motor_types"], name, "motor_types", dict))
             for name in self.get(self.root, "motor_types", "", dict)
         }
-        table, motors = self.named("motor", MOTOR_JOINTS), []
+        table, motors = self.table_of("motor", MOTOR_JOINTS), []
         for joint in MOTOR_JOINTS:
             name = self.get(table, joint, "motors", str)
             self.require(name in types, f"motor {joint}", f"unknown motor type {name!r:.60}")
             motors.append(types[name])
         return tuple(motors)
 
-    def named(self, what: str, names: Sequence[str]) -> dict:
-        """Return the object of all motors or loops, which are among some names."""
-        table = self.get(self.root, f"{what}s", "", dict)
+    def table_of(self, noun: str, names: Sequence[str]) -> dict:
+        """Return the root's object "motors" or "loops" (noun: singular); refuse keys that are not among `names`."""
+        table = self.get(self.root, f"{noun}s", "", dict)
         for name in table:
-            self.require(name in names, f"{what} {name}", f"expected one of {', '.join(names)}")
+            self.require(name in names, f"{noun} {name}", f"expected one of {', '.join(names)}")
         return table
 
     def motor_type(self, name: str, table: dict) -> Motor:
-        """Return the constants of one motor type."""
+        """Return the constants of a motor type from its JSON object, whose speeds are in rpm."""
         part = f"motor type {name}"
         gains = self.get(table, "gains", part, dict)
         motor = Motor(
@@ -186,14 +183,14 @@ class JsonReader:
         return motor
 
     def gains(self, table: dict, use: str, part: str) -> Gains:
-        """Return the gains for one use."""
+        """Return kp [N m/rad] and kd [N m s/rad] of the entry `use`, "jumping" or "walking"."""
         gains = self.get(table, use, part, dict)
         return Gains(self.positive(gains, "kp", f"{part} {use}"), self.positive(gains, "kd", f"{part} {use}"))
 
     def loops(self) -> tuple[Loop, ...]:
-        """Return the loop joints in leg order."""
+        """Return the four ankle loops in leg order, anchors (3,) [m]."""
         names = [f"{leg}_ankle" for leg in LEGS]
-        table, loops = self.named("loop", names), []
+        table, loops = self.table_of("loop", names), []
         for name in names:
             loop = self.get(table, name, "loops", dict)
             anchors = (np.array(self.vector(loop, f"{side}_anchor", 3, f"loop {name}")) for side in ("parent", "child"))
@@ -202,7 +199,7 @@ class JsonReader:
         return tuple(loops)
 
     def poses(self) -> dict[str, tuple[float, float]]:
-        """Return the named poses [rad]."""
+        """Return (lateral, transversal) angle [rad] of every leg by the name of the pose."""
         poses = {}
         for name in self.get(self.root, "poses", "", dict):
             pose = self.get(self.root["poses"], name, "poses", dict)

@@ -21,10 +21,9 @@ CELL = 0.02
 
 @dataclass(frozen=True)
 class BlockCfg:
-    """Block in every world that slides on the floor without turning. Each value may be an array, a row per world.
+    """Box in every world that slides on the floor without turning. Each value may be an array, one row per world.
 
-    Its walls are upright and its top is level. The floor's friction acts under the block's own weight and the paws'
-    load. It passes through steps of a heightfield.
+    Floor friction acts under the block's weight and the paws' load. The block passes through steps of a heightfield.
     """
 
     center: tuple[float, float] | np.ndarray
@@ -39,6 +38,7 @@ class BlockCfg:
     """[1] Coefficient of friction between block and floor."""
 
     def __post_init__(self) -> None:
+        """Raise InputError: an extent or the mass is not positive, friction is negative, or a center is not finite."""
         for name in ("half", "height", "mass"):
             if not np.all(np.asarray(getattr(self, name)) > 0.0):
                 raise InputError(f"block {name} must be positive, got {getattr(self, name)}")
@@ -48,9 +48,9 @@ class BlockCfg:
             raise InputError(f"block center must be finite, got {self.center}")
 
     def per_world(self, num_worlds: int) -> dict[str, np.ndarray]:
-        """Return the values of every world by name: `center` and `half` (num_worlds, 2), the others (num_worlds,).
+        """Return the fields by name as arrays: `center`, `half` (num_worlds, 2) [m], the others (num_worlds,).
 
-        Raises ValueError for arrays of another number of worlds.
+        Raises InputError for arrays of another number of worlds.
         """
         shapes = {name: (num_worlds, 2) if name in ("center", "half") else (num_worlds,) for name in vars(self)}
         try:
@@ -60,10 +60,10 @@ class BlockCfg:
 
 
 def platform(height: float, *, edge: float = 0.5, size: float = SIZE, cell: float = CELL) -> newton.Heightfield:
-    """Return level ground with a step across x: z = 0 up to `edge` [m], beyond it `height` [m], negative for a drop.
+    """Return level ground with a step at x = `edge` [m]: z = 0 before it, `height` [m] behind it, negative for a drop.
 
     The edge moves back to the nearest node, and the wall takes one cell. size: edge of the square [m]; cell: largest
-    distance between nodes [m]. Raises ValueError: `height` is zero or not finite, an edge not between 0 and the rim,
+    distance between nodes [m]. Raises InputError: `height` is zero or not finite, an edge not between 0 and the rim,
     or as `uneven` for size and cell.
     """
     x = _nodes(size, cell)
@@ -86,11 +86,11 @@ def uneven(
 ) -> newton.Heightfield:
     """Return smooth random bumps up to `amplitude` [m] high and deep, level within `flat_radius` [m] of the origin.
 
-    The bumps grow to full height over the next two `length`s: the correlation length [m], where the correlation of two
-    heights has fallen to 1/e. With the defaults slopes reach 20 to 25 degrees. size: edge of the square [m]; cell:
-    largest distance between nodes [m].
+    length: correlation length [m], at which the correlation of two heights is 1/e; the bumps grow to full height within
+    two lengths beyond `flat_radius`. size: edge of the square [m]; cell: largest distance between nodes [m]. With the
+    defaults slopes reach 20 to 25 degrees.
 
-    Raises ValueError: a length that is not positive, a cell above half of `size`, or no room beyond `flat_radius`.
+    Raises InputError: a length that is not positive, a cell above half of `size`, or no room beyond `flat_radius`.
     """
     x = _nodes(size, cell)
     if not (amplitude > 0.0 and length > 0.0):
@@ -99,20 +99,20 @@ def uneven(
         raise InputError(f"flat_radius must lie between 0 and {0.5 * size:g} m, got {flat_radius}")
     bumps = _gaussian_field(np.random.default_rng(seed), len(x), x[1] - x[0], length)
     radius = np.hypot(x[:, None], x[None, :])
-    share = np.clip((radius - flat_radius) / (2.0 * length), 0.0, 1.0)
-    bumps *= share * share * (3.0 - 2.0 * share)
+    ramp = np.clip((radius - flat_radius) / (2.0 * length), 0.0, 1.0)
+    bumps *= ramp * ramp * (3.0 - 2.0 * ramp)
     return _heightfield(bumps * amplitude / np.abs(bumps).max(), size)
 
 
 def _nodes(size: float, cell: float) -> np.ndarray:
-    """Return the node coordinates [m] along an axis, from -size/2 to size/2."""
+    """Return the node coordinates [m] along an axis, from -size/2 to size/2, at most `cell` [m] apart."""
     if not (size > 0.0 and 0.0 < cell <= 0.5 * size):
         raise InputError(f"a ground needs size > 0 and 0 < cell <= size / 2, got {size} and {cell}")
     return np.linspace(-0.5 * size, 0.5 * size, int(np.ceil(size / cell - 1.0e-9)) + 1)
 
 
 def _gaussian_field(rng: np.random.Generator, nodes: int, cell: float, length: float) -> np.ndarray:
-    """Return a random field of zero mean and correlation exp(-(distance / length)^2), (nodes, nodes)."""
+    """Return a random field (nodes, nodes), mean 0, correlation exp(-(distance / length)^2); cell, length: [m]."""
     padded = nodes + int(np.ceil(4.0 * length / cell))  # the transform is periodic: opposite rims must not correlate
     wave = 2.0 * np.pi * np.fft.fftfreq(padded, cell)
     spectrum = np.exp(-0.125 * length**2 * (wave[:, None] ** 2 + wave[None, :] ** 2))
@@ -120,7 +120,7 @@ def _gaussian_field(rng: np.random.Generator, nodes: int, cell: float, length: f
 
 
 def _heightfield(heights: np.ndarray, size: float) -> newton.Heightfield:
-    """Return a heightfield of heights [m], rows along y."""
+    """Return a square heightfield of edge `size` [m]; heights: (n, n) [m], rows along y, columns along x."""
     rows, cols = heights.shape
     half = 0.5 * size
     return newton.Heightfield(data=heights.astype(np.float32), nrow=rows, ncol=cols, hx=half, hy=half)

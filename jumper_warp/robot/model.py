@@ -29,21 +29,21 @@ PHYSICS_DT = 1.0 / 480.0
 
 CONTACT_STIFFNESS = 56689.0
 CONTACT_DAMPING = 476.0
-"""Contact `ke` and `kd`: MuJoCo's solref becomes (2 / kd, kd / (2 sqrt(ke))), critically damped over two physics
-steps. Softer contacts cost jump height."""
-CONTACT_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)
+"""Contact `ke` [N/m] and `kd` [N s/m]: MuJoCo's solref becomes (2 / kd, kd / (2 sqrt(ke))), critically damped over two
+physics steps. Softer contacts cost jump height."""
+CONTACT_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)  # MuJoCo's solimp: dmin, dmax, width [m], midpoint, power
 GROUND_FRICTION = 1.0e-4
 """[1] Nearly 0: a contact takes the larger of its two coefficients, so the paw's."""
 MAX_FRICTION = 10.0
 """[1] Of the paws: ten times that of rubber on concrete."""
-GROUND_COLOR = (0.42, 0.46, 0.48)
+GROUND_COLOR = (0.42, 0.46, 0.48)  # red, green, blue, 0 to 1
 LIMIT_STIFFNESS = CONTACT_STIFFNESS
 """[N m/rad] Stiffness of hard stops: plastic for SolverJumper, critically damped over two physics steps for MuJoCo."""
-LIMIT_DAMPING = CONTACT_DAMPING
+LIMIT_DAMPING = CONTACT_DAMPING  # [N m s/rad]
 NO_EFFORT_LIMIT = 1.0e6
-"""[N m] Motor models saturate torque; the model itself does not. A knee's limit is that of its damping."""
+"""[N m] Effort limit of motor joints, never reached: motor models saturate torque. A knee's limit is its damping's."""
 KNEE_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (2, 4)]
-"""A world's knees in `joint_qd`."""
+"""Indices of a world's eight knees in its 38 `joint_qd`: outer, inner of each leg."""
 PAWS = tuple(f"{leg}_paw" for leg in LEGS)
 """Labels of the paws' shapes, without the world's prefix."""
 PAW_GROUP = -1
@@ -71,17 +71,17 @@ def build_model(
         description: The robot; by default the project's own.
         ground: "plane" (z = 0), a heightfield, or None for free flight.
         friction: Coulomb friction coefficient of the paws [1].
-        gravity: Downward, of every world [m/s^2]; `model.gravity` holds that of each.
+        gravity: Downward, of every world [m/s^2]; `model.gravity` (num_worlds + 1,) vec3 can differ by world.
         requires_grad: Whether the model's arrays carry gradients.
         visuals: Whether to add shapes that only viewers see. Without them large batches build faster.
-        extras: Adds the caller's own sites and shapes. It is called once, with the builder of one robot, whose links
-            are `builder.body_label.index("FL_inner_shank")` and so on; what it adds is in every world, with the
-            world's prefix before its label. Sites and shapes that do not collide serve sensors and viewers on every
-            solver. Colliding shapes and obstacles (body -1) act on Newton's solvers; SolverJumper ignores them with
-            a warning, and refuses bodies, joints and particles.
+        extras: Function that adds the caller's sites and shapes to the builder of one robot; it is called once, and
+            every world gets a copy whose labels start with `world_i/`. A link's index is
+            `builder.body_label.index("FL_inner_shank")`. Sites and shapes that do not collide work with every solver.
+            Colliding shapes and obstacles (body -1) act in Newton's solvers; SolverJumper ignores them with a warning.
+            It refuses bodies, joints and particles.
 
     Raises:
-        ValueError: `num_worlds` no whole number above 0, `friction` not in 0 to 10, `gravity` not in 0 to 100, or an
+        InputError: `num_worlds` no whole number above 0, `friction` not in 0 to 10, `gravity` not in 0 to 100, or an
             unknown `ground`.
         RobotDescriptionError: the default description cannot be read.
     """
@@ -101,7 +101,7 @@ def build_model(
 
 
 def other_colliders(model: Model) -> np.ndarray:
-    """Return the indices of the colliding shapes that are neither paws nor the shared ground."""
+    """Return the shape indices (n,) int of the colliding shapes that are neither paws nor the shared ground."""
     flags, worlds, kinds = model.shape_flags.numpy(), model.shape_world.numpy(), model.shape_type.numpy()
     ground = (worlds == -1) & np.isin(kinds, [int(newton.GeoType.PLANE), int(newton.GeoType.HFIELD)])
     colliding = np.flatnonzero(((flags & int(newton.ShapeFlags.COLLIDE_SHAPES)) != 0) & ~ground)
@@ -109,17 +109,14 @@ def other_colliders(model: Model) -> np.ndarray:
 
 
 def leg_geometry(description: RobotDescription) -> list[dict]:
-    """Return the fields of the kernels' `LegGeometry` for the four legs, derived from the joint origins."""
+    """Return the fields of the kernels' `LegGeometry` by name, one dict per leg in FL, FR, BL, BR order."""
     return [dataclasses.asdict(leg_dimensions(description, leg)) for leg in LEGS]
 
 
 def leg_geometry_array(
     description: RobotDescription, geometry_module: ModuleType, device: wp.DeviceLike = None
 ) -> wp.array:
-    """Return the four legs as a `wp.array` of the module's LegGeometry.
-
-    `geometry_module` is `jumper_warp.kernels.kinematics.geometry` or its double-precision twin.
-    """
+    """Return the legs' `LegGeometry`, (4,); geometry_module: `kernels.kinematics.geometry` in either precision."""
     legs = []
     for fields in leg_geometry(description):
         leg = geometry_module.LegGeometry()
@@ -130,7 +127,7 @@ def leg_geometry_array(
 
 
 def standing_configuration(description: RobotDescription, pose: str = "default") -> np.ndarray:
-    """Return one world's `joint_q`, shape (43,): level base at the origin, paws touching z = 0, in a named pose.
+    """Return one world's `joint_q`, (43,), in a named pose: level base at x = y = 0, the lowest paws touching z = 0.
 
     Raises KeyError for an unknown pose.
     """
@@ -149,7 +146,10 @@ def standing_configuration(description: RobotDescription, pose: str = "default")
 
 
 def _paw_depth(leg: LegDimensions, lateral: float, ankle_z: float) -> float:
-    """Return the distance [m] of the paw's lowest point below the hips, for a level base."""
+    """Return the depth [m] of a paw's lowest point below the hips of a level base.
+
+    lateral: motor angle [rad]; ankle_z: height of the ankle in the housing frame [m], negative below the hip.
+    """
     ankle_y = leg.plane_y + leg.knee_y
     return leg.paw_radius - math.cos(lateral) * ankle_z - leg.side * math.sin(lateral) * ankle_y
 
@@ -157,7 +157,7 @@ def _paw_depth(leg: LegDimensions, lateral: float, ankle_z: float) -> float:
 def _robot_builder(
     description: RobotDescription, friction: float, gravity: float, visuals: bool
 ) -> newton.ModelBuilder:
-    """Return the builder of one robot in the default pose, with the world's gravity [m/s^2]."""
+    """Return the builder of one robot in the default pose; friction: of the paws [1]; gravity: downward [m/s^2]."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     bodies = {}
@@ -181,7 +181,7 @@ def _robot_builder(
 
 
 def _add_joints(builder: newton.ModelBuilder, bodies: dict[str, int], description: RobotDescription) -> None:
-    """Add the base, the tree as one articulation, and the loop joints outside it."""
+    """Add base and hinges as one articulation, then the loop joints outside it; bodies: indices by link name."""
     motors = dict(zip(MOTOR_JOINTS, description.motors, strict=True))
     tree = [builder.add_joint_free(bodies["body"], label="base")]
     for joint in description.joints:
@@ -217,7 +217,7 @@ def _add_joints(builder: newton.ModelBuilder, bodies: dict[str, int], descriptio
 def _add_paw(
     builder: newton.ModelBuilder, body: int, paw: Shape, label: str, friction: float, *, visible: bool
 ) -> None:
-    """Add the sphere of a paw; it is hidden where a visual shape shows the paw."""
+    """Add a paw's collision sphere to a body; friction: Coulomb coefficient [1]; visible: whether viewers show it."""
     config = newton.ModelBuilder.ShapeConfig(
         density=0.0,
         mu=friction,
@@ -237,7 +237,7 @@ def _add_paw(
 
 
 def _add_visuals(builder: newton.ModelBuilder, body: int, link: Link, meshes: dict[int, newton.Mesh]) -> None:
-    """Add massless shapes without collision; equal meshes are shared."""
+    """Add a link's massless, non-colliding shapes to a body; meshes: cache by id of the description's mesh."""
     config = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False, has_particle_collision=False)
     for index, shape in enumerate(link.visuals):
         common = {
@@ -262,7 +262,7 @@ def _add_visuals(builder: newton.ModelBuilder, body: int, link: Link, meshes: di
 
 
 def _add_ground(builder: newton.ModelBuilder, ground: str | newton.Heightfield | None) -> None:
-    """Add the ground that all worlds share. Raises ValueError."""
+    """Add the ground that all worlds share: "plane", a heightfield or None. Raises InputError for anything else."""
     config = newton.ModelBuilder.ShapeConfig(density=0.0, mu=GROUND_FRICTION, ke=CONTACT_STIFFNESS, kd=CONTACT_DAMPING)
     common = {
         "cfg": config,

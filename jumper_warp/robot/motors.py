@@ -17,15 +17,14 @@ from jumper_warp.robot.parts import Motor
 from jumper_warp.utils.checks import check_count, check_not_negative
 from jumper_warp.utils.errors import InputError
 
-OVERSPEED_START = math.radians(2000.0)
-OVERSPEED_END = math.radians(2500.0)
-"""[rad/s] Speeds at which the torque begins to fade, and is 0."""
+OVERSPEED_START, OVERSPEED_END = math.radians(2000.0), math.radians(2500.0)
+"""[rad/s] Speeds at which over-speed protection starts to reduce the torque, and at which the torque is 0."""
 MOTOR_CONSTANTS = ("kp", "kd", "saturation", "peak", "cutoff_speed", "no_load_speed", "offset")
 """Constants of a motor in `MotorArrays`; units as in `jumper_warp.kernels.actuation.motors`."""
 LIMITS = ("lower", "upper", "lower_zone", "upper_zone")
-FILTER_NAMES = (*(f"{what}.{limit}" for what in ("lateral", "transversal", "sum") for limit in LIMITS), "horizon",
+FILTER_NAMES = (*(f"{angle}.{limit}" for angle in ("lateral", "transversal", "sum") for limit in LIMITS), "horizon",
                 "speed_floor")  # fmt: skip
-"""Rows of `filter_constants`: angles [rad], horizon [s], speed [rad/s]. Zones only switch: their gradient is 0."""
+"""Names of the 14 entries of `filter_constants`: angles [rad], horizon [s], speed [rad/s]; zones have no gradient."""
 
 
 @dataclass(frozen=True)
@@ -37,16 +36,16 @@ class MotorKindCfg:
     kd: float
     """[N m s/rad]"""
     saturation: float
-    """[N m] Largest torque that the controller asks for."""
+    """[N m] Limit of the commanded torque."""
     peak: float
-    """[N m] Largest torque that the motor gives, up to the cutoff speed."""
+    """[N m] Largest torque of the motor, up to the cutoff speed."""
     cutoff_speed: float
-    """[rad/s] Full driving torque up to here."""
+    """[rad/s] Speed up to which full driving torque is available."""
     no_load_speed: float
-    """[rad/s] No driving torque from here."""
+    """[rad/s] Speed from which no driving torque is available."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
+        """Raise InputError: a value is negative or not finite, a torque limit is 0, or the speeds do not rise."""
         for name, value in vars(self).items():
             check_not_negative(f"motor {name}", value)
         if self.saturation == 0.0 or self.peak == 0.0:
@@ -62,12 +61,12 @@ class MotorCfg:
     lateral: MotorKindCfg
     transversal: MotorKindCfg
     fade_start: float = OVERSPEED_START
-    """[rad/s] Over-speed protection takes torque away from here."""
+    """[rad/s] Speed at which over-speed protection starts to reduce the torque."""
     fade_end: float = OVERSPEED_END
-    """[rad/s] No torque from here."""
+    """[rad/s] Speed from which the torque is 0."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
+        """Raise InputError unless 0 <= fade_start < fade_end, both finite."""
         if not 0.0 <= self.fade_start < self.fade_end < math.inf:
             raise InputError(f"fade_start and fade_end must rise, got {self.fade_start}, {self.fade_end}")
 
@@ -79,9 +78,9 @@ class MotorCfg:
         lateral_torque: float,
         transversal_torque: float,
     ) -> MotorCfg:
-        """Return the robot's motors with a choice of gains and torque limits [N m], cut to what each motor can give.
+        """Return the description's motors with its jumping or walking gains and the given torque limits [N m].
 
-        Raises ValueError if the motors of one kind are not alike.
+        A limit is cut to the motor's peak torque. Raises InputError if the motors of one kind are not of one type.
         """
         motors = description.motors
         if len({*motors[0::3]}) > 1 or len({*motors[1::3], *motors[2::3]}) > 1:
@@ -90,20 +89,20 @@ class MotorCfg:
 
 
 def motor_kind(motor: Motor, gains: Literal["jumping", "walking"], torque: float) -> MotorKindCfg:
-    """Return the settings of a motor type, limited to `torque` [N m] and to its peak torque."""
-    chosen = getattr(motor, gains)
+    """Return a motor type's constants with one set of gains, limited to `torque` [N m] and its peak torque."""
+    pd = getattr(motor, gains)
     saturation, peak = min(torque, motor.peak_torque), motor.peak_torque
-    return MotorKindCfg(chosen.kp, chosen.kd, saturation, peak, motor.cutoff_speed, motor.no_load_speed)
+    return MotorKindCfg(pd.kp, pd.kd, saturation, peak, motor.cutoff_speed, motor.no_load_speed)
 
 
 def jumping_motors(torque: float = 18.0, lateral_torque: float | None = None) -> MotorCfg:
-    """Return the motors for jumping, limited to a torque [N m]; `lateral_torque` defaults to the same."""
+    """Return the project's motors with jumping gains, limited to torques [N m]; lateral_torque defaults to `torque`."""
     lateral_torque = torque if lateral_torque is None else lateral_torque
     return MotorCfg.from_description(load_description(), "jumping", lateral_torque, torque)
 
 
 def walking_motors(torque: float = 10.0) -> MotorCfg:
-    """Return the motors for walking, limited to a torque [N m]."""
+    """Return the project's motors with walking gains, limited to a torque [N m]."""
     return MotorCfg.from_description(load_description(), "walking", torque, torque)
 
 
@@ -115,21 +114,21 @@ def motor_arrays(
     device: wp.DeviceLike = None,
     requires_grad: bool = False,
 ) -> Any:
-    """Return the `MotorArrays` of `num_worlds` equal worlds, without sensor offsets.
+    """Return the `MotorArrays` of `num_worlds` equal worlds, arrays (12, num_worlds), without sensor offsets.
 
-    module: `actuator` in either precision. Raises ValueError for less than one world.
+    module: `jumper_warp.kernels.actuation.motors` in either precision. Raises InputError for less than one world.
     """
     check_count("num_worlds", num_worlds)
 
-    def spread(lateral: float, transversal: float) -> wp.array:
+    def per_motor(lateral: float, transversal: float) -> wp.array:
         column = np.tile([lateral, transversal, transversal], 4)[:, None]
         values = np.repeat(column, num_worlds, axis=1)
         return wp.array(values, dtype=module.real, device=device, requires_grad=requires_grad)
 
     motors = module.MotorArrays()
     for name in vars(cfg.lateral):
-        setattr(motors, name, spread(getattr(cfg.lateral, name), getattr(cfg.transversal, name)))
-    motors.offset = spread(0.0, 0.0)
+        setattr(motors, name, per_motor(getattr(cfg.lateral, name), getattr(cfg.transversal, name)))
+    motors.offset = per_motor(0.0, 0.0)
     motors.fade_start = cfg.fade_start
     motors.fade_end = cfg.fade_end
     return motors
@@ -137,7 +136,7 @@ def motor_arrays(
 
 @dataclass(frozen=True)
 class LimitsCfg:
-    """Limits of one quantity that the filter watches."""
+    """Limits of one angle, or sum of angles, that the filter enforces."""
 
     lower: float
     """[deg]"""
@@ -149,7 +148,7 @@ class LimitsCfg:
     """[deg] Width of the hard zone before the upper limit."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
+        """Raise InputError: the limits do not rise or are not finite, or the zones are negative or overlap."""
         if not -math.inf < self.lower < self.upper < math.inf:
             raise InputError(f"limits must be finite and rise, got {self.lower}, {self.upper}")
         if not (self.lower_zone >= 0.0 and self.upper_zone >= 0.0):
@@ -160,19 +159,19 @@ class LimitsCfg:
 
 @dataclass(frozen=True)
 class FilterCfg:
-    """Settings of the motor command filter."""
+    """Settings of the motor command filter, which keeps motor targets [rad] away from limits of the angles."""
 
     lateral: LimitsCfg
     transversal: LimitsCfg
     sum: LimitsCfg
-    """Of the two transversal angles of a leg."""
+    """Limits of outer + inner angle of a leg."""
     horizon: float
     """[s] Time to violation below which the limits begin to bind."""
     speed_floor: float = 60.0
     """[deg/s] Least speed assumed toward a limit."""
 
     def __post_init__(self) -> None:
-        """Check the values."""
+        """Raise InputError unless horizon and speed floor are finite and above 0."""
         for name in ("horizon", "speed_floor"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise InputError(f"filter {name} must be finite and > 0, got {getattr(self, name)}")
@@ -193,19 +192,19 @@ def horizontal_jump_filter() -> FilterCfg:
 
 
 def walking_filter() -> FilterCfg:
-    """Return the filter for walking: no hard zones, and the lateral range that the robot's hard stops leave."""
+    """Return the filter for walking: no hard zones, lateral limits at the robot's hard stops."""
     lateral, transversal = LimitsCfg(-50.0, 110.0), LimitsCfg(-30.0, 140.0)
     return FilterCfg(lateral, transversal, sum=LimitsCfg(0.0, 220.0), horizon=5.0 / 60.0)
 
 
 def loose_filter() -> FilterCfg:
-    """Return a filter that looks two policy steps ahead and leaves full torque to the last, for the highest jumps."""
+    """Return a filter with a horizon of two policy steps and no hard zones, for the highest jumps."""
     lateral, transversal = LimitsCfg(-15.0, 15.0), LimitsCfg(-30.0, 140.0)
     return FilterCfg(lateral, transversal, sum=LimitsCfg(0.0, 240.0), horizon=2.0 / 60.0)
 
 
 def filter_params(cfg: FilterCfg, *, module: ModuleType = command_filter) -> Any:
-    """Return the `FilterParams` of a filter; module: `command_filter` in either precision."""
+    """Return the kernels' `FilterParams`, angles in radians; module: `command_filter` in either precision."""
     params = module.FilterParams()
     for name in ("lateral", "transversal", "sum"):
         limits = module.Limits()
@@ -218,7 +217,7 @@ def filter_params(cfg: FilterCfg, *, module: ModuleType = command_filter) -> Any
 
 
 def filter_constants(cfg: FilterCfg | None) -> np.ndarray:
-    """Return a filter's constants, (14,), in the order of `FILTER_NAMES`; None: those of the vertical jump."""
+    """Return a filter's constants, (14,), in the order and units of `FILTER_NAMES`; None: the vertical jump's."""
     cfg = cfg or vertical_jump_filter()
-    angles = [getattr(getattr(cfg, what), limit) for what in ("lateral", "transversal", "sum") for limit in LIMITS]
+    angles = [getattr(getattr(cfg, angle), limit) for angle in ("lateral", "transversal", "sum") for limit in LIMITS]
     return np.array([*np.radians(angles), cfg.horizon, math.radians(cfg.speed_floor)])

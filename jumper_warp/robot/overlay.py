@@ -1,4 +1,4 @@
-"""Robot overlays: JSON files of values that replace described ones, and ranges of randomisation around them."""
+"""Robot overlays: JSON files with values that replace those of the description, and randomisation ranges."""
 
 from __future__ import annotations
 
@@ -39,26 +39,26 @@ RANGES = {
     "spring_stiffness": bounds.SPRING_STIFFNESS,
     "spring_length": bounds.SPRING_LENGTH,
 }
-"""Allowed values of each quantity."""
+"""Allowed values by field of `RobotValues`."""
 SECTIONS = ("schema", "source", "values", "randomization")
 RANDOMIZED = (
     "static_friction", "dynamic_friction", "base_mass", "link_mass", "com_shift", "gains", "damping_gains",
     "no_load_speed", "cutoff_speed", "motor_friction", "armature", "joint_offset", "latency", "observation_latency",
     "push_force", "push_torque", "push_interval",
 )  # fmt: skip
-"""Allowed ranges: the rows of `RandomizationCfg`."""
+"""Names that `RobotOverlay.randomization` may have: the ranges of `RandomizationCfg`."""
 
 
 @dataclass(frozen=True, eq=False)
 class RobotOverlay:
-    """Values of one robot that replace described ones, and ranges of randomisation around them."""
+    """Values of one robot that replace those of the description, and randomisation ranges around them."""
 
     values: Mapping[str, tuple[float, ...]]
-    """Fields of `RobotValues` that differ from the description, of one robot."""
+    """By field of `RobotValues`, its values for one robot, in its unit."""
     randomization: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """Rows of `RandomizationCfg`, relative to these values."""
+    """By field of `RandomizationCfg`, its range (lower, upper), relative to these values."""
     source: str = ""
-    """Origin of the values, for the reader."""
+    """Origin of the values, free text."""
 
     def __post_init__(self) -> None:
         """Raises InputError: an unknown quantity or range, a wrong number of values, or one out of range."""
@@ -74,7 +74,7 @@ class RobotOverlay:
             raise InputError("robot overlay: each cutoff_speed must be below the no_load_speed")
 
     def robots(self, description: RobotDescription | None = None) -> RobotValues:
-        """Return the values of the robot, N = 1; other values are as described."""
+        """Return all values of the robot, N = 1; those that the overlay lacks come from the description."""
         robot = RobotValues.nominal(1, description)
         for name, values in self.values.items():
             getattr(robot, name)[0] = values
@@ -86,7 +86,7 @@ class RobotOverlay:
         return self.values["latency"][0] if "latency" in self.values else None
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of the JSON file."""
+        """Return the content of the JSON file, with the keys `SECTIONS`."""
         return {
             "schema": SCHEMA,
             "source": self.source,
@@ -96,7 +96,7 @@ class RobotOverlay:
 
     @classmethod
     def from_json(cls, saved: Any) -> RobotOverlay:
-        """Return the overlay of `to_json`. Raises InputError for anything else."""
+        """Return the overlay that `to_json` wrote as `saved`. Raises InputError for anything else."""
         if not isinstance(saved, dict) or saved.get("schema") != SCHEMA:
             raise InputError(f"not a robot overlay: expected an object with schema {SCHEMA!r}")
         check_names("section", saved, SECTIONS)
@@ -105,7 +105,7 @@ class RobotOverlay:
             table = saved.get(section, {})
             if not isinstance(table, dict):
                 raise InputError(f"robot overlay: {section} must be an object")
-            sections[section] = {name: numbers(f"{section} {name}", values) for name, values in table.items()}
+            sections[section] = {name: finite_tuple(f"{section} {name}", values) for name, values in table.items()}
         for name, pair in sections["randomization"].items():
             if len(pair) != 2 or pair[0] > pair[1]:
                 raise InputError(f"robot overlay: randomization {name!r:.60} must be two rising numbers, got {pair}")
@@ -116,15 +116,15 @@ class RobotOverlay:
         write_atomically(path, (json.dumps(self.to_json(), indent=2, allow_nan=False) + "\n").encode())
 
 
-def check_names(what: str, names: Iterable[str], known: Iterable[str]) -> None:
-    """Raise InputError for a name that is not among the known ones; what: kind of name, for the message."""
+def check_names(noun: str, names: Iterable[str], known: Iterable[str]) -> None:
+    """Raise InputError for a name that is not among the known ones; noun: kind of name, for the message."""
     for name in names:
         if name not in known:
-            raise InputError(f"robot overlay: no {what} {name!r:.60}; there are {', '.join(known)}")
+            raise InputError(f"robot overlay: no {noun} {name!r:.60}; there are {', '.join(known)}")
 
 
 def check_range(name: str, values: tuple[float, ...]) -> None:
-    """Raise InputError for a value of a quantity outside `RANGES`."""
+    """Raise InputError for a value outside RANGES[name]."""
     low, high, unit = RANGES[name]
     hint = " (a ratio: 1 is as described)" if RANGES[name] is RATIO else ""
     for value in values:
@@ -133,8 +133,8 @@ def check_range(name: str, values: tuple[float, ...]) -> None:
             raise InputError(f"robot overlay: {name} must be in {limits}, got {value:.6g}")
 
 
-def numbers(name: str, values: Any) -> tuple[float, ...]:
-    """Return a list of finite numbers as a tuple. Raises InputError: anything else; name: for the message."""
+def finite_tuple(name: str, values: Any) -> tuple[float, ...]:
+    """Return a list of finite numbers as a tuple. Raises InputError for anything else; name: for the message."""
     if not isinstance(values, list) or any(isinstance(x, bool) or not isinstance(x, int | float) for x in values):
         raise InputError(f"robot overlay: {name!r:.60} must be a list of numbers")
     if not all(math.isfinite(x) for x in values):
@@ -143,7 +143,7 @@ def numbers(name: str, values: Any) -> tuple[float, ...]:
 
 
 def with_springs(stiffness: float, length: float) -> RobotOverlay:
-    """Return an overlay with springs between the knees of each leg, of a stiffness [N/m] and a rest length [m].
+    """Return an overlay with springs of a stiffness [N/m] and rest length [m] between the two knees of each leg.
 
     Raises InputError: one of them is out of range.
     """
@@ -151,7 +151,7 @@ def with_springs(stiffness: float, length: float) -> RobotOverlay:
 
 
 def load_overlay(path: Path) -> RobotOverlay:
-    """Return the overlay of a file. Raises InputError: not an overlay, or OSError: it cannot be read."""
+    """Return the overlay of a JSON file. Raises InputError: it is no overlay, or OSError: it cannot be read."""
     try:
         return RobotOverlay.from_json(json.loads(Path(path).read_text(encoding="utf-8")))
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
@@ -160,7 +160,7 @@ def load_overlay(path: Path) -> RobotOverlay:
         raise InputError(f"{path}: {error}") from None
 
 
-def overlay_of(values: RobotValues, quantities: tuple[str, ...], **more: Any) -> RobotOverlay:
-    """Return the overlay that sets some quantities to the values of the first of N robots; more: its other fields."""
-    chosen = {name: tuple(float(x) for x in np.asarray(getattr(values, name))[0]) for name in quantities}
-    return RobotOverlay(chosen, **more)
+def overlay_of(values: RobotValues, quantities: tuple[str, ...], **fields: Any) -> RobotOverlay:
+    """Return the overlay of the named quantities of the first of N robots; fields: other fields of `RobotOverlay`."""
+    selected = {name: tuple(float(x) for x in np.asarray(getattr(values, name))[0]) for name in quantities}
+    return RobotOverlay(selected, **fields)

@@ -20,7 +20,7 @@ MOTOR_JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("lateral", "
 
 
 class RobotDescriptionError(InputError):
-    """A robot description that cannot be used. The message is one line: file, part, what was expected."""
+    """An unusable robot description. The message is one line: "FILE: PART: PROBLEM", without PART if it is empty."""
 
     def __init__(self, file: Path, part: str, problem: str):
         place = f"{file}: {part}" if part else f"{file}"
@@ -28,17 +28,17 @@ class RobotDescriptionError(InputError):
 
 
 def require(holds: bool, file: Path, part: str, problem: str) -> None:
-    """Raise RobotDescriptionError unless a condition holds."""
+    """Raise RobotDescriptionError(file, part, problem) unless `holds`."""
     if not holds:
         raise RobotDescriptionError(file, part, problem)
 
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """A triangle mesh: vertices [m] (n, 3) and indices (m, 3)."""
+    """A triangle mesh."""
 
-    vertices: np.ndarray
-    triangles: np.ndarray
+    vertices: np.ndarray  # (n, 3) [m], shape frame
+    triangles: np.ndarray  # (m, 3) int32, indices of vertices
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +48,12 @@ class Shape:
     kind: str
     """"box", "cylinder", "sphere" or "mesh"."""
     size: tuple[float, ...]
-    """[m] box: full edges; cylinder (axis z): radius, length; sphere: radius; mesh: empty."""
+    """[m] box: three full edges; cylinder (axis z): radius, length; sphere: radius; mesh: empty."""
     position: np.ndarray
     """[m] (3,), link frame."""
     rotation: np.ndarray
     """(4,) xyzw, shape to link frame."""
-    color: tuple[float, float, float] | None = None
+    color: tuple[float, float, float] | None = None  # red, green, blue, 0 to 1
     mesh: TriangleMesh | None = None
 
 
@@ -69,7 +69,7 @@ class Link:
     inertia: np.ndarray
     """[kg m^2] (3, 3), about the centre of mass, axes of the link frame."""
     visuals: tuple[Shape, ...]
-    collisions: tuple[Shape, ...]
+    collisions: tuple[Shape, ...]  # a paw, on the inner shank alone
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,20 +77,16 @@ class Joint:
     """A hinge. The child link's frame sits at `origin` and is parallel to the parent's at angle zero."""
 
     name: str
-    parent: str
-    child: str
+    parent: str  # name of the link
+    child: str  # name of the link
     origin: np.ndarray
     """[m] (3,), parent link frame."""
     axis: np.ndarray
     """(3,) unit vector, parent link frame."""
-    lower: float
-    """[rad]"""
-    upper: float
-    """[rad]"""
-    effort: float
-    """[N m]"""
-    velocity: float
-    """[rad/s]"""
+    lower: float  # [rad] hard stop
+    upper: float  # [rad] hard stop
+    effort: float  # [N m] limit
+    velocity: float  # [rad/s] limit
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,8 +94,8 @@ class Loop:
     """A joint that closes a loop: the two anchor points coincide."""
 
     name: str
-    parent: str
-    child: str
+    parent: str  # name of the link
+    child: str  # name of the link
     parent_anchor: np.ndarray
     """[m] (3,), parent link frame."""
     child_anchor: np.ndarray
@@ -110,18 +106,16 @@ class Loop:
 class Gains:
     """Gains of a motor's position control."""
 
-    kp: float
-    """[N m/rad]"""
-    kd: float
-    """[N m s/rad]"""
+    kp: float  # [N m/rad]
+    kd: float  # [N m s/rad]
 
 
 @dataclass(frozen=True)
 class Motor:
     """Constants of one motor type, at the output of its gear."""
 
-    type: str
-    gear_ratio: float
+    type: str  # name, as "AK70-10"
+    gear_ratio: float  # [1] rotor speed over output speed
     rotor_inertia: float
     """[kg m^2], before the gear."""
     peak_torque: float
@@ -132,8 +126,8 @@ class Motor:
     """[rad/s] Speed at which the torque has fallen linearly to 0."""
     coulomb_friction: float
     """[N m]"""
-    jumping: Gains
-    walking: Gains
+    jumping: Gains  # for the jump tasks
+    walking: Gains  # for the velocity tasks
 
     @property
     def armature(self) -> float:
@@ -145,24 +139,21 @@ class Motor:
 class RobotDescription:
     """Robot independent of a simulator: links, joints, loops, motors and poses; `dataclasses.replace` modifies it."""
 
-    path: Path
-    """The description file."""
+    path: Path  # JSON file
     urdf_path: Path
-    urdf: str
-    """Text of the tree's URDF."""
-    links: tuple[Link, ...]
-    joints: tuple[Joint, ...]
-    loops: tuple[Loop, ...]
-    motors: tuple[Motor, ...]
-    """12, in motor order."""
+    urdf: str  # text of the URDF
+    links: tuple[Link, ...]  # 21, body first, then leg by leg
+    joints: tuple[Joint, ...]  # 20 hinges, leg by leg
+    loops: tuple[Loop, ...]  # 4, in leg order
+    motors: tuple[Motor, ...]  # 12, in motor order
     knee_damping: float
     """[N m s/rad], every knee."""
     knee_damping_limit: float
     """[N m] Largest torque of a knee's damping."""
     transversal_sum: tuple[float, float]
-    """[rad] Stops of outer plus inner angle of a leg."""
+    """[rad] Lower and upper stop of the sum outer + inner angle of a leg."""
     poses: Mapping[str, tuple[float, float]]
-    """Named poses: lateral and transversal angle [rad], the same for every leg."""
+    """(lateral, transversal) angle [rad] of every leg by name of the pose; outer and inner are both transversal."""
 
     @property
     def mass(self) -> float:
@@ -178,17 +169,17 @@ class RobotDescription:
         return {joint.name: joint for joint in self.joints}[name]
 
     def pose(self, name: str) -> np.ndarray:
-        """Return the 12 motor angles [rad] of a named pose. Raises KeyError."""
+        """Return the motor angles (12,) [rad] of a named pose, in motor order. Raises KeyError."""
         lateral, transversal = self.poses[name]
         return np.tile([lateral, transversal, transversal], 4)
 
 
 def make_read_only(part: Any) -> None:
-    """Make the arrays of a description, or of a part of it, read-only."""
+    """Make all arrays in a description, or in a part of it, read-only, in place."""
     if isinstance(part, np.ndarray):
         part.setflags(write=False)
     elif isinstance(part, tuple):
-        for each in part:
-            make_read_only(each)
+        for member in part:
+            make_read_only(member)
     elif is_dataclass(part):
         make_read_only(tuple(vars(part).values()))

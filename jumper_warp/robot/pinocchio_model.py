@@ -18,12 +18,10 @@ from jumper_warp.robot.values import LINK_KINDS, RobotValues
 from jumper_warp.utils.errors import InputError
 
 pin: Any = pinocchio  # a compiled module without types
-PROXIMAL_ACCURACY = 1.0e-12
-PROXIMAL_DAMPING = 1.0e-10
-"""A planar loop has three rows of rank two; the proximal term keeps the solve regular."""
+PROXIMAL_ACCURACY = 1.0e-12  # residual at which Pinocchio's proximal iteration ends
+PROXIMAL_DAMPING = 1.0e-10  # proximal mu: keeps the solve regular, since a planar loop has three rows of rank two
 PROXIMAL_ITERATIONS = 20
-CLOSED = 1.0e-9
-"""[m] Largest gap of a loop that counts as closed."""
+MAX_GAP = 1.0e-9  # [m] of a closed loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,30 +30,23 @@ class PinocchioRobot:
 
     Velocities follow Pinocchio: the base's six are the linear velocity of the body origin [m/s] and the angular
     velocity [rad/s], both in the body frame. Joints are in Pinocchio's own order; the index arrays map to it.
-    The buffers in `data` are overwritten by every call.
+    Every call overwrites the buffers in `data`. q: configuration (27,), v: velocity (26,).
     """
 
-    model: Any
-    """`pinocchio.Model`"""
-    data: Any
-    """`pinocchio.Data`"""
-    constraints: Any
-    """Loop constraint models, in leg order."""
-    constraint_data: Any
-    motor_q: np.ndarray
-    """(12,) index into q of each motor, in motor order."""
-    motor_v: np.ndarray
-    """(12,) index into v."""
-    knee_q: np.ndarray
-    """(8,) index into q of the knees: outer, inner per leg."""
-    knee_v: np.ndarray
-    """(8,) index into v."""
+    model: Any  # pinocchio.Model
+    data: Any  # pinocchio.Data
+    constraints: Any  # four RigidConstraintModel, one per loop, in leg order
+    constraint_data: Any  # four RigidConstraintData
+    motor_q: np.ndarray  # (12,) index into q of each motor, in motor order
+    motor_v: np.ndarray  # (12,) index into v of each motor
+    knee_q: np.ndarray  # (8,) index into q of the knees: outer, inner of each leg
+    knee_v: np.ndarray  # (8,) index into v of the knees
 
     def configuration(self, base_pos: np.ndarray, base_quat_xyzw: np.ndarray, motors: np.ndarray) -> np.ndarray:
-        """Return q, shape (27,), with the knee angles that close the loops, ankles below the knees.
+        """Return q, (27,), with the knee angles that close the loops, ankles below the knees.
 
-        base_pos: body origin [m], world frame. base_quat_xyzw: body to world, unit. motors: angles [rad] in motor
-        order. Raises ValueError: a loop cannot be closed.
+        base_pos: body origin (3,) [m], world frame. base_quat_xyzw: (4,) body to world, unit. motors: angles (12,)
+        [rad] in motor order. Raises InputError: a loop cannot be closed.
         """
         q = pin.neutral(self.model)
         q[0:3] = base_pos
@@ -64,17 +55,17 @@ class PinocchioRobot:
         for leg, name in enumerate(LEGS):
             q[self.knee_q[2 * leg : 2 * leg + 2]] = self._knees(name, motors[3 * leg + 1], motors[3 * leg + 2])
         gap = self.loop_gap(q)
-        if not gap < CLOSED:
+        if not gap < MAX_GAP:
             raise InputError(f"expected closed loops, found a gap of {gap:.3g} m")
         return q
 
     def loop_gap(self, q: np.ndarray) -> float:
-        """Return the largest distance [m] between the two anchors of a loop."""
+        """Return the largest distance [m] between the two anchors of a loop, over all loops; q: (27,)."""
         pin.forwardKinematics(self.model, self.data, q)
-        place = self.data.oMi
+        pose = self.data.oMi
         gaps = (
-            place[c.joint1_id].act(c.joint1_placement.translation)
-            - place[c.joint2_id].act(c.joint2_placement.translation)
+            pose[c.joint1_id].act(c.joint1_placement.translation)
+            - pose[c.joint2_id].act(c.joint2_placement.translation)
             for c in self.constraints
         )
         return max(float(np.linalg.norm(gap)) for gap in gaps)
@@ -97,9 +88,9 @@ class PinocchioRobot:
         return np.array(velocities)
 
     def paw_jacobians(self, q: np.ndarray) -> np.ndarray:
-        """Return the paws' Jacobians [m], shape (4, 3, 3): velocity, world frame, by the rates of the leg's own motors.
+        """Return the paws' Jacobians [m], (4, 3, 3): velocity in the world frame per motor rate, with the base at rest.
 
-        Legs FL, FR, BL, BR; motors lateral, outer, inner; the base does not move.
+        Axes: legs FL, FR, BL, BR; x, y, z; the leg's motors lateral, outer, inner. q: configuration (27,).
         """
         rates = (np.tile(motor, 4) for motor in np.eye(3))
         return np.stack([self.paw_velocities(q, self.closed_velocity(q, np.zeros(6), rate)) for rate in rates], axis=2)
@@ -107,8 +98,8 @@ class PinocchioRobot:
     def closed_velocity(self, q: np.ndarray, base_twist: np.ndarray, motor_rates: np.ndarray) -> np.ndarray:
         """Return v, shape (26,), with the knee rates that keep the loops of a configuration (27,) closed.
 
-        base_twist: linear velocity [m/s] of the body origin and angular velocity [rad/s], body frame. motor_rates:
-        [rad/s], motor order.
+        base_twist: (6,) linear velocity [m/s] of the body origin, then angular velocity [rad/s], body frame.
+        motor_rates: (12,) [rad/s], motor order.
         """
         v = np.zeros(self.model.nv)
         v[self.motor_v] = motor_rates
@@ -123,9 +114,9 @@ class PinocchioRobot:
     def forward_dynamics(self, q: np.ndarray, v: np.ndarray, motor_torques: np.ndarray) -> np.ndarray:
         """Return the acceleration dv/dt, shape (26,), of the robot in free flight under gravity, loops rigid.
 
-        The base's six are derivatives of its components in the body frame, which turns: the origin's own acceleration
-        is theirs plus omega x v. q: (27,), loops closed; v: (26,), which keeps them closed; motor_torques: [N m],
-        (12,), motor order. Motors carry their armature, and no friction.
+        The first six entries are time derivatives of the base's body-frame components: add omega x v to the linear
+        three for the acceleration of the origin. q: (27,), loops closed; v: (26,), which keeps them closed;
+        motor_torques: (12,) [N m], motor order. Motors have armature but no friction.
         """
         torques = np.zeros(self.model.nv)
         torques[self.motor_v] = motor_torques
@@ -136,13 +127,13 @@ class PinocchioRobot:
         ).copy()
 
     def _knees(self, leg: str, outer: float, inner: float) -> tuple[float, float]:
-        """Return outer and inner knee angle [rad] from the triangle of the two knees and the ankle."""
-        place = {name: self.model.jointPlacements[self.model.getJointId(f"{leg}_{name}")].translation
-                 for name in ("outer", "inner", "outer_knee")}  # fmt: skip
-        separation = abs(place["outer"][0] - place["inner"][0])
-        thigh = -place["outer_knee"][2]
+        """Return outer and inner knee angle [rad] from the thigh angles [rad], by the triangle knee, knee, ankle."""
+        origin = {name: self.model.jointPlacements[self.model.getJointId(f"{leg}_{name}")].translation
+                  for name in ("outer", "inner", "outer_knee")}  # fmt: skip
+        separation = abs(origin["outer"][0] - origin["inner"][0])
+        thigh = -origin["outer_knee"][2]
         shank = -self.constraints[LEGS.index(leg)].joint1_placement.translation[2]
-        # inner to outer knee, in the plane (toward the outer side, down)
+        # vector [m] from inner to outer knee in the leg's plane: across, toward the outer side, and down
         across = separation + thigh * (math.sin(outer) + math.sin(inner))
         down = thigh * (math.cos(outer) - math.cos(inner))
         cosine = 0.5 * math.hypot(across, down) / shank
@@ -153,10 +144,10 @@ class PinocchioRobot:
 
 
 def build_pinocchio(description: RobotDescription | None = None, values: RobotValues | None = None) -> PinocchioRobot:
-    """Return the robot in Pinocchio, with a free-flying base; by default the project's own.
+    """Return a described robot, by default the project's, in Pinocchio, with a free-flying base.
 
-    values: a robot that differs from the description, as `RobotOverlay.robots()` returns it; the first one counts, and
-    nothing but its `base_mass`, `base_com`, `base_inertia`, `link_mass` and `armature`.
+    values: a robot that differs from the description, as `RobotOverlay.robots()` returns it. Of the first robot,
+    `base_mass`, `base_com`, `base_inertia`, `link_mass` and `armature` are used.
     """
     description = load_description() if description is None else description
     values = RobotValues.nominal(1, description) if values is None else values
@@ -190,7 +181,7 @@ def build_pinocchio(description: RobotDescription | None = None, values: RobotVa
 
 
 def _write_masses(model: Any, description: RobotDescription, values: RobotValues) -> None:
-    """Write masses, centres of mass and inertias of the first robot into a Pinocchio model."""
+    """Write masses, centres of mass and inertias of the first robot in `values` into a Pinocchio model."""
     base, ratio = description.links[0], values.base_mass[0, 0] / description.links[0].mass
     inertia = ratio * values.base_inertia[0, 0] * base.inertia
     model.inertias[1] = pin.Inertia(values.base_mass[0, 0], values.base_com[0], inertia)

@@ -1,4 +1,4 @@
-"""Terrain map of square tiles: difficulty grows along x, the kind of ground changes along y."""
+"""Terrain map of square tiles: difficulty grows along x, and the kind of ground changes along y."""
 
 from __future__ import annotations
 
@@ -12,24 +12,23 @@ import numpy as np
 
 from jumper_warp.utils.errors import InputError
 
-KINDS = ("flat", "uneven", "waves", "slope", "bowl", "stairs", "pit", "blocks")
-"""Kinds of tiles."""
+KINDS = ("flat", "uneven", "waves", "slope", "bowl", "stairs", "pit", "blocks")  # of tiles
 
 
 @dataclass(frozen=True)
 class TerrainCfg:
-    """Terrain map: rows of growing difficulty, and a column for each entry of `kinds`."""
+    """Terrain map: rows (along x) of growing difficulty, and a column (along y) for each entry of `kinds`."""
 
     rows: int = 10
-    """Levels of difficulty, from a tenth of the heights and slopes below to all of them; 0: no map."""
+    """Number of difficulties: row i has (i + 1) / rows of the heights and slopes below; 0: no map."""
     kinds: tuple[str, ...] = KINDS
     """Kind of each column."""
     tile: float = 8.0
-    """[m] Edge of a tile. Its middle is level, for the start; its rim is at z = 0."""
+    """[m] Edge of a tile, whose middle is level, for the start, and whose rim is at z = 0."""
     uneven: float = 0.05
     """[m] Largest height or depth of random ground."""
     slope: float = 15.0
-    """[deg]"""
+    """[deg] Steepness of slopes and bowls in the last row."""
     step: tuple[float, float] = (0.03, 0.10)
     """[m] Height of steps, in the first row and in the last."""
     start: float = 0.7
@@ -37,14 +36,14 @@ class TerrainCfg:
     rim: float = 0.3
     """[m] Width of the level rim."""
     border: float = 6.0
-    """[m] Of level ground around all tiles."""
+    """[m] Width of the level ground around all tiles."""
     cell: float = 0.04
-    """[m] Distance between nodes, at most; steps are as wide as this."""
+    """[m] Largest distance between nodes, over which a step rises."""
     seed: int = 0
-    """Of random ground."""
+    """Seed of random ground."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a length or a slope is out of range."""
+        """Raise InputError: a count, length or slope is out of range, or a kind is unknown."""
         if self.rows < 0 or self.seed < 0:
             raise InputError(f"terrain rows and seed must not be negative, got {self.rows}, {self.seed}")
         for kind in self.kinds or ("",):
@@ -73,10 +72,10 @@ class TerrainCfg:
 
 
 def terrain_map(cfg: TerrainCfg) -> newton.Heightfield:
-    """Return the map as a heightfield centred on the origin.
+    """Return the map as a heightfield centred on the origin, its data with rows along y.
 
     The tile of row i and column j has its middle at x = (i + 1/2 - rows/2) tile, y = (j + 1/2 - cols/2) tile.
-    Raises ValueError for a configuration without rows.
+    Raises InputError for a configuration without rows.
     """
     if cfg.rows == 0:
         raise InputError("a map needs at least one row")
@@ -96,7 +95,7 @@ def terrain_map(cfg: TerrainCfg) -> newton.Heightfield:
 
 
 def single_tile(cfg: TerrainCfg, kind: str) -> newton.Heightfield:
-    """Return one tile of full difficulty as a heightfield centred on the origin. Raises ValueError for another kind."""
+    """Return one tile of full difficulty, centred on the origin. Raises InputError for a kind not in `KINDS`."""
     check_kind(kind)
     heights = tile_heights(cfg, kind, 1.0, np.random.default_rng(cfg.seed)).astype(np.float32)
     half = 0.5 * cfg.tile
@@ -110,64 +109,64 @@ def check_kind(kind: str) -> None:
 
 
 def tile_heights(cfg: TerrainCfg, kind: str, difficulty: float, rng: np.random.Generator) -> np.ndarray:
-    """Return the heights [m] of a tile's nodes, rows along y, 0 on its rim; difficulty: 0 to 1."""
+    """Return the heights [m] of a tile's nodes, (n, n), rows along y, 0 on its rim; difficulty: 0 to 1."""
     nodes = math.ceil(cfg.tile / cfg.cell - 1.0e-9) + 1
     axis = np.linspace(-0.5 * cfg.tile, 0.5 * cfg.tile, nodes)
     return _SHAPES[kind](_Tile(cfg, difficulty, rng, *np.meshgrid(axis, axis)))
 
 
 class _Tile(NamedTuple):
-    """Tile of a difficulty (0 to 1), with the coordinates x and y [m] of its nodes from its middle."""
+    """One tile, whose methods return the heights of its nodes."""
 
     cfg: TerrainCfg
-    difficulty: float
+    difficulty: float  # 0 to 1
     rng: np.random.Generator
-    x: np.ndarray
-    y: np.ndarray
+    x: np.ndarray  # (n, n) [m], of nodes, from the middle
+    y: np.ndarray  # (n, n) [m]
 
     @property
     def off(self) -> np.ndarray:
-        """Distance [m] from the middle along x or y, the larger one."""
+        """Distance of each node from the middle, (n, n) [m]: the larger of |x| and |y|."""
         return np.maximum(np.abs(self.x), np.abs(self.y))
 
     @property
     def reach(self) -> float:
-        """Distance [m] of the level rim from the middle."""
+        """Distance [m] from the middle to the inner edge of the level rim."""
         return 0.5 * self.cfg.tile - self.cfg.rim
 
     @property
     def step(self) -> float:
-        """Height of steps [m]."""
+        """Height of a step [m] at this difficulty."""
         return self.cfg.step[0] + self.difficulty * (self.cfg.step[1] - self.cfg.step[0])
 
     def slope(self) -> np.ndarray:
-        """Return the heights [m] of a slope from the rim up to the level middle."""
+        """Return the heights (n, n) [m] of a slope from the rim up to the level middle."""
         return math.tan(math.radians(self.difficulty * self.cfg.slope)) * self._inward()
 
     def stairs(self) -> np.ndarray:
-        """Return the heights [m] of stairs from the rim up to the level middle, treads 0.6 m deep."""
+        """Return the heights (n, n) [m] of stairs from the rim up to the level middle, treads 0.6 m deep."""
         return self.step * np.floor(self._inward() / 0.6 + 1.0e-6)
 
     def _inward(self) -> np.ndarray:
-        """Return the distance [m] of each node from the rim, at most that of the level middle."""
+        """Return the distance of each node from the rim, (n, n) [m], clipped to the distance of the level middle."""
         return np.clip(self.reach - self.off, 0.0, self.reach - self.cfg.start)
 
     def waves(self, shortest: float, longest: float, count: int) -> np.ndarray:
-        """Return the heights [m] of `count` plane waves of random direction and wavelength [m].
+        """Return the heights (n, n) [m] of `count` plane waves of random direction and wavelength [m].
 
-        Rim and middle are level; over 0.3 m the waves grow to the full height of the difficulty.
+        Rim and middle are level; over 0.3 m the waves grow to full height, which is `difficulty * cfg.uneven`.
         """
         total = np.zeros_like(self.x)
         for length in self.rng.uniform(shortest, longest, count):
             angle, phase = self.rng.uniform(0.0, 2.0 * math.pi, 2)
             along = math.cos(angle) * self.x + math.sin(angle) * self.y
             total += math.sqrt(length) * np.sin(2.0 * math.pi * along / length + phase)
-        share = np.clip(np.minimum(self.reach - self.off, self.off - self.cfg.start) / 0.3, 0.0, 1.0)
-        total *= share * share * (3.0 - 2.0 * share)
+        ramp = np.clip(np.minimum(self.reach - self.off, self.off - self.cfg.start) / 0.3, 0.0, 1.0)
+        total *= ramp * ramp * (3.0 - 2.0 * ramp)
         return total / np.abs(total).max() * self.difficulty * self.cfg.uneven
 
     def blocks(self) -> np.ndarray:
-        """Return the heights [m] of squares of 0.5 m, half of them raised by a step."""
+        """Return the heights (n, n) [m] of squares of 0.5 m, each raised by a step with probability 1/2."""
         raised = self.rng.integers(0, 2, (64, 64))
         square = raised[np.floor(self.y / 0.5).astype(int) + 32, np.floor(self.x / 0.5).astype(int) + 32]
         return self.step * square * ((self.off > self.cfg.start) & (self.off < self.reach))

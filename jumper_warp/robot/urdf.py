@@ -14,10 +14,11 @@ from jumper_warp.robot.parts import Joint, Link, RobotDescriptionError, Shape, T
 
 MAX_FILE_BYTES = 8_000_000
 SHAPE_SIZES = {"box": ("size", 3), "cylinder": ("radius length", 1), "sphere": ("radius", 1)}
+"""By tag of the shape: its attributes, and how many numbers [m] each holds."""
 
 
 def read_text(file: Path) -> str:
-    """Return the UTF-8 text of a file. Raises RobotDescriptionError."""
+    """Return the text of a UTF-8 file of at most MAX_FILE_BYTES. Raises RobotDescriptionError."""
     try:
         if file.stat().st_size > MAX_FILE_BYTES:
             raise RobotDescriptionError(file, "", f"expected at most {MAX_FILE_BYTES} bytes")
@@ -31,10 +32,7 @@ def read_text(file: Path) -> str:
 
 
 def parse_xml(file: Path, text: str) -> Element:
-    """Return the root element of an XML text without a document type, hence without entities.
-
-    Raises RobotDescriptionError.
-    """
+    """Return the root element of an XML text; file: for messages. Raises RobotDescriptionError, also for a DOCTYPE."""
     builder = TreeBuilder()
     parser = expat.ParserCreate()
 
@@ -55,20 +53,23 @@ def parse_xml(file: Path, text: str) -> Element:
 
 
 class UrdfReader:
-    """Reads one URDF text into links and joints. Every method raises RobotDescriptionError on bad input."""
+    """Reads one URDF text into links and joints. Every method raises RobotDescriptionError on bad input.
+
+    Parameters: element, an XML element; part, the place that an error message names, as "link body".
+    """
 
     def __init__(self, file: Path, text: str):
         self.file = file
         self.root = parse_xml(file, text)
         self.require(self.root.tag == "robot", "", f"expected <robot>, found <{self.root.tag}>")
-        self.meshes: dict[str, TriangleMesh] = {}
-        self.colors = {}
+        self.meshes: dict[str, TriangleMesh] = {}  # by file name
+        self.colors = {}  # (red, green, blue) by name of the material
         for material in self.root.findall("material"):
             color = self.child(material, "color", "material")
             self.colors[material.get("name")] = tuple(self.numbers(color, "rgba", 4, "material")[:3])
 
     def require(self, holds: bool, part: str, problem: str) -> None:
-        """Refuse the file unless a condition holds."""
+        """Raise RobotDescriptionError for this file unless `holds`; problem: of the message."""
         require(holds, self.file, part, problem)
 
     def links(self) -> tuple[Link, ...]:
@@ -80,7 +81,7 @@ class UrdfReader:
         return tuple(self.joint(element) for element in self.named("joint"))
 
     def named(self, tag: str) -> list[Element]:
-        """Return the elements of one kind, each with its own name."""
+        """Return the root's child elements with a tag; refuse missing or repeated names."""
         elements = self.root.findall(tag)
         for name, count in Counter(element.get("name") for element in elements).items():
             self.require(bool(name), tag, "expected a name")
@@ -88,13 +89,13 @@ class UrdfReader:
         return elements
 
     def child(self, element: Element, tag: str, part: str) -> Element:
-        """Return the only child element with a tag."""
+        """Return the only child element with a tag; refuse none or several."""
         children = element.findall(tag)
         self.require(len(children) == 1, part, f"expected one <{tag}>, found {len(children)}")
         return children[0]
 
     def numbers(self, element: Element, attribute: str, count: int, part: str, default: str = "") -> list[float]:
-        """Return an attribute's finite numbers."""
+        """Return an attribute's `count` finite numbers; default: text of a missing attribute."""
         text = element.get(attribute, default)
         try:
             values = [float(word) for word in text.split()]
@@ -105,7 +106,7 @@ class UrdfReader:
         return values
 
     def placement(self, element: Element, part: str, may_rotate: bool) -> tuple[np.ndarray, np.ndarray]:
-        """Return position [m] and rotation (xyzw) of an element's <origin>; only shapes may be rotated."""
+        """Return the position (3,) [m] and rotation (4,) xyzw of an element's <origin>; only shapes may be rotated."""
         if element.find("origin") is None:
             return np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0])
         origin = self.child(element, "origin", part)
@@ -117,7 +118,7 @@ class UrdfReader:
         return np.array(self.numbers(origin, "xyz", 3, part, default="0 0 0")), quat_from_rpy(*angles)
 
     def link(self, element: Element) -> Link:
-        """Return one link, with its mass and inertia checked."""
+        """Return the link of a <link> element, with its mass and inertia checked."""
         name = element.get("name", "")
         part = f"link {name}"
         inertial = self.child(element, "inertial", part)
@@ -142,7 +143,7 @@ class UrdfReader:
         self.require(low + middle >= high * (1.0 - 1.0e-9), part, problem)
 
     def joint(self, element: Element) -> Joint:
-        """Return one joint, with its axis and limits checked."""
+        """Return the hinge of a <joint> element, with its axis and limits checked."""
         name = element.get("name", "")
         part = f"joint {name}"
         kind = element.get("type")
@@ -159,7 +160,7 @@ class UrdfReader:
         return Joint(name, parent, child, origin, axis, lower, upper, effort, velocity)
 
     def shape(self, element: Element, part: str) -> Shape:
-        """Return one visual or collision shape."""
+        """Return the shape of a <visual> or <collision> element."""
         geometry = self.child(element, "geometry", part)
         known = len(geometry) == 1 and geometry[0].tag in (*SHAPE_SIZES, "mesh")
         self.require(known, part, "expected one box, cylinder, sphere or mesh in <geometry>")
@@ -178,7 +179,7 @@ class UrdfReader:
         return Shape(kind, tuple(size), position, rotation, color, mesh)
 
     def mesh(self, name: str, part: str) -> TriangleMesh:
-        """Return a mesh of the robot's folder."""
+        """Return the mesh of an OBJ file, named relative to the URDF's folder; each file is read once."""
         if name not in self.meshes:
             file = file_inside(self.file, name, part)
             self.require(file.suffix == ".obj", part, f"expected an .obj mesh, found {name!r}")
@@ -187,7 +188,7 @@ class UrdfReader:
 
 
 def file_inside(source: Path, name: str, part: str) -> Path:
-    """Return the file that `source` names relative to its own folder. Raises RobotDescriptionError."""
+    """Return the path of a file `name`, relative to `source`'s folder and inside it. Raises RobotDescriptionError."""
     folder = source.parent.resolve()
     try:
         file = (folder / name).resolve()
@@ -223,7 +224,7 @@ def read_obj(file: Path) -> TriangleMesh:
 
 
 def quat_from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """Return the quaternion (xyzw) of a URDF's fixed-axis roll, pitch, yaw [rad]."""
+    """Return the quaternion (4,) xyzw of a URDF's fixed-axis roll, pitch, yaw [rad]."""
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(0.5 * angle), math.sin(0.5 * angle)) for angle in (roll, pitch, yaw))
     x, y = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy
     return np.array([x, y, cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy])

@@ -1,4 +1,4 @@
-"""Values of the robot that may differ from its description, as identified or set by an overlay."""
+"""Values of robots that may differ from the description: identified, or set by an overlay."""
 
 from __future__ import annotations
 
@@ -9,11 +9,9 @@ import numpy as np
 from jumper_warp.robot.description import RobotDescription, load_description
 
 LINK_KINDS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
-"""Links of a leg; those of one kind share their mass ratio."""
-LATERAL, TRANSVERSAL = tuple(range(0, 12, 3)), tuple(motor for motor in range(12) if motor % 3)
-"""Indices of the motors of each kind."""
-PAW_FRICTION = 0.9
-"""[1] Of the described robot, as in `Simulation`."""
+"""Kinds of a leg's links; the four links of a kind share one mass ratio."""
+LATERAL, TRANSVERSAL = tuple(range(0, 12, 3)), tuple(motor for motor in range(12) if motor % 3)  # motor indices
+PAW_FRICTION = 0.9  # [1] Coulomb coefficient of the described robot, the default of `Simulation`
 MOTOR_QUANTITIES = (
     "armature", "motor_friction", "kp", "kd", "saturation", "no_load_speed", "cutoff_speed", "offset",
 )  # fmt: skip
@@ -21,16 +19,16 @@ MOTOR_QUANTITIES = (
 
 @dataclass
 class RobotValues:
-    """Values of N robots; the first axis of every array has length N."""
+    """Values of N robots: arrays (N, columns). Motors: legs FL, FR, BL, BR, each lateral, outer, inner."""
 
     base_mass: np.ndarray
     """(N, 1) [kg]"""
     base_com: np.ndarray
     """(N, 3) [m], base frame."""
     base_inertia: np.ndarray
-    """(N, 1) [1] Ratio to the described inertia about the centre of mass, times the ratio of the masses."""
+    """(N, 1) [1] Scales the described inertia about the centre of mass, besides the ratio of the base masses."""
     link_mass: np.ndarray
-    """(N, 5) [1] Ratio of mass and inertia by `LINK_KINDS`."""
+    """(N, 5) [1] Ratio to the described mass and inertia, one column per entry of `LINK_KINDS`."""
     armature: np.ndarray
     """(N, 12) [kg m^2]"""
     motor_friction: np.ndarray
@@ -46,24 +44,24 @@ class RobotValues:
     cutoff_speed: np.ndarray
     """(N, 12) [rad/s]"""
     offset: np.ndarray
-    """(N, 12) [rad] Reading of a position sensor less the true angle."""
+    """(N, 12) [rad] Position sensor's reading minus the true angle."""
     knee_damping: np.ndarray
     """(N, 1) [N m s/rad]"""
     paw_friction: np.ndarray
     """(N, 1) [1]"""
     latency: np.ndarray
-    """(N, 1) [s] From target to motor."""
+    """(N, 1) [s] From a commanded target to its effect on the motor."""
     spring_stiffness: np.ndarray
-    """(N, 1) [N/m] Of the springs between the knees of each leg; 0: none."""
+    """(N, 1) [N/m] Stiffness of the spring between the two knees of each leg; 0: no spring."""
     spring_length: np.ndarray
-    """(N, 1) [m] Of these springs at rest."""
+    """(N, 1) [m] Rest length of these springs."""
 
     @classmethod
     def nominal(cls, count: int, description: RobotDescription | None = None) -> RobotValues:
-        """Return `count` copies of the described robot."""
+        """Return the values of `count` equal robots as described, by default as the project's description."""
         robot = load_description() if description is None else description
         motors, base = robot.motors, robot.links[0]
-        one = cls(
+        single = cls(
             base_mass=np.array([base.mass]),
             base_com=np.array(base.com),
             base_inertia=np.ones(1),
@@ -82,4 +80,4 @@ class RobotValues:
             spring_stiffness=np.zeros(1),
             spring_length=np.zeros(1),
         )
-        return cls(**{name: np.tile(value, (count, 1)) for name, value in vars(one).items()})
+        return cls(**{name: np.tile(value, (count, 1)) for name, value in vars(single).items()})

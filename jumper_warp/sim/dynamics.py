@@ -29,8 +29,6 @@ KERNEL_MODULES = (
     "dynamics.world.advance", "dynamics.world.rollout", "kinematics.full_state", "kinematics.geometry",
     "layout", "scalar", "state", "terrain.ground",
 )  # fmt: skip
-
-
 ALONE = "this robot alone, shapes and sites aside"
 
 
@@ -39,7 +37,7 @@ class NotThisRobotError(InputError):
 
 
 def kernel_modules(double: bool = False) -> SimpleNamespace:
-    """Return the kernel modules by the last part of their name, in single or double precision."""
+    """Return the modules `KERNEL_MODULES`, as attributes named by the last part, in single or double precision."""
     package = float64_kernels().__name__ if double else "jumper_warp.kernels"
     return SimpleNamespace(
         **{name.split(".")[-1]: importlib.import_module(f"{package}.{name}") for name in KERNEL_MODULES}
@@ -53,35 +51,35 @@ def check_model(model: Model) -> None:
     count = model.world_count
     if count < 1:
         raise NotThisRobotError("the model has no worlds; build it with jumper_warp.robot.model.build_model")
-    for what, labels, expected in (("body", model.body_label, bodies), ("joint", model.joint_label, joints)):
+    for noun, labels, expected in (("body", model.body_label, bodies), ("joint", model.joint_label, joints)):
         names = [label.split("/")[-1] for label in labels]
         stranger = next((label for label, name in zip(labels, names, strict=True) if name not in expected), None)
         if stranger is not None and len(names) > count * len(expected):
-            raise NotThisRobotError(f"{what} {stranger!r:.60} cannot be simulated: every world must hold {ALONE}")
+            raise NotThisRobotError(f"{noun} {stranger!r:.60} cannot be simulated: every world must hold {ALONE}")
         if len(names) != count * len(expected):
             raise NotThisRobotError(
-                f"{count} worlds of this robot have {count * len(expected)} {what} labels, the model has {len(names)}"
+                f"{count} worlds of this robot have {count * len(expected)} {noun} labels, the model has {len(names)}"
             )
         for i, name in enumerate(names):
             if name != expected[i % len(expected)]:
-                raise NotThisRobotError(f"{what} {i} must be {expected[i % len(expected)]!r}, found {name!r}")
-    for name, have, want in (("joint_q", model.joint_coord_count, 43), ("joint_qd", model.joint_dof_count, 38)):
-        if have != count * want:
-            raise NotThisRobotError(f"{name} must hold {want} values a world, found {have / count:g}")
-    others = {
+                raise NotThisRobotError(f"{noun} {i} must be {expected[i % len(expected)]!r}, found {name!r}")
+    for name, size, per_world in (("joint_q", model.joint_coord_count, 43), ("joint_qd", model.joint_dof_count, 38)):
+        if size != count * per_world:
+            raise NotThisRobotError(f"{name} must hold {per_world} values a world, found {size / count:g}")
+    unsupported = {
         "particles": model.particle_count,
         "muscles": model.muscle_count,
         "tendons": model.tendon_count,
         "mimic joints": np.count_nonzero(model.joint_mimic_joint.numpy() >= 0) + model.constraint_mimic_count,
         **{name: n for name, n in model.custom_frequency_counts.items() if name.startswith("mujoco:")},
     }
-    for what, number in others.items():
+    for noun, number in unsupported.items():
         if number > 0:
-            raise NotThisRobotError(f"{number} {what} cannot be simulated: every world must hold {ALONE}")
+            raise NotThisRobotError(f"{number} {noun} cannot be simulated: every world must hold {ALONE}")
 
 
 def find_paws(model: Model) -> np.ndarray:
-    """Return the shape indices of the paws, shape (num_worlds, 4)."""
+    """Return the shape indices of the paws, (num_worlds, 4) int32, legs FL, FR, BL, BR. Raises NotThisRobotError."""
     paws = {leg: [] for leg in LEGS}
     for i, label in enumerate(model.shape_label):
         name = label.split("/")[-1]
@@ -94,9 +92,9 @@ def find_paws(model: Model) -> np.ndarray:
 
 
 def find_ground(model: Model) -> int:
-    """Return the index of the ground shape, a plane z = 0 or a heightfield of the global world; -1 without one.
+    """Return the index of the ground shape that all worlds share, a plane or a heightfield; -1 without one.
 
-    Raises NotThisRobotError for more than one, or a plane that is not z = 0.
+    Raises NotThisRobotError for several, a plane other than z = 0, or a tilted heightfield.
     """
     worlds, types = model.shape_world.numpy(), model.shape_type.numpy()
     kinds = (int(newton.GeoType.PLANE), int(newton.GeoType.HFIELD))
@@ -113,12 +111,11 @@ def find_ground(model: Model) -> int:
 
 
 def ground_struct(model: Model, shape: int, ground_module: ModuleType) -> Any:
-    """Return the kernels' `Ground` for a ground shape; -1: a plane out of reach."""
+    """Return the kernels' `Ground` of a shape index from `find_ground`; for -1 a plane that nothing reaches."""
     ground = ground_module.Ground()
     heights = np.zeros((1, 1), dtype=np.float32)
     if shape < 0:
-        # a flat grid a kilometre down is never in reach
-        heights = np.full((2, 2), -1000.0, dtype=np.float32)
+        heights = np.full((2, 2), -1000.0, dtype=np.float32)  # [m] far below every robot
         ground.rows, ground.cols, ground.half_x, ground.half_y = 2, 2, 1.0, 1.0
     elif model.shape_type.numpy()[shape] == int(newton.GeoType.HFIELD):
         field = model.shape_source[shape]
@@ -132,7 +129,7 @@ def ground_struct(model: Model, shape: int, ground_module: ModuleType) -> Any:
 
 
 def block_array(cfg: BlockCfg | None, num_worlds: int, modules: SimpleNamespace, device: wp.DeviceLike) -> wp.array:
-    """Return the kernels' `Block` of every world, at rest at its start, (num_worlds,); (0,) without blocks."""
+    """Return the kernels' `Block` of every world, (num_worlds,), at rest at its start; (0,) if cfg is None."""
     block = modules.ground.Block
     fields = {} if cfg is None else cfg.per_world(num_worlds)
     values: Any = np.zeros(num_worlds if fields else 0, dtype=block.numpy_dtype())
@@ -147,8 +144,8 @@ def block_array(cfg: BlockCfg | None, num_worlds: int, modules: SimpleNamespace,
 class JumperDynamics:
     """Parameters, geometry and work arrays of the dedicated dynamics for every world of a model.
 
-    `SolverJumper` drives it in single precision. In double precision it is the reference for rounding and gradients;
-    its states are arrays of float64 in the layout of `joint_q` and `joint_qd`.
+    `SolverJumper` uses it in single precision. Tests use it in double precision, as the reference for rounding errors
+    and gradients. q, qd: flat arrays of `real` in the layout of `joint_q` (43 a world) and `joint_qd` (38 a world).
     """
 
     def __init__(
@@ -159,9 +156,9 @@ class JumperDynamics:
         block: BlockCfg | None = None,
         double: bool = False,
     ):
-        """Read all parameters from the model; `block` adds a moving block to every world.
+        """Read all parameters from the model; block: a moving block for every world; double: whether in float64.
 
-        Raises NotThisRobotError: not this robot, InputError: a block that does not fit the number of worlds.
+        Raises NotThisRobotError: the model is not this robot, InputError: `block` has another number of worlds.
         """
         check_model(model)
         self.model = model
@@ -175,8 +172,9 @@ class JumperDynamics:
         self.static_friction_ratio = wp.full(self.num_worlds, 1.0, dtype=float, device=self.device)
         """Static over dynamic friction coefficient [1], shape (num_worlds,); call `pack_friction` after a change."""
         self.leg_springs = wp.zeros(self.num_worlds, dtype=wp.vec2, device=self.device)
-        """Stiffness [N/m], 0: none, and rest length [m] of the springs between the knees, shape (num_worlds,); call
-        `pack_springs` after a change."""
+        """Stiffness [N/m], 0: none, and rest length [m] of the springs between knees, vec2 of shape (num_worlds,).
+
+        Call `pack_springs` after a change."""
 
         self.robot = self.modules.step.RobotModel()
         self.robot.geometry = leg_geometry_array(self.description, self.modules.geometry, self.device)
@@ -193,7 +191,7 @@ class JumperDynamics:
         self.pack()
 
     def _workspace(self) -> Any:
-        """Return the kernels' `Workspace`, zeroed."""
+        """Return the kernels' `Workspace`, zeroed, with the model's `joint_q` as reference pose."""
         scalar, n = self.modules.scalar, self.num_worlds
         work = self.modules.drive.Workspace()
         for names, shape, dtype in (
@@ -209,7 +207,7 @@ class JumperDynamics:
         return work
 
     def step_record(self, steps: int) -> Any:
-        """Return the kernels' `StepRecord` of the steps that a reverse pass recomputes."""
+        """Return the kernels' `StepRecord`, zeroed, for the steps that a reverse pass recomputes."""
         record, n = self.modules.multipliers.StepRecord(), self.num_worlds
         for name, var in record._cls.vars.items():
             shape = (n, steps + (name in ("base", "angles", "rates")))
@@ -218,7 +216,7 @@ class JumperDynamics:
         return record
 
     def pack(self) -> None:
-        """Read masses, joints, friction, gravity and springs of every world from the model."""
+        """Read masses, joints, friction and gravity of every world from the model, and `leg_springs`."""
         self.pack_masses()
         self.pack_joints()
         self.pack_friction()
@@ -226,13 +224,13 @@ class JumperDynamics:
         self.pack_springs()
 
     def pack_masses(self) -> None:
-        """Read masses, centres of mass and inertias."""
+        """Read masses, centres of mass and inertias of all links from the model."""
         m = self.model
         arrays = [m.body_mass, m.body_com, m.body_inertia]
         self._launch(self.modules.parameters.pack_masses_kernel, (self.num_worlds, 21), arrays)
 
     def pack_joints(self) -> None:
-        """Read armature, friction, damping and hard stops."""
+        """Read armature, friction, damping and hard stops of all joints from the model."""
         m = self.model
         lower, upper = self.description.transversal_sum
         self._launch(
@@ -243,7 +241,7 @@ class JumperDynamics:
         )  # fmt: skip
 
     def pack_friction(self) -> None:
-        """Read the friction coefficients of paws and ground."""
+        """Read the friction coefficients of paws and ground from the model, and `static_friction_ratio`."""
         self._launch(
             self.modules.parameters.pack_friction_kernel,
             (self.num_worlds, 4),
@@ -251,9 +249,9 @@ class JumperDynamics:
         )
 
     def repack(self, mask: wp.array, worlds: WorldRange | None = None) -> None:
-        """Read masses, armature, motor friction and paw friction of worlds whose mask (num_worlds,), float, is not 0.
+        """Read masses, armature, motor and paw friction from the model, where mask (num_worlds,) float is not 0.
 
-        worlds: range to read, by default all.
+        worlds: range in which the mask is read, by default all.
         """
         m, (first, count) = self.model, worlds or (0, self.num_worlds)
         self._launch(
@@ -264,35 +262,32 @@ class JumperDynamics:
         )  # fmt: skip
 
     def pack_gravity(self) -> None:
-        """Read gravity."""
+        """Read gravity of every world from the model."""
         self._launch(self.modules.parameters.pack_gravity_kernel, self.num_worlds, [self.model.gravity])
 
     def pack_springs(self) -> None:
-        """Read `leg_springs`."""
+        """Read `leg_springs` into the parameter table."""
         self._launch(self.modules.parameters.pack_springs_kernel, (self.num_worlds, 4), [self.leg_springs])
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
+        """Launch a kernel that writes the parameter table (PARAMETER_ROWS, num_worlds)."""
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self.robot.table], device=self.device)
 
     def settings(self, dt: float, substeps: int, max_sweeps: int, tolerance: float) -> Any:
-        """Return the kernels' `StepSettings`."""
+        """Return the kernels' `StepSettings`; dt [s]; max_sweeps and tolerance [m/s] end the contact iteration."""
         settings = self.modules.step.StepSettings()
         settings.dt, settings.substeps = dt, substeps
         settings.max_sweeps, settings.tolerance = max_sweeps, tolerance
         return settings
 
     def drive(
-        self,
-        joint_f: wp.array,
-        body_f: wp.array,
-        motors: Any = None,
-        target: wp.array | None = None,
-        previous: wp.array | None = None,
-        delay: wp.array | None = None,
-    ) -> Any:
-        """Return the kernels' `Drive`; closed-loop with `motors` (MotorArrays) and `target` [rad] (12, num_worlds).
+        self, joint_f: wp.array, body_f: wp.array, motors: Any = None, target: wp.array | None = None,
+        previous: wp.array | None = None, delay: wp.array | None = None,
+    ) -> Any:  # fmt: skip
+        """Return the kernels' `Drive`; joint_f: (num_worlds * 38,), body_f: wrenches (num_worlds * 21,), as in Newton.
 
-        With `delay` [physics steps], (num_worlds,), the motors follow `previous` until the target arrives.
+        With motors (`MotorArrays`) they follow target [rad], (12, num_worlds); with delay [physics steps],
+        (num_worlds,), they follow `previous`, shaped as target, until the target arrives.
         """
         drive = self.modules.drive.Drive()
         drive.joint_f, drive.body_f = joint_f, body_f
@@ -303,7 +298,7 @@ class JumperDynamics:
         return drive
 
     def advance_kernel(self, by_legs: bool | None = None) -> tuple[wp.Kernel, int]:
-        """Return the kernel that `advance` launches, and its block size; by_legs: see `advance`."""
+        """Return the kernel that `advance` launches, and its threads per block; by_legs: see `advance`."""
         if self.device.is_cuda if by_legs is None else by_legs:
             return self.modules.advance_legs.advance_legs_kernel, 32 if self.device.is_cuda else 4
         return self.modules.advance.advance_kernel, 32 if self.device.is_cuda else 1
@@ -312,27 +307,27 @@ class JumperDynamics:
         self, settings: Any, drive: Any, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array,
         worlds: WorldRange | None = None, by_legs: bool | None = None,
     ) -> None:  # fmt: skip
-        """Advance base and motor coordinates by `settings.substeps` steps; outputs may be inputs.
+        """Write base and motor coordinates after `settings.substeps` steps to q_out and qd_out, which may be q and qd.
 
-        worlds: range to advance, by default all. by_legs: a thread per leg (default on a GPU) or per world (default on
-        a CPU).
+        worlds: range to advance, by default all. by_legs: whether each leg has a thread (default on a GPU) or each
+        world (default on a CPU).
         """
         settings.first, count = worlds or (0, self.num_worlds)
         inputs, outputs = [self.robot, settings, drive, q, qd, self.work], [q_out, qd_out]
         by_legs = self.device.is_cuda if by_legs is None else by_legs
-        kernel, block = self.advance_kernel(by_legs)
-        dim, inputs = ((-(-count // 8) * 8, 4), [count, *inputs]) if by_legs else (count, inputs)
-        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block)
+        kernel, block_dim = self.advance_kernel(by_legs)
+        dim, inputs = ((-(-count // 8) * 8, 4), [count, *inputs]) if by_legs else (count, inputs)  # 8 worlds a warp
+        wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)
 
     def momenta(self) -> Any:
-        """Return the kernels' `Momenta` of all worlds, zeroed."""
+        """Return the kernels' `Momenta`, zeroed: `lin` [kg m/s] and `ang` [kg m^2/s], vec3 of shape (num_worlds,)."""
         momenta = self.modules.momentum.Momenta()
         for name in ("lin", "ang"):
             setattr(momenta, name, wp.zeros(self.num_worlds, dtype=self.modules.scalar.vec3, device=self.device))
         return momenta
 
     def read_momenta(self, q: wp.array, qd: wp.array, momenta: Any, worlds: WorldRange | None = None) -> None:
-        """Write the robots' momenta, world axes, to `momenta`; worlds: range, by default all."""
+        """Write the robots' momenta at q, qd, in world axes, to `momenta`; worlds: range, by default all."""
         first, count = worlds or (0, self.num_worlds)
         inputs = [first, self.robot, q, qd, momenta]
         wp.launch(self.modules.momentum.momentum_kernel, count, inputs, device=self.device, block_dim=32)
@@ -340,9 +335,10 @@ class JumperDynamics:
     def project_momentum(
         self, q: wp.array, qd: wp.array, momenta: Any, body_f: wp.array, time: float, worlds: WorldRange | None = None
     ) -> None:
-        """Correct the base's velocities where a robot flew freely in the last call of `advance`, which took a time [s].
+        """Correct the base's velocity in qd, so that gravity alone changes the momentum of a robot in free flight.
 
-        momenta: of before it. body_f: the wrenches in it. worlds: which are corrected, by default all.
+        Call it after `advance` by `time` [s]. momenta: before that call. body_f: wrenches during it; a robot with a
+        contact or a wrench on its base stays uncorrected. worlds: range, by default all.
         """
         first, count = worlds or (0, self.num_worlds)
         inputs = [first, self.robot, momenta, body_f, self.work.peak_force, self.work.diverged, time, q, qd]
@@ -351,9 +347,9 @@ class JumperDynamics:
     def full_state(
         self, q: wp.array, qd: wp.array, body_q: wp.array, body_qd: wp.array, worlds: WorldRange | None = None
     ) -> None:
-        """Write passive and loop joints (into q, qd) and all bodies, from base and motor coordinates.
+        """Compute passive and loop joints (in q, qd) and all bodies from the base and motor coordinates in q, qd.
 
-        worlds: range, by default all.
+        body_q: poses [m], xyzw; body_qd: velocities [m/s], [rad/s]. worlds: range, by default all.
         """
         first, count = worlds or (0, self.num_worlds)
         wp.launch(

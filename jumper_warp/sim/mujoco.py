@@ -16,20 +16,19 @@ MUJOCO_FRICTION = 0.005
 def mujoco_solver(model: Model, *, dt: float = PHYSICS_DT, **overrides) -> newton.solvers.SolverMuJoCo:
     """Return Newton's MuJoCo solver with stiff loops for physics steps of `dt` [s].
 
-    MuJoCo has neither a damper with a torque limit nor a stop of the sum of two angles. `Simulation` removes the knees'
-    damping from the model and adds both as torques (`kernels.actuation.passive`); here the damping has no limit.
+    MuJoCo has neither a damper with a torque limit nor a stop of the sum of two angles: here the knees' damping is
+    unlimited and outer + inner has no stop. `Simulation` adds both as torques (`kernels.actuation.passive`).
 
-    `overrides` replace settings of `newton.solvers.SolverMuJoCo`. Raises InputError: paws with less
-    friction than `MUJOCO_FRICTION`.
+    overrides: arguments of `newton.solvers.SolverMuJoCo`. Raises InputError: paw friction below `MUJOCO_FRICTION`.
     """
     paws = [index for index, label in enumerate(model.shape_label) if label.split("/")[-1] in PAWS]
     friction = model.shape_material_mu.numpy()[paws].min(initial=math.inf)
     if not friction >= MUJOCO_FRICTION:
         raise InputError(f"SolverMuJoCo needs paws of friction {MUJOCO_FRICTION:g} or more, got {friction:g}")
-    rich = newton.GeoType.HFIELD in model.shape_type.numpy() or len(other_colliders(model)) > 0
+    many_contacts = newton.GeoType.HFIELD in model.shape_type.numpy() or len(other_colliders(model)) > 0
     settings = {
-        "njmax": 128 if rich else 64,
-        "nconmax": None if rich else 12,  # None: as many as heightfield and obstacles may need
+        "njmax": 128 if many_contacts else 64,  # constraint rows of a world
+        "nconmax": None if many_contacts else 12,  # contacts of a world; None: estimated from the shapes
         "iterations": 6,
         "ls_iterations": 6,
         "cone": "pyramidal",
@@ -40,6 +39,6 @@ def mujoco_solver(model: Model, *, dt: float = PHYSICS_DT, **overrides) -> newto
     solver.mjw_model.opt.warn_overflow = 0
     solver.mjw_model.eq_solref.fill_(wp.vec2(2.0 * dt, 1.0))
     impedance = solver.mjw_model.eq_solimp.numpy()
-    impedance[:] = (0.99, 0.999, 0.001, 0.5, 2.0)
+    impedance[:] = (0.99, 0.999, 0.001, 0.5, 2.0)  # of the loops: dmin, dmax, width [m], midpoint, power
     solver.mjw_model.eq_solimp.assign(impedance)
     return solver

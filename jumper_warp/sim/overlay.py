@@ -1,4 +1,4 @@
-"""Write values of robots into Newton's model and into the motors of a simulation."""
+"""Writing of `RobotValues` into Newton's model, the springs and the motors of a simulation."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ from jumper_warp.sim.dynamics import JumperDynamics, find_paws
 from jumper_warp.utils.newton_types import Model
 
 MOTOR_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (0, 1, 3)]
-"""Indices of a world's motors in `joint_qd`."""
+"""Indices of a world's 12 motors in its 38 `joint_qd`."""
 
 
 def write_model(model: Model, robots: RobotValues, *, paws: bool = True) -> None:
     """Write masses, joints and paw friction into a model of the described robot, before a solver reads it.
 
-    robots: one for all worlds, or one a world. paws: whether to write their friction.
+    robots: N = 1 for all worlds, or N = num_worlds. paws: whether to write the paws' friction.
     """
     n = model.world_count
     mass = model.body_mass.numpy().reshape(n, -1)
@@ -55,16 +55,16 @@ def write_model(model: Model, robots: RobotValues, *, paws: bool = True) -> None
 
 
 def write_springs(dynamics: JumperDynamics, robots: RobotValues) -> None:
-    """Write the springs between the knees; robots: one for all worlds, or one a world."""
+    """Write and pack the springs between knees; robots: N = 1 for all worlds, or N = num_worlds."""
     values = np.hstack([robots.spring_stiffness, robots.spring_length])
     dynamics.leg_springs.assign(np.broadcast_to(values, (dynamics.num_worlds, 2)).astype(np.float32))
     dynamics.pack_springs()
 
 
 def write_motors(motors: Any, robots: RobotValues) -> None:
-    """Write motor constants into `MotorArrays` that hold the described ones.
+    """Scale kp, kd and saturation of `MotorArrays` that hold described values, and set speeds and sensor offsets.
 
-    robots: one for all worlds, or one a world.
+    robots: N = 1 for all worlds, or N = num_worlds.
     """
     for name in ("kp", "kd", "saturation"):
         array: wp.array = getattr(motors, name)

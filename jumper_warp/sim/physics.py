@@ -1,4 +1,4 @@
-"""Common interface of both solvers for simulations and environments."""
+"""Common interface of SolverJumper and SolverMuJoCo for simulations and environments."""
 
 from __future__ import annotations
 
@@ -24,89 +24,83 @@ from jumper_warp.sim.slices import WorldRange
 from jumper_warp.sim.solver import SolverJumper
 
 EXPLICIT_STOP = (1000.0, 2.0)
-"""[N m/rad], [N m s/rad] Stops of the transversal sum on MuJoCo, explicit and therefore softer than SolverJumper's."""
+"""[N m/rad], [N m s/rad] of the outer + inner stop on MuJoCo: an explicit torque, so softer than SolverJumper's."""
 RANDOMIZED_FLAGS = (
     ModelFlags.BODY_INERTIAL_PROPERTIES
     | ModelFlags.JOINT_DOF_FORCE_PROPERTIES
     | ModelFlags.JOINT_DOF_INERTIAL_PROPERTIES
     | ModelFlags.SHAPE_PROPERTIES
 )
-"""Properties of the model that domain randomisation changes."""
+"""Flags of the model's properties that domain randomisation changes."""
 
 
 class Physics(ABC):
-    """Interface of a solver for simulations and environments. Arrays are never reallocated."""
+    """A solver with motors for the worlds of a `Simulation`. Arrays are never reallocated; legs FL, FR, BL, BR."""
 
     sliced: bool
-    """Whether it can advance a range of worlds."""
+    """Whether `advance` supports a range of worlds."""
     solver: newton.solvers.SolverBase
     dynamics: JumperDynamics
-    """Geometry, ground and friction ratio; on other solvers for kinematics only."""
+    """Geometry, ground and friction ratio; SolverMuJoCo uses it for kinematics only."""
     diverged: wp.array
     """(num_worlds,) int, 1: the world diverged."""
     impulse: wp.array
-    """(4, num_worlds) vec3 [N s] Contact impulses that start the next contact iteration."""
+    """(4, num_worlds) vec3 [N s] Paws' contact impulses, world frame, with which the next contact iteration starts."""
     torque: wp.array
-    """(12, num_worlds) [N m], of the last physics step."""
+    """(12, num_worlds) [N m] Motor torques of the last physics step, in motor order."""
     paw_force: wp.array
-    """(4, num_worlds) vec3 [N], of the last physics step."""
+    """(4, num_worlds) vec3 [N] Ground forces on the paws in the last physics step, world frame."""
     peak_force: wp.array
     """(num_worlds,) [N] Largest total paw force in the last call of `advance`."""
     peak_paw_force: wp.array
     """(4, num_worlds) [N] Largest force on each paw in the last call of `advance`."""
 
     def __init__(self, sim: Any) -> None:
-        """Attach to a `Simulation`."""
+        """Attach to a `Simulation`, whose model, state, control and motors are allocated."""
         self._sim = sim
 
     @abstractmethod
     def advance(
-        self,
-        substeps: int,
-        target: wp.array,
-        previous: wp.array | None = None,
-        delay: wp.array | None = None,
-        bodies: bool = True,
-        worlds: WorldRange | None = None,
-    ) -> None:
-        """Launch physics steps towards motor targets [rad], shape (12, num_worlds).
+        self, substeps: int, target: wp.array, previous: wp.array | None = None, delay: wp.array | None = None,
+        bodies: bool = True, worlds: WorldRange | None = None,
+    ) -> None:  # fmt: skip
+        """Launch `substeps` physics steps, with motors that follow target [rad], (12, num_worlds).
 
-        With `delay` [physics steps], shape (num_worlds,), the motors follow `previous` until the target arrives.
-        bodies False: passive joints and bodies of the state need not be written. worlds: range to advance, by default
-        all.
+        With delay [physics steps], (num_worlds,), they follow `previous` (12, num_worlds) until the target arrives.
+        bodies: whether to write passive joints and bodies of the state. worlds: range to advance, by default all.
         """
 
     @abstractmethod
     def parameters_changed(self, mask: wp.array | None = None, worlds: WorldRange | None = None) -> None:
-        """Read the model's masses, joints and friction of worlds whose mask (num_worlds,) is not 0; None: of all.
+        """Read masses, joints and friction from the model, where mask (num_worlds,) float is not 0; None: all worlds.
 
         worlds: range in which the mask is read, by default all.
         """
 
     @abstractmethod
     def forget(self, mask: wp.array) -> None:
-        """Clear the solver's state of worlds whose mask (num_worlds + 1,), bool, is set."""
+        """Clear warm starts, contact history and diverged flags where mask (num_worlds + 1,) bool is set."""
 
     @abstractmethod
     def after_reset(self, mask: wp.array) -> None:
-        """Update the solver after coordinates were written in worlds whose mask (num_worlds,) is not 0."""
+        """Update the solver after joint coordinates were written in worlds whose mask (num_worlds,) is not 0."""
 
     def write_bodies(self) -> None:
-        """Write the state's passive joints and bodies from base and motor coordinates."""
+        """Compute the state's passive joints and bodies from its base and motor coordinates."""
         state = self._sim.state
         self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
 
     def kernels(self) -> list[tuple[wp.Kernel, int]]:
-        """Return the kernels of a policy step to compile in advance, with their block sizes."""
+        """Return (kernel, threads per block) of a policy step's launches, to compile in advance."""
         return []
 
     def carried(self) -> dict[str, wp.array]:
-        """Return the solver's arrays, besides coordinates and impulses, that the next step depends on, by name."""
+        """Return by name the arrays, besides joint_q, joint_qd and `impulse`, on which the next step depends."""
         return {}
 
 
 class JumperPhysics(Physics):
-    """`SolverJumper`, with a policy step in one launch."""
+    """`SolverJumper`, which advances a whole policy step in one launch."""
 
     sliced = True
     solver: SolverJumper
@@ -122,14 +116,9 @@ class JumperPhysics(Physics):
         self._momenta = self.dynamics.momenta() if keep_momentum else None
 
     def advance(
-        self,
-        substeps: int,
-        target: wp.array,
-        previous: wp.array | None = None,
-        delay: wp.array | None = None,
-        bodies: bool = True,
-        worlds: WorldRange | None = None,
-    ) -> None:
+        self, substeps: int, target: wp.array, previous: wp.array | None = None, delay: wp.array | None = None,
+        bodies: bool = True, worlds: WorldRange | None = None,
+    ) -> None:  # fmt: skip
         """See `Physics.advance`."""
         state, sim = self._sim.state, self._sim
         q, qd, momenta = state.joint_q, state.joint_qd, self._momenta
@@ -152,7 +141,7 @@ class JumperPhysics(Physics):
             self.dynamics.repack(mask, worlds)
 
     def after_reset(self, mask: wp.array) -> None:
-        """See `Physics.after_reset`; the solver reads base and motors only."""
+        """Do nothing: the solver reads base and motor coordinates alone."""
 
     def forget(self, mask: wp.array) -> None:
         """See `Physics.forget`."""
@@ -161,20 +150,20 @@ class JumperPhysics(Physics):
             self.solver.reset_blocks(mask)
 
     def kernels(self) -> list[tuple[wp.Kernel, int]]:
-        """See `Physics.kernels`."""
+        """See `Physics.kernels`; with `keep_momentum` also the projection's kernels."""
         momentum = self.dynamics.modules.momentum
         projection = [(momentum.momentum_kernel, 32), (momentum.project_momentum_kernel, 32)]
         return [self.dynamics.advance_kernel(), *(projection if self._momenta is not None else [])]
 
 
 class MujocoPhysics(Physics):
-    """Newton's SolverMuJoCo with this robot's motors and passive joints, one launch set per physics step."""
+    """Newton's SolverMuJoCo with this robot's motors and passive joints, several launches per physics step."""
 
     sliced = False
     solver: newton.solvers.SolverMuJoCo
 
     def __init__(self, sim: Any, observe_forces: bool) -> None:
-        """Make the solver for a simulation's model, whose knee damping it takes over."""
+        """Make the solver, with knee damping as an explicit torque; observe_forces: see `Simulation`."""
         super().__init__(sim)
         n, device, model = sim.num_worlds, sim.device, sim.model
         self.dynamics = JumperDynamics(model)  # refuses another robot
@@ -193,7 +182,7 @@ class MujocoPhysics(Physics):
         self.peak_force = wp.zeros(n, dtype=float, device=device)
         self.peak_paw_force = wp.zeros((4, n), dtype=float, device=device)
         self._arrived = wp.zeros((12, n), dtype=float, device=device)
-        self._mask = wp.zeros(n + 1, dtype=wp.bool, device=device)  # the last one: no world
+        self._mask = wp.zeros(n + 1, dtype=wp.bool, device=device)  # the last entry belongs to no world
         self._sensor = self._contacts = self._observables = None
         if observe_forces:
             pipeline = newton.CollisionPipeline(
@@ -204,15 +193,10 @@ class MujocoPhysics(Physics):
             self._observables = self.solver.observables({"contact_f"}, contacts=self._contacts)
 
     def advance(
-        self,
-        substeps: int,
-        target: wp.array,
-        previous: wp.array | None = None,
-        delay: wp.array | None = None,
-        bodies: bool = True,
-        worlds: WorldRange | None = None,
-    ) -> None:
-        """See `Physics.advance`; always advances all worlds and writes bodies."""
+        self, substeps: int, target: wp.array, previous: wp.array | None = None, delay: wp.array | None = None,
+        bodies: bool = True, worlds: WorldRange | None = None,
+    ) -> None:  # fmt: skip
+        """See `Physics.advance`; ignores `bodies` and `worlds`: it advances all worlds and writes all bodies."""
         for i in range(substeps):
             if delay is not None:
                 self._launch(
@@ -221,7 +205,7 @@ class MujocoPhysics(Physics):
             self._step(target if delay is None else self._arrived, restart=i == 0)
 
     def _step(self, target: wp.array, restart: bool) -> None:
-        """Advance one physics step; restart: peak forces begin with this step."""
+        """Advance one physics step towards target [rad], (12, num_worlds); restart: whether to reset peak forces."""
         sim, state, joint_f = self._sim, self._sim.state, self._sim.control.joint_f
         q, qd, motors = state.joint_q, state.joint_qd, (12, sim.num_worlds)
         self._launch(motor_torque_kernel, motors, [target, q, qd, COORDS, DOFS, sim.motors], [joint_f])
@@ -236,27 +220,28 @@ class MujocoPhysics(Physics):
             )
 
     def parameters_changed(self, mask: wp.array | None = None, worlds: WorldRange | None = None) -> None:
-        """See `Physics.parameters_changed`; MuJoCo reads all worlds."""
+        """See `Physics.parameters_changed`; ignores mask and range: MuJoCo reads all worlds."""
         self.solver.notify_model_changed(RANDOMIZED_FLAGS)
 
     def after_reset(self, mask: wp.array) -> None:
-        """See `Physics.after_reset`."""
+        """Clear the reset worlds' warm starts and write all bodies; see `Physics.after_reset`."""
         self._launch(mask_kernel, self._sim.num_worlds, [mask], [self._mask])
         self.forget(self._mask)
         self.write_bodies()
 
     def forget(self, mask: wp.array) -> None:
-        """See `Physics.forget`; also clears velocities of the last step, which the loops' rows use."""
+        """See `Physics.forget`; also clears the last step's velocities, which the constraint rows of the loops read."""
         self.solver.reset(self._sim.state, mask, flags=newton.StateFlags.NONE)
         for stale in (self.solver.mjw_data.cvel, self.solver.mjw_data.cdof_dot):
             self._launch(zero_worlds_kernel, stale.shape, [mask], [stale])
 
     def carried(self) -> dict[str, wp.array]:
-        """See `Physics.carried`."""
+        """See `Physics.carried`: MuJoCo's warm start and velocities, and the bodies' poses and velocities."""
         data = self.solver.mjw_data
         names = ("qacc_warmstart", "cvel", "cdof_dot")
         bodies = {"body_q": self._sim.state.body_q, "body_qd": self._sim.state.body_qd}
         return bodies | {name: getattr(data, name) for name in names}
 
     def _launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
+        """Launch a kernel on the simulation's device."""
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self._sim.device)

@@ -10,7 +10,7 @@ from jumper_warp import kernels
 def float64_kernels() -> ModuleType:
     """Return `jumper_warp.kernels_float64`: the files of `jumper_warp.kernels`, loaded again with a float64 `real`.
 
-    Import its modules as usual afterwards, with `importlib.import_module("jumper_warp.kernels_float64.layout")`.
+    It registers the package, so that `importlib.import_module("jumper_warp.kernels_float64.layout")` works afterwards.
     """
     name = "jumper_warp.kernels_float64"
     if name not in sys.modules:

@@ -1,4 +1,4 @@
-"""Batched simulation of the robot with motors, motor command filter and a solver."""
+"""Batched simulation of the robot: motor command filter, motors and a solver."""
 
 from __future__ import annotations
 
@@ -36,34 +36,34 @@ SolverName = Literal["jumper", "mujoco"]
 
 
 class Simulation:
-    """Batched simulation of the robot under position targets, standing in the default pose at first.
+    """Batched simulation of the robot under position targets, which starts standing in the default pose.
 
-    Pass raw motor targets [rad] to `set_targets`, or write them unchecked on the device to `target`, (12, num_worlds);
-    then call `step` for one policy step: the filter once, then `substeps` times motors and
-    physics. All calls are asynchronous.
+    Pass motor targets [rad] to `set_targets`, or write them unchecked on the device to `target`, (12, num_worlds).
+    Then call `step` for one policy step: the filter once, then motors and physics `substeps` times.
+    Calls are asynchronous.
 
     Args:
         solver: "jumper" or "mujoco" (Newton's SolverMuJoCo).
         motors: By default the jumping gains at 18 N m.
-        command_filter: None leaves the targets as they are.
+        command_filter: Motor command filter; None passes targets to the motors unchanged.
         ground: As in `build_model`.
         block: A block in each world that slides when the robot pushes it; on SolverJumper only.
-        friction: Of the paws [1].
+        friction: Coulomb coefficient of the paws [1].
         gravity: Downward, of every world [m/s^2].
         dt: Physics step [s], `substeps` of which are in a policy step.
         tolerance: Of SolverJumper's contact iteration [m/s].
-        keep_momentum: Whether robots that fly freely keep their momentum from policy step to policy step exactly,
-            by a correction of the base's velocity; on SolverJumper only.
+        keep_momentum: Whether to correct the base's velocity after every policy step, so that gravity alone changes
+            the momentum of a robot in free flight; on SolverJumper only.
         observe_forces: Whether to measure paw forces on MuJoCo, which costs time; SolverJumper always has them.
         visuals: Whether to add shapes that only viewers see.
         extras: Adds the caller's own sites and shapes to every world, as in `build_model`.
-        robot: What differs from the description: an overlay, or values of one robot or of one a world. Their
-            latency is the caller's to apply.
-        threads: CPU threads that share the worlds; results do not depend on them. By default those of
+        robot: Overlay, or values of one robot (N = 1) or of every world (N = num_worlds), that replace the
+            description's. Their latency is not applied.
+        threads: Number of CPU threads, which does not change results; by default that of
             `jumper_warp.utils.threads.set_threads`, or all cores. SolverMuJoCo and few worlds use one.
 
     Raises:
-        ValueError: unknown solver, a block on MuJoCo, dt or tolerance not finite and positive, substeps or
+        InputError: unknown solver, a block on MuJoCo, dt or tolerance not finite and positive, substeps or
             threads no whole number of at least 1, or as `build_model` and `SolverJumper`.
         NotThisRobotError: `extras` adds more than sites and shapes.
     """
@@ -127,7 +127,7 @@ class Simulation:
         self._start = state_arrays(start)
 
     def _write_robot(self, robot: RobotOverlay | RobotValues | None) -> RobotValues | None:
-        """Write a robot that differs from the description into model and motors; return its values."""
+        """Write a robot's values into model and motors, and return them; None: the described robot."""
         values = robot.robots() if isinstance(robot, RobotOverlay) else robot
         if values is not None:
             paws = not isinstance(robot, RobotOverlay) or "paw_friction" in robot.values
@@ -136,22 +136,22 @@ class Simulation:
         return values
 
     def _make_arrays(self) -> None:
-        """Allocate state, targets and readout arrays."""
+        """Allocate state, control, targets, standing pose, reset mask and readout arrays."""
         self.state, self.control = self.model.state(), self.model.control()
         standing = motor_values(self.model.joint_q.numpy().reshape(self.num_worlds, -1)[:, 7:])
         self._standing = wp.array(standing.T, dtype=float, device=self.device)
         self.target, self._safe_target = wp.clone(self._standing), wp.clone(self._standing)
-        self._mask = wp.zeros(self.num_worlds + 1, dtype=wp.bool, device=self.device)  # the last one: no world
+        self._mask = wp.zeros(self.num_worlds + 1, dtype=wp.bool, device=self.device)  # last entry: no world
         self._base_velocity = wp.zeros(self.num_worlds, dtype=wp.vec3, device=self.device)
         self._graphs: dict[str, SlicedGraph | None] = {}
 
     def set_targets(self, angles: np.ndarray | torch.Tensor | Sequence) -> None:
         """Write raw motor targets [rad], (12, num_worlds), or (12,) for all worlds, to `target`.
 
-        Raises ValueError: another shape, or not finite.
+        Raises InputError: another shape, or not finite.
         """
-        given: Any = angles
-        values = np.asarray(given.detach().cpu() if hasattr(given, "detach") else given, dtype=np.float32)
+        array: Any = angles
+        values = np.asarray(array.detach().cpu() if hasattr(array, "detach") else array, dtype=np.float32)
         if values.shape not in ((12,), (12, self.num_worlds)):
             raise InputError(f"targets must have shape (12, {self.num_worlds}) or (12,), got {values.shape}")
         if not np.isfinite(values).all():
@@ -159,17 +159,16 @@ class Simulation:
         self.target.assign(np.broadcast_to(values.reshape(12, -1), (12, self.num_worlds)))
 
     def step(self) -> None:
-        """Advance one policy step towards `target`."""
+        """Advance one policy step of `substeps` physics steps towards `target`."""
         self._captured("step", self._step)
 
     def reset(self, mask: Sequence[bool] | np.ndarray | torch.Tensor | wp.array | None = None) -> None:
         """Reset worlds to the initial state of the simulation: standing at rest, with the standing pose as target.
 
         Contact history, torques, forces and the flags of diverged worlds are cleared; blocks return to their starts.
-        Changes of the model stay. A captured graph may contain the call with a mask on the device, which is read at
-        every replay.
+        Changes of the model stay. A captured graph may contain the call; a mask on the device is read at every replay.
 
-        mask: Which worlds, bool of shape (num_worlds,), by default all. Raises ValueError for anything else.
+        mask: Worlds to reset, bool of shape (num_worlds,), by default all. Raises InputError for anything else.
         """
         self._take_mask(mask)
         self.physics.forget(self._mask)
@@ -179,29 +178,29 @@ class Simulation:
         self._launch(restore_motors_kernel, self.num_worlds, [self._mask, self._standing], results)
 
     def _take_mask(self, mask: Sequence[bool] | np.ndarray | torch.Tensor | wp.array | None) -> None:
-        """Copy a mask of worlds to the device. Raises ValueError."""
+        """Copy a mask, bool of shape (num_worlds,), to the device; None: all True. Raises InputError."""
         if mask is None:
             self._mask.fill_(True)
             return
-        given: Any = mask
-        of_torch = hasattr(mask, "is_cuda")
+        array: Any = mask
+        is_tensor = hasattr(mask, "is_cuda")
         try:
-            given = given if of_torch or isinstance(given, wp.array) else np.asarray(given)
-            kind, shape = getattr(given.dtype, "__name__", str(given.dtype)), tuple(given.shape)
+            array = array if is_tensor or isinstance(array, wp.array) else np.asarray(array)
+            dtype, shape = getattr(array.dtype, "__name__", str(array.dtype)), tuple(array.shape)
         except ValueError:  # lists of different lengths
-            kind, shape = "lists", "several lengths"
-        if kind not in ("bool", "torch.bool") or shape != (self.num_worlds,):
-            raise InputError(f"mask must be bool of shape ({self.num_worlds},), got {kind} of shape {shape}")
-        if of_torch:
-            given = wp.from_torch(cast("torch.Tensor", given).contiguous())
-        elif isinstance(given, np.ndarray):
-            given = wp.array(given, dtype=wp.bool, device=self.device)
-        wp.copy(self._mask, given, count=self.num_worlds)
+            dtype, shape = "lists", "several lengths"
+        if dtype not in ("bool", "torch.bool") or shape != (self.num_worlds,):
+            raise InputError(f"mask must be bool of shape ({self.num_worlds},), got {dtype} of shape {shape}")
+        if is_tensor:
+            array = wp.from_torch(cast("torch.Tensor", array).contiguous())
+        elif isinstance(array, np.ndarray):
+            array = wp.array(array, dtype=wp.bool, device=self.device)
+        wp.copy(self._mask, array, count=self.num_worlds)
 
     def filter_targets(self) -> None:
-        """Run the motor command filter on `target` once, on the angles that the sensors read (`motors.offset`).
+        """Run the motor command filter on `target` once, with measured angles (true angle + `motors.offset`).
 
-        Follow with `physics_step`s. A captured graph may contain the calls.
+        Call `physics_step` afterwards. A captured graph may contain both calls.
         """
         self._captured("filter", self._filter_targets)
 
@@ -215,7 +214,7 @@ class Simulation:
         self._physics(self.substeps, worlds)
 
     def _captured(self, name: str, body: Callable[[WorldRange], None]) -> None:
-        """Run a function eagerly the first time, then as a captured graph; within another capture, as part of it."""
+        """Run `body` for all worlds: the first call of a name, or one in a capture, launches; others replay."""
         if self.device.is_capturing:
             body(WorldRange(0, self.num_worlds))
             return
@@ -229,12 +228,12 @@ class Simulation:
         graph.replay()
 
     def _filter_targets(self, worlds: WorldRange) -> None:
-        """Launch the command filter, or a copy without one, for a range of worlds."""
+        """Write the filtered targets of a range of worlds; without a filter copy the targets."""
         if self._filter is None:
             if worlds.count == self.num_worlds:
                 wp.copy(self._safe_target, self.target)
                 return
-            for motor in range(12):  # a copy of whole columns cannot be captured on a CPU
+            for motor in range(12):  # a CPU graph cannot capture one strided copy of all motors
                 first = motor * self.num_worlds + worlds.first
                 wp.copy(self._safe_target.flatten(), self.target.flatten(), first, first, worlds.count)
             return
@@ -247,17 +246,19 @@ class Simulation:
         )  # fmt: skip
 
     def _physics(self, substeps: int, worlds: WorldRange) -> None:
+        """Launch `substeps` physics steps of a range of worlds towards the filtered targets."""
         self.physics.advance(substeps, self._safe_target, worlds=worlds)
 
     def _launch(self, kernel: Any, dim: int | tuple[int, ...], inputs: list, outputs: list) -> None:
+        """Launch a kernel on the simulation's device."""
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
     def joint_q(self) -> np.ndarray:
-        """Return the joint coordinates, (num_worlds, 43)."""
+        """Return the joint coordinates, (num_worlds, 43), in the layout of `jumper_warp.robot.model`."""
         return self.state.joint_q.numpy().reshape(self.num_worlds, -1)
 
     def joint_qd(self) -> np.ndarray:
-        """Return the joint rates, (num_worlds, 38)."""
+        """Return the joint rates, (num_worlds, 38): base [m/s] at its COM, [rad/s], 20 hinges [rad/s], four ankles."""
         return self.state.joint_qd.numpy().reshape(self.num_worlds, -1)
 
     def base_velocity(self) -> np.ndarray:
@@ -274,7 +275,7 @@ class Simulation:
         return self._base_velocity
 
     def loop_gap(self) -> np.ndarray:
-        """Return the largest distance [m] between the two ankle anchors of a leg, (num_worlds,)."""
+        """Return the largest distance [m] between the two anchors of an ankle, over the four legs, (num_worlds,)."""
         model = self.model
         parents, children = model.joint_parent.numpy(), model.joint_child.numpy()
         frames = self.state.body_q.numpy()
@@ -290,5 +291,5 @@ class Simulation:
 
 
 def motor_values(joint_values: np.ndarray) -> np.ndarray:
-    """Return the motors' values (..., 12), given those of all joints after the base, (..., 20 or more)."""
+    """Return the 12 motors' entries, (..., 12), of values of all joints after the base, (..., 20 or more)."""
     return joint_values[..., [5 * leg + j for leg in range(4) for j in (0, 1, 3)]]

@@ -17,28 +17,28 @@ import warp as wp
 from jumper_warp.utils.threads import run_in_parallel
 
 MIN_WORLDS = 16
-"""Worlds of the smallest slice: fewer do not pay for a thread; and no two slices share a cache line of a row."""
+"""Smallest slice: a thread costs more than it gains for fewer worlds, and slices share no cache line of a row."""
 
 
 class WorldRange(NamedTuple):
-    """Contiguous range of `count` worlds from `first` on."""
+    """Contiguous range of worlds: first, ..., first + count - 1."""
 
     first: int
     count: int
 
 
 def slices_of(num_worlds: int, threads: int) -> list[WorldRange]:
-    """Return at most `threads` slices of about equal size; a single one for few worlds."""
+    """Return at most `threads` slices of all worlds, of about equal size and at least MIN_WORLDS; else a single one."""
     count = max(1, min(threads, num_worlds // MIN_WORLDS))
     begins = [MIN_WORLDS * (num_worlds // MIN_WORLDS * i // count) for i in range(count)]
     return [WorldRange(a, b - a) for a, b in itertools.pairwise([*begins, num_worlds])]
 
 
 class SlicedGraph:
-    """Captured graphs of the launches for each slice."""
+    """Graphs of the same launches, one for each slice of worlds."""
 
     def __init__(self, launch: Callable[[WorldRange], None], slices: list[WorldRange], device: wp.Device) -> None:
-        """Capture the launches; launch: launches all kernels, already loaded, for a range of worlds."""
+        """Capture `launch(slice)` for each slice; launch: function that launches kernels, whose modules are loaded."""
         self._device, self._graphs = device, []
         for worlds in slices:
             with wp.ScopedCapture(device=device) as capture:
@@ -46,7 +46,7 @@ class SlicedGraph:
             self._graphs.append(capture.graph)
 
     def replay(self) -> None:
-        """Launch all graphs; on a CPU concurrently, and all have ended when this returns."""
+        """Launch all graphs; several graphs run concurrently on a CPU, and all have ended when this returns."""
         if len(self._graphs) == 1:
             wp.capture_launch(self._graphs[0])
         else:

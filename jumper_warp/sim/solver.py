@@ -32,15 +32,15 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Control, Model, State
 
 MAX_SWEEPS = 50
-"""Sweeps of the contact iteration in a step, at most."""
+"""Largest number of contact sweeps in a step."""
 TOLERANCE = 1.0e-5
-"""[m/s] The contact iteration ends when a sweep changes no contact velocity by more."""
+"""[m/s] The contact iteration ends when a sweep changes every contact velocity by at most this."""
 DIFFERENTIABLE_TOLERANCE = 1.0e-6
-"""[m/s] Tolerance of steps with gradients, which inherit its error."""
+"""[m/s] Largest tolerance of steps with gradients, since gradients inherit the iteration's error."""
 
 
 def check_step(dt: float, substeps: int = 1) -> None:
-    """Raise ValueError unless dt [s] is finite and above 0 and substeps a whole number of at least 1."""
+    """Raise InputError unless dt [s] is finite and above 0 and substeps a whole number of at least 1."""
     if not 0.0 < dt < math.inf:
         raise InputError(f"dt must be finite and above 0 [s], got {dt!r}")
     if not isinstance(substeps, Integral) or substeps < 1:
@@ -48,7 +48,7 @@ def check_step(dt: float, substeps: int = 1) -> None:
 
 
 def check_tolerance(tolerance: float) -> None:
-    """Raise ValueError unless the tolerance [m/s] of a contact iteration is finite and above 0."""
+    """Raise InputError unless the tolerance [m/s] of a contact iteration is finite and above 0."""
     if not 0.0 < tolerance < math.inf:
         raise InputError(f"tolerance must be finite and above 0 [m/s], got {tolerance!r}")
 
@@ -62,7 +62,7 @@ def state_arrays(state: State | Model) -> Any:
 
 
 def warn_of_colliders(model: Model) -> None:
-    """Warn of shapes that collide in the model but not on SolverJumper."""
+    """Emit one UserWarning if shapes collide in the model that SolverJumper ignores."""
     ignored = other_colliders(model)
     if len(ignored) > 0:
         warnings.warn(
@@ -75,25 +75,25 @@ def warn_of_colliders(model: Model) -> None:
 class SolverJumper(SolverBase):
     """Exact 18-coordinate dynamics of the Jumper with rigid paw contact.
 
-    The five-bar loops hold by construction. Semi-implicit Euler; contact paw by paw to `tolerance`, on a CPU in turn
-    (Gauss-Seidel), on a GPU all at once, or one at a time where that does not converge. Hard stops, of motors and of a
-    leg's outer + inner, are settled together with contact (`kernels.actuation.stops`). Per-world masses, inertias,
-    armature, motor friction, damping, joint stops, paw friction and gravity are read from the model: write the model's
-    arrays, then call `notify_model_changed`.
+    The five-bar loops hold by construction. Integration is semi-implicit Euler. Contact is solved
+    paw by paw to `tolerance`: in turn on a CPU (Gauss-Seidel), all at once on a GPU, or in turn where that does not
+    converge. Hard stops of motors and of a leg's outer + inner are solved together with contact
+    (`kernels.actuation.stops`). Masses, inertias, armature, motor friction, damping, joint stops, paw friction and
+    gravity of each world are read from the model: write its arrays, then call `notify_model_changed`.
 
     Reads base and motor coordinates of `joint_q`/`joint_qd`, `control.joint_f` of base and motors (world wrench [N],
     [N m] at the base's com; motor torques [N m]) and `state.body_f` of the base. Writes every joint, loop joint and
     body. Forces on other bodies and passive joints are not read. On a CPU a thread owns a world, on a GPU four
     threads share one and add up in a fixed order, so results repeat bit for bit on a device.
 
-    Where the states carry gradients (`finalize(requires_grad=True)`) `wp.Tape` can run `step` backwards, with a state
-    of its own for every step (see `jumper_warp.sim.tape`). Record `dynamics.pack_masses()` or `pack_joints()` on the
-    tape for gradients with respect to the model's arrays.
+    Where the states carry gradients (`finalize(requires_grad=True)`) `wp.Tape` can differentiate `step`, given a
+    separate state for every step (see `jumper_warp.sim.tape`). Record `dynamics.pack_masses()` or `pack_joints()` on
+    the tape for gradients with respect to the model's arrays.
 
-    With `block`, each world has a block of its own that slides on the floor under the paws that push it. A paw touches
-    floor or block, whichever is nearer. Gradients do not go through blocks.
+    With `block`, each world has a block that the paws can push over the floor. A paw touches floor or block, whichever
+    is nearer. Steps with blocks have no gradients.
 
-    Shapes of the model other than paws and ground do not collide; a warning names the first that would. Sites and
+    Shapes of the model other than paws and ground do not collide; a warning names the first such shape. Sites and
     shapes that do not collide serve sensors and viewers.
 
     A diverged (non-finite) world is flagged in `diverged` and frozen at rest in the model's reference pose until
@@ -112,11 +112,11 @@ class SolverJumper(SolverBase):
         max_sweeps: int = MAX_SWEEPS,
         tolerance: float = TOLERANCE,
     ):
-        """Prepare for a model of `jumper_warp.robot.model.build_model`.
+        """Prepare the solver for a model of `jumper_warp.robot.model.build_model`.
 
         Raises:
             NotThisRobotError: the model is another robot's, or holds more bodies, joints or particles than it.
-            ValueError: `max_sweeps` below 1, `tolerance` [m/s] not finite and positive, or arrays of `block` that do
+            InputError: `max_sweeps` below 1, `tolerance` [m/s] not finite and positive, or arrays of `block` that do
                 not have one row per world.
         """
         super().__init__(model)
@@ -129,7 +129,7 @@ class SolverJumper(SolverBase):
         self.tolerance = tolerance
         work = self.dynamics.work
         self.contact_force: wp.array = work.contact_force
-        """Force of the ground on each paw in the last step [N], world frame, vec3 of shape (4, num_worlds)."""
+        """Force of the ground on each paw (FL, FR, BL, BR) in the last step [N], world frame, (4, num_worlds) vec3."""
         self.peak_force: wp.array = work.peak_force
         """Largest total paw force of the last call [N], shape (num_worlds,)."""
         self.torque: wp.array = work.torque
@@ -137,79 +137,55 @@ class SolverJumper(SolverBase):
         self.residual: wp.array = work.residual
         """Largest velocity change [m/s] of the last contact sweep, worst step of the last call, (num_worlds,)."""
         self.sweeps: wp.array = work.sweeps
-        """Most contact sweeps of a step in the last call, on a GPU rounds of all paws at once, shape (num_worlds,)."""
+        """Largest number of contact sweeps of a step in the last call (on a GPU: rounds of all paws), (num_worlds,)."""
         self.diverged: wp.array = work.diverged
-        """1: the world diverged and waits for `reset`, shape (num_worlds,)."""
+        """1: the world diverged and is frozen until `reset`, int of shape (num_worlds,)."""
         self._differentiable = DifferentiableStep(self.dynamics, max_sweeps, min(tolerance, DIFFERENTIABLE_TOLERANCE))
         self._default_control = model.control(clone_variables=False)
         self._no_body_f = wp.zeros(model.body_count, dtype=wp.spatial_vectorf, device=model.device)
         self._old_body_qd = wp.zeros(model.body_count, dtype=wp.spatial_vectorf, device=model.device)
 
     def step(
-        self,
-        state_in: State,
-        state_out: State,
-        control: Control | None,
-        contacts: newton.Contacts | None,
-        dt: float,
-        *,
-        observables: SolverBase.Observables | None = None,
-    ) -> None:
+        self, state_in: State, state_out: State, control: Control | None, contacts: newton.Contacts | None, dt: float,
+        *, observables: SolverBase.Observables | None = None,
+    ) -> None:  # fmt: skip
         """Advance every world by dt [s]. `contacts` is not used: the solver finds the paws' contacts itself.
 
-        Raises ValueError for a dt that is not finite and positive.
+        Raises InputError for a dt that is not finite and positive.
         """
         self.validate_observables(observables, contacts)
         drive = self.dynamics.drive(*self._forces(state_in, control))
         self._advance(state_in, state_out, drive, dt, 1, observables, bodies=True)
 
     def step_motors(
-        self,
-        state_in: State,
-        state_out: State,
-        motors: Any,
-        target: wp.array,
-        dt: float,
-        substeps: int,
-        *,
-        control: Control | None = None,
-        previous: wp.array | None = None,
-        delay: wp.array | None = None,
-        bodies: bool = True,
-        observables: SolverBase.Observables | None = None,
-        worlds: WorldRange | None = None,
-    ) -> None:
-        """Advance every world by `substeps` steps of dt [s], the motors following targets, in one launch.
+        self, state_in: State, state_out: State, motors: Any, target: wp.array, dt: float, substeps: int, *,
+        control: Control | None = None, previous: wp.array | None = None, delay: wp.array | None = None,
+        bodies: bool = True, observables: SolverBase.Observables | None = None, worlds: WorldRange | None = None,
+    ) -> None:  # fmt: skip
+        """Advance every world by `substeps` steps of dt [s] in one launch, with motors that follow targets.
 
-        motors: `jumper_warp.kernels.actuation.motors.MotorArrays`, see `jumper_warp.robot.motors.motor_arrays`.
-        target: motor angles [rad], (12, num_worlds), held; with `delay` [physics steps], (num_worlds,), the motors
-        follow `previous` until it arrives. control: additional joint forces, held. bodies: whether to write passive
-        joints, loop joints and bodies, which the solver itself does not need. observables: of the whole call. worlds:
-        which are advanced, by default all. `state_out` may be `state_in`.
+        motors: `MotorArrays`, as `jumper_warp.robot.motors.motor_arrays` returns them. target: motor angles [rad],
+        (12, num_worlds), constant during the call; with delay [physics steps], (num_worlds,), the motors follow
+        `previous` (12, num_worlds) until the target arrives. control: additional joint forces, constant. bodies:
+        whether to write passive joints, loop joints and bodies, which the solver does not read. observables: over the
+        whole call. worlds: range to advance, by default all. `state_out` may be `state_in`.
 
-        Raises ValueError: dt is not finite and positive, or substeps no whole number of at least 1.
+        Raises InputError: dt is not finite and positive, or substeps no whole number of at least 1.
         """
         self.validate_observables(observables)
         drive = self.dynamics.drive(*self._forces(state_in, control), motors, target, previous, delay)
         self._advance(state_in, state_out, drive, dt, substeps, observables, bodies, worlds)
 
     def _forces(self, state: State, control: Control | None) -> tuple[wp.array, wp.array]:
-        """Return the joint forces [N m] of a control and the body wrenches [N], [N m] of a state."""
+        """Return `joint_f` of a control and `body_f` of a state, or zeros where they are None."""
         control = self._default_control if control is None else control
         return control.joint_f, self._no_body_f if state.body_f is None else state.body_f
 
     def _advance(
-        self,
-        state_in: State,
-        state_out: State,
-        drive: Any,
-        dt: float,
-        substeps: int,
-        observables: SolverBase.Observables | None,
-        bodies: bool,
-        worlds: WorldRange | None = None,
-    ) -> None:
-        """Advance a range of worlds by `substeps` steps of dt [s]; arguments as in `step_motors`."""
+        self, state_in: State, state_out: State, drive: Any, dt: float, substeps: int,
+        observables: SolverBase.Observables | None, bodies: bool, worlds: WorldRange | None = None,
+    ) -> None:  # fmt: skip
+        """Advance a range of worlds by `substeps` steps of dt [s]; drive: kernels' `Drive`; rest: see `step_motors`."""
         check_step(dt, substeps)
         qdd = None
         if observables is not None and observables.is_requested(SolverBase.ObservableKind.BODY_QDD):
@@ -236,17 +212,17 @@ class SolverJumper(SolverBase):
             )
 
     def block_position(self) -> np.ndarray:
-        """Return the centres of the blocks [m], world frame, (num_worlds, 2). Raises ValueError without blocks."""
+        """Return the centres of the blocks [m], world frame, (num_worlds, 2). Raises InputError without blocks."""
         return self._block_values()["center"].copy()
 
     def block_velocity(self) -> np.ndarray:
-        """Return the velocities of the blocks [m/s], world frame, (num_worlds, 2). Raises ValueError without blocks."""
+        """Return the velocities of the blocks [m/s], world frame, (num_worlds, 2). Raises InputError without blocks."""
         return self._block_values()["velocity"].copy()
 
     def place_blocks(self, center: np.ndarray, worlds: Sequence[int] | None = None) -> None:
-        """Place the blocks of some worlds, by default all, at rest at new starts [m], world frame, (2,) or (worlds, 2).
+        """Move the blocks of some worlds (indices), by default all, to new start positions, at rest.
 
-        Raises ValueError without blocks.
+        center: x and y [m], world frame, (2,) or (len(worlds), 2). Raises InputError without blocks.
         """
         values = self._block_values()
         values["start"][slice(None) if worlds is None else list(worlds)] = center
@@ -256,29 +232,29 @@ class SolverJumper(SolverBase):
     def reset_blocks(self, worlds: Sequence[int] | wp.array | None = None) -> None:
         """Reset the blocks of some worlds, by default all, to their starts, at rest.
 
-        `worlds`: indices, or a mask on the device, bool of shape (num_worlds,). Raises ValueError without blocks.
+        `worlds`: indices, or a mask on the device, bool of shape (num_worlds,). Raises InputError without blocks.
         """
         n, device = self._blocks().shape[0], self.model.device
         mask = worlds
         if not isinstance(worlds, wp.array):
-            chosen = np.zeros(n, dtype=bool)
-            chosen[slice(None) if worlds is None else list(worlds)] = True
-            mask = wp.array(chosen, dtype=wp.bool, device=device)
+            selected = np.zeros(n, dtype=bool)
+            selected[slice(None) if worlds is None else list(worlds)] = True
+            mask = wp.array(selected, dtype=wp.bool, device=device)
         wp.launch(rest_blocks_kernel, dim=n, inputs=[mask, self.dynamics.robot.ground], device=device)
 
     def _block_values(self) -> Any:
-        """Return the blocks as a structured array of NumPy. Raises ValueError without blocks."""
+        """Return the blocks as a structured array (num_worlds,) of `Block`. Raises InputError without blocks."""
         return self._blocks().numpy()
 
     def _blocks(self) -> wp.array:
-        """Return the kernels' `Block` of every world. Raises ValueError without blocks."""
+        """Return the kernels' `Block` of every world, (num_worlds,). Raises InputError without blocks."""
         blocks = self.dynamics.robot.ground.blocks
         if blocks.shape[0] == 0:
             raise InputError("the solver was made without a block")
         return blocks
 
     def notify_model_changed(self, flags: ModelFlags | int) -> None:
-        """Read changed parameters from the model again."""
+        """Read the parameters that `flags` names from the model again."""
         if flags & ModelFlags.BODY_INERTIAL_PROPERTIES:
             self.dynamics.pack_masses()
         if flags & (
@@ -293,10 +269,10 @@ class SolverJumper(SolverBase):
             self.dynamics.pack_gravity()
 
     def reset(self, state: State, world_mask: wp.array | None = None, flags: StateFlags | int | None = None) -> None:
-        """Clear contact history and the `diverged` flag of the masked worlds, and put them in the reference pose.
+        """Clear contact history and `diverged` of the masked worlds, and write the reference pose to their state.
 
-        Blocks return to their starts.
-        With `flags=StateFlags.NONE` the state is left alone, for callers that write their own.
+        world_mask: bool (num_worlds + 1,), the last entry for the global world; None: all. Blocks return to their
+        starts. With `flags=StateFlags.NONE` state and blocks stay as they are.
         """
         world_mask = self._normalize_reset_world_mask(world_mask)
         n, device = self.model.world_count, self.model.device

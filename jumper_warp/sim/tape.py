@@ -11,32 +11,27 @@ from jumper_warp.utils.errors import InputError
 
 
 class DifferentiableStep:
-    """One time step that `wp.Tape` can reverse; each call allocates its buffers.
+    """One time step that `wp.Tape` can differentiate; each call allocates its buffers.
 
     Gradients reach the state, the joint forces, the external wrench and the parameter table. They are exact at the
     contact modes and pressed stops of the step; see `kernels.dynamics.adjoint.tape_step`.
     """
 
     def __init__(self, dynamics: JumperDynamics, max_sweeps: int, tolerance: float):
-        """tolerance [m/s]: of the contact iteration, whose error the gradients inherit."""
+        """max_sweeps, tolerance [m/s]: of the contact iteration, whose error the gradients inherit."""
         self._dynamics = dynamics
         self._max_sweeps = max_sweeps
         self._tolerance = tolerance
         self._record: Any = None
 
     def step(
-        self,
-        q: wp.array,
-        qd: wp.array,
-        joint_f: wp.array,
-        body_f: wp.array,
-        q_out: wp.array,
-        qd_out: wp.array,
+        self, q: wp.array, qd: wp.array, joint_f: wp.array, body_f: wp.array, q_out: wp.array, qd_out: wp.array,
         dt: float,
-    ) -> None:
-        """Advance base and motor coordinates by dt [s]; arrays as in `JumperDynamics.advance`, none shared.
+    ) -> None:  # fmt: skip
+        """Write base and motor coordinates after one step of dt [s] to q_out and qd_out.
 
-        Raises InputError: an output is an input, or there are moving blocks.
+        q, qd: as in `JumperDynamics.advance`; joint_f, body_f: as in `JumperDynamics.drive`. Raises InputError: an
+        output is an input, or there are moving blocks.
         """
         if q.ptr == q_out.ptr or qd.ptr == qd_out.ptr:
             raise InputError("a differentiable step needs its own output state: state_out must not be state_in")
@@ -55,7 +50,7 @@ class DifferentiableStep:
         wp.launch(kernels.integrate_kernel, n, [*inputs, self._record, power], [q_out, qd_out], device=device)
 
     def _solved(self) -> Any:
-        """Return the kernels' `SolvedStep`, zeroed."""
+        """Return the kernels' `SolvedStep`, zeroed: contact modes, impulses and torques of one step of all worlds."""
         dynamics, n = self._dynamics, self._dynamics.num_worlds
         solved, trajectory = dynamics.modules.tape_step.SolvedStep(), dynamics.modules.trajectory.TrajectoryArrays()
         for name, shape in {"torque": (1, 12, n), "impulse": (1, 4, n), "pressed": (1, 4, n)}.items():

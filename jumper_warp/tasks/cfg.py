@@ -1,4 +1,4 @@
-"""What a task is: its state, tables of terms, resets, commands, curriculum and randomisation, as data."""
+"""Definition of a task as data: state, tables of terms, reset, command, curriculum and randomisation."""
 
 from __future__ import annotations
 
@@ -36,35 +36,35 @@ class Reset:
     """How an episode begins."""
 
     func: Function
-    """(arrays: RobotArrays, scene: Scene, skill: SkillSettings, old, settings, level, rng: RngStream) -> state of
-    the new episode; writes coordinates and rates of `rng.world`."""
+    """@wp.func (arrays: RobotArrays, scene: Scene, skill: SkillSettings, old state, settings, level, rng: RngStream) ->
+    new state; writes coordinates and rates of world `rng.world`."""
     settings: Any = None
-    """Frozen dataclass with `struct`, the type of the kernels' settings, and `values(step_dt)`, which makes them."""
+    """Frozen dataclass with `struct`, a `@wp.struct`, and `values(step_dt)` [s], which returns one; or None."""
     parallel: bool = False
-    """Whether `func` makes attempts `range(rng.lane, number, rng.lanes)`, which threads of a GPU share: they run it
-    with the same arguments but for `rng.lane`, and all that they write otherwise must be the same."""
+    """Whether threads of a GPU share `func`'s attempts, `range(rng.lane, number, rng.lanes)`. Only `rng.lane` differs
+    between the threads; apart from the attempts they must write equal values."""
 
 
 @dataclass(frozen=True)
 class Command:
-    """Command of a task: set from outside, and resampled within an episode."""
+    """Functions that set a task's command from outside and resample it within an episode."""
 
     set: Function
-    """(robot, scene: Scene, state, values: wp.vec4, heading: float) -> state with a command from outside."""
+    """@wp.func (robot, scene: Scene, state, values: wp.vec4, heading [rad]) -> state with the command `values`."""
     resample_due: Function | None = None
-    """(state) -> bool, whether a new command is drawn within the episode."""
+    """@wp.func (state) -> bool, whether to sample a new command in this step; None: never."""
     resample: Function | None = None
-    """(robot, scene: Scene, state, level, rng: RngStream) -> state with a new command."""
+    """@wp.func (robot, scene: Scene, state, level, rng: RngStream) -> state with a sampled command."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: one of resample_due and resample is missing."""
+        """Raise InputError: one of resample_due and resample is missing."""
         if (self.resample_due is None) != (self.resample is None):
             raise InputError("a command needs both resample_due and resample, or neither")
 
 
 @dataclass(frozen=True)
 class ObservationsCfg:
-    """Observation terms of the two networks."""
+    """Observation terms of the policy (actor) and of the value network (critic), in the order of their columns."""
 
     actor: tuple[ObservationTerm, ...]
     critic: tuple[ObservationTerm, ...]
@@ -72,52 +72,52 @@ class ObservationsCfg:
 
 @dataclass(frozen=True)
 class TaskCfg:
-    """A task on the robot."""
+    """A task on the robot: everything that an environment needs, as data."""
 
     name: str
     state: Any
-    """The `@wp.struct` of one world's state; it counts the episode's policy steps in `steps`."""
+    """The `@wp.struct` of one world's state, whose field `steps` counts the policy steps of the episode."""
     advance: Advance
     reset: Reset
     command: Command
     curriculum: Curriculum
     rewards: tuple[RewardTerm, ...]
     terminations: tuple[TerminationTerm, ...]
-    """The first that holds ends the episode."""
+    """In this order; the first that is true ends the episode and is logged."""
     observations: ObservationsCfg
     motors: MotorCfg
     command_filter: FilterCfg
     action_scale: Pair
-    """[deg] Lateral and transversal."""
+    """[deg] Change of the motor target per unit of action: lateral, transversal motors."""
     levels: tuple[Any, ...] = ()
-    """Curriculum, easiest first: frozen dataclasses with `struct` and `values()`, as the reset's settings."""
+    """Levels of the curriculum, easiest first: frozen dataclasses of one type with `struct` and `values()`."""
     events: tuple[EventTerm, ...] = ()
-    """Besides those of `randomization`."""
+    """Events in addition to those of `randomization`."""
     randomization: RandomizationCfg = field(default_factory=RandomizationCfg)
     gravity: float = EARTH
-    """[m/s^2] Downward, of every world; all estimates of flights take it from there."""
+    """[m/s^2] Downward, of every world; estimates of flights use it too."""
     keep_momentum: bool = False
-    """Whether robots in free flight keep their momentum exactly, as in `Simulation`."""
+    """Whether gravity alone changes the momentum of robots in free flight; see `Simulation`."""
     eval_height_offset: float = 0.0
-    """[m] Above standing, at which robots begin whose policy is measured."""
+    """[m] Height of the base above standing at the start of evaluation episodes."""
     contact_force: float = 0.1
-    """[N] Above it a paw counts as in contact."""
+    """[N] Force above which a paw is in contact."""
     self_collision_margin: float = 0.0
-    """[m] Links closer to one another than this count as touching, in training; in tests of policies links touch."""
+    """[m] Distance below which links collide in training; in evaluation it is 0."""
     obstacle_margin: float = 0.0
-    """[m] By which blocks are wider and higher for links that must not touch them, in training, not in tests either."""
+    """[m] Growth of blocks in width and height, for collisions with links, in training; in evaluation it is 0."""
     reward_floor: float | None = 0.0
     """Least total reward of a step; None: no floor."""
     metrics: tuple[StateMetric, ...] = ()
-    """What is logged of the state, besides the means of all terms."""
+    """Logged metrics of the state, in addition to the means of all terms."""
     evaluation_suite: str = "episode"
-    """How policies are measured and played: a key of `jumper_warp.evaluation.evaluations.EVALUATIONS`."""
+    """Evaluation and playback of policies: a key of `jumper_warp.evaluation.evaluations.EVALUATIONS`."""
 
     groups = ("actor", "critic")
     """Names of the observation groups."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: two terms share a name, one is for another task's state, or a setting is out of range."""
+        """Raise InputError: two terms share a name, a function does not fit the state, or a setting is out of range."""
         for section in ("rewards", "terminations", "observations.actor", "observations.critic", "events"):
             names = [term.name for term in operator.attrgetter(section)(self)]
             if len(set(names)) < len(names):
@@ -145,15 +145,15 @@ class TaskCfg:
             raise InputError(f"{self.name}: reward_floor must be finite or None, got {self.reward_floor}")
 
     def without_margins(self) -> TaskCfg:
-        """Return the task as policies are tested on it: links touch where they do."""
+        """Return the task with collision margins of 0 m, as in evaluation."""
         return replace(self, self_collision_margin=0.0, obstacle_margin=0.0)
 
     def _check_functions(self) -> None:
-        """Raises ValueError: a function outside the tables takes other structs than those of this task."""
+        """Raise InputError: reset, command or curriculum takes other structs than this task's."""
         if len({level.struct for level in self.levels}) > 1:
             raise InputError(f"{self.name}: all levels must be of one kind")
         state, level = self.state, self.level_type
-        expected = {
+        expected = {  # by place: the function, and the struct of each argument by its index
             "reset": (self.reset.func, {3: state, 4: self.settings_type, 5: level}),
             "command set": (self.command.set, {2: state}),
             "command resample_due": (self.command.resample_due, {0: state}),
@@ -163,16 +163,16 @@ class TaskCfg:
         for where, (func, structs) in expected.items():
             if func is None:
                 continue
-            found = list(func.input_types.values())
-            for place, struct in structs.items() if found else ():
-                kind = found[place] if len(found) > place else None
-                if kind not in (Any, struct):
-                    what = f"argument {place + 1} of {func.key} is {getattr(kind, 'key', kind)}"
-                    raise InputError(f"{self.name} {where}: {what}, the task has {struct.key}")
+            types = list(func.input_types.values())
+            for index, struct in structs.items() if types else ():
+                actual = types[index] if len(types) > index else None
+                if actual not in (Any, struct):
+                    argument = f"argument {index + 1} of {func.key} is {getattr(actual, 'key', actual)}"
+                    raise InputError(f"{self.name} {where}: {argument}, the task has {struct.key}")
 
     @functools.cached_property
     def params(self) -> TaskParams:
-        """Numbers of all terms."""
+        """Numbers of all terms, by section: "advance", "curriculum", "rewards", "observations.actor" and so on."""
         sections = {"advance": (self.advance,), "curriculum": (self.curriculum,), "rewards": self.rewards,
                     "terminations": self.terminations, "observations.actor": self.observations.actor,
                     "observations.critic": self.observations.critic,
@@ -180,7 +180,7 @@ class TaskCfg:
         return TaskParams(self.name, sections)
 
     def layout(self, group: str) -> dict[str, tuple[int, int]]:
-        """Return the columns of an observation group, (first, end) by the name of the term."""
+        """Return the half-open column range (first, end) of each term by its name; group: "actor" or "critic"."""
         columns, first = {}, 0
         for term in getattr(self.observations, group):
             end = first + term.width * term.options["history"]
@@ -189,23 +189,23 @@ class TaskCfg:
 
     @property
     def observation_names(self) -> tuple[str, ...]:
-        """Names of all columns that the policy sees, in order."""
+        """Names of all columns of the policy's observation, in order."""
         return tuple(column for term in self.observations.actor for column in term.columns)
 
     @property
     def settings_type(self) -> Any:
-        """The struct of the reset's settings."""
+        """The `@wp.struct` of the reset's settings, `NoSettings` without any."""
         return NoSettings if self.reset.settings is None else self.reset.settings.struct
 
     @property
     def level_type(self) -> Any:
-        """The struct of a level."""
+        """The `@wp.struct` of a curriculum level, `NoSettings` without levels."""
         return self.levels[0].struct if self.levels else NoSettings
 
     def with_terms(self, section: str, **changes: dict[str, Any]) -> TaskCfg:
-        """Return the task with other numbers or options in terms of a section, by name.
+        """Return the task with changed terms; changes: by name of the term, its new numbers and options by name.
 
-        Raises ValueError for an unknown term or number.
+        section: "rewards", "terminations" or "events". Raises InputError for an unknown term or number.
         """
         terms: tuple[Term, ...] = getattr(self, section)
         unknown = set(changes) - {term.name for term in terms}
@@ -214,39 +214,39 @@ class TaskCfg:
         return replace(self, **{section: tuple(term.replace(**changes.get(term.name, {})) for term in terms)})
 
     def without_noise(self) -> TaskCfg:
-        """Return the task with exact observations."""
+        """Return the task with observation noise 0 in both groups; delays stay."""
         exact = {g: tuple(term.replace(noise=0.0) for term in getattr(self.observations, g)) for g in self.groups}
         return replace(self, observations=ObservationsCfg(**exact))
 
     @property
     def draws_ground(self) -> bool:
-        """Whether its resets draw another ground than a level one."""
+        """Whether resets sample ground other than a plane."""
         return bool(getattr(self.reset.settings, "draws_ground", False))
 
     @property
     def terrain(self) -> Any:
-        """The heightfield that its episodes begin on, as `Simulation(ground=...)` takes it; None: a plane."""
+        """Heightfield of the task for `Simulation(ground=...)`; None: a plane."""
         make = getattr(self.reset.settings, "heightfield", None)
         return None if make is None else make()
 
     def on_level_ground(self) -> TaskCfg:
-        """Return the task whose resets leave the ground as it is."""
+        """Return the task whose resets sample no ground and whose terrain is a plane."""
         if not hasattr(self.reset.settings, "on_level_ground"):
             return self
         return replace(self, reset=replace(self.reset, settings=self.reset.settings.on_level_ground()))
 
     def nominal(self) -> TaskCfg:
-        """Return the task without randomisation and other events."""
+        """Return the task without randomisation and without events."""
         return replace(self, randomization=RandomizationCfg.off(), events=())
 
 
 @dataclass(frozen=True)
 class Handover:
-    """When and how a world goes from one task to another; the robot is left as it is."""
+    """Condition and function of a world's switch from one task to another; the robot's state does not change."""
 
     source: TaskCfg
     target: TaskCfg
     when: Function
-    """(robot, task of the source, requested: bool) -> bool"""
+    """@wp.func (robot, state of source, requested: bool) -> bool, whether to switch in this step."""
     begin: Function
-    """(robot, task of the source) -> task of the target; then the target's `Command.set`, if the request has one."""
+    """@wp.func (robot, state of source) -> state of target; then `Command.set` if the request has a command."""

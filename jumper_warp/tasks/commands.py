@@ -1,4 +1,4 @@
-"""What the numbers of a task's command are, by the function that takes them, and checks of those from outside."""
+"""Layouts of the tasks' commands, by the function that sets them, and checks of commands from outside."""
 
 from __future__ import annotations
 
@@ -22,25 +22,27 @@ class CommandValue:
     name: str
     """With its unit, as `x [m]`."""
     least: float = -math.inf
+    """Smallest allowed number, in its unit."""
     optional: bool = False
-    """Whether it may be left out, which is 0; only the last one."""
+    """Whether it may be omitted, which means 0; only trailing numbers may be."""
 
 
 @dataclass(frozen=True)
 class CommandLayout:
-    """The numbers of a command, at most four."""
+    """The one to four numbers of a task's command, in order."""
 
     values: tuple[CommandValue, ...]
     nonzero: bool = False
-    """Whether not all of them may be 0."""
+    """Whether at least one number must differ from 0."""
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """How many numbers there may be."""
+        """Allowed lengths of a command: with all, some or none of the optional numbers."""
         required = sum(not value.optional for value in self.values)
         return tuple(range(required, len(self.values) + 1))
 
     def __str__(self) -> str:
+        """Return the names with units, for messages."""
         return ", ".join(f"{value.name}{' (optional)' if value.optional else ''}" for value in self.values)
 
 
@@ -63,30 +65,29 @@ LAYOUTS: dict[Function, CommandLayout] = {
     ),
     set_turn: CommandLayout(tuple(CommandValue(f"quaternion {axis} [1]") for axis in "xyzw"), nonzero=True),
 }
-"""By `Command.set`. Of another function a command is any one to four numbers."""
-
-ANY = CommandLayout((CommandValue("a number"), *(CommandValue("a number", optional=True) for _ in range(3))))
+"""By `Command.set` of a task; any other function has `ANY_NUMBERS`."""
+ANY_NUMBERS = CommandLayout((CommandValue("a number"), *(CommandValue("a number", optional=True) for _ in range(3))))
 
 
 def layout_of(task: TaskCfg) -> CommandLayout:
-    """Return what a task's command takes."""
-    return LAYOUTS.get(task.command.set, ANY)
+    """Return the layout of a task's command."""
+    return LAYOUTS.get(task.command.set, ANY_NUMBERS)
 
 
 def check_commands(commands: np.ndarray, task: TaskCfg, num_envs: int, worlds: np.ndarray) -> None:
-    """Raise ValueError unless commands are one row a world, or one for all, that the task's command takes.
+    """Raise InputError unless commands, (num_envs, n) or (n,) for all worlds, fit the layout of the task's command.
 
-    worlds: (num_envs,) bool, for which the numbers have to be within their bounds.
+    worlds: (num_envs,) bool, worlds whose numbers must be within their bounds.
     """
     layout = layout_of(task)
-    what = f"commands of {task.name} are {layout}"
+    subject = f"commands of {task.name} are {layout}"
     if commands.shape[:-1] not in ((num_envs,), ()) or commands.shape[-1:] not in [(n,) for n in layout.counts]:
-        raise InputError(f"{what}, {num_envs} rows or one for all, got shape {commands.shape}")
+        raise InputError(f"{subject}, {num_envs} rows or one for all, got shape {commands.shape}")
     if not np.isfinite(commands).all():
         raise InputError("commands must be finite")
     rows = np.broadcast_to(commands, (num_envs, commands.shape[-1]))[worlds]
     for value, column in zip(layout.values, rows.T, strict=False):
         if (column < value.least).any():
-            raise InputError(f"{what}: {value.name} must be at least {value.least:g}, got {column.min():g}")
+            raise InputError(f"{subject}: {value.name} must be at least {value.least:g}, got {column.min():g}")
     if layout.nonzero and (rows == 0.0).all(axis=1).any():
-        raise InputError(f"{what}: not all may be 0")
+        raise InputError(f"{subject}: not all may be 0")

@@ -1,4 +1,4 @@
-"""What a policy of a task reads and drives, as plain data that goes with every policy."""
+"""Inputs and outputs of a task's policies, as plain data that is saved with every policy."""
 
 from __future__ import annotations
 
@@ -12,7 +12,11 @@ from jumper_warp.tasks.cfg import TaskCfg
 
 
 def interface(task: TaskCfg) -> dict[str, Any]:
-    """Return observation columns and layout, scales, gains [N m/rad], [N m s/rad], limits [N m] and command filter."""
+    """Return a policy's interface as JSON data; lists of 12 are in the order of `joint_names`.
+
+    Units: action_scale, default_joint_pos [rad]; joint_stiffness [N m/rad]; joint_damping [N m s/rad]; torque_limit
+    [N m]; command_filter [deg], [deg/s] and [s]. observation_layout: by term its columns first to end - 1.
+    """
 
     def per_motor(lateral: float, transversal: float) -> list[float]:
         return [lateral, transversal, transversal] * (len(MOTOR_JOINTS) // 3)

@@ -1,8 +1,7 @@
-"""The left-right mirror image of what policies see and do, as permutations and signs.
+"""Left-right mirror images of observations and actions, as permutations and signs.
 
-A robot that is mirrored about its x-z plane sees `signs * x[order]` of what it saw, and answers it by the mirror image
-of its action. Lateral angles are positive outward and transversal ones away from the twin on both sides, so that motors
-swap sides and keep their signs.
+`signs * x[order]` is the observation x, or the action, of the robot mirrored about its x-z plane. Lateral angles are
+positive outward and transversal ones away from the twin on both sides, so motors swap sides and keep their signs.
 """
 
 from __future__ import annotations
@@ -23,21 +22,16 @@ class Mirror(NamedTuple):
     """The mirror image of a vector x: `signs * x[order]`."""
 
     order: np.ndarray
-    """(columns,) int"""
+    """(columns,) int, source column of each column."""
     signs: np.ndarray
-    """(columns,) float32, 1 or -1"""
+    """(columns,) float32, 1 or -1."""
 
 
-LEGS = (1, 0, 3, 2)
-"""FL, FR, BL, BR with sides swapped."""
-MOTORS = tuple(3 * leg + j for leg in LEGS for j in range(3))
-"""Motors with sides swapped."""
-ROWS = tuple(3 * (i // 3) + 2 - i % 3 for i in range(15))
-"""Points of `ground_heights` with sides swapped."""
-RAYS = (4, 5, 2, 3, 0, 1, 6)
-"""Columns of `block_ahead` with sides swapped."""
-VECTOR, AXIAL = (1, -1, 1), (-1, 1, -1)
-"""Signs of a vector's components in body axes, and of those of a vector of rotation."""
+LEGS = (1, 0, 3, 2)  # indices of FL, FR, BL, BR with sides swapped: FR, FL, BR, BL
+MOTORS = tuple(3 * leg + j for leg in LEGS for j in range(3))  # motor indices with sides swapped
+ROWS = tuple(3 * (i // 3) + 2 - i % 3 for i in range(15))  # points of `ground_heights`: 5 rows of 3 across
+RAYS = (4, 5, 2, 3, 0, 1, 6)  # columns of `block_ahead`: (begin, end) of left, middle, right ray; height
+VECTOR, AXIAL = (1, -1, 1), (-1, 1, -1)  # signs of x, y, z of a vector, and of a rotation vector, body axes
 
 _PLAIN: dict[Any, tuple[int, ...]] = {
     obs.lin_vel: VECTOR, obs.ang_vel: AXIAL, obs.gravity: VECTOR, velocity.command: (1, -1, -1),
@@ -47,38 +41,35 @@ _PLAIN: dict[Any, tuple[int, ...]] = {
     jump.phase_times: (1, 1), jump.height_errors: (1, 1), jump.landing_miss: (1, -1), jump.way: (1, -1),
     obs.drawn_mass: (1, 1), obs.drawn_com: VECTOR, obs.drawn_latency: (1,), obs.drawn_friction: (1, 1),
 }  # fmt: skip
-"""Signs of terms whose columns stay where they are."""
+"""Signs by function of the term, for terms whose columns keep their order."""
 _SWAPPED: dict[Any, tuple[int, ...]] = {
     obs.angle: MOTORS, obs.rate: MOTORS, obs.last_action: MOTORS, obs.contacts: LEGS, obs.air_times: LEGS,
     obs.paw_forces: LEGS, velocity.contact_times: LEGS, velocity.paw_heights: LEGS, velocity.recent_steps: LEGS,
     velocity.ground_heights: ROWS, jump.block_ahead: RAYS, obs.drawn_gains: MOTORS,
     obs.drawn_speed_limits: MOTORS, obs.drawn_offset: MOTORS,
 }  # fmt: skip
-"""Orders of terms that keep their signs."""
+"""Orders by function of the term, for terms whose columns keep their signs."""
 
 
 def mirror_of(task: TaskCfg, group: str) -> Mirror:
-    """Return the mirror image of an observation group's rows.
-
-    Raises ValueError: a term is of none of these.
-    """
+    """Return the mirror image of the rows of a group, "actor" or "critic". Raises InputError for an unknown term."""
     order: list[int] = []
     signs: list[int] = []
     for term in getattr(task.observations, group):
         width = term.width
         if term.func in _PLAIN:
-            places, flips = tuple(range(width)), _PLAIN[term.func]
+            columns, flips = tuple(range(width)), _PLAIN[term.func]
         elif term.func in _SWAPPED:
-            places, flips = _SWAPPED[term.func], (1,) * width
+            columns, flips = _SWAPPED[term.func], (1,) * width
         else:
             raise InputError(f"{task.name} {group}: the mirror image of {term.name} is not known")
         for _ in range(term.options["history"]):
             first = len(order)
-            order += [first + place for place in places]
+            order += [first + column for column in columns]
             signs += flips
     return Mirror(np.array(order), np.array(signs, dtype=np.float32))
 
 
 def mirror_of_action() -> Mirror:
-    """Return the mirror image of an action."""
+    """Return the mirror image of an action (12,), in motor order."""
     return Mirror(np.array(MOTORS), np.ones(12, dtype=np.float32))

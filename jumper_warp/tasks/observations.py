@@ -7,8 +7,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import ObservationTerm
 from jumper_warp.tasks.units import DEG
 
-POSITION_NOISE = 0.005
-"""[m] Of the base's height and of the way to a goal."""
+POSITION_NOISE = 0.005  # [m] of the base's height and of the position of a goal
 
 ROBOT = (
     ObservationTerm(obs.lin_vel, noise=0.1),
@@ -18,7 +17,7 @@ ROBOT = (
     ObservationTerm(obs.rate, noise=10.0 * DEG),
     ObservationTerm(obs.last_action),
 )
-"""Velocity, gravity, motors and last action, as the paper's policies see them."""
+"""Velocities, gravity direction, motors and last action: the paper's common policy observations."""
 
 DRAWN = (
     ObservationTerm(obs.drawn_mass),
@@ -30,20 +29,19 @@ DRAWN = (
     ObservationTerm(obs.drawn_offset),
     ObservationTerm(obs.drawn_push),
 )
-"""What was drawn for the world and matters most, for the critic."""
-
+"""Randomised parameters of the world, for critics."""
 
 REMEMBERED = ("lin_vel", "ang_vel", "gravity", "angle", "last_action")
-"""Observations of which policies see the last steps too."""
+"""Names of the terms that `remembered` extends over several policy steps."""
 
 
 def remembered(terms: tuple[ObservationTerm, ...], steps: int = 4) -> tuple[ObservationTerm, ...]:
-    """Return terms of which some span several policy steps, from which noise, latency and motors can be told."""
+    """Return terms with a history of `steps` policy steps in those that `REMEMBERED` names."""
     return tuple(term.replace(history=steps) if term.name in REMEMBERED else term for term in terms)
 
 
 def with_history(task: TaskCfg, steps: int | None) -> TaskCfg:
-    """Return the task whose policy sees so many policy steps; None: as it is."""
+    """Return the task whose actor terms in `REMEMBERED` have a history of `steps` policy steps; None: unchanged."""
     if steps is None:
         return task
     return replace(task, observations=replace(task.observations, actor=remembered(task.observations.actor, steps)))

@@ -1,6 +1,6 @@
 """Numbers of a task's terms in one array, by name: `rewards.jump_height.weight`, `observations.actor.lin_vel.noise`.
 
-Flags change a task's numbers before its environment is made, `Env.set` while it runs; kernels read them by `TermSlot`.
+Flags change them before an environment is made, `Env.set` changes them while it runs; kernels index them by `TermSlot`.
 """
 
 from __future__ import annotations
@@ -18,36 +18,36 @@ from jumper_warp.utils.errors import InputError
 
 
 class TermSlot(SimpleNamespace):
-    """A term as kernels read it.
+    """A term for kernels: where its numbers lie in the array p of `TaskParams.values`.
 
-    Each of its `settings` is an attribute, the index of its value, of a pair the first: `p[slot.weight]`. So are its
-    options, as values.
+    Each name in the term's `settings` is an attribute, the index of its value (of a pair: the first): `p[slot.weight]`.
+    Each name in its `options` is an attribute with the option's value.
     """
 
     def __init__(self, term: Any, offset: int) -> None:
-        """offset: index of the term's first number."""
+        """offset: index of the term's first number in the array."""
         numbers = list(term.flat_numbers)
         settings = numbers[: len(numbers) - term.num_params]
         super().__init__(**term.options, **{name.removesuffix(".lower"): offset + i for i, name in enumerate(settings)})
-        self.term, self.func, self.parameterless = term, term.func, not term.num_params
-        """parameterless: Warp refuses an empty `*p[start:start]`."""
+        self.term, self.func = term, term.func
+        self.parameterless = not term.num_params  # Warp refuses an empty `*p[start:start]`
         self.start, self.stop = offset + len(settings), offset + len(numbers)
-        """Range of the function's parameters."""
+        """Half-open range of the function's parameters: `*p[slot.start : slot.stop]`."""
         self.compiled = (term.func, offset, self.start, self.stop, *term.options.items())
-        """What a kernel holds of the term; tasks with the same share the kernel, whatever their numbers."""
+        """Everything of the term that is compiled into a kernel; tasks with equal tuples share the kernel."""
 
 
 class TaskParams:
-    """Numbers of all terms of a task, and the index of each."""
+    """Numbers of all terms of a task in one list, and the index of each by name."""
 
     def __init__(self, task: str, sections: Mapping[str, Sequence[Term]]) -> None:
-        """task: its name, for messages."""
+        """task: name, for messages; sections: terms by name of their section."""
         self.task = task
         self.slots: dict[str, list[TermSlot]] = {section: [] for section in sections}
-        """By section, in the order of its terms."""
+        """By section, one slot per term, in the order of the terms."""
         self.values: list[float] = []
         self.names: dict[str, int] = {}
-        """Index in `values` by dotted name; the first one where a randomisation and an event have the same name."""
+        """Index in `values` by dotted name; the first index if a randomisation and an event share a name."""
         for section, terms in sections.items():
             for term in terms:
                 self.slots[section].append(TermSlot(term, len(self.values)))
@@ -66,13 +66,14 @@ class TaskParams:
 
 
 class ParamArrays:
-    """Numbers of a task on a device, where captured graphs read changes."""
+    """Numbers of a task on a device, where captured graphs read changed values."""
 
     def __init__(self, params: TaskParams, device: Any) -> None:
+        """params: names and initial values; device: of Warp."""
         self.params = params
         self.values = wp.array(params.values, dtype=float, device=device)
         self.changed = wp.full(len(params.values), math.inf, dtype=float, device=device)
-        """Of `values`, those that `set` has changed; infinite where it has not."""
+        """(len(values),): the value where `set` changed a number, infinity elsewhere."""
 
     def set(self, name: str, value: float) -> None:
         """Change a number by its dotted name. Raises InputError: there is none, or the value is not finite."""
@@ -83,6 +84,6 @@ class ParamArrays:
             array[i : i + 1].fill_(value)
 
     def restore(self) -> None:
-        """Take the task's numbers except those in `changed` (waits for the device)."""
+        """Reset all numbers to `params.values` except those that `set` changed. Waits for the device."""
         changed = self.changed.numpy()
         self.values.assign(np.where(np.isinf(changed), np.array(self.params.values, dtype=np.float32), changed))

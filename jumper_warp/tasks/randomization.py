@@ -1,4 +1,4 @@
-"""Domain randomisation as data (paper, Table V): ranges by name, turned into events."""
+"""Domain randomisation as data (paper, Table V): ranges by name, which `events` turns into terms."""
 
 from __future__ import annotations
 
@@ -14,26 +14,27 @@ from jumper_warp.utils.checks import check_finite, check_probabilities
 from jumper_warp.utils.errors import InputError
 
 Range = tuple[float, float] | None
+"""(lower, upper), or None: off."""
 NOMINAL_FRICTION = 0.9
-"""[1] Of the paws, where it is not drawn."""
+"""[1] Friction coefficient of the paws where it is not randomised."""
 MEAN_FRICTION = 0.85
-"""[1] Of the paws in nominal tests of what was trained with friction that is drawn."""
+"""[1] Friction coefficient of the paws in nominal evaluations of policies trained with randomised friction."""
 LONGEST_LATENCY = 100.0
-"""[ms] What the ring of past targets and observations holds: 48 physics steps, six policy steps."""
+"""[ms] Capacity of the ring buffers of past targets and observations: 48 physics steps, six policy steps."""
 PUSH_INTERVAL = (0.2, 0.5)
-"""[s] After which a push comes, stays or goes (authors' configuration)."""
+"""[s] Time from one sample of the push to the next (authors' configuration)."""
 PUSH_PROBABILITY = 0.25
-"""[1] That there is a push in such an interval (authors' configuration)."""
+"""[1] Probability of a push in such an interval (authors' configuration)."""
 
 
 @cache
 def _base_mass() -> float:
-    """Return the mass of the base as described [kg]."""
+    """Return the described mass of the base link [kg]."""
     return load_description().links[0].mass
 
 
 def _least(name: str) -> tuple[float, bool]:
-    """Return the least value of a row, and whether the row must stay above it."""
+    """Return the lower bound of a field's range, in its unit, and whether the range must stay above it."""
     if name == "base_mass":
         return -_base_mass(), True
     if name in ("link_mass", "gains", "damping_gains", "no_load_speed", "cutoff_speed", "armature", "push_interval"):
@@ -45,31 +46,31 @@ def _least(name: str) -> tuple[float, bool]:
 
 @dataclass(frozen=True)
 class RandomizationCfg:
-    """Ranges of uniform draws; None turns a row off. The defaults are those for jumping.
+    """Ranges (lower, upper) of uniform distributions; None: the described value. The defaults are for jumping.
 
-    Masses and scales stay positive; friction and latency may be 0.
+    Masses and scales must be positive; friction and latency may be 0.
     """
 
     static_friction: Range = (0.9, 1.2)
-    """[1] Not below the dynamic coefficient of the same environment."""
+    """[1] Coefficient of the paws; raised to the world's dynamic coefficient if below it."""
     dynamic_friction: Range = (0.8, 0.9)
-    """[1]"""
+    """[1] Coefficient of the paws."""
     base_mass: Range = (-1.0, 2.0)
-    """[kg] Added to the base."""
+    """[kg] Added to the base's mass."""
     link_mass: Range = (0.8, 1.2)
     """[1] Scales mass and inertia of each link."""
     com_shift: Range = (-0.03, 0.03)
-    """[m] Of the base, along each axis."""
+    """[m] Shift of the base's centre of mass along each body axis."""
     gains: Range = (0.6, 1.4)
-    """[1] Scales kp of each motor, and kd unless `damping_gains` says otherwise."""
+    """[1] Scales kp of each motor, and kd too unless `damping_gains` is set."""
     no_load_speed: Range = (0.8, 1.2)
-    """[1] Scales each motor's."""
+    """[1] Scales the no-load speed of each motor."""
     cutoff_speed: Range = (0.8, 1.4)
-    """[1] Scales each motor's; stays below the no-load speed."""
+    """[1] Scales the cutoff speed of each motor, which stays below its no-load speed."""
     motor_friction: Range = (0.005, 0.04)
     """[N m] Coulomb friction of each motor."""
     armature: Range = (0.6, 1.4)
-    """[1] Scales each motor's."""
+    """[1] Scales the armature of each motor."""
     joint_offset: Range = (-2.0, 2.0)
     """[deg] Constant error of each motor's position sensor."""
     latency: Range = (0.0, 16.0)
@@ -77,34 +78,34 @@ class RandomizationCfg:
     observation_latency: Range = None
     """[ms] From sensor to policy, rounded to the nearest physics step."""
     zero_latency_probability: float = 0.0
-    """[1] Of no latency, for either of the two. Else the nominal case has next to no weight in training, and a policy
-    may chatter there."""
+    """[1] Probability of zero latency, for either latency. Without it, training hardly contains the nominal case, and
+    a policy may chatter there."""
     push_force: Range = (-5.0, 5.0)
     """[N] On the base, along each world axis, while a paw is on the ground."""
     push_torque: Range = (-3.0, 3.0)
     """[N m] On the base, about each world axis, while a paw is on the ground."""
     push_interval: Range = PUSH_INTERVAL
-    """[s] Between two draws of the push; None: one for the whole episode."""
+    """[s] Time from one sample of the push to the next; None: one push for the whole episode."""
     push_probability: float = PUSH_PROBABILITY
-    """[1] That there is a push in an interval."""
+    """[1] Probability of a push in an interval."""
     push_in_flight: bool = False
-    """Whether pushes act in the air too."""
+    """Whether pushes also act while no paw is on the ground."""
     damping_gains: Range = None
-    """[1] Scales kd of each motor; None: drawn from `gains`."""
+    """[1] Scales kd of each motor; None: as `gains`."""
     resample_at: Literal["startup", "reset"] = "reset"
-    """When all but the pushes is sampled: once, or at every reset of a world."""
+    """When all values but pushes are sampled: once at startup, or at every reset of a world."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a range falls, is not finite, or reaches what no robot can have."""
+        """Raise InputError: a range falls, is not finite or out of bounds, or a probability is not in 0 to 1."""
         for name, value in vars(self).items():
             if not isinstance(value, tuple):
                 continue
             check_finite(f"randomisation range {name}", *value)
             if not value[0] <= value[1]:
                 raise InputError(f"randomisation range {name} must rise, got {value}")
-            least, above = _least(name)
-            if value[0] < least or (above and value[0] == least):
-                bound = f"be above {least:g}" if above else "not be negative"
+            least, exclusive = _least(name)
+            if value[0] < least or (exclusive and value[0] == least):
+                bound = f"be above {least:g}" if exclusive else "not be negative"
                 raise InputError(f"randomisation range {name} must {bound}, got {value}")
         for name in ("latency", "observation_latency"):
             value = getattr(self, name)
@@ -114,14 +115,14 @@ class RandomizationCfg:
 
     @classmethod
     def off(cls) -> RandomizationCfg:
-        """Return a configuration with every row off."""
-        rows = [name for name, field in cls.__dataclass_fields__.items() if "Range" in str(field.type)]
-        off: dict[str, Any] = dict.fromkeys(rows)
+        """Return a configuration with every range None, and push_probability 1 for pushes that a caller adds."""
+        ranges = [name for name, field in cls.__dataclass_fields__.items() if "Range" in str(field.type)]
+        off: dict[str, Any] = dict.fromkeys(ranges)
         return cls(**off, push_probability=1.0)
 
     @classmethod
     def walking(cls) -> RandomizationCfg:
-        """Return the paper's ranges for walking, and no latency with probability 0.2."""
+        """Return the paper's ranges for walking, with zero latency at a probability of 0.2."""
         return cls(
             static_friction=(0.8, 0.95),
             dynamic_friction=(0.7, 0.8),
@@ -137,34 +138,34 @@ class RandomizationCfg:
 
     @property
     def nominal_friction(self) -> float:
-        """Return the paws' coefficient [1] of robots of which nothing is drawn."""
+        """Return the paws' friction coefficient [1] for evaluations without randomisation."""
         return MEAN_FRICTION if self.dynamic_friction else NOMINAL_FRICTION
 
     def in_tests(self) -> RandomizationCfg:
-        """Return the same ranges, drawn at every reset, with pushes that come and go, however the training had it."""
+        """Return the ranges for evaluation: sampled at every reset, with pushes at intervals."""
         timing = {} if self.push_interval else {"push_interval": PUSH_INTERVAL, "push_probability": PUSH_PROBABILITY}
         return replace(self, resample_at="reset", **timing)
 
     def with_fixed(
         self, *, latency: float | None = None, gains: tuple[float, float] | None = None, friction: float | None = None
     ) -> RandomizationCfg:
-        """Return the same with rows of one value: latency [ms], scales of kp and kd [1], friction of the paws [1].
+        """Return the ranges with fixed values: latency [ms], gains: scales of (kp, kd) [1], friction of the paws [1].
 
-        Raises ValueError: a value out of range.
+        Raises InputError: a value out of range.
         """
         kp, kd = gains or (None, None)
-        rows = {"latency": latency, "gains": kp, "damping_gains": kd, "dynamic_friction": friction,
-                "static_friction": friction}  # fmt: skip
-        return replace(self, **{name: (value, value) for name, value in rows.items() if value is not None})
+        fixed = {"latency": latency, "gains": kp, "damping_gains": kd, "dynamic_friction": friction,
+                 "static_friction": friction}  # fmt: skip
+        return replace(self, **{name: (value, value) for name, value in fixed.items() if value is not None})
 
     def events(self) -> tuple[EventTerm, ...]:
-        """Return the rows that are on as events."""
-        found = []
+        """Return one event for each range, or pair of ranges, that is not None; numbers in SI units."""
+        terms = []
 
-        def add(func: Any, pair: Range, scale: float = 1.0, parallel: bool = False, **more: float) -> None:
+        def add(func: Any, pair: Range, scale: float = 1.0, parallel: bool = False, **numbers: float) -> None:
             if pair is not None:
                 ends = {"lower": scale * pair[0], "upper": scale * pair[1]}
-                found.append(EventTerm(func, mode=self.resample_at, parallel=parallel, **ends, **more))
+                terms.append(EventTerm(func, mode=self.resample_at, parallel=parallel, **ends, **numbers))
 
         add(parameters.base_mass, self.base_mass)
         add(parameters.link_mass, self.link_mass, parallel=True)
@@ -174,21 +175,21 @@ class RandomizationCfg:
         if self.gains or self.damping_gains:
             kp = self.gains or (1.0, 1.0)
             kd = self.damping_gains or kp
-            found.append(
+            terms.append(
                 EventTerm(parameters.gains, mode=self.resample_at, parallel=True, kp_lower=kp[0], kp_upper=kp[1],
                           kd_lower=kd[0], kd_upper=kd[1])
             )  # fmt: skip
         if self.no_load_speed or self.cutoff_speed:
-            low, high = self.no_load_speed or (1.0, 1.0), self.cutoff_speed or (1.0, 1.0)
-            found.append(
-                EventTerm(parameters.speed_limits, mode=self.resample_at, parallel=True, no_load_lower=low[0],
-                          no_load_upper=low[1], cutoff_lower=high[0], cutoff_upper=high[1])
+            no_load, cutoff = self.no_load_speed or (1.0, 1.0), self.cutoff_speed or (1.0, 1.0)
+            terms.append(
+                EventTerm(parameters.speed_limits, mode=self.resample_at, parallel=True, no_load_lower=no_load[0],
+                          no_load_upper=no_load[1], cutoff_lower=cutoff[0], cutoff_upper=cutoff[1])
             )  # fmt: skip
         add(parameters.joint_offset, self.joint_offset, math.pi / 180.0, parallel=True)
         if self.dynamic_friction or self.static_friction:
             dynamic = self.dynamic_friction or (NOMINAL_FRICTION, NOMINAL_FRICTION)
-            static = self.static_friction or (0.0, 0.0)  # not below the dynamic one
-            found.append(
+            static = self.static_friction or (0.0, 0.0)  # the kernel raises it to the dynamic one
+            terms.append(
                 EventTerm(parameters.friction, mode=self.resample_at, dynamic_lower=dynamic[0],
                           dynamic_upper=dynamic[1], static_lower=static[0], static_upper=static[1])
             )  # fmt: skip
@@ -200,8 +201,8 @@ class RandomizationCfg:
             timing: dict[str, Any] = {"mode": "reset", "update_solver": False}
             if self.push_interval is not None:
                 timing |= {"mode": "interval", "interval_range_s": self.push_interval}
-            found.append(
+            terms.append(
                 EventTerm(parameters.push, **timing, probability=self.push_probability, force_lower=force[0],
                           force_upper=force[1], torque_lower=torque[0], torque_upper=torque[1])
             )  # fmt: skip
-        return tuple(found)
+        return tuple(terms)

@@ -1,6 +1,6 @@
-"""Tasks as JSON, and back. Functions and types are saved as `module:name`; reading one imports nothing for its sake.
+"""Tasks as JSON, and back. Functions and types are saved as `module:name`.
 
-They are looked up in the project's own modules and in those that a user has named, nowhere else.
+Reading looks names up in the project's modules and those that the user passes; it imports no module for a name.
 """
 
 from __future__ import annotations
@@ -26,33 +26,30 @@ from jumper_warp.tasks.terms import RewardTerm, Term
 from jumper_warp.utils.checks import NAME, version_error
 from jumper_warp.utils.errors import InputError
 
-VERSION = 4
-"""Of the form in which tasks are saved."""
-OWN = ("jumper_warp.tasks.", "jumper_warp.robot.", "jumper_warp.kernels.")
-"""Beginnings of the names of the project's modules that a task may name."""
-OPTIONAL = ("rewards", "critic", "events")
-"""Sections that a policy needs for training only."""
-MAX_ENTRIES = 1000
-"""Longest list; a kernel of more terms would not be compiled in a day."""
+VERSION = 4  # of the saved format
+PROJECT_PREFIXES = ("jumper_warp.tasks.", "jumper_warp.robot.", "jumper_warp.kernels.")
+"""Prefixes of the project's modules that a saved task may name."""
+OPTIONAL = ("rewards", "critic", "events")  # sections that only training needs
+MAX_ENTRIES = 1000  # of a list: a kernel of more terms would compile for a day
 Struct = type(NoSettings)
 
 
 class TaskError(InputError):
-    """A saved task that cannot be restored, or a task that could not be. The message is one line."""
+    """A saved task that cannot be restored, or a task that cannot be saved. The message is one line."""
 
 
 # ---------------------------------------------------------------------- to JSON
 
 
-def name_of(thing: Any) -> str:
+def name_of(definition: Any) -> str:
     """Return `module:name` of a Warp function, a struct or a class.
 
-    Of a file that runs as a program the module is its stem, under which `--task-module` loads it.
-    Raises TaskError for one that would not be found again.
+    For a file that runs as a program, the module is the file's stem, under which `--task-module` loads it.
+    Raises TaskError unless the definition is at the top level of its module.
     """
-    python: Any = thing.func if isinstance(thing, wp.Function) else getattr(thing, "cls", thing)
+    python: Any = definition.func if isinstance(definition, wp.Function) else getattr(definition, "cls", definition)
     module, name = python.__module__, python.__qualname__
-    if vars(sys.modules.get(module, object)).get(name) is not thing:
+    if vars(sys.modules.get(module, object)).get(name) is not definition:
         raise TaskError(f"{module}:{name} cannot be saved: define it under this name at the top level of a module")
     if module == "__main__":
         main = sys.modules[module]
@@ -61,7 +58,7 @@ def name_of(thing: Any) -> str:
 
 
 def json_value(value: Any) -> Any:
-    """Return a configuration as JSON can hold it. Raises TaskError: a part of it could not be read back."""
+    """Return a configuration as JSON data: dicts with "type", lists, scalars. Raises TaskError: it cannot be saved."""
     if isinstance(value, Term):
         options = {key: json_value(option) for key, option in value.options.items()}
         named = {"type": name_of(type(value)), "func": name_of(value.func), "name": value.name}
@@ -81,18 +78,18 @@ def json_value(value: Any) -> Any:
 
 
 def task_to_json(task: TaskCfg) -> dict[str, Any]:
-    """Return a task as JSON can hold it. Raises TaskError: a function of it cannot be found again."""
+    """Return a task as JSON data: "version", and its fields by name. Raises TaskError: a part of it cannot be saved."""
     return {"version": VERSION, **json_value(task)}
 
 
 def handover_to_json(handover: Handover) -> dict[str, Any]:
-    """Return a handover as JSON can hold it: names of its tasks and functions. Raises TaskError as `task_to_json`."""
+    """Return a handover as JSON data: names of its tasks and functions. Raises TaskError as `name_of`."""
     tasks = {"source": handover.source.name, "target": handover.target.name}
     return {**tasks, "when": name_of(handover.when), "begin": name_of(handover.begin)}
 
 
 def shown(value: Any) -> str:
-    """Return a short word on a value, however deep or long it is."""
+    """Return a short description of any JSON value for messages: the scalar itself, or its type."""
     if value is None or isinstance(value, bool | int | float | str):
         return f"{value!r:.60}" if not isinstance(value, int) or abs(value) < 10**18 else "a huge integer"
     return f"a {type(value).__name__}"
@@ -102,53 +99,52 @@ def shown(value: Any) -> str:
 
 
 @functools.cache
-def load_own_modules() -> None:
-    """Import the project's tasks, and with them the functions that saved ones may name."""
+def load_project_tasks() -> None:
+    """Import all modules of `jumper_warp.tasks`, and so the kernels that saved tasks may name; once."""
     for module in pkgutil.walk_packages(jumper_warp.tasks.__path__, f"{jumper_warp.tasks.__name__}."):
         importlib.import_module(module.name)
 
 
 class Finder:
-    """Looks functions and types up by name."""
+    """Look-up of functions and types by `module:name`, in the project's modules and the user's."""
 
     def __init__(self, modules: Iterable[ModuleType] = ()) -> None:
-        """modules: those that the user has named, besides the project's own."""
-        load_own_modules()
+        """modules: the user's loaded modules."""
+        load_project_tasks()
         self.modules = {module.__name__: module for module in modules}
 
     def __call__(self, name: Any, where: str) -> Any:
-        """Return a Warp function, struct, dataclass or kind of term by `module:name`. Raises TaskError."""
+        """Return a Warp function, struct, dataclass or subclass of `Term`; where: of messages. Raises TaskError."""
         if not isinstance(name, str) or name.count(":") != 1:
             raise TaskError(f"{where}: expected module:name, got {shown(name)}")
         module_name, _, attribute = name.partition(":")
         module = self.modules.get(module_name)
-        if module is None and module_name.startswith(OWN):
+        if module is None and module_name.startswith(PROJECT_PREFIXES):
             module = sys.modules.get(module_name)
-        found = None if module is None else vars(module).get(attribute)
-        usable = isinstance(found, wp.Function | Struct)
-        if isinstance(found, type):
-            usable = dataclasses.is_dataclass(found) or issubclass(found, Term)
+        value = None if module is None else vars(module).get(attribute)
+        usable = isinstance(value, wp.Function | Struct)
+        if isinstance(value, type):
+            usable = dataclasses.is_dataclass(value) or issubclass(value, Term)
         if not usable:
-            known = module is not None or module_name.startswith(OWN)
+            known = module is not None or module_name.startswith(PROJECT_PREFIXES)
             hint = "there is no such one here" if known else "name the file that defines it with --task-module"
             raise TaskError(f"{where} needs {name!r:.80}: {hint}")
-        return found
+        return value
 
 
 def check_version(saved: Any) -> None:
-    """Raise TaskError unless this is a saved task of today's version."""
+    """Raise TaskError unless `saved` is a JSON object of the current VERSION."""
     if not isinstance(saved, dict):
         raise TaskError(f"the task must be a JSON object, got {shown(saved)}")
-    if (found := saved.get("version")) != VERSION:
-        raise TaskError(f"the task {version_error(shown(found), VERSION)}")
+    if (version := saved.get("version")) != VERSION:
+        raise TaskError(f"the task {version_error(shown(version), VERSION)}")
 
 
 def task_from_json(saved: Any, modules: Iterable[ModuleType] = (), *, leave_out: Collection[str] = ()) -> TaskCfg:
-    """Return a saved task; settings that it lacks have their defaults.
+    """Return the task that `task_to_json` saved; missing settings have their defaults.
 
-    saved: what `task_to_json` gave. modules: that the user has named. leave_out: sections of OPTIONAL that are not
-    wanted, and whose functions need not be found.
-    Raises TaskError: it is not a task of this version, or a function is in none of the modules.
+    modules: the user's loaded modules. leave_out: sections in OPTIONAL to make empty, whose functions may be missing.
+    Raises TaskError: it is no task of this version, or a function is in none of the modules.
     """
     check_version(saved)
     content = {key: value for key, value in saved.items() if key not in ("version", "type")}
@@ -164,7 +160,7 @@ def task_from_json(saved: Any, modules: Iterable[ModuleType] = (), *, leave_out:
 
 
 def _build(kind: type, saved: dict[str, Any], where: str, find: Finder) -> Any:
-    """Return a dataclass of a kind from its saved fields; fields that are missing have their defaults."""
+    """Return a dataclass of type `kind` from its saved fields; missing fields have their defaults. Raises TaskError."""
     hints = get_type_hints(kind)
     fields = {spec.name: spec for spec in dataclasses.fields(kind) if spec.init}
     unknown = [name for name in saved if name not in fields]
@@ -175,7 +171,7 @@ def _build(kind: type, saved: dict[str, Any], where: str, find: Finder) -> Any:
             raise TaskError(f"{where}.{name} is missing")
     values = {name: _value(value, hints[name], f"{where}.{name}", find) for name, value in saved.items()}
     if kind is TaskCfg:
-        _check_kernels_types(values)
+        _check_kernel_types(values)
     try:
         return kind(**values)
     except ValueError as error:
@@ -183,7 +179,7 @@ def _build(kind: type, saved: dict[str, Any], where: str, find: Finder) -> Any:
 
 
 def _value(saved: Any, hint: Any, where: str, find: Finder) -> Any:
-    """Return a saved value as what the hint of its field asks for."""
+    """Return a saved value converted to the type hint of its field; where: place for messages. Raises TaskError."""
     if get_origin(hint) in (Union, UnionType):
         kinds = get_args(hint)
         if saved is None and type(None) in kinds:
@@ -192,17 +188,17 @@ def _value(saved: Any, hint: Any, where: str, find: Finder) -> Any:
     if isinstance(saved, dict):
         return _object(saved, hint, where, find)
     if hint is wp.Function or (hint is Any and isinstance(saved, str)):
-        found = find(saved, where)
-        if hint is wp.Function and not isinstance(found, wp.Function):
+        value = find(saved, where)
+        if hint is wp.Function and not isinstance(value, wp.Function):
             raise TaskError(f"{where}: {saved!r:.80} is not a @wp.func")
-        return found
+        return value
     if get_origin(hint) is tuple or isinstance(saved, list):
         return _tuple(saved, hint, where, find)
     return _scalar(saved, hint, where)
 
 
 def _tuple(saved: Any, hint: Any, where: str, find: Finder) -> tuple[Any, ...]:
-    """Return a saved list as the tuple that the hint asks for."""
+    """Return a saved list as a tuple of the hinted length and element types. Raises TaskError."""
     kinds = get_args(hint)
     if get_origin(hint) is not tuple or not isinstance(saved, list):
         raise TaskError(f"{where}: expected {_word(hint)}, got {shown(saved)}")
@@ -216,17 +212,17 @@ def _tuple(saved: Any, hint: Any, where: str, find: Finder) -> tuple[Any, ...]:
 
 
 def _object(saved: dict[str, Any], hint: Any, where: str, find: Finder) -> Any:
-    """Return a saved term or dataclass; of the kind that the field asks for, unless it names one of these."""
-    wanted = object if hint is Any else hint
+    """Return a saved term or dataclass of its entry "type", by default of the hint, and a subclass of the hint."""
+    base = object if hint is Any else hint
     kind = hint if "type" not in saved and dataclasses.is_dataclass(hint) else find(saved.get("type"), where)
-    if not (isinstance(kind, type) and isinstance(wanted, type) and issubclass(kind, wanted)):
+    if not (isinstance(kind, type) and isinstance(base, type) and issubclass(kind, base)):
         raise TaskError(f"{where}: expected {_word(hint)}, got {shown(saved.get('type'))}")
     content = {key: value for key, value in saved.items() if key != "type"}
     return _term(kind, content, where, find) if issubclass(kind, Term) else _build(kind, content, where, find)
 
 
 def _term(kind: type[Term], saved: dict[str, Any], where: str, find: Finder) -> Term:
-    """Return a term of a kind from its saved function, numbers and options."""
+    """Return a term of class `kind` from its saved function, numbers and options. Raises TaskError."""
     func = _value(saved.pop("func", None), wp.Function, where, find)
     name = saved.get("name", "")
     if not isinstance(name, str) or (name and not NAME.fullmatch(name)):
@@ -252,7 +248,7 @@ def _term(kind: type[Term], saved: dict[str, Any], where: str, find: Finder) -> 
 
 
 def _scalar(saved: Any, hint: Any, where: str) -> Any:
-    """Return a number, string or flag, checked against the hint."""
+    """Return a number, string or bool that fits the hint: float, int, str, bool, a Literal or Any. Raises TaskError."""
     kinds = {float: (float, int), int: (int,), str: (str,), bool: (bool,)}.get(hint)
     if get_args(hint) and not kinds:  # a Literal
         if saved not in get_args(hint):
@@ -271,7 +267,7 @@ def _scalar(saved: Any, hint: Any, where: str) -> Any:
 
 
 def _word(hint: Any) -> str:
-    """Return what a field of this type holds, in words."""
+    """Return a type hint in words, for messages."""
     if get_origin(hint) is tuple:
         return "a list"
     if isinstance(hint, type) and (dataclasses.is_dataclass(hint) or issubclass(hint, Term)):
@@ -279,15 +275,15 @@ def _word(hint: Any) -> str:
     return getattr(hint, "__name__", str(hint))
 
 
-def _check_kernels_types(task: dict[str, Any]) -> None:
-    """Raise TaskError unless name, state, settings and levels of a task are what the kernels and files can hold."""
+def _check_kernel_types(task: dict[str, Any]) -> None:
+    """Raise TaskError unless name, state, reset settings and levels of a task's fields fit files and kernels."""
     if not NAME.fullmatch(task["name"]):
         raise TaskError(f"task.name is of letters, digits, and _ . - or spaces, got {task['name']!r:.60}")
     if not isinstance(task["state"], Struct) or "steps" not in task["state"].vars:
         raise TaskError("task.state is not a struct that counts steps")
     levels, settings = task.get("levels", ()), task["reset"].settings
-    read = [] if settings is None else [("reset.settings", settings)]
-    for where, value in [*read, *((f"levels[{i}]", level) for i, level in enumerate(levels))]:
+    checked = [] if settings is None else [("reset.settings", settings)]
+    for where, value in [*checked, *((f"levels[{i}]", level) for i, level in enumerate(levels))]:
         if not isinstance(getattr(value, "struct", None), Struct) or not callable(getattr(value, "values", None)):
             raise TaskError(f"task.{where}: {shown(value)} is not for the kernels: it needs struct and values()")
     if len({type(level) for level in levels}) > 1:

@@ -1,12 +1,12 @@
 """One robot with several skills, walking, jumps and turning in flight, and the handovers between them.
 
-A jump begins only from where its training did: at rest on four paws near the default pose, to which walking brings the
-robot when it is commanded to stand. The jump is commanded as soon as it takes over, since walking stands more quietly
-than the jump policies hold a squat. Once landed and at rest, or if a landing went wrong, walking takes over. Each skill
-has its own observation, action scale, gains, torque limits and command filter.
+A jump starts as in its training: at rest on four paws near the default pose, which walking reaches when it is commanded
+to stand. The jump command is set at the handover, since walking stands more quietly than the jump policies hold a
+squat. Walking takes over once the robot has landed and rests, or after a failed landing. Each skill has its own
+observation, action scale, gains, torque limits and command filter.
 
-In a long flight a jump hands over to turning when it is asked to, which brings the base level, in the jump's heading,
-and hands back shortly before the landing.
+On request a jump hands over to turning in a long flight. Turning brings the base level, in the jump's heading, and
+hands back shortly before the landing.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ FALLS, FALLS_FROM_FLIGHT = (
     )
     for tilt in (terminations.tilted, terminations.fallen)
 )
-"""What ends the episode of a robot that switches, whatever its skill, and of one that turns in flight at any tilt."""
+"""Terminations of a robot that switches between skills; in the second, a tilt in flight is no fall."""
 
 
 def for_switching(
     task: TaskCfg, randomization: RandomizationCfg, falls: tuple[TerminationTerm, ...] = FALLS
 ) -> TaskCfg:
-    """Return a task of which only a fall ends an episode, on level ground, without what a training needs.
+    """Return a task for switching: on level ground, ended by falls alone, without rewards, critic, events and metrics.
 
-    randomization: of the robot, which all its skills share.
+    randomization: of the robot, equal in all its skills.
     """
     task = replace(
         task,
@@ -56,10 +56,10 @@ def for_switching(
 
 
 def flight_skills(jump: TaskCfg, turning: TaskCfg) -> tuple[list[TaskCfg], list[Handover]]:
-    """Return the tasks of a robot that turns in the flight of a jump, the jump first, and their handovers.
+    """Return the tasks [jump, turning] of a robot that turns in the flight of a jump, and the handovers there and back.
 
-    Gravity and randomisation are the jump's; the momentum of free flight is kept.
-    Raises InputError: a task is no jump, or not one of turning.
+    Both have the jump's gravity and randomisation, and keep momentum in free flight.
+    Raises InputError: `jump` is no jump task, or `turning` no attitude task.
     """
     for task, state in ((jump, JumpState), (turning, AttitudeState)):
         if task.state is not state:
@@ -80,19 +80,19 @@ def flight_skills(jump: TaskCfg, turning: TaskCfg) -> tuple[list[TaskCfg], list[
 
 
 def skills_and_handovers(walking: TaskCfg, jumps: tuple[TaskCfg, ...]) -> tuple[list[TaskCfg], list[Handover]]:
-    """Return the tasks of one robot, walking first, and the handovers between it and each jump.
+    """Return the tasks [walking, *jumps] of one robot, and two handovers per jump: walking to jump, jump to walking.
 
-    The robot is randomised as for the last jump: walking has seen more of everything but friction.
-    Raises InputError: a task is not one of velocity tracking, or not a jump.
+    All have the randomisation of the last jump: walking was trained with wider ranges of everything but friction.
+    Raises InputError: `walking` is no velocity task, or a jump no jump task.
     """
     for task, state in ((walking, VelocityState), *((jump, JumpState) for jump in jumps)):
         if task.state is not state:
             raise InputError(f"switching needs a task of {state.key} here, got {task.name}")
     randomization = replace((jumps[-1] if jumps else walking).randomization, resample_at="reset")
     walk = for_switching(walking, randomization)
-    tasks, found = [walk], []
+    tasks, switches = [walk], []
     for jump in jumps:
         tasks.append(for_switching(jump, randomization))
-        found.append(Handover(walk, tasks[-1], handovers.come_to_a_stop, handovers.begin_jump))
-        found.append(Handover(tasks[-1], walk, handovers.landed_or_lost, handovers.begin_walk))
-    return tasks, found
+        switches.append(Handover(walk, tasks[-1], handovers.come_to_a_stop, handovers.begin_jump))
+        switches.append(Handover(tasks[-1], walk, handovers.landed_or_lost, handovers.begin_walk))
+    return tasks, switches

@@ -1,4 +1,4 @@
-"""Terms of a task: a Warp function and its numbers by name, checked when they are written down.
+"""Terms of a task: a Warp function and its numbers by name, checked when a term is created.
 
 The first arguments of a function come from the kernel; its other parameters, all float, are numbers of the term. All
 numbers of a task lie in one array on the device, so that each can change while a captured graph replays.
@@ -30,21 +30,21 @@ class Term:
     """A Warp function with its numbers. Equal terms have the same function, name, numbers and options."""
 
     context: int = 2
-    """How many arguments of the function come from the kernel."""
+    """Number of leading arguments that the kernel passes; the others are the term's numbers."""
     takes: ClassVar[tuple[Any, ...]] = (RobotView,)
-    """What the first of them may be."""
+    """Allowed types of the first argument."""
     returns: ClassVar[tuple[Any, ...]] = ()
-    """What the function may return; anything if empty."""
+    """Allowed return types; empty: any."""
     settings: ClassVar[dict[str, Any]] = {}
-    """Numbers that the kernel itself reads, with their defaults; they come before those of the function."""
+    """Defaults of the numbers that the kernel itself reads; they come before the function's numbers."""
     options: Mapping[str, Any] = {}
-    """What is compiled in, with its defaults."""
+    """Defaults of values that are compiled into the kernel; on an instance, its values."""
 
-    def __init__(self, func: Function, *, name: str = "", **given: Any) -> None:
-        """func: with the signature that the class names. name: for logs and flags (default: the function's).
+    def __init__(self, func: Function, *, name: str = "", **values: Any) -> None:
+        """func: @wp.func with the class's signature. name: for logs and flags (default: the function's name).
 
-        given: numbers and options by name.
-        Raises ValueError: a number is missing, unknown or not finite, or the function is not one for such a term.
+        values: numbers and options by name.
+        Raises InputError: a number is missing, unknown or not finite, or the function does not fit the class.
         """
         kind = type(self).__name__
         if not isinstance(func, wp.Function):
@@ -62,10 +62,10 @@ class Term:
         for p in params:
             if func.input_types.get(p.name) not in (float, wp.float32):
                 raise InputError(f"{where}: parameter {p.name!r} must be annotated float")
-        for key in given:
+        for key in values:
             if key not in known and key not in self.options:
                 raise InputError(f"{where}: unknown parameter {key!r}; it has {[*known, *self.options]}")
-        self.numbers = {key: given.get(key, default) for key, default in known.items()}
+        self.numbers = {key: values.get(key, default) for key, default in known.items()}
         for key, value in self.numbers.items():
             if value is REQUIRED:
                 raise InputError(f"{where}: parameter {key!r} is missing")
@@ -73,11 +73,11 @@ class Term:
             wrong = any(isinstance(part, bool) or not isinstance(part, int | float) for part in parts)
             if wrong or not all(abs(part) <= FLOAT32_MAX for part in parts):
                 raise InputError(f"{where}: parameter {key!r} must be a finite number, got {value!r:.60}")
-        self.options = {key: given.get(key, default) for key, default in type(self).options.items()}
+        self.options = {key: values.get(key, default) for key, default in type(self).options.items()}
         self.num_params = len(params)
 
     def _check_types(self, where: str) -> None:
-        """Raise ValueError unless the function takes and returns what such a term's does."""
+        """Raise InputError unless the function's first argument is in `takes` and its result in `returns`."""
         first = next(iter(self.func.input_types.values()), None)
         if first is not Any and first not in self.takes:
             takes = " or ".join(kind.key for kind in self.takes)
@@ -87,12 +87,12 @@ class Term:
             raise InputError(f"{where}: the function must return {self.returns[0].__name__}, it returns {returned}")
 
     def replace(self, **changes: Any) -> Any:
-        """Return the term with other numbers or options; raises ValueError as the constructor."""
+        """Return the term with changed function, name, numbers or options; raises InputError as the constructor."""
         return type(self)(**{"func": self.func, "name": self.name, **self.numbers, **self.options, **changes})
 
     @property
     def flat_numbers(self) -> dict[str, float]:
-        """Numbers by name in the order of the device's array; a pair as `name.lower` and `name.upper`."""
+        """Numbers by name in the order of the device array, settings first; a pair as `name.lower` and `name.upper`."""
         flat: dict[str, float] = {}
         for key, value in self.numbers.items():
             pair = isinstance(value, tuple)
@@ -101,7 +101,7 @@ class Term:
 
     @property
     def of_state(self) -> Any:
-        """The struct of the task's state that the function reads, or Any."""
+        """Type of the function's argument `state`: a task's `@wp.struct`, or Any."""
         return self.func.input_types.get("state", Any)
 
     def __eq__(self, other: object) -> bool:
@@ -118,26 +118,26 @@ class Term:
 
 
 class RewardTerm(Term):
-    """(robot: RobotView, state, ...) -> float; times the weight, and with `scale_by_dt` times the policy step [s]."""
+    """(robot: RobotView, state, ...) -> float, multiplied by weight and, with `scale_by_dt`, by the policy step [s]."""
 
     settings: ClassVar = {"weight": REQUIRED}
     options: Mapping[str, Any] = {"scale_by_dt": True}
     returns: ClassVar = (float, wp.float32)
 
-    def __init__(self, func: Function, weight: float, **given: Any) -> None:
-        super().__init__(func, weight=weight, **given)
+    def __init__(self, func: Function, weight: float, **values: Any) -> None:
+        super().__init__(func, weight=weight, **values)
 
     @property
     def weight(self) -> float:
-        """Multiplies the term; carries the sign."""
+        """Factor of the term; negative: a penalty."""
         return self.numbers["weight"]
 
 
 class TerminationTerm(Term):
-    """(robot: RobotView, state, ...) -> bool.
+    """(robot: RobotView, state, ...) -> bool, whether the episode ends.
 
-    time_out: an end that says nothing against the state, so that what would follow counts. success: what the success
-    rate and the curriculum count.
+    time_out: whether the end is no failure, so that the value of the last state is bootstrapped. success: whether the
+    success rate and the curriculum count the end.
     """
 
     options: Mapping[str, Any] = {"time_out": False, "success": False}
@@ -145,21 +145,22 @@ class TerminationTerm(Term):
 
 
 class ObservationTerm(Term):
-    """(robot: RobotView, state, ...) -> float or vector; or likewise (parameters: RobotParameters, world: int), or of
-    the ground around the robot (arrays: RobotArrays, ground: Ground, world: int).
+    """(robot: RobotView, state, ...) -> float or vector, one frame of columns.
 
-    noise: standard deviation, cut at one. Then clipped to plus and minus `clip`, and scaled. history: frames, the
-    oldest first. delayed: whether it comes as late as the world's sensors do.
+    Other signatures: (parameters: RobotParameters, world: int, ...) and, to read the ground, (arrays: RobotArrays,
+    ground: Ground, world: int, ...). noise: standard deviation of Gaussian noise, cut at one standard deviation, in the
+    function's unit; then values are clipped to [-clip, clip] and multiplied by scale. history: number of frames, oldest
+    first. delayed: whether the world's observation latency applies.
     """
 
     settings: ClassVar = {"noise": 0.0, "scale": 1.0, "clip": 100.0}
     options: Mapping[str, Any] = {"history": 1, "delayed": False}
     takes: ClassVar = (RobotView, RobotParameters, RobotArrays)
 
-    def __init__(self, func: Function, **given: Any) -> None:
+    def __init__(self, func: Function, **values: Any) -> None:
         if isinstance(func, wp.Function) and RobotArrays in func.input_types.values():
-            self.context = 3
-        super().__init__(func, **given)
+            self.context = 3  # arrays, ground, world
+        super().__init__(func, **values)
         history = self.options["history"]
         if not isinstance(history, int) or history < 1:
             raise InputError(f"ObservationTerm {self.name}: history must be at least 1, got {history!r:.40}")
@@ -174,32 +175,31 @@ class ObservationTerm(Term):
 
     @property
     def columns(self) -> tuple[str, ...]:
-        """Names of the columns of all frames."""
+        """Names of the columns of all frames, oldest first: `gravity_x_3_ago`, ..., `gravity_x`."""
         width = self.width
         if width == 1:
             frame = (self.name,)
         else:
-            ends = AXES.get(width) or {4: LEGS, 12: MOTORS}.get(width) or tuple(map(str, range(width)))
-            frame = tuple(f"{self.name}_{end}" for end in ends)
+            suffixes = AXES.get(width) or {4: LEGS, 12: MOTORS}.get(width) or tuple(map(str, range(width)))
+            frame = tuple(f"{self.name}_{suffix}" for suffix in suffixes)
         ages = range(self.options["history"] - 1, -1, -1)
         return tuple(f"{column}_{age}_ago" if age else column for age in ages for column in frame)
 
 
 class EventTerm(Term):
-    """(parameters: RobotParameters, rng: RngStream, ...), writes the parameters of `rng.world`.
+    """(parameters: RobotParameters, rng: RngStream, ...), writes parameters of world `rng.world`.
 
-    mode: once at the start ("startup"), at every "reset", or also at "interval"s sampled from
-    `interval_range_s`.
-    update_solver: whether the solver must read the model again, as after any but pushes and latencies.
-    parallel: whether its loop is one over range(rng.lane, end, rng.lanes), which threads share; not at intervals.
+    mode: "startup": once; "reset": at every reset; "interval": at resets and then at intervals sampled from
+    `interval_range_s` [s]. update_solver: whether the solver must read the model again; pushes and latencies need not.
+    parallel: whether threads share its loop over range(rng.lane, end, rng.lanes); not with "interval".
     """
 
     settings: ClassVar = {"interval_range_s": (0.0, 0.0)}
     options: Mapping[str, Any] = {"mode": "reset", "update_solver": True, "parallel": False}
     takes: ClassVar = (RobotParameters,)
 
-    def __init__(self, func: Function, **given: Any) -> None:
-        super().__init__(func, **given)
+    def __init__(self, func: Function, **values: Any) -> None:
+        super().__init__(func, **values)
         mode, interval = self.options["mode"], self.numbers["interval_range_s"]
         if mode not in ("startup", "reset", "interval"):
             raise InputError(f"EventTerm {self.name}: mode must be startup, reset or interval, got {mode!r:.40}")
@@ -210,28 +210,28 @@ class EventTerm(Term):
             raise InputError(f"EventTerm {self.name}: interval_range_s must be (lower, upper) above 0, got {interval}")
 
     def due_at(self, stage: int) -> bool:
-        """Return whether it may be due at a stage of `jumper_warp.kernels.mdp.events`."""
+        """Return whether the event may run at a stage: an int constant `AT_...` of `jumper_warp.kernels.mdp.events`."""
         mode = MODES[self.options["mode"]]
         return stage == mode or (mode == AT_STEP and stage == AT_RESET)
 
 
 class Advance(Term):
-    """(robot: RobotView, state, ...) -> state, one policy step later: the task's phase machine."""
+    """(robot: RobotView, state, ...) -> state after one policy step: the task's state machine."""
 
 
 class Curriculum(Term):
-    """(robot: RobotView, state) -> error of an ended episode.
+    """(robot: RobotView, state) -> float, error of an ended episode in `unit`.
 
-    An episode that ends with success and an error up to `tolerance` is one; `promote_after` of them in a row raise the
-    world's level. counts: (state) -> bool, whether an episode counts at all. unit: of the error, as it is logged.
+    `promote_after` episodes in a row that end with success and an error up to `tolerance` raise the world's level.
+    counts: @wp.func (state) -> bool, whether an episode counts at all. unit: suffix of the logged error's name.
     """
 
     settings: ClassVar = {"tolerance": REQUIRED, "promote_after": 5}
     options: Mapping[str, Any] = {"counts": REQUIRED, "unit": "m"}
     returns: ClassVar = (float, wp.float32)
 
-    def __init__(self, func: Function, **given: Any) -> None:
-        super().__init__(func, **given)
+    def __init__(self, func: Function, **values: Any) -> None:
+        super().__init__(func, **values)
         if not isinstance(self.options["counts"], wp.Function):
             raise InputError(f"Curriculum {self.name}: counts must be a @wp.func (state) -> bool")
         if self.numbers["tolerance"] < 0.0 or self.numbers["promote_after"] < 1:
@@ -240,11 +240,11 @@ class Curriculum(Term):
 
 @dataclass(frozen=True)
 class StateMetric:
-    """A figure of the training log: what worlds have counted in a field of their state since it was read last."""
+    """A metric of the training log, from a float field of all worlds' task states."""
 
     name: str
-    """Under which it is logged, with its unit."""
+    """Key in the log, with its unit."""
     field: str
-    """Field of the task's state, float; all that are read are set to 0."""
+    """Field of the task's state. With `per`, worlds accumulate in it, and logging sets both fields to 0."""
     per: str | None = None
-    """Field by whose sum over all worlds that of `field` is divided; None: its mean over all worlds, which stays."""
+    """Field whose sum over all worlds divides the sum of `field`; None: log the mean of `field` and keep it."""

@@ -1,3 +1,5 @@
+"""The project's robot description against the numbers of the paper and hand calculations."""
+
 import math
 
 import numpy as np
@@ -16,11 +18,12 @@ def test_total_mass_is_14_5_kg(description):
 
 
 @pytest.mark.parametrize(
-    ("motor", "armature", "no_load", "cutoff", "peak"),
+    ("motor", "armature", "no_load", "cutoff", "peak"),  # index in the leg, [kg m^2], [rad/s], [rad/s], [N m]
     [(0, 4.69e-3, 49.2, 35.1, 18.0), (1, 4.14e-3, 40.0, 23.6, 24.8), (2, 4.14e-3, 40.0, 23.6, 24.8)],
+    ids=["lateral", "outer", "inner"],
 )
-def test_motor_constants(description, motor, armature, no_load, cutoff, peak):
-    constants = description.motors[motor + 9]
+def test_constants_of_back_right_motors(description, motor, armature, no_load, cutoff, peak):
+    constants = description.motors[motor + 9]  # the last leg
     assert constants.armature == pytest.approx(armature, rel=1e-4)
     assert constants.no_load_speed == pytest.approx(no_load, rel=1e-3)
     assert constants.cutoff_speed == pytest.approx(cutoff, rel=2e-3)
@@ -29,7 +32,7 @@ def test_motor_constants(description, motor, armature, no_load, cutoff, peak):
 
 def test_paw_is_merged_into_the_inner_shank_by_the_parallel_axis_theorem(description):
     shank = description.link("FL_inner_shank")
-    # 0.1993 kg at (-0.0183, 0, -0.1819), 0.020 kg at (0, 0, -0.3)
+    # shank of 0.1993 kg at (-0.0183, 0, -0.1819) m, paw of 0.020 kg at (0, 0, -0.3) m
     assert shank.mass == pytest.approx(0.2193)
     assert shank.com == pytest.approx([-0.0166311, 0.0, -0.1926707], abs=1e-7)
     # reduced mass 0.018176 kg, offset (0.0183, 0, -0.1181): Ixx += m z^2, Iyy += m (x^2 + z^2), Ixz -= m x z
@@ -44,15 +47,15 @@ def test_mirrored_legs_have_products_of_inertia_of_opposite_sign(description):
 
 def test_leg_dimensions_of_the_back_right_leg(description):
     leg = leg_dimensions(description, "BR")
-    assert leg.hip == (-0.1433, -0.15, 0.0)
-    assert (leg.front, leg.side) == (-1.0, -1.0)
+    assert leg.hip == (-0.1433, -0.15, 0.0)  # [m]
+    assert (leg.front, leg.side) == (-1.0, -1.0)  # back, right
     assert (leg.outer_x, leg.inner_x, leg.plane_y, leg.knee_y) == (-0.1417, -0.0517, -0.05945, -0.00075)
     assert (leg.thigh, leg.shank, leg.paw_radius) == (0.175, 0.3, 0.025)
 
 
 @pytest.mark.parametrize("leg", ["FL", "BR"])
-@pytest.mark.parametrize(("degrees", "depth"), [(0, 0.4716), (45, 0.3718)])
-def test_ankle_depth_below_the_hips(description, leg, degrees, depth):
+@pytest.mark.parametrize(("degrees", "depth"), [(0, 0.4716), (45, 0.3718)])  # of both thighs; [m]
+def test_knee_angles_and_ankle_depth_of_a_symmetric_leg(description, leg, degrees, depth):
     angle = math.radians(degrees)
     outer_knee, inner_knee, ankle_z = knee_angles(leg_dimensions(description, leg), angle, angle)
     assert -ankle_z == pytest.approx(depth, abs=5e-5)
@@ -61,30 +64,30 @@ def test_ankle_depth_below_the_hips(description, leg, degrees, depth):
     assert (outer_knee, inner_knee) == pytest.approx((angle + lean, angle + lean))
 
 
-def test_knees_coincide_at_minus_14_9_degrees(description):
-    angle = -math.asin(0.045 / 0.175)
+def test_refuses_leg_with_coinciding_knees_at_minus_14_9_degrees(description):
+    angle = -math.asin(0.045 / 0.175)  # half the distance of the thigh axes over the thigh length
     assert math.degrees(angle) == pytest.approx(-14.9, abs=0.05)
     with pytest.raises(ValueError, match="do not meet"):
         knee_angles(leg_dimensions(description, "FL"), angle, angle)
 
 
-def test_stops(description):
-    stops = [np.degrees((joint.lower, joint.upper)) for joint in description.joints[:2]]
-    assert stops[0] == pytest.approx((-50.0, 110.0), abs=1e-3)
-    assert stops[1] == pytest.approx((-30.0, 140.0), abs=1e-3)
+def test_stops_of_lateral_outer_and_transversal_sum(description):
+    lateral, outer = [np.degrees((joint.lower, joint.upper)) for joint in description.joints[:2]]
+    assert lateral == pytest.approx((-50.0, 110.0), abs=1e-3)
+    assert outer == pytest.approx((-30.0, 140.0), abs=1e-3)
     assert np.degrees(description.transversal_sum) == pytest.approx((0.0, 240.0))
 
 
-def test_default_pose(description):
+def test_default_pose_has_transversals_at_45_degrees(description):
     assert np.degrees(description.pose("default")) == pytest.approx([0.0, 45.0, 45.0] * 4)
 
 
 def test_default_description_is_cached_and_read_only():
-    own = load_description()
-    assert load_description() is own and load_description(own.path) is not own
-    meshes = [shape.mesh for link in own.links for shape in link.visuals if shape.mesh]
-    for array in (own.links[0].inertia, own.joints[0].axis, own.loops[0].child_anchor, meshes[0].vertices):
+    default = load_description()
+    assert load_description() is default and load_description(default.path) is not default
+    meshes = [shape.mesh for link in default.links for shape in link.visuals if shape.mesh]
+    for array in (default.links[0].inertia, default.joints[0].axis, default.loops[0].child_anchor, meshes[0].vertices):
         with pytest.raises(ValueError, match="read-only"):
             array[0] = 1.0
     with pytest.raises(TypeError):
-        own.poses["default"] = (0.0, 0.0)
+        default.poses["default"] = (0.0, 0.0)

@@ -1,4 +1,4 @@
-"""The shipped description with one thing changed: it is refused in one line, or still describes a robot."""
+"""Mutations of the project's description: each is refused with a message of one line, or gives a plausible robot."""
 
 import json
 import math
@@ -15,13 +15,13 @@ from json_helpers import places
 from jumper_warp.robot.description import DEFAULT_DESCRIPTION, RobotDescriptionError, load_description
 
 JSON = json.loads(DEFAULT_DESCRIPTION.read_text())
-FACTORS = [1e-30, 1e-6, 1e-3, -1.0, 1e3, 1e6, 1e30]
+FACTORS = [1e-30, 1e-6, 1e-3, -1.0, 1e3, 1e6, 1e30]  # wrong units and signs
 NOT_FINITE = [math.nan, math.inf]
 JUNK = ["", "x", "1 2 3 4", "body", [], {}, [1.0], True, None, 10**400, "\n", "nan"]
 
 
-def urdf_without_twins():
-    """The shipped tree, its legs but the first without visual shapes, to be quick."""
+def urdf_with_visuals_of_one_leg():
+    """Return the URDF's text without the visual shapes of all legs but FL, which makes loading faster."""
     root = ElementTree.parse(DEFAULT_DESCRIPTION.parent / "jumper.urdf").getroot()
     for link in root.findall("link"):
         if link.get("name")[:2] in ("FR", "BL", "BR"):
@@ -30,20 +30,20 @@ def urdf_without_twins():
     return ElementTree.tostring(root, encoding="unicode")
 
 
-URDF = urdf_without_twins()
+URDF = urdf_with_visuals_of_one_leg()
 
 
 @pytest.fixture(scope="module")
 def assets(tmp_path_factory):
-    """A writable copy of the robot's folder, with a tetrahedron for each mesh."""
+    """Writable copy of the robot's folder, with a tetrahedron for each mesh."""
     folder = shutil.copytree(DEFAULT_DESCRIPTION.parent, tmp_path_factory.mktemp("robot") / "jumper")
     for mesh in (folder / "meshes").iterdir():
         mesh.write_text("v 0.1 0 0\nv 0 0.1 0\nv 0 0 0.1\nv 0 0 -0.1\nf 1 2 3\nf 1 2 4\nf 1 3 4\nf 2 3 4\n")
     return folder
 
 
-def attributes(root):
-    """Every attribute of an XML tree that holds numbers: its element's attributes, its name, its words."""
+def numeric_attributes(root):
+    """Yield (dict of the element's attributes, key in it, list of numbers) of each numeric attribute of an XML tree."""
     for element in root.iter():
         for name, text in element.attrib.items():
             try:
@@ -53,20 +53,21 @@ def attributes(root):
 
 
 def is_number(value):
+    """Return whether a JSON value is a number."""
     return isinstance(value, int | float) and not isinstance(value, bool)
 
 
 def magnitudes():
-    """The absolute values of all numbers of the description."""
-    found = {abs(value) for _, _, values in attributes(ElementTree.fromstring(URDF)) for value in values}
-    found |= {abs(table[key]) for table, key in places(JSON) if is_number(table[key])}
-    return sorted(found - {0.0})
+    """Return the sorted absolute values, without 0, of all numbers in the URDF and the JSON file."""
+    numbers = {abs(value) for _, _, values in numeric_attributes(ElementTree.fromstring(URDF)) for value in values}
+    numbers |= {abs(table[key]) for table, key in places(JSON) if is_number(table[key])}
+    return sorted(numbers - {0.0})
 
 
 def change_everywhere(magnitude, change):
-    """Both files with every number of this absolute value changed: legs, motors and loops stay alike."""
+    """Return URDF and JSON text with change(x) for every number x of this magnitude, so that legs stay equal."""
     root = ElementTree.fromstring(URDF)
-    for holder, name, values in attributes(root):
+    for holder, name, values in numeric_attributes(root):
         if magnitude in map(abs, values):
             holder[name] = " ".join(repr(change(v) if abs(v) == magnitude else v) for v in values)
     tree = json.loads(json.dumps(JSON))
@@ -77,7 +78,7 @@ def change_everywhere(magnitude, change):
 
 
 def load(assets, urdf, text):
-    """The description of these texts, or None if it was refused in one line; whatever else is raised passes through."""
+    """Return the description of URDF text and JSON text, or None after a refusal of one line; warnings are errors."""
     (assets / "jumper.urdf").write_text(urdf, encoding="utf-8")
     (assets / "jumper.json").write_text(text, encoding="utf-8")
     try:
@@ -90,12 +91,12 @@ def load(assets, urdf, text):
 
 
 def assert_valid_robot(robot):
-    """Say what a person with scales and a ruler would ask of a legged robot."""
+    """Assert that masses, lengths, torques, speeds and gains (SI units) are those of some legged robot."""
     for link in robot.links:
         assert 1e-3 <= link.mass <= 100.0
         assert np.abs(link.com).max() <= 2.0
         moments = np.linalg.eigvalsh(link.inertia)
-        # between that of a bead of 1 mm, and of all mass on a ring of 3 m
+        # radius of gyration from 1 mm to 3 m
         assert 1e-6 * link.mass <= moments[0] * 1.001 and moments[-1] <= 9.0 * link.mass
         for shape in (*link.visuals, *link.collisions):
             assert np.abs(shape.position).max() <= 2.0 and all(1e-4 <= size <= 2.0 for size in shape.size)
@@ -134,7 +135,7 @@ def test_refuses_non_finite_numbers(assets):
 
 @settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_one_change_of_the_json_is_refused_or_harmless(assets, data):
+def test_one_change_of_the_json_is_refused_or_gives_a_valid_robot(assets, data):
     tree = json.loads(json.dumps(JSON))
     table, key = data.draw(st.sampled_from(list(places(tree))))
     old = table[key]
@@ -153,10 +154,10 @@ def test_one_change_of_the_json_is_refused_or_harmless(assets, data):
 
 @settings(max_examples=250, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_one_change_of_the_urdf_is_refused_or_harmless(assets, data):
+def test_one_change_of_the_urdf_is_refused_or_gives_a_valid_robot(assets, data):
     root = ElementTree.fromstring(URDF)
-    parents = [(parent, index) for parent in root.iter() for index in range(len(parent))]
-    parent, index = data.draw(st.sampled_from(parents))
+    slots = [(parent, index) for parent in root.iter() for index in range(len(parent))]
+    parent, index = data.draw(st.sampled_from(slots))
     element = parent[index]
     kind = data.draw(st.sampled_from(["delete", "double", "attribute", "number"]))
     if kind == "delete":
@@ -167,10 +168,10 @@ def test_one_change_of_the_urdf_is_refused_or_harmless(assets, data):
         name = data.draw(st.sampled_from(sorted(element.attrib)))
         element.attrib[name] = data.draw(st.sampled_from([text for text in JUNK if isinstance(text, str)]))
     else:
-        holder, name, values = data.draw(st.sampled_from(list(attributes(root))))
-        which = data.draw(st.integers(0, len(values) - 1)) if values else 0
-        new = data.draw(st.sampled_from([*NOT_FINITE, 0.0, *(values[which] * factor for factor in FACTORS)]))
-        holder[name] = " ".join(repr(new if i == which else value) for i, value in enumerate(values))
+        holder, name, values = data.draw(st.sampled_from(list(numeric_attributes(root))))
+        place = data.draw(st.integers(0, len(values) - 1)) if values else 0
+        new = data.draw(st.sampled_from([*NOT_FINITE, 0.0, *(values[place] * factor for factor in FACTORS)]))
+        holder[name] = " ".join(repr(new if i == place else value) for i, value in enumerate(values))
     robot = load(assets, ElementTree.tostring(root, encoding="unicode"), json.dumps(JSON))
     if robot is not None:
         assert_valid_robot(robot)

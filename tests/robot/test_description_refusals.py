@@ -1,3 +1,5 @@
+"""Faulty robot descriptions: each is refused with a message of one line that names the part and the fault."""
+
 import re
 import shutil
 
@@ -13,18 +15,19 @@ JSON = "jumper.json"
 
 @pytest.fixture
 def assets(tmp_path):
-    """A writable copy of the robot's folder."""
+    """Writable copy of the robot's folder."""
     return shutil.copytree(DEFAULT_DESCRIPTION.parent, tmp_path / "jumper")
 
 
 def edit(folder, file, pattern, replacement):
-    """Replace every match of a regular expression in a file of the folder; there must be one."""
-    text, found = re.subn(pattern, replacement, (folder / file).read_text(), flags=re.DOTALL)
-    assert found, f"{pattern} does not occur in {file}"
+    """Replace all matches of a regular expression in a file of the folder, at least one."""
+    text, matches = re.subn(pattern, replacement, (folder / file).read_text(), flags=re.DOTALL)
+    assert matches, f"{pattern} does not occur in {file}"
     (folder / file).write_text(text)
 
 
 def refusal(folder):
+    """Return the message, of one line, with which the description in a folder is refused."""
     with pytest.raises(RobotDescriptionError) as caught:
         load_description(folder / JSON)
     message = str(caught.value)
@@ -33,14 +36,14 @@ def refusal(folder):
 
 
 def at(element, inner, new):
-    """Replace `inner` within an element given as "tag name"."""
+    """Return pattern and replacement for `edit`: `inner`, in the URDF element given as "tag name", becomes `new`."""
     tag, name = element.split()
     return rf'(<{tag} name="{name}"(?:(?!</{tag}>).)*?){inner}', rf"\g<1>{new}"
 
 
-NUMBERS = '"[^"]*"'
+NUMBERS = '"[^"]*"'  # pattern of an attribute's value
 
-BAD_URDF = {
+BAD_URDF = {  # by fault: (pattern, replacement) for `edit`, and part of the message
     "negative mass": (at("link FR_housing", f"value={NUMBERS}", 'value="-1"'), "link FR_housing: expected mass > 0"),
     "nan mass": (at("link body", f"value={NUMBERS}", 'value="nan"'), "link body: expected 1 finite"),
     "infinite inertia": (at("link body", f"ixx={NUMBERS}", 'ixx="inf"'), "link body: expected 1 finite"),
@@ -49,25 +52,17 @@ BAD_URDF = {
     "zero axis": (at("joint FL_outer", "0 -1 0", "0 0 0"), "joint FL_outer: expected an axis of length 1"),
     "long axis": (at("joint FL_outer", "0 -1 0", "0 -2 0"), "joint FL_outer: expected an axis of length 1"),
     "wrong axis": (at("joint FL_outer", "0 -1 0", "0 1 0"), "joint FL_outer: expected axis"),
-    "inverted limits": (
-        at("joint BR_inner", f"lower={NUMBERS}", 'lower="3"'),
-        "joint BR_inner: expected lower < upper",
-    ),
-    "turned frame": (
-        at("joint BR_inner", "<origin", '<origin rpy="0 0 1"'),
-        "joint BR_inner: expected a frame parallel",
-    ),
+    "inverted limits": (at("joint BR_inner", f"lower={NUMBERS}", 'lower="3"'),
+        "joint BR_inner: expected lower < upper"),
+    "turned frame": (at("joint BR_inner", "<origin", '<origin rpy="0 0 1"'),
+        "joint BR_inner: expected a frame parallel"),
     "unlike motor": (('effort="24.8"', 'effort="18"'), "joint FL_outer: expected effort 24.8 as of motor AK70-10"),
-    "heavy leg": (
-        at("link BR_outer_thigh", '"0.081"', '"0.09"'),
-        "link BR_outer_thigh: expected mass, com, inertia to",
-    ),
+    "heavy leg": (at("link BR_outer_thigh", '"0.081"', '"0.09"'),
+        "link BR_outer_thigh: expected mass, com, inertia to"),
     "unmirrored com": (at("link FR_housing", "0928 -", "0928 "), "link FR_housing: expected mass, com, inertia to"),
     "moved hip": (at("joint FR_lateral", "-0.105", "-0.1"), "joint FR_lateral: expected to mirror FL_lateral"),
-    "no paw": (
-        at("link BL_inner_shank", "<collision>.*?</collision>", ""),
-        "link BL_inner_shank: expected 1 collision",
-    ),
+    "no paw": (at("link BL_inner_shank", "<collision>.*?</collision>", ""),
+        "link BL_inner_shank: expected 1 collision"),
     "missing mesh": (("meshes/thigh.obj", "meshes/none.obj"), "missing file 'meshes/none.obj'"),
     "mesh outside": (("meshes/thigh.obj", "../../../etc/thigh.obj"), "expected a file inside"),
     "remote mesh": (("meshes/thigh.obj", "https://example.org/thigh.obj"), "expected a file inside"),
@@ -77,52 +72,40 @@ BAD_URDF = {
     "second parent": (('child link="BR_inner_shank"', 'child link="BR_outer_shank"'), "expected one parent joint"),
     "renamed root": (('name="body"', 'name="trunk"'), "joint FL_lateral: unknown link 'body'"),
     "cycle": (at("joint FL_lateral", '"body"', '"FL_inner_shank"'), "joint FL_lateral: expected to lead from body"),
-    "second root": (
-        (r'  <joint name="FL_lateral".*?</joint>\n', ""),
-        "expected the one root link body, found body, FL_h",
-    ),
-    "heavy body": (
-        at("link body", '"6.43"', '"6.43e3"'),
-        "link body: expected mass in 0.001 to 100 kg, found 6430",
-    ),
+    "second root": ((r'  <joint name="FL_lateral".*?</joint>\n', ""),
+        "expected the one root link body, found body, FL_h"),
+    "heavy body": (at("link body", '"6.43"', '"6.43e3"'),
+        "link body: expected mass in 0.001 to 100 kg, found 6430"),
     "compact body": (
         at("link body", 'ixx="0.0536" iyy="0.1495" izz="0.1952"', 'ixx="5.36e-5" iyy="1.495e-4" izz="1.952e-4"'),
-        "link body: expected largest radius of gyration in 0.1 to 1.5 of the link's reach, found 0.0144",
-    ),
-    "wide body": (
-        at("link body", '"6.43"', '"0.00643"'),
-        "link body: expected smallest radius of gyration in 0.001 to 2 m, found 2.887",
-    ),
+        "link body: expected largest radius of gyration in 0.1 to 1.5 of the link's reach, found 0.0144"),
+    "wide body": (at("link body", '"6.43"', '"0.00643"'),
+        "link body: expected smallest radius of gyration in 0.001 to 2 m, found 2.887"),
     "thin link": (
         at("link FL_outer_thigh", 'ixx="0.000518" iyy="0.000524" izz="7.9e-06"', 'ixx="5e-4" iyy="5e-4" izz="7.9e-9"'),
-        "link FL_outer_thigh: expected smallest radius of gyration in 0.001 to 2 m, found 0.000312",
-    ),
+        "link FL_outer_thigh: expected smallest radius of gyration in 0.001 to 2 m, found 0.000312"),
     "far com": (at("link body", "0.0111", "11.1"), "link body: expected z of centre of mass in -2 to 2 m, found 11.1"),
     "huge paw": (('radius="0.025"', 'radius="1e30"'), "link FL_inner_shank: expected sphere size in 0.0001 to 2 m"),
     "large paw": (('radius="0.025"', 'radius="0.25"'), "link FL_inner_shank: expected paw radius in 0.001 to 0.2 m"),
     "far hip": (at("joint FR_lateral", "-0.105", "-105"), "joint FR_lateral: expected y of origin in -2 to 2 m"),
     "narrow hips": (('(xyz="-?0.1433) ', r"\g<1>e-6 "), "joint FL_lateral: expected hip x in 0.001 to 2 m"),
-    "stop beyond a turn": (
-        at("joint BR_inner", "2.443461", "140"),
-        "joint BR_inner: expected upper in -6.283 to 6.283",
-    ),
+    "stop beyond a turn": (at("joint BR_inner", "2.443461", "140"),
+        "joint BR_inner: expected upper in -6.283 to 6.283"),
     "effort": (at("joint FL_inner_knee", '"1000"', '"1e9"'), "joint FL_inner_knee: expected effort in 0.1 to 1e+04"),
     "shape turned in degrees": (("1.5707963267948966", "90"), "link body: expected rpy within a turn"),
     "color of 255": (("0.93 0.42 0.1 1", "237 107 25 1"), "link body: expected color in 0 to 1, found 237"),
     "entity": (("<robot", '<!DOCTYPE robot [<!ENTITY a "b">]><robot'), "expected no document type"),
     "truncated": (("</robot>.*", ""), "expected well-formed XML"),
     "other root": (("<robot(.*)</robot>", r"<sdf\1</sdf>"), "expected <robot>, found <sdf>"),
-}
+}  # fmt: skip
 
-BAD_JSON = {
+BAD_JSON = {  # as BAD_URDF
     "missing loop": ((r'"BR_ankle": \{.*?\}', '"extra": {}'), "loop extra: expected one of"),
     "doubled loop": (('"BR_ankle": ', '"BL_ankle": '), "BL_ankle: expected one entry, found it twice"),
     "unknown link": (('"child": "FL_outer_shank"', '"child": "FL_paw"'), "loop FL_ankle: unknown link 'FL_paw'"),
     "other link": (('"FL_outer_shank"', '"FR_outer_shank"'), "loop FL_ankle: expected link FL_outer_shank"),
-    "open anchor": (
-        (r'"child_anchor": \[0, 0, -0.3', '"child_anchor": [0, 0, -0.31'),
-        "loop FL_ankle: expected both anc",
-    ),
+    "open anchor": ((r'"child_anchor": \[0, 0, -0.3', '"child_anchor": [0, 0, -0.31'),
+        "loop FL_ankle: expected both anc"),
     "unknown motor": (('"FR_outer": "AK70-10"', '"FR_outer": "AK60"'), "motor FR_outer: unknown motor type 'AK60'"),
     "missing motor": (('"FR_outer": "AK70-10", ', ""), "motors: expected FR_outer to be a str, found nothing"),
     "extra motor": (('"FR_outer": ', '"tail": "AK80-9", "FR_outer": '), "motor tail: expected one of"),
@@ -130,41 +113,27 @@ BAD_JSON = {
     "negative rotor": (("5.79e-5", "-5.79e-5"), "motor type AK80-9: expected rotor_inertia > 0"),
     "zero gain": (('"kp": 17.0', '"kp": 0'), "motor type AK80-9 jumping: expected kp > 0"),
     "high cutoff": (('"cutoff_speed_rpm": 335', '"cutoff_speed_rpm": 500'), "AK80-9: expected cutoff_speed_rpm <"),
-    "friction": (
-        ('"coulomb_friction": 0.02', '"coulomb_friction": 1e8'),
-        "motor type AK80-9: expected coulomb_friction in 0 to 10 N m, found 1e+08",
-    ),
-    "friction above torque": (
-        ('"peak_torque": 18.0(.*?)0.02', r'"peak_torque": 1.8\g<1>2.0'),
-        "AK80-9: expected coulomb_friction in 0 to 1.8 N m, its peak_torque, found 2",
-    ),
+    "friction": (('"coulomb_friction": 0.02', '"coulomb_friction": 1e8'),
+        "motor type AK80-9: expected coulomb_friction in 0 to 10 N m, found 1e+08"),
+    "friction above torque": (('"peak_torque": 18.0(.*?)0.02', r'"peak_torque": 1.8\g<1>2.0'),
+        "AK80-9: expected coulomb_friction in 0 to 1.8 N m, its peak_torque, found 2"),
     "rotor in g cm^2": (("5.79e-5", "579"), "motor type AK80-9: expected rotor_inertia in 1e-08 to 0.01 kg m^2"),
-    "speed in rpm": (
-        ('"no_load_speed_rpm": 470', '"no_load_speed_rpm": 47000'),
-        "expected no-load speed in 0.1 to 1000",
-    ),
-    "gain": (
-        ('"kp": 17.0, "kd": 1.8', '"kp": 17.0, "kd": 1800'),
-        "AK80-9: expected jumping kd in 0.01 to 100 N m s/rad",
-    ),
+    "speed in rpm": (('"no_load_speed_rpm": 470', '"no_load_speed_rpm": 47000'),
+        "expected no-load speed in 0.1 to 1000"),
+    "gain": (('"kp": 17.0, "kd": 1.8', '"kp": 17.0, "kd": 1800'),
+        "AK80-9: expected jumping kd in 0.01 to 100 N m s/rad"),
     "knee damping": (('"knee_damping": 0.1', '"knee_damping": 1e5'), "expected knee_damping in 1e-06 to 10 N m s/rad"),
     "sum in tenths": ((r"\[0, 240\]", "[0, 2400]"), "expected upper transversal_sum in -12.57 to 12.57 rad"),
-    "long shank": (
-        (r'"child_anchor": \[0, 0, -0.3', '"child_anchor": [0, 0, -300'),
-        "loop FL_ankle: expected z of anchor",
-    ),
+    "long shank": ((r'"child_anchor": \[0, 0, -0.3', '"child_anchor": [0, 0, -300'),
+        "loop FL_ankle: expected z of anchor"),
     "infinite number": (('"knee_damping": 0.1', '"knee_damping": 1e999'), "knee_damping to be a finite number"),
     "nan": (('"knee_damping": 0.1', '"knee_damping": NaN'), "expected finite numbers, found NaN"),
     "huge integer": (('"knee_damping": 0.1', '"knee_damping": ' + "9" * 5000), "expected JSON (ValueError)"),
     "no default pose": (('"default": ', '"other": '), "poses: expected a pose named default"),
-    "pose beyond stops": (
-        ('"transversal_deg": 45', '"transversal_deg": 150'),
-        "pose default: expected FL_outer within",
-    ),
-    "pose beyond sum": (
-        ('"transversal_deg": 45', '"transversal_deg": 125'),
-        "pose default: expected the transversal sum",
-    ),
+    "pose beyond stops": (('"transversal_deg": 45', '"transversal_deg": 150'),
+        "pose default: expected FL_outer within"),
+    "pose beyond sum": (('"transversal_deg": 45', '"transversal_deg": 125'),
+        "pose default: expected the transversal sum"),
     "inverted sum": ((r"\[0, 240\]", "[240, 0]"), "transversal_sum_deg: expected lower < upper"),
     "urdf outside": (('"jumper.urdf"', '"../jumper.urdf"'), "urdf: expected a file inside"),
     "urdf missing": (('"jumper.urdf"', '"other.urdf"'), "urdf: missing file"),
@@ -172,18 +141,18 @@ BAD_JSON = {
     "list": (("^.*$", "[]"), "expected a JSON object"),
     "deep": (("^.*$", "[" * 100000), "expected JSON (RecursionError)"),
     "malformed": ((r"\}\s*$", ""), "expected JSON"),
-}
+}  # fmt: skip
 
 
 @pytest.mark.parametrize("case", BAD_URDF)
-def test_refuses_urdf_with(assets, case):
+def test_refuses_faulty_urdf(assets, case):
     change, message = BAD_URDF[case]
     edit(assets, URDF, *change)
     assert message in refusal(assets)
 
 
 @pytest.mark.parametrize("case", BAD_JSON)
-def test_refuses_json_with(assets, case):
+def test_refuses_faulty_json(assets, case):
     change, message = BAD_JSON[case]
     edit(assets, JSON, *change)
     assert message in refusal(assets)
@@ -203,7 +172,7 @@ def test_refuses_a_missing_file_and_a_folder(tmp_path):
 
 
 def test_refuses_a_mesh_in_millimetres(assets):
-    edit(assets, "meshes/shell.obj", r"v (\S+) ", r"v \g<1>e3 ")
+    edit(assets, "meshes/shell.obj", r"v (\S+) ", r"v \g<1>e3 ")  # x in mm
     assert "link body: expected smallest mesh coordinate in -2 to 2 m, found -3" in refusal(assets)
 
 

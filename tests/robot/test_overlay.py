@@ -20,19 +20,19 @@ VALUES = {
     "offset": (0.02,) + 11 * (-0.01,), "armature": 12 * (0.005,), "knee_damping": (0.2,), "paw_friction": (0.7,),
     "latency": (0.0042,), "no_load_speed": 12 * (44.0,),
 }  # fmt: skip
-RANGES = {"base_mass": (-0.1, 0.1), "joint_offset": (-0.2, 0.2), "latency": (3.0, 5.0)}
+RANGES = {"base_mass": (-0.1, 0.1), "joint_offset": (-0.2, 0.2), "latency": (3.0, 5.0)}  # [kg], [deg], [ms]
 
 
 def test_load_overlay_inverts_save(tmp_path):
     overlay = RobotOverlay(VALUES, RANGES, "a bench")
     overlay.save(tmp_path / "robot.json")
-    found = load_overlay(tmp_path / "robot.json")
-    assert found.to_json() == overlay.to_json()
-    assert found.robots().kp[0, 0] == 1.2 and found.robots().kd[0, 0] == 1.0
+    loaded = load_overlay(tmp_path / "robot.json")
+    assert loaded.to_json() == overlay.to_json()
+    assert loaded.robots().kp[0, 0] == 1.2 and loaded.robots().kd[0, 0] == 1.0  # kd: the default
 
 
 @pytest.mark.parametrize(
-    ("change", "words"),
+    ("change", "message"),
     [
         ({"schema": "other"}, "not a robot overlay"),
         ({"values": {"colour": [1.0]}}, "no quantity 'colour'"),
@@ -50,15 +50,15 @@ def test_load_overlay_inverts_save(tmp_path):
         ({"randomization": {"gains": [1.1, 0.9]}}, "two rising numbers"),
     ],
 )
-def test_refuses_bad_overlay_in_one_line(tmp_path, change, words):
+def test_refuses_bad_overlay_in_one_line(tmp_path, change, message):
     file = tmp_path / "robot.json"
     file.write_text(json.dumps(RobotOverlay(VALUES).to_json() | change))
-    with pytest.raises(InputError, match=words) as told:
+    with pytest.raises(InputError, match=message) as refusal:
         load_overlay(file)
-    assert str(told.value).startswith(str(file)) and "\n" not in str(told.value)
+    assert str(refusal.value).startswith(str(file)) and "\n" not in str(refusal.value)
 
 
-def test_overlay_accepts_every_row_of_randomization_cfg():
+def test_overlay_accepts_the_ranges_of_randomization_cfg():
     assert set(RANDOMIZED) == {name for name, value in vars(RandomizationCfg.off()).items() if value is None}
 
 
@@ -66,15 +66,15 @@ def test_overlay_accepts_every_row_of_randomization_cfg():
 def test_simulation_uses_overlay_values(solver):
     sim = Simulation(2, solver=solver, visuals=False, robot=RobotOverlay(VALUES))
     plain = Simulation(2, visuals=False)
-    mass, old = (s.model.body_mass.numpy().reshape(2, int(BODIES)) for s in (sim, plain))
+    mass, described = (s.model.body_mass.numpy().reshape(2, int(BODIES)) for s in (sim, plain))
     assert mass[:, 0] == pytest.approx([7.0, 7.0])
-    np.testing.assert_allclose(mass[:, 1:6] / old[:, 1:6], [[1.1, 1.0, 1.0, 1.0, 0.9]] * 2, rtol=1e-6)
-    inertia, old = (s.model.body_inertia.numpy()[1] for s in (sim, plain))
-    np.testing.assert_allclose(inertia, 1.1 * old, rtol=1e-5)
+    np.testing.assert_allclose(mass[:, 1:6] / described[:, 1:6], [[1.1, 1.0, 1.0, 1.0, 0.9]] * 2, rtol=1e-6)
+    inertia, described = (s.model.body_inertia.numpy()[1] for s in (sim, plain))  # FL housing of world 0
+    np.testing.assert_allclose(inertia, 1.1 * described, rtol=1e-5)
     scale = sim.motors.kp.numpy() / plain.motors.kp.numpy()
     np.testing.assert_allclose(scale, np.repeat(np.array(VALUES["kp"])[:, None], 2, axis=1), rtol=1e-6)
     np.testing.assert_allclose(sim.motors.offset.numpy()[:, 0], VALUES["offset"], rtol=1e-6)
-    assert sim.model.joint_armature.numpy().reshape(2, int(DOFS))[1, 6] == pytest.approx(0.005)
+    assert sim.model.joint_armature.numpy().reshape(2, int(DOFS))[1, 6] == pytest.approx(0.005)  # FL lateral
     if solver == "jumper":
         table = sim.physics.dynamics.robot.table.numpy()
         assert table[:, 0] == pytest.approx(table[:, 1])
@@ -85,20 +85,20 @@ def test_environment_randomises_around_overlay_and_saves_it():
     overlay = RobotOverlay(VALUES, RANGES)
     task = for_robot(make_task("vertical-jump"), overlay)
     assert task.randomization.base_mass == (-0.1, 0.1)
-    still = Env(task, 2, randomize=False, noise=False, robot=overlay, device="cpu")
-    assert still.parameters.latency.numpy().tolist() == [2, 2]
-    assert still.parameters.nominal_kp.numpy()[0, 0] == pytest.approx(1.2 * task.motors.lateral.kp)
-    assert RobotOverlay.from_json(still.config()["robot"]).values["kp"] == VALUES["kp"]
+    nominal = Env(task, 2, randomize=False, noise=False, robot=overlay, device="cpu")
+    assert nominal.parameters.latency.numpy().tolist() == [2, 2]  # physics steps: 4.2 ms of 1/480 s
+    assert nominal.parameters.nominal_kp.numpy()[0, 0] == pytest.approx(1.2 * task.motors.lateral.kp)
+    assert RobotOverlay.from_json(nominal.config()["robot"]).values["kp"] == VALUES["kp"]
     env = Env(task, 16, noise=False, robot=overlay, device="cpu")
     env.reset()
     mass = env.sim.model.body_mass.numpy().reshape(16, -1)[:, 0]
     assert 6.9 <= mass.min() < mass.max() <= 7.1
     offset = np.degrees(env.sim.motors.offset.numpy() - np.array(VALUES["offset"])[:, None])
     assert np.abs(offset).max() <= 0.2 + 1e-5 and np.ptp(offset) > 0.2
-    assert set(env.parameters.latency.numpy()) <= {1, 2}
+    assert set(env.parameters.latency.numpy()) <= {1, 2}  # 3 to 5 ms
 
 
-def test_training_flags_override_overlay(tmp_path):
+def test_overlay_is_read_from_both_forms_of_the_training_flag(tmp_path):
     RobotOverlay(VALUES, RANGES).save(tmp_path / "robot.json")
     assert overlay_in(["--seed", "1"]) is None
     assert overlay_in(["--robot", str(tmp_path / "robot.json")]).values["base_mass"] == (7.0,)

@@ -1,3 +1,5 @@
+"""The robot in Pinocchio: geometry by hand, and velocities and dynamics by finite differences and conservation laws."""
+
 import math
 
 import numpy as np
@@ -7,7 +9,7 @@ import pytest
 from jumper_warp.robot.description import MOTOR_JOINTS, load_description
 from jumper_warp.robot.pinocchio_model import build_pinocchio
 
-LEVEL = (0.0, 0.0, 0.0, 1.0)
+LEVEL = (0.0, 0.0, 0.0, 1.0)  # xyzw
 
 
 @pytest.fixture(scope="module")
@@ -17,7 +19,7 @@ def robot():
 
 @pytest.fixture
 def moving(robot):
-    """A random configuration and velocity with closed loops."""
+    """A random configuration (27,) and velocity (26,) with closed loops."""
     rng = np.random.default_rng(3)
     motors = np.tile(np.radians([0.0, 60.0, 60.0]), 4) + rng.uniform(-0.5, 0.5, 12)
     quat = rng.normal(size=4)
@@ -25,7 +27,7 @@ def moving(robot):
     return q, robot.closed_velocity(q, rng.normal(size=6), 4.0 * rng.normal(size=12))
 
 
-def test_mass_and_motor_indices(robot):
+def test_mass_motor_indices_and_armature(robot):
     assert pin.computeTotalMass(robot.model) == pytest.approx(14.5)
     names = [robot.model.names[joint] for joint in range(robot.model.njoints)]
     by_velocity = {robot.model.joints[joint].idx_v: names[joint] for joint in range(1, robot.model.njoints)}
@@ -34,14 +36,14 @@ def test_mass_and_motor_indices(robot):
     assert not robot.model.armature[robot.knee_v].any()
 
 
-@pytest.mark.parametrize(("degrees", "depth"), [(0, 0.4716), (45, 0.3718)])
+@pytest.mark.parametrize(("degrees", "depth"), [(0, 0.4716), (45, 0.3718)])  # of both thighs; [m]
 def test_ankle_depth_below_the_hips(robot, degrees, depth):
     q = robot.configuration((0.0, 0.0, 0.0), LEVEL, np.tile(np.radians([0.0, degrees, degrees]), 4))
     assert -robot.paw_positions(q)[:, 2] == pytest.approx(np.full(4, depth), abs=5e-5)
 
 
 def test_lateral_motor_swings_the_paw_outward(robot):
-    # at 90 degrees the ankle lies level with the hip, 0.3718 m out, 0.0602 m above it
+    # at 90 degrees the ankle is 0.3718 m beside the hip and 0.0602 m above it; the right hip is at y = -0.105 m
     q = robot.configuration((0.0, 0.0, 0.0), LEVEL, np.tile(np.radians([90.0, 45.0, 45.0]), 4))
     assert robot.paw_positions(q)[1, 1:] == pytest.approx([-0.105 - 0.3718, 0.0602], abs=5e-5)
 
@@ -53,7 +55,7 @@ def test_configuration_closes_the_loops(moving, robot):
 def test_configuration_refuses_knees_out_of_reach(robot):
     shank = robot.constraints[1].joint1_placement
     original = shank.translation.copy()
-    shank.translation = np.array([0.0, 0.0, -0.15])
+    shank.translation = np.array([0.0, 0.0, -0.15])  # the knees are 0.3375 m apart
     try:
         with pytest.raises(ValueError, match="knees of FR"):
             robot.configuration((0.0, 0.0, 0.0), LEVEL, np.tile(np.radians([0.0, 45.0, 45.0]), 4))
@@ -63,7 +65,7 @@ def test_configuration_refuses_knees_out_of_reach(robot):
 
 def test_closed_velocity_matches_differences_of_configurations(moving, robot):
     q, v = moving
-    step = 1e-6
+    step = 1e-6  # [s]
     ahead, behind = (
         robot.configuration(q[0:3], q[3:7], q[robot.motor_q] + sign * step * v[robot.motor_v]) for sign in (1, -1)
     )
@@ -71,14 +73,14 @@ def test_closed_velocity_matches_differences_of_configurations(moving, robot):
     assert v[robot.knee_v] == pytest.approx(rates, abs=1e-7)
 
 
-def test_paw_velocities_match_differences_of_positions(moving, robot):
+def test_paw_velocities_and_jacobians_match_differences_of_positions(moving, robot):
     q, v = moving
-    step = 1e-6
+    step = 1e-6  # [s]
     ahead, behind = (robot.paw_positions(pin.integrate(robot.model, q, sign * step * v)) for sign in (1, -1))
     assert robot.paw_velocities(q, v) == pytest.approx((ahead - behind) / (2.0 * step), abs=1e-7)
-    still = robot.closed_velocity(q, np.zeros(6), v[robot.motor_v])
-    rates = np.einsum("kij,kj->ki", robot.paw_jacobians(q), v[robot.motor_v].reshape(4, 3))
-    assert rates == pytest.approx(robot.paw_velocities(q, still), abs=1e-12)
+    fixed_base = robot.closed_velocity(q, np.zeros(6), v[robot.motor_v])
+    velocities = np.einsum("kij,kj->ki", robot.paw_jacobians(q), v[robot.motor_v].reshape(4, 3))
+    assert velocities == pytest.approx(robot.paw_velocities(q, fixed_base), abs=1e-12)
 
 
 def test_robot_at_rest_falls_freely(robot):
@@ -94,21 +96,22 @@ def test_energy_changes_by_motor_power(moving, robot):
     acceleration = robot.forward_dynamics(q, v, torques)
 
     def energy(time):
+        """Return the energy [J] after a time [s] at constant acceleration."""
         rates = v + time * acceleration
         pose = pin.integrate(robot.model, q, time * v + 0.5 * time**2 * acceleration)
         upper = np.triu(pin.crba(robot.model, robot.data, pose))  # mass matrix with the rotors
         kinetic = rates @ upper @ rates - 0.5 * np.diag(upper) @ rates**2
         return kinetic + pin.computePotentialEnergy(robot.model, robot.data, pose)
 
-    step = 1e-5
-    power = torques @ v[robot.motor_v]
+    step = 1e-5  # [s]
+    power = torques @ v[robot.motor_v]  # [W]
     assert (energy(step) - energy(-step)) / (2.0 * step) == pytest.approx(power, rel=1e-5)
 
 
 def test_loops_stay_closed_while_moving(moving, robot):
     q, v = moving
     acceleration = robot.forward_dynamics(q, v, np.linspace(-10.0, 10.0, 12))
-    # a gap would open with time^2 if velocity or acceleration broke the loops; what is left is time^3
+    # gaps grow with time^3, or with time or time^2 if velocity or acceleration did not keep the loops closed
     gaps = [
         robot.loop_gap(pin.integrate(robot.model, q, time * v + 0.5 * time**2 * acceleration)) for time in (1e-3, 2e-3)
     ]

@@ -1,3 +1,5 @@
+"""Newton's model of the robot: layout, poses, contacts and dynamics, against hand calculations and Pinocchio."""
+
 import dataclasses
 import importlib
 import math
@@ -15,10 +17,10 @@ from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.sim.mujoco import mujoco_solver
 from jumper_warp.sim.precision import float64_kernels
 
-COORDS, DOFS = 43, 38
+COORDS, DOFS = 43, 38  # of a world
 LEGS = ("FL", "FR", "BL", "BR")
-FRONT = np.array([1, 1, -1, -1])
-SIDE = np.array([1, -1, 1, -1])
+FRONT = np.array([1, 1, -1, -1])  # sign of x by leg
+SIDE = np.array([1, -1, 1, -1])  # sign of y by leg
 MOTOR_DOFS = np.array([6 + 5 * leg + joint for leg in range(4) for joint in (0, 1, 3)])
 
 
@@ -33,7 +35,7 @@ def model():
 
 
 def body_poses(model, joint_q):
-    """World 0's link positions (21, 3) and rotations for one world's joint_q."""
+    """Return world 0's link positions (21, 3) [m] and 21 rotations, world frame, for joint_q (43,)."""
     state = model.state()
     coords = state.joint_q.numpy()
     coords[:COORDS] = joint_q
@@ -44,7 +46,7 @@ def body_poses(model, joint_q):
 
 
 def far_ends(model, joint_q, link, length):
-    """World positions (4, 3) of the far ends of link 0..4 of each leg."""
+    """Return positions (4, 3) [m], world frame, of the points (0, 0, -length [m]) of link 0 to 4 of each leg."""
     positions, rotations = body_poses(model, joint_q)
     bodies = [1 + 5 * leg + link for leg in range(4)]
     return positions[bodies] + rotations[bodies].apply([0.0, 0.0, -length])
@@ -72,6 +74,7 @@ def test_masses_and_inertias_match_description(model, description):
 
 def test_motor_and_knee_properties(model):
     def legs(array):
+        """Return world 1's values by leg and joint, (4, 5): lateral, outer, outer knee, inner, inner knee."""
         return array.numpy().reshape(2, DOFS)[1, 6:26].reshape(4, 5)
 
     assert legs(model.joint_armature) == pytest.approx(np.tile([4.69e-3, 4.14e-3, 0, 4.14e-3, 0], (4, 1)), rel=1e-3)
@@ -85,11 +88,10 @@ def test_default_pose_stands_on_closed_legs(model):
     joint_q = model.joint_q.numpy()[COORDS:]
     # base height: ankle depth 0.3718 at 45 degrees plus the paw radius
     assert joint_q[2] == pytest.approx(0.3718 + 0.025, abs=5e-5)
-    outer = far_ends(model, joint_q, 2, 0.3)
-    inner = far_ends(model, joint_q, 4, 0.3)
+    outer, inner = (far_ends(model, joint_q, link, length=0.3) for link in (2, 4))  # ankles by both shanks
     assert inner == pytest.approx(outer, abs=1e-6)
     assert inner[:, 2] == pytest.approx(np.full(4, 0.025), abs=1e-6)
-    # under the middle between the transversal axes, 0.1433 + (0.1417 + 0.0517) / 2
+    # below the middle between the transversal axes, x = 0.1433 + (0.1417 + 0.0517) / 2; y: hip + 0.05945 + 0.00075
     assert inner[:, 0] == pytest.approx(0.24 * FRONT, abs=1e-6)
     assert inner[:, 1] == pytest.approx(SIDE * (np.array([0.105, 0.105, 0.15, 0.15]) + 0.0602), abs=1e-6)
 
@@ -98,16 +100,16 @@ def test_loop_coordinates_are_relative_rotations_of_shanks(model):
     joint_q = model.joint_q.numpy()[:COORDS]
     _, rotations = body_poses(model, joint_q)
     for leg in range(4):
-        relative = rotations[5 + 5 * leg].inv() * rotations[3 + 5 * leg]
+        relative = rotations[5 + 5 * leg].inv() * rotations[3 + 5 * leg]  # outer shank in the inner one's frame
         stored = Rotation.from_quat(joint_q[27 + 4 * leg : 31 + 4 * leg])
         assert (stored.inv() * relative).magnitude() < 1e-6
 
 
 def test_positive_lateral_swings_the_paw_outward(model):
     joint_q = model.joint_q.numpy()[:COORDS].astype(float)
-    before = far_ends(model, joint_q, 4, 0.3)
-    joint_q[7:27:5] += 0.1
-    moved = far_ends(model, joint_q, 4, 0.3) - before
+    before = far_ends(model, joint_q, link=4, length=0.3)
+    joint_q[7:27:5] += 0.1  # [rad] all laterals
+    moved = far_ends(model, joint_q, link=4, length=0.3) - before
     assert (SIDE * moved[:, 1] > 0.03).all()
 
 
@@ -132,7 +134,7 @@ def test_positive_knee_angle_folds_the_shank_under_the_body(model, joint):
 
 
 def test_nominal_pose_stands_at_the_nominal_height(description):
-    assert standing_configuration(description, "nominal")[2] == pytest.approx(0.35, abs=2e-3)
+    assert standing_configuration(description, "nominal")[2] == pytest.approx(0.35, abs=2e-3)  # [m]
 
 
 def test_standing_height_with_the_legs_swung_outward(model, description):
@@ -163,17 +165,17 @@ def test_leg_geometry_array_in_both_precisions(description, package, bits):
 def test_only_paws_collide_with_the_ground():
     solver = mujoco_solver(build_model(1, visuals=False, device="cpu"))
     kind, affinity = solver.mj_model.geom_contype, solver.mj_model.geom_conaffinity
-    meets = (kind[:, None] & affinity[None, :]) | (kind[None, :] & affinity[:, None])
+    collides = (kind[:, None] & affinity[None, :]) | (kind[None, :] & affinity[:, None])
     # the ground is global and comes first
-    assert meets[0, 1:].all()
-    assert not meets[1:, 1:].any()
+    assert collides[0, 1:].all()
+    assert not collides[1:, 1:].any()
 
 
 def test_contact_has_the_paw_friction_and_is_stiff():
     model = build_model(1, friction=0.6, visuals=False, device="cpu")
     solver = mujoco_solver(model)
     joint_q = model.joint_q.numpy()
-    joint_q[2] -= 1e-3
+    joint_q[2] -= 1e-3  # [m] paws into the ground
     model.joint_q.assign(joint_q)
     state, control = model.state(), model.control()
     solver.step(state, state, control, None, 1.0 / 480.0)
@@ -185,7 +187,7 @@ def test_contact_has_the_paw_friction_and_is_stiff():
 
 
 def standing_energy(angle):
-    """Base height [m] and energy [J] of the robot on legs of 17 N m/rad commanded to 45 degrees, all at one angle.
+    """Return base height [m] and energy [J] with all thighs at an angle [rad] and motors of 17 N m/rad held at 45 deg.
 
     In the leg's plane each shank leans by asin((0.045 + 0.175 sin q) / 0.3); heights follow from the paws upward.
     """
@@ -200,14 +202,14 @@ def standing_energy(angle):
     return hip, weight + springs
 
 
-def test_robot_stands_under_position_control():
+def test_robot_stands_at_the_height_of_least_energy_with_closed_loops():
     model = build_model(1, visuals=False, device="cpu")
     solver = mujoco_solver(model)
     state, control = model.state(), model.control()
     target = np.radians([0.0, 45.0, 45.0] * 4)
     damping = np.array([1.8, 0.8, 0.8] * 4)
     torque = np.zeros(DOFS, dtype=np.float32)
-    for _ in range(200):
+    for _ in range(200):  # 0.42 s
         angle, rate = state.joint_q.numpy()[MOTOR_DOFS + 1], state.joint_qd.numpy()[MOTOR_DOFS]
         torque[MOTOR_DOFS] = 17.0 * (target - angle) - damping * rate
         control.joint_f.assign(torque)
@@ -246,37 +248,40 @@ def test_accelerations_in_flight_agree_with_pinocchio(description):
     solver.mjw_model.eq_solimp.fill_(wp.types.vector(5, float)(0.9999, 0.9999, 0.001, 0.5, 2.0))  # all but rigid loops
     for _ in range(3):  # the solver warm-starts from the previous call
         solver.step(state, model.state(), control, None, 1.0e-5)
-    found = solver.mjw_data.qacc.numpy()[0]
+    accelerations = solver.mjw_data.qacc.numpy()[0]
 
     scale = np.abs(expected).max()
     # MuJoCo: linear acceleration of the base in the world frame, angular in the body frame
-    assert found[:3] == pytest.approx(Rotation.from_quat(quat).apply(expected[:3]), abs=3e-4 * scale)
-    assert found[3:6] == pytest.approx(expected[3:6], abs=3e-4 * scale)
-    assert found[MOTOR_DOFS] == pytest.approx(expected[reference.motor_v], abs=3e-4 * scale)
-    assert found[knees - 1] == pytest.approx(expected[reference.knee_v], abs=3e-4 * scale)
+    assert accelerations[:3] == pytest.approx(Rotation.from_quat(quat).apply(expected[:3]), abs=3e-4 * scale)
+    assert accelerations[3:6] == pytest.approx(expected[3:6], abs=3e-4 * scale)
+    assert accelerations[MOTOR_DOFS] == pytest.approx(expected[reference.motor_v], abs=3e-4 * scale)
+    assert accelerations[knees - 1] == pytest.approx(expected[reference.knee_v], abs=3e-4 * scale)
+
+
+def test_mujoco_refuses_friction_below_the_least():
+    with pytest.raises(ValueError, match=r"friction 0\.005 or more, got 0\.004"):
+        mujoco_solver(build_model(1, friction=0.004, visuals=False, device="cpu"))
 
 
 def test_robot_slides_on_mujoco_with_the_least_friction():
-    with pytest.raises(ValueError, match=r"friction 0\.005 or more, got 0\.004"):
-        mujoco_solver(build_model(1, friction=0.004, visuals=False, device="cpu"))
     model = build_model(1, friction=0.005, visuals=False, device="cpu")
     solver, state, control = mujoco_solver(model), model.state(), model.control()
     rates = state.joint_qd.numpy()
-    rates[0] = 3.0
+    rates[0] = 3.0  # [m/s]
     state.joint_qd.assign(rates)
-    for _ in range(48):
+    for _ in range(48):  # 0.1 s
         solver.step(state, state, control, None, 1.0 / 480.0)
-    # it loses 0.005 g for 0.1 s
+    # 3 m/s for 0.1 s, less 0.005 g t^2 / 2
     assert state.joint_q.numpy()[0] == pytest.approx(0.3, abs=0.002)
 
 
-def test_robot_on_a_heightfield():
+def test_paws_touch_a_heightfield_at_its_height():
     heights = np.full((21, 21), 0.1, dtype=np.float32)
-    heights[0, 0] = 0.0
+    heights[0, 0] = 0.0  # a constant field has no range to scale
     ground = newton.Heightfield(data=heights, nrow=21, ncol=21, hx=2.0, hy=2.0)
     model = build_model(1, ground=ground, visuals=False, device="cpu")
     joint_q = model.joint_q.numpy()
-    joint_q[2] += 0.099
+    joint_q[2] += 0.099  # [m] 1 mm into the ground
     model.joint_q.assign(joint_q)
     solver = mujoco_solver(model)
     state = model.state()
@@ -286,11 +291,11 @@ def test_robot_on_a_heightfield():
     assert solver.mjw_data.contact.dist.numpy()[:contacts].min() == pytest.approx(-0.001, abs=2e-4)
 
 
-def test_no_ground_on_request():
+def test_model_without_ground_has_no_ground_shape():
     assert "ground" not in build_model(1, ground=None, visuals=False, device="cpu").shape_label
 
 
-def test_gradients_on_request():
+def test_model_with_requires_grad_has_gradients():
     assert build_model(1, visuals=False, requires_grad=True, device="cpu").joint_q.requires_grad
 
 
@@ -305,6 +310,6 @@ def test_gradients_on_request():
         ({"num_worlds": 1, "ground": "sea"}, "ground must be"),
     ],
 )
-def test_build_model_refuses(arguments, message):
+def test_build_model_refuses_bad_arguments(arguments, message):
     with pytest.raises(ValueError, match=message):
         build_model(**arguments, device="cpu")

@@ -1,4 +1,4 @@
-"""Physics with a thread per leg (for GPUs) against a thread per world; on the CPU threads of a block take turns."""
+"""`advance` with a thread per leg (for GPUs) against a thread per world, the oracle, both on the CPU in float64."""
 
 import numpy as np
 import pytest
@@ -8,20 +8,20 @@ from jumper_warp.robot.grounds import BlockCfg, uneven
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.dynamics import JumperDynamics
 
-N = 11  # not a multiple of the 8 worlds that share a warp
-MOTORS = [6 + 5 * leg + j for leg in range(4) for j in (0, 1, 3)]
+N = 11  # worlds, not a multiple of the 8 worlds that share a warp
+MOTORS = [6 + 5 * leg + j for leg in range(4) for j in (0, 1, 3)]  # in joint_qd
 
 
 @pytest.fixture(autouse=True)
 def blocks_of_threads():
-    """Let the CPU run blocks of several threads."""
+    """Let the CPU run blocks of several threads, which take turns."""
     wp.config.enable_cpu_blocks = True
     yield
     wp.config.enable_cpu_blocks = False
 
 
 def states(model, height, seed=0):
-    """Return coordinates, rates and forces of robots near a height [m], any yaw, most paws near the ground."""
+    """Return random joint_q (N, 43), joint_qd (N, 38), joint_f (N, 38) of robots with the base near a height [m]."""
     rng = np.random.default_rng(seed)
     q = model.joint_q.numpy().reshape(N, 43).astype(np.float64)
     q[:, :2] = rng.normal(size=(N, 2)) * 0.3
@@ -37,10 +37,10 @@ def states(model, height, seed=0):
 
 
 def squatting(model):
-    """Return states and forces of robots about their squat's stops, paws near the ground."""
+    """Return joint_q, joint_qd, joint_f of robots near the stop of outer + inner, paws near the ground."""
     q, qd, force = states(model, 0.14)
     rng = np.random.default_rng(2)
-    half = np.radians(120.0) + rng.uniform(-0.01, 0.01, (N, 4))
+    half = np.radians(120.0) + rng.uniform(-0.01, 0.01, (N, 4))  # half of outer + inner
     aside = rng.uniform(-0.1, 0.1, (N, 4))
     for leg in range(4):
         q[:, 7 + 5 * leg] = rng.uniform(-0.05, 0.05, N)
@@ -49,7 +49,7 @@ def squatting(model):
 
 
 def advance(dynamics, q, qd, force, by_legs, substeps=4, tolerance=1.0e-12):
-    """Return coordinates, rates and work arrays after some steps of 1/480 s."""
+    """Return joint_q, joint_qd, impulse, contact force, peak forces (all, paws) and torque after steps of 1/480 s."""
     real = dynamics.real
     q, qd, force = (wp.array(x.ravel(), dtype=real) for x in (q, qd, force))
     wrench = np.zeros((N * 21, 6), dtype=np.float32)
@@ -59,7 +59,7 @@ def advance(dynamics, q, qd, force, by_legs, substeps=4, tolerance=1.0e-12):
     dynamics.advance(settings, drive, q, qd, q, qd, by_legs=by_legs)
     work = dynamics.work
     arrays = (work.impulse, work.contact_force, work.peak_force, work.peak_paw_force, work.torque)
-    return q.numpy(), qd.numpy(), *(each.numpy() for each in arrays)
+    return q.numpy(), qd.numpy(), *(array.numpy() for array in arrays)
 
 
 GROUNDS = {
@@ -76,25 +76,24 @@ def test_thread_per_leg_matches_thread_per_world(kind):
     q, qd, force = states(model, 0.34)
     legs, world = (JumperDynamics(model, double=True, block=GROUNDS[kind].get("block")) for _ in range(2))
     if kind == "springs":
-        for each in (legs, world):
-            each.leg_springs.fill_(wp.vec2(1000.0, 0.17))
-            each.pack_springs()
+        for dynamics in (legs, world):
+            dynamics.leg_springs.fill_(wp.vec2(1000.0, 0.17))  # [N/m], [m]
+            dynamics.pack_springs()
     found = advance(legs, q, qd, force, by_legs=True)
     expected = advance(world, q, qd, force, by_legs=False)
-    paws = expected[2]
-    assert (np.abs(paws).max(axis=(1, 2)) > 0.0).sum() >= 3  # legs that push
+    assert (np.abs(expected[2]).max(axis=(1, 2)) > 0.0).sum() >= 3  # legs with contact impulses
     for a, b in zip(found, expected, strict=True):
         np.testing.assert_allclose(a, b, atol=1.0e-8, rtol=1.0e-8)
     if kind == "springs":
-        rates = advance(JumperDynamics(model, double=True), q, qd, force, by_legs=False)[1]
-        assert np.abs(found[1] - rates).max() > 1.0
+        springless = advance(JumperDynamics(model, double=True), q, qd, force, by_legs=False)[1]
+        assert np.abs(found[1] - springless).max() > 1.0  # [rad/s]
     if kind == "block":
-        moved = [each.robot.ground.blocks.numpy()["center"] for each in (legs, world)]
-        assert np.abs(moved[1] - [0.1, 0.0]).max() > 1.0e-6
+        moved = [dynamics.robot.ground.blocks.numpy()["center"] for dynamics in (legs, world)]
+        assert np.abs(moved[1] - [0.1, 0.0]).max() > 1.0e-6  # [m] from its start
         np.testing.assert_allclose(*moved, atol=1.0e-9)
 
 
-def test_stops_match_thread_per_world():
+def test_thread_per_leg_matches_thread_per_world_at_stops_with_and_without_contact():
     model = build_model(N, friction=0.5)
     q, qd, force = squatting(model)
     legs, world = (JumperDynamics(model, double=True) for _ in range(2))
@@ -104,13 +103,13 @@ def test_stops_match_thread_per_world():
         np.testing.assert_allclose(a, b, atol=1.0e-8, rtol=1.0e-8)
     angles = expected[0].reshape(N, 43)[:, 7:27].reshape(N, 4, 5)
     pressed = angles[..., 1] + angles[..., 3] > np.radians(240.0)
-    paws = np.linalg.norm(expected[2], axis=2).T > 0.0
-    assert (pressed & paws).sum() > 5
-    assert (pressed & ~paws).any()
-    assert (~pressed & paws).any()
+    touching = np.linalg.norm(expected[2], axis=2).T > 0.0
+    assert (pressed & touching).sum() > 5
+    assert (pressed & ~touching).any()
+    assert (~pressed & touching).any()
 
 
-def test_diverged_world_is_frozen():
+def test_diverged_world_is_frozen_and_others_advance_unchanged():
     model = build_model(N)
     dynamics = JumperDynamics(model, double=True)
     q, qd, force = states(model, 0.34)
@@ -119,11 +118,11 @@ def test_diverged_world_is_frozen():
     np.testing.assert_array_equal(np.flatnonzero(dynamics.work.diverged.numpy()), [4])
     np.testing.assert_allclose(found[0].reshape(N, 43)[4], model.joint_q.numpy().reshape(N, 43)[4], atol=1.0e-7)
     np.testing.assert_array_equal(found[1].reshape(N, 38)[4], 0.0)
-    np.testing.assert_array_equal(found[2][:, 4], 0.0)
-    alone = JumperDynamics(model, double=True)
+    np.testing.assert_array_equal(found[2][:, 4], 0.0)  # impulses
+    intact = JumperDynamics(model, double=True)
     qd[4, 3] = 0.0
     others = np.arange(N) != 4
-    for a, b in zip(found[:2], advance(alone, q, qd, force, by_legs=True)[:2], strict=True):
+    for a, b in zip(found[:2], advance(intact, q, qd, force, by_legs=True)[:2], strict=True):
         np.testing.assert_array_equal(a.reshape(N, -1)[others], b.reshape(N, -1)[others])
 
 
@@ -139,9 +138,9 @@ def test_contact_iteration_ends_at_tolerance_and_reports_residual():
 
 @pytest.mark.parametrize("friction", [0.2, 0.5, 1.0])
 def test_sliding_paws_converge_in_few_rounds(friction):
-    """Friction in steps of the summed responses takes 10 to 13 rounds, and one paw at a time more than 9 too."""
+    """A friction step by the summed response of all paws would take 10 to 13 rounds, one paw at a time more than 9."""
     model = build_model(N, friction=friction)
     dynamics = JumperDynamics(model, double=True)
     found = advance(dynamics, *states(model, 0.34), by_legs=True, tolerance=1.0e-5)
-    assert (np.abs(found[2]).max(axis=(1, 2)) > 0.0).sum() >= 3  # legs that push
+    assert (np.abs(found[2]).max(axis=(1, 2)) > 0.0).sum() >= 3  # legs with contact impulses
     assert 0 < dynamics.work.sweeps.numpy().max() <= 9

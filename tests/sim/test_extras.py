@@ -17,17 +17,18 @@ from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.viz.shapes import shape_meshes
 
 DT = 1.0 / 480.0
-CORNER = (0.3, 0.05, 0.1)
-TILT = Rotation.from_euler("xyz", [0.3, -0.2, 0.5])
+CORNER = (0.3, 0.05, 0.1)  # [m], body frame
+TILT = Rotation.from_euler("xyz", [0.3, -0.2, 0.5])  # of the site at the corner
 GHOST = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False, has_particle_collision=False)
 
 
 def link(builder, name):
+    """Return the index of a link in the builder of one robot."""
     return builder.body_label.index(name)
 
 
 def corner_site(builder):
-    """A turned site at a corner of the body, and one on a shank."""
+    """Add a rotated site at a corner of the body, and one at the ankle of a shank."""
     builder.add_site(link(builder, "body"), xform=wp.transform(CORNER, wp.quat(*TILT.as_quat())), label="corner")
     builder.add_site(
         link(builder, "FL_inner_shank"), xform=wp.transform((0.0, 0.0, -0.3), wp.quat_identity()), label="ankle"
@@ -35,26 +36,29 @@ def corner_site(builder):
 
 
 def mast(builder):
-    """Something to look at, on the body."""
+    """Add a visual box to the body."""
     xform = wp.transform((0.0, 0.0, 0.2), wp.quat_identity())
     builder.add_shape_box(link(builder, "body"), xform=xform, hx=0.01, hy=0.02, hz=0.1, cfg=GHOST, label="mast")
 
 
 def wall(builder):
-    """An obstacle that stands in each world."""
+    """Add a colliding wall, fixed in the world, whose near face is at x = 0.45 m."""
     xform = wp.transform((0.5, 0.0, 0.25), wp.quat_identity())
     builder.add_shape_box(-1, xform=xform, hx=0.05, hy=1.0, hz=0.25, label="wall")
 
 
 def bumper(builder):
+    """Add a colliding sphere to the body."""
     builder.add_shape_sphere(link(builder, "body"), radius=0.1, label="bumper")
 
 
 def ball(builder):
+    """Add a free body."""
     builder.add_shape_sphere(builder.add_body(label="ball"), radius=0.1)
 
 
 def arm(builder):
+    """Add a body on a hinge that is fixed in the world."""
     elbow = builder.add_joint_revolute(
         -1, builder.add_link(mass=1.0, inertia=wp.mat33(np.eye(3)), label="forearm"), label="elbow"
     )
@@ -62,29 +66,32 @@ def arm(builder):
 
 
 def leash(builder):
+    """Add a ball joint between the front shanks."""
     builder.add_joint_ball(link(builder, "FL_inner_shank"), link(builder, "FR_inner_shank"), label="leash")
 
 
 def grain(builder):
+    """Add a particle."""
     builder.add_particle((0.0, 0.0, 1.0), (0.0, 0.0, 0.0), 0.1)
 
 
 def coupling(builder):
+    """Add a mimic joint between the front outer thighs."""
     builder.set_joint_mimic(builder.joint_label.index("FR_outer"), builder.joint_label.index("FL_outer"))
 
 
-def test_extras_keep_the_robots_layout():
+def test_extras_keep_labels_and_masses_of_the_robot_and_are_in_every_world():
     plain = build_model(2, visuals=False, device="cpu")
     model = build_model(2, visuals=False, device="cpu", extras=lambda b: (corner_site(b), mast(b), wall(b), bumper(b)))
     assert model.body_label == plain.body_label and model.joint_label == plain.joint_label
     assert np.array_equal(model.body_mass.numpy(), plain.body_mass.numpy())
     assert np.array_equal(model.body_inertia.numpy(), plain.body_inertia.numpy())
     for name in ("corner", "ankle", "mast", "wall", "bumper"):
-        found = [label for label in model.shape_label if label.endswith(name)]
-        assert found == [f"world_0/{name}", f"world_1/{name}"]
+        labels = [label for label in model.shape_label if label.endswith(name)]
+        assert labels == [f"world_0/{name}", f"world_1/{name}"]
 
 
-def test_default_density_does_not_change_a_links_mass():
+def test_shape_of_default_density_does_not_change_the_mass():
     model = build_model(1, visuals=False, device="cpu", extras=bumper)
     assert model.body_mass.numpy().sum() == pytest.approx(14.5, rel=1e-6)
 
@@ -102,7 +109,7 @@ def test_imu_on_a_site_of_a_standing_robot_measures_gravity(solver):
         sim.solver.step(sim.state, sim.state, sim.control, None, DT, observables=observables)
     sensor.update(sim.state, observables=observables)
     turn = Rotation.from_quat(sim.joint_q()[0, 3:7]) * TILT
-    # MuJoCo still trembles a little
+    # [m/s^2], [rad/s]: on MuJoCo the robot still oscillates slightly
     assert sensor.accelerometer.numpy()[0] == pytest.approx(turn.inv().apply([0.0, 0.0, 9.81]), abs=0.1)
     assert sensor.gyroscope.numpy()[0] == pytest.approx(np.zeros(3), abs=0.02)
 
@@ -114,16 +121,16 @@ def test_imu_on_a_falling_and_rotating_robot_measures_centripetal_acceleration()
     rates = sim.joint_qd().copy()
     rates[0, 3:6] = [0.0, 0.0, 6.0]
     sim.state.joint_qd.assign(rates.ravel())
-    places, times = [], 1.0e-3 * np.arange(9)
+    positions, times = [], 1.0e-3 * np.arange(9)  # of the site [m], [s]
     for _ in times:
         pose = sim.joint_q()[0].astype(float)
-        places.append(pose[:3] + Rotation.from_quat(pose[3:7]).apply(CORNER))
+        positions.append(pose[:3] + Rotation.from_quat(pose[3:7]).apply(CORNER))
         sim.solver.step(sim.state, sim.state, None, None, 1.0e-3, observables=observables)
-        if len(places) == 5:
+        if len(positions) == 5:  # in the middle of the fit
             sensor.update(sim.state, observables=observables)
             turn = Rotation.from_quat(sim.joint_q()[0, 3:7]) * TILT
-    # acceleration of the site as seen from outside, less gravity
-    acceleration = 2.0 * np.polyfit(times, np.array(places), 2)[0] - [0.0, 0.0, -9.81]
+    # world-frame acceleration of the site by a parabola through its positions, minus gravity [m/s^2]
+    acceleration = 2.0 * np.polyfit(times, np.array(positions), 2)[0] - [0.0, 0.0, -9.81]
     assert np.linalg.norm(acceleration) > 8.0  # 6^2 times 0.3 m, towards the axis
     assert sensor.accelerometer.numpy()[0] == pytest.approx(turn.inv().apply(acceleration), abs=1.0)
     assert sensor.gyroscope.numpy()[0] == pytest.approx(turn.inv().apply(sim.joint_qd()[0, 3:6]), abs=0.1)
@@ -135,12 +142,12 @@ def test_frame_transform_of_a_site_follows_the_link(solver):
     sensor = SensorFrameTransform(sim.model, shapes="*/ankle", reference_sites="*/corner")
     target = np.repeat(np.radians([[0.0], [70.0], [60.0]] * 4), 2, axis=1)
     sim.target.assign(target.astype(np.float32))
-    seen = []
+    readings = []
     for _ in range(20):
         sim.step()
         sensor.update(sim.state)
-        seen.append(sensor.transforms.numpy()[:, :3].copy())
-    # the front left ankle in the body's frame, from the leg's own closed form: the housing swings about x
+        readings.append(sensor.transforms.numpy()[:, :3].copy())
+    # the FL ankle [m] in the body frame by hand: intersection of shank circles, then rotation of the housing about x
     lateral, outer, inner = sim.joint_q()[0, [7, 8, 10]].astype(float)
     tips = np.array([[0.1417 + 0.175 * np.sin(outer), -0.175 * np.cos(outer)],
                      [0.0517 - 0.175 * np.sin(inner), -0.175 * np.cos(inner)]])  # fmt: skip
@@ -149,9 +156,9 @@ def test_frame_transform_of_a_site_follows_the_link(solver):
     ankle = tips.mean(axis=0) + rise * np.array([span[1], -span[0]]) / np.linalg.norm(span)
     swung = Rotation.from_euler("x", lateral).apply([ankle[0], 0.05945 + 0.00075, ankle[1]])
     expected = TILT.inv().apply(np.array([0.1433, 0.105, 0.0]) + swung - CORNER)
-    # MuJoCo's loops give a little
-    assert seen[-1] == pytest.approx(np.tile(expected, (2, 1)), abs=1e-5 if solver == "jumper" else 2e-3)
-    assert np.abs(seen[-1] - seen[0]).max() > 0.01
+    # MuJoCo's loops are compliant
+    assert readings[-1] == pytest.approx(np.tile(expected, (2, 1)), abs=1e-5 if solver == "jumper" else 2e-3)
+    assert np.abs(readings[-1] - readings[0]).max() > 0.01  # [m]
 
 
 def test_visual_shape_is_shown_in_every_world():
@@ -179,13 +186,13 @@ def test_sites_and_visual_shapes_change_no_motion_and_give_no_warning():
 
 
 @pytest.mark.parametrize(
-    ("extras", "what"),
+    ("extras", "part"),
     [(ball, "body 'world_0/ball'"), (arm, "body 'world_0/forearm'"), (leash, "joint 'world_0/leash'"),
      (grain, "2 particles"), (coupling, "2 mimic joints")],
 )  # fmt: skip
-def test_solver_refuses_bodies_joints_and_particles(extras, what):
+def test_solver_refuses_bodies_joints_and_particles(extras, part):
     model = build_model(2, visuals=False, device="cpu", extras=extras)
-    with pytest.raises(NotThisRobotError, match=f"{what}.*this robot alone") as refusal:
+    with pytest.raises(NotThisRobotError, match=f"{part}.*this robot alone") as refusal:
         SolverJumper(model)
     assert "\n" not in str(refusal.value)
 
@@ -199,16 +206,16 @@ def test_simulation_refuses_another_body_on_either_solver(solver):
 @pytest.mark.parametrize(("extras", "name"), [(wall, "wall"), (bumper, "bumper")])
 def test_solver_warns_once_of_ignored_collisions(extras, name):
     model = build_model(2, visuals=False, device="cpu", extras=extras)
-    with pytest.warns(UserWarning, match=f"ignores the collisions of 2 shapes, such as 'world_0/{name}'") as said:
+    with pytest.warns(UserWarning, match=f"ignores the collisions of 2 shapes, such as 'world_0/{name}'") as warned:
         solver = SolverJumper(model)
         state = model.state()
         for _ in range(3):
             solver.step(state, state, None, None, DT)
-    assert len(said) == 1 and said[0].filename == __file__
+    assert len(warned) == 1 and warned[0].filename == __file__
 
 
 def farthest_paw(model):
-    """The largest x [m] of a paw's rim when the limp robot slides along x at 3 m/s on SolverMuJoCo."""
+    """Return the largest x [m] of the FL paw's surface when the unactuated robot slides along x at 3 m/s on MuJoCo."""
     solver = mujoco_solver(model)
     state, control = model.state(), model.control()
     rates = state.joint_qd.numpy()
@@ -225,5 +232,5 @@ def farthest_paw(model):
 def test_obstacle_stops_the_paws_on_mujoco():
     free, stopped = (build_model(1, friction=0.1, visuals=False, device="cpu", extras=e) for e in (None, wall))
     assert farthest_paw(free) > 0.55
-    # they start at 0.265 m, the wall at 0.45 m
+    # the surface starts at x = 0.265 m, the wall at 0.45 m
     assert farthest_paw(stopped) == pytest.approx(0.45, abs=0.02)

@@ -28,14 +28,14 @@ from solver_helpers import COORDS, MOTOR_V, Reference, States
 
 wp.set_module_options({"enable_backward": False})
 
-MASS = 14.5
-TOP = 0.1
+MASS = 14.5  # [kg] robot
+TOP = 0.1  # [m] height of the block
 WIDE = {"center": (0.0, 0.0), "half": (1.0, 1.0), "height": TOP}
 """A block under the whole robot."""
 
 
 def on_block(num_worlds, settle=60, **block):
-    """Robots standing on their blocks' middle."""
+    """Return a simulation of robots on the middle of their blocks after `settle` policy steps; block: of `BlockCfg`."""
     arguments = {name: block.pop(name) for name in ("motors", "friction_paws") if name in block}
     arguments = {"friction": arguments.pop("friction_paws", 0.9), **arguments}
     sim = simulation(num_worlds, block=BlockCfg(**(WIDE | block)), **arguments)
@@ -56,7 +56,7 @@ def set_block_velocity(sim, velocity):
 
 
 def momenta(sim, reference):
-    """Horizontal momenta of the robots [kg m/s], (num_worlds, 2)."""
+    """Return the robots' horizontal momenta [kg m/s], (num_worlds, 2), by Pinocchio."""
     states = States.read(sim.joint_q(), sim.joint_qd())
     return np.array([reference.momentum(states, i)[:2] for i in range(sim.num_worlds)])
 
@@ -72,13 +72,13 @@ def block_velocity_kernel(law: BlockLaw, impulse: wp.array(dtype=vec3), out: wp.
 
 
 @pytest.mark.parametrize(
-    ("speed", "paw_impulse", "expected"),
+    ("speed", "paw_impulse", "expected"),  # [m/s] along x, [N s] on the paw in 0.01 s, [m/s]
     [
         # (100 N - 0.5 * 8 kg * 9.81 m/s^2) / 8 kg for 0.01 s
         (0.0, (-1.0, 0.0, 0.0), (1.0 - 0.3924) / 8.0),
         # a load of 60 N on top takes another 0.5 * 60 N
         (0.0, (-1.0, 0.0, 0.6), (1.0 - 0.3924 - 0.3) / 8.0),
-        # friction holds against 30 N, and stops a slow block without turning it back
+        # friction holds against 30 N, and stops a slow block without reversing it
         (0.0, (-0.3, 0.0, 0.0), 0.0),
         (0.04, (0.0, 0.0, 0.0), 0.0),
         (-1.0, (0.0, 0.0, 0.0), -1.0 + 0.3924 / 8.0),
@@ -96,10 +96,10 @@ def test_a_paw_force_pushes_the_block_against_friction(speed, paw_impulse, expec
 
 def test_block_stays_at_rest_under_a_standing_robot():
     sim = on_block(2, settle=0, mass=np.array([5.0, 20.0]))
-    for _ in range(60):
+    for _ in range(60):  # 1 s
         sim.step()
     paws = paw_centres(sim)
-    for _ in range(120):
+    for _ in range(120):  # 2 s
         sim.step()
     assert np.abs(sim.solver.block_position()).max() < 1e-3
     assert np.abs(paw_centres(sim) - paws).max() < 1e-3
@@ -108,7 +108,7 @@ def test_block_stays_at_rest_under_a_standing_robot():
 
 
 def test_robot_and_block_accelerate_together_under_a_force():
-    masses, force, friction = np.array([5.0, 10.0]), 40.0, 0.1
+    masses, force, friction = np.array([5.0, 10.0]), 40.0, 0.1  # [kg], [N], [1] of the floor
     sim = on_block(2, mass=masses, friction=friction, motors=stiff_motors())
     wrench = np.zeros((2, 21, 6), dtype=np.float32)
     wrench[:, 0, 0] = force
@@ -118,23 +118,23 @@ def test_robot_and_block_accelerate_together_under_a_force():
     before = sim.solver.block_velocity()[:, 0].copy()
     for _ in range(30):
         sim.step()
-    gained = (sim.solver.block_velocity()[:, 0] - before) / 0.5
+    acceleration = (sim.solver.block_velocity()[:, 0] - before) / 0.5  # 30 policy steps are 0.5 s
     total = MASS + masses
-    assert gained == pytest.approx((force - friction * total * 9.81) / total, rel=0.01)
+    assert acceleration == pytest.approx((force - friction * total * 9.81) / total, rel=0.01)
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.3])
 def test_block_momentum_matches_paw_and_floor_impulses(friction):
     masses = np.array([5.0, 10.0, 40.0, 5.0])
     sim = on_block(4, settle=0, mass=masses, friction=friction, half=(3.0, 3.0))
-    thrown(sim, 21, height=(0.5, 0.7), speed=1.0)
+    thrown(sim, seed=21, height=(0.5, 0.7), speed=1.0)
     moved = 0
     for _ in range(240):
         before = sim.solver.block_velocity().astype(float)
         sim.physics_step()
         force, after = paw_forces(sim).sum(axis=1), sim.solver.block_velocity().astype(float)
-        lost = masses[:, None] * (before - after) - PHYSICS_DT * force[:, :2]
-        most = friction * PHYSICS_DT * (masses * 9.81 + force[:, 2])
+        lost = masses[:, None] * (before - after) - PHYSICS_DT * force[:, :2]  # [N s] to the floor
+        most = friction * PHYSICS_DT * (masses * 9.81 + force[:, 2])  # [N s] Coulomb limit
         speed = np.linalg.norm(after, axis=1)
         sliding = speed > 1e-4
         expected = most[:, None] * after / np.maximum(speed, 1e-9)[:, None]
@@ -158,11 +158,11 @@ def test_landing_on_a_frictionless_block_conserves_momentum():
     block = masses[:, None] * sim.solver.block_velocity()
     assert paw_forces(sim)[..., 2].sum(axis=1).min() > 10.0
     assert block[:, 0].min() > 2.0
-    # free flight alone drifts by the integration error
+    # tolerance: 1 % of the initial momentum, since free flight drifts by the integration error
     assert momenta(sim, reference) + block == pytest.approx(before, abs=0.01 * MASS * 1.2)
 
 
-def test_sticking_paws_move_with_a_light_block():
+def test_sticking_paws_move_with_the_block():
     sim = on_block(4, settle=20, mass=np.array([1.0, 5.0, 10.0, 100.0]), friction=0.05)
     qd = sim.joint_qd().copy()
     qd[:, 0] = 0.5
@@ -182,8 +182,8 @@ def test_sticking_paws_move_with_a_light_block():
     assert fastest > 0.1
 
 
-def test_static_friction_holds_on_a_block_that_moves():
-    # riding a heavy block at 0.5 m/s, pulled with a quarter of the weight: more than 0.2 holds, far less than 0.8
+def test_static_friction_holds_on_a_moving_block():
+    # on a heavy block at 0.5 m/s, pulled by 0.25 of the weight: friction 0.2 slides, static friction 0.8 holds
     sim = on_block(2, mass=1000.0, friction=0.0, friction_paws=0.2, motors=stiff_motors())
     dynamics = sim.solver.dynamics
     dynamics.static_friction_ratio.assign(np.array([4.0, 1.0], dtype=np.float32))
@@ -205,11 +205,11 @@ def test_static_friction_holds_on_a_block_that_moves():
 
 def test_robots_thrown_on_light_blocks_converge_and_stay_finite():
     sim = on_block(32, settle=0, mass=np.repeat([1.0, 5.0], 16), friction=0.0, half=(3.0, 3.0))
-    thrown(sim, 11, height=(0.5, 1.1))
+    thrown(sim, seed=11, height=(0.5, 1.1))
     for _ in range(90):
         sim.step()
         assert sim.solver.residual.numpy().max() <= TOLERANCE
-        assert np.linalg.norm(sim.solver.block_velocity(), axis=1).max() < 10.0
+        assert np.linalg.norm(sim.solver.block_velocity(), axis=1).max() < 10.0  # [m/s]
     assert not sim.solver.diverged.numpy().any()
 
 
@@ -226,14 +226,14 @@ def test_paws_push_the_side_of_a_block():
         sim.step()
         side = sim.solver.block_position()[:, 0] - 0.4
         assert np.all(paw_centres(sim)[:, :2, 0].max(axis=1) < side - PAW_RADIUS + 0.01)
-    gained = masses * sim.solver.block_velocity()[:, 0]
-    assert gained.min() > 2.0
-    assert momenta(sim, reference)[:, 0] + gained == pytest.approx(before[:, 0], abs=0.01 * before[0, 0])
+    block = masses * sim.solver.block_velocity()[:, 0]  # [kg m/s]
+    assert block.min() > 2.0
+    assert momenta(sim, reference)[:, 0] + block == pytest.approx(before[:, 0], abs=0.01 * before[0, 0])
 
 
 @wp.kernel
 def probe_kernel(ground: Ground, point: wp.array(dtype=vec3), out: wp.array2d(dtype=float)):
-    """Height, distance and block normal at a point, in each world."""
+    """Write surface height [m], ground distance [m] and block normal at each point, (worlds * points, 5)."""
     world, i = wp.tid()
     here = world_ground(ground, world)
     normal = block_normal(ground.blocks[world], point[i])
@@ -244,14 +244,14 @@ def probe_kernel(ground: Ground, point: wp.array(dtype=vec3), out: wp.array2d(dt
         out[row, 2 + j] = normal[j]
 
 
-def test_surface_and_distance_of_a_block():
+def test_surface_distance_and_normal_of_a_block():
     block = BlockCfg(center=np.array([[1.0, 0.0], [5.0, 0.0]]), half=(0.4, 0.2), height=0.1)
     ground = SolverJumper(build_model(2, visuals=False, device="cpu"), block=block).dynamics.robot.ground
     points = [(1.3, 0.1, 0.15), (0.5, 0.0, 0.06), (1.43, 0.0, 0.14), (1.0, 0.19, 0.02)]
     out = wp.zeros((8, 5), dtype=float, device="cpu")
     wp.launch(probe_kernel, (2, 4), inputs=[ground, wp.array(points, dtype=vec3, device="cpu"), out], device="cpu")
     found = out.numpy().reshape(2, 4, 5)
-    # above the top; beside a wall, the floor as near; off an edge, 0.03 and 0.04 m away; inside, near a wall
+    # 0.05 m above the top; 0.06 m above floor and 0.1 m from a wall; 0.05 m off an edge (0.03, 0.04); 0.01 m inside
     assert found[0, :, 0] == pytest.approx([0.1, 0.0, 0.0, 0.1])
     assert found[0, :, 1] == pytest.approx([0.05, 0.06, 0.05, -0.01], abs=1e-6)
     normals = [(0, 0, 1), (-1, 0, 0), (0.6, 0, 0.8), (0, 1, 0)]
@@ -261,7 +261,7 @@ def test_surface_and_distance_of_a_block():
 
 
 def test_shank_in_a_block_is_a_collision():
-    # the front shanks lean forward over a block in world 0; in world 1 the block is elsewhere
+    # world 0: the front shanks intersect a block; world 1: the block is far away
     block = BlockCfg(center=np.array([[0.69, 0.0], [3.0, 0.0]]), half=(0.4, 0.5), height=0.15)
     sim = simulation(2, block=block)
     flags, clearance = wp.zeros(2, dtype=int, device="cpu"), wp.zeros(2, dtype=float, device="cpu")
@@ -272,11 +272,11 @@ def test_shank_in_a_block_is_a_collision():
     assert flags.numpy()[1] == 0
 
 
-def test_blocks_return_to_their_starts():
+def test_blocks_are_placed_and_reset_by_indices_mask_and_solver_reset():
     sim = on_block(3, settle=0, mass=5.0, friction=0.0)
     starts = np.array([[0.1, 0.0], [0.0, 0.2], [0.3, 0.1]], dtype=np.float32)
     sim.solver.place_blocks(starts)
-    thrown(sim, 3, height=(0.5, 0.6))
+    thrown(sim, seed=3, height=(0.5, 0.6))
     for _ in range(40):
         sim.step()
     moved = sim.solver.block_position()
@@ -308,14 +308,14 @@ def test_block_of_a_diverged_world_returns_to_its_start():
     assert np.isfinite(sim.solver.block_velocity()).all()
 
 
-def test_block_moves_alike_in_double_precision():
+def test_block_in_single_precision_matches_double_precision():
     sim = on_block(2, settle=30, mass=np.array([5.0, 20.0]), friction=0.1)
     qd = sim.joint_qd().copy()
     qd[:, 0] = 1.0
     write_state(sim, qd=qd)
     double = JumperDynamics(sim.model, block=BlockCfg(**WIDE, mass=np.array([5.0, 20.0]), friction=0.1), double=True)
     q, qd = (wp.array(v.ravel(), dtype=wp.float64, device="cpu") for v in (sim.joint_q(), sim.joint_qd()))
-    for _ in range(SUBSTEPS * 4):
+    for _ in range(SUBSTEPS * 4):  # four policy steps
         sim.physics_step()
         joint_f = np.zeros((2, 38))
         joint_f[:, MOTOR_V] = sim.torque.numpy().T
@@ -330,7 +330,7 @@ def test_block_moves_alike_in_double_precision():
     assert blocks["center"] == pytest.approx(sim.solver.block_position(), abs=1e-4)
 
 
-def test_refuses_blocks_where_they_are_not_supported():
+def test_refuses_blocks_on_mujoco_and_with_gradients_and_reset_without_blocks():
     block = BlockCfg(center=(1.0, 0.0))
     with pytest.raises(ValueError, match="needs solver='jumper'"):
         simulation(1, solver="mujoco", block=block)
@@ -365,7 +365,7 @@ def test_block_values_need_one_row_per_world():
 
 
 @pytest.mark.parametrize("begin", ["reset", "evaluation_reset"])
-def test_new_episode_resets_the_block(begin):
+def test_new_episode_resets_the_block_and_a_loaded_state_restores_it(begin):
     block = BlockCfg(center=(1.0, 0.0), half=(0.3, 0.3), height=0.05, mass=10.0, friction=0.4)
     env = Env(make_task("horizontal-jump"), 2, device="cpu", block=block)
     start = env.sim.solver.block_position()

@@ -10,41 +10,43 @@ from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
 
 SOLVERS = ("jumper", "mujoco")
-RESULTS = ("torque", "paw_force", "peak_force")
+RESULTS = ("torque", "paw_force", "peak_force")  # arrays that a reset clears
 
 
 def simulation(num_worlds, solver, **arguments):
+    """Return a simulation on the CPU with the filter of the vertical jump."""
     return Simulation(
         num_worlds, solver=solver, command_filter=vertical_jump_filter(), visuals=False, device="cpu", **arguments
     )
 
 
 def command(sim, step):
-    """Squat, then stretch, each world a little more than the one before."""
+    """Command a squat up to policy step 5, then stretched legs; target angles grow by up to 20 % with the world."""
     degrees = np.array([0.0, 70.0, 70.0] if step < 6 else [0.0, 25.0, 25.0])
     spread = degrees[:, None] * np.linspace(1.0, 1.2, sim.num_worlds)
     sim.target.assign(np.radians(np.tile(spread, (4, 1))).astype(np.float32))
 
 
 def jump(sim, steps=10):
-    """What a simulation goes through in a jump, as one array of numbers per step."""
-    story = []
+    """Run a jump; return joint_q, joint_qd and torque of each step, (steps, num_worlds, 93)."""
+    log = []
     for step in range(steps):
         command(sim, step)
         sim.step()
-        story.append(np.concatenate([sim.joint_q(), sim.joint_qd(), sim.torque.numpy().T], axis=1))
-    return np.array(story)
+        log.append(np.concatenate([sim.joint_q(), sim.joint_qd(), sim.torque.numpy().T], axis=1))
+    return np.array(log)
 
 
 def snapshot(sim):
-    """Everything that a fresh simulation shows, the world first."""
+    """Return state, results and targets of a simulation, arrays (num_worlds, ...)."""
     n = sim.num_worlds
     state = [getattr(sim.state, name).numpy().reshape(n, -1) for name in ("joint_q", "joint_qd", "body_q", "body_qd")]
-    moved = [np.moveaxis(getattr(sim, name).numpy(), 0 if name == "peak_force" else 1, 0) for name in RESULTS]
-    return [values.reshape(n, -1).copy() for values in [*state, *moved, sim.target.numpy().T]]
+    results = [np.moveaxis(getattr(sim, name).numpy(), 0 if name == "peak_force" else 1, 0) for name in RESULTS]
+    return [values.reshape(n, -1).copy() for values in [*state, *results, sim.target.numpy().T]]
 
 
 def break_world(sim, world):
+    """Write NaN to a joint rate of a world, which makes it diverge."""
     rates = sim.joint_qd().copy()
     rates[world, 7] = np.nan
     sim.state.joint_qd.assign(rates.ravel())
@@ -63,23 +65,23 @@ def test_reset_simulation_matches_a_new_one_bitwise(solver):
 
 @pytest.mark.parametrize("solver", SOLVERS)
 @pytest.mark.parametrize("kind", ["list", "numpy", "torch", "warp"])
-def test_reset_leaves_other_worlds_alone(solver, kind):
-    sim, other = simulation(3, solver), simulation(3, solver)
+def test_reset_affects_masked_worlds_only(solver, kind):
+    sim, unreset = simulation(3, solver), simulation(3, solver)
     fresh = snapshot(sim)
-    jump(sim, 8), jump(other, 8)
-    chosen = [False, True, False]
+    for each in (sim, unreset):
+        jump(each, 8)
+    selected = [False, True, False]
     mask = {
-        "list": chosen,
-        "numpy": np.array(chosen),
-        "torch": torch.tensor(chosen),
-        "warp": wp.array(chosen, dtype=wp.bool, device="cpu"),
+        "list": selected,
+        "numpy": np.array(selected),
+        "torch": torch.tensor(selected),
+        "warp": wp.array(selected, dtype=wp.bool, device="cpu"),
     }[kind]
     sim.reset(mask)
-    for found, start, going_on in zip(snapshot(sim), fresh, snapshot(other), strict=True):
-        assert np.array_equal(found[1], start[1])
-        assert np.array_equal(found[[0, 2]], going_on[[0, 2]])
-    moving, reference = jump(sim, 3), jump(other, 3)
-    assert np.array_equal(moving[:, [0, 2]], reference[:, [0, 2]])
+    for actual, start, expected in zip(snapshot(sim), fresh, snapshot(unreset), strict=True):
+        assert np.array_equal(actual[1], start[1])
+        assert np.array_equal(actual[[0, 2]], expected[[0, 2]])
+    assert np.array_equal(jump(sim, 3)[:, [0, 2]], jump(unreset, 3)[:, [0, 2]])
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -107,31 +109,33 @@ def test_standing_robot_stays_standing_after_a_reset(solver):
     sim.reset()
     for _ in range(30):
         sim.step()
-    assert sim.joint_q()[:, 2] == pytest.approx(height, abs=0.06)  # it sags on its motors, and no more
+    assert sim.joint_q()[:, 2] == pytest.approx(height, abs=0.06)  # [m] of sag on its motors
 
 
 def test_captured_filter_and_physics_match_single_calls():
-    one, held = simulation(2, "jumper"), simulation(2, "jumper")
-    start = one.joint_q()[0, 2]
+    eager, captured = simulation(2, "jumper"), simulation(2, "jumper")
+    start = eager.joint_q()[0, 2]
 
     def policy_step(sim):
+        """Advance one policy step by single calls."""
         sim.filter_targets()
         for _ in range(sim.substeps):
             sim.physics_step()
 
-    for sim in (one, held):
+    for sim in (eager, captured):
         sim.motors.offset.fill_(0.03)
         command(sim, 0)
         policy_step(sim)
-    with wp.ScopedCapture(device=held.device) as capture:
-        policy_step(held)
+    with wp.ScopedCapture(device=captured.device) as capture:
+        policy_step(captured)
     for step in range(1, 6):
-        for sim in (one, held):
+        for sim in (eager, captured):
             command(sim, step)
-        policy_step(one)
+        policy_step(eager)
         wp.capture_launch(capture.graph)
-        assert np.array_equal(held.joint_q(), one.joint_q()) and np.array_equal(held.joint_qd(), one.joint_qd())
-    assert one.joint_q()[0, 2] < start - 0.05  # it squats
+        assert np.array_equal(captured.joint_q(), eager.joint_q())
+        assert np.array_equal(captured.joint_qd(), eager.joint_qd())
+    assert eager.joint_q()[0, 2] < start - 0.05  # [m] it squats
 
 
 @pytest.mark.parametrize("solver", SOLVERS)
@@ -152,7 +156,7 @@ def test_captured_reset_reads_its_mask_at_every_replay(solver):
         assert np.array_equal(sim.joint_q(), expected)
 
 
-def test_reset_returns_blocks_to_their_starts():
+def test_reset_returns_blocks_of_masked_worlds_to_their_starts():
     sim = simulation(2, "jumper", block=BlockCfg(center=(0.2, 0.0), mass=1.0, friction=0.0))
     start = sim.solver.block_position()
     jump(sim, 12)
@@ -176,7 +180,7 @@ def test_reset_refuses_bad_mask(mask):
 
 
 def spinning(solver):
-    """Two worlds in the air that move and turn."""
+    """Return a simulation of two robots without ground that translate and rotate."""
     sim = simulation(2, solver, ground=None)
     rates = sim.joint_qd().copy()
     rates[:, :6] = [[1.0, -2.0, 0.5, 2.0, -3.0, 1.0], [0.0, 0.0, 0.0, -4.0, 0.0, 5.0]]
@@ -191,12 +195,12 @@ def test_base_velocity_matches_differences_of_position(solver):
         before = sim.joint_q()[:, :3].astype(float)
         sim.physics_step()
         found = sim.base_velocity()
-        gone = (sim.joint_q()[:, :3].astype(float) - before) / sim.dt
+        expected = (sim.joint_q()[:, :3].astype(float) - before) / sim.dt
         assert found.shape == (2, 3)
-        # MuJoCo moves by the mean of two velocities of the com on its way around the origin
-        assert found == pytest.approx(gone, abs=1e-3 if solver == "jumper" else 5e-3)
+        # [m/s] MuJoCo integrates the mean of two velocities
+        assert found == pytest.approx(expected, abs=1e-3 if solver == "jumper" else 5e-3)
     com_velocity = sim.joint_qd()[:, :3]
-    assert np.abs(found - com_velocity).max() > 0.02
+    assert np.abs(found - com_velocity).max() > 0.02  # origin and COM differ
 
 
 def test_base_velocity_in_a_captured_graph():
@@ -207,18 +211,18 @@ def test_base_velocity_in_a_captured_graph():
     with wp.ScopedCapture(device=sim.device) as capture:
         sim.solver.step(sim.state, sim.state, None, None, sim.dt)
         sim.read_base_velocity()
-    seen = []
+    velocities = []
     for _ in range(3):
         wp.capture_launch(capture.graph)
-        seen.append(velocity.numpy().copy())
-        assert np.array_equal(seen[-1], sim.base_velocity())
-    assert np.abs(np.diff(seen, axis=0)).min(axis=(1, 2)).max() > 0.0
+        velocities.append(velocity.numpy().copy())
+        assert np.array_equal(velocities[-1], sim.base_velocity())
+    assert np.abs(np.diff(velocities, axis=0)).min(axis=(1, 2)).max() > 0.0
 
 
-def test_set_targets_checks_and_broadcasts():
+def test_set_targets_broadcasts_and_refuses_bad_targets():
     sim, angles = Simulation(3, visuals=False, device="cpu"), np.arange(36.0).reshape(12, 3) / 36.0
-    for given in (angles, torch.tensor(angles), angles.tolist()):
-        sim.set_targets(given)
+    for targets in (angles, torch.tensor(angles), angles.tolist()):
+        sim.set_targets(targets)
         np.testing.assert_array_equal(sim.target.numpy(), angles.astype(np.float32))
     sim.set_targets(angles[:, 1])
     np.testing.assert_array_equal(sim.target.numpy(), np.repeat(angles[:, 1:2], 3, axis=1).astype(np.float32))

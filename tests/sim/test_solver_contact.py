@@ -1,3 +1,5 @@
+"""Contact of SolverJumper: friction cone, slopes, convergence, and hard stops under torques and impacts."""
+
 import itertools
 import math
 
@@ -24,7 +26,7 @@ from solver_helpers import DOFS, MOTOR_Q, MOTOR_V
 
 @pytest.fixture(scope="module")
 def standing():
-    """A robot that has stood for two seconds."""
+    """A simulation of one robot that has stood for two seconds."""
     sim = simulation(1)
     for _ in range(120):
         sim.step()
@@ -38,15 +40,15 @@ def test_paw_forces_of_a_standing_robot_carry_its_weight(standing):
 
 def test_standing_robot_creeps_less_than_a_millimetre_in_ten_seconds(standing):
     base, paws = standing.joint_q()[0, :7].copy(), paw_centres(standing)[0]
-    for _ in range(600):
+    for _ in range(600):  # 10 s
         standing.step()
-    assert np.abs(standing.joint_q()[0, :3] - base[:3]).max() < 1e-3
+    assert np.abs(standing.joint_q()[0, :3] - base[:3]).max() < 1e-3  # [m]
     assert np.abs(paw_centres(standing)[0] - paws).max() < 1e-3
 
 
 def test_contacts_never_pull_and_stay_in_the_friction_cone():
     sim = simulation(64, friction=0.6)
-    thrown(sim, 11)
+    thrown(sim, seed=11)
     touched = np.zeros(64, dtype=bool)
     for _ in range(480):
         sim.physics_step()
@@ -62,20 +64,20 @@ def test_contact_iteration_reaches_its_tolerance(standing):
     standing.step()
     assert standing.solver.residual.numpy()[0] <= TOLERANCE
     sim = simulation(64)
-    thrown(sim, 12)
+    thrown(sim, seed=12)
     steps, missed = 0, 0
     for _ in range(720):
         sim.physics_step()
         steps += np.count_nonzero(sim.solver.sweeps.numpy())
         missed += np.count_nonzero(sim.solver.residual.numpy() > TOLERANCE)
-    # a few impacts on nearly jammed legs cycle
+    # a few impacts on nearly singular legs do not converge
     assert steps > 10000
     assert missed <= 1e-3 * steps
 
 
 def test_friction_never_accelerates_a_sliding_paw():
     sim = simulation(64)
-    thrown(sim, 11, height=(0.3, 0.6), speed=2.0)
+    thrown(sim, seed=11, height=(0.3, 0.6), speed=2.0)
     rng = np.random.default_rng(18)
     lower, upper = np.radians([-50.0, -30.0, -30.0] * 4), np.radians([110.0, 140.0, 140.0] * 4)
     slides = 0
@@ -86,7 +88,7 @@ def test_friction_never_accelerates_a_sliding_paw():
         joint_q = sim.joint_q().copy()
         sim.physics_step()
         force, slip = paw_forces(sim), slip_velocities(sim, joint_q)[..., :2]
-        sliding = (np.linalg.norm(slip, axis=-1) > 0.3) & (force[..., 2] > 20.0)
+        sliding = (np.linalg.norm(slip, axis=-1) > 0.3) & (force[..., 2] > 20.0)  # [m/s], [N]
         slides += sliding.sum()
         assert ((force[..., :2] * slip).sum(axis=-1)[sliding] < 0.0).all()
     assert slides > 10000
@@ -96,7 +98,7 @@ def test_friction_opposes_sliding_at_mu_times_the_normal_force():
     sim = simulation(8, friction=0.3)
     qd = np.zeros((8, DOFS))
     heading = np.arange(8) * math.pi / 4.0
-    qd[:, 0], qd[:, 1] = 2.0 * np.cos(heading), 2.0 * np.sin(heading)
+    qd[:, 0], qd[:, 1] = 2.0 * np.cos(heading), 2.0 * np.sin(heading)  # [m/s]
     write_state(sim, qd=qd)
     checked = 0
     for _ in range(120):
@@ -108,13 +110,13 @@ def test_friction_opposes_sliding_at_mu_times_the_normal_force():
         friction, normal = force[sliding][:, :2], force[sliding][:, 2]
         checked += sliding.sum()
         assert np.linalg.norm(friction, axis=1) == pytest.approx(0.3 * normal, rel=1e-3)
-        along = (friction * slip[sliding]).sum(axis=1) / (np.linalg.norm(friction, axis=1) * speed[sliding])
-        assert along.max() < -0.999
+        cosine = (friction * slip[sliding]).sum(axis=1) / (np.linalg.norm(friction, axis=1) * speed[sliding])
+        assert cosine.max() < -0.999
     assert checked > 1000
 
 
 def on_slope(num_worlds, degrees, friction):
-    """Robots standing on a slope on stiff legs, the base parallel to it, and its rotation."""
+    """Return a simulation of robots with stiff motors on a slope that rises along x, and the rotation of their base."""
     sim = simulation(num_worlds, ground=slope(degrees), friction=friction, motors=stiff_motors())
     return sim, tilted(sim, degrees)
 
@@ -132,7 +134,7 @@ def test_robot_holds_on_a_slope_below_the_friction_angle():
 
 
 def test_robot_slides_down_a_slope_above_the_friction_angle():
-    # atan(0.15) is 8.5 degrees; the slope's own direction downhill is -x of the tilted base
+    # atan(0.15) is 8.5 degrees; downhill is -x of the tilted base
     sim, tilt = on_slope(1, 12.0, friction=0.15)
     for _ in range(60):
         sim.step()
@@ -144,7 +146,7 @@ def test_robot_slides_down_a_slope_above_the_friction_angle():
     assert gained / 0.5 == pytest.approx(expected, rel=0.02)
 
 
-def test_static_friction_holds_where_dynamic_friction_alone_slides():
+def test_static_friction_holds_where_dynamic_friction_slides():
     # atan(0.20) = 11.3 degrees < 12.4 degrees < atan(0.24) = 13.5 degrees
     sim, _ = on_slope(2, 12.4, friction=0.2)
     ratio = sim.solver.dynamics.static_friction_ratio
@@ -162,15 +164,15 @@ def test_static_friction_holds_where_dynamic_friction_alone_slides():
         sim.step()
     assert np.abs(paw_centres(sim) - settled)[0].max() < 1e-3
     moved = np.abs(paw_centres(sim) - before).max(axis=(1, 2))
-    # 0.5 (sin 12.4 - 0.2 cos 12.4) g t^2 = 0.38 m
+    # 0.5 (sin 12.4 - 0.2 cos 12.4) g t^2 = 0.38 m for t = 2 s
     assert moved[1] == pytest.approx(0.38, rel=0.1)
 
 
-def test_flat_heightfield_behaves_as_the_plane():
-    height = 0.4
+def test_flat_heightfield_matches_the_plane():
+    height = 0.4  # [m]
     plane, field = simulation(16), simulation(16, ground=slope(0.0, height))
     for sim in (plane, field):
-        thrown(sim, 13, height=(0.5, 0.8), speed=0.5)
+        thrown(sim, seed=13, height=(0.5, 0.8), speed=0.5)
     q = field.joint_q().copy()
     q[:, 2] += height
     write_state(field, q)
@@ -179,7 +181,7 @@ def test_flat_heightfield_behaves_as_the_plane():
         field.step()
     difference = field.joint_q() - plane.joint_q()
     difference[:, 2] -= height
-    assert np.abs(difference).max() < 1e-3
+    assert np.abs(difference).max() < 1e-3  # [m], [rad]
 
 
 def test_robot_survives_a_drop_from_one_metre():
@@ -197,7 +199,7 @@ def test_robot_survives_a_drop_from_one_metre():
 
 
 def worst_excess(sim, worlds=slice(None)):
-    """How far [deg] the angles pass the stops: motors, and sums of a leg's transversals."""
+    """Return the largest excess [deg] beyond the stops, of motors and of outer + inner; negative: within them."""
     angles = np.degrees(sim.joint_q()[worlds][:, MOTOR_Q].astype(float))
     total = angles[:, 1::3] + angles[:, 2::3]
     lower, upper = np.array([-50.0, -30.0, -30.0] * 4), np.array([110.0, 140.0, 140.0] * 4)
@@ -206,7 +208,7 @@ def worst_excess(sim, worlds=slice(None)):
 
 
 def lowest_corner(sim):
-    """Height [m] of the lowest corner of the body's bounding box, (num_worlds,)."""
+    """Return the height [m] of the lowest corner of the body's bounding box, (num_worlds,)."""
     q = sim.joint_q()
     corners = np.array(list(itertools.product((-0.343, 0.343), (-0.2, 0.2), (-0.049, 0.099))))
     heights = [Rotation.from_quat(quat).apply(corners)[:, 2].min() for quat in q[:, 3:7]]
@@ -214,9 +216,9 @@ def lowest_corner(sim):
 
 
 def push(sim, torque_of_step, steps):
-    """Apply torques [N m] (num_worlds, 12) up to the motors' no-load speed; return the worst excess [deg].
+    """Apply torque_of_step(i) [N m], (num_worlds, 12), below the no-load speed; return the worst `worst_excess` [deg].
 
-    A robot counts until its body would touch the ground, which only the paws feel.
+    A robot counts until its body would touch the ground, with which only the paws collide.
     """
     joint_f = np.zeros((sim.num_worlds, DOFS), dtype=np.float32)
     no_load = np.tile([49.2, 40.0, 40.0], 4)  # [rad/s]
@@ -246,11 +248,11 @@ def test_stops_hold_constant_torque(ground):
     for world, (outer, inner) in enumerate(((1, 1), (-1, -1), (1, -1), (-1, 1)), start=24):
         torque[world, 1::3], torque[world, 2::3] = 24.8 * outer, 24.8 * inner
     motors, sums = push(simulation(28, ground=ground), lambda _: torque, 480)
-    assert motors < 0.3
+    assert motors < 0.3  # [deg]
     assert sums < 0.1
 
 
-# 1 degree: impacts of several kN on jammed legs
+# [deg] impacts on nearly singular legs are of several kN
 @pytest.mark.parametrize(("ground", "most"), [("plane", 1.0), (None, 0.3)])
 def test_stops_hold_random_torque(ground, most):
     sim = simulation(64, ground=ground)
@@ -264,7 +266,7 @@ def test_stops_hold_random_torque(ground, most):
 
 def test_stops_hold_in_drops_from_two_metres_on_stiff_legs():
     sim = simulation(64, motors=stiff_motors())
-    thrown(sim, 16, height=(2.4, 2.5), joint_rate=0.0)
+    thrown(sim, seed=16, height=(2.4, 2.5), joint_rate=0.0)
     worst, counts, landed = np.array([-np.inf, -np.inf]), np.ones(64, dtype=bool), np.zeros(64, dtype=bool)
     for _ in range(480):
         sim.physics_step()
@@ -273,8 +275,8 @@ def test_stops_hold_in_drops_from_two_metres_on_stiff_legs():
         worst = np.maximum(worst, worst_excess(sim, counts)) if counts.any() else worst
     assert landed.sum() > 40
     assert not sim.solver.diverged.numpy().any()
-    assert worst[0] < 1.0
-    assert worst[1] < 0.3
+    assert worst[0] < 1.0  # [deg] motors
+    assert worst[1] < 0.3  # [deg] outer + inner
 
 
 def test_thousand_policy_steps_of_random_targets_stay_finite():
@@ -286,4 +288,4 @@ def test_thousand_policy_steps_of_random_targets_stay_finite():
         sim.step()
     assert not sim.solver.diverged.numpy().any()
     assert np.isfinite(sim.joint_q()).all()
-    assert np.abs(sim.joint_qd()).max() < 500.0
+    assert np.abs(sim.joint_qd()).max() < 500.0  # [rad/s]

@@ -1,3 +1,5 @@
+"""Free flight of SolverJumper against Pinocchio, and drift of energy and momentum."""
+
 import importlib
 
 import numpy as np
@@ -14,7 +16,7 @@ GRAVITY = 9.81
 
 
 def loaded_model(worlds, seed):
-    """A model whose worlds carry different payloads."""
+    """Return a model whose base mass, inertia and centre of mass differ between worlds."""
     rng = np.random.default_rng(seed)
     model = bare_model(worlds)
     mass, com, inertia = (a.numpy() for a in (model.body_mass, model.body_com, model.body_inertia))
@@ -30,7 +32,7 @@ def loaded_model(worlds, seed):
 
 @pytest.fixture(scope="module")
 def forced():
-    """2000 states with payloads and torques, and Pinocchio's accelerations (n, 18) in body axes."""
+    """Model of 2000 payloads, states, torques (n, 12) [N m], and Pinocchio's accelerations (n, 18), body axes."""
     n = 2000
     model, states = loaded_model(n, 1), random_states(n, 2)
     torque = np.random.default_rng(3).uniform(-18.0, 18.0, (n, 12)).astype(np.float32).astype(float)
@@ -52,16 +54,16 @@ def test_accelerations_match_pinocchio(forced, double, dt, tolerance):
         reference.use_world(i)
         start, turn = Rotation.from_quat(states.quat[i]), Rotation.from_quat(after.quat[i])
         before_twist, after_twist = reference.base_twist(states, i), reference.base_twist(after, i)
-        # the origin's velocity in world axes; the angular velocity in body axes
+        # differences of the origin's velocity, in world axes, and of the angular velocity, in body axes
         found[i, :3] = start.inv().apply(turn.apply(after_twist[:3])) - before_twist[:3]
         found[i, 3:6] = after_twist[3:] - before_twist[3:]
         found[i, 6:] = after.rates[i] - states.rates[i]
-    error = np.abs(found / dt - expected).max(axis=1) / np.abs(expected).max(axis=1)
+    error = np.abs(found / dt - expected).max(axis=1) / np.abs(expected).max(axis=1)  # relative
     assert error.max() < tolerance
 
 
 def paw_map_kernel(double):
-    """A kernel that writes the solver's paw positions and Jacobians (body axes), and the modules of its precision."""
+    """Return a kernel of the solver's paw positions and Jacobians (body frame), and the modules of its precision."""
     modules = kernel_modules(double)
     leg = importlib.import_module(f"{modules.step.__package__}.leg_dynamics")
     vec3, mat33, geometry = modules.scalar.vec3, modules.scalar.mat33, modules.geometry.LegGeometry
@@ -73,18 +75,16 @@ def paw_map_kernel(double):
         position: wp.array2d(dtype=vec3),
         jacobian: wp.array2d(dtype=mat33),
     ):
-        i, k = wp.tid()
-        geo = legs[k]
-        q = angles[i, k]
-        paw = leg.paw_kinematics(geo, leg.leg_pose(geo, q))
-        position[i, k] = paw.position
-        jacobian[i, k] = paw.jacobian
+        world, k = wp.tid()
+        paw = leg.paw_kinematics(legs[k], leg.leg_pose(legs[k], angles[world, k]))
+        position[world, k] = paw.position
+        jacobian[world, k] = paw.jacobian
 
     return kernel, modules
 
 
 def reference_paws(states):
-    """Pinocchio's paw positions (n, 4, 3) and motor Jacobians (n, 4, 3, 3), body axes."""
+    """Return Pinocchio's paw positions (n, 4, 3) [m] and Jacobians by motor rate (n, 4, 3, 3) [m], body frame."""
     reference = Reference(bare_model(1))
     robot = reference.robot
     position, jacobian = np.empty((len(states.pos), 4, 3)), np.empty((len(states.pos), 4, 3, 3))
@@ -117,7 +117,7 @@ def test_paw_position_and_jacobian_match_pinocchio(double, tolerance):
 
 @pytest.fixture(scope="module")
 def gentle():
-    """States that drift for a second without reaching a stop."""
+    """Six states of slow motion that reaches no stop within a second."""
     states = random_states(6, 5, body_rate=0.5)
     rng = np.random.default_rng(6)
     states.angles = np.tile(np.radians([20.0, 50.0, 50.0]), (6, 4)) + rng.uniform(-0.1, 0.1, (6, 12))
@@ -126,7 +126,7 @@ def gentle():
 
 
 def inside_stops(states):
-    """Whether all angles are well inside the stops."""
+    """Return whether all motor angles and outer + inner are at least 0.02 rad inside the stops."""
     total = states.angles[:, 1::3] + states.angles[:, 2::3]
     lower, upper = np.radians([-50.0, -30.0, -30.0] * 4), np.radians([110.0, 140.0, 140.0] * 4)
     margin = 0.02
@@ -143,7 +143,7 @@ def test_energy_and_momentum_drift_in_flight_halves_with_the_step(gentle, gravit
     model = bare_model(6)
     model.gravity.fill_(wp.vec3(0.0, 0.0, gravity))
     flight, reference = Flight(model, double=True), Reference(model)
-    impulse = np.array([0.0, 0.0, gravity * reference.mass])  # of the weight in 1 s
+    impulse = np.array([0.0, 0.0, gravity * reference.mass])  # [N s] of the weight in 1 s
     energy, linear, angular = [], [], []
     for steps in (1000, 2000, 4000):
         after = flight.run(gentle, 1.0 / steps, steps)
@@ -152,7 +152,7 @@ def test_energy_and_momentum_drift_in_flight_halves_with_the_step(gentle, gravit
         momentum = [reference.momentum(after, i) - reference.momentum(gentle, i) for i in range(6)]
         linear.append([m[:3] - impulse for m in momentum])
         angular.append([m[3:] for m in momentum])
-    # free fall alone: m g^2 dt / 2 of energy in 1 s, 0.70 J
+    # Euler's error of free fall is m g^2 dt / 2 = 0.70 J after 1 s; sizes in J, N s, N m s
     for drift, size in ((energy, 0.02 if gravity == 0.0 else 0.72), (linear, 0.01), (angular, 0.005)):
         worst = [np.abs(d).max() for d in drift]
         assert worst[0] < size
@@ -180,7 +180,7 @@ def test_passive_losses_dissipate_expected_power(loss):
         assert found == pytest.approx(expected, rel=1e-3)
 
 
-def test_losses_never_add_energy(gentle):
+def test_damping_and_friction_always_reduce_energy(gentle):
     n = len(gentle.pos)
     model = bare_model(n)
     for array, dofs, value in ((model.joint_damping, KNEE_V, 0.1), (model.joint_friction, MOTOR_V, 0.02)):
@@ -202,10 +202,10 @@ def test_losses_never_add_energy(gentle):
 
 @pytest.mark.parametrize("route", ["body_f", "joint_f"])
 def test_wrench_on_the_base_changes_the_momentum_of_the_robot(route):
-    # force at the base link's com, moment about z; the robot's momentum follows Newton and Euler
+    # oracle: Newton-Euler, with the force at the base link's com
     n, dt = 20, 1e-6
     model, states = loaded_model(n, 8), random_states(n, 9)
-    force, moment = np.array([30.0, -20.0, 50.0]), np.array([0.0, 0.0, 7.0])
+    force, moment = np.array([30.0, -20.0, 50.0]), np.array([0.0, 0.0, 7.0])  # [N], [N m]
     wrench = np.concatenate([force, moment])
     arguments = {"body_f": wrench} if route == "body_f" else {"base_joint_f": wrench}
     after = Flight(model, double=True).run(states, dt, **arguments)

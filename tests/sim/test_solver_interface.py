@@ -1,3 +1,5 @@
+"""Newton's solver interface of SolverJumper: refusals, changed parameters, reset, divergence, states and bodies."""
+
 import newton
 import numpy as np
 import pytest
@@ -15,7 +17,7 @@ DT = 1.0 / 480.0
 
 
 def launch(sim):
-    """Slide along x and drop from 0.2 m: friction, masses, motors and gravity all matter."""
+    """Reset all worlds to a start 0.2 m above standing at 1.5 m/s along x: every parameter affects the motion."""
     sim.solver.reset(sim.state)
     q, qd = sim.joint_q().copy(), sim.joint_qd().copy()
     q[:, 2] += 0.2
@@ -25,13 +27,13 @@ def launch(sim):
 
 
 def command(sim, step):
-    """Move all motors, into the stops of the transversals at 140 degrees."""
+    """Command all motors; in policy steps 10 to 19 the outer ones beyond their stop at 140 degrees."""
     degrees = np.tile([10.0, 160.0 if 10 <= step < 20 else 60.0, 50.0], 4)
     sim.target.assign(np.repeat(np.radians(degrees)[:, None], sim.num_worlds, axis=1).astype(np.float32))
 
 
 def trajectory(sim, steps=30):
-    """The motion of all worlds after `launch`, (steps, num_worlds, 43)."""
+    """Return joint_q of each policy step after `launch`, (steps, num_worlds, 43)."""
     launch(sim)
     motion = []
     for step in range(steps):
@@ -41,7 +43,7 @@ def trajectory(sim, steps=30):
     return np.array(motion)
 
 
-def test_refuses_empty_model():
+def test_refuses_model_of_another_robot():
     builder = newton.ModelBuilder()
     body = builder.add_body(label="box")
     builder.add_shape_box(body, hx=0.1, hy=0.1, hz=0.1)
@@ -106,7 +108,7 @@ def test_simulation_refuses(solver, argument, value):
         simulation(1, solver=solver, **{argument: value})
 
 
-CHANGES = [
+CHANGES = [  # array, rows per world, rows to change (None: world 1's shapes), factor, flag to notify
     ("body_mass", BODIES, slice(0, 1), 1.3, ModelFlags.BODY_INERTIAL_PROPERTIES),
     ("body_com", BODIES, slice(0, 1), 3.0, ModelFlags.BODY_INERTIAL_PROPERTIES),
     ("body_inertia", BODIES, slice(1, 21), 2.0, ModelFlags.BODY_INERTIAL_PROPERTIES),
@@ -123,13 +125,13 @@ CHANGES = [
 
 @pytest.fixture(scope="module")
 def pair():
-    """Two worlds and their unchanged motion."""
+    """A simulation of two worlds, and its `trajectory` with unchanged parameters."""
     sim = simulation(2)
     return sim, trajectory(sim)
 
 
 @pytest.mark.parametrize("change", CHANGES, ids=[f"{c[0]}-{c[4].name}" for c in CHANGES])
-def test_notified_change_affects_only_its_world(pair, change):
+def test_changed_parameter_acts_after_notification_and_in_its_world_only(pair, change):
     sim, before = pair
     name, rows, which, factor, flag = change
     array = getattr(sim.model, name)
@@ -141,28 +143,28 @@ def test_notified_change_affects_only_its_world(pair, change):
         values[rows : 2 * rows][which] *= factor
     array.assign(values)
     try:
-        unnoticed = trajectory(sim)
+        unnotified = trajectory(sim)
         sim.solver.notify_model_changed(flag)
         after = trajectory(sim)
     finally:
         array.assign(original)
         sim.solver.notify_model_changed(flag)
     if name != "body_com":  # joint_qd itself refers to the model's com
-        assert np.array_equal(unnoticed, before)
+        assert np.array_equal(unnotified, before)
     assert np.array_equal(after[:, 0], before[:, 0])
     assert np.abs(after[:, 1, :27] - before[:, 1, :27]).max() > 1e-3
 
 
-def test_gravity_of_each_world():
+def test_each_world_has_its_gravity():
     sim = simulation(2, ground=None)
     sim.model.gravity.assign(np.array([[0.0, 0.0, -9.81], [1.0, 2.0, -3.0], [0.0, 0.0, 0.0]], dtype=np.float32))
     sim.solver.notify_model_changed(ModelFlags.MODEL_PROPERTIES)
     sim.solver.step(sim.state, sim.state, None, None, DT)
-    # all links fall alike, so the base does too
+    # all links accelerate equally
     assert sim.joint_qd()[:, :3] == pytest.approx(np.array([[0.0, 0.0, -9.81], [1.0, 2.0, -3.0]]) * DT, abs=1e-6)
 
 
-def test_solver_reset_with_flag_none_keeps_the_state():
+def test_reset_with_flag_none_clears_contact_forces_but_keeps_the_state():
     sim = simulation(2)
     trajectory(sim, steps=25)
     moved = sim.joint_q().copy()
@@ -172,7 +174,7 @@ def test_solver_reset_with_flag_none_keeps_the_state():
     assert not sim.paw_force.numpy().any()
 
 
-def test_diverged_world_is_frozen_and_disturbs_no_other():
+def test_diverged_world_is_frozen_until_reset_and_others_are_unaffected():
     sims = [simulation(3), simulation(3)]
     for sim in sims:
         launch(sim)
@@ -201,7 +203,7 @@ def test_diverged_world_is_frozen_and_disturbs_no_other():
     assert np.array_equal(broken.joint_q(), intact.joint_q())
 
 
-def test_runs_repeat_bit_for_bit(pair):
+def test_runs_are_bitwise_repeatable(pair):
     sim, before = pair
     assert np.array_equal(trajectory(sim), before)
     assert np.array_equal(trajectory(simulation(2)), before)
@@ -213,7 +215,7 @@ def test_explicit_torques_match_closed_loop_motors():
         launch(sim)
     command(driven, 12)
     driven.filter_targets()
-    largest = 0.0
+    largest = 0.0  # [N m]
     for _ in range(60):
         before = driven.joint_q().copy(), driven.joint_qd().copy()
         driven.physics_step()
@@ -254,7 +256,7 @@ def test_bodies_match_newton_kinematics(pair):
     assert sim.loop_gap().max() < 1e-6
 
 
-def test_body_accelerations_are_observable():
+def test_body_accelerations_are_observable_and_contact_forces_are_not():
     sim = simulation(1, ground=None)
     observables = sim.solver.observables({SolverBase.ObservableKind.BODY_QDD})
     sim.solver.step(sim.state, sim.state, None, None, DT, observables=observables)

@@ -1,4 +1,4 @@
-"""Hard stops: robots that rest on them, impulses against a quadratic program, and dissipated energy."""
+"""Hard stops: robots that rest on them, step velocities against a quadratic program, and dissipated energy."""
 
 import math
 
@@ -28,23 +28,22 @@ from solver_helpers import BODIES, DOFS, MOTOR_V, Reference, States, random_stat
 
 DT = 1.0 / 480.0
 BOUNDED = np.vstack([np.eye(12), np.kron(np.eye(4), [0.0, 1.0, 1.0])])
-"""Quantities with stops: the motors, and each leg's outer + inner."""
+"""(16, 12) matrix from motor angles to the quantities with stops: 12 motors, and outer + inner of 4 legs."""
 LOWER = np.radians([-50.0, -30.0, -30.0] * 4 + [0.0] * 4).astype(np.float32).astype(float)
 UPPER = np.radians([110.0, 140.0, 140.0] * 4 + [240.0] * 4).astype(np.float32).astype(float)
-STRENGTH = DT * LIMIT_STIFFNESS + LIMIT_DAMPING
-"""[N m s/rad]"""
+STRENGTH = DT * LIMIT_STIFFNESS + LIMIT_DAMPING  # [N m s/rad] torque of an implicit stop per speed
 SQUATS = [2.05, 2.1, 2.4, 2.6]
 """[rad] Targets of the transversal motors; their stop is at 2.09 rad."""
 
 
 def randomise(sim, seed):
-    """Draw masses, armatures, motor friction and gains in the ranges of the jumps."""
+    """Randomise masses, armatures, motor friction and gains in the ranges of the jump tasks."""
     rng, n, model = np.random.default_rng(seed), sim.num_worlds, sim.model
-    shares = rng.uniform(0.8, 1.2, (n, BODIES))
-    shares[:, 0] = 1.0 + rng.uniform(-0.1, 0.2, n)
-    shares = shares.ravel()
-    model.body_mass.assign((model.body_mass.numpy() * shares).astype(np.float32))
-    model.body_inertia.assign((model.body_inertia.numpy() * shares[:, None, None]).astype(np.float32))
+    ratios = rng.uniform(0.8, 1.2, (n, BODIES))
+    ratios[:, 0] = 1.0 + rng.uniform(-0.1, 0.2, n)
+    ratios = ratios.ravel()
+    model.body_mass.assign((model.body_mass.numpy() * ratios).astype(np.float32))
+    model.body_inertia.assign((model.body_inertia.numpy() * ratios[:, None, None]).astype(np.float32))
     com = model.body_com.numpy().reshape(n, BODIES, 3)
     com[:, 0] += rng.uniform(-0.03, 0.03, (n, 3))
     model.body_com.assign(com.reshape(-1, 3))
@@ -56,9 +55,10 @@ def randomise(sim, seed):
 
 
 def ripple(sim, transversal, ramp=25, settle=60, steps=240):
-    """Command a squat or straight legs [rad], wait a second, and return what the paw forces then do.
+    """Return the ripple of paw forces of robots that stand with transversal targets [rad], (num_worlds,).
 
-    Peak to peak of each paw over `steps` [N], (num_worlds, 4), and the share of paw-steps without contact.
+    Targets are reached after `ramp` policy steps; `settle` more precede `steps` physics steps of measurement. Ripple:
+    peak to peak of each paw [N], (num_worlds, 4), and fraction of paw-steps without contact.
     """
     start = sim.target.numpy().T.copy()
     goal = np.outer(transversal, [0.0, 1.0, 1.0] * 4)
@@ -85,7 +85,7 @@ def test_robot_rests_on_the_stops(filtered):
     assert lost == 0.0
 
 
-def test_robots_of_all_kinds_rest_on_the_stops_of_the_squat():
+def test_randomised_robots_rest_on_the_stops_of_the_squat():
     targets = np.repeat(SQUATS, 6)
     sim = simulation(len(targets))
     randomise(sim, 1)
@@ -103,7 +103,7 @@ def test_robot_rests_on_the_stops_on_a_slope():
 
 
 def at_the_stops(n, seed, joint_rate=8.0):
-    """Random states, half of the bounded quantities within 1 degree of a stop, on either side of it."""
+    """Return n random states with half of the bounded quantities within 1 degree of a stop, on either side of it."""
     rng, states = np.random.default_rng(seed), random_states(n, seed, joint_rate=joint_rate)
     for angles in states.angles:
         for i in rng.permutation(16)[:8]:
@@ -117,6 +117,7 @@ class StopSteps:
     """Single steps in double precision, with or without stops."""
 
     def __init__(self, num_worlds, *, stops):
+        """stops: whether the stops have stiffness and damping."""
         self.n, self.model = num_worlds, build_model(num_worlds, visuals=False, device="cpu")
         self.dynamics = JumperDynamics(self.model, double=True)
         if not stops:
@@ -127,7 +128,7 @@ class StopSteps:
             self.dynamics.robot.table.assign(table)
 
     def bounds(self):
-        """Return the stops of all bounded quantities [rad], lower and upper, to the last bit."""
+        """Return the lower and upper stops of the bounded quantities [rad], (16,) each, from the table."""
         table = self.dynamics.robot.table.numpy()[:, 0]
         legs = np.arange(4)[:, None] * int(layout.LEG_ROWS)
         single = (table[legs + int(row) + np.arange(3)].ravel() for row in (layout.LOWER, layout.UPPER))
@@ -135,7 +136,7 @@ class StopSteps:
         return [np.append(*pair) for pair in zip(single, sums, strict=True)]
 
     def run(self, states, torque=0.0):
-        """Return the velocities at the end of a step, in the pose of its start; torque [N m] (n, 12)."""
+        """Return states with the velocities after a step and the poses before it; torque: [N m], scalar or (n, 12)."""
         joint_f = np.zeros((self.n, DOFS))
         joint_f[:, MOTOR_V] = torque
         q, qd, force = (wp.array(v, dtype=wp.float64) for v in (states.joint_q(), states.joint_qd(), joint_f.ravel()))
@@ -153,6 +154,7 @@ class StopSteps:
 
 
 def repeated(states, times):
+    """Return states in which each state is repeated `times` times."""
     return States(*(np.repeat(values, times, axis=0) for values in vars(states).values()))
 
 
@@ -170,7 +172,7 @@ def test_stops_solve_a_quadratic_program():
     units = np.tile(np.vstack([np.zeros(12), np.eye(12)]), (n, 1))
     free = StopSteps(13 * n, stops=False).run(repeated(states, 13), units).rates.reshape(n, 13, 12)
     toward = np.vstack([BOUNDED, -BOUNDED])
-    several = surprised = 0
+    several = changed = 0  # states with more than two pressed stops, or other ones than the initial rates press
     for i in range(n):
         response = (free[i, 1:] - free[i, 0]).T
         gaps = toward @ states.angles[i] - np.append(lower, -upper)
@@ -181,18 +183,18 @@ def test_stops_solve_a_quadratic_program():
         np.testing.assert_allclose(found[i], free[i, 0] + response @ toward.T @ torque, rtol=0.0, atol=1.0e-6)
         pressed = torque > 0.0
         several += pressed.reshape(2, 16)[:, :12].sum() > 2
-        surprised += (pressed != (toward @ states.rates[i] < goal)).any()
+        changed += (pressed != (toward @ states.rates[i] < goal)).any()
     assert several > n // 2
-    assert surprised > 5  # where the rates at the start press other stops
+    assert changed > 5
 
 
 @pytest.mark.parametrize("falling", [False, True])
-def test_stops_return_no_more_energy_than_they_store(falling):
-    """One step with stops and contact leaves no more kinetic and spring energy than the same one without them."""
+def test_stops_add_no_energy(falling):
+    """One step with stops leaves no more kinetic and stop-spring energy than one without stops and contact."""
     n = 64
     states = at_the_stops(n, 22, joint_rate=15.0)
     states.pos[:, 2] = 3.0
-    if falling:  # level, the lowest paw 0.1 mm above the ground, legs anyhow
+    if falling:  # at 3 m/s, base level, the lowest paw 0.1 mm above the ground
         states.quat[:] = [0.0, 0.0, 0.0, 1.0]
         states.com_vel += [0.0, 0.0, -3.0]
         sim = simulation(n)
@@ -206,6 +208,7 @@ def test_stops_return_no_more_energy_than_they_store(falling):
     reference = Reference(stopping.model)
 
     def spring(angles):
+        """Return the energy [J] of the stops' springs, (n,)."""
         bounded = angles @ BOUNDED.T
         inside = np.maximum(np.maximum(LOWER - bounded, bounded - UPPER), 0.0)
         return 0.5 * LIMIT_STIFFNESS * (inside**2).sum(axis=1)
@@ -214,5 +217,5 @@ def test_stops_return_no_more_energy_than_they_store(falling):
     gained = np.array([reference.energy(ended, i) - reference.energy(freely, i) for i in range(n)]) + held
     landed = stopping.dynamics.work.impulse.numpy()[..., 2].max(axis=0) > 0.0
     assert landed.mean() > 0.8 if falling else not landed.any()
-    assert gained.max() < 1.0e-6
+    assert gained.max() < 1.0e-6  # [J]
     assert np.median(gained) < -0.1

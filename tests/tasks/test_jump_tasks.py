@@ -1,4 +1,4 @@
-"""The jump tasks as data: curricula of goals and of starts, the tasks on Mars, and what each departure is undone by."""
+"""The jump tasks as data: curricula of goals and starts, the tasks on Mars, and flags that undo differences."""
 
 import dataclasses
 import re
@@ -13,48 +13,48 @@ from jumper_warp.robot.motors import loose_filter, vertical_jump_filter
 from jumper_warp.tasks.jump.cfg import Level, cross_levels
 
 GOALS = (Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.3, 0.3)), Level((0.0, 0.0, 0.6), (0.0, 0.0, 0.9), (0.3, 0.3)))
-STARTS = ((0.22, 0.35), (0.22, 0.45))
+STARTS = ((0.22, 0.35), (0.22, 0.45))  # [m] base heights
 
 
-def test_starts_have_a_curriculum_of_their_own_within_each_level_of_goals():
+def test_cross_levels_repeats_all_starts_for_each_level_of_goals():
     levels = cross_levels(GOALS, STARTS)
     assert [level.goal_upper[2] for level in levels] == [0.6, 0.6, 0.9, 0.9]
     assert [level.base_height for level in levels] == [*STARTS, *STARTS]
 
 
 @pytest.mark.parametrize("name", ["vertical-jump", "horizontal-jump", "omnidirectional-jump", "vertical-jump-mars"])
-def test_goals_grow_only_when_all_starts_are_mastered(name):
+def test_each_goal_level_has_the_easier_and_then_the_harder_starts(name):
     levels = make_task(name).levels
     for easier, harder in zip(levels[0::2], levels[1::2], strict=True):
         assert dataclasses.replace(easier, base_height=STARTS[1]) == harder and easier.base_height == STARTS[0]
 
 
 def test_tolerances_of_the_curricula_are_the_papers():
-    assert make_task("vertical-jump").curriculum.numbers["tolerance"] == 0.05
+    assert make_task("vertical-jump").curriculum.numbers["tolerance"] == 0.05  # [m]
     assert make_task("horizontal-jump").curriculum.numbers["tolerance"] == 0.10
 
 
-def test_reaches_grow_at_their_own_rates_all_around():
+def test_omnidirectional_goals_are_elliptical_and_grow_with_the_level():
     task = make_task("omnidirectional-jump")
     reaches = [(level.goal_upper[0], level.goal_upper[1], -level.goal_lower[0]) for level in task.levels[2::2]]
     assert all(level.elliptical for level in task.levels[2:])
     assert reaches == sorted(reaches) and all(
-        reach > wanted for reach, wanted in zip(reaches[-1], (1.2, 0.8, 0.8), strict=True)
+        reach > least
+        for reach, least in zip(reaches[-1], (1.2, 0.8, 0.8), strict=True)  # [m] ahead, aside, back
     )
 
 
 @pytest.mark.parametrize("name", ["vertical-jump-mars", "horizontal-jump-mars"])
-def test_mars_has_its_gravity_and_all_of_the_motors(name):
+def test_mars_has_its_gravity_full_torque_and_a_loose_variant_with_higher_goals(name):
     task, loose = make_task(name), make_task(f"{name}-loose")
     kind = task.motors.transversal
     assert (task.gravity, kind.saturation, kind.kp) == (3.71, 24.8, 20.0)
     assert task.command_filter.horizon == vertical_jump_filter().horizon and loose.command_filter == loose_filter()
-    beaten = 3.1 if name.startswith("vertical") else 3.9
-    axis = 2 if name.startswith("vertical") else 0
-    assert loose.levels[-1].goal_upper[axis] > beaten
+    axis, paper = (2, 3.1) if name.startswith("vertical") else (0, 3.9)  # z or x, [m]
+    assert loose.levels[-1].goal_upper[axis] > paper
 
 
-UNDOING = """--env.curriculum.tolerance 0.1 --env.reset.balance-by resets --env.reset.start-probability.pushing 0
+UNDO_FLAGS = """--env.curriculum.tolerance 0.1 --env.reset.balance-by resets --env.reset.start-probability.pushing 0
 --env.reset.start-probability.standing 0.45 --env.reset.start-probability.in-flight 0.175
 --env.reset.start-probability.touchdown 0.175 --env.reset.lean 0 --env.reset.takeoff-ahead 0 0.1
 --env.reset.takeoff-pitch 0 0 --env.reset.takeoff-angle 50 75 --env.reset.heading 0 --env.reset.ground.platform 0
@@ -67,8 +67,8 @@ UNDOING = """--env.curriculum.tolerance 0.1 --env.reset.balance-by resets --env.
 --env.terminations.second-takeoff.speed 100 --ppo.entropy-coef 0.001"""
 
 
-def test_departures_are_undone_from_the_command_line():
-    task = parse_train(["horizontal-jump", *UNDOING.split()])[1]
+def test_flags_undo_differences_from_the_paper():
+    task = parse_train(["horizontal-jump", *UNDO_FLAGS.split()])[1]
     assert task.reset.settings.balance_by == "resets" and task.reset.settings.lean == 0.0
     ends = {term.name: term.numbers for term in task.terminations}
     assert ends["second_takeoff"]["speed"] == 100.0 and ends["missed_goal"]["tolerance"] == 0.2
@@ -77,14 +77,14 @@ def test_departures_are_undone_from_the_command_line():
     )
 
 
-def flags(group, before="--env"):
-    """Return the names of all flags of a task's settings."""
+def flags(group, prefix="--env"):
+    """Yield the names of all flags of a dataclass of task settings, recursively."""
     for spec in dataclasses.fields(group):
-        name, value = f"{before}.{spec.metadata['flag']}", getattr(group, spec.name)
+        name, value = f"{prefix}.{spec.metadata['flag']}", getattr(group, spec.name)
         yield from flags(value, name) if dataclasses.is_dataclass(value) else (name,)
 
 
-def test_the_table_of_departures_names_flags_that_there_are():
+def test_flags_in_the_table_of_differences_exist():
     tasks = ("vertical-jump", "horizontal-jump", "omnidirectional-jump", "attitude")
     known = {flag for name in tasks for flag in flags(flags_of(make_task(name)))}
     table = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text()

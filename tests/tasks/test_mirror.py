@@ -1,4 +1,4 @@
-"""A mirrored robot sees the mirror image: two halves of an environment, the second made the first's reflection."""
+"""Observations of mirrored robots: the second half of an environment's worlds is the mirror image of the first half."""
 
 import dataclasses
 
@@ -16,15 +16,15 @@ from jumper_warp.tasks.terms import ObservationTerm
 from jumper_warp.utils.errors import InputError
 from velocity_helpers import edit, states_of, walking_env
 
-HALF = 8
+HALF = 8  # worlds
 BODIES = 21
-SWAPPED = [5 * leg + j for leg in LEGS for j in range(5)]
-FLIP, SPIN = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])
-QUAT = np.array([-1.0, 1.0, -1.0, 1.0])
+SWAPPED_JOINTS = [5 * leg + j for leg in LEGS for j in range(5)]  # of the 20 hinges
+FLIP, SPIN = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])  # signs of vectors and of rotation vectors
+QUAT = np.array([-1.0, 1.0, -1.0, 1.0])  # signs of xyzw
 
 
 def task():
-    """The task on rough ground with a clock, so that every term of all velocity tasks is there."""
+    """Return velocity-rough with a gait clock, whose observations have the terms of all velocity tasks."""
     rough, gait_phase = make_task("velocity-rough"), ObservationTerm(velocity.gait_phase)
     return dataclasses.replace(
         rough,
@@ -34,18 +34,18 @@ def task():
     )
 
 
-def reflected(values, change):
-    """Write the change of the first half of the worlds, which are the first axis, into the second."""
+def with_mirrored_half(values, mirror):
+    """Return a copy of values (2 * HALF, ...) whose second half is mirror(first half)."""
     values = values.copy()
-    values[HALF:] = change(values[:HALF])
+    values[HALF:] = mirror(values[:HALF])
     return values
 
 
-def change(array, shape, how, worlds_last=False):
-    """Reflect an array of the environment; shape: of its values with worlds as the first axis."""
+def mirror_array(array, shape, mirror, worlds_last=False):
+    """Write mirror(first half) into the second half of a Warp array, (n, 2 * HALF) if worlds_last, else `shape`."""
     values = array.numpy()
     values = np.moveaxis(values, 1, 0) if worlds_last else values.reshape(shape)
-    values = reflected(values, how)
+    values = with_mirrored_half(values, mirror)
     array.assign(
         np.ascontiguousarray(np.moveaxis(values, 0, 1)) if worlds_last else values.reshape(array.numpy().shape)
     )
@@ -53,36 +53,36 @@ def change(array, shape, how, worlds_last=False):
 
 @pytest.fixture(scope="module")
 def reflection():
-    """Observations of both halves after some steps, by group."""
+    """The task, and observations (2 * HALF, columns) of both halves after some steps, by group."""
     ground = single_tile(TerrainCfg(tile=6.0, cell=0.1), "slope")
     env = walking_env(2 * HALF, task=task(), ground=ground, randomize=True)
     rng, n = torch.Generator().manual_seed(2), 2 * HALF
     for _ in range(12):
         env.step(0.3 * torch.randn((n, 12), generator=rng))
     robot, parameters = env.robot, env.parameters
-    change(
+    mirror_array(
         robot.joint_q,
         (n, 43),
-        lambda q: np.concatenate([q[:, :3] * FLIP, q[:, 3:7] * QUAT, q[:, 7:27][:, SWAPPED], q[:, 27:]], axis=1),
+        lambda q: np.concatenate([q[:, :3] * FLIP, q[:, 3:7] * QUAT, q[:, 7:27][:, SWAPPED_JOINTS], q[:, 27:]], axis=1),
     )
-    change(
+    mirror_array(
         robot.joint_qd,
         (n, 38),
-        lambda v: np.concatenate([v[:, :3] * FLIP, v[:, 3:6] * SPIN, v[:, 6:26][:, SWAPPED], v[:, 26:]], axis=1),
+        lambda v: np.concatenate([v[:, :3] * FLIP, v[:, 3:6] * SPIN, v[:, 6:26][:, SWAPPED_JOINTS], v[:, 26:]], axis=1),
     )
     robot.body_f.assign(np.random.default_rng(1).normal(size=(n * BODIES, 6)))
-    change(robot.body_f, (n, BODIES, 6), lambda f: f * np.concatenate([FLIP, SPIN]))
-    change(robot.body_com, (n, BODIES, 3), lambda c: c * FLIP)
+    mirror_array(robot.body_f, (n, BODIES, 6), lambda f: f * np.concatenate([FLIP, SPIN]))
+    mirror_array(robot.body_com, (n, BODIES, 3), lambda c: c * FLIP)
     for name in ("contact_time", "air_time", "touchdown_speed", "peak_force", "paw_height", "paw_force"):
-        change(getattr(robot, name), None, lambda x: x[:, LEGS], worlds_last=True)
+        mirror_array(getattr(robot, name), None, lambda x: x[:, LEGS], worlds_last=True)
     for name in ("action", "prev_action", "prev_prev_action", "torque", "joint_offset"):
-        change(getattr(robot, name), None, lambda x: x[:, MOTORS], worlds_last=True)
+        mirror_array(getattr(robot, name), None, lambda x: x[:, MOTORS], worlds_last=True)
     for array in (parameters.gain_ratio, parameters.motors.no_load_speed):
-        change(array, None, lambda x: x[:, MOTORS], worlds_last=True)
+        mirror_array(array, None, lambda x: x[:, MOTORS], worlds_last=True)
     for array in (parameters.latency, parameters.static_ratio):
-        change(array, (n,), lambda x: x)
+        mirror_array(array, (n,), lambda x: x)
     mass = parameters.body_mass.numpy().reshape(n, BODIES)
-    parameters.body_mass.assign(reflected(mass, lambda x: x).ravel())
+    parameters.body_mass.assign(with_mirrored_half(mass, lambda x: x).ravel())
     mu, paws = parameters.shape_mu.numpy().copy(), parameters.paw_shapes.numpy().reshape(n, 4)
     mu[paws[HALF:]] = mu[paws[:HALF]]
     parameters.shape_mu.assign(mu)
@@ -103,27 +103,26 @@ def reflection():
 
 
 @pytest.mark.parametrize("group", ["actor", "critic"])
-def test_mirrored_robot_sees_the_mirror_image(reflection, group):
-    env_task, seen = reflection
+def test_observation_of_a_mirrored_robot_is_the_mirror_image(reflection, group):
+    env_task, observations = reflection
     mirror = mirror_of(env_task, group)
-    first, second = seen[group][:HALF], seen[group][HALF:]
-    for name, (a, b) in env_task.layout(group).items():
-        np.testing.assert_allclose(
-            second[:, a:b], (mirror.signs * first[:, mirror.order])[:, a:b], atol=2e-5, err_msg=name
-        )
-        assert np.abs(first[:, a:b]).max() > 0.0, f"{name} tells nothing"
+    first, second = observations[group][:HALF], observations[group][HALF:]
+    for name, (begin, end) in env_task.layout(group).items():
+        expected = (mirror.signs * first[:, mirror.order])[:, begin:end]
+        np.testing.assert_allclose(second[:, begin:end], expected, atol=2e-5, err_msg=name)
+        assert np.abs(first[:, begin:end]).max() > 0.0, f"{name} is all zero"
 
 
-def test_mirroring_twice_gives_back_what_was():
+def test_mirroring_twice_is_the_identity():
     for mirror in (mirror_of(task(), "actor"), mirror_of(task(), "critic"), mirror_of_action()):
         x = np.random.default_rng(0).normal(size=len(mirror.order))
         once = mirror.signs * x[mirror.order]
         np.testing.assert_allclose(mirror.signs * once[mirror.order], x)
 
 
-def test_term_whose_image_is_not_known_is_refused():
-    other = dataclasses.replace(
+def test_refuses_a_term_without_a_known_mirror_image():
+    asymmetric = dataclasses.replace(
         make_task("velocity-flat"), observations=ObservationsCfg(actor=(), critic=(ObservationTerm(obs.drawn_push),))
     )
     with pytest.raises(InputError, match="mirror image of drawn_push is not known"):
-        mirror_of(other, "critic")
+        mirror_of(asymmetric, "critic")

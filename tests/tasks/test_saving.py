@@ -1,3 +1,5 @@
+"""Saved tasks: round trips, refusals, functions of users, and mutations of the JSON."""
+
 import copy
 import dataclasses
 import json
@@ -32,7 +34,7 @@ JUMP = "jumper_warp.kernels.jump"
 
 @wp.func
 def base_at_rest(robot: RobotView, state: Any, std_lin_vel: float, std_ang_vel: float) -> float:
-    """Another `base_at_rest` than the project's, with the same numbers."""
+    """A function with the name and numbers of the project's `base_at_rest`."""
     return std_lin_vel + std_ang_vel
 
 
@@ -40,39 +42,39 @@ THIS = sys.modules[__name__]
 
 
 def saved(task):
-    """A task as a file holds it."""
+    """Return a task as the JSON data that a file holds."""
     return json.loads(json.dumps(task_to_json(task)))
 
 
 @pytest.mark.parametrize("name", list(TASKS))
-def test_every_task_comes_back(name):
+def test_every_task_is_equal_after_saving_and_loading(name):
     task = make_task(name)
     assert task_from_json(saved(task)) == task
 
 
-def test_task_of_a_user_comes_back_with_its_module_only():
+def test_task_of_a_user_loads_only_with_its_module():
     task = hold_height.hold_height()
     assert task_from_json(saved(task), [hold_height]) == task
     with pytest.raises(TaskError, match=r"task.state needs 'hold_height:HoldState': name the file .* --task-module"):
         task_from_json(saved(task))
 
 
-def with_own_rest():
-    """The vertical jump with this file's `base_at_rest` in place of the project's."""
+def jump_with_user_reward():
+    """Return the vertical jump with this file's `base_at_rest` in place of the project's, at rewards[9]."""
     task = make_task("vertical-jump")
     mine = RewardTerm(base_at_rest, 20.0, std_lin_vel=0.1, std_ang_vel=0.5)
     return dataclasses.replace(task, rewards=tuple(mine if t.name == "base_at_rest" else t for t in task.rewards))
 
 
-def test_function_of_a_user_is_never_taken_for_the_projects_of_the_same_name():
-    task = with_own_rest()
+def test_function_of_a_user_is_not_confused_with_the_projects_of_the_same_name():
+    task = jump_with_user_reward()
     with pytest.raises(TaskError, match=rf"task.rewards\[9\] needs '{__name__}:base_at_rest': name the file"):
         task_from_json(saved(task))
-    found = {term.name: term.func for term in task_from_json(saved(task), [THIS]).rewards}
-    assert found["base_at_rest"] is base_at_rest and found["base_at_rest"] is not rewards.base_at_rest
+    functions = {term.name: term.func for term in task_from_json(saved(task), [THIS]).rewards}
+    assert functions["base_at_rest"] is base_at_rest and base_at_rest is not rewards.base_at_rest
 
 
-def test_module_that_is_loaded_but_was_not_named_is_not_looked_into():
+def test_functions_of_a_loaded_but_not_passed_module_are_refused():
     assert sys.modules["hold_height"] is hold_height
     content = saved(make_task("vertical-jump"))
     content["rewards"][0]["func"] = "hold_height:near_goal"
@@ -80,15 +82,15 @@ def test_module_that_is_loaded_but_was_not_named_is_not_looked_into():
         task_from_json(content, [THIS])
 
 
-def test_module_without_the_function_is_told_so():
-    content = saved(with_own_rest())
+def test_refusal_says_that_a_passed_module_lacks_the_function():
+    content = saved(jump_with_user_reward())
     content["rewards"][9]["func"] = f"{__name__}:sleep"
     with pytest.raises(TaskError, match="there is no such one here"):
         task_from_json(content, [THIS])
 
 
-def test_sections_of_a_training_can_be_left_out_with_their_functions():
-    task, content = with_own_rest(), saved(with_own_rest())
+def test_sections_for_training_can_be_left_out_with_their_functions():
+    task, content = jump_with_user_reward(), saved(jump_with_user_reward())
     content["observations"]["critic"][0]["func"] = content["rewards"][0]["func"] = "elsewhere:unknown"
     expected = dataclasses.replace(
         task, rewards=(), observations=dataclasses.replace(task.observations, critic=()), events=()
@@ -100,6 +102,8 @@ def test_sections_of_a_training_can_be_left_out_with_their_functions():
 
 
 def local_func():
+    """Return a @wp.func that is not at the top level of a module."""
+
     @wp.func
     def inner(robot: RobotView, state: Any) -> float:
         return 1.0
@@ -110,14 +114,14 @@ def local_func():
 renamed = local_func()
 
 
-@pytest.mark.parametrize("func", [local_func(), renamed])
-def test_function_that_could_not_be_found_again_is_not_saved(func):
+@pytest.mark.parametrize("func", [local_func(), renamed], ids=["local", "under another name"])
+def test_function_outside_the_top_level_of_a_module_is_not_saved(func):
     task = dataclasses.replace(make_task("vertical-jump"), rewards=(RewardTerm(func, 1.0, name="mine"),))
     with pytest.raises(TaskError, match="cannot be saved: define it under this name at the top level"):
         task_to_json(task)
 
 
-def test_function_of_a_program_has_the_name_of_its_file(monkeypatch):
+def test_function_of_main_is_saved_under_the_stem_of_its_file(monkeypatch):
     main = sys.modules["__main__"]
     monkeypatch.setattr(main, "base_at_rest", base_at_rest, raising=False)
     monkeypatch.setattr(main, "__file__", "/some/where/my_task.py", raising=False)
@@ -128,11 +132,13 @@ def test_function_of_a_program_has_the_name_of_its_file(monkeypatch):
 
 @dataclasses.dataclass(frozen=True)
 class Settings:
+    """Settings with one value of any type."""
+
     value: Any = 1.0
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, {"a": 1.0}, [1.0], b"x", object()])
-def test_setting_that_would_not_come_back_is_not_saved(value):
+def test_setting_that_json_cannot_restore_is_not_saved(value):
     with pytest.raises(TaskError):
         json_value(Settings(value))
 
@@ -167,14 +173,14 @@ def test_setting_that_would_not_come_back_is_not_saved(value):
         (lambda t: t["randomization"].update(resample_at="never"), "task.randomization.resample_at: must be one of"),
     ],
 )  # fmt: skip
-def test_what_is_no_task_is_refused(change, message):
+def test_changed_json_that_is_no_task_is_refused(change, message):
     content = saved(make_task("vertical-jump"))
     change(content)
     with pytest.raises(TaskError, match=message):
         task_from_json(content)
 
 
-def test_setting_that_is_not_saved_keeps_its_default():
+def test_missing_setting_has_its_default():
     content = saved(make_task("vertical-jump"))
     del content["contact_force"], content["curriculum"]["promote_after"], content["reset"]["settings"]["tilt"]
     assert task_from_json(content) == make_task("vertical-jump")
@@ -183,8 +189,8 @@ def test_setting_that_is_not_saved_keeps_its_default():
 # ---------------------------------------------------------------------- mutations
 
 
-def deep(levels):
-    """Lists and objects in each other."""
+def nested(levels):
+    """Return lists and objects nested in turn, `levels` deep, around 1.0."""
     value: Any = 1.0
     for i in range(levels):
         value = [value] if i % 2 else {"type": value}
@@ -200,13 +206,13 @@ VALUES = [
     "jumper_warp.robot.parts:Motor", "jumper_warp.tasks.jump.cfg:GroundCfg", "jumper_warp.tasks.saving:Finder",
     [], [1], [1.0, 2.0], [[1.0]], ["a"] * 3, [None] * 5000, [{}] * 5000, {}, {"type": None}, {"a": 1}, {"type": "os:x"},
     {"type": "jumper_warp.tasks.jump.cfg:GroundCfg"}, {"func": f"{JUMP}.rewards:base_at_rest"}, {"a\nb": [math.nan]},
-    deep(300), {"type": ["x"]}, {"type": {"type": "x"}},
+    nested(300), {"type": ["x"]}, {"type": {"type": "x"}},
 ]  # fmt: skip
 KEYS = ["extra", "", "a\nb", "\ud800", "type", "func", "name", "self", "weight", "history", "settings", "version"]
 
 
 def mutate(tree, rng):
-    """Change, drop, add, double or swap one entry."""
+    """Replace, scale, drop, add, double or copy one entry of a JSON tree, in place; rng: random.Random."""
     table, key = rng.choice(list(places(tree)))
     kind = rng.choice(["value", "value", "value", "scale", "drop", "add", "double", "swap"])
     if kind == "drop":
@@ -216,8 +222,8 @@ def mutate(tree, rng):
     elif kind == "double" and isinstance(table, list):
         table.insert(key, copy.deepcopy(table[key]))
     elif kind == "swap":
-        other, place = rng.choice(list(places(tree)))
-        table[key] = copy.deepcopy(other[place])
+        source, source_key = rng.choice(list(places(tree)))
+        table[key] = copy.deepcopy(source[source_key])
     elif kind == "scale" and isinstance(table[key], int | float):
         table[key] = table[key] * rng.choice([-1.0, 0.0, 1e3, 1e300, 1e-300])
     else:
@@ -225,7 +231,7 @@ def mutate(tree, rng):
 
 
 @pytest.mark.parametrize("name", [*TASKS, "hold-height"])
-def test_mutated_task_is_a_task_or_refused_in_one_line_and_nothing_is_imported(name, tmp_path, monkeypatch):
+def test_mutated_task_loads_or_is_refused_in_one_line_and_imports_nothing(name, tmp_path, monkeypatch):
     (tmp_path / "trap.py").write_text("raise SystemExit('imported')")
     monkeypatch.syspath_prepend(tmp_path)
     task = hold_height.hold_height() if name == "hold-height" else make_task(name)
@@ -238,19 +244,19 @@ def test_mutated_task_is_a_task_or_refused_in_one_line_and_nothing_is_imported(n
         for _ in range(rng.choice([1, 1, 2, 4])):
             mutate(changed, rng)
         try:
-            found = task_from_json(changed, modules)
+            task = task_from_json(changed, modules)
         except TaskError as error:
             refused += 1
             assert len(str(error).splitlines()) == 1 and 0 < len(str(error)) < 500
             continue
-        assert isinstance(found, TaskCfg) and all(math.isfinite(number) for number in found.params.values)
-        assert len(found.observation_names) < 10**6
-        assert task_from_json(json.loads(json.dumps(task_to_json(found), allow_nan=False)), modules) == found
+        assert isinstance(task, TaskCfg) and all(math.isfinite(number) for number in task.params.values)
+        assert len(task.observation_names) < 10**6
+        assert task_from_json(json.loads(json.dumps(task_to_json(task), allow_nan=False)), modules) == task
     assert set(sys.modules) == loaded and 40 < refused < 200
 
 
-@pytest.mark.parametrize("content", [None, [], "task", 3, math.nan, {}, {"version": 3}, deep(200), {"version": [2]}])
-def test_what_is_no_object_is_refused(content):
+@pytest.mark.parametrize("content", [None, [], "task", 3, math.nan, {}, {"version": 3}, nested(200), {"version": [2]}])
+def test_json_without_version_or_fields_is_refused(content):
     with pytest.raises(TaskError):
         task_from_json(content)
 

@@ -1,4 +1,4 @@
-"""How robots begin to turn in free flight, and how far: starts and turns, as data."""
+"""Configuration of turning in free flight: starts of episodes and ranges of commanded turns."""
 
 from __future__ import annotations
 
@@ -16,49 +16,49 @@ from jumper_warp.utils.errors import InputError
 
 @dataclass(frozen=True)
 class TurnCfg:
-    """Drawn turns: one level of the curriculum."""
+    """Range of sampled turns: one level of the curriculum."""
 
     angle: Pair
-    """[deg] Smallest and largest."""
+    """[deg] Of a commanded turn."""
     body_axis_probability: float = 0.5
-    """[1] Of a turn about x, y or z of the body; the others are about any axis."""
+    """[1] Probability of a turn about body x, y or z; other turns have a uniformly random axis."""
 
     struct = TurnRanges
-    """What the kernels read."""
+    """Kernels' struct that `values` returns."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a range or a probability is not one."""
+        """Raise InputError unless 0 <= lower <= upper <= 180 deg and the probability is in 0 to 1."""
         if not 0.0 <= self.angle[0] <= self.angle[1] <= 180.0:
             raise InputError(f"turn angle must be (lower, upper) within 0 to 180 degrees, got {self.angle}")
         check_probabilities("turn", self, "body_axis_probability")
 
     def values(self) -> Any:
-        """Return the kernels' `TurnRanges`."""
+        """Return the kernels' `TurnRanges`, angles in radians."""
         return filled(TurnRanges(), self, degrees=("angle",))
 
 
 @dataclass(frozen=True)
 class AttitudeResetCfg:
-    """How episodes begin, in any orientation; angles in degrees."""
+    """Ranges of the state at the start of an episode, in any orientation; angles in degrees."""
 
     episode: Pair = (2.0, 4.0)
-    """[s] Length of an episode; drawn, so that not all worlds are at the same stage of theirs."""
+    """[s] Length of an episode; sampled, so that worlds are at different stages."""
     height: float = 2.0
-    """[m] Of the base above the ground."""
+    """[m] Height of the base above the ground."""
     default_pose_probability: float = 0.3
-    """[1] Of a start in the default pose."""
+    """[1] Probability of a start in the default pose."""
     lateral: Pair = (-20.0, 80.0)
-    """[deg] Of the other legs' motors."""
+    """[deg] Lateral motor angles in other starts."""
     transversal: Pair = (0.0, 105.0)
-    """[deg]"""
+    """[deg] Outer and inner motor angles in other starts."""
     spin: float = 0.0
-    """[rad/s] Half width of the angular velocity about each axis; with any, the robot has a momentum that stays."""
+    """[rad/s] Half width of the angular velocity about each axis; 0: no angular momentum."""
 
     struct = AttitudeSettings
-    """What the kernels read."""
+    """Kernels' struct that `values` returns."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a pair is reversed, a number not finite or out of range."""
+        """Raise InputError: a pair is reversed, a number not finite or out of range."""
         check_ranges("reset", self, not_negative=("spin",))
         check_positive("reset episode", *self.episode)
         check_positive("reset height", self.height)

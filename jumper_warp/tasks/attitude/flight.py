@@ -1,11 +1,10 @@
-"""Turning in free flight: the robot floats, and moves its legs so that its base takes a commanded orientation.
+"""Turning in free flight: a floating robot moves its legs so that its base reaches a commanded orientation.
 
-Nothing pushes on it, so that its angular momentum stays zero: the base turns while legs move, and stays turned when
-they have gone round and come back another way, stretched in one direction and folded in the other. Weights and limits
-are of the order of the authors' sequel (attitude wide and narrow 2.5 and 1.5, collision -100, 8 N m); their forms were
-not published. `approach` pays every degree once, so that strokes are worth their while far from the goal, where the
-kernels are flat. What touches while turning costs, and fails the episode at its end, but does not cut it short: early
-on, legs meet in every one.
+No force acts, so angular momentum stays zero: the base turns while legs move, and stays turned after a closed cycle of
+the legs, stretched in one direction and folded in the other. Weights and limits are of the order of the authors' sequel
+(attitude wide and narrow 2.5 and 1.5, collision -100, 8 N m), which does not publish the terms' forms. `approach` pays
+for every degree of progress, also far from the goal, where the other kernels are flat. A collision costs reward and
+fails the episode at its end but does not terminate it, since legs collide in every episode early in training.
 """
 
 from __future__ import annotations
@@ -25,16 +24,14 @@ from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, RewardTerm, StateMetric, TerminationTerm
 from jumper_warp.tasks.units import DEG
 
-TORQUE = 8.0
-"""[N m] Of all motors."""
-TOLERANCE = 5.0
-"""[deg] Of the goal."""
+TORQUE = 8.0  # [N m] limit of all motors
+TOLERANCE = 5.0  # [deg] largest error of a settled robot
 
 ACTOR = (
     ObservationTerm(attitude.turn_left, noise=0.02),
     *(term for term in ROBOT if term.name not in ("lin_vel", "gravity")),
 )
-"""The rotation to the goal, angular velocity, motors and last action."""
+"""Policy observation: rotation to the goal, angular velocity, motors and last action."""
 
 CRITIC = (
     *exact(ACTOR),
@@ -42,7 +39,7 @@ CRITIC = (
     ObservationTerm(attitude.in_collision),
     *(term for term in DRAWN if term.name not in ("drawn_friction", "drawn_push")),
 )
-"""What only a simulation knows besides."""
+"""Critic observation: the actor's without noise, plus values that only a simulation has."""
 
 REWARDS = (
     RewardTerm(rewards.approach, 15.0),
@@ -74,7 +71,7 @@ METRICS = (
 
 
 def attitude_in_flight() -> TaskCfg:
-    """Return the task in zero gravity, with 8 N m and all the room that the hard stops leave to the legs."""
+    """Return the task in zero gravity, with motors limited to 8 N m and the legs' full range between the hard stops."""
     return TaskCfg(
         name="attitude",
         state=AttitudeState,

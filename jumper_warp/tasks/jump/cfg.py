@@ -1,4 +1,4 @@
-"""How jumps begin: reference states, grounds and the levels of the curriculum, as data."""
+"""Configuration of jumps: reference states at the start, grounds and levels of the curriculum."""
 
 from __future__ import annotations
 
@@ -21,30 +21,30 @@ from jumper_warp.utils.errors import InputError
 
 @dataclass(frozen=True)
 class GroundCfg:
-    """What standing starts of a randomised training on SolverJumper stand on or jump to; elsewhere the ground is level.
+    """Ranges of platforms and blocks that resets sample for standing starts; other starts have level ground.
 
-    An environment that is given a ground or a block draws none.
+    They apply to randomised training on SolverJumper, unless the environment has its own ground or block.
     """
 
     platform: float = 0.0
-    """[1] Share that begins on a platform, where the paws have room to land beside it."""
+    """[1] Probability of a start on a platform, if the paws have room to land beside it."""
     block: float = 0.0
-    """[1] Share with a block under the goal that slides, where there is room before it."""
+    """[1] Probability of a sliding block under the goal, if there is room before it."""
     drop: Pair = (0.03, 0.20)
     """[m] Height of the platform."""
     rise: Pair = (0.02, 0.08)
     """[m] Height of the block."""
     room: float = 0.30
-    """[m] Most between the paws and an edge, each way; the near side of a block may be farther from both."""
+    """[m] Largest distance from the paws to an edge, each way; a block's near side may be farther."""
     clearance: float = 0.12
-    """[m] Least between an edge that must be crossed and the paws at the goal."""
+    """[m] Smallest distance from an edge that must be crossed to the paws at the goal."""
     mass: Pair = (5.0, 100.0)
-    """[kg] Of the block."""
+    """[kg] Mass of the block."""
     friction: Pair = (0.3, 1.0)
-    """[1] Of block and floor."""
+    """[1] Friction coefficient between block and floor."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: shares or lengths out of range, or a pair that is reversed, not positive or not finite."""
+        """Raise InputError: probabilities or lengths out of range, or a pair reversed, not positive or not finite."""
         if not (min(self.platform, self.block) >= 0.0 and self.platform + self.block <= 1.0):
             raise InputError(f"ground shares must be >= 0 and add up to at most 1, got {self.platform}, {self.block}")
         for name, value in vars(self).items():
@@ -56,7 +56,7 @@ class GroundCfg:
 
     @property
     def drawn(self) -> bool:
-        """Whether there is anything but level ground."""
+        """Whether platforms or blocks are ever sampled."""
         return self.platform + self.block > 0.0
 
     def ranges(self) -> Any:
@@ -66,24 +66,24 @@ class GroundCfg:
 
 @dataclass(frozen=True)
 class Level:
-    """One level of the curriculum."""
+    """Ranges of goals and standing starts: one level of the curriculum."""
 
     goal_lower: tuple[float, float, float]
-    """Smallest goal relative to start and heading [m]: landing x, y, and base height at the apex (0: any)."""
+    """[m] Smallest goal: landing x, y relative to start and heading, and base height at the apex (0: any)."""
     goal_upper: tuple[float, float, float]
-    """Largest goal."""
+    """[m] Largest goal, as `goal_lower`."""
     base_height: Pair
-    """[m] Of standing starts; low ones are deep squats."""
+    """[m] Height of the base in standing starts; low ones are deep squats."""
     next_jump_probability: float = 0.0
-    """[1] Of another goal for a landed robot."""
+    """[1] Probability of another goal after a landing."""
     elliptical: bool = False
-    """Whether goals lie in the ellipse inside the box alone, whose half axes are the reaches each way."""
+    """Whether goals lie in the ellipse within the box, with half axes up to its edges, instead of in the box."""
 
     struct = JumpLevel
-    """What the kernels read."""
+    """Kernels' struct that `values` returns."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a range is not one."""
+        """Raise InputError: a range falls or is not finite, or a height or probability is out of range."""
         pairs = [*zip(self.goal_lower, self.goal_upper, strict=True), self.base_height]
         if not all(-math.inf < low <= high < math.inf for low, high in pairs):
             raise InputError(f"a level's ranges must be finite and rise, got {self}")
@@ -100,30 +100,29 @@ class Level:
 
 
 def cross_levels(goals: Sequence[Level], starts: Sequence[Pair]) -> tuple[Level, ...]:
-    """Return the levels of two curricula: for each level of goals all ranges of standing starts [m], easiest first.
+    """Return len(goals) * len(starts) levels: each goal level with all ranges of standing starts [m], easiest first.
 
-    So the starts have their own curriculum, which begins anew with every level of goals, as the authors have it.
+    The curriculum of starts restarts with every level of goals, as in the authors' training.
     """
     return tuple(replace(goal, base_height=start) for goal, start in product(goals, starts))
 
 
 @dataclass(frozen=True)
 class StartProbability:
-    """[1] Probabilities of the modes in which an episode begins, in the order of the kernels; they add up to 1."""
+    """[1] Probabilities of the start modes of an episode, in the order of the kernels; they add up to 1."""
 
     standing: float = 0.0
-    """On four paws, from upright to a deep squat."""
+    """Standing on four paws, from upright to a deep squat."""
     default: float = 0.0
     """In the default pose."""
-    in_flight: float = 0.0
-    touchdown: float = 0.0
-    """Just before it."""
-    after_landing: float = 0.0
+    in_flight: float = 0.0  # between takeoff and landing
+    touchdown: float = 0.0  # just before touchdown
+    after_landing: float = 0.0  # on four paws near the goal
     pushing: float = 0.0
     """During the push of a takeoff."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: one is negative, or they do not add up to 1."""
+        """Raise InputError: one is negative, or they do not add up to 1."""
         values = tuple(vars(self).values())
         if not min(values) >= 0.0 or not abs(sum(values) - 1.0) < 1.0e-6:
             raise InputError(f"start_probability must be >= 0 and add up to 1, got {vars(self)}")
@@ -131,76 +130,76 @@ class StartProbability:
 
 @dataclass(frozen=True)
 class ResetCfg:
-    """Reference state initialisation: probabilities of start modes and ranges of their states; angles in degrees."""
+    """Reference state initialisation: probabilities of start modes, and ranges of their states; angles in degrees."""
 
     start_probability: StartProbability = StartProbability(0.60, 0.15, 0.20, after_landing=0.05)
     balance_by: Literal["resets", "steps"] = "resets"
-    """Whether the probabilities are of resets, or of policy steps, which a world evens out from reset to reset."""
+    """Quantity with these probabilities: resets, or policy steps, which each world balances over its resets."""
     base_xy: float = 0.05
-    """[m]"""
+    """[m] Half width of the base's x and y."""
     tilt: float = 5.0
-    """[deg] Roll, pitch and yaw."""
+    """[deg] Half width of roll, pitch and yaw."""
     forward_pitch: float = 0.0
-    """[deg] Largest mean pitch of standing states."""
+    """[deg] Largest mean pitch (nose down) of standing states."""
     lean: float = 0.0
-    """[m] Farthest that the base of the deepest squats is behind the middle of the paws, away from the goal."""
+    """[m] Largest distance of the base behind the middle of the paws, away from the goal, in the deepest squats."""
     heading: float = 0.0
     """[deg] Half width of the heading."""
     front_x: Pair = (0.20, 0.22)
-    """[m] Paw positions relative to the base."""
+    """[m] Distance of the front paws ahead of the base."""
     front_y: Pair = (0.15, 0.17)
-    """[m]"""
+    """[m] Distance of the front paws to either side."""
     back_x: Pair = (0.20, 0.22)
-    """[m]"""
+    """[m] Distance of the back paws behind the base."""
     back_y: Pair = (0.20, 0.22)
-    """[m]"""
+    """[m] Distance of the back paws to either side."""
     takeoff_height: Pair = (0.40, 0.45)
-    """[m]"""
+    """[m] Height of the base at takeoff."""
     takeoff_ahead: Pair = (0.0, 0.0)
-    """[m] Base ahead of its start, towards the goal."""
+    """[m] Distance of the base at takeoff from its start, towards the goal."""
     takeoff_pitch: Pair = (0.0, 0.0)
-    """[deg] Mean pitch, nose down, in flight and pushing off."""
+    """[deg] Mean pitch, nose down, in flight and while pushing off."""
     push_length: Pair = (0.0, 0.4)
-    """[m] Of the straight way to the takeoff, on which the base of those that push off is."""
+    """[m] Distance of a pushing base from its takeoff point, along a straight line."""
     push_acceleration: Pair = (10.0, 20.0)
-    """[m/s^2] On it."""
+    """[m/s^2] Acceleration along this line."""
     takeoff_angle: Pair = (50.0, 75.0)
-    """[deg] Above the horizon, where the goal names no apex."""
+    """[deg] Takeoff direction above the horizontal, for goals without an apex height."""
     highest_apex: float = 1.0
-    """[m] Of jumps with a drawn takeoff angle."""
+    """[m] Largest apex height of the base with a sampled takeoff angle."""
     landing_height: float = 0.42
-    """[m] Of the base, where the projectile ends."""
+    """[m] Height of the base at the end of the ballistic flight."""
     flight_time: Pair = (0.01, 0.95)
-    """[1] Share of the time in the air."""
+    """[1] Fraction of the flight time that has passed in in-flight starts."""
     flight_lateral: float = 10.0
-    """[deg]"""
+    """[deg] Half width of lateral motor angles in flight."""
     flight_transversal: Pair = (0.0, 90.0)
-    """[deg]"""
+    """[deg] Outer and inner motor angles in flight."""
     touchdown_time: Pair = (0.03, 0.15)
-    """[s] Before landing."""
+    """[s] Time before landing of touchdown starts."""
     touchdown_behind: Pair = (0.0, 0.0)
-    """[m] Base behind the projectile before touchdown, so that the paws are ahead of it."""
+    """[m] Distance of the base behind the ballistic path in touchdown starts, so that the paws are ahead of it."""
     paw_depth: Pair = (0.30, 0.45)
-    """[m] Paws below the base before touchdown."""
+    """[m] Depth of the paws below the base in touchdown starts."""
     landed_height: Pair = (0.30, 0.42)
-    """[m]"""
+    """[m] Height of the base in after-landing starts."""
     landed_ahead: Pair = (0.0, 0.0)
-    """[m] Base ahead of the goal just after landing."""
+    """[m] Distance of the base ahead of the goal in after-landing starts."""
     landed_speed: Pair = (0.0, 1.0)
-    """[m/s] Downward."""
+    """[m/s] Downward speed in after-landing starts."""
     ground: GroundCfg = field(default_factory=GroundCfg)
-    """What standing starts stand on or jump to."""
+    """Sampled platforms and blocks of standing starts."""
     command_delay: float = 0.5
-    """[s] Longest time until the jump is commanded."""
+    """[s] Longest time from reset to the command to jump."""
     long_wait_probability: float = 0.0
-    """[1] Of `long_wait` instead: a policy learns to wait, and most episodes stay short."""
+    """[1] Probability of `long_wait` in place of `command_delay`; policies learn to wait; most episodes are short."""
     long_wait: float = 2.5
-    """[s]"""
+    """[s] Longest time to the command in such episodes."""
     next_jump_delay: Pair = (0.2, 0.7)
-    """[s] From touchdown to the next goal."""
+    """[s] Time from touchdown to the next goal."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a pair is reversed, a number not finite or out of range."""
+        """Raise InputError: a pair is reversed, a number not finite or out of range."""
         positive = ("command_delay", "long_wait", "next_jump_delay", "lean", "push_length", "push_acceleration")
         check_ranges("reset", self, skip=("start_probability", "ground", "balance_by"), not_negative=positive)
         check_probabilities("reset", self, "long_wait_probability")
@@ -208,7 +207,7 @@ class ResetCfg:
             raise InputError(f"reset balance_by must be resets or steps, got {self.balance_by!r:.40}")
 
     struct = JumpSettings
-    """What the kernels read."""
+    """Kernels' struct that `values` returns."""
 
     def values(self, step_dt: float) -> Any:
         """Return the kernels' `JumpSettings`: angles in radians, delays in policy steps of step_dt [s]."""
@@ -218,20 +217,21 @@ class ResetCfg:
 
     @property
     def draws_ground(self) -> bool:
-        """Whether there is anything but level ground."""
+        """Whether resets sample platforms or blocks."""
         return self.ground.drawn
 
     def on_level_ground(self) -> ResetCfg:
-        """Return the same with level ground only."""
+        """Return the configuration without sampled platforms and blocks."""
         return replace(self, ground=GroundCfg())
 
     def _ranges(self, step_dt: float) -> Any:
+        """Return the kernels' `ResetRanges`; step_dt: policy step [s]."""
         degrees = (
             "tilt", "forward_pitch", "heading", "takeoff_angle", "takeoff_pitch", "flight_lateral",
             "flight_transversal",
         )  # fmt: skip
-        apart = ("start_probability", "balance_by", "command_delay", "long_wait", "next_jump_delay", "ground")
-        ranges = filled(ResetRanges(), self, apart, degrees)
+        converted = ("start_probability", "balance_by", "command_delay", "long_wait", "next_jump_delay", "ground")
+        ranges = filled(ResetRanges(), self, skip=converted, degrees=degrees)
         ranges.start_probability = vec_start_modes(*vars(self.start_probability).values())
         ranges.by_steps = int(self.balance_by == "steps")
         ranges.command_delay = round(self.command_delay / step_dt)

@@ -1,7 +1,7 @@
-"""The horizontal jump: steer the base to a place in the plane by one jump, and stay there.
+"""The horizontal jump: one jump to a goal position in the plane, and standing there.
 
-Forms and constants are the paper's and its authors' training configuration; `docs/tasks.md` lists every departure, its
-reason and how to undo it.
+Forms and constants are the paper's and its authors' training configuration; `docs/tasks.md` lists all differences,
+their reasons and how to undo them.
 """
 
 from __future__ import annotations
@@ -21,8 +21,7 @@ from jumper_warp.tasks.observations import remembered
 from jumper_warp.tasks.terms import Advance, Curriculum, RewardTerm, TerminationTerm
 from jumper_warp.tasks.units import DEG, SECOND, G
 
-LANDING_HEIGHT = 0.30
-"""[m] Of the base, at which the ballistic estimate ends."""
+LANDING_HEIGHT = 0.30  # [m] of the base, at which the ballistic estimate ends
 
 REWARDS = (
     RewardTerm(rewards.tracking, 50.0, std_wide=0.15, std_fine=0.03, fine_weight=0.6),
@@ -65,9 +64,7 @@ TERMINATIONS = (
     TerminationTerm(mdp_terminations.too_long, steps=20.0 * SECOND, time_out=True),
 )
 
-
-NEXT_JUMP_PROBABILITY = 0.175
-"""[1] Of another goal for a landed robot, past the first level."""
+NEXT_JUMP_PROBABILITY = 0.175  # [1] of another goal after a landing, above the first level
 
 RESET = ResetCfg(
     start_probability=StartProbability(
@@ -91,23 +88,23 @@ RESET = ResetCfg(
 
 
 def level(x: tuple[float, float], y: float, next_jump_probability: float = NEXT_JUMP_PROBABILITY) -> Level:
-    """Return a level with goals ahead within x [m], up to y [m] to either side."""
+    """Return a level with goals x = (lower, upper) [m] ahead and up to y [m] to either side, and the first starts."""
     return Level((x[0], -y, 0.0), (x[1], y, 0.0), STARTS[0], next_jump_probability)
 
 
 def level_all_around(ahead: float, aside: float, back: float) -> Level:
-    """Return a level with goals up to these distances [m] ahead, to either side and back."""
+    """Return a level with goals in an ellipse with these half axes [m] ahead, to either side and back."""
     return Level((-back, -aside, 0.0), (ahead, aside, 0.0), STARTS[0], NEXT_JUMP_PROBABILITY, elliptical=True)
 
 
 REACHES = ((0.4, 0.3, 0.3), (0.7, 0.5, 0.5), (1.0, 0.7, 0.7), (1.4, 0.95, 0.95))
-"""[m] Of goals all around: ahead, aside, back; by level."""
+"""[m] Farthest goals (ahead, to either side, back) of each level of `omnidirectional_jump` above the first."""
 NEAREST = level((0.2, 0.5), 0.0, next_jump_probability=0.0)
-"""Where every curriculum begins."""
+"""First level of every curriculum of goal positions."""
 
 
 def horizontal_jump() -> TaskCfg:
-    """Return the task, with the torque limits of the paper's tests: 18 N m, 12 N m for the lateral motors."""
+    """Return the horizontal jump with the torque limits of the paper's tests: 18 N m, lateral motors 12 N m."""
     return TaskCfg(
         name="horizontal-jump",
         state=JumpState,
@@ -138,14 +135,14 @@ def horizontal_jump() -> TaskCfg:
 
 
 def horizontal_jump_slippery() -> TaskCfg:
-    """Return the same task on ground of unknown grip: friction of the paws from slippery to what the paper draws."""
+    """Return the horizontal jump with paw friction randomised from 0.35 up to the paper's range."""
     task = horizontal_jump()
-    drawn = replace(task.randomization, static_friction=(0.4, 1.2), dynamic_friction=(0.35, 0.9))
-    return replace(task, name="horizontal-jump-slippery", randomization=drawn)
+    slippery = replace(task.randomization, static_friction=(0.4, 1.2), dynamic_friction=(0.35, 0.9))
+    return replace(task, name="horizontal-jump-slippery", randomization=slippery)
 
 
 def horizontal_jump_sighted() -> TaskCfg:
-    """Return the same task for a robot that sees where a platform or block ahead begins and ends, and its height."""
+    """Return the horizontal jump with the edges and height of the block ahead in the policy's observation."""
     task, ground = horizontal_jump(), replace(RESET.ground, platform=0.30, block=0.45)
     return replace(
         task,
@@ -156,10 +153,7 @@ def horizontal_jump_sighted() -> TaskCfg:
 
 
 def omnidirectional_jump() -> TaskCfg:
-    """Return the same task with goals all around: the curriculum of goals and starts differs, and symmetry pays half.
-
-    Reaches ahead, to the sides and back grow at their own rates.
-    """
+    """Return the horizontal jump with goals in all directions: other levels and starts, half the symmetry reward."""
     task = horizontal_jump()
     settings = replace(
         RESET, forward_pitch=0.0, takeoff_pitch=(0.0, 0.0), takeoff_ahead=(0.0, 0.2), touchdown_behind=(0.05, 0.12)

@@ -1,10 +1,9 @@
-"""Jumps on Mars: 3.71 m/s^2, 24.8 N m and a transversal kp of 20 N m/rad, as the authors' sequel has them, no springs.
+"""Jumps on Mars: 3.71 m/s^2, 24.8 N m and a transversal kp of 20 N m/rad, as in the authors' sequel, without springs.
 
-The open-loop jump reaches 2.96 m through the filter of the jumps on Earth, 3.70 m through a loose one: each has a task.
-Weights of the vertical jump are those of the sequel's configuration but for that of the angular velocity, as flights
-take up to 2.7 s; its levels begin at 1.8 m, here lower, with steps in between, and low jumps stay in all of them.
-Limits on impacts are those on Earth, since they protect the same robot; those on misses grow with the distance: the
-same error of the takeoff carries a robot FARTHER times as far off.
+The open-loop jump reaches 2.96 m with the filter of the jumps on Earth and 3.70 m with the loose one: each has a task.
+Weights of the vertical jump are the sequel's, except for the angular velocity, since flights take up to 2.7 s. The
+sequel's levels start at 1.8 m; these start lower, have smaller steps, and all include low jumps. Limits on impacts are
+those on Earth, since they protect the same robot. Limits on misses grow by the factor FARTHER, as a takeoff error does.
 """
 
 from __future__ import annotations
@@ -21,20 +20,18 @@ from jumper_warp.tasks.jump.vertical import STARTS, heights, vertical_jump
 from jumper_warp.tasks.terms import RewardTerm
 from jumper_warp.tasks.units import DEG
 
-TORQUE, KP = 24.8, 20.0
-"""[N m], [N m/rad] Of the transversal motors."""
-FARTHER = EARTH / MARS
-"""[1] By which the same takeoff goes higher and farther."""
+TORQUE, KP = 24.8, 20.0  # [N m], [N m/rad] of the transversal motors
+FARTHER = EARTH / MARS  # [1] ratio of heights and distances after the same takeoff
 
 
 def mars_motors(lateral_torque: float) -> MotorCfg:
-    """Return the motors with all that they can give; lateral_torque [N m]: limit of the lateral ones."""
+    """Return the jumping motors with kp = KP and the limit TORQUE; lateral_torque: limit of the lateral ones [N m]."""
     motors = jumping_motors(TORQUE, lateral_torque=lateral_torque)
     return replace(motors, transversal=replace(motors.transversal, kp=KP))
 
 
 def vertical_jump_mars() -> TaskCfg:
-    """Return the vertical jump on Mars through the filter of the jumps on Earth."""
+    """Return the vertical jump on Mars with the command filter of the vertical jump on Earth."""
     task = vertical_jump()
     task = replace(
         task,
@@ -50,11 +47,11 @@ def vertical_jump_mars() -> TaskCfg:
         tilted={"angle": 40.0 * DEG},
     )  # fmt: skip
     ends = tuple(term for term in task.terminations if term.func is not terminations.second_takeoff)
-    task = replace(task, terminations=ends)  # robots that only learn to land bounce, and must live to learn not to
-    falling = RewardTerm(rewards.descent_tilt, -60.0, angle=10.0 * DEG)  # a long flight turns a robot that tips slowly
-    landed = RewardTerm(rewards.lifted_again, -30.0, threshold=0.0)  # what its policies were trained with
-    kept = (landed if term.func is rewards.paws_down else term for term in task.rewards)
-    task = replace(task, rewards=(*kept, falling))
+    task = replace(task, terminations=ends)  # a bounce must not end episodes early in training
+    descent_tilt = RewardTerm(rewards.descent_tilt, -60.0, angle=10.0 * DEG)  # long flights amplify slow rotation
+    lifted_again = RewardTerm(rewards.lifted_again, -30.0, threshold=0.0)  # in place of `paws_down`
+    terms = (lifted_again if term.func is rewards.paws_down else term for term in task.rewards)
+    task = replace(task, rewards=(*terms, descent_tilt))
     return task.with_terms(
         "rewards",
         jump_height={"std_wide": 0.8},
@@ -67,7 +64,7 @@ def vertical_jump_mars() -> TaskCfg:
 
 
 def vertical_jump_mars_loose() -> TaskCfg:
-    """Return the same through a loose filter, to greater heights."""
+    """Return the vertical jump on Mars with the loose command filter and goals up to 3.6 m."""
     return replace(
         vertical_jump_mars(),
         name="vertical-jump-mars-loose",
@@ -77,7 +74,7 @@ def vertical_jump_mars_loose() -> TaskCfg:
 
 
 def horizontal_jump_mars() -> TaskCfg:
-    """Return the jump to places on Mars through the filter of the jumps on Earth, on level ground."""
+    """Return the horizontal jump on Mars, on level ground, with the command filter of the horizontal jump on Earth."""
     task = horizontal_jump()
     settings = replace(task.reset.settings, highest_apex=2.5, takeoff_angle=(35.0, 70.0), ground=GroundCfg())
     task = replace(
@@ -105,5 +102,5 @@ def horizontal_jump_mars() -> TaskCfg:
 
 
 def horizontal_jump_mars_loose() -> TaskCfg:
-    """Return the same through a loose filter."""
+    """Return the horizontal jump on Mars with the loose command filter."""
     return replace(horizontal_jump_mars(), name="horizontal-jump-mars-loose", command_filter=loose_filter())

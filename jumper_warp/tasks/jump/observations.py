@@ -1,4 +1,4 @@
-"""What policies of the jump tasks see, and their critics."""
+"""Observation terms of the jump tasks' policies and critics."""
 
 from jumper_warp.kernels.jump import observations as jump
 from jumper_warp.kernels.mdp import observations as obs
@@ -8,16 +8,15 @@ from jumper_warp.tasks.terms import ObservationTerm
 HEIGHT = ObservationTerm(obs.height, noise=POSITION_NOISE)
 
 VERTICAL = (ObservationTerm(jump.wanted_height), ObservationTerm(jump.jump_command), HEIGHT, *ROBOT)
-"""Of the vertical jump."""
+"""Policy observation of the vertical jump."""
 
 HORIZONTAL = (ObservationTerm(jump.goal, noise=POSITION_NOISE), HEIGHT, *ROBOT)
-"""Of jumps to places."""
+"""Policy observation of jumps to a goal position."""
 
-SIGHT = ObservationTerm(jump.block_ahead)
-"""Of the block ahead, exact, for critics."""
+SIGHT = ObservationTerm(jump.block_ahead)  # exact, for critics
 
 SIGHTED = (*HORIZONTAL, SIGHT.replace(noise=0.01))
-"""Of jumps to places by robots that see the edges ahead to a centimetre."""
+"""Policy observation of `horizontal_jump_sighted`: also the block's edges and height, with noise of 0.01 m."""
 
 EPISODE = (
     ObservationTerm(jump.phase),
@@ -27,9 +26,9 @@ EPISODE = (
     ObservationTerm(jump.way),
     ObservationTerm(obs.paw_forces),
 )
-"""What only a simulation knows of a jump."""
+"""State of the jump that only a simulation knows, for critics."""
 
 
-def critic(policy: tuple[ObservationTerm, ...], *more: ObservationTerm) -> tuple[ObservationTerm, ...]:
-    """Return the critic's terms: the policy's without noise, the episode's, more of them, and the drawn parameters."""
-    return (*exact(policy), *EPISODE, *DRAWN, *more)
+def critic(policy: tuple[ObservationTerm, ...], *extra: ObservationTerm) -> tuple[ObservationTerm, ...]:
+    """Return a critic's terms: the policy's without noise and delay, `EPISODE`, `DRAWN` and extra terms."""
+    return (*exact(policy), *EPISODE, *DRAWN, *extra)

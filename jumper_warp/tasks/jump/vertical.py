@@ -1,7 +1,7 @@
 """The vertical jump: reach a commanded base height, and land.
 
-Forms and constants are the paper's and its authors' training configuration; `docs/tasks.md` lists every departure, its
-reason and how to undo it.
+Forms and constants are the paper's and its authors' training configuration; `docs/tasks.md` lists all differences,
+their reasons and how to undo them.
 """
 
 from __future__ import annotations
@@ -18,27 +18,24 @@ from jumper_warp.tasks.observations import remembered
 from jumper_warp.tasks.terms import Advance, Curriculum, RewardTerm, TerminationTerm
 from jumper_warp.tasks.units import DEG, SECOND, G
 
-PATIENCE = 0.1
-"""Share that the always-paid terms keep while a commanded jump has not begun."""
-
-TAKEOFF_SPEED = 0.75
-"""[m/s] Upward, that a takeoff needs, the first or, what ends an episode, a second."""
+WAITING_SCALE = 0.1  # [1] factor of the always-paid terms from the jump command to the takeoff
+TAKEOFF_SPEED = 0.75  # [m/s] smallest upward speed of a takeoff; a second takeoff ends the episode
 
 QUIET = (
     RewardTerm(rewards.resting_action_rate, -2.0),
     RewardTerm(rewards.torque_ripple, -0.01),
     RewardTerm(rewards.force_ripple, -5.0, weight_force=14.5 * G),
 )
-"""What standing quietly costs less of, before the command and after the landing."""
+"""Penalties of restless standing, before the command and after the landing."""
 
 REWARDS = (
     RewardTerm(rewards.jump_height, 40.0, std_fine=0.10, scale_sharp=0.05, std_wide=0.4, scale_by_dt=False),
     RewardTerm(rewards.estimated_jump_height, 20.0, std_fine=0.10, scale_sharp=0.05, std_wide=0.4),
-    RewardTerm(rewards.horizontal_velocity, 10.0, speed_scale=0.04, waiting_scale=PATIENCE),
-    RewardTerm(rewards.orientation, 15.0, std=0.1, waiting_scale=PATIENCE),
-    RewardTerm(rewards.angular_velocity, 2.0, std=2.0, waiting_scale=PATIENCE),
-    RewardTerm(rewards.joint_symmetry, 35.0, std_variance=0.05, std_lateral=0.35, waiting_scale=PATIENCE),
-    RewardTerm(rewards.ground_posture, 10.0, std=10.0 * DEG, shift=35.0 * DEG, waiting_scale=PATIENCE),
+    RewardTerm(rewards.horizontal_velocity, 10.0, speed_scale=0.04, waiting_scale=WAITING_SCALE),
+    RewardTerm(rewards.orientation, 15.0, std=0.1, waiting_scale=WAITING_SCALE),
+    RewardTerm(rewards.angular_velocity, 2.0, std=2.0, waiting_scale=WAITING_SCALE),
+    RewardTerm(rewards.joint_symmetry, 35.0, std_variance=0.05, std_lateral=0.35, waiting_scale=WAITING_SCALE),
+    RewardTerm(rewards.ground_posture, 10.0, std=10.0 * DEG, shift=35.0 * DEG, waiting_scale=WAITING_SCALE),
     RewardTerm(rewards.air_posture, 80.0, std=15.0 * DEG),
     RewardTerm(rewards.post_landing_posture, 10.0, std=15.0 * DEG, shift=15.0 * DEG),
     RewardTerm(rewards.base_at_rest, 20.0, std_lin_vel=0.1, std_ang_vel=0.5),
@@ -73,9 +70,7 @@ TERMINATIONS = (
     TerminationTerm(mdp_terminations.too_long, steps=20.0 * SECOND, time_out=True),
 )
 
-
-STARTS = ((0.22, 0.35), (0.22, 0.45))
-"""[m] Base heights of standing starts, deep squats first."""
+STARTS = ((0.22, 0.35), (0.22, 0.45))  # [m] base heights of standing starts by level, easiest (deep squats) first
 
 RESET = ResetCfg(
     start_probability=StartProbability(0.50, default=0.15, in_flight=0.20, after_landing=0.05, pushing=0.10),
@@ -84,12 +79,12 @@ RESET = ResetCfg(
 
 
 def heights(*pairs: tuple[float, float]) -> tuple[Level, ...]:
-    """Return levels with goals between two base heights [m] each, and for each of them all starts."""
+    """Return the curriculum for pairs (lowest, highest) of apex heights of the base [m], each with all `STARTS`."""
     return cross_levels([Level((0.0, 0.0, low), (0.0, 0.0, high), STARTS[0]) for low, high in pairs], STARTS)
 
 
 def vertical_jump() -> TaskCfg:
-    """Return the task, with the torque limits of the paper's tests: 18 N m, 10 N m for the lateral motors."""
+    """Return the vertical jump with the torque limits of the paper's tests: 18 N m, lateral motors 10 N m."""
     return TaskCfg(
         name="vertical-jump",
         state=JumpState,

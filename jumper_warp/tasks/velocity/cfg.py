@@ -1,4 +1,4 @@
-"""How velocity tracking begins and what is commanded: starts, ranges of commands and the map, as data."""
+"""Configuration of velocity tracking: starts of episodes, ranges of commands and the terrain map."""
 
 from __future__ import annotations
 
@@ -16,33 +16,33 @@ from jumper_warp.tasks.ranges import Pair, check_ranges, filled
 from jumper_warp.utils.checks import check_finite, check_probabilities
 from jumper_warp.utils.errors import InputError
 
-Reach = tuple[float, float, float, float]
+Reach = tuple[float, float, float, float]  # largest speeds: ahead, back, sideways [m/s], turning [rad/s]
 
 
 @dataclass(frozen=True)
 class CommandCfg:
-    """Drawn commands. A reach is (ahead, back, to either side [m/s], turning to either side [rad/s])."""
+    """Ranges of sampled commands. A range is (ahead, back, to either side [m/s], turning to either side [rad/s])."""
 
     first_range: Reach = (0.8, 0.8, 0.8, 0.8)
-    """At the first level."""
+    """Range at the first level."""
     last_range: Reach = (2.2, 1.6, 1.0, 1.4)
-    """At the last level. From the second on, going fast along x leaves less room for going sideways and turning."""
+    """Range at the last level. Above the first level, a fast command along x limits the sideways and turning speeds."""
     levels: int = 10
-    """Steps from the first level to the last; 0: all commands are of the first."""
+    """Number of steps from the first level to the last; 0: first level only."""
     first_range_probability: float = 0.5
-    """[1] Of a command of the first level on all others."""
+    """[1] Probability of a command from `first_range` at higher levels."""
     standing_probability: float = 0.12
-    """[1] Of the command to stand."""
+    """[1] Probability of the command to stand."""
     turn_in_place_probability: float = 0.05
-    """[1] Of a command to turn on the spot."""
+    """[1] Probability of a command to turn on the spot."""
     resampling_time_range: Pair = (2.0, 6.0)
-    """[s] From command to command."""
+    """[s] Time from one command to the next."""
 
     struct = CommandRanges
-    """What the kernels read."""
+    """Kernels' struct that `values` returns."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a range or a probability is not one."""
+        """Raise InputError: a range shrinks or is not positive, or a count, time or probability is out of range."""
         check_finite("command reach", *self.first_range, *self.last_range)
         if not all(0.0 < low <= high for low, high in zip(self.first_range, self.last_range, strict=True)):
             raise InputError(f"command ranges must be positive and grow, got {self.first_range}, {self.last_range}")
@@ -57,7 +57,7 @@ class CommandCfg:
             raise InputError(f"resampling_time_range must be (lower, upper), positive and finite, got ({low}, {high})")
 
     def values(self) -> Any:
-        """Return the kernels' `CommandRanges`."""
+        """Return the kernels' `CommandRanges`, times in policy steps of 1/60 s."""
         ranges = filled(CommandRanges(), self, skip=("first_range", "last_range", "levels", "resampling_time_range"))
         ranges.first_range, ranges.last_range = wp.vec4(*self.first_range), wp.vec4(*self.last_range)
         ranges.levels = self.levels
@@ -67,48 +67,48 @@ class CommandCfg:
 
 @dataclass(frozen=True)
 class VelocityResetCfg:
-    """How episodes begin; angles in degrees."""
+    """Ranges of the state at the start of an episode; angles in degrees."""
 
     episode: float = 20.0
     """[s] Length of an episode."""
     gait: float = 0.0
-    """[Hz] Frequency of the clock, 0: none. What it is for are the trot's observation and reward."""
+    """[Hz] Frequency of the gait clock, which the trot's observation and reward read; 0: no clock."""
     default_pose_probability: float = 0.1
-    """[1] Of a start in the default pose at rest."""
+    """[1] Probability of a start in the default pose at rest."""
     base_xy: float = 0.1
-    """[m] Half width."""
+    """[m] Half width of the base's x and y."""
     height: Pair = (0.30, 0.50)
-    """[m] Of the base above the ground."""
+    """[m] Height of the base above the ground."""
     tilt: float = 5.0
     """[deg] Half width of roll and pitch."""
     heading: float = 180.0
     """[deg] Half width of the heading."""
     front_x: Pair = (0.12, 0.32)
-    """[m] Paws relative to the base."""
+    """[m] Distance of the front paws ahead of the base."""
     front_y: Pair = (0.12, 0.24)
-    """[m]"""
+    """[m] Distance of the front paws to either side."""
     back_x: Pair = (0.12, 0.32)
-    """[m]"""
+    """[m] Distance of the back paws behind the base."""
     back_y: Pair = (0.16, 0.28)
-    """[m]"""
+    """[m] Distance of the back paws to either side."""
     max_swing_height: float = 0.10
-    """[m] Greatest height of paws in the air."""
+    """[m] Largest height of paws in the air."""
     swing_probability: float = 0.3
-    """[1] Of a paw being in the air."""
+    """[1] Probability of each paw being in the air."""
     lin_vel: float = 0.5
-    """[m/s] Half width of the base's velocity along x and y, three tenths of it along z."""
+    """[m/s] Half width of the base's velocity along x and y; along z it is 0.3 times as wide."""
     ang_vel: float = 0.5
-    """[rad/s] Half width of its angular velocity about each axis."""
+    """[rad/s] Half width of the base's angular velocity about each axis."""
     tolerance: float = 0.18
-    """[m/s] Mean error up to which an episode raises the levels: of the velocity, and 0.3 m of that of the yaw rate."""
+    """[m/s] Largest mean error of an episode that raises the levels: velocity error plus 0.3 m times yaw rate error."""
     terrain: TerrainCfg = field(default_factory=TerrainCfg.none)
-    """The map that episodes begin on."""
+    """Terrain map on which episodes start."""
 
     struct = VelocitySettings
-    """What the kernels read."""
+    """Kernels' struct that `values` returns."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a pair is reversed, a number not finite or out of range."""
+        """Raise InputError: a pair is reversed, a number not finite or out of range."""
         check_ranges("reset", self, skip=("terrain",), not_negative=vars(self))
         check_probabilities("reset", self, "default_pose_probability", "swing_probability")
 
@@ -122,9 +122,9 @@ class VelocityResetCfg:
         return settings
 
     def heightfield(self) -> newton.Heightfield | None:
-        """Return the map, None without one."""
+        """Return the terrain map; None: a plane."""
         return terrain_map(self.terrain) if self.terrain.rows else None
 
     def on_level_ground(self) -> VelocityResetCfg:
-        """Return the same without a map."""
+        """Return the configuration without a terrain map."""
         return replace(self, terrain=TerrainCfg.none())

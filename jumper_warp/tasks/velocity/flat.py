@@ -1,12 +1,12 @@
-"""Velocity tracking: walk ahead, back, sideways and turn as commanded; by itself on a plane.
+"""Velocity tracking on a plane: walk ahead, back and sideways, and turn, as commanded.
 
-Forms and constants are the paper's and its authors' training configuration, except: the tracking terms have narrow
-second kernels, since the wide ones are flat where a few centimetres per second are to be decided; air time counts
-sixteen times, with which the robot trots by itself, and not in short quick steps; rapid stepping grows in a straight
-line, since the clamped exponential has no slope where training begins; swings are to reach a height, paws not to slip
-and to come down softly; torques, joint accelerations and changes of the action cost, whose weights the configuration
-lists and overwrites with 0, and second differences of the action, which tell chatter from walking. Commands are
-redrawn every few seconds, so that transients are learnt, and reach farther as they are followed.
+Forms and constants are the paper's and its authors' training configuration, except: tracking terms have second, narrow
+kernels, since the wide ones are flat at errors of a few cm/s. Air time has sixteen times the weight, which makes the
+robot trot without short quick steps. Rapid stepping grows linearly, since the clamped exponential has no slope at the
+start of training. Swing height, slip and touchdown speed have terms. Torques, joint accelerations and changes of the
+action are penalised (the configuration lists these weights but sets them to 0), as are second differences of the
+action, which distinguish chatter from walking. Commands are resampled every few seconds, so that policies learn
+transients, and their range grows with the tracking score.
 """
 
 from __future__ import annotations
@@ -29,13 +29,13 @@ from jumper_warp.tasks.units import DEG, SECOND
 from jumper_warp.tasks.velocity.cfg import CommandCfg, VelocityResetCfg
 
 SENSED = ("lin_vel", "ang_vel", "gravity", "angle", "rate")
-"""Observations that come as late as the sensors do."""
+"""Names of the terms with observation latency."""
 
 WITHOUT_HISTORY = (ObservationTerm(velocity.command), *(term.replace(delayed=term.name in SENSED) for term in ROBOT))
-"""What the paper's walking policy sees, in another order."""
+"""Observation of the paper's walking policy, in another order."""
 
 ACTOR = remembered(WITHOUT_HISTORY)
-"""The same over four policy steps."""
+"""Policy observation: `WITHOUT_HISTORY` over four policy steps."""
 
 CRITIC = (
     *exact(WITHOUT_HISTORY),
@@ -50,7 +50,7 @@ CRITIC = (
     ObservationTerm(velocity.push),
     *(term for term in DRAWN if term.func is not obs.drawn_push),  # in world axes, whatever the heading
 )
-"""What only a simulation knows besides."""
+"""Critic observation: the actor's without noise and delay, plus values that only a simulation has."""
 
 REWARDS = (
     RewardTerm(rewards.linear_velocity, 2.5, std=0.5),
@@ -98,7 +98,7 @@ METRICS = (
 
 
 def velocity_flat() -> TaskCfg:
-    """Return the task on a plane, with the gains and the torque limit of the paper's walking tests, 10 N m."""
+    """Return velocity tracking on a plane, with the gains and the 10 N m torque limit of the paper's walking tests."""
     return TaskCfg(
         name="velocity-flat",
         state=VelocityState,
@@ -122,7 +122,7 @@ def velocity_flat() -> TaskCfg:
 
 
 def velocity_trot() -> TaskCfg:
-    """Return the task with a clock that is seen and whose trot is paid for, at 2 Hz."""
+    """Return velocity tracking on a plane with an observed 2 Hz gait clock and a reward for trotting in its time."""
     flat = velocity_flat()
     gait_phase = ObservationTerm(velocity.gait_phase)
     return replace(
