@@ -45,8 +45,7 @@ COLUMNS = {
 }
 """Columns of the table: metric and scale; cells are nominal / randomised."""
 WIDTH = 180  # Width of the table in characters
-MetricsByTraining = dict[tuple[str, int], dict[str, dict[str, Any]]]
-"""Metrics by training (name, seed), test and name."""
+MetricsByTraining = dict[tuple[str, int], dict[str, dict[str, Any]]]  # Metrics by training (name, seed), test and name
 
 
 @dataclass(frozen=True)

@@ -230,8 +230,7 @@ def plot_flights(path: Path, logs: Mapping[str, FlightLog]) -> None:
 class FlightRun(Run):
     """Evaluation of flights with two skills: a jump, and a policy that turns in flight."""
 
-    flights: FlightLog
-    """Log of the flights under way."""
+    flights: FlightLog  # Log of the flights under way
 
     def __init__(self, args: EvaluationArgs, landing: str, jump: str) -> None:
         """Open the policies that turn (`args.policy`) and land (`landing`; empty: none, `jump` is the task that lands).

@@ -40,8 +40,7 @@ class GradientStats:
         return (self.std / self.signal) ** 2 if self.signal > 0.0 else float("inf")
 
 
-StatsByPolicy = dict[str, dict[str, list[GradientStats]]]
-"""Statistics by policy and estimator, one per horizon."""
+StatsByPolicy = dict[str, dict[str, list[GradientStats]]]  # Statistics by policy and estimator, one per horizon
 
 
 def gradient_stats(rows: torch.Tensor) -> GradientStats:

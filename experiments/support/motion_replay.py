@@ -103,8 +103,7 @@ class MotionReplay:
         self.takeoff = int(free.argmax()) + 1 if free.any() else len(free)
         """Policy step at whose end the robot is off the ground; the last if it never is."""
         first = self.takeoff * self.sim.substeps
-        self.work = float(self.sim.dt * self.power[:first].sum())
-        """[J] Positive work of the motors until takeoff."""
+        self.work = float(self.sim.dt * self.power[:first].sum())  # [J] Positive work of the motors until takeoff
         landing = np.flatnonzero(down[first:].any(axis=1))
         self.apex = float(self.height[first - 1 : first + landing[0] if len(landing) else None].max())
         """[m] Largest base height before a paw touches down."""

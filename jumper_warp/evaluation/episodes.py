@@ -16,8 +16,7 @@ from jumper_warp.tasks.commands import layout_of
 from jumper_warp.utils.errors import InputError
 
 MAX_SECONDS = 600.0
-MAX_COMMAND_SIZE = 4
-"""Maximum number of values in a command."""
+MAX_COMMAND_SIZE = 4  # Maximum number of values in a command
 
 
 @dataclass

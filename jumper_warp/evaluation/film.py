@@ -23,12 +23,9 @@ if TYPE_CHECKING:
     from jumper_warp.robot.grounds import BlockCfg
     from jumper_warp.sim.simulation import Simulation
 
-ANKLE = np.array([0.0, 0.0, -0.3])
-"""[m] Position of the ankle in the shank's frame."""
-CAMERA_DISTANCE = 2.4
-"""[m] Distance from the path to the camera in `side_view`."""
-PICTURE_SIZE = (400, 320)
-"""[px] Width and height of a filmstrip's picture in `side_view`."""
+ANKLE = np.array([0.0, 0.0, -0.3])  # [m] Position of the ankle in the shank's frame
+CAMERA_DISTANCE = 2.4  # [m] Distance from the path to the camera in `side_view`
+PICTURE_SIZE = (400, 320)  # [px] Width and height of a filmstrip's picture in `side_view`
 
 
 @dataclass(frozen=True)

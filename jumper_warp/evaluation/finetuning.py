@@ -30,17 +30,12 @@ from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.runtime import git_commit
 
-AHEAD = "goal_x"
-"""Observation of jumps to landing positions: distance to the goal ahead [m]."""
-DELAYS = (0.3, 0.7)
-"""[s] Range of the time until jumps are commanded."""
-TRUST_REGION_SECONDS = 3.5
-"""[s] Length of the episodes whose observations are sampled."""
+AHEAD = "goal_x"  # Observation of jumps to landing positions: distance to the goal ahead [m]
+DELAYS = (0.3, 0.7)  # [s] Range of the time until jumps are commanded
+TRUST_REGION_SECONDS = 3.5  # [s] Length of the episodes whose observations are sampled
 TRUST_REGION_SAMPLES = 4096
-DAMPING = 1.0e-2
-"""Damping of the first step."""
-AIM_ROUNDS = 3
-"""Maximum number of corrections of the aim."""
+DAMPING = 1.0e-2  # Damping of the first step
+AIM_ROUNDS = 3  # Maximum number of corrections of the aim
 
 
 @dataclass(frozen=True)

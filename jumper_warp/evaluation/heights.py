@@ -31,23 +31,17 @@ from jumper_warp.evaluation.log import (
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 
-SUCCESS_TOLERANCE = 0.1
-"""[m] Largest difference between apex and commanded height of a jump that reaches its height."""
-LEVEL_TILT = 10.0
-"""[deg] Tilt of the base below which a landing of a sweep is good."""
+SUCCESS_TOLERANCE = 0.1  # [m] Largest difference between apex and commanded height of a jump that reaches its height
+LEVEL_TILT = 10.0  # [deg] Tilt of the base below which a landing of a sweep is good
 SWEEP_ENDS = (DIVERGED, "low_base", "tilted", COLLIDED, "no_jump", "too_long", SUCCESS)
 """Terminations that end a jump of a sweep, in order of precedence; the others only shape the training."""
 FALLS = ("low_base", "tilted")
-WRONG_HEIGHT = "wrong_height"
-"""Outcome of a jump that landed from another apex height than commanded."""
-DRIFT, TURN = 0.2, 25.0
-"""[m], [deg] Drift and turn of the base beyond which the authors' configuration ends an episode."""
-MAX_ROBOTS = 64
-"""Maximum number of robots in one recording."""
+WRONG_HEIGHT = "wrong_height"  # Outcome of a jump that landed from another apex height than commanded
+DRIFT, TURN = 0.2, 25.0  # [m], [deg] Drift and turn of the base beyond which the authors' configuration ends an episode
+MAX_ROBOTS = 64  # Maximum number of robots in one recording
 LOWEST, HIGHEST, ABOVE = -0.37, 1.47, 0.45
 """[m] Lower and upper edge of a filmstrip's pictures at the robot, and margin above the base."""
-SHOWN_HEIGHT = 1.0
-"""[m] The filmstrip shows the jump whose commanded height is nearest to this."""
+SHOWN_HEIGHT = 1.0  # [m] The filmstrip shows the jump whose commanded height is nearest to this
 
 
 def with_success_last(task: TaskCfg) -> TaskCfg:

@@ -21,25 +21,17 @@ from jumper_warp.evaluation.log import (
 )
 from jumper_warp.utils.errors import InputError
 
-STANCE, LANDED = 0, 2
-"""Values of the jump's phase before takeoff and after touchdown."""
-REST_SPEED = 0.1
-"""[m/s] Speed of the base's centre of mass below which the robot is at rest."""
-REST_TIME = 1.0
-"""[s] Time after touchdown at which the robot should be at rest."""
-DELAY = 0.5
-"""[s] Time until the first jump is commanded."""
-SOON_AFTER = 0.3
-"""[s] Time after touchdown at which the base position is recorded as well."""
+STANCE, LANDED = 0, 2  # Values of the jump's phase before takeoff and after touchdown
+REST_SPEED = 0.1  # [m/s] Speed of the base's centre of mass below which the robot is at rest
+REST_TIME = 1.0  # [s] Time after touchdown at which the robot should be at rest
+DELAY = 0.5  # [s] Time until the first jump is commanded
+SOON_AFTER = 0.3  # [s] Time after touchdown at which the base position is recorded as well
 HOP_TIME = 0.05
 """[s] Longest time with no paw on the ground after touchdown that is no second hop, and shortest time for which a paw
 is lifted again that is a step."""
-TAKEOFF_SPEED = 0.25
-"""[m/s] Upward speed of the base, with no paw down, of a second takeoff (authors' configuration)."""
-TIME_EPS = 1.0e-6
-"""[s] Tolerance for rounding of sums of steps."""
-NOT_BEGUN = "not_begun"
-"""Outcome of a jump that was not commanded, as one before it failed."""
+TAKEOFF_SPEED = 0.25  # [m/s] Upward speed of the base, with no paw down, of a second takeoff (authors' configuration)
+TIME_EPS = 1.0e-6  # [s] Tolerance for rounding of sums of steps
+NOT_BEGUN = "not_begun"  # Outcome of a jump that was not commanded, as one before it failed
 
 
 def paw_arrays(env: Env) -> dict[str, np.ndarray]:
@@ -65,8 +57,7 @@ class JumpLog(EvaluationLog):
     its command. A jump's entries do not change after its end.
     """
 
-    speed_time: float
-    """[s] Time after touchdown at which the base's speed is recorded."""
+    speed_time: float  # [s] Time after touchdown at which the base's speed is recorded
 
     def __init__(
         self,

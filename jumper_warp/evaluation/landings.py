@@ -36,22 +36,17 @@ from jumper_warp.tasks.terms import TerminationTerm
 from jumper_warp.utils.errors import InputError
 
 Position2D = tuple[float, float]
-SUCCESS_TOLERANCE = 0.1
-"""[m] Largest error of a successful jump."""
+SUCCESS_TOLERANCE = 0.1  # [m] Largest error of a successful jump
 LANDING_TERMINATIONS = (DIVERGED, "low_base", COLLIDED, "no_jump", SUCCESS)
 """Terminations that end a jump of an evaluation, in order of precedence: success last, so that it hides no fall. The
 other terminations of a task only shape the training."""
 FALLS = (DIVERGED, "low_base", COLLIDED)
-MISSED = "missed"
-"""Outcome of a jump that landed, but beyond SUCCESS_TOLERANCE."""
-EARLY = "early"
-"""Outcome of a landed jump that began before its command."""
+MISSED = "missed"  # Outcome of a jump that landed, but beyond SUCCESS_TOLERANCE
+EARLY = "early"  # Outcome of a landed jump that began before its command
 AT_REST_AT_END = "below_0_1_m_s_at_the_end_rate"
 """Metric: share of landed jumps whose base was at rest (`REST_SPEED`) when the jump was over."""
-JUMP_SECONDS, NEXT_JUMP_SECONDS = 3.5, 2.5
-"""[s] Length of a recording of one jump, and addition for each further jump."""
-SHOWN_DISTANCE = 1.0
-"""[m] The filmstrip shows the jump whose goal is nearest to this distance."""
+JUMP_SECONDS, NEXT_JUMP_SECONDS = 3.5, 2.5  # [s] Length of a recording of one jump, and addition for each further jump
+SHOWN_DISTANCE = 1.0  # [m] The filmstrip shows the jump whose goal is nearest to this distance
 
 
 def with_landing_terminations(task: TaskCfg) -> TaskCfg:

@@ -25,8 +25,7 @@ if TYPE_CHECKING:
 SUCCESS = "success"
 DIVERGED = "came_apart"
 COLLIDED = "collided"
-NO_END = "no_end"
-"""Outcome of an episode that was still running when the time was over."""
+NO_END = "no_end"  # Outcome of an episode that was still running when the time was over
 
 Metrics = dict[str, float | int | None]
 
@@ -34,14 +33,10 @@ Metrics = dict[str, float | int | None]
 class EvaluationLog(ABC):
     """Commands one episode per world and records its outcome."""
 
-    row_name = "jump"
-    """Noun for a row of `columns`; names the CSV file and the recording."""
-    spacing = 1.2
-    """[m] Distance between robots that a recording shows side by side."""
-    count: int
-    """Number of worlds."""
-    arrays: dict[str, np.ndarray]
-    """Result of the last `read_env`, one row per world."""
+    row_name = "jump"  # Noun for a row of `columns`; names the CSV file and the recording
+    spacing = 1.2  # [m] Distance between robots that a recording shows side by side
+    count: int  # Number of worlds
+    arrays: dict[str, np.ndarray]  # Result of the last `read_env`, one row per world
 
     @property
     @abstractmethod

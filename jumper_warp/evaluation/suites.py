@@ -21,10 +21,8 @@ from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite, check
 from jumper_warp.robot.grounds import BlockCfg, platform, uneven
 
-AHEAD, ASIDE = (0.35, 1.4), (-0.35, 0.35)
-"""[m] Ranges of the grid's goals ahead and to the left."""
-SECTORS = ("ahead", "left", "back", "right")
-"""Quarters of a ring, each centred on its direction."""
+AHEAD, ASIDE = (0.35, 1.4), (-0.35, 0.35)  # [m] Ranges of the grid's goals ahead and to the left
+SECTORS = ("ahead", "left", "back", "right")  # Quarters of a ring, each centred on its direction
 PAIRS = {"diagonal": ((0.8, 0.2), (0.75, -0.2)), "straight": ((0.8, 0.0), (0.8, 0.0))}
 """[m] Goals of the paper's two jumps in a row, each relative to the one before."""
 ROW_LOWER, ROW_UPPER, DELAYS = (0.4, -0.2), (0.9, 0.2), (0.3, 1.0)

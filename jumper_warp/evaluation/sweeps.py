@@ -28,10 +28,8 @@ from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, Evaluati
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.utils.errors import InputError
 
-HEIGHTS_IN_RANGE, DISTANCES_IN_RANGE = (0.5, 1.1), (0.3, 1.4)
-"""[m] Ranges in which all jumps of the paper succeed."""
-PAPER_TRAINED = (0.4, 1.0)
-"""[m] Range of goal distances in the paper's training."""
+HEIGHTS_IN_RANGE, DISTANCES_IN_RANGE = (0.5, 1.1), (0.3, 1.4)  # [m] Ranges in which all jumps of the paper succeed
+PAPER_TRAINED = (0.4, 1.0)  # [m] Range of goal distances in the paper's training
 
 
 def check(good: bool, message: str) -> None:

@@ -18,12 +18,9 @@ from jumper_warp.utils.rotations import CONJUGATE, rotate
 
 Velocity = tuple[float, float, float]
 AXES = ("vx", "vy", "yaw_rate")
-SETTLING_TIME = 1.0
-"""[s] Time after each command that is excluded from tracking errors."""
-SHOWN_TIME = 0.6
-"""[s] Length of the filmstrip at the end of a walk, more than a stride."""
-PICTURES = 9
-"""Number of pictures in a filmstrip."""
+SETTLING_TIME = 1.0  # [s] Time after each command that is excluded from tracking errors
+SHOWN_TIME = 0.6  # [s] Length of the filmstrip at the end of a walk, more than a stride
+PICTURES = 9  # Number of pictures in a filmstrip
 MAX_ROBOTS = 20_000
 
 
