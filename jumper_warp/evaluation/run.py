@@ -36,9 +36,9 @@ from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.threads import checked_threads
 
-HEIGHTS = ("height", "height-mars")
+HEIGHTS = ("apex_height", "apex_height_mars")
 """Keys of `EVALUATIONS` of policies that jump to a commanded height."""
-PLACES = ("place", "around", "place-mars")
+PLACES = ("landing_position", "omnidirectional", "landing_position_mars")
 """Keys of `EVALUATIONS` of policies that jump to a commanded landing position."""
 SOLVER_TITLES = {"jumper": "SolverJumper", "mujoco": "SolverMuJoCo"}
 Log = TypeVar("Log", bound=EvaluationLog)
