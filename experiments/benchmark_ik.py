@@ -28,14 +28,14 @@ class Args(DeviceArgs):
     poses: int = 65536
     """Robots per launch, four legs each."""
     repeats: int = 5
-    """Timed launches; the median counts."""
+    """Number of timed launches; the median is reported."""
     scatter: float = 0.3
-    """Half edge [m] of the cube around each paw's reachable position that the scattered targets fill."""
+    """[m] Half edge of the cube around each paw's reachable position that the scattered targets fill."""
     seed: int = 0
 
 
 def main(args: Args) -> dict:
-    """Run the benchmark and return its metrics."""
+    """Run the benchmark, write and return its metrics. Raises RuntimeError: a reachable target is not reached."""
     info, device, n = configure_device(args.device), wp.get_device(args.device), args.poses
     folder = output_dir("benchmark_ik", args.out)
     description, rng = load_description(), np.random.default_rng(args.seed)

@@ -5,7 +5,7 @@
 A policy step is 8 physics steps of 1/480 s, motors included. Both solvers replay a captured graph. The outcome is
 checked before timing: the robots must stand, or reach their apex. `--baseline PATH` also runs the script of another
 checkout and reports the speed ratio. `--threads 1 2` compares numbers of CPU threads, on physics and on whole
-environments; all other metrics are those of the last number.
+environments; all other metrics are measured with the last number.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class Args(DeviceArgs):
     """Numbers of environments, one run for each."""
     solvers: list[SolverName] = field(default_factory=lambda: ["jumper", "mujoco"])
     repeats: int = 5
-    """Timed repetitions; the median counts."""
+    """Number of timed repetitions; the median is reported."""
     steps: int = 100
-    """Policy steps in a repetition, standing."""
+    """Number of policy steps in a repetition of the standing test."""
     baseline: Path | None = None
     """Root of another checkout to compare with."""
     threads: list[int] | None = None
@@ -48,7 +48,7 @@ class Args(DeviceArgs):
 
 
 def main(args: Args) -> dict:
-    """Run the benchmark and return its metrics."""
+    """Run the benchmark, write and return its metrics. Raises InputError: threads compared on a GPU."""
     values: dict = {"device": configure_device(args.device, args.threads[-1] if args.threads else None).name}
     if args.threads and wp.get_device(args.device).is_cuda:
         raise InputError("threads are compared on a CPU; add --device cpu")

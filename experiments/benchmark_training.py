@@ -1,4 +1,4 @@
-"""Benchmark of training: speed of solver, environment and PPO, and shares of their parts.
+"""Benchmark of training: speed of solver, environment and PPO, and fractions of time of their parts.
 
     python experiments/benchmark_training.py --envs 4096 8192 16384 --out outputs/benchmark_training
 
@@ -38,15 +38,15 @@ class Args(ThreadArgs):
     steps: int = 200
     """Policy steps in a repetition."""
     repeats: int = 5
-    """Repetitions of a timing; the median counts."""
+    """Number of repetitions of a timing; the median is reported."""
     iterations: int = 10
-    """Training iterations that are timed, of either trainer."""
+    """Number of timed training iterations of each trainer."""
     rsl_rl: bool = True
     """Train with rsl-rl-lib too."""
     num_steps: int = 32
     """Policy steps of each environment in an iteration."""
     variants: tuple[str, ...] = ()
-    """Variants of PPO that are timed too (`support.variants`), or all."""
+    """Names of further timed variants of PPO (`support.variants`), or all."""
     only_ppo: bool = False
     """Time PPO and its variants only."""
     baseline: Path | None = None
@@ -65,7 +65,7 @@ class Args(ThreadArgs):
 
 
 def main(args: Args) -> dict:
-    """Run the benchmark and return its metrics."""
+    """Time solver, environment and trainers as the flags say, write and return the metrics."""
     info = configure_device(args.device, args.threads)
     folder = output_dir("benchmark_training", args.out)
     gpu = wp.get_device(args.device).is_cuda

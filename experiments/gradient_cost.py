@@ -6,7 +6,7 @@
 The same jump (squat, push-off, flight; 36 policy steps of 8 physics steps) is run by the solver's kernel with the
 command filter, and as a rollout with its reverse pass, which differentiates by all parameters, targets and the initial
 state. Both run in single precision, with the solver's default tolerance, on one thread of a CPU. The errors of the
-gradient are those against double precision.
+gradient are relative to double precision.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class Args(DeviceArgs):
     num_envs: int | None = None
     """Number of environments (default: 64 on a CPU, 4096 on a GPU)."""
     repeats: int = 7
-    """Timed repetitions; the fastest counts, and the two kinds take turns."""
+    """Number of timed repetitions; simulation and gradient alternate, and the fastest time of each is reported."""
     double: bool = False
     """Whether to compute in double precision."""
 
@@ -44,7 +44,7 @@ class Args(DeviceArgs):
 
 
 def main(args: Args) -> dict:
-    """Run the comparison and return its metrics."""
+    """Time simulation, rollout and gradient, compare the gradient with double precision, and return the metrics."""
     name, device = configure_device(args.device, 1).name, wp.get_device(args.device)
     folder = output_dir("gradient_cost", args.out)
     worlds = args.num_envs or (4096 if device.is_cuda else 64)

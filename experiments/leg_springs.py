@@ -56,14 +56,14 @@ class Args(DeviceArgs):
             with_springs(stiffness, self.rest_length)
 
     def jumps(self, name: str) -> SpringJumps:
-        """Return the jumps with the command filter of a name in FILTERS."""
+        """Return the jumps with these flags and the command filter `name`, a key of FILTERS."""
         motors = jumping_motors(self.torque_limit)
         motors = replace(motors, transversal=replace(motors.transversal, kp=self.kp))
         return SpringJumps(motors, name, self.gravity, self.rest_length, self.device)
 
 
 def main(args: Args) -> dict:
-    """Run the jumps of all springs, plot apex over stiffness, and return the metrics."""
+    """Run the jumps of all springs and squats, plot apex over stiffness, and return the metrics."""
     start = time.perf_counter()
     folder = prepare("leg_springs", args)
     values: dict[str, Any] = {"gravity_m_s2": args.gravity, "torque_limit_nm": args.torque_limit, "kp_nm_rad": args.kp,

@@ -36,7 +36,7 @@ from support.scripts import DeviceArgs, parse_flags, prepare
 HARDWARE_APEX = 1.075  # [m] Paper, open loop on the robot at 18 N m
 STRIP_TIMES = (0.9, 2.2, 2.32, 2.45, 2.7, 2.95, 3.15, 3.8)
 """[s] Times of the filmstrip's pictures: standing, squatting, push-off, rising, apex, falling, landing, standing."""
-PER_MOTOR = tuple(f"peak_{what}_{leg}" for what in ("torque", "speed") for leg in LEGS)
+PER_MOTOR = tuple(f"peak_{quantity}_{leg}" for quantity in ("torque", "speed") for leg in LEGS)
 """Prefixes of the metrics that are saved but not printed."""
 
 
@@ -67,7 +67,7 @@ class Args(DeviceArgs):
 
 
 def save_filmstrip(frames: list[np.ndarray], path: Path) -> None:
-    """Write pictures of the robot at STRIP_TIMES; frames: body poses of every policy step, (21, 7) each."""
+    """Write pictures of the robot at STRIP_TIMES into a PNG file; frames: link poses of every policy step, (21, 7)."""
     model = build_model(1)
     state = model.state()
     camera, pictures = Camera(model, eye=(1.6, 2.0, 0.75), target=(0.0, 0.0, 0.55), size=(300, 400)), []

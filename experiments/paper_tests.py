@@ -34,7 +34,7 @@ class Args(EvaluationArgs):
 
 
 def main(args: Args) -> dict:
-    """Run all tests, and return the metrics that also have a value in the paper."""
+    """Run all suites, print a table, and return the metrics with a value in the paper, `<policy>_<suite>_<metric>`."""
     folder, values = output_dir("paper_tests", args.out), {}
     table = Table("policy", "test", "metric", "here", "paper")
     for policy in args.policies:

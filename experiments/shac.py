@@ -3,7 +3,7 @@
     python experiments/shac.py --num-envs 4096 --seconds 120 --out outputs/shac          # on a GPU
     python experiments/shac.py --num-envs 128 --seconds 300 --hidden 64 64 --history 1 --seeds 0     # on a CPU
 
-First the variance of the policy gradient between worlds is measured over the length of the window, through the physics
+First the variance of the policy gradient between worlds is measured for windows of several lengths, through the physics
 and by the score function of PPO, for random and for trained weights. Then both train. Every few seconds of training
 time, the policy is evaluated on jumps to heights of 0.5 to 1.1 m; time and steps to success rates are reported.
 """
@@ -55,7 +55,7 @@ class Args(DeviceArgs):
     hidden: tuple[int, ...] = (256, 128, 128)
     """Widths of the hidden layers of both."""
     history: int | None = None
-    """Policy steps that the policies of trainings see, as `jumper train --history` (default: as the task says)."""
+    """Number of policy steps in the observation, as `jumper train --history` (default: the task's)."""
     num_jumps: int = 200
     """Number of jumps of an evaluation."""
     horizons: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64)
@@ -70,13 +70,13 @@ class Args(DeviceArgs):
 
 
 def make_env(args: Args, num_envs: int, seed: int = 0, *, history: int | None = None) -> Env:
-    """Return an environment of the nominal task; history: number of policy steps in the observation."""
+    """Return an environment of the nominal task; history: policy steps in the observation, None: the task's."""
     task = with_history(make_task(TASK), history)
     return Env(task, num_envs, seed=seed, device=args.device, randomize=False, noise=False)
 
 
 def train(args: Args, algorithm: str, seed: int) -> LearningCurve:
-    """Train with "ppo" or "shac" and a seed, and return the learning curve."""
+    """Train with an algorithm, "ppo" or "shac", and a seed, and return the learning curve."""
     torch.manual_seed(seed)
     env, settings = make_env(args, args.num_envs, seed, history=args.history), trainer_settings(TASK)
     eval_env = make_eval_env(env.tasks[0], args.num_jumps, args.device)
@@ -90,7 +90,7 @@ def train(args: Args, algorithm: str, seed: int) -> LearningCurve:
 
 
 def compare(args: Args, folder: Path) -> dict[str, Any]:
-    """Train with every trainer and seed, plot the learning curves, and return the metrics."""
+    """Train with every trainer and seed, plot the learning curves into `folder`, and return the metrics."""
     values, curves = {}, {trainer: [] for trainer in args.trainers}
     for trainer in args.trainers:
         for seed in args.seeds:
