@@ -18,12 +18,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.attitude import DIRECTIONS, AttitudeFlags, AttitudeLog, random_turns, turn_metrics
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from support.momentum import MomentumRecorder, rotational_inertia
-from support.scripts import parse_flags
+from support.scripts import run_script
 
 HARDWARE = {"mean_settling_s": 2.6}  # Settling time of the authors' robot, 90 degrees
 COLORS = ("tab:red", "tab:green", "tab:blue")  # Of turns about x, y, z
@@ -83,4 +82,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

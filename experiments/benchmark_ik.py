@@ -12,12 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.robot.description import load_description
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from support.inverse_kinematics import InverseKinematics, random_motors
-from support.scripts import DeviceArgs, parse_flags, report
+from support.scripts import DeviceArgs, report, run_script
 from support.timing import median_time
 
 
@@ -57,9 +56,8 @@ def main(args: Args) -> dict:
         "scattered_time [ms]": 1.0e3 * times[1],
         "scattered_reachable [%]": 100.0 * robots.reachable.numpy().mean(),
     }
-    report(folder, values)
-    return values
+    return report(folder, values)
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

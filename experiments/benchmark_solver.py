@@ -15,13 +15,12 @@ from pathlib import Path
 
 import warp as wp
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.threads import checked_threads
-from support.scripts import DeviceArgs, parse_flags, report
+from support.scripts import DeviceArgs, report, run_script
 from support.speed import time_solver, time_threads
 from support.timing import baseline_ratios
 
@@ -64,9 +63,8 @@ def main(args: Args) -> dict:
         prefix = "" if len(args.envs) == 1 else f"envs_{envs}_"
         values |= {f"{prefix}{name}": value for name, value in metrics.items()}
     values |= {"envs": args.envs, **baseline_ratios(args.baseline, "experiments/benchmark_solver.py", args, values)}
-    report(folder, values)
-    return values
+    return report(folder, values)
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

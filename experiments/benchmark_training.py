@@ -16,12 +16,11 @@ from pathlib import Path
 
 import warp as wp
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
-from support.scripts import ThreadArgs, parse_flags, report
+from support.scripts import ThreadArgs, report, run_script
 from support.speed import time_parts, time_ppo, time_rsl_rl
 from support.timing import baseline_ratios
 from support.variants import VARIANTS, variant
@@ -86,9 +85,8 @@ def main(args: Args) -> dict:
         values |= time_rsl_rl(train_envs, args.num_steps, args.iterations, args.device)
         values["ppo_over_rsl_rl"] = values["ppo_steps_per_s"] / values["rsl_rl_steps_per_s"]
     values |= baseline_ratios(args.baseline, "experiments/benchmark_training.py", args, values)
-    report(folder, values)
-    return values
+    return report(folder, values)
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

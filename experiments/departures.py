@@ -21,12 +21,11 @@ from typing import Any
 
 from rich.console import Console
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.departure_runs import BASELINE, JUMP_TASKS, TESTS, WIDTH, JumpTask, evaluate, parse, report, train_or_load
 from support.departures import DEPARTURES, Ablation, ablation_flags
-from support.scripts import ThreadArgs, parse_flags, prepare
+from support.scripts import ThreadArgs, prepare, run_script
 
 
 @dataclass(frozen=True)
@@ -103,4 +102,4 @@ def main(args: Args) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

@@ -15,14 +15,13 @@ from pathlib import Path
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
 from support.agreement import jumper_quantities, pinocchio_quantities, random_states
-from support.scripts import parse_flags
+from support.scripts import run_script
 
 UNITS = {  # by quantity of `support.agreement`
     "base_acceleration": "m/s^2",
@@ -78,4 +77,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

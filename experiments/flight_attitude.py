@@ -18,11 +18,10 @@ from typing import Literal
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.run import EvaluationArgs
 from jumper_warp.utils.errors import InputError
 from support.flights import FlightLog, FlightRun, extension_delays, flight_metrics, plot_flights
-from support.scripts import parse_flags
+from support.scripts import run_script
 
 
 @dataclass(frozen=True)
@@ -72,4 +71,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

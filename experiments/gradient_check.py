@@ -14,11 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.diff.rollout import Trajectory
 from jumper_warp.evaluation.plots import figure
 from support.gradients import INNER, OUTER, TICKS, GradientJump, GradientPair, apex, check, schedule
-from support.scripts import DeviceArgs, parse_flags, prepare, report
+from support.scripts import DeviceArgs, prepare, report, run_script
 
 WEAK_PUSH = (20.0, 20.0)  # [deg] Commands of the push-off that the ascent starts from
 ASCENT_STEPS = 20  # Number of steps of the gradient ascent
@@ -93,9 +92,8 @@ def main(args: DeviceArgs) -> dict:
         "seconds": time.perf_counter() - start,
     }
     plot_gradients(jump, checks["actions"], ascent, folder / "gradients.png")
-    report(folder, values)
-    return values
+    return report(folder, values)
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(DeviceArgs)))
+    run_script(main, DeviceArgs)

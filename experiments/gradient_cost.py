@@ -16,14 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from support.gradient_runs import GradientRun, PlainJump
 from support.gradients import PUSH, TICKS, schedule
-from support.scripts import DeviceArgs, parse_flags, report
+from support.scripts import DeviceArgs, report, run_script
 from support.timing import device_memory, wall_time
 
 
@@ -79,9 +78,8 @@ def main(args: Args) -> dict:
     }
     if device.is_cuda:
         values["memory_kib_a_world"] = (device_memory(device) - before) / worlds / 1024.0
-    report(folder, values)
-    return values
+    return report(folder, values)
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

@@ -16,7 +16,6 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.identification.parameters import jumper_parameters
 from jumper_warp.identification.recording import KINDS, replay_plan, simulate_plan
 from jumper_warp.identification.replay import MotionReplay
@@ -25,7 +24,7 @@ from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from support.identification_methods import compare_methods
 from support.known_robots import make_case, plot_cases, policy_errors, run_case
-from support.scripts import parse_flags, report
+from support.scripts import report, run_script
 
 REFINE = 16  # Physics steps of the finer truth per step of the model
 Part = Literal["same", "fine", "rough", "mujoco", "methods", "policy"]
@@ -96,9 +95,8 @@ def main(args: Args) -> dict[str, Any]:
         values |= policy_errors(args.policy, args.num_jumps, cases[0][0], cases[0][2], folder)
     if rows:
         plot_cases(rows, folder / "identification.png")
-    report(folder, values)
-    return values
+    return report(folder, values)
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

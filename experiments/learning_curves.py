@@ -20,13 +20,12 @@ from typing import Any
 
 import warp as wp
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.learning import TEST_HEIGHTS, LearningCurve, curve_metrics, plot_curves, train_and_time
-from support.scripts import DeviceArgs, parse_flags, prepare
+from support.scripts import DeviceArgs, prepare, run_script
 from support.variants import DEFAULT, variant
 
 TASK = "vertical-jump"
@@ -95,4 +94,4 @@ def main(args: Args) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

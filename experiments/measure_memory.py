@@ -18,12 +18,11 @@ from pathlib import Path
 
 import warp as wp
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.output import output_dir, write_metrics
-from support.scripts import parse_flags
+from support.scripts import run_script
 
 
 @dataclass(frozen=True)
@@ -75,4 +74,4 @@ def main(args: Args) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

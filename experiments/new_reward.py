@@ -17,11 +17,10 @@ import torch
 import warp as wp
 
 from jumper_warp import Env, make_task, mdp
-from jumper_warp.cli.main import run_command
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.runner import train
 from jumper_warp.utils.output import output_dir, write_metrics
-from support.scripts import parse_flags
+from support.scripts import run_script
 
 
 @wp.func
@@ -78,4 +77,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

@@ -16,7 +16,6 @@ from typing import Any, Literal, cast
 
 import torch
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.diff.differentiable_env import DifferentiableEnv
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.vec_env import DifferentiableVecEnv
@@ -29,7 +28,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.gradient_variance import measure_stats, plot_variances, print_variances, variance_metrics
 from support.learning import LearningCurve, curve_metrics, make_eval_env, plot_curves, train_and_evaluate
-from support.scripts import DeviceArgs, parse_flags, prepare
+from support.scripts import DeviceArgs, prepare, run_script
 
 TASK = "vertical-jump"
 
@@ -116,4 +115,4 @@ def main(args: Args) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

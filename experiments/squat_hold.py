@@ -14,11 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.utils.errors import InputError
-from support.scripts import parse_flags
+from support.scripts import run_script
 from support.squats import SquatLog, squat_goals, squat_metrics
 
 
@@ -74,4 +73,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

@@ -27,12 +27,11 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.motion_replay import MotionReplay, plot_replays
-from support.optimized_jumps import FINE, JUMPS, LIMITED, around, optimise
-from support.scripts import ThreadArgs, parse_flags, prepare
+from support.optimized_jumps import FINE, JUMPS, LIMITED, noisy_variants, optimise
+from support.scripts import ThreadArgs, prepare, run_script
 
 ALL_JUMPS = JUMPS | LIMITED  # By name
 
@@ -72,7 +71,7 @@ def run_jump(name: str, args: Args, folder: Path, best: dict[str, np.ndarray]) -
     knots, rng = jump.make(**FINE, **settings).knots, np.random.default_rng(args.seed)
     begin = jump.draw(knots, args.samples or jump.samples, rng)
     if jump.after in best:
-        begin = np.concatenate([begin, around(best[jump.after], knots, rng)])
+        begin = np.concatenate([begin, noisy_variants(best[jump.after], knots, rng)])
     last = args.final_iterations or jump.polish
     progress, steps = optimise(jump.scaled(args.effort), begin, args.seed, last, **settings)
     x = best[name] = progress.x[progress.best]
@@ -112,4 +111,4 @@ def main(args: Args) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

@@ -16,14 +16,13 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_course
 from jumper_warp.evaluation.landings import random_headings
 from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.utils.errors import InputError
-from support.scripts import parse_flags
+from support.scripts import run_script
 from support.walks import PAPER
 
 REACH, EACH = 0.8, 2.0  # [m/s] and [rad/s] Limit of commanded velocities; [s] time of each walking command
@@ -109,4 +108,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

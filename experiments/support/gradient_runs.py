@@ -79,5 +79,5 @@ class GradientRun:
         return self.rollout.run(self._targets, self._q, self._qd)
 
     def run(self) -> dict[str, wp.array]:
-        """Simulate the jump, return the gradients of the final base height by input, shapes as in `Rollout.backward`."""
+        """Simulate the jump, return the gradients of the final base height by input, as `Rollout.backward`."""
         return self.rollout.backward(self.forward(), q=self._cotangent)

@@ -56,7 +56,7 @@ def gradients(env: DifferentiableEnv, network: Network, horizon: int, std: float
     """Return each world's gradient of the reward of a window, (worlds, weights), by physics and by the score function.
 
     The window of `horizon` policy steps starts at the present state; rewards of a world count until its episode ends.
-    std: of the action noise [1]. The advantage of the score function is the remaining reward minus its mean over worlds.
+    std: of action noise [1]. The advantage of the score function is the remaining reward minus its mean over worlds.
     """
     env.begin_window()
     tape, score_tape, scores, rewards = Tape(), Tape(), [], []

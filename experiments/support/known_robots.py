@@ -44,7 +44,7 @@ Simulate = Callable[[Plan, RobotValues], Record]  # Returns the trajectory of a 
 
 
 def make_case(parameters: ParameterSet, seed: int, simulate: Simulate, replay: MotionReplay) -> Case:
-    """Return a random robot with its recorded motions; simulate: stands in for the real robot; replay: checks safety."""
+    """Return a random robot with its recorded motions; simulate: replaces the real robot; replay: checks safety."""
     rng = np.random.default_rng(seed)
     z = np.clip(SPREAD * rng.normal(size=len(parameters)), -MOST, MOST)
     late = parameters.names.index("latency")

@@ -11,7 +11,7 @@ from jumper_warp.evaluation.velocities import VelocityFlags, VelocityLog, Veloci
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
 from support import gaits
-from support.walks import kept_speeds, settling_times, step_commands, top_speed, walked_share
+from support.walks import kept_speeds, settling_times, step_commands, top_speed, walked_fraction
 
 DT = 1.0 / 60.0
 TASK = make_task("velocity-flat")
@@ -106,12 +106,12 @@ def test_command_history_starts_one_step_after_command():
     np.testing.assert_array_equal(walks.command_history()[:, 0, 0], [0.0] * 60 + [1.0] * 60)
 
 
-def test_walked_share_stops_at_fall():
+def test_walked_fraction_stops_at_fall_and_is_at_most_1():
     commands = np.tile([0.5, 0.0, 0.0], (ROBOTS, 1, 1))
     walks = walk_log(lambda t: np.tile([0.3, 0.1, 0.0], (ROBOTS, 1)), seconds=3.0, commands=commands, falls={2: 91})
-    assert walked_share(walks) == pytest.approx([0.9, 0.9, 0.45], rel=1e-5)  # of the last two seconds
+    assert walked_fraction(walks) == pytest.approx([0.9, 0.9, 0.45], rel=1e-5)  # of the last two seconds
     fast = walk_log(lambda t: np.tile([0.9, 0.0, 0.0], (ROBOTS, 1)), commands=commands)
-    assert walked_share(fast) == pytest.approx([1.0] * 3)
+    assert walked_fraction(fast) == pytest.approx([1.0] * 3)
 
 
 def test_top_speed_is_of_highest_bin_that_is_kept():
