@@ -48,14 +48,10 @@ def main(args: Args) -> dict:
         raise RuntimeError(f"{100.0 * reached:.4f} % reached, residual {max_residual:.2e} m: the time means nothing")
     times = [median_time(lambda aim=aim: robots.solve(aim), device, repeats=args.repeats) for aim in (paws, scattered)]
     values = {
-        "device": info.name,
-        "poses": n,
-        "reachable_time [ms]": 1.0e3 * times[0],
-        "reachable_rate [poses/s]": n / times[0],
-        "reachable_max_residual [m]": max_residual,
-        "scattered_time [ms]": 1.0e3 * times[1],
-        "scattered_reachable [%]": 100.0 * robots.reachable.numpy().mean(),
-    }
+        "device": info.name, "poses": n, "reachable_time [ms]": 1.0e3 * times[0],
+        "reachable_rate [poses/s]": n / times[0], "reachable_max_residual [m]": max_residual,
+        "scattered_time [ms]": 1.0e3 * times[1], "scattered_reachable [%]": 100.0 * robots.reachable.numpy().mean(),
+    }  # fmt: skip
     return report(folder, values)
 
 

@@ -86,11 +86,9 @@ def main(args: DeviceArgs) -> dict:
         for name, (gradient, differenced) in checks.items()
     }
     values |= {
-        "jump_apex_m": float(apex(jump)[0]),
-        "apex_before_m": ascent.apex[0],
-        "apex_after_m": ascent.apex[-1],
+        "jump_apex_m": float(apex(jump)[0]), "apex_before_m": ascent.apex[0], "apex_after_m": ascent.apex[-1],
         "seconds": time.perf_counter() - start,
-    }
+    }  # fmt: skip
     plot_gradients(jump, checks["actions"], ascent, folder / "gradients.png")
     return report(folder, values)
 

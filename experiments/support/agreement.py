@@ -34,13 +34,10 @@ def random_states(n: int, seed: int) -> States:
     rng = np.random.default_rng(seed)
     quat = rng.normal(size=(n, 4))
     return {
-        "quat": quat / np.linalg.norm(quat, axis=1, keepdims=True),
-        "com_vel": rng.normal(size=(n, 3)),
-        "ang_vel": 2.0 * rng.normal(size=(n, 3)),
-        "angles": random_motors(load_description(), n, rng, MARGIN).T,
-        "rates": 4.0 * rng.normal(size=(n, 12)),
-        "torque": rng.uniform(-18.0, 18.0, (n, 12)),
-    }
+        "quat": quat / np.linalg.norm(quat, axis=1, keepdims=True), "com_vel": rng.normal(size=(n, 3)),
+        "ang_vel": 2.0 * rng.normal(size=(n, 3)), "angles": random_motors(load_description(), n, rng, MARGIN).T,
+        "rates": 4.0 * rng.normal(size=(n, 12)), "torque": rng.uniform(-18.0, 18.0, (n, 12)),
+    }  # fmt: skip
 
 
 def jumper_quantities(values: RobotValues, states: States) -> Quantities:

@@ -32,17 +32,12 @@ HOLD = 3.0  # [s] Time for which squats are held
 TESTS = ("nominal", "randomized")  # Robots of the evaluations
 BASELINE = "kept"  # Name of the training with all departures
 COLUMNS = {
-    "error [mm]": ("error_m", 1000.0),
-    "success [%]": ("success_rate", 100.0),
-    "falls [%]": ("fall_rate", 100.0),
-    "still [%]": ("still_landing_rate", 100.0),
-    "hops again [%]": ("second_takeoff_rate", 100.0),
-    "at rest [%]": ("at_rest_within_1_s_rate", 100.0),
-    "largest tilt [deg]": ("max_landing_tilt_deg", 1.0),
-    "waits [%]": ("holding_rate", 100.0),
-    "paw force varies [N]": ("median_paw_force_range_n", 1.0),
+    "error [mm]": ("error_m", 1000.0), "success [%]": ("success_rate", 100.0), "falls [%]": ("fall_rate", 100.0),
+    "still [%]": ("still_landing_rate", 100.0), "hops again [%]": ("second_takeoff_rate", 100.0),
+    "at rest [%]": ("at_rest_within_1_s_rate", 100.0), "largest tilt [deg]": ("max_landing_tilt_deg", 1.0),
+    "waits [%]": ("holding_rate", 100.0), "paw force varies [N]": ("median_paw_force_range_n", 1.0),
     "torque ripple [N m]": ("mean_torque_ripple_nm", 1.0),
-}
+}  # fmt: skip
 """Columns of the table: metric and scale; cells are nominal / randomised."""
 WIDTH = 180  # Width of the table in characters
 MetricsByTraining = dict[tuple[str, int], dict[str, dict[str, Any]]]  # Metrics by training (name, seed), test and name

@@ -85,16 +85,13 @@ def accuracy(parameters: ParameterSet, case: Case, result: Identification) -> di
 
     error = np.abs(result.z - case.truth) / np.maximum(result.std, 1.0e-9)
     return {
-        "kp_worst_percent": 100.0 * worst("kp", True),
-        "kd_worst_percent": 100.0 * worst("kd", True),
+        "kp_worst_percent": 100.0 * worst("kp", True), "kd_worst_percent": 100.0 * worst("kd", True),
         "base_mass_percent": 100.0 * worst("base_mass", True),
         "offset_worst_deg": float(np.degrees(worst("offset", False))),
-        "armature_worst_percent": 100.0 * worst("armature", True),
-        "latency_us": 1.0e6 * worst("latency", False),
+        "armature_worst_percent": 100.0 * worst("armature", True), "latency_us": 1.0e6 * worst("latency", False),
         "coverage": float(np.mean(error[result.identified] < 1.96)),
-        "error_over_deviation_rms": float(np.sqrt(np.mean(error[result.identified] ** 2))),
-        "mismatch": result.mismatch,
-    }
+        "error_over_deviation_rms": float(np.sqrt(np.mean(error[result.identified] ** 2))), "mismatch": result.mismatch,
+    }  # fmt: skip
 
 
 def run_case(

@@ -77,8 +77,6 @@ class MomentumRecorder:
         turned = np.linalg.solve(inertia[~diverged], drift.sum(axis=0)[..., None])[..., 0] * self.env.step_dt
         size, turn = np.linalg.norm(drift, axis=-1), np.degrees(np.linalg.norm(turned, axis=-1))
         return {
-            "max_angular_momentum_nm_s": float(size.max()),
-            "mean_angular_momentum_at_end_nm_s": float(size[-1].mean()),
-            "mean_turn_by_drift_deg": float(turn.mean()),
-            "max_turn_by_drift_deg": float(turn.max()),
-        }
+            "max_angular_momentum_nm_s": float(size.max()), "mean_angular_momentum_at_end_nm_s": float(size[-1].mean()),
+            "mean_turn_by_drift_deg": float(turn.mean()), "max_turn_by_drift_deg": float(turn.max()),
+        }  # fmt: skip

@@ -200,14 +200,11 @@ JUMPS = {
     ),
 }  # fmt: skip
 LIMITS: dict[str, tuple[str, dict[str, Any]]] = {
-    "torque_24_8": ("24.8 N m", {"torque": 24.8}),
-    "speed": ("motor speeds × 1.5", {"speed": 1.5}),
-    "friction_1_5": ("friction 1.5", {"friction": 1.5}),
-    "friction_0_6": ("friction 0.6", {"friction": 0.6}),
-    "pitch": ("any pitch at landing", {"pitch": FREE}),
-    "stance": ("stance beyond 0.3 m", {"away": FREE}),
+    "torque_24_8": ("24.8 N m", {"torque": 24.8}), "speed": ("motor speeds × 1.5", {"speed": 1.5}),
+    "friction_1_5": ("friction 1.5", {"friction": 1.5}), "friction_0_6": ("friction 0.6", {"friction": 0.6}),
+    "pitch": ("any pitch at landing", {"pitch": FREE}), "stance": ("stance beyond 0.3 m", {"away": FREE}),
     "filter": ("loose command filter", {"command_filter": loose_filter}),
-}
+}  # fmt: skip
 """Limits of the farthest flight: label, and the changed settings of its problem."""
 LIMITED = {
     f"farthest_{name}": replace(

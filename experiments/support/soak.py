@@ -174,12 +174,7 @@ def soak_metrics(counters: SoakCounters, count: int, wall: float) -> dict:
     """Return the metrics by name; count: policy steps of all worlds together; wall: time for them [s]."""
     totals = counters.read()
     return {
-        "steps": count,
-        "non_finite_worlds": totals.flagged,
-        "non_finite_rows": totals.rows,
-        "largest_speed_m_s": totals.speed,
-        "largest_joint_speed_rad_s": totals.joint_speed,
-        "share_of_steps_contact_unsolved": totals.unsolved / count,
-        "wall_s": wall,
-        "steps_per_s": count / wall,
-    }
+        "steps": count, "non_finite_worlds": totals.flagged, "non_finite_rows": totals.rows,
+        "largest_speed_m_s": totals.speed, "largest_joint_speed_rad_s": totals.joint_speed,
+        "share_of_steps_contact_unsolved": totals.unsolved / count, "wall_s": wall, "steps_per_s": count / wall,
+    }  # fmt: skip

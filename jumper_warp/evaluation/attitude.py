@@ -156,19 +156,15 @@ def turn_metrics(turns: AttitudeLog) -> Metrics:
     """Return the metrics of turns by name, which ends with the unit; times are over settled turns, rates over all."""
     settling, outcomes = turns.settling_time, turns.outcomes
     metrics: Metrics = {
-        "turns": len(outcomes),
-        "mean_angle_deg": mean(np.degrees(turns.angle)),
-        "tolerance_deg": turns.tolerance,
+        "turns": len(outcomes), "mean_angle_deg": mean(np.degrees(turns.angle)), "tolerance_deg": turns.tolerance,
         "success_rate": float(turns.success.mean()),
         "within_2_6_s_rate": float((turns.success & (np.nan_to_num(settling, nan=np.inf) <= HARDWARE_TIME)).mean()),
-        "mean_error_at_end_deg": mean(np.degrees(turns.error)),
-        "mean_first_s": mean(turns.first_time),
+        "mean_error_at_end_deg": mean(np.degrees(turns.error)), "mean_first_s": mean(turns.first_time),
         "mean_settling_s": mean(settling),
         "max_settling_s": mean(settling[settling == np.nanmax(settling)]) if np.isfinite(settling).any() else None,
-        "mean_spin_at_end_rad_s": mean(turns.angular_speeds[-1]),
-        "collision_rate": float(turns.collided.mean()),
+        "mean_spin_at_end_rad_s": mean(turns.angular_speeds[-1]), "collision_rate": float(turns.collided.mean()),
         DIVERGED: int(turns.diverged.sum()),
-    }
+    }  # fmt: skip
     return metrics | failed_by(outcomes[~turns.success])
 
 

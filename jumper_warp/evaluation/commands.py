@@ -54,11 +54,9 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.seed)
     run.run_episodes(run.env(log.count), log)
     metrics = {
-        "task": run.policy.interface.task,
-        **run.condition_metrics,
-        "noise": cfg.conditions.noise,
+        "task": run.policy.interface.task, **run.condition_metrics, "noise": cfg.conditions.noise,
         **cfg.flags.metrics(log),
-    }
+    }  # fmt: skip
     write_metrics(run.folder, metrics)
     rows = f"{log.row_name}s.csv"
     (run.folder / rows).write_text(csv_text(log))

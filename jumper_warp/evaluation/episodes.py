@@ -102,17 +102,14 @@ def episode_metrics(episodes: EpisodeLog) -> Metrics:
     success, timed_out = episodes.ended_with("success"), episodes.ended_with("time_out")
     distance = np.linalg.norm(episodes.displacement, axis=1)
     metrics: Metrics = {
-        "episodes": len(outcomes),
-        "mean_episode_s": mean(episodes.length),
-        "success_rate": float(success.mean()),
-        "failure_rate": float((~running & ~success & ~timed_out).mean()),
-        "no_end_rate": float(running.mean()),
+        "episodes": len(outcomes), "mean_episode_s": mean(episodes.length), "success_rate": float(success.mean()),
+        "failure_rate": float((~running & ~success & ~timed_out).mean()), "no_end_rate": float(running.mean()),
         "mean_base_height_m": mean(finite(episodes.mean_height)),
         "mean_base_height_at_the_end_m": mean(finite(episodes.end_position[:, 2])),
         "mean_distance_from_start_m": mean(finite(distance)),
         "mean_moved_x_m": mean(finite(episodes.displacement[:, 0])),
         "mean_moved_y_m": mean(finite(episodes.displacement[:, 1])),
-    }
+    }  # fmt: skip
     return metrics | {f"ended_by_{name}": int((outcomes == name).sum()) for name in sorted(set(outcomes))}
 
 

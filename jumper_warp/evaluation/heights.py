@@ -148,17 +148,13 @@ def apex_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
     """
     success, outcomes = jumps.success, jumps.outcomes
     metrics: Metrics = {
-        **apex_error_metrics(jumps, in_range),
-        "max_abs_error_of_successes_m": largest(np.abs(jumps.error)[success]),
-        "success_rate": mean(success),
-        "success_rate_in_range": mean(success[within(jumps.commanded, in_range)]),
-        "range_lower_m": in_range[0],
-        "range_upper_m": in_range[1],
+        **apex_error_metrics(jumps, in_range), "max_abs_error_of_successes_m": largest(np.abs(jumps.error)[success]),
+        "success_rate": mean(success), "success_rate_in_range": mean(success[within(jumps.commanded, in_range)]),
+        "range_lower_m": in_range[0], "range_upper_m": in_range[1],
         "at_rest_within_1_s_rate": mean((jumps.rest_speed < REST_SPEED)[success]),
         "mean_landing_tilt_deg": mean(np.degrees(jumps.tilt[success])),
-        "fall_rate": mean(np.isin(outcomes, (*FALLS, COLLIDED, DIVERGED))),
-        "miss_rate": mean(outcomes == WRONG_HEIGHT),
-    }
+        "fall_rate": mean(np.isin(outcomes, (*FALLS, COLLIDED, DIVERGED))), "miss_rate": mean(outcomes == WRONG_HEIGHT),
+    }  # fmt: skip
     return metrics | failed_by(outcomes[~success])
 
 
@@ -170,15 +166,11 @@ def apex_error_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metri
     error, landed = np.abs(jumps.error), jumps.landed
     beyond = (jumps.drift > DRIFT) | (np.degrees(np.abs(jumps.yaw)) > TURN)
     return {
-        "jumps": len(jumps.end),
-        "mean_abs_error_m": mean(error),
-        "mean_abs_error_in_range_m": mean(error[within(jumps.commanded, in_range)]),
-        **stance_metrics(jumps),
-        "second_takeoff_rate": mean((jumps.takeoffs > 0)[landed]),
-        **mean_and_max("drift_m", jumps.drift[landed]),
-        "beyond_authors_drift_or_turn_rate": mean(beyond[landed]),
-        DIVERGED: int(np.isnan(error).sum()),
-    }
+        "jumps": len(jumps.end), "mean_abs_error_m": mean(error),
+        "mean_abs_error_in_range_m": mean(error[within(jumps.commanded, in_range)]), **stance_metrics(jumps),
+        "second_takeoff_rate": mean((jumps.takeoffs > 0)[landed]), **mean_and_max("drift_m", jumps.drift[landed]),
+        "beyond_authors_drift_or_turn_rate": mean(beyond[landed]), DIVERGED: int(np.isnan(error).sum()),
+    }  # fmt: skip
 
 
 def sweep_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
@@ -191,21 +183,15 @@ def sweep_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
     tilt, at_rest = np.where(np.isnan(jumps.error), 0.0, np.degrees(jumps.tilt)), jumps.rest_speed < REST_SPEED
     landed = jumps.landed & (tilt < LEVEL_TILT) & at_rest
     return {
-        **apex_error_metrics(jumps, in_range),
-        "mean_error_m": mean(jumps.error),
-        "success_rate": mean(near),
+        **apex_error_metrics(jumps, in_range), "mean_error_m": mean(jumps.error), "success_rate": mean(near),
         "success_and_landing_rate": mean(near & landed),
         "success_rate_in_range": mean(near[within(commanded, in_range)]),
         "success_rate_0_6_1_1": mean(near[within(commanded, (0.6, 1.1))]),
-        "largest_reached_m": largest(jumps.error + commanded),
-        "landing_rate": mean(landed),
-        "fall_rate": mean(np.isin(jumps.ends, FALLS)),
-        "miss_rate": mean(jumps.landed & ~jumps.early & ~near),
-        "no_jump_rate": mean(jumps.ends == "no_jump"),
-        "early_rate": mean(jumps.early),
-        "at_rest_within_1_s_rate": mean(at_rest),
-        "largest_tilt_deg": largest(tilt),
-    }
+        "largest_reached_m": largest(jumps.error + commanded), "landing_rate": mean(landed),
+        "fall_rate": mean(np.isin(jumps.ends, FALLS)), "miss_rate": mean(jumps.landed & ~jumps.early & ~near),
+        "no_jump_rate": mean(jumps.ends == "no_jump"), "early_rate": mean(jumps.early),
+        "at_rest_within_1_s_rate": mean(at_rest), "largest_tilt_deg": largest(tilt),
+    }  # fmt: skip
 
 
 @dataclass(frozen=True)

@@ -163,17 +163,12 @@ def landing_metrics(landings: LandingLog, inside: np.ndarray | None = None) -> M
     offset = np.where(np.isnan(error)[..., None], np.nan, landings.offset)
     at_rest = "at_rest_within_1_s_rate" if landings.rest == REST_TIME else AT_REST_AT_END
     metrics: Metrics = {
-        "jumps": int(begun.sum()),
-        **mean_and_max("error_m", error),
-        **mean_and_max("error_of_successes_m", error[success]),
-        "mean_error_ahead_m": mean(offset[..., 0]),
-        "mean_error_left_m": mean(offset[..., 1]),
-        "success_rate": mean(success[begun]),
+        "jumps": int(begun.sum()), **mean_and_max("error_m", error),
+        **mean_and_max("error_of_successes_m", error[success]), "mean_error_ahead_m": mean(offset[..., 0]),
+        "mean_error_left_m": mean(offset[..., 1]), "success_rate": mean(success[begun]),
         "single_jump_success_rate": mean((success & ~landings.hopped)[begun]),
-        "step_free_success_rate": mean((success & ~landings.stepped)[begun]),
-        "landing_rate": mean(landed[begun]),
-        "second_hop_rate": mean(landings.hopped[landed]),
-        "step_rate": mean(landings.stepped[landed]),
+        "step_free_success_rate": mean((success & ~landings.stepped)[begun]), "landing_rate": mean(landed[begun]),
+        "second_hop_rate": mean(landings.hopped[landed]), "step_rate": mean(landings.stepped[landed]),
         "mean_error_at_touchdown_m": mean(landings.goal_distance(landings.touchdown)[landed]),
         "mean_error_0_3_s_after_touchdown_m": mean(landings.goal_distance(landings.position_soon)[landed]),
         **stance_metrics(landings),
@@ -181,10 +176,9 @@ def landing_metrics(landings: LandingLog, inside: np.ndarray | None = None) -> M
         at_rest: mean((landings.rest_speed < REST_SPEED)[landed]),
         "mean_landing_tilt_deg": mean(np.degrees(landings.tilt[landed])),
         "fall_rate": mean(np.isin(landings.ends, FALLS)[begun]),
-        "miss_rate": mean((landings.outcomes == MISSED)[begun]),
-        "early_rate": mean(landings.early[begun]),
+        "miss_rate": mean((landings.outcomes == MISSED)[begun]), "early_rate": mean(landings.early[begun]),
         DIVERGED: int(landings.diverged.sum()),
-    }
+    }  # fmt: skip
     if inside is not None:
         inside = begun & inside
         metrics |= {

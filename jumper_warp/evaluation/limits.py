@@ -67,13 +67,11 @@ def limit_metrics(jumps: HeightLog, limit: np.ndarray) -> Metrics:
     target, near = jumps.commanded[:, 0], jumps.reached[:, 0]
     reachable, below, inner = target <= limit + SUCCESS_TOLERANCE, target <= limit, within(target, INNER_RANGE)
     return {
-        "open_loop_limit_m": mean(limit),
-        "lowest_open_loop_limit_m": float(np.nanmin(limit)),
+        "open_loop_limit_m": mean(limit), "lowest_open_loop_limit_m": float(np.nanmin(limit)),
         "open_loop_mean_abs_error_m": mean(np.maximum(target - limit, 0.0)),
         "mean_abs_error_up_to_limit_m": mean(np.abs(jumps.error[:, 0])[below]),
-        "success_rate_reachable": mean(near[reachable]),
-        "reachable_share": mean(reachable),
+        "success_rate_reachable": mean(near[reachable]), "reachable_share": mean(reachable),
         "success_rate_beyond_limit": mean(near[~reachable]),
         "success_rate_reachable_0_6_1_1": mean(near[reachable & inner]),
         "reachable_share_0_6_1_1": mean(reachable[inner]),
-    }
+    }  # fmt: skip

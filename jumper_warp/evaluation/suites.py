@@ -50,13 +50,9 @@ BIN_METRICS = (
 )  # fmt: skip
 """Metrics of each bin of distances, reported as lists `bin_<name>`."""
 PUBLISHED = {
-    "Barkour (Caluwaerts et al. 2023)": 0.5,
-    "Margolis et al. 2021": 0.66,
-    "Liu et al. 2023": 0.8,
-    "Cheng et al. 2024": 0.8,
-    "Atanassov et al. 2024": 0.9,
-    "Jumper, the paper's robot": 1.25,
-}
+    "Barkour (Caluwaerts et al. 2023)": 0.5, "Margolis et al. 2021": 0.66, "Liu et al. 2023": 0.8,
+    "Cheng et al. 2024": 0.8, "Atanassov et al. 2024": 0.9, "Jumper, the paper's robot": 1.25,
+}  # fmt: skip
 """[m] Jump distances of robots, from the paper's table."""
 
 
