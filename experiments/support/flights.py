@@ -29,8 +29,7 @@ from jumper_warp.tasks.switching import FALLS_FROM_FLIGHT, flight_skills
 from support.momentum import momentum
 
 JUMP, TURN = 0, 1  # Indices of the skills in `Env.skills`
-RAMP, HOLD, EXTEND = 25, 35, 40
-"""Numbers of policy steps of the ramp into the squat, the held squat, and at most of the extension."""
+RAMP, HOLD, EXTEND = 25, 35, 40  # Policy steps of the ramp into the squat, the held squat, at most of the extension
 SQUAT = 120.0  # [deg] Commanded transversal angle of the squat
 STRETCHED = -45.0  # [deg] Commanded transversal angle of the extension
 HIGH = 0.7  # [m] Base height above which no paw can touch level ground
@@ -47,15 +46,13 @@ class FlightLog(EvaluationLog):
     """Log of one flight per world; arrays have shape (num_envs,) and do not change after the flight's end."""
 
     apex: np.ndarray  # [m] (num_envs,) Apex heights commanded to the jump's policy
-    late: np.ndarray | None = None
-    """[s] (num_envs, 2) Delay of the extension of front and left legs; None: the jump's policy takes off."""
+    late: np.ndarray | None = None  # [s] (num_envs, 2) Delays of front and left legs; None: the policy takes off
     turns: bool = True  # Whether the turning skill is requested in flight
     seconds: float = 9.0  # [s] Maximum simulated time
     row_name = "flight"
     spacing = 1.6
 
     def __post_init__(self) -> None:
-        """Start with no flight ended."""
         n = self.count = len(self.apex)
         self.step_dt = 1.0 / 60.0  # [s] policy step; `begin` sets that of the environment
         self.end = np.full(n, -1)  # index in OUTCOMES, -1 while under way

@@ -22,10 +22,8 @@ class GaitRecorder:
     env: Any  # The sampled `jumper_warp.envs.env.Env`
     skip: float = 2.0  # [s] Time at the start that is not sampled
     contact: list[np.ndarray] = field(default_factory=list)  # (robots, 4) Whether each paw is on the ground
-    paw_height: list[np.ndarray] = field(default_factory=list)
-    """[m] (robots, 4) Height of each paw above the ground below it."""
-    force: list[np.ndarray] = field(default_factory=list)
-    """[N] (robots, 4) Upward force on each paw in the last physics step."""
+    paw_height: list[np.ndarray] = field(default_factory=list)  # [m] (robots, 4) Height of paws above the ground
+    force: list[np.ndarray] = field(default_factory=list)  # [N] (robots, 4) Upward force on paws
     torque: list[np.ndarray] = field(default_factory=list)  # [N m] (robots, 12) Motor torques
     power: list[np.ndarray] = field(default_factory=list)  # [W] (robots,) Sum of the positive powers of the motors
     speed: list[np.ndarray] = field(default_factory=list)  # [m/s] (robots,) Horizontal speed of the base

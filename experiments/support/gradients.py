@@ -20,14 +20,12 @@ from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
 
 TICKS = 36  # Number of policy steps of 1/60 s of the jump
 SQUAT = math.radians(85.0)  # [rad] Transversal angle of the squat
-PUSH = (-5.0, -8.0)
-"""[deg] Outer and inner transversal command of the push-off; the filter binds, the motors saturate at first."""
+PUSH = (-5.0, -8.0)  # [deg] Outer and inner command of the push-off; the filter binds, the motors saturate at first
 SLIP_SPEED = 1.5  # [m/s] Initial forward speed of the jump on slippery ground for the gradient by friction
 SLIP_FRICTION = 0.25  # [1] Dynamic friction of this ground; static is 1.2 times as large
 OUTER, INNER = 1, 2  # Motors of the front left leg whose targets are checked
 PARAMETERS = ("table", "saturation")  # Inputs that are parameters of the rollout
-GradientPair = tuple[np.ndarray, np.ndarray]
-"""Derivatives of the apex height by the gradient, and by central differences, (n,) each."""
+GradientPair = tuple[np.ndarray, np.ndarray]  # Derivatives of the apex: gradient, central differences; (n,) each
 
 
 def schedule(push: tuple[float, float]) -> np.ndarray:

@@ -45,10 +45,8 @@ class InverseKinematics:
         self._legs, self._limits = leg_geometry_array(description, geometry, device), leg_limits(description)
         self._base = [wp.zeros(n, dtype=kind, device=device) for kind in (wp.vec3, wp.quat)]
         self._angles = [wp.zeros((rows, n), dtype=float, device=device) for rows in (12, 8)]
-        self.reachable = wp.zeros((4, n), dtype=wp.int32, device=device)
-        """(4, n) 1 where the last `solve` reached the paw's target."""
-        self.residual = wp.zeros((4, n), dtype=float, device=device)
-        """[m] (4, n) Remaining distance to the targets of the last `solve`."""
+        self.reachable = wp.zeros((4, n), dtype=wp.int32, device=device)  # 1 where the last `solve` reached the target
+        self.residual = wp.zeros((4, n), dtype=float, device=device)  # [m] distance to targets of the last `solve`
 
     def paws(self, motors: np.ndarray) -> wp.array:
         """Return paw positions [m], (4, n) vec3, body frame, at motor angles [rad], (12, n)."""

@@ -61,8 +61,7 @@ class MomentumRecorder:
     """Recorder of the angular momentum of all robots; call the object after every policy step."""
 
     env: Any  # The recorded `jumper_warp.envs.env.Env`
-    angular: list[np.ndarray] = field(default_factory=list)
-    """[kg m^2/s] (num_envs, 3) after every policy step, world axes."""
+    angular: list[np.ndarray] = field(default_factory=list)  # [kg m^2/s] (num_envs, 3) per policy step, world axes
 
     def __call__(self, *_: Any) -> None:
         """Append the present angular momentum about the COM."""

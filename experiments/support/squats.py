@@ -25,7 +25,6 @@ class SquatLog(EvaluationLog):
     row_name = "squat"
 
     def __post_init__(self) -> None:
-        """Start with empty histories."""
         self.count, self.step_dt = len(self.goals), 1.0 / 60.0
         self.ended = np.zeros(self.count, dtype=bool)  # (num_envs,) whether each episode has ended
         # one array per policy step

@@ -51,23 +51,20 @@ def random_turns(count: int, angle: float, seed: int) -> np.ndarray:
 class AttitudeLog(EvaluationLog):
     """Log of one commanded turn per world; properties have shape (num_envs,). A diverged world records NaN."""
 
-    turns: np.ndarray
-    """(num_envs, 4) Commanded turns, quaternions xyzw, body axes, relative to the orientation at the start."""
+    turns: np.ndarray  # (num_envs, 4) Commanded turns, quaternions xyzw, body axes, relative to the start
     tolerance: float = 5.0  # [deg] Largest error of a robot at its goal
     seconds: float = 5.0  # [s] Simulated time of every turn
     errors: list[np.ndarray] = field(default_factory=list, init=False)
     """[rad] Angle to the goal, one array (num_envs,) per policy step; NaN once the world has diverged."""
     angular_speeds: list[np.ndarray] = field(default_factory=list, init=False)
     """[rad/s] Angular speed of the base, one array (num_envs,) per policy step; NaN once the world has diverged."""
-    collided: np.ndarray = field(init=False)
-    """(num_envs,) Whether a link other than a paw touched the ground, or links touched each other."""
+    collided: np.ndarray = field(init=False)  # (num_envs,) Whether a link but the paws touched ground, or links touched
     diverged: np.ndarray = field(init=False)  # (num_envs,) Whether the simulation diverged
 
     row_name = "turn"
     spacing = 1.5
 
     def __post_init__(self) -> None:
-        """Start with empty histories."""
         self.turns, self.count = np.asarray(self.turns, dtype=float), len(self.turns)
         self.collided, self.diverged = (np.zeros(self.count, dtype=bool) for _ in range(2))
         self.step_dt = 1.0 / 60.0  # [s] Policy step; `begin` sets that of the environment

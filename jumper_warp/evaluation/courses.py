@@ -35,14 +35,15 @@ BLOCK = BlockCfg(center=(1.0e3, 1.0e3), half=(0.55, 0.55), height=0.05, mass=10.
 """Block to jump onto: initially 1 km away on both axes, moved under the goal when the jump skill takes over."""
 SQUAT_TIME = 0.5  # [s] Time from the jump skill's takeover, when it squats, to its command
 MAX_ACCELERATION = 1.25  # [m/s^2], [rad/s^2] Rate at which commanded velocities change
-NUDGE_AFTER, NUDGE_TIME = 2.0, 0.5
-"""[s] Period at which a robot that waits for its jump walks a few steps, and time for which it walks."""
+NUDGE_AFTER, NUDGE_TIME = (
+    2.0,
+    0.5,
+)  # [s] Period at which a robot that waits for its jump walks a few steps; its time
 NUDGE = (0.25, 0.0, 0.0)  # [m/s], [rad/s] Commanded velocity of these steps
 JUMP_TIMEOUT = 15.0  # [s] Time after its request at which an unfinished jump has failed
 STUCK, DONE = len(FALLS), len(FALLS) + 1  # Indices in OUTCOMES; smaller ones are falls
 OUTCOMES = (*(term.name for term in FALLS), "stuck", "done")
-GOAL_TOLERANCE, LANDED_PHASE = 0.1, 2
-"""[m] Largest error of a jump that is on its goal; the jump's phase after touchdown."""
+GOAL_TOLERANCE = 0.1  # [m] Largest error of a jump that is on its goal
 FORCE_WINDOW = 0.2  # [s] Time before a handover to a jump over which paw forces are evaluated
 COLOURS = {WALK: "white", JUMP_UP: "tab:orange", JUMP_TO: "tab:purple"}  # Background of plots, by skill
 NAMES = {WALK: "walk", JUMP_UP: "jump up", JUMP_TO: "jump to"}
@@ -120,7 +121,7 @@ class CourseLog(EvaluationLog):
         }  # fmt: skip
         rows = np.arange(len(q))
         kind = self.target_skill[rows, np.minimum(self.current, self.target_skill.shape[1] - 1)]
-        for name in ("max_height", "goal", "took_off", "phase"):
+        for name in ("max_height", "goal", "took_off"):
             by_skill = [env.skills[skill].states.numpy()[name] for skill in (JUMP_UP, JUMP_TO)]
             arrays[f"jump_{name}"] = np.array(by_skill)[np.where(kind == JUMP_TO, 1, 0), rows]
         return arrays

@@ -35,7 +35,6 @@ class EpisodeLog(EvaluationLog):
     spacing = 2.0
 
     def __post_init__(self) -> None:
-        """Start with all episodes running."""
         self.count = count = len(self.commands)
         self.end, self.length = np.full(count, -1), np.zeros(count)
         self.start_position, self.end_position = (np.full((count, 3), np.nan) for _ in range(2))

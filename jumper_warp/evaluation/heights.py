@@ -39,8 +39,11 @@ FALLS = ("low_base", "tilted")
 WRONG_HEIGHT = "wrong_height"  # Outcome of a jump that landed from another apex height than commanded
 DRIFT, TURN = 0.2, 25.0  # [m], [deg] Drift and turn of the base beyond which the authors' configuration ends an episode
 MAX_ROBOTS = 64  # Maximum number of robots in one recording
-LOWEST, HIGHEST, ABOVE = -0.37, 1.47, 0.45
-"""[m] Lower and upper edge of a filmstrip's pictures at the robot, and margin above the base."""
+LOWEST, HIGHEST, ABOVE = (
+    -0.37,
+    1.47,
+    0.45,
+)  # [m] Lower, upper edge of a filmstrip at the robot; margin above the apex
 SHOWN_HEIGHT = 1.0  # [m] The filmstrip shows the jump whose commanded height is nearest to this
 
 

@@ -26,8 +26,7 @@ REST_SPEED = 0.1  # [m/s] Speed of the base's centre of mass below which the rob
 REST_TIME = 1.0  # [s] Time after touchdown at which the robot should be at rest
 DELAY = 0.5  # [s] Time until the first jump is commanded
 SOON_AFTER = 0.3  # [s] Time after touchdown at which the base position is recorded as well
-HOP_TIME = 0.05
-"""[s] After touchdown, a time with no paw on the ground above this is a hop; a paw lifted for at least this, a step."""
+HOP_TIME = 0.05  # [s] After touchdown, longer without any paw on the ground is a hop; a paw lifted so long is a step
 TAKEOFF_SPEED = 0.25  # [m/s] Upward speed of the base, with no paw down, of a second takeoff (authors' configuration)
 TIME_EPS = 1.0e-6  # [s] Tolerance for rounding of sums of steps
 NOT_BEGUN = "not_begun"  # Outcome of a jump that was not commanded, as one before it failed

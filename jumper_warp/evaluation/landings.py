@@ -42,8 +42,7 @@ LANDING_TERMINATIONS = (DIVERGED, "low_base", COLLIDED, "no_jump", SUCCESS)
 FALLS = (DIVERGED, "low_base", COLLIDED)  # Terminations that `fall_rate` counts
 MISSED = "missed"  # Outcome of a jump that landed, but beyond SUCCESS_TOLERANCE
 EARLY = "early"  # Outcome of a landed jump that began before its command
-AT_REST_AT_END = "below_0_1_m_s_at_the_end_rate"
-"""Metric: fraction of landed jumps whose base was at rest (`REST_SPEED`) when the jump was over."""
+AT_REST_AT_END = "below_0_1_m_s_at_the_end_rate"  # Metric: fraction of landed jumps with the base at rest at the end
 JUMP_SECONDS, NEXT_JUMP_SECONDS = 3.5, 2.5  # [s] Length of a recording of one jump, and addition for each further jump
 SHOWN_DISTANCE = 1.0  # [m] The filmstrip shows the jump whose goal is nearest to this distance
 

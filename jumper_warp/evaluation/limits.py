@@ -14,13 +14,11 @@ from jumper_warp.evaluation.log import Metrics, mean, within
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
 
-RAMP, HOLD, EXTEND = 25, 50, 40
-"""Numbers of policy steps of the ramp into the squat, the held squat, and the full extension."""
+RAMP, HOLD, EXTEND = 25, 50, 40  # Policy steps of the ramp into the squat, the held squat, and the full extension
 STAND = 31  # Policy steps in the default pose before the ramp, as before the command of a sweep's jumps
 COAST = 30  # Policy steps after the extension, within which the apex has passed
 INNER_RANGE = (0.6, 1.1)  # [m] Commanded heights with metrics of their own
-PUSH_PARAMS = ("events.push.force_", "events.push.torque_")
-"""Prefixes of the names of parameters that set the ranges of pushes."""
+PUSH_PARAMS = ("events.push.force_", "events.push.torque_")  # Prefixes of parameters that set ranges of pushes
 
 
 def open_loop_action(step: int) -> float:

@@ -40,8 +40,7 @@ BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION, BLOCK_BEYOND, BLOCK_WIDTH = 0.05, 10.0
 """[m], [kg], [1] Height, mass, friction with the floor; [m] distance from goal to far side; [m] width along y."""
 BIN, IN_RANGE, LIMIT = 0.1, (1.0, 1.4), 9.0
 """[m] Width of a bin of distances; range of distances of `success_rate_in_range`; largest `max_distance`."""
-GIVEN_UP, RELIABLE = 0.5, 0.95
-"""[1] Success rate below which no farther bin is tried; success rate of a reliable distance."""
+GIVEN_UP, RELIABLE = 0.5, 0.95  # [1] Success rate below which no farther bin is tried; that of a reliable distance
 RATES = {"": "success_rate", "_without_hop": "single_jump_success_rate", "_without_step": "step_free_success_rate"}
 """Success rate that defines each reliable distance, by the suffix of the distance's metric."""
 BIN_METRICS = (

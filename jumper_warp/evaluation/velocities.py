@@ -28,27 +28,22 @@ MAX_ROBOTS = 20_000  # Maximum number of robots in a test
 class VelocityLog(EvaluationLog):
     """Velocity-tracking log, one robot per world; samples after a robot's fall are ignored."""
 
-    commands: np.ndarray
-    """(robots, commands, 3) Successive commands: velocity ahead, to the left [m/s], about z [rad/s], body axes."""
+    commands: np.ndarray  # (robots, commands, 3) Commands in order: ahead, left [m/s], about z [rad/s], body axes
     task: TaskCfg
     seconds: float = 10.0  # [s] Simulated time
-    times: np.ndarray = field(default_factory=lambda: np.zeros(1))
-    """[s] (commands,) Time of each command; the first is 0."""
+    times: np.ndarray = field(default_factory=lambda: np.zeros(1))  # [s] (commands,) Time of each command, first 0
     headings: np.ndarray | float = 0.0  # [rad] (robots,) Headings at the start, or one for all
     kick_time: np.ndarray | None = None  # [s] (robots,) Time of a step change of each base's velocity, or None
     kick: np.ndarray | None = None  # [m/s] (robots, 2) Step change of the velocity at `kick_time`, world axes, or None
     velocity: list[np.ndarray] = field(default_factory=list, init=False)
     """Velocity in the components of `commands`, one array (robots, 3) per policy step."""
-    end: np.ndarray = field(init=False)
-    """(robots,) Index of the termination of a fall, -1 for robots that have not fallen."""
-    fall_step: np.ndarray = field(init=False)
-    """(robots,) Policy step of the fall; the number of steps for robots that have not fallen."""
+    end: np.ndarray = field(init=False)  # (robots,) Index of the termination of a fall, -1 if not fallen
+    fall_step: np.ndarray = field(init=False)  # (robots,) Policy step of the fall, else the number of steps
 
     row_name = "robot"
     spacing = 2.0
 
     def __post_init__(self) -> None:
-        """Start with no robot fallen."""
         self.count = len(self.commands)
         self.end, self.fall_step = np.full(self.count, -1), np.zeros(self.count, dtype=int)
         self.times = np.asarray(self.times, dtype=float)
