@@ -3,7 +3,7 @@
     python experiments/attitude.py --policy attitude --num-turns 60 --out outputs/attitude
     python experiments/attitude.py --policy logs/attitude/<run> --randomize --angle 60
 
-Robots float at rest in the default pose, in zero gravity, and one turn is commanded. The settling time is that from
+Robots float at rest in the default pose, in zero gravity, and one turn is commanded. The settling time is the time from
 which the error stays within a tolerance until the end; a turn succeeds if it settles without a collision. The authors'
 robot turned by 90 degrees in 2.6 s. The robot turns by its legs alone, so its angular momentum should stay 0. Its drift
 is reported as the largest value of all robots, and as the turn that it causes: its integral over the moment of inertia
@@ -18,26 +18,25 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.attitude import DIRECTIONS, AttitudeFlags, AttitudeLog, random_turns, turn_metrics
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from support.momentum import MomentumRecorder, rotational_inertia
-from support.scripts import parse_flags
+from support.scripts import run_script
 
 HARDWARE = {"mean_settling_s": 2.6}  # Settling time of the authors' robot, 90 degrees
-COLORS = ("tab:red", "tab:green", "tab:blue")
+COLORS = ("tab:red", "tab:green", "tab:blue")  # Of turns about x, y, z
 
 
 @dataclass(frozen=True)
 class Args(EvaluationArgs, AttitudeFlags):
-    """Flags; as many turns about any axis as about the body's."""
+    """Flags, with those of `AttitudeFlags`; `num_turns` turns about body axes, and as many about random axes."""
 
     policy: str = "attitude"
     keep_momentum: bool = True
-    """Whether the momentum of free flight is kept exactly, whatever the training had."""
+    """Conserve the momentum of free flight exactly, regardless of the training's setting."""
     refine: int = 1
-    """How many times finer the physics step is than that of the training."""
+    """[1] Factor by which the physics step is smaller than that of the training."""
     num_recorded: int = 6
     """Number of turns to record for the Rerun viewer and, the first of them, as a filmstrip; 0: none."""
 
@@ -47,7 +46,7 @@ class Args(EvaluationArgs, AttitudeFlags):
 
 
 def plot_turns(run: EvaluationRun, turns: AttitudeLog, title: str) -> None:
-    """Plot errors over time and settling times of turns about the body's axes, a color per axis."""
+    """Plot errors over time and settling times of turns of `axis_turns` into `turns.png`, a color per axis."""
     errors = np.degrees(np.array(turns.errors))
     time = (np.arange(len(errors)) + 1) * turns.step_dt
     with figure(run.folder / "turns.png", 1, 2, figsize=(11, 4.2)) as axes:
@@ -67,7 +66,7 @@ def plot_turns(run: EvaluationRun, turns: AttitudeLog, title: str) -> None:
 
 
 def main(args: Args) -> dict:
-    """Run both tests and return the metrics."""
+    """Run turns about body axes and about random axes, write plots and recording, and return the metrics."""
     run = EvaluationRun.from_args("attitude", args, ("attitude",))
     env = run.env(args.num_turns, lambda task: replace(task, keep_momentum=args.keep_momentum), refine=args.refine)
     run.setup_metrics |= {"physics_step_s": env.physics_dt, "keep_momentum": args.keep_momentum}
@@ -83,4 +82,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

@@ -12,12 +12,11 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.robot.description import load_description
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from support.inverse_kinematics import InverseKinematics, random_motors
-from support.scripts import DeviceArgs, parse_flags, report
+from support.scripts import DeviceArgs, report, run_script
 from support.timing import median_time
 
 
@@ -28,14 +27,14 @@ class Args(DeviceArgs):
     poses: int = 65536
     """Robots per launch, four legs each."""
     repeats: int = 5
-    """Timed launches; the median counts."""
+    """Number of timed launches; the median is reported."""
     scatter: float = 0.3
-    """Half edge [m] of the cube around each paw's reachable position that the scattered targets fill."""
+    """[m] Half edge of the cube around each paw's reachable position that the scattered targets fill."""
     seed: int = 0
 
 
 def main(args: Args) -> dict:
-    """Run the benchmark and return its metrics."""
+    """Run the benchmark, write and return its metrics. Raises RuntimeError: a reachable target is not reached."""
     info, device, n = configure_device(args.device), wp.get_device(args.device), args.poses
     folder = output_dir("benchmark_ik", args.out)
     description, rng = load_description(), np.random.default_rng(args.seed)
@@ -49,17 +48,12 @@ def main(args: Args) -> dict:
         raise RuntimeError(f"{100.0 * reached:.4f} % reached, residual {max_residual:.2e} m: the time means nothing")
     times = [median_time(lambda aim=aim: robots.solve(aim), device, repeats=args.repeats) for aim in (paws, scattered)]
     values = {
-        "device": info.name,
-        "poses": n,
-        "reachable_time [ms]": 1.0e3 * times[0],
-        "reachable_rate [poses/s]": n / times[0],
-        "reachable_max_residual [m]": max_residual,
-        "scattered_time [ms]": 1.0e3 * times[1],
-        "scattered_reachable [%]": 100.0 * robots.reachable.numpy().mean(),
-    }
-    report(folder, values)
-    return values
+        "device": info.name, "poses": n, "reachable_time [ms]": 1.0e3 * times[0],
+        "reachable_rate [poses/s]": n / times[0], "reachable_max_residual [m]": max_residual,
+        "scattered_time [ms]": 1.0e3 * times[1], "scattered_reachable [%]": 100.0 * robots.reachable.numpy().mean(),
+    }  # fmt: skip
+    return report(folder, values)
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

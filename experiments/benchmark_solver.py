@@ -5,7 +5,7 @@
 A policy step is 8 physics steps of 1/480 s, motors included. Both solvers replay a captured graph. The outcome is
 checked before timing: the robots must stand, or reach their apex. `--baseline PATH` also runs the script of another
 checkout and reports the speed ratio. `--threads 1 2` compares numbers of CPU threads, on physics and on whole
-environments; all other metrics are those of the last number.
+environments; all other metrics are measured with the last number.
 """
 
 from __future__ import annotations
@@ -15,13 +15,12 @@ from pathlib import Path
 
 import warp as wp
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.threads import checked_threads
-from support.scripts import DeviceArgs, parse_flags, report
+from support.scripts import DeviceArgs, report, run_script
 from support.speed import time_solver, time_threads
 from support.timing import baseline_ratios
 
@@ -34,9 +33,9 @@ class Args(DeviceArgs):
     """Numbers of environments, one run for each."""
     solvers: list[SolverName] = field(default_factory=lambda: ["jumper", "mujoco"])
     repeats: int = 5
-    """Timed repetitions; the median counts."""
+    """Number of timed repetitions; the median is reported."""
     steps: int = 100
-    """Policy steps in a repetition, standing."""
+    """Number of policy steps in a repetition of the standing test."""
     baseline: Path | None = None
     """Root of another checkout to compare with."""
     threads: list[int] | None = None
@@ -48,7 +47,7 @@ class Args(DeviceArgs):
 
 
 def main(args: Args) -> dict:
-    """Run the benchmark and return its metrics."""
+    """Run the benchmark, write and return its metrics. Raises InputError: threads compared on a GPU."""
     values: dict = {"device": configure_device(args.device, args.threads[-1] if args.threads else None).name}
     if args.threads and wp.get_device(args.device).is_cuda:
         raise InputError("threads are compared on a CPU; add --device cpu")
@@ -64,9 +63,8 @@ def main(args: Args) -> dict:
         prefix = "" if len(args.envs) == 1 else f"envs_{envs}_"
         values |= {f"{prefix}{name}": value for name, value in metrics.items()}
     values |= {"envs": args.envs, **baseline_ratios(args.baseline, "experiments/benchmark_solver.py", args, values)}
-    report(folder, values)
-    return values
+    return report(folder, values)
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

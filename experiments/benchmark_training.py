@@ -1,4 +1,4 @@
-"""Benchmark of training: speed of solver, environment and PPO, and shares of their parts.
+"""Benchmark of training: speed of solver, environment and PPO, and fractions of time of their parts.
 
     python experiments/benchmark_training.py --envs 4096 8192 16384 --out outputs/benchmark_training
 
@@ -16,12 +16,11 @@ from pathlib import Path
 
 import warp as wp
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
-from support.scripts import ThreadArgs, parse_flags, report
+from support.scripts import ThreadArgs, report, run_script
 from support.speed import time_parts, time_ppo, time_rsl_rl
 from support.timing import baseline_ratios
 from support.variants import VARIANTS, variant
@@ -38,15 +37,15 @@ class Args(ThreadArgs):
     steps: int = 200
     """Policy steps in a repetition."""
     repeats: int = 5
-    """Repetitions of a timing; the median counts."""
+    """Number of repetitions of a timing; the median is reported."""
     iterations: int = 10
-    """Training iterations that are timed, of either trainer."""
+    """Number of timed training iterations of each trainer."""
     rsl_rl: bool = True
     """Train with rsl-rl-lib too."""
     num_steps: int = 32
     """Policy steps of each environment in an iteration."""
     variants: tuple[str, ...] = ()
-    """Variants of PPO that are timed too (`support.variants`), or all."""
+    """Names of further timed variants of PPO (`support.variants`), or all."""
     only_ppo: bool = False
     """Time PPO and its variants only."""
     baseline: Path | None = None
@@ -65,7 +64,7 @@ class Args(ThreadArgs):
 
 
 def main(args: Args) -> dict:
-    """Run the benchmark and return its metrics."""
+    """Time solver, environment and trainers as the flags say, write and return the metrics."""
     info = configure_device(args.device, args.threads)
     folder = output_dir("benchmark_training", args.out)
     gpu = wp.get_device(args.device).is_cuda
@@ -86,9 +85,8 @@ def main(args: Args) -> dict:
         values |= time_rsl_rl(train_envs, args.num_steps, args.iterations, args.device)
         values["ppo_over_rsl_rl"] = values["ppo_steps_per_s"] / values["rsl_rl_steps_per_s"]
     values |= baseline_ratios(args.baseline, "experiments/benchmark_training.py", args, values)
-    report(folder, values)
-    return values
+    return report(folder, values)
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

@@ -21,12 +21,11 @@ from typing import Any
 
 from rich.console import Console
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.departure_runs import BASELINE, JUMP_TASKS, TESTS, WIDTH, JumpTask, evaluate, parse, report, train_or_load
 from support.departures import DEPARTURES, Ablation, ablation_flags
-from support.scripts import ThreadArgs, parse_flags, prepare
+from support.scripts import ThreadArgs, prepare, run_script
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class Args(ThreadArgs):
     task: JumpTask = "vertical-jump"
     """Task whose departures are undone."""
     only: tuple[str, ...] = ()
-    """Names of the departures to undo (default: all)."""
+    """Names of the departures to undo, or kept for none (default: all)."""
     iterations: int | None = None
     """Iterations of each training (default: 800 or 1000, when the task with all departures has learned)."""
     num_envs: int = 8192
@@ -67,13 +66,13 @@ class Args(ThreadArgs):
         return JUMP_TASKS[self.task].iterations if self.iterations is None else self.iterations
 
     def trainings(self) -> Iterator[tuple[str, int, Ablation]]:
-        """Yield name, seed and ablation of every training."""
+        """Yield name of the departure (or BASELINE), seed, and ablation (BASELINE: no flags) of every training."""
         for name in self.only or (BASELINE, *DEPARTURES[self.task]):
             for seed in self.baseline_seeds if name == BASELINE else self.seeds:
                 yield name, seed, DEPARTURES[self.task].get(name, "")
 
     def command(self, ablation: Ablation, seed: int, folder: Path) -> list[str]:
-        """Return the arguments of `jumper train` for an ablation; folder: of its log."""
+        """Return the arguments of `jumper train` for an ablation and a seed; folder: root of its logs."""
         flags = f"--num-envs {self.num_envs} --max-iterations {self.length} --seed {seed} --no-tensorboard"
         flags += "" if self.device is None else f" --device {self.device}"
         flags += "" if self.threads is None else f" --threads {self.threads}"
@@ -83,7 +82,7 @@ class Args(ThreadArgs):
 
 def main(args: Args) -> dict[str, Any]:
     """Train and evaluate each ablation, write the table and the plot, and return the metrics."""
-    for name, seed, ablation in args.trainings():  # a wrong flag is refused before any training
+    for name, seed, ablation in args.trainings():  # refuse wrong flags before the first training
         parse(ablation, args.command(ablation, seed, Path(name)))
     folder, results, table = prepare("departures", args, args.threads), {}, None
     values: dict[str, Any] = {"task": args.task, "iterations": args.length, "envs": args.num_envs}
@@ -103,4 +102,4 @@ def main(args: Args) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

@@ -5,9 +5,8 @@
 Runs the suite `grid`, as `jumper evaluate horizontal_jump --suite grid` does.
 """
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.suites import Grid
-from support.scripts import parse_flags
+from support.scripts import run_script
 
 if __name__ == "__main__":
-    run_command(lambda: parse_flags(Grid).run())
+    run_script(Grid.run, Grid)

@@ -4,8 +4,8 @@
 
 Both robots have the masses and armatures of the description or of an overlay and random motor torques, without ground,
 friction, knee damping and springs. The project's dynamics compute in double precision with masses that Newton's model
-stores in single precision, so seven digits can agree. Relative differences are those over the largest value of the same
-state.
+stores in single precision, so seven digits can agree. A relative difference is the difference over the largest value of
+the same state.
 """
 
 from __future__ import annotations
@@ -15,21 +15,20 @@ from pathlib import Path
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
 from support.agreement import jumper_quantities, pinocchio_quantities, random_states
-from support.scripts import parse_flags
+from support.scripts import run_script
 
-UNITS = {
+UNITS = {  # by quantity of `support.agreement`
     "base_acceleration": "m/s^2",
     "base_angular_acceleration": "rad/s^2",
     "joint_acceleration": "rad/s^2",
     "paw_position": "m",
-    "paw_jacobian": "m",
+    "paw_jacobian": "m",  # per rad
 }
 
 
@@ -52,16 +51,16 @@ class Args:
 
 
 def differences(ours: np.ndarray, expected: np.ndarray) -> tuple[float, float, float]:
-    """Return the largest expected value, difference, and difference relative to its state's largest value.
+    """Return three maxima over states: expected value, difference, and difference over the state's largest value.
 
-    ours, expected: (states, ...) values of one quantity.
+    ours, expected: (states, ...) values of one quantity in its unit.
     """
     size, difference = (np.abs(rows.reshape(len(rows), -1)).max(axis=1) for rows in (expected, ours - expected))
     return float(size.max()), float(difference.max()), float((difference / size).max())
 
 
 def main(args: Args) -> dict:
-    """Compare all quantities and return the metrics."""
+    """Compare all quantities, write and print their differences, and return the metrics."""
     configure_device("cpu")
     folder = output_dir("dynamics_agreement", args.out)
     values = RobotValues.nominal(1) if args.robot is None else load_overlay(args.robot).robots()
@@ -78,4 +77,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

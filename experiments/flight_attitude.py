@@ -18,11 +18,10 @@ from typing import Literal
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.run import EvaluationArgs
 from jumper_warp.utils.errors import InputError
 from support.flights import FlightLog, FlightRun, extension_delays, flight_metrics, plot_flights
-from support.scripts import parse_flags
+from support.scripts import run_script
 
 
 @dataclass(frozen=True)
@@ -47,8 +46,8 @@ class Args(EvaluationArgs):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.num_flights < 1 or not 0.0 <= self.max_leg_delay <= 100.0:
-            given = f"{self.num_flights}, {self.max_leg_delay}"
-            raise InputError(f"need at least one flight, and max_leg_delay in 0 to 100 ms, got {given}")
+            values = f"{self.num_flights}, {self.max_leg_delay}"
+            raise InputError(f"need at least one flight, and max_leg_delay in 0 to 100 ms, got {values}")
         if not 0.3 <= self.height_range[0] <= self.height_range[1] <= 10.0:
             raise InputError(f"height_range must be in 0.3 to 10 m and rise, got {self.height_range}")
         if self.takeoff == "policy" and not self.landing_policy:
@@ -56,7 +55,7 @@ class Args(EvaluationArgs):
 
 
 def main(args: Args) -> dict:
-    """Run the flights with and without turning, and return the metrics."""
+    """Run the same flights with and without turning, plot them, and return the metrics."""
     run = FlightRun(args, args.landing_policy, args.jump_task)
     env, heights = run.env(args.num_flights), np.linspace(*args.height_range, args.num_flights)
     max_delay = 1.0e-3 * args.max_leg_delay
@@ -72,4 +71,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

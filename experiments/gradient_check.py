@@ -14,14 +14,13 @@ from pathlib import Path
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.diff.rollout import Trajectory
 from jumper_warp.evaluation.plots import figure
 from support.gradients import INNER, OUTER, TICKS, GradientJump, GradientPair, apex, check, schedule
-from support.scripts import DeviceArgs, parse_flags, prepare, report
+from support.scripts import DeviceArgs, prepare, report, run_script
 
 WEAK_PUSH = (20.0, 20.0)  # [deg] Commands of the push-off that the ascent starts from
-ASCENT_STEPS = 20
+ASCENT_STEPS = 20  # Number of steps of the gradient ascent
 ASCENT_CHANGE = 0.05  # [rad] Largest change of a target in a step of the ascent
 
 
@@ -29,13 +28,13 @@ ASCENT_CHANGE = 0.05  # [rad] Largest change of a target in a step of the ascent
 class Ascent:
     """Result of the gradient ascent."""
 
-    apex: list[float]  # [m] before each step and after the last
-    before: np.ndarray  # targets [rad], (TICKS, 12)
-    after: np.ndarray
+    apex: list[float]  # [m] Apex height before each step and after the last
+    before: np.ndarray  # [rad] (TICKS, 12) Motor targets before the first step
+    after: np.ndarray  # [rad] (TICKS, 12) Motor targets after the last step
 
 
 def ascend(device: str | None) -> Ascent:
-    """Return the result of ASCENT_STEPS normalised gradient steps on all motor targets of the weak jump."""
+    """Raise the apex of the jump with WEAK_PUSH by ASCENT_STEPS normalised gradient steps on all motor targets."""
     jump = GradientJump(1, double=False, device=device)
     targets, heights = schedule(WEAK_PUSH), []
     for _ in range(ASCENT_STEPS):
@@ -47,7 +46,10 @@ def ascend(device: str | None) -> Ascent:
 
 
 def plot_gradients(jump: Trajectory, actions: GradientPair, ascent: Ascent, path: Path) -> None:
-    """Plot gradient and differences over the targets' time, the jump's height, and the ascent; actions: of `check`."""
+    """Plot gradient and differences over the targets' time, the jump's height, and the ascent into a file.
+
+    jump: in one world; actions: (gradient, differences) [m/rad], FL outer then FL inner, TICKS values each.
+    """
     with figure(path, 4, 1, figsize=(8, 11)) as axes:
         ticks = np.arange(TICKS) / 60.0
         gradient, differenced = (values.reshape(2, TICKS) for values in actions)
@@ -58,23 +60,23 @@ def plot_gradients(jump: Trajectory, actions: GradientPair, ascent: Ascent, path
             )
         height = jump.q.numpy()[:, 2, 0]
         pushed = np.flatnonzero(jump.impulse.numpy()[: height.argmax(), :, 0].any(axis=(1, 2)))
-        axes[1].plot(np.arange(len(height)) / 480.0, height)
+        axes[1].plot(np.arange(len(height)) / 480.0, height)  # physics steps of 1/480 s
         axes[1].axvline((pushed[-1] + 1) / 480.0, color="0.6", linestyle="--", label="takeoff")
         axes[2].plot(range(ASCENT_STEPS + 1), ascent.apex, "o-")
         for motor, name in ((OUTER, "outer"), (INNER, "inner")):
             (line,) = axes[3].plot(ticks, np.degrees(ascent.before[:, motor]), "--", label=f"FL {name}, before")
             axes[3].plot(ticks, np.degrees(ascent.after[:, motor]), color=line.get_color(), label="after")
-        across = ("time of the target [s]", "time [s]", "step of the ascent", "time [s]")
-        up = ("d apex / d target [cm/rad]", "base height [m]", "apex [m]", "target [deg]")
-        for axis, x, y in zip(axes, across, up, strict=True):
-            axis.set(xlabel=x, ylabel=y)
+        x_labels = ("time of the target [s]", "time [s]", "step of the ascent", "time [s]")
+        y_labels = ("d apex / d target [cm/rad]", "base height [m]", "apex [m]", "target [deg]")
+        for axis, x_label, y_label in zip(axes, x_labels, y_labels, strict=True):
+            axis.set(xlabel=x_label, ylabel=y_label)
             axis.grid(alpha=0.3)
         for axis in (axes[0], axes[1], axes[3]):
             axis.legend(fontsize=8, ncols=2)
 
 
 def main(args: DeviceArgs) -> dict:
-    """Run check and ascent, and return the metrics."""
+    """Check the gradients, run the ascent, plot both, and return the metrics."""
     folder = prepare("gradient_check", args)
     start = time.perf_counter()
     jump, checks = check(args.device)
@@ -84,15 +86,12 @@ def main(args: DeviceArgs) -> dict:
         for name, (gradient, differenced) in checks.items()
     }
     values |= {
-        "jump_apex_m": float(apex(jump)[0]),
-        "apex_before_m": ascent.apex[0],
-        "apex_after_m": ascent.apex[-1],
+        "jump_apex_m": float(apex(jump)[0]), "apex_before_m": ascent.apex[0], "apex_after_m": ascent.apex[-1],
         "seconds": time.perf_counter() - start,
-    }
+    }  # fmt: skip
     plot_gradients(jump, checks["actions"], ascent, folder / "gradients.png")
-    report(folder, values)
-    return values
+    return report(folder, values)
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(DeviceArgs)))
+    run_script(main, DeviceArgs)

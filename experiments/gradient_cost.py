@@ -6,7 +6,7 @@
 The same jump (squat, push-off, flight; 36 policy steps of 8 physics steps) is run by the solver's kernel with the
 command filter, and as a rollout with its reverse pass, which differentiates by all parameters, targets and the initial
 state. Both run in single precision, with the solver's default tolerance, on one thread of a CPU. The errors of the
-gradient are those against double precision.
+gradient are relative to double precision.
 """
 
 from __future__ import annotations
@@ -16,14 +16,13 @@ from dataclasses import dataclass
 import numpy as np
 import warp as wp
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.sim.simulation import SUBSTEPS
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from support.gradient_runs import GradientRun, PlainJump
 from support.gradients import PUSH, TICKS, schedule
-from support.scripts import DeviceArgs, parse_flags, report
+from support.scripts import DeviceArgs, report, run_script
 from support.timing import device_memory, wall_time
 
 
@@ -34,7 +33,7 @@ class Args(DeviceArgs):
     num_envs: int | None = None
     """Number of environments (default: 64 on a CPU, 4096 on a GPU)."""
     repeats: int = 7
-    """Timed repetitions; the fastest counts, and the two kinds take turns."""
+    """Number of timed repetitions; simulation and gradient alternate, and the fastest time of each is reported."""
     double: bool = False
     """Whether to compute in double precision."""
 
@@ -44,7 +43,7 @@ class Args(DeviceArgs):
 
 
 def main(args: Args) -> dict:
-    """Run the comparison and return its metrics."""
+    """Time simulation, rollout and gradient, compare the gradient with double precision, and return the metrics."""
     name, device = configure_device(args.device, 1).name, wp.get_device(args.device)
     folder = output_dir("gradient_cost", args.out)
     worlds = args.num_envs or (4096 if device.is_cuda else 64)
@@ -79,9 +78,8 @@ def main(args: Args) -> dict:
     }
     if device.is_cuda:
         values["memory_kib_a_world"] = (device_memory(device) - before) / worlds / 1024.0
-    report(folder, values)
-    return values
+    return report(folder, values)
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

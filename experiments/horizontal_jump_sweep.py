@@ -5,9 +5,8 @@
 Runs the suite `sweep` of policies that jump to landing positions, as `jumper evaluate horizontal_jump --suite sweep`.
 """
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.sweeps import DistanceSweep
-from support.scripts import parse_flags
+from support.scripts import run_script
 
 if __name__ == "__main__":
-    run_command(lambda: parse_flags(DistanceSweep).run())
+    run_script(DistanceSweep.run, DistanceSweep)

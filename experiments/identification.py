@@ -16,7 +16,6 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.identification.parameters import jumper_parameters
 from jumper_warp.identification.recording import KINDS, replay_plan, simulate_plan
 from jumper_warp.identification.replay import MotionReplay
@@ -25,10 +24,10 @@ from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from support.identification_methods import compare_methods
 from support.known_robots import make_case, plot_cases, policy_errors, run_case
-from support.scripts import parse_flags, report
+from support.scripts import report, run_script
 
 REFINE = 16  # Physics steps of the finer truth per step of the model
-Experiment = Literal["same", "fine", "rough", "mujoco", "methods", "policy"]
+Part = Literal["same", "fine", "rough", "mujoco", "methods", "policy"]
 
 
 @dataclass(frozen=True)
@@ -39,7 +38,7 @@ class Args:
     """Number of robots that are identified with the simulator that recorded them."""
     num_mismatched: int = 1
     """Number of robots recorded on another simulator, for each of the parts fine, rough, mujoco; metrics: the first."""
-    parts: tuple[Experiment, ...] = get_args(Experiment)
+    parts: tuple[Part, ...] = get_args(Part)
     """Parts to run."""
     fine_dt: float = 1.0 / 3840.0
     """[s] Physics step of the model that identifies the robot recorded at a sixteenth of 1/480 s; "rough": 1/480."""
@@ -54,16 +53,16 @@ class Args:
 
     def __post_init__(self) -> None:
         if self.num_matched < 1 or self.num_mismatched < 1 or self.num_jumps < 3:
-            given = f"{self.num_matched}, {self.num_mismatched}, {self.num_jumps}"
-            raise InputError(f"need at least 1 robot of either kind and 3 jumps, got {given}")
+            values = f"{self.num_matched}, {self.num_mismatched}, {self.num_jumps}"
+            raise InputError(f"need at least 1 robot of either kind and 3 jumps, got {values}")
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Run the parts of the experiment and return their metrics."""
+    """Run the parts of the experiment on the CPU, write and return their metrics."""
     configure_device("cpu", args.threads)
     folder, parameters = output_dir("identification", args.out), jumper_parameters()
     replay = MotionReplay(device="cpu", threads=args.threads)
-    ours = partial(replay_plan, MotionReplay(device="cpu", threads=1))
+    ours = partial(replay_plan, MotionReplay(device="cpu", threads=1))  # simulates a plan with this project's step
     fine_steps = max(1, round(1.0 / 480.0 / args.fine_dt))
     simulate_finely, replay_finely = (partial(ours, refine=n) for n in (REFINE, fine_steps))
     values: dict[str, Any] = {"parameters": len(parameters), "seconds_of_data": 1.25 * len(KINDS)}
@@ -78,9 +77,10 @@ def main(args: Args) -> dict[str, Any]:
         values |= {name: float(np.median([row[name] for row in rows])) for name in rows[0]}
         values["coverage"] = float(np.mean([row["coverage"] for row in rows]))
         values |= {f"{name}_of_seeds": [row[name] for row in rows] for name in ("chi2", "wall_s", "cpu_s", "coverage")}
-    others = {"fine": (simulate_finely, replay_finely, args.fine_dt), "rough": (simulate_finely, ours, None),
+    # part: truth that is recorded, model that identifies it, its physics step [s] (None: the default)
+    mismatched = {"fine": (simulate_finely, replay_finely, args.fine_dt), "rough": (simulate_finely, ours, None),
               "mujoco": (partial(simulate_plan, solver="mujoco"), ours, None)}  # fmt: skip
-    for part, (simulate, model, dt) in others.items():
+    for part, (simulate, model, dt) in mismatched.items():
         if part in args.parts:
             results = []
             for seed in range(100, 100 + args.num_mismatched):
@@ -95,9 +95,8 @@ def main(args: Args) -> dict[str, Any]:
         values |= policy_errors(args.policy, args.num_jumps, cases[0][0], cases[0][2], folder)
     if rows:
         plot_cases(rows, folder / "identification.png")
-    report(folder, values)
-    return values
+    return report(folder, values)
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

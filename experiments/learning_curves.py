@@ -20,13 +20,12 @@ from typing import Any
 
 import warp as wp
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.learning import TEST_HEIGHTS, LearningCurve, curve_metrics, plot_curves, train_and_time
-from support.scripts import DeviceArgs, parse_flags, prepare
+from support.scripts import DeviceArgs, prepare, run_script
 from support.variants import DEFAULT, variant
 
 TASK = "vertical-jump"
@@ -51,7 +50,7 @@ class Args(DeviceArgs):
     height_range: tuple[float, float] = TEST_HEIGHTS
     """[m] Lowest and highest commanded base height."""
     history: int | None = None
-    """Policy steps that the policy sees, as `jumper train --history` (default: as the task says)."""
+    """Number of policy steps in the observation, as `jumper train --history` (default: the task's)."""
     randomize: bool = False
     """Train with randomisation and noise."""
 
@@ -65,20 +64,20 @@ class Args(DeviceArgs):
 
 
 def train(args: Args, name: str, seed: int) -> LearningCurve:
-    """Train a variant with a seed, and return the learning curve."""
+    """Train the trainer's variant `name` with a seed, and return the learning curve."""
     wp.config.log_level = wp.LOG_WARNING
     task, cfg = with_history(make_task(TASK), args.history), variant(trainer_settings(TASK), name)
     return train_and_time(task, cfg, args, seed)
 
 
 def train_in_process(args: Args, name: str, seed: int) -> LearningCurve:
-    """Run `train` in a separate process."""
+    """Run `train` in a new process, which compiles or loads everything itself, and return the learning curve."""
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         return pool.submit(train, args, name, seed).result()
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Train every variant with every seed and return the metrics."""
+    """Train every variant with every seed, write metrics and plot after each, and return the metrics."""
     folder = prepare("learning_curves", args)
     values: dict[str, Any] = {"seconds": args.seconds, "envs": args.num_envs, "randomize": args.randomize}
     values |= {"seeds": list(args.seeds), "heights_m": list(args.height_range), "history": args.history}
@@ -95,4 +94,4 @@ def main(args: Args) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

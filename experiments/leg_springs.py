@@ -19,14 +19,13 @@ from typing import Any, Literal
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.robot.gravity import EARTH, MARS
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.robot.overlay import with_springs
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
-from support.scripts import DeviceArgs, parse_flags, prepare
+from support.scripts import DeviceArgs, prepare, run_script
 from support.spring_jumps import FILTERS, SpringJumps
 
 
@@ -56,14 +55,14 @@ class Args(DeviceArgs):
             with_springs(stiffness, self.rest_length)
 
     def jumps(self, name: str) -> SpringJumps:
-        """Return the jumps with the command filter of a name in FILTERS."""
+        """Return the jumps with these flags and the command filter `name`, a key of FILTERS."""
         motors = jumping_motors(self.torque_limit)
         motors = replace(motors, transversal=replace(motors.transversal, kp=self.kp))
         return SpringJumps(motors, name, self.gravity, self.rest_length, self.device)
 
 
 def main(args: Args) -> dict:
-    """Run the jumps of all springs, plot apex over stiffness, and return the metrics."""
+    """Run the jumps of all springs and squats, plot apex over stiffness, and return the metrics."""
     start = time.perf_counter()
     folder = prepare("leg_springs", args)
     values: dict[str, Any] = {"gravity_m_s2": args.gravity, "torque_limit_nm": args.torque_limit, "kp_nm_rad": args.kp,
@@ -97,4 +96,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

@@ -18,17 +18,16 @@ from pathlib import Path
 
 import warp as wp
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.output import output_dir, write_metrics
-from support.scripts import parse_flags
+from support.scripts import run_script
 
 
 @dataclass(frozen=True)
 class Args:
-    """Memory of each world."""
+    """Flags of the measurement of memory per world."""
 
     solver: SolverName = "jumper"
     """Physics solver."""
@@ -43,14 +42,14 @@ class Args:
 def array_bytes() -> int:
     """Return the total size [byte] of all live Warp arrays that own their memory."""
     gc.collect()
-    arrays = [each for each in gc.get_objects() if type(each) is wp.array and each.ptr and each.deleter is not None]
+    arrays = [obj for obj in gc.get_objects() if type(obj) is wp.array and obj.ptr and obj.deleter is not None]
     return sum({array.ptr: array.capacity for array in arrays}.values())
 
 
 def measure(args: Args) -> dict[str, float]:
-    """Build one environment on the CPU, and return the process's peak main memory and the size of all arrays [byte].
+    """Build an environment of `args.envs[0]` worlds on the CPU, and return its memory [byte].
 
-    The arrays are the same on a GPU.
+    `building`: peak main memory of the process; `standing`: size of all arrays, which are the same on a GPU.
     """
     wp.config.log_level = wp.LOG_WARNING
     env = Env(make_task(args.task), args.envs[0], device="cpu", solver=args.solver)
@@ -59,7 +58,7 @@ def measure(args: Args) -> dict[str, float]:
 
 
 def main(args: Args) -> dict[str, float]:
-    """Return the memory per world [byte]; for a single number of worlds that of `measure`."""
+    """Return `building_` and `standing_bytes_per_world` [byte]; for a single number of worlds, those of `measure`."""
     if len(args.envs) == 1:
         values = measure(args)
         print(json.dumps(values))
@@ -75,4 +74,4 @@ def main(args: Args) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

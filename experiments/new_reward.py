@@ -17,16 +17,15 @@ import torch
 import warp as wp
 
 from jumper_warp import Env, make_task, mdp
-from jumper_warp.cli.main import run_command
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.runner import train
 from jumper_warp.utils.output import output_dir, write_metrics
-from support.scripts import parse_flags
+from support.scripts import run_script
 
 
 @wp.func
 def even_load(robot: mdp.RobotView, state: mdp.JumpState, spread: float) -> float:  # pyright: ignore[reportGeneralTypeIssues]
-    """Even load: exp(-deviation / spread) of the paw forces [N] from their mean, on the ground."""
+    """Even load [0..1]: exp(-norm(paw forces - their mean) / spread); 0 in flight. spread: [N]."""
     if state.phase == mdp.FLIGHT:
         return 0.0
     force = robot.paw_force
@@ -39,7 +38,7 @@ TASK = replace(TASK, rewards=(*TASK.rewards, mdp.RewardTerm(even_load, weight=5.
 
 
 def make_env(num_envs: int, seed: int, device: torch.device) -> Env:
-    """Return the environment with the new term, for `train`."""
+    """Return an environment with the new term; argument of `train`."""
     return Env(TASK, num_envs, seed=seed, device=str(device))
 
 
@@ -60,7 +59,7 @@ class Args:
 
 
 def main(args: Args) -> dict:
-    """Train for a few iterations and return the logged value of the new term."""
+    """Train for a few iterations, write and return the logged reward of the new term and the mean return."""
     wp.config.log_level = wp.LOG_WARNING
     folder = output_dir("new_reward", args.out)
     ppo = PpoCfg(num_steps=args.num_steps)
@@ -78,4 +77,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

@@ -18,7 +18,6 @@ from typing import Any, Literal
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.commands import print_metrics
 from jumper_warp.evaluation.run import SOLVER_TITLES
 from jumper_warp.robot.description import LEGS
@@ -31,12 +30,12 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from jumper_warp.viz.snapshot import Camera, contact_sheet
 from support.open_loop import SQUAT, plot_trace, simulate_jump, trace_metrics
-from support.scripts import DeviceArgs, parse_flags, prepare
+from support.scripts import DeviceArgs, prepare, run_script
 
 HARDWARE_APEX = 1.075  # [m] Paper, open loop on the robot at 18 N m
 STRIP_TIMES = (0.9, 2.2, 2.32, 2.45, 2.7, 2.95, 3.15, 3.8)
 """[s] Times of the filmstrip's pictures: standing, squatting, push-off, rising, apex, falling, landing, standing."""
-PER_MOTOR = tuple(f"peak_{what}_{leg}" for what in ("torque", "speed") for leg in LEGS)
+PER_MOTOR = tuple(f"peak_{quantity}_{leg}" for quantity in ("torque", "speed") for leg in LEGS)
 """Prefixes of the metrics that are saved but not printed."""
 
 
@@ -67,7 +66,7 @@ class Args(DeviceArgs):
 
 
 def save_filmstrip(frames: list[np.ndarray], path: Path) -> None:
-    """Write pictures of the robot at STRIP_TIMES; frames: body poses of every policy step, (21, 7) each."""
+    """Write pictures of the robot at STRIP_TIMES into a PNG file; frames: link poses of every policy step, (21, 7)."""
     model = build_model(1)
     state = model.state()
     camera, pictures = Camera(model, eye=(1.6, 2.0, 0.75), target=(0.0, 0.0, 0.55), size=(300, 400)), []
@@ -111,4 +110,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

@@ -17,11 +17,10 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, format_value
 from jumper_warp.evaluation.suites import suites_for
 from jumper_warp.utils.output import output_dir, write_metrics
-from support.scripts import parse_flags
+from support.scripts import run_script
 
 
 @dataclass(frozen=True)
@@ -34,7 +33,7 @@ class Args(EvaluationArgs):
 
 
 def main(args: Args) -> dict:
-    """Run all tests, and return the metrics that also have a value in the paper."""
+    """Run all suites, print a table, and return the metrics with a value in the paper, `<policy>_<suite>_<metric>`."""
     folder, values = output_dir("paper_tests", args.out), {}
     table = Table("policy", "test", "metric", "here", "paper")
     for policy in args.policies:
@@ -52,4 +51,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

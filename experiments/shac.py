@@ -3,7 +3,7 @@
     python experiments/shac.py --num-envs 4096 --seconds 120 --out outputs/shac          # on a GPU
     python experiments/shac.py --num-envs 128 --seconds 300 --hidden 64 64 --history 1 --seeds 0     # on a CPU
 
-First the variance of the policy gradient between worlds is measured over the length of the window, through the physics
+First the variance of the policy gradient between worlds is measured for windows of several lengths, through the physics
 and by the score function of PPO, for random and for trained weights. Then both train. Every few seconds of training
 time, the policy is evaluated on jumps to heights of 0.5 to 1.1 m; time and steps to success rates are reported.
 """
@@ -16,7 +16,6 @@ from typing import Any, Literal, cast
 
 import torch
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.diff.differentiable_env import DifferentiableEnv
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.vec_env import DifferentiableVecEnv
@@ -29,7 +28,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.gradient_variance import measure_stats, plot_variances, print_variances, variance_metrics
 from support.learning import LearningCurve, curve_metrics, make_eval_env, plot_curves, train_and_evaluate
-from support.scripts import DeviceArgs, parse_flags, prepare
+from support.scripts import DeviceArgs, prepare, run_script
 
 TASK = "vertical-jump"
 
@@ -55,7 +54,7 @@ class Args(DeviceArgs):
     hidden: tuple[int, ...] = (256, 128, 128)
     """Widths of the hidden layers of both."""
     history: int | None = None
-    """Policy steps that the policies of trainings see, as `jumper train --history` (default: as the task says)."""
+    """Number of policy steps in the observation, as `jumper train --history` (default: the task's)."""
     num_jumps: int = 200
     """Number of jumps of an evaluation."""
     horizons: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64)
@@ -70,13 +69,13 @@ class Args(DeviceArgs):
 
 
 def make_env(args: Args, num_envs: int, seed: int = 0, *, history: int | None = None) -> Env:
-    """Return an environment of the nominal task; history: number of policy steps in the observation."""
+    """Return an environment of the nominal task; history: policy steps in the observation, None: the task's."""
     task = with_history(make_task(TASK), history)
     return Env(task, num_envs, seed=seed, device=args.device, randomize=False, noise=False)
 
 
 def train(args: Args, algorithm: str, seed: int) -> LearningCurve:
-    """Train with "ppo" or "shac" and a seed, and return the learning curve."""
+    """Train with an algorithm, "ppo" or "shac", and a seed, and return the learning curve."""
     torch.manual_seed(seed)
     env, settings = make_env(args, args.num_envs, seed, history=args.history), trainer_settings(TASK)
     eval_env = make_eval_env(env.tasks[0], args.num_jumps, args.device)
@@ -90,7 +89,7 @@ def train(args: Args, algorithm: str, seed: int) -> LearningCurve:
 
 
 def compare(args: Args, folder: Path) -> dict[str, Any]:
-    """Train with every trainer and seed, plot the learning curves, and return the metrics."""
+    """Train with every trainer and seed, plot the learning curves into `folder`, and return the metrics."""
     values, curves = {}, {trainer: [] for trainer in args.trainers}
     for trainer in args.trainers:
         for seed in args.seeds:
@@ -116,4 +115,4 @@ def main(args: Args) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

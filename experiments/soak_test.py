@@ -13,12 +13,11 @@ from __future__ import annotations
 
 import torch
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
-from support.scripts import parse_flags, prepare, report
+from support.scripts import prepare, report, run_script
 from support.soak import SoakArgs, hardest, soak_env, soak_simulation
 
 
@@ -39,4 +38,4 @@ def main(args: SoakArgs) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(SoakArgs)))
+    run_script(main, SoakArgs)

@@ -14,11 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.utils.errors import InputError
-from support.scripts import parse_flags
+from support.scripts import run_script
 from support.squats import SquatLog, squat_goals, squat_metrics
 
 
@@ -31,7 +30,7 @@ class Args(EvaluationArgs):
     num_squats: int = 100
     """Number of robots."""
     hold_time: float = 3.0
-    """[s] How long each robot holds its squat."""
+    """[s] Time for which each robot holds its squat."""
     height: tuple[float, float] = (0.6, 1.1)
     """[m] Lowest and highest goal, for a policy that jumps to heights."""
     distance: tuple[float, float] = (0.3, 1.5)
@@ -40,8 +39,8 @@ class Args(EvaluationArgs):
     def __post_init__(self) -> None:
         super().__post_init__()
         if self.num_squats < 1 or not 1.5 <= self.hold_time <= 30.0:
-            given = f"{self.num_squats}, {self.hold_time}"
-            raise InputError(f"need at least one squat, and hold_time in 1.5 to 30 s, got {given}")
+            values = f"{self.num_squats}, {self.hold_time}"
+            raise InputError(f"need at least one squat, and hold_time in 1.5 to 30 s, got {values}")
         for name in ("height", "distance"):
             low, high = getattr(self, name)
             if not 0.0 < low <= high < 10.0:
@@ -49,7 +48,7 @@ class Args(EvaluationArgs):
 
 
 def plot_squats(run: EvaluationRun, squats: SquatLog) -> None:
-    """Plot forces and torques of the robot with the largest force range, and the force ranges of all robots."""
+    """Plot forces and torques of the robot with the largest force range, and force ranges of all, into `hold.png`."""
     time = (np.arange(len(squats.forces)) + 1) * squats.step_dt
     robot = np.flatnonzero(~squats.ended)[squats.force_range.argmax()]
     with figure(run.folder / "hold.png", 1, 3, figsize=(14, 4)) as axes:
@@ -62,7 +61,7 @@ def plot_squats(run: EvaluationRun, squats: SquatLog) -> None:
 
 
 def main(args: Args) -> dict:
-    """Run the squats and return the metrics."""
+    """Run the squats, plot them unless all robots fall, and return the metrics."""
     run = EvaluationRun.from_args("squat_hold", args, (*HEIGHTS, *PLACES))
     env = run.env(args.num_squats)
     up = run.task.evaluation_suite in HEIGHTS
@@ -74,4 +73,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

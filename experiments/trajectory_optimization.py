@@ -27,14 +27,13 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.motion_replay import MotionReplay, plot_replays
-from support.optimized_jumps import FINE, JUMPS, LIMITED, around, optimise
-from support.scripts import ThreadArgs, parse_flags, prepare
+from support.optimized_jumps import FINE, JUMPS, LIMITED, noisy_variants, optimise
+from support.scripts import ThreadArgs, prepare, run_script
 
-KNOWN = JUMPS | LIMITED
+ALL_JUMPS = JUMPS | LIMITED  # By name
 
 
 @dataclass(frozen=True)
@@ -53,9 +52,9 @@ class Args(ThreadArgs):
     """Seed of random candidates and displacements."""
 
     def __post_init__(self) -> None:
-        unknown = [name for name in self.jumps if name not in KNOWN]
+        unknown = [name for name in self.jumps if name not in ALL_JUMPS]
         if unknown or not self.jumps:
-            raise InputError(f"no jump {(unknown or [''])[0]!r:.40}; there are {', '.join(KNOWN)}")
+            raise InputError(f"no jump {(unknown or [''])[0]!r:.40}; there are {', '.join(ALL_JUMPS)}")
         if not self.effort > 0.0 or (self.final_iterations is not None and self.final_iterations < 1):
             raise InputError("need an iteration of the last descent, and an effort above 0")
         if self.samples is not None and self.samples < 48:
@@ -63,13 +62,16 @@ class Args(ThreadArgs):
 
 
 def run_jump(name: str, args: Args, folder: Path, best: dict[str, np.ndarray]) -> tuple[dict[str, float], MotionReplay]:
-    """Optimise one jump, and return its metrics and replay; best: solutions by jump, to which it is added."""
-    jump, wall, cpu = KNOWN[name], time.perf_counter(), time.process_time()
+    """Optimise the named jump, write its targets, and return metrics of the search and the replay.
+
+    best: solutions (len(knots),) by name of the jump; one may start this search, and the new one is added.
+    """
+    jump, wall, cpu = ALL_JUMPS[name], time.perf_counter(), time.process_time()
     settings: dict[str, Any] = {"device": args.device, "threads": args.threads}
     knots, rng = jump.make(**FINE, **settings).knots, np.random.default_rng(args.seed)
     begin = jump.draw(knots, args.samples or jump.samples, rng)
     if jump.after in best:
-        begin = np.concatenate([begin, around(best[jump.after], knots, rng)])
+        begin = np.concatenate([begin, noisy_variants(best[jump.after], knots, rng)])
     last = args.final_iterations or jump.polish
     progress, steps = optimise(jump.scaled(args.effort), begin, args.seed, last, **settings)
     x = best[name] = progress.x[progress.best]
@@ -82,14 +84,14 @@ def run_jump(name: str, args: Args, folder: Path, best: dict[str, np.ndarray]) -
 
 def main(args: Args) -> dict[str, Any]:
     """Optimise the jumps in order, write their replays, and return the metrics."""
-    torch.set_num_threads(1)  # its arrays are small, and the worlds have the cores
+    torch.set_num_threads(1)  # arrays of torch are small; the simulated worlds use the cores
     folder, best = prepare("trajectory_optimization", args, args.threads), {}
     replays: dict[str, MotionReplay] = {}
     values: dict[str, Any] = {}
     table = Table("jump", "reached", "violation", "simulated steps", "reverse steps", "processor [s]", "wall [s]")
     for name in args.jumps:
         row, replay = run_jump(name, args, folder, best)
-        replays[KNOWN[name].label] = replay
+        replays[ALL_JUMPS[name].label] = replay
         values |= {f"{name}_gradients_{key}": value for key, value in row.items()}
         values |= {f"{name}_{key}": value for key, value in replay.metrics().items()}
         if name == "still":
@@ -98,7 +100,7 @@ def main(args: Args) -> dict[str, Any]:
         replay.save_filmstrip(folder / f"{name}_strip.png")
         write_metrics(folder, values)
         table.add_row(
-            KNOWN[name].label, f"{row['value']:.3f} {KNOWN[name].unit}", f"{row['violation']:.4f}",
+            ALL_JUMPS[name].label, f"{row['value']:.3f} {ALL_JUMPS[name].unit}", f"{row['violation']:.4f}",
             f"{row['simulated_steps'] / 1e6:.2f} M", f"{row['reverse_steps'] / 1e6:.2f} M", f"{row['cpu_s']:.0f}",
             f"{row['wall_s']:.0f}",
         )  # fmt: skip
@@ -109,4 +111,4 @@ def main(args: Args) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

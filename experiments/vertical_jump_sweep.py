@@ -6,9 +6,8 @@
 Runs the suite `sweep` of policies that jump to heights, as `jumper evaluate vertical_jump --suite sweep` does.
 """
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.sweeps import HeightSweep
-from support.scripts import parse_flags
+from support.scripts import run_script
 
 if __name__ == "__main__":
-    run_command(lambda: parse_flags(HeightSweep).run())
+    run_script(HeightSweep.run, HeightSweep)

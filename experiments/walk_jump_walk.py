@@ -6,7 +6,7 @@ Every robot walks by random commands, sampled every two seconds within 0.8 m/s a
 jumps 0.85 m ahead, and walks. `--course` gives every robot ten random commands instead: to walk, turn, jump up, jump to
 a landing position, or jump onto a sliding block of 0.05 m (no block on SolverMuJoCo). The block is placed under the
 goal when the jump takes over. A jump is commanded while the robot walks: it stops, stands, jumps, and walks again.
-`success_rate` is the share of robots that finished every command without a fall. `--randomize` adds the jumps'
+`success_rate` is the fraction of robots that finished every command without a fall. `--randomize` adds the jumps'
 randomisation, noise, latency and pushes; `--solver mujoco` evaluates on physics that the policies were not trained on.
 """
 
@@ -16,21 +16,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_course
 from jumper_warp.evaluation.landings import random_headings
 from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.utils.errors import InputError
-from support.scripts import parse_flags
+from support.scripts import run_script
 from support.walks import PAPER
 
-REACH, EACH = 0.8, 2.0  # [m/s] and [rad/s] Limit of the commanded velocities; [s] time of each command
+REACH, EACH = 0.8, 2.0  # [m/s] and [rad/s] Limit of commanded velocities; [s] time of each walking command
 HEIGHT, DISTANCE = 0.75, 0.85  # [m] Apex height and distance of the paper's two jumps
 WALKS = (3, 3, 2)  # Numbers of walking commands before, between and after the jumps
 COMMANDS = 10  # Number of commands in a course
-JUMPS = ("jump_up", "jump_to", "jump_onto")
+JUMPS = ("jump_up", "jump_to", "jump_onto")  # Kinds of `ScriptStep`
 PROBABILITIES = (0.35, 0.2, 0.15, 0.15, 0.15)  # Probabilities of walking, turning and each of the jumps
 
 
@@ -58,7 +57,7 @@ class Args(EvaluationArgs):
 
 
 def random_walks(rng: np.random.Generator, count: int) -> list[ScriptStep]:
-    """Return a number of walking commands with random velocities."""
+    """Return `count` walking commands with random velocities within REACH, EACH seconds long."""
     return [ScriptStep("walk", tuple(rng.uniform(-REACH, REACH, 3).tolist()), EACH) for _ in range(count)]
 
 
@@ -70,7 +69,10 @@ def paper_script(rng: np.random.Generator) -> list[ScriptStep]:
 
 
 def random_script(rng: np.random.Generator, blocks: bool = True) -> list[ScriptStep]:
-    """Return ten commands in random order: a jump of each kind, the others random; blocks: allow jumps onto a block."""
+    """Return COMMANDS commands in random order: one jump of each kind, the others random.
+
+    blocks: False to replace jumps onto a block by jumps to a position.
+    """
     random_kinds = rng.choice(["walk", "turn", *JUMPS], COMMANDS - len(JUMPS), p=PROBABILITIES)
     script = []
     for kind in rng.permutation([*JUMPS, *random_kinds]):
@@ -95,7 +97,7 @@ def scripts(args: Args) -> list[list[ScriptStep]]:
 
 
 def main(args: Args) -> dict:
-    """Run the test, plot one robot's course, and return the metrics."""
+    """Run the test, plot the course of robot 0, and return the metrics."""
     name = "course" if args.course else "walk_jump_walk"
     run = SkillRun.from_args(name, args, SkillNames(args.policy, args.jump_up, args.jump_to))
     course = CourseLog(scripts(args), random_headings(args.num_robots, args.seed))
@@ -106,4 +108,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

@@ -3,7 +3,7 @@
     python experiments/walking_terrain.py --policy walking_rough --num-robots 500 --out outputs/terrain
 
 Robots start in the middle of a tile with random headings and are commanded to walk straight ahead at 0.5 m/s for 10 s.
-The success rate of a terrain is the mean share of the commanded distance that they walk before they fall. Slopes and
+The success rate of a terrain is the mean fraction of the commanded distance that they walk before they fall. Slopes and
 stairs descend from the start, bowls and pits ascend. `--randomize` adds the randomisation, noise and latency of the
 training; `--solver mujoco` evaluates on physics that the policy was not trained on.
 """
@@ -14,15 +14,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.landings import random_headings
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import VelocityLog, check_velocity_settings
 from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile
 from jumper_warp.utils.errors import InputError
-from support.scripts import parse_flags
-from support.walks import walked_share
+from support.scripts import run_script
+from support.walks import walked_fraction
 
 SECONDS = 10.0  # [s] Time of each walk
 
@@ -37,7 +36,7 @@ class Args(EvaluationArgs):
     terrains: tuple[str, ...] = KINDS
     """Terrains to walk on."""
     speed: float = 0.5
-    """[m/s] Commanded, straight ahead."""
+    """[m/s] Commanded velocity straight ahead."""
     uneven: float = 0.05
     """[m] Largest height or depth of random ground."""
     slope: float = 10.0
@@ -55,23 +54,23 @@ class Args(EvaluationArgs):
 
 
 def main(args: Args) -> dict:
-    """Run the walks on every terrain, plot the shares, and return the metrics."""
+    """Run the walks on every terrain, plot the walked fractions, and return the metrics."""
     run = EvaluationRun.from_args("walking_terrain", args, ("velocity",))
-    commands, metrics, shares = np.tile([args.speed, 0.0, 0.0], (args.num_robots, 1, 1)), {}, {}
+    commands, metrics, fractions = np.tile([args.speed, 0.0, 0.0], (args.num_robots, 1, 1)), {}, {}
     terrain = TerrainCfg(tile=14.0, uneven=args.uneven, slope=args.slope, step=(args.step_height, args.step_height))
     for kind in args.terrains:
         ground = single_tile(terrain, kind)
         env = run.env(args.num_robots, ground=ground)
         log = VelocityLog(commands, env.task, SECONDS, headings=random_headings(args.num_robots, args.seed))
         walks = run.run_episodes(env, log, film=kind, film_scene={"ground": ground})
-        shares[kind] = walked_share(walks)
-        metrics[f"success_rate_{kind}"] = float(shares[kind].mean())
+        fractions[kind] = walked_fraction(walks)
+        metrics[f"success_rate_{kind}"] = float(fractions[kind].mean())
         metrics[f"fall_rate_{kind}"] = float(walks.fallen.mean())
     with figure(run.folder / "terrain.png", figsize=(7, 4)) as axis:
-        axis.boxplot([shares[kind] for kind in args.terrains], tick_labels=list(args.terrains), whis=(5, 95))
+        axis.boxplot([fractions[kind] for kind in args.terrains], tick_labels=list(args.terrains), whis=(5, 95))
         axis.set(ylabel="share of the way", title=f"{args.num_robots} robots each, {run.title}", ylim=(0.0, 1.05))
     return run.report({"robots": args.num_robots, "speed_m_s": args.speed} | metrics, {})
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

@@ -3,9 +3,9 @@
     python experiments/walking_tracking.py --policy walking_flat --commands-per-axis 13 --out outputs/walking
 
 One robot for each point of a grid, from minus to plus 0.8 m/s, 0.8 m/s and 0.8 rad/s, all three at once, walks for
-10 s; the first second does not count. Then as many robots get another command while they walk, 0.8 m/s away from the
-first in any direction, and have settled when they stay near it: to the end, or for half a second (pushes of later
-seconds do not count). In the test of top speed the command rises over three seconds and must be kept for five more
+10 s; the first second does not count. Then the same number of robots get another command while they walk, 0.8 m/s away
+from the first in any direction, and have settled when they stay near it: to the end, or for half a second (later pushes
+do not count). In the test of top speed the command rises over three seconds and must be kept for five more
 within 10 %. In the last test a kick changes the velocity by 0.5 m/s in any direction. The gait is that of straight
 walking at 0.8 m/s. `--randomize` adds the randomisation, noise, latency on both sides and pushes of the training;
 `--solver mujoco` evaluates on physics that the policy was not trained on.
@@ -17,13 +17,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jumper_warp.cli.main import run_command
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import AXES, VelocityLog, check_velocity_settings, command_grid, tracking_metrics
 from jumper_warp.utils.errors import InputError
 from support.gaits import GaitRecorder
-from support.scripts import parse_flags
+from support.scripts import run_script
 from support.walks import (
     HOLD,
     PAPER,
@@ -57,7 +56,10 @@ class Args(EvaluationArgs):
 
 
 def plot_tracking(run: EvaluationRun, walks: VelocityLog, settling: np.ndarray) -> None:
-    """Plot mean velocities over commands, and the distribution of settling times [s], (robots,)."""
+    """Plot mean velocities over commands, and the distribution of settling times, into `tracking.png`.
+
+    walks: of the grid; settling [s]: (robots,), infinite if a robot did not settle.
+    """
     history = walks.velocity_history()[round(1.0 / walks.step_dt) :]
     with figure(run.folder / "tracking.png", 2, 2, figsize=(9, 8)) as axes:
         for i, (axis, name) in enumerate(zip(axes.flat, AXES, strict=False)):
@@ -76,7 +78,7 @@ def plot_tracking(run: EvaluationRun, walks: VelocityLog, settling: np.ndarray) 
 
 
 def main(args: Args) -> dict:
-    """Run all tests, plot the tracking, and return the metrics."""
+    """Run all tests, plot tracking and settling times, and return the metrics."""
     run, rng = EvaluationRun.from_args("walking_tracking", args, ("velocity",)), np.random.default_rng(args.seed)
     env = run.env(args.commands_per_axis**3)
     walks = run.run_episodes(env, VelocityLog(command_grid(args.commands_per_axis, 3 * (REACH,)), env.task))
@@ -101,4 +103,4 @@ def main(args: Args) -> dict:
 
 
 if __name__ == "__main__":
-    run_command(lambda: main(parse_flags(Args)))
+    run_script(main, Args)

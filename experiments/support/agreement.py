@@ -21,30 +21,27 @@ from support.inverse_kinematics import random_motors
 
 MARGIN = 0.35  # [rad] Distance of the motor angles from the stops; a stretched leg is singular
 DT = 1.0e-6  # [s] Time step over which the change of velocity gives the acceleration
-States = dict[str, np.ndarray]
-Quantities = dict[str, np.ndarray]
+States = dict[str, np.ndarray]  # Keys and shapes: `random_states`
+Quantities = dict[str, np.ndarray]  # Keys: those of `UNITS` in `experiments/dynamics_agreement.py`; first axis states
 
 
 def random_states(n: int, seed: int) -> States:
-    """Return n random states by name, first axis states.
+    """Return n random states by name.
 
-    quat (xyzw), com_vel [m/s], ang_vel [rad/s] of the base, world frame; angles [rad], rates [rad/s], torque [N m] of
-    the 12 motors.
+    quat (n, 4), xyzw, com_vel (n, 3) [m/s], ang_vel (n, 3) [rad/s] of the base, world axes; angles [rad], rates
+    [rad/s], torque [N m] of the motors, (n, 12).
     """
     rng = np.random.default_rng(seed)
     quat = rng.normal(size=(n, 4))
     return {
-        "quat": quat / np.linalg.norm(quat, axis=1, keepdims=True),
-        "com_vel": rng.normal(size=(n, 3)),
-        "ang_vel": 2.0 * rng.normal(size=(n, 3)),
-        "angles": random_motors(load_description(), n, rng, MARGIN).T,
-        "rates": 4.0 * rng.normal(size=(n, 12)),
-        "torque": rng.uniform(-18.0, 18.0, (n, 12)),
-    }
+        "quat": quat / np.linalg.norm(quat, axis=1, keepdims=True), "com_vel": rng.normal(size=(n, 3)),
+        "ang_vel": 2.0 * rng.normal(size=(n, 3)), "angles": random_motors(load_description(), n, rng, MARGIN).T,
+        "rates": 4.0 * rng.normal(size=(n, 12)), "torque": rng.uniform(-18.0, 18.0, (n, 12)),
+    }  # fmt: skip
 
 
 def jumper_quantities(values: RobotValues, states: States) -> Quantities:
-    """Return all quantities by this project's dynamics, of the first robot of `values`."""
+    """Return all quantities of states by this project's dynamics, with the first robot of `values`."""
     n = len(states["angles"])
     model = build_model(n, ground=None, visuals=False, device="cpu")
     write_model(model, values)
@@ -57,10 +54,11 @@ def jumper_quantities(values: RobotValues, states: States) -> Quantities:
     force[:, MOTOR_DOFS] = states["torque"]
 
     def array(rows: np.ndarray) -> wp.array:
+        """Return rows as a flat Warp array in double precision."""
         return wp.array(rows.ravel(), dtype=wp.float64, device="cpu")
 
     def base_velocity(q: np.ndarray, qd: np.ndarray) -> tuple[Rotation, np.ndarray, np.ndarray]:
-        """Return orientation, velocity of the base origin (world axes) and angular velocity (body axes)."""
+        """Return orientation, velocity of the base origin [m/s] (world) and angular velocity [rad/s] (body axes)."""
         turn = Rotation.from_quat(q[:, 3:7])
         origin = qd[:, :3] - np.cross(qd[:, 3:6], turn.apply(values.base_com[0].astype(np.float32)))
         return turn, origin, turn.inv().apply(qd[:, 3:6])
@@ -79,7 +77,10 @@ def jumper_quantities(values: RobotValues, states: States) -> Quantities:
 
 
 def jumper_paws(dynamics: JumperDynamics, q: np.ndarray) -> Quantities:
-    """Return paw positions and Jacobians of coordinates q (n, 43), with the base level and at rest in the origin."""
+    """Return `paw_position` (n, 4, 3) [m] and `paw_jacobian` (n, 4, 3, 3) [m/rad], with the base level at the origin.
+
+    q: joint coordinates (n, 43), whose base orientation is overwritten.
+    """
     n, model = len(q), dynamics.model
     q[:, 3:7] = 0.0, 0.0, 0.0, 1.0
     shanks = [model.body_label.index(f"world_0/{leg}_inner_shank") for leg in LEGS]
@@ -100,7 +101,7 @@ def jumper_paws(dynamics: JumperDynamics, q: np.ndarray) -> Quantities:
 
 
 def pinocchio_quantities(values: RobotValues, states: States) -> Quantities:
-    """Return all quantities by Pinocchio, of the first robot of `values`."""
+    """Return all quantities of states by Pinocchio, with the first robot of `values`."""
     robot, rows = build_pinocchio(values=values), []
     for quat, com_vel, ang_vel, angles, rates, torque in zip(*states.values(), strict=True):
         turn = Rotation.from_quat(quat)
@@ -108,9 +109,9 @@ def pinocchio_quantities(values: RobotValues, states: States) -> Quantities:
         twist = np.concatenate([turn.inv().apply(com_vel) - np.cross(spin, values.base_com[0]), spin])
         q = robot.configuration(np.zeros(3), quat, angles)
         v = robot.closed_velocity(q, twist, rates)
-        change = robot.forward_dynamics(q, v, torque)
+        acceleration = robot.forward_dynamics(q, v, torque)
         level = robot.configuration(np.zeros(3), np.array([0.0, 0.0, 0.0, 1.0]), angles)
-        rows.append((change[:3] + np.cross(v[3:6], v[:3]), change[3:6], change[robot.motor_v],
+        rows.append((acceleration[:3] + np.cross(v[3:6], v[:3]), acceleration[3:6], acceleration[robot.motor_v],
                      robot.paw_positions(level), robot.paw_jacobians(level)))  # fmt: skip
     names = ("base_acceleration", "base_angular_acceleration", "joint_acceleration", "paw_position", "paw_jacobian")
     return dict(zip(names, map(np.array, zip(*rows, strict=True)), strict=True))

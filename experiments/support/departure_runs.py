@@ -1,4 +1,4 @@
-"""Trainings of ablations, evaluation of their policies, and the report."""
+"""Trainings of ablations (`support.departures`), evaluation of their policies, and the report."""
 
 from __future__ import annotations
 
@@ -27,36 +27,30 @@ from jumper_warp.utils.errors import InputError
 from support.departures import Ablation
 from support.squats import SquatLog, squat_goals, squat_metrics
 
-ELSEWHERE = {"log_root", "device", "threads"}  # Settings in which a training may differ from a saved one
+NOT_COMPARED = {"log_root", "device", "threads"}  # Settings in which a training may differ from a saved one
 HOLD = 3.0  # [s] Time for which squats are held
-TESTS = ("nominal", "randomized")
+TESTS = ("nominal", "randomized")  # Robots of the evaluations
 BASELINE = "kept"  # Name of the training with all departures
 COLUMNS = {
-    "error [mm]": ("error_m", 1000.0),
-    "success [%]": ("success_rate", 100.0),
-    "falls [%]": ("fall_rate", 100.0),
-    "still [%]": ("still_landing_rate", 100.0),
-    "hops again [%]": ("second_takeoff_rate", 100.0),
-    "at rest [%]": ("at_rest_within_1_s_rate", 100.0),
-    "largest tilt [deg]": ("max_landing_tilt_deg", 1.0),
-    "waits [%]": ("holding_rate", 100.0),
-    "paw force varies [N]": ("median_paw_force_range_n", 1.0),
+    "error [mm]": ("error_m", 1000.0), "success [%]": ("success_rate", 100.0), "falls [%]": ("fall_rate", 100.0),
+    "still [%]": ("still_landing_rate", 100.0), "hops again [%]": ("second_takeoff_rate", 100.0),
+    "at rest [%]": ("at_rest_within_1_s_rate", 100.0), "largest tilt [deg]": ("max_landing_tilt_deg", 1.0),
+    "waits [%]": ("holding_rate", 100.0), "paw force varies [N]": ("median_paw_force_range_n", 1.0),
     "torque ripple [N m]": ("mean_torque_ripple_nm", 1.0),
-}
+}  # fmt: skip
 """Columns of the table: metric and scale; cells are nominal / randomised."""
 WIDTH = 180  # Width of the table in characters
-MetricsByTraining = dict[tuple[str, int], dict[str, dict[str, Any]]]
-"""Metrics by training (name, seed), test and name."""
+MetricsByTraining = dict[tuple[str, int], dict[str, dict[str, Any]]]  # Metrics by training (name, seed), test and name
 
 
 @dataclass(frozen=True)
 class DepartureCfg:
-    """How the ablations of a task are trained and evaluated."""
+    """Settings with which the ablations of a task are trained and evaluated."""
 
     iterations: int  # Iterations of each training
     goals: dict[str, Any]  # [m] Flags that set the goals of the evaluated jumps
     squats: tuple[float, float]  # [m] Range of goals for which squats are held
-    begin: str = ""  # More flags of every training
+    begin: str = ""  # Further flags of `jumper train` for every training
 
 
 JumpTask = Literal["vertical-jump", "horizontal-jump", "omnidirectional-jump", "horizontal-jump-mars-loose"]
@@ -71,29 +65,35 @@ JUMP_TASKS: dict[JumpTask, DepartureCfg] = {
 
 
 def parse(ablation: Ablation, arguments: list[str]) -> tuple[Any, TaskCfg]:
-    """Return the parsed settings of `jumper train`, and its task with the ablation."""
+    """Return the settings parsed from the arguments of `jumper train`, and its task with the ablation."""
     parsed, task = parse_train(arguments)
     return parsed, task if isinstance(ablation, str) else ablation(task)
 
 
 def train_or_load(ablation: Ablation, arguments: list[str]) -> Path:
-    """Return the last checkpoint of a training, which is run unless it exists. Raises InputError: other settings."""
+    """Return the last checkpoint of a training, and run the training unless the checkpoint exists.
+
+    arguments: of `jumper train`. Raises InputError: the existing training has other settings.
+    """
     (parsed, task), name = parse(ablation, arguments), f"{CHECKPOINTS}/iteration_{{:06d}}.pt"
     if checkpoints := sorted(Path(parsed.cfg.log_root).glob(f"*/*/{name.format(parsed.cfg.max_iterations)}")):
         config = json.loads((checkpoints[-1].parents[1] / CONFIG).read_text())
         requested = json.loads(json.dumps(asdict(parsed.cfg), default=str))
-        other = {key for key in requested.keys() - ELSEWHERE if requested[key] != config["train"].get(key)}
-        if other or config["env"]["task"] != task_to_json(task):
+        changed = {key for key in requested.keys() - NOT_COMPARED if requested[key] != config["train"].get(key)}
+        if changed or config["env"]["task"] != task_to_json(task):
             raise InputError(f"{checkpoints[-1].parents[1]} was trained with other settings: choose another --out")
         return checkpoints[-1]
     start = actor_init_from_policy(parsed.cfg.init_policy, task, parsed.cfg.ppo) if parsed.cfg.init_policy else None
-    typed = shlex.join(["jumper", "train", *arguments])
-    result = train(parsed.cfg, env_maker(task, parsed), typed, actor_init=start)
+    command = shlex.join(["jumper", "train", *arguments])
+    result = train(parsed.cfg, env_maker(task, parsed), command, actor_init=start)
     return result.folder / name.format(result.iteration)
 
 
 def evaluate(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, Any]]:
-    """Return the metrics of a policy's jumps and held squats by test; args: `Args` of `experiments/departures.py`."""
+    """Return the scalar metrics of a policy's jumps and held squats, by name, for each of TESTS.
+
+    args: `Args` of `experiments/departures.py`; folder: for outputs of the run.
+    """
     run, ends = EvaluationRun(checkpoint), make_task(args.task).terminations
     run.prepare("departures", Conditions(device=args.device, threads=args.threads), folder)
     tests = {}
@@ -113,7 +113,7 @@ def evaluate(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, A
 
 
 def report(results: MetricsByTraining, title: str, folder: Path) -> Table:
-    """Write the table and the plot of all results into a folder, and return the table."""
+    """Write `departures.txt` and `departures.png` of all results into a folder, and return the table."""
     table = Table("ablation, seed", *map(escape, COLUMNS), title=title)
     for (name, seed), tests in results.items():
         table.add_row(f"{name.replace('_', ' ')}, {seed}", *(cell(tests, *column) for column in COLUMNS.values()))
@@ -124,13 +124,13 @@ def report(results: MetricsByTraining, title: str, folder: Path) -> Table:
 
 
 def cell(tests: dict[str, dict[str, Any]], name: str, scale: float) -> str:
-    """Return a metric, scaled, of both tests as text of a table cell."""
+    """Return a metric of both tests times `scale` as text `nominal / randomized`; tests: metrics by test and name."""
     values = (tests[test][name] for test in TESTS)
     return " / ".join("-" if value is None else f"{scale * value:.3g}" for value in values)
 
 
 def plot_results(results: MetricsByTraining, path: Path) -> None:
-    """Plot success and error of every training; the lines are those with all departures."""
+    """Plot success and error of every training; grey lines mark the trainings with all departures."""
     rows = [*results]
     with figure(path, 1, 2, figsize=(11, 1.0 + 0.25 * len(rows)), sharey=True) as axes:
         for axis, name, scale in zip(axes, ("success_rate", "error_m"), (100.0, 1000.0), strict=True):

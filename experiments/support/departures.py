@@ -11,44 +11,46 @@ from dataclasses import replace
 from jumper_warp.tasks.cfg import TaskCfg
 
 Ablation = str | Callable[[TaskCfg], TaskCfg]
-"""How a departure is undone: flags of `jumper train TASK`, or a function that returns the task without it."""
-Point = tuple[float, float, float]
+"""Change that undoes a departure: flags of `jumper train TASK`, or a function that returns the task without it."""
+Point = tuple[float, float, float]  # [m] x, y, z of a goal
 
 
 def may_jump_early(task: TaskCfg) -> TaskCfg:
-    """Return the task without its termination on a takeoff before the command."""
+    """Return a copy of the task without the termination `early_takeoff`."""
     terminations = tuple(term for term in task.terminations if term.name != "early_takeoff")
     return replace(task, terminations=terminations)
 
 
 def with_goals(task: TaskCfg, goals: Sequence[tuple[Point, Point]], starts: int) -> TaskCfg:
-    """Return the task with levels of other goal ranges [m] (lower, upper), each with the last `starts` base heights."""
-    last, heights = task.levels[-1], dict.fromkeys(level.base_height for level in task.levels)
-    ranges = [*heights][-starts:]
-    levels = (replace(last, goal_lower=a, goal_upper=b, base_height=start) for a, b in goals for start in ranges)
+    """Return a copy of the task with new levels: every goal range with each of the last `starts` start height ranges.
+
+    goals [m]: lower and upper point of each range; all other fields are those of the task's last level.
+    """
+    last, heights = task.levels[-1], [*dict.fromkeys(level.base_height for level in task.levels)][-starts:]
+    levels = (replace(last, goal_lower=low, goal_upper=top, base_height=z) for low, top in goals for z in heights)
     return replace(task, levels=tuple(levels))
 
 
 def heights_of_paper(task: TaskCfg) -> TaskCfg:
-    """Return the task with goal heights of 0.6 to 1.1 m in three levels, all starts from the first level on."""
+    """Return a copy of the task with goal heights of 0.6 to 1.1 m in three levels, all with the last start heights."""
     return with_goals(task, [((0.0, 0.0, 0.6), (0.0, 0.0, top)) for top in (0.75, 0.9, 1.1)], starts=1)
 
 
 def places_of_paper(task: TaskCfg) -> TaskCfg:
-    """Return the task with goals 0.4 to 1.0 m ahead, up to 0.3 m aside, in four steps with two levels each."""
+    """Return a copy of the task with goals 0.4 to 1.0 m ahead, up to 0.3 m aside, in four steps of two levels each."""
     tops = ((0.55, 0.0), (0.7, 0.1), (0.85, 0.2), (1.0, 0.3))
     return with_goals(task, [((0.4, -y, 0.0), (top, y, 0.0)) for top, y in tops], starts=2)
 
 
 def places_of_sequel(task: TaskCfg) -> TaskCfg:
-    """Return the task on Mars with goals 1.4 to 4.75 m ahead in the sequel's four steps with two levels each."""
+    """Return a copy of the Mars task with goals 1.4 to 4.75 m ahead in the sequel's four steps of two levels each."""
     (_, *low), (_, *top) = task.levels[-1].goal_lower, task.levels[-1].goal_upper
     ahead = ((1.4, 1.85), (1.6, 2.25), (2.0, 3.75), (3.0, 4.75))
     return with_goals(task, [((near, *low), (far, *top)) for near, far in ahead], starts=2)
 
 
 def alike_all_around(task: TaskCfg) -> TaskCfg:
-    """Return the task whose levels with goals all around reach as far aside and back as ahead."""
+    """Return a copy of the task whose elliptical goal ranges are circles with the radius of the reach ahead."""
     levels = list(task.levels)
     for i, level in enumerate(levels):
         reach = level.goal_upper[0]
@@ -58,7 +60,7 @@ def alike_all_around(task: TaskCfg) -> TaskCfg:
 
 
 def without_another_goal(task: TaskCfg) -> TaskCfg:
-    """Return the task in which a landed robot is never given a next goal."""
+    """Return a copy of the task in which a landed robot never gets a next goal."""
     return replace(task, levels=tuple(replace(level, next_jump_probability=0.0) for level in task.levels))
 
 
@@ -122,5 +124,5 @@ DEPARTURES: dict[str, dict[str, Ablation]] = {
 
 
 def ablation_flags(ablation: Ablation) -> str:
-    """Return the flags of an ablation, empty if it is a function."""
+    """Return the flags of an ablation of `jumper train`, empty if it is a function."""
     return ablation if isinstance(ablation, str) else ""

@@ -28,44 +28,41 @@ from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import FALLS_FROM_FLIGHT, flight_skills
 from support.momentum import momentum
 
-JUMP, TURN = 0, 1  # Indices of the skills in the environment
-RAMP, HOLD, EXTEND = 25, 35, 40
-"""Numbers of policy steps of the ramp into the squat, the held squat, and at most of the extension."""
+JUMP, TURN = 0, 1  # Indices of the skills in `Env.skills`
+RAMP, HOLD, EXTEND = 25, 35, 40  # Policy steps of the ramp into the squat, the held squat, at most of the extension
 SQUAT = 120.0  # [deg] Commanded transversal angle of the squat
 STRETCHED = -45.0  # [deg] Commanded transversal angle of the extension
 HIGH = 0.7  # [m] Base height above which no paw can touch level ground
 UPRIGHT = 30.0  # [deg] Largest tilt of a successful landing
 CLEAR = 3  # Policy steps without contact that count as takeoff of a policy; open loop, one is enough
 AFTER = 1.5  # [s] Time after touchdown at which a landing is evaluated
-OUTCOMES = (*(term.name for term in FALLS_FROM_FLIGHT), "landed", "tilted", "no_takeoff")
+OUTCOMES = (*(term.name for term in FALLS_FROM_FLIGHT), "landed", "tilted", "no_takeoff")  # By index `FlightLog.end`
 LEG_SIGNS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
-"""Sign of each leg FL, FR, BL, BR along front and left."""
+"""Sides of the legs FL, FR, BL, BR: 1 front or left, -1 back or right; columns: front, left."""
 
 
 @dataclass
 class FlightLog(EvaluationLog):
     """Log of one flight per world; arrays have shape (num_envs,) and do not change after the flight's end."""
 
-    apex: np.ndarray  # [m] (num_envs,) Apex heights that are commanded to the jump's policy
-    late: np.ndarray | None = None
-    """[s] (num_envs, 2) Delay of the extension of front and left legs; None: the jump's policy takes off."""
+    apex: np.ndarray  # [m] (num_envs,) Apex heights commanded to the jump's policy
+    late: np.ndarray | None = None  # [s] (num_envs, 2) Delays of front and left legs; None: the policy takes off
     turns: bool = True  # Whether the turning skill is requested in flight
-    seconds: float = 9.0
+    seconds: float = 9.0  # [s] Maximum simulated time
     row_name = "flight"
     spacing = 1.6
 
     def __post_init__(self) -> None:
-        """Begin with no flight ended."""
-        self.count, self.step_dt = len(self.apex), 1.0 / 60.0
-        n = self.count
+        n = self.count = len(self.apex)
+        self.step_dt = 1.0 / 60.0  # [s] policy step; `begin` sets that of the environment
         self.end = np.full(n, -1)  # index in OUTCOMES, -1 while under way
-        self.takeoff_tilt, self.takeoff_spin = (np.full(n, np.nan) for _ in range(2))  # [rad], [rad/s]
-        self.takeoff_momentum = np.full(n, np.nan)  # [kg m^2/s] angular, about the com
+        self.takeoff_tilt, self.takeoff_spin = (np.full(n, np.nan) for _ in range(2))  # [rad], [rad/s] at takeoff
+        self.takeoff_momentum = np.full(n, np.nan)  # [kg m^2/s] norm of the angular momentum about the COM at takeoff
         self.largest_tilt = np.zeros(n)  # [rad] in flight
         self.touchdown_tilt = np.full(n, np.nan)  # [rad] in the step before the touchdown
-        self.touchdown_turn = np.full(n, np.nan)  # [rad] yaw relative to the start, in the step before
+        self.touchdown_turn = np.full(n, np.nan)  # [rad] size of the yaw from the start, in the step before touchdown
         self.height = np.zeros(n)  # [m] largest base height
-        self.flight_time = np.full(n, np.nan)  # [s]
+        self.flight_time = np.full(n, np.nan)  # [s] from takeoff to touchdown
         self.drift = np.zeros(n)  # [kg m^2/s] largest change of the angular momentum above HIGH
         self.tilts: list[np.ndarray] = []  # [rad] (num_envs,) after every policy step, until the end
         self.heights: list[np.ndarray] = []  # [m] (num_envs,) base height after every policy step
@@ -73,25 +70,29 @@ class FlightLog(EvaluationLog):
         self._airborne_steps, self._yaw, self._initial_momentum = np.zeros(n, dtype=int), np.zeros(n), np.zeros((n, 3))
 
     def begin(self, env: Any) -> None:
-        """Reset every robot to the default pose, with its commanded height."""
+        """Reset every robot to the default pose, with its commanded apex height."""
         self.step_dt, goals = env.step_dt, np.zeros((len(self.apex), 3))
         goals[:, 2] = self.apex
         env.evaluation_reset(jump_commands(goals, DELAY if self.late is None else 0.0, env.step_dt))
 
     def open_loop(self, late: np.ndarray) -> np.ndarray:
-        """Return the open-loop transversal angles [deg] of the next policy step, (num_envs, 4); late: the field."""
+        """Return the open-loop transversal angles [deg] of the next policy step, (num_envs, 4), legs FL, FR, BL, BR.
+
+        late: the field `late`.
+        """
         step, n = len(self.tilts), len(self.apex)
         squat = 45.0 + (SQUAT - 45.0) * min(step / RAMP, 1.0)
-        delay = late @ (0.5 * LEG_SIGNS.T) / self.step_dt
-        share = np.clip(step + 1 - (RAMP + HOLD) - (delay - delay.min(axis=1, keepdims=True)), 0.0, 1.0)
+        delay = late @ (0.5 * LEG_SIGNS.T) / self.step_dt  # [policy steps]
+        extended = np.clip(step + 1 - (RAMP + HOLD) - (delay - delay.min(axis=1, keepdims=True)), 0.0, 1.0)
         if step < RAMP + HOLD + EXTEND:
-            return squat + (STRETCHED - squat) * share
+            return squat + (STRETCHED - squat) * extended
         return np.full((n, 4), 45.0)
 
     def action(self, scale: float, policy: torch.Tensor | None) -> np.ndarray:
-        """Return the jump's action, (num_envs, 12): open loop up to takeoff if `late` is set, else the policy's.
+        """Return the jump's action [1], (num_envs, 12): open loop up to takeoff if `late` is set, else of the policy.
 
-        scale [deg]: action scale of the transversal motors; policy: its action, None for the default pose.
+        scale [deg]: action scale of the transversal motors; policy: action of the policy (num_envs, 12), None: the
+        default pose.
         """
         n = len(self.apex)
         action = np.zeros((n, 12)) if policy is None else policy.cpu().numpy().copy()
@@ -104,7 +105,11 @@ class FlightLog(EvaluationLog):
         return action
 
     def read_env(self, env: Any) -> dict[str, np.ndarray]:
-        """Return base state, tilt and yaw [rad], paw contact, termination and angular momentum of every robot."""
+        """Return arrays (num_envs, ...) by name, world axes.
+
+        base_pos [m], tilt [rad], turn (size of the yaw [rad]), rise (upward speed [m/s]), spin (angular speed [rad/s]),
+        down (whether any paw is on the ground), termination (index), momentum (angular, about the COM [kg m^2/s]).
+        """
         q, qd = env.sim.joint_q(), env.sim.joint_qd()
         quat = q[:, 3:7]
         up = 1.0 - 2.0 * (quat[:, 0] ** 2 + quat[:, 1] ** 2)
@@ -114,16 +119,19 @@ class FlightLog(EvaluationLog):
                 "termination": env.episodes.termination.numpy().copy(), "momentum": momentum(env.sim)[1]}  # fmt: skip
 
     def record_step(self, env: Any) -> bool:
-        """Record a policy step, and request a turn where a flight has begun."""
+        """Record a policy step, request a turn of robots that took off in it; return whether all flights have ended."""
         before = self._takeoff_step.copy()
         ended = super().record_step(env)
-        fresh = (self._takeoff_step >= 0) & (before < 0)
-        if self.turns and fresh.any():
-            env.request(TURN, fresh)
+        took_off = (self._takeoff_step >= 0) & (before < 0)
+        if self.turns and took_off.any():
+            env.request(TURN, took_off)
         return ended
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
-        """Record a policy step from the arrays of `read_env`; return whether all flights have ended."""
+        """Record a policy step from the arrays of `read_env`; return whether all flights have ended.
+
+        A flight ends with a fall, AFTER seconds after touchdown, or without a takeoff by the end of the extension.
+        """
         step, running = len(self.tilts), self.end < 0
         self._airborne_steps = np.where(arrays["down"], 0, self._airborne_steps + 1)
         earliest, needed = (0, CLEAR) if self.late is None else (RAMP + HOLD, 1)
@@ -146,37 +154,37 @@ class FlightLog(EvaluationLog):
         high = flying & (arrays["base_pos"][:, 2] > HIGH)
         self.drift[high] = np.maximum(self.drift, change)[high]
         self.height[running] = np.maximum(self.height, arrays["base_pos"][:, 2])[running]
-        for kept, now in ((self.tilts, arrays["tilt"]), (self.heights, arrays["base_pos"][:, 2])):
-            kept.append(np.where(running, now, kept[-1]) if kept else now)
+        for history, value in ((self.tilts, arrays["tilt"]), (self.heights, arrays["base_pos"][:, 2])):
+            history.append(np.where(running, value, history[-1]) if history else value)
         fell = running & (arrays["termination"] >= 0)
         self.end[fell] = arrays["termination"][fell]
         over = running & ~fell & (self._touchdown_step >= 0) & (step - self._touchdown_step >= round(AFTER / step_dt))
-        good = np.degrees(arrays["tilt"]) < UPRIGHT
-        self.end[over] = np.where(good[over], OUTCOMES.index("landed"), OUTCOMES.index("tilted"))
+        upright = np.degrees(arrays["tilt"]) < UPRIGHT
+        self.end[over] = np.where(upright[over], OUTCOMES.index("landed"), OUTCOMES.index("tilted"))
         late = running & (self._takeoff_step < 0) & (step > RAMP + HOLD + EXTEND)
         self.end[late] = OUTCOMES.index("no_takeoff")
         return bool((self.end >= 0).all())
 
     @property
     def success(self) -> np.ndarray:
-        """Whether each robot landed and was upright AFTER seconds later."""
+        """(num_envs,) Whether each robot landed and was within UPRIGHT of level AFTER seconds later."""
         return self.end == OUTCOMES.index("landed")
 
     @property
     def outcomes(self) -> np.ndarray:
-        """Outcome of each flight, one of OUTCOMES or NO_END."""
+        """(num_envs,) Outcome of each flight, one of OUTCOMES or NO_END."""
         return np.array([*OUTCOMES, NO_END])[self.end]
 
     def columns(self) -> dict[str, list]:
-        """Return tilts [deg], spin, apex height [m] and outcome of every flight."""
-        numbers = {
+        """Return lists with one value per flight: takeoff tilt and spin, touchdown tilt, apex_m, end (outcome)."""
+        columns = {
             "takeoff_tilt_deg": np.degrees(self.takeoff_tilt), "takeoff_spin_rad_s": self.takeoff_spin,
             "touchdown_tilt_deg": np.degrees(self.touchdown_tilt), "apex_m": self.height,
         }  # fmt: skip
-        return {name: finite(values) for name, values in numbers.items()} | {"end": self.outcomes.tolist()}
+        return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return tilt and base height of some worlds."""
+        """Return the last tilt [deg] and base height [m] of some worlds."""
         series = {}
         for world in worlds:
             series[f"tilt/of {world} [deg]"] = float(np.degrees(self.tilts[-1][world]))
@@ -184,7 +192,7 @@ class FlightLog(EvaluationLog):
         return series
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the commanded heights [m] and the delays of the extension [ms] of some worlds."""
+        """Return commanded heights `asked_m` and delays of the extension `late_ms` (front, left) of some worlds."""
         notes = {"asked_m": self.apex[list(worlds)].tolist()}
         return notes if self.late is None else notes | {"late_ms": (1000.0 * self.late[list(worlds)]).tolist()}
 
@@ -210,14 +218,17 @@ def flight_metrics(flights: FlightLog) -> Metrics:
 
 
 def extension_delays(count: int, most: float, seed: int) -> np.ndarray:
-    """Return random delays of front and left legs [s], (count, 2): vectors of length most / 2 to most."""
+    """Return random delays of front and left legs [s], (count, 2), vectors of length most / 2 to most [s].
+
+    A negative delay is one of the back or right legs.
+    """
     rng = np.random.default_rng(seed)
     size, angle = rng.uniform(0.5 * most, most, count), rng.uniform(0.0, 2.0 * np.pi, count)
     return np.stack([size * np.cos(angle), size * np.sin(angle)], axis=1)
 
 
 def plot_flights(path: Path, logs: Mapping[str, FlightLog]) -> None:
-    """Plot tilt and base height of all flights over time, one column per log (by name)."""
+    """Plot tilt and base height of all flights over time; logs: one column each, by title."""
     with figure(path, 2, len(logs), figsize=(11, 6), sharex=True, sharey="row") as axes:
         for column, (name, flights) in zip(axes.T, logs.items(), strict=True):
             time = np.arange(len(flights.tilts)) * flights.step_dt
@@ -230,13 +241,13 @@ def plot_flights(path: Path, logs: Mapping[str, FlightLog]) -> None:
 class FlightRun(Run):
     """Evaluation of flights with two skills: a jump, and a policy that turns in flight."""
 
-    flights: FlightLog
-    """Log of the flights under way."""
+    flights: FlightLog  # Log of the flights under way
 
     def __init__(self, args: EvaluationArgs, landing: str, jump: str) -> None:
-        """Open the policies that turn (`args.policy`) and land (`landing`; empty: none, `jump` is the task that lands).
+        """Open the policies, and prepare the output folder.
 
-        Raises PolicyError or CheckpointError: one cannot be used, or is of another kind of task.
+        args.policy: policy that turns; landing: policy that lands, empty: the default pose in the task `jump`. Raises
+        PolicyError or CheckpointError: a policy cannot be used, or its task is another one.
         """
         super().__init__()
         self.turn: Policy = open_policy(args.policy)
@@ -251,7 +262,7 @@ class FlightRun(Run):
         self.prepare("flight_attitude", conditions_of(args), args.out, record=args.num_recorded)
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return the function that gives the actions of both skills, (2, num_envs, 12)."""
+        """Return a function of any argument that returns the actions of JUMP and TURN, (2, num_envs, 12)."""
         scale = env.skills[JUMP].task.action_scale[1]
 
         def act(obs: torch.Tensor) -> torch.Tensor:
@@ -277,7 +288,7 @@ class FlightRun(Run):
         return env
 
     def fly(self, env: Env, flights: FlightLog, film: str) -> FlightLog:
-        """Run the flights, and return their log; film: name of the recording."""
+        """Run the flights of a new log, and return it; film: name of the recording."""
         self.flights = flights
         self.run_episodes(env, flights, film=film)
         return flights

@@ -14,19 +14,20 @@ from jumper_warp.robot.description import LEGS
 
 @dataclass
 class GaitRecorder:
-    """Samples the gait of all worlds, which walk with one command; call it after every policy step."""
+    """Recorder of the gait of all worlds (robots); call the object after every policy step.
+
+    Lists have one array per sampled policy step; paws FL, FR, BL, BR.
+    """
 
     env: Any  # The sampled `jumper_warp.envs.env.Env`
     skip: float = 2.0  # [s] Time at the start that is not sampled
     contact: list[np.ndarray] = field(default_factory=list)  # (robots, 4) Whether each paw is on the ground
-    paw_height: list[np.ndarray] = field(default_factory=list)
-    """[m] (robots, 4) Height of each paw above the ground below it."""
-    force: list[np.ndarray] = field(default_factory=list)
-    """[N] (robots, 4) Upward force on each paw in the last physics step."""
+    paw_height: list[np.ndarray] = field(default_factory=list)  # [m] (robots, 4) Height of paws above the ground
+    force: list[np.ndarray] = field(default_factory=list)  # [N] (robots, 4) Upward force on paws
     torque: list[np.ndarray] = field(default_factory=list)  # [N m] (robots, 12) Motor torques
     power: list[np.ndarray] = field(default_factory=list)  # [W] (robots,) Sum of the positive powers of the motors
     speed: list[np.ndarray] = field(default_factory=list)  # [m/s] (robots,) Horizontal speed of the base
-    steps: int = 0  # Number of policy steps so far
+    steps: int = 0  # Number of policy steps so far, skipped ones included
 
     def __call__(self, *_: Any) -> None:
         """Append a sample, unless within `skip` of the start."""
@@ -35,7 +36,7 @@ class GaitRecorder:
             return
         robot, sim = self.env.robot, self.env.sim
         torque = robot.torque.numpy().T.astype(float)
-        rate = sim.joint_qd()[:, [6 + 5 * leg + j for leg in range(4) for j in (0, 1, 3)]]
+        rate = sim.joint_qd()[:, [6 + 5 * leg + j for leg in range(4) for j in (0, 1, 3)]]  # motor joints
         self.contact.append(robot.contact_time.numpy().T > 0.0)
         self.paw_height.append(robot.paw_height.numpy().T.copy())
         self.force.append(sim.paw_force.numpy()[..., 2].T.copy())
@@ -61,10 +62,10 @@ def gait_metrics(
     contact: np.ndarray, paw_height: np.ndarray, force: np.ndarray, torque: np.ndarray, power: np.ndarray,
     speed: np.ndarray, weight: np.ndarray, step_dt: float,
 ) -> Metrics:  # fmt: skip
-    """Return the metrics of a gait from the samples of `GaitRecorder`, (steps, robots, ...); weight [N]: (robots,).
+    """Return the metrics of a gait from the lists of `GaitRecorder` as arrays (steps, robots, ...).
 
-    The cost of transport is mean power / (weight * mean speed); None if a robot does not move. Contact patterns are
-    named by the paws on the ground.
+    weight [N]: (robots,); step_dt [s]: policy step. The cost of transport is mean power / (weight * mean speed); None
+    if a robot does not move. `share_down_<paws>` is the fraction of time in which exactly these paws touch the ground.
     """
     apexes = np.concatenate([np.zeros(0), *(swing_apexes(contact[:, i, k], paw_height[:, i, k])
                                            for i in range(contact.shape[1]) for k in range(4))])  # fmt: skip
@@ -82,18 +83,18 @@ def gait_metrics(
         "paw_force_ripple": float(load.std(axis=0).mean()),
         "largest_paw_force_n": float(force.max()),
     }
-    codes = (contact * [1, 2, 4, 8]).sum(axis=2)
-    shares = np.bincount(codes.ravel(), minlength=16) / codes.size
-    for code in np.argsort(-shares, kind="stable"):
-        if shares[code] >= 0.005:
+    codes = (contact * [1, 2, 4, 8]).sum(axis=2)  # one bit per paw
+    fractions = np.bincount(codes.ravel(), minlength=16) / codes.size
+    for code in np.argsort(-fractions, kind="stable"):
+        if fractions[code] >= 0.005:
             paws = "_".join(leg for k, leg in enumerate(LEGS) if code >> k & 1) or "none"
-            metrics[f"share_down_{paws}"] = float(shares[code])
+            metrics[f"share_down_{paws}"] = float(fractions[code])
     return metrics
 
 
 def swing_apexes(contact: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Return the largest height [m] in each complete swing of a paw; contact (bool), height [m]: (steps,)."""
-    change = np.diff(contact.astype(int))
-    lifts, lands = np.flatnonzero(change == -1) + 1, np.flatnonzero(change == 1) + 1
+    """Return the largest height [m] in each complete swing of one paw, (swings,); contact, height [m]: (steps,)."""
+    edges = np.diff(contact.astype(int))
+    lifts, lands = np.flatnonzero(edges == -1) + 1, np.flatnonzero(edges == 1) + 1
     lands = lands[lands > lifts[0]] if len(lifts) else lands[:0]
     return np.array([height[a:b].max() for a, b in zip(lifts, lands, strict=False)])

@@ -18,7 +18,7 @@ class PlainJump:
     """The jump by the solver's kernel, as a captured graph of filter and physics of all policy steps."""
 
     def __init__(self, rollout: Rollout, targets: np.ndarray):
-        """Capture the graph; model and parameters are the rollout's; targets [rad]: (steps, 12)."""
+        """Capture the graph with model and parameters of the rollout; targets: motor targets [rad], (steps, 12)."""
         self._rollout, n = rollout, rollout.num_worlds
         dynamics, modules = rollout.dynamics, rollout.dynamics.modules
         self._start = [rollout.array(np.tile(values, n)) for values in start()]
@@ -32,6 +32,7 @@ class PlainJump:
         settings = dynamics.settings(PHYSICS_DT, SUBSTEPS, MAX_SWEEPS, TOLERANCE)
 
         def run() -> None:
+            """Simulate from the start, one command filter launch and SUBSTEPS physics steps per target."""
             dynamics.work.impulse.zero_()
             for current, initial in zip((self._q, self._qd), self._start, strict=True):
                 wp.copy(current, initial)
@@ -61,7 +62,7 @@ class GradientRun:
     """The jump as a rollout, and the gradient of its final height by the reverse pass."""
 
     def __init__(self, worlds: int, double: bool, device: str | None):
-        """Build the rollout and its inputs for a number of worlds; double: precision."""
+        """Build the rollout and its inputs for a number of worlds; double: compute in double precision."""
         model = build_model(worlds, visuals=False, device=device)
         self.rollout = Rollout(
             model, jumping_motors(), vertical_jump_filter(), double=double, tolerance=TOLERANCE, threads=1
@@ -78,5 +79,5 @@ class GradientRun:
         return self.rollout.run(self._targets, self._q, self._qd)
 
     def run(self) -> dict[str, wp.array]:
-        """Simulate the jump and return the gradients by name of the input."""
+        """Simulate the jump, return the gradients of the final base height by input, as `Rollout.backward`."""
         return self.rollout.backward(self.forward(), q=self._cotangent)

@@ -21,7 +21,7 @@ from jumper_warp.rl.networks import ActorCritic, linear_layers
 from jumper_warp.trajectory.gauss_newton import Network, Tape, per_world_gradients
 
 NOISE = 0.2  # [1] Standard deviation of the actions in windows
-ESTIMATORS = ("physics", "score")
+ESTIMATORS = ("physics", "score")  # Gradients through the physics, and by the score function
 METRICS = {"deviation": "std", "signal": "signal", "worlds_needed": "worlds_needed", "non_finite": "non_finite"}
 """Field of `GradientStats` by name of the metric."""
 
@@ -32,16 +32,15 @@ class GradientStats:
 
     std: float  # Square root of the sum over weights of the variance between worlds
     signal: float  # Norm of the mean over worlds, without the part expected from noise alone; 0 if noise explains it
-    non_finite: float  # Share of worlds whose gradient is not finite
+    non_finite: float  # Fraction of worlds whose gradient is not finite
 
     @property
     def worlds_needed(self) -> float:
-        """Number of worlds for which the noise of the mean is as long as the signal."""
+        """Number of worlds over which the mean has noise of the norm of the signal; infinite without signal."""
         return (self.std / self.signal) ** 2 if self.signal > 0.0 else float("inf")
 
 
-StatsByPolicy = dict[str, dict[str, list[GradientStats]]]
-"""Statistics by policy and estimator, one per horizon."""
+StatsByPolicy = dict[str, dict[str, list[GradientStats]]]  # Statistics by policy and estimator, one per horizon
 
 
 def gradient_stats(rows: torch.Tensor) -> GradientStats:
@@ -56,8 +55,8 @@ def gradient_stats(rows: torch.Tensor) -> GradientStats:
 def gradients(env: DifferentiableEnv, network: Network, horizon: int, std: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Return each world's gradient of the reward of a window, (worlds, weights), by physics and by the score function.
 
-    The window starts at the present state; rewards of a world count until its episode ends. std: standard deviation of
-    the actions' noise [1]. The advantage of the score function is the remaining reward minus its mean over worlds.
+    The window of `horizon` policy steps starts at the present state; rewards of a world count until its episode ends.
+    std: of action noise [1]. The advantage of the score function is the remaining reward minus its mean over worlds.
     """
     env.begin_window()
     tape, score_tape, scores, rewards = Tape(), Tape(), [], []
@@ -77,7 +76,7 @@ def gradients(env: DifferentiableEnv, network: Network, horizon: int, std: float
 
 
 def policies() -> dict[str, Policy]:
-    """Return `trained`, the shipped policy, and `new`, one with random weights and the same interface."""
+    """Return the shipped policy as `trained`, and as `new` a policy with random weights and the same interface."""
     trained = open_policy("vertical_jump")
     interface = trained.interface
     torch.manual_seed(0)
@@ -106,28 +105,29 @@ def measure_stats(make_env: Callable[[], Env], horizons: tuple[int, ...]) -> Sta
 
 
 def variance_metrics(stats: StatsByPolicy) -> dict[str, Any]:
-    """Return the statistics as metrics, one list over horizons each; None where not finite."""
+    """Return `<metric>_<estimator>_<policy>`, lists over horizons of all METRICS; None where not finite."""
     values = {}
     for policy, by_estimator in stats.items():
         for estimator, of_horizons in by_estimator.items():
             for key, field in METRICS.items():
-                series = [getattr(each, field) for each in of_horizons]
+                series = [getattr(one_horizon, field) for one_horizon in of_horizons]
                 values[f"{key}_{estimator}_{policy}"] = [x if math.isfinite(x) else None for x in series]
     return values
 
 
 def print_variances(stats: StatsByPolicy, horizons: tuple[int, ...]) -> None:
     """Print a table of standard deviations and numbers of worlds by policy and horizon."""
-    table = Table("policy", "steps", *(f"{name}: {what}" for name in ESTIMATORS for what in ("deviation", "worlds")))
+    columns = (f"{name}: {column}" for name in ESTIMATORS for column in ("deviation", "worlds"))
+    table = Table("policy", "steps", *columns)
     for policy, by_estimator in stats.items():
         for horizon, *pair in zip(horizons, *by_estimator.values(), strict=True):
-            cells = [f"{x:.3g}" for each in pair for x in (each.std, each.worlds_needed)]
+            cells = [f"{x:.3g}" for estimate in pair for x in (estimate.std, estimate.worlds_needed)]
             table.add_row(policy, str(horizon), *cells)
     Console().print(table)
 
 
 def plot_variances(stats: StatsByPolicy, horizons: tuple[int, ...], path: Path) -> None:
-    """Plot standard deviation and number of worlds over the horizon, a color per policy."""
+    """Plot standard deviation and number of worlds over the horizon, a color per policy, a line style per estimator."""
     with figure(path, 1, 2, figsize=(11, 4.5)) as axes:
         for i, (policy, by_estimator) in enumerate(stats.items()):
             for name, of_horizons in by_estimator.items():

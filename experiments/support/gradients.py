@@ -19,15 +19,13 @@ from jumper_warp.robot.model import build_model, standing_configuration
 from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
 
 TICKS = 36  # Number of policy steps of 1/60 s of the jump
-SQUAT = math.radians(85.0)
-PUSH = (-5.0, -8.0)
-"""[deg] Outer and inner transversal command of the push-off; the filter binds, the motors saturate at first."""
+SQUAT = math.radians(85.0)  # [rad] Transversal angle of the squat
+PUSH = (-5.0, -8.0)  # [deg] Outer and inner command of the push-off; the filter binds, the motors saturate at first
 SLIP_SPEED = 1.5  # [m/s] Initial forward speed of the jump on slippery ground for the gradient by friction
-SLIP_FRICTION = 0.25
+SLIP_FRICTION = 0.25  # [1] Dynamic friction of this ground; static is 1.2 times as large
 OUTER, INNER = 1, 2  # Motors of the front left leg whose targets are checked
-PARAMETERS = ("table", "saturation")
-GradientPair = tuple[np.ndarray, np.ndarray]
-"""Gradient of the apex along some directions, and its central differences; the same shape."""
+PARAMETERS = ("table", "saturation")  # Inputs that are parameters of the rollout
+GradientPair = tuple[np.ndarray, np.ndarray]  # Derivatives of the apex: gradient, central differences; (n,) each
 
 
 def schedule(push: tuple[float, float]) -> np.ndarray:
@@ -47,10 +45,13 @@ def start() -> tuple[np.ndarray, np.ndarray]:
 
 
 class GradientJump:
-    """Simulates the jump from inputs: targets (TICKS, 12), q (19,), qd (18,), table (rows,), saturation (12,)."""
+    """Simulates the jump from inputs by name.
+
+    targets [rad] (TICKS, 12), coordinates q (19,), rates qd (18,), parameters table (rows,), saturation [N m] (12,).
+    """
 
     def __init__(self, num_worlds: int, double: bool, device: str | None):
-        """Build the rollout and the default inputs, `values`; double: precision."""
+        """Build the rollout and the default inputs, `values`; double: compute in double precision."""
         self.num_worlds = num_worlds
         model = build_model(num_worlds, visuals=False, device=device)
         self.rollout = Rollout(model, jumping_motors(), vertical_jump_filter(), double=double, every=1)
@@ -59,17 +60,20 @@ class GradientJump:
         self.values |= {name: self.rollout.parameters[name].numpy()[:, 0].astype(float) for name in PARAMETERS}
 
     def run(self, inputs: dict[str, np.ndarray]) -> Trajectory:
-        """Simulate with some inputs changed; they have the world as first axis where worlds differ."""
-        full = {}
+        """Simulate with `inputs` in place of defaults; an input that differs between worlds has them as first axis."""
+        by_world = {}
         for name, value in (self.values | inputs).items():
-            whole = np.broadcast_to(value, (self.num_worlds, *value.shape[-self.values[name].ndim :]))
-            full[name] = np.moveaxis(whole, 0, -1)
+            rows = np.broadcast_to(value, (self.num_worlds, *value.shape[-self.values[name].ndim :]))
+            by_world[name] = np.moveaxis(rows, 0, -1)
         for name in PARAMETERS:
-            self.rollout.parameters[name].assign(np.ascontiguousarray(full[name]))
-        return self.rollout.run(full["targets"], full["q"], full["qd"])
+            self.rollout.parameters[name].assign(np.ascontiguousarray(by_world[name]))
+        return self.rollout.run(by_world["targets"], by_world["q"], by_world["qd"])
 
     def gradients(self, inputs: dict[str, np.ndarray]) -> tuple[Trajectory, dict[str, np.ndarray]]:
-        """Return the jump in one world and the gradients of its apex by each input, and by body mass, `mass` (21,)."""
+        """Return the jump in one world and the gradients of its apex by each input, shaped as it, and by `mass` (21,).
+
+        inputs: as for `run`; mass: of each body [m/kg].
+        """
         jump = self.run(inputs)
         cotangent = np.zeros(jump.q.shape)
         cotangent[jump.q.numpy()[:, 2, 0].argmax(), 2, 0] = 1.0
@@ -80,26 +84,26 @@ class GradientJump:
 
 
 def apex(jump: Trajectory) -> np.ndarray:
-    """Return the largest base height [m] of every world."""
+    """Return the largest base height [m] of every world, (num_worlds,)."""
     return jump.q.numpy()[:, 2].max(axis=0)
 
 
 def differences(
     inputs: dict[str, np.ndarray], name: str, directions: np.ndarray, step: float, device: str | None
 ) -> np.ndarray:
-    """Return central differences of the apex along directions (n, ...) of the input `name`, (n,).
+    """Return central differences of the apex [m per unit] along directions (n, ...) of the input `name`, (n,).
 
-    inputs: changed from the defaults; step: half distance. All 2 n jumps run in parallel worlds.
+    inputs: as for `GradientJump.run`; step: half the distance of the two points. All 2 n jumps run in parallel worlds.
     """
     batch = GradientJump(2 * len(directions), double=True, device=device)
     middle = inputs.get(name, batch.values[name])
-    ends = np.concatenate([middle + step * directions, middle - step * directions])
-    ahead, behind = np.split(apex(batch.run(inputs | {name: ends})), 2)
-    return (ahead - behind) / (2.0 * step)
+    points = np.concatenate([middle + step * directions, middle - step * directions])
+    upper, lower = np.split(apex(batch.run(inputs | {name: points})), 2)
+    return (upper - lower) / (2.0 * step)
 
 
 def unit_directions(shape: tuple[int, ...], indices: list) -> np.ndarray:
-    """Return unit directions along the entries of an input at some indices, (n, *shape)."""
+    """Return unit directions (n, *shape) along the entries of an input of a shape at n indices."""
     directions = np.zeros((len(indices), *shape))
     for direction, entry in zip(directions, indices, strict=True):
         direction[entry] = 1.0
@@ -107,7 +111,10 @@ def unit_directions(shape: tuple[int, ...], indices: list) -> np.ndarray:
 
 
 def mass_directions(table: np.ndarray) -> np.ndarray:
-    """Return the change of the parameter table, (bodies, rows), by 1 kg more of each body, com and inertia constant."""
+    """Return the change of the parameter table (rows,) by 1 kg more of each body, (bodies, rows).
+
+    The COM and the inertia about it are constant.
+    """
     directions = np.zeros((int(BODIES), len(table)))
     for body, direction in enumerate(directions):
         moments = table[moment_rows(body)]
@@ -117,16 +124,21 @@ def mass_directions(table: np.ndarray) -> np.ndarray:
 
 
 def check(device: str | None) -> tuple[Trajectory, dict[str, GradientPair]]:
-    """Return the jump, and gradient and differences of its apex by kind of input."""
+    """Return the jump, and pairs of gradient and differences of its apex by kind of input.
+
+    Kinds: actions (targets of OUTER and INNER), mass, torque_limit, friction (on the slippery ground), initial_state.
+    """
     jump = GradientJump(1, double=True, device=device)
     trajectory, grads = jump.gradients({})
     motors = [(t, m) for m in (OUTER, INNER) for t in range(TICKS)]
     coords, rates = [2, 3, 4, 5, *range(7, 19)], list(range(18))
 
     def compare(gradient: np.ndarray, name: str, directions: np.ndarray, step: float, inputs: dict) -> GradientPair:
+        """Pair derivatives along directions of an input with their central differences."""
         return gradient, differences(inputs, name, directions, step, device)
 
     def at_entries(name: str, indices: list, step: float, gradient: np.ndarray, inputs: dict) -> GradientPair:
+        """Pair derivatives by entries of an input with their central differences."""
         directions = unit_directions(gradient.shape, indices)
         return compare(np.array([gradient[index] for index in indices]), name, directions, step, inputs)
 

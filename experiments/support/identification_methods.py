@@ -18,18 +18,18 @@ from support.known_robots import Case, Simulate, prediction_errors
 
 
 def make_problem(parameters: ParameterSet, case: Case, replay: MotionReplay) -> LeastSquares:
-    """Return the least-squares problem of a case, with the initial states of the recorded motions as start."""
-    whole = [MotionResiduals(motion, parameters, NoiseLevels(), replay.description) for motion in case.motions]
-    return LeastSquares(parameters, whole, replay, [case.mass])
+    """Return the least-squares problem of a case's motions and weighed mass; replay: simulates them."""
+    residuals = [MotionResiduals(motion, parameters, NoiseLevels(), replay.description) for motion in case.motions]
+    return LeastSquares(parameters, residuals, replay, [case.mass])
 
 
 def chi2_at(problem: LeastSquares, point: Point) -> float:
-    """Return the mean squared weighted residual at a point."""
+    """Return χ², the mean squared weighted residual [1], at a point (parameters and initial states)."""
     return sum(float(residual @ residual) for residual in problem.residuals(point)) / problem.count
 
 
 def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
-    """Return the best point of SciPy's trust-region method within `seconds`, with differences over parallel worlds."""
+    """Return the best point that SciPy's trust-region method finds within `seconds`, with the problem's Jacobians."""
     begin, size, ends = problem.nominal_point(), len(problem.parameters), time.perf_counter() + seconds
     edges = np.cumsum([size, *(len(start) for start in begin.starts)])
     best = (np.inf, begin)
@@ -38,10 +38,12 @@ def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
         """The time is over."""
 
     def to_point(x: np.ndarray) -> Point:
+        """Split the variables: normalised parameters, then the initial state of each motion."""
         z, *starts = np.split(x.copy(), edges[:-1])
         return Point(z, starts)
 
     def residuals(x: np.ndarray) -> np.ndarray:
+        """Return all residuals: motions, weighed mass, priors; remember the best point. Raises OutOfTime."""
         nonlocal best
         point = to_point(x)
         residual = np.concatenate([*problem.residuals(point), [problem.prior_residuals(point.z)[0][0]], x])
@@ -53,6 +55,7 @@ def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
         return np.nan_to_num(residual, posinf=1.0e6)
 
     def jacobian(x: np.ndarray) -> np.ndarray:
+        """Return the derivatives of `residuals`, (residuals, variables)."""
         point = to_point(x)
         table = np.zeros((problem.count + 1 + len(x), len(x)))
         row = 0
@@ -79,7 +82,10 @@ def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
 
 
 def compare_methods(parameters: ParameterSet, case: Case, replay: MotionReplay, ours: Simulate, seconds: float) -> dict:
-    """Return χ² and held-out errors of CMA-ES and SciPy, each run for `seconds`."""
+    """Return χ² and held-out errors [deg], [mm] of CMA-ES and SciPy, each run for `seconds`.
+
+    replay: simulates the motions for SciPy; ours: simulates a plan, for the predictions.
+    """
     problem = make_problem(parameters, case, replay)
     evolved = identify_by_evolution(case.motions, parameters, prior_measurements=[case.mass], max_seconds=seconds)
     points = {"cma": Point(evolved.z, list(evolved.starts)), "scipy": scipy_fit(problem, seconds)}

@@ -1,4 +1,4 @@
-"""Random poses, and inverse kinematics of many robots by direct launches of the kernels."""
+"""Random poses and inverse kinematics of many robots, by direct launches of the kernels."""
 
 from __future__ import annotations
 
@@ -14,18 +14,21 @@ from jumper_warp.robot.model import leg_geometry_array
 
 
 def random_motors(description: RobotDescription, n: int, rng: np.random.Generator, margin: float = 0.0) -> np.ndarray:
-    """Return motor angles [rad], shape (12, n), uniform between the stops, a margin [rad] away from them."""
+    """Return random motor angles [rad], (12, n), uniform between the stops, at least a margin [rad] away from them.
+
+    Rows: legs FL, FR, BL, BR; each lateral, outer, inner. Outer and inner angles also respect the stops of their sum.
+    """
     lateral, outer = (description.joint(name) for name in MOTOR_JOINTS[:2])
-    least, most = (outer.lower + margin, outer.upper - margin)
-    swing = rng.uniform(lateral.lower + margin, lateral.upper - margin, (4, 1, n))
-    first = rng.uniform(least, most, (4, 1, n))
-    lowest = np.maximum(least, description.transversal_sum[0] + margin - first)
-    highest = np.minimum(most, description.transversal_sum[1] - margin - first)
-    return np.concatenate([swing, first, rng.uniform(lowest, highest)], axis=1).reshape(12, n)
+    lower, upper = (outer.lower + margin, outer.upper - margin)
+    lateral_angle = rng.uniform(lateral.lower + margin, lateral.upper - margin, (4, 1, n))
+    outer_angle = rng.uniform(lower, upper, (4, 1, n))
+    lowest = np.maximum(lower, description.transversal_sum[0] + margin - outer_angle)
+    highest = np.minimum(upper, description.transversal_sum[1] - margin - outer_angle)
+    return np.concatenate([lateral_angle, outer_angle, rng.uniform(lowest, highest)], axis=1).reshape(12, n)
 
 
 def leg_limits(description: RobotDescription) -> Any:
-    """Return the hard stops of a leg, `LegLimits`."""
+    """Return the hard stops [rad] of a leg, the struct `LegLimits`."""
     lateral, outer = (description.joint(name) for name in MOTOR_JOINTS[:2])
     limits = LegLimits()
     limits.lateral_lower, limits.lateral_upper = lateral.lower, lateral.upper
@@ -35,20 +38,18 @@ def leg_limits(description: RobotDescription) -> Any:
 
 
 class InverseKinematics:
-    """Forward and inverse kinematics of the four legs of n robots."""
+    """Forward and inverse kinematics of the legs FL, FR, BL, BR of n robots."""
 
     def __init__(self, description: RobotDescription, n: int, device: wp.Device) -> None:
-        """Allocate the outputs on a device."""
+        """Allocate the outputs for n robots on a device."""
         self._legs, self._limits = leg_geometry_array(description, geometry, device), leg_limits(description)
         self._base = [wp.zeros(n, dtype=kind, device=device) for kind in (wp.vec3, wp.quat)]
         self._angles = [wp.zeros((rows, n), dtype=float, device=device) for rows in (12, 8)]
-        self.reachable = wp.zeros((4, n), dtype=wp.int32, device=device)
-        """(4, n) 1 where the last `solve` reached the paw's target."""
-        self.residual = wp.zeros((4, n), dtype=float, device=device)
-        """[m] (4, n) Remaining distance to the targets of the last `solve`."""
+        self.reachable = wp.zeros((4, n), dtype=wp.int32, device=device)  # 1 where the last `solve` reached the target
+        self.residual = wp.zeros((4, n), dtype=float, device=device)  # [m] distance to targets of the last `solve`
 
     def paws(self, motors: np.ndarray) -> wp.array:
-        """Return paw positions [m] (4, n), body frame, of motor angles [rad] (12, n)."""
+        """Return paw positions [m], (4, n) vec3, body frame, at motor angles [rad], (12, n)."""
         device = self.residual.device
         angles = wp.array(motors.astype(np.float32), dtype=float, device=device)
         paws = wp.zeros(self.residual.shape, dtype=wp.vec3, device=device)
@@ -56,7 +57,7 @@ class InverseKinematics:
         return paws
 
     def solve(self, targets: wp.array) -> None:
-        """Solve for the poses that put the paws at targets [m], (4, n), body frame; sets `reachable` and `residual`."""
+        """Find the poses that put the paws at targets [m], (4, n) vec3, body frame; set `reachable` and `residual`."""
         inputs = [self._legs, self._limits, *self._base, targets, 0]
         outputs = [*self._angles, self.reachable, self.residual]
         wp.launch(inverse_kinematics_kernel, targets.shape, inputs, outputs, device=targets.device)

@@ -23,7 +23,7 @@ from jumper_warp.policies.runs import open_policy
 from jumper_warp.robot.overlay import overlay_of
 from jumper_warp.robot.values import RobotValues
 
-SPREAD, MOST = 0.7, 1.5  # Standard deviation and limit of the sampled parameters, in standard deviations of the priors
+SPREAD, MOST = 0.7, 1.5  # [1] Standard deviation and limit of sampled parameters, in standard deviations of priors
 HELD_OUT_TORQUE = 16.0  # [N m] Torque limit of the held-out jump
 SCALE_STD = 0.02  # [kg] Standard deviation of the weighed mass
 
@@ -33,22 +33,22 @@ class Case:
     """A known robot, its recorded motions, and a held-out jump."""
 
     truth: np.ndarray  # (parameters,) True parameters, normalised by the priors
-    robots: RobotValues
-    motions: list[RecordedMotion]
-    mass: PriorMeasurement
-    held_out: Plan
+    robots: RobotValues  # The same parameters in their units, one robot
+    motions: list[RecordedMotion]  # Measured motions, one for each of KINDS
+    mass: PriorMeasurement  # Weighed mass
+    held_out: Plan  # Targets of the held-out jump
     record: Record  # Measured trajectory of the held-out jump
 
 
-Simulate = Callable[[Plan, RobotValues], Record]
+Simulate = Callable[[Plan, RobotValues], Record]  # Returns the trajectory of a robot that executes a plan
 
 
 def make_case(parameters: ParameterSet, seed: int, simulate: Simulate, replay: MotionReplay) -> Case:
-    """Return a random robot with its recorded motions; simulate: records a plan on it; replay: checks safety."""
+    """Return a random robot with its recorded motions; simulate: replaces the real robot; replay: checks safety."""
     rng = np.random.default_rng(seed)
     z = np.clip(SPREAD * rng.normal(size=len(parameters)), -MOST, MOST)
     late = parameters.names.index("latency")
-    z[late] = 0.2 + abs(z[late])
+    z[late] = 0.2 + abs(z[late])  # a latency is positive
     robots = parameters.robots(z)
     nominal = parameters.robots(np.zeros((1, len(z))))
     plans: list[Plan] = []
@@ -63,7 +63,7 @@ def make_case(parameters: ParameterSet, seed: int, simulate: Simulate, replay: M
 
 
 def prediction_errors(case: Case, robots: RobotValues, simulate: Simulate) -> tuple[float, float]:
-    """Return RMS errors of angles [deg] and height [mm] of the held-out jump as predicted by `robots`."""
+    """Return RMS errors of motor angles [deg] and base height [mm] of the held-out jump predicted by `robots`."""
     predicted = simulate(case.held_out, robots)
     angle = predicted.angle[..., 0] + robots.offset[:1] - case.record.angle[..., 0] - case.robots.offset[:1]
     height = predicted.position[:, 2, 0] - case.record.position[:, 2, 0]
@@ -71,34 +71,36 @@ def prediction_errors(case: Case, robots: RobotValues, simulate: Simulate) -> tu
 
 
 def accuracy(parameters: ParameterSet, case: Case, result: Identification) -> dict[str, float]:
-    """Return the largest error of each quantity, the coverage of the 95 % intervals, and the mismatch."""
+    """Return the largest error of each quantity, the coverage of the 95 % intervals, and the mismatch.
+
+    result: identified from the case. Keys end with the unit; coverage, error_over_deviation_rms, mismatch are [1].
+    """
     values, true = result.values, parameters.values(case.truth)
 
     def worst(quantity: str, relative: bool) -> float:
+        """Return the largest absolute or relative error of the parameters of a quantity."""
         chosen = [i for i, p in enumerate(parameters) if p.quantity == quantity]
         error = np.abs(values[chosen] - true[chosen])
         return float((error / np.abs(true[chosen]) if relative else error).max())
 
     error = np.abs(result.z - case.truth) / np.maximum(result.std, 1.0e-9)
     return {
-        "kp_worst_percent": 100.0 * worst("kp", True),
-        "kd_worst_percent": 100.0 * worst("kd", True),
+        "kp_worst_percent": 100.0 * worst("kp", True), "kd_worst_percent": 100.0 * worst("kd", True),
         "base_mass_percent": 100.0 * worst("base_mass", True),
         "offset_worst_deg": float(np.degrees(worst("offset", False))),
-        "armature_worst_percent": 100.0 * worst("armature", True),
-        "latency_us": 1.0e6 * worst("latency", False),
+        "armature_worst_percent": 100.0 * worst("armature", True), "latency_us": 1.0e6 * worst("latency", False),
         "coverage": float(np.mean(error[result.identified] < 1.96)),
-        "error_over_deviation_rms": float(np.sqrt(np.mean(error[result.identified] ** 2))),
-        "mismatch": result.mismatch,
-    }
+        "error_over_deviation_rms": float(np.sqrt(np.mean(error[result.identified] ** 2))), "mismatch": result.mismatch,
+    }  # fmt: skip
 
 
 def run_case(
     parameters: ParameterSet, case: Case, replay: MotionReplay, ours: Simulate, dt: float | None = None
 ) -> tuple[dict[str, float], Identification]:
-    """Identify a robot, and return its metrics and the result.
+    """Identify the robot of a case, and return the metrics and the identification.
 
-    ours: simulates a plan with the model; dt [s]: physics step of the model.
+    replay: simulates the motions of the identification; ours: simulates a plan with the model, for the predictions;
+    dt [s]: physics step of the model, None: the default.
     """
     result = identify(case.motions, parameters, prior_measurements=[case.mass], replay=replay, dt=dt)
     (nominal_deg, nominal_mm), (deg, mm) = (
@@ -116,7 +118,11 @@ def run_case(
 
 
 def policy_errors(name: str, jumps: int, case: Case, result: Identification, folder: Path) -> dict[str, float]:
-    """Return the errors of the described and the identified robot in predicting a policy's jumps on the true one."""
+    """Return mean errors [m] of the apexes of a policy's jumps predicted by the described and the identified robot.
+
+    name: of the policy; jumps: number of them, to heights of 0.5 to 1.0 m; result: identified from the case. Robots
+    are saved as overlays into `folder`. `policy_success_<robot>` is the rate of reached heights.
+    """
     quantities = tuple(dict.fromkeys(parameter.quantity for parameter in result.parameters))
     identified = identified_overlay(result, "identified")
     overlays = {"true": overlay_of(case.robots, quantities, source="truth"), "identified": identified}
@@ -138,10 +144,10 @@ def policy_errors(name: str, jumps: int, case: Case, result: Identification, fol
 
 
 def plot_cases(rows: list[dict[str, float]], path: Path) -> None:
-    """Plot χ², coverage, held-out errors and time over seeds; rows: metrics of `run_case`."""
+    """Plot χ², coverage, held-out errors and time over seeds; rows: metrics of `run_case`, one per seed."""
     panels = (
         ("χ² per value", {"": "chi2"}, {}),
-        ("share within 95 % interval", {"": "coverage"}, {"ylim": (0.0, 1.0)}),
+        ("fraction within 95 % interval", {"": "coverage"}, {"ylim": (0.0, 1.0)}),
         ("held-out angle error [deg]", {"described": "held_out_nominal_deg", "identified": "held_out_deg"},
          {"yscale": "log"}),
         ("time [s]", {"wall": "wall_s", "CPU": "cpu_s"}, {"ylim": (0.0, None)}),

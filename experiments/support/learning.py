@@ -30,10 +30,10 @@ TEST_HEIGHTS = (0.5, 1.1)  # [m] Default range of the heights of the evaluated j
 class LearningCurve:
     """Success of one training over its time; lists have one entry per evaluation."""
 
-    seconds: list[float] = field(default_factory=list)  # Training time so far
-    success: list[float] = field(default_factory=list)
+    seconds: list[float] = field(default_factory=list)  # [s] Training time so far
+    success: list[float] = field(default_factory=list)  # [1] Success rate
     steps: list[int] = field(default_factory=list)  # Policy steps of all worlds together so far
-    iterations: int = 0
+    iterations: int = 0  # Number of iterations of the training
     ready: float = 0.0  # [s] Time from the start of the process to the start of the training; 0 if not measured
 
     def seconds_to(self, rate: float) -> float | None:
@@ -47,7 +47,7 @@ def make_eval_env(task: TaskCfg, jumps: int, device: str | None) -> Env:
 
 
 def success_rate(trainer: Ppo | Shac, eval_env: Env, heights: tuple[float, float] = TEST_HEIGHTS) -> float:
-    """Return the success rate of jumps to evenly spaced heights between two limits [m], one per world of `eval_env`."""
+    """Return the success rate [1] of jumps to evenly spaced heights between limits [m], one per world of `eval_env`."""
     return float(run_jumps(trainer.model.act, eval_env, np.linspace(*heights, eval_env.num_envs)).success.mean())
 
 
@@ -64,10 +64,9 @@ def train_and_evaluate(
     env: VecEnv, trainer: Ppo | Shac, eval_env: Env, seconds: float, every: float,
     heights: tuple[float, float] = TEST_HEIGHTS,
 ) -> LearningCurve:  # fmt: skip
-    """Train for a time [s] as `jumper train --max-seconds` does, and return the learning curve.
+    """Train for `seconds` as `jumper train --max-seconds` does, and return the learning curve.
 
     Compilation (`warm_up`) and evaluations do not count as training time.
-
     env: environment of the training, not yet reset; eval_env: one world per evaluated jump; every [s]: training time
     between two evaluations; heights [m]: range of the evaluated jumps.
     """
@@ -90,9 +89,9 @@ def train_and_evaluate(
 
 
 def train_and_time(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> LearningCurve:
-    """Train with PPO and return the learning curve, with the time from the start of this process to the training.
+    """Train with PPO and return the learning curve, whose `ready` counts from the start of this process.
 
-    args: `Args` of `experiments/learning_curves.py`.
+    args: `Args` of `experiments/learning_curves.py`; seed: of weights, noise and worlds.
     """
     torch.manual_seed(seed)
     env = Env(task, args.num_envs, seed=seed, device=args.device, randomize=args.randomize, noise=args.randomize)
@@ -106,7 +105,7 @@ def train_and_time(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Learning
 
 
 def curve_metrics(curve: LearningCurve, name: str) -> dict[str, Any]:
-    """Return the metrics of one training, with suffix `name`, and print the times to reach each of RATES."""
+    """Return the metrics of one training, `<metric>_<name>`, and print time and steps to reach each of RATES."""
     steps_per_s = curve.steps[-1] / curve.seconds[-1]
     values = {f"success_{name}": curve.success[-1], f"steps_per_s_{name}": steps_per_s}
     values |= {f"curve_{series}_{name}": getattr(curve, series) for series in ("seconds", "steps", "success")}
@@ -120,7 +119,7 @@ def curve_metrics(curve: LearningCurve, name: str) -> dict[str, Any]:
 
 
 def plot_curves(curves: Mapping[str, Sequence[LearningCurve]], path: Path) -> None:
-    """Plot success over training time and over steps, a color for each name."""
+    """Plot success over training time and over steps into a file; curves: by name of the trainer, a color each."""
     with figure(path, 1, 2, figsize=(11, 4.5), sharey=True) as axes:
         for i, (name, runs) in enumerate(curves.items()):
             for number, curve in enumerate(runs):

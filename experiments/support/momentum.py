@@ -12,9 +12,9 @@ from jumper_warp.utils.rotations import CONJUGATE, rotate
 
 
 def momentum(sim: Any) -> tuple[np.ndarray, np.ndarray]:
-    """Return the linear [kg m/s] and angular momentum [kg m^2/s] about the robot's com, (num_worlds, 3) each.
+    """Return the linear [kg m/s] and angular momentum [kg m^2/s] about the robot's COM, (num_worlds, 3) each.
 
-    World axes. The spin of the rotors relative to their links is not included, as it turns no link.
+    sim: a `Simulation`. World axes. The spin of rotors relative to their links, which turns no link, is not included.
     """
     mass, inertia, quat, arm, twist = _links(sim)
     linear = mass * twist[..., :3]
@@ -23,7 +23,7 @@ def momentum(sim: Any) -> tuple[np.ndarray, np.ndarray]:
 
 
 def rotational_inertia(sim: Any) -> np.ndarray:
-    """Return the inertia [kg m^2] of the robot with locked joints about its com, world axes, (num_worlds, 3, 3)."""
+    """Return the inertia [kg m^2] of the robot with locked joints about its COM, world axes, (num_worlds, 3, 3)."""
     mass, inertia, quat, arm, _ = _links(sim)
     columns = []
     for axis in np.eye(3):
@@ -37,48 +37,45 @@ class LinkStates(NamedTuple):
     """State of all links, (num_worlds, links, ...) each."""
 
     mass: np.ndarray  # (..., 1) [kg]
-    inertia: np.ndarray  # (..., 3, 3) [kg m^2] about the link's com, link axes
+    inertia: np.ndarray  # (..., 3, 3) [kg m^2] about the link's COM, link axes
     quat: np.ndarray  # (..., 4) orientation, xyzw
-    arm: np.ndarray  # (..., 3) [m] from the robot's com to the link's, world axes
-    twist: np.ndarray  # (..., 6) velocity of the com [m/s] and angular velocity [rad/s], world axes
+    arm: np.ndarray  # (..., 3) [m] from the robot's COM to the link's COM, world axes
+    twist: np.ndarray  # (..., 6) velocity of the COM [m/s] and angular velocity [rad/s], world axes
 
 
 def _links(sim: Any) -> LinkStates:
-    """Return the present state of all links; waits for the device."""
+    """Return the present state of all links of a `Simulation`; waits for the device."""
     model, n = sim.model, sim.num_worlds
     sim.physics.write_bodies()
-    frame = sim.state.body_q.numpy().reshape(n, -1, 7).astype(float)
+    pose = sim.state.body_q.numpy().reshape(n, -1, 7).astype(float)
     twist = sim.state.body_qd.numpy().reshape(n, -1, 6).astype(float)
     mass = model.body_mass.numpy().reshape(n, -1, 1).astype(float)
     inertia = model.body_inertia.numpy().reshape(n, -1, 3, 3).astype(float)
-    com = frame[..., :3] + rotate(frame[..., 3:], model.body_com.numpy().reshape(n, -1, 3).astype(float))
+    com = pose[..., :3] + rotate(pose[..., 3:], model.body_com.numpy().reshape(n, -1, 3).astype(float))
     arm = com - (mass * com).sum(axis=1, keepdims=True) / mass.sum(axis=1, keepdims=True)
-    return LinkStates(mass, inertia, frame[..., 3:], arm, twist)
+    return LinkStates(mass, inertia, pose[..., 3:], arm, twist)
 
 
 @dataclass
 class MomentumRecorder:
-    """Records the angular momentum of all robots; call it after every policy step."""
+    """Recorder of the angular momentum of all robots; call the object after every policy step."""
 
-    env: Any
-    angular: list[np.ndarray] = field(default_factory=list)
-    """[kg m^2/s] (num_envs, 3) after every policy step, world axes."""
+    env: Any  # The recorded `jumper_warp.envs.env.Env`
+    angular: list[np.ndarray] = field(default_factory=list)  # [kg m^2/s] (num_envs, 3) per policy step, world axes
 
     def __call__(self, *_: Any) -> None:
-        """Record the present angular momentum."""
+        """Append the present angular momentum about the COM."""
         self.angular.append(momentum(self.env.sim)[1])
 
     def metrics(self, diverged: np.ndarray, inertia: np.ndarray) -> Metrics:
-        """Return the momentum drift, and the turn that it causes, of the robots that have not diverged.
+        """Return the angular momentum, which should be 0, and the turn that it causes, of the robots not diverged.
 
         diverged: (num_envs,) bool; inertia [kg m^2]: (num_envs, 3, 3), of `rotational_inertia`.
         """
         drift = np.array(self.angular)[:, ~diverged]
         turned = np.linalg.solve(inertia[~diverged], drift.sum(axis=0)[..., None])[..., 0] * self.env.step_dt
-        size, by = np.linalg.norm(drift, axis=-1), np.degrees(np.linalg.norm(turned, axis=-1))
+        size, turn = np.linalg.norm(drift, axis=-1), np.degrees(np.linalg.norm(turned, axis=-1))
         return {
-            "max_angular_momentum_nm_s": float(size.max()),
-            "mean_angular_momentum_at_end_nm_s": float(size[-1].mean()),
-            "mean_turn_by_drift_deg": float(by.mean()),
-            "max_turn_by_drift_deg": float(by.max()),
-        }
+            "max_angular_momentum_nm_s": float(size.max()), "mean_angular_momentum_at_end_nm_s": float(size[-1].mean()),
+            "mean_turn_by_drift_deg": float(turn.mean()), "max_turn_by_drift_deg": float(turn.max()),
+        }  # fmt: skip

@@ -31,12 +31,16 @@ PAW_RADIUS = 0.025  # [m] Radius of a paw
 class MotionReplay:
     """One world of the simulation that trains policies, in single precision, driven by the targets of a motion.
 
-    The measured arrays have one row per physics step: time [s], height [m], up (speed) [m/s], force (n, 4) [N],
-    gap (n, 4) [m] of the paws above the ground, tilt [rad], power [W], angle (n, 12) [rad], torque (n, 12) [N m].
+    The measured arrays have one row per physics step: time [s], height [m] and up (upward speed) [m/s] of the base,
+    force (n, 4) [N] and gap (n, 4) [m] above the ground of the paws FL, FR, BL, BR, tilt [rad], power (positive,
+    all motors) [W], angle (n, 12) [rad], torque (n, 12) [N m]. `_evaluate` documents the results.
     """
 
     def __init__(self, targets: np.ndarray, problem: Problem, *, notes: dict[str, Any] | None = None) -> None:
-        """Simulate targets [rad], (steps, 12), from standing, with the robot of a problem; notes: of the recording."""
+        """Simulate motor targets [rad], (policy steps, 12), from standing, with the robot and ground of a problem.
+
+        notes: JSON metadata of the recording.
+        """
         from jumper_warp.viz.recorder import Recorder
 
         self.problem = problem
@@ -60,7 +64,7 @@ class MotionReplay:
         self._evaluate()
 
     def _physics_step(self, number: int) -> tuple:
-        """Advance by a physics step, and return its row of the measured arrays; number: steps before it."""
+        """Advance by a physics step, return its row of the measured arrays; number: of physics steps before it."""
         sim = self.sim
         before = motor_values(sim.joint_qd()[0, 6:])
         sim.physics_step()
@@ -103,14 +107,13 @@ class MotionReplay:
         self.takeoff = int(free.argmax()) + 1 if free.any() else len(free)
         """Policy step at whose end the robot is off the ground; the last if it never is."""
         first = self.takeoff * self.sim.substeps
-        self.work = float(self.sim.dt * self.power[:first].sum())
-        """[J] Positive work of the motors until takeoff."""
+        self.work = float(self.sim.dt * self.power[:first].sum())  # [J] Positive work of the motors until takeoff
         landing = np.flatnonzero(down[first:].any(axis=1))
         self.apex = float(self.height[first - 1 : first + landing[0] if len(landing) else None].max())
         """[m] Largest base height before a paw touches down."""
         ups = np.diff(self.up[ticks][max(self.takeoff - 1, 0) :], prepend=self.up[ticks][max(self.takeoff - 1, 0)])
         self.hardest = float(ups.max() / (self.sim.substeps * self.sim.dt * EARTH))
-        """[g] Largest upward acceleration of the base over a policy step after takeoff."""
+        """[g] Largest upward acceleration of the base over a policy step after takeoff, g of Earth."""
         self.longest_lift, self.highest_lift, self.touched = 0.0, 0.0, 0
         """[s] and [m] Longest time and largest height of a paw lifted after touchdown; number of paws that touched."""
         for leg in range(4):
@@ -133,12 +136,12 @@ class MotionReplay:
 
     @property
     def violation(self) -> float:
-        """Return the largest constraint violation of the problem, at least 0."""
+        """Largest violation of a constraint of the problem by the replay, in its unit, at least 0."""
         constraints = self.problem.values(self.motion).constraints
         return max(0.0, float(constraints.max())) if constraints.shape[1] else 0.0
 
     def metrics(self) -> dict[str, Any]:
-        """Return the metrics of the jump."""
+        """Return the metrics of the jump by name, which ends with the unit; `collisions`: flags of touching links."""
         return {
             "apex_m": self.apex, "takeoff_s": float(self.takeoff / 60.0), "landing_g": self.hardest,
             "work_j": self.work,
@@ -162,7 +165,7 @@ class MotionReplay:
 
 
 def plot_replays(replays: dict[str, MotionReplay], path: Path) -> None:
-    """Plot height, angles and torques of two legs, and paw forces over time, a column for each label."""
+    """Plot height, angles and torques of two legs, and paw forces over time into a file; replays: a column by label."""
     with figure(path, 4, len(replays), figsize=(4.2 * len(replays), 10), sharex="col", squeeze=False) as axes:
         for column, (label, replay) in zip(axes.T, replays.items(), strict=True):
             column[0].plot(replay.time, replay.height)

@@ -19,41 +19,38 @@ if TYPE_CHECKING:
     from jumper_warp.viz.recorder import Recorder
 
 STAND, LAND = 60, 60  # Numbers of policy steps in the default pose before and after the jump
-
 SQUAT = 135.0  # [deg] Commanded transversal angle of the squat, which the command filter does not let the legs reach
 
 
 def transversal_command(tick: int, squat: float = SQUAT) -> float:
-    """Return the commanded transversal angle [rad] at a policy step; squat [deg]: commanded angle of the squat."""
-    ramp = np.clip((tick - STAND) / RAMP, 0.0, 1.0)
-    degrees = 45.0 + (squat - 45.0) * ramp
+    """Return the commanded transversal angle [rad] at policy step `tick`; squat [deg]: commanded angle of the squat."""
+    degrees = 45.0 + (squat - 45.0) * np.clip((tick - STAND) / RAMP, 0.0, 1.0)
     if tick >= STAND + RAMP + HOLD:
-        degrees = -45.0
-    if tick >= STAND + RAMP + HOLD + EXTEND:
-        degrees = 45.0
+        degrees = -45.0 if tick < STAND + RAMP + HOLD + EXTEND else 45.0
     return np.radians(degrees)
 
 
 @dataclass
 class Trace:
-    """Measurements of the jump, one row per physics step."""
+    """Measurements of the jump, one row per physics step; motors and paws in the order of legs FL, FR, BL, BR."""
 
     time: np.ndarray  # (n,) [s]
     height: np.ndarray  # (n,) [m] of the base
-    speed: np.ndarray  # (n,) [m/s], vertical, of the base origin
+    speed: np.ndarray  # (n,) [m/s] upward speed of the base origin
     angle: np.ndarray  # (n, 12) [rad] of the motors
-    rate: np.ndarray  # (n, 12) [rad/s]
-    torque: np.ndarray  # (n, 12) [N m]
-    force: np.ndarray  # (n, 4, 3) [N] on the paws
-    gap: np.ndarray  # (n,) [m] largest gap of the legs' loops
+    rate: np.ndarray  # (n, 12) [rad/s] of the motors
+    torque: np.ndarray  # (n, 12) [N m] of the motors
+    force: np.ndarray  # (n, 4, 3) [N] on the paws, world axes
+    gap: np.ndarray  # (n,) [m] largest gap of the legs' closed loops
 
 
 def simulate_jump(
     sim: Simulation, notes: Mapping[str, Any], squat: float = SQUAT
 ) -> tuple[Trace, Recorder, list[np.ndarray]]:
-    """Simulate the jump in one world; return measurements, a recording at 60 Hz, and body poses of every policy step.
+    """Simulate the jump in world 0; return measurements, a recording at 60 Hz, and link poses of every policy step.
 
-    notes: metadata of the recording; squat [deg]: commanded transversal angle of the squat.
+    Poses are (21, 7) each: position [m] and quaternion (xyzw). notes: JSON metadata of the recording; squat [deg]:
+    commanded transversal angle of the squat.
     """
     from jumper_warp.viz.recorder import Recorder
 
@@ -78,7 +75,7 @@ def simulate_jump(
 
 
 def record(recorder: Recorder, poses: np.ndarray, row: tuple) -> None:
-    """Add a frame to the recording; poses: of the links, (21, 7); row: fields of `Trace` at the frame."""
+    """Add a frame to the recording; poses: of the links, (21, 7); row: fields of `Trace` at one physics step."""
     now, height, speed, angle, rate, torque, force, _ = row
     series = {"base/height [m]": height, "base/vertical speed [m s⁻¹]": speed}
     for i, name in enumerate(MOTOR_JOINTS):
@@ -91,19 +88,19 @@ def record(recorder: Recorder, poses: np.ndarray, row: tuple) -> None:
 
 
 def trace_metrics(trace: Trace) -> dict[str, float]:
-    """Return the metrics of the jump."""
+    """Return the metrics of the jump by name, which ends with the unit; times count from the extension's command."""
     contact = np.linalg.norm(trace.force, axis=2).max(axis=1) > 0.1
-    extend = trace.time > (STAND + RAMP + HOLD) / 60.0
-    apex = int(np.argmax(np.where(extend, trace.height, 0.0)))
+    extend_s = (STAND + RAMP + HOLD) / 60.0  # [s] command of the extension
+    apex = int(np.argmax(np.where(trace.time > extend_s, trace.height, 0.0)))
     takeoff = int(np.flatnonzero(contact[:apex])[-1])
     push = trace.time <= trace.time[takeoff]
     values = {
         "apex_height_m": trace.height[apex],
-        "apex_time_s": trace.time[apex] - (STAND + RAMP + HOLD) / 60.0,
+        "apex_time_s": trace.time[apex] - extend_s,
         "takeoff_speed_m_s": trace.speed[takeoff],
         "takeoff_height_m": trace.height[takeoff],
-        "takeoff_time_s": trace.time[takeoff] - (STAND + RAMP + HOLD) / 60.0,
-        "squat_height_m": trace.height[int((STAND + RAMP + HOLD) * 8 - 1)],
+        "takeoff_time_s": trace.time[takeoff] - extend_s,
+        "squat_height_m": trace.height[int((STAND + RAMP + HOLD) * 8 - 1)],  # 8 physics steps per policy step
         "peak_torque_nm": np.abs(trace.torque).max(),
         "peak_speed_rad_s": np.abs(trace.rate).max(),
         "peak_contact_force_n": np.linalg.norm(trace.force.sum(axis=1), axis=1)[push].max(),

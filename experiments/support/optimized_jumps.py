@@ -36,59 +36,64 @@ HEIGHT = 0.80  # [m] Apex height of the jump with the least work
 STILL_HEIGHT = 0.65  # [m] Apex height of the jump that lands still
 SOFT = 4.5  # [g] Largest acceleration of the base over a policy step of the landing; the tasks end an episode at 5
 APEX_STEPS = 61  # Number of policy steps of a motion up to the apex
-BACK, LEAN = 0.28, 1.0
-"""[m], [1] Backward distance of the base that early stages of the search for the farthest flight reward; weight."""
+BACK, LEAN = (
+    0.28,
+    1.0,
+)  # [m], [1] Largest backward shift of the base that early stages of the search reward; weight
 POSTURES = np.array([[-0.2, -0.7, 0.7, -0.3], [0.6, 0.0, 0.3, 0.8], [0.9, 0.5, 0.9, 0.5]])
 """[1] Actions of a run-up in place: base behind the paws, hind legs folded under it, crouch."""
 SCATTER = 0.35  # [1] Standard deviation of these postures
 
 
 def squats(knots: Knots, count: int, rng: np.random.Generator, push: int = 32) -> np.ndarray:
-    """Return random candidates, (count, len(knots)): two postures, then extension of front and hind legs.
+    """Return random candidates of actions [1], (count, len(knots)): two postures, then extension of the legs.
 
     The extension begins around step `push`, separately for front and hind legs; left and right are equal.
     """
-    shape, now = (count, 1, 4), np.array(knots.at)[None, :, None]
+    shape, step = (count, 1, 4), np.array(knots.at)[None, :, None]
     first, second = rng.uniform(-1.0, 1.0, shape), rng.uniform(-0.2, 1.0, shape)
-    change = rng.uniform(8.0, push - 4.0, (count, 1, 1))
-    stretch = np.repeat(rng.uniform(push - 8.0, push + 8.0, (count, 1, 2)), 2, axis=2)
-    return np.where(now < stretch, np.where(now < change, first, second), -1.0).reshape(count, -1)
+    switch_step = rng.uniform(8.0, push - 4.0, (count, 1, 1))
+    extend_step = np.repeat(rng.uniform(push - 8.0, push + 8.0, (count, 1, 2)), 2, axis=2)
+    return np.where(step < extend_step, np.where(step < switch_step, first, second), -1.0).reshape(count, -1)
 
 
 def run_ups(knots: Knots, count: int, rng: np.random.Generator, push: int = 40) -> np.ndarray:
-    """Return random candidates, (count, len(knots)): lean back, fall forward, crouch, extend hind legs, then front.
+    """Return random candidates of actions, (count, len(knots)): lean back, fall forward, crouch, extend hind, front.
 
     Postures scatter around POSTURES, times are random; the hind legs push around step `push`; left and right are equal.
     """
-    now, each = np.array(knots.at)[None, :, None], (count, 1, 1)
+    step, shape = np.array(knots.at)[None, :, None], (count, 1, 1)
     lean, fall, crouch = np.clip(POSTURES[:, None, None] + SCATTER * rng.normal(size=(3, count, 1, 4)), -1.0, 1.0)
-    hind = rng.uniform(push - 5.0, push + 3.0, each)
-    front = hind + rng.uniform(0.0, 4.0, each)
-    crouching = hind - rng.uniform(2.0, 8.0, each)
-    falling = crouching - rng.uniform(4.0, 10.0, each)
-    before = np.where(now < falling, lean, np.where(now < crouching, fall, crouch))
-    stretch = np.concatenate([front, front, hind, hind], axis=2)
-    return np.where(now < stretch, before, -1.0).reshape(count, -1)
+    hind = rng.uniform(push - 5.0, push + 3.0, shape)
+    front = hind + rng.uniform(0.0, 4.0, shape)
+    crouch_step = hind - rng.uniform(2.0, 8.0, shape)
+    fall_step = crouch_step - rng.uniform(4.0, 10.0, shape)
+    before = np.where(step < fall_step, lean, np.where(step < crouch_step, fall, crouch))
+    extend_step = np.concatenate([front, front, hind, hind], axis=2)
+    return np.where(step < extend_step, before, -1.0).reshape(count, -1)
 
 
-def around(x: np.ndarray, knots: Knots, rng: np.random.Generator) -> np.ndarray:
-    """Return 64 noisy variants of a solution x of as many or fewer knots, as candidates, padded with 0."""
-    whole = np.zeros((len(knots.at), 4))
-    whole[: len(x) // 4] = x.reshape(-1, 4)
+def noisy_variants(solution: np.ndarray, knots: Knots, rng: np.random.Generator) -> np.ndarray:
+    """Return 64 candidates (64, len(knots)): a solution (n,) plus noise of standard deviation 0 to 0.2.
+
+    The solution may be of a shorter motion; missing knots are 0 before the noise.
+    """
+    actions = np.zeros((len(knots.at), 4))
+    actions[: len(solution) // 4] = solution.reshape(-1, 4)
     spread = np.linspace(0.0, 0.2, 64)[:, None]
-    return np.clip(whole.ravel() + spread * rng.normal(size=(64, whole.size)), -1.0, 1.0)
+    return np.clip(actions.ravel() + spread * rng.normal(size=(64, actions.size)), -1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Jump:
     """A jump to optimise: its problem, the stages of the search, and the reported value."""
 
-    label: str
+    label: str  # Name in tables and plots
     unit: str  # Unit of `value`
     make: Callable[..., Problem]  # Returns the problem for the settings of a stage, device and threads
     stages: tuple[tuple[Mapping[str, Any], Stage], ...]  # Stages of the search, each with its settings of `make`
     value: Callable[[MotionReplay], float]  # Returns the reported value of a replay
-    draw: Callable[[Knots, int, np.random.Generator], np.ndarray] = squats  # Returns a number of random candidates
+    draw: Callable[[Knots, int, np.random.Generator], np.ndarray] = squats  # Returns random candidates
     samples: int = 2048  # Default number of random candidates
     polish: int = 40  # Default number of iterations of the last descent
     after: str = ""  # Name of the jump whose solution is also a candidate; empty: none
@@ -98,21 +103,19 @@ class Jump:
         return MotionReplay(targets, self.make(**FINE, device=device, threads=1), notes={"jump": self.label})
 
     def scaled(self, effort: float) -> Jump:
-        """Return the jump with all numbers of iterations scaled."""
-        stages = tuple(
-            (how, replace(part, iterations=max(1, round(effort * part.iterations)))) for how, part in self.stages
-        )
-        return replace(self, stages=stages)
+        """Return a copy of the jump with the iterations of all stages multiplied by `effort` [1], at least 1 each."""
+        stages = ((how, replace(s, iterations=max(1, round(effort * s.iterations)))) for how, s in self.stages)
+        return replace(self, stages=tuple(stages))
 
 
 FORWARD_KNOTS = Knots((0.0, 8.0, 16.0, *map(float, range(24, 48))), steps=53)  # Knots of the farthest flight
 
 
 def motors_of(torque: float, speed: float = 1.0) -> MotorCfg:
-    """Return motors with a torque limit [N m] and scaled speed limits of the transversal motors."""
+    """Return motors with a torque limit [N m]; speed [1]: factor on all speed limits of the transversal motors."""
     motors = jumping_motors(torque, lateral_torque=12.0)
-    kind = motors.transversal
-    faster = replace(kind, cutoff_speed=speed * kind.cutoff_speed, no_load_speed=speed * kind.no_load_speed)
+    stock = motors.transversal
+    faster = replace(stock, cutoff_speed=speed * stock.cutoff_speed, no_load_speed=speed * stock.no_load_speed)
     return replace(motors, transversal=faster, fade_start=speed * motors.fade_start, fade_end=speed * motors.fade_end)
 
 
@@ -120,7 +123,11 @@ def _far(
     lean: float = 0.0, *, torque: float = 18.0, speed: float = 1.0, pitch: float = PITCH, away: float = AWAY,
     command_filter: Callable[[], FilterCfg] = horizontal_jump_filter, **settings: Any,
 ) -> Problem:  # fmt: skip
-    """Return the problem of the farthest flight; lean [1]: weight of leaning back before it, up to BACK."""
+    """Return the problem of the farthest flight.
+
+    lean [1]: weight of leaning back before it, up to BACK; torque [N m] and speed [1]: as for `motors_of`; pitch [rad],
+    away [m]: limits PITCH, AWAY; settings: further arguments of `Problem`.
+    """
     constraints = (
         jumps.landing_pitch(pitch), jumps.stays(away, TAKEOFF_SPEED), jumps.clear(speed=TAKEOFF_SPEED),
         jumps.no_run_up(AHEAD), jumps.takes_off(TAKEOFF_SPEED),
@@ -139,12 +146,12 @@ LANDING = Knots((*UP.at, 48.0, 52.0, *map(float, range(54, 74, 2)), 80.0, 90.0, 
 def _vertical(
     objective: Term, *more: Term, torque: float = 18.0, knots: Knots = UP, **settings: Any
 ) -> Problem:  # fmt: skip
-    """Return the problem of a vertical jump with some objective; more: constraints beyond the common ones."""
+    """Return the problem of a vertical jump; more: constraints beyond the common ones; torque [N m]: limit."""
     constraints = (jumps.clear(), jumps.upright(TILT, at_end=False), jumps.drifts(DRIFT), *more)
     return Problem(knots, objective, constraints, jumping_motors(torque), vertical_jump_filter(), **settings)
 
 
-FINE: dict[str, Any] = {"substeps": SUBSTEPS}
+FINE: dict[str, Any] = {"substeps": SUBSTEPS}  # Arguments of `Problem`: physics steps per policy step
 COARSE = FINE | {"substeps": 4}  # Fewer physics steps per policy step, for the first stages of a search
 QUICK = FINE | {"double": False, "tolerance": None}  # Single precision, and its tolerance of the contact iteration
 UPWARD = (
@@ -195,14 +202,11 @@ JUMPS = {
     ),
 }  # fmt: skip
 LIMITS: dict[str, tuple[str, dict[str, Any]]] = {
-    "torque_24_8": ("24.8 N m", {"torque": 24.8}),
-    "speed": ("motor speeds × 1.5", {"speed": 1.5}),
-    "friction_1_5": ("friction 1.5", {"friction": 1.5}),
-    "friction_0_6": ("friction 0.6", {"friction": 0.6}),
-    "pitch": ("any pitch at landing", {"pitch": FREE}),
-    "stance": ("stance beyond 0.3 m", {"away": FREE}),
+    "torque_24_8": ("24.8 N m", {"torque": 24.8}), "speed": ("motor speeds × 1.5", {"speed": 1.5}),
+    "friction_1_5": ("friction 1.5", {"friction": 1.5}), "friction_0_6": ("friction 0.6", {"friction": 0.6}),
+    "pitch": ("any pitch at landing", {"pitch": FREE}), "stance": ("stance beyond 0.3 m", {"away": FREE}),
     "filter": ("loose command filter", {"command_filter": loose_filter}),
-}
+}  # fmt: skip
 """Limits of the farthest flight: label, and the changed settings of its problem."""
 LIMITED = {
     f"farthest_{name}": replace(
@@ -215,9 +219,10 @@ LIMITED = {
 def optimise(
     jump: Jump, begin: np.ndarray, seed: int, polish: int, **settings: Any
 ) -> tuple[Progress, dict[str, float]]:
-    """Search from candidates; return the last descent and the numbers of simulated and reverse policy steps.
+    """Run all stages of the search; return the last descent, and `simulated_steps` and `reverse_steps` of all worlds.
 
-    begin: candidates, (n, len(knots)); polish: iterations of the last descent; settings: device, threads.
+    begin: candidates, (n, len(knots)); seed: of displacements; polish: iterations of the last descent; settings:
+    device, threads.
     """
     problems = {str(how): jump.make(**how, **settings) for how in (FINE, *(how for how, _ in jump.stages))}
     costs: list[torch.Tensor] = []

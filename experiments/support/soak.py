@@ -50,7 +50,7 @@ class SoakArgs(ThreadArgs):
 
 
 def randomize(sim: Simulation, rng: np.random.Generator) -> None:
-    """Scale the masses of every world by 0.8 to 1.25, and set its paw friction to 0.2 to 1.2, at random."""
+    """Scale masses and inertias of every world by a random 0.8 to 1.25, and set its friction to a random 0.2 to 1.2."""
     model, n = sim.model, sim.num_worlds
     scale = rng.uniform(0.8, 1.25, n).astype(np.float32)
     model.body_mass.assign(model.body_mass.numpy() * np.repeat(scale, 21))
@@ -63,7 +63,10 @@ def randomize(sim: Simulation, rng: np.random.Generator) -> None:
 
 
 def simulation_steps(sim: Simulation, args: SoakArgs) -> Iterator[torch.Tensor]:
-    """Step a simulation under random targets; after each step, yield which worlds are flagged as non-finite, (n,)."""
+    """Step a simulation under random targets; yield after each step which worlds to count as non-finite, (n,) bool.
+
+    Flags stay set until the reset after `args.episode_steps` and are yielded once, before it.
+    """
     if sim.device.is_cuda:
         torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(sim.device)))
     randomize(sim, np.random.default_rng(args.seed))
@@ -78,12 +81,12 @@ def simulation_steps(sim: Simulation, args: SoakArgs) -> Iterator[torch.Tensor]:
         sim.step()
         last = (step + 1) % args.episode_steps == 0 or step + 1 == args.steps
         yield (diverged != 0) & last
-        if last:  # flagged worlds are counted once
+        if last:
             sim.reset()
 
 
 def hardest(task: TaskCfg) -> TaskCfg:
-    """Return the task with only the last row of its terrain map, if it has one, as falls return robots to the first."""
+    """Return a copy of the task with only the hardest row of its terrain map; tasks without a map are unchanged."""
     settings = task.reset.settings
     terrain = getattr(settings, "terrain", None)
     if terrain is None or terrain.rows == 0:
@@ -94,7 +97,7 @@ def hardest(task: TaskCfg) -> TaskCfg:
 class SoakTotals(NamedTuple):
     """Totals of a soak test over all worlds and steps."""
 
-    flagged: int  # worlds flagged as non-finite
+    flagged: int  # worlds flagged as non-finite, once per episode
     unsolved: int  # world steps whose contacts did not converge
     rows: int  # world steps with a value that is not finite
     speed: float  # [m/s] largest speed of a base
@@ -105,23 +108,23 @@ class SoakCounters:
     """Counts invalid worlds and unsolved contacts, and keeps the largest speeds, on the device."""
 
     def __init__(self, sim: Simulation) -> None:
-        """Begin at zero."""
+        """Start all counters at 0; sim: simulation whose state is read."""
         self._rates = wp.to_torch(sim.state.joint_qd).view(sim.num_worlds, -1)
         self._state = wp.to_torch(sim.state.joint_q).view(sim.num_worlds, -1)
         assert isinstance(sim.solver, SolverJumper)
         self._residual, self._tolerance = wp.to_torch(sim.solver.residual), sim.solver.tolerance
         self._speeds = self._rates.new_zeros(2)  # [m/s] of a base, [rad/s] of a joint
         self._counts = torch.zeros(3, dtype=torch.int64, device=self._rates.device)
-        self._fast = self._rates.new_zeros(2)
+        self._step_speeds = self._rates.new_zeros(2)  # the same of one step
 
     def update(self, flagged: torch.Tensor, *rows: torch.Tensor) -> None:
         """Count a policy step. flagged: (num_worlds,) bool; rows: (num_worlds, ...) values that should be finite."""
-        self._fast[0] = self._rates[:, :3].square().sum(dim=1).max().sqrt()
-        self._fast[1] = self._rates[:, 6:26].abs().max()
-        torch.maximum(self._speeds, self._fast, out=self._speeds)
+        self._step_speeds[0] = self._rates[:, :3].square().sum(dim=1).max().sqrt()
+        self._step_speeds[1] = self._rates[:, 6:26].abs().max()
+        torch.maximum(self._speeds, self._step_speeds, out=self._speeds)
         finite = self._rates.isfinite().all(dim=1) & self._state.isfinite().all(dim=1)
-        for each in rows:
-            finite &= each.view(len(finite), -1).isfinite().all(dim=1)
+        for values in rows:
+            finite &= values.view(len(finite), -1).isfinite().all(dim=1)
         self._counts += torch.stack([flagged.sum(), (self._residual > self._tolerance).sum(), (~finite).sum()])
 
     def read(self) -> SoakTotals:
@@ -140,7 +143,7 @@ def soak_simulation(sim: Simulation, args: SoakArgs) -> dict:
 
 
 def soak_env(env: Env, args: SoakArgs) -> dict:
-    """Step an environment under random actions, `hold` steps as one graph, and return the metrics.
+    """Step an environment under random actions, `args.hold_steps` steps as one graph, and return the metrics.
 
     Worlds that diverged are flagged. Raises RuntimeError: a coordinate, rate, reward or observation after the step (and
     reset) is NaN or infinite.
@@ -151,6 +154,7 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
     termination = wp.to_torch(env.episodes.termination)
 
     def step_held() -> None:
+        """Hold one random action for all steps, and count each."""
         action.uniform_(-1.0, 1.0)
         for _ in range(args.hold_steps):
             env.step(action)
@@ -167,15 +171,10 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
 
 
 def soak_metrics(counters: SoakCounters, count: int, wall: float) -> dict:
-    """Return the metrics of `count` steps of all worlds together, made in a time [s]; waits for the device."""
+    """Return the metrics by name; count: policy steps of all worlds together; wall: time for them [s]."""
     totals = counters.read()
     return {
-        "steps": count,
-        "non_finite_worlds": totals.flagged,
-        "non_finite_rows": totals.rows,
-        "largest_speed_m_s": totals.speed,
-        "largest_joint_speed_rad_s": totals.joint_speed,
-        "share_of_steps_contact_unsolved": totals.unsolved / count,
-        "wall_s": wall,
-        "steps_per_s": count / wall,
-    }
+        "steps": count, "non_finite_worlds": totals.flagged, "non_finite_rows": totals.rows,
+        "largest_speed_m_s": totals.speed, "largest_joint_speed_rad_s": totals.joint_speed,
+        "share_of_steps_contact_unsolved": totals.unsolved / count, "wall_s": wall, "steps_per_s": count / wall,
+    }  # fmt: skip

@@ -23,32 +23,38 @@ from support.timing import device_memory, median_time, wall_time
 
 SQUAT, DEFAULT, EXTEND = 110.0, 45.0, -10.0  # [deg] Commanded transversal angles of the scripted jump
 JUMP_STEPS = 45  # Number of timed policy steps of the scripted jump: push-off, flight, landing
-CALLS = 3  # Launches of a part of a policy step per repetition
+CALLS = 3  # Number of launches of a part of a policy step per repetition
 
 
 def command(sim: Simulation, degrees: float, steps: int) -> float:
-    """Command all transversal motors to an angle for some policy steps; return the wall time per step [s]."""
+    """Command all transversal motors to an angle [deg] for some policy steps; return the wall time per step [s]."""
     target = np.tile([0.0, 1.0, 1.0], 4) * np.radians(degrees)
     sim.target.assign(np.repeat(target[:, None], sim.num_worlds, axis=1).astype(np.float32))
     return wall_time(sim.step, sim.device, steps)
 
 
-def check_standing(sim: Simulation, most: float) -> None:
-    """Raise RuntimeError unless the base height of every robot is between 0.33 m and `most` [m]."""
+def check_standing(sim: Simulation, highest: float) -> None:
+    """Raise RuntimeError unless the base height of every robot is between 0.33 m and `highest` [m]."""
     height = sim.joint_q()[:, 2]
-    if not (np.all(height > 0.33) and np.all(height < most)):
+    if not (np.all(height > 0.33) and np.all(height < highest)):
         raise RuntimeError(f"the robots do not stand: heights {height.min():.3f} to {height.max():.3f} m")
 
 
 def time_standing(sim: Simulation, steps: int, repeats: int) -> float:
-    """Return the wall time per policy step [s] while standing. Raises RuntimeError: a robot does not stand."""
+    """Return the median wall time per policy step [s] while standing. Raises RuntimeError: a robot does not stand.
+
+    steps: policy steps in each of `repeats` repetitions.
+    """
     command(sim, DEFAULT, 90)
     check_standing(sim, 0.37)
     return median_time(sim.step, sim.device, steps, repeats)
 
 
 def time_jump(sim: Simulation, repeats: int) -> tuple[float, float]:
-    """Return the wall time per policy step [s] during a jump, and the mean apex [m]. Raises RuntimeError: no jump."""
+    """Return the median wall time per policy step [s] of `repeats` jumps, and the mean apex [m].
+
+    Raises RuntimeError: a robot does not reach 0.8 m.
+    """
     times, apex, push = [], np.zeros(1), JUMP_STEPS // 3
     for repeat in range(repeats + 1):
         command(sim, DEFAULT, 60)
@@ -67,11 +73,12 @@ def time_jump(sim: Simulation, repeats: int) -> tuple[float, float]:
 
 
 def time_solver(solver: SolverName, envs: int, steps: int, repeats: int, device: str | None) -> dict[str, float]:
-    """Return the metrics of one solver at one number of environments; steps: per repetition, standing."""
+    """Return the metrics of one solver with `envs` environments; steps: in each repetition of standing."""
     build_model(1, device=device)  # Newton's own modules are not part of the metrics
     before, sims = device_memory(wp.get_device(device)), []
 
     def build() -> None:
+        """Build the simulation, compile its kernels and capture its graph."""
         sims.append(Simulation(envs, solver=solver, observe_forces=False, visuals=False, device=device))
         sims[0].step()
         sims[0].step()
@@ -101,7 +108,7 @@ def standing_solver(envs: int, device: str | None) -> Callable[[], None]:
     def advance(worlds: WorldRange) -> None:
         sim.physics.advance(sim.substeps, sim.target, bodies=False, worlds=worlds)
 
-    graph_and_sim = (SlicedGraph(advance, sim.slices, sim.device), sim)  # keeps the arrays of the graph alive
+    graph_and_sim = (SlicedGraph(advance, sim.slices, sim.device), sim)  # the graph does not keep its arrays alive
     return lambda: graph_and_sim[0].replay()
 
 
@@ -131,22 +138,22 @@ def time_threads(envs: int, threads: Sequence[int], steps: int, repeats: int) ->
     Repetitions alternate and the fastest counts, as other load only slows them down. `thread_speedup` is the smaller
     speedup of physics and environment.
     """
-    steps_of: dict[str, list[Callable[[], object]]] = {"physics": [], "env": []}
+    step_functions: dict[str, list[Callable[[], object]]] = {"physics": [], "env": []}
     for n in threads:
         sim = Simulation(envs, visuals=False, device="cpu", threads=n)
         command(sim, DEFAULT, 90)
-        steps_of["physics"].append(sim.step)
-        steps_of["env"].append(stepping_env(envs, "cpu", n)[1])
+        step_functions["physics"].append(sim.step)
+        step_functions["env"].append(stepping_env(envs, "cpu", n)[1])
     metrics = {}
-    for name, functions in steps_of.items():
-        times = np.array([[wall_time(each, "cpu", steps) for each in functions] for _ in range(repeats)]).min(axis=0)
+    for name, functions in step_functions.items():
+        times = np.array([[wall_time(step, "cpu", steps) for step in functions] for _ in range(repeats)]).min(axis=0)
         metrics |= {f"{name}_steps_per_s_threads_{n}": envs / t for n, t in zip(threads, times, strict=True)}
         metrics[f"thread_speedup_{name}"] = float(times[0] / times[-1])
-    return metrics | {"thread_speedup": min(metrics[f"thread_speedup_{name}"] for name in steps_of)}
+    return metrics | {"thread_speedup": min(metrics[f"thread_speedup_{name}"] for name in step_functions)}
 
 
 def time_stages(envs: int, device: str | None, repeats: int) -> dict[str, float]:
-    """Return the wall time [s] of each part of a policy step (`Env.stages`), always from the same state."""
+    """Return the median wall time [s] of each part of a policy step, by name in `Env.stages`, from one same state."""
     env, _ = stepping_env(envs, device)
     saved, parts = env.state_dict(), {}
     for name in env.stages():
@@ -157,11 +164,14 @@ def time_stages(envs: int, device: str | None, repeats: int) -> dict[str, float]
 
 
 def time_parts(envs: Sequence[int], train_envs: int, steps: int, repeats: int, device: str | None) -> dict[str, float]:
-    """Return speeds of solver and environment by number of environments, and times of the parts of a policy step."""
+    """Return `solver_` and `env_steps_per_s_<n>` for numbers of environments, and time `<part>_us`, `<part>_share`.
+
+    envs, train_envs: numbers of environments; parts of a policy step are timed with train_envs.
+    """
     values: dict[str, float] = {}
     for n in sorted({*envs, train_envs}):
-        bodies = standing_solver(n, device), stepping_env(n, device)[1]
-        solver, step = (median_time(body, device, steps, repeats) for body in bodies)
+        functions = standing_solver(n, device), stepping_env(n, device)[1]
+        solver, step = (median_time(function, device, steps, repeats) for function in functions)
         values |= {f"solver_steps_per_s_{n}": n / solver, f"env_steps_per_s_{n}": n / step}
         if n == train_envs:
             values["env_step_us"] = 1e6 * step

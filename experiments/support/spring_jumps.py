@@ -16,18 +16,18 @@ from jumper_warp.sim.simulation import Simulation
 from support.open_loop import EXTEND, HOLD, RAMP, STAND, simulate_jump, trace_metrics, transversal_command
 
 FALLING = 60  # Number of policy steps after the extension in which a jump may still rise
-FILTERS = {"stock": vertical_jump_filter, "loose": loose_filter}
+FILTERS = {"stock": vertical_jump_filter, "loose": loose_filter}  # Functions that return the command filter, by name
 
 
 @dataclass(frozen=True)
 class SpringJumps:
     """Open-loop jumps with given motors, command filter, gravity and spring length."""
 
-    motors: MotorCfg
+    motors: MotorCfg  # Gains and limits of the motors
     filter: str  # One of FILTERS
     gravity: float  # [m/s^2] Downward
     length: float  # [m] Rest length of the springs
-    device: str | None
+    device: str | None  # Warp device, None: the default
 
     def simulation(self, count: int, robot: RobotOverlay | RobotValues, **settings: Any) -> Simulation:
         """Return a simulation of `count` robots; robot: their parameters; settings: more arguments of `Simulation`."""
@@ -54,7 +54,7 @@ class SpringJumps:
         return apex.reshape(shape)
 
     def record(self, stiffness: float, squat: float, folder: Path) -> dict[str, float]:
-        """Simulate one jump, write its recording into a folder, and return its metrics."""
+        """Simulate one jump, write its recording, return `trace_metrics`; stiffness [N/m], squat [deg]: command."""
         sim = self.simulation(1, with_springs(stiffness, self.length))
         trace, recorder, _ = simulate_jump(sim, {"spring_stiffness_n_m": stiffness, "squat_command_deg": squat}, squat)
         recorder.save_rrd(folder / f"jump_{self.filter}.rrd")

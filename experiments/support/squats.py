@@ -25,13 +25,12 @@ class SquatLog(EvaluationLog):
     row_name = "squat"
 
     def __post_init__(self) -> None:
-        """Begin with nothing recorded."""
         self.count, self.step_dt = len(self.goals), 1.0 / 60.0
-        self.ended = np.zeros(self.count, dtype=bool)  # whether each episode has ended
-        # in each policy step, (num_envs, 4), (num_envs, 4), (num_envs, 12)
-        self.peaks: list[np.ndarray] = []  # [N] largest force on each paw, of all its physics steps
-        self.forces: list[np.ndarray] = []  # [N] force on each paw at the end of it
-        self.torques: list[np.ndarray] = []  # [N m] of the motors
+        self.ended = np.zeros(self.count, dtype=bool)  # (num_envs,) whether each episode has ended
+        # one array per policy step
+        self.peaks: list[np.ndarray] = []  # [N] (num_envs, 4) largest force on each paw over its physics steps
+        self.forces: list[np.ndarray] = []  # [N] (num_envs, 4) force on each paw at its end
+        self.torques: list[np.ndarray] = []  # [N m] (num_envs, 12) motor torques at its end
 
     @property
     def seconds(self) -> float:
@@ -44,7 +43,7 @@ class SquatLog(EvaluationLog):
         env.evaluation_reset(jump_commands(self.goals, self.hold + 1.0, env.step_dt))
 
     def read_env(self, env: Any) -> dict[str, np.ndarray]:
-        """Return paw forces [N], motor torques [N m] and terminations."""
+        """Return `peak` and `force` (num_envs, 4) [N], `torque` (num_envs, 12) [N m], `termination` (num_envs,)."""
         return {
             "peak": env.sim.physics.peak_paw_force.numpy().T.copy(),
             "force": np.linalg.norm(env.sim.paw_force.numpy(), axis=2).T.copy(),
@@ -59,25 +58,25 @@ class SquatLog(EvaluationLog):
         return bool(self.ended.all())
 
     def in_window(self, values: list[np.ndarray]) -> np.ndarray:
-        """Return the values within the window of the robots that still hold, (steps, robots, ...)."""
+        """Return a history (arrays per policy step) within the window, of robots not ended, (steps, robots, ...)."""
         return np.array(values[-round(self.window / self.step_dt) :])[:, ~self.ended]
 
     @property
     def force_range(self) -> np.ndarray:
-        """[N] (robots,) Largest minus smallest force on a paw within the window, maximum over the four paws."""
+        """[N] (robots not ended,) Largest minus smallest force on a paw within the window, maximum over the paws."""
         return (self.in_window(self.peaks).max(axis=0) - self.in_window(self.forces).min(axis=0)).max(axis=1)
 
     @property
     def torque_ripple(self) -> np.ndarray:
-        """[N m] (robots,) Standard deviation of a motor's torque within the window, RMS over motors."""
+        """[N m] (robots not ended,) Standard deviation of a motor's torque within the window, RMS over motors."""
         return np.sqrt(self.in_window(self.torques).var(axis=0).mean(axis=1))
 
     def columns(self) -> dict[str, list]:
-        """Return force range and torque ripple of every robot that squats."""
+        """Return lists with one value per robot not ended: paw_force_range_n, torque_ripple_nm."""
         return {"paw_force_range_n": self.force_range.tolist(), "torque_ripple_nm": self.torque_ripple.tolist()}
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the force on every paw of some worlds."""
+        """Return the last force [N] on every paw of some worlds."""
         names = ("front left", "front right", "back left", "back right")
         return {
             f"force/{name} of {world} [N]": float(self.forces[-1][world, paw])
@@ -87,14 +86,14 @@ class SquatLog(EvaluationLog):
 
 
 def squat_goals(count: int, reach: tuple[float, float], *, up: bool) -> np.ndarray:
-    """Return evenly spaced goals [m] for `SquatLog`, (count, 3), between limits; up: apex heights, else ahead."""
+    """Return evenly spaced goals [m] for `SquatLog`, (count, 3); reach [m]: limits of apex heights (up) or x."""
     goals = np.zeros((count, 3))
     goals[:, 2 if up else 0] = np.linspace(*reach, count)
     return goals
 
 
 def squat_metrics(squats: SquatLog) -> Metrics:
-    """Return the metrics of held squats; forces and torques are those of the robots that hold to the end."""
+    """Return the metrics of held squats by name; forces and torques are of the robots that hold to the end."""
     spread, ripple = squats.force_range, squats.torque_ripple
     return {
         "squats": len(squats.ended),

@@ -21,24 +21,24 @@ from jumper_warp.utils.errors import InputError
 RATE = "steps_per_s"  # Part of the names of metrics that are compared with a baseline
 
 
-def wall_time(body: Callable[[], Any], device: wp.DeviceLike = None, calls: int = 1) -> float:
-    """Return the mean wall time of a call [s]; waits for the device before the first and after the last call."""
+def wall_time(function: Callable[[], Any], device: wp.DeviceLike = None, calls: int = 1) -> float:
+    """Return the mean wall time [s] of `calls` calls; waits for the device before the first and after the last."""
     wp.synchronize_device(device)
     start = time.perf_counter()
     for _ in range(calls):
-        body()
+        function()
     wp.synchronize_device(device)
     return (time.perf_counter() - start) / calls
 
 
-def median_time(body: Callable[[], Any], device: wp.DeviceLike = None, calls: int = 1, repeats: int = 5) -> float:
-    """Return the median over repetitions of `wall_time` [s]."""
-    return float(np.median([wall_time(body, device, calls) for _ in range(repeats)]))
+def median_time(function: Callable[[], Any], device: wp.DeviceLike = None, calls: int = 1, repeats: int = 5) -> float:
+    """Return the median of `wall_time` [s] over repetitions of `calls` calls each."""
+    return float(np.median([wall_time(function, device, calls) for _ in range(repeats)]))
 
 
 def process_age() -> float:
-    """Return the time since the start of this process [s]."""
-    ticks = int(Path("/proc/self/stat").read_text().rsplit(")", 1)[1].split()[19])
+    """Return the time since the start of this process [s]; Linux only."""
+    ticks = int(Path("/proc/self/stat").read_text().rsplit(")", 1)[1].split()[19])  # start time, field 22
     return time.clock_gettime(time.CLOCK_BOOTTIME) - ticks / os.sysconf("SC_CLK_TCK")
 
 
@@ -48,7 +48,7 @@ def device_memory(device: wp.Device) -> int:
 
 
 def baseline_ratios(checkout: Path | None, script: str, args: Any, metrics: Mapping[str, Any]) -> dict[str, float]:
-    """Run the same script of another checkout, and return the ratios of all rates, this run over the baseline.
+    """Run the same script of another checkout; return `<metric>_over_baseline`, ratios of all metrics with RATE.
 
     checkout: root of the other checkout, None: no comparison; script: path within; args: dataclass with the flags of
     this run; metrics: of this run. Raises InputError: there is no such script, or it fails.
@@ -70,9 +70,9 @@ def baseline_ratios(checkout: Path | None, script: str, args: Any, metrics: Mapp
 
 
 def changed_flags(args: Any) -> list[str]:
-    """Return the fields of a dataclass as command-line flags, without defaults, `out` and `baseline`.
+    """Return the fields of a dataclass as command-line flags, without `out`, `baseline` and values at their default.
 
-    Defaults are left out so that another checkout need not know the newest flags.
+    Without defaults, another checkout may lack the newest flags.
     """
     flags: list[str] = []
     for spec in dataclasses.fields(args):

@@ -25,7 +25,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 def variant(cfg: PpoCfg, name: str) -> PpoCfg:
-    """Return the settings of a variant. Raises InputError: there is no such variant."""
+    """Return a copy of the settings with the changes of a variant. Raises InputError: `name` is not in VARIANTS."""
     if name not in VARIANTS:
         raise InputError(f"variants are {', '.join(VARIANTS)}, got {name!r:.60}")
     return dataclasses.replace(cfg, **VARIANTS[name])

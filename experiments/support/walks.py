@@ -10,36 +10,36 @@ from jumper_warp.evaluation.velocities import SETTLING_TIME, VelocityLog
 
 REACH, STEP, KICK = 0.8, 0.8, 0.5
 """[m/s] and [rad/s] Limit of the commands; [m/s] step of a changed command; [m/s] step of a kicked velocity."""
-RAMP, KEEP, SHARE = 3.0, 5.0, 0.1
-"""[s] Time of the command's ramp, time for which it is held, and [1] tolerance of a kept speed."""
+RAMP, KEEP, TOLERANCE = 3.0, 5.0, 0.1
+"""[s] Time of the command's ramp, time for which it is then held; [1] relative tolerance of a kept speed."""
 DIRECTIONS = {"ahead": (0, 1.0, 4.0), "back": (0, -1.0, 4.0), "sideways": (1, 1.0, 2.0), "turning": (2, 1.0, 4.0)}
 """Axis, sign and highest command [m/s] or [rad/s] of the test of top speed."""
 SETTLED = 0.1  # [m/s] Largest error of a robot that has settled on a new command
 SMOOTHING = 0.2  # [s] Window over which velocities are averaged for the settling time
 PAPER = {"rmse_vx_m_s": 0.17, "rmse_vy_m_s": 0.05, "rmse_yaw_rate_rad_s": 0.12}
-"""Tracking errors of the paper, one test on the robot: commands up to 0.8 that a person gave."""
-HOLD = 0.5  # [s] Time within that error after which a robot has settled, regardless of later pushes
+"""Tracking errors of the paper: one test on the robot with commands up to 0.8 by a person."""
+HOLD = 0.5  # [s] Time with an error below SETTLED after which a robot has settled, regardless of later pushes
 
 
 def redirected_walks(env: Env, rng: np.random.Generator) -> VelocityLog:
-    """Return the log of walks whose random command changes after 3 s."""
+    """Return a new log of walks of 7 s whose random command (`step_commands`) changes after 3 s."""
     commands = step_commands(rng, env.num_envs, REACH, STEP)
     return VelocityLog(commands, env.task, 7.0, times=np.array([0.0, 3.0]))
 
 
 def sped_up_walks(env: Env) -> tuple[VelocityLog, np.ndarray]:
-    """Return the log of walks whose command rises to a speed, and each robot's index in DIRECTIONS, (robots,)."""
-    which = np.arange(env.num_envs) % len(DIRECTIONS)
+    """Return a new log of walks whose command rises to a speed, and each robot's index in DIRECTIONS, (robots,)."""
+    direction = np.arange(env.num_envs) % len(DIRECTIONS)
     commands = np.zeros((env.num_envs, 7, 3))
     for i, (axis, sign, highest) in enumerate(DIRECTIONS.values()):
-        speeds = sign * np.linspace(0.3, highest, int((which == i).sum()))
-        commands[which == i, :, axis] = speeds[:, None] * np.linspace(1.0 / 7.0, 1.0, 7)
+        speeds = sign * np.linspace(0.3, highest, int((direction == i).sum()))
+        commands[direction == i, :, axis] = speeds[:, None] * np.linspace(1.0 / 7.0, 1.0, 7)
     times = RAMP * np.arange(7) / 7.0
-    return VelocityLog(commands, env.task, RAMP + 1.0 + KEEP, times=times), which
+    return VelocityLog(commands, env.task, RAMP + 1.0 + KEEP, times=times), direction
 
 
 def kicked_walks(env: Env, rng: np.random.Generator) -> VelocityLog:
-    """Return the log of walks with random commands and a kick at a random time."""
+    """Return a new log of walks of 7 s with a random command and a kick in a random direction after 2 to 4 s."""
     n = env.num_envs
     commands, angle = rng.uniform(-REACH, REACH, (n, 1, 3)), rng.uniform(0.0, 2.0 * np.pi, n)
     kick = KICK * np.stack([np.cos(angle), np.sin(angle)], axis=1)
@@ -47,17 +47,20 @@ def kicked_walks(env: Env, rng: np.random.Generator) -> VelocityLog:
 
 
 def speed_metrics(walks: VelocityLog, direction: np.ndarray) -> Metrics:
-    """Return the top speed in each direction; direction: index in DIRECTIONS of each robot, (robots,)."""
+    """Return `top_<direction>_<unit>` for DIRECTIONS; walks, direction: of `sped_up_walks`."""
     metrics: Metrics = {}
     for i, (name, (axis, _, _)) in enumerate(DIRECTIONS.items()):
         unit = "rad_s" if axis == 2 else "m_s"
-        kept = kept_speeds(walks, axis, KEEP, SHARE)[direction == i]
+        kept = kept_speeds(walks, axis, KEEP, TOLERANCE)[direction == i]
         metrics[f"top_{name}_{unit}"] = top_speed(np.abs(walks.commands[direction == i, -1, axis]), kept)
     return metrics
 
 
 def step_commands(rng: np.random.Generator, robots: int, reach: float, step: float) -> np.ndarray:
-    """Return two random commands per robot whose planar velocities differ by `step` [m/s], (robots, 2, 3)."""
+    """Return two random commands per robot, (robots, 2, 3), whose planar velocities differ by `step` [m/s].
+
+    All values are within ±reach; the yaw rates [rad/s] of a robot's commands are equal.
+    """
     commands = np.zeros((robots, 2, 3))
     commands[..., 2] = rng.uniform(-reach, reach, robots)[:, None]
     todo = np.arange(robots)
@@ -74,7 +77,6 @@ def settling_times(walks: VelocityLog, hold: float | None = None) -> np.ndarray:
     """Return the time [s] from the last command until the planar velocity stays within SETTLED of it, (robots,).
 
     Velocities are means over the last SMOOTHING seconds. Infinite if a robot never settles, or falls.
-
     hold [s]: time for which the velocity must stay; None: to the end, so that later pushes count too.
     """
     window, first = round(SMOOTHING / walks.step_dt), round(walks.times[-1] / walks.step_dt)
@@ -82,28 +84,28 @@ def settling_times(walks: VelocityLog, hold: float | None = None) -> np.ndarray:
     total = np.cumsum(velocity, axis=0)
     smooth = velocity.copy()
     smooth[window:] = (total[window:] - total[:-window]) / window
-    off = np.linalg.norm(smooth[first:] - walks.command_history()[first:, :, :2], axis=2)
-    outside = ~(off <= SETTLED)
+    error = np.linalg.norm(smooth[first:] - walks.command_history()[first:, :, :2], axis=2)
+    outside = ~(error <= SETTLED)
     if hold is not None:
-        steps = min(round(hold / walks.step_dt), len(off))
+        steps = min(round(hold / walks.step_dt), len(error))
         held = ~np.lib.stride_tricks.sliding_window_view(outside, steps, axis=0).any(axis=-1)
         return np.where(held.any(axis=0), held.argmax(axis=0) * walks.step_dt, np.inf)
-    last = np.where(outside.any(axis=0), len(off) - np.argmax(outside[::-1], axis=0), 0)
-    return np.where(last == len(off), np.inf, last * walks.step_dt)
+    last = np.where(outside.any(axis=0), len(error) - np.argmax(outside[::-1], axis=0), 0)
+    return np.where(last == len(error), np.inf, last * walks.step_dt)
 
 
-def kept_speeds(walks: VelocityLog, axis: int, seconds: float, share: float) -> np.ndarray:
-    """Return which robots kept their last command along an axis, within a share, as the mean of the last seconds.
+def kept_speeds(walks: VelocityLog, axis: int, seconds: float, tolerance: float) -> np.ndarray:
+    """Return which robots kept their last command along an axis, (robots,) bool: mean over the last `seconds`.
 
-    The other two velocity components are ignored.
+    axis: index of the component, the other two are ignored; tolerance [1]: relative error.
     """
     last = walks.velocity_history()[-round(seconds / walks.step_dt) :, :, axis].mean(axis=0)
     wanted = walks.commands[:, -1, axis]
-    return np.abs(last - wanted) <= share * np.abs(wanted)
+    return np.abs(last - wanted) <= tolerance * np.abs(wanted)
 
 
-def walked_share(walks: VelocityLog) -> np.ndarray:
-    """Return the share of the commanded distance straight ahead that each robot walked until its fall, at most 1.
+def walked_fraction(walks: VelocityLog) -> np.ndarray:
+    """Return the fraction, (robots,), of the commanded distance ahead that each robot walked until its fall, at most 1.
 
     Distance is along the robot's present heading; SETTLING_TIME at the start is not part of the commanded distance.
     """
@@ -112,14 +114,14 @@ def walked_share(walks: VelocityLog) -> np.ndarray:
 
 
 def top_speed(commanded: np.ndarray, kept: np.ndarray, share: float = 0.9, width: float = 0.1) -> float:
-    """Return the highest speed that at least a share of the robots kept, 0 if there is none.
+    """Return the highest speed that at least a fraction `share` of the robots kept, 0 if no speed was kept.
 
     Robots are grouped by commanded speed into bins of a width; the result is the largest command of its bin.
-    commanded [m/s] or [rad/s]: (robots,), at least 0; kept: (robots,) bool.
+    commanded, width [m/s] or [rad/s]; commanded: (robots,), at least 0; kept: (robots,) bool, of `kept_speeds`.
     """
-    classes, top = np.floor(commanded / width + 1.0e-9).astype(int), 0.0
-    for each in np.unique(classes):
-        inside = classes == each
+    bins, top = np.floor(commanded / width + 1.0e-9).astype(int), 0.0
+    for number in np.unique(bins):
+        inside = bins == number
         if kept[inside].mean() >= share:
             top = float(commanded[inside].max())
     return top

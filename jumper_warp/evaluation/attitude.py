@@ -26,23 +26,21 @@ from jumper_warp.utils.errors import InputError
 
 AXES = ("roll", "pitch", "yaw")
 DIRECTIONS = tuple(f"{axis}_{sign}" for axis in AXES for sign in ("plus", "minus"))
-"""Turns about the body's x, y and z axes, each way, in the order in which they are commanded."""
-HARDWARE_TIME = 2.6  # [s] Time in which the authors' robot turned by 90 degrees
+"""Turns about the body's x, y and z axes: roll_plus, roll_minus, pitch_plus, ...; plus is right-handed."""
+HARDWARE_TIME = 2.6  # [s] Settling time of the authors' robot for a turn by 90 degrees
 PICTURES = 6  # Number of pictures in a filmstrip
 
 
 def axis_turns(count: int, angle: float) -> np.ndarray:
-    """Return quaternions xyzw, body axes, (count, 4), of turns by an angle [deg] that cycle through DIRECTIONS."""
-    half = 0.5 * np.radians(angle)
-    quats = np.zeros((count, 4))
-    rows = np.arange(count)
-    quats[rows, rows % 6 // 2] = np.where(rows % 2 == 0, 1.0, -1.0) * np.sin(half)
+    """Return turns by an angle [deg], quaternions (count, 4), xyzw, body axes; row i turns about DIRECTIONS[i % 6]."""
+    half, rows, quats = 0.5 * np.radians(angle), np.arange(count), np.zeros((count, 4))
+    quats[rows, rows % 6 // 2] = np.where(rows % 2 == 0, 1.0, -1.0) * np.sin(half)  # even rows: plus, odd: minus
     quats[:, 3] = np.cos(half)
     return quats
 
 
 def random_turns(count: int, angle: float, seed: int) -> np.ndarray:
-    """Return quaternions xyzw, body axes, (count, 4), of turns by an angle [deg] about uniformly random axes."""
+    """Return turns by an angle [deg] about uniformly random axes, quaternions (count, 4), xyzw, body axes."""
     axis = np.random.default_rng(seed).normal(size=(count, 3))
     axis /= np.linalg.norm(axis, axis=1, keepdims=True)
     half = 0.5 * np.radians(angle)
@@ -51,28 +49,25 @@ def random_turns(count: int, angle: float, seed: int) -> np.ndarray:
 
 @dataclass
 class AttitudeLog(EvaluationLog):
-    """Log of one commanded turn per world; arrays have shape (num_envs,). Diverged worlds are not recorded further."""
+    """Log of one commanded turn per world; properties have shape (num_envs,). A diverged world records NaN."""
 
-    turns: np.ndarray
-    """(num_envs, 4) Commanded turns, quaternions xyzw, body axes, relative to the orientation at the start."""
+    turns: np.ndarray  # (num_envs, 4) Commanded turns, quaternions xyzw, body axes, relative to the start
     tolerance: float = 5.0  # [deg] Largest error of a robot at its goal
     seconds: float = 5.0  # [s] Simulated time of every turn
     errors: list[np.ndarray] = field(default_factory=list, init=False)
-    """[rad] (num_envs,) Angle to the goal after every policy step; NaN once the world has diverged."""
+    """[rad] Angle to the goal, one array (num_envs,) per policy step; NaN once the world has diverged."""
     angular_speeds: list[np.ndarray] = field(default_factory=list, init=False)
-    """[rad/s] (num_envs,) Angular speed of the base after every policy step."""
-    collided: np.ndarray = field(init=False)
-    """Whether a link other than a paw touched the ground, or links touched each other."""
-    diverged: np.ndarray = field(init=False)  # Whether the simulation diverged
+    """[rad/s] Angular speed of the base, one array (num_envs,) per policy step; NaN once the world has diverged."""
+    collided: np.ndarray = field(init=False)  # (num_envs,) Whether a link but the paws touched ground, or links touched
+    diverged: np.ndarray = field(init=False)  # (num_envs,) Whether the simulation diverged
 
     row_name = "turn"
     spacing = 1.5
 
     def __post_init__(self) -> None:
-        """Begin with nothing recorded."""
         self.turns, self.count = np.asarray(self.turns, dtype=float), len(self.turns)
         self.collided, self.diverged = (np.zeros(self.count, dtype=bool) for _ in range(2))
-        self.step_dt = 1.0 / 60.0
+        self.step_dt = 1.0 / 60.0  # [s] Policy step; `begin` sets that of the environment
 
     def begin(self, env: Env) -> None:
         """Reset every robot to the default pose, floating at rest, and command its turn."""
@@ -80,7 +75,7 @@ class AttitudeLog(EvaluationLog):
         env.evaluation_reset(self.turns)
 
     def read_env(self, env: Any) -> dict[str, np.ndarray]:
-        """Return the state of every world's episode and the base's angular velocity [rad/s], world frame."""
+        """Return `Env.task_arrays`, and `base_ang_vel` (num_envs, 3): angular velocity [rad/s], world axes."""
         return env.task_arrays() | {"base_ang_vel": env.sim.joint_qd()[:, 3:6].copy()}
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
@@ -103,36 +98,36 @@ class AttitudeLog(EvaluationLog):
 
     @property
     def first_time(self) -> np.ndarray:
-        """[s] (num_envs,) Time at which a robot first reached its goal; NaN if it never did."""
+        """[s] (num_envs,) Time at which the error first was within `tolerance`; NaN if it never was."""
         inside = np.array(self.errors) <= np.radians(self.tolerance)
         return np.where(inside.any(axis=0), (inside.argmax(axis=0) + 1) * self.step_dt, np.nan)
 
     @property
     def settling_time(self) -> np.ndarray:
-        """[s] (num_envs,) Time from which a robot stayed at its goal; NaN if it was not there at the end."""
+        """[s] (num_envs,) Time from which the error stayed within `tolerance`; NaN if it was larger at the end."""
         inside = np.array(self.errors) <= np.radians(self.tolerance)
         outside = np.where((~inside).any(axis=0), len(inside) - (~inside)[::-1].argmax(axis=0), 0)
         return np.where(inside[-1], (outside + 1) * self.step_dt, np.nan)
 
     @property
     def success(self) -> np.ndarray:
-        """Whether a robot was at its goal at the end, without any collision."""
+        """(num_envs,) Whether the error was within `tolerance` at the end, without any collision."""
         return ~np.isnan(self.settling_time) & ~self.collided
 
     @property
     def outcomes(self) -> np.ndarray:
-        """Outcome of each turn: SUCCESS, COLLIDED, DIVERGED, or NO_END if not at the goal."""
+        """(num_envs,) Outcome of each turn: SUCCESS, COLLIDED, DIVERGED, or NO_END if not at the goal at the end."""
         ends = np.where(self.success, SUCCESS, np.where(self.collided, COLLIDED, NO_END))
         return np.where(self.diverged, DIVERGED, ends)
 
     def columns(self) -> dict[str, list]:
-        """Return turns, errors [deg], times [s] and outcomes, one value per turn."""
-        numbers = {f"turn_{axis}": self.turns[:, i] for i, axis in enumerate("xyzw")}
-        numbers |= {"error_deg": np.degrees(self.error), "first_s": self.first_time, "settling_s": self.settling_time}
-        return {name: finite(values) for name, values in numbers.items()} | {"end": self.outcomes.tolist()}
+        """Return lists with one value per turn: turn_x to turn_w, error_deg, first_s, settling_s, end (outcome)."""
+        columns = {f"turn_{axis}": self.turns[:, i] for i, axis in enumerate("xyzw")}
+        columns |= {"error_deg": np.degrees(self.error), "first_s": self.first_time, "settling_s": self.settling_time}
+        return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return angle to the goal [deg] and angular speed [rad/s] of some worlds."""
+        """Return the last angle to the goal [deg] and angular speed [rad/s] of some worlds, 0 in place of NaN."""
         series = {}
         for world in worlds:
             series[f"attitude/error of {world} [deg]"] = float(np.degrees(np.nan_to_num(self.errors[-1][world])))
@@ -140,11 +135,11 @@ class AttitudeLog(EvaluationLog):
         return series
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the commanded turns of some worlds."""
+        """Return the commanded turns of some worlds: key `turns_xyzw`, a list of quaternions."""
         return {"turns_xyzw": self.turns[list(worlds)].tolist()}
 
     def filmstrip(self, film: Film) -> Filmstrip:
-        """Return a filmstrip of the first recorded world until it has settled."""
+        """Return a filmstrip of the first recorded world, evenly spaced until it settles, else to the end."""
         world = film.worlds[0]
         until = np.nan_to_num(self.settling_time[world], nan=self.seconds)
         frames = np.linspace(0, round(until / self.step_dt) - 1, PICTURES).round().astype(int).tolist()
@@ -155,27 +150,23 @@ class AttitudeLog(EvaluationLog):
 
 
 def turn_metrics(turns: AttitudeLog) -> Metrics:
-    """Return the metrics of turns; times are means over the turns that settled, rates are over all."""
+    """Return the metrics of turns by name, which ends with the unit; times are over settled turns, rates over all."""
     settling, outcomes = turns.settling_time, turns.outcomes
     metrics: Metrics = {
-        "turns": len(outcomes),
-        "mean_angle_deg": mean(np.degrees(turns.angle)),
-        "tolerance_deg": turns.tolerance,
+        "turns": len(outcomes), "mean_angle_deg": mean(np.degrees(turns.angle)), "tolerance_deg": turns.tolerance,
         "success_rate": float(turns.success.mean()),
         "within_2_6_s_rate": float((turns.success & (np.nan_to_num(settling, nan=np.inf) <= HARDWARE_TIME)).mean()),
-        "mean_error_at_end_deg": mean(np.degrees(turns.error)),
-        "mean_first_s": mean(turns.first_time),
+        "mean_error_at_end_deg": mean(np.degrees(turns.error)), "mean_first_s": mean(turns.first_time),
         "mean_settling_s": mean(settling),
         "max_settling_s": mean(settling[settling == np.nanmax(settling)]) if np.isfinite(settling).any() else None,
-        "mean_spin_at_end_rad_s": mean(turns.angular_speeds[-1]),
-        "collision_rate": float(turns.collided.mean()),
+        "mean_spin_at_end_rad_s": mean(turns.angular_speeds[-1]), "collision_rate": float(turns.collided.mean()),
         DIVERGED: int(turns.diverged.sum()),
-    }
+    }  # fmt: skip
     return metrics | failed_by(outcomes[~turns.success])
 
 
 def axis_metrics(turns: AttitudeLog) -> Metrics:
-    """Return mean settling time, success rate and final error of turns of `axis_turns`, by direction."""
+    """Return `<direction>_settling_s`, `_success_rate`, `_error_at_end_deg` for DIRECTIONS; turns: of `axis_turns`."""
     metrics: Metrics = {}
     for i, name in enumerate(DIRECTIONS):
         metrics[f"{name}_settling_s"] = mean(turns.settling_time[i::6])
@@ -206,11 +197,11 @@ class AttitudeFlags:
             raise InputError(f"seconds must be in [0.1, 60], got {self.seconds}")
 
     def log(self, task: TaskCfg, seed: int) -> AttitudeLog:
-        """Return the log of the turns, one per world."""
+        """Return the log of the turns, one per world; task and seed have no effect."""
         return AttitudeLog(axis_turns(self.num_turns, self.angle), self.tolerance, self.seconds)
 
     def metrics(self, log: AttitudeLog) -> Metrics:
-        """Return `turn_metrics` and `axis_metrics`."""
+        """Return `turn_metrics` and `axis_metrics` of a finished log."""
         return turn_metrics(log) | axis_metrics(log)
 
 
@@ -221,12 +212,12 @@ class AttitudePlayFlags:
     angle: float = 90.0
     """[deg] Angle of every turn."""
 
-    length = 4.0
+    length = 4.0  # [s] Length of the recording
 
     def __post_init__(self) -> None:
         if not 0.0 < self.angle <= 180.0:
             raise InputError(f"angle must be in (0, 180] degrees, got {self.angle}")
 
     def log(self, task: TaskCfg) -> AttitudeLog:
-        """Return the log of six turns, one per robot."""
+        """Return the log of six turns, one per robot, in the order of DIRECTIONS; task has no effect."""
         return AttitudeLog(axis_turns(len(DIRECTIONS), self.angle), seconds=self.length)

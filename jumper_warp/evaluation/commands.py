@@ -1,4 +1,4 @@
-"""Implementation of `jumper evaluate` and `jumper play` on an opened policy: run, write and print."""
+"""Implementation of `jumper evaluate` and `jumper play`: run episodes, write and print their metrics."""
 
 from __future__ import annotations
 
@@ -44,9 +44,9 @@ class EvaluateCfg(Generic[Flags]):
 
 
 def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
-    """Evaluate a policy, write `metrics.json` and the rows of the log as CSV, print and return the metrics.
+    """Evaluate a policy, write `metrics.json` and one CSV row per trial, print and return the metrics by name.
 
-    Raises PolicyError: the policy cannot be used or cannot store metrics; OSError: the folder cannot be created.
+    Raises PolicyError: unusable policy, or `save_to_policy` for a run; OSError: the folder cannot be created.
     """
     if cfg.save_to_policy and is_run(run.source):
         raise PolicyError(f"{run.source}: a run keeps no metrics; export it first")
@@ -54,11 +54,9 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.seed)
     run.run_episodes(run.env(log.count), log)
     metrics = {
-        "task": run.policy.interface.task,
-        **run.condition_metrics,
-        "noise": cfg.conditions.noise,
+        "task": run.policy.interface.task, **run.condition_metrics, "noise": cfg.conditions.noise,
         **cfg.flags.metrics(log),
-    }
+    }  # fmt: skip
     write_metrics(run.folder, metrics)
     rows = f"{log.row_name}s.csv"
     (run.folder / rows).write_text(csv_text(log))
@@ -71,7 +69,7 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
 
 
 def csv_text(log: EvaluationLog) -> str:
-    """Return the columns of a log as CSV text: a heading, then one line per row."""
+    """Return `log.columns()` as CSV text: a line of headings, then one line per row; None becomes an empty cell."""
     columns = log.columns()
     lines = [",".join(columns)]
     for row in zip(*columns.values(), strict=True):
@@ -80,7 +78,7 @@ def csv_text(log: EvaluationLog) -> str:
 
 
 def print_metrics(metrics: dict[str, Any]) -> None:
-    """Print a table of metrics to standard output."""
+    """Print a table of metrics by name to standard output, floats with four significant digits."""
     table = Table("metric", "value", box=None)
     for name, value in metrics.items():
         table.add_row(name, f"{value:.4g}" if isinstance(value, float) else json.dumps(value))
@@ -89,7 +87,7 @@ def print_metrics(metrics: dict[str, Any]) -> None:
 
 @dataclass(frozen=True, kw_only=True)
 class RecordingCfg:
-    """How something is recorded."""
+    """Flags that all recordings share."""
 
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
     """What the policies are tried in."""
@@ -114,7 +112,7 @@ class PlayCfg(RecordingCfg, Generic[Flags]):
 
 
 def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
-    """Simulate a policy, write a recording and `metrics.json`, print the outcomes; return the path of the recording.
+    """Simulate a policy, write a recording and `metrics.json` (the columns of the log), return the recording's path.
 
     Raises PolicyError: the policy cannot be used; OSError: the folder cannot be created.
     """
@@ -147,9 +145,9 @@ class ScriptCfg(RecordingCfg):
 
 
 def play_script(cfg: ScriptCfg) -> Path:
-    """Simulate a script, write a recording, a plot and `metrics.json`, print them; return the path of the recording.
+    """Simulate a script with one robot, write a recording, plot and `metrics.json`, return the recording's path.
 
-    Raises InputError: the script or device cannot be used; PolicyError: a policy; OSError: the folder.
+    Raises InputError: unusable script or device; PolicyError: unusable policy; OSError: the folder cannot be created.
     """
     script = read_script(cfg.script)
     run = SkillRun(cfg.policies)
@@ -180,7 +178,7 @@ def viewer_command(path: Path) -> list[str]:
 
 
 def print_rows(log: EvaluationLog) -> None:
-    """Print the columns of a log as a table to standard output."""
+    """Print the columns of a log as a table to standard output, floats with three decimals."""
     columns = log.columns()
     table = Table(*columns, box=None)
     for row in zip(*columns.values(), strict=True):

@@ -1,8 +1,8 @@
-"""Courses: one robot per world executes a script of walks and jumps, and switches between skills for it.
+"""Courses: one robot per world executes a script of walks and jumps by switching between skills.
 
-For a jump the robot is commanded to stand, and the jump is requested with its goal. The jump skill takes over once the
-robot is at rest, and hands back by itself (`kernels.skills.handovers`). A robot that does not come to rest walks a few
-steps. Commanded velocities change at a limited rate.
+Before a jump the robot is commanded to stand, and the jump is requested with its goal. The jump skill takes over once
+the robot is at rest, and returns control to walking (`kernels.skills.handovers`). A robot that does not come to rest
+walks a few steps. Commanded velocities change at a limited rate.
 """
 
 from __future__ import annotations
@@ -24,27 +24,34 @@ from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.tasks.switching import FALLS
 from jumper_warp.utils.errors import InputError
 
-SKILL_OF = {"walk": WALK, "stand": WALK, "jump_up": JUMP_UP, "jump_to": JUMP_TO, "jump_onto": JUMP_TO}
+SKILLS = {
+    "walk": WALK,
+    "stand": WALK,
+    "jump_up": JUMP_UP,
+    "jump_to": JUMP_TO,
+    "jump_onto": JUMP_TO,
+}  # By kind of command
 BLOCK = BlockCfg(center=(1.0e3, 1.0e3), half=(0.55, 0.55), height=0.05, mass=10.0, friction=0.4)
-"""Block to jump onto: far away at first, moved under the goal when the jump skill takes over."""
+"""Block to jump onto: initially 1 km away on both axes, moved under the goal when the jump skill takes over."""
 SQUAT_TIME = 0.5  # [s] Time from the jump skill's takeover, when it squats, to its command
 MAX_ACCELERATION = 1.25  # [m/s^2], [rad/s^2] Rate at which commanded velocities change
-NUDGE_AFTER, NUDGE_TIME = 2.0, 0.5
-"""[s] Time after which a robot that waits for its jump walks a few steps, and how long it does."""
+NUDGE_AFTER, NUDGE_TIME = (
+    2.0,
+    0.5,
+)  # [s] Period at which a robot that waits for its jump walks a few steps; its time
 NUDGE = (0.25, 0.0, 0.0)  # [m/s], [rad/s] Commanded velocity of these steps
 JUMP_TIMEOUT = 15.0  # [s] Time after its request at which an unfinished jump has failed
-STUCK, DONE = len(FALLS), len(FALLS) + 1
+STUCK, DONE = len(FALLS), len(FALLS) + 1  # Indices in OUTCOMES; smaller ones are falls
 OUTCOMES = (*(term.name for term in FALLS), "stuck", "done")
-GOAL_TOLERANCE, LANDED_PHASE = 0.1, 2
-"""[m] Largest error of a jump that is on its goal; the jump's phase after touchdown."""
+GOAL_TOLERANCE = 0.1  # [m] Largest error of a jump that is on its goal
 FORCE_WINDOW = 0.2  # [s] Time before a handover to a jump over which paw forces are evaluated
-COLOURS = {WALK: "white", JUMP_UP: "tab:orange", JUMP_TO: "tab:purple"}
+COLOURS = {WALK: "white", JUMP_UP: "tab:orange", JUMP_TO: "tab:purple"}  # Background of plots, by skill
 NAMES = {WALK: "walk", JUMP_UP: "jump up", JUMP_TO: "jump to"}
 
 
 @dataclass
 class CourseLog(EvaluationLog):
-    """Log of one course per robot; samples after a robot's end are ignored."""
+    """Log of one course per robot (world); samples after the end of a robot's course are NaN or ignored."""
 
     scripts: Sequence[Sequence[ScriptStep]]  # One script per robot, all with the same number of commands
     headings: np.ndarray | float = 0.0  # [rad] (robots,) Headings at the start, or one for all
@@ -52,13 +59,14 @@ class CourseLog(EvaluationLog):
     spacing = 2.0
 
     def __post_init__(self) -> None:
-        """Begin with no command finished. Raises InputError: scripts of different lengths."""
+        """Start with no command finished. Raises InputError: scripts of different lengths, or empty."""
         lengths = {len(script) for script in self.scripts}
         if len(lengths) != 1 or 0 in lengths:
             raise InputError(f"a course needs scripts of one length, got {sorted(lengths)} commands")
         n, k = shape = len(self.scripts), lengths.pop()
+        # (robots, commands) each: whether the command is jump_onto, its skill, goal (..., 3) and time [s]
         self.onto_block = np.array([[step.kind == "jump_onto" for step in script] for script in self.scripts])
-        self.target_skill = np.array([[SKILL_OF[step.kind] for step in script] for script in self.scripts])
+        self.target_skill = np.array([[SKILLS[step.kind] for step in script] for script in self.scripts])
         self.goal = np.array([[step.goal for step in script] for script in self.scripts])
         self.durations = np.array([[step.seconds for step in script] for script in self.scripts])
         self.count, self.step_dt = n, 1.0 / 60.0
@@ -71,10 +79,10 @@ class CourseLog(EvaluationLog):
         self.finish_step = np.full(shape, -1)  # (robots, commands) policy step in which the command finished
         self.apex = np.full(shape, np.nan)  # [m] (robots, commands) largest base height of the jump
         self.offset = np.full((n, k, 2), np.nan)  # [m] from the goal to the base as walking takes over, world axes
-        # after every policy step
+        # one array per policy step
         self.velocity: list[np.ndarray] = []  # (robots, 3) ahead, left [m/s], about z [rad/s]; NaN after the end
         self.commands: list[np.ndarray] = []  # (robots, 3) commanded; NaN while it does not walk
-        self.is_tracked: list[np.ndarray] = []  # (robots,) whether the tracking error counts
+        self.is_tracked: list[np.ndarray] = []  # (robots,) whether it walks, SETTLING_TIME after a command
         self.skills: list[np.ndarray] = []  # (robots,) active skill
         self.height: list[np.ndarray] = []  # [m] (robots,) of the base
         self.force: list[np.ndarray] = []  # [N] (robots, 4) on each paw
@@ -82,7 +90,7 @@ class CourseLog(EvaluationLog):
 
     @property
     def block(self) -> BlockCfg | None:
-        """Value of `Env(block=...)` for these scripts: a block if any command jumps onto one."""
+        """Argument `block` of `Env` for these scripts: BLOCK if any command is a jump onto it, else None."""
         return BLOCK if self.onto_block.any() else None
 
     @property
@@ -91,7 +99,7 @@ class CourseLog(EvaluationLog):
         return float((self.durations.sum(axis=1) + JUMP_TIMEOUT * (self.target_skill != WALK).sum(axis=1)).max()) + 1.0
 
     def begin(self, env: Any) -> None:
-        """Reset every robot to the default pose and start its first command."""
+        """Reset every robot to the default pose at rest, and start its first command."""
         self.step_dt = env.step_dt
         first = np.where(self.target_skill[:, :1] == WALK, self.goal[:, 0], 0.0)
         self._target_velocity = first
@@ -99,7 +107,11 @@ class CourseLog(EvaluationLog):
         self._request_jumps(env, np.full(len(self.end), True))
 
     def read_env(self, env: Any) -> dict[str, np.ndarray]:
-        """Return base state, active skill, termination and paw forces of every robot, and state of its jump."""
+        """Return arrays (robots, ...) by name: base state, active skill, termination, paw forces [N], `jump_` state.
+
+        Base position [m], quaternion (xyzw), velocity [m/s] and angular velocity [rad/s] are in world axes. `jump_`
+        arrays are fields of the jump skill of the present command, of JUMP_UP while it walks.
+        """
         q, qd = env.sim.joint_q(), env.sim.joint_qd()
         arrays = {
             "base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_ang_vel": qd[:, 3:6].copy(),
@@ -109,13 +121,13 @@ class CourseLog(EvaluationLog):
         }  # fmt: skip
         rows = np.arange(len(q))
         kind = self.target_skill[rows, np.minimum(self.current, self.target_skill.shape[1] - 1)]
-        for name in ("max_height", "goal", "took_off", "phase"):
-            of_kind = [env.skills[skill].states.numpy()[name] for skill in (JUMP_UP, JUMP_TO)]
-            arrays[f"jump_{name}"] = np.array(of_kind)[np.where(kind == JUMP_TO, 1, 0), rows]
+        for name in ("max_height", "goal", "took_off"):
+            by_skill = [env.skills[skill].states.numpy()[name] for skill in (JUMP_UP, JUMP_TO)]
+            arrays[f"jump_{name}"] = np.array(by_skill)[np.where(kind == JUMP_TO, 1, 0), rows]
         return arrays
 
     def record_step(self, env: Any) -> bool:
-        """Record a policy step, then command velocities and request jumps that are due."""
+        """Record a policy step, then send due commands and requests; return whether all courses have ended."""
         before, previous = self.current.copy(), self._skill
         ended = super().record_step(env)
         rows, running = np.arange(len(before)), self.end < 0
@@ -146,7 +158,7 @@ class CourseLog(EvaluationLog):
             env.sim.solver.place_blocks(goals, begins.tolist())
 
     def _request_jumps(self, env: Any, worlds: np.ndarray) -> None:
-        """Request the jump of every robot in `worlds` (bool) whose present command is one."""
+        """Request the jump of every robot in `worlds`, (robots,) bool, whose present command is a jump."""
         rows, at = np.arange(len(worlds)), np.minimum(self.current, self.target_skill.shape[1] - 1)
         for skill in (JUMP_UP, JUMP_TO):
             requested = worlds & (self.target_skill[rows, at] == skill)
@@ -155,7 +167,11 @@ class CourseLog(EvaluationLog):
                 env.request(skill, requested, np.concatenate([self.goal[rows, at], delay], axis=1))
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
-        """Record a policy step from the arrays of `read_env`; return whether all courses have ended."""
+        """Record a policy step from the arrays of `read_env`; return whether all courses have ended.
+
+        A walk finishes after its time, a jump when its skill hands over to another. A jump without a takeoff, or
+        unfinished JUMP_TIMEOUT seconds after its request, ends the course as STUCK.
+        """
         self.step_dt, last = step_dt, self.target_skill.shape[1] - 1
         skill, previous, step = arrays["skill"], self._skill, len(self.skills) + 1
         running = self.end < 0
@@ -192,7 +208,11 @@ class CourseLog(EvaluationLog):
     def _append_history(
         self, arrays: dict[str, np.ndarray], running: np.ndarray, previous: np.ndarray, step: int
     ) -> None:
-        """Append a policy step to the histories; previous: skill of every robot that was active in it."""
+        """Append a policy step to the histories.
+
+        arrays: of `read_env`; running: (robots,) whether the course had not ended; previous: (robots,) skill that was
+        active in the step; step: its number, from 1.
+        """
         rows = np.arange(len(running))
         at = np.minimum(self.current, self.target_skill.shape[1] - 1)
         alive, walking = running[:, None], (previous == WALK)[:, None]
@@ -206,40 +226,39 @@ class CourseLog(EvaluationLog):
 
     @property
     def fallen(self) -> np.ndarray:
-        """Whether each robot fell."""
+        """(robots,) Whether each robot fell."""
         return (self.end >= 0) & (self.end < STUCK)
 
     @property
     def outcomes(self) -> np.ndarray:
-        """Outcome of each robot's course, one of OUTCOMES or "under_way"."""
+        """(robots,) Outcome of each robot's course, one of OUTCOMES or "under_way"."""
         return np.array([*OUTCOMES, "under_way"])[self.end]
 
     @property
     def apex_error(self) -> np.ndarray:
-        """[m] (robots, commands) Apex minus commanded height; NaN unless the command is a jump up that was made."""
+        """[m] (robots, commands) Apex minus commanded height; NaN unless the command is a finished jump up."""
         return np.where(self.target_skill == JUMP_UP, self.apex - self.goal[..., 2], np.nan)
 
     @property
     def landing_error(self) -> np.ndarray:
-        """[m] (robots, commands) Distance from the goal when walking takes over; NaN for other commands."""
+        """[m] (robots, commands) Distance of the base from the goal when walking takes over; NaN for other commands."""
         return np.where(self.target_skill == JUMP_TO, np.linalg.norm(self.offset, axis=-1), np.nan)
 
     @property
     def on_goal(self) -> np.ndarray:
-        """(robots, commands) Whether a command was finished, jumps within GOAL_TOLERANCE of their goal."""
-        off = np.where(self.target_skill == JUMP_UP, np.abs(self.apex_error), self.landing_error)
-        near = np.nan_to_num(off, nan=np.inf) <= GOAL_TOLERANCE
+        """(robots, commands) Whether a command finished, and, if a jump, within GOAL_TOLERANCE of its goal."""
+        error = np.where(self.target_skill == JUMP_UP, np.abs(self.apex_error), self.landing_error)
+        near = np.nan_to_num(error, nan=np.inf) <= GOAL_TOLERANCE
         return (self.finish_step >= 0) & ((self.target_skill == WALK) | near)
 
     def columns(self) -> dict[str, list]:
-        """Return outcome, number of finished commands, and largest errors of every robot."""
-        apex, landing = (np.abs(each) for each in (self.apex_error, self.landing_error))
-        worst = {"apex_error_m": _row_max(apex), "landing_error_m": _row_max(landing)}
+        """Return lists with one value per robot: end, commands_done, largest apex_error_m and landing_error_m."""
+        worst = {"apex_error_m": _row_max(np.abs(self.apex_error)), "landing_error_m": _row_max(self.landing_error)}
         done = {"end": self.outcomes.tolist(), "commands_done": (self.finish_step >= 0).sum(axis=1).tolist()}
         return done | {name: finite(values) for name, values in worst.items()}
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return velocity, command, base height and active skill of some robots."""
+        """Return the last velocity, command, base height [m] and active skill of some robots."""
         series = velocity_series(self.velocity[-1], np.nan_to_num(self.commands[-1]), worlds)
         for world in worlds:
             series[f"height/base of {world} [m]"] = float(self.height[-1][world])
@@ -247,12 +266,12 @@ class CourseLog(EvaluationLog):
         return series
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the scripts of some robots."""
+        """Return the scripts of some robots: key `scripts`, lists of [kind, *values]."""
         return {"scripts": [[[step.kind, *step.values] for step in self.scripts[world]] for world in worlds]}
 
 
 def _row_max(values: np.ndarray) -> np.ndarray:
-    """Return the largest finite value of each row, NaN where there is none."""
+    """Return the largest finite value of each row of values (rows, columns), NaN for rows without one."""
     known = np.isfinite(values)
     return np.where(known.any(axis=1), np.where(known, values, -np.inf).max(axis=1), np.nan)
 
@@ -260,9 +279,9 @@ def _row_max(values: np.ndarray) -> np.ndarray:
 def course_metrics(course: CourseLog) -> Metrics:
     """Return the metrics of all robots together.
 
-    `success_rate` is the share of robots that finished every command without a fall, whatever their errors;
-    `on_goal_rate` also requires all jumps within 0.1 m of their goals. Errors are means over the jumps that were made.
-    Tracking errors exclude the first second after each command.
+    `success_rate` is the fraction of robots that finished every command without a fall, whatever their errors;
+    `on_goal_rate` also requires all jumps within 0.1 m of their goals. Errors are means over finished jumps. Tracking
+    errors exclude the first second after each command.
     """
     robots, up, to = len(course.end), course.target_skill == JUMP_UP, course.target_skill == JUMP_TO
     jumps = up | to
@@ -298,17 +317,17 @@ def course_metrics(course: CourseLog) -> Metrics:
 
 
 def tracking_error(course: CourseLog) -> np.ndarray:
-    """Return velocity minus command, (steps, robots, 3); NaN where the robot does not walk or a command is new."""
+    """Return velocity minus command [m/s], [m/s], [rad/s], (steps, robots, 3); NaN where not `is_tracked`."""
     error = np.array(course.velocity, dtype=float) - np.array(course.commands, dtype=float)
     error[~np.array(course.is_tracked)] = np.nan
     return error
 
 
 def handover_forces(course: CourseLog) -> tuple[np.ndarray, np.ndarray]:
-    """Return ripple and step of the paw force at each handover to a jump [N], (handovers,) each.
+    """Return ripple and step of the paw force [N] at all handovers to a jump, (handovers,) each.
 
     Ripple: peak-to-peak force over the last FORCE_WINDOW seconds before the handover; step: change of the force between
-    the policy steps before and after it. Each is that of the paw where it is largest.
+    the policy steps before and after it. Each is the maximum over the four paws.
     """
     force, ripples, steps = np.array(course.force, dtype=float), [], []
     window = round(FORCE_WINDOW / course.step_dt)
@@ -322,14 +341,14 @@ def handover_forces(course: CourseLog) -> tuple[np.ndarray, np.ndarray]:
 
 
 def active_spans(course: CourseLog, world: int) -> list[tuple[int, float, float]]:
-    """Return the successive skills of a robot: index, beginning and end [s]."""
+    """Return a robot's successive active skills as tuples: skill (WALK, JUMP_UP, JUMP_TO), beginning and end [s]."""
     skills = np.array(course.skills)[:, world]
     edges = [0, *(np.flatnonzero(np.diff(skills)) + 1).tolist(), len(skills)]
     return [(int(skills[a]), a * course.step_dt, b * course.step_dt) for a, b in pairwise(edges)]
 
 
 def plot_course(path: Path, course: CourseLog, world: int, title: str = "") -> None:
-    """Plot velocities with commands, base height and active skill of a robot over time."""
+    """Plot velocities with commands, base height and active skill of one robot (its world's index) over time."""
     with figure(path, 5, 1, figsize=(10, 9), sharex=True) as axes:
         time = course.step_dt * np.arange(1, len(course.skills) + 1)
         velocity, command = (np.array(values)[:, world] for values in (course.velocity, course.commands))

@@ -15,16 +15,15 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.commands import layout_of
 from jumper_warp.utils.errors import InputError
 
-MAX_SECONDS = 600.0
-MAX_COMMAND_SIZE = 4
-"""Maximum number of values in a command."""
+MAX_SECONDS = 600.0  # [s] Maximum length of an episode
+MAX_COMMAND_SIZE = 4  # Maximum number of values in a command
 
 
 @dataclass
 class EpisodeLog(EvaluationLog):
-    """Log of one episode per world; arrays have shape (num_envs, ...) and do not change after the episode's end."""
+    """Log of one episode per world of any task; entries of a world do not change after its episode's end."""
 
-    commands: np.ndarray  # (num_envs, n) Command of each world, as the task takes it
+    commands: np.ndarray  # (num_envs, n) Command of each world, `jumper_warp.tasks.commands.layout_of`
     task: TaskCfg
     seconds: float = 10.0  # [s] Maximum simulated time
     end: np.ndarray = field(init=False)  # (num_envs,) Index of the termination that ended the episode, -1 while it runs
@@ -36,7 +35,6 @@ class EpisodeLog(EvaluationLog):
     spacing = 2.0
 
     def __post_init__(self) -> None:
-        """Begin with no episode ended."""
         self.count = count = len(self.commands)
         self.end, self.length = np.full(count, -1), np.zeros(count)
         self.start_position, self.end_position = (np.full((count, 3), np.nan) for _ in range(2))
@@ -70,22 +68,22 @@ class EpisodeLog(EvaluationLog):
 
     @property
     def outcomes(self) -> np.ndarray:
-        """Name of the termination of each episode, NO_END if it still runs."""
+        """(num_envs,) Name of the termination of each episode, NO_END if it still runs."""
         return np.array([*(term.name for term in self.task.terminations), NO_END])[self.end]
 
     def ended_with(self, option: str) -> np.ndarray:
-        """Return which episodes were ended by a termination with an option, such as `success` or `time_out`."""
+        """Return which episodes ended by a termination with the option `success` or `time_out`, (num_envs,) bool."""
         return np.array([*(bool(term.options[option]) for term in self.task.terminations), False])[self.end]
 
     def columns(self) -> dict[str, list]:
-        """Return commands, lengths, mean heights, end positions and terminations, one value per episode."""
-        numbers = {f"command_{i}": self.commands[:, i] for i in range(self.commands.shape[1])}
-        numbers |= {"length_s": self.length, "mean_base_height_m": self.mean_height}
-        numbers |= {f"base_{axis}_m": self.end_position[:, i] for i, axis in enumerate("xyz")}
-        return {name: finite(values) for name, values in numbers.items()} | {"end": self.outcomes.tolist()}
+        """Return lists with one value per episode: command_0 ..., length_s, mean_base_height_m, base_x_m ..., end."""
+        columns = {f"command_{i}": self.commands[:, i] for i in range(self.commands.shape[1])}
+        columns |= {"length_s": self.length, "mean_base_height_m": self.mean_height}
+        columns |= {f"base_{axis}_m": self.end_position[:, i] for i, axis in enumerate("xyz")}
+        return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the base's height and horizontal distance from the start [m] of some worlds."""
+        """Return the present base height and horizontal distance from the start [m] of some worlds."""
         series, pos = {}, self.arrays["base_pos"]
         for world in worlds:
             series[f"height/base of {world} [m]"] = pos[world, 2]
@@ -93,27 +91,24 @@ class EpisodeLog(EvaluationLog):
         return series
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the commands of some worlds."""
+        """Return the commands of some worlds: key `commands`, a list of rows."""
         return {"commands": self.commands[list(worlds)].tolist()}
 
 
 def episode_metrics(episodes: EpisodeLog) -> Metrics:
-    """Return rates and means over all episodes, and the number of episodes by termination."""
+    """Return rates [1] and means over all episodes, and `ended_by_<termination>`, the number of episodes."""
     outcomes, running = episodes.outcomes, episodes.end < 0
     success, timed_out = episodes.ended_with("success"), episodes.ended_with("time_out")
     distance = np.linalg.norm(episodes.displacement, axis=1)
     metrics: Metrics = {
-        "episodes": len(outcomes),
-        "mean_episode_s": mean(episodes.length),
-        "success_rate": float(success.mean()),
-        "failure_rate": float((~running & ~success & ~timed_out).mean()),
-        "no_end_rate": float(running.mean()),
-        "mean_base_height_m": mean(np.array(finite(episodes.mean_height), dtype=float)),
-        "mean_base_height_at_the_end_m": mean(np.array(finite(episodes.end_position[:, 2]), dtype=float)),
-        "mean_distance_from_start_m": mean(np.array(finite(distance), dtype=float)),
-        "mean_moved_x_m": mean(np.array(finite(episodes.displacement[:, 0]), dtype=float)),
-        "mean_moved_y_m": mean(np.array(finite(episodes.displacement[:, 1]), dtype=float)),
-    }
+        "episodes": len(outcomes), "mean_episode_s": mean(episodes.length), "success_rate": float(success.mean()),
+        "failure_rate": float((~running & ~success & ~timed_out).mean()), "no_end_rate": float(running.mean()),
+        "mean_base_height_m": mean(finite(episodes.mean_height)),
+        "mean_base_height_at_the_end_m": mean(finite(episodes.end_position[:, 2])),
+        "mean_distance_from_start_m": mean(finite(distance)),
+        "mean_moved_x_m": mean(finite(episodes.displacement[:, 0])),
+        "mean_moved_y_m": mean(finite(episodes.displacement[:, 1])),
+    }  # fmt: skip
     return metrics | {f"ended_by_{name}": int((outcomes == name).sum()) for name in sorted(set(outcomes))}
 
 
@@ -128,7 +123,7 @@ def check_episodes(count: int, command: tuple[float, ...], seconds: float) -> No
 
 
 def tile_command(command: tuple[float, ...], count: int, task: TaskCfg) -> np.ndarray:
-    """Return the command for each of `count` worlds, (count, n), padded with zeros to the size that the task takes."""
+    """Return the command for `count` worlds, (count, n), padded with zeros to the size n of the task's command."""
     missing = max(layout_of(task).counts[-1] - len(command), 0)
     return np.tile(np.pad(np.array(command, dtype=float), (0, missing)), (count, 1))
 
@@ -140,7 +135,7 @@ class EpisodeFlags:
     num_episodes: int = 200
     """Number of episodes."""
     command: tuple[float, ...] = ()
-    """Up to four numbers, as the task's command takes them; those left out are 0."""
+    """Up to four values of the task's command; omitted ones are 0."""
     seconds: float = 10.0
     """[s] Largest length of an episode."""
 
@@ -148,11 +143,11 @@ class EpisodeFlags:
         check_episodes(self.num_episodes, self.command, self.seconds)
 
     def log(self, task: TaskCfg, seed: int) -> EpisodeLog:
-        """Return the log of episodes with this command."""
+        """Return the log of episodes that all have this command; seed has no effect."""
         return EpisodeLog(tile_command(self.command, self.num_episodes, task), task, self.seconds)
 
     def metrics(self, log: EpisodeLog) -> Metrics:
-        """Return `episode_metrics`."""
+        """Return `episode_metrics` of a finished log."""
         return episode_metrics(log)
 
 
@@ -161,13 +156,13 @@ class EpisodePlayFlags:
     """An episode that is recorded."""
 
     command: tuple[float, ...] = ()
-    """Up to four numbers, as the task's command takes them; those left out are 0."""
+    """Up to four values of the task's command; omitted ones are 0."""
 
-    length = 10.0
+    length = 10.0  # [s] Length of the recording
 
     def __post_init__(self) -> None:
         check_episodes(1, self.command, self.length)
 
     def log(self, task: TaskCfg) -> EpisodeLog:
-        """Return the log of one robot's episode."""
+        """Return the log of one robot's episode of at most `length`."""
         return EpisodeLog(tile_command(self.command, 1, task), task, self.length)

@@ -1,4 +1,4 @@
-"""Table of evaluations: flags, terminations and metrics by the key in `TaskCfg.evaluation_suite`."""
+"""Table EVALUATIONS: flags, terminations and metrics of `jumper evaluate`, by `TaskCfg.evaluation_suite`."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class EvaluationFlags(Protocol):
     """Flags of `jumper evaluate` for a kind of task; a frozen dataclass."""
 
     def log(self, task: TaskCfg, seed: int) -> EvaluationLog:
-        """Return the log that gives the commands, one episode per world."""
+        """Return a new log with the commands of all worlds; seed: of sampled commands."""
         ...
 
     def metrics(self, log: Any) -> Metrics:
-        """Return the metrics of a finished log of `log`."""
+        """Return the metrics of a finished log that `self.log` returned."""
         ...
 
 
@@ -38,37 +38,37 @@ class PlayFlags(Protocol):
         ...
 
     def log(self, task: TaskCfg) -> EvaluationLog:
-        """Return the log that gives the commands, one episode per world."""
+        """Return a new log with the commands of all worlds."""
         ...
 
 
 @dataclass(frozen=True)
 class Evaluation:
-    """How `jumper evaluate`, `play` and `finetune` handle the policies of a task."""
+    """Settings of `jumper evaluate`, `play` and `finetune` for the policies of a task."""
 
     flags: EvaluationFlags  # Default flags of `jumper evaluate`
     play: PlayFlags  # Default flags of `jumper play`
     prepare_task: Callable[[TaskCfg], TaskCfg] = lambda task: task
-    """Returns the task with the terminations that the evaluation uses."""
+    """Function that returns a copy of the task with the terminations of the evaluation."""
     finetune_target: Literal["apex", "landing"] | None = None
     """Error that `jumper finetune` reduces; None: these policies cannot be fine-tuned."""
 
 
-HEIGHT = Evaluation(HeightFlags(), HeightPlayFlags(), heights.with_success_last, "apex")
-PLACE = Evaluation(LandingFlags(), LandingPlayFlags(), landings.with_landing_terminations, "landing")
+HEIGHT_EVALUATION = Evaluation(HeightFlags(), HeightPlayFlags(), heights.with_success_last, "apex")
+LANDING_EVALUATION = Evaluation(LandingFlags(), LandingPlayFlags(), landings.with_landing_terminations, "landing")
 EVALUATIONS: dict[str, Evaluation] = {
-    "apex_height": HEIGHT,
-    "landing_position": PLACE,
+    "apex_height": HEIGHT_EVALUATION,
+    "landing_position": LANDING_EVALUATION,
     "apex_height_mars": replace(
-        HEIGHT, flags=HeightFlags(height_range=(1.0, 3.3), success_range=(1.0, 2.9)),
+        HEIGHT_EVALUATION, flags=HeightFlags(height_range=(1.0, 3.3), success_range=(1.0, 2.9)),
         play=HeightPlayFlags((1.5, 2.3, 3.0), 6.0),
     ),
     "landing_position_mars": replace(
-        PLACE, flags=LandingFlags(goal_x=(0.5, 4.2), success_range=(0.5, 3.9)),
+        LANDING_EVALUATION, flags=LandingFlags(goal_x=(0.5, 4.2), success_range=(0.5, 3.9)),
         play=LandingPlayFlags(default_goals=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))),
     ),
     "omnidirectional": replace(
-        PLACE, finetune_target=None,
+        LANDING_EVALUATION, finetune_target=None,
         flags=LandingFlags(goal_x=(-0.7, 0.7), goal_y=(-0.7, 0.7), success_range=(0.0, 0.7)),
         play=LandingPlayFlags(default_goals=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
     ),
@@ -76,11 +76,11 @@ EVALUATIONS: dict[str, Evaluation] = {
     "attitude": Evaluation(AttitudeFlags(), AttitudePlayFlags()),
     "episode": Evaluation(EpisodeFlags(), EpisodePlayFlags()),
 }  # fmt: skip
-"""Evaluations by key; a user's module may add its own."""
+"""Evaluations by key; a user's module may add entries."""
 
 
 def evaluation_of(task: TaskCfg) -> Evaluation:
-    """Return the evaluation of a task. Raises PolicyError: its key is unknown."""
+    """Return the evaluation of a task. Raises PolicyError: EVALUATIONS lacks its `evaluation_suite`."""
     if task.evaluation_suite not in EVALUATIONS:
         known = f"there are {[*EVALUATIONS]}"
         raise PolicyError(f"{task.name} asks for the evaluation {task.evaluation_suite!r:.60}; {known}")

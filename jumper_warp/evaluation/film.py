@@ -23,12 +23,9 @@ if TYPE_CHECKING:
     from jumper_warp.robot.grounds import BlockCfg
     from jumper_warp.sim.simulation import Simulation
 
-ANKLE = np.array([0.0, 0.0, -0.3])
-"""[m] Position of the ankle in the shank's frame."""
-CAMERA_DISTANCE = 2.4
-"""[m] Distance from the path to the camera in `side_view`."""
-PICTURE_SIZE = (400, 320)
-"""[px] Width and height of a filmstrip's picture in `side_view`."""
+ANKLE = np.array([0.0, 0.0, -0.3])  # [m] Position of the ankle in the shank's frame
+CAMERA_DISTANCE = 2.4  # [m] Distance from the path to the camera in `side_view`
+PICTURE_SIZE = (400, 320)  # [px] Width and height of a filmstrip's picture in `side_view`
 
 
 @dataclass(frozen=True)
@@ -45,43 +42,38 @@ class Filmstrip:
 
 
 class LinkReader:
-    """Computes the state of all links from base and motor coordinates, without changing the simulation."""
+    """Computes poses and twists of all links from the joint coordinates, without changing the simulation."""
 
     def __init__(self, env: Env) -> None:
         """Allocate a separate state of the environment's model."""
         self._sim, self._state = env.sim, env.sim.model.state()
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return pose (num_envs, links, 7) and twist (num_envs, links, 6) of every link; waits for the device."""
-        here, there = self._state, self._sim.state
-        wp.copy(here.joint_q, there.joint_q)
-        wp.copy(here.joint_qd, there.joint_qd)
-        self._sim.physics.dynamics.full_state(here.joint_q, here.joint_qd, here.body_q, here.body_qd)
-        n = self._sim.num_worlds
-        return here.body_q.numpy().reshape(n, -1, 7), here.body_qd.numpy().reshape(n, -1, 6)
+        """Return pose (num_envs, 21, 7) and twist (num_envs, 21, 6) of every link, world frame; waits for the device.
+
+        pose: position [m] and quaternion (xyzw); twist: velocity of the COM [m/s] and angular velocity [rad/s].
+        """
+        state, n = self._state, self._sim.num_worlds
+        wp.copy(state.joint_q, self._sim.state.joint_q)
+        wp.copy(state.joint_qd, self._sim.state.joint_qd)
+        self._sim.physics.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
+        return state.body_q.numpy().reshape(n, -1, 7), state.body_qd.numpy().reshape(n, -1, 6)
 
 
 class Film:
-    """Records some worlds of an environment; call it after every policy step."""
+    """Recorder of some worlds of an environment; call the object after every policy step to add a frame."""
 
     def __init__(
-        self,
-        env: Env,
-        series: Callable[[Sequence[int]], Mapping[str, float]],
-        worlds: Sequence[int],
-        *,
-        spacing: float = 1.2,
-        ground: Any = "plane",
-        block: BlockCfg | None = None,
-        notes: Mapping[str, Any] | None = None,
-        record_motors: bool = False,
-    ) -> None:
-        """Record worlds (at least one) of the environment, and time series.
+        self, env: Env, series: Callable[[Sequence[int]], Mapping[str, float]], worlds: Sequence[int], *,
+        spacing: float = 1.2, ground: Any = "plane", block: BlockCfg | None = None,
+        notes: Mapping[str, Any] | None = None, record_motors: bool = False,
+    ) -> None:  # fmt: skip
+        """Prepare an empty recording of worlds (indices, at least one) of the environment.
 
-        series: returns the present values of the time series, as `EvaluationLog.series`; spacing [m]: distance along y
-        at which worlds are shown side by side, 0 on a heightfield; ground: as in `build_model`; block: the
-        environment's sliding blocks, if any; notes: metadata of the recording, must be JSON; record_motors: add
-        torques and actions of the first world.
+        series: function of `worlds` that returns the present values of the time series, as `EvaluationLog.series`;
+        spacing [m]: distance along y at which worlds are shown side by side, 0 on a heightfield; ground: as in
+        `build_model`; block: the environment's sliding blocks, if any; notes: JSON metadata of the recording;
+        record_motors: add torques and actions of the first world.
         """
         from jumper_warp.viz.recorder import Recorder
 
@@ -95,7 +87,7 @@ class Film:
         self.block_positions: list[np.ndarray] = []
 
     def __call__(self) -> None:
-        """Record the environment's present state as a frame."""
+        """Append the environment's present state as a frame: link poses, series, ankle positions, paw forces."""
         sim = self.env.sim
         poses = self.links.read()[0][self.worlds]
         series = {**self.series(self.worlds), **(self._motor_series() if self.record_motors else {})}
@@ -106,7 +98,7 @@ class Film:
         self.recorder.record(self.frames * self.env.step_dt, poses.reshape(-1, 7), series, ankles(poses), forces)
 
     def _motor_series(self) -> dict[str, float]:
-        """Return torque [N m] and action [1] of every motor of the first recorded world."""
+        """Return torque [N m] and action [1] of all 12 motors of the first recorded world, by name of the series."""
         from jumper_warp.robot.description import MOTOR_JOINTS
 
         world = self.worlds[0]
@@ -115,12 +107,12 @@ class Film:
         return series | {f"action/{name} [1]": action[i] for i, name in enumerate(MOTOR_JOINTS)}
 
     def base_positions(self, index: int) -> np.ndarray:
-        """Return the base positions [m] of the index-th recorded world, world frame, (frames, 3)."""
+        """Return the base positions [m] of the index-th recorded world, (frames, 3), world frame."""
         recording = self.recorder.recording()
         return recording.poses[:, index * len(recording.bodies) // len(self.worlds), :3]
 
     def save_rrd(self, path: Path, goals: np.ndarray | None = None) -> Path:
-        """Write the recording; goals [m]: positions to mark, world frame, (recorded worlds, goals per world, 3)."""
+        """Write the recording to `path`, and return it; goals [m]: marked positions, (recorded worlds, n, 3), world."""
         from jumper_warp.viz.props import with_blocks, with_goal_markers
         from jumper_warp.viz.rerun import write_rrd
 
@@ -147,34 +139,36 @@ class Film:
 
 
 def block_positions(sim: Simulation) -> np.ndarray:
-    """Return the positions [m] of the sliding blocks, world frame, (num_worlds, 2); only SolverJumper has blocks."""
+    """Return x and y [m] of the sliding blocks' centres, (num_worlds, 2), world frame; only SolverJumper has blocks."""
     assert isinstance(sim.solver, SolverJumper)
     return sim.solver.block_position()
 
 
 def ankles(poses: np.ndarray) -> np.ndarray:
-    """Return ankle positions [m], world frame, (num_worlds, 4, 3), from the poses (num_worlds, 21, 7) of all links."""
-    shanks = poses[:, 5 * np.arange(1, len(LEGS) + 1)]
+    """Return ankle positions [m], (num_worlds, 4, 3), world frame, legs FL, FR, BL, BR; poses: (num_worlds, 21, 7)."""
+    shanks = poses[:, 5 * np.arange(1, len(LEGS) + 1)]  # the base, then five links per leg, the inner shank last
     return shanks[..., :3] + rotate(shanks[..., 3:], ANKLE)
 
 
 def keyframes(height: np.ndarray, command: int) -> list[int]:
-    """Return seven frames of a jump for a filmstrip: command, squat, push-off, apex, fall, catch, end.
+    """Return the indices of seven frames of a jump: command, squat, push-off, apex, fall, catch, end.
 
-    height [m]: of the base, (frames,); command: frame in which the jump is commanded.
+    height: base height [m], (frames,); command: frame in which the jump is commanded, clamped to the recording.
     """
     command = min(max(command, 0), len(height) - 1)
     apex = command + int(np.argmax(height[command:]))
     squat = command + int(np.argmin(height[command : apex + 1]))
-    catch = apex + int(np.argmin(height[apex : apex + 60]))
+    catch = apex + int(np.argmin(height[apex : apex + 60]))  # lowest base within a second
     push = squat + int(np.argmax(height[squat : apex + 1] >= 0.5 * (height[squat] + height[apex])))
     return [command, squat, push, apex, (apex + catch) // 2, catch, len(height) - 1]
 
 
 def side_view(start: np.ndarray, end: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return a camera position beside the path from start to end (2,), and its target, (3,) each; [m], world frame."""
-    path = end - start
-    length = float(np.linalg.norm(path))
+    """Return position and target of a camera beside the path from start to end, (3,) each; [m], world frame.
+
+    start, end: (2,). The camera is to the right of the path, farther away from paths longer than 1.5 m.
+    """
+    path, length = end - start, float(np.linalg.norm(end - start))
     ahead = path / length if length > 1.0e-3 else np.array([1.0, 0.0])
     middle = np.append(start + 0.5 * path, 0.4)
     distance = CAMERA_DISTANCE * max(1.0, length / 1.5)

@@ -1,7 +1,7 @@
 """Fine-tuning of a jumping policy: Gauss-Newton on the errors of apex heights or landing positions.
 
-The jumps are those of the nominal robot and of randomised ones, and the actions are held near those of the original
-policy. For landing positions the aim is corrected first: the observed goal is shifted by the mean error.
+Nominal and randomised robots jump, and a trust region keeps the actions near those of the original policy. For landing
+positions the aim is corrected first: the observed goal is shifted by the mean error.
 """
 
 from __future__ import annotations
@@ -30,22 +30,17 @@ from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.runtime import git_commit
 
-AHEAD = "goal_x"
-"""Observation of jumps to landing positions: distance to the goal ahead [m]."""
-DELAYS = (0.3, 0.7)
-"""[s] Range of the time until jumps are commanded."""
-TRUST_REGION_SECONDS = 3.5
-"""[s] Length of the episodes whose observations are sampled."""
-TRUST_REGION_SAMPLES = 4096
-DAMPING = 1.0e-2
-"""Damping of the first step."""
-AIM_ROUNDS = 3
-"""Maximum number of corrections of the aim."""
+AHEAD = "goal_x"  # Observation of jumps to landing positions: distance to the goal ahead [m]
+DELAYS = (0.3, 0.7)  # [s] Range of the time until jumps are commanded
+TRUST_REGION_SECONDS = 3.5  # [s] Length of the episodes whose observations are sampled
+TRUST_REGION_SAMPLES = 4096  # Maximum number of these samples
+DAMPING = 1.0e-2  # [1] Levenberg-Marquardt damping of the first step
+AIM_ROUNDS = 3  # Maximum number of corrections of the aim
 
 
 @dataclass(frozen=True)
 class FinetuneCfg:
-    """How a policy is fine-tuned."""
+    """Settings of fine-tuning: numbers of jumps, ranges of goals, standard deviations that weight errors."""
 
     num_goals: int = 64
     """Number of jumps of the nominal robot, spread evenly over the goals."""
@@ -98,7 +93,11 @@ class FinetuneArgs(FinetuneCfg):
 
 
 def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] = ()) -> list[JumpGroup]:
-    """Return the groups of jumps that are not empty: nominal, late (with latency) and randomised robots."""
+    """Return the groups `nominal`, `late` (with latency) and `randomized` of jumps, without empty ones.
+
+    Goals are evenly spaced over the range of `cfg`. modules: the user's task modules. Raises InputError: the policy
+    does not jump.
+    """
     rng, groups = np.random.default_rng(cfg.seed), []
 
     def on_level_ground(task: TaskCfg) -> TaskCfg:
@@ -109,17 +108,18 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
         ranges = replace(ranges, latency=task.randomization.latency)
         return replace(on_level_ground(task), randomization=ranges, events=())
 
+    # name, number of jumps, standard deviation [m], whether robots are randomised, change of the task
     kinds: tuple[tuple[str, int, float, bool, Callable[[TaskCfg], TaskCfg]], ...] = (
         ("nominal", cfg.num_goals, cfg.miss_std, False, on_level_ground),
         ("late", cfg.num_delayed, cfg.delayed_std, True, with_latencies),
         ("randomized", cfg.num_randomized, cfg.randomized_std, True, on_level_ground),
     )
-    for name, count, std, draws, change in kinds:
+    for name, count, std, randomize, change_task in kinds:
         if count:
             conditions = Conditions(
-                randomize=draws, noise=name == "randomized", seed=cfg.seed, device=cfg.device, threads=cfg.threads
+                randomize=randomize, noise=name == "randomized", seed=cfg.seed, device=cfg.device, threads=cfg.threads
             )
-            env = env_of_policy(policy, count, conditions, change=change, modules=modules)
+            env = env_of_policy(policy, count, conditions, change=change_task, modules=modules)
             target = evaluation_of(env.task).finetune_target
             if target is None:
                 raise InputError(f"fine-tuning is for jumps to heights and places, not for {env.task.name}")
@@ -132,9 +132,10 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
 
 
 def collect_trust_region_samples(groups: list[JumpGroup], network: Network, cfg: FinetuneCfg) -> Anchor:
-    """Run all groups, and return the trust region of the actions on a sample of their observations.
+    """Run the network on all groups, and return the trust region around its actions on a sample of observations.
 
-    Observations are from standing to rest; those after touchdown have the standard deviation `landing_std`.
+    Observations are sampled from the first TRUST_REGION_SECONDS; after touchdown the allowed change of the actions is
+    `cfg.landing_std`, before it `cfg.action_std`.
     """
     observations, landed = [], []
     for group in groups:
@@ -151,12 +152,12 @@ def collect_trust_region_samples(groups: list[JumpGroup], network: Network, cfg:
 
 
 def mean_abs_errors(groups: list[JumpGroup], errors: list[JumpErrors]) -> dict[str, float]:
-    """Return the mean absolute error [m] by name of the group."""
+    """Return the mean absolute error [m] of the valid jumps of each group, by its name."""
     return {group.name: float(e.value[e.valid].abs().mean()) for group, e in zip(groups, errors, strict=True)}
 
 
 def shift_goal_observation(policy: Policy, shift: float) -> Policy:
-    """Return the policy that observes its goals `shift` [m] farther ahead, by a change of its normaliser."""
+    """Return a copy of the policy that observes its goals `shift` [m] farther ahead, by a change of its normaliser."""
     mean = policy.mean.clone()
     mean[policy.interface.observation_names.index(AHEAD)] -= shift
     return Policy(policy.layers, mean, policy.std, policy.interface, policy.config)
@@ -165,13 +166,15 @@ def shift_goal_observation(policy: Policy, shift: float) -> Policy:
 def correct_aim(
     policy: Policy, groups: list[JumpGroup], log: Callable[[str], object]
 ) -> tuple[Policy, list[dict[str, dict[str, float]]]]:
-    """Return the policy with its aim at goals straight ahead corrected, and the errors [m] by group of each round.
+    """Return the policy with corrected aim at goals straight ahead, and the errors [m] before it and of each round.
 
     Every round subtracts the weighted mean error from the observed goal; a round that does not lower the cost is undone
     and ends the correction. A factor on the goal would have little effect: the observed distance is short at landing.
+    Errors are the dicts `ahead` (mean, signed) and `mean_abs_miss_m` by group. log: prints a line of progress.
     """
 
     def measure(policy: Policy) -> tuple[float, list[JumpErrors], dict[str, dict[str, float]]]:
+        """Run the jumps of a policy; return their cost [1], errors by group, and mean errors [m]."""
         network = Network(policy, device=groups[0].env.device)
         errors = [jump_errors(group, network, derivatives=False) for group in groups]
         pairs = list(zip(groups, errors, strict=True))
@@ -201,13 +204,15 @@ def correct_aim(
 def tune_weights(
     groups: list[JumpGroup], network: Network, cfg: FinetuneCfg, log: Callable[[str], object], begin: float
 ) -> list[dict[str, Any]]:
-    """Take Gauss-Newton steps on the network's weights; return cost and errors [m] by group before and after each step.
+    """Take Gauss-Newton steps on the network's weights in place; return one dict before them and one after each step.
 
-    begin: time from which the reported seconds count, by `time.perf_counter`.
+    Keys: step, mean_abs_miss_m (by group [m]), cost, action_change (RMS [1]), seconds since `begin`, a value of
+    `time.perf_counter`. A step that does not lower the cost is undone. log: prints a line of progress.
     """
     anchor = collect_trust_region_samples(groups, network, cfg)
 
     def measure(derivatives: bool) -> tuple[float, list[JumpErrors]]:
+        """Run the jumps with the present weights; return the cost [1] with that of the trust region, and the errors."""
         errors = [jump_errors(group, network, derivatives=derivatives) for group in groups]
         pairs = zip(groups, errors, strict=True)
         total = sum(float((0.5 * group.importance(e) * e.value.square()).sum()) for group, e in pairs)
@@ -236,15 +241,12 @@ def tune_weights(
 
 
 def finetune(
-    policy: Policy,
-    cfg: FinetuneCfg,
-    modules: Iterable[ModuleType] = (),
-    log: Callable[[str], object] = print,
+    policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] = (), log: Callable[[str], object] = print
 ) -> tuple[Policy, dict]:
-    """Return the fine-tuned policy and its record: settings, and errors [m] by group before and after each step.
+    """Return the fine-tuned policy and its record: `settings`, `aims` (`correct_aim`), `steps` (`tune_weights`).
 
     modules: the user's task modules; log: prints a line of progress. Raises InputError as `ClosedLoop` and
-    `make_groups`, and if there is nothing to do.
+    `make_groups`, and for a policy for heights without iterations.
     """
     begin = time.perf_counter()
     groups = make_groups(policy, cfg, modules)

@@ -24,7 +24,7 @@ HUBER = 0.02  # [m] Threshold of the Huber weight: larger errors, of jumps that 
 
 
 class JumpErrors(NamedTuple):
-    """Errors of one group of n jumps; m = n for apex heights, m = 2n for landing positions (all x, then all y)."""
+    """Errors of a group of n jumps; m = n for apex heights, m = 2n for landing positions (all x, then all y, world)."""
 
     value: torch.Tensor  # (m,) [m] Errors, 0 where not valid
     jacobian: torch.Tensor  # (m, weights) [m] Derivatives by the network's weights; empty if not requested
@@ -35,12 +35,12 @@ class JumpErrors(NamedTuple):
 class JumpGroup:
     """Jumps of one environment with fixed commands."""
 
-    name: str
-    env: Env
+    name: str  # Name of the group in logs and records
+    env: Env  # Environment of n worlds, one jump each
     std: float  # [m] Standard deviation that weights the errors
     commands: np.ndarray  # (n, 4) Commands of `jump_commands`
     to_height: bool  # Whether the error is that of the apex height, else of the landing position
-    loop: ClosedLoop = field(init=False)
+    loop: ClosedLoop = field(init=False)  # Differentiable steps of the same robots
 
     def __post_init__(self) -> None:
         """Save the environment's state, so that every run samples the same robots."""
@@ -48,7 +48,7 @@ class JumpGroup:
         self.loop = ClosedLoop(self.env)
 
     def begin(self) -> None:
-        """Reset all robots to the initial state and set their commands."""
+        """Reset all robots to the state at construction and set their commands."""
         self.env.load_state_dict(self._initial_state)
         self.env.evaluation_reset(self.commands)
         self.loop.read_parameters()
@@ -60,7 +60,10 @@ class JumpGroup:
 
 
 def apex_heights(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np.ndarray]) -> list[torch.Tensor]:
-    """Return the base heights at the apex [m] as a list of one tensor (n,); arrays: the last of `env.task_arrays`."""
+    """Return [heights], the differentiable base heights at the apex [m], (n,).
+
+    states: of every policy step; arrays: `env.task_arrays` after the last one, whose `max_height` picks the step.
+    """
     heights = torch.stack([state.q[2] for state in states])
     reached = torch.as_tensor(arrays["max_height"], dtype=heights.dtype, device=heights.device)
     row = (heights.detach() - reached).abs().argmin(0, keepdim=True)
@@ -68,20 +71,23 @@ def apex_heights(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np
 
 
 def ballistic_landing(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np.ndarray]) -> list[torch.Tensor]:
-    """Return x and y [m], (n,) each, of the landing point of the ballistic flight from the apex."""
+    """Return [x, y], (n,) each, the differentiable landing point [m], world, of the ballistic flight from the apex.
+
+    states, arrays: as for `apex_heights`. The base lands at LANDING_HEIGHT.
+    """
     reached = torch.as_tensor(arrays["max_height"], device=states[0].q.device)
     row = (torch.stack([state.q[2].detach() for state in states]) - reached).abs().argmin(0)
     motions = [loop.motion(state) for state in states]
     pos, vel = (torch.stack([getattr(motion, name) for motion in motions]) for name in ("pos", "lin_vel"))
     worlds = torch.arange(len(row), device=row.device)
     pos, vel = pos[row, worlds], vel[row, worlds]
-    g = loop.task.gravity
-    fall = (vel[:, 2] + (vel[:, 2].square() + 2.0 * g * (pos[:, 2] - LANDING_HEIGHT).clamp(min=0.0)).sqrt()) / g
-    return [pos[:, i] + fall * vel[:, i] for i in range(2)]
+    g, drop = loop.task.gravity, (pos[:, 2] - LANDING_HEIGHT).clamp(min=0.0)
+    fall_time = (vel[:, 2] + (vel[:, 2].square() + 2.0 * g * drop).sqrt()) / g
+    return [pos[:, i] + fall_time * vel[:, i] for i in range(2)]
 
 
 def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> JumpErrors:
-    """Run the jumps of a group with a network as policy, and return their errors; derivatives: also the Jacobian."""
+    """Run the jumps of a group with a network as policy, and return their errors; derivatives: with Jacobian."""
     env, loop, to_height = group.env, group.loop, group.to_height
     group.begin()
     begin, last = int(group.commands[:, 3].min()), int(group.commands[:, 3].max()) + round(LATEST / env.step_dt)
@@ -116,13 +122,10 @@ def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> Jum
 
 
 def _landing_errors(env: Env, network: Network) -> list[np.ndarray]:
-    """Continue until a second after touchdown, and return the distances to the goals [m], x and y, (n,) each.
-
-    On Mars the fall before it takes up to 1.4 s.
-    """
+    """Continue until REST_TIME after touchdown, and return [x, y], (n,) each: base minus goal [m], world."""
     rest = round(REST_TIME / env.step_dt)
     with torch.no_grad():
-        for _ in range(3 * rest):
+        for _ in range(3 * rest):  # on Mars the fall from the apex takes up to 1.4 s
             arrays = env.task_arrays()
             if ((arrays["phase"] == LANDED) & (arrays["phase_steps"] >= rest)).all():
                 break

@@ -21,35 +21,25 @@ from jumper_warp.evaluation.log import (
 )
 from jumper_warp.utils.errors import InputError
 
-STANCE, LANDED = 0, 2
-"""Values of the jump's phase before takeoff and after touchdown."""
-REST_SPEED = 0.1
-"""[m/s] Speed of the base's centre of mass below which the robot is at rest."""
-REST_TIME = 1.0
-"""[s] Time after touchdown at which the robot should be at rest."""
-DELAY = 0.5
-"""[s] Time until the first jump is commanded."""
-SOON_AFTER = 0.3
-"""[s] Time after touchdown at which the base position is recorded as well."""
-HOP_TIME = 0.05
-"""[s] Longest time with no paw on the ground after touchdown that is no second hop, and shortest time for which a paw
-is lifted again that is a step."""
-TAKEOFF_SPEED = 0.25
-"""[m/s] Upward speed of the base, with no paw down, of a second takeoff (authors' configuration)."""
-TIME_EPS = 1.0e-6
-"""[s] Tolerance for rounding of sums of steps."""
-NOT_BEGUN = "not_begun"
-"""Outcome of a jump that was not commanded, as one before it failed."""
+STANCE, LANDED = 0, 2  # Values of the jump's phase before takeoff and after touchdown
+REST_SPEED = 0.1  # [m/s] Speed of the base's centre of mass below which the robot is at rest
+REST_TIME = 1.0  # [s] Time after touchdown at which the robot should be at rest
+DELAY = 0.5  # [s] Time until the first jump is commanded
+SOON_AFTER = 0.3  # [s] Time after touchdown at which the base position is recorded as well
+HOP_TIME = 0.05  # [s] After touchdown, longer without any paw on the ground is a hop; a paw lifted so long is a step
+TAKEOFF_SPEED = 0.25  # [m/s] Upward speed of the base, with no paw down, of a second takeoff (authors' configuration)
+TIME_EPS = 1.0e-6  # [s] Tolerance for rounding of sums of steps
+NOT_BEGUN = "not_begun"  # Outcome of a jump that was not commanded, as one before it failed
 
 
 def paw_arrays(env: Env) -> dict[str, np.ndarray]:
-    """Return `paws_down`, whether each paw is on the ground, (num_envs, 4), and `up`, the base's upward speed [m/s]."""
+    """Return `paws_down` (num_envs, 4), whether FL, FR, BL, BR touch ground, and `up` (num_envs,), base speed [m/s]."""
     force = np.linalg.norm(env.sim.paw_force.numpy(), axis=2)
     return {"paws_down": (force > env.task.contact_force).T, "up": env.sim.base_velocity()[:, 2]}
 
 
 def jump_commands(goals: np.ndarray, delay: np.ndarray | float, step_dt: float) -> np.ndarray:
-    """Return commands of jump tasks, (num_envs, 4): goal x, y, z [m] and policy step of the command.
+    """Return commands of jump tasks, (num_envs, 4): goal x, y, z [m] and number of the policy step of the command.
 
     goals [m]: (num_envs, 3), landing x, y relative to start and heading, and base height at the apex, 0 for any;
     delay [s]: time until the jump is commanded, (num_envs,) or one for all.
@@ -65,8 +55,7 @@ class JumpLog(EvaluationLog):
     its command. A jump's entries do not change after its end.
     """
 
-    speed_time: float
-    """[s] Time after touchdown at which the base's speed is recorded."""
+    speed_time: float  # [s] Time after touchdown at which the base's speed is recorded
 
     def __init__(
         self,
@@ -76,12 +65,14 @@ class JumpLog(EvaluationLog):
         delay: np.ndarray | float = DELAY,
         rest: float = REST_TIME,
     ) -> None:
-        """Begin with no jump ended.
+        """Start with no jump ended.
 
         goals [m]: landing positions ahead and to the left, (num_envs, jumps in a row, 2 or 3), third the base height at
         the apex, 0 for any; terminations: names of the task's terminations, SUCCESS among them; headings [rad]:
         (num_envs,) or one for all; delay [s]: time until the first jump is commanded, likewise; rest [s]: time from
         touchdown until the jump is over and the next one is commanded. Raises InputError: another shape, or no SUCCESS.
+
+        Below, arrays have shape (num_envs, jumps in a row, ...).
         """
         goals = np.asarray(goals, dtype=float)
         if goals.ndim != 3 or goals.shape[2] not in (2, 3):
@@ -111,15 +102,15 @@ class JumpLog(EvaluationLog):
         self._success = success_index(terminations)
 
     def begin(self, env: Env) -> None:
-        """Reset every world to the default pose and set its first goal."""
+        """Reset every world to the default pose, and command its first jump `delay` seconds after the reset."""
         env.evaluation_reset(jump_commands(self.goals[:, 0], self.delay, env.step_dt), self.headings)
 
     def read_env(self, env: Env) -> dict[str, np.ndarray]:
-        """Return the state of every world's episode and `paw_arrays`."""
+        """Return `Env.task_arrays` and `paw_arrays`."""
         return env.task_arrays() | paw_arrays(env)
 
     def record_step(self, env: Env) -> bool:
-        """Record a policy step, and command the next jumps that are due."""
+        """Record a policy step, command the next jumps that are due; return whether all jumps have ended."""
         before = self.current.copy()
         ended = super().record_step(env)
         due = (self.current > before) & (self.current < self.goals.shape[1])
@@ -130,7 +121,10 @@ class JumpLog(EvaluationLog):
         return ended
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
-        """Record a policy step from the arrays of `read_env`; return whether all jumps have ended."""
+        """Record a policy step from the arrays of `read_env`; return whether all jumps have ended.
+
+        A jump ends with a termination other than SUCCESS, which ends the row, or `rest` seconds after touchdown.
+        """
         count = self.goals.shape[1]
         row = np.flatnonzero(self.current < count)
         now = {name: values[row] for name, values in arrays.items()}
@@ -151,7 +145,10 @@ class JumpLog(EvaluationLog):
         return bool((self.current >= count).all())
 
     def _record_early(self, arrays: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray]) -> None:
-        """Mark jumps that take off before the command; at: world and number of each jump under way."""
+        """Mark jumps that take off before the command.
+
+        arrays: of all worlds; at: indices (worlds, numbers in the row), (n,) each, of the n jumps under way.
+        """
         takes_off = (arrays["took_off"] == 1) & (arrays["steps"] < arrays["command_step"])
         self.early[at] |= takes_off[at[0]]
 
@@ -160,8 +157,8 @@ class JumpLog(EvaluationLog):
     ) -> None:
         """Record base positions, speeds and paw contacts after touchdown.
 
-        now: arrays of the worlds whose jumps are under way; at: world and number of these jumps; landed: whether each
-        has touched down; step_dt [s].
+        now: arrays (n, ...) of the n worlds whose jumps are under way; at: indices (worlds, numbers in the row) of
+        these jumps; landed: (n,) whether each has touched down; step_dt [s]: policy step.
         """
         row, number = at
         steps, speed = now["phase_steps"], np.linalg.norm(now["base_vel"], axis=1)
@@ -185,7 +182,7 @@ class JumpLog(EvaluationLog):
 
     @property
     def ends(self) -> np.ndarray:
-        """Name of the termination of each jump, regardless of its distance from the goal; NO_END, NOT_BEGUN."""
+        """(num_envs, jumps in a row) Name of the termination of each jump, NO_END or NOT_BEGUN."""
         names = np.array([*self.terminations, NO_END], dtype=object)[self.end]
         return np.where(self.begun, names, NOT_BEGUN)
 
@@ -206,7 +203,7 @@ class JumpLog(EvaluationLog):
 
     @property
     def hopped(self) -> np.ndarray:
-        """Whether no paw was on the ground for longer than HOP_TIME after touchdown."""
+        """Whether all paws together were off the ground for longer than HOP_TIME after touchdown."""
         return self.air_time > HOP_TIME + TIME_EPS
 
     @property
@@ -220,12 +217,12 @@ class JumpLog(EvaluationLog):
         return self.landed & ~self.stepped
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the base's height [m]."""
+        """Return the present base height [m] of some worlds."""
         return {f"height/base of {world} [m]": self.arrays["base_pos"][world, 2] for world in worlds}
 
 
 def stance_metrics(jumps: JumpLog) -> Metrics:
-    """Return the rates of still landings and collisions among all jumps, and tilt and turn of the landed ones."""
+    """Return the rates of still landings and collisions among commanded jumps, tilt and turn [deg] of landed ones."""
     begun, landed = jumps.begun, jumps.landed
     return {
         "still_landing_rate": mean(jumps.still[begun]),
@@ -252,11 +249,11 @@ class JumpFlags:
 
 
 def yaw_of(quat: np.ndarray) -> np.ndarray:
-    """Return the yaw [rad] of orientations (..., 4), xyzw: the heading of body x in the world plane."""
+    """Return the yaw [rad], (...), of quaternions (..., 4), xyzw: angle of body x in the world plane, from world x."""
     x, y, z, w = np.moveaxis(quat, -1, 0)
     return np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
 
 
 def wrapped(angle: np.ndarray) -> np.ndarray:
-    """Return angles [rad] within -pi..pi."""
+    """Return angles [rad] wrapped into -pi..pi."""
     return np.arctan2(np.sin(angle), np.cos(angle))

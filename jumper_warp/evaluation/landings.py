@@ -1,7 +1,7 @@
 """Jumps to landing positions: log, metrics, and flags of `jumper evaluate` and `play`.
 
-The error of a jump is the horizontal distance between base and goal a second after touchdown, or where the jump failed
-before. Second hops and steps after touchdown are reported separately.
+The error of a jump is the horizontal distance between base and goal a second after touchdown, or at an earlier
+failure. Second hops and steps after touchdown are reported separately.
 """
 
 from __future__ import annotations
@@ -35,45 +35,41 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import TerminationTerm
 from jumper_warp.utils.errors import InputError
 
-Position2D = tuple[float, float]
-SUCCESS_TOLERANCE = 0.1
-"""[m] Largest error of a successful jump."""
+Position2D = tuple[float, float]  # [m] Ahead and to the left
+SUCCESS_TOLERANCE = 0.1  # [m] Largest error of a successful jump
 LANDING_TERMINATIONS = (DIVERGED, "low_base", COLLIDED, "no_jump", SUCCESS)
-"""Terminations that end a jump of an evaluation, in order of precedence: success last, so that it hides no fall. The
-other terminations of a task only shape the training."""
-FALLS = (DIVERGED, "low_base", COLLIDED)
-MISSED = "missed"
-"""Outcome of a jump that landed, but beyond SUCCESS_TOLERANCE."""
-EARLY = "early"
-"""Outcome of a landed jump that began before its command."""
-AT_REST_AT_END = "below_0_1_m_s_at_the_end_rate"
-"""Metric: share of landed jumps whose base was at rest (`REST_SPEED`) when the jump was over."""
-JUMP_SECONDS, NEXT_JUMP_SECONDS = 3.5, 2.5
-"""[s] Length of a recording of one jump, and addition for each further jump."""
-SHOWN_DISTANCE = 1.0
-"""[m] The filmstrip shows the jump whose goal is nearest to this distance."""
+"""Terminations of a jump of an evaluation, in order of precedence; success is last, so that it hides no fall."""
+FALLS = (DIVERGED, "low_base", COLLIDED)  # Terminations that `fall_rate` counts
+MISSED = "missed"  # Outcome of a jump that landed, but beyond SUCCESS_TOLERANCE
+EARLY = "early"  # Outcome of a landed jump that began before its command
+AT_REST_AT_END = "below_0_1_m_s_at_the_end_rate"  # Metric: fraction of landed jumps with the base at rest at the end
+JUMP_SECONDS, NEXT_JUMP_SECONDS = 3.5, 2.5  # [s] Length of a recording of one jump, and addition for each further jump
+SHOWN_DISTANCE = 1.0  # [m] The filmstrip shows the jump whose goal is nearest to this distance
 
 
 def with_landing_terminations(task: TaskCfg) -> TaskCfg:
-    """Return the task with the terminations of an evaluation, LANDING_TERMINATIONS."""
+    """Return a copy of the task with only LANDING_TERMINATIONS; its others, which shape training, are dropped."""
     return with_terminations(task, LANDING_TERMINATIONS)
 
 
 def with_second_takeoff(task: TaskCfg) -> TaskCfg:
-    """Return the task with LANDING_TERMINATIONS, then a second takeoff, as in the authors' configuration."""
+    """Return a copy of the task with LANDING_TERMINATIONS and, before success, the authors' second takeoff."""
     task = with_landing_terminations(task)
     takeoff = TerminationTerm(terminations.second_takeoff, speed=TAKEOFF_SPEED)
     return replace(task, terminations=(*task.terminations[:-1], takeoff, task.terminations[-1]))
 
 
 class LandingLog(JumpLog):
-    """Log of jumps to landing positions; success: begun on command and landed within SUCCESS_TOLERANCE."""
+    """Log of jumps to landing positions; arrays as in `JumpLog`, (num_envs, jumps in a row, ...).
+
+    Success: begun on command and landed within SUCCESS_TOLERANCE.
+    """
 
     spacing = 3.0
 
     @property
     def goal_positions(self) -> np.ndarray:
-        """[m] (..., 2) Goals ahead and to the left of where the jump starts."""
+        """[m] (num_envs, jumps in a row, 2) Goals ahead and to the left of the start of each jump."""
         return self.goals[..., :2]
 
     @property
@@ -83,7 +79,7 @@ class LandingLog(JumpLog):
 
     @property
     def offset(self) -> np.ndarray:
-        """[m] (..., 2) Signed error at the end, goal to base, ahead and to the left of the jump's heading."""
+        """[m] (..., 2) Base minus goal at the end, ahead and to the left along the jump's heading."""
         x, y = np.moveaxis(self.end_position - self.goal_world, -1, 0)
         cos, sin = np.cos(-self.heading), np.sin(-self.heading)
         return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
@@ -95,12 +91,12 @@ class LandingLog(JumpLog):
 
     @property
     def error(self) -> np.ndarray:
-        """[m] Horizontal distance of the base from the goal at the end; NaN where the simulation diverged."""
+        """[m] (...) Horizontal distance of the base from the goal at the end; NaN if diverged or not begun."""
         invalid = self.diverged | ~np.isfinite(self.end_position).all(axis=-1)
         return np.where(invalid, np.nan, self.goal_distance(self.end_position))
 
     def goal_distance(self, position: np.ndarray) -> np.ndarray:
-        """Return the distances [m] of positions (num_envs, jumps in a row, 2), world frame, from the goals."""
+        """Return the distances [m], (num_envs, jumps in a row), of positions (..., 2) [m], world, from the goals."""
         return np.linalg.norm(position - self.goal_world, axis=-1)
 
     @property
@@ -110,18 +106,18 @@ class LandingLog(JumpLog):
 
     @property
     def outcomes(self) -> np.ndarray:
-        """Outcome of each jump: SUCCESS, MISSED or EARLY if landed without success, else what ended it."""
+        """Outcome of each jump: SUCCESS, MISSED or EARLY if it landed without success, else its entry in `ends`."""
         missed = np.where(self.landed & ~self.success, np.where(self.early, EARLY, MISSED), self.ends)
         return np.where(self.success, SUCCESS, missed)
 
     def columns(self) -> dict[str, list]:
         """Return goals, headings, landing positions, errors and outcomes, one value per jump, world after world."""
-        numbers = {f"goal_{axis}_m": self.goal_positions[..., i] for i, axis in enumerate("xy")}
-        numbers |= {"heading_deg": np.degrees(self.heading)}
-        numbers |= {f"landing_{axis}_m": self.landing[..., i] for i, axis in enumerate("xy")}
-        numbers |= {"error_m": self.error}
+        columns = {f"goal_{axis}_m": self.goal_positions[..., i] for i, axis in enumerate("xy")}
+        columns |= {"heading_deg": np.degrees(self.heading)}
+        columns |= {f"landing_{axis}_m": self.landing[..., i] for i, axis in enumerate("xy")}
+        columns |= {"error_m": self.error}
         ends = {"end": self.outcomes.ravel().tolist()}
-        return {name: finite(values.ravel()) for name, values in numbers.items()} | ends
+        return {name: finite(values.ravel()) for name, values in columns.items()} | ends
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
         """Return the base's height and its distance from the current goal [m] of some worlds."""
@@ -130,11 +126,10 @@ class LandingLog(JumpLog):
 
     def goal_markers(self, worlds: Sequence[int]) -> np.ndarray:
         """Return the commanded goals [m], world frame, (worlds, jumps in a row, 3), z = 0."""
-        target = self.goal_world[list(worlds)]
-        return np.concatenate([target, np.zeros_like(target[..., :1])], axis=-1)
+        return np.pad(self.goal_world[list(worlds)], ((0, 0), (0, 0), (0, 1)))
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the goals [m] of some worlds."""
+        """Return the goals [m] of some worlds: key `goals_m`."""
         return {"goals_m": self.goal_positions[list(worlds)].tolist()}
 
     def filmstrip(self, film: Film) -> Filmstrip:
@@ -167,17 +162,12 @@ def landing_metrics(landings: LandingLog, inside: np.ndarray | None = None) -> M
     offset = np.where(np.isnan(error)[..., None], np.nan, landings.offset)
     at_rest = "at_rest_within_1_s_rate" if landings.rest == REST_TIME else AT_REST_AT_END
     metrics: Metrics = {
-        "jumps": int(begun.sum()),
-        **mean_and_max("error_m", error),
-        **mean_and_max("error_of_successes_m", error[success]),
-        "mean_error_ahead_m": mean(offset[..., 0]),
-        "mean_error_left_m": mean(offset[..., 1]),
-        "success_rate": mean(success[begun]),
+        "jumps": int(begun.sum()), **mean_and_max("error_m", error),
+        **mean_and_max("error_of_successes_m", error[success]), "mean_error_ahead_m": mean(offset[..., 0]),
+        "mean_error_left_m": mean(offset[..., 1]), "success_rate": mean(success[begun]),
         "single_jump_success_rate": mean((success & ~landings.hopped)[begun]),
-        "step_free_success_rate": mean((success & ~landings.stepped)[begun]),
-        "landing_rate": mean(landed[begun]),
-        "second_hop_rate": mean(landings.hopped[landed]),
-        "step_rate": mean(landings.stepped[landed]),
+        "step_free_success_rate": mean((success & ~landings.stepped)[begun]), "landing_rate": mean(landed[begun]),
+        "second_hop_rate": mean(landings.hopped[landed]), "step_rate": mean(landings.stepped[landed]),
         "mean_error_at_touchdown_m": mean(landings.goal_distance(landings.touchdown)[landed]),
         "mean_error_0_3_s_after_touchdown_m": mean(landings.goal_distance(landings.position_soon)[landed]),
         **stance_metrics(landings),
@@ -185,10 +175,9 @@ def landing_metrics(landings: LandingLog, inside: np.ndarray | None = None) -> M
         at_rest: mean((landings.rest_speed < REST_SPEED)[landed]),
         "mean_landing_tilt_deg": mean(np.degrees(landings.tilt[landed])),
         "fall_rate": mean(np.isin(landings.ends, FALLS)[begun]),
-        "miss_rate": mean((landings.outcomes == MISSED)[begun]),
-        "early_rate": mean(landings.early[begun]),
+        "miss_rate": mean((landings.outcomes == MISSED)[begun]), "early_rate": mean(landings.early[begun]),
         DIVERGED: int(landings.diverged.sum()),
-    }
+    }  # fmt: skip
     if inside is not None:
         inside = begun & inside
         metrics |= {
@@ -200,13 +189,13 @@ def landing_metrics(landings: LandingLog, inside: np.ndarray | None = None) -> M
 
 
 def trained_range(task: TaskCfg) -> dict[str, float]:
-    """Return the range of goal distances straight ahead [m] over all levels of a task's training."""
+    """Return `trained_lower_m` and `trained_upper_m`, the range of goals straight ahead over all levels of a task."""
     lower, upper = zip(*((level.goal_lower[0], level.goal_upper[0]) for level in task.levels), strict=True)
     return {"trained_lower_m": max(min(lower), 0.0), "trained_upper_m": max(upper)}
 
 
 def random_headings(count: int, seed: int) -> np.ndarray:
-    """Return random headings [rad] over the full circle, (count,)."""
+    """Return headings [rad] in -pi..pi, (count,), uniformly random."""
     return np.random.default_rng(seed).uniform(-math.pi, math.pi, count)
 
 
@@ -219,7 +208,7 @@ class LandingFlags(JumpFlags):
     goal_y: tuple[float, float] = (0.0, 0.0)
     """[m] Smallest and largest distance of the goal to the left; goals are sampled."""
     heading: Literal["any"] | float = "any"
-    """[deg] Heading of all robots, or any: drawn from the full circle."""
+    """[deg] Heading of all robots, or any: sampled from the full circle."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -272,5 +261,5 @@ class LandingPlayFlags:
         return JUMP_SECONDS + NEXT_JUMP_SECONDS * len(self.next_goals)
 
     def log(self, task: TaskCfg) -> LandingLog:
-        """Return the log of the jumps, one sequence per robot."""
+        """Return the log of the jumps: each robot jumps to its goal of `goals`, then to all `next_goals`."""
         return LandingLog(np.array([[goal, *self.next_goals] for goal in self.goals]), termination_names(task))

@@ -1,4 +1,4 @@
-"""Apex of the open-loop jump of each robot of an environment: squat, hold, full extension."""
+"""Apex height of the open-loop jump (squat, hold, full extension) of each robot of an environment."""
 
 from __future__ import annotations
 
@@ -14,28 +14,25 @@ from jumper_warp.evaluation.log import Metrics, mean, within
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
 
-RAMP, HOLD, EXTEND = 25, 50, 40
-"""Numbers of policy steps of the ramp into the squat, the held squat, and the full extension."""
+RAMP, HOLD, EXTEND = 25, 50, 40  # Policy steps of the ramp into the squat, the held squat, and the full extension
 STAND = 31  # Policy steps in the default pose before the ramp, as before the command of a sweep's jumps
 COAST = 30  # Policy steps after the extension, within which the apex has passed
 INNER_RANGE = (0.6, 1.1)  # [m] Commanded heights with metrics of their own
-PUSH_PARAMS = ("events.push.force_", "events.push.torque_")
-"""Prefixes of the names of parameters that set the ranges of pushes."""
+PUSH_PARAMS = ("events.push.force_", "events.push.torque_")  # Prefixes of parameters that set ranges of pushes
 
 
 def open_loop_action(step: int) -> float:
-    """Return the open-loop action [1] of all transversal motors at a policy step: 1 squat, -1 full extension."""
-    since = step - STAND
-    if since >= RAMP + HOLD:
-        return -1.0 if since < RAMP + HOLD + EXTEND else 0.0
-    return min(max(since, 0) / RAMP, 1.0)
+    """Return the open-loop action [1] of all transversal motors at a policy step: 0 stand, 1 squat, -1 extension."""
+    ramp_step = step - STAND
+    if ramp_step >= RAMP + HOLD:
+        return -1.0 if ramp_step < RAMP + HOLD + EXTEND else 0.0
+    return min(max(ramp_step, 0) / RAMP, 1.0)
 
 
 def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
-    """Return the apex of the open-loop jump of each robot, its largest base height [m], (num_envs,).
+    """Return the apex (largest base height) [m] of the open-loop jump of each robot, (num_envs,), NaN if it diverges.
 
-    The robots have the parameters that their first `evaluation_reset` samples, latency included, but no pushes. NaN
-    where the simulation diverges.
+    The robots have the parameters that their first `evaluation_reset` samples, latency included, but no pushes.
 
     env: of a jump task whose actions of ±1 are full extension and squat; it is left at the end of the jump.
     initial_state: `env.state_dict()` before its first `evaluation_reset`.
@@ -60,21 +57,19 @@ def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
 
 
 def limit_metrics(jumps: HeightLog, limit: np.ndarray) -> Metrics:
-    """Return the metrics of jumps relative to `limit`, the open-loop apex of the same robots [m], (num_envs,).
+    """Return the metrics of jumps relative to `limit`, the same robots' open-loop apex [m], (num_envs,).
 
-    A height is reachable if it is at most the tolerance above the open-loop apex; `success_rate_beyond_limit` counts
-    the other heights. `open_loop_mean_abs_error_m` is the error of ideal jumps that cannot exceed the limit.
+    A height is reachable if at most SUCCESS_TOLERANCE above the open-loop apex; `success_rate_beyond_limit` counts the
+    other heights. `open_loop_mean_abs_error_m` is the error of ideal jumps that cannot exceed the limit.
     """
     target, near = jumps.commanded[:, 0], jumps.reached[:, 0]
     reachable, below, inner = target <= limit + SUCCESS_TOLERANCE, target <= limit, within(target, INNER_RANGE)
     return {
-        "open_loop_limit_m": mean(limit),
-        "lowest_open_loop_limit_m": float(np.nanmin(limit)),
+        "open_loop_limit_m": mean(limit), "lowest_open_loop_limit_m": float(np.nanmin(limit)),
         "open_loop_mean_abs_error_m": mean(np.maximum(target - limit, 0.0)),
         "mean_abs_error_up_to_limit_m": mean(np.abs(jumps.error[:, 0])[below]),
-        "success_rate_reachable": mean(near[reachable]),
-        "reachable_share": mean(reachable),
+        "success_rate_reachable": mean(near[reachable]), "reachable_share": mean(reachable),
         "success_rate_beyond_limit": mean(near[~reachable]),
         "success_rate_reachable_0_6_1_1": mean(near[reachable & inner]),
         "reachable_share_0_6_1_1": mean(reachable[inner]),
-    }
+    }  # fmt: skip

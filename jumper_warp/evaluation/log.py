@@ -1,7 +1,4 @@
-"""Evaluation loop and the base class of its logs: one episode per world, commands given and outcomes recorded.
-
-`run_evaluation` is the loop. Each kind of task has a log, which sets the commands and computes the outcomes.
-"""
+"""Evaluation loop `run_evaluation`, and the base class of the logs that set commands and record outcomes."""
 
 from __future__ import annotations
 
@@ -22,31 +19,26 @@ if TYPE_CHECKING:
 
     from jumper_warp.evaluation.film import Film, Filmstrip
 
-SUCCESS = "success"
-DIVERGED = "came_apart"
-COLLIDED = "collided"
-NO_END = "no_end"
-"""Outcome of an episode that was still running when the time was over."""
+SUCCESS = "success"  # Outcomes, also names of terminations
+DIVERGED = "came_apart"  # The state of the simulation is not finite or absurdly fast
+COLLIDED = "collided"  # A link other than a paw touched something
+NO_END = "no_end"  # Outcome of an episode that was still running when the time was over
 
-Metrics = dict[str, float | int | None]
+Metrics = dict[str, float | int | None]  # Values by name, which ends with the unit; None if undefined
 
 
 class EvaluationLog(ABC):
-    """Commands one episode per world and records its outcome."""
+    """Commands one episode per world and records its outcome; `run_evaluation` calls `begin`, then `record_step`."""
 
-    row_name = "jump"
-    """Noun for a row of `columns`; names the CSV file and the recording."""
-    spacing = 1.2
-    """[m] Distance between robots that a recording shows side by side."""
-    count: int
-    """Number of worlds."""
-    arrays: dict[str, np.ndarray]
-    """Result of the last `read_env`, one row per world."""
+    row_name = "jump"  # Noun for a row of `columns`; names the CSV file and the recording
+    spacing = 1.2  # [m] Distance between robots that a recording shows side by side
+    count: int  # Number of worlds
+    arrays: dict[str, np.ndarray]  # Result of the last `read_env`, one row per world
 
     @property
     @abstractmethod
     def seconds(self) -> float:
-        """[s] Maximum simulated time; an episode that has not ended by then has failed."""
+        """[s] Maximum simulated time; an episode that has not ended by then has the outcome NO_END."""
 
     @abstractmethod
     def begin(self, env: Env) -> None:
@@ -58,18 +50,18 @@ class EvaluationLog(ABC):
 
     @abstractmethod
     def columns(self) -> dict[str, list]:
-        """Return the columns of the CSV file by heading, one value per row."""
+        """Return the columns of the CSV file by heading, lists of equal length; a row is one trial."""
 
     @abstractmethod
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the present values of the recorded time series of some worlds, by `group/quantity [unit]`."""
+        """Return the present values of the time series to record, by `group/quantity [unit]`; worlds: their indices."""
 
     def goal_markers(self, worlds: Sequence[int]) -> np.ndarray | None:
         """Return goal positions [m] to mark in a recording, world frame, (worlds, goals per world, 3), or None."""
         return None
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the metadata that a recording of some worlds saves; must be JSON."""
+        """Return the metadata, JSON values by key, that a recording of some worlds (indices) saves."""
         return {}
 
     def filmstrip(self, film: Film) -> Filmstrip | None:
@@ -77,7 +69,7 @@ class EvaluationLog(ABC):
         return None
 
     def read_env(self, env: Env) -> dict[str, np.ndarray]:
-        """Return the arrays that `update` needs, one row per world; waits for the device."""
+        """Return the arrays that `update` needs, by name, (num_envs, ...) each; by default `Env.task_arrays`."""
         return env.task_arrays()
 
     def record_step(self, env: Env) -> bool:
@@ -97,8 +89,8 @@ def run_evaluation(
 ) -> None:
     """Run one episode per world with the commands of the log, until all have ended.
 
-    act: observations (num_envs, num_obs) to actions, such as `Policy.act`; seconds: maximum simulated time (default:
-    the log's); on_step: called after every policy step; stop: False to continue to the end of the time.
+    act: observations (num_envs, num_obs) to actions (num_envs, 12), such as `Policy.act`; seconds: maximum simulated
+    time (default: the log's); on_step: called after every policy step; stop: False to continue to the end of the time.
     """
     log.begin(env)
     for _ in range(round((log.seconds if seconds is None else seconds) / env.step_dt)):
@@ -118,7 +110,7 @@ def success_index(terminations: Sequence[str]) -> int:
 
 
 def with_terminations(task: TaskCfg, names: Sequence[str]) -> TaskCfg:
-    """Return the task with only the named terminations, checked in the order of the names; others are ignored."""
+    """Return the task with only the named terminations, in the order of `names`; names that it lacks are skipped."""
     terms = {term.name: term for term in task.terminations}
     return replace(task, terminations=tuple(terms[name] for name in names if name in terms))
 
@@ -129,19 +121,19 @@ def termination_names(task: TaskCfg) -> tuple[str, ...]:
 
 
 def within(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
-    """Return which values [m] are between two limits, with half a millimetre of tolerance for rounding."""
-    return (values >= limits[0] - 5e-4) & (values <= limits[1] + 5e-4)
+    """Return which values [m] are between two limits, as bool of the same shape, with tolerance for rounding."""
+    return (values >= limits[0] - 5e-4) & (values <= limits[1] + 5e-4)  # [m]
 
 
 def mean(values: ArrayLike | Sequence[float | None]) -> float | None:
-    """Return the mean of the values that are not NaN or None, None if there are none."""
+    """Return the mean of the values that are neither NaN nor None; None if no such value exists."""
     numbers = np.asarray(values, dtype=float)
     numbers = numbers[~np.isnan(numbers)]
     return float(numbers.mean()) if len(numbers) else None
 
 
 def largest(values: np.ndarray) -> float | None:
-    """Return the largest of the values that are not NaN, None if there are none."""
+    """Return the largest of the values that are not NaN; None if no such value exists."""
     values = values[~np.isnan(values)]
     return float(values.max()) if len(values) else None
 
@@ -152,10 +144,10 @@ def mean_and_max(name: str, values: np.ndarray) -> Metrics:
 
 
 def failed_by(outcomes: np.ndarray) -> Metrics:
-    """Return the number of failed episodes by outcome, as `failed_by_<outcome>`; outcomes: of the failed ones."""
+    """Return the number of episodes of each outcome, as `failed_by_<outcome>`; outcomes: of the failed episodes."""
     return {f"failed_by_{name}": int((outcomes == name).sum()) for name in sorted(set(outcomes))}
 
 
 def finite(values: np.ndarray) -> list[float | None]:
-    """Return values as a list for JSON, None in place of NaN and infinity."""
+    """Return values (n,) as a list of floats for JSON, None in place of NaN and infinity."""
     return [float(value) if np.isfinite(value) else None for value in values]

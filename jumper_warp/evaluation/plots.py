@@ -19,7 +19,7 @@ import matplotlib.pyplot as plt
 
 @contextmanager
 def figure(path: Path, *shape: int, **settings: Any) -> Iterator[Any]:
-    """Context of the axes of a new figure, written to `path` at its end; shape, settings: as of `plt.subplots`."""
+    """Yield the axes of a new figure, and write it to `path` on exit; shape, settings: arguments of `plt.subplots`."""
     fig, axes = plt.subplots(*shape, constrained_layout=True, **settings)
     yield axes
     fig.savefig(path, dpi=110)
@@ -29,10 +29,10 @@ def figure(path: Path, *shape: int, **settings: Any) -> Iterator[Any]:
 def plot_sweep(
     axis: Any, commanded: np.ndarray, reached: np.ndarray, good: np.ndarray, tolerance: float, names: tuple[str, str]
 ) -> None:
-    """Plot reached over commanded values [m] with the band of success.
+    """Plot reached over commanded values [m] with the band of success onto a matplotlib axis.
 
-    commanded, reached [m], good (bool): (jumps, 1) each; tolerance [m]: half width of the band; names: legend of the
-    good and of the other jumps.
+    commanded, reached [m], good (bool, success): (jumps, 1) each; tolerance [m]: half width of the band; names: legend
+    of the good and of the other jumps.
     """
     line = np.array([commanded.min(), commanded.max()])
     axis.fill_between(
@@ -61,27 +61,31 @@ def plot_landings(path: Path, tests: dict[str, LandingLog], size: tuple[float, f
 
 
 class BasePaths:
-    """Records the path of every base; call it after every policy step."""
+    """Recorder of the path of every base; call the object after every policy step."""
 
     def __init__(self) -> None:
-        self.positions: list[np.ndarray] = []
+        self.positions: list[np.ndarray] = []  # [m] x, y of every base, one array (worlds, 2) per step, world frame
 
     def __call__(self, landings: JumpLog) -> None:
-        """Record the present base positions; those of rows of jumps that have ended are NaN."""
+        """Append the present base positions; NaN for worlds whose last jump has ended."""
         running = landings.current < landings.goals.shape[1]
         self.positions.append(np.where(running[:, None], landings.arrays["base_pos"][:, :2], np.nan))
 
     def in_start_frame(self, headings: np.ndarray) -> np.ndarray:
-        """Return the paths [m], (worlds, steps, 2), ahead and to the left of the start; headings [rad]: (worlds,)."""
+        """Return the paths [m], (worlds, steps, 2), ahead and to the left of the world's origin.
+
+        headings [rad]: of the robots at the start, (worlds,).
+        """
         x, y = np.moveaxis(np.stack(self.positions, axis=1), -1, 0)
         cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
 
 def plot_paths(path: Path, paths: dict[str, np.ndarray], goals: Mapping[str, Sequence], title: str) -> None:
-    """Plot paths of bases from above, one panel per test, with the goals of a test whose robots share them.
+    """Plot base paths from above, one panel per test, with the goals of tests in which all robots have the same.
 
-    paths [m]: by test, as `BasePaths.in_start_frame` returns; goals [m]: by test, each relative to the one before.
+    paths [m]: by test, of `BasePaths.in_start_frame`; goals [m]: by test, (jumps, 2), each relative to the one before;
+    title: suffix of each panel's title.
     """
     with figure(path, 1, len(paths), figsize=(5.0 * len(paths), 4.5)) as axes:
         for axis, (name, test_paths) in zip(axes, paths.items(), strict=True):

@@ -36,11 +36,11 @@ from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.threads import checked_threads
 
-HEIGHTS = ("height", "height-mars")
+HEIGHTS = ("apex_height", "apex_height_mars")
 """Keys of `EVALUATIONS` of policies that jump to a commanded height."""
-PLACES = ("place", "around", "place-mars")
+PLACES = ("landing_position", "omnidirectional", "landing_position_mars")
 """Keys of `EVALUATIONS` of policies that jump to a commanded landing position."""
-SOLVER_TITLES = {"jumper": "SolverJumper", "mujoco": "SolverMuJoCo"}
+SOLVER_TITLES = {"jumper": "SolverJumper", "mujoco": "SolverMuJoCo"}  # By value of `Conditions.solver`
 Log = TypeVar("Log", bound=EvaluationLog)
 
 
@@ -73,24 +73,24 @@ def conditions_of(args: EvaluationArgs) -> Conditions:
 class Run(ABC):
     """Base class of evaluations: runs episodes, records some worlds, reports metrics. A subclass provides the actor."""
 
-    folder: Path
+    folder: Path  # Output folder, set by `prepare`
 
     def __init__(self) -> None:
-        """Call `prepare` before anything else."""
+        """Start the clock of the report; call `prepare` before anything else."""
         self.started = time.perf_counter()
-        self.conditions, self.record = Conditions(), 0
-        self.setup_metrics: dict[str, Any] = {}
-        self._latency: list[np.ndarray] = []
+        self.conditions, self.record = Conditions(), 0  # Conditions of all episodes; number of worlds to record
+        self.setup_metrics: dict[str, Any] = {}  # Metrics of task and robot, reported with the conditions
+        self._latency: list[np.ndarray] = []  # [physics steps] (num_envs,) per `run_episodes`
         self._physics_dt = PHYSICS_DT
 
     @abstractmethod
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return the function from observations to actions, as `run_evaluation` takes it."""
+        """Return the function from observations (num_envs, num_obs) to actions, argument `act` of `run_evaluation`."""
 
     def prepare(self, name: str, conditions: Conditions, out: Path | None = None, *, record: int = 0) -> None:
         """Set the conditions, select the device and create the output folder, before anything is simulated.
 
-        name: of the folder, unless `out` is given; record: number of worlds to record.
+        name: of the folder outputs/<name>/<time>, unless `out` is given; record: number of worlds to record.
         Raises InputError: no such device or number of threads; OSError: the folder cannot be created.
         """
         configure_device(conditions.device, conditions.threads)
@@ -99,7 +99,7 @@ class Run(ABC):
 
     @property
     def title(self) -> str:
-        """Solver, robots and changed conditions in words, for tables and plots."""
+        """Solver, robots and changed conditions as text, separated by commas, for tables and plots."""
         conditions = self.conditions
         words = [SOLVER_TITLES[conditions.solver], "randomised" if conditions.randomize else "nominal"]
         if conditions.latency is not None and self._latency:
@@ -111,7 +111,7 @@ class Run(ABC):
 
     @property
     def condition_metrics(self) -> dict[str, Any]:
-        """Conditions as they are reported; latency is that of all episodes simulated so far."""
+        """Conditions by metric name, without unset ones; latency is the simulated one of all episodes so far."""
         conditions, values = self.conditions, {**self.setup_metrics}
         values |= {name: getattr(conditions, name) for name in ("solver", "randomize", "seed")}
         if conditions.randomize:
@@ -124,14 +124,9 @@ class Run(ABC):
         return values
 
     def run_episodes(
-        self,
-        env: Env,
-        log: Log,
-        *,
-        film: str = "",
-        film_scene: Mapping[str, Any] | None = None,
+        self, env: Env, log: Log, *, film: str = "", film_scene: Mapping[str, Any] | None = None,
         on_step: Callable[[Log], None] | None = None,
-    ) -> Log:
+    ) -> Log:  # fmt: skip
         """Run one episode per world with the commands of a log, and return the log.
 
         film: name of the recording and filmstrip of some worlds; empty: none. film_scene: the environment's `ground`
@@ -153,7 +148,7 @@ class Run(ABC):
         return log
 
     def _make_film(self, env: Env, log: EvaluationLog, film_scene: Mapping[str, Any]) -> Film:
-        """Return a film of `record` evenly chosen worlds."""
+        """Return a film of `record` evenly spaced worlds; film_scene: as for `run_episodes`."""
         ground = film_scene.get("ground", "plane")
         worlds = np.linspace(0, env.num_envs - 1, min(self.record, env.num_envs)).round().astype(int).tolist()
         spacing = log.spacing if isinstance(ground, str) else 0.0
@@ -161,14 +156,14 @@ class Run(ABC):
         return Film(env, log.series, worlds, spacing=spacing, ground=ground, block=block, notes=notes)
 
     def _save_film(self, film: Film, log: EvaluationLog, name: str) -> None:
-        """Write a film as a recording, and as a filmstrip unless it has blocks, which filmstrips do not show."""
+        """Write a film as `<name>.rrd`, and as a PNG filmstrip unless it has blocks, which filmstrips do not show."""
         film.save_rrd(self.folder / f"{name}.rrd", log.goal_markers(film.worlds))
         filmstrip = None if film.block is not None else log.filmstrip(film)
         if filmstrip is not None:
             film.save_filmstrip(filmstrip, self.folder / f"{filmstrip.name or name}.png")
 
     def report(self, metrics: Mapping[str, Any], paper: Mapping[str, float]) -> dict[str, Any]:
-        """Write conditions and metrics to `metrics.json`, print them beside the paper's values, and return them."""
+        """Write conditions and metrics to `metrics.json`, print them beside the paper's values, return them."""
         values = self.condition_metrics | dict(metrics)
         write_metrics(self.folder, values)
         table = Table("metric", self.title, "paper")
@@ -196,16 +191,12 @@ class EvaluationRun(Run):
 
     @classmethod
     def from_args(
-        cls,
-        name: str,
-        args: EvaluationArgs,
-        evaluations: Sequence[str] = PLACES,
-        modules: Iterable[ModuleType] = (),
+        cls, name: str, args: EvaluationArgs, evaluations: Sequence[str] = PLACES, modules: Iterable[ModuleType] = ()
     ) -> EvaluationRun:
-        """Return the prepared evaluation of an experiment.
+        """Return the prepared evaluation of the policy `args.policy` under the flags of an experiment.
 
         name: of the output folder; evaluations: accepted keys of `EVALUATIONS`, else PolicyError; modules: the user's
-        task modules. Raises as the constructor and `prepare`.
+        task modules. Also raises the errors of the constructor and `prepare`.
         """
         run = cls(args.policy, modules)
         if run.task.evaluation_suite not in evaluations:
@@ -222,16 +213,13 @@ class EvaluationRun(Run):
         return self.policy.act
 
     def env(
-        self,
-        count: int,
-        change: Callable[[TaskCfg], TaskCfg] | None = None,
-        conditions: Conditions | None = None,
+        self, count: int, change: Callable[[TaskCfg], TaskCfg] | None = None, conditions: Conditions | None = None,
         **scene: Any,
-    ) -> Env:
+    ) -> Env:  # fmt: skip
         """Return an environment of the policy's task with `count` worlds. Raises PolicyError as `env_of_policy`.
 
-        change: returns the task with other terminations (default: `Evaluation.prepare_task`); conditions: in place of
-        the run's; scene: more arguments of `Env`.
+        change: function that returns the task with other terminations (default: `Evaluation.prepare_task`); conditions:
+        replace the run's; scene: further arguments of `Env`, such as `ground` or `block`.
         """
         change, conditions = change or self.evaluation.prepare_task, conditions or self.conditions
         env = env_of_policy(self.policy, count, conditions, change=change, modules=self.modules, **scene)
@@ -242,33 +230,37 @@ class EvaluationRun(Run):
 
 
 class SkillRun(Run):
-    """Evaluation of several policies on one robot."""
+    """Evaluation of three policies (walk, jump up, jump to) on one robot."""
 
     def __init__(self, names: SkillNames | None = None) -> None:
-        """Open policies; call `prepare` before anything else. Raises PolicyError or CheckpointError."""
+        """Open the policies; call `prepare` before anything else. Raises PolicyError or CheckpointError."""
         super().__init__()
         self.skills = SkillPolicies(names)
 
     @classmethod
     def from_args(cls, name: str, args: EvaluationArgs, names: SkillNames) -> SkillRun:
-        """Return the prepared evaluation of an experiment. Raises PolicyError, CheckpointError or InputError."""
+        """Return the prepared evaluation of the named policies under the flags of an experiment; name: of the folder.
+
+        Raises PolicyError, CheckpointError or InputError.
+        """
         run = cls(names)
         run.prepare(name, conditions_of(args), args.out, record=args.num_recorded)
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return the function that gives the actions of all skills, (skills, num_envs, 12)."""
+        """Return a function of any argument that returns the actions of all skills, (skills, num_envs, 12)."""
         return lambda obs: self.skills.act(env)
 
     def env(self, count: int, **scene: Any) -> Env:
-        """Return the environment of the robot with all skills; scene: more arguments of `Env`."""
+        """Return an environment with all skills and `count` worlds; scene: further arguments of `Env`, as `block`."""
         return self.skills.env(count, self.conditions, **scene)
 
 
 def latency_metrics(steps: np.ndarray, physics_dt: float, requested: float | None = None) -> dict[str, Any]:
-    """Return the simulated latency from action to motor: mean `latency_ms`, and `latency` in words.
+    """Return the simulated latency from action to motor: mean `latency_ms`, `latency` as text, `latency_asked_ms`.
 
-    steps: [physics steps] of all worlds, (num_envs,); physics_dt [s]; requested [ms]: value of the flag, if any.
+    steps: latency of all worlds [physics steps], (num_envs,); physics_dt: physics step [s]; requested [ms]: value of
+    the flag `--latency`, None: without `latency_asked_ms`.
     """
     metrics: dict[str, Any] = {} if requested is None else {"latency_asked_ms": requested}
     mean = 1000.0 * physics_dt * float(np.mean(steps))
@@ -276,7 +268,7 @@ def latency_metrics(steps: np.ndarray, physics_dt: float, requested: float | Non
 
 
 def latency_text(steps: np.ndarray, physics_dt: float) -> str:
-    """Return latencies in milliseconds and physics steps as text: one value, or range and mean."""
+    """Return latencies (num_envs,) [steps of physics_dt s] as text in ms and steps: one value, or range and mean."""
     least, most = int(np.min(steps)), int(np.max(steps))
     low, high, mean = (f"{1000.0 * physics_dt * float(value):.3g}" for value in (least, most, np.mean(steps)))
     if least == most:
@@ -291,7 +283,7 @@ def torque_limit(env: Env) -> float:
 
 
 def format_value(value: Any) -> str:
-    """Return a metric as text; floats, also those in lists, have four significant digits."""
+    """Return a metric as text; floats, also in lists, have four significant digits."""
     if isinstance(value, list):
         return ", ".join(format_value(item) for item in value)
     return f"{value:.4g}" if isinstance(value, float) else str(value)

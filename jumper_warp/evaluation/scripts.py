@@ -1,4 +1,4 @@
-"""Scripts: sequences of commands to one robot, and their files.
+"""Scripts: sequences of commands to one robot, read from JSON files.
 
 A script is a JSON list of commands: `{"walk": [vx, vy, yaw_rate], "seconds": s}` ([m/s], [rad/s], [s]),
 `{"stand": seconds}`, `{"jump_up": height}` (of the base at the apex [m]), `{"jump_to": [ahead, left]}` ([m]), and
@@ -18,7 +18,7 @@ from jumper_warp.utils.errors import InputError
 
 KINDS = {"walk": 3, "stand": 1, "jump_up": 1, "jump_to": 2, "jump_onto": 2}  # Number of values of each kind of command
 LIMITS = {"walk": 10.0, "stand": 600.0, "jump_up": 2.0, "jump_to": 5.0, "jump_onto": 5.0}
-"""Largest absolute value of each kind of command."""
+"""Largest absolute value of each kind of command, in its unit: [m/s] and [rad/s], [s], [m], [m], [m]."""
 MAX_SECONDS = 600.0  # [s] Maximum total time of walking and standing in one script
 MAX_COMMANDS = 1000
 MAX_BYTES = 2**20
@@ -30,8 +30,7 @@ class ScriptStep:
 
     kind: str  # One of `KINDS`
     values: tuple[float, ...] = (0.0, 0.0, 0.0)
-    """walk: velocity ahead, to the left [m/s], about z [rad/s]; jump_up: height [m]; jump_to, jump_onto: place
-    ahead, left [m]."""
+    """walk: velocity ahead, to the left [m/s], about z [rad/s]; jump_up: height [m]; jump_to, jump_onto: x, y [m]."""
     seconds: float = 0.0  # [s] Time of walking or standing; 0 for jumps
 
     @property
@@ -41,7 +40,7 @@ class ScriptStep:
 
     @property
     def goal(self) -> tuple[float, float, float]:
-        """Command to the environment: velocity, or landing position x, y and apex height z of a jump."""
+        """Velocity [m/s], [m/s], [rad/s], or for a jump its landing position x, y and apex height z [m]; unused: 0."""
         if self.kind == "jump_up":
             return (0.0, 0.0, self.values[0])
         x, y, z = (*self.values, 0.0, 0.0, 0.0)[:3]
@@ -49,7 +48,7 @@ class ScriptStep:
 
 
 def read_script(path: Path) -> tuple[ScriptStep, ...]:
-    """Return the commands of a script file. Raises InputError: it cannot be read, or a command is malformed."""
+    """Return the commands of a script file. Raises InputError, with the path: unreadable, or a malformed command."""
     try:
         too_large = path.stat().st_size > MAX_BYTES
         content = None if too_large else json.loads(path.read_bytes())
@@ -66,7 +65,7 @@ def read_script(path: Path) -> tuple[ScriptStep, ...]:
 
 
 def parse_script(content: Any) -> tuple[ScriptStep, ...]:
-    """Return the commands of a parsed JSON script. Raises InputError: a command is malformed."""
+    """Return the commands of a parsed JSON script. Raises InputError: a malformed command, or too many or too long."""
     if not isinstance(content, list) or not 1 <= len(content) <= MAX_COMMANDS:
         raise InputError(f"a script is a list of 1 to {MAX_COMMANDS} commands, such as {{'walk': [0.5, 0, 0.3]}}")
     steps = tuple(_step(i, item) for i, item in enumerate(content))
@@ -77,7 +76,7 @@ def parse_script(content: Any) -> tuple[ScriptStep, ...]:
 
 
 def _step(index: int, item: Any) -> ScriptStep:
-    """Return the index-th command from its JSON object. Raises InputError: it is malformed."""
+    """Return the command at an index (from 0) from its JSON object `item`. Raises InputError: it is malformed."""
     where = f"command {index + 1}"
     kinds = [key for key in item if key in KINDS] if isinstance(item, dict) else []
     if len(kinds) != 1:
@@ -98,7 +97,7 @@ def _step(index: int, item: Any) -> ScriptStep:
 
 
 def _seconds(where: str, value: Any) -> float:
-    """Return a positive time [s]. Raises InputError; where: beginning of its message."""
+    """Return `value` as a positive time [s] up to MAX_SECONDS. Raises InputError; where: prefix of its message."""
     (seconds,) = _numbers(f"{where}: seconds", [value], 1, MAX_SECONDS)
     if not seconds > 0.0:
         raise InputError(f"{where}: seconds must be positive, got {seconds:g}")
@@ -106,7 +105,7 @@ def _seconds(where: str, value: Any) -> float:
 
 
 def _numbers(where: str, values: Sequence[Any], count: int, most: float) -> tuple[float, ...]:
-    """Return `count` finite numbers of size up to `most`. Raises InputError; where: beginning of its message."""
+    """Return `values` as `count` finite floats within ±most. Raises InputError; where: prefix of its message."""
     good = len(values) == count and all(
         isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and abs(v) <= most for v in values
     )

@@ -21,10 +21,8 @@ from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite, check
 from jumper_warp.robot.grounds import BlockCfg, platform, uneven
 
-AHEAD, ASIDE = (0.35, 1.4), (-0.35, 0.35)
-"""[m] Ranges of the grid's goals ahead and to the left."""
-SECTORS = ("ahead", "left", "back", "right")
-"""Quarters of a ring, each centred on its direction."""
+AHEAD, ASIDE = (0.35, 1.4), (-0.35, 0.35)  # [m] Ranges of the grid's goals ahead and to the left
+SECTORS = ("ahead", "left", "back", "right")  # Quarters of a ring, each centred on its direction
 PAIRS = {"diagonal": ((0.8, 0.2), (0.75, -0.2)), "straight": ((0.8, 0.0), (0.8, 0.0))}
 """[m] Goals of the paper's two jumps in a row, each relative to the one before."""
 ROW_LOWER, ROW_UPPER, DELAYS = (0.4, -0.2), (0.9, 0.2), (0.3, 1.0)
@@ -33,7 +31,7 @@ ROW_METRICS = (
     "success_rate", "fall_rate", "miss_rate", "step_rate", "still_landing_rate", "second_takeoff_rate",
     "max_landing_tilt_deg", AT_REST_AT_END,
 )  # fmt: skip
-"""Metrics that are also reported for the long rows, with the suffix `_ten`."""
+"""Metrics that are also reported for the long rows of jumps, with the suffix `_ten`."""
 GROUND_LOWER, GROUND_UPPER = (0.8, -0.15), (1.4, 0.15)
 """[m] Range of goals off the platform or on the block; the paper's simulation always succeeds in it."""
 DROP, AMPLITUDE, FLAT_RADIUS = 0.15, 0.05, 0.35
@@ -41,25 +39,20 @@ DROP, AMPLITUDE, FLAT_RADIUS = 0.15, 0.05, 0.35
 BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION, BLOCK_BEYOND, BLOCK_WIDTH = 0.05, 10.0, 0.4, 0.40, 0.8
 """[m], [kg], [1] Height, mass, friction with the floor; [m] distance from goal to far side; [m] width along y."""
 BIN, IN_RANGE, LIMIT = 0.1, (1.0, 1.4), 9.0
-"""[m] Width of a bin of distances; distances of `success_rate_in_range`; largest distance."""
-GIVEN_UP, RELIABLE = 0.5, 0.95
-"""[1] Success rate below which no farther bin is tried; success rate of a reliable distance."""
-KINDS = {"": "success_rate", "_without_hop": "single_jump_success_rate", "_without_step": "step_free_success_rate"}
-"""Success rate of each reliable distance, by the suffix of its name."""
+"""[m] Width of a bin of distances; range of distances of `success_rate_in_range`; largest `max_distance`."""
+GIVEN_UP, RELIABLE = 0.5, 0.95  # [1] Success rate below which no farther bin is tried; that of a reliable distance
+RATES = {"": "success_rate", "_without_hop": "single_jump_success_rate", "_without_step": "step_free_success_rate"}
+"""Success rate that defines each reliable distance, by the suffix of the distance's metric."""
 BIN_METRICS = (
-    *KINDS.values(), "mean_error_m", "mean_error_of_successes_m", "mean_error_at_touchdown_m",
+    *RATES.values(), "mean_error_m", "mean_error_of_successes_m", "mean_error_at_touchdown_m",
     "mean_error_0_3_s_after_touchdown_m", "fall_rate", "miss_rate", "still_landing_rate", "max_landing_tilt_deg",
 )  # fmt: skip
-"""Metrics that are reported for each bin."""
+"""Metrics of each bin of distances, reported as lists `bin_<name>`."""
 PUBLISHED = {
-    "Barkour (Caluwaerts et al. 2023)": 0.5,
-    "Margolis et al. 2021": 0.66,
-    "Liu et al. 2023": 0.8,
-    "Cheng et al. 2024": 0.8,
-    "Atanassov et al. 2024": 0.9,
-    "Jumper, the paper's robot": 1.25,
-}
-"""[m] The paper's table of jump distances."""
+    "Barkour (Caluwaerts et al. 2023)": 0.5, "Margolis et al. 2021": 0.66, "Liu et al. 2023": 0.8,
+    "Cheng et al. 2024": 0.8, "Atanassov et al. 2024": 0.9, "Jumper, the paper's robot": 1.25,
+}  # fmt: skip
+"""[m] Jump distances of robots, from the paper's table."""
 
 
 @dataclass(frozen=True)
@@ -112,7 +105,7 @@ class Ring(Suite):
         check(0.0 < self.radius < 3.0, f"radius must be in (0, 3) m, got {self.radius}")
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
-        """Run the jumps, plot the landing positions, and return the metrics, also for each quarter of the ring."""
+        """Run the jumps, plot landing positions, return the metrics, with three rates per quarter of the ring."""
         angle = np.linspace(0.0, 2.0 * np.pi, self.num_jumps, endpoint=False)
         goals = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
         landings = self.run_landings(run, goals, film="jumps")
@@ -129,13 +122,13 @@ class Ring(Suite):
 
 @dataclass(frozen=True)
 class Consecutive(Suite):
-    """Jumps in a row: the paper's pairs, and ten to drawn goals; the next is commanded a second after touchdown.
+    """Jumps in a row: the paper's pairs, and ten to random goals; the next is commanded a second after touchdown.
 
-    A goal is relative to the robot's place and heading when the jump is commanded. Robots differ in heading and in the
-    delay of the first command. The error of a jump is the distance of the base from its goal when the next one is
-    commanded; after a fall or a collision no further jump counts. `ten_in_a_row_rate` is the share of rows in which no
-    jump ended so, `row_all_on_goal_rate` that of rows in which every jump succeeded. The range of
-    `success_rate_in_range` is all goals.
+    A goal is relative to the robot's position and heading when the jump is commanded. Robots differ in heading and in
+    the delay of the first command. The error of a jump is the distance of the base from its goal when the next one is
+    commanded; after a fall or a collision no further jump counts. `ten_in_a_row_rate` is the fraction of rows without a
+    fall or collision, `row_all_on_goal_rate` the fraction in which every jump succeeded. `success_rate_in_range`
+    includes all goals.
     """
 
     num_jumps: int = 20
@@ -150,8 +143,8 @@ class Consecutive(Suite):
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        given = (self.num_trials, self.jumps_per_trial)
-        check(min(given) >= 1, f"need at least one trial and one jump in it, got {given[0]}, {given[1]}")
+        trials, jumps = self.num_trials, self.jumps_per_trial
+        check(min(trials, jumps) >= 1, f"need at least one trial and one jump in it, got {trials}, {jumps}")
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Run pairs and long rows, plot the paths of the bases, and return the metrics."""
@@ -169,11 +162,11 @@ class Consecutive(Suite):
 
 
 def consecutive_metrics(pairs: LandingLog, row: LandingLog) -> dict[str, Any]:
-    """Return the metrics of pairs and long rows of jumps; the first half of the pairs are the diagonal ones."""
+    """Return `landing_metrics` of pairs, and metrics of long rows; pairs: first half diagonal, second half straight."""
     values, ten = (landing_metrics(landings) for landings in (pairs, row))
-    for part in (values, ten):
-        if "at_rest_within_1_s_rate" in part:
-            part[AT_REST_AT_END] = part.pop("at_rest_within_1_s_rate")
+    for metrics in (values, ten):
+        if "at_rest_within_1_s_rate" in metrics:
+            metrics[AT_REST_AT_END] = metrics.pop("at_rest_within_1_s_rate")
     halves = zip(PAIRS, np.split(pairs.error, 2), strict=True)
     return values | {
         "success_rate_in_range": values["success_rate"],
@@ -196,7 +189,7 @@ class Platform(Suite):
     """Jumps off a platform of 0.15 m, onto uneven ground, and onto a sliding block.
 
     Most policies observe nothing of the ground but the base's height above the spot below it. Uneven ground has bumps
-    of up to 0.05 m around a level start, and every robot jumps in a direction of its own. The block, 10 kg and 0.05 m
+    of up to 0.05 m around a level start, and every robot jumps in a random direction. The block, 10 kg and 0.05 m
     high, reaches from before the goal to beyond it and slides when the robot lands on it; the goal stays. The range of
     `success_rate_in_range` is all goals. SolverMuJoCo has no sliding block: with it that scene is left out.
     """
@@ -213,7 +206,7 @@ class Platform(Suite):
         check(low <= self.edge < high, f"edge must be from {low} m to below {high} m, got {self.edge}")
 
     def scenes(self, goals: np.ndarray, rng: np.random.Generator) -> Iterator[tuple[str, dict[str, Any], np.ndarray]]:
-        """Yield name, arguments of `Env`, and headings [rad] of each scene; goals [m]: (num_envs, 2)."""
+        """Yield name, keywords of `Env`, and headings [rad], (num_envs,), of each scene; goals [m]: (num_envs, 2)."""
         straight = np.zeros(len(goals))
         yield "platform", {"ground": platform(-DROP, edge=self.edge)}, straight
         bumps = uneven(AMPLITUDE, int(rng.integers(2**31)), flat_radius=FLAT_RADIUS)
@@ -225,7 +218,7 @@ class Platform(Suite):
             yield "block", {"block": BlockCfg(center, half, BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION)}, straight
 
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
-        """Run the jumps of all scenes, plot them, and return the metrics of each scene by prefix, and their means."""
+        """Run the jumps of all scenes, plot them, return `<scene>_<metric>` and the means of metrics over scenes."""
         rng = np.random.default_rng(self.seed)
         goals, values = rng.uniform(GROUND_LOWER, GROUND_UPPER, (self.num_jumps, 2)), {}
         done: dict[str, LandingLog] = {}
@@ -248,7 +241,7 @@ class Platform(Suite):
 
 @dataclass(frozen=True)
 class Farthest(Suite):
-    """Jumps whose distance grows from 1 m by bins of 0.1 m, until fewer than half of a bin succeed.
+    """Jumps to bins of goals 0.1 m wide, from 1 m on, until fewer than half of the jumps of a bin succeed.
 
     Goals of a bin lie in one direction, within 0.05 m of its middle. A far goal may be reached by steps or a second hop
     after the landing, so three distances are reported, each the largest middle of a bin up to which at least 95 % of
@@ -276,7 +269,7 @@ class Farthest(Suite):
         check(-180.0 <= self.direction <= 180.0, f"direction must be in -180..180 deg, got {self.direction}")
 
     def goals(self, middle: float) -> np.ndarray:
-        """Return the goals [m] of the bin around a distance [m], (jumps, 1, 2)."""
+        """Return the goals [m], (num_jumps, 1, 2), ahead and left, of the bin around the distance `middle` [m]."""
         distance = middle + BIN * (np.linspace(0.0, 1.0, self.num_jumps) - 0.5 if self.num_jumps > 1 else np.zeros(1))
         angle = math.radians(self.direction)
         return distance[:, None, None] * np.array([math.cos(angle), math.sin(angle)])
@@ -297,11 +290,11 @@ class Farthest(Suite):
 
 
 def plot_distances(run: EvaluationRun, values: dict[str, Any]) -> None:
-    """Plot success rates and mean error over distance; values: of `distance_metrics`."""
+    """Plot success rates and mean error over distance into `max_jump.png`; values: of `distance_metrics`."""
     with figure(run.folder / "max_jump.png", 2, 1, figsize=(7, 6), sharex=True) as (top, bottom):
-        for kind, rate in KINDS.items():
-            label = f"success{kind.replace('_', ' ')}"
-            top.plot(values["bin_m"], [100.0 * share for share in values[f"bin_{rate}"]], marker="o", label=label)
+        for suffix, rate in RATES.items():
+            label = f"success{suffix.replace('_', ' ')}"
+            top.plot(values["bin_m"], [100.0 * success for success in values[f"bin_{rate}"]], marker="o", label=label)
         top.axhline(100.0 * RELIABLE, color="0.5", linestyle="--", linewidth=1.0)
         for work, distance in PUBLISHED.items():
             if distance >= values["bin_m"][0]:
@@ -314,9 +307,12 @@ def plot_distances(run: EvaluationRun, values: dict[str, Any]) -> None:
 
 
 def distance_metrics(bins: dict[float, LandingLog]) -> dict[str, Any]:
-    """Return metrics over all bins (log by middle [m]), reliable distances, and `bin_` lists with one entry per bin."""
-    each = [landing_metrics(landings) for landings in bins.values()]
-    lists: dict[str, list[Any]] = {name: [values[name] for values in each] for name in BIN_METRICS}
+    """Return means over all bins, reliable distances [m], and `bin_<metric>` lists with one entry per bin.
+
+    bins: log by distance at the bin's middle [m], ascending.
+    """
+    by_bin = [landing_metrics(landings) for landings in bins.values()]
+    lists: dict[str, list[Any]] = {name: [values[name] for values in by_bin] for name in BIN_METRICS}
     flown = [mean(np.linalg.norm(log.touchdown[log.success], axis=-1)) for log in bins.values()]
     landed = [landings.landing[landings.success][:, 0] for landings in bins.values()]
     inside = [landings.success[within(landings.goal_positions[..., 0], IN_RANGE)] for landings in bins.values()]
@@ -324,13 +320,13 @@ def distance_metrics(bins: dict[float, LandingLog]) -> dict[str, Any]:
         "jumps": sum(int(landings.begun.sum()) for landings in bins.values()),
         "mean_error_m": mean(lists["mean_error_m"]),
         "success_rate_in_range": mean(np.concatenate(inside)),
-        **{rate: mean(lists[rate]) for rate in (*KINDS.values(), "fall_rate", "miss_rate", "still_landing_rate")},
+        **{rate: mean(lists[rate]) for rate in (*RATES.values(), "fall_rate", "miss_rate", "still_landing_rate")},
         "max_landing_tilt_deg": max((tilt for tilt in lists["max_landing_tilt_deg"] if tilt is not None), default=None),
     }
-    for kind, rate in KINDS.items():
-        bad = next((i for i, share in enumerate(lists[rate]) if share < RELIABLE), len(bins))
-        values[f"largest_reliable{kind}_m"] = list(bins)[bad - 1] if bad else None
-        values[f"base_at_touchdown{kind}_m"] = flown[bad - 1] if bad else None
+    for suffix, rate in RATES.items():
+        first_bad = next((i for i, success in enumerate(lists[rate]) if success < RELIABLE), len(bins))
+        values[f"largest_reliable{suffix}_m"] = list(bins)[first_bad - 1] if first_bad else None
+        values[f"base_at_touchdown{suffix}_m"] = flown[first_bad - 1] if first_bad else None
     values["hop_free_distance_m"] = values["largest_reliable_without_hop_m"]
     values["farthest_success_m"] = largest(np.concatenate(landed))
     values |= {"bin_m": list(bins), "bin_base_at_touchdown_m": flown}
@@ -341,5 +337,5 @@ SUITES: tuple[type[Suite], ...] = (HeightSweep, DistanceSweep, Grid, Ring, Conse
 
 
 def suites_for(evaluation: str) -> dict[str, type[Suite]]:
-    """Return the suites, by name, that accept policies with a key of `EVALUATIONS`."""
+    """Return the suites, by name, that accept policies whose `evaluation_suite` is `evaluation`."""
     return {suite.name: suite for suite in SUITES if evaluation in suite.evaluations}

@@ -28,28 +28,26 @@ from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, Evaluati
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.utils.errors import InputError
 
-HEIGHTS_IN_RANGE, DISTANCES_IN_RANGE = (0.5, 1.1), (0.3, 1.4)
-"""[m] Ranges in which all jumps of the paper succeed."""
-PAPER_TRAINED = (0.4, 1.0)
-"""[m] Range of goal distances in the paper's training."""
+HEIGHTS_IN_RANGE, DISTANCES_IN_RANGE = (0.5, 1.1), (0.3, 1.4)  # [m] Ranges in which all jumps of the paper succeed
+PAPER_TRAINED = (0.4, 1.0)  # [m] Range of goal distances in the paper's training, also of `success_rate_0_4_1_0`
 
 
-def check(good: bool, message: str) -> None:
-    """Raise InputError with the message unless the condition `good` holds."""
-    if not good:
+def check(condition: bool, message: str) -> None:
+    """Raise InputError with the message unless the condition holds."""
+    if not condition:
         raise InputError(message)
 
 
 @dataclass(frozen=True)
 class Suite(EvaluationArgs, ABC):
-    """A test of jumping policies: its flags, and what it measures."""
+    """A test of jumping policies: its flags (also those of `EvaluationArgs`), runs and metrics."""
 
     num_jumps: int = 200
     """Number of jumps (where there are several scenes, bins or goals on a grid, of each)."""
     rest_time: float = REST_TIME
-    """[s] From touchdown until a jump is over."""
+    """[s] Time from touchdown until a jump is over."""
 
-    name: ClassVar[str]
+    name: ClassVar[str]  # Value of `jumper evaluate --suite`, and name of the output folder
     evaluations: ClassVar[tuple[str, ...]] = PLACES
     """Keys of `EVALUATIONS` of the policies that the suite accepts."""
     paper: ClassVar[dict[str, float]] = {}
@@ -65,7 +63,7 @@ class Suite(EvaluationArgs, ABC):
 
     @abstractmethod
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
-        """Run the jumps, write their plots into the run's folder, and return the metrics."""
+        """Run the jumps, write plots into `run.folder`, and return the metrics by name."""
 
     def run(self, modules: Iterable[ModuleType] = ()) -> dict[str, Any]:
         """Evaluate the policy, report and return the metrics; modules: the user's task modules.
@@ -76,28 +74,24 @@ class Suite(EvaluationArgs, ABC):
         return run.report(self.measure(run), self.paper)
 
     def run_landings(
-        self,
-        run: EvaluationRun,
-        places: np.ndarray,
-        env: Env | None = None,
-        *,
-        headings: np.ndarray | None = None,
-        delay: np.ndarray | float = DELAY,
-        **options: Any,
-    ) -> LandingLog:
-        """Run jumps to goals [m], (num_envs, jumps in a row, 2), and return their log.
+        self, run: EvaluationRun, goals: np.ndarray, env: Env | None = None, *, headings: np.ndarray | None = None,
+        delay: np.ndarray | float = DELAY, **options: Any,
+    ) -> LandingLog:  # fmt: skip
+        """Run jumps to goals [m], (num_envs, jumps in a row, 2), ahead and to the left, and return their log.
 
-        env, headings: new and sampled by default; delay: as in `LandingLog`; options: of `EvaluationRun.run_episodes`.
+        env: default: `run.env`; headings [rad]: (num_envs,), default: random; delay [s]: as in `LandingLog`; options:
+        keywords of `EvaluationRun.run_episodes`.
         """
-        env = run.env(len(places)) if env is None else env
-        headings = random_headings(len(places), self.seed) if headings is None else headings
-        log = LandingLog(places, termination_names(env.task), headings, delay, self.rest_time)
+        env = run.env(len(goals)) if env is None else env
+        headings = random_headings(len(goals), self.seed) if headings is None else headings
+        log = LandingLog(goals, termination_names(env.task), headings, delay, self.rest_time)
         return run.run_episodes(env, log, **options)
 
     def pushed_in_flight(self, run: EvaluationRun, measure: Callable[[Conditions], Metrics], *names: str) -> Metrics:
-        """Return the named metrics of the same randomised test with pushes in flight; empty if not applicable.
+        """Return the named metrics of the same test with pushes in flight, as `pushed_in_flight_<name>`.
 
-        measure: runs the test under given conditions and returns its metrics.
+        Empty for nominal robots, and if the test itself pushes in flight. measure: runs the test under conditions and
+        returns its metrics.
         """
         if not self.randomize or self.push_in_flight:
             return {}
@@ -132,7 +126,7 @@ class HeightSweep(Suite):
         check(0.0 < low <= high < 10.0, f"height_range must be in (0, 10) m, got {self.height_range}")
 
     def run_jumps(self, run: EvaluationRun, env: Env, film: str = "") -> HeightLog:
-        """Run one jump per height and return the log; film: name of the recording."""
+        """Run one jump per height and return the log; film: name of the recording, empty for none."""
         heights = np.linspace(*self.height_range, self.num_jumps)
         return run.run_episodes(env, HeightLog(heights, termination_names(env.task), self.rest_time), film=film)
 
@@ -149,20 +143,20 @@ class HeightSweep(Suite):
             axis.set(xlabel="commanded base height [m]", ylabel="highest base height [m]")
             axis.set_title(f"{self.num_jumps} jumps, {run.title}", wrap=True)
 
-        def pushed(conditions: Conditions) -> Metrics:
+        def measure_under(conditions: Conditions) -> Metrics:
             pushed_env = run.env(self.num_jumps, with_sweep_terminations, conditions)
             return sweep_metrics(self.run_jumps(run, pushed_env), HEIGHTS_IN_RANGE)
 
         names = ("mean_abs_error_m", "success_rate", "success_rate_in_range", "fall_rate", "miss_rate", "landing_rate")
         values = sweep_metrics(jumps, HEIGHTS_IN_RANGE) | limit_metrics(jumps, limit)
-        return {"rest_s": self.rest_time} | values | self.pushed_in_flight(run, pushed, *names)
+        return {"rest_s": self.rest_time} | values | self.pushed_in_flight(run, measure_under, *names)
 
 
 @dataclass(frozen=True)
 class DistanceSweep(Suite):
     """Jumps 0.3 to 1.5 m straight ahead, spread evenly, each once.
 
-    Every robot stands in the default pose, with a heading of its own drawn from the full circle, and is commanded to
+    Every robot stands in the default pose, with a heading sampled from the full circle, and is commanded to
     jump after half a second. The error is the distance of the base from its goal in the plane a second after touchdown,
     or where the jump failed before. A jump succeeds if it was begun on command, ends within 0.1 m of its goal, and
     nothing but the paws touched anything. Steps, second hops and second takeoffs (upward at 0.25 m/s with no paw down)
@@ -173,7 +167,7 @@ class DistanceSweep(Suite):
     distance_range: tuple[float, float] = (0.3, 1.5)
     """[m] Distance of the nearest and of the farthest goal."""
     max_lateral_offset: float = 0.0
-    """[m] Largest offset of a goal to either side; offsets are drawn."""
+    """[m] Largest offset of a goal to either side; offsets are sampled."""
     end_at_second_takeoff: bool = False
     """A second takeoff after landing ends a jump, as a failure, as in the authors' configuration."""
     num_recorded: int = 5
@@ -185,11 +179,11 @@ class DistanceSweep(Suite):
     def __post_init__(self) -> None:
         super().__post_init__()
         (near, far), side = self.distance_range, self.max_lateral_offset
-        good = 0.0 < near < far < 10.0 and 0.0 <= side < 10.0
-        check(good, f"goals must be within 10 m and rise, got {self.distance_range}, {side} to either side")
+        valid = 0.0 < near < far < 10.0 and 0.0 <= side < 10.0
+        check(valid, f"goals must be within 10 m and rise, got {self.distance_range}, {side} to either side")
 
     def run_jumps(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> LandingLog:
-        """Run one jump per distance under some conditions and return the log; film: name of the recording."""
+        """Run one jump per distance under some conditions, return the log; film: name of the recording, or empty."""
         side, rng = self.max_lateral_offset, np.random.default_rng(self.seed + 1)
         x, y = np.linspace(*self.distance_range, self.num_jumps), rng.uniform(-side, side, self.num_jumps)
         goals = np.stack([x, y], axis=1)[:, None]
@@ -198,7 +192,7 @@ class DistanceSweep(Suite):
 
     @staticmethod
     def metrics(landings: LandingLog) -> Metrics:
-        """Return the metrics of a log of the sweep."""
+        """Return `landing_metrics` of the sweep, `in_range` over DISTANCES_IN_RANGE, and `success_rate_0_4_1_0`."""
         distance = landings.goal_positions[..., 0]
         values = landing_metrics(landings, within(distance, DISTANCES_IN_RANGE))
         return values | {"success_rate_0_4_1_0": mean(landings.success[within(distance, PAPER_TRAINED)])}

@@ -16,48 +16,40 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.rotations import CONJUGATE, rotate
 
-Velocity = tuple[float, float, float]
+Velocity = tuple[float, float, float]  # Ahead, to the left [m/s], about z [rad/s]
 AXES = ("vx", "vy", "yaw_rate")
-SETTLING_TIME = 1.0
-"""[s] Time after each command that is excluded from tracking errors."""
-SHOWN_TIME = 0.6
-"""[s] Length of the filmstrip at the end of a walk, more than a stride."""
-PICTURES = 9
-"""Number of pictures in a filmstrip."""
-MAX_ROBOTS = 20_000
+SETTLING_TIME = 1.0  # [s] Time after each command that is excluded from tracking errors
+SHOWN_TIME = 0.6  # [s] Length of the filmstrip at the end of a walk, more than a stride
+PICTURES = 9  # Number of pictures in a filmstrip
+MAX_ROBOTS = 20_000  # Maximum number of robots in a test
 
 
 @dataclass
 class VelocityLog(EvaluationLog):
     """Velocity-tracking log, one robot per world; samples after a robot's fall are ignored."""
 
-    commands: np.ndarray
-    """(robots, commands, 3) Successive commands: velocity ahead, to the left [m/s], about z [rad/s], body axes."""
+    commands: np.ndarray  # (robots, commands, 3) Commands in order: ahead, left [m/s], about z [rad/s], body axes
     task: TaskCfg
     seconds: float = 10.0  # [s] Simulated time
-    times: np.ndarray = field(default_factory=lambda: np.zeros(1))
-    """[s] (commands,) Time of each command; the first is 0."""
+    times: np.ndarray = field(default_factory=lambda: np.zeros(1))  # [s] (commands,) Time of each command, first 0
     headings: np.ndarray | float = 0.0  # [rad] (robots,) Headings at the start, or one for all
     kick_time: np.ndarray | None = None  # [s] (robots,) Time of a step change of each base's velocity, or None
     kick: np.ndarray | None = None  # [m/s] (robots, 2) Step change of the velocity at `kick_time`, world axes, or None
     velocity: list[np.ndarray] = field(default_factory=list, init=False)
-    """(robots, 3) Velocity after every policy step, in the components of `commands`."""
-    end: np.ndarray = field(init=False)
-    """(robots,) Index of the termination of a fall, -1 for robots that have not fallen."""
-    fall_step: np.ndarray = field(init=False)
-    """(robots,) Policy step of the fall; the number of steps for robots that have not fallen."""
+    """Velocity in the components of `commands`, one array (robots, 3) per policy step."""
+    end: np.ndarray = field(init=False)  # (robots,) Index of the termination of a fall, -1 if not fallen
+    fall_step: np.ndarray = field(init=False)  # (robots,) Policy step of the fall, else the number of steps
 
     row_name = "robot"
     spacing = 2.0
 
     def __post_init__(self) -> None:
-        """Begin with no robot fallen."""
         self.count = len(self.commands)
         self.end, self.fall_step = np.full(self.count, -1), np.zeros(self.count, dtype=int)
         self.times = np.asarray(self.times, dtype=float)
-        self.step_dt = 0.0
+        self.step_dt = 0.0  # [s] Policy step; `begin` sets it
         falls = [not term.options["time_out"] for term in self.task.terminations]
-        self._is_fall = np.array([*falls, False])
+        self._is_fall = np.array([*falls, False])  # by index of the termination; the last entry is index -1
 
     def begin(self, env: Env) -> None:
         """Reset every robot to the default pose, with its first command and the gait phase of the task's reset."""
@@ -66,7 +58,7 @@ class VelocityLog(EvaluationLog):
         env.evaluation_reset(np.concatenate([self.commands[:, 0], gait], axis=1), self.headings)
 
     def read_env(self, env: Env) -> dict[str, np.ndarray]:
-        """Return orientation, velocities and terminations of all robots; set the commands and kicks that are due."""
+        """Return base_quat (xyzw), base_vel, base_ang_vel (world) and termination; set due commands and kicks."""
         sim = env.sim
         q, qd = sim.joint_q(), sim.joint_qd()
         arrays = {"base_quat": q[:, 3:7].copy(), "base_vel": sim.base_velocity(), "base_ang_vel": qd[:, 3:6].copy(),
@@ -95,33 +87,32 @@ class VelocityLog(EvaluationLog):
 
     @property
     def fallen(self) -> np.ndarray:
-        """Whether each robot fell."""
+        """(robots,) Whether each robot fell."""
         return self.end >= 0
 
     @property
     def outcomes(self) -> np.ndarray:
-        """Name of the termination by which each robot fell, `walked` where it did not."""
+        """(robots,) Name of the termination by which each robot fell, `walked` if it did not."""
         return np.array([*(term.name for term in self.task.terminations), "walked"])[self.end]
 
     def velocity_history(self) -> np.ndarray:
         """Return the velocities after every policy step, (steps, robots, 3), NaN from the fall on."""
         velocity = np.array(self.velocity, dtype=float).reshape(-1, len(self.commands), 3)
-        after = np.arange(len(velocity))[:, None] >= self.fall_step
-        velocity[after] = np.nan
+        velocity[np.arange(len(velocity))[:, None] >= self.fall_step] = np.nan
         return velocity
 
     def command_history(self) -> np.ndarray:
-        """Return the command at every policy step, (steps, robots, 3); it counts from the step after its time."""
+        """Return the command at every policy step, (steps, robots, 3); it applies from the step after its time."""
         steps = np.arange(1, len(self.velocity) + 1)
-        which = np.searchsorted(np.round(self.times / self.step_dt), steps, side="left") - 1
-        return self.commands[:, np.maximum(which, 0)].transpose(1, 0, 2)
+        index = np.searchsorted(np.round(self.times / self.step_dt), steps, side="left") - 1
+        return self.commands[:, np.maximum(index, 0)].transpose(1, 0, 2)
 
     def columns(self) -> dict[str, list]:
-        """Return first command, RMS errors without excluded samples, and outcome of every robot."""
+        """Return lists with one value per robot: first command_<axis>, rms_error_<axis> of `errors`, end (outcome)."""
         error = rms(self.errors(), axis=0)
-        numbers = {f"command_{axis}": self.commands[:, 0, i] for i, axis in enumerate(AXES)}
-        numbers |= {f"rms_error_{axis}": error[:, i] for i, axis in enumerate(AXES)}
-        return {name: finite(values) for name, values in numbers.items()} | {"end": self.outcomes.tolist()}
+        columns = {f"command_{axis}": self.commands[:, 0, i] for i, axis in enumerate(AXES)}
+        columns |= {f"rms_error_{axis}": error[:, i] for i, axis in enumerate(AXES)}
+        return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
 
     def errors(self) -> np.ndarray:
         """Return velocity minus command, (steps, robots, 3); NaN within SETTLING_TIME of a command and after a fall."""
@@ -133,15 +124,15 @@ class VelocityLog(EvaluationLog):
         return error
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return velocities and commands of some robots."""
+        """Return the last velocities and commands of some robots."""
         return velocity_series(self.velocity[-1], self.command_history()[-1], worlds)
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
-        """Return the commands of some robots, and their times."""
+        """Return the commands of some robots and their times: keys `commands`, `times_s`."""
         return {"commands": self.commands[list(worlds)].tolist(), "times_s": self.times.tolist()}
 
     def filmstrip(self, film: Film) -> Filmstrip:
-        """Return a filmstrip of the last stride of the first recorded robot."""
+        """Return a filmstrip of the last SHOWN_TIME seconds of the first recorded robot."""
         base = film.base_positions(0)
         first = max(0, len(base) - 1 - round(SHOWN_TIME / film.env.step_dt))
         frames = np.linspace(first, len(base) - 1, PICTURES).round().astype(int).tolist()
@@ -153,16 +144,16 @@ class VelocityLog(EvaluationLog):
 def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:
     """Return velocity ahead and to the left [m/s] and yaw rate [rad/s], body axes, (robots, 3).
 
-    arrays: base_quat (xyzw), base_vel [m/s] and base_ang_vel [rad/s], world axes.
+    arrays: base_quat (robots, 4), xyzw; base_vel [m/s] and base_ang_vel [rad/s], (robots, 3), world axes.
     """
-    back = arrays["base_quat"].astype(float) * CONJUGATE
-    vel = rotate(back, arrays["base_vel"].astype(float))
-    ang = rotate(back, arrays["base_ang_vel"].astype(float))
+    to_body = arrays["base_quat"].astype(float) * CONJUGATE
+    vel = rotate(to_body, arrays["base_vel"].astype(float))
+    ang = rotate(to_body, arrays["base_ang_vel"].astype(float))
     return np.stack([vel[:, 0], vel[:, 1], ang[:, 2]], axis=1)
 
 
 def velocity_series(velocity: np.ndarray, command: np.ndarray, worlds: Sequence[int]) -> dict[str, float]:
-    """Return velocities and commands, (robots, 3) each, of some robots in the form of `EvaluationLog.series`."""
+    """Return velocities and commands, (robots, 3) each, of some robots as time series of `EvaluationLog.series`."""
     series = {}
     for world in worlds:
         for i, (axis, unit) in enumerate(zip(AXES, ("m/s", "m/s", "rad/s"), strict=True)):
@@ -172,21 +163,21 @@ def velocity_series(velocity: np.ndarray, command: np.ndarray, worlds: Sequence[
 
 
 def rmse_metrics(error: np.ndarray) -> Metrics:
-    """Return the RMS of velocity errors (steps, robots, 3) over all that are not NaN, one metric per component."""
+    """Return the RMS of velocity errors (steps, robots, 3) over steps and robots, without NaN, by component."""
     names = ("rmse_vx_m_s", "rmse_vy_m_s", "rmse_yaw_rate_rad_s")
     return dict(zip(names, finite(rms(error, axis=(0, 1))), strict=True))
 
 
 def rms(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np.ndarray:
-    """Return the root mean square of the finite values along axes, NaN where there are none."""
+    """Return the root mean square of the finite values along axes (None: all), NaN where no value is finite."""
     known = np.isfinite(values)
-    total = np.where(known, values, 0.0) ** 2
+    total, count = (np.where(known, values, 0.0) ** 2).sum(axis=axis), known.sum(axis=axis)
     with np.errstate(invalid="ignore"):
-        return np.sqrt(total.sum(axis=axis) / np.where(known.sum(axis=axis) > 0, known.sum(axis=axis), np.nan))
+        return np.sqrt(total / np.where(count > 0, count, np.nan))
 
 
 def tracking_metrics(walks: VelocityLog) -> Metrics:
-    """Return RMS tracking errors over all robots without excluded samples, and number and rate of falls."""
+    """Return RMS tracking errors (`rmse_metrics` of `errors`), number and rate of falls, and falls by termination."""
     robots, falls = walks.count, int(walks.fallen.sum())
     metrics = rmse_metrics(walks.errors()) | {"robots": robots, "falls": falls, "fall_rate": falls / robots}
     return metrics | {f"fell_by_{name}": int((walks.outcomes == name).sum())
@@ -194,7 +185,7 @@ def tracking_metrics(walks: VelocityLog) -> Metrics:
 
 
 def command_grid(per_axis: int, reach: Sequence[float]) -> np.ndarray:
-    """Return commands on a grid from minus to plus `reach` [m/s], [m/s], [rad/s], (per_axis^3, 1, 3)."""
+    """Return commands on a grid from -reach to reach, (per_axis^3, 1, 3); reach: [m/s], [m/s], [rad/s]."""
     axes = [np.linspace(-limit, limit, per_axis) for limit in reach]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 1, 3)
 
@@ -216,11 +207,11 @@ class VelocityFlags:
             raise InputError(f"commands_per_axis must be at least 2, got {self.commands_per_axis}")
 
     def log(self, task: TaskCfg, seed: int) -> VelocityLog:
-        """Return the log of walks, one command of the grid per robot."""
+        """Return the log of walks, one command of the grid per robot; seed has no effect."""
         return VelocityLog(command_grid(self.commands_per_axis, self.max_velocity), task, self.seconds)
 
     def metrics(self, log: VelocityLog) -> Metrics:
-        """Return `tracking_metrics`."""
+        """Return `tracking_metrics` of a finished log."""
         return tracking_metrics(log)
 
 
@@ -242,7 +233,7 @@ class VelocityPlayFlags:
 
     @property
     def velocities(self) -> tuple[Velocity, ...]:
-        """Successive commands."""
+        """Successive commands: the flag, or the default."""
         return self.velocity or self.default_velocities
 
     @property
@@ -251,7 +242,7 @@ class VelocityPlayFlags:
         return self.command_interval * len(self.velocities)
 
     def log(self, task: TaskCfg) -> VelocityLog:
-        """Return the log of one robot's walk."""
+        """Return the log of one robot's walk with `velocities` one after the other."""
         commands = np.array(self.velocities, dtype=float)[None]
         return VelocityLog(commands, task, self.length, times=self.command_interval * np.arange(commands.shape[1]))
 

@@ -16,7 +16,7 @@ from jumper_warp.registry import make_task
 from jumper_warp.tasks.randomization import PUSH_INTERVAL, PUSH_PROBABILITY, RandomizationCfg
 from landing_helpers import still_policy
 
-DT = 1.0 / 480.0
+DT = 1.0 / 480.0  # [s] Physics step
 JUMP = make_task("horizontal-jump")
 HELD = dataclasses.replace(
     JUMP,
@@ -28,7 +28,7 @@ HELD = dataclasses.replace(
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
-# ---------------------------------------------------------------- ends
+# ---------------------------------------------------------------- terminations
 
 
 @pytest.mark.parametrize(
@@ -40,7 +40,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
         ("vertical-jump", heights.with_sweep_terminations),
     ],
 )
-def test_fall_takes_precedence_over_success(name, change):
+def test_fall_takes_precedence_over_success(name, change):  # world 1 is too low
     env = make_env(2, task=change(make_task(name)), auto_reset=False)
     env.evaluation_reset(np.zeros((2, 4)))
     edit_episodes(env, phase=LANDED, phase_steps=119)
@@ -49,13 +49,13 @@ def test_fall_takes_precedence_over_success(name, change):
     assert ending_names(env) == ["success", "low_base"]
 
 
-def test_with_second_takeoff_ends_jump_at_second_takeoff():
+def test_only_with_second_takeoff_ends_landed_jump_above_limit_speed():
     names = {}
     for change in (landings.with_landing_terminations, landings.with_second_takeoff):
         env = make_env(2, task=change(JUMP), auto_reset=False)
         env.evaluation_reset(np.zeros((2, 4)))
         edit_episodes(env, phase=LANDED, phase_steps=5)
-        for world, up in ((0, 0.5), (1, 0.2)):
+        for world, up in ((0, 0.5), (1, 0.2)):  # [m/s] upward speed after the step, beside the limit of 0.25
             edit_coordinates(env, world, q={2: 1.0}, qd={2: up + 9.81 / 60.0})
         env.step(torch.zeros((2, 12)))
         names[change.__name__] = ending_names(env)
@@ -65,7 +65,7 @@ def test_with_second_takeoff_ends_jump_at_second_takeoff():
 # ---------------------------------------------------------------- pushes
 
 
-def test_evaluation_uses_intermittent_pushes_by_default():
+def test_evaluation_replaces_constant_wrench_by_intermittent_pushes_and_keeps_trained_intervals():
     drawn = Conditions(randomize=True).applied(HELD).randomization
     assert (drawn.push_interval, drawn.push_probability, drawn.resample_at) == (
         PUSH_INTERVAL,
@@ -79,13 +79,13 @@ def test_evaluation_uses_intermittent_pushes_by_default():
 
 
 @pytest.mark.parametrize("in_flight", [False, True])
-def test_push_in_flight_flag_controls_pushes_in_flight(in_flight):
+def test_flying_robot_is_pushed_only_with_push_in_flight(in_flight):
     conditions = Conditions(randomize=True, push_in_flight=in_flight)
     task = conditions.applied(dataclasses.replace(HELD, randomization=RandomizationCfg(push_probability=1.0)))
     env = make_env(2, task=landings.with_landing_terminations(task), randomize=True, auto_reset=False)
     env.evaluation_reset(np.zeros((2, 4)))
-    edit_coordinates(env, 1, q={2: 1.0})
-    for _ in range(2):  # in the first, the paws of all were last seen in the air
+    edit_coordinates(env, 1, q={2: 1.0})  # [m] world 1 flies
+    for _ in range(2):  # before the first step no paw has been in contact
         push = env.parameters.push.numpy().copy()
         env.step(torch.zeros((2, 12)))
     wrench = env.sim.state.body_f.numpy().reshape(2, 21, 6)[:, 0]
@@ -93,7 +93,7 @@ def test_push_in_flight_flag_controls_pushes_in_flight(in_flight):
     np.testing.assert_array_equal(wrench, push * [[1.0], [float(in_flight)]])
 
 
-def test_walking_conditions_keep_pushes_in_flight():
+def test_conditions_keep_randomization_of_walking():
     walking = make_task("velocity-flat")
     assert Conditions(randomize=True).applied(walking).randomization == walking.randomization
 
@@ -111,15 +111,15 @@ def test_conditions_change_only_the_fixed_parameters():
     conditions = Conditions(latency=8.0, gain_scale=(0.6, 1.0), friction=0.4)
     task = landings.with_landing_terminations(JUMP)
     nominal = make_env(2, task=task, auto_reset=False)
-    env = make_env(2, task=conditions.applied(task), randomize=conditions.sets_parameters, auto_reset=False)
-    assert env.parameters.latency.numpy().tolist() == [4, 4]  # 3.84
+    env = make_env(2, task=conditions.applied(task), randomize=conditions.draws, auto_reset=False)
+    assert env.parameters.latency.numpy().tolist() == [4, 4]  # 8 ms are 3.84 physics steps
     motors, others = env.sim.motors, nominal.sim.motors
     np.testing.assert_allclose(motors.kp.numpy(), 0.6 * others.kp.numpy(), rtol=1e-6)
     for name in ("kd", "no_load_speed", "cutoff_speed", "saturation", "offset"):
         np.testing.assert_array_equal(getattr(motors, name).numpy(), getattr(others, name).numpy())
     table, before = (each.sim.physics.dynamics.robot.table.numpy() for each in (env, nominal))
     changed = (table != before).any(axis=1)
-    assert changed.sum() == 8 and (table[changed] == np.float32(0.4)).all()  # static and dynamic, of four legs
+    assert changed.sum() == 8 and (table[changed] == np.float32(0.4)).all()  # static, dynamic friction of four legs
     assert not env.parameters.push.numpy().any()
 
 
@@ -171,7 +171,7 @@ def test_latency_text_rounds_to_physics_steps():
     assert latency_metrics(np.array([4]), DT, 8.0)["latency_asked_ms"] == 8.0
 
 
-def test_run_reports_simulated_latency(tmp_path):
+def test_run_reports_simulated_latency_in_metrics_and_title(tmp_path):
     save_policy(tmp_path / "still", still_policy("horizontal-jump"))
     args = EvaluationArgs(policy=str(tmp_path / "still"), latency=40.0, num_recorded=0, out=tmp_path, device="cpu")
     run = EvaluationRun.from_args("test", args)

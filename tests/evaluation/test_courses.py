@@ -10,9 +10,9 @@ from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.utils.errors import InputError
 
-DT = 1.0 / 60.0
-SLEW_STEP = MAX_ACCELERATION * DT
-SCRIPT = (
+DT = 1.0 / 60.0  # [s] Policy step
+SLEW_STEP = MAX_ACCELERATION * DT  # Largest change of a commanded velocity in a policy step
+SCRIPT = (  # 120 policy steps of walking, a jump, 90 of walking
     ScriptStep("walk", (0.5, 0.1, -0.2), 2.0),
     ScriptStep("jump_up", (0.75,)),
     ScriptStep("walk", (0.3, 0, 0), 1.5),
@@ -23,6 +23,7 @@ class ScriptedEnv:
     """Robots that stop 50 steps after a jump is requested, take off 25 steps later and finish 40 steps after that."""
 
     def __init__(self, n: int, error=(0.1, 0.0, 0.0), falls_at=None, never_stops=False):
+        """Stand n robots; error: velocity minus command; falls_at: (n,) policy step of each fall, -1: none."""
         self.n, self.error, self.falls_at, self.never_stops = n, np.array(error), falls_at, never_stops
         self.skill, self.commands, self.since, self.command_values = np.zeros(n, int), np.full(n, -1), np.zeros(n), None
         self.step_dt, self.steps, self.velocity, self.requests = DT, 0, np.zeros((n, 3)), []
@@ -33,15 +34,15 @@ class ScriptedEnv:
         place = lambda center, worlds: self.placed.append((self.steps, center.tolist(), worlds))  # noqa: E731
         self.sim = SimpleNamespace(solver=SimpleNamespace(place_blocks=place))
 
-    def evaluation_reset(self, commands, headings):
+    def evaluation_reset(self, commands, headings):  # stub of Env
         self.velocity = np.array(commands, dtype=float)
 
-    def command(self, values, worlds):
+    def command(self, values, worlds):  # stub of Env: robots that walk get velocities (n, 3)
         walking = worlds & (self.skill == WALK)
         self.velocity[walking] = values[walking]
         self.command_values = values.copy()
 
-    def request(self, skill, worlds, commands):
+    def request(self, skill, worlds, commands):  # stub of Env: records (step, skill, world)
         self.goals = commands.copy()
         self.requests += [(self.steps, skill, int(w)) for w in np.flatnonzero(worlds)]
         self.commands[worlds] = skill
@@ -70,7 +71,7 @@ class ScriptedEnv:
 
 
 def run_course(script=SCRIPT, n=2, **env_settings) -> tuple[CourseLog, ScriptedEnv]:
-    """Return the log of a script on n robots, run to its end, and the environment."""
+    """Return the log of a script on n robots, run to its end, and the environment; env_settings: of ScriptedEnv."""
     course, env = CourseLog([script] * n), ScriptedEnv(n, **env_settings)
     course.read_env = lambda env: env.step()
     course.begin(env)
@@ -82,8 +83,8 @@ def run_course(script=SCRIPT, n=2, **env_settings) -> tuple[CourseLog, ScriptedE
 
 def test_jump_is_requested_at_its_command_and_walking_resumes():
     course, env = run_course()
-    assert env.requests == [(120, JUMP_UP, 0), (120, JUMP_UP, 1)]
-    np.testing.assert_allclose(env.goals, [[0.0, 0.0, 0.75, 30.0]] * 2)
+    assert env.requests == [(120, JUMP_UP, 0), (120, JUMP_UP, 1)]  # 2 s of walking; then 50 + 65 steps of a jump
+    np.testing.assert_allclose(env.goals, [[0.0, 0.0, 0.75, 30.0]] * 2)  # SQUAT_TIME of 30 steps
     assert [skill for skill, *_ in active_spans(course, 0)] == [WALK, JUMP_UP, WALK]
     np.testing.assert_array_equal(course.start_step[0], [0, 120, 235])
     np.testing.assert_array_equal(course.finish_step[0], [120, 235, 325])
@@ -110,7 +111,7 @@ def test_course_metrics_match_hand_computed_values():
     assert metrics["handover_force_ripple_n"] == pytest.approx(1.0) == metrics["handover_force_step_n"]
 
 
-def test_course_landing_error_is_distance_from_goal():
+def test_landing_error_is_distance_from_goal_and_beyond_tolerance_off_goal():
     course, _ = run_course((ScriptStep("jump_to", (0.8, 0.0)), ScriptStep("stand", seconds=0.2)), n=1)
     assert course_metrics(course)["landing_error_m"] == pytest.approx(0.05) and course.switch_step[0, 0] > 0
     course.offset[0, 0] = 0.2
@@ -130,7 +131,7 @@ def test_block_is_placed_under_goal_when_jump_onto_it_starts():
     assert env.placed == [(switch_step, [[3.0, 4.0]], [1])] and switch_step > course.finish_step[1, 0]
 
 
-def test_fall_ends_course():
+def test_fall_ends_course_and_its_samples():
     course, _ = run_course(falls_at=np.array([60, -1]))
     metrics = course_metrics(course)
     assert course.outcomes.tolist() == ["collided", "done"] and metrics["failed_by_collided"] == 1

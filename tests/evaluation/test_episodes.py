@@ -11,9 +11,9 @@ from jumper_warp.registry import make_task
 from jumper_warp.tasks.saving import task_to_json
 from landing_helpers import still_policy
 
-DT = 0.5
+DT = 0.5  # [s] Policy step of the stub
 TASK = make_task("vertical-jump")
-ENDS = [term.name for term in TASK.terminations]
+ENDS = [term.name for term in TASK.terminations]  # Names by index of the termination
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
@@ -25,13 +25,13 @@ class StubEnv:
     def __init__(self):
         self.arrays = {"base_pos": np.tile([1.0, 0.0, 0.3], (4, 1)), "termination": np.full(4, -1)}
 
-    def evaluation_reset(self, commands):
+    def evaluation_reset(self, commands):  # stub of Env
         self.commands = commands
 
-    def task_arrays(self):
+    def task_arrays(self):  # stub of Env
         return self.arrays
 
-    def set(self, **changes):
+    def set(self, **changes):  # arrays by name, (4, ...)
         for name, value in changes.items():
             self.arrays[name] = np.array(value)
 
@@ -80,7 +80,7 @@ def test_columns_have_one_row_per_episode_and_none_for_nan(episodes):
     assert episodes.series([1]) == {"height/base of 1 [m]": 0.0, "distance/start of 1 [m]": pytest.approx(0.4)}
 
 
-def test_update_returns_true_when_all_episodes_ended():
+def test_update_returns_true_when_all_episodes_ended():  # 3: index of any termination
     log = EpisodeLog(np.zeros((1, 4)), TASK)
     assert log.update({"base_pos": np.zeros((1, 3)), "termination": np.array([3])}, DT)
 
@@ -101,7 +101,7 @@ def test_refuses_invalid_settings(make, message):
 
 @pytest.fixture(scope="module")
 def policy(tmp_path_factory):
-    """Folder of a policy of a task that says nothing of its evaluation, which holds the default pose."""
+    """Folder of a policy that holds the default pose, of a task with the general evaluation `episode`."""
     folder, still = tmp_path_factory.mktemp("policy") / "still", still_policy("horizontal-jump")
     task = replace(make_task("horizontal-jump"), name="any-task", evaluation_suite="episode")
     still.config = {"env": {"task": task_to_json(task)}}
@@ -110,7 +110,7 @@ def policy(tmp_path_factory):
     return str(folder)
 
 
-def test_policy_of_any_task_is_evaluated(policy, tmp_path):
+def test_policy_of_any_task_is_evaluated_with_metrics_and_csv(policy, tmp_path):
     evaluate.run(
         [policy, *"--num-episodes 3 --command 0.5 0 0 30 --seconds 4 --device cpu --out".split(), str(tmp_path)], []
     )
@@ -122,7 +122,7 @@ def test_policy_of_any_task_is_evaluated(policy, tmp_path):
     assert len(rows) == 4 and rows[0].startswith("command_0,command_1") and rows[1].endswith("no_jump")
 
 
-def test_policy_of_any_task_is_played(policy, tmp_path):
+def test_policy_of_any_task_is_recorded(policy, tmp_path):
     play.run([policy, *"--seconds 0.25 --device cpu --out".split(), str(tmp_path)], [])
     assert (tmp_path / "episode.rrd").stat().st_size > 1000
     assert json.loads((tmp_path / "metrics.json").read_text())["end"] == ["no_end"]

@@ -7,7 +7,7 @@ from jumper_warp.viz.recording import Recording
 
 
 def recording(frames=3, worlds=2, spacing=2.0):
-    """Return a recording of bodies at the origin."""
+    """Return a recording with one body per world at the origin; spacing [m]: between worlds along y."""
     return Recording(
         times=np.arange(1, frames + 1) / 60.0,
         worlds=tuple(range(worlds)),
@@ -23,7 +23,7 @@ def recording(frames=3, worlds=2, spacing=2.0):
 def test_ankle_positions_follow_shank_poses():
     poses = np.zeros((1, 21, 7))
     poses[..., 6] = 1.0
-    poses[0, 5, 2] = 1.0
+    poses[0, 5, 2] = 1.0  # [m] FL shank is link 5, FR shank link 10; the ankle is 0.3 m below the shank's origin
     poses[0, 10] = [0.0, 0.0, 1.0, 0.0, np.sqrt(0.5), 0.0, np.sqrt(0.5)]  # 90° about y: z points to x
     points = ankles(poses)
     assert points.shape == (1, 4, 3)
@@ -41,7 +41,7 @@ def test_keyframes_clamp_command_to_recording(command, first):
     assert keyframes(np.array([0.3, 0.4, 0.3]), command)[0] == first
 
 
-def test_goal_markers_skip_nan_and_are_spaced_by_world():
+def test_goal_markers_are_fixed_discs_that_skip_nan_and_are_spaced_by_world():
     places = np.array([[[0.8, 0.2, 0.0], [np.nan, np.nan, 0.0]], [[0.5, 0.0, 0.1], [0.6, 0.0, 0.1]]])
     shapes = with_goal_markers(recording(), places).shapes
     assert [shape.name for shape in shapes] == ["goal_0_0", "goal_1_0", "goal_1_1"]

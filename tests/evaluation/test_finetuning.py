@@ -20,12 +20,12 @@ FEW |= {"iterations": 1, "device": "cpu"}
 
 @pytest.fixture(scope="module")
 def tuned():
-    """Policy that aims 8 mm too high after one iteration of fine-tuning, and its record."""
+    """Policy of `aiming_high` after one iteration of fine-tuning, and its record."""
     return finetune(aiming_high(), FinetuneCfg(**FEW), log=lambda line: None)
 
 
 def aiming_high():
-    """Return the shipped policy with goals that look 8 mm higher than they are."""
+    """Return the shipped policy with an observation of the commanded height that is 8 mm too large."""
     policy = open_policy("vertical_jump")
     tensors = policy.tensors()
     mean = tensors["normaliser.mean"].clone()
@@ -33,7 +33,7 @@ def aiming_high():
     return Policy(policy.layers, mean, tensors["normaliser.std"], policy.interface, policy.config)
 
 
-def test_jump_errors_match_environment_and_ignore_derivatives():
+def test_jump_errors_match_environment_with_and_without_derivatives():
     policy = open_policy("vertical_jump")
     (group,) = make_groups(policy, FinetuneCfg(**FEW))
     network = Network(policy)
@@ -41,16 +41,16 @@ def test_jump_errors_match_environment_and_ignore_derivatives():
     assert torch.equal(errors.value, plain.value)
     assert errors.jacobian.shape == (4, len(network.weights)) and errors.valid.all()
     group.begin()
-    for _ in range(120):
+    for _ in range(120):  # 2 s, until after the apex
         group.env.step(policy.act(group.env.obs))
     misses = group.env.task_arrays()["max_height"] - np.linspace(0.8, 1.05, 4)
     np.testing.assert_allclose(errors.value.numpy(), misses, rtol=0.0, atol=1.0e-4)
 
 
-def test_one_iteration_halves_error_of_biased_policy(tuned):
+def test_one_iteration_halves_error_of_biased_policy_with_small_change_of_actions(tuned):
     _, record = tuned
     before, after = (step["mean_abs_miss_m"]["nominal"] for step in record["steps"])
-    assert before > 0.003
+    assert before > 0.003  # [m]
     assert after < 0.5 * before
     assert 0.0 < record["steps"][1]["action_change"] < 0.01
 
@@ -61,7 +61,7 @@ def test_finetuning_is_bitwise_reproducible(tuned):
         assert torch.equal(tensor, again.tensors()[name]), name
 
 
-def test_finetune_command_writes_a_loadable_policy(tmp_path, capsys):
+def test_finetune_command_writes_a_loadable_policy_and_refuses_to_overwrite_it(tmp_path, capsys):
     out = tmp_path / "tuned"
     flags = "--num-goals 2 --num-delayed 0 --num-randomized 0 --iterations 1 --device cpu".split()
     main(["finetune", "vertical_jump", *flags, "--out", str(out)])
@@ -83,10 +83,10 @@ def test_landing_errors_on_mars_are_measured_at_rest():
     errors = jump_errors(group, Network(policy), derivatives=False)
     arrays = group.env.task_arrays()
     assert errors.valid.all() and (arrays["phase_steps"] >= 60).all()  # a second after touchdown
-    assert errors.value.abs().max() < 0.05
+    assert errors.value.abs().max() < 0.05  # [m]
 
 
-def test_shift_goal_observation_equals_shifted_goal():
+def test_policy_with_shifted_goal_observation_acts_as_for_shifted_goal():
     policy, obs = open_policy("horizontal_jump"), 0.3 * torch.randn((5, 147), generator=torch.manual_seed(3))
     moved = obs.clone()
     moved[:, policy.interface.observation_names.index("goal_x")] += 0.02
@@ -95,7 +95,7 @@ def test_shift_goal_observation_equals_shifted_goal():
 
 
 def test_correct_aim_removes_constant_overshoot():
-    """A policy whose observed goals are 40 mm too far ends nearer to its goals than the original one."""
+    """A policy that observes goals 40 mm too far misses by less than the original after the correction alone."""
     policy, cfg = (
         open_policy("slippery_jump"),
         FinetuneCfg(**FEW | {"num_goals": 8, "iterations": 0}),

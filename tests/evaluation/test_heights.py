@@ -8,7 +8,7 @@ from jumper_warp.viz.snapshot import FIELD_OF_VIEW
 
 
 def make_arrays(jumps, **changes):
-    """Return the arrays of `JumpLog.read_env` of robots in stance, with some changed."""
+    """Return the arrays of `JumpLog.read_env`, (num_envs, ...), of robots standing at the origin, with some changed."""
     count = len(jumps.goals)
     arrays = {
         "phase": np.zeros(count, dtype=int), "phase_steps": np.zeros(count, dtype=int),
@@ -26,7 +26,7 @@ def test_apex_metrics_match_hand_computed_values():
     jumps = HeightLog(np.array([0.5, 0.8, 1.1, 1.2]), ("success", "came_apart", "collided"))
     landed = {"phase": [2, 0, 2, 0], "phase_steps": [60, 0, 60, 0]}
     heights = {"max_height": [0.52, 1.0e13, 1.06, 0.4], "peak_tilt": [0.1, 3.0, 0.2, 0.0]}
-    half = [math.radians(0.5 * angle) for angle in (10.0, 90.0, -26.0, 0.0)]
+    half = [math.radians(0.5 * angle) for angle in (10.0, 90.0, -26.0, 0.0)]  # half yaw angles
     base_poses = {
         "base_pos": [[0.06, -0.08, 0.3], [9.0, 0.0, 0.0], [0.0, 0.3, 0.3], [0.0] * 3],
         "base_quat": [[0.0, 0.0, math.sin(angle), math.cos(angle)] for angle in half],
@@ -64,7 +64,7 @@ def test_apex_metrics_match_hand_computed_values():
     assert {name: metrics[name] for name in expected} == pytest.approx(expected, abs=1e-9)
 
 
-def test_unfinished_jump_fails_with_no_end():
+def test_unfinished_jump_fails_with_no_end_and_without_landing_metrics():
     jumps = HeightLog(np.array([0.5]), ("success",))
     assert not jumps.update(make_arrays(jumps), 1.0 / 60.0)
     metrics = apex_metrics(jumps, (0.5, 1.1))
@@ -82,7 +82,7 @@ def test_columns_have_one_row_per_jump_and_none_for_nan():
     }  # fmt: skip
 
 
-def test_jump_in_progress_at_command_is_early():
+def test_jump_that_has_left_stance_at_command_is_early():
     jumps = HeightLog(np.array([0.5, 0.8, 1.0]), ("success", "came_apart"))
     for step, phase in ((29, [0, 1, 0]), (30, [0, 1, 0]), (31, [1, 2, 0])):
         jumps.update(make_arrays(jumps, steps=[step] * 3, phase=phase), 1.0 / 60.0)
@@ -97,13 +97,13 @@ def test_landing_from_wrong_height_counts_as_miss_not_fall():
 
 
 @pytest.mark.parametrize("apex", [0.5, 1.0, 3.6])
-def test_side_camera_shows_ground_and_apex(apex):
+def test_side_camera_shows_ground_and_apex_at_constant_scale(apex):
     eye, target, (width, height) = side_camera(apex)
     axis = np.subtract(target, eye) / np.linalg.norm(np.subtract(target, eye))
     for z in (0.0, apex + 0.2):
         ray = np.subtract((0.0, 0.0, z), eye)
         assert np.arccos(axis @ ray / np.linalg.norm(ray)) < 0.5 * FIELD_OF_VIEW
-    # the same pixels a metre
+    # the same pixels per metre as for a low jump
     assert np.linalg.norm(np.subtract(target, eye)) / height == pytest.approx(
         np.linalg.norm([1.5, 2.0, 0.35]) / 420, rel=1e-3
     )

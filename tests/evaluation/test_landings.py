@@ -15,14 +15,14 @@ from jumper_warp.evaluation.landings import (
 )
 from jumper_warp.registry import make_task
 
-DT = 1.0 / 60.0
+DT = 1.0 / 60.0  # [s] Policy step
 TERMINATIONS = ("success", "came_apart", "low_base", "collided", "no_jump")
-COLLIDED, NO_JUMP = 3, 4
+COLLIDED, NO_JUMP = 3, 4  # Indices in TERMINATIONS
 QUARTER = math.radians(90.0)
 
 
 def quat_about_z(angle):
-    """Return the quaternion xyzw of a rotation about z [rad]."""
+    """Return the quaternion (xyzw) of a rotation by an angle [rad] about z."""
     return [0.0, 0.0, math.sin(0.5 * angle), math.cos(0.5 * angle)]
 
 
@@ -44,35 +44,35 @@ class StubEnv:
             "phase": np.zeros(count, dtype=int), "phase_steps": np.zeros(count, dtype=int),
         }  # fmt: skip
 
-    def evaluation_reset(self, goals, headings):
+    def evaluation_reset(self, goals, headings):  # stub of Env: goals (n, 4) of `jump_commands`, headings [rad]
         self.command_step = goals[:, 3]
         cos, sin = np.cos(headings), np.sin(headings)
         self.arrays["goal"][:, 0] = cos * goals[:, 0] - sin * goals[:, 1]
         self.arrays["goal"][:, 1] = sin * goals[:, 0] + cos * goals[:, 1]
         self.arrays["heading"][:] = headings
 
-    def command(self, goals, worlds):
+    def command(self, goals, worlds):  # stub of Env: goals (n, 3) [m] for worlds (n,) bool
         self.commanded.append((goals.copy(), worlds.copy()))
         for name in ("phase", "phase_steps"):
             self.arrays[name][worlds] = 0
         self.arrays["goal"][worlds] = self.arrays["base_pos"][worlds] + goals[worlds, :3]
 
-    def task_arrays(self):
+    def task_arrays(self):  # stub of Env
         return self.arrays
 
-    def set(self, **changes):
+    def set(self, **changes):  # arrays by name, or one value for all worlds
         for name, value in changes.items():
             self.arrays[name][:] = value
 
     def stand_on(self, *down):
-        """Load the given paws of every world by 9 N, the others by a twentieth of a newton."""
+        """Load the paws `down` (0 FL, 1 FR, 2 BL, 3 BR) of every world by 9 N, the others by 0.05 N, below contact."""
         loads = np.zeros((4, self.num_envs, 3))
         loads[..., 2] = np.where(np.isin(range(4), down), 9.0, 0.05)[:, None]
         self.sim.paw_force.assign(loads)
 
 
 def five_jumps():
-    """Return the log of five jumps heading left: success, miss, divergence, collision, no jump."""
+    """Return the log of five jumps headed 90° left: success, miss, divergence, collision, no jump."""
     goals = np.array([[[1.0, 0.0]], [[0.6, 0.2]], [[0.8, 0.0]], [[1.2, 0.0]], [[0.5, 0.0]]])
     landings = LandingLog(goals, TERMINATIONS, QUARTER)
     env = StubEnv(5)
@@ -95,7 +95,7 @@ def five_jumps():
     return landings
 
 
-def test_landing_and_offset_are_in_heading_frame():
+def test_landing_offset_and_outcome_are_in_heading_frame():
     landings = five_jumps()
     assert landings.landing[:2, 0] == pytest.approx(np.array([[0.96, -0.03], [0.8, 0.2]]), abs=1e-6)
     assert landings.offset[:2, 0] == pytest.approx(np.array([[-0.04, -0.03], [0.2, 0.0]]), abs=1e-6)
@@ -166,7 +166,7 @@ def test_jump_before_command_is_not_a_success():
 
 
 @pytest.mark.parametrize(("steps", "hopped"), [([3, 3], False), ([1, 4], True)])
-def test_long_airtime_after_touchdown_is_second_hop(steps, hopped):
+def test_airtime_above_hop_time_after_touchdown_is_second_hop(steps, hopped):  # policy steps of 1/60 s, limit 3
     landings, env = LandingLog(np.zeros((1, 1, 2)), TERMINATIONS), StubEnv(1)
     landings.begin(env)
     for phase, force, count in ((1, 0.0, 20), (2, 0.0, steps[0]), (2, 9.0, 2), (2, 0.05, steps[1])):
@@ -192,7 +192,7 @@ def test_long_airtime_after_touchdown_is_second_hop(steps, hopped):
         ([((0,), 1), ((1, 2), 3), ((0, 1, 2, 3), 2)], True),
     ],
 )
-def test_paw_lifted_after_its_contact_is_a_step(contacts, stepped):
+def test_paw_lifted_3_policy_steps_after_its_contact_is_a_step(contacts, stepped):  # rows: paws down, policy steps
     landings, env = LandingLog(np.zeros((1, 1, 2)), TERMINATIONS), StubEnv(1)
     landings.begin(env)
     for phase, rows in ((0, [((0, 1, 2, 3), 5)]), (1, [((), 20)]), (2, contacts)):
@@ -209,7 +209,7 @@ def test_paw_lifted_after_its_contact_is_a_step(contacts, stepped):
 
 
 @pytest.mark.parametrize(
-    ("phases", "takeoffs"),
+    ("phases", "takeoffs"),  # phases: paws down, upward speed [m/s], policy steps
     [
         ([((), 0.3, 1)], 1),
         ([((), 0.2, 5)], 0),  # too slow
@@ -241,7 +241,7 @@ def test_second_takeoff_needs_upward_speed_and_no_contact(phases, takeoffs):
     assert (metrics["success_rate"], metrics["second_takeoff_rate"]) == (1.0, float(takeoffs > 0))
 
 
-def test_longer_rest_time_counts_later_falls():
+def test_longer_rest_time_counts_later_falls_and_renames_rest_metric():
     landings, env = LandingLog(np.zeros((2, 1, 2)), TERMINATIONS, rest=3.0), StubEnv(2)
     landings.begin(env)
     env.set(phase=2, phase_steps=60, termination=0)
@@ -279,7 +279,7 @@ def test_unfinished_jump_fails_at_last_position():
 
 
 def two_in_a_row():
-    """Return the log of two rows of jumps, one successful and one whose first jump collides, and the environment."""
+    """Return the log and environment of two rows of two jumps after the first: world 0 landed, world 1 collided."""
     landings, env = LandingLog(np.array([[[0.8, 0.2], [0.7, 0.0]]] * 2), TERMINATIONS, rest=0.5), StubEnv(2)
     landings.begin(env)
     env.set(base_pos=[0.8, 0.15, 0.3], phase=2, phase_steps=[29, 10], termination=[-1, COLLIDED])
@@ -296,7 +296,7 @@ def test_next_jump_is_commanded_only_after_rest_of_landed_jump():
     assert goals[0] == pytest.approx([0.7, 0.0, 0.0])
 
 
-def test_next_jump_error_is_relative_to_its_own_goal():
+def test_next_jump_has_error_outcome_and_marker_of_its_own_goal():
     landings, env = two_in_a_row()
     env.set(base_pos=[[1.48, 0.15, 0.3], [0.0, 0.0, 0.0]], phase=2, phase_steps=30, termination=0)
     assert landings.record_step(env)
@@ -310,7 +310,7 @@ def test_next_jump_error_is_relative_to_its_own_goal():
     assert landings.goal_markers([0])[0, :, :2] == pytest.approx(np.array([[0.8, 0.2], [1.5, 0.15]]))
 
 
-def test_columns_have_one_row_per_jump_and_none_if_not_begun():
+def test_columns_have_one_row_per_jump_and_none_for_error_of_jump_not_begun():
     landings, _ = two_in_a_row()
     columns = landings.columns()
     assert all(len(values) == 4 for values in columns.values())
@@ -334,10 +334,10 @@ def test_trained_range_covers_all_levels(task, range_m):
 def test_command_delay_may_differ_between_worlds():
     env = StubEnv(2)
     LandingLog(np.zeros((2, 1, 2)), TERMINATIONS, delay=np.array([0.5, 0.25])).begin(env)
-    assert env.command_step.tolist() == [30.0, 15.0]
+    assert env.command_step.tolist() == [30.0, 15.0]  # policy steps
 
 
-def test_maximum_time_grows_with_number_of_jumps():
+def test_maximum_time_grows_with_number_of_jumps():  # 1 + 2 * (3.5 + rest 1) + delay 0.5
     assert LandingLog(np.zeros((1, 2, 2)), TERMINATIONS).seconds == pytest.approx(10.5)
 
 

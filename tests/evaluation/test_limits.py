@@ -22,14 +22,14 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def initial_env(conditions, worlds):
-    """Return an environment that has begun no episode yet, and its state."""
+    """Return an environment without a begun episode under some conditions, and its `state_dict`."""
     task = conditions.applied(with_sweep_terminations(make_task("vertical-jump")))
     env = make_env(worlds, task=task, randomize=conditions.sets_parameters, auto_reset=False)
     return env, env.state_dict()
 
 
 def simulated_apex(kp, kd):
-    """Return the apex of the paper's open-loop jump with scaled gains, from a simulation without an environment."""
+    """Return the apex [m] of the open-loop jump with gains scaled by kp, kd [1], simulated without an environment."""
     motors = make_task("vertical-jump").motors
     lateral, transversal = (replace(m, kp=kp * m.kp, kd=kd * m.kd) for m in (motors.lateral, motors.transversal))
     motors = replace(motors, lateral=lateral, transversal=transversal)
@@ -50,7 +50,7 @@ def test_open_loop_limit_equals_simulated_apex(gains, about):
     assert apexes == pytest.approx([about] * 2, abs=0.005)
 
 
-def test_open_loop_limits_reuse_sampled_robots_without_pushes():
+def test_open_loop_limits_reuse_sampled_robots_without_pushes_and_are_reproducible():
     env, fresh = initial_env(Conditions(randomize=True), 8)
     command = jump_commands(np.tile([0.0, 0.0, 0.8], (8, 1)), 0.5, env.step_dt)
     env.evaluation_reset(command)
@@ -66,5 +66,5 @@ def test_open_loop_limits_reuse_sampled_robots_without_pushes():
         else:
             np.testing.assert_array_equal(params[name], drawn[name], err_msg=name)
     np.testing.assert_array_equal(skill.params.values.numpy(), numbers)
-    assert 0.75 < limits.min() < limits.max() - 0.05 < 1.3
+    assert 0.75 < limits.min() < limits.max() - 0.05 < 1.3  # [m]
     np.testing.assert_array_equal(open_loop_limits(env, fresh), limits)

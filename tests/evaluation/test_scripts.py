@@ -11,7 +11,7 @@ from jumper_warp.utils.errors import InputError
 EXAMPLE = Path(__file__).parents[2] / "assets" / "scripts" / "walk_jump_walk.json"
 
 
-def test_parse_script_accepts_every_kind_of_command():
+def test_parse_script_returns_values_times_and_goals_of_every_kind_of_command():
     script = parse_script(
         [{"walk": [0.5, 0, 0.3]}, {"walk": [0, 1, 0], "seconds": 4}, {"stand": 1.5}, {"jump_up": 0.75},
          {"jump_to": [0.85, -0.1]}, {"jump_onto": [1.3, 0.1]}]

@@ -11,16 +11,19 @@ from jumper_warp.evaluation.velocities import VelocityFlags, VelocityLog, Veloci
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
 from support import gaits
-from support.walks import kept_speeds, settling_times, step_commands, top_speed, walked_share
+from support.walks import kept_speeds, settling_times, step_commands, top_speed, walked_fraction
 
-DT = 1.0 / 60.0
+DT = 1.0 / 60.0  # [s] Policy step
 TASK = make_task("velocity-flat")
 NAMES = [term.name for term in TASK.terminations]
 ROBOTS = 3
 
 
 def walk_log(velocity_of, *, seconds=2.0, falls=None, task=TASK, commands=None, times=(0.0,), **given) -> VelocityLog:
-    """Return the log of robots whose velocity (robots, 3) is a function of time [s]; falls: policy step by robot."""
+    """Return a log of ROBOTS robots with random constant orientations, which walk with a given velocity.
+
+    velocity_of: function of time [s], returns (robots, 3) in body axes; falls: policy step of the fall by robot.
+    """
     commands = np.tile([0.5, -0.2, 0.4], (ROBOTS, 1, 1)) if commands is None else commands
     walks = VelocityLog(commands, task, seconds, times=np.array(times), **given)
     turn = Rotation.random(ROBOTS, random_state=4)
@@ -37,7 +40,7 @@ def walk_log(velocity_of, *, seconds=2.0, falls=None, task=TASK, commands=None, 
     return walks
 
 
-def test_tracking_errors_are_in_body_axes_and_exclude_first_second():
+def test_tracking_errors_are_rms_in_body_axes_without_first_second():
     off = np.array([[0.1, 0.0, 0.0], [0.0, -0.2, 0.0], [0.2, 0.0, 0.3]])
     walks = walk_log(lambda t: np.array([0.5, -0.2, 0.4]) + off + (0.0 if t > 1.0 + 1e-6 else 5.0))
     metrics = velocities.tracking_metrics(walks)
@@ -66,7 +69,7 @@ def test_time_out_is_not_a_fall():
     assert not walks.fallen.any() and walks.outcomes[0] == "walked"
 
 
-def test_settling_time_is_when_mean_velocity_stays_near_command():
+def test_settling_time_is_from_command_until_mean_velocity_stays_near_it():
     commands = np.zeros((ROBOTS, 2, 3))
     commands[:, 1, 0] = 0.8
 
@@ -106,12 +109,12 @@ def test_command_history_starts_one_step_after_command():
     np.testing.assert_array_equal(walks.command_history()[:, 0, 0], [0.0] * 60 + [1.0] * 60)
 
 
-def test_walked_share_stops_at_fall():
+def test_walked_fraction_stops_at_fall_and_is_at_most_1():
     commands = np.tile([0.5, 0.0, 0.0], (ROBOTS, 1, 1))
     walks = walk_log(lambda t: np.tile([0.3, 0.1, 0.0], (ROBOTS, 1)), seconds=3.0, commands=commands, falls={2: 91})
-    assert walked_share(walks) == pytest.approx([0.9, 0.9, 0.45], rel=1e-5)  # of the last two seconds
+    assert walked_fraction(walks) == pytest.approx([0.9, 0.9, 0.45], rel=1e-5)  # over the last 2 s
     fast = walk_log(lambda t: np.tile([0.9, 0.0, 0.0], (ROBOTS, 1)), commands=commands)
-    assert walked_share(fast) == pytest.approx([1.0] * 3)
+    assert walked_fraction(fast) == pytest.approx([1.0] * 3)
 
 
 def test_top_speed_is_of_highest_bin_that_is_kept():
@@ -127,7 +130,7 @@ def test_kept_speeds_use_mean_of_last_seconds():
     np.testing.assert_array_equal(kept_speeds(walks, 0, 1.0, 0.1), [True, False, True])
 
 
-def test_command_grid_and_step_commands_cover_their_ranges():
+def test_command_grid_and_step_commands_stay_in_their_ranges():
     commands = velocities.command_grid(3, (0.8, 0.6, 0.4))
     assert commands.shape == (27, 1, 3) and {tuple(c) for c in commands[:, 0]} >= {(0.8, -0.6, 0.4), (0.0, 0.0, 0.0)}
     pairs = step_commands(np.random.default_rng(0), 200, 0.8, 0.8)
@@ -146,7 +149,7 @@ def test_refuses_settings_out_of_range(make):
         make()
 
 
-def test_play_flags_command_velocities_in_sequence():
+def test_play_flags_command_velocities_in_sequence_and_six_by_default():
     one, two = ((0.5, 0.0, 0.3),), ((0.5, 0.0, 0.3), (0.0, -0.2, 0.0))
     np.testing.assert_array_equal(VelocityPlayFlags(velocity=one).log(TASK).commands, [one])
     goals = VelocityPlayFlags(velocity=two, command_interval=2.0)
@@ -175,7 +178,7 @@ def test_gait_metrics_of_synthetic_trot():
     assert metrics["median_swing_apex_m"] == pytest.approx(0.07)
 
 
-def test_gait_recorder_skips_first_seconds():
+def test_gait_recorder_skips_first_seconds_and_has_no_metrics_without_robots():
     env = SimpleNamespace(step_dt=DT)
     gait = gaits.GaitRecorder(env, skip=0.5)
     for _ in range(30):

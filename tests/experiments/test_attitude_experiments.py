@@ -14,14 +14,14 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def run(tmp_path_factory):
-    """A run of one iteration."""
+    """Folder of a run of `jumper train attitude` with one iteration."""
     root = tmp_path_factory.mktemp("logs")
     args = "--num-envs 8 --max-iterations 1 --ppo.num-steps 4 --ppo.minibatches 1 --ppo.hidden 8 --device cpu"
     cli(["train", "attitude", *args.split(), "--log-root", str(root)])
     return next((root / "attitude").iterdir())
 
 
-def test_turns_about_all_axes_are_measured(run, tmp_path):
+def test_turns_about_all_axes_write_metrics_plot_and_recording(run, tmp_path):
     args = attitude.Args(
         policy=str(run), num_turns=6, seconds=0.2, num_recorded=1, refine=2, out=tmp_path, device="cpu"
     )
@@ -33,7 +33,7 @@ def test_turns_about_all_axes_are_measured(run, tmp_path):
     assert (tmp_path / "turns.png").is_file() and (tmp_path / "turns.rrd").stat().st_size > 10_000
 
 
-def test_flights_run_with_and_without_turning(run, tmp_path):
+def test_flights_with_and_without_turning_have_the_same_takeoffs(run, tmp_path):
     args = flight_attitude.Args(
         policy=str(run), num_flights=2, max_leg_delay=10.0, num_recorded=1, out=tmp_path, device="cpu"
     )
@@ -58,7 +58,7 @@ def test_policy_takes_off_to_commanded_heights_and_lands(run, tmp_path):
     assert 0.0 < held["mean_touchdown_turn_deg"] <= held["max_touchdown_turn_deg"] < 20.0
 
 
-def test_refuses_invalid_flags(tmp_path):
+def test_refuses_invalid_flags_and_policies_of_other_tasks(tmp_path):
     with pytest.raises(InputError, match="num_turns must be at least 6"):
         attitude.Args(num_turns=3)
     with pytest.raises(InputError, match="max_leg_delay in 0 to 100 ms"):

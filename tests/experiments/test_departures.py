@@ -18,9 +18,9 @@ from support.departures import DEPARTURES, ablation_flags
 
 
 def train_settings(task, name):
-    """Return the settings of a training without a departure, and its task."""
-    each = DEPARTURES[task][name]
-    return parse(each, departures.Args(task=task).command(each, 1, Path("logs")))
+    """Return the parsed settings of a training of `task` without the departure `name`, and the changed task."""
+    ablation = DEPARTURES[task][name]
+    return parse(ablation, departures.Args(task=task).command(ablation, 1, Path("logs")))
 
 
 @pytest.mark.parametrize("task", DEPARTURES)
@@ -59,7 +59,7 @@ def test_ablation_functions_change_only_their_departure():
     assert {level.next_jump_probability for level in again} == {0.0}
 
 
-def test_ablations_of_mars_and_omnidirectional_jumps():
+def test_ablations_of_mars_and_omnidirectional_jumps_have_levels_and_limits_of_the_papers():
     goals = DEPARTURES["horizontal-jump-mars-loose"]["goals"](make_task("horizontal-jump-mars-loose")).levels
     assert [(level.goal_lower[0], level.goal_upper[0]) for level in goals[::2]] == [
         (1.4, 1.85), (1.6, 2.25), (2.0, 3.75), (3.0, 4.75),
@@ -78,7 +78,7 @@ def test_ablations_of_mars_and_omnidirectional_jumps():
     assert around[0] == plain.levels[0]
 
 
-def test_documented_paw_penetration_is_below_one_millimetre():
+def test_documented_paw_penetration_is_below_one_millimetre():  # runs the example of docs/departures.md, shortened
     text = (Path(__file__).parents[2] / "docs" / "departures.md").read_text()
     names = {}
     exec(re.search(r"```python\n(.*?)```", text, re.DOTALL)[1].replace("200", "20"), names)
@@ -91,7 +91,7 @@ def test_documented_departures_list_their_flags():
         assert callable(each) or f"`{each}`" in table, name
 
 
-def test_trainings_are_cached_and_evaluated_with_task_terminations(tmp_path, capsys, monkeypatch):
+def test_trainings_are_cached_evaluated_with_task_terminations_and_refuse_other_settings(tmp_path, capsys, monkeypatch):
     args = departures.Args(
         only=("jumping_early",), iterations=1, num_envs=4, num_jumps=(2, 3), num_squats=2, out=tmp_path,
         measure=False, train_flags="--ppo.compile off --ppo.num-steps 8 --ppo.minibatches 1", device="cpu", threads=1,
@@ -127,7 +127,7 @@ def test_training_with_max_seconds_saves_checkpoint(tmp_path):
     assert checkpoint.is_file() and int(checkpoint.stem.removeprefix("iteration_")) < 1000
 
 
-def test_baseline_is_trained_with_kept_seeds():
+def test_baseline_is_trained_with_baseline_seeds():
     args = departures.Args(only=("kept", "drift"), seeds=(1,), baseline_seeds=(2, 3))
     flags = [(name, seed, ablation) for name, seed, ablation in args.trainings()]
     assert flags == [("kept", 2, ""), ("kept", 3, ""), ("drift", 1, DEPARTURES["vertical-jump"]["drift"])]

@@ -55,7 +55,7 @@ def test_new_reward_is_logged_by_name(trained):
 
 
 def height_log(target, apex, end, tilt_deg, rest_speed, early=False):
-    """Return the log of finished jumps with these outcomes; end: index in SWEEP_ENDS."""
+    """Return the log of finished jumps, one value each: heights [m], end (index in SWEEP_ENDS), rest_speed [m/s]."""
     jumps = HeightLog(np.array(target), SWEEP_ENDS)
     jumps.apex[:, 0], jumps.end[:, 0], jumps.early[:, 0] = apex, end, early
     jumps.tilt[:, 0], jumps.rest_speed[:, 0] = np.radians(tilt_deg), rest_speed
@@ -107,7 +107,7 @@ def test_sweep_metrics_match_hand_computed_values():
     assert (weak["lowest_open_loop_limit_m"], weak["reachable_share_0_6_1_1"]) == (0.49, 2 / 4)
 
 
-def test_diverged_world_is_excluded_from_success_and_error():
+def test_diverged_world_is_a_failure_excluded_from_errors():
     jumps = height_log([0.6, 0.8, 1.0], [0.65, 1e6, np.nan], [0, 1, 1], [1.0] * 3, [0.0] * 3)
     metrics = sweep_metrics(jumps, HEIGHTS_IN_RANGE)
     assert metrics["mean_abs_error_m"] == pytest.approx(0.05)
@@ -117,12 +117,12 @@ def test_diverged_world_is_excluded_from_success_and_error():
 
 
 class OpenLoopPolicy:
-    """Squats for a second and then extends the legs, beginning at a policy step."""
+    """Policy that from policy step `begin` on squats for 60 steps and then extends the legs for 20 steps."""
 
     def __init__(self, begin):
         self.begin, self.step = begin, 0
 
-    def act(self, obs):
+    def act(self, obs):  # actions (num_envs, 12), whatever the observations (num_envs, n)
         since = self.step - self.begin
         self.step += 1
         level = 0.0 if since < 0 else min(since / 25, 1.0) if since < 60 else -1.0 if since < 80 else 0.0
@@ -130,12 +130,12 @@ class OpenLoopPolicy:
 
 
 @pytest.fixture(scope="module")
-def sweep_env():
+def sweep_env():  # environment of three nominal robots with the terminations of the sweep
     return env_of_policy(still_policy("vertical-jump"), 3, Conditions(device="cpu"), change=with_sweep_terminations)
 
 
 @pytest.mark.parametrize(("begin", "early"), [(31, False), (-45, True)])
-def test_scripted_jump_reaches_the_open_loop_height_and_lands(sweep_env, begin, early):
+def test_scripted_jump_reaches_open_loop_height_and_is_early_before_command(sweep_env, begin, early):
     targets = np.array([0.5, 0.7, 1.05])
     metrics = sweep_metrics(run_jumps(OpenLoopPolicy(begin).act, sweep_env, targets), HEIGHTS_IN_RANGE)
     assert metrics["largest_reached_m"] == pytest.approx(OPEN_LOOP_APEX, abs=0.02)
@@ -164,7 +164,7 @@ def test_sweep_of_a_run_writes_metrics_plot_recording_and_filmstrip(trained, tmp
 # ---------------------------------------------------------------- learning curves
 
 
-def test_learning_curves_report_time_to_success_rates(tmp_path, monkeypatch):
+def test_learning_curves_report_time_to_success_rates_and_refuse_unknown_variants(tmp_path, monkeypatch):
     def train(args, name, seed):
         if seed == 1:
             return LearningCurve([2.0, 4.0, 6.0], [0.5, 0.96, 0.9], [10, 20, 30], ready=3.0)
@@ -208,7 +208,7 @@ def test_benchmark_reports_solver_environment_and_both_trainers(tmp_path):
     assert values["ppo_collect_s"] + values["ppo_update_s"] == pytest.approx(values["ppo_iteration_s"], rel=0.2)
 
 
-def test_soak_reports_no_invalid_worlds(tmp_path):
+def test_soak_of_simulation_and_environment_reports_no_invalid_worlds(tmp_path):
     for task in (None, "horizontal-jump"):
         args = SoakArgs(num_envs=8, steps=40, episode_steps=20, task=task, out=tmp_path, device="cpu")
         values = soak_test.main(args)
@@ -218,7 +218,7 @@ def test_soak_reports_no_invalid_worlds(tmp_path):
         assert 0.01 < values["largest_speed_m_s"] < 10.0 and values["largest_joint_speed_rad_s"] > 1.0
 
 
-def test_soak_counts_diverged_worlds(tmp_path, monkeypatch):
+def test_soak_counts_diverged_worlds(tmp_path, monkeypatch):  # 4 worlds diverge in each of 5 steps
     step = soak_test.Env.step
     monkeypatch.setattr(soak_test.Env, "step", lambda env, action: step(env, torch.full_like(action, torch.nan)))
     args = SoakArgs(
@@ -240,14 +240,14 @@ def test_soak_raises_on_non_finite_reward(tmp_path, monkeypatch):
         soak_test.main(args)
 
 
-def test_hardest_keeps_last_terrain_row_and_other_tasks():
+def test_hardest_keeps_only_last_terrain_row_and_tasks_without_terrain():
     terrain = hardest(make_task("velocity-rough")).reset.settings.terrain
     assert terrain == dataclasses.replace(make_task("velocity-rough").reset.settings.terrain, rows=1)
     for name in ("velocity-flat", "vertical-jump"):
         assert hardest(make_task(name)) == make_task(name)
 
 
-def test_baseline_ratios_compare_rates_with_other_checkout(tmp_path):
+def test_baseline_ratios_run_other_checkout_with_changed_flags_and_compare_rates(tmp_path):
     script = tmp_path / "base" / "experiments" / "script.py"
     script.parent.mkdir(parents=True)
     script.write_text(
@@ -311,7 +311,7 @@ def test_gradient_cost_reports_gradient_error_and_saved_bytes(tmp_path):
         assert 0.0 < values[f"error_{name}"] < 0.02
 
 
-def test_shac_experiment_reports_curves_and_gradient_noise(tmp_path):
+def test_shac_experiment_reports_curves_and_gradient_noise_and_refuses_empty_windows(tmp_path):
     args = shac.Args(
         seconds=0.1, eval_interval=0.1, seeds=(0,), num_envs=8, window=2, hidden=(8,), num_jumps=3, horizons=(1, 2),
         num_gradient_envs=4, out=tmp_path, device="cpu",

@@ -37,7 +37,10 @@ def policy(tmp_path_factory):
 
 
 def landing_log(goals, landing, end, **changes):
-    """Return the log of finished jumps of heading 0; goals, landing [m]: (rows, jumps, 2); end: termination index."""
+    """Return the log of finished jumps of heading 0.
+
+    goals, landing [m]: (worlds, jumps, 2), world; end: indices of terminations; changes: other arrays of the log.
+    """
     landings = LandingLog(np.array(goals, dtype=float), LANDING_TERMINATIONS)
     landings.end[:] = end
     landings.goal_world[:], landings.end_position[:], landings.touchdown[:] = goals, landing, landing
@@ -48,7 +51,7 @@ def landing_log(goals, landing, end, **changes):
 
 
 def goals_ahead(distances):
-    """Return goals straight ahead [m], (n, 1, 2)."""
+    """Return goals [m], (n, 1, 2), straight ahead at distances [m], (n,)."""
     return np.stack([distances, np.zeros(len(distances))], axis=1)[:, None]
 
 
@@ -131,7 +134,10 @@ def test_base_paths_are_in_start_frame():
 
 
 def bin_log(middle, *, clean, stepped=0, hopped=0):
-    """Return the log of 20 jumps: clean, stepped and hopped ones, the rest collides; touchdown 0.2 m short."""
+    """Return the log of 20 jumps over `middle` m: numbers of clean, stepped, hopped ones, the others collide.
+
+    Jumps end 0.01 m beyond the goal and touch down 0.2 m short of it.
+    """
     goals, good = goals_ahead([middle] * 20), clean + stepped + hopped
     air = [[0.0]] * (clean + stepped) + [[0.1]] * (20 - clean - stepped)
     lift = [[0.0]] * clean + [[0.1]] * (20 - clean)
@@ -184,7 +190,7 @@ def test_format_value_uses_four_digits_also_in_lists():
     assert format_value([0.123456, None, 2]) == "0.1235, None, 2" and format_value(1.0 / 3.0) == "0.3333"
 
 
-def test_platform_scenes_have_specified_ground_and_block():
+def test_platform_scenes_have_specified_ground_block_and_headings():
     rng, goals = np.random.default_rng(0), np.array([[0.8, 0.1], [1.0, -0.1]])
     scenes = {name: scene for name, *scene in Platform(edge=0.46).scenes(goals, rng)}
     ground = scenes["platform"][0]["ground"]
@@ -210,12 +216,12 @@ def test_side_view_is_perpendicular_to_path():
 
 
 class HopPolicy:
-    """Squats and extends the legs a second after the start, and again when `begin` is set."""
+    """Policy that squats for 60 policy steps and extends the legs for 20, from policy step `begin` on."""
 
     def __init__(self):
         self.step, self.begin = 0, 31
 
-    def act(self, obs):
+    def act(self, obs):  # actions (num_envs, 12), whatever the observations (num_envs, n)
         since, self.step = self.step - self.begin, self.step + 1
         level = 0.0 if since < 0 else min(since / 25, 1.0) if since < 60 else -1.0 if since < 80 else 0.0
         return torch.tensor([0.0, level, level] * 4).repeat(len(obs), 1)
@@ -223,9 +229,9 @@ class HopPolicy:
 
 @pytest.fixture(scope="module")
 def hops():
-    """Log of two hops in place of three worlds with different goals."""
+    """Log of two open-loop hops in place of each of three robots, which have different goals."""
     policy = still_policy("horizontal-jump")
-    ends = set(LANDING_TERMINATIONS) - {"no_jump"}  # the script squats too long for the task's patience
+    ends = set(LANDING_TERMINATIONS) - {"no_jump"}  # the script squats longer than `no_jump` allows
 
     def change(task):
         return dataclasses.replace(task, terminations=tuple(term for term in task.terminations if term.name in ends))

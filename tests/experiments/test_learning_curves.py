@@ -11,7 +11,7 @@ from support.learning import LearningCurve, train_and_evaluate
 
 
 class Trainer:
-    """A trainer whose iterations take 10 ms; records the progress that is set."""
+    """Stub of a trainer whose iterations take 10 ms; records the progress (0 to 1) that is set."""
 
     batch_size = 64
 

@@ -10,7 +10,7 @@ from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.utils.errors import InputError
 
 
-def test_springs_let_the_robot_jump_higher(tmp_path):
+def test_springs_raise_apex_and_highest_jump_is_recorded(tmp_path):
     args = leg_springs.Args(stiffness=(0.0, 500.0), squat_angles=(120.0,), filter="stock", out=tmp_path, device="cpu")
     values = leg_springs.main(args)
     assert json.loads((tmp_path / "metrics.json").read_text()) == values

@@ -9,7 +9,7 @@ from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.errors import InputError
 
 
-def test_a_heavier_robot_jumps_lower(tmp_path):
+def test_heavier_robot_jumps_lower_without_hardware_comparison(tmp_path):
     overlay = RobotOverlay({"base_mass": (10.0,)}, source="6.43 kg, and a load")
     overlay.save(tmp_path / "heavy.json")
     args = open_loop_jump.Args(robot=tmp_path / "heavy.json", out=tmp_path, device="cpu")

@@ -13,7 +13,10 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def squat_log(steps, **changes):
-    """Return the log of three robots, the last of which ends; steps: paw forces (4,) [N] of each policy step."""
+    """Return the log of three robots, of which robot 2 ends at step 2; steps: paw forces [N], (4,), by policy step.
+
+    Peak forces are 1, 2 and 900 N larger; torques alternate between 0 and 2 N m.
+    """
     squats = SquatLog(np.zeros((3, 3)), hold=1.5, window=2.0 / 60.0)
     for step, force in enumerate(steps):
         arrays = {

@@ -11,7 +11,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 
 def test_reported_metrics_equal_replay_of_saved_targets(tmp_path):
-    """A short search: the metrics are those of a replay of the targets that it wrote."""
+    """A short search reports the metrics of a replay of the targets that it wrote."""
     args = experiment.Args(jumps=("highest",), samples=48, effort=0.01, final_iterations=1, out=tmp_path, device="cpu")
     values = experiment.main(args)
     saved = np.load(tmp_path / "highest.npz", allow_pickle=False)
@@ -23,7 +23,7 @@ def test_reported_metrics_equal_replay_of_saved_targets(tmp_path):
 
 
 def test_replay_measures_paws_lifted_after_touchdown():
-    """A jump, a landing, a squat; and, in the second motion, another jump."""
+    """The first motion jumps, lands and squats; the second one then jumps again."""
     jump = JUMPS["still"]
     knots = jump.make(substeps=8, device="cpu").knots
     x = np.zeros((2, len(knots.at), 4))
@@ -37,7 +37,7 @@ def test_replay_measures_paws_lifted_after_touchdown():
 
 
 def test_replay_matches_objective_and_constraints_of_problem():
-    """Distance and constraints of a jump forward, in the simulation and in the rollout."""
+    """Distance [m] and largest violation of forward jumps, replayed in the simulation and rolled out in the problem."""
     jump = JUMPS["farthest"]
     made = jump.make(device="cpu", threads=1)
     x = torch.as_tensor(run_ups(made.knots, 32, np.random.default_rng(0)))
@@ -65,7 +65,7 @@ def test_each_limit_changes_only_the_named_setting():
     assert [made[f"farthest_friction_{name}"].friction for name in ("1_5", "0_6")] == [1.5, 0.6]
 
 
-def test_run_ups_lean_back_before_they_push():
+def test_run_ups_vary_lean_back_and_take_off():
     made = JUMPS["farthest"].make(device="cpu", threads=1)
     x = run_ups(made.knots, 32, np.random.default_rng(0))
     rows = x.reshape(32, -1, 4)

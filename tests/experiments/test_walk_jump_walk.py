@@ -28,7 +28,7 @@ def test_walk_jump_walk_with_two_robots_succeeds(tmp_path, monkeypatch):
     assert (tmp_path / "course.png").is_file() and (tmp_path / "walk_jump_walk.rrd").stat().st_size > 10_000
 
 
-def test_scripts_have_specified_commands():
+def test_scripts_have_specified_commands_and_are_reproducible():
     rng = np.random.default_rng(3)
     paper = walk_jump_walk.paper_script(rng)
     assert [step.kind for step in paper] == 3 * ["walk"] + ["jump_up"] + 3 * ["walk"] + ["jump_to"] + 2 * ["walk"]
@@ -42,7 +42,7 @@ def test_scripts_have_specified_commands():
     assert walk_jump_walk.scripts(args) == walk_jump_walk.scripts(args)
 
 
-def test_refuses_invalid_flags(tmp_path):
+def test_refuses_invalid_flags_and_policy_of_other_task(tmp_path):
     with pytest.raises(InputError, match="robots"):
         walk_jump_walk.Args(num_robots=0)
     with pytest.raises(PolicyError, match="evaluated by velocity"):

@@ -18,14 +18,14 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 @pytest.fixture(scope="module")
 def policies(tmp_path_factory):
-    """Folders of still policies by task."""
+    """Folder with a subfolder per task that holds a policy which stands still."""
     folder = tmp_path_factory.mktemp("policies")
     for name in ("velocity-flat", "horizontal-jump"):
         save_policy(folder / name, still_policy(name))
     return folder
 
 
-def test_standing_policy_has_rmse_of_command(policies, tmp_path):
+def test_standing_policy_has_rmse_of_command_and_gait_of_standing(policies, tmp_path):
     args = walking_tracking.Args(
         policy=str(policies / "velocity-flat"), commands_per_axis=2, num_recorded=0, out=tmp_path, device="cpu"
     )
@@ -52,7 +52,7 @@ def test_standing_policy_has_zero_success_on_terrains(policies, tmp_path):
 
 
 def test_kicked_and_sped_up_walks_have_specified_kicks_and_speeds():
-    class Env:
+    class Env:  # stub with the attributes that the walks read
         num_envs, task, step_dt = 16, make_task("velocity-flat"), 1.0 / 60.0
 
     kicked = kicked_walks(Env, np.random.default_rng(0))
