@@ -1,8 +1,8 @@
-"""`step_adjoint` for GPUs, with a thread per leg; each of a world's four computes the base's part. In three parts.
+"""`step_adjoint` for GPUs, with a thread per leg; each of a world's four threads also computes the base's part.
 
-`replay_leg` recomputes the motion and inverts the system of the contact laws' multipliers, for many steps in parallel.
-`reverse_leg` goes backwards from step to step and records multipliers. The gradients by parameters follow from these,
-again for many steps in parallel (`add_leg_constants`).
+1. `replay_leg` recomputes the motion and inverts the system of the contact laws' multipliers, many steps in parallel.
+2. `reverse_leg` goes backwards from step to step and records multipliers.
+3. `add_leg_constants` adds the gradients by parameters, computed from these, many steps in parallel.
 """
 
 import warp as wp
@@ -27,11 +27,7 @@ from .action_gradients import (
     make_base_factors,
     make_leg_factors,
 )
-from .gradients import (
-    ThreadSums,
-    add_entry,
-    add_leg_parameters,
-)
+from .gradients import ThreadSums, add_entry, add_leg_parameters
 from .leg_record import (
     ANGLES,
     RATES,
@@ -62,11 +58,11 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class LegAdjoint:
-    """Gradient by a world's state and inputs as a leg's thread holds it; axes and order as those of the value."""
+    """Gradient by a world's state and inputs, the part of one leg's thread; axes and order as those of the value."""
 
-    base: BaseState  # by the base's state at the start of the step, as the next two
-    angles: vec3  # by the motors' angles: lateral, outer, inner
-    rates: vec3
+    base: BaseState  # by the base's state at the start of the step
+    angles: vec3  # by the motors' angles at the start of the step: lateral, outer, inner
+    rates: vec3  # by the motors' rates at the start of the step
     torque: vec3  # by the motors' torques in the step
     force: vec3  # by the wrench on the base at its com, world axes; summed over steps as are the next four
     moment: vec3
@@ -77,7 +73,7 @@ class LegAdjoint:
 
 @wp.func
 def leg_law(c: PawContact, law: PawLaw, impulse: vec3, point: vec3) -> LegLaw:
-    """Return the part of a paw's law that is recorded; impulse [N s], point [m] of contact: body axes."""
+    """Return the recorded part of a paw's contact law; impulse [N s], point [m] of contact: body axes."""
     recorded = LegLaw()
     recorded.mode = law.mode
     recorded.mu_row = law.mu_row
@@ -98,8 +94,9 @@ def replay_leg(
 ):  # fmt: skip
     """Recompute a step of the rollout from entry i of the record, and write the state at its end to entry i + 1.
 
-    To entry i go the inverse of the base's system, the leg's elimination, and its paw's law. force [N], moment [N m]:
-    on the base at its com, world axes. Every thread of a world writes the base, with the same bits; see `replay_step`.
+    Entry i gets the inverse of the base's system, the leg's elimination, and its paw's law. force [N], moment [N m]:
+    on the base at its com, world axes. first_impulse: as `Commands.impulse`. All four threads of a world write the same
+    bits for the base; see `replay_step`.
     """
     base = get_base(record, i, world)
     rates = get_vec(record, i, RATES, world, leg)
@@ -111,8 +108,8 @@ def replay_leg(
     terms = leg_terms(
         params, spring, angles, rates, torque, stops, int(trajectory.pressed[step, leg, world]), base.ang, g, dt
     )
-    share = add_leg(BaseSystem(), terms.dynamics, terms.solve)
-    system = sum_systems(base_system(model, world, base, g, force, moment), share)
+    leg_system = add_leg(BaseSystem(), terms.dynamics, terms.solve)
+    system = sum_systems(base_system(model, world, base, g, force, moment), leg_system)
     inverse = hold_base(model, world, invert(system))
     solve = terms.solve
     put_inverse(record, i, world, inverse)
@@ -155,15 +152,18 @@ def replay_leg(
 
 @wp.func
 def any_leg(flag: bool) -> bool:
-    """Return whether a flag is set for any leg of the world."""
+    """Return whether the flag is set in any of the four threads of the world."""
     return sum_legs(wp.where(flag, real(1.0), real(0.0))) > real(0.0)
 
 
 @wp.func
-def law_block(c: PawContact, law: PawLaw, of: PawContact, of_law: PawLaw, leg: int, j: int) -> mat33:
-    """Return block (leg, j) of the system of the laws' multipliers; `of`, `of_law`: own paw, which thread j sends."""
-    to_lin = mat_from_leg(of.to_lin * wp.transpose(of_law.by_velocity), j)
-    to_ang = mat_from_leg(of.to_ang * wp.transpose(of_law.by_velocity), j)
+def law_block(c: PawContact, law: PawLaw, sent: PawContact, sent_law: PawLaw, leg: int, j: int) -> mat33:
+    """Return block (leg, j) of the matrix A^T of `step_adjoint`; all arguments but j are those of this thread's leg.
+
+    sent, sent_law: c and law again, of which thread j sends its own to the other threads.
+    """
+    to_lin = mat_from_leg(sent.to_lin * wp.transpose(sent_law.by_velocity), j)
+    to_ang = mat_from_leg(sent.to_ang * wp.transpose(sent_law.by_velocity), j)
     if law.mode == SEPARATE:
         return wp.where(leg == j, wp.identity(n=3, dtype=real), mat33(real(0.0)))
     if leg == j:
@@ -173,7 +173,10 @@ def law_block(c: PawContact, law: PawLaw, of: PawContact, of_law: PawLaw, leg: i
 
 @wp.func
 def reduce_block(block: mat33, factor: mat33, pivot: mat33, j: int, leg: int) -> mat33:
-    """Return a block after elimination with row j, whose scaled block is `pivot` in its own thread."""
+    """Return `block` of this thread's row (leg) after Gauss-Jordan elimination with row j.
+
+    factor: this row's block in column j. pivot: in thread j, the block of row j scaled by the inverse diagonal block.
+    """
     scaled = mat_from_leg(pivot, j)
     if leg == j:
         return scaled
@@ -182,7 +185,7 @@ def reduce_block(block: mat33, factor: mat33, pivot: mat33, j: int, leg: int) ->
 
 @wp.func
 def inverted_laws(c: PawContact, law: PawLaw, leg: int) -> LawRow:
-    """Return a row of the inverse of the multipliers' system: Gauss-Jordan by blocks in place, a row a thread."""
+    """Return row `leg` of the inverse of A^T (12x12) of `step_adjoint`: Gauss-Jordan by 3x3 blocks, a row a thread."""
     eye = wp.identity(n=3, dtype=real)
     none = mat33(real(0.0))
     a0 = law_block(c, law, c, law, leg, 0)
@@ -215,16 +218,17 @@ def inverted_laws(c: PawContact, law: PawLaw, leg: int) -> LawRow:
 
 @wp.func
 def multiplier(row: LawRow, impulse_cotangent: vec3) -> vec3:
-    """Return the multiplier of a paw's law, given each paw's gradient by its impulse, 0 where it is separated."""
+    """Return the multiplier l of the law of this thread's paw; impulse_cotangent: gradient by the paw's impulse.
+
+    row: see `inverted_laws`. Threads of separated paws must pass 0.
+    """
     total = row.a * vec_from_leg(impulse_cotangent, 0) + row.b * vec_from_leg(impulse_cotangent, 1)
     return -(total + row.c * vec_from_leg(impulse_cotangent, 2) + row.d * vec_from_leg(impulse_cotangent, 3))
 
 
 @wp.func
-def base_factors(
-    record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights
-) -> BaseFactors:  # fmt: skip
-    """Return the base's constants in the step at entry i."""
+def base_factors(record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights) -> BaseFactors:
+    """Return the base's constants in the step dt [s] at entry i of the record; base: state at its start."""
     return make_base_factors(base, get_base(record, i + 1, world), weights.lin, weights.ang, dt)
 
 
@@ -233,7 +237,7 @@ def leg_factors(
     record: LegRecord, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, world: int, step: int, i: int,
     leg: int, dt: real, law: LegLaw, weights: LegWeights,
 ) -> LegFactors:  # fmt: skip
-    """Return a leg's constants in the step of the rollout whose entry in the record is i."""
+    """Return a leg's constants in step `step` of the rollout, of dt [s], whose entry in the record is i."""
     push = vec3(real(0.0))
     if cotangent.impulse.shape[0] > 0:
         push = cotangent.impulse[step, leg, world]
@@ -245,7 +249,7 @@ def leg_factors(
 
 @wp.struct
 class StepWeights:
-    """Multipliers of a step's equations, and the gradients by the velocities at its start that they leave."""
+    """Multipliers of a step's equations, and the gradients by the velocities at its start that follow from them."""
 
     base: BaseWeights
     leg: LegWeights
@@ -261,7 +265,8 @@ def find_weights(
 ) -> StepWeights:  # fmt: skip
     """Return the multipliers of a step, given the gradients by the velocities at its end; see `find_multipliers`.
 
-    lin_, ang_, rate_cotangent: by the base's velocities in the body axes of the step's start, and the motors' rates.
+    lin_cotangent, ang_cotangent: by the base's velocities, in the body axes of the step's start; rate_cotangent: by the
+    motors' rates. i: the step's entry in the record.
     """
     inverse = get_inverse(record, i, world)
     solve = get_solve(record, i, world, leg)
@@ -305,10 +310,10 @@ def reverse_leg(
     trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, step: int, i: int, record: LegRecord, adj: LegAdjoint,
     writes_record: bool,
 ) -> LegAdjoint:  # fmt: skip
-    """Return the gradient by the state at the start of a step from `adj`, that at its end; see `reverse_step`.
+    """Return the gradient by the state at the start of a step, given `adj`, that by the state at its end.
 
-    i: the step's entry in the record, `step`: its number in the rollout. force [N], moment [N m]: on the base at its
-    com, world axes. writes_record: whether this thread writes the step's multipliers to the record.
+    See `reverse_step`. i: the step's entry in the record, step: its number in the rollout. force [N], moment [N m]: on
+    the base at its com, world axes. writes_record: whether this thread writes the step's multipliers to the record.
     """
     base = get_base(record, i, world)
     law = get_law(record, i, world, leg)
@@ -353,8 +358,8 @@ def reverse_leg(
 
 @wp.func
 def add_leg_constants(sums: ThreadSums, leg: int, law: LegLaw, gradient: LegGradient):
-    """Add a step's gradients by the parameters of a leg."""
+    """Add the gradient of a step by the parameters of a leg, friction coefficients included."""
     add_leg_parameters(sums, leg, gradient)
-    for row in range(2):  # one of the two coefficients
+    for row in range(2):  # the step depends on one of the two coefficients
         mu_row = leg * LEG_ROWS + wp.where(row == 0, int(MU_STATIC), int(MU_DYNAMIC))
         add_entry(sums, mu_row, wp.where(law.mode != SEPARATE and law.mu_row == mu_row, gradient.mu, real(0.0)))

@@ -1,7 +1,8 @@
-"""`rollout_adjoint` for GPUs, with four threads per world, one per leg; a span of rows at a time, last to first.
+"""`rollout_adjoint` for GPUs, with four threads per world, one per leg; spans of rows are processed last to first.
 
-Each span takes four launches: its steps are recomputed, all rows in parallel; run backwards one by one; and then twice
-visited in parallel for the gradients by parameters (`constants_adjoint`).
+Each span takes four launches: `replay_legs_kernel` recomputes its steps, all rows in parallel; `reverse_legs_kernel`
+runs backwards step by step; the two kernels of `constants_adjoint` add the gradients by parameters, all steps in
+parallel.
 """
 
 import warp as wp
@@ -56,7 +57,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class Span:
-    """Range of rows whose steps a launch takes."""
+    """Range of rows whose steps a launch processes."""
 
     begin: int  # first row
     end: int  # excluded
@@ -64,7 +65,7 @@ class Span:
 
 @wp.func
 def first_entry(timing: Timing, span: Span, row: int) -> int:
-    """Return the record's entry of the first step after a row; each row has `every` + 1, the last for its end."""
+    """Return the record's entry of the first step after a row; a row has `every` + 1 entries, the last for its end."""
     return (row - span.begin) * (timing.every + 1)
 
 
@@ -85,7 +86,7 @@ def replay_legs_kernel(
 ):
     """Recompute the steps after each row; launch over (rows of the span, count rounded up to a multiple of 8, 4).
 
-    Threads beyond the last world repeat it, and write the same bits.
+    count: number of worlds, from `settings.first` on. Threads beyond the last world repeat it and write the same bits.
     """
     offset, index, leg = wp.tid()
     world = settings.first + wp.min(index, count - 1)
@@ -127,7 +128,7 @@ def replay_legs_kernel(
 
 @wp.func
 def load_entries(gradients: Gradients, world: int) -> RowCotangent:
-    """Return the gradient by the base's entries of the row after a span."""
+    """Return the gradient by the base's entries of the row after a span, from `gradients.q` and `gradients.qd`."""
     entries = RowCotangent()
     entries.pos = vec3(gradients.q[0, world], gradients.q[1, world], gradients.q[2, world])
     entries.quat = quat(gradients.q[3, world], gradients.q[4, world], gradients.q[5, world], gradients.q[6, world])
@@ -138,7 +139,7 @@ def load_entries(gradients: Gradients, world: int) -> RowCotangent:
 
 @wp.func
 def load_motor_entries(gradients: Gradients, world: int, leg: int) -> LegAdjoint:
-    """Return the gradient by a leg's entries of the row after a span."""
+    """Return the gradient by a leg's angles and rates in the row after a span; all else is 0."""
     m = 3 * leg
     adj = LegAdjoint()
     adj.angles = vec3(gradients.q[7 + m, world], gradients.q[8 + m, world], gradients.q[9 + m, world])
@@ -151,7 +152,10 @@ def reverse_motors(
     old: LegAdjoint, slopes: MotorSlopes, arrived: Arrival, cotangent: TrajectoryArrays, step: int, leg: int,
     world: int, gradients: Gradients, writes: bool,
 ) -> LegAdjoint:  # fmt: skip
-    """Return the gradient with that by the motors' angles and rates; if it `writes`, add that by their targets."""
+    """Return `old` plus the gradient through the motors' torques by angles and rates of a leg in a physics step.
+
+    slopes: derivatives of the torques. writes: whether this thread adds the gradient by the targets to `gradients`.
+    """
     adj = old
     torque_cotangent = adj.torque
     if cotangent.torque.shape[0] > 0:
@@ -184,8 +188,9 @@ def reverse_legs_kernel(
 ):
     """Run the steps of a span backwards; launch over (count rounded up to a multiple of 8, 4).
 
-    gradients.q and qd hold the gradient by the row after the span, and then that by its first row. Of those by
-    parameters the base's and the filter's are added. Threads beyond the last world repeat it, and write nothing.
+    gradients.q and gradients.qd hold the gradient by the row after the span, and are replaced by that by its first row.
+    Of the gradients by parameters those of base, gravity and filter are added. count: number of worlds, from
+    `settings.first` on; threads beyond the last world repeat it and write nothing.
     """
     index, leg = wp.tid()
     world = settings.first + wp.min(index, count - 1)

@@ -26,7 +26,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class LegStep:
-    """A leg in a step: input (angles, rates, torque), scratch and results; vectors are lateral, outer, inner."""
+    """A leg in a step: input (angles, rates, torque), scratch and results; motors are lateral, outer, inner."""
 
     angles: vec3  # [rad] at the start of the step
     rates: vec3  # [rad/s] at the start of the step
@@ -41,12 +41,12 @@ class LegStep:
 
 @wp.struct
 class StepSolution:
-    """Velocities of the base at the end of a step, in the body axes of its start, and statistics."""
+    """Velocities of the base at the end of a step, in the body axes of the start of the step, and statistics."""
 
     lin: vec3  # [m/s]
     ang: vec3  # [rad/s]
     contact: ContactState  # of the last solution
-    sets: int  # of pressed stops that were tried
+    sets: int  # number of sets of pressed stops that were tried
 
 
 @wp.func
@@ -54,7 +54,7 @@ def solve_with_stops(
     model: RobotModel, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
     impulse: wp.array2d(dtype=vec3), legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact),
 ) -> StepSolution:  # fmt: skip
-    """Solve a step with given sets of pressed stops; see `solve_step`."""
+    """Solve a step with the sets `legs[k].pressed` and their `stop_rates`; arguments and results as `solve_step`."""
     dt = settings.dt
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     system = base_system(model, world, base, g, force, moment)
@@ -94,7 +94,10 @@ def solve_with_stops(
 
 @wp.func
 def revise_stops(legs: wp.array(dtype=LegStep), slack: real, sets: int) -> bool:
-    """Replace each leg's set of pressed stops by the one its new rates require; returns whether any changed."""
+    """Replace each leg's set of pressed stops by the one its new rates require; returns whether any set changed.
+
+    slack [rad/s]: see `pressed_stops`; sets: number of sets tried in this step.
+    """
     changed = bool(False)
     for k in range(legs.shape[0]):
         pressed = legs[k].pressed
@@ -114,11 +117,9 @@ def solve_step(
 ) -> StepSolution:  # fmt: skip
     """Solve a step of one world, and write every leg's pressed stops, contact and motor rates at the end of the step.
 
-    force [N], moment [N m]: from outside at the base's com, world axes. impulse: first guess [N s], world frame,
-    (4, num_worlds). legs, contacts: local to the thread, shape (4,); of the legs the motors' angles, rates and torques
-    are read, and all else is written.
-
-    The stops that the rates at the start would press are tried first.
+    force [N], moment [N m]: external, at the base's com, world axes. impulse: first guess [N s], world axes,
+    (4, num_worlds). legs, contacts: local to the thread, (4,); `angles`, `rates` and `torque` of the legs are read, and
+    all else but `peak_sq` is written. The first set tried holds the stops that the rates at the start would press.
     """
     dt = settings.dt
     for k in range(legs.shape[0]):
