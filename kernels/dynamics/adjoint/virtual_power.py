@@ -123,7 +123,7 @@ def inertia_power(body: MassMoments, frame: FrameMotion) -> real:
 
 @wp.func_grad(inertia_power)
 def adj_inertia_power(body: MassMoments, frame: FrameMotion, adj_ret: real):
-    """Add adj_ret times the partial derivatives of `inertia_power` to `wp.adjoint`; u, h: see the module's docstring."""
+    """Add adj_ret times the partial derivatives of `inertia_power` to `wp.adjoint`; u, h: see the module."""
     acc, ang, ang_acc = frame.acc, frame.ang, frame.ang_acc
     lin_v, ang_v, first = frame.virtual_lin, frame.virtual_ang, body.first
     u = wp.cross(ang, first)
