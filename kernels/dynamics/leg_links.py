@@ -151,15 +151,11 @@ def add_thigh(
     sums.first += vec3(link.mass * x + u[0], link.mass * y + u[1], u[2])
     sums.second += (
         vec6(
-            x * along_x,
-            y * (two * u[1] + link.mass * y),
-            real(0.0),
-            x * u[1] + y * u[0] + link.mass * x * y,
-            x * u[2],
-            y * u[2],
+            x * along_x, y * (two * u[1] + link.mass * y), real(0.0),
+            x * u[1] + y * u[0] + link.mass * x * y, x * u[2], y * u[2],
         )
         + s
-    )
+    )  # fmt: skip
     sums.second_o += vec5(two * u_o[0] * x, real(0.0), u_o[0] * y, u_o[1] * x, u_o[1] * y) + sign * cross_y_second(s)
     sums.lin_o += u_o
     sums.ang_o += vec3(y * u_o[1], -x * u_o[1], -y * u_o[0]) + sign * spin_y(s)

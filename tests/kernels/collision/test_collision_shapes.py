@@ -11,14 +11,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def shape_kernel(
-    start_a: wp.array(dtype=wp.vec3),
-    end_a: wp.array(dtype=wp.vec3),
-    start_b: wp.array(dtype=wp.vec3),
-    end_b: wp.array(dtype=wp.vec3),
-    half: wp.array(dtype=wp.vec3),
-    segments: wp.array(dtype=float),
+    start_a: wp.array(dtype=wp.vec3), end_a: wp.array(dtype=wp.vec3), start_b: wp.array(dtype=wp.vec3),
+    end_b: wp.array(dtype=wp.vec3), half: wp.array(dtype=wp.vec3), segments: wp.array(dtype=float),
     boxes: wp.array(dtype=float),
-):
+):  # fmt: skip
     """Write the distances [m] of segments a and b, and of segment a and the box at the origin; one thread per case."""
     i = wp.tid()
     segments[i] = wp.sqrt(collision_shapes.segment_segment_sq(start_a[i], end_a[i], start_b[i], end_b[i]))
