@@ -329,10 +329,7 @@ def collision_kernel(
     flags: wp.array(dtype=wp.int32),
     clearance: wp.array(dtype=wp.float32),
 ):
-    """Write `world_collisions` of every robot to flags, clearance [m] (num_worlds,); one thread per world.
-
-    joint_q: Newton's, flat, `coords_per_world` per world.
-    """
+    """Write `world_collisions` per world, clearance in [m]; joint_q: Newton's, flat, `coords_per_world` per world."""
     world = wp.tid()
     here = world_ground(ground, world)
     collisions = world_collisions(geometry, here, joint_q, world * coords_per_world, margin)

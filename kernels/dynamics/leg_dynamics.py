@@ -204,10 +204,7 @@ def assemble_leg(
 
 @wp.func
 def leg_dynamics(geo: LegGeometry, masses: LegMasses, pose: LegPose, rates: vec3, omega: vec3, g: vec3) -> LegDynamics:
-    """Return the dynamics of one leg; rates [rad/s]: of the lateral, outer and inner motor.
-
-    omega [rad/s]: base angular velocity, g [m/s^2]: gravity, both in body axes.
-    """
+    """Return a leg's dynamics; motor rates [rad/s]; omega [rad/s], g [m/s^2]: base rate and gravity, body axes."""
     bias = five_bar_bias(geo, pose.loop, rates[1], rates[2])
     outer = outer_sums(geo, masses.outer_thigh, masses.outer_shank, pose.loop, bias)
     inner = inner_sums(geo, masses.inner_thigh, masses.inner_shank, pose.loop, bias)

@@ -206,10 +206,7 @@ def paw_contact(
 
 @wp.func
 def base_system(model: RobotModel, world: int, base: BaseState, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
-    """Return the equations of the base link alone; g: gravity [m/s^2], body axes.
-
-    force [N], moment [N m]: external, at the base's com, world axes.
-    """
+    """Return the base link's equations; g [m/s^2]: body axes; force [N], moment [N m]: external, at com, world axes."""
     wrench = external_wrench(base, base_com(model.table, world), force, moment)
     return base_link_system(load_moments(model.table, BASE, world), base.ang, g, wrench.force, wrench.moment)
 

@@ -98,10 +98,7 @@ def thigh_angle(geo: LegGeometry, away: real, z: real) -> real:
 
 @wp.func
 def clamped_closed_form(geo: LegGeometry, limits: LegLimits, target: vec3) -> vec3:
-    """Return (lateral, outer, inner) [rad] for an ankle target [m] relative to the hip, body axes, within limits.
-
-    Exact for a reachable target, otherwise a first guess.
-    """
+    """Return motor angles [rad] in limits for an ankle target [m] from the hip, body axes; a guess if out of reach."""
     plane = geo.plane_y + geo.knee_y
     z = -wp.sqrt(wp.max(target[1] * target[1] + target[2] * target[2] - plane * plane, real(0.0)))
     outer = thigh_angle(geo, geo.front * (target[0] - geo.outer_x), z)

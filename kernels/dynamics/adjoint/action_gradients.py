@@ -72,10 +72,7 @@ def make_leg_factors(
     rates: vec3, new_rates: vec3, virtual_rates: vec3, mode: int, pressed: int, impulse: vec3, law: vec3, push: vec3,
     dt: real,
 ) -> LegFactors:  # fmt: skip
-    """Return a leg's constants, see `LegFactors` for all arguments but rates and dt.
-
-    rates, new_rates [rad/s]: of the motors at start and end of a step of dt [s].
-    """
+    """Return a leg's `LegFactors`; rates, new_rates [rad/s]: of the motors at start and end of a step of dt [s]."""
     factors = LegFactors()
     factors.virtual_rates = virtual_rates
     factors.rates = new_rates

@@ -20,37 +20,10 @@ from ..inertia import MassMoments
 from ..parameters import load_spring, load_stops, load_vec3
 from ..step import LegParams, RobotModel, base_system, hold_base, leg_terms
 from ..trajectory import TrajectoryArrays, row_vec3
-from .action_gradients import (
-    LegGradient,
-    base_action_gradient,
-    leg_action_gradient,
-    make_base_factors,
-    make_leg_factors,
-)
+from . import action_gradients, leg_record
+from .action_gradients import LegGradient, base_action_gradient, leg_action_gradient, make_base_factors
 from .gradients import ThreadSums, add_entry, add_leg_parameters
-from .leg_record import (
-    ANGLES,
-    RATES,
-    BaseWeights,
-    LawRow,
-    LegLaw,
-    LegRecord,
-    LegWeights,
-    get_base,
-    get_inverse,
-    get_law,
-    get_law_row,
-    get_solve,
-    get_vec,
-    put_base,
-    put_base_weights,
-    put_inverse,
-    put_law,
-    put_law_row,
-    put_leg_weights,
-    put_solve,
-    put_vec,
-)
+from .leg_record import ANGLES, RATES, BaseWeights, LawRow, LegLaw, LegRecord, LegWeights
 from .virtual_power import BaseFactors, LegFactors, add, rotation_adjoint_scalar
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -98,9 +71,9 @@ def replay_leg(
     on the base at its com, world axes. first_impulse: as `Commands.impulse`. All four threads of a world write the same
     bits for the base; see `replay_step`.
     """
-    base = get_base(record, i, world)
-    rates = get_vec(record, i, RATES, world, leg)
-    angles = get_vec(record, i, ANGLES, world, leg)
+    base = leg_record.get_base(record, i, world)
+    rates = leg_record.get_vec(record, i, RATES, world, leg)
+    angles = leg_record.get_vec(record, i, ANGLES, world, leg)
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     torque = row_vec3(trajectory.torque, step, 3 * leg, world)
     stops = stop_rates(load_stops(model.table, leg, world), angles, dt)
@@ -112,7 +85,7 @@ def replay_leg(
     system = sum_systems(base_system(model, world, base, g, force, moment), leg_system)
     inverse = hold_base(model, world, invert(system))
     solve = terms.solve
-    put_inverse(record, i, world, inverse)
+    leg_record.put_inverse(record, i, world, inverse)
     paw = terms.paw
     c = PawContact()
     push = vec3(real(0.0))
@@ -127,16 +100,16 @@ def replay_leg(
         push = impulse - wp.transpose(solve.to_lin) * joint
         twist = wp.cross(point, impulse) - wp.transpose(solve.to_ang) * joint
         solve.free += solve.inverse * (joint / dt)
-    put_solve(record, i, world, leg, solve)
+    leg_record.put_solve(record, i, world, leg, solve)
     push = dt * system.force + sum_vec(push)
     twist = dt * system.moment + sum_vec(twist)
     lin = solve_lin(inverse, push, twist)
     ang = solve_ang(inverse, push, twist)
     new_rates = rates + dt * motor_acceleration(solve, lin / dt, ang / dt)
-    put_vec(record, i + 1, RATES, world, leg, new_rates)
-    put_vec(record, i + 1, ANGLES, world, leg, angles + dt * new_rates)
+    leg_record.put_vec(record, i + 1, RATES, world, leg, new_rates)
+    leg_record.put_vec(record, i + 1, ANGLES, world, leg, angles + dt * new_rates)
     old_lin = wp.quat_rotate_inv(base.quat, base.lin)
-    put_base(record, i + 1, world, integrate_base(base, old_lin + lin, base.ang + ang, dt))
+    leg_record.put_base(record, i + 1, world, integrate_base(base, old_lin + lin, base.ang + ang, dt))
     law = PawLaw()
     if touches:
         old_velocity = old_lin + wp.cross(base.ang, point) + c.jacobian * rates
@@ -146,8 +119,8 @@ def replay_leg(
             old_impulse = trajectory.impulse[step - 1, leg, world]
         law = paw_law(model, world, leg, c, old_velocity, velocity, wp.quat_rotate_inv(base.quat, old_impulse))
     if any_world(any_leg(law.mode != SEPARATE)):
-        put_law_row(record, i, world, leg, inverted_laws(c, law, leg))
-    put_law(record, i, world, leg, leg_law(c, law, impulse, point))
+        leg_record.put_law_row(record, i, world, leg, inverted_laws(c, law, leg))
+    leg_record.put_law(record, i, world, leg, leg_law(c, law, impulse, point))
 
 
 @wp.func
@@ -229,7 +202,7 @@ def multiplier(row: LawRow, impulse_cotangent: vec3) -> vec3:
 @wp.func
 def base_factors(record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights) -> BaseFactors:
     """Return the base's constants in the step dt [s] at entry i of the record; base: state at its start."""
-    return make_base_factors(base, get_base(record, i + 1, world), weights.lin, weights.ang, dt)
+    return make_base_factors(base, leg_record.get_base(record, i + 1, world), weights.lin, weights.ang, dt)
 
 
 @wp.func
@@ -241,9 +214,9 @@ def leg_factors(
     push = vec3(real(0.0))
     if cotangent.impulse.shape[0] > 0:
         push = cotangent.impulse[step, leg, world]
-    return make_leg_factors(
-        get_vec(record, i, RATES, world, leg), get_vec(record, i + 1, RATES, world, leg), weights.rates, law.mode,
-        int(trajectory.pressed[step, leg, world]), law.impulse, weights.law, push, dt,
+    return action_gradients.make_leg_factors(
+        leg_record.get_vec(record, i, RATES, world, leg), leg_record.get_vec(record, i + 1, RATES, world, leg),
+        weights.rates, law.mode, int(trajectory.pressed[step, leg, world]), law.impulse, weights.law, push, dt,
     )  # fmt: skip
 
 
@@ -268,8 +241,8 @@ def find_weights(
     lin_cotangent, ang_cotangent: by the base's velocities, in the body axes of the step's start; rate_cotangent: by the
     motors' rates. i: the step's entry in the record.
     """
-    inverse = get_inverse(record, i, world)
-    solve = get_solve(record, i, world, leg)
+    inverse = leg_record.get_inverse(record, i, world)
+    solve = leg_record.get_solve(record, i, world, leg)
     weights = StepWeights()
     weights.lin = lin_cotangent
     weights.ang = ang_cotangent
@@ -289,7 +262,7 @@ def find_weights(
             impulse_cotangent += wp.quat_rotate_inv(base.quat, cotangent.impulse[step, leg, world])
     if any_world(any_leg(touches)):
         y = vec3(real(0.0))
-        weights.leg.law = multiplier(get_law_row(record, i, world, leg), impulse_cotangent)
+        weights.leg.law = multiplier(leg_record.get_law_row(record, i, world, leg), impulse_cotangent)
         if touches:
             y = wp.transpose(law.by_velocity) * weights.leg.law
         joint = wp.transpose(law.jacobian) * y
@@ -315,8 +288,8 @@ def reverse_leg(
     See `reverse_step`. i: the step's entry in the record, step: its number in the rollout. force [N], moment [N m]: on
     the base at its com, world axes. writes_record: whether this thread writes the step's multipliers to the record.
     """
-    base = get_base(record, i, world)
-    law = get_law(record, i, world, leg)
+    base = leg_record.get_base(record, i, world)
+    law = leg_record.get_law(record, i, world, leg)
     new_velocity = adj.base.lin + dt * adj.base.pos
     quat_adj, ang_cotangent, _dt, _quat_adj = wp.grad(rotation_adjoint_scalar)(
         base.quat, row_vec3(record.base, i + 1, 10, world), dt, adj.base.quat
@@ -330,16 +303,16 @@ def reverse_leg(
     base_held = base_factors(record, world, i, dt, base, base_weights)
     leg_held = leg_factors(record, trajectory, cotangent, world, step, i, leg, dt, law, weights.leg)
     gradient = leg_action_gradient(
-        model, params, world, leg, law.mu, base, get_vec(record, i, ANGLES, world, leg),
-        get_vec(record, i, RATES, world, leg), base_held, leg_held, dt,
+        model, params, world, leg, law.mu, base, leg_record.get_vec(record, i, ANGLES, world, leg),
+        leg_record.get_vec(record, i, RATES, world, leg), base_held, leg_held, dt,
     )  # fmt: skip
     base_weights.cotangent.velocity = weights.lin
     base_weights.cotangent.new_velocity = new_velocity
     base_weights.cotangent.gravity = sum_vec(gradient.gravity)
     by_base = base_action_gradient(model, world, force, moment, base, base_held, base_weights.cotangent, dt)
     if writes_record:
-        put_base_weights(record, i, world, base_weights)
-        put_leg_weights(record, i, world, leg, weights.leg)
+        leg_record.put_base_weights(record, i, world, base_weights)
+        leg_record.put_leg_weights(record, i, world, leg, weights.leg)
     out = LegAdjoint()
     out.base.pos = adj.base.pos + sum_vec(gradient.pos)
     out.base.quat = quat_adj + by_base.quat + sum_quat(gradient.quat)

@@ -74,10 +74,7 @@ class Multipliers:
 def solve_system(
     record: StepRecord, at: ReplayedStep, lin_cotangent: vec3, ang_cotangent: vec3, legs: wp.array(dtype=LegReverse)
 ) -> Multipliers:
-    """Return the base's m of M m = y, and write the motors' m to `virtual_rates` of `legs`.
-
-    y: lin_cotangent, ang_cotangent (base, body axes) and `rates` of each of the `legs`.
-    """
+    """Return the base's m of M m = y and write the motors' m to `legs`; y: *_cotangent (base), `legs[k].rates`."""
     m = Multipliers()
     m.lin_cotangent = lin_cotangent
     m.ang_cotangent = ang_cotangent

@@ -27,16 +27,8 @@ from ..trajectory import (
     row_vec3,
     store_row_vec3,
 )
-from .command_adjoint import (
-    FilterAdjoint,
-    MotorAdjoint,
-    add_motor_constants,
-    add_offsets,
-    add_targets,
-    filter_adjoint_scalar,
-    filter_gradient,
-    motor_gradient,
-)
+from . import command_adjoint
+from .command_adjoint import FilterAdjoint, MotorAdjoint
 from .gradients import GRADIENT_ROWS, Gradients, add_com, add_filter
 from .multipliers import LegReverse, ReplayedStep, StepRecord, replay_step
 from .step_adjoint import reverse_step
@@ -211,8 +203,8 @@ def add_motor_adjoint(
     torque_cotangent = legs[k].torque[c]
     if cotangent.torque.shape[0] > 0:
         torque_cotangent += cotangent.torque[at.step, motor, at.world]
-    add_targets(gradients, arrived, motor, at.world, torque_cotangent * by_motor.target)
-    add_motor_constants(sums, sums, motor, torque_cotangent, by_motor)
+    command_adjoint.add_targets(gradients, arrived, motor, at.world, torque_cotangent * by_motor.target)
+    command_adjoint.add_motor_constants(sums, sums, motor, torque_cotangent, by_motor)
     angles = legs[k].angles
     rates = legs[k].rates
     angles[c] += torque_cotangent * by_motor.angle
@@ -228,7 +220,7 @@ def add_filter_adjoint(
 ):  # fmt: skip
     """Add the gradients by the inputs of leg k's filter in policy step t: raw targets, constants, angles and rates."""
     store_row_vec3(gradients.target, t, 3 * k, world, by_filter.target)
-    add_offsets(sums, k, by_filter.angles)
+    command_adjoint.add_offsets(sums, k, by_filter.angles)
     add_filter(sums, by_filter.constants)
     legs[k].angles = legs[k].angles + by_filter.angles
     legs[k].rates = legs[k].rates + by_filter.rates
@@ -303,7 +295,7 @@ def reverse_kernel(
             for i in range(motors.shape[0]):
                 angle = record.angles[world, at.entry, i / 3][i % 3]
                 rate = record.rates[world, at.entry, i / 3][i % 3]
-                by_motor = motor_gradient(
+                by_motor = command_adjoint.motor_gradient(
                     motors[i], delay, commands, filtered_target, timing, at.dt, at.step, i, world, angle, rate
                 )
                 add_motor_adjoint(by_motor, arrived, at, i, cotangent, gradients, legs, sums)
@@ -312,7 +304,7 @@ def reverse_kernel(
         )
         if row * timing.every == t * timing.substeps:
             for k in range(legs.shape[0]):
-                by_filter = filter_gradient(
+                by_filter = command_adjoint.filter_gradient(
                     commands, actuation, t, k, world, record.angles[world, 0, k], record.rates[world, 0, k], gradients
                 )
                 add_filter_adjoint(by_filter, t, k, world, gradients, legs, sums)
@@ -346,7 +338,7 @@ def adjoint_roots(
         + base_action(load_moments(model.table, BASE, world), v, v, v, v, q, v, v, base, base_cotangent, x)
         + rotation_adjoint_scalar(q, v, x, q)
         + motor_torque(x, x, x, load_world_motor(actuation, 0, world))
-        + filter_adjoint_scalar(v, v, v, load_filter(actuation.limits, world), v)
+        + command_adjoint.filter_adjoint_scalar(v, v, v, load_filter(actuation.limits, world), v)
         + row_adjoint_scalar(v, q, v, v, v, state)
         + store_adjoint_scalar(q, v, v, v, v, v)
     )

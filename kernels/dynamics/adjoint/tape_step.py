@@ -53,10 +53,7 @@ def solve_kernel(
     # out
     solved: SolvedStep,
 ):
-    """Write the solution of a step of every world (velocities, impulses, pressed stops); one thread per world.
-
-    Motor torques are those in drive.joint_f; blocks are ignored.
-    """
+    """Write the solution of a step of every world to `solved` and `work`, without blocks; torques: drive.joint_f."""
     world = wp.tid()
     base = load_base(joint_q, joint_qd, base_com(model.table, world), world)
     legs = wp.zeros(shape=(4,), dtype=LegStep)
@@ -155,10 +152,7 @@ def adj_end_velocities(
     joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), solved: SolvedStep, record: StepRecord,
     power: wp.array2d(dtype=real), world: int, adj_ret: EndVelocities,
 ):  # fmt: skip
-    """Write the multipliers that `power_kernel` reads to `solved`, and add 1 to the gradient by its `power`.
-
-    adj_ret: gradient by the result of `end_velocities`.
-    """
+    """Write multipliers for `power_kernel` to `solved`, add 1 to the gradient by `power`; adj_ret: by the result."""
     params = wp.zeros(shape=(4,), dtype=LegParams)
     legs = wp.zeros(shape=(4,), dtype=LegReverse)
     wrench = base_wrench(joint_f, body_f, world)

@@ -277,10 +277,7 @@ def housing_motion(
 def passive_power(
     joints: JointParams, loop: FiveBar, front: real, rates: vec3, stop_rates: StopRates, leg: LegFactors, dt: real
 ) -> real:
-    """Return the virtual power of friction, damping, pressed stops and the motors' armature; arguments: `joint_forces`.
-
-    rates [rad/s]: at the start of the step dt [s].
-    """
+    """Return the virtual power of friction, damping, pressed stops and armature; arguments as in `joint_forces`."""
     passive = joint_forces(joints, loop, front, rates, stop_rates, leg.pressed, dt)
     implicit = passive.inertia * leg.acc + wp.cw_mul(joints.armature, leg.acc)
     return wp.dot(leg.virtual_rates, passive.torque - implicit)

@@ -40,10 +40,7 @@ def rollout_legs_kernel(
     filtered_target: wp.array3d(dtype=real),
     trajectory: TrajectoryArrays,
 ):
-    """Run a rollout as `rollout_kernel`, up to the contact tolerance; launch over (count rounded up to 8 n, 4).
-
-    count: number of worlds, from `settings.first` on. Arguments as there.
-    """
+    """Run a rollout as `rollout_kernel`; launch over (count, the number of worlds, rounded up to 8 n; 4)."""
     index, leg = wp.tid()
     world = settings.first + wp.min(index, count - 1)  # threads beyond the last world repeat it
     com = base_com(model.table, world)

@@ -2,16 +2,7 @@
 
 import warp as wp
 
-from ...actuation.stops import (
-    MAX_SETS,
-    SLACK,
-    StopRates,
-    change_one,
-    one_by_one,
-    pressed_stops,
-    revised_stops,
-    stop_rates,
-)
+from ...actuation import stops
 from ...layout import GRAVITY
 from ...scalar import real, vec3
 from ...state import BaseState
@@ -32,7 +23,7 @@ class LegStep:
     rates: vec3  # [rad/s] at the start of the step
     torque: vec3  # [N m] of the motors
     new_rates: vec3  # [rad/s] at the end of the step
-    stop_rates: StopRates
+    stop_rates: stops.StopRates
     pressed: int  # set of pressed hard stops, see `stops`
     solve: LegSolve
     paw: PawKinematics
@@ -101,10 +92,10 @@ def revise_stops(legs: wp.array(dtype=LegStep), slack: real, sets: int) -> bool:
     changed = bool(False)
     for k in range(legs.shape[0]):
         pressed = legs[k].pressed
-        required = revised_stops(legs[k].stop_rates, legs[k].new_rates, slack, pressed, sets)
-        if required != pressed and not (changed and one_by_one(sets)):
-            if one_by_one(sets):
-                required = change_one(pressed, required)
+        required = stops.revised_stops(legs[k].stop_rates, legs[k].new_rates, slack, pressed, sets)
+        if required != pressed and not (changed and stops.one_by_one(sets)):
+            if stops.one_by_one(sets):
+                required = stops.change_one(pressed, required)
             legs[k].pressed = required
             changed = True
     return changed
@@ -123,16 +114,16 @@ def solve_step(
     """
     dt = settings.dt
     for k in range(legs.shape[0]):
-        bounds = stop_rates(load_stops(model.table, k, world), legs[k].angles, dt)
+        bounds = stops.stop_rates(load_stops(model.table, k, world), legs[k].angles, dt)
         legs[k].stop_rates = bounds
-        legs[k].pressed = pressed_stops(bounds, legs[k].rates, real(0.0), 0)
-    slack = SLACK * settings.tolerance
+        legs[k].pressed = stops.pressed_stops(bounds, legs[k].rates, real(0.0), 0)
+    slack = stops.SLACK * settings.tolerance
     solution = StepSolution()
     sets = int(0)
     working = bool(True)
     while working:
         solution = solve_with_stops(model, settings, world, base, force, moment, block, impulse, legs, contacts)
         sets += 1
-        working = sets < MAX_SETS and revise_stops(legs, slack, sets)
+        working = sets < stops.MAX_SETS and revise_stops(legs, slack, sets)
     solution.sets = sets
     return solution

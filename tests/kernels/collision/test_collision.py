@@ -142,10 +142,7 @@ def random_poses():
 
 
 def leg_points(leg, lateral, outer, inner):
-    """Return (5, 3) points [m] of leg 0 to 3 in the body frame for motor angles [rad].
-
-    Rows: outer axis, inner axis, outer knee, inner knee, ankle.
-    """
+    """Return points [m] (outer axis, inner axis, outer knee, inner knee, ankle; body frame) of a leg, angles [rad]."""
     front, side = LEGS[leg]
     hip = np.array([front * 0.1433, side * (0.105 if front > 0 else 0.150), 0.0])
     housing = Rotation.from_rotvec([side * lateral, 0, 0])

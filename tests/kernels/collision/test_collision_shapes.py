@@ -30,10 +30,7 @@ def shape_distances(start_a, end_a, start_b, end_b, half):
 
 
 def random_segments(count=4000):
-    """Return start_a, end_a, start_b, end_b and half extents [m], each (count, 3).
-
-    By quarters: a nearly parallel to b, a along a box edge, a a point, any.
-    """
+    """Return start_a, end_a, start_b, end_b, half [m], (count, 3); quarters: parallel, a along y, a a point, any."""
     rng = np.random.default_rng(3)
     start_a, start_b = rng.uniform(-0.3, 0.3, (2, count, 3))
     step_a, step_b = rng.uniform(-0.3, 0.3, (2, count, 3))

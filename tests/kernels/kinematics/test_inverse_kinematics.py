@@ -219,7 +219,7 @@ def test_inverse_kinematics_inverts_forward_kinematics_with_bent_knees(build):
 
 
 def sampled_ankle(geo, q):
-    """Return ankles [m] in the body frame, (..., 3), for q (..., 3): lateral, outer, inner [rad]; points as x + 1j z."""
+    """Return ankles [m] in the body frame, (..., 3), for q (..., 3): lateral, outer, inner [rad]."""
     lateral, outer, inner = np.moveaxis(q, -1, 0)
     front, thigh = geo["front"], geo["thigh"]
     outer_knee = geo["outer_x"] + front * thigh * np.sin(outer) - 1j * thigh * np.cos(outer)
@@ -241,10 +241,7 @@ def into_limits(q):
 
 
 def nearest_by_sampling(geo, targets):
-    """Return distances [m] (n,) of targets (n, 3) to the nearest reachable point, sampled.
-
-    A grid of joint angles, then seven ever finer grids around the 20 best points.
-    """
+    """Return distances [m] (n,) of targets (n, 3) to the reachable set, by ever finer grids around the 20 best points."""
     axes = [np.radians(np.linspace(*limits, n)) for limits, n in ((LATERAL, 41), (TRANSVERSAL, 52), (TRANSVERSAL, 52))]
     grid = into_limits(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
     centers = grid[cKDTree(sampled_ankle(geo, grid)).query(targets, 20)[1]]
