@@ -241,7 +241,7 @@ def into_limits(q):
 
 
 def nearest_by_sampling(geo, targets):
-    """Return distances [m] (n,) of targets (n, 3) to the reachable set, by ever finer grids around the 20 best points."""
+    """Return distances [m] (n,) of targets (n, 3) to the reachable set, by finer grids around the 20 best points."""
     axes = [np.radians(np.linspace(*limits, n)) for limits, n in ((LATERAL, 41), (TRANSVERSAL, 52), (TRANSVERSAL, 52))]
     grid = into_limits(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
     centers = grid[cKDTree(sampled_ankle(geo, grid)).query(targets, 20)[1]]
