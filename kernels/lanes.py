@@ -1,8 +1,8 @@
-"""Exchange between the threads of a GPU's warp that share a world: four, one per leg, or 32, eight attempts of four.
+"""Exchange of values between the threads of a GPU warp that share a world.
 
-Legs are neighbours, leg fastest, and all threads of a warp must reach every call together: none may stand behind an
-`and` or `or`, which may skip them, or in a branch that not all take. On the CPU, where these
-functions serve tests, a block is the threads of one world (launch with `block_dim=4`, or 32).
+A world has four threads (one per leg: FL, FR, BL, BR), or 32 (eight attempts of four); the leg index runs fastest. All
+threads of a warp must execute every call together: place none behind `and` or `or`, or in a branch that some threads
+skip. On the CPU, which only tests use, a block holds the threads of one world (`block_dim=4`, or 32).
 """
 
 import warp as wp
@@ -11,7 +11,11 @@ from .scalar import mat33, quat, real, vec3
 
 
 def _exchange(gpu: str, sent: str, received: str, threads: int = 4) -> str:
-    """Return the code of an exchange. Threads of a CPU's block take turns: each fills its box, waits, and reads."""
+    """Return the C++ code of an exchange: `gpu` for CUDA, otherwise write `sent` to a box, wait, and read `received`.
+
+    gpu: CUDA statements that return the result. sent, received: C++ expressions; `received` may read all of
+    `box[threads]`, which holds the value `sent` of every thread of a world.
+    """
     return f"""
 #if defined(__CUDA_ARCH__)
     {gpu}
@@ -49,7 +53,7 @@ _ALL = _exchange(
     "return __all_sync(0xfu << (threadIdx.x & 28u), flag);",
     "flag", "box[lane & 28] && box[lane & 28 | 1] && box[lane & 28 | 2] && box[lane & 28 | 3]", 32,
 )  # fmt: skip
-_FROM_OWN = _exchange("return __shfl_sync(0xfu << (threadIdx.x & 28u), x, leg, 4);", "x", "box[lane & 28 | leg]", 32)
+_FROM_TRY = _exchange("return __shfl_sync(0xfu << (threadIdx.x & 28u), x, leg, 4);", "x", "box[lane & 28 | leg]", 32)
 _STEP_THREADS = """
 #if defined(__CUDA_ARCH__)
     x += __shfl_xor_sync(0xffffffffu, x, 4);
@@ -65,7 +69,7 @@ _ANY = """
     return flag;
 #endif
 """
-_MEET = """
+_SYNC = """
 #if defined(__CUDA_ARCH__)
     __syncwarp();
 #else
@@ -76,59 +80,59 @@ _MEET = """
 
 @wp.func_native(_SUM)
 def sum_legs(x: real) -> real:
-    """Return the sum over the legs of a world, the same bits in each thread."""
+    """Return the sum of x over the four legs of a world; all four threads get the same bits."""
     ...
 
 
 @wp.func_native(_STEP_THREADS)
 def sum_step_threads(x: real) -> real:
-    """Return the sum over threads of a leg where a warp has one world, its threads being (8, 4); itself on a CPU."""
+    """Return the sum of x over the eight threads of a leg in a warp of (8 threads, 4 legs) of one world; x on a CPU."""
     ...
 
 
 @wp.func_native(_MAX)
 def max_legs(x: real) -> real:
-    """Return the largest value among the legs of a world; x: not NaN."""
+    """Return the largest x among the four legs of a world; no x may be NaN."""
     ...
 
 
 @wp.func_native(_FROM)
 def from_leg(x: real, leg: int) -> real:
-    """Return the value of one leg of the world."""
+    """Return the x of the thread of leg `leg` (0 to 3) of the same world."""
     ...
 
 
 @wp.func_native(_FIRST)
 def first_leg(flag: bool) -> int:
-    """Return the first leg of the world whose flag is set, 0 if none is."""
+    """Return the smallest leg index (0 to 3) of the world whose flag is set, 0 if none is."""
     ...
 
 
 @wp.func_native(_LEAST)
 def least_of_attempts(x: int) -> int:
-    """Return the smallest number, >= 0, among the 32 threads of a world."""
+    """Return the smallest x among the 32 threads of a world; every x must be >= 0."""
     ...
 
 
 @wp.func_native(_ALL)
 def all_of_attempt(flag: bool) -> bool:
-    """Return whether a flag is set in all four threads of an attempt, which reach this call together."""
+    """Return whether the flag is set in all four threads of an attempt; the four must make this call together."""
     ...
 
 
-@wp.func_native(_FROM_OWN)
+@wp.func_native(_FROM_TRY)
 def from_leg_of_attempt(x: float, leg: int) -> float:
-    """Return the value of one leg of the attempt, whose four threads reach this call together."""
+    """Return the x of leg `leg` (0 to 3) of the same attempt, whose four threads must make this call together."""
     ...
 
 
 @wp.func_native(_ANY)
 def any_world(flag: bool) -> bool:
-    """Return whether a flag, the same for all legs of a world, is set in any world that must wait for this one."""
+    """Return whether the flag is set in any world of the warp; all threads of a world must pass the same flag."""
     ...
 
 
-@wp.func_native(_MEET)
+@wp.func_native(_SYNC)
 def sync_lanes():
     """Synchronise the threads of a world; memory writes before it are visible to all of them after it."""
     ...
@@ -136,19 +140,19 @@ def sync_lanes():
 
 @wp.func
 def sum_vec(v: vec3) -> vec3:
-    """Return the sum of vectors over the legs."""
+    """Return the sum of v over the four legs of a world."""
     return vec3(sum_legs(v[0]), sum_legs(v[1]), sum_legs(v[2]))
 
 
 @wp.func
 def vec_from_leg(v: vec3, leg: int) -> vec3:
-    """Return the vector of one leg."""
+    """Return the v of the thread of leg `leg` (0 to 3) of the same world."""
     return vec3(from_leg(v[0], leg), from_leg(v[1], leg), from_leg(v[2], leg))
 
 
 @wp.func
 def mat_from_leg(m: mat33, leg: int) -> mat33:
-    """Return the matrix of one leg."""
+    """Return the m of the thread of leg `leg` (0 to 3) of the same world."""
     return mat33(
         from_leg(m[0, 0], leg), from_leg(m[0, 1], leg), from_leg(m[0, 2], leg),
         from_leg(m[1, 0], leg), from_leg(m[1, 1], leg), from_leg(m[1, 2], leg),
@@ -158,13 +162,13 @@ def mat_from_leg(m: mat33, leg: int) -> mat33:
 
 @wp.func
 def sum_quat(q: quat) -> quat:
-    """Return the sum of the entries of quaternions over the legs."""
+    """Return the entrywise sum of q over the four legs of a world, as for gradients; not normalised."""
     return quat(sum_legs(q[0]), sum_legs(q[1]), sum_legs(q[2]), sum_legs(q[3]))
 
 
 @wp.func
 def sum_symmetric(m: mat33) -> mat33:
-    """Return the sum of symmetric matrices over the legs."""
+    """Return the sum of m over the four legs of a world, m symmetric: six sums, of the upper triangle."""
     xx, yy, zz = sum_legs(m[0, 0]), sum_legs(m[1, 1]), sum_legs(m[2, 2])
     xy, xz, yz = sum_legs(m[0, 1]), sum_legs(m[0, 2]), sum_legs(m[1, 2])
     return mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
@@ -172,7 +176,7 @@ def sum_symmetric(m: mat33) -> mat33:
 
 @wp.func
 def sum_matrix(m: mat33) -> mat33:
-    """Return the sum of matrices over the legs."""
+    """Return the sum of m over the four legs of a world, for any 3x3 matrices: nine sums."""
     return mat33(
         sum_legs(m[0, 0]), sum_legs(m[0, 1]), sum_legs(m[0, 2]),
         sum_legs(m[1, 0]), sum_legs(m[1, 1]), sum_legs(m[1, 2]),

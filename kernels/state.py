@@ -23,7 +23,7 @@ class BaseState:
 
 @wp.func
 def base_com(table: wp.array2d(dtype=real), world: int) -> vec3:
-    """Return the base link's centre of mass [m] in its frame."""
+    """Return the base link's centre of mass [m] in its frame; table: (PARAMETER_ROWS, num_worlds), see `layout`."""
     return vec3(table[BASE + 1, world], table[BASE + 2, world], table[BASE + 3, world]) / table[BASE, world]
 
 
@@ -44,7 +44,7 @@ def load_base(joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real), com
 
 @wp.func
 def store_base(joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real), com: vec3, world: int, base: BaseState):
-    """Write the base state of a world."""
+    """Write the base state of a world; the inverse of `load_base`, arguments as there."""
     i = world * COORDS
     j = world * DOFS
     ang = wp.quat_rotate(base.quat, base.ang)
@@ -59,13 +59,13 @@ def store_base(joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real), co
 
 @wp.func
 def load_motors(values: wp.array(dtype=real), first: int) -> vec3:
-    """Return (lateral, outer, inner) of a leg whose five joint values start at `first`."""
+    """Return (lateral, outer, inner) of the leg whose five joint values start at index `first`, see `leg_coord`."""
     return vec3(values[first], values[first + 1], values[first + 3])
 
 
 @wp.func
 def store_motors(values: wp.array(dtype=real), first: int, motors: vec3):
-    """Write (lateral, outer, inner) of a leg whose five joint values start at `first`."""
+    """Write (lateral, outer, inner) of the leg whose five joint values start at index `first`; knees stay unchanged."""
     values[first] = motors[0]
     values[first + 1] = motors[1]
     values[first + 3] = motors[2]
@@ -73,11 +73,11 @@ def store_motors(values: wp.array(dtype=real), first: int, motors: vec3):
 
 @wp.func
 def leg_coord(world: int, leg: int) -> int:
-    """Return the index of a leg's first joint in joint_q."""
+    """Return the index of the first joint of leg 0 to 3 of a world in joint_q."""
     return world * COORDS + 7 + 5 * leg
 
 
 @wp.func
 def leg_dof(world: int, leg: int) -> int:
-    """Return the index of a leg's first joint in joint_qd."""
+    """Return the index of the first joint of leg 0 to 3 of a world in joint_qd."""
     return world * DOFS + 6 + 5 * leg

@@ -22,13 +22,13 @@ import warp as wp
 
 from ..scalar import real, vec3
 
-# [rad] Two turns: commands are bounded to this before anything else, which keeps an infinite one from becoming NaN.
+# [rad] two turns: commands are clamped to +- this first, so that an infinite command does not become NaN
 COMMAND_BOUND = wp.constant(real(12.566370614359172))
 
 
 @wp.struct
 class Limits:
-    """Limits of one quantity, and the width of the hard zones before them (0: none)."""
+    """Limits of one quantity (a motor angle or a sum of two), and widths of the hard zones inside them (0: none)."""
 
     lower: real  # [rad]
     upper: real  # [rad]
@@ -49,7 +49,10 @@ class FilterParams:
 
 @wp.func
 def limit_weight(command: real, pos: real, vel: real, limits: Limits, horizon: real, speed_floor: real) -> real:
-    """Return the weight [1] of the limits, from 0 (ignored) to 1 (in force), for a command and position [rad]."""
+    """Return the weight w [1] of the limits, from 0 (ignored) to 1 (in force); see the module for the rules.
+
+    command, pos [rad], vel [rad/s]: of the limited quantity; horizon [s], speed_floor [rad/s]: see `FilterParams`.
+    """
     upper_margin = limits.upper - pos
     lower_margin = pos - limits.lower
     time_left = wp.min(upper_margin / wp.max(vel, speed_floor), lower_margin / wp.max(-vel, speed_floor))
@@ -66,25 +69,25 @@ def limit_weight(command: real, pos: real, vel: real, limits: Limits, horizon: r
 
 @wp.func
 def limit_command(command: real, pos: real, vel: real, limits: Limits, horizon: real, speed_floor: real) -> real:
-    """Return the filtered command [rad] for a quantity at `pos` [rad] that moves at `vel` [rad/s]."""
+    """Return the filtered command [rad] of a quantity at `pos` [rad], `vel` [rad/s]; see `limit_weight`."""
     weight = limit_weight(command, pos, vel, limits, horizon, speed_floor)
     return command + weight * (wp.clamp(command, limits.lower, limits.upper) - command)
 
 
 @wp.func
 def filter_leg(target: vec3, pos: vec3, vel: vec3, params: FilterParams) -> vec3:
-    """Return the filtered targets [rad] of one leg. All vectors: (lateral, outer, inner), [rad] and [rad/s].
+    """Return the filtered targets [rad] of one leg; all vectors are (lateral, outer, inner), vel [rad/s].
 
-    The single motors' limits come first. The limits of the transversal sum then act on the sum of what is left, and
-    each transversal command takes half of the correction.
+    The limits of each motor act first. The limits of the transversal sum then act on the sum of the two results, and
+    each transversal command takes half of that correction.
     """
     t, h, v = params.transversal, params.horizon, params.speed_floor
     lateral = limit_command(wp.clamp(target[0], -COMMAND_BOUND, COMMAND_BOUND), pos[0], vel[0], params.lateral, h, v)
     outer = limit_command(wp.clamp(target[1], -COMMAND_BOUND, COMMAND_BOUND), pos[1], vel[1], t, h, v)
     inner = limit_command(wp.clamp(target[2], -COMMAND_BOUND, COMMAND_BOUND), pos[2], vel[2], t, h, v)
     total = outer + inner
-    share = real(0.5) * (limit_command(total, pos[1] + pos[2], vel[1] + vel[2], params.sum, h, v) - total)
-    return vec3(lateral, outer + share, inner + share)
+    half = real(0.5) * (limit_command(total, pos[1] + pos[2], vel[1] + vel[2], params.sum, h, v) - total)
+    return vec3(lateral, outer + half, inner + half)
 
 
 @wp.kernel
@@ -101,10 +104,10 @@ def command_filter_kernel(
     # out
     filtered_target: wp.array2d(dtype=real),
 ):
-    """Filter the motor targets of every leg. Launch over (4, worlds from `first` on).
+    """Write the filtered motor targets of every leg; launch over (4, number of worlds), worlds from `first` on.
 
-    raw_target, filtered_target [rad]: (12, num_worlds). joint_q, joint_qd: flat over worlds, laid out as Newton's.
-    offset [rad]: added by each position sensor to the true angle, (12, num_worlds); the filter uses the reading.
+    raw_target, filtered_target [rad]: (12, num_worlds). joint_q, joint_qd: Newton's, flat over worlds. offset [rad],
+    (12, num_worlds): reading minus true angle of each position sensor; the filter uses the reading.
     """
     leg, world = wp.tid()
     world += first

@@ -37,7 +37,7 @@ class JointForces:
 
 @wp.func
 def joint_friction(p: JointParams, rates: vec3) -> vec3:
-    """Return the viscous coefficients [N m s/rad] of motor damping and Coulomb friction at the current rates."""
+    """Return the viscous coefficients [N m s/rad] of motor damping and Coulomb friction at `rates` [rad/s]."""
     return vec3(
         p.damping[0] + p.friction[0] / wp.max(wp.abs(rates[0]), FRICTION_SPEED),
         p.damping[1] + p.friction[1] / wp.max(wp.abs(rates[1]), FRICTION_SPEED),
@@ -47,13 +47,13 @@ def joint_friction(p: JointParams, rates: vec3) -> vec3:
 
 @wp.func
 def capped_damping(damping: real, rate: real, limit: real) -> real:
-    """Return the viscous coefficient [N m s/rad] of a damper whose torque never exceeds `limit` [N m]."""
+    """Return the viscous coefficient [N m s/rad]: `damping`, but torque <= `limit` [N m] at `rate` [rad/s]."""
     return wp.min(damping, limit / wp.max(wp.abs(rate), real(1.0e-6)))
 
 
 @wp.func
 def knee_damping(p: JointParams, loop: FiveBar, front: real, rates: vec3) -> mat33:
-    """Return the motor-space damping matrix [N m s/rad] of a leg's passive knees."""
+    """Return the motor-space damping matrix [N m s/rad] of a leg's passive knees; front, rates: see `joint_forces`."""
     zero = real(0.0)
     # knee rate = shank rate - thigh rate, per outer and inner motor rate
     outer_knee = vec3(zero, loop.outer_shank_do + front, loop.outer_shank_di)
@@ -67,9 +67,10 @@ def knee_damping(p: JointParams, loop: FiveBar, front: real, rates: vec3) -> mat
 def joint_forces(
     p: JointParams, loop: FiveBar, front: real, rates: vec3, stop_rates: StopRates, pressed: int, dt: real
 ) -> JointForces:
-    """Return friction, knee damping and pressed hard stops of one leg.
+    """Return friction, knee damping and pressed hard stops of one leg, in motor space.
 
-    rates: lateral, outer, inner [rad/s]; rows, pressed: the leg's stops, see `stops`; dt: step [s].
+    front: +1 front leg, -1 back leg. rates [rad/s]: lateral, outer, inner, at the start of the step dt [s]. stop_rates,
+    pressed: the leg's hard stops, see `stops`.
     """
     damping = knee_damping(p, loop, front, rates) + wp.diag(joint_friction(p, rates))
     stops = stop_forces(stop_rates, rates, pressed, dt)

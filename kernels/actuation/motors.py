@@ -23,7 +23,7 @@ class MotorParams:
 
 @wp.struct
 class MotorArrays:
-    """Constants of all motors, arrays of shape (12, num_worlds); units as in `MotorParams`."""
+    """Constants of all motors, arrays of shape (12, num_worlds), legs FL, FR, BL, BR; units as in `MotorParams`."""
 
     kp: wp.array2d(dtype=real)
     kd: wp.array2d(dtype=real)
@@ -32,13 +32,13 @@ class MotorArrays:
     cutoff_speed: wp.array2d(dtype=real)
     no_load_speed: wp.array2d(dtype=real)
     offset: wp.array2d(dtype=real)
-    fade_start: real
+    fade_start: real  # the same for all motors, as is `fade_end`
     fade_end: real
 
 
 @wp.func
 def load_motor(motors: MotorArrays, motor: int, world: int) -> MotorParams:
-    """Return the constants of one motor of one world."""
+    """Return the constants of motor 0 to 11 of a world."""
     params = MotorParams()
     params.kp = motors.kp[motor, world]
     params.kd = motors.kd[motor, world]
@@ -65,7 +65,7 @@ def envelope(direction: real, vel: real, motor: MotorParams) -> real:
 
 @wp.func
 def motor_torque(target: real, pos: real, vel: real, motor: MotorParams) -> real:
-    """Return the torque [N m] at the joint, for a target and a true position [rad] and a speed [rad/s].
+    """Return the torque [N m] at the joint for a target [rad], the true position [rad] and speed [rad/s].
 
     Position control, bounded by the torque-speed envelope; then over-speed protection fades driving and braking alike.
     """
@@ -87,9 +87,9 @@ def motor_torque_kernel(
     # out
     joint_f: wp.array(dtype=real),
 ):
-    """Write the motor torques [N m] into generalized forces laid out as Newton's; other entries stay as they are.
+    """Write the motor torques [N m] to their entries of Newton's joint_f; launch over (12, num_worlds).
 
-    Launch over (12, num_worlds). target [rad]: (12, num_worlds). joint_q, joint_qd, joint_f: flat over worlds.
+    target [rad]: (12, num_worlds). joint_q, joint_qd, joint_f: flat over worlds; other entries of joint_f are kept.
     """
     motor, world = wp.tid()
     coord = coords_per_world * world + 7 + motor_slot(motor)

@@ -17,7 +17,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def stop_torque(angle: real, rate: real, lower: real, upper: real, ke: real, kd: real) -> real:
-    """Return the torque [N m] of a pair of hard stops: a spring, damped while the angle goes further in."""
+    """Return the torque [N m] of a pair of hard stops: a spring, with damping while the penetration grows.
+
+    angle, lower, upper [rad], rate [rad/s], ke [N m/rad], kd [N m s/rad]. The torque is 0 within [lower, upper].
+    """
     if angle < lower:
         return ke * (lower - angle) - wp.where(rate < real(0.0), kd * rate, real(0.0))
     if angle > upper:
@@ -41,10 +44,11 @@ def passive_torque_kernel(
     # in, out
     joint_f: wp.array(dtype=real),
 ):
-    """Write the knees' torques, add stops of outer + inner and the legs' springs [N m]; one thread per (world, leg).
+    """Write the knees' damping torques, add torques of sum stops and springs [N m]; one thread per (world, leg).
 
-    knee_damping [N m s/rad] acts up to knee_limit [N m]; stop_ke [N m/rad], stop_kd [N m s/rad] must be soft enough
-    for explicit integration. springs: stiffness [N/m] and rest length [m], (num_worlds,).
+    knee_damping [N m s/rad] acts up to knee_limit [N m]. sum_lower, sum_upper [rad]: stops of outer + inner angle;
+    stop_ke [N m/rad], stop_kd [N m s/rad] must be soft enough for explicit integration. springs (num_worlds,):
+    stiffness [N/m] and rest length [m]. joint_q, joint_qd, joint_f: Newton's, flat over worlds.
     """
     world, leg = wp.tid()
     q = world * COORDS + 7 + 5 * leg

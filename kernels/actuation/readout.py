@@ -15,7 +15,7 @@ def motor_values_kernel(
     # out
     motor_values: wp.array2d(dtype=float),
 ):
-    """Gather the motors' entries of a per-dof array into shape (12, num_worlds); launch over that shape."""
+    """Copy the motors' entries of `joint_values` (38 num_worlds,) to (12, num_worlds); launch over that shape."""
     motor, world = wp.tid()
     motor_values[motor, world] = joint_values[DOFS * world + 6 + motor_slot(motor)]
 
@@ -30,9 +30,10 @@ def paw_force_kernel(
     peak_force: wp.array(dtype=float),
     peak_paw_force: wp.array2d(dtype=float),
 ):
-    """Turn a contact sensor's forces [N], four rows a world, into shape (4, num_worlds), and keep the largest.
+    """Copy the paws' contact forces [N] to shape (4, num_worlds) and update the peaks; one thread per world.
 
-    Launch over worlds. peak_force is of their sum. restart 1: forget the largest so far.
+    total_force (4 num_worlds,): a contact sensor's, paws FL, FR, BL, BR of each world. peak_paw_force (4, num_worlds)
+    is the largest magnitude of each paw, peak_force that of the sum of the four; restart != 0 drops earlier peaks.
     """
     world = wp.tid()
     total = wp.vec3(0.0)
@@ -58,7 +59,10 @@ def arrived_target_kernel(
     # out
     arrived: wp.array2d(dtype=float),
 ):
-    """Write the motor targets [rad] of a physics step: before `delay` the previous ones; (12, num_worlds) threads."""
+    """Write the target [rad] of each motor in physics step `step`: `previous` until `delay` [steps], then `target`.
+
+    Launch over (12, num_worlds), the shape of all targets. delay: (num_worlds,). step counts from the new target.
+    """
     motor, world = wp.tid()
     arrived[motor, world] = wp.where(step < delay[world], previous[motor, world], target[motor, world])
 
@@ -72,7 +76,7 @@ def base_velocity_kernel(
     # out
     velocity: wp.array(dtype=wp.vec3),
 ):
-    """Write the velocity of the base link's origin [m/s], world frame; launch over worlds."""
+    """Write the velocity of the base link's origin [m/s], world frame, (num_worlds,); one thread per world."""
     world = wp.tid()
     velocity[world] = load_base(joint_q, joint_qd, body_com[world * BODIES], world).lin
 
@@ -86,6 +90,9 @@ def body_acceleration_kernel(
     # out
     acceleration: wp.array(dtype=wp.spatial_vector),
 ):
-    """Write the mean acceleration of each body over dt [s]; one thread per body."""
+    """Write the mean acceleration ([m/s^2], [rad/s^2]) of each body over dt [s]; one thread per body.
+
+    before, after: (linear [m/s], angular [rad/s]) velocities of all bodies at the start and the end of dt.
+    """
     body = wp.tid()
     acceleration[body] = (after[body] - before[body]) / dt

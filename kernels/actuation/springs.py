@@ -1,9 +1,9 @@
-"""Springs between the two knees of a leg: they store energy in the squat and give it back in the push-off.
+"""Springs between the two knees of a leg, which store energy in the squat and return it in the push-off.
 
-A spring pulls the knees together with k (l - r) where it is longer than its rest length r, and pushes them apart where
-it is shorter. The knees are carried by the thighs alone, so that it turns outer and inner thigh and nothing else. It is
-taken explicitly, at the angles at the start of a step: 1000 N/m swing at some 9 Hz on these legs, a tenth of what the
-semi-implicit step can follow, and keep their energy on the average.
+A spring of length l pulls the knees together with the force k (l - r), r its rest length; it pushes where l < r. The
+knees move with the thighs alone, so only the outer and the inner motor feel it. The force is explicit: it uses the
+angles at the start of a step. 1000 N/m oscillates at about 9 Hz on these legs, a tenth of the frequency at which the
+semi-implicit step becomes unstable.
 """
 
 import warp as wp
@@ -16,13 +16,13 @@ from ..scalar import real, vec3
 class LegSpring:
     """The spring of one leg."""
 
-    stiffness: real  # [N/m], 0: none, and no gradient by it
+    stiffness: real  # [N/m]; 0: no spring, and no gradient with respect to the stiffness
     length: real  # [m] at rest
 
 
 @wp.func
 def spring_torque(spring: LegSpring, loop: FiveBar) -> vec3:
-    """Return the torques [N m] of a leg's spring on its motors: lateral, outer, inner."""
+    """Return the torques [N m] of a leg's spring on its motors: lateral (0), outer, inner."""
     span = loop.outer_knee - loop.inner_knee
     length = wp.max(wp.length(span), real(1.0e-4))
     pull = spring.stiffness * (spring.length / length - real(1.0)) * span  # [N] on the outer knee

@@ -20,17 +20,15 @@ import warp as wp
 
 from ..scalar import mat33, real, vec3, vec4
 
-# sets of a leg: two bits for each of lateral, outer, inner, and outer + inner
-LOWER_STOP = wp.constant(1)
-UPPER_STOP = wp.constant(2)
-ROW_BITS = wp.constant(2)
-ROW_MASK = wp.constant(3)
+# set of a leg's pressed stops: an int with two bits per row; rows 0 to 3 are lateral, outer, inner, outer + inner
+LOWER_STOP = wp.constant(1)  # value of a row's two bits where the lower stop is pressed; 0: neither
+UPPER_STOP = wp.constant(2)  # value where the upper stop is pressed
+ROW_BITS = wp.constant(2)  # bits per row
+ROW_MASK = wp.constant(3)  # mask of row 0
 ROWS = wp.constant(4)
-# after this many sets of a step only one stop changes at a time, which cannot cycle without friction; then none is
-# released; and after the last number the set stands
-ONE_BY_ONE = wp.constant(3)
-PRESS_ONLY = wp.constant(8)
-MAX_SETS = wp.constant(12)
+ONE_BY_ONE = wp.constant(3)  # sets tried in a step after which one stop changes at a time: no cycles without friction
+PRESS_ONLY = wp.constant(8)  # sets tried after which stops are pressed and none is released
+MAX_SETS = wp.constant(12)  # sets tried after which the last set is accepted
 # slack of a stop's law [rad/s] for each [m/s] of the contact tolerance
 SLACK = wp.constant(real(10.0))
 
@@ -52,8 +50,8 @@ class StopRates:
     """Rates at which the stops of one leg press in a step; rows are lateral, outer, inner, outer + inner."""
 
     lower: vec4  # [rad/s] rate at the end of the step above which the lower stop is free
-    upper: vec4  # [rad/s] rate below which the upper stop is free
-    damping: real  # c [N m s/rad]
+    upper: vec4  # [rad/s] rate at the end of the step below which the upper stop is free
+    damping: real  # c = dt ke + kd [N m s/rad]
 
 
 @wp.struct
@@ -94,7 +92,7 @@ def stop_rates(p: StopParams, angles: vec3, dt: real) -> StopRates:
 
 @wp.func
 def beyond_stops(p: StopParams, angles: vec3) -> bool:
-    """Return whether motor angles [rad] are beyond a stop; a stop is not pressed by a step that ends within all."""
+    """Return whether motor angles [rad] are beyond any stop of the leg, or NaN. A step ending within presses none."""
     fold = angles[1] + angles[2]
     past = wp.max(p.sum_lower - fold, fold - p.sum_upper)
     for j in range(3):
@@ -104,15 +102,15 @@ def beyond_stops(p: StopParams, angles: vec3) -> bool:
 
 @wp.func
 def row_side(pressed: int, i: int) -> int:
-    """Return which stop of row i is pressed: 0, LOWER_STOP or UPPER_STOP."""
+    """Return which stop of row i the set `pressed` holds: 0, LOWER_STOP or UPPER_STOP."""
     return (pressed >> (ROW_BITS * i)) & ROW_MASK
 
 
 @wp.func
 def pressed_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int) -> int:
-    """Return the set of stops that a leg presses which ends the step at `rates` [rad/s].
+    """Return the set of stops that a leg presses if its motors end the step at `rates` [rad/s].
 
-    pressed: the set that led to the rates; its stops are released, and others pressed, only beyond the slack [rad/s].
+    pressed: the set with which `rates` was solved; a stop is added or removed only beyond the slack [rad/s].
     """
     rate = vec4(rates[0], rates[1], rates[2], rates[1] + rates[2])
     if pressed == 0 and not wp.max(wp.max(stop_rates.lower - rate, rate - stop_rates.upper)) > slack:
@@ -129,7 +127,7 @@ def pressed_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int)
 
 @wp.func
 def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int, sets: int) -> int:
-    """Return the set to try after `sets` sets of a step, the last of which, `pressed`, led to `rates` [rad/s]."""
+    """Return the set to try next, after `sets` sets; `pressed`, the last one, gave `rates` [rad/s]; slack [rad/s]."""
     required = pressed_stops(stop_rates, rates, slack, pressed)
     if required == pressed or sets < PRESS_ONLY:
         return required
@@ -142,13 +140,13 @@ def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int,
 
 @wp.func
 def one_by_one(sets: int) -> bool:
-    """Return whether the set after `sets` sets of a step differs in one stop of a world only."""
+    """Return whether, after `sets` sets of a step, the next set may change one stop per world only."""
     return sets >= ONE_BY_ONE and sets < PRESS_ONLY
 
 
 @wp.func
 def change_one(pressed: int, required: int) -> int:
-    """Return `pressed` with the first row in which it differs from `required` changed."""
+    """Return the set `pressed` with the first row that differs from the set `required` replaced by that row."""
     for i in range(ROWS):
         bits = ROW_MASK << (ROW_BITS * i)
         if (pressed ^ required) & bits != 0:
@@ -158,7 +156,7 @@ def change_one(pressed: int, required: int) -> int:
 
 @wp.func
 def row_torque(stop_rates: StopRates, i: int, rate: real, pressed: int) -> real:
-    """Return the torque [N m] of row i at its current rate [rad/s]."""
+    """Return the torque [N m] of row i at its rate [rad/s] at the start of the step; 0 where no stop is pressed."""
     side = row_side(pressed, i)
     if side == 0:
         return real(0.0)
@@ -167,7 +165,7 @@ def row_torque(stop_rates: StopRates, i: int, rate: real, pressed: int) -> real:
 
 @wp.func
 def stop_forces(stop_rates: StopRates, rates: vec3, pressed: int, dt: real) -> StopForces:
-    """Return the forces of a leg's pressed stops; rates [rad/s] at the start of the step."""
+    """Return the forces of the stops in the set `pressed`; rates [rad/s]: at the start of the step dt [s]."""
     forces = StopForces()
     if pressed == 0:
         return forces

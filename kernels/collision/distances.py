@@ -1,7 +1,7 @@
 """Distances between the simple shapes that model links: capsules and boxes.
 
-A sphere is a capsule of zero length. Distances are signed as far as the radii go: two overlapping capsules report
-minus their overlap, but never less than minus the sum of their radii.
+A sphere is a capsule of zero length. Distances of capsules are negative where they overlap, and at least minus the sum
+of the radii. All points are [m], in any common frame.
 """
 
 import warp as wp
@@ -11,7 +11,7 @@ from ..scalar import real, vec3
 
 @wp.func
 def segment_segment_sq(start_a: vec3, end_a: vec3, start_b: vec3, end_b: vec3) -> real:
-    """Return the squared distance [m^2] between two segments, either of which may be a point."""
+    """Return the squared distance [m^2] between segments a and b; a segment may be a point."""
     a = end_a - start_a
     b = end_b - start_b
     start_offset = start_a - start_b
@@ -31,7 +31,7 @@ def segment_segment_sq(start_a: vec3, end_a: vec3, start_b: vec3, end_b: vec3) -
 
 @wp.func
 def outside_box(point: vec3, half: vec3) -> vec3:
-    """Return the vector [m] from the nearest point of a box centred at the origin to `point`; zero inside."""
+    """Return the vector [m] from the nearest point of a box (half extents `half` [m], at the origin) to `point`."""
     return point - wp.min(wp.max(point, -half), half)
 
 
@@ -63,7 +63,7 @@ def segment_box_sq(start: vec3, end: vec3, half: vec3) -> real:
 
 @wp.func
 def segment_box_bound_sq(start: vec3, end: vec3, half: vec3) -> real:
-    """Return a cheap lower bound on `segment_box_sq`: the squared distance of the segment's bounding box."""
+    """Return a cheap lower bound [m^2] on `segment_box_sq`: the squared distance of the segment's bounding box."""
     gap = wp.max(wp.min(start, end) - half, -half - wp.max(start, end))
     gap_outside = wp.max(gap, vec3(real(0.0)))
     return wp.dot(gap_outside, gap_outside)
@@ -71,7 +71,7 @@ def segment_box_bound_sq(start: vec3, end: vec3, half: vec3) -> real:
 
 @wp.func
 def inflated_distance(distance_sq: real, radius: real, bound: real) -> real:
-    """Return the distance [m] of shapes inflated by `radius` [m] in total, or `bound` (>= 0) if it is not smaller."""
+    """Return min(sqrt(distance_sq [m^2]) - radius, bound) [m]; radius: of both shapes together, bound >= 0 [m]."""
     reach = bound + radius
     if distance_sq >= reach * reach:
         return bound

@@ -1,26 +1,27 @@
-"""Contacts that must not happen: links with the ground, with other legs, with their own leg and with the shell.
+"""Forbidden contacts: of links with the ground, with other legs, with their own leg and with the shell.
 
 Paws may touch the ground; that contact belongs to the dynamics. Each leg is five capsules (two thighs, two shanks,
 the paw as a capsule of zero length) whose ends come from the five-bar in closed form, the housings are capsules
-along the lateral axes, and the shell is four boxes. Pairs between links are measured in the body frame.
+along the lateral axes, and the shell is four boxes. Distances between links are computed in the body frame. Every
+distance is signed: positive apart, negative where the shapes overlap.
 
-Not measured, because the mechanism keeps them apart or together at any joint angle: a leg with its own housing and
+Pairs that the mechanism keeps apart or together at any joint angle are not checked: a leg with its own housing and
 with the motor drums at its own end of the body, around whose axis it turns at a fixed distance; thighs with the shanks
-that hang from them; a paw with its own thighs; housings with one another and with other legs (a leg meets the shell or
-its neighbour first).
+that hang from them; a paw with its own thighs; housings with one another and with other legs (a leg touches the shell
+or its neighbour first).
 """
 
 import warp as wp
 
 from ..kinematics.five_bar import five_bar
 from ..kinematics.geometry import LegGeometry
-from ..scalar import mat33, quat, real, vec3
+from ..scalar import mat33, mat43, quat, real, vec3, vec4
 from ..terrain.ground import Ground, ground_distance, world_ground
 from .distances import inflated_distance, segment_box_bound_sq, segment_box_sq, segment_segment_sq
 
 wp.set_module_options({"enable_backward": False})
 
-BODY_GROUND = wp.constant(1)
+BODY_GROUND = wp.constant(1)  # bits of `Collisions.flags`; the body is the shell
 HOUSING_GROUND = wp.constant(2)
 THIGH_GROUND = wp.constant(4)
 KNEE_GROUND = wp.constant(8)
@@ -33,19 +34,17 @@ HOUSING_LENGTH = wp.constant(real(0.19))  # [m] from the hip outward along the l
 HOUSING_RADIUS = wp.constant(real(0.048))  # [m]
 THIGH_RADIUS = wp.constant(real(0.019))  # [m], knees too
 SHANK_RADIUS = wp.constant(real(0.012))  # [m]
-SHANK_FREE = wp.constant(real(0.9))  # share of a shank, from the knee, that must not touch the ground
-SHANK_APART = wp.constant(real(0.5))  # share of a shank, from the knee, that must not touch its twin
+SHANK_FREE = wp.constant(real(0.9))  # fraction of a shank, from the knee, that must not touch the ground
+SHANK_APART = wp.constant(real(0.5))  # fraction of a shank, from the knee, that must not touch its twin
+FAR = wp.constant(real(1.0e6))  # [m] start value of a minimum of distances
 
-vec4 = wp.types.vector(length=4, dtype=real)
-mat43 = wp.types.matrix(shape=(4, 3), dtype=real)
 mat53 = wp.types.matrix(shape=(5, 3), dtype=real)
 
-# Shell boxes in the body frame [m]: nose to tail, trunk, front motor drums, rear motor drums.
+# shell boxes in the body frame [m], one a row: nose to tail, trunk, front motor drums, rear motor drums
 SHELL_BOXES = wp.constant(4)
+LOWER_CORNERS = wp.constant(4 * SHELL_BOXES)
 SHELL_CENTER = wp.constant(mat43(0.0, 0.0, 0.025, 0.0, 0.0, 0.025, 0.1125, 0.0, 0.0, -0.112, 0.0, 0.0))
-SHELL_HALF = wp.constant(
-    mat43(0.343, 0.05, 0.074, 0.144, 0.112, 0.074, 0.0315, 0.154, 0.049, 0.032, 0.199, 0.049),
-)
+SHELL_HALF = wp.constant(mat43(0.343, 0.05, 0.074, 0.144, 0.112, 0.074, 0.0315, 0.154, 0.049, 0.032, 0.199, 0.049))
 
 
 @wp.struct
@@ -53,9 +52,9 @@ class LegCapsules:
     """The capsules of one leg, in the body frame."""
 
     ends: mat53  # [m] rows: outer transversal axis, inner transversal axis, outer knee, inner knee, ankle
-    low: vec3  # [m] smallest coordinates of the ends
-    high: vec3  # [m] largest coordinates of the ends
-    hip: vec3  # [m]
+    low: vec3  # [m] smallest x, y and z of the ends
+    high: vec3  # [m] largest x, y and z of the ends
+    hip: vec3  # [m] see `LegGeometry`
     normal: vec3  # unit normal of the leg's plane
     offset: real  # [m] of the knees and the ankle along the normal, from the hip
     front: real  # +1 front leg, -1 back leg
@@ -66,13 +65,13 @@ class LegCapsules:
 class Collisions:
     """Forbidden contacts of one robot."""
 
-    flags: int  # bitmask of the contacts that exist
-    clearance: real  # [m] smallest distance, negative in contact
+    flags: int  # bitmask of BODY_GROUND to LEG_SHELL
+    clearance: real  # [m] smallest distance of all, negative in contact
 
 
 @wp.func
 def leg_capsules(geo: LegGeometry, lateral: real, outer: real, inner: real) -> LegCapsules:
-    """Return the capsules of one leg for its motor angles [rad]."""
+    """Return the capsules of one leg in the body frame, for its motor angles [rad]."""
     loop = five_bar(geo, outer, inner)
     normal = vec3(real(0.0), wp.cos(lateral), geo.side * wp.sin(lateral))
     up = vec3(real(0.0), -normal[2], normal[1])
@@ -110,10 +109,10 @@ def capsule_radius(capsules: LegCapsules, k: int) -> real:
 
 @wp.func
 def leg_self_distance(capsules: LegCapsules, bound: real) -> real:
-    """Return the distance [m] between links of one leg, at most `bound` (>= 0).
+    """Return the smallest distance [m] between links of one leg, at most `bound` (>= 0) [m].
 
-    Counted are thigh to thigh, each thigh to the shank of the other, and shank to shank. The shanks meet in the
-    ankle, so only their upper parts count; those are nearest at their lower ends.
+    Pairs: thigh to thigh, each thigh to the shank of the other, and shank to shank. The shanks join in the ankle, so
+    only their upper parts (`SHANK_APART`) count; those are nearest at their lower ends.
     """
     outer_axis, inner_axis = capsules.ends[0], capsules.ends[1]
     outer_knee, inner_knee, ankle = capsules.ends[2], capsules.ends[3], capsules.ends[4]
@@ -129,12 +128,12 @@ def leg_self_distance(capsules: LegCapsules, bound: real) -> real:
 
 @wp.func
 def leg_box_distance(capsules: LegCapsules, box: int, bound: real) -> real:
-    """Return the distance [m] between a leg and one box of the shell, at most `bound` (>= 0)."""
+    """Return the distance [m] between a leg and box 0 to 3 of the shell (`SHELL_CENTER`), at most `bound` (>= 0)."""
     center = SHELL_CENTER[box]
     half = SHELL_HALF[box]
     nearest = bound
-    # the whole leg lies in one plane: if that clears the box, so does every link (the thighs' upper ends lie knee_y
-    # inside the plane, which their smaller radius makes good)
+    # The whole leg lies in one plane: if the plane is clear of the box, so is every link. (The thighs' upper ends lie
+    # knee_y inside the plane, which their radius, smaller than the paw's, offsets.)
     plane_gap = wp.abs(wp.dot(capsules.normal, capsules.hip - center) + capsules.offset) - wp.dot(
         wp.abs(capsules.normal), half
     )
@@ -153,26 +152,26 @@ def leg_box_distance(capsules: LegCapsules, box: int, bound: real) -> real:
 
 @wp.func
 def leg_shell_distance(capsules: LegCapsules, bound: real) -> real:
-    """Return the distance [m] between a leg and the shell without the motor drums at its own end, at most `bound`."""
+    """Return the distance [m] of a leg to the shell less the drums at the leg's end; at most `bound` (>= 0) [m]."""
     drums = wp.where(capsules.front > real(0.0), 3, 2)
     nearest = wp.min(leg_box_distance(capsules, 0, bound), leg_box_distance(capsules, 1, bound))
     return wp.min(nearest, leg_box_distance(capsules, drums, bound))
 
 
 @wp.func
-def leg_leg_distance(leg: LegCapsules, other: LegCapsules, bound: real) -> real:
-    """Return the distance [m] between two legs' thighs, shanks and paws, at most `bound` (>= 0)."""
-    gap = wp.max(wp.max(other.low - leg.high, leg.low - other.high), vec3(real(0.0)))
-    reach = bound + leg.paw_radius + other.paw_radius
+def leg_leg_distance(leg: LegCapsules, neighbour: LegCapsules, bound: real) -> real:
+    """Return the smallest distance [m] between thighs, shanks and paws of two legs, at most `bound` (>= 0) [m]."""
+    gap = wp.max(wp.max(neighbour.low - leg.high, leg.low - neighbour.high), vec3(real(0.0)))
+    reach = bound + leg.paw_radius + neighbour.paw_radius
     nearest = bound
     if wp.dot(gap, gap) < reach * reach:
         count = wp.int32(25)
         for pair in range(count):
             k = pair // 5
             m = pair % 5
-            radius = capsule_radius(leg, k) + capsule_radius(other, m)
+            radius = capsule_radius(leg, k) + capsule_radius(neighbour, m)
             distance_sq = segment_segment_sq(
-                leg.ends[k], leg.ends[capsule_end(k)], other.ends[m], other.ends[capsule_end(m)]
+                leg.ends[k], leg.ends[capsule_end(k)], neighbour.ends[m], neighbour.ends[capsule_end(m)]
             )
             nearest = wp.min(nearest, inflated_distance(distance_sq, radius, bound))
     return nearest
@@ -180,14 +179,14 @@ def leg_leg_distance(leg: LegCapsules, other: LegCapsules, bound: real) -> real:
 
 @wp.func
 def body_ground_distance(ground: Ground, pos: vec3, rotation: mat33) -> real:
-    """Return the distance [m] of the shell from the ground, at the lower corners of its boxes.
+    """Return the smallest `ground_distance` [m] of the shell: signed, along the ground's normal, negative inside.
 
-    Exact over a plane; over a heightfield, what rises between the corners (0.2 m apart at most along x) is missed.
-    pos: base position [m], world; rotation: body to world.
+    Only the four lower corners of each shell box are tested: exact over a plane, but bumps of a heightfield between
+    the corners (at most 0.2 m apart along x) are missed. pos: base position [m], world; rotation: body to world.
     """
-    lower = wp.where(rotation[2, 2] < real(0.0), real(1.0), real(-1.0))
-    nearest = real(1.0e6)
-    count = wp.int32(16)
+    lower = wp.where(rotation[2, 2] < real(0.0), real(1.0), real(-1.0))  # sign of the body z that points down
+    nearest = real(FAR)
+    count = wp.int32(LOWER_CORNERS)
     for i in range(count):
         half = SHELL_HALF[i // 4]
         x = wp.where(i % 2 == 0, half[0], -half[0])
@@ -199,18 +198,18 @@ def body_ground_distance(ground: Ground, pos: vec3, rotation: mat33) -> real:
 
 @wp.func
 def leg_ground_distances(ground: Ground, capsules: LegCapsules, pos: vec3, rotation: mat33) -> vec4:
-    """Return the distances [m] of one leg's (housing, thighs, knees, shanks) from the ground.
+    """Return the smallest `ground_distance` [m] of one leg's (housing, thighs, knees, shanks), negative inside.
 
     A knee is the end of its thigh; the thigh counts from its axis to its middle, the shank down to `SHANK_FREE`.
-    Exact over a plane; over a heightfield links are probed every 0.09 m. pos: base position [m], world;
-    rotation: body to world.
+    Exact over a plane; over a heightfield links are tested every 0.09 m. pos: base position [m], world; rotation: body
+    to world.
     """
     housing = ground_distance(ground, pos + rotation * capsules.hip)
     tip = capsules.hip + vec3(capsules.front * HOUSING_LENGTH, real(0.0), real(0.0))
     housing = wp.min(housing, ground_distance(ground, pos + rotation * tip))
-    thigh = real(1.0e6)
-    knee = real(1.0e6)
-    shank = real(1.0e6)
+    thigh = real(FAR)
+    knee = real(FAR)
+    shank = real(FAR)
     ankle_world = pos + rotation * capsules.ends[4]
     for k in range(2):
         axis_world = pos + rotation * capsules.ends[k]
@@ -227,7 +226,7 @@ def leg_ground_distances(ground: Ground, capsules: LegCapsules, pos: vec3, rotat
 
 @wp.func
 def add_distance(collisions: Collisions, distance: real, least: real, flag: int) -> Collisions:
-    """Return the result with one more distance [m] taken into account: below `least` it raises `flag`."""
+    """Return `collisions` updated by one distance [m]: the clearance, and `flag` (a bit) if distance < least [m]."""
     result = Collisions()
     result.flags = collisions.flags | wp.where(distance < least, flag, 0)
     result.clearance = wp.min(collisions.clearance, distance)
@@ -238,14 +237,14 @@ def add_distance(collisions: Collisions, distance: real, least: real, flag: int)
 def load_leg(
     geometry: wp.array(dtype=LegGeometry), joint_q: wp.array(dtype=wp.float32), start: int, leg: int
 ) -> LegCapsules:
-    """Return the capsules of one leg in the world whose joint coordinates begin at index `start`."""
+    """Return the capsules of leg 0 to 3 of the world whose joint coordinates begin at index `start` of joint_q."""
     motor = start + 7 + 5 * leg
     return leg_capsules(geometry[leg], real(joint_q[motor]), real(joint_q[motor + 1]), real(joint_q[motor + 3]))
 
 
 @wp.func
 def next_leg(order: int) -> int:
-    """Return the leg at a position around the body, modulo 4: FL, FR, BR, BL are legs 0, 1, 3, 2."""
+    """Return the index of the leg at position `order` (modulo 4) around the body: FL, FR, BR, BL are 0, 1, 3, 2."""
     return (order % 4) ^ ((order % 4) >> 1)
 
 
@@ -254,9 +253,9 @@ def add_leg_distances(
     collisions: Collisions, ground: Ground, leg: LegCapsules, neighbour: LegCapsules, pos: vec3, rotation: mat33,
     min_distance: real,
 ) -> Collisions:  # fmt: skip
-    """Return the result with one leg taken into account: with the ground, itself, the shell and the next leg.
+    """Return `collisions` updated by one leg: its distances to the ground, itself, the shell and `neighbour`.
 
-    apart: links closer to one another than this [m] count as touching.
+    pos [m], rotation: see `leg_ground_distances`. min_distance [m]: links closer than this to another link raise flags.
     """
     zero = real(0.0)
     over_ground = leg_ground_distances(ground, leg, pos, rotation)
@@ -272,18 +271,13 @@ def add_leg_distances(
 
 @wp.func
 def world_collisions(
-    geometry: wp.array(dtype=LegGeometry),
-    ground: Ground,
-    joint_q: wp.array(dtype=wp.float32),
-    start: int,
-    margin: real,
+    geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), start: int, margin: real
 ) -> Collisions:
-    """Return the contacts that must not exist and the smallest distance [m] of one robot, at most `margin`.
+    """Return the forbidden contacts of one robot and its smallest distance [m], at most `margin`.
 
     geometry: the four legs. ground: of the robot's world, see `world_ground`. joint_q: base position [m] and
-    quaternion xyzw, then five coordinates a leg [rad], from index `start`. margin: distances [m] above it (>= 0) are
-    not resolved, and with 0 only the flags mean anything: a small margin is fast. A state that is not finite raises no
-    dependable flag.
+    quaternion xyzw, then five coordinates a leg [rad], from index `start`. margin [m], >= 0: larger distances are cut
+    off to it, which is fast; with 0 only the flags are meaningful. Flags of a non-finite state are undefined.
     """
     pos = vec3(real(joint_q[start]), real(joint_q[start + 1]), real(joint_q[start + 2]))
     rotation = wp.quat_to_matrix(
@@ -306,11 +300,10 @@ def leg_collisions(
     geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), start: int, order: int,
     min_distance: real,
 ) -> int:  # fmt: skip
-    """Return the flags of the leg at position `order` around the body, see `next_leg`.
+    """Return the flags of the leg at position `order` (0 to 3) around the body, see `next_leg`.
 
-    Those of all four are those of `world_collisions`.
-
-    apart: links closer to one another than this [m] count as touching; `world_collisions` has 0.
+    The union over all four orders equals the flags of `world_collisions` if min_distance is 0. min_distance [m]: links
+    closer than this to another link raise flags.
     """
     pos = vec3(real(joint_q[start]), real(joint_q[start + 1]), real(joint_q[start + 2]))
     rotation = wp.quat_to_matrix(
@@ -336,7 +329,7 @@ def collision_kernel(
     flags: wp.array(dtype=wp.int32),
     clearance: wp.array(dtype=wp.float32),
 ):
-    """Check one world per thread; see `world_collisions`. joint_q: Newton's, flat, `coords_per_world` a world."""
+    """Write `world_collisions` per world, clearance in [m]; joint_q: Newton's, flat, `coords_per_world` per world."""
     world = wp.tid()
     here = world_ground(ground, world)
     collisions = world_collisions(geometry, here, joint_q, world * coords_per_world, margin)

@@ -1,4 +1,7 @@
-"""The arrow-shaped system: legs eliminated onto the base's six equations, solved, and substituted back."""
+"""Solution of the arrow-shaped system: eliminate the legs, solve the base's six equations, substitute back.
+
+Equations and symbols (D, Bv, Bw, tau, h): see `leg_dynamics`. All vectors are in body axes.
+"""
 
 import warp as wp
 
@@ -10,7 +13,7 @@ from .leg_dynamics import LegDynamics
 
 @wp.struct
 class LegSolve:
-    """One leg with its motors eliminated: q'' = free - to_lin a - to_ang alpha."""
+    """One leg with its motors eliminated: q'' = free - to_lin a - to_ang alpha; rows are lateral, outer, inner."""
 
     inverse: mat33  # inverse of D, implicit terms included [1/(kg m^2)]
     free: vec3  # D^-1 (tau - h) [rad/s^2]
@@ -31,7 +34,7 @@ class BaseSystem:
 
 @wp.struct
 class BaseInverse:
-    """Inverse of the base's system in 3x3 blocks."""
+    """Inverse of the matrix of `BaseSystem`, in the same 3x3 blocks."""
 
     lin: mat33  # [1/kg]
     cross: mat33  # [1/(kg m)]
@@ -40,7 +43,7 @@ class BaseInverse:
 
 @wp.func
 def eliminate_leg(leg: LegDynamics, implicit: mat33, torque: vec3) -> LegSolve:
-    """Return the leg's elimination; implicit: addition to D [kg m^2]; torque: motor-space torque [N m]."""
+    """Return the leg's elimination; implicit: matrix to add to D [kg m^2]; torque: tau [N m], motor space."""
     solve = LegSolve()
     inverse = inverse_symmetric(leg.inertia + implicit)
     solve.inverse = inverse
@@ -54,8 +57,8 @@ def eliminate_leg(leg: LegDynamics, implicit: mat33, torque: vec3) -> LegSolve:
 def base_link_system(body: MassMoments, omega: vec3, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
     """Return the system of the base link alone.
 
-    omega: angular velocity [rad/s], g: gravity [m/s^2], force [N] and moment about the origin [N m] from outside;
-    all in body axes.
+    omega: angular velocity [rad/s]; g: gravity [m/s^2]; force [N], moment [N m] about the origin: external; all in body
+    axes.
     """
     system = BaseSystem()
     system.lin = wp.diag(vec3(body.mass))
@@ -68,7 +71,7 @@ def base_link_system(body: MassMoments, omega: vec3, g: vec3, force: vec3, momen
 
 @wp.func
 def add_leg(system: BaseSystem, leg: LegDynamics, solve: LegSolve) -> BaseSystem:
-    """Return the system with a leg added, its motors eliminated."""
+    """Return `system` plus the terms of one leg, whose motors `solve` has eliminated."""
     s = BaseSystem()
     s.lin = system.lin + wp.diag(vec3(leg.body.mass)) - leg.coupling_lin * solve.to_lin
     s.cross = system.cross - skew(leg.body.first) - leg.coupling_lin * solve.to_ang
@@ -94,25 +97,25 @@ def invert(system: BaseSystem) -> BaseInverse:
 
 @wp.func
 def solve_lin(inverse: BaseInverse, force: vec3, moment: vec3) -> vec3:
-    """Return the linear part of the solution."""
+    """Return the linear part of inverse (force, moment): an acceleration [m/s^2], or for impulses a velocity [m/s]."""
     return inverse.lin * force + inverse.cross * moment
 
 
 @wp.func
 def solve_ang(inverse: BaseInverse, force: vec3, moment: vec3) -> vec3:
-    """Return the angular part of the solution."""
+    """Return the angular part of inverse (force, moment): [rad/s^2], or for impulses a velocity [rad/s]."""
     return wp.transpose(inverse.cross) * force + inverse.ang * moment
 
 
 @wp.func
 def motor_acceleration(solve: LegSolve, lin: vec3, ang: vec3) -> vec3:
-    """Return the motor accelerations [rad/s^2] of a leg for base accelerations in body axes."""
+    """Return the motor accelerations [rad/s^2] of a leg for base accelerations [m/s^2], [rad/s^2] in body axes."""
     return solve.free - solve.to_lin * lin - solve.to_ang * ang
 
 
 @wp.func
 def sum_systems(base: BaseSystem, leg: BaseSystem) -> BaseSystem:
-    """Return the base's own system with those of all legs added."""
+    """Return `base` plus the sum of `leg` over the four threads of a world, each of which passes its own leg."""
     s = BaseSystem()
     s.lin = base.lin + sum_symmetric(leg.lin)
     s.cross = base.cross + sum_matrix(leg.cross)

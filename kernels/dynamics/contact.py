@@ -5,7 +5,7 @@ At the end of a step each paw satisfies, with v the velocity of its contact poin
     0 <= p_n  complementary to  v_n - v_free >= 0,      |p_t| <= mu p_n,
     p_t = -mu p_n v_t / |v_t|  where the paw slides,    v_t = 0 where it sticks,
 
-v_free = -gap / dt lets an open gap close exactly. The four paws are coupled through the base alone,
+v_free = -gap / dt closes an open gap exactly. The four paws are coupled through the base alone,
 
     v_k = v_k0 + A_k p_k + G_k (change of base twist),   change of base twist = S^-1 sum_k G_k^T p_k,
 
@@ -24,37 +24,32 @@ from .base_dynamics import BaseInverse, LegSolve
 from .inertia import skew
 from .leg_dynamics import PawKinematics
 
-# share of a penetration that is pushed out per step, and the fastest push [m/s]
-PUSH_OUT = wp.constant(real(0.2))
-PUSH_OUT_SPEED = wp.constant(real(1.0))
-# paws that could close this much [m] more than their free motion are solved for
-CONTACT_MARGIN = wp.constant(real(0.02))
-# gaps [m], either way, that a paw of a leg on a hard stop keeps
-STIFF_BAND = wp.constant(real(2.0e-6))
-# slower contacts [m/s] start the step with static friction
-STICK_SPEED = wp.constant(real(0.01))
-# scale of a sliding paw's next friction, by the sum of its responses to friction along the ground
-FRICTION_STEP = wp.constant(real(0.6))
+PUSH_OUT = wp.constant(real(0.2))  # fraction of a penetration that is pushed out per step
+PUSH_OUT_SPEED = wp.constant(real(1.0))  # largest speed of that push [m/s]
+CONTACT_MARGIN = wp.constant(real(0.02))  # [m] a paw is solved for if its free motion leaves a smaller gap
+STIFF_BAND = wp.constant(real(2.0e-6))  # [m] a paw of a leg on a hard stop keeps gaps of this size, + or -
+STICK_SPEED = wp.constant(real(0.01))  # [m/s] contacts slower than this start the step with static friction
+FRICTION_STEP = wp.constant(real(0.6))  # `scale` of `sliding_impulse` per sum of the two tangential responses
 
-SEPARATE = wp.constant(0)
+SEPARATE = wp.constant(0)  # modes of a contact
 STICK = wp.constant(1)
 SLIDE = wp.constant(2)
 
 
 @wp.struct
 class PawContact:
-    """One paw in the contact problem."""
+    """One paw in the contact problem; vectors in body axes, motors lateral, outer, inner."""
 
-    active: int  # 0: too far from the ground to touch within the step
-    on_block: int  # 1: the ground is the sliding block there
+    active: int  # 0: too far from the ground to touch within the step, and the impulse is 0
+    on_block: int  # 1: the paw's nearest surface is the sliding block
     normal: vec3  # unit, out of the ground
     mu: real  # friction coefficient
     mu_row: int  # row of mu in the parameter table
     goal: real  # smallest admissible normal velocity at the end of the step [m/s]
     free: vec3  # contact point velocity without any impulse [m/s]
     jacobian: mat33  # contact velocity per motor rate [m/rad]
-    from_lin: mat33  # G: contact velocity per base velocity [1]
-    from_ang: mat33  # and per base angular velocity [m]
+    from_lin: mat33  # G, linear part: contact velocity per base velocity [1]
+    from_ang: mat33  # G, angular part: contact velocity per base angular velocity [m]
     to_lin: mat33  # S^-1 G^T: base velocity per impulse [1/kg]
     to_ang: mat33  # base angular velocity per impulse [1/(kg m)]
     leg_response: mat33  # A: contact velocity per impulse through the leg alone [1/kg]
@@ -65,7 +60,7 @@ class PawContact:
 
 @wp.struct
 class BlockLaw:
-    """What decides the velocity of a sliding block at the end of a step, given the paws' impulses."""
+    """Constants of the velocity of a sliding block at the end of a step, see `block_velocity`; body axes."""
 
     velocity: vec3  # at the start of the step [m/s]
     up: vec3  # world z
@@ -76,16 +71,17 @@ class BlockLaw:
 
 @wp.func
 def contact_jacobian(paw: PawKinematics, arm: vec3) -> mat33:
-    """Return the contact point's velocity per motor rate; arm [m] leads from the paw centre to the point."""
+    """Return the contact point's velocity per motor rate [m/rad]; arm [m]: from paw centre to point, body axes."""
     return paw.jacobian - skew(arm) * paw.spin
 
 
 @wp.func
 def target_normal_velocity(gap: real, pressed: int, dt: real) -> real:
-    """Return the smallest admissible normal velocity [m/s] for a gap [m]: close it exactly, push penetration out.
+    """Return the smallest admissible normal velocity [m/s] at the end of a step dt [s] for a gap [m], < 0 inside.
 
-    pressed: the leg's pressed hard stops. On stops the legs are stiff like those of a table, and the rounding error
-    of a gap would shift load between them: then gaps within `STIFF_BAND` stay, and close gently at first beyond it.
+    An open gap closes exactly; penetration is pushed out. pressed: the leg's pressed hard stops. On stops a leg is
+    stiff, and rounding errors of gaps would shift load between legs: gaps within `STIFF_BAND` are then kept, and those
+    slightly beyond it close by `PUSH_OUT` only.
     """
     beyond = gap
     if pressed != 0:
@@ -98,7 +94,7 @@ def target_normal_velocity(gap: real, pressed: int, dt: real) -> real:
 
 @wp.func
 def couple_contact(contact: PawContact, point: vec3, leg: LegSolve, base: BaseInverse) -> PawContact:
-    """Return the contact with its responses filled in; point [m] from the base origin."""
+    """Return the contact with `from_lin` to `total` written; point [m]: contact point from the base origin."""
     c = contact
     eye = wp.identity(n=3, dtype=real)
     leg_response = leg.inverse * wp.transpose(c.jacobian)
@@ -116,11 +112,12 @@ def couple_contact(contact: PawContact, point: vec3, leg: LegSolve, base: BaseIn
 
 @wp.func
 def sliding_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
-    """Return the next impulse of a sliding paw, meeting the normal condition, from the present impulse and velocity.
+    """Return the next impulse [N s] of a sliding paw, which satisfies the normal condition of its contact.
 
-    Its friction is (present friction - slip / scale), cut at the cone. At the fixed point that is the cone's edge,
-    opposite to the slip; cutting only, never stretching, keeps friction along the slip from being one too. Such
-    steps converge where scale is above half the largest response to friction, and fastest at half of their sum.
+    impulse [N s], velocity [m/s]: present values at the paw. The new friction is (present friction - slip / scale),
+    cut off at the friction cone. The fixed point is the cone's edge opposite to the slip; friction is never stretched
+    to the cone, which would make friction along the slip a fixed point too. The steps converge if scale exceeds half
+    the largest tangential response, and fastest if it is half the sum of both.
     """
     n = c.normal
     across = c.total * n
@@ -139,9 +136,9 @@ def sliding_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
 
 @wp.func
 def local_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
-    """Return the impulse that solves one paw's contact law, the others fixed.
+    """Return the impulse [N s] that solves one paw's contact law while the impulses of the other paws are fixed.
 
-    impulse [N s] and velocity [m/s]: present values at this paw.
+    impulse [N s] and velocity [m/s]: present values at this paw. A sliding paw takes one step, see `sliding_impulse`.
     """
     n = c.normal
     stick = impulse + c.total_inv * (c.goal * n - velocity)
@@ -157,7 +154,7 @@ def local_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
 
 @wp.func
 def push_on_block(contacts: wp.array(dtype=PawContact)) -> vec3:
-    """Return the impulse [N s] of the paws on the block."""
+    """Return the sum of the paws' impulses [N s] on the block; contacts: the (4,) of a world."""
     push = vec3(real(0.0))
     for k in range(contacts.shape[0]):
         if contacts[k].on_block != 0:
@@ -167,9 +164,9 @@ def push_on_block(contacts: wp.array(dtype=PawContact)) -> vec3:
 
 @wp.func
 def block_velocity(block: BlockLaw, push: vec3) -> vec3:
-    """Return the block's velocity [m/s] at the end of the step, pushed by the paws [N s] and slowed by the floor.
+    """Return the block's velocity [m/s] at the end of the step; push [N s]: impulse of the paws on it; body axes.
 
-    Coulomb friction under the weight and the paws' load takes speed off, and never more than there is.
+    Coulomb friction with the floor, under the weight and the paws' load, reduces the horizontal speed, at most to 0.
     """
     upward = wp.dot(push, block.up)
     free = block.velocity + (push - upward * block.up) / block.mass
@@ -182,7 +179,7 @@ def block_velocity(block: BlockLaw, push: vec3) -> vec3:
 
 @wp.func
 def add_block(contact: PawContact, block: BlockLaw) -> PawContact:
-    """Return a contact with the block, whose response to impulses includes the block's."""
+    """Return the contact as one with the block: `on_block` is 1, and `total` includes the block's response."""
     c = contact
     c.on_block = 1
     c.total += (wp.identity(n=3, dtype=real) - wp.outer(block.up, block.up)) / block.mass
@@ -192,7 +189,7 @@ def add_block(contact: PawContact, block: BlockLaw) -> PawContact:
 
 @wp.struct
 class ContactState:
-    """Progress of the contact iteration."""
+    """Progress of the contact iteration; changes since the motion without contact, body axes."""
 
     lin: vec3  # change of the base's linear velocity [m/s]
     ang: vec3  # change of its angular velocity [rad/s]
@@ -202,7 +199,7 @@ class ContactState:
 
 @wp.func
 def sweep_contacts(contacts: wp.array(dtype=PawContact), block: BlockLaw, state: ContactState) -> ContactState:
-    """Run one Gauss-Seidel sweep over the active paws, updating their impulses in place."""
+    """Run one Gauss-Seidel sweep over the active paws; updates the impulses in `contacts` (4,), returns the state."""
     s = state
     s.change = real(0.0)
     s.sweeps = state.sweeps + 1
@@ -225,9 +222,10 @@ def sweep_contacts(contacts: wp.array(dtype=PawContact), block: BlockLaw, state:
 def solve_contacts(
     contacts: wp.array(dtype=PawContact), block: BlockLaw, max_sweeps: int, tolerance: real
 ) -> ContactState:
-    """Solve the contact problem from the impulses in `contacts`; returns the change of base twist and the residual.
+    """Solve the contact problem of a world; returns the change of the base twist and the residual.
 
-    Stops when a sweep changes no contact velocity by more than `tolerance` [m/s].
+    contacts (4,): impulses are the first guess and are replaced by the solution. Ends after `max_sweeps`, or when a
+    sweep changes no contact velocity by more than `tolerance` [m/s].
     """
     state = ContactState()
     for k in range(contacts.shape[0]):
@@ -242,7 +240,7 @@ def solve_contacts(
 
 @wp.func
 def contact_mode(impulse: vec3, normal: vec3, mu: real) -> int:
-    """Return SEPARATE, STICK or SLIDE for a solved impulse."""
+    """Return SEPARATE, STICK or SLIDE for a solved impulse [N s]; normal: unit, out of the ground; mu: friction."""
     size = wp.dot(impulse, normal)
     if size <= real(0.0):
         return SEPARATE

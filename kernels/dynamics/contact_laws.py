@@ -1,4 +1,4 @@
-"""The paws' contact laws at a solution, and their derivatives."""
+"""Contact laws of the paws at the solution of a step, and their derivatives for the reverse pass."""
 
 import warp as wp
 
@@ -28,7 +28,7 @@ class PawLaw:
 def contact_at(
     model: RobotModel, k: int, base: BaseState, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, impulse: vec3
 ) -> PawContact:
-    """Return paw k's response to impulses; impulse [N s]: in body axes."""
+    """Return the contact of paw k (0 to 3) with the floor, responses to impulses included; impulse [N s]: body axes."""
     contact = PawContact()
     contact.active = 1
     contact.impulse = impulse
@@ -41,7 +41,7 @@ def contact_at(
 
 @wp.func
 def contact_point(model: RobotModel, k: int, paw: PawKinematics, contact: PawContact) -> vec3:
-    """Return where paw k touches [m], body axes, from the base's origin."""
+    """Return the contact point [m] of paw k (0 to 3) in the body frame."""
     return paw.position - model.geometry[k].paw_radius * contact.normal
 
 
@@ -49,7 +49,7 @@ def contact_point(model: RobotModel, k: int, paw: PawKinematics, contact: PawCon
 def paw_law(
     model: RobotModel, world: int, k: int, contact: PawContact, old_velocity: vec3, velocity: vec3, old_impulse: vec3
 ) -> PawLaw:
-    """Return the contact law of paw k.
+    """Return the contact law of paw k (0 to 3), linearised at the solution.
 
     old_velocity, velocity [m/s]: of the contact point at the start and the end of the step; old_impulse [N s]: in the
     preceding step; all in body axes.
@@ -74,10 +74,10 @@ def paw_law(
 
 @wp.func
 def contact_residual(impulse: vec3, velocity: vec3, normal: vec3, goal: real, mu: real, mode: int) -> vec3:
-    """Return R, zero where an impulse [N s] and a contact velocity [m/s] satisfy the law of a mode.
+    """Return the residual R of the contact law of `mode`, zero where impulse [N s] and velocity [m/s] satisfy it.
 
-    Separated: R = p. Sticking: R = v - goal n. Sliding: normal part v_n - goal, tangential part
-    |v_t| p_t + mu p_n v_t.
+    SEPARATE: R = p. STICK: R = v - goal n. SLIDE: normal part v_n - goal, tangential part |v_t| p_t + mu p_n v_t.
+    goal [m/s]: see `PawContact`.
     """
     if mode == SEPARATE:
         return impulse

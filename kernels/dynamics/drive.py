@@ -1,4 +1,4 @@
-"""Inputs of a launch of the dynamics (targets, forces), and the solver's results for every world."""
+"""Inputs of a launch of the dynamics (targets, forces), and the arrays of results of every world."""
 
 import warp as wp
 
@@ -14,13 +14,13 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class Drive:
-    """Inputs of a launch: motor targets, joint forces and a wrench on the base, constant over it."""
+    """Inputs of a launch: motor targets, joint forces and a wrench on the base, constant during the launch."""
 
     closed_loop: int  # 1: the motors follow `target`; 0: only `joint_f` acts
     motors: MotorArrays
     target: wp.array2d(dtype=real)  # [rad], (12, num_worlds)
-    previous: wp.array2d(dtype=real)  # [rad], (12, num_worlds), followed until the target arrives
-    delay: wp.array(dtype=int)  # physics steps until it arrives, (num_worlds,); empty: none
+    previous: wp.array2d(dtype=real)  # [rad], (12, num_worlds), followed during the first `delay` steps
+    delay: wp.array(dtype=int)  # physics steps until `target` is followed, (num_worlds,); empty: 0
     joint_f: wp.array(dtype=real)  # [N m] and, for the base, world wrench at its com; Newton's layout
     body_f: wp.array(dtype=wp.spatial_vector)  # world wrench at the com of each body; the base's is used
 
@@ -41,7 +41,7 @@ class LegDrive:
 
 @wp.struct
 class Workspace:
-    """The solver's own arrays, per world."""
+    """Arrays that the solver writes, and keeps from launch to launch; per-world arrays are (num_worlds,)."""
 
     impulse: wp.array2d(dtype=vec3)  # [N s] of each paw in the last step, world frame, (4, num_worlds)
     contact_force: wp.array2d(dtype=vec3)  # [N] on each paw in the last step, world frame, (4, num_worlds)
@@ -49,16 +49,16 @@ class Workspace:
     peak_paw_force: wp.array2d(dtype=real)  # [N] largest on each paw in the launch, (4, num_worlds)
     torque: wp.array2d(dtype=real)  # [N m] of each motor in the last step, (12, num_worlds)
     residual: wp.array(dtype=real)  # [m/s] of the contact iteration, largest of the launch
-    sweeps: wp.array(dtype=int)  # of the contact iteration, most of the launch
+    sweeps: wp.array(dtype=int)  # of the contact iteration, largest number of the launch
     diverged: wp.array(dtype=int)  # 1: the state became non-finite; the world is frozen until a reset
-    reference_q: wp.array(dtype=real)  # joint_q that diverged worlds are frozen in
+    reference_q: wp.array(dtype=real)  # joint_q of diverged worlds, (43 num_worlds,)
 
 
 @wp.func
 def freeze_diverged_world(
     model: RobotModel, work: Workspace, world: int, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)
 ):
-    """Put a world at rest in its reference pose, its block at rest at its start."""
+    """Write the world's reference pose with zero velocities and contact forces, and reset its block."""
     rest_block(model.ground, world)
     for i in range(int(COORDS)):
         joint_q[world * COORDS + i] = work.reference_q[world * COORDS + i]
@@ -71,7 +71,7 @@ def freeze_diverged_world(
 
 @wp.func
 def load_leg_drive(drive: Drive, world: int, k: int) -> LegDrive:
-    """Return the inputs of leg k of a world."""
+    """Return the inputs of leg k (0 to 3) of a world."""
     leg = LegDrive()
     leg.extra = load_motors(drive.joint_f, leg_dof(world, k))
     leg.closed_loop = drive.closed_loop
@@ -90,7 +90,7 @@ def load_leg_drive(drive: Drive, world: int, k: int) -> LegDrive:
 
 @wp.func
 def applied_torque(leg: LegDrive, step: int, angles: vec3, rates: vec3) -> vec3:
-    """Return a leg's motor-space torque [N m] in a step of the launch."""
+    """Return a leg's motor torques [N m] in step `step` of the launch (from 0), at angles [rad] and rates [rad/s]."""
     if leg.closed_loop == 0:
         return leg.extra
     target = leg.target
@@ -106,14 +106,10 @@ def applied_torque(leg: LegDrive, step: int, angles: vec3, rates: vec3) -> vec3:
 
 @wp.func
 def base_wrench(joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), world: int) -> vec6:
-    """Return the external wrench on the base at its com, world axes (force [N], moment [N m])."""
+    """Return the external wrench on the base at its com, world axes: force x, y, z [N], moment x, y, z [N m]."""
     w = body_f[world * BODIES]
     i = world * DOFS
     return vec6(
-        real(w[0]) + joint_f[i],
-        real(w[1]) + joint_f[i + 1],
-        real(w[2]) + joint_f[i + 2],
-        real(w[3]) + joint_f[i + 3],
-        real(w[4]) + joint_f[i + 4],
-        real(w[5]) + joint_f[i + 5],
-    )
+        real(w[0]) + joint_f[i], real(w[1]) + joint_f[i + 1], real(w[2]) + joint_f[i + 2],
+        real(w[3]) + joint_f[i + 3], real(w[4]) + joint_f[i + 4], real(w[5]) + joint_f[i + 5],
+    )  # fmt: skip

@@ -1,7 +1,7 @@
 """Mass properties: zeroth, first and second moments of a mass distribution.
 
-Second moments are kept as S = integral of r r^T dm about a stated point, packed (xx, yy, zz, xy, xz, yz): they add up
-without case distinctions, and the inertia tensor is trace(S) 1 - S.
+Packed second moments are S = integral of r r^T dm [kg m^2] about a stated point, as (xx, yy, zz, xy, xz, yz). Moments
+of several links about one point add up; the inertia tensor is trace(S) 1 - S.
 """
 
 import warp as wp
@@ -11,7 +11,7 @@ from ..scalar import mat33, real, vec2, vec3, vec5, vec6
 
 @wp.struct
 class MassMoments:
-    """Moments of one or more links about a point and in axes that the context names."""
+    """Moments of one or more links; the user of the struct states the point and the axes."""
 
     mass: real  # [kg]
     first: vec3  # [kg m]
@@ -20,13 +20,13 @@ class MassMoments:
 
 @wp.func
 def trace(s: vec6) -> real:
-    """Return the trace of packed second moments."""
+    """Return the trace [kg m^2] of packed second moments."""
     return s[0] + s[1] + s[2]
 
 
 @wp.func
 def mul(s: vec6, v: vec3) -> vec3:
-    """Return S v for packed second moments."""
+    """Return S v for packed second moments S."""
     return vec3(
         s[0] * v[0] + s[3] * v[1] + s[4] * v[2],
         s[3] * v[0] + s[1] * v[1] + s[5] * v[2],
@@ -36,17 +36,15 @@ def mul(s: vec6, v: vec3) -> vec3:
 
 @wp.func
 def mul_plane(s: vec5, v: vec3) -> vec3:
-    """Return S v for packed second moments without yy: xx zz xy xz yz."""
+    """Return S v for packed second moments S with yy = 0, stored as (xx, zz, xy, xz, yz)."""
     return vec3(
-        s[0] * v[0] + s[2] * v[1] + s[3] * v[2],
-        s[2] * v[0] + s[4] * v[2],
-        s[3] * v[0] + s[4] * v[1] + s[1] * v[2],
+        s[0] * v[0] + s[2] * v[1] + s[3] * v[2], s[2] * v[0] + s[4] * v[2], s[3] * v[0] + s[4] * v[1] + s[1] * v[2]
     )
 
 
 @wp.func
 def inertia_mul(s: vec6, v: vec3) -> vec3:
-    """Return I v for the inertia tensor of packed second moments."""
+    """Return I v for the inertia tensor I of packed second moments."""
     return trace(s) * v - mul(s, v)
 
 
@@ -62,27 +60,23 @@ def inertia_matrix(s: vec6) -> mat33:
 
 @wp.func
 def sym_outer(a: vec3, b: vec3) -> vec6:
-    """Return a b^T + b a^T, packed."""
+    """Return a b^T + b a^T, packed as (xx, yy, zz, xy, xz, yz)."""
     two = real(2.0)
     return vec6(
-        two * a[0] * b[0],
-        two * a[1] * b[1],
-        two * a[2] * b[2],
-        a[0] * b[1] + a[1] * b[0],
-        a[0] * b[2] + a[2] * b[0],
-        a[1] * b[2] + a[2] * b[1],
-    )
+        two * a[0] * b[0], two * a[1] * b[1], two * a[2] * b[2],
+        a[0] * b[1] + a[1] * b[0], a[0] * b[2] + a[2] * b[0], a[1] * b[2] + a[2] * b[1],
+    )  # fmt: skip
 
 
 @wp.func
 def rotate_y(v: vec3, c: real, s: real) -> vec3:
-    """Return v turned about y by the angle with cosine c and sine s."""
+    """Return v rotated about +y by the angle with cosine c and sine s."""
     return vec3(c * v[0] + s * v[2], v[1], c * v[2] - s * v[0])
 
 
 @wp.func
 def rotate_y_second(m: vec6, c: real, s: real) -> vec6:
-    """Return packed second moments turned about y."""
+    """Return packed second moments rotated about +y by the angle with cosine c and sine s."""
     cc = c * c
     ss = s * s
     cs = c * s
@@ -99,13 +93,13 @@ def rotate_y_second(m: vec6, c: real, s: real) -> vec6:
 
 @wp.func
 def rotate_x(v: vec3, c: real, s: real) -> vec3:
-    """Return v turned about x by the angle with cosine c and sine s."""
+    """Return v rotated about +x by the angle with cosine c and sine s."""
     return vec3(v[0], c * v[1] - s * v[2], s * v[1] + c * v[2])
 
 
 @wp.func
 def rotate_x_second(m: vec6, c: real, s: real) -> vec6:
-    """Return packed second moments turned about x."""
+    """Return packed second moments rotated about +x by the angle with cosine c and sine s."""
     cc = c * c
     ss = s * s
     cs = c * s
@@ -122,20 +116,20 @@ def rotate_x_second(m: vec6, c: real, s: real) -> vec6:
 
 @wp.func
 def rotate_x_plane(v: vec2, c: real, s: real) -> vec3:
-    """Return (v_x, 0, v_z) turned about x."""
+    """Return (v[0], 0, v[1]) rotated about +x by the angle with cosine c and sine s."""
     return vec3(v[0], -s * v[1], c * v[1])
 
 
 @wp.func
 def skew(v: vec3) -> mat33:
-    """Return [v]x, with [v]x u = v x u."""
+    """Return the cross-product matrix [v]x of v, with [v]x u = v x u."""
     zero = real(0.0)
     return mat33(zero, -v[2], v[1], v[2], zero, -v[0], -v[1], v[0], zero)
 
 
 @wp.func
 def symmetric(xx: real, xy: real, xz: real, yy: real, yz: real, zz: real) -> mat33:
-    """Return the symmetric matrix with this upper triangle."""
+    """Return the symmetric matrix with the given upper triangle."""
     return mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
 
 

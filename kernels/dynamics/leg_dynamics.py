@@ -1,12 +1,12 @@
-"""Dynamics of one leg seen from the base: couplings, velocity-product forces, and the leg's elimination.
+"""Dynamics of one leg in the base's equations: inertia, couplings to the base, and velocity-product forces.
 
-With the base acceleration a (of the base origin, inertial) and alpha, and motor accelerations q'':
+With the base's linear acceleration a (of its origin), angular one alpha, and motor accelerations q'' and torques tau:
 
     D q'' + Bv^T a + Bw^T alpha + h = tau
     force on the base origin  = m a - first x alpha + Bv q'' + F
     moment about it           = first x a + I alpha + Bw q'' + N
 
-All vectors are in body axes, about the base origin.
+All vectors are in body axes, about the base origin; m, first, I: the leg's mass moments and inertia tensor.
 """
 
 import warp as wp
@@ -15,15 +15,7 @@ from ..kinematics.five_bar import FiveBar, five_bar, five_bar_bias
 from ..kinematics.geometry import LegGeometry
 from ..kinematics.trig import sin_cos
 from ..scalar import mat33, real, vec2, vec3, vec5
-from .inertia import (
-    MassMoments,
-    inertia_mul,
-    mul_plane,
-    rotate_x,
-    rotate_x_plane,
-    rotate_x_second,
-    sym_outer,
-)
+from .inertia import MassMoments, inertia_mul, mul_plane, rotate_x, rotate_x_plane, rotate_x_second, sym_outer
 from .leg_links import LinkSums, inner_sums, leg_sums, outer_sums
 
 
@@ -43,7 +35,7 @@ class LegPose:
     """Configuration of a leg: the five-bar in the housing, and the housing's rotation about body x."""
 
     loop: FiveBar
-    cosine: real  # of the lateral angle times `side`
+    cosine: real  # of the rotation, the lateral angle times `LegGeometry.side`
     sine: real
 
 
@@ -107,13 +99,16 @@ def paw_kinematics(geo: LegGeometry, pose: LegPose) -> PawKinematics:
 
 @wp.func
 def centrifugal(second_j: vec5, w: vec3) -> real:
-    """Return 1/2 w^T (dI/dq_j) w, the centrifugal force on motor j [N m]."""
+    """Return 1/2 w^T (dI/dq_j) w, the centrifugal torque [N m] on motor j (outer or inner).
+
+    second_j: d S / d q_j as in `LinkSums`; w [rad/s]: angular velocity of the housing, housing axes.
+    """
     return real(0.5) * ((second_j[0] + second_j[1]) * wp.dot(w, w) - wp.dot(w, mul_plane(second_j, w)))
 
 
 @wp.func
 def leg_body(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> MassMoments:
-    """Return the mass moments of a leg about the base origin, body axes."""
+    """Return the mass moments of a leg about the base origin, body axes; cosine, sine: see `LegPose`."""
     first = rotate_x(sums.first, cosine, sine)
     body = MassMoments()
     body.mass = sums.mass
@@ -128,7 +123,7 @@ def leg_body(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> Mass
 
 @wp.func
 def couple_leg(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> LegDynamics:
-    """Return a leg's dynamics with its inertia, and its coupling to the base in body axes about the base origin."""
+    """Return a leg's dynamics with `inertia` and couplings written, all else zero; cosine, sine: see `LegPose`."""
     leg = LegDynamics()
     second = sums.second
     lateral_ang = geo.side * vec3(second[1] + second[2], -second[3], -second[4])  # of a unit rate about x
@@ -156,7 +151,8 @@ def assemble_leg(
 ) -> LegDynamics:
     """Return the leg's dynamics from its link sums.
 
-    rates: motor rates [rad/s]; omega: base angular velocity [rad/s], g: gravity [m/s^2], both in body axes.
+    rates: motor rates [rad/s]; omega: base angular velocity [rad/s], g: gravity [m/s^2], both in body axes; cosine,
+    sine: see `LegPose`.
     """
     zero = real(0.0)
     lateral_rate = geo.side * rates[0]
@@ -208,11 +204,7 @@ def assemble_leg(
 
 @wp.func
 def leg_dynamics(geo: LegGeometry, masses: LegMasses, pose: LegPose, rates: vec3, omega: vec3, g: vec3) -> LegDynamics:
-    """Return the dynamics of one leg.
-
-    rates: of the lateral, outer and inner motor [rad/s]; omega: base angular velocity [rad/s]; g: gravity [m/s^2];
-    both in body axes.
-    """
+    """Return a leg's dynamics; motor rates [rad/s]; omega [rad/s], g [m/s^2]: base rate and gravity, body axes."""
     bias = five_bar_bias(geo, pose.loop, rates[1], rates[2])
     outer = outer_sums(geo, masses.outer_thigh, masses.outer_shank, pose.loop, bias)
     inner = inner_sums(geo, masses.inner_thigh, masses.inner_shank, pose.loop, bias)

@@ -19,7 +19,7 @@ from .inertia import MassMoments, rotate_y, rotate_y_second, sym_outer
 class LinkSums:
     """Integrals over link mass; subscripts o and i mean derivatives by the outer and inner motor angle.
 
-    Of a link or a side of the leg, o is the motor of the same side and i the other; `leg_sums` sorts them.
+    In the sums of one side of the leg, o is the motor of that side and i the other motor; `leg_sums` reorders them.
     """
 
     mass: real  # [kg]
@@ -43,32 +43,32 @@ class LinkSums:
 
 @wp.func
 def cross_y(v: vec3) -> vec2:
-    """Return x and z of e_y x v."""
+    """Return (x, z) of e_y x v."""
     return vec2(v[2], -v[0])
 
 
 @wp.func
 def cross_y_second(s: vec6) -> vec5:
-    """Return the derivative of packed second moments by a rotation about y."""
+    """Return d S / d angle (xx zz xy xz yz) of packed second moments S that rotate about +y; its yy is 0."""
     two = real(2.0)
     return vec5(two * s[4], -two * s[4], s[5], s[2] - s[0], -s[3])
 
 
 @wp.func
 def spin_y(s: vec6) -> vec3:
-    """Return the integral of r x (e_y x r): angular momentum of a unit rotation rate about y."""
+    """Return the integral of r x (e_y x r) [kg m^2]: angular momentum per unit rate about +y; s: packed moments."""
     return vec3(-s[3], s[0] + s[2], -s[5])
 
 
 @wp.func
 def cross_plane(a: vec3, b: vec2) -> vec3:
-    """Return a x (b_x, 0, b_z)."""
+    """Return a x (b[0], 0, b[1])."""
     return vec3(a[1] * b[1], a[2] * b[0] - a[0] * b[1], -a[1] * b[0])
 
 
 @wp.func
 def sym_outer_plane(a: vec2, b: vec3) -> vec5:
-    """Return a b^T + b a^T for a in the plane: xx zz xy xz yz."""
+    """Return a b^T + b a^T for a = (x, z) in the plane, packed without yy: xx zz xy xz yz."""
     two = real(2.0)
     return vec5(two * a[0] * b[0], two * a[1] * b[2], a[0] * b[1], a[0] * b[2] + a[1] * b[0], a[1] * b[1])
 
@@ -85,11 +85,11 @@ def shank_sums(
     knee_acc: vec2,
     rotation_acc: real,
 ) -> LinkSums:
-    """Return the sums of a shank, whose frame has its origin at the knee of its side and rotates about y.
+    """Return the sums of a shank, whose frame has its origin at its knee and rotates about housing +y.
 
-    link: about that frame. knee [m], direction (unit, knee to ankle): in the housing frame. knee_do [m/rad]: derivative
-    by the motor of its side. rotation_do, _di [1]: of the shank's angle about y by that motor and the other. rate
-    [rad/s], knee_acc [m/s^2], rotation_acc [rad/s^2]: at zero motor accelerations, see `FiveBarBias`.
+    link: moments in that frame. knee [m], direction (unit, knee to ankle): in the housing frame. Derivatives: knee_do
+    [m/rad] by the motor of the shank's side; rotation_do, rotation_di [1] of the shank's angle by that motor and by
+    the other. rate [rad/s], knee_acc [m/s^2], rotation_acc [rad/s^2]: see `FiveBarBias`.
     """
     # a shank hanging along -z has direction (0, -1): its rotation has sine -x and cosine -z
     u = rotate_y(link.first, -direction[1], -direction[0])
@@ -133,10 +133,10 @@ def shank_sums(
 def add_thigh(
     shank: LinkSums, link: MassMoments, axis: vec2, cosine: real, sine: real, rate: real, sign: real
 ) -> LinkSums:
-    """Return a shank's sums with those of the thigh above it.
+    """Return the sums `shank` plus those of the thigh above it; link: the thigh's moments in its own frame.
 
-    The thigh turns about its transversal axis, at x and y `axis` [m], z = 0, by `sign` (-1 or +1) times its motor's
-    angle, at `rate` [rad/s]; cosine, sine: of that angle about y.
+    The thigh rotates about its transversal axis, at x and y `axis` [m], z = 0 in the housing frame, by `sign` (-1 or
+    +1) times its motor's angle; cosine, sine: of that rotation about +y; rate [rad/s]: of the rotation.
     """
     u = rotate_y(link.first, cosine, sine)
     s = rotate_y_second(link.second, cosine, sine)
@@ -151,15 +151,11 @@ def add_thigh(
     sums.first += vec3(link.mass * x + u[0], link.mass * y + u[1], u[2])
     sums.second += (
         vec6(
-            x * along_x,
-            y * (two * u[1] + link.mass * y),
-            real(0.0),
-            x * u[1] + y * u[0] + link.mass * x * y,
-            x * u[2],
-            y * u[2],
+            x * along_x, y * (two * u[1] + link.mass * y), real(0.0),
+            x * u[1] + y * u[0] + link.mass * x * y, x * u[2], y * u[2],
         )
         + s
-    )
+    )  # fmt: skip
     sums.second_o += vec5(two * u_o[0] * x, real(0.0), u_o[0] * y, u_o[1] * x, u_o[1] * y) + sign * cross_y_second(s)
     sums.lin_o += u_o
     sums.ang_o += vec3(y * u_o[1], -x * u_o[1], -y * u_o[0]) + sign * spin_y(s)
@@ -171,7 +167,7 @@ def add_thigh(
 
 @wp.func
 def outer_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: FiveBar, bias: FiveBarBias) -> LinkSums:
-    """Return the sums of the outer thigh and shank."""
+    """Return the sums of the outer thigh and shank; o: outer motor, i: inner motor."""
     sin_cos = loop.outer_sin_cos
     knee = vec3(loop.outer_knee[0], geo.plane_y + geo.knee_y, loop.outer_knee[1])
     shank_part = shank_sums(
@@ -184,7 +180,7 @@ def outer_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: F
 
 @wp.func
 def inner_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: FiveBar, bias: FiveBarBias) -> LinkSums:
-    """Return the sums of the inner thigh and shank."""
+    """Return the sums of the inner thigh and shank; o: inner motor, i: outer motor."""
     sin_cos = loop.inner_sin_cos
     knee = vec3(loop.inner_knee[0], geo.plane_y + geo.knee_y, loop.inner_knee[1])
     shank_part = shank_sums(
@@ -197,7 +193,7 @@ def inner_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: F
 
 @wp.func
 def leg_sums(housing: MassMoments, outer: LinkSums, inner: LinkSums) -> LinkSums:
-    """Return the sums of a whole leg; the housing does not move in its own frame."""
+    """Return the sums of a whole leg (o: outer motor, i: inner motor); the housing does not move in its own frame."""
     c = LinkSums()
     c.mass = housing.mass + outer.mass + inner.mass
     c.first = housing.first + outer.first + inner.first

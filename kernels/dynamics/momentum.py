@@ -1,9 +1,8 @@
 """Momentum of a robot in free flight, and its correction to the conserved value.
 
-The step is semi-implicit Euler, whose momentum drifts by an error of first order while legs move. In free flight, with
-no paw down and no wrench from outside, the right momentum is known: the angular one about the centre of mass is
-constant, the linear one grows by m g t. The correction changes the base's twist alone, as an impulse on a robot with
-locked joints.
+Semi-implicit Euler has a first-order drift of momentum while legs move. In free flight, with no paw down and no
+external wrench, the exact momentum is known: angular momentum about the centre of mass is constant, linear momentum
+grows by m g t. The correction changes the base's twist only, like an impulse on a robot with locked joints.
 """
 
 import warp as wp
@@ -40,7 +39,7 @@ class Momenta:
 def robot_momentum(
     model: RobotModel, world: int, base: BaseState, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)
 ) -> RobotMomentum:  # fmt: skip
-    """Return a robot's mass moments and momentum; joint_q, joint_qd: in Newton's layout, of all worlds."""
+    """Return a robot's mass moments and momentum, body axes; joint_q, joint_qd: Newton's, flat over worlds."""
     momentum = RobotMomentum()
     body = load_moments(model.table, BASE, world)
     for k in range(model.geometry.shape[0]):
@@ -63,7 +62,10 @@ def robot_momentum(
 
 @wp.func
 def base_with_momentum(base: BaseState, momentum: RobotMomentum, lin: vec3, ang: vec3) -> BaseState:
-    """Return the base with the twist that gives the robot a momentum lin [kg m/s], ang [kg m^2/s], world axes."""
+    """Return `base` with the twist that changes the robot's momentum from `momentum` to lin, ang (world axes).
+
+    lin [kg m/s], ang [kg m^2/s] about the robot's centre of mass; the rates of the motors stay unchanged.
+    """
     mass = momentum.body.mass
     com = momentum.body.first / mass
     # about the centre of mass: I - m (c.c 1 - c c^T)
@@ -88,7 +90,7 @@ def momentum_kernel(
     # out
     momenta: Momenta,
 ):
-    """Write the momentum of every robot; one thread per world, from world `first` on."""
+    """Write the momentum of every robot, world axes; one thread per world, from world `first` on."""
     world = first + wp.tid()
     base = load_base(joint_q, joint_qd, base_com(model.table, world), world)
     momentum = robot_momentum(model, world, base, joint_q, joint_qd)
@@ -110,10 +112,10 @@ def project_momentum_kernel(
     joint_q: wp.array(dtype=real),
     joint_qd: wp.array(dtype=real),
 ):
-    """Project the base twist of robots in free flight onto conserved momentum; one thread per world.
+    """Correct the base twist of robots in free flight to the conserved momentum; one thread per world from `first`.
 
-    momenta: at the start of an interval of `time` [s]. body_f: wrenches in it. peak_force [N]: largest total paw force
-    in it, 0 in flight. diverged: worlds left alone.
+    momenta: at the start of an interval of `time` [s]. For that interval, body_f: external wrenches; peak_force [N]:
+    largest total paw force, 0 in flight. Skips held worlds and those with diverged != 0.
     """
     world = first + wp.tid()
     if diverged[world] != 0 or peak_force[world] > real(0.0) or wp.length_sq(body_f[world * BODIES]) > 0.0:

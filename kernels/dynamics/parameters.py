@@ -1,39 +1,14 @@
-"""Per-world parameters of the robot, packed from a Newton model into the table that `layout` describes."""
+"""Per-world parameters of the robot: the table of `layout`, (PARAMETER_ROWS, num_worlds), read and packed from Newton.
+
+`load_*` return structs for leg 0 to 3 (FL, FR, BL, BR) of a world; units are those of the structs.
+"""
 
 import warp as wp
 
+from .. import layout
 from ..actuation.joint_forces import JointParams
 from ..actuation.springs import LegSpring
 from ..actuation.stops import StopParams
-from ..layout import (
-    ARMATURE,
-    BASE,
-    BODIES,
-    DAMPING,
-    DOFS,
-    FRICTION,
-    GRAVITY,
-    HOUSING,
-    INNER_SHANK,
-    INNER_THIGH,
-    KNEE_DAMPING,
-    KNEE_LIMIT,
-    LEG_BODIES,
-    LEG_ROWS,
-    LOWER,
-    MOMENT_ROWS,
-    MU_DYNAMIC,
-    MU_STATIC,
-    OUTER_SHANK,
-    OUTER_THIGH,
-    SPRING,
-    STOP_KD,
-    STOP_KE,
-    SUM_LOWER,
-    SUM_UPPER,
-    UPPER,
-    motor_slot,
-)
 from ..scalar import real, vec3, vec6
 from .inertia import MassMoments
 from .leg_dynamics import LegMasses
@@ -41,73 +16,69 @@ from .leg_dynamics import LegMasses
 
 @wp.func
 def load_vec3(table: wp.array2d(dtype=real), row: int, world: int) -> vec3:
-    """Return three consecutive rows as a vector."""
+    """Return three consecutive rows of the table, from `row` on, as a vector."""
     return vec3(table[row, world], table[row + 1, world], table[row + 2, world])
 
 
 @wp.func
 def load_moments(table: wp.array2d(dtype=real), row: int, world: int) -> MassMoments:
-    """Return the mass moments that start at a row."""
+    """Return the mass moments of a link, stored in MOMENT_ROWS rows of the table from `row` on."""
     m = MassMoments()
     m.mass = table[row, world]
     m.first = load_vec3(table, row + 1, world)
     m.second = vec6(
-        table[row + 4, world],
-        table[row + 5, world],
-        table[row + 6, world],
-        table[row + 7, world],
-        table[row + 8, world],
-        table[row + 9, world],
-    )
+        table[row + 4, world], table[row + 5, world], table[row + 6, world],
+        table[row + 7, world], table[row + 8, world], table[row + 9, world],
+    )  # fmt: skip
     return m
 
 
 @wp.func
 def load_masses(table: wp.array2d(dtype=real), leg: int, world: int) -> LegMasses:
-    """Return the mass moments of a leg's links."""
-    row = leg * LEG_ROWS
+    """Return the mass moments of a leg's five links, each in its own link frame."""
+    row = leg * layout.LEG_ROWS
     masses = LegMasses()
-    masses.housing = load_moments(table, row + HOUSING, world)
-    masses.outer_thigh = load_moments(table, row + OUTER_THIGH, world)
-    masses.outer_shank = load_moments(table, row + OUTER_SHANK, world)
-    masses.inner_thigh = load_moments(table, row + INNER_THIGH, world)
-    masses.inner_shank = load_moments(table, row + INNER_SHANK, world)
+    masses.housing = load_moments(table, row + layout.HOUSING, world)
+    masses.outer_thigh = load_moments(table, row + layout.OUTER_THIGH, world)
+    masses.outer_shank = load_moments(table, row + layout.OUTER_SHANK, world)
+    masses.inner_thigh = load_moments(table, row + layout.INNER_THIGH, world)
+    masses.inner_shank = load_moments(table, row + layout.INNER_SHANK, world)
     return masses
 
 
 @wp.func
 def load_stops(table: wp.array2d(dtype=real), leg: int, world: int) -> StopParams:
     """Return the hard stops of a leg."""
-    row = leg * LEG_ROWS
+    row = leg * layout.LEG_ROWS
     p = StopParams()
-    p.lower = load_vec3(table, row + LOWER, world)
-    p.upper = load_vec3(table, row + UPPER, world)
-    p.sum_lower = table[row + SUM_LOWER, world]
-    p.sum_upper = table[row + SUM_UPPER, world]
-    p.ke = table[row + STOP_KE, world]
-    p.kd = table[row + STOP_KD, world]
+    p.lower = load_vec3(table, row + layout.LOWER, world)
+    p.upper = load_vec3(table, row + layout.UPPER, world)
+    p.sum_lower = table[row + layout.SUM_LOWER, world]
+    p.sum_upper = table[row + layout.SUM_UPPER, world]
+    p.ke = table[row + layout.STOP_KE, world]
+    p.kd = table[row + layout.STOP_KD, world]
     return p
 
 
 @wp.func
 def load_joint_params(table: wp.array2d(dtype=real), leg: int, world: int) -> JointParams:
-    """Return the joint-space parameters of a leg."""
-    row = leg * LEG_ROWS
+    """Return armature, friction and damping of a leg's motors and knees."""
+    row = leg * layout.LEG_ROWS
     p = JointParams()
-    p.armature = load_vec3(table, row + ARMATURE, world)
-    p.friction = load_vec3(table, row + FRICTION, world)
-    p.damping = load_vec3(table, row + DAMPING, world)
-    p.knee_damping_outer = table[row + KNEE_DAMPING, world]
-    p.knee_damping_inner = table[row + KNEE_DAMPING + 1, world]
-    p.knee_limit_outer = table[row + KNEE_LIMIT, world]
-    p.knee_limit_inner = table[row + KNEE_LIMIT + 1, world]
+    p.armature = load_vec3(table, row + layout.ARMATURE, world)
+    p.friction = load_vec3(table, row + layout.FRICTION, world)
+    p.damping = load_vec3(table, row + layout.DAMPING, world)
+    p.knee_damping_outer = table[row + layout.KNEE_DAMPING, world]
+    p.knee_damping_inner = table[row + layout.KNEE_DAMPING + 1, world]
+    p.knee_limit_outer = table[row + layout.KNEE_LIMIT, world]
+    p.knee_limit_inner = table[row + layout.KNEE_LIMIT + 1, world]
     return p
 
 
 @wp.func
 def load_spring(table: wp.array2d(dtype=real), leg: int, world: int) -> LegSpring:
-    """Return the spring of a leg."""
-    row = leg * LEG_ROWS + SPRING
+    """Return the spring between the knees of a leg."""
+    row = leg * layout.LEG_ROWS + layout.SPRING
     spring = LegSpring()
     spring.stiffness = table[row, world]
     spring.length = table[row + 1, world]
@@ -116,7 +87,7 @@ def load_spring(table: wp.array2d(dtype=real), leg: int, world: int) -> LegSprin
 
 @wp.func
 def store_link(table: wp.array2d(dtype=real), row: int, world: int, mass: float, com: wp.vec3, inertia: wp.mat33):
-    """Write a link's mass moments about its own frame, from mass, com [m] and inertia about the com [kg m^2]."""
+    """Write a link's mass moments about its frame's origin, from mass [kg], com [m] and inertia at the com [kg m^2]."""
     half_trace = real(0.5) * (real(inertia[0, 0]) + real(inertia[1, 1]) + real(inertia[2, 2]))
     m = real(mass)
     c = vec3(real(com[0]), real(com[1]), real(com[2]))
@@ -134,16 +105,16 @@ def store_link(table: wp.array2d(dtype=real), row: int, world: int, mass: float,
 
 @wp.func
 def body_row(body: int) -> int:
-    """Return the first row of a body's mass moments."""
+    """Return the first row of the mass moments of body 0 (base) to 20 of a world."""
     if body == 0:
-        return BASE
-    return ((body - 1) // LEG_BODIES) * LEG_ROWS + ((body - 1) % LEG_BODIES) * MOMENT_ROWS
+        return layout.BASE
+    return ((body - 1) // layout.LEG_BODIES) * layout.LEG_ROWS + ((body - 1) % layout.LEG_BODIES) * layout.MOMENT_ROWS
 
 
 @wp.func
 def motor_dof(leg: int, motor: int) -> int:
-    """Return a motor's place among the rates of its world; motors: lateral, outer, inner."""
-    return 6 + motor_slot(3 * leg + motor)
+    """Return the index of a motor among the 38 rates of its world; motor: 0 lateral, 1 outer, 2 inner."""
+    return 6 + layout.motor_slot(3 * leg + motor)
 
 
 @wp.kernel
@@ -155,9 +126,9 @@ def pack_masses_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write the mass moments of every body; one thread per (world, body)."""
+    """Write the mass moments of every body; one thread per (world, body). Inputs: Newton's, flat over worlds."""
     world, body = wp.tid()
-    i = world * BODIES + body
+    i = world * layout.BODIES + body
     store_link(table, body_row(body), world, body_mass[i], body_com[i], body_inertia[i])
 
 
@@ -177,32 +148,39 @@ def pack_joints_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write the joint-space parameters of every leg; one thread per (world, leg)."""
+    """Write armature, friction, damping and hard stops of every leg; one thread per (world, leg).
+
+    Arrays: Newton's per-dof model arrays, (38 num_worlds,), [rad], [N m] and their rates as in `JointParams` and
+    `StopParams`; effort_limit [N m] caps the knees' damping. sum_lower, sum_upper [rad]: stops of outer + inner.
+    """
     world, leg = wp.tid()
-    row = leg * LEG_ROWS
-    dof = world * DOFS + 6 + 5 * leg
+    row = leg * layout.LEG_ROWS
+    dof = world * layout.DOFS + 6 + 5 * leg
     for j in range(3):
-        i = world * DOFS + motor_dof(leg, j)
-        table[row + ARMATURE + j, world] = real(armature[i])
-        table[row + FRICTION + j, world] = real(friction[i])
-        table[row + DAMPING + j, world] = real(damping[i])
-        table[row + LOWER + j, world] = real(lower[i])
-        table[row + UPPER + j, world] = real(upper[i])
-    table[row + KNEE_DAMPING, world] = real(damping[dof + 2])
-    table[row + KNEE_DAMPING + 1, world] = real(damping[dof + 4])
-    table[row + KNEE_LIMIT, world] = real(effort_limit[dof + 2])
-    table[row + KNEE_LIMIT + 1, world] = real(effort_limit[dof + 4])
-    table[row + SUM_LOWER, world] = real(sum_lower)
-    table[row + SUM_UPPER, world] = real(sum_upper)
-    table[row + STOP_KE, world] = real(limit_ke[dof + 1])
-    table[row + STOP_KD, world] = real(limit_kd[dof + 1])
+        i = world * layout.DOFS + motor_dof(leg, j)
+        table[row + layout.ARMATURE + j, world] = real(armature[i])
+        table[row + layout.FRICTION + j, world] = real(friction[i])
+        table[row + layout.DAMPING + j, world] = real(damping[i])
+        table[row + layout.LOWER + j, world] = real(lower[i])
+        table[row + layout.UPPER + j, world] = real(upper[i])
+    table[row + layout.KNEE_DAMPING, world] = real(damping[dof + 2])
+    table[row + layout.KNEE_DAMPING + 1, world] = real(damping[dof + 4])
+    table[row + layout.KNEE_LIMIT, world] = real(effort_limit[dof + 2])
+    table[row + layout.KNEE_LIMIT + 1, world] = real(effort_limit[dof + 4])
+    table[row + layout.SUM_LOWER, world] = real(sum_lower)
+    table[row + layout.SUM_UPPER, world] = real(sum_upper)
+    table[row + layout.STOP_KE, world] = real(limit_ke[dof + 1])
+    table[row + layout.STOP_KD, world] = real(limit_kd[dof + 1])
 
 
 @wp.func
 def paw_friction(
     paw_shapes: wp.array(dtype=int), ground_shape: int, shape_mu: wp.array(dtype=float), world: int, leg: int
 ) -> float:
-    """Return a paw's coefficient on the ground: the larger of the two, as in MuJoCo."""
+    """Return the friction coefficient [1] of a paw on the ground: the larger of their two, as in MuJoCo.
+
+    paw_shapes (4 num_worlds,), ground_shape: indices into shape_mu; ground_shape < 0: the paw's coefficient alone.
+    """
     mu = shape_mu[paw_shapes[world * 4 + leg]]
     if ground_shape >= 0:
         mu = wp.max(mu, shape_mu[ground_shape])
@@ -211,9 +189,9 @@ def paw_friction(
 
 @wp.func
 def store_friction(table: wp.array2d(dtype=real), leg: int, world: int, mu: float, static_ratio: float):
-    """Write a paw's dynamic coefficient and its static one, static_ratio times as large."""
-    table[leg * LEG_ROWS + MU_DYNAMIC, world] = real(mu)
-    table[leg * LEG_ROWS + MU_STATIC, world] = real(mu * static_ratio)
+    """Write a paw's dynamic friction coefficient mu and its static one, mu * static_ratio."""
+    table[leg * layout.LEG_ROWS + layout.MU_DYNAMIC, world] = real(mu)
+    table[leg * layout.LEG_ROWS + layout.MU_STATIC, world] = real(mu * static_ratio)
 
 
 @wp.kernel
@@ -226,7 +204,7 @@ def pack_friction_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write the friction coefficients of every paw; one thread per (world, leg)."""
+    """Write the friction coefficients of every paw, see `paw_friction`; one thread per (world, leg)."""
     world, leg = wp.tid()
     store_friction(table, leg, world, paw_friction(paw_shapes, ground_shape, shape_mu, world, leg), static_ratio[world])
 
@@ -248,23 +226,24 @@ def repack_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write what domain randomisation draws, where mask (num_worlds,) is not 0; launch over (worlds from first on, 25).
+    """Write the parameters that domain randomisation samples, in worlds whose mask (num_worlds,) is not 0.
 
-    The first 21 threads of a world write a body each, the others a leg's motors and paw.
+    Launch over (worlds from `first` on, 25): threads 0 to 20 of a world write the mass moments of a body each, the
+    other four a leg's armature, friction torques and paw friction. Inputs as in the pack kernels.
     """
     world, part = wp.tid()
     world += first
     if mask[world] == 0.0:
         return
-    if part < BODIES:
-        i = world * BODIES + part
+    if part < layout.BODIES:
+        i = world * layout.BODIES + part
         store_link(table, body_row(part), world, body_mass[i], body_com[i], body_inertia[i])
         return
-    leg = part - BODIES
+    leg = part - layout.BODIES
     for j in range(3):
-        dof = world * DOFS + motor_dof(leg, j)
-        table[leg * LEG_ROWS + ARMATURE + j, world] = real(armature[dof])
-        table[leg * LEG_ROWS + FRICTION + j, world] = real(friction[dof])
+        dof = world * layout.DOFS + motor_dof(leg, j)
+        table[leg * layout.LEG_ROWS + layout.ARMATURE + j, world] = real(armature[dof])
+        table[leg * layout.LEG_ROWS + layout.FRICTION + j, world] = real(friction[dof])
     store_friction(table, leg, world, paw_friction(paw_shapes, ground_shape, shape_mu, world, leg), static_ratio[world])
 
 
@@ -275,10 +254,10 @@ def pack_springs_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write stiffness [N/m] and rest length [m] of the springs of every leg; one thread per (world, leg)."""
+    """Write the springs of every leg; one thread per (world, leg). springs: (stiffness [N/m], length [m]) a world."""
     world, leg = wp.tid()
     for j in range(2):
-        table[leg * LEG_ROWS + SPRING + j, world] = real(springs[world][j])
+        table[leg * layout.LEG_ROWS + layout.SPRING + j, world] = real(springs[world][j])
 
 
 @wp.kernel
@@ -288,7 +267,7 @@ def pack_gravity_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write gravity [m/s^2]; one thread per world."""
+    """Write gravity [m/s^2], (num_worlds,), world frame; one thread per world."""
     world = wp.tid()
     for j in range(3):
-        table[GRAVITY + j, world] = real(gravity[world][j])
+        table[layout.GRAVITY + j, world] = real(gravity[world][j])

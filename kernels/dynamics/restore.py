@@ -1,4 +1,4 @@
-"""Reset of masked worlds to their initial state."""
+"""Reset of masked worlds to their initial state; masks have shape (num_worlds,)."""
 
 import warp as wp
 
@@ -10,7 +10,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class StateArrays:
-    """State of all worlds, in Newton's layout."""
+    """State of all worlds, in Newton's layout, see `state`."""
 
     joint_q: wp.array(dtype=float)  # (43 num_worlds,)
     joint_qd: wp.array(dtype=float)  # (38 num_worlds,)
@@ -53,7 +53,10 @@ def restore_motors_kernel(
     paw_force: wp.array2d(dtype=wp.vec3),
     peak_force: wp.array(dtype=float),
 ):
-    """Command the standing angles [rad] in the masked worlds, and zero torques and forces; launch over worlds."""
+    """Write standing angles [rad] to the targets of masked worlds and zero their forces; one thread per world.
+
+    standing, target, filtered_target, torque: (12, num_worlds). paw_force: (4, num_worlds).
+    """
     world = wp.tid()
     if not mask[world]:
         return
@@ -73,7 +76,7 @@ def zero_worlds_kernel(
     # out
     values: wp.array2d(dtype=wp.spatial_vector),
 ):
-    """Zero the rows of the masked worlds; launch over the shape of `values`, (num_worlds, any)."""
+    """Zero the rows of `values`, (num_worlds, n), of masked worlds; launch over that shape."""
     world, i = wp.tid()
     if mask[world]:
         values[world, i] = wp.spatial_vector()
@@ -86,7 +89,7 @@ def mask_kernel(
     # out
     chosen: wp.array(dtype=wp.bool),
 ):
-    """Write where a mask is not 0; one thread per world."""
+    """Convert a float mask to bool (true where it is not 0); one thread per world."""
     world = wp.tid()
     chosen[world] = mask[world] != 0.0
 
@@ -100,7 +103,7 @@ def clear_contact_kernel(
     contact_force: wp.array2d(dtype=wp.vec3),
     diverged: wp.array(dtype=int),
 ):
-    """Zero contact history and the flag `diverged` of the masked worlds; one thread per world."""
+    """Zero impulses and contact forces (4, num_worlds) and `diverged` of masked worlds; one thread per world."""
     world = wp.tid()
     if mask[world]:
         diverged[world] = 0
@@ -116,7 +119,7 @@ def rest_blocks_kernel(
     # in, out
     ground: Ground,
 ):
-    """Put the blocks of the masked worlds back to their starts, at rest; one thread per world."""
+    """Move the blocks of masked worlds to their start positions with zero velocity; one thread per world."""
     world = wp.tid()
     if mask[world]:
         rest_block(ground, world)

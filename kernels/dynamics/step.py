@@ -1,6 +1,7 @@
 """The parts of a time step shared by `advance` and `advance_legs`: a leg's terms, a paw's contact, the base.
 
-Semi-implicit Euler: forces and Jacobians at the start of the step, positions moved with the velocities at its end.
+Semi-implicit Euler: forces and Jacobians are those at the start of the step, and positions move with the velocities at
+its end. Legs and paws k are 0 to 3 (FL, FR, BL, BR).
 """
 
 import warp as wp
@@ -13,13 +14,7 @@ from ..layout import BASE, GRAVITY, LEG_ROWS, MU_DYNAMIC, MU_STATIC
 from ..scalar import real, vec3
 from ..state import BaseState, base_com
 from ..terrain.ground import Ground, block_distance, block_normal, floor_distance, floor_normal, has_block
-from .base_dynamics import (
-    BaseInverse,
-    BaseSystem,
-    LegSolve,
-    base_link_system,
-    eliminate_leg,
-)
+from .base_dynamics import BaseInverse, BaseSystem, LegSolve, base_link_system, eliminate_leg
 from .base_motion import external_wrench
 from .contact import (
     CONTACT_MARGIN,
@@ -44,7 +39,7 @@ class RobotModel:
     geometry: wp.array(dtype=LegGeometry)  # (4,): FL, FR, BL, BR, the same in all worlds
     table: wp.array2d(dtype=real)  # (PARAMETER_ROWS, num_worlds), rows as in `layout`
     ground: Ground
-    held: wp.array(dtype=int)  # (num_worlds,), not 0: the base keeps its twist (hung up); empty: none
+    held: wp.array(dtype=int)  # (num_worlds,), not 0: the base keeps its twist (suspended); empty: none held
 
 
 @wp.struct
@@ -69,7 +64,7 @@ class LegParams:
 
 @wp.struct
 class LegTerms:
-    """One leg in the dynamics of a step."""
+    """Terms of one leg in the equations of a step: its dynamics, its elimination and its paw."""
 
     dynamics: LegDynamics
     solve: LegSolve
@@ -78,7 +73,7 @@ class LegTerms:
 
 @wp.func
 def load_leg(model: RobotModel, world: int, k: int) -> LegParams:
-    """Return the parameters of leg k."""
+    """Return the parameters of leg k of a world."""
     params = LegParams()
     params.geometry = model.geometry[k]
     params.masses = load_masses(model.table, k, world)
@@ -113,16 +108,16 @@ def leg_terms(
 
 @wp.struct
 class Touch:
-    """The nearest point of a surface to a paw."""
+    """Point of a surface that is nearest to a paw."""
 
-    gap: real  # [m] between surface and paw
-    normal: vec3  # body axes
+    gap: real  # [m] between surface and paw, negative inside
+    normal: vec3  # unit, out of the surface, body axes
     velocity: vec3  # of the surface [m/s], body axes
 
 
 @wp.func
 def block_law(model: RobotModel, world: int, base: BaseState, dt: real) -> BlockLaw:
-    """Return the law of a world's block in body axes; a block without mass where there is none."""
+    """Return the law of a world's block for a step dt [s], in body axes; all zero where there is no block."""
     law = BlockLaw()
     if model.ground.blocks.shape[0] > 0:
         block = model.ground.blocks[world]
@@ -136,7 +131,7 @@ def block_law(model: RobotModel, world: int, base: BaseState, dt: real) -> Block
 
 @wp.func
 def touch_floor(model: RobotModel, k: int, base: BaseState, paw: PawKinematics) -> Touch:
-    """Return where paw k is nearest to the floor."""
+    """Return the point of the floor that is nearest to paw k; the floor is at rest."""
     centre = base.pos + wp.quat_rotate(base.quat, paw.position)
     touch = Touch()
     touch.gap = floor_distance(model.ground, centre) - model.geometry[k].paw_radius
@@ -146,7 +141,7 @@ def touch_floor(model: RobotModel, k: int, base: BaseState, paw: PawKinematics) 
 
 @wp.func
 def touch_block(model: RobotModel, world: int, k: int, base: BaseState, paw: PawKinematics, law: BlockLaw) -> Touch:
-    """Return where paw k is nearest to the block."""
+    """Return the point of the world's block that is nearest to paw k; law: see `block_law`."""
     centre = base.pos + wp.quat_rotate(base.quat, paw.position)
     block = model.ground.blocks[world]
     touch = Touch()
@@ -158,7 +153,11 @@ def touch_block(model: RobotModel, world: int, k: int, base: BaseState, paw: Paw
 
 @wp.func
 def friction_row(k: int, velocity: vec3, impulse: vec3, normal: vec3) -> int:
-    """Return the row of paw k's friction: static where it hardly slipped [m/s] and pushed [N s] before the step."""
+    """Return the table row of paw k's friction coefficient: MU_STATIC where it stuck before the step, or MU_DYNAMIC.
+
+    velocity [m/s]: of the contact point relative to the ground at the start of the step; impulse [N s]: in the
+    preceding step; normal: unit; all in the same axes.
+    """
     slip = velocity - wp.dot(velocity, normal) * normal
     if wp.dot(slip, slip) < STICK_SPEED * STICK_SPEED and wp.dot(impulse, normal) > real(0.0):
         return k * LEG_ROWS + MU_STATIC
@@ -172,8 +171,9 @@ def paw_contact(
 ) -> PawContact:  # fmt: skip
     """Return paw k's contact problem with floor or block, whichever is nearer.
 
-    lin, ang, rates: base twist (body axes) and motor rates at the end of the step without contact; old_rates and
-    `base`: at its start; impulse: first guess [N s], world frame; pressed: the leg's hard stops.
+    lin [m/s], ang [rad/s], rates [rad/s]: base twist (body axes) and motor rates at the end of the step dt [s] without
+    contact; old_rates, base: at its start; impulse [N s]: of the preceding step, world axes, the first guess; pressed:
+    the leg's pressed stops.
     """
     contact = PawContact()
     touch = touch_floor(model, k, base, paw)
@@ -206,7 +206,7 @@ def paw_contact(
 
 @wp.func
 def base_system(model: RobotModel, world: int, base: BaseState, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
-    """Return the base link's own equations; force [N] and moment [N m] from outside at its com, world axes."""
+    """Return the base link's equations; g [m/s^2]: body axes; force [N], moment [N m]: external, at com, world axes."""
     wrench = external_wrench(base, base_com(model.table, world), force, moment)
     return base_link_system(load_moments(model.table, BASE, world), base.ang, g, wrench.force, wrench.moment)
 

@@ -9,14 +9,12 @@ from ..state import BaseState
 
 wp.set_module_options({"enable_backward": False})
 
-# rows of a state: position and orientation (xyzw) of the base, motor angles
-ROW_COORDS = wp.constant(19)
-# velocity of its com and angular velocity, both world frame, motor rates
-ROW_RATES = wp.constant(18)
+ROW_COORDS = wp.constant(19)  # entries of a row of q: base position (3) and orientation (4, xyzw), motor angles (12)
+ROW_RATES = wp.constant(18)  # of qd: velocity of the base's com (3), angular velocity (3), world; motor rates (12)
 
-# rows of the filter's constants: lower, upper, lower and upper zone of lateral, transversal, sum, then
-FILTER_HORIZON = wp.constant(12)
-FILTER_SPEED = wp.constant(13)
+# rows of the filter's constants: 0 to 11 are lower, upper, lower_zone, upper_zone of lateral, transversal, sum
+FILTER_HORIZON = wp.constant(12)  # [s]
+FILTER_SPEED = wp.constant(13)  # speed floor [rad/s]
 FILTER_ROWS = wp.constant(14)
 
 
@@ -31,7 +29,7 @@ class Timing:
 
 @wp.struct
 class Actuation:
-    """Motors, latency and command filter of every world: from targets to torques."""
+    """Constants of motors, latency and command filter of every world, from targets to torques."""
 
     motors: MotorArrays  # without its fades, see `fade`
     fade: wp.array2d(dtype=real)  # [rad/s], (2, num_worlds): start and end of the over-speed protection
@@ -52,7 +50,7 @@ class Commands:
 
 @wp.struct
 class TrajectoryArrays:
-    """A trajectory, or a gradient by one, where an empty array means zeros; K = T S / every, see `Timing`."""
+    """A trajectory, or the gradient with respect to one (empty array: zeros); K = T S / every, see `Timing`."""
 
     q: wp.array3d(dtype=real)  # [m], [rad], (K + 1, ROW_COORDS, num_worlds)
     qd: wp.array3d(dtype=real)  # [m/s], [rad/s], (K + 1, ROW_RATES, num_worlds)
@@ -63,7 +61,10 @@ class TrajectoryArrays:
 
 @wp.func
 def row_base(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3) -> BaseState:
-    """Return the base's state; com_lin [m/s]: velocity of its com [m], ang [rad/s]: angular velocity, world axes."""
+    """Return the base's state from the entries of a row: pos [m], orientation (xyzw), com_lin [m/s], ang [rad/s].
+
+    com_lin: velocity of the com; com [m]: centre of mass in the base's frame; all others in world axes.
+    """
     base = BaseState()
     base.pos = pos
     base.quat = wp.normalize(orientation)
@@ -80,7 +81,7 @@ def row_vec3(values: wp.array3d(dtype=real), row: int, first: int, world: int) -
 
 @wp.func
 def row_quat(values: wp.array3d(dtype=real), row: int, first: int, world: int) -> quat:
-    """Return four entries of a row, from index `first`."""
+    """Return four entries (xyzw) of a row, from index `first`; values: (rows, entries, num_worlds)."""
     return quat(
         values[row, first, world], values[row, first + 1, world], values[row, first + 2, world],
         values[row, first + 3, world],
@@ -89,14 +90,14 @@ def row_quat(values: wp.array3d(dtype=real), row: int, first: int, world: int) -
 
 @wp.func
 def store_row_vec3(values: wp.array3d(dtype=real), row: int, first: int, world: int, v: vec3):
-    """Write three entries of a row, from index `first`."""
+    """Write v to three entries of a row, from index `first`; values: (rows, entries, num_worlds)."""
     for i in range(3):
         values[row, first + i, world] = v[i]
 
 
 @wp.func
 def load_row_base(trajectory: TrajectoryArrays, row: int, world: int, com: vec3) -> BaseState:
-    """Return the base's state in a row."""
+    """Return the base's state stored in a row; com [m]: the base's centre of mass in its frame."""
     return row_base(
         row_vec3(trajectory.q, row, 0, world), row_quat(trajectory.q, row, 3, world),
         row_vec3(trajectory.qd, row, 0, world), row_vec3(trajectory.qd, row, 3, world), com,
@@ -105,7 +106,7 @@ def load_row_base(trajectory: TrajectoryArrays, row: int, world: int, com: vec3)
 
 @wp.func
 def store_row_base(trajectory: TrajectoryArrays, row: int, world: int, com: vec3, base: BaseState):
-    """Write the base's state to a row."""
+    """Write the base's state to a row; com [m]: the base's centre of mass in its frame."""
     ang = wp.quat_rotate(base.quat, base.ang)
     store_row_vec3(trajectory.q, row, 0, world, base.pos)
     for i in range(4):
@@ -116,7 +117,7 @@ def store_row_base(trajectory: TrajectoryArrays, row: int, world: int, com: vec3
 
 @wp.func
 def load_limits(table: wp.array2d(dtype=real), row: int, world: int) -> Limits:
-    """Return the filter's limits of one quantity, its rows beginning at `row`."""
+    """Return the filter's limits [rad] of one quantity, rows `row` to `row` + 3 of table (FILTER_ROWS, num_worlds)."""
     limits = Limits()
     limits.lower = table[row, world]
     limits.upper = table[row + 1, world]
@@ -127,7 +128,7 @@ def load_limits(table: wp.array2d(dtype=real), row: int, world: int) -> Limits:
 
 @wp.func
 def load_filter(table: wp.array2d(dtype=real), world: int) -> FilterParams:
-    """Return the filter's constants."""
+    """Return the filter's constants of a world; table: (FILTER_ROWS, num_worlds)."""
     params = FilterParams()
     params.lateral = load_limits(table, 0, world)
     params.transversal = load_limits(table, 4, world)
@@ -139,7 +140,7 @@ def load_filter(table: wp.array2d(dtype=real), world: int) -> FilterParams:
 
 @wp.func
 def load_world_motor(actuation: Actuation, motor: int, world: int) -> MotorParams:
-    """Return the constants of one motor of one world."""
+    """Return the constants of motor 0 to 11 of a world, its own over-speed fade included."""
     params = load_motor(actuation.motors, motor, world)
     params.fade_start = actuation.fade[0, world]
     params.fade_end = actuation.fade[1, world]
@@ -148,19 +149,19 @@ def load_world_motor(actuation: Actuation, motor: int, world: int) -> MotorParam
 
 @wp.struct
 class Arrival:
-    """Interpolation of the targets that a motor follows in a physics step, delayed by the latency: its mean target."""
+    """Weights of the mean target that a motor follows in a physics step, between two delayed policy targets."""
 
     older: int  # policy step of the target at the start of the physics step; -1: `Commands.initial_target`
-    newer: int  # and at its end
-    weight: real  # of the newer one
+    newer: int  # policy step of the target at the end of the physics step
+    weight: real  # of the newer target, in (0, 1]; the older one has 1 - weight
 
 
 @wp.func
 def arrival(step: int, substeps: int, delay: real) -> Arrival:
-    """Return the targets that arrive during a physics step; delay: latency in physics steps, any fraction.
+    """Return the targets in effect during physics step `step` (from 0); delay: latency in physics steps, a real >= 0.
 
-    Where a target arrives just as the step begins it has weight 1, whose derivative is that of more latency. No target
-    arrives before it is sent, whatever the latency.
+    substeps: physics steps per policy step. A target that arrives exactly at the start of the step has weight 1, and
+    the one-sided derivative toward a larger latency. No target arrives before it is sent.
     """
     begin = real(step) - delay
     size = real(substeps)
@@ -177,7 +178,7 @@ def arrival(step: int, substeps: int, delay: real) -> Arrival:
 def policy_target(
     filtered_target: wp.array3d(dtype=real), initial_target: wp.array2d(dtype=real), step: int, motor: int, world: int
 ) -> real:
-    """Return a motor's filtered target [rad] of a policy step; step -1: its initial target."""
+    """Return the filtered target [rad] of motor 0 to 11 in policy step `step`; step -1: its initial target."""
     if step < 0:
         return initial_target[motor, world]
     return filtered_target[step, motor, world]
@@ -187,7 +188,7 @@ def policy_target(
 def arrived_target(
     commands: Commands, filtered_target: wp.array3d(dtype=real), arrived: Arrival, motor: int, world: int
 ) -> real:
-    """Return the target [rad] that a motor follows in a physics step; filtered_target [rad]: (T, 12, num_worlds)."""
+    """Return the target [rad] that motor 0 to 11 follows in a physics step; filtered_target: (T, 12, num_worlds)."""
     newer = policy_target(filtered_target, commands.initial_target, arrived.newer, motor, world)
     if arrived.weight == real(1.0):
         return newer
@@ -200,7 +201,7 @@ def leg_torque(
     commands: Commands, actuation: Actuation, filtered_target: wp.array3d(dtype=real), arrived: Arrival, leg: int,
     world: int, angles: vec3, rates: vec3,
 ) -> vec3:  # fmt: skip
-    """Return a leg's motor torques [N m] in a physics step; angles [rad], rates [rad/s]: of its motors."""
+    """Return a leg's torques [N m] (lateral, outer, inner) in a physics step, at angles [rad] and rates [rad/s]."""
     torque = vec3(real(0.0))
     for j in range(3):
         motor = 3 * leg + j
@@ -214,7 +215,10 @@ def filter_commands(
     commands: Commands, actuation: Actuation, step: int, leg: int, world: int, angles: vec3, rates: vec3,
     filtered_target: wp.array3d(dtype=real),
 ):  # fmt: skip
-    """Write a leg's filtered targets [rad] of a policy step, for angles [rad] and rates [rad/s] at its start."""
+    """Write a leg's filtered targets [rad] of policy step `step`, for angles [rad], rates [rad/s] at its start.
+
+    filtered_target: (T, 12, num_worlds). Without a filter the targets are copied.
+    """
     m = 3 * leg
     target = row_vec3(commands.target, step, m, world)
     if actuation.filtered != 0:

@@ -1,10 +1,9 @@
 """The planar five-bar loop of one leg: position, velocity and bias acceleration in closed form.
 
 All points are (x, z) [m] in the motor housing frame. The two thighs turn about the transversal axes; a positive
-motor angle moves the thigh tip away from its twin. The loop constraint (paper, Eq. 1) is met by construction: the
-ankle is the intersection of the two shank circles, on the branch below the knees.
-
-Rotation angles of links are counted about housing +y, from a link that hangs along -z.
+motor angle moves the thigh tip away from its twin. The loop constraint (paper, Eq. 1) holds by construction: the
+ankle is the intersection of the two shank circles, on the branch below the knees. Rotation angles of links are about
+housing +y, 0 for a link that hangs along -z.
 """
 
 import warp as wp
@@ -18,8 +17,8 @@ from .trig import sin_cos
 class FiveBar:
     """Configuration of the loop and its first derivatives with respect to the outer and inner motor angles."""
 
-    outer_sin_cos: vec2  # sine and cosine of the outer motor angle
-    inner_sin_cos: vec2
+    outer_sin_cos: vec2  # (sine, cosine) of the outer motor angle
+    inner_sin_cos: vec2  # (sine, cosine) of the inner motor angle
     outer_knee: vec2  # [m]
     inner_knee: vec2  # [m]
     ankle: vec2  # [m]
@@ -30,14 +29,14 @@ class FiveBar:
     ankle_do: vec2  # [m/rad] d ankle / d outer angle
     ankle_di: vec2  # [m/rad] d ankle / d inner angle
     outer_shank_do: real  # [1] d (rotation of the outer shank) / d outer angle
-    outer_shank_di: real
-    inner_shank_do: real
-    inner_shank_di: real
+    outer_shank_di: real  # [1] d (rotation of the outer shank) / d inner angle
+    inner_shank_do: real  # [1] d (rotation of the inner shank) / d outer angle
+    inner_shank_di: real  # [1] d (rotation of the inner shank) / d inner angle
 
 
 @wp.struct
 class FiveBarBias:
-    """Rates of the loop, and its accelerations while the motor accelerations are zero."""
+    """Rates of the loop, and its accelerations at zero motor acceleration (velocity-product terms)."""
 
     outer_thigh_rate: real  # [rad/s] about +y
     inner_thigh_rate: real
@@ -52,7 +51,10 @@ class FiveBarBias:
 
 @wp.func
 def rotation_rate(direction: vec2, velocity: vec2, length: real) -> real:
-    """Return the rate about +y [rad/s] of a link whose far end moves at `velocity` relative to its near end."""
+    """Return the rate about +y [rad/s] of a link whose far end moves at `velocity` [m/s] relative to its near end.
+
+    direction: unit vector (x, z) from the near end to the far end; length [m]. Accelerations give [rad/s^2] likewise.
+    """
     return (direction[1] * velocity[0] - direction[0] * velocity[1]) / length
 
 
@@ -68,7 +70,7 @@ def solve_projections(a: vec2, b: vec2, along_a: real, along_b: real) -> vec2:
 
 @wp.func
 def five_bar(geo: LegGeometry, outer: real, inner: real) -> FiveBar:
-    """Return the loop's configuration and derivatives for motor angles `outer` and `inner` [rad]."""
+    """Return the loop's configuration and derivatives at the motor angles `outer` and `inner` [rad]."""
     f = geo.front
     loop = FiveBar()
     outer_sin_cos, inner_sin_cos = sin_cos(outer), sin_cos(inner)
@@ -108,7 +110,7 @@ def five_bar(geo: LegGeometry, outer: real, inner: real) -> FiveBar:
 
 @wp.func
 def five_bar_bias(geo: LegGeometry, loop: FiveBar, outer_rate: real, inner_rate: real) -> FiveBarBias:
-    """Return the loop's rates and velocity-product accelerations for motor rates [rad/s]."""
+    """Return the loop's rates and velocity-product accelerations for the motor rates [rad/s]."""
     f = geo.front
     bias = FiveBarBias()
     outer_knee_vel = outer_rate * loop.outer_knee_do
@@ -139,5 +141,5 @@ def five_bar_bias(geo: LegGeometry, loop: FiveBar, outer_rate: real, inner_rate:
 
 @wp.func
 def in_plane(p: vec2, y: real) -> vec3:
-    """Return a point of the five-bar plane as a vector of the housing frame."""
+    """Return the point (x, z) `p` of the five-bar plane as a vector (x, y, z) of the housing frame."""
     return vec3(p[0], y, p[1])

@@ -1,4 +1,4 @@
-"""From the 18 coordinates to everything else that a Newton state holds: passive joints, loop joints, all bodies."""
+"""Completion of a Newton state from the base and the 12 motors: passive knees, loop joints, poses of all bodies."""
 
 import warp as wp
 
@@ -21,25 +21,25 @@ class Frame:
 
 @wp.func
 def rotation_x(angle: real) -> quat:
-    """Return a rotation about x [rad]."""
+    """Return the quaternion (xyzw) of a rotation about x [rad]."""
     return quat(wp.sin(real(0.5) * angle), real(0.0), real(0.0), wp.cos(real(0.5) * angle))
 
 
 @wp.func
 def rotation_y(angle: real) -> quat:
-    """Return a rotation about y [rad]."""
+    """Return the quaternion (xyzw) of a rotation about y [rad]."""
     return quat(real(0.0), wp.sin(real(0.5) * angle), real(0.0), wp.cos(real(0.5) * angle))
 
 
 @wp.func
 def shank_angle(direction: vec2) -> real:
-    """Return the rotation about y [rad] of a shank along `direction` (x, z)."""
+    """Return the rotation about housing +y [rad] of a shank, 0 along -z; direction (x, z): unit, knee to ankle."""
     return wp.atan2(-direction[0], -direction[1])
 
 
 @wp.func
 def housing_frame(base: BaseState, geo: LegGeometry, angle: real, rate: real) -> Frame:
-    """Return the motor housing's frame for the lateral motor's angle [rad] and rate [rad/s]."""
+    """Return the motor housing's world frame for the lateral motor's angle [rad] and rate [rad/s]."""
     frame = Frame()
     arm = wp.quat_rotate(base.quat, geo.hip)
     ang = wp.quat_rotate(base.quat, base.ang)
@@ -52,7 +52,7 @@ def housing_frame(base: BaseState, geo: LegGeometry, angle: real, rate: real) ->
 
 @wp.func
 def link_frame(housing: Frame, origin: vec3, velocity: vec3, angle: real, rate: real) -> Frame:
-    """Return the frame of a link of the five-bar plane.
+    """Return the world frame of a link of the five-bar plane.
 
     origin [m], velocity [m/s]: of its origin in the housing frame; angle [rad], rate [rad/s]: about housing y.
     """
@@ -67,13 +67,10 @@ def link_frame(housing: Frame, origin: vec3, velocity: vec3, angle: real, rate: 
 
 @wp.func
 def store_body(
-    frame: Frame,
-    body: int,
-    body_com: wp.array(dtype=wp.vec3),
-    body_q: wp.array(dtype=wp.transform),
+    frame: Frame, body: int, body_com: wp.array(dtype=wp.vec3), body_q: wp.array(dtype=wp.transform),
     body_qd: wp.array(dtype=wp.spatial_vector),
-):
-    """Write a body's pose, and its velocity at the centre of mass."""
+):  # fmt: skip
+    """Write a body's world pose, and its velocity at the centre of mass; body: index over all worlds."""
     com = body_com[body]
     lin = frame.lin + wp.cross(frame.ang, wp.quat_rotate(frame.quat, vec3(real(com[0]), real(com[1]), real(com[2]))))
     body_q[body] = wp.transform(
@@ -87,7 +84,7 @@ def store_body(
 
 @wp.func
 def base_frame(base: BaseState) -> Frame:
-    """Return the frame of the base link."""
+    """Return the world frame of the base link."""
     frame = Frame()
     frame.pos = base.pos
     frame.quat = base.quat
@@ -101,13 +98,17 @@ def store_passive(
     geo: LegGeometry, bias: FiveBarBias, outer: real, inner: real, outer_thigh: real, inner_thigh: real, k: int,
     coord: int, dof: int, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real),
 ):  # fmt: skip
-    """Write the knees and the loop joint of leg k; outer, inner [rad]: pitch of its shanks, and of its thighs."""
+    """Write the knees and the loop joint of leg k.
+
+    outer, inner, outer_thigh, inner_thigh [rad]: rotations of shanks and thighs about housing +y. coord, dof: indices
+    of the leg's first joint in joint_q and joint_qd.
+    """
     joint_q[coord + 2] = geo.front * (outer - outer_thigh)
     joint_q[coord + 4] = -geo.front * (inner - inner_thigh)
     joint_qd[dof + 2] = geo.front * (bias.outer_shank_rate - bias.outer_thigh_rate)
     joint_qd[dof + 4] = -geo.front * (bias.inner_shank_rate - bias.inner_thigh_rate)
     across = rotation_y(outer - inner)
-    # behind the 27 tree coordinates and 26 tree rates of the world
+    # the loop joints follow the world's 27 tree coordinates (4 each) and 26 tree rates (3 each)
     loop_coord = coord + 20 - k
     loop_dof = dof + 20 - 2 * k
     for i in range(4):
@@ -132,7 +133,7 @@ def full_state_kernel(
 ):
     """Write knees, loop joints and bodies from the base and motor coordinates; one thread per (world, leg).
 
-    first: world of the first thread.
+    first: world of the first thread. Arrays are Newton's, flat over worlds; body_com [m]: in each body's frame.
     """
     world, k = wp.tid()
     world += first

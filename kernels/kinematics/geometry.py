@@ -1,4 +1,4 @@
-"""Geometry of one leg, as the kernels read it."""
+"""Geometry of one leg, the argument of most kernels of the physics."""
 
 import warp as wp
 
@@ -13,7 +13,7 @@ class LegGeometry:
     the lateral motor. The five-bar loop lies in the housing's x-z plane, at `plane_y`.
     """
 
-    hip: vec3  # [m] lateral axis in the body frame
+    hip: vec3  # [m] origin of the housing frame, on the lateral axis, in the body frame
     front: real  # +1 front leg, -1 back leg
     side: real  # +1 left leg, -1 right leg
     outer_x: real  # [m] outer transversal axis, housing x

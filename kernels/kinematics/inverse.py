@@ -6,9 +6,9 @@ every ankle position has exactly one such solution, and `five_bar` returns the s
 
 For an unreachable target the result is the pose within limits whose ankle is nearest to it: a coarse grid over
 both thigh angles, then a compass search around the best point, with the lateral angle solved exactly at each. The
-distance left is within 1 mm of the true least distance, and most often within 1 micrometre.
+residual is within 1 mm of the true least distance, and most often within 1 micrometre.
 
-No gradients are generated for this file; the derivative is the inverse of `leg_kinematics.leg_jacobian`.
+No gradients are generated for this file; the derivative is the inverse of `leg.leg_jacobian`.
 """
 
 import warp as wp
@@ -23,18 +23,18 @@ wp.set_module_options({"enable_backward": False})
 REACHED = wp.constant(real(1.0e-5))
 """[m] A pose whose ankle is this close to its target reaches it."""
 FAR = wp.constant(real(10.0))
-"""[m] Targets farther from the hip along an axis are drawn in to here before the search."""
+"""[m] Targets farther from the hip than this along an axis are scaled toward the hip before the search."""
 GRID = wp.constant(9)
 """Grid points per thigh angle at the start of the search."""
 ROUNDS = wp.constant(40)
-"""Rounds of the compass search at most."""
+"""Largest number of rounds of the compass search."""
 FINEST = wp.constant(real(5.0e-5))
 """[rad] The compass search ends below this step."""
 
 
 @wp.struct
 class LegLimits:
-    """Joint limits of a leg [rad]; both thighs have the same ones. Lower must not exceed upper."""
+    """Joint limits of a leg [rad]; outer and inner motor share `transversal`. Lower must not exceed upper."""
 
     lateral_lower: real
     lateral_upper: real  # at most a full turn above lower
@@ -56,7 +56,7 @@ class LegPose:
 
 @wp.func
 def clamp_transversal(limits: LegLimits, outer: real, inner: real) -> vec2:
-    """Return (outer, inner) [rad] clamped to limits; the limits of the sum change the inner one."""
+    """Return (outer, inner) [rad] clamped to limits; where the sum is out of limits, `inner` gives way."""
     lower = limits.transversal_lower
     upper = limits.transversal_upper
     clamped_outer = wp.clamp(outer, wp.max(lower, limits.sum_lower - upper), wp.min(upper, limits.sum_upper - lower))
@@ -70,8 +70,8 @@ def clamp_transversal(limits: LegLimits, outer: real, inner: real) -> vec2:
 def nearest_lateral(geo: LegGeometry, limits: LegLimits, target: vec3, ankle_z: real) -> real:
     """Return the lateral angle [rad] within limits that brings the ankle nearest to a target [m] relative to the hip.
 
-    ankle_z [m]: the ankle's z in the housing frame. As the ankle moves on a circle about x, that is the angle toward
-    the target, or else the limit that is nearer around the circle.
+    ankle_z [m]: the ankle's z in the housing frame. The ankle moves on a circle about x, so the result is the angle
+    toward the target, clamped to the limit that is nearer around the circle.
     """
     toward = geo.side * (wp.atan2(target[2], target[1]) - wp.atan2(ankle_z, geo.plane_y + geo.knee_y))
     middle = real(0.5) * (limits.lateral_lower + limits.lateral_upper)
@@ -84,10 +84,10 @@ def nearest_lateral(geo: LegGeometry, limits: LegLimits, target: vec3, ankle_z: 
 
 @wp.func
 def thigh_angle(geo: LegGeometry, away: real, z: real) -> real:
-    """Return the motor angle [rad] of a thigh whose knee points away from its twin.
+    """Return the motor angle [rad] of a thigh, on the branch whose knee points away from the other thigh.
 
-    away [m]: ankle from the thigh's axis along x, counted away from the twin; z [m]: ankle in the housing frame. Out of
-    reach, the leg is stretched or folded toward the ankle (`wp.acos` clamps its argument).
+    away [m]: ankle from the thigh's axis along x, positive away from the other thigh; z [m]: ankle in the housing
+    frame. Out of reach, the leg is stretched or folded toward the ankle (`wp.acos` clamps its argument).
     """
     distance_sq = wp.max(away * away + z * z, real(1.0e-12))
     cosine = (distance_sq + geo.thigh * geo.thigh - geo.shank * geo.shank) / (
@@ -98,10 +98,7 @@ def thigh_angle(geo: LegGeometry, away: real, z: real) -> real:
 
 @wp.func
 def clamped_closed_form(geo: LegGeometry, limits: LegLimits, target: vec3) -> vec3:
-    """Return motor angles [rad] for an ankle target [m] relative to the hip, body axes; each angle clamped to limits.
-
-    Exact for a reachable target, otherwise a guess.
-    """
+    """Return motor angles [rad] in limits for an ankle target [m] from the hip, body axes; a guess if out of reach."""
     plane = geo.plane_y + geo.knee_y
     z = -wp.sqrt(wp.max(target[1] * target[1] + target[2] * target[2] - plane * plane, real(0.0)))
     outer = thigh_angle(geo, geo.front * (target[0] - geo.outer_x), z)
@@ -119,7 +116,7 @@ def nearest_ankle(geo: LegGeometry, limits: LegLimits, target: vec3, thighs: vec
 
 @wp.func
 def grid_thighs(limits: LegLimits, row: int, col: int) -> vec2:
-    """Return (outer, inner) [rad] of a grid that covers the region within limits, edges included."""
+    """Return (outer, inner) [rad] at row, col (each 0 to GRID - 1) of a grid over the limits, edges included."""
     lower = limits.transversal_lower
     upper = limits.transversal_upper
     along_row = real(row) / real(GRID - 1)
@@ -166,10 +163,10 @@ def nearest_reachable(geo: LegGeometry, limits: LegLimits, target: vec3, guess: 
 
 @wp.func
 def leg_inverse_kinematics(geo: LegGeometry, limits: LegLimits, ankle_body: vec3) -> LegPose:
-    """Return the leg's pose for a target ankle position [m] in the body frame.
+    """Return the leg's pose for a target ankle position [m] in the body frame, the nearest one if out of reach.
 
-    Out of reach: the pose within limits with the nearest ankle. A target that is not finite counts as
-    the point a shank's length below the middle of the two transversal axes; no result is ever NaN.
+    A non-finite target is replaced by the point a shank's length below the middle of the two transversal axes (with
+    reachable 0 and an infinite residual); no result is ever NaN.
     """
     pose = LegPose()
     finite = wp.isfinite(ankle_body)
@@ -198,7 +195,7 @@ def paws_kernel(
     # out
     paws: wp.array2d(dtype=vec3),
 ):
-    """Write paw positions [m] (4, n), body frame, of motor angles [rad] (12, n); launched over (4, n)."""
+    """Write paw centres [m] (4, n) in the body frame for motor angles [rad] (12, n) of n robots; launch over (4, n)."""
     leg, robot = wp.tid()
     m = 3 * leg
     paws[leg, robot] = leg_forward_kinematics(
@@ -221,7 +218,7 @@ def inverse_kinematics_kernel(
     reachable: wp.array2d(dtype=wp.int32),
     residual: wp.array2d(dtype=real),
 ):
-    """Write the poses of whole robots; one thread per (leg, robot), launched over (4, n).
+    """Write the joint angles that put the paws at target positions; launch over (4, n) for n robots.
 
     geometry: 4 legs. base_pos [m] (n,), base_quat (n,) xyzw, unit: body to world. paws [m] (4, n): target centres of
     the paws, in the body frame, or in the world frame if `paws_in_world` is 1 (the base is not read otherwise).

@@ -1,4 +1,4 @@
-"""One leg from motor angles to its paw, and back again for velocities.
+"""Forward kinematics of one leg, its Jacobian and inverse velocity kinematics.
 
 Motor angles and rates are ordered lateral, outer, inner. The ankle is the centre of the paw. A leg's housing turns
 about (side, 0, 0) through the hip, so that a positive lateral angle swings the paw outward.
@@ -10,10 +10,12 @@ from ..scalar import mat33, real, vec2, vec3
 from .five_bar import FiveBar, five_bar
 from .geometry import LegGeometry
 
+LEVER_FLOOR = wp.constant(real(0.01))  # [m/rad] below this lever rates are damped, see `damped_ratio`
+
 
 @wp.func
 def rotate_lateral(geo: LegGeometry, lateral: real, housing_vector: vec3) -> vec3:
-    """Return a housing-frame vector in the body frame, for the lateral angle [rad]; a negated angle turns back."""
+    """Return a housing-frame vector in body axes, for the lateral angle [rad]; -lateral gives the inverse rotation."""
     c = wp.cos(lateral)
     s = geo.side * wp.sin(lateral)
     return vec3(
@@ -23,20 +25,20 @@ def rotate_lateral(geo: LegGeometry, lateral: real, housing_vector: vec3) -> vec
 
 @wp.func
 def ankle_in_housing(geo: LegGeometry, loop: FiveBar) -> vec3:
-    """Return the ankle [m] in the housing frame, that is, relative to the hip."""
+    """Return the ankle [m] in the housing frame, whose origin is the hip."""
     return vec3(loop.ankle[0], geo.plane_y + geo.knee_y, loop.ankle[1])
 
 
 @wp.func
 def leg_forward_kinematics(geo: LegGeometry, lateral: real, outer: real, inner: real) -> vec3:
-    """Return the ankle [m] in the body frame, for motor angles [rad]."""
+    """Return the ankle [m] in the body frame, for the motor angles [rad]."""
     loop = five_bar(geo, outer, inner)
     return geo.hip + rotate_lateral(geo, lateral, ankle_in_housing(geo, loop))
 
 
 @wp.func
 def leg_jacobian(geo: LegGeometry, lateral: real, outer: real, inner: real) -> mat33:
-    """Return d ankle / d (lateral, outer, inner) [m/rad], shape (3, 3), ankle in the body frame, angles in rad."""
+    """Return d ankle / d (lateral, outer, inner) [m/rad], 3x3: rows body x, y, z; columns motors; angles [rad]."""
     loop = five_bar(geo, outer, inner)
     arm = rotate_lateral(geo, lateral, ankle_in_housing(geo, loop))
     by_outer = rotate_lateral(geo, lateral, vec3(loop.ankle_do[0], real(0.0), loop.ankle_do[1]))
@@ -49,22 +51,21 @@ def leg_jacobian(geo: LegGeometry, lateral: real, outer: real, inner: real) -> m
 
 
 @wp.func
-def damped_ratio(value: real, divisor: real) -> real:
-    """Return value / divisor, fading to zero where the divisor's magnitude is below 10 mm.
+def damped_ratio(speed: real, lever: real) -> real:
+    """Return the thigh rate speed / lever [rad/s], damped to speed lever / LEVER_FLOOR^2 where |lever| < LEVER_FLOOR.
 
-    The divisor is the ankle's lever about a thigh axis along the shank [m/rad]; it is below 10 mm where thigh and shank
-    are within 3.3 degrees of one line, and no sensible rate gives the wanted velocity.
+    speed [m/s]: of the ankle along the shank; lever [m/rad]: knee speed along the shank per thigh rate. |lever| is
+    below LEVER_FLOOR where thigh and shank are within 3.3 degrees of one line, and no bounded rate reaches the speed.
     """
-    floor = real(0.01)
-    return value * divisor / wp.max(divisor * divisor, floor * floor)
+    return speed * lever / wp.max(lever * lever, LEVER_FLOOR * LEVER_FLOOR)
 
 
 @wp.func
 def leg_inverse_velocity(geo: LegGeometry, angles: vec3, ankle_vel: vec3) -> vec3:
     """Return motor rates [rad/s] that move the ankle at `ankle_vel` [m/s] relative to the body, in the body frame.
 
-    The inverse of `leg_jacobian`, exact within joint limits unless a thigh and its shank are within 3.3 degrees of one
-    line; nearer to it the rates are damped: at most 100 rad/s per m/s along the shank.
+    The inverse of `leg_jacobian` at the motor angles [rad], exact within joint limits unless a thigh and its shank are
+    within 3.3 degrees of one line; there the rates are damped, to at most 100 rad/s per m/s along the shank.
     """
     loop = five_bar(geo, angles[1], angles[2])
     vel = rotate_lateral(geo, -angles[0], ankle_vel)
@@ -79,7 +80,7 @@ def leg_inverse_velocity(geo: LegGeometry, angles: vec3, ankle_vel: vec3) -> vec
 
 @wp.func
 def knee_angles(geo: LegGeometry, loop: FiveBar, outer: real, inner: real) -> vec2:
-    """Return the passive outer and inner knee angle [rad] of a loop configuration; positive folds the shank back."""
+    """Return the passive (outer, inner) knee angles [rad] of a loop at motor angles [rad]; positive bends inward."""
     outer_shank = wp.atan2(-loop.outer_shank[0], -loop.outer_shank[1])
     inner_shank = wp.atan2(-loop.inner_shank[0], -loop.inner_shank[1])
     return vec2(outer + geo.front * outer_shank, inner - geo.front * inner_shank)

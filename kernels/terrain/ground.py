@@ -42,7 +42,7 @@ class Ground:
 
 @wp.func
 def world_ground(ground: Ground, world: int) -> Ground:
-    """Return the ground of one world, with that world's block."""
+    """Return a copy of the ground whose `block` is the block of the world."""
     here = ground
     if ground.blocks.shape[0] > 0:
         here.block = ground.blocks[world]
@@ -51,7 +51,7 @@ def world_ground(ground: Ground, world: int) -> Ground:
 
 @wp.func
 def grown_block(ground: Ground, margin: float) -> Ground:
-    """Return the ground of one world with its block wider on every side, and higher, by a margin [m]."""
+    """Return a copy of a world's ground whose block is larger by `margin` [m] on all four sides and at the top."""
     here = ground
     here.block.half += vec2(real(margin), real(margin))
     here.block.height += real(margin)
@@ -68,7 +68,7 @@ def has_block(ground: Ground, world: int) -> bool:
 
 @wp.func
 def move_block(ground: Ground, world: int, velocity: vec3, dt: real):
-    """Let the block of a world slide for dt [s] with a velocity [m/s], world frame; upward parts do not count."""
+    """Move the block of a world for dt [s] with a velocity [m/s], world frame, and store it; velocity z is ignored."""
     block = ground.blocks[world]
     block.velocity = vec2(velocity[0], velocity[1])
     block.center += dt * block.velocity
@@ -77,7 +77,7 @@ def move_block(ground: Ground, world: int, velocity: vec3, dt: real):
 
 @wp.func
 def rest_block(ground: Ground, world: int):
-    """Put the block of a world, if there is one, back to its start, at rest."""
+    """Move the block of a world, if there is one, to its start position with zero velocity."""
     if ground.blocks.shape[0] > 0:
         block = ground.blocks[world]
         block.velocity = vec2(real(0.0))
@@ -87,7 +87,7 @@ def rest_block(ground: Ground, world: int):
 
 @wp.func
 def floor_surface(ground: Ground, x: real, y: real) -> vec3:
-    """Return `surface` of the plane or heightfield alone."""
+    """Return (height [m], slope along x, slope along y) of the plane or heightfield at world x, y [m]; no block."""
     if ground.rows == 0:
         return vec3(real(0.0))
     dx = real(2.0) * real(ground.half_x) / real(ground.cols - 1)
@@ -111,7 +111,7 @@ def floor_surface(ground: Ground, x: real, y: real) -> vec3:
 
 @wp.func
 def surface(ground: Ground, x: real, y: real) -> vec3:
-    """Return (height [m], slope along x, slope along y) of the ground surface at a point of the world plane."""
+    """Return (height [m], slope along x, slope along y) of floor and block at world x, y [m]; slopes [1]."""
     floor = floor_surface(ground, x, y)
     if ground.block.exists == 0:
         return floor
@@ -154,7 +154,7 @@ def floor_distance(ground: Ground, point: vec3) -> real:
 
 @wp.func
 def outside_block(block: Block, point: vec3) -> vec3:
-    """Return how far [m] a point lies beyond the walls along x and y and above the top; negative inside."""
+    """Return how far [m] a point (world) lies beyond the walls along x and y and above the top; negative inside."""
     return vec3(
         wp.abs(point[0] - block.center[0]) - block.half[0],
         wp.abs(point[1] - block.center[1]) - block.half[1],
@@ -164,7 +164,7 @@ def outside_block(block: Block, point: vec3) -> vec3:
 
 @wp.func
 def block_distance(block: Block, point: vec3) -> real:
-    """Return the signed distance [m] of a point from a block that reaches down without end."""
+    """Return the signed distance [m] of a point (world) from a block extended down to infinity; negative inside."""
     beyond = outside_block(block, point)
     return wp.length(wp.max(beyond, vec3(real(0.0)))) + wp.min(wp.max(beyond), real(0.0))
 
@@ -187,7 +187,10 @@ def block_normal(block: Block, point: vec3) -> vec3:
 
 @wp.func
 def ground_distance(ground: Ground, point: vec3) -> real:
-    """Return the signed distance [m] of a point from the surface, floor or block, positive outside, world frame."""
+    """Return the signed distance [m] of a point (world) to the nearer of floor and block, positive outside.
+
+    Measured along the normal, not vertically: see `floor_distance` and `block_distance`.
+    """
     distance = floor_distance(ground, point)
     if ground.block.exists != 0:
         distance = wp.min(distance, block_distance(ground.block, point))

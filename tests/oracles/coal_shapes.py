@@ -1,4 +1,4 @@
-"""Capsules and boxes for the collision library coal, the oracle of the collision tests."""
+"""Capsules and boxes for the collision library coal, the oracle of the collision tests; any common frame."""
 
 import coal
 import numpy as np
@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 
 def capsule(start, end, radius):
-    """Return (shape, placement, radius) of a capsule [m]; a sphere where the ends coincide."""
+    """Return (shape, placement, radius) of a capsule between two points [m]; a sphere where they coincide."""
     axis = np.asarray(end) - start
     length = np.linalg.norm(axis)
     turn = Rotation.align_vectors([axis / length], [[0, 0, 1]])[0].as_matrix() if length > 0 else np.eye(3)
@@ -14,12 +14,12 @@ def capsule(start, end, radius):
 
 
 def box(low, high):
-    """Return (shape, placement, 0) of an axis-aligned box with these corners [m]."""
+    """Return (shape, placement, radius 0) of the axis-aligned box with lowest and highest corners low, high [m]."""
     size = np.subtract(high, low)
     return coal.Box(*size), coal.Transform3s(np.eye(3), np.add(low, high) / 2), 0.0
 
 
 def coal_distance(a, b):
-    """Signed distance [m], not below minus the sum of the radii."""
+    """Return the signed distance [m] of two (shape, placement, radius), at least minus the sum of the radii."""
     result = coal.distance(a[0], a[1], b[0], b[1], coal.DistanceRequest(), coal.DistanceResult())
     return max(result, -a[2] - b[2])

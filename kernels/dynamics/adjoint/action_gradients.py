@@ -1,4 +1,7 @@
-"""Gradients of the scalars of `virtual_power`, and the constants that go into them, for both stacks."""
+"""Gradients of `leg_action` and `base_action` (`virtual_power`), and their constants; for CPU and GPU kernels.
+
+"Gradient by x" means the partial derivative with respect to x, in the axes and the order of x.
+"""
 
 import warp as wp
 
@@ -21,7 +24,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class LegGradient:
-    """Gradient of `leg_action` by its arguments; those by the base and by gravity are to be summed over legs."""
+    """Gradient of `leg_action` by its arguments; the caller sums those by base and gravity over legs."""
 
     geometry: LegGeometry
     masses: LegMasses
@@ -53,7 +56,7 @@ class BaseGradient:
 
 @wp.func
 def make_base_factors(base: BaseState, end: BaseState, virtual_lin: vec3, virtual_ang: vec3, dt: real) -> BaseFactors:
-    """Return the base's constants in a step of dt [s] from `base` to `end`; virtual_*: multipliers, body axes."""
+    """Return the base's constants in a step dt [s] from `base` to `end`; virtual_*: see `BaseFactors`, body axes."""
     factors = BaseFactors()
     factors.virtual_lin = virtual_lin
     factors.virtual_ang = virtual_ang
@@ -69,7 +72,7 @@ def make_leg_factors(
     rates: vec3, new_rates: vec3, virtual_rates: vec3, mode: int, pressed: int, impulse: vec3, law: vec3, push: vec3,
     dt: real,
 ) -> LegFactors:  # fmt: skip
-    """Return a leg's constants, see `LegFactors`; rates, new_rates [rad/s]: at start and end of a step of dt [s]."""
+    """Return a leg's `LegFactors`; rates, new_rates [rad/s]: of the motors at start and end of a step of dt [s]."""
     factors = LegFactors()
     factors.virtual_rates = virtual_rates
     factors.rates = new_rates
@@ -88,7 +91,10 @@ def leg_action_gradient(
     model: RobotModel, params: LegParams, world: int, leg: int, mu: real, base: BaseState, angles: vec3, rates: vec3,
     base_held: BaseFactors, leg_held: LegFactors, dt: real,
 ) -> LegGradient:  # fmt: skip
-    """Return the gradient of `leg_action` in a step of dt [s]; base, angles [rad], rates [rad/s]: at its start."""
+    """Return the gradient of `leg_action` of leg 0 to 3 in a step dt [s]; mu: friction coefficient.
+
+    base, angles [rad], rates [rad/s]: at the start of the step. base_held, leg_held: constants of the differentiation.
+    """
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     gradient = LegGradient()
     (geometry, masses, joints, spring, stops, _ground, mu_adj, pos, quat_adj, omega, g_adj, angles_adj, rates_adj,
@@ -119,7 +125,10 @@ def base_action_gradient(
     model: RobotModel, world: int, force: vec3, moment: vec3, base: BaseState, held: BaseFactors,
     cotangent: BaseCotangent, dt: real,
 ) -> BaseGradient:  # fmt: skip
-    """Return the gradient of `base_action` in a step of dt [s]; force [N], moment [N m]: at the com, world axes."""
+    """Return the gradient of `base_action` in a step dt [s]; held, cotangent: constants of the differentiation.
+
+    force [N], moment [N m]: at the com, world axes. base: at the start of the step.
+    """
     body, com, gravity, force_adj, moment_adj, quat_adj, lin, omega, _held, _cotangent, _dt = wp.grad(base_action)(
         load_moments(model.table, BASE, world), base_com(model.table, world), load_vec3(model.table, GRAVITY, world),
         force, moment, base.quat, base.lin, base.ang, held, cotangent, dt,

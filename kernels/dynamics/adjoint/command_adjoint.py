@@ -1,4 +1,7 @@
-"""From gradients by motor torques to those by targets and actuation: motors, latency, command filter, backwards."""
+"""Reverse pass of motors, latency and command filter: from gradients by torques to those by targets and constants.
+
+Motors are 0 to 11 (legs FL, FR, BL, BR; each lateral, outer, inner).
+"""
 
 from typing import Any
 
@@ -18,10 +21,10 @@ class MotorAdjoint:
     """Derivatives of a motor's torque."""
 
     target: real  # [N m/rad] by the target that it follows
-    angle: real  # [N m/rad]
-    rate: real  # [N m s/rad]
-    constants: MotorParams  # by each of them
-    latency: real  # [N m/s]
+    angle: real  # [N m/rad] by the joint angle
+    rate: real  # [N m s/rad] by the joint rate
+    constants: MotorParams  # [N m] per unit of each constant
+    latency: real  # [N m/s] by the latency
 
 
 @wp.struct
@@ -36,7 +39,7 @@ class FilterAdjoint:
 
 @wp.func
 def add_target(gradients: Gradients, step: int, motor: int, world: int, gradient: real):
-    """Add to the gradient by a motor's filtered target of a policy step, or, for step -1, by its initial target."""
+    """Add to the gradient by a motor's filtered target of policy step `step`, or for step -1 by its initial target."""
     if step < 0:
         # atomic to avoid a load: no other thread writes here
         wp.atomic_add(gradients.initial_target, motor, world, gradient)
@@ -49,7 +52,10 @@ def motor_gradient(
     params: MotorParams, delay: real, commands: Commands, filtered_target: wp.array3d(dtype=real), timing: Timing,
     dt: real, step: int, motor: int, world: int, angle: real, rate: real,
 ) -> MotorAdjoint:  # fmt: skip
-    """Return the derivatives of a motor's torque in a physics step of dt [s]; delay: latency in physics steps."""
+    """Return the derivatives of the torque of a motor in physics step `step` of dt [s], at angle [rad], rate [rad/s].
+
+    params: the motor's constants. delay: latency in physics steps. filtered_target [rad]: (T, 12, num_worlds).
+    """
     adjoint = MotorAdjoint()
     arrived = arrival(step, timing.substeps, delay)
     newer = policy_target(filtered_target, commands.initial_target, arrived.newer, motor, world)
@@ -70,7 +76,7 @@ def motor_gradient(
 
 @wp.func
 def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, gradient: real):
-    """Add a gradient by the target that a motor follows to those by the filtered targets it comes from."""
+    """Add the gradient by the mean target that a motor follows to those by the two policy targets of the mean."""
     add_target(gradients, arrived.newer, motor, world, arrived.weight * gradient)
     if arrived.newer > arrived.older:
         add_target(gradients, arrived.older, motor, world, (real(1.0) - arrived.weight) * gradient)
@@ -78,14 +84,17 @@ def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, 
 
 @wp.func
 def add_motor_constants(sums: Any, shared: Any, motor: int, cotangent: real, adjoint: MotorAdjoint):
-    """Add to the gradients by a motor's constants, and to `shared` by the latency; seed: gradient by its torque."""
+    """Add cotangent times the derivatives by a motor's constants to `sums`, and that by the latency to `shared`.
+
+    cotangent: gradient by the motor's torque. sums, shared: rows of GRADIENT_ROWS, see `add_entry`.
+    """
     add_motor(sums, shared, motor, cotangent, adjoint.constants)
     add_entry(shared, LATENCY_GRADIENT, cotangent * adjoint.latency)
 
 
 @wp.func
 def filter_adjoint_scalar(target: vec3, angles: vec3, rates: vec3, params: FilterParams, cotangent: vec3) -> real:
-    """Return cotangent . (filtered targets of a leg [rad])."""
+    """Return cotangent . (filtered targets of a leg [rad]), see `filter_leg`; differentiated by `wp.grad`."""
     return wp.dot(cotangent, filter_leg(target, angles, rates, params))
 
 
@@ -94,9 +103,10 @@ def filter_gradient(
     commands: Commands, actuation: Actuation, step: int, leg: int, world: int, angles: vec3, rates: vec3,
     gradients: Gradients,
 ) -> FilterAdjoint:  # fmt: skip
-    """Return the gradients by the filter's inputs, given those by a leg's filtered targets of a policy step.
+    """Return the gradients by the inputs of a leg's command filter in policy step `step`.
 
-    angles [rad], rates [rad/s]: of the leg's motors at the start of the policy step.
+    Reads the gradient by the filtered targets from `gradients`. angles [rad], rates [rad/s]: of the leg's motors at the
+    start of the policy step. Without a filter the gradient passes to the target unchanged.
     """
     m = 3 * leg
     adjoint = FilterAdjoint()
@@ -118,5 +128,5 @@ def filter_gradient(
 
 @wp.func
 def add_offsets(sums: Any, leg: int, by_angles: vec3):
-    """Add to the gradients by the sensors' offsets, given those by the angles that the filter reads."""
+    """Add `by_angles`, the gradient by the angles that a leg's filter reads, to that by the sensors' offsets."""
     add_vec3(sums, MOTOR_GRADIENT + 72 + 3 * leg, by_angles)

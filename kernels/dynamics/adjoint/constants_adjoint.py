@@ -19,22 +19,22 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class SpanStep:
-    """A step of a span, as one of the threads of a leg takes it."""
+    """Indices of a step of a span, and its weight in the sums of the thread that processes it."""
 
     step: int  # of the rollout
     entry: int  # of the record
-    weight: real  # 0 where there are no steps left and the thread repeats the last one
+    weight: real  # 1, or 0 where no steps are left and the thread repeats the last one
 
 
 @wp.func
 def steps_per_thread(timing: Timing, span: Span, threads_per_leg: int) -> int:
-    """Return how many steps each of `threads_per_leg` threads takes, one after the other."""
+    """Return the number of steps of a span that each of the `threads_per_leg` threads of a leg processes."""
     return ((span.end - span.begin) * timing.every + threads_per_leg - 1) / threads_per_leg
 
 
 @wp.func
 def span_step(timing: Timing, span: Span, k: int) -> SpanStep:
-    """Return the k-th step of a span."""
+    """Return the k-th step (from 0) of a span, or the last one with weight 0 if k is beyond it."""
     step = SpanStep()
     end = span.end * timing.every
     step.step = span.begin * timing.every + k
@@ -59,9 +59,10 @@ def leg_constants_kernel(
     # in, out
     gradients: Gradients,
 ):
-    """Add the gradients by constants of legs of the steps of a span; launch over (worlds, turns, 4).
+    """Add the gradients of a span's steps by the constants of legs; launch over (worlds, threads_per_leg, 4).
 
-    turns: threads that share the steps of a leg, 8 on a GPU, with a warp a world, and 1 on a CPU.
+    threads_per_leg: threads that divide the steps of a leg, 8 on a GPU (a warp per world) and 1 on a CPU. Worlds count
+    from `settings.first`.
     """
     index, thread, leg = wp.tid()
     world = settings.first + index
@@ -99,9 +100,9 @@ def motor_constants_kernel(
     # in, out
     gradients: Gradients,
 ):
-    """Add the gradients by constants of motors of the steps of a span; launched as `leg_constants_kernel`.
+    """Add the gradients of a span's steps by the constants of motors; launch as `leg_constants_kernel`.
 
-    Two kernels, since one would need more memory per thread than a GPU's L1 cache holds.
+    The kernels are separate, because one would need more memory per thread than a GPU's L1 cache holds.
     """
     index, thread, leg = wp.tid()
     world = settings.first + index

@@ -1,9 +1,14 @@
-"""Where the reverse pass of a rollout adds up its gradients."""
+"""Arrays of the gradients of a rollout, and functions that add to them.
+
+`add_*` take `sums`, an array (GRADIENT_ROWS,) of one world or `ThreadSums`, and add a struct of gradients, entry by
+entry, to the rows of the parameters it names; leg: 0 to 3, motor: 0 to 11.
+"""
 
 from typing import Any
 
 import warp as wp
 
+from ... import layout
 from ...actuation.command_filter import FilterParams, Limits
 from ...actuation.joint_forces import JointParams
 from ...actuation.motors import MotorParams
@@ -11,28 +16,6 @@ from ...actuation.springs import LegSpring
 from ...actuation.stops import StopParams
 from ...kinematics.geometry import LegGeometry
 from ...lanes import sum_legs, sum_step_threads
-from ...layout import (
-    ARMATURE,
-    BASE,
-    DAMPING,
-    FRICTION,
-    HOUSING,
-    INNER_SHANK,
-    INNER_THIGH,
-    KNEE_DAMPING,
-    KNEE_LIMIT,
-    LEG_ROWS,
-    LOWER,
-    OUTER_SHANK,
-    OUTER_THIGH,
-    PARAMETER_ROWS,
-    SPRING,
-    STOP_KD,
-    STOP_KE,
-    SUM_LOWER,
-    SUM_UPPER,
-    UPPER,
-)
 from ...scalar import real, vec3
 from ..inertia import MassMoments
 from ..leg_dynamics import LegMasses
@@ -41,11 +24,11 @@ from .action_gradients import LegGradient
 
 wp.set_module_options({"enable_backward": False})
 
-# rows of a leg's geometry: hip (3), then the lengths in the order of `LegGeometry`, its signs left out
+# rows of a leg's geometry: hip (3), then the lengths in the order of `LegGeometry`, without `front` and `side`
 GEOMETRY_ROWS = wp.constant(10)
 
-# rows of the gradient by a world's parameters: the parameter table, then 12 per motor constant, then
-MOTOR_GRADIENT = wp.constant(PARAMETER_ROWS)  # kp, kd, saturation, peak, cutoff_speed, no_load_speed, offset
+# rows of the gradient by a world's parameters: first the PARAMETER_ROWS of the table of `layout`
+MOTOR_GRADIENT = wp.constant(layout.PARAMETER_ROWS)  # 7 x 12: kp, kd, saturation, peak, cutoff, no_load, offset
 FADE_GRADIENT = wp.constant(MOTOR_GRADIENT + 84)  # 2: start and end
 LATENCY_GRADIENT = wp.constant(FADE_GRADIENT + 2)
 FILTER_GRADIENT = wp.constant(LATENCY_GRADIENT + 1)
@@ -55,20 +38,20 @@ GRADIENT_ROWS = wp.constant(GEOMETRY_GRADIENT + 40)
 
 @wp.struct
 class Gradients:
-    """Gradient of one number per world by all inputs of a rollout; units: the number's per the input's."""
+    """Gradient of one scalar per world by all inputs of a rollout; units: the scalar's per the input's."""
 
     q: wp.array2d(dtype=real)  # of row 0, (ROW_COORDS, num_worlds)
     qd: wp.array2d(dtype=real)  # (ROW_RATES, num_worlds)
     target: wp.array3d(dtype=real)  # (T, 12, num_worlds)
-    initial_target: wp.array2d(dtype=real)  # (12, num_worlds), to be zeroed first
-    wrench: wp.array3d(dtype=real)  # (T, 6, num_worlds), likewise
-    filtered_target: wp.array3d(dtype=real)  # of the filtered targets, (T, 12, num_worlds), likewise
+    initial_target: wp.array2d(dtype=real)  # (12, num_worlds); the caller must zero it first
+    wrench: wp.array3d(dtype=real)  # (T, 6, num_worlds); the caller must zero it first
+    filtered_target: wp.array3d(dtype=real)  # (T, 12, num_worlds); the caller must zero it first
     parameters: wp.array2d(dtype=real)  # (GRADIENT_ROWS, num_worlds)
 
 
 @wp.struct
 class ThreadSums:
-    """Destination of a thread's gradients by parameters, and over which threads of its warp they are summed first."""
+    """Destination of a thread's gradients by parameters, and the threads of its warp to sum them over first."""
 
     parameters: wp.array2d(dtype=real)  # (GRADIENT_ROWS, num_worlds)
     world: int
@@ -80,7 +63,7 @@ class ThreadSums:
 
 @wp.func
 def thread_sums(gradients: Gradients, world: int, writes: bool, over_steps: bool, over_legs: bool) -> ThreadSums:
-    """Return `ThreadSums` of weight 1 that add to `gradients.parameters`."""
+    """Return `ThreadSums` of weight 1 that add to `gradients.parameters`; arguments: see its fields."""
     sums = ThreadSums()
     sums.parameters = gradients.parameters
     sums.world = world
@@ -93,13 +76,13 @@ def thread_sums(gradients: Gradients, world: int, writes: bool, over_steps: bool
 
 @wp.func
 def add_entry(sums: wp.array(dtype=real), row: int, x: real):
-    """Add a number to a row."""
+    """Add x to a row of an array of one world, (GRADIENT_ROWS,)."""
     sums[row] = sums[row] + x
 
 
 @wp.func
 def add_entry(sums: ThreadSums, row: int, x: real):  # noqa: F811
-    """Add x, weighted and summed over threads as `sums` says, to a row of their world; one atomic addition."""
+    """Add x to a row of the world of `sums`, weighted and summed over threads first; one atomic addition."""
     total = sums.weight * x
     if sums.over_steps:
         total = sum_step_threads(total)
@@ -111,14 +94,14 @@ def add_entry(sums: ThreadSums, row: int, x: real):  # noqa: F811
 
 @wp.func
 def add_vec3(sums: Any, row: int, v: vec3):
-    """Add a vector to three rows."""
+    """Add a vector to three rows, from `row` on."""
     for i in range(3):
         add_entry(sums, row + i, v[i])
 
 
 @wp.func
 def add_moments(sums: Any, row: int, m: MassMoments):
-    """Add the gradient by a link's mass moments."""
+    """Add the gradient by a link's mass moments to MOMENT_ROWS rows, from `row` on."""
     add_entry(sums, row, m.mass)
     add_vec3(sums, row + 1, m.first)
     for i in range(6):
@@ -127,32 +110,32 @@ def add_moments(sums: Any, row: int, m: MassMoments):
 
 @wp.func
 def add_masses(sums: Any, leg: int, masses: LegMasses):
-    """Add the gradient by the mass moments of a leg."""
-    row = leg * LEG_ROWS
-    add_moments(sums, row + HOUSING, masses.housing)
-    add_moments(sums, row + OUTER_THIGH, masses.outer_thigh)
-    add_moments(sums, row + OUTER_SHANK, masses.outer_shank)
-    add_moments(sums, row + INNER_THIGH, masses.inner_thigh)
-    add_moments(sums, row + INNER_SHANK, masses.inner_shank)
+    """Add the gradient by the mass moments of a leg's links."""
+    row = leg * layout.LEG_ROWS
+    add_moments(sums, row + layout.HOUSING, masses.housing)
+    add_moments(sums, row + layout.OUTER_THIGH, masses.outer_thigh)
+    add_moments(sums, row + layout.OUTER_SHANK, masses.outer_shank)
+    add_moments(sums, row + layout.INNER_THIGH, masses.inner_thigh)
+    add_moments(sums, row + layout.INNER_SHANK, masses.inner_shank)
 
 
 @wp.func
 def add_joints(sums: Any, leg: int, p: JointParams):
-    """Add the gradient by the joint-space parameters of a leg."""
-    row = leg * LEG_ROWS
-    add_vec3(sums, row + ARMATURE, p.armature)
-    add_vec3(sums, row + FRICTION, p.friction)
-    add_vec3(sums, row + DAMPING, p.damping)
-    add_entry(sums, row + KNEE_DAMPING, p.knee_damping_outer)
-    add_entry(sums, row + KNEE_DAMPING + 1, p.knee_damping_inner)
-    add_entry(sums, row + KNEE_LIMIT, p.knee_limit_outer)
-    add_entry(sums, row + KNEE_LIMIT + 1, p.knee_limit_inner)
+    """Add the gradient by armature, friction and damping of a leg."""
+    row = leg * layout.LEG_ROWS
+    add_vec3(sums, row + layout.ARMATURE, p.armature)
+    add_vec3(sums, row + layout.FRICTION, p.friction)
+    add_vec3(sums, row + layout.DAMPING, p.damping)
+    add_entry(sums, row + layout.KNEE_DAMPING, p.knee_damping_outer)
+    add_entry(sums, row + layout.KNEE_DAMPING + 1, p.knee_damping_inner)
+    add_entry(sums, row + layout.KNEE_LIMIT, p.knee_limit_outer)
+    add_entry(sums, row + layout.KNEE_LIMIT + 1, p.knee_limit_inner)
 
 
 @wp.func
 def add_spring(sums: Any, leg: int, p: LegSpring):
     """Add the gradient by the spring of a leg."""
-    row = leg * LEG_ROWS + SPRING
+    row = leg * layout.LEG_ROWS + layout.SPRING
     add_entry(sums, row, p.stiffness)
     add_entry(sums, row + 1, p.length)
 
@@ -160,18 +143,18 @@ def add_spring(sums: Any, leg: int, p: LegSpring):
 @wp.func
 def add_stops(sums: Any, leg: int, p: StopParams):
     """Add the gradient by the hard stops of a leg."""
-    row = leg * LEG_ROWS
-    add_vec3(sums, row + LOWER, p.lower)
-    add_vec3(sums, row + UPPER, p.upper)
-    add_entry(sums, row + SUM_LOWER, p.sum_lower)
-    add_entry(sums, row + SUM_UPPER, p.sum_upper)
-    add_entry(sums, row + STOP_KE, p.ke)
-    add_entry(sums, row + STOP_KD, p.kd)
+    row = leg * layout.LEG_ROWS
+    add_vec3(sums, row + layout.LOWER, p.lower)
+    add_vec3(sums, row + layout.UPPER, p.upper)
+    add_entry(sums, row + layout.SUM_LOWER, p.sum_lower)
+    add_entry(sums, row + layout.SUM_UPPER, p.sum_upper)
+    add_entry(sums, row + layout.STOP_KE, p.ke)
+    add_entry(sums, row + layout.STOP_KD, p.kd)
 
 
 @wp.func
 def add_geometry(sums: Any, leg: int, geo: LegGeometry):
-    """Add the gradient by a leg's lengths."""
+    """Add the gradient by a leg's hip position and lengths."""
     row = GEOMETRY_GRADIENT + leg * GEOMETRY_ROWS
     add_vec3(sums, row, geo.hip)
     add_entry(sums, row + 3, geo.outer_x)
@@ -185,7 +168,7 @@ def add_geometry(sums: Any, leg: int, geo: LegGeometry):
 
 @wp.func
 def add_leg_parameters(sums: Any, leg: int, gradient: LegGradient):
-    """Add the gradient by a leg's parameters, its friction coefficients aside."""
+    """Add the gradient by all parameters of a leg except its friction coefficients."""
     add_geometry(sums, leg, gradient.geometry)
     add_masses(sums, leg, gradient.masses)
     add_joints(sums, leg, gradient.joints)
@@ -195,14 +178,14 @@ def add_leg_parameters(sums: Any, leg: int, gradient: LegGradient):
 
 @wp.func
 def add_com(sums: Any, mass: real, com: vec3, gradient: vec3):
-    """Add a gradient by the base's centre of mass [m], the ratio of its first moment and its mass [kg]."""
-    add_entry(sums, BASE, -wp.dot(gradient, com) / mass)
-    add_vec3(sums, BASE + 1, gradient / mass)
+    """Add `gradient` by the base's centre of mass com [m] to those by its mass [kg] and first moment mass * com."""
+    add_entry(sums, layout.BASE, -wp.dot(gradient, com) / mass)
+    add_vec3(sums, layout.BASE + 1, gradient / mass)
 
 
 @wp.func
 def add_motor(sums: Any, shared: Any, motor: int, scale: real, p: MotorParams):
-    """Add `scale` times a gradient by a motor's constants, to `shared` the constants that all motors share."""
+    """Add scale times the gradient p by a motor's constants to `sums`; fade_start and fade_end go to `shared`."""
     row = MOTOR_GRADIENT + motor
     add_entry(sums, row, scale * p.kp)
     add_entry(sums, row + 12, scale * p.kd)
@@ -217,14 +200,14 @@ def add_motor(sums: Any, shared: Any, motor: int, scale: real, p: MotorParams):
 
 @wp.func
 def add_limits(sums: Any, row: int, limits: Limits):
-    """Add the gradient by one quantity's limits; hard zones only switch."""
+    """Add the gradient by the limits of one quantity; the gradient by its hard zones, mere switches, is 0."""
     add_entry(sums, row, limits.lower)
     add_entry(sums, row + 1, limits.upper)
 
 
 @wp.func
 def add_filter(sums: Any, p: FilterParams):
-    """Add the gradient by the filter's constants."""
+    """Add the gradient by the constants of the command filter."""
     add_limits(sums, FILTER_GRADIENT, p.lateral)
     add_limits(sums, FILTER_GRADIENT + 4, p.transversal)
     add_limits(sums, FILTER_GRADIENT + 8, p.sum)

@@ -1,8 +1,8 @@
-"""`step_adjoint` for GPUs, with a thread per leg; each of a world's four computes the base's part. In three parts.
+"""`step_adjoint` for GPUs, with a thread per leg; each of a world's four threads also computes the base's part.
 
-`replay_leg` recomputes the motion and inverts the system of the contact laws' multipliers, for many steps in parallel.
-`reverse_leg` goes backwards from step to step and records multipliers. The gradients by parameters follow from these,
-again for many steps in parallel (`add_leg_constants`).
+1. `replay_leg` recomputes the motion and inverts the system of the contact laws' multipliers, many steps in parallel.
+2. `reverse_leg` goes backwards from step to step and records multipliers.
+3. `add_leg_constants` adds the gradients by parameters, computed from these, many steps in parallel.
 """
 
 import warp as wp
@@ -20,41 +20,10 @@ from ..inertia import MassMoments
 from ..parameters import load_spring, load_stops, load_vec3
 from ..step import LegParams, RobotModel, base_system, hold_base, leg_terms
 from ..trajectory import TrajectoryArrays, row_vec3
-from .action_gradients import (
-    LegGradient,
-    base_action_gradient,
-    leg_action_gradient,
-    make_base_factors,
-    make_leg_factors,
-)
-from .gradients import (
-    ThreadSums,
-    add_entry,
-    add_leg_parameters,
-)
-from .leg_record import (
-    ANGLES,
-    RATES,
-    BaseWeights,
-    LawRow,
-    LegLaw,
-    LegRecord,
-    LegWeights,
-    get_base,
-    get_inverse,
-    get_law,
-    get_law_row,
-    get_solve,
-    get_vec,
-    put_base,
-    put_base_weights,
-    put_inverse,
-    put_law,
-    put_law_row,
-    put_leg_weights,
-    put_solve,
-    put_vec,
-)
+from . import action_gradients, leg_record
+from .action_gradients import LegGradient, base_action_gradient, leg_action_gradient, make_base_factors
+from .gradients import ThreadSums, add_entry, add_leg_parameters
+from .leg_record import ANGLES, RATES, BaseWeights, LawRow, LegLaw, LegRecord, LegWeights
 from .virtual_power import BaseFactors, LegFactors, add, rotation_adjoint_scalar
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
@@ -62,11 +31,11 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class LegAdjoint:
-    """Gradient by a world's state and inputs as a leg's thread holds it; axes and order as those of the value."""
+    """Gradient by a world's state and inputs, the part of one leg's thread; axes and order as those of the value."""
 
-    base: BaseState  # by the base's state at the start of the step, as the next two
-    angles: vec3  # by the motors' angles: lateral, outer, inner
-    rates: vec3
+    base: BaseState  # by the base's state at the start of the step
+    angles: vec3  # by the motors' angles at the start of the step: lateral, outer, inner
+    rates: vec3  # by the motors' rates at the start of the step
     torque: vec3  # by the motors' torques in the step
     force: vec3  # by the wrench on the base at its com, world axes; summed over steps as are the next four
     moment: vec3
@@ -77,7 +46,7 @@ class LegAdjoint:
 
 @wp.func
 def leg_law(c: PawContact, law: PawLaw, impulse: vec3, point: vec3) -> LegLaw:
-    """Return the part of a paw's law that is recorded; impulse [N s], point [m] of contact: body axes."""
+    """Return the recorded part of a paw's contact law; impulse [N s], point [m] of contact: body axes."""
     recorded = LegLaw()
     recorded.mode = law.mode
     recorded.mu_row = law.mu_row
@@ -98,12 +67,13 @@ def replay_leg(
 ):  # fmt: skip
     """Recompute a step of the rollout from entry i of the record, and write the state at its end to entry i + 1.
 
-    To entry i go the inverse of the base's system, the leg's elimination, and its paw's law. force [N], moment [N m]:
-    on the base at its com, world axes. Every thread of a world writes the base, with the same bits; see `replay_step`.
+    Entry i gets the inverse of the base's system, the leg's elimination, and its paw's law. force [N], moment [N m]:
+    on the base at its com, world axes. first_impulse: as `Commands.impulse`. All four threads of a world write the same
+    bits for the base; see `replay_step`.
     """
-    base = get_base(record, i, world)
-    rates = get_vec(record, i, RATES, world, leg)
-    angles = get_vec(record, i, ANGLES, world, leg)
+    base = leg_record.get_base(record, i, world)
+    rates = leg_record.get_vec(record, i, RATES, world, leg)
+    angles = leg_record.get_vec(record, i, ANGLES, world, leg)
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     torque = row_vec3(trajectory.torque, step, 3 * leg, world)
     stops = stop_rates(load_stops(model.table, leg, world), angles, dt)
@@ -111,11 +81,11 @@ def replay_leg(
     terms = leg_terms(
         params, spring, angles, rates, torque, stops, int(trajectory.pressed[step, leg, world]), base.ang, g, dt
     )
-    share = add_leg(BaseSystem(), terms.dynamics, terms.solve)
-    system = sum_systems(base_system(model, world, base, g, force, moment), share)
+    leg_system = add_leg(BaseSystem(), terms.dynamics, terms.solve)
+    system = sum_systems(base_system(model, world, base, g, force, moment), leg_system)
     inverse = hold_base(model, world, invert(system))
     solve = terms.solve
-    put_inverse(record, i, world, inverse)
+    leg_record.put_inverse(record, i, world, inverse)
     paw = terms.paw
     c = PawContact()
     push = vec3(real(0.0))
@@ -130,16 +100,16 @@ def replay_leg(
         push = impulse - wp.transpose(solve.to_lin) * joint
         twist = wp.cross(point, impulse) - wp.transpose(solve.to_ang) * joint
         solve.free += solve.inverse * (joint / dt)
-    put_solve(record, i, world, leg, solve)
+    leg_record.put_solve(record, i, world, leg, solve)
     push = dt * system.force + sum_vec(push)
     twist = dt * system.moment + sum_vec(twist)
     lin = solve_lin(inverse, push, twist)
     ang = solve_ang(inverse, push, twist)
     new_rates = rates + dt * motor_acceleration(solve, lin / dt, ang / dt)
-    put_vec(record, i + 1, RATES, world, leg, new_rates)
-    put_vec(record, i + 1, ANGLES, world, leg, angles + dt * new_rates)
+    leg_record.put_vec(record, i + 1, RATES, world, leg, new_rates)
+    leg_record.put_vec(record, i + 1, ANGLES, world, leg, angles + dt * new_rates)
     old_lin = wp.quat_rotate_inv(base.quat, base.lin)
-    put_base(record, i + 1, world, integrate_base(base, old_lin + lin, base.ang + ang, dt))
+    leg_record.put_base(record, i + 1, world, integrate_base(base, old_lin + lin, base.ang + ang, dt))
     law = PawLaw()
     if touches:
         old_velocity = old_lin + wp.cross(base.ang, point) + c.jacobian * rates
@@ -149,21 +119,24 @@ def replay_leg(
             old_impulse = trajectory.impulse[step - 1, leg, world]
         law = paw_law(model, world, leg, c, old_velocity, velocity, wp.quat_rotate_inv(base.quat, old_impulse))
     if any_world(any_leg(law.mode != SEPARATE)):
-        put_law_row(record, i, world, leg, inverted_laws(c, law, leg))
-    put_law(record, i, world, leg, leg_law(c, law, impulse, point))
+        leg_record.put_law_row(record, i, world, leg, inverted_laws(c, law, leg))
+    leg_record.put_law(record, i, world, leg, leg_law(c, law, impulse, point))
 
 
 @wp.func
 def any_leg(flag: bool) -> bool:
-    """Return whether a flag is set for any leg of the world."""
+    """Return whether the flag is set in any of the four threads of the world."""
     return sum_legs(wp.where(flag, real(1.0), real(0.0))) > real(0.0)
 
 
 @wp.func
-def law_block(c: PawContact, law: PawLaw, of: PawContact, of_law: PawLaw, leg: int, j: int) -> mat33:
-    """Return block (leg, j) of the system of the laws' multipliers; `of`, `of_law`: own paw, which thread j sends."""
-    to_lin = mat_from_leg(of.to_lin * wp.transpose(of_law.by_velocity), j)
-    to_ang = mat_from_leg(of.to_ang * wp.transpose(of_law.by_velocity), j)
+def law_block(c: PawContact, law: PawLaw, sent: PawContact, sent_law: PawLaw, leg: int, j: int) -> mat33:
+    """Return block (leg, j) of the matrix A^T of `step_adjoint`; all arguments but j are those of this thread's leg.
+
+    sent, sent_law: c and law again, of which thread j sends its own to the other threads.
+    """
+    to_lin = mat_from_leg(sent.to_lin * wp.transpose(sent_law.by_velocity), j)
+    to_ang = mat_from_leg(sent.to_ang * wp.transpose(sent_law.by_velocity), j)
     if law.mode == SEPARATE:
         return wp.where(leg == j, wp.identity(n=3, dtype=real), mat33(real(0.0)))
     if leg == j:
@@ -173,7 +146,10 @@ def law_block(c: PawContact, law: PawLaw, of: PawContact, of_law: PawLaw, leg: i
 
 @wp.func
 def reduce_block(block: mat33, factor: mat33, pivot: mat33, j: int, leg: int) -> mat33:
-    """Return a block after elimination with row j, whose scaled block is `pivot` in its own thread."""
+    """Return `block` of this thread's row (leg) after Gauss-Jordan elimination with row j.
+
+    factor: this row's block in column j. pivot: in thread j, the block of row j scaled by the inverse diagonal block.
+    """
     scaled = mat_from_leg(pivot, j)
     if leg == j:
         return scaled
@@ -182,7 +158,7 @@ def reduce_block(block: mat33, factor: mat33, pivot: mat33, j: int, leg: int) ->
 
 @wp.func
 def inverted_laws(c: PawContact, law: PawLaw, leg: int) -> LawRow:
-    """Return a row of the inverse of the multipliers' system: Gauss-Jordan by blocks in place, a row a thread."""
+    """Return row `leg` of the inverse of A^T (12x12) of `step_adjoint`: Gauss-Jordan by 3x3 blocks, a row a thread."""
     eye = wp.identity(n=3, dtype=real)
     none = mat33(real(0.0))
     a0 = law_block(c, law, c, law, leg, 0)
@@ -215,17 +191,18 @@ def inverted_laws(c: PawContact, law: PawLaw, leg: int) -> LawRow:
 
 @wp.func
 def multiplier(row: LawRow, impulse_cotangent: vec3) -> vec3:
-    """Return the multiplier of a paw's law, given each paw's gradient by its impulse, 0 where it is separated."""
+    """Return the multiplier l of the law of this thread's paw; impulse_cotangent: gradient by the paw's impulse.
+
+    row: see `inverted_laws`. Threads of separated paws must pass 0.
+    """
     total = row.a * vec_from_leg(impulse_cotangent, 0) + row.b * vec_from_leg(impulse_cotangent, 1)
     return -(total + row.c * vec_from_leg(impulse_cotangent, 2) + row.d * vec_from_leg(impulse_cotangent, 3))
 
 
 @wp.func
-def base_factors(
-    record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights
-) -> BaseFactors:  # fmt: skip
-    """Return the base's constants in the step at entry i."""
-    return make_base_factors(base, get_base(record, i + 1, world), weights.lin, weights.ang, dt)
+def base_factors(record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights) -> BaseFactors:
+    """Return the base's constants in the step dt [s] at entry i of the record; base: state at its start."""
+    return make_base_factors(base, leg_record.get_base(record, i + 1, world), weights.lin, weights.ang, dt)
 
 
 @wp.func
@@ -233,19 +210,19 @@ def leg_factors(
     record: LegRecord, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, world: int, step: int, i: int,
     leg: int, dt: real, law: LegLaw, weights: LegWeights,
 ) -> LegFactors:  # fmt: skip
-    """Return a leg's constants in the step of the rollout whose entry in the record is i."""
+    """Return a leg's constants in step `step` of the rollout, of dt [s], whose entry in the record is i."""
     push = vec3(real(0.0))
     if cotangent.impulse.shape[0] > 0:
         push = cotangent.impulse[step, leg, world]
-    return make_leg_factors(
-        get_vec(record, i, RATES, world, leg), get_vec(record, i + 1, RATES, world, leg), weights.rates, law.mode,
-        int(trajectory.pressed[step, leg, world]), law.impulse, weights.law, push, dt,
+    return action_gradients.make_leg_factors(
+        leg_record.get_vec(record, i, RATES, world, leg), leg_record.get_vec(record, i + 1, RATES, world, leg),
+        weights.rates, law.mode, int(trajectory.pressed[step, leg, world]), law.impulse, weights.law, push, dt,
     )  # fmt: skip
 
 
 @wp.struct
 class StepWeights:
-    """Multipliers of a step's equations, and the gradients by the velocities at its start that they leave."""
+    """Multipliers of a step's equations, and the gradients by the velocities at its start that follow from them."""
 
     base: BaseWeights
     leg: LegWeights
@@ -261,10 +238,11 @@ def find_weights(
 ) -> StepWeights:  # fmt: skip
     """Return the multipliers of a step, given the gradients by the velocities at its end; see `find_multipliers`.
 
-    lin_, ang_, rate_cotangent: by the base's velocities in the body axes of the step's start, and the motors' rates.
+    lin_cotangent, ang_cotangent: by the base's velocities, in the body axes of the step's start; rate_cotangent: by the
+    motors' rates. i: the step's entry in the record.
     """
-    inverse = get_inverse(record, i, world)
-    solve = get_solve(record, i, world, leg)
+    inverse = leg_record.get_inverse(record, i, world)
+    solve = leg_record.get_solve(record, i, world, leg)
     weights = StepWeights()
     weights.lin = lin_cotangent
     weights.ang = ang_cotangent
@@ -284,7 +262,7 @@ def find_weights(
             impulse_cotangent += wp.quat_rotate_inv(base.quat, cotangent.impulse[step, leg, world])
     if any_world(any_leg(touches)):
         y = vec3(real(0.0))
-        weights.leg.law = multiplier(get_law_row(record, i, world, leg), impulse_cotangent)
+        weights.leg.law = multiplier(leg_record.get_law_row(record, i, world, leg), impulse_cotangent)
         if touches:
             y = wp.transpose(law.by_velocity) * weights.leg.law
         joint = wp.transpose(law.jacobian) * y
@@ -305,13 +283,13 @@ def reverse_leg(
     trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, step: int, i: int, record: LegRecord, adj: LegAdjoint,
     writes_record: bool,
 ) -> LegAdjoint:  # fmt: skip
-    """Return the gradient by the state at the start of a step from `adj`, that at its end; see `reverse_step`.
+    """Return the gradient by the state at the start of a step, given `adj`, that by the state at its end.
 
-    i: the step's entry in the record, `step`: its number in the rollout. force [N], moment [N m]: on the base at its
-    com, world axes. writes_record: whether this thread writes the step's multipliers to the record.
+    See `reverse_step`. i: the step's entry in the record, step: its number in the rollout. force [N], moment [N m]: on
+    the base at its com, world axes. writes_record: whether this thread writes the step's multipliers to the record.
     """
-    base = get_base(record, i, world)
-    law = get_law(record, i, world, leg)
+    base = leg_record.get_base(record, i, world)
+    law = leg_record.get_law(record, i, world, leg)
     new_velocity = adj.base.lin + dt * adj.base.pos
     quat_adj, ang_cotangent, _dt, _quat_adj = wp.grad(rotation_adjoint_scalar)(
         base.quat, row_vec3(record.base, i + 1, 10, world), dt, adj.base.quat
@@ -325,16 +303,16 @@ def reverse_leg(
     base_held = base_factors(record, world, i, dt, base, base_weights)
     leg_held = leg_factors(record, trajectory, cotangent, world, step, i, leg, dt, law, weights.leg)
     gradient = leg_action_gradient(
-        model, params, world, leg, law.mu, base, get_vec(record, i, ANGLES, world, leg),
-        get_vec(record, i, RATES, world, leg), base_held, leg_held, dt,
+        model, params, world, leg, law.mu, base, leg_record.get_vec(record, i, ANGLES, world, leg),
+        leg_record.get_vec(record, i, RATES, world, leg), base_held, leg_held, dt,
     )  # fmt: skip
     base_weights.cotangent.velocity = weights.lin
     base_weights.cotangent.new_velocity = new_velocity
     base_weights.cotangent.gravity = sum_vec(gradient.gravity)
     by_base = base_action_gradient(model, world, force, moment, base, base_held, base_weights.cotangent, dt)
     if writes_record:
-        put_base_weights(record, i, world, base_weights)
-        put_leg_weights(record, i, world, leg, weights.leg)
+        leg_record.put_base_weights(record, i, world, base_weights)
+        leg_record.put_leg_weights(record, i, world, leg, weights.leg)
     out = LegAdjoint()
     out.base.pos = adj.base.pos + sum_vec(gradient.pos)
     out.base.quat = quat_adj + by_base.quat + sum_quat(gradient.quat)
@@ -353,8 +331,8 @@ def reverse_leg(
 
 @wp.func
 def add_leg_constants(sums: ThreadSums, leg: int, law: LegLaw, gradient: LegGradient):
-    """Add a step's gradients by the parameters of a leg."""
+    """Add the gradient of a step by the parameters of a leg, friction coefficients included."""
     add_leg_parameters(sums, leg, gradient)
-    for row in range(2):  # one of the two coefficients
+    for row in range(2):  # the step depends on one of the two coefficients
         mu_row = leg * LEG_ROWS + wp.where(row == 0, int(MU_STATIC), int(MU_DYNAMIC))
         add_entry(sums, mu_row, wp.where(law.mode != SEPARATE and law.mu_row == mu_row, gradient.mu, real(0.0)))

@@ -1,4 +1,8 @@
-"""Record of a few steps for the reverse pass with a thread per leg, world and leg last for coalesced access."""
+"""Record of a few steps for the reverse pass with a thread per leg.
+
+`get_*` and `put_*` read and write the fields of one entry (a step) and world; indices of world and leg come last for
+coalesced access.
+"""
 
 import warp as wp
 
@@ -11,30 +15,30 @@ from .virtual_power import BaseCotangent
 
 wp.set_module_options({"enable_backward": False})
 
-# fields of the base: position, orientation, velocities as in `BaseState`, then
-BASE_INVERSE = wp.constant(13)  # three matrices
-BASE_WEIGHTS = wp.constant(40)  # five vectors
+# fields of the base: 0 to 12 are those of `BaseState`, then
+BASE_INVERSE = wp.constant(13)  # 3 x 9: `BaseInverse`
+BASE_WEIGHTS = wp.constant(40)  # 5 x 3: `BaseWeights`
 BASE_FIELDS = wp.constant(55)
 
 # fields of a leg
-ANGLES = wp.constant(0)
-RATES = wp.constant(3)
-SOLVE = wp.constant(6)  # inverse, to_lin, to_ang
-SLOPES = wp.constant(33)  # three vectors
-MODE = wp.constant(42)
+ANGLES = wp.constant(0)  # 3: [rad] lateral, outer, inner
+RATES = wp.constant(3)  # 3: [rad/s]
+SOLVE = wp.constant(6)  # 3 x 9: `LegSolve` without `free`
+SLOPES = wp.constant(33)  # 3 x 3: `MotorSlopes`
+MODE = wp.constant(42)  # this and the next two: as in `LegLaw`
 MU_ROW = wp.constant(43)
 MU = wp.constant(44)
-LEG_WEIGHTS = wp.constant(45)  # two vectors
-PUSH = wp.constant(51)  # impulse, point
-PAW = wp.constant(57)  # jacobian, to_lin, to_ang, by_velocity
-LAWS = wp.constant(93)  # four matrices
+LEG_WEIGHTS = wp.constant(45)  # 2 x 3: `LegWeights`
+PUSH = wp.constant(51)  # 2 x 3: `LegLaw.impulse`, `LegLaw.point`
+PAW = wp.constant(57)  # 4 x 9: `LegLaw.jacobian`, `to_lin`, `to_ang`, `by_velocity`
+LAWS = wp.constant(93)  # 4 x 9: `LawRow`
 FILTER = wp.constant(129)  # gradient by the angles that the filter reads, where a policy step begins
 LEG_FIELDS = wp.constant(132)
 
 
 @wp.struct
 class LegRecord:
-    """Entries of steps; the last of a few steps has only the state at its end."""
+    """Entries of successive steps, and a last entry for the state at the end of the last step."""
 
     base: wp.array3d(dtype=real)  # (entries, BASE_FIELDS, num_worlds)
     legs: wp.array4d(dtype=real)  # (entries, LEG_FIELDS, num_worlds, 4)
@@ -83,17 +87,17 @@ class LegLaw:
 
 @wp.struct
 class LawRow:
-    """A paw's row of the inverse of the system of the laws' multipliers, one 3x3 block per paw, in order of legs."""
+    """A paw's row of the inverse of A^T (12x12) of `step_adjoint`: a 3x3 block per paw."""
 
-    a: mat33
-    b: mat33
-    c: mat33
-    d: mat33
+    a: mat33  # FL
+    b: mat33  # FR
+    c: mat33  # BL
+    d: mat33  # BR
 
 
 @wp.func
 def get_vec(record: LegRecord, entry: int, field: int, world: int, leg: int) -> vec3:
-    """Return three fields of a leg."""
+    """Return three fields of a leg, from `field` on."""
     return vec3(
         record.legs[entry, field, world, leg],
         record.legs[entry, field + 1, world, leg],
@@ -103,14 +107,14 @@ def get_vec(record: LegRecord, entry: int, field: int, world: int, leg: int) -> 
 
 @wp.func
 def put_vec(record: LegRecord, entry: int, field: int, world: int, leg: int, v: vec3):
-    """Write three fields of a leg."""
+    """Write three fields of a leg, from `field` on."""
     for i in range(3):
         record.legs[entry, field + i, world, leg] = v[i]
 
 
 @wp.func
 def get_mat(record: LegRecord, entry: int, field: int, world: int, leg: int) -> mat33:
-    """Return nine fields of a leg."""
+    """Return nine fields of a leg, from `field` on, as a matrix (row by row)."""
     return wp.matrix_from_rows(
         get_vec(record, entry, field, world, leg),
         get_vec(record, entry, field + 3, world, leg),
@@ -120,7 +124,7 @@ def get_mat(record: LegRecord, entry: int, field: int, world: int, leg: int) -> 
 
 @wp.func
 def put_mat(record: LegRecord, entry: int, field: int, world: int, leg: int, m: mat33):
-    """Write nine fields of a leg."""
+    """Write a matrix row by row to nine fields of a leg, from `field` on."""
     for i in range(3):
         for j in range(3):
             record.legs[entry, field + 3 * i + j, world, leg] = m[i, j]
@@ -128,7 +132,7 @@ def put_mat(record: LegRecord, entry: int, field: int, world: int, leg: int, m: 
 
 @wp.func
 def get_base_mat(record: LegRecord, entry: int, field: int, world: int) -> mat33:
-    """Return nine fields of the base."""
+    """Return nine fields of the base, from `field` on, as a matrix (row by row)."""
     return wp.matrix_from_rows(
         row_vec3(record.base, entry, field, world),
         row_vec3(record.base, entry, field + 3, world),
@@ -138,7 +142,7 @@ def get_base_mat(record: LegRecord, entry: int, field: int, world: int) -> mat33
 
 @wp.func
 def put_base_mat(record: LegRecord, entry: int, field: int, world: int, m: mat33):
-    """Write nine fields of the base."""
+    """Write a matrix row by row to nine fields of the base, from `field` on."""
     for i in range(3):
         for j in range(3):
             record.base[entry, field + 3 * i + j, world] = m[i, j]
@@ -146,7 +150,7 @@ def put_base_mat(record: LegRecord, entry: int, field: int, world: int, m: mat33
 
 @wp.func
 def get_base(record: LegRecord, entry: int, world: int) -> BaseState:
-    """Return the base's state."""
+    """Return the base's state at the start of the step."""
     base = BaseState()
     base.pos = row_vec3(record.base, entry, 0, world)
     base.quat = row_quat(record.base, entry, 3, world)
@@ -157,7 +161,7 @@ def get_base(record: LegRecord, entry: int, world: int) -> BaseState:
 
 @wp.func
 def put_base(record: LegRecord, entry: int, world: int, base: BaseState):
-    """Write the base's state."""
+    """Write the base's state at the start of the step."""
     store_row_vec3(record.base, entry, 0, world, base.pos)
     for i in range(4):
         record.base[entry, 3 + i, world] = base.quat[i]
@@ -185,7 +189,7 @@ def put_inverse(record: LegRecord, entry: int, world: int, inverse: BaseInverse)
 
 @wp.func
 def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
-    """Return a leg's elimination, `free` left out."""
+    """Return a leg's elimination with `free` zero, which is not recorded."""
     solve = LegSolve()
     solve.inverse = get_mat(record, entry, SOLVE, world, leg)
     solve.to_lin = get_mat(record, entry, SOLVE + 9, world, leg)
@@ -195,7 +199,7 @@ def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
 
 @wp.func
 def put_solve(record: LegRecord, entry: int, world: int, leg: int, solve: LegSolve):
-    """Write a leg's elimination, `free` left out."""
+    """Write a leg's elimination without `free`."""
     put_mat(record, entry, SOLVE, world, leg, solve.inverse)
     put_mat(record, entry, SOLVE + 9, world, leg, solve.to_lin)
     put_mat(record, entry, SOLVE + 18, world, leg, solve.to_ang)
@@ -221,7 +225,7 @@ def put_slopes(record: LegRecord, entry: int, world: int, leg: int, slopes: Moto
 
 @wp.func
 def get_law(record: LegRecord, entry: int, world: int, leg: int) -> LegLaw:
-    """Return a paw's law; where it is separated all else is 0."""
+    """Return a paw's contact law; all fields but `mode` are 0 where it is SEPARATE."""
     law = LegLaw()
     law.mode = int(record.legs[entry, MODE, world, leg])
     if law.mode != SEPARATE:
@@ -238,7 +242,7 @@ def get_law(record: LegRecord, entry: int, world: int, leg: int) -> LegLaw:
 
 @wp.func
 def put_law(record: LegRecord, entry: int, world: int, leg: int, law: LegLaw):
-    """Write a paw's law."""
+    """Write a paw's contact law; only `mode` where it is SEPARATE."""
     record.legs[entry, MODE, world, leg] = real(law.mode)
     if law.mode != SEPARATE:
         record.legs[entry, MU_ROW, world, leg] = real(law.mu_row)
@@ -253,7 +257,7 @@ def put_law(record: LegRecord, entry: int, world: int, leg: int, law: LegLaw):
 
 @wp.func
 def get_law_row(record: LegRecord, entry: int, world: int, leg: int) -> LawRow:
-    """Return a row of the inverse of the multipliers' system; only where a paw of the world is not separated."""
+    """Return a paw's `LawRow`; it is defined only where a paw of the world touches."""
     row = LawRow()
     row.a = get_mat(record, entry, LAWS, world, leg)
     row.b = get_mat(record, entry, LAWS + 9, world, leg)
@@ -264,7 +268,7 @@ def get_law_row(record: LegRecord, entry: int, world: int, leg: int) -> LawRow:
 
 @wp.func
 def put_law_row(record: LegRecord, entry: int, world: int, leg: int, row: LawRow):
-    """Write a row of the inverse of the multipliers' system."""
+    """Write a paw's `LawRow`."""
     put_mat(record, entry, LAWS, world, leg, row.a)
     put_mat(record, entry, LAWS + 9, world, leg, row.b)
     put_mat(record, entry, LAWS + 18, world, leg, row.c)
@@ -273,7 +277,7 @@ def put_law_row(record: LegRecord, entry: int, world: int, leg: int, row: LawRow
 
 @wp.func
 def get_leg_weights(record: LegRecord, entry: int, world: int, leg: int) -> LegWeights:
-    """Return a leg's weights."""
+    """Return a leg's multipliers."""
     weights = LegWeights()
     weights.rates = get_vec(record, entry, LEG_WEIGHTS, world, leg)
     weights.law = get_vec(record, entry, LEG_WEIGHTS + 3, world, leg)
@@ -282,14 +286,14 @@ def get_leg_weights(record: LegRecord, entry: int, world: int, leg: int) -> LegW
 
 @wp.func
 def put_leg_weights(record: LegRecord, entry: int, world: int, leg: int, weights: LegWeights):
-    """Write a leg's weights."""
+    """Write a leg's multipliers."""
     put_vec(record, entry, LEG_WEIGHTS, world, leg, weights.rates)
     put_vec(record, entry, LEG_WEIGHTS + 3, world, leg, weights.law)
 
 
 @wp.func
 def get_base_weights(record: LegRecord, entry: int, world: int) -> BaseWeights:
-    """Return the base's weights."""
+    """Return the base's multipliers."""
     weights = BaseWeights()
     weights.lin = row_vec3(record.base, entry, BASE_WEIGHTS, world)
     weights.ang = row_vec3(record.base, entry, BASE_WEIGHTS + 3, world)
@@ -301,7 +305,7 @@ def get_base_weights(record: LegRecord, entry: int, world: int) -> BaseWeights:
 
 @wp.func
 def put_base_weights(record: LegRecord, entry: int, world: int, weights: BaseWeights):
-    """Write the base's weights."""
+    """Write the base's multipliers."""
     store_row_vec3(record.base, entry, BASE_WEIGHTS, world, weights.lin)
     store_row_vec3(record.base, entry, BASE_WEIGHTS + 3, world, weights.ang)
     store_row_vec3(record.base, entry, BASE_WEIGHTS + 6, world, weights.cotangent.velocity)

@@ -1,4 +1,7 @@
-"""A step recomputed, and the multipliers of its equations of motion and contact laws; see `step_adjoint`."""
+"""Recomputation of a step, and the multipliers of its equations of motion and contact laws; see `step_adjoint`.
+
+`legs` is scratch of the thread, (4,), legs FL, FR, BL, BR.
+"""
 
 import warp as wp
 
@@ -34,7 +37,7 @@ class StepRecord:
 
 @wp.struct
 class ReplayedStep:
-    """Indices of a step that is recomputed and run backwards, and the wrench on the base in it."""
+    """Indices of a step that is recomputed and differentiated, and the wrench on the base in it."""
 
     dt: real  # [s]
     world: int
@@ -48,30 +51,30 @@ class ReplayedStep:
 class LegReverse:
     """Scratch of a leg in the reverse pass: gradients by its motors (lateral, outer, inner), multipliers, contact."""
 
-    angles: vec3  # by the angles at the end of the step, then at its start
-    rates: vec3  # by the rates, likewise
+    angles: vec3  # by the angles at the end of the step; after `reverse_step` at its start
+    rates: vec3  # by the rates at the end of the step; after `reverse_step` at its start
     torque: vec3  # by the torques in the step
     virtual_rates: vec3  # multipliers of the motors' equations
     contact: PawContact  # of its paw at the solution
-    law: PawLaw  # of its paw's contact
-    multiplier: vec3  # of the paw's law; until `solve_laws` the gradient by its impulse
+    law: PawLaw  # of its paw at the solution
+    multiplier: vec3  # of the paw's law; before `solve_laws` the gradient by the paw's impulse
 
 
 @wp.struct
 class Multipliers:
-    """Multipliers m of the base's equations in a step, and the gradients y in M m = y; body axes."""
+    """Multipliers m of the base's equations in a step, and the gradients y in M m = y (M: mass matrix); body axes."""
 
     lin_cotangent: vec3  # y: by the base's linear velocity at the end of the step, contact laws included
-    ang_cotangent: vec3  # by its angular velocity
-    lin: vec3  # m
-    ang: vec3
+    ang_cotangent: vec3  # y: by the base's angular velocity
+    lin: vec3  # m of the linear equations
+    ang: vec3  # m of the angular equations
 
 
 @wp.func
 def solve_system(
     record: StepRecord, at: ReplayedStep, lin_cotangent: vec3, ang_cotangent: vec3, legs: wp.array(dtype=LegReverse)
 ) -> Multipliers:
-    """Solve M m = y; y: lin_cotangent, ang_cotangent, and each leg's `rates`. The motors' m goes to `virtual_rates`."""
+    """Return the base's m of M m = y and write the motors' m to `legs`; y: *_cotangent (base), `legs[k].rates`."""
     m = Multipliers()
     m.lin_cotangent = lin_cotangent
     m.ang_cotangent = ang_cotangent
@@ -142,7 +145,7 @@ def replay_step(
 
 @wp.func
 def solve_linear(a: wp.array2d(dtype=real), b: wp.array(dtype=real), n: int):
-    """Replace the first n of b by the solution x of a x = b; Gaussian elimination with row pivots, a is overwritten."""
+    """Write the solution x of a x = b (first n rows and columns) to b; Gaussian elimination with row pivots in a."""
     for col in range(n):
         best = col
         for row in range(col + 1, n):
@@ -173,7 +176,7 @@ def solve_linear(a: wp.array2d(dtype=real), b: wp.array(dtype=real), n: int):
 
 @wp.func
 def solve_laws(legs: wp.array(dtype=LegReverse)):
-    """Replace the gradients by the paws' impulses in `multiplier` by the multipliers of their laws."""
+    """Replace `multiplier` of all legs: from the gradient by the paw's impulse to the multiplier of its law, or 0."""
     matrix = wp.zeros(shape=(12, 12), dtype=real)
     vector = wp.zeros(shape=(12,), dtype=real)
     row = int(0)
@@ -214,7 +217,8 @@ def write_laws(
 ) -> bool:  # fmt: skip
     """Write the paws' contacts and laws at the solution, and the gradients by their impulses, to `legs`.
 
-    Returns whether any paw touches. first_impulse: as `Commands.impulse`; cotangent: gradient by the trajectory.
+    Returns whether any paw touches. m: from `solve_system`. first_impulse: as `Commands.impulse`. cotangent: gradient
+    by the trajectory.
     """
     world, i = at.world, at.entry
     base = record.base[world, i]
@@ -251,7 +255,7 @@ def write_laws(
 def add_laws(
     model: RobotModel, at: ReplayedStep, record: StepRecord, multipliers: Multipliers, legs: wp.array(dtype=LegReverse),
 ) -> Multipliers:  # fmt: skip
-    """Return the multipliers with the contact laws' part added, from the laws' own in `legs`; updates the legs' too."""
+    """Return `multipliers` plus the part of the contact laws, whose multipliers are in `legs`; updates `legs` too."""
     m = multipliers
     law_lin = vec3(real(0.0))
     law_ang = vec3(real(0.0))
@@ -280,10 +284,10 @@ def find_multipliers(
     cotangent: TrajectoryArrays, record: StepRecord, lin_cotangent: vec3, ang_cotangent: vec3,
     legs: wp.array(dtype=LegReverse),
 ) -> Multipliers:  # fmt: skip
-    """Return the multipliers of a step's equations, given the gradients by the velocities at its end.
+    """Return the multipliers of a step's equations (`step_adjoint`), given the gradients by the velocities at its end.
 
-    See `step_adjoint` for the equations. lin_cotangent, ang_cotangent: by the base's, body axes. legs: `rates` are
-    those by the motors' rates, to which the contact laws' part is added; multipliers, contacts and laws are written.
+    lin_cotangent, ang_cotangent: by the base's velocities, body axes. legs: `rates` are the gradients by the motors'
+    rates, to which the contact laws' part is added; multipliers, contacts and laws are written.
     """
     m = solve_system(record, at, lin_cotangent, ang_cotangent, legs)
     if write_laws(model, at, first_impulse, trajectory, record, m, cotangent, legs):
@@ -294,7 +298,7 @@ def find_multipliers(
 
 @wp.func
 def base_factors(at: ReplayedStep, record: StepRecord, m: Multipliers) -> BaseFactors:
-    """Return the base's constants in a step."""
+    """Return the base's constants in the recomputed step `at`; m: from `find_multipliers`."""
     base = record.base[at.world, at.entry]
     return make_base_factors(base, record.base[at.world, at.entry + 1], m.lin, m.ang, at.dt)
 
@@ -304,7 +308,7 @@ def leg_factors(
     at: ReplayedStep, k: int, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord,
     legs: wp.array(dtype=LegReverse),
 ) -> LegFactors:  # fmt: skip
-    """Return the constants of leg k in a step."""
+    """Return the constants of leg k (0 to 3) in the recomputed step `at`, after `find_multipliers`."""
     push = vec3(real(0.0))
     if cotangent.impulse.shape[0] > 0:
         push = cotangent.impulse[at.step, k, at.world]

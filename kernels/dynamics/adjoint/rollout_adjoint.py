@@ -27,16 +27,8 @@ from ..trajectory import (
     row_vec3,
     store_row_vec3,
 )
-from .command_adjoint import (
-    FilterAdjoint,
-    MotorAdjoint,
-    add_motor_constants,
-    add_offsets,
-    add_targets,
-    filter_adjoint_scalar,
-    filter_gradient,
-    motor_gradient,
-)
+from . import command_adjoint
+from .command_adjoint import FilterAdjoint, MotorAdjoint
 from .gradients import GRADIENT_ROWS, Gradients, add_com, add_filter
 from .multipliers import LegReverse, ReplayedStep, StepRecord, replay_step
 from .step_adjoint import reverse_step
@@ -47,7 +39,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def row_adjoint_scalar(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3, cotangent: BaseState) -> real:
-    """Return cotangent . (the base's state that a row holds, see `row_base`)."""
+    """Return cotangent . `row_base` (the base's state from the entries of a row); differentiated by `wp.grad`."""
     base = row_base(pos, orientation, com_lin, ang, com)
     return (
         wp.dot(cotangent.pos, base.pos)
@@ -61,14 +53,17 @@ def row_adjoint_scalar(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, c
 def store_adjoint_scalar(
     orientation: quat, lin: vec3, omega: vec3, com: vec3, lin_cotangent: vec3, ang_cotangent: vec3
 ) -> real:
-    """Return the cotangents . (the velocities that a row stores of a base state, see `store_row_base`)."""
+    """Return the cotangents . (velocities that `store_row_base` writes for a base state); differentiated by `wp.grad`.
+
+    orientation (xyzw), lin [m/s], omega [rad/s]: of the `BaseState`; com [m]: body frame; cotangents: world axes.
+    """
     ang = wp.quat_rotate(orientation, omega)
     return wp.dot(ang_cotangent, ang) + wp.dot(lin_cotangent, lin + wp.cross(ang, wp.quat_rotate(orientation, com)))
 
 
 @wp.struct
 class RowCotangent:
-    """Gradient by the base's entries of a row, in their order and axes, see `TrajectoryArrays`."""
+    """Gradient by the base's entries of a row, see `TrajectoryArrays`; world axes."""
 
     pos: vec3
     quat: quat
@@ -81,9 +76,9 @@ class RowCotangent:
 def load_row_base_adjoint(
     trajectory: TrajectoryArrays, model: RobotModel, row: int, world: int, adj: BaseState, later_com: vec3
 ) -> RowCotangent:
-    """Return the gradient by a row's entries from `adj`, that by the base's state read from it.
+    """Return the gradient by a row's entries; adj: gradient by the base's state that was read from the row.
 
-    later_com: gradient by the base's centre of mass of the rows after it.
+    later_com: gradient by the base's centre of mass, summed over the later rows.
     """
     com = base_com(model.table, world)
     pos, orientation, lin, ang, com_adj, _cotangent = wp.grad(row_adjoint_scalar)(
@@ -101,7 +96,7 @@ def load_row_base_adjoint(
 
 @wp.func
 def add_row_cotangent(into: RowCotangent, cotangent: TrajectoryArrays, row: int, world: int) -> RowCotangent:
-    """Return the gradient by a row's base entries, `into` plus the direct one in `cotangent`."""
+    """Return `into` plus the loss's own gradient by the base entries of a row, from `cotangent`."""
     s = into
     if cotangent.q.shape[0] > 0:
         s.pos += row_vec3(cotangent.q, row, 0, world)
@@ -122,7 +117,7 @@ class RowBaseAdjoint:
 
 @wp.func
 def store_row_base_adjoint(model: RobotModel, world: int, base: BaseState, cotangent: RowCotangent) -> RowBaseAdjoint:
-    """Return the gradient by the base's state that a row was written from, given that by the row's entries."""
+    """Return the gradient by the base's state `base` that a row was written from; cotangent: by the row's entries."""
     com = base_com(model.table, world)
     orientation, lin, ang, com_adj, _lin, _ang = wp.grad(store_adjoint_scalar)(
         base.quat, base.lin, base.ang, com, cotangent.lin, cotangent.ang
@@ -138,7 +133,7 @@ def store_row_base_adjoint(model: RobotModel, world: int, base: BaseState, cotan
 
 @wp.func
 def add_motor_rows(legs: wp.array(dtype=LegReverse), cotangent: TrajectoryArrays, row: int, world: int):
-    """Add the direct gradient by a row's angles and rates, in `cotangent`, to `legs`."""
+    """Add the loss's own gradient by the angles and rates of a row, from `cotangent`, to `legs`."""
     for k in range(legs.shape[0]):
         if cotangent.q.shape[0] > 0:
             legs[k].angles = legs[k].angles + row_vec3(cotangent.q, row, 7 + 3 * k, world)
@@ -148,13 +143,10 @@ def add_motor_rows(legs: wp.array(dtype=LegReverse), cotangent: TrajectoryArrays
 
 @wp.func
 def load_parts(
-    model: RobotModel,
-    actuation: Actuation,
-    world: int,
-    params: wp.array(dtype=LegParams),
+    model: RobotModel, actuation: Actuation, world: int, params: wp.array(dtype=LegParams),
     motors: wp.array(dtype=MotorParams),
-):
-    """Write the parameters of a world's legs and motors."""
+):  # fmt: skip
+    """Write the parameters of a world's legs to params (4,) and of its motors to motors (12,)."""
     for k in range(params.shape[0]):
         params[k] = load_leg(model, world, k)
     for i in range(motors.shape[0]):
@@ -163,7 +155,7 @@ def load_parts(
 
 @wp.func
 def replayed_step(commands: Commands, t: int, dt: real, world: int) -> ReplayedStep:
-    """Return the constants of the steps of policy step t; `step` and `entry` are to be set."""
+    """Return a `ReplayedStep` for the physics steps of policy step t, with `step` and `entry` still 0."""
     at = ReplayedStep()
     at.dt = dt
     at.world = world
@@ -177,7 +169,7 @@ def replay_row(
     model: RobotModel, params: wp.array(dtype=LegParams), policy_step: ReplayedStep, trajectory: TrajectoryArrays,
     row: int, every: int, com: vec3, record: StepRecord,
 ):  # fmt: skip
-    """Recompute the `every` steps after a row into the record."""
+    """Recompute the `every` steps after a row and write them to the record; com [m]: of the base, body frame."""
     at = policy_step
     record.base[at.world, 0] = load_row_base(trajectory, row, at.world, com)
     for k in range(record.angles.shape[2]):
@@ -191,7 +183,7 @@ def replay_row(
 
 @wp.func
 def add_wrench(gradients: Gradients, t: int, world: int, force: vec3, moment: vec3):
-    """Add to the gradient by the wrench on the base in a policy step."""
+    """Add force and moment to the gradient by the wrench on the base in policy step t."""
     store_row_vec3(gradients.wrench, t, 0, world, row_vec3(gradients.wrench, t, 0, world) + force)
     store_row_vec3(gradients.wrench, t, 3, world, row_vec3(gradients.wrench, t, 3, world) + moment)
 
@@ -201,14 +193,18 @@ def add_motor_adjoint(
     by_motor: MotorAdjoint, arrived: Arrival, at: ReplayedStep, motor: int, cotangent: TrajectoryArrays,
     gradients: Gradients, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
 ):  # fmt: skip
-    """Add the gradients by the inputs of a motor's torque in a step: targets, constants, angle and rate."""
+    """Add the gradients by the inputs of the torque of motor 0 to 11 in a step: targets, constants, angle, rate.
+
+    `legs[k].torque` and cotangent.torque are the gradient by the torque; angle and rate go to `legs`, constants to
+    `sums`, targets to `gradients`.
+    """
     k = motor / 3
     c = motor - 3 * k
     torque_cotangent = legs[k].torque[c]
     if cotangent.torque.shape[0] > 0:
         torque_cotangent += cotangent.torque[at.step, motor, at.world]
-    add_targets(gradients, arrived, motor, at.world, torque_cotangent * by_motor.target)
-    add_motor_constants(sums, sums, motor, torque_cotangent, by_motor)
+    command_adjoint.add_targets(gradients, arrived, motor, at.world, torque_cotangent * by_motor.target)
+    command_adjoint.add_motor_constants(sums, sums, motor, torque_cotangent, by_motor)
     angles = legs[k].angles
     rates = legs[k].rates
     angles[c] += torque_cotangent * by_motor.angle
@@ -219,20 +215,20 @@ def add_motor_adjoint(
 
 @wp.func
 def add_filter_adjoint(
-    by_motor: FilterAdjoint, t: int, k: int, world: int, gradients: Gradients, legs: wp.array(dtype=LegReverse),
+    by_filter: FilterAdjoint, t: int, k: int, world: int, gradients: Gradients, legs: wp.array(dtype=LegReverse),
     sums: wp.array(dtype=real),
 ):  # fmt: skip
-    """Add the gradients by the inputs of a leg's filter in policy step t: raw targets, constants, angles and rates."""
-    store_row_vec3(gradients.target, t, 3 * k, world, by_motor.target)
-    add_offsets(sums, k, by_motor.angles)
-    add_filter(sums, by_motor.constants)
-    legs[k].angles = legs[k].angles + by_motor.angles
-    legs[k].rates = legs[k].rates + by_motor.rates
+    """Add the gradients by the inputs of leg k's filter in policy step t: raw targets, constants, angles and rates."""
+    store_row_vec3(gradients.target, t, 3 * k, world, by_filter.target)
+    command_adjoint.add_offsets(sums, k, by_filter.angles)
+    add_filter(sums, by_filter.constants)
+    legs[k].angles = legs[k].angles + by_filter.angles
+    legs[k].rates = legs[k].rates + by_filter.rates
 
 
 @wp.func
 def store_base_entries(gradients: Gradients, world: int, entries: RowCotangent):
-    """Write the gradient by a row's base entries."""
+    """Write the gradient by a row's base entries to `gradients.q` and `gradients.qd`."""
     for i in range(3):
         gradients.q[i, world] = entries.pos[i]
         gradients.qd[i, world] = entries.lin[i]
@@ -243,7 +239,7 @@ def store_base_entries(gradients: Gradients, world: int, entries: RowCotangent):
 
 @wp.func
 def store_motor_entries(gradients: Gradients, world: int, leg: int, angles: vec3, rates: vec3):
-    """Write the gradient by a row's entries of one leg: angles and rates of its motors."""
+    """Write the gradient by a row's angles and rates of one leg's motors to `gradients.q` and `gradients.qd`."""
     for i in range(3):
         gradients.q[7 + 3 * leg + i, world] = angles[i]
         gradients.qd[6 + 3 * leg + i, world] = rates[i]
@@ -264,7 +260,11 @@ def reverse_kernel(
     record: StepRecord,
     gradients: Gradients,
 ):
-    """Add the gradient of a scalar to `gradients`, given its gradient by the trajectory; one thread per world."""
+    """Write the gradient of a scalar to `gradients`, given its gradient by the trajectory; one thread per world.
+
+    cotangent: gradient by the trajectory. filtered_target [rad]: (T, 12, num_worlds), from the forward pass, like
+    `trajectory`. record: scratch for `timing.every` steps. Worlds count from `settings.first`.
+    """
     world = settings.first + wp.tid()
     legs = wp.zeros(shape=(4,), dtype=LegReverse)
     sums = wp.zeros(shape=(GRADIENT_ROWS,), dtype=real)
@@ -295,7 +295,7 @@ def reverse_kernel(
             for i in range(motors.shape[0]):
                 angle = record.angles[world, at.entry, i / 3][i % 3]
                 rate = record.rates[world, at.entry, i / 3][i % 3]
-                by_motor = motor_gradient(
+                by_motor = command_adjoint.motor_gradient(
                     motors[i], delay, commands, filtered_target, timing, at.dt, at.step, i, world, angle, rate
                 )
                 add_motor_adjoint(by_motor, arrived, at, i, cotangent, gradients, legs, sums)
@@ -304,7 +304,7 @@ def reverse_kernel(
         )
         if row * timing.every == t * timing.substeps:
             for k in range(legs.shape[0]):
-                by_filter = filter_gradient(
+                by_filter = command_adjoint.filter_gradient(
                     commands, actuation, t, k, world, record.angles[world, 0, k], record.rates[world, 0, k], gradients
                 )
                 add_filter_adjoint(by_filter, t, k, world, gradients, legs, sums)
@@ -322,7 +322,7 @@ def adjoint_roots(
     factors: LegFactors, base: BaseFactors, base_cotangent: BaseCotangent, model: RobotModel, actuation: Actuation,
     trajectory: TrajectoryArrays, state: BaseState, world: int,
 ) -> real:  # fmt: skip
-    """Return the sum of all functions that the reverse pass differentiates; see `generate_adjoints`."""
+    """Return a sum of calls of all functions that the reverse pass differentiates; see `generate_adjoints`."""
     params = load_leg(model, world, 0)
     v = row_vec3(trajectory.q, 0, 0, world)
     q = row_quat(trajectory.q, 0, 3, world)
@@ -338,7 +338,7 @@ def adjoint_roots(
         + base_action(load_moments(model.table, BASE, world), v, v, v, v, q, v, v, base, base_cotangent, x)
         + rotation_adjoint_scalar(q, v, x, q)
         + motor_torque(x, x, x, load_world_motor(actuation, 0, world))
-        + filter_adjoint_scalar(v, v, v, load_filter(actuation.limits, world), v)
+        + command_adjoint.filter_adjoint_scalar(v, v, v, load_filter(actuation.limits, world), v)
         + row_adjoint_scalar(v, q, v, v, v, state)
         + store_adjoint_scalar(q, v, v, v, v, v)
     )
@@ -347,8 +347,8 @@ def adjoint_roots(
 def generate_adjoints(module: str) -> wp.Kernel:
     """Make Warp generate, in a module of kernels, the adjoints of all functions that the reverse pass differentiates.
 
-    `wp.grad` alone leaves out those of functions which something else called first. A kernel with a backward pass has
-    them all; it is never launched.
+    module: its `__name__`. `wp.grad` alone omits adjoints of functions that were called elsewhere before; a kernel with
+    a backward pass, never launched, includes them all.
     """
 
     @wp.kernel(enable_backward=True, module=wp.get_module(module))

@@ -1,7 +1,8 @@
-"""`rollout_adjoint` for GPUs, with four threads per world, one per leg; a span of rows at a time, last to first.
+"""`rollout_adjoint` for GPUs, with four threads per world, one per leg; spans of rows are processed last to first.
 
-Each span takes four launches: its steps are recomputed, all rows in parallel; run backwards one by one; and then twice
-visited in parallel for the gradients by parameters (`constants_adjoint`).
+Each span takes four launches: `replay_legs_kernel` recomputes its steps, all rows in parallel; `reverse_legs_kernel`
+runs backwards step by step; the two kernels of `constants_adjoint` add the gradients by parameters, all steps in
+parallel.
 """
 
 import warp as wp
@@ -24,39 +25,19 @@ from ..trajectory import (
     row_vec3,
     store_row_vec3,
 )
+from . import leg_record, rollout_adjoint
 from .command_adjoint import add_targets, filter_gradient, motor_gradient
 from .gradients import Gradients, add_com, add_filter, add_moments, add_vec3, thread_sums
 from .leg_adjoint import LegAdjoint, replay_leg, reverse_leg
-from .leg_record import (
-    ANGLES,
-    FILTER,
-    RATES,
-    LegRecord,
-    MotorSlopes,
-    get_base,
-    get_slopes,
-    get_vec,
-    put_base,
-    put_slopes,
-    put_vec,
-)
-from .rollout_adjoint import (
-    RowCotangent,
-    add_row_cotangent,
-    add_wrench,
-    generate_adjoints,
-    load_row_base_adjoint,
-    store_base_entries,
-    store_motor_entries,
-    store_row_base_adjoint,
-)
+from .leg_record import ANGLES, FILTER, RATES, LegRecord, MotorSlopes
+from .rollout_adjoint import RowCotangent, generate_adjoints
 
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
 @wp.struct
 class Span:
-    """Range of rows whose steps a launch takes."""
+    """Range of rows whose steps a launch processes."""
 
     begin: int  # first row
     end: int  # excluded
@@ -64,7 +45,7 @@ class Span:
 
 @wp.func
 def first_entry(timing: Timing, span: Span, row: int) -> int:
-    """Return the record's entry of the first step after a row; each row has `every` + 1, the last for its end."""
+    """Return the record's entry of the first step after a row; a row has `every` + 1 entries, the last for its end."""
     return (row - span.begin) * (timing.every + 1)
 
 
@@ -85,7 +66,7 @@ def replay_legs_kernel(
 ):
     """Recompute the steps after each row; launch over (rows of the span, count rounded up to a multiple of 8, 4).
 
-    Threads beyond the last world repeat it, and write the same bits.
+    count: number of worlds, from `settings.first` on. Threads beyond the last world repeat it and write the same bits.
     """
     offset, index, leg = wp.tid()
     world = settings.first + wp.min(index, count - 1)
@@ -96,9 +77,9 @@ def replay_legs_kernel(
     params = load_leg(model, world, leg)
     force = row_vec3(commands.wrench, t, 0, world)
     moment = row_vec3(commands.wrench, t, 3, world)
-    put_base(record, start_entry, world, load_row_base(trajectory, row, world, base_com(model.table, world)))
-    put_vec(record, start_entry, ANGLES, world, leg, row_vec3(trajectory.q, row, 7 + 3 * leg, world))
-    put_vec(record, start_entry, RATES, world, leg, row_vec3(trajectory.qd, row, 6 + 3 * leg, world))
+    leg_record.put_base(record, start_entry, world, load_row_base(trajectory, row, world, base_com(model.table, world)))
+    leg_record.put_vec(record, start_entry, ANGLES, world, leg, row_vec3(trajectory.q, row, 7 + 3 * leg, world))
+    leg_record.put_vec(record, start_entry, RATES, world, leg, row_vec3(trajectory.qd, row, 6 + 3 * leg, world))
     sync_lanes()
     motors = wp.zeros(shape=(3,), dtype=MotorParams)
     for c in range(motors.shape[0]):
@@ -111,8 +92,8 @@ def replay_legs_kernel(
             record,
         )  # fmt: skip
         sync_lanes()
-        angles = get_vec(record, start_entry + i, ANGLES, world, leg)
-        rates = get_vec(record, start_entry + i, RATES, world, leg)
+        angles = leg_record.get_vec(record, start_entry + i, ANGLES, world, leg)
+        rates = leg_record.get_vec(record, start_entry + i, RATES, world, leg)
         slopes = MotorSlopes()
         for c in range(motors.shape[0]):
             by_motor = motor_gradient(
@@ -122,12 +103,12 @@ def replay_legs_kernel(
             slopes.target[c] = by_motor.target
             slopes.angle[c] = by_motor.angle
             slopes.rate[c] = by_motor.rate
-        put_slopes(record, start_entry + i, world, leg, slopes)
+        leg_record.put_slopes(record, start_entry + i, world, leg, slopes)
 
 
 @wp.func
 def load_entries(gradients: Gradients, world: int) -> RowCotangent:
-    """Return the gradient by the base's entries of the row after a span."""
+    """Return the gradient by the base's entries of the row after a span, from `gradients.q` and `gradients.qd`."""
     entries = RowCotangent()
     entries.pos = vec3(gradients.q[0, world], gradients.q[1, world], gradients.q[2, world])
     entries.quat = quat(gradients.q[3, world], gradients.q[4, world], gradients.q[5, world], gradients.q[6, world])
@@ -138,7 +119,7 @@ def load_entries(gradients: Gradients, world: int) -> RowCotangent:
 
 @wp.func
 def load_motor_entries(gradients: Gradients, world: int, leg: int) -> LegAdjoint:
-    """Return the gradient by a leg's entries of the row after a span."""
+    """Return the gradient by a leg's angles and rates in the row after a span; all else is 0."""
     m = 3 * leg
     adj = LegAdjoint()
     adj.angles = vec3(gradients.q[7 + m, world], gradients.q[8 + m, world], gradients.q[9 + m, world])
@@ -151,7 +132,10 @@ def reverse_motors(
     old: LegAdjoint, slopes: MotorSlopes, arrived: Arrival, cotangent: TrajectoryArrays, step: int, leg: int,
     world: int, gradients: Gradients, writes: bool,
 ) -> LegAdjoint:  # fmt: skip
-    """Return the gradient with that by the motors' angles and rates; if it `writes`, add that by their targets."""
+    """Return `old` plus the gradient through the motors' torques by angles and rates of a leg in a physics step.
+
+    slopes: derivatives of the torques. writes: whether this thread adds the gradient by the targets to `gradients`.
+    """
     adj = old
     torque_cotangent = adj.torque
     if cotangent.torque.shape[0] > 0:
@@ -184,8 +168,9 @@ def reverse_legs_kernel(
 ):
     """Run the steps of a span backwards; launch over (count rounded up to a multiple of 8, 4).
 
-    gradients.q and qd hold the gradient by the row after the span, and then that by its first row. Of those by
-    parameters the base's and the filter's are added. Threads beyond the last world repeat it, and write nothing.
+    gradients.q and gradients.qd hold the gradient by the row after the span, and are replaced by that by its first row.
+    Of the gradients by parameters those of base, gravity and filter are added. count: number of worlds, from
+    `settings.first` on; threads beyond the last world repeat it and write nothing.
     """
     index, leg = wp.tid()
     world = settings.first + wp.min(index, count - 1)
@@ -203,7 +188,9 @@ def reverse_legs_kernel(
         t = first / timing.substeps
         force = row_vec3(commands.wrench, t, 0, world)
         moment = row_vec3(commands.wrench, t, 3, world)
-        end = store_row_base_adjoint(model, world, get_base(record, start_entry + timing.every, world), entries)
+        end = rollout_adjoint.store_row_base_adjoint(
+            model, world, leg_record.get_base(record, start_entry + timing.every, world), entries
+        )
         adj.base = end.base
         adj.force = vec3(real(0.0))
         adj.moment = vec3(real(0.0))
@@ -215,22 +202,25 @@ def reverse_legs_kernel(
                 index < count,
             )  # fmt: skip
             arrived = arrival(step, timing.substeps, delay)
-            slopes = get_slopes(record, start_entry + i, world, leg)
+            slopes = leg_record.get_slopes(record, start_entry + i, world, leg)
             adj = reverse_motors(adj, slopes, arrived, cotangent, step, leg, world, gradients, index < count)
-        entries = add_row_cotangent(
-            load_row_base_adjoint(trajectory, model, row, world, adj.base, end.com), cotangent, row, world
+        entries = rollout_adjoint.add_row_cotangent(
+            rollout_adjoint.load_row_base_adjoint(trajectory, model, row, world, adj.base, end.com),
+            cotangent,
+            row,
+            world,
         )
         if index < count:
             if leg == 0:
-                add_wrench(gradients, t, world, adj.force, adj.moment)
+                rollout_adjoint.add_wrench(gradients, t, world, adj.force, adj.moment)
         if first == t * timing.substeps:
             by_filter = filter_gradient(
-                commands, actuation, t, leg, world, get_vec(record, start_entry, ANGLES, world, leg),
-                get_vec(record, start_entry, RATES, world, leg), gradients,
+                commands, actuation, t, leg, world, leg_record.get_vec(record, start_entry, ANGLES, world, leg),
+                leg_record.get_vec(record, start_entry, RATES, world, leg), gradients,
             )  # fmt: skip
             add_filter(shared_sums, by_filter.constants)
             if index < count:
-                put_vec(record, start_entry, FILTER, world, leg, by_filter.angles)
+                leg_record.put_vec(record, start_entry, FILTER, world, leg, by_filter.angles)
                 store_row_vec3(gradients.target, t, 3 * leg, world, by_filter.target)
             adj.angles += by_filter.angles
             adj.rates += by_filter.rates
@@ -239,9 +229,9 @@ def reverse_legs_kernel(
         if cotangent.qd.shape[0] > 0:
             adj.rates += row_vec3(cotangent.qd, row, 6 + 3 * leg, world)
     if index < count:
-        store_motor_entries(gradients, world, leg, adj.angles, adj.rates)
+        rollout_adjoint.store_motor_entries(gradients, world, leg, adj.angles, adj.rates)
         if leg == 0:
-            store_base_entries(gradients, world, entries)
+            rollout_adjoint.store_base_entries(gradients, world, entries)
             add_moments(leg_sums, BASE, adj.body)
             add_com(leg_sums, model.table[BASE, world], base_com(model.table, world), adj.com + entries.com)
             add_vec3(leg_sums, GRAVITY, adj.gravity)

@@ -1,14 +1,14 @@
-"""One time step of one world, backwards.
+"""Reverse pass of one time step of one world.
 
 The step solves M (v' - v) = dt f + J^T p for the velocities v' at its end, with impulses p that satisfy the contact law
-R(p, v') = 0 in modes (separated, sticking, sliding) that are held. For a gradient y of v' and z of p:
+R(p, v') = 0 in fixed modes (separated, sticking, sliding). For a gradient y by v' and z by p, the multipliers l, m are
 
     A^T l = -(z + J M^-1 y),   A = dR/dp + dR/dv' J M^-1 J^T     (implicit function theorem)
     m = M^-1 (y + J^T (dR/dv')^T l)
 
 and the gradient with respect to all else, the old velocities aside, is that of m . (dt f + J^T p - M (v' - v)) + l . R
-with v', p, m and l held (`virtual_power`). Where a mode changes the motion has a kink; the gradient is that of the mode
-which the forward pass found.
+at constant v', p, m and l (`virtual_power`). Where a mode changes, the motion has a kink; the gradient is that of the
+mode in the forward pass.
 """
 
 import warp as wp
@@ -20,13 +20,7 @@ from ..contact import SEPARATE
 from ..step import LegParams, RobotModel
 from ..trajectory import TrajectoryArrays
 from .action_gradients import LegGradient, base_action_gradient, leg_action_gradient
-from .gradients import (
-    add_com,
-    add_entry,
-    add_leg_parameters,
-    add_moments,
-    add_vec3,
-)
+from .gradients import add_com, add_entry, add_leg_parameters, add_moments, add_vec3
 from .multipliers import LegReverse, ReplayedStep, StepRecord, base_factors, find_multipliers, leg_factors
 from .virtual_power import BaseCotangent, rotation_adjoint_scalar
 
@@ -46,7 +40,10 @@ class StepAdjoint:
 def add_leg_gradient(
     gradient: LegGradient, k: int, dt: real, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real)
 ):
-    """Add a leg's gradient by its motors to `legs`, by its parameters to `sums`, and write that by its torques."""
+    """Add leg k's gradient by its motors to `legs` and by its parameters to `sums`; write that by its torques.
+
+    dt [s]: of the step. legs (4,): scratch. sums (GRADIENT_ROWS,): gradient by parameters.
+    """
     add_leg_parameters(sums, k, gradient)
     if legs[k].law.mode != SEPARATE:
         add_entry(sums, legs[k].law.mu_row, gradient.mu)
@@ -61,11 +58,11 @@ def reverse_step(
     trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord, adj: BaseState,
     legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
 ) -> StepAdjoint:  # fmt: skip
-    """Run a step backwards: from the gradient by the state at its end to that by the state at its start.
+    """Return the gradient by the base's state at the start of a step; adj: that by its state at the end.
 
-    adj: gradient by the base's state at the end. legs (4,): `angles` and `rates` are replaced in place, `torque` is
-    written, the rest overwritten. first_impulse: as `Commands.impulse`. sums (GRADIENT_ROWS,): gradient by parameters,
-    added to. trajectory, cotangent: of the rollout, and the gradient by it. record: the step as `replay_step` made it.
+    legs (4,): gradients by `angles` and `rates` at the end are replaced by those at the start, `torque` is written, the
+    rest is scratch. sums (GRADIENT_ROWS,): gradient by parameters, added to. first_impulse: as `Commands.impulse`.
+    trajectory, cotangent: of the rollout, and the gradient by it. record: written by `replay_step`.
     """
     dt, world = at.dt, at.world
     base = record.base[world, at.entry]

@@ -2,9 +2,9 @@
 
     solve_kernel (not recorded) -> power_kernel -> integrate_kernel
 
-Backwards, `integrate_kernel` hands the gradient by the velocities at the end of the step to `find_multipliers`, and
-`power_kernel` is the scalar whose derivatives by all that the step read are those of the step: the virtual power of its
-equations of motion, weighted with these multipliers (see `step_adjoint`).
+In the reverse pass, `integrate_kernel` passes the gradient by the velocities at the end of the step to
+`find_multipliers`. `power_kernel` computes the virtual power of the equations of motion, weighted with these
+multipliers: its derivatives by the inputs of the step are the gradient of the step (see `step_adjoint`).
 """
 
 import warp as wp
@@ -30,8 +30,8 @@ class SolvedStep:
     trajectory: TrajectoryArrays  # torques, impulses and pressed stops, shape (1, ..., num_worlds)
     old_impulse: wp.array2d(dtype=vec3)  # [N s] on each paw in the step before, world axes
     lin: wp.array(dtype=vec3)  # [m/s] of the base at the end of the step, in the body axes of its start
-    ang: wp.array(dtype=vec3)  # [rad/s]
-    rates: wp.array2d(dtype=vec3)  # [rad/s] of the motors
+    ang: wp.array(dtype=vec3)  # [rad/s] of the base, likewise
+    rates: wp.array2d(dtype=vec3)  # [rad/s] of the motors at the end of the step
     base: wp.array(dtype=BaseFactors)
     cotangent: wp.array(dtype=BaseCotangent)
     ang_cotangent: wp.array(dtype=vec3)  # gradient by the base's angular velocity at the start
@@ -53,7 +53,7 @@ def solve_kernel(
     # out
     solved: SolvedStep,
 ):
-    """Solve every world's contacts and stops; one thread per world."""
+    """Write the solution of a step of every world to `solved` and `work`, without blocks; torques: drive.joint_f."""
     world = wp.tid()
     base = load_base(joint_q, joint_qd, base_com(model.table, world), world)
     legs = wp.zeros(shape=(4,), dtype=LegStep)
@@ -93,7 +93,7 @@ def power_kernel(
     # out
     power: wp.array2d(dtype=real),
 ):
-    """Write the virtual power of each leg (4, num_worlds), the base's with leg 0's; one thread per (leg, world)."""
+    """Write the virtual power of each leg to power (4, num_worlds), leg 0 with the base; thread per (leg, world)."""
     k, world = wp.tid()
     com = base_com(model.table, world)
     base = load_base(joint_q, joint_qd, com, world)
@@ -137,7 +137,7 @@ def end_velocities(
     joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), solved: SolvedStep, record: StepRecord,
     power: wp.array2d(dtype=real), world: int,
 ) -> EndVelocities:  # fmt: skip
-    """Return the velocities that were solved for."""
+    """Return the velocities in `solved`; the other arguments are for `adj_end_velocities`, its reverse pass."""
     end = EndVelocities()
     end.lin = solved.lin[world]
     end.ang = solved.ang[world]
@@ -152,7 +152,7 @@ def adj_end_velocities(
     joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), solved: SolvedStep, record: StepRecord,
     power: wp.array2d(dtype=real), world: int, adj_ret: EndVelocities,
 ):  # fmt: skip
-    """Write the multipliers that `power_kernel` reads to `solved`, and set the gradient by its `power` to 1."""
+    """Write multipliers for `power_kernel` to `solved`, add 1 to the gradient by `power`; adj_ret: by the result."""
     params = wp.zeros(shape=(4,), dtype=LegParams)
     legs = wp.zeros(shape=(4,), dtype=LegReverse)
     wrench = base_wrench(joint_f, body_f, world)
@@ -199,7 +199,7 @@ def integrate_kernel(
     joint_q_out: wp.array(dtype=real),
     joint_qd_out: wp.array(dtype=real),
 ):
-    """Move the coordinates with the velocities at the end of the step; one thread per world."""
+    """Write the coordinates after a step dt [s] at the velocities of its end; one thread per world."""
     world = wp.tid()
     com = base_com(model.table, world)
     base = load_base(joint_q, joint_qd, com, world)

@@ -44,8 +44,8 @@ from ..leg_dynamics import LegMasses, PawKinematics, leg_pose, paw_kinematics
 class BaseFactors:
     """Constants of the base in the scalar: multipliers, accelerations, new velocities; body axes of its start."""
 
-    virtual_lin: vec3  # multipliers of the base's equations
-    virtual_ang: vec3
+    virtual_lin: vec3  # multipliers of the base's linear equations
+    virtual_ang: vec3  # multipliers of the base's angular equations
     lin_acc: vec3  # [m/s^2] over the step, contact included
     ang_acc: vec3  # [rad/s^2]
     lin: vec3  # [m/s] at the end of the step
@@ -68,13 +68,13 @@ class LegFactors:
 
 @wp.struct
 class FrameMotion:
-    """Motion and virtual velocity of a link's frame, in its own axes."""
+    """Motion and virtual velocity of a link's frame, in its own axes; symbols as in the module's docstring."""
 
-    virtual_lin: vec3
-    virtual_ang: vec3
-    acc: vec3  # [m/s^2] of its origin, less gravity
-    ang: vec3  # [rad/s]
-    ang_acc: vec3  # [rad/s^2]
+    virtual_lin: vec3  # v*
+    virtual_ang: vec3  # w*
+    acc: vec3  # a [m/s^2], of its origin, less gravity
+    ang: vec3  # w [rad/s]
+    ang_acc: vec3  # w' [rad/s^2]
 
 
 @wp.func
@@ -91,7 +91,7 @@ def add(a: FrameMotion, b: FrameMotion) -> FrameMotion:
 
 @wp.func
 def add(a: MassMoments, b: MassMoments) -> MassMoments:  # noqa: F811
-    """Return a + b."""
+    """Return a + b; Warp calls it for `wp.adjoint[body] += ...`."""
     c = MassMoments()
     c.mass = a.mass + b.mass
     c.first = a.first + b.first
@@ -101,7 +101,7 @@ def add(a: MassMoments, b: MassMoments) -> MassMoments:  # noqa: F811
 
 @wp.func
 def second_moment_product(a: vec3, b: vec3) -> vec6:
-    """Return sym(a, b), the derivative of a^T S b by packed second moments S (xx yy zz xy xz yz)."""
+    """Return sym(a, b), the gradient of a^T S b by packed second moments S (xx yy zz xy xz yz)."""
     return vec6(
         a[0] * b[0], a[1] * b[1], a[2] * b[2],
         a[0] * b[1] + a[1] * b[0], a[0] * b[2] + a[2] * b[0], a[1] * b[2] + a[2] * b[1],
@@ -110,7 +110,7 @@ def second_moment_product(a: vec3, b: vec3) -> vec6:
 
 @wp.func
 def inertia_power(body: MassMoments, frame: FrameMotion) -> real:
-    """Return P of a rigid body, see the module; body: mass moments about the frame's origin, in its axes."""
+    """Return P, the virtual power of the inertia of a link, see the module; body: moments in the link's frame."""
     acc, ang, ang_acc = frame.acc, frame.ang, frame.ang_acc
     force = body.mass * acc + wp.cross(ang_acc, body.first) + wp.cross(ang, wp.cross(ang, body.first))
     moment = (
@@ -123,7 +123,7 @@ def inertia_power(body: MassMoments, frame: FrameMotion) -> real:
 
 @wp.func_grad(inertia_power)
 def adj_inertia_power(body: MassMoments, frame: FrameMotion, adj_ret: real):
-    """Add `adj_ret` times the partial derivatives of `inertia_power`; u, h as in the docstring of the module."""
+    """Add adj_ret times the partial derivatives of `inertia_power` to `wp.adjoint`; u, h: see the module."""
     acc, ang, ang_acc = frame.acc, frame.ang, frame.ang_acc
     lin_v, ang_v, first = frame.virtual_lin, frame.virtual_ang, body.first
     u = wp.cross(ang, first)
@@ -153,7 +153,7 @@ def adj_inertia_power(body: MassMoments, frame: FrameMotion, adj_ret: real):
 
 @wp.func
 def planar(v: vec2) -> vec3:
-    """Return (x, 0, z)."""
+    """Return the vector (v[0], 0, v[1]) of a point (x, z) in the five-bar's plane."""
     return vec3(v[0], real(0.0), v[1])
 
 
@@ -175,9 +175,9 @@ def link_motion(
 ) -> FrameMotion:
     """Return the motion of a link's frame in the housing, in the link's axes.
 
-    origin [m], vel [m/s], acc [m/s^2], virtual: of the link frame's origin, in housing axes; the last three in the
-    five-bar's plane (x, z). about_y: rate [rad/s], acceleration [rad/s^2] and virtual rate about y. cosine, sine: of
-    the link's angle about y.
+    origin [m], vel [m/s], acc [m/s^2], virtual velocity: of the link frame's origin relative to the housing, in housing
+    axes; the last three in the five-bar's plane, (x, z). about_y: the link's rate [rad/s], acceleration [rad/s^2] and
+    virtual rate about +y. cosine, sine: of the link's rotation about +y.
     """
     w = housing.ang
     link = FrameMotion()
@@ -203,7 +203,7 @@ def adj_link_motion(
     housing: FrameMotion, origin: vec3, vel: vec2, acc: vec2, virtual: vec2, about_y: vec3, cosine: real, sine: real,
     adj_ret: FrameMotion,
 ):  # fmt: skip
-    """Add the gradient of `link_motion`, given `adj_ret` by its result; adj_*: gradients in housing axes."""
+    """Add the gradient of `link_motion` to `wp.adjoint`; adj_ret: by its result; adj_* locals: in housing axes."""
     w = housing.ang
     # in housing axes
     relative_vel = wp.cross(w, origin) + real(2.0) * planar(vel)
@@ -252,7 +252,7 @@ def adj_link_motion(
 def housing_motion(
     geo: LegGeometry, rate: real, omega: vec3, g: vec3, c: real, s: real, base: BaseFactors, leg: LegFactors
 ) -> FrameMotion:
-    """Return the motion of a leg's housing frame.
+    """Return the motion of a leg's housing frame, in housing axes.
 
     rate [rad/s]: of the lateral motor. omega [rad/s], g [m/s^2]: of the base, body axes. c, s: cosine and sine of the
     housing's rotation about body x.
@@ -277,7 +277,7 @@ def housing_motion(
 def passive_power(
     joints: JointParams, loop: FiveBar, front: real, rates: vec3, stop_rates: StopRates, leg: LegFactors, dt: real
 ) -> real:
-    """Return the virtual power of friction, damping, pressed stops and the motors' armature, see `joint_forces`."""
+    """Return the virtual power of friction, damping, pressed stops and armature; arguments as in `joint_forces`."""
     passive = joint_forces(joints, loop, front, rates, stop_rates, leg.pressed, dt)
     implicit = passive.inertia * leg.acc + wp.cw_mul(joints.armature, leg.acc)
     return wp.dot(leg.virtual_rates, passive.torque - implicit)
@@ -290,7 +290,7 @@ def contact_action(
 ) -> real:  # fmt: skip
     """Return a paw's part of the scalar: impulse . virtual velocity + multiplier . law + cotangent . impulse.
 
-    pos [m], orientation (xyzw): of the base, world; paw: body axes.
+    mu: friction coefficient. pos [m], orientation (xyzw): of the base, world, at the start of the step dt [s].
     """
     centre = pos + wp.quat_rotate(orientation, paw.position)
     normal = wp.quat_rotate_inv(orientation, floor_normal(ground, centre))
@@ -375,11 +375,11 @@ def leg_action(
 
 @wp.struct
 class BaseCotangent:
-    """Cotangents of further quantities that depend on the base's orientation and velocity."""
+    """Gradients by further quantities that depend on the base's orientation and velocity, for `base_action`."""
 
-    velocity: vec3  # of its linear velocity at the start of the step, body axes
-    new_velocity: vec3  # of its linear velocity at the end of the step, world axes
-    gravity: vec3  # of gravity in body axes
+    velocity: vec3  # by its linear velocity at the start of the step, body axes
+    new_velocity: vec3  # by its linear velocity at the end of the step, world axes
+    gravity: vec3  # by gravity in body axes
 
 
 @wp.func
@@ -412,5 +412,5 @@ def base_action(
 
 @wp.func
 def rotation_adjoint_scalar(orientation: quat, ang: vec3, dt: real, cotangent: quat) -> real:
-    """Return cotangent . (orientation (xyzw) after dt [s] at an angular velocity [rad/s] in body axes)."""
+    """Return cotangent . (orientation (xyzw) after dt [s] at ang [rad/s], body axes); differentiated by `wp.grad`."""
     return wp.dot(cotangent, wp.normalize(orientation * exp_rotation(dt * ang)))

@@ -1,10 +1,11 @@
 """`advance` for GPUs: four threads per world, one per leg, which exchange sums for the base and the contacts.
 
 A thread holds one leg and a copy of the base; the base's equations are sums over the four threads. The contact law is
-that of `contact`; here all paws propose their next impulse at once, until none would change its contact velocity by
-more than the tolerance. All take it, since paws are coupled through the heavy base only; should the largest change not
-shrink so, the paw that would change most takes its own alone from then on. A step whose set of stops turns out
-wrong (see `world_step`) is repeated by its world, while the others of a warp continue.
+the one in `contact`. In each round all paws compute their next impulse at once, and all apply it, which converges
+because paws are coupled through the heavy base only; rounds end when no contact velocity changes by more than the
+tolerance. If the largest change stops shrinking, each later round applies only the impulse of the paw that changes
+most. A step whose set of pressed stops proves wrong (see `world_step`) is repeated by its world, while the other
+worlds of a warp continue.
 """
 
 import warp as wp
@@ -43,37 +44,35 @@ from ..step import (
     paw_contact,
 )
 
-# largest change of a contact velocity, by that of the time before, with which all paws go on taking theirs at once
-SHRINKING = wp.constant(real(0.9))
-# [m^2/s^2] square of a change that no proposal reaches
-ANY_CHANGE = wp.constant(real(1.0e12))
+SHRINKING = wp.constant(real(0.9))  # largest ratio of successive changes for which all paws move at once
+ANY_CHANGE = wp.constant(real(1.0e12))  # [m^2/s^2] square of the change before the first round: larger than any
 
-# division and roots are rounded to 2 units in the last place, as a third of the code
+# fast_math: division and roots are exact to 2 units in the last place and take a third of the code
 wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 
 @wp.struct
 class LegState:
-    """State of a thread between steps: a leg, and a copy of the base."""
+    """State of a thread between steps: its leg, and a copy of the base; vectors are lateral, outer, inner."""
 
     base: BaseState
     angles: vec3  # [rad] of its leg's motors
     rates: vec3  # [rad/s]
     torque: vec3  # [N m] of its motors in the last step
-    impulse: vec3  # [N s] of its paw, world frame
+    impulse: vec3  # [N s] on its paw in the last step, world axes
     peak_sq: real  # [N^2 s^2] largest impulse on the paw, squared
     total_sq: real  # [N^2 s^2] largest sum of the impulses, squared
-    residual: real  # [m/s] of the contact iteration, largest
-    rounds: int  # of the contact iteration, most of a step
-    step: int  # steps made in this launch
-    sets: int  # sets of pressed stops tried for the present step without agreement
-    pressed: int  # the leg's set in the next attempt
-    used: int  # the leg's set of pressed stops in the last step
+    residual: real  # [m/s] largest of the contact iteration
+    rounds: int  # largest number of rounds of the contact iteration in a step
+    step: int  # steps completed in this launch
+    sets: int  # sets of pressed stops tried for the present step and rejected
+    pressed: int  # the leg's set of pressed stops in the next attempt, see `stops`
+    used: int  # the leg's set of pressed stops in the last completed step
 
 
 @wp.struct
 class PawSolution:
-    """The contact problem's solution: one paw's impulse, and the base's change of velocity."""
+    """The contact problem's solution: the thread's paw impulse, and the base's change of velocity; body axes."""
 
     impulse: vec3  # [N s] on the paw, body axes
     lin: vec3  # change of the base's linear velocity [m/s]
@@ -84,9 +83,9 @@ class PawSolution:
 
 @wp.func
 def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_rounds: int, tolerance: real) -> PawSolution:
-    """Solve the contact problem by simultaneous proposals of all paws, see the module; body axes.
+    """Return the solution of a world's contact problem, iterated for all paws at once, see the module; body axes.
 
-    blocks: whether any world has a block. leg: this thread's. tolerance [m/s].
+    c: contact of this thread's leg 0 to 3. blocks: whether any world has a block. tolerance [m/s]: see the module.
     """
     s = PawSolution()
     s.impulse = c.impulse
@@ -136,7 +135,7 @@ class StopAttempt:
 
 @wp.func
 def stop_attempt(model: RobotModel, world: int, leg: int, old: LegState, dt: real) -> StopAttempt:
-    """Return the leg's stops for the present attempt at a step of dt [s]."""
+    """Return the leg's stops for the present attempt at a step of dt [s] from the state `old`."""
     attempt = StopAttempt()
     attempt.pressed = old.pressed
     if attempt.pressed != 0 or old.sets == 0:
@@ -152,7 +151,10 @@ def stop_attempt(model: RobotModel, world: int, leg: int, old: LegState, dt: rea
 def required_stops(
     model: RobotModel, settings: StepSettings, world: int, leg: int, angles: vec3, rates: vec3, pressed: int, sets: int
 ) -> int:
-    """Return the set required by `rates` [rad/s] at the end of the step; reloads the limits, to save registers."""
+    """Return the set of stops to try next if the attempt with set `pressed` ends at `rates` [rad/s].
+
+    angles [rad]: at the start of the step. sets: number of sets tried. The limits are reloaded to save registers.
+    """
     limits = load_stops(model.table, leg, world)
     required = int(0)
     if pressed != 0 or beyond_stops(limits, angles + settings.dt * rates):
@@ -166,7 +168,10 @@ def completed_step(
     old: LegState, base: BaseState, angles: vec3, rates: vec3, torque: vec3, solved: PawSolution, total: vec3,
     pressed: int,
 ) -> LegState:  # fmt: skip
-    """Return the state after a step; total [N s]: sum of the paws' impulses."""
+    """Return the state after a completed step, from the state `old` before it and the results of the step.
+
+    base, angles [rad], rates [rad/s]: at the end. total [N s]: sum of the paws' impulses. pressed: the leg's set.
+    """
     new = old
     new.base = base
     new.angles = angles
@@ -186,7 +191,10 @@ def completed_step(
 
 @wp.func
 def next_attempt(old: LegState, pressed: int, required: int, changes: bool) -> LegState:
-    """Return the state with the next set to try for the same step; changes: this leg changes, if only one may."""
+    """Return the state `old` with the next set to try for the same step: the set `required`, or one change toward it.
+
+    pressed: the set just tried. changes: whether this leg is the one to change where only one may (`one_by_one`).
+    """
     new = old
     new.sets = old.sets + 1
     new.pressed = pressed
@@ -202,9 +210,9 @@ def advance_leg(
     model: RobotModel, settings: StepSettings, drive: Drive, params: LegParams, motors: LegDrive, world: int, leg: int,
     old: LegState, writes: bool,
 ) -> LegState:  # fmt: skip
-    """Return the thread's state after a step, or the old one with another set of stops to try for the same step.
+    """Return the thread's state after a step, or `old` with another set of stops to try for the same step.
 
-    A world that has made all its steps keeps its state. params, motors: of this thread's leg. writes: whether this
+    A world that has completed all its steps keeps its state. params, motors: of this thread's leg. writes: whether this
     thread moves its world's block.
     """
     dt = settings.dt
@@ -270,9 +278,7 @@ def advance_legs_kernel(
 ):
     """Advance every world by `settings.substeps` steps; launch over (count rounded up to a multiple of 8, 4).
 
-    count: worlds, from `settings.first` on.
-
-    Does what `advance_kernel` does, to the contact tolerance.
+    count: number of worlds, from `settings.first` on. Equals `advance_kernel` up to the contact tolerance.
     """
     index, leg = wp.tid()
     world = settings.first + wp.min(index, count - 1)  # threads beyond the last world repeat it, and write nothing

@@ -40,10 +40,7 @@ def rollout_legs_kernel(
     filtered_target: wp.array3d(dtype=real),
     trajectory: TrajectoryArrays,
 ):
-    """Do what `rollout_kernel` does, to the contact tolerance; launch over (count rounded up to a multiple of 8, 4).
-
-    count: worlds, from `settings.first` on.
-    """
+    """Run a rollout as `rollout_kernel`; launch over (count, the number of worlds, rounded up to 8 n; 4)."""
     index, leg = wp.tid()
     world = settings.first + wp.min(index, count - 1)  # threads beyond the last world repeat it
     com = base_com(model.table, world)

@@ -1,6 +1,6 @@
-"""The kernel that advances every world by several steps in one launch, with one thread per world: the CPU's.
+"""The kernel for CPUs that advances every world by several steps in one launch, with one thread per world.
 
-On one CPU thread `advance_legs`, with a thread per leg, takes 4.1 to 4.8 times as long per policy step (64 and 512
+On one CPU core `advance_legs`, with a thread per leg, takes 4.1 to 4.8 times as long per policy step (64 and 512
 worlds, standing and jumping).
 """
 
@@ -25,9 +25,9 @@ def advance_once(
 ) -> BaseState:  # fmt: skip
     """Advance one world by `settings.dt`; overwrites `legs` and `contacts`, returns the new base state.
 
-    step: of the launch, counted from 0; the last one writes torques and paw forces to `work`. legs, contacts: scratch
-    of the thread, shape (4,), see `solve_step`; of the legs the motors' angles and rates are input, and then those at
-    the end of the step. A block moves in `model.ground`; `work` gets the paws' impulses and the largest values.
+    step: of the launch, from 0; the last one writes torques and paw forces to `work`. legs, contacts (4,): the thread's
+    scratch, see `solve_step`; `angles` and `rates` of the legs are input, and are replaced by those at the end of the
+    step. Also moves the world's block in `model.ground` and updates impulses and peak values in `work`.
     """
     dt = settings.dt
     last = step == settings.substeps - 1
@@ -58,7 +58,10 @@ def record_contacts(
     work: Workspace, world: int, base: BaseState, contacts: wp.array(dtype=PawContact), solved: ContactState, dt: real,
     last: bool, legs: wp.array(dtype=LegStep),
 ):  # fmt: skip
-    """Write the paws' impulses [N s] and, if `last`, forces [N] to `work`, world axes, and keep the largest values."""
+    """Write the paws' impulses [N s] and, if `last`, forces [N] to `work`, world axes, and update the peak values.
+
+    solved: statistics of the step dt [s]. The peak of each paw goes to `legs`, all other peaks to `work`.
+    """
     total = vec3(real(0.0))
     for k in range(contacts.shape[0]):
         impulse = wp.quat_rotate(base.quat, contacts[k].impulse)
@@ -87,9 +90,9 @@ def advance_kernel(
     joint_q_out: wp.array(dtype=real),
     joint_qd_out: wp.array(dtype=real),
 ):
-    """Advance every world by `settings.substeps` steps; one thread per world.
+    """Advance every world by `settings.substeps` steps; one thread per world, from `settings.first` on.
 
-    Writes the base and motor coordinates; the passive ones follow in `full_state`.
+    Writes the base and motor coordinates; `full_state_kernel` completes the passive ones.
     """
     world = settings.first + wp.tid()
     if work.diverged[world] != 0:

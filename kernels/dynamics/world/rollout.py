@@ -1,7 +1,7 @@
 """Rollouts: policy steps of command filter, latency, motors and physics in one launch, with one thread per world.
 
-A rollout has T policy steps of S physics steps. It records what the reverse pass needs: a row of the state every
-`every` physics steps, and each paw's impulse in each of them.
+A rollout has T policy steps of S physics steps. For the reverse pass it records the state every `every` physics steps
+(a row), and torques, paw impulses and pressed stops of every physics step.
 """
 
 import warp as wp
@@ -46,10 +46,9 @@ def rollout_kernel(
     filtered_target: wp.array3d(dtype=real),
     trajectory: TrajectoryArrays,
 ):
-    """Run a rollout from the state in row 0; one thread per world.
+    """Run a rollout from the state in row 0 of `trajectory`; one thread per world, from `settings.first` on.
 
-    settings.substeps is 1; drive.joint_f and drive.wrench are overwritten. filtered_target [rad]: (T, 12,
-    num_worlds).
+    settings.substeps must be 1; drive.joint_f is overwritten. filtered_target [rad]: (T, 12, num_worlds).
     """
     world = settings.first + wp.tid()
     com = base_com(model.table, world)

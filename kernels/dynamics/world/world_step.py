@@ -2,16 +2,7 @@
 
 import warp as wp
 
-from ...actuation.stops import (
-    MAX_SETS,
-    SLACK,
-    StopRates,
-    change_one,
-    one_by_one,
-    pressed_stops,
-    revised_stops,
-    stop_rates,
-)
+from ...actuation import stops
 from ...layout import GRAVITY
 from ...scalar import real, vec3
 from ...state import BaseState
@@ -26,13 +17,13 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class LegStep:
-    """A leg in a step: input (angles, rates, torque), scratch and results; vectors are lateral, outer, inner."""
+    """A leg in a step: input (angles, rates, torque), scratch and results; motors are lateral, outer, inner."""
 
     angles: vec3  # [rad] at the start of the step
     rates: vec3  # [rad/s] at the start of the step
     torque: vec3  # [N m] of the motors
     new_rates: vec3  # [rad/s] at the end of the step
-    stop_rates: StopRates
+    stop_rates: stops.StopRates
     pressed: int  # set of pressed hard stops, see `stops`
     solve: LegSolve
     paw: PawKinematics
@@ -41,12 +32,12 @@ class LegStep:
 
 @wp.struct
 class StepSolution:
-    """Velocities of the base at the end of a step, in the body axes of its start, and statistics."""
+    """Velocities of the base at the end of a step, in the body axes of the start of the step, and statistics."""
 
     lin: vec3  # [m/s]
     ang: vec3  # [rad/s]
     contact: ContactState  # of the last solution
-    sets: int  # of pressed stops that were tried
+    sets: int  # number of sets of pressed stops that were tried
 
 
 @wp.func
@@ -54,7 +45,7 @@ def solve_with_stops(
     model: RobotModel, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
     impulse: wp.array2d(dtype=vec3), legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact),
 ) -> StepSolution:  # fmt: skip
-    """Solve a step with given sets of pressed stops; see `solve_step`."""
+    """Solve a step with the sets `legs[k].pressed` and their `stop_rates`; arguments and results as `solve_step`."""
     dt = settings.dt
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     system = base_system(model, world, base, g, force, moment)
@@ -94,14 +85,17 @@ def solve_with_stops(
 
 @wp.func
 def revise_stops(legs: wp.array(dtype=LegStep), slack: real, sets: int) -> bool:
-    """Replace each leg's set of pressed stops by the one its new rates require; returns whether any changed."""
+    """Replace each leg's set of pressed stops by the one its new rates require; returns whether any set changed.
+
+    slack [rad/s]: see `pressed_stops`; sets: number of sets tried in this step.
+    """
     changed = bool(False)
     for k in range(legs.shape[0]):
         pressed = legs[k].pressed
-        required = revised_stops(legs[k].stop_rates, legs[k].new_rates, slack, pressed, sets)
-        if required != pressed and not (changed and one_by_one(sets)):
-            if one_by_one(sets):
-                required = change_one(pressed, required)
+        required = stops.revised_stops(legs[k].stop_rates, legs[k].new_rates, slack, pressed, sets)
+        if required != pressed and not (changed and stops.one_by_one(sets)):
+            if stops.one_by_one(sets):
+                required = stops.change_one(pressed, required)
             legs[k].pressed = required
             changed = True
     return changed
@@ -114,24 +108,22 @@ def solve_step(
 ) -> StepSolution:  # fmt: skip
     """Solve a step of one world, and write every leg's pressed stops, contact and motor rates at the end of the step.
 
-    force [N], moment [N m]: from outside at the base's com, world axes. impulse: first guess [N s], world frame,
-    (4, num_worlds). legs, contacts: local to the thread, shape (4,); of the legs the motors' angles, rates and torques
-    are read, and all else is written.
-
-    The stops that the rates at the start would press are tried first.
+    force [N], moment [N m]: external, at the base's com, world axes. impulse: first guess [N s], world axes,
+    (4, num_worlds). legs, contacts: local to the thread, (4,); `angles`, `rates` and `torque` of the legs are read, and
+    all else but `peak_sq` is written. The first set tried holds the stops that the rates at the start would press.
     """
     dt = settings.dt
     for k in range(legs.shape[0]):
-        bounds = stop_rates(load_stops(model.table, k, world), legs[k].angles, dt)
+        bounds = stops.stop_rates(load_stops(model.table, k, world), legs[k].angles, dt)
         legs[k].stop_rates = bounds
-        legs[k].pressed = pressed_stops(bounds, legs[k].rates, real(0.0), 0)
-    slack = SLACK * settings.tolerance
+        legs[k].pressed = stops.pressed_stops(bounds, legs[k].rates, real(0.0), 0)
+    slack = stops.SLACK * settings.tolerance
     solution = StepSolution()
     sets = int(0)
     working = bool(True)
     while working:
         solution = solve_with_stops(model, settings, world, base, force, moment, block, impulse, legs, contacts)
         sets += 1
-        working = sets < MAX_SETS and revise_stops(legs, slack, sets)
+        working = sets < stops.MAX_SETS and revise_stops(legs, slack, sets)
     solution.sets = sets
     return solution

@@ -16,13 +16,13 @@ from jumper_warp.sim.precision import float64_kernels
 float64_kernels()
 actuator64 = importlib.import_module("jumper_warp.kernels_float64.actuation.motors")
 
-MOTOR_COORDS = [7, 8, 10, 12, 13, 15, 17, 18, 20, 22, 23, 25]
-MOTOR_DOFS = [6, 7, 9, 11, 12, 14, 16, 17, 19, 21, 22, 24]
-COORDS, DOFS = 43, 38
+MOTOR_COORDS = [7, 8, 10, 12, 13, 15, 17, 18, 20, 22, 23, 25]  # indices of the 12 motors in a world's joint_q
+MOTOR_DOFS = [6, 7, 9, 11, 12, 14, 16, 17, 19, 21, 22, 24]  # and in its joint_qd
+COORDS, DOFS = 43, 38  # entries of joint_q and joint_qd per world
 
 
 def make_motor(**values):
-    """A motor whose torque is its saturation, unless told otherwise: 18 N m to 20 rad/s, none at 40 rad/s."""
+    """Return `MotorParams`, by default saturated: 18 N m up to 20 rad/s, 0 at 40 rad/s, fade far above that."""
     motor = actuator.MotorParams()
     defaults = dict(kp=1.0e4, kd=0.0, saturation=18.0, peak=18.0, cutoff_speed=20.0, no_load_speed=40.0, offset=0.0)
     for name, value in (defaults | dict(fade_start=1.0e3, fade_end=2.0e3) | values).items():
@@ -31,19 +31,19 @@ def make_motor(**values):
 
 
 def transversal_motor(kp=1.0e4, kd=0.0):
-    """The robot's transversal motor with the jumping torque."""
+    """Return the robot's transversal motor with the jumping torque; kp [N m/rad], kd [N m s/rad]."""
     rpm = math.pi / 30.0
     overspeed = dict(fade_start=math.radians(2000.0), fade_end=math.radians(2500.0))
     return make_motor(kp=kp, kd=kd, cutoff_speed=225.0 * rpm, no_load_speed=382.0 * rpm, **overspeed)
 
 
-def test_position_control_by_hand():
+def test_unsaturated_torque_is_pd_control_on_the_sensor_reading():
     motor = make_motor(kp=17.0, kd=0.8, offset=0.1)
-    # 17 (0.5 - (0.2 + 0.1)) - 0.8 * 1 = 2.6
+    # 17 (0.5 - (0.2 + 0.1)) - 0.8 * 1 = 2.6 N m, for a target of 0.5 rad at 0.2 rad and 1 rad/s
     assert actuator.motor_torque(0.5, 0.2, 1.0, motor) == pytest.approx(2.6, abs=1e-6)
 
 
-@pytest.mark.parametrize(
+@pytest.mark.parametrize(  # [rad/s], [N m]: 18 (40 - vel) / 20 beyond the cutoff at 20 rad/s
     ("vel", "torque"), [(0.0, 18.0), (20.0, 18.0), (25.0, 13.5), (30.0, 9.0), (40.0, 0.0), (45.0, 0.0)]
 )
 def test_driving_torque_is_flat_then_linear_to_zero_at_no_load(vel, torque):
@@ -57,7 +57,7 @@ def test_saturation_below_peak_limits_torque_until_the_envelope_does(vel, torque
     assert actuator.motor_torque(1.0, 0.0, vel, make_motor(peak=24.0)) == pytest.approx(torque, abs=1e-5)
 
 
-@pytest.mark.parametrize("vel", [5.0, 30.0, 60.0])
+@pytest.mark.parametrize("vel", [5.0, 30.0, 60.0])  # [rad/s]: below cutoff, between cutoff and no load, above no load
 def test_braking_keeps_full_torque(vel):
     assert actuator.motor_torque(1.0, 0.0, -vel, make_motor()) == pytest.approx(18.0)
     assert actuator.motor_torque(-1.0, 0.0, vel, make_motor()) == pytest.approx(-18.0)
@@ -65,10 +65,11 @@ def test_braking_keeps_full_torque(vel):
 
 @pytest.mark.parametrize(("vel", "torque"), [(35.0, 18.0), (40.0, 9.0), (44.0, 1.8), (45.0, 0.0), (50.0, 0.0)])
 def test_overspeed_fades_driving_and_braking_alike(vel, torque):
+    # [rad/s]; expected: 18 (45 - vel) / (45 - 35) N m from 35 rad/s on
     motor = make_motor(cutoff_speed=100.0, no_load_speed=200.0, fade_start=35.0, fade_end=45.0)
-    for target, speed in [(1.0, vel), (1.0, -vel)]:
-        assert actuator.motor_torque(target, 0.0, speed, motor) == pytest.approx(torque, abs=1e-5)
-        assert actuator.motor_torque(-target, 0.0, -speed, motor) == pytest.approx(-torque, abs=1e-5)
+    for speed in (vel, -vel):
+        assert actuator.motor_torque(1.0, 0.0, speed, motor) == pytest.approx(torque, abs=1e-5)
+        assert actuator.motor_torque(-1.0, 0.0, -speed, motor) == pytest.approx(-torque, abs=1e-5)
 
 
 @pytest.mark.parametrize(
@@ -81,23 +82,23 @@ def test_overspeed_fades_driving_and_braking_alike(vel, torque):
         (-40.0, 7.494),  # braking: 18 faded by 0.4163
     ],
 )
-def test_transversal_motor_curve(vel, torque):
+def test_transversal_motor_torque_by_hand(vel, torque):
     assert actuator.motor_torque(1.0, 0.0, vel, transversal_motor()) == pytest.approx(torque, abs=2e-3)
 
 
-finite = st.floats(-60.0, 60.0, width=32)
+finite = st.floats(-60.0, 60.0, width=32)  # [rad] or [rad/s], beyond all speeds of the torque curve
 
 
 @given(target=finite, pos=finite, vel=finite)
-def test_torque_is_bounded_and_odd(target, pos, vel):
+def test_torque_is_within_saturation_and_odd(target, pos, vel):
     motor = transversal_motor(kp=17.0, kd=0.8)
     torque = actuator.motor_torque(target, pos, vel, motor)
     assert abs(torque) <= 18.0 + 1e-5
     assert actuator.motor_torque(-target, -pos, -vel, motor) == pytest.approx(-torque, abs=1e-5)
 
 
-def test_equals_newtons_drive_and_dc_motor_below_no_load_speed():
-    num = 400
+def test_equals_newtons_drive_and_dc_motor_below_the_overspeed_fade():
+    num = 400  # independent joints, each with Newton's PD drive and DC motor, the oracle
     rng = np.random.default_rng(3)
     cutoff, no_load, saturation = 225.0 * math.pi / 30.0, 382.0 * math.pi / 30.0, 18.0
     clamping = dict(
@@ -110,7 +111,7 @@ def test_equals_newtons_drive_and_dc_motor_below_no_load_speed():
         builder.add_actuator(DrivePD, index=joint, kp=17.0, kd=0.8, clamping=[(ClampingDCMotor, clamping)])
     model = builder.finalize(device="cpu")
     state, control = model.state(), model.control()
-    # every speed at which the over-speed protection is idle: 2000 deg/s = 34.9 rad/s
+    # speeds at which the over-speed protection is idle: it begins at 2000 deg/s = 34.9 rad/s
     target, pos, vel = rng.uniform(-3.0, 3.0, num), rng.uniform(-3.0, 3.0, num), rng.uniform(-34.5, 34.5, num)
     control.joint_target_q.assign(target)
     state.joint_q.assign(pos)
@@ -122,11 +123,11 @@ def test_equals_newtons_drive_and_dc_motor_below_no_load_speed():
 
     motor = transversal_motor(kp=17.0, kd=0.8)
     ours = [actuator.motor_torque(*map(float, args), motor) for args in zip(target, pos, vel, strict=True)]
-    np.testing.assert_allclose(ours, expected, atol=2e-4)
+    np.testing.assert_allclose(ours, expected, atol=2e-4)  # [N m]
 
 
 def distinct_motors(num_worlds, module=actuator, requires_grad=False):
-    """Motors with their own constants each, and what these are."""
+    """Return `MotorArrays` (12, num_worlds) in which every motor has its own constants, within 10 % of the robot's."""
     motors = motor_arrays(jumping_motors(), num_worlds, module=module, device="cpu", requires_grad=requires_grad)
     rng = np.random.default_rng(5)
     for name in ("kp", "kd", "saturation", "peak", "cutoff_speed", "no_load_speed"):
@@ -142,7 +143,7 @@ def test_kernel_writes_each_motors_torque_and_nothing_else():
     motors = distinct_motors(num_worlds)
     q, qd = rng.uniform(-1.0, 1.0, (num_worlds, COORDS)), rng.uniform(-45.0, 45.0, (num_worlds, DOFS))
     target = rng.uniform(-4.0, 4.0, (12, num_worlds))
-    joint_f = wp.full(num_worlds * DOFS, 7.0, dtype=float, device="cpu")
+    joint_f = wp.full(num_worlds * DOFS, 7.0, dtype=float, device="cpu")  # 7: entries that must not change
     arrays = [wp.array(x, dtype=float, device="cpu") for x in (target, q.ravel(), qd.ravel())]
     wp.launch(actuator.motor_torque_kernel, (12, num_worlds), [*arrays, COORDS, DOFS, motors], [joint_f], device="cpu")
 
@@ -156,13 +157,12 @@ def test_kernel_writes_each_motors_torque_and_nothing_else():
     torque = np.clip(command, -bound, bound) * fade
 
     written = joint_f.numpy().reshape(num_worlds, DOFS)
-    np.testing.assert_allclose(written[:, MOTOR_DOFS].T, torque, atol=1e-4)
-    others = np.setdiff1d(np.arange(DOFS), MOTOR_DOFS)
-    assert np.all(written[:, others] == 7.0)
+    np.testing.assert_allclose(written[:, MOTOR_DOFS].T, torque, atol=1e-4)  # [N m]
+    assert np.all(np.delete(written, MOTOR_DOFS, axis=1) == 7.0)
 
 
 def test_gradients_equal_central_differences():
-    num_worlds, step = 64, 1.0e-6
+    num_worlds, step = 64, 1.0e-6  # step: of each difference, along a random direction per input
     rng = np.random.default_rng(2)
     motors = distinct_motors(num_worlds, actuator64, requires_grad=True)
     weights = wp.array(rng.uniform(0.5, 1.5, num_worlds * DOFS), dtype=wp.float64, device="cpu")
@@ -178,13 +178,8 @@ def test_gradients_equal_central_differences():
 
     def torques():
         joint_f = wp.zeros(num_worlds * DOFS, dtype=wp.float64, device="cpu", requires_grad=True)
-        wp.launch(
-            actuator64.motor_torque_kernel,
-            (12, num_worlds),
-            [*inputs.values(), COORDS, DOFS, motors],
-            [joint_f],
-            device="cpu",
-        )
+        arguments = [*inputs.values(), COORDS, DOFS, motors]
+        wp.launch(actuator64.motor_torque_kernel, (12, num_worlds), arguments, [joint_f], device="cpu")
         return joint_f
 
     with wp.Tape() as tape:
@@ -213,27 +208,26 @@ def test_saturation_is_clamped_to_peak_torque():
 
 
 def test_arrays_repeat_lateral_and_transversal_constants():
-    motors = motor_arrays(walking_motors(), 2, device="cpu")
+    motors = motor_arrays(walking_motors(), 2, device="cpu")  # rows lateral, outer, inner of each leg; 2 worlds
     np.testing.assert_allclose(motors.kd.numpy(), np.tile([[2.07], [0.92], [0.92]], (4, 2)), rtol=1e-6)
-    np.testing.assert_allclose(motors.saturation.numpy(), np.full((12, 2), 10.0))
-    np.testing.assert_allclose(motors.no_load_speed.numpy()[:3, 1], [49.218, 40.003, 40.003], atol=1e-3)
-    assert motors.fade_start == pytest.approx(34.9066, abs=1e-4)
+    np.testing.assert_allclose(motors.saturation.numpy(), np.full((12, 2), 10.0))  # [N m]
+    np.testing.assert_allclose(motors.no_load_speed.numpy()[:3, 1], [49.218, 40.003, 40.003], atol=1e-3)  # 470, 382 rpm
+    assert motors.fade_start == pytest.approx(34.9066, abs=1e-4)  # 2000 deg/s
+
+
+VALID_KIND = dict(kp=17.0, kd=0.8, saturation=18.0, peak=24.8, cutoff_speed=20.0, no_load_speed=40.0)
 
 
 @pytest.mark.parametrize(
-    ("bad", "message"),
-    [
-        (dict(saturation=0.0), "saturation"),
-        (dict(kp=math.nan), "kp"),
-        (dict(kd=-1.0), "kd"),
-        (dict(no_load_speed=20.0), "no_load_speed"),
-    ],
+    ("name", "value"), [("saturation", 0.0), ("kp", math.nan), ("kd", -1.0), ("no_load_speed", 20.0)]
 )
-def test_refuses_invalid_motor(bad, message):
-    good = dict(kp=17.0, kd=0.8, saturation=18.0, peak=24.8, cutoff_speed=20.0, no_load_speed=40.0)
-    with pytest.raises(ValueError, match=message):
-        MotorKindCfg(**(good | bad))
-    kind = MotorKindCfg(**good)
+def test_motor_constant_out_of_range_raises_an_error_that_names_it(name, value):
+    with pytest.raises(ValueError, match=name):
+        MotorKindCfg(**(VALID_KIND | {name: value}))
+
+
+def test_falling_fade_and_zero_worlds_raise_errors():
+    kind = MotorKindCfg(**VALID_KIND)
     with pytest.raises(ValueError, match="fade_start"):
         MotorCfg(kind, kind, fade_start=3.0, fade_end=2.0)
     with pytest.raises(ValueError, match="num_worlds"):

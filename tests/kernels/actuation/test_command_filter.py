@@ -28,23 +28,23 @@ filter64 = importlib.import_module("jumper_warp.kernels_float64.actuation.comman
 
 JUMP = filter_params(vertical_jump_filter())
 WALK = filter_params(walking_filter())
-COORDS, DOFS = 43, 38
-MOTOR_COORDS = [7, 8, 10, 12, 13, 15, 17, 18, 20, 22, 23, 25]
-MOTOR_DOFS = [6, 7, 9, 11, 12, 14, 16, 17, 19, 21, 22, 24]
+COORDS, DOFS = 43, 38  # entries of joint_q and joint_qd per world
+MOTOR_COORDS = [7, 8, 10, 12, 13, 15, 17, 18, 20, 22, 23, 25]  # indices of the 12 motors in a world's joint_q
+MOTOR_DOFS = [6, 7, 9, 11, 12, 14, 16, 17, 19, 21, 22, 24]  # and in its joint_qd
 
 
 def safe_leg(target, pos, vel=(0.0, 0.0, 0.0), params=JUMP):
-    """Filter one leg; everything in degrees and degrees per second."""
+    """Return the filtered targets [deg] of one leg; vectors are lateral, outer, inner, [deg] and [deg/s]."""
     args = [vec3(*(math.radians(x) for x in values)) for values in (target, pos, vel)]
     return [math.degrees(x) for x in command_filter.filter_leg(*args, params)]
 
 
-# Each case: raw target, position, velocity, safe target of (lateral, outer, inner) [deg, deg/s]. Jumping: lateral
-# -15..15 (hard zones 10, 15), transversal -30..140 (10, 15), sum 0..240 (35, 45), horizon 8/60 s.
+# Each case: raw target, position, velocity, expected filtered target, each (lateral, outer, inner) [deg, deg/s]. JUMP:
+# lateral -15..15 (hard zones 10, 15), transversal -30..140 (10, 15), sum 0..240 (35, 45), horizon 8/60 s.
 JUMP_CASES = {
     "within the limits: untouched": ((10, 100, 90), (0, 50, 50), (0, 0, 0), (10, 100, 90)),
     "far from the limits: a command beyond them is untouched": ((0, 200, 45), (0, 45, 45), (0, 300, 0), (0, 200, 45)),
-    # the margin of 60 deg lasts 60/900 = 1/15 s, half the horizon: half of the 60 deg beyond 140 go
+    # the margin of 60 deg lasts 60/900 = 1/15 s, half the horizon: half of the 60 deg beyond 140 is removed
     "half the horizon left: half way to the limit": ((0, 200, 0), (0, 80, 0), (0, 900, 0), (0, 170, 0)),
     "a quarter of the horizon left": ((0, 200, 0), (0, 80, 0), (0, 1800, 0), (0, 155, 0)),
     "moving away from the near limit: untouched": ((0, 200, 45), (0, 80, 45), (0, -300, 0), (0, 200, 45)),
@@ -62,7 +62,7 @@ JUMP_CASES = {
     # the sum: 230 of 240, hard zone 45; 250 commanded, so 5 deg each
     "sum, hard zone toward: both give way equally": ((0, 130, 120), (0, 120, 110), (0, 0, 0), (0, 125, 115)),
     "sum, hard zone away: untouched": ((0, 100, 110), (0, 120, 110), (0, 900, 0), (0, 100, 110)),
-    # sum 0..240 with 150 at 1350 deg/s: 90/1350 = 1/15 s, half of the 40 deg too much go, 10 deg each
+    # sum 0..240 with 150 at 1350 deg/s: 90/1350 = 1/15 s, half of the 40 deg above 240 is removed, 10 deg each
     "sum, half the horizon left": ((0, 140, 140), (0, 75, 75), (0, 675, 675), (0, 130, 130)),
     "sum, one thigh's speed cancels the other's": ((0, 140, 140), (0, 75, 75), (0, 675, -675), (0, 140, 140)),
     # 20 deg of sum, hard zone 35; -50 commanded, so 25 deg each; the single angles are far from their own limits
@@ -76,10 +76,11 @@ JUMP_CASES = {
 @pytest.mark.parametrize("case", JUMP_CASES)
 def test_jump_filter_by_hand(case):
     target, pos, vel, safe = JUMP_CASES[case]
-    assert safe_leg(target, pos, vel) == pytest.approx(safe, abs=2e-4)
+    assert safe_leg(target, pos, vel) == pytest.approx(safe, abs=2e-4)  # [deg]
 
 
-# walking: no hard zones, horizon 5/60 s, so the speed floor of 60 deg/s matters within 5 deg
+# Each case: raw target, position, velocity, expected filtered target of the outer motor [deg, deg/s]. WALK: no hard
+# zones, horizon 5/60 s, so the speed floor of 60 deg/s matters within 5 deg of a limit.
 WALK_CASES = {
     "slower than the floor: 2 deg at 60 deg/s last 2/5 of the horizon": (160, 138, 10, 148),
     "at rest the floor counts too": (160, 138, 0, 148),
@@ -95,15 +96,15 @@ WALK_CASES = {
 @pytest.mark.parametrize("case", WALK_CASES)
 def test_walking_filter_by_hand(case):
     target, pos, vel, safe = WALK_CASES[case]
-    assert safe_leg((0, target, 0), (0, pos, 0), (0, vel, 0), WALK)[1] == pytest.approx(safe, abs=2e-4)
+    assert safe_leg((0, target, 0), (0, pos, 0), (0, vel, 0), WALK)[1] == pytest.approx(safe, abs=2e-4)  # [deg]
 
 
-def test_filters_are_the_published_ones():
+def test_filter_constants_are_the_published_ones():
     vertical, horizontal, walking = vertical_jump_filter(), horizontal_jump_filter(), walking_filter()
     assert (vertical.sum.upper, vertical.sum.lower_zone, vertical.sum.upper_zone) == (240.0, 35.0, 45.0)
     assert (horizontal.sum.upper, horizontal.sum.lower_zone, horizontal.sum.upper_zone) == (220.0, 30.0, 30.0)
-    assert vertical.horizon == horizontal.horizon == pytest.approx(0.13333, abs=1e-5)
-    assert walking.horizon == pytest.approx(0.08333, abs=1e-5)
+    assert vertical.horizon == horizontal.horizon == pytest.approx(0.13333, abs=1e-5)  # 8/60 s
+    assert walking.horizon == pytest.approx(0.08333, abs=1e-5)  # 5/60 s
     for limits in (walking.lateral, walking.transversal, walking.sum):
         assert limits.lower_zone == limits.upper_zone == 0.0
     params = filter_params(horizontal)
@@ -116,18 +117,18 @@ def test_filters_are_the_published_ones():
 @pytest.mark.parametrize("params", [JUMP, WALK], ids=["jump", "walk"])
 @pytest.mark.parametrize("pos", [(0.0, 45.0, 45.0), (15.0, 140.0, 100.0), (-30.0, -90.0, 90.0)])
 def test_infinite_command_becomes_finite(command, params, pos):
-    assert np.all(np.abs(safe_leg((command,) * 3, pos, (0.0, 0.0, 0.0), params)) <= 720.1)
+    assert np.all(np.abs(safe_leg((command,) * 3, pos, (0.0, 0.0, 0.0), params)) <= 720.1)  # [deg], two turns
 
 
 ROUNDING = 1.0e-4
 """[deg] Nearer to a limit, degrees and single precision radians may be on different sides of it."""
-angle = st.floats(-300.0, 300.0, width=32)
-speed = st.floats(-2000.0, 2000.0, width=32)
+angle = st.floats(-300.0, 300.0, width=32)  # [deg]
+speed = st.floats(-2000.0, 2000.0, width=32)  # [deg/s]
 
 
 @given(raw=st.tuples(angle, angle), pos=st.tuples(angle, angle), vel=st.tuples(speed, speed))
-def test_sum_limit_corrects_both_transversal_commands_equally(raw, pos, vel):
-    wide = LimitsCfg(-1.0e4, 1.0e4)
+def test_sum_limit_corrects_both_transversal_commands_equally_and_binds_outside(raw, pos, vel):
+    wide = LimitsCfg(-1.0e4, 1.0e4)  # [deg], never reached
     only_sum = filter_params(FilterCfg(wide, wide, sum=LimitsCfg(0.0, 240.0, 35.0, 45.0), horizon=0.1))
     _, outer, inner = safe_leg((0.0, *raw), (0.0, *pos), (0.0, *vel), only_sum)
     assert outer - raw[0] == pytest.approx(inner - raw[1], abs=1e-3)
@@ -136,9 +137,9 @@ def test_sum_limit_corrects_both_transversal_commands_equally(raw, pos, vel):
 
 
 @given(raw=angle, pos=st.floats(-200.0, 200.0, width=32), vel=speed)
-def test_outside_or_toward_the_limit_in_its_hard_zone_the_command_ends_within(raw, pos, vel):
+def test_lateral_command_is_clamped_outside_and_toward_a_limit_and_never_pushed_outward(raw, pos, vel):
     outside = not -15.0 - ROUNDING <= pos <= 15.0 + ROUNDING
-    toward = (pos > 0.001 and raw > pos) or (pos < -5.001 and raw < pos)
+    toward = (pos > 0.001 and raw > pos) or (pos < -5.001 and raw < pos)  # hard zones: above 15 - 15, below -15 + 10
     safe = safe_leg((raw, 45.0, 45.0), (pos, 45.0, 45.0), (vel, 0.0, 0.0))[0]
     if outside or toward:
         assert -15.001 <= safe <= 15.001
@@ -147,21 +148,23 @@ def test_outside_or_toward_the_limit_in_its_hard_zone_the_command_ends_within(ra
 
 @given(raw=st.tuples(angle, angle, angle), pos=st.floats(60.0, 80.0, width=32), vel=st.floats(-200.0, 200.0, width=32))
 def test_commands_far_from_the_limits_pass_unchanged(raw, pos, vel):
-    # 60 deg of margin and more at 200 deg/s at most, 75 deg of the sum at 400: beyond the horizon
-    walk = (0.0, pos, pos)
-    assert safe_leg(raw, walk, (0.0, vel, vel), WALK) == pytest.approx(raw, abs=1e-3)
+    # margins of at least 60 deg at 200 deg/s or less, of the sum 80 deg at 400 deg/s: longer than the horizon, 5/60 s
+    assert safe_leg(raw, (0.0, pos, pos), (0.0, vel, vel), WALK) == pytest.approx(raw, abs=1e-3)  # [deg]
 
 
 @given(raw=st.tuples(angle, angle), pos=angle, vel=speed)
 def test_filter_is_monotonic_in_the_command(raw, pos, vel):
     low, high = sorted(raw)
-    # without hard zones: these judge by the command's direction, which lets one away from the limit pass untouched
+    # WALK has no hard zones, which depend on the command's direction and are not monotonic
     safe = [safe_leg((command, 45.0, 45.0), (pos, 45.0, 45.0), (vel, 0.0, 0.0), WALK)[0] for command in (low, high)]
     assert safe[0] <= safe[1] + 1e-3
 
 
 def launch(module, target, q, qd, params, offset=None, requires_grad=False):
-    """Run the filter kernel of either precision; returns the safe targets."""
+    """Return the filtered targets [rad] (12, num_worlds) of the kernel of `module` (single or double precision).
+
+    target, offset [rad]: (12, num_worlds), offset None: zeros. q, qd: joint_q, joint_qd, flat over worlds.
+    """
     offset = wp.zeros(target.shape, dtype=module.real, device="cpu") if offset is None else offset
     safe = wp.zeros(target.shape, dtype=module.real, device="cpu", requires_grad=requires_grad)
     dim = (4, target.shape[1])
@@ -169,7 +172,7 @@ def launch(module, target, q, qd, params, offset=None, requires_grad=False):
     return safe
 
 
-def test_kernel_reads_and_writes_every_leg_of_every_world():
+def test_kernel_equals_filter_leg_on_sensor_readings_for_every_leg_and_world():
     num_worlds = 3
     rng = np.random.default_rng(4)
     q, qd = np.full((num_worlds, COORDS), math.nan), np.full((num_worlds, DOFS), math.nan)
@@ -181,16 +184,16 @@ def test_kernel_reads_and_writes_every_leg_of_every_world():
     safe = launch(command_filter, *arrays[:3], JUMP, arrays[3]).numpy()
     for world in range(num_worlds):
         for leg in range(4):
-            mine = slice(3 * leg, 3 * leg + 3)
-            pos, vel = q[world, MOTOR_COORDS][mine], qd[world, MOTOR_DOFS][mine]
-            read = vec3(*(pos + offset[mine, world]))
-            expected = command_filter.filter_leg(vec3(*target[mine, world]), read, vec3(*vel), JUMP)
-            np.testing.assert_allclose(safe[mine, world], list(expected), atol=1e-5)
+            rows = slice(3 * leg, 3 * leg + 3)
+            pos, vel = q[world, MOTOR_COORDS][rows], qd[world, MOTOR_DOFS][rows]
+            reading = vec3(*(pos + offset[rows, world]))
+            expected = command_filter.filter_leg(vec3(*target[rows, world]), reading, vec3(*vel), JUMP)
+            np.testing.assert_allclose(safe[rows, world], list(expected), atol=1e-5)  # [rad]
 
 
 @pytest.mark.parametrize("cfg", [vertical_jump_filter(), walking_filter()], ids=["jump", "walk"])
 def test_gradients_equal_central_differences(cfg):
-    num_worlds, step = 64, 1.0e-7
+    num_worlds, step = 64, 1.0e-7  # step: of each difference, along a random direction per input
     rng = np.random.default_rng(6)
     params = filter_params(cfg, module=filter64)
     motors = rng.uniform(-0.5, 2.4, (num_worlds, 12))
@@ -219,7 +222,7 @@ def test_gradient_of_the_blend_by_hand():
     # the upper limit u = 140 deg, margin 60 deg, w = 1 - margin / (v T): d safe / d raw = 1 - w = 1/2 at half the
     # horizon; d safe / d vel = -(raw - u) margin / (v^2 T) = -(60 deg) (60 deg) / (900^2 (8/60)) = -1/30 s
     q, qd = np.zeros(COORDS), np.zeros(DOFS)
-    q[8], qd[7] = math.radians(80.0), math.radians(900.0)
+    q[8], qd[7] = math.radians(80.0), math.radians(900.0)  # the outer motor of FL, motor 1
     target = np.zeros((12, 1))
     target[1] = math.radians(200.0)
     inputs = [wp.array(x, dtype=wp.float64, device="cpu", requires_grad=True) for x in (target, q, qd)]
@@ -242,10 +245,13 @@ def overshoot_kernel(
     # out
     overshoot: wp.array2d(dtype=real),
 ):
-    """Drive three free joints through commands at 60 Hz and motors at 480 Hz; overshoot of each and of the sum."""
+    """Write the largest overshoot [rad] (lateral, outer, inner, outer + inner; world) of one leg's joints.
+
+    The joints are free bodies of `inertia` [kg m^2]. command [rad]: (steps, num_worlds) at 60 Hz; motors run at 480 Hz.
+    """
     world = wp.tid()
     dt = real(1.0 / 480.0)
-    pos, vel, over = vec3(0.0, 0.7854, 0.7854), vec3(), wp.vec4()
+    pos, vel, over = vec3(0.0, 0.7854, 0.7854), vec3(), wp.vec4()  # start: 0, 45, 45 degrees at rest
     for step in range(command.shape[0]):
         target = command[step, world]
         if filtered:
@@ -264,24 +270,26 @@ def overshoot_kernel(
 
 
 def worst_overshoot(low, high, filtered):
-    """Largest overshoot [deg] of lateral, outer, inner and sum in 64 runs of 5 s, jumping between two commands."""
+    """Return the largest overshoot [deg] of lateral, outer, inner and outer + inner in 64 runs of 5 s.
+
+    low, high [deg]: two commands (lateral, outer, inner); each joint switches with probability 0.1 per policy step.
+    """
     rng = np.random.default_rng(0)
     steps, num_worlds, ends = 300, 64, np.radians([low, high])
-    last = rng.integers(0, 2, (num_worlds, 3))
+    side = rng.integers(0, 2, (num_worlds, 3))  # 0: low, 1: high
     commands = np.empty((steps, num_worlds, 3))
     for step in range(steps):
-        last = np.where(rng.random(last.shape) < 0.1, 1 - last, last)
-        commands[step] = np.take_along_axis(ends, last, axis=0)
+        side = np.where(rng.random(side.shape) < 0.1, 1 - side, side)
+        commands[step] = np.take_along_axis(ends, side, axis=0)
     overshoot = wp.zeros((4, num_worlds), dtype=float, device="cpu")
     motors = motor_arrays(jumping_motors(), num_worlds, device="cpu")
-    inputs = [wp.array(commands, dtype=vec3, device="cpu"), filtered, JUMP, motors, 0.02]
+    inputs = [wp.array(commands, dtype=vec3, device="cpu"), filtered, JUMP, motors, 0.02]  # [kg m^2]
     wp.launch(overshoot_kernel, num_worlds, inputs, [overshoot], device="cpu")
     return np.degrees(overshoot.numpy()).max(axis=1)
 
 
 def test_filter_bounds_overshoot_of_extreme_actions():
-    # a free joint of 0.02 kg m^2; commands are bounded by the actions: 45 +- 90 deg transversal, +-15 deg lateral
-    low, high = (-15.0, -45.0, -45.0), (15.0, 135.0, 135.0)
+    low, high = (-15.0, -45.0, -45.0), (15.0, 135.0, 135.0)  # largest actions: +-15 deg lateral, 45 +- 90 transversal
     assert np.all(worst_overshoot(low, high, filtered=True) < [0.1, 10.0, 10.0, 20.0])
     assert np.all(worst_overshoot(low, high, filtered=False)[1:] > [20.0, 20.0, 90.0])
 
@@ -295,13 +303,13 @@ def test_filter_reduces_overshoot_of_commands_beyond_the_limits():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: LimitsCfg(10.0, 10.0), "rise"),
-        (lambda: LimitsCfg(math.nan, 10.0), "finite"),
-        (lambda: LimitsCfg(0.0, 10.0, lower_zone=-1.0), "hard zones"),
-        (lambda: LimitsCfg(0.0, 10.0, 6.0, 6.0), "overlap"),
+        (lambda: LimitsCfg(lower=10.0, upper=10.0), "rise"),
+        (lambda: LimitsCfg(lower=math.nan, upper=10.0), "finite"),
+        (lambda: LimitsCfg(lower=0.0, upper=10.0, lower_zone=-1.0), "hard zones"),
+        (lambda: LimitsCfg(lower=0.0, upper=10.0, lower_zone=6.0, upper_zone=6.0), "overlap"),
         (lambda: FilterCfg(LimitsCfg(0, 1), LimitsCfg(0, 1), LimitsCfg(0, 1), horizon=0.0), "horizon"),
     ],
 )
-def test_refuses_invalid_filter(make, message):
+def test_invalid_filter_raises_an_error_that_states_the_fault(make, message):
     with pytest.raises(ValueError, match=message):
         make()

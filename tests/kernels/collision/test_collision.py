@@ -18,17 +18,8 @@ from jumper_warp.sim.precision import float64_kernels
 wp.set_module_options({"enable_backward": False})
 
 LEGS = ((1, 1), (1, -1), (-1, 1), (-1, -1))  # FL, FR, BL, BR as (front, side)
-PAIRS = ((0, 1), (2, 3), (0, 2), (1, 3))
-FLAGS = (
-    "BODY_GROUND",
-    "HOUSING_GROUND",
-    "THIGH_GROUND",
-    "KNEE_GROUND",
-    "SHANK_GROUND",
-    "LEG_LEG",
-    "LEG_SELF",
-    "LEG_SHELL",
-)
+NEIGHBOURS = ((0, 1), (2, 3), (0, 2), (1, 3))  # pairs of legs that can touch
+FLAGS = "BODY_GROUND HOUSING_GROUND THIGH_GROUND KNEE_GROUND SHANK_GROUND LEG_LEG LEG_SELF LEG_SHELL".split()
 MASKS = np.array([getattr(collision_module, name) for name in FLAGS])
 THIGH, SHANK, PAW, HOUSING = 0.019, 0.012, 0.025, 0.048  # radii [m]
 # shell boxes [m]: smallest and largest corner
@@ -39,6 +30,7 @@ REAR_DRUMS = ((-0.144, -0.199, -0.049), (-0.080, 0.199, 0.049))
 
 
 def leg_array(module=geometry_module):
+    """Return the robot's four `LegGeometry` of `module` (single or double precision) as a Warp array."""
     legs = []
     for front, side in LEGS:
         leg = module.LegGeometry()
@@ -52,7 +44,7 @@ def leg_array(module=geometry_module):
 
 
 def make_ground(module=ground, heights=None):
-    """A plane, or heights [m] over x and y within ±2 m."""
+    """Return a plane z = 0, or a grid of heights [m] (rows along y, columns along x) over x and y within ±2 m."""
     result = module.Ground()
     result.rows, result.cols = (0, 0) if heights is None else heights.shape
     result.half_x = result.half_y = 2.0
@@ -61,7 +53,7 @@ def make_ground(module=ground, heights=None):
 
 
 def joint_coordinates(pos, quat_xyzw, motors):
-    """Newton's joint_q, shape (n, 43), for motor angles [rad], shape (n, 12). Knees and loops are not read: NaN."""
+    """Return Newton's joint_q, (n, 43), for motor angles [rad] (n, 12); knees and loop joints, not read, are NaN."""
     motors = np.atleast_2d(motors)
     joint_q = np.full((len(motors), 43), np.nan, np.float32)
     joint_q[:, :3], joint_q[:, 3:7] = pos, quat_xyzw
@@ -71,7 +63,7 @@ def joint_coordinates(pos, quat_xyzw, motors):
 
 
 def collide(pos, quat_xyzw, motors_deg, margin=1.0, heights=None, module=collision_module):
-    """Flags and clearance [m], each shape (n,)."""
+    """Return flags and clearance [m], each (n,), of robots with motor angles [deg] (n, 12); heights: `make_ground`."""
     package = module.__package__.rpartition(".")[0]
     joint_q = joint_coordinates(pos, quat_xyzw, np.radians(motors_deg))
     flags = wp.zeros(len(joint_q), dtype=wp.int32, device="cpu")
@@ -85,13 +77,10 @@ def collide(pos, quat_xyzw, motors_deg, margin=1.0, heights=None, module=collisi
 
 @wp.kernel
 def category_kernel(
-    legs: wp.array(dtype=LegGeometry),
-    surface: Ground,
-    joint_q: wp.array(dtype=wp.float32),
-    bound: float,
+    legs: wp.array(dtype=LegGeometry), surface: Ground, joint_q: wp.array(dtype=wp.float32), bound: float,
     out: wp.array2d(dtype=wp.float32),
-):
-    """Distance of each category, in the order of FLAGS."""
+):  # fmt: skip
+    """Write the smallest distance [m] of each category, in the order of FLAGS, to out (n, 8); one thread per robot."""
     world = wp.tid()
     start = 43 * world
     pos = vec3(joint_q[start], joint_q[start + 1], joint_q[start + 2])
@@ -106,9 +95,9 @@ def category_kernel(
         over_ground = collision_module.leg_ground_distances(surface, capsules, pos, rotation)
         for k in range(4):
             out[world, 1 + k] = wp.min(out[world, 1 + k], over_ground[k])
-        for other in range(leg):
-            if leg + other != 3:
-                neighbour = collision_module.load_leg(legs, joint_q, start, other)
+        for earlier in range(leg):
+            if leg + earlier != 3:  # not diagonal
+                neighbour = collision_module.load_leg(legs, joint_q, start, earlier)
                 distance = collision_module.leg_leg_distance(capsules, neighbour, bound)
                 out[world, 5] = wp.min(out[world, 5], distance)
         out[world, 6] = wp.min(out[world, 6], collision_module.leg_self_distance(capsules, bound))
@@ -116,7 +105,7 @@ def category_kernel(
 
 
 def category_distances(poses, bound=10.0, heights=None):
-    """Distances [m], shape (n, 8)."""
+    """Return the distances [m] (n, 8) of FLAGS for poses (pos, quat_xyzw, motors [rad]), each (n, ...)."""
     joint_q = joint_coordinates(*poses)
     out = wp.zeros((len(joint_q), 8), dtype=wp.float32, device="cpu")
     surface = make_ground(heights=heights)
@@ -126,7 +115,7 @@ def category_distances(poses, bound=10.0, heights=None):
 
 
 def transversal_angles(rng, count, low, high, sum_low, sum_high):
-    """Pairs (outer, inner) in degrees, uniform over low..high where the sum lies in sum_low..sum_high."""
+    """Return (outer, inner) [deg], (count, 2), uniform in low..high with their sum in sum_low..sum_high."""
     angles = rng.uniform(low, high, (8 * count, 2))
     inside = (angles.sum(axis=1) >= sum_low) & (angles.sum(axis=1) <= sum_high)
     return angles[inside][:count]
@@ -134,7 +123,10 @@ def transversal_angles(rng, count, low, high, sum_low, sum_high):
 
 @cache
 def random_poses():
-    """300 poses within the hard stops (and a little below the least sum), near the ground, in any attitude."""
+    """Return (pos [m], quat_xyzw, motors [rad]) of 300 robots near the ground, in any attitude.
+
+    Motor angles are within the hard stops, but the sum outer + inner begins 20 degrees below its stop.
+    """
     rng = np.random.default_rng(7)
     motors = np.hstack(
         [
@@ -150,7 +142,7 @@ def random_poses():
 
 
 def leg_points(leg, lateral, outer, inner):
-    """Transversal axes, knees and ankle [m] of one leg in the body frame: rows outer, inner, outer, inner, ankle."""
+    """Return points [m] (outer axis, inner axis, outer knee, inner knee, ankle; body frame) of a leg, angles [rad]."""
     front, side = LEGS[leg]
     hip = np.array([front * 0.1433, side * (0.105 if front > 0 else 0.150), 0.0])
     housing = Rotation.from_rotvec([side * lateral, 0, 0])
@@ -167,19 +159,24 @@ def leg_points(leg, lateral, outer, inner):
 
 
 def links(points):
+    """Return coal capsules of outer thigh, inner thigh, outer shank, inner shank and paw; points: `leg_points`."""
     radii = (THIGH, THIGH, SHANK, SHANK)
     bars = [capsule(points[k], points[min(k + 2, 4)], radius) for k, radius in enumerate(radii)]
     return [*bars, capsule(points[4], points[4], PAW)]
 
 
 def self_distance(points):
+    """Return coal's smallest distance [m] between the links of a leg, shanks by their upper halves."""
     bars = links(points)
     upper = [capsule(points[k], (points[k] + points[4]) / 2, SHANK) for k in (2, 3)]
     return min(coal_distance(*pair) for pair in ((bars[0], bars[1]), (bars[0], bars[3]), (bars[1], bars[2]), upper))
 
 
 def ground_oracle(pos, quat_xyzw, points):
-    """Lowest points [m] of shell, housings, thighs, knees and shanks over z = 0."""
+    """Return heights [m] over z = 0 of the lowest point of shell, housings, thighs, knees and shanks.
+
+    points: (4, 5, 3), `leg_points` of all legs; shanks count down to 0.9 of their length, thighs to the middle.
+    """
     turn = Rotation.from_quat(quat_xyzw)
 
     def height(body_points):
@@ -190,8 +187,8 @@ def ground_oracle(pos, quat_xyzw, points):
         for low, high in (NOSE, TRUNK, FRONT_DRUMS, REAR_DRUMS)
         for pick in np.ndindex(2, 2, 2)
     ]
-    hips = np.array([[f * 0.1433, s * (0.105 if f > 0 else 0.150), 0.0] for f, s in LEGS])
-    tips = hips + [[f * 0.19, 0.0, 0.0] for f, _ in LEGS]
+    hips = np.array([[front * 0.1433, side * (0.105 if front > 0 else 0.150), 0.0] for front, side in LEGS])
+    tips = hips + [[front * 0.19, 0.0, 0.0] for front, _ in LEGS]
     axes, knees = points[:, :2], points[:, 2:4]
     lower_shank = knees + 0.9 * (points[:, 4:] - knees)
     return (
@@ -205,16 +202,17 @@ def ground_oracle(pos, quat_xyzw, points):
 
 @cache
 def oracle_distances():
+    """Return coal's distances [m] (300, 8) of `random_poses`, in the order of FLAGS."""
     pos, quat_xyzw, motors = random_poses()
     out = []
     for i in range(len(pos)):
         points = np.array([leg_points(leg, *motors[i, 3 * leg : 3 * leg + 3]) for leg in range(4)])
         bars = [links(p) for p in points]
-        uniform = min(coal_distance(a, b) for one, two in PAIRS for a in bars[one] for b in bars[two])
-        shells = [[box(*NOSE), box(*TRUNK), box(*(REAR_DRUMS if f > 0 else FRONT_DRUMS))] for f, _ in LEGS]
-        shell = min(coal_distance(a, b) for leg in range(4) for a in bars[leg] for b in shells[leg])
-        own = min(self_distance(p) for p in points)
-        out.append((*ground_oracle(pos[i], quat_xyzw[i], points), uniform, own, shell))
+        leg_leg = min(coal_distance(a, b) for i, j in NEIGHBOURS for a in bars[i] for b in bars[j])
+        shells = [[box(*NOSE), box(*TRUNK), box(*(REAR_DRUMS if front > 0 else FRONT_DRUMS))] for front, _ in LEGS]
+        leg_shell = min(coal_distance(a, b) for leg in range(4) for a in bars[leg] for b in shells[leg])
+        leg_self = min(self_distance(p) for p in points)
+        out.append((*ground_oracle(pos[i], quat_xyzw[i], points), leg_leg, leg_self, leg_shell))
     return np.array(out)
 
 
@@ -224,39 +222,39 @@ def oracle_distances():
 @pytest.mark.parametrize("category", range(8), ids=FLAGS)
 def test_category_distance_agrees_with_coal(category):
     ours = category_distances(random_poses())[:, category]
-    np.testing.assert_allclose(ours, oracle_distances()[:, category], atol=1e-5)
+    np.testing.assert_allclose(ours, oracle_distances()[:, category], atol=1e-5)  # [m]
 
 
-@pytest.mark.parametrize("bound", [0.0, 0.01, 0.1])
-def test_bound_cuts_off_and_changes_nothing_below(bound):
-    full = category_distances(random_poses())[:, 5:]
+@pytest.mark.parametrize("bound", [0.0, 0.01, 0.1])  # [m]
+def test_distances_between_links_with_a_bound_are_the_minimum_of_distance_and_bound(bound):
+    full = category_distances(random_poses())[:, 5:]  # LEG_LEG, LEG_SELF, LEG_SHELL
     np.testing.assert_allclose(category_distances(random_poses(), bound)[:, 5:], np.minimum(full, bound), atol=1e-6)
 
 
-@pytest.mark.parametrize("margin", [0.0, 0.02, 5.0])
+@pytest.mark.parametrize("margin", [0.0, 0.02, 5.0])  # [m]
 def test_flags_and_clearance_agree_with_coal(margin):
     pos, quat_xyzw, motors = random_poses()
     flags, clearance = collide(pos, quat_xyzw, np.degrees(motors), margin)
     expected = oracle_distances()
     np.testing.assert_allclose(clearance, np.minimum(expected.min(axis=1), margin), atol=1e-5)
-    clear_cut = np.abs(expected) > 1e-5
+    beyond_rounding = np.abs(expected) > 1e-5  # [m]
     raised = (flags[:, None] & MASKS) != 0
-    np.testing.assert_array_equal(raised[clear_cut], (expected < 0)[clear_cut])
+    np.testing.assert_array_equal(raised[beyond_rounding], (expected < 0)[beyond_rounding])
     assert raised.any(axis=0).all(), "every flag occurs among the poses"
 
 
-def test_double_precision_agrees():
+def test_flags_and_clearance_are_equal_in_double_precision():
     float64_kernels()
     module = importlib.import_module("jumper_warp.kernels_float64.collision.robot")
     pos, quat_xyzw, motors = random_poses()
     single = collide(pos, quat_xyzw, np.degrees(motors))
     double = collide(pos, quat_xyzw, np.degrees(motors), module=module)
-    np.testing.assert_allclose(single[1], double[1], atol=2e-6)
+    np.testing.assert_allclose(single[1], double[1], atol=2e-6)  # [m]
 
 
-LEVEL = (0.0, 0.0, 0.0, 1.0)
-STAND = (0, 45, 45) * 4
-CASES = {
+LEVEL = (0.0, 0.0, 0.0, 1.0)  # xyzw
+STAND = (0, 45, 45) * 4  # [deg] lateral, outer, inner of FL, FR, BL, BR
+CASES = {  # base position [m], quaternion xyzw, motor angles [deg], expected flags
     "standing": ((0, 0, 0.397), LEVEL, STAND, ()),
     # shell bottom 0.049 below the base, legs stretched out sideways above it
     "belly 1 mm in the ground": ((0, 0, 0.048), LEVEL, (90, 45, 45) * 4, ("BODY_GROUND",)),
@@ -291,7 +289,7 @@ def test_standing_clearance_by_hand():
 
 
 def workspace(count):
-    """Motor angles in degrees, shape (count, 12), over the range that the jumping tasks use."""
+    """Return motor angles [deg] (count, 12), random in the range that the jumping tasks use."""
     rng = np.random.default_rng(11)
     legs = [(rng.uniform(-15, 15, count), transversal_angles(rng, count, -10, 135, 0, 230)) for _ in range(4)]
     return np.hstack([np.column_stack(leg) for leg in legs])
@@ -302,9 +300,9 @@ def test_jumping_workspace_is_free_of_self_and_shell_contacts():
     assert not np.any(flags & ~collision_module.LEG_LEG)
 
 
-def test_legs_meet_in_the_jumping_workspace_only_when_one_reaches_far_inward():
+def test_legs_touch_in_the_jumping_workspace_rarely_and_only_where_one_reaches_far_inward():
     motors = workspace(20000)
-    inward = np.abs(motors[:, 2::3] - motors[:, 1::3]).max(axis=1)
+    inward = np.abs(motors[:, 2::3] - motors[:, 1::3]).max(axis=1)  # largest |inner - outer| of the legs [deg]
     flags, _ = collide((0, 0, 2), LEVEL, motors, margin=0.0)
     assert 0.0 < np.mean(flags != 0) < 0.01
     assert not np.any(flags[inward < 80.0])
@@ -314,7 +312,7 @@ def test_legs_meet_in_the_jumping_workspace_only_when_one_reaches_far_inward():
 
 
 @pytest.mark.parametrize(("height", "raised"), [(0.34, False), (0.36, True)])
-def test_shell_corner_meets_a_mesa(height, raised):
+def test_shell_corner_inside_a_mesa_raises_body_ground(height, raised):
     # the shell's bottom stands at 0.397 - 0.049 = 0.348; of it only the left rear drums, x -0.144, y 0.199, overlap
     # the mesa x < -0.13, 0.18 < y < 0.205; the paws stand outside
     heights = np.zeros((801, 801))
@@ -332,7 +330,7 @@ def test_slope_agrees_with_level_ground_seen_from_a_tilted_frame():
     tilted = tilt * Rotation.from_quat(quat_xyzw)
     ours = category_distances((tilt.apply(pos), tilted.as_quat(), motors), heights=heights)
     level = category_distances(random_poses())
-    np.testing.assert_allclose(ours[:, 1:5], level[:, 1:5], atol=2e-5)
-    # the shell is probed at the corners that are lower in the world, so both attitudes must agree on which these are
+    np.testing.assert_allclose(ours[:, 1:5], level[:, 1:5], atol=2e-5)  # [m], HOUSING_GROUND to SHANK_GROUND
+    # the shell is tested at the corners that are lower in the world, so both attitudes must agree on which these are
     same_side = Rotation.from_quat(quat_xyzw).as_matrix()[:, 2, 2] * tilted.as_matrix()[:, 2, 2] > 0
     np.testing.assert_allclose(ours[same_side, 0], level[same_side, 0], atol=2e-5)

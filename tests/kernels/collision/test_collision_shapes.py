@@ -11,20 +11,18 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.kernel
 def shape_kernel(
-    start_a: wp.array(dtype=wp.vec3),
-    end_a: wp.array(dtype=wp.vec3),
-    start_b: wp.array(dtype=wp.vec3),
-    end_b: wp.array(dtype=wp.vec3),
-    half: wp.array(dtype=wp.vec3),
-    segments: wp.array(dtype=float),
+    start_a: wp.array(dtype=wp.vec3), end_a: wp.array(dtype=wp.vec3), start_b: wp.array(dtype=wp.vec3),
+    end_b: wp.array(dtype=wp.vec3), half: wp.array(dtype=wp.vec3), segments: wp.array(dtype=float),
     boxes: wp.array(dtype=float),
-):
+):  # fmt: skip
+    """Write the distances [m] of segments a and b, and of segment a and the box at the origin; one thread per case."""
     i = wp.tid()
     segments[i] = wp.sqrt(collision_shapes.segment_segment_sq(start_a[i], end_a[i], start_b[i], end_b[i]))
     boxes[i] = wp.sqrt(collision_shapes.segment_box_sq(start_a[i], end_a[i], half[i]))
 
 
 def shape_distances(start_a, end_a, start_b, end_b, half):
+    """Return distances [m] (n,) of segments a to segments b, and of a to boxes of half extents `half`; all (n, 3)."""
     arrays = [wp.array(a, dtype=wp.vec3, device="cpu") for a in (start_a, end_a, start_b, end_b, half)]
     segments, boxes = (wp.zeros(len(start_a), dtype=float, device="cpu") for _ in range(2))
     wp.launch(shape_kernel, len(start_a), inputs=arrays, outputs=[segments, boxes], device="cpu")
@@ -32,7 +30,7 @@ def shape_distances(start_a, end_a, start_b, end_b, half):
 
 
 def random_segments(count=4000):
-    """Segments a and b and half extents; a quarter each: any, nearly parallel, along a box edge, and points."""
+    """Return start_a, end_a, start_b, end_b, half [m], (count, 3); quarters: parallel, a along y, a a point, any."""
     rng = np.random.default_rng(3)
     start_a, start_b = rng.uniform(-0.3, 0.3, (2, count, 3))
     step_a, step_b = rng.uniform(-0.3, 0.3, (2, count, 3))
@@ -47,7 +45,7 @@ def test_segment_distances_agree_with_coal():
     cases = random_segments()
     ours = shape_distances(*cases)[0]
     for distance, start_a, end_a, start_b, end_b in zip(ours, *cases[:4], strict=True):
-        expected = coal_distance(capsule(start_a, end_a, 0.01), capsule(start_b, end_b, 0.01)) + 0.02
+        expected = coal_distance(capsule(start_a, end_a, 0.01), capsule(start_b, end_b, 0.01)) + 0.02  # less the radii
         assert distance == pytest.approx(expected, abs=1e-5)
 
 
@@ -55,7 +53,7 @@ def test_box_distances_agree_with_coal():
     cases = random_segments()
     ours = shape_distances(*cases)[1]
     for distance, start, end, half in zip(ours, cases[0], cases[1], cases[4], strict=True):
-        expected = coal_distance(capsule(start, end, 0.01), box(-half, half)) + 0.01
+        expected = coal_distance(capsule(start, end, 0.01), box(-half, half)) + 0.01  # less the radius
         assert distance == pytest.approx(expected, abs=1e-5)
 
 
@@ -69,8 +67,8 @@ def test_box_distances_agree_with_coal():
     ],
 )
 def test_segment_distance_by_hand(start_b, end_b, expected):
-    start, end = vec3(0.0, 0.0, 0.0), vec3(1.0, 0.0, 0.0)
-    distance_sq = collision_shapes.segment_segment_sq(start, end, vec3(*start_b), vec3(*end_b))
+    start_a, end_a = vec3(0.0, 0.0, 0.0), vec3(1.0, 0.0, 0.0)
+    distance_sq = collision_shapes.segment_segment_sq(start_a, end_a, vec3(*start_b), vec3(*end_b))
     assert distance_sq == pytest.approx(expected**2, rel=1e-6)
 
 
@@ -84,5 +82,5 @@ def test_segment_distance_by_hand(start_b, end_b, expected):
     ],
 )
 def test_box_distance_by_hand(start, end, expected):
-    distance = shape_distances([start], [end], [start], [end], [(1, 2, 3)])[1]
+    distance = shape_distances([start], [end], [start], [end], half=[(1, 2, 3)])[1]
     assert distance[0] == pytest.approx(expected, abs=1e-6)

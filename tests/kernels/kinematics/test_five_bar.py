@@ -1,4 +1,4 @@
-"""The closed form of `kernels/five_bar.py` against hand figures and a numeric solution of the loop equations."""
+"""The closed form of `kinematics/five_bar.py` against hand calculations and numeric solutions of the loop equations."""
 
 import importlib
 import math
@@ -11,11 +11,11 @@ from jumper_warp.robot.description import load_description
 from jumper_warp.robot.model import leg_geometry, leg_geometry_array
 from jumper_warp.sim.precision import float64_kernels
 
-SAMPLES = 1000
+SAMPLES = 1000  # random configurations per leg
 POINTS = ("outer_knee", "inner_knee", "ankle")
 LINKS = ("outer_thigh", "inner_thigh", "outer_shank", "inner_shank")
 
-# columns that the test kernel writes
+# fields of `FiveBar` and `FiveBarBias` that the test kernel writes: (x, z) from column 0 on, SCALARS from column 24 on
 FIELDS = (
     ["outer_knee", "inner_knee", "ankle", "outer_shank", "inner_shank"]
     + ["outer_knee_do", "inner_knee_di", "ankle_do", "ankle_di"]
@@ -29,8 +29,11 @@ SCALARS = (
 
 
 def make_kernel(five_bar, geometry, scalar):
+    """Return a kernel that writes FIELDS and SCALARS to out (n, 34); arguments: modules of one precision."""
+
     @wp.func
     def put(row: int, col: int, value: scalar.vec2, out: wp.array2d(dtype=scalar.real)):
+        """Write (x, z) to two columns."""
         out[row, col] = value[0]
         out[row, col + 1] = value[1]
 
@@ -40,6 +43,7 @@ def make_kernel(five_bar, geometry, scalar):
         motors: wp.array2d(dtype=scalar.real),
         out: wp.array2d(dtype=scalar.real),
     ):
+        """Evaluate one leg, geo (1,), at motors (n, 4): outer, inner [rad], their rates [rad/s]; one thread per row."""
         i = wp.tid()
         leg = geo[0]
         loop = five_bar.five_bar(leg, motors[i, 0], motors[i, 1])
@@ -71,7 +75,7 @@ def make_kernel(five_bar, geometry, scalar):
 
 
 class Build:
-    """One precision of the kernels; calling it evaluates the loop of a leg."""
+    """Kernels of one precision; a call evaluates the loop of a leg. package: jumper_warp.kernels or kernels_float64."""
 
     def __init__(self, package: str) -> None:
         float64_kernels()
@@ -84,7 +88,7 @@ class Build:
         self.kernel = make_kernel(importlib.import_module(f"{package}.kinematics.five_bar"), geometry, scalar)
 
     def __call__(self, leg: int, motors: np.ndarray) -> dict[str, np.ndarray]:
-        """Return the fields for rows of (outer, inner [rad], their rates [rad/s]), as float64."""
+        """Return FIELDS (n, 2), SCALARS (n,) by name, as float64; motors (n, 4): outer, inner [rad], rates [rad/s]."""
         rows = wp.array(motors.astype(self.numpy_real), dtype=self.real, device="cpu")
         out = wp.zeros((len(motors), 34), dtype=self.real, device="cpu")
         wp.launch(self.kernel, len(motors), [self.legs[leg : leg + 1], rows], [out], device="cpu")
@@ -95,65 +99,68 @@ class Build:
 
 @pytest.fixture(scope="module", params=["jumper_warp.kernels", "jumper_warp.kernels_float64"])
 def build(request):
+    """Return the `Build` of each precision."""
     return Build(request.param)
 
 
 # --- The reference: the loop equations, solved for the shanks' rotations by Newton's method and continuation. ---
+# leg: `leg_geometry` of a leg; outer, inner [rad]: motor angles (n,); shanks [rad]: rotations about +y from -z, (2, n).
 
 
-def direction(turn):
-    """Return the direction (x, z) of a link turned by `turn` [rad] about +y from -z, shape (2, n)."""
-    return np.array([-np.sin(turn), -np.cos(turn)])
+def direction(angle):
+    """Return the unit vectors (x, z), (2, n), along links rotated by `angle` [rad] (n,) about +y from -z."""
+    return np.array([-np.sin(angle), -np.cos(angle)])
 
 
-def slope(turn):
-    return np.array([-np.cos(turn), np.sin(turn)])
+def direction_derivative(angle):
+    """Return d direction / d angle, (2, n)."""
+    return np.array([-np.cos(angle), np.sin(angle)])
 
 
 def solve_loop(leg, outer, inner, shanks, iterations=4):
-    """Return the shanks' rotations, shape (2, n), that close the loop; accepts complex angles."""
+    """Return the shanks' rotations that close the loop, by Newton's method from `shanks`; accepts complex angles."""
     gap_of_axes = np.array([leg["outer_x"] - leg["inner_x"], 0.0])[:, None]
     thighs = leg["thigh"] * (direction(-leg["front"] * outer) - direction(leg["front"] * inner))
     for _ in range(iterations):
         gap = gap_of_axes + thighs + leg["shank"] * (direction(shanks[0]) - direction(shanks[1]))
-        a, b = leg["shank"] * slope(shanks[0]), -leg["shank"] * slope(shanks[1])
+        a, b = leg["shank"] * direction_derivative(shanks[0]), -leg["shank"] * direction_derivative(shanks[1])
         det = a[0] * b[1] - a[1] * b[0]
         shanks = shanks - np.array([gap[0] * b[1] - gap[1] * b[0], a[0] * gap[1] - a[1] * gap[0]]) / det
     return shanks
 
 
 def assemble(leg, outer, inner):
-    """Return the shanks' rotations, followed from the default pose (45, 45 degrees), which hangs below the knees."""
+    """Return the shanks' rotations on the branch of the default pose (45, 45 degrees), by continuation in 61 steps."""
     start = math.radians(45.0)
-    half_base = 0.045 + 0.175 * math.sin(start)
-    lean = leg["front"] * math.asin(half_base / 0.3)
-    shanks = np.array([np.full_like(outer, lean), np.full_like(outer, -lean)])
-    for part in np.linspace(0.0, 1.0, 61):
-        shanks = solve_loop(leg, start + part * (outer - start), start + part * (inner - start), shanks)
+    half_base = 0.045 + 0.175 * math.sin(start)  # [m] half the distance between the knees
+    start_angle = leg["front"] * math.asin(half_base / 0.3)
+    shanks = np.array([np.full_like(outer, start_angle), np.full_like(outer, -start_angle)])
+    for fraction in np.linspace(0.0, 1.0, 61):
+        shanks = solve_loop(leg, start + fraction * (outer - start), start + fraction * (inner - start), shanks)
     return shanks
 
 
 def configuration(leg, outer, inner, shanks):
-    """Return points [m], (2, n), and rotations of links [rad], (n,), by name."""
+    """Return POINTS [m] (2, n) and rotations of LINKS [rad] (n,) by name; shanks: start of Newton's method."""
     shanks = solve_loop(leg, outer, inner, shanks)
-    turns = {"outer_thigh": -leg["front"] * outer, "inner_thigh": leg["front"] * inner}
-    turns |= {"outer_shank": shanks[0], "inner_shank": shanks[1]}
-    outer_knee = np.array([[leg["outer_x"]], [0.0]]) + leg["thigh"] * direction(turns["outer_thigh"])
-    inner_knee = np.array([[leg["inner_x"]], [0.0]]) + leg["thigh"] * direction(turns["inner_thigh"])
+    rotations = {"outer_thigh": -leg["front"] * outer, "inner_thigh": leg["front"] * inner}
+    rotations |= {"outer_shank": shanks[0], "inner_shank": shanks[1]}
+    outer_knee = np.array([[leg["outer_x"]], [0.0]]) + leg["thigh"] * direction(rotations["outer_thigh"])
+    inner_knee = np.array([[leg["inner_x"]], [0.0]]) + leg["thigh"] * direction(rotations["inner_thigh"])
     ankle = outer_knee + leg["shank"] * direction(shanks[0])
-    return {"outer_knee": outer_knee, "inner_knee": inner_knee, "ankle": ankle} | turns
+    return {"outer_knee": outer_knee, "inner_knee": inner_knee, "ankle": ankle} | rotations
 
 
 def derivative(leg, outer, inner, shanks, along):
-    """Return d configuration along (d outer, d inner), by a complex step."""
+    """Return the derivative of `configuration` by motor angles along (d outer, d inner), by a complex step."""
     step = 1.0e-20
     moved = configuration(leg, outer + 1j * step * along[0], inner + 1j * step * along[1], shanks + 0j)
     return {name: np.imag(value) / step for name, value in moved.items()}
 
 
 def second_derivative(leg, outer, inner, shanks, along):
-    """Return d^2 configuration along a straight line in motor angles: fourth-order differences of the complex step."""
-    h = 5.0e-4
+    """Return the second derivative of `configuration` likewise: fourth-order differences of `derivative`."""
+    h = 5.0e-4  # step along the line
     total = {name: 0.0 for name in POINTS + LINKS}
     for offset, weight in ((-2, 1.0), (-1, -8.0), (1, 8.0), (2, -1.0)):
         at = derivative(leg, outer + offset * h * along[0], inner + offset * h * along[1], shanks, along)
@@ -162,7 +169,7 @@ def second_derivative(leg, outer, inner, shanks, along):
 
 
 def random_motors(seed):
-    """Return rows of outer, inner [rad], outer rate, inner rate [rad/s]; transversal -10..140, sum 0..240 degrees."""
+    """Return (SAMPLES, 4): outer, inner [rad], their rates [rad/s]; angles -10..140, their sum 0..240 degrees."""
     rng = np.random.default_rng(seed)
     angles = rng.uniform(-10.0, 140.0, (4 * SAMPLES, 2))
     angles = angles[(angles.sum(1) >= 0.0) & (angles.sum(1) <= 240.0)][:SAMPLES]
@@ -171,22 +178,23 @@ def random_motors(seed):
 
 @pytest.fixture(scope="module", params=range(4), ids=["FL", "FR", "BL", "BR"])
 def case(request, build):
-    """Return (fields under test, reference leg, outer, inner, rates, shanks, tolerance)."""
+    """Return (kernel's fields, leg geometry, outer (n,), inner (n,), rates (2, n), shanks (2, n), tolerance)."""
     leg = leg_geometry(load_description())[request.param]
-    # the reference starts from the very numbers that the kernel reads
+    # rounded to the kernel's precision, so that kernel and reference have the same inputs
     motors = random_motors(request.param).astype(build.numpy_real).astype(np.float64)
     outer, inner, rates = motors[:, 0], motors[:, 1], motors[:, 2:].T
     return build(request.param, motors), leg, outer, inner, rates, assemble(leg, outer, inner), build.tolerance
 
 
-def assert_close(got, want, tolerance):
-    """Compare relative to the reference where that exceeds 1 (second derivatives grow toward a stretched leg)."""
-    np.testing.assert_allclose(got, np.moveaxis(np.asarray(want), 0, -1), rtol=tolerance, atol=tolerance)
+def assert_close(actual, expected, tolerance):
+    """Assert |actual - expected| <= tolerance (1 + |expected|); actual (n, 2) or (n,), expected (2, n) or (n,)."""
+    np.testing.assert_allclose(actual, np.moveaxis(np.asarray(expected), 0, -1), rtol=tolerance, atol=tolerance)
 
 
-# --- Hand figures ---
+# --- Hand calculations ---
 
 
+# depth [m] of the ankle = 0.175 cos a + sqrt(0.3^2 - (0.045 + 0.175 sin a)^2) at outer = inner = a [deg]
 @pytest.mark.parametrize(("angle", "depth"), [(0.0, 0.4716), (45.0, 0.3718), (57.0, 0.3260)])
 def test_ankle_of_symmetric_leg_by_hand(build, angle, depth):
     motors = np.radians([[angle, angle, 0.0, 0.0]])
@@ -198,19 +206,19 @@ def test_ankle_of_symmetric_leg_by_hand(build, angle, depth):
 def test_jacobian_of_symmetric_leg_by_hand(build):
     # depth = 0.175 cos a + sqrt(0.09 - w^2), w = 0.045 + 0.175 sin a; at 45 degrees w = 0.168744, sqrt = 0.248046
     fields = build(0, np.radians([[45.0, 45.0, 0.0, 0.0]]))
-    rise = fields["ankle_do"][0, 1] + fields["ankle_di"][0, 1]
+    rise = fields["ankle_do"][0, 1] + fields["ankle_di"][0, 1]  # [m/rad] d ankle z / d a
     assert rise == pytest.approx(0.123744 + 0.168744 * 0.123744 / 0.248046, abs=2.0e-6)
 
 
 def test_parallel_thighs_move_ankle_on_a_circle(build):
-    # outer = -inner keeps knees 0.09 apart and level: the ankle moves as the thigh tips do, 0.175 m/rad
-    fields = build(0, np.array([[0.0, 0.0, 1.0, -1.0]]))
+    # outer = -inner keeps knees 0.09 m apart and level: the ankle moves as the thigh tips do, 0.175 m/rad
+    fields = build(0, np.array([[0.0, 0.0, 1.0, -1.0]]))  # at 0 rad, 1 and -1 rad/s
     assert fields["ankle_do"][0] - fields["ankle_di"][0] == pytest.approx([0.175, 0.0], abs=1.0e-6)
     assert fields["ankle_acc"][0] == pytest.approx([0.0, 0.175], abs=1.0e-6)
 
 
 def test_coinciding_knees_give_finite_values(build):
-    angle = -math.asin(0.045 / 0.175)
+    angle = -math.asin(0.045 / 0.175)  # both knees at the middle of the axes, which are 2 x 0.045 m apart
     fields = build(0, np.array([[angle, angle, 10.0, -10.0]]))
     assert all(np.isfinite(value).all() for value in fields.values())
 

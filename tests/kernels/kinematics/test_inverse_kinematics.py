@@ -1,4 +1,7 @@
-"""Inverse kinematics against Pinocchio, a sampled search for the nearest reachable point, and hand figures."""
+"""Inverse kinematics against Pinocchio, a sampled search for the nearest reachable point, and hand calculations.
+
+Motor angles are (12, n): lateral, outer, inner of FL, FR, BL, BR for n robots. Paw positions are (4, n, 3) [m].
+"""
 
 import importlib
 import math
@@ -23,22 +26,18 @@ ROBOTS = 200
 
 
 def make_leg_kernel(package):
-    """Return a kernel that evaluates the functions of one leg at given joint angles and ankle velocities."""
+    """Return a kernel that evaluates the functions of `kinematics.leg` at joint angles and ankle velocities."""
     names = ("kinematics.five_bar", "kinematics.geometry", "scalar", "kinematics.leg")
     five_bar, geometry, scalar, leg_kinematics = (importlib.import_module(f"{package}.{name}") for name in names)
     real, vec2, vec3 = scalar.real, scalar.vec2, scalar.vec3
 
     @wp.kernel(module="unique", enable_backward=False)
     def leg_kernel(
-        legs: wp.array(dtype=geometry.LegGeometry),
-        motors: wp.array2d(dtype=real),
-        ankle_vel: wp.array2d(dtype=vec3),
-        ankle: wp.array2d(dtype=vec3),
-        jacobian: wp.array2d(dtype=scalar.mat33),
-        knees: wp.array2d(dtype=vec2),
-        motor_rates: wp.array2d(dtype=vec3),
-        knee_rates: wp.array2d(dtype=vec2),
-    ):
+        legs: wp.array(dtype=geometry.LegGeometry), motors: wp.array2d(dtype=real), ankle_vel: wp.array2d(dtype=vec3),
+        ankle: wp.array2d(dtype=vec3), jacobian: wp.array2d(dtype=scalar.mat33), knees: wp.array2d(dtype=vec2),
+        motor_rates: wp.array2d(dtype=vec3), knee_rates: wp.array2d(dtype=vec2),
+    ):  # fmt: skip
+        """Write the outputs of `Build.legs_at`; launch over (4, n). motors [rad]: (12, n); ankle_vel [m/s]: (4, n)."""
         k, i = wp.tid()
         geo = legs[k]
         angles = vec3(motors[3 * k, i], motors[3 * k + 1, i], motors[3 * k + 2, i])
@@ -56,9 +55,9 @@ def make_leg_kernel(package):
 
 
 class Build:
-    """One precision of the kernels, launched on numpy arrays; robots are the last index of joint arrays."""
+    """Kernels of one precision, launched on NumPy arrays; package: jumper_warp.kernels or kernels_float64."""
 
-    def __init__(self, package):
+    def __init__(self, package: str):
         float64_kernels()
         self.ik = importlib.import_module(f"{package}.kinematics.inverse")
         self.scalar = importlib.import_module(f"{package}.scalar")
@@ -72,24 +71,32 @@ class Build:
             setattr(self.limits, f"{name}_upper", math.radians(upper))
 
     def array(self, values, dtype):
+        """Return values as a Warp array of this precision; dtype: a Warp scalar or vector type."""
         return wp.array(np.asarray(values, np.float64 if self.double else np.float32), dtype=dtype, device="cpu")
 
     def zeros(self, rows, n, dtype=None):
+        """Return a Warp array of zeros, (rows, n), by default of scalars of this precision."""
         return wp.zeros((rows, n), dtype=dtype or self.scalar.real, device="cpu")
 
     def solve(self, paws, base_pos=None, base_quat=None):
-        """Return motors (12, n), knees (8, n), reachable (4, n), residual (4, n) for paws (4, n, 3)."""
+        """Return motors (12, n), knees (8, n) [rad], reachable (4, n), residual [m] (4, n) for paws (4, n, 3) [m].
+
+        Paws are in the world frame if base_pos [m] (n, 3) and base_quat (n, 4) are passed, else in the body frame.
+        """
         n, vec3, quat = paws.shape[1], self.scalar.vec3, self.scalar.quat
         in_world = base_pos is not None
         pos = self.array(base_pos if in_world else np.zeros((n, 3)), vec3)
-        turn = self.array(base_quat if in_world else np.zeros((n, 4)), quat)
+        orientation = self.array(base_quat if in_world else np.zeros((n, 4)), quat)
         out = [self.zeros(12, n), self.zeros(8, n), self.zeros(4, n, wp.int32), self.zeros(4, n)]
-        inputs = [self.legs, self.limits, pos, turn, self.array(paws, vec3), int(in_world)]
+        inputs = [self.legs, self.limits, pos, orientation, self.array(paws, vec3), int(in_world)]
         wp.launch(self.ik.inverse_kinematics_kernel, (4, n), inputs, out, device="cpu")
         return [array.numpy() for array in out]
 
     def legs_at(self, motors, ankle_vel=None):
-        """Return ankle (4, n, 3), jacobian and knees for motors (12, n), and motor and knee rates for velocities."""
+        """Return ankles, Jacobians, knees (outer, inner), motor rates and knee rates of all legs, each (4, n, ...).
+
+        motors [rad]: (12, n); ankle_vel [m/s]: (4, n, 3), None: zero; all in the body frame.
+        """
         n, s = motors.shape[1], self.scalar
         inputs = [self.legs, self.array(motors, s.real)]
         inputs.append(self.array(np.zeros((4, n, 3)) if ankle_vel is None else ankle_vel, s.vec3))
@@ -100,21 +107,24 @@ class Build:
 
 @pytest.fixture(scope="module", params=["jumper_warp.kernels", "jumper_warp.kernels_float64"])
 def build(request):
+    """Return the `Build` of each precision."""
     return Build(request.param)
 
 
 @pytest.fixture(scope="module")
 def double():
+    """Return the `Build` of double precision."""
     return Build("jumper_warp.kernels_float64")
 
 
 @pytest.fixture(scope="module")
 def robot():
+    """Return Pinocchio's model of the robot, the oracle."""
     return build_pinocchio()
 
 
 def random_motors(n, seed=0):
-    """Return motor angles [rad] within limits, shape (12, n)."""
+    """Return random motor angles [rad] within the hard stops, (12, n)."""
     rng = np.random.default_rng(seed)
     thighs = rng.uniform(*TRANSVERSAL, (16 * n, 2))
     thighs = thighs[(thighs.sum(1) >= SUM[0]) & (thighs.sum(1) <= SUM[1])][: 4 * n].reshape(4, n, 2)
@@ -123,13 +133,13 @@ def random_motors(n, seed=0):
 
 
 def random_bases(n, seed=1):
-    """Return base positions (n, 3) [m] and quaternions xyzw (n, 4)."""
+    """Return random base positions [m] (n, 3) and quaternions xyzw (n, 4)."""
     rng = np.random.default_rng(seed)
     return rng.uniform(-1.0, 1.0, (n, 3)), Rotation.random(n, random_state=seed).as_quat()
 
 
 def reached_by_pinocchio(robot, q):
-    """Return the far ends of inner and outer shanks in the world, both (4, 3) [m]."""
+    """Return the ankle ends of inner and outer shanks in the world, (2, 4, 3) [m]; q: Pinocchio's configuration."""
     pin.forwardKinematics(robot.model, robot.data, q)
     ends = [
         [robot.data.oMi[c.joint1_id].act(c.joint1_placement).translation for c in robot.constraints],
@@ -138,7 +148,7 @@ def reached_by_pinocchio(robot, q):
     return np.array(ends)
 
 
-# --- Forward: hand figures and derivatives ---
+# --- Forward: hand calculations and derivatives ---
 
 
 def test_paw_positions_of_default_pose_by_hand(build):
@@ -158,20 +168,20 @@ def test_positive_lateral_angle_swings_paws_outward_about_the_hip(build):
 
 
 def test_jacobian_matches_central_differences(double):
-    motors, h = random_motors(ROBOTS), 1.0e-5
+    motors, size = random_motors(ROBOTS), 1.0e-5  # [rad]
     jacobian = double.legs_at(motors)[1]
     for joint in range(3):
         step = np.zeros((12, 1))
-        step[joint::3] = h
-        slope = (double.legs_at(motors + step)[0] - double.legs_at(motors - step)[0]) / (2.0 * h)
-        np.testing.assert_allclose(jacobian[:, :, :, joint], slope, atol=2.0e-8)
+        step[joint::3] = size
+        difference = (double.legs_at(motors + step)[0] - double.legs_at(motors - step)[0]) / (2.0 * size)
+        np.testing.assert_allclose(jacobian[:, :, :, joint], difference, atol=2.0e-8)  # [m/rad]
 
 
 # --- Position: reachable targets ---
 
 
 def test_inverse_kinematics_closes_the_loop_in_pinocchio(build, robot):
-    tolerance = 1.0e-12 if build.double else 5.0e-6
+    tolerance = 1.0e-12 if build.double else 5.0e-6  # [m]
     base_pos, base_quat = random_bases(ROBOTS)
     want = np.empty((4, ROBOTS, 3))
     for i, motors in enumerate(random_motors(ROBOTS).T):
@@ -196,8 +206,8 @@ def test_every_paw_position_within_limits_is_reached(build):
     np.testing.assert_allclose(build.legs_at(motors)[0], paws, atol=1.0e-12 if build.double else 1.0e-6)
 
 
-def test_inverse_kinematics_inverts_forward_kinematics_of_a_stance(build):
-    # knees outward: both knees bent, as for every thigh at 10 degrees or more
+def test_inverse_kinematics_inverts_forward_kinematics_with_bent_knees(build):
+    # thighs at 10 degrees or more bend both knees
     rng = np.random.default_rng(3)
     want = np.radians(rng.uniform(10.0, 100.0, (12, 500)))
     motors, knees, _, _ = build.solve(build.legs_at(want)[0])
@@ -209,7 +219,7 @@ def test_inverse_kinematics_inverts_forward_kinematics_of_a_stance(build):
 
 
 def sampled_ankle(geo, q):
-    """Return ankles [m] in the body frame, (..., 3), for (lateral, outer, inner) [rad]."""
+    """Return ankles [m] in the body frame, (..., 3), for q (..., 3): lateral, outer, inner [rad]."""
     lateral, outer, inner = np.moveaxis(q, -1, 0)
     front, thigh = geo["front"], geo["thigh"]
     outer_knee = geo["outer_x"] + front * thigh * np.sin(outer) - 1j * thigh * np.cos(outer)
@@ -222,7 +232,7 @@ def sampled_ankle(geo, q):
 
 
 def into_limits(q):
-    """Return joint angles moved within limits."""
+    """Return joint angles [rad] (..., 3) clipped to the hard stops; an excess of the sum is halved between its two."""
     lower, upper = np.radians([LATERAL, TRANSVERSAL, TRANSVERSAL]).T
     clamped = np.clip(q, lower, upper)
     total = clamped[..., 1] + clamped[..., 2]
@@ -231,7 +241,7 @@ def into_limits(q):
 
 
 def nearest_by_sampling(geo, targets):
-    """Return the distance [m] to the nearest reachable point: a grid, then finer ones around its 20 best points."""
+    """Return distances [m] (n,) of targets (n, 3) to the reachable set, by finer grids around the 20 best points."""
     axes = [np.radians(np.linspace(*limits, n)) for limits, n in ((LATERAL, 41), (TRANSVERSAL, 52), (TRANSVERSAL, 52))]
     grid = into_limits(np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3))
     centers = grid[cKDTree(sampled_ankle(geo, grid)).query(targets, 20)[1]]
@@ -244,20 +254,20 @@ def nearest_by_sampling(geo, targets):
     return miss.min(axis=(1, 2))
 
 
-@pytest.mark.parametrize("leg", [0, 3])
+@pytest.mark.parametrize("leg", [0, 3], ids=["FL", "BR"])
 def test_nearest_reachable_point_is_within_2_mm_of_a_sampled_search(build, leg):
     geo = leg_geometry(load_description())[leg]
     targets = np.array(geo["hip"]) + np.random.default_rng(leg).uniform(-0.7, 0.7, (120, 3))
     motors, _, reachable, residual = build.solve(np.tile(targets, (4, 1, 1)))
     nearest = nearest_by_sampling(geo, targets)
-    assert 0 < reachable[leg].sum() < 60
-    assert (residual[leg] - nearest).max() < 2.0e-3
+    assert 0 < reachable[leg].sum() < 60  # of 120: most targets are out of reach
+    assert (residual[leg] - nearest).max() < 2.0e-3  # [m]
     assert (residual[leg] - nearest).min() > -3.0e-4  # the sampled search stops near 0.2 mm
     ankle = sampled_ankle(geo, motors[3 * leg : 3 * leg + 3].T.astype(np.float64))
     np.testing.assert_allclose(np.linalg.norm(ankle - targets, axis=1), residual[leg], atol=2.0e-6)
 
 
-def test_reachable_flag_agrees_with_a_zero_distance(build):
+def test_reachable_flag_is_set_where_the_residual_is_below_10_micrometres(build):
     paws = build.legs_at(random_motors(1000, seed=6))[0]
     far_paws = paws + np.array([0.0, 0.0, -1.0])
     for targets in (paws, far_paws):
@@ -278,14 +288,14 @@ def test_target_below_reach_gives_stretched_leg(build):
 def test_every_pose_is_within_limits(build):
     targets = np.random.default_rng(7).uniform(-1.0, 1.0, (4, 500, 3))
     motors = np.degrees(build.solve(targets)[0].astype(np.float64)).reshape(4, 3, 500)
-    slack = 1.0e-4
+    slack = 1.0e-4  # [deg]
     total = motors[:, 1] + motors[:, 2]
     assert motors[:, 0].min() > LATERAL[0] - slack and motors[:, 0].max() < LATERAL[1] + slack
     assert motors[:, 1:].min() > TRANSVERSAL[0] - slack and motors[:, 1:].max() < TRANSVERSAL[1] + slack
     assert total.min() > SUM[0] - slack and total.max() < SUM[1] + slack
 
 
-@pytest.mark.parametrize("depth", [1.0e3, 1.0e12, 1.0e30])
+@pytest.mark.parametrize("depth", [1.0e3, 1.0e12, 1.0e30])  # [m]
 def test_target_far_below_stretches_the_legs_under_the_hips(build, depth):
     motors, _, reachable, _ = build.solve(np.tile([0.0, 0.0, -depth], (4, 1, 1)))
     assert not reachable.any()
@@ -304,13 +314,13 @@ def test_non_finite_target_puts_the_ankle_0_3_below_the_axes(build):
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1.0e30, -1.0e30, 0.0])
 @pytest.mark.parametrize("axes", [[0], [1], [2], [0, 1, 2]])
-def test_non_finite_targets_give_finite_unreachable_poses(build, value, axes):
+def test_non_finite_huge_and_central_targets_give_finite_unreachable_poses(build, value, axes):
     targets = np.array([leg["hip"] for leg in leg_geometry(load_description())])[:, None]
     targets[:, :, axes] = value  # value 0: the centre of the body and points level with the hips
     motors, knees, reachable, residual = build.solve(targets)
     assert np.isfinite(motors).all() and np.isfinite(knees).all()
     assert not reachable.any()
-    assert not np.isnan(residual).any() and (residual > 0.05).all()
+    assert not np.isnan(residual).any() and (residual > 0.05).all()  # [m]
 
 
 def test_non_finite_base_gives_finite_unreachable_poses(build):
@@ -331,7 +341,7 @@ def test_inverse_velocity_undoes_the_jacobian(build):
     jacobian = build.legs_at(motors)[1]
     rates = build.legs_at(motors, wanted)[3]
     reached = np.einsum("lnij,lnj->lni", jacobian, rates)
-    np.testing.assert_allclose(reached, wanted, atol=1.0e-12 if build.double else 2.0e-5)
+    np.testing.assert_allclose(reached, wanted, atol=1.0e-12 if build.double else 2.0e-5)  # [m/s]
 
 
 def test_inverse_velocity_of_a_stretched_leg_is_finite_and_damped(build):
@@ -348,16 +358,16 @@ def test_inverse_velocity_of_a_stretched_leg_is_finite_and_damped(build):
     assert (np.abs(rates[np.arange(4), straight, 1]) < 5.0).all()
 
 
-def test_rates_that_hold_the_paws_still_do_so_in_pinocchio(build, robot):
-    tolerance = 1.0e-9 if build.double else 5.0e-5
+def test_rates_that_cancel_the_base_twist_hold_the_ankles_still_in_pinocchio(build, robot):
+    tolerance = 1.0e-9 if build.double else 5.0e-5  # [m/s]
     rng = np.random.default_rng(9)
     n = 50
     base_pos, base_quat = random_bases(n)
     lin, ang = rng.uniform(-1.0, 1.0, (2, n, 3))
     motors = np.radians(rng.uniform(10.0, 100.0, (12, n)))
     to_body = Rotation.from_quat(base_quat).inv()
-    swept = to_body.apply(lin) + np.cross(to_body.apply(ang), build.legs_at(motors)[0])
-    rates, knee_rates = build.legs_at(motors, -swept)[3:]
+    rigid_velocity = to_body.apply(lin) + np.cross(to_body.apply(ang), build.legs_at(motors)[0])  # of ankles, body axes
+    rates, knee_rates = build.legs_at(motors, -rigid_velocity)[3:]
     for i in range(n):
         q = robot.configuration(base_pos[i], base_quat[i], motors[:, i])
         v = np.zeros(robot.model.nv)
