@@ -91,11 +91,11 @@ def test_the_apex_is_found_and_paid_exactly_once(speed):
     assert apex - sampled - 1e-5 <= tasks["max_height"][-1] <= apex + 1e-5
     assert np.flatnonzero(paid).tolist() == at_apex.tolist()
     reached = float(tasks["max_height"][-1])
-    assert paid.sum() == pytest.approx(rewards.height_kernel(reached - 0.9, *HEIGHT))
+    assert paid.sum() == pytest.approx(rewards.height_closeness(reached - 0.9, *HEIGHT))
     # est jump height: from takeoff (in flight from the third view on) to the step before the apex
     assert np.flatnonzero(estimate).tolist() == list(range(2, at_apex[0]))
     # a projectile's estimate does not change: the final height all the way
-    exact = rewards.height_kernel(apex - 0.9, *HEIGHT)
+    exact = rewards.height_closeness(apex - 0.9, *HEIGHT)
     np.testing.assert_allclose(estimate[2 : at_apex[0]], exact, rtol=1e-3)
 
 
