@@ -88,9 +88,7 @@ def write_start(
     start.pos = wp.vec3(0.0, 0.0, surface(start.ground, 0.0, 0.0)[0] + settings.height)
     start.quat = quat
     start.ang_vel = wp.vec3(
-        uniform(rng, streams.SPIN, -w, w),
-        uniform(rng, streams.SPIN + 1, -w, w),
-        uniform(rng, streams.SPIN + 2, -w, w),
+        uniform(rng, streams.SPIN, -w, w), uniform(rng, streams.SPIN + 1, -w, w), uniform(rng, streams.SPIN + 2, -w, w)
     )
     start.com_vel = wp.cross(start.ang_vel, wp.quat_rotate(quat, arrays.body_com[rng.world * BODIES]))
     start.default_legs = uniform(rng, streams.DEFAULT_LEGS, 0.0, 1.0) < settings.default_pose_probability

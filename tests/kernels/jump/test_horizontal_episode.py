@@ -6,16 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from jump_helpers import (
-    DEG,
-    edit_coordinates,
-    edit_episodes,
-    ending_names,
-    episodes_of,
-    make_env,
-    only,
-    random_actions,
-)
+from jump_helpers import DEG, edit_coordinates, edit_episodes, ending_names, episodes_of, make_env, only, random_actions
 from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task

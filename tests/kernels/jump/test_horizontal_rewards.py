@@ -30,12 +30,7 @@ paid = Table([term.func for term in TASK.rewards], float)
 
 @pytest.mark.parametrize(
     ("miss", "expected"),
-    [
-        (0.0, 1.6),
-        (0.03, E(-0.04) + 0.6 * E(-1.0)),
-        (0.15, E(-1.0) + 0.6 * E(-25.0)),
-        (0.30, E(-4.0)),
-    ],
+    [(0.0, 1.6), (0.03, E(-0.04) + 0.6 * E(-1.0)), (0.15, E(-1.0) + 0.6 * E(-25.0)), (0.30, E(-4.0))],
 )
 def test_tracking_has_a_wide_and_a_narrow_kernel_and_is_paid_after_takeoff(miss, expected):
     # 3-4-5 beside the goal; the height does not matter

@@ -2,11 +2,7 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jump_helpers import DEG, Table, functions, make_episode, make_view
-from jump_oracle import (
-    FLIGHT,
-    LANDED,
-    STANCE,
-)
+from jump_oracle import FLIGHT, LANDED, STANCE
 from jumper_warp.kernels.jump import terminations
 from jumper_warp.registry import make_task
 
