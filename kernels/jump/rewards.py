@@ -36,9 +36,6 @@ def should_rest(state: JumpState) -> bool:
     return state.phase == STANCE and not commanded(state)
 
 
-# ---------------------------------------------------------------- vertical jump
-
-
 @wp.func
 def height_closeness(error: float, std_fine: float, scale_sharp: float, std_wide: float) -> float:
     """Return phi_fine + 3 psi_sharp + phi_wide of a height error, all [m]; phi_wide gives low jumps a slope."""
@@ -134,9 +131,6 @@ def post_landing_posture(robot: RobotView, state: JumpState, std: float, shift: 
     return phi(posture_offset(robot, shift), std)
 
 
-# ---------------------------------------------------------------- horizontal jump
-
-
 @wp.func
 def tracking(robot: RobotView, state: JumpState, std_wide: float, std_fine: float, fine_weight: float) -> float:
     """Tracking: phi_wide + fine_weight phi_fine of the distance from the goal [m], after takeoff."""
@@ -193,9 +187,6 @@ def standing_posture(robot: RobotView, state: JumpState, std: float, shift: floa
     if not should_rest(state):
         return 0.0
     return phi(posture_offset(robot, shift), std)
-
-
-# ---------------------------------------------------------------- impacts and landing
 
 
 @wp.func
@@ -299,9 +290,6 @@ def capture_point(robot: RobotView, state: JumpState, std: float) -> float:
         x -= 0.25 * robot.paw_pos[k, 0]
         y -= 0.25 * robot.paw_pos[k, 1]
     return phi(wp.length(wp.vec2(x, y)), std)
-
-
-# ---------------------------------------------------------------- standing quietly
 
 
 @wp.func

@@ -73,9 +73,6 @@ def contacts(robot: RobotView, state: Any) -> wp.vec4:
     return robot.contact
 
 
-# ---------------------------------------------------------------- randomised parameters, of order 1, 0 if nominal
-
-
 @wp.func
 def drawn_mass(robot: RobotParameters, world: int) -> wp.vec2:
     """Mass added to the base, and to all legs together [kg]."""

@@ -95,9 +95,6 @@ def to_block(scenes, request):
     return scenes["block", request.param]
 
 
-# ---------------------------------------------------------------- platforms
-
-
 def test_all_paws_stand_on_the_platform_away_from_its_edges(on_platform):
     taken = on_platform.taken
     paws, height = on_platform.paws[taken], on_platform.of_block("height")
@@ -137,9 +134,6 @@ def test_paws_land_clear_of_the_platform_where_there_is_one(on_platform):
     assert not on_platform.taken[widest < CLEARANCE - 1e-4].any()
     assert on_platform.taken[widest > CLEARANCE + ROOM - MARGIN + 1e-4].all()
     assert 0.1 < on_platform.taken.mean() < 0.9
-
-
-# ---------------------------------------------------------------- blocks
 
 
 def test_a_block_is_under_all_paws_at_the_goal(to_block):
@@ -190,9 +184,6 @@ def test_blocks_have_uniform_heights_masses_and_frictions(to_block):
         assert kstest(share, "uniform").pvalue > 1e-3, name
     np.testing.assert_array_equal(to_block.of_block("center"), to_block.of_block("start"))
     assert not to_block.of_block("velocity").any()
-
-
-# ---------------------------------------------------------------- both
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -252,9 +243,6 @@ def test_where_there_is_no_block_nothing_of_one_appears():
     for name, values in after.items():
         assert not values[none].any(), name
     assert all(np.isfinite(values).all() for values in after.values())
-
-
-# ---------------------------------------------------------------- standing there
 
 
 def hold(env, steps=20):

@@ -52,9 +52,6 @@ def angle_between(one, other):
     return np.abs(np.angle(np.exp(1j * (one - other))))
 
 
-# ---------------------------------------------------------------- turning the world
-
-
 def test_a_turned_world_runs_alike():
     """Two robots, one turned by 137 degrees, jump off under the same random actions."""
     env = make_env(2, task=TASK)
@@ -92,9 +89,6 @@ def test_an_evaluation_starts_with_its_heading_and_goal(turn):
     assert angle_between(yaw_of(arrays), turn * DEG).max() < 1e-5
     assert not env.obs[:, :2].any()  # the jump is commanded later
     assert (arrays["next_jump_step"] == 0).all()
-
-
-# ---------------------------------------------------------------- another jump
 
 
 def land(env, **fields):
@@ -238,9 +232,6 @@ def test_another_jump_that_is_overdue_begins(env):
     np.testing.assert_array_equal(env.task_arrays()["jumps"][going], (np.arange(N) % 3 + 1)[going])
 
 
-# ---------------------------------------------------------------- the caller's next jump
-
-
 def test_a_command_changes_chosen_landed_worlds(env):
     land(env, steps=1 + np.arange(N))
     phase = np.array([STANCE, FLIGHT, LANDED, LANDED])[np.arange(N) % 4]
@@ -282,9 +273,6 @@ def test_a_command_before_the_first_step_is_taken_by_a_robot_that_stands(env):
     offset = in_yaw_frame((after["goal"] - after["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(after))
     np.testing.assert_allclose(offset, np.tile([0.7, -0.2, 0.0], (N, 1)), atol=1e-5)
     assert not after["command_step"].any() and not after["jumps"].any()
-
-
-# ---------------------------------------------------------------- success
 
 
 @pytest.mark.parametrize(("miss", "near"), [(0.0, True), (0.095, True), (0.105, False), (0.4, False)])

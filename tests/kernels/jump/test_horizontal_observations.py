@@ -58,9 +58,6 @@ def yaw_quat(angle):
     return Rotation.from_euler("z", angle, degrees=True).as_quat()
 
 
-# ---------------------------------------------------------------- the actor's
-
-
 def test_the_layout_begins_with_the_way_to_the_goal():
     assert NAMES[:4] == ("goal_x", "goal_y", "height", "lin_vel_x") and len(NAMES) == ROBOT
     assert NAMES[3:] == VERTICAL.observation_names[3:]
@@ -121,9 +118,6 @@ def test_the_height_is_that_above_the_ground_below_the_base():
     robots.heights = np.array([[0.0, 0.0, -0.15], [0.0, 0.0, -0.15]])  # falls from x = 0 to x = 2 m
     robots.q[:, 0], robots.q[:, 2] = (-1.0, 1.0), (0.4, 0.3)
     np.testing.assert_allclose(robots.observe()[:, 2], [0.4, 0.3 + 0.075], atol=1e-6)
-
-
-# ---------------------------------------------------------------- the critic's
 
 
 @pytest.mark.parametrize("task", [HORIZONTAL, VERTICAL], ids=lambda task: task.name)
@@ -190,9 +184,6 @@ def test_the_critic_sees_paw_forces_in_body_weights_and_no_more_than_five():
     np.testing.assert_allclose(found, [0.0, 1.0, 0.5, 5.0], atol=1e-6)
 
 
-# ---------------------------------------------------------------- in the environment
-
-
 @pytest.fixture(scope="module")
 def env():
     return make_env(256, task=make_task("horizontal-jump"), reset=only("default"), randomize=True, noise=True, seed=8)
@@ -222,9 +213,6 @@ def test_drawn_parameters_are_of_order_one_and_zero_without_randomisation(env):
     assert np.abs(shown).max() < 3.0 and (np.abs(shown).max(axis=0) > 0.04).all()
     nominal = make_env(16, task=make_task("horizontal-jump"), reset=only("default"))
     assert not nominal.critic_obs[:, DRAWN].any()
-
-
-# ---------------------------------------------------------------- the block ahead
 
 
 def edges(block, base, heading):
@@ -263,9 +251,6 @@ def test_the_block_ahead_is_seen_along_three_rays():
 def test_without_blocks_nothing_is_ahead():
     env = make_env(2, task=make_task("horizontal-jump-sighted"))
     np.testing.assert_array_equal(env.obs[:, -BLOCK:], np.tile([2.0] * 6 + [0.0], (2, 1)))
-
-
-# ---------------------------------------------------------------- mirror image
 
 
 @pytest.mark.parametrize("task", [HORIZONTAL, VERTICAL], ids=["horizontal", "vertical"])

@@ -135,9 +135,6 @@ def test_phases_and_the_command_fit_the_scheme(starts):
             assert not episodes[name].any(), name
 
 
-# ---------------------------------------------------------------- on the ground
-
-
 def test_standing_paws_are_on_the_ground_within_their_boxes(env, starts):
     found = starts["standing"]
     paws = found.paws_around(np.zeros_like(found.pos))
@@ -171,9 +168,6 @@ def test_landed_robots_are_around_their_goal_with_paws_at_rest_on_the_ground(sta
     assert error.max() < 0.15 + CORNER + 1e-5
 
 
-# ---------------------------------------------------------------- pushing off
-
-
 def test_pushes_lead_over_their_takeoff_to_the_goal(env):
     """A push of 0.2 m at 15 m/s^2 ends in the takeoff of a projectile to the goal."""
     found = Starts(env, "pushing", exact=True, push_length=(0.2, 0.2), push_acceleration=(15.0, 15.0))
@@ -205,9 +199,6 @@ def test_joints_of_a_push_move_so_that_the_paws_do_not(env):
     assert np.abs(velocities).max() < 1e-3 and np.abs(env.sim.joint_qd()[worlds, :3]).max() > 1.0
 
 
-# ---------------------------------------------------------------- shares of time
-
-
 def test_shares_of_time_are_met_however_long_episodes_are():
     """Jumps that begin standing last 3 s here, in flight 1.5 s, landed 1 s: of resets the shares are others."""
     length = np.array([180, 120, 90, 60, 60, 45])
@@ -228,9 +219,6 @@ def test_shares_of_time_are_met_however_long_episodes_are():
     assert np.abs(own / own.sum(axis=1, keepdims=True) - wanted).max() < 0.08  # of every single world
     counted = episodes_of(env)["steps_per_mode"]
     assert np.abs(counted.sum() - time.sum()) < 1.0
-
-
-# ---------------------------------------------------------------- in the air
 
 
 def test_flights_lead_to_the_goal(starts):
@@ -311,9 +299,6 @@ def test_touchdowns_fall(starts):
     # than 1.14 m/s upward from 0.1 m above the landing, at 35 degrees or more, for less than 0.49 m, up to 0.35 m ahead
     assert (found.vel[found.distance > 0.84, 2] < 0.0).all()
     assert (found.vel[found.distance > 0.2, 2] < 0.0).mean() > 0.99  # 0.9993 of 300,000
-
-
-# ---------------------------------------------------------------- more than one jump
 
 
 def test_another_goal_is_planned_past_the_first_level_only(env, starts):

@@ -52,9 +52,6 @@ def random_action(n, size=1.0, seed=0):
     return np.random.default_rng(seed).uniform(-size, size, (n, 12)).astype(np.float32)
 
 
-# ---------------------------------------------------------------- from action to target
-
-
 def test_an_action_is_clamped_and_scaled_about_the_default_pose():
     commands, action = Commands(32), random_action(32, 2.0)
     commands.act(action)
@@ -113,9 +110,6 @@ def test_targets_are_filtered_by_what_the_sensors_read(offset, safe):
     np.testing.assert_array_equal(commands.motors("target")[0, 1:], commands.motors("filtered_target")[0, 1:])
 
 
-# ---------------------------------------------------------------- actions that are no numbers
-
-
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
 def test_an_action_that_is_not_finite_counts_as_0_and_is_told(bad):
     commands, action = Commands(8), random_action(8)
@@ -124,9 +118,6 @@ def test_an_action_that_is_not_finite_counts_as_0_and_is_told(bad):
     expected = np.where(np.isfinite(action), action, 0.0)
     np.testing.assert_array_equal(commands.motors("action"), expected)
     assert commands.episodes.bad_action.numpy().tolist() == [0, 0, 0, 1, 0, 1, 0, 0]
-
-
-# ---------------------------------------------------------------- latency
 
 
 def test_motors_follow_the_target_of_as_many_physics_steps_ago_as_the_latency():
@@ -198,9 +189,6 @@ def test_a_drawn_latency_is_the_one_that_acts():
         task = dataclasses.replace(make_task("vertical-jump"), randomization=drawn)
         env = make_env(3, task=task, randomize=True)
         assert env.delays.steps.numpy().tolist() == [delay] * 3
-
-
-# ---------------------------------------------------------------- pushes and the clock
 
 
 def test_a_push_acts_on_the_base_while_a_paw_is_down_or_in_the_air_too_where_the_skill_says_so():

@@ -78,9 +78,6 @@ def counting():
     return Events("start begin")
 
 
-# ---------------------------------------------------------------- modes
-
-
 def test_each_stage_runs_its_own_events(counting):
     counting.run(STARTUP)
     assert [set(found) for found in counting.event_counts()] == [{1}, {0}]
@@ -111,9 +108,6 @@ def test_numbers_of_an_event_change_while_it_runs(counting):
     counting.skill.set("events", "start", times=7.0)
     counting.run(STARTUP)
     assert set(counting.event_counts()[0]) == {8}
-
-
-# ---------------------------------------------------------------- intervals
 
 
 def gaps_of(events, steps):
@@ -184,9 +178,6 @@ def test_an_interval_shorter_than_a_step_comes_in_every_step():
     events.skill.params.set("events.regular.interval_range_s.lower", 0.1 * STEP_DT)
     events.skill.params.set("events.regular.interval_range_s.upper", 0.2 * STEP_DT)
     assert (gaps_of(events, 5) == 1).all()
-
-
-# ---------------------------------------------------------------- draws
 
 
 def test_draws_follow_seed_and_clock_and_nothing_else():

@@ -51,9 +51,6 @@ def test_terms_follow_each_other_in_their_groups(probe):
     np.testing.assert_array_equal(probe.obs("actor", final=True), probe.obs("actor"))
 
 
-# ---------------------------------------------------------------- noise, clipping, scale
-
-
 def noise_of(probe):
     """Return the noise of each world over its standard deviation, as it comes at the present clock."""
     probe.skill.set("observations.actor", "value", noise=1.0, scale=1.0, clip=100.0)
@@ -89,9 +86,6 @@ def test_terms_without_noise_are_exact_beside_noisy_ones(probe):
     policy, critic = play(probe, values, others)
     np.testing.assert_array_equal(policy[..., 5], values)
     np.testing.assert_array_equal(critic[..., 0], others)
-
-
-# ---------------------------------------------------------------- history
 
 
 def test_history_shifts_by_a_frame_a_step_and_begins_with_the_first_frame_everywhere(probe):
@@ -132,9 +126,6 @@ def test_a_new_episode_has_no_past_and_the_last_observation_keeps_that_of_the_ol
     again, _ = play(probe, values[:1], others[:1])
     np.testing.assert_array_equal(again[0][some][:, [1, 2, 3, 4]], np.tile([7.5, -7.5], (len(some), 2)))
     np.testing.assert_array_equal(again[0][rest][:, [1, 2, 3, 4]], policy[-1][rest][:, [3, 4, 5, 6]])
-
-
-# ---------------------------------------------------------------- delay
 
 
 def test_a_delayed_term_is_on_the_straight_line_between_past_frames(probe):
@@ -197,9 +188,6 @@ def test_a_command_within_an_episode_renews_the_newest_frame_and_keeps_those_bef
     again, _ = play(probe, values[:1], others[:1])
     np.testing.assert_array_equal(again[0][some][:, [3, 4, 7, 8]], np.tile([7.5, -7.5], (len(some), 2)))
     np.testing.assert_array_equal(again[0][some][:, [1, 2]], policy[-1, some][:, [3, 4]])
-
-
-# ---------------------------------------------------------------- broken worlds, other skills
 
 
 def test_broken_worlds_read_0_in_all_frames_and_go_on_without_a_trace(probe):

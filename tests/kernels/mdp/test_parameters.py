@@ -111,9 +111,6 @@ def dofs(values):
     return values.reshape(N, 38)
 
 
-# ---------------------------------------------------------------- masses
-
-
 def consistent(made, found):
     """Check that inertias are in proportion to masses, and inverses are those of what they invert."""
     mass, inertia = bodies(found.body_mass), bodies(found.body_inertia).astype(float)
@@ -153,9 +150,6 @@ def test_the_bases_centre_of_mass_is_shifted_along_each_axis(made, drawn):
     found = drawn("com_shift", -0.03, 0.02, only=("body_com",))
     shift = bodies(found.body_com) - bodies(made.nominal["body_com"])
     assert uniform(shift[:, 0], -0.03, 0.02) and independent(shift[:, 0]) and not shift[:, 1:].any()
-
-
-# ---------------------------------------------------------------- motors
 
 
 def test_kp_and_kd_may_have_ranges_of_their_own(made, drawn):
@@ -213,9 +207,6 @@ def test_each_sensor_has_a_constant_error(made, drawn):
     assert uniform(found.offset, -0.035, 0.02) and independent(found.offset.T)
 
 
-# ---------------------------------------------------------------- friction, latency, push
-
-
 @pytest.mark.parametrize(("dynamic", "static", "bound"), [((0.8, 0.9), (0.9, 1.2), 0.0), ((0.7, 0.9), (0.6, 1.0), 0.5)])
 def test_paws_have_one_dynamic_coefficient_and_a_static_one_that_is_not_below_it(made, drawn, dynamic, static, bound):
     found = drawn("friction", *dynamic, *static, only=("shape_mu", "static_ratio"))
@@ -260,9 +251,6 @@ def test_a_push_comes_in_its_share_of_draws_and_else_there_is_none(drawn):
     matrix = np.corrcoef(push[there].T) - np.eye(6)
     assert np.abs(matrix).max() < 5.0 / np.sqrt(there.sum())
     assert drawn("push", 1.0, -5.0, 4.0, -3.0, 2.0, only=("push",)).push.any(axis=1).all()
-
-
-# ---------------------------------------------------------------- skills
 
 
 def test_every_world_has_the_motors_of_its_skill_by_what_was_drawn(made, drawn):

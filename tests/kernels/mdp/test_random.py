@@ -69,9 +69,6 @@ def hashed(*keys):
     return state
 
 
-# ---------------------------------------------------------------- a pure function
-
-
 @pytest.mark.parametrize("seed", [0, 7, 2**31 - 1, -5])
 def test_numbers_are_a_hash_of_seed_world_clock_stream_and_column(seed):
     worlds = np.arange(WORLDS)
@@ -90,9 +87,6 @@ def test_a_number_is_the_same_whatever_else_is_drawn():
         _, alone, bell = draws(worlds, first=first, columns=columns)
         np.testing.assert_array_equal(alone, uniform[worlds, first : first + columns])
         np.testing.assert_array_equal(bell, normal[worlds, first : first + columns])
-
-
-# ---------------------------------------------------------------- independence
 
 
 OTHERS = {
@@ -141,9 +135,6 @@ def test_streams_rarely_meet():
     states = np.concatenate([draws(step_count=step_count, columns=1)[0] for step_count in range(16, 80)])
     meetings = len(states) - len(np.unique(states))
     assert meetings < 8 + 5 * math.sqrt(8)
-
-
-# ---------------------------------------------------------------- distributions
 
 
 def test_uniform_numbers_fill_their_range():

@@ -98,9 +98,6 @@ def unchanged(before, after, worlds, but=()):
         np.testing.assert_array_equal(rows(getattr(after, name))[worlds], rows(values)[worlds], name)
 
 
-# ---------------------------------------------------------------- resets
-
-
 def test_a_reset_begins_episodes_in_the_masked_worlds_and_touches_no_other(stage):
     stage.scramble()
     stage.write(value=1.5, other=-1.0, steps=9)
@@ -165,9 +162,6 @@ def test_past_the_last_level_every_episode_draws_one():
     assert (stage.world("level") == 2).all()
     drawn = stage.read("other")
     assert abs(np.corrcoef(drawn, stage.read("counts"))[0, 1]) < 5.0 / np.sqrt(2048)
-
-
-# ---------------------------------------------------------------- commands
 
 
 def test_a_command_that_is_due_is_drawn_and_moves_nothing(stage):
@@ -235,9 +229,6 @@ def test_a_command_before_the_first_step_leaves_a_beginning_one(stage):
     assert (stage.world("history_reset") == BEGUN).all()
 
 
-# ---------------------------------------------------------------- standing up, the clock
-
-
 def test_robots_stand_up_with_their_headings_on_the_block_below_them_at_its_start():
     stage = Stage()
     sim = Simulation(N, block=BlockCfg((0.0, 0.0)), visuals=False, device="cpu")
@@ -267,9 +258,6 @@ def test_the_clock_goes_on_in_the_masked_worlds(stage):
     step_count = stage.world("step_count")
     wp.launch(advance_rng_kernel, N, [stage.mask(SOME), stage.episodes], device="cpu")
     np.testing.assert_array_equal(stage.world("step_count"), step_count + SOME)
-
-
-# ---------------------------------------------------------------- forgetting
 
 
 def test_forgetting_touches_the_masked_worlds_only(stage):

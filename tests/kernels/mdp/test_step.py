@@ -36,9 +36,6 @@ def endings(probe):
     return [NAMES[i] if i >= 0 else "" for i in probe.world("termination")]
 
 
-# ---------------------------------------------------------------- rewards
-
-
 def test_rewards_are_weighted_and_times_the_step_unless_paid_once(probe):
     expected = weighted(*random_state(probe))
     probe.step()
@@ -105,9 +102,6 @@ def test_sums_count_on_where_single_precision_would_not(probe):
     np.testing.assert_array_equal(sums[0], 2.0**27)
 
 
-# ---------------------------------------------------------------- the task's state
-
-
 def test_the_state_moves_on_before_it_is_judged(probe):
     random_state(probe)
     probe.write(value=1.0, other=0.0, steps=np.where(np.arange(N) < 7, 99, 98))
@@ -132,9 +126,6 @@ def test_worlds_of_another_skill_are_passed_over(probe):
         values = probe.world(name)
         assert (values[away] == 5).all() and (values[~away] != 5).all(), name
     assert not probe.skill.counters.termination_count.numpy()[:, away].any()
-
-
-# ---------------------------------------------------------------- ends
 
 
 @pytest.mark.parametrize(
@@ -184,9 +175,6 @@ def test_a_broken_world_ends_as_one_that_came_apart_and_pays_nothing(probe, how,
     assert probe.world("diverged").tolist() == (np.arange(N) == 3).astype(int).tolist()
     assert not probe.world("bad_action").any()
     np.testing.assert_array_equal(probe.skill.counters.bad_actions.numpy(), (np.arange(N) == 3) * (how == "action"))
-
-
-# ---------------------------------------------------------------- curriculum
 
 
 def end(probe, error=0.0, other=11.0, counts=1):

@@ -53,9 +53,6 @@ def track(robot, sim, ground=None, settings=None, worlds=None):
     wp.launch(track_kernel, (4, n), inputs, device="cpu")
 
 
-# ---------------------------------------------------------------- places and velocities
-
-
 def test_paws_are_where_pinocchio_puts_them_and_move_alike(sim, robots):
     states, reference = random_states(N, seed=1), Reference(sim.model)
     robots.joint_q, robots.joint_qd = array(states.joint_q()), array(states.joint_qd())
@@ -73,9 +70,6 @@ def test_paws_are_where_pinocchio_puts_them_and_move_alike(sim, robots):
             np.testing.assert_allclose(place[i, leg], data.oMi[joint].act(ANKLE), atol=2e-5)
             np.testing.assert_allclose(speed[i, leg], velocity, atol=2e-3)
     assert np.abs(speed).max() > 3.0
-
-
-# ---------------------------------------------------------------- contact
 
 
 @wp.kernel(enable_backward=False)
@@ -162,9 +156,6 @@ def test_a_paw_is_down_above_the_force_of_its_worlds_skill(sim, robots):
     track(robots, sim, settings=contact_force([1.0, 4.0]), worlds=worlds)
     down = forces > np.where(np.arange(N) % 2 == 0, 1.0, 4.0)
     np.testing.assert_array_equal(robots.contact_time.numpy() > 0.0, np.tile(down, (4, 1)))
-
-
-# ---------------------------------------------------------------- collisions
 
 
 def hills():
