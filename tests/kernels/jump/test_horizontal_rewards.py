@@ -25,7 +25,7 @@ E = math.exp
 PHASES = [int(STANCE), int(FLIGHT), int(LANDED)]
 TRANSVERSAL = np.tile([0.0, 1.0, 1.0], 4)
 ESTIMATE = {"std_middle": 0.30, "std_wide": 0.50, "std_fine": 0.10, "height": 0.30}
-paid = Table([term.func for term in TASK.rewards], float)
+reward = Table([term.func for term in TASK.rewards], float)
 
 
 @pytest.mark.parametrize(
@@ -38,8 +38,8 @@ def test_tracking_has_a_wide_and_a_narrow_kernel_and_is_paid_after_takeoff(miss,
     widths = {"std_wide": 0.15, "std_fine": 0.03, "fine_weight": 0.6}
     for phase in (FLIGHT, LANDED):
         task = make_episode(phase=phase, goal=(1.0, -2.0, 0.0))
-        assert paid("tracking", view, task, **widths) == pytest.approx(expected, rel=1e-4)
-    assert paid("tracking", view, make_episode(goal=(1.0, -2.0, 0.0)), **widths) == 0.0
+        assert reward("tracking", view, task, **widths) == pytest.approx(expected, rel=1e-4)
+    assert reward("tracking", view, make_episode(goal=(1.0, -2.0, 0.0)), **widths) == 0.0
 
 
 @pytest.mark.parametrize(
@@ -56,9 +56,9 @@ def test_est_tracking_is_of_the_ballistic_landing_and_paid_in_flight(miss, expec
     view = make_view(pos=(0.2, 0.3, 0.52625), lin_vel=(1.0, -0.6, 2.0))
     goal = (0.7 + 0.6 * miss, -0.8 * miss, 0.0)
     flying = make_episode(phase=FLIGHT, goal=goal)
-    assert paid("estimated_tracking", view, flying, **ESTIMATE) == pytest.approx(expected, rel=1e-3)
+    assert reward("estimated_tracking", view, flying, **ESTIMATE) == pytest.approx(expected, rel=1e-3)
     for phase in (STANCE, LANDED):
-        assert paid("estimated_tracking", view, make_episode(phase=phase, goal=goal), **ESTIMATE) == 0.0
+        assert reward("estimated_tracking", view, make_episode(phase=phase, goal=goal), **ESTIMATE) == 0.0
 
 
 @pytest.mark.parametrize("rise", [0.08, -0.2])
@@ -66,7 +66,7 @@ def test_est_tracking_ends_above_the_ground_at_the_goal(rise):
     # as above, all of it higher by the ground at the goal
     view = make_view(pos=(0.2, 0.3, 0.52625 + rise), lin_vel=(1.0, -0.6, 2.0))
     flying = make_episode(phase=FLIGHT, goal=(0.7, 0.0, 0.0), goal_ground=rise)
-    assert paid("estimated_tracking", view, flying, **ESTIMATE) == pytest.approx(1.4, rel=1e-4)
+    assert reward("estimated_tracking", view, flying, **ESTIMATE) == pytest.approx(1.4, rel=1e-4)
 
 
 @pytest.mark.parametrize("heading", [0.0, 90.0, 179.0, -179.0, 180.0])
@@ -79,41 +79,42 @@ def test_flight_orientation_is_the_rotation_from_level_and_heading(heading, yaw,
     for sign in (1.0, -1.0):  # both quaternions of the orientation
         view = make_view(quat=sign * quat, lin_vel=(1.0, 0.0, 0.0))
         flying = make_episode(phase=FLIGHT, heading=heading * DEG, goal=(1.0, 0.0, 0.0))
-        assert paid("flight_orientation", view, flying, std=10.0 * DEG) == pytest.approx(expected, rel=2e-3)
+        assert reward("flight_orientation", view, flying, std=10.0 * DEG) == pytest.approx(expected, rel=2e-3)
 
 
 @pytest.mark.parametrize(
-    ("vel", "share"), [((0.1, 5.0, 0.0), 1.0), ((0.0, 5.0, 3.0), 0.0), ((-0.1, 0.0, 3.0), 0.0), ((0.0, 0.0, -3.0), 0.0)]
+    ("vel", "factor"),
+    [((0.1, 5.0, 0.0), 1.0), ((0.0, 5.0, 3.0), 0.0), ((-0.1, 0.0, 3.0), 0.0), ((0.0, 0.0, -3.0), 0.0)],
 )
-def test_flight_orientation_is_paid_while_moving_towards_the_goal(vel, share):
+def test_flight_orientation_is_paid_while_moving_towards_the_goal(vel, factor):
     fields = {"goal": (2.0, 1.0, 0.0)}
     view = make_view(pos=(1.0, 1.0, 0.5), lin_vel=vel)
     flying = make_episode(phase=FLIGHT, **fields)
-    assert paid("flight_orientation", view, flying, std=10.0 * DEG) == pytest.approx(share)
+    assert reward("flight_orientation", view, flying, std=10.0 * DEG) == pytest.approx(factor)
     for phase in (STANCE, LANDED):
-        assert paid("flight_orientation", view, make_episode(phase=phase, **fields), std=10.0 * DEG) == 0.0
+        assert reward("flight_orientation", view, make_episode(phase=phase, **fields), std=10.0 * DEG) == 0.0
 
 
 @pytest.mark.parametrize("phase", PHASES)
 def test_flight_angular_velocity(phase):
     view = make_view(ang_vel=(6.0, 0.0, -8.0))
     expected, task = E(-1.0) if phase == FLIGHT else 0.0, make_episode(phase=phase)
-    assert paid("flight_angular_velocity", view, task, std=10.0) == pytest.approx(expected, rel=1e-4)
+    assert reward("flight_angular_velocity", view, task, std=10.0) == pytest.approx(expected, rel=1e-4)
 
 
 def test_left_right_symmetry_compares_transversal_motors_of_a_pair():
     mirrored = make_view(angle=np.array([0.3, 0.1, 0.9, -0.5, 0.1, 0.9, 0.2, 1.1, 0.4, 0.0, 1.1, 0.4]))
-    unasked = make_episode(command_step=1)
-    assert paid("left_right_symmetry", mirrored, unasked, std=0.5, waiting_scale=0.1) == pytest.approx(1.0)
+    before_command = make_episode(command_step=1)
+    assert reward("left_right_symmetry", mirrored, before_command, std=0.5, waiting_scale=0.1) == pytest.approx(1.0)
     # one of the four pairs differs by 1 rad: rms 0.5
     for motor in (1, 2, 4, 5, 7, 8, 10, 11):
         view = make_view(angle=DEFAULT_ANGLE + np.eye(12)[motor])
-        for task, share in ((unasked, 1.0), (make_episode(), 0.1)):
-            found = paid("left_right_symmetry", view, task, std=0.5, waiting_scale=0.1)
-            assert found == pytest.approx(share * E(-1.0), rel=1e-4)
+        for task, factor in ((before_command, 1.0), (make_episode(), 0.1)):
+            value = reward("left_right_symmetry", view, task, std=0.5, waiting_scale=0.1)
+            assert value == pytest.approx(factor * E(-1.0), rel=1e-4)
 
 
-AT_EASE = [
+REST_CASES = [
     ({"steps": 9, "command_step": 10}, True),
     ({"steps": 10, "command_step": 10}, False),
     ({"phase": FLIGHT, "steps": 9, "command_step": 10}, False),
@@ -124,42 +125,42 @@ AT_EASE = [
 ]
 
 
-@pytest.mark.parametrize(("episode", "due"), AT_EASE)
+@pytest.mark.parametrize(("episode", "due"), REST_CASES)
 def test_standing_is_paid_before_the_command_and_half_a_second_after_touchdown(episode, due):
     task = make_episode(**episode)
     posture, still = {"std": 20.0 * DEG, "shift": 25.0 * DEG}, {"std_lin_vel": 0.1, "std_ang_vel": 0.5}
-    wanted = make_view(angle=DEFAULT_ANGLE + 25.0 * DEG * TRANSVERSAL)
-    assert paid("standing_posture", wanted, task, **posture) == pytest.approx(float(due))
+    target = make_view(angle=DEFAULT_ANGLE + 25.0 * DEG * TRANSVERSAL)
+    assert reward("standing_posture", target, task, **posture) == pytest.approx(float(due))
     off = make_view(angle=DEFAULT_ANGLE + 25.0 * DEG * TRANSVERSAL + 20.0 * DEG)
-    assert paid("standing_posture", off, task, **posture) == pytest.approx(due * E(-1.0), rel=1e-4)
-    assert paid("base_at_rest", make_view(), task, **still) == pytest.approx(float(due))
+    assert reward("standing_posture", off, task, **posture) == pytest.approx(due * E(-1.0), rel=1e-4)
+    assert reward("base_at_rest", make_view(), task, **still) == pytest.approx(float(due))
     slow = make_view(lin_vel=(0.06, 0.0, -0.08))
-    assert paid("base_at_rest", slow, task, **still) == pytest.approx(due * E(-1.0), rel=1e-4)
+    assert reward("base_at_rest", slow, task, **still) == pytest.approx(due * E(-1.0), rel=1e-4)
     turning = make_view(lin_vel=(0.06, 0.0, -0.08), ang_vel=(0.3, 0.4, 0.0))
-    assert paid("base_at_rest", turning, task, **still) == pytest.approx(due * E(-2.0), rel=1e-4)
+    assert reward("base_at_rest", turning, task, **still) == pytest.approx(due * E(-2.0), rel=1e-4)
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.6, -0.8, 0.0)])
 def test_landing_tilt_is_1_at_its_limit_and_counts_after_touchdown(axis):
     view = make_view(**tilted_by(10.0 * DEG, axis))
     half = make_view(**tilted_by(5.0 * DEG, axis))
-    assert paid("landing_tilt", view, make_episode(phase=LANDED), angle=10.0 * DEG) == pytest.approx(1.0, rel=1e-4)
-    share = (math.sin(5.0 * DEG) / math.sin(10.0 * DEG)) ** 2
-    assert paid("landing_tilt", half, make_episode(phase=LANDED), angle=10.0 * DEG) == pytest.approx(share, rel=1e-4)
-    assert paid("landing_tilt", make_view(), make_episode(phase=LANDED), angle=10.0 * DEG) == 0.0
+    assert reward("landing_tilt", view, make_episode(phase=LANDED), angle=10.0 * DEG) == pytest.approx(1.0, rel=1e-4)
+    factor = (math.sin(5.0 * DEG) / math.sin(10.0 * DEG)) ** 2
+    assert reward("landing_tilt", half, make_episode(phase=LANDED), angle=10.0 * DEG) == pytest.approx(factor, rel=1e-4)
+    assert reward("landing_tilt", make_view(), make_episode(phase=LANDED), angle=10.0 * DEG) == 0.0
     for phase in (STANCE, FLIGHT):
-        assert paid("landing_tilt", view, make_episode(phase=phase), angle=10.0 * DEG) == 0.0
+        assert reward("landing_tilt", view, make_episode(phase=phase), angle=10.0 * DEG) == 0.0
 
 
 @pytest.mark.parametrize("axis", [(1.0, 0.0, 0.0), (0.6, -0.8, 0.0)])
 def test_descent_tilt_counts_in_flight_while_the_base_falls(axis):
     view = make_view(**tilted_by(20.0 * DEG, axis), lin_vel=(1.0, 0.0, -0.1))
-    share = (math.sin(20.0 * DEG) / math.sin(10.0 * DEG)) ** 2
-    assert paid("descent_tilt", view, make_episode(phase=FLIGHT), angle=10.0 * DEG) == pytest.approx(share, rel=1e-4)
+    factor = (math.sin(20.0 * DEG) / math.sin(10.0 * DEG)) ** 2
+    assert reward("descent_tilt", view, make_episode(phase=FLIGHT), angle=10.0 * DEG) == pytest.approx(factor, rel=1e-4)
     rising = make_view(**tilted_by(20.0 * DEG, axis), lin_vel=(1.0, 0.0, 0.1))
-    assert paid("descent_tilt", rising, make_episode(phase=FLIGHT), angle=10.0 * DEG) == 0.0
+    assert reward("descent_tilt", rising, make_episode(phase=FLIGHT), angle=10.0 * DEG) == 0.0
     for phase in (STANCE, LANDED):
-        assert paid("descent_tilt", view, make_episode(phase=phase), angle=10.0 * DEG) == 0.0
+        assert reward("descent_tilt", view, make_episode(phase=phase), angle=10.0 * DEG) == 0.0
 
 
 @pytest.fixture(scope="module")
@@ -191,9 +192,9 @@ def test_paws_cost_that_are_off_again_after_their_own_first_contact():
     """Of FL, FR, BL, BR: down; up for 0.1 s after it was down; up for 0.02 s; still to come down."""
     view = make_view(contact=(1.0, 0.0, 0.0, 0.0), air_time=(0.0, 0.1, 0.02, 0.4))
     landed = make_episode(phase=LANDED, paws_landed=0b0111)
-    assert paid("lifted_again", view, landed, threshold=0.05) == 1.0
-    assert paid("lifted_again", view, landed, threshold=0.0) == 2.0
-    assert paid("lifted_again", view, make_episode(phase=FLIGHT, paws_landed=0b0111), threshold=0.0) == 0.0
+    assert reward("lifted_again", view, landed, threshold=0.05) == 1.0
+    assert reward("lifted_again", view, landed, threshold=0.0) == 2.0
+    assert reward("lifted_again", view, make_episode(phase=FLIGHT, paws_landed=0b0111), threshold=0.0) == 0.0
 
 
 def test_bracing_is_paid_where_a_pendulum_stops_over_the_paws():
@@ -201,10 +202,10 @@ def test_bracing_is_paid_where_a_pendulum_stops_over_the_paws():
     paws = np.tile([0.3162, 0.0, 0.0], (4, 1))
     view = make_view(pos=(0.0, 0.0, 0.24525), lin_vel=(2.0, 0.0, -3.0), paw_pos=paws.ravel())
     landed = make_episode(phase=LANDED)
-    assert paid("capture_point", view, landed, std=0.1) == pytest.approx(1.0, abs=1e-4)
+    assert reward("capture_point", view, landed, std=0.1) == pytest.approx(1.0, abs=1e-4)
     view.gravity_magnitude = 9.81 / 4.0  # twice as far
-    assert paid("capture_point", view, landed, std=0.3162) == pytest.approx(E(-1.0), rel=1e-3)
-    assert paid("capture_point", view, make_episode(phase=FLIGHT), std=0.1) == 0.0
+    assert reward("capture_point", view, landed, std=0.3162) == pytest.approx(E(-1.0), rel=1e-3)
+    assert reward("capture_point", view, make_episode(phase=FLIGHT), std=0.1) == 0.0
 
 
 def test_ripple_costs_while_the_robot_should_rest_only():
@@ -216,5 +217,5 @@ def test_ripple_costs_while_the_robot_should_rest_only():
     moving = (make_episode(steps=9, command_step=9), make_episode(phase=FLIGHT), make_episode(phase=LANDED))
     for name, value, numbers in (("torque_ripple", 3.0, {}), ("resting_action_rate", 0.12, {}),
                                  ("force_ripple", 0.01, {"weight_force": 100.0})):  # fmt: skip
-        assert all(paid(name, view, task, **numbers) == pytest.approx(value, rel=1e-4) for task in resting), name
-        assert not any(paid(name, view, task, **numbers) for task in moving), name
+        assert all(reward(name, view, task, **numbers) == pytest.approx(value, rel=1e-4) for task in resting), name
+        assert not any(reward(name, view, task, **numbers) for task in moving), name

@@ -7,7 +7,7 @@ from jump_helpers import Table, functions, make_episode, make_view
 from jumper_warp.kernels.mdp import rewards
 
 NAMES = "ground_force action_clip motor_torque_sq joint_acceleration action_rate action_acceleration collision"
-paid = Table(functions(rewards, NAMES), float)
+reward = Table(functions(rewards, NAMES), float)
 E = math.exp
 
 
@@ -30,10 +30,10 @@ def test_regularization_is_a_sum_of_squares_in_every_phase(phase):
         prev_prev_action=np.full(12, 0.25),
         collisions=int(phase == 1) * 16,
     )
-    assert paid("ground_force", view, task, weight_force=30.0) == pytest.approx(1.0)
-    assert paid("action_clip", view, task) == pytest.approx(0.7)
-    assert paid("motor_torque_sq", view, task) == pytest.approx(506.0)
-    assert paid("joint_acceleration", view, task) == pytest.approx(2024.0)
-    assert paid("action_rate", view, task) == pytest.approx(12.0)
-    assert paid("action_acceleration", view, task) == pytest.approx(12.0 * 1.75**2)
-    assert paid("collision", view, task) == float(phase == 1)
+    assert reward("ground_force", view, task, weight_force=30.0) == pytest.approx(1.0)
+    assert reward("action_clip", view, task) == pytest.approx(0.7)
+    assert reward("motor_torque_sq", view, task) == pytest.approx(506.0)
+    assert reward("joint_acceleration", view, task) == pytest.approx(2024.0)
+    assert reward("action_rate", view, task) == pytest.approx(12.0)
+    assert reward("action_acceleration", view, task) == pytest.approx(12.0 * 1.75**2)
+    assert reward("collision", view, task) == float(phase == 1)

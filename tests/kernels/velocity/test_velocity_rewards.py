@@ -17,7 +17,7 @@ from mdp_helpers import DEFAULT_ANGLE
 NAMES = """linear_velocity yaw_rate lin_vel_z_l2 ang_vel_xy_l2 flat_orientation_l2 standing_posture lateral_position
 transversal_position air_time rapid_stepping restless_stand foot_clearance slip touchdown torque_sign_changes
 trot_schedule shank_lean"""
-paid = Table(functions(rewards, NAMES), float, VelocityState)
+reward = Table(functions(rewards, NAMES), float, VelocityState)
 TRANSVERSAL = np.arange(12) % 3 != 0
 N = 16
 
@@ -126,7 +126,7 @@ EXPECTED = {
 @pytest.mark.parametrize("name", NAMES.split())
 def test_reward_is_that_of_numpy(name):
     numbers, expected = EXPECTED[name]
-    values = paid.all(name, [view for _, view, _ in ROBOTS], [state for _, _, state in ROBOTS], **numbers)
+    values = reward.all(name, [view for _, view, _ in ROBOTS], [state for _, _, state in ROBOTS], **numbers)
     wanted = [expected(fields) for fields, _, _ in ROBOTS]
     np.testing.assert_allclose(values, wanted, rtol=2e-4, atol=2e-6)
     assert np.ptp(wanted) > 1e-3
@@ -142,14 +142,14 @@ def test_shanks_lean_as_inverse_kinematics_has_them():
     """In the default pose a shank is off vertical by asin of (0.045 + 0.175 sin 45 deg) / 0.3: 34.3 degrees."""
     view = make_view(contact=np.ones(4), projected_gravity=(0.0, 0.0, -1.0))
     lean = np.arcsin((0.045 + 0.175 * np.sin(np.pi / 4.0)) / 0.3)
-    assert paid("shank_lean", view, make_state(), **(LEG | {"threshold": 0.0})) == pytest.approx(
+    assert reward("shank_lean", view, make_state(), **(LEG | {"threshold": 0.0})) == pytest.approx(
         8.0 * lean**2, rel=1e-5
     )
-    assert paid("shank_lean", view, make_state(), **(LEG | {"threshold": lean + 0.01})) == 0.0
+    assert reward("shank_lean", view, make_state(), **(LEG | {"threshold": lean + 0.01})) == 0.0
 
 
 def test_standing_robot_at_rest_gets_full_tracking():
     state = make_state(standing=1)
-    assert paid("linear_velocity", make_view(), state, std=0.1) == pytest.approx(1.0)
-    assert paid("standing_posture", make_view(), state, std=0.1) == pytest.approx(1.0)
+    assert reward("linear_velocity", make_view(), state, std=0.1) == pytest.approx(1.0)
+    assert reward("standing_posture", make_view(), state, std=0.1) == pytest.approx(1.0)
     assert vec12(*DEFAULT_ANGLE) == make_view().default_angle
