@@ -202,7 +202,7 @@ def test_paws_of_a_push_are_at_rest_while_the_base_moves(env):
     assert np.abs(velocities).max() < 1e-3 and np.abs(env.sim.joint_qd()[worlds, :3]).max() > 1.0
 
 
-def test_shares_of_time_are_met_however_long_episodes_are():
+def test_start_modes_take_their_fractions_of_policy_steps_whatever_their_episode_length():
     """Jumps that begin standing last 3 s here, in flight 1.5 s, landed 1 s: of resets the fractions are others."""
     length = np.array([180, 120, 90, 60, 60, 45])  # policy steps of an episode, by start mode
     task = make_task("horizontal-jump")

@@ -12,13 +12,13 @@ ground_posture air_posture post_landing_posture paws_down soft_impact stance_imp
 reward = Table(functions(rewards, NAMES), float)
 E = math.exp
 PHASES = [int(STANCE), int(FLIGHT), int(LANDED)]
-TRANSVERSAL = np.tile([0.0, 1.0, 1.0], 4)
-LATERAL = 1.0 - TRANSVERSAL
-HEIGHT = {"std_fine": 0.10, "scale_sharp": 0.05, "std_wide": 0.4}
+TRANSVERSAL = np.tile([0.0, 1.0, 1.0], 4)  # 1 for outer and inner motors
+LATERAL = 1.0 - TRANSVERSAL  # 1 for lateral motors
+HEIGHT = {"std_fine": 0.10, "scale_sharp": 0.05, "std_wide": 0.4}  # [m]
 
 
 def name_of(value):
-    """Name the cases of a table of terms."""
+    """Return the id of a parameter in a table of terms: the term's name, other values have none."""
     return value if isinstance(value, str) else ""
 
 
@@ -101,7 +101,7 @@ POSTURES = [
 
 
 @pytest.mark.parametrize(("term", "shift", "numbers", "phases"), POSTURES, ids=name_of)
-def test_postures_count_the_rms_offset_of_all_motors(term, shift, numbers, phases):
+def test_postures_are_phi_of_the_rms_motor_offset_in_their_phases(term, shift, numbers, phases):
     target = DEFAULT_ANGLE + shift * TRANSVERSAL
     one_motor_off = target.copy()
     one_motor_off[4] += math.sqrt(12.0) * 10.0 * DEG
@@ -122,10 +122,8 @@ LANDING_TERMS = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("term", "view", "numbers", "expected"), LANDING_TERMS, ids=lambda v: v if isinstance(v, str) else ""
-)
-def test_landing_terms_are_paid_for_three_tenths_of_a_second(term, view, numbers, expected):
+@pytest.mark.parametrize(("term", "view", "numbers", "expected"), LANDING_TERMS, ids=name_of)
+def test_landing_terms_are_paid_for_18_policy_steps_from_touchdown(term, view, numbers, expected):
     assert reward(term, view, make_episode(phase=LANDED, phase_steps=0), **numbers) == pytest.approx(expected)
     assert reward(term, view, make_episode(phase=LANDED, phase_steps=17), **numbers) == pytest.approx(expected)
     assert reward(term, view, make_episode(phase=LANDED, phase_steps=18), **numbers) == 0.0
@@ -141,13 +139,13 @@ IMPACTS = [
     ((3.0, 0.0, -4.0), (-5.0, 0.0, 10.0), 0.78, -0.44),  # (-5 * 3 - 10 * 4) / 5 = -11
     ((0.0, 0.0, 0.0), (0.0, 0.0, 30.0), 1.0, 0.0),  # no direction of motion
     ((0.0, 0.0, -3.0), (0.0, 0.0, 180.0), 0.0, -1.0),  # a landing within the step
-    ((0.0, 0.0, -3.0), (0.0, 0.0, 240.0), 0.0, -1.0),  # the same with a rebound of 1 m/s
+    ((0.0, 0.0, -3.0), (0.0, 0.0, 240.0), 0.0, -1.0),  # likewise, rebounding with 1 m/s
     ((0.0, 0.0, -0.05), (0.0, 0.0, 40.0), 0.94, -0.12),  # pushing off while sinking: 0.05 m/s were lost, 3 m/s^2
-]  # (velocity before the step, mean acceleration, soft impact, stance impact)
+]  # (previous velocity [m/s], mean acceleration [m/s^2], soft impact, stance impact)
 
 
 @pytest.mark.parametrize(("vel", "acc", "soft", "stance"), IMPACTS)
-def test_impacts_count_what_was_lost_of_the_speed_before(vel, acc, soft, stance):
+def test_impacts_are_the_loss_of_the_previous_speed_over_the_limit(vel, acc, soft, stance):
     view = make_view(prev_lin_vel=vel, lin_acc=acc, lin_vel=np.array(vel) + np.array(acc) / 60.0)
     assert reward("soft_impact", view, make_episode(phase=LANDED), limit=50.0) == pytest.approx(soft)
     assert reward("stance_impact", view, make_episode(phase=STANCE), limit=25.0) == pytest.approx(stance)
@@ -167,7 +165,7 @@ def test_damp_landing_is_the_mean_of_clamped_folding_rates():
     assert reward("damp_landing", view, make_episode(phase=LANDED)) == pytest.approx(0.5)
 
 
-def test_paws_are_paid_for_that_are_on_the_ground_after_touchdown():
+def test_paws_down_is_the_number_of_contacts_after_touchdown():
     view = make_view(contact=(1.0, 1.0, 0.0, 1.0), contacts=3)
     assert reward("paws_down", view, make_episode(phase=LANDED)) == 3.0
     for phase in (STANCE, FLIGHT):

@@ -11,14 +11,14 @@ reward = Table(functions(rewards, NAMES), float)
 E = math.exp
 
 
-def test_kernels_of_the_paper():
+def test_phi_is_gaussian_and_psi_laplacian():
     assert rewards.phi(0.2, 0.2) == pytest.approx(E(-1.0))
     assert rewards.phi(-0.6, 0.2) == pytest.approx(E(-9.0))
     assert rewards.psi(-0.6, 0.2) == pytest.approx(E(-3.0))
 
 
 @pytest.mark.parametrize("phase", range(3))
-def test_regularization_is_a_sum_of_squares_in_every_phase(phase):
+def test_regularisation_terms_are_sums_of_squares_in_every_phase(phase):
     task = make_episode(phase=phase)
     view = make_view(
         paw_force=(10.0, 20.0, 0.0, 20.0),
