@@ -18,7 +18,7 @@ from jumper_warp.envs.arrays import (
     checked_tasks,
     checked_values,
     checked_worlds,
-    prepared,
+    prepared_tasks,
 )
 from jumper_warp.envs.stages import Stages
 from jumper_warp.envs.state import load_state, save_state
@@ -38,32 +38,33 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import load_kernels, records
 
 CONTACT_TOLERANCE = 1.0e-4
-"""[m/s] Of the contact iteration: a fifth fewer sweeps than the solver's default."""
+"""[m/s] Stopping tolerance of the contact iteration; takes a fifth fewer sweeps than the solver's default."""
 
 
 class Step(NamedTuple):
-    """What a step gives; tensors on the device that the next step writes anew."""
+    """Result of `Env.step`; tensors on the device that the next step overwrites."""
 
     obs: dict[str, torch.Tensor]
-    """(num_envs, columns) by group, of the next step; an ended episode has begun anew."""
+    """(num_envs, columns) by group (`actor`, `critic`), for the next step; ended episodes are already reset."""
     reward: torch.Tensor
     """(num_envs,)"""
     terminated: torch.Tensor
-    """(num_envs,) bool, whether the episode ended in a state that is to blame."""
+    """(num_envs,) bool, whether the episode ended with failure."""
     truncated: torch.Tensor
-    """(num_envs,) bool, whether it ended for another reason."""
+    """(num_envs,) bool, whether it ended without failure (time limit or success)."""
     extras: dict[str, Any]
-    """`final_obs`: observations by group before a new beginning; `time_outs`: truncated as float."""
+    """`final_obs`: as `obs`, before resets; `time_outs`: `truncated` as float, (num_envs,)."""
 
 
 class Env(Stages):
-    """Many robots on one task, or several tasks of which each world has one. Nothing in `step` waits for the device.
+    """One robot per world on one task, or on several of which each world has one. `step` never waits for the device.
 
-    Attributes, tensors on the device, rewritten in place by `reset` and `step`, of the first task:
-        obs, critic_obs: (num_envs, columns), of the next step; an ended episode has begun anew.
-        final_obs, final_critic_obs: the same before that new beginning.
-        reward_terms: (num_envs,) by the name of each reward, weight and step applied, of worlds on that task.
+    Attributes, tensors on the device that `reset` and `step` overwrite, of the first task:
+        obs, critic_obs: (num_envs, columns), for the next step; ended episodes are already reset.
+        final_obs, final_critic_obs: the same before resets.
+        reward_terms: (num_envs,) by name of the reward, weight and time step applied, of worlds on that task.
         reward, done, timeout: (num_envs,); done 1 where an episode ended, timeout 1 where it did without failure.
+    `Stages` holds the arrays and launches the kernels.
     """
 
     def __init__(
@@ -86,15 +87,15 @@ class Env(Stages):
         threads: int | None = None,
         refine: int = 1,
     ):
-        """Build everything; call `reset` before the first step.
+        """Allocate everything; call `reset` before the first step.
 
-        ground, block: as in `Simulation`; by default the terrain of the first task that has one, or what tasks draw, if
-        randomised on SolverJumper, else a plane. skill: index of the task that each world begins in, (num_envs,) or one
-        for all. handovers: between tasks. robot: what differs from the description, latency included. threads: of a
-        CPU, as in `Simulation`. refine: how many times finer the physics step is than that of trainings.
-        Raises ValueError: no task, two of one name, motors that cannot be those of one robot, different gravities, a
-        handover between other tasks, num_envs or refine no whole number of at least 1, a seed not in 0 to 2^31 - 1, or
-        as `Simulation`.
+        randomize, noise: enable domain randomisation, observation noise. auto_reset: reset ended episodes in `step`.
+        ground, block: as in `Simulation`; by default the terrain of the first task that has one, else the tasks'
+        sampled ground (SolverJumper with randomize), else a plane. skill: index of each world's first task, (num_envs,)
+        or one for all. robot: differences from the robot description. threads: CPU threads, as in `Simulation`.
+        refine: factor by which the physics step is shorter than in training.
+        Raises InputError (a ValueError): see `checked_tasks` and `Simulation`, num_envs or refine no whole number of at
+        least 1, or a seed not in 0 to 2^31 - 1.
         """
         check_count("num_envs", num_envs)
         check_count("refine", refine)
@@ -103,7 +104,7 @@ class Env(Stages):
         self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
         self.handovers, self._overlay, self._conditions = tuple(handovers), robot, (randomize, noise)
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
-        run, self._draws_ground = prepared(tasks, randomize, noise, may_vary)
+        run, self._draws_ground = prepared_tasks(tasks, randomize, noise, may_vary)
         terrains = [terrain for each in run if (terrain := each.terrain) is not None]
         ground = terrains[0] if terrains else ground
         self.sim = Simulation(
@@ -124,7 +125,7 @@ class Env(Stages):
         self._show()
 
     def _show(self) -> None:
-        """Let torch see Warp's memory."""
+        """Set the public tensors: torch views of Warp's arrays, of the first task where tasks differ."""
         self.num_actions, self.actions = 12, wp.to_torch(self._action)
         self.action, first = self.actions[0], self.skills[0]
         self.obs, self.critic_obs = first.obs["actor"], first.obs["critic"]
@@ -136,17 +137,16 @@ class Env(Stages):
         self.reward, self.done, self.timeout, ended, cut = (wp.to_torch(getattr(self.episodes, name)) for name in names)
         self._step = Step(first.obs, self.reward, ended, cut, {"final_obs": first.final_obs, "time_outs": self.timeout})
 
-    # ------------------------------------------------------------------ stepping
-
     def reset(self, seed: int | None = None, *, worlds: Any = None) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
-        """Begin a new episode in every world; return observations by group, and extras.
+        """Begin a new episode in every world; return (observations by group, extras), extras being empty.
 
-        seed: draw and begin as a new environment of this seed does, its curriculum included; graphs that were captured
-        outside keep the old one. worlds: begin anew in these only, (num_envs,) bool or indices; the others go on, with
-        new commands where they are due. After `evaluation_reset` episodes end again when all worlds have begun anew.
-        Raises ValueError: not a seed, not worlds, or both. RuntimeError: worlds before the first reset of all.
+        seed: restart all random streams and the curriculum as in a new environment with this seed; graphs captured
+        elsewhere keep the old one. worlds: reset only these, (num_envs,) bool or indices; the others continue, with
+        new commands where due. A reset of all worlds ends the mode of `evaluation_reset`.
+        Raises InputError (a ValueError): invalid seed or worlds, or both given. RuntimeError: worlds before the first
+        reset of all.
         """
-        chosen = self._all if worlds is None else self._array(checked_worlds(worlds, self.num_envs))
+        mask = self._all if worlds is None else self._array(checked_worlds(worlds, self.num_envs))
         if worlds is not None and seed is not None:
             raise InputError("a seed is for all worlds: reset(seed), or reset(worlds=...) without one")
         if worlds is not None and not self._started:
@@ -155,19 +155,20 @@ class Env(Stages):
             check_seed(seed)
             self._start_over(seed)
         self._ends_episodes = self._ends_episodes or worlds is None
-        self.compile()  # an evaluation compiles no draws
-        self._advance_rng(chosen)
-        self._reset_worlds(self._part(), chosen)
+        self.compile()  # `evaluation_reset` compiles no reset kernel
+        self._advance_rng(mask)
+        self._reset_worlds(self._part(), mask)
         self._observe(self._part(), after_reset=int(worlds is not None))
         return self._step.obs, {}
 
     def compile(self) -> None:
-        """Compile all kernels of `reset` and `step`, side by side; the first `reset` does so itself."""
+        """Compile all kernels of `reset` and `step` in parallel; the first `reset` calls this itself."""
         if not self._compiled:
             load_kernels(self.kernels(), self.wp_device)
             self._compiled = True
 
     def _start_over(self, seed: int) -> None:
+        """Put episodes, curriculum and task states back to those of a new environment with this seed."""
         self.seed = self.episodes.seed = seed
         self._started = False
         self._graphs.clear()  # they hold the old seed
@@ -180,11 +181,11 @@ class Env(Stages):
             skill.states.zero_()
 
     def step(self, action: torch.Tensor) -> Step:
-        """Advance one policy step; the next one overwrites the tensors that this one returns, so clone what is kept.
+        """Advance one policy step; the next step overwrites the returned tensors, so clone what you keep.
 
-        action: (num_envs, 12), clamped to -1..1; with several tasks (tasks, num_envs, 12), of which each world takes
-        its own. A world whose action is not finite ends as one that came apart.
-        Raises ValueError: an action of another shape, kind of numbers or device. RuntimeError: no `reset` before.
+        action: (num_envs, 12) floating point, clamped to -1..1; with several tasks (tasks, num_envs, 12), of which each
+        world uses the row of its task. A non-finite action ends the episode as `came_apart`.
+        Raises InputError (a ValueError): an action of another shape, dtype or device. RuntimeError: no `reset` before.
         """
         if not self._started:
             raise RuntimeError("call reset before the first step")
@@ -201,10 +202,10 @@ class Env(Stages):
         return self._step
 
     def set(self, name: str, value: float, skill: int = 0) -> None:
-        """Change a number of a task's term, at once and in captured graphs too: `rewards.jump_height.weight`.
+        """Change a number of a task's term, from the next step on, also in captured graphs.
 
-        name: section, term and number, as in `jumper_warp.tasks.params`; skill: index of the task.
-        Raises ValueError: no such number or skill, or a value that is not finite.
+        name: "section.term.number" such as `rewards.jump_height.weight`; skill: index of the task.
+        Raises InputError (a ValueError): no such number or skill, or a value that is not finite.
         """
         self._check_skill(skill)
         self.skills[skill].params.set(name, value)
@@ -213,17 +214,12 @@ class Env(Stages):
         if not 0 <= skill < len(self.skills):
             raise InputError(f"skill must be an index below {len(self.skills)}, got {skill}")
 
-    # ------------------------------------------------------------------ commands from outside
-
     def evaluation_reset(self, commands: Any, headings: Any = 0.0, worlds: Any = None) -> None:
-        """Stand worlds in the default pose with commands of their own, and end no episode until `reset`.
+        """Begin an episode with a given command in the default pose and first skill; ended episodes stay until `reset`.
 
-        They are in their first skill, and asked for no other.
-
-        commands: one row a world or one for all, of what the task's command takes
-        (`jumper_warp.tasks.commands.layout_of`); headings [rad]: (num_envs,) or one for all; worlds: (num_envs,) bool,
-        by default all.
-        Raises ValueError: values of another shape, out of bounds or not finite.
+        commands: one row a world or one for all, columns as in `jumper_warp.tasks.commands.layout_of`; headings [rad]:
+        (num_envs,) or one for all; worlds: (num_envs,) bool, by default all.
+        Raises InputError (a ValueError): values of another shape, out of bounds or not finite.
         """
         n, chosen = self.num_envs, checked_mask(worlds, self.num_envs)
         values = checked_commands(commands, chosen, [self.tasks[i] for i in np.unique(self._first_skill)])
@@ -245,22 +241,21 @@ class Env(Stages):
         self._observe(self._part(), after_reset=1)
 
     def command(self, commands: Any, worlds: Any = None) -> None:
-        """Give worlds a command within their episode; `obs` shows it at once.
+        """Set commands within running episodes and update `obs`.
 
-        commands: as of `evaluation_reset`, relative to base and yaw as they are; worlds: (num_envs,) bool, by default
-        all.
-        Raises ValueError: values of another shape, out of bounds or not finite.
+        commands: as in `evaluation_reset`, relative to the present base position and yaw; worlds: (num_envs,) bool, by
+        default all. Raises InputError (a ValueError): values of another shape, out of bounds or not finite.
         """
         chosen = checked_mask(worlds, self.num_envs)
         self._set_commands(self._array(chosen), 0, checked_commands(commands, chosen, self.tasks), self._all)
         self._observe(self._part(), after_reset=1)
 
     def request(self, skill: int, worlds: Any = None, commands: Any = None) -> None:
-        """Ask worlds to hand over to another skill as soon as a handover allows it.
+        """Request that worlds hand over to another skill as soon as the condition of a handover holds.
 
-        worlds: (num_envs,) bool, by default all. commands: rows of what the skill's command takes, given as it takes
-        over, relative to base and yaw as they are then; by default the skill begins as the handover says.
-        Raises ValueError: no such skill, or commands of another shape, out of bounds or not finite.
+        skill: index of the task. worlds: (num_envs,) bool, by default all. commands: as in `evaluation_reset`, set at
+        the handover relative to the base position and yaw of that moment; by default the handover's `begin` sets one.
+        Raises InputError (a ValueError): no such skill, or commands of another shape, out of bounds or not finite.
         """
         self._check_skill(skill)
         mask, values = checked_mask(worlds, self.num_envs), np.zeros((self.num_envs, 4), dtype=np.float32)
@@ -270,19 +265,18 @@ class Env(Stages):
         for array, new in ((self.episodes.requested_task, skill),
                            (self.episodes.has_command, int(commands is not None)),
                            (self.episodes.pending_command, values[mask])):  # fmt: skip
-            kept = array.numpy()
-            kept[mask] = new
-            array.assign(kept)
+            host_values = array.numpy()
+            host_values[mask] = new
+            array.assign(host_values)
 
     def _array(self, values: np.ndarray) -> wp.array:
         return wp.array(values, dtype=float, device=self.wp_device)
 
-    # ------------------------------------------------------------------ looking at it
-
     def task_arrays(self, skill: int = 0) -> dict[str, np.ndarray]:
-        """Return every world's state of a task, one array of shape (num_envs, ...) a field (waits for the device).
+        """Return the fields of every world's state of a task as arrays (num_envs, ...) (waits for the device).
 
-        Besides the fields of the task: base_pos [m], base_vel [m/s], base_quat (xyzw), done, termination, level.
+        Also, of all worlds: base_pos [m], base_vel [m/s] of the centre of mass, base_quat (xyzw), done, termination
+        (index, -1: none), level.
         """
         state = records(self.skills[skill].states)
         arrays = {name: np.array(state[name]) for name in state.dtype.names or ()}
@@ -291,7 +285,7 @@ class Env(Stages):
         return arrays | {name: getattr(self.episodes, name).numpy().copy() for name in ("done", "termination", "level")}
 
     def snapshot(self) -> Snapshot:
-        """Return the robots, their parameters and their state, as gradients need them; waits for nothing."""
+        """Return the robots' present state and parameters for `jumper_warp.diff`; does not wait for the device."""
         sim, n = self.sim, self.num_envs
         past, step_count = wp.to_torch(self.delays.target_history), wp.to_torch(self.episodes.step_count).long()
         parameters = {name: wp.to_torch(getattr(sim.motors, name)) for name in MOTOR_CONSTANTS}
@@ -317,28 +311,28 @@ class Env(Stages):
         )
 
     def metrics(self) -> dict[str, float]:
-        """Return means since the last call, and clear the counters (waits for the device).
+        """Return metrics by name, means since the last call, and clear the counters (waits for the device).
 
-        Those of the first task have plain names, those of each other one begin with its name and a slash.
+        Names of tasks other than the first begin with the task's name and a slash.
         """
-        figures = self.skills[0].metrics()
+        metrics = self.skills[0].metrics()
         for skill in self.skills[1:]:
-            figures |= {f"{skill.task.name}/{name}": value for name, value in skill.metrics().items()}
+            metrics |= {f"{skill.task.name}/{name}": value for name, value in skill.metrics().items()}
         levels = np.bincount(self.episodes.level.numpy(), minlength=len(self.task.levels) + 1)
-        return figures | {f"Curriculum/level_{i}": float(count) / self.num_envs for i, count in enumerate(levels)}
+        return metrics | {f"Curriculum/level_{i}": float(count) / self.num_envs for i, count in enumerate(levels)}
 
     def mirror(self, what: str) -> Mirror:
-        """Return order and signs of the left-right mirror image of the first task's "observation", or of an "action".
+        """Return the left-right mirror image (order, signs) of the first task's "observation", or of an "action".
 
         Raises ValueError: the mirror image of a term is not known.
         """
         return mirror_of_action() if what == "action" else mirror_of(self.task, "actor")
 
     def config(self) -> dict:
-        """Return everything that defines the environment, as JSON can hold it.
+        """Return everything that defines the environment, ready for JSON.
 
-        `task` and `interface` are of the first task; several have `tasks`, and `handovers` as their functions' names.
-        `robot` is there if an overlay was given.
+        `task` and `interface` are those of the first task; with several tasks, `tasks`, `first_skill` and `handovers`
+        (names of functions) are added, with a robot overlay, `robot`.
         """
         config = {
             "task": task_to_json(self.task),
@@ -365,9 +359,9 @@ class Env(Stages):
         }
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """Return everything that the next step depends on, as `jumper_warp.envs.state.save_state`."""
+        """Return everything that the next step depends on, see `jumper_warp.envs.state.save_state`."""
         return save_state(self)
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
-        """Go on from a saved state, in the same steps; raises ValueError as `jumper_warp.envs.state.load_state`."""
+        """Restore a saved state, so that later steps are bitwise the same; see `jumper_warp.envs.state.load_state`."""
         load_state(self, state)

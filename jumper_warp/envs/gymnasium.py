@@ -1,4 +1,4 @@
-"""The environment as Gymnasium sees a vector of environments."""
+"""Adapter from the environment to `gymnasium.vector.VectorEnv`."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ Obs = Any
 
 
 class GymVectorEnv(gymnasium.vector.VectorEnv):
-    """Adapter. An episode that ends begins anew in the same step; what is returned are copies.
+    """`Env` of one task as a Gymnasium vector environment; ended episodes are reset in the same step; returns copies.
 
-    Infos of a step in which episodes ended, besides masks `_final_obs` and `_final_info` of the worlds concerned:
-        final_obs: (num_envs,) the old episode's last observations, None elsewhere.
-        final_info: `termination`, (num_envs,) index in `endings` of the termination.
-    With tensors=True, actions and all that is returned are torch tensors on the environment's device, and nothing waits
-    for it. Infos of every step then have both, `final_obs` with a row for every world.
+    Infos of a step in which episodes ended, with masks `_final_obs` and `_final_info` (num_envs,) of these worlds:
+        final_obs: (num_envs,) objects, last observations of the ended episodes, None elsewhere.
+        final_info: `termination`, (num_envs,) index in `endings` (names of terminations), -1 elsewhere.
+    With tensors=True, actions and all returned values are torch tensors on the environment's device, nothing waits for
+    the device, and infos of every step have both entries, `final_obs` as observations of all worlds.
     """
 
     metadata: ClassVar[dict[str, Any]] = {
@@ -36,10 +36,10 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
     }
 
     def __init__(self, env: Env, *, all_groups: bool = False, tensors: bool = False) -> None:
-        """Take over an environment; call `reset` before the first step.
+        """Wrap `env`; call `reset` before the first step.
 
-        all_groups: observations are all groups by name, not only what the policy sees. tensors: see the class.
-        Raises ValueError: the environment's worlds do not restart by themselves, or it has several tasks.
+        all_groups: observations are a dict with the groups `actor` and `critic`, else those of `actor` only. tensors:
+        see the class. Raises InputError (a ValueError): the environment has no auto_reset, or several tasks.
         """
         if not env.auto_reset:
             raise InputError("Gymnasium's adapter needs an environment with auto_reset")
@@ -47,7 +47,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
             raise InputError(f"Gymnasium's adapter needs an environment of one task, this one has {len(env.tasks)}")
         self.env, self.num_envs = env, env.num_envs
         self.endings = tuple(term.name for term in env.task.terminations)
-        self._all_groups, self._tensors, self._began = all_groups, tensors, False
+        self._all_groups, self._tensors, self._was_reset = all_groups, tensors, False
         self._termination = wp.to_torch(env.episodes.termination)
         widths = {"actor": env.num_obs, "critic": env.num_critic_obs}
         boxes = {group: Box(-RAW_LIMIT, RAW_LIMIT, (width,)) for group, width in widths.items()}
@@ -57,10 +57,10 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Obs, dict[str, Any]]:
-        """Begin a new episode in every world; return observations, and infos (none).
+        """Begin a new episode in every world; return (observations, infos), infos being empty.
 
-        seed: all goes as in a new environment of this seed (modulo 2**31); None: the draws go on. options: none exist.
-        Raises ValueError: there are options. gymnasium.error.Error: not a seed.
+        seed: restart all random streams as in a new environment with this seed (modulo 2**31); None: they continue.
+        Raises InputError (a ValueError): there are options. gymnasium.error.Error: not a seed.
         """
         self._check_open()
         if options:
@@ -69,59 +69,62 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         if seed is not None:
             seed %= MOST_SEED + 1
         obs, _ = self.env.reset(seed)
-        self._began = True
-        return self._shown(obs), {}
+        self._was_reset = True
+        return self._observation(obs), {}
 
     def step(self, actions: Any) -> tuple[Obs, Any, Any, Any, dict[str, Any]]:
-        """Advance by a policy period; return observations, rewards, terminations, truncations and infos.
+        """Advance one policy step; return (observations, rewards, terminations, truncations, infos), see the class.
 
-        actions: (num_envs, 12), clamped to -1..1. Observations are those of the new episode where one has ended.
-        Raises ValueError: actions of another shape, or no numbers. gymnasium.error.ResetNeeded: no `reset` came before.
+        actions: (num_envs, 12), clamped to -1..1. Where an episode ended, the observation is that of the new episode.
+        Raises InputError (a ValueError): actions of another shape or dtype. gymnasium.error.ResetNeeded: not reset.
         """
         self._check_open()
-        if not self._began:
+        if not self._was_reset:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
-        step = self.env.step(actions if self._tensors else self._checked(actions))
+        step = self.env.step(actions if self._tensors else self._checked_actions(actions))
         reward = torch.nan_to_num(step.reward, nan=0.0, posinf=0.0, neginf=0.0)
-        terminated, truncated = (self._given(flag.clone()) for flag in (step.terminated, step.truncated))
+        terminated, truncated = (self._converted(flag.clone()) for flag in (step.terminated, step.truncated))
         ended, infos = terminated | truncated, {}
         if self._tensors or ended.any():
-            final, termination = self._shown(step.extras["final_obs"]), self._given(self._termination.clone())
-            infos["final_obs"], infos["_final_obs"] = final if self._tensors else self._rows(final, ended), ended
-            infos["final_info"] = {"termination": termination, "_termination": _copy(ended)}
-            infos["_final_info"] = _copy(ended)
-        return self._shown(step.obs), self._given(reward), terminated, truncated, infos
+            final, termination = self._observation(step.extras["final_obs"]), self._converted(self._termination.clone())
+            infos["final_obs"], infos["_final_obs"] = final if self._tensors else self._final_rows(final, ended), ended
+            infos["final_info"] = {"termination": termination, "_ending": _copied(ended)}
+            infos["_final_info"] = _copied(ended)
+        return self._observation(step.obs), self._converted(reward), terminated, truncated, infos
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Let the environment go; its memory is free when nobody else holds it."""
+        """Drop the references to the environment, called by `close`; kwargs are unused."""
         del self.env, self._termination
 
     def _check_open(self) -> None:
         if self.closed:
             raise gymnasium.error.ClosedEnvironmentError("the environment is closed")
 
-    def _checked(self, actions: Any) -> torch.Tensor:
+    def _checked_actions(self, actions: Any) -> torch.Tensor:
+        """Return actions as a float32 tensor on the device. Raises InputError: another shape, or not numbers."""
         array, shape = np.asarray(actions), self.action_space.shape
         if array.shape != shape or array.dtype.kind not in "fiu":
             raise InputError(f"actions must be numbers of shape {shape}, got {array.dtype} of shape {array.shape}")
         return torch.from_numpy(np.array(array, dtype=np.float32)).to(self.env.device)
 
-    def _given(self, tensor: torch.Tensor) -> Any:
+    def _converted(self, tensor: torch.Tensor) -> Any:
+        """Return a tensor as it is returned: itself with `tensors`, else as a NumPy array."""
         return tensor if self._tensors else tensor.cpu().numpy()
 
-    def _shown(self, groups: dict[str, torch.Tensor]) -> Obs:
-        """Return copies as the observation space has them, finite and bounded."""
+    def _observation(self, groups: dict[str, torch.Tensor]) -> Obs:
+        """Return copies of observations in the form of the observation space, finite and within RAW_LIMIT."""
         if not self._all_groups:
-            return self._given(sanitise(groups["actor"]))
-        return {group: self._given(sanitise(groups[group])) for group in ("actor", "critic")}
+            return self._converted(sanitise(groups["actor"]))
+        return {group: self._converted(sanitise(groups[group])) for group in ("actor", "critic")}
 
-    def _rows(self, obs: Obs, worlds: np.ndarray) -> np.ndarray:
-        """Return the observation of each of some worlds as an object, None for others."""
+    def _final_rows(self, obs: Obs, worlds: np.ndarray) -> np.ndarray:
+        """Return an object array (num_envs,): a world's observation where worlds (num_envs,) bool is set, else None."""
         rows = np.full(self.num_envs, None, dtype=object)
         for world in np.flatnonzero(worlds):
-            rows[world] = {group: x[world] for group, x in obs.items()} if self._all_groups else obs[world]
+            rows[world] = {group: values[world] for group, values in obs.items()} if self._all_groups else obs[world]
         return rows
 
 
-def _copy(flags: Any) -> Any:
+def _copied(flags: Any) -> Any:
+    """Return a copy of a tensor or an array."""
     return flags.clone() if isinstance(flags, torch.Tensor) else flags.copy()

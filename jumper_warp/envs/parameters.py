@@ -1,4 +1,4 @@
-"""The arrays that domain randomisation writes, taken from a simulation."""
+"""`RobotParameters`, the arrays that domain randomisation writes, on the memory of a simulation."""
 
 from __future__ import annotations
 
@@ -16,18 +16,18 @@ from jumper_warp.tasks.cfg import TaskCfg
 MODEL = (
     "body_mass", "body_inv_mass", "body_com", "body_inertia", "body_inv_inertia", "joint_armature", "joint_friction",
 )  # fmt: skip
-"""Arrays of Newton's model."""
+"""Arrays of Newton's model that `RobotParameters` shares under the same name."""
 NOMINAL = {
     "body_mass": "mass", "body_com": "com", "body_inertia": "inertia", "body_inv_inertia": "inv_inertia",
     "joint_armature": "armature",
 }  # fmt: skip
-"""Arrays of the model whose values of one world are kept."""
+"""Arrays of the model whose values of one world are copied to `nominal_<value>`."""
 
 
 def robot_parameters(sim: Simulation, tasks: tuple[TaskCfg, ...], skill: wp.array) -> Any:
-    """Return the kernels' `RobotParameters`; the model's values of the moment are the nominal ones.
+    """Return the kernels' `RobotParameters`; the model's present values become the nominal ones.
 
-    skill: index of each world's task among `tasks`, (num_worlds,).
+    skill: (num_worlds,) int, index in `tasks` of each world's active task.
     """
     model, n, device = sim.model, sim.num_worlds, sim.device
     robot = RobotParameters()
@@ -35,15 +35,15 @@ def robot_parameters(sim: Simulation, tasks: tuple[TaskCfg, ...], skill: wp.arra
         setattr(robot, name, getattr(model, name))
     for name, short in NOMINAL.items():
         array = getattr(model, name)
-        one = array.numpy()[: int(BODIES) if name.startswith("body") else int(DOFS)]
-        setattr(robot, f"nominal_{short}", wp.array(one, dtype=array.dtype, device=device))
+        first_world = array.numpy()[: int(BODIES) if name.startswith("body") else int(DOFS)]
+        setattr(robot, f"nominal_{short}", wp.array(first_world, dtype=array.dtype, device=device))
     robot.shape_mu = model.shape_material_mu
     robot.paw_shapes = wp.array(find_paws(model).flatten(), dtype=int, device=device)
     robot.static_ratio = sim.physics.dynamics.static_friction_ratio
     robot.motors, robot.physics_dt, robot.skill = sim.motors, sim.dt, skill
-    values = sim.robot
-    late = 0 if values is None else round(float(values.latency[0, 0]) / sim.dt)
-    robot.latency = wp.full(n, late, dtype=int, device=device)
+    overlay = sim.robot
+    latency = 0 if overlay is None else round(float(overlay.latency[0, 0]) / sim.dt)
+    robot.latency = wp.full(n, latency, dtype=int, device=device)
     robot.observation_latency = wp.zeros(n, dtype=int, device=device)
     robot.push = wp.zeros(n, dtype=wp.spatial_vectorf, device=device)
     for name in ("gain_ratio", "speed_ratio"):
@@ -55,11 +55,11 @@ def robot_parameters(sim: Simulation, tasks: tuple[TaskCfg, ...], skill: wp.arra
         for task in tasks:
             lateral, transversal = getattr(task.motors.lateral, attribute), getattr(task.motors.transversal, attribute)
             row = np.array(4 * [lateral, transversal, transversal])
-            if values is not None:
-                of_robot = getattr(values, attribute)[0]
-                row = of_robot if attribute.endswith("speed") else row * of_robot
+            if overlay is not None:  # speeds of an overlay are absolute [rad/s], gains and saturation are factors
+                value = getattr(overlay, attribute)[0]
+                row = value if attribute.endswith("speed") else row * value
             rows.append(row)
         setattr(robot, f"nominal_{name}", wp.array(np.array(rows, dtype=np.float32), dtype=float, device=device))
-    offset = np.zeros(12) if values is None else values.offset[0]
+    offset = np.zeros(12) if overlay is None else overlay.offset[0]
     robot.nominal_offset = wp.array(offset, dtype=float, device=device)
     return robot

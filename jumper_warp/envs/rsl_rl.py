@@ -1,4 +1,4 @@
-"""The environment as rsl-rl sees one."""
+"""Adapter from the environment to rsl-rl's `VecEnv`."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from jumper_warp.envs.vec_env import VecEnv, sanitise
 
 
 class RslRlVecEnv(RslRlEnv):
-    """Adapter. What it returns are copies, because rsl-rl keeps references over the next step."""
+    """A `VecEnv` as rsl-rl's `VecEnv`; returns copies, because rsl-rl keeps references over the next step."""
 
     def __init__(self, env: VecEnv, metrics_every: int = 24, max_episode_length: int = 1200) -> None:
-        """Take an environment that was reset, or call `reset` of the adapter before a training.
+        """Wrap `env`; unless it was reset, call `reset` of the adapter before training.
 
-        metrics_every: Policy steps between two readings of the environment's metrics, which wait for the device; those
-            of an iteration log it once. max_episode_length: Policy steps after which no episode goes on; only reported.
+        metrics_every: policy steps between two reads of the metrics, which wait for the device; with the number of
+            steps per iteration they are logged once per iteration. max_episode_length: policy steps; only reported.
         """
         self.env = env
         self.num_envs, self.num_actions = env.num_envs, env.num_actions
@@ -50,11 +50,11 @@ class RslRlVecEnv(RslRlEnv):
         return TensorDict(groups, batch_size=[self.num_envs], device=self.device)
 
     def step(self, actions: torch.Tensor) -> tuple[TensorDict, torch.Tensor, torch.Tensor, dict[str, Any]]:
-        """Advance by a policy period.
+        """Advance one policy step; return (observations, rewards (num_envs,), dones (num_envs,) int64, extras).
 
-        actions: (num_envs, num_actions). Returns observations, of the new episode where one has ended, rewards and
-        dones (num_envs,), and extras: `time_outs` (num_envs,), 1 where the episode ended without failure, and now and
-        then `log`, the metrics by name. Raises ValueError as the environment.
+        actions: (num_envs, num_actions). Observations of ended episodes are those of the new one. extras: `time_outs`
+        (num_envs,), 1 where the episode ended without failure, and every `metrics_every` steps `log`, the metrics by
+        name. Raises InputError as `Env.step`.
         """
         env = self.env
         env.step(actions)

@@ -1,4 +1,4 @@
-"""One task in an environment: its kernels and all that it keeps of every world."""
+"""One task in an environment: its kernels and its arrays of all worlds."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import torch
 import warp as wp
 
-from jumper_warp.envs.arrays import fill
+from jumper_warp.envs.arrays import allocate
 from jumper_warp.kernels.mdp.env import RING, Counters, NoSettings, SkillSettings
 from jumper_warp.kernels.mdp.events import make_event_kernel
 from jumper_warp.kernels.mdp.observe import CHUNK, ObservationArrays, make_observe_kernel
@@ -26,10 +26,13 @@ _KERNELS: dict[tuple, Kernel] = {}
 
 
 class TaskRuntime:
-    """The side of an environment that belongs to one task. Struct and array attributes are the kernels' arguments."""
+    """Kernels and arrays of one task in an environment; struct and array attributes are arguments of the kernels.
+
+    kernels: see `kernels_of`. obs, final_obs: torch views (num_envs, columns) by group, after and before resets.
+    """
 
     def __init__(self, task: TaskCfg, index: int, num_envs: int, step_dt: float, substeps: int, device: Any) -> None:
-        """Allocate everything; index: of the skill in the environment; step_dt [s]: policy step."""
+        """Allocate everything; index: of the task in the environment; step_dt [s]: policy step of `substeps`."""
         self.task, self.index, self.num_envs, self.device = task, index, num_envs, device
         self.kernels = kernels_of(task)
         self.params = ParamArrays(task.params, device)
@@ -43,19 +46,21 @@ class TaskRuntime:
         self._allocate_observations(substeps)
 
     def _counters(self) -> Any:
+        """Return the kernels' `Counters`, all 0."""
         n, task, counters = self.num_envs, self.task, Counters()
-        fill(counters, ("term_sum",), (max(len(task.rewards), 1), n), wp.float64, self.device)
-        fill(counters, ("termination_count",), (len(task.terminations), n), int, self.device)
-        fill(counters, ("curriculum_episodes", "curriculum_successes", "bad_actions"), n, int, self.device)
-        fill(counters, ("error_sum",), n, wp.float64, self.device)
+        allocate(counters, ("term_sum",), (max(len(task.rewards), 1), n), wp.float64, self.device)
+        allocate(counters, ("termination_count",), (len(task.terminations), n), int, self.device)
+        allocate(counters, ("curriculum_episodes", "curriculum_successes", "bad_actions"), n, int, self.device)
+        allocate(counters, ("error_sum",), n, wp.float64, self.device)
         return counters
 
     def _structs(self, values: list, kind: Any = None) -> wp.array:
-        """Return structs as an array; an unused one where there are none."""
+        """Return structs (of type `kind`) as a Warp array, of one unused `NoSettings` if there are none."""
         values = values or [NoSettings()]
         return wp.array(values, dtype=kind or values[0]._cls, device=self.device)
 
     def _allocate_observations(self, substeps: int) -> None:
+        """Set the index table of components, the observation arrays and their torch views by group."""
         n, task = self.num_envs, self.task
         layouts = {group: task.layout(group) for group in task.groups}
         widths = {group: max((end for _, end in layout.values()), default=0) for group, layout in layouts.items()}
@@ -71,16 +76,16 @@ class TaskRuntime:
         self.columns = wp.array(np.array(columns, dtype=np.int32).T, dtype=int, device=self.device)
         self.num_chunks = -(-sum(len(task.params.slots[f"observations.{group}"]) for group in task.groups) // CHUNK)
         arrays = ObservationArrays()
-        fill(arrays, ("raw",), (len(columns), n), float, self.device)
-        fill(arrays, ("now", "final"), start, float, self.device)
-        fill(arrays, ("past",), (RING, n, max(past, 1)), float, self.device)
+        allocate(arrays, ("raw",), (len(columns), n), float, self.device)
+        allocate(arrays, ("now", "final"), start, float, self.device)
+        allocate(arrays, ("past",), (RING, n, max(past, 1)), float, self.device)
         arrays.latency = wp.zeros(n, dtype=int, device=self.device)
         arrays.substeps = substeps
         self.observations = arrays
         self.obs, self.final_obs = (self._views(a, widths) for a in (arrays.now, arrays.final))
 
     def _views(self, array: wp.array, widths: dict[str, int]) -> dict[str, torch.Tensor]:
-        """Return torch views (num_envs, columns) of each group's rows."""
+        """Return torch views (num_envs, columns) by group; array: flat, groups end to end; widths: columns by group."""
         flat, first, views = wp.to_torch(array), 0, {}
         for group, width in widths.items():
             views[group] = flat[first : first + self.num_envs * width].view(self.num_envs, width)
@@ -88,7 +93,7 @@ class TaskRuntime:
         return views
 
     def settings_of_skill(self) -> Any:
-        """Return the kernels' `SkillSettings`."""
+        """Return the kernels' `SkillSettings` of the task."""
         lateral, transversal = (math.radians(scale) for scale in self.task.action_scale)
         settings = SkillSettings()
         settings.action_scale = vec12(*(4 * (lateral, transversal, transversal)))
@@ -101,53 +106,51 @@ class TaskRuntime:
         return settings
 
     def set(self, section: str, name: str, **numbers: float) -> None:
-        """Change numbers of a term, as `Env.set` changes one; raises ValueError as it does."""
+        """Change numbers of term `section.name`, each as `Env.set` does; raises InputError as `Env.set`."""
         for key, value in numbers.items():
             self.params.set(f"{section}.{name}.{key}", value)
 
     def metrics(self) -> dict[str, float]:
-        """Return means since the last call, and clear the counters (waits for the device)."""
-        task, counters, figures = self.task, self.counters, {}
+        """Return metrics by name, means since the last call, and clear the counters (waits for the device)."""
+        task, counters, metrics = self.task, self.counters, {}
         endings = counters.termination_count.numpy().sum(axis=1)
         ended = max(int(endings.sum()), 1)
         for term, total in zip(task.rewards, counters.term_sum.numpy().sum(axis=1), strict=False):
-            figures[f"Episode_Reward/{term.name}"] = float(total) / ended
+            metrics[f"Episode_Reward/{term.name}"] = float(total) / ended
         for term, count in zip(task.terminations, endings, strict=True):
-            figures[f"Episode_Termination/{term.name}"] = float(count) / ended
-        counted, succeeded = (
-            int(counters.curriculum_episodes.numpy().sum()),
-            int(counters.curriculum_successes.numpy().sum()),
-        )
-        figures["Metrics/success"] = succeeded / max(counted, 1)
+            metrics[f"Episode_Termination/{term.name}"] = float(count) / ended
+        counted = int(counters.curriculum_episodes.numpy().sum())
+        succeeded = int(counters.curriculum_successes.numpy().sum())
+        metrics["Metrics/success"] = succeeded / max(counted, 1)
         error = float(counters.error_sum.numpy().sum())
-        figures[f"Metrics/error_{task.curriculum.options['unit']}"] = error / max(succeeded, 1)
-        figures["Metrics/bad_actions"] = float(counters.bad_actions.numpy().sum())
+        metrics[f"Metrics/error_{task.curriculum.options['unit']}"] = error / max(succeeded, 1)
+        metrics["Metrics/bad_actions"] = float(counters.bad_actions.numpy().sum())
         for name in Counters.vars:
             getattr(counters, name).zero_()
-        return figures | self._state_metrics()
+        return metrics | self._state_metrics()
 
     def _state_metrics(self) -> dict[str, float]:
-        """Return what the worlds counted in their states, and begin to count anew."""
-        metrics, figures = self.task.metrics, {}
+        """Return the task's metrics of state fields: sum of `field` over sum of `per`, else the mean; clear both."""
+        metrics, values_by_name = self.task.metrics, {}
         if not metrics:
-            return figures
+            return values_by_name
         states = records(self.states).copy()
         for metric in metrics:
             values = states[metric.field].astype(np.float64)
             total = 0.0 if metric.per is None else float(states[metric.per].astype(np.float64).sum())
             mean = float(values.mean()) if metric.per is None else 0.0
-            figures[metric.name] = float(values.sum()) / total if total else mean
+            values_by_name[metric.name] = float(values.sum()) / total if total else mean
         for metric in metrics:
             if metric.per is not None:
                 states[metric.field] = states[metric.per] = 0.0
         self.states.assign(wp.array(states, dtype=self.task.state, device=self.device))
-        return figures
+        return values_by_name
 
 
 def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
-    """Return a task's kernels; tasks share each that reads the same of them, whatever their numbers."""
+    """Return a task's kernels by name; tasks that differ in numbers only share them."""
     slots = task.params.slots
-    compiled = {section: tuple(slot.compiled for slot in of_section) for section, of_section in slots.items()}
+    compiled = {section: tuple(slot.compiled for slot in section_slots) for section, section_slots in slots.items()}
     ends = tuple(compiled[section] for section in ("advance", "curriculum", "rewards", "terminations"))
     begins = (task.reset.func, task.settings_type, task.level_type, task.command.resample_due, task.command.resample)
     return {
@@ -161,8 +164,8 @@ def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
     }
 
 
-def _kernel(make: Callable[[Any], Kernel], source: Any, *read: Any) -> Kernel:
-    """Return what a function makes of a source, made once for all of which it reads the same."""
-    if (key := (make, *read)) not in _KERNELS:
+def _kernel(make: Callable[[Any], Kernel], source: Any, *key_parts: Any) -> Kernel:
+    """Return make(source), cached by `make` and key_parts: everything in source that the kernel depends on."""
+    if (key := (make, *key_parts)) not in _KERNELS:
         _KERNELS[key] = make(source)
     return _KERNELS[key]

@@ -1,4 +1,4 @@
-"""The stages of a policy step: what is launched, in which order, on which arrays."""
+"""The stages of a policy step: kernels, their order and their arrays."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.utils.kernels import Kernel
 
 BLOCK = 32
-"""Threads of a block: small ones spread a few thousand heavy threads over all multiprocessors."""
+"""Default threads of a block; small, to spread a few thousand heavy threads over all multiprocessors."""
 BLOCKS = {"reset": 128, "event": 256}
-"""Of kernels of a task that are not launched so, by name."""
+"""Threads of a block of task kernels, by name, where it is not BLOCK."""
 POSTPROCESS_BLOCK = 256
 EVENT_BLOCKS = 264
-"""Most blocks of events: of their many threads few have something to do, and a new block costs more than a turn."""
+"""Largest number of blocks of event kernels: most threads are idle, and a new block costs more than another turn."""
 
 
 class WorldSlice(NamedTuple):
@@ -51,7 +51,7 @@ class WorldSlice(NamedTuple):
 
 
 class Stages:
-    """What an environment launches. It holds all arrays; `Env` is the side that its users see."""
+    """Arrays and kernel launches of an environment; `Env` adds the public methods."""
 
     sim: Simulation
     tasks: tuple[TaskCfg, ...]
@@ -63,10 +63,10 @@ class Stages:
     _started: bool
     """Whether `reset` or `evaluation_reset` has begun the first episodes."""
     _ends_episodes: bool
-    """Whether ended episodes begin anew; not while a policy is measured."""
+    """Whether ended episodes are reset; false after `evaluation_reset`."""
 
     def _allocate(self, tasks: Sequence[TaskCfg], skill: np.ndarray | int, handovers: Sequence[Handover]) -> None:
-        """Make all arrays and kernels; skill: index of the task that each world begins in."""
+        """Allocate all arrays and make all kernels; skill: index of each world's first task, (num_envs,) or one."""
         n, device, sim = self.num_envs, self.wp_device, self.sim
         self._first_skill = checked_skill(skill, n, len(tasks))
         active, self._home = (wp.array(self._first_skill, dtype=int, device=device) for _ in range(2))
@@ -86,25 +86,25 @@ class Stages:
             (make_handover_kernel(h), self.tasks.index(h.source), self.tasks.index(h.target)) for h in handovers
         ]
 
-    def restored(self) -> None:
-        """Let the solver and the terms read what was put back."""
+    def after_load_state(self) -> None:
+        """Update what depends on the arrays after `load_state` wrote them: start flag, terms' numbers and solver."""
         self._started = bool((self.episodes.step_count.numpy() > FIRST_STEP_COUNT).all())
         for skill in self.skills:
             skill.params.restore()
         self.sim.physics.parameters_changed()
 
     def kernels(self, draws: bool = True) -> list[tuple[Kernel, int]]:
-        """Return what `reset` and `step` launch, each with its block size; draws: the draw of starts too."""
+        """Return the kernels of `reset` and `step`, each with its block size; draws: include `reset`."""
         shared = [action_kernel, motors_kernel, clear_history_kernel, advance_rng_kernel, track_kernel]
         shared += [restore_task_kernel] if len(self.skills) > 1 else []
         shared += [kernel for kernel, _, _ in self._handovers]
         names = [name for name in self.skills[0].kernels if draws or name != "reset"]
-        found = [(skill.kernels[name], BLOCKS.get(name, BLOCK)) for skill in self.skills for name in names]
-        found += [(postprocess_obs_kernel, POSTPROCESS_BLOCK), *((kernel, BLOCK) for kernel in shared)]
-        return found + self.sim.physics.kernels()
+        kernels = [(skill.kernels[name], BLOCKS.get(name, BLOCK)) for skill in self.skills for name in names]
+        kernels += [(postprocess_obs_kernel, POSTPROCESS_BLOCK), *((kernel, BLOCK) for kernel in shared)]
+        return kernels + self.sim.physics.kernels()
 
     def _part(self, worlds: WorldRange | None = None) -> WorldSlice:
-        """Return some of the worlds as stages are launched for them, by default all."""
+        """Return a range of worlds, by default all, with the `EpisodeArrays` that begin at its first world."""
         if worlds is None or worlds.count == self.num_envs:
             return WorldSlice(0, self.num_envs, self.episodes)
         env = EpisodeArrays()
@@ -114,13 +114,14 @@ class Stages:
         return WorldSlice(*worlds, env)
 
     def _launch_step(self, worlds: WorldRange | None = None) -> None:
+        """Launch all stages of a policy step for a range of worlds, by default all."""
         for stage in self.stages(worlds).values():
             stage()
 
     def stages(self, worlds: WorldRange | None = None) -> dict[str, Callable[[], None]]:
-        """Return the parts of a step by name, in order: each launches its kernels and does not wait for them.
+        """Return the stages of a policy step by name, in order; calling one launches its kernels without waiting.
 
-        worlds: for which they are launched, by default all; no stage of some reads or writes what is of others.
+        worlds: range of worlds, by default all; no stage reads or writes data of worlds outside the range.
         """
         part = self._part(worlds)
         return {"action": lambda: self._apply_actions(part), "physics": lambda: self._advance(part),
@@ -129,11 +130,13 @@ class Stages:
                 "reset": lambda: self._reset_done(part)}  # fmt: skip
 
     def _apply_actions(self, part: WorldSlice) -> None:
+        """Turn actions into motor targets and wrenches, then run interval events."""
         inputs = [self._action, self._settings, self.parameters.push, self.robot, part.episode, self.delays]
         self._launch(action_kernel, (4, part.count), inputs)
         self._events(part, AT_STEP, self._all)
 
     def _advance(self, part: WorldSlice) -> None:
+        """Advance the physics by one policy step, then update paw kinematics, contacts and collisions."""
         delays, scene = self.delays, self._scene
         self.sim.physics.advance(
             self.sim.substeps, delays.current_target, delays.prev_target, delays.switch_step, bodies=False,
@@ -143,6 +146,7 @@ class Stages:
         self._launch(track_kernel, (4, part.count), inputs)
 
     def _compute_rewards_and_dones(self, part: WorldSlice) -> None:
+        """Advance the task states, and evaluate terminations, rewards and curriculum of every task."""
         for skill in self.skills:
             self._launch(
                 skill.kernels["step"], part.count,
@@ -151,6 +155,7 @@ class Stages:
             )  # fmt: skip
 
     def _reset_done(self, part: WorldSlice) -> None:
+        """Hand over worlds where due, reset ended episodes (with auto_reset), and observe both again."""
         self._hand_over(part)
         begins = self.auto_reset and self._ends_episodes
         if begins:
@@ -159,6 +164,7 @@ class Stages:
             self._observe(part, after_reset=1)
 
     def _hand_over(self, part: WorldSlice) -> None:
+        """Perform the handovers that are due, at most one in a world."""
         if self._handovers:
             self._moved[part.first : part.first + part.count].zero_()
         for kernel, source, target in self._handovers:
@@ -169,7 +175,7 @@ class Stages:
             )  # fmt: skip
 
     def _reset_worlds(self, part: WorldSlice, mask: wp.array) -> None:
-        """Begin new episodes where mask is not 0, in the first skill, and commands where they are due."""
+        """Begin new episodes in the first skill where mask (num_envs,) is not 0, and sample commands where due."""
         self._restore_first_task(part, mask)
         self._randomize(part, mask)
         for skill in self.skills:
@@ -182,12 +188,12 @@ class Stages:
         self._clear_history(part, mask)
 
     def _restore_first_task(self, part: WorldSlice, mask: wp.array) -> None:
-        """Put worlds back into their first skill where mask is not 0, and forget what they were asked for."""
+        """Reset worlds to their first skill, without a request, where mask is not 0."""
         if len(self.skills) > 1:
             self._launch(restore_task_kernel, part.count, [mask, self._home, self.parameters, part.episode])
 
     def _randomize(self, part: WorldSlice, mask: wp.array) -> None:
-        """Draw parameters of episodes that begin where mask is not 0."""
+        """Run the reset events where mask is not 0; before the first reset, of all worlds, also the startup events."""
         if not self._started:  # all worlds begin
             self._launch(motors_kernel, (12, self.num_envs), [self.parameters])
             self._events(part, STARTUP, self._all)
@@ -195,7 +201,7 @@ class Stages:
         self._events(part, AT_RESET, mask)
 
     def _events(self, part: WorldSlice, stage: int, mask: wp.array) -> None:
-        """Run the events of a stage, and let the solver read what they changed."""
+        """Run the events due at a stage (STARTUP, AT_RESET, AT_STEP) where mask is not 0, and update the solver."""
         for skill in self.skills:
             slots = enumerate(skill.task.params.slots["events"])
             due = {i: slot for i, slot in slots if slot.term.due_at(stage)}
@@ -211,6 +217,7 @@ class Stages:
                 self.sim.physics.parameters_changed(mask, WorldRange(part.first, part.count))
 
     def _clear_history(self, part: WorldSlice, mask: wp.array) -> None:
+        """Clear actions, contacts, delays and the solver's memory where mask is not 0."""
         inputs = [part.first, mask, self._scene.geometry, self.robot, self.delays]
         self._launch(clear_history_kernel, (12, part.count), inputs)
         self.sim.physics.after_reset(mask)
@@ -219,6 +226,7 @@ class Stages:
         self._launch(advance_rng_kernel, self.num_envs, [mask, self.episodes])
 
     def _observe(self, part: WorldSlice, after_reset: int) -> None:
+        """Write observations; after_reset 1: only where an episode, skill or command has just begun, not `final`."""
         for skill in self.skills:
             arrays = skill.observations
             self._launch(
@@ -232,10 +240,11 @@ class Stages:
     def _launch(
         self, kernel: Kernel, dim: int | tuple[int, ...], inputs: list, block: int = BLOCK, blocks: int = 0
     ) -> None:
-        """Launch; blocks: most blocks of a GPU, whose threads take turns (0: as many as there are threads)."""
+        """Launch a kernel; block: threads of a block; blocks: largest number of blocks on a GPU, 0 for no limit."""
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.wp_device, block_dim=block, max_blocks=blocks)
 
     def _set_commands(self, mask: wp.array, begins: int, values: np.ndarray, headings: wp.array) -> None:
+        """Set commands (num_envs, 4) where mask is not 0; begins 1: of new episodes with headings [rad]."""
         commands = wp.array(values, dtype=wp.vec4, device=self.wp_device)
         for skill in self.skills:
             self._launch(

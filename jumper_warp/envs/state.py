@@ -1,4 +1,4 @@
-"""What the next step of an environment depends on, as tensors: taken, and put back, bit for bit."""
+"""Save and restore, bitwise, everything that the next step of an environment depends on."""
 
 from __future__ import annotations
 
@@ -22,31 +22,32 @@ if TYPE_CHECKING:
     from jumper_warp.envs.stages import Stages
 
 CONSTANT = ("gravity", "default_angle", "paw_shapes")
-"""Arrays of the kernels' structs that are no state; those that begin with `nominal_` are none either."""
+"""Arrays of the kernels' structs that are not saved because they never change, like those named `nominal_*`."""
 MOTORS = ("kp", "kd", "saturation", "peak", "no_load_speed", "cutoff_speed", "offset")
+"""Saved arrays of the simulation's motors."""
 FINGERPRINT = "nominal"
-"""Name of the nominal parameters' fingerprint."""
+"""Key of the nominal parameters' fingerprint."""
 SEED = "seed"
-"""Name of the seed."""
+"""Key of the seed."""
 
 
 def save_state(env: Stages) -> dict[str, torch.Tensor]:
-    """Return everything that the next step depends on, on the CPU (waits for the device); counters are left out.
+    """Return everything that the next step depends on, as CPU tensors by name (waits for the device).
 
-    Drawn parameters are in it, nominal ones only as a fingerprint; of the numbers of the task's terms those that
-    `Env.set` has changed.
+    Keys: "struct.field" of the kernels' arrays, "task/name" and "task.field" of each task, `nominal` and `seed`.
+    Nominal parameters are saved as a fingerprint only, numbers of terms only if `Env.set` changed them, counters never.
     """
     state = {name: tensor.to("cpu", copy=True) for name, tensor in _tensors(env).items()}
     for prefix, array in _records(env).items():
-        found = records(array)
-        state |= {prefix + name: torch.from_numpy(np.array(found[name])) for name in found.dtype.names or ()}
+        fields = records(array)
+        state |= {prefix + name: torch.from_numpy(np.array(fields[name])) for name in fields.dtype.names or ()}
     return state | {FINGERPRINT: nominal_fingerprint(env), SEED: torch.tensor(env.seed)}
 
 
 def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
-    """Put a saved state back, so that the next step is the one that would have followed.
+    """Restore a state of `save_state`, so that the next step is the one that followed it.
 
-    Raises ValueError: it is of another number of environments, other fields, robots or seed; nothing is changed.
+    Raises InputError (a ValueError), and changes nothing: another num_envs, task, solver, robot, seed or version.
     """
     if not isinstance(state, dict):
         raise InputError(f"a saved environment must be a dictionary, got {type(state).__name__}")
@@ -87,12 +88,12 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
         array.assign(wp.array(saved[prefix], dtype=array.dtype, device=env.wp_device))
     for name, tensor in tensors.items():
         tensor.copy_(state[name])
-    env.restored()
+    env.after_load_state()
 
 
 def _check_indices(env: Stages, state: dict[str, torch.Tensor]) -> None:
-    """Raise ValueError where a saved number would index an array beyond its ends."""
-    longest = (RING - 2) * env.sim.substeps
+    """Raise InputError where a saved index (level, skill, step count, latency) is out of bounds."""
+    longest = (RING - 2) * env.sim.substeps  # [physics steps] latency that the ring buffers can hold
     bounds = {
         "env.level": (0, max(len(skill.task.levels) for skill in env.skills)),
         "env.skill": (0, len(env.skills) - 1),
@@ -107,7 +108,7 @@ def _check_indices(env: Stages, state: dict[str, torch.Tensor]) -> None:
 
 
 def nominal_fingerprint(env: Stages) -> torch.Tensor:
-    """Return the SHA-256 (32 bytes) of all nominal parameters; it does not depend on the device."""
+    """Return the SHA-256 of all nominal parameters, (32,) uint8; it does not depend on the device."""
     digest = hashlib.sha256()
     for name in RobotParameters.vars:
         if name.startswith("nominal_"):
@@ -116,24 +117,24 @@ def nominal_fingerprint(env: Stages) -> torch.Tensor:
 
 
 def _records(env: Stages) -> dict[str, wp.array]:
-    """Return the environment's arrays of structs by the prefix of their fields; blocks only where there are any."""
+    """Return the environment's arrays of structs (task states, blocks if any) by the prefix of their fields' keys."""
     blocks = env.sim.physics.dynamics.robot.ground.blocks
     states = {f"{skill.task.name}.": skill.states for skill in env.skills}
     return states | ({"block.": blocks} if blocks.shape[0] else {})
 
 
 def _tensors(env: Stages) -> dict[str, torch.Tensor]:
-    """Return views of the environment's own memory by name."""
-    found: dict[str, Any] = {}
+    """Return torch views of the environment's other saved arrays by key."""
+    arrays: dict[str, Any] = {}
     structs = (("robot", RobotArrays, env.robot), ("env", EpisodeArrays, env.episodes), ("delays", Delays, env.delays),
                ("parameters", RobotParameters, env.parameters))  # fmt: skip
     for prefix, kind, struct in structs:
         for name in kind.vars:
             if name not in CONSTANT and not name.startswith("nominal_"):
-                found[f"{prefix}.{name}"] = getattr(struct, name)
-    found |= {f"motors.{name}": getattr(env.sim.motors, name) for name in MOTORS}
-    found |= {f"solver.{name}": array for name, array in env.sim.physics.carried().items()}
+                arrays[f"{prefix}.{name}"] = getattr(struct, name)
+    arrays |= {f"motors.{name}": getattr(env.sim.motors, name) for name in MOTORS}
+    arrays |= {f"solver.{name}": array for name, array in env.sim.physics.carried().items()}
     for skill in env.skills:
-        found |= {f"{skill.task.name}/{name}": getattr(skill.observations, name) for name in ("now", "final", "past")}
-        found |= {f"{skill.task.name}/timer": skill.timer, f"{skill.task.name}/changed": skill.params.changed}
-    return {name: wp.to_torch(array) for name, array in found.items() if isinstance(array, wp.array)}
+        arrays |= {f"{skill.task.name}/{name}": getattr(skill.observations, name) for name in ("now", "final", "past")}
+        arrays |= {f"{skill.task.name}/timer": skill.timer, f"{skill.task.name}/changed": skill.params.changed}
+    return {name: wp.to_torch(array) for name, array in arrays.items() if isinstance(array, wp.array)}

@@ -1,4 +1,4 @@
-"""The side of an environment that training sees, and how observations are kept within bounds."""
+"""Protocols of the environments that PPO and SHAC train on, and bounds of observations."""
 
 from __future__ import annotations
 
@@ -8,51 +8,48 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 
 RAW_LIMIT = 100.0
-"""Raw observations are clamped to plus and minus this, so that one absurd world cannot spoil the statistics."""
+"""Raw observations are clamped to plus and minus this, so that one diverging world cannot spoil the statistics."""
 
 
 class VecEnv(Protocol):
-    """What PPO asks of an environment of many worlds that begin new episodes by themselves.
+    """Environment for PPO: many worlds whose ended episodes are reset in `step`.
 
-    The tensors are on `device` and keep their place: `reset`, `step` and `load_state_dict` write them anew.
+    The tensors are on `device`; `reset`, `step` and `load_state_dict` overwrite them in place.
     """
 
     num_envs: int
-    """Worlds, each with an episode of its own."""
+    """Number of worlds."""
     num_obs: int
     num_critic_obs: int
     num_actions: int
     device: torch.device
-    """Where all tensors are, the action too."""
+    """Device of all tensors, the action included."""
     obs: torch.Tensor
-    """(num_envs, num_obs) float32, what the actor sees, of the new episode where one has just begun."""
+    """(num_envs, num_obs) float32, the actor's observation; of the new episode where one has ended."""
     critic_obs: torch.Tensor
-    """(num_envs, num_critic_obs) float32, what the critic sees, of the new episode where one has just begun."""
+    """(num_envs, num_critic_obs) float32, the critic's observation; of the new episode where one has ended."""
     reward: torch.Tensor
     """(num_envs,) float32, of the last step."""
     done: torch.Tensor
     """(num_envs,) float32, 1 where the last step ended the episode, else 0."""
     timeout: torch.Tensor
-    """(num_envs,) float32, 1 where it did so without failure, so that the value of the final state counts."""
+    """(num_envs,) float32, 1 where it ended without failure, so that the final state's value is bootstrapped."""
     final_obs: torch.Tensor
-    """(num_envs, num_obs) float32, the last observation of the old episode, where one has ended."""
+    """(num_envs, num_obs) float32, the actor's observation before resets."""
     final_critic_obs: torch.Tensor
-    """(num_envs, num_critic_obs) float32, likewise."""
+    """(num_envs, num_critic_obs) float32, the critic's observation before resets."""
 
     def reset(self) -> Any:
-        """Begin a new episode in all worlds; `obs` and `critic_obs` are those of its beginning.
-
-        What it returns is not read.
-        """
+        """Begin a new episode in all worlds, and write its first `obs` and `critic_obs`; the return value is unused."""
 
     def step(self, action: torch.Tensor) -> Any:
-        """Advance by a policy period, and begin a new episode where one has ended; what it returns is not read.
+        """Advance one policy step, and reset ended episodes; the return value is unused.
 
-        action: (num_envs, num_actions), only read. No work waits for the host, so that a graph can hold many steps.
+        action: (num_envs, num_actions), not modified. Must not wait for the host, so that a graph can hold many steps.
         """
 
     def metrics(self) -> dict[str, float]:
-        """Return what to log of the episodes that ended since the last call, by name (waits for the device)."""
+        """Return metrics by name of the episodes that ended since the last call (waits for the device)."""
         ...
 
     def config(self) -> dict[str, Any]:
@@ -60,11 +57,11 @@ class VecEnv(Protocol):
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """Return all that the next step depends on, tensors only; later steps do not change them."""
+        """Return everything that the next step depends on, as tensors that later steps do not change."""
         ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Take up what `state_dict` gave; the next step, without a `reset`, is the one that would have followed.
+        """Restore a state of `state_dict`; the next step, without a `reset`, is the one that followed it.
 
         Raises ValueError: the state does not fit this environment.
         """
@@ -72,28 +69,28 @@ class VecEnv(Protocol):
 
 @runtime_checkable
 class MirroredVecEnv(Protocol):
-    """What PPO asks besides of an environment whose policy is to be symmetric."""
+    """Additional method that PPO needs to train a left-right symmetric policy."""
 
     def mirror(self, what: str) -> tuple[Sequence[int], Sequence[float]]:
-        """Return order and signs of the mirror image `signs * x[order]` of x, an "observation" or an "action".
+        """Return (order, signs) of the mirror image `signs * x[order]` of an "observation" or an "action" x.
 
-        Raises ValueError: there is none.
+        Raises ValueError: no mirror image is defined.
         """
         ...
 
 
 class DifferentiableVecEnv(VecEnv, Protocol):
-    """What SHAC asks of an environment: steps whose observations and rewards carry derivatives by the actions before.
+    """Environment for SHAC: observations and rewards with derivatives with respect to earlier actions of a window.
 
-    Its values are those of `obs`, `critic_obs`, `final_obs`, `final_critic_obs` and `reward`. What it returns is new in
+    Values are those of `obs`, `critic_obs`, `final_obs`, `final_critic_obs` and `reward`; returned tensors are new in
     every call.
     """
 
     def begin_window(self) -> None:
-        """Forget what the present depends on."""
+        """Begin a window: later derivatives do not reach actions before this call."""
 
     def observe(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return `obs` and `critic_obs` with derivatives; a world whose episode has just begun has none."""
+        """Return `obs` and `critic_obs` with derivatives, which are 0 where an episode has just begun."""
         ...
 
     def observe_final(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -101,10 +98,10 @@ class DifferentiableVecEnv(VecEnv, Protocol):
         ...
 
     def step_with_gradient(self, action: torch.Tensor) -> torch.Tensor:
-        """Advance as `step`; return the reward (num_envs,) with derivatives as far as it has any."""
+        """Advance as `step`; return the reward (num_envs,) with derivatives where its terms have any."""
         ...
 
 
 def sanitise(obs: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
-    """Return a copy of observations, in `out` if given: non-finite entries 0, the rest clamped to ±RAW_LIMIT."""
+    """Return a copy of observations (in `out` if given): non-finite entries are 0, others clamped to ±RAW_LIMIT."""
     return torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0, out=out).clamp_(-RAW_LIMIT, RAW_LIMIT)

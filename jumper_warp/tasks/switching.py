@@ -74,8 +74,8 @@ def flight_skills(jump: TaskCfg, turning: TaskCfg) -> tuple[list[TaskCfg], list[
         for task in (jump, turning)
     )
     return [jump, turning], [
-        Handover(jump, turning, handovers.in_flight, handovers.begin_turn),
-        Handover(turning, jump, handovers.about_to_land, handovers.begin_landing),
+        Handover(jump, turning, handovers.jump_to_turn_due, handovers.begin_turn),
+        Handover(turning, jump, handovers.turn_to_jump_due, handovers.begin_landing),
     ]
 
 
@@ -93,6 +93,6 @@ def skills_and_handovers(walking: TaskCfg, jumps: tuple[TaskCfg, ...]) -> tuple[
     tasks, switches = [walk], []
     for jump in jumps:
         tasks.append(for_switching(jump, randomization))
-        switches.append(Handover(walk, tasks[-1], handovers.come_to_a_stop, handovers.begin_jump))
-        switches.append(Handover(tasks[-1], walk, handovers.landed_or_lost, handovers.begin_walk))
-    return tasks, switches
+        found.append(Handover(walk, tasks[-1], handovers.walk_to_jump_due, handovers.begin_jump))
+        found.append(Handover(tasks[-1], walk, handovers.jump_to_walk_due, handovers.begin_walk))
+    return tasks, found

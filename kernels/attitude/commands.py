@@ -13,10 +13,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class TurnRanges:
-    """Ranges of sampled rotations."""
+    """Ranges of sampled rotations, body axes."""
 
-    angle: wp.vec2  # [rad] smallest and largest
-    body_axis_probability: float  # of a turn about x, y or z of the body; the others are about any axis
+    angle: wp.vec2  # [rad] (smallest, largest)
+    body_axis_probability: float  # of an axis +-x, +-y or +-z; else the axis is uniform over the sphere
 
 
 @wp.func
@@ -32,7 +32,7 @@ def sample_unit_quat(rng: RngStream) -> wp.quat:
 
 @wp.func
 def sample_axis(rng: RngStream, body_axis_probability: float) -> wp.vec3:
-    """Return a sampled unit vector: one of the body's axes with a probability, else uniform over the sphere."""
+    """Return a unit vector, body axes: +-x, +-y or +-z with the probability, else uniform over the sphere."""
     sign = wp.where(uniform(rng, streams.SIGN, 0.0, 1.0) < 0.5, -1.0, 1.0)
     if uniform(rng, streams.ALONG_BODY, 0.0, 1.0) < body_axis_probability:
         axis = wp.vec3(0.0)
@@ -46,14 +46,17 @@ def sample_axis(rng: RngStream, body_axis_probability: float) -> wp.vec3:
 
 @wp.func
 def sample_rotation(rng: RngStream, ranges: TurnRanges) -> wp.quat:
-    """Return a sampled rotation (xyzw), body axes."""
+    """Return a rotation (xyzw) about a sampled axis of the body by an angle sampled from `ranges.angle`."""
     axis = sample_axis(fold_in(rng, streams.AXIS_BRANCH), ranges.body_axis_probability)
     return wp.quat_from_axis_angle(axis, uniform_range(rng, streams.ANGLE, ranges.angle))
 
 
 @wp.func
 def set_turn(robot: RobotView, scene: Scene, state: AttitudeState, values: wp.vec4, heading: float) -> AttitudeState:
-    """Return the state with a commanded rotation (xyzw, any length) from the present orientation; 0: none."""
+    """Return the state whose goal is the present orientation turned by `values`; all zeros: the present orientation.
+
+    values: quaternion xyzw of any length, body axes. scene and heading are unused (signature of `command.set`).
+    """
     turn = wp.quat(values[0], values[1], values[2], values[3])
     if wp.length(values) == 0.0:
         turn = wp.quat(0.0, 0.0, 0.0, 1.0)

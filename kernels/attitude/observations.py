@@ -8,18 +8,18 @@ from .state import POLICY_RATE, AttitudeState, rotation_between
 
 @wp.func
 def turn_left(robot: RobotView, state: AttitudeState) -> wp.vec4:
-    """Rotation from the robot's orientation to the goal, quaternion xyzw with w >= 0, body axes."""
+    """Rotation from the robot's orientation to the goal orientation: quaternion xyzw with w >= 0, body axes."""
     turn = rotation_between(robot.quat, state.goal)
     return wp.vec4(turn[0], turn[1], turn[2], turn[3])
 
 
 @wp.func
 def time_left(robot: RobotView, state: AttitudeState) -> float:
-    """Time until the end of the episode [s]; 0 if it has none."""
+    """Time until the end of the episode [s]; 0 for an episode without end."""
     return float(wp.max(state.episode_steps - state.steps, 0)) / POLICY_RATE
 
 
 @wp.func
 def in_collision(robot: RobotView, state: AttitudeState) -> float:
-    """Whether links touch each other, or anything but a paw the ground [1]."""
+    """1 if links touch each other or anything but a paw touches the ground, else 0."""
     return wp.where(robot.collisions != 0, 1.0, 0.0)

@@ -1,4 +1,4 @@
-"""How episodes of turning begin: afloat, with a turn to make; see `start_states` for the state of the robot."""
+"""Reset of the attitude task: sampled goal and episode length; `start_states` samples the state of the robot."""
 
 import warp as wp
 
@@ -20,7 +20,10 @@ def reset_attitude(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: AttitudeState, settings: AttitudeSettings,
     level: TurnRanges, rng: RngStream,
 ) -> AttitudeState:  # fmt: skip
-    """Begin an episode with a drawn turn, and return its state."""
+    """Write a sampled start state to world `rng.world`, and return the task state of its new episode.
+
+    old: state of the previous episode, whose statistics are kept. level: ranges of the rotation to the goal.
+    """
     new = carried_over(old)
     rest_block(scene.ground, rng.world)
     quat = sample_unit_quat(fold_in(rng, streams.ORIENTATION_BRANCH))

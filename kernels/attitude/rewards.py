@@ -9,26 +9,25 @@ from .state import POLICY_RATE, AttitudeState
 
 @wp.func
 def approach(robot: RobotView, state: AttitudeState) -> float:
-    """Approach: how fast the angle to the goal falls [rad/s]."""
+    """Approach: decrease of the angle to the goal per second [rad/s]; negative while the angle grows."""
     return (state.old_error - state.error) * POLICY_RATE
 
 
 @wp.func
 def attitude(robot: RobotView, state: AttitudeState, std: float) -> float:
-    """Attitude: phi of the angle to the goal; std [rad]."""
+    """Attitude: phi of the angle to the goal, 1 at the goal; std [rad]: width of phi."""
     return phi(state.error, std)
 
 
 @wp.func
 def hold(robot: RobotView, state: AttitudeState, std: float, std_ang_vel: float) -> float:
-    """Hold: at the goal, not turning; phi of the angle, std [rad], and of the angular speed, std_ang_vel [rad/s]."""
+    """Hold: phi(angle to the goal; std [rad]) times phi(angular speed; std_ang_vel [rad/s]), 1 at rest at the goal."""
     return phi(state.error, std) * phi(wp.length(robot.ang_vel), std_ang_vel)
 
 
 @wp.func
 def landing_posture(robot: RobotView, state: AttitudeState, std: float, std_posture: float) -> float:
-    """Landing posture: at the goal and near the default pose; phi of the angle, std [rad], and of the rms offset of
-    the motors, std_posture [rad]."""
+    """Landing posture: phi(angle to the goal; std [rad]) times phi(rms offset from default; std_posture [rad])."""
     return phi(state.error, std) * phi(posture_offset(robot, 0.0), std_posture)
 
 

@@ -19,26 +19,26 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class AttitudeSettings:
-    """How episodes begin; pairs are (lower, upper)."""
+    """Ranges of start states; pairs are (lower, upper)."""
 
     episode_steps: wp.vec2  # policy steps that an episode lasts
     height: float  # [m] of the base above the ground
     default_pose_probability: float  # of a start in the default pose
-    lateral: wp.vec2  # [rad] of drawn legs
-    transversal: wp.vec2  # [rad]
-    spin: float  # [rad/s] half width of the angular velocity about each axis
+    lateral: wp.vec2  # [rad] angle of lateral motors, unless in the default pose
+    transversal: wp.vec2  # [rad] angle of outer and inner motors, likewise
+    spin: float  # [rad/s] angular velocity about each world axis is sampled from -spin to spin
 
 
 @wp.struct
 class AttitudeStart:
-    """What all attempts at a start state share, the base included."""
+    """Values that all attempts at a start state share: base pose and velocity, limits and ground."""
 
     pos: wp.vec3  # [m] of the base
     quat: wp.quat  # xyzw, body to world
     com_vel: wp.vec3  # [m/s] world axes
     ang_vel: wp.vec3  # [rad/s] world axes
     default_legs: bool  # whether the legs are in the default pose
-    default_angle: wp.array(dtype=float)  # [rad] of the motors
+    default_angle: wp.array(dtype=float)  # [rad] (12,) motor angles of the default pose
     settings: AttitudeSettings
     limits: LegLimits
     ground: Ground
@@ -46,7 +46,10 @@ class AttitudeStart:
 
 @wp.func
 def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> AttitudeStart:
-    """Return the base, the same in every attempt; in the last attempt the legs are in the default pose."""
+    """Return `start`, the base of every attempt; in the last attempt with `default_legs` set.
+
+    A `sample_base` of `mdp.attempts.sample_valid_state`; arrays and rng are unused.
+    """
     base = start
     base.default_legs = start.default_legs or attempt == ATTEMPTS - 1
     return base
@@ -54,37 +57,38 @@ def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attem
 
 @wp.func
 def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return a sampled leg at rest; reachable if the sum of its transversal angles is within limits."""
-    found = LegSample()
+    """Return leg `leg` at rest, in the default pose or sampled; reachable if outer + inner angle is within limits."""
+    sample = LegSample()
     if base.default_legs:
         for j in range(3):
-            found.angles[j] = start.default_angle[3 * leg + j]
-        found.reachable = True
-        return found
-    found.angles = wp.vec3(
+            sample.angles[j] = start.default_angle[3 * leg + j]
+        sample.reachable = True
+        return sample
+    sample.angles = wp.vec3(
         uniform_range(rng, streams.LATERAL + leg, start.settings.lateral),
         uniform_range(rng, streams.OUTER + leg, start.settings.transversal),
         uniform_range(rng, streams.INNER + leg, start.settings.transversal),
     )
-    total = found.angles[1] + found.angles[2]
-    found.reachable = total > start.limits.sum_lower and total < start.limits.sum_upper
-    return found
+    total = sample.angles[1] + sample.angles[2]
+    sample.reachable = total > start.limits.sum_lower and total < start.limits.sum_upper
+    return sample
 
 
 @wp.func
 def write_start(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, settings: AttitudeSettings, quat: wp.quat, rng: RngStream
 ):
-    """Write a sampled start state with orientation `quat` (xyzw) to a world."""
+    """Write a weightless start state with orientation `quat` (xyzw, body to world) to world `rng.world`.
+
+    The base origin is at rest above the world's origin while the body spins; `skill` gives the motors' limits.
+    """
     w = settings.spin
     start = AttitudeStart()
     start.ground = world_ground(scene.ground, rng.world)
     start.pos = wp.vec3(0.0, 0.0, surface(start.ground, 0.0, 0.0)[0] + settings.height)
     start.quat = quat
     start.ang_vel = wp.vec3(
-        uniform(rng, streams.SPIN, -w, w),
-        uniform(rng, streams.SPIN + 1, -w, w),
-        uniform(rng, streams.SPIN + 2, -w, w),
+        uniform(rng, streams.SPIN, -w, w), uniform(rng, streams.SPIN + 1, -w, w), uniform(rng, streams.SPIN + 2, -w, w)
     )
     start.com_vel = wp.cross(start.ang_vel, wp.quat_rotate(quat, arrays.body_com[rng.world * BODIES]))
     start.default_legs = uniform(rng, streams.DEFAULT_LEGS, 0.0, 1.0) < settings.default_pose_probability

@@ -9,43 +9,43 @@ POLICY_RATE = wp.constant(60.0)  # policy steps in a second
 
 @wp.struct
 class AttitudeState:
-    """Task state of one world; statistics accumulate over episodes until the host reads them."""
+    """Task state of one world; the fields from `episodes` on accumulate over episodes until the host reads them."""
 
-    goal: wp.quat  # xyzw, body to world: wanted orientation
+    goal: wp.quat  # xyzw, body to world: commanded orientation
     steps: int  # policy steps since the episode began
     episode_steps: int  # policy steps that it lasts, 0: no end
     error: float  # [rad] angle of the rotation to the goal
-    old_error: float  # [rad] one policy step before
-    inside: int  # policy steps in a row with an error within tolerance, up to now
-    collisions: int  # policy steps in which anything but paws touched something, or links touched each other
-    jump_start: wp.vec3  # [m] where the jump began whose flight this is, if it is one
-    jump_goal: wp.vec3  # [m] where it is to land, base x, y; and its wanted height at the apex
-    goal_ground: float  # [m] height of the ground there
-    max_height: float  # [m] of the base since takeoff
-    episodes: float  # that were followed to an end, counted
-    sum_error: float  # [rad] of their errors at the end
-    settled: float  # of these, how many ended within tolerance
-    sum_settling: float  # [s] of the times in which these came there to stay
-    sum_collisions: float  # [s] in collision
+    old_error: float  # [rad] `error` of the previous policy step
+    inside: int  # consecutive policy steps with `error` within tolerance, 0 outside
+    collisions: int  # policy steps in which links touched each other or anything but a paw touched the ground
+    jump_start: wp.vec3  # [m] world, start of the jump that this flight is part of; 0 without a jump, as the next two
+    jump_goal: wp.vec3  # [m] world, goal of that jump: base x, y at landing and base height at the apex
+    goal_ground: float  # [m] height of the ground at `jump_goal`
+    max_height: float  # [m] highest base origin since takeoff, world z
+    episodes: float  # number of episodes that lasted `episode_steps`
+    sum_error: float  # [rad] sum of `error` at their ends
+    settled: float  # number of them that ended within tolerance
+    sum_settling: float  # [s] sum over `settled` of the time from the start until the error stays within tolerance
+    sum_collisions: float  # [s] sum of the time in collision
 
 
 @wp.func
 def rotation_between(quat: wp.quat, goal: wp.quat) -> wp.quat:
-    """Return the rotation from an orientation to a goal (xyzw, body to world), body axes, w >= 0."""
+    """Return the rotation (xyzw, body axes, w >= 0) from orientation `quat` to `goal` (both xyzw, body to world)."""
     turn = wp.quat_inverse(quat) * goal
     return wp.where(turn[3] < 0.0, -turn, turn)
 
 
 @wp.func
 def angle_between(quat: wp.quat, goal: wp.quat) -> float:
-    """Return the angle [rad] of the rotation from an orientation to a goal (xyzw), 0 to pi."""
+    """Return the angle [rad], 0 to pi, between two orientations (xyzw, body to world)."""
     turn = rotation_between(quat, goal)
     return 2.0 * wp.atan2(wp.length(wp.vec3(turn[0], turn[1], turn[2])), turn[3])
 
 
 @wp.func
 def with_goal(state: AttitudeState, quat: wp.quat, goal: wp.quat) -> AttitudeState:
-    """Return the state with a new goal; quat, goal: present and wanted orientation (xyzw), body to world."""
+    """Return the state with a new goal; quat, goal: present and commanded orientation (xyzw, body to world)."""
     new = state
     new.goal = goal
     new.error = angle_between(quat, goal)
@@ -56,7 +56,7 @@ def with_goal(state: AttitudeState, quat: wp.quat, goal: wp.quat) -> AttitudeSta
 
 @wp.func
 def advance_attitude(robot: RobotView, state: AttitudeState, tolerance: float) -> AttitudeState:
-    """Return the state one policy step later; tolerance [rad]: error up to which the robot is at its goal."""
+    """Return the state after one more policy step; tolerance [rad]: largest error that counts as at the goal."""
     t = state
     t.steps = state.steps + 1
     t.old_error = state.error
@@ -70,7 +70,7 @@ def advance_attitude(robot: RobotView, state: AttitudeState, tolerance: float) -
 
 @wp.func
 def carried_over(old: AttitudeState) -> AttitudeState:
-    """Return the initial state of the next episode, statistics kept; an old one that came to its end is counted."""
+    """Return the initial state of the next episode: statistics kept, with `old` added if it lasted to its end."""
     new = AttitudeState()
     new.episodes = old.episodes
     new.sum_error = old.sum_error
@@ -89,7 +89,7 @@ def carried_over(old: AttitudeState) -> AttitudeState:
 
 @wp.func
 def attitude_error(robot: RobotView, state: AttitudeState) -> float:
-    """Angle of the rotation to the goal [rad]."""
+    """Return the angle of the rotation to the goal [rad]; `robot` is unused (signature of curriculum errors)."""
     return state.error
 
 

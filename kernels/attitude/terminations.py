@@ -1,4 +1,4 @@
-"""Why an episode of turning in free flight ends, besides what ends any task's."""
+"""Terminations of the attitude task; `mdp.terminations` has those of all tasks."""
 
 import warp as wp
 
@@ -8,11 +8,11 @@ from .state import AttitudeState
 
 @wp.func
 def ended_clear(robot: RobotView, state: AttitudeState) -> bool:
-    """The episode has lasted as long as it should, and nothing has touched anything."""
+    """Episode of `state.episode_steps` policy steps without a collision; never if that is 0."""
     return state.episode_steps > 0 and state.steps >= state.episode_steps and state.collisions == 0
 
 
 @wp.func
 def ended(robot: RobotView, state: AttitudeState) -> bool:
-    """The episode has lasted as long as it should."""
+    """Episode of `state.episode_steps` policy steps; never if that is 0."""
     return state.episode_steps > 0 and state.steps >= state.episode_steps

@@ -1,4 +1,4 @@
-"""How far a finished jump is from its goal."""
+"""Errors of a finished jump: apex height and landing position."""
 
 import warp as wp
 
@@ -8,11 +8,11 @@ from .state import JumpState, goal_offset
 
 @wp.func
 def height_error(robot: RobotView, state: JumpState) -> float:
-    """Return the distance [m] of the highest base height from the wanted one."""
+    """Return the absolute difference [m] between the highest base height of the jump and the commanded one."""
     return wp.abs(state.max_height - state.goal[2])
 
 
 @wp.func
 def landing_error(robot: RobotView, state: JumpState) -> float:
-    """Return the horizontal distance [m] of the base from the goal."""
+    """Return the horizontal distance [m] between base origin and goal."""
     return wp.length(goal_offset(robot, state))

@@ -10,27 +10,27 @@ from .start_states import ResetRanges
 
 wp.set_module_options({"enable_backward": False})
 
-EVERY_SIDE = wp.constant(0.05)  # [m] between the paws' centres and an edge, at least
-DEFAULT_PAWS = wp.constant(wp.vec2(0.24, 0.2102))  # [m] from the base, ahead and beside, in the default pose
+MIN_EDGE_DISTANCE = wp.constant(0.05)  # [m] between the paws' centres and an edge of a block
+DEFAULT_PAWS = wp.constant(wp.vec2(0.24, 0.2102))  # [m] of a paw from the base, ahead and beside, in the default pose
 
 
 @wp.struct
 class GroundRanges:
-    """Shares of standing starts, and ranges of what they stand on or jump to; pairs are (lower, upper)."""
+    """Probabilities of a platform and of a block in standing starts, and their ranges; pairs are (lower, upper)."""
 
-    platform: float  # share
-    block: float  # share
+    platform: float  # probability of a platform under the start
+    block: float  # probability of a block under the goal
     drop: wp.vec2  # [m] height of the platform
     rise: wp.vec2  # [m] height of the block
-    room: float  # [m] most between the paws and an edge, but for a block's near side
-    clearance: float  # [m] least between an edge and the place of the paws at the goal
+    room: float  # [m] largest distance of an edge from the paws inside it; not for a block's near side
+    clearance: float  # [m] least distance of a platform's edge, or a block's near side, from the paws at the goal
     mass: wp.vec2  # [kg] of the block
-    friction: wp.vec2  # of block and floor [1]
+    friction: wp.vec2  # [1] between block and floor
 
 
 @wp.func
 def footprint(ranges: ResetRanges, heading: float) -> wp.vec2:
-    """Return the half extents [m] along world x and y of the rectangle that the paws' centres fill."""
+    """Return the half extents [m] along world x and y of the paws' centres at `heading` [rad], widest stance."""
     half_length = wp.max(wp.max(ranges.front_x[1], ranges.back_x[1]), DEFAULT_PAWS[0])
     half_width = wp.max(wp.max(ranges.front_y[1], ranges.back_y[1]), DEFAULT_PAWS[1])
     c = wp.abs(wp.cos(heading))
@@ -40,7 +40,7 @@ def footprint(ranges: ResetRanges, heading: float) -> wp.vec2:
 
 @wp.func
 def fixed_block(center: wp.vec2, half: wp.vec2, height: float) -> Block:
-    """Return a block that is too heavy to slide; lengths [m]."""
+    """Return a block that is too heavy to slide (10^6 kg); center, half extents and height [m], world axes."""
     block = Block()
     block.exists = 1
     block.start = vec2(real(center[0]), real(center[1]))
@@ -54,10 +54,13 @@ def fixed_block(center: wp.vec2, half: wp.vec2, height: float) -> Block:
 
 @wp.func
 def sample_platform(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
-    """Return a sampled platform under a robot at the origin; none if its paws could not land beside it."""
+    """Return a sampled platform under a robot at the origin, or no block if its paws would land on it at the goal.
+
+    foot: half extents [m] of the paws (`footprint`); goal [m]: world axes.
+    """
     half = foot + wp.vec2(
-        uniform(rng, streams.PLATFORM_ROOM_X, EVERY_SIDE, ranges.room),
-        uniform(rng, streams.PLATFORM_ROOM_Y, EVERY_SIDE, ranges.room),
+        uniform(rng, streams.PLATFORM_ROOM_X, MIN_EDGE_DISTANCE, ranges.room),
+        uniform(rng, streams.PLATFORM_ROOM_Y, MIN_EDGE_DISTANCE, ranges.room),
     )
     beyond = wp.vec2(wp.abs(goal[0]), wp.abs(goal[1])) - half - foot
     if wp.max(beyond) < ranges.clearance:
@@ -67,23 +70,23 @@ def sample_platform(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: w
 
 @wp.func
 def sample_block(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
-    """Return a sampled block under the goal; none without room for its near side between the paws of start and goal.
+    """Return a sampled block under the goal, or no block if its near side fits nowhere between start and goal paws.
 
-    The near side is anywhere there, more often near than far (a third within a ninth of the room), across the axis
-    along which the goal is farther.
+    The near side crosses the axis (x or y) along which the goal is farther. Its distance is u^2 of the free length from
+    the nearest place on, u uniform, so that a third lies in the first ninth. foot, goal: as in `sample_platform`.
     """
-    along = wp.where(wp.abs(goal[0]) >= wp.abs(goal[1]), 0, 1)
-    way = wp.abs(goal[along])
-    nearest = foot[along] + EVERY_SIDE
-    farthest = way - foot[along] - ranges.clearance
+    along = wp.where(wp.abs(goal[0]) >= wp.abs(goal[1]), 0, 1)  # axis: 0 x, 1 y
+    distance = wp.abs(goal[along])
+    nearest = foot[along] + MIN_EDGE_DISTANCE
+    farthest = distance - foot[along] - ranges.clearance
     if nearest > farthest:
         return Block()
     u = uniform(rng, streams.BLOCK_NEAR_SIDE, 0.0, 1.0)
     near = nearest + u * u * (farthest - nearest)
-    far = way + foot[along] + uniform(rng, streams.BLOCK_FAR_ROOM, EVERY_SIDE, ranges.room)
+    far = distance + foot[along] + uniform(rng, streams.BLOCK_FAR_ROOM, MIN_EDGE_DISTANCE, ranges.room)
     center = wp.vec2(goal[0], goal[1])
     center[along] = wp.sign(goal[along]) * 0.5 * (near + far)
-    half = foot + wp.vec2(uniform(rng, streams.BLOCK_SIDE_ROOM, EVERY_SIDE, ranges.room))
+    half = foot + wp.vec2(uniform(rng, streams.BLOCK_SIDE_ROOM, MIN_EDGE_DISTANCE, ranges.room))
     half[along] = 0.5 * (far - near)
     block = fixed_block(center, half, uniform_range(rng, streams.BLOCK_HEIGHT, ranges.rise))
     block.mass = real(uniform_range(rng, streams.BLOCK_MASS, ranges.mass))
@@ -93,7 +96,7 @@ def sample_block(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.v
 
 @wp.func
 def sample_ground(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
-    """Return a sampled platform, block or level ground (no block) of a standing start; goal [m]: world axes."""
+    """Return the sampled block of a standing start: platform, block or none; foot, goal: as in `sample_platform`."""
     u = uniform(rng, streams.GROUND, 0.0, 1.0)
     if u < ranges.platform:
         return sample_platform(rng, ranges, foot, goal)

@@ -8,35 +8,38 @@ from .state import FLIGHT, LANDED, STANCE, JumpState
 
 @wp.func
 def estimated_apex(pos: wp.vec3, lin_vel: wp.vec3, g: float) -> float:
-    """Return the height [m] that a projectile will reach, h_max = z + v_z^2 / 2g, or z if it falls; g [m/s^2]."""
+    """Return the apex height [m] of a projectile, z + v_z^2 / 2g, or z if it falls; units m, m/s, m/s^2."""
     up = wp.max(lin_vel[2], 0.0)
     return pos[2] + up * up / (2.0 * g)
 
 
 @wp.func
 def time_to_height(z: float, vz: float, height: float, g: float) -> float:
-    """Return the time [s] at which a projectile falls through a height [m]; if it never gets there, at its apex."""
+    """Return the time [s] until a projectile falls through `height` [m], or until its apex if that is lower.
+
+    z [m], vz [m/s], g [m/s^2]: present height, vertical velocity and gravity. The result is >= 0.
+    """
     under_root = vz * vz + 2.0 * g * (z - height)
     return wp.max((vz + wp.sqrt(wp.max(under_root, 0.0))) / g, 0.0)
 
 
 @wp.func
 def estimated_landing(pos: wp.vec3, lin_vel: wp.vec3, height: float, g: float) -> wp.vec2:
-    """Return where (x, y) [m] a projectile falls through a height [m]."""
+    """Return the position (x, y) [m] at which a projectile falls through `height` [m]; arguments: world, z up."""
     t = time_to_height(pos[2], lin_vel[2], height, g)
     return wp.vec2(pos[0] + t * lin_vel[0], pos[1] + t * lin_vel[1])
 
 
 @wp.func
 def landing_error_estimate(robot: RobotView, state: JumpState, height: float) -> float:
-    """Return how far from the goal [m] the base's projectile falls through a height [m] above the ground there."""
+    """Return the distance [m] between goal and ballistic landing: base at `height` [m] above the goal's ground."""
     landing = estimated_landing(robot.pos, robot.lin_vel, height + state.goal_ground, robot.gravity_magnitude)
     return wp.length(wp.vec2(state.goal[0] - landing[0], state.goal[1] - landing[1]))
 
 
 @wp.func
 def next_phase(state: JumpState, robot: RobotView, takeoff_speed: float) -> int:
-    """Return the phase after this policy step; a takeoff needs free paws and an upward speed [m/s]."""
+    """Return the phase after this policy step; takeoff: no paw in contact, upward speed above takeoff_speed [m/s]."""
     if state.phase == STANCE and robot.contacts == 0 and robot.lin_vel[2] > takeoff_speed:
         return FLIGHT
     if state.phase == FLIGHT and robot.contacts > 0:
@@ -46,7 +49,7 @@ def next_phase(state: JumpState, robot: RobotView, takeoff_speed: float) -> int:
 
 @wp.func
 def advance_jump(robot: RobotView, state: JumpState, takeoff_speed: float) -> JumpState:
-    """Return the jump's state one policy step later; takeoff_speed [m/s]: upward, that begins a flight."""
+    """Return the jump's state after one more policy step; takeoff_speed [m/s]: least upward speed of a takeoff."""
     t = state
     t.steps = state.steps + 1
     phase = next_phase(state, robot, takeoff_speed)

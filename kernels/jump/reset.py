@@ -1,4 +1,7 @@
-"""Reset of a jump and the next jump in an episode: start mode, goal, ground, command; robot: see `start_states`."""
+"""Reset of the jump task, and the next jump in an episode: start mode, goal, ground and command.
+
+`start_states` samples the state of the robot.
+"""
 
 import warp as wp
 
@@ -29,7 +32,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class JumpSettings:
-    """How jumps begin."""
+    """Ranges of start states and of sampled ground."""
 
     states: ResetRanges
     grounds: GroundRanges
@@ -37,18 +40,18 @@ class JumpSettings:
 
 @wp.struct
 class JumpLevel:
-    """One level of the curriculum."""
+    """One level of the curriculum; goals are sampled from a box."""
 
     goal_lower: wp.vec3  # [m] relative to start and heading: landing x, y, and base height at the apex (0: any)
-    goal_upper: wp.vec3
-    base_height: wp.vec2  # [m] of standing starts
+    goal_upper: wp.vec3  # [m] opposite corner of the box
+    base_height: wp.vec2  # [m] (lower, upper) of standing starts
     next_jump_probability: float  # of another goal for a landed robot
-    elliptical: int  # 1: goals are drawn from the ellipse inside the box
+    elliptical: int  # 1: goals are sampled from the ellipse inscribed in the box, seen from above
 
 
 @wp.func
 def project_to_ellipse(goal: wp.vec3, lower: wp.vec3, upper: wp.vec3) -> wp.vec3:
-    """Return a goal [m] of a box around the start, scaled into the ellipse inscribed in the box; its height is kept.
+    """Return a goal [m] inside the box (lower, upper) moved horizontally toward the start into the inscribed ellipse.
 
     Each quadrant has its own half axes, since the box need not be centred on the start.
     """
@@ -74,23 +77,20 @@ def sample_goal(rng: RngStream, level: JumpLevel) -> wp.vec3:
 
 
 @wp.func
-def sample_next_jump_step(rng: RngStream, delay: wp.vec2, share: float) -> int:
-    """Return how many policy steps after touchdown another goal comes; 0: none.
-
-    delay: range in policy steps.
-    """
+def sample_next_jump_step(rng: RngStream, delay: wp.vec2, probability: float) -> int:
+    """Return policy steps from touchdown to another goal, from range `delay`, with `probability`; else 0: none."""
     steps = int(uniform_range(rng, streams.AGAIN_STEP, delay))
-    return wp.where(uniform(rng, streams.AGAIN, 0.0, 1.0) < share, wp.max(steps, 1), 0)
+    return wp.where(uniform(rng, streams.AGAIN, 0.0, 1.0) < probability, wp.max(steps, 1), 0)
 
 
 @wp.func
 def sample_command_step(rng: RngStream, ranges: ResetRanges) -> int:
-    """Return the policy step of the jump command: uniform in one of two ranges, the longer one with a probability."""
+    """Return the policy step of the jump command: 0 to `long_wait` with its probability, else 0 to `command_delay`."""
     u = uniform(rng, streams.COMMAND_STEP, 0.0, 1.0)
-    share = ranges.long_wait_probability
-    soon = (u - share) / wp.max(1.0 - share, 1.0e-6) * (float(ranges.command_delay) + 0.999)
-    later = u / wp.max(share, 1.0e-6) * (float(ranges.long_wait) + 0.999)
-    return int(wp.where(u < share, later, soon))
+    probability = ranges.long_wait_probability
+    soon = (u - probability) / wp.max(1.0 - probability, 1.0e-6) * (float(ranges.command_delay) + 0.999)
+    later = u / wp.max(probability, 1.0e-6) * (float(ranges.long_wait) + 0.999)
+    return int(wp.where(u < probability, later, soon))
 
 
 @wp.func
@@ -98,7 +98,10 @@ def begin_jump(
     rng: RngStream, ranges: ResetRanges, start_mode: int, goal: wp.vec3, pos: wp.vec3, vz: float,
     next_jump_probability: float,
 ) -> JumpState:  # fmt: skip
-    """Return the state of a new episode; pos [m]: base position, vz [m/s]: its vertical velocity."""
+    """Return the task state of a new episode in phase and with the command that fit its start mode.
+
+    goal [m]: world axes; pos [m], vz [m/s]: position and vertical velocity of the base.
+    """
     state = JumpState()
     state.start_mode = start_mode
     state.goal = goal
@@ -128,7 +131,10 @@ def begin_jump(
 
 @wp.func
 def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3, heading: float) -> JumpState:
-    """Return the state of the next jump of an episode, commanded at once; goal relative to base and heading."""
+    """Return the state of the next jump of an episode, commanded at once.
+
+    goal [m]: x, y relative to base position `pos` [m] and `heading` [rad], and base height at the apex, world z.
+    """
     state = old
     state.heading = heading
     state.goal = rotate_yaw(goal, heading) + wp.vec3(pos[0], pos[1], 0.0)
@@ -149,7 +155,7 @@ def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3,
 
 @wp.func
 def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, rng: RngStream) -> Ground:
-    """Reset or sample the block of a world, and return the world's ground."""
+    """Sample the block of a world, or reset it if `grounds` has no probabilities, and return the world's ground."""
     if grounds.platform + grounds.block > 0.0:
         block = Block()
         if start.start_mode == STANDING or start.start_mode == DEFAULT:
@@ -165,7 +171,10 @@ def reset_jump(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: JumpState, settings: JumpSettings, level: JumpLevel,
     rng: RngStream,
 ) -> JumpState:  # fmt: skip
-    """Reset a world to a sampled start state of a jump, and return the task's state."""
+    """Write a sampled start state of a jump to world `rng.world`, and return the task state of its new episode.
+
+    old: state of the previous episode, whose steps count for its start mode.
+    """
     world = rng.world
     ranges = settings.states
     steps_per_mode = old.steps_per_mode
@@ -195,7 +204,7 @@ def next_jump_due(state: JumpState) -> bool:
 
 @wp.func
 def resample_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpLevel, rng: RngStream) -> JumpState:
-    """Return the state of the next jump of an episode, to a sampled goal."""
+    """Return the state of the next jump of an episode, to a goal sampled from `level`."""
     goal = sample_goal(rng, level)
     new = begin_next_jump(state, world_ground(scene.ground, robot.world), goal, robot.pos, yaw_of(robot.quat))
     new.next_jump_step = sample_next_jump_step(rng, state.next_jump_delay, level.next_jump_probability)
@@ -204,10 +213,10 @@ def resample_jump(robot: RobotView, scene: Scene, state: JumpState, level: JumpL
 
 @wp.func
 def set_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, heading: float) -> JumpState:
-    """Return the state with a commanded jump, of a robot that stands at its start or has landed; else unchanged.
+    """Return the state with a commanded jump if the robot is at the start of an episode or has landed; else `state`.
 
-    values: goal x, y [m] relative to base and heading, base height at the apex [m], and at a start the policy step of
-    the command.
+    values: goal x, y [m] relative to base and heading [rad], base height at the apex [m], and, at the start only, the
+    policy step of the command.
     """
     here = world_ground(scene.ground, robot.world)
     goal = wp.vec3(values[0], values[1], values[2])
@@ -227,5 +236,5 @@ def set_jump(robot: RobotView, scene: Scene, state: JumpState, values: wp.vec4, 
 
 @wp.func
 def from_standing(state: JumpState) -> bool:
-    """Return whether an episode began standing or in the default pose; only these count for the curriculum."""
+    """Return whether the episode counts for the curriculum: it began standing or in the default pose."""
     return state.start_mode <= DEFAULT

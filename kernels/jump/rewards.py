@@ -1,6 +1,8 @@
 """Reward terms of jumps (paper, Tables I to III): pure functions of the robot, the jump and named numbers.
 
-Times are counted in policy steps of 1/60 s.
+Times are counted in policy steps of 1/60 s. phi, psi: Gaussian and Laplacian kernels of `mdp.rewards`; std_* and
+scale_*: their widths, in the unit of their argument. shift [rad]: added to the default angles of transversal motors.
+waiting_scale: factor on rewards that do not need a jump, while a commanded jump has not begun.
 """
 
 import warp as wp
@@ -10,55 +12,52 @@ from ..mdp.view import RobotView, angle_from_level, base_deceleration
 from .phase import estimated_apex, landing_error_estimate
 from .state import FLIGHT, LANDED, STANCE, JumpState, commanded, goal_offset, waiting
 
-SOON = wp.constant(18)  # policy steps: the first 0.3 s after touchdown
-RECOVERED = wp.constant(30)  # policy steps: 0.5 s after touchdown
+JUST_LANDED_STEPS = wp.constant(18)  # policy steps (0.3 s) after touchdown that count as just landed
+REST_STEPS = wp.constant(30)  # policy steps (0.5 s) after touchdown from which on the robot should rest
 
 
 @wp.func
-def patience(state: JumpState, waiting_scale: float) -> float:
-    """Return the weight of what pays without jumping: `waiting_scale` while a commanded jump has not begun, else 1."""
+def waiting_weight(state: JumpState, waiting_scale: float) -> float:
+    """Return `waiting_scale` while a commanded jump has not begun, else 1."""
     return wp.where(waiting(state), waiting_scale, 1.0)
 
 
 @wp.func
 def just_landed(state: JumpState) -> bool:
     """Return whether the touchdown was within the last 0.3 s."""
-    return state.phase == LANDED and state.phase_steps < SOON
+    return state.phase == LANDED and state.phase_steps < JUST_LANDED_STEPS
 
 
 @wp.func
 def should_rest(state: JumpState) -> bool:
     """Return whether the robot should stand still: before the command, and from 0.5 s after touchdown."""
     if state.phase == LANDED:
-        return state.phase_steps >= RECOVERED
+        return state.phase_steps >= REST_STEPS
     return state.phase == STANCE and not commanded(state)
 
 
-# ---------------------------------------------------------------- vertical jump
-
-
 @wp.func
-def height_kernel(error: float, std_fine: float, scale_sharp: float, std_wide: float) -> float:
-    """Return phi_fine + 3 psi_sharp + phi_wide of a height error [m]; the wide one gives a slope to low jumps."""
+def height_closeness(error: float, std_fine: float, scale_sharp: float, std_wide: float) -> float:
+    """Return phi_fine + 3 psi_sharp + phi_wide of a height error, all [m]; phi_wide gives low jumps a slope."""
     return phi(error, std_fine) + 3.0 * psi(error, scale_sharp) + phi(error, std_wide)
 
 
 @wp.func
 def jump_height(robot: RobotView, state: JumpState, std_fine: float, scale_sharp: float, std_wide: float) -> float:
-    """Jump height: closeness of the highest base height to the goal, once, at the apex."""
+    """Jump height: `height_closeness` of the highest base height to the commanded one, once, at the apex."""
     if state.at_apex == 0:
         return 0.0
-    return height_kernel(state.max_height - state.goal[2], std_fine, scale_sharp, std_wide)
+    return height_closeness(state.max_height - state.goal[2], std_fine, scale_sharp, std_wide)
 
 
 @wp.func
 def estimated_jump_height(
     robot: RobotView, state: JumpState, std_fine: float, scale_sharp: float, std_wide: float
 ) -> float:
-    """Est jump height: the same of the ballistic estimate, in flight until the apex."""
+    """Est jump height: `height_closeness` of the estimated apex to the commanded one, in flight until the apex."""
     if state.phase != FLIGHT or state.apex_passed != 0:
         return 0.0
-    return height_kernel(
+    return height_closeness(
         estimated_apex(robot.pos, robot.lin_vel, robot.gravity_magnitude) - state.goal[2],
         std_fine,
         scale_sharp,
@@ -68,58 +67,57 @@ def estimated_jump_height(
 
 @wp.func
 def horizontal_velocity(robot: RobotView, state: JumpState, speed_scale: float, waiting_scale: float) -> float:
-    """Staying over the spot: exp(-|v_xy| / speed_scale), twice off stance; `waiting_scale` of it while due."""
+    """Staying over the spot: exp(-|v_xy| / speed_scale), twice that off stance; speed_scale [m/s]."""
     speed = wp.length(wp.vec2(robot.lin_vel[0], robot.lin_vel[1]))
-    return wp.exp(-speed / speed_scale) * wp.where(state.phase == STANCE, 1.0, 2.0) * patience(state, waiting_scale)
+    return (
+        wp.exp(-speed / speed_scale) * wp.where(state.phase == STANCE, 1.0, 2.0) * waiting_weight(state, waiting_scale)
+    )
 
 
 @wp.func
 def orientation(robot: RobotView, state: JumpState, std: float, waiting_scale: float) -> float:
-    """Orientation error: phi_std of the horizontal projected gravity; `waiting_scale` of it while due."""
-    return phi(wp.length(wp.vec2(robot.projected_gravity[0], robot.projected_gravity[1])), std) * patience(
+    """Orientation error: phi_std of the horizontal part of projected gravity [1] (sine of the tilt)."""
+    return phi(wp.length(wp.vec2(robot.projected_gravity[0], robot.projected_gravity[1])), std) * waiting_weight(
         state, waiting_scale
     )
 
 
 @wp.func
 def angular_velocity(robot: RobotView, state: JumpState, std: float, waiting_scale: float) -> float:
-    """Angular velocity: phi_std(|w|); `waiting_scale` of it while due."""
-    return phi(wp.length(robot.ang_vel), std) * patience(state, waiting_scale)
+    """Angular velocity: phi_std of the base's angular speed [rad/s]."""
+    return phi(wp.length(robot.ang_vel), std) * waiting_weight(state, waiting_scale)
 
 
 @wp.func
 def joint_symmetry(
     robot: RobotView, state: JumpState, std_variance: float, std_lateral: float, waiting_scale: float
 ) -> float:
-    """Joint symmetry: phi of the transversal angles' variance and |lateral angles|; `waiting_scale` of it while due."""
+    """Joint symmetry: phi(variance of transversal angles [rad^2]) times phi(norm of lateral angles [rad])."""
     total = float(0.0)
     total_sq = float(0.0)
     lateral_sq = float(0.0)
     for m in range(12):
-        a = robot.angle[m]
+        angle = robot.angle[m]
         if m % 3 == 0:
-            lateral_sq += a * a
+            lateral_sq += angle * angle
         else:
-            total += a
-            total_sq += a * a
-    spread = total_sq / 8.0 - total * total / 64.0
-    return phi(spread, std_variance) * phi(wp.sqrt(lateral_sq), std_lateral) * patience(state, waiting_scale)
+            total += angle
+            total_sq += angle * angle
+    variance = total_sq / 8.0 - total * total / 64.0
+    return phi(variance, std_variance) * phi(wp.sqrt(lateral_sq), std_lateral) * waiting_weight(state, waiting_scale)
 
 
 @wp.func
 def ground_posture(robot: RobotView, state: JumpState, std: float, shift: float, waiting_scale: float) -> float:
-    """Desired joint position on the ground: phi_std of the offset from default, transversal motors + shift.
-
-    `waiting_scale` of it while a jump is due.
-    """
+    """Desired joint position on the ground: phi_std of the rms motor offset [rad] from default plus shift."""
     if state.phase == FLIGHT:
         return 0.0
-    return phi(posture_offset(robot, shift), std) * patience(state, waiting_scale)
+    return phi(posture_offset(robot, shift), std) * waiting_weight(state, waiting_scale)
 
 
 @wp.func
 def air_posture(robot: RobotView, state: JumpState, std: float) -> float:
-    """Desired joint position in the air: phi_std of the offset from default."""
+    """Desired joint position in the air: phi_std of the rms motor offset [rad] from default, in flight."""
     if state.phase != FLIGHT:
         return 0.0
     return phi(posture_offset(robot, 0.0), std)
@@ -127,13 +125,10 @@ def air_posture(robot: RobotView, state: JumpState, std: float) -> float:
 
 @wp.func
 def post_landing_posture(robot: RobotView, state: JumpState, std: float, shift: float) -> float:
-    """Retracting after landing: phi_std of the offset from default, transversal motors + shift, first 0.3 s."""
+    """Retracting after landing: phi_std of the rms motor offset [rad] from default plus shift, for 0.3 s."""
     if not just_landed(state):
         return 0.0
     return phi(posture_offset(robot, shift), std)
-
-
-# ---------------------------------------------------------------- horizontal jump
 
 
 @wp.func
@@ -149,9 +144,9 @@ def tracking(robot: RobotView, state: JumpState, std_wide: float, std_fine: floa
 def estimated_tracking(
     robot: RobotView, state: JumpState, std_middle: float, std_wide: float, std_fine: float, height: float
 ) -> float:
-    """Est tracking: phi_middle + 0.1 phi_wide + 0.3 phi_fine of the ballistic landing's distance from the goal.
+    """Est tracking: phi_middle + 0.1 phi_wide + 0.3 phi_fine of the estimated landing's distance from the goal [m].
 
-    In flight. The landing is where the base falls through a height [m].
+    In flight. The ballistic landing is where the base falls through `height` [m] above the goal's ground.
     """
     if state.phase != FLIGHT:
         return 0.0
@@ -161,7 +156,7 @@ def estimated_tracking(
 
 @wp.func
 def flight_orientation(robot: RobotView, state: JumpState, std: float) -> float:
-    """Orientation error: phi_std of the rotation from level and heading, in flight while moving toward the goal."""
+    """Orientation error: phi_std of the rotation angle [rad] from level at the heading, in flight toward the goal."""
     if state.phase != FLIGHT or wp.dot(robot.lin_vel, goal_offset(robot, state)) <= 0.0:
         return 0.0
     return phi(angle_from_level(robot.quat, state.heading), std)
@@ -169,7 +164,7 @@ def flight_orientation(robot: RobotView, state: JumpState, std: float) -> float:
 
 @wp.func
 def flight_angular_velocity(robot: RobotView, state: JumpState, std: float) -> float:
-    """Angular velocity: phi_std(|w|), in flight."""
+    """Angular velocity: phi_std of the base's angular speed [rad/s], in flight."""
     if state.phase != FLIGHT:
         return 0.0
     return phi(wp.length(robot.ang_vel), std)
@@ -177,29 +172,26 @@ def flight_angular_velocity(robot: RobotView, state: JumpState, std: float) -> f
 
 @wp.func
 def left_right_symmetry(robot: RobotView, state: JumpState, std: float, waiting_scale: float) -> float:
-    """Joint symmetry: phi_std of the rms left-right difference of transversal angles, `waiting_scale` of it if due."""
+    """Joint symmetry: phi_std of the rms left-right difference of transversal motor angles [rad]."""
     total = float(0.0)
     for m in range(12):
-        if m % 3 != 0 and (m / 3) % 2 == 0:
-            off = robot.angle[m] - robot.angle[m + 3]
-            total += off * off
-    return phi(wp.sqrt(total / 4.0), std) * patience(state, waiting_scale)
+        if m % 3 != 0 and (m / 3) % 2 == 0:  # transversal motors of left legs; the right leg is 3 motors later
+            difference = robot.angle[m] - robot.angle[m + 3]
+            total += difference * difference
+    return phi(wp.sqrt(total / 4.0), std) * waiting_weight(state, waiting_scale)
 
 
 @wp.func
 def standing_posture(robot: RobotView, state: JumpState, std: float, shift: float) -> float:
-    """Stance: phi_std of the offset from default, transversal motors + shift, while the robot should rest."""
+    """Stance: phi_std of the rms motor offset [rad] from default plus shift, while the robot should rest."""
     if not should_rest(state):
         return 0.0
     return phi(posture_offset(robot, shift), std)
 
 
-# ---------------------------------------------------------------- impacts and landing
-
-
 @wp.func
 def soft_impact(robot: RobotView, state: JumpState, limit: float) -> float:
-    """Soft impact: max(0, 1 - deceleration / limit), first 0.3 s after touchdown."""
+    """Soft impact: max(0, 1 - base deceleration / limit [m/s^2]), 0.3 s from touchdown."""
     if not just_landed(state):
         return 0.0
     return wp.max(0.0, 1.0 + base_deceleration(robot) / limit)
@@ -207,7 +199,7 @@ def soft_impact(robot: RobotView, state: JumpState, limit: float) -> float:
 
 @wp.func
 def stance_impact(robot: RobotView, state: JumpState, limit: float) -> float:
-    """Stance impact: deceleration / limit in stance, in -1..0."""
+    """Stance impact: minus base deceleration / limit [m/s^2], clamped to -1..0, in stance."""
     if state.phase != STANCE:
         return 0.0
     return wp.clamp(base_deceleration(robot) / limit, -1.0, 0.0)
@@ -215,7 +207,7 @@ def stance_impact(robot: RobotView, state: JumpState, limit: float) -> float:
 
 @wp.func
 def catch_landing(robot: RobotView, state: JumpState) -> float:
-    """Catch landing: let the base fall on, clamp(-v_z, 0, 1), first 0.3 s."""
+    """Catch landing: downward base speed [m/s], clamped to 0..1, for 0.3 s from touchdown."""
     if not just_landed(state):
         return 0.0
     return wp.clamp(-robot.lin_vel[2], 0.0, 1.0)
@@ -223,7 +215,7 @@ def catch_landing(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def damp_landing(robot: RobotView, state: JumpState) -> float:
-    """Damp landing: fold the legs, mean clamp(transversal rates, 0, 1), first 0.3 s."""
+    """Damp landing: mean over transversal motors of the rate [rad/s], clamped to 0..1 (legs fold), for 0.3 s."""
     if not just_landed(state):
         return 0.0
     total = float(0.0)
@@ -235,7 +227,7 @@ def damp_landing(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def base_at_rest(robot: RobotView, state: JumpState, std_lin_vel: float, std_ang_vel: float) -> float:
-    """Rest: phi_std_lin_vel(|v|) phi_std_ang_vel(|w|), while the robot should rest."""
+    """Rest: phi(base speed [m/s]) times phi(angular speed [rad/s]), while the robot should rest."""
     if not should_rest(state):
         return 0.0
     return phi(wp.length(robot.lin_vel), std_lin_vel) * phi(wp.length(robot.ang_vel), std_ang_vel)
@@ -243,14 +235,14 @@ def base_at_rest(robot: RobotView, state: JumpState, std_lin_vel: float, std_ang
 
 @wp.func
 def tilt_over(robot: RobotView, angle: float) -> float:
-    """Return the squared sine of the angle between body z and world z over that of `angle` [rad]."""
+    """Return (sin(tilt) / sin(angle))^2; tilt: angle between body z and world z; angle [rad]."""
     sine = wp.length(wp.vec2(robot.projected_gravity[0], robot.projected_gravity[1])) / wp.sin(angle)
     return sine * sine
 
 
 @wp.func
 def landing_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
-    """Tilt after touchdown: squared sine of the tilt over that of `angle` [rad]."""
+    """Tilt after touchdown: (sin(tilt) / sin(angle))^2; angle [rad]."""
     if state.phase != LANDED:
         return 0.0
     return tilt_over(robot, angle)
@@ -258,7 +250,7 @@ def landing_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
 
 @wp.func
 def descent_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
-    """Tilt while the base falls in flight: squared sine as in `landing_tilt`."""
+    """Tilt while the base falls in flight: (sin(tilt) / sin(angle))^2; angle [rad]."""
     if state.phase != FLIGHT or robot.lin_vel[2] > 0.0:
         return 0.0
     return tilt_over(robot, angle)
@@ -266,7 +258,7 @@ def descent_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
 
 @wp.func
 def lifted_again(robot: RobotView, state: JumpState, threshold: float) -> float:
-    """Still landing: paws off the ground again for more than `threshold` [s] after their own first contact, 0 to 4."""
+    """Still landing: number of paws, 0 to 4, in the air for more than `threshold` [s] since they had landed."""
     count = float(0.0)
     if state.phase == LANDED:
         for k in range(4):
@@ -277,7 +269,7 @@ def lifted_again(robot: RobotView, state: JumpState, threshold: float) -> float:
 
 @wp.func
 def paws_down(robot: RobotView, state: JumpState) -> float:
-    """Still landing: paws on the ground after touchdown, 0 to 4."""
+    """Still landing: number of paws on the ground, 0 to 4, after touchdown."""
     if state.phase != LANDED:
         return 0.0
     return float(robot.contacts)
@@ -285,27 +277,24 @@ def paws_down(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def capture_point(robot: RobotView, state: JumpState, std: float) -> float:
-    """Bracing: phi_std of the way from the middle of the paws to where a pendulum of the base's height would stop.
+    """Bracing: phi_std of the horizontal distance [m] between capture point and middle of the paws, after touchdown.
 
-    After touchdown. The pendulum that moves with the base comes to rest over p + v sqrt(h / g).
+    Capture point: p + v sqrt(h / g), where a pendulum with the base's position p, velocity v and height h stops.
     """
     if state.phase != LANDED:
         return 0.0
-    reach = wp.sqrt(wp.max(robot.height, 0.0) / robot.gravity_magnitude)
-    x = robot.pos[0] + reach * robot.lin_vel[0]
-    y = robot.pos[1] + reach * robot.lin_vel[1]
+    time = wp.sqrt(wp.max(robot.height, 0.0) / robot.gravity_magnitude)
+    x = robot.pos[0] + time * robot.lin_vel[0]
+    y = robot.pos[1] + time * robot.lin_vel[1]
     for k in range(4):
         x -= 0.25 * robot.paw_pos[k, 0]
         y -= 0.25 * robot.paw_pos[k, 1]
     return phi(wp.length(wp.vec2(x, y)), std)
 
 
-# ---------------------------------------------------------------- standing quietly
-
-
 @wp.func
 def resting_action_rate(robot: RobotView, state: JumpState) -> float:
-    """Quiet actions: sum of squared changes of the action, while the robot should rest."""
+    """Quiet actions: sum over motors of the action's squared change in a policy step, while the robot should rest."""
     if not should_rest(state):
         return 0.0
     return square_sum(robot.action - robot.prev_action)
@@ -313,7 +302,7 @@ def resting_action_rate(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def torque_ripple(robot: RobotView, state: JumpState) -> float:
-    """Torque ripple: sum of squared changes of the motor torques over the step [N^2 m^2], while it should rest."""
+    """Torque ripple: sum over motors of the torque's squared change [N^2 m^2], while the robot should rest."""
     if not should_rest(state):
         return 0.0
     return square_sum(robot.torque - robot.prev_torque)
@@ -321,8 +310,8 @@ def torque_ripple(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def force_ripple(robot: RobotView, state: JumpState, weight_force: float) -> float:
-    """Force ripple: sum over paws of squares of the step's peak less its last force over the weight's [N], at rest."""
+    """Force ripple: sum over paws of ((peak - last force of the step) / weight_force [N])^2, while it should rest."""
     if not should_rest(state):
         return 0.0
-    off = robot.peak_force - robot.paw_force
-    return wp.dot(off, off) / (weight_force * weight_force)
+    excess = robot.peak_force - robot.paw_force
+    return wp.dot(excess, excess) / (weight_force * weight_force)

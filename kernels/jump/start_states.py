@@ -1,10 +1,7 @@
-"""Start states of a jump (paper, Section V-D: reference state initialisation), one function a start mode.
+"""Start states of a jump (paper, Section V-D: reference state initialisation), one function `*_base` per start mode.
 
-Standing or squatting on given paw positions, the default pose, pushing off, in flight on a projectile to the goal, just
-before touchdown, and just landed. If no attempt is valid, the episode begins in the default pose.
-
-A jump goes from above the origin to `goal`: x, y [m] of the landing and, for a vertical jump, the base height [m]
-wanted at the apex; where none is wanted, the takeoff angle is drawn.
+If no attempt is valid, the episode begins in the default pose. A jump goes from above the origin to `goal`: x, y [m] of
+the landing and the commanded base height [m] at the apex; if that is 0, the takeoff angle is sampled instead.
 """
 
 import warp as wp
@@ -26,57 +23,57 @@ from .state import NUM_START_MODES, vec_start_modes
 
 wp.set_module_options({"enable_backward": False})
 
-STANDING = wp.constant(0)
-DEFAULT = wp.constant(1)
-IN_FLIGHT = wp.constant(2)
-TOUCHDOWN = wp.constant(3)
-AFTER_LANDING = wp.constant(4)
-PUSHING = wp.constant(5)
+STANDING = wp.constant(0)  # at rest, squatting more or less, on sampled paw positions
+DEFAULT = wp.constant(1)  # default pose at rest
+IN_FLIGHT = wp.constant(2)  # on the ballistic flight to the goal
+TOUCHDOWN = wp.constant(3)  # in flight just before touchdown
+AFTER_LANDING = wp.constant(4)  # over paws on the ground at the goal, still moving down
+PUSHING = wp.constant(5)  # in stance, accelerating toward takeoff
 
 
 @wp.struct
 class ResetRanges:
-    """Ranges of the drawn states; pairs are (lower, upper), angles [rad], lengths [m]."""
+    """Ranges of sampled states; pairs are (lower, upper), angles [rad], lengths [m]; half width w: from -w to w."""
 
-    start_probability: vec_start_modes  # of standing, default, in flight, touchdown, just landed, pushing off
-    by_steps: int  # 1: probabilities are of a world's policy steps, 0: of its resets
-    base_xy: float  # half width
-    tilt: float  # half width of roll, pitch; of yaw too around the heading
+    start_probability: vec_start_modes  # of STANDING, DEFAULT, IN_FLIGHT, TOUCHDOWN, AFTER_LANDING, PUSHING
+    by_steps: int  # 1: probabilities are fractions of a world's policy steps, 0: of its resets
+    base_xy: float  # half width of the base's horizontal offset along x and y
+    tilt: float  # half width of roll, pitch, and yaw around the heading
     forward_pitch: float  # largest mean pitch of standing states
-    lean: float  # base of the deepest squats behind the middle of the paws, at most; straight above it at the highest
+    lean: float  # largest distance of the base behind the paws' middle in the deepest squat; 0 at the highest
     heading: float  # half width of the heading
-    front_x: wp.vec2  # paw ahead of the base
-    front_y: wp.vec2  # paw beside the base, absolute
-    back_x: wp.vec2  # paw behind the base, absolute
-    back_y: wp.vec2
-    takeoff_height: wp.vec2
+    front_x: wp.vec2  # front paws ahead of the base
+    front_y: wp.vec2  # front paws beside the base, absolute
+    back_x: wp.vec2  # back paws behind the base, absolute
+    back_y: wp.vec2  # back paws beside the base, absolute
+    takeoff_height: wp.vec2  # base above the ground
     takeoff_ahead: wp.vec2  # base ahead of its start, towards the goal
     takeoff_pitch: wp.vec2  # nose down, of states in flight and pushing off
-    push_length: wp.vec2  # of the way to the takeoff, straight along its velocity
+    push_length: wp.vec2  # distance to the takeoff position, straight along the takeoff velocity
     push_acceleration: wp.vec2  # [m/s^2] along it
-    takeoff_angle: wp.vec2  # above the horizon, where no apex is wanted
-    highest_apex: float  # of jumps with a drawn angle
-    landing_height: float  # of the base, where the projectile ends
-    flight_time: wp.vec2  # share of the time in the air
-    flight_lateral: float  # half width
-    flight_transversal: wp.vec2
+    takeoff_angle: wp.vec2  # above the horizon, for goals without an apex
+    highest_apex: float  # of jumps with a sampled takeoff angle
+    landing_height: float  # base above the ground at the end of the flight
+    flight_time: wp.vec2  # [1] fraction of the flight's duration
+    flight_lateral: float  # half width of lateral angles in flight
+    flight_transversal: wp.vec2  # outer and inner angles in flight
     touchdown_time: wp.vec2  # [s] before landing
     touchdown_behind: wp.vec2  # base behind the projectile, so that the paws are ahead of it
     paw_depth: wp.vec2  # paws below the base before touchdown
-    landed_height: wp.vec2
+    landed_height: wp.vec2  # base above the ground
     landed_ahead: wp.vec2  # base ahead of the goal
     landed_speed: wp.vec2  # [m/s] downward
-    command_delay: int  # most policy steps until the jump is commanded
-    long_wait_probability: float  # of the draws in which it may be `long_wait`
-    long_wait: int
-    next_jump_delay: wp.vec2  # policy steps after touchdown
+    command_delay: int  # largest number of policy steps until the jump is commanded
+    long_wait_probability: float  # that `long_wait` replaces `command_delay`
+    long_wait: int  # policy steps
+    next_jump_delay: wp.vec2  # policy steps from touchdown to the next goal
 
 
 @wp.struct
 class JumpStart:
-    """What all attempts at a start state share."""
+    """Values that all attempts at a start state share."""
 
-    start_mode: int
+    start_mode: int  # STANDING to PUSHING
     heading: float  # [rad] yaw
     goal: wp.vec3  # [m] from the origin, world axes
     base_height: wp.vec2  # [m] range of standing starts
@@ -89,19 +86,19 @@ class JumpStart:
 class JumpBase:
     """The base in an attempt, see `sample_valid_state`; paws are placed around `spot`."""
 
-    pos: wp.vec3
-    quat: wp.quat
-    com_vel: wp.vec3
-    ang_vel: wp.vec3
-    lin_vel: wp.vec3  # [m/s] of the origin, world axes
+    pos: wp.vec3  # [m] base origin, world
+    quat: wp.quat  # xyzw, body to world
+    com_vel: wp.vec3  # [m/s] centre of mass, world axes
+    ang_vel: wp.vec3  # [rad/s] world axes, 0
+    lin_vel: wp.vec3  # [m/s] of the base origin, world axes
     ground_height: float  # [m] at the origin
     height: float  # [m] above it
-    spot: wp.vec3  # [m] on the ground, or below the projectile before touchdown
+    spot: wp.vec3  # [m] middle of the paws on the ground; for TOUCHDOWN x, y of the projectile
 
 
 @wp.func
 def start_mode_at(probability: vec_start_modes, u: float) -> int:
-    """Return the start mode in whose interval u in [0, 1) falls, probabilities laid end to end."""
+    """Return the start mode in whose interval u in [0, 1) lies; mode i's interval has length probability[i]."""
     start_mode = int(0)
     rest = u
     for i in range(NUM_START_MODES):
@@ -113,23 +110,23 @@ def start_mode_at(probability: vec_start_modes, u: float) -> int:
 
 @wp.func
 def least_sampled_mode(probability: vec_start_modes, steps_per_mode: vec_start_modes) -> int:
-    """Return the start mode whose policy steps so far are farthest below its probability of all."""
+    """Return the start mode whose policy steps fall farthest short of probability times all policy steps."""
     total = float(0.0)
     for i in range(NUM_START_MODES):
         total += steps_per_mode[i]
     start_mode = int(0)
-    most = float(-3.0e38)
+    largest = float(-3.0e38)
     for i in range(NUM_START_MODES):
         lack = probability[i] * total - steps_per_mode[i]
-        if probability[i] > 0.0 and lack > most:
+        if probability[i] > 0.0 and lack > largest:
             start_mode = i
-            most = lack
+            largest = lack
     return start_mode
 
 
 @wp.func
 def sample_start_mode(rng: RngStream, ranges: ResetRanges, steps_per_mode: vec_start_modes) -> int:
-    """Return the start mode of a new episode: sampled, or by steps the one that lacks most."""
+    """Return the start mode of a new episode: sampled, or with `by_steps` the `least_sampled_mode` (after resets)."""
     if ranges.by_steps != 0 and wp.length_sq(steps_per_mode) > 0.0:
         return least_sampled_mode(ranges.start_probability, steps_per_mode)
     return start_mode_at(ranges.start_probability, uniform(rng, streams.START_MODE, 0.0, 1.0))
@@ -137,23 +134,23 @@ def sample_start_mode(rng: RngStream, ranges: ResetRanges, steps_per_mode: vec_s
 
 @wp.func
 def sample_quat(rng: RngStream, ranges: ResetRanges, heading: float, pitch: float) -> wp.quat:
-    """Return a sampled orientation (xyzw): heading and pitch [rad] plus uniform noise, and a sampled roll."""
+    """Return a sampled orientation (xyzw, body to world) around yaw `heading`, `pitch` (nose down) and roll 0 [rad]."""
     yaw = heading + uniform(rng, streams.YAW, -ranges.tilt, ranges.tilt)
-    tip = pitch + uniform(rng, streams.PITCH, -ranges.tilt, ranges.tilt)
+    sampled_pitch = pitch + uniform(rng, streams.PITCH, -ranges.tilt, ranges.tilt)
     roll = uniform(rng, streams.ROLL, -ranges.tilt, ranges.tilt)
-    return quat_from_ypr(yaw, tip, roll)
+    return quat_from_ypr(yaw, sampled_pitch, roll)
 
 
 @wp.func
 def sample_offset(rng: RngStream, ranges: ResetRanges) -> wp.vec3:
-    """Return a sampled horizontal offset [m] of the base."""
+    """Return a sampled horizontal offset [m] of the base from its nominal position, world axes, z = 0."""
     x = uniform(rng, streams.OFFSET_X, -ranges.base_xy, ranges.base_xy)
     return wp.vec3(x, uniform(rng, streams.OFFSET_Y, -ranges.base_xy, ranges.base_xy), 0.0)
 
 
 @wp.func
-def direction(start: JumpStart) -> wp.vec3:
-    """Return the horizontal unit vector towards the goal, along the heading for a jump on the spot."""
+def goal_direction(start: JumpStart) -> wp.vec3:
+    """Return the horizontal unit vector toward the goal, world axes; along the heading for a jump on the spot."""
     to_goal = wp.vec3(start.goal[0], start.goal[1], 0.0)
     if wp.length(to_goal) > 1.0e-3:
         return wp.normalize(to_goal)
@@ -161,29 +158,29 @@ def direction(start: JumpStart) -> wp.vec3:
 
 
 @wp.func
-def standing(start: JumpStart, rng: RngStream) -> JumpBase:
-    """Return a base at rest over paws around the origin; in a deeper squat it may be farther behind their middle."""
+def standing_base(start: JumpStart, rng: RngStream) -> JumpBase:
+    """Return a base at rest over paws around the origin; a deeper squat may lean farther back (`lean`)."""
     ranges = start.ranges
     lower = start.base_height[0]
     upper = start.base_height[1]
     height = uniform_range(rng, streams.HEIGHT, start.base_height)
-    tip = uniform(rng, streams.FORWARD_PITCH, 0.0, ranges.forward_pitch)
+    pitch = uniform(rng, streams.FORWARD_PITCH, 0.0, ranges.forward_pitch)
     lean = (upper - height) / wp.max(upper - lower, 1.0e-6) * uniform(rng, streams.LEAN, 0.0, ranges.lean)
     base = JumpBase()
-    base.quat = sample_quat(rng, ranges, start.heading, tip)
-    base.pos = sample_offset(rng, ranges) + wp.vec3(0.0, 0.0, height) - lean * direction(start)
+    base.quat = sample_quat(rng, ranges, start.heading, pitch)
+    base.pos = sample_offset(rng, ranges) + wp.vec3(0.0, 0.0, height) - lean * goal_direction(start)
     return base
 
 
 @wp.func
-def just_landed(start: JumpStart, rng: RngStream) -> JumpBase:
-    """Return a base just after landing: over paws around the goal, moving down."""
+def landed_base(start: JumpStart, rng: RngStream) -> JumpBase:
+    """Return a base just after landing: over paws around the goal, moving down without horizontal velocity."""
     ranges = start.ranges
     base = JumpBase()
     base.quat = sample_quat(rng, ranges, start.heading, 0.0)
     base.spot = wp.vec3(start.goal[0], start.goal[1], 0.0)
     ahead = uniform_range(rng, streams.LANDED_AHEAD, ranges.landed_ahead)
-    base.pos = sample_offset(rng, ranges) + base.spot + ahead * direction(start)
+    base.pos = sample_offset(rng, ranges) + base.spot + ahead * goal_direction(start)
     base.pos[2] = uniform_range(rng, streams.LANDED_HEIGHT, ranges.landed_height)
     base.lin_vel = wp.vec3(0.0, 0.0, -uniform_range(rng, streams.LANDED_SPEED, ranges.landed_speed))
     return base
@@ -191,7 +188,10 @@ def just_landed(start: JumpStart, rng: RngStream) -> JumpBase:
 
 @wp.func
 def takeoff_speed(rng: RngStream, ranges: ResetRanges, height: float, distance: float, apex: float, g: float) -> float:
-    """Return the vertical takeoff speed [m/s] at `height` [m] of a jump over `distance` [m]; apex [m], 0: any."""
+    """Return the vertical takeoff speed [m/s] at base height `height` [m] of a jump over `distance` [m].
+
+    It reaches `apex` [m]; if that is 0, it follows from a sampled takeoff angle. g [m/s^2].
+    """
     if apex > 0.0:
         return wp.sqrt(wp.max(2.0 * g * (apex - height), 0.0))
     # height + v_z t - g t^2 / 2 = landing_height, where v_z t = distance tan(angle)
@@ -202,14 +202,17 @@ def takeoff_speed(rng: RngStream, ranges: ResetRanges, height: float, distance: 
 
 
 @wp.func
-def in_flight(start: JumpStart, rng: RngStream, g: float) -> JumpBase:
-    """Return a base on the ballistic flight to the goal: anywhere on it, before touchdown, or at takeoff (PUSHING)."""
+def flight_base(start: JumpStart, rng: RngStream, g: float) -> JumpBase:
+    """Return a base on the ballistic flight to the goal: anywhere (IN_FLIGHT), near its end, or at takeoff (PUSHING).
+
+    g [m/s^2]. Heights are above the ground at the origin.
+    """
     ranges = start.ranges
-    along = direction(start)
+    along = goal_direction(start)
     height = uniform_range(rng, streams.TAKEOFF_HEIGHT, ranges.takeoff_height)
-    way = wp.length(wp.vec3(start.goal[0], start.goal[1], 0.0))
-    ahead = wp.min(uniform_range(rng, streams.TAKEOFF_AHEAD, ranges.takeoff_ahead), way)
-    distance = way - ahead
+    goal_distance = wp.length(wp.vec3(start.goal[0], start.goal[1], 0.0))
+    ahead = wp.min(uniform_range(rng, streams.TAKEOFF_AHEAD, ranges.takeoff_ahead), goal_distance)
+    distance = goal_distance - ahead
     up = takeoff_speed(rng, ranges, height, distance, start.goal[2], g)
     duration = wp.max(time_to_height(height, up, ranges.landing_height, g), 1.0e-3)
     forward = distance / duration
@@ -227,43 +230,46 @@ def in_flight(start: JumpStart, rng: RngStream, g: float) -> JumpBase:
 
 
 @wp.func
-def before_touchdown(start: JumpStart, flight: JumpBase, rng: RngStream) -> JumpBase:
-    """Return a base in flight, moved back [m] relative to its paws, which stay below the projectile."""
+def touchdown_base(start: JumpStart, flight: JumpBase, rng: RngStream) -> JumpBase:
+    """Return `flight` with the base moved back from the goal; its paws (`spot`) stay below the projectile."""
     base = flight
     base.spot = wp.vec3(flight.pos[0], flight.pos[1], 0.0)
-    base.pos = flight.pos - uniform_range(rng, streams.TOUCHDOWN_BEHIND, start.ranges.touchdown_behind) * direction(
-        start
-    )
+    behind = uniform_range(rng, streams.TOUCHDOWN_BEHIND, start.ranges.touchdown_behind)
+    base.pos = flight.pos - behind * goal_direction(start)
     return base
 
 
 @wp.func
-def pushing_off(start: JumpStart, takeoff: JumpBase, rng: RngStream) -> JumpBase:
-    """Return a base on a straight line to its takeoff state, with constant acceleration, over paws around the start."""
+def pushing_base(start: JumpStart, takeoff: JumpBase, rng: RngStream) -> JumpBase:
+    """Return a base that reaches the state `takeoff` on a straight line with constant acceleration.
+
+    Its position and speed are those `push_length` [m] before takeoff; its paws are around the origin.
+    """
     base = takeoff
     back = uniform_range(rng, streams.PUSH_LENGTH, start.ranges.push_length)
     speed = wp.length(takeoff.lin_vel)
-    before = speed * speed - 2.0 * back * uniform_range(rng, streams.PUSH_ACCELERATION, start.ranges.push_acceleration)
-    way = wp.normalize(takeoff.lin_vel)
-    base.pos = takeoff.pos - back * way
-    base.lin_vel = wp.sqrt(wp.max(before, 0.0)) * way
+    acceleration = uniform_range(rng, streams.PUSH_ACCELERATION, start.ranges.push_acceleration)
+    speed_sq = speed * speed - 2.0 * back * acceleration
+    along = wp.normalize(takeoff.lin_vel)
+    base.pos = takeoff.pos - back * along
+    base.lin_vel = wp.sqrt(wp.max(speed_sq, 0.0)) * along
     return base
 
 
 @wp.func
 def sample_base(start: JumpStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> JumpBase:
-    """Return the base's sampled state of an attempt, for the start's mode."""
+    """Return the base's sampled state for the start mode (a `sample_base` of `sample_valid_state`)."""
     base = JumpBase()
     if start.start_mode == STANDING:
-        base = standing(start, rng)
+        base = standing_base(start, rng)
     elif start.start_mode == AFTER_LANDING:
-        base = just_landed(start, rng)
+        base = landed_base(start, rng)
     else:
-        base = in_flight(start, rng, -arrays.gravity[rng.world][2])
+        base = flight_base(start, rng, -arrays.gravity[rng.world][2])
         if start.start_mode == TOUCHDOWN:
-            base = before_touchdown(start, base, rng)
+            base = touchdown_base(start, base, rng)
         if start.start_mode == PUSHING:
-            base = pushing_off(start, base, rng)
+            base = pushing_base(start, base, rng)
     base.com_vel = base.lin_vel + wp.cross(base.ang_vel, wp.quat_rotate(base.quat, arrays.body_com[rng.world * BODIES]))
     base.height = base.pos[2]
     base.ground_height = surface(start.ground, 0.0, 0.0)[0]
@@ -273,7 +279,10 @@ def sample_base(start: JumpStart, arrays: RobotArrays, rng: RngStream, attempt: 
 
 @wp.func
 def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return a leg in flight: angles near one sampled value for all legs; reachable if its paw is above the ground."""
+    """Return leg `leg` in flight, at rest relative to the base; reachable if its paw is 0.01 m above the ground.
+
+    Its angles are within 0.03 rad (lateral) or 0.1 rad (outer, inner) of a value sampled once for all legs.
+    """
     lower = ranges.flight_transversal[0]
     upper = ranges.flight_transversal[1]
     middle = uniform_range(rng, streams.FLIGHT_TRANSVERSAL, ranges.flight_transversal)
@@ -283,16 +292,16 @@ def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: Rn
         wp.clamp(middle + uniform(rng, streams.LEG_OUTER + leg, -0.1, 0.1), lower, upper),
         wp.clamp(middle + uniform(rng, streams.LEG_INNER + leg, -0.1, 0.1), lower, upper),
     )
-    found = LegSample()
-    found.angles = angles
+    sample = LegSample()
+    sample.angles = angles
     ankle = leg_forward_kinematics(geo, angles[0], angles[1], angles[2])
-    found.reachable = base.height + wp.quat_rotate(base.quat, ankle)[2] >= geo.paw_radius + 0.01
-    return found
+    sample.reachable = base.height + wp.quat_rotate(base.quat, ankle)[2] >= geo.paw_radius + 0.01
+    return sample
 
 
 @wp.func
 def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return a leg of an attempt: in flight, or from its paw's position on the ground (TOUCHDOWN: above it)."""
+    """Return leg `leg` of an attempt: in flight, or with its paw on (TOUCHDOWN: above) a sampled spot of the ground."""
     ranges = start.ranges
     if start.start_mode == IN_FLIGHT:
         return leg_in_flight(ranges, base, geo, rng, leg)
@@ -306,17 +315,17 @@ def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, rng: RngStrea
     else:
         below = surface(start.ground, spot[0], spot[1])[0]
         paw[2] = below + geo.paw_radius - base.height - base.ground_height
-    found = leg_ik(geo, start.limits, wp.quat_rotate_inv(base.quat, paw))
+    sample = leg_ik(geo, start.limits, wp.quat_rotate_inv(base.quat, paw))
     if start.start_mode == AFTER_LANDING or start.start_mode == PUSHING:
         # the paw rests on the ground while the base moves, so the joints move too
         moving = base.lin_vel + wp.cross(base.ang_vel, paw)
-        found = with_foot_velocity(geo, found, -wp.quat_rotate_inv(base.quat, moving))
-    return found
+        sample = with_foot_velocity(geo, sample, -wp.quat_rotate_inv(base.quat, moving))
+    return sample
 
 
 @wp.func
 def write_start(arrays: RobotArrays, scene: Scene, start: JumpStart, rng: RngStream) -> int:
-    """Write a start state to a world, and return its mode; `DEFAULT` also where no attempt was valid."""
+    """Write a start state to world `rng.world`, and return its mode, which is DEFAULT if no attempt is valid."""
     if start.start_mode != DEFAULT:
         if sample_valid_state(sample_base, sample_leg, start, arrays, scene, rng):
             return start.start_mode

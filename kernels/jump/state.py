@@ -4,11 +4,9 @@ import warp as wp
 
 from ..mdp.view import RobotView
 
-STANCE = wp.constant(0)
-FLIGHT = wp.constant(1)
-LANDED = wp.constant(2)
-
-
+STANCE = wp.constant(0)  # phases: before takeoff
+FLIGHT = wp.constant(1)  # from takeoff to the first contact of a paw
+LANDED = wp.constant(2)  # from that contact on
 NUM_START_MODES = wp.constant(6)  # see `start_states`
 vec_start_modes = wp.types.vector(length=6, dtype=wp.float32)
 
@@ -17,9 +15,9 @@ vec_start_modes = wp.types.vector(length=6, dtype=wp.float32)
 class JumpState:
     """Task state of one world in a jump episode."""
 
-    goal: wp.vec3  # [m] where to land: base x, y; and its wanted height at the apex, 0 if any will do
-    start: wp.vec3  # [m] base origin where the jump began
-    goal_ground: float  # [m] height of the ground there
+    goal: wp.vec3  # [m] world: base x, y at landing, and commanded base height at the apex (0: any)
+    start: wp.vec3  # [m] world, base origin where the jump began
+    goal_ground: float  # [m] height of the ground at the goal
     heading: float  # [rad] yaw of the jump
     phase: int  # STANCE, FLIGHT, LANDED
     steps: int  # policy steps since the episode began
@@ -29,21 +27,21 @@ class JumpState:
     took_off: int  # 1 in the step of the takeoff
     touched_down: int  # 1 in the step of the touchdown
     at_apex: int  # 1 in the step in which the base begins to fall
-    apex_passed: int
-    max_height: float  # [m] of the base since takeoff
-    touchdown_vel: wp.vec3  # [m/s] of the base, step before touchdown
-    peak_tilt: float  # [rad] largest between body and world z since touchdown
-    start_mode: int  # reset scheme that began the episode
+    apex_passed: int  # 1 from that step on
+    max_height: float  # [m] highest base origin since takeoff, world z
+    touchdown_vel: wp.vec3  # [m/s] world, velocity of the base in the step before touchdown
+    peak_tilt: float  # [rad] largest angle between body and world z since touchdown
+    start_mode: int  # start mode of the episode (`start_states`)
     next_jump_step: int  # policy steps after touchdown at which another goal comes, 0: never
-    next_jump_delay: wp.vec2  # policy steps between which that of yet another goal is drawn
-    jumps: int  # jumps that were followed by another in this episode
-    paws_landed: int  # bits of the paws that have come down since touchdown
-    steps_per_mode: vec_start_modes  # policy steps that the world has spent in episodes of each scheme, before this one
+    next_jump_delay: wp.vec2  # [policy steps] range from which the `next_jump_step` of the next jump is sampled
+    jumps: int  # jumps of this episode that were followed by another
+    paws_landed: int  # bit k: paw k has been in contact since touchdown
+    steps_per_mode: vec_start_modes  # policy steps of the world's earlier episodes by start mode
 
 
 @wp.func
 def goal_offset(robot: RobotView, state: JumpState) -> wp.vec3:
-    """Return the horizontal vector from the base to the goal [m], world axes."""
+    """Return the horizontal vector from the base origin to the goal [m], world axes."""
     return wp.vec3(state.goal[0] - robot.pos[0], state.goal[1] - robot.pos[1], 0.0)
 
 

@@ -12,7 +12,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def begin_policy_step(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_in_flight: int, world: int):
-    """Store the base's velocity as the previous one, and write the push wrench; in flight only if `push_in_flight`."""
+    """Store the base's velocity as `prev_lin_vel`, and write the base wrench: the push, or 0 if it must not act.
+
+    push [N], [N m]: (num_worlds,), world axes; without a paw in contact it acts only if push_in_flight is 1.
+    """
     arrays.prev_lin_vel[world] = base_velocity(arrays, world, base_quat(arrays, world))
     pushed = push_in_flight
     for k in range(4):
@@ -26,7 +29,10 @@ def begin_policy_step(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vecto
 
 @wp.func
 def select_delayed_target(delays: Delays, step_count: int, world: int, m: int):
-    """Write the two targets [rad] that motor m follows in this policy step, and when it switches, from the latency."""
+    """Write the two targets [rad] that motor m follows in this policy step, and the physics step of the switch.
+
+    step_count: policy steps of the world so far. The latency is `delays.steps` physics steps.
+    """
     whole = delays.steps[world] // delays.substeps
     delays.current_target[m, world] = delays.target_history[(step_count - whole) % RING, m, world]
     delays.prev_target[m, world] = delays.target_history[(step_count - whole - 1) % RING, m, world]
@@ -47,7 +53,7 @@ def action_kernel(
 ):
     """Clamp, scale and filter the action (skills, num_worlds, 12) of each world's skill; one thread per (leg, world).
 
-    An action that is not finite counts as 0, and its world as diverged.
+    A non-finite action counts as 0 and sets `bad_action` of its world. push: see `begin_policy_step`.
     """
     leg, world = wp.tid()
     world += episode.first
@@ -59,11 +65,11 @@ def action_kernel(
     target = wp.vec3(0.0)
     for j in range(3):
         m = 3 * leg + j
-        asked = policy_action[episode.skill[world], world, m]
-        if not wp.isfinite(asked):
-            asked = 0.0
+        raw_action = policy_action[episode.skill[world], world, m]
+        if not wp.isfinite(raw_action):
+            raw_action = 0.0
             episode.bad_action[world] = 1
-        action = wp.clamp(asked, -1.0, 1.0)
+        action = wp.clamp(raw_action, -1.0, 1.0)
         arrays.prev_prev_action[m, world] = arrays.prev_action[m, world]
         arrays.prev_action[m, world] = arrays.action[m, world]
         arrays.action[m, world] = action

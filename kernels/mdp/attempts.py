@@ -1,9 +1,9 @@
-"""Rejection sampling of start states: attempts in turn in one thread, or on a GPU by a warp, 8 attempts of 4 legs.
+"""Rejection sampling of start states: up to 8 attempts in one thread, or on a GPU all at once in 8 x 4 threads.
 
 Joint angles come from the closed-form inverse kinematics and joint rates from the leg's Jacobian, so that every state
-satisfies the loops. A sample whose paws cannot be reached within limits, or whose links touch what they must not, is
-rejected. On a GPU the 32 threads of a world differ in `RngStream.lane` alone, and reach every exchange together (see
-`lanes`); each writes to coordinates of its own until one is accepted.
+satisfies the loops. A sample is rejected if a paw is out of reach within limits or a link collides. On a GPU the 32
+threads of a world are one warp: lane 4 a + l (`RngStream.lane`) samples leg l of attempt a, and all threads reach each
+exchange of `lanes` together. Each thread has coordinates of one world to itself until an attempt is accepted.
 """
 
 from typing import Any
@@ -31,19 +31,19 @@ LANES = 32
 
 @wp.func
 def first_leg(rng: RngStream) -> int:
-    """Return the first leg that a thread samples."""
+    """Return the first leg (0 to 3) that this thread samples."""
     return rng.lane % 4
 
 
 @wp.func
 def leg_step(rng: RngStream) -> int:
-    """Return the stride over legs of a thread."""
+    """Return the stride over legs of this thread: 1 (all legs) with one lane, 4 (one leg) with 32."""
     return wp.min(rng.lanes, 4)
 
 
 @wp.func
 def all_legs(rng: RngStream, flag: bool) -> bool:
-    """Return whether a per-thread flag holds for all legs of an attempt."""
+    """Return whether `flag` is true in the threads of all legs of this thread's attempt."""
     if rng.lanes > 1:
         return all_of_attempt(flag)
     return flag
@@ -51,20 +51,20 @@ def all_legs(rng: RngStream, flag: bool) -> bool:
 
 @wp.func
 def vec_from_leg(v: vec3, leg: int) -> vec3:
-    """Return leg `leg`'s vector of the attempt in each of its four threads."""
+    """Return the `v` of the thread that samples leg `leg`, in all four threads of an attempt."""
     return vec3(from_leg_of_attempt(v[0], leg), from_leg_of_attempt(v[1], leg), from_leg_of_attempt(v[2], leg))
 
 
 @wp.func
 def sync_attempts(rng: RngStream):
-    """Synchronise the threads of a world, so that each sees the others' writes."""
+    """Synchronise the threads of a world, so that each sees the writes of all."""
     if rng.lanes > 1:
         sync_lanes()
 
 
 @wp.func
 def store_leg(leg: int, sample: LegSample, joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float)):
-    """Write motor angles [rad] and rates [rad/s] of a leg to one world's coordinates."""
+    """Write motor angles [rad] and rates [rad/s] of a leg to coordinates of one world, (COORDS,) and (DOFS,)."""
     store_motors(joint_q, leg_coord(0, leg), sample.angles)
     store_motors(joint_qd, leg_dof(0, leg), sample.rates)
 
@@ -74,19 +74,20 @@ def pose_is_valid(
     geometry: wp.array(dtype=LegGeometry), ground: Ground, rng: RngStream, sample: LegSample, reachable: bool,
     joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
-    """Return whether all legs are reachable and free of collisions; first gathers the legs of other threads.
+    """Return whether all legs of an attempt are reachable and free of collisions; first gathers them from all threads.
 
-    sample: the leg that this thread has sampled, if it is one of several; reachable: whether its legs are.
+    sample: last leg that this thread sampled; reachable: whether all legs of this thread are. joint_q (COORDS,) and
+    joint_qd (DOFS,): coordinates of the attempt, completed here.
     """
     all_reachable = all_legs(rng, reachable)
     if rng.lanes == 1 and not all_reachable:
-        return False  # several threads go on together
+        return False  # several threads must all reach the exchange below
     if rng.lanes > 1:
-        other = LegSample()
+        gathered = LegSample()
         for leg in range(geometry.shape[0]):
-            other.angles = vec_from_leg(sample.angles, leg)
-            other.rates = vec_from_leg(sample.rates, leg)
-            store_leg(leg, other, joint_q, joint_qd)
+            gathered.angles = vec_from_leg(sample.angles, leg)
+            gathered.rates = vec_from_leg(sample.rates, leg)
+            store_leg(leg, gathered, joint_q, joint_qd)
     flags = int(0)
     for leg in range(first_leg(rng), geometry.shape[0], leg_step(rng)):
         flags = flags | leg_collisions(geometry, ground, joint_q, 0, leg, MIN_LINK_DISTANCE)
@@ -98,7 +99,10 @@ def write_sample_and_check(
     sample_base: wp.Function, sample_leg: wp.Function, start: Any, arrays: RobotArrays, scene: Scene, rng: RngStream,
     attempt: int, joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
-    """Write an attempt's sample to coordinates of one world, and return whether it is valid."""
+    """Sample attempt `attempt` into joint_q (COORDS,) and joint_qd (DOFS,), and return whether it is valid.
+
+    sample_base, sample_leg, start: see `sample_valid_state`. rng: stream of the attempt.
+    """
     base = sample_base(start, arrays, rng, attempt)
     for j in range(3):
         joint_q[j] = base.pos[j]
@@ -120,9 +124,9 @@ def write_first_valid(
     geometry: wp.array(dtype=LegGeometry), rng: RngStream, accepted: int, attempt_q: wp.array(dtype=float),
     attempt_qd: wp.array(dtype=float), joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
-    """Write the first valid attempt to the world's coordinates in `joint_q`, `joint_qd`; returns whether there is one.
+    """Copy the first valid attempt to the world's coordinates in `joint_q`, `joint_qd`; return whether there is one.
 
-    accepted: attempt of this thread that was valid, `ATTEMPTS` if none was.
+    accepted: valid attempt of this thread, `ATTEMPTS` if none; attempt_q (COORDS,), attempt_qd (DOFS,): its sample.
     """
     first = accepted
     if rng.lanes > 1:
@@ -143,11 +147,11 @@ def write_first_valid(
 def sample_valid_state(
     sample_base: wp.Function, sample_leg: wp.Function, start: Any, arrays: RobotArrays, scene: Scene, rng: RngStream
 ) -> bool:
-    """Sample states of a world until one is valid, and write it; returns whether one of the attempts was.
+    """Write the first valid sample of `ATTEMPTS` to world `rng.world`; return whether any is valid (else no write).
 
-    A task's `start_states` define how: start: struct of what all attempts share, with the `ground` of the world.
-    sample_base: (start, robot, draw, attempt) -> struct with pos [m], quat (xyzw), com_vel [m/s] and ang_vel [rad/s] of
-    the base, world axes. sample_leg: (start, base, geometry, draw, leg) -> `LegSample`.
+    A task's `start_states` define start: struct of values that all attempts share, with the `ground` of the world;
+    sample_base: (start, arrays, rng, attempt) -> struct with pos [m], quat (xyzw), com_vel [m/s] and ang_vel [rad/s] of
+    the base, world axes; sample_leg: (start, base, geometry, rng, leg) -> `LegSample`.
     """
     attempt_q = wp.zeros(shape=(COORDS,), dtype=float)
     attempt_qd = wp.zeros(shape=(DOFS,), dtype=float)

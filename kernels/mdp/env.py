@@ -7,8 +7,8 @@ from ..kinematics.geometry import LegGeometry
 from ..terrain.ground import Ground
 from .view import vec12
 
-BEGUN = wp.constant(1)
-COMMANDED = wp.constant(2)
+BEGUN = wp.constant(1)  # `history_reset`: an episode or skill began in this step, so observations have no history
+COMMANDED = wp.constant(2)  # `history_reset`: a command came within an episode
 RING = wp.constant(8)
 """Length [policy steps] of the ring buffers of targets and observations; a constant, since kernels divide by it."""
 
@@ -19,7 +19,7 @@ class Scene:
 
     geometry: wp.array(dtype=LegGeometry)  # (4,)
     ground: Ground
-    reference_q: wp.array(dtype=float)  # joint_q of the default pose, all worlds
+    reference_q: wp.array(dtype=float)  # [m], [1], [rad] joint_q of the default pose, all worlds
 
 
 @wp.struct
@@ -33,21 +33,19 @@ class NoSettings:
 class EpisodeArrays:
     """Episode state of all worlds, arrays of shape (num_worlds,)."""
 
-    seed: int
+    seed: int  # of all random streams
     first: int  # world of the first thread of a launch
     step_count: wp.array(dtype=int)  # policy steps made; with the seed, the whole state of the random streams
-    skill: wp.array(dtype=int)  # index of the task that a world is in
-    requested_task: wp.array(dtype=int)  # skill that a world is to hand over to, -1: none
+    skill: wp.array(dtype=int)  # index of a world's active task
+    requested_task: wp.array(dtype=int)  # index of the requested task (`Env.request`), -1: none
     pending_command: wp.array(dtype=wp.vec4)  # command of the requested skill, set when it takes over
     has_command: wp.array(dtype=int)  # 1: `pending_command` is set
-    history_reset: wp.array(
-        dtype=int
-    )  # BEGUN: an episode or skill began, so observations have no history; COMMANDED: a command came within an episode
-    reward: wp.array(dtype=float)
+    history_reset: wp.array(dtype=int)  # BEGUN, COMMANDED, else 0
+    reward: wp.array(dtype=float)  # of the last policy step
     done: wp.array(dtype=float)  # 1: the episode ended
-    timeout: wp.array(dtype=float)  # 1: it ended without failure (truncated)
+    timeout: wp.array(dtype=float)  # 1: it ended without failure, as `truncated`
     terminated: wp.array(dtype=wp.bool)  # it ended with failure
-    truncated: wp.array(dtype=wp.bool)  # it ended without failure
+    truncated: wp.array(dtype=wp.bool)  # it ended without failure (by a termination with `time_out`)
     termination: wp.array(dtype=int)  # index of the termination term that ended it, -1: none
     diverged: wp.array(dtype=int)  # 1: the state is not finite or too fast; observations are 0
     bad_action: wp.array(dtype=int)  # 1: the action was not finite; the world counts as diverged at the end of the step
@@ -59,19 +57,19 @@ class EpisodeArrays:
 class Counters:
     """Statistics that accumulate until the host reads and clears them."""
 
-    term_sum: wp.array2d(dtype=wp.float64)  # (rewards, num_worlds)
-    termination_count: wp.array2d(dtype=int)  # (terminations, num_worlds)
+    term_sum: wp.array2d(dtype=wp.float64)  # (rewards, num_worlds) sum of each reward term, weight applied
+    termination_count: wp.array2d(dtype=int)  # (terminations, num_worlds) ended episodes by termination term
     curriculum_episodes: wp.array(dtype=int)  # (num_worlds,) ended episodes that count for the curriculum
     curriculum_successes: wp.array(dtype=int)  # of these, successful
-    error_sum: wp.array(dtype=wp.float64)  # (num_worlds,) sum of the errors of the successful ones
-    bad_actions: wp.array(dtype=int)  # (num_worlds,) actions that were not finite
+    error_sum: wp.array(dtype=wp.float64)  # (num_worlds,) sum of curriculum errors of these, unit of the task
+    bad_actions: wp.array(dtype=int)  # (num_worlds,) policy steps with a non-finite action
 
 
 @wp.struct
 class SkillSettings:
     """Constants of a skill: action scale, command filter, thresholds and margins."""
 
-    action_scale: vec12  # [rad]
+    action_scale: vec12  # [rad] offset from the default pose at an action of 1
     command_filter: FilterParams
     contact_force: float  # [N] a paw with more is in contact
     push_in_flight: int  # 1: pushes act in the air too
@@ -84,9 +82,9 @@ class SkillSettings:
 class Delays:
     """Actuation latency: the last motor targets, and the two that motors follow within a policy step."""
 
-    target_history: wp.array3d(dtype=float)  # [rad] (RING, 12, num_worlds) filtered targets, a ring buffer
-    steps: wp.array(dtype=int)  # [physics steps] (num_worlds,) from action to motor
+    target_history: wp.array3d(dtype=float)  # [rad] (RING, 12, num_worlds) filtered targets by policy step % RING
+    steps: wp.array(dtype=int)  # [physics steps] (num_worlds,) latency from action to motor
     substeps: int  # physics steps in a policy step
-    switch_step: wp.array(dtype=int)  # [physics steps] (num_worlds,) at which `current_target` follows `prev_target`
+    switch_step: wp.array(dtype=int)  # (num_worlds,) physics step in the policy step, first with `current_target`
     current_target: wp.array2d(dtype=float)  # [rad] (12, num_worlds) target from `switch_step` on
     prev_target: wp.array2d(dtype=float)  # [rad] (12, num_worlds) target before `switch_step`

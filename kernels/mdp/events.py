@@ -7,20 +7,21 @@ from .options import FAST
 from .parameters import RobotParameters
 from .random import EVENT, INTERVAL, RngStream, make_stream, uniform
 
-STARTUP, AT_RESET, AT_STEP = 0, 1, 2
+STARTUP, AT_RESET, AT_STEP = 0, 1, 2  # stages at which `event_kernel` is launched
 LANES = 8
 """Threads of a GPU that share the loops of an event."""
 MODES = {"startup": STARTUP, "reset": AT_RESET, "interval": AT_STEP}
+"""Stage of each mode of an event term."""
 
 
 @wp.func
 def steps_until(rng: RngStream, least: float, most: float, step_dt: float) -> int:
-    """Return a drawn number of policy steps between two times [s], at least one."""
+    """Return a sampled number of policy steps, at least one: a time uniform from least to most [s] over step_dt [s]."""
     return wp.max(int(wp.round(uniform(rng, INTERVAL, least, most) / step_dt)), 1)
 
 
 def make_event_kernel(slots: list) -> wp.Kernel:
-    """Return the kernel of a task's events; slots: see `jumper_warp.tasks.params.TermSlot`."""
+    """Return the kernel that runs a task's events; slots: its `jumper_warp.tasks.params.TermSlot`s of events."""
     modes = [MODES[slot.mode] for slot in slots]
 
     @wp.kernel(module="unique", module_options=FAST)
@@ -38,12 +39,11 @@ def make_event_kernel(slots: list) -> wp.Kernel:
         timer: wp.array2d(dtype=int),
         robot: RobotParameters,
     ):
-        """Run what is due at a stage where mask is not 0; launch over (events from `first` on, lanes, num_worlds).
+        """Run the events due at a stage in worlds of `skill` with mask != 0; launch over (events, lanes, num_worlds).
 
-        The lanes share the loops of events that are `parallel`; of the others the first lane is all.
-
-        timer: policy steps until the next time, (events, num_worlds), 0: not set yet, as after a handover. An interval
-        event is due at a reset as well.
+        first: event of the first thread. The lanes share the loops of `parallel` events; lane 0 runs all others.
+        mask: (num_worlds,). p: numbers of the task's terms. timer: (events, num_worlds), policy steps until an interval
+        event is due, 0: not set, as after a handover. An interval event is also due at a reset.
         """
         row, lane, world = wp.tid()
         row += first

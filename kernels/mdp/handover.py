@@ -10,7 +10,7 @@ from .view import RobotArrays, load_view, yaw_of
 
 wp.set_module_options({"enable_backward": False})
 
-NONE = wp.constant(-1)
+NONE = wp.constant(-1)  # `requested_task` without a request
 
 
 @wp.func
@@ -18,14 +18,17 @@ def hand_over(
     arrays: RobotArrays, parameters: RobotParameters, episode: EpisodeArrays, skills: wp.array(dtype=SkillSettings),
     world: int, target: int,
 ):  # fmt: skip
-    """Make `target` the active skill: its motor constants, and as previous actions the one that holds the targets."""
+    """Make skill `target` active in a world: set its motor constants, clear requests and observation history.
+
+    The previous actions become the `target` action that yields the present filtered motor targets.
+    """
     episode.skill[world] = target
     episode.requested_task[world] = NONE
     episode.has_command[world] = 0
     episode.history_reset[world] = BEGUN
     for m in range(12):
-        off = arrays.filtered_target[m, world] - arrays.default_angle[m]
-        action = wp.clamp(off / skills[target].action_scale[m], -1.0, 1.0)
+        offset = arrays.filtered_target[m, world] - arrays.default_angle[m]
+        action = wp.clamp(offset / skills[target].action_scale[m], -1.0, 1.0)
         arrays.action[m, world] = action
         arrays.prev_action[m, world] = action
         arrays.prev_prev_action[m, world] = action
@@ -41,7 +44,10 @@ def restore_task_kernel(
     parameters: RobotParameters,
     episode: EpisodeArrays,
 ):
-    """Reset worlds with mask != 0 to their first skill, its motors, and no request; one thread per world."""
+    """Reset worlds with mask != 0 to their first skill and its motors, without a request; one thread per world.
+
+    home: (num_worlds,) index of each world's first skill.
+    """
     world = episode.first + wp.tid()
     if mask[world] == 0.0:
         return
@@ -53,7 +59,7 @@ def restore_task_kernel(
 
 
 def make_handover_kernel(handover: Any) -> wp.Kernel:
-    """Return the kernel of a handover; handover: see `jumper_warp.tasks.cfg.Handover`."""
+    """Return the kernel that performs a handover (a `jumper_warp.tasks.cfg.Handover`) where it is due."""
     when, begin, set_command = handover.when, handover.begin, handover.target.command.set
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -71,9 +77,10 @@ def make_handover_kernel(handover: Any) -> wp.Kernel:
         sources: wp.array(dtype=handover.source.state),
         targets: wp.array(dtype=handover.target.state),
     ):
-        """Hand over worlds of `source` for which `when` holds, and set their pending command; one thread per world.
+        """Hand over worlds from skill `source` to `target` where `when` holds; one thread per world.
 
-        moved: 1 where a world was handed over in this step.
+        A pending command of the target is set. moved: (num_worlds,) 1 where a world was handed over in this step; such
+        worlds, and ended ones, stay. sources, targets: (num_worlds,) task states of both skills.
         """
         world = episode.first + wp.tid()
         if episode.skill[world] != source or episode.done[world] != 0.0 or moved[world] != 0:

@@ -1,4 +1,4 @@
-"""Observation terms that any task can use: of the robot, or of the parameters that were drawn for it."""
+"""Observation terms that any task can use: of the robot's state, or of its randomised parameters (`drawn_*`)."""
 
 from typing import Any
 
@@ -12,7 +12,7 @@ vec6 = wp.types.vector(length=6, dtype=wp.float32)
 
 @wp.func
 def lin_vel(robot: RobotView, state: Any) -> wp.vec3:
-    """Velocity of the base [m/s], body axes."""
+    """Velocity of the base origin [m/s], body axes."""
     return wp.quat_rotate_inv(robot.quat, robot.lin_vel)
 
 
@@ -24,19 +24,19 @@ def ang_vel(robot: RobotView, state: Any) -> wp.vec3:
 
 @wp.func
 def gravity(robot: RobotView, state: Any) -> wp.vec3:
-    """Direction of gravity, body axes [1]."""
+    """Unit vector of gravity, body axes [1]; (0, 0, -1) when level."""
     return robot.projected_gravity
 
 
 @wp.func
 def height(robot: RobotView, state: Any) -> float:
-    """Height of the base above the ground below it [m]."""
+    """Height of the base origin above the ground below it [m]."""
     return robot.height
 
 
 @wp.func
 def angle(robot: RobotView, state: Any) -> vec12:
-    """Motor angles as the sensors read them, relative to the default pose [rad]."""
+    """Motor angles as the position sensors read them, less those of the default pose [rad]."""
     return robot.sensed_angle - robot.default_angle
 
 
@@ -48,13 +48,13 @@ def rate(robot: RobotView, state: Any) -> vec12:
 
 @wp.func
 def last_action(robot: RobotView, state: Any) -> vec12:
-    """The action before [1]."""
+    """Action of the previous policy step, clamped to -1..1 [1]."""
     return robot.action
 
 
 @wp.func
 def paw_forces(robot: RobotView, state: Any) -> wp.vec4:
-    """Forces on the paws over the robot's weight, at most 5 [1]."""
+    """Force on each paw in units of the robot's weight (140 N), at most 5 [1]."""
     force = wp.vec4(0.0)
     for k in range(4):
         force[k] = wp.min(robot.paw_force[k] / 140.0, 5.0)
@@ -63,22 +63,19 @@ def paw_forces(robot: RobotView, state: Any) -> wp.vec4:
 
 @wp.func
 def air_times(robot: RobotView, state: Any) -> wp.vec4:
-    """Time that each paw has been in the air [s]."""
+    """Time that each paw has been in the air [s]; at its first contact the length of the swing, then 0."""
     return robot.air_time
 
 
 @wp.func
 def contacts(robot: RobotView, state: Any) -> wp.vec4:
-    """Which paws are on the ground [1]."""
+    """1 for each paw on the ground, else 0."""
     return robot.contact
-
-
-# ---------------------------------------------------------------- drawn parameters, of order 1, 0 if nominal
 
 
 @wp.func
 def drawn_mass(robot: RobotParameters, world: int) -> wp.vec2:
-    """Mass added to the base and to all legs [kg]."""
+    """Mass added to the base, and to all legs together [kg]."""
     first = world * 21
     legs = float(0.0)
     for body in range(1, 21):
@@ -88,13 +85,13 @@ def drawn_mass(robot: RobotParameters, world: int) -> wp.vec2:
 
 @wp.func
 def drawn_com(robot: RobotParameters, world: int) -> wp.vec3:
-    """Shift of the base's centre of mass over 0.03 m."""
+    """Shift of the base's centre of mass, body axes, in units of 0.03 m."""
     return (robot.body_com[world * 21] - robot.nominal_com[0]) / 0.03
 
 
 @wp.func
 def drawn_gains(robot: RobotParameters, world: int) -> vec12:
-    """Relative change of kp of each motor."""
+    """Relative change of kp of each motor from the active skill's value [1]."""
     change = vec12()
     for m in range(12):
         change[m] = robot.gain_ratio[m, world][0] - 1.0
@@ -103,7 +100,7 @@ def drawn_gains(robot: RobotParameters, world: int) -> vec12:
 
 @wp.func
 def drawn_speed_limits(robot: RobotParameters, world: int) -> vec12:
-    """Relative change of the no-load speed of each motor."""
+    """Relative change of the no-load speed of each motor from the active skill's value [1]."""
     change = vec12()
     for m in range(12):
         change[m] = robot.motors.no_load_speed[m, world] / robot.nominal_no_load[robot.skill[world], m] - 1.0
@@ -112,20 +109,20 @@ def drawn_speed_limits(robot: RobotParameters, world: int) -> vec12:
 
 @wp.func
 def drawn_latency(robot: RobotParameters, world: int) -> float:
-    """Latency of actions in policy steps of 8 physics steps."""
+    """Latency of actions in units of 8 physics steps [1]."""
     return float(robot.latency[world]) / 8.0
 
 
 @wp.func
 def drawn_friction(robot: RobotParameters, world: int) -> wp.vec2:
-    """Dynamic friction from 0.85, in tenths, and by how much the static coefficient is larger [1]."""
+    """Dynamic friction coefficient less 0.85 in units of 0.1, and static over dynamic coefficient less 1."""
     dynamic = robot.shape_mu[robot.paw_shapes[4 * world]]
     return wp.vec2((dynamic - 0.85) * 10.0, robot.static_ratio[world] - 1.0)
 
 
 @wp.func
 def drawn_offset(robot: RobotParameters, world: int) -> vec12:
-    """Error of each position sensor over 2 degrees."""
+    """Constant error of each motor's position sensor in units of 0.035 rad (2 degrees)."""
     error = vec12()
     for m in range(12):
         error[m] = robot.motors.offset[m, world] / 0.035
@@ -134,7 +131,7 @@ def drawn_offset(robot: RobotParameters, world: int) -> vec12:
 
 @wp.func
 def drawn_push(robot: RobotParameters, world: int) -> vec6:
-    """Push on the base over 5 N and 3 N m."""
+    """Push on the base, world axes: force in units of 5 N, torque in units of 3 N m."""
     wrench = robot.push[world]
     return vec6(
         wrench[0] / 5.0, wrench[1] / 5.0, wrench[2] / 5.0, wrench[3] / 3.0, wrench[4] / 3.0, wrench[5] / 3.0

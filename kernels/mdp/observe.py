@@ -14,44 +14,44 @@ from .view import RobotArrays, load_view
 wp.set_module_options(FAST)
 
 CHUNK = 12
-"""Terms that one thread evaluates: each chunk loads the robot once, and chunks run side by side."""
+"""Terms that one thread evaluates; it loads the robot once for all of them."""
 LANES = wp.constant(32)
-"""Threads that share the components of a world: a warp writes neighbouring columns."""
+"""Threads that share the components of a world, so that a warp writes neighbouring columns."""
 
 
 @wp.struct
 class ObservationColumn:
     """Index table of one component of an observation term: its source, and its columns in its group."""
 
-    raw: int  # its row among the raw values
-    group: int
-    start: int  # of the group's rows
+    raw: int  # row in `ObservationArrays.raw`
+    group: int  # index of the group
+    start: int  # index of the group's first element in `now` and `final`
     stride: int  # columns of the group
-    noise: int  # its index in the array of numbers, as those of scale and clip
-    scale: int
-    clip: int
-    oldest: int  # column of its oldest frame
-    width: int  # columns of a frame
+    noise: int  # index of the noise level in the array of the terms' numbers `p`
+    scale: int  # index of the scale in `p`
+    clip: int  # index of the limit in `p`
+    oldest: int  # column of the component's oldest frame in the group
+    width: int  # columns of a frame (components of the term)
     history: int  # number of frames
     delayed: int  # 1: subject to the observation latency of the world
-    past: int  # column in the ring of past values
+    past: int  # column in the ring buffer `past`
 
 
 @wp.struct
 class ObservationArrays:
-    """Observations of all worlds, one row a world, one group after the other."""
+    """Observations of all worlds; `now` and `final` are flat, per group (num_worlds, columns), groups end to end."""
 
     raw: wp.array2d(dtype=float)  # (components, num_worlds) values of the terms
-    now: wp.array(dtype=float)  # of the next step; ended episodes are already reset
-    final: wp.array(dtype=float)  # the same before resets
+    now: wp.array(dtype=float)  # observations for the next step, after resets
+    final: wp.array(dtype=float)  # observations before resets
     past: wp.array3d(dtype=float)  # (RING, num_worlds, columns) delayed components, ring buffer over policy steps
-    latency: wp.array(dtype=int)  # [physics steps] (num_worlds,)
-    substeps: int
+    latency: wp.array(dtype=int)  # [physics steps] (num_worlds,) from sensor to policy
+    substeps: int  # physics steps in a policy step
 
 
 @wp.func
 def load_column(columns: wp.array2d(dtype=int), component: int) -> ObservationColumn:
-    """Return a component's row; columns: (fields of `Column`, components), so that neighbours read neighbours."""
+    """Return the `ObservationColumn` of a component; columns: (fields of `ObservationColumn`, components)."""
     column = ObservationColumn()
     column.raw = columns[0, component]
     column.group = columns[1, component]
@@ -70,19 +70,19 @@ def load_column(columns: wp.array2d(dtype=int), component: int) -> ObservationCo
 
 @wp.func
 def store(value: float, row: int, world: int, out: wp.array2d(dtype=float)):
-    """Write a number."""
+    """Write a scalar to out[row, world]."""
     out[row, world] = value
 
 
 @wp.func
 def store(value: Any, row: int, world: int, out: wp.array2d(dtype=float)):  # noqa: F811
-    """Write a vector."""
+    """Write vector element j to out[row + j, world]."""
     for j in range(len(value)):
         out[row + j, world] = value[j]
 
 
 def make_observe_kernel(task: Any) -> wp.Kernel:
-    """Return the kernel that evaluates all observation terms of a task."""
+    """Return the kernel that evaluates all observation terms of a task (a `jumper_warp.tasks.cfg.TaskCfg`)."""
     slots = [slot for group in task.groups for slot in task.params.slots[f"observations.{group}"]]
     input_types = [next(iter(slot.func.input_types.values())) for slot in slots]
     reads_parameters = [kind is RobotParameters for kind in input_types]
@@ -103,9 +103,9 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
         # out
         raw: wp.array2d(dtype=float),
     ):
-        """Write the values of the terms; one thread per (chunk of terms, world).
+        """Write the terms' values to raw (components, num_worlds); one thread per (chunk of terms, world of `skill`).
 
-        after_reset 1: only where an episode or the skill has just begun, or another command came.
+        after_reset 1: only where an episode or the skill has just begun, or a new command came.
         """
         chunk, world = wp.tid()
         world += episode.first
@@ -136,7 +136,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
 
 @wp.func
 def finite_or_zero(value: float, diverged: bool) -> float:
-    """Return a value, or 0 if its world diverged or it is not finite."""
+    """Return value, or 0 if its world diverged or value is not finite."""
     if diverged or not wp.isfinite(value):
         return 0.0
     return value
@@ -144,21 +144,21 @@ def finite_or_zero(value: float, diverged: bool) -> float:
 
 @wp.struct
 class StepContext:
-    """What all observation components of a world share in a policy step."""
+    """Values that all observation components of a world share in a policy step."""
 
     world: int
     step_key: wp.uint32  # see `mdp.random`
     history_reset: int  # as in `EpisodeArrays`
     diverged: bool
-    slot: int  # present one of the ring buffers
-    newer: int  # slot of the latest value that is as old as the latency
-    older: int  # slot before it
-    fraction: float  # [1] interpolation from newer to older
+    slot: int  # ring buffer slot of this policy step
+    newer: int  # slot of the delay rounded down to policy steps
+    older: int  # slot one policy step before `newer`
+    fraction: float  # [1] weight of `older`, 0 to 1; `newer` has the rest
 
 
 @wp.func
 def step_context(episode: EpisodeArrays, arrays: ObservationArrays, world: int) -> StepContext:
-    """Return what a world's observation components share in this policy step."""
+    """Return the `StepContext` of a world in this policy step."""
     step_count = episode.step_count[world]
     steps = arrays.latency[world] // arrays.substeps
     m = StepContext()
@@ -175,7 +175,10 @@ def step_context(episode: EpisodeArrays, arrays: ObservationArrays, world: int) 
 
 @wp.func
 def delay_value(arrays: ObservationArrays, m: StepContext, column: int, value: float) -> float:
-    """Store a component's value, and return it delayed by the observation latency, linear between policy steps."""
+    """Store value in ring buffer column `column`, and return the value delayed by the observation latency.
+
+    The delayed value is linear between policy steps. Where an episode or skill begins, the ring is filled with value.
+    """
     if m.history_reset == BEGUN:
         for i in range(RING):
             arrays.past[i, m.world, column] = value
@@ -190,7 +193,10 @@ def delay_value(arrays: ObservationArrays, m: StepContext, column: int, value: f
 def postprocess(
     arrays: ObservationArrays, column: ObservationColumn, p: wp.array(dtype=float), m: StepContext, after_reset: int
 ):
-    """Write a component's observation: delayed, with noise, clipped, scaled, behind the older frames of its history."""
+    """Write a component's observation (delayed, with noise, clipped, then scaled) as newest frame of its history.
+
+    p: numbers of the task's terms. after_reset: as in `postprocess_obs_kernel`.
+    """
     value = finite_or_zero(arrays.raw[column.raw, m.world], m.diverged)
     if column.delayed != 0:
         value = delay_value(arrays, m, column.past, value)
@@ -226,9 +232,8 @@ def postprocess_obs_kernel(
 ):
     """Turn raw values into observations; launch over (num_worlds, LANES).
 
-    Rows of diverged worlds are 0, with their history; so are other values that are not finite.
-    after_reset 1: only where an episode or skill has just begun, or another command came; then older frames
-    stay, and so does `final`.
+    Non-finite values, and all rows and history of diverged worlds, are 0. after_reset 1: only where an episode or
+    skill has just begun, or a new command came; `final` stays, and so do the older frames after a command.
     """
     world, lane = wp.tid()
     world += episode.first

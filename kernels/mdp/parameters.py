@@ -1,8 +1,8 @@
-"""What domain randomisation may change of every robot, and the events that change it (paper, Table V).
+"""Robot parameters that domain randomisation changes, and the events that change them (paper, Table V).
 
-An event is a pure function of (parameters, rng, named numbers) that writes one world's parameters, always from the
-nominal values. Ranges are uniform; lower and upper are its numbers. Those with a loop over motors or links share it
-among `rng.lanes` threads.
+An event is a function of (parameters, rng, named numbers) that samples parameters of world `rng.world`, relative to the
+nominal values. Its numbers lower and upper bound a uniform distribution. `rng.lanes` threads share loops over motors or
+links. Motors m are 0 to 11: legs FL, FR, BL, BR; each lateral, outer, inner.
 """
 
 import warp as wp
@@ -16,43 +16,43 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 1})  # long loops
 
 @wp.struct
 class RobotParameters:
-    """Parameters of all worlds, and what they are without randomisation."""
+    """Parameters of all worlds, and their values without randomisation (`nominal_*`)."""
 
-    body_mass: wp.array(dtype=float)  # [kg] Newton's, like the next ones
-    body_inv_mass: wp.array(dtype=float)
-    body_com: wp.array(dtype=wp.vec3)  # [m]
-    body_inertia: wp.array(dtype=wp.mat33)  # [kg m^2]
+    body_mass: wp.array(dtype=float)  # [kg] (21 num_worlds,) of Newton's model, like all up to shape_mu
+    body_inv_mass: wp.array(dtype=float)  # [1/kg]
+    body_com: wp.array(dtype=wp.vec3)  # [m] body axes
+    body_inertia: wp.array(dtype=wp.mat33)  # [kg m^2] body axes
     body_inv_inertia: wp.array(dtype=wp.mat33)
-    joint_armature: wp.array(dtype=float)  # [kg m^2]
+    joint_armature: wp.array(dtype=float)  # [kg m^2] (38 num_worlds,), 6 dofs of the base first, like joint_friction
     joint_friction: wp.array(dtype=float)  # [N m]
-    shape_mu: wp.array(dtype=float)  # [1]
+    shape_mu: wp.array(dtype=float)  # [1] dynamic friction coefficient of each shape
     paw_shapes: wp.array(dtype=int)  # (4 num_worlds,) indices of the paws in shape_mu
     static_ratio: wp.array(dtype=float)  # [1] (num_worlds,) static over dynamic friction
     motors: MotorArrays
     latency: wp.array(dtype=int)  # [physics steps] (num_worlds,) from action to motor
     observation_latency: wp.array(dtype=int)  # [physics steps] (num_worlds,) from sensor to policy
     push: wp.array(dtype=wp.spatial_vector)  # [N], [N m] (num_worlds,) on the base at its com, world axes
-    gain_ratio: wp.array2d(dtype=wp.vec2)  # [1] (12, num_worlds) of kp and kd to those of the active skill
-    speed_ratio: wp.array2d(dtype=wp.vec2)  # [1] (12, num_worlds) of no-load and cutoff speed likewise
-    torque_ratio: wp.array2d(dtype=float)  # [1] (12, num_worlds) of the torque limit likewise
+    gain_ratio: wp.array2d(dtype=wp.vec2)  # [1] (12, num_worlds) kp, kd over the active skill's nominal values
+    speed_ratio: wp.array2d(dtype=wp.vec2)  # [1] (12, num_worlds) no-load, cutoff speed over nominal values
+    torque_ratio: wp.array2d(dtype=float)  # [1] (12, num_worlds) torque limit over nominal value
     physics_dt: float  # [s]
-    nominal_mass: wp.array(dtype=float)  # (21,) of one world, like all below
+    nominal_mass: wp.array(dtype=float)  # (21,) of one world, like all up to nominal_inv_inertia
     nominal_com: wp.array(dtype=wp.vec3)
     nominal_inertia: wp.array(dtype=wp.mat33)
     nominal_inv_inertia: wp.array(dtype=wp.mat33)
     nominal_armature: wp.array(dtype=float)  # (38,)
-    nominal_kp: wp.array2d(dtype=float)  # (skills, 12), like all below
-    nominal_kd: wp.array2d(dtype=float)
+    nominal_kp: wp.array2d(dtype=float)  # [N m/rad] (skills, 12), like all up to nominal_saturation
+    nominal_kd: wp.array2d(dtype=float)  # [N m s/rad]
     nominal_no_load: wp.array2d(dtype=float)  # [rad/s]
     nominal_cutoff: wp.array2d(dtype=float)  # [rad/s]
     nominal_saturation: wp.array2d(dtype=float)  # [N m]
     nominal_offset: wp.array(dtype=float)  # [rad] (12,) of the position sensors
-    skill: wp.array(dtype=int)  # (num_worlds,) the active one
+    skill: wp.array(dtype=int)  # (num_worlds,) index of the active skill
 
 
 @wp.func
 def write_mass(robot: RobotParameters, world: int, body: int, scale: float):
-    """Scale mass and inertia of a link."""
+    """Write mass and inertia of body `body` (0: base) of a world: nominal values times `scale`."""
     i = world * BODIES + body
     mass = scale * robot.nominal_mass[body]
     inertia = scale * robot.nominal_inertia[body]
@@ -64,27 +64,27 @@ def write_mass(robot: RobotParameters, world: int, body: int, scale: float):
 
 @wp.func
 def base_mass(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Add a mass [kg] to the base, its inertia in proportion."""
+    """Add a mass from lower to upper [kg] to the base, and scale its inertia in proportion."""
     write_mass(robot, rng.world, 0, 1.0 + uniform(rng, 0, lower, upper) / robot.nominal_mass[0])
 
 
 @wp.func
 def link_mass(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Scale mass and inertia of each link of the legs."""
+    """Scale mass and inertia of each leg link by a factor from lower to upper [1]."""
     for body in range(1 + rng.lane, BODIES, rng.lanes):
         write_mass(robot, rng.world, body, uniform(rng, body, lower, upper))
 
 
 @wp.func
 def com_shift(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Shift the base's centre of mass [m] along each axis."""
+    """Shift the base's centre of mass along each body axis by a distance from lower to upper [m]."""
     shift = wp.vec3(uniform(rng, 0, lower, upper), uniform(rng, 1, lower, upper), uniform(rng, 2, lower, upper))
     robot.body_com[rng.world * BODIES] = robot.nominal_com[0] + shift
 
 
 @wp.func
 def armature(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Scale each motor's armature."""
+    """Scale each motor's armature by a factor from lower to upper [1]."""
     for m in range(rng.lane, 12, rng.lanes):
         dof = 6 + motor_slot(m)
         robot.joint_armature[rng.world * DOFS + dof] = robot.nominal_armature[dof] * uniform(rng, m, lower, upper)
@@ -92,14 +92,14 @@ def armature(robot: RobotParameters, rng: RngStream, lower: float, upper: float)
 
 @wp.func
 def motor_friction(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Give each motor a Coulomb friction [N m]."""
+    """Give each motor a Coulomb friction from lower to upper [N m]."""
     for m in range(rng.lane, 12, rng.lanes):
         robot.joint_friction[rng.world * DOFS + 6 + motor_slot(m)] = uniform(rng, m, lower, upper)
 
 
 @wp.func
 def set_gains(robot: RobotParameters, world: int, m: int, ratio: wp.vec2):
-    """Write gains of a motor: those of the active skill, by the drawn ratios of kp and kd."""
+    """Write gains of motor m in a world: the active skill's nominal (kp, kd) times `ratio`."""
     skill = robot.skill[world]
     robot.motors.kp[m, world] = robot.nominal_kp[skill, m] * ratio[0]
     robot.motors.kd[m, world] = robot.nominal_kd[skill, m] * ratio[1]
@@ -107,7 +107,10 @@ def set_gains(robot: RobotParameters, world: int, m: int, ratio: wp.vec2):
 
 @wp.func
 def set_speed_limits(robot: RobotParameters, world: int, m: int, ratio: wp.vec2):
-    """Write no-load and cutoff speed of a motor likewise; a drawn cutoff stays below the no-load speed."""
+    """Write speeds of motor m in a world: the active skill's nominal (no-load, cutoff) speeds times `ratio`.
+
+    Unless both ratios are 1, the cutoff speed is at most 0.95 of the no-load speed.
+    """
     skill = robot.skill[world]
     no_load = robot.nominal_no_load[skill, m] * ratio[0]
     cutoff = robot.nominal_cutoff[skill, m] * ratio[1]
@@ -119,13 +122,13 @@ def set_speed_limits(robot: RobotParameters, world: int, m: int, ratio: wp.vec2)
 
 @wp.func
 def set_torque_limit(robot: RobotParameters, world: int, m: int):
-    """Write the torque limit of a motor likewise."""
+    """Write the torque limit of motor m in a world: the active skill's nominal limit times `torque_ratio`."""
     robot.motors.saturation[m, world] = robot.nominal_saturation[robot.skill[world], m] * robot.torque_ratio[m, world]
 
 
 @wp.func
 def set_motor(robot: RobotParameters, world: int, m: int):
-    """Write all constants of a motor that depend on the active skill."""
+    """Write gains, speeds and torque limit of motor m in a world for its active skill and its stored ratios."""
     set_gains(robot, world, m, robot.gain_ratio[m, world])
     set_speed_limits(robot, world, m, robot.speed_ratio[m, world])
     set_torque_limit(robot, world, m)
@@ -136,7 +139,7 @@ def motors_kernel(
     # in, out
     robot: RobotParameters,
 ):
-    """Give every world the motors of its skill; one thread per (motor, world)."""
+    """Write all motor constants for the active skills (`set_motor`); one thread per (motor, world)."""
     m, world = wp.tid()
     set_motor(robot, world, m)
 
@@ -145,7 +148,7 @@ def motors_kernel(
 def gains(
     robot: RobotParameters, rng: RngStream, kp_lower: float, kp_upper: float, kd_lower: float, kd_upper: float
 ):  # fmt: skip
-    """Scale kp and kd of each motor."""
+    """Scale kp and kd of each motor by factors [1] from the two ranges."""
     for m in range(rng.lane, 12, rng.lanes):
         ratio = wp.vec2(uniform(rng, m, kp_lower, kp_upper), uniform(rng, 12 + m, kd_lower, kd_upper))
         robot.gain_ratio[m, rng.world] = ratio
@@ -157,7 +160,7 @@ def speed_limits(
     robot: RobotParameters, rng: RngStream, no_load_lower: float, no_load_upper: float, cutoff_lower: float,
     cutoff_upper: float,
 ):  # fmt: skip
-    """Scale no-load and cutoff speed of each motor; the cutoff stays below the no-load speed."""
+    """Scale no-load and cutoff speed of each motor by factors [1]; the cutoff stays below the no-load speed."""
     for m in range(rng.lane, 12, rng.lanes):
         ratio = wp.vec2(uniform(rng, m, no_load_lower, no_load_upper), uniform(rng, 12 + m, cutoff_lower, cutoff_upper))
         robot.speed_ratio[m, rng.world] = ratio
@@ -166,7 +169,7 @@ def speed_limits(
 
 @wp.func
 def joint_offset(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Give each motor's position sensor a constant error [rad] besides its nominal one."""
+    """Add a constant error from lower to upper [rad] to the nominal one of each motor's position sensor."""
     for m in range(rng.lane, 12, rng.lanes):
         robot.motors.offset[m, rng.world] = robot.nominal_offset[m] + uniform(rng, m, lower, upper)
 
@@ -176,7 +179,7 @@ def friction(
     robot: RobotParameters, rng: RngStream, dynamic_lower: float, dynamic_upper: float, static_lower: float,
     static_upper: float,
 ):  # fmt: skip
-    """Draw the paws' dynamic coefficient, and a static one that is not below it."""
+    """Sample the dynamic friction coefficient [1] of a robot's paws, and the static one, raised to it if lower."""
     dynamic = uniform(rng, 0, dynamic_lower, dynamic_upper)
     static = wp.max(uniform(rng, 1, static_lower, static_upper), dynamic)
     for k in range(4):
@@ -187,13 +190,13 @@ def friction(
 
 @wp.func
 def physics_steps(robot: RobotParameters, seconds: float) -> int:
-    """Return the number of physics steps that is nearest to a time; latencies are whole steps."""
+    """Return a time [s] as the nearest whole number of physics steps."""
     return int(wp.round(seconds / robot.physics_dt))
 
 
 @wp.func
 def drawn_delay(robot: RobotParameters, rng: RngStream, lower: float, upper: float, zero_probability: float) -> int:
-    """Return a drawn delay [physics steps], 0 with `zero_probability`."""
+    """Return a sampled delay [physics steps]: 0 with `zero_probability`, else from lower to upper [s]."""
     if uniform(rng, 1, 0.0, 1.0) < zero_probability:
         return 0
     return physics_steps(robot, uniform(rng, 0, lower, upper))
@@ -201,7 +204,7 @@ def drawn_delay(robot: RobotParameters, rng: RngStream, lower: float, upper: flo
 
 @wp.func
 def action_latency(robot: RobotParameters, rng: RngStream, lower: float, upper: float, zero_probability: float = 0.0):
-    """Delay actions [s]; none with `zero_probability`."""
+    """Delay actions by a latency from lower to upper [s], with `zero_probability` by 0."""
     robot.latency[rng.world] = drawn_delay(robot, rng, lower, upper, zero_probability)
 
 
@@ -209,7 +212,7 @@ def action_latency(robot: RobotParameters, rng: RngStream, lower: float, upper: 
 def observation_latency(
     robot: RobotParameters, rng: RngStream, lower: float, upper: float, zero_probability: float = 0.0
 ):
-    """Delay what the policy reads of its sensors [s]; none with `zero_probability`."""
+    """Delay delayed observation terms by a latency from lower to upper [s], with `zero_probability` by 0."""
     robot.observation_latency[rng.world] = drawn_delay(robot, rng, lower, upper, zero_probability)
 
 
@@ -218,7 +221,7 @@ def push(
     robot: RobotParameters, rng: RngStream, probability: float, force_lower: float, force_upper: float,
     torque_lower: float, torque_upper: float,
 ):  # fmt: skip
-    """Push the base with a force [N] along and a torque [N m] about each world axis with `probability`."""
+    """Push the base with `probability`, else not: a sampled force [N] and torque [N m] for each world axis."""
     wrench = wp.spatial_vector()
     if uniform(rng, 6, 0.0, 1.0) < probability:
         for i in range(3):

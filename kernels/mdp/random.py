@@ -2,22 +2,22 @@
 
 import warp as wp
 
-# streams; events and observation groups have one each, numbered from these on
+# numbers of streams
 RESET = wp.constant(1)
 COMMAND = wp.constant(2)
-OBSERVATION = wp.constant(100)
-EVENT = wp.constant(1000)  # a hundred for each stage
+OBSERVATION = wp.constant(100)  # plus the index of the observation group
+EVENT = wp.constant(1000)  # plus 100 times the stage (`mdp.events`) and the index of the event
 
-# indices in a stream beside those of tasks and events
-INTERVAL = wp.constant(-1)  # until the next time of an event
-ANY_LEVEL = wp.constant(-2)  # of the curriculum, of a world past the last
+# indices in a stream; tasks and events use those from 0 on
+INTERVAL = wp.constant(-1)  # time until an interval event is due next
+ANY_LEVEL = wp.constant(-2)  # curriculum level of a world that passed the last one
 
 
 @wp.struct
 class RngStream:
-    """A random stream of one world; `uniform(rng, i, ...)` is a pure function of stream and index i."""
+    """A random stream of one world; `uniform(rng, i, ...)` depends on `seed` and index i only."""
 
-    world: int
+    world: int  # index of the world whose quantities are sampled
     seed: wp.uint32
     lane: int  # index of this thread among those that share the work of a world
     lanes: int  # number of these threads
@@ -25,32 +25,32 @@ class RngStream:
 
 @wp.func
 def step_key(seed: int, world: int, step_count: int) -> wp.uint32:
-    """Return the seed of all streams of a world in one policy step; step_count: policy steps made."""
+    """Return the key from which all streams of a world in one policy step derive; step_count: policy steps made."""
     return wp.rand_init(int(wp.rand_init(seed, world)), step_count)
 
 
 @wp.func
-def stream_at(moment: wp.uint32, world: int, stream: int) -> RngStream:
-    """Return a stream of a policy step; step_key: see `step_key`."""
+def stream_at(key: wp.uint32, world: int, stream: int) -> RngStream:
+    """Return stream number `stream` of a world in the policy step of `key` (`step_key`), for one thread."""
     rng = RngStream()
     rng.world = world
     rng.lanes = 1
-    rng.seed = wp.rand_init(int(moment), stream)
+    rng.seed = wp.rand_init(int(key), stream)
     return rng
 
 
 @wp.func
 def make_stream(seed: int, world: int, step_count: int, stream: int) -> RngStream:
-    """Return a stream of a world; step_count: policy steps that the world has made."""
+    """Return stream number `stream` of a world, for one thread; step_count: policy steps that the world has made."""
     return stream_at(step_key(seed, world, step_count), world, stream)
 
 
 @wp.func
 def fold_in(rng: RngStream, i: int) -> RngStream:
     """Return a stream derived from another one, independent for every i (as `jax.random.fold_in`)."""
-    other = rng
-    other.seed = wp.rand_init(int(rng.seed), 7919 + i)
-    return other
+    branch = rng
+    branch.seed = wp.rand_init(int(rng.seed), 7919 + i)
+    return branch
 
 
 @wp.func
@@ -61,7 +61,7 @@ def uniform(rng: RngStream, i: int, lower: float, upper: float) -> float:
 
 @wp.func
 def uniform_range(rng: RngStream, i: int, pair: wp.vec2) -> float:
-    """Return the i-th number of a stream, uniform in a pair (lower, upper)."""
+    """Return the i-th number of a stream, uniform in [pair[0], pair[1])."""
     return uniform(rng, i, pair[0], pair[1])
 
 

@@ -1,4 +1,4 @@
-"""Resets: new episodes, and new commands within an episode where they are due."""
+"""Resets: new episodes, commands within an episode (sampled or from the host), and the default pose."""
 
 from typing import Any
 
@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def previous_state(old: Any, done: float):
-    """Return the state of the previous episode; with 0 steps if it was cut off from outside (done = 0)."""
+    """Return the task state `old` of the previous episode, with `steps` 0 if `Env.reset` cut it off (done = 0)."""
     state = old
     if done == 0.0:
         state.steps = 0
@@ -50,7 +50,8 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
     ):
         """Begin a new episode where mask != 0, else sample a command where one is due; launch over (worlds, lanes).
 
-        The lanes, neighbours in a warp, do the same but for what they share by `draw.lane`.
+        Worlds of `skill` only; mask: (num_worlds,). All lanes of a world (one warp) run the task's reset, which splits
+        its work by `rng.lane`; lane 0 writes the state. A world that passed the last level gets a sampled one.
         """
         world, lane = wp.tid()
         world += episode.first
@@ -87,7 +88,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
 
 
 def make_set_command_kernel(task: Any) -> wp.Kernel:
-    """Return the kernel that sets commands from the host; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
+    """Return the kernel that sets a task's commands from the host; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
     set_command = task.command.set
 
     @wp.kernel(module="unique", enable_backward=False)
@@ -104,9 +105,9 @@ def make_set_command_kernel(task: Any) -> wp.Kernel:
         episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
     ):
-        """Set a command where mask != 0; one thread per world.
+        """Set the command `values` where mask != 0, in worlds of `skill`; one thread per world.
 
-        begins 1: of a new episode, with its heading [rad]; 0: within the episode, relative to the robot's yaw.
+        begins 1: first command of a new episode, relative to `headings` [rad]; 0: relative to the robot's present yaw.
         """
         world = wp.tid()
         if episode.skill[world] != skill or mask[world] == 0.0:
@@ -127,7 +128,7 @@ def make_set_command_kernel(task: Any) -> wp.Kernel:
 
 @wp.func
 def leg_limits(params: FilterParams) -> LegLimits:
-    """Return a command filter's angle limits [rad] as limits of the inverse kinematics."""
+    """Return the angle limits [rad] of a command filter as `LegLimits` of the inverse kinematics."""
     limits = LegLimits()
     limits.lateral_lower = params.lateral.lower
     limits.lateral_upper = params.lateral.upper
@@ -140,7 +141,7 @@ def leg_limits(params: FilterParams) -> LegLimits:
 
 @wp.func
 def write_default_pose(arrays: RobotArrays, scene: Scene, world: int, heading: float, ground_height: float):
-    """Write the default pose at rest, with a yaw `heading` [rad], on ground of height `ground_height` [m]."""
+    """Write the default pose at rest to a world: yaw `heading` [rad], on ground of height `ground_height` [m]."""
     q = world * COORDS
     for j in range(int(COORDS)):
         arrays.joint_q[q + j] = scene.reference_q[q + j]
@@ -163,9 +164,9 @@ def default_pose_kernel(
     # in, out
     arrays: RobotArrays,
 ):
-    """Put robots with mask != 0 into the default pose with a heading [rad], and blocks to their starts.
+    """Write the default pose, with yaw `headings` [rad], where mask != 0; its block returns to its start.
 
-    The base is above the ground by the `lift` of the world's skill; one thread per world.
+    The robot is above the ground by the `eval_height_offset` of the world's skill; one thread per world.
     """
     world = wp.tid()
     if mask[world] != 0.0:
@@ -181,7 +182,7 @@ def advance_rng_kernel(
     # in, out
     episode: EpisodeArrays,
 ):
-    """Advance the step count where mask != 0, so that the next samples are new ones; one thread per world."""
+    """Increment the step count where mask != 0, so that all random streams are new ones; one thread per world."""
     world = wp.tid()
     if mask[world] != 0.0:
         episode.step_count[world] = episode.step_count[world] + 1
@@ -199,7 +200,7 @@ def clear_history_kernel(
 ):
     """Clear actions, torques, contacts and delays where mask != 0; one thread per (motor, world).
 
-    Paw positions and velocities are those of the present state. first: world of the first thread.
+    Targets become the present motor angles; paw and base kinematics are updated. first: world of the first thread.
     """
     m, world = wp.tid()
     world += first

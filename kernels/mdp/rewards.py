@@ -1,7 +1,4 @@
-"""Reward terms that any task can use: pure functions of the robot, the task's state and named numbers.
-
-phi(x, s) = exp(-x^2 / s^2), psi(x, s) = exp(-|x| / s) as in the paper's tables.
-"""
+"""Reward terms that any task can use: pure functions of the robot, the task's state and named numbers."""
 
 from typing import Any
 
@@ -12,71 +9,71 @@ from .view import RobotView, vec12
 
 @wp.func
 def phi(x: float, s: float) -> float:
-    """Return the exponential kernel phi_s(x)."""
+    """Return the Gaussian kernel phi_s(x) = exp(-x^2 / s^2) of the paper's tables; x and s in the same unit."""
     return wp.exp(-x * x / (s * s))
 
 
 @wp.func
 def psi(x: float, s: float) -> float:
-    """Return the Laplacian kernel psi_s(x)."""
+    """Return the Laplacian kernel psi_s(x) = exp(-|x| / s) of the paper's tables; x and s in the same unit."""
     return wp.exp(-wp.abs(x) / s)
 
 
 @wp.func
 def square_sum(v: vec12) -> float:
-    """Return the sum of squares."""
+    """Return the sum of squares of the 12 elements."""
     return wp.dot(v, v)
 
 
 @wp.func
 def posture_offset(robot: RobotView, shift: float) -> float:
-    """Return the rms offset [rad] of all motors from the default pose, the transversal ones shifted by `shift`."""
+    """Return the rms offset [rad] of all motors from a pose: default angles, transversal ones plus `shift` [rad]."""
     total = float(0.0)
     for m in range(12):
-        off = robot.angle[m] - robot.default_angle[m]
+        offset = robot.angle[m] - robot.default_angle[m]
         if m % 3 != 0:
-            off = off - shift
-        total += off * off
+            offset = offset - shift
+        total += offset * offset
     return wp.sqrt(total / 12.0)
 
 
 @wp.func
 def ground_force(robot: RobotView, state: Any, weight_force: float) -> float:
-    """Ground force L2: sum of squared paw forces over that of the robot's weight [N]."""
+    """Ground force L2: sum over paws of squared force over squared weight [1]; weight_force: robot's weight [N]."""
     return wp.dot(robot.paw_force, robot.paw_force) / (weight_force * weight_force)
 
 
 @wp.func
 def action_clip(robot: RobotView, state: Any) -> float:
-    """Action clip: squared distance that the command filter moved the targets [rad^2]."""
+    """Action clip: sum over motors of the squared change of the target by the command filter [rad^2]."""
     return robot.clipped
 
 
 @wp.func
 def motor_torque_sq(robot: RobotView, state: Any) -> float:
-    """Motor torque: sum of squares [N^2 m^2]."""
+    """Motor torque: sum over motors of squared torque [N^2 m^2]."""
     return square_sum(robot.torque)
 
 
 @wp.func
 def joint_acceleration(robot: RobotView, state: Any) -> float:
-    """Joint acceleration: sum of squares [rad^2/s^4]."""
+    """Joint acceleration: sum over motors of squared acceleration [rad^2/s^4]."""
     return square_sum(robot.joint_acc)
 
 
 @wp.func
 def action_rate(robot: RobotView, state: Any) -> float:
-    """Action rate: sum of squared changes of the action."""
+    """Action rate: sum over motors of the action's squared change since the previous policy step [1]."""
     return square_sum(robot.action - robot.prev_action)
 
 
 @wp.func
 def action_acceleration(robot: RobotView, state: Any) -> float:
-    """Action acceleration: sum of squared second differences of the action."""
+    """Action acceleration: sum over motors of the action's squared second difference over policy steps [1]."""
     return square_sum(robot.action - 2.0 * robot.prev_action + robot.prev_prev_action)
 
 
 @wp.func
 def collision(robot: RobotView, state: Any) -> float:
-    """Collision: 1 if anything but a paw touched the ground, or links touched each other."""
+    """Collision: 1 if anything but a paw touched the ground or links touched each other, else 0."""
     return wp.where(robot.collisions != 0, 1.0, 0.0)

@@ -1,4 +1,7 @@
-"""Parts of start states that tasks share: legs from foot positions, sampled foot positions, orientations."""
+"""Parts of start states that tasks share: legs from foot positions, sampled foot positions, orientations.
+
+A foot position is the ankle (the paw's centre) unless stated otherwise.
+"""
 
 import warp as wp
 
@@ -9,47 +12,50 @@ from .random import RngStream, uniform_range
 
 wp.set_module_options({"enable_backward": False})
 
-MAX_FOOT_ERROR = wp.constant(1.0e-4)  # [m] distance of a foot from its wanted position
-MAX_LEG_SPEED = wp.constant(30.0)  # [rad/s] norm of a leg's motor rates
-MIN_LINK_DISTANCE = wp.constant(0.005)  # [m] least between links
+MAX_FOOT_ERROR = wp.constant(1.0e-4)  # [m] distance of a reachable foot from its requested position
+MAX_LEG_SPEED = wp.constant(30.0)  # [rad/s] norm of the three motor rates of a leg
+MIN_LINK_DISTANCE = wp.constant(0.005)  # [m] between links, and between links and the ground
 
 PAW_X, PAW_Y = 20, 24
-"""Indices in a stream, each the first of four: one a leg."""
+"""Indices in the stream of an attempt, each the first of four: one a leg."""
 
 
 @wp.struct
 class LegSample:
     """Sampled motor state of one leg."""
 
-    angles: wp.vec3  # [rad] of the motors
+    angles: wp.vec3  # [rad] of the lateral, outer and inner motor
     rates: wp.vec3  # [rad/s]
-    reachable: bool  # within the limits of angles and rates
+    reachable: bool  # whether angles and rates are within limits
 
 
 @wp.func
 def leg_ik(geo: LegGeometry, limits: LegLimits, ankle: wp.vec3) -> LegSample:
     """Return the leg at rest with its ankle at a position [m] from the base origin, body axes (inverse kinematics)."""
-    found = LegSample()
+    sample = LegSample()
     angles = clamped_closed_form(geo, limits, ankle - geo.hip)
-    found.angles = angles
-    found.reachable = wp.length(leg_forward_kinematics(geo, angles[0], angles[1], angles[2]) - ankle) <= MAX_FOOT_ERROR
-    return found
+    sample.angles = angles
+    sample.reachable = wp.length(leg_forward_kinematics(geo, angles[0], angles[1], angles[2]) - ankle) <= MAX_FOOT_ERROR
+    return sample
 
 
 @wp.func
 def with_foot_velocity(geo: LegGeometry, leg: LegSample, ankle_vel: wp.vec3) -> LegSample:
     """Return a leg with the motor rates that move its ankle with `ankle_vel` [m/s] relative to the base, body axes."""
-    found = leg
-    found.rates = leg_inverse_velocity(geo, leg.angles, ankle_vel)
-    found.reachable = leg.reachable and wp.length(found.rates) <= MAX_LEG_SPEED
-    return found
+    sample = leg
+    sample.rates = leg_inverse_velocity(geo, leg.angles, ankle_vel)
+    sample.reachable = leg.reachable and wp.length(sample.rates) <= MAX_LEG_SPEED
+    return sample
 
 
 @wp.func
 def sample_foot_offset(
     rng: RngStream, leg: int, front_x: wp.vec2, front_y: wp.vec2, back_x: wp.vec2, back_y: wp.vec2
 ) -> wp.vec3:  # fmt: skip
-    """Return a sampled foot position [m] relative to the stance's centre, z = 0; ranges (lower, upper) of |x|, |y|."""
+    """Return a sampled foot position [m] of leg `leg` from the stance's centre: x ahead, y to the left, z = 0.
+
+    front_x, front_y, back_x, back_y [m]: ranges (lower, upper) of |x| and |y| of front and back legs.
+    """
     x = uniform_range(rng, PAW_X + leg, front_x)
     y = uniform_range(rng, PAW_Y + leg, front_y)
     if leg >= 2:
@@ -62,7 +68,7 @@ def sample_foot_offset(
 
 @wp.func
 def quat_from_ypr(yaw: float, pitch: float, roll: float) -> wp.quat:
-    """Return the orientation (xyzw), body to world, Rz(yaw) Ry(pitch) Rx(roll); angles [rad]."""
+    """Return the orientation (xyzw, body to world) Rz(yaw) Ry(pitch) Rx(roll); angles [rad]."""
     return (
         wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
         * wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), pitch)

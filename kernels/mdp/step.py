@@ -10,7 +10,7 @@ from .options import FAST
 from .terminations import came_apart
 from .view import RobotArrays, has_diverged, load_view
 
-NOT_TERMINATED = wp.constant(-1)
+NOT_TERMINATED = wp.constant(-1)  # `EpisodeArrays.termination` of an episode that goes on
 
 
 @wp.func
@@ -18,7 +18,10 @@ def update_curriculum(
     episode: EpisodeArrays, counters: Counters, world: int, success: bool, error: float, promote_after: float,
     num_levels: int,
 ):  # fmt: skip
-    """Count an ended episode for the curriculum: `promote_after` successes in a row raise the world's level."""
+    """Count an ended episode for the curriculum: `promote_after` successes in a row raise the world's level.
+
+    error: curriculum error of the episode in the task's unit, summed over successes. num_levels: level past the last.
+    """
     streak = wp.where(success, episode.streak[world] + 1, 0)
     if streak >= int(promote_after):
         streak = int(0)
@@ -35,7 +38,11 @@ def write_step_result(
     episode: EpisodeArrays, counters: Counters, world: int, total: float, termination: int, timeout: float,
     diverged: bool,
 ):  # fmt: skip
-    """Write reward, done flags and termination of a world's policy step, and advance its step count."""
+    """Write reward, done flags and termination of a world's policy step, and advance its step count.
+
+    total: sum of rewards. termination: index of the termination term, NOT_TERMINATED if none. timeout: 1 if it is one
+    without failure, else 0. diverged: whether the state is invalid.
+    """
     episode.reward[world] = total
     episode.termination[world] = termination
     episode.done[world] = wp.where(termination == NOT_TERMINATED, 0.0, 1.0)
@@ -53,7 +60,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
     """Return the kernel that ends a policy step; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
     (advance,), endings, rewards = (task.params.slots[name] for name in ("advance", "terminations", "rewards"))
     (curriculum,) = task.params.slots["curriculum"]
-    broken_ending = [slot.func for slot in endings].index(came_apart)
+    diverged_ending = [slot.func for slot in endings].index(came_apart)
     floor = task.reward_floor
 
     @wp.kernel(module="unique", module_options=FAST)
@@ -71,9 +78,10 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         term_value: wp.array2d(dtype=float),
         counters: Counters,
     ):
-        """Advance the task state of every world of a skill by one policy step; one thread per world.
+        """Advance the task state of every world of `skill`, then evaluate terminations, rewards and curriculum.
 
-        term_value: rewards of this step, weights applied, (rewards, num_worlds). Those that are not finite count 0.
+        One thread per world. p: numbers of the task's terms. The first termination that holds ends the episode.
+        term_value: (rewards, num_worlds), rewards of this step, weights applied; non-finite ones add 0 to the reward.
         """
         world = episode.first + wp.tid()
         if episode.skill[world] != skill:
@@ -91,7 +99,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         success = bool(False)
         diverged = arrays.diverged[world] != 0 or episode.bad_action[world] != 0 or has_diverged(robot)
         if diverged:
-            termination = wp.static(broken_ending)
+            termination = wp.static(diverged_ending)
         for i in range(wp.static(len(endings))):
             if termination == NOT_TERMINATED:
                 if wp.static(endings[i].parameterless):

@@ -1,6 +1,6 @@
-"""Reasons for an episode to end that any task can use: pure functions of the robot, the task's state and numbers.
+"""Terminations that any task can use: pure functions of the robot, the task's state and named numbers.
 
-A task's state counts its policy steps in `steps`.
+A task's state has the number of policy steps of the episode in `steps`.
 """
 
 from typing import Any
@@ -12,31 +12,31 @@ from .view import RobotView, has_diverged, tilt
 
 @wp.func
 def too_long(robot: RobotView, state: Any, steps: float) -> bool:
-    """Episode of so many policy steps."""
+    """Episode of at least `steps` policy steps."""
     return state.steps >= int(steps)
 
 
 @wp.func
 def came_apart(robot: RobotView, state: Any) -> bool:
-    """State non-finite or absurdly fast."""
+    """Diverged simulation: state non-finite or beyond the speed limits of `has_diverged`."""
     return has_diverged(robot)
 
 
 @wp.func
 def low_base(robot: RobotView, state: Any, height: float) -> bool:
-    """Base less than a height [m] above the ground."""
+    """Base origin less than `height` [m] above the ground below it."""
     return robot.height < height
 
 
 @wp.func
 def tilted(robot: RobotView, state: Any, angle: float) -> bool:
-    """Body z more than an angle [rad] from vertical."""
+    """Body z more than `angle` [rad] from world z."""
     return tilt(robot) > angle
 
 
 @wp.func
 def fallen(robot: RobotView, state: Any, angle: float) -> bool:
-    """Body z more than an angle [rad] from vertical while a paw is on the ground."""
+    """Body z more than `angle` [rad] from world z while a paw is on the ground."""
     return robot.contacts > 0 and tilt(robot) > angle
 
 

@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.func
 def update_paw_kinematics(arrays: RobotArrays, geo: LegGeometry, world: int, leg: int):
-    """Write position [m] and velocity [m/s] of a paw's centre, world axes."""
+    """Write position [m] and velocity [m/s] of a leg's paw centre (`paw_pos`, `paw_vel`), world axes."""
     quat = base_quat(arrays, world)
     angles = load_motors(arrays.joint_q, leg_coord(world, leg))
     rates = load_motors(arrays.joint_qd, leg_dof(world, leg))
@@ -31,14 +31,17 @@ def update_paw_kinematics(arrays: RobotArrays, geo: LegGeometry, world: int, leg
 
 @wp.func
 def paw_clearance(arrays: RobotArrays, geo: LegGeometry, ground: Ground, world: int, leg: int) -> float:
-    """Return the height of a paw's lowest point above the ground below its centre [m]."""
+    """Return the height of a paw's lowest point above the ground below its centre [m], negative inside the ground."""
     pos = arrays.paw_pos[leg, world]
     return pos[2] - surface(world_ground(ground, world), pos[0], pos[1])[0] - geo.paw_radius
 
 
 @wp.func
 def update_contact_timers(arrays: RobotArrays, world: int, leg: int, down: bool):
-    """Update contact and air time [s] of a paw; `air_time` stays through the step of its first contact."""
+    """Update contact time, air time [s] and touchdown speed [m/s] of a paw; down: whether it is in contact.
+
+    At the first contact `air_time` still holds the length of the swing; it is 0 from the next step on.
+    """
     was_down = arrays.contact_time[leg, world] > 0.0
     if down:
         if was_down:
@@ -68,10 +71,10 @@ def track_kernel(
     world += episode.first
     skill = skills[episode.skill[world]]
     down = wp.length(arrays.paw_force[leg, world]) > skill.contact_force
-    update_contact_timers(arrays, world, leg, down)  # before the velocity of the step before is written over
+    update_contact_timers(arrays, world, leg, down)  # reads paw_vel of the previous policy step: call it first
     update_paw_kinematics(arrays, geometry[leg], world, leg)
     arrays.paw_height[leg, world] = paw_clearance(arrays, geometry[leg], ground, world, leg)
-    here = grown_block(world_ground(ground, world), skill.obstacle_margin)
+    grown_ground = grown_block(world_ground(ground, world), skill.obstacle_margin)
     arrays.collisions[leg, world] = leg_collisions(
-        geometry, here, arrays.joint_q, world * COORDS, leg, skill.self_collision_margin
+        geometry, grown_ground, arrays.joint_q, world * COORDS, leg, skill.self_collision_margin
     )

@@ -18,29 +18,29 @@ class RobotView:
     height: float  # [m] of the base origin above the ground below it
     quat: wp.quat  # xyzw, body to world
     lin_vel: wp.vec3  # [m/s] base origin, world
-    prev_lin_vel: wp.vec3  # [m/s] the same one policy step before
+    prev_lin_vel: wp.vec3  # [m/s] `lin_vel` of the previous policy step
     lin_acc: wp.vec3  # [m/s^2] base origin, world, mean of the policy step
     ang_vel: wp.vec3  # [rad/s] body axes
     projected_gravity: wp.vec3  # [1] direction of gravity in body axes
-    gravity_magnitude: float  # [m/s^2] of gravity, downward
-    angle: vec12  # [rad]
-    sensed_angle: vec12  # [rad] as the motors' position sensors read it
-    rate: vec12  # [rad/s]
+    gravity_magnitude: float  # [m/s^2] downward
+    angle: vec12  # [rad] of the motors
+    sensed_angle: vec12  # [rad] `angle` as the motors' position sensors read it
+    rate: vec12  # [rad/s] of the motors
     joint_acc: vec12  # [rad/s^2] mean of the policy step
     torque: vec12  # [N m] last physics step
-    prev_torque: vec12  # [N m] last physics step of the policy step before
+    prev_torque: vec12  # [N m] last physics step of the previous policy step
     action: vec12  # [1] within -1..1
-    prev_action: vec12
-    prev_prev_action: vec12  # two policy steps before
-    clipped: float  # [rad^2] squared distance that the command filter moved the targets
-    default_angle: vec12  # [rad]
+    prev_action: vec12  # one policy step earlier
+    prev_prev_action: vec12  # two policy steps earlier
+    clipped: float  # [rad^2] sum over motors of the squared change of the target by the command filter
+    default_angle: vec12  # [rad] motor angles of the default pose
     contacts: int  # number of paws on the ground
     collisions: int  # bits of `jumper_warp.kernels.collision.robot`
     contact: wp.vec4  # [1] 1: the paw is on the ground
     first_contact: wp.vec4  # [1] 1: it touched down in this step
     air_time: wp.vec4  # [s] since the paw left the ground; at its first contact the length of its swing, later 0
     contact_time: wp.vec4  # [s] since the paw touched down; 0 in the air
-    touchdown_speed: wp.vec4  # [m/s] downward, of the paw in the step before touchdown
+    touchdown_speed: wp.vec4  # [m/s] downward speed of the paw in the policy step before its last touchdown
     paw_force: wp.vec4  # [N] on each paw, last physics step
     peak_force: wp.vec4  # [N] on each paw, largest of the policy step
     paw_pos: mat43  # [m] centres, world
@@ -50,16 +50,16 @@ class RobotView:
 
 @wp.struct
 class RobotArrays:
-    """State of all robots; the `prev_` arrays hold the values of the policy step before."""
+    """State of all robots; the `prev_` arrays hold the values of the previous policy step. Units as in `RobotView`."""
 
-    joint_q: wp.array(dtype=float)
-    joint_qd: wp.array(dtype=float)
-    body_com: wp.array(dtype=wp.vec3)
+    joint_q: wp.array(dtype=float)  # (COORDS num_worlds,) base position [m], quaternion (xyzw), joint angles [rad]
+    joint_qd: wp.array(dtype=float)  # (DOFS num_worlds,) base com [m/s], angular velocity, joints [rad/s]; world axes
+    body_com: wp.array(dtype=wp.vec3)  # [m] (BODIES num_worlds,) centre of mass of each body, body axes
     body_f: wp.array(dtype=wp.spatial_vector)  # [N], [N m] wrench on each body at its com, world axes
     gravity: wp.array(dtype=wp.vec3)  # [m/s^2] (num_worlds + 1,), world axes
     diverged: wp.array(dtype=int)  # (num_worlds,) 1: the solver froze the world because its state diverged
-    impulse: wp.array2d(dtype=wp.vec3)  # [N s] (4, num_worlds) first guess of the next contact
-    paw_force: wp.array2d(dtype=wp.vec3)  # [N] (4, num_worlds), like all of paws
+    impulse: wp.array2d(dtype=wp.vec3)  # [N s] (4, num_worlds) contact impulses, first guess of the next physics step
+    paw_force: wp.array2d(dtype=wp.vec3)  # [N] (4, num_worlds), like all up to collisions; world axes
     peak_force: wp.array2d(dtype=float)  # [N]
     paw_pos: wp.array2d(dtype=wp.vec3)
     paw_vel: wp.array2d(dtype=wp.vec3)
@@ -84,7 +84,7 @@ class RobotArrays:
 
 @wp.func
 def base_velocity(arrays: RobotArrays, world: int, quat: wp.quat) -> wp.vec3:
-    """Return the velocity of the base origin [m/s], world frame."""
+    """Return the velocity of a world's base origin [m/s], world axes; quat: its orientation (xyzw, body to world)."""
     i = world * DOFS
     com_vel = wp.vec3(arrays.joint_qd[i], arrays.joint_qd[i + 1], arrays.joint_qd[i + 2])
     ang = wp.vec3(arrays.joint_qd[i + 3], arrays.joint_qd[i + 4], arrays.joint_qd[i + 5])
@@ -93,21 +93,21 @@ def base_velocity(arrays: RobotArrays, world: int, quat: wp.quat) -> wp.vec3:
 
 @wp.func
 def base_pos(arrays: RobotArrays, world: int) -> wp.vec3:
-    """Return the base origin [m], world frame."""
+    """Return the position of a world's base origin [m], world frame."""
     i = world * COORDS
     return wp.vec3(arrays.joint_q[i], arrays.joint_q[i + 1], arrays.joint_q[i + 2])
 
 
 @wp.func
 def base_quat(arrays: RobotArrays, world: int) -> wp.quat:
-    """Return the base's orientation, xyzw, body to world."""
+    """Return the orientation of a world's base (xyzw, body to world)."""
     i = world * COORDS + 3
     return wp.quat(arrays.joint_q[i], arrays.joint_q[i + 1], arrays.joint_q[i + 2], arrays.joint_q[i + 3])
 
 
 @wp.func
 def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
-    """Return the `RobotView` of a world with the entries of the base alone."""
+    """Return the `RobotView` of a world with the fields of the base only; those of motors and paws are 0."""
     j = world * DOFS
     robot = RobotView()
     robot.world = world
@@ -128,7 +128,7 @@ def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView
 
 @wp.func
 def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
-    """Return the `RobotView` of a world."""
+    """Return the complete `RobotView` of a world."""
     robot = load_base_view(arrays, ground, world)
     contacts = int(0)
     collisions = int(0)
@@ -165,15 +165,15 @@ def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
         robot.prev_action[m] = arrays.prev_action[m, world]
         robot.prev_prev_action[m] = arrays.prev_prev_action[m, world]
         robot.default_angle[m] = arrays.default_angle[m]
-        off = arrays.target[m, world] - arrays.filtered_target[m, world]
-        clipped += off * off
+        change = arrays.target[m, world] - arrays.filtered_target[m, world]
+        clipped += change * change
     robot.clipped = clipped
     return robot
 
 
 @wp.func
 def has_diverged(robot: RobotView) -> bool:
-    """Return whether a state is not finite or faster than 15 m/s, 40 rad/s (base) or 120 rad/s (joints)."""
+    """Return whether a state is not finite, or faster than 15 m/s or 40 rad/s (base) or 120 rad/s (any motor)."""
     fastest = float(0.0)
     total = wp.length_sq(robot.pos) + wp.length_sq(robot.lin_vel) + wp.length_sq(robot.ang_vel)
     for m in range(12):
@@ -193,7 +193,7 @@ def yaw_of(quat: wp.quat) -> float:
 
 @wp.func
 def rotate_yaw(v: wp.vec3, heading: float) -> wp.vec3:
-    """Return a vector rotated about z by a heading [rad]."""
+    """Return a vector rotated about z by a heading [rad]: from heading axes to world axes."""
     return wp.quat_rotate(wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), heading), v)
 
 
@@ -202,27 +202,27 @@ def angle_from_level(quat: wp.quat, heading: float) -> float:
     """Return the rotation angle [rad] between an orientation (xyzw) and the level one with a yaw `heading` [rad]."""
     half = 0.5 * heading
     level = wp.quat(0.0, 0.0, wp.sin(half), wp.cos(half))
-    off = wp.quat_inverse(level) * quat
-    return 2.0 * wp.atan2(wp.length(wp.vec3(off[0], off[1], off[2])), wp.abs(off[3]))
+    turn = wp.quat_inverse(level) * quat
+    return 2.0 * wp.atan2(wp.length(wp.vec3(turn[0], turn[1], turn[2])), wp.abs(turn[3]))
 
 
 @wp.func
 def tilt(robot: RobotView) -> float:
-    """Return the angle [rad] between body z and world z."""
+    """Return the angle [rad], 0 to pi, between body z and world z."""
     return wp.acos(wp.clamp(-robot.projected_gravity[2], -1.0, 1.0))
 
 
 @wp.func
 def base_deceleration(robot: RobotView) -> float:
-    """Return the base's acceleration against its previous velocity [m/s^2], <= 0, mean of the policy step.
+    """Return the base's acceleration along its previous velocity [m/s^2], mean of the policy step; 0 if it speeds up.
 
-    A rebound does not count: a fall that ends within the step loses all of its speed, and no more.
+    The result is <= 0. A rebound does not count: at most the whole previous speed is lost within a policy step.
     """
     speed = wp.length(robot.prev_lin_vel)
     if speed < 1.0e-6:
         return 0.0
-    kept = wp.dot(robot.lin_vel, robot.prev_lin_vel) / speed
+    new_speed = wp.dot(robot.lin_vel, robot.prev_lin_vel) / speed  # [m/s] along the previous velocity
     rate = wp.dot(robot.lin_acc, robot.prev_lin_vel) / speed
-    if kept < 0.0:
-        rate = rate * speed / (speed - kept)
+    if new_speed < 0.0:
+        rate = rate * speed / (speed - new_speed)
     return wp.min(rate, 0.0)

@@ -1,4 +1,7 @@
-"""When walking, jumping and turning in flight follow each other, and how each begins; the robot is left as it is."""
+"""Handovers between walking, jumping and turning in flight: conditions (`*_due`) and initial task states (`begin_*`).
+
+Neither changes the robot. requested: whether `Env.request` asked for the target skill.
+"""
 
 import warp as wp
 
@@ -10,60 +13,63 @@ from ..velocity.state import VelocityState
 
 wp.set_module_options({"enable_backward": False})
 
-REST_SPEED = wp.constant(0.10)  # [m/s] of a base at rest
-REST_SPIN = wp.constant(0.30)  # [rad/s]
-LEVEL = wp.constant(0.14)  # [rad] tilt of a base that stands
-NEAR = wp.constant(0.44)  # [rad] motors farther from the default pose are not near it
-PLANTED = wp.constant(0.3)  # [s] that a paw has been down
-FALLING = wp.constant(0.35)  # [rad] tilt at which walking takes over from a landing
-LANDED_STEPS = wp.constant(18)  # policy steps after touchdown before which a landing is not over
-RECOVER_STEPS = wp.constant(60)  # policy steps after touchdown after which walking takes over
-NO_JUMP_STEPS = wp.constant(150)  # policy steps without a takeoff after which it does
-FREE_STEPS = wp.constant(2)  # policy steps after a takeoff after which turning takes over
-LANDING_TIME = wp.constant(0.35)  # [s] before a base falls through LANDING_HEIGHT, in which the jump lands
+REST_SPEED = wp.constant(0.10)  # [m/s] largest speed of a base at rest
+REST_SPIN = wp.constant(0.30)  # [rad/s] largest angular speed of a base at rest
+MAX_STAND_TILT = wp.constant(0.14)  # [rad] of a standing base
+MAX_OFFSET = wp.constant(0.44)  # [rad] of a motor from the default pose, to be near it
+MIN_STAND_TIME = wp.constant(0.3)  # [s] of contact of each paw of a standing robot
+LOST_TILT = wp.constant(0.35)  # [rad] tilt after touchdown beyond which walking takes over
+LANDED_STEPS = wp.constant(18)  # policy steps after touchdown before which walking never takes over
+RECOVER_STEPS = wp.constant(60)  # policy steps after touchdown after which walking takes over in any state
+NO_JUMP_STEPS = wp.constant(150)  # policy steps in stance after which walking takes over without a jump
+FREE_STEPS = wp.constant(2)  # policy steps after a takeoff from which on turning takes over
+LANDING_TIME = wp.constant(0.35)  # [s] the jump takes over this long before the base falls below LANDING_HEIGHT
 LANDING_HEIGHT = wp.constant(0.45)  # [m] of the base above the ground
-NEVER = wp.constant(1_000_000)  # policy step of a command that has not come
+NEVER = wp.constant(1_000_000)  # `command_step` of a jump without a command
 
 
 @wp.func
 def at_rest(robot: RobotView) -> bool:
-    """Return whether a robot stands: on four paws for a while, the base level, slow and not turning."""
+    """Return whether a robot stands still: four paws down for MIN_STAND_TIME, base level and nearly motionless."""
     return (
         robot.contacts == 4
-        and wp.min(robot.contact_time) > PLANTED
+        and wp.min(robot.contact_time) > MIN_STAND_TIME
         and wp.length(robot.lin_vel) < REST_SPEED
         and wp.length(robot.ang_vel) < REST_SPIN
-        and tilt(robot) < LEVEL
+        and tilt(robot) < MAX_STAND_TILT
     )
 
 
 @wp.func
 def near_default(robot: RobotView) -> bool:
-    """Return whether all motors are near the default pose."""
-    most = float(0.0)
+    """Return whether all motors are within MAX_OFFSET of the default pose."""
+    largest = float(0.0)
     for m in range(12):
-        most = wp.max(most, wp.abs(robot.angle[m] - robot.default_angle[m]))
-    return most < NEAR
+        largest = wp.max(largest, wp.abs(robot.angle[m] - robot.default_angle[m]))
+    return largest < MAX_OFFSET
 
 
 @wp.func
-def come_to_a_stop(robot: RobotView, state: VelocityState, requested: bool) -> bool:
-    """Walking to a jump: asked for, commanded to stand, at rest, and near the default pose."""
+def walk_to_jump_due(robot: RobotView, state: VelocityState, requested: bool) -> bool:
+    """Return whether walking hands over to a requested jump: commanded to stand, at rest and near the default pose."""
     return requested and state.standing == 1 and at_rest(robot) and near_default(robot)
 
 
 @wp.func
-def landed_or_lost(robot: RobotView, state: JumpState, requested: bool) -> bool:
-    """A jump to walking: landed and at rest; or as recovery, landed badly, not at rest in time or not taken off."""
+def jump_to_walk_due(robot: RobotView, state: JumpState, requested: bool) -> bool:
+    """Return whether a jump hands over to walking: at rest after landing, or as recovery, requested or not.
+
+    Recovery: tilted after landing, not at rest within RECOVER_STEPS, or no takeoff within NO_JUMP_STEPS.
+    """
     if state.phase == LANDED:
-        over = at_rest(robot) or tilt(robot) > FALLING or state.phase_steps >= RECOVER_STEPS
+        over = at_rest(robot) or tilt(robot) > LOST_TILT or state.phase_steps >= RECOVER_STEPS
         return state.phase_steps >= LANDED_STEPS and over
     return state.phase == STANCE and state.steps >= NO_JUMP_STEPS
 
 
 @wp.func
 def begin_walk(robot: RobotView, state: JumpState) -> VelocityState:
-    """Return the state of walking, commanded to stand."""
+    """Return the initial state of walking after a jump, commanded to stand; the arguments are unused."""
     new = VelocityState()
     new.standing = 1
     return new
@@ -71,7 +77,7 @@ def begin_walk(robot: RobotView, state: JumpState) -> VelocityState:
 
 @wp.func
 def begin_jump(robot: RobotView, state: VelocityState) -> JumpState:
-    """Return the state of a jump whose command has not come; that of the request is given at once."""
+    """Return the initial state of a jump after walking, without a command; the handover sets the requested one."""
     new = JumpState()
     new.heading = yaw_of(robot.quat)
     new.start = robot.pos
@@ -83,25 +89,25 @@ def begin_jump(robot: RobotView, state: VelocityState) -> JumpState:
 
 
 @wp.func
-def in_flight(robot: RobotView, state: JumpState, requested: bool) -> bool:
-    """A jump to turning: asked for, and in flight."""
+def jump_to_turn_due(robot: RobotView, state: JumpState, requested: bool) -> bool:
+    """Return whether a jump hands over to requested turning: from FREE_STEPS policy steps after takeoff on."""
     return requested and state.phase == FLIGHT and state.phase_steps >= FREE_STEPS
 
 
 @wp.func
-def about_to_land(robot: RobotView, state: AttitudeState, requested: bool) -> bool:
-    """Turning to the jump: down soon, or down."""
+def turn_to_jump_due(robot: RobotView, state: AttitudeState, requested: bool) -> bool:
+    """Return whether turning hands back to its jump, requested or not: a paw is down, or soon (LANDING_TIME)."""
     if robot.contacts > 0:
         return True
     if robot.gravity_magnitude <= 0.0 or robot.lin_vel[2] > 0.0:
         return False
-    left = time_to_height(robot.height, robot.lin_vel[2], LANDING_HEIGHT, robot.gravity_magnitude)
-    return left < LANDING_TIME or robot.height < LANDING_HEIGHT
+    time_left = time_to_height(robot.height, robot.lin_vel[2], LANDING_HEIGHT, robot.gravity_magnitude)
+    return time_left < LANDING_TIME or robot.height < LANDING_HEIGHT
 
 
 @wp.func
 def begin_turn(robot: RobotView, state: JumpState) -> AttitudeState:
-    """Return the state of a turn that brings the robot level, in the heading of its jump."""
+    """Return the initial state of turning in the flight of a jump: goal orientation level, with the jump's heading."""
     new = AttitudeState()
     new.jump_start = state.start
     new.jump_goal = state.goal
@@ -112,7 +118,7 @@ def begin_turn(robot: RobotView, state: JumpState) -> AttitudeState:
 
 @wp.func
 def begin_landing(robot: RobotView, state: AttitudeState) -> JumpState:
-    """Return the state of the jump that turning was part of, in flight past its apex."""
+    """Return the state of the jump whose flight the turn was part of: in flight, past its apex."""
     new = JumpState()
     new.phase = FLIGHT
     new.start = state.jump_start

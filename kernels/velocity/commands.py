@@ -10,63 +10,63 @@ from .state import POLICY_RATE, VelocityState
 
 wp.set_module_options({"enable_backward": False})
 
-LEAST = wp.constant(0.05)  # [m/s], [rad/s] a command smaller in all three components means to stand
+MIN_COMMAND = wp.constant(0.05)  # [m/s], [rad/s] a command with all three components smaller means to stand
 
 
 @wp.struct
 class CommandRanges:
-    """Ranges of drawn commands; reaches are (ahead, back, to either side [m/s], turning [rad/s])."""
+    """Ranges of sampled commands; limits are largest speeds (ahead, back, to either side [m/s], turning [rad/s])."""
 
-    first_range: wp.vec4  # reach at the first level
-    last_range: wp.vec4  # reach at the last level
-    levels: int  # from the first to the last
-    first_range_probability: float  # of a command of the first level on all others
+    first_range: wp.vec4  # limits at level 0
+    last_range: wp.vec4  # limits at level `levels`
+    levels: int  # index of the last level
+    first_range_probability: float  # of a command within `first_range` at a higher level
     standing_probability: float  # of the command to stand
-    turn_in_place_probability: float  # of a command to turn on the spot
+    turn_in_place_probability: float  # of a command with a yaw rate only
     resampling_time_range: wp.vec2  # [policy steps] from command to command
 
 
 @wp.func
-def reach_of(ranges: CommandRanges, level: int) -> wp.vec4:
-    """Return the command limits at a level, linear between those of the first and the last one."""
+def command_limits(ranges: CommandRanges, level: int) -> wp.vec4:
+    """Return the limits (ahead, back, side [m/s], yaw rate [rad/s]) at a level, linear from first to last range."""
     if ranges.levels == 0:
         return ranges.first_range
-    share = float(wp.min(level, ranges.levels)) / float(ranges.levels)
-    return ranges.first_range + share * (ranges.last_range - ranges.first_range)
+    fraction = float(wp.min(level, ranges.levels)) / float(ranges.levels)
+    return ranges.first_range + fraction * (ranges.last_range - ranges.first_range)
 
 
 @wp.func
 def sample_velocity_command(rng: RngStream, ranges: CommandRanges, level: int) -> wp.vec3:
-    """Return a sampled command of a level: velocity ahead, to the left [m/s], yaw rate [rad/s].
+    """Return a sampled command of a level: velocity ahead, to the left [m/s], yaw rate [rad/s], body axes.
 
-    Beyond the first level, y and yaw shrink with the speed along x, as on an ellipse.
+    Above level 0, lateral velocity and yaw rate shrink with the speed ahead as on an ellipse, to at least 0.2 of them.
     """
     kind = uniform(rng, streams.KIND, 0.0, 1.0)
     if kind < ranges.standing_probability:
         return wp.vec3(0.0)
-    reach = reach_of(ranges, level)
+    limits = command_limits(ranges, level)
     easy = level == 0 or uniform(rng, streams.NARROW, 0.0, 1.0) < ranges.first_range_probability
     if easy:
-        reach = ranges.first_range
-    spin = uniform(rng, streams.TURN, -reach[3], reach[3])
+        limits = ranges.first_range
+    spin = uniform(rng, streams.TURN, -limits[3], limits[3])
     if kind < ranges.standing_probability + ranges.turn_in_place_probability:
         return wp.vec3(0.0, 0.0, spin)
-    ahead = uniform(rng, streams.AHEAD, -reach[1], reach[0])
-    side = uniform(rng, streams.SIDE, -reach[2], reach[2])
+    ahead = uniform(rng, streams.AHEAD, -limits[1], limits[0])
+    side = uniform(rng, streams.SIDE, -limits[2], limits[2])
     if easy:
         return wp.vec3(ahead, side, spin)
-    share = ahead / wp.where(ahead > 0.0, ranges.last_range[0], ranges.last_range[1])
-    left = wp.sqrt(wp.max(1.0 - share * share, 0.04))
-    return wp.vec3(ahead, left * side, left * spin)
+    fraction = ahead / wp.where(ahead > 0.0, ranges.last_range[0], ranges.last_range[1])
+    shrink = wp.sqrt(wp.max(1.0 - fraction * fraction, 0.04))
+    return wp.vec3(ahead, shrink * side, shrink * spin)
 
 
 @wp.func
 def with_command(state: VelocityState, command: wp.vec3) -> VelocityState:
-    """Return the state with a new command."""
+    """Return the state with a new command (ahead, to the left [m/s], yaw rate [rad/s]); a small one means to stand."""
     new = state
     new.command = command
     new.command_steps = 0
-    new.standing = wp.where(wp.max(wp.abs(command)) < LEAST, 1, 0)
+    new.standing = wp.where(wp.max(wp.abs(command)) < MIN_COMMAND, 1, 0)
     if new.standing == 1:
         new.command = wp.vec3(0.0)
     return new
@@ -82,7 +82,7 @@ def resample_due(state: VelocityState) -> bool:
 def resample_velocity(
     robot: RobotView, scene: Scene, state: VelocityState, level: CommandRanges, rng: RngStream
 ) -> VelocityState:
-    """Return the state with a newly sampled command."""
+    """Return the state with a newly sampled command and its duration; robot and scene are unused."""
     new = with_command(state, sample_velocity_command(rng, level, state.command_level))
     new.command_lasts = wp.max(int(uniform_range(rng, streams.LASTS, level.resampling_time_range)), 1)
     return new
@@ -92,9 +92,10 @@ def resample_velocity(
 def set_velocity(
     robot: RobotView, scene: Scene, state: VelocityState, values: wp.vec4, heading: float
 ) -> VelocityState:
-    """Return the state with a commanded velocity: ahead, to the left [m/s], yaw rate [rad/s], body axes.
+    """Return the state with a commanded velocity that holds until the next command.
 
-    It holds until the next command. values[3]: gait frequency [Hz], 0: unchanged.
+    values: velocity ahead, to the left [m/s], yaw rate [rad/s], body axes; gait frequency [Hz], 0: unchanged. The other
+    arguments are unused.
     """
     new = with_command(state, wp.vec3(values[0], values[1], values[2]))
     if values[3] > 0.0:

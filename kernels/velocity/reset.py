@@ -1,4 +1,4 @@
-"""Reset of velocity tracking: curriculum levels and a command; robot: see `start_states`."""
+"""Reset of velocity tracking: curriculum levels and a command; `start_states` samples the state of the robot."""
 
 import warp as wp
 
@@ -9,17 +9,17 @@ from ..mdp.view import RobotArrays, base_pos
 from ..terrain.ground import rest_block
 from . import streams
 from .commands import CommandRanges, sample_velocity_command, with_command
-from .start_states import Map, VelocitySettings, write_start
+from .start_states import TileMap, VelocitySettings, write_start
 from .state import VelocityState, mean_error
 from .terminations import off_map
 
 wp.set_module_options({"enable_backward": False})
 
-FALL = wp.constant(60.0)  # [m/s] penalty of a fall in the score, as much as a second at 1 m/s adds
+FALL_PENALTY = wp.constant(60.0)  # [m/s] subtracted from the score for a fall, as much as a second at 1 m/s adds
 
 
 @wp.func
-def map_limit(map: Map) -> wp.vec2:
+def map_limit(map: TileMap) -> wp.vec2:
     """Return the half extents [m] of the map along x and y, 0 without a map."""
     return 0.5 * map.tile * wp.vec2(float(map.rows), float(map.cols))
 
@@ -30,8 +30,8 @@ def carried_over(
 ) -> VelocityState:  # fmt: skip
     """Return the initial state of the next episode: statistics kept, both curriculum levels updated.
 
-    pos [m]: base at the end of the old one. A full episode with a mean error up to `tolerance` [m/s] raises the levels,
-    a fall lowers them.
+    pos [m]: base at the end of the old one. A full episode with a mean error up to `tolerance` [m/s] raises both levels
+    by 1, a fall lowers them by 1. command_levels, terrain_levels: largest levels.
     """
     new = VelocityState()
     new.sum_xy = old.sum_xy
@@ -44,16 +44,16 @@ def carried_over(
     new.falls = old.falls
     new.touchdowns = old.touchdowns
     new.apexes = old.apexes
-    up = int(0)
+    change = int(0)
     if old.steps > 0 and old.episode_steps > 0 and not off_map(pos, old.limit):
         if old.steps < old.episode_steps:
             new.falls = old.falls + 1.0
-            new.score = old.score - FALL
-            up = int(-1)
+            new.score = old.score - FALL_PENALTY
+            change = int(-1)
         elif old.settled > 0.0 and mean_error(old) <= tolerance:
-            up = int(1)
-    new.command_level = wp.clamp(old.command_level + up, 0, command_levels)
-    new.terrain_level = wp.clamp(old.terrain_level + up, 0, terrain_levels)
+            change = int(1)
+    new.command_level = wp.clamp(old.command_level + change, 0, command_levels)
+    new.terrain_level = wp.clamp(old.terrain_level + change, 0, terrain_levels)
     return new
 
 
@@ -62,11 +62,14 @@ def reset_velocity(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: VelocityState, settings: VelocitySettings,
     level: CommandRanges, rng: RngStream,
 ) -> VelocityState:  # fmt: skip
-    """Reset a world to a sampled start state with a sampled command, and return the task's state."""
+    """Write a sampled start state to world `rng.world`, and return the task state, with a sampled command.
+
+    old: state of the previous episode. level: ranges of commands.
+    """
     world = rng.world
     new = carried_over(old, base_pos(arrays, world), settings.tolerance, level.levels, settings.map.rows)
     rest_block(scene.ground, world)
-    sync_attempts(rng)  # all have read where the base was
+    sync_attempts(rng)  # all threads must have read the base position
     write_start(arrays, scene, skill, settings, new.terrain_level, rng)
     new.episode_steps = settings.episode_steps
     new.pace = settings.pace

@@ -1,4 +1,7 @@
-"""Reward terms of velocity tracking (paper, Tables III and IV): pure functions of robot, command and numbers."""
+"""Reward terms of velocity tracking (paper, Tables III and IV): pure functions of robot, command and numbers.
+
+phi: Gaussian kernel of `mdp.rewards`; std: its width, in the unit of its argument.
+"""
 
 import warp as wp
 
@@ -15,33 +18,33 @@ def moving(state: VelocityState) -> float:
 
 @wp.func
 def linear_velocity(robot: RobotView, state: VelocityState, std: float) -> float:
-    """Linear velocity tracking: phi_std of the distance [m/s] of the velocity in the plane from the command."""
+    """Linear velocity tracking: phi_std of the horizontal velocity error [m/s], body axes."""
     error = velocity_error(robot, state)
     return phi(wp.length(wp.vec2(error[0], error[1])), std)
 
 
 @wp.func
 def yaw_rate(robot: RobotView, state: VelocityState, std: float) -> float:
-    """Yaw rate tracking: phi_std of the error [rad/s]."""
+    """Yaw rate tracking: phi_std of the yaw rate error [rad/s]."""
     return phi(velocity_error(robot, state)[2], std)
 
 
 @wp.func
 def lin_vel_z_l2(robot: RobotView, state: VelocityState) -> float:
-    """Vertical velocity: its square [m^2/s^2], body axes."""
+    """Vertical velocity: square of the base's velocity along body z [m^2/s^2]."""
     up = wp.quat_rotate_inv(robot.quat, robot.lin_vel)[2]
     return up * up
 
 
 @wp.func
 def ang_vel_xy_l2(robot: RobotView, state: VelocityState) -> float:
-    """Lateral stability: square of the angular velocity about body x and y [rad^2/s^2]."""
+    """Lateral stability: sum of squared angular velocities about body x and y [rad^2/s^2]."""
     return robot.ang_vel[0] * robot.ang_vel[0] + robot.ang_vel[1] * robot.ang_vel[1]
 
 
 @wp.func
 def flat_orientation_l2(robot: RobotView, state: VelocityState) -> float:
-    """Square of the horizontal part of projected gravity [1] (flat in the paper)."""
+    """Flat orientation: squared horizontal part of projected gravity [1], the squared sine of the tilt."""
     return (
         robot.projected_gravity[0] * robot.projected_gravity[0]
         + robot.projected_gravity[1] * robot.projected_gravity[1]
@@ -50,20 +53,20 @@ def flat_orientation_l2(robot: RobotView, state: VelocityState) -> float:
 
 @wp.func
 def standing_posture(robot: RobotView, state: VelocityState, std: float) -> float:
-    """Stance: phi_std of the rms offset [rad] of the transversal angles from default, when commanded to stand."""
+    """Stance: phi_std of the rms offset [rad] of transversal motors from default, when commanded to stand."""
     if state.standing == 0:
         return 0.0
     total = float(0.0)
     for m in range(12):
         if m % 3 != 0:
-            off = robot.angle[m] - robot.default_angle[m]
-            total += off * off
+            offset = robot.angle[m] - robot.default_angle[m]
+            total += offset * offset
     return phi(wp.sqrt(total / 8.0), std)
 
 
 @wp.func
 def lateral_position(robot: RobotView, state: VelocityState, steepness: float) -> float:
-    """Lateral position: sum over lateral motors of exp(-steepness offset^8) - 1, offset from default [rad]."""
+    """Lateral position: sum over lateral motors of exp(-steepness offset^8) - 1, -4 to 0; offset from default [rad]."""
     total = float(0.0)
     for m in range(12):
         if m % 3 == 0:
@@ -74,19 +77,22 @@ def lateral_position(robot: RobotView, state: VelocityState, steepness: float) -
 
 @wp.func
 def transversal_position(robot: RobotView, state: VelocityState, steepness: float, shift: float) -> float:
-    """Transversal position: sum over these motors of exp(-steepness offset^20) - 1, offset from default + shift."""
+    """Transversal position: sum over transversal motors of exp(-steepness offset^20) - 1, -8 to 0.
+
+    offset [rad]: from default plus shift [rad].
+    """
     total = float(0.0)
     for m in range(12):
         if m % 3 != 0:
-            off = robot.angle[m] - robot.default_angle[m] - shift
-            fourth = off * off * off * off
+            offset = robot.angle[m] - robot.default_angle[m] - shift
+            fourth = offset * offset * offset * offset
             total += wp.exp(-steepness * fourth * fourth * fourth * fourth * fourth) - 1.0
     return total
 
 
 @wp.func
 def air_time(robot: RobotView, state: VelocityState, threshold: float) -> float:
-    """Air time: sum of the times in the air less `threshold` [s] of paws that come down, when commanded to move."""
+    """Air time: sum over paws that touch down of swing duration less `threshold` [s], when commanded to move."""
     total = float(0.0)
     for k in range(4):
         total += robot.first_contact[k] * (robot.air_time[k] - threshold)
@@ -95,7 +101,7 @@ def air_time(robot: RobotView, state: VelocityState, threshold: float) -> float:
 
 @wp.func
 def rapid_stepping(robot: RobotView, state: VelocityState, threshold: float) -> float:
-    """Rapid stepping: sum over paws of steps in the last 0.75 s beyond `threshold`, without bound."""
+    """Rapid stepping: sum over paws of max(0, touchdowns in the last 0.75 s - threshold)."""
     total = float(0.0)
     for k in range(4):
         total += wp.max(state.recent_steps[k] - threshold, 0.0)
@@ -104,7 +110,7 @@ def rapid_stepping(robot: RobotView, state: VelocityState, threshold: float) -> 
 
 @wp.func
 def restless_stand(robot: RobotView, state: VelocityState) -> float:
-    """Paws off the ground when commanded to stand, 0 to 4."""
+    """Restless stand: number of paws off the ground, 0 to 4, when commanded to stand."""
     return float(4 - robot.contacts) * (1.0 - moving(state))
 
 
@@ -113,9 +119,9 @@ def foot_clearance(robot: RobotView, state: VelocityState, target_height: float)
     """Foot clearance: sum over paws in the air of (height - target_height [m])^2 times horizontal speed [m/s]."""
     total = float(0.0)
     for k in range(4):
-        off = robot.paw_height[k] - target_height
+        error = robot.paw_height[k] - target_height
         speed = wp.length(wp.vec2(robot.paw_vel[k, 0], robot.paw_vel[k, 1]))
-        total += (1.0 - robot.contact[k]) * off * off * speed
+        total += (1.0 - robot.contact[k]) * error * error * speed
     return total
 
 
@@ -132,7 +138,7 @@ def slip(robot: RobotView, state: VelocityState) -> float:
 
 @wp.func
 def touchdown(robot: RobotView, state: VelocityState) -> float:
-    """Touchdown: sum of squared downward speeds of paws that come down [m^2/s^2]."""
+    """Touchdown: sum over paws that touch down of squared downward speed [m^2/s^2]."""
     total = float(0.0)
     for k in range(4):
         total += robot.first_contact[k] * robot.touchdown_speed[k] * robot.touchdown_speed[k]
@@ -141,7 +147,7 @@ def touchdown(robot: RobotView, state: VelocityState) -> float:
 
 @wp.func
 def torque_sign_changes(robot: RobotView, state: VelocityState) -> float:
-    """Number of motors whose torque changed its sign since the last policy step (jerk in the paper)."""
+    """Jerk: number of motors whose torque changed its sign since the previous policy step, 0 to 12."""
     total = float(0.0)
     for m in range(12):
         total += wp.where(wp.sign(robot.torque[m]) != wp.sign(robot.prev_torque[m]), 1.0, 0.0)
@@ -150,9 +156,9 @@ def torque_sign_changes(robot: RobotView, state: VelocityState) -> float:
 
 @wp.func
 def trot_schedule(robot: RobotView, state: VelocityState, duty: float) -> float:
-    """Trot: share of paws that are down or up as the clock says, when commanded to move.
+    """Trot: fraction of paws whose contact fits the gait's phase, when commanded to move.
 
-    FL and BR are to be down in the first `duty` of the cycle, FR and BL half a cycle later.
+    FL and BR should be down in the first `duty` [1] of the cycle, FR and BL half a cycle later.
     """
     total = float(0.0)
     for k in range(4):
@@ -160,8 +166,8 @@ def trot_schedule(robot: RobotView, state: VelocityState, duty: float) -> float:
         if k == 1 or k == 2:
             phase = phase + 0.5
         phase = phase - wp.floor(phase)
-        wanted = wp.where(phase < duty, 1.0, 0.0)
-        total += 0.25 * (1.0 - wp.abs(wanted - robot.contact[k]))
+        target = wp.where(phase < duty, 1.0, 0.0)
+        total += 0.25 * (1.0 - wp.abs(target - robot.contact[k]))
     return total * moving(state)
 
 
@@ -169,10 +175,10 @@ def trot_schedule(robot: RobotView, state: VelocityState, duty: float) -> float:
 def shank_lean(
     robot: RobotView, state: VelocityState, threshold: float, hip: float, thigh: float, shank: float
 ) -> float:
-    """Shank lean: sum over both shanks of paws on the ground of squared angles from vertical beyond `threshold` [rad].
+    """Shank lean: sum over both shanks of legs in contact of max(0, angle from vertical - threshold)^2 [rad^2].
 
-    A shank that leans far over its paw hits the edge of a step beside it. The angles are those in the leg's plane, with
-    the pitch of the base. hip: half the distance of the transversal axes [m]; thigh, shank: lengths [m].
+    A shank that leans far over its paw hits the edge of a step beside it. Angles are in the leg's plane and include the
+    pitch of the base. hip: half the distance of the transversal axes [m]; thigh, shank: lengths [m].
     """
     down = wp.vec2(robot.projected_gravity[0], robot.projected_gravity[2])
     total = float(0.0)

@@ -21,31 +21,31 @@ wp.set_module_options({"enable_backward": False})
 
 
 @wp.struct
-class Map:
-    """A map of square tiles around the origin: harder ones with growing x, of another kind with growing y."""
+class TileMap:
+    """A map of square tiles centred on the origin: difficulty grows with the row, the column is the kind of terrain."""
 
-    rows: int  # along x, 0: no map
-    cols: int  # along y
+    rows: int  # number of tiles along x (terrain levels), 0: no map
+    cols: int  # number of tiles along y
     tile: float  # [m] edge of a tile
 
 
 @wp.struct
 class VelocitySettings:
-    """How episodes begin; pairs are (lower, upper)."""
+    """Ranges of start states; pairs are (lower, upper), half width w: sampled from -w to w."""
 
-    map: Map
+    map: TileMap
     episode_steps: int  # policy steps that an episode lasts
-    pace: float  # cycles of the gait in a policy step, 0: no clock
+    pace: float  # gait cycles per policy step, 0: no gait clock
     default_pose_probability: float  # of a start in the default pose at rest
-    base_xy: float  # [m] half width
+    base_xy: float  # [m] half width of the base's offset along x and y
     height: wp.vec2  # [m] of the base above the ground
     tilt: float  # [rad] half width of roll and pitch
-    heading: float  # [rad] half width
-    front_x: wp.vec2  # [m] paws relative to the base
-    front_y: wp.vec2
-    back_x: wp.vec2
-    back_y: wp.vec2
-    max_swing_height: float  # [m] greatest of the paws in the air
+    heading: float  # [rad] half width of the yaw
+    front_x: wp.vec2  # [m] front paws ahead of the base
+    front_y: wp.vec2  # [m] front paws beside the base, absolute
+    back_x: wp.vec2  # [m] back paws behind the base, absolute
+    back_y: wp.vec2  # [m] back paws beside the base, absolute
+    max_swing_height: float  # [m] largest height of a paw in the air above the ground
     swing_probability: float  # of a paw being in the air
     lin_vel: float  # [m/s] half width of the base's velocity along each axis
     ang_vel: float  # [rad/s] half width of its angular velocity about each axis
@@ -54,10 +54,10 @@ class VelocitySettings:
 
 @wp.struct
 class VelocityStart:
-    """What all attempts at a start state share."""
+    """Values that all attempts at a start state share."""
 
-    spot: wp.vec2  # [m] of the ground that the base is around
-    heading: float  # [rad]
+    spot: wp.vec2  # [m] x, y around which the base is placed
+    heading: float  # [rad] yaw
     settings: VelocitySettings
     limits: LegLimits
     ground: Ground
@@ -67,17 +67,17 @@ class VelocityStart:
 class VelocityBase:
     """The base in an attempt, see `sample_valid_state`."""
 
-    pos: wp.vec3
-    quat: wp.quat
-    com_vel: wp.vec3
-    ang_vel: wp.vec3
-    lin_vel: wp.vec3  # [m/s] of the origin, world axes
+    pos: wp.vec3  # [m] base origin, world
+    quat: wp.quat  # xyzw, body to world
+    com_vel: wp.vec3  # [m/s] centre of mass, world axes
+    ang_vel: wp.vec3  # [rad/s] world axes
+    lin_vel: wp.vec3  # [m/s] of the base origin, world axes
     body_rate: wp.vec3  # [rad/s] angular velocity, body axes
 
 
 @wp.func
-def sample_tile(rng: RngStream, map: Map, level: int) -> wp.vec2:
-    """Return the centre [m] of a sampled tile of a terrain level (any past the last); the origin without a map."""
+def sample_tile(rng: RngStream, map: TileMap, level: int) -> wp.vec2:
+    """Return the centre (x, y) [m] of a tile: row `level` (sampled if past the last), sampled column; 0 without map."""
     if map.rows == 0:
         return wp.vec2(0.0)
     row = level
@@ -91,7 +91,10 @@ def sample_tile(rng: RngStream, map: Map, level: int) -> wp.vec2:
 
 @wp.func
 def sample_base(start: VelocityStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> VelocityBase:
-    """Return the base's sampled pose and velocity, around the start's position."""
+    """Return the base's sampled pose and velocity around `start.spot`; its vertical velocity is 0.3 of the range.
+
+    A `sample_base` of `mdp.attempts.sample_valid_state`.
+    """
     settings = start.settings
     v = settings.lin_vel
     w = settings.ang_vel
@@ -119,7 +122,7 @@ def sample_base(start: VelocityStart, arrays: RobotArrays, rng: RngStream, attem
 
 @wp.func
 def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return a sampled leg; its paw rests on the ground, or is in the air with a probability."""
+    """Return leg `leg`: its paw at rest on the ground, or in the air with motors at rest with `swing_probability`."""
     settings = start.settings
     beside = sample_foot_offset(rng, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
     paw = base.pos + rotate_yaw(beside, start.heading)
@@ -129,11 +132,11 @@ def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, rng: 
         up = uniform(rng, streams.LIFT + leg, 0.01, settings.max_swing_height)
     paw[2] = surface(start.ground, paw[0], paw[1])[0] + geo.paw_radius + up
     ankle = wp.quat_rotate_inv(base.quat, paw - base.pos)
-    found = leg_ik(geo, start.limits, ankle)
+    sample = leg_ik(geo, start.limits, ankle)
     if lifted:
-        return found
+        return sample
     return with_foot_velocity(
-        geo, found, -wp.quat_rotate_inv(base.quat, base.lin_vel) - wp.cross(base.body_rate, ankle)
+        geo, sample, -wp.quat_rotate_inv(base.quat, base.lin_vel) - wp.cross(base.body_rate, ankle)
     )
 
 
@@ -142,7 +145,7 @@ def write_start(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, settings: VelocitySettings, terrain_level: int,
     rng: RngStream,
 ):  # fmt: skip
-    """Write a start state to a world: a sampled one, or with a probability the default pose."""
+    """Write a start state to world `rng.world`: a sampled one, or with `default_pose_probability` the default pose."""
     world = rng.world
     start = VelocityStart()
     start.spot = sample_tile(rng, settings.map, terrain_level)

@@ -1,45 +1,45 @@
-"""The state of velocity tracking, and how it moves on by a policy step."""
+"""State of velocity tracking (`VelocityState`), its update in a policy step, and its errors."""
 
 import warp as wp
 
 from ..mdp.view import RobotView
 
 POLICY_RATE = wp.constant(60.0)  # policy steps in a second
-ABSURD = wp.constant(40.0)  # [m/s], [rad/s] an error of a world that came apart
+MAX_COUNTED_ERROR = wp.constant(40.0)  # [m/s], [rad/s] larger errors are those of a diverged world and do not count
 vec4l = wp.types.vector(length=4, dtype=wp.int64)
 
 
 @wp.struct
 class VelocityState:
-    """State of one world's episode. What is counted goes on over episodes until it is read."""
+    """Task state of one world; the fields from `sum_xy` on accumulate over episodes until the host reads them."""
 
-    command: wp.vec3  # [m/s], [m/s], [rad/s] wanted velocity ahead, to the left and about z, body axes
+    command: wp.vec3  # [m/s], [m/s], [rad/s] commanded velocity ahead, to the left and about z, body axes
     standing: int  # 1: commanded to stand
     steps: int  # policy steps since the episode began
     episode_steps: int  # policy steps that it lasts, 0: no end
     command_steps: int  # policy steps since the command
     command_lasts: int  # policy steps from this command to the next, 0: it stays
-    pace: float  # cycles of the gait in a policy step, 0: no clock
+    pace: float  # gait cycles per policy step, 0: no gait clock
     phase: float  # of the gait's cycle, 0 to 1
-    recent: vec4l  # bit i: the paw came down i policy steps ago, for 45 policy steps
-    recent_steps: wp.vec4  # how often each paw came down in the last 0.75 s
-    swing_height: wp.vec4  # [m] highest that each paw has been above the ground since it left it
-    error_xy: float  # [m/s] sum over settled policy steps of the episode
-    error_yaw: float  # [rad/s]
-    settled: float  # policy steps that these sums are of
-    command_level: int  # of the curriculum of commands
-    terrain_level: int  # of that of the ground
-    limit: wp.vec2  # [m] base beyond it along x or y has left the map, 0: no map
-    sum_xy: float  # [m/s] of errors in settled policy steps, counted
-    sum_yaw: float  # [rad/s]
-    sum_settled: float  # policy steps
-    score: float  # [m/s] commanded speed less twice the error, more on harder ground
+    recent: vec4l  # per paw, bit i: the paw touched down i policy steps ago, i < 45
+    recent_steps: wp.vec4  # number of touchdowns of each paw in the last 0.75 s
+    swing_height: wp.vec4  # [m] largest height of each paw above the ground in its present swing, 0 in contact
+    error_xy: float  # [m/s] sum of horizontal velocity errors over the episode's settled policy steps
+    error_yaw: float  # [rad/s] sum of absolute yaw rate errors over them
+    settled: float  # number of settled policy steps: those long enough after a command
+    command_level: int  # level of the command curriculum
+    terrain_level: int  # level of the terrain curriculum (row of the map)
+    limit: wp.vec2  # [m] half extents of the map along x, y, 0: no map
+    sum_xy: float  # [m/s] sum of horizontal velocity errors over settled policy steps
+    sum_yaw: float  # [rad/s] sum of absolute yaw rate errors over them
+    sum_settled: float  # number of settled policy steps
+    score: float  # [m/s] sum over them of commanded speed less twice the error, weighted by the terrain level
     all_steps: float  # policy steps
     minutes: float  # [min] simulated
     seconds_walking: float  # [s] simulated with a command to move
     falls: float  # episodes that ended with failure
-    touchdowns: float  # of a quarter of the paws, while commanded to move
-    apexes: float  # [m] sum of their swings' highest points
+    touchdowns: float  # touchdowns per paw (0.25 for each) while commanded to move
+    apexes: float  # [m] sum of `swing_height` at these touchdowns, times 0.25
 
 
 @wp.func
@@ -50,16 +50,16 @@ def velocity_error(robot: RobotView, state: VelocityState) -> wp.vec3:
 
 
 @wp.func
-def follow_steps(robot: RobotView, state: VelocityState) -> VelocityState:
-    """Return the state with updated step counts and swing heights of the paws."""
+def update_step_counts(robot: RobotView, state: VelocityState) -> VelocityState:
+    """Return the state with updated touchdown history, touchdown counts and swing heights of the paws."""
     t = state
     for k in range(4):
-        came_down = robot.first_contact[k]
+        touchdown = robot.first_contact[k]
         oldest = (state.recent[k] >> wp.int64(44)) & wp.int64(1)
-        kept = (state.recent[k] << wp.int64(1)) & wp.int64(35184372088831)  # 2^45 - 1
-        t.recent[k] = kept | wp.int64(came_down)
-        t.recent_steps[k] = state.recent_steps[k] + came_down - float(oldest)
-        if came_down > 0.0 and state.standing == 0:
+        shifted = (state.recent[k] << wp.int64(1)) & wp.int64(35184372088831)  # 2^45 - 1
+        t.recent[k] = shifted | wp.int64(touchdown)
+        t.recent_steps[k] = state.recent_steps[k] + touchdown - float(oldest)
+        if touchdown > 0.0 and state.standing == 0:
             t.touchdowns = t.touchdowns + 0.25
             t.apexes = t.apexes + 0.25 * state.swing_height[k]
         t.swing_height[k] = wp.where(robot.contact[k] > 0.0, 0.0, wp.max(state.swing_height[k], robot.paw_height[k]))
@@ -68,8 +68,8 @@ def follow_steps(robot: RobotView, state: VelocityState) -> VelocityState:
 
 @wp.func
 def advance_velocity(robot: RobotView, state: VelocityState, settle: float) -> VelocityState:
-    """Return the state one policy step later; errors count from `settle` policy steps after a command on."""
-    t = follow_steps(robot, state)
+    """Return the state after one more policy step; errors count later than `settle` policy steps after a command."""
+    t = update_step_counts(robot, state)
     t.steps = state.steps + 1
     t.command_steps = state.command_steps + 1
     phase = state.phase + state.pace
@@ -81,7 +81,7 @@ def advance_velocity(robot: RobotView, state: VelocityState, settle: float) -> V
     error = velocity_error(robot, state)
     xy = wp.length(wp.vec2(error[0], error[1]))
     yaw = wp.abs(error[2])
-    if t.command_steps > int(settle) and xy < ABSURD and yaw < ABSURD:  # both false if not a number
+    if t.command_steps > int(settle) and xy < MAX_COUNTED_ERROR and yaw < MAX_COUNTED_ERROR:  # both false for NaN
         speed = wp.length(wp.vec2(state.command[0], state.command[1])) + 0.3 * wp.abs(state.command[2])
         t.error_xy = state.error_xy + xy
         t.error_yaw = state.error_yaw + yaw
@@ -95,13 +95,13 @@ def advance_velocity(robot: RobotView, state: VelocityState, settle: float) -> V
 
 @wp.func
 def mean_error(state: VelocityState) -> float:
-    """Return the episode's mean error [m/s]: of the velocity in the plane, and 0.3 m of that of the yaw rate."""
+    """Return the episode's mean error [m/s]: horizontal velocity error + 0.3 m times yaw rate error [rad/s]."""
     return (state.error_xy + 0.3 * state.error_yaw) / wp.max(state.settled, 1.0)
 
 
 @wp.func
 def tracking_error(robot: RobotView, state: VelocityState) -> float:
-    """Mean error of the episode [m/s]."""
+    """Return `mean_error` of the episode [m/s]; `robot` is unused (signature of curriculum errors)."""
     return mean_error(state)
 
 

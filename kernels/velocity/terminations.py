@@ -1,4 +1,4 @@
-"""Why an episode of velocity tracking ends, besides what ends any task's."""
+"""Terminations of velocity tracking; `mdp.terminations` has those of all tasks."""
 
 import warp as wp
 
@@ -8,17 +8,17 @@ from .state import VelocityState
 
 @wp.func
 def finished(robot: RobotView, state: VelocityState) -> bool:
-    """The episode has lasted as long as it should."""
+    """Episode of `state.episode_steps` policy steps; never if that is 0."""
     return state.episode_steps > 0 and state.steps >= state.episode_steps
 
 
 @wp.func
 def off_map(pos: wp.vec3, limit: wp.vec2) -> bool:
-    """Return whether a base position [m] is beyond the limit of a map along x or y; never without a map."""
+    """Return whether a base position [m], world, is beyond the map's half extents `limit` (x, y) [m]; 0: no map."""
     return limit[0] > 0.0 and (wp.abs(pos[0]) > limit[0] or wp.abs(pos[1]) > limit[1])
 
 
 @wp.func
 def left_map(robot: RobotView, state: VelocityState) -> bool:
-    """The base comes near the edge of the map."""
+    """Base origin beyond the edge of the map; never without a map."""
     return off_map(robot.pos, state.limit)

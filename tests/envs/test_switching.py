@@ -129,7 +129,7 @@ def test_configuration_names_all_tasks_and_handovers(followed):
     assert [task["name"] for task in config["tasks"]] == [task.name for task in policies.skills]
     assert config["handovers"][0] == {
         "source": "velocity-flat", "target": "vertical-jump",
-        "when": f"{HANDOVERS}:come_to_a_stop", "begin": f"{HANDOVERS}:begin_jump",
+        "when": f"{HANDOVERS}:walk_to_jump_due", "begin": f"{HANDOVERS}:begin_jump",
     }  # fmt: skip
     assert len(config["handovers"]) == 4 and "tasks" not in Env(env.tasks[0], 1, device="cpu").config()
     assert dataclasses.asdict(policies.names) == {

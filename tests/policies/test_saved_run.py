@@ -125,7 +125,7 @@ def test_restores_ground_randomisation_with_none_as_default(saved):
 
 
 @pytest.mark.parametrize(
-    "name", ["wp", "SOON", "__doc__", "landing_error_estimate", "", "cartwheel", "success:x", 3, None]
+    "name", ["wp", "JUST_LANDED_STEPS", "__doc__", "landing_error_estimate", "", "cartwheel", "success:x", 3, None]
 )
 @pytest.mark.parametrize("prefix", ["", "jumper_warp.kernels.jump.terminations:", "jumper_warp.kernels.jump.phase:"])
 def test_refuses_a_function_that_is_not_a_termination(saved, name, prefix):

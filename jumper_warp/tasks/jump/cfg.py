@@ -10,7 +10,7 @@ from typing import Any, Literal
 
 import warp as wp
 
-from jumper_warp.kernels.jump.ground_draws import EVERY_SIDE, GroundRanges
+from jumper_warp.kernels.jump.ground_draws import MIN_EDGE_DISTANCE, GroundRanges
 from jumper_warp.kernels.jump.reset import JumpLevel, JumpSettings
 from jumper_warp.kernels.jump.start_states import ResetRanges
 from jumper_warp.kernels.jump.state import vec_start_modes
@@ -50,7 +50,7 @@ class GroundCfg:
         for name, value in vars(self).items():
             if isinstance(value, tuple) and not 0.0 < value[0] <= value[1] < math.inf:
                 raise InputError(f"ground {name} must be (lower, upper), positive and finite, got {value}")
-        for name, least in (("room", EVERY_SIDE), ("clearance", 0.0)):
+        for name, least in (("room", MIN_EDGE_DISTANCE), ("clearance", 0.0)):
             if not least <= getattr(self, name) < math.inf:
                 raise InputError(f"ground {name} must be finite and at least {least:g}, got {getattr(self, name)}")
 

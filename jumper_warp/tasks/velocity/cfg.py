@@ -10,7 +10,7 @@ import newton
 import warp as wp
 
 from jumper_warp.kernels.velocity.commands import CommandRanges
-from jumper_warp.kernels.velocity.start_states import Map, VelocitySettings
+from jumper_warp.kernels.velocity.start_states import TileMap, VelocitySettings
 from jumper_warp.robot.terrain import TerrainCfg, terrain_map
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
 from jumper_warp.utils.checks import check_finite, check_probabilities
@@ -116,7 +116,7 @@ class VelocityResetCfg:
         """Return the kernels' `VelocitySettings`: angles in radians, times in policy steps of step_dt [s]."""
         settings = filled(VelocitySettings(), self, skip=("episode", "gait", "terrain"), degrees=("tilt", "heading"))
         settings.episode_steps, settings.pace = round(self.episode / step_dt), self.gait * step_dt
-        tiles = Map()
+        tiles = TileMap()
         tiles.rows, tiles.cols, tiles.tile = self.terrain.rows, self.terrain.cols, self.terrain.tile
         settings.map = tiles
         return settings

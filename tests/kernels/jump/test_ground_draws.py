@@ -24,48 +24,49 @@ from jumper_warp.tasks.randomization import RandomizationCfg
 from simulation_helpers import WEIGHT, paw_centres, paw_forces
 
 N = 8192
-PAWS = np.array([0.24, 0.22])  # [m] ahead and beside, at most: the default pose reaches farther ahead, squats beside
-MARGIN, ROOM, CLEARANCE = 0.05, 0.30, 0.12  # [m]
+PAWS = np.array([0.24, 0.22])  # [m] largest distance of a paw ahead (default pose) and beside (squats) the base
+MARGIN, ROOM, CLEARANCE = 0.05, 0.30, 0.12  # [m] MIN_EDGE_DISTANCE, and `GroundCfg` of the tasks, as the next line
 DROP, RISE, MASS, FRICTION = (0.03, 0.20), (0.02, 0.08), (5.0, 100.0), (0.3, 1.0)  # [m], [m], [kg], [1]
 KINDS = {"platform": GroundCfg(platform=1.0), "block": GroundCfg(block=1.0)}
 WIDE = tuple(Level((-1.5, -1.5, 0.0), (1.5, 1.5, 0.0), height) for height in ((0.22, 0.35), (0.30, 0.45)))
-"""Goals all around, most of them far enough for an edge on the way."""
+"""Levels with goals in all directions, most of them far enough for an edge of a block before the goal."""
 FAR = (Level((1.8, -0.2, 0.0), (2.2, 0.2, 0.0), (0.22, 0.35)),)
-"""Goals with room for an edge on the way at any heading."""
+"""Level with goals far enough for an edge of a block before the goal, at any heading."""
 
 
-def extents(heading):
-    """Half extents [m] along world x and y of the rectangle of the paws, by its corners, (worlds, 2)."""
+def half_extents(heading):
+    """Return the half extents [m] along world x and y, (worlds, 2), of the paws' rectangle turned by heading [rad]."""
     corners = PAWS * [[1, 1], [1, -1], [-1, 1], [-1, -1]]
     c, s = np.cos(heading), np.sin(heading)
     turn = np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
     return np.abs(np.einsum("wij,cj->wci", turn, corners)).max(axis=1)
 
 
-def drawn_blocks(env):
-    """Fields of every world's block."""
+def block_fields(env):
+    """Return the fields of all blocks as arrays (num_envs, ...) by name."""
     values = env._scene.ground.blocks.numpy()
     return {name: values[name].astype(float) for name in values.dtype.names}
 
 
 class Scenes(Starts):
-    """Thousands of starts on one kind of ground; the attributes of `Starts`, and of those `taken` the block's too."""
+    """`Starts` of one mode on one kind of ground (key of KINDS), with the blocks (a platform is one too)."""
 
     def __init__(self, env, kind, start_mode):
         super().__init__(env, start_mode, ground=KINDS[kind])
-        self.block = {name: values[self.drawn] for name, values in drawn_blocks(env).items()}
-        self.foot = extents(self.episodes["heading"])
-        self.taken = self.block["exists"] == 1
+        self.block = {name: values[self.drawn] for name, values in block_fields(env).items()}
+        self.foot = half_extents(self.episodes["heading"])  # [m] (worlds, 2)
+        self.has_block = self.block["exists"] == 1
         rows = np.arange(len(self.goal))
-        self.across = np.argmax(np.abs(self.goal[:, :2]), axis=1)  # axis across which a block's near side lies
-        self.way, self.reach = np.abs(self.goal[rows, self.across]), self.foot[rows, self.across]
+        self.across = np.argmax(np.abs(self.goal[:, :2]), axis=1)  # axis (0 x, 1 y) that a block's near side crosses
+        self.way, self.reach = np.abs(self.goal[rows, self.across]), self.foot[rows, self.across]  # [m] along it
 
-    def of_block(self, name):
-        return self.block[name][self.taken]
+    def block_field(self, name):
+        """Return a field of the blocks that exist."""
+        return self.block[name][self.has_block]
 
 
-def drawing_env(name, count, ground, seed=2, reset=None, **changes):
-    """Environment whose starts have a drawn ground, its robots nominal."""
+def sampled_ground_env(name, count, ground, seed=2, reset=None, **changes):
+    """Return a reset environment with sampled ground (a `GroundCfg`), without other randomisation."""
     task = dataclasses.replace(make_task(name), randomization=RandomizationCfg.off(), **changes)
     reset = dataclasses.replace(reset or task.reset.settings, ground=ground)
     return make_env(count, task=resetting(task, reset), seed=seed, randomize=True)
@@ -74,193 +75,188 @@ def drawing_env(name, count, ground, seed=2, reset=None, **changes):
 @pytest.fixture(scope="module", params=PLACES)
 def env(request):
     levels = {"levels": WIDE} if request.param == "omnidirectional-jump" else {}
-    return drawing_env(request.param, N, GroundCfg(platform=0.5, block=0.5), **levels)
+    return sampled_ground_env(request.param, N, GroundCfg(platform=0.5, block=0.5), **levels)
 
 
 @pytest.fixture(scope="module")
 def scenes(env):
-    """(kind, scheme) -> Scenes"""
+    """Return the `Scenes` of every (kind, start mode)."""
     return {
         (kind, start_mode): Scenes(env, kind, start_mode) for kind in KINDS for start_mode in ("standing", "default")
     }
 
 
 @pytest.fixture(params=["standing", "default"])
-def on_platform(scenes, request):
+def platform_starts(scenes, request):
     return scenes["platform", request.param]
 
 
 @pytest.fixture(params=["standing", "default"])
-def to_block(scenes, request):
+def block_starts(scenes, request):
     return scenes["block", request.param]
 
 
-# ---------------------------------------------------------------- platforms
-
-
-def test_all_paws_stand_on_the_platform_away_from_its_edges(on_platform):
-    taken = on_platform.taken
-    paws, height = on_platform.paws[taken], on_platform.of_block("height")
-    assert taken.sum() > 500 and covers(height, *DROP)
+def test_all_paws_stand_on_the_platform_away_from_its_edges(platform_starts):
+    has_block = platform_starts.has_block
+    paws, height = platform_starts.paws[has_block], platform_starts.block_field("height")
+    assert has_block.sum() > 500 and covers(height, *DROP)
     np.testing.assert_allclose(paws[..., 2], height[:, None] + PAW_RADIUS + np.zeros(4), atol=2e-4)
-    inside = on_platform.of_block("half")[:, None] - np.abs(paws[..., :2])
+    inside = platform_starts.block_field("half")[:, None] - np.abs(paws[..., :2])
     assert inside.min() >= MARGIN - 2e-4
-    np.testing.assert_allclose(on_platform.paws[~taken][..., 2], PAW_RADIUS, atol=2e-4)
+    np.testing.assert_allclose(platform_starts.paws[~has_block][..., 2], PAW_RADIUS, atol=2e-4)
 
 
-def test_edges_of_a_platform_are_somewhere_within_the_room(on_platform):
-    beyond = on_platform.of_block("half") - on_platform.foot[on_platform.taken]
+def test_platforms_are_at_rest_at_the_origin_with_independent_uniform_extents(platform_starts):
+    beyond = platform_starts.block_field("half") - platform_starts.foot[platform_starts.has_block]
     assert covers(beyond[:, 0], MARGIN, ROOM) and covers(beyond[:, 1], MARGIN, ROOM)
     assert np.abs(np.corrcoef(beyond.T)[0, 1]) < 0.2
-    assert not on_platform.of_block("center").any() and not on_platform.of_block("start").any()
-    assert not on_platform.of_block("velocity").any()
+    assert not platform_starts.block_field("center").any() and not platform_starts.block_field("start").any()
+    assert not platform_starts.block_field("velocity").any()
 
 
-def test_robots_are_as_high_above_the_platform_as_their_level_says(env, scenes):
-    found = scenes["platform", "standing"]
-    above, counts = found.pos[:, 2] - np.where(found.taken, found.block["height"], 0.0), []
+def test_base_height_above_a_platform_is_that_of_the_level_or_the_default_pose(env, scenes):
+    sample = scenes["platform", "standing"]
+    above, counts = sample.pos[:, 2] - np.where(sample.has_block, sample.block["height"], 0.0), []
     for number, level in enumerate(env.task.levels):
-        mine = found.taken & (found.level == number)
-        counts.append(mine.sum())
-        assert counts[-1] == 0 or covers(above[mine], *level.base_height, 6.0 / counts[-1])
+        chosen = sample.has_block & (sample.level == number)
+        counts.append(chosen.sum())
+        assert counts[-1] == 0 or covers(above[chosen], *level.base_height, 6.0 / counts[-1])
     assert max(counts) > 300, counts
-    found = scenes["platform", "default"]
-    above = found.pos[:, 2] - np.where(found.taken, found.block["height"], 0.0)
+    sample = scenes["platform", "default"]
+    above = sample.pos[:, 2] - np.where(sample.has_block, sample.block["height"], 0.0)
     np.testing.assert_allclose(above, env.sim.model.joint_q.numpy()[2], atol=1e-5)
 
 
-def test_paws_land_clear_of_the_platform_where_there_is_one(on_platform):
-    apart = np.abs(on_platform.goal[:, :2]) - 2.0 * on_platform.foot  # between the rectangles before and after
-    gap = (apart[on_platform.taken] - on_platform.of_block("half") + on_platform.foot[on_platform.taken]).max(axis=1)
+def test_a_platform_exists_only_where_paws_land_clear_of_it(platform_starts):
+    has_block = platform_starts.has_block
+    apart = np.abs(platform_starts.goal[:, :2]) - 2.0 * platform_starts.foot  # [m] between paws at start and goal
+    gap = (apart[has_block] - platform_starts.block_field("half") + platform_starts.foot[has_block]).max(axis=1)
     assert gap.min() >= CLEARANCE - 1e-4 and gap.min() < CLEARANCE + 0.02
-    widest = apart.max(axis=1) - MARGIN
-    assert not on_platform.taken[widest < CLEARANCE - 1e-4].any()
-    assert on_platform.taken[widest > CLEARANCE + ROOM - MARGIN + 1e-4].all()
-    assert 0.1 < on_platform.taken.mean() < 0.9
+    widest = apart.max(axis=1) - MARGIN  # [m] gap to the smallest platform
+    assert not has_block[widest < CLEARANCE - 1e-4].any()
+    assert has_block[widest > CLEARANCE + ROOM - MARGIN + 1e-4].all()
+    assert 0.1 < has_block.mean() < 0.9
 
 
-# ---------------------------------------------------------------- blocks
-
-
-def test_a_block_is_under_all_paws_at_the_goal(to_block):
-    taken = to_block.taken
-    off = np.abs(to_block.goal[taken, :2] - to_block.of_block("center")) + to_block.foot[taken]
-    inside = to_block.of_block("half") - off
-    assert taken.sum() > 500 and inside.min() >= MARGIN - 1e-4
-    rows = np.arange(taken.sum())
-    beside = inside[rows, 1 - to_block.across[taken]]
+def test_a_block_extends_beyond_all_paws_at_the_goal_by_independent_distances(block_starts):
+    has_block = block_starts.has_block
+    outermost = np.abs(block_starts.goal[has_block, :2] - block_starts.block_field("center"))
+    inside = block_starts.block_field("half") - outermost - block_starts.foot[has_block]  # [m] paws from the edges
+    assert has_block.sum() > 500 and inside.min() >= MARGIN - 1e-4
+    rows = np.arange(has_block.sum())
+    beside = inside[rows, 1 - block_starts.across[has_block]]
     assert covers(beside, MARGIN, ROOM)
-    far = np.abs(to_block.of_block("center")) + to_block.of_block("half")
-    behind = far[rows, to_block.across[taken]] - to_block.way[taken] - to_block.reach[taken]
+    far = np.abs(block_starts.block_field("center")) + block_starts.block_field("half")
+    behind = far[rows, block_starts.across[has_block]] - block_starts.way[has_block] - block_starts.reach[has_block]
     assert covers(behind, MARGIN, ROOM) and np.abs(np.corrcoef(behind, beside)[0, 1]) < 0.2
 
 
-def test_robots_stand_on_the_floor_outside_the_block(to_block):
-    taken = to_block.taken
-    np.testing.assert_allclose(to_block.paws[..., 2], PAW_RADIUS, atol=2e-4)
-    off = np.abs(to_block.paws[taken, :, :2] - to_block.of_block("center")[:, None])
-    outside = (off - to_block.of_block("half")[:, None]).max(axis=2)
+def test_robots_stand_on_the_floor_outside_the_block(block_starts):
+    has_block = block_starts.has_block
+    np.testing.assert_allclose(block_starts.paws[..., 2], PAW_RADIUS, atol=2e-4)
+    offset = np.abs(block_starts.paws[has_block, :, :2] - block_starts.block_field("center")[:, None])
+    outside = (offset - block_starts.block_field("half")[:, None]).max(axis=2)  # [m] from the block
     assert outside.min() >= MARGIN - 2e-4
 
 
-def test_the_near_side_is_between_the_paws_before_and_after_the_jump_and_more_often_near(to_block):
-    taken, rows = to_block.taken, np.arange(to_block.taken.sum())
-    axis = to_block.across[taken]
-    sign = np.sign(to_block.goal[taken][rows, axis])
-    near = sign * to_block.of_block("center")[rows, axis] - to_block.of_block("half")[rows, axis]
-    first = to_block.reach[taken] + MARGIN
-    last = to_block.way[taken] - to_block.reach[taken] - CLEARANCE
+def test_square_root_of_the_near_sides_position_between_the_paws_is_uniform(block_starts):
+    has_block, rows = block_starts.has_block, np.arange(block_starts.has_block.sum())
+    axis = block_starts.across[has_block]
+    sign = np.sign(block_starts.goal[has_block][rows, axis])
+    near = sign * block_starts.block_field("center")[rows, axis] - block_starts.block_field("half")[rows, axis]
+    first = block_starts.reach[has_block] + MARGIN
+    last = block_starts.way[has_block] - block_starts.reach[has_block] - CLEARANCE
     assert (near >= first - 1e-4).all() and (near <= last + 1e-4).all()
-    wide = last - first > 0.05
-    share = ((near - first) / (last - first))[wide]
-    assert kstest(np.sqrt(share.clip(0.0)), "uniform").pvalue > 1e-3
+    wide = last - first > 0.05  # [m]
+    fraction = ((near - first) / (last - first))[wide]
+    assert kstest(np.sqrt(fraction.clip(0.0)), "uniform").pvalue > 1e-3
     assert set(axis) == {0, 1} and set(sign) == {-1.0, 1.0}
 
 
-def test_there_is_a_block_exactly_where_there_is_room(to_block):
-    room = to_block.way - 2.0 * to_block.reach - MARGIN - CLEARANCE
-    assert to_block.taken[room > 1e-4].all() and not to_block.taken[room < -1e-4].any()
-    assert 0.1 < to_block.taken.mean() < 0.9
+def test_a_block_exists_exactly_where_its_near_side_fits(block_starts):
+    room = block_starts.way - 2.0 * block_starts.reach - MARGIN - CLEARANCE
+    assert block_starts.has_block[room > 1e-4].all() and not block_starts.has_block[room < -1e-4].any()
+    assert 0.1 < block_starts.has_block.mean() < 0.9
 
 
-def test_blocks_have_uniform_heights_masses_and_frictions(to_block):
+def test_blocks_start_at_rest_with_uniform_heights_masses_and_frictions(block_starts):
     for name, (lower, upper) in (("height", RISE), ("mass", MASS), ("friction", FRICTION)):
-        share = (to_block.of_block(name) - lower) / (upper - lower)
-        assert share.min() >= -1e-5 and share.max() <= 1.0 + 1e-5
-        assert kstest(share, "uniform").pvalue > 1e-3, name
-    np.testing.assert_array_equal(to_block.of_block("center"), to_block.of_block("start"))
-    assert not to_block.of_block("velocity").any()
-
-
-# ---------------------------------------------------------------- both
+        fraction = (block_starts.block_field(name) - lower) / (upper - lower)
+        assert fraction.min() >= -1e-5 and fraction.max() <= 1.0 + 1e-5
+        assert kstest(fraction, "uniform").pvalue > 1e-3, name
+    np.testing.assert_array_equal(block_starts.block_field("center"), block_starts.block_field("start"))
+    assert not block_starts.block_field("velocity").any()
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("start_mode", ["standing", "default"])
 def test_no_start_collides(scenes, kind, start_mode):
-    found = scenes[kind, start_mode]
-    assert not found.flags.any() and found.fallbacks < 0.005
+    sample = scenes[kind, start_mode]
+    assert not sample.flags.any() and sample.fallbacks < 0.005
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_an_episode_knows_the_ground_at_its_goal(scenes, kind):
-    found = scenes[kind, "standing"]
-    expected = np.where(found.taken, found.block["height"], 0.0) if kind == "block" else np.zeros(len(found.goal))
-    np.testing.assert_allclose(found.episodes["goal_ground"], expected, atol=1e-6)
+def test_goal_ground_is_the_blocks_height_or_0_beside_a_platform(scenes, kind):
+    sample = scenes[kind, "standing"]
+    expected = (
+        np.where(sample.has_block, sample.block["height"], 0.0) if kind == "block" else np.zeros(len(sample.goal))
+    )
+    np.testing.assert_allclose(sample.episodes["goal_ground"], expected, atol=1e-6)
 
 
 @pytest.mark.parametrize("kind", KINDS)
 @pytest.mark.parametrize("start_mode", ["in_flight", "touchdown", "after_landing"])
-def test_the_ground_is_level_where_a_jump_has_begun(env, kind, start_mode):
+def test_starts_after_takeoff_have_no_block_even_after_an_episode_with_one(env, kind, start_mode):
     for start in ("default", start_mode):
         begin_by(env, only(start, resets_of(env), ground=KINDS[kind]))
         edit_episodes(env, level=len(env.task.levels) - 1)
         env.reset()
-        assert drawn_blocks(env)["exists"].any() == (start == "default")
+        assert block_fields(env)["exists"].any() == (start == "default")
     assert not episodes_of(env)["goal_ground"].any() and not collision_flags(env).any()
 
 
-def test_kinds_are_drawn_by_their_shares_where_there_is_room():
-    env = drawing_env("horizontal-jump", N, GroundCfg(platform=0.3, block=0.45), levels=FAR, reset=only("default"))
-    block = drawn_blocks(env)
-    platform = (block["exists"] == 1) & (block["mass"] > 1.0e5)
+def test_kinds_of_ground_are_sampled_with_their_probabilities():
+    env = sampled_ground_env(
+        "horizontal-jump", N, GroundCfg(platform=0.3, block=0.45), levels=FAR, reset=only("default")
+    )
+    block = block_fields(env)
+    platform = (block["exists"] == 1) & (block["mass"] > 1.0e5)  # [kg] of a fixed block
     sliding = (block["exists"] == 1) & (block["mass"] < 1.0e3)
-    found = np.array([platform.mean(), sliding.mean(), 1.0 - block["exists"].mean()])
+    sample = np.array([platform.mean(), sliding.mean(), 1.0 - block["exists"].mean()])
     expected = np.array([0.3, 0.45, 0.25])
-    assert np.abs(found - expected).max() < 4.0 * np.sqrt(0.25 / N)
+    assert np.abs(sample - expected).max() < 4.0 * np.sqrt(0.25 / N)
 
 
-def test_every_episode_draws_its_ground_anew():
-    env = drawing_env("horizontal-jump", 64, KINDS["block"], levels=FAR, reset=only("default"))
-    first = drawn_blocks(env)
-    edit_episodes(env, [3, 5], steps=5000)
+def test_only_worlds_with_a_new_episode_sample_new_ground():
+    env = sampled_ground_env("horizontal-jump", 64, KINDS["block"], levels=FAR, reset=only("default"))
+    first = block_fields(env)
+    edit_episodes(env, [3, 5], steps=5000)  # beyond the time limit
     env.step(torch.zeros((64, 12)))
     assert env.done.nonzero().ravel().tolist() == [3, 5]
-    second = drawn_blocks(env)
+    second = block_fields(env)
     changed = (first["mass"] != second["mass"]) | (first["half"] != second["half"]).any(axis=1)
     assert changed.nonzero()[0].tolist() == [3, 5]
 
 
-def test_where_there_is_no_block_nothing_of_one_appears():
-    env = drawing_env("horizontal-jump", 256, GroundCfg(platform=0.2, block=0.2), levels=FAR, reset=only("default"))
-    none = drawn_blocks(env)["exists"] == 0
+def test_fields_of_missing_blocks_stay_0_while_stepping():
+    env = sampled_ground_env(
+        "horizontal-jump", 256, GroundCfg(platform=0.2, block=0.2), levels=FAR, reset=only("default")
+    )
+    none = block_fields(env)["exists"] == 0
     for _ in range(5):
         env.step(torch.zeros((256, 12)))
         assert not env.done.any()
-    after = drawn_blocks(env)
+    after = block_fields(env)
     assert none.any() and not none.all()
     for name, values in after.items():
         assert not values[none].any(), name
     assert all(np.isfinite(values).all() for values in after.values())
 
 
-# ---------------------------------------------------------------- standing there
-
-
 def hold(env, steps=20):
-    """Hold the angles that the robots have for some steps, and fail where an episode ends or a world breaks."""
+    """Command the present motor angles for `steps` policy steps; fail if an episode ends or a world diverges."""
     angles = env.sim.joint_q()[:, 7 + MOTOR_SLOTS]
-    scale = np.radians(np.tile([15.0, 90.0, 90.0], 4))
+    scale = np.radians(np.tile([15.0, 90.0, 90.0], 4))  # action scale of the task
     action = torch.from_numpy((angles - DEFAULT_ANGLE) / scale).float()
     for _ in range(steps):
         env.step(action)
@@ -269,10 +265,12 @@ def hold(env, steps=20):
 
 
 @pytest.mark.parametrize("start_mode", ["standing", "default"])
-def test_robots_stand_still_on_platforms_which_do_not_move(start_mode):
-    env = drawing_env("horizontal-jump", 64, KINDS["platform"], levels=FAR, reset=only(start_mode, heading=180.0))
-    edit_episodes(env, command_step=1000)
-    block, before = drawn_blocks(env), env.sim.joint_q()
+def test_robots_and_platforms_stay_at_rest(start_mode):
+    env = sampled_ground_env(
+        "horizontal-jump", 64, KINDS["platform"], levels=FAR, reset=only(start_mode, heading=180.0)
+    )
+    edit_episodes(env, command_step=1000)  # later than the test's steps
+    block, before = block_fields(env), env.sim.joint_q()
     assert block["exists"].all()
     hold(env)
     np.testing.assert_allclose(
@@ -281,12 +279,13 @@ def test_robots_stand_still_on_platforms_which_do_not_move(start_mode):
     assert np.abs(env.sim.joint_q()[:, :3] - before[:, :3]).max() < 0.06
     assert np.abs(env.sim.solver.block_position()).max() < 1e-6
     assert (env.task_arrays()["phase"] == STANCE).all()
-    np.testing.assert_allclose(env.obs[:, 2], env.sim.joint_q()[:, 2] - block["height"], atol=1e-5)
+    observed_height = env.obs[:, 2]
+    np.testing.assert_allclose(observed_height, env.sim.joint_q()[:, 2] - block["height"], atol=1e-5)
 
 
-def test_robots_stand_still_on_the_block_at_their_goal():
-    env = drawing_env("horizontal-jump", 64, KINDS["block"], levels=FAR, reset=only("default", heading=180.0))
-    block, episodes = drawn_blocks(env), env.task_arrays()
+def test_robots_put_onto_the_block_at_their_goal_stay_at_rest():
+    env = sampled_ground_env("horizontal-jump", 64, KINDS["block"], levels=FAR, reset=only("default", heading=180.0))
+    block, episodes = block_fields(env), env.task_arrays()
     assert block["exists"].all()
     q = env.sim.joint_q().copy()
     q[:, :2] += episodes["goal"][:, :2]

@@ -6,16 +6,7 @@ import pytest
 import torch
 from scipy.spatial.transform import Rotation
 
-from jump_helpers import (
-    DEG,
-    edit_coordinates,
-    edit_episodes,
-    ending_names,
-    episodes_of,
-    make_env,
-    only,
-    random_actions,
-)
+from jump_helpers import DEG, edit_coordinates, edit_episodes, ending_names, episodes_of, make_env, only, random_actions
 from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
@@ -23,48 +14,45 @@ from jumper_warp.registry import make_task
 TASK = make_task("horizontal-jump")
 N = 64
 REST = torch.zeros((N, 12))
-AGAIN = np.arange(10, 20)
-"""Worlds that get another goal, where a test asks for some."""
+NEXT_JUMP = np.arange(10, 20)
+"""Indices of the worlds that get another goal."""
 
 
 @pytest.fixture(scope="module")
 def env():
-    """Standing starts with any heading, nominal, without noise; another goal is always planned past the first level."""
-    return make_env(N, task=again_and_again(1.0), reset=only("default", heading=180.0), seed=4)
+    """Return N nominal worlds without noise, default pose, any heading; a next jump is planned above level 0."""
+    return make_env(N, task=task_with_next_jump(1.0), reset=only("default", heading=180.0), seed=4)
 
 
-def again_and_again(share):
-    """Return the task in which a share of the landed robots gets another goal past the first level."""
-    levels = (TASK.levels[0], *(dataclasses.replace(level, next_jump_probability=share) for level in TASK.levels[1:]))
-    return dataclasses.replace(TASK, levels=levels)
+def task_with_next_jump(probability):
+    """Return the task with this `next_jump_probability` at all levels but level 0."""
+    later = (dataclasses.replace(level, next_jump_probability=probability) for level in TASK.levels[1:])
+    return dataclasses.replace(TASK, levels=(TASK.levels[0], *later))
 
 
-def stand(env, **fields):
-    """Begin episodes in the default pose, and overwrite fields of all of them."""
+def set_standing(env, **fields):
+    """Begin episodes in the default pose, without a command or next jump, and overwrite fields of all."""
     env.auto_reset = True
     env.reset()
     edit_episodes(env, **({"command_step": 1000, "next_jump_step": 0} | fields))
 
 
 def yaw_of(arrays):
-    """Return the yaw of the bases [rad]."""
+    """Return the yaw of all bases [rad], (worlds,); arrays: of `Env.task_arrays`."""
     return Rotation.from_quat(arrays["base_quat"]).as_euler("ZYX")[:, 0]
 
 
-def in_yaw_frame(vectors, yaw):
-    """Return horizontal vectors in axes turned about z."""
+def to_yaw_frame(vectors, yaw):
+    """Return vectors (worlds, 3) in axes turned about z by yaw [rad], (worlds,)."""
     return Rotation.from_euler("z", yaw[:, None]).inv().apply(vectors)
 
 
-def angle_between(one, other):
-    """Return the distance of two angles [rad] on the circle."""
-    return np.abs(np.angle(np.exp(1j * (one - other))))
+def angle_between(first, second):
+    """Return the absolute difference of two angles [rad] on the circle, 0 to pi."""
+    return np.abs(np.angle(np.exp(1j * (first - second))))
 
 
-# ---------------------------------------------------------------- turning the world
-
-
-def test_a_turned_world_runs_alike():
+def test_observations_and_rewards_do_not_depend_on_the_heading_of_the_world():
     """Two robots, one turned by 137 degrees, jump off under the same random actions."""
     env = make_env(2, task=TASK)
     turn = 137.0 * DEG
@@ -73,10 +61,10 @@ def test_a_turned_world_runs_alike():
     phases = set()
     for step, action in enumerate(random_actions(1, 30, seed=2)):
         action = 0.5 * action
-        action[:, [1, 2, 4, 5, 7, 8, 10, 11]] += 0.8 if step < 12 else -1.0
+        action[:, [1, 2, 4, 5, 7, 8, 10, 11]] += 0.8 if step < 12 else -1.0  # transversal motors: squat, then push
         env.step(action.repeat(2, 1))
-        for seen in (env.obs, env.critic_obs):
-            torch.testing.assert_close(seen[1], seen[0], atol=2e-3, rtol=2e-3)
+        for obs in (env.obs, env.critic_obs):
+            torch.testing.assert_close(obs[1], obs[0], atol=2e-3, rtol=2e-3)
         assert env.reward[1].item() == pytest.approx(env.reward[0].item(), abs=2e-3, rel=2e-3)
         assert env.done[0] == env.done[1]
         arrays = env.task_arrays()
@@ -89,7 +77,7 @@ def test_a_turned_world_runs_alike():
 
 
 @pytest.mark.parametrize("turn", [0.0, 90.0, 180.0])
-def test_an_evaluation_starts_with_its_heading_and_goal(turn):
+def test_an_evaluation_starts_with_its_heading_and_goal_before_the_command(turn):
     env = make_env(2, task=TASK)
     goals = np.array([[0.8, 0.2, 0.0], [0.3, -0.1, 0.0]])
     env.evaluation_reset(jump_commands(goals, 0.5, env.step_dt), headings=turn * DEG)
@@ -99,16 +87,13 @@ def test_an_evaluation_starts_with_its_heading_and_goal(turn):
                                [[0.8, 0.2], [0.3, -0.1]], atol=1e-5)  # fmt: skip
     np.testing.assert_allclose(arrays["heading"], turn * DEG, atol=1e-6)
     assert angle_between(yaw_of(arrays), turn * DEG).max() < 1e-5
-    assert not env.obs[:, :2].any()  # the jump is commanded later
+    assert not env.obs[:, :2].any()  # goal_x, goal_y: 0 before the command after 0.5 s
     assert (arrays["next_jump_step"] == 0).all()
 
 
-# ---------------------------------------------------------------- another jump
-
-
-def land(env, **fields):
-    """Let some robots stand as if landed a fifth of a second ago, at different places, headings and steps."""
-    stand(env, level=1)
+def set_landed(env, **fields):
+    """Let all robots stand as if landed 12 policy steps ago, with different positions, steps and jumps."""
+    set_standing(env, level=1)
     edit_episodes(env, phase=LANDED, phase_steps=12, apex_passed=1, steps=np.arange(N), command_step=0)
     edit_episodes(env, jumps=np.arange(N) % 3)
     edit_episodes(env, **fields)
@@ -116,55 +101,55 @@ def land(env, **fields):
         edit_coordinates(env, world, q={0: 0.1 * world, 1: -0.2 * world})
 
 
-def every_array(env):
-    """Return what is known of every world's episode."""
+def all_fields(env):
+    """Return the fields of `Env.task_arrays` and `episodes_of`."""
     return env.task_arrays() | episodes_of(env)
 
 
 @pytest.fixture(scope="module")
-def second(env):
-    """Episodes before and after the step in which some worlds got another goal."""
-    land(env)
-    edit_episodes(env, AGAIN, next_jump_step=13, level=np.arange(10) % 4 + 1)
+def next_jump(env):
+    """Return the task arrays before and after the step in which the worlds NEXT_JUMP got another goal."""
+    set_landed(env)
+    edit_episodes(env, NEXT_JUMP, next_jump_step=13, level=np.arange(10) % 4 + 1)
     before = env.task_arrays()
     env.step(REST)
     return before, env.task_arrays()
 
 
-def test_another_jump_begins_at_its_time_where_the_robot_is(second):
-    before, after = second
-    np.testing.assert_array_equal(np.flatnonzero(after["phase"] == STANCE), AGAIN)
+def test_a_next_jump_begins_at_its_step_in_stance_at_the_robots_position(next_jump):
+    before, after = next_jump
+    np.testing.assert_array_equal(np.flatnonzero(after["phase"] == STANCE), NEXT_JUMP)
     assert not after["done"].any()
-    np.testing.assert_array_equal(after["jumps"] - before["jumps"], np.isin(np.arange(N), AGAIN))
+    np.testing.assert_array_equal(after["jumps"] - before["jumps"], np.isin(np.arange(N), NEXT_JUMP))
     for name in ("phase_steps", "idle_steps", "apex_passed", "peak_tilt", "took_off", "touched_down", "at_apex"):
-        assert not after[name][AGAIN].any(), name
-    np.testing.assert_array_equal(after["start"][AGAIN], after["base_pos"][AGAIN])
-    np.testing.assert_array_equal(after["max_height"][AGAIN], after["base_pos"][AGAIN, 2])
-    assert angle_between(after["heading"], yaw_of(after))[AGAIN].max() < 1e-5
+        assert not after[name][NEXT_JUMP].any(), name
+    np.testing.assert_array_equal(after["start"][NEXT_JUMP], after["base_pos"][NEXT_JUMP])
+    np.testing.assert_array_equal(after["max_height"][NEXT_JUMP], after["base_pos"][NEXT_JUMP, 2])
+    assert angle_between(after["heading"], yaw_of(after))[NEXT_JUMP].max() < 1e-5
 
 
-def test_the_second_jump_is_commanded_at_once(second):
-    _, after = second
+def test_a_next_jump_is_commanded_at_once(next_jump):
+    _, after = next_jump
     np.testing.assert_array_equal(after["steps"], np.arange(1, N + 1))
-    np.testing.assert_array_equal(after["command_step"][AGAIN], after["steps"][AGAIN])
+    np.testing.assert_array_equal(after["command_step"][NEXT_JUMP], after["steps"][NEXT_JUMP])
 
 
-def shown(arrays):
-    """Return the way to the goal [m] ahead and to the left, as it is observed."""
-    return in_yaw_frame((arrays["goal"] - arrays["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(arrays))[:, :2]
+def goal_ahead_and_left(arrays):
+    """Return the vector from base to goal [m], ahead and to the left, (worlds, 2)."""
+    return to_yaw_frame((arrays["goal"] - arrays["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(arrays))[:, :2]
 
 
-def test_the_second_goal_is_seen_at_once(env):
-    land(env)
-    edit_episodes(env, AGAIN, next_jump_step=13)
+def test_the_goal_of_a_next_jump_is_observed_at_once(env):
+    set_landed(env)
+    edit_episodes(env, NEXT_JUMP, next_jump_step=13)
     env.step(REST)
     after = env.task_arrays()
-    assert (after["jumps"][AGAIN] == np.arange(N)[AGAIN] % 3 + 1).all()
-    np.testing.assert_allclose(env.obs[:, :2].numpy(), shown(after), atol=1e-5)
+    assert (after["jumps"][NEXT_JUMP] == np.arange(N)[NEXT_JUMP] % 3 + 1).all()
+    np.testing.assert_allclose(env.obs[:, :2].numpy(), goal_ahead_and_left(after), atol=1e-5)
 
 
-def test_a_goal_from_outside_is_seen_at_once(env):
-    land(env)
+def test_a_goal_of_env_command_is_observed_at_once_in_chosen_worlds_only(env):
+    set_landed(env)
     env.step(REST)
     before = env.obs.clone()
     chosen = np.arange(N) % 2 == 0
@@ -173,14 +158,14 @@ def test_a_goal_from_outside_is_seen_at_once(env):
     assert torch.equal(env.obs[~chosen], before[~chosen])
 
 
-def test_the_second_goal_is_in_the_levels_box_before_the_robot(env):
+def test_goals_of_next_jumps_cover_the_levels_box_ahead_of_the_robot(env):
     ahead, level = [], []
     for _ in range(8):
-        land(env, next_jump_step=13, level=1 + np.arange(N) % 4)
+        set_landed(env, next_jump_step=13, level=1 + np.arange(N) % 4)
         env.step(REST)
         after = env.task_arrays()
         assert (after["phase"] == STANCE).all()
-        ahead.append(in_yaw_frame((after["goal"] - after["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(after)))
+        ahead.append(to_yaw_frame((after["goal"] - after["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(after)))
         level.append(after["level"])
     ahead, level = np.concatenate(ahead), np.concatenate(level)
     for number in range(1, 5):
@@ -191,79 +176,77 @@ def test_the_second_goal_is_in_the_levels_box_before_the_robot(env):
             assert np.ptp(here[:, axis]) > 0.85 * (upper - lower)
 
 
-def test_others_keep_their_episode(second):
-    before, after = second
-    others = np.setdiff1d(np.arange(N), AGAIN)
+def test_worlds_without_a_next_jump_keep_their_episode(next_jump):
+    before, after = next_jump
+    others = np.setdiff1d(np.arange(N), NEXT_JUMP)
     for name in ("goal", "start", "heading", "command_step", "jumps", "next_jump_step"):
         np.testing.assert_array_equal(after[name][others], before[name][others])
     np.testing.assert_array_equal(after["phase_steps"][others], 13)
 
 
-def test_another_goal_moves_nothing_but_the_episode():
-    pair = [make_env(N, task=again_and_again(1.0), reset=only("default"), seed=4) for _ in range(2)]
+def test_a_next_jump_changes_no_robot_state_and_only_the_observed_goal():
+    pair = [make_env(N, task=task_with_next_jump(1.0), reset=only("default"), seed=4) for _ in range(2)]
     for env, when in zip(pair, (13, 0), strict=True):
         edit_episodes(env, level=1, phase=LANDED, phase_steps=12, next_jump_step=when)
         for action in 0.3 * random_actions(N, 5):
             env.step(action)
-    one, other = pair
-    assert (one.task_arrays()["jumps"] == 1).all() and not other.task_arrays()["jumps"].any()
-    np.testing.assert_array_equal(one.sim.joint_q(), other.sim.joint_q())
-    np.testing.assert_array_equal(one.sim.joint_qd(), other.sim.joint_qd())
-    assert torch.equal(one.obs[:, 2:], other.obs[:, 2:]) and not torch.equal(one.obs[:, :2], other.obs[:, :2])
+    jumping, resting = pair
+    assert (jumping.task_arrays()["jumps"] == 1).all() and not resting.task_arrays()["jumps"].any()
+    np.testing.assert_array_equal(jumping.sim.joint_q(), resting.sim.joint_q())
+    np.testing.assert_array_equal(jumping.sim.joint_qd(), resting.sim.joint_qd())
+    assert torch.equal(jumping.obs[:, 2:], resting.obs[:, 2:])
+    assert not torch.equal(jumping.obs[:, :2], resting.obs[:, :2])  # goal_x, goal_y
 
 
-def test_jumps_follow_each_other_as_often_as_planned(env):
-    land(env, next_jump_step=13)
+def test_a_third_jump_is_planned_with_next_jump_probability(env):
+    set_landed(env, next_jump_step=13)
     env.step(REST)
-    planned = env.task_arrays()["next_jump_step"]  # next_jump_probability = 1: after every second jump a third
-    assert planned.min() >= 12 and planned.max() <= 42 and len(set(planned)) > 20
-    never = make_env(N, task=again_and_again(0.0), reset=only("default"))
-    land(never, next_jump_step=13)
+    planned = env.task_arrays()["next_jump_step"]  # next_jump_probability = 1
+    assert planned.min() >= 12 and planned.max() <= 42 and len(set(planned)) > 20  # 0.2 to 0.7 s
+    never = make_env(N, task=task_with_next_jump(0.0), reset=only("default"))
+    set_landed(never, next_jump_step=13)
     never.step(REST)
     arrays = never.task_arrays()
     assert (arrays["phase"] == STANCE).all() and not arrays["next_jump_step"].any()
 
 
-def test_an_ended_episode_begins_anew_instead(env):
-    land(env, next_jump_step=60, phase_steps=59)
+def test_an_episode_that_ends_in_the_step_of_a_next_jump_is_reset(env):
+    set_landed(env, next_jump_step=60, phase_steps=59)
     env.step(REST)
     after = env.task_arrays()
     assert env.done.all() and not after["jumps"].any() and not after["steps"].any()
 
 
 @pytest.mark.parametrize("wait", [{"phase_steps": 11}, {"phase": STANCE}, {"phase": FLIGHT}])
-def test_another_jump_waits_for_its_time_after_touchdown(env, wait):
-    land(env, **({"next_jump_step": 13} | wait))
+def test_no_next_jump_before_its_step_or_in_another_phase(env, wait):
+    set_landed(env, **({"next_jump_step": 13} | wait))
     env.step(REST)
-    going = env.done.numpy() == 0.0
-    np.testing.assert_array_equal(env.task_arrays()["jumps"][going], (np.arange(N) % 3)[going])
+    running = env.done.numpy() == 0.0
+    np.testing.assert_array_equal(env.task_arrays()["jumps"][running], (np.arange(N) % 3)[running])
 
 
-def test_another_jump_that_is_overdue_begins(env):
-    land(env, next_jump_step=13, phase_steps=20)
+def test_an_overdue_next_jump_begins(env):
+    set_landed(env, next_jump_step=13, phase_steps=20)
     env.step(REST)
-    going = env.done.numpy() == 0.0
-    assert going.any()
-    np.testing.assert_array_equal(env.task_arrays()["jumps"][going], (np.arange(N) % 3 + 1)[going])
+    running = env.done.numpy() == 0.0
+    assert running.any()
+    np.testing.assert_array_equal(env.task_arrays()["jumps"][running], (np.arange(N) % 3 + 1)[running])
 
 
-# ---------------------------------------------------------------- the caller's next jump
-
-
-def test_a_command_changes_chosen_landed_worlds(env):
-    land(env, steps=1 + np.arange(N))
+def test_a_command_begins_a_jump_in_chosen_landed_worlds_only(env):
+    set_landed(env, steps=1 + np.arange(N))
     phase = np.array([STANCE, FLIGHT, LANDED, LANDED])[np.arange(N) % 4]
     edit_episodes(env, phase=phase, idle_steps=3, apex_passed=1, touched_down=0)
     chosen = np.arange(N) % 8 < 6
     goals = np.stack([np.linspace(0.3, 1.5, N), np.linspace(-0.3, 0.3, N), np.zeros(N)], axis=1)
-    before, q, qd = every_array(env), env.sim.joint_q().copy(), env.sim.joint_qd().copy()
+    before, q, qd = all_fields(env), env.sim.joint_q().copy(), env.sim.joint_qd().copy()
     env.command(goals, chosen)
-    after = every_array(env)
+    after = all_fields(env)
     begun = chosen & (phase == LANDED)
     assert 0 < begun.sum() < chosen.sum()
     for name in episodes_of(env):
         np.testing.assert_array_equal(after[name][~begun], before[name][~begun], name)
-    offset = in_yaw_frame((after["goal"] - after["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(after))
+    offset = to_yaw_frame((after["goal"] - after["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(after))
     np.testing.assert_allclose(offset[begun], goals[begun], atol=1e-5)
     assert (after["phase"][begun] == STANCE).all() and not after["phase_steps"][begun].any()
     np.testing.assert_array_equal(after["command_step"][begun], after["steps"][begun])
@@ -272,50 +255,47 @@ def test_a_command_changes_chosen_landed_worlds(env):
     np.testing.assert_array_equal(env.sim.joint_qd(), qd)
 
 
-def test_a_command_before_the_first_step_waits_for_no_flight_and_goes_on_from_a_landing(env):
-    land(env)
+def test_a_command_before_the_first_step_is_ignored_in_flight_and_begins_a_jump_after_landing(env):
+    set_landed(env)
     phase = np.array([FLIGHT, LANDED])[np.arange(N) % 2]
     edit_episodes(env, phase=phase, steps=0, jumps=0)
-    before = every_array(env)
+    before = all_fields(env)
     env.command(np.tile([0.7, -0.2, 0.0], (N, 1)))
-    after = every_array(env)
+    after = all_fields(env)
     for name in episodes_of(env):
         np.testing.assert_array_equal(after[name][phase == FLIGHT], before[name][phase == FLIGHT], name)
     np.testing.assert_array_equal(after["jumps"], phase == LANDED)
 
 
-def test_a_command_before_the_first_step_is_taken_by_a_robot_that_stands(env):
-    stand(env)
+def test_a_command_before_the_first_step_sets_the_goal_of_a_standing_robot(env):
+    set_standing(env)
     env.command(np.tile([0.7, -0.2, 0.0], (N, 1)))
     after = env.task_arrays()
-    offset = in_yaw_frame((after["goal"] - after["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(after))
+    offset = to_yaw_frame((after["goal"] - after["base_pos"]) * [1.0, 1.0, 0.0], yaw_of(after))
     np.testing.assert_allclose(offset, np.tile([0.7, -0.2, 0.0], (N, 1)), atol=1e-5)
     assert not after["command_step"].any() and not after["jumps"].any()
 
 
-# ---------------------------------------------------------------- success
-
-
 @pytest.mark.parametrize(("miss", "near"), [(0.0, True), (0.095, True), (0.105, False), (0.4, False)])
-def test_a_jump_counts_where_it_ended_near_its_goal(env, miss, near):
-    stand(env, level=1, streak=2)
+def test_a_jump_is_a_success_if_its_landing_error_is_within_a_tenth_of_a_metre(env, miss, near):
+    set_standing(env, level=1, streak=2)
     position = env.task_arrays()["base_pos"]
-    edit_episodes(env, phase=LANDED, phase_steps=59, goal=position + [0.6 * miss, -0.8 * miss, 0.0])
+    edit_episodes(env, phase=LANDED, phase_steps=59, goal=position + [0.6 * miss, -0.8 * miss, 0.0])  # ends at 60
     env.metrics()
     env.step(REST)
     assert ending_names(env) == ["success"] * N and (env.timeout == 1.0).all()
     assert episodes_of(env)["streak"].tolist() == [3 if near else 0] * N
-    figures = env.metrics()
-    assert figures["Metrics/success"] == float(near)
-    assert figures["Metrics/error_m"] == pytest.approx(miss if near else 0.0, abs=3e-3)
+    metrics = env.metrics()
+    assert metrics["Metrics/success"] == float(near)
+    assert metrics["Metrics/error_m"] == pytest.approx(miss if near else 0.0, abs=3e-3)  # [m]
 
 
 @pytest.mark.parametrize(
     ("termination", "episode"),
     [("too_long", {"steps": 1199, "phase_steps": 10}), ("no_jump", {"phase": STANCE, "steps": 500, "command_step": 0})],
 )
-def test_any_other_end_at_the_goal_is_no_success(env, termination, episode):
-    stand(env, level=1, streak=2)
+def test_other_terminations_at_the_goal_are_no_success(env, termination, episode):
+    set_standing(env, level=1, streak=2)
     edit_episodes(env, goal=env.task_arrays()["base_pos"], **({"phase": LANDED} | episode))
     env.metrics()
     env.step(REST)
@@ -324,12 +304,9 @@ def test_any_other_end_at_the_goal_is_no_success(env, termination, episode):
 
 
 def test_five_near_landings_raise_the_level_and_a_far_one_does_not(env):
-    stand(env, level=1, streak=4)
+    set_standing(env, level=1, streak=4)
     position = env.task_arrays()["base_pos"]
-    miss = np.where(np.arange(N) < 32, 0.05, 0.2)[:, None] * [1.0, 0.0, 0.0]
+    miss = np.where(np.arange(N) < 32, 0.05, 0.2)[:, None] * [1.0, 0.0, 0.0]  # [m] tolerance: 0.1
     edit_episodes(env, phase=LANDED, phase_steps=59, goal=position + miss)
     env.step(REST)
     assert env.task_arrays()["level"].tolist() == [2] * 32 + [1] * 32
-
-
-# ---------------------------------------------------------------- the critic's observation at an episode's end

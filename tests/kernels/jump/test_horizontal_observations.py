@@ -13,17 +13,17 @@ from mdp_helpers import array
 
 HORIZONTAL, VERTICAL = (without_draws(make_task(name)) for name in ("horizontal-jump", "vertical-jump"))
 NAMES = HORIZONTAL.observation_names
-ROBOT, EPISODE, BLOCK = 48, 15, 7  # columns
-DRAWN = slice(ROBOT + EPISODE, -BLOCK)
-N = 200
+ROBOT, EPISODE, BLOCK = 48, 15, 7  # columns of the critic: the actor's, of the episode, of the block ahead (last)
+DRAWN = slice(ROBOT + EPISODE, -BLOCK)  # columns of randomised parameters
+N = 200  # robots
 
 
 def random_robots(task, turn=0.0, seed=0):
-    """Return robots in any attitude with goals around them, all of it turned about z by an angle [rad]."""
+    """Return N random robots and goals, all turned about the world's z axis by `turn` [rad]; deterministic in seed."""
     rng = np.random.default_rng(seed)
     robots = Robots(task, N)
     heading = rng.uniform(-np.pi, np.pi, N)
-    heading[:50] = np.pi + rng.uniform(-0.02, 0.02, 50)
+    heading[:50] = np.pi + rng.uniform(-0.02, 0.02, 50)  # around the jump of the yaw at pi
     tilt = Rotation.from_rotvec(rng.uniform(-0.8, 0.8, (N, 3)))
     world = Rotation.from_euler("z", turn)
     robots.q[:, :3] = world.apply(rng.uniform(-1.0, 1.0, (N, 3)))
@@ -46,52 +46,49 @@ def random_robots(task, turn=0.0, seed=0):
     return robots
 
 
-def robot_with(task=HORIZONTAL, **fields):
-    """Return one robot at rest with an episode."""
+def one_robot(task=HORIZONTAL, **fields):
+    """Return one robot at rest in the default pose; fields: of its `JumpState`."""
     robots = Robots(task)
     robots.tasks = [make_episode(**fields)]
     return robots
 
 
 def yaw_quat(angle):
-    """Return the quaternion of a turn about z [deg]."""
+    """Return the quaternion (xyzw) of a rotation about z by `angle` [deg]."""
     return Rotation.from_euler("z", angle, degrees=True).as_quat()
 
 
-# ---------------------------------------------------------------- the actor's
-
-
-def test_the_layout_begins_with_the_way_to_the_goal():
+def test_the_layout_is_that_of_the_vertical_jump_but_for_the_goal():
     assert NAMES[:4] == ("goal_x", "goal_y", "height", "lin_vel_x") and len(NAMES) == ROBOT
     assert NAMES[3:] == VERTICAL.observation_names[3:]
 
 
 @pytest.mark.parametrize(
-    ("yaw", "way"),
+    ("yaw", "offset"),
     [(0.0, (0.6, 0.2)), (90.0, (0.2, -0.6)), (180.0, (-0.6, -0.2)), (-180.0, (-0.6, -0.2)), (-90.0, (-0.2, 0.6))],
 )
-def test_the_way_to_the_goal_is_in_the_yaw_aligned_frame(yaw, way):
-    robots = robot_with(goal=(1.6, -0.8, 0.0))
+def test_goal_and_height_are_observed_in_the_yaw_aligned_frame(yaw, offset):
+    robots = one_robot(goal=(1.6, -0.8, 0.0))
     robots.q[0, :3], robots.q[0, 3:7] = (1.0, -1.0, 0.4), yaw_quat(yaw)
-    np.testing.assert_allclose(robots.observe()[0, :3], [*way, 0.4], atol=1e-6)
+    np.testing.assert_allclose(robots.observe()[0, :3], [*offset, 0.4], atol=1e-6)
 
 
-def test_the_way_does_not_change_with_pitch_and_roll():
-    robots = robot_with(goal=(0.6, 0.2, 0.0))
+def test_goal_columns_do_not_change_with_pitch_and_roll():
+    robots = one_robot(goal=(0.6, 0.2, 0.0))
     robots.q[0, 3:7] = Rotation.from_euler("ZYX", [90.0, 40.0, -30.0], degrees=True).as_quat()
     np.testing.assert_allclose(robots.observe()[0, :2], [0.2, -0.6], atol=1e-6)
 
 
 @pytest.mark.parametrize("turn", [0.3, 137.0 * DEG, math.pi, -2.0])
-def test_turning_robot_and_goal_about_the_vertical_changes_nothing(turn):
-    before, after = random_robots(HORIZONTAL).both(), random_robots(HORIZONTAL, turn).both()
-    for one, other in zip(before, after, strict=True):
-        np.testing.assert_allclose(one, other, atol=2e-5)
-    assert np.abs(before[0][:, :2]).max() > 1.0
+def test_observations_do_not_change_if_robot_and_goal_turn_about_the_vertical(turn):
+    unturned, turned = random_robots(HORIZONTAL).both(), random_robots(HORIZONTAL, turn).both()
+    for group, turned_group in zip(unturned, turned, strict=True):
+        np.testing.assert_allclose(group, turned_group, atol=2e-5)
+    assert np.abs(unturned[0][:, :2]).max() > 1.0  # [m] goals
 
 
 @pytest.mark.parametrize(
-    ("episode", "told"),
+    ("episode", "visible"),
     [
         ({"phase": STANCE, "steps": 4}, False),
         ({"phase": STANCE, "steps": 5}, True),
@@ -99,59 +96,57 @@ def test_turning_robot_and_goal_about_the_vertical_changes_nothing(turn):
         ({"phase": LANDED, "steps": 50}, True),
     ],
 )
-def test_the_goal_is_zero_before_the_command_and_stays_after_the_landing(episode, told):
-    robots = robot_with(goal=(0.6, 0.2, 0.0), command_step=5, **episode)
-    np.testing.assert_allclose(robots.observe()[0, :2], [0.6 * told, 0.2 * told], atol=1e-6)
+def test_the_goal_is_zero_before_the_command_and_stays_after_the_landing(episode, visible):
+    robots = one_robot(goal=(0.6, 0.2, 0.0), command_step=5, **episode)
+    np.testing.assert_allclose(robots.observe()[0, :2], [0.6 * visible, 0.2 * visible], atol=1e-6)
 
 
 @pytest.mark.parametrize("steps", [4, 5])
-def test_noise_of_way_and_height_ends_at_one_sigma(steps):
+def test_noise_of_goal_and_height_is_independent_and_clamped_at_one_sigma(steps):
     robots = Robots(HORIZONTAL, 4096)
     robots.tasks = [make_episode(goal=(0.6, 0.2, 0.0), command_step=5, steps=steps)] * 4096
     clean = robots.observe()
-    noise = (robots.observe(noise=True) - clean)[:, :3] / 0.005
+    noise = (robots.observe(noise=True) - clean)[:, :3] / 0.005  # [m] standard deviation of the terms
     assert np.abs(noise).max() <= 1.0 + 1e-3
+    # variance of a clamped standard normal number: 0.5161; bounds: 4 standard errors of 4096 = 64^2 samples
     assert noise.std(axis=0) == pytest.approx(math.sqrt(0.5161), abs=4.0 * 0.4 / 64.0)
     assert noise.mean(axis=0) == pytest.approx(0.0, abs=4.0 * 0.7184 / 64.0)
     assert np.abs(np.corrcoef(noise.T) - np.eye(3)).max() < 5.0 / 64.0
 
 
-def test_the_height_is_that_above_the_ground_below_the_base():
+def test_height_is_measured_from_the_ground_below_the_base():
     robots = Robots(HORIZONTAL, 2)
     robots.heights = np.array([[0.0, 0.0, -0.15], [0.0, 0.0, -0.15]])  # falls from x = 0 to x = 2 m
     robots.q[:, 0], robots.q[:, 2] = (-1.0, 1.0), (0.4, 0.3)
     np.testing.assert_allclose(robots.observe()[:, 2], [0.4, 0.3 + 0.075], atol=1e-6)
 
 
-# ---------------------------------------------------------------- the critic's
-
-
 @pytest.mark.parametrize("task", [HORIZONTAL, VERTICAL], ids=lambda task: task.name)
-def test_the_critic_sees_what_the_actor_does_without_noise(task):
+def test_the_critic_gets_the_actors_terms_without_noise(task):
     robots = random_robots(task)
     clean, critic = robots.both()
     np.testing.assert_array_equal(critic[:, :ROBOT], clean)
-    noisy, same = robots.both(noise=True)
-    np.testing.assert_array_equal(same, critic)
-    assert (noisy[:, 2:36] != clean[:, 2:36]).mean() > 0.99
+    noisy, critic_again = robots.both(noise=True)
+    np.testing.assert_array_equal(critic_again, critic)
+    assert (noisy[:, 2:36] != clean[:, 2:36]).mean() > 0.99  # columns with noise
 
 
-def test_every_column_of_every_row_is_written_and_nothing_after_the_last():
+def test_every_element_of_the_observations_is_written_and_none_beyond_them():
     robots = random_robots(VERTICAL)
     arrays = robots.skill.observations
-    marked = np.full(arrays.now.shape[0] + 7, 7.0)
+    marked = np.full(arrays.now.shape[0] + 7, 7.0)  # 7 more elements than observations
     arrays.now, last = array(marked), arrays.now.shape[0]
     robots.both()
-    found = arrays.now.numpy()
-    assert last == N * (ROBOT + ROBOT + EPISODE) and not (found[:last] == 7.0).any()
-    np.testing.assert_array_equal(found[last:], 7.0)
+    values = arrays.now.numpy()
+    assert last == N * (ROBOT + ROBOT + EPISODE) and not (values[:last] == 7.0).any()
+    np.testing.assert_array_equal(values[last:], 7.0)
 
 
 @pytest.mark.parametrize("phase", [STANCE, FLIGHT, LANDED])
-def test_the_critic_sees_phase_and_times(phase):
-    robots = robot_with(phase=phase, phase_steps=90, steps=150, command_step=60)
-    found = robots.both()[1][0, ROBOT : ROBOT + 5]
-    np.testing.assert_allclose(found, [*(float(phase == i) for i in range(3)), 1.5, 1.5], atol=1e-6)
+def test_the_critic_gets_phase_and_times(phase):
+    robots = one_robot(phase=phase, phase_steps=90, steps=150, command_step=60)
+    values = robots.both()[1][0, ROBOT : ROBOT + 5]
+    np.testing.assert_allclose(values, [*(float(phase == i) for i in range(3)), 1.5, 1.5], atol=1e-6)  # 90 / 60 s
 
 
 @pytest.mark.parametrize(
@@ -162,35 +157,32 @@ def test_the_critic_sees_phase_and_times(phase):
         ({"phase_steps": 0, "steps": 0, "command_step": 90}, [0.0, -1.0]),
     ],
 )
-def test_times_are_bounded(episode, times):
-    np.testing.assert_allclose(robot_with(**episode).both()[1][0, ROBOT + 3 : ROBOT + 5], times, atol=1e-6)
+def test_times_in_the_phase_and_since_the_command_are_clamped(episode, times):
+    np.testing.assert_allclose(one_robot(**episode).both()[1][0, ROBOT + 3 : ROBOT + 5], times, atol=1e-6)
 
 
-def test_the_critic_sees_heights_way_and_predicted_miss_even_before_the_command():
-    robots = robot_with(goal=(1.6, -0.8, 0.9), max_height=0.7, steps=0, command_step=30)
+def test_the_critic_gets_height_errors_predicted_miss_and_goal_even_before_the_command():
+    robots = one_robot(goal=(1.6, -0.8, 0.9), max_height=0.7, steps=0, command_step=30)
     robots.q[0, :3], robots.q[0, 3:7] = (1.0, -1.0, 0.52625), yaw_quat(90.0)
     robots.qd[0, :3] = (1.0, -0.6, 2.0)
-    found = robots.both()[1][0, ROBOT + 5 : ROBOT + 11]
+    values = robots.both()[1][0, ROBOT + 5 : ROBOT + 11]
     # apex 0.52625 + 4 / 19.62 m; half a second to 0.3 m, at (1.5, -1.3); body x is world y, body y is world -x
     expected = [0.7 - 0.9, 0.52625 + 4.0 / 19.62 - 0.9, 0.5, -0.1, 0.2, -0.6]
-    np.testing.assert_allclose(found, expected, atol=1e-5)
+    np.testing.assert_allclose(values, expected, atol=1e-5)
 
 
-def test_the_predicted_miss_is_that_above_the_ground_at_the_goal():
-    robots = robot_with(goal=(1.6, -0.8, 0.0), goal_ground=0.08)
+def test_the_predicted_miss_is_computed_above_the_ground_at_the_goal():
+    robots = one_robot(goal=(1.6, -0.8, 0.0), goal_ground=0.08)
     robots.q[0, :3], robots.qd[0, :3] = (1.0, -1.0, 0.60625), (1.0, -0.6, 2.0)
     # half a second to 0.38 m, at (1.5, -1.3)
     np.testing.assert_allclose(robots.both()[1][0, ROBOT + 7 : ROBOT + 9], [0.1, 0.5], atol=1e-5)
 
 
-def test_the_critic_sees_paw_forces_in_body_weights_and_no_more_than_five():
-    robots = robot_with()
+def test_the_critic_gets_paw_forces_in_body_weights_up_to_five():
+    robots = one_robot()
     robots.force[:, 0] = [(0.0, 0.0, 0.0), (84.0, 0.0, 112.0), (0.0, 0.0, 70.0), (0.0, 9000.0, 0.0)]
-    found = robots.both()[1][0, ROBOT + 11 : ROBOT + EPISODE]
-    np.testing.assert_allclose(found, [0.0, 1.0, 0.5, 5.0], atol=1e-6)
-
-
-# ---------------------------------------------------------------- in the environment
+    values = robots.both()[1][0, ROBOT + 11 : ROBOT + EPISODE]
+    np.testing.assert_allclose(values, [0.0, 1.0, 0.5, 5.0], atol=1e-6)
 
 
 @pytest.fixture(scope="module")
@@ -198,7 +190,7 @@ def env():
     return make_env(256, task=make_task("horizontal-jump"), reset=only("default"), randomize=True, noise=True, seed=8)
 
 
-def test_the_environment_shows_the_critic_what_was_drawn(env):
+def test_the_critic_gets_the_environments_randomised_parameters(env):
     model, motors = env.sim.model, env.sim.motors
     nominal = make_env(1, task=make_task("horizontal-jump"), reset=only("default")).sim
     mass, com = model.body_mass.numpy().reshape(256, -1), model.body_com.numpy().reshape(256, -1, 3)
@@ -216,63 +208,60 @@ def test_the_environment_shows_the_critic_what_was_drawn(env):
     np.testing.assert_allclose(env.critic_obs[:, DRAWN], np.concatenate(columns, axis=1), atol=1e-4)
 
 
-def test_drawn_parameters_are_of_order_one_and_zero_without_randomisation(env):
-    shown = env.critic_obs[:, DRAWN].numpy()
-    assert shown.shape[1] == env.num_critic_obs - ROBOT - EPISODE - BLOCK
-    assert np.abs(shown).max() < 3.0 and (np.abs(shown).max(axis=0) > 0.04).all()
+def test_randomised_parameters_are_of_order_one_and_zero_without_randomisation(env):
+    observed = env.critic_obs[:, DRAWN].numpy()
+    assert observed.shape[1] == env.num_critic_obs - ROBOT - EPISODE - BLOCK
+    assert np.abs(observed).max() < 3.0 and (np.abs(observed).max(axis=0) > 0.04).all()
     nominal = make_env(16, task=make_task("horizontal-jump"), reset=only("default"))
     assert not nominal.critic_obs[:, DRAWN].any()
 
 
-# ---------------------------------------------------------------- the block ahead
+def ray_edges(block, base, heading):
+    """Return the first and last distance [m] along a ray above a block, sampled every 0.5 mm; (2, 2) if there is none.
+
+    base: x, y [m] of the ray's origin; heading [rad].
+    """
+    distance = np.arange(-2.0, 2.0, 5e-4)
+    points = base[:, None] + np.outer([np.cos(heading), np.sin(heading)], distance)
+    above = distance[(np.abs(points - block["center"][:, None]) <= block["half"][:, None]).all(axis=0)]
+    return (above[0], above[-1]) if len(above) and block["exists"] else (2.0, 2.0)
 
 
-def edges(block, base, heading):
-    """Return where a ray is first and last above a block [m], by looking every half a millimetre; 2 m if it is not."""
-    at = np.arange(-2.0, 2.0, 5e-4)
-    off = np.abs(base[:, None] + np.outer([np.cos(heading), np.sin(heading)], at) - block["center"][:, None])
-    over = at[(off <= block["half"][:, None]).all(axis=0)]
-    return (over[0], over[-1]) if len(over) and block["exists"] else (2.0, 2.0)
-
-
-def test_the_block_ahead_is_seen_along_three_rays():
+def test_block_ahead_matches_sampling_along_three_rays():
     task = make_task("horizontal-jump-sighted")
     assert list(task.layout("actor"))[-1] == "block_ahead"
     env = make_env(256, task=task, reset=only("standing", task.reset.settings), randomize=True, seed=5)
-    edit_episodes(env, level=7)
+    edit_episodes(env, level=7)  # far goals, most with room for a block
     env.reset()
     blocks = env.sim.physics.dynamics.robot.ground.blocks.numpy()
     exists = blocks["exists"] == 1
     assert 40 < exists.sum() < 216
-    seen = env.obs[:, -BLOCK:].numpy()
-    np.testing.assert_array_equal(env.critic_obs[:, ROBOT : ROBOT + BLOCK], seen)
+    observed = env.obs[:, -BLOCK:].numpy()
+    np.testing.assert_array_equal(env.critic_obs[:, ROBOT : ROBOT + BLOCK], observed)
     q = env.sim.joint_q()
     yaw = np.arctan2(*Rotation.from_quat(q[:, 3:7]).apply([1.0, 0.0, 0.0])[:, 1::-1].T)
-    sides = [(0, 0.2), (1, 0.0), (2, -0.2)]
+    sides = [(0, 0.2), (1, 0.0), (2, -0.2)]  # (ray, distance to the left of the base [m])
     for world in range(256):
         for ray, aside in sides:
             base = q[world, :2] + aside * np.array([-np.sin(yaw[world]), np.cos(yaw[world])])
-            expected = edges(blocks[world], base, yaw[world])
-            np.testing.assert_allclose(seen[world, 2 * ray : 2 * ray + 2], expected, atol=2e-3)
-    np.testing.assert_allclose(seen[:, 6], np.where(exists, blocks["height"], 0.0), atol=1e-6)
-    ahead = exists & (seen[:, 2] > 0.0) & (seen[:, 2] < 2.0)
-    under = exists & (seen[:, 2] < 0.0)
+            expected = ray_edges(blocks[world], base, yaw[world])
+            np.testing.assert_allclose(observed[world, 2 * ray : 2 * ray + 2], expected, atol=2e-3)
+    np.testing.assert_allclose(observed[:, 6], np.where(exists, blocks["height"], 0.0), atol=1e-6)
+    ahead = exists & (observed[:, 2] > 0.0) & (observed[:, 2] < 2.0)
+    under = exists & (observed[:, 2] < 0.0)
     assert ahead.sum() > 20 and under.sum() > 20
 
 
-def test_without_blocks_nothing_is_ahead():
+def test_block_ahead_is_2_m_for_all_rays_without_a_block():
     env = make_env(2, task=make_task("horizontal-jump-sighted"))
     np.testing.assert_array_equal(env.obs[:, -BLOCK:], np.tile([2.0] * 6 + [0.0], (2, 1)))
 
 
-# ---------------------------------------------------------------- mirror image
-
-
 @pytest.mark.parametrize("task", [HORIZONTAL, VERTICAL], ids=["horizontal", "vertical"])
-def test_a_mirrored_robot_sees_the_mirror_image(task):
+def test_observations_of_a_mirrored_robot_are_the_mirror_image(task):
     robots = random_robots(task)
     first = robots.both()
-    flip, spin = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])
+    flip, spin = np.array([1.0, -1.0, 1.0]), np.array([-1.0, 1.0, -1.0])  # of vectors, of angular velocities
     joints = [5 * leg + j for leg in LEGS for j in range(5)]
     motors = [3 * leg + j for leg in LEGS for j in range(3)]
     robots.q[:, :3] *= flip
@@ -285,8 +274,8 @@ def test_a_mirrored_robot_sees_the_mirror_image(task):
     robots.force = robots.force[list(LEGS)] * flip
     for episode in robots.tasks:
         episode.goal = wp.vec3(episode.goal[0], -episode.goal[1], episode.goal[2])
-    second, seen = robots.both(), robots.skill.task
-    for group, a, b in zip(("actor", "critic"), first, second, strict=True):
-        mirror = mirror_of(seen, group)
-        np.testing.assert_allclose(b, mirror.signs * a[:, mirror.order], atol=1e-5)
-        assert np.abs(b - a).max() > 0.5
+    second, observed_task = robots.both(), robots.skill.task
+    for group, original, mirrored in zip(("actor", "critic"), first, second, strict=True):
+        mirror = mirror_of(observed_task, group)
+        np.testing.assert_allclose(mirrored, mirror.signs * original[:, mirror.order], atol=1e-5)
+        assert np.abs(mirrored - original).max() > 0.5

@@ -21,23 +21,26 @@ from jumper_warp.registry import make_task
 from solver_helpers import MOTOR_Q, MOTOR_V
 
 N = 4096
-G = 9.81
-LANDING_HEIGHT = 0.30  # [m]
-CORNER = 0.05 * np.sqrt(2.0)  # [m] how far the start of a jump lies from the origin at most
+G = 9.81  # [m/s^2]
+LANDING_HEIGHT = 0.30  # [m] of the base
+CORNER = 0.05 * np.sqrt(2.0)  # [m] largest horizontal offset of the base, from `base_xy` 0.05
 
 
 def land(pos: np.ndarray, vel: np.ndarray, height: float) -> tuple[np.ndarray, np.ndarray]:
-    """Return place [m] and time [s] at which point masses fall through a height, by small steps."""
+    """Return position (n, 3) [m] and time (n,) [s] at which point masses fall through `height` [m], NaN if never.
+
+    pos [m], vel [m/s]: (n, 3). Oracle of the ballistic formulas: steps of 2 ms, linear within a step.
+    """
     pos, vel, dt = pos.copy(), vel.copy(), 2.0e-3
-    found, when = np.full_like(pos, np.nan), np.full(len(pos), np.nan)
+    place, when = np.full_like(pos, np.nan), np.full(len(pos), np.nan)
     for step in range(600):
         after = pos + dt * vel - [0.0, 0.0, 0.5 * G * dt**2]
         through = np.isnan(when) & (pos[:, 2] >= height) & (after[:, 2] < height)
-        share = (pos[:, 2] - height) / np.maximum(pos[:, 2] - after[:, 2], 1e-12)
-        found[through] = (pos + share[:, None] * (after - pos))[through]
-        when[through] = dt * (step + share[through])
+        fraction = (pos[:, 2] - height) / np.maximum(pos[:, 2] - after[:, 2], 1e-12)
+        place[through] = (pos + fraction[:, None] * (after - pos))[through]
+        when[through] = dt * (step + fraction[through])
         pos, vel = after, vel - [0.0, 0.0, G * dt]
-    return found, when
+    return place, when
 
 
 @pytest.fixture(scope="module", params=PLACES)
@@ -47,21 +50,21 @@ def env(request):
 
 @pytest.fixture(scope="module")
 def starts(env):
-    """Beginnings of every scheme, (scheme) -> Starts, and those of jumps from the very origin, (exact scheme)."""
-    found = {start_mode: Starts(env, start_mode) for start_mode in NUM_START_MODES}
-    return found | {
+    """Return the `Starts` of every mode by its name, and without base offset by "exact " and its name."""
+    samples = {start_mode: Starts(env, start_mode) for start_mode in NUM_START_MODES}
+    return samples | {
         f"exact {start_mode}": Starts(env, start_mode, exact=True)
         for start_mode in ("in_flight", "touchdown", "after_landing")
     }
 
 
-def test_schemes_have_the_tasks_shares(env):
+def test_start_modes_have_the_tasks_probabilities(env):
     begin_by(env, dataclasses.replace(resets_of(env), balance_by="resets"))
     edit_episodes(env, level=np.arange(N) % len(env.task.levels))
     env.reset()
-    shares = np.bincount(episodes_of(env)["start_mode"], minlength=6) / N
-    # 0.02: default poses that stand in for what cannot be drawn
-    assert np.abs(shares - [0.40, 0.15, 0.15, 0.15, 0.05, 0.10]).max() < 4.0 * np.sqrt(0.25 / N) + 0.02
+    fractions = np.bincount(episodes_of(env)["start_mode"], minlength=6) / N
+    # 0.02: default poses in place of samples that are invalid in all attempts
+    assert np.abs(fractions - [0.40, 0.15, 0.15, 0.15, 0.05, 0.10]).max() < 4.0 * np.sqrt(0.25 / N) + 0.02
 
 
 @pytest.mark.parametrize("start_mode", NUM_START_MODES)
@@ -74,130 +77,124 @@ def test_no_state_collides_or_crosses_the_motor_limits(starts, start_mode):
 
 
 @pytest.mark.parametrize("start_mode", [name for name in NUM_START_MODES if name != "default"])
-def test_the_default_pose_rarely_stands_in(starts, start_mode):
+def test_the_default_pose_rarely_replaces_invalid_samples(starts, start_mode):
     assert starts[start_mode].fallbacks < 0.02
 
 
 @pytest.mark.parametrize("start_mode", NUM_START_MODES)
-def test_headings_cover_the_circle(env, starts, start_mode):
-    found = starts[start_mode]
-    heading = found.episodes["heading"]
+def test_headings_cover_the_circle_and_attitudes_their_ranges(env, starts, start_mode):
+    sample = starts[start_mode]
+    heading = sample.episodes["heading"]
     assert covers(heading, -np.pi, np.pi, 0.01)
-    shares = np.histogram(heading, np.linspace(-np.pi, np.pi, 9))[0] / len(heading)
-    assert np.abs(shares - 0.125).max() < 5.0 * np.sqrt(0.125 * 0.875 / len(heading))
-    body = (found.heading.inv() * Rotation.from_quat(found.q[:, 3:7])).as_euler("ZYX")
+    fractions = np.histogram(heading, np.linspace(-np.pi, np.pi, 9))[0] / len(heading)
+    assert np.abs(fractions - 0.125).max() < 5.0 * np.sqrt(0.125 * 0.875 / len(heading))
+    body = (sample.heading.inv() * Rotation.from_quat(sample.q[:, 3:7])).as_euler("ZYX")
     if start_mode in ("in_flight", "touchdown", "pushing"):  # nose down in the mean
         down = env.task.reset.settings.takeoff_pitch[1] * DEG
         assert covers(body[:, 1], -5.0 * DEG, down + 5.0 * DEG, 0.1)
-        body[:, 1] = body[:, 0]
+        body[:, 1] = body[:, 0]  # pitch is checked: leave it out below
     half = 0.0 if start_mode == "default" else 5.0 * DEG
     assert np.abs(body[:, [0, 2]]).max() <= half + 1e-4
     if start_mode not in ("standing", "default"):
         assert covers(body[:, 0], -half, half) and covers(body[:, 1], -half, half) and covers(body[:, 2], -half, half)
 
 
-def test_only_forward_jumps_begin_pitched_forward(env, starts):
+def test_only_horizontal_jumps_stand_pitched_forward(env, starts):
     body = (starts["standing"].heading.inv() * Rotation.from_quat(starts["standing"].q[:, 3:7])).as_euler("ZYX")
     mean = 10.0 * DEG if env.task.name == "horizontal-jump" else 0.0
     assert covers(body[:, 1], -5.0 * DEG, mean + 5.0 * DEG, 0.1)
-    # 0.15: what cannot be reached leaning back is drawn again, pitched down more often
+    # 0.15: samples that lean back are rejected more often, which raises the mean pitch
     assert body[:, 1].mean() == pytest.approx(0.5 * mean, abs=0.15 * mean + 4.0 * 5.0 * DEG / np.sqrt(len(body)))
 
 
 @pytest.mark.parametrize("start_mode", NUM_START_MODES)
 def test_goals_lie_in_the_levels_box_or_ellipse_turned_by_the_heading(env, starts, start_mode):
-    found = starts[start_mode]
-    ahead = found.heading.inv().apply(found.goal)
+    sample = starts[start_mode]
+    ahead = sample.heading.inv().apply(sample.goal)
     for number, level in enumerate(env.task.levels):
-        here = ahead[found.level == number]
+        here = ahead[sample.level == number]
         for axis in (0, 1):
             assert covers(here[:, axis], level.goal_lower[axis], level.goal_upper[axis], 0.05)
         if level.elliptical:
-            reach = np.where(here < 0.0, np.negative(level.goal_lower), level.goal_upper)[:, :2]
-            radius = np.linalg.norm(here[:, :2] / reach, axis=1)
+            half_axes = np.where(here < 0.0, np.negative(level.goal_lower), level.goal_upper)[:, :2]
+            radius = np.linalg.norm(here[:, :2] / half_axes, axis=1)
             assert radius.max() <= 1.0 + 1e-4 and np.histogram(radius, 4, (0.0, 1.0))[0].min() > 0
-    assert not found.episodes["goal"][:, 2].any()
+    assert not sample.episodes["goal"][:, 2].any()
 
 
-def test_phases_and_the_command_fit_the_scheme(starts):
+def test_phases_and_the_command_fit_the_start_mode(starts):
     for start_mode, phase in zip(NUM_START_MODES, (STANCE, STANCE, FLIGHT, FLIGHT, LANDED, STANCE), strict=True):
         episodes = starts[start_mode].episodes
         assert (episodes["phase"] == int(phase)).all()
         if start_mode in ("standing", "default"):
-            assert set(episodes["command_step"]) == set(range(31))
+            assert set(episodes["command_step"]) == set(range(31))  # up to 0.5 s
         else:
             assert not episodes["command_step"].any()
         if phase == LANDED:
-            assert set(episodes["phase_steps"]) == set(range(18))
+            assert set(episodes["phase_steps"]) == set(range(18))  # less than 0.3 s
         else:
             assert not episodes["phase_steps"].any()
         for name in ("steps", "jumps", "took_off", "touched_down", "idle_steps"):
             assert not episodes[name].any(), name
 
 
-# ---------------------------------------------------------------- on the ground
-
-
-def test_standing_paws_are_on_the_ground_within_their_boxes(env, starts):
-    found = starts["standing"]
-    paws = found.paws_around(np.zeros_like(found.pos))
-    np.testing.assert_allclose(found.paws[..., 2], PAW_RADIUS, atol=2e-4)
+def test_standing_starts_have_paws_in_their_boxes_and_lean_back_the_lower_they_are(env, starts):
+    sample = starts["standing"]
+    paws = sample.paws_around(np.zeros_like(sample.pos))
+    np.testing.assert_allclose(sample.paws[..., 2], PAW_RADIUS, atol=2e-4)
     assert covers(paws[..., 0], 0.20, 0.22)
     assert covers(paws[:, :2, 1], 0.15, 0.17) and covers(paws[:, 2:, 1], 0.20, 0.22)
-    level = np.array([level.base_height for level in env.task.levels])[found.level]
-    behind, aside = found.split((np.zeros(3) - found.pos) * [1.0, 1.0, 0.0])
-    low = (level[:, 1] - found.pos[:, 2]) / (level[:, 1] - level[:, 0])
+    level = np.array([level.base_height for level in env.task.levels])[sample.level]
+    behind, aside = sample.split((np.zeros(3) - sample.pos) * [1.0, 1.0, 0.0])
+    low = (level[:, 1] - sample.pos[:, 2]) / (level[:, 1] - level[:, 0])
     lean = env.task.reset.settings.lean
     assert (behind >= -CORNER - 1e-5).all() and (behind <= lean * low + CORNER + 1e-5).all()
     assert np.abs(aside).max() <= CORNER + 1e-5 and behind[low > 0.9].max() > 0.8 * lean
-    assert (found.episodes["start"][:, :2] == 0.0).all()  # where the paws are, however the robot leans
+    assert (sample.episodes["start"][:, :2] == 0.0).all()  # middle of the paws, not the leaning base
     for number, level in enumerate(env.task.levels):
-        assert covers(found.pos[found.level == number, 2], *level.base_height)
-    assert not found.qd.any()
+        assert covers(sample.pos[sample.level == number, 2], *level.base_height)
+    assert not sample.qd.any()
 
 
-def test_landed_robots_are_around_their_goal_with_paws_at_rest_on_the_ground(starts):
-    found = starts["after_landing"]
-    np.testing.assert_allclose(found.paws[..., 2], PAW_RADIUS, atol=2e-4)
-    paws = found.paws_around(found.goal)
+def test_landed_starts_are_around_their_goal_with_paws_on_the_ground_and_move_down(starts):
+    sample = starts["after_landing"]
+    np.testing.assert_allclose(sample.paws[..., 2], PAW_RADIUS, atol=2e-4)
+    paws = sample.paws_around(sample.goal)
     assert covers(paws[..., 0], 0.20, 0.22)
     assert covers(paws[:, :2, 1], 0.15, 0.17) and covers(paws[:, 2:, 1], 0.20, 0.22)
-    assert covers(found.pos[:, 2], 0.30, 0.45)
-    assert covers(-found.vel[:, 2], 0.0, 1.0) and not found.vel[:, :2].any()
+    assert covers(sample.pos[:, 2], 0.30, 0.45)
+    assert covers(-sample.vel[:, 2], 0.0, 1.0) and not sample.vel[:, :2].any()
     exact = starts["exact after_landing"]
     ahead, aside = exact.split((exact.pos - exact.goal) * [1.0, 1.0, 0.0])
     assert covers(ahead, -0.15, 0.10) and np.abs(aside).max() < 1e-5
-    error = np.linalg.norm((found.pos - found.goal)[:, :2], axis=1)
+    error = np.linalg.norm((sample.pos - sample.goal)[:, :2], axis=1)
     assert error.max() < 0.15 + CORNER + 1e-5
 
 
-# ---------------------------------------------------------------- pushing off
-
-
-def test_pushes_lead_over_their_takeoff_to_the_goal(env):
-    """A push of 0.2 m at 15 m/s^2 ends in the takeoff of a projectile to the goal."""
-    found = Starts(env, "pushing", exact=True, push_length=(0.2, 0.2), push_acceleration=(15.0, 15.0))
-    speed = np.linalg.norm(found.vel, axis=1)
-    moving = (speed > 0.05) & (found.distance > 0.4)
+def test_pushing_starts_accelerate_to_a_takeoff_whose_flight_ends_at_the_goal(env):
+    """A push of 0.2 m at 15 m/s^2 ends in the takeoff of a projectile to the goal, integrated by `land`."""
+    sample = Starts(env, "pushing", exact=True, push_length=(0.2, 0.2), push_acceleration=(15.0, 15.0))
+    speed = np.linalg.norm(sample.vel, axis=1)
+    moving = (speed > 0.05) & (sample.distance > 0.4)
     assert moving.mean() > 0.1
-    way = found.vel[moving] / speed[moving, None]
-    leaving = np.sqrt(speed[moving] ** 2 + 2.0 * 15.0 * 0.2)
-    takeoff = found.pos[moving] + 0.2 * way
+    along = sample.vel[moving] / speed[moving, None]
+    takeoff_speed = np.sqrt(speed[moving] ** 2 + 2.0 * 15.0 * 0.2)
+    takeoff = sample.pos[moving] + 0.2 * along
     assert takeoff[:, 2].min() >= 0.40 - 1e-4 and takeoff[:, 2].max() <= 0.45 + 1e-4
-    place, _ = land(takeoff, leaving[:, None] * way, LANDING_HEIGHT)
-    np.testing.assert_allclose(place[:, :2], found.goal[moving, :2], atol=1e-3)
-    assert (found.episodes["start"][:, :2] == 0.0).all()
+    place, _ = land(takeoff, takeoff_speed[:, None] * along, LANDING_HEIGHT)
+    np.testing.assert_allclose(place[:, :2], sample.goal[moving, :2], atol=1e-3)
+    assert (sample.episodes["start"][:, :2] == 0.0).all()
 
 
 def test_paws_of_a_push_rest_on_the_ground_around_the_start(starts):
-    found = starts["pushing"]
-    np.testing.assert_allclose(found.paws[..., 2], PAW_RADIUS, atol=2e-4)
-    paws = found.paws_around(np.zeros_like(found.pos))
+    sample = starts["pushing"]
+    np.testing.assert_allclose(sample.paws[..., 2], PAW_RADIUS, atol=2e-4)
+    paws = sample.paws_around(np.zeros_like(sample.pos))
     assert covers(paws[..., 0], 0.20, 0.22)
-    assert np.linalg.norm(found.vel, axis=1).max() > 3.0  # nearly a takeoff
+    assert np.linalg.norm(sample.vel, axis=1).max() > 3.0  # [m/s] nearly a takeoff
 
 
-def test_joints_of_a_push_move_so_that_the_paws_do_not(env):
+def test_paws_of_a_push_are_at_rest_while_the_base_moves(env):
     begin_by(env, only("pushing", resets_of(env)))
     env.reset()
     worlds = np.flatnonzero(episodes_of(env)["start_mode"] == NUM_START_MODES.index("pushing"))[:40]
@@ -205,124 +202,113 @@ def test_joints_of_a_push_move_so_that_the_paws_do_not(env):
     assert np.abs(velocities).max() < 1e-3 and np.abs(env.sim.joint_qd()[worlds, :3]).max() > 1.0
 
 
-# ---------------------------------------------------------------- shares of time
-
-
-def test_shares_of_time_are_met_however_long_episodes_are():
-    """Jumps that begin standing last 3 s here, in flight 1.5 s, landed 1 s: of resets the shares are others."""
-    length = np.array([180, 120, 90, 60, 60, 45])
+def test_start_modes_take_their_fractions_of_policy_steps_whatever_their_episode_length():
+    """Jumps that begin standing last 3 s here, in flight 1.5 s, landed 1 s: of resets the fractions are others."""
+    length = np.array([180, 120, 90, 60, 60, 45])  # policy steps of an episode, by start mode
     task = make_task("horizontal-jump")
     env = make_env(64, task=task, seed=3)
-    resets, schemes = np.zeros(6), []
+    resets, modes = np.zeros(6), []
     for _ in range(120):
-        schemes.append(episodes_of(env)["start_mode"])
-        resets += np.bincount(schemes[-1], minlength=6)
-        edit_episodes(env, steps=length[schemes[-1]])
+        modes.append(episodes_of(env)["start_mode"])
+        resets += np.bincount(modes[-1], minlength=6)
+        edit_episodes(env, steps=length[modes[-1]])
         env.episodes.done.fill_(1.0)
         env.reset()
-    wanted = np.array([0.40, 0.15, 0.15, 0.15, 0.05, 0.10])
+    expected = np.array([0.40, 0.15, 0.15, 0.15, 0.05, 0.10])
     time = resets * length
-    np.testing.assert_allclose(time / time.sum(), wanted, atol=0.02)
-    assert resets[4] / resets.sum() > 1.3 * wanted[4]
-    own = np.array([np.bincount(column, minlength=6) for column in np.array(schemes).T]) * length
-    assert np.abs(own / own.sum(axis=1, keepdims=True) - wanted).max() < 0.08  # of every single world
+    np.testing.assert_allclose(time / time.sum(), expected, atol=0.02)
+    assert resets[4] / resets.sum() > 1.3 * expected[4]
+    by_world = np.array([np.bincount(column, minlength=6) for column in np.array(modes).T]) * length
+    assert np.abs(by_world / by_world.sum(axis=1, keepdims=True) - expected).max() < 0.08
     counted = episodes_of(env)["steps_per_mode"]
     assert np.abs(counted.sum() - time.sum()) < 1.0
 
 
-# ---------------------------------------------------------------- in the air
-
-
-def test_flights_lead_to_the_goal(starts):
-    found, spread = starts["exact in_flight"], starts["in_flight"]
-    place, _ = land(found.pos, found.vel, LANDING_HEIGHT)
+def test_ballistic_flights_end_at_the_goal(starts):
+    sample, spread = starts["exact in_flight"], starts["in_flight"]
+    place, _ = land(sample.pos, sample.vel, LANDING_HEIGHT)
     assert not np.isnan(place).any()
-    miss = place - found.goal
-    far = found.distance >= 0.1
-    np.testing.assert_allclose(miss[far, :2], 0.0, atol=5e-4)
-    np.testing.assert_allclose(miss[:, :2], 0.0, atol=5e-4)  # those of the nearest goals go straight up
+    miss = place - sample.goal
+    np.testing.assert_allclose(miss[:, :2], 0.0, atol=5e-4)
     miss = (land(spread.pos, spread.vel, LANDING_HEIGHT)[0] - spread.goal)[spread.distance >= 0.1]
     assert covers(miss[:, 0], -0.05, 0.05) and covers(miss[:, 1], -0.05, 0.05)
 
 
-def test_flights_take_off_within_their_angles_but_not_too_high(starts):
-    found = starts["exact in_flight"]
-    _, left = land(found.pos, found.vel, LANDING_HEIGHT)
-    # the share of the flight that has passed is 0.02 to 0.10
-    up = [found.vel[:, 2] + G * left * share / (1.0 - share) for share in (0.02, 0.10)]
-    forward = np.linalg.norm(found.vel[:, :2], axis=1)
-    apex = found.pos[:, 2] + np.maximum(found.vel[:, 2], 0.0) ** 2 / (2.0 * G)
+def test_flights_take_off_within_the_ranges_of_angle_height_and_apex(starts):
+    sample = starts["exact in_flight"]
+    _, left = land(sample.pos, sample.vel, LANDING_HEIGHT)
+    # [m/s] takeoff speeds for 0.02 and 0.10, the ends of `flight_time`, of the flight's duration passed
+    up = [sample.vel[:, 2] + G * left * fraction / (1.0 - fraction) for fraction in (0.02, 0.10)]
+    forward = np.linalg.norm(sample.vel[:, :2], axis=1)
+    apex = sample.pos[:, 2] + np.maximum(sample.vel[:, 2], 0.0) ** 2 / (2.0 * G)
     assert apex.max() <= 1.0 + 1e-4
-    free = (apex < 0.999) & (found.distance > 0.15)
+    free = (apex < 0.999) & (sample.distance > 0.15)
     shallowest, steepest = (np.degrees(np.arctan2(v, forward)) for v in up)
     assert shallowest[free].max() <= 75.0 + 0.1 and steepest[free].min() >= 35.0 - 0.1
     assert np.ptp(0.5 * (shallowest + steepest)[free]) > 35.0
-    start = [found.pos[:, 2] - v * t + 0.5 * G * t**2 for v, t in zip(up, (left / 49.0, left / 9.0), strict=True)]
+    start = [sample.pos[:, 2] - v * t + 0.5 * G * t**2 for v, t in zip(up, (left / 49.0, left / 9.0), strict=True)]
     assert np.maximum(*start).min() >= 0.40 - 1e-3 and np.minimum(*start).max() <= 0.45 + 1e-3
 
 
-def test_flights_begin_with_bent_legs_and_paws_off_the_ground(starts):
-    found = starts["in_flight"]
-    angles = found.q[:, MOTOR_Q].reshape(-1, 4, 3)
+def test_flights_begin_with_resting_bent_legs_and_paws_off_the_ground(starts):
+    sample = starts["in_flight"]
+    angles = sample.q[:, MOTOR_Q].reshape(-1, 4, 3)
     assert covers(angles[..., 1:], 40.0 * DEG, 80.0 * DEG)
     assert covers(angles[..., 0], -10.0 * DEG - 0.03, 10.0 * DEG + 0.03, 0.1)
-    assert found.paws[..., 2].min() >= PAW_RADIUS + 0.01 - 1e-4
-    assert not found.qd[:, MOTOR_V].any() and not found.qd[:, 3:6].any()
+    assert sample.paws[..., 2].min() >= PAW_RADIUS + 0.01 - 1e-4
+    assert not sample.qd[:, MOTOR_V].any() and not sample.qd[:, 3:6].any()
 
 
-def test_touchdowns_lead_to_the_goal_once_their_lag_is_made_up(env, starts):
-    found = starts["exact touchdown"]
-    place, left = land(found.pos, found.vel, LANDING_HEIGHT)
+def test_touchdown_starts_lag_behind_the_flight_to_the_goal_by_touchdown_behind(env, starts):
+    sample = starts["exact touchdown"]
+    place, left = land(sample.pos, sample.vel, LANDING_HEIGHT)
     assert left.min() >= 0.03 - 2e-3 and left.max() <= 0.15 + 2e-3
-    lag, aside = found.split((found.goal - place) * [1.0, 1.0, 0.0])
-    far = found.distance >= 0.1
+    lag, aside = sample.split((sample.goal - place) * [1.0, 1.0, 0.0])
+    far = sample.distance >= 0.1
     assert covers(lag[far], *env.task.reset.settings.touchdown_behind) and np.abs(aside[far]).max() < 5e-4
     assert lag[~far].max(initial=0.0) <= 0.20 + 5e-4 and np.abs(aside).max() < 5e-4
-    shares = np.histogram(lag[far], np.linspace(*env.task.reset.settings.touchdown_behind, 4))[0] / far.sum()
-    assert shares.min() > 0.1  # long lags are out of the legs' reach more often, above all sideways
+    fractions = np.histogram(lag[far], np.linspace(*env.task.reset.settings.touchdown_behind, 4))[0] / far.sum()
+    assert fractions.min() > 0.1  # long lags are rejected more often
     spread = starts["touchdown"]
     lag, aside = spread.split((spread.goal - land(spread.pos, spread.vel, LANDING_HEIGHT)[0]) * [1.0, 1.0, 0.0])
     far = spread.distance >= 0.1
     assert lag[far].min() >= 0.05 - CORNER and lag[far].max() <= 0.20 + CORNER and np.abs(aside).max() <= CORNER + 5e-4
 
 
-def test_touchdowns_have_their_paws_ahead_of_the_base_towards_the_goal(env, starts):
+def test_touchdown_starts_have_their_paws_ahead_of_the_base_towards_the_goal(env, starts):
     behind = env.task.reset.settings.touchdown_behind
-    found = starts["touchdown"]
+    sample = starts["touchdown"]
     # the paws' boxes are centred on the projectile to 1 cm in x and y
-    ahead, aside = found.split((found.paws.mean(axis=1) - found.pos) * [1.0, 1.0, 0.0])
+    ahead, aside = sample.split((sample.paws.mean(axis=1) - sample.pos) * [1.0, 1.0, 0.0])
     assert ahead.min() > behind[0] - 0.0142 and ahead.max() < behind[1] + 0.0142
     assert np.abs(aside).max() < 0.0142
     assert ahead.mean() > behind[0] + 0.25 * (behind[1] - behind[0])
 
 
-def test_touchdowns_reach_for_the_ground_but_not_below_it(starts):
-    found = starts["touchdown"]
-    depth, height = found.pos[:, 2, None] - found.paws[..., 2], found.pos[:, 2, None]
-    assert np.ptp(found.paws[..., 2], axis=1).max() < 2e-4
-    assert found.paws[..., 2].min() >= 0.05 - 1e-4
+def test_touchdown_starts_have_resting_paws_at_one_height_above_the_ground(starts):
+    sample = starts["touchdown"]
+    depth, height = sample.pos[:, 2, None] - sample.paws[..., 2], sample.pos[:, 2, None]
+    assert np.ptp(sample.paws[..., 2], axis=1).max() < 2e-4
+    assert sample.paws[..., 2].min() >= 0.05 - 1e-4
     assert depth.max() <= 0.45 + 1e-4 and (depth >= np.minimum(0.30, height - 0.05) - 2e-4).all()
-    assert (found.pos[:, 2] > LANDING_HEIGHT - 1e-4).all() and not found.qd[:, MOTOR_V].any()
+    assert (sample.pos[:, 2] > LANDING_HEIGHT - 1e-4).all() and not sample.qd[:, MOTOR_V].any()
 
 
-def test_touchdowns_fall(starts):
-    found = starts["touchdown"]
-    # begun up to 0.15 s before the landing: what does not fall yet flies for less than 0.3 s, so it took off with less
-    # than 1.14 m/s upward from 0.1 m above the landing, at 35 degrees or more, for less than 0.49 m, up to 0.35 m ahead
-    assert (found.vel[found.distance > 0.84, 2] < 0.0).all()
-    assert (found.vel[found.distance > 0.2, 2] < 0.0).mean() > 0.99  # 0.9993 of 300,000
+def test_touchdown_starts_of_far_goals_fall(starts):
+    sample = starts["touchdown"]
+    # starts are up to 0.15 s before the landing: a base that still rises flies for less than 0.3 s, so it took off with
+    # less than 1.14 m/s upward from 0.1 m above the landing, at 35 degrees or more: over less than 0.49 + 0.35 m
+    assert (sample.vel[sample.distance > 0.84, 2] < 0.0).all()
+    assert (sample.vel[sample.distance > 0.2, 2] < 0.0).mean() > 0.99  # 0.9993 of 300,000
 
 
-# ---------------------------------------------------------------- more than one jump
-
-
-def test_another_goal_is_planned_past_the_first_level_only(env, starts):
+def test_a_next_jump_is_planned_above_the_first_levels_with_its_probability(env, starts):
     planned = np.concatenate([starts[start_mode].episodes["next_jump_step"] for start_mode in NUM_START_MODES])
     level = np.concatenate([starts[start_mode].level for start_mode in NUM_START_MODES])
     assert not planned[level == 0].any()
-    share = (planned[level > 1] > 0).mean()  # the first goals have two levels of starts
+    fraction = (planned[level > 1] > 0).mean()  # the first goals have two levels of starts
     assert not planned[level == 1].any()
-    assert share == pytest.approx(0.175, abs=4.0 * np.sqrt(0.175 * 0.825 / (level > 1).sum()))
+    assert fraction == pytest.approx(0.175, abs=4.0 * np.sqrt(0.175 * 0.825 / (level > 1).sum()))
     assert covers(planned[planned > 0], 12.0, 42.0, 0.05)  # 0.2 to 0.7 s
     set_levels(env, *(dataclasses.replace(level, next_jump_probability=0.0) for level in env.task.levels))
     env.reset()

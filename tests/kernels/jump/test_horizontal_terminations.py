@@ -2,21 +2,18 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jump_helpers import DEG, Table, functions, make_episode, make_view
-from jump_oracle import (
-    FLIGHT,
-    LANDED,
-    STANCE,
-)
+from jump_oracle import FLIGHT, LANDED, STANCE
 from jumper_warp.kernels.jump import terminations
 from jumper_warp.registry import make_task
 
 holds = Table(functions(terminations, "missed_goal predicted_miss turned_touchdown left_stance second_takeoff"), bool)
-PREDICTED = {"tolerance": 0.55, "steps": 6.0, "height": 0.3}
-HEADINGS = [0.0, 100.0, 175.0, 180.0, -175.0]
+"""holds(name, view, episode, **numbers): whether a termination holds."""
+PREDICTED = {"tolerance": 0.55, "steps": 6.0, "height": 0.3}  # [m], policy steps, [m]
+HEADINGS = [0.0, 100.0, 175.0, 180.0, -175.0]  # [deg]
 
 
 @pytest.mark.parametrize(
-    ("phase", "contacts", "up", "ends"),
+    ("phase", "contacts", "up", "ends"),  # up: [m/s]
     [
         (LANDED, 0, 0.26, True), (LANDED, 0, 0.24, False), (LANDED, 1, 2.0, False), (FLIGHT, 0, 2.0, False),
         (STANCE, 0, 2.0, False),
@@ -50,13 +47,13 @@ def test_predicted_miss_is_decided_once_a_tenth_of_a_second_after_takeoff(miss, 
 
 
 @pytest.mark.parametrize(("miss", "missed"), [(0.54, False), (0.56, True)])
-def test_predicted_miss_is_that_above_the_ground_at_the_goal(miss, missed):
+def test_predicted_miss_is_computed_above_the_ground_at_the_goal(miss, missed):
     view = make_view(pos=(0.2, 0.0, 0.60625), lin_vel=(1.0, 0.0, 2.0))  # half a second to 0.38 m
     flying = make_episode(phase=FLIGHT, phase_steps=6, goal=(0.7 + miss, 0.0, 0.0), goal_ground=0.08)
     assert holds("predicted_miss", view, flying, **PREDICTED) is missed
 
 
-def test_predicted_miss_of_the_task_is_decided_at_a_whole_step():
+def test_times_of_the_tasks_terminations_are_whole_policy_steps():
     numbers = {term.name: term.numbers for term in make_task("horizontal-jump").terminations}
     assert numbers["predicted_miss"]["steps"] == 6.0 and numbers["success"] == {"steps": 60.0}
 

@@ -11,65 +11,66 @@ TASK = without_draws(make_task("vertical-jump"))
 NAMES = TASK.observation_names
 COLUMN = {name: i for i, name in enumerate(NAMES)}
 MOTORS = [f"{leg}_{motor}" for leg in ("FL", "FR", "BL", "BR") for motor in ("lateral", "outer", "inner")]
-SCALES = np.concatenate(
+SCALES = np.concatenate(  # standard deviations of the noise: [m], [m/s], [rad/s], [1], [rad], [rad/s] by column
     [
         [0.0, 0.0, 0.005], [0.1] * 6, [0.05] * 3, [3.0 * DEG] * 12, [10.0 * DEG] * 12, [0.0] * 12,
     ]
 )  # fmt: skip
 
 
-def standing(n=1):
-    """Return robots in front of a vertical jump of 0.8 m."""
+def standing_robots(n=1):
+    """Return n robots at rest in the default pose, 0.35 m high, before a vertical jump of 0.8 m."""
     return Robots(TASK, n)
 
 
-def columns(prefix, names):
+def columns_of(prefix, names):
+    """Return the column indices of the components prefix_name."""
     return [COLUMN[f"{prefix}_{name}"] for name in names]
 
 
-def test_the_layout_is_the_papers():
-    robot = [f"{what}_{axis}" for what in ("lin_vel", "ang_vel", "gravity") for axis in "xyz"]
-    joints = [f"{what}_{motor}" for what in ("angle", "rate", "last_action") for motor in MOTORS]
+def test_the_layout_of_columns_is_the_papers():
+    robot = [f"{quantity}_{axis}" for quantity in ("lin_vel", "ang_vel", "gravity") for axis in "xyz"]
+    joints = [f"{quantity}_{motor}" for quantity in ("angle", "rate", "last_action") for motor in MOTORS]
     assert list(NAMES) == ["wanted_height", "jump_command", "height", *robot, *joints]
 
 
-def test_a_standing_robot():
+def test_observation_of_a_robot_at_rest():
     expected = np.zeros(48)
     expected[[COLUMN["wanted_height"], COLUMN["height"], COLUMN["gravity_z"]]] = 0.8, 0.35, -1.0
-    np.testing.assert_allclose(standing().observe()[0], expected, atol=1e-6)
+    np.testing.assert_allclose(standing_robots().observe()[0], expected, atol=1e-6)
 
 
 def test_joints_are_in_motor_order_and_angles_relative_to_default():
-    robots = standing()
+    robots = standing_robots()
     robots.q[0, 7 + MOTOR_SLOTS] = DEFAULT_ANGLE + 0.01 * np.arange(12)
     robots.qd[0, 6 + MOTOR_SLOTS] = np.arange(12.0)
     robots.action[:, 0] = -0.05 * np.arange(12)
     obs = robots.observe()[0]
-    np.testing.assert_allclose(obs[columns("angle", MOTORS)], 0.01 * np.arange(12), atol=1e-6)
-    np.testing.assert_allclose(obs[columns("rate", MOTORS)], np.arange(12.0))
-    np.testing.assert_allclose(obs[columns("last_action", MOTORS)], -0.05 * np.arange(12), atol=1e-6)
+    np.testing.assert_allclose(obs[columns_of("angle", MOTORS)], 0.01 * np.arange(12), atol=1e-6)
+    np.testing.assert_allclose(obs[columns_of("rate", MOTORS)], np.arange(12.0))
+    np.testing.assert_allclose(obs[columns_of("last_action", MOTORS)], -0.05 * np.arange(12), atol=1e-6)
 
 
 def test_velocities_and_gravity_are_in_body_axes():
-    robots = standing()
+    robots = standing_robots()
     # turned by 90 degrees about z: body x is world y, body y is world -x
     robots.q[0, 3:7] = [0.0, 0.0, math.sqrt(0.5), math.sqrt(0.5)]
     robots.qd[0, :6] = [1.0, 2.0, 3.0, 4.0, 5.0, 6.0]
     obs = robots.observe()[0]
-    np.testing.assert_allclose(obs[columns("lin_vel", "xyz")], [2.0, -1.0, 3.0], atol=1e-6)
-    np.testing.assert_allclose(obs[columns("ang_vel", "xyz")], [5.0, -4.0, 6.0], atol=1e-6)
-    # nose down by 30 degrees: gravity has a share along body x
+    np.testing.assert_allclose(obs[columns_of("lin_vel", "xyz")], [2.0, -1.0, 3.0], atol=1e-6)
+    np.testing.assert_allclose(obs[columns_of("ang_vel", "xyz")], [5.0, -4.0, 6.0], atol=1e-6)
+    # nose down by 30 degrees: gravity has a component along body x
     robots.q[0, 3:7] = [0.0, math.sin(15.0 * DEG), 0.0, math.cos(15.0 * DEG)]
-    gravity = robots.observe()[0][columns("gravity", "xyz")]
+    gravity = robots.observe()[0][columns_of("gravity", "xyz")]
     np.testing.assert_allclose(gravity, [0.5, 0.0, -math.sqrt(0.75)], atol=1e-6)
 
 
-def test_the_velocity_is_that_of_the_base_origin():
-    robots = standing()
+def test_lin_vel_is_the_velocity_of_the_base_origin_not_the_centre_of_mass():
+    robots = standing_robots()
     robots.com = np.array([0.0, 0.1, 0.02])
     # the com moves with 1 m/s along x and the base turns with 3 rad/s about z: the origin moves 0.3 m/s faster
     robots.qd[0, :6] = [1.0, 0.0, 0.0, 0.0, 0.0, 3.0]
-    np.testing.assert_allclose(robots.observe()[0][columns("lin_vel", "xyz")], [1.3, 0.0, 0.0], atol=1e-6)
+    np.testing.assert_allclose(robots.observe()[0][columns_of("lin_vel", "xyz")], [1.3, 0.0, 0.0], atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -81,33 +82,33 @@ def test_the_velocity_is_that_of_the_base_origin():
         ({"phase": LANDED, "steps": 50}, 0.0),
     ],
 )
-def test_the_jump_is_commanded_after_its_delay_and_until_the_landing(fields, command):
-    robots = standing()
+def test_jump_command_is_1_from_its_step_until_the_landing(fields, command):
+    robots = standing_robots()
     robots.tasks = [make_episode(goal=(0.0, 0.0, 0.8), command_step=5, **fields)]
     assert robots.observe()[0, COLUMN["jump_command"]] == command
 
 
 def test_a_sensor_offset_is_added_to_its_own_angle():
-    robots = standing(2)
-    robots.offset[4, 1] = 0.03
+    robots = standing_robots(2)
+    robots.offset[4, 1] = 0.03  # [rad] of FR outer, in the second world
     difference = robots.observe()[1] - robots.observe()[0]
     assert np.flatnonzero(difference).tolist() == [COLUMN["angle_FR_outer"]]
     assert difference[COLUMN["angle_FR_outer"]] == pytest.approx(0.03, abs=1e-6)
 
 
 @pytest.fixture(scope="module")
-def draws():
-    """Noise over its standard deviation in 4 steps of 4096 worlds, (4, 4096, 33), and the raw noise."""
-    robots, clean = standing(4096), standing().observe()[0]
+def noise_samples():
+    """Return noise over its standard deviation, (4 steps, 4096 worlds, 33 noisy columns), and raw noise, all 48."""
+    robots, clean = standing_robots(4096), standing_robots().observe()[0]
     raw = np.array([robots.observe(noise=True) - clean for _ in range(4)])
     return raw[..., SCALES > 0.0] / SCALES[SCALES > 0.0], raw
 
 
-def test_noise_has_the_papers_size_and_ends_at_one_sigma(draws):
-    scaled, raw = draws
-    assert not raw[..., SCALES == 0.0].any()  # command, wanted height and own actions are known
+def test_noise_has_the_papers_size_and_is_clamped_at_one_sigma(noise_samples):
+    scaled, raw = noise_samples
+    assert not raw[..., SCALES == 0.0].any()  # commanded height, command and last actions have no noise
     assert np.abs(scaled).max() <= 1.0 + 1e-4
-    # of a Gaussian, 31.7 % lie beyond one sigma; cut, the standard deviation is sqrt(0.5161); 4 standard errors
+    # of a Gaussian, 31.7 % lie beyond one sigma; clamped, its variance is 0.5161; bounds: 4 standard errors
     cells = scaled.shape[0] * scaled.shape[1]
     assert np.mean(np.abs(scaled) > 0.9999, axis=(0, 1)) == pytest.approx(0.3173, abs=4.0 * 0.466 / math.sqrt(cells))
     assert scaled.std(axis=(0, 1)) == pytest.approx(math.sqrt(0.5161), abs=4.0 * 0.4 / math.sqrt(cells))
@@ -115,16 +116,17 @@ def test_noise_has_the_papers_size_and_ends_at_one_sigma(draws):
 
 
 def correlation(a, b):
+    """Return the correlation of two arrays of scaled noise (mean 0, variance 0.5161)."""
     return np.mean(a * b) / 0.5161
 
 
-def test_noise_is_independent_across_columns_worlds_and_steps(draws):
-    scaled, _ = draws
+def test_noise_is_independent_across_columns_worlds_and_steps(noise_samples):
+    scaled, _ = noise_samples
     matrix = np.corrcoef(scaled.reshape(-1, scaled.shape[2]).T) - np.eye(scaled.shape[2])
     assert np.abs(matrix).max() < 5.0 / math.sqrt(4 * 4096)
     bound = 5.0 / math.sqrt(3 * 4096 * 33)
     assert abs(correlation(scaled[:, 1:], scaled[:, :-1])) < bound  # neighbouring worlds
     for shift in (1, 2, 3):
         assert abs(correlation(scaled[shift:], scaled[:-shift])) < 5.0 / math.sqrt((4 - shift) * 4096 * 33)
-        # nor does a step repeat another column of the one before
+        # a step does not repeat another column of the previous step
         assert abs(correlation(scaled[1:, :, shift:], scaled[:-1, :, :-shift])) < bound

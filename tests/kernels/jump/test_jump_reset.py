@@ -24,20 +24,20 @@ from solver_helpers import MOTOR_Q, MOTOR_V
 
 N = 4096
 TASK = make_task("vertical-jump")
-G = 9.81
-ALL = ResetCfg(start_probability=StartProbability(0.3, 0.1, in_flight=0.25, touchdown=0.2, after_landing=0.15))
-SHARES = np.array([0.3, 0.1, 0.25, 0.2, 0.15])
+G = 9.81  # [m/s^2]
+ALL_MODES = ResetCfg(start_probability=StartProbability(0.3, 0.1, in_flight=0.25, touchdown=0.2, after_landing=0.15))
+PROBABILITIES = np.array([0.3, 0.1, 0.25, 0.2, 0.15])
 
 
 @pytest.fixture(scope="module")
-def of_all_schemes():
-    return make_env(N, reset=ALL)
+def all_modes_env():
+    return make_env(N, reset=ALL_MODES)
 
 
 @pytest.fixture(scope="module", params=range(len(TASK.levels)), ids=lambda level: f"level{level}")
-def drawn(request, of_all_schemes):
-    """Thousands of beginnings at one level: environment, episodes, coordinates and rates."""
-    env = of_all_schemes
+def sampled(request, all_modes_env):
+    """Reset N worlds at one level; return (environment, fields of episodes, joint_q (N, 43), joint_qd (N, 38))."""
+    env = all_modes_env
     edit_episodes(env, level=request.param)
     env.reset()
     return env, episodes_of(env), env.sim.joint_q().astype(float), env.sim.joint_qd().astype(float)
@@ -49,119 +49,120 @@ def other_env():
 
 
 @pytest.fixture
-def begun(other_env):
-    """(reset, level) -> an environment that has just begun so in every world."""
+def reset_with(other_env):
+    """Return a function (reset settings, *levels) that resets all worlds so, and returns the environment."""
 
-    def begin(reset, *levels):
+    def reset_env(reset, *levels):
         begin_by(other_env, reset)
         set_levels(other_env, *(levels or TASK.levels))
         other_env.reset()
         return other_env
 
-    return begin
+    return reset_env
 
 
-def uniform_range(values, lower, upper, reach=0.02):
-    """Whether values stay in a range and come near both of its ends."""
+def covers_range(values, lower, upper, reach=0.02):
+    """Return whether values stay in a range and come within the fraction `reach` of its width of both ends."""
     width = upper - lower
     inside = values.min() >= lower - 1e-5 and values.max() <= upper + 1e-5
     return inside and values.min() <= lower + reach * width and values.max() >= upper - reach * width
 
 
 def euler(quat):
-    """Return roll, pitch, yaw [rad] of quaternions xyzw, turned about z, then y, then x."""
+    """Return roll, pitch, yaw [rad], (n, 3), of quaternions xyzw, (n, 4), as Rz(yaw) Ry(pitch) Rx(roll)."""
     x, y, z, w = quat.T
     roll = np.arctan2(2.0 * (w * x + y * z), 1.0 - 2.0 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2.0 * (w * y - z * x), -1.0, 1.0))
     return np.stack([roll, pitch, np.arctan2(2.0 * (w * z + x * y), 1.0 - 2.0 * (y * y + z * z))], axis=1)
 
 
-def some(episodes, start_mode, count=60):
+def worlds_with_mode(episodes, start_mode, count=60):
+    """Return the indices of the first `count` worlds that began in a start mode."""
     return np.flatnonzero(episodes["start_mode"] == NUM_START_MODES.index(start_mode))[:count]
 
 
-def test_schemes_have_their_shares(drawn):
-    _, episodes, _, _ = drawn
-    shares = np.bincount(episodes["start_mode"], minlength=5) / N
-    assert np.abs(shares - SHARES).max() < 4.0 * np.sqrt(0.25 / N)
+def test_start_modes_have_their_probabilities(sampled):
+    _, episodes, _, _ = sampled
+    fractions = np.bincount(episodes["start_mode"], minlength=5) / N
+    assert np.abs(fractions - PROBABILITIES).max() < 4.0 * np.sqrt(0.25 / N)
 
 
-def test_phase_and_counters_fit_the_scheme(drawn):
-    _, episodes, _, qd = drawn
+def test_phase_and_counters_fit_the_start_mode(sampled):
+    _, episodes, _, qd = sampled
     phases = np.array([STANCE, STANCE, FLIGHT, FLIGHT, LANDED])[episodes["start_mode"]]
     np.testing.assert_array_equal(episodes["phase"], phases)
     for name in ("steps", "idle_steps", "took_off", "touched_down", "at_apex", "streak"):
         assert not episodes[name].any(), name
-    on_feet = episodes["start_mode"] < 2
-    assert uniform_range(episodes["command_step"][on_feet], 0, 30) and not episodes["command_step"][~on_feet].any()
+    on_feet = episodes["start_mode"] < 2  # standing, default
+    assert covers_range(episodes["command_step"][on_feet], 0, 30) and not episodes["command_step"][~on_feet].any()
     landed = episodes["phase"] == LANDED
-    assert uniform_range(episodes["phase_steps"][landed], 0, 17) and not episodes["phase_steps"][~landed].any()
-    # a flight on its way down, and a landed robot, have reached the goal
+    assert covers_range(episodes["phase_steps"][landed], 0, 17) and not episodes["phase_steps"][~landed].any()
+    # max_height of a falling or landed robot is the commanded height
     passed = landed | ((episodes["phase"] == FLIGHT) & (qd[:, 2] <= 0.0))
     np.testing.assert_array_equal(episodes["apex_passed"], passed)
     np.testing.assert_allclose(episodes["max_height"][passed], episodes["goal"][passed, 2], rtol=2e-7)
 
 
-def test_goals_and_starts_are_within_the_level(drawn):
-    env, episodes, q, _ = drawn
+def test_goals_and_starts_are_within_the_level(sampled):
+    env, episodes, q, _ = sampled
     level = env.task.levels[episodes["level"][0]]
-    assert uniform_range(episodes["goal"][:, 2], level.goal_lower[2], level.goal_upper[2])
-    standing = some(episodes, "standing", N)
-    assert uniform_range(q[standing, 2], *level.base_height)
+    assert covers_range(episodes["goal"][:, 2], level.goal_lower[2], level.goal_upper[2])
+    standing = worlds_with_mode(episodes, "standing", N)
+    assert covers_range(q[standing, 2], *level.base_height)
     np.testing.assert_array_equal(episodes["start"], q[:, :3].astype(np.float32))
-    default = q[some(episodes, "default", N)][:, MOTOR_Q]
+    default = q[worlds_with_mode(episodes, "default", N)][:, MOTOR_Q]
     np.testing.assert_array_equal(default, np.broadcast_to(DEFAULT_ANGLE.astype(np.float32), default.shape))
 
 
 @pytest.mark.parametrize("start_mode", ["standing", "in_flight", "touchdown", "after_landing"])
-def test_base_place_and_attitude_cover_their_ranges(drawn, start_mode):
-    _, episodes, q, qd = drawn
-    worlds = some(episodes, start_mode, N)
+def test_base_place_and_attitude_cover_their_ranges(sampled, start_mode):
+    _, episodes, q, qd = sampled
+    worlds = worlds_with_mode(episodes, start_mode, N)
     for axis in (0, 1):
-        assert uniform_range(q[worlds, axis], -0.05, 0.05)
-        assert uniform_range(euler(q[worlds, 3:7])[:, axis], -5.0 * DEG, 5.0 * DEG)
-    assert uniform_range(euler(q[worlds, 3:7])[:, 2], -5.0 * DEG, 5.0 * DEG)
+        assert covers_range(q[worlds, axis], -0.05, 0.05)
+        assert covers_range(euler(q[worlds, 3:7])[:, axis], -5.0 * DEG, 5.0 * DEG)
+    assert covers_range(euler(q[worlds, 3:7])[:, 2], -5.0 * DEG, 5.0 * DEG)
     np.testing.assert_allclose(np.linalg.norm(q[worlds, 3:7], axis=1), 1.0, atol=1e-6)
     assert not qd[worlds, :2].any() and not qd[worlds, 3:6].any()
 
 
-@pytest.mark.parametrize("share", [0.0, 0.25, 1.0])
-def test_a_share_of_the_commands_comes_after_a_long_wait(begun, share):
-    reset = only("default", command_delay=0.5, long_wait_probability=share, long_wait=2.0)
-    found = episodes_of(begun(reset))["command_step"]
-    # 31 and 121 steps, each as likely as the others of its range
-    expected = (1.0 - share) * (np.arange(121) < 31) / 31.0 + share / 121.0
-    counts = np.bincount(found, minlength=121)
+@pytest.mark.parametrize("probability", [0.0, 0.25, 1.0])
+def test_command_steps_are_uniform_in_the_long_range_with_its_probability(reset_with, probability):
+    reset = only("default", command_delay=0.5, long_wait_probability=probability, long_wait=2.0)
+    command_step = episodes_of(reset_with(reset))["command_step"]
+    # uniform over steps 0 to 30 (0.5 s) or 0 to 120 (2 s)
+    expected = (1.0 - probability) * (np.arange(121) < 31) / 31.0 + probability / 121.0
+    counts = np.bincount(command_step, minlength=121)
     assert len(counts) == 121
     assert np.abs(np.cumsum(counts) / N - np.cumsum(expected)).max() < 1.95 / np.sqrt(N)  # Kolmogorov, 1 in 1000
 
 
 @pytest.mark.parametrize("start_mode", ["standing", "default", "after_landing"])
-def test_robots_on_their_feet_have_their_paws_at_rest_on_the_ground(drawn, start_mode):
-    env, episodes, _, _ = drawn
-    worlds = some(episodes, start_mode)
+def test_paws_of_grounded_starts_are_at_rest_on_the_ground_within_their_boxes(sampled, start_mode):
+    env, episodes, _, _ = sampled
+    worlds = worlds_with_mode(episodes, start_mode)
     position, velocity = paws_and_velocities(env, worlds)
     np.testing.assert_allclose(position[..., 2], PAW_RADIUS, atol=2e-4)
     np.testing.assert_allclose(velocity, 0.0, atol=2e-3)
     if start_mode != "default":
         spots = position * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
-        assert uniform_range(spots[..., 0], 0.20, 0.22, 0.1)
-        assert uniform_range(spots[:, :2, 1], 0.15, 0.17, 0.1) and uniform_range(spots[:, 2:, 1], 0.20, 0.22, 0.1)
+        assert covers_range(spots[..., 0], 0.20, 0.22, 0.1)
+        assert covers_range(spots[:, :2, 1], 0.15, 0.17, 0.1) and covers_range(spots[:, 2:, 1], 0.20, 0.22, 0.1)
 
 
-def test_landed_robots_still_fall(drawn):
-    _, episodes, q, qd = drawn
-    worlds = some(episodes, "after_landing", N)
-    assert uniform_range(-qd[worlds, 2], 0.0, 1.0) and uniform_range(q[worlds, 2], 0.30, 0.42)
+def test_landed_starts_move_down_with_moving_legs(sampled):
+    _, episodes, q, qd = sampled
+    worlds = worlds_with_mode(episodes, "after_landing", N)
+    assert covers_range(-qd[worlds, 2], 0.0, 1.0) and covers_range(q[worlds, 2], 0.30, 0.42)
     assert np.abs(qd[worlds][:, MOTOR_V]).max() > 1.0
 
 
 @pytest.mark.parametrize("start_mode", ["in_flight", "touchdown"])
-def test_flights_are_on_a_projectile_to_the_goal(drawn, start_mode):
-    _, episodes, q, qd = drawn
-    worlds = some(episodes, start_mode, N)
+def test_apex_of_flights_is_the_commanded_height(sampled, start_mode):
+    _, episodes, q, qd = sampled
+    worlds = worlds_with_mode(episodes, start_mode, N)
     apex = q[worlds, 2] + qd[worlds, 2] ** 2 / (2.0 * G)
-    # from a takeoff height of 0.40 to 0.45 m; a goal below it is the takeoff itself
+    # takeoff is 0.40 to 0.45 m high; a lower goal cannot be the apex
     goal = episodes["goal"][worlds, 2]
     reachable = goal > 0.45
     assert reachable.mean() > 0.95
@@ -173,12 +174,12 @@ def test_flights_are_on_a_projectile_to_the_goal(drawn, start_mode):
     assert rising == 0.0 if start_mode == "touchdown" else 0.3 < rising < 0.7
 
 
-def test_flights_cover_the_leg_ranges_and_touchdowns_reach_for_the_ground(drawn):
-    env, episodes, q, _ = drawn
-    angles = q[some(episodes, "in_flight", N)][:, MOTOR_Q].reshape(-1, 4, 3)
+def test_flights_cover_the_leg_ranges_and_touchdowns_reach_for_the_ground(sampled):
+    env, episodes, q, _ = sampled
+    angles = q[worlds_with_mode(episodes, "in_flight", N)][:, MOTOR_Q].reshape(-1, 4, 3)
     assert np.abs(angles[..., 0]).max() <= 10.0 * DEG + 0.03 + 1e-5
-    assert uniform_range(angles[..., 1:], 0.0, 90.0 * DEG)
-    worlds = some(episodes, "touchdown")
+    assert covers_range(angles[..., 1:], 0.0, 90.0 * DEG)
+    worlds = worlds_with_mode(episodes, "touchdown")
     height = paws_and_velocities(env, worlds)[0][..., 2]
     depth = q[worlds, 2][:, None] - height
     assert height.min() >= 0.05 - 1e-4
@@ -186,33 +187,33 @@ def test_flights_cover_the_leg_ranges_and_touchdowns_reach_for_the_ground(drawn)
     assert np.ptp(height, axis=1).max() < 1e-4
 
 
-def test_no_state_collides_and_paws_are_not_under_the_ground(drawn):
-    env, episodes, q, _ = drawn
+def test_no_state_collides_and_paws_are_not_under_the_ground(sampled):
+    env, episodes, q, _ = sampled
     assert not collision_flags(env).any()
-    flying = some(episodes, "in_flight")
+    flying = worlds_with_mode(episodes, "in_flight")
     assert paws_and_velocities(env, flying)[0][..., 2].min() >= PAW_RADIUS + 0.01 - 1e-4
     sums = q[:, MOTOR_Q].reshape(N, 4, 3)[..., 1:].sum(axis=2)
     assert sums.min() >= -1e-4 and sums.max() <= 240.0 * DEG + 1e-4
     assert np.abs(q[:, MOTOR_Q[::3]]).max() <= 15.0 * DEG + 1e-4
 
 
-def test_draws_that_collide_are_drawn_again(begun):
+def test_colliding_samples_are_rejected(reset_with):
     # bases so low that shanks lie on the ground, and thighs so far in that they meet
     level = Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.10, 0.30))
     for reset in (only("standing"), only("in_flight", flight_transversal=(-30.0, 60.0))):
-        env = begun(reset, level)
+        env = reset_with(reset, level)
         assert not collision_flags(env).any()
         assert np.mean(env.task_arrays()["start_mode"] == NUM_START_MODES.index("default")) < 0.5
 
 
-def test_the_same_draw_is_taken_once(drawn):
-    _, episodes, q, _ = drawn
+def test_worlds_start_at_different_positions(sampled):
+    _, episodes, q, _ = sampled
     moving = episodes["start_mode"] != NUM_START_MODES.index("default")
     assert len(np.unique(q[moving, :3], axis=0)) == moving.sum()
 
 
-def test_loops_are_closed():
-    env = make_env(64, reset=ALL)
+def test_kinematic_loops_of_starts_are_closed():
+    env = make_env(64, reset=ALL_MODES)
     state = env.sim.state
     env.sim.physics.write_bodies()
     newton.eval_fk(env.sim.model, state.joint_q, state.joint_qd, state)
@@ -220,12 +221,12 @@ def test_loops_are_closed():
 
 
 @pytest.mark.parametrize("start_mode", ["standing", "in_flight", "touchdown", "after_landing"])
-def test_the_default_pose_rarely_stands_in(begun, start_mode):
-    env = begun(only(start_mode), Level((0.0, 0.0, 0.45), (0.0, 0.0, 1.2), (0.22, 0.45)))
+def test_the_default_pose_rarely_replaces_invalid_samples(reset_with, start_mode):
+    env = reset_with(only(start_mode), Level((0.0, 0.0, 0.45), (0.0, 0.0, 1.2), (0.22, 0.45)))
     assert np.mean(env.task_arrays()["start_mode"] == NUM_START_MODES.index("default")) < 0.005
 
 
-def test_a_state_that_cannot_be_reached_becomes_the_default_pose():
+def test_an_unreachable_start_becomes_the_default_pose():
     # a base 0.7 m above paws on the ground: beyond the legs' length
     level = Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.7, 0.8))
     env = make_env(16, reset=only("standing"), task=dataclasses.replace(TASK, levels=(level,)))
@@ -233,11 +234,11 @@ def test_a_state_that_cannot_be_reached_becomes_the_default_pose():
     np.testing.assert_array_equal(env.sim.joint_q(), env.sim.model.joint_q.numpy().reshape(16, -1))
 
 
-def test_heading_and_forward_pitch(begun):
-    env = begun(only("standing", heading=180.0, forward_pitch=10.0))
+def test_standing_starts_sample_heading_and_forward_pitch_and_turn_paws_with_the_heading(reset_with):
+    env = reset_with(only("standing", heading=180.0, forward_pitch=10.0))
     angles = euler(env.sim.joint_q()[:, 3:7].astype(float))
     # a mean from 0 to 10 degrees, and 5 degrees to either side of it
-    assert uniform_range(angles[:, 1], -5.0 * DEG, 15.0 * DEG, 0.05)
+    assert covers_range(angles[:, 1], -5.0 * DEG, 15.0 * DEG, 0.05)
     spread = math.sqrt(2.0 * 10.0**2 / 12.0) * DEG
     assert angles[:, 1].mean() == pytest.approx(5.0 * DEG, abs=4.0 * spread / math.sqrt(N))
     assert angles[:, 1].std() == pytest.approx(spread, rel=4.0 / math.sqrt(2.0 * N))
@@ -249,17 +250,17 @@ def test_heading_and_forward_pitch(begun):
     assert np.abs((turn + np.pi) % (2.0 * np.pi) - np.pi).max() < 8.0 * DEG
 
 
-def test_worlds_past_the_last_level_draw_a_level_each_time(begun):
-    env = begun(ResetCfg())
+def test_goals_of_worlds_past_the_last_level_are_those_of_a_uniform_level(reset_with):
+    env = reset_with(ResetCfg())
     edit_episodes(env, level=len(TASK.levels))
     env.reset()
     goals, levels = env.task_arrays()["goal"][:, 2], set(env.task_arrays()["level"])
     edit_episodes(env, level=0)
     lower, upper = [np.array([getattr(level, end)[2] for level in TASK.levels]) for end in ("goal_lower", "goal_upper")]
-    cuts = np.linspace(0.4, 1.3, 19)
-    expected = sum(np.clip((cuts - a) / (b - a), 0.0, 1.0) for a, b in zip(lower, upper, strict=True)) / len(lower)
-    found = np.mean(goals[:, None] < cuts, axis=0)
-    assert np.abs(found - expected).max() < 4.0 * np.sqrt(0.25 / N)
+    heights = np.linspace(0.4, 1.3, 19)  # [m] at which distribution functions are compared
+    expected = sum(np.clip((heights - a) / (b - a), 0.0, 1.0) for a, b in zip(lower, upper, strict=True)) / len(lower)
+    below = np.mean(goals[:, None] < heights, axis=0)
+    assert np.abs(below - expected).max() < 4.0 * np.sqrt(0.25 / N)
     assert levels == {len(TASK.levels)}
 
 
@@ -288,16 +289,16 @@ def test_refuses_start_probabilities_that_do_not_add_up_to_1(probability):
         ({"balance_by": "worlds"}, "balance_by must be resets or steps, got 'worlds'"),
     ],
 )
-def test_impossible_starts_are_refused(change, message):
+def test_invalid_reset_settings_raise_a_one_line_value_error(change, message):
     with pytest.raises(ValueError, match=message) as caught:
         ResetCfg(**change)
     assert "\n" not in str(caught.value)
 
 
-@pytest.mark.parametrize("share", [1.1, -0.1, math.nan])
-def test_impossible_shares_of_another_jump_are_refused(share):
+@pytest.mark.parametrize("probability", [1.1, -0.1, math.nan])
+def test_next_jump_probability_outside_0_to_1_raises_a_one_line_value_error(probability):
     with pytest.raises(ValueError, match="next_jump_probability must be in") as caught:
-        Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.22, 0.35), next_jump_probability=share)
+        Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.22, 0.35), next_jump_probability=probability)
     assert "\n" not in str(caught.value)
 
 
@@ -316,7 +317,7 @@ def test_settings_reach_the_kernels_by_name_in_radians_and_steps():
     assert list(ranges.next_jump_delay) == pytest.approx([30.0, 60.0])
 
 
-def test_a_levels_numbers_reach_the_kernels():
+def test_level_values_reach_the_kernel_struct_by_name():
     level = Level(
         (0.25, -0.5, 0.0), (0.5, 0.75, 1.0), (0.125, 0.375), next_jump_probability=0.75, elliptical=True
     ).values()

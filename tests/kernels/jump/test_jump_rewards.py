@@ -9,16 +9,16 @@ from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 
 NAMES = """jump_height estimated_jump_height horizontal_velocity orientation angular_velocity joint_symmetry
 ground_posture air_posture post_landing_posture paws_down soft_impact stance_impact catch_landing damp_landing"""
-paid = Table(functions(rewards, NAMES), float)
+reward = Table(functions(rewards, NAMES), float)
 E = math.exp
 PHASES = [int(STANCE), int(FLIGHT), int(LANDED)]
-TRANSVERSAL = np.tile([0.0, 1.0, 1.0], 4)
-LATERAL = 1.0 - TRANSVERSAL
-HEIGHT = {"std_fine": 0.10, "scale_sharp": 0.05, "std_wide": 0.4}
+TRANSVERSAL = np.tile([0.0, 1.0, 1.0], 4)  # 1 for outer and inner motors
+LATERAL = 1.0 - TRANSVERSAL  # 1 for lateral motors
+HEIGHT = {"std_fine": 0.10, "scale_sharp": 0.05, "std_wide": 0.4}  # [m]
 
 
 def name_of(value):
-    """Name the cases of a table of terms."""
+    """Return the id of a parameter in a table of terms: the term's name, other values have none."""
     return value if isinstance(value, str) else ""
 
 
@@ -28,9 +28,9 @@ def name_of(value):
 )
 def test_jump_height_is_paid_at_the_apex_only(error, expected):
     at_apex = make_episode(phase=FLIGHT, at_apex=1, apex_passed=1, max_height=0.9 + error, goal=(0.0, 0.0, 0.9))
-    assert paid("jump_height", make_view(), at_apex, **HEIGHT) == pytest.approx(expected, rel=1e-4)
+    assert reward("jump_height", make_view(), at_apex, **HEIGHT) == pytest.approx(expected, rel=1e-4)
     at_apex.at_apex = 0
-    assert paid("jump_height", make_view(), at_apex, **HEIGHT) == 0.0
+    assert reward("jump_height", make_view(), at_apex, **HEIGHT) == 0.0
 
 
 def test_estimated_jump_height_is_ballistic_and_paid_in_flight_before_the_apex():
@@ -39,13 +39,13 @@ def test_estimated_jump_height_is_ballistic_and_paid_in_flight_before_the_apex()
     fields = {"goal": (0.0, 0.0, 0.7462), "max_height": 0.6}
     rising = make_episode(phase=FLIGHT, **fields)
     expected = E(-0.25) + 3.0 * E(-1.0) + E(-1.0 / 64.0)
-    assert paid("estimated_jump_height", view, rising, **HEIGHT) == pytest.approx(expected, rel=1e-4)
-    for other in (
+    assert reward("estimated_jump_height", view, rising, **HEIGHT) == pytest.approx(expected, rel=1e-4)
+    for episode in (
         make_episode(phase=FLIGHT, apex_passed=1, **fields),
         make_episode(phase=STANCE, **fields),
         make_episode(phase=LANDED, **fields),
     ):
-        assert paid("estimated_jump_height", view, other, **HEIGHT) == 0.0
+        assert reward("estimated_jump_height", view, episode, **HEIGHT) == 0.0
 
 
 ALWAYS_PAID = [
@@ -72,16 +72,16 @@ ALWAYS_PAID = [
 ]  # (term, robot, numbers, value in [stance, off stance])
 
 
-@pytest.mark.parametrize(("term", "robot", "p", "values"), ALWAYS_PAID, ids=name_of)
-def test_always_paid_terms_count_less_while_a_jump_is_due(term, robot, p, values):
+@pytest.mark.parametrize(("term", "robot", "numbers", "values"), ALWAYS_PAID, ids=name_of)
+def test_always_paid_terms_count_less_while_a_jump_is_due(term, robot, numbers, values):
     view = make_view(**robot)
-    unasked = make_episode(phase=STANCE, steps=9, command_step=10)
-    assert paid(term, view, unasked, **p) == pytest.approx(values[0], rel=1e-4)
+    before_command = make_episode(phase=STANCE, steps=9, command_step=10)
+    assert reward(term, view, before_command, **numbers) == pytest.approx(values[0], rel=1e-4)
     due = make_episode(phase=STANCE, steps=10, command_step=10)
-    assert paid(term, view, due, **p) == pytest.approx(0.25 * values[0], rel=1e-4)
+    assert reward(term, view, due, **numbers) == pytest.approx(0.25 * values[0], rel=1e-4)
     for phase in (FLIGHT, LANDED):
         jumped = make_episode(phase=phase, steps=10, command_step=10)
-        assert paid(term, view, jumped, **p) == pytest.approx(values[1], rel=1e-4)
+        assert reward(term, view, jumped, **numbers) == pytest.approx(values[1], rel=1e-4)
 
 
 def test_joint_symmetry_falls_with_variance_and_with_lateral_angles():
@@ -89,8 +89,8 @@ def test_joint_symmetry_falls_with_variance_and_with_lateral_angles():
     variance_only = make_view(angle=np.tile([0.0, 0.5, 0.9], 4))
     task = make_episode(command_step=1)
     widths = {"std_variance": 0.04, "std_lateral": 0.2, "waiting_scale": 1.0}
-    assert paid("joint_symmetry", lateral_only, task, **widths) == pytest.approx(E(-1.0), rel=1e-4)
-    assert paid("joint_symmetry", variance_only, task, **widths) == pytest.approx(E(-1.0), rel=1e-4)
+    assert reward("joint_symmetry", lateral_only, task, **widths) == pytest.approx(E(-1.0), rel=1e-4)
+    assert reward("joint_symmetry", variance_only, task, **widths) == pytest.approx(E(-1.0), rel=1e-4)
 
 
 POSTURES = [
@@ -100,18 +100,18 @@ POSTURES = [
 ]
 
 
-@pytest.mark.parametrize(("term", "shift", "p", "phases"), POSTURES, ids=name_of)
-def test_postures_count_the_rms_offset_of_all_motors(term, shift, p, phases):
-    wanted = DEFAULT_ANGLE + shift * TRANSVERSAL
-    one_motor_off = wanted.copy()
+@pytest.mark.parametrize(("term", "shift", "numbers", "phases"), POSTURES, ids=name_of)
+def test_postures_are_phi_of_the_rms_motor_offset_in_their_phases(term, shift, numbers, phases):
+    target = DEFAULT_ANGLE + shift * TRANSVERSAL
+    one_motor_off = target.copy()
     one_motor_off[4] += math.sqrt(12.0) * 10.0 * DEG
-    laterals_off = wanted + math.sqrt(3.0) * 10.0 * DEG * LATERAL
+    laterals_off = target + math.sqrt(3.0) * 10.0 * DEG * LATERAL
     for phase in PHASES:
         task = make_episode(phase=phase)
         due = 1.0 if phase in phases else 0.0
-        assert paid(term, make_view(angle=wanted), task, **p) == pytest.approx(due)
-        assert paid(term, make_view(angle=one_motor_off), task, **p) == pytest.approx(due * E(-1.0), rel=1e-4)
-        assert paid(term, make_view(angle=laterals_off), task, **p) == pytest.approx(due * E(-1.0), rel=1e-4)
+        assert reward(term, make_view(angle=target), task, **numbers) == pytest.approx(due)
+        assert reward(term, make_view(angle=one_motor_off), task, **numbers) == pytest.approx(due * E(-1.0), rel=1e-4)
+        assert reward(term, make_view(angle=laterals_off), task, **numbers) == pytest.approx(due * E(-1.0), rel=1e-4)
 
 
 LANDING_TERMS = [
@@ -122,15 +122,13 @@ LANDING_TERMS = [
 ]
 
 
-@pytest.mark.parametrize(
-    ("term", "view", "p", "expected"), LANDING_TERMS, ids=lambda v: v if isinstance(v, str) else ""
-)
-def test_landing_terms_are_paid_for_three_tenths_of_a_second(term, view, p, expected):
-    assert paid(term, view, make_episode(phase=LANDED, phase_steps=0), **p) == pytest.approx(expected)
-    assert paid(term, view, make_episode(phase=LANDED, phase_steps=17), **p) == pytest.approx(expected)
-    assert paid(term, view, make_episode(phase=LANDED, phase_steps=18), **p) == 0.0
-    assert paid(term, view, make_episode(phase=STANCE), **p) == 0.0
-    assert paid(term, view, make_episode(phase=FLIGHT), **p) == 0.0
+@pytest.mark.parametrize(("term", "view", "numbers", "expected"), LANDING_TERMS, ids=name_of)
+def test_landing_terms_are_paid_for_18_policy_steps_from_touchdown(term, view, numbers, expected):
+    assert reward(term, view, make_episode(phase=LANDED, phase_steps=0), **numbers) == pytest.approx(expected)
+    assert reward(term, view, make_episode(phase=LANDED, phase_steps=17), **numbers) == pytest.approx(expected)
+    assert reward(term, view, make_episode(phase=LANDED, phase_steps=18), **numbers) == 0.0
+    assert reward(term, view, make_episode(phase=STANCE), **numbers) == 0.0
+    assert reward(term, view, make_episode(phase=FLIGHT), **numbers) == 0.0
 
 
 IMPACTS = [
@@ -141,34 +139,34 @@ IMPACTS = [
     ((3.0, 0.0, -4.0), (-5.0, 0.0, 10.0), 0.78, -0.44),  # (-5 * 3 - 10 * 4) / 5 = -11
     ((0.0, 0.0, 0.0), (0.0, 0.0, 30.0), 1.0, 0.0),  # no direction of motion
     ((0.0, 0.0, -3.0), (0.0, 0.0, 180.0), 0.0, -1.0),  # a landing within the step
-    ((0.0, 0.0, -3.0), (0.0, 0.0, 240.0), 0.0, -1.0),  # the same with a rebound of 1 m/s
+    ((0.0, 0.0, -3.0), (0.0, 0.0, 240.0), 0.0, -1.0),  # likewise, rebounding with 1 m/s
     ((0.0, 0.0, -0.05), (0.0, 0.0, 40.0), 0.94, -0.12),  # pushing off while sinking: 0.05 m/s were lost, 3 m/s^2
-]  # (velocity before the step, mean acceleration, soft impact, stance impact)
+]  # (previous velocity [m/s], mean acceleration [m/s^2], soft impact, stance impact)
 
 
 @pytest.mark.parametrize(("vel", "acc", "soft", "stance"), IMPACTS)
-def test_impacts_count_what_was_lost_of_the_speed_before(vel, acc, soft, stance):
+def test_impacts_are_the_loss_of_the_previous_speed_over_the_limit(vel, acc, soft, stance):
     view = make_view(prev_lin_vel=vel, lin_acc=acc, lin_vel=np.array(vel) + np.array(acc) / 60.0)
-    assert paid("soft_impact", view, make_episode(phase=LANDED), limit=50.0) == pytest.approx(soft)
-    assert paid("stance_impact", view, make_episode(phase=STANCE), limit=25.0) == pytest.approx(stance)
+    assert reward("soft_impact", view, make_episode(phase=LANDED), limit=50.0) == pytest.approx(soft)
+    assert reward("stance_impact", view, make_episode(phase=STANCE), limit=25.0) == pytest.approx(stance)
     for phase in (FLIGHT, LANDED):
-        assert paid("stance_impact", view, make_episode(phase=phase), limit=25.0) == 0.0
+        assert reward("stance_impact", view, make_episode(phase=phase), limit=25.0) == 0.0
 
 
 @pytest.mark.parametrize(("vz", "expected"), [(0.3, 0.0), (-0.3, 0.3), (-2.5, 1.0)])
 def test_catch_landing_is_the_clamped_speed_of_the_fall(vz, expected):
     falling = make_view(lin_vel=(1.0, 1.0, vz))
-    assert paid("catch_landing", falling, make_episode(phase=LANDED)) == pytest.approx(expected)
+    assert reward("catch_landing", falling, make_episode(phase=LANDED)) == pytest.approx(expected)
 
 
 def test_damp_landing_is_the_mean_of_clamped_folding_rates():
     # per leg: lateral ignored, outer 3 -> 1, inner -2 -> 0
     view = make_view(rate=np.tile([9.0, 3.0, -2.0], 4))
-    assert paid("damp_landing", view, make_episode(phase=LANDED)) == pytest.approx(0.5)
+    assert reward("damp_landing", view, make_episode(phase=LANDED)) == pytest.approx(0.5)
 
 
-def test_paws_are_paid_for_that_are_on_the_ground_after_touchdown():
+def test_paws_down_is_the_number_of_contacts_after_touchdown():
     view = make_view(contact=(1.0, 1.0, 0.0, 1.0), contacts=3)
-    assert paid("paws_down", view, make_episode(phase=LANDED)) == 3.0
+    assert reward("paws_down", view, make_episode(phase=LANDED)) == 3.0
     for phase in (STANCE, FLIGHT):
-        assert paid("paws_down", view, make_episode(phase=phase)) == 0.0
+        assert reward("paws_down", view, make_episode(phase=phase)) == 0.0

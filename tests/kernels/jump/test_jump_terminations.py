@@ -8,9 +8,10 @@ NAMES = (
     "landed_for wrong_height low_touchdown moved_away slanted_takeoff hard_impact no_jump early_takeoff second_takeoff"
 )
 holds = Table(functions(terminations, NAMES), bool)
+"""holds(name, view, episode, **numbers): whether a termination holds."""
 
 
-def test_success_comes_a_time_after_touchdown():
+def test_landed_for_holds_after_its_steps_since_touchdown():
     for steps, over in ((59, False), (60, True)):
         landed = make_episode(phase=LANDED, phase_steps=steps)
         assert holds("landed_for", make_view(), landed, steps=60.0) is over
@@ -28,7 +29,7 @@ def test_wrong_height_counts_at_touchdown(error, missed):
     assert not holds("wrong_height", make_view(), make_episode(touched_down=0, **fields), tolerance=0.1)
 
 
-def test_low_touchdown():
+def test_low_touchdown_is_a_base_below_its_height_at_touchdown_only():
     for z, low in ((0.21, False), (0.19, True)):
         view = make_view(pos=(0.0, 0.0, z))
         assert holds("low_touchdown", view, make_episode(touched_down=1), height=0.2) is low
@@ -37,11 +38,11 @@ def test_low_touchdown():
 
 def test_moved_away_is_measured_in_the_plane_from_the_start():
     start = make_episode(start=(1.0, -1.0, 0.3))
-    assert not holds("moved_away", make_view(pos=(1.11, -0.85, 1.2)), start, distance=0.2)
-    assert holds("moved_away", make_view(pos=(1.13, -0.84, 0.3)), start, distance=0.2)
+    assert not holds("moved_away", make_view(pos=(1.11, -0.85, 1.2)), start, distance=0.2)  # 0.186 m
+    assert holds("moved_away", make_view(pos=(1.13, -0.84, 0.3)), start, distance=0.2)  # 0.206 m
 
 
-def test_slanted_takeoff():
+def test_slanted_takeoff_is_a_horizontal_speed_above_its_limit_at_takeoff_only():
     for vx, slanted in ((0.59, False), (0.61, True)):
         view = make_view(lin_vel=(vx, -0.45, 3.0))  # 0.6, 0.45: 0.75 m/s
         assert holds("slanted_takeoff", view, make_episode(phase=FLIGHT, took_off=1), speed=0.75) is slanted
@@ -66,7 +67,7 @@ def test_a_landing_that_stops_within_a_step_is_a_hard_impact():
     assert holds("hard_impact", stopped, make_episode(phase=LANDED, touched_down=1), stance=25.0, flight=50.0)
 
 
-def test_no_jump_within_the_time_or_at_rest_for_too_long():
+def test_no_jump_holds_in_stance_too_long_after_the_command_or_at_rest():
     view, limits = make_view(), {"steps": 180.0, "idle_steps": 60.0}
     assert not holds("no_jump", view, make_episode(steps=210, command_step=30), **limits)
     assert holds("no_jump", view, make_episode(steps=211, command_step=30), **limits)
@@ -77,7 +78,7 @@ def test_no_jump_within_the_time_or_at_rest_for_too_long():
     assert not holds("no_jump", view, make_episode(steps=20, command_step=30, idle_steps=99), **limits)
 
 
-def test_early_takeoff():
+def test_early_takeoff_is_a_takeoff_before_the_command_step():
     jumped = {"phase": FLIGHT, "command_step": 30}
     assert holds("early_takeoff", make_view(), make_episode(took_off=1, steps=29, **jumped))
     assert not holds("early_takeoff", make_view(), make_episode(took_off=1, steps=30, **jumped))

@@ -21,14 +21,14 @@ from solver_helpers import MOTOR_Q, MOTOR_V
 DEG = np.pi / 180.0
 SCALE = np.tile([15.0, 90.0, 90.0], 4) * DEG
 DELAYS = np.arange(49)
-"""[physics steps] Every latency that the ring of targets holds."""
+"""[physics steps] All latencies that the ring buffer of targets can hold."""
 
 
 class Commands:
-    """Worlds that are commanded step by step."""
+    """Arrays of n worlds, and launches of `action_kernel` on them; motor targets start at the default pose."""
 
     def __init__(self, n, tasks=(), delay=0):
-        """tasks: of the skills, (by default one); delay [physics steps]: of each world."""
+        """tasks: one per skill, by default the probe task; delay [physics steps]: (n,) or one for all worlds."""
         skills = [TaskRuntime(task, i, n, STEP_DT, SUBSTEPS, "cpu") for i, task in enumerate(tasks or [probe_task()])]
         self.n, self.robot, self.episodes = n, standing_robots(n), new_worlds(n)
         self.delays = no_delays(n, delay)
@@ -37,52 +37,50 @@ class Commands:
         self.delays.target_history.assign(np.tile(DEFAULT_ANGLE[None, :, None], (8, 1, n)))
 
     def act(self, action):
-        """Begin a step with an action, (n, 12) or (skills, n, 12)."""
+        """Launch the action stage with an action, (n, 12) or (skills, n, 12), and increment the step count."""
         action = array(np.reshape(action, (-1, self.n, 12)))
         inputs = [action, self.settings, self.push, self.robot, self.episodes, self.delays]
         wp.launch(action_kernel, (4, self.n), inputs, device="cpu")
         wp.launch(advance_rng_kernel, self.n, [array(np.ones(self.n)), self.episodes], device="cpu")
 
-    def motors(self, name):
-        """Return an array of the motors, (n, 12)."""
+    def motor_array(self, name):
+        """Return a copy of the array `name` of `RobotArrays`, (n, 12)."""
         return getattr(self.robot, name).numpy().T.copy()
 
 
 def random_action(n, size=1.0, seed=0):
+    """Return a uniform action within -size..size, (n, 12)."""
     return np.random.default_rng(seed).uniform(-size, size, (n, 12)).astype(np.float32)
 
 
-# ---------------------------------------------------------------- from action to target
-
-
-def test_an_action_is_clamped_and_scaled_about_the_default_pose():
+def test_an_action_is_clamped_scaled_about_the_default_pose_and_kept_for_two_steps():
     commands, action = Commands(32), random_action(32, 2.0)
     commands.act(action)
     clamped = np.clip(action, -1.0, 1.0)
-    np.testing.assert_array_equal(commands.motors("action"), clamped)
-    np.testing.assert_allclose(commands.motors("target"), DEFAULT_ANGLE + SCALE * clamped, atol=1e-6)
-    assert not commands.motors("prev_action").any()
+    np.testing.assert_array_equal(commands.motor_array("action"), clamped)
+    np.testing.assert_allclose(commands.motor_array("target"), DEFAULT_ANGLE + SCALE * clamped, atol=1e-6)
+    assert not commands.motor_array("prev_action").any()
     commands.act(0.5 * action)
-    np.testing.assert_array_equal(commands.motors("prev_action"), clamped)
-    assert not commands.motors("prev_prev_action").any()
+    np.testing.assert_array_equal(commands.motor_array("prev_action"), clamped)
+    assert not commands.motor_array("prev_prev_action").any()
     commands.act(0.2 * action)
-    np.testing.assert_array_equal(commands.motors("prev_prev_action"), clamped)
+    np.testing.assert_array_equal(commands.motor_array("prev_prev_action"), clamped)
 
 
-def test_a_world_takes_the_action_and_the_scale_of_its_own_skill():
-    other = dataclasses.replace(probe_task(), name="other", action_scale=(30.0, 45.0))
-    commands = Commands(32, [probe_task(), other])
+def test_a_world_uses_the_action_and_the_scale_of_its_skill():
+    second_task = dataclasses.replace(probe_task(), name="other", action_scale=(30.0, 45.0))  # [deg]
+    commands = Commands(32, [probe_task(), second_task])
     commands.episodes.skill.assign(np.arange(32) % 2)
     actions = np.stack([random_action(32, seed=1), random_action(32, seed=2)])
     commands.act(actions)
     odd = (np.arange(32) % 2 == 1)[:, None]
     scale = np.where(odd, np.tile([30.0, 45.0, 45.0], 4) * DEG, SCALE)
     np.testing.assert_allclose(
-        commands.motors("target"), DEFAULT_ANGLE + scale * np.where(odd, actions[1], actions[0]), atol=1e-6
+        commands.motor_array("target"), DEFAULT_ANGLE + scale * np.where(odd, actions[1], actions[0]), atol=1e-6
     )
 
 
-def test_what_happened_before_the_step_is_kept():
+def test_rates_torques_and_base_velocity_are_stored_as_previous_ones():
     commands = Commands(32)
     rates, torque = random_action(32, seed=3), random_action(32, seed=4)
     qd = np.zeros((32, 38), dtype=np.float32)
@@ -90,106 +88,100 @@ def test_what_happened_before_the_step_is_kept():
     commands.robot.joint_qd.assign(qd.ravel())
     commands.robot.torque.assign(torque.T)
     commands.act(np.zeros((32, 12)))
-    np.testing.assert_array_equal(commands.motors("prev_rate"), rates)
-    np.testing.assert_array_equal(commands.motors("prev_torque"), torque)
+    np.testing.assert_array_equal(commands.motor_array("prev_rate"), rates)
+    np.testing.assert_array_equal(commands.motor_array("prev_torque"), torque)
     np.testing.assert_array_equal(commands.robot.prev_lin_vel.numpy(), np.tile([1.0, 2.0, 3.0], (32, 1)))
 
 
 @pytest.mark.parametrize(("offset", "safe"), [(0.0, 24.375), (4.0, 16.875), (-10.0, 30.0)])
-def test_targets_are_filtered_by_what_the_sensors_read(offset, safe):
-    """At 10 degrees, read with an error of `offset`, before a limit of 15, 30 degrees are asked for.
+def test_targets_are_filtered_at_the_sensed_angle(offset, safe):
+    """The motor is at 10 degrees (sensor error `offset` [deg]), the target is 30, the limit 15; safe: filtered [deg].
 
-    The limit is 5, 1 or 15 degrees away at the least speed of 60 deg/s: a weight of 1 - 5/8, 1 - 1/8 or 0.
+    The sensed distance to the limit is 5, 1 or 15 degrees; at the least speed of 60 deg/s the target moves toward the
+    limit with a weight of 1 - 5/8, 1 - 1/8 or 0.
     """
     open_filter = dataclasses.replace(vertical_jump_filter(), lateral=LimitsCfg(-15.0, 15.0))
     commands = Commands(1, [probe_task(action_scale=(30.0, 90.0), command_filter=open_filter)])
     q = commands.robot.joint_q.numpy().copy()
-    q[7] = 10.0 * DEG
+    q[7] = 10.0 * DEG  # FL lateral
     commands.robot.joint_q.assign(q)
     commands.robot.joint_offset.assign(np.full((12, 1), offset * DEG))
     commands.act(np.eye(1, 12))
-    assert commands.motors("target")[0, 0] == pytest.approx(30.0 * DEG)
-    assert commands.motors("filtered_target")[0, 0] == pytest.approx(safe * DEG, abs=1e-5)
-    np.testing.assert_array_equal(commands.motors("target")[0, 1:], commands.motors("filtered_target")[0, 1:])
-
-
-# ---------------------------------------------------------------- actions that are no numbers
+    assert commands.motor_array("target")[0, 0] == pytest.approx(30.0 * DEG)
+    assert commands.motor_array("filtered_target")[0, 0] == pytest.approx(safe * DEG, abs=1e-5)
+    np.testing.assert_array_equal(commands.motor_array("target")[0, 1:], commands.motor_array("filtered_target")[0, 1:])
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
-def test_an_action_that_is_not_finite_counts_as_0_and_is_told(bad):
+def test_a_nonfinite_action_counts_as_0_and_sets_bad_action(bad):
     commands, action = Commands(8), random_action(8)
     action[3, 7], action[5] = bad, bad
     commands.act(action)
     expected = np.where(np.isfinite(action), action, 0.0)
-    np.testing.assert_array_equal(commands.motors("action"), expected)
+    np.testing.assert_array_equal(commands.motor_array("action"), expected)
     assert commands.episodes.bad_action.numpy().tolist() == [0, 0, 0, 1, 0, 1, 0, 0]
 
 
-# ---------------------------------------------------------------- latency
-
-
-def test_motors_follow_the_target_of_as_many_physics_steps_ago_as_the_latency():
-    """One world a latency, a target of its own in every policy step; before the first all was the default pose."""
+def test_motors_follow_targets_delayed_by_the_latency_in_physics_steps():
+    """One world per latency; targets change in every policy step and are the default pose before the first."""
     commands = Commands(len(DELAYS), delay=DELAYS)
     steps = 30
-    asked = 0.2 * np.random.default_rng(0).uniform(-1.0, 1.0, (steps, 12))
-    wanted = DEFAULT_ANGLE + SCALE * asked  # well within the limits, so that the filter leaves them alone
+    actions = 0.2 * np.random.default_rng(0).uniform(-1.0, 1.0, (steps, 12))
+    targets = DEFAULT_ANGLE + SCALE * actions  # well within the limits, so that the filter leaves them alone
     followed = []
-    for action in asked:
+    for action in actions:
         commands.act(np.tile(action, (len(DELAYS), 1)))
-        np.testing.assert_array_equal(commands.motors("filtered_target"), commands.motors("target"))
+        np.testing.assert_array_equal(commands.motor_array("filtered_target"), commands.motor_array("target"))
         late, earlier = commands.delays.current_target.numpy().T, commands.delays.prev_target.numpy().T
         when = commands.delays.switch_step.numpy()
         assert (when >= 0).all() and (when < SUBSTEPS).all()
         followed += [np.where((substep < when)[:, None], earlier, late) for substep in range(SUBSTEPS)]
     followed = np.array(followed)
-    commanded = np.repeat(wanted, SUBSTEPS, axis=0)  # by physics step
+    commanded = np.repeat(targets, SUBSTEPS, axis=0)  # by physics step
     for world, delay in enumerate(DELAYS):
         expected = np.concatenate([np.tile(DEFAULT_ANGLE, (delay, 1)), commanded])[: steps * SUBSTEPS]
         np.testing.assert_allclose(followed[:, world], expected, atol=1e-6, err_msg=f"latency {delay}")
 
 
-def test_the_ring_goes_on_over_thousands_of_steps():
+def test_delayed_targets_are_right_at_step_counts_around_a_million():
     commands = Commands(len(DELAYS), delay=DELAYS)
     commands.episodes.step_count.fill_(2**20 - 3)
     past = [np.tile(DEFAULT_ANGLE, (len(DELAYS), 1)).astype(np.float32)] * 8
     for step in range(40):
         commands.act(0.2 * random_action(len(DELAYS), seed=step))
-        past.append(commands.motors("filtered_target"))
+        past.append(commands.motor_array("filtered_target"))
         late, earlier = commands.delays.current_target.numpy().T, commands.delays.prev_target.numpy().T
         for world, delay in enumerate(DELAYS):
             np.testing.assert_array_equal(late[world], past[-1 - delay // 8][world])
             np.testing.assert_array_equal(earlier[world], past[-2 - delay // 8][world])
 
 
-def test_the_solvers_motors_follow_it_too():
-    """Against the same robots, driven physics step by physics step with targets that the test delays itself."""
+def test_simulated_motors_follow_delayed_targets():
+    """Oracle: the same robots advanced one physics step at a time with targets that the test delays."""
     delays = np.array([0, 1, 7, 8, 13, 16, 31, 48])
-    env, other = (make_env(len(delays), reset=only("default")) for _ in range(2))
+    env, oracle = (make_env(len(delays), reset=only("default")) for _ in range(2))
     env.parameters.latency.assign(delays)
-    for each in (env, other):  # contact iterations that begin with other bits may end a tolerance apart
+    for each in (env, oracle):  # contact iterations from different initial guesses differ by the tolerance
         each.sim.physics.solver.tolerance = 1.0e-6
-    physics, past = other.sim.physics, []
-    still = env.sim.joint_q()[:, 7 + MOTOR_SLOTS]
-    now = wp.zeros((12, len(delays)), dtype=float, device="cpu")
+    physics, past = oracle.sim.physics, []
+    initial = env.sim.joint_q()[:, 7 + MOTOR_SLOTS]
+    target = wp.zeros((12, len(delays)), dtype=float, device="cpu")
     for action in 0.3 * random_actions(len(delays), 12, seed=1):
         env.step(action)
         past += SUBSTEPS * [env.robot.filtered_target.numpy().T.copy()]
         for substep in range(SUBSTEPS):
             when = len(past) - SUBSTEPS + substep - delays
-            targets = [past[at][world] if at >= 0 else still[world] for world, at in enumerate(when)]
-            now.assign(np.array(targets).T)
-            physics.advance(1, now)
+            targets = [past[step][world] if step >= 0 else initial[world] for world, step in enumerate(when)]
+            target.assign(np.array(targets).T)
+            physics.advance(1, target)
         assert not env.done.any()
-        motors, rates = [*range(7), *MOTOR_Q], [*range(6), *MOTOR_V]  # knees are not written in between
-        np.testing.assert_allclose(env.sim.joint_q()[:, motors], other.sim.joint_q()[:, motors], atol=1e-5)
-        np.testing.assert_allclose(env.sim.joint_qd()[:, rates], other.sim.joint_qd()[:, rates], atol=0.01)
+        motors, rates = [*range(7), *MOTOR_Q], [*range(6), *MOTOR_V]  # base and motors; knees are not written
+        np.testing.assert_allclose(env.sim.joint_q()[:, motors], oracle.sim.joint_q()[:, motors], atol=1e-5)  # [rad]
+        np.testing.assert_allclose(env.sim.joint_qd()[:, rates], oracle.sim.joint_qd()[:, rates], atol=0.01)  # [rad/s]
     assert np.abs(env.sim.joint_qd()[1:] - env.sim.joint_qd()[:1]).max() > 0.1
 
 
-def test_a_drawn_latency_is_the_one_that_acts():
-    """A range of one value in milliseconds gives that many physics steps in the motors of every world."""
+def test_a_randomised_latency_in_milliseconds_becomes_physics_steps_of_the_motors():
     for delay in (0, 3, 48):
         milliseconds = 1000.0 * delay / 480.0
         drawn = dataclasses.replace(RandomizationCfg.off(), latency=(milliseconds, milliseconds))
@@ -200,10 +192,7 @@ def test_a_drawn_latency_is_the_one_that_acts():
         assert env.delays.steps.numpy().tolist() == [delay] * 3
 
 
-# ---------------------------------------------------------------- pushes and the clock
-
-
-def test_a_push_acts_on_the_base_while_a_paw_is_down_or_in_the_air_too_where_the_skill_says_so():
+def test_a_push_acts_on_the_base_with_a_paw_in_contact_or_with_push_in_flight():
     flying = probe_task(name="flying", randomization=dataclasses.replace(RandomizationCfg.off(), push_in_flight=True))
     commands = Commands(8, [probe_task(), flying])
     commands.episodes.skill.assign([0, 0, 0, 0, 1, 1, 1, 1])
@@ -214,12 +203,12 @@ def test_a_push_acts_on_the_base_while_a_paw_is_down_or_in_the_air_too_where_the
     commands.robot.contact_time.assign(time)
     commands.act(np.zeros((2, 8, 12)))
     pushed = np.array([False, True, False, True, True, True, True, True])
-    found = commands.robot.body_f.numpy().reshape(8, 21, 6)
-    np.testing.assert_array_equal(found[:, 0], np.where(pushed[:, None], wrench, 0.0))
-    assert not found[:, 1:].any()
+    wrenches = commands.robot.body_f.numpy().reshape(8, 21, 6)  # (worlds, bodies, force and torque)
+    np.testing.assert_array_equal(wrenches[:, 0], np.where(pushed[:, None], wrench, 0.0))
+    assert not wrenches[:, 1:].any()
 
 
-def test_a_step_moves_the_clock_on_and_nothing_is_new_any_more():
+def test_a_step_increments_the_step_count_and_clears_history_reset():
     env = make_env(4)
     env.episodes.history_reset.fill_(1)
     step_count = env.episodes.step_count.numpy().copy()

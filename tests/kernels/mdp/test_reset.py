@@ -16,12 +16,12 @@ from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, array, values_of, write
 from probe_task import Probe, probe_task
 
 N = 96
-SOME = np.arange(N) % 3 == 0
-"""Worlds that begin anew."""
+MASK = np.arange(N) % 3 == 0
+"""(N,) bool, the worlds that are reset."""
 
 
 class Stage(Probe):
-    """Worlds in any state, and launches of what begins episodes."""
+    """n worlds of the probe task with a simulation's geometry, and launches of the reset kernels."""
 
     def __init__(self, n=N, task=None, seed=0):
         super().__init__(n, task, seed=seed)
@@ -30,34 +30,35 @@ class Stage(Probe):
         self.settings = wp.array([self.skill.settings_of_skill()], dtype=SkillSettings, device="cpu")
 
     def mask(self, chosen):
+        """Return chosen, (n,) or one for all, as a Warp array of floats."""
         return array(np.broadcast_to(np.asarray(chosen, dtype=float), self.n))
 
     def reset(self, chosen):
-        """Launch the beginning of episodes."""
+        """Launch the reset kernel where chosen is not 0; it samples due commands elsewhere."""
         skill = self.skill
         inputs = [skill.index, 1, self.mask(chosen), self.scene, self.settings, skill.settings, skill.levels,
                   self.episodes, skill.states, self.robot]  # fmt: skip
         wp.launch(skill.kernels["reset"], (self.n, 1), inputs, device="cpu")
 
-    def give(self, chosen, begins, values, headings):
-        """Launch commands from outside."""
+    def set_command(self, chosen, begins, values, headings):
+        """Launch the command kernel where chosen is not 0; begins 1: new episodes with headings [rad]."""
         skill = self.skill
         inputs = [skill.index, self.mask(chosen), begins, array(values, wp.vec4), array(headings), self.scene,
                   self.robot, self.episodes, skill.states]  # fmt: skip
         wp.launch(skill.kernels["set_command"], self.n, inputs, device="cpu")
 
-    def forget(self, chosen):
-        """Launch what forgets the past."""
+    def clear_history(self, chosen):
+        """Launch `clear_history_kernel` where chosen is not 0."""
         inputs = [0, self.mask(chosen), self.scene.geometry, self.robot, self.delays]
         wp.launch(clear_history_kernel, (12, self.n), inputs, device="cpu")
 
-    def stand(self, chosen, headings):
-        """Launch what stands robots up."""
+    def write_default_pose(self, chosen, headings):
+        """Launch `default_pose_kernel` where chosen is not 0; headings [rad]: (n,)."""
         inputs = [self.mask(chosen), array(headings), self.scene, self.settings, self.episodes.skill, self.robot]
         wp.launch(default_pose_kernel, self.n, inputs, device="cpu")
 
     def scramble(self, seed=0):
-        """Give the robots random states and pasts."""
+        """Write random values into all robot and delay arrays, and random attitudes and motor angles."""
         rng = np.random.default_rng(seed)
         for struct, kind in ((self.robot, RobotArrays), (self.delays, Delays)):
             for name in kind.vars:
@@ -80,62 +81,60 @@ def scene_of(sim):
 
 @pytest.fixture
 def stage():
+    """Return N worlds of the probe task."""
     return Stage()
 
 
-def rows(values, n=N):
-    """Return the values of each world, whatever axis holds the worlds, (n, ...)."""
+def by_world(values, n=N):
+    """Return values as (n, columns), from an array whose last axis divisible by n holds the worlds."""
     axis = next(i for i in reversed(range(values.ndim)) if values.shape[i] % n == 0)
     values = np.moveaxis(values, axis, 0)
     return values.reshape(n, -1)
 
 
-def unchanged(before, after, worlds, but=()):
-    """Check that nothing of some worlds has changed, bit for bit."""
+def assert_unchanged(before, after, worlds, but=()):
+    """Assert that all arrays of a struct but those named in `but` are bitwise equal in worlds, (N,) bool."""
     for name, values in vars(before).items():
         if name in but or not any(size % N == 0 for size in values.shape):
             continue
-        np.testing.assert_array_equal(rows(getattr(after, name))[worlds], rows(values)[worlds], name)
+        np.testing.assert_array_equal(by_world(getattr(after, name))[worlds], by_world(values)[worlds], name)
 
 
-# ---------------------------------------------------------------- resets
-
-
-def test_a_reset_begins_episodes_in_the_masked_worlds_and_touches_no_other(stage):
+def test_a_reset_begins_episodes_in_masked_worlds_and_changes_no_other(stage):
     stage.scramble()
     stage.write(value=1.5, other=-1.0, steps=9)
     before, worlds = values_of(stage.robot, RobotArrays), values_of(stage.episodes, EpisodeArrays)
     stage.episodes.diverged.fill_(1)
-    stage.reset(SOME)
+    stage.reset(MASK)
     after = values_of(stage.robot, RobotArrays)
-    unchanged(before, after, ~SOME)
-    unchanged(worlds, values_of(stage.episodes, EpisodeArrays), ~SOME, but=("diverged",))
-    np.testing.assert_array_equal(stage.world("history_reset"), SOME)
-    np.testing.assert_array_equal(stage.world("diverged"), ~SOME)
-    np.testing.assert_array_equal(stage.read("value"), np.where(SOME, 2.5, 1.5))
-    np.testing.assert_array_equal(stage.read("steps"), np.where(SOME, 0, 9))
-    np.testing.assert_array_equal(stage.read("counts"), np.where(SOME, 11, 0))
-    q = after.joint_q.reshape(N, 43)[SOME]
-    reference = stage.scene.reference_q.numpy().reshape(N, 43)[SOME]
+    assert_unchanged(before, after, ~MASK)
+    assert_unchanged(worlds, values_of(stage.episodes, EpisodeArrays), ~MASK, but=("diverged",))
+    np.testing.assert_array_equal(stage.world("history_reset"), MASK)
+    np.testing.assert_array_equal(stage.world("diverged"), ~MASK)
+    np.testing.assert_array_equal(stage.read("value"), np.where(MASK, 2.5, 1.5))
+    np.testing.assert_array_equal(stage.read("steps"), np.where(MASK, 0, 9))
+    np.testing.assert_array_equal(stage.read("counts"), np.where(MASK, 11, 0))
+    q = after.joint_q.reshape(N, 43)[MASK]
+    reference = stage.scene.reference_q.numpy().reshape(N, 43)[MASK]
     np.testing.assert_array_equal(q[:, 7:], reference[:, 7:])
     np.testing.assert_allclose(q[:, 2], reference[:, 2] + 0.25, atol=1e-6)
-    np.testing.assert_allclose(Rotation.from_quat(q[:, 3:7]).as_euler("ZYX"), np.tile([0.5, 0, 0], (SOME.sum(), 1)),
+    np.testing.assert_allclose(Rotation.from_quat(q[:, 3:7]).as_euler("ZYX"), np.tile([0.5, 0, 0], (MASK.sum(), 1)),
                                atol=1e-6)  # fmt: skip
-    assert not after.joint_qd.reshape(N, 38)[SOME].any()
+    assert not after.joint_qd.reshape(N, 38)[MASK].any()
 
 
-def test_worlds_of_another_skill_are_passed_over(stage):
-    stage.episodes.skill.assign(SOME.astype(int))
+def test_worlds_of_another_skill_get_neither_resets_nor_commands(stage):
+    stage.episodes.skill.assign(MASK.astype(int))
     stage.write(value=7.0)
     before = values_of(stage.robot, RobotArrays)
     stage.reset(1.0)
-    stage.give(1.0, 1, np.ones((N, 4)), np.zeros(N))
-    unchanged(before, values_of(stage.robot, RobotArrays), SOME)
-    np.testing.assert_array_equal(stage.read("value"), np.where(SOME, 7.0, 1.0))
-    np.testing.assert_array_equal(stage.world("history_reset"), ~SOME)
+    stage.set_command(1.0, 1, np.ones((N, 4)), np.zeros(N))
+    assert_unchanged(before, values_of(stage.robot, RobotArrays), MASK)
+    np.testing.assert_array_equal(stage.read("value"), np.where(MASK, 7.0, 1.0))
+    np.testing.assert_array_equal(stage.world("history_reset"), ~MASK)
 
 
-def test_draws_of_a_beginning_follow_seed_and_clock():
+def test_samples_of_a_reset_depend_on_seed_and_step_count():
     def draws(seed=0, later=0):
         stage = Stage(seed=seed)
         stage.episodes.step_count.assign(stage.episodes.step_count.numpy() + later)
@@ -145,18 +144,18 @@ def test_draws_of_a_beginning_follow_seed_and_clock():
     first = draws()
     np.testing.assert_array_equal(draws(), first)
     assert kstest(first, "uniform").pvalue > 1e-3
-    for other in (draws(seed=1), draws(later=1)):
-        assert abs(np.corrcoef(first, other)[0, 1]) < 5.0 / np.sqrt(N)
+    for changed in (draws(seed=1), draws(later=1)):
+        assert abs(np.corrcoef(first, changed)[0, 1]) < 5.0 / np.sqrt(N)
 
 
 @pytest.mark.parametrize("level", [0, 1])
-def test_an_episode_is_of_its_worlds_level(stage, level):
+def test_a_reset_uses_the_level_of_its_world(stage, level):
     stage.episodes.level.fill_(level)
     stage.reset(1.0)
-    assert set(stage.read("counts")) == {11 + level}
+    assert set(stage.read("counts")) == {11 + level}  # the probe task's levels are numbered 11, 12
 
 
-def test_past_the_last_level_every_episode_draws_one():
+def test_worlds_past_the_last_level_sample_one_at_each_reset():
     stage = Stage(2048)
     stage.episodes.level.fill_(2)
     stage.reset(1.0)
@@ -167,17 +166,14 @@ def test_past_the_last_level_every_episode_draws_one():
     assert abs(np.corrcoef(drawn, stage.read("counts"))[0, 1]) < 5.0 / np.sqrt(2048)
 
 
-# ---------------------------------------------------------------- commands
-
-
-def test_a_command_that_is_due_is_drawn_and_moves_nothing(stage):
+def test_a_due_command_is_sampled_and_changes_no_robot_state(stage):
     stage.scramble()
     due = np.arange(N) % 4 == 1
-    stage.write(value=np.where(due, 7.0, 6.0), other=-1.0, steps=30)
+    stage.write(value=np.where(due, 7.0, 6.0), other=-1.0, steps=30)  # the probe task's command is due at 7
     stage.episodes.level.fill_(1)
     before = values_of(stage.robot, RobotArrays)
     stage.reset(0.0)
-    unchanged(before, values_of(stage.robot, RobotArrays), np.ones(N, dtype=bool))
+    assert_unchanged(before, values_of(stage.robot, RobotArrays), np.ones(N, dtype=bool))
     np.testing.assert_array_equal(stage.world("history_reset"), np.where(due, COMMANDED, 0))
     np.testing.assert_array_equal(stage.read("counts"), np.where(due, 12, 0))
     other = stage.read("other")
@@ -185,60 +181,57 @@ def test_a_command_that_is_due_is_drawn_and_moves_nothing(stage):
     np.testing.assert_array_equal(stage.read("steps"), 30)
 
 
-def test_a_beginning_comes_before_a_command_and_draws_other_numbers(stage):
+def test_a_reset_takes_precedence_over_a_due_command_and_uses_another_stream(stage):
     stage.write(value=7.0, steps=30)
-    stage.reset(SOME)
-    np.testing.assert_array_equal(stage.read("steps"), np.where(SOME, 0, 30))
+    stage.reset(MASK)
+    np.testing.assert_array_equal(stage.read("steps"), np.where(MASK, 0, 30))
     drawn = stage.read("other").copy()
     stage.write(value=7.0)
-    stage.reset(~SOME)
+    stage.reset(~MASK)
     assert (stage.read("other") != drawn).all()
 
 
-def test_a_task_without_drawn_commands_begins_alike():
+def test_a_task_without_sampled_commands_resets():
     task = probe_task()
     stage = Stage(
         task=dataclasses.replace(task, command=dataclasses.replace(task.command, resample_due=None, resample=None))
     )
     stage.write(value=7.0, other=-1.0)
-    stage.reset(SOME)
-    np.testing.assert_array_equal(stage.read("other") == -1.0, ~SOME)
+    stage.reset(MASK)
+    np.testing.assert_array_equal(stage.read("other") == -1.0, ~MASK)
 
 
-def test_a_command_from_outside_begins_an_episode_with_its_heading(stage):
+def test_a_host_command_begins_an_episode_with_its_heading(stage):
     stage.write(value=1.5, steps=9, other=3.0)
     stage.episodes.diverged.fill_(1)
     values, headings = np.arange(4.0 * N).reshape(N, 4), np.linspace(-3.0, 3.0, N).astype(np.float32)
-    stage.give(SOME, 1, values, headings)
-    np.testing.assert_array_equal(stage.read("value"), np.where(SOME, values[:, 0], 1.5))
-    np.testing.assert_array_equal(stage.read("other"), np.where(SOME, headings, 3.0))
-    np.testing.assert_array_equal(stage.read("steps"), np.where(SOME, 0, 9))
-    np.testing.assert_array_equal(stage.world("history_reset"), SOME)
-    np.testing.assert_array_equal(stage.world("diverged"), ~SOME)
+    stage.set_command(MASK, 1, values, headings)
+    np.testing.assert_array_equal(stage.read("value"), np.where(MASK, values[:, 0], 1.5))
+    np.testing.assert_array_equal(stage.read("other"), np.where(MASK, headings, 3.0))
+    np.testing.assert_array_equal(stage.read("steps"), np.where(MASK, 0, 9))
+    np.testing.assert_array_equal(stage.world("history_reset"), MASK)
+    np.testing.assert_array_equal(stage.world("diverged"), ~MASK)
 
 
-def test_a_command_from_outside_within_an_episode_comes_in_the_robots_heading(stage):
+def test_a_host_command_within_an_episode_uses_the_robots_yaw(stage):
     stage.scramble()
     stage.write(value=1.5, steps=9, other=3.0)
-    yaw = Rotation.from_quat(stage.robot.joint_q.numpy().reshape(N, 43)[:, 3:7]).apply([1.0, 0.0, 0.0])
-    stage.give(SOME, 0, np.full((N, 4), 4.25), np.full(N, 99.0))
-    np.testing.assert_array_equal(stage.read("value"), np.where(SOME, 4.25, 1.5))
-    expected = np.where(SOME, np.arctan2(yaw[:, 1], yaw[:, 0]), 3.0)
+    ahead = Rotation.from_quat(stage.robot.joint_q.numpy().reshape(N, 43)[:, 3:7]).apply([1.0, 0.0, 0.0])
+    stage.set_command(MASK, 0, np.full((N, 4), 4.25), np.full(N, 99.0))
+    np.testing.assert_array_equal(stage.read("value"), np.where(MASK, 4.25, 1.5))
+    expected = np.where(MASK, np.arctan2(ahead[:, 1], ahead[:, 0]), 3.0)
     np.testing.assert_allclose(stage.read("other"), expected, atol=1e-5)
     assert (stage.read("steps") == 9).all()
-    np.testing.assert_array_equal(stage.world("history_reset"), np.where(SOME, COMMANDED, 0))
+    np.testing.assert_array_equal(stage.world("history_reset"), np.where(MASK, COMMANDED, 0))
 
 
-def test_a_command_before_the_first_step_leaves_a_beginning_one(stage):
+def test_a_command_before_the_first_step_keeps_history_reset_begun(stage):
     stage.episodes.history_reset.fill_(BEGUN)
-    stage.give(SOME, 0, np.zeros((N, 4)), np.zeros(N))
+    stage.set_command(MASK, 0, np.zeros((N, 4)), np.zeros(N))
     assert (stage.world("history_reset") == BEGUN).all()
 
 
-# ---------------------------------------------------------------- standing up, the clock
-
-
-def test_robots_stand_up_with_their_headings_on_the_block_below_them_at_its_start():
+def test_default_pose_has_its_heading_on_top_of_the_block_which_returns_to_its_start():
     stage = Stage()
     sim = Simulation(N, block=BlockCfg((0.0, 0.0)), visuals=False, device="cpu")
     stage.scene = scene_of(sim)
@@ -249,77 +242,74 @@ def test_robots_stand_up_with_their_headings_on_the_block_below_them_at_its_star
     stage.scramble()
     before = values_of(stage.robot, RobotArrays)
     headings = np.linspace(-3.0, 3.0, N)
-    stage.stand(SOME, headings)
+    stage.write_default_pose(MASK, headings)
     after = values_of(stage.robot, RobotArrays)
-    unchanged(before, after, ~SOME)
-    q = after.joint_q.reshape(N, 43)[SOME]
-    reference = stage.scene.reference_q.numpy().reshape(N, 43)[SOME]
+    assert_unchanged(before, after, ~MASK)
+    q = after.joint_q.reshape(N, 43)[MASK]
+    reference = stage.scene.reference_q.numpy().reshape(N, 43)[MASK]
     np.testing.assert_array_equal(q[:, 7:], reference[:, 7:])
     np.testing.assert_allclose(q[:, :2], reference[:, :2])
     np.testing.assert_allclose(q[:, 2], reference[:, 2] + records["height"][0], atol=1e-6)
-    np.testing.assert_allclose(Rotation.from_quat(q[:, 3:7]).as_euler("ZYX")[:, 0], headings[SOME], atol=1e-6)
-    assert not after.joint_qd.reshape(N, 38)[SOME].any()
+    np.testing.assert_allclose(Rotation.from_quat(q[:, 3:7]).as_euler("ZYX")[:, 0], headings[MASK], atol=1e-6)
+    assert not after.joint_qd.reshape(N, 38)[MASK].any()
     center = stage.scene.ground.blocks.numpy()["center"]
-    np.testing.assert_array_equal(center, np.where(SOME[:, None], records["start"], [3.0, 4.0]))
+    np.testing.assert_array_equal(center, np.where(MASK[:, None], records["start"], [3.0, 4.0]))
 
 
-def test_the_clock_goes_on_in_the_masked_worlds(stage):
+def test_advance_rng_increments_the_step_count_of_masked_worlds(stage):
     step_count = stage.world("step_count")
-    wp.launch(advance_rng_kernel, N, [stage.mask(SOME), stage.episodes], device="cpu")
-    np.testing.assert_array_equal(stage.world("step_count"), step_count + SOME)
+    wp.launch(advance_rng_kernel, N, [stage.mask(MASK), stage.episodes], device="cpu")
+    np.testing.assert_array_equal(stage.world("step_count"), step_count + MASK)
 
 
-# ---------------------------------------------------------------- forgetting
-
-
-def test_forgetting_touches_the_masked_worlds_only(stage):
+def test_clear_history_changes_only_its_arrays_and_only_masked_worlds(stage):
     stage.scramble()
     before = values_of(stage.robot, RobotArrays), values_of(stage.delays, Delays)
-    stage.forget(SOME)
+    stage.clear_history(MASK)
     after = values_of(stage.robot, RobotArrays), values_of(stage.delays, Delays)
     for old, new in zip(before, after, strict=True):
-        unchanged(old, new, ~SOME)
-    unchanged(before[0], after[0], SOME, but=FORGOTTEN)
+        assert_unchanged(old, new, ~MASK)
+    assert_unchanged(before[0], after[0], MASK, but=CLEARED)
 
 
 ZERO = ("torque", "prev_torque", "action", "prev_action", "prev_prev_action", "impulse", "paw_force", "peak_force",
         "contact_time", "air_time", "touchdown_speed", "paw_height", "diverged", "collisions")  # fmt: skip
-FORGOTTEN = (*ZERO, "target", "filtered_target", "prev_rate", "prev_lin_vel", "paw_pos", "paw_vel")
+CLEARED = (*ZERO, "target", "filtered_target", "prev_rate", "prev_lin_vel", "paw_pos", "paw_vel")
 
 
-def test_nothing_has_been_done_felt_or_touched_before_a_beginning(stage):
+def test_clear_history_sets_arrays_to_0_or_the_present_state(stage):
     stage.scramble()
-    stage.forget(SOME)
-    found = values_of(stage.robot, RobotArrays)
+    stage.clear_history(MASK)
+    robot = values_of(stage.robot, RobotArrays)
     for name in ZERO:
-        assert not rows(getattr(found, name))[SOME].any(), name
-        assert rows(getattr(found, name))[~SOME].all(), name
-    q, qd = found.joint_q.reshape(N, 43), found.joint_qd.reshape(N, 38)
-    angles = q[:, 7 + MOTOR_SLOTS][SOME]
+        assert not by_world(getattr(robot, name))[MASK].any(), name
+        assert by_world(getattr(robot, name))[~MASK].all(), name
+    q, qd = robot.joint_q.reshape(N, 43), robot.joint_qd.reshape(N, 38)
+    angles = q[:, 7 + MOTOR_SLOTS][MASK]
     for name in ("target", "filtered_target"):
-        np.testing.assert_array_equal(rows(getattr(found, name))[SOME], angles, name)
-    np.testing.assert_array_equal(rows(found.prev_rate)[SOME], qd[:, 6 + MOTOR_SLOTS][SOME])
+        np.testing.assert_array_equal(by_world(getattr(robot, name))[MASK], angles, name)
+    np.testing.assert_array_equal(by_world(robot.prev_rate)[MASK], qd[:, 6 + MOTOR_SLOTS][MASK])
     past = stage.delays.target_history.numpy()
-    np.testing.assert_array_equal(past[:, :, SOME], np.tile(angles.T, (8, 1, 1)))
-    origin = qd[:, :3] - np.cross(qd[:, 3:6], Rotation.from_quat(q[:, 3:7]).apply([0.01, -0.02, 0.03]))
-    np.testing.assert_allclose(found.prev_lin_vel[SOME], origin[SOME], atol=1e-5)
+    np.testing.assert_array_equal(past[:, :, MASK], np.tile(angles.T, (8, 1, 1)))
+    com = Rotation.from_quat(q[:, 3:7]).apply([0.01, -0.02, 0.03])  # [m] of `scramble`, world axes
+    np.testing.assert_allclose(robot.prev_lin_vel[MASK], (qd[:, :3] - np.cross(qd[:, 3:6], com))[MASK], atol=1e-5)
 
 
-def test_paws_are_known_where_they_are_at_a_beginning():
-    """As the stage that follows paws finds them in the same state."""
+def test_clear_history_writes_paw_positions_and_velocities_of_the_present_state():
+    """Oracle: `track_kernel` in the same state."""
     stage = Stage()
     stage.scramble()
-    stage.forget(SOME)
+    stage.clear_history(MASK)
     place, speed = (getattr(stage.robot, name).numpy().copy() for name in ("paw_pos", "paw_vel"))
     inputs = [stage.scene.geometry, stage.scene.ground, stage.settings, stage.episodes, stage.robot]
     wp.launch(track_kernel, (4, N), inputs, device="cpu")
     for before, after in ((place, stage.robot.paw_pos.numpy()), (speed, stage.robot.paw_vel.numpy())):
-        np.testing.assert_array_equal(before[:, SOME], after[:, SOME])
-        assert (before[:, ~SOME] != after[:, ~SOME]).all()
+        np.testing.assert_array_equal(before[:, MASK], after[:, MASK])
+        assert (before[:, ~MASK] != after[:, ~MASK]).all()
 
 
-def test_motors_hold_still_after_a_beginning_however_late_they_are(stage):
+def test_clear_history_fills_the_target_history_with_motor_angles(stage):
     write(stage.delays.target_history, slice(None), 9.0)
-    stage.forget(1.0)
+    stage.clear_history(1.0)
     angles = stage.robot.joint_q.numpy().reshape(N, 43)[:, 7 + MOTOR_SLOTS]
     assert (stage.delays.target_history.numpy() == angles.T).all()

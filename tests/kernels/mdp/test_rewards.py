@@ -7,18 +7,18 @@ from jump_helpers import Table, functions, make_episode, make_view
 from jumper_warp.kernels.mdp import rewards
 
 NAMES = "ground_force action_clip motor_torque_sq joint_acceleration action_rate action_acceleration collision"
-paid = Table(functions(rewards, NAMES), float)
+reward = Table(functions(rewards, NAMES), float)
 E = math.exp
 
 
-def test_kernels_of_the_paper():
+def test_phi_is_gaussian_and_psi_laplacian():
     assert rewards.phi(0.2, 0.2) == pytest.approx(E(-1.0))
     assert rewards.phi(-0.6, 0.2) == pytest.approx(E(-9.0))
     assert rewards.psi(-0.6, 0.2) == pytest.approx(E(-3.0))
 
 
 @pytest.mark.parametrize("phase", range(3))
-def test_regularization_is_a_sum_of_squares_in_every_phase(phase):
+def test_regularisation_terms_are_sums_of_squares_in_every_phase(phase):
     task = make_episode(phase=phase)
     view = make_view(
         paw_force=(10.0, 20.0, 0.0, 20.0),
@@ -30,10 +30,10 @@ def test_regularization_is_a_sum_of_squares_in_every_phase(phase):
         prev_prev_action=np.full(12, 0.25),
         collisions=int(phase == 1) * 16,
     )
-    assert paid("ground_force", view, task, weight_force=30.0) == pytest.approx(1.0)
-    assert paid("action_clip", view, task) == pytest.approx(0.7)
-    assert paid("motor_torque_sq", view, task) == pytest.approx(506.0)
-    assert paid("joint_acceleration", view, task) == pytest.approx(2024.0)
-    assert paid("action_rate", view, task) == pytest.approx(12.0)
-    assert paid("action_acceleration", view, task) == pytest.approx(12.0 * 1.75**2)
-    assert paid("collision", view, task) == float(phase == 1)
+    assert reward("ground_force", view, task, weight_force=30.0) == pytest.approx(1.0)
+    assert reward("action_clip", view, task) == pytest.approx(0.7)
+    assert reward("motor_torque_sq", view, task) == pytest.approx(506.0)
+    assert reward("joint_acceleration", view, task) == pytest.approx(2024.0)
+    assert reward("action_rate", view, task) == pytest.approx(12.0)
+    assert reward("action_acceleration", view, task) == pytest.approx(12.0 * 1.75**2)
+    assert reward("collision", view, task) == float(phase == 1)

@@ -5,19 +5,20 @@ from mdp_helpers import STEP_DT, write
 from probe_task import Probe, probe_task
 
 N = 64
-NAMES = ["first", "second", "third", "came_apart", "too_long"]
+NAMES = ["first", "second", "third", "came_apart", "too_long"]  # terminations of the probe task
 FIRST, SECOND, THIRD, DIVERGED, LONG = range(5)
 NONE = -1
-GROWTH = 0.25
+GROWTH = 0.25  # of the state's value in a policy step
 
 
 @pytest.fixture
 def probe():
+    """Return N worlds of the probe task."""
     return Probe(N)
 
 
 def random_state(probe, seed=0):
-    """Give all worlds random values, and return them as they are after the step: value, other, height."""
+    """Write random states; return (value, other, base height [m]) after the next step, (N,) each."""
     rng = np.random.default_rng(seed)
     value, other, height = rng.normal(size=N), rng.normal(size=N), rng.uniform(0.2, 1.0, N)
     write(probe.robot.joint_q, slice(2, None, 43), height)
@@ -25,31 +26,29 @@ def random_state(probe, seed=0):
     return (value + GROWTH).astype(np.float32), other.astype(np.float32), height.astype(np.float32)
 
 
-def weighted(value, other, height):
-    """Return the terms of the probe's rewards, once more, (terms, worlds)."""
+def expected_rewards(value, other, height):
+    """Return the probe task's weighted reward terms as written here in NumPy, (rewards, N)."""
     return np.array(
         [3.0 * value * STEP_DT, -0.5 * 2.0 * (value - 1.5) ** 2 * STEP_DT, 4.0 * other, 10.0 * height * STEP_DT]
     )
 
 
 def endings(probe):
+    """Return the name of each world's termination in the last step, "" if none."""
     return [NAMES[i] if i >= 0 else "" for i in probe.world("termination")]
 
 
-# ---------------------------------------------------------------- rewards
-
-
-def test_rewards_are_weighted_and_times_the_step_unless_paid_once(probe):
-    expected = weighted(*random_state(probe))
+def test_rewards_are_weighted_and_scaled_by_dt_unless_turned_off(probe):
+    expected = expected_rewards(*random_state(probe))
     probe.step()
     np.testing.assert_allclose(probe.skill.term_value.numpy(), expected, rtol=1e-5, atol=1e-6)
     np.testing.assert_allclose(probe.world("reward"), expected.sum(axis=0), rtol=1e-5, atol=1e-5)
     assert expected.sum(axis=0).min() < -1.0
 
 
-def test_a_floor_is_the_least_reward_of_a_step():
+def test_reward_floor_bounds_the_total_but_not_the_terms():
     probe = Probe(N, probe_task(reward_floor=-1.0))
-    expected = weighted(*random_state(probe))
+    expected = expected_rewards(*random_state(probe))
     probe.step()
     total = expected.sum(axis=0)
     assert 0 < np.count_nonzero(total < -1.0) < N
@@ -57,34 +56,34 @@ def test_a_floor_is_the_least_reward_of_a_step():
     np.testing.assert_allclose(probe.skill.term_value.numpy(), expected, rtol=1e-5, atol=1e-6)
 
 
-def test_weights_and_parameters_change_while_it_runs(probe):
+def test_changed_weights_and_parameters_act_in_the_next_step(probe):
     state = random_state(probe)
     probe.skill.set("rewards", "value", weight=-7.0)
     probe.skill.set("rewards", "offset_square", offset=0.5)
     probe.step()
-    expected = weighted(*state)
+    expected = expected_rewards(*state)
     expected[0] *= -7.0 / 3.0
     expected[1] = -0.5 * 2.0 * (state[0] - 0.5) ** 2 * STEP_DT
     np.testing.assert_allclose(probe.skill.term_value.numpy(), expected, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf])
-def test_a_term_that_is_not_finite_erases_no_other_and_is_seen(probe, number):
+def test_a_nonfinite_term_counts_0_in_the_reward_and_is_visible_in_logs(probe, number):
     _, other, height = random_state(probe)
     probe.write(value=np.where(np.arange(N) < 5, number, 1.0))
     probe.step()
-    expected = weighted(np.full(N, 1.0 + GROWTH), other, height)
+    expected = expected_rewards(np.full(N, 1.0 + GROWTH), other, height)
     expected[:2, :5] = 0.0
     np.testing.assert_allclose(probe.world("reward"), expected.sum(axis=0), rtol=1e-5, atol=1e-5)
-    seen = np.isfinite(probe.skill.term_value.numpy())
-    assert not seen[:2, :5].any() and seen[:2, 5:].all() and seen[2:].all()
+    is_finite = np.isfinite(probe.skill.term_value.numpy())
+    assert not is_finite[:2, :5].any() and is_finite[:2, 5:].all() and is_finite[2:].all()
     means = probe.skill.metrics()
     finite = [np.isfinite(means[f"Episode_Reward/{name}"]) for name in ("value", "offset_square", "other")]
     assert finite == [False, False, True]
 
 
-def test_a_total_that_is_not_finite_is_no_reward(probe):
-    """Of terms that are: 3.396e38 and 0.055e38, where single precision ends at 3.403e38."""
+def test_a_total_that_overflows_counts_as_0(probe):
+    """The finite terms 3.396e38 and 0.055e38 sum to more than the largest float, 3.403e38."""
     random_state(probe)
     probe.write(value=1.1 - GROWTH, other=np.where(np.arange(N) < 5, 8.49e37, 1.0))
     probe.skill.set("rewards", "value", weight=3.0e38)
@@ -93,7 +92,7 @@ def test_a_total_that_is_not_finite_is_no_reward(probe):
     assert np.isfinite(probe.skill.term_value.numpy()).all() and not reward[:5].any() and (reward[5:] > 5.0e36).all()
 
 
-def test_sums_count_on_where_single_precision_would_not(probe):
+def test_sums_of_terms_are_exact_beyond_single_precision(probe):
     random_state(probe)
     probe.write(value=-GROWTH, other=0.25 / 4.0)
     write(probe.skill.counters.term_sum, slice(None), 2.0**24 * 8.0)
@@ -105,10 +104,7 @@ def test_sums_count_on_where_single_precision_would_not(probe):
     np.testing.assert_array_equal(sums[0], 2.0**27)
 
 
-# ---------------------------------------------------------------- the task's state
-
-
-def test_the_state_moves_on_before_it_is_judged(probe):
+def test_terminations_read_the_state_after_its_update(probe):
     random_state(probe)
     probe.write(value=1.0, other=0.0, steps=np.where(np.arange(N) < 7, 99, 98))
     probe.step()
@@ -117,7 +113,7 @@ def test_the_state_moves_on_before_it_is_judged(probe):
     assert endings(probe) == ["too_long"] * 7 + [""] * (N - 7)
 
 
-def test_worlds_of_another_skill_are_passed_over(probe):
+def test_a_step_changes_nothing_in_worlds_of_another_skill(probe):
     random_state(probe)
     away = np.arange(N) % 3 == 0
     probe.episodes.skill.assign(np.where(away, 1, 0))
@@ -132,9 +128,6 @@ def test_worlds_of_another_skill_are_passed_over(probe):
         values = probe.world(name)
         assert (values[away] == 5).all() and (values[~away] != 5).all(), name
     assert not probe.skill.counters.termination_count.numpy()[:, away].any()
-
-
-# ---------------------------------------------------------------- ends
 
 
 @pytest.mark.parametrize(
@@ -155,23 +148,23 @@ def test_the_first_termination_that_holds_ends_the_episode(probe, other, termina
     np.testing.assert_array_equal(counted, expected)
 
 
-def break_world(probe, how, world):
-    """Make a world one whose state is not that of a robot."""
-    if how == "diverged":
+def make_diverge(probe, cause, world):
+    """Make a world diverge; cause: "diverged" (solver's flag), "action", "fast" (15.1 m/s up) or "nan" (an angle)."""
+    if cause == "diverged":
         write(probe.robot.diverged, world, 1)
-    elif how == "action":
+    elif cause == "action":
         write(probe.episodes.bad_action, world, 1)
-    elif how == "fast":
+    elif cause == "fast":
         write(probe.robot.joint_qd, 38 * world + 2, 15.1)
     else:
         write(probe.robot.joint_q, 43 * world + 8, np.nan)
 
 
-@pytest.mark.parametrize("how", ["diverged", "action", "fast", "nan"])
+@pytest.mark.parametrize("cause", ["diverged", "action", "fast", "nan"])
 @pytest.mark.parametrize("other", [0.0, 2.0e3])
-def test_a_broken_world_ends_as_one_that_came_apart_and_pays_nothing(probe, how, other):
+def test_a_diverged_world_ends_with_came_apart_and_reward_0(probe, cause, other):
     probe.write(value=1.0, other=other)
-    break_world(probe, how, 3)
+    make_diverge(probe, cause, 3)
     probe.step()
     others = np.delete(np.arange(N), 3)
     assert (
@@ -183,21 +176,21 @@ def test_a_broken_world_ends_as_one_that_came_apart_and_pays_nothing(probe, how,
     assert not probe.skill.term_value.numpy()[:, 3].any() and not probe.skill.counters.term_sum.numpy()[:, 3].any()
     assert probe.world("diverged").tolist() == (np.arange(N) == 3).astype(int).tolist()
     assert not probe.world("bad_action").any()
-    np.testing.assert_array_equal(probe.skill.counters.bad_actions.numpy(), (np.arange(N) == 3) * (how == "action"))
+    np.testing.assert_array_equal(probe.skill.counters.bad_actions.numpy(), (np.arange(N) == 3) * (cause == "action"))
 
 
-# ---------------------------------------------------------------- curriculum
+def end_episode(probe, error=0.0, other=11.0, counts=1):
+    """End an episode in every world: other > 10 is a success, > 100 a time-out, > 1000 a failure.
 
-
-def end(probe, error=0.0, other=11.0, counts=1):
-    """End an episode in every world; the third termination is a success."""
+    error: curriculum error at the end (tolerance 2); counts: whether the curriculum counts the episode.
+    """
     probe.write(value=error - GROWTH, other=other, counts=counts, steps=0)
     probe.step()
 
 
-def test_successes_in_a_row_raise_the_level_up_to_past_the_last(probe):
+def test_three_successes_in_a_row_raise_the_level_up_to_past_the_last(probe):
     for number in range(1, 10):
-        end(probe)
+        end_episode(probe)
         assert (probe.world("level") == min(number // 3, 2)).all()
         assert (probe.world("streak") == number % 3).all()
     np.testing.assert_array_equal(probe.skill.counters.curriculum_episodes.numpy(), 9)
@@ -209,45 +202,45 @@ def test_successes_in_a_row_raise_the_level_up_to_past_the_last(probe):
     [{"error": 2.01}, {"other": 101.0}, {"other": 1001.0}],
     ids=["far", "time out without success", "failure"],
 )
-def test_anything_else_breaks_the_row(probe, failure):
-    end(probe)
-    end(probe)
-    end(probe, **failure)
+def test_an_episode_without_success_clears_the_streak(probe, failure):
+    end_episode(probe)
+    end_episode(probe)
+    end_episode(probe, **failure)
     assert not probe.world("level").any() and not probe.world("streak").any()
     assert (probe.skill.counters.curriculum_episodes.numpy() == 3).all() and (
         probe.skill.counters.curriculum_successes.numpy() == 2
     ).all()
     for _ in range(3):
-        end(probe)
+        end_episode(probe)
     assert (probe.world("level") == 1).all()
 
 
-def test_a_broken_world_is_no_success(probe):
+def test_a_diverged_world_is_no_success(probe):
     write(probe.episodes.streak, slice(None), 2)
-    break_world(probe, "diverged", 0)
-    end(probe)
+    make_diverge(probe, "diverged", 0)
+    end_episode(probe)
     assert probe.world("level").tolist() == [0] + [1] * (N - 1)
 
 
-def test_episodes_that_do_not_count_change_neither_level_nor_row(probe):
-    end(probe)
-    end(probe, counts=0)
-    end(probe, counts=0, other=1001.0)
+def test_episodes_that_do_not_count_change_neither_level_nor_streak(probe):
+    end_episode(probe)
+    end_episode(probe, counts=0)
+    end_episode(probe, counts=0, other=1001.0)
     assert (probe.world("streak") == 1).all() and (probe.skill.counters.curriculum_episodes.numpy() == 1).all()
     assert (probe.skill.counters.termination_count.numpy().sum(axis=0) == 3).all()
 
 
 def test_the_errors_of_successes_add_up_in_double_precision(probe):
     write(probe.skill.counters.error_sum, slice(None), 2.0**27)
-    end(probe, error=0.5)
-    end(probe, error=1.5)
-    end(probe, error=3.0)
+    end_episode(probe, error=0.5)
+    end_episode(probe, error=1.5)
+    end_episode(probe, error=3.0)
     np.testing.assert_array_equal(probe.skill.counters.error_sum.numpy(), 2.0**27 + 2.0)
 
 
-def test_tolerance_and_length_of_the_row_change_while_it_runs(probe):
+def test_changed_tolerance_and_promote_after_act_in_the_next_step(probe):
     probe.skill.set("curriculum", "value", tolerance=0.5, promote_after=1)
-    end(probe, error=0.6)
+    end_episode(probe, error=0.6)
     assert not probe.world("level").any()
-    end(probe, error=0.4)
+    end_episode(probe, error=0.4)
     assert (probe.world("level") == 1).all()

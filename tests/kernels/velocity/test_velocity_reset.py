@@ -1,4 +1,4 @@
-"""How episodes of velocity tracking begin, by a thousand draws; Pinocchio tells where the paws are."""
+"""Resets of velocity tracking: distributions over 1024 worlds; paw positions and velocities come from Pinocchio."""
 
 import dataclasses
 
@@ -15,30 +15,32 @@ from velocity_helpers import edit, states_of, walking_env
 N = 1024
 TASK = make_task("velocity-flat")
 RESET = TASK.reset.settings
-CALM = {"error_xy": 60.0, "error_yaw": 60.0, "settled": 600.0, "steps": 1200, "episode_steps": 1200}  # 0.13 m/s
+CALM = {"error_xy": 60.0, "error_yaw": 60.0, "settled": 600.0, "steps": 1200, "episode_steps": 1200}
+"""State of a full episode with a mean error of (60 + 0.3 * 60) / 600 = 0.13 m/s, below the tolerance."""
 
 
 @pytest.fixture(scope="module")
 def env():
+    """Return N nominal worlds of `velocity-flat` without noise."""
     return walking_env(N)
 
 
 @pytest.fixture
 def begun(env):
-    """The environment where every world has just begun its first episode: coordinates and rates besides."""
+    """Reset all worlds with seed 1; return (environment, joint_q (N, 43), joint_qd (N, 38))."""
     env.reset(seed=1)
     return env, env.sim.joint_q().astype(float), env.sim.joint_qd().astype(float)
 
 
 def moving_starts(q, qd):
-    """Which worlds do not begin in the default pose."""
+    """Return which worlds do not start in the default pose at rest, (N,) bool."""
     return np.abs(qd).max(axis=1) > 0.0
 
 
-def test_bases_are_where_they_should_be(begun):
+def test_base_poses_cover_their_ranges_or_are_the_default_pose(begun):
     _, q, qd = begun
     drawn = moving_starts(q, qd)
-    assert 0.80 < drawn.mean() < 0.92  # a tenth by choice, and where no draw could be taken
+    assert 0.80 < drawn.mean() < 0.92  # default pose: probability 0.1, or no attempt valid
     assert 0.30 < q[drawn, 2].min() < 0.31 and q[drawn, 2].max() < 0.50
     assert np.abs(q[:, :2]).max() <= 0.1
     turn = Rotation.from_quat(q[:, 3:7]).as_euler("ZYX", degrees=True)
@@ -47,31 +49,31 @@ def test_bases_are_where_they_should_be(begun):
     np.testing.assert_allclose(q[~drawn][:, MOTOR_Q] - DEFAULT_ANGLE, 0.0, atol=1e-5)
 
 
-def test_paws_are_on_the_ground_or_above_it_where_forward_kinematics_finds_them(begun):
+def test_paws_are_on_the_ground_or_in_the_air_with_swing_probability(begun):
     env, q, qd = begun
     paws, _ = paws_and_velocities(env, np.flatnonzero(moving_starts(q, qd)))
     above = paws[..., 2] - PAW_RADIUS
     down = np.abs(above) < 2e-4
     assert (down | ((above > 0.0098) & (above < 0.1002))).all()
-    assert 0.62 < down.mean() < 0.78  # seven tenths, less what could not be taken
+    assert 0.62 < down.mean() < 0.78  # 0.7 of samples, changed a little by rejections
 
 
-def test_paws_on_the_ground_are_at_rest(begun):
+def test_paws_on_the_ground_are_at_rest_while_bases_turn(begun):
     env, q, qd = begun
     drawn = moving_starts(q, qd)
     paws, velocities = paws_and_velocities(env, np.flatnonzero(drawn))
     down = np.abs(paws[..., 2] - PAW_RADIUS) < 2e-4
     speed = np.linalg.norm(velocities, axis=2)
-    # but for near-singular legs, whose inverse Jacobian is damped
+    # [m/s] except near-singular legs, whose inverse Jacobian is damped
     assert np.quantile(speed[down], 0.99) < 1e-4 and speed[down].max() < 0.1 and np.median(speed[~down]) > 0.1
     assert np.abs(qd[drawn, 3:6]).max() > 0.4
 
 
-def test_nothing_touches_what_it_must_not(begun):
+def test_no_start_collides(begun):
     assert not collision_flags(begun[0]).any()
 
 
-def test_commands_are_drawn_within_the_first_reach(begun):
+def test_first_commands_have_their_kinds_limits_and_durations(begun):
     env, _, _ = begun
     state = states_of(env)
     command, standing = state["command"], state["standing"] == 1
@@ -83,7 +85,7 @@ def test_commands_are_drawn_within_the_first_reach(begun):
     assert state["command_lasts"].min() >= 119 and state["command_lasts"].max() <= 360
 
 
-def test_commands_of_the_last_level_reach_far_ahead_but_not_across_as_well(env):
+def test_commands_of_the_last_level_shrink_sideways_with_the_speed_ahead(env):
     edit(env, command_level=10, steps=0)
     env.reset()
     command = states_of(env)["command"]
@@ -93,8 +95,8 @@ def test_commands_of_the_last_level_reach_far_ahead_but_not_across_as_well(env):
     assert 0.85 * turning < np.abs(command[:, 2]).max() <= turning
     fast = command[:, 0] > 0.7 * ahead
     assert fast.sum() > 40
-    left = np.sqrt(np.maximum(1.0 - (command[fast, 0] / ahead) ** 2, 0.04))
-    assert (np.abs(command[fast, 1]) <= aside * left + 1e-5).all()
+    shrink = np.sqrt(np.maximum(1.0 - (command[fast, 0] / ahead) ** 2, 0.04))
+    assert (np.abs(command[fast, 1]) <= aside * shrink + 1e-5).all()
 
 
 @pytest.mark.parametrize(
@@ -104,7 +106,7 @@ def test_commands_of_the_last_level_reach_far_ahead_but_not_across_as_well(env):
      (CALM | {"steps": 0}, 1.0, 3, 0.0), (CALM | {"steps": 700, "limit": (1e-3, 1e-3)}, 1.0, 3, 0.0)],
     ids=["followed", "not followed", "fell", "cut off", "not begun", "left the map"],
 )  # fmt: skip
-def test_levels_follow_how_the_episode_went(env, fields, ended, level, falls):
+def test_a_full_accurate_episode_raises_the_level_and_a_fall_lowers_it(env, fields, ended, level, falls):
     q = env.sim.joint_q().copy()
     q[:, :2] = 0.05
     env.sim.state.joint_q.assign(q.ravel())
@@ -117,7 +119,7 @@ def test_levels_follow_how_the_episode_went(env, fields, ended, level, falls):
     assert not state["steps"].any() and not state["settled"].any() and not state["error_xy"].any()
 
 
-def test_what_was_counted_goes_on_and_the_rest_begins_anew(env):
+def test_a_reset_keeps_statistics_and_clears_touchdown_history(env):
     counted = ("sum_xy", "sum_yaw", "sum_settled", "score", "all_steps", "minutes", "seconds_walking", "touchdowns",
                "apexes")  # fmt: skip
     values = {name: 2.0 + i for i, name in enumerate(counted)}
@@ -129,7 +131,7 @@ def test_what_was_counted_goes_on_and_the_rest_begins_anew(env):
     assert not state["recent"].any() and not state["recent_steps"].any()
 
 
-def test_a_seed_begins_as_it_began_before_levels_included(env):
+def test_a_reset_with_a_seed_is_reproducible_with_levels_and_statistics(env):
     env.reset(seed=5)
     first, q = states_of(env), env.sim.joint_q().copy()
     edit(env, command_level=7, falls=3.0)
@@ -139,7 +141,7 @@ def test_a_seed_begins_as_it_began_before_levels_included(env):
         np.testing.assert_array_equal(values, first[name], name)
 
 
-def test_reset_ranges_are_taken_from_the_task():
+def test_reset_settings_reach_the_kernel_struct_in_policy_steps_and_radians():
     still = {"tilt": 0.0, "lin_vel": 0.0, "ang_vel": 0.0, "default_pose_probability": 0.0, "swing_probability": 0.0}
     settings = dataclasses.replace(RESET, height=(0.40, 0.41), gait=2.0, episode=5.0, **still)
     values = settings.values(1.0 / 60.0)

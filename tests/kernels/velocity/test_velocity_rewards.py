@@ -1,4 +1,4 @@
-"""Rewards of velocity tracking against the same forms in NumPy, on random robots."""
+"""Rewards of velocity tracking against NumPy formulas, on random robots."""
 
 import inspect
 
@@ -17,12 +17,13 @@ from mdp_helpers import DEFAULT_ANGLE
 NAMES = """linear_velocity yaw_rate lin_vel_z_l2 ang_vel_xy_l2 flat_orientation_l2 standing_posture lateral_position
 transversal_position air_time rapid_stepping restless_stand foot_clearance slip touchdown torque_sign_changes
 trot_schedule shank_lean"""
-paid = Table(functions(rewards, NAMES), float, VelocityState)
+reward = Table(functions(rewards, NAMES), float, VelocityState)
 TRANSVERSAL = np.arange(12) % 3 != 0
 N = 16
 
 
 def make_state(**fields) -> VelocityState:
+    """Return a task state with these fields, others 0."""
     state = VelocityState()
     for name, value in fields.items():
         setattr(state, name, type(getattr(state, name))(*value) if np.ndim(value) else value)
@@ -30,9 +31,9 @@ def make_state(**fields) -> VelocityState:
 
 
 def robots(seed: int = 3):
-    """Random robots and commands: fields of views and states as NumPy, and the structs."""
+    """Return N random (fields of view and state by name as NumPy, `RobotView`, `VelocityState`)."""
     rng = np.random.default_rng(seed)
-    found = []
+    samples = []
     for _ in range(N):
         quat = wp.normalize(wp.quat(*rng.normal(size=4).tolist()))
         contact = rng.integers(0, 2, 4).astype(float)
@@ -52,25 +53,27 @@ def robots(seed: int = 3):
         struct = make_view(**view)
         struct.paw_vel = mat43(*paw_vel.ravel())
         vel = np.array(wp.quat_rotate_inv(quat, wp.vec3(*view["lin_vel"])))
-        found.append((view | state | {"vel": vel, "paw_vel": paw_vel}, struct, make_state(**state)))
-    return found
+        samples.append((view | state | {"vel": vel, "paw_vel": paw_vel}, struct, make_state(**state)))
+    return samples
 
 
 ROBOTS = robots()
 
 
 def trot(r, duty):
+    """Return the NumPy value of `trot_schedule`; r: fields of `robots`, as in all functions below."""
     phase = np.mod(r["phase"] + np.array([0.0, 0.5, 0.5, 0.0]), 1.0)
     return np.mean((phase < duty) == (r["contact"] > 0.5)) * (1 - r["standing"])
 
 
 def clearance(r, height):
+    """Return the NumPy value of `foot_clearance`; height [m]."""
     speed = np.linalg.norm(r["paw_vel"][:, :2], axis=1)
     return np.sum((1.0 - r["contact"]) * (r["paw_height"] - height) ** 2 * speed)
 
 
 def shank_lean(r, threshold, hip, thigh, shank):
-    """Knees by the thighs' angles, ankles where circles about them meet below, angles between links and gravity."""
+    """Return the NumPy value of `shank_lean`: ankles are the lower intersections of circles around the knees."""
     down, total = r["projected_gravity"][[0, 2]] / np.linalg.norm(r["projected_gravity"][[0, 2]]), 0.0
     for leg, contact in enumerate(r["contact"]):
         front = 1.0 if leg < 2 else -1.0
@@ -79,8 +82,8 @@ def shank_lean(r, threshold, hip, thigh, shank):
                  for side, a in ((1.0, outer), (-1.0, inner))]  # fmt: skip
         links = []
         for turn in (1.0, -1.0):  # by the law of cosines, at the first knee
-            uniform = knees[1] - knees[0]
-            angle = np.arctan2(uniform[1], uniform[0]) + turn * np.arccos(np.linalg.norm(uniform) / (2.0 * shank))
+            between = knees[1] - knees[0]
+            angle = np.arctan2(between[1], between[0]) + turn * np.arccos(np.linalg.norm(between) / (2.0 * shank))
             links.append(knees[0] + shank * np.array([np.cos(angle), np.sin(angle)]))
         ankle = min(links, key=lambda p: p[1])
         leans = [np.arccos(np.dot(ankle - knee, down) / shank) for knee in knees]
@@ -88,7 +91,7 @@ def shank_lean(r, threshold, hip, thigh, shank):
     return total
 
 
-LEG = {"threshold": 0.5, "hip": 0.045, "thigh": 0.175, "shank": 0.3}
+LEG = {"threshold": 0.5, "hip": 0.045, "thigh": 0.175, "shank": 0.3}  # [rad], [m], [m], [m]
 OFF = {"angle": lambda r: r["angle"] - DEFAULT_ANGLE}
 EXPECTED = {
     "linear_velocity": ({"std": 0.5}, lambda r: np.exp(-np.sum((r["vel"] - r["command"])[:2] ** 2) / 0.25)),
@@ -124,32 +127,32 @@ EXPECTED = {
 
 
 @pytest.mark.parametrize("name", NAMES.split())
-def test_reward_is_that_of_numpy(name):
+def test_reward_equals_its_numpy_formula(name):
     numbers, expected = EXPECTED[name]
-    values = paid.all(name, [view for _, view, _ in ROBOTS], [state for _, _, state in ROBOTS], **numbers)
-    wanted = [expected(fields) for fields, _, _ in ROBOTS]
-    np.testing.assert_allclose(values, wanted, rtol=2e-4, atol=2e-6)
-    assert np.ptp(wanted) > 1e-3
+    values = reward.all(name, [view for _, view, _ in ROBOTS], [state for _, _, state in ROBOTS], **numbers)
+    expected_values = [expected(fields) for fields, _, _ in ROBOTS]
+    np.testing.assert_allclose(values, expected_values, rtol=2e-4, atol=2e-6)
+    assert np.ptp(expected_values) > 1e-3
 
 
-def test_every_reward_of_the_task_is_compared():
+def test_expected_covers_every_velocity_reward_of_the_tasks():
     used = {term.func.func for task in (velocity_rough(), velocity_trot()) for term in task.rewards}
-    own = {func for func in used if inspect.getmodule(func).__name__ == "jumper_warp.kernels.velocity.rewards"}
-    assert {func.__name__ for func in own} == set(EXPECTED)
+    names = {f.__name__ for f in used if inspect.getmodule(f).__name__ == "jumper_warp.kernels.velocity.rewards"}
+    assert names == set(EXPECTED)
 
 
-def test_shanks_lean_as_inverse_kinematics_has_them():
+def test_shank_lean_in_the_default_pose_is_that_of_the_geometry():
     """In the default pose a shank is off vertical by asin of (0.045 + 0.175 sin 45 deg) / 0.3: 34.3 degrees."""
     view = make_view(contact=np.ones(4), projected_gravity=(0.0, 0.0, -1.0))
     lean = np.arcsin((0.045 + 0.175 * np.sin(np.pi / 4.0)) / 0.3)
-    assert paid("shank_lean", view, make_state(), **(LEG | {"threshold": 0.0})) == pytest.approx(
+    assert reward("shank_lean", view, make_state(), **(LEG | {"threshold": 0.0})) == pytest.approx(
         8.0 * lean**2, rel=1e-5
     )
-    assert paid("shank_lean", view, make_state(), **(LEG | {"threshold": lean + 0.01})) == 0.0
+    assert reward("shank_lean", view, make_state(), **(LEG | {"threshold": lean + 0.01})) == 0.0
 
 
-def test_standing_robot_at_rest_gets_full_tracking():
+def test_a_robot_at_rest_in_the_default_pose_gets_full_standing_rewards():
     state = make_state(standing=1)
-    assert paid("linear_velocity", make_view(), state, std=0.1) == pytest.approx(1.0)
-    assert paid("standing_posture", make_view(), state, std=0.1) == pytest.approx(1.0)
+    assert reward("linear_velocity", make_view(), state, std=0.1) == pytest.approx(1.0)
+    assert reward("standing_posture", make_view(), state, std=0.1) == pytest.approx(1.0)
     assert vec12(*DEFAULT_ANGLE) == make_view().default_angle

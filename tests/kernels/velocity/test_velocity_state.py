@@ -1,4 +1,4 @@
-"""How the state of velocity tracking moves on, against plain Python."""
+"""Update of the velocity tracking state against NumPy."""
 
 import numpy as np
 import pytest
@@ -9,12 +9,12 @@ from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.kernels.velocity.state import VelocityState, advance_velocity
 from velocity_helpers import FIELDS
 
-WORLDS, STEPS, SETTLE, DT = 6, 140, 30, 1.0 / 60.0
+WORLDS, STEPS, SETTLE, DT = 6, 140, 30, 1.0 / 60.0  # SETTLE: policy steps after a command without errors; DT [s]
 
 
 @wp.kernel(module="unique", enable_backward=False)
 def advance_kernel(views: wp.array2d(dtype=RobotView), settle: float, states: wp.array(dtype=VelocityState)):
-    """One thread per world follows all its steps."""
+    """Advance the states through all policy steps; views: (steps, worlds); one thread per world."""
     world = wp.tid()
     state = states[world]
     for step in range(views.shape[0]):
@@ -23,7 +23,7 @@ def advance_kernel(views: wp.array2d(dtype=RobotView), settle: float, states: wp
 
 
 def histories():
-    """Paws that go up and down, and velocities, by (step, world)."""
+    """Return random contacts, first contacts, paw heights [m] (STEPS, WORLDS, 4) and velocities (STEPS, WORLDS, 3)."""
     rng = np.random.default_rng(5)
     down = rng.uniform(size=(STEPS, WORLDS, 4)) < 0.6
     return {
@@ -35,13 +35,14 @@ def histories():
     }
 
 
-COMMAND = np.array([0.5, -0.3, 0.7])
+COMMAND = np.array([0.5, -0.3, 0.7])  # [m/s], [m/s], [rad/s]
 
 
 @pytest.fixture(scope="module")
 def followed():
+    """Return histories and the fields of the states after them; world 3 is commanded to stand."""
     h = histories()
-    h["lin_vel"][50, 1, 0] = np.nan  # worlds that came apart
+    h["lin_vel"][50, 1, 0] = np.nan  # diverged worlds
     h["ang_vel"][60, 2, 2] = 1e6
     views = [
         [
@@ -64,17 +65,17 @@ def followed():
     return h, {name: records[name].copy() for name in FIELDS}
 
 
-def test_steps_of_the_last_three_quarters_of_a_second_are_counted(followed):
+def test_recent_steps_counts_touchdowns_of_the_last_45_policy_steps(followed):
     h, state = followed
     np.testing.assert_array_equal(state["recent_steps"], h["first"][-45:].sum(axis=0))
     assert state["recent_steps"].min() > 3 and (h["first"][-46] & ~h["first"][-45]).any()
 
 
-def test_errors_count_once_the_command_has_settled(followed):
+def test_errors_and_score_sum_over_settled_finite_policy_steps(followed):
     h, state = followed
-    off = np.concatenate([h["lin_vel"][..., :2], h["ang_vel"][..., 2:]], axis=2) - COMMAND
-    xy, yaw = np.linalg.norm(off[..., :2], axis=2)[SETTLE:], np.abs(off[..., 2])[SETTLE:]
-    fine = (xy < 40.0) & (yaw < 40.0)
+    error = np.concatenate([h["lin_vel"][..., :2], h["ang_vel"][..., 2:]], axis=2) - COMMAND
+    xy, yaw = np.linalg.norm(error[..., :2], axis=2)[SETTLE:], np.abs(error[..., 2])[SETTLE:]
+    fine = (xy < 40.0) & (yaw < 40.0)  # [m/s], [rad/s] MAX_COUNTED_ERROR
     assert (~fine).sum() == 2
     xy, yaw = np.where(fine, xy, 0.0), np.where(fine, yaw, 0.0)
     for total in ("error_xy", "sum_xy"):
@@ -83,11 +84,11 @@ def test_errors_count_once_the_command_has_settled(followed):
         np.testing.assert_allclose(state[total], yaw.sum(axis=0), rtol=1e-5)
     np.testing.assert_array_equal(state["settled"], fine.sum(axis=0))
     speed = np.hypot(0.5, 0.3) + 0.3 * 0.7
-    score = 1.2 * np.where(fine, speed - 2.0 * (xy + 0.3 * yaw), 0.0).sum(axis=0)
+    score = 1.2 * np.where(fine, speed - 2.0 * (xy + 0.3 * yaw), 0.0).sum(axis=0)  # 1.2: terrain level 2
     np.testing.assert_allclose(state["score"], score, rtol=1e-4)
 
 
-def test_time_and_phase_go_on(followed):
+def test_times_and_gait_phase_advance_with_every_policy_step(followed):
     _, state = followed
     assert set(state["steps"]) == set(state["command_steps"]) == {STEPS} and set(state["all_steps"]) == {STEPS}
     np.testing.assert_allclose(state["minutes"], STEPS * DT / 60.0, rtol=1e-5)
@@ -95,7 +96,7 @@ def test_time_and_phase_go_on(followed):
     np.testing.assert_allclose(state["seconds_walking"], np.where(np.arange(WORLDS) == 3, 0.0, STEPS * DT), rtol=1e-5)
 
 
-def test_swings_are_as_high_as_the_paw_has_been(followed):
+def test_swing_heights_and_their_sums_at_touchdowns_match_numpy(followed):
     h, state = followed
     apex, steps, high = np.zeros(WORLDS), np.zeros(WORLDS), np.zeros((WORLDS, 4))
     for down, first, height in zip(h["down"], h["first"], h["height"], strict=True):
