@@ -93,6 +93,6 @@ def skills_and_handovers(walking: TaskCfg, jumps: tuple[TaskCfg, ...]) -> tuple[
     tasks, switches = [walk], []
     for jump in jumps:
         tasks.append(for_switching(jump, randomization))
-        found.append(Handover(walk, tasks[-1], handovers.walk_to_jump_due, handovers.begin_jump))
-        found.append(Handover(tasks[-1], walk, handovers.jump_to_walk_due, handovers.begin_walk))
-    return tasks, found
+        switches.append(Handover(walk, tasks[-1], handovers.walk_to_jump_due, handovers.begin_jump))
+        switches.append(Handover(tasks[-1], walk, handovers.jump_to_walk_due, handovers.begin_walk))
+    return tasks, switches

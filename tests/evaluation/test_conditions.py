@@ -111,7 +111,7 @@ def test_conditions_change_only_the_fixed_parameters():
     conditions = Conditions(latency=8.0, gain_scale=(0.6, 1.0), friction=0.4)
     task = landings.with_landing_terminations(JUMP)
     nominal = make_env(2, task=task, auto_reset=False)
-    env = make_env(2, task=conditions.applied(task), randomize=conditions.draws, auto_reset=False)
+    env = make_env(2, task=conditions.applied(task), randomize=conditions.sets_parameters, auto_reset=False)
     assert env.parameters.latency.numpy().tolist() == [4, 4]  # 8 ms are 3.84 physics steps
     motors, others = env.sim.motors, nominal.sim.motors
     np.testing.assert_allclose(motors.kp.numpy(), 0.6 * others.kp.numpy(), rtol=1e-6)
