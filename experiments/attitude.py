@@ -33,10 +33,8 @@ class Args(EvaluationArgs, AttitudeFlags):
     """Flags, with those of `AttitudeFlags`; `num_turns` turns about body axes, and as many about random axes."""
 
     policy: str = "attitude"
-    keep_momentum: bool = True
-    """Conserve the momentum of free flight exactly, regardless of the training's setting."""
-    refine: int = 1
-    """[1] Factor by which the physics step is smaller than that of the training."""
+    keep_momentum: bool = True  # Conserve the momentum of free flight exactly, regardless of the training's setting
+    refine: int = 1  # [1] Factor by which the physics step is smaller than that of the training
     num_recorded: int = 6
     """Number of turns to record for the Rerun viewer and, the first of them, as a filmstrip; 0: none."""
 

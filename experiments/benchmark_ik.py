@@ -24,10 +24,8 @@ from support.timing import median_time
 class Args(DeviceArgs):
     """Flags."""
 
-    poses: int = 65536
-    """Robots per launch, four legs each."""
-    repeats: int = 5
-    """Number of timed launches; the median is reported."""
+    poses: int = 65536  # Robots per launch, four legs each
+    repeats: int = 5  # Number of timed launches; the median is reported
     scatter: float = 0.3
     """[m] Half edge of the cube around each paw's reachable position that the scattered targets fill."""
     seed: int = 0

@@ -29,17 +29,12 @@ from support.timing import baseline_ratios
 class Args(DeviceArgs):
     """Flags."""
 
-    envs: list[int] = field(default_factory=lambda: [64])
-    """Numbers of environments, one run for each."""
+    envs: list[int] = field(default_factory=lambda: [64])  # Numbers of environments, one run for each
     solvers: list[SolverName] = field(default_factory=lambda: ["jumper", "mujoco"])
-    repeats: int = 5
-    """Number of timed repetitions; the median is reported."""
-    steps: int = 100
-    """Number of policy steps in a repetition of the standing test."""
-    baseline: Path | None = None
-    """Root of another checkout to compare with."""
-    threads: list[int] | None = None
-    """Numbers of CPU threads to compare (default: all cores, nothing is compared)."""
+    repeats: int = 5  # Number of timed repetitions; the median is reported
+    steps: int = 100  # Number of policy steps in a repetition of the standing test
+    baseline: Path | None = None  # Root of another checkout to compare with
+    threads: list[int] | None = None  # Numbers of CPU threads to compare (default: all cores, nothing is compared)
 
     def __post_init__(self) -> None:
         for threads in self.threads or []:

@@ -34,22 +34,14 @@ class Args(ThreadArgs):
     """Numbers of environments for solver and environment (default: 4096 8192 16384 on a GPU, 64 on a CPU)."""
     train_envs: int | None = None
     """Number of environments for training and profile (default: 8192 on a GPU, 64 on a CPU)."""
-    steps: int = 200
-    """Policy steps in a repetition."""
-    repeats: int = 5
-    """Number of repetitions of a timing; the median is reported."""
-    iterations: int = 10
-    """Number of timed training iterations of each trainer."""
-    rsl_rl: bool = True
-    """Train with rsl-rl-lib too."""
-    num_steps: int = 32
-    """Policy steps of each environment in an iteration."""
-    variants: tuple[str, ...] = ()
-    """Names of further timed variants of PPO (`support.variants`), or all."""
-    only_ppo: bool = False
-    """Time PPO and its variants only."""
-    baseline: Path | None = None
-    """Root of another checkout to compare with."""
+    steps: int = 200  # Policy steps in a repetition
+    repeats: int = 5  # Number of repetitions of a timing; the median is reported
+    iterations: int = 10  # Number of timed training iterations of each trainer
+    rsl_rl: bool = True  # Train with rsl-rl-lib too
+    num_steps: int = 32  # Policy steps of each environment in an iteration
+    variants: tuple[str, ...] = ()  # Names of further timed variants of PPO (`support.variants`), or all
+    only_ppo: bool = False  # Time PPO and its variants only
+    baseline: Path | None = None  # Root of another checkout to compare with
 
     def __post_init__(self) -> None:
         for name in ("steps", "repeats", "iterations", "num_steps"):

@@ -32,26 +32,17 @@ from support.scripts import ThreadArgs, prepare, run_script
 class Args(ThreadArgs):
     """Flags."""
 
-    task: JumpTask = "vertical-jump"
-    """Task whose departures are undone."""
-    only: tuple[str, ...] = ()
-    """Names of the departures to undo, or kept for none (default: all)."""
+    task: JumpTask = "vertical-jump"  # Task whose departures are undone
+    only: tuple[str, ...] = ()  # Names of the departures to undo, or kept for none (default: all)
     iterations: int | None = None
     """Iterations of each training (default: 800 or 1000, when the task with all departures has learned)."""
-    num_envs: int = 8192
-    """Number of environments."""
-    seeds: tuple[int, ...] = (1,)
-    """Seeds of the trainings without one departure."""
-    baseline_seeds: tuple[int, ...] = (1, 2, 3)
-    """Seeds of the trainings with all departures."""
-    num_jumps: tuple[int, int] = (200, 1000)
-    """Numbers of nominal and of randomised jumps."""
-    num_squats: int = 100
-    """Number of robots that hold a squat."""
-    train_flags: str = ""
-    """More flags of `jumper train`, for all trainings: --train-flags="--ppo.gamma 0.98"."""
-    measure: bool = True
-    """Make the jumps after each training."""
+    num_envs: int = 8192  # Number of environments
+    seeds: tuple[int, ...] = (1,)  # Seeds of the trainings without one departure
+    baseline_seeds: tuple[int, ...] = (1, 2, 3)  # Seeds of the trainings with all departures
+    num_jumps: tuple[int, int] = (200, 1000)  # Numbers of nominal and of randomised jumps
+    num_squats: int = 100  # Number of robots that hold a squat
+    train_flags: str = ""  # More flags of `jumper train`, for all trainings: --train-flags="--ppo.gamma 0.98"
+    measure: bool = True  # Make the jumps after each training
 
     def __post_init__(self) -> None:
         unknown = set(self.only) - {BASELINE, *DEPARTURES[self.task]}

@@ -36,14 +36,10 @@ UNITS = {  # by quantity of `support.agreement`
 class Args:
     """Flags."""
 
-    robot: Path | None = None
-    """Robot overlay (docs/robot_overlays.md; default: the robot as described)."""
-    states: int = 200
-    """Number of random states."""
-    seed: int = 0
-    """Seed of the states."""
-    out: Path | None = None
-    """Folder for metrics.json (default: outputs/dynamics_agreement/<time>)."""
+    robot: Path | None = None  # Robot overlay (docs/robot_overlays.md; default: the robot as described)
+    states: int = 200  # Number of random states
+    seed: int = 0  # Seed of the states
+    out: Path | None = None  # Folder for metrics.json (default: outputs/dynamics_agreement/<time>)
 
     def __post_init__(self) -> None:
         if self.states < 1:

@@ -28,16 +28,12 @@ from support.scripts import run_script
 class Args(EvaluationArgs):
     """Flags."""
 
-    policy: str = "attitude"
-    """Name or folder of the policy that turns, a run's folder, or a checkpoint."""
+    policy: str = "attitude"  # Name or folder of the policy that turns, a run's folder, or a checkpoint
     landing_policy: str = ""
     """Policy that jumps to heights and lands: name, folder, run or checkpoint (default: the default pose)."""
-    jump_task: str = "vertical-jump-mars"
-    """Task that takes off and lands, unless `landing_policy` is given."""
-    num_flights: int = 60
-    """Number of flights."""
-    max_leg_delay: float = 15.0
-    """[ms] Largest delay with which the legs of one end, or side, extend after the others."""
+    jump_task: str = "vertical-jump-mars"  # Task that takes off and lands, unless `landing_policy` is given
+    num_flights: int = 60  # Number of flights
+    max_leg_delay: float = 15.0  # [ms] Largest delay with which the legs of one end, or side, extend after the others
     takeoff: Literal["open-loop", "policy"] = "open-loop"
     """How robots take off: with legs that extend unequally, or by the policy that lands."""
     height_range: tuple[float, float] = (2.5, 2.5)

@@ -30,12 +30,10 @@ from support.timing import device_memory, wall_time
 class Args(DeviceArgs):
     """Flags."""
 
-    num_envs: int | None = None
-    """Number of environments (default: 64 on a CPU, 4096 on a GPU)."""
+    num_envs: int | None = None  # Number of environments (default: 64 on a CPU, 4096 on a GPU)
     repeats: int = 7
     """Number of timed repetitions; simulation and gradient alternate, and the fastest time of each is reported."""
-    double: bool = False
-    """Whether to compute in double precision."""
+    double: bool = False  # Whether to compute in double precision
 
     def __post_init__(self) -> None:
         if self.repeats < 1 or (self.num_envs is not None and self.num_envs < 1):

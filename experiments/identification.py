@@ -34,22 +34,16 @@ Part = Literal["same", "fine", "rough", "mujoco", "methods", "policy"]
 class Args:
     """Flags."""
 
-    num_matched: int = 20
-    """Number of robots that are identified with the simulator that recorded them."""
+    num_matched: int = 20  # Number of robots that are identified with the simulator that recorded them
     num_mismatched: int = 1
     """Number of robots recorded on another simulator, for each of the parts fine, rough, mujoco; metrics: the first."""
-    parts: tuple[Part, ...] = get_args(Part)
-    """Parts to run."""
+    parts: tuple[Part, ...] = get_args(Part)  # Parts to run
     fine_dt: float = 1.0 / 3840.0
     """[s] Physics step of the model that identifies the robot recorded at a sixteenth of 1/480 s; "rough": 1/480."""
-    policy: str = "vertical_jump"
-    """Policy whose jumps the identified robot is to predict."""
-    num_jumps: int = 64
-    """Number of jumps to predict."""
-    out: Path | None = None
-    """Folder for metrics and plots (default: outputs/identification/<time>)."""
-    threads: int | None = None
-    """CPU threads (default: all cores)."""
+    policy: str = "vertical_jump"  # Policy whose jumps the identified robot is to predict
+    num_jumps: int = 64  # Number of jumps to predict
+    out: Path | None = None  # Folder for metrics and plots (default: outputs/identification/<time>)
+    threads: int | None = None  # CPU threads (default: all cores)
 
     def __post_init__(self) -> None:
         if self.num_matched < 1 or self.num_mismatched < 1 or self.num_jumps < 3:

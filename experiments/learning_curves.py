@@ -35,24 +35,16 @@ TASK = "vertical-jump"
 class Args(DeviceArgs):
     """Flags."""
 
-    seconds: float = 60.0
-    """[s] Time of each training, its evaluations not counted."""
-    eval_interval: float = 2.0
-    """[s] Training time between two evaluations."""
-    seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds of weights, noise and worlds."""
-    variants: tuple[str, ...] = (DEFAULT,)
-    """Variants of the trainer (`support.variants`)."""
-    num_envs: int = 8192
-    """Number of environments."""
-    num_jumps: int = 200
-    """Number of jumps of an evaluation."""
-    height_range: tuple[float, float] = TEST_HEIGHTS
-    """[m] Lowest and highest commanded base height."""
+    seconds: float = 60.0  # [s] Time of each training, its evaluations not counted
+    eval_interval: float = 2.0  # [s] Training time between two evaluations
+    seeds: tuple[int, ...] = (0, 1, 2)  # Seeds of weights, noise and worlds
+    variants: tuple[str, ...] = (DEFAULT,)  # Variants of the trainer (`support.variants`)
+    num_envs: int = 8192  # Number of environments
+    num_jumps: int = 200  # Number of jumps of an evaluation
+    height_range: tuple[float, float] = TEST_HEIGHTS  # [m] Lowest and highest commanded base height
     history: int | None = None
     """Number of policy steps in the observation, as `jumper train --history` (default: the task's)."""
-    randomize: bool = False
-    """Train with randomisation and noise."""
+    randomize: bool = False  # Train with randomisation and noise
 
     def __post_init__(self) -> None:
         for name in self.variants:

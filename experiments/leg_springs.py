@@ -35,16 +35,12 @@ class Args(DeviceArgs):
 
     stiffness: tuple[float, ...] = (0.0, 125.0, 250.0, 375.0, 500.0, 625.0, 750.0, 875.0, 1000.0, 1250.0, 1500.0)
     """[N/m] Stiffnesses of the springs to try; 0: no springs."""
-    rest_length: float = 0.17
-    """[m] Rest length of the springs."""
+    rest_length: float = 0.17  # [m] Rest length of the springs
     squat_angles: tuple[float, ...] = (60.0, 75.0, 90.0, 105.0, 120.0, 135.0)
     """[deg] Transversal angles to command for the squat."""
-    torque_limit: float = 18.0
-    """[N m] Torque saturation of the motors; lateral motors give 18 at most."""
-    kp: float = 17.0
-    """[N m/rad] Position gain of the transversal motors."""
-    gravity: float = EARTH
-    """[m/s^2] Downward."""
+    torque_limit: float = 18.0  # [N m] Torque saturation of the motors; lateral motors give 18 at most
+    kp: float = 17.0  # [N m/rad] Position gain of the transversal motors
+    gravity: float = EARTH  # [m/s^2] Downward
     filter: Literal["both", "stock", "loose"] = "both"
     """Motor command filter: that of the vertical jump, the loose one, or each in turn."""
 

@@ -29,14 +29,10 @@ from support.scripts import run_script
 class Args:
     """Flags of the measurement of memory per world."""
 
-    solver: SolverName = "jumper"
-    """Physics solver."""
-    task: str = "vertical-jump"
-    """Name of the task."""
-    envs: tuple[int, ...] = (256, 2048)
-    """Numbers of worlds; a single one is measured in this process."""
-    out: Path | None = None
-    """Folder for metrics.json (default: outputs/measure_memory/<time>)."""
+    solver: SolverName = "jumper"  # Physics solver
+    task: str = "vertical-jump"  # Name of the task
+    envs: tuple[int, ...] = (256, 2048)  # Numbers of worlds; a single one is measured in this process
+    out: Path | None = None  # Folder for metrics.json (default: outputs/measure_memory/<time>)
 
 
 def array_bytes() -> int:

@@ -46,16 +46,11 @@ def make_env(num_envs: int, seed: int, device: torch.device) -> Env:
 class Args:
     """Flags."""
 
-    num_envs: int = 256
-    """Number of environments."""
-    iterations: int = 5
-    """Training iterations."""
-    num_steps: int = 32
-    """Policy steps of each environment in an iteration."""
-    out: Path | None = None
-    """Folder for the run and metrics.json (default: outputs/new_reward/<time>)."""
-    device: str | None = None
-    """Torch device."""
+    num_envs: int = 256  # Number of environments
+    iterations: int = 5  # Training iterations
+    num_steps: int = 32  # Policy steps of each environment in an iteration
+    out: Path | None = None  # Folder for the run and metrics.json (default: outputs/new_reward/<time>)
+    device: str | None = None  # Torch device
 
 
 def main(args: Args) -> dict:

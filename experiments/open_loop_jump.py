@@ -43,22 +43,15 @@ PER_MOTOR = tuple(f"peak_{quantity}_{leg}" for quantity in ("torque", "speed") f
 class Args(DeviceArgs):
     """Flags."""
 
-    solver: Literal["jumper", "mujoco"] = "jumper"
-    """Physics: the dedicated solver, or Newton's SolverMuJoCo."""
-    torque_limit: float = 18.0
-    """[N m] Torque saturation of the motors; lateral motors give 18 at most."""
-    kp: float = 17.0
-    """[N m/rad] Position gain of the transversal motors."""
-    gravity: float = EARTH
-    """[m/s^2] Downward."""
-    loose: bool = False
-    """A looser filter, as for the paper's 1.42 m."""
-    squat_angle: float = SQUAT
-    """[deg] Transversal angle commanded for the squat."""
+    solver: Literal["jumper", "mujoco"] = "jumper"  # Physics: the dedicated solver, or Newton's SolverMuJoCo
+    torque_limit: float = 18.0  # [N m] Torque saturation of the motors; lateral motors give 18 at most
+    kp: float = 17.0  # [N m/rad] Position gain of the transversal motors
+    gravity: float = EARTH  # [m/s^2] Downward
+    loose: bool = False  # A looser filter, as for the paper's 1.42 m
+    squat_angle: float = SQUAT  # [deg] Transversal angle commanded for the squat
     spring: tuple[float, float] | None = None
     """[N/m] [m] Stiffness and rest length of springs between the knees of each leg (default: none)."""
-    robot: Path | None = None
-    """Robot overlay, as `jumper sysid` writes it, in place of springs."""
+    robot: Path | None = None  # Robot overlay, as `jumper sysid` writes it, in place of springs
 
     def __post_init__(self) -> None:
         if self.spring is not None and self.robot is not None:

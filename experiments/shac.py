@@ -37,30 +37,19 @@ TASK = "vertical-jump"
 class Args(DeviceArgs):
     """Flags."""
 
-    seconds: float = 120.0
-    """[s] Time of each training, its evaluations not counted; 0: none."""
-    eval_interval: float = 5.0
-    """[s] Training time between two evaluations."""
-    seeds: tuple[int, ...] = (0, 1, 2)
-    """Seeds of weights, noise and worlds."""
-    trainers: tuple[Literal["ppo", "shac"], ...] = ("ppo", "shac")
-    """Trainers to compare."""
-    num_envs: int = 4096
-    """Number of environments of a training."""
-    window: int = 16
-    """Policy steps of SHAC's windows; PPO's are those of the task."""
-    init_std: float = 0.3
-    """Exploration noise at the start, of SHAC; PPO's is that of the task."""
-    hidden: tuple[int, ...] = (256, 128, 128)
-    """Widths of the hidden layers of both."""
+    seconds: float = 120.0  # [s] Time of each training, its evaluations not counted; 0: none
+    eval_interval: float = 5.0  # [s] Training time between two evaluations
+    seeds: tuple[int, ...] = (0, 1, 2)  # Seeds of weights, noise and worlds
+    trainers: tuple[Literal["ppo", "shac"], ...] = ("ppo", "shac")  # Trainers to compare
+    num_envs: int = 4096  # Number of environments of a training
+    window: int = 16  # Policy steps of SHAC's windows; PPO's are those of the task
+    init_std: float = 0.3  # Exploration noise at the start, of SHAC; PPO's is that of the task
+    hidden: tuple[int, ...] = (256, 128, 128)  # Widths of the hidden layers of both
     history: int | None = None
     """Number of policy steps in the observation, as `jumper train --history` (default: the task's)."""
-    num_jumps: int = 200
-    """Number of jumps of an evaluation."""
-    horizons: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64)
-    """Policy steps of the windows whose gradients are measured."""
-    num_gradient_envs: int = 256
-    """Number of environments whose gradients are measured."""
+    num_jumps: int = 200  # Number of jumps of an evaluation
+    horizons: tuple[int, ...] = (1, 2, 4, 8, 16, 32, 64)  # Policy steps of the windows whose gradients are measured
+    num_gradient_envs: int = 256  # Number of environments whose gradients are measured
 
     def __post_init__(self) -> None:
         positive = min((self.eval_interval, *self.horizons, self.num_gradient_envs - 1)) > 0

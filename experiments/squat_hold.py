@@ -25,16 +25,11 @@ from support.squats import SquatLog, squat_goals, squat_metrics
 class Args(EvaluationArgs):
     """Flags."""
 
-    policy: str = "vertical_jump"
-    """Name or folder of a policy that jumps, a run's folder, or a checkpoint."""
-    num_squats: int = 100
-    """Number of robots."""
-    hold_time: float = 3.0
-    """[s] Time for which each robot holds its squat."""
-    height: tuple[float, float] = (0.6, 1.1)
-    """[m] Lowest and highest goal, for a policy that jumps to heights."""
-    distance: tuple[float, float] = (0.3, 1.5)
-    """[m] Nearest and farthest goal, for a policy that jumps to places."""
+    policy: str = "vertical_jump"  # Name or folder of a policy that jumps, a run's folder, or a checkpoint
+    num_squats: int = 100  # Number of robots
+    hold_time: float = 3.0  # [s] Time for which each robot holds its squat
+    height: tuple[float, float] = (0.6, 1.1)  # [m] Lowest and highest goal, for a policy that jumps to heights
+    distance: tuple[float, float] = (0.3, 1.5)  # [m] Nearest and farthest goal, for a policy that jumps to places
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -40,16 +40,11 @@ ALL_JUMPS = JUMPS | LIMITED  # By name
 class Args(ThreadArgs):
     """Flags."""
 
-    jumps: tuple[str, ...] = tuple(JUMPS)
-    """Names of the jumps to optimise."""
-    samples: int | None = None
-    """Random candidates (default: those of each jump)."""
-    effort: float = 1.0
-    """[1] Factor on the number of iterations."""
-    final_iterations: int | None = None
-    """Iterations of the last descent (default: those of each jump)."""
-    seed: int = 0
-    """Seed of random candidates and displacements."""
+    jumps: tuple[str, ...] = tuple(JUMPS)  # Names of the jumps to optimise
+    samples: int | None = None  # Random candidates (default: those of each jump)
+    effort: float = 1.0  # [1] Factor on the number of iterations
+    final_iterations: int | None = None  # Iterations of the last descent (default: those of each jump)
+    seed: int = 0  # Seed of random candidates and displacements
 
     def __post_init__(self) -> None:
         unknown = [name for name in self.jumps if name not in ALL_JUMPS]

@@ -37,18 +37,12 @@ PROBABILITIES = (0.35, 0.2, 0.15, 0.15, 0.15)  # Probabilities of walking, turni
 class Args(EvaluationArgs):
     """Flags."""
 
-    policy: str = "walking_flat"
-    """Policy that walks: name or folder, a run's folder, or a checkpoint."""
-    jump_up: str = "vertical_jump"
-    """Policy that jumps to heights."""
-    jump_to: str = "horizontal_jump"
-    """Policy that jumps to places."""
-    num_robots: int = 200
-    """Number of robots; each has its own commands."""
-    course: bool = False
-    """Ten random commands a robot instead of the paper's test."""
-    blocks: bool = True
-    """Whether courses have blocks to jump onto; SolverMuJoCo has none."""
+    policy: str = "walking_flat"  # Policy that walks: name or folder, a run's folder, or a checkpoint
+    jump_up: str = "vertical_jump"  # Policy that jumps to heights
+    jump_to: str = "horizontal_jump"  # Policy that jumps to places
+    num_robots: int = 200  # Number of robots; each has its own commands
+    course: bool = False  # Ten random commands a robot instead of the paper's test
+    blocks: bool = True  # Whether courses have blocks to jump onto; SolverMuJoCo has none
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -31,20 +31,13 @@ class Args(EvaluationArgs):
     """Flags."""
 
     policy: str = "walking_rough"
-    num_robots: int = 500
-    """Robots on each terrain."""
-    terrains: tuple[str, ...] = KINDS
-    """Terrains to walk on."""
-    speed: float = 0.5
-    """[m/s] Commanded velocity straight ahead."""
-    uneven: float = 0.05
-    """[m] Largest height or depth of random ground."""
-    slope: float = 10.0
-    """[deg] Inclination of slopes."""
-    step_height: float = 0.06
-    """[m] Height of steps."""
-    num_recorded: int = 1
-    """Number of robots to record on each terrain for the Rerun viewer; 0: none."""
+    num_robots: int = 500  # Robots on each terrain
+    terrains: tuple[str, ...] = KINDS  # Terrains to walk on
+    speed: float = 0.5  # [m/s] Commanded velocity straight ahead
+    uneven: float = 0.05  # [m] Largest height or depth of random ground
+    slope: float = 10.0  # [deg] Inclination of slopes
+    step_height: float = 0.06  # [m] Height of steps
+    num_recorded: int = 1  # Number of robots to record on each terrain for the Rerun viewer; 0: none
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -45,8 +45,7 @@ class Args(EvaluationArgs):
     policy: str = "walking_flat"
     commands_per_axis: int = 13
     """Number of commands along each of the three axes; one robot for each combination, and as many in other tests."""
-    num_recorded: int = 1
-    """Number of robots to record for the Rerun viewer, redirected while they walk; 0: none."""
+    num_recorded: int = 1  # Number of robots to record for the Rerun viewer, redirected while they walk; 0: none
 
     def __post_init__(self) -> None:
         super().__post_init__()

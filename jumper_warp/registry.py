@@ -34,11 +34,9 @@ class TaskEntry:
 
     make: Callable[[], TaskCfg] | str
     """Function that returns the task, or `module:function`, which is imported when the task is made."""
-    ppo: PpoCfg = field(default_factory=PpoCfg)
-    """Default settings of PPO for training."""
+    ppo: PpoCfg = field(default_factory=PpoCfg)  # Default settings of PPO for training
     aliases: tuple[str, ...] = ()  # other names of the task
-    best_metric: str = "Metrics/success"
-    """Default metric of the log whose largest value selects the best checkpoint."""
+    best_metric: str = "Metrics/success"  # Default metric of the log whose largest value selects the best checkpoint
 
     @property
     def origin(self) -> str:
@@ -63,14 +61,11 @@ class TaskEntry:
 
 WALKING = PpoCfg(num_steps=24, gamma=0.985, entropy_coef=0.0025, init_std=0.4, symmetry="actor")
 """Training of velocity tracking."""
-HEIGHTS = PpoCfg(gamma=0.99)
-"""Training of vertical jumps."""
+HEIGHTS = PpoCfg(gamma=0.99)  # Training of vertical jumps
 ON_MARS = replace(HEIGHTS, symmetry="actor")
 """Training of vertical jumps on Mars, with symmetry: there a small angular velocity turns the robot far."""
-PLACES = PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")
-"""Training of jumps to goal positions."""
-TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5, symmetry="actor")
-"""Training of turning in flight."""
+PLACES = PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")  # Training of jumps to goal positions
+TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5, symmetry="actor")  # Training of turning in flight
 
 TASKS: dict[str, TaskEntry] = {
     "vertical-jump": TaskEntry("jumper_warp.tasks.jump.vertical:vertical_jump", HEIGHTS, ("Olympus-Vertical-Jump",)),

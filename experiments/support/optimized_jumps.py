@@ -36,10 +36,7 @@ HEIGHT = 0.80  # [m] Apex height of the jump with the least work
 STILL_HEIGHT = 0.65  # [m] Apex height of the jump that lands still
 SOFT = 4.5  # [g] Largest acceleration of the base over a policy step of the landing; the tasks end an episode at 5
 APEX_STEPS = 61  # Number of policy steps of a motion up to the apex
-BACK, LEAN = (
-    0.28,
-    1.0,
-)  # [m], [1] Largest backward shift of the base that early stages of the search reward; weight
+BACK, LEAN = (0.28, 1.0)  # [m], [1] Largest backward shift of the base that early stages of the search reward; weight
 POSTURES = np.array([[-0.2, -0.7, 0.7, -0.3], [0.6, 0.0, 0.3, 0.8], [0.9, 0.5, 0.9, 0.5]])
 """[1] Actions of a run-up in place: base behind the paws, hind legs folded under it, crouch."""
 SCATTER = 0.35  # [1] Standard deviation of these postures

@@ -22,18 +22,15 @@ Args = TypeVar("Args")
 class DeviceArgs:
     """Flags of a script that computes on one device."""
 
-    out: Path | None = None
-    """Folder for metrics.json, plots and recordings (default: outputs/<script>/<time>)."""
-    device: str | None = None
-    """Warp device."""
+    out: Path | None = None  # Folder for metrics.json, plots and recordings (default: outputs/<script>/<time>)
+    device: str | None = None  # Warp device
 
 
 @dataclass(frozen=True)
 class ThreadArgs(DeviceArgs):
     """Flags of a script whose worlds may share CPU threads."""
 
-    threads: int | None = None
-    """CPU threads that share the worlds (default: all cores); they change no result."""
+    threads: int | None = None  # CPU threads that share the worlds (default: all cores); they change no result
 
 
 def run_script(main: Callable[[Args], Any], kind: type[Args]) -> None:

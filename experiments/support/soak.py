@@ -24,24 +24,17 @@ from support.scripts import ThreadArgs
 class SoakArgs(ThreadArgs):
     """Flags of a soak test."""
 
-    num_envs: int = 1024
-    """Number of environments."""
-    steps: int = 10_000
-    """Number of policy steps of each environment; with 1024 environments 10 million in all."""
-    hold_steps: int = 10
-    """Number of policy steps for which an action is held."""
+    num_envs: int = 1024  # Number of environments
+    steps: int = 10_000  # Number of policy steps of each environment; with 1024 environments 10 million in all
+    hold_steps: int = 10  # Number of policy steps for which an action is held
     episode_steps: int = 300
     """Number of policy steps after which all worlds restart or, with --task, after which the host checks them."""
-    lateral: float = 15.0
-    """[deg] Largest lateral target."""
-    transversal: tuple[float, float] = (-30.0, 140.0)
-    """[deg] Least and largest transversal target."""
-    command_filter: bool = False
-    """Pass the targets through the motor command filter."""
+    lateral: float = 15.0  # [deg] Largest lateral target
+    transversal: tuple[float, float] = (-30.0, 140.0)  # [deg] Least and largest transversal target
+    command_filter: bool = False  # Pass the targets through the motor command filter
     task: str | None = None
     """Name of a task whose environment is tested, with its limits and filter (default: the simulation alone)."""
-    seed: int = 0
-    """Seed of actions, masses and friction."""
+    seed: int = 0  # Seed of actions, masses and friction
 
     def __post_init__(self) -> None:
         for name in ("num_envs", "steps", "hold_steps", "episode_steps"):

@@ -16,14 +16,11 @@ from jumper_warp.cli.main import parse
 class ExportCfg:
     """Save the policy of a training run as a folder, or a policy as one ONNX file."""
 
-    source: tyro.conf.Positional[str]
-    """Folder of a run, checkpoint, or name or folder of a policy."""
+    source: tyro.conf.Positional[str]  # Folder of a run, checkpoint, or name or folder of a policy
     out: Path | None = None
     """File name that ends in .onnx, or folder of the new policy (default: policy/ in the run, or <task>.onnx)."""
-    newest: bool = False
-    """Export the newest checkpoint of a run, not the best."""
-    overwrite: bool = False
-    """Replace an existing policy with its metrics and README."""
+    newest: bool = False  # Export the newest checkpoint of a run, not the best
+    overwrite: bool = False  # Replace an existing policy with its metrics and README
     blend: tuple[str, float] | None = None
     """Name or folder of a second policy, and its fraction, 0 to 1, in the weighted mean of both networks."""
 

@@ -15,10 +15,8 @@ from typing import Any
 
 from jumper_warp.utils.errors import InputError
 
-USAGE_ERROR = 2
-"""Exit code for input that cannot be used."""
-INTERRUPTED = 130
-"""Exit code after Ctrl-C."""
+USAGE_ERROR = 2  # Exit code for input that cannot be used
+INTERRUPTED = 130  # Exit code after Ctrl-C
 COMMANDS = {
     "train": "Train a policy: jumper train TASK.",
     "finetune": "Make a jumping policy miss by less, by gradients through the physics.",

@@ -35,69 +35,45 @@ jumper sysid DATA --help shows the flags, and so do excite --help and actuator -
 class SysidCfg:
     """Identify parameters of the robot from recorded motions: writes identified.json, report.html and report.json."""
 
-    data: Annotated[tuple[Path, ...], tyro.conf.Positional]
-    """Files of recorded motions, or folders of them."""
-    params: str = "motors,masses,friction,latency,offsets"
-    """Groups of parameters to identify, separated by commas."""
-    exclude: str = ""
-    """Parameters, or groups of them, that keep their described values, separated by commas."""
+    data: Annotated[tuple[Path, ...], tyro.conf.Positional]  # Files of recorded motions, or folders of them
+    params: str = "motors,masses,friction,latency,offsets"  # Groups of parameters to identify, separated by commas
+    exclude: str = ""  # Parameters, or groups of them, that keep their described values, separated by commas
     mass: float | None = None
     """[kg] Mass of the whole robot on a scale: without it or torques, masses and gains share a factor. `excite` prints
     the mass of the robot that it records."""
-    mass_std: float = 0.02
-    """[kg] Standard deviation of the scale."""
-    dt: float | None = None
-    """[s] Largest physics step (default: 1/480)."""
-    method: Literal["lm", "cma"] = "lm"
-    """Staged Levenberg-Marquardt over parallel worlds, or CMA-ES."""
-    max_seconds: float = 60.0
-    """[s] Time limit of CMA-ES."""
-    noise: NoiseLevels = field(default_factory=NoiseLevels)
-    """Noise of the sensors, standard deviations."""
+    mass_std: float = 0.02  # [kg] Standard deviation of the scale
+    dt: float | None = None  # [s] Largest physics step (default: 1/480)
+    method: Literal["lm", "cma"] = "lm"  # Staged Levenberg-Marquardt over parallel worlds, or CMA-ES
+    max_seconds: float = 60.0  # [s] Time limit of CMA-ES
+    noise: NoiseLevels = field(default_factory=NoiseLevels)  # Noise of the sensors, standard deviations
     base: Literal["", "free", "fixed"] = ""
     """Whether the base was free or fixed in all motions (default: as their files say)."""
     gain_preset: Literal["", "jumping", "walking"] = ""
     """Preset of gains that the controllers were set to (default: as the files say, else jumping)."""
     torque_limit: float = 0.0
     """[N m] Torque limit that the controllers were set to (default: as the files say, else 18)."""
-    torque_constant: float = 0.0
-    """[N m/A] Torque at the joint over current, for files with currents."""
-    out: Path | None = None
-    """Folder for the results (default: outputs/sysid/<time>)."""
-    device: str | None = None
-    """Warp device."""
-    threads: int | None = None
-    """CPU threads (default: all cores)."""
+    torque_constant: float = 0.0  # [N m/A] Torque at the joint over current, for files with currents
+    out: Path | None = None  # Folder for the results (default: outputs/sysid/<time>)
+    device: str | None = None  # Warp device
+    threads: int | None = None  # CPU threads (default: all cores)
 
 
 @dataclass(frozen=True)
 class ExciteCfg:
     """Plan safe, informative motions, record them on a simulated robot, and write them as npz."""
 
-    params: str = "motors,masses,friction,latency,offsets"
-    """Groups of parameters that the motions are to identify."""
-    num_candidates: int = 4
-    """Number of random motions of each kind, of which the most informative one is taken."""
-    seconds: float = 1.25
-    """[s] Length of each motion."""
-    num_sets: int = 1
-    """Number of sets to plan, each of two hung chirps, a standing chirp and a small jump."""
-    solver: Literal["jumper", "mujoco"] = "jumper"
-    """Physics solver of the robot that is recorded."""
-    robot: Path | None = None
-    """Overlay of the robot that is recorded (default: as described)."""
-    noise: NoiseLevels = field(default_factory=NoiseLevels)
-    """Noise of the sensors, standard deviations."""
-    no_noise: tyro.conf.FlagCreatePairsOff[bool] = False
-    """Record without noise."""
-    record_torque: bool = False
-    """Also record the motors' torques."""
-    seed: int = 0
-    """Seed of motions and noise."""
-    out: Path | None = None
-    """Folder for the motions and excite.json (default: outputs/excite/<time>)."""
-    threads: int | None = None
-    """CPU threads (default: all cores)."""
+    params: str = "motors,masses,friction,latency,offsets"  # Groups of parameters that the motions are to identify
+    num_candidates: int = 4  # Number of random motions of each kind, of which the most informative one is taken
+    seconds: float = 1.25  # [s] Length of each motion
+    num_sets: int = 1  # Number of sets to plan, each of two hung chirps, a standing chirp and a small jump
+    solver: Literal["jumper", "mujoco"] = "jumper"  # Physics solver of the robot that is recorded
+    robot: Path | None = None  # Overlay of the robot that is recorded (default: as described)
+    noise: NoiseLevels = field(default_factory=NoiseLevels)  # Noise of the sensors, standard deviations
+    no_noise: tyro.conf.FlagCreatePairsOff[bool] = False  # Record without noise
+    record_torque: bool = False  # Also record the motors' torques
+    seed: int = 0  # Seed of motions and noise
+    out: Path | None = None  # Folder for the motions and excite.json (default: outputs/excite/<time>)
+    threads: int | None = None  # CPU threads (default: all cores)
 
     def __post_init__(self) -> None:
         """Raises InputError: a number is out of range."""
@@ -112,12 +88,9 @@ class ActuatorCfg:
 
     bench: Annotated[Path, tyro.conf.Positional]
     """CSV file with columns test, time [s], command [N m], speed [rad/s], torque [N m]; see docs/identification.md."""
-    motor: Literal["lateral", "transversal"] = "transversal"
-    """Kind of motor; its described constants are the prior."""
-    torque_noise: float = 0.1
-    """[N m] Noise of the bench's torque sensor, standard deviation."""
-    out: Path | None = None
-    """Folder for the results (default: outputs/actuator/<time>)."""
+    motor: Literal["lateral", "transversal"] = "transversal"  # Kind of motor; its described constants are the prior
+    torque_noise: float = 0.1  # [N m] Noise of the bench's torque sensor, standard deviation
+    out: Path | None = None  # Folder for the results (default: outputs/actuator/<time>)
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:

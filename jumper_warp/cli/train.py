@@ -37,21 +37,17 @@ class TrainArgs:
     """Train a policy on a task."""
 
     cfg: Annotated[TrainCfg, tyro.conf.arg(name="")] = field(default_factory=TrainCfg)
-    solver: Literal["jumper", "mujoco"] = "jumper"
-    """Physics: the dedicated solver, or Newton's SolverMuJoCo."""
+    solver: Literal["jumper", "mujoco"] = "jumper"  # Physics: the dedicated solver, or Newton's SolverMuJoCo
     randomize: bool = True
     """Randomise masses, friction, motors, latency and pushes for each world; ranges are under --env.randomization."""
-    noise: bool = True
-    """Add noise to observations."""
+    noise: bool = True  # Add noise to observations
     history: int | None = None
     """Policy steps of velocities, gravity, angles and actions in the observation (default: the task's). With 1 it has
     a third of the size, learns faster on few worlds, and is enough without randomisation and noise."""
     robot: Path | None = None
     """Robot overlay, as `jumper sysid` writes it; its randomisation ranges override the task's, flags override both."""
-    robot_of_run: Annotated[Any, tyro.conf.Suppress] = None
-    """Robot overlay of the run that is resumed."""
-    checkpoint: Annotated[Any, tyro.conf.Suppress] = None
-    """Checkpoint that is resumed."""
+    robot_of_run: Annotated[Any, tyro.conf.Suppress] = None  # Robot overlay of the run that is resumed
+    checkpoint: Annotated[Any, tyro.conf.Suppress] = None  # Checkpoint that is resumed
 
 
 def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:

@@ -21,12 +21,9 @@ BUILD_BYTES: dict[SolverName, int] = {"jumper": 70_000, "mujoco": 112_000}
 """[byte] Main memory for each world while the environment is built (`experiments/measure_memory.py`)."""
 ENV_BYTES: dict[SolverName, int] = {"jumper": 25_750, "mujoco": 71_400}
 """[byte] Device memory of the environment's arrays for each world, measured likewise."""
-FLOAT_BYTES = 4
-"""[byte] Size of a float32."""
-INDEX_BYTES = 8
-"""[byte] Size of a sample's index in the order of an epoch."""
-MAX_PADDING = 21
-"""Largest number of floats that pad a sample's row."""
+FLOAT_BYTES = 4  # [byte] Size of a float32
+INDEX_BYTES = 8  # [byte] Size of a sample's index in the order of an epoch
+MAX_PADDING = 21  # Largest number of floats that pad a sample's row
 
 
 class MemoryNeed(NamedTuple):

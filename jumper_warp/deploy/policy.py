@@ -16,10 +16,8 @@ import onnxruntime
 
 from jumper_warp.utils.errors import InputError
 
-COMMAND_BOUND = 4.0 * math.pi
-"""[rad] Motor targets are clipped to ± this before the filter."""
-LAST_ACTION = "last_action"
-"""Observation term that `DeployedPolicy` computes, so that readings must not contain it."""
+COMMAND_BOUND = 4.0 * math.pi  # [rad] Motor targets are clipped to ± this before the filter
+LAST_ACTION = "last_action"  # Observation term that `DeployedPolicy` computes, so that readings must not contain it
 
 
 class DeployedPolicy:

@@ -102,8 +102,7 @@ class ClosedLoop:
             robots.model, task.motors, task.command_filter, double=double, dt=robots.dt, substeps=robots.substeps
         )
         self.dtype = torch.float64 if double else torch.float32
-        self.randomizes = bool(task.params.slots["events"])
-        """Whether resets randomise the robots."""
+        self.randomizes = bool(task.params.slots["events"])  # Whether resets randomise the robots
         self.layout = task.layout("actor")
         self._columns = {
             group: [(term, *task.layout(group)[term.name]) for term in getattr(task.observations, group)]
@@ -114,8 +113,7 @@ class ClosedLoop:
         like = {"dtype": self.dtype, "device": env.device}
         self.scale = torch.tensor(4 * [lateral, transversal, transversal], **like)
         """(12,) [rad] Change of the motor targets by an action of 1."""
-        self.default = robots.default_angle.to(**like)
-        """(12,) [rad] Motor targets at a zero action."""
+        self.default = robots.default_angle.to(**like)  # (12,) [rad] Motor targets at a zero action
         self.read_parameters()
 
     def read_parameters(self) -> dict[str, torch.Tensor]:

@@ -39,8 +39,7 @@ from jumper_warp.utils.threads import checked_threads, run_in_parallel
 MAX_SWEEPS = 200  # largest number of sweeps of the contact iteration in a physics step
 TOLERANCE = 1.0e-6  # [m/s] of the contact iteration in single precision; gradients inherit its error
 TOLERANCE_DOUBLE = 1.0e-13  # [m/s] of the contact iteration in double precision
-LATENCY_RANGE = (0.0, 0.1)
-"""[s] Allowed values of `Rollout.parameters["latency"]`."""
+LATENCY_RANGE = (0.0, 0.1)  # [s] Allowed values of `Rollout.parameters["latency"]`
 GEOMETRY_NAMES = (
     "hip_x", "hip_y", "hip_z", "outer_x", "inner_x", "plane_y", "knee_y", "thigh", "shank", "paw_radius",
 )  # fmt: skip
@@ -61,16 +60,12 @@ class Trajectory:
     qd: wp.array
     """(K + 1, 18, num_worlds) Velocity of the base's centre of mass [m/s], its angular velocity [rad/s], world frame,
     motor rates [rad/s]."""
-    torque: wp.array
-    """(T S, 12, num_worlds) [N m] Motor torques in each physics step."""
-    impulse: wp.array
-    """(T S, 4, num_worlds) vec3 [N s] Contact impulses on the paws in each physics step, world frame."""
+    torque: wp.array  # (T S, 12, num_worlds) [N m] Motor torques in each physics step
+    impulse: wp.array  # (T S, 4, num_worlds) vec3 [N s] Contact impulses on the paws in each physics step, world frame
     pressed: wp.array
     """(T S, 4, num_worlds) Bit sets of each leg's pressed hard stops, see `jumper_warp.kernels.actuation.stops`."""
-    filtered_target: wp.array
-    """(T, 12, num_worlds) [rad] Targets after the command filter."""
-    commands: Any
-    """The kernels' `Commands` of the rollout."""
+    filtered_target: wp.array  # (T, 12, num_worlds) [rad] Targets after the command filter
+    commands: Any  # The kernels' `Commands` of the rollout
     from_start: bool = False
     """True: `initial_target` was left out, so that the gradient by q includes the gradient by initial_target."""
 
@@ -131,8 +126,7 @@ class Rollout:
         tolerance = tolerance or (TOLERANCE_DOUBLE if double else TOLERANCE)
         self._new_settings = partial(self.dynamics.settings, dt, 1, MAX_SWEEPS, tolerance)
         self._actuation = self._make_actuation(motors or jumping_motors(), command_filter)
-        self.motors = self._actuation.motors
-        """The kernels' `MotorArrays`, whose arrays are among the parameters."""
+        self.motors = self._actuation.motors  # The kernels' `MotorArrays`, whose arrays are among the parameters
         self.parameters: dict[str, wp.array] = {
             "table": self.dynamics.robot.table,
             **{name: getattr(self._actuation.motors, name) for name in MOTOR_CONSTANTS},

@@ -46,14 +46,10 @@ class Step(NamedTuple):
 
     obs: dict[str, torch.Tensor]
     """(num_envs, columns) by group (`actor`, `critic`), for the next step; ended episodes are already reset."""
-    reward: torch.Tensor
-    """(num_envs,)"""
-    terminated: torch.Tensor
-    """(num_envs,) bool, whether the episode ended with failure."""
-    truncated: torch.Tensor
-    """(num_envs,) bool, whether it ended without failure (time limit or success)."""
-    extras: dict[str, Any]
-    """`final_obs`: as `obs`, before resets; `time_outs`: `truncated` as float, (num_envs,)."""
+    reward: torch.Tensor  # (num_envs,)
+    terminated: torch.Tensor  # (num_envs,) bool, whether the episode ended with failure
+    truncated: torch.Tensor  # (num_envs,) bool, whether it ended without failure (time limit or success)
+    extras: dict[str, Any]  # `final_obs`: as `obs`, before resets; `time_outs`: `truncated` as float, (num_envs,)
 
 
 class Env(Stages):

@@ -16,8 +16,7 @@ from jumper_warp.envs.vec_env import RAW_LIMIT, sanitise
 from jumper_warp.utils.checks import MOST_SEED
 from jumper_warp.utils.errors import InputError
 
-Obs = Any
-"""Observations of all worlds: an array (num_envs, columns), or a dict of them by group."""
+Obs = Any  # Observations of all worlds: an array (num_envs, columns), or a dict of them by group
 
 
 class GymVectorEnv(gymnasium.vector.VectorEnv):

@@ -32,10 +32,8 @@ from jumper_warp.sim.slices import WorldRange
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.utils.kernels import Kernel
 
-BLOCK = 32
-"""Default threads of a block; small, to spread a few thousand heavy threads over all multiprocessors."""
-BLOCKS = {"reset": 128, "event": 256}
-"""Threads of a block of task kernels, by name, where it is not BLOCK."""
+BLOCK = 32  # Default threads of a block; small, to spread a few thousand heavy threads over all multiprocessors
+BLOCKS = {"reset": 128, "event": 256}  # Threads of a block of task kernels, by name, where it is not BLOCK
 POSTPROCESS_BLOCK = 256
 EVENT_BLOCKS = 264
 """Largest number of blocks of event kernels: most threads are idle, and a new block costs more than another turn."""
@@ -46,8 +44,7 @@ class WorldSlice(NamedTuple):
 
     first: int
     count: int
-    episode: Any
-    """The kernels' `EpisodeArrays` that begin at `first`."""
+    episode: Any  # The kernels' `EpisodeArrays` that begin at `first`
 
 
 class Stages:
@@ -60,10 +57,8 @@ class Stages:
     step_dt: float
     wp_device: wp.Device
     auto_reset: bool
-    _started: bool
-    """Whether `reset` or `evaluation_reset` has begun the first episodes."""
-    _ends_episodes: bool
-    """Whether ended episodes are reset; false after `evaluation_reset`."""
+    _started: bool  # Whether `reset` or `evaluation_reset` has begun the first episodes
+    _ends_episodes: bool  # Whether ended episodes are reset; false after `evaluation_reset`
 
     def _allocate(self, tasks: Sequence[TaskCfg], skill: np.ndarray | int, handovers: Sequence[Handover]) -> None:
         """Allocate all arrays and make all kernels; skill: index of each world's first task, (num_envs,) or one."""

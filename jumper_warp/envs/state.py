@@ -25,10 +25,8 @@ CONSTANT = ("gravity", "default_angle", "paw_shapes")
 """Arrays of the kernels' structs that are not saved because they never change, like those named `nominal_*`."""
 MOTORS = ("kp", "kd", "saturation", "peak", "no_load_speed", "cutoff_speed", "offset")
 """Saved arrays of the simulation's motors."""
-FINGERPRINT = "nominal"
-"""Key of the nominal parameters' fingerprint."""
-SEED = "seed"
-"""Key of the seed."""
+FINGERPRINT = "nominal"  # Key of the nominal parameters' fingerprint
+SEED = "seed"  # Key of the seed
 
 
 def save_state(env: Stages) -> dict[str, torch.Tensor]:

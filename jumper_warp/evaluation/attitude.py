@@ -179,14 +179,10 @@ def axis_metrics(turns: AttitudeLog) -> Metrics:
 class AttitudeFlags:
     """Turns about the body's axes, each way, from rest in the default pose."""
 
-    num_turns: int = 60
-    """Number of turns."""
-    angle: float = 90.0
-    """[deg] Angle of every turn."""
-    tolerance: float = 5.0
-    """[deg] Error up to which a robot is at its goal."""
-    seconds: float = 5.0
-    """[s] Length of every turn's episode."""
+    num_turns: int = 60  # Number of turns
+    angle: float = 90.0  # [deg] Angle of every turn
+    tolerance: float = 5.0  # [deg] Error up to which a robot is at its goal
+    seconds: float = 5.0  # [s] Length of every turn's episode
 
     def __post_init__(self) -> None:
         if self.num_turns < len(DIRECTIONS):
@@ -209,8 +205,7 @@ class AttitudeFlags:
 class AttitudePlayFlags:
     """Turns that are recorded, about the body's axes, each way."""
 
-    angle: float = 90.0
-    """[deg] Angle of every turn."""
+    angle: float = 90.0  # [deg] Angle of every turn
 
     length = 4.0  # [s] Length of the recording
 

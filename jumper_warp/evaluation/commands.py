@@ -39,8 +39,7 @@ class EvaluateCfg(Generic[Flags]):
     """Conditions of the evaluation."""
     out: Path | None = None
     """Folder for metrics.json and a CSV file with one row for each trial (default: outputs/evaluate/<time>)."""
-    save_to_policy: bool = False
-    """Also save the metrics into the policy's folder."""
+    save_to_policy: bool = False  # Also save the metrics into the policy's folder
 
 
 def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
@@ -91,8 +90,7 @@ class RecordingCfg:
 
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
     """What the policies are tried in."""
-    out: Path | None = None
-    """Folder for the recording, metrics.json and plots (default: outputs/play/<time>)."""
+    out: Path | None = None  # Folder for the recording, metrics.json and plots (default: outputs/play/<time>)
     viewer: Literal["none", "rerun"] = "none"
     """Open the recording in Rerun's viewer, which then listens on this machine's loopback address only."""
 
@@ -138,10 +136,8 @@ class ScriptCfg(RecordingCfg):
     assets/scripts/walk_jump_walk.json.
     """
 
-    script: Path
-    """File with the commands."""
-    policies: Annotated[SkillNames, tyro.conf.arg(name="")] = field(default_factory=SkillNames)
-    """Who carries them out."""
+    script: Path  # File with the commands
+    policies: Annotated[SkillNames, tyro.conf.arg(name="")] = field(default_factory=SkillNames)  # Who carries them out
 
 
 def play_script(cfg: ScriptCfg) -> Path:

@@ -35,10 +35,7 @@ BLOCK = BlockCfg(center=(1.0e3, 1.0e3), half=(0.55, 0.55), height=0.05, mass=10.
 """Block to jump onto: initially 1 km away on both axes, moved under the goal when the jump skill takes over."""
 SQUAT_TIME = 0.5  # [s] Time from the jump skill's takeover, when it squats, to its command
 MAX_ACCELERATION = 1.25  # [m/s^2], [rad/s^2] Rate at which commanded velocities change
-NUDGE_AFTER, NUDGE_TIME = (
-    2.0,
-    0.5,
-)  # [s] Period at which a robot that waits for its jump walks a few steps; its time
+NUDGE_AFTER, NUDGE_TIME = (2.0, 0.5)  # [s] Period at which a robot that waits for its jump walks a few steps; its time
 NUDGE = (0.25, 0.0, 0.0)  # [m/s], [rad/s] Commanded velocity of these steps
 JUMP_TIMEOUT = 15.0  # [s] Time after its request at which an unfinished jump has failed
 STUCK, DONE = len(FALLS), len(FALLS) + 1  # Indices in OUTCOMES; smaller ones are falls

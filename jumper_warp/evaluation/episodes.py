@@ -132,12 +132,9 @@ def tile_command(command: tuple[float, ...], count: int, task: TaskCfg) -> np.nd
 class EpisodeFlags:
     """Episodes from standing still."""
 
-    num_episodes: int = 200
-    """Number of episodes."""
-    command: tuple[float, ...] = ()
-    """Up to four values of the task's command; omitted ones are 0."""
-    seconds: float = 10.0
-    """[s] Largest length of an episode."""
+    num_episodes: int = 200  # Number of episodes
+    command: tuple[float, ...] = ()  # Up to four values of the task's command; omitted ones are 0
+    seconds: float = 10.0  # [s] Largest length of an episode
 
     def __post_init__(self) -> None:
         check_episodes(self.num_episodes, self.command, self.seconds)
@@ -155,8 +152,7 @@ class EpisodeFlags:
 class EpisodePlayFlags:
     """An episode that is recorded."""
 
-    command: tuple[float, ...] = ()
-    """Up to four values of the task's command; omitted ones are 0."""
+    command: tuple[float, ...] = ()  # Up to four values of the task's command; omitted ones are 0
 
     length = 10.0  # [s] Length of the recording
 

@@ -39,11 +39,7 @@ FALLS = ("low_base", "tilted")
 WRONG_HEIGHT = "wrong_height"  # Outcome of a jump that landed from another apex height than commanded
 DRIFT, TURN = 0.2, 25.0  # [m], [deg] Drift and turn of the base beyond which the authors' configuration ends an episode
 MAX_ROBOTS = 64  # Maximum number of robots in one recording
-LOWEST, HIGHEST, ABOVE = (
-    -0.37,
-    1.47,
-    0.45,
-)  # [m] Lower, upper edge of a filmstrip at the robot; margin above the apex
+LOWEST, HIGHEST, ABOVE = (-0.37, 1.47, 0.45)  # [m] Lower, upper edge of a filmstrip at the robot; margin above the apex
 SHOWN_HEIGHT = 1.0  # [m] The filmstrip shows the jump whose commanded height is nearest to this
 
 
@@ -202,8 +198,7 @@ class HeightFlags(JumpFlags):
     """Jumps to evenly spaced heights."""
 
     success_range: tuple[float, float] = field(default=(0.5, 1.1), kw_only=True)
-    height_range: tuple[float, float] = (0.5, 1.2)
-    """[m] Lowest and highest commanded base height."""
+    height_range: tuple[float, float] = (0.5, 1.2)  # [m] Lowest and highest commanded base height
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -223,10 +218,8 @@ class HeightFlags(JumpFlags):
 class HeightPlayFlags:
     """Jumps to heights that are recorded."""
 
-    height: tuple[float, ...] = (0.6, 0.9, 1.1)
-    """[m] Commanded base heights, one robot each."""
-    length: tyro.conf.Suppress[float] = 3.5
-    """[s] Length of the recording, unless `jumper play --seconds` sets it."""
+    height: tuple[float, ...] = (0.6, 0.9, 1.1)  # [m] Commanded base heights, one robot each
+    length: tyro.conf.Suppress[float] = 3.5  # [s] Length of the recording, unless `jumper play --seconds` sets it
 
     def __post_init__(self) -> None:
         if not 1 <= len(self.height) <= MAX_ROBOTS or not all(0.0 < height < 10.0 for height in self.height):

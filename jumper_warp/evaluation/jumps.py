@@ -236,8 +236,7 @@ def stance_metrics(jumps: JumpLog) -> Metrics:
 class JumpFlags:
     """Jumps from standing still."""
 
-    num_jumps: int = 200
-    """Number of jumps."""
+    num_jumps: int = 200  # Number of jumps
     success_range: tuple[float, float] = field(default=(0.3, 1.4), kw_only=True)
     """[m] Smallest and largest distance or height counted by `success_rate_in_range`."""
 

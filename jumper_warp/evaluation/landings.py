@@ -207,8 +207,7 @@ class LandingFlags(JumpFlags):
     """[m] Smallest and largest distance of the goal ahead; goals are evenly spaced."""
     goal_y: tuple[float, float] = (0.0, 0.0)
     """[m] Smallest and largest distance of the goal to the left; goals are sampled."""
-    heading: Literal["any"] | float = "any"
-    """[deg] Heading of all robots, or any: sampled from the full circle."""
+    heading: Literal["any"] | float = "any"  # [deg] Heading of all robots, or any: sampled from the full circle
 
     def __post_init__(self) -> None:
         super().__post_init__()

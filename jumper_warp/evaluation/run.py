@@ -36,8 +36,7 @@ from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.threads import checked_threads
 
-HEIGHTS = ("apex_height", "apex_height_mars")
-"""Keys of `EVALUATIONS` of policies that jump to a commanded height."""
+HEIGHTS = ("apex_height", "apex_height_mars")  # Keys of `EVALUATIONS` of policies that jump to a commanded height
 PLACES = ("landing_position", "omnidirectional", "landing_position_mars")
 """Keys of `EVALUATIONS` of policies that jump to a commanded landing position."""
 SOLVER_TITLES = {"jumper": "SolverJumper", "mujoco": "SolverMuJoCo"}  # By value of `Conditions.solver`
@@ -49,12 +48,9 @@ class EvaluationArgs(Conditions):
     """Flags of every experiment that evaluates a policy; randomised robots have observation noise too."""
 
     noise: tyro.conf.Suppress[tyro.conf.Fixed[bool]] = False
-    policy: str = "horizontal_jump"
-    """Name or folder of a policy, a run's folder, or a checkpoint."""
-    num_recorded: int = 1
-    """Number of jumps to record for the Rerun viewer and, one of them, as a filmstrip; 0: none."""
-    out: Path | None = None
-    """Folder for figures, plots, recordings and filmstrips (default: outputs/<name>/<time>)."""
+    policy: str = "horizontal_jump"  # Name or folder of a policy, a run's folder, or a checkpoint
+    num_recorded: int = 1  # Number of jumps to record for the Rerun viewer and, one of them, as a filmstrip; 0: none
+    out: Path | None = None  # Folder for figures, plots, recordings and filmstrips (default: outputs/<name>/<time>)
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -63,10 +63,8 @@ class Grid(Suite):
     """
 
     num_jumps: int = 2
-    columns: int = 22
-    """Number of distances ahead."""
-    rows: int = 5
-    """Number of distances to the side."""
+    columns: int = 22  # Number of distances ahead
+    rows: int = 5  # Number of distances to the side
 
     name: ClassVar = "grid"
     paper: ClassVar = {"mean_error_m": 0.025, "success_rate": 0.968, "success_rate_in_range": 1.0}
@@ -94,8 +92,7 @@ class Ring(Suite):
     """Jumps to goals spread evenly over a ring around the start."""
 
     policy: str = "omnidirectional_jump"
-    radius: float = 0.5
-    """[m] Radius of the ring."""
+    radius: float = 0.5  # [m] Radius of the ring
 
     name: ClassVar = "ring"
     least: ClassVar = (len(SECTORS), 0.1)
@@ -131,12 +128,9 @@ class Consecutive(Suite):
     includes all goals.
     """
 
-    num_jumps: int = 20
-    """Number of trials of each pair."""
-    num_trials: int = 100
-    """Number of trials with many jumps in a row."""
-    jumps_per_trial: int = 10
-    """Number of jumps in each of these trials."""
+    num_jumps: int = 20  # Number of trials of each pair
+    num_trials: int = 100  # Number of trials with many jumps in a row
+    jumps_per_trial: int = 10  # Number of jumps in each of these trials
 
     name: ClassVar = "consecutive"
     paper: ClassVar = {"mean_error_m": 0.0054}
@@ -252,12 +246,9 @@ class Farthest(Suite):
     """
 
     num_jumps: int = 100
-    min_distance: float = 1.0
-    """[m] Distance at the middle of the first bin."""
-    max_distance: float = 2.5
-    """[m] Distance at the middle of the last bin."""
-    direction: float = 0.0
-    """[deg] Direction of the goals from the robot: 0 ahead, 90 to the left, 180 back."""
+    min_distance: float = 1.0  # [m] Distance at the middle of the first bin
+    max_distance: float = 2.5  # [m] Distance at the middle of the last bin
+    direction: float = 0.0  # [deg] Direction of the goals from the robot: 0 ahead, 90 to the left, 180 back
 
     name: ClassVar = "max"
     paper: ClassVar = {"hop_free_distance_m": 1.25}

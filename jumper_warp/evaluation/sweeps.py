@@ -42,18 +42,13 @@ def check(condition: bool, message: str) -> None:
 class Suite(EvaluationArgs, ABC):
     """A test of jumping policies: its flags (also those of `EvaluationArgs`), runs and metrics."""
 
-    num_jumps: int = 200
-    """Number of jumps (where there are several scenes, bins or goals on a grid, of each)."""
-    rest_time: float = REST_TIME
-    """[s] Time from touchdown until a jump is over."""
+    num_jumps: int = 200  # Number of jumps (where there are several scenes, bins or goals on a grid, of each)
+    rest_time: float = REST_TIME  # [s] Time from touchdown until a jump is over
 
     name: ClassVar[str]  # Value of `jumper evaluate --suite`, and name of the output folder
-    evaluations: ClassVar[tuple[str, ...]] = PLACES
-    """Keys of `EVALUATIONS` of the policies that the suite accepts."""
-    paper: ClassVar[dict[str, float]] = {}
-    """Values in the paper of metrics with the same names."""
-    least: ClassVar[tuple[int, float]] = (1, 0.1)
-    """Minimum number of jumps and minimum rest [s]."""
+    evaluations: ClassVar[tuple[str, ...]] = PLACES  # Keys of `EVALUATIONS` of the policies that the suite accepts
+    paper: ClassVar[dict[str, float]] = {}  # Values in the paper of metrics with the same names
+    least: ClassVar[tuple[int, float]] = (1, 0.1)  # Minimum number of jumps and minimum rest [s]
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -111,8 +106,7 @@ class HeightSweep(Suite):
     """
 
     policy: str = "vertical_jump"
-    height_range: tuple[float, float] = (0.5, 1.2)
-    """[m] Lowest and highest commanded base height."""
+    height_range: tuple[float, float] = (0.5, 1.2)  # [m] Lowest and highest commanded base height
     num_recorded: int = 5
 
     name: ClassVar = "sweep"
@@ -164,10 +158,8 @@ class DistanceSweep(Suite):
     flight too.
     """
 
-    distance_range: tuple[float, float] = (0.3, 1.5)
-    """[m] Distance of the nearest and of the farthest goal."""
-    max_lateral_offset: float = 0.0
-    """[m] Largest offset of a goal to either side; offsets are sampled."""
+    distance_range: tuple[float, float] = (0.3, 1.5)  # [m] Distance of the nearest and of the farthest goal
+    max_lateral_offset: float = 0.0  # [m] Largest offset of a goal to either side; offsets are sampled
     end_at_second_takeoff: bool = False
     """A second takeoff after landing ends a jump, as a failure, as in the authors' configuration."""
     num_recorded: int = 5

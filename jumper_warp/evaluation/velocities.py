@@ -198,8 +198,7 @@ class VelocityFlags:
     """Number of commands along each of the three axes of the grid; one robot for each combination."""
     max_velocity: tuple[float, float, float] = (0.8, 0.8, 0.8)
     """[m/s], [m/s], [rad/s] Largest command ahead, to the left and about z; the grid goes from minus to plus this."""
-    seconds: float = 10.0
-    """[s] Length of each walk; the first second does not count for the error."""
+    seconds: float = 10.0  # [s] Length of each walk; the first second does not count for the error
 
     def __post_init__(self) -> None:
         check_velocity_settings(self.commands_per_axis**3, self.seconds, *self.max_velocity)
@@ -225,8 +224,7 @@ class VelocityPlayFlags:
         (0.8, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0), (0.6, 0.3, 0.6), (0.0, 0.0, 0.0),
     )  # fmt: skip
     """Commands if there are none; flags that are given several times would be added to a default."""
-    command_interval: float = 2.5
-    """[s] Time from one command to the next."""
+    command_interval: float = 2.5  # [s] Time from one command to the next
 
     def __post_init__(self) -> None:
         check_velocity_settings(1, self.length, *(value for command in self.velocity for value in command))

@@ -29,8 +29,7 @@ from jumper_warp.utils.errors import InputError
 
 COLUMNS = ("test", "time", "command", "speed", "torque")
 """Columns of a bench's CSV: test number, time [s], commanded torque [N m], output speed [rad/s] and torque [N m]."""
-STANDSTILL = 0.01
-"""[rad/s] Output speed below which friction falls linearly to zero, as in the simulation."""
+STANDSTILL = 0.01  # [rad/s] Output speed below which friction falls linearly to zero, as in the simulation
 PRIORS = {
     "saturation": (0.5, "N m"), "peak": (0.3, "N m"), "cutoff_speed": (0.3, "rad/s"), "no_load_speed": (0.3, "rad/s"),
     "fade_start": (0.2, "rad/s"), "fade_end": (0.2, "rad/s"), "friction": (1.5, "N m"), "latency": (2.0, "s"),
@@ -122,16 +121,11 @@ def bench_torque(constants: Mapping[str, float], bench: Bench) -> np.ndarray:
 class Actuator:
     """Identified constants of a motor."""
 
-    kind: str
-    """"lateral" or "transversal"."""
-    constants: Mapping[str, float]
-    """By the names and units of `PRIORS`."""
-    intervals: Mapping[str, tuple[float, float]]
-    """95 % intervals, wider where the law does not fit the data."""
-    open: tuple[str, ...]
-    """Names of the constants whose standard deviation is above half the prior's: not identified."""
-    chi2: float
-    """[1] Mean over rows of (torque error / torque noise)^2; 1 if the law fits to the noise."""
+    kind: str  # "lateral" or "transversal"
+    constants: Mapping[str, float]  # By the names and units of `PRIORS`
+    intervals: Mapping[str, tuple[float, float]]  # 95 % intervals, wider where the law does not fit the data
+    open: tuple[str, ...]  # Names of the constants whose standard deviation is above half the prior's: not identified
+    chi2: float  # [1] Mean over rows of (torque error / torque noise)^2; 1 if the law fits to the noise
 
     def rows(self) -> dict[str, tuple[float, float, float, str]]:
         """Return (value, low, high, unit) by name of the constant; low and high bound the 95 % interval."""

@@ -30,8 +30,7 @@ PIECES_DECREASE, STAGE_DECREASE = 0.1, 0.02
 """[1] Relative decrease of the cost below which the stage on pieces, and the stages on whole motions, end."""
 CONVERGED = 0.5
 """Decrease of the cost, in mean squared residuals, below which the last stage ends; 1 is one standard deviation."""
-GOOD_STEP = 0.3
-"""Actual over predicted decrease of the cost above which a step is good enough to reuse the Jacobian."""
+GOOD_STEP = 0.3  # Actual over predicted decrease of the cost above which a step is good enough to reuse the Jacobian
 HORIZONS = (0.4, 0.7, 1.0)
 """Fractions of a motion on the ground that are fitted in turn, as a paw's motion depends on all earlier contacts."""
 ATTEMPTS = 2  # largest number of passes over all motions
@@ -126,8 +125,7 @@ class Descent:
     def __init__(self, replay: MotionReplay):
         """Start the clocks at stage 0, with an empty log; replay: simulation whose physics steps are counted."""
         self.replay, self.steps, self.stage = replay, [], 0
-        self.shortfall = 0.0
-        """Predicted minus actual decrease of the cost in the last step."""
+        self.shortfall = 0.0  # Predicted minus actual decrease of the cost in the last step
         self._begin = (time.perf_counter(), time.process_time(), replay.world_steps)
 
     def effort(self) -> Effort:

@@ -13,17 +13,13 @@ from jumper_warp.robot.description import LEGS, RobotDescription, leg_dimensions
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.rotations import CONJUGATE, from_rotation_vector, multiply, rotate
 
-HANGING_HEIGHT = 1.0
-"""[m] Height of a held base whose position is not measured."""
-STEP = 1.0e-6
-"""[s] Time step, or [rad] angle step, of central differences of paw positions."""
-NORMAL_WEIGHT = 1.0e3
-"""[1] Weight of the paws' velocities normal to the ground against those along the ground."""
+HANGING_HEIGHT = 1.0  # [m] Height of a held base whose position is not measured
+STEP = 1.0e-6  # [s] Time step, or [rad] angle step, of central differences of paw positions
+NORMAL_WEIGHT = 1.0e3  # [1] Weight of the paws' velocities normal to the ground against those along the ground
 LEVELLING_STEPS = 6  # Newton steps after which all paws lie in one plane to rounding
 FIRST_ROWS = 8  # rows from which a motion's initial state is measured
 QUIET_ROWS = 2
-QUIET = 0.2
-"""[rad/s] Mean rate over the first `QUIET_ROWS` below which a standing robot has all paws on the ground."""
+QUIET = 0.2  # [rad/s] Mean rate over the first `QUIET_ROWS` below which a standing robot has all paws on the ground
 TRUST = 3.0
 """[1] Prior std of a measured initial state over the sensor's noise: large, as the same reading is also a residual."""
 
@@ -50,8 +46,7 @@ class InitialStatePrior:
     def __init__(self, motion: RecordedMotion, noise: NoiseLevels, description: RobotDescription):
         """Estimate the state of the first row, and its standard deviations, from the first rows and the stance."""
         self.free, self.description = motion.base == "free", description
-        self.size = 36 if self.free else 27
-        """Number I of coordinates."""
+        self.size = 36 if self.free else 27  # Number I of coordinates
         rows = min(FIRST_ROWS, len(motion.time))
         angle_noise, rate_noise = DEGREES * noise.angle, DEGREES * noise.rate
         angle, angle_std = first_values(motion.angle, motion.target[0], TRUST * angle_noise, 10.0 * DEGREES)

@@ -123,8 +123,7 @@ class LeastSquares:
         self.parameters, self.motions, self.replay = parameters, motions, replay
         self.prior_measurements, self.robust = prior_measurements, robust
         self._typical = math.inf
-        self.count = sum(int(motion.valid.sum()) for motion in motions)
-        """Number of measured values."""
+        self.count = sum(int(motion.valid.sum()) for motion in motions)  # Number of measured values
         self._low, self._high = parameters.bounds()
         self._change = [np.full(len(parameters) + motion.start_size, DIFFERENCE) for motion in motions]
 

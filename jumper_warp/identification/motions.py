@@ -45,16 +45,11 @@ EXAMPLE = (
 class NoiseLevels:
     """Standard deviations of the measurements."""
 
-    angle: float = 0.05
-    """[deg] Of motor angles."""
-    rate: float = 1.0
-    """[deg/s] Of motor rates."""
-    torque: float = 0.3
-    """[N m] Of motor torques."""
-    position: float = 5.0
-    """[mm] Of the base."""
-    orientation: float = 0.5
-    """[deg] Of the base."""
+    angle: float = 0.05  # [deg] Of motor angles
+    rate: float = 1.0  # [deg/s] Of motor rates
+    torque: float = 0.3  # [N m] Of motor torques
+    position: float = 5.0  # [mm] Of the base
+    orientation: float = 0.5  # [deg] Of the base
 
     def check(self) -> None:
         """Raise InputError: a level is not positive and finite."""
@@ -69,30 +64,21 @@ class RecordedMotion:
     The 12 motors are ordered by leg FL, FR, BL, BR, each lateral, outer, inner.
     """
 
-    name: str
-    """Name of the file without suffix."""
-    time: np.ndarray
-    """(n,) [s], rising."""
-    target: np.ndarray
-    """(n, 12) [rad] Sent to the motors (after the command filter), each held until the next row."""
-    angle: np.ndarray | None = None
-    """(n, 12) [rad] Readings of the motors' angle sensors, including their offsets."""
-    rate: np.ndarray | None = None
-    """(n, 12) [rad/s] Motor rates."""
+    name: str  # Name of the file without suffix
+    time: np.ndarray  # (n,) [s], rising
+    target: np.ndarray  # (n, 12) [rad] Sent to the motors (after the command filter), each held until the next row
+    angle: np.ndarray | None = None  # (n, 12) [rad] Readings of the motors' angle sensors, including their offsets
+    rate: np.ndarray | None = None  # (n, 12) [rad/s] Motor rates
     torque: np.ndarray | None = None
     """(n, 12) [N m] At the joints: measured, or current times torque constant times gear ratio."""
-    position: np.ndarray | None = None
-    """(n, 3) [m] Of the base link's origin, world frame, the ground at z = 0."""
-    quaternion: np.ndarray | None = None
-    """(n, 4) xyzw, base to world."""
+    position: np.ndarray | None = None  # (n, 3) [m] Of the base link's origin, world frame, the ground at z = 0
+    quaternion: np.ndarray | None = None  # (n, 4) xyzw, base to world
     base: Literal["free", "fixed"] = "free"
     """"free": the robot stands or jumps on the ground; "fixed": it hangs from a stand, paws in the air."""
     gains: Literal["jumping", "walking"] = "jumping"
     """Set of the robot description's motor gains that the controllers used."""
-    torque_limit: float = 18.0
-    """[N m] Limit on the controllers' torque."""
-    notes: Mapping[str, Any] = field(default_factory=dict)
-    """Free-form metadata, saved with the motion."""
+    torque_limit: float = 18.0  # [N m] Limit on the controllers' torque
+    notes: Mapping[str, Any] = field(default_factory=dict)  # Free-form metadata, saved with the motion
 
     def __post_init__(self) -> None:
         """Raise InputError: a channel of another shape, not finite, or out of range, or a bad setting."""

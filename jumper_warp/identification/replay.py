@@ -44,8 +44,7 @@ class MotionReplay:
     ):
         """Prepare; description: of the robot, by default the project's; threads: of the CPU."""
         self.description = load_description() if description is None else description
-        self.world_steps = 0
-        """Physics steps of all worlds so far."""
+        self.world_steps = 0  # Physics steps of all worlds so far
         self._device, self._threads = device, checked_threads(threads)
         self._rollouts: dict[tuple[int, float], tuple[Rollout, np.ndarray]] = {}
 

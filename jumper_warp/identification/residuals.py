@@ -27,8 +27,7 @@ depend on micrometres."""
 FAR_APART = math.radians(20.0)
 """[rad] Root mean square of angle minus target above which `check_signs` compares their signs."""
 PIECE = 0.25  # [s] length of the pieces that motions on the ground are first cut into
-DIFFERENCE = 1.0e-5
-"""Default step of finite differences by an unknown, in standard deviations of its prior."""
+DIFFERENCE = 1.0e-5  # Default step of finite differences by an unknown, in standard deviations of its prior
 FIXED_AT_REST = (24, 25, 29, 32, 33, 34)
 """Coordinates of a resting initial state that contact determines: roll, pitch, height, z velocity, roll, pitch rate."""
 

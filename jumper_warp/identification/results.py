@@ -15,8 +15,7 @@ from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.identification.uncertainty import Direction, mismatch_factor, systematic_std, weak_directions
 from jumper_warp.robot.values import RobotValues
 
-CONFIDENCE = 1.959964
-"""Standard deviations on either side of a 95 % interval."""
+CONFIDENCE = 1.959964  # Standard deviations on either side of a 95 % interval
 LARGEST_CHI2 = 10.0
 """χ² above which a warning is given; simulations with other physics but right base and units give 3 to 5."""
 LARGEST_PRIOR_ERROR = 3.0

@@ -16,8 +16,7 @@ TORQUE_SCALE = (
     "base_mass", "link_mass", "kp", "kd", "saturation", "armature", "motor_friction", "knee_damping",
 )  # fmt: skip
 """Quantities of `RobotValues` that may all grow by the same factor without any effect on motor angles."""
-MAX_LAGS = 200
-"""Largest lag [rows] of the summed autocorrelations."""
+MAX_LAGS = 200  # Largest lag [rows] of the summed autocorrelations
 ADVICE = {
     "no_load_speed": "no motor comes close to its no-load speed: add a fast motion, or measure torque against speed",
     "cutoff_speed": "no motor exceeds its cutoff speed at full torque: add a fast motion, or a test bench",

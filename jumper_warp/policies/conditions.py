@@ -22,8 +22,7 @@ from jumper_warp.utils.errors import InputError
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
 
-SHORTEST_LATENCY = 500.0 * PHYSICS_DT
-"""[ms] Half a physics step; a shorter latency would round to 0."""
+SHORTEST_LATENCY = 500.0 * PHYSICS_DT  # [ms] Half a physics step; a shorter latency would round to 0
 
 
 @dataclass(frozen=True)

@@ -28,19 +28,16 @@ from jumper_warp.utils.checks import version_error
 from jumper_warp.utils.files import json_bytes, write_atomically
 from jumper_warp.utils.runtime import source_versions
 
-POLICIES = ASSETS / "policies"
-"""Folder of the project's own policies."""
+POLICIES = ASSETS / "policies"  # Folder of the project's own policies
 FORMAT = "jumper-warp policy"
 SCHEMA_VERSION = 3
 MANIFEST = "manifest.json"
 CONFIG = "config.json"
 ONNX = "policy.onnx"
 README = "README.md"
-MAX_BYTES = 256 * 2**20
-"""Larger files are refused without reading."""
+MAX_BYTES = 256 * 2**20  # Larger files are refused without reading
 FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
-FILE_SUFFIXES = (".pt", ".pth", ".onnx", ".safetensors")
-"""Suffixes that a policy's folder may not have."""
+FILE_SUFFIXES = (".pt", ".pth", ".onnx", ".safetensors")  # Suffixes that a policy's folder may not have
 
 
 def save_policy(

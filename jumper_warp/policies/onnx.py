@@ -28,8 +28,7 @@ IR_VERSION = 9
 INPUT, OUTPUT = "obs", "actions"
 OPERATORS = {"elu": "Elu", "relu": "Relu", "tanh": "Tanh"}
 METADATA_VERSION = 2
-CONFIG_KEYS = ("commit", "dirty")
-"""Entries of a policy's configuration that are copied to the metadata."""
+CONFIG_KEYS = ("commit", "dirty")  # Entries of a policy's configuration that are copied to the metadata
 NORMALISER_TENSORS = {"mean": "normaliser.mean", "std": "normaliser.std"}
 """Names of the normaliser's tensors by initialiser."""
 LAYER_INITIALISER = re.compile(r"actor_(\d+)_(weight|bias|block)")

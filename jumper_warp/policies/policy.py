@@ -14,8 +14,7 @@ from jumper_warp.rl.networks import ACTIVATIONS, linear_layers
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.normalise import normalise
 
-MAX_OUTPUT = 1.0e38
-"""Bound of layer outputs, below the largest float32."""
+MAX_OUTPUT = 1.0e38  # Bound of layer outputs, below the largest float32
 
 
 class Policy(nn.Module):

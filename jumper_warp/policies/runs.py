@@ -25,8 +25,7 @@ CURVE = (
     "iteration", "Perf/elapsed_s", "Train/mean_return", "Train/mean_length", "Metrics/success", "Metrics/score",
 )  # fmt: skip
 """Columns of a saved learning curve."""
-CURVE_ROWS = 60
-"""Maximum number of its rows, evenly spaced."""
+CURVE_ROWS = 60  # Maximum number of its rows, evenly spaced
 
 
 def is_run(source: str | Path) -> bool:

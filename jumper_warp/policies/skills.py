@@ -18,20 +18,16 @@ from jumper_warp.utils.errors import InputError
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
 
-WALK, JUMP_UP, JUMP_TO = range(3)
-"""Indices of the skills: walking, jump to a height, jump to a position."""
+WALK, JUMP_UP, JUMP_TO = range(3)  # Indices of the skills: walking, jump to a height, jump to a position
 
 
 @dataclass(frozen=True)
 class SkillNames:
     """Name or folder of the policy of each skill."""
 
-    walk: str = "walking_flat"
-    """Follows commanded velocities."""
-    jump_up: str = "vertical_jump"
-    """Jumps to a commanded height."""
-    jump_to: str = "horizontal_jump"
-    """Jumps to a commanded position."""
+    walk: str = "walking_flat"  # Follows commanded velocities
+    jump_up: str = "vertical_jump"  # Jumps to a commanded height
+    jump_to: str = "horizontal_jump"  # Jumps to a commanded position
 
 
 class SkillPolicies:

@@ -11,8 +11,7 @@ from jumper_warp.rl.cfg import ACTIVATIONS
 from jumper_warp.utils.checks import NAME
 from jumper_warp.utils.errors import InputError
 
-MAX_HIDDEN = 64
-"""Largest number of hidden layers."""
+MAX_HIDDEN = 64  # Largest number of hidden layers
 FULL_TURN = 2.0 * math.pi
 JOINT_BOUNDS = {
     "action_scale": (-FULL_TURN, FULL_TURN),  # [rad]
@@ -29,8 +28,7 @@ SCALAR_BOUNDS = {
     "normalised_limit": (1.0e-3, 1.0e6),
 }
 """Lower and upper bound of the scalar fields."""
-LAYOUT_FIELDS = ("first", "end", "scale", "clip", "history")
-"""Fields of each term in an observation layout."""
+LAYOUT_FIELDS = ("first", "end", "scale", "clip", "history")  # Fields of each term in an observation layout
 
 
 class PolicyError(InputError):

@@ -10,10 +10,8 @@ from jumper_warp.utils.checks import check_finite, check_not_negative, check_pos
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import checked_threads
 
-ACTIVATIONS = ("elu", "relu", "tanh")
-"""Names of the activations of hidden layers."""
-LATEST, LATEST_OR_NEW = "latest", "latest-or-new"
-"""Values of `TrainCfg.resume` that are not paths."""
+ACTIVATIONS = ("elu", "relu", "tanh")  # Names of the activations of hidden layers
+LATEST, LATEST_OR_NEW = "latest", "latest-or-new"  # Values of `TrainCfg.resume` that are not paths
 
 
 @dataclass(frozen=True)

@@ -14,8 +14,7 @@ import torch
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_atomically
 
-MANIFEST = "manifest.json"
-"""File beside the checkpoints with SHA-256, iteration and score of each."""
+MANIFEST = "manifest.json"  # File beside the checkpoints with SHA-256, iteration and score of each
 REQUIRED = {"iteration": int, "ppo": dict, "env": dict, "rng": dict, "config": str}
 """Required keys of a checkpoint, and the types of their values."""
 DECODE_ERRORS = (LookupError, TypeError, ValueError, AttributeError, RuntimeError)

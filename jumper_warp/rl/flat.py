@@ -10,14 +10,10 @@ import torch
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.networks import ActorCritic, ActorTensors, Layers
 
-ALIGNMENT = 32
-"""Every parameter begins at a multiple of this many entries: 128 bytes, a GPU's cache line."""
-ROW_ALIGNMENT = 8
-"""Columns of an input layer's weight, and of its features, are zero-padded to a multiple of this."""
-BETAS = (0.9, 0.999)
-"""Decay rates of Adam's first and second moment per step (Kingma & Ba 2015)."""
-ADAM_EPS = 1.0e-8
-"""Added to the square root of Adam's second moment."""
+ALIGNMENT = 32  # Every parameter begins at a multiple of this many entries: 128 bytes, a GPU's cache line
+ROW_ALIGNMENT = 8  # Columns of an input layer's weight, and of its features, are zero-padded to a multiple of this
+BETAS = (0.9, 0.999)  # Decay rates of Adam's first and second moment per step (Kingma & Ba 2015)
+ADAM_EPS = 1.0e-8  # Added to the square root of Adam's second moment
 
 
 def aligned(count: int, to: int) -> int:

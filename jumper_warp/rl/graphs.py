@@ -11,8 +11,7 @@ import torch
 
 from jumper_warp.rl.distributed import all_ranks_agree, wait_for_ranks
 
-BACKEND = "inductor"
-"""Backend of torch.compile."""
+BACKEND = "inductor"  # Backend of torch.compile
 
 
 class Compiler:

@@ -18,8 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedCo
 from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
 from jumper_warp.utils.errors import InputError
 
-REWARDS = "Episode_Reward/"
-"""Part of the names of metrics that are means of reward terms."""
+REWARDS = "Episode_Reward/"  # Part of the names of metrics that are means of reward terms
 
 
 class Stopwatch:

@@ -9,8 +9,7 @@ from pathlib import Path
 
 from jumper_warp.utils.files import write_atomically
 
-METRICS_FILE = "metrics.jsonl"
-"""File in a run's folder, with one JSON object per logged iteration."""
+METRICS_FILE = "metrics.jsonl"  # File in a run's folder, with one JSON object per logged iteration
 
 
 class MetricsFile:
@@ -25,8 +24,7 @@ class MetricsFile:
         lines = content.splitlines()
         kept = [line for line in lines if _iteration_of(line) <= iteration]
         self.path = path
-        self.dropped = len(lines) - len(kept)
-        """Number of removed lines."""
+        self.dropped = len(lines) - len(kept)  # Number of removed lines
         valid_content = b"".join(line + b"\n" for line in kept)
         if valid_content != content:
             write_atomically(path, valid_content)

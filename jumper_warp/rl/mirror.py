@@ -21,8 +21,7 @@ from jumper_warp.utils.errors import InputError
 
 Weights = list[tuple[torch.Tensor, torch.Tensor]]
 """Weight (out, in) and bias (out,) of each layer of a network, first to last."""
-Vector = Sequence[float] | np.ndarray | torch.Tensor
-"""Numbers (n,) in any container."""
+Vector = Sequence[float] | np.ndarray | torch.Tensor  # Numbers (n,) in any container
 
 
 class MirrorMap(NamedTuple):

@@ -22,14 +22,10 @@ from jumper_warp.rl.distributed import all_reduce_mean, world_size
 from jumper_warp.rl.mirror import MirrorMap, Symmetry, Weights
 from jumper_warp.utils.normalise import normalise
 
-NORMALISED_LIMIT = 10.0
-"""Normalised observations are clipped to ± this many standard deviations."""
-VARIANCE_EPS = 1.0e-5
-"""Added to a variance before its square root is taken."""
-ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}
-"""Activation modules by `PpoCfg.activation`."""
-DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}
-"""Data type of the hidden layers, by `PpoCfg.precision`."""
+NORMALISED_LIMIT = 10.0  # Normalised observations are clipped to ± this many standard deviations
+VARIANCE_EPS = 1.0e-5  # Added to a variance before its square root is taken
+ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}  # Activation modules by `PpoCfg.activation`
+DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}  # Data type of the hidden layers, by `PpoCfg.precision`
 
 
 class Moments(NamedTuple):

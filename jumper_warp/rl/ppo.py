@@ -56,8 +56,7 @@ class StepStatistics(NamedTuple):
     skipped: torch.Tensor  # 1 if a gradient was not finite and was replaced by 0
 
 
-STATISTICS = StepStatistics._fields
-"""Names of the statistics that `Ppo.statistics` averages over minibatches."""
+STATISTICS = StepStatistics._fields  # Names of the statistics that `Ppo.statistics` averages over minibatches
 
 
 class Ppo:

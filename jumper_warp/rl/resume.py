@@ -26,12 +26,10 @@ if TYPE_CHECKING:
     from jumper_warp.rl.cfg import TrainCfg
     from jumper_warp.rl.distributed import Rank
 
-CHECKPOINTS = "checkpoints"
-"""Folder in a run's folder that holds its checkpoints."""
+CHECKPOINTS = "checkpoints"  # Folder in a run's folder that holds its checkpoints
 SESSION = ("device", "threads", "log_root", "resume", "init_policy", "tensorboard", "wandb")
 """Training settings that are not restored when a run is resumed."""
-DERIVED = ("interface", "num_envs", "seed")
-"""Entries of an environment's configuration that follow from other settings."""
+DERIVED = ("interface", "num_envs", "seed")  # Entries of an environment's configuration that follow from other settings
 
 
 def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:

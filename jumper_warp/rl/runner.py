@@ -34,14 +34,12 @@ from jumper_warp.utils.runtime import git_commit, versions
 from jumper_warp.utils.sources import source_checksums
 from jumper_warp.utils.threads import set_threads
 
-CONFIG = "config.json"
-"""File in a run's folder with all settings, versions and the commit."""
+CONFIG = "config.json"  # File in a run's folder with all settings, versions and the commit
 PERF = ("Perf/fps", "Perf/collect_s", "Perf/update_s", "Perf/elapsed_s")
 """Performance metrics: policy steps per second, rollout time [s], update time [s], training time [s]."""
 LEARNING = ("Loss/learning_rate", "Policy/mean_std", "Train/mean_return", "Train/mean_length")
 """Learning metrics besides the losses; Train/ only if an episode has ended."""
-INTERRUPTED = 130
-"""Exit code of a training that a signal stopped."""
+INTERRUPTED = 130  # Exit code of a training that a signal stopped
 MakeEnv = Callable[[int, int, torch.device], VecEnv]
 """Makes an environment from the number of worlds, the seed and the device."""
 AsRslRl = Callable[[VecEnv, int], Any]

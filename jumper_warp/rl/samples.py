@@ -15,8 +15,7 @@ from jumper_warp.rl.mirror import MirrorMap
 from jumper_warp.rl.networks import DTYPES, ActorCritic, Layers, Moments, Scaling, all_reduce_moments, gaussian_log_prob
 from jumper_warp.rl.rollout import RolloutBuffer
 
-CPU_CHUNK_SIZE = 4096
-"""Samples that a CPU processes at a time, so that intermediate tensors stay in its caches."""
+CPU_CHUNK_SIZE = 4096  # Samples that a CPU processes at a time, so that intermediate tensors stay in its caches
 
 
 class Batch(NamedTuple):
@@ -141,8 +140,7 @@ class BatchPacker:
         self.layout = RowLayout(rollout.obs.shape[2], rollout.critic_obs.shape[2], num_actions)
         self.rows = rollout.obs.new_zeros(steps * worlds, sum(self.layout.widths))
         """(steps · worlds, columns of `layout`), time-major."""
-        self.old_log_std = torch.zeros_like(rollout.log_std)
-        """(num_actions,) of the policy that acted."""
+        self.old_log_std = torch.zeros_like(rollout.log_std)  # (num_actions,) of the policy that acted
         self._chunk_size = CPU_CHUNK_SIZE if self.rows.device.type == "cpu" else None
         self._compute_values_and_gae, self._write_rows = compiler(compute_values_and_gae), compiler(write_rows)
 

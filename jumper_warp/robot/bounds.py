@@ -21,33 +21,25 @@ class Range(NamedTuple):
     unit: str  # for messages; "" if dimensionless
 
 
-LINK_MASS = Range(1.0e-3, 100.0, "kg")
-"""From a bracket to the trunk of a robot that carries a person."""
-PLACE = Range(-2.0, 2.0, "m")
-"""Coordinate of a point in its link's frame; no leg is longer."""
+LINK_MASS = Range(1.0e-3, 100.0, "kg")  # From a bracket to the trunk of a robot that carries a person
+PLACE = Range(-2.0, 2.0, "m")  # Coordinate of a point in its link's frame; no leg is longer
 LENGTH = Range(1.0e-3, 2.0, "m")
 """Thighs, shanks, distances of axes; below a millimetre the closed form of the leg loses precision."""
 PAW_RADIUS = Range(1.0e-3, 0.2, "m")
-SHAPE_SIZE = Range(1.0e-4, 2.0, "m")
-"""From the thickness of a decal to the length of a trunk."""
+SHAPE_SIZE = Range(1.0e-4, 2.0, "m")  # From the thickness of a decal to the length of a trunk
 SMALLEST_GYRATION = Range(1.0e-3, 2.0, "m")
 """Radius of gyration of the smallest moment of inertia: a steel wire of 4 mm has 1 mm."""
 GYRATION_OF_REACH = Range(0.1, 1.5, "of the link's reach")
 """Radius of gyration of the largest moment over the farthest distance of the link's joints and shapes from its centre
 of mass: 1 with all mass at the rim, 0.6 for a rod; more room for links whose shapes are left out."""
-STOP = Range(-2.0 * math.pi, 2.0 * math.pi, "rad")
-"""Hinges of a leg turn at most once."""
-JOINT_EFFORT = Range(0.1, 1.0e4, "N m")
-"""Any joint, also the passive ones, whose limit is only nominal."""
+STOP = Range(-2.0 * math.pi, 2.0 * math.pi, "rad")  # Hinges of a leg turn at most once
+JOINT_EFFORT = Range(0.1, 1.0e4, "N m")  # Any joint, also the passive ones, whose limit is only nominal
 JOINT_SPEED = Range(0.1, 1.0e4, "rad/s")
 PEAK_TORQUE = Range(0.1, 1.0e3, "N m")
-MOTOR_SPEED = Range(0.1, 1.0e3, "rad/s")
-"""At the output of the gear; 1000 rad/s are 9500 rpm."""
+MOTOR_SPEED = Range(0.1, 1.0e3, "rad/s")  # At the output of the gear; 1000 rad/s are 9500 rpm
 GEAR_RATIO = Range(1.0, 1.0e3, "")
-ROTOR_INERTIA = Range(1.0e-8, 1.0e-2, "kg m^2")
-"""From a rotor of a gram and 3 mm radius to one of 2 kg and 0.1 m."""
-ARMATURE = Range(1.0e-6, 1.0, "kg m^2")
-"""Behind the gear; 1 kg m^2 is ten times a whole stretched leg."""
+ROTOR_INERTIA = Range(1.0e-8, 1.0e-2, "kg m^2")  # From a rotor of a gram and 3 mm radius to one of 2 kg and 0.1 m
+ARMATURE = Range(1.0e-6, 1.0, "kg m^2")  # Behind the gear; 1 kg m^2 is ten times a whole stretched leg
 MOTOR_FRICTION = Range(0.0, 10.0, "N m")
 PROPORTIONAL_GAIN = Range(0.1, 1.0e4, "N m/rad")
 """Below, no motor moves a leg in time; above, it is nearly as hard as the stops."""

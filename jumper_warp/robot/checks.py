@@ -15,8 +15,7 @@ from jumper_warp.utils.errors import InputError
 
 TOLERANCE = 1.0e-6
 """[m, kg, rad] Largest deviation of a mirrored leg from the front left one, and of a leg from its planar form."""
-INERTIA_TOLERANCE = 1.0e-9
-"""[kg m^2] Largest deviation of mirrored moments of inertia."""
+INERTIA_TOLERANCE = 1.0e-9  # [kg m^2] Largest deviation of mirrored moments of inertia
 
 
 @dataclass(frozen=True)

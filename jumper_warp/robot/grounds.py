@@ -13,10 +13,8 @@ import numpy as np
 
 from jumper_warp.utils.errors import InputError
 
-SIZE = 4.0
-"""[m] Edge of the square, by default: a jump of 2 m from its middle ends on it."""
-CELL = 0.02
-"""[m] Distance between nodes, by default: less than a paw's radius of 0.025 m."""
+SIZE = 4.0  # [m] Edge of the square, by default: a jump of 2 m from its middle ends on it
+CELL = 0.02  # [m] Distance between nodes, by default: less than a paw's radius of 0.025 m
 
 
 @dataclass(frozen=True)

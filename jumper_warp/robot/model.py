@@ -24,18 +24,15 @@ from jumper_warp.utils.checks import check_count
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
 
-PHYSICS_DT = 1.0 / 480.0
-"""[s] Physics step that contacts and loops are tuned for."""
+PHYSICS_DT = 1.0 / 480.0  # [s] Physics step that contacts and loops are tuned for
 
 CONTACT_STIFFNESS = 56689.0
 CONTACT_DAMPING = 476.0
 """Contact `ke` [N/m] and `kd` [N s/m]: MuJoCo's solref becomes (2 / kd, kd / (2 sqrt(ke))), critically damped over two
 physics steps. Softer contacts cost jump height."""
 CONTACT_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)  # MuJoCo's solimp: dmin, dmax, width [m], midpoint, power
-GROUND_FRICTION = 1.0e-4
-"""[1] Nearly 0: a contact takes the larger of its two coefficients, so the paw's."""
-MAX_FRICTION = 10.0
-"""[1] Of the paws: ten times that of rubber on concrete."""
+GROUND_FRICTION = 1.0e-4  # [1] Nearly 0: a contact takes the larger of its two coefficients, so the paw's
+MAX_FRICTION = 10.0  # [1] Of the paws: ten times that of rubber on concrete
 GROUND_COLOR = (0.42, 0.46, 0.48)  # red, green, blue, 0 to 1
 LIMIT_STIFFNESS = CONTACT_STIFFNESS
 """[N m/rad] Stiffness of hard stops: plastic for SolverJumper, critically damped over two physics steps for MuJoCo."""
@@ -44,10 +41,8 @@ NO_EFFORT_LIMIT = 1.0e6
 """[N m] Effort limit of motor joints, never reached: motor models saturate torque. A knee's limit is its damping's."""
 KNEE_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (2, 4)]
 """Indices of a world's eight knees in its 38 `joint_qd`: outer, inner of each leg."""
-PAWS = tuple(f"{leg}_paw" for leg in LEGS)
-"""Labels of the paws' shapes, without the world's prefix."""
-PAW_GROUP = -1
-"""Collision group of the paws: they collide with the ground, but not with each other."""
+PAWS = tuple(f"{leg}_paw" for leg in LEGS)  # Labels of the paws' shapes, without the world's prefix
+PAW_GROUP = -1  # Collision group of the paws: they collide with the ground, but not with each other
 
 Extras = Callable[[newton.ModelBuilder], Any]
 """Adds sites and shapes to the builder of one robot, for every world; its result is ignored."""

@@ -12,8 +12,7 @@ import numpy as np
 
 from jumper_warp.utils.errors import InputError
 
-LEGS = ("FL", "FR", "BL", "BR")
-"""Legs in the order of every array: front left, front right, back left, back right."""
+LEGS = ("FL", "FR", "BL", "BR")  # Legs in the order of every array: front left, front right, back left, back right
 
 MOTOR_JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("lateral", "outer", "inner"))
 """The 12 motor joints in motor order: index 3 * leg + {0 lateral, 1 outer, 2 inner}."""
@@ -45,14 +44,10 @@ class TriangleMesh:
 class Shape:
     """A piece of geometry fixed to a link."""
 
-    kind: str
-    """"box", "cylinder", "sphere" or "mesh"."""
-    size: tuple[float, ...]
-    """[m] box: three full edges; cylinder (axis z): radius, length; sphere: radius; mesh: empty."""
-    position: np.ndarray
-    """[m] (3,), link frame."""
-    rotation: np.ndarray
-    """(4,) xyzw, shape to link frame."""
+    kind: str  # "box", "cylinder", "sphere" or "mesh"
+    size: tuple[float, ...]  # [m] box: three full edges; cylinder (axis z): radius, length; sphere: radius; mesh: empty
+    position: np.ndarray  # [m] (3,), link frame
+    rotation: np.ndarray  # (4,) xyzw, shape to link frame
     color: tuple[float, float, float] | None = None  # red, green, blue, 0 to 1
     mesh: TriangleMesh | None = None
 
@@ -62,12 +57,9 @@ class Link:
     """A rigid body."""
 
     name: str
-    mass: float
-    """[kg]"""
-    com: np.ndarray
-    """[m] (3,), link frame."""
-    inertia: np.ndarray
-    """[kg m^2] (3, 3), about the centre of mass, axes of the link frame."""
+    mass: float  # [kg]
+    com: np.ndarray  # [m] (3,), link frame
+    inertia: np.ndarray  # [kg m^2] (3, 3), about the centre of mass, axes of the link frame
     visuals: tuple[Shape, ...]
     collisions: tuple[Shape, ...]  # a paw, on the inner shank alone
 
@@ -79,10 +71,8 @@ class Joint:
     name: str
     parent: str  # name of the link
     child: str  # name of the link
-    origin: np.ndarray
-    """[m] (3,), parent link frame."""
-    axis: np.ndarray
-    """(3,) unit vector, parent link frame."""
+    origin: np.ndarray  # [m] (3,), parent link frame
+    axis: np.ndarray  # (3,) unit vector, parent link frame
     lower: float  # [rad] hard stop
     upper: float  # [rad] hard stop
     effort: float  # [N m] limit
@@ -96,10 +86,8 @@ class Loop:
     name: str
     parent: str  # name of the link
     child: str  # name of the link
-    parent_anchor: np.ndarray
-    """[m] (3,), parent link frame."""
-    child_anchor: np.ndarray
-    """[m] (3,), child link frame."""
+    parent_anchor: np.ndarray  # [m] (3,), parent link frame
+    child_anchor: np.ndarray  # [m] (3,), child link frame
 
 
 @dataclass(frozen=True)
@@ -116,16 +104,11 @@ class Motor:
 
     type: str  # name, as "AK70-10"
     gear_ratio: float  # [1] rotor speed over output speed
-    rotor_inertia: float
-    """[kg m^2], before the gear."""
-    peak_torque: float
-    """[N m]"""
-    cutoff_speed: float
-    """[rad/s] Speed up to which full torque is available."""
-    no_load_speed: float
-    """[rad/s] Speed at which the torque has fallen linearly to 0."""
-    coulomb_friction: float
-    """[N m]"""
+    rotor_inertia: float  # [kg m^2], before the gear
+    peak_torque: float  # [N m]
+    cutoff_speed: float  # [rad/s] Speed up to which full torque is available
+    no_load_speed: float  # [rad/s] Speed at which the torque has fallen linearly to 0
+    coulomb_friction: float  # [N m]
     jumping: Gains  # for the jump tasks
     walking: Gains  # for the velocity tasks
 

@@ -21,40 +21,24 @@ MOTOR_QUANTITIES = (
 class RobotValues:
     """Values of N robots: arrays (N, columns). Motors: legs FL, FR, BL, BR, each lateral, outer, inner."""
 
-    base_mass: np.ndarray
-    """(N, 1) [kg]"""
-    base_com: np.ndarray
-    """(N, 3) [m], base frame."""
+    base_mass: np.ndarray  # (N, 1) [kg]
+    base_com: np.ndarray  # (N, 3) [m], base frame
     base_inertia: np.ndarray
     """(N, 1) [1] Scales the described inertia about the centre of mass, besides the ratio of the base masses."""
-    link_mass: np.ndarray
-    """(N, 5) [1] Ratio to the described mass and inertia, one column per entry of `LINK_KINDS`."""
-    armature: np.ndarray
-    """(N, 12) [kg m^2]"""
-    motor_friction: np.ndarray
-    """(N, 12) [N m]"""
-    kp: np.ndarray
-    """(N, 12) [1] Ratio to the gain of the motion or task."""
-    kd: np.ndarray
-    """(N, 12) [1] Ratio to the gain of the motion or task."""
-    saturation: np.ndarray
-    """(N, 12) [1] Ratio to the torque limit of the motion or task."""
-    no_load_speed: np.ndarray
-    """(N, 12) [rad/s]"""
-    cutoff_speed: np.ndarray
-    """(N, 12) [rad/s]"""
-    offset: np.ndarray
-    """(N, 12) [rad] Position sensor's reading minus the true angle."""
-    knee_damping: np.ndarray
-    """(N, 1) [N m s/rad]"""
-    paw_friction: np.ndarray
-    """(N, 1) [1]"""
-    latency: np.ndarray
-    """(N, 1) [s] From a commanded target to its effect on the motor."""
-    spring_stiffness: np.ndarray
-    """(N, 1) [N/m] Stiffness of the spring between the two knees of each leg; 0: no spring."""
-    spring_length: np.ndarray
-    """(N, 1) [m] Rest length of these springs."""
+    link_mass: np.ndarray  # (N, 5) [1] Ratio to the described mass and inertia, one column per entry of `LINK_KINDS`
+    armature: np.ndarray  # (N, 12) [kg m^2]
+    motor_friction: np.ndarray  # (N, 12) [N m]
+    kp: np.ndarray  # (N, 12) [1] Ratio to the gain of the motion or task
+    kd: np.ndarray  # (N, 12) [1] Ratio to the gain of the motion or task
+    saturation: np.ndarray  # (N, 12) [1] Ratio to the torque limit of the motion or task
+    no_load_speed: np.ndarray  # (N, 12) [rad/s]
+    cutoff_speed: np.ndarray  # (N, 12) [rad/s]
+    offset: np.ndarray  # (N, 12) [rad] Position sensor's reading minus the true angle
+    knee_damping: np.ndarray  # (N, 1) [N m s/rad]
+    paw_friction: np.ndarray  # (N, 1) [1]
+    latency: np.ndarray  # (N, 1) [s] From a commanded target to its effect on the motor
+    spring_stiffness: np.ndarray  # (N, 1) [N/m] Stiffness of the spring between the two knees of each leg; 0: no spring
+    spring_length: np.ndarray  # (N, 1) [m] Rest length of these springs
 
     @classmethod
     def nominal(cls, count: int, description: RobotDescription | None = None) -> RobotValues:

@@ -37,23 +37,16 @@ RANDOMIZED_FLAGS = (
 class Physics(ABC):
     """A solver with motors for the worlds of a `Simulation`. Arrays are never reallocated; legs FL, FR, BL, BR."""
 
-    sliced: bool
-    """Whether `advance` supports a range of worlds."""
+    sliced: bool  # Whether `advance` supports a range of worlds
     solver: newton.solvers.SolverBase
-    dynamics: JumperDynamics
-    """Geometry, ground and friction ratio; SolverMuJoCo uses it for kinematics only."""
-    diverged: wp.array
-    """(num_worlds,) int, 1: the world diverged."""
+    dynamics: JumperDynamics  # Geometry, ground and friction ratio; SolverMuJoCo uses it for kinematics only
+    diverged: wp.array  # (num_worlds,) int, 1: the world diverged
     impulse: wp.array
     """(4, num_worlds) vec3 [N s] Paws' contact impulses, world frame, with which the next contact iteration starts."""
-    torque: wp.array
-    """(12, num_worlds) [N m] Motor torques of the last physics step, in motor order."""
-    paw_force: wp.array
-    """(4, num_worlds) vec3 [N] Ground forces on the paws in the last physics step, world frame."""
-    peak_force: wp.array
-    """(num_worlds,) [N] Largest total paw force in the last call of `advance`."""
-    peak_paw_force: wp.array
-    """(4, num_worlds) [N] Largest force on each paw in the last call of `advance`."""
+    torque: wp.array  # (12, num_worlds) [N m] Motor torques of the last physics step, in motor order
+    paw_force: wp.array  # (4, num_worlds) vec3 [N] Ground forces on the paws in the last physics step, world frame
+    peak_force: wp.array  # (num_worlds,) [N] Largest total paw force in the last call of `advance`
+    peak_paw_force: wp.array  # (4, num_worlds) [N] Largest force on each paw in the last call of `advance`
 
     def __init__(self, sim: Any) -> None:
         """Attach to a `Simulation`, whose model, state, control and motors are allocated."""

@@ -29,8 +29,7 @@ from jumper_warp.utils.threads import checked_threads
 if TYPE_CHECKING:
     import torch
 
-SUBSTEPS = 8
-"""Physics steps of 1/480 s in a policy step of 1/60 s."""
+SUBSTEPS = 8  # Physics steps of 1/480 s in a policy step of 1/60 s
 
 SolverName = Literal["jumper", "mujoco"]
 

@@ -31,10 +31,8 @@ from jumper_warp.sim.tape import DifferentiableStep
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Control, Model, State
 
-MAX_SWEEPS = 50
-"""Largest number of contact sweeps in a step."""
-TOLERANCE = 1.0e-5
-"""[m/s] The contact iteration ends when a sweep changes every contact velocity by at most this."""
+MAX_SWEEPS = 50  # Largest number of contact sweeps in a step
+TOLERANCE = 1.0e-5  # [m/s] The contact iteration ends when a sweep changes every contact velocity by at most this
 DIFFERENTIABLE_TOLERANCE = 1.0e-6
 """[m/s] Largest tolerance of steps with gradients, since gradients inherit the iteration's error."""
 
@@ -130,10 +128,8 @@ class SolverJumper(SolverBase):
         work = self.dynamics.work
         self.contact_force: wp.array = work.contact_force
         """Force of the ground on each paw (FL, FR, BL, BR) in the last step [N], world frame, (4, num_worlds) vec3."""
-        self.peak_force: wp.array = work.peak_force
-        """Largest total paw force of the last call [N], shape (num_worlds,)."""
-        self.torque: wp.array = work.torque
-        """Torque of each motor in the last step [N m], shape (12, num_worlds)."""
+        self.peak_force: wp.array = work.peak_force  # Largest total paw force of the last call [N], shape (num_worlds,)
+        self.torque: wp.array = work.torque  # Torque of each motor in the last step [N m], shape (12, num_worlds)
         self.residual: wp.array = work.residual
         """Largest velocity change [m/s] of the last contact sweep, worst step of the last call, (num_worlds,)."""
         self.sweeps: wp.array = work.sweeps

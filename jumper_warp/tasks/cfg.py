@@ -246,7 +246,6 @@ class Handover:
 
     source: TaskCfg
     target: TaskCfg
-    when: Function
-    """@wp.func (robot, state of source, requested: bool) -> bool, whether to switch in this step."""
+    when: Function  # @wp.func (robot, state of source, requested: bool) -> bool, whether to switch in this step
     begin: Function
     """@wp.func (robot, state of source) -> state of target; then `Command.set` if the request has a command."""

@@ -19,12 +19,9 @@ from jumper_warp.utils.kernels import Function
 class CommandValue:
     """One number of a command."""
 
-    name: str
-    """With its unit, as `x [m]`."""
-    least: float = -math.inf
-    """Smallest allowed number, in its unit."""
-    optional: bool = False
-    """Whether it may be omitted, which means 0; only trailing numbers may be."""
+    name: str  # With its unit, as `x [m]`
+    least: float = -math.inf  # Smallest allowed number, in its unit
+    optional: bool = False  # Whether it may be omitted, which means 0; only trailing numbers may be
 
 
 @dataclass(frozen=True)
@@ -32,8 +29,7 @@ class CommandLayout:
     """The one to four numbers of a task's command, in order."""
 
     values: tuple[CommandValue, ...]
-    nonzero: bool = False
-    """Whether at least one number must differ from 0."""
+    nonzero: bool = False  # Whether at least one number must differ from 0
 
     @property
     def counts(self) -> tuple[int, ...]:

@@ -21,10 +21,8 @@ from jumper_warp.utils.errors import InputError
 class Mirror(NamedTuple):
     """The mirror image of a vector x: `signs * x[order]`."""
 
-    order: np.ndarray
-    """(columns,) int, source column of each column."""
-    signs: np.ndarray
-    """(columns,) float32, 1 or -1."""
+    order: np.ndarray  # (columns,) int, source column of each column
+    signs: np.ndarray  # (columns,) float32, 1 or -1
 
 
 LEGS = (1, 0, 3, 2)  # indices of FL, FR, BL, BR with sides swapped: FR, FL, BR, BL

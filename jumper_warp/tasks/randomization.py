@@ -13,18 +13,14 @@ from jumper_warp.tasks.terms import EventTerm
 from jumper_warp.utils.checks import check_finite, check_probabilities
 from jumper_warp.utils.errors import InputError
 
-Range = tuple[float, float] | None
-"""(lower, upper), or None: off."""
-NOMINAL_FRICTION = 0.9
-"""[1] Friction coefficient of the paws where it is not randomised."""
+Range = tuple[float, float] | None  # (lower, upper), or None: off
+NOMINAL_FRICTION = 0.9  # [1] Friction coefficient of the paws where it is not randomised
 MEAN_FRICTION = 0.85
 """[1] Friction coefficient of the paws in nominal evaluations of policies trained with randomised friction."""
 LONGEST_LATENCY = 100.0
 """[ms] Capacity of the ring buffers of past targets and observations: 48 physics steps, six policy steps."""
-PUSH_INTERVAL = (0.2, 0.5)
-"""[s] Time from one sample of the push to the next (authors' configuration)."""
-PUSH_PROBABILITY = 0.25
-"""[1] Probability of a push in such an interval (authors' configuration)."""
+PUSH_INTERVAL = (0.2, 0.5)  # [s] Time from one sample of the push to the next (authors' configuration)
+PUSH_PROBABILITY = 0.25  # [1] Probability of a push in such an interval (authors' configuration)
 
 
 @cache

@@ -11,8 +11,7 @@ import warp as wp
 from jumper_warp.utils.checks import check_finite
 from jumper_warp.utils.errors import InputError
 
-Pair = tuple[float, float]
-"""(lower, upper) end of a range."""
+Pair = tuple[float, float]  # (lower, upper) end of a range
 
 
 def check_ranges(prefix: str, cfg: Any, skip: Collection[str] = (), not_negative: Collection[str] = ()) -> None:

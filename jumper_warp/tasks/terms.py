@@ -242,9 +242,7 @@ class Curriculum(Term):
 class StateMetric:
     """A metric of the training log, from a float field of all worlds' task states."""
 
-    name: str
-    """Key in the log, with its unit."""
-    field: str
-    """Field of the task's state. With `per`, worlds accumulate in it, and logging sets both fields to 0."""
+    name: str  # Key in the log, with its unit
+    field: str  # Field of the task's state. With `per`, worlds accumulate in it, and logging sets both fields to 0.
     per: str | None = None
     """Field whose sum over all worlds divides the sum of `field`; None: log the mean of `field` and keep it."""

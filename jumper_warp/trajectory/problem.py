@@ -34,14 +34,11 @@ CONTACT_FORCE = 0.1  # [N] force above which a paw is in contact
 class Knots:
     """Parametrisation of motor targets: actions within ±1 at knots, linear in between, the last held to the end."""
 
-    at: tuple[float, ...]
-    """Policy steps of the knots, rising from 0."""
-    steps: int
-    """Policy steps of the motion."""
+    at: tuple[float, ...]  # Policy steps of the knots, rising from 0
+    steps: int  # Policy steps of the motion
     scale: tuple[float, float] = (15.0, 90.0)
     """[deg] Change of the target by an action of 1: lateral motors, transversal motors."""
-    middle: tuple[float, float] = (0.0, 45.0)
-    """[deg] Target at an action of 0: lateral motors, transversal motors."""
+    middle: tuple[float, float] = (0.0, 45.0)  # [deg] Target at an action of 0: lateral motors, transversal motors
     symmetric: bool = True
     """True: left and right legs are equal and lateral motors at 0; False: all twelve motors are free."""
 
@@ -190,20 +187,14 @@ class Problem:
     constraints: Sequence[Term] = ()
     motors: MotorCfg = field(default_factory=jumping_motors)
     command_filter: FilterCfg | None = None
-    friction: float = 0.85
-    """[1] Friction coefficient of the paws."""
-    gravity: float = EARTH
-    """[m/s^2] Downward, positive."""
-    substeps: int = SUBSTEPS
-    """Physics steps in a policy step of 1/60 s; fewer are faster and coarser."""
-    double: bool = True
-    """Whether to compute in double precision."""
-    tolerance: float | None = 1.0e-9
-    """[m/s] Tolerance of the contact iteration."""
+    friction: float = 0.85  # [1] Friction coefficient of the paws
+    gravity: float = EARTH  # [m/s^2] Downward, positive
+    substeps: int = SUBSTEPS  # Physics steps in a policy step of 1/60 s; fewer are faster and coarser
+    double: bool = True  # Whether to compute in double precision
+    tolerance: float | None = 1.0e-9  # [m/s] Tolerance of the contact iteration
     device: Any = None
     threads: int | None = None
-    world_steps: int = field(default=0, init=False)
-    """Number of simulated policy steps so far, worlds times steps."""
+    world_steps: int = field(default=0, init=False)  # Number of simulated policy steps so far, worlds times steps
     reverse_steps: int = field(default=0, init=False)
     """Number of policy steps of reverse passes so far, worlds times steps."""
 

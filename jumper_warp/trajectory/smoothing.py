@@ -31,27 +31,18 @@ MAX_VIOLATION = 0.05  # [1] clip of the violations that raise multipliers
 class Stage:
     """Settings of one stage of a smoothed descent."""
 
-    keep: int
-    """Number of best starts that enter the stage."""
-    iterations: int
-    """Gradient steps of the stage."""
-    rate: float
-    """[1] Initial learning rate."""
-    noise: float
-    """[1] Initial standard deviation of the random displacements of actions."""
-    final_fraction: float = 0.0
-    """[1] Fraction of rate and noise at the end of the stage; they fall linearly."""
-    penalty: float = 20.0
-    """[1] Weight of squared violations of constraints."""
-    dual: float = 0.0
-    """[1] Rate at which violations raise the multipliers of constraints; 0: no multipliers."""
+    keep: int  # Number of best starts that enter the stage
+    iterations: int  # Gradient steps of the stage
+    rate: float  # [1] Initial learning rate
+    noise: float  # [1] Initial standard deviation of the random displacements of actions
+    final_fraction: float = 0.0  # [1] Fraction of rate and noise at the end of the stage; they fall linearly
+    penalty: float = 20.0  # [1] Weight of squared violations of constraints
+    dual: float = 0.0  # [1] Rate at which violations raise the multipliers of constraints; 0: no multipliers
     slack: float = inf
     """[1] A start whose merit exceeds its best by more than this returns to its best point, and the stage returns the
     best points. Infinite: starts never return, and the stage returns the last points."""
-    check_every: int = 20
-    """Iterations between evaluations of the undisplaced starts, after which they can return."""
-    return_scale: float = 1.0
-    """[1] Factor on a start's later steps and displacements at each return."""
+    check_every: int = 20  # Iterations between evaluations of the undisplaced starts, after which they can return
+    return_scale: float = 1.0  # [1] Factor on a start's later steps and displacements at each return
     crossings: int = 0
     """Number of crossings by start, of which the best replaces the start before the stage, see `crossed`."""
 

@@ -18,8 +18,7 @@ from jumper_warp.kernels.collision.robot import HOUSING_LENGTH, HOUSING_RADIUS, 
 from jumper_warp.kernels.layout import BODIES
 
 FRONT = (1.0, 1.0, -1.0, -1.0)
-SIDE = (1.0, -1.0, 1.0, -1.0)
-"""Signs of the legs FL, FR, BL, BR: front +1, hind -1; left +1, right -1."""
+SIDE = (1.0, -1.0, 1.0, -1.0)  # Signs of the legs FL, FR, BL, BR: front +1, hind -1; left +1, right -1
 OUTER, INNER = 0, 1  # indices of a leg's two transversal motors, thighs or shanks
 
 

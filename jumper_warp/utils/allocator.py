@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import ctypes
 
-TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3
-"""Options of glibc's mallopt (malloc.h)."""
+TRIM_THRESHOLD, MMAP_THRESHOLD = -1, -3  # Options of glibc's mallopt (malloc.h)
 MAX_FREE, MAX_HEAP_BLOCK = 1 << 30, 32 << 20
 """[B] Free memory kept at the top of the heap, and the largest block allocated from the heap (glibc's maximum)."""
 

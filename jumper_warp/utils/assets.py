@@ -9,5 +9,4 @@ def assets_folder(package: Path) -> Path:
     return inside if inside.is_dir() else package.parent / "assets"
 
 
-ASSETS = assets_folder(Path(__file__).resolve().parents[1])
-"""The project's assets folder."""
+ASSETS = assets_folder(Path(__file__).resolve().parents[1])  # The project's assets folder

@@ -11,12 +11,9 @@ from jumper_warp.utils.errors import InputError
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}")
 """Valid names of tasks, terms, observation columns and joints, for comma-separated lists and file names."""
-FLOAT32_MAX = 3.4028234e38
-"""Largest finite float32; settings are converted to float32 on a device."""
-MOST_SEED = 2**31 - 1
-"""Largest valid seed; the kernels' random streams take an int32."""
-LAST_OF_PREVIOUS_VERSION = "05fa856"
-"""Last commit that reads policies, tasks and runs of the previous version."""
+FLOAT32_MAX = 3.4028234e38  # Largest finite float32; settings are converted to float32 on a device
+MOST_SEED = 2**31 - 1  # Largest valid seed; the kernels' random streams take an int32
+LAST_OF_PREVIOUS_VERSION = "05fa856"  # Last commit that reads policies, tasks and runs of the previous version
 
 
 def check_finite(name: str, *values: float) -> None:

@@ -8,8 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-PROJECT_PREFIX = "jumper_warp."
-"""Prefix of the project's modules, whose content the commit identifies."""
+PROJECT_PREFIX = "jumper_warp."  # Prefix of the project's modules, whose content the commit identifies
 
 
 def source_checksums(saved: Any) -> dict[str, str]:

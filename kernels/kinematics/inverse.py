@@ -20,16 +20,12 @@ from .leg import ankle_in_housing, knee_angles, leg_forward_kinematics, rotate_l
 
 wp.set_module_options({"enable_backward": False})
 
-REACHED = wp.constant(real(1.0e-5))
-"""[m] A pose whose ankle is this close to its target reaches it."""
+REACHED = wp.constant(real(1.0e-5))  # [m] A pose whose ankle is this close to its target reaches it
 FAR = wp.constant(real(10.0))
 """[m] Targets farther from the hip than this along an axis are scaled toward the hip before the search."""
-GRID = wp.constant(9)
-"""Grid points per thigh angle at the start of the search."""
-ROUNDS = wp.constant(40)
-"""Largest number of rounds of the compass search."""
-FINEST = wp.constant(real(5.0e-5))
-"""[rad] The compass search ends below this step."""
+GRID = wp.constant(9)  # Grid points per thigh angle at the start of the search
+ROUNDS = wp.constant(40)  # Largest number of rounds of the compass search
+FINEST = wp.constant(real(5.0e-5))  # [rad] The compass search ends below this step
 
 
 @wp.struct

@@ -25,8 +25,7 @@ from .view import RobotArrays
 wp.set_module_options({"enable_backward": False})
 
 ATTEMPTS = wp.constant(8)
-LANES = 32
-"""Threads of a GPU that share a world's attempts."""
+LANES = 32  # Threads of a GPU that share a world's attempts
 
 
 @wp.func

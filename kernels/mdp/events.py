@@ -8,10 +8,8 @@ from .parameters import RobotParameters
 from .random import EVENT, INTERVAL, RngStream, make_stream, uniform
 
 STARTUP, AT_RESET, AT_STEP = 0, 1, 2  # stages at which `event_kernel` is launched
-LANES = 8
-"""Threads of a GPU that share the loops of an event."""
-MODES = {"startup": STARTUP, "reset": AT_RESET, "interval": AT_STEP}
-"""Stage of each mode of an event term."""
+LANES = 8  # Threads of a GPU that share the loops of an event
+MODES = {"startup": STARTUP, "reset": AT_RESET, "interval": AT_STEP}  # Stage of each mode of an event term
 
 
 @wp.func

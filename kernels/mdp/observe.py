@@ -13,10 +13,8 @@ from .view import RobotArrays, load_view
 
 wp.set_module_options(FAST)
 
-CHUNK = 12
-"""Terms that one thread evaluates; it loads the robot once for all of them."""
-LANES = wp.constant(32)
-"""Threads that share the components of a world, so that a warp writes neighbouring columns."""
+CHUNK = 12  # Terms that one thread evaluates; it loads the robot once for all of them
+LANES = wp.constant(32)  # Threads that share the components of a world, so that a warp writes neighbouring columns
 
 
 @wp.struct

@@ -16,8 +16,7 @@ MAX_FOOT_ERROR = wp.constant(1.0e-4)  # [m] distance of a reachable foot from it
 MAX_LEG_SPEED = wp.constant(30.0)  # [rad/s] norm of the three motor rates of a leg
 MIN_LINK_DISTANCE = wp.constant(0.005)  # [m] between links, and between links and the ground
 
-PAW_X, PAW_Y = 20, 24
-"""Indices in the stream of an attempt, each the first of four: one a leg."""
+PAW_X, PAW_Y = 20, 24  # Indices in the stream of an attempt, each the first of four: one a leg
 
 
 @wp.struct

@@ -10,19 +10,7 @@ from jump_helpers import DEG, edit_episodes, make_env, only, random_actions, res
 from jumper_warp.evaluation.jumps import paw_arrays
 from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.tasks.randomization import RandomizationCfg
-from randomization_helpers import (
-    ALL,
-    HELD,
-    OFF,
-    ROWS,
-    TASK,
-    fills,
-    own_model,
-    randomized,
-    read,
-    seen,
-    within,
-)
+from randomization_helpers import ALL, HELD, OFF, ROWS, TASK, fills, own_model, randomized, read, seen, within
 
 
 @pytest.fixture(scope="module")

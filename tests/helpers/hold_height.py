@@ -177,10 +177,7 @@ def hold_height() -> mdp.TaskCfg:
         reset=mdp.Reset(reset_hold, HoldResetCfg()),
         command=mdp.Command(give_hold, another_goal_due, sample_goal),
         curriculum=mdp.Curriculum(height_error, tolerance=0.03, promote_after=2, counts=every_episode),
-        rewards=(
-            mdp.RewardTerm(near_goal, 60.0, width=0.05),
-            mdp.RewardTerm(mdp.rewards.action_rate, -0.02),
-        ),
+        rewards=(mdp.RewardTerm(near_goal, 60.0, width=0.05), mdp.RewardTerm(mdp.rewards.action_rate, -0.02)),
         terminations=(
             mdp.TerminationTerm(mdp.terminations.came_apart),
             mdp.TerminationTerm(mdp.terminations.low_base, height=0.12),

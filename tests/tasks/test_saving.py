@@ -18,15 +18,7 @@ from jumper_warp.kernels.jump.state import JumpState
 from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.saving import (
-    MAX_ENTRIES,
-    OPTIONAL,
-    TaskError,
-    json_value,
-    name_of,
-    task_from_json,
-    task_to_json,
-)
+from jumper_warp.tasks.saving import MAX_ENTRIES, OPTIONAL, TaskError, json_value, name_of, task_from_json, task_to_json
 from jumper_warp.tasks.terms import RewardTerm
 
 JUMP = "jumper_warp.kernels.jump"

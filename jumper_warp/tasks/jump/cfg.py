@@ -70,17 +70,13 @@ class Level:
 
     goal_lower: tuple[float, float, float]
     """[m] Smallest goal: landing x, y relative to start and heading, and base height at the apex (0: any)."""
-    goal_upper: tuple[float, float, float]
-    """[m] Largest goal, as `goal_lower`."""
-    base_height: Pair
-    """[m] Height of the base in standing starts; low ones are deep squats."""
-    next_jump_probability: float = 0.0
-    """[1] Probability of another goal after a landing."""
+    goal_upper: tuple[float, float, float]  # [m] Largest goal, as `goal_lower`
+    base_height: Pair  # [m] Height of the base in standing starts; low ones are deep squats
+    next_jump_probability: float = 0.0  # [1] Probability of another goal after a landing
     elliptical: bool = False
     """Whether goals lie in the ellipse within the box, with half axes up to its edges, instead of in the box."""
 
-    struct = JumpLevel
-    """Kernels' struct that `values` returns."""
+    struct = JumpLevel  # Kernels' struct that `values` returns
 
     def __post_init__(self) -> None:
         """Raise InputError: a range falls or is not finite, or a height or probability is out of range."""
@@ -111,15 +107,12 @@ def cross_levels(goals: Sequence[Level], starts: Sequence[Pair]) -> tuple[Level,
 class StartProbability:
     """[1] Probabilities of the start modes of an episode, in the order of the kernels; they add up to 1."""
 
-    standing: float = 0.0
-    """Standing on four paws, from upright to a deep squat."""
-    default: float = 0.0
-    """In the default pose."""
+    standing: float = 0.0  # Standing on four paws, from upright to a deep squat
+    default: float = 0.0  # In the default pose
     in_flight: float = 0.0  # between takeoff and landing
     touchdown: float = 0.0  # just before touchdown
     after_landing: float = 0.0  # on four paws near the goal
-    pushing: float = 0.0
-    """During the push of a takeoff."""
+    pushing: float = 0.0  # During the push of a takeoff
 
     def __post_init__(self) -> None:
         """Raise InputError: one is negative, or they do not add up to 1."""

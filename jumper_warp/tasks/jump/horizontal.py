@@ -99,8 +99,7 @@ def level_all_around(ahead: float, aside: float, back: float) -> Level:
 
 REACHES = ((0.4, 0.3, 0.3), (0.7, 0.5, 0.5), (1.0, 0.7, 0.7), (1.4, 0.95, 0.95))
 """[m] Farthest goals (ahead, to either side, back) of each level of `omnidirectional_jump` above the first."""
-NEAREST = level((0.2, 0.5), 0.0, next_jump_probability=0.0)
-"""First level of every curriculum of goal positions."""
+NEAREST = level((0.2, 0.5), 0.0, next_jump_probability=0.0)  # First level of every curriculum of goal positions
 
 
 def horizontal_jump() -> TaskCfg:
@@ -162,10 +161,7 @@ def omnidirectional_jump() -> TaskCfg:
         task,
         name="omnidirectional-jump",
         evaluation_suite="omnidirectional",
-        levels=cross_levels(
-            (NEAREST, *(level_all_around(*reach) for reach in REACHES)),
-            STARTS,
-        ),
+        levels=cross_levels((NEAREST, *(level_all_around(*reach) for reach in REACHES)), STARTS),
         reset=replace(task.reset, settings=settings),
     )
     return task.with_terms("rewards", left_right_symmetry={"weight": 10.0})

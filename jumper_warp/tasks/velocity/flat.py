@@ -28,14 +28,12 @@ from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, Reward
 from jumper_warp.tasks.units import DEG, SECOND
 from jumper_warp.tasks.velocity.cfg import CommandCfg, VelocityResetCfg
 
-SENSED = ("lin_vel", "ang_vel", "gravity", "angle", "rate")
-"""Names of the terms with observation latency."""
+SENSED = ("lin_vel", "ang_vel", "gravity", "angle", "rate")  # Names of the terms with observation latency
 
 WITHOUT_HISTORY = (ObservationTerm(velocity.command), *(term.replace(delayed=term.name in SENSED) for term in ROBOT))
 """Observation of the paper's walking policy, in another order."""
 
-ACTOR = remembered(WITHOUT_HISTORY)
-"""Policy observation: `WITHOUT_HISTORY` over four policy steps."""
+ACTOR = remembered(WITHOUT_HISTORY)  # Policy observation: `WITHOUT_HISTORY` over four policy steps
 
 CRITIC = (
     *exact(WITHOUT_HISTORY),
