@@ -52,7 +52,7 @@ ALWAYS_PAID = [
     (
         "horizontal_velocity",
         {"lin_vel": (0.03, -0.04, 7.0)},
-        {"std": 0.05, "waiting_scale": 0.25},
+        {"speed_scale": 0.05, "waiting_scale": 0.25},
         [E(-1.0), 2.0 * E(-1.0)],
     ),
     (
