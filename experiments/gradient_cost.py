@@ -50,7 +50,7 @@ def main(args: Args) -> dict:
     differentiable = GradientRun(worlds, args.double, args.device)
     plain = PlainJump(differentiable.rollout, schedule(PUSH))
     gradient = differentiable.run()
-    errors = {
+    errors = {  # largest error in world 0 (worlds last) relative to the largest entry, by input of the rollout
         key: float(np.abs(gradient[key].numpy()[..., 0] - exact[key].numpy()[..., 0]).max())
         / float(np.abs(exact[key].numpy()).max())
         for key in ("targets", "q", "qd", "table", "saturation")
@@ -71,7 +71,7 @@ def main(args: Args) -> dict:
         "forward_ratio": best["forward"] / best["plain"],
         **{f"{kind}_us_a_step": 1.0e6 * value / steps for kind, value in best.items()},
         "kept_bytes_a_policy_step": sum(a.size * wp.types.type_size_in_bytes(a.dtype) for a in saved) / worlds / TICKS,
-        "height_difference_m": float(np.abs(plain.heights() - first.q.numpy()[-1, 2]).max()),
+        "height_difference_m": float(np.abs(plain.heights() - first.q.numpy()[-1, 2]).max()),  # final base z
         **{f"error_{key}": error for key, error in errors.items()},
     }
     if device.is_cuda:

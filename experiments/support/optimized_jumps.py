@@ -87,21 +87,21 @@ class Jump:
 
     label: str  # Name in tables and plots
     unit: str  # Unit of `value`
-    make: Callable[..., Problem]  # Returns the problem for the settings of a stage, device and threads
+    make: Callable[..., Problem]  # make(**settings of a stage, device=, threads=); settings: e.g. `FINE`
     stages: tuple[tuple[Mapping[str, Any], Stage], ...]  # Stages of the search, each with its settings of `make`
     value: Callable[[MotionReplay], float]  # Returns the reported value of a replay
     draw: Callable[[Knots, int, np.random.Generator], np.ndarray] = squats  # Returns random candidates
     samples: int = 2048  # Default number of random candidates
     polish: int = 40  # Default number of iterations of the last descent
-    after: str = ""  # Name of the jump whose solution is also a candidate; empty: none
+    after: str = ""  # Key in `JUMPS` of the jump whose solution is also a candidate; empty: none
 
     def replay(self, targets: np.ndarray, device: str | None = None) -> MotionReplay:
         """Return the replay of targets [rad], (steps, 12)."""
         return MotionReplay(targets, self.make(**FINE, device=device, threads=1), notes={"jump": self.label})
 
     def scaled(self, effort: float) -> Jump:
-        """Return a copy of the jump with the iterations of all stages multiplied by `effort` [1], at least 1 each."""
-        stages = ((how, replace(s, iterations=max(1, round(effort * s.iterations)))) for how, s in self.stages)
+        """Return a copy of the jump with the iterations of all stages (not `polish`) multiplied by `effort` [1], at least 1."""
+        stages = ((made, replace(s, iterations=max(1, round(effort * s.iterations)))) for made, s in self.stages)
         return replace(self, stages=tuple(stages))
 
 

@@ -336,7 +336,7 @@ class Rollout:
         return names | {"geometry": gradient[first:].reshape((4, len(GEOMETRY_NAMES), self.num_worlds))}
 
     def _timing(self, count: int) -> Any:
-        """Return the kernels' `Timing` of a rollout of `count` policy steps."""
+        """Return the `Timing` of `count` policy steps; `every`: physics steps between saved rows."""
         timing = self.dynamics.modules.trajectory.Timing()
         timing.steps, timing.substeps, timing.every = count, self.substeps, self.every
         return timing

@@ -51,12 +51,12 @@ def passive_torque_kernel(
     stiffness [N/m] and rest length [m]. joint_q, joint_qd, joint_f: Newton's, flat over worlds.
     """
     world, leg = wp.tid()
-    q = world * COORDS + 7 + 5 * leg
+    q = world * COORDS + 7 + 5 * leg  # joints: lateral, outer motor, outer knee, inner motor, inner knee
     d = world * DOFS + 6 + 5 * leg
-    outer_rate = joint_qd[d + 2]
-    inner_rate = joint_qd[d + 4]
-    joint_f[d + 2] = -capped_damping(knee_damping, outer_rate, knee_limit) * outer_rate
-    joint_f[d + 4] = -capped_damping(knee_damping, inner_rate, knee_limit) * inner_rate
+    outer_knee_rate = joint_qd[d + 2]
+    inner_knee_rate = joint_qd[d + 4]
+    joint_f[d + 2] = -capped_damping(knee_damping, outer_knee_rate, knee_limit) * outer_knee_rate
+    joint_f[d + 4] = -capped_damping(knee_damping, inner_knee_rate, knee_limit) * inner_knee_rate
     fold = joint_q[q + 1] + joint_q[q + 3]
     fold_rate = joint_qd[d + 1] + joint_qd[d + 3]
     stop = stop_torque(fold, fold_rate, sum_lower, sum_upper, stop_ke, stop_kd)
@@ -66,6 +66,8 @@ def passive_torque_kernel(
         spring = LegSpring()
         spring.stiffness = real(springs[world][0])
         spring.length = real(springs[world][1])
-        pull = spring_torque(spring, five_bar(geometry[leg], joint_q[q + 1], joint_q[q + 3]))
+        pull = spring_torque(
+            spring, five_bar(geometry[leg], joint_q[q + 1], joint_q[q + 3])
+        )  # lateral, outer, inner [N m]
         joint_f[d + 1] = joint_f[d + 1] + pull[1]
         joint_f[d + 3] = joint_f[d + 3] + pull[2]

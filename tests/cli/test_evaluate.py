@@ -15,7 +15,7 @@ from jumper_warp.registry import TASKS, make_task
 from jumper_warp.utils.errors import InputError
 from landing_helpers import still_policy
 
-TASK = EVALUATIONS["place"].prepare_task(make_task("horizontal-jump"))
+TASK = EVALUATIONS["landing_position"].prepare_task(make_task("horizontal-jump"))
 
 
 @pytest.fixture(scope="module")
@@ -103,9 +103,9 @@ def test_policy_must_be_the_first_argument(command, args):
 
 
 def test_success_range_selects_goals_by_distance():
-    goals = [[0.3, 0.0], [0.0, -0.3], [0.6, 0.6]]
+    goals = [[0.3, 0.0], [0.0, -0.3], [0.6, 0.6]]  # [m] at distances 0.3, 0.3 and 0.85
     flags = LandingFlags(num_jumps=3, goal_x=(0.0, 0.0), goal_y=(0.0, 0.0), heading=0.0, success_range=(0.3, 0.5))
-    landings = flags.log(TASK, 0)
+    landings = flags.log(TASK, seed=0)  # arrays: (3 worlds, 1 jump in a row)
     landings.goal_positions[:, 0] = goals
     landings.end_position[:, 0], landings.goal_world[:, 0] = goals, goals
     landings.heading[:], landings.yaw[:], landings.tilt[:] = 0.0, 0.0, 0.0
