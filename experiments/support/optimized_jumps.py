@@ -100,7 +100,7 @@ class Jump:
         return MotionReplay(targets, self.make(**FINE, device=device, threads=1), notes={"jump": self.label})
 
     def scaled(self, effort: float) -> Jump:
-        """Return a copy of the jump with the iterations of all stages (not `polish`) multiplied by `effort` [1], at least 1."""
+        """Return a copy with the iterations of all stages (not `polish`) multiplied by `effort` [1], at least 1."""
         stages = ((made, replace(s, iterations=max(1, round(effort * s.iterations)))) for made, s in self.stages)
         return replace(self, stages=tuple(stages))
 

@@ -39,8 +39,8 @@ def test_jump_evaluations_check_success_after_failures():
 
 
 def test_refuses_unknown_evaluation():
-    with pytest.raises(PolicyError, match=r"horizontal-jump asks for the evaluation 'walk'; there are \['height', 'pl"):
-        evaluation_of(replace(TASK, evaluation="walk"))
+    with pytest.raises(PolicyError, match=r"asks for the evaluation 'walk'; there are \['apex_height', "):
+        evaluation_of(replace(TASK, evaluation_suite="walk"))
 
 
 def test_goals_are_evenly_spaced_ahead_and_sampled_to_the_side():
