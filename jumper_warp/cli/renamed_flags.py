@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import re
 import sys
 from collections.abc import Sequence
@@ -31,17 +32,38 @@ RENAMED = {
     "x": "goal-x", "y": "goal-y",
 }  # fmt: skip
 """Old name to new name, or names for different commands with a space between; the first that a command has counts."""
+RENAMED_ENV_PARTS = {
+    "again-delay": "next-jump-delay", "axis-share": "body-axis-probability", "block-margin": "obstacle-margin",
+    "critic": "observations.critic", "default": "start-probability.default",
+    "default-share": "default-pose-probability",
+    "fine": "std-fine", "fine-share": "fine-weight", "flat": "flat-orientation-l2", "force": "push-force",
+    "free": "threshold", "height": "target-height", "in-flight": "start-probability.in-flight",
+    "jerk": "torque-sign-changes", "jump-again": "next-jump-probability", "lasts": "resampling-time-range",
+    "lateral": "std-lateral", "lateral-stability": "ang-vel-xy-l2", "least": "threshold",
+    "lift": "eval-height-offset max-swing-height", "lifted-share": "swing-probability",
+    "link-margin": "self-collision-margin", "long-wait-share": "long-wait-probability", "middle": "std-middle",
+    "narrow": "first-range", "narrow-share": "first-range-probability", "no-latency": "zero-latency-probability",
+    "policy": "observations.actor", "posture": "std-posture", "push-share": "push-probability",
+    "pushing": "start-probability.pushing", "redraw": "resample-at", "rest": "base-at-rest",
+    "retract": "post-landing-posture", "round": "elliptical", "share": "waiting-scale", "shares-of": "balance-by",
+    "sharp": "scale-sharp", "speed": "std-lin-vel", "spin": "std-ang-vel",
+    "stand": "standing-posture standing-probability", "standing": "start-probability.standing",
+    "torque": "push-torque", "touchdown": "start-probability.touchdown", "turn": "turn-in-place-probability",
+    "variance": "std-variance", "vertical-velocity": "lin-vel-z-l2", "wide": "std-wide last-range",
+    "width": "std speed-scale angle",
+}  # fmt: skip
+"""Old to new parts, between dots, of a task's flags `--env.…`; the first combination that is a flag counts."""
 
 
 def flag_names(cfg: Any) -> set[str]:
     """Return the names, without leading dashes, of tyro's flags for a dataclass or an instance; nested ones dotted."""
     names, hints = set(), get_type_hints(cfg if isinstance(cfg, type) else type(cfg), include_extras=True)
     for spec in dataclasses.fields(cfg):
-        value, name = getattr(cfg, spec.name, spec.default_factory), spec.name.replace("_", "-")
+        value, marks = getattr(cfg, spec.name, spec.default_factory), getattr(hints[spec.name], "__metadata__", ())
+        given = [mark.name for mark in marks if getattr(mark, "name", None) is not None]
+        name = given[-1] if given else spec.name.replace("_", "-")
         if dataclasses.is_dataclass(value):
-            marks = getattr(hints[spec.name], "__metadata__", ())
-            prefix = "" if any(getattr(mark, "name", None) == "" for mark in marks) else f"{name}."
-            names |= {prefix + nested for nested in flag_names(value)}
+            names |= {f"{name}.{nested}" if name else nested for nested in flag_names(value)}
         else:
             names.add(name)
     return names
@@ -53,6 +75,14 @@ def name_of(arg: str) -> str:
     return re.sub(r"(^|\.)no-", r"\1", match[1].replace("_", "-")) if match else ""
 
 
+def new_name(old: str, current: set[str]) -> str | None:
+    """Return the new name of a flag, None if it has none; current: names of all flags of the command."""
+    if not old.startswith("env."):
+        return next((name for name in RENAMED.get(old, "").split() if name in current), None)
+    options = [[part, *RENAMED_ENV_PARTS.get(part, "").split()] for part in old.split(".")]
+    return next((name for parts in itertools.product(*options) if (name := ".".join(parts)) in current), None)
+
+
 def use_new_names(args: Sequence[str], cfg: Any) -> list[str]:
     """Return a copy of the arguments with renamed flags under their new names; prints each renaming on standard error.
 
@@ -60,12 +90,12 @@ def use_new_names(args: Sequence[str], cfg: Any) -> list[str]:
     Raises InputError: a flag is given under both names.
     """
     arg_names, new_args = [name_of(arg) for arg in args], list(args)
-    if RENAMED.keys().isdisjoint(arg_names):
+    if not any(name in RENAMED or name.startswith("env.") for name in arg_names):
         return new_args
     current, renamed = flag_names(cfg), {}
     for i, old in enumerate(arg_names):
-        new = next((name for name in RENAMED.get(old, "").split() if name in current), None)
-        if new is None or old in current:
+        new = None if old in current else new_name(old, current)
+        if new is None:
             continue
         if name_of(f"--{new}") in arg_names:
             raise InputError(f"--{old} is now --{new}: give only --{new}")

@@ -87,7 +87,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         if self._tensors or ended.any():
             final, termination = self._observation(step.extras["final_obs"]), self._converted(self._termination.clone())
             infos["final_obs"], infos["_final_obs"] = final if self._tensors else self._final_rows(final, ended), ended
-            infos["final_info"] = {"termination": termination, "_ending": _copied(ended)}
+            infos["final_info"] = {"termination": termination, "_termination": _copied(ended)}
             infos["_final_info"] = _copied(ended)
         return self._observation(step.obs), self._converted(reward), terminated, truncated, infos
 

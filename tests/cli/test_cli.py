@@ -185,7 +185,7 @@ def test_keyboard_interrupt_exits_with_130(capsys, monkeypatch):
 
 def flag_of(name):
     """Return the flag of a term's parameter by its dotted name, such as rewards.jump_height.weight."""
-    section, term, key = name.split(".")
+    section, term, key = name.rsplit(".", 2)
     middle = "" if section in ("advance", "curriculum") else f".{flag_name(term)}"
     return f"--env.{section}{middle}.{flag_name(key)}"
 
@@ -197,8 +197,9 @@ def test_flag_sets_each_term_parameter(name):
     args, expected = [], {}
     for name, i in task.params.names.items():
         if not name.startswith(sampled):
-            expected[name] = task.params.values[i] + (not name.endswith(".most"))  # other than the default
-            args += [flag_of(name), f"{expected[name]:.17g}"]
+            expected[name] = task.params.values[i] + 1.0  # other than the default
+            value = f"{expected[name]:.17g}"  # upper follows lower: two values of one flag
+            args += [value] if name.endswith("_s.upper") else [flag_of(name.replace("_s.lower", "_s")), value]
     params = parsed(task, args).params
     for name, value in expected.items():
         assert params.values[params.index(name)] == value, name
@@ -243,7 +244,7 @@ def test_flag_exists_for_each_setting_outside_terms(name):
 def test_task_fields_without_flags_hold_functions_or_names():
     flags = {spec.metadata["flag"] for spec in dataclasses.fields(flags_of(hold_height()))}
     names = {flag_name(spec.name) for spec in dataclasses.fields(TaskCfg)}
-    assert names - flags == {"name", "state", "command", "evaluation_suite", "metrics"} and not flags - names
+    assert names - flags == {"name", "state", "command", "evaluation-suite", "metrics"} and not flags - names
 
 
 @pytest.mark.parametrize("name", [*TASKS, "hold-height"])

@@ -69,6 +69,21 @@ def test_refuses_abbreviated_flags(flag, capsys):
     assert code == 2 and "Unrecognized options" in "\n".join(err) and "is now" not in "\n".join(err)
 
 
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ("env.rewards.jump-height.fine", "env.rewards.jump-height.std-fine"),
+        ("env.rewards.horizontal-velocity.width", "env.rewards.horizontal-velocity.speed-scale"),
+        ("env.policy.lin-vel.noise", "env.observations.actor.lin-vel.noise"),
+        ("env.reset.standing", "env.reset.start-probability.standing"),
+        ("env.link-margin", "env.self-collision-margin"),
+    ],
+)
+def test_training_accepts_old_flag_of_a_task(old, new, capsys):
+    code, _, err = run(capsys, "train", "vertical-jump", f"--{old}", "x")  # no number: fails before the training starts
+    assert code == 2 and err[0] == f"jumper: --{old} is now --{new}"
+
+
 def test_command_accepts_old_flag_and_refuses_both(capsys):
     renamed = "jumper: --keep is now --max-checkpoints"
     code, _, err = run(capsys, "train", "vertical-jump", "--keep", "0")  # 0 fails before the training starts

@@ -72,7 +72,7 @@ def test_evaluation_replaces_constant_wrench_by_intermittent_pushes_and_keeps_tr
         PUSH_PROBABILITY,
         "reset",
     )
-    assert (drawn.push_in_flight, drawn.force) == (False, (-7.0, 7.0))
+    assert (drawn.push_in_flight, drawn.push_force) == (False, (-7.0, 7.0))
     trained = dataclasses.replace(HELD, randomization=RandomizationCfg(push_interval=(1.0, 2.0), push_probability=0.5))
     drawn = Conditions(randomize=True).applied(trained).randomization
     assert (drawn.push_interval, drawn.push_probability) == ((1.0, 2.0), 0.5)

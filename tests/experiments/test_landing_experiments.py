@@ -334,7 +334,7 @@ def test_script_refuses_a_policy_of_another_task_in_one_line_with_code_2(policy)
     done = subprocess.run(command, cwd=root, capture_output=True, text=True)
     (line,) = done.stderr.splitlines()
     assert (done.returncode, done.stdout) == (2, "")
-    assert line.startswith("jumper: this needs a policy that is evaluated by height")
+    assert line.startswith("jumper: this needs a policy that is evaluated by apex_height")
 
 
 @pytest.mark.parametrize(
