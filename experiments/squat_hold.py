@@ -43,7 +43,7 @@ class Args(EvaluationArgs):
 
 
 def plot_squats(run: EvaluationRun, squats: SquatLog) -> None:
-    """Plot forces and torques of the robot with the largest force range, and force ranges of all, into `hold.png`."""
+    """Plot forces and torques of the robot with the largest force range, and all ranges, into `hold.png`."""
     time = (np.arange(len(squats.forces)) + 1) * squats.step_dt
     robot = np.flatnonzero(~squats.ended)[squats.force_range.argmax()]
     with figure(run.folder / "hold.png", 1, 3, figsize=(14, 4)) as axes:

@@ -28,7 +28,7 @@ class PlainJump:
         limits = filter_params(vertical_jump_filter(), module=modules.command_filter)
         wrench = wp.zeros(dynamics.model.body_count, dtype=wp.spatial_vectorf, device=rollout.device)
         motors = rollout.motors
-        drive = dynamics.drive(rollout.array(np.zeros(38 * n)), wrench, motors, filtered)
+        drive = dynamics.drive(rollout.array(np.zeros(DOFS * n)), wrench, motors, filtered)
         settings = dynamics.settings(PHYSICS_DT, SUBSTEPS, MAX_SWEEPS, TOLERANCE)
 
         def run() -> None:

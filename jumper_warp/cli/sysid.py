@@ -96,7 +96,7 @@ class ActuatorCfg:
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """Run `jumper sysid` with the given arguments: identify parameters, plan motions (excite), or fit one motor.
 
-    modules: unused. Raises InputError or OSError: data or a flag is invalid. Exits as tyro does.
+    modules: unused, as all commands take it. Raises InputError or OSError: data or a flag is invalid.
     """
     if not args:
         raise UsageError("data comes first: jumper sysid DATA ... [flags]; jumper sysid --help lists the flags")

@@ -81,7 +81,7 @@ class DeployedPolicy:
         return self._frames[name].ravel()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return the action, (12,) in [-1, 1], and store it for the next observation; observation: (num_obs,)."""
+        """Return and store the action, (12,), clipped to [-1, 1] by the network; observation: (num_obs,) float32."""
         self.action = np.asarray(self._session.run(["actions"], {"obs": observation[None]})[0])[0]
         return self.action
 

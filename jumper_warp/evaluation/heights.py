@@ -142,8 +142,8 @@ def run_jumps(act: Callable[[torch.Tensor], torch.Tensor], env: Env, heights: np
 def apex_metrics(jumps: HeightLog, in_range: tuple[float, float]) -> Metrics:
     """Return the metrics of `jumper evaluate`, where a jump succeeds if none of the task's terminations ends it.
 
-    Errors include failed jumps, but not those whose simulation diverged, which `came_apart` counts. Metrics of landings
-    are over successful jumps. in_range [m]: commanded heights that the `in_range` metrics count.
+    Errors include failed jumps, but not diverged ones, which `came_apart` counts. `fall_rate` counts falls, collisions
+    and diverged jumps. Metrics of landings are of successful jumps. in_range [m]: heights of the `in_range` metrics.
     """
     success, outcomes = jumps.success, jumps.outcomes
     metrics: Metrics = {

@@ -125,7 +125,7 @@ class Identification:
         return tuple(lines)
 
     def robots(self, count: int = 1) -> RobotValues:
-        """Return `count` copies of the identified robot."""
+        """Return the identified robot `count` times, one row a world to simulate."""
         return self.parameters.robots(np.repeat(self.z[None], count, axis=0))
 
 

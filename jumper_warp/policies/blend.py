@@ -18,7 +18,7 @@ def blend(policy: Policy, other: Policy, fraction: float) -> Policy:
 
     The first layer of `other` is rescaled to that normaliser before. The configuration is a copy of `policy.config`
     with the entry `blended`: the keys share (the fraction), and commit and iteration of `other`.
-    fraction: 0 gives `policy`, 1 gives `other` within the limits of normalised observations.
+    fraction: 0 gives `policy`; 1 acts like `other` wherever neither policy clips its normalised observation.
     Raises PolicyError: the interfaces differ, or the fraction is not in [0, 1].
     """
     if not 0.0 <= fraction <= 1.0:

@@ -182,7 +182,7 @@ JUMP_TRANSVERSAL = LimitsCfg(-30.0, 140.0, lower_zone=10.0, upper_zone=15.0)
 
 
 def vertical_jump_filter() -> FilterCfg:
-    """Return the filter for vertical jumps."""
+    """Return the filter for vertical jumps; horizon: 8 policy steps."""
     return FilterCfg(JUMP_LATERAL, JUMP_TRANSVERSAL, sum=LimitsCfg(0.0, 240.0, 35.0, 45.0), horizon=8.0 / 60.0)
 
 

@@ -25,7 +25,7 @@ def time_to_height(z: float, vz: float, height: float, g: float) -> float:
 
 @wp.func
 def estimated_landing(pos: wp.vec3, lin_vel: wp.vec3, height: float, g: float) -> wp.vec2:
-    """Return the position (x, y) [m] at which a projectile falls through `height` [m]; arguments: world, z up."""
+    """Return where (x, y) [m] a projectile falls through `height` [m]; pos [m], lin_vel [m/s]: world, g > 0 [m/s^2]."""
     t = time_to_height(pos[2], lin_vel[2], height, g)
     return wp.vec2(pos[0] + t * lin_vel[0], pos[1] + t * lin_vel[1])
 

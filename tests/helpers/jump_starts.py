@@ -43,7 +43,7 @@ class Starts:
 
     @cached_property
     def paws(self) -> np.ndarray:
-        """Paw positions [m], world frame, (worlds, 4, 3)."""
+        """Centres of the paws FL, FR, BL, BR [m], world frame, (selected worlds, 4, 3)."""
         return paws_of(self._model, self.q, self.qd)
 
     def split(self, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -54,8 +54,8 @@ class Starts:
     def paws_around(self, spot: np.ndarray) -> np.ndarray:
         """Return the paws relative to positions [m], (worlds, 3), in the jump's heading, mirrored to front left."""
         relative = self.paws - spot[:, None]
-        rotate_yaw = np.stack([self.heading.inv().apply(relative[:, leg]) for leg in range(4)], axis=1)
-        return rotate_yaw * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
+        rotated = np.stack([self.heading.inv().apply(relative[:, leg]) for leg in range(4)], axis=1)
+        return rotated * np.array([[1, 1, 1], [1, -1, 1], [-1, 1, 1], [-1, -1, 1]])
 
 
 def paws_of(model, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
