@@ -29,30 +29,22 @@ SHORTEST_LATENCY = 500.0 * PHYSICS_DT  # [ms] Half a physics step; a shorter lat
 class Conditions:
     """Conditions of a test: physics, randomisation, and parameters with a fixed value; see `env_of_policy`."""
 
-    solver: Literal["jumper", "mujoco"] = "jumper"
-    """Physics: the dedicated solver, or Newton's SolverMuJoCo."""
-    randomize: bool = False
-    """Sample masses, friction, motors, latency and pushes as in training."""
-    noise: bool = False
-    """Add the training's observation noise."""
-    seed: int = 0
-    """Seed of randomisation and noise, 0 to 2147483647."""
-    device: str | None = None
-    """Warp device (default: a GPU if there is one)."""
-    threads: int | None = None
-    """CPU threads that share the worlds (default: all cores); they change no result."""
+    solver: Literal["jumper", "mujoco"] = "jumper"  # Physics: the dedicated solver, or Newton's SolverMuJoCo
+    randomize: bool = False  # Sample masses, friction, motors, latency and pushes as in training
+    noise: bool = False  # Add the training's observation noise
+    seed: int = 0  # Seed of randomisation and noise, 0 to 2147483647
+    device: str | None = None  # Warp device (default: a GPU if there is one)
+    threads: int | None = None  # CPU threads that share the worlds (default: all cores); they change no result
     robot: Path | None = None
     """Robot overlay, as `jumper sysid` writes it (default: the training's overlay, if it had one)."""
-    push_in_flight: bool = False
-    """Push the robot of a randomised test in flight too, not only while a paw is down."""
+    push_in_flight: bool = False  # Push the robot of a randomised test in flight too, not only while a paw is down
     latency: float | None = None
     """[ms] Latency from action to motor, to the nearest physics step (default: none, or sampled if randomised)."""
     gain_scale: tuple[float, float] | None = None
     """[1] Scales of kp and kd of all motors (default: 1, or sampled if randomised)."""
     friction: float | None = None
     """[1] Friction of the paws, static and dynamic (default: nominal, or sampled if randomised)."""
-    gravity: float | None = None
-    """[m/s^2] Gravity, downward (default: the task's)."""
+    gravity: float | None = None  # [m/s^2] Gravity, downward (default: the task's)
 
     def __post_init__(self) -> None:
         """Raise InputError if a value is out of range, or push_in_flight is set without randomize."""
