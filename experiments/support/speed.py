@@ -128,7 +128,7 @@ def stepping_env(envs: int, device: str | None, threads: int | None = None) -> t
         step()
     metrics = env.metrics()
     if not bool(env.obs.isfinite().all()) or metrics["Episode_Termination/came_apart"] > 0.01:
-        raise RuntimeError(f"{100 * metrics['Episode_Termination/came_apart']:.1f} % of the episodes came apart")
+        raise RuntimeError(f"{100 * metrics['Episode_Termination/came_apart']:.1f} % of the episodes diverged")
     return env, step
 
 

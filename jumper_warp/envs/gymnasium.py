@@ -107,7 +107,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         return torch.from_numpy(np.array(array, dtype=np.float32)).to(self.env.device)
 
     def _converted(self, tensor: torch.Tensor) -> Any:
-        """Return a tensor as it is returned: itself with `tensors`, else as a NumPy array."""
+        """Return the tensor unchanged with `tensors`, else its values as a NumPy array."""
         return tensor if self._tensors else tensor.cpu().numpy()
 
     def _observation(self, groups: dict[str, torch.Tensor]) -> Obs:

@@ -198,6 +198,6 @@ class TrainCfg:
             if self.trainer == "rsl-rl" and getattr(self, name):
                 raise InputError(f"{name} is not offered with trainer rsl-rl")
         if self.resume and self.resume != LATEST_OR_NEW and self.init_policy:
-            raise InputError("give resume, which goes on with a training, or init_policy, which begins one, not both")
+            raise InputError("give resume, to continue a training, or init_policy, to begin one, not both")
         if self.trainer != "ppo" and self.ppo.symmetry != "off":
             raise InputError(f"symmetry is not offered with trainer {self.trainer}")

@@ -268,7 +268,7 @@ class SolverJumper(SolverBase):
         """Clear contact history and `diverged` of the masked worlds, and write the reference pose to their state.
 
         world_mask: bool (num_worlds + 1,), the last entry for the global world; None: all. Blocks return to their
-        starts. With `flags=StateFlags.NONE` state and blocks stay as they are.
+        starts. With `flags=StateFlags.NONE` state and blocks do not change.
         """
         world_mask = self._normalize_reset_world_mask(world_mask)
         n, device = self.model.world_count, self.model.device

@@ -10,7 +10,7 @@ from .options import FAST
 from .terminations import came_apart
 from .view import RobotArrays, has_diverged, load_view
 
-NOT_TERMINATED = wp.constant(-1)  # `EpisodeArrays.termination` of an episode that goes on
+NOT_TERMINATED = wp.constant(-1)  # `EpisodeArrays.termination` of an episode that has not ended
 
 
 @wp.func

@@ -22,7 +22,7 @@ from jumper_warp.tasks.observations import exact
 from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, STEP_DT, SUBSTEPS, array, new_worlds, observe, standing_robots
 
 DEG = np.pi / 180.0
-NUM_START_MODES = ("standing", "default", "in_flight", "touchdown", "after_landing", "pushing")
+START_MODES = ("standing", "default", "in_flight", "touchdown", "after_landing", "pushing")
 OF_WORLD = ("level", "streak")  # What a world keeps from episode to episode
 
 

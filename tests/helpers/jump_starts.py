@@ -7,7 +7,7 @@ import pinocchio as pin
 import warp as wp
 from scipy.spatial.transform import Rotation
 
-from jump_helpers import NUM_START_MODES, begin_by, edit_episodes, episodes_of, only, resets_of
+from jump_helpers import START_MODES, begin_by, edit_episodes, episodes_of, only, resets_of
 from jumper_warp.envs.env import Env
 from jumper_warp.kernels.collision.robot import collision_kernel
 from solver_helpers import Reference, States, paw_joint
@@ -28,7 +28,7 @@ class Starts:
         edit_episodes(env, level=self.level)
         env.reset()
         episodes = episodes_of(env)
-        drawn = episodes["start_mode"] == NUM_START_MODES.index(start_mode)
+        drawn = episodes["start_mode"] == START_MODES.index(start_mode)
         self.drawn, self.fallbacks = drawn, 1.0 - drawn.mean()
         self.flags = collision_flags(env)
         self.episodes = {name: values[drawn].astype(float) for name, values in episodes.items()}

@@ -4,17 +4,7 @@ import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
 
-from jump_helpers import (
-    DEG,
-    NUM_START_MODES,
-    begin_by,
-    edit_episodes,
-    episodes_of,
-    make_env,
-    only,
-    resets_of,
-    set_levels,
-)
+from jump_helpers import DEG, START_MODES, begin_by, edit_episodes, episodes_of, make_env, only, resets_of, set_levels
 from jump_starts import PAW_RADIUS, PLACES, Starts, covers, paws_and_velocities
 from jumper_warp.kernels.jump.state import FLIGHT, LANDED, STANCE
 from jumper_warp.registry import make_task
@@ -51,7 +41,7 @@ def env(request):
 @pytest.fixture(scope="module")
 def starts(env):
     """Return the `Starts` of every mode by its name, and without base offset by "exact " and its name."""
-    samples = {start_mode: Starts(env, start_mode) for start_mode in NUM_START_MODES}
+    samples = {start_mode: Starts(env, start_mode) for start_mode in START_MODES}
     return samples | {
         f"exact {start_mode}": Starts(env, start_mode, exact=True)
         for start_mode in ("in_flight", "touchdown", "after_landing")
@@ -67,7 +57,7 @@ def test_start_modes_have_the_tasks_probabilities(env):
     assert np.abs(fractions - [0.40, 0.15, 0.15, 0.15, 0.05, 0.10]).max() < 4.0 * np.sqrt(0.25 / N) + 0.02
 
 
-@pytest.mark.parametrize("start_mode", NUM_START_MODES)
+@pytest.mark.parametrize("start_mode", START_MODES)
 def test_no_state_collides_or_crosses_the_motor_limits(starts, start_mode):
     assert not starts[start_mode].flags.any()
     angles = starts[start_mode].q[:, MOTOR_Q].reshape(-1, 4, 3)
@@ -76,12 +66,12 @@ def test_no_state_collides_or_crosses_the_motor_limits(starts, start_mode):
     assert sums.min() >= -1e-4 and sums.max() <= 220.0 * DEG + 1e-4
 
 
-@pytest.mark.parametrize("start_mode", [name for name in NUM_START_MODES if name != "default"])
+@pytest.mark.parametrize("start_mode", [name for name in START_MODES if name != "default"])
 def test_the_default_pose_rarely_replaces_invalid_samples(starts, start_mode):
     assert starts[start_mode].fallbacks < 0.02
 
 
-@pytest.mark.parametrize("start_mode", NUM_START_MODES)
+@pytest.mark.parametrize("start_mode", START_MODES)
 def test_headings_cover_the_circle_and_attitudes_their_ranges(env, starts, start_mode):
     sample = starts[start_mode]
     heading = sample.episodes["heading"]
@@ -107,7 +97,7 @@ def test_only_horizontal_jumps_stand_pitched_forward(env, starts):
     assert body[:, 1].mean() == pytest.approx(0.5 * mean, abs=0.15 * mean + 4.0 * 5.0 * DEG / np.sqrt(len(body)))
 
 
-@pytest.mark.parametrize("start_mode", NUM_START_MODES)
+@pytest.mark.parametrize("start_mode", START_MODES)
 def test_goals_lie_in_the_levels_box_or_ellipse_turned_by_the_heading(env, starts, start_mode):
     sample = starts[start_mode]
     ahead = sample.heading.inv().apply(sample.goal)
@@ -123,7 +113,7 @@ def test_goals_lie_in_the_levels_box_or_ellipse_turned_by_the_heading(env, start
 
 
 def test_phases_and_the_command_fit_the_start_mode(starts):
-    for start_mode, phase in zip(NUM_START_MODES, (STANCE, STANCE, FLIGHT, FLIGHT, LANDED, STANCE), strict=True):
+    for start_mode, phase in zip(START_MODES, (STANCE, STANCE, FLIGHT, FLIGHT, LANDED, STANCE), strict=True):
         episodes = starts[start_mode].episodes
         assert (episodes["phase"] == int(phase)).all()
         if start_mode in ("standing", "default"):
@@ -197,7 +187,7 @@ def test_paws_of_a_push_rest_on_the_ground_around_the_start(starts):
 def test_paws_of_a_push_are_at_rest_while_the_base_moves(env):
     begin_by(env, only("pushing", resets_of(env)))
     env.reset()
-    worlds = np.flatnonzero(episodes_of(env)["start_mode"] == NUM_START_MODES.index("pushing"))[:40]
+    worlds = np.flatnonzero(episodes_of(env)["start_mode"] == START_MODES.index("pushing"))[:40]
     _, velocities = paws_and_velocities(env, worlds)
     assert np.abs(velocities).max() < 1e-3 and np.abs(env.sim.joint_qd()[worlds, :3]).max() > 1.0
 
@@ -303,8 +293,8 @@ def test_touchdown_starts_of_far_goals_fall(starts):
 
 
 def test_a_next_jump_is_planned_above_the_first_levels_with_its_probability(env, starts):
-    planned = np.concatenate([starts[start_mode].episodes["next_jump_step"] for start_mode in NUM_START_MODES])
-    level = np.concatenate([starts[start_mode].level for start_mode in NUM_START_MODES])
+    planned = np.concatenate([starts[start_mode].episodes["next_jump_step"] for start_mode in START_MODES])
+    level = np.concatenate([starts[start_mode].level for start_mode in START_MODES])
     assert not planned[level == 0].any()
     fraction = (planned[level > 1] > 0).mean()  # the first goals have two levels of starts
     assert not planned[level == 1].any()

@@ -8,7 +8,7 @@ import pytest
 from jump_helpers import (
     DEFAULT_ANGLE,
     DEG,
-    NUM_START_MODES,
+    START_MODES,
     begin_by,
     edit_episodes,
     episodes_of,
@@ -78,7 +78,7 @@ def euler(quat):
 
 def worlds_with_mode(episodes, start_mode, count=60):
     """Return the indices of the first `count` worlds that began in a start mode."""
-    return np.flatnonzero(episodes["start_mode"] == NUM_START_MODES.index(start_mode))[:count]
+    return np.flatnonzero(episodes["start_mode"] == START_MODES.index(start_mode))[:count]
 
 
 def test_start_modes_have_their_probabilities(sampled):
@@ -203,12 +203,12 @@ def test_colliding_samples_are_rejected(reset_with):
     for reset in (only("standing"), only("in_flight", flight_transversal=(-30.0, 60.0))):
         env = reset_with(reset, level)
         assert not collision_flags(env).any()
-        assert np.mean(env.task_arrays()["start_mode"] == NUM_START_MODES.index("default")) < 0.5
+        assert np.mean(env.task_arrays()["start_mode"] == START_MODES.index("default")) < 0.5
 
 
 def test_worlds_start_at_different_positions(sampled):
     _, episodes, q, _ = sampled
-    moving = episodes["start_mode"] != NUM_START_MODES.index("default")
+    moving = episodes["start_mode"] != START_MODES.index("default")
     assert len(np.unique(q[moving, :3], axis=0)) == moving.sum()
 
 
@@ -223,14 +223,14 @@ def test_kinematic_loops_of_starts_are_closed():
 @pytest.mark.parametrize("start_mode", ["standing", "in_flight", "touchdown", "after_landing"])
 def test_the_default_pose_rarely_replaces_invalid_samples(reset_with, start_mode):
     env = reset_with(only(start_mode), Level((0.0, 0.0, 0.45), (0.0, 0.0, 1.2), (0.22, 0.45)))
-    assert np.mean(env.task_arrays()["start_mode"] == NUM_START_MODES.index("default")) < 0.005
+    assert np.mean(env.task_arrays()["start_mode"] == START_MODES.index("default")) < 0.005
 
 
 def test_an_unreachable_start_becomes_the_default_pose():
     # a base 0.7 m above paws on the ground: beyond the legs' length
     level = Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.7, 0.8))
     env = make_env(16, reset=only("standing"), task=dataclasses.replace(TASK, levels=(level,)))
-    assert env.task_arrays()["start_mode"].tolist() == [NUM_START_MODES.index("default")] * 16
+    assert env.task_arrays()["start_mode"].tolist() == [START_MODES.index("default")] * 16
     np.testing.assert_array_equal(env.sim.joint_q(), env.sim.model.joint_q.numpy().reshape(16, -1))
 
 
