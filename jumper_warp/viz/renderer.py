@@ -1,0 +1,243 @@
+"""Images of triangle meshes without a display: OpenGL, or ray tracing where OpenGL is missing.
+
+OpenGL (Newton's `ViewerGL`) draws soft shadows, lines and transparent bodies. The ray tracer (Newton's `SensorCamera`)
+is four times slower and draws neither lines nor transparency.
+"""
+
+from __future__ import annotations
+
+import math
+import sys
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, cast
+
+import newton
+import numpy as np
+import warp as wp
+from newton.sensors import SensorCamera
+
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.newton_types import Model, State
+from jumper_warp.viz.shapes import ShapeMesh
+
+FIELD_OF_VIEW = 30.0  # [deg] vertical angle of view
+SUN = (-0.35, -0.45, 0.82)  # direction to the sun, world frame
+SKY = (0.93, 0.95, 0.97)  # RGB of the sky above
+HORIZON = (0.83, 0.87, 0.91)  # RGB of the sky at the horizon
+AMBIENT = (0.55, 0.56, 0.60)  # linear RGB of the ray tracer's ambient light
+SAMPLES = 4  # rays per pixel of the ray tracer
+LINE_WIDTH = 1.0 / 320.0  # [1] width of lines over the image's height
+GL_PACKAGES = "apt-get install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri"
+NO_GL = f"pip install jumper-warp[video], and on Debian {GL_PACKAGES}"
+
+
+@dataclass(frozen=True)
+class View:
+    """A pinhole camera that looks from `eye` at `target`, with z up in the image."""
+
+    eye: np.ndarray  # (3,) [m] world frame
+    target: np.ndarray  # (3,) [m] world frame, at the image's centre
+    field_of_view: float = FIELD_OF_VIEW  # [deg] vertical
+
+    def axes(self) -> np.ndarray:
+        """Return the unit vectors right, up and ahead of the image as rows, (3, 3), world frame.
+
+        Raises InputError: eye and target are on one vertical line.
+        """
+        ahead = np.asarray(self.target, dtype=float) - np.asarray(self.eye, dtype=float)
+        right = np.cross(ahead, [0.0, 0.0, 1.0])
+        if np.linalg.norm(right) < 1.0e-6 * max(1.0, float(np.linalg.norm(ahead))):
+            raise InputError(f"cannot look from {tuple(self.eye)} to {tuple(self.target)}: no horizontal distance")
+        ahead, right = ahead / np.linalg.norm(ahead), right / np.linalg.norm(right)
+        return np.stack([right, np.cross(right, ahead), ahead])
+
+    def project(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+        """Return pixels (n, 2) of points (n, 3) [m], world frame, from the image's upper left corner.
+
+        size: width and height [px]. Points behind the camera become NaN.
+        """
+        right, up, depth = ((np.asarray(points, dtype=float) - self.eye) @ self.axes().T).T
+        depth = np.where(depth > 1.0e-6, depth, np.nan)
+        focal = 0.5 * size[1] / math.tan(0.5 * math.radians(self.field_of_view))
+        return np.stack([0.5 * size[0] + focal * right / depth, 0.5 * size[1] - focal * up / depth], axis=1)
+
+
+@dataclass(frozen=True)
+class Line:
+    """A polyline of one color, without thickness in the world."""
+
+    points: np.ndarray  # (n, 3) [m], world frame
+    color: tuple[float, float, float]  # RGB, each in [0, 1]
+    arrow: bool = False  # Draw an arrow from the first to the last point
+
+
+class Renderer(ABC):
+    """Draws bodies with triangle meshes at given poses. Use as a context manager, or call `close`."""
+
+    name: str  # in words, for messages
+
+    def __init__(
+        self, shapes: Sequence[ShapeMesh], num_bodies: int, size: tuple[int, int], opacity: Sequence[float] = (1.0,)
+    ) -> None:
+        """Prepare copies of the bodies; shapes that are fixed to the world exist once.
+
+        num_bodies: indices in `ShapeMesh.body` are below it. size: width and height of the images [px]. opacity: of
+        each copy, 0 to 1.
+        """
+        self.size = size
+        self.model = _scene_model(shapes, num_bodies, opacity)
+        self.state: State = self.model.state()
+
+    def draw(self, poses: np.ndarray, view: View, lines: Sequence[Line] = ()) -> np.ndarray:
+        """Return an image, (height, width, 3) uint8, RGB, row 0 on top.
+
+        poses: of the bodies of every copy, (copies * num_bodies, 7), position [m] and quaternion xyzw, world frame.
+        """
+        self.state.body_q.assign(np.ascontiguousarray(poses, dtype=np.float32).reshape(-1, 7))
+        return self._image(view, lines)
+
+    @abstractmethod
+    def _image(self, view: View, lines: Sequence[Line]) -> np.ndarray:
+        """Return an image of `state`, as `draw`."""
+
+    def close(self) -> None:
+        """Free the renderer's resources; it draws no more."""
+
+    def __enter__(self) -> Renderer:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+
+class GLRenderer(Renderer):
+    """Renderer with OpenGL, by Newton's viewer in an invisible window."""
+
+    name = "OpenGL"
+
+    def __init__(
+        self, shapes: Sequence[ShapeMesh], num_bodies: int, size: tuple[int, int], opacity: Sequence[float] = (1.0,)
+    ) -> None:
+        """As `Renderer`. Raises ImportError: pyglet is missing; RuntimeError: OpenGL is missing or too old."""
+        super().__init__(shapes, num_bodies, size, opacity)
+        self._viewer = viewer = _gl_viewer(size)
+        viewer.set_model(self.model)
+        viewer.show_joints = viewer.show_com = False
+        renderer = viewer.renderer
+        renderer.spotlight_enabled, renderer.sky_upper, renderer.sky_lower = False, SKY, HORIZON
+        renderer._sun_direction = np.array(SUN) / np.linalg.norm(SUN)
+        renderer.line_width = LINE_WIDTH * size[1]
+        renderer.arrow_scale = 0.5 * LINE_WIDTH * size[1]
+
+    def _image(self, view: View, lines: Sequence[Line]) -> np.ndarray:
+        viewer, camera = self._viewer, self._viewer.camera
+        camera.fov = view.field_of_view
+        camera.pos = camera._as_vec3(view.eye)
+        camera.look_at(view.target)
+        viewer.begin_frame(0.0)
+        viewer.log_state(self.state)
+        for arrow, log in ((False, viewer.log_lines), (True, viewer.log_arrows)):
+            log(f"lines/{arrow}", *_segments([line for line in lines if line.arrow == arrow]))
+        viewer.end_frame()
+        return viewer.get_frame().numpy().copy()
+
+    def close(self) -> None:
+        """Close the window."""
+        self._viewer.close()
+
+
+class RayTracer(Renderer):
+    """Renderer without OpenGL; draws neither lines nor transparency."""
+
+    name = "ray tracing"
+
+    def __init__(
+        self, shapes: Sequence[ShapeMesh], num_bodies: int, size: tuple[int, int], opacity: Sequence[float] = (1.0,)
+    ) -> None:
+        """As `Renderer`."""
+        super().__init__(shapes, num_bodies, size, opacity)
+        self._sensor = SensorCamera(self.model)
+        self._sensor.create_default_light(direction=wp.vec3(*(-np.array(SUN) / np.linalg.norm(SUN))))
+        self._sensor.set_ambient_light(AMBIENT)
+        red, green, blue = (round(255 * channel) for channel in SKY)
+        clear = SensorCamera.ClearData(clear_color=0xFF000000 | blue << 16 | green << 8 | red)
+        self._sensor.default_clear_data = clear
+        self._sensor.default_render_config.enable_shadows = True
+        self._sensor.default_render_config.anti_aliasing = SensorCamera.AntiAliasing.SSAA
+        self._pixels: Any = self._sensor.allocate_image_color(1, *size)
+        self._rays: Any = None
+        self._field_of_view = 0.0  # [deg] of `_rays`
+
+    def _image(self, view: View, lines: Sequence[Line]) -> np.ndarray:
+        if view.field_of_view != self._field_of_view:
+            self._field_of_view = view.field_of_view
+            self._rays = SensorCamera.compute_camera_rays_pinhole(
+                *self.size, camera_fov=math.radians(view.field_of_view), sample_count=SAMPLES, device=self.model.device
+            )
+        right, up, ahead = view.axes()
+        turn: Any = wp.quat_from_matrix(wp.mat33(*np.stack([right, up, -ahead], axis=1).ravel().tolist()))
+        pose = wp.array([wp.transformf(wp.vec3(*map(float, view.eye)), turn)], dtype=wp.transformf)
+        self.model.bvh_refit_shapes(self.state)
+        self._sensor.update(self.state, pose, self._rays, color_image=self._pixels)
+        colors: Any = SensorCamera.Utils.to_rgba_from_color(self._pixels)
+        return colors.numpy()[0, ..., :3].copy()
+
+
+def open_renderer(
+    shapes: Sequence[ShapeMesh], num_bodies: int, size: tuple[int, int], opacity: Sequence[float] = (1.0,)
+) -> Renderer:
+    """Return a renderer with OpenGL, or, with a line on standard error, one that traces rays; as `Renderer`."""
+    try:
+        return GLRenderer(shapes, num_bodies, size, opacity)
+    except (ImportError, RuntimeError, OSError) as error:
+        print(f"no OpenGL ({error!s:.100}), so the slow ray tracer draws: {NO_GL}", file=sys.stderr)
+        return RayTracer(shapes, num_bodies, size, opacity)
+
+
+def _gl_viewer(size: tuple[int, int]) -> Any:
+    """Return Newton's viewer in an invisible window of a size [px].
+
+    Raises ImportError: pyglet is missing; RuntimeError: no OpenGL.
+    """
+    import pyglet
+
+    pyglet.options["headless"] = True  # read when pyglet's window module is first imported
+    try:
+        return newton.viewer.ViewerGL(width=size[0], height=size[1], headless=True)
+    except ImportError:
+        raise
+    except Exception as error:  # pyglet and Newton raise many kinds, of no common base
+        raise RuntimeError(f"{type(error).__name__}: {error}") from error
+
+
+def _scene_model(shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float]) -> Model:
+    """Return a Newton model of `len(opacity)` copies of the bodies, only to be drawn."""
+    builder = newton.ModelBuilder()
+    builder.default_shape_cfg = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False)
+    meshes = [
+        newton.Mesh(shape.vertices, shape.triangles.ravel(), normals=shape.normals, compute_inertia=False)
+        for shape in shapes
+    ]
+    for copy, alpha in enumerate(opacity):
+        for _ in range(num_bodies):
+            builder.add_body(is_kinematic=True)
+        for shape, mesh in zip(shapes, meshes, strict=True):
+            if shape.body >= 0:
+                body = copy * num_bodies + shape.body
+                builder.add_shape_mesh(body, mesh=mesh, color=shape.color, opacity=alpha)
+            elif copy == 0:
+                builder.add_shape_mesh(-1, mesh=mesh, color=shape.color)
+    return cast(Model, builder.finalize())
+
+
+def _segments(lines: Sequence[Line]) -> tuple[wp.array | None, wp.array | None, wp.array | None]:
+    """Return starts, ends and colors of all segments of lines, vec3 each; an arrow is one segment."""
+    if not lines:
+        return None, None, None
+    parts = [line.points[[0, -1]] if line.arrow else line.points for line in lines]
+    starts = np.concatenate([points[:-1] for points in parts])
+    ends = np.concatenate([points[1:] for points in parts])
+    colors = np.concatenate([np.tile(line.color, (len(points) - 1, 1)) for line, points in zip(lines, parts)])
+    return tuple(wp.array(values.astype(np.float32), dtype=wp.vec3) for values in (starts, ends, colors))
