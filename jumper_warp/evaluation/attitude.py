@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.film import Film, Filmstrip
 from jumper_warp.evaluation.log import (
     COLLIDED,
     DIVERGED,
@@ -28,7 +27,6 @@ AXES = ("roll", "pitch", "yaw")
 DIRECTIONS = tuple(f"{axis}_{sign}" for axis in AXES for sign in ("plus", "minus"))
 """Turns about the body's x, y and z axes: roll_plus, roll_minus, pitch_plus, ...; plus is right-handed."""
 HARDWARE_TIME = 2.6  # [s] Settling time of the authors' robot for a turn by 90 degrees
-PICTURES = 6  # Number of pictures in a filmstrip
 
 
 def axis_turns(count: int, angle: float) -> np.ndarray:
@@ -137,16 +135,6 @@ class AttitudeLog(EvaluationLog):
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the commanded turns of some worlds: key `turns_xyzw`, a list of quaternions."""
         return {"turns_xyzw": self.turns[list(worlds)].tolist()}
-
-    def filmstrip(self, film: Film) -> Filmstrip:
-        """Return a filmstrip of the first recorded world, evenly spaced until it settles, else to the end."""
-        world = film.worlds[0]
-        until = np.nan_to_num(self.settling_time[world], nan=self.seconds)
-        frames = np.linspace(0, round(until / self.step_dt) - 1, PICTURES).round().astype(int).tolist()
-        captions = [f"{(i + 1) * self.step_dt:.2f} s, {np.degrees(self.errors[i][world]):.0f} deg" for i in frames]
-        height = float(film.base_positions(0)[0, 2])
-        view = {"eye": (1.2, 1.5, height + 0.5), "target": (0.0, 0.0, height - 0.05), "size": (320, 320)}
-        return Filmstrip(0, frames, captions, **view, name="turn_strip")
 
 
 def turn_metrics(turns: AttitudeLog) -> Metrics:

@@ -11,8 +11,7 @@ import torch
 import tyro
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.film import Film, Filmstrip, keyframes
-from jumper_warp.evaluation.jumps import DELAY, REST_SPEED, REST_TIME, STANCE, JumpFlags, JumpLog, stance_metrics
+from jumper_warp.evaluation.jumps import REST_SPEED, REST_TIME, STANCE, JumpFlags, JumpLog, stance_metrics
 from jumper_warp.evaluation.log import (
     COLLIDED,
     DIVERGED,
@@ -39,8 +38,6 @@ FALLS = ("low_base", "tilted")
 WRONG_HEIGHT = "wrong_height"  # Outcome of a jump that landed from another apex height than commanded
 DRIFT, TURN = 0.2, 25.0  # [m], [deg] Drift and turn of the base beyond which the authors' configuration ends an episode
 MAX_ROBOTS = 64  # Maximum number of robots in one recording
-LOWEST, HIGHEST, ABOVE = (-0.37, 1.47, 0.45)  # [m] Lower, upper edge of a filmstrip at the robot; margin above the apex
-SHOWN_HEIGHT = 1.0  # [m] The filmstrip shows the jump whose commanded height is nearest to this
 
 
 def with_success_last(task: TaskCfg) -> TaskCfg:
@@ -111,25 +108,13 @@ class HeightLog(JumpLog):
         """Return the commanded heights [m] of some worlds: key `targets_m`."""
         return {"targets_m": self.commanded[list(worlds), 0].tolist()}
 
-    def filmstrip(self, film: Film) -> Filmstrip:
-        """Return a filmstrip of the jump whose commanded height is nearest to SHOWN_HEIGHT."""
-        heights = self.commanded[film.worlds, 0]
-        index = int(np.argmin(np.abs(heights - SHOWN_HEIGHT)))
-        height = film.base_positions(index)[:, 2]
-        frames = keyframes(height, round(DELAY / film.env.step_dt) - 1)
-        captions = [f"{(frame + 1) * film.env.step_dt:.2f} s, {height[frame]:.2f} m" for frame in frames]
-        eye, target, size = side_camera(float(height[frames].max()))
-        return Filmstrip(index, frames, captions, eye, target, size, name=f"jump_{heights[index]:.2f}_m")
+    def goal_heights(self, worlds: Sequence[int]) -> np.ndarray:
+        """Return the commanded heights [m] of some worlds, (worlds,)."""
+        return self.commanded[list(worlds), 0]
 
-
-def side_camera(apex: float) -> tuple[tuple[float, float, float], tuple[float, float, float], tuple[int, int]]:
-    """Return camera position and target [m], world, and picture width and height [px] for a jump to an apex [m].
-
-    Pictures of higher jumps are taller, at the same scale.
-    """
-    taller = max(1.0, (apex + ABOVE - LOWEST) / (HIGHEST - LOWEST))
-    middle = LOWEST + 0.5 * taller * (HIGHEST - LOWEST)
-    return (1.5 * taller, 2.0 * taller, middle + 0.35 * taller), (0.0, 0.0, middle), (320, round(420 * taller))
+    def labels(self, worlds: Sequence[int]) -> list[str]:
+        """Return the commanded heights of some worlds in metres, such as "0.90 m"."""
+        return [f"{self.commanded[world, 0]:.2f} m" for world in worlds]
 
 
 def run_jumps(act: Callable[[torch.Tensor], torch.Tensor], env: Env, heights: np.ndarray) -> HeightLog:

@@ -21,6 +21,7 @@ from jumper_warp.evaluation.log import (
 )
 from jumper_warp.utils.errors import InputError
 
+PHASES = ("stance", "flight", "landed")  # Names of the values of a jump's phase
 STANCE, LANDED = 0, 2  # Values of the jump's phase before takeoff and after touchdown
 REST_SPEED = 0.1  # [m/s] Speed of the base's centre of mass below which the robot is at rest
 REST_TIME = 1.0  # [s] Time after touchdown at which the robot should be at rest
@@ -219,6 +220,11 @@ class JumpLog(EvaluationLog):
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
         """Return the present base height [m] of some worlds."""
         return {f"height/base of {world} [m]": self.arrays["base_pos"][world, 2] for world in worlds}
+
+    def states(self, worlds: Sequence[int]) -> dict[str, str]:
+        """Return the phase of some worlds' jumps."""
+        labels = self.labels(worlds)
+        return {f"phase/{label}": PHASES[self.arrays["phase"][world]] for label, world in zip(labels, worlds)}
 
 
 def stance_metrics(jumps: JumpLog) -> Metrics:

@@ -14,7 +14,6 @@ from typing import Any, Literal
 import numpy as np
 import tyro
 
-from jumper_warp.evaluation.film import PICTURE_SIZE, Film, Filmstrip, keyframes, side_view
 from jumper_warp.evaluation.heights import MAX_ROBOTS
 from jumper_warp.evaluation.jumps import REST_SPEED, REST_TIME, TAKEOFF_SPEED, JumpFlags, JumpLog, stance_metrics
 from jumper_warp.evaluation.log import (
@@ -44,7 +43,6 @@ MISSED = "missed"  # Outcome of a jump that landed, but beyond SUCCESS_TOLERANCE
 EARLY = "early"  # Outcome of a landed jump that began before its command
 AT_REST_AT_END = "below_0_1_m_s_at_the_end_rate"  # Metric: fraction of landed jumps with the base at rest at the end
 JUMP_SECONDS, NEXT_JUMP_SECONDS = 3.5, 2.5  # [s] Length of a recording of one jump, and addition for each further jump
-SHOWN_DISTANCE = 1.0  # [m] The filmstrip shows the jump whose goal is nearest to this distance
 
 
 def with_landing_terminations(task: TaskCfg) -> TaskCfg:
@@ -132,20 +130,10 @@ class LandingLog(JumpLog):
         """Return the goals [m] of some worlds: key `goals_m`."""
         return {"goals_m": self.goal_positions[list(worlds)].tolist()}
 
-    def filmstrip(self, film: Film) -> Filmstrip:
-        """Return a filmstrip of the world whose first goal is nearest to SHOWN_DISTANCE."""
-        distance = np.linalg.norm(self.goal_positions[film.worlds, 0], axis=1)
-        index = int(np.argmin(np.abs(distance - SHOWN_DISTANCE)))
-        base = film.base_positions(index)
-        if self.goal_positions.shape[1] == 1:
-            delay = np.broadcast_to(self.delay, film.env.num_envs)[film.worlds[index]]
-            frames = keyframes(base[:, 2], round(delay / film.env.step_dt) - 1)
-        else:
-            frames = np.linspace(0, len(base) - 1, 9).round().astype(int).tolist()
-        end_positions = self.end_position[film.worlds[index]]
-        eye, target = side_view(base[0, :2], end_positions[np.isfinite(end_positions[:, 0])][-1])
-        captions = [f"{(frame + 1) * film.env.step_dt:.2f} s" for frame in frames]
-        return Filmstrip(index, frames, captions, eye, target, PICTURE_SIZE)
+    def labels(self, worlds: Sequence[int]) -> list[str]:
+        """Return the first goals of some worlds in metres: "0.90 m" ahead, or "(0.80, 0.20) m" ahead and left."""
+        goals = self.goal_positions[list(worlds), 0]
+        return [f"{x:.2f} m" if y == 0.0 else f"({x:.2f}, {y:.2f}) m" for x, y in goals]
 
 
 def landing_metrics(landings: LandingLog, inside: np.ndarray | None = None) -> Metrics:

@@ -17,8 +17,6 @@ from jumper_warp.utils.errors import InputError
 if TYPE_CHECKING:
     import torch
 
-    from jumper_warp.evaluation.film import Film, Filmstrip
-
 SUCCESS = "success"  # Outcomes, also names of terminations
 DIVERGED = "came_apart"  # The state of the simulation is not finite or absurdly fast
 COLLIDED = "collided"  # A link other than a paw touched something
@@ -60,13 +58,25 @@ class EvaluationLog(ABC):
         """Return goal positions [m] to mark in a recording, world frame, (worlds, goals per world, 3), or None."""
         return None
 
+    def goal_heights(self, worlds: Sequence[int]) -> np.ndarray | None:
+        """Return commanded heights [m] of the base at the apex, above the ground, (worlds,), or None."""
+        return None
+
+    def labels(self, worlds: Sequence[int]) -> list[str]:
+        """Return the names of some worlds in recordings and pictures, such as their goals in metres."""
+        return [f"{self.row_name} {world}" for world in worlds]
+
+    def states(self, worlds: Sequence[int]) -> dict[str, str]:
+        """Return the present state of some worlds in words, such as the phase of a jump, by `quantity/label`."""
+        return {}
+
+    def velocity_commands(self, worlds: Sequence[int]) -> np.ndarray | None:
+        """Return present commanded velocities ahead, left [m/s], about z [rad/s], body axes, (worlds, 3), or None."""
+        return None
+
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the metadata, JSON values by key, that a recording of some worlds (indices) saves."""
         return {}
-
-    def filmstrip(self, film: Film) -> Filmstrip | None:
-        """Return frames, captions and camera of a filmstrip, or None if this kind of log has none."""
-        return None
 
     def read_env(self, env: Env) -> dict[str, np.ndarray]:
         """Return the arrays that `update` needs, by name, (num_envs, ...) each; by default `Env.task_arrays`."""

@@ -21,7 +21,7 @@ from rich.table import Table
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.evaluations import evaluation_of
-from jumper_warp.evaluation.film import Film
+from jumper_warp.evaluation.film import EnvRecorder
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.restore import restored_task
@@ -49,8 +49,8 @@ class EvaluationArgs(Conditions):
 
     noise: tyro.conf.Suppress[tyro.conf.Fixed[bool]] = False
     policy: str = "horizontal_jump"  # Name or folder of a policy, a run's folder, or a checkpoint
-    num_recorded: int = 1  # Number of jumps to record for the Rerun viewer and, one of them, as a filmstrip; 0: none
-    out: Path | None = None  # Folder for figures, plots, recordings and filmstrips (default: outputs/<name>/<time>)
+    num_recorded: int = 1  # Number of jumps to record for the Rerun viewer and, one of them, as a picture; 0: none
+    out: Path | None = None  # Folder for metrics, plots, pictures and recordings (default: outputs/<name>/<time>)
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -125,10 +125,10 @@ class Run(ABC):
     ) -> Log:  # fmt: skip
         """Run one episode per world with the commands of a log, and return the log.
 
-        film: name of the recording and filmstrip of some worlds; empty: none. film_scene: the environment's `ground`
+        film: name of the recording and picture of some worlds; empty: none. film_scene: the environment's `ground`
         and `block`, to show them in the recording. on_step: called with the log after every policy step.
         """
-        recorder = self._make_film(env, log, film_scene or {}) if film and self.record else None
+        recorder = self._make_recorder(env, log, film_scene or {}) if film and self.record else None
 
         def after_step() -> None:
             if on_step is not None:
@@ -140,23 +140,13 @@ class Run(ABC):
         self._latency.append(env.parameters.latency.numpy().copy())
         self._physics_dt = env.physics_dt
         if recorder is not None:
-            self._save_film(recorder, log, film)
+            save_pictures(recorder.recording(), self.folder, film)
         return log
 
-    def _make_film(self, env: Env, log: EvaluationLog, film_scene: Mapping[str, Any]) -> Film:
-        """Return a film of `record` evenly spaced worlds; film_scene: as for `run_episodes`."""
-        ground = film_scene.get("ground", "plane")
+    def _make_recorder(self, env: Env, log: EvaluationLog, scene: Mapping[str, Any]) -> EnvRecorder:
+        """Return a recorder of `record` evenly spaced worlds; scene: as for `run_episodes`."""
         worlds = np.linspace(0, env.num_envs - 1, min(self.record, env.num_envs)).round().astype(int).tolist()
-        spacing = log.spacing if isinstance(ground, str) else 0.0
-        block, notes = film_scene.get("block"), log.notes(worlds)
-        return Film(env, log.series, worlds, spacing=spacing, ground=ground, block=block, notes=notes)
-
-    def _save_film(self, film: Film, log: EvaluationLog, name: str) -> None:
-        """Write a film as `<name>.rrd`, and as a PNG filmstrip unless it has blocks, which filmstrips do not show."""
-        film.save_rrd(self.folder / f"{name}.rrd", log.goal_markers(film.worlds))
-        filmstrip = None if film.block is not None else log.filmstrip(film)
-        if filmstrip is not None:
-            film.save_filmstrip(filmstrip, self.folder / f"{filmstrip.name or name}.png")
+        return EnvRecorder(env, log, worlds, ground=scene.get("ground", "plane"), block=scene.get("block"))
 
     def report(self, metrics: Mapping[str, Any], paper: Mapping[str, float]) -> dict[str, Any]:
         """Write conditions and metrics to `metrics.json`, print them beside the paper's values, return them."""

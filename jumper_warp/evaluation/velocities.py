@@ -10,7 +10,6 @@ import numpy as np
 import tyro
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.film import PICTURE_SIZE, Film, Filmstrip, side_view
 from jumper_warp.evaluation.log import EvaluationLog, Metrics, finite
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
@@ -19,8 +18,6 @@ from jumper_warp.utils.rotations import CONJUGATE, rotate
 Velocity = tuple[float, float, float]  # Ahead, to the left [m/s], about z [rad/s]
 AXES = ("vx", "vy", "yaw_rate")
 SETTLING_TIME = 1.0  # [s] Time after each command that is excluded from tracking errors
-SHOWN_TIME = 0.6  # [s] Length of the filmstrip at the end of a walk, more than a stride
-PICTURES = 9  # Number of pictures in a filmstrip
 MAX_ROBOTS = 20_000  # Maximum number of robots in a test
 
 
@@ -131,14 +128,9 @@ class VelocityLog(EvaluationLog):
         """Return the commands of some robots and their times: keys `commands`, `times_s`."""
         return {"commands": self.commands[list(worlds)].tolist(), "times_s": self.times.tolist()}
 
-    def filmstrip(self, film: Film) -> Filmstrip:
-        """Return a filmstrip of the last SHOWN_TIME seconds of the first recorded robot."""
-        base = film.base_positions(0)
-        first = max(0, len(base) - 1 - round(SHOWN_TIME / film.env.step_dt))
-        frames = np.linspace(first, len(base) - 1, PICTURES).round().astype(int).tolist()
-        eye, target = side_view(base[first, :2], base[-1, :2])
-        captions = [f"{(frame + 1) * film.env.step_dt:.2f} s" for frame in frames]
-        return Filmstrip(0, frames, captions, eye + [0.0, 0.0, base[-1, 2] - 0.3], target, PICTURE_SIZE)
+    def velocity_commands(self, worlds: Sequence[int]) -> np.ndarray:
+        """Return the present commands of some robots, (worlds, 3)."""
+        return self.command_history()[-1][list(worlds)]
 
 
 def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:

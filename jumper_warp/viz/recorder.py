@@ -31,11 +31,12 @@ class Recorder:
         *,
         spacing: float = 0.0,
         notes: Mapping[str, Any] | None = None,
+        labels: Sequence[str] = (),
     ) -> None:
         """Prepare to record some worlds of a model; its bodies and shapes are read once, here.
 
         spacing: distance [m] along y between the drawings of consecutive worlds; zero keeps the true positions, as a
-        heightfield needs. notes: metadata of JSON types, saved with the recording.
+        heightfield needs. notes: metadata of JSON types, saved with the recording. labels: names of the worlds.
         Raises InputError: a world has no bodies, or a visible shape cannot be drawn.
         """
         world_of_body = model.body_world.numpy()
@@ -52,11 +53,13 @@ class Recorder:
             ShapeMesh(s.name, index[s.body], s.color, s.vertices, s.normals, s.triangles)
             for s in shape_meshes(model, self._worlds)
         )
-        self._notes = dict(notes or {})
+        self._notes, self._labels = dict(notes or {}), tuple(labels)
         self._times: list[float] = []
         self._poses: list[np.ndarray] = []
         self._series: dict[str, list[float]] | None = None
         self._contacts: list[tuple[np.ndarray, np.ndarray]] = []
+        self._states: list[dict[str, str]] = []
+        self._commands: list[np.ndarray] = []
 
     def record(
         self,
@@ -65,13 +68,17 @@ class Recorder:
         series: Mapping[str, float] | None = None,
         contact_points: np.ndarray | None = None,
         contact_forces: np.ndarray | None = None,
+        *,
+        states: Mapping[str, str] | None = None,
+        commands: np.ndarray | None = None,
     ) -> None:
         """Add a frame at a time [s] after the previous frame's.
 
         body_poses: of all bodies of the model, as in `state.body_q`: (body_count, 7), position [m] and quaternion xyzw.
         series: values by name, `group/quantity [unit]`, the same names in every frame. contact_points [m] and
         contact_forces [N] on the robot: world frame, (num_worlds, contacts_per_world, 3), or (contacts, 3) for one
-        world, the same number in every frame.
+        world, the same number in every frame. states: words by name, such as a phase, the same names in every frame.
+        commands: commanded velocities ahead, to the left [m/s] and about z [rad/s], (worlds, 3), in every frame or none.
         Raises InputError: time does not increase, a shape is wrong, or a name is malformed, new or missing.
         """
         if self._times and not time > self._times[-1]:
@@ -84,6 +91,9 @@ class Recorder:
         self._times.append(float(time))
         self._poses.append(poses[self._bodies])
         self._contacts.append(contacts)
+        self._states.append(dict(states or {}))
+        if commands is not None:
+            self._commands.append(np.array(commands, dtype=np.float32).reshape(len(self._worlds), 3))
 
     def _append_series(self, series: Mapping[str, float]) -> None:
         """Append a frame's values by name. Raises InputError: a malformed, new or missing name."""
@@ -119,8 +129,11 @@ class Recorder:
             raise InputError(f"every frame needs contacts of shape {self._contacts[0][0].shape}, got {points.shape}")
         return points, forces
 
-    def recording(self) -> Recording:
-        """Return a recording of all frames so far. Raises InputError: there is no frame."""
+    def recording(self, *, goals: np.ndarray | None = None, heights: np.ndarray | None = None) -> Recording:
+        """Return a recording of all frames so far. Raises InputError: there is no frame.
+
+        goals [m]: on the ground, world frame, (worlds, goals, 3), NaN: none. heights [m]: commanded, (worlds,), NaN: none.
+        """
         if not self._times:
             raise InputError("nothing was recorded")
         return Recording(
@@ -134,6 +147,13 @@ class Recorder:
             spacing=self._spacing,
             shapes=self._shapes,
             notes=self._notes,
+            labels=self._labels,
+            states={name: [frame[name] for frame in self._states] for name in self._states[0]},
+            **{
+                name: np.asarray(values, dtype=np.float32)
+                for name, values in (("goals", goals), ("heights", heights), ("commands", self._commands or None))
+                if values is not None
+            },
         )
 
     def save_npz(self, path: Path) -> Path:

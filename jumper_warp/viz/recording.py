@@ -20,8 +20,8 @@ from jumper_warp.utils.files import write_atomically
 from jumper_warp.viz.shapes import ShapeMesh
 
 FORMAT = "jumper-warp recording"
-VERSION = 1
-ARRAYS = ("times", "poses", "contact_points", "contact_forces")  # fields of `Recording` that are arrays
+VERSION = 2
+ARRAYS = ("times", "poses", "contact_points", "contact_forces", "goals", "heights", "commands")  # fields of `Recording` that are arrays
 SURFACE = ("vertices", "normals", "triangles")  # fields of `ShapeMesh` that are arrays
 SERIES_NAME = re.compile(r"[^/\[\]]+/[^/\[\]]+ \[[^\[\]]+\]")
 """Pattern of a series' name, `group/quantity [unit]`; the unit of a pure number is 1."""
@@ -46,6 +46,23 @@ class Recording:
     spacing: float = 0.0  # [m] Distance along y between the drawings of consecutive worlds; the data are not moved
     shapes: tuple[ShapeMesh, ...] = ()  # meshes to draw; their `body` is an index of `bodies`, -1 for the world
     notes: dict[str, Any] = field(default_factory=dict)  # metadata of JSON types, such as seed, gains and commit
+    labels: tuple[str, ...] = ()  # names of the worlds to show, such as their goals; default `world_<i>`
+    states: dict[str, list[str]] = field(default_factory=dict)  # a word for each frame, such as a phase, by name
+    goals: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
+    """(num_worlds, goals, 3) [m] goals on the ground, world frame, NaN where there is none; no worlds: no goals."""
+    heights: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
+    """(num_worlds,) [m] commanded heights of the base at the apex, above z = 0; NaN or no worlds: none."""
+    commands: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
+    """(num_frames, num_worlds, 3) commanded velocity ahead, to the left [m/s] and about z [rad/s]; no frames: none."""
+
+    def label(self, rank: int) -> str:
+        """Return the name of the rank-th recorded world."""
+        return self.labels[rank] if self.labels else f"world_{self.worlds[rank]}"
+
+    def body_poses(self, rank: int) -> np.ndarray:
+        """Return the poses of the rank-th recorded world's own bodies, (num_frames, bodies, 7), the base first."""
+        prefix = f"world_{self.worlds[rank]}/"
+        return self.poses[:, [i for i, body in enumerate(self.bodies) if body.startswith(prefix)]]
 
     def save_npz(self, path: Path) -> Path:
         """Write the recording atomically to one NumPy archive without pickles; return its path. Raises OSError."""
@@ -58,6 +75,8 @@ class Recording:
             "shapes": [{"name": shape.name, "body": shape.body, "color": shape.color} for shape in self.shapes],
             "spacing": self.spacing,
             "notes": self.notes,
+            "labels": self.labels,
+            "states": self.states,
         }
         arrays = {name: getattr(self, name) for name in ARRAYS}
         arrays["header"] = np.array(json.dumps(header))
@@ -103,4 +122,6 @@ def _from_archive(header: dict[str, Any], archive: Mapping[str, np.ndarray]) -> 
         spacing=header["spacing"],
         shapes=shapes,
         notes=header["notes"],
+        labels=tuple(header["labels"]),
+        states=header["states"],
     )
