@@ -140,7 +140,7 @@ class Run(ABC):
         self._latency.append(env.parameters.latency.numpy().copy())
         self._physics_dt = env.physics_dt
         if recorder is not None:
-            save_pictures(recorder.recording(), self.folder, film)
+            pass
         return log
 
     def _make_recorder(self, env: Env, log: EvaluationLog, scene: Mapping[str, Any]) -> EnvRecorder:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,32 +9,42 @@ import trimesh
 
 from jumper_warp.viz.recording import Recording
 from jumper_warp.viz.shapes import ShapeMesh
+from jumper_warp.viz.style import GOAL_COLOR
 
-MARK_RADIUS = 0.04  # [m]
-MARK_LIFT = 0.003  # [m] height above the goal, so that the ground does not hide the disc
-MARK_CORNERS = 24  # of the polygon that approximates the disc
-MARK_COLOR = (0.85, 0.15, 0.15)  # RGB, each in [0, 1]
+RING_RADIUS = 0.1  # [m] outer radius: the largest error of a successful jump
+RING_WIDTH = 0.015  # [m]
+MARK_LIFT = 0.003  # [m] height above the goal, so that the ground does not hide the ring
+BAR_LENGTH, BAR_WIDTH, BAR_DISTANCE = 1.2, 0.012, 0.45  # [m] of a bar; distance from the robot
 BLOCK_COLOR = (0.55, 0.45, 0.35)  # RGB, each in [0, 1]
 
 
-def with_goal_markers(recording: Recording, goals: np.ndarray) -> Recording:
-    """Return the recording with a red disc at each finite goal.
+def goal_shapes(recording: Recording) -> list[ShapeMesh]:
+    """Return the shapes that mark a recording's goals: rings on the ground, bars at commanded heights.
 
-    goals: (recorded worlds, goals by world, 3) [m], world frame.
+    A ring has the radius of the tolerance of success. The two bars are parallel to x, on both sides of the robot.
     """
-    angle = np.linspace(0.0, 2.0 * math.pi, MARK_CORNERS, endpoint=False)
-    rim = MARK_RADIUS * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
-    disc = np.concatenate([np.zeros((1, 3)), rim]) + (0.0, 0.0, MARK_LIFT)
-    corner = np.arange(MARK_CORNERS)
-    triangles = np.stack([np.zeros_like(corner), 1 + corner, 1 + (corner + 1) % MARK_CORNERS], axis=1).astype(np.int32)
-    normals = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (len(disc), 1))
     marks = []
-    for rank, world_goals in enumerate(goals):
-        for number, goal in enumerate(world_goals):
+    for rank in range(len(recording.worlds)):
+        shift = np.array([0.0, rank * recording.spacing, 0.0])
+        for number, goal in enumerate(recording.goals[rank] if len(recording.goals) else ()):
             if np.isfinite(goal).all():
-                vertices = (disc + goal + (0.0, rank * recording.spacing, 0.0)).astype(np.float32)
-                marks.append(ShapeMesh(f"goal_{rank}_{number}", -1, MARK_COLOR, vertices, normals, triangles))
-    return replace(recording, shapes=(*recording.shapes, *marks))
+                ring = trimesh.creation.annulus(RING_RADIUS - RING_WIDTH, RING_RADIUS, 2.0 * MARK_LIFT, sections=48)
+                marks.append(_mark(f"goal_{rank}_{number}", ring, goal + shift))
+        if len(recording.heights) and np.isfinite(recording.heights[rank]):
+            base = recording.body_poses(rank)[0, 0, :2]
+            for side in (-1.0, 1.0):
+                bar = trimesh.creation.box(extents=(BAR_LENGTH, BAR_WIDTH, BAR_WIDTH))
+                place = np.array([base[0], base[1] + side * BAR_DISTANCE, recording.heights[rank]])
+                marks.append(_mark(f"height_{rank}_{'left' if side > 0 else 'right'}", bar, place + shift))
+    return marks
+
+
+def _mark(name: str, mesh: trimesh.Trimesh, place: np.ndarray) -> ShapeMesh:
+    """Return a mesh at a place [m], world frame, as a shape in the color of goals."""
+    mesh = mesh.smooth_shaded
+    vertices = (np.asarray(mesh.vertices) + place).astype(np.float32)
+    normals = np.asarray(mesh.vertex_normals, np.float32)
+    return ShapeMesh(name, -1, GOAL_COLOR, vertices, normals, np.asarray(mesh.faces, np.int32))
 
 
 def with_blocks(recording: Recording, centers: np.ndarray, half: np.ndarray, height: np.ndarray) -> Recording:

@@ -60,9 +60,13 @@ class Recording:
         return self.labels[rank] if self.labels else f"world_{self.worlds[rank]}"
 
     def body_poses(self, rank: int) -> np.ndarray:
-        """Return the poses of the rank-th recorded world's own bodies, (num_frames, bodies, 7), the base first."""
+        """Return the poses of the rank-th recorded world's bodies, (num_frames, bodies, 7), the base first."""
+        return self.poses[:, self.body_indices(rank)]
+
+    def body_indices(self, rank: int) -> list[int]:
+        """Return the indices in `bodies` of the rank-th recorded world."""
         prefix = f"world_{self.worlds[rank]}/"
-        return self.poses[:, [i for i, body in enumerate(self.bodies) if body.startswith(prefix)]]
+        return [i for i, body in enumerate(self.bodies) if body.startswith(prefix)]
 
     def save_npz(self, path: Path) -> Path:
         """Write the recording atomically to one NumPy archive without pickles; return its path. Raises OSError."""

@@ -27,8 +27,10 @@ SUN = (-0.35, -0.45, 0.82)  # direction to the sun, world frame
 SKY = (0.93, 0.95, 0.97)  # RGB of the sky above
 HORIZON = (0.83, 0.87, 0.91)  # RGB of the sky at the horizon
 AMBIENT = (0.55, 0.56, 0.60)  # linear RGB of the ray tracer's ambient light
+EXPOSURE = 1.15  # [1] brightness with OpenGL
+SHADOW_EXTENT = 6.0  # [m] distance from the world's origin up to which OpenGL draws shadows
 SAMPLES = 4  # rays per pixel of the ray tracer
-LINE_WIDTH = 1.0 / 320.0  # [1] width of lines over the image's height
+LINE_WIDTH = 1.0 / 560.0  # [1] width of lines over the image's width
 GL_PACKAGES = "apt-get install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri"
 NO_GL = f"pip install jumper-warp[video], and on Debian {GL_PACKAGES}"
 
@@ -127,9 +129,9 @@ class GLRenderer(Renderer):
         viewer.show_joints = viewer.show_com = False
         renderer = viewer.renderer
         renderer.spotlight_enabled, renderer.sky_upper, renderer.sky_lower = False, SKY, HORIZON
-        renderer._sun_direction = np.array(SUN) / np.linalg.norm(SUN)
-        renderer.line_width = LINE_WIDTH * size[1]
-        renderer.arrow_scale = 0.5 * LINE_WIDTH * size[1]
+        renderer._sun_direction, renderer.exposure = np.array(SUN) / np.linalg.norm(SUN), EXPOSURE
+        renderer.shadow_extents = SHADOW_EXTENT
+        renderer.line_width, renderer.arrow_scale = LINE_WIDTH * size[0], 0.6 * LINE_WIDTH * size[0]
 
     def _image(self, view: View, lines: Sequence[Line]) -> np.ndarray:
         viewer, camera = self._viewer, self._viewer.camera

@@ -1,0 +1,167 @@
+"""Films of recordings: H.264 in MP4, animated WebP or GIF."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+from PIL import Image
+from rich.console import Console
+from rich.progress import track
+
+from jumper_warp.utils.errors import InputError
+from jumper_warp.viz.props import goal_shapes
+from jumper_warp.viz.recording import Recording
+from jumper_warp.viz.renderer import Line, View, open_renderer
+from jumper_warp.viz.scene import Label, annotate, body_paths, corners, fit, follow, velocity_arrows
+from jumper_warp.viz.style import BASE_COLOR, LEG_COLORS
+
+SUFFIXES = (".mp4", ".webp", ".gif")
+DIRECTION = (0.62, -1.0, 0.28)  # from the robots to the eye, world frame: on their right, ahead, above
+MAX_FRAMES = 1800  # of WebP and GIF, which are encoded in memory
+TRAIL_SECONDS = 1.5  # [s] length of the trails of base and paws
+
+
+def write_film(
+    recording: Recording,
+    path: Path,
+    *,
+    size: tuple[int, int] = (854, 480),
+    fps: float = 30.0,
+    speed: float = 1.0,
+    eye: Sequence[float] | None = None,
+    ranks: Sequence[int] | None = None,
+) -> Path:
+    """Write a film whose camera follows the robots; return its path. The suffix .mp4, .webp or .gif sets the format.
+
+    size: width and height [px], rounded up to even numbers. fps: frames per second of the film. speed: of the playback,
+    0.25 for slow motion. eye: offset [m] of the camera from the robots' mean position, world frame (default: beside
+    them, near enough that all stay in view). ranks: indices in `recording.worlds`, shown side by side (default: all).
+    Raises InputError: another suffix, a size, rate or speed out of range, or too many frames; ImportError: MP4
+    without imageio-ffmpeg; OSError.
+    """
+    path, size = Path(path), (size[0] + size[0] % 2, size[1] + size[1] % 2)
+    if path.suffix not in SUFFIXES:
+        raise InputError(f"{path}: a film ends with {', '.join(SUFFIXES)}")
+    if not (64 <= min(size) and max(size) <= 7680 and 0.0 < fps <= 240.0 and 0.0 < speed <= 100.0):
+        raise InputError(f"a film needs 64 to 7680 px, fps in (0, 240], speed in (0, 100]; got {size}, {fps}, {speed}")
+    times = np.arange(recording.times[0], recording.times[-1] + 1.0e-9, speed / fps)
+    if path.suffix != ".mp4" and len(times) > MAX_FRAMES:
+        raise InputError(f"{path}: {len(times)} frames are too many for {path.suffix}; up to {MAX_FRAMES}, or use .mp4")
+    ranks = range(len(recording.worlds)) if ranks is None else ranks
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{os.getpid()}.{path.name}")
+    encode = _encode_mp4 if path.suffix == ".mp4" else _encode_animation
+    try:
+        encode(temporary, _images(recording, times, size, eye, ranks, path.name), size, fps, len(times))
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    return path
+
+
+def _images(
+    recording: Recording, times: np.ndarray, size: tuple[int, int], eye: Sequence[float] | None, ranks: Sequence[int],
+    name: str,
+) -> Iterator[Image.Image]:  # fmt: skip
+    """Yield the annotated images of a film at `times` [s], with a progress bar; name: of the film, for the bar."""
+    frames = np.clip(np.searchsorted(recording.times, times - 1.0e-9), 0, len(recording.times) - 1)
+    poses, paths = drawn_poses(recording, times), body_paths(recording, ranks)
+    targets = follow(paths, float(np.mean(np.diff(recording.times))) if len(recording.times) > 1 else 1.0)
+    frame_view = _view(paths - targets[:, None], size, eye)
+    shapes = [*recording.shapes, *goal_shapes(recording)]
+    console = Console(stderr=True)
+    with open_renderer(shapes, len(recording.bodies), size) as renderer:
+        title = f"{name}, {renderer.name}"
+        for frame, time, pose in track(
+            zip(frames, times, poses, strict=True), title, len(times), console=console, disable=not sys.stderr.isatty()
+        ):
+            view = View(targets[frame] + frame_view.eye, targets[frame] + frame_view.target)
+            image = renderer.draw(pose, view, _lines(recording, paths, frame, ranks))
+            labels = [] if len(ranks) == 1 else _world_labels(recording, paths[frame], ranks)
+            yield annotate(image, view, labels, _heading(recording, time, ranks))
+
+
+def drawn_poses(recording: Recording, times: np.ndarray) -> np.ndarray:
+    """Return the bodies' poses at times [s], interpolated, with worlds apart as drawn, (times, bodies, 7)."""
+    after = np.clip(np.searchsorted(recording.times, times), 1, max(1, len(recording.times) - 1))
+    after = np.minimum(after, len(recording.times) - 1)
+    before = np.maximum(after - 1, 0)
+    span = np.maximum(recording.times[after] - recording.times[before], 1.0e-9)
+    weight = np.clip((times - recording.times[before]) / span, 0.0, 1.0)[:, None, None]
+    start, end = recording.poses[before].astype(float), recording.poses[after].astype(float)
+    sign = np.where((start[..., 3:] * end[..., 3:]).sum(axis=-1, keepdims=True) < 0.0, -1.0, 1.0)
+    end[..., 3:] *= sign
+    poses = start + weight * (end - start)
+    poses[..., 3:] /= np.linalg.norm(poses[..., 3:], axis=-1, keepdims=True)
+    rank = {f"world_{world}": rank for rank, world in enumerate(recording.worlds)}
+    poses[..., 1] += recording.spacing * np.array([rank[body.split("/")[0]] for body in recording.bodies])
+    return poses
+
+
+def _view(paths: np.ndarray, size: tuple[int, int], eye: Sequence[float] | None) -> View:
+    """Return the view, relative to the camera's target, that shows the robots in all frames, or that from `eye`.
+
+    paths: base positions relative to the target [m], (num_frames, worlds, 3).
+    """
+    if eye is not None:
+        return View(np.asarray(eye, dtype=float), np.zeros(3))
+    return fit(corners(np.nan_to_num(paths)), np.array(DIRECTION), size)
+
+
+def _lines(recording: Recording, paths: np.ndarray, frame: int, ranks: Sequence[int]) -> list[Line]:
+    """Return trails of base and paws up to a frame, and arrows of commanded and actual velocity.
+
+    paths: base positions as drawn [m], (num_frames, worlds, 3).
+    """
+    first = int(np.searchsorted(recording.times, recording.times[frame] - TRAIL_SECONDS))
+    lines = []
+    for rank, path in zip(ranks, np.moveaxis(paths, 1, 0), strict=True):
+        paws = recording.contact_points[first : frame + 1, rank] + [0.0, recording.spacing * rank, 0.0]
+        if frame > first:
+            lines.append(Line(path[first : frame + 1], BASE_COLOR))
+            lines += [Line(paws[:, leg], color) for leg, color in enumerate(LEG_COLORS.values()) if leg < paws.shape[1]]
+        lines += velocity_arrows(recording, frame, rank, path[frame] + [0.0, 0.0, 0.3])
+    return lines
+
+
+def _world_labels(recording: Recording, bases: np.ndarray, ranks: Sequence[int]) -> list[Label]:
+    """Return the names of the worlds above their robots; bases: positions [m], (worlds, 3)."""
+    return [Label(recording.label(rank), base + [0.0, 0.0, 0.18]) for rank, base in zip(ranks, bases, strict=True)]
+
+
+def _heading(recording: Recording, time: float, ranks: Sequence[int]) -> str:
+    """Return task, goal of a single world, and time as text."""
+    words = [str(recording.notes.get("task", "")), recording.label(ranks[0]) if len(ranks) == 1 else ""]
+    return "   ".join([*(word for word in words if word), f"{time:.2f} s"])
+
+
+def _encode_mp4(path: Path, images: Iterator[Image.Image], size: tuple[int, int], fps: float, count: int) -> None:
+    """Write images as H.264 in yuv420p, which browsers and slides play. Raises ImportError: no imageio-ffmpeg."""
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise ImportError("MP4 films need imageio-ffmpeg: pip install jumper-warp[video]") from error
+    writer = imageio_ffmpeg.write_frames(
+        str(path), size, fps=fps, codec="libx264", pix_fmt_in="rgb24", macro_block_size=2, quality=7,
+        output_params=["-movflags", "+faststart"],
+    )  # fmt: skip
+    writer.send(None)
+    try:
+        for image in images:
+            writer.send(image.tobytes())
+    finally:
+        writer.close()
+
+
+def _encode_animation(path: Path, images: Iterator[Image.Image], size: tuple[int, int], fps: float, count: int) -> None:
+    """Write images as animated WebP or GIF that repeats, by the path's suffix."""
+    pictures = list(images)
+    duration = 1000.0 / fps  # [ms]
+    ends = np.round(duration * np.arange(count + 1)).astype(int)
+    durations = np.diff(ends).tolist()
+    options = {"quality": 75, "method": 4} if path.suffix == ".webp" else {"optimize": True}
+    pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, **options)

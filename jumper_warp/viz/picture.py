@@ -1,0 +1,253 @@
+"""Composite pictures: one scene with the robot at several moments of a recording, heights and goals marked."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import write_atomically
+from jumper_warp.viz.props import goal_shapes
+from jumper_warp.viz.recording import Recording
+from jumper_warp.viz.renderer import Line, View, open_renderer
+from jumper_warp.viz.scene import Label, annotate, corners, fit, velocity_arrows
+from jumper_warp.viz.shapes import ShapeMesh
+from jumper_warp.viz.style import BASE_COLOR, GOAL_COLOR
+
+WIDTH = 1600  # [px] default width
+HEIGHTS = (380, 1400)  # [px] least and largest height for that width
+ELEVATION = 0.13  # [1] height of the eye over its horizontal distance
+FIELD_OF_VIEW = 16.0  # [deg] narrow, so that near and far moments have nearly the same scale
+GAP = 0.28  # [m] least distance in the picture between the bases of two moments of a jump
+SIDE_BY_SIDE = 0.8  # [m] least distance between two moments of a walk
+APART = 0.55  # [m] distance to the right from which two moments do not hide each other
+GHOST = 0.4  # opacity of moments that would hide others
+SPREAD = 0.95  # [m] distance between moments of a robot that stays in place
+STAYS = 0.6  # [m] horizontal distance up to which a robot stays in place
+RISE = 0.1  # [m] of the base during a flight, above which the flight is a jump
+CONTACT = 1.0  # [N] paw force above which a paw touches
+GROUND = -0.1  # [m] lowest height that a picture must show
+MOST = 7  # moments in a picture
+FORMATS = {".png": {}, ".webp": {"quality": 88, "method": 6}, ".jpg": {"quality": 90}}  # Pillow's options by suffix
+
+
+@dataclass(frozen=True)
+class Composition:
+    """The moments of one world in one scene, in a vertical plane through its path."""
+
+    recording: Recording
+    rank: int  # index in `recording.worlds`
+    base: np.ndarray  # (num_frames, 3) [m] base positions, world frame
+    right: np.ndarray  # (3,) horizontal unit vector of the path, to the right in the picture
+    frames: np.ndarray  # (moments,) indices of the shown frames
+    shift: np.ndarray  # (moments,) [m] along `right`, by which each moment is drawn away from its place
+
+    @property
+    def bases(self) -> np.ndarray:
+        """[m] (moments, 3) Base positions as drawn."""
+        return self.base[self.frames] + self.shift[:, None] * self.right
+
+    @property
+    def heights(self) -> np.ndarray:
+        """[m] (n,) Commanded heights, at most one."""
+        heights = self.recording.heights[self.rank : self.rank + 1]
+        return heights[np.isfinite(heights)]
+
+    @property
+    def grounded(self) -> bool:
+        """Whether a paw touches the ground in the recording."""
+        return bool((np.linalg.norm(self.recording.contact_forces[:, self.rank], axis=-1) > CONTACT).any())
+
+    @property
+    def toward_eye(self) -> np.ndarray:
+        """(3,) Horizontal unit vector from the path to the eye."""
+        return np.array([self.right[1], -self.right[0], 0.0])
+
+    def span(self) -> tuple[float, float]:
+        """Return the least and the largest coordinate along `right` [m] of what is shown."""
+        along = corners(self.bases) @ self.right
+        return float(along.min()) - 0.15, float(along.max()) + 0.15
+
+    def point(self, along: float, height: float, nearer: float = 0.0) -> np.ndarray:
+        """Return a point of the plane [m], (3,): `along` right, at a height, and nearer to the eye by a distance."""
+        depth = self.base[0] @ self.toward_eye + nearer
+        return along * self.right + depth * self.toward_eye + [0.0, 0.0, height]
+
+
+def compose(recording: Recording, rank: int = 0) -> Composition:
+    """Return the composition of the rank-th recorded world. A robot that stays in place is spread to the right."""
+    base = recording.body_poses(rank)[:, 0, :3].astype(float)
+    displacement = base[-1, :2] - base[0, :2]
+    distance = float(np.linalg.norm(displacement))
+    stays = distance < STAYS
+    right = np.array([1.0, 0.0, 0.0]) if stays else np.append(displacement / distance, 0.0)
+    flights = _flights(recording, rank)
+    if not stays and flights:
+        frames = _distinct(base @ np.stack([right, [0.0, 0.0, 1.0]], axis=1), flights)
+    elif not stays:
+        frames = _evenly_moved(base[:, None], int(np.clip(distance / SIDE_BY_SIDE + 1.0, 2.0, MOST)))
+    elif flights:
+        frames = _events(base[:, 2], *flights[0])
+    else:
+        frames = _evenly_moved(recording.body_poses(rank), 6)
+    shift = SPREAD * (np.arange(len(frames)) - 0.5 * (len(frames) - 1)) if stays else np.zeros(len(frames))
+    return Composition(recording, rank, base, right, frames, shift)
+
+
+def _flights(recording: Recording, rank: int) -> list[tuple[int, int]]:
+    """Return (first, last) frame of every flight of a world in which the base rises by RISE, in order."""
+    height = recording.body_poses(rank)[:, 0, 2]
+    free = ~(np.linalg.norm(recording.contact_forces[:, rank], axis=-1) > CONTACT).any(axis=-1)
+    edges = np.flatnonzero(np.diff(np.concatenate([[False], free, [False]]).astype(int)))
+    runs = [(int(first), int(last) - 1) for first, last in edges.reshape(-1, 2)]
+    return [(first, last) for first, last in runs if height[first : last + 1].max() - height[first] > RISE]
+
+
+def _events(height: np.ndarray, takeoff: int, touchdown: int) -> np.ndarray:
+    """Return the frames of a jump in place: squat, takeoff, rise, apex, fall, touchdown, rest."""
+    apex = takeoff + int(np.argmax(height[takeoff : touchdown + 1]))
+    squat = int(np.argmin(height[: takeoff + 1]))
+    return np.array(
+        [squat, takeoff, (takeoff + apex) // 2, apex, (apex + touchdown) // 2, touchdown, len(height) - 1]
+    )
+
+
+def _distinct(places: np.ndarray, flights: list[tuple[int, int]]) -> np.ndarray:
+    """Return up to MOST frames whose places are GAP apart: apexes, end, start, touchdowns and takeoffs first.
+
+    places: base positions in the picture [m], (num_frames, 2), to the right and up.
+    """
+    apexes = [first + int(np.argmax(places[first : last + 1, 1])) for first, last in flights]
+    wanted = [*apexes, len(places) - 1, 0, *(last for _, last in flights), *(first for first, _ in flights)]
+    chosen: list[int] = []
+    while len(chosen) < MOST:
+        distance = np.full(len(places), np.inf)
+        for frame in chosen:
+            distance = np.minimum(distance, np.linalg.norm(places - places[frame], axis=1))
+        wanted = [frame for frame in wanted if distance[frame] >= GAP]
+        farthest = int(np.argmax(distance))
+        if not wanted and distance[farthest] < GAP:
+            break
+        chosen.append(wanted.pop(0) if wanted else farthest)
+    return np.array(sorted(chosen))
+
+
+def _evenly_moved(poses: np.ndarray, count: int) -> np.ndarray:
+    """Return `count` frames between which the bodies move equally far in sum; poses: (num_frames, bodies, 3 or more)."""
+    steps = np.linalg.norm(np.diff(poses[..., :3], axis=0), axis=-1).sum(axis=1)
+    moved = np.concatenate([[0.0], np.cumsum(steps)])
+    return np.searchsorted(moved, np.linspace(0.0, 0.99 * moved[-1], count))
+
+
+def write_picture(
+    recording: Recording, path: Path, *, rank: int = 0, width: int = WIDTH, angle: float = 0.0, title: str | None = None
+) -> Path:
+    """Write a composite picture of one world of a recording; return its path. The suffix .png, .webp or .jpg counts.
+
+    rank: index in `recording.worlds`. width: of the picture [px]; its height follows from the motion. angle [deg]: of
+    the eye about z, from the right of the path towards its end. title: default: task and name of the world.
+    Raises InputError: another suffix or width; OSError.
+    """
+    path = Path(path)
+    if path.suffix not in FORMATS or not 200 <= width <= 8000:
+        raise InputError(f"{path}: a picture ends with {', '.join(FORMATS)} and is 200 to 8000 px wide, got {width}")
+    scene = compose(recording, rank)
+    turn = np.arctan2(scene.toward_eye[1], scene.toward_eye[0]) + np.radians(angle)
+    points = _extent(scene)
+    view, size = _framed(points, np.array([np.cos(turn), np.sin(turn), ELEVATION]), width)
+    poses = recording.body_poses(rank)[scene.frames].astype(float)
+    poses[..., :3] += scene.shift[:, None, None] * scene.right
+    with open_renderer(_shapes(scene), poses.shape[1], size, _opacity(scene)) as renderer:
+        image = renderer.draw(poses, view, _lines(scene))
+    heading = "   ".join([str(recording.notes.get("task", "")), recording.label(rank)]) if title is None else title
+    data = io.BytesIO()
+    options = FORMATS[path.suffix]
+    annotate(image, view, _labels(scene), heading, 0.0145 * width / size[1]).save(data, path.suffix[1:].replace("jpg", "jpeg"), **options)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_atomically(path, data.getvalue())
+    return path
+
+
+def _opacity(scene: Composition) -> list[float]:
+    """Return the opacity of each moment: 1, but GHOST for those that overlap an opaque one before them."""
+    opacity, along = [], scene.bases @ scene.right
+    last = -np.inf
+    for place in along:
+        opaque = place - last >= APART
+        last = place if opaque else last
+        opacity.append(1.0 if opaque else GHOST)
+    return opacity
+
+
+def _extent(scene: Composition) -> np.ndarray:
+    """Return points [m], (n, 3), that the picture must show: robots with their labels, scale and bars."""
+    low, high = scene.span()
+    heights = [*scene.heights, *([GROUND] if scene.grounded else [])]
+    frame = [scene.point(along, height) for along in (low - 0.25, high) for height in heights]
+    goals = scene.recording.goals[scene.rank] if len(scene.recording.goals) and not scene.shift.any() else np.zeros((0, 3))
+    boxes = corners(scene.bases, GROUND)
+    return np.concatenate([boxes, boxes + [0.0, 0.0, 0.2], np.reshape(frame, (-1, 3)), goals[np.isfinite(goals).all(axis=1)]])
+
+
+def _framed(points: np.ndarray, direction: np.ndarray, width: int) -> tuple[View, tuple[int, int]]:
+    """Return view and image size [px] that show points from a direction, with the height that they need."""
+    size = (width, HEIGHTS[1] * width // WIDTH)
+    pixels = fit(points, direction, size, FIELD_OF_VIEW).project(points, size)
+    needed = float(np.ptp(pixels[:, 1]) / np.ptp(pixels[:, 0])) * width
+    height = int(np.clip(needed + 0.04 * width, *(limit * width // WIDTH for limit in HEIGHTS)))
+    size = (width, height + height % 2)
+    return fit(points, direction, size, FIELD_OF_VIEW), size
+
+
+def _shapes(scene: Composition) -> list[ShapeMesh]:
+    """Return the shapes of one robot, of the ground, and rings at its goals if it is drawn at its true place."""
+    own = {body: i for i, body in enumerate(scene.recording.body_indices(scene.rank))} | {-1: -1}
+    shapes = [replace(shape, body=own[shape.body]) for shape in scene.recording.shapes if shape.body in own]
+    if scene.shift.any():
+        return shapes
+    moved = replace(scene.recording, spacing=0.0, heights=np.zeros(0))
+    return shapes + [shape for shape in goal_shapes(moved) if shape.name.startswith(f"goal_{scene.rank}_")]
+
+
+def _lines(scene: Composition) -> list[Line]:
+    """Return the base's path, bars at commanded heights, a scale of heights, and one of distances on the ground."""
+    low, high = scene.span()
+    first, last = scene.frames[0], scene.frames[-1]
+    frames = np.arange(first, last + 1)
+    shift = np.interp(frames, scene.frames, scene.shift)
+    lines = [Line(scene.base[frames] + shift[:, None] * scene.right, BASE_COLOR)]
+    lines += [Line(np.stack([scene.point(low, z), scene.point(high, z)]), GOAL_COLOR) for z in scene.heights]
+    ticks = _ticks(scene)
+    if len(ticks):
+        lines.append(Line(np.stack([scene.point(low, 0.0), scene.point(low, ticks[-1])]), BASE_COLOR))
+    lines += [Line(np.stack([scene.point(low - 0.03, z), scene.point(low + 0.03, z)]), BASE_COLOR) for z in ticks]
+    for frame, base in zip(scene.frames, scene.bases, strict=True):
+        lines += velocity_arrows(scene.recording, int(frame), scene.rank, base + [0.0, 0.0, 0.2])
+    return lines
+
+
+def _ticks(scene: Composition) -> np.ndarray:
+    """Return the heights [m] of the scale's marks: every 0.25 m up to the highest base; none without ground."""
+    if not scene.grounded:
+        return np.zeros(0)
+    top = max(float(scene.bases[:, 2].max()), *scene.heights, 0.25)
+    step = 0.25 if top < 1.5 else 0.5
+    return np.arange(0.0, top + step, step)
+
+
+def _labels(scene: Composition) -> list[Label]:
+    """Return time and, in jumps, base height above each moment, and the numbers of scale and bars."""
+    low, high = scene.span()
+    start, jumps = scene.recording.times[scene.frames[0]], float(np.ptp(scene.base[:, 2])) > 2.0 * RISE
+    labels = []
+    for frame, base, opacity in zip(scene.frames, scene.bases, _opacity(scene), strict=True):
+        if opacity < 1.0:
+            continue
+        text = f"{scene.recording.times[frame]:.2f} s" + (f"\n{base[2]:.2f} m" if jumps else "")
+        labels.append(Label(text, base + [0.0, 0.0, 0.2 if jumps else 0.3]))
+    labels += [Label(f"{z:g} m", scene.point(low - 0.06, z), "rm") for z in _ticks(scene)]
+    labels += [Label(f"commanded {z:.2f} m", scene.point(high, z + 0.01), "rd") for z in scene.heights]
+    return labels

@@ -1,0 +1,135 @@
+"""Where a camera stands and what is written into its images: framing, following, labels."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import matplotlib
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+from scipy.ndimage import gaussian_filter1d
+
+from jumper_warp.viz.recording import Recording
+from jumper_warp.viz.renderer import FIELD_OF_VIEW, Line, View
+from jumper_warp.viz.style import ACTUAL_COLOR, COMMAND_COLOR
+
+REACH = 0.45  # [m] half the length and width of a standing robot, with legs
+ABOVE = 0.25  # [m] free space above the base
+DEAD_ZONE = np.array([0.25, 0.25, 0.20])  # [m] how far a robot moves from the target before the camera follows
+SMOOTHING = 0.25  # [s] standard deviation of the filter of the camera's motion
+ARROW_SECONDS = 0.6  # [s] length of an arrow over the velocity that it shows
+SLOWEST = 0.02  # [m/s] below which no arrow is drawn
+VELOCITY_WINDOW = 0.2  # [s] over which the actual velocity is averaged
+MARGIN = 0.94  # fraction of the image that robots may fill
+
+
+@dataclass(frozen=True)
+class Label:
+    """Text at a point of the world."""
+
+    text: str
+    point: np.ndarray  # (3,) [m] world frame
+    anchor: str = "md"  # Pillow's anchor: middle of the text's bottom at the point
+
+
+def body_paths(recording: Recording, ranks: Sequence[int]) -> np.ndarray:
+    """Return base positions as drawn [m], (num_frames, worlds, 3): world frame, consecutive worlds apart in y."""
+    paths = np.stack([recording.body_poses(rank)[:, 0, :3] for rank in ranks], axis=1).astype(float)
+    return paths + recording.spacing * np.array(ranks)[:, None] * np.array([0.0, 1.0, 0.0])
+
+
+def corners(bases: np.ndarray, ground: float = -np.inf) -> np.ndarray:
+    """Return the corners [m], (n, 3), of boxes that enclose robots with base positions (..., 3), and their paws.
+
+    ground [m]: height below which nothing needs to be seen.
+    """
+    half = np.array([REACH, REACH, 0.0])
+    signs = np.array([[x, y, 0.0] for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
+    flat = bases.reshape(-1, 1, 3) + signs * half
+    low = flat - [0.0, 0.0, REACH]
+    low[..., 2] = np.maximum(low[..., 2], ground)
+    return np.concatenate([flat + [0.0, 0.0, ABOVE], low]).reshape(-1, 3)
+
+
+def fit(
+    points: np.ndarray, direction: np.ndarray, size: tuple[int, int], field_of_view: float = FIELD_OF_VIEW
+) -> View:
+    """Return the nearest view from a direction that shows all points (n, 3) [m], world frame.
+
+    direction: from the target to the eye, (3,), world frame; size: width and height of the image [px].
+    """
+    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    unit = direction / np.linalg.norm(direction)
+    for _ in range(3):  # the second and third time around the middle of the image
+        low, high = 0.1, 200.0
+        for _ in range(40):
+            distance = 0.5 * (low + high)
+            view = View(middle + distance * unit, middle, field_of_view)
+            pixels = view.project(points, size) / size
+            fits = bool((np.abs(pixels - 0.5) <= 0.5 * MARGIN).all())  # false for points behind the eye, NaN
+            low, high = (low, distance) if fits else (distance, high)
+        view = View(middle + high * unit, middle, field_of_view)
+        pixels = view.project(points, size)
+        offset = 0.5 * (pixels.min(axis=0) + pixels.max(axis=0)) - 0.5 * np.array(size)
+        scale = 2.0 * high * np.tan(np.radians(0.5 * field_of_view)) / size[1]  # [m] of a pixel at the target
+        right, up, _ = view.axes()
+        middle = middle + scale * (offset[0] * right - offset[1] * up)
+    return View(middle + high * unit, middle, field_of_view)
+
+
+def follow(paths: np.ndarray, dt: float) -> np.ndarray:
+    """Return where a camera looks that follows robots with a dead zone, (num_frames, 3) [m], world frame.
+
+    paths: base positions [m], (num_frames, worlds, 3); dt [s]: between frames. The target moves smoothly, and only
+    while the robots' mean position is further than DEAD_ZONE from it.
+    """
+    middle = np.nan_to_num(paths).mean(axis=1)
+    target, targets = middle[0], []
+    for position in middle:
+        target = position + np.clip(target - position, -DEAD_ZONE, DEAD_ZONE)
+        targets.append(target)
+    return gaussian_filter1d(np.array(targets), SMOOTHING / dt, axis=0, mode="nearest")
+
+
+def velocity_arrows(recording: Recording, frame: int, rank: int, start: np.ndarray) -> list[Line]:
+    """Return arrows of commanded and actual horizontal velocity of a world from a point [m], world frame, if any.
+
+    The actual velocity is the mean over VELOCITY_WINDOW.
+    """
+    if not len(recording.commands):
+        return []
+    poses = recording.poses[:, recording.body_indices(rank)[0]].astype(float)
+    x, y, z, w = poses[frame, 3:]
+    yaw = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+    ahead, left = recording.commands[frame, rank, :2]
+    commanded = np.array([np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left, 0.0])
+    window = np.abs(recording.times - recording.times[frame]) <= 0.5 * VELOCITY_WINDOW + 1.0e-9
+    path, times = poses[window, :3], recording.times[window]
+    actual = (path[-1] - path[0]) / max(times[-1] - times[0], 1.0e-9) * [1.0, 1.0, 0.0]
+    arrows = ((commanded, COMMAND_COLOR, 0.05), (actual, ACTUAL_COLOR, 0.0))
+    return [
+        Line(np.stack([start, start + ARROW_SECONDS * velocity]) + [0.0, 0.0, above], color, arrow=True)
+        for velocity, color, above in arrows
+        if np.linalg.norm(np.nan_to_num(velocity)) > SLOWEST
+    ]
+
+
+def annotate(image: np.ndarray, view: View, labels: Sequence[Label], heading: str = "", size: float = 0.03) -> Image.Image:
+    """Return an image (height, width, 3) uint8 with labels at their points, and a heading in its upper left corner.
+
+    size: height of the text over that of the image.
+    """
+    picture = Image.fromarray(image)
+    draw, pixels = ImageDraw.Draw(picture), max(11, round(size * picture.height))
+    font = ImageFont.truetype(str(Path(matplotlib.get_data_path()) / "fonts/ttf/DejaVuSans.ttf"), pixels)
+    style = {"font": font, "fill": (30, 32, 36), "stroke_width": max(1, pixels // 9), "stroke_fill": (255, 255, 255)}
+    if heading:
+        draw.text((pixels, pixels), heading, anchor="la", **style)
+    if labels:
+        places = view.project(np.array([label.point for label in labels]), picture.size)
+        for label, place in zip(labels, places, strict=True):
+            if np.isfinite(place).all():
+                draw.text(tuple(place), label.text, anchor=label.anchor, align="center", **style)
+    return picture
