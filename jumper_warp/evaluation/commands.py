@@ -14,7 +14,7 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_course
-from jumper_warp.evaluation.film import EnvRecorder
+from jumper_warp.evaluation.film import EnvRecorder, save_recording
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.run import EvaluationRun, SkillRun
 from jumper_warp.evaluation.scripts import read_script
@@ -25,6 +25,8 @@ from jumper_warp.policies.skills import SkillNames
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
+from jumper_warp.viz.film import check_film, write_film
+from jumper_warp.viz.recording import Recording
 
 Flags = TypeVar("Flags")
 
@@ -85,12 +87,35 @@ def print_metrics(metrics: dict[str, Any]) -> None:
 
 
 @dataclass(frozen=True, kw_only=True)
+class FilmCfg:
+    """A film of the recording."""
+
+    video: Path | None = None  # Film to write: .mp4 (H.264), .webp or .gif (default: none)
+    size: tuple[int, int] = (854, 480)  # [px] Width and height
+    fps: float = 30.0  # [1/s] Frames per second
+    speed: float = 1.0  # Speed of the playback; 0.25 for slow motion
+    eye: tuple[float, float, float] | None = None
+    """[m] Camera's offset from the robot, world axes: ahead, to the left, up (default: beside the robot)."""
+
+    def __post_init__(self) -> None:
+        if self.video is not None:
+            check_film(self.video, self.size, self.fps, self.speed)
+
+    def write(self, recording: Recording) -> Path:
+        """Write the film; return its path."""
+        assert self.video is not None
+        return write_film(recording, self.video, size=self.size, fps=self.fps, speed=self.speed, eye=self.eye)
+
+
+@dataclass(frozen=True, kw_only=True)
 class RecordingCfg:
     """Flags that all recordings share."""
 
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
     """What the policies are tried in."""
-    out: Path | None = None  # Folder for the recording, metrics.json and plots (default: outputs/play/<time>)
+    film: Annotated[FilmCfg, tyro.conf.arg(name="")] = field(default_factory=FilmCfg)
+    """A film of the recording."""
+    out: Path | None = None  # Folder for recording, picture, metrics.json and plots (default: outputs/play/<time>)
     viewer: Literal["none", "rerun"] = "none"
     """Open the recording in Rerun's viewer, which then listens on this machine's loopback address only."""
 
@@ -118,13 +143,13 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     run.prepare("play", cfg.conditions, cfg.out)
     log = flags.log(run.evaluation.prepare_task(run.task))
     env, worlds = run.env(log.count), range(log.count)
-    notes = {"task": name, **log.notes(worlds), "solver": cfg.conditions.solver}
-    film = Film(env, log.series, worlds, spacing=log.spacing, notes=notes, record_motors=True)
-    run_evaluation(run.policy.act, env, log, seconds=cfg.seconds or flags.length, on_step=film, stop=False)
-    path = film.save_rrd(run.folder / f"{log.row_name}.rrd", log.goal_markers(worlds))
+    notes = {"task": name, "solver": cfg.conditions.solver}
+    recorder = EnvRecorder(env, log, worlds, notes=notes)
+    seconds, stop = cfg.seconds or flags.length, cfg.seconds is None
+    run_evaluation(run.policy.act, env, log, seconds=seconds, on_step=recorder, stop=stop)
     write_metrics(run.folder, log.columns())
     print_rows(log)
-    return show_recording(path, cfg.viewer)
+    return show_recording(recorder.recording(), run.folder, log.row_name, cfg)
 
 
 @dataclass(frozen=True)
@@ -150,20 +175,29 @@ def play_script(cfg: ScriptCfg) -> Path:
     run.prepare("play", cfg.conditions, cfg.out)
     course = CourseLog([script])
     env = run.env(1, block=course.block)
-    film = Film(env, course.series, [0], notes={**course.notes([0]), "solver": cfg.conditions.solver})
-    run_evaluation(run.actor(env), env, course, on_step=film)
-    path = film.save_rrd(run.folder / "course.rrd")
-    plot_course(run.folder / "course.png", course, 0)
+    notes = {"task": cfg.script.stem, "solver": cfg.conditions.solver}
+    recorder = EnvRecorder(env, course, [0], block=course.block, notes=notes)
+    run_evaluation(run.actor(env), env, course, on_step=recorder)
+    plot_course(run.folder / "course_plot.png", course, 0)
     metrics = {"outcome": str(course.outcomes[0]), **course_metrics(course)}
     write_metrics(run.folder, metrics)
     print_metrics(metrics)
-    return show_recording(path, cfg.viewer)
+    return show_recording(recorder.recording(), run.folder, "course", cfg)
 
 
-def show_recording(path: Path, viewer: str) -> Path:
-    """Print the path of a recording to standard error, open it if `viewer` is "rerun", and return the path."""
-    Console(stderr=True).print(str(path), highlight=False, soft_wrap=True)
-    if viewer == "rerun":
+def show_recording(recording: Recording, folder: Path, name: str, cfg: RecordingCfg) -> Path:
+    """Write a recording as .rrd, picture and, on request, film; print their paths, open the viewer on request.
+
+    Returns the path of the .rrd file.
+    """
+    console = Console(stderr=True)
+    path = save_recording(recording, folder, name)
+    paths = [path, path.with_suffix(".png")]
+    if cfg.film.video is not None:
+        paths.append(cfg.film.write(recording))
+    for written in paths:
+        console.print(str(written), highlight=False, soft_wrap=True)
+    if cfg.viewer == "rerun":
         subprocess.run(viewer_command(path), check=False)
     return path
 

@@ -6,6 +6,7 @@ Viewer and renderer are imported only when something is recorded.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,6 +24,7 @@ if TYPE_CHECKING:
     from jumper_warp.sim.simulation import Simulation
     from jumper_warp.viz.recording import Recording
 
+SHOWN = 0.7  # Place of the world in a picture among the recorded ones, which are in the order of their goals, 0 to 1
 ANKLE = np.array([0.0, 0.0, -0.3])  # [m] Position of the ankle in the shank's frame
 
 
@@ -99,6 +101,15 @@ class EnvRecorder:
             return recording
         half, height = self.block["half"][self.worlds], self.block["height"][self.worlds]
         return with_blocks(recording, np.stack(self.block_positions), half, height)
+
+
+def save_recording(recording: Recording, folder: Path, name: str) -> Path:
+    """Write `<name>.rrd` for the Rerun viewer and `<name>.png`, a composite picture of one world; return the first."""
+    from jumper_warp.viz.picture import write_picture
+    from jumper_warp.viz.rerun import write_rrd
+
+    write_picture(recording, folder / f"{name}.png", rank=round(SHOWN * (len(recording.worlds) - 1)))
+    return write_rrd(recording, folder / f"{name}.rrd")
 
 
 def block_positions(sim: Simulation) -> np.ndarray:

@@ -21,7 +21,7 @@ from rich.table import Table
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.evaluations import evaluation_of
-from jumper_warp.evaluation.film import EnvRecorder
+from jumper_warp.evaluation.film import EnvRecorder, save_recording
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.restore import restored_task
@@ -140,7 +140,7 @@ class Run(ABC):
         self._latency.append(env.parameters.latency.numpy().copy())
         self._physics_dt = env.physics_dt
         if recorder is not None:
-            pass
+            save_recording(recorder.recording(), self.folder, film)
         return log
 
     def _make_recorder(self, env: Env, log: EvaluationLog, scene: Mapping[str, Any]) -> EnvRecorder:

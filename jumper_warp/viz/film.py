@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import sys
 from collections.abc import Iterator, Sequence
+from importlib.util import find_spec
 from pathlib import Path
 
 import numpy as np
@@ -40,14 +41,10 @@ def write_film(
     size: width and height [px], rounded up to even numbers. fps: frames per second of the film. speed: of the playback,
     0.25 for slow motion. eye: offset [m] of the camera from the robots' mean position, world frame (default: beside
     them, near enough that all stay in view). ranks: indices in `recording.worlds`, shown side by side (default: all).
-    Raises InputError: another suffix, a size, rate or speed out of range, or too many frames; ImportError: MP4
-    without imageio-ffmpeg; OSError.
+    Raises InputError: as `check_film`, or too many frames for the format; OSError.
     """
     path, size = Path(path), (size[0] + size[0] % 2, size[1] + size[1] % 2)
-    if path.suffix not in SUFFIXES:
-        raise InputError(f"{path}: a film ends with {', '.join(SUFFIXES)}")
-    if not (64 <= min(size) and max(size) <= 7680 and 0.0 < fps <= 240.0 and 0.0 < speed <= 100.0):
-        raise InputError(f"a film needs 64 to 7680 px, fps in (0, 240], speed in (0, 100]; got {size}, {fps}, {speed}")
+    check_film(path, size, fps, speed)
     times = np.arange(recording.times[0], recording.times[-1] + 1.0e-9, speed / fps)
     if path.suffix != ".mp4" and len(times) > MAX_FRAMES:
         raise InputError(f"{path}: {len(times)} frames are too many for {path.suffix}; up to {MAX_FRAMES}, or use .mp4")
@@ -61,6 +58,16 @@ def write_film(
     finally:
         temporary.unlink(missing_ok=True)
     return path
+
+
+def check_film(path: Path, size: tuple[int, int], fps: float, speed: float) -> None:
+    """Raise InputError unless a film can be written with these arguments of `write_film`."""
+    if path.suffix not in SUFFIXES:
+        raise InputError(f"{path}: a film ends with {', '.join(SUFFIXES)}")
+    if path.suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:
+        raise InputError("MP4 films need imageio-ffmpeg: pip install jumper-warp[video]")
+    if not (64 <= min(size) and max(size) <= 7680 and 0.0 < fps <= 240.0 and 0.0 < speed <= 100.0):
+        raise InputError(f"a film needs 64 to 7680 px, fps in (0, 240], speed in (0, 100]; got {size}, {fps}, {speed}")
 
 
 def _images(
@@ -140,13 +147,11 @@ def _heading(recording: Recording, time: float, ranks: Sequence[int]) -> str:
 
 
 def _encode_mp4(path: Path, images: Iterator[Image.Image], size: tuple[int, int], fps: float, count: int) -> None:
-    """Write images as H.264 in yuv420p, which browsers and slides play. Raises ImportError: no imageio-ffmpeg."""
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise ImportError("MP4 films need imageio-ffmpeg: pip install jumper-warp[video]") from error
+    """Write images as H.264 in yuv420p, which browsers and slides play."""
+    import imageio_ffmpeg
+
     writer = imageio_ffmpeg.write_frames(
-        str(path), size, fps=fps, codec="libx264", pix_fmt_in="rgb24", macro_block_size=2, quality=7,
+        str(path), size, fps=fps, codec="libx264", pix_fmt_in="rgb24", macro_block_size=2, quality=6,
         output_params=["-movflags", "+faststart"],
     )  # fmt: skip
     writer.send(None)

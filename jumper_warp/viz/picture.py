@@ -110,9 +110,7 @@ def _events(height: np.ndarray, takeoff: int, touchdown: int) -> np.ndarray:
     """Return the frames of a jump in place: squat, takeoff, rise, apex, fall, touchdown, rest."""
     apex = takeoff + int(np.argmax(height[takeoff : touchdown + 1]))
     squat = int(np.argmin(height[: takeoff + 1]))
-    return np.array(
-        [squat, takeoff, (takeoff + apex) // 2, apex, (apex + touchdown) // 2, touchdown, len(height) - 1]
-    )
+    return np.array([squat, takeoff, (takeoff + apex) // 2, apex, (apex + touchdown) // 2, touchdown, len(height) - 1])
 
 
 def _distinct(places: np.ndarray, flights: list[tuple[int, int]]) -> np.ndarray:
@@ -165,7 +163,9 @@ def write_picture(
     heading = "   ".join([str(recording.notes.get("task", "")), recording.label(rank)]) if title is None else title
     data = io.BytesIO()
     options = FORMATS[path.suffix]
-    annotate(image, view, _labels(scene), heading, 0.0145 * width / size[1]).save(data, path.suffix[1:].replace("jpg", "jpeg"), **options)
+    annotate(image, view, _labels(scene), heading, 0.0145 * width / size[1]).save(
+        data, path.suffix[1:].replace("jpg", "jpeg"), **options
+    )
     path.parent.mkdir(parents=True, exist_ok=True)
     write_atomically(path, data.getvalue())
     return path
@@ -187,9 +187,13 @@ def _extent(scene: Composition) -> np.ndarray:
     low, high = scene.span()
     heights = [*scene.heights, *([GROUND] if scene.grounded else [])]
     frame = [scene.point(along, height) for along in (low - 0.25, high) for height in heights]
-    goals = scene.recording.goals[scene.rank] if len(scene.recording.goals) and not scene.shift.any() else np.zeros((0, 3))
+    goals = (
+        scene.recording.goals[scene.rank] if len(scene.recording.goals) and not scene.shift.any() else np.zeros((0, 3))
+    )
     boxes = corners(scene.bases, GROUND)
-    return np.concatenate([boxes, boxes + [0.0, 0.0, 0.2], np.reshape(frame, (-1, 3)), goals[np.isfinite(goals).all(axis=1)]])
+    return np.concatenate(
+        [boxes, boxes + [0.0, 0.0, 0.2], np.reshape(frame, (-1, 3)), goals[np.isfinite(goals).all(axis=1)]]
+    )
 
 
 def _framed(points: np.ndarray, direction: np.ndarray, width: int) -> tuple[View, tuple[int, int]]:

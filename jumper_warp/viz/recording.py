@@ -21,7 +21,15 @@ from jumper_warp.viz.shapes import ShapeMesh
 
 FORMAT = "jumper-warp recording"
 VERSION = 2
-ARRAYS = ("times", "poses", "contact_points", "contact_forces", "goals", "heights", "commands")  # fields of `Recording` that are arrays
+ARRAYS = (
+    "times",
+    "poses",
+    "contact_points",
+    "contact_forces",
+    "goals",
+    "heights",
+    "commands",
+)  # fields of `Recording` that are arrays
 SURFACE = ("vertices", "normals", "triangles")  # fields of `ShapeMesh` that are arrays
 SERIES_NAME = re.compile(r"[^/\[\]]+/[^/\[\]]+ \[[^\[\]]+\]")
 """Pattern of a series' name, `group/quantity [unit]`; the unit of a pure number is 1."""

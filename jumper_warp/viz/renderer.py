@@ -241,5 +241,5 @@ def _segments(lines: Sequence[Line]) -> tuple[wp.array | None, wp.array | None, 
     parts = [line.points[[0, -1]] if line.arrow else line.points for line in lines]
     starts = np.concatenate([points[:-1] for points in parts])
     ends = np.concatenate([points[1:] for points in parts])
-    colors = np.concatenate([np.tile(line.color, (len(points) - 1, 1)) for line, points in zip(lines, parts)])
+    colors = np.concatenate([np.tile(line.color, (len(points) - 1, 1)) for line, points in zip(lines, parts, strict=True)])
     return tuple(wp.array(values.astype(np.float32), dtype=wp.vec3) for values in (starts, ends, colors))

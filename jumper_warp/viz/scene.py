@@ -53,9 +53,7 @@ def corners(bases: np.ndarray, ground: float = -np.inf) -> np.ndarray:
     return np.concatenate([flat + [0.0, 0.0, ABOVE], low]).reshape(-1, 3)
 
 
-def fit(
-    points: np.ndarray, direction: np.ndarray, size: tuple[int, int], field_of_view: float = FIELD_OF_VIEW
-) -> View:
+def fit(points: np.ndarray, direction: np.ndarray, size: tuple[int, int], field_of_view: float = FIELD_OF_VIEW) -> View:
     """Return the nearest view from a direction that shows all points (n, 3) [m], world frame.
 
     direction: from the target to the eye, (3,), world frame; size: width and height of the image [px].
@@ -116,7 +114,9 @@ def velocity_arrows(recording: Recording, frame: int, rank: int, start: np.ndarr
     ]
 
 
-def annotate(image: np.ndarray, view: View, labels: Sequence[Label], heading: str = "", size: float = 0.03) -> Image.Image:
+def annotate(
+    image: np.ndarray, view: View, labels: Sequence[Label], heading: str = "", size: float = 0.03
+) -> Image.Image:
     """Return an image (height, width, 3) uint8 with labels at their points, and a heading in its upper left corner.
 
     size: height of the text over that of the image.
