@@ -1,0 +1,156 @@
+"""A composite picture and a film of every policy, and the pictures of the README.
+
+    python experiments/policy_pictures.py --policies vertical_jump walking_flat --out outputs/pictures
+    python experiments/policy_pictures.py --save-to-policies
+
+Every policy shows what it was trained for, once, on SolverJumper with nominal robots. `walk_jump_walk` is one robot
+with three policies. `--save-to-policies` writes `picture.webp` into the policies' folders.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from PIL import Image
+
+from jumper_warp.evaluation.attitude import AttitudePlayFlags
+from jumper_warp.evaluation.courses import CourseLog
+from jumper_warp.evaluation.evaluations import PlayFlags
+from jumper_warp.evaluation.film import EnvRecorder
+from jumper_warp.evaluation.heights import HeightPlayFlags
+from jumper_warp.evaluation.landings import LandingPlayFlags
+from jumper_warp.evaluation.log import run_evaluation
+from jumper_warp.evaluation.run import EvaluationRun, SkillRun
+from jumper_warp.evaluation.scripts import read_script
+from jumper_warp.evaluation.velocities import VelocityPlayFlags
+from jumper_warp.policies.conditions import Conditions
+from jumper_warp.policies.folder import add_files, find_policy
+from jumper_warp.robot.grounds import platform
+from jumper_warp.robot.terrain import TerrainCfg, single_tile
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import write_atomically
+from jumper_warp.viz.film import write_film
+from jumper_warp.viz.picture import write_picture
+from jumper_warp.viz.recording import Recording
+from support.scripts import ThreadArgs, prepare, run_script
+
+COURSE = "walk_jump_walk"  # a script instead of a policy
+SCRIPT = Path(__file__).parents[1] / "assets/scripts/walk_jump_walk.json"
+TILE, ANIMATION = ("vertical_jump", "horizontal_jump", "walking_flat", "attitude"), COURSE  # of the README
+TILE_WIDTH, FILM_SIZE, ANIMATION_SIZE = 800, (854, 480), (640, 360)  # [px]
+
+
+@dataclass(frozen=True)
+class Shot:
+    """What a policy does in its picture."""
+
+    flags: PlayFlags
+    title: str
+    ground: Callable[[], Any] = lambda: "plane"  # as in `build_model`
+
+
+def heights(*values: float) -> HeightPlayFlags:
+    return HeightPlayFlags(values, 6.0)
+
+
+def goal(ahead: float, left: float = 0.0) -> LandingPlayFlags:
+    return LandingPlayFlags(goal=((ahead, left),))
+
+
+def walk(*velocity: float) -> VelocityPlayFlags:
+    return VelocityPlayFlags(velocity=(velocity,), command_interval=6.0)
+
+
+SHOTS = {
+    "attitude": Shot(AttitudePlayFlags(), "turn by 90 degrees about the long axis, floating"),
+    "horizontal_jump": Shot(goal(1.4), "jump to a place 1.4 m ahead"),
+    "mars_horizontal_jump": Shot(goal(3.5), "Mars: jump to a place 3.5 m ahead"),
+    "mars_springs_jump": Shot(goal(3.9), "Mars, springs between the knees: jump to a place 3.9 m ahead"),
+    "mars_vertical_jump": Shot(heights(3.0), "Mars: jump to 3 m"),
+    "mars_vertical_jump_stock": Shot(heights(2.0), "Mars, stock robot: jump to 2 m"),
+    "omnidirectional_jump": Shot(goal(-0.5, 0.5), "jump to a place 0.5 m back and 0.5 m to the left"),
+    "sighted_jump": Shot(goal(1.3), "jump off a platform of 0.15 m that it sees", lambda: platform(-0.15, edge=0.4)),
+    "slippery_jump": Shot(goal(1.2), "jump to a place 1.2 m ahead, for slippery ground"),
+    "slippery_waiting_jump": Shot(goal(1.2), "wait, then jump to a place 1.2 m ahead, for slippery ground"),
+    "vertical_jump": Shot(heights(1.0), "jump to a base height of 1 m"),
+    "walking_flat": Shot(walk(0.8, 0.0, 0.0), "walk at 0.8 m/s"),
+    "walking_rough": Shot(
+        walk(0.5, 0.0, 0.0), "walk at 0.5 m/s over stairs that it does not see",
+        lambda: single_tile(TerrainCfg(tile=8.0), "pit"),
+    ),
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Args(ThreadArgs):
+    """Flags."""
+
+    policies: tuple[str, ...] = (*SHOTS, COURSE)  # Which to draw
+    films: bool = True  # Also make films
+    save_to_policies: bool = False  # Write picture.webp into the policies' folders
+    readme: Path | None = None  # Folder for the README's tile of four pictures and its animation
+
+    def __post_init__(self) -> None:
+        unknown = sorted(set(self.policies) - {*SHOTS, COURSE})
+        if unknown:
+            raise InputError(f"no picture of {unknown[0]!r:.40}; there are {', '.join((*SHOTS, COURSE))}")
+
+
+def record(name: str) -> Recording:
+    """Return a recording of one episode of a policy's shot, or of the course."""
+    if name == COURSE:
+        run: EvaluationRun | SkillRun = SkillRun()
+        log: Any = CourseLog([read_script(SCRIPT)])
+        env, ground = run.env(1), "plane"
+    else:
+        shot = SHOTS[name]
+        run = EvaluationRun(name)
+        log, ground = shot.flags.log(run.evaluation.prepare_task(run.task)), shot.ground()
+        env = run.env(log.count, ground=ground)
+    recorder = EnvRecorder(env, log, [0], ground=ground, notes={"task": name})
+    run_evaluation(run.actor(env), env, log, on_step=recorder)
+    return recorder.recording()
+
+
+def main(args: Args) -> dict:
+    """Draw all pictures and films, and return their sizes [KiB] by name."""
+    folder = prepare("policy_pictures", args, args.threads)
+    sizes = {}
+    for name in args.policies:
+        recording = record(name)
+        title = "walk, jump up, walk, jump ahead, walk" if name == COURSE else SHOTS[name].title
+        picture = write_picture(recording, folder / f"{name}.webp", title=title)
+        paths = [picture]
+        if args.films:
+            paths.append(write_film(recording, folder / f"{name}.mp4", size=FILM_SIZE))
+        if args.save_to_policies and name != COURSE:
+            add_files(find_policy(name), {"picture.webp": picture.read_bytes()})
+        if args.readme is not None and name == ANIMATION:
+            paths.append(write_film(recording, args.readme / f"{name}.webp", size=ANIMATION_SIZE, fps=15.0))
+        for path in paths:
+            sizes[path.name] = path.stat().st_size / 1024
+            print(f"{path} {sizes[path.name]:.0f} KiB")
+    if args.readme is not None:
+        save_tile([folder / f"{name}.webp" for name in TILE], args.readme / "policies.webp")
+    return sizes
+
+
+def save_tile(paths: list[Path], path: Path) -> None:
+    """Write four pictures of one width each as a tile of two by two."""
+    pictures = [Image.open(each).convert("RGB") for each in paths]
+    pictures = [each.resize((TILE_WIDTH, each.height * TILE_WIDTH // each.width)) for each in pictures]
+    rows = [max(pictures[i].height, pictures[i + 1].height) for i in (0, 2)]
+    tile = Image.new("RGB", (2 * TILE_WIDTH, sum(rows)), (255, 255, 255))
+    for i, picture in enumerate(pictures):
+        tile.paste(picture, (TILE_WIDTH * (i % 2), (i // 2) * rows[0]))
+    data = io.BytesIO()
+    tile.save(data, "webp", quality=85, method=6)
+    write_atomically(path, data.getvalue())
+
+
+if __name__ == "__main__":
+    run_script(main, Args)
