@@ -23,13 +23,12 @@ ELEVATION = 0.13  # [1] height of the eye over its horizontal distance
 FIELD_OF_VIEW = 16.0  # [deg] narrow, so that near and far moments have nearly the same scale
 GAP = 0.28  # [m] least distance in the picture between the bases of two moments of a jump
 SIDE_BY_SIDE = 0.8  # [m] least distance between two moments of a walk
-APART = 0.55  # [m] distance to the right from which two moments do not hide each other
+APART = (0.6, 0.6)  # [m] distance to the right or up from which two moments do not hide each other
 GHOST = 0.4  # opacity of moments that would hide others
 SPREAD = 0.95  # [m] distance between moments of a robot that stays in place
 STAYS = 0.6  # [m] horizontal distance up to which a robot stays in place
 RISE = 0.1  # [m] of the base during a flight, above which the flight is a jump
 CONTACT = 1.0  # [N] paw force above which a paw touches
-GROUND = -0.1  # [m] lowest height that a picture must show
 MOST = 7  # moments in a picture
 FORMATS = {".png": {}, ".webp": {"quality": 88, "method": 6}, ".jpg": {"quality": 90}}  # Pillow's options by suffix
 
@@ -43,6 +42,7 @@ class Composition:
     base: np.ndarray  # (num_frames, 3) [m] base positions, world frame
     right: np.ndarray  # (3,) horizontal unit vector of the path, to the right in the picture
     frames: np.ndarray  # (moments,) indices of the shown frames
+    flights: list[tuple[int, int]]  # first and last frame of each flight of a jump
     shift: np.ndarray  # (moments,) [m] along `right`, by which each moment is drawn away from its place
 
     @property
@@ -60,6 +60,12 @@ class Composition:
     def grounded(self) -> bool:
         """Whether a paw touches the ground in the recording."""
         return bool((np.linalg.norm(self.recording.contact_forces[:, self.rank], axis=-1) > CONTACT).any())
+
+    @property
+    def lowest(self) -> float:
+        """[m] Lowest height of a paw, 0 without paws."""
+        points = self.recording.contact_points[:, self.rank, :, 2]
+        return float(points.min()) if points.size else 0.0
 
     @property
     def toward_eye(self) -> np.ndarray:
@@ -94,7 +100,7 @@ def compose(recording: Recording, rank: int = 0) -> Composition:
     else:
         frames = _evenly_moved(recording.body_poses(rank), 6)
     shift = SPREAD * (np.arange(len(frames)) - 0.5 * (len(frames) - 1)) if stays else np.zeros(len(frames))
-    return Composition(recording, rank, base, right, frames, shift)
+    return Composition(recording, rank, base, right, frames, flights, shift)
 
 
 def _flights(recording: Recording, rank: int) -> list[tuple[int, int]]:
@@ -171,26 +177,32 @@ def write_picture(
     return path
 
 
-def _opacity(scene: Composition) -> list[float]:
-    """Return the opacity of each moment: 1, but GHOST for those that overlap an opaque one before them."""
-    opacity, along = [], scene.bases @ scene.right
-    last = -np.inf
-    for place in along:
-        opaque = place - last >= APART
-        last = place if opaque else last
-        opacity.append(1.0 if opaque else GHOST)
+def _opacity(scene: Composition) -> np.ndarray:
+    """Return the opacity of each moment, (moments,): GHOST for those that would hide a more important one, else 1.
+
+    Apexes, start and end are the most important.
+    """
+    places = np.stack([scene.bases @ scene.right, scene.bases[:, 2]], axis=1)
+    apexes = [first + int(np.argmax(scene.base[first : last + 1, 2])) for first, last in scene.flights]
+    first, last = scene.frames[0], scene.frames[-1]
+    rank = [0 if frame in apexes else 1 if frame in (first, last) else 2 for frame in scene.frames]
+    opacity = np.full(len(places), GHOST)
+    for i in sorted(range(len(places)), key=lambda i: rank[i]):
+        hidden = (np.abs(places[opacity == 1.0] - places[i]) < APART).all(axis=1).any()
+        opacity[i] = GHOST if hidden and rank[i] > 0 else 1.0
     return opacity
 
 
 def _extent(scene: Composition) -> np.ndarray:
     """Return points [m], (n, 3), that the picture must show: robots with their labels, scale and bars."""
     low, high = scene.span()
-    heights = [*scene.heights, *([GROUND] if scene.grounded else [])]
+    ground = scene.lowest - 0.1
+    heights = [*scene.heights, *([ground] if scene.grounded else [])]
     frame = [scene.point(along, height) for along in (low - 0.25, high) for height in heights]
     goals = (
         scene.recording.goals[scene.rank] if len(scene.recording.goals) and not scene.shift.any() else np.zeros((0, 3))
     )
-    boxes = corners(scene.bases, GROUND)
+    boxes = corners(scene.bases, ground)
     return np.concatenate(
         [boxes, boxes + [0.0, 0.0, 0.2], np.reshape(frame, (-1, 3)), goals[np.isfinite(goals).all(axis=1)]]
     )
@@ -239,19 +251,18 @@ def _ticks(scene: Composition) -> np.ndarray:
         return np.zeros(0)
     top = max(float(scene.bases[:, 2].max()), *scene.heights, 0.25)
     step = 0.25 if top < 1.5 else 0.5
-    return np.arange(0.0, top + step, step)
+    return np.arange(0.0, top + 0.1, step)
 
 
 def _labels(scene: Composition) -> list[Label]:
     """Return time and, in jumps, base height above each moment, and the numbers of scale and bars."""
     low, high = scene.span()
-    start, jumps = scene.recording.times[scene.frames[0]], float(np.ptp(scene.base[:, 2])) > 2.0 * RISE
-    labels = []
+    jumps, labels = bool(scene.flights), []
     for frame, base, opacity in zip(scene.frames, scene.bases, _opacity(scene), strict=True):
         if opacity < 1.0:
             continue
         text = f"{scene.recording.times[frame]:.2f} s" + (f"\n{base[2]:.2f} m" if jumps else "")
-        labels.append(Label(text, base + [0.0, 0.0, 0.2 if jumps else 0.3]))
+        labels.append(Label(text, base + [0.0, 0.0, 0.4 if len(scene.recording.commands) else 0.2]))
     labels += [Label(f"{z:g} m", scene.point(low - 0.06, z), "rm") for z in _ticks(scene)]
     labels += [Label(f"commanded {z:.2f} m", scene.point(high, z + 0.01), "rd") for z in scene.heights]
     return labels
