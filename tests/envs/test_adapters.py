@@ -388,4 +388,4 @@ def test_rsl_rl_writes_the_metrics(tmp_path, one_thread):
     assert (tmp_path / "model_1.pt").exists()
     events = EventAccumulator(str(tmp_path))
     events.Reload()
-    assert [event.step for event in events.Scalars("/Episode_Termination/too_long")] == [0, 1]
+    assert [event.step for event in events.Scalars("Episode_Termination/too_long")] == [0, 1]
