@@ -54,7 +54,7 @@ class Args:
 
 
 def main(args: Args) -> dict:
-    """Train for a few iterations, write and return the logged reward of the new term and the mean reward of an episode."""
+    """Train for a few iterations, write and return the logged reward of the new term and of whole episodes."""
     wp.config.log_level = wp.LOG_WARNING
     folder = output_dir("new_reward", args.out)
     ppo = PpoCfg(num_steps=args.num_steps)

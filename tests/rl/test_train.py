@@ -46,7 +46,9 @@ def test_run_writes_config_metrics_and_checkpoints(cfg):
     lines = [json.loads(line) for line in (result.folder / METRICS_FILE).read_text().splitlines()]
     assert [line["iteration"] for line in lines] == [2, 4]
     assert lines[-1]["Train/mean_episode_length"] == 16.0
-    assert {"Perf/total_fps", "Perf/collection_time", "Perf/learning_time", "Loss/kl", "Metrics/success"} <= lines[0].keys()
+    assert {"Loss/kl", "Metrics/success", "Perf/elapsed_s"} <= lines[0].keys()
+    seconds = lines[0]["Perf/collection_time"] + lines[0]["Perf/learning_time"]
+    assert lines[0]["Perf/total_fps"] * seconds == pytest.approx(16 * 32)
     manifest = json.loads((result.folder / CHECKPOINTS / MANIFEST).read_text())
     assert manifest.keys() == {"iteration_000002.pt", "iteration_000004.pt"}
     assert json.loads(final_state(result)["config"]) == settings
@@ -265,7 +267,9 @@ def test_refuses_an_unknown_best_metric_before_the_first_iteration(cfg):
         def step(self, action):
             pytest.fail("an iteration began")
 
-    message = r"best_metric must name a logged metric, such as Metrics/success, Train/mean_episode_length, .*, got 'nonsense'"
+    message = (
+        r"best_metric must name a logged metric, such as Metrics/success, Train/mean_episode_length, .*, got 'nonsense'"
+    )
     with pytest.raises(ValueError, match=message):
         train(dataclasses.replace(cfg, best_metric="nonsense"), UnsteppedTask)
     assert not cfg.log_root.exists()
