@@ -54,7 +54,7 @@ class Args:
 
 
 def main(args: Args) -> dict:
-    """Train for a few iterations, write and return the logged reward of the new term and the mean return."""
+    """Train for a few iterations, write and return the logged reward of the new term and of whole episodes."""
     wp.config.log_level = wp.LOG_WARNING
     folder = output_dir("new_reward", args.out)
     ppo = PpoCfg(num_steps=args.num_steps)
@@ -62,12 +62,12 @@ def main(args: Args) -> dict:
                    ppo=ppo, device=args.device, tensorboard=False)  # fmt: skip
     result = train(cfg, make_env)
     values = {
-        "even_load_per_episode": result.metrics["Episode_Reward/even_load"],
-        "mean_return": result.metrics.get("Train/mean_return"),
+        "episode_reward_even_load": result.metrics["Episode_Reward/even_load"],
+        "mean_reward": result.metrics.get("Train/mean_reward"),
         "iterations": result.iteration,
     }
     write_metrics(folder, values)
-    print(f"Episode_Reward/even_load {values['even_load_per_episode']:.4f}; run in {result.folder}")
+    print(f"Episode_Reward/even_load {values['episode_reward_even_load']:.4f}; run in {result.folder}")
     return values
 
 

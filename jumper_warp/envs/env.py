@@ -307,15 +307,16 @@ class Env(Stages):
         )
 
     def metrics(self) -> dict[str, float]:
-        """Return metrics by name, means since the last call, and clear the counters (waits for the device).
+        """Return metrics by name since the last call, see `TaskRuntime.metrics`, and clear the counters.
 
-        Names of tasks other than the first begin with the task's name and a slash.
+        Waits for the device. Names of tasks other than the first begin with the task's name and a slash.
         """
         metrics = self.skills[0].metrics()
         for skill in self.skills[1:]:
             metrics |= {f"{skill.task.name}/{name}": value for name, value in skill.metrics().items()}
         levels = np.bincount(self.episodes.level.numpy(), minlength=len(self.task.levels) + 1)
-        return metrics | {f"Curriculum/level_{i}": float(count) / self.num_envs for i, count in enumerate(levels)}
+        fractions = levels / self.num_envs
+        return metrics | {f"Curriculum/fraction_at_level_{i}": float(part) for i, part in enumerate(fractions)}
 
     def mirror(self, what: str) -> Mirror:
         """Return the left-right mirror image (order, signs) of the first task's "observation", or of an "action".

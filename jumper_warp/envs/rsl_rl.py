@@ -62,6 +62,6 @@ class RslRlVecEnv(RslRlEnv):
         self._episode_length.add_(1).mul_((1.0 - env.done).long())
         extras: dict[str, Any] = {"time_outs": env.timeout.clone()}
         if self._steps % self._metrics_every == 0:
-            extras["log"] = {f"/{name}": value for name, value in env.metrics().items()}
+            extras["log"] = env.metrics()
         reward = torch.nan_to_num(env.reward, nan=0.0, posinf=0.0, neginf=0.0)
         return self.get_observations(), reward, env.done.long(), extras

@@ -39,8 +39,10 @@ class TaskRuntime:
         self.states = wp.zeros(num_envs, dtype=task.state, device=device)
         self.num_events = len(task.params.slots["events"])
         self.timer = wp.zeros((max(self.num_events, 1), num_envs), dtype=int, device=device)
-        self.term_value = wp.zeros((max(len(task.rewards), 1), num_envs), dtype=float, device=device)
+        terms = (max(len(task.rewards), 1), num_envs)
+        self.term_value, self.episode_sum = (wp.zeros(terms, dtype=float, device=device) for _ in range(2))
         self.counters = self._counters()
+        self._max_episode_length_s = task.max_episode_length_s(step_dt)
         self.settings = self._structs([] if task.reset.settings is None else [task.reset.settings.values(step_dt)])
         self.levels = self._structs([level.values() for level in task.levels], task.level_type)
         self._allocate_observations(substeps)
@@ -111,19 +113,26 @@ class TaskRuntime:
             self.params.set(f"{section}.{name}.{key}", value)
 
     def metrics(self) -> dict[str, float]:
-        """Return metrics by name, means since the last call, and clear the counters (waits for the device)."""
+        """Return metrics by name since the last call, and clear the counters (waits for the device).
+
+        Means of nothing are 0. `Episode_Reward/<term>`: mean over the ended episodes of the term's sum over the
+        episode, divided by the time limit [s]; `Episode_Sum/<term>`: the mean sum, of a task without a time limit.
+        `Episode_Termination/<term>`: fraction of the ended episodes. `Metrics/success`: fraction of the episodes that
+        the curriculum counts; `Metrics/error_of_successes_<unit>`: mean curriculum error of the successful ones.
+        """
         task, counters, metrics = self.task, self.counters, {}
         endings = counters.termination_count.numpy().sum(axis=1)
         ended = max(int(endings.sum()), 1)
+        limit = self._max_episode_length_s
         for term, total in zip(task.rewards, counters.term_sum.numpy().sum(axis=1), strict=False):
-            metrics[f"Episode_Reward/{term.name}"] = float(total) / ended
+            metrics[f"Episode_{'Reward' if limit else 'Sum'}/{term.name}"] = float(total) / ended / (limit or 1.0)
         for term, count in zip(task.terminations, endings, strict=True):
             metrics[f"Episode_Termination/{term.name}"] = float(count) / ended
         counted = int(counters.curriculum_episodes.numpy().sum())
         succeeded = int(counters.curriculum_successes.numpy().sum())
         metrics["Metrics/success"] = succeeded / max(counted, 1)
         error = float(counters.error_sum.numpy().sum())
-        metrics[f"Metrics/error_{task.curriculum.options['unit']}"] = error / max(succeeded, 1)
+        metrics[f"Metrics/error_of_successes_{task.curriculum.options['unit']}"] = error / max(succeeded, 1)
         metrics["Metrics/bad_actions"] = float(counters.bad_actions.numpy().sum())
         for name in Counters.vars:
             getattr(counters, name).zero_()

@@ -146,7 +146,7 @@ class Stages:
             self._launch(
                 skill.kernels["step"], part.count,
                 [skill.index, self.robot, self._scene.ground, len(skill.task.levels), skill.params.values, part.episode,
-                 skill.states, skill.term_value, skill.counters],
+                 skill.states, skill.episode_sum, skill.term_value, skill.counters],
             )  # fmt: skip
 
     def _reset_done(self, part: WorldSlice) -> None:

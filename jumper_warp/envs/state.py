@@ -134,5 +134,6 @@ def _tensors(env: Stages) -> dict[str, torch.Tensor]:
     arrays |= {f"solver.{name}": array for name, array in env.sim.physics.carried().items()}
     for skill in env.skills:
         arrays |= {f"{skill.task.name}/{name}": getattr(skill.observations, name) for name in ("now", "final", "past")}
-        arrays |= {f"{skill.task.name}/timer": skill.timer, f"{skill.task.name}/changed": skill.params.changed}
+        own = {"timer": skill.timer, "changed": skill.params.changed, "episode_sum": skill.episode_sum}
+        arrays |= {f"{skill.task.name}/{name}": array for name, array in own.items()}
     return {name: wp.to_torch(array) for name, array in arrays.items() if isinstance(array, wp.array)}

@@ -22,7 +22,7 @@ from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.tasks.saving import TaskError, check_version
 
 CURVE = (
-    "iteration", "Perf/elapsed_s", "Train/mean_return", "Train/mean_length", "Metrics/success", "Metrics/score",
+    "iteration", "Perf/elapsed_s", "Train/mean_reward", "Train/mean_episode_length", "Metrics/success", "Metrics/score",
 )  # fmt: skip
 """Columns of a saved learning curve."""
 CURVE_ROWS = 60  # Maximum number of its rows, evenly spaced

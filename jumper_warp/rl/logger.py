@@ -18,7 +18,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedCo
 from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
 from jumper_warp.utils.errors import InputError
 
-REWARDS = "Episode_Reward/"  # Part of the names of metrics that are means of reward terms
+REWARDS = ("Episode_Reward/", "Episode_Sum/")  # Parts of the names of metrics that are means of reward terms
 
 
 class Stopwatch:
@@ -149,10 +149,10 @@ class _PipeSafeConsole(Console):
 
 
 def _summary(metrics: dict[str, float]) -> str:
-    """Return steps per second, mean return and success rate as one line, as far as metrics has them."""
-    parts = [f"{metrics['Perf/fps']:,.0f} steps/s"]
-    if (total := metrics.get("Train/mean_return")) is not None:
-        parts.append(f"return {total:.2f}")
+    """Return steps per second, mean reward of an episode and success rate as one line, as far as metrics has them."""
+    parts = [f"{metrics['Perf/total_fps']:,.0f} steps/s"]
+    if (total := metrics.get("Train/mean_reward")) is not None:
+        parts.append(f"reward {total:.2f}")
     if (success := metrics.get("Metrics/success")) is not None:
         parts.append(f"success {100.0 * success:.1f} %")
     return ", ".join(parts)
@@ -160,8 +160,8 @@ def _summary(metrics: dict[str, float]) -> str:
 
 def _non_finite_terms(metrics: dict[str, float]) -> list[str]:
     """Return the names of reward terms whose mean is not finite."""
-    means = {name.replace(REWARDS, ""): value for name, value in metrics.items() if REWARDS in name}
-    return [name for name, value in means.items() if not math.isfinite(value)]
+    faulty = [name for name, value in metrics.items() if not math.isfinite(value)]
+    return [name.replace(part, "") for name in faulty for part in REWARDS if part in name]
 
 
 def format_duration(seconds: float) -> str:

@@ -313,7 +313,7 @@ def take_averages(
     metrics |= {"Loss/learning_rate": lr.item(), "Policy/mean_std": log_std.exp().mean().item()}
     total_return, total_length, episodes = finished_sums
     if episodes > 0.0:
-        metrics |= {"Train/mean_return": total_return / episodes, "Train/mean_length": total_length / episodes}
+        metrics |= {"Train/mean_reward": total_return / episodes, "Train/mean_episode_length": total_length / episodes}
     sums.zero_()
     finished.zero_()
     return metrics

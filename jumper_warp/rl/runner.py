@@ -35,9 +35,9 @@ from jumper_warp.utils.sources import source_checksums
 from jumper_warp.utils.threads import set_threads
 
 CONFIG = "config.json"  # File in a run's folder with all settings, versions and the commit
-PERF = ("Perf/fps", "Perf/collect_s", "Perf/update_s", "Perf/elapsed_s")
-"""Performance metrics: policy steps per second, rollout time [s], update time [s], training time [s]."""
-LEARNING = ("Loss/learning_rate", "Policy/mean_std", "Train/mean_return", "Train/mean_length")
+PERF = ("Perf/total_fps", "Perf/collection_time", "Perf/learning_time", "Perf/elapsed_s")
+"""Performance metrics: policy steps per second of rollout and update, time of each [s], training time [s]."""
+LEARNING = ("Loss/learning_rate", "Policy/mean_std", "Train/mean_reward", "Train/mean_episode_length")
 """Learning metrics besides the losses; Train/ only if an episode has ended."""
 INTERRUPTED = 130  # Exit code of a training that a signal stopped
 MakeEnv = Callable[[int, int, torch.device], VecEnv]
@@ -226,7 +226,7 @@ class TrainingRun:
                 is_last = is_last_iteration(self.iteration, cfg, self.sync_stop_request(stop))
                 if is_last or self.iteration % cfg.log_interval == 0:
                     times, seconds = watch.read()
-                    self.metrics = self._read_metrics(times, seconds)
+                    self.metrics = self._read_metrics(times)
                     log.log(self.iteration, self.metrics, self._remaining(seconds))
                 elif self.iteration == first_iteration:  # discard its time, which includes warm-up
                     watch.read()
@@ -277,10 +277,10 @@ class TrainingRun:
             stop.requested, over_time = map(bool, distributed.all_reduce_max([int(stop.requested), int(over_time)]))
         return stop.requested or over_time
 
-    def _read_metrics(self, times: list[float], seconds: float) -> dict[str, float]:
-        """Return the metrics to log; times: of rollout and update [s], as in PERF; seconds: of an iteration [s]."""
+    def _read_metrics(self, times: list[float]) -> dict[str, float]:
+        """Return the metrics to log; times: of rollout and update [s], as in PERF."""
         steps = self.cfg.ppo.num_steps * self.cfg.num_envs
-        perf = (steps / seconds, *times, self._elapsed())
+        perf = (steps / sum(times), *times, self._elapsed())
         return {**self.ppo.statistics(), **self.env.metrics(), **dict(zip(PERF, perf, strict=True))}
 
     def _save(self, log: TrainingLog | _NoLog, is_last: bool, stop: StopRequest) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from jumper_warp.kernels.mdp.env import NoSettings
 from jumper_warp.kernels.mdp.starts import MIN_LINK_DISTANCE
-from jumper_warp.kernels.mdp.terminations import came_apart
+from jumper_warp.kernels.mdp.terminations import came_apart, too_long
 from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
 from jumper_warp.tasks.params import TaskParams
@@ -39,7 +39,8 @@ class Reset:
     """@wp.func (arrays: RobotArrays, scene: Scene, skill: SkillSettings, old state, settings, level, rng: RngStream) ->
     new state; writes coordinates and rates of world `rng.world`."""
     settings: Any = None
-    """Frozen dataclass with `struct`, a `@wp.struct`, and `values(step_dt)` [s], which returns one; or None."""
+    """Frozen dataclass with `struct`, a `@wp.struct`, and `values(step_dt)` [s], which returns one; or None.
+    A property `max_episode_length_s` tells the time limit [s] of episodes that it ends (0: none)."""
     parallel: bool = False
     """Whether threads of a GPU share `func`'s attempts, `range(rng.lane, number, rng.lanes)`. Only `rng.lane` differs
     between the threads; apart from the attempts they must write equal values."""
@@ -186,6 +187,15 @@ class TaskCfg:
             end = first + term.width * term.options["history"]
             columns[term.name], first = (first, end), end
         return columns
+
+    def max_episode_length_s(self, step_dt: float) -> float:
+        """Return the time limit of episodes [s], of the reset and the termination `too_long`; 0: no limit.
+
+        step_dt [s]: policy step.
+        """
+        limits = [term.numbers["steps"] * step_dt for term in self.terminations if term.func is too_long]
+        limits.append(getattr(self.reset.settings, "max_episode_length_s", 0.0))
+        return min((limit for limit in limits if limit), default=0.0)
 
     @property
     def observation_names(self) -> tuple[str, ...]:

@@ -57,7 +57,7 @@ class EpisodeArrays:
 class Counters:
     """Statistics that accumulate until the host reads and clears them."""
 
-    term_sum: wp.array2d(dtype=wp.float64)  # (rewards, num_worlds) sum of each reward term, weight applied
+    term_sum: wp.array2d(dtype=wp.float64)  # (rewards, num_worlds) `episode_sum`, summed over ended episodes
     termination_count: wp.array2d(dtype=int)  # (terminations, num_worlds) ended episodes by termination term
     curriculum_episodes: wp.array(dtype=int)  # (num_worlds,) ended episodes that count for the curriculum
     curriculum_successes: wp.array(dtype=int)  # of these, successful

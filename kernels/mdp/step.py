@@ -5,7 +5,7 @@ from typing import Any
 import warp as wp
 
 from ..terrain.ground import Ground
-from .env import Counters, EpisodeArrays
+from .env import BEGUN, Counters, EpisodeArrays
 from .options import FAST
 from .terminations import came_apart
 from .view import RobotArrays, has_diverged, load_view
@@ -74,6 +74,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         # in, out
         episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
+        episode_sum: wp.array2d(dtype=float),
         # out
         term_value: wp.array2d(dtype=float),
         counters: Counters,
@@ -81,6 +82,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         """Advance the task state of every world of `skill`, then evaluate terminations, rewards and curriculum.
 
         One thread per world. p: numbers of the task's terms. The first termination that holds ends the episode.
+        episode_sum: (rewards, num_worlds), sums of `term_value` since the episode, or this skill in it, began.
         term_value: (rewards, num_worlds), rewards of this step, weights applied; non-finite ones add 0 to the reward.
         """
         world = episode.first + wp.tid()
@@ -113,6 +115,8 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                     timeout = wp.where(wp.static(bool(endings[i].time_out)), 1.0, 0.0)
                     success = wp.static(bool(endings[i].success))
 
+        begun = episode.history_reset[world] == BEGUN
+        ended = termination != NOT_TERMINATED
         total = float(0.0)
         for i in range(wp.static(len(rewards))):
             if wp.static(rewards[i].parameterless):
@@ -127,7 +131,10 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             if diverged:
                 value = float(0.0)
             term_value[i, world] = value
-            counters.term_sum[i, world] = counters.term_sum[i, world] + wp.float64(value)
+            running = wp.where(begun, value, episode_sum[i, world] + value)
+            episode_sum[i, world] = wp.where(ended, 0.0, running)
+            if ended:
+                counters.term_sum[i, world] = counters.term_sum[i, world] + wp.float64(running)
             if wp.isfinite(value):
                 total += value
         if not wp.isfinite(total):
@@ -136,7 +143,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             total = wp.max(total, wp.static(0.0 if floor is None else float(floor)))
         write_step_result(episode, counters, world, total, termination, timeout, diverged)
         states[world] = state
-        if termination != NOT_TERMINATED:
+        if ended:
             counters.termination_count[termination, world] = counters.termination_count[termination, world] + 1
             if wp.static(curriculum.counts)(state):
                 error = wp.static(curriculum.func)(robot, state)

@@ -15,7 +15,9 @@ from jumper_warp.envs.rsl_rl import RslRlVecEnv
 from jumper_warp.envs.vec_env import RAW_LIMIT
 from jumper_warp.gym import env_id, register_envs
 from jumper_warp.registry import TASKS, make_task
+from jumper_warp.rl.ppo import STATISTICS
 from jumper_warp.rl.rsl_rl import rsl_rl_config, train_rsl_rl
+from jumper_warp.rl.runner import LEARNING, PERF
 from jumper_warp.tasks.randomization import RandomizationCfg
 from toy_task import SMALL
 
@@ -381,11 +383,15 @@ def test_rsl_rl_bootstraps_time_outs_but_not_failures(one_thread):
     assert (stored - reward)[time_out.bool()].abs().min() > 1.0e-4
 
 
-def test_rsl_rl_writes_the_metrics(tmp_path, one_thread):
+def test_rsl_rl_and_this_packages_trainer_log_the_same_keys(tmp_path, one_thread):
     adapter = RslRlVecEnv(jumper(4), metrics_every=SMALL.num_steps)
     adapter.reset()
     train_rsl_rl(adapter, SMALL, 2, save_interval=1, seed=0, folder=tmp_path)
     assert (tmp_path / "model_1.pt").exists()
     events = EventAccumulator(str(tmp_path))
     events.Reload()
-    assert [event.step for event in events.Scalars("/Episode_Termination/too_long")] == [0, 1]
+    assert [event.step for event in events.Scalars("Episode_Termination/too_long")] == [0, 1]
+    theirs = {name for name in events.Tags()["scalars"] if not name.endswith("/time")}
+    metrics = adapter.env.metrics().keys()
+    assert metrics | {"Train/mean_reward", "Train/mean_episode_length"} <= theirs
+    assert theirs - metrics <= {*PERF, *LEARNING, *(f"Loss/{name}" for name in STATISTICS)}

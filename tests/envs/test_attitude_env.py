@@ -92,7 +92,7 @@ def test_an_episode_succeeds_within_tolerance_and_without_touching(env):
     metrics = env.metrics()
     assert metrics["Metrics/success"] == pytest.approx((N - 2) / N)
     assert metrics["Metrics/settled"] == pytest.approx((N - 1) / N)
-    assert metrics["Metrics/settling_s"] == pytest.approx(1.0 / 60.0)
+    assert metrics["Metrics/settling_time_of_settled_s"] == pytest.approx(1.0 / 60.0)
     assert metrics["Metrics/error_at_end_rad"] == pytest.approx(30.0 * DEG / N, abs=2e-3)
 
 

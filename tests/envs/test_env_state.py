@@ -104,8 +104,10 @@ def test_an_environment_goes_on_from_a_saved_state_bit_for_bit(solver):
     for action in random_actions(count, 5):
         saved.step(action)
     edit_episodes(saved, level=np.arange(count) % 4, streak=np.arange(count) % 5)
+    saved.metrics()
     fresh.load_state_dict(saved.state_dict())
     assert len(list(go_on_alike(saved, fresh))) == 25
+    assert fresh.metrics() == saved.metrics()
 
 
 def ground_env(count=N, platform=0.4, block=0.6, **arguments):

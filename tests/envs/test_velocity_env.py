@@ -123,13 +123,14 @@ def test_logged_figures_are_ratios_of_what_worlds_counted(flat):
          command_level=worlds)  # fmt: skip
     figures = flat.metrics()
     expected = {
-        "Metrics/error_xy_m_s": 2.8 / 16.0, "Metrics/error_yaw_rad_s": 5.6 / 16.0, "Metrics/falls_per_minute": 0.5,
-        "Metrics/swing_apex_m": 0.075, "Metrics/steps_hz": 2.0, "Metrics/score": 0.35, "Curriculum/command_level": 3.5,
+        "Metrics/error_vel_xy_settled_m_s": 2.8 / 16.0, "Metrics/error_vel_yaw_settled_rad_s": 5.6 / 16.0,
+        "Metrics/falls_per_minute": 0.5, "Metrics/swing_apex_m": 0.075, "Metrics/steps_hz": 2.0, "Metrics/score": 0.35,
+        "Curriculum/command_level": 3.5,
     }  # fmt: skip
     assert {name: figures[name] for name in expected} == pytest.approx(expected, rel=1e-5)
-    assert "Metrics/error_m_s" in figures
+    assert "Metrics/error_of_successes_m_s" in figures
     again = flat.metrics()
-    assert again["Metrics/error_xy_m_s"] == 0.0 and again["Curriculum/command_level"] == 3.5
+    assert again["Metrics/error_vel_xy_settled_m_s"] == 0.0 and again["Curriculum/command_level"] == 3.5
 
 
 def test_metric_of_an_unknown_field_is_refused():

@@ -46,8 +46,8 @@ def trained(tmp_path_factory):
 def test_new_reward_is_logged_by_name(trained):
     folder, values, run = trained
     line = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])
-    assert values["even_load_per_episode"] == line["Episode_Reward/even_load"]
-    assert values["even_load_per_episode"] > 0.0
+    assert values["episode_reward_even_load"] == line["Episode_Reward/even_load"]
+    assert values["episode_reward_even_load"] > 0.0
     assert json.loads((folder / "metrics.json").read_text())["iterations"] == 2
 
 

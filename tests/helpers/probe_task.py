@@ -248,7 +248,7 @@ class Probe:
         """Launch the end of a step."""
         skill = self.skill
         inputs = [skill.index, self.robot, self.ground, len(self.task.levels), skill.params.values, self.episodes,
-                  skill.states, skill.term_value, skill.counters]  # fmt: skip
+                  skill.states, skill.episode_sum, skill.term_value, skill.counters]  # fmt: skip
         wp.launch(skill.kernels["step"], self.n, inputs, device="cpu")
 
     def observe(self, after_reset: int = 0) -> None:

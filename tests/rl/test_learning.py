@@ -19,7 +19,7 @@ def mean_returns(cfg: TrainCfg) -> list[float]:
     task = dataclasses.replace(task, levels=task.levels[:1])
     result = train(cfg, lambda n, seed, _: Env(task, n, seed=seed, device="cpu", randomize=False, noise=False))
     lines = (result.folder / METRICS_FILE).read_text().splitlines()
-    return [json.loads(line)["Train/mean_return"] for line in lines]
+    return [json.loads(line)["Train/mean_reward"] for line in lines]
 
 
 def test_short_training_on_the_vertical_jump_doubles_the_return(tmp_path):

@@ -181,7 +181,7 @@ def trained(iterations):
 
 def test_training_learns_to_push_the_mass_to_the_origin():
     ppo, history = trained(30)
-    returns = [metrics["Train/mean_return"] for metrics in history if "Train/mean_return" in metrics]
+    returns = [metrics["Train/mean_reward"] for metrics in history if "Train/mean_reward" in metrics]
     assert returns[0] < 25.0
     assert returns[-1] > 44.0  # the maximum is 1 for each of 50 steps
     env = ppo.env
@@ -194,7 +194,7 @@ def test_training_learns_to_push_the_mass_to_the_origin():
 def test_critic_learns_the_normalised_return():
     ppo, history = trained(30)
     # A mass that stays at the origin gets the scaled reward 0.6 in every step: 0.6 / (1 - 0.985) = 40.
-    expected = 40.0 * history[-2]["Train/mean_return"] / 50.0
+    expected = 40.0 * history[-2]["Train/mean_reward"] / 50.0
     with torch.no_grad():
         head = ppo.model.value_head(ppo.model.critic_features(ppo.rollout.critic_obs))
         value = ppo.model.value(ppo.rollout.critic_obs)

@@ -143,7 +143,7 @@ def test_train_with_shac_runs_resumes_and_refuses_an_env_without_gradients(tmp_p
     cfg = push_cfg(tmp_path, num_envs=16, max_iterations=3, log_interval=1, trainer="shac", ppo=CFG)
     result = train(cfg, lambda n, seed, device: SmoothPushTask(n, seed, device, episode_length=8))
     assert result.iteration == 3
-    assert result.metrics["Train/mean_length"] == 8.0
+    assert result.metrics["Train/mean_episode_length"] == 8.0
     resumed = dataclasses.replace(cfg, max_iterations=4, resume=str(result.folder))
     assert train(resumed, lambda n, seed, device: SmoothPushTask(n, seed, device, episode_length=8)).iteration == 4
     with pytest.raises(InputError, match="an environment with gradients"):

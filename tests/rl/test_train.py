@@ -45,8 +45,10 @@ def test_run_writes_config_metrics_and_checkpoints(cfg):
     assert settings["versions"]["torch"].split("+")[0] == torch.__version__.split("+")[0]
     lines = [json.loads(line) for line in (result.folder / METRICS_FILE).read_text().splitlines()]
     assert [line["iteration"] for line in lines] == [2, 4]
-    assert lines[-1]["Train/mean_length"] == 16.0
-    assert {"Perf/fps", "Perf/collect_s", "Perf/update_s", "Loss/kl", "Metrics/success"} <= lines[0].keys()
+    assert lines[-1]["Train/mean_episode_length"] == 16.0
+    assert {"Loss/kl", "Metrics/success", "Perf/elapsed_s"} <= lines[0].keys()
+    seconds = lines[0]["Perf/collection_time"] + lines[0]["Perf/learning_time"]
+    assert lines[0]["Perf/total_fps"] * seconds == pytest.approx(16 * 32)
     manifest = json.loads((result.folder / CHECKPOINTS / MANIFEST).read_text())
     assert manifest.keys() == {"iteration_000002.pt", "iteration_000004.pt"}
     assert json.loads(final_state(result)["config"]) == settings
@@ -55,11 +57,11 @@ def test_run_writes_config_metrics_and_checkpoints(cfg):
 def test_logged_iterations_are_printed(cfg, capsys):
     result = train(cfg, make_env)
     metrics, stderr = result.metrics, capsys.readouterr().err.splitlines()
-    fps, total = f"{metrics['Perf/fps']:,.0f}", f"{metrics['Train/mean_return']:.2f}"
+    fps, total = f"{metrics['Perf/total_fps']:,.0f}", f"{metrics['Train/mean_reward']:.2f}"
     success = f"{100.0 * metrics['Metrics/success']:.1f}"
     assert stderr[0] == f"run {result.folder}"
     assert stderr[1].startswith("iteration 2/4: ") and stderr[1].endswith(" s left")
-    assert stderr[2] == f"iteration 4/4: {fps} steps/s, return {total}, success {success} %, 0 s left"
+    assert stderr[2] == f"iteration 4/4: {fps} steps/s, reward {total}, success {success} %, 0 s left"
     assert stderr[3:] == [f"saved {result.folder / CHECKPOINTS / 'iteration_000004.pt'}"]
 
 
@@ -265,7 +267,9 @@ def test_refuses_an_unknown_best_metric_before_the_first_iteration(cfg):
         def step(self, action):
             pytest.fail("an iteration began")
 
-    message = r"best_metric must name a logged metric, such as Metrics/success, Train/mean_length, .*, got 'nonsense'"
+    message = (
+        r"best_metric must name a logged metric, such as Metrics/success, Train/mean_episode_length, .*, got 'nonsense'"
+    )
     with pytest.raises(ValueError, match=message):
         train(dataclasses.replace(cfg, best_metric="nonsense"), UnsteppedTask)
     assert not cfg.log_root.exists()
@@ -275,7 +279,7 @@ def test_every_logged_metric_can_be_the_best_metric(cfg):
     metrics = train(cfg, make_env).metrics
     for name in metrics:
         TrainingRun(dataclasses.replace(cfg, best_metric=name), make_env(32, 1, "cpu"), Rank(0, 1, torch.device("cpu")))
-    assert {"Train/mean_return", "Perf/fps", "Loss/kl", "Metrics/success"} <= metrics.keys()
+    assert {"Train/mean_reward", "Perf/total_fps", "Loss/kl", "Metrics/success"} <= metrics.keys()
 
 
 def test_trains_with_the_largest_seed(cfg):

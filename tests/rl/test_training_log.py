@@ -11,7 +11,7 @@ from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
 from jumper_warp.rl.runner import CHECKPOINTS, train
 from toy_task import PushTask, push_cfg
 
-METRICS = {"Perf/fps": 1234.0, "Metrics/success": 0.5}  # steps per second, fraction
+METRICS = {"Perf/total_fps": 1234.0, "Metrics/success": 0.5}  # steps per second, fraction
 
 
 @pytest.fixture

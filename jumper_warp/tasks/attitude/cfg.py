@@ -64,6 +64,11 @@ class AttitudeResetCfg:
         check_positive("reset height", self.height)
         check_probabilities("reset", self, "default_pose_probability")
 
+    @property
+    def max_episode_length_s(self) -> float:
+        """Time limit of the longest episode [s]."""
+        return self.episode[1]
+
     def values(self, step_dt: float) -> Any:
         """Return the kernels' `AttitudeSettings`: angles in radians, times in policy steps of step_dt [s]."""
         settings = filled(AttitudeSettings(), self, skip=("episode",), degrees=("lateral", "transversal"))

@@ -65,7 +65,7 @@ TERMINATIONS = (
 METRICS = (
     StateMetric("Metrics/error_at_end_rad", "sum_error", "episodes"),
     StateMetric("Metrics/settled", "settled", "episodes"),
-    StateMetric("Metrics/settling_s", "sum_settling", "settled"),
+    StateMetric("Metrics/settling_time_of_settled_s", "sum_settling", "settled"),
     StateMetric("Metrics/in_collision_s", "sum_collisions", "episodes"),
 )
 

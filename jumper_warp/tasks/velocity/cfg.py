@@ -112,6 +112,11 @@ class VelocityResetCfg:
         check_ranges("reset", self, skip=("terrain",), not_negative=vars(self))
         check_probabilities("reset", self, "default_pose_probability", "swing_probability")
 
+    @property
+    def max_episode_length_s(self) -> float:
+        """Time limit of an episode [s]."""
+        return self.episode
+
     def values(self, step_dt: float) -> Any:
         """Return the kernels' `VelocitySettings`: angles in radians, times in policy steps of step_dt [s]."""
         settings = filled(VelocitySettings(), self, skip=("episode", "gait", "terrain"), degrees=("tilt", "heading"))

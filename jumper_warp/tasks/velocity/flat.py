@@ -85,8 +85,8 @@ TERMINATIONS = (
 
 METRICS = (
     StateMetric("Metrics/score", "score", "all_steps"),
-    StateMetric("Metrics/error_xy_m_s", "sum_xy", "sum_settled"),
-    StateMetric("Metrics/error_yaw_rad_s", "sum_yaw", "sum_settled"),
+    StateMetric("Metrics/error_vel_xy_settled_m_s", "sum_xy", "sum_settled"),
+    StateMetric("Metrics/error_vel_yaw_settled_rad_s", "sum_yaw", "sum_settled"),
     StateMetric("Metrics/falls_per_minute", "falls", "minutes"),
     StateMetric("Metrics/swing_apex_m", "apexes", "touchdowns"),
     StateMetric("Metrics/steps_hz", "touchdowns", "seconds_walking"),

@@ -287,7 +287,7 @@ def test_a_jump_is_a_success_if_its_landing_error_is_within_a_tenth_of_a_metre(e
     assert episodes_of(env)["streak"].tolist() == [3 if near else 0] * N
     metrics = env.metrics()
     assert metrics["Metrics/success"] == float(near)
-    assert metrics["Metrics/error_m"] == pytest.approx(miss if near else 0.0, abs=3e-3)  # [m]
+    assert metrics["Metrics/error_of_successes_m"] == pytest.approx(miss if near else 0.0, abs=3e-3)  # [m]
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 import numpy as np
 import pytest
 
+from jumper_warp.kernels.mdp.env import BEGUN
 from mdp_helpers import STEP_DT, write
 from probe_task import Probe, probe_task
 
@@ -77,6 +78,7 @@ def test_a_nonfinite_term_counts_0_in_the_reward_and_is_visible_in_logs(probe, n
     np.testing.assert_allclose(probe.world("reward"), expected.sum(axis=0), rtol=1e-5, atol=1e-5)
     is_finite = np.isfinite(probe.skill.term_value.numpy())
     assert not is_finite[:2, :5].any() and is_finite[:2, 5:].all() and is_finite[2:].all()
+    end_episode(probe)
     means = probe.skill.metrics()
     finite = [np.isfinite(means[f"Episode_Reward/{name}"]) for name in ("value", "offset_square", "other")]
     assert finite == [False, False, True]
@@ -92,16 +94,51 @@ def test_a_total_that_overflows_counts_as_0(probe):
     assert np.isfinite(probe.skill.term_value.numpy()).all() and not reward[:5].any() and (reward[5:] > 5.0e36).all()
 
 
-def test_sums_of_terms_are_exact_beyond_single_precision(probe):
-    random_state(probe)
-    probe.write(value=-GROWTH, other=0.25 / 4.0)
-    write(probe.skill.counters.term_sum, slice(None), 2.0**24 * 8.0)
+def test_sums_over_episodes_are_exact_beyond_single_precision(probe):
+    write(probe.skill.counters.term_sum, slice(None), 2.0**27)
     for _ in range(4):
-        probe.write(value=-GROWTH)
-        probe.step()
+        end_episode(probe, other=11.0)
     sums = probe.skill.counters.term_sum.numpy()
-    np.testing.assert_array_equal(sums[2], 2.0**27 + 4 * 0.25)
+    np.testing.assert_array_equal(sums[2], 2.0**27 + 4 * 44.0)
     np.testing.assert_array_equal(sums[0], 2.0**27)
+
+
+def test_episode_reward_is_the_mean_sum_of_ended_episodes_over_the_time_limit(probe):
+    """Worlds 0 to 15 end in the third step, 16 to 31 do and had their episode restarted after the first one."""
+    rewards = []
+    for step in range(3):
+        state = random_state(probe, seed=step)
+        ends = (step == 2) & (np.arange(N) < 32)
+        probe.write(other=np.where(ends, 101.0, state[1]))
+        if step == 1:
+            write(probe.episodes.history_reset, slice(16, 32), BEGUN)
+        probe.step()
+        rewards.append(expected_rewards(state[0], np.where(ends, 101.0, state[1]), state[2]))
+    sums = np.array(rewards)[:, :, :32].sum(axis=0)
+    sums[:, 16:] -= rewards[0][:, 16:32]
+    expected = sums.mean(axis=1) / (100.0 * STEP_DT)  # [s] of too_long
+    metrics = probe.skill.metrics()
+    names = [f"Episode_Reward/{term.name}" for term in probe.task.rewards]
+    np.testing.assert_allclose([metrics[name] for name in names], expected, rtol=1e-5)
+    end_episode(probe, other=101.0)  # the others still have the sums of their whole episodes
+    ended = expected_rewards(np.zeros(N), np.full(N, 101.0), state[2])
+    ended[:, 32:] += np.array(rewards)[:, :, 32:].sum(axis=0)
+    metrics = probe.skill.metrics()
+    np.testing.assert_allclose(
+        [metrics[name] for name in names], ended.mean(axis=1) / (100.0 * STEP_DT), rtol=1e-5, atol=1e-6
+    )
+
+
+def test_a_task_without_a_time_limit_logs_mean_episode_sums():
+    probe = Probe(N, probe_task(terminations=probe_task().terminations[:-1]))
+    state = random_state(probe)
+    probe.write(other=101.0)
+    probe.step()
+    expected = expected_rewards(state[0], np.full(N, 101.0), state[2]).mean(axis=1)
+    metrics = probe.skill.metrics()
+    assert not any(name.startswith("Episode_Reward/") for name in metrics)
+    sums = [metrics[f"Episode_Sum/{term.name}"] for term in probe.task.rewards]
+    np.testing.assert_allclose(sums, expected, rtol=1e-5)
 
 
 def test_terminations_read_the_state_after_its_update(probe):
