@@ -36,7 +36,7 @@ class Args(EvaluationArgs, AttitudeFlags):
     keep_momentum: bool = True  # Conserve the momentum of free flight exactly, regardless of the training's setting
     refine: int = 1  # [1] Factor by which the physics step is smaller than that of the training
     num_recorded: int = 6
-    """Number of turns to record for the Rerun viewer and, the first of them, as a filmstrip; 0: none."""
+    """Number of turns to record for the Rerun viewer and, one of them, as a picture; 0: none."""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -70,7 +70,7 @@ def main(args: Args) -> dict:
     run.setup_metrics |= {"physics_step_s": env.physics_dt, "keep_momentum": args.keep_momentum}
     turns, momentum = args.log(run.task, args.seed), MomentumRecorder(env)
     inertia = rotational_inertia(env.sim)
-    run.run_episodes(env, turns, film="turns", on_step=momentum)
+    run.run_episodes(env, turns, film="turn", on_step=momentum)
     values = args.metrics(turns) | momentum.metrics(turns.diverged, inertia)
     plot_turns(run, turns, f"{args.num_turns} turns by {args.angle:g} degrees, {run.title}")
     others = AttitudeLog(random_turns(args.num_turns, args.angle, args.seed), args.tolerance, args.seconds)

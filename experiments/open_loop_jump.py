@@ -22,19 +22,15 @@ from jumper_warp.evaluation.commands import print_metrics
 from jumper_warp.evaluation.run import SOLVER_TITLES
 from jumper_warp.robot.description import LEGS
 from jumper_warp.robot.gravity import EARTH
-from jumper_warp.robot.model import build_model
 from jumper_warp.robot.motors import jumping_motors, loose_filter, vertical_jump_filter
 from jumper_warp.robot.overlay import load_overlay, with_springs
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
-from jumper_warp.viz.snapshot import Camera, contact_sheet
 from support.open_loop import SQUAT, plot_trace, simulate_jump, trace_metrics
 from support.scripts import DeviceArgs, prepare, run_script
 
 HARDWARE_APEX = 1.075  # [m] Paper, open loop on the robot at 18 N m
-STRIP_TIMES = (0.9, 2.2, 2.32, 2.45, 2.7, 2.95, 3.15, 3.8)
-"""[s] Times of the filmstrip's pictures: standing, squatting, push-off, rising, apex, falling, landing, standing."""
 PER_MOTOR = tuple(f"peak_{quantity}_{leg}" for quantity in ("torque", "speed") for leg in LEGS)
 """Prefixes of the metrics that are saved but not printed."""
 
@@ -58,17 +54,6 @@ class Args(DeviceArgs):
             raise InputError("give springs or a robot, which may have springs")
 
 
-def save_filmstrip(frames: list[np.ndarray], path: Path) -> None:
-    """Write pictures of the robot at STRIP_TIMES into a PNG file; frames: link poses of every policy step, (21, 7)."""
-    model = build_model(1)
-    state = model.state()
-    camera, pictures = Camera(model, eye=(1.6, 2.0, 0.75), target=(0.0, 0.0, 0.55), size=(300, 400)), []
-    for time_s in STRIP_TIMES:
-        state.body_q.assign(frames[round(60 * time_s)])
-        pictures.append(camera.picture(state))
-    contact_sheet(pictures, path, [f"{time_s:.2f} s" for time_s in STRIP_TIMES])
-
-
 def main(args: Args) -> dict:
     """Simulate the jump, write its plots and recording, and return the metrics."""
     start = time.perf_counter()
@@ -88,15 +73,15 @@ def main(args: Args) -> dict:
         1, solver=args.solver, motors=motors, command_filter=command_filter, gravity=args.gravity, robot=robot,
         device=args.device,
     )  # fmt: skip
-    trace, recorder, frames = simulate_jump(sim, variant, args.squat_angle)
-    save_filmstrip(frames, folder / "jump_strip.png")
+    trace, recorder = simulate_jump(sim, variant, args.squat_angle)
     values: dict[str, Any] = {**variant, **trace_metrics(trace), "hardware_apex_height_m": None}
     if args.torque_limit == 18.0 and args.gravity == EARTH and not args.loose and robot is None:
         values["hardware_apex_height_m"] = HARDWARE_APEX
     write_metrics(folder, values)
     title = f"Open-loop jump, {SOLVER_TITLES[args.solver]}, {args.torque_limit:g} N m"
-    plot_trace(folder / "jump.png", trace, title, HARDWARE_APEX)
+    plot_trace(folder / "trace.png", trace, title, HARDWARE_APEX)
     recorder.save_rrd(folder / "jump.rrd")
+    recorder.save_picture(folder / "jump.png", title=title)
     print_metrics({name: value for name, value in values.items() if not name.startswith(PER_MOTOR)})
     print(f"{time.perf_counter() - start:.1f} s; metrics, plot and recording (rerun {folder / 'jump.rrd'}) in {folder}")
     return values

@@ -92,7 +92,7 @@ def main(args: Args) -> dict[str, Any]:
         if name == "still":
             values |= {"still_longest_lift_s": replay.longest_lift, "still_highest_lift_m": replay.highest_lift}
         replay.recorder.save_rrd(folder / f"{name}.rrd")
-        replay.save_filmstrip(folder / f"{name}_strip.png")
+        replay.recorder.save_picture(folder / f"{name}.png", title=ALL_JUMPS[name].label)
         write_metrics(folder, values)
         table.add_row(
             ALL_JUMPS[name].label, f"{row['value']:.3f} {ALL_JUMPS[name].unit}", f"{row['violation']:.4f}",

@@ -97,7 +97,7 @@ def main(args: Args) -> dict:
     course = CourseLog(scripts(args), random_headings(args.num_robots, args.seed))
     run.run_episodes(run.env(args.num_robots, block=course.block), course, film=name)
     title = f"walk, jump, walk: robot 0 of {course.count}, {run.title}"
-    plot_course(run.folder / "course.png", course, 0, title)
+    plot_course(run.folder / "timeline.png", course, 0, title)
     return run.report(course_metrics(course), {} if args.course else PAPER)
 
 

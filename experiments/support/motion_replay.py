@@ -19,7 +19,6 @@ from jumper_warp.kernels.collision.robot import collision_kernel
 from jumper_warp.kernels.layout import COORDS
 from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.robot.gravity import EARTH
-from jumper_warp.robot.model import build_model
 from jumper_warp.sim.simulation import Simulation, motor_values
 from jumper_warp.trajectory.problem import Problem, SimulatedMotion
 
@@ -50,7 +49,6 @@ class MotionReplay:
         rows: list[tuple] = []
         self.states = [compact(self.sim.joint_q(), self.sim.joint_qd())]
         self.impulses: list[np.ndarray] = []
-        self.poses: list[np.ndarray] = []
         self.flags, self.work = 0, 0.0
         for target in targets:
             self.sim.set_targets(target)
@@ -85,7 +83,6 @@ class MotionReplay:
         """Record a policy step: state, link poses, collision flags and a frame; row: of its last physics step."""
         sim = self.sim
         pose = sim.state.body_q.numpy().copy()
-        self.poses.append(pose)
         self.states.append(compact(sim.joint_q(), sim.joint_qd()))
         flags, clearance = wp.zeros(1, dtype=int, device=sim.device), wp.zeros(1, dtype=float, device=sim.device)
         robot = sim.physics.dynamics.robot
@@ -148,20 +145,6 @@ class MotionReplay:
             "largest_tilt_deg": math.degrees(float(self.tilt.max())), "collisions": self.flags,
             "deepest_paw_mm": float(-1000.0 * self.gap.min()), "peak_torque_nm": float(np.abs(self.torque).max()),
         }  # fmt: skip
-
-    def save_filmstrip(self, path: Path, count: int = 8) -> None:
-        """Write `count` pictures of the robot, evenly spaced in time from the push-off on, side by side."""
-        from jumper_warp.viz.snapshot import Camera, contact_sheet
-
-        first = max(self.takeoff - 20, 0)
-        frames = np.linspace(first, len(self.poses) - 1, count).round().astype(int)
-        model = build_model(1)
-        state, pictures = model.state(), []
-        for frame in frames:
-            x = float(self.poses[frame][0, 0])
-            state.body_q.assign(self.poses[frame])
-            pictures.append(Camera(model, (x + 1.2, 2.0, 0.7), (x, 0.0, 0.5), (300, 400)).picture(state))
-        contact_sheet(pictures, path, [f"{frame / 60:.2f} s" for frame in frames])
 
 
 def plot_replays(replays: dict[str, MotionReplay], path: Path) -> None:

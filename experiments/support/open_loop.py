@@ -46,16 +46,15 @@ class Trace:
 
 def simulate_jump(
     sim: Simulation, notes: Mapping[str, Any], squat: float = SQUAT
-) -> tuple[Trace, Recorder, list[np.ndarray]]:
-    """Simulate the jump in world 0; return measurements, a recording at 60 Hz, and link poses of every policy step.
+) -> tuple[Trace, Recorder]:
+    """Simulate the jump in world 0; return measurements and a recording at 60 Hz.
 
-    Poses are (21, 7) each: position [m] and quaternion (xyzw). notes: JSON metadata of the recording; squat [deg]:
-    commanded transversal angle of the squat.
+    notes: JSON metadata of the recording; squat [deg]: commanded transversal angle of the squat.
     """
     from jumper_warp.viz.recorder import Recorder
 
     recorder = Recorder(sim.model, notes=notes)
-    rows, frames = [], []
+    rows = []
     total = STAND + RAMP + HOLD + EXTEND + LAND
     for tick in range(total):
         target = np.tile([0.0, 1.0, 1.0], 4) * transversal_command(tick, squat)
@@ -69,9 +68,8 @@ def simulate_jump(
                 (now, q[2], sim.base_velocity()[0, 2], motor_values(q[7:]), motor_values(qd[6:]),
                  sim.torque.numpy()[:, 0].copy(), sim.paw_force.numpy()[:, 0].copy(), sim.loop_gap()[0])
             )  # fmt: skip
-        frames.append(sim.state.body_q.numpy().copy())
-        record(recorder, frames[-1], rows[-1])
-    return Trace(*(np.array(column) for column in zip(*rows, strict=True))), recorder, frames
+        record(recorder, sim.state.body_q.numpy(), rows[-1])
+    return Trace(*(np.array(column) for column in zip(*rows, strict=True))), recorder
 
 
 def record(recorder: Recorder, poses: np.ndarray, row: tuple) -> None:

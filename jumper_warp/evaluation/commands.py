@@ -178,7 +178,7 @@ def play_script(cfg: ScriptCfg) -> Path:
     notes = {"task": cfg.script.stem, "solver": cfg.conditions.solver}
     recorder = EnvRecorder(env, course, [0], block=course.block, notes=notes)
     run_evaluation(run.actor(env), env, course, on_step=recorder)
-    plot_course(run.folder / "course_plot.png", course, 0)
+    plot_course(run.folder / "timeline.png", course, 0)
     metrics = {"outcome": str(course.outcomes[0]), **course_metrics(course)}
     write_metrics(run.folder, metrics)
     print_metrics(metrics)

@@ -17,7 +17,7 @@ def test_heavier_robot_jumps_lower_without_hardware_comparison(tmp_path):
     assert values == json.loads((tmp_path / "metrics.json").read_text())
     assert 0.9 < values["apex_height_m"] < 1.02  # 1.075 m without
     assert values["hardware_apex_height_m"] is None and values["robot"].endswith("heavy.json")
-    assert (tmp_path / "jump_strip.png").stat().st_size > 10_000
+    assert (tmp_path / "jump.png").stat().st_size > 10_000
 
 
 def test_refuses_springs_together_with_robot(tmp_path):

@@ -19,7 +19,7 @@ def test_reported_metrics_equal_replay_of_saved_targets(tmp_path):
     assert values["highest_apex_m"] == pytest.approx(replay.apex, abs=1e-6) and replay.apex > 0.4
     assert values["highest_gradients_value"] == values["highest_apex_m"]
     assert values["highest_gradients_reverse_steps"] > 0.0
-    assert {"highest.rrd", "highest_strip.png", "trajectories.png"} <= {path.name for path in tmp_path.iterdir()}
+    assert {"highest.rrd", "highest.png", "trajectories.png"} <= {path.name for path in tmp_path.iterdir()}
 
 
 def test_replay_measures_paws_lifted_after_touchdown():
