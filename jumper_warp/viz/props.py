@@ -1,8 +1,7 @@
-"""Additions to a recording: goal markers on the ground and moving blocks."""
+"""Additions to a recording: markers of goals and commanded heights, and moving blocks."""
 
 from __future__ import annotations
 
-import math
 from dataclasses import replace
 
 import numpy as np
@@ -10,32 +9,36 @@ import trimesh
 
 from jumper_warp.viz.recording import Recording
 from jumper_warp.viz.shapes import ShapeMesh
+from jumper_warp.viz.style import GOAL_COLOR
 
-MARK_RADIUS = 0.04  # [m]
-MARK_LIFT = 0.003  # [m] height above the goal, so that the ground does not hide the disc
-MARK_CORNERS = 24  # of the polygon that approximates the disc
-MARK_COLOR = (0.85, 0.15, 0.15)  # RGB, each in [0, 1]
+RING_RADIUS = 0.1  # [m] outer radius of a goal's ring: largest error of a successful jump
+RING_WIDTH, RING_HEIGHT = 0.012, 0.006  # [m] of the ring's rectangular cross-section
+BAR_SIZE = (1.2, 0.012, 0.012)  # [m] extents of a bar at the commanded height, along x, y, z
+BAR_OFFSET = 0.45  # [m] distance along y from the base's start to each of the two bars
 BLOCK_COLOR = (0.55, 0.45, 0.35)  # RGB, each in [0, 1]
 
 
-def with_goal_markers(recording: Recording, goals: np.ndarray) -> Recording:
-    """Return the recording with a red disc at each finite goal.
+def goal_shapes(recording: Recording) -> list[ShapeMesh]:
+    """Return a ring around each goal on the ground and two bars at each world's commanded height, world frame.
 
-    goals: (recorded worlds, goals by world, 3) [m], world frame.
+    The bars are parallel to x, on both sides of the base's first position. Shapes of later worlds are moved along y by
+    the recording's spacing. Names: `goal_<rank>_<number>`, `height_<rank>_<number>`; NaN goals and heights have none.
     """
-    angle = np.linspace(0.0, 2.0 * math.pi, MARK_CORNERS, endpoint=False)
-    rim = MARK_RADIUS * np.stack([np.cos(angle), np.sin(angle), np.zeros_like(angle)], axis=1)
-    disc = np.concatenate([np.zeros((1, 3)), rim]) + (0.0, 0.0, MARK_LIFT)
-    corner = np.arange(MARK_CORNERS)
-    triangles = np.stack([np.zeros_like(corner), 1 + corner, 1 + (corner + 1) % MARK_CORNERS], axis=1).astype(np.int32)
-    normals = np.tile(np.array([0.0, 0.0, 1.0], np.float32), (len(disc), 1))
-    marks = []
-    for rank, world_goals in enumerate(goals):
-        for number, goal in enumerate(world_goals):
-            if np.isfinite(goal).all():
-                vertices = (disc + goal + (0.0, rank * recording.spacing, 0.0)).astype(np.float32)
-                marks.append(ShapeMesh(f"goal_{rank}_{number}", -1, MARK_COLOR, vertices, normals, triangles))
-    return replace(recording, shapes=(*recording.shapes, *marks))
+    shapes = []
+    for rank, goals in enumerate(recording.goals):
+        for number, goal in enumerate(goals):
+            ring = trimesh.creation.annulus(RING_RADIUS - RING_WIDTH, RING_RADIUS, RING_HEIGHT, sections=48)
+            shapes.append((f"goal_{rank}_{number}", rank, ring, goal + (0.0, 0.0, 0.5 * RING_HEIGHT)))
+    for rank, height in enumerate(recording.heights):
+        start = recording.body_poses(rank)[0, 0]
+        for number, side in enumerate((BAR_OFFSET, -BAR_OFFSET)):
+            place = np.array([start[0], start[1] + side, height])
+            shapes.append((f"height_{rank}_{number}", rank, trimesh.creation.box(extents=BAR_SIZE), place))
+    return [
+        _shape(name, -1, GOAL_COLOR, mesh.apply_translation(place + (0.0, rank * recording.spacing, 0.0)))
+        for name, rank, mesh, place in shapes
+        if np.isfinite(place).all()
+    ]
 
 
 def with_blocks(recording: Recording, centers: np.ndarray, half: np.ndarray, height: np.ndarray) -> Recording:
@@ -50,9 +53,15 @@ def with_blocks(recording: Recording, centers: np.ndarray, half: np.ndarray, hei
         pose[:, 0, :2] = centers[:, rank]
         pose[:, 0, 2] = 0.5 * height[rank]
         pose[:, 0, 6] = 1.0
-        box = trimesh.creation.box(extents=(*(2.0 * half[rank]), height[rank])).smooth_shaded
-        surface = (np.asarray(box.vertices, np.float32), np.asarray(box.vertex_normals, np.float32))
-        shapes.append(ShapeMesh("block", len(names), BLOCK_COLOR, *surface, np.asarray(box.faces, np.int32)))
+        box = trimesh.creation.box(extents=(*(2.0 * half[rank]), height[rank]))
+        shapes.append(_shape("block", len(names), BLOCK_COLOR, box))
         names.append(f"world_{world}/block")
         poses.append(pose)
     return replace(recording, poses=np.concatenate(poses, axis=1), bodies=tuple(names), shapes=tuple(shapes))
+
+
+def _shape(name: str, body: int, color: tuple[float, float, float], mesh: trimesh.Trimesh) -> ShapeMesh:
+    """Return a mesh [m] in the body's frame as a shape."""
+    smooth = mesh.smooth_shaded
+    surface = (np.asarray(smooth.vertices, np.float32), np.asarray(smooth.vertex_normals, np.float32))
+    return ShapeMesh(name, body, color, *surface, np.asarray(smooth.faces, np.int32))

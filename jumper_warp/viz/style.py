@@ -1,0 +1,14 @@
+"""Colors of legs, commands and measurements in plots and scenes: RGB, each in [0, 1], safe for color-blind readers.
+
+They are of the palette of Okabe and Ito.
+"""
+
+LEG_COLORS = {
+    "FL": (0.000, 0.447, 0.698),  # blue
+    "FR": (0.902, 0.624, 0.000),  # orange
+    "BL": (0.000, 0.620, 0.451),  # green
+    "BR": (0.800, 0.475, 0.655),  # purple
+}  # By leg, in the order in which legs are shown
+COMMAND_COLOR = (0.835, 0.369, 0.000)  # vermilion
+ACTUAL_COLOR = (0.337, 0.706, 0.914)  # sky blue
+GOAL_COLOR = COMMAND_COLOR  # a goal is a commanded place
