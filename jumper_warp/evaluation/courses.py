@@ -261,7 +261,9 @@ class CourseLog(EvaluationLog):
         """Return the last velocity, command and base height [m] of some robots."""
         rows, names = list(worlds), self.names(worlds)
         series = velocity_series(self.velocity[-1][rows], self.velocity_commands(worlds), names)
-        return series | {f"height/base, {name} [m]": self.height[-1][row] for name, row in zip(names, rows, strict=True)}
+        return series | {
+            f"height/base, {name} [m]": self.height[-1][row] for name, row in zip(names, rows, strict=True)
+        }
 
     def states(self, worlds: Sequence[int]) -> dict[str, str]:
         """Return the skill that was active in some robots' last policy step."""

@@ -52,7 +52,7 @@ class EvaluationLog(ABC):
 
     @abstractmethod
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the present values to record of some worlds (indices), by `group/quantity, name of the world [unit]`."""
+        """Return the present values of some worlds (indices), by `group/quantity, name of the world [unit]`."""
 
     def goal_markers(self, worlds: Sequence[int]) -> np.ndarray | None:
         """Return goal positions [m] to mark in a recording, world frame, (worlds, goals per world, 3), or None."""

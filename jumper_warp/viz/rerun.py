@@ -34,15 +34,15 @@ if TYPE_CHECKING:
 TIMELINE = "time"  # name of the only timeline; durations [s]
 FORCE_SCALE = 1.0e-3  # [m/N] length of a contact arrow over its force
 VELOCITY_SCALE = 0.5  # [s] length of a velocity arrow over the velocity
-VELOCITY_LIFT = 0.25  # [m] height of the velocity arrows above the base
+VELOCITY_LIFTS = (0.22, 0.27)  # [m] height of the arrows of commanded and of actual velocity above the base
 ARROW_RADIUS = 0.006  # [m]
 TRAIL_WIDTH = 1.5  # [px]
 LINE_WIDTHS = (1.0, 2.0)  # [px] of commanded and of all other curves
-EYE_DIRECTION = np.array([0.55, 0.77, 0.32])  # from the target of the view to the eye, world frame; a unit vector
-EYE_DISTANCE = 2.2  # [m] smallest distance of the eye from its target
-LEGEND_SHARE = 0.3  # free time axis behind the curves, where the legend is, over the recording's length
+EYE_DIRECTION = np.array([0.70, 0.63, 0.336])  # from the target of the view to the eye, world frame; a unit vector
+EYE_DISTANCE = 1.8  # [m] smallest distance of the eye from its target
+LEGEND_SHARE = 0.35  # free time axis behind the curves, where the legend is, over the recording's length
 LEG_QUANTITY = re.compile(rf"({'|'.join(LEG_COLORS)})(?:_(\w+))? (\[.+\])")
-"""Pattern of a quantity of one leg: leg, motor if any, unit with brackets."""
+"""Pattern of a quantity of one leg: leg, motor if any, unit in brackets."""
 
 
 def write_rrd(recording: "Recording", path: Path) -> Path:
@@ -122,11 +122,14 @@ class _Writer:
         )
         self.stream.log(rr.new_entity_path([*parent, "trail"]), trail, static=True)
         if len(colors):
-            self._log_arrows([*parent, "contact_forces"], points, FORCE_SCALE * recording.contact_forces[:, rank], colors)
+            self._log_arrows(
+                [*parent, "contact_forces"], points, FORCE_SCALE * recording.contact_forces[:, rank], colors
+            )
         if len(recording.commands):
-            origin = base[:, None, :3] + (0.0, 0.0, VELOCITY_LIFT)
-            commanded, actual = velocities(recording, rank)
-            for name, values, color in (("commanded", commanded, COMMAND_COLOR), ("actual", actual, ACTUAL_COLOR)):
+            arrows = zip(("commanded", "actual"), velocities(recording, rank), VELOCITY_LIFTS, strict=True)
+            for name, values, lift in arrows:
+                color = COMMAND_COLOR if name == "commanded" else ACTUAL_COLOR
+                origin = base[:, None, :3] + (0.0, 0.0, lift)
                 self._log_arrows([*parent, f"{name}_velocity"], origin, VELOCITY_SCALE * values[:, None], [color])
 
     def _log_arrows(
@@ -140,8 +143,10 @@ class _Writer:
 
     def log_series(self) -> None:
         """Log each plot of the recording as scalars over time."""
-        for plot in _plots(self.recording):
-            style = self.rr.SeriesLines(names=plot.names, colors=_rgb(plot.colors), widths=plot.widths)
+        for plot in (plot for plots in _plots(self.recording).values() for plot in plots):
+            style = self.rr.SeriesLines(
+                names=plot.names, colors=_rgb(plot.colors), widths=[plot.width] * len(plot.names)
+            )
             self.stream.log(self.rr.new_entity_path(plot.entity), style, static=True)
             self._send(plot.entity, self.rr.Scalars.columns(scalars=plot.values))
 
@@ -191,7 +196,8 @@ def velocities(recording: "Recording", rank: int) -> tuple[np.ndarray, np.ndarra
     commanded = np.stack([np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left], axis=1)
     moves = len(base) > 1
     actual = np.gradient(base[:, :2], recording.times, axis=0) if moves else np.zeros_like(base[:, :2])
-    return tuple(np.pad(np.nan_to_num(values), ((0, 0), (0, 1))) for values in (commanded, actual))
+    commanded, actual = (np.pad(np.nan_to_num(values), ((0, 0), (0, 1))) for values in (commanded, actual))
+    return commanded, actual
 
 
 def view_targets(recording: "Recording") -> tuple[np.ndarray, float]:
@@ -207,7 +213,7 @@ def view_targets(recording: "Recording") -> tuple[np.ndarray, float]:
     low, high = base[..., 2].min(), base[..., 2].max()
     target[:, 2] = 0.5 * (low + high)
     spread = np.linalg.norm((base - target[:, None])[..., :2], axis=2).max()
-    return target, max(EYE_DISTANCE, 1.5 * (high - low)) + 1.5 * spread
+    return target, max(EYE_DISTANCE, 2.4 * (high - low)) + 1.3 * spread
 
 
 @dataclass(frozen=True)
@@ -218,7 +224,7 @@ class _Plot:
     title: str  # `quantity [unit]`
     names: list[str]  # of the curves, for the legend
     colors: list[tuple[float, float, float]]  # of the curves
-    widths: list[float]  # [px] of the curves
+    width: float  # [px] of the curves
     values: np.ndarray  # (frames, curves)
     by_leg: bool  # whether there is one curve for each leg
 
@@ -228,32 +234,39 @@ class _Plot:
         return ["series", self.group, self.title]
 
 
-def _plots(recording: "Recording") -> list[_Plot]:
-    """Return the series in their order; those of the legs of one motor, or of the paws, together, in the order of legs.
+def _plots(recording: "Recording") -> dict[str, list[_Plot]]:
+    """Return the series by group; those of all legs' same motor, or of the paws, are one plot, in the order of legs.
 
     Colors: of the leg; for several worlds, of the world; else of commanded or actual quantities.
     """
-    plots: list[_Plot] = []
-    worlds, palette = _world_names(recording), list(LEG_COLORS.values())
+    plots: dict[str, list[_Plot]] = {}
     legs: dict[tuple[str, str], dict[str, np.ndarray]] = {}  # by group and title, then by leg
     for name, values in recording.series.items():
         group, quantity = name.split("/", 1)
+        plots.setdefault(group, [])
         if match := LEG_QUANTITY.fullmatch(quantity):
             leg, motor, unit = match.groups()
-            legs.setdefault((group, f"{motor or 'paw'} {unit}"), {})[leg] = values
-            continue
-        commanded = quantity.startswith("command")
-        color = COMMAND_COLOR if commanded else ACTUAL_COLOR
-        if len(worlds) > 1:
-            of = [rank for rank, world in enumerate(worlds) if f", {world} [" in quantity]
-            color = palette[of[0] % len(palette)] if of else color
-        width = LINE_WIDTHS[0 if commanded else 1]
-        plots.append(_Plot(group, quantity, [quantity], [color], [width], values[:, None], False))
+            legs.setdefault((group, f"{motor or 'paws'} {unit}"), {})[leg] = values
+        else:
+            plots[group].append(_curve(recording, group, quantity, values))
     for (group, title), by_leg in legs.items():
         order = [leg for leg in LEG_COLORS if leg in by_leg]
-        colors, widths = [LEG_COLORS[leg] for leg in order], [LINE_WIDTHS[1]] * len(order)
-        plots.append(_Plot(group, title, order, colors, widths, np.stack([by_leg[leg] for leg in order], axis=1), True))
+        values = np.stack([by_leg[leg] for leg in order], axis=1)
+        colors = [LEG_COLORS[leg] for leg in order]
+        plots[group].append(_Plot(group, title, order, colors, LINE_WIDTHS[1], values, True))
     return plots
+
+
+def _curve(recording: "Recording", group: str, quantity: str, values: np.ndarray) -> _Plot:
+    """Return the plot of one series, values (frames,); its legend leaves out the label of the only world."""
+    commanded = quantity.startswith("command")
+    color, label, worlds = COMMAND_COLOR if commanded else ACTUAL_COLOR, quantity, _world_names(recording)
+    for rank, world in enumerate(worlds):
+        if f", {world} [" in quantity:
+            several = len(worlds) > 1
+            color = list(LEG_COLORS.values())[rank % len(LEG_COLORS)] if several else color
+            label = quantity if several else quantity.replace(f", {world} [", " [")
+    return _Plot(group, quantity, [label], [color], LINE_WIDTHS[0 if commanded else 1], values[:, None], False)
 
 
 def _blueprint(recording: "Recording") -> Any:
@@ -267,27 +280,40 @@ def _blueprint(recording: "Recording") -> Any:
     start, end = float(recording.times[0]), float(recording.times[-1])
     limits = (rrb.TimeRangeBoundary.absolute(seconds=t) for t in (start, end + LEGEND_SHARE * (end - start)))
     axis = rrb.TimeAxis(view_range=rr.TimeRange(*limits))
-    legend = rrb.PlotLegend(rrb.Corner2D.RightTop)
-    by_group: dict[str, list[Any]] = {}
-    for group in dict.fromkeys(plot.group for plot in _plots(recording)):
-        plots = [plot for plot in _plots(recording) if plot.group == group]
-        titles = [(plot.entity, f"{group} {plot.title}") for plot in plots] if plots[0].by_leg else [(["series", group], group)]
-        by_group[group] = [
-            rrb.TimeSeriesView(origin=rr.new_entity_path(entity), name=title, axis_x=axis, plot_legend=legend)
-            for entity, title in titles
-        ]
-    views = [views[0] for views in by_group.values() if len(views) == 1]
-    tabs = [rrb.Vertical(*views, name=group) for group, views in by_group.items() if len(views) > 1]
-    right = [*views, *([rrb.Tabs(*tabs)] if tabs else [])]
-    left: list[Any] = [_scene_view(recording)]
+    left, shares = [_scene_view(recording)], [1.0]
     if recording.states:
         left.append(rrb.StateTimelineView(origin="/states", name="states", time_view=axis))
-    columns = [rrb.Vertical(*left, row_shares=[5, 1][: len(left)])]
-    if right:
-        columns.append(rrb.Vertical(*right, row_shares=[1.0] * len(views) + [2.0] * (len(right) - len(views))))
+        shares.append(0.08 + 0.06 * len(recording.states))
+    columns: list[Any] = [rrb.Vertical(*left, row_shares=shares)]
+    groups = {group: _group_views(group, plots, axis) for group, plots in _plots(recording).items()}
+    plain = [views[0] for views in groups.values() if len(views) == 1]
+    tabs = [rrb.Vertical(*views, name=group) for group, views in groups.items() if len(views) > 1]
+    if groups:
+        shares = [1.0] * len(plain) + [3.0] * bool(tabs)
+        columns.append(rrb.Vertical(*plain, *([rrb.Tabs(*tabs)] if tabs else []), row_shares=shares))
     panel = rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="playing", loop_mode="all")
     layout = rrb.Horizontal(*columns, column_shares=[3, 2][: len(columns)])
     return rrb.Blueprint(layout, panel, rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
+
+
+def _group_views(group: str, plots: list[_Plot], axis: Any) -> list[Any]:
+    """Return a view for each motor of a group of series, or one for the whole group; axis: Rerun's time axis.
+
+    Legends are in the free part of the time axis; of the motors' views only the first has one.
+    """
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    by_motor = len(plots) > 1 and all(plot.by_leg for plot in plots)
+    return [
+        rrb.TimeSeriesView(
+            origin=rr.new_entity_path(plot.entity if by_motor else ["series", group]),
+            name=f"{group} {plot.title.removeprefix('paws ')}" if plot.by_leg else group,
+            axis_x=axis,
+            plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=number == 0),
+        )
+        for number, plot in enumerate(plots if by_motor else plots[:1])
+    ]
 
 
 def _scene_view(recording: "Recording") -> Any:
