@@ -208,7 +208,7 @@ def view_targets(recording: "Recording") -> tuple[np.ndarray, float]:
     count = len(recording.worlds)
     base = np.stack([recording.body_poses(rank)[:, 0, :3] for rank in range(count)], axis=1).astype(float)
     base[..., 1] += recording.spacing * np.arange(count)
-    base = np.nan_to_num(base)
+    base = np.where(np.isfinite(base), base, 0.0)
     target = base.mean(axis=1)
     low, high = base[..., 2].min(), base[..., 2].max()
     target[:, 2] = 0.5 * (low + high)
