@@ -3,7 +3,11 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.film import ankles
+from jump_helpers import make_env, random_actions
+from jumper_warp.evaluation.film import EnvRecorder, ankles
+from jumper_warp.evaluation.heights import HeightLog
+from jumper_warp.evaluation.log import run_evaluation, termination_names
+from jumper_warp.registry import make_task
 from jumper_warp.viz.props import BAR_OFFSET, RING_RADIUS, goal_shapes, with_blocks
 from jumper_warp.viz.recording import Recording
 
@@ -31,6 +35,21 @@ def test_ankle_positions_follow_shank_poses():
     assert points.shape == (1, 4, 3)
     assert points[0, 0] == pytest.approx([0.0, 0.0, 0.7])
     assert points[0, 1] == pytest.approx([-0.3, 0.0, 1.0])
+
+
+def test_series_of_paw_forces_are_peaks_between_the_frames():
+    env, log = make_env(1), HeightLog(np.array([0.9]), termination_names(make_task("vertical-jump")))
+    recorder = EnvRecorder(env, log, [0])
+    actions = iter(random_actions(1, 30))
+    run_evaluation(lambda obs: next(actions), env, log, seconds=0.5, on_step=recorder, stop=False)
+    shown = recorder.recording()
+    sampled = np.linalg.norm(shown.contact_forces[:, 0], axis=2)
+    peaks = np.stack([shown.series[f"peak paw force/{leg} [N]"] for leg in ("FL", "FR", "BL", "BR")], axis=1)
+    assert (peaks >= sampled - 1e-3).all()
+    assert (
+        peaks > 2.0 * sampled + 50.0
+    ).any()  # [N] a paw strikes the ground, and the impact is over at the next frame
+    assert shown.labels == ("0.90 m",) and set(shown.states) == {"phase/0.90 m"}
 
 
 def test_goals_are_rings_of_the_tolerance_on_the_ground_spaced_by_world():
