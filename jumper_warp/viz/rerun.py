@@ -113,7 +113,8 @@ class _Writer:
         offset = rr.Transform3D(translation=[0.0, rank * recording.spacing, 0.0])
         self.stream.log(rr.new_entity_path(parent), offset, static=True)
         points, base = recording.contact_points[:, rank], recording.body_poses(rank)[:, 0]
-        colors = list(LEG_COLORS.values()) if points.shape[1] == len(LEG_COLORS) else [ACTUAL_COLOR] * points.shape[1]
+        colors = list(LEG_COLORS.values())  # four contact points are the paws
+        colors = colors if points.shape[1] == len(colors) else [ACTUAL_COLOR] * points.shape[1]
         strips = [base[:, :3], *points.transpose(1, 0, 2)]
         trail = rr.LineStrips3D(
             [strip[np.isfinite(strip).all(axis=1)] for strip in strips],
