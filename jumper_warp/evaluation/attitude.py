@@ -127,9 +127,9 @@ class AttitudeLog(EvaluationLog):
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
         """Return the last angle to the goal [deg] and angular speed [rad/s] of some worlds, 0 in place of NaN."""
         series = {}
-        for world in worlds:
-            series[f"attitude/error of {world} [deg]"] = float(np.degrees(np.nan_to_num(self.errors[-1][world])))
-            series[f"spin/of {world} [rad/s]"] = float(np.nan_to_num(self.angular_speeds[-1][world]))
+        for name, world in zip(self.names(worlds), worlds, strict=True):
+            series[f"error/angle to goal, {name} [deg]"] = float(np.degrees(np.nan_to_num(self.errors[-1][world])))
+            series[f"spin/angular speed, {name} [rad/s]"] = float(np.nan_to_num(self.angular_speeds[-1][world]))
         return series
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:

@@ -76,6 +76,7 @@ class CourseLog(EvaluationLog):
         self.finish_step = np.full(shape, -1)  # (robots, commands) policy step in which the command finished
         self.apex = np.full(shape, np.nan)  # [m] (robots, commands) largest base height of the jump
         self.offset = np.full((n, k, 2), np.nan)  # [m] from the goal to the base as walking takes over, world axes
+        self.goal_world = np.full((n, k, 2), np.nan)  # [m] of jumps to a place whose skill took over, world axes
         # one array per policy step
         self.velocity: list[np.ndarray] = []  # (robots, 3) ahead, left [m/s], about z [rad/s]; NaN after the end
         self.commands: list[np.ndarray] = []  # (robots, 3) commanded; NaN while it does not walk
@@ -181,6 +182,8 @@ class CourseLog(EvaluationLog):
         jumps = kind != WALK
         entered = jumps & (skill[row] == kind) & (previous[row] != kind)
         self.switch_step[row[entered], self.current[row[entered]]] = step
+        placed = row[entered & (kind == JUMP_TO)]
+        self.goal_world[placed, self.current[placed]] = arrays["jump_goal"][placed, :2]
         left = jumps & (skill[row] != kind) & (previous[row] == kind)
         took_off = jumps & (previous[row] == kind) & (arrays["jump_took_off"][row] == 1)
         self.takeoff_step[row[took_off], self.current[row[took_off]]] = step
@@ -255,12 +258,25 @@ class CourseLog(EvaluationLog):
         return done | {name: finite(values) for name, values in worst.items()}
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the last velocity, command, base height [m] and active skill of some robots."""
-        series = velocity_series(self.velocity[-1], np.nan_to_num(self.commands[-1]), worlds)
-        for world in worlds:
-            series[f"height/base of {world} [m]"] = float(self.height[-1][world])
-            series[f"skill/of {world} [1]"] = float(self.skills[-1][world])
-        return series
+        """Return the last velocity, command and base height [m] of some robots."""
+        rows, names = list(worlds), self.names(worlds)
+        series = velocity_series(self.velocity[-1][rows], self.velocity_commands(worlds), names)
+        return series | {
+            f"height/base, {name} [m]": self.height[-1][row] for name, row in zip(names, rows, strict=True)
+        }
+
+    def states(self, worlds: Sequence[int]) -> dict[str, str]:
+        """Return the skill that was active in some robots' last policy step."""
+        skills = self.skills[-1][list(worlds)]
+        return {f"skill/{name}": NAMES[skill] for name, skill in zip(self.names(worlds), skills, strict=True)}
+
+    def velocity_commands(self, worlds: Sequence[int]) -> np.ndarray:
+        """Return the last commands of some robots, (worlds, 3), 0 while a robot does not walk."""
+        return np.nan_to_num(self.commands[-1][list(worlds)])
+
+    def goal_markers(self, worlds: Sequence[int]) -> np.ndarray:
+        """Return the goals [m] of some robots' jumps, world frame, (worlds, commands, 3), z = 0; NaN for others."""
+        return np.pad(self.goal_world[list(worlds)], ((0, 0), (0, 0), (0, 1)))
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the scripts of some robots: key `scripts`, lists of [kind, *values]."""

@@ -85,9 +85,9 @@ class EpisodeLog(EvaluationLog):
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
         """Return the present base height and horizontal distance from the start [m] of some worlds."""
         series, pos = {}, self.arrays["base_pos"]
-        for world in worlds:
-            series[f"height/base of {world} [m]"] = pos[world, 2]
-            series[f"distance/start of {world} [m]"] = np.linalg.norm((pos - self.start_position)[world, :2])
+        for name, world in zip(self.names(worlds), worlds, strict=True):
+            series[f"height/base, {name} [m]"] = pos[world, 2]
+            series[f"distance/from start, {name} [m]"] = np.linalg.norm((pos - self.start_position)[world, :2])
         return series
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:

@@ -65,7 +65,7 @@ class EnvRecorder:
         self.links = LinkReader(env)
         spacing = log.spacing if isinstance(ground, str) else 0.0  # robots on a heightfield keep their places
         model = build_model(len(worlds), ground=ground, device=env.wp_device)
-        labels, notes = log.labels(self.worlds), {**(notes or {}), **log.notes(self.worlds)}
+        labels, notes = log.names(self.worlds), {**(notes or {}), **log.notes(self.worlds)}
         self.recorder = Recorder(model, range(len(worlds)), spacing=spacing, notes=notes, labels=labels)
         self.frames = 0
         self.block = None if block is None else block.per_world(env.num_envs)
@@ -85,10 +85,15 @@ class EnvRecorder:
         )  # fmt: skip
 
     def _motor_series(self) -> dict[str, float]:
-        """Return torque [N m] and action [1] of all 12 motors of the first recorded world, by name of the series."""
-        world = self.worlds[0]
-        torque, action = self.env.sim.torque.numpy()[:, world], self.env.action[world].cpu().numpy()
-        series = {f"torque/{name} [N m]": torque[i] for i, name in enumerate(MOTOR_JOINTS)}
+        """Return values of the first recorded world by name of the series: of its paws and its 12 motors.
+
+        Largest force [N] on each paw in any physics step of the policy step; torque [N m] and action [1] of each motor.
+        """
+        world, sim = self.worlds[0], self.env.sim
+        peak, torque = sim.physics.peak_paw_force.numpy()[:, world], sim.torque.numpy()[:, world]
+        action = self.env.action[world].cpu().numpy()
+        series = {f"peak paw force/{leg} [N]": peak[i] for i, leg in enumerate(LEGS)}
+        series |= {f"torque/{name} [N m]": torque[i] for i, name in enumerate(MOTOR_JOINTS)}
         return series | {f"action/{name} [1]": action[i] for i, name in enumerate(MOTOR_JOINTS)}
 
     def recording(self) -> Recording:

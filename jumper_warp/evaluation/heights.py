@@ -102,7 +102,8 @@ class HeightLog(JumpLog):
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
         """Return the base's present and commanded height [m] of some worlds."""
-        return super().series(worlds) | {f"height/target of {i} [m]": self.commanded[i, 0] for i in worlds}
+        targets = zip(self.names(worlds), self.commanded[list(worlds), 0], strict=True)
+        return super().series(worlds) | {f"height/command, {name} [m]": height for name, height in targets}
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the commanded heights [m] of some worlds: key `targets_m`."""

@@ -219,12 +219,13 @@ class JumpLog(EvaluationLog):
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
         """Return the present base height [m] of some worlds."""
-        return {f"height/base of {world} [m]": self.arrays["base_pos"][world, 2] for world in worlds}
+        heights = self.arrays["base_pos"][list(worlds), 2]
+        return {f"height/base, {name} [m]": height for name, height in zip(self.names(worlds), heights, strict=True)}
 
     def states(self, worlds: Sequence[int]) -> dict[str, str]:
         """Return the phase of some worlds' jumps."""
-        labels = self.labels(worlds)
-        return {f"phase/{label}": PHASES[self.arrays["phase"][world]] for label, world in zip(labels, worlds)}
+        phases = self.arrays["phase"][list(worlds)]
+        return {f"phase/{name}": PHASES[phase] for name, phase in zip(self.names(worlds), phases, strict=True)}
 
 
 def stance_metrics(jumps: JumpLog) -> Metrics:

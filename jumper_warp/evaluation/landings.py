@@ -119,8 +119,9 @@ class LandingLog(JumpLog):
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
         """Return the base's height and its distance from the current goal [m] of some worlds."""
-        distance = np.linalg.norm((self.arrays["base_pos"] - self.arrays["goal"])[:, :2], axis=1)
-        return super().series(worlds) | {f"distance/goal of {world} [m]": distance[world] for world in worlds}
+        offset = (self.arrays["base_pos"] - self.arrays["goal"])[list(worlds), :2]
+        distances = zip(self.names(worlds), np.linalg.norm(offset, axis=1), strict=True)
+        return super().series(worlds) | {f"distance/to goal, {name} [m]": distance for name, distance in distances}
 
     def goal_markers(self, worlds: Sequence[int]) -> np.ndarray:
         """Return the commanded goals [m], world frame, (worlds, jumps in a row, 3), z = 0."""

@@ -52,7 +52,7 @@ class EvaluationLog(ABC):
 
     @abstractmethod
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the present values of the time series to record, by `group/quantity [unit]`; worlds: their indices."""
+        """Return the present values of some worlds (indices), by `group/quantity, name of the world [unit]`."""
 
     def goal_markers(self, worlds: Sequence[int]) -> np.ndarray | None:
         """Return goal positions [m] to mark in a recording, world frame, (worlds, goals per world, 3), or None."""
@@ -66,8 +66,16 @@ class EvaluationLog(ABC):
         """Return the names of some worlds in recordings and pictures, such as their goals in metres."""
         return [f"{self.row_name} {world}" for world in worlds]
 
+    def names(self, worlds: Sequence[int]) -> list[str]:
+        """Return distinct names of some worlds: their labels, a repeated one with its world's index in parentheses."""
+        labels = self.labels(worlds)
+        return [
+            label if labels.count(label) == 1 else f"{label} ({world})"
+            for label, world in zip(labels, worlds, strict=True)
+        ]
+
     def states(self, worlds: Sequence[int]) -> dict[str, str]:
-        """Return the present state of some worlds in words, such as the phase of a jump, by `quantity/label`."""
+        """Return the present state of some worlds in words, such as the phase of a jump, by `quantity/name`."""
         return {}
 
     def velocity_commands(self, worlds: Sequence[int]) -> np.ndarray | None:

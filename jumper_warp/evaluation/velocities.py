@@ -122,7 +122,8 @@ class VelocityLog(EvaluationLog):
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
         """Return the last velocities and commands of some robots."""
-        return velocity_series(self.velocity[-1], self.command_history()[-1], worlds)
+        rows = list(worlds)
+        return velocity_series(self.velocity[-1][rows], self.command_history()[-1][rows], self.names(worlds))
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the commands of some robots and their times: keys `commands`, `times_s`."""
@@ -144,13 +145,13 @@ def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:
     return np.stack([vel[:, 0], vel[:, 1], ang[:, 2]], axis=1)
 
 
-def velocity_series(velocity: np.ndarray, command: np.ndarray, worlds: Sequence[int]) -> dict[str, float]:
-    """Return velocities and commands, (robots, 3) each, of some robots as time series of `EvaluationLog.series`."""
+def velocity_series(velocity: np.ndarray, command: np.ndarray, names: Sequence[str]) -> dict[str, float]:
+    """Return velocities and commands, (robots, 3) each, of named robots as values of `EvaluationLog.series`."""
     series = {}
-    for world in worlds:
+    for robot, name in enumerate(names):
         for i, (axis, unit) in enumerate(zip(AXES, ("m/s", "m/s", "rad/s"), strict=True)):
-            series[f"{axis}/robot {world} [{unit}]"] = float(velocity[world, i])
-            series[f"{axis}/command of {world} [{unit}]"] = float(command[world, i])
+            series[f"{axis}/actual, {name} [{unit}]"] = float(velocity[robot, i])
+            series[f"{axis}/command, {name} [{unit}]"] = float(command[robot, i])
     return series
 
 

@@ -1,4 +1,4 @@
-"""Additions to a recording: goal markers on the ground and moving blocks."""
+"""Additions to a recording: markers of goals and commanded heights, and moving blocks."""
 
 from __future__ import annotations
 
@@ -11,40 +11,33 @@ from jumper_warp.viz.recording import Recording
 from jumper_warp.viz.shapes import ShapeMesh
 from jumper_warp.viz.style import GOAL_COLOR
 
-RING_RADIUS = 0.1  # [m] outer radius: the largest error of a successful jump
-RING_WIDTH = 0.015  # [m]
-MARK_LIFT = 0.003  # [m] height above the goal, so that the ground does not hide the ring
-BAR_LENGTH, BAR_WIDTH, BAR_DISTANCE = 1.2, 0.012, 0.45  # [m] of a bar; distance from the robot
+RING_RADIUS = 0.1  # [m] outer radius of a goal's ring: largest error of a successful jump
+RING_WIDTH, RING_HEIGHT = 0.012, 0.006  # [m] of the ring's rectangular cross-section
+BAR_SIZE = (1.2, 0.012, 0.012)  # [m] extents of a bar at the commanded height, along x, y, z
+BAR_OFFSET = 0.45  # [m] distance along y from the base's start to the bar
 BLOCK_COLOR = (0.55, 0.45, 0.35)  # RGB, each in [0, 1]
 
 
 def goal_shapes(recording: Recording) -> list[ShapeMesh]:
-    """Return the shapes that mark a recording's goals: rings on the ground, bars at commanded heights.
+    """Return a ring around each goal on the ground and a bar at each world's commanded height, world frame.
 
-    A ring has the radius of the tolerance of success. The two bars are parallel to x, on both sides of the robot.
+    The bar is parallel to x, to the left of the base's first position. Shapes of later worlds are moved along y by the
+    recording's spacing. Names: `goal_<rank>_<number>`, `height_<rank>`; NaN goals and heights have none.
     """
-    marks = []
-    for rank in range(len(recording.worlds)):
-        shift = np.array([0.0, rank * recording.spacing, 0.0])
-        for number, goal in enumerate(recording.goals[rank] if len(recording.goals) else ()):
-            if np.isfinite(goal).all():
-                ring = trimesh.creation.annulus(RING_RADIUS - RING_WIDTH, RING_RADIUS, 2.0 * MARK_LIFT, sections=48)
-                marks.append(_mark(f"goal_{rank}_{number}", ring, goal + shift))
-        if len(recording.heights) and np.isfinite(recording.heights[rank]):
-            base = recording.body_poses(rank)[0, 0, :2]
-            for side in (-1.0, 1.0):
-                bar = trimesh.creation.box(extents=(BAR_LENGTH, BAR_WIDTH, BAR_WIDTH))
-                place = np.array([base[0], base[1] + side * BAR_DISTANCE, recording.heights[rank]])
-                marks.append(_mark(f"height_{rank}_{'left' if side > 0 else 'right'}", bar, place + shift))
-    return marks
-
-
-def _mark(name: str, mesh: trimesh.Trimesh, place: np.ndarray) -> ShapeMesh:
-    """Return a mesh at a place [m], world frame, as a shape in the color of goals."""
-    mesh = mesh.smooth_shaded
-    vertices = (np.asarray(mesh.vertices) + place).astype(np.float32)
-    normals = np.asarray(mesh.vertex_normals, np.float32)
-    return ShapeMesh(name, -1, GOAL_COLOR, vertices, normals, np.asarray(mesh.faces, np.int32))
+    shapes = []
+    for rank, goals in enumerate(recording.goals):
+        for number, goal in enumerate(goals):
+            ring = trimesh.creation.annulus(RING_RADIUS - RING_WIDTH, RING_RADIUS, RING_HEIGHT, sections=48)
+            shapes.append((f"goal_{rank}_{number}", rank, ring, goal + (0.0, 0.0, 0.5 * RING_HEIGHT)))
+    for rank, height in enumerate(recording.heights):
+        x, y = recording.body_poses(rank)[0, 0, :2]
+        bar, place = trimesh.creation.box(extents=BAR_SIZE), np.array([x, y + BAR_OFFSET, height])
+        shapes.append((f"height_{rank}", rank, bar, place))
+    return [
+        _shape(name, -1, GOAL_COLOR, mesh.apply_translation(place + (0.0, rank * recording.spacing, 0.0)))
+        for name, rank, mesh, place in shapes
+        if np.isfinite(place).all()
+    ]
 
 
 def with_blocks(recording: Recording, centers: np.ndarray, half: np.ndarray, height: np.ndarray) -> Recording:
@@ -59,9 +52,15 @@ def with_blocks(recording: Recording, centers: np.ndarray, half: np.ndarray, hei
         pose[:, 0, :2] = centers[:, rank]
         pose[:, 0, 2] = 0.5 * height[rank]
         pose[:, 0, 6] = 1.0
-        box = trimesh.creation.box(extents=(*(2.0 * half[rank]), height[rank])).smooth_shaded
-        surface = (np.asarray(box.vertices, np.float32), np.asarray(box.vertex_normals, np.float32))
-        shapes.append(ShapeMesh("block", len(names), BLOCK_COLOR, *surface, np.asarray(box.faces, np.int32)))
+        box = trimesh.creation.box(extents=(*(2.0 * half[rank]), height[rank]))
+        shapes.append(_shape("block", len(names), BLOCK_COLOR, box))
         names.append(f"world_{world}/block")
         poses.append(pose)
     return replace(recording, poses=np.concatenate(poses, axis=1), bodies=tuple(names), shapes=tuple(shapes))
+
+
+def _shape(name: str, body: int, color: tuple[float, float, float], mesh: trimesh.Trimesh) -> ShapeMesh:
+    """Return a mesh [m] in the body's frame as a shape."""
+    smooth = mesh.smooth_shaded
+    surface = (np.asarray(smooth.vertices, np.float32), np.asarray(smooth.vertex_normals, np.float32))
+    return ShapeMesh(name, body, color, *surface, np.asarray(smooth.faces, np.int32))

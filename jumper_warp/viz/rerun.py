@@ -1,33 +1,48 @@
 """Recordings as files of the Rerun viewer: `rerun FILE.rrd` shows them.
 
-Entities:
-    scene/<shape>                 ground and other shapes that are fixed to the world
-    scene/world_<i>/<link>        pose of a link over time
-    scene/world_<i>/<link>/<shape>
-    scene/world_<i>/contact_forces
-    series/<group>/<quantity [unit]>
+Entities, where <world> is the label of a world, or `world_<i>` if two worlds have the same label:
+    scene/<shape>                       ground, goals, and other shapes that are fixed to the world
+    scene/<world>/<link>                pose of a link over time
+    scene/<world>/<link>/<shape>
+    scene/<world>/trail                 paths of the base and of the contact points
+    scene/<world>/contact_forces
+    scene/<world>/commanded_velocity, actual_velocity
+    scene/view_target                   point that the eye follows
+    series/<group>/<quantity [unit]>    one curve, or one for each leg in the order of LEG_COLORS
+    states/<quantity>/<world>           words over time
 
 No viewer is started and no port is opened.
 """
 
 import os
+import re
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from jumper_warp.viz.props import goal_shapes
 from jumper_warp.viz.shapes import ShapeMesh
+from jumper_warp.viz.style import ACTUAL_COLOR, COMMAND_COLOR, LEG_COLORS
 
 if TYPE_CHECKING:
     from jumper_warp.viz.recording import Recording
 
 TIMELINE = "time"  # name of the only timeline; durations [s]
 FORCE_SCALE = 1.0e-3  # [m/N] length of a contact arrow over its force
+VELOCITY_SCALE = 0.5  # [s] length of a velocity arrow over the velocity
+VELOCITY_LIFTS = (0.22, 0.27)  # [m] height of the arrows of commanded and of actual velocity above the base
 ARROW_RADIUS = 0.006  # [m]
-ARROW_COLOR = (220, 60, 40)  # RGB, each 0 to 255
-EYE_OFFSET = np.array([1.3, 1.7, 0.6])
-"""[m] Vector from the target of the view to the eye, world frame, for a robot that stays in place."""
+TRAIL_WIDTH = 1.5  # [px]
+LINE_WIDTHS = (1.0, 2.0)  # [px] of commanded and of all other curves
+EYE_DIRECTION = np.array([0.70, 0.63, 0.336])  # from the target of the view to the eye, world frame; a unit vector
+EYE_DISTANCE = 1.8  # [m] smallest distance of the eye from its target
+LEGEND_SHARE = 0.35  # free time axis behind the curves, where the legend is, over the recording's length
+LEG_QUANTITY = re.compile(rf"({'|'.join(LEG_COLORS)})(?:_(\w+))? (\[.+\])")
+"""Pattern of a quantity of one leg: leg, motor if any, unit in brackets."""
 
 
 def write_rrd(recording: "Recording", path: Path) -> Path:
@@ -38,10 +53,14 @@ def write_rrd(recording: "Recording", path: Path) -> Path:
     rr = _import_rerun()
     temporary = path.with_name(f".{path.name}.{os.getpid()}")
     stream = rr.RecordingStream("jumper-warp")
+    writer = _Writer(rr, stream, recording)
     try:
         stream.save(temporary, default_blueprint=_blueprint(recording))
-        _log_scene(rr, stream, recording)
-        _log_series(rr, stream, recording)
+        writer.log_scene()
+        for rank in range(len(recording.worlds)):
+            writer.log_world(rank)
+        writer.log_series()
+        writer.log_states()
         stream.disconnect()  # closes the file
         os.replace(temporary, path)
     finally:
@@ -58,84 +77,258 @@ def _import_rerun() -> ModuleType:
     return rerun
 
 
-def _log_scene(rr: ModuleType, stream: Any, recording: "Recording") -> None:
-    """Log the shapes once, and the poses and contact forces of all frames with one call for each entity."""
-    times = [rr.TimeColumn(TIMELINE, duration=recording.times)]
-    stream.log("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
-    for shape in recording.shapes:
-        parent = ["scene"] if shape.body < 0 else ["scene", *recording.bodies[shape.body].split("/")]
-        stream.log(rr.new_entity_path([*parent, shape.name]), _mesh(rr, shape), static=True)
-    for index, body in enumerate(recording.bodies):
-        pos, quat = np.split(recording.poses[:, index], [3], axis=1)
-        columns = rr.Transform3D.columns(translation=pos, quaternion=quat)
-        stream.send_columns(rr.new_entity_path(["scene", *body.split("/")]), times, columns)
-    for rank, world in enumerate(recording.worlds):
+class _Writer:
+    """Writer of one recording to a Rerun stream, with one call for all frames of an entity."""
+
+    def __init__(self, rr: ModuleType, stream: Any, recording: "Recording") -> None:
+        """Prepare to write; rr: the module rerun, stream: its `RecordingStream`."""
+        self.rr, self.stream, self.recording = rr, stream, recording
+        self.worlds = _world_names(recording)
+        self.times = [rr.TimeColumn(TIMELINE, duration=recording.times)]
+
+    def log_scene(self) -> None:
+        """Log all shapes once, the poses of all bodies, and the target of the eye."""
+        rr, recording = self.rr, self.recording
+        parents = []
+        for body in recording.bodies:
+            world, link = body.split("/")
+            parents.append(["scene", self.worlds[recording.worlds.index(int(world.removeprefix("world_")))], link])
+        self.stream.log("scene", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
+        for shape in (*recording.shapes, *goal_shapes(recording)):
+            parent = ["scene"] if shape.body < 0 else parents[shape.body]
+            self.stream.log(rr.new_entity_path([*parent, shape.name]), _mesh(rr, shape), static=True)
+        for index, parent in enumerate(parents):
+            pos, quat = np.split(recording.poses[:, index], [3], axis=1)
+            self._send(parent, rr.Transform3D.columns(translation=pos, quaternion=quat))
+        # The viewer puts the eye at 1.5 times the radius of the tracked entity: an invisible one, without area, sets it
+        target, distance = view_targets(recording)
+        ends = np.outer([-1.0, 1.0], [distance / 1.5, 0.0, 0.0])
+        flat = rr.Mesh3D(vertex_positions=ends, triangle_indices=[[0, 0, 1]])
+        self.stream.log("scene/view_target", flat, static=True)
+        self._send(["scene", "view_target"], rr.Transform3D.columns(translation=target))
+
+    def log_world(self, rank: int) -> None:
+        """Log place, trail, contact forces and velocities of the rank-th recorded world."""
+        rr, recording, parent = self.rr, self.recording, ["scene", self.worlds[rank]]
         offset = rr.Transform3D(translation=[0.0, rank * recording.spacing, 0.0])
-        stream.log(f"scene/world_{world}", offset, static=True)
-        _log_contacts(rr, stream, f"scene/world_{world}/contact_forces", times, recording, rank)
+        self.stream.log(rr.new_entity_path(parent), offset, static=True)
+        points, base = recording.contact_points[:, rank], recording.body_poses(rank)[:, 0]
+        colors = list(LEG_COLORS.values())  # four contact points are the paws
+        colors = colors if points.shape[1] == len(colors) else [ACTUAL_COLOR] * points.shape[1]
+        strips = [base[:, :3], *points.transpose(1, 0, 2)]
+        trail = rr.LineStrips3D(
+            [strip[np.isfinite(strip).all(axis=1)] for strip in strips],
+            colors=_rgb([ACTUAL_COLOR, *colors]),
+            radii=rr.Radius.ui_points(0.5 * TRAIL_WIDTH),
+        )
+        self.stream.log(rr.new_entity_path([*parent, "trail"]), trail, static=True)
+        if len(colors):
+            self._log_arrows(
+                [*parent, "contact_forces"], points, FORCE_SCALE * recording.contact_forces[:, rank], colors
+            )
+        if len(recording.commands):
+            arrows = zip(("commanded", "actual"), velocities(recording, rank), VELOCITY_LIFTS, strict=True)
+            for name, values, lift in arrows:
+                color = COMMAND_COLOR if name == "commanded" else ACTUAL_COLOR
+                origin = base[:, None, :3] + (0.0, 0.0, lift)
+                self._log_arrows([*parent, f"{name}_velocity"], origin, VELOCITY_SCALE * values[:, None], [color])
+
+    def _log_arrows(
+        self, entity: list[str], origins: np.ndarray, vectors: np.ndarray, colors: Iterable[tuple[float, float, float]]
+    ) -> None:
+        """Log the same number of arrows in each frame; origins, vectors [m]: (frames, arrows, 3)."""
+        style = self.rr.Arrows3D.from_fields(radii=ARROW_RADIUS, colors=_rgb(colors))
+        self.stream.log(self.rr.new_entity_path(entity), style, static=True)
+        columns = self.rr.Arrows3D.columns(origins=origins.reshape(-1, 3), vectors=vectors.reshape(-1, 3))
+        self._send(entity, columns.partition([origins.shape[1]] * len(origins)))
+
+    def log_series(self) -> None:
+        """Log each plot of the recording as scalars over time."""
+        for plot in (plot for plots in _plots(self.recording).values() for plot in plots):
+            style = self.rr.SeriesLines(
+                names=plot.names, colors=_rgb(plot.colors), widths=[plot.width] * len(plot.names)
+            )
+            self.stream.log(self.rr.new_entity_path(plot.entity), style, static=True)
+            self._send(plot.entity, self.rr.Scalars.columns(scalars=plot.values))
+
+    def log_states(self) -> None:
+        """Log the frames in which a state changes."""
+        for name, words in self.recording.states.items():
+            changes = [i for i, word in enumerate(words) if i == 0 or word != words[i - 1]]
+            times = [self.rr.TimeColumn(TIMELINE, duration=self.recording.times[changes])]
+            columns = self.rr.StateChange.columns(state=[words[i] for i in changes])
+            self.stream.send_columns(self.rr.new_entity_path(["states", *name.split("/", 1)]), times, columns)
+
+    def _send(self, entity: list[str], columns: Any) -> None:
+        """Log one value in each frame of the recording."""
+        self.stream.send_columns(self.rr.new_entity_path(entity), self.times, columns)
 
 
-def _log_contacts(
-    rr: ModuleType, stream: Any, entity: str, times: list[Any], recording: "Recording", rank: int
-) -> None:
-    """Log one world's contact forces as arrows of an entity; times: Rerun's time columns; rank: index in `worlds`."""
-    points, forces = recording.contact_points[:, rank], recording.contact_forces[:, rank]
-    frames, contacts = points.shape[:2]
-    if contacts == 0:
-        return
-    stream.log(entity, rr.Arrows3D.from_fields(radii=ARROW_RADIUS, colors=ARROW_COLOR), static=True)
-    columns = rr.Arrows3D.columns(origins=points.reshape(-1, 3), vectors=FORCE_SCALE * forces.reshape(-1, 3))
-    stream.send_columns(entity, times, columns.partition([contacts] * frames))
+def _world_names(recording: "Recording") -> list[str]:
+    """Return distinct names of the recorded worlds for entity paths."""
+    labels = [recording.label(rank) for rank in range(len(recording.worlds))]
+    return labels if len(set(labels)) == len(labels) else [f"world_{world}" for world in recording.worlds]
 
 
 def _mesh(rr: ModuleType, shape: ShapeMesh) -> Any:
     """Return a shape as Rerun's mesh, in the body's frame, with an opaque color."""
-    color = [round(255 * min(max(channel, 0.0), 1.0)) for channel in shape.color]
     return rr.Mesh3D(
         vertex_positions=shape.vertices,
         vertex_normals=shape.normals,
         triangle_indices=shape.triangles,
-        albedo_factor=[*color, 255],
+        albedo_factor=[*_rgb([shape.color])[0], 255],
     )
 
 
-def _log_series(rr: ModuleType, stream: Any, recording: "Recording") -> None:
-    """Log each series as a scalar over time, entity `series/<group>/<quantity [unit]>`."""
-    times = [rr.TimeColumn(TIMELINE, duration=recording.times)]
+def _rgb(colors: Iterable[tuple[float, float, float]]) -> np.ndarray:
+    """Return colors (n, 3) in [0, 1] as bytes."""
+    return np.round(255.0 * np.clip(list(colors), 0.0, 1.0)).astype(np.uint8)
+
+
+def velocities(recording: "Recording", rank: int) -> tuple[np.ndarray, np.ndarray]:
+    """Return commanded and actual horizontal velocity [m/s] of a world's base, world axes, (frames, 3) each.
+
+    Commands are turned by the base's yaw; NaN is replaced by 0. Actual: central differences of the base's origin.
+    """
+    base = recording.body_poses(rank)[:, 0].astype(float)
+    x, y, z, w = base[:, 3:].T
+    yaw = np.arctan2(2.0 * (x * y + w * z), 1.0 - 2.0 * (y * y + z * z))
+    ahead, left = recording.commands[:, rank, :2].T
+    commanded = np.stack([np.cos(yaw) * ahead - np.sin(yaw) * left, np.sin(yaw) * ahead + np.cos(yaw) * left], axis=1)
+    moves = len(base) > 1
+    actual = np.gradient(base[:, :2], recording.times, axis=0) if moves else np.zeros_like(base[:, :2])
+    commanded, actual = (np.pad(np.nan_to_num(values), ((0, 0), (0, 1))) for values in (commanded, actual))
+    return commanded, actual
+
+
+def view_targets(recording: "Recording") -> tuple[np.ndarray, float]:
+    """Return the point that the eye looks at [m], world frame, (frames, 3), and the eye's distance from it [m].
+
+    The point follows the mean horizontal position of the worlds' bases, at the mean of their extreme heights.
+    """
+    count = len(recording.worlds)
+    base = np.stack([recording.body_poses(rank)[:, 0, :3] for rank in range(count)], axis=1).astype(float)
+    base[..., 1] += recording.spacing * np.arange(count)
+    base = np.where(np.isfinite(base), base, 0.0)
+    target = base.mean(axis=1)
+    low, high = base[..., 2].min(), base[..., 2].max()
+    target[:, 2] = 0.5 * (low + high)
+    spread = np.linalg.norm((base - target[:, None])[..., :2], axis=2).max()
+    return target, max(EYE_DISTANCE, 2.4 * (high - low)) + 1.3 * spread
+
+
+@dataclass(frozen=True)
+class _Plot:
+    """Curves of one entity."""
+
+    group: str  # of the series
+    title: str  # `quantity [unit]`
+    names: list[str]  # of the curves, for the legend
+    colors: list[tuple[float, float, float]]  # of the curves
+    width: float  # [px] of the curves
+    values: np.ndarray  # (frames, curves)
+    by_leg: bool  # whether there is one curve for each leg
+
+    @property
+    def entity(self) -> list[str]:
+        """Parts of the entity's path."""
+        return ["series", self.group, self.title]
+
+
+def _plots(recording: "Recording") -> dict[str, list[_Plot]]:
+    """Return the series by group; those of all legs' same motor, or of the paws, are one plot, in the order of legs.
+
+    Colors: of the leg; for several worlds, of the world; else of commanded or actual quantities.
+    """
+    plots: dict[str, list[_Plot]] = {}
+    legs: dict[tuple[str, str], dict[str, np.ndarray]] = {}  # by group and title, then by leg
     for name, values in recording.series.items():
         group, quantity = name.split("/", 1)
-        entity = rr.new_entity_path(["series", group, quantity])
-        stream.log(entity, rr.SeriesLines(names=quantity), static=True)
-        stream.send_columns(entity, times, rr.Scalars.columns(scalars=values))
+        plots.setdefault(group, [])
+        if match := LEG_QUANTITY.fullmatch(quantity):
+            leg, motor, unit = match.groups()
+            legs.setdefault((group, f"{motor or 'paws'} {unit}"), {})[leg] = values
+        else:
+            plots[group].append(_curve(recording, group, quantity, values))
+    for (group, title), by_leg in legs.items():
+        order = [leg for leg in LEG_COLORS if leg in by_leg]
+        values = np.stack([by_leg[leg] for leg in order], axis=1)
+        colors = [LEG_COLORS[leg] for leg in order]
+        plots[group].append(_Plot(group, title, order, colors, LINE_WIDTHS[1], values, True))
+    return plots
+
+
+def _curve(recording: "Recording", group: str, quantity: str, values: np.ndarray) -> _Plot:
+    """Return the plot of one series, values (frames,); its legend leaves out the label of the only world."""
+    commanded = quantity.startswith("command")
+    color, label, worlds = COMMAND_COLOR if commanded else ACTUAL_COLOR, quantity, _world_names(recording)
+    for rank, world in enumerate(worlds):
+        if f", {world} [" in quantity:
+            several = len(worlds) > 1
+            color = list(LEG_COLORS.values())[rank % len(LEG_COLORS)] if several else color
+            label = quantity if several else quantity.replace(f", {world} [", " [")
+    return _Plot(group, quantity, [label], [color], LINE_WIDTHS[0 if commanded else 1], values[:, None], False)
 
 
 def _blueprint(recording: "Recording") -> Any:
-    """Return the viewer's layout: scene on the left, on the right a plot for each group of series."""
+    """Return the viewer's layout: scene and states on the left, on the right plots, those of motors in tabs.
+
+    It plays in a loop from the beginning, with all panels collapsed.
+    """
     import rerun as rr
     import rerun.blueprint as rrb
 
-    target, eye = _viewpoint(recording)
-    scene = rrb.Spatial3DView(
-        origin="/scene",
-        name="scene",
-        eye_controls=rrb.EyeControls3D(position=eye, look_target=target, eye_up=[0.0, 0.0, 1.0]),
-        line_grid=False,
-    )
-    groups = dict.fromkeys(name.split("/")[0] for name in recording.series)
-    plots = [rrb.TimeSeriesView(origin=rr.new_entity_path(["series", group]), name=group) for group in groups]
-    layout = rrb.Horizontal(scene, rrb.Vertical(*plots), column_shares=[3, 2]) if plots else scene
-    panel = rrb.TimePanel(timeline=TIMELINE, state="collapsed")
+    start, end = float(recording.times[0]), float(recording.times[-1])
+    limits = (rrb.TimeRangeBoundary.absolute(seconds=t) for t in (start, end + LEGEND_SHARE * (end - start)))
+    axis = rrb.TimeAxis(view_range=rr.TimeRange(*limits))
+    left, shares = [_scene_view(recording)], [1.0]
+    if recording.states:
+        left.append(rrb.StateTimelineView(origin="/states", name="states", time_view=axis))
+        shares.append(0.08 + 0.06 * len(recording.states))
+    columns: list[Any] = [rrb.Vertical(*left, row_shares=shares)]
+    groups = {group: _group_views(group, plots, axis) for group, plots in _plots(recording).items()}
+    plain = [views[0] for views in groups.values() if len(views) == 1]
+    tabs = [rrb.Vertical(*views, name=group) for group, views in groups.items() if len(views) > 1]
+    if groups:
+        shares = [1.0] * len(plain) + [3.0] * bool(tabs)
+        columns.append(rrb.Vertical(*plain, *([rrb.Tabs(*tabs)] if tabs else []), row_shares=shares))
+    panel = rrb.TimePanel(timeline=TIMELINE, state="collapsed", play_state="playing", loop_mode="all")
+    layout = rrb.Horizontal(*columns, column_shares=[3, 2][: len(columns)])
     return rrb.Blueprint(layout, panel, rrb.BlueprintPanel(state="collapsed"), rrb.SelectionPanel(state="collapsed"))
 
 
-def _viewpoint(recording: "Recording") -> tuple[np.ndarray, np.ndarray]:
-    """Return target and eye of the view [m], world frame, (3,) each, so that all worlds' motions are visible."""
-    pos = recording.poses[..., :3].reshape(len(recording.times), len(recording.worlds), -1, 3)
-    pos = pos + recording.spacing * np.arange(len(recording.worlds))[:, None, None] * np.array([0.0, 1.0, 0.0])
-    points = pos.reshape(-1, 3)
-    points = points[np.isfinite(points).all(axis=1)]
-    if len(points) == 0:
-        return np.zeros(3), EYE_OFFSET
-    low, high = points.min(axis=0), points.max(axis=0)
-    target = 0.5 * (low + high)
-    return target, target + EYE_OFFSET * max(1.0, float(np.linalg.norm(high - low)))
+def _group_views(group: str, plots: list[_Plot], axis: Any) -> list[Any]:
+    """Return a view for each motor of a group of series, or one for the whole group; axis: Rerun's time axis.
+
+    Legends are in the free part of the time axis; of the motors' views only the first has one.
+    """
+    import rerun as rr
+    import rerun.blueprint as rrb
+
+    by_motor = len(plots) > 1 and all(plot.by_leg for plot in plots)
+    return [
+        rrb.TimeSeriesView(
+            origin=rr.new_entity_path(plot.entity if by_motor else ["series", group]),
+            name=f"{group} {plot.title.removeprefix('paws ')}" if plot.by_leg else group,
+            axis_x=axis,
+            plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=number == 0),
+        )
+        for number, plot in enumerate(plots if by_motor else plots[:1])
+    ]
+
+
+def _scene_view(recording: "Recording") -> Any:
+    """Return the view of the scene, whose eye follows `scene/view_target`."""
+    import rerun.blueprint as rrb
+
+    targets, distance = view_targets(recording)
+    eye = rrb.EyeControls3D(
+        position=targets[0] + distance * EYE_DIRECTION,
+        look_target=targets[0],
+        eye_up=[0.0, 0.0, 1.0],
+        tracking_entity="/scene/view_target",
+    )
+    labels = ", ".join(recording.labels)
+    return rrb.Spatial3DView(
+        origin="/scene", name=f"scene: {labels}" if labels else "scene", eye_controls=eye, line_grid=False
+    )

@@ -1,12 +1,15 @@
-"""Colors that pictures, films, recordings and plots share: Okabe and Ito's palette, safe for color-blind readers."""
+"""Colors of legs, commands and measurements in plots and scenes: RGB, each in [0, 1], safe for color-blind readers.
+
+They are of the palette of Okabe and Ito.
+"""
 
 LEG_COLORS = {
-    "FL": (0.0, 0.447, 0.698),
-    "FR": (0.835, 0.369, 0.0),
-    "BL": (0.0, 0.620, 0.451),
-    "BR": (0.800, 0.475, 0.655),
-}  # RGB, each in [0, 1]
-COMMAND_COLOR = (0.902, 0.624, 0.0)  # RGB of what is commanded
-ACTUAL_COLOR = (0.0, 0.447, 0.698)  # RGB of what the robot does
-GOAL_COLOR = (0.835, 0.369, 0.0)  # RGB of goals
-BASE_COLOR = (0.15, 0.15, 0.18)  # RGB of the base's path
+    "FL": (0.000, 0.447, 0.698),  # blue
+    "FR": (0.902, 0.624, 0.000),  # orange
+    "BL": (0.000, 0.620, 0.451),  # green
+    "BR": (0.800, 0.475, 0.655),  # purple
+}  # By leg, in the order in which legs are shown
+COMMAND_COLOR = (0.835, 0.369, 0.000)  # vermilion
+ACTUAL_COLOR = (0.000, 0.447, 0.698)  # blue
+GOAL_COLOR = COMMAND_COLOR  # a goal is a commanded place
+BASE_COLOR = (0.15, 0.15, 0.18)  # nearly black: the path of the base, and scales in pictures

@@ -385,9 +385,9 @@ def test_play_records_each_step_of_each_robot(trained_run, tmp_path, capsys):
     code, out, _ = run(capsys, "play", str(trained_run), *args)
     assert code == 0 and "0.900" in out
     series = {name.split("/")[-1]: values for name, values in curves(tmp_path / "jump.rrd").items()}
-    assert [len(series[f"base of {world} [m]"]) for world in (0, 1)] == [15, 15]  # 0.25 s at 60 Hz
-    assert series["target of 1 [m]"] == pytest.approx([0.9] * 15)
-    assert 0.2 < series["base of 0 [m]"][0] < 0.5
+    assert [len(series[f"base, {name} [m]"]) for name in ("0.60 m", "0.90 m")] == [15, 15]  # 0.25 s at 60 Hz
+    assert series["command, 0.90 m [m]"] == pytest.approx([0.9] * 15)
+    assert 0.2 < series["base, 0.60 m [m]"][0] < 0.5
 
 
 def test_evaluate_horizontal_jumps(still, tmp_path, capsys):
@@ -408,8 +408,8 @@ def test_play_horizontal_jumps_records_distances_and_goal_markers(still, tmp_pat
     assert code == 0 and out.count("not_begun") == 2
     series = {name.split("/")[-1]: values for name, values in curves(tmp_path / "jump.rrd").items()}
     entities = {str(chunk.entity_path) for chunk in RrdReader(tmp_path / "jump.rrd").stream().to_chunks()}
-    assert series["goal of 0 [m]"] == pytest.approx([np.hypot(0.8, 0.2)] * 15, abs=0.02)
-    assert series["goal of 1 [m]"] == pytest.approx([0.5] * 15, abs=0.02)
+    assert series["to goal, (0.80, 0.20) m [m]"] == pytest.approx([np.hypot(0.8, 0.2)] * 15, abs=0.02)
+    assert series["to goal, 0.50 m [m]"] == pytest.approx([0.5] * 15, abs=0.02)
     assert {"/scene/goal_0_0", "/scene/goal_1_0"} <= entities
 
 
@@ -432,7 +432,7 @@ def test_play_walks_for_the_given_time(tmp_path, capsys):
     code, out, _ = run(capsys, "play", "walking_flat", *args)
     assert code == 0 and "walked" in out and "0.500" in out and "0.300" in out
     series = curves(tmp_path / "robot.rrd")
-    (yaw_rate_command,) = (values for name, values in series.items() if "yaw_rate/command of 0" in name)
+    (yaw_rate_command,) = (values for name, values in series.items() if "yaw_rate/command" in name)
     assert yaw_rate_command == pytest.approx([0.3] * 15)
 
 

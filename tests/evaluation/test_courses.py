@@ -145,6 +145,18 @@ def test_robot_that_never_stops_has_outcome_stuck():
     assert env.steps == 120 + round(JUMP_TIMEOUT / DT) and course_metrics(course)["command_to_takeoff_s"] is None
 
 
+def test_goals_of_jumps_to_a_place_are_marked_when_the_jump_skill_takes_over():
+    course, env = CourseLog([(SCRIPT[0], ScriptStep("jump_to", (0.5, 0.1)))]), ScriptedEnv(1)
+    course.begin(env)
+    for number in range(200):
+        goal = np.full((1, 3), 0.01 * number)
+        course.read_env = lambda env, goal=goal: env.step() | {"jump_goal": goal}
+        course.record_step(env)
+    before = course.switch_step[0, 1] - 1
+    expected = [[np.nan, np.nan, 0.0], [0.01 * before, 0.01 * before, 0.0]]
+    np.testing.assert_allclose(course.goal_markers([0])[0], expected)
+
+
 def test_refuses_scripts_of_different_lengths():
     with pytest.raises(InputError, match="one length"):
         CourseLog([SCRIPT, SCRIPT[:1]])
@@ -153,6 +165,7 @@ def test_refuses_scripts_of_different_lengths():
 def test_series_and_columns_report_robot_state():
     course, _ = run_course()
     series = course.series([1])
-    assert series["vx/robot 1 [m/s]"] == pytest.approx(0.4) and series["vx/command of 1 [m/s]"] == pytest.approx(0.3)
-    assert series["skill/of 1 [1]"] == WALK and course.columns()["commands_done"] == [3, 3]
+    assert series["vx/actual, robot 1 [m/s]"] == pytest.approx(0.4)
+    assert series["vx/command, robot 1 [m/s]"] == pytest.approx(0.3) == course.velocity_commands([1])[0, 0]
+    assert course.states([1]) == {"skill/robot 1": "walk"} and course.columns()["commands_done"] == [3, 3]
     assert SimpleNamespace(**course.notes([0])).scripts[0][1] == ["jump_up", 0.75]

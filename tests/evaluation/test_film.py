@@ -1,8 +1,14 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.film import ankles, keyframes
-from jumper_warp.viz.props import MARK_LIFT, MARK_RADIUS, with_blocks, with_goal_markers
+from jump_helpers import make_env, random_actions
+from jumper_warp.evaluation.film import EnvRecorder, ankles
+from jumper_warp.evaluation.heights import HeightLog
+from jumper_warp.evaluation.log import run_evaluation, termination_names
+from jumper_warp.registry import make_task
+from jumper_warp.viz.props import BAR_OFFSET, RING_RADIUS, goal_shapes, with_blocks
 from jumper_warp.viz.recording import Recording
 
 
@@ -31,26 +37,39 @@ def test_ankle_positions_follow_shank_poses():
     assert points[0, 1] == pytest.approx([-0.3, 0.0, 1.0])
 
 
-def test_keyframes_are_command_squat_push_apex_fall_catch_end():
-    height = np.array([0.35, 0.35, 0.30, 0.20, 0.40, 0.70, 0.90, 0.70, 0.40, 0.25, 0.30, 0.35])
-    assert keyframes(height, command=1) == [1, 3, 5, 6, 7, 9, 11]
+def test_series_of_paw_forces_are_peaks_between_the_frames():
+    env, log = make_env(1), HeightLog(np.array([0.9]), termination_names(make_task("vertical-jump")))
+    recorder = EnvRecorder(env, log, [0])
+    actions = iter(random_actions(1, 30))
+    run_evaluation(lambda obs: next(actions), env, log, seconds=0.5, on_step=recorder, stop=False)
+    shown = recorder.recording()
+    sampled = np.linalg.norm(shown.contact_forces[:, 0], axis=2)
+    peaks = np.stack([shown.series[f"peak paw force/{leg} [N]"] for leg in ("FL", "FR", "BL", "BR")], axis=1)
+    assert (peaks >= sampled - 1e-3).all()
+    assert (peaks > 2.0 * sampled + 50.0).any()  # [N] an impact is over before the frame
+    assert shown.labels == ("0.90 m",) and set(shown.states) == {"phase/0.90 m"}
 
 
-@pytest.mark.parametrize(("command", "first"), [(-1, 0), (99, 2)])
-def test_keyframes_clamp_command_to_recording(command, first):
-    assert keyframes(np.array([0.3, 0.4, 0.3]), command)[0] == first
-
-
-def test_goal_markers_are_fixed_discs_that_skip_nan_and_are_spaced_by_world():
+def test_goals_are_rings_of_the_tolerance_on_the_ground_spaced_by_world():
     places = np.array([[[0.8, 0.2, 0.0], [np.nan, np.nan, 0.0]], [[0.5, 0.0, 0.1], [0.6, 0.0, 0.1]]])
-    shapes = with_goal_markers(recording(), places).shapes
+    shapes = goal_shapes(replace(recording(), goals=places))
     assert [shape.name for shape in shapes] == ["goal_0_0", "goal_1_0", "goal_1_1"]
     assert all(shape.body == -1 for shape in shapes)
-    assert shapes[0].vertices[0] == pytest.approx([0.8, 0.2, MARK_LIFT])
-    assert shapes[2].vertices[0] == pytest.approx([0.6, 2.0, 0.1 + MARK_LIFT])
-    rim = shapes[2].vertices[1:] - shapes[2].vertices[0]
-    assert np.linalg.norm(rim, axis=1) == pytest.approx(MARK_RADIUS, rel=1e-5)
-    assert shapes[0].triangles.max() == len(shapes[0].vertices) - 1
+    for shape, center in zip(shapes, ([0.8, 0.2, 0.0], [0.5, 2.0, 0.1], [0.6, 2.0, 0.1]), strict=True):
+        offset = shape.vertices - center
+        assert np.linalg.norm(offset[:, :2], axis=1).max() == pytest.approx(RING_RADIUS, rel=1e-5)
+        assert np.linalg.norm(offset[:, :2], axis=1).min() > 0.8 * RING_RADIUS
+        assert offset[:, 2].min() == pytest.approx(0.0, abs=1e-6)
+
+
+def test_commanded_heights_are_bars_on_both_sides_of_the_base_at_its_start():
+    jump = recording(worlds=3)
+    jump.poses[0, 1, :3] = [0.4, 0.1, 0.35]
+    shapes = goal_shapes(replace(jump, heights=np.array([np.nan, 0.9, 0.6])))
+    assert [shape.name for shape in shapes] == ["height_1_0", "height_1_1", "height_2_0", "height_2_1"]
+    for shape, side in zip(shapes[:2], (BAR_OFFSET, -BAR_OFFSET), strict=True):
+        assert shape.vertices.mean(axis=0) == pytest.approx([0.4, 2.1 + side, 0.9], abs=1e-6)
+        assert np.ptp(shape.vertices, axis=0) == pytest.approx([1.2, 0.012, 0.012], abs=1e-6)
 
 
 def test_blocks_are_bodies_that_move():

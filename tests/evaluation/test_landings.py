@@ -316,7 +316,15 @@ def test_columns_have_one_row_per_jump_and_none_for_error_of_jump_not_begun():
     assert all(len(values) == 4 for values in columns.values())
     assert columns["goal_x_m"] == [0.8, 0.7, 0.8, 0.7]
     assert columns["error_m"][3] is None and columns["end"][3] == "not_begun"
-    assert landings.series([1])["distance/goal of 1 [m]"] == pytest.approx(0.05)
+    assert landings.series([1])["distance/to goal, (0.80, 0.20) m [m]"] == pytest.approx(0.05)
+
+
+def test_worlds_with_the_same_goal_have_distinct_names_in_series_and_states():
+    landings, _ = two_in_a_row()
+    assert landings.labels([0, 1]) == ["(0.80, 0.20) m"] * 2
+    assert landings.names([0, 1]) == ["(0.80, 0.20) m (0)", "(0.80, 0.20) m (1)"]
+    assert len(landings.series([0, 1])) == 2 * len(landings.series([0]))
+    assert list(landings.states([0, 1])) == ["phase/(0.80, 0.20) m (0)", "phase/(0.80, 0.20) m (1)"]
 
 
 def test_landing_evaluation_excludes_shaping_terminations():

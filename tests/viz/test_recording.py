@@ -13,9 +13,12 @@ from jumper_warp.robot.model import build_model
 from jumper_warp.viz.recorder import Recorder
 from jumper_warp.viz.recording import Recording, RecordingError, load_npz
 from jumper_warp.viz.rerun import write_rrd
+from jumper_warp.viz.style import LEG_COLORS
 
 HEIGHT, TORQUE = "base/height [m]", "torque/FL_outer [N m]"  # series
 FRAMES = 5  # of `record`, 0.02 s apart
+REVERSED = ("BR", "BL", "FR", "FL")
+LEGS = [LEG_COLORS[leg] for leg in reversed(REVERSED)]
 
 
 @pytest.fixture(scope="module")
@@ -127,7 +130,7 @@ def test_rrd_has_each_bodys_pose_in_each_frame(model, tmp_path):
 def test_rrd_has_each_shape_once_below_its_body(model, tmp_path):
     entities = rows(record(model).save_rrd(tmp_path / "run.rrd"))
     drawn = {entity for entity, components in entities.items() if "Mesh3D:vertex_positions" in components}
-    scene = ("world_0/body/box", "world_0/arm/rod", "ground_light", "ground_dark")
+    scene = ("world_0/body/box", "world_0/arm/rod", "ground_light", "ground_dark", "view_target")
     assert drawn == {f"/scene/{shape}" for shape in scene}
     box = entities["/scene/world_0/body/box"]
     ((time, corners),) = box["Mesh3D:vertex_positions"]
@@ -150,7 +153,7 @@ def test_rrd_draws_and_moves_every_link_of_the_robot(tmp_path):
 
 def test_rrd_has_the_series_and_forces(model, tmp_path):
     entities = rows(record(model, worlds=(0, 1)).save_rrd(tmp_path / "run.rrd"))
-    torque = sorted(entities[r"/series/torque/FL_outer\ \[N\ m\]"]["Scalars:scalars"])
+    torque = sorted(entities[r"/series/torque/outer\ \[N\ m\]"]["Scalars:scalars"])
     assert [value for _, value in torque] == [[0.0], [-1.0], [-2.0], [-3.0], [-4.0]]
     assert r"/series/base/height\ \[m\]" in entities
     arrows = entities["/scene/world_1/contact_forces"]
@@ -160,18 +163,91 @@ def test_rrd_has_the_series_and_forces(model, tmp_path):
     assert np.array(vectors[2][1]) == pytest.approx(np.full((3, 3), 0.2))  # 200 N at 1 mm/N
 
 
+def blueprint(path):
+    """Return {component: [value, ...]} of all entities of a Rerun file's blueprint."""
+    reader, values = RrdReader(path), defaultdict(list)
+    for chunk in reader.stream(store=reader.blueprints()[0]).to_chunks():
+        batch = chunk.to_record_batch()
+        for name in (name for name in batch.schema.names if ":" in name):  # components, without times
+            values[name] += batch.column(name).to_pylist()
+    return values
+
+
 def test_rrd_of_a_loaded_recording_is_the_only_new_file_and_has_a_view_of_each_group(model, tmp_path):
     record(model).save_npz(tmp_path / "run.npz")
     path = write_rrd(load_npz(tmp_path / "run.npz"), tmp_path / "run.rrd")
     reader = RrdReader(path)
     assert len(reader.recordings()) == len(reader.blueprints()) == 1
-    views = [
-        chunk.to_record_batch().column("ViewBlueprint:display_name").to_pylist()[0][0]
-        for chunk in reader.stream(store=reader.blueprints()[0]).to_chunks()
-        if "ViewBlueprint:display_name" in chunk.to_record_batch().schema.names
-    ]
-    assert sorted(views) == ["base", "scene", "torque"]
+    views = [name for (name,) in blueprint(path)["ViewBlueprint:display_name"]]
+    assert sorted(views) == ["base", "scene", "torque outer [N m]"]
     assert sorted(item.name for item in tmp_path.iterdir()) == ["run.npz", "run.rrd"]
+
+
+def test_rrd_plays_from_the_start_and_its_eye_follows_the_worlds(model, tmp_path):
+    path = record(model, worlds=(0, 1), spacing=1.5).save_rrd(tmp_path / "run.rrd")
+    layout, target = blueprint(path), rows(path)["/scene/view_target"]
+    assert layout["TimePanelBlueprint:play_state"] == [[2]]  # playing; 3 would follow the end
+    assert layout["EyeControls3D:tracking_entity"] == [["/scene/view_target"]]
+    positions = [value[0] for _, value in sorted(target["Transform3D:translation"])]
+    # mean of the bodies at x = 0 and 2 m; heights of 0 to 0.4 m; the second world is drawn 1.5 m to the left
+    assert np.array(positions) == pytest.approx(np.tile([1.0, 0.75, 0.2], (FRAMES, 1)))
+    eye, center = np.array(layout["EyeControls3D:position"]), np.array(layout["EyeControls3D:look_target"])
+    assert center[0, 0] == pytest.approx(positions[0])
+    ends = np.array(target["Mesh3D:vertex_positions"][0][1])  # the viewer's distance is 1.5 times their radius
+    assert np.linalg.norm(eye - center) == pytest.approx(0.75 * np.linalg.norm(ends[1] - ends[0]), rel=1e-3)
+
+
+def test_rrd_shows_a_curve_of_each_leg_in_the_order_and_colors_of_legs(model, tmp_path):
+    recorder = Recorder(model)
+    for frame in range(2):
+        recorder.record(frame, frame_poses(frame), {f"torque/{leg}_inner [N m]": i for i, leg in enumerate(REVERSED)})
+    entities = rows(recorder.save_rrd(tmp_path / "run.rrd"))
+    inner = entities[r"/series/torque/inner\ \[N\ m\]"]
+    assert inner["SeriesLines:names"] == [(None, ["FL", "FR", "BL", "BR"])]
+    assert [value for _, value in inner["Scalars:scalars"]] == [[3.0, 2.0, 1.0, 0.0]] * 2
+    colors = [sum(round(255 * c) << shift for c, shift in zip(rgb, (24, 16, 8), strict=True)) + 255 for rgb in LEGS]
+    assert inner["SeriesLines:colors"] == [(None, colors)] and len(set(colors)) == 4
+
+
+@pytest.mark.parametrize(
+    ("labels", "names"), [(("0.60 m", "0.90 m"), (r"0.60\ m", r"0.90\ m")), (("0.60 m",) * 2, ("world_0", "world_1"))]
+)
+def test_rrd_names_worlds_by_their_distinct_labels(model, tmp_path, labels, names):
+    entities = rows(record(model, worlds=(0, 1), labels=labels).save_rrd(tmp_path / "run.rrd"))
+    for name in names:
+        assert "Transform3D:quaternion" in entities[f"/scene/{name}/body"]
+        assert "Mesh3D:vertex_positions" in entities[f"/scene/{name}/body/box"]
+
+
+def test_rrd_has_goals_trails_and_the_changes_of_states(model, tmp_path):
+    recorder = Recorder(model, spacing=1.5)
+    for frame in range(FRAMES):
+        points = np.zeros((1, 4, 3)) + np.arange(4)[:, None] + (0.01 * frame, 0.0, 0.0)
+        phase = {"phase/0.90 m": "stance" if frame < 3 else "flight"}
+        recorder.record(0.02 * frame, frame_poses(frame), {}, points, np.zeros_like(points), states=phase)
+    goals, heights = np.array([[[0.8, 0.2, 0.0]]]), np.array([0.9])
+    entities = rows(write_rrd(recorder.recording(goals=goals, heights=heights), tmp_path / "run.rrd"))
+    ring = np.array(entities["/scene/goal_0_0"]["Mesh3D:vertex_positions"][0][1])
+    assert ring.mean(axis=0)[:2] == pytest.approx([0.8, 0.2], abs=1e-4)
+    assert {"/scene/height_0_0", "/scene/height_0_1"} <= set(entities)
+    ((time, (base, *paws)),) = entities["/scene/world_0/trail"]["LineStrips3D:strips"]
+    assert time is None and len(paws) == 4
+    assert np.array(base) == pytest.approx(np.array([frame_poses(frame)[0, :3] for frame in range(FRAMES)]))
+    assert np.array(paws[2]) == pytest.approx(np.array([[2.0 + 0.01 * frame, 2.0, 2.0] for frame in range(FRAMES)]))
+    changes = sorted(entities[r"/states/phase/0.90\ m"]["StateChange:state"])
+    assert changes == [(pytest.approx(0.0), ["stance"]), (pytest.approx(0.06), ["flight"])]
+
+
+def test_rrd_has_commanded_and_actual_velocity_of_a_turned_base(model, tmp_path):
+    recorder = Recorder(model)
+    for frame in range(FRAMES):
+        poses = np.zeros((4, 7))
+        poses[0] = [0.1 * frame, -0.04 * frame, 0.3, 0.0, 0.0, np.sqrt(0.5), np.sqrt(0.5)]  # 90° to the left
+        recorder.record(0.1 * frame, poses, commands=np.array([[0.6, 0.2, 0.1]]))
+    entities = rows(recorder.save_rrd(tmp_path / "run.rrd"))
+    for name, velocity in (("commanded", [-0.2, 0.6, 0.0]), ("actual", [1.0, -0.4, 0.0])):  # [m/s]
+        arrows = [value for _, value in entities[f"/scene/world_0/{name}_velocity"]["Arrows3D:vectors"]]
+        assert np.array(arrows) == pytest.approx(np.tile(0.5 * np.array(velocity), (FRAMES, 1, 1)), abs=1e-5)
 
 
 def test_rrd_without_rerun_fails_in_one_line_and_leaves_no_file(model, tmp_path, monkeypatch):
