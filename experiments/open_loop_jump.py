@@ -94,8 +94,8 @@ def main(args: Args) -> dict:
     if args.torque_limit == 18.0 and args.gravity == EARTH and not args.loose and robot is None:
         values["hardware_apex_height_m"] = HARDWARE_APEX
     write_metrics(folder, values)
-    title = f"Open-loop jump, {SOLVER_TITLES[args.solver]}, {args.torque_limit:g} N m"
-    plot_trace(folder / "jump.png", trace, title, HARDWARE_APEX)
+    conditions = f"{SOLVER_TITLES[args.solver]}, {args.torque_limit:g} N m"
+    plot_trace(folder / "jump.png", trace, conditions, HARDWARE_APEX)
     recorder.save_rrd(folder / "jump.rrd")
     print_metrics({name: value for name, value in values.items() if not name.startswith(PER_MOTOR)})
     print(f"{time.perf_counter() - start:.1f} s; metrics, plot and recording (rerun {folder / 'jump.rrd'}) in {folder}")

@@ -179,9 +179,7 @@ def plot_distances(
             rate, low, high = rate_interval(good)
             top.plot(distances, 100.0 * rate, marker=marker, label=label)
             top.fill_between(distances, 100.0 * low, 100.0 * high, alpha=0.15)
-        top.axhline(
-            100.0 * reliable, color="0.5", linestyle="--", linewidth=1.0, label=f"reliable: {100.0 * reliable:g} %"
-        )
+        top.axhline(100.0 * reliable, color="0.5", linestyle="--", linewidth=1.0, label="reliable")
         for work, distance in published.items():
             if distance >= distances[0]:
                 top.axvline(distance, color="C4", linestyle="-.", label=f"{work}, {distance:g} m")
@@ -227,8 +225,8 @@ def plot_paths(path: Path, paths: dict[str, np.ndarray], goals: Mapping[str, Seq
     paths [m]: by test, of `BasePaths.in_start_frame`; goals [m]: by test, (jumps, 2), each relative to the one before.
     """
     limits = [path_limits(values) for values in paths.values()]
-    height = 6.5 * sum(np.ptp(y) / np.ptp(x) for x, y in limits)
-    settings = {"figsize": (8.0, height + len(paths) + 1.2), "title": "Jumps in a row", "conditions": conditions}
+    height = 6.2 * sum(np.ptp(y) / np.ptp(x) for x, y in limits)
+    settings = {"figsize": (8.0, height + 0.8 * len(paths) + 1.2), "title": "Jumps in a row", "conditions": conditions}
     with figure(path, len(paths), 1, squeeze=False, **settings) as axes:
         for axis, (name, test_paths), (xlim, ylim) in zip(axes[:, 0], paths.items(), limits, strict=True):
             axis.set(xlim=xlim, ylim=ylim, ylabel="left [m]", title=name, aspect="equal")
