@@ -56,7 +56,7 @@ def plot_turns(run: EvaluationRun, turns: AttitudeLog, conditions: str) -> None:
         axes[0].axhline(turns.tolerance, color="0.6", linewidth=0.8)
         axes[0].set(xlabel="time [s]", ylabel="angle to the goal [deg]")
         axes[1].axhline(2.6, color="0.4", linestyle=":", label="robot, 90 degrees")
-        axes[1].set_xticks(range(6), [name.replace("_", " ") for name in DIRECTIONS], rotation=30)
+        axes[1].set_xticks(range(6), [name.replace("_", " ") for name in DIRECTIONS], rotation=30, ha="right")
         axes[1].set(ylabel="time to settle [s]", ylim=(0.0, turns.seconds))
 
 

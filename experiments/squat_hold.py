@@ -49,10 +49,11 @@ def plot_squats(run: EvaluationRun, squats: SquatLog) -> None:
     robot = np.flatnonzero(~squats.ended)[squats.force_range.argmax()]
     settings = {"title": "Held squats", "conditions": f"{run.title}, {len(squats.ended)} robots"}
     with figure(run.folder / "hold.png", 1, 3, figsize=(14, 5), **settings) as axes:
-        axes[0].plot(time, np.array(squats.forces)[:, robot], linewidth=1.0, label=[*LEG_COLORS])
+        forces, torques = (np.array(values)[:, robot] for values in (squats.forces, squats.torques))
+        for i, (leg, color) in enumerate(LEG_COLORS.items()):
+            axes[0].plot(time, forces[:, i], linewidth=1.0, color=color, label=leg)
+            axes[1].plot(time, torques[:, 3 * i : 3 * i + 3], linewidth=1.0, color=color)
         axes[0].set(xlabel="time [s]", ylabel="force on each paw [N]", title="robot whose forces vary most")
-        for color, torques in zip(LEG_COLORS.values(), np.split(np.array(squats.torques)[:, robot], 4, 1), strict=True):
-            axes[1].plot(time, torques, linewidth=1.0, color=color)
         axes[1].set(xlabel="time [s]", ylabel="torque of each motor [N m]", title="the same robot")
         axes[2].hist(squats.force_range, bins=30)
         axes[2].locator_params(axis="x", nbins=5)

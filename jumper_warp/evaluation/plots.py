@@ -183,7 +183,7 @@ def plot_distances(
         for work, distance in published.items():
             if distance >= distances[0]:
                 top.axvline(distance, color="C4", linestyle="-.", label=f"{work}, {distance:g} m")
-        top.set(ylabel="success [%]", ylim=(0.0, 103.0))
+        top.set(ylabel="success [%], 95 % interval", ylim=(0.0, 103.0))
         for distance, error in zip(distances, errors, strict=True):
             bottom.plot(np.full(len(error), distance), error, ".", color="0.7", zorder=1, label="jump")
         means = [np.nan if np.isnan(error).all() else np.nanmean(error) for error in errors]
