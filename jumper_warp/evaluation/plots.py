@@ -59,7 +59,7 @@ class Published:
 
 def plot_sweep(
     path: Path, commanded: np.ndarray, reached: np.ndarray, good: np.ndarray, *, tolerance: float, paper: Published,
-    limit: np.ndarray | None = None, trained: Mapping[str, tuple[float, float]] | None = None,
+    limit: np.ndarray | None = None, trained: Mapping[str, Sequence[float]] | None = None,
     labels: tuple[str, str], marks: tuple[str, str], title: str, conditions: str,
 ) -> None:  # fmt: skip
     """Plot reached over commanded values, and below them the errors with their running mean.
