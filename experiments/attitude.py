@@ -25,7 +25,6 @@ from support.momentum import MomentumRecorder, rotational_inertia
 from support.scripts import run_script
 
 HARDWARE = {"mean_settling_s": 2.6}  # Settling time of the authors' robot, 90 degrees
-COLORS = ("tab:red", "tab:green", "tab:blue")  # Of turns about x, y, z
 
 
 @dataclass(frozen=True)
@@ -43,24 +42,22 @@ class Args(EvaluationArgs, AttitudeFlags):
         AttitudeFlags.__post_init__(self)
 
 
-def plot_turns(run: EvaluationRun, turns: AttitudeLog, title: str) -> None:
+def plot_turns(run: EvaluationRun, turns: AttitudeLog, conditions: str) -> None:
     """Plot errors over time and settling times of turns of `axis_turns` into `turns.png`, a color per axis."""
     errors = np.degrees(np.array(turns.errors))
     time = (np.arange(len(errors)) + 1) * turns.step_dt
-    with figure(run.folder / "turns.png", 1, 2, figsize=(11, 4.2)) as axes:
+    with figure(run.folder / "turns.png", 1, 2, figsize=(11, 5), title="Turns", conditions=conditions) as axes:
         for i, name in enumerate(DIRECTIONS):
-            style = {"color": COLORS[i // 2], "linestyle": "-" if i % 2 == 0 else "--"}
+            style = {"color": f"C{i // 2}", "linestyle": "-" if i % 2 == 0 else "--"}
             axes[0].plot(time, errors[:, i::6], alpha=0.15 if errors.shape[1] > 6 else 0.0, linewidth=0.6, **style)
             axes[0].plot(time, np.nanmean(errors[:, i::6], axis=1), label=name.replace("_", " "), **style)
             settled = turns.settling_time[i::6]
-            axes[1].scatter(np.full(len(settled), i), settled, s=12, color=COLORS[i // 2])
+            axes[1].scatter(np.full(len(settled), i), settled, color=f"C{i // 2}")
         axes[0].axhline(turns.tolerance, color="0.6", linewidth=0.8)
-        axes[0].set(xlabel="time [s]", ylabel="angle to the goal [deg]", title=title)
-        axes[0].legend(fontsize=8)
-        axes[1].axhline(2.6, color="0.6", linestyle="--", label="hardware, 90 degrees")
-        axes[1].set_xticks(range(6), [name.replace("_", " ") for name in DIRECTIONS], rotation=30, fontsize=8)
+        axes[0].set(xlabel="time [s]", ylabel="angle to the goal [deg]")
+        axes[1].axhline(2.6, color="0.4", linestyle=":", label="robot, 90 degrees")
+        axes[1].set_xticks(range(6), [name.replace("_", " ") for name in DIRECTIONS], rotation=30, ha="right")
         axes[1].set(ylabel="time to settle [s]", ylim=(0.0, turns.seconds))
-        axes[1].legend(fontsize=8)
 
 
 def main(args: Args) -> dict:
@@ -72,7 +69,7 @@ def main(args: Args) -> dict:
     inertia = rotational_inertia(env.sim)
     run.run_episodes(env, turns, film="turn", on_step=momentum)
     values = args.metrics(turns) | momentum.metrics(turns.diverged, inertia)
-    plot_turns(run, turns, f"{args.num_turns} turns by {args.angle:g} degrees, {run.title}")
+    plot_turns(run, turns, f"{run.title}, {args.num_turns} turns by {args.angle:g} degrees")
     others = AttitudeLog(random_turns(args.num_turns, args.angle, args.seed), args.tolerance, args.seconds)
     run.run_episodes(env, others)
     values |= {f"any_axis_{name}": value for name, value in turn_metrics(others).items()}

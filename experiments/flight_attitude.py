@@ -59,7 +59,7 @@ def main(args: Args) -> dict:
     flights = {
         name: run.fly(env, FlightLog(heights, late, turns=name == "turning"), name) for name in ("turning", "without")
     }
-    plot_flights(run.folder / "flights.png", flights)
+    plot_flights(run.folder / "flights.png", flights, run.title)
     settings = {"takeoff": args.takeoff, "landing": args.landing_policy or "default pose"}
     values = settings | ({} if late is None else {"late_ms": args.max_leg_delay}) | flight_metrics(flights["turning"])
     values |= {f"without_turning_{name}": value for name, value in flight_metrics(flights["without"]).items()}

@@ -50,29 +50,25 @@ def plot_gradients(jump: Trajectory, actions: GradientPair, ascent: Ascent, path
 
     jump: in one world; actions: (gradient, differences) [m/rad], FL outer then FL inner, TICKS values each.
     """
-    with figure(path, 4, 1, figsize=(8, 11)) as axes:
+    with figure(path, 4, 1, figsize=(8, 12), title="Gradient of a jump's apex with respect to its targets") as axes:
         ticks = np.arange(TICKS) / 60.0
         gradient, differenced = (values.reshape(2, TICKS) for values in actions)
         for i, name in enumerate(("outer", "inner")):
-            (line,) = axes[0].plot(ticks, 100.0 * gradient[i], label=f"FL {name}, gradient")
-            axes[0].plot(
-                ticks, 100.0 * differenced[i], "o", mfc="none", color=line.get_color(), label="central difference"
-            )
+            (line,) = axes[0].plot(ticks, 100.0 * gradient[i], label=f"FL {name}: gradient")
+            style = {"mfc": "none", "color": line.get_color(), "label": f"FL {name}: central difference"}
+            axes[0].plot(ticks, 100.0 * differenced[i], "o", **style)
         height = jump.q.numpy()[:, 2, 0]
         pushed = np.flatnonzero(jump.impulse.numpy()[: height.argmax(), :, 0].any(axis=(1, 2)))
         axes[1].plot(np.arange(len(height)) / 480.0, height)  # physics steps of 1/480 s
-        axes[1].axvline((pushed[-1] + 1) / 480.0, color="0.6", linestyle="--", label="takeoff")
+        axes[1].axvline((pushed[-1] + 1) / 480.0, color="0.4", linestyle=":", label="takeoff")
         axes[2].plot(range(ASCENT_STEPS + 1), ascent.apex, "o-")
         for motor, name in ((OUTER, "outer"), (INNER, "inner")):
-            (line,) = axes[3].plot(ticks, np.degrees(ascent.before[:, motor]), "--", label=f"FL {name}, before")
-            axes[3].plot(ticks, np.degrees(ascent.after[:, motor]), color=line.get_color(), label="after")
+            (line,) = axes[3].plot(ticks, np.degrees(ascent.before[:, motor]), "--", label=f"FL {name}: at first")
+            axes[3].plot(ticks, np.degrees(ascent.after[:, motor]), color=line.get_color(), label=f"FL {name}: at last")
         x_labels = ("time of the target [s]", "time [s]", "step of the ascent", "time [s]")
-        y_labels = ("d apex / d target [cm/rad]", "base height [m]", "apex [m]", "target [deg]")
+        y_labels = ("gradient [cm/rad]", "base height [m]", "apex [m]", "target [deg]")
         for axis, x_label, y_label in zip(axes, x_labels, y_labels, strict=True):
             axis.set(xlabel=x_label, ylabel=y_label)
-            axis.grid(alpha=0.3)
-        for axis in (axes[0], axes[1], axes[3]):
-            axis.legend(fontsize=8, ncols=2)
 
 
 def main(args: DeviceArgs) -> dict:

@@ -64,10 +64,10 @@ def main(args: Args) -> dict:
     values: dict[str, Any] = {"gravity_m_s2": args.gravity, "torque_limit_nm": args.torque_limit, "kp_nm_rad": args.kp,
                               "spring_length_m": args.rest_length, "stiffness_n_m": list(args.stiffness)}  # fmt: skip
     planet = {EARTH: "Earth", MARS: "Mars"}.get(args.gravity, f"{args.gravity:g} m/s^2")
-    title = f"open-loop apex in m, {planet}, {args.torque_limit:g} N m, springs {args.rest_length:g} m"
+    title = f"Open-loop apex in m, {planet}, {args.torque_limit:g} N m, springs {args.rest_length:g} m"
     table = Table("stiffness [N/m]", title=title)
     rows = [[f"{stiffness:g}"] for stiffness in args.stiffness]
-    with figure(folder / "springs.png", figsize=(7, 4.5)) as axis:
+    with figure(folder / "springs.png", figsize=(7, 5), title=title) as axis:
         for name in FILTERS if args.filter == "both" else (args.filter,):
             jumps = args.jumps(name)
             apexes = jumps.apexes(args.stiffness, args.squat_angles)
@@ -81,8 +81,7 @@ def main(args: Args) -> dict:
             table.add_column(f"{name} filter")
             for row, apex in zip(rows, best, strict=True):
                 row.append(f"{apex:.3f}")
-        axis.set(xlabel="stiffness between the knees [N/m]", ylabel="highest base height [m]", title=table.title)
-        axis.legend()
+        axis.set(xlabel="stiffness between the knees [N/m]", ylabel="highest base height [m]")
     for row in rows:
         table.add_row(*row)
     write_metrics(folder, values)

@@ -78,10 +78,12 @@ def main(args: Args) -> dict:
     if args.torque_limit == 18.0 and args.gravity == EARTH and not args.loose and robot is None:
         values["hardware_apex_height_m"] = HARDWARE_APEX
     write_metrics(folder, values)
-    title = f"Open-loop jump, {SOLVER_TITLES[args.solver]}, {args.torque_limit:g} N m"
-    plot_trace(folder / "trace.png", trace, title, HARDWARE_APEX)
+    words = [SOLVER_TITLES[args.solver], f"{args.torque_limit:g} N m", f"kp {args.kp:g} N m/rad"]
+    words += [f"gravity {args.gravity:g} m/s²"] + ["loose command filter"] * args.loose
+    words += [] if args.spring is None else ["springs of {:g} N/m, {:g} m".format(*args.spring)]
+    plot_trace(folder / "trace.png", trace, ", ".join(words), HARDWARE_APEX)
     recorder.save_rrd(folder / "jump.rrd")
-    recorder.save_picture(folder / "jump.png", title=title)
+    recorder.save_picture(folder / "jump.png", title="Open-loop jump, " + ", ".join(words))
     print_metrics({name: value for name, value in values.items() if not name.startswith(PER_MOTOR)})
     print(f"{time.perf_counter() - start:.1f} s; metrics, plot and recording (rerun {folder / 'jump.rrd'}) in {folder}")
     return values

@@ -17,6 +17,7 @@ import numpy as np
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.utils.errors import InputError
+from jumper_warp.viz.style import LEG_COLORS
 from support.scripts import run_script
 from support.squats import SquatLog, squat_goals, squat_metrics
 
@@ -46,13 +47,17 @@ def plot_squats(run: EvaluationRun, squats: SquatLog) -> None:
     """Plot forces and torques of the robot with the largest force range, and all ranges, into `hold.png`."""
     time = (np.arange(len(squats.forces)) + 1) * squats.step_dt
     robot = np.flatnonzero(~squats.ended)[squats.force_range.argmax()]
-    with figure(run.folder / "hold.png", 1, 3, figsize=(14, 4)) as axes:
-        axes[0].plot(time, np.array(squats.forces)[:, robot], linewidth=0.8)
-        axes[0].set(xlabel="time [s]", ylabel="force on each paw [N]", title="the robot whose forces vary most")
-        axes[1].plot(time, np.array(squats.torques)[:, robot], linewidth=0.8)
-        axes[1].set(xlabel="time [s]", ylabel="torque of each motor [N m]")
+    settings = {"title": "Held squats", "conditions": f"{run.title}, {len(squats.ended)} robots"}
+    with figure(run.folder / "hold.png", 1, 3, figsize=(14, 5), **settings) as axes:
+        forces, torques = (np.array(values)[:, robot] for values in (squats.forces, squats.torques))
+        for i, (leg, color) in enumerate(LEG_COLORS.items()):
+            axes[0].plot(time, forces[:, i], linewidth=1.0, color=color, label=leg)
+            axes[1].plot(time, torques[:, 3 * i : 3 * i + 3], linewidth=1.0, color=color)
+        axes[0].set(xlabel="time [s]", ylabel="force on each paw [N]", title="robot whose forces vary most")
+        axes[1].set(xlabel="time [s]", ylabel="torque of each motor [N m]", title="the same robot")
         axes[2].hist(squats.force_range, bins=30)
-        axes[2].set(xlabel="range of a paw's force in the last second [N]", ylabel="robots", title=run.title)
+        axes[2].locator_params(axis="x", nbins=5)
+        axes[2].set(xlabel="range of a paw's force in the last second [N]", ylabel="robots", title="all robots")
 
 
 def main(args: Args) -> dict:

@@ -96,8 +96,7 @@ def main(args: Args) -> dict:
     run = SkillRun.from_args(name, args, SkillNames(args.policy, args.jump_up, args.jump_to))
     course = CourseLog(scripts(args), random_headings(args.num_robots, args.seed))
     run.run_episodes(run.env(args.num_robots, block=course.block), course, film=name)
-    title = f"walk, jump, walk: robot 0 of {course.count}, {run.title}"
-    plot_course(run.folder / "timeline.png", course, 0, title)
+    plot_course(run.folder / "timeline.png", course, 0, f"{run.title}, robot 0 of {course.count}")
     return run.report(course_metrics(course), {} if args.course else PAPER)
 
 

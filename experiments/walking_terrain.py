@@ -59,9 +59,10 @@ def main(args: Args) -> dict:
         fractions[kind] = walked_fraction(walks)
         metrics[f"success_rate_{kind}"] = float(fractions[kind].mean())
         metrics[f"fall_rate_{kind}"] = float(walks.fallen.mean())
-    with figure(run.folder / "terrain.png", figsize=(7, 4)) as axis:
+    settings = {"title": f"Walks at {args.speed:g} m/s", "conditions": f"{run.title}, {args.num_robots} robots each"}
+    with figure(run.folder / "terrain.png", figsize=(7, 4), **settings) as axis:
         axis.boxplot([fractions[kind] for kind in args.terrains], tick_labels=list(args.terrains), whis=(5, 95))
-        axis.set(ylabel="share of the way", title=f"{args.num_robots} robots each, {run.title}", ylim=(0.0, 1.05))
+        axis.set(ylabel="share of the way [1]", ylim=(0.0, 1.05))
     return run.report({"robots": args.num_robots, "speed_m_s": args.speed} | metrics, {})
 
 

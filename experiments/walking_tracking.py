@@ -21,6 +21,7 @@ from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import AXES, VelocityLog, check_velocity_settings, command_grid, tracking_metrics
 from jumper_warp.utils.errors import InputError
+from jumper_warp.viz.style import ACTUAL_COLOR
 from support.gaits import GaitRecorder
 from support.scripts import run_script
 from support.walks import (
@@ -60,20 +61,21 @@ def plot_tracking(run: EvaluationRun, walks: VelocityLog, settling: np.ndarray) 
     walks: of the grid; settling [s]: (robots,), infinite if a robot did not settle.
     """
     history = walks.velocity_history()[round(1.0 / walks.step_dt) :]
-    with figure(run.folder / "tracking.png", 2, 2, figsize=(9, 8)) as axes:
+    conditions = f"{run.title}, {len(walks.end)} robots"
+    with figure(run.folder / "tracking.png", 2, 2, figsize=(9, 9), title="Walking", conditions=conditions) as axes:
         for i, (axis, name) in enumerate(zip(axes.flat, AXES, strict=False)):
             commanded = walks.commands[:, 0, i]
-            axis.plot([-REACH, REACH], [-REACH, REACH], color="tab:green", linewidth=1.0, label="commanded")
+            axis.plot([-REACH, REACH], [-REACH, REACH], color=ACTUAL_COLOR, linestyle="--", label="commanded")
             standing = ~walks.fallen
             mean = history[:, standing, i].mean(axis=0)
-            axis.scatter(commanded[standing], mean, s=5, color="tab:blue", label="walked")
-            unit = "rad/s" if i == 2 else "m/s"
-            axis.set(xlabel=f"commanded {name} [{unit}]", ylabel=f"mean [{unit}]")
-        axes[0, 0].set_title(f"{len(walks.end)} robots, {run.title}")
-        axes[0, 0].legend()
+            axis.plot(commanded[standing], mean, ".", color=ACTUAL_COLOR, label="mean of a walk")
+            label = f"{name.replace('_', ' ')} [{'rad/s' if i == 2 else 'm/s'}]"
+            axis.set(xlabel=f"commanded {label}", ylabel=f"mean {label}", aspect="equal")
         times = np.sort(settling)
         axes[1, 1].step(times, np.arange(1, len(times) + 1) / len(times), where="post")
-        axes[1, 1].set(xlabel=f"time to settle after a step of {STEP} m/s [s]", ylabel="share", xlim=(0.0, 4.0))
+        axes[1, 1].set(
+            xlabel=f"time to settle after a step of {STEP} m/s [s]", ylabel="share of robots", xlim=(0.0, 4.0)
+        )
 
 
 def main(args: Args) -> dict:

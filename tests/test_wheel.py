@@ -73,6 +73,7 @@ def test_wheel_holds_one_package_and_all_assets(wheel):
         kinds = "*" if folder == "assets" else "*.py"
         files = {f"{inside}{path.relative_to(ROOT)}" for path in (ROOT / folder).rglob(kinds) if path.is_file()}
         assert files and files <= names, sorted(files - names)[:5]
+    assert "jumper_warp/viz/jumper.mplstyle" in names
     others = {name.split("/")[0] for name in names} - {"jumper_warp"}
     assert len(others) == 1 and others.pop().endswith(".dist-info")
     assert wheel.stat().st_size < 16e6  # bytes

@@ -132,15 +132,14 @@ def cell(tests: dict[str, dict[str, Any]], name: str, scale: float) -> str:
 def plot_results(results: MetricsByTraining, path: Path) -> None:
     """Plot success and error of every training; grey lines mark the trainings with all departures."""
     rows = [*results]
-    with figure(path, 1, 2, figsize=(11, 1.0 + 0.25 * len(rows)), sharey=True) as axes:
+    with figure(path, 1, 2, figsize=(11, 2.0 + 0.3 * len(rows)), sharey=True, title="Ablations") as axes:
         for axis, name, scale in zip(axes, ("success_rate", "error_m"), (100.0, 1000.0), strict=True):
             for test, marker in zip(TESTS, "ox", strict=True):
                 x = [np.nan if (v := results[row][test][name]) is None else scale * v for row in rows]
                 axis.plot(x, range(len(rows)), marker, label=test)
                 for value in (x[i] for i, (row, _) in enumerate(rows) if row == BASELINE):
-                    axis.axvline(value, color="0.8", linewidth=0.8, zorder=0)
+                    axis.axvline(value, color="0.5", linewidth=0.8, zorder=0, label="all departures")
         axes[0].set(xlabel="success [%]", yticks=range(len(rows)))
         axes[0].set_yticklabels([f"{name.replace('_', ' ')}, {seed}" for name, seed in rows])
         axes[0].invert_yaxis()
         axes[1].set(xlabel="mean error [mm]")
-        axes[1].legend()

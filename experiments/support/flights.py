@@ -227,13 +227,14 @@ def extension_delays(count: int, most: float, seed: int) -> np.ndarray:
     return np.stack([size * np.cos(angle), size * np.sin(angle)], axis=1)
 
 
-def plot_flights(path: Path, logs: Mapping[str, FlightLog]) -> None:
+def plot_flights(path: Path, logs: Mapping[str, FlightLog], conditions: str) -> None:
     """Plot tilt and base height of all flights over time; logs: one column each, by title."""
-    with figure(path, 2, len(logs), figsize=(11, 6), sharex=True, sharey="row") as axes:
+    settings = {"figsize": (11, 7), "sharex": True, "sharey": "row", "title": "Flights", "conditions": conditions}
+    with figure(path, 2, len(logs), **settings) as axes:
         for column, (name, flights) in zip(axes.T, logs.items(), strict=True):
             time = np.arange(len(flights.tilts)) * flights.step_dt
-            column[0].plot(time, np.degrees(np.array(flights.tilts)), linewidth=0.6, alpha=0.5, color="tab:red")
-            column[1].plot(time, np.array(flights.heights), linewidth=0.6, alpha=0.5, color="tab:blue")
+            column[0].plot(time, np.degrees(np.array(flights.tilts)), linewidth=0.8, alpha=0.5, color="C1")
+            column[1].plot(time, np.array(flights.heights), linewidth=0.8, alpha=0.5, color="C0")
             column[0].set(ylabel="tilt [deg]", title=f"{name}: {flights.success.mean():.0%} landed upright")
             column[1].set(xlabel="time [s]", ylabel="base height [m]")
 

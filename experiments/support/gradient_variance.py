@@ -128,7 +128,7 @@ def print_variances(stats: StatsByPolicy, horizons: tuple[int, ...]) -> None:
 
 def plot_variances(stats: StatsByPolicy, horizons: tuple[int, ...], path: Path) -> None:
     """Plot standard deviation and number of worlds over the horizon, a color per policy, a line style per estimator."""
-    with figure(path, 1, 2, figsize=(11, 4.5)) as axes:
+    with figure(path, 1, 2, figsize=(11, 5), title="Noise of policy gradients") as axes:
         for i, (policy, by_estimator) in enumerate(stats.items()):
             for name, of_horizons in by_estimator.items():
                 style = {"color": f"C{i}", "linestyle": "-" if name == "physics" else "--", "marker": "o"}
@@ -138,5 +138,5 @@ def plot_variances(stats: StatsByPolicy, horizons: tuple[int, ...], path: Path) 
         axes[1].set(ylabel="worlds until noise is as long as the signal")
         for axis in axes:
             axis.set(xscale="log", yscale="log", xlabel="policy steps of the window")
-            axis.grid(alpha=0.3)
-        axes[0].legend()
+            axis.set_xticks(horizons, map(str, horizons))
+            axis.set_xticks([], minor=True)

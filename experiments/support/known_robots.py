@@ -150,12 +150,10 @@ def plot_cases(rows: list[dict[str, float]], path: Path) -> None:
         ("fraction within 95 % interval", {"": "coverage"}, {"ylim": (0.0, 1.0)}),
         ("held-out angle error [deg]", {"described": "held_out_nominal_deg", "identified": "held_out_deg"},
          {"yscale": "log"}),
-        ("time [s]", {"wall": "wall_s", "CPU": "cpu_s"}, {"ylim": (0.0, None)}),
+        ("time [s]", {"wall time": "wall_s", "CPU time": "cpu_s"}, {"ylim": (0.0, None)}),
     )  # fmt: skip
-    with figure(path, 1, len(panels), figsize=(14, 3.2)) as axes:
+    with figure(path, 1, len(panels), figsize=(15, 4.5), title="Identified robots") as axes:
         for axis, (title, series, settings) in zip(axes, panels, strict=True):
             for label, name in series.items():
                 axis.plot([row[name] for row in rows], "o", label=label)
             axis.set(xlabel="seed", ylabel=title, **settings)
-            if len(series) > 1:
-                axis.legend()

@@ -120,11 +120,10 @@ def curve_metrics(curve: LearningCurve, name: str) -> dict[str, Any]:
 
 def plot_curves(curves: Mapping[str, Sequence[LearningCurve]], path: Path) -> None:
     """Plot success over training time and over steps into a file; curves: by name of the trainer, a color each."""
-    with figure(path, 1, 2, figsize=(11, 4.5), sharey=True) as axes:
+    with figure(path, 1, 2, figsize=(11, 5), sharey=True, title="Success over training") as axes:
         for i, (name, runs) in enumerate(curves.items()):
             for number, curve in enumerate(runs):
                 for axis, x in zip(axes, (curve.seconds, np.array(curve.steps) / 1e6), strict=True):
                     axis.plot(x, curve.success, color=f"C{i}", label=None if number else name)
         axes[0].set(xlabel="training time [s]", ylabel="success [1]")
         axes[1].set(xlabel="steps [million]")
-        axes[0].legend()

@@ -21,6 +21,8 @@ from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.sim.simulation import Simulation, motor_values
 from jumper_warp.trajectory.problem import Problem, SimulatedMotion
+from jumper_warp.viz.style import LEG_COLORS
+from support.open_loop import plot_motors
 
 CONTACT_FORCE = 0.1  # [N] Force above which a paw is in contact
 TAKEOFF_SPEED = 0.25  # [m/s] Smallest upward speed of the base at takeoff
@@ -149,21 +151,15 @@ class MotionReplay:
 
 def plot_replays(replays: dict[str, MotionReplay], path: Path) -> None:
     """Plot height, angles and torques of two legs, and paw forces over time into a file; replays: a column by label."""
-    with figure(path, 4, len(replays), figsize=(4.2 * len(replays), 10), sharex="col", squeeze=False) as axes:
+    with figure(path, 4, len(replays), figsize=(5.0 * len(replays), 11), sharex="col", squeeze=False) as axes:
         for column, (label, replay) in zip(axes.T, replays.items(), strict=True):
             column[0].plot(replay.time, replay.height)
-            column[0].axvline(replay.takeoff / 60.0, color="0.7", linestyle="--")
-            for i, motor in ((1, "FL outer"), (2, "FL inner"), (7, "BL outer"), (8, "BL inner")):
-                column[1].plot(replay.time, np.degrees(replay.angle[:, i]), label=motor)
-                column[2].plot(replay.time, replay.torque[:, i], label=motor)
-            column[3].plot(replay.time, replay.force[:, 0], label="FL")
-            column[3].plot(replay.time, replay.force[:, 2], label="BL")
+            column[0].axvline(replay.takeoff / 60.0, color="0.4", linestyle=":", label="takeoff")
+            plot_motors(column[1:3], replay.time, replay.angle, replay.torque)
+            for i, leg in ((0, "FL"), (2, "BL")):
+                column[3].plot(replay.time, replay.force[:, i], color=LEG_COLORS[leg], label=f"{leg} paw")
             column[0].set_title(label)
             column[3].set_xlabel("time [s]")
-            for axis in column:
-                axis.grid(alpha=0.3)
         labels = ("base height [m]", "motor angle [deg]", "motor torque [N m]", "paw force [N]")
         for axis, label in zip(axes[:, 0], labels, strict=True):
             axis.set_ylabel(label)
-        axes[1, 0].legend(fontsize=8)
-        axes[3, 0].legend(fontsize=8)

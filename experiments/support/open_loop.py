@@ -14,6 +14,7 @@ from jumper_warp.evaluation.limits import EXTEND, HOLD, RAMP
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
 from jumper_warp.sim.simulation import Simulation, motor_values
+from jumper_warp.viz.style import LEG_COLORS
 
 if TYPE_CHECKING:
     from jumper_warp.viz.recorder import Recorder
@@ -111,23 +112,29 @@ def trace_metrics(trace: Trace) -> dict[str, float]:
     return {name: float(value) for name, value in values.items()}
 
 
-def plot_trace(path: Path, trace: Trace, title: str, hardware: float) -> None:
+def plot_trace(path: Path, trace: Trace, conditions: str, hardware: float) -> None:
     """Plot height, vertical speed, angles, torques and paw forces over time; hardware [m]: apex of the real robot."""
-    with figure(path, 5, 1, figsize=(9, 12), sharex=True) as axes:
+    with figure(path, 5, 1, figsize=(9, 12), sharex=True, title="Open-loop jump", conditions=conditions) as axes:
         axes[0].plot(trace.time, trace.height)
-        axes[0].axhline(hardware, color="0.6", linestyle="--", label="hardware, 18 N m")
+        axes[0].axhline(hardware, color="0.4", linestyle=":", label="paper, robot: 18 N m")
         axes[1].plot(trace.time, trace.speed)
-        for i, name in enumerate(MOTOR_JOINTS):
-            if name.endswith(("outer", "inner")) and name.startswith(("FL", "BL")):
-                axes[2].plot(trace.time, np.degrees(trace.angle[:, i]), label=name)
-                axes[3].plot(trace.time, trace.torque[:, i], label=name)
+        plot_motors(axes[2:4], trace.time, trace.angle, trace.torque)
         for i, leg in enumerate(LEGS):
-            axes[4].plot(trace.time, trace.force[:, i, 2], label=leg)
+            axes[4].plot(trace.time, trace.force[:, i, 2], color=LEG_COLORS[leg], label=f"{leg} paw")
         labels = ("base height [m]", "vertical speed [m/s]", "motor angle [deg]", "motor torque [N m]", "paw force [N]")
         for axis, label in zip(axes, labels, strict=True):
             axis.set_ylabel(label)
-            axis.grid(alpha=0.3)
-            if axis is not axes[1]:
-                axis.legend(ncols=4, fontsize=8, loc="upper left")
         axes[-1].set_xlabel("time [s]")
-        axes[0].set_title(title)
+
+
+def plot_motors(axes: np.ndarray, time: np.ndarray, angle: np.ndarray, torque: np.ndarray) -> None:
+    """Plot the transversal motors of two left legs over time [s], (n,), onto two axes.
+
+    angle [rad], torque [N m]: of all motors, (n, 12).
+    """
+    for i, name in enumerate(MOTOR_JOINTS):
+        leg, motor = name.split("_")
+        if leg in ("FL", "BL") and motor != "lateral":
+            style = {"color": LEG_COLORS[leg], "linestyle": "-" if motor == "outer" else "--"}
+            axes[0].plot(time, np.degrees(angle[:, i]), **style, label=f"{leg} {motor} motor")
+            axes[1].plot(time, torque[:, i], **style)

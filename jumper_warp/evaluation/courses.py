@@ -23,6 +23,7 @@ from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.tasks.switching import FALLS
 from jumper_warp.utils.errors import InputError
+from jumper_warp.viz.style import ACTUAL_COLOR
 
 SKILLS = {
     "walk": WALK,
@@ -42,7 +43,7 @@ STUCK, DONE = len(FALLS), len(FALLS) + 1  # Indices in OUTCOMES; smaller ones ar
 OUTCOMES = (*(term.name for term in FALLS), "stuck", "done")
 GOAL_TOLERANCE = 0.1  # [m] Largest error of a jump that is on its goal
 FORCE_WINDOW = 0.2  # [s] Time before a handover to a jump over which paw forces are evaluated
-COLOURS = {WALK: "white", JUMP_UP: "tab:orange", JUMP_TO: "tab:purple"}  # Background of plots, by skill
+COLOURS = {JUMP_UP: "C4", JUMP_TO: "C3"}  # Shades of plots, by skill
 NAMES = {WALK: "walk", JUMP_UP: "jump up", JUMP_TO: "jump to"}
 
 
@@ -360,22 +361,18 @@ def active_spans(course: CourseLog, world: int) -> list[tuple[int, float, float]
     return [(int(skills[a]), a * course.step_dt, b * course.step_dt) for a, b in pairwise(edges)]
 
 
-def plot_course(path: Path, course: CourseLog, world: int, title: str = "") -> None:
-    """Plot velocities with commands, base height and active skill of one robot (its world's index) over time."""
-    with figure(path, 5, 1, figsize=(10, 9), sharex=True) as axes:
+def plot_course(path: Path, course: CourseLog, world: int, conditions: str = "") -> None:
+    """Plot velocities with commands, and base height, of one robot (its world's index) over time; jumps are shaded."""
+    settings = {"figsize": (10.0, 9.0), "sharex": True, "title": "Walk and jump", "conditions": conditions}
+    with figure(path, 4, 1, **settings) as axes:
         time = course.step_dt * np.arange(1, len(course.skills) + 1)
         velocity, command = (np.array(values)[:, world] for values in (course.velocity, course.commands))
-        labels = ("vx [m/s]", "vy [m/s]", "yaw rate [rad/s]")
-        for i, label in enumerate(labels):
-            axes[i].plot(time, velocity[:, i], color="tab:blue", linewidth=0.9, label="actual")
-            axes[i].plot(time, command[:, i], color="tab:red", linewidth=1.2, label="commanded")
+        for i, label in enumerate(("ahead [m/s]", "to the left [m/s]", "yaw rate [rad/s]")):
+            axes[i].plot(time, velocity[:, i], color=ACTUAL_COLOR, linewidth=0.9, label="actual")
+            axes[i].plot(time, command[:, i], color=ACTUAL_COLOR, linestyle="--", label="commanded")
             axes[i].set(ylabel=label, ylim=(-1.6, 1.6))
-        axes[0].legend(loc="upper right", ncols=2)
-        axes[3].plot(time, np.array(course.height)[:, world], color="tab:blue", linewidth=0.9)
-        axes[3].set(ylabel="height [m]")
-        axes[4].step(time, np.array(course.skills)[:, world], where="pre", color="black", linewidth=1.0)
-        axes[4].set(xlabel="time [s]", ylabel="skill", yticks=list(NAMES), yticklabels=list(NAMES.values()))
+        axes[3].plot(time, np.array(course.height)[:, world], color=ACTUAL_COLOR)
+        axes[3].set(xlabel="time [s]", ylabel="base height [m]")
         for skill, begin, end in active_spans(course, world):
-            for axis in axes:
-                axis.axvspan(begin, end, color=COLOURS[skill], alpha=0.15, linewidth=0.0)
-        axes[0].set_title(title)
+            for axis in axes if skill in COLOURS else ():
+                axis.axvspan(begin, end, color=COLOURS[skill], alpha=0.2, label=NAMES[skill])

@@ -1,9 +1,11 @@
-"""Plots that several experiments and suites share."""
+"""Plots that several experiments and suites share; they take plain arrays, and have the style `STYLE`."""
 
 from __future__ import annotations
 
+import textwrap
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,53 +13,189 @@ import matplotlib
 import numpy as np
 
 from jumper_warp.evaluation.jumps import JumpLog
-from jumper_warp.evaluation.landings import LandingLog
+from jumper_warp.viz.style import ACTUAL_COLOR, GOAL_COLOR
 
 matplotlib.use("Agg")
 import matplotlib.pyplot as plt
+from matplotlib.collections import PolyCollection
+
+STYLE = "jumper_warp.viz.jumper"  # Style sheet jumper_warp/viz/jumper.mplstyle
+FAILED = {"color": "black", "marker": "x", "linewidth": 1.0}  # Marks of failed trials
+BAND = {"color": "C2", "alpha": 0.15}  # Area of success
+WINDOW, MOST_WINDOWS, RESAMPLES = (5, 40), 100, 1000
+"""Least and largest number of jumps in a window of the running mean; number of windows; bootstrap samples of each."""
 
 
 @contextmanager
-def figure(path: Path, *shape: int, **settings: Any) -> Iterator[Any]:
-    """Yield the axes of a new figure, and write it to `path` on exit; shape, settings: arguments of `plt.subplots`."""
-    fig, axes = plt.subplots(*shape, constrained_layout=True, **settings)
-    yield axes
-    fig.savefig(path, dpi=110)
-    plt.close(fig)
+def figure(path: Path, *shape: int, title: str = "", conditions: str = "", **settings: Any) -> Iterator[Any]:
+    """Yield the axes of a new figure; on exit, add a legend below it and write it to `path`.
+
+    The legend has the labels of all axes without a legend of their own. title, conditions: lines above the axes; shape,
+    settings: arguments of `plt.subplots`.
+    """
+    with plt.style.context(STYLE):
+        fig, axes = plt.subplots(*shape, layout="compressed", **settings)
+        lines = [title, *textwrap.wrap(conditions, int(10.5 * fig.get_figwidth()))]
+        fig.suptitle("\n".join(filter(None, lines)), x=0.01, horizontalalignment="left")
+        yield axes
+        shown = [axis.get_legend_handles_labels() for axis in fig.axes if axis.get_legend() is None]
+        entries = {label: handle for handles, labels in shown for handle, label in zip(handles, labels, strict=True)}
+        if entries:
+            columns = int(fig.get_figwidth() / (0.55 + 0.076 * max(map(len, entries))))
+            fig.legend(entries.values(), entries.keys(), loc="outside lower left", ncols=max(columns, 1))
+        fig.savefig(path)
+        plt.close(fig)
+
+
+@dataclass(frozen=True)
+class Published:
+    """Results that the paper prints for a sweep."""
+
+    mean_error: float  # [m] Mean error in simulation
+    robot: tuple[tuple[float, float, float], ...]
+    """[m] Jumps of the robot: command, signed error, and size of an error whose sign is not printed."""
+    open_loop: float | None = None  # [m] Apex of the robot's open-loop jump
 
 
 def plot_sweep(
-    axis: Any, commanded: np.ndarray, reached: np.ndarray, good: np.ndarray, tolerance: float, names: tuple[str, str]
-) -> None:
-    """Plot reached over commanded values [m] with the band of success onto a matplotlib axis.
+    path: Path, commanded: np.ndarray, reached: np.ndarray, good: np.ndarray, *, tolerance: float, paper: Published,
+    limit: np.ndarray | None = None, trained: Mapping[str, Sequence[float]] | None = None,
+    labels: tuple[str, str], marks: tuple[str, str], title: str, conditions: str,
+) -> None:  # fmt: skip
+    """Plot reached over commanded values, and below them the errors with their running mean.
 
-    commanded, reached [m], good (bool, success): (jumps, 1) each; tolerance [m]: half width of the band; names: legend
-    of the good and of the other jumps.
+    commanded, reached [m], good (bool, success): (jumps,) each; tolerance [m]: largest error of a success; limit [m]:
+    apexes of open-loop jumps of the same robots, (jumps,); trained [m]: ranges of commands by label; labels: of the
+    axes above; marks: labels of good and of other jumps.
     """
-    line = np.array([commanded.min(), commanded.max()])
-    axis.fill_between(
-        line, line - tolerance, line + tolerance, color="tab:green", alpha=0.12, label=f"within {tolerance:g} m"
+    error, pad = reached - commanded, max(0.05 * np.ptp(commanded), 0.02)
+    low, high = commanded.min() - pad, commanded.max() + pad
+    bottom, top = np.clip(
+        [np.nanmin([*(reached - pad), low]), np.nanmax([*(reached + pad), high])], 2 * low - high, 2 * high - low
     )
-    axis.plot(line, line, color="tab:green", linewidth=1.0, label="commanded")
-    axis.scatter(commanded[good], reached[good], s=9, color="tab:blue", label=names[0])
-    axis.scatter(commanded[~good], reached[~good], s=14, color="tab:red", marker="x", label=names[1])
-    axis.legend(loc="upper left")
+    edge = np.clip(1.1 * np.nanmax(np.abs(error), initial=tolerance), 1.5 * tolerance, 2.5 * tolerance)
+    ratios = ((top - bottom) / (high - low), 0.45)
+    size = (7.0, 5.8 * sum(ratios) + 2.4)
+    with figure(
+        path, 2, 1, sharex=True, height_ratios=ratios, figsize=size, title=title, conditions=conditions
+    ) as axes:
+        line, none = np.array([low, high]), np.zeros(2)
+        for axis, y, ideal in zip(axes, (reached, np.clip(error, -edge, edge)), (line, none), strict=True):
+            axis.fill_between(line, ideal - tolerance, ideal + tolerance, **BAND, label=f"within {tolerance:g} m")
+            axis.plot(line, ideal, color="C2", linewidth=1.0, label="commanded")
+            axis.plot(commanded[good], y[good], "o", color=ACTUAL_COLOR, alpha=0.6, label=marks[0])
+            axis.scatter(commanded[~good], y[~good], **FAILED, label=None if good.all() else marks[1])
+            plot_robot(axis, paper.robot, ideal=axis is axes[0])
+        if limit is not None:
+            axes[0].plot(commanded, limit, ".", color="0.6", label="open-loop jump of the same robot", zorder=1)
+        if paper.open_loop is not None:
+            axes[0].axhline(paper.open_loop, color="0.4", linestyle=":", label="paper, robot: open-loop jump")
+        for sign in (-1.0, 1.0):
+            label = f"paper, simulation: mean error {paper.mean_error:g} m"
+            axes[1].axhline(sign * paper.mean_error, color="C1", linestyle="--", linewidth=1.0, label=label)
+        plot_running_mean(axes[1], commanded, error)
+        for i, (label, span) in enumerate((trained or {}).items()):
+            style = {"color": f"C{3 + i}", "linewidth": 5.0, "solid_capstyle": "butt"}
+            axes[1].plot(span, np.full(2, (0.1 * i - 0.95) * edge), label=label, **style)
+        axes[0].set(xlim=(low, high), ylim=(bottom, top), ylabel=labels[1], aspect="equal")
+        axes[1].set(ylim=(-edge, edge), xlabel=labels[0], ylabel="error [m]")
 
 
-def plot_landings(path: Path, tests: dict[str, LandingLog], size: tuple[float, float]) -> None:
-    """Plot goals and landing positions of first jumps from above, relative to the start, one panel per test.
+def plot_robot(axis: Any, jumps: Sequence[tuple[float, float, float]], *, ideal: bool) -> None:
+    """Mark jumps of the paper's robot (`Published.robot`); ideal: over the commands instead of over zero."""
+    command, error, size = np.array(jumps).T
+    style = {"color": "C1", "markersize": 8.0, "markeredgecolor": "black", "capsize": 3.0, "zorder": 3}
+    axis.errorbar(command, error + ideal * command, yerr=size, fmt="*", label="paper, robot", **style)
 
-    tests: log by title of its panel; size [in]: of the figure.
+
+def plot_running_mean(axis: Any, commanded: np.ndarray, error: np.ndarray) -> None:
+    """Plot the running mean of errors [m] over commands [m], (jumps,) each, with its 95 % bootstrap interval."""
+    order = np.argsort(commanded)[~np.isnan(error)[np.argsort(commanded)]]
+    if len(order) < WINDOW[0]:
+        return
+    width = int(np.clip(len(order) // 10, *WINDOW))
+    step = max(1, len(order) // MOST_WINDOWS)
+    x, windows = (
+        np.lib.stride_tricks.sliding_window_view(values[order], width)[::step] for values in (commanded, error)
+    )
+    draws = np.random.default_rng(0).integers(width, size=(RESAMPLES, width))
+    interval = np.quantile(windows[:, draws].mean(axis=-1), (0.025, 0.975), axis=1)
+    axis.plot(x.mean(axis=1), windows.mean(axis=1), color="black", label=f"mean of {width} jumps, 95 % interval")
+    axis.fill_between(x.mean(axis=1), *interval, color="black", alpha=0.25)
+
+
+def plot_landings(
+    path: Path, tests: Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]], *, tolerance: float, title: str,
+    conditions: str, outlines: Mapping[str, tuple[str, np.ndarray]] | None = None,
+) -> None:  # fmt: skip
+    """Plot goals and landing positions from above, relative to the start, one panel per test.
+
+    tests: by title of the panel, goals [m] and landing positions [m], (jumps, 2), and success (jumps,); tolerance [m]:
+    largest error of a success; outlines: of platforms, blocks or level ground, by key of `tests`: title that describes
+    them, and corners [m] of polygons, (polygons, corners, 2).
     """
-    with figure(path, 1, len(tests), figsize=size, squeeze=False) as axes:
-        for axis, (title, landings) in zip(axes[0], tests.items(), strict=True):
-            good, goals, landing = landings.success[:, 0], landings.goal_positions[:, 0], landings.landing[:, 0]
-            axis.plot(*np.stack([goals, landing]).transpose(2, 0, 1), color="0.7", linewidth=0.8)
-            axis.scatter(goals[:, 0], goals[:, 1], s=20, color="0.4", marker="x", linewidth=0.8, label="goal")
-            axis.scatter(landing[good, 0], landing[good, 1], s=12, color="tab:blue", label="landed there")
-            axis.scatter(landing[~good, 0], landing[~good, 1], s=14, color="tab:red", label="failed")
-            axis.set(xlabel="ahead [m]", ylabel="to the left [m]", title=title, aspect="equal")
-        axes[0, 0].figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
+    points = np.concatenate([np.nan_to_num(np.concatenate(values[:2])) for values in tests.values()])
+    (x0, y0), (x1, y1) = np.minimum(points.min(axis=0), 0.0), np.maximum(points.max(axis=0), 0.0)
+    margin, width = (3.0 if outlines else 1.5) * tolerance, max(7.0, 4.5 * len(tests))
+    size = (width, (width - 0.9) / len(tests) * (y1 - y0 + 2 * margin) / (x1 - x0 + 2 * margin) + 1.8)
+    with figure(
+        path, 1, len(tests), sharex=True, sharey=True, squeeze=False, figsize=size, title=title, conditions=conditions
+    ) as axes:
+        for axis, (name, (goals, landing, good)) in zip(axes[0], tests.items(), strict=True):
+            panel, corners = (outlines or {}).get(name, (name, np.zeros((0, 3, 2))))
+            style = {"facecolor": "0.93", "edgecolor": "0.4", "linewidth": 1.0, "zorder": 0.5}
+            axis.add_collection(PolyCollection(list(corners), **style), autolim=False)
+            disks = regular_polygons(np.unique(goals, axis=0), tolerance)
+            style = {"facecolor": "#d9efe8", "label": f"within {tolerance:g} m of a goal", "zorder": 0.6}
+            axis.add_collection(PolyCollection(list(disks), **style), autolim=False)
+            axis.plot(*np.stack([goals, landing]).transpose(2, 0, 1), color="0.6", linewidth=0.8)
+            axis.plot(*goals.T, "+", color=GOAL_COLOR, markersize=7.0, label="goal")
+            axis.plot(*landing[good].T, "o", color=ACTUAL_COLOR, alpha=0.6, label="landed there")
+            axis.scatter(*landing[~good].T, **FAILED, label=None if good.all() else "failed")
+            axis.plot(0.0, 0.0, "s", color="0.4", label="start")
+            axis.set(xlim=(x0 - margin, x1 + margin), ylim=(y0 - margin, y1 + margin), xlabel="ahead [m]")
+            axis.set(title=panel, aspect="equal")
+        axes[0, 0].set(ylabel="to the left [m]")
+
+
+def regular_polygons(centers: np.ndarray, radius: float, corners: int = 48) -> np.ndarray:
+    """Return the corners [m], (polygons, corners, 2), of regular polygons around centers [m], (polygons, 2)."""
+    angle = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
+    return centers[:, None] + radius * np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+
+def plot_distances(
+    path: Path, distances: Sequence[float], successes: Mapping[str, np.ndarray], errors: np.ndarray, *,
+    reliable: float, published: Mapping[str, float], conditions: str,
+) -> None:  # fmt: skip
+    """Plot success rates and mean errors of bins of distances, with their 95 % intervals.
+
+    distances [m]: of the bins' middles; successes (bool) by label, errors [m] (NaN: not counted): (bins, jumps) each;
+    reliable [1]: rate of a reliable distance; published [m]: distances of other works, by name.
+    """
+    settings = {"figsize": (8.0, 7.5), "sharex": True, "title": "Jumps to far goals", "conditions": conditions}
+    with figure(path, 2, 1, height_ratios=(3, 2), **settings) as (top, bottom):
+        for marker, (label, good) in zip("o^s", successes.items(), strict=False):
+            rate, low, high = rate_interval(good)
+            top.plot(distances, 100.0 * rate, marker=marker, label=label)
+            top.fill_between(distances, 100.0 * low, 100.0 * high, alpha=0.15)
+        top.axhline(100.0 * reliable, color="0.5", linestyle="--", linewidth=1.0, label="reliable")
+        for work, distance in published.items():
+            if distance >= distances[0]:
+                top.axvline(distance, color="C4", linestyle="-.", label=f"{work}, {distance:g} m")
+        top.set(ylabel="success [%], 95 % interval", ylim=(0.0, 103.0))
+        for distance, error in zip(distances, errors, strict=True):
+            bottom.plot(np.full(len(error), distance), error, ".", color="0.7", zorder=1, label="jump")
+        means = [np.nan if np.isnan(error).all() else np.nanmean(error) for error in errors]
+        bottom.plot(distances, means, marker="o", color="black", label="mean")
+        bottom.set(xlabel="commanded distance [m]", ylabel="error of successes [m]", ylim=(0.0, None))
+
+
+def rate_interval(good: np.ndarray) -> np.ndarray:
+    """Return the rates of true values (bins, trials) with the limits of Wilson's 95 % interval, (3, bins)."""
+    n, rate, z = good.shape[1], good.mean(axis=1), 1.96
+    center, half = rate + z**2 / (2 * n), z * np.sqrt(rate * (1.0 - rate) / n + (z / (2 * n)) ** 2)
+    return np.stack([rate, (center - half) / (1.0 + z**2 / n), (center + half) / (1.0 + z**2 / n)])
 
 
 class BasePaths:
@@ -81,19 +219,29 @@ class BasePaths:
         return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
 
-def plot_paths(path: Path, paths: dict[str, np.ndarray], goals: Mapping[str, Sequence], title: str) -> None:
+def plot_paths(path: Path, paths: dict[str, np.ndarray], goals: Mapping[str, Sequence], conditions: str) -> None:
     """Plot base paths from above, one panel per test, with the goals of tests in which all robots have the same.
 
-    paths [m]: by test, of `BasePaths.in_start_frame`; goals [m]: by test, (jumps, 2), each relative to the one before;
-    title: suffix of each panel's title.
+    paths [m]: by test, of `BasePaths.in_start_frame`; goals [m]: by test, (jumps, 2), each relative to the one before.
     """
-    with figure(path, 1, len(paths), figsize=(5.0 * len(paths), 4.5)) as axes:
-        for axis, (name, test_paths) in zip(axes, paths.items(), strict=True):
-            for base_path in test_paths:
-                axis.plot(base_path[:, 0], base_path[:, 1], linewidth=0.8, alpha=0.5, color="tab:blue")
+    limits = [path_limits(values) for values in paths.values()]
+    height = 6.2 * sum(np.ptp(y) / np.ptp(x) for x, y in limits)
+    settings = {"figsize": (8.0, height + 0.8 * len(paths) + 1.2), "title": "Jumps in a row", "conditions": conditions}
+    with figure(path, len(paths), 1, squeeze=False, **settings) as axes:
+        for axis, (name, test_paths), (xlim, ylim) in zip(axes[:, 0], paths.items(), limits, strict=True):
+            axis.set(xlim=xlim, ylim=ylim, ylabel="left [m]", title=name, aspect="equal")
+            for i, base_path in enumerate(test_paths):
+                label = None if i else "path of the base"
+                axis.plot(*base_path.T, linewidth=0.8, alpha=0.5, color=ACTUAL_COLOR, label=label)
             if name in goals:
                 ideal = np.cumsum(goals[name], axis=0)
-                axis.scatter(*ideal.T, s=50, color="tab:red", marker="x", zorder=3, label="goal, no error")
-                axis.legend(loc="upper left")
-            axis.set(xlabel="ahead [m]", ylabel="to the left [m]", title=f"{name}, {title}", aspect="equal")
-            axis.margins(0.1, 0.3)
+                axis.plot(*ideal.T, "+", color=GOAL_COLOR, markersize=10.0, zorder=3, label="goal, no error")
+        axes[-1, 0].set(xlabel="ahead [m]")
+
+
+def path_limits(paths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the limits [m] of both axes around paths [m], (paths, steps, 2), at least a fifth as high as wide."""
+    low, high = (limit(paths, axis=(0, 1)) for limit in (np.nanmin, np.nanmax))
+    middle, size = 0.5 * (low + high), np.maximum(1.1 * (high - low), 0.2)
+    size[1] = max(size[1], 0.2 * size[0])
+    return middle[0] + size[0] * np.array([-0.5, 0.5]), middle[1] + size[1] * np.array([-0.5, 0.5])

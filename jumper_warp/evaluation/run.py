@@ -100,8 +100,9 @@ class Run(ABC):
         words = [SOLVER_TITLES[conditions.solver], "randomised" if conditions.randomize else "nominal"]
         if conditions.latency is not None and self._latency:
             words.append(f"latency {latency_text(self._latency[0], self._physics_dt)}")
-        words += [] if conditions.gain_scale is None else ["kp x {:g}, kd x {:g}".format(*conditions.gain_scale)]
+        words += [] if conditions.gain_scale is None else ["kp × {:g}, kd × {:g}".format(*conditions.gain_scale)]
         words += [] if conditions.friction is None else [f"friction {conditions.friction:g}"]
+        words += [] if conditions.gravity is None else [f"gravity {conditions.gravity:g} m/s²"]
         words += [] if conditions.robot is None else [f"robot of {conditions.robot.name}"]
         return ", ".join(words + (["pushed in flight too"] if conditions.push_in_flight else []))
 

@@ -14,12 +14,13 @@ from typing import Any, ClassVar
 import numpy as np
 
 from jumper_warp.evaluation.film import block_positions
+from jumper_warp.evaluation.heights import SUCCESS_TOLERANCE
 from jumper_warp.evaluation.landings import AT_REST_AT_END, FALLS, MISSED, LandingLog, landing_metrics, trained_range
 from jumper_warp.evaluation.log import largest, mean, within
-from jumper_warp.evaluation.plots import BasePaths, figure, plot_landings, plot_paths
+from jumper_warp.evaluation.plots import BasePaths, plot_distances, plot_landings, plot_paths, regular_polygons
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite, check
-from jumper_warp.robot.grounds import BlockCfg, platform, uneven
+from jumper_warp.robot.grounds import SIZE, BlockCfg, platform, uneven
 
 AHEAD, ASIDE = (0.35, 1.4), (-0.35, 0.35)  # [m] Ranges of the grid's goals ahead and to the left
 SECTORS = ("ahead", "left", "back", "right")  # Quarters of a ring, each centred on its direction
@@ -82,7 +83,10 @@ class Grid(Suite):
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Run the jumps, plot the landing positions, and return the metrics."""
         landings = self.run_landings(run, self.goals, film="jumps")
-        plot_landings(run.folder / "grid.png", {f"{len(landings.end)} jumps, {run.title}": landings}, (8.0, 5.0))
+        plot_landings(
+            run.folder / "grid.png", {"": landed_at(landings)}, tolerance=SUCCESS_TOLERANCE,
+            title="Jumps to a grid of goals", conditions=f"{run.title}, {len(landings.end)} jumps",
+        )  # fmt: skip
         inside = landings.goal_positions[..., 0] < AHEAD[1] - 1.0e-6
         return {"goals": self.columns * self.rows, **landing_metrics(landings, inside)}
 
@@ -106,8 +110,10 @@ class Ring(Suite):
         angle = np.linspace(0.0, 2.0 * np.pi, self.num_jumps, endpoint=False)
         goals = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
         landings = self.run_landings(run, goals, film="jumps")
-        title = f"{self.num_jumps} jumps over {self.radius:g} m, {run.title}"
-        plot_landings(run.folder / "landings.png", {title: landings}, (6.0, 6.5))
+        plot_landings(
+            run.folder / "landings.png", {"": landed_at(landings)}, tolerance=SUCCESS_TOLERANCE,
+            title=f"Jumps over {self.radius:g} m", conditions=f"{run.title}, {self.num_jumps} jumps",
+        )  # fmt: skip
         sector = np.round(np.arctan2(goals[..., 1], goals[..., 0]) / (0.5 * np.pi)).astype(int) % len(SECTORS)
         fell, missed = np.isin(landings.ends, FALLS), landings.outcomes == MISSED
         values = landing_metrics(landings)
@@ -151,7 +157,8 @@ class Consecutive(Suite):
             logs.append(self.run_landings(run, goals, delay=delay, film=name, on_step=base_paths))
             paths.append(base_paths.in_start_frame(logs[-1].headings))
         parts = dict(zip((*PAIRS, f"{self.jumps_per_trial} in a row"), (*np.split(paths[0], 2), paths[1]), strict=True))
-        plot_paths(run.folder / "paths.png", parts, PAIRS, run.title)
+        words = f"{run.title}, {self.num_jumps} pairs of each kind, {self.num_trials} long rows"
+        plot_paths(run.folder / "paths.png", parts, PAIRS, words)
         return {"rest_s": self.rest_time} | consecutive_metrics(*logs)
 
 
@@ -211,6 +218,17 @@ class Platform(Suite):
             half = np.stack([0.5 * (far - self.edge), np.full(len(goals), 0.5 * BLOCK_WIDTH)], axis=1)
             yield "block", {"block": BlockCfg(center, half, BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION)}, straight
 
+    def outlines(self, goals: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
+        """Return the argument `outlines` of `plot_landings`: platform, median block, and level ground of the bumps."""
+        x, y = np.median(goals, axis=0)
+        block = rectangle(self.edge, x + BLOCK_BEYOND, y - 0.5 * BLOCK_WIDTH, y + 0.5 * BLOCK_WIDTH)
+        level = regular_polygons(np.zeros((1, 2)), FLAT_RADIUS)
+        return {
+            "platform": (f"platform, {DROP:g} m high", rectangle(-SIZE, self.edge, -SIZE, SIZE)),
+            "uneven": (f"level circle, then bumps up to ±{AMPLITUDE:g} m", level),
+            "block": (f"block of the median goal, {BLOCK_HEIGHT:g} m high", block),
+        }
+
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Run the jumps of all scenes, plot them, return `<scene>_<metric>` and the means of metrics over scenes."""
         rng = np.random.default_rng(self.seed)
@@ -223,8 +241,11 @@ class Platform(Suite):
             if "block" in scene:
                 slide = np.linalg.norm(block_positions(env.sim) - scene["block"].center, axis=1)
                 values |= {"block_mean_slide_m": float(slide.mean()), "block_max_slide_m": float(slide.max())}
-        titles = {f"{name}, {run.title}": landings for name, landings in done.items()}
-        plot_landings(run.folder / "landings.png", titles, (5.0 * len(done), 4.0))
+        plot_landings(
+            run.folder / "landings.png", {name: landed_at(landings) for name, landings in done.items()},
+            tolerance=SUCCESS_TOLERANCE, outlines=self.outlines(goals), title="Jumps to other grounds",
+            conditions=f"{run.title}, {self.num_jumps} jumps each",
+        )  # fmt: skip
         names = ("mean_error_m", "success_rate", "fall_rate", "miss_rate", "still_landing_rate")
         summary = {name: mean([values[f"{scene}_{name}"] for scene in done]) for name in names}
         tilts = [values[f"{scene}_max_landing_tilt_deg"] for scene in done]
@@ -276,25 +297,27 @@ class Farthest(Suite):
             if success < GIVEN_UP:
                 break
         values = distance_metrics(bins) | trained_range(env.task) | {"direction_deg": self.direction}
-        plot_distances(run, values)
+        logs = bins.values()
+        successes = {
+            "success": np.array([log.success[:, 0] for log in logs]),
+            "success without a second hop": np.array([(log.success & ~log.hopped)[:, 0] for log in logs]),
+            "success without a step": np.array([(log.success & ~log.stepped)[:, 0] for log in logs]),
+        }
+        errors = np.array([np.where(log.success, log.error, np.nan)[:, 0] for log in logs])
+        conditions = f"{run.title}, {self.num_jumps} jumps each"
+        plot_distances(run.folder / "max_jump.png", [*bins], successes, errors, reliable=RELIABLE, published=PUBLISHED,
+                       conditions=conditions)  # fmt: skip
         return values
 
 
-def plot_distances(run: EvaluationRun, values: dict[str, Any]) -> None:
-    """Plot success rates and mean error over distance into `max_jump.png`; values: of `distance_metrics`."""
-    with figure(run.folder / "max_jump.png", 2, 1, figsize=(7, 6), sharex=True) as (top, bottom):
-        for suffix, rate in RATES.items():
-            label = f"success{suffix.replace('_', ' ')}"
-            top.plot(values["bin_m"], [100.0 * success for success in values[f"bin_{rate}"]], marker="o", label=label)
-        top.axhline(100.0 * RELIABLE, color="0.5", linestyle="--", linewidth=1.0)
-        for work, distance in PUBLISHED.items():
-            if distance >= values["bin_m"][0]:
-                top.axvline(distance, color="tab:green", linewidth=1.0, label=f"{work}, {distance:g} m")
-        top.set(ylabel="success [%]", ylim=(0.0, 103.0), title=run.title)
-        top.legend(loc="lower left")
-        error = [np.nan if value is None else value for value in values["bin_mean_error_of_successes_m"]]
-        bottom.plot(values["bin_m"], error, marker="o")
-        bottom.set(xlabel="commanded distance [m]", ylabel="mean error of successes [m]", ylim=(0.0, None))
+def landed_at(landings: LandingLog) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return goals [m], landing positions [m], (worlds, 2), and success (worlds,) of first jumps, to be plotted."""
+    return landings.goal_positions[:, 0], landings.landing[:, 0], landings.success[:, 0]
+
+
+def rectangle(x0: float, x1: float, y0: float, y1: float) -> np.ndarray:
+    """Return the corners [m] of an axis-aligned rectangle, (1, 4, 2)."""
+    return np.array([[(x0, y0), (x1, y0), (x1, y1), (x0, y1)]])
 
 
 def distance_metrics(bins: dict[float, LandingLog]) -> dict[str, Any]:

@@ -23,12 +23,14 @@ from jumper_warp.evaluation.landings import (
 )
 from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
 from jumper_warp.evaluation.log import Metrics, mean, termination_names, within
-from jumper_warp.evaluation.plots import figure, plot_sweep
+from jumper_warp.evaluation.plots import Published, plot_sweep
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.utils.errors import InputError
 
 HEIGHTS_IN_RANGE, DISTANCES_IN_RANGE = (0.5, 1.1), (0.3, 1.4)  # [m] Ranges in which all jumps of the paper succeed
+PAPER_HEIGHTS = Published(mean_error=0.04, robot=((0.75, 0.0, 0.023), (1.0, 0.01, 0.0)), open_loop=1.075)
+PAPER_DISTANCES = Published(mean_error=0.026, robot=((1.25, 0.0, 0.004),))
 PAPER_TRAINED = (0.4, 1.0)  # [m] Range of goal distances in the paper's training, also of `success_rate_0_4_1_0`
 
 
@@ -130,12 +132,12 @@ class HeightSweep(Suite):
         initial_state = env.state_dict()
         jumps = self.run_jumps(run, env, "jumps")
         limit = open_loop_limits(env, initial_state)
-        with figure(run.folder / "sweep.png", figsize=(6, 5.5)) as axis:
-            axis.scatter(jumps.commanded, limit, s=5, color="0.6", label="open-loop jump of the same robot")
-            plot_sweep(axis, jumps.commanded, jumps.apex, jumps.reached, SUCCESS_TOLERANCE, ("reached", "missed"))
-            axis.legend(loc="lower right")
-            axis.set(xlabel="commanded base height [m]", ylabel="highest base height [m]")
-            axis.set_title(f"{self.num_jumps} jumps, {run.title}", wrap=True)
+        plot_sweep(
+            run.folder / "sweep.png", jumps.commanded[:, 0], jumps.apex[:, 0], jumps.reached[:, 0], limit=limit,
+            tolerance=SUCCESS_TOLERANCE, paper=PAPER_HEIGHTS, marks=("reached", "missed"), title="Jumps to heights",
+            labels=("commanded base height [m]", "highest base height [m]"),
+            conditions=f"{run.title}, {self.num_jumps} jumps",
+        )  # fmt: skip
 
         def measure_under(conditions: Conditions) -> Metrics:
             pushed_env = run.env(self.num_jumps, with_sweep_terminations, conditions)
@@ -192,14 +194,13 @@ class DistanceSweep(Suite):
     def measure(self, run: EvaluationRun) -> dict[str, Any]:
         """Run the jumps, plot reached over commanded distance, and return the metrics."""
         landings, trained = self.run_jumps(run, run.conditions, "jumps"), trained_range(run.task)
-        with figure(run.folder / "sweep.png", figsize=(6, 5.5)) as axis:
-            axis.axvspan(*PAPER_TRAINED, color="0.5", alpha=0.08, label="training of the paper")
-            axis.axvspan(*trained.values(), color="tab:orange", alpha=0.06, label="training of this policy")
-            commanded, reached = landings.goal_positions[..., 0], landings.landing[..., 0]
-            plot_sweep(axis, commanded, reached, landings.success, SUCCESS_TOLERANCE, ("landed there", "failed"))
-            axis.set(xlabel="commanded distance [m]", ylabel="distance of the base at the end [m]")
-            axis.set(xlim=(self.distance_range[0] - 0.05, self.distance_range[1] + 0.05))
-            axis.set_title(f"{self.num_jumps} jumps, {run.title}", wrap=True)
+        plot_sweep(
+            run.folder / "sweep.png", landings.goal_positions[:, 0, 0], landings.landing[:, 0, 0],
+            landings.success[:, 0], tolerance=SUCCESS_TOLERANCE, paper=PAPER_DISTANCES, marks=("on goal", "failed"),
+            trained={"paper: range of training": PAPER_TRAINED, "range of training": tuple(trained.values())},
+            labels=("commanded distance [m]", "distance of the base at the end [m]"), title="Jumps ahead",
+            conditions=f"{run.title}, {self.num_jumps} jumps",
+        )  # fmt: skip
         values = {"rest_s": self.rest_time, "end_at_second_takeoff": self.end_at_second_takeoff}
         values |= self.metrics(landings)
         pushed = self.pushed_in_flight(

@@ -442,7 +442,7 @@ def test_play_script_writes_recording_plot_and_metrics(tmp_path, capsys):
     code, out, _ = run(capsys, "play", "--script", str(script), "--device", "cpu", "--out", str(tmp_path / "out"))
     assert code == 0 and "success_rate" in out
     assert json.loads((tmp_path / "out" / "metrics.json").read_text())["outcome"] == "done"
-    assert (tmp_path / "out" / "course.rrd").stat().st_size > 10_000 and (tmp_path / "out" / "course.png").is_file()
+    assert (tmp_path / "out" / "course.rrd").stat().st_size > 10_000 and (tmp_path / "out" / "timeline.png").is_file()
 
 
 @pytest.mark.parametrize(

@@ -25,7 +25,7 @@ def test_walk_jump_walk_with_two_robots_succeeds(tmp_path, monkeypatch):
     assert (metrics["success_rate"], metrics["robots"], metrics["jumps_made"]) == (1.0, 2, 4)
     assert metrics["apex_error_m"] < 0.05 and metrics["landing_error_m"] < 0.05
     assert 0.0 < metrics["rmse_vx_m_s"] < 0.2 and 0.2 < metrics["command_to_takeoff_s"] < 2.5
-    assert (tmp_path / "course.png").is_file() and (tmp_path / "walk_jump_walk.rrd").stat().st_size > 10_000
+    assert (tmp_path / "timeline.png").is_file() and (tmp_path / "walk_jump_walk.rrd").stat().st_size > 10_000
 
 
 def test_scripts_have_specified_commands_and_are_reproducible():

@@ -1,0 +1,106 @@
+"""Plots: errors below sweeps, intervals, outlines of grounds, legends beside the data."""
+
+import matplotlib.pyplot as plt
+import numpy as np
+import pytest
+
+from jumper_warp.evaluation import plots
+
+
+@pytest.fixture
+def drawn(monkeypatch, tmp_path):
+    """Function that calls a plotting function with a path, and returns the axes of its figure."""
+    figures = []
+    monkeypatch.setattr(plt, "close", figures.append)
+
+    def draw(plot, *args, **keywords):
+        plot(tmp_path / "plot.png", *args, **keywords)
+        assert (tmp_path / "plot.png").stat().st_size > 5000
+        return figures[-1].axes
+
+    return draw
+
+
+def sweep(drawn, reached, good):
+    commanded = np.linspace(0.5, 1.2, len(reached))
+    return drawn(
+        plots.plot_sweep, commanded, commanded + reached, good, tolerance=0.1, marks=("reached", "missed"), title="",
+        paper=plots.Published(0.04, ((0.75, 0.0, 0.023), (1.0, 0.01, 0.0)), 1.075), labels=("x", "y"), conditions="",
+    )  # fmt: skip
+
+
+def line(axis, label):
+    return next(line for line in axis.lines if line.get_label() == label)
+
+
+def test_sweep_has_equal_axes_and_errors_below(drawn):
+    error = np.linspace(-0.15, 0.05, 30)
+    top, bottom = sweep(drawn, error, error > -0.1)
+    assert top.get_aspect() == 1.0 and bottom.get_ylabel() == "error [m]"
+    np.testing.assert_allclose(line(bottom, "reached").get_ydata(), error[error > -0.1], atol=1e-12)
+    np.testing.assert_allclose(line(top, "reached").get_ydata(), (np.linspace(0.5, 1.2, 30) + error)[error > -0.1])
+
+
+def test_sweep_marks_the_values_of_the_paper(drawn):
+    top, bottom = sweep(drawn, np.zeros(10), np.ones(10, dtype=bool))
+    robot = {axis: axis.containers[0][0].get_xydata() for axis in (top, bottom)}
+    np.testing.assert_allclose(robot[top], [(0.75, 0.75), (1.0, 1.01)])
+    np.testing.assert_allclose(robot[bottom], [(0.75, 0.0), (1.0, 0.01)])
+    means = [line.get_ydata()[0] for line in bottom.lines if "paper, simulation" in line.get_label()]
+    assert means == [-0.04, 0.04]
+
+
+def test_sweep_of_diverged_and_of_single_jumps_is_plotted(drawn):
+    sweep(drawn, np.full(3, np.nan), np.zeros(3, dtype=bool))
+    sweep(drawn, np.zeros(1), np.ones(1, dtype=bool))
+
+
+def test_interval_of_running_mean_has_the_width_of_the_standard_error():
+    error = np.random.default_rng(3).normal(0.0, 0.1, 4000)
+    _, axis = plt.subplots()
+    plots.plot_running_mean(axis, np.linspace(0.0, 1.0, len(error)), error)
+    band = axis.collections[0].get_paths()[0].vertices
+    middle = axis.lines[0].get_xdata()[len(axis.lines[0].get_xdata()) // 2]
+    low, high = np.ptp(band[np.isclose(band[:, 0], middle), 1]), 2 * 1.96 * 0.1 / np.sqrt(plots.WINDOW[1])
+    plt.close()
+    assert low == pytest.approx(high, rel=0.3)
+
+
+def test_rate_interval_is_wilsons():
+    good = np.arange(10) < np.array([[0], [5], [10]])
+    expected = [[0.0, 0.5, 1.0], [0.0, 0.2366, 0.7225], [0.2775, 0.7634, 1.0]]  # Wilson 1927, 10 trials
+    np.testing.assert_allclose(plots.rate_interval(good), expected, atol=1e-4)
+
+
+def test_landings_show_outline_of_a_platform_and_failures(drawn):
+    goals, good = np.array([[0.8, 0.0], [1.2, 0.1]]), np.array([True, False])
+    corners = np.array([[(-1.0, -1.0), (0.4, -1.0), (0.4, 1.0), (-1.0, 1.0)]])
+    (axis,) = drawn(
+        plots.plot_landings, {"platform": (goals, goals + 0.2, good)}, tolerance=0.1, title="", conditions="",
+        outlines={"platform": ("platform, 0.15 m high", corners)},
+    )  # fmt: skip
+    assert axis.get_title(loc="left") == "platform, 0.15 m high" and axis.get_aspect() == 1.0
+    np.testing.assert_allclose(axis.collections[0].get_paths()[0].vertices[:4], corners[0])
+    failed = next(marks for marks in axis.collections if marks.get_label() == "failed")
+    np.testing.assert_allclose(failed.get_offsets(), [(1.4, 0.3)])
+
+
+def test_legend_is_below_the_axes_and_names_labels_once(drawn):
+    def plot(path):
+        with plots.figure(path, 1, 2, title="Title", conditions="nominal") as axes:
+            for axis in axes:
+                axis.plot([0, 1], [0, 1], label="same")
+                axis.set_xlabel("time [s]")
+
+    axes = drawn(plot)
+    (legend,) = axes[0].figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["same"]
+    assert axes[0].figure.get_suptitle() == "Title\nnominal"
+    assert legend.get_window_extent().y1 <= min(axis.get_tightbbox().y0 for axis in axes) + 1.0
+
+
+def test_figures_have_the_style_of_the_sheet_and_leave_others_alone(drawn):
+    before = plt.rcParams["axes.grid"], plt.rcParams["font.size"]
+    (top, *_) = sweep(drawn, np.zeros(10), np.ones(10, dtype=bool))
+    assert not top.spines["top"].get_visible() and top.xaxis.label.get_size() == 12.0
+    assert (plt.rcParams["axes.grid"], plt.rcParams["font.size"]) == before
