@@ -134,7 +134,7 @@ class JumpCommand:
     """
 
     def __init__(self, takeoff_speed: float = 0.75) -> None:
-        """Start without a request; takeoff_speed: least upward speed [m/s] that counts as a takeoff."""
+        """Start without a request; takeoff_speed: upward speed [m/s] above which a robot takes off."""
         self._takeoff_speed = takeoff_speed
         self.requested, self.in_flight = False, False
 
@@ -147,8 +147,9 @@ class JumpCommand:
 
         vertical_velocity: of the base, world frame, upward positive [m/s]. paws_down: number of paws on the ground.
         """
-        if self.in_flight and paws_down > 0:
+        rises = vertical_velocity > self._takeoff_speed
+        if self.in_flight and paws_down > 0 and not rises:
             self.requested, self.in_flight = False, False
-        elif paws_down == 0 and vertical_velocity > self._takeoff_speed:
+        elif paws_down == 0 and rises:
             self.in_flight = True
         return float(self.requested)

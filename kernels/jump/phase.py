@@ -39,23 +39,32 @@ def landing_error_estimate(robot: RobotView, state: JumpState, height: float) ->
 
 @wp.func
 def next_phase(state: JumpState, robot: RobotView, takeoff_speed: float) -> int:
-    """Return the phase after this policy step; takeoff: no paw in contact, upward speed above takeoff_speed [m/s]."""
-    if state.phase == STANCE and robot.contacts == 0 and robot.lin_vel[2] > takeoff_speed:
+    """Return the phase after this policy step.
+
+    A jump takes off when no paw is in contact and the base rises faster than takeoff_speed [m/s]. It touches down when
+    a paw is in contact and the base does not rise faster than that. At higher speed the contact belongs to the push-off
+    (compliant contact can break for some steps of it) or is a clipped edge: the robot stays in flight.
+    """
+    rises = robot.lin_vel[2] > takeoff_speed
+    if state.phase == STANCE and robot.contacts == 0 and rises:
         return FLIGHT
-    if state.phase == FLIGHT and robot.contacts > 0:
+    if state.phase == FLIGHT and robot.contacts > 0 and not rises:
         return LANDED
     return state.phase
 
 
 @wp.func
 def advance_jump(robot: RobotView, state: JumpState, takeoff_speed: float) -> JumpState:
-    """Return the jump's state after one more policy step; takeoff_speed [m/s]: least upward speed of a takeoff."""
+    """Return the jump's state after one more policy step; takeoff_speed [m/s]: least upward speed of a takeoff.
+
+    Contact in flight that is no touchdown moves the takeoff to its step: the flight and its apex begin there.
+    """
     t = state
     t.steps = state.steps + 1
     phase = next_phase(state, robot, takeoff_speed)
-    t.took_off = wp.where(state.phase == STANCE and phase == FLIGHT, 1, 0)
+    t.took_off = wp.where(phase == FLIGHT and (state.phase == STANCE or robot.contacts > 0), 1, 0)
     t.touched_down = wp.where(state.phase == FLIGHT and phase == LANDED, 1, 0)
-    t.phase_steps = wp.where(phase == state.phase, state.phase_steps + 1, 0)
+    t.phase_steps = wp.where(phase == state.phase and t.took_off == 0, state.phase_steps + 1, 0)
     t.phase = phase
     if t.took_off == 1:
         t.max_height = robot.pos[2]

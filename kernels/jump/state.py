@@ -5,8 +5,8 @@ import warp as wp
 from ..mdp.view import RobotView
 
 STANCE = wp.constant(0)  # phases: before takeoff
-FLIGHT = wp.constant(1)  # from takeoff to the first contact of a paw
-LANDED = wp.constant(2)  # from that contact on
+FLIGHT = wp.constant(1)  # from takeoff to touchdown, see `phase.next_phase`
+LANDED = wp.constant(2)  # from touchdown on
 NUM_START_MODES = wp.constant(6)  # see `start_states`
 vec_start_modes = wp.types.vector(length=6, dtype=wp.float32)
 
@@ -24,7 +24,7 @@ class JumpState:
     phase_steps: int  # policy steps in this phase
     command_step: int  # policy step from which the jump is commanded
     idle_steps: int  # policy steps without motion while a jump was commanded
-    took_off: int  # 1 in the step of the takeoff
+    took_off: int  # 1 in the step of the takeoff, and in each step to which later contact moves it
     touched_down: int  # 1 in the step of the touchdown
     at_apex: int  # 1 in the step in which the base begins to fall
     apex_passed: int  # 1 from that step on

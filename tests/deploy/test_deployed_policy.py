@@ -178,9 +178,10 @@ def test_refuses_unknown_readings_and_wrong_sizes(change, message):
 def test_jump_command_ends_with_the_landing():
     command = JumpCommand(takeoff_speed=0.75)
     command.request()
-    # (vertical velocity [m/s], paws down): standing, too slow, a paw down, takeoff, flight, landing, next flight
-    steps = [(0.0, 4), (0.7, 0), (0.8, 1), (0.8, 0), (-1.0, 0), (-1.0, 1), (0.9, 0)]
-    assert [command.update(*step) for step in steps] == [1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0]
+    # (vertical velocity [m/s], paws down): standing, too slow, a paw down, takeoff, still pushing off, flight, landing,
+    # next flight
+    steps = [(0.0, 4), (0.7, 0), (0.8, 1), (0.8, 0), (0.9, 2), (-1.0, 0), (-1.0, 1), (0.9, 0)]
+    assert [command.update(*step) for step in steps] == [1.0, 1.0, 1.0, 1.0, 1.0, 1.0, 0.0, 0.0]
 
 
 @pytest.mark.parametrize("module", ["deploy.policy", "policies.spec"])

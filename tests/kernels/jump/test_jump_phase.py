@@ -77,6 +77,31 @@ def test_a_flight_ends_with_the_first_contact_and_landed_is_final():
     np.testing.assert_allclose(tasks["touchdown_vel"][2:, 2], -1.0)  # [m/s] of the step before the contact
 
 
+def test_contact_while_the_base_rises_belongs_to_the_push_off():
+    # a push-off whose contact breaks for two steps: paws off the ground, on it again, takeoff, apex, touchdown
+    contacts = (4, 0, 0, 2, 4, 2, 0, 0, 0, 0, 1, 4)
+    up = (0.5, 1.0, 0.9, 1.3, 2.0, 2.6, 2.5, 1.2, -0.1, -1.5, -2.4, -1.0)
+    z = (0.15, 0.17, 0.18, 0.20, 0.23, 0.30, 0.35, 0.50, 0.55, 0.45, 0.30, 0.25)
+    tasks, height_reward, _ = advance(views_of(contacts, up, z))
+    assert tasks["phase"].tolist() == [STANCE] + 9 * [FLIGHT] + 2 * [LANDED]
+    assert np.flatnonzero(tasks["touched_down"]).tolist() == [10]
+    assert np.flatnonzero(tasks["took_off"]).tolist() == [1, 3, 4, 5]  # the takeoff moves on with the contact
+    assert tasks["phase_steps"][5:].tolist() == [0, 1, 2, 3, 4, 0, 1]
+    assert np.flatnonzero(tasks["at_apex"]).tolist() == np.flatnonzero(height_reward).tolist() == [8]
+    assert tasks["max_height"][-1] == pytest.approx(0.55)
+
+
+@pytest.mark.parametrize("speed", [TAKEOFF_SPEED - 0.01, 0.0, -1.0])
+def test_contact_ends_a_flight_unless_the_base_rises_faster_than_the_takeoff_speed(speed):
+    tasks, _, _ = advance(views_of(contacts=(0, 0, 1, 0), up=(2.0, 1.0, speed, 2.0)))
+    assert tasks["phase"].tolist() == [FLIGHT, FLIGHT, LANDED, LANDED]
+
+
+def test_a_paw_that_clips_an_edge_on_the_way_up_does_not_end_the_flight():
+    tasks, _, _ = advance(views_of(contacts=(0, 1, 0, 0, 2), up=(2.0, 0.8, 0.7, -1.0, -1.5)))
+    assert tasks["phase"].tolist() == [FLIGHT, FLIGHT, FLIGHT, FLIGHT, LANDED]
+
+
 def test_steps_count_in_the_episode_and_in_the_phase():
     tasks, _, _ = advance(views_of(contacts=(4, 0, 0, 2, 4), up=(0.0, 2.0, 1.0, -1.0, 0.0)))
     assert tasks["steps"].tolist() == [1, 2, 3, 4, 5]
@@ -102,7 +127,7 @@ def test_apex_and_height_rewards_of_a_projectile(speed):
 
 
 def test_touching_down_while_rising_pays_the_height_reached():
-    views = views_of(contacts=(0, 0, 2, 4), up=(3.0, 2.8, 2.6, 0.0), z=(0.5, 0.55, 0.6, 0.62))
+    views = views_of(contacts=(0, 0, 2, 4), up=(3.0, 2.8, 0.7, 0.0), z=(0.5, 0.55, 0.6, 0.62))
     tasks, height_reward, _ = advance(views)
     assert tasks["at_apex"].tolist() == [0, 0, 1, 0]
     assert tasks["max_height"][-1] == pytest.approx(0.6)
