@@ -16,8 +16,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
-import numpy as np
-
 from jumper_warp.evaluation.commands import print_metrics
 from jumper_warp.evaluation.run import SOLVER_TITLES
 from jumper_warp.robot.description import LEGS

@@ -27,7 +27,6 @@ from jumper_warp.evaluation.log import run_evaluation
 from jumper_warp.evaluation.run import EvaluationRun, SkillRun
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.evaluation.velocities import VelocityPlayFlags
-from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.folder import add_files, find_policy
 from jumper_warp.robot.grounds import platform
 from jumper_warp.robot.terrain import TerrainCfg, single_tile
@@ -40,7 +39,7 @@ from support.scripts import ThreadArgs, prepare, run_script
 
 COURSE = "walk_jump_walk"  # a script instead of a policy
 SCRIPT = Path(__file__).parents[1] / "assets/scripts/walk_jump_walk.json"
-TILE, ANIMATION = ("vertical_jump", "horizontal_jump", "walking_flat", "attitude"), COURSE  # of the README
+TILE = ("vertical_jump", "horizontal_jump", "walking_flat", "attitude")  # policies in the tile
 TILE_WIDTH, FILM_SIZE, ANIMATION_SIZE = 800, (854, 480), (640, 360)  # [px]
 
 
@@ -54,15 +53,18 @@ class Shot:
 
 
 def heights(*values: float) -> HeightPlayFlags:
+    """Return jumps to heights [m]."""
     return HeightPlayFlags(values, 6.0)
 
 
 def goal(ahead: float, left: float = 0.0) -> LandingPlayFlags:
+    """Return a jump to a place [m]."""
     return LandingPlayFlags(goal=((ahead, left),))
 
 
-def walk(*velocity: float) -> VelocityPlayFlags:
-    return VelocityPlayFlags(velocity=(velocity,), command_interval=6.0)
+def walk(ahead: float) -> VelocityPlayFlags:
+    """Return a straight walk of 6 s at a velocity [m/s]."""
+    return VelocityPlayFlags(velocity=((ahead, 0.0, 0.0),), command_interval=6.0)
 
 
 SHOTS = {
@@ -77,9 +79,9 @@ SHOTS = {
     "slippery_jump": Shot(goal(1.2), "jump to a place 1.2 m ahead, for slippery ground"),
     "slippery_waiting_jump": Shot(goal(1.2), "wait, then jump to a place 1.2 m ahead, for slippery ground"),
     "vertical_jump": Shot(heights(1.0), "jump to a base height of 1 m"),
-    "walking_flat": Shot(walk(0.8, 0.0, 0.0), "walk at 0.8 m/s"),
+    "walking_flat": Shot(walk(0.8), "walk at 0.8 m/s"),
     "walking_rough": Shot(
-        walk(0.5, 0.0, 0.0), "walk at 0.5 m/s over stairs that it does not see",
+        walk(0.5), "walk at 0.5 m/s over stairs that it does not see",
         lambda: single_tile(TerrainCfg(tile=8.0), "pit"),
     ),
 }  # fmt: skip
@@ -103,8 +105,7 @@ class Args(ThreadArgs):
 def record(name: str) -> Recording:
     """Return a recording of one episode of a policy's shot, or of the course."""
     if name == COURSE:
-        run: EvaluationRun | SkillRun = SkillRun()
-        log: Any = CourseLog([read_script(SCRIPT)])
+        run, log = SkillRun(), CourseLog([read_script(SCRIPT)])
         env, ground = run.env(1), "plane"
     else:
         shot = SHOTS[name]
@@ -129,7 +130,7 @@ def main(args: Args) -> dict:
             paths.append(write_film(recording, folder / f"{name}.mp4", size=FILM_SIZE))
         if args.save_to_policies and name != COURSE:
             add_files(find_policy(name), {"picture.webp": picture.read_bytes()})
-        if args.readme is not None and name == ANIMATION:
+        if args.readme is not None and name == COURSE:
             paths.append(write_film(recording, args.readme / f"{name}.webp", size=ANIMATION_SIZE, fps=15.0))
         for path in paths:
             sizes[path.name] = path.stat().st_size / 1024

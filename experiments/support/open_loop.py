@@ -45,9 +45,7 @@ class Trace:
     gap: np.ndarray  # (n,) [m] largest gap of the legs' closed loops
 
 
-def simulate_jump(
-    sim: Simulation, notes: Mapping[str, Any], squat: float = SQUAT
-) -> tuple[Trace, Recorder]:
+def simulate_jump(sim: Simulation, notes: Mapping[str, Any], squat: float = SQUAT) -> tuple[Trace, Recorder]:
     """Simulate the jump in world 0; return measurements and a recording at 60 Hz.
 
     notes: JSON metadata of the recording; squat [deg]: commanded transversal angle of the squat.

@@ -7,6 +7,7 @@ import sys
 from collections.abc import Iterator, Sequence
 from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -150,8 +151,9 @@ def _encode_mp4(path: Path, images: Iterator[Image.Image], size: tuple[int, int]
     """Write images as H.264 in yuv420p, which browsers and slides play."""
     import imageio_ffmpeg
 
+    rate: Any = fps  # the library writes it as text
     writer = imageio_ffmpeg.write_frames(
-        str(path), size, fps=fps, codec="libx264", pix_fmt_in="rgb24", macro_block_size=2, quality=6,
+        str(path), size, fps=rate, codec="libx264", pix_fmt_in="rgb24", macro_block_size=2, quality=6,
         output_params=["-movflags", "+faststart"],
     )  # fmt: skip
     writer.send(None)
@@ -168,5 +170,5 @@ def _encode_animation(path: Path, images: Iterator[Image.Image], size: tuple[int
     duration = 1000.0 / fps  # [ms]
     ends = np.round(duration * np.arange(count + 1)).astype(int)
     durations = np.diff(ends).tolist()
-    options = {"quality": 75, "method": 4} if path.suffix == ".webp" else {"optimize": True}
+    options: dict[str, Any] = {"quality": 75, "method": 4} if path.suffix == ".webp" else {"optimize": True}
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, **options)

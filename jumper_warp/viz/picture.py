@@ -140,7 +140,7 @@ def _distinct(places: np.ndarray, flights: list[tuple[int, int]]) -> np.ndarray:
 
 
 def _evenly_moved(poses: np.ndarray, count: int) -> np.ndarray:
-    """Return `count` frames between which the bodies move equally far in sum; poses: (num_frames, bodies, 3 or more)."""
+    """Return `count` frames between which the bodies move equally far; poses: (num_frames, bodies, 3 or more)."""
     steps = np.linalg.norm(np.diff(poses[..., :3], axis=0), axis=-1).sum(axis=1)
     moved = np.concatenate([[0.0], np.cumsum(steps)])
     return np.searchsorted(moved, np.linspace(0.0, 0.99 * moved[-1], count))
@@ -164,7 +164,7 @@ def write_picture(
     view, size = _framed(points, np.array([np.cos(turn), np.sin(turn), ELEVATION]), width)
     poses = recording.body_poses(rank)[scene.frames].astype(float)
     poses[..., :3] += scene.shift[:, None, None] * scene.right
-    with open_renderer(_shapes(scene), poses.shape[1], size, _opacity(scene)) as renderer:
+    with open_renderer(_shapes(scene), poses.shape[1], size, _opacity(scene).tolist()) as renderer:
         image = renderer.draw(poses, view, _lines(scene))
     heading = "   ".join([str(recording.notes.get("task", "")), recording.label(rank)]) if title is None else title
     data = io.BytesIO()
@@ -213,7 +213,8 @@ def _framed(points: np.ndarray, direction: np.ndarray, width: int) -> tuple[View
     size = (width, HEIGHTS[1] * width // WIDTH)
     pixels = fit(points, direction, size, FIELD_OF_VIEW).project(points, size)
     needed = float(np.ptp(pixels[:, 1]) / np.ptp(pixels[:, 0])) * width
-    height = int(np.clip(needed + 0.04 * width, *(limit * width // WIDTH for limit in HEIGHTS)))
+    least, most = (limit * width // WIDTH for limit in HEIGHTS)
+    height = min(max(round(needed + 0.04 * width), least), most)
     size = (width, height + height % 2)
     return fit(points, direction, size, FIELD_OF_VIEW), size
 

@@ -78,7 +78,7 @@ class Recorder:
         series: values by name, `group/quantity [unit]`, the same names in every frame. contact_points [m] and
         contact_forces [N] on the robot: world frame, (num_worlds, contacts_per_world, 3), or (contacts, 3) for one
         world, the same number in every frame. states: words by name, such as a phase, the same names in every frame.
-        commands: commanded velocities ahead, to the left [m/s] and about z [rad/s], (worlds, 3), in every frame or none.
+        commands: commanded velocities ahead, left [m/s] and about z [rad/s], (worlds, 3), in every frame or none.
         Raises InputError: time does not increase, a shape is wrong, or a name is malformed, new or missing.
         """
         if self._times and not time > self._times[-1]:
@@ -132,7 +132,7 @@ class Recorder:
     def recording(self, *, goals: np.ndarray | None = None, heights: np.ndarray | None = None) -> Recording:
         """Return a recording of all frames so far. Raises InputError: there is no frame.
 
-        goals [m]: on the ground, world frame, (worlds, goals, 3), NaN: none. heights [m]: commanded, (worlds,), NaN: none.
+        goals [m]: on the ground, world frame, (worlds, goals, 3); heights [m]: commanded, (worlds,); NaN: none.
         """
         if not self._times:
             raise InputError("nothing was recorded")

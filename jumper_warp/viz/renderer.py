@@ -17,6 +17,7 @@ import newton
 import numpy as np
 import warp as wp
 from newton.sensors import SensorCamera
+from scipy.spatial.transform import Rotation
 
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model, State
@@ -104,7 +105,7 @@ class Renderer(ABC):
     def _image(self, view: View, lines: Sequence[Line]) -> np.ndarray:
         """Return an image of `state`, as `draw`."""
 
-    def close(self) -> None:
+    def close(self) -> None:  # noqa: B027, nothing to free by default
         """Free the renderer's resources; it draws no more."""
 
     def __enter__(self) -> Renderer:
@@ -161,7 +162,8 @@ class RayTracer(Renderer):
         """As `Renderer`."""
         super().__init__(shapes, num_bodies, size, opacity)
         self._sensor = SensorCamera(self.model)
-        self._sensor.create_default_light(direction=wp.vec3(*(-np.array(SUN) / np.linalg.norm(SUN))))
+        rays: Any = wp.vec3(*(-np.array(SUN) / np.linalg.norm(SUN)))
+        self._sensor.create_default_light(direction=rays)
         self._sensor.set_ambient_light(AMBIENT)
         red, green, blue = (round(255 * channel) for channel in SKY)
         clear = SensorCamera.ClearData(clear_color=0xFF000000 | blue << 16 | green << 8 | red)
@@ -179,8 +181,8 @@ class RayTracer(Renderer):
                 *self.size, camera_fov=math.radians(view.field_of_view), sample_count=SAMPLES, device=self.model.device
             )
         right, up, ahead = view.axes()
-        turn: Any = wp.quat_from_matrix(wp.mat33(*np.stack([right, up, -ahead], axis=1).ravel().tolist()))
-        pose = wp.array([wp.transformf(wp.vec3(*map(float, view.eye)), turn)], dtype=wp.transformf)
+        quat = Rotation.from_matrix(np.stack([right, up, -ahead], axis=1)).as_quat()  # xyzw
+        pose = wp.array(np.concatenate([view.eye, quat])[None].astype(np.float32), dtype=wp.transformf)
         self.model.bvh_refit_shapes(self.state)
         self._sensor.update(self.state, pose, self._rays, color_image=self._pixels)
         colors: Any = SensorCamera.Utils.to_rgba_from_color(self._pixels)
@@ -239,7 +241,9 @@ def _segments(lines: Sequence[Line]) -> tuple[wp.array | None, wp.array | None, 
     if not lines:
         return None, None, None
     parts = [line.points[[0, -1]] if line.arrow else line.points for line in lines]
-    starts = np.concatenate([points[:-1] for points in parts])
-    ends = np.concatenate([points[1:] for points in parts])
-    colors = np.concatenate([np.tile(line.color, (len(points) - 1, 1)) for line, points in zip(lines, parts, strict=True)])
-    return tuple(wp.array(values.astype(np.float32), dtype=wp.vec3) for values in (starts, ends, colors))
+    colors = [np.tile(line.color, (len(points) - 1, 1)) for line, points in zip(lines, parts, strict=True)]
+    starts, ends, shades = (
+        wp.array(np.concatenate(values).astype(np.float32), dtype=wp.vec3)
+        for values in ([points[:-1] for points in parts], [points[1:] for points in parts], colors)
+    )
+    return starts, ends, shades

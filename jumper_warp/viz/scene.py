@@ -58,23 +58,31 @@ def fit(points: np.ndarray, direction: np.ndarray, size: tuple[int, int], field_
 
     direction: from the target to the eye, (3,), world frame; size: width and height of the image [px].
     """
-    middle = 0.5 * (points.min(axis=0) + points.max(axis=0))
+    target = 0.5 * (points.min(axis=0) + points.max(axis=0))
     unit = direction / np.linalg.norm(direction)
-    for _ in range(3):  # the second and third time around the middle of the image
-        low, high = 0.1, 200.0
-        for _ in range(40):
-            distance = 0.5 * (low + high)
-            view = View(middle + distance * unit, middle, field_of_view)
-            pixels = view.project(points, size) / size
-            fits = bool((np.abs(pixels - 0.5) <= 0.5 * MARGIN).all())  # false for points behind the eye, NaN
-            low, high = (low, distance) if fits else (distance, high)
-        view = View(middle + high * unit, middle, field_of_view)
+    for _ in range(2):  # then around the middle of the image
+        distance = _nearest(points, target, unit, size, field_of_view)
+        view = View(target + distance * unit, target, field_of_view)
         pixels = view.project(points, size)
         offset = 0.5 * (pixels.min(axis=0) + pixels.max(axis=0)) - 0.5 * np.array(size)
-        scale = 2.0 * high * np.tan(np.radians(0.5 * field_of_view)) / size[1]  # [m] of a pixel at the target
+        scale = 2.0 * distance * np.tan(np.radians(0.5 * field_of_view)) / size[1]  # [m] of a pixel at the target
         right, up, _ = view.axes()
-        middle = middle + scale * (offset[0] * right - offset[1] * up)
-    return View(middle + high * unit, middle, field_of_view)
+        target = target + scale * (offset[0] * right - offset[1] * up)
+    distance = _nearest(points, target, unit, size, field_of_view)
+    return View(target + distance * unit, target, field_of_view)
+
+
+def _nearest(
+    points: np.ndarray, target: np.ndarray, unit: np.ndarray, size: tuple[int, int], field_of_view: float
+) -> float:
+    """Return the least distance [m] from target to eye, along a unit vector, from which all points are in view."""
+    low, high = 0.1, 200.0
+    for _ in range(40):
+        distance = 0.5 * (low + high)
+        pixels = View(target + distance * unit, target, field_of_view).project(points, size) / size
+        fits = bool((np.abs(pixels - 0.5) <= 0.5 * MARGIN).all())  # false for points behind the eye, NaN
+        low, high = (low, distance) if fits else (distance, high)
+    return high
 
 
 def follow(paths: np.ndarray, dt: float) -> np.ndarray:
