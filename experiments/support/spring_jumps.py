@@ -56,6 +56,6 @@ class SpringJumps:
     def record(self, stiffness: float, squat: float, folder: Path) -> dict[str, float]:
         """Simulate one jump, write its recording, return `trace_metrics`; stiffness [N/m], squat [deg]: command."""
         sim = self.simulation(1, with_springs(stiffness, self.length))
-        trace, recorder, _ = simulate_jump(sim, {"spring_stiffness_n_m": stiffness, "squat_command_deg": squat}, squat)
+        trace, recorder = simulate_jump(sim, {"spring_stiffness_n_m": stiffness, "squat_command_deg": squat}, squat)
         recorder.save_rrd(folder / f"jump_{self.filter}.rrd")
         return trace_metrics(trace)
