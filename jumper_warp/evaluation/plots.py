@@ -20,7 +20,7 @@ import matplotlib.pyplot as plt
 from matplotlib.collections import PolyCollection
 
 STYLE = "jumper_warp.viz.jumper"  # Style sheet jumper_warp/viz/jumper.mplstyle
-FAILED = {"color": "black", "marker": "x", "linewidth": 1.0}  # Marks of failed trials
+FAILED = {"color": "black", "marker": "x", "linewidth": 1.0, "clip_on": False}  # Marks of failed trials
 BAND = {"color": "C2", "alpha": 0.15}  # Area of success
 WINDOW, MOST_WINDOWS, RESAMPLES = (5, 40), 100, 1000
 """Least and largest number of jumps in a window of the running mean; number of windows; bootstrap samples of each."""
@@ -63,6 +63,8 @@ def plot_sweep(
     labels: tuple[str, str], marks: tuple[str, str], title: str, conditions: str,
 ) -> None:  # fmt: skip
     """Plot reached over commanded values, and below them the errors with their running mean.
+
+    Errors beyond the lower axes are marked at its edge.
 
     commanded, reached [m], good (bool, success): (jumps,) each; tolerance [m]: largest error of a success; limit [m]:
     apexes of open-loop jumps of the same robots, (jumps,); trained [m]: ranges of commands by label; labels: of the
