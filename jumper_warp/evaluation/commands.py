@@ -7,7 +7,7 @@ import subprocess
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 
 import tyro
 from rich.console import Console
@@ -25,8 +25,9 @@ from jumper_warp.policies.skills import SkillNames
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
-from jumper_warp.viz.film import check_film, write_film
-from jumper_warp.viz.recording import Recording
+
+if TYPE_CHECKING:
+    from jumper_warp.viz.recording import Recording
 
 Flags = TypeVar("Flags")
 
@@ -99,10 +100,14 @@ class FilmCfg:
 
     def __post_init__(self) -> None:
         if self.video is not None:
+            from jumper_warp.viz.film import check_film
+
             check_film(self.video, self.size, self.fps, self.speed)
 
     def write(self, recording: Recording) -> Path:
         """Write the film; return its path."""
+        from jumper_warp.viz.film import write_film
+
         assert self.video is not None
         return write_film(recording, self.video, size=self.size, fps=self.fps, speed=self.speed, eye=self.eye)
 

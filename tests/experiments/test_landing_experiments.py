@@ -10,7 +10,6 @@ import pytest
 import torch
 
 from experiments import paper_tests
-from jumper_warp.evaluation.film import side_view
 from jumper_warp.evaluation.landings import LANDING_TERMINATIONS, LandingLog
 from jumper_warp.evaluation.log import run_evaluation, termination_names
 from jumper_warp.evaluation.plots import BasePaths
@@ -204,12 +203,6 @@ def test_platform_scenes_have_specified_ground_block_and_headings():
     assert near == pytest.approx(0.46) and far == pytest.approx(goals[:, 0] + 0.40)
     assert block.center[:, 1] == pytest.approx(goals[:, 1]) and not headings.any()
     assert [name for name, *_ in Platform(solver="mujoco").scenes(goals, rng)] == ["platform", "uneven"]
-
-
-def test_side_view_is_perpendicular_to_path():
-    eye, target = side_view(np.array([0.0, 0.0]), np.array([0.0, 1.0]))
-    assert target == pytest.approx([0.0, 0.5, 0.4])
-    assert eye == pytest.approx([2.4, 0.5, 0.75])
 
 
 # ---------------------------------------------------------------- real jumps
