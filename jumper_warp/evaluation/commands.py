@@ -99,7 +99,7 @@ class FilmCfg:
 
     def __post_init__(self) -> None:
         if self.video is not None:
-            check_film(self.video, self.size, self.fps, self.speed)
+            check_film(self.video, self.size, self.fps, self.speed, self.eye)
 
     def write(self, recording: Recording) -> Path:
         """Write the film; return its path."""

@@ -78,7 +78,9 @@ def test_body_follows_its_pose_and_a_fixed_shape_stays(one_ball):
 
 def test_field_of_view_and_eye_may_change_between_images(one_ball):
     far = View(np.array([-4.0, 0.0, 0.0]), np.zeros(3), 20.0)
-    heights = [np.ptp(np.nonzero(colored(one_ball.draw(poses((9.0, 0.0, 0.0)), view), BLUE))[0]) for view in (VIEW, far)]
+    heights = [
+        np.ptp(np.nonzero(colored(one_ball.draw(poses((9.0, 0.0, 0.0)), view), BLUE))[0]) for view in (VIEW, far)
+    ]
     focal = 0.5 * SIZE[1] / math.tan(math.radians(10.0))
     assert heights == pytest.approx([2.0 * FOCAL * RADIUS / 2.0 - 1.0, 2.0 * focal * RADIUS / 4.0 - 1.0], abs=1.5)
 
@@ -96,7 +98,9 @@ def test_copies_are_drawn_at_their_poses_and_fixed_shapes_once(kind):
     with kind([BALL, FIXED], 1, SIZE, (1.0, 1.0)) as renderer:
         assert renderer.model.shape_count == 3
         columns = np.nonzero(colored(renderer.draw(poses((0.0, 0.6, 0.0), (0.0, -0.6, 0.0)), VIEW), RED))[1]
-    assert (columns < 40).sum() == pytest.approx((columns > 56).sum(), abs=12) and not ((columns > 40) & (columns < 56)).any()
+    assert (columns < 40).sum() == pytest.approx((columns > 56).sum(), abs=12) and not (
+        (columns > 40) & (columns < 56)
+    ).any()
 
 
 def test_opacity_mixes_a_copy_with_what_is_behind(opengl):
@@ -150,7 +154,9 @@ def test_points_behind_the_eye_have_no_pixel():
 
 @pytest.mark.parametrize("eye", [(0.0, 0.0, 2.0), (1.0, 2.0, 3.0)])
 def test_vertical_view_is_refused_in_one_line(one_ball, eye):
-    with pytest.raises(InputError, match=r"^cannot look from \(\S+, \S+, \S+\) to .*: no horizontal distance$") as error:
+    with pytest.raises(
+        InputError, match=r"^cannot look from \(\S+, \S+, \S+\) to .*: no horizontal distance$"
+    ) as error:
         one_ball.draw(poses((0.0, 0.0, 0.0)), View(np.array(eye), np.array([*eye[:2], 0.0])))
     assert "float" not in str(error.value)
 

@@ -36,7 +36,9 @@ def test_fitted_view_shows_all_points_and_no_nearer_view_does(direction, extent)
     points = np.random.default_rng(3).uniform(-0.5, 0.5, (40, 3)) * extent + [4.0, -2.0, 1.0]
     view = fit(points, np.array(direction), SIZE, 25.0)
     ahead = view.target - view.eye
-    assert np.cross(ahead, direction) == pytest.approx(0.0, abs=1e-6 * np.linalg.norm(ahead)) and ahead @ direction < 0.0
+    assert (
+        np.cross(ahead, direction) == pytest.approx(0.0, abs=1e-6 * np.linalg.norm(ahead)) and ahead @ direction < 0.0
+    )
     assert out_of_view(points, view, view.eye) <= 1.0 + 1e-6
     assert out_of_view(points, view, view.eye + 0.03 * ahead) > 1.0
 
@@ -51,7 +53,9 @@ def test_fitted_points_are_in_the_middle_of_the_image():
 def test_boxes_around_robots_end_at_the_ground():
     bases = np.array([[0.0, 0.0, 0.3], [2.0, 1.0, 0.9]])
     around = corners(bases, ground=0.0)
-    assert around.min(axis=0) == pytest.approx([-0.45, -0.45, 0.0]) and around.max(axis=0) == pytest.approx([2.45, 1.45, 1.15])
+    assert around.min(axis=0) == pytest.approx([-0.45, -0.45, 0.0]) and around.max(axis=0) == pytest.approx(
+        [2.45, 1.45, 1.15]
+    )
 
 
 def test_camera_rests_while_the_robot_moves_within_the_dead_zone():
