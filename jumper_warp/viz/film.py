@@ -18,7 +18,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.viz.props import goal_shapes
 from jumper_warp.viz.recording import Recording
 from jumper_warp.viz.renderer import Line, View, open_renderer
-from jumper_warp.viz.scene import Label, annotate, body_paths, corners, fit, follow, velocity_arrows
+from jumper_warp.viz.scene import Label, annotate, body_paths, corners, fit, follow, velocity_arrows, without_divergence
 from jumper_warp.viz.shapes import ShapeMesh
 from jumper_warp.viz.style import BASE_COLOR, LEG_COLORS
 
@@ -52,6 +52,7 @@ def write_film(
     if path.suffix != ".mp4" and len(times) > MAX_FRAMES:
         raise InputError(f"{path}: {len(times)} frames are too many for {path.suffix}; up to {MAX_FRAMES}, or use .mp4")
     ranks = range(len(recording.worlds)) if ranks is None else ranks
+    recording = without_divergence(recording)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{os.getpid()}.{path.name}")
     encode = _encode_mp4 if path.suffix == ".mp4" else _encode_animation
@@ -135,7 +136,7 @@ def _view(paths: np.ndarray, size: tuple[int, int], eye: Sequence[float] | None)
     """
     if eye is not None:
         return View(np.asarray(eye, dtype=float), np.zeros(3))
-    return fit(corners(np.nan_to_num(paths)), np.array(DIRECTION), size)
+    return fit(corners(paths), np.array(DIRECTION), size)
 
 
 def _lines(recording: Recording, paths: np.ndarray, bases: np.ndarray, frame: int, ranks: Sequence[int]) -> list[Line]:

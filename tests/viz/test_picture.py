@@ -160,12 +160,12 @@ def test_recording_that_ends_in_flight_shows_no_moment_twice():
     assert len(set(frames)) == len(frames) and frames[-1] == APEX - 1
 
 
-@pytest.mark.parametrize("distance", [0.0, 1.5])
-@pytest.mark.parametrize("first", [TAKEOFF + 5, TOUCHDOWN + 3])
-def test_diverged_robot_is_shown_until_then(tmp_path, distance, first):
+@pytest.mark.parametrize("value", [np.nan, 1.0e9])
+@pytest.mark.parametrize(("distance", "first"), [(0.0, TAKEOFF + 5), (1.5, TOUCHDOWN + 3)])
+def test_diverged_robot_is_shown_until_then(tmp_path, distance, first, value):
     recording = jump_recording(distance)
     for values in (recording.poses, recording.contact_points, recording.contact_forces):
-        values[first:] = np.nan
+        values[first:] = value
     assert compose(recording).frames.max() < first
     with Image.open(write_picture(recording, tmp_path / "lost.png", width=WIDTH)) as image:
         assert image.size[0] == WIDTH and colored(image, 1).any()
@@ -174,7 +174,7 @@ def test_diverged_robot_is_shown_until_then(tmp_path, distance, first):
 def test_recording_without_a_finite_pose_is_refused_in_one_line_and_still_written_for_the_viewer(tmp_path):
     recording = jump_recording()
     recording.poses[:] = np.nan
-    with pytest.raises(InputError, match="world_0 has no finite pose") as error:
+    with pytest.raises(InputError, match="world_0 has no finite pose in its first frame") as error:
         save_recording(recording, tmp_path, "lost")
     assert "\n" not in str(error.value) and [file.name for file in tmp_path.iterdir()] == ["lost.rrd"]
 
