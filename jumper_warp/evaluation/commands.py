@@ -102,7 +102,7 @@ class FilmCfg:
         if self.video is not None:
             from jumper_warp.viz.film import check_film
 
-            check_film(self.video, self.size, self.fps, self.speed)
+            check_film(self.video, self.size, self.fps, self.speed, self.eye)
 
     def write(self, recording: Recording) -> Path:
         """Write the film; return its path."""

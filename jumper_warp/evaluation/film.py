@@ -113,8 +113,9 @@ def save_recording(recording: Recording, folder: Path, name: str) -> Path:
     from jumper_warp.viz.picture import write_picture
     from jumper_warp.viz.rerun import write_rrd
 
+    path = write_rrd(recording, folder / f"{name}.rrd")
     write_picture(recording, folder / f"{name}.png", rank=round(SHOWN * (len(recording.worlds) - 1)))
-    return write_rrd(recording, folder / f"{name}.rrd")
+    return path
 
 
 def block_positions(sim: Simulation) -> np.ndarray:

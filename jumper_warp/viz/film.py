@@ -18,12 +18,14 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.viz.props import goal_shapes
 from jumper_warp.viz.recording import Recording
 from jumper_warp.viz.renderer import Line, View, open_renderer
-from jumper_warp.viz.scene import Label, annotate, body_paths, corners, fit, follow, velocity_arrows
+from jumper_warp.viz.scene import Label, annotate, body_paths, corners, fit, follow, velocity_arrows, without_divergence
+from jumper_warp.viz.shapes import ShapeMesh
 from jumper_warp.viz.style import BASE_COLOR, LEG_COLORS
 
 SUFFIXES = (".mp4", ".webp", ".gif")
 DIRECTION = (0.62, -1.0, 0.28)  # from the robots to the eye, world frame: on their right, ahead, above
 MAX_FRAMES = 1800  # of WebP and GIF, which are encoded in memory
+GIF_FPS = 50.0  # [1/s] most frames per second of a GIF: players slow down images that are shorter than 20 ms
 TRAIL_SECONDS = 1.5  # [s] length of the trails of base and paws
 
 
@@ -45,11 +47,12 @@ def write_film(
     Raises InputError: as `check_film`, or too many frames for the format; OSError.
     """
     path, size = Path(path), (size[0] + size[0] % 2, size[1] + size[1] % 2)
-    check_film(path, size, fps, speed)
+    check_film(path, size, fps, speed, eye)
     times = np.arange(recording.times[0], recording.times[-1] + 1.0e-9, speed / fps)
     if path.suffix != ".mp4" and len(times) > MAX_FRAMES:
         raise InputError(f"{path}: {len(times)} frames are too many for {path.suffix}; up to {MAX_FRAMES}, or use .mp4")
     ranks = range(len(recording.worlds)) if ranks is None else ranks
+    recording = without_divergence(recording)
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{os.getpid()}.{path.name}")
     encode = _encode_mp4 if path.suffix == ".mp4" else _encode_animation
@@ -61,7 +64,7 @@ def write_film(
     return path
 
 
-def check_film(path: Path, size: tuple[int, int], fps: float, speed: float) -> None:
+def check_film(path: Path, size: tuple[int, int], fps: float, speed: float, eye: Sequence[float] | None = None) -> None:
     """Raise InputError unless a film can be written with these arguments of `write_film`."""
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: a film ends with {', '.join(SUFFIXES)}")
@@ -69,6 +72,10 @@ def check_film(path: Path, size: tuple[int, int], fps: float, speed: float) -> N
         raise InputError("MP4 films need imageio-ffmpeg: pip install jumper-warp[video]")
     if not (64 <= min(size) and max(size) <= 7680 and 0.0 < fps <= 240.0 and 0.0 < speed <= 100.0):
         raise InputError(f"a film needs 64 to 7680 px, fps in (0, 240], speed in (0, 100]; got {size}, {fps}, {speed}")
+    if path.suffix == ".gif" and fps > GIF_FPS:
+        raise InputError(f"{path}: a GIF shows up to {GIF_FPS:g} frames per second, got {fps:g}")
+    if eye is not None:
+        _view(np.zeros((0, 0, 3)), size, eye).axes()
 
 
 def _images(
@@ -80,17 +87,29 @@ def _images(
     poses, paths = drawn_poses(recording, times), body_paths(recording, ranks)
     targets = follow(paths, float(np.mean(np.diff(recording.times))) if len(recording.times) > 1 else 1.0)
     frame_view = _view(paths - targets[:, None], size, eye)
-    shapes = [*recording.shapes, *goal_shapes(recording)]
+    targets, bases = _interpolated(recording, targets, times), _interpolated(recording, paths, times)
     console = Console(stderr=True)
-    with open_renderer(shapes, len(recording.bodies), size) as renderer:
+    with open_renderer(_shapes(recording, ranks), len(recording.bodies), size) as renderer:
         title = f"{name}, {renderer.name}"
-        for frame, time, pose in track(
-            zip(frames, times, poses, strict=True), title, len(times), console=console, disable=not sys.stderr.isatty()
-        ):
-            view = View(targets[frame] + frame_view.eye, targets[frame] + frame_view.target)
-            image = renderer.draw(pose, view, _lines(recording, paths, frame, ranks))
-            labels = [] if len(ranks) == 1 else _world_labels(recording, paths[frame], ranks)
+        bar = track(range(len(times)), title, console=console, disable=not sys.stderr.isatty())
+        for i, frame, time in zip(bar, frames, times, strict=True):
+            view = View(targets[i] + frame_view.eye, targets[i] + frame_view.target)
+            image = renderer.draw(poses[i], view, _lines(recording, paths, bases[i], frame, ranks))
+            labels = [] if len(ranks) == 1 else _world_labels(recording, bases[i], ranks)
             yield annotate(image, view, labels, _heading(recording, time, ranks))
+
+
+def _shapes(recording: Recording, ranks: Sequence[int]) -> list[ShapeMesh]:
+    """Return the shapes of some worlds, of their goals, and those that all worlds share."""
+    bodies = {-1}.union(*(recording.body_indices(rank) for rank in ranks))
+    goals = [shape for shape in goal_shapes(recording) if int(shape.name.split("_")[1]) in ranks]
+    return [shape for shape in recording.shapes if shape.body in bodies] + goals
+
+
+def _interpolated(recording: Recording, values: np.ndarray, times: np.ndarray) -> np.ndarray:
+    """Return values of the recording's frames, (num_frames, ...), at times [s], (times, ...)."""
+    columns = [np.interp(times, recording.times, column) for column in values.reshape(len(values), -1).T]
+    return np.stack(columns, axis=1).reshape(len(times), *values.shape[1:])
 
 
 def drawn_poses(recording: Recording, times: np.ndarray) -> np.ndarray:
@@ -117,22 +136,22 @@ def _view(paths: np.ndarray, size: tuple[int, int], eye: Sequence[float] | None)
     """
     if eye is not None:
         return View(np.asarray(eye, dtype=float), np.zeros(3))
-    return fit(corners(np.nan_to_num(paths)), np.array(DIRECTION), size)
+    return fit(corners(paths), np.array(DIRECTION), size)
 
 
-def _lines(recording: Recording, paths: np.ndarray, frame: int, ranks: Sequence[int]) -> list[Line]:
+def _lines(recording: Recording, paths: np.ndarray, bases: np.ndarray, frame: int, ranks: Sequence[int]) -> list[Line]:
     """Return trails of base and paws up to a frame, and arrows of commanded and actual velocity.
 
-    paths: base positions as drawn [m], (num_frames, worlds, 3).
+    paths: base positions as drawn [m], (num_frames, worlds, 3); bases: at the image's time [m], (worlds, 3).
     """
     first = int(np.searchsorted(recording.times, recording.times[frame] - TRAIL_SECONDS))
     lines = []
-    for rank, path in zip(ranks, np.moveaxis(paths, 1, 0), strict=True):
+    for rank, path, base in zip(ranks, np.moveaxis(paths, 1, 0), bases, strict=True):
         paws = recording.contact_points[first : frame + 1, rank] + [0.0, recording.spacing * rank, 0.0]
         if frame > first:
             lines.append(Line(path[first : frame + 1], BASE_COLOR))
             lines += [Line(paws[:, leg], color) for leg, color in enumerate(LEG_COLORS.values()) if leg < paws.shape[1]]
-        lines += velocity_arrows(recording, frame, rank, path[frame] + [0.0, 0.0, 0.3])
+        lines += velocity_arrows(recording, frame, rank, base + [0.0, 0.0, 0.3])
     return lines
 
 
@@ -167,8 +186,8 @@ def _encode_mp4(path: Path, images: Iterator[Image.Image], size: tuple[int, int]
 def _encode_animation(path: Path, images: Iterator[Image.Image], size: tuple[int, int], fps: float, count: int) -> None:
     """Write images as animated WebP or GIF that repeats, by the path's suffix."""
     pictures = list(images)
-    duration = 1000.0 / fps  # [ms]
-    ends = np.round(duration * np.arange(count + 1)).astype(int)
-    durations = np.diff(ends).tolist()
+    tick = 10 if path.suffix == ".gif" else 1  # [ms] unit of the durations in the file
+    ends = tick * np.round(1000.0 / fps / tick * np.arange(count + 1)).astype(int)
+    durations = np.diff(ends).tolist()  # [ms]
     options: dict[str, Any] = {"quality": 75, "method": 4} if path.suffix == ".webp" else {"optimize": True}
     pictures[0].save(path, save_all=True, append_images=pictures[1:], duration=durations, loop=0, **options)

@@ -13,7 +13,7 @@ from jumper_warp.utils.files import write_atomically
 from jumper_warp.viz.props import goal_shapes
 from jumper_warp.viz.recording import Recording
 from jumper_warp.viz.renderer import Line, View, open_renderer
-from jumper_warp.viz.scene import Label, annotate, corners, fit, velocity_arrows
+from jumper_warp.viz.scene import Label, annotate, corners, fit, valid_frames, velocity_arrows
 from jumper_warp.viz.shapes import ShapeMesh
 from jumper_warp.viz.style import BASE_COLOR, GOAL_COLOR
 
@@ -84,7 +84,15 @@ class Composition:
 
 
 def compose(recording: Recording, rank: int = 0) -> Composition:
-    """Return the composition of the rank-th recorded world. A robot that stays in place is spread to the right."""
+    """Return the composition of the rank-th recorded world. A robot that stays in place is spread to the right.
+
+    Frames after `valid_frames` are left out. Raises InputError: no frame is left.
+    """
+    count = valid_frames(recording, rank)
+    if count == 0:
+        raise InputError(f"{recording.label(rank)} has no finite pose in its first frame, so there is no picture")
+    fields = ("times", "poses", "contact_points", "contact_forces", "commands")
+    recording = replace(recording, **{name: getattr(recording, name)[:count] for name in fields})
     base = recording.body_poses(rank)[:, 0, :3].astype(float)
     displacement = base[-1, :2] - base[0, :2]
     distance = float(np.linalg.norm(displacement))
@@ -99,6 +107,7 @@ def compose(recording: Recording, rank: int = 0) -> Composition:
         frames = _events(base[:, 2], *flights[0])
     else:
         frames = _evenly_moved(recording.body_poses(rank), 6)
+    frames = np.unique(frames)
     shift = SPREAD * (np.arange(len(frames)) - 0.5 * (len(frames) - 1)) if stays else np.zeros(len(frames))
     return Composition(recording, rank, base, right, frames, flights, shift)
 
@@ -247,11 +256,11 @@ def _lines(scene: Composition) -> list[Line]:
 
 
 def _ticks(scene: Composition) -> np.ndarray:
-    """Return the heights [m] of the scale's marks: every 0.25 m up to the highest base; none without ground."""
+    """Return the heights [m] of the scale's marks: every 0.25 m, or more above 1.5 m; none without ground."""
     if not scene.grounded:
         return np.zeros(0)
     top = max(float(scene.bases[:, 2].max()), *scene.heights, 0.25)
-    step = 0.25 if top < 1.5 else 0.5
+    step = 0.25 * 2.0 ** max(0.0, np.floor(np.log2(top / 1.5)) + 1.0)
     return np.arange(0.0, top + 0.1, step)
 
 

@@ -52,7 +52,8 @@ class View:
         ahead = np.asarray(self.target, dtype=float) - np.asarray(self.eye, dtype=float)
         right = np.cross(ahead, [0.0, 0.0, 1.0])
         if np.linalg.norm(right) < 1.0e-6 * max(1.0, float(np.linalg.norm(ahead))):
-            raise InputError(f"cannot look from {tuple(self.eye)} to {tuple(self.target)}: no horizontal distance")
+            eye, target = (tuple(np.asarray(point, dtype=float).tolist()) for point in (self.eye, self.target))
+            raise InputError(f"cannot look from {eye} to {target}: no horizontal distance")
         ahead, right = ahead / np.linalg.norm(ahead), right / np.linalg.norm(right)
         return np.stack([right, np.cross(right, ahead), ahead])
 
@@ -97,7 +98,9 @@ class Renderer(ABC):
         """Return an image, (height, width, 3) uint8, RGB, row 0 on top.
 
         poses: of the bodies of every copy, (copies * num_bodies, 7), position [m] and quaternion xyzw, world frame.
+        Raises InputError: a vertical view.
         """
+        view.axes()  # OpenGL's camera would turn a vertical view without an error
         self.state.body_q.assign(np.ascontiguousarray(poses, dtype=np.float32).reshape(-1, 7))
         return self._image(view, lines)
 
@@ -196,7 +199,8 @@ def open_renderer(
     try:
         return GLRenderer(shapes, num_bodies, size, opacity)
     except (ImportError, RuntimeError, OSError) as error:
-        print(f"no OpenGL ({error!s:.100}), so the slow ray tracer draws: {NO_GL}", file=sys.stderr)
+        reason = " ".join(str(error).split())[:100]
+        print(f"no OpenGL ({reason}), so the slow ray tracer draws: {NO_GL}", file=sys.stderr)
         return RayTracer(shapes, num_bodies, size, opacity)
 
 

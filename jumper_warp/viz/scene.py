@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import matplotlib
@@ -20,8 +20,9 @@ ABOVE = 0.25  # [m] free space above the base
 DEAD_ZONE = np.array([0.25, 0.25, 0.20])  # [m] how far a robot moves from the target before the camera follows
 SMOOTHING = 0.25  # [s] standard deviation of the filter of the camera's motion
 ARROW_SECONDS = 0.6  # [s] length of an arrow over the velocity that it shows
-SLOWEST = 0.02  # [m/s] below which no arrow is drawn
+SLOWEST = 0.05  # [m/s] below which no arrow is drawn
 VELOCITY_WINDOW = 0.2  # [s] over which the actual velocity is averaged
+FAR = 100.0  # [m] from the start, beyond which the simulation of a robot has diverged
 MARGIN = 0.94  # fraction of the image that robots may fill
 
 
@@ -34,9 +35,32 @@ class Label:
     anchor: str = "md"  # Pillow's anchor: middle of the text's bottom at the point
 
 
+def valid_frames(recording: Recording, rank: int) -> int:
+    """Return the number of frames before a world's first pose that is not finite, or FAR from its start."""
+    poses = recording.body_poses(rank)
+    start = np.append(poses[0, 0, :3], np.zeros(4))
+    near = (np.abs(poses - start) < FAR).all(axis=(1, 2))  # false for NaN
+    return int(np.argmin(np.append(near, False)))
+
+
+def without_divergence(recording: Recording) -> Recording:
+    """Return the recording with poses and contact points of NaN, which are not drawn, after `valid_frames`."""
+    poses, points = recording.poses.copy(), recording.contact_points.copy()
+    for rank in range(len(recording.worlds)):
+        count = valid_frames(recording, rank)
+        poses[count:, recording.body_indices(rank)], points[count:, rank] = np.nan, np.nan
+    return replace(recording, poses=poses, contact_points=points)
+
+
 def body_paths(recording: Recording, ranks: Sequence[int]) -> np.ndarray:
-    """Return base positions as drawn [m], (num_frames, worlds, 3): world frame, consecutive worlds apart in y."""
+    """Return base positions as drawn [m], (num_frames, worlds, 3): world frame, consecutive worlds apart in y.
+
+    A robot whose simulation diverges keeps its last valid position, or the origin.
+    """
     paths = np.stack([recording.body_poses(rank)[:, 0, :3] for rank in ranks], axis=1).astype(float)
+    for i, rank in enumerate(ranks):
+        count = valid_frames(recording, rank)
+        paths[count:, i] = paths[count - 1, i] if count else 0.0
     return paths + recording.spacing * np.array(ranks)[:, None] * np.array([0.0, 1.0, 0.0])
 
 
@@ -91,7 +115,7 @@ def follow(paths: np.ndarray, dt: float) -> np.ndarray:
     paths: base positions [m], (num_frames, worlds, 3); dt [s]: between frames. The target moves smoothly, and only
     while the robots' mean position is further than DEAD_ZONE from it.
     """
-    middle = np.nan_to_num(paths).mean(axis=1)
+    middle = paths.mean(axis=1)
     target, targets = middle[0], []
     for position in middle:
         target = position + np.clip(target - position, -DEAD_ZONE, DEAD_ZONE)
@@ -104,7 +128,7 @@ def velocity_arrows(recording: Recording, frame: int, rank: int, start: np.ndarr
 
     The actual velocity is the mean over VELOCITY_WINDOW.
     """
-    if not len(recording.commands):
+    if not len(recording.commands) or not np.isfinite(recording.commands[frame, rank]).all():
         return []
     poses = recording.poses[:, recording.body_indices(rank)[0]].astype(float)
     x, y, z, w = poses[frame, 3:]
@@ -118,7 +142,7 @@ def velocity_arrows(recording: Recording, frame: int, rank: int, start: np.ndarr
     return [
         Line(np.stack([start, start + ARROW_SECONDS * velocity]) + [0.0, 0.0, above], color, arrow=True)
         for velocity, color, above in arrows
-        if np.linalg.norm(np.nan_to_num(velocity)) > SLOWEST
+        if np.linalg.norm(velocity) > SLOWEST
     ]
 
 

@@ -1,0 +1,210 @@
+"""Composite pictures of hand-made jumps and walks."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from PIL import Image
+from scipy import ndimage
+
+from box_robot import GREEN, RATE, STANDING, box_recording, colored, pinhole, walk
+from jumper_warp.evaluation.film import save_recording
+from jumper_warp.utils.errors import InputError
+from jumper_warp.viz import picture
+from jumper_warp.viz.picture import GAP, MOST, SIDE_BY_SIDE, SPREAD, compose, write_picture
+from jumper_warp.viz.props import with_blocks
+
+GRAVITY = 9.81  # [m/s²]
+SQUAT, TAKEOFF, APEX, TOUCHDOWN, REST = 12, 20, 44, 68, 88  # frames of `jump`
+WIDTH = 240  # [px]
+
+
+def jump(distance=0.0):
+    """Return base positions [m], (89, 3), and paw force [N], (89,), of a jump: squat, push, flight, landing, rest.
+
+    The base moves by a distance [m] along x during the flight.
+    """
+    knots = ([0, SQUAT, TAKEOFF], [STANDING, 0.18, STANDING])
+    height = np.interp(np.arange(REST + 1.0), *knots)
+    flight = np.arange(TAKEOFF, TOUCHDOWN + 1)
+    time = (flight - TAKEOFF) / RATE
+    height[flight] += 0.5 * GRAVITY * time * ((TOUCHDOWN - TAKEOFF) / RATE - time)
+    height[TOUCHDOWN + 1 :] = np.interp(np.arange(TOUCHDOWN + 1, REST + 1), [TOUCHDOWN, 76, REST], [0.3, 0.22, 0.3])
+    along = np.interp(np.arange(REST + 1), [TAKEOFF, TOUCHDOWN], [0.0, distance])
+    force = np.full(REST + 1, 150.0)
+    force[flight] = 0.0
+    return np.stack([along, 0.0 * along, height], axis=1), force
+
+
+def jump_recording(distance=0.0, **fields):
+    """Return a recording of `jump`."""
+    positions, forces = jump(distance)
+    return box_recording(positions, forces=forces, **fields)
+
+
+def test_jump_in_place_is_shown_from_squat_to_rest_and_spread():
+    scene = compose(jump_recording())
+    assert list(scene.frames[[0, 1, 3, 5, 6]]) == [SQUAT, TAKEOFF, APEX, TOUCHDOWN, REST]
+    assert TAKEOFF < scene.frames[2] < APEX < scene.frames[4] < TOUCHDOWN
+    assert scene.flights == [(TAKEOFF, TOUCHDOWN)]
+    assert np.diff(scene.bases[:, 0]) == pytest.approx(SPREAD) and scene.shift.mean() == pytest.approx(0.0)
+    assert scene.bases[:, 2] == pytest.approx(jump()[0][scene.frames, 2], abs=1e-6)
+
+
+@pytest.mark.parametrize("heading", [0.0, 2.0])
+def test_horizontal_jump_keeps_its_places_and_runs_to_the_right(heading):
+    positions, forces = jump(1.5)
+    turned = np.array([[np.cos(heading), np.sin(heading), 0.0], [-np.sin(heading), np.cos(heading), 0.0], [0, 0, 1.0]])
+    scene = compose(box_recording(positions @ turned, forces=forces))
+    assert not scene.shift.any()
+    assert scene.right == pytest.approx(turned[0], abs=1e-6)
+    assert scene.bases == pytest.approx((positions @ turned)[scene.frames], abs=1e-6)
+    assert {0, APEX, REST} <= set(scene.frames) and len(scene.frames) <= MOST
+    distance = np.linalg.norm(scene.bases[:, None] - scene.bases, axis=-1)
+    assert distance[~np.eye(len(distance), dtype=bool)].min() >= GAP - 1e-6  # [m]
+
+
+def test_each_of_two_jumps_in_a_row_has_its_apex():
+    positions, forces = jump(1.0)
+    twice = np.concatenate([positions, positions + [1.0, 0.0, 0.0]])
+    scene = compose(box_recording(twice, forces=np.tile(forces, 2)))
+    second = REST + 1
+    assert scene.flights == [(TAKEOFF, TOUCHDOWN), (second + TAKEOFF, second + TOUCHDOWN)]
+    assert {APEX, second + APEX} <= set(scene.frames)
+
+
+def test_lifted_paws_without_rise_are_no_jump():
+    forces = np.full(61, 100.0)
+    forces[10:20] = 0.0  # a trot with a flight phase
+    assert compose(box_recording(walk(2.0, 1.0), forces=forces)).flights == []
+
+
+@pytest.mark.parametrize(("distance", "moments"), [(0.7, 2), (2.5, 4), (4.0, 6), (9.0, MOST)])
+def test_moments_of_a_walk_are_side_by_side(distance, moments):
+    scene = compose(box_recording(walk(distance, 5.0)))
+    gaps = np.diff(scene.bases[:, 0])
+    assert len(scene.frames) == moments and not scene.shift.any()
+    assert gaps.min() >= min(SIDE_BY_SIDE, 0.95 * distance) - 0.05 and gaps.max() < 1.1 * gaps.min()
+
+
+def test_apex_is_opaque_and_moments_behind_others_are_not():
+    for distance in (0.0, 0.7, 1.5):
+        scene = compose(jump_recording(distance))
+        opacity = picture._opacity(scene)
+        assert opacity[list(scene.frames).index(APEX)] == 1.0
+        assert (opacity < 1.0).any() == (distance > 0.0)
+
+
+def test_moments_are_drawn_at_their_places(tmp_path):
+    path = write_picture(jump_recording(), tmp_path / "jump.png", width=640)
+    with Image.open(path) as image:
+        _, blobs = ndimage.label(ndimage.binary_opening(colored(image, 1), iterations=2))
+    assert blobs == 7
+
+
+def test_later_world_is_drawn_at_its_true_place_with_its_goal_and_height(tmp_path, monkeypatch):
+    positions, forces = jump(1.5)
+    places = np.stack([0.0 * positions + [0.0, 0.0, 0.3], positions], axis=1)
+    goals = np.array([[[0.4, 0.0, 0.0]], [[1.5, 0.1, 0.0]]])
+    recording = box_recording(places, forces=forces, spacing=2.0, goals=goals, heights=np.array([0.5, 0.9]))
+    drawn = []
+    opened = picture.open_renderer
+
+    def spy(shapes, num_bodies, size, opacity):
+        renderer = opened(shapes, num_bodies, size, opacity)
+        draw = renderer.draw
+
+        def keep(poses, view, lines):
+            drawn.append((shapes, size, poses, view))
+            return draw(poses, view, lines)
+
+        renderer.draw = keep
+        return renderer
+
+    monkeypatch.setattr(picture, "open_renderer", spy)
+    write_picture(recording, tmp_path / "jump.png", rank=1, width=WIDTH)
+    ((shapes, size, poses, view),) = drawn
+    assert poses[:, 0, :3] == pytest.approx(positions[compose(recording, 1).frames], abs=1e-6)
+    (ring,) = (shape for shape in shapes if shape.name.startswith("goal"))
+    assert ring.vertices[:, :2].mean(axis=0) == pytest.approx([1.5, 0.1], abs=1e-5)
+    assert sum(shape.color == GREEN for shape in shapes) == 1  # the other world's robot is not drawn
+    pixels = pinhole(np.concatenate([poses[:, 0, :3], goals[1]]), view.eye, view.target, view.field_of_view, size)
+    assert (pixels > 0.0).all() and (pixels < size).all()
+    assert (np.diff(pixels[:-1, 0]) > 0.0).all()  # from left to right
+    assert list(compose(recording, 1).heights) == [pytest.approx(0.9)]
+
+
+def test_blocks_move_with_their_world_and_do_not_change_the_moments(tmp_path):
+    positions, forces = jump(1.5)
+    recording = box_recording(np.stack([positions, positions], axis=1), forces=forces)
+    centers = np.tile([1.5, 0.0], (REST + 1, 2, 1))
+    shown = with_blocks(recording, centers, np.full((2, 2), 0.3), np.array([0.1, 0.1]))
+    for rank in (0, 1):
+        np.testing.assert_array_equal(compose(shown, rank).frames, compose(recording, rank).frames)
+        with Image.open(write_picture(shown, tmp_path / "block.png", rank=rank, width=WIDTH)) as image:
+            assert image.size[0] == WIDTH and colored(image, 1).any()
+
+
+@pytest.mark.parametrize("frames", [1, 2, 30])
+def test_robot_that_never_moves_is_shown_once(tmp_path, frames):
+    recording = box_recording(np.tile([1.0, 2.0, STANDING], (frames, 1)))
+    assert list(compose(recording).frames) == [0]
+    with Image.open(write_picture(recording, tmp_path / "still.png", width=WIDTH)) as image:
+        assert image.size[0] == WIDTH and colored(image, 1).any()
+
+
+def test_recording_that_ends_in_flight_shows_no_moment_twice():
+    recording = jump_recording()
+    part = {name: getattr(recording, name)[:APEX] for name in ("times", "poses", "contact_points", "contact_forces")}
+    frames = compose(replace(recording, **part)).frames
+    assert len(set(frames)) == len(frames) and frames[-1] == APEX - 1
+
+
+@pytest.mark.parametrize("value", [np.nan, 1.0e9])
+@pytest.mark.parametrize(("distance", "first"), [(0.0, TAKEOFF + 5), (1.5, TOUCHDOWN + 3)])
+def test_diverged_robot_is_shown_until_then(tmp_path, distance, first, value):
+    recording = jump_recording(distance)
+    for values in (recording.poses, recording.contact_points, recording.contact_forces):
+        values[first:] = value
+    assert compose(recording).frames.max() < first
+    with Image.open(write_picture(recording, tmp_path / "lost.png", width=WIDTH)) as image:
+        assert image.size[0] == WIDTH and colored(image, 1).any()
+
+
+def test_recording_without_a_finite_pose_is_refused_in_one_line_and_still_written_for_the_viewer(tmp_path):
+    recording = jump_recording()
+    recording.poses[:] = np.nan
+    with pytest.raises(InputError, match="world_0 has no finite pose in its first frame") as error:
+        save_recording(recording, tmp_path, "lost")
+    assert "\n" not in str(error.value) and [file.name for file in tmp_path.iterdir()] == ["lost.rrd"]
+
+
+@pytest.mark.parametrize(("suffix", "kind"), [(".png", "PNG"), (".webp", "WEBP"), (".jpg", "JPEG")])
+def test_file_has_the_format_of_its_suffix_and_the_width(tmp_path, suffix, kind):
+    path = write_picture(jump_recording(1.5), tmp_path / "new" / f"jump{suffix}", width=WIDTH + 1)
+    with Image.open(path) as image:
+        assert (image.format, image.size[0]) == (kind, WIDTH + 1)
+    assert [file.name for file in path.parent.iterdir()] == [path.name]
+
+
+@pytest.mark.parametrize(
+    ("name", "width"), [("jump.gif", 240), ("jump", 240), ("jump.png", 199), ("jump.png", 8001), ("jump.png", -1)]
+)
+def test_bad_suffix_and_width_are_refused_before_drawing(tmp_path, monkeypatch, name, width):
+    monkeypatch.setattr(picture, "open_renderer", None)
+    with pytest.raises(
+        InputError, match=rf"{name}: a picture ends with \.png, \.webp, \.jpg and is 200 to 8000 px wide"
+    ):
+        write_picture(jump_recording(), tmp_path / name, width=width)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("angle", "toward"), [(0.0, (0.0, -1.0)), (90.0, (1.0, 0.0))])
+def test_eye_stands_on_the_right_of_the_path_and_turns_to_its_end(tmp_path, monkeypatch, angle, toward):
+    views = []
+    framed = picture._framed
+    monkeypatch.setattr(picture, "_framed", lambda *args: views.append(framed(*args)) or views[-1])
+    write_picture(jump_recording(1.5), tmp_path / "jump.png", width=WIDTH, angle=angle)
+    ((view, _),) = views
+    aside = (view.eye - view.target)[:2]
+    assert aside / np.linalg.norm(aside) == pytest.approx(toward, abs=1e-6)
