@@ -100,6 +100,7 @@ class WorldCamera:
     def _scenery_shapes(self, scenery: np.ndarray) -> list[ShapeMesh]:
         """Return the shapes of every world's scenery; its bodies after the links are heightfield and block by world."""
         builder, bodies = newton.ModelBuilder(), []
+        builder.default_shape_cfg = newton.ModelBuilder.ShapeConfig(has_shape_collision=False)
         for rank, (x, y, half_x, half_y, height) in enumerate(scenery):
             body = self._num_links + 2 * rank
             if self._is_field:
