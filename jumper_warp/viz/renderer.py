@@ -11,7 +11,7 @@ import sys
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, cast
+from typing import Any, ClassVar, cast
 
 import newton
 import numpy as np
@@ -122,7 +122,12 @@ class Renderer(ABC):
 
 
 class GLRenderer(Renderer):
-    """Renderer with OpenGL, by Newton's viewer in an invisible window."""
+    """Renderer with OpenGL, by Newton's viewer in an invisible window.
+
+    A closed renderer leaves its window to the next one of its size, as closing a window does not free its memory.
+    """
+
+    _idle: ClassVar[dict[tuple[int, int], list[Any]]] = {}  # viewers without a renderer, by size [px]
 
     name = "OpenGL"
 
@@ -130,8 +135,10 @@ class GLRenderer(Renderer):
         self, shapes: Sequence[ShapeMesh], num_bodies: int, size: tuple[int, int], opacity: Sequence[float] = (1.0,)
     ) -> None:
         """As `Renderer`. Raises ImportError: pyglet is missing; RuntimeError: OpenGL is missing or too old."""
-        self._viewer = viewer = _gl_viewer(size)
+        idle = self._idle.setdefault(size, [])
+        self._viewer: Any = idle.pop() if idle else _gl_viewer(size)
         super().__init__(shapes, num_bodies, size, opacity)
+        viewer = self._viewer
         viewer.show_joints = viewer.show_com = False
         renderer = viewer.renderer
         renderer.spotlight_enabled, renderer.sky_upper, renderer.sky_lower = False, SKY, HORIZON
@@ -159,8 +166,12 @@ class GLRenderer(Renderer):
         return viewer.get_frame().numpy().copy()
 
     def close(self) -> None:
-        """Close the window."""
-        self._viewer.close()
+        """Free the bodies, and leave the window to the next renderer."""
+        viewer, self._viewer = self._viewer, None
+        if viewer is not None:
+            viewer.renderer._make_current()
+            viewer.set_model(None)
+            self._idle[self.size].append(viewer)
 
 
 class RayTracer(Renderer):

@@ -68,6 +68,41 @@ def test_drawn_ball_is_where_the_view_projects_it(one_ball, place):
     assert pixel == pytest.approx(pinhole([place], view.eye, view.target, 40.0, SIZE)[0], abs=1e-9)
 
 
+def test_renderers_draw_in_turn_while_others_open_and_close(kind):
+    place, lines = poses((0.0, 0.6, 0.0)), [Line(np.array([[0.0, -0.5, 0.0], [0.0, -0.5, 0.5]]), (0.0, 0.0, 1.0))]
+    with kind([BALL, FIXED], 1, SIZE) as alone:
+        expected = [alone.draw(place, VIEW), alone.draw(place, VIEW, lines)]
+    first, second = kind([BALL], 1, SIZE), kind([BALL, FIXED], 1, SIZE)
+    for _ in range(2):
+        assert not colored(first.draw(poses((0.0, -0.6, 0.0)), VIEW), BLUE).any()
+        np.testing.assert_array_equal(second.draw(place, VIEW), expected[0])
+    first.draw(place, VIEW)
+    np.testing.assert_array_equal(second.draw(place, VIEW, lines), expected[1])
+    first.close()
+    third = kind([FIXED], 1, SIZE)
+    assert not colored(third.draw(place, VIEW), RED).any()
+    np.testing.assert_array_equal(second.draw(place, VIEW), expected[0])
+    third.close()
+    second.close()
+
+
+def test_windows_are_used_again(opengl):
+    renderer = GLRenderer([BALL], 1, SIZE)
+    window = renderer._viewer
+    renderer.close()
+    renderer.close()
+    with GLRenderer([FIXED], 1, SIZE) as first, GLRenderer([BALL], 1, SIZE) as second:
+        assert window is first._viewer is not second._viewer
+
+
+def test_loaded_bodies_replace_those_before(kind):
+    with kind([BALL], 1, SIZE) as renderer:
+        renderer.draw(poses((0.0, 0.0, 0.0)), VIEW)
+        renderer.load([FIXED], 2)
+        image = renderer.draw(poses(*np.zeros((2, 3))), VIEW)
+    assert colored(image, BLUE).any() and not colored(image, RED).any()
+
+
 def test_body_follows_its_pose_and_a_fixed_shape_stays(one_ball):
     images = [one_ball.draw(poses((0.0, y, 0.5)), VIEW) for y in (0.5, -0.5)]
     left, right = (np.nonzero(colored(image, RED))[1].mean() for image in images)
@@ -162,6 +197,8 @@ def test_vertical_view_is_refused_in_one_line(one_ball, eye):
 
 
 def test_ray_tracing_replaces_missing_opengl_with_one_line_about_what_to_install(capsys, monkeypatch):
+    monkeypatch.setattr(GLRenderer, "_idle", {})
+
     def fail(size):
         raise RuntimeError("NoSuchDisplayException:\n  no display,\n  no device")
 
@@ -173,6 +210,7 @@ def test_ray_tracing_replaces_missing_opengl_with_one_line_about_what_to_install
 
 
 def test_missing_pyglet_has_the_same_effect(capsys, monkeypatch):
+    monkeypatch.setattr(GLRenderer, "_idle", {})
     monkeypatch.setitem(sys.modules, "pyglet", None)
     assert isinstance(open_renderer([BALL], 1, SIZE), RayTracer)
     (line,) = capsys.readouterr().err.splitlines()
@@ -187,6 +225,7 @@ def test_any_failure_of_the_viewer_counts_as_missing_opengl(monkeypatch):
         raise Failure("old driver")
 
     pytest.importorskip("pyglet")
+    monkeypatch.setattr(GLRenderer, "_idle", {})
     monkeypatch.setattr(module.newton.viewer, "ViewerGL", fail)
     with pytest.raises(RuntimeError, match="Failure: old driver"):
         GLRenderer([BALL], 1, SIZE)
