@@ -1,0 +1,72 @@
+"""Tables of the metrics of jumps to heights and to places."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from jumper_warp.evaluation.jumps import JumpOutcome
+from jumper_warp.evaluation.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
+
+DRIFT, TURN = 0.2, 25.0  # [m], [deg] Drift and turn of the base beyond which the authors' configuration ends an episode
+
+JUMP_METRICS = (
+    Metric("success_rate", rate, "jumps", lambda o: o.success),
+    Metric("goal_reached_rate", rate, "jumps", lambda o: o.reached),
+    Metric("landed_rate", rate, "jumps", lambda o: o.landed),
+    Metric("at_rest_rate", rate, "jumps", lambda o: o.at_rest),
+    Metric("no_paw_lift_rate", rate, "jumps", lambda o: o.still),
+    Metric("success_without_paw_lift_rate", rate, "jumps", lambda o: o.success & o.still),
+    Metric("success_without_hop_rate", rate, "jumps", lambda o: o.success & ~o.hopped),
+    Metric("fall_rate", rate, "jumps", lambda o: o.fell),
+    Metric("collision_rate", rate, "jumps", lambda o: o.collided),
+    Metric("diverged_rate", rate, "jumps", lambda o: o.diverged),
+    Metric("miss_rate", rate, "jumps", lambda o: o.missed),
+    Metric("early_rate", rate, "jumps", lambda o: o.early),
+    Metric("no_jump_rate", rate, "jumps", lambda o: o.no_jump),
+    Metric("second_takeoff_rate", rate, "jumps that touched down", lambda o: o.took_off_again),
+    Metric("landing_tilt_mean_deg", mean, "landed jumps", lambda o: o.tilt),
+    Metric("landing_tilt_max_deg", largest, "landed jumps", lambda o: o.tilt),
+    Metric("turn_abs_mean_deg", mean, "landed jumps", lambda o: o.turn),
+    Metric("turn_abs_max_deg", largest, "landed jumps", lambda o: o.turn),
+)
+"""Metrics of all jumps; `JumpOutcome` defines their events."""
+HEIGHT_METRICS = (
+    *JUMP_METRICS[:7],
+    Metric("apex_error_abs_mean_m", mean, "jumps that did not diverge", lambda o: np.abs(o.apex_error)),
+    Metric("apex_error_signed_mean_m", mean, "jumps that did not diverge", lambda o: o.apex_error),
+    Metric("apex_error_abs_max_of_successes_m", largest, "successful jumps", lambda o: np.abs(o.apex_error)),
+    Metric("apex_max_m", largest, "jumps that did not diverge", lambda o: o.apex),
+    Metric("drift_mean_m", mean, "landed jumps", lambda o: o.drift),
+    Metric("drift_max_m", largest, "landed jumps", lambda o: o.drift),
+    Metric("beyond_authors_limits_rate", rate, "landed jumps", lambda o: (o.drift > DRIFT) | (o.turn > TURN)),
+    *JUMP_METRICS[7:],
+)
+"""Metrics of jumps to heights; the authors' limits are those of drift and turn, DRIFT and TURN."""
+PLACE_METRICS = (
+    *JUMP_METRICS[:7],
+    Metric("goal_distance_at_rest_mean_m", mean, "landed jumps", lambda o: o.distance_at_rest),
+    Metric("goal_distance_at_touchdown_mean_m", mean, "jumps that touched down", lambda o: o.distance_at_touchdown),
+    Metric("goal_distance_at_end_mean_m", mean, "jumps that did not diverge", lambda o: o.distance_at_end),
+    Metric("goal_distance_at_rest_max_m", largest, "landed jumps", lambda o: o.distance_at_rest),
+    Metric("goal_error_ahead_signed_mean_m", mean, "landed jumps", lambda o: o.ahead),
+    Metric("goal_error_left_signed_mean_m", mean, "landed jumps", lambda o: o.left),
+    Metric("distance_flown_mean_m", mean, "jumps that touched down", lambda o: o.flown),
+    Metric("paw_to_paw_distance_mean_m", mean, "landed jumps", lambda o: o.paw_distance),
+    *JUMP_METRICS[7:],
+)
+"""Metrics of jumps to places."""
+IN_RANGE = ("success_rate", "goal_reached_rate", "no_paw_lift_rate", "apex_error_abs_mean_m",
+            "goal_distance_at_rest_mean_m")  # fmt: skip
+"""Keys that are also reported, with the prefix `in_range_`, of the goals within a range."""
+
+
+def jump_metrics(outcome: JumpOutcome, where: np.ndarray | None = None, prefix: str = "", note: str = "") -> Metrics:
+    """Return HEIGHT_METRICS or PLACE_METRICS of jumps; arguments as for `measure`."""
+    table = HEIGHT_METRICS if outcome.to_height.all() else PLACE_METRICS
+    return measure(table, outcome, where, prefix, note)
+
+
+def range_metrics(outcome: JumpOutcome, inside: np.ndarray, note: str) -> Metrics:
+    """Return the metrics IN_RANGE of the jumps in a mask, as `in_range_<key>`; note: says which these are."""
+    table = HEIGHT_METRICS if outcome.to_height.all() else PLACE_METRICS
+    return measure(chosen(table, *IN_RANGE), outcome, inside, "in_range_", note)
