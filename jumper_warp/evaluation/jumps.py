@@ -64,7 +64,7 @@ def jump_commands(goals: np.ndarray, delay: np.ndarray | float, step_dt: float) 
 
 @dataclass(frozen=True)
 class JumpOutcome:
-    """Outcome of jumps; arrays have shape (num_envs, jumps in a row). Lengths are in m, angles in deg."""
+    """Outcome of jumps; arrays have shape (num_envs, jumps in a row)."""
 
     commanded: np.ndarray  # Whether the jump was commanded
     to_height: np.ndarray  # Whether the goal is an apex height, else a place
@@ -82,18 +82,18 @@ class JumpOutcome:
     diverged: np.ndarray  # Whether the simulation diverged
     missed: np.ndarray  # Whether it landed without reaching the goal
     no_jump: np.ndarray  # Whether it did not take off in time
-    apex: np.ndarray  # Largest base height
-    apex_error: np.ndarray  # Largest base height minus commanded one
-    distance_at_end: np.ndarray  # From goal to base, horizontal, when the jump was over or failed
-    distance_at_touchdown: np.ndarray  # From goal to base, horizontal, at touchdown
-    distance_at_rest: np.ndarray  # From goal to base, horizontal, one second after touchdown
-    ahead: np.ndarray  # Base at rest minus goal, along the heading
-    left: np.ndarray  # Base at rest minus goal, to the left of the heading
-    flown: np.ndarray  # Horizontal distance of the base from takeoff to touchdown
-    paw_distance: np.ndarray  # Horizontal distance from the paws at takeoff to the paws at touchdown, mean of the paws
-    tilt: np.ndarray  # Largest tilt since touchdown
-    turn: np.ndarray  # Size of the yaw at the end
-    drift: np.ndarray  # Horizontal distance of the base from its start at the end
+    apex_m: np.ndarray  # Largest base height
+    apex_error_m: np.ndarray  # Largest base height minus commanded one
+    distance_at_end_m: np.ndarray  # From goal to base, horizontal, when the jump was over or failed
+    distance_at_touchdown_m: np.ndarray  # From goal to base, horizontal, at touchdown
+    distance_at_rest_m: np.ndarray  # From goal to base, horizontal, one second after touchdown
+    ahead_m: np.ndarray  # Base at rest minus goal, along the heading
+    left_m: np.ndarray  # Base at rest minus goal, to the left of the heading
+    distance_flown_m: np.ndarray  # Horizontal distance of the base from takeoff to touchdown
+    paw_to_paw_distance_m: np.ndarray  # Horizontal distance from the paws at takeoff to the paws at touchdown, mean of the paws
+    tilt_deg: np.ndarray  # Largest tilt since touchdown
+    turn_deg: np.ndarray  # Size of the yaw at the end
+    drift_m: np.ndarray  # Horizontal distance of the base from its start at the end
 
     @property
     def trials(self) -> dict[str, np.ndarray]:
@@ -150,18 +150,18 @@ def jump_outcome(jumps: JumpLog) -> JumpOutcome:
         diverged=diverged,
         missed=landed & ~reached,
         no_jump=ends == "no_jump",
-        apex=known(jumps.apex),
-        apex_error=np.where(to_height, apex_error, np.nan),
-        distance_at_end=goal_distance(jumps.end_position),
-        distance_at_touchdown=goal_distance(jumps.touchdown),
-        distance_at_rest=distance_at_rest,
-        ahead=known(cos * x + sin * y),
-        left=known(cos * y - sin * x),
-        flown=known(np.linalg.norm(jumps.touchdown - jumps.takeoff, axis=-1)),
-        paw_distance=known(np.linalg.norm(jumps.paw_shift.mean(axis=-2), axis=-1)),
-        tilt=known(np.degrees(jumps.tilt)),
-        turn=known(np.degrees(np.abs(jumps.yaw))),
-        drift=known(jumps.drift),
+        apex_m=known(jumps.apex),
+        apex_error_m=np.where(to_height, apex_error, np.nan),
+        distance_at_end_m=goal_distance(jumps.end_position),
+        distance_at_touchdown_m=goal_distance(jumps.touchdown),
+        distance_at_rest_m=distance_at_rest,
+        ahead_m=known(cos * x + sin * y),
+        left_m=known(cos * y - sin * x),
+        distance_flown_m=known(np.linalg.norm(jumps.touchdown - jumps.takeoff, axis=-1)),
+        paw_to_paw_distance_m=known(np.linalg.norm(jumps.paw_shift.mean(axis=-2), axis=-1)),
+        tilt_deg=known(np.degrees(jumps.tilt)),
+        turn_deg=known(np.degrees(np.abs(jumps.yaw))),
+        drift_m=known(jumps.drift),
     )
 
 
@@ -319,7 +319,7 @@ class JumpLog(EvaluationLog):
 
     def columns(self) -> dict[str, list]:
         """Return goals, headings, the fields of `JumpOutcome` and outcomes, one value per jump, world after world."""
-        columns = {name: self.goals[..., i].ravel() for i, name in enumerate(("goal_x", "goal_y", "goal_height"))}
+        columns = {name: self.goals[..., i].ravel() for i, name in enumerate(("goal_x_m", "goal_y_m", "goal_height_m"))}
         columns |= {"heading_deg": np.degrees(self.heading).ravel(), **self.outcome.arrays()}
         lists = {name: values.tolist() if values.dtype == bool else finite(values) for name, values in columns.items()}
         return lists | {"outcome": self.outcomes.ravel().tolist()}
