@@ -90,7 +90,9 @@ class JumpOutcome:
     ahead_m: np.ndarray  # Base at rest minus goal, along the heading
     left_m: np.ndarray  # Base at rest minus goal, to the left of the heading
     distance_flown_m: np.ndarray  # Horizontal distance of the base from takeoff to touchdown
-    paw_to_paw_distance_m: np.ndarray  # Horizontal distance from the paws at takeoff to the paws at touchdown, mean of the paws
+    paw_to_paw_distance_m: (
+        np.ndarray
+    )  # Horizontal distance from the paws at takeoff to the paws at touchdown, mean of the paws
     tilt_deg: np.ndarray  # Largest tilt since touchdown
     turn_deg: np.ndarray  # Size of the yaw at the end
     drift_m: np.ndarray  # Horizontal distance of the base from its start at the end

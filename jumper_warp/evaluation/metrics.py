@@ -52,8 +52,9 @@ def measure(
 
 
 def chosen(table: Iterable[Metric], *keys: str) -> list[Metric]:
-    """Return the rows of a table with these keys."""
-    return [metric for metric in table if metric.key in keys]
+    """Return the rows of a table with these keys, in their order; keys that it lacks are skipped."""
+    rows = {metric.key: metric for metric in table}
+    return [rows[key] for key in keys if key in rows]
 
 
 def rate(values: ArrayLike, over: str = "") -> MetricValue:

@@ -71,8 +71,8 @@ def test_samples_after_a_fall_are_ignored():
 
 def test_time_out_is_not_a_fall():
     walks = VelocityLog(np.zeros((1, 1, 3)), TASK, 1.0)
-    arrays = {"base_quat": np.array([[0.0, 0.0, 0.0, 1.0]]), "base_vel": np.zeros((1, 3)),
-              "base_pos": np.zeros((1, 3)), "base_ang_vel": np.zeros((1, 3)), "termination": np.array([NAMES.index("finished")])}  # fmt: skip
+    arrays = {name: np.zeros((1, 3)) for name in ("base_pos", "base_vel", "base_ang_vel")}
+    arrays |= {"base_quat": np.array([[0.0, 0.0, 0.0, 1.0]]), "termination": np.array([NAMES.index("finished")])}
     walks.update(arrays, DT)
     assert not walks.fallen.any() and walks.outcomes[0] == "walked"
 
