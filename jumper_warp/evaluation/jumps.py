@@ -82,8 +82,8 @@ class JumpOutcome:
     diverged: np.ndarray  # Whether the simulation diverged
     missed: np.ndarray  # Whether it landed without reaching the goal
     no_jump: np.ndarray  # Whether it did not take off in time
-    apex_m: np.ndarray  # Largest base height
-    apex_error_m: np.ndarray  # Largest base height minus commanded one
+    apex_m: np.ndarray  # Largest base height from takeoff to touchdown; without a takeoff the last one
+    apex_error_m: np.ndarray  # Apex minus commanded height
     distance_at_end_m: np.ndarray  # From goal to base, horizontal, when the jump was over or failed
     distance_at_touchdown_m: np.ndarray  # From goal to base, horizontal, at touchdown
     distance_at_rest_m: np.ndarray  # From goal to base, horizontal, one second after touchdown
@@ -92,7 +92,7 @@ class JumpOutcome:
     distance_flown_m: np.ndarray  # Horizontal distance of the base from takeoff to touchdown
     paw_to_paw_distance_m: (
         np.ndarray
-    )  # Horizontal distance from the paws at takeoff to the paws at touchdown, mean of the paws
+    )  # Horizontal distance from the paws at takeoff to those at touchdown, mean of four
     tilt_deg: np.ndarray  # Largest tilt since touchdown
     turn_deg: np.ndarray  # Size of the yaw at the end
     drift_m: np.ndarray  # Horizontal distance of the base from its start at the end
@@ -210,7 +210,9 @@ class JumpLog(EvaluationLog):
         self.heading = np.full(shape, np.nan)  # [rad] heading of the jump
         self.yaw = np.full(shape, np.nan)  # [rad] yaw of the base at the end, relative to the heading
         self.drift = np.full(shape, np.nan)  # [m] horizontal distance of the base from its start at the end
-        self.apex = np.full(shape, np.nan)  # [m] largest base height
+        self.apex = np.full(
+            shape, np.nan
+        )  # [m] largest base height from takeoff to touchdown; before takeoff the present one
         self.tilt = np.full(shape, np.nan)  # [rad] largest tilt since touchdown
         self.rest_speed = np.full(shape, np.inf)  # [m/s] speed REST_TIME after touchdown; inf before
         self.early = np.zeros(shape, dtype=bool)  # whether the jump began before the command
@@ -256,8 +258,10 @@ class JumpLog(EvaluationLog):
         self.heading[at] = now["heading"]
         self.yaw[at] = wrapped(yaw_of(now["base_quat"]) - now["heading"])
         self.drift[at] = np.linalg.norm((now["base_pos"] - now["start"])[:, :2], axis=1)
-        self.apex[at], self.tilt[at] = now["max_height"], now["peak_tilt"]
-        landed = now["phase"] == LANDED
+        landed, height, self.tilt[at] = now["phase"] == LANDED, now["base_pos"][:, 2], now["peak_tilt"]
+        begins = (now["phase"] == STANCE) | (now["took_off"] == 1)
+        rises = ~landed | (now["touched_down"] == 1)
+        self.apex[at] = np.where(begins, height, np.where(rises, np.fmax(self.apex[at], height), self.apex[at]))
         self._record_landing(now, at, landed, step_dt)
         failed = (now["termination"] >= 0) & (now["termination"] != self._success)
         rested = ~failed & landed & (now["phase_steps"] >= round(self.rest / step_dt))

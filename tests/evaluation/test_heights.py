@@ -13,7 +13,7 @@ def make_arrays(jumps, **changes):
     count = len(jumps.goals)
     arrays = {
         "phase": np.zeros(count, dtype=int), "phase_steps": np.zeros(count, dtype=int),
-        "termination": np.full(count, -1), "max_height": np.zeros(count), "peak_tilt": np.zeros(count),
+        "termination": np.full(count, -1), "peak_tilt": np.zeros(count),
         "base_vel": np.zeros((count, 3)), "steps": np.full(count, 40),
         "command_step": np.full(count, 30), "base_pos": np.zeros((count, 3)),
         "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), "start": np.zeros((count, 3)),
@@ -24,6 +24,13 @@ def make_arrays(jumps, **changes):
     return arrays | {name: np.array(value) for name, value in changes.items()}
 
 
+def fly(jumps, heights):
+    """Record a policy step of flight at base heights [m], one per jump."""
+    base_pos = np.zeros((len(heights), 3))
+    base_pos[:, 2] = heights
+    assert not jumps.update(make_arrays(jumps, phase=[1] * len(heights), base_pos=base_pos), 1.0 / 60.0)
+
+
 def metrics_of(jumps):
     """Return the values of `jumper evaluate` for a log."""
     return values(HeightFlags(success_range=(0.5, 1.1)).metrics(jumps))
@@ -32,7 +39,8 @@ def metrics_of(jumps):
 def test_height_metrics_match_hand_computed_values():
     jumps = HeightLog(np.array([0.5, 0.8, 1.1, 1.2]), ("success", "came_apart", "collided"))
     landed = {"phase": [2, 0, 2, 0], "phase_steps": [60, 0, 60, 0]}
-    heights = {"max_height": [0.52, 1.0e13, 1.06, 0.4], "peak_tilt": [0.1, 3.0, 0.2, 0.0]}
+    for heights in ([0.45, 0.5, 0.9, 0.4], [0.52, 1.0e13, 1.06, 0.9], [0.51, 0.4, 0.8, 0.8]):
+        fly(jumps, heights)
     half = [math.radians(0.5 * angle) for angle in (10.0, 90.0, -26.0, 0.0)]  # half yaw angles
     base_poses = {
         "base_pos": [[0.06, -0.08, 0.3], [9.0, 0.0, 0.0], [0.0, 0.3, 0.3], [0.0] * 3],
@@ -40,10 +48,16 @@ def test_height_metrics_match_hand_computed_values():
     }
     speeds = {"base_vel": [[0.0, 0.03, 0.04], [9.0] * 3, [0.0, 0.0, -0.2], [0.0] * 3]}
     first = make_arrays(
-        jumps, termination=[0, 1, 0, -1], touched_down=[1, 0, 1, 0], **landed, **heights, **speeds, **base_poses
+        jumps,
+        termination=[0, 1, 0, -1],
+        touched_down=[1, 0, 1, 0],
+        peak_tilt=[0.1, 3.0, 0.2, 0.0],
+        **landed,
+        **speeds,
+        **base_poses,
     )
     assert not jumps.update(first, 1.0 / 60.0)
-    later = {"max_height": [9.0, 9.0, 9.0, 0.9], "peak_tilt": [3.0] * 4}
+    later = {"base_pos": np.full((4, 3), 9.0), "peak_tilt": [3.0] * 4, "phase": [2] * 4}
     assert jumps.update(make_arrays(jumps, termination=[2, 2, 2, 2], **later), 1.0 / 60.0)
     metrics = metrics_of(jumps)
     expected = {
@@ -86,7 +100,8 @@ def test_unfinished_jump_fails_with_no_end_and_without_landing_metrics():
 def test_columns_have_one_row_per_jump_and_none_for_nan():
     jumps = HeightLog(np.array([0.5, 0.8]), ("success", "came_apart"))
     landed = {"phase": [2, 0], "phase_steps": [60, 0]}
-    jumps.update(make_arrays(jumps, termination=[0, 1], max_height=[0.52, np.nan], **landed), 1.0 / 60.0)
+    fly(jumps, [0.52, np.nan])
+    jumps.update(make_arrays(jumps, termination=[0, 1], **landed), 1.0 / 60.0)
     columns = jumps.columns()
     assert (columns["goal_height_m"], columns["outcome"]) == ([0.5, 0.8], ["success", "diverged"])
     assert columns["apex_error_m"] == [pytest.approx(0.02), None] and columns["landed"] == [True, False]
@@ -101,12 +116,8 @@ def test_jump_that_takes_off_before_command_can_be_seen_is_early():
 
 def test_landing_from_wrong_height_counts_as_miss_not_fall():
     jumps = HeightLog(np.array([0.5, 0.6, 0.7]), ("low_base", "success"))
-    changes = {
-        "termination": [-1, 0, -1],
-        "phase": [2, 2, 2],
-        "phase_steps": [60, 3, 60],
-        "max_height": [0.7, 0.6, 0.65],
-    }
+    fly(jumps, [0.7, 0.6, 0.65])
+    changes = {"termination": [-1, 0, -1], "phase": [2, 2, 2], "phase_steps": [60, 3, 60]}
     jumps.update(make_arrays(jumps, **changes), 1.0 / 60.0)
     metrics = metrics_of(jumps)
     assert [metrics[name] for name in ("success_rate", "fall_rate", "miss_rate")] == pytest.approx([1 / 3] * 3)

@@ -36,7 +36,7 @@ class StubEnv:
             "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), "start": np.zeros((count, 3)),
             "base_pos": np.zeros((count, 3)),
             "base_vel": np.zeros((count, 3)), "goal": np.zeros((count, 3)), "heading": np.zeros(count),
-            "max_height": np.zeros(count), "peak_tilt": np.zeros(count), "took_off": np.zeros(count, dtype=int),
+            "peak_tilt": np.zeros(count), "took_off": np.zeros(count, dtype=int),
             "steps": np.full(count, 40), "command_step": np.full(count, 30), "termination": np.full(count, -1),
             "touched_down": np.zeros(count, dtype=int),
             "phase": np.zeros(count, dtype=int), "phase_steps": np.zeros(count, dtype=int),
@@ -87,7 +87,7 @@ def five_jumps():
         base_quat=[quat_about_z(QUARTER + 0.1), quat_about_z(QUARTER - 0.3), *([[0.0, 0.0, 0.0, 1.0]] * 3)],
         base_vel=[[0.0, 0.06, 0.0], [0.2, 0.0, 0.0], *([[0.0] * 3] * 3)],
         phase=[2, 2, 1, 2, 0], phase_steps=[60, 60, 3, 20, 9], termination=[0, -1, 1, COLLIDED, NO_JUMP],
-        peak_tilt=[0.1, 0.2, 3.0, 1.0, 0.0], max_height=[0.6, 0.5, 9.0, 0.7, 0.3],
+        peak_tilt=[0.1, 0.2, 3.0, 1.0, 0.0],
     )  # fmt: skip
     assert landings.record_step(env)
     return landings
