@@ -212,7 +212,7 @@ class JumpLog(EvaluationLog):
         self.drift = np.full(shape, np.nan)  # [m] horizontal distance of the base from its start at the end
         self.apex = np.full(
             shape, np.nan
-        )  # [m] largest base height from takeoff to touchdown; before takeoff the present one
+        )  # [m] largest base height in flight; before takeoff the present one
         self.tilt = np.full(shape, np.nan)  # [rad] largest tilt since touchdown
         self.rest_speed = np.full(shape, np.inf)  # [m/s] speed REST_TIME after touchdown; inf before
         self.early = np.zeros(shape, dtype=bool)  # whether the jump began before the command

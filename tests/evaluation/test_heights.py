@@ -38,7 +38,7 @@ def metrics_of(jumps):
 
 def test_height_metrics_match_hand_computed_values():
     jumps = HeightLog(np.array([0.5, 0.8, 1.1, 1.2]), ("success", "came_apart", "collided"))
-    landed = {"phase": [2, 0, 2, 0], "phase_steps": [60, 0, 60, 0]}
+    landed = {"phase": [2, 0, 2, 1], "phase_steps": [60, 0, 60, 0]}
     for heights in ([0.45, 0.5, 0.9, 0.4], [0.52, 1.0e13, 1.06, 0.9], [0.51, 0.4, 0.8, 0.8]):
         fly(jumps, heights)
     half = [math.radians(0.5 * angle) for angle in (10.0, 90.0, -26.0, 0.0)]  # half yaw angles
