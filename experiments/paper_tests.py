@@ -15,9 +15,9 @@ from typing import Any
 
 import tyro
 
-from jumper_warp.evaluation.metrics import Metrics, print_metrics
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.suites import suites_for
+from jumper_warp.utils.metrics import Metrics, print_metrics
 from jumper_warp.utils.output import output_dir, read_metrics, read_values, write_metrics
 from support.scripts import run_script
 

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from jumper_warp.evaluation.metrics import Metrics
 from jumper_warp.kernels.layout import BODIES
 from jumper_warp.robot.description import LEGS
-from jumper_warp.utils.output import MetricValue
+from jumper_warp.utils.metrics import Metrics, MetricValue
 
 
 @dataclass

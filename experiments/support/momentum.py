@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jumper_warp.evaluation.metrics import Metrics, largest, mean
+from jumper_warp.utils.metrics import Metrics, largest, mean
 from jumper_warp.utils.rotations import CONJUGATE, rotate
 
 

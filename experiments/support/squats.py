@@ -11,8 +11,7 @@ import numpy as np
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import jump_commands
 from jumper_warp.evaluation.log import EvaluationLog
-from jumper_warp.evaluation.metrics import Metrics, largest, mean, rate
-from jumper_warp.utils.output import MetricValue
+from jumper_warp.utils.metrics import Metrics, MetricValue, largest, mean, rate
 
 CONTACT_FORCE = 0.1  # [N] Smallest force on a paw that is on the ground
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.metrics import Metrics
 from jumper_warp.evaluation.velocities import SETTLING_TIME, VelocityLog
-from jumper_warp.utils.output import MetricValue
+from jumper_warp.utils.metrics import Metrics, MetricValue
 
 REACH, STEP, KICK = 0.8, 0.8, 0.5
 """[m/s] and [rad/s] Limit of the commands; [m/s] step of a changed command; [m/s] step of a kicked velocity."""

@@ -11,9 +11,9 @@ import numpy as np
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.film import Film, Filmstrip
 from jumper_warp.evaluation.log import COLLIDED, DIVERGED, NO_END, SUCCESS, EvaluationLog, finite
-from jumper_warp.evaluation.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
 
 AXES = ("roll", "pitch", "yaw")
 DIRECTIONS = tuple(f"{axis}_{sign}" for axis in AXES for sign in ("plus", "minus"))

@@ -15,7 +15,6 @@ from rich.table import Table
 from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_course
 from jumper_warp.evaluation.film import Film
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
-from jumper_warp.evaluation.metrics import print_metrics
 from jumper_warp.evaluation.run import EvaluationRun, SkillRun
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.policies.conditions import Conditions
@@ -24,6 +23,7 @@ from jumper_warp.policies.runs import is_run
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import print_metrics
 from jumper_warp.utils.output import write_metrics
 
 Flags = TypeVar("Flags")

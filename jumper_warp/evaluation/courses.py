@@ -16,14 +16,22 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.evaluation.log import EvaluationLog, ended_by, finite, outcome_names
-from jumper_warp.evaluation.metrics import Metrics, largest, mean, rate, rmse
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.scripts import ScriptStep
-from jumper_warp.evaluation.velocities import AXES, SETTLING_TIME, SLEW_RATE, UNITS, body_velocity, velocity_series
+from jumper_warp.evaluation.velocities import (
+    AXES,
+    SETTLING_TIME,
+    SLEW_RATE,
+    UNITS,
+    body_velocity,
+    square_sums,
+    velocity_series,
+)
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.tasks.switching import FALLS
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import Metrics, largest, mean, rate, rmse
 
 SKILLS = {
     "walk": WALK,
@@ -252,7 +260,7 @@ class CourseLog(EvaluationLog):
         """Return sums of squared tracking errors and numbers of samples, (robots, 3, 2), where `is_tracked`."""
         error = np.array(self.velocity, dtype=float) - np.array(self.commands, dtype=float)
         error[~np.array(self.is_tracked)] = np.nan
-        return np.stack([np.nansum(error**2, axis=0), np.isfinite(error).sum(axis=0)], axis=-1)
+        return square_sums(error)
 
     def columns(self) -> dict[str, list]:
         """Return lists with one value per robot: end, commands_done, largest apex_error_m and landing_error_m."""

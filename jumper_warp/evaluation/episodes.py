@@ -11,10 +11,10 @@ import numpy as np
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, finite, outcome_names
-from jumper_warp.evaluation.metrics import Metrics, mean, rate
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.commands import layout_of
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import Metrics, mean, rate
 
 MAX_SECONDS = 600.0  # [s] Maximum length of an episode
 MAX_COMMAND_SIZE = 4  # Maximum number of values in a command

@@ -13,10 +13,10 @@ from jumper_warp.evaluation.heights import HeightFlags, HeightPlayFlags
 from jumper_warp.evaluation.jumps import with_jump_terminations
 from jumper_warp.evaluation.landings import LandingFlags, LandingPlayFlags
 from jumper_warp.evaluation.log import EvaluationLog
-from jumper_warp.evaluation.metrics import Metrics
 from jumper_warp.evaluation.velocities import VelocityFlags, VelocityPlayFlags
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.metrics import Metrics
 
 
 class EvaluationFlags(Protocol):

@@ -12,10 +12,9 @@ import tyro
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.film import Film, Filmstrip, keyframes
-from jumper_warp.evaluation.jump_metrics import jump_metrics, range_metrics
-from jumper_warp.evaluation.jumps import DELAY, REST_TIME, JumpFlags, JumpLog
-from jumper_warp.evaluation.log import run_evaluation, termination_names, within
-from jumper_warp.evaluation.metrics import Metrics
+from jumper_warp.evaluation.jump_metrics import JumpFlags
+from jumper_warp.evaluation.jumps import DELAY, REST_TIME, JumpLog
+from jumper_warp.evaluation.log import run_evaluation, termination_names
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 
@@ -105,12 +104,6 @@ class HeightFlags(JumpFlags):
     def log(self, task: TaskCfg, seed: int) -> HeightLog:
         """Return the log of jumps to these heights, one per world; seed has no effect."""
         return HeightLog(np.linspace(*self.height_range, self.num_jumps), termination_names(task))
-
-    def metrics(self, log: HeightLog) -> Metrics:
-        """Return the metrics of a finished log: of all jumps, and of those within `success_range`."""
-        low, high = self.success_range
-        inside = within(log.commanded, self.success_range)
-        return jump_metrics(log.outcome) | range_metrics(log.outcome, inside, f"to {low:g} to {high:g} m")
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,15 @@
-"""Tables of the metrics of jumps to heights and to places."""
+"""Tables of the metrics of jumps to heights and to places, and the flags that their evaluations share."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
+
 import numpy as np
 
-from jumper_warp.evaluation.jumps import JumpOutcome
-from jumper_warp.evaluation.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
+from jumper_warp.evaluation.jumps import JumpLog, JumpOutcome
+from jumper_warp.evaluation.log import within
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
 
 DRIFT, TURN = 0.2, 25.0  # [m], [deg] Drift and turn of the base beyond which the authors' configuration ends an episode
 
@@ -70,3 +74,25 @@ def range_metrics(outcome: JumpOutcome, inside: np.ndarray, note: str) -> Metric
     """Return the metrics IN_RANGE of the jumps in a mask, as `in_range_<key>`; note: says which these are."""
     table = HEIGHT_METRICS if outcome.to_height.all() else PLACE_METRICS
     return measure(chosen(table, *IN_RANGE), outcome, inside, "in_range_", note)
+
+
+@dataclass(frozen=True)
+class JumpFlags:
+    """Jumps from standing still."""
+
+    num_jumps: int = 200  # Number of jumps
+    success_range: tuple[float, float] = field(default=(0.3, 1.4), kw_only=True)
+    """[m] Smallest and largest distance or height counted by the `in_range` metrics."""
+
+    def __post_init__(self) -> None:
+        if self.num_jumps < 1:
+            raise InputError(f"num_jumps must be at least 1, got {self.num_jumps}")
+        if not 0.0 <= self.success_range[0] <= self.success_range[1] < 10.0:
+            raise InputError(f"success_range must be in [0, 10) m and rise, got {self.success_range}")
+
+    def metrics(self, log: JumpLog) -> Metrics:
+        """Return the metrics of a finished log: of all jumps, and of those within `success_range`."""
+        (low, high), outcome = self.success_range, log.outcome
+        size = np.linalg.norm(log.goals, axis=-1)  # [m] height or distance: the other one is 0
+        inside = within(size, self.success_range)
+        return jump_metrics(outcome) | range_metrics(outcome, inside, f"with goals of {low:g} to {high:g} m")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -90,9 +90,7 @@ class JumpOutcome:
     ahead_m: np.ndarray  # Base at rest minus goal, along the heading
     left_m: np.ndarray  # Base at rest minus goal, to the left of the heading
     distance_flown_m: np.ndarray  # Horizontal distance of the base from takeoff to touchdown
-    paw_to_paw_distance_m: (
-        np.ndarray
-    )  # Horizontal distance from the paws at takeoff to those at touchdown, mean of four
+    paw_to_paw_distance_m: np.ndarray  # Horizontal, from the paws at takeoff to those at touchdown, mean of four
     tilt_deg: np.ndarray  # Largest tilt since touchdown
     turn_deg: np.ndarray  # Size of the yaw at the end
     drift_m: np.ndarray  # Horizontal distance of the base from its start at the end
@@ -136,35 +134,18 @@ def jump_outcome(jumps: JumpLog) -> JumpOutcome:
     reached = np.nan_to_num(off, nan=np.inf) <= TOLERANCE
     at_rest = landed & (jumps.rest_speed < REST_SPEED)
     return JumpOutcome(
-        commanded=commanded,
-        to_height=to_height,
-        early=jumps.early & commanded,
-        touched_down=np.isfinite(jumps.touchdown[..., 0]),
-        reached=reached,
-        landed=landed,
-        at_rest=at_rest,
-        success=reached & at_rest & ~jumps.early,
-        still=landed & (jumps.lift_time <= HOP_TIME - TIME_EPS),
-        hopped=jumps.air_time > HOP_TIME + TIME_EPS,
-        took_off_again=jumps.takeoffs > 0,
-        fell=np.isin(ends, FALLS),
-        collided=ends == COLLIDED,
-        diverged=diverged,
-        missed=landed & ~reached,
-        no_jump=ends == "no_jump",
-        apex_m=known(jumps.apex),
-        apex_error_m=np.where(to_height, apex_error, np.nan),
-        distance_at_end_m=goal_distance(jumps.end_position),
-        distance_at_touchdown_m=goal_distance(jumps.touchdown),
-        distance_at_rest_m=distance_at_rest,
-        ahead_m=known(cos * x + sin * y),
-        left_m=known(cos * y - sin * x),
+        commanded=commanded, to_height=to_height, early=jumps.early & commanded, reached=reached, landed=landed,
+        touched_down=np.isfinite(jumps.touchdown[..., 0]), at_rest=at_rest, success=reached & at_rest & ~jumps.early,
+        still=landed & (jumps.lift_time <= HOP_TIME - TIME_EPS), hopped=jumps.air_time > HOP_TIME + TIME_EPS,
+        took_off_again=jumps.takeoffs > 0, fell=np.isin(ends, FALLS), collided=ends == COLLIDED, diverged=diverged,
+        missed=landed & ~reached, no_jump=ends == "no_jump", apex_m=known(jumps.apex),
+        apex_error_m=np.where(to_height, apex_error, np.nan), distance_at_end_m=goal_distance(jumps.end_position),
+        distance_at_touchdown_m=goal_distance(jumps.touchdown), distance_at_rest_m=distance_at_rest,
+        ahead_m=known(cos * x + sin * y), left_m=known(cos * y - sin * x), drift_m=known(jumps.drift),
         distance_flown_m=known(np.linalg.norm(jumps.touchdown - jumps.takeoff, axis=-1)),
         paw_to_paw_distance_m=known(np.linalg.norm(jumps.paw_shift.mean(axis=-2), axis=-1)),
-        tilt_deg=known(np.degrees(jumps.tilt)),
-        turn_deg=known(np.degrees(np.abs(jumps.yaw))),
-        drift_m=known(jumps.drift),
-    )
+        tilt_deg=known(np.degrees(jumps.tilt)), turn_deg=known(np.degrees(np.abs(jumps.yaw))),
+    )  # fmt: skip
 
 
 class JumpLog(EvaluationLog):
@@ -210,9 +191,7 @@ class JumpLog(EvaluationLog):
         self.heading = np.full(shape, np.nan)  # [rad] heading of the jump
         self.yaw = np.full(shape, np.nan)  # [rad] yaw of the base at the end, relative to the heading
         self.drift = np.full(shape, np.nan)  # [m] horizontal distance of the base from its start at the end
-        self.apex = np.full(
-            shape, np.nan
-        )  # [m] largest base height in flight; before takeoff the present one
+        self.apex = np.full(shape, np.nan)  # [m] largest base height in flight; before takeoff the present one
         self.tilt = np.full(shape, np.nan)  # [rad] largest tilt since touchdown
         self.rest_speed = np.full(shape, np.inf)  # [m/s] speed REST_TIME after touchdown; inf before
         self.early = np.zeros(shape, dtype=bool)  # whether the jump began before the command
@@ -333,21 +312,6 @@ class JumpLog(EvaluationLog):
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
         """Return the present base height [m] of some worlds."""
         return {f"height/base of {world} [m]": self.arrays["base_pos"][world, 2] for world in worlds}
-
-
-@dataclass(frozen=True)
-class JumpFlags:
-    """Jumps from standing still."""
-
-    num_jumps: int = 200  # Number of jumps
-    success_range: tuple[float, float] = field(default=(0.3, 1.4), kw_only=True)
-    """[m] Smallest and largest distance or height counted by `success_rate_in_range`."""
-
-    def __post_init__(self) -> None:
-        if self.num_jumps < 1:
-            raise InputError(f"num_jumps must be at least 1, got {self.num_jumps}")
-        if not 0.0 <= self.success_range[0] <= self.success_range[1] < 10.0:
-            raise InputError(f"success_range must be in [0, 10) m and rise, got {self.success_range}")
 
 
 def yaw_of(quat: np.ndarray) -> np.ndarray:

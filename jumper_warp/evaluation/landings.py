@@ -12,10 +12,9 @@ import tyro
 
 from jumper_warp.evaluation.film import PICTURE_SIZE, Film, Filmstrip, keyframes, side_view
 from jumper_warp.evaluation.heights import MAX_ROBOTS
-from jumper_warp.evaluation.jump_metrics import jump_metrics, range_metrics
-from jumper_warp.evaluation.jumps import TAKEOFF_SPEED, JumpFlags, JumpLog, with_jump_terminations
-from jumper_warp.evaluation.log import termination_names, within
-from jumper_warp.evaluation.metrics import Metrics
+from jumper_warp.evaluation.jump_metrics import JumpFlags
+from jumper_warp.evaluation.jumps import TAKEOFF_SPEED, JumpLog, with_jump_terminations
+from jumper_warp.evaluation.log import termination_names
 from jumper_warp.kernels.jump import terminations
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import TerminationTerm
@@ -119,12 +118,6 @@ class LandingFlags(JumpFlags):
         goals = np.stack([np.linspace(*self.goal_x, self.num_jumps), rng.uniform(*self.goal_y, self.num_jumps)], axis=1)
         headings = random_headings(self.num_jumps, seed) if self.heading == "any" else math.radians(self.heading)
         return LandingLog(goals[:, None], termination_names(task), headings)
-
-    def metrics(self, log: LandingLog) -> Metrics:
-        """Return the metrics of a finished log: of all jumps, and of those within `success_range`."""
-        low, high = self.success_range
-        inside = within(np.linalg.norm(log.goal_positions, axis=-1), self.success_range)
-        return jump_metrics(log.outcome) | range_metrics(log.outcome, inside, f"over {low:g} to {high:g} m")
 
 
 @dataclass(frozen=True)

@@ -9,7 +9,7 @@ import torch
 
 from jumper_warp.evaluation.jump_metrics import HEIGHT_METRICS
 from jumper_warp.evaluation.jumps import TOLERANCE, JumpOutcome, jump_commands
-from jumper_warp.evaluation.metrics import Metrics, chosen, mean, measure, rate
+from jumper_warp.utils.metrics import Metrics, chosen, mean, measure, rate
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env

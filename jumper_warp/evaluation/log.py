@@ -10,9 +10,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.metrics import Metrics, rate
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import Metrics, rate
 
 if TYPE_CHECKING:
     import torch

@@ -21,7 +21,6 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.evaluations import evaluation_of
 from jumper_warp.evaluation.film import Film
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
-from jumper_warp.evaluation.metrics import print_metrics
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.runs import open_policy
@@ -31,7 +30,8 @@ from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import AnyMetrics, output_dir, read_values, write_metrics
+from jumper_warp.utils.metrics import AnyMetrics, print_metrics
+from jumper_warp.utils.output import output_dir, read_values, write_metrics
 from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.threads import checked_threads
 

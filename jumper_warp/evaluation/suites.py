@@ -18,12 +18,11 @@ from jumper_warp.evaluation.jump_metrics import PLACE_METRICS, jump_metrics, ran
 from jumper_warp.evaluation.jumps import JumpOutcome
 from jumper_warp.evaluation.landings import LandingLog
 from jumper_warp.evaluation.log import within
-from jumper_warp.evaluation.metrics import Metrics, chosen, largest, mean, measure, rate
 from jumper_warp.evaluation.plots import BasePaths, figure, plot_landings, plot_paths
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite, check
 from jumper_warp.robot.grounds import BlockCfg, platform, uneven
-from jumper_warp.utils.output import MetricValue
+from jumper_warp.utils.metrics import Metrics, MetricValue, chosen, largest, mean, measure, rate
 
 AHEAD, ASIDE = (0.35, 1.4), (-0.35, 0.35)  # [m] Ranges of the grid's goals ahead and to the left
 SECTORS = ("ahead", "left", "back", "right")  # Quarters of a ring, each centred on its direction

@@ -12,17 +12,17 @@ import numpy as np
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation import heights, landings
-from jumper_warp.evaluation.heights import HeightFlags, HeightLog
+from jumper_warp.evaluation.heights import HeightFlags
 from jumper_warp.evaluation.jump_metrics import PLACE_METRICS
 from jumper_warp.evaluation.jumps import DELAY, REST_TIME, TOLERANCE, with_jump_terminations
 from jumper_warp.evaluation.landings import LandingFlags, LandingLog, random_headings, with_second_takeoff
 from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
 from jumper_warp.evaluation.log import termination_names, within
-from jumper_warp.evaluation.metrics import Metrics, chosen, measure
 from jumper_warp.evaluation.plots import figure, plot_sweep
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun, trained_range
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import Metrics, chosen, measure
 
 PAPER_TRAINED = (0.4, 1.0)  # [m] Range of goal distances in the paper's training
 
@@ -63,6 +63,12 @@ class Suite(EvaluationArgs, ABC):
         run = EvaluationRun.from_args(self.name, self, self.evaluations, modules)
         run.settings["rest_s"] = self.rest_time
         return run.report(self.measure(run), self.paper)
+
+    def run_flags(self, run: EvaluationRun, flags: Any, env: Env, film: str = "") -> Any:
+        """Run the jumps of `jumper evaluate` with some flags, and return their log; film: name of the recording."""
+        log = flags.log(env.task, self.seed)
+        log.rest = self.rest_time
+        return run.run_episodes(env, log, film=film)
 
     def run_landings(
         self, run: EvaluationRun, goals: np.ndarray, env: Env | None = None, *, headings: np.ndarray | None = None,
@@ -121,17 +127,11 @@ class HeightSweep(Suite):
         """Flags of `jumper evaluate` with the same jumps."""
         return HeightFlags(self.num_jumps, height_range=self.height_range)
 
-    def run_jumps(self, run: EvaluationRun, env: Env, film: str = "") -> HeightLog:
-        """Run one jump per height and return the log; film: name of the recording, empty for none."""
-        log = self.flags.log(env.task, self.seed)
-        log.rest = self.rest_time
-        return run.run_episodes(env, log, film=film)
-
     def measure(self, run: EvaluationRun) -> Metrics:
         """Run the jumps and the open-loop jumps of the same robots, plot both, and return the metrics."""
         env, flags = run.env(self.num_jumps), self.flags
         initial_state = env.state_dict()
-        jumps = self.run_jumps(run, env, "jumps")
+        jumps = self.run_flags(run, flags, env, "jumps")
         limit = open_loop_limits(env, initial_state)
         with figure(run.folder / "sweep.png", figsize=(6, 5.5)) as axis:
             axis.scatter(jumps.commanded, limit, s=5, color="0.6", label="open-loop jump of the same robot")
@@ -141,7 +141,7 @@ class HeightSweep(Suite):
             axis.set_title(f"{self.num_jumps} jumps, {run.title}", wrap=True)
 
         def pushed(conditions: Conditions) -> Metrics:
-            return flags.metrics(self.run_jumps(run, run.env(self.num_jumps, None, conditions)))
+            return flags.metrics(self.run_flags(run, flags, run.env(self.num_jumps, None, conditions)))
 
         inside = within(jumps.commanded, flags.success_range)
         values = flags.metrics(jumps) | limit_metrics(jumps.outcome, jumps.commanded, limit[:, None], inside)
@@ -186,10 +186,7 @@ class DistanceSweep(Suite):
     def run_jumps(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> LandingLog:
         """Run one jump per distance under some conditions, return the log; film: name of the recording, or empty."""
         change = with_second_takeoff if self.end_at_second_takeoff else with_jump_terminations
-        env = run.env(self.num_jumps, change, conditions)
-        log = self.flags.log(env.task, self.seed)
-        log.rest = self.rest_time
-        return run.run_episodes(env, log, film=film)
+        return self.run_flags(run, self.flags, run.env(self.num_jumps, change, conditions), film)
 
     def metrics(self, log: LandingLog) -> Metrics:
         """Return the metrics of `jumper evaluate`, and the success over the distances of the paper's training."""

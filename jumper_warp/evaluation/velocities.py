@@ -14,9 +14,9 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.film import PICTURE_SIZE, Film, Filmstrip, side_view
 from jumper_warp.evaluation.jumps import wrapped, yaw_of
 from jumper_warp.evaluation.log import EvaluationLog, finite, outcome_names
-from jumper_warp.evaluation.metrics import Metric, Metrics, mean, measure, rate, rmse
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import Metric, Metrics, mean, measure, rate, rmse
 from jumper_warp.utils.rotations import CONJUGATE, rotate
 
 Velocity = tuple[float, float, float]  # Ahead, to the left [m/s], about z [rad/s]
@@ -141,7 +141,8 @@ class VelocityLog(EvaluationLog):
 
     def columns(self) -> dict[str, list]:
         """Return lists with one value per robot: first command_<axis>, rms_error_<axis> over all time, end."""
-        error = rms(self.errors(), axis=0)
+        total, count = np.moveaxis(self.square_errors(settled=False), -1, 0)
+        error = np.sqrt(total / np.where(count > 0, count, np.nan))
         columns = {f"command_{axis}": self.commands[:, 0, i] for i, axis in enumerate(AXES)}
         columns |= {f"rms_error_{axis}": error[:, i] for i, axis in enumerate(AXES)}
         return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
@@ -156,8 +157,7 @@ class VelocityLog(EvaluationLog):
 
     def square_errors(self, *, settled: bool) -> np.ndarray:
         """Return sums of squared errors and numbers of samples, (robots, 3, 2); settled: as for `errors`."""
-        error = self.errors(settled=settled)
-        return np.stack([np.nansum(error**2, axis=0), np.isfinite(error).sum(axis=0)], axis=-1)
+        return square_sums(self.errors(settled=settled))
 
     def errors(self, *, settled: bool = False) -> np.ndarray:
         """Return velocity minus command, (steps, robots, 3), NaN after a fall; settled: also near commands' changes.
@@ -212,17 +212,13 @@ def velocity_series(velocity: np.ndarray, command: np.ndarray, worlds: Sequence[
     return series
 
 
-def rms(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np.ndarray:
-    """Return the root mean square of the finite values along axes (None: all), NaN where no value is finite."""
-    known = np.isfinite(values)
-    total, count = (np.where(known, values, 0.0) ** 2).sum(axis=axis), known.sum(axis=axis)
-    with np.errstate(invalid="ignore"):
-        return np.sqrt(total / np.where(count > 0, count, np.nan))
+def square_sums(error: np.ndarray) -> np.ndarray:
+    """Return sums of squares and numbers of the values that are not NaN, (robots, 3, 2); error: (steps, robots, 3)."""
+    return np.stack([np.nansum(error**2, axis=0), np.isfinite(error).sum(axis=0)], axis=-1)
 
 
 def rmse_rows(prefix: str, over: str, *, settled: bool) -> list[Metric]:
     """Return rows of a table: `<prefix>rmse_<axis>_<unit>` of `VelocityLog`, over a set of its robots."""
-
     keys = [f"{prefix}rmse_{axis}_{unit}" for axis, unit in zip(AXES, UNITS, strict=True)]
     return [
         Metric(key, rmse, over, lambda o, i=i: o.square_errors(settled=settled)[:, i]) for i, key in enumerate(keys)

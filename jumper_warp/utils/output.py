@@ -2,38 +2,20 @@
 
 import json
 import math
-import re
 import sys
 from collections.abc import Mapping
 from datetime import datetime
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import json_bytes, write_atomically
+from jumper_warp.utils.metrics import AnyMetrics, MetricValue, Scalar, unit_of
 from jumper_warp.utils.runtime import device_info, source_versions
 
-Scalar = float | int | str | bool | None  # Type of a value, or of each item of a list of values
 VERSION = 1  # Version of the layout of metrics.json
-UNITS = {
-    "_rad_s": "rad/s", "_m_s2": "m/s^2", "_nm_s": "N m s", "_m_s": "m/s", "_deg": "deg", "_mm": "mm", "_ms": "ms",
-    "_us": "us", "_nm": "N m", "_hz": "Hz", "_m": "m", "_s": "s", "_n": "N",
-}  # fmt: skip
-"""Unit by the end of a metric's key; longer ends come before the shorter ones that they contain."""
-
-
-class MetricValue(NamedTuple):
-    """Value of a metric, with the trials that it was computed from."""
-
-    value: Scalar | list[Scalar]  # None: undefined, such as a mean over no trials
-    trials: int | None = None  # Number of trials; None: not computed from trials
-    interval: tuple[float, float] | None = None  # 95 % confidence interval; None: undefined
-    over: str | None = None  # The trials, such as "landed jumps"
-
-
-AnyMetrics = Mapping[str, MetricValue | Scalar | list[Scalar]]  # Metrics by key, which ends in the unit
 
 
 def output_dir(name: str, out: Path | None = None) -> Path:
@@ -88,13 +70,6 @@ def read_values(folder: Path) -> dict[str, Any]:
     """Return the conditions of a file `metrics.json` and the values of its metrics, by name."""
     conditions = json.loads((folder / "metrics.json").read_text())["conditions"]
     return conditions | {key: metric.value for key, metric in read_metrics(folder).items()}
-
-
-def unit_of(key: str) -> str | None:
-    """Return the unit in the end of a metric's key, as `_m_s` or ` [m/s]`; None: there is none, as in counts."""
-    if bracket := re.search(r"\[(.+)\]$", key):
-        return bracket[1]
-    return next((unit for end, unit in UNITS.items() if key.endswith(end)), None)
 
 
 def _entry(key: str, value: Any) -> dict[str, Any]:

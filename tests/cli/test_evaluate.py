@@ -116,7 +116,7 @@ def test_success_range_selects_goals_by_distance():
     metrics = flags.metrics(landings)
     assert metrics["success_rate"].value == pytest.approx(2 / 3)
     near = metrics["in_range_success_rate"]
-    assert (near.value, near.trials, near.over) == (1.0, 2, "jumps over 0.3 to 0.5 m")
+    assert (near.value, near.trials, near.over) == (1.0, 2, "jumps with goals of 0.3 to 0.5 m")
 
 
 def test_height_goals_are_evenly_spaced():

@@ -7,10 +7,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jumper_warp.evaluation import velocities
-from jumper_warp.evaluation.metrics import measure
 from jumper_warp.evaluation.velocities import VelocityFlags, VelocityLog, VelocityPlayFlags
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import measure
 from metric_helpers import values
 from support import gaits
 from support.walks import kept_speeds, settling_times, step_commands, top_speed, walked_fraction

@@ -13,7 +13,6 @@ from jumper_warp.evaluation.film import side_view
 from jumper_warp.evaluation.jumps import TERMINATIONS
 from jumper_warp.evaluation.landings import LandingLog
 from jumper_warp.evaluation.log import run_evaluation, termination_names
-from jumper_warp.evaluation.metrics import format_value
 from jumper_warp.evaluation.plots import BasePaths
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.suites import Consecutive, Farthest, Grid, Platform, consecutive_metrics, distance_metrics
@@ -22,6 +21,7 @@ from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import format_value
 from jumper_warp.utils.output import read_values
 from landing_helpers import OPEN_LOOP_APEX, still_policy
 from metric_helpers import values

@@ -10,6 +10,7 @@ import pytest
 from rich.console import Console
 
 from jumper_warp.utils import output, runtime
+from jumper_warp.utils.metrics import MetricValue, unit_of
 
 
 def test_default_output_folder_is_name_and_time(tmp_path, monkeypatch):
@@ -45,7 +46,7 @@ def test_metrics_file_holds_the_given_metrics(tmp_path):
 
 def test_metrics_file_has_documented_layout(tmp_path):
     jsonschema = pytest.importorskip("jsonschema")
-    rate = output.MetricValue(0.5, 4, (0.15, 0.85), "landed jumps")
+    rate = MetricValue(0.5, 4, (0.15, 0.85), "landed jumps")
     output.write_metrics(tmp_path, {"fall_rate": rate, "apex [m]": 1.0, "bin_m": [1.0, None]}, {"solver": "mujoco"})
     schema = json.loads((Path(__file__).parents[2] / "docs" / "metrics.schema.json").read_text())
     document = json.loads((tmp_path / "metrics.json").read_text())
@@ -55,12 +56,12 @@ def test_metrics_file_has_documented_layout(tmp_path):
 
 
 def test_metric_has_value_unit_trials_interval_and_set_of_trials(tmp_path):
-    path = output.write_metrics(tmp_path, {"drift_m": output.MetricValue(0.5, 4, (0.1, 0.9), "jumps")}, {"a": 1})
+    path = output.write_metrics(tmp_path, {"drift_m": MetricValue(0.5, 4, (0.1, 0.9), "jumps")}, {"a": 1})
     assert json.loads(path.read_text()) == {
         "schema": "jumper-warp metrics", "version": 1, "conditions": {"a": 1},
         "metrics": {"drift_m": {"value": 0.5, "unit": "m", "trials": 4, "interval": [0.1, 0.9], "over": "jumps"}},
     }  # fmt: skip
-    assert output.read_metrics(tmp_path) == {"drift_m": output.MetricValue(0.5, 4, [0.1, 0.9], "jumps")}
+    assert output.read_metrics(tmp_path) == {"drift_m": MetricValue(0.5, 4, [0.1, 0.9], "jumps")}
 
 
 @pytest.mark.parametrize(
@@ -69,7 +70,7 @@ def test_metric_has_value_unit_trials_interval_and_set_of_trials(tmp_path):
      ("gravity_m_s2", "m/s^2"), ("torque_nm", "N m"), ("rate [poses/s]", "poses/s"), ("fall_rate", None)],
 )  # fmt: skip
 def test_unit_is_read_from_the_end_of_the_key(key, unit):
-    assert output.unit_of(key) == unit
+    assert unit_of(key) == unit
 
 
 def test_numpy_scalars_are_written_as_numbers(tmp_path):

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from jumper_warp.evaluation.metrics import Metric, largest, mean, measure, print_metrics, rate, rmse
-from jumper_warp.utils.output import MetricValue
+from jumper_warp.utils.metrics import Metric, MetricValue, largest, mean, measure, print_metrics, rate, rmse
 
 
 @pytest.mark.parametrize(("successes", "trials"), [(0, 7), (3, 7), (7, 7), (4000, 4096)])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, Protocol
 
@@ -10,8 +11,24 @@ from numpy.typing import ArrayLike
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.utils.output import AnyMetrics, MetricValue
+Scalar = float | int | str | bool | None  # Type of a value, or of each item of a list of values
+UNITS = {
+    "_rad_s": "rad/s", "_m_s2": "m/s^2", "_nm_s": "N m s", "_m_s": "m/s", "_deg": "deg", "_mm": "mm", "_ms": "ms",
+    "_us": "us", "_nm": "N m", "_hz": "Hz", "_m": "m", "_s": "s", "_n": "N",
+}  # fmt: skip
+"""Unit by the end of a metric's key; longer ends come before the shorter ones that they contain."""
 
+
+class MetricValue(NamedTuple):
+    """Value of a metric, with the trials that it was computed from."""
+
+    value: Scalar | list[Scalar]  # None: undefined, such as a mean over no trials
+    trials: int | None = None  # Number of trials; None: not computed from trials
+    interval: tuple[float, float] | None = None  # 95 % confidence interval; None: undefined
+    over: str | None = None  # The trials, such as "landed jumps"
+
+
+AnyMetrics = Mapping[str, MetricValue | Scalar | list[Scalar]]  # Metrics by key, which ends in the unit
 Metrics = dict[str, MetricValue]  # Metrics by key
 Z = 1.959964  # [1] Two-sided 95 % quantile of the normal distribution
 RESAMPLES, BOOTSTRAP_SEED = 2000, 0  # Number of bootstrap samples of each mean, and seed of their draws
@@ -35,6 +52,13 @@ class Metric(NamedTuple):
     statistic: Callable[[np.ndarray, str], MetricValue]  # `rate`, `mean`, `largest` or `rmse`
     over: str  # Set of trials, a name in `Outcome.trials`
     values: Callable[[Any], np.ndarray]  # Returns an array of an outcome, one entry per trial
+
+
+def unit_of(key: str) -> str | None:
+    """Return the unit in the end of a metric's key, as `_m_s` or ` [m/s]`; None: there is none, as in counts."""
+    if bracket := re.search(r"\[(.+)\]$", key):
+        return bracket[1]
+    return next((unit for end, unit in UNITS.items() if key.endswith(end)), None)
 
 
 def measure(
@@ -72,11 +96,8 @@ def rate(values: ArrayLike, over: str = "") -> MetricValue:
 def mean(values: ArrayLike, over: str = "") -> MetricValue:
     """Return the mean of the values (n,) that are finite, with a bootstrap interval; over: what the trials are."""
     values = np.asarray(values, dtype=float).ravel()
-    values = values[np.isfinite(values)]
-    if not len(values):
-        return MetricValue(None, 0, None, over)
-    low, high = np.quantile(resampled_means(values[:, None]), (0.025, 0.975))
-    return MetricValue(float(values.mean()), len(values), (float(low), float(high)), over)
+    known = np.isfinite(values)
+    return _ratio(np.stack([np.where(known, values, 0.0), known], axis=1), over)
 
 
 def rmse(squares: np.ndarray, over: str = "") -> MetricValue:
@@ -84,12 +105,17 @@ def rmse(squares: np.ndarray, over: str = "") -> MetricValue:
 
     squares: (trials, 2), sum of squared errors and number of samples of each trial.
     """
-    squares = np.asarray(squares, dtype=float)[squares[:, 1] > 0]
-    if not len(squares):
+    return _ratio(np.asarray(squares, dtype=float), over, np.sqrt)
+
+
+def _ratio(rows: np.ndarray, over: str, function: Callable[[Any], Any] = lambda ratio: ratio) -> MetricValue:
+    """Return a function of the ratio of the sums of two columns, (trials, 2); the second holds numbers of samples."""
+    rows = rows[rows[:, 1] > 0]
+    if not len(rows):
         return MetricValue(None, 0, None, over)
-    total, means = squares.sum(axis=0), resampled_means(squares)
-    low, high = np.quantile(np.sqrt(means[:, 0] / means[:, 1]), (0.025, 0.975))
-    return MetricValue(float(np.sqrt(total[0] / total[1])), len(squares), (float(low), float(high)), over)
+    total, means = rows.sum(axis=0), resampled_means(rows)
+    low, high = np.quantile(function(means[:, 0] / means[:, 1]), (0.025, 0.975))
+    return MetricValue(float(function(total[0] / total[1])), len(rows), (float(low), float(high)), over)
 
 
 def largest(values: ArrayLike, over: str = "") -> MetricValue:
