@@ -11,6 +11,7 @@ from jumper_warp.evaluation.log import within
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
 
+LEVEL_TILT = 10.0  # [deg] Tilt of the base below which a landing is level
 DRIFT, TURN = 0.2, 25.0  # [m], [deg] Drift and turn of the base beyond which the authors' configuration ends an episode
 
 JUMP_METRICS = (
@@ -28,6 +29,7 @@ JUMP_METRICS = (
     Metric("early_rate", rate, "jumps", lambda o: o.early),
     Metric("no_jump_rate", rate, "jumps", lambda o: o.no_jump),
     Metric("second_takeoff_rate", rate, "jumps that touched down", lambda o: o.took_off_again),
+    Metric("landing_tilt_below_10_deg_rate", rate, "landed jumps", lambda o: o.tilt_deg < LEVEL_TILT),
     Metric("landing_tilt_mean_deg", mean, "landed jumps", lambda o: o.tilt_deg),
     Metric("landing_tilt_max_deg", largest, "landed jumps", lambda o: o.tilt_deg),
     Metric("turn_abs_mean_deg", mean, "landed jumps", lambda o: o.turn_deg),

@@ -9,7 +9,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike
 from rich.console import Console
-from rich.table import Table
+from rich.table import Column, Table
 
 Scalar = float | int | str | bool | None  # Type of a value, or of each item of a list of values
 UNITS = {
@@ -142,7 +142,14 @@ def print_metrics(
     Metrics whose value is a list are left out.
     """
     console, conditions = Console(width=WIDTH), conditions or {}
-    table = Table("metric", "value", "95 % interval", *(["paper"] if paper else []), box=None, pad_edge=False)
+    table = Table(
+        Column("metric", overflow="fold"),
+        "value",
+        "95 % interval",
+        *(["paper"] if paper else []),
+        box=None,
+        pad_edge=False,
+    )
     for key, entry in metrics.items():
         value, _, interval, _ = entry if isinstance(entry, MetricValue) else MetricValue(entry)
         if not isinstance(value, list):

@@ -123,6 +123,7 @@ def test_landing_metrics_match_hand_computed_values():
         "success_without_hop_rate": 1 / 5,
         "success_without_paw_lift_rate": 1 / 5,
         "second_takeoff_rate": 0.0,
+        "landing_tilt_below_10_deg_rate": 1 / 2,
         "landing_tilt_mean_deg": math.degrees(0.15),
         "landing_tilt_max_deg": math.degrees(0.2),
         "turn_abs_mean_deg": math.degrees(0.2),
