@@ -61,7 +61,8 @@ def main(args: Args) -> dict:
     }
     plot_flights(run.folder / "flights.png", flights, run.title)
     settings = {"takeoff": args.takeoff, "landing": args.landing_policy or "default pose"}
-    values = settings | ({} if late is None else {"late_ms": args.max_leg_delay}) | flight_metrics(flights["turning"])
+    run.settings |= settings | ({} if late is None else {"late_ms": args.max_leg_delay})
+    values = flight_metrics(flights["turning"])
     values |= {f"without_turning_{name}": value for name, value in flight_metrics(flights["without"]).items()}
     return run.report(values, {})
 
