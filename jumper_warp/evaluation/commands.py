@@ -13,8 +13,8 @@ from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_course
-from jumper_warp.evaluation.film import EnvRecorder, save_recording
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
+from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.evaluation.run import EvaluationRun, SkillRun
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.policies.conditions import Conditions

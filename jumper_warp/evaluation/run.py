@@ -19,8 +19,8 @@ import tyro
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.evaluations import evaluation_of
-from jumper_warp.evaluation.film import EnvRecorder, save_recording
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
+from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.runs import open_policy

@@ -13,12 +13,12 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from jumper_warp.evaluation.film import block_positions
 from jumper_warp.evaluation.jump_metrics import PLACE_METRICS, jump_metrics, range_metrics
 from jumper_warp.evaluation.jumps import TOLERANCE, JumpOutcome
 from jumper_warp.evaluation.landings import LandingLog
 from jumper_warp.evaluation.log import within
 from jumper_warp.evaluation.plots import BasePaths, plot_distances, plot_landings, plot_paths, regular_polygons
+from jumper_warp.evaluation.recorder import block_positions
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite, check
 from jumper_warp.robot.grounds import SIZE, BlockCfg, platform, uneven
