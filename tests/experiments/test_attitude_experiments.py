@@ -29,7 +29,7 @@ def test_turns_about_all_axes_write_metrics_plot_and_recording(run, tmp_path):
     assert values["physics_step_s"] == pytest.approx(1.0 / 960.0)
     assert values["settled_without_collision_rate"] == 0.0 and 80.0 < values["error_at_end_mean_deg"] < 100.0
     assert 0.0 < values["angular_momentum_max_nm_s"] < 1.0e-5
-    assert (tmp_path / "turns.png").is_file() and (tmp_path / "turns.rrd").stat().st_size > 10_000
+    assert (tmp_path / "turns.png").is_file() and (tmp_path / "turn.rrd").stat().st_size > 10_000
 
 
 def test_flights_with_and_without_turning_have_the_same_takeoffs(run, tmp_path):
