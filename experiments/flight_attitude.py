@@ -55,7 +55,7 @@ def main(args: Args) -> dict:
     run = FlightRun(args, args.landing_policy, args.jump_task)
     env, heights = run.env(args.num_flights), np.linspace(*args.height_range, args.num_flights)
     max_delay = 1.0e-3 * args.max_leg_delay
-    late = extension_delays(args.num_flights, max_delay, args.seed) if args.takeoff == "open-loop" else None
+    late = extension_delays(args.num_flights, max_delay, args.stream_seed) if args.takeoff == "open-loop" else None
     flights = {
         name: run.fly(env, FlightLog(heights, late, turns=name == "turning"), name) for name in ("turning", "without")
     }

@@ -86,7 +86,7 @@ def random_script(rng: np.random.Generator, blocks: bool = True) -> list[ScriptS
 
 def scripts(args: Args) -> list[list[ScriptStep]]:
     """Return one script per robot."""
-    rng, blocks = np.random.default_rng(args.seed), args.blocks and args.solver == "jumper"
+    rng, blocks = np.random.default_rng(args.stream_seed), args.blocks and args.solver == "jumper"
     return [random_script(rng, blocks) if args.course else paper_script(rng) for _ in range(args.num_robots)]
 
 
@@ -94,7 +94,7 @@ def main(args: Args) -> dict:
     """Run the test, plot the course of robot 0, and return the metrics."""
     name = "course" if args.course else "walk_jump_walk"
     run = SkillRun.from_args(name, args, SkillNames(args.policy, args.jump_up, args.jump_to))
-    course = CourseLog(scripts(args), random_headings(args.num_robots, args.seed))
+    course = CourseLog(scripts(args), random_headings(args.num_robots, args.stream_seed))
     run.run_episodes(run.env(args.num_robots, block=course.block), course, film=name)
     plot_course(run.folder / "timeline.png", course, 0, f"{run.title}, robot 0 of {course.count}")
     paper = {} if args.course else {f"settled_{key}": value for key, value in PAPER.items()}

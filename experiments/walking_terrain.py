@@ -51,11 +51,12 @@ def main(args: Args) -> dict:
     """Run the walks on every terrain, plot the walked fractions, and return the metrics."""
     run = EvaluationRun.from_args("walking_terrain", args, ("velocity",))
     commands, metrics, fractions = np.tile([args.speed, 0.0, 0.0], (args.num_robots, 1, 1)), {}, {}
-    terrain = TerrainCfg(tile=14.0, uneven=args.uneven, slope=args.slope, step=(args.step_height, args.step_height))
+    steps = (args.step_height, args.step_height)
+    terrain = TerrainCfg(tile=14.0, uneven=args.uneven, slope=args.slope, step=steps, seed=args.stream_seed)
     for kind in args.terrains:
         ground = single_tile(terrain, kind)
         env = run.env(args.num_robots, ground=ground)
-        log = VelocityLog(commands, env.task, SECONDS, headings=random_headings(args.num_robots, args.seed))
+        log = VelocityLog(commands, env.task, SECONDS, headings=random_headings(args.num_robots, args.stream_seed))
         walks = run.run_episodes(env, log, film=kind, film_scene={"ground": ground})
         fractions[kind] = walked_fraction(walks)
         metrics[f"{kind}_walked_fraction_mean"] = mean(fractions[kind], f"robots on {kind}")

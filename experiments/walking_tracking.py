@@ -81,9 +81,9 @@ def plot_tracking(run: EvaluationRun, walks: VelocityLog, settling: np.ndarray) 
 
 def main(args: Args) -> dict:
     """Run all tests, plot tracking and settling times, and return the metrics."""
-    run, rng = EvaluationRun.from_args("walking_tracking", args, ("velocity",)), np.random.default_rng(args.seed)
+    run, rng = EvaluationRun.from_args("walking_tracking", args, ("velocity",)), np.random.default_rng(args.stream_seed)
     flags = VelocityFlags(args.commands_per_axis, (REACH, REACH, REACH))
-    log = flags.log(run.task, args.seed)
+    log = flags.log(run.task, args.stream_seed)
     walks, env = run.run_episodes(run.env(log.count), log), run.env(args.commands_per_axis**3)
     redirected = run.run_episodes(env, redirected_walks(env, rng), film="walk")
     settling = settling_times(redirected)

@@ -284,9 +284,9 @@ class FlightRun(Run):
         conditions = self.conditions
         tasks, handovers = flight_skills(*(conditions.applied(task) for task in self.tasks))
         env = Env(
-            tasks, count, seed=conditions.seed, device=conditions.device, solver=conditions.solver,
-            randomize=conditions.sets_parameters, noise=conditions.noise, auto_reset=False, threads=conditions.threads,
-            handovers=handovers,
+            tasks, count, seed=conditions.seed, stream=conditions.stream, device=conditions.device,
+            solver=conditions.solver, randomize=conditions.sets_parameters, noise=conditions.noise, auto_reset=False,
+            threads=conditions.threads, handovers=handovers,
         )  # fmt: skip
         for policy in (self.turn, self.landing):
             if policy is not None:

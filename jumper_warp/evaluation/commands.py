@@ -48,12 +48,15 @@ class EvaluateCfg(Generic[Flags]):
 def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     """Evaluate a policy, write `metrics.json`, print the metrics, and return conditions and metrics by name.
 
-    Raises PolicyError: unusable policy, or `save_to_policy` for a run; OSError: the folder cannot be created.
+    Raises PolicyError: unusable policy, or `save_to_policy` for a run; InputError: `save_to_policy` for another stream
+    than reporting; OSError: the folder cannot be created.
     """
+    if cfg.save_to_policy and cfg.conditions.stream != "reporting":
+        raise InputError(f"save_to_policy is for the stream reporting, got {cfg.conditions.stream}")
     if cfg.save_to_policy and is_run(run.source):
         raise PolicyError(f"{run.source}: a run keeps no metrics; export it first")
     run.prepare("evaluate", cfg.conditions, cfg.out, save_trials=cfg.save_trials)
-    log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.seed)
+    log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.stream_seed)
     run.run_episodes(run.env(log.count), log)
     values = run.report(cfg.flags.metrics(log), run.evaluation.paper)
     if cfg.save_to_policy:

@@ -114,7 +114,7 @@ class Run(ABC):
     def condition_values(self) -> dict[str, Any]:
         """Conditions by name, without unset ones; latency is the simulated one of all episodes so far."""
         conditions, values = self.conditions, {**self.settings}
-        values |= {name: getattr(conditions, name) for name in ("solver", "randomize", "noise", "seed")}
+        values |= {name: getattr(conditions, name) for name in ("solver", "randomize", "noise", "seed", "stream")}
         if conditions.randomize:
             values["push_in_flight"] = conditions.push_in_flight
         values |= {} if conditions.gain_scale is None else {"gains": list(conditions.gain_scale)}

@@ -146,7 +146,7 @@ class Consecutive(Suite):
 
     def measure(self, run: EvaluationRun) -> Metrics:
         """Run pairs and long rows, plot the paths of the bases, and return the metrics."""
-        rng = np.random.default_rng(self.seed)
+        rng = np.random.default_rng(self.stream_seed)
         pairs = np.repeat(np.array(list(PAIRS.values())), self.num_jumps, axis=0)
         rows = rng.uniform(ROW_LOWER, ROW_UPPER, (self.num_trials, self.jumps_per_trial, 2))
         logs, paths = [], []
@@ -226,7 +226,7 @@ class Platform(Suite):
 
     def measure(self, run: EvaluationRun) -> Metrics:
         """Run the jumps of all scenes, plot them, and return `<scene>_<key>`."""
-        rng = np.random.default_rng(self.seed)
+        rng = np.random.default_rng(self.stream_seed)
         goals = rng.uniform(GROUND_LOWER, GROUND_UPPER, (self.num_jumps, 2))
         run.settings["edge_m"], values = self.edge, {}
         done: dict[str, LandingLog] = {}

@@ -68,7 +68,7 @@ class Suite(EvaluationArgs, ABC):
 
     def run_flags(self, run: EvaluationRun, flags: Any, env: Env, film: str = "") -> Any:
         """Run the jumps of `jumper evaluate` with some flags, and return their log; film: name of the recording."""
-        log = flags.log(env.task, self.seed)
+        log = flags.log(env.task, self.stream_seed)
         log.rest = self.rest_time
         return run.run_episodes(env, log, film=film)
 
@@ -82,7 +82,7 @@ class Suite(EvaluationArgs, ABC):
         keywords of `EvaluationRun.run_episodes`.
         """
         env = run.env(len(goals)) if env is None else env
-        headings = random_headings(len(goals), self.seed) if headings is None else headings
+        headings = random_headings(len(goals), self.stream_seed) if headings is None else headings
         log = LandingLog(goals, termination_names(env.task), headings, delay, self.rest_time)
         return run.run_episodes(env, log, **options)
 

@@ -384,7 +384,7 @@ def test_evaluate_writes_metrics_and_saves_them_to_the_policy(trained_run, tmp_p
     code, out, _ = run(capsys, "evaluate", str(trained_run / "policy"), *args)
     metrics = read_values(tmp_path)
     assert code == 0 and "in_range_success_rate" in out
-    assert (metrics["noise"], metrics["success_rate"]) == (True, 0.0)
+    assert (metrics["noise"], metrics["stream"], metrics["success_rate"]) == (True, "reporting", 0.0)
     trials = np.load(tmp_path / "trials.npz")
     assert trials["goal_height_m"].tolist() == [0.5, 0.85, 1.2] and trials["success"].tolist() == [False] * 3
     assert read_values(trained_run / "policy") == metrics
@@ -501,6 +501,12 @@ def test_export_refuses_truncated_checkpoint(trained_run, tmp_path, capsys):
 def test_refuses_to_save_metrics_to_a_training_run(trained_run, capsys):
     code, _, err = run(capsys, "evaluate", str(trained_run), "--save-to-policy", "--device", "cpu")
     assert code == 2 and "export it first" in err[-1]
+
+
+def test_refuses_to_save_metrics_of_another_stream_than_reporting(trained_run, capsys):
+    args = [str(trained_run / "policy"), "--save-to-policy", "--stream", "selection", "--device", "cpu"]
+    code, _, err = run(capsys, "evaluate", *args)
+    assert code == 2 and err[-1].endswith("save_to_policy is for the stream reporting, got selection")
 
 
 def test_viewer_binds_to_loopback(tmp_path):

@@ -9,6 +9,7 @@ import torch
 from jumper_warp.cli.main import main
 from jumper_warp.evaluation.finetuning import FinetuneCfg, finetune, make_groups, shift_goal_observation
 from jumper_warp.evaluation.jump_errors import jump_errors
+from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.trajectory.gauss_newton import Network
@@ -84,6 +85,24 @@ def test_landing_errors_on_mars_are_measured_at_rest():
     arrays = group.env.task_arrays()
     assert errors.valid.all() and (arrays["phase_steps"] >= 60).all()  # a second after touchdown
     assert errors.value.abs().max() < 0.05  # [m]
+
+
+@pytest.mark.parametrize("seed", [0, 5])
+def test_finetuning_and_evaluation_share_no_robot_and_no_delay(seed):
+    policy = open_policy("vertical_jump")
+    cfg = FinetuneCfg(**FEW | {"num_goals": 2, "num_randomized": 16, "seed": 0})
+    tuned = make_groups(policy, cfg)[-1].env
+    reported = env_of_policy(policy, 16, Conditions(randomize=True, noise=True, seed=seed, device="cpu"))
+    for env in (tuned, reported):
+        env.evaluation_reset(np.tile([0.0, 0.0, 0.8], (16, 1)))
+    masses = [env.parameters.body_mass.numpy().reshape(16, 1, -1) for env in (tuned, reported)]
+    for drawn in (
+        masses,
+        [env.parameters.gain_ratio.numpy().swapaxes(0, 1).reshape(16, 1, -1) for env in (tuned, reported)],
+    ):
+        random = np.ptp(drawn[0], axis=0)[0] > 0.0
+        assert random.sum() > 10
+        assert not (drawn[0] == drawn[1].swapaxes(0, 1))[..., random].any()
 
 
 def test_policy_with_shifted_goal_observation_acts_as_for_shifted_goal():

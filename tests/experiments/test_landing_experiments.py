@@ -26,7 +26,7 @@ from landing_helpers import OPEN_LOOP_APEX, still_policy
 from metric_helpers import values
 
 COLLIDED, NO_JUMP, LANDED = (TERMINATIONS.index(name) for name in ("collided", "no_jump", "success"))
-SHARED = {"solver", "randomize", "seed", "rest_s", "trained_range_m"}
+SHARED = {"solver", "randomize", "seed", "stream", "rest_s", "trained_range_m"}
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
