@@ -106,6 +106,7 @@ class Run(ABC):
             words.append(f"latency {latency_text(self._latency[0], self._physics_dt)}")
         words += [] if conditions.gain_scale is None else ["kp × {:g}, kd × {:g}".format(*conditions.gain_scale)]
         words += [] if conditions.friction is None else [f"friction {conditions.friction:g}"]
+        words += [] if conditions.sensor_offset is None else [f"sensors ± {conditions.sensor_offset:g}°"]
         words += [] if conditions.gravity is None else [f"gravity {conditions.gravity:g} m/s²"]
         words += [] if conditions.robot is None else [f"robot of {conditions.robot.name}"]
         return ", ".join(words + (["pushed in flight too"] if conditions.push_in_flight else []))
@@ -119,6 +120,7 @@ class Run(ABC):
             values["push_in_flight"] = conditions.push_in_flight
         values |= {} if conditions.gain_scale is None else {"gains": list(conditions.gain_scale)}
         values |= {} if conditions.friction is None else {"friction": conditions.friction}
+        values |= {} if conditions.sensor_offset is None else {"sensor_offset_deg": conditions.sensor_offset}
         values |= {} if conditions.robot is None else {"robot": str(conditions.robot)}
         if self._latency:
             values |= latency_values(np.concatenate(self._latency), self._physics_dt, conditions.latency)

@@ -47,6 +47,8 @@ class Conditions:
     """[1] Scales of kp and kd of all motors (default: 1, or sampled if randomised)."""
     friction: float | None = None
     """[1] Friction of the paws, static and dynamic (default: nominal, or sampled if randomised)."""
+    sensor_offset: float | None = None
+    """[deg] Largest constant error of the motors' position sensors (default: none, or sampled if randomised)."""
     gravity: float | None = None  # [m/s^2] Gravity, downward (default: the task's)
 
     def __post_init__(self) -> None:
@@ -68,8 +70,9 @@ class Conditions:
 
     @property
     def fixed_parameters(self) -> dict[str, Any]:
-        """Values of the parameters latency, gains and friction that are not None here, by name in RandomizationCfg."""
-        values = {"latency": self.latency, "gains": self.gain_scale, "friction": self.friction}
+        """Arguments of `RandomizationCfg.with_fixed` that are not None here, by name."""
+        values = {"latency": self.latency, "gains": self.gain_scale, "friction": self.friction,
+                  "sensor_offset": self.sensor_offset}  # fmt: skip
         return {name: value for name, value in values.items() if value is not None}
 
     def overlay(self, config: dict[str, Any]) -> RobotOverlay | None:

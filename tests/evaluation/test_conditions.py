@@ -123,6 +123,16 @@ def test_conditions_change_only_the_fixed_parameters():
     assert not env.parameters.push.numpy().any()
 
 
+def test_sensor_offset_is_drawn_for_every_robot_and_motor_within_its_size():
+    conditions = Conditions(sensor_offset=4.0)
+    env = make_env(16, task=conditions.applied(JUMP), randomize=conditions.sets_parameters, auto_reset=False)
+    offset = np.degrees(env.sim.motors.offset.numpy())
+    assert len(np.unique(offset)) == offset.size == 16 * 12
+    assert 3.5 < np.abs(offset).max() <= 4.0 and abs(offset.mean()) < 1.0
+    drawn = Conditions(randomize=True, sensor_offset=4.0).applied(JUMP).randomization
+    assert (drawn.joint_offset, drawn.gains) == ((-4.0, 4.0), RandomizationCfg().gains)
+
+
 def test_fixing_a_parameter_at_its_nominal_value_is_bitwise_neutral():
     conditions, task = Conditions(latency=0.0), with_jump_terminations(JUMP)
     pair = [make_env(2, task=task), make_env(2, task=conditions.applied(task), randomize=conditions.sets_parameters)]
@@ -155,6 +165,7 @@ def test_randomised_conditions_keep_fixed_parameters():
         (lambda: Conditions(gain_scale=(0.0, 1.0)), "gains must be above 0"),
         (lambda: EvaluationArgs(gain_scale=(1.0, -1.0)), "damping_gains must be above 0"),
         (lambda: Conditions(friction=-0.1), "friction must not be negative"),
+        (lambda: Conditions(sensor_offset=-1.0), r"joint_offset must rise, got \(1\.0, -1\.0\)"),
         (lambda: EvaluationArgs(push_in_flight=True), "push_in_flight needs randomize"),
     ],
 )
