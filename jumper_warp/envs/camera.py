@@ -30,8 +30,8 @@ BELOW = -1000.0  # [m] height of the scenery of worlds that are not being drawn
 class WorldCamera:
     """Draws the first worlds of a simulation, with their ground and blocks, without changing the simulation.
 
-    All worlds share a renderer, which holds one robot and the scenery of every world. It is opened anew when a block
-    gets another size, or a robot on a heightfield leaves the part that is drawn.
+    All worlds share a renderer, which opens at the first image and holds one robot and the scenery of every world. It
+    loads the scenery anew when a block gets another size, or a robot on a heightfield goes far.
     """
 
     def __init__(self, sim: Simulation, count: int, size: tuple[int, int]) -> None:
@@ -88,12 +88,13 @@ class WorldCamera:
         return scenery, centers
 
     def _renderer_of(self, scenery: np.ndarray) -> Renderer:
-        """Return the renderer of a scenery, as `_present_scenery`, opened anew if the scenery changed."""
+        """Return the renderer of a scenery, as `_present_scenery`, which loads it if it changed."""
         if self._renderer is None or not np.array_equal(scenery, self._scenery):
-            make = open_renderer if self._renderer is None else type(self._renderer)
-            self.close()
-            shapes = [*self._shapes, *self._scenery_shapes(scenery)]
-            self._renderer = make(shapes, self._num_links + 2 * self._count, self._size)
+            bodies = [*self._shapes, *self._scenery_shapes(scenery)], self._num_links + 2 * self._count
+            if self._renderer is None:
+                self._renderer = open_renderer(*bodies, self._size)
+            else:
+                self._renderer.load(*bodies)
             self._scenery = scenery
         return self._renderer
 

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 from rerun.chunk import RrdReader
 
 from cli_helpers import curves, run
@@ -437,6 +438,21 @@ def test_play_horizontal_jumps_records_distances_and_goal_markers(still, tmp_pat
 def test_refuses_flags_of_other_tasks_and_falling_ranges(still, capsys, args, message):
     code, _, err = run(capsys, args[0], still, *args[1:], "--device", "cpu")
     assert code == 2 and message in err[-1]
+
+
+def test_play_writes_film_and_picture_and_prints_their_paths(still, tmp_path, capsys):
+    film, folder = tmp_path / "films" / "jump.webp", tmp_path / "out"
+    args = ["--goal", "0.8", "0.2", "--seconds", "0.5", "--video", str(film), "--size", "96", "64", "--fps", "10"]
+    code, _, err = run(capsys, "play", still, *args, "--speed", "0.5", "--device", "cpu", "--out", str(folder))
+    assert code == 0 and err[-3:] == [str(folder / "jump.rrd"), str(folder / "jump.png"), str(film)]
+    with Image.open(film) as animation, Image.open(folder / "jump.png") as picture:
+        assert (animation.n_frames, animation.size, picture.size[0]) == (10, (96, 64), 1600)  # 0.48 s at half speed
+
+
+@pytest.mark.parametrize("flags", [["--video", "jump.avi"], ["--video", "jump.gif", "--fps", "60"]])
+def test_play_refuses_bad_films_before_the_simulation(still, tmp_path, capsys, flags):
+    code, out, err = run(capsys, "play", still, *flags, "--device", "cpu", "--out", str(tmp_path / "out"))
+    assert code == 2 and not out and "jump." in err[-1] and not (tmp_path / "out").exists()
 
 
 def test_play_walks_for_the_given_time(tmp_path, capsys):

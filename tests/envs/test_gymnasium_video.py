@@ -107,6 +107,17 @@ def test_the_camera_follows_a_robot_over_any_distance(envs):
     assert np.abs(envs.render()[1].astype(int) - before).mean() > 3.0
 
 
+def test_environments_draw_in_turn(envs):
+    other = vector(num_envs=1)
+    other.reset(seed=1)
+    before = envs.render(), other.render()
+    after = envs.render(), other.render()
+    for images, same in zip(before, after, strict=True):
+        np.testing.assert_array_equal(images, same)
+    other.close()
+    np.testing.assert_array_equal(envs.render(), before[0])
+
+
 def test_only_the_first_worlds_are_drawn():
     envs = vector(num_envs=3, render_envs=2)
     envs.reset(seed=1)
