@@ -57,9 +57,11 @@ def one_jump(rec, world, takeoff_speed):
     leaves = np.flatnonzero(airborne[1:] & (vel[1:, 2] > takeoff_speed)) + 1
     takeoff = int(leaves[0]) if len(leaves) else None
     touchdown = None
-    if takeoff is not None:
-        lands = np.flatnonzero(~airborne[takeoff:])
-        touchdown = takeoff + int(lands[0]) if len(lands) else None
+    for step in range(len(pos) if takeoff is None else takeoff + 1, len(pos)):
+        if not airborne[step] and vel[step, 2] <= takeoff_speed:
+            touchdown = step
+            break
+        takeoff = takeoff if airborne[step] else step  # contact of a base that rises is part of the push-off
     bad = np.flatnonzero((pos[1:, 2] < 0.10) | hit[1:]) + 1
     fall = int(bad[0]) if len(bad) else None
     rest = len(pos) - 1 if touchdown is None else touchdown + SECOND
@@ -91,10 +93,13 @@ def one_jump(rec, world, takeoff_speed):
 
 
 def compare(metrics, expected):
-    """Compare metrics with expected values: rates and numbers of trials exactly, others to 1e-5."""
+    """Compare metrics with expected values: rates and numbers of trials exactly, lengths and RMSE to 1e-5.
+
+    Angles agree to 2e-4 degrees: the simulation has the cosine of a tilt in float32, 3e-7 over the sine of 7.8 degrees.
+    """
     for key, (value, trials) in expected.items():
         assert metrics[key].trials == trials, key
-        tolerance = 1e-12 if key.endswith("_rate") else 1e-5 * abs(float(value))
+        tolerance = {"rate": 1e-12, "deg": 2e-4}.get(key.split("_")[-1], 1e-5 * abs(float(value)))
         assert metrics[key].value == pytest.approx(float(value), rel=0.0, abs=tolerance), key
 
 
