@@ -268,8 +268,9 @@ class JumpLog(EvaluationLog):
             (self.rest_speed, at_rest, speed),
         ):
             record[row[due], number[due]] = values[due]
-        down, standing = landed[:, None] & now["paws_down"], (now["phase"] == STANCE)[:, None] & now["paws_down"]
-        self._paw_start[row] = np.where(standing[..., None], now["paw_pos"], self._paw_start[row])
+        down, pushing = landed[:, None] & now["paws_down"], (now["phase"] == STANCE) | (now["took_off"] == 1)
+        standing = (pushing[:, None] & now["paws_down"])[..., None]
+        self._paw_start[row] = np.where(standing, now["paw_pos"], self._paw_start[row])
         first = (down & ~self._paw_touched[row])[..., None]
         self.paw_shift[at] = np.where(first, now["paw_pos"] - self._paw_start[row], self.paw_shift[at])
         airborne = landed & ~down.any(axis=1)

@@ -82,7 +82,7 @@ def one_jump(rec, world, takeoff_speed):
             lifts = max(lifts, length)
     shifts = []
     for k in range(4):
-        before = np.flatnonzero(down[1:takeoff, k])[-1] + 1
+        before = np.flatnonzero(down[1 : takeoff + 1, k])[-1] + 1
         after = np.flatnonzero(down[touchdown : end + 1, k])
         shifts.append(paw[touchdown + after[0], k, :2] - paw[before, k, :2] if len(after) else [np.nan, np.nan])
     return jump | {
