@@ -20,10 +20,10 @@ from PIL import Image
 from jumper_warp.evaluation.attitude import AttitudePlayFlags
 from jumper_warp.evaluation.courses import CourseLog
 from jumper_warp.evaluation.evaluations import PlayFlags
-from jumper_warp.evaluation.film import EnvRecorder
 from jumper_warp.evaluation.heights import HeightPlayFlags
 from jumper_warp.evaluation.landings import LandingPlayFlags
 from jumper_warp.evaluation.log import run_evaluation
+from jumper_warp.evaluation.recorder import EnvRecorder
 from jumper_warp.evaluation.run import EvaluationRun, SkillRun
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.evaluation.velocities import VelocityPlayFlags

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import errno
 import os
+import subprocess
 import sys
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
@@ -167,20 +170,21 @@ def _heading(recording: Recording, time: float, ranks: Sequence[int]) -> str:
 
 
 def _encode_mp4(path: Path, images: Iterator[Image.Image], size: tuple[int, int], fps: float, count: int) -> None:
-    """Write images as H.264 in yuv420p, which browsers and slides play."""
-    import imageio_ffmpeg
+    """Write images as H.264 in yuv420p, which browsers and slides play. Raises OSError: ffmpeg fails."""
+    from imageio_ffmpeg import get_ffmpeg_exe
 
-    rate: Any = fps  # the library writes it as text
-    writer = imageio_ffmpeg.write_frames(
-        str(path), size, fps=rate, codec="libx264", pix_fmt_in="rgb24", macro_block_size=2, quality=6,
-        output_params=["-movflags", "+faststart"],
-    )  # fmt: skip
-    writer.send(None)
-    try:
-        for image in images:
-            writer.send(image.tobytes())
-    finally:
-        writer.close()
+    source = ["-f", "rawvideo", "-pix_fmt", "rgb24", "-s", f"{size[0]}x{size[1]}", "-r", str(fps), "-i", "-"]
+    coding = ["-c:v", "libx264", "-pix_fmt", "yuv420p", "-crf", "20", "-movflags", "+faststart"]
+    command = [get_ffmpeg_exe(), "-y", "-v", "error", *source, *coding, str(path)]
+    with subprocess.Popen(command, stdin=subprocess.PIPE, stderr=subprocess.PIPE) as ffmpeg:
+        assert ffmpeg.stdin is not None
+        with suppress(BrokenPipeError):  # the exit status and message follow
+            for image in images:
+                ffmpeg.stdin.write(image.tobytes())
+        message = ffmpeg.communicate()[1].decode(errors="replace")
+    if ffmpeg.returncode:
+        reason = f"ffmpeg failed with status {ffmpeg.returncode}: {' '.join(message.split())[-300:]}"
+        raise OSError(errno.EIO, reason, str(path))
 
 
 def _encode_animation(path: Path, images: Iterator[Image.Image], size: tuple[int, int], fps: float, count: int) -> None:

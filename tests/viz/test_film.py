@@ -96,12 +96,12 @@ def test_slow_motion_doubles_the_frames(tmp_path, canvas):
 
 
 def test_camera_moves_evenly_in_slow_motion(tmp_path, canvas):
-    write_film(box_recording(walk(4.0, 2.0)), tmp_path / "slow.webp", size=SIZE, speed=0.1)  # 5 images a frame
+    write_film(box_recording(walk(4.0, 2.0)), tmp_path / "slow.gif", size=SIZE, speed=0.2)  # 2.5 images a frame
     (drawn,) = canvas
-    eyes = np.array([view.eye[0] for view in drawn.views])[200:400]
-    bodies = np.array([poses[0, 0] for poses in drawn.poses])[200:400]
-    assert np.diff(bodies) == pytest.approx(2.0 * 0.1 / 30.0, rel=1e-3)  # [m] a frame
-    assert np.diff(eyes) == pytest.approx(2.0 * 0.1 / 30.0, rel=0.03)
+    eyes = np.array([view.eye[0] for view in drawn.views])[100:200]
+    bodies = np.array([poses[0, 0] for poses in drawn.poses])[100:200]
+    assert np.diff(bodies) == pytest.approx(2.0 * 0.2 / 30.0, rel=1e-3)  # [m] a frame
+    assert np.diff(eyes) == pytest.approx(2.0 * 0.2 / 30.0, rel=0.03)
 
 
 def test_robots_stay_in_view_of_the_default_camera(tmp_path, canvas):
@@ -237,11 +237,17 @@ def test_failure_while_drawing_leaves_the_old_film_and_no_other_file(tmp_path, c
     assert [file.name for file in tmp_path.iterdir()] == [path.name] and path.read_bytes() == b"old"
 
 
-def test_failing_encoder_leaves_no_file(tmp_path, canvas, monkeypatch):
-    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", "/bin/false")
-    with pytest.raises(OSError):
-        write_film(box_recording(walk(1.0)), tmp_path / "walk.mp4", size=SIZE)
-    assert not list(tmp_path.iterdir())
+@pytest.mark.parametrize("reads", ["", "cat > /dev/null; "], ids=["at once", "at the end"])
+def test_failing_encoder_leaves_no_file_and_its_message_in_one_line(tmp_path, canvas, monkeypatch, reads):
+    encoder, folder = tmp_path / "ffmpeg", tmp_path / "films"
+    encoder.write_text(
+        f"#!/bin/sh\nfor last; do :; done\necho part > \"$last\"\n{reads}printf 'disk\\nfull\\n' >&2\nexit 3\n"
+    )
+    encoder.chmod(0o755)
+    monkeypatch.setenv("IMAGEIO_FFMPEG_EXE", str(encoder))
+    with pytest.raises(OSError, match=r"ffmpeg failed with status 3: disk full: '.*walk\.mp4'$"):
+        write_film(box_recording(walk(1.0)), folder / "walk.mp4", size=(640, 480))
+    assert not list(folder.iterdir())
 
 
 def test_recorder_saves_film_and_picture(tmp_path, one_box):

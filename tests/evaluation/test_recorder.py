@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 
 from jump_helpers import make_env, random_actions
-from jumper_warp.evaluation.film import EnvRecorder, ankles
 from jumper_warp.evaluation.heights import HeightLog
 from jumper_warp.evaluation.log import run_evaluation, termination_names
+from jumper_warp.evaluation.recorder import EnvRecorder, ankles
 from jumper_warp.registry import make_task
 from jumper_warp.viz.props import BAR_OFFSET, RING_RADIUS, goal_shapes, with_blocks
 from jumper_warp.viz.recording import Recording
