@@ -148,7 +148,11 @@ def seed_section(rows: Sequence[Row]) -> str:
          f"{test.p:.2g}", f"{min(test.p * count, 1.0):.2g}"]
         for test in significant or tests[:3]
     ]  # fmt: skip
-    return text + "\n" + markdown(("policy", "condition", "metric", "seed 1", "seed 2", "p", "corrected p"), lines)
+    return (
+        text
+        + "\n"
+        + markdown(("policy", "condition", "metric", "first seed", "second seed", "p", "corrected p"), lines)
+    )
 
 
 def _words(condition: str) -> str:

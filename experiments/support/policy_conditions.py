@@ -47,7 +47,7 @@ def undefined(task: TaskCfg, name: str) -> str | None:
     if name == "push_in_flight" and randomization.push_force is None and randomization.push_torque is None:
         return "its randomisation has no pushes"
     if name == "push_in_flight" and randomization.push_in_flight:
-        return "its randomisation always pushes in flight, so this is the row of randomised robots"
+        return "its randomised robots always are"
     return None
 
 
