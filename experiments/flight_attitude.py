@@ -55,13 +55,14 @@ def main(args: Args) -> dict:
     run = FlightRun(args, args.landing_policy, args.jump_task)
     env, heights = run.env(args.num_flights), np.linspace(*args.height_range, args.num_flights)
     max_delay = 1.0e-3 * args.max_leg_delay
-    late = extension_delays(args.num_flights, max_delay, args.seed) if args.takeoff == "open-loop" else None
+    late = extension_delays(args.num_flights, max_delay, args.stream_seed) if args.takeoff == "open-loop" else None
     flights = {
         name: run.fly(env, FlightLog(heights, late, turns=name == "turning"), name) for name in ("turning", "without")
     }
     plot_flights(run.folder / "flights.png", flights, run.title)
     settings = {"takeoff": args.takeoff, "landing": args.landing_policy or "default pose"}
-    values = settings | ({} if late is None else {"late_ms": args.max_leg_delay}) | flight_metrics(flights["turning"])
+    run.settings |= settings | ({} if late is None else {"late_ms": args.max_leg_delay})
+    values = flight_metrics(flights["turning"])
     values |= {f"without_turning_{name}": value for name, value in flight_metrics(flights["without"]).items()}
     return run.report(values, {})
 

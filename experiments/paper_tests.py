@@ -14,12 +14,11 @@ from pathlib import Path
 from typing import Any
 
 import tyro
-from rich.console import Console
-from rich.table import Table
 
-from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, format_value
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.suites import suites_for
-from jumper_warp.utils.output import output_dir, write_metrics
+from jumper_warp.utils.metrics import Metrics, print_metrics
+from jumper_warp.utils.output import output_dir, read_metrics, read_values, write_metrics
 from support.scripts import run_script
 
 
@@ -33,21 +32,22 @@ class Args(EvaluationArgs):
 
 
 def main(args: Args) -> dict:
-    """Run all suites, print a table, and return the metrics with a value in the paper, `<policy>_<suite>_<metric>`."""
-    folder, values = output_dir("paper_tests", args.out), {}
-    table = Table("policy", "test", "metric", "here", "paper")
+    """Run all suites, print and return the metrics with a value in the paper, `<policy>_<suite>_<key>`."""
+    folder, paper = output_dir("paper_tests", args.out), {}
+    metrics: Metrics = {}
     for policy in args.policies:
         for name, suite in suites_for(EvaluationRun(policy).task.evaluation_suite).items():
             if not suite.paper:
                 continue
             flags: dict[str, Any] = {key: value for key, value in asdict(args).items() if key != "policies"}
-            metrics = suite(**flags | {"policy": policy, "out": folder / f"{Path(policy).name}_{name}"}).run()
-            for metric, paper in suite.paper.items():
-                values[f"{Path(policy).name}_{name}_{metric}"] = metrics[metric]
-                table.add_row(policy, name, metric, format_value(metrics[metric]), f"{paper:g}")
-    write_metrics(folder, values)
-    Console().print(table)
-    return values
+            prefix = f"{Path(policy).name}_{name}"
+            suite(**flags | {"policy": policy, "out": folder / prefix}).run()
+            values = read_metrics(folder / prefix)
+            metrics |= {f"{prefix}_{key}": values[key] for key in suite.paper}
+            paper |= {f"{prefix}_{key}": value for key, value in suite.paper.items()}
+    write_metrics(folder, metrics)
+    print_metrics(metrics, paper)
+    return read_values(folder)
 
 
 if __name__ == "__main__":

@@ -20,10 +20,10 @@ from PIL import Image
 from jumper_warp.evaluation.attitude import AttitudePlayFlags
 from jumper_warp.evaluation.courses import CourseLog
 from jumper_warp.evaluation.evaluations import PlayFlags
-from jumper_warp.evaluation.film import EnvRecorder
 from jumper_warp.evaluation.heights import HeightPlayFlags
 from jumper_warp.evaluation.landings import LandingPlayFlags
 from jumper_warp.evaluation.log import run_evaluation
+from jumper_warp.evaluation.recorder import EnvRecorder
 from jumper_warp.evaluation.run import EvaluationRun, SkillRun
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.evaluation.velocities import VelocityPlayFlags
@@ -39,8 +39,8 @@ from support.scripts import ThreadArgs, prepare, run_script
 
 COURSE = "walk_jump_walk"  # a script instead of a policy
 SCRIPT = Path(__file__).parents[1] / "assets/scripts/walk_jump_walk.json"
-TILE = ("vertical_jump", "horizontal_jump", "walking_flat", "attitude")  # policies in the tile
-TILE_WIDTH, FILM_SIZE, ANIMATION_SIZE = 800, (854, 480), (640, 360)  # [px]
+TILE = ("vertical_jump", "horizontal_jump", "walking_flat", "attitude", COURSE)
+TILE_WIDTH, FILM_SIZE, ANIMATION_SIZE = 800, (854, 480), (560, 316)  # [px]
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Args(ThreadArgs):
     policies: tuple[str, ...] = (*SHOTS, COURSE)  # Which to draw
     films: bool = True  # Also make films
     save_to_policies: bool = False  # Write picture.webp into the policies' folders
-    readme: Path | None = None  # Folder for the README's tile of four pictures and its animation
+    readme: Path | None = None  # Folder for the README's tile and animation
 
     def __post_init__(self) -> None:
         unknown = sorted(set(self.policies) - {*SHOTS, COURSE})
@@ -131,7 +131,7 @@ def main(args: Args) -> dict:
         if args.save_to_policies and name != COURSE:
             add_files(find_policy(name), {"picture.webp": picture.read_bytes()})
         if args.readme is not None and name == COURSE:
-            paths.append(write_film(recording, args.readme / f"{name}.webp", size=ANIMATION_SIZE, fps=15.0))
+            paths.append(write_film(recording, args.readme / f"{name}.webp", size=ANIMATION_SIZE, fps=12.0))
         for path in paths:
             sizes[path.name] = path.stat().st_size / 1024
             print(f"{path} {sizes[path.name]:.0f} KiB")
@@ -141,13 +141,18 @@ def main(args: Args) -> dict:
 
 
 def save_tile(paths: list[Path], path: Path) -> None:
-    """Write four pictures of one width each as a tile of two by two."""
-    pictures = [Image.open(each).convert("RGB") for each in paths]
-    pictures = [each.resize((TILE_WIDTH, each.height * TILE_WIDTH // each.width)) for each in pictures]
-    rows = [max(pictures[i].height, pictures[i + 1].height) for i in (0, 2)]
-    tile = Image.new("RGB", (2 * TILE_WIDTH, sum(rows)), (255, 255, 255))
-    for i, picture in enumerate(pictures):
-        tile.paste(picture, (TILE_WIDTH * (i % 2), (i // 2) * rows[0]))
+    """Write pictures in two columns, each below the shorter one; the longer column is cut at the bottom."""
+    columns, heights = ([], []), [0, 0]
+    for each in paths:
+        picture = Image.open(each).convert("RGB")
+        picture = picture.resize((TILE_WIDTH, picture.height * TILE_WIDTH // picture.width))
+        column = heights.index(min(heights))
+        columns[column].append((heights[column], picture))
+        heights[column] += picture.height
+    tile = Image.new("RGB", (2 * TILE_WIDTH, min(heights)))
+    for column, placed in enumerate(columns):
+        for top, picture in placed:
+            tile.paste(picture, (TILE_WIDTH * column, top))
     data = io.BytesIO()
     tile.save(data, "webp", quality=85, method=6)
     write_atomically(path, data.getvalue())

@@ -69,7 +69,8 @@ def main(args: Args) -> dict:
     squats = run.run_episodes(env, SquatLog(goals, args.hold_time), film="holds")
     if not squats.ended.all():
         plot_squats(run, squats)
-    return run.report({"hold_s": args.hold_time} | squat_metrics(squats), {})
+    run.settings["hold_s"] = args.hold_time
+    return run.report(squat_metrics(squats), {})
 
 
 if __name__ == "__main__":

@@ -6,7 +6,7 @@ Every robot walks by random commands, sampled every two seconds within 0.8 m/s a
 jumps 0.85 m ahead, and walks. `--course` gives every robot ten random commands instead: to walk, turn, jump up, jump to
 a landing position, or jump onto a sliding block of 0.05 m (no block on SolverMuJoCo). The block is placed under the
 goal when the jump takes over. A jump is commanded while the robot walks: it stops, stands, jumps, and walks again.
-`success_rate` is the fraction of robots that finished every command without a fall. `--randomize` adds the jumps'
+`finished_rate` is the fraction of robots that finished every command without a fall. `--randomize` adds the jumps'
 randomisation, noise, latency and pushes; `--solver mujoco` evaluates on physics that the policies were not trained on.
 """
 
@@ -20,10 +20,10 @@ from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_cours
 from jumper_warp.evaluation.landings import random_headings
 from jumper_warp.evaluation.run import EvaluationArgs, SkillRun
 from jumper_warp.evaluation.scripts import ScriptStep
+from jumper_warp.evaluation.velocities import PAPER
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.utils.errors import InputError
 from support.scripts import run_script
-from support.walks import PAPER
 
 REACH, EACH = 0.8, 2.0  # [m/s] and [rad/s] Limit of commanded velocities; [s] time of each walking command
 HEIGHT, DISTANCE = 0.75, 0.85  # [m] Apex height and distance of the paper's two jumps
@@ -86,7 +86,7 @@ def random_script(rng: np.random.Generator, blocks: bool = True) -> list[ScriptS
 
 def scripts(args: Args) -> list[list[ScriptStep]]:
     """Return one script per robot."""
-    rng, blocks = np.random.default_rng(args.seed), args.blocks and args.solver == "jumper"
+    rng, blocks = np.random.default_rng(args.stream_seed), args.blocks and args.solver == "jumper"
     return [random_script(rng, blocks) if args.course else paper_script(rng) for _ in range(args.num_robots)]
 
 
@@ -94,10 +94,11 @@ def main(args: Args) -> dict:
     """Run the test, plot the course of robot 0, and return the metrics."""
     name = "course" if args.course else "walk_jump_walk"
     run = SkillRun.from_args(name, args, SkillNames(args.policy, args.jump_up, args.jump_to))
-    course = CourseLog(scripts(args), random_headings(args.num_robots, args.seed))
+    course = CourseLog(scripts(args), random_headings(args.num_robots, args.stream_seed))
     run.run_episodes(run.env(args.num_robots, block=course.block), course, film=name)
     plot_course(run.folder / "timeline.png", course, 0, f"{run.title}, robot 0 of {course.count}")
-    return run.report(course_metrics(course), {} if args.course else PAPER)
+    paper = {} if args.course else {f"settled_{key}": value for key, value in PAPER.items()}
+    return run.report(course_metrics(course), paper)
 
 
 if __name__ == "__main__":

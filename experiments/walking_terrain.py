@@ -3,7 +3,7 @@
     python experiments/walking_terrain.py --policy walking_rough --num-robots 500 --out outputs/terrain
 
 Robots start in the middle of a tile with random headings and are commanded to walk straight ahead at 0.5 m/s for 10 s.
-The success rate of a terrain is the mean fraction of the commanded distance that they walk before they fall. Slopes and
+The metric of a terrain is the mean fraction of the commanded distance that they walk before they fall. Slopes and
 stairs descend from the start, bowls and pits ascend. `--randomize` adds the randomisation, noise and latency of the
 training; `--solver mujoco` evaluates on physics that the policy was not trained on.
 """
@@ -20,6 +20,7 @@ from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import VelocityLog, check_velocity_settings
 from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import mean, rate
 from support.scripts import run_script
 from support.walks import walked_fraction
 
@@ -50,20 +51,22 @@ def main(args: Args) -> dict:
     """Run the walks on every terrain, plot the walked fractions, and return the metrics."""
     run = EvaluationRun.from_args("walking_terrain", args, ("velocity",))
     commands, metrics, fractions = np.tile([args.speed, 0.0, 0.0], (args.num_robots, 1, 1)), {}, {}
-    terrain = TerrainCfg(tile=14.0, uneven=args.uneven, slope=args.slope, step=(args.step_height, args.step_height))
+    steps = (args.step_height, args.step_height)
+    terrain = TerrainCfg(tile=14.0, uneven=args.uneven, slope=args.slope, step=steps, seed=args.stream_seed)
     for kind in args.terrains:
         ground = single_tile(terrain, kind)
         env = run.env(args.num_robots, ground=ground)
-        log = VelocityLog(commands, env.task, SECONDS, headings=random_headings(args.num_robots, args.seed))
+        log = VelocityLog(commands, env.task, SECONDS, headings=random_headings(args.num_robots, args.stream_seed))
         walks = run.run_episodes(env, log, film=kind, film_scene={"ground": ground})
         fractions[kind] = walked_fraction(walks)
-        metrics[f"success_rate_{kind}"] = float(fractions[kind].mean())
-        metrics[f"fall_rate_{kind}"] = float(walks.fallen.mean())
+        metrics[f"{kind}_walked_fraction_mean"] = mean(fractions[kind], f"robots on {kind}")
+        metrics[f"{kind}_fall_rate"] = rate(walks.fallen, f"robots on {kind}")
     settings = {"title": f"Walks at {args.speed:g} m/s", "conditions": f"{run.title}, {args.num_robots} robots each"}
     with figure(run.folder / "terrain.png", figsize=(7, 4), **settings) as axis:
         axis.boxplot([fractions[kind] for kind in args.terrains], tick_labels=list(args.terrains), whis=(5, 95))
         axis.set(ylabel="share of the way [1]", ylim=(0.0, 1.05))
-    return run.report({"robots": args.num_robots, "speed_m_s": args.speed} | metrics, {})
+    run.settings["speed_m_s"] = args.speed
+    return run.report(metrics, {})
 
 
 if __name__ == "__main__":

@@ -2,12 +2,13 @@
 
     python experiments/walking_tracking.py --policy walking_flat --commands-per-axis 13 --out outputs/walking
 
-One robot for each point of a grid, from minus to plus 0.8 m/s, 0.8 m/s and 0.8 rad/s, all three at once, walks for
-10 s; the first second does not count. Then the same number of robots get another command while they walk, 0.8 m/s away
-from the first in any direction, and have settled when they stay near it: to the end, or for half a second (later pushes
-do not count). In the test of top speed the command rises over three seconds and must be kept for five more
-within 10 %. In the last test a kick changes the velocity by 0.5 m/s in any direction. The gait is that of straight
-walking at 0.8 m/s. `--randomize` adds the randomisation, noise, latency on both sides and pushes of the training;
+Two robots for each point of a grid, from minus to plus 0.8 m/s, 0.8 m/s and 0.8 rad/s, all three at once, get that
+command and every 3 s another one of the grid: one of them at once, the other slewed (`jumper evaluate` is the same
+test). Then robots get another command while they walk, 0.8 m/s away from the first in any direction, and have settled
+when they stay near it: to the end, or for half a second (later pushes do not count). In the test of top speed the
+command rises over three seconds and must be kept for five more within 10 %. In the last test a kick changes the
+velocity by 0.5 m/s in any direction. The gait is that of straight walking at 0.8 m/s. `--randomize` adds the
+randomisation, noise, latency on both sides and pushes of the training;
 `--solver mujoco` evaluates on physics that the policy was not trained on.
 """
 
@@ -19,14 +20,14 @@ import numpy as np
 
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.velocities import AXES, VelocityLog, check_velocity_settings, command_grid, tracking_metrics
+from jumper_warp.evaluation.velocities import AXES, PAPER, VelocityFlags, VelocityLog, check_velocity_settings
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import MetricValue, rate
 from jumper_warp.viz.style import ACTUAL_COLOR
 from support.gaits import GaitRecorder
 from support.scripts import run_script
 from support.walks import (
     HOLD,
-    PAPER,
     REACH,
     STEP,
     kicked_walks,
@@ -60,7 +61,7 @@ def plot_tracking(run: EvaluationRun, walks: VelocityLog, settling: np.ndarray) 
 
     walks: of the grid; settling [s]: (robots,), infinite if a robot did not settle.
     """
-    history = walks.velocity_history()[round(1.0 / walks.step_dt) :]
+    history = walks.velocity_history()[round(1.0 / walks.step_dt) : round(walks.times[1] / walks.step_dt)]
     conditions = f"{run.title}, {len(walks.end)} robots"
     with figure(run.folder / "tracking.png", 2, 2, figsize=(9, 9), title="Walking", conditions=conditions) as axes:
         for i, (axis, name) in enumerate(zip(axes.flat, AXES, strict=False)):
@@ -80,9 +81,10 @@ def plot_tracking(run: EvaluationRun, walks: VelocityLog, settling: np.ndarray) 
 
 def main(args: Args) -> dict:
     """Run all tests, plot tracking and settling times, and return the metrics."""
-    run, rng = EvaluationRun.from_args("walking_tracking", args, ("velocity",)), np.random.default_rng(args.seed)
-    env = run.env(args.commands_per_axis**3)
-    walks = run.run_episodes(env, VelocityLog(command_grid(args.commands_per_axis, 3 * (REACH,)), env.task))
+    run, rng = EvaluationRun.from_args("walking_tracking", args, ("velocity",)), np.random.default_rng(args.stream_seed)
+    flags = VelocityFlags(args.commands_per_axis, (REACH, REACH, REACH))
+    log = flags.log(run.task, args.stream_seed)
+    walks, env = run.run_episodes(run.env(log.count), log), run.env(args.commands_per_axis**3)
     redirected = run.run_episodes(env, redirected_walks(env, rng), film="walk")
     settling = settling_times(redirected)
     fast, direction = sped_up_walks(env)
@@ -92,11 +94,13 @@ def main(args: Args) -> dict:
     run.run_episodes(env, straight, on_step=gait)
     plot_tracking(run, walks, settling)
     median, held = (float(np.median(times)) for times in (settling, settling_times(redirected, HOLD)))
+    times = {"settling_time_median_s": median, "settling_time_for_half_a_second_median_s": held}
     return run.report(
-        tracking_metrics(walks)
-        | {"median_settling_s": median if np.isfinite(median) else None,
-           "median_settling_half_a_second_s": held if np.isfinite(held) else None,
-           "redirected_fall_rate": float(redirected.fallen.mean()), "kicked_fall_rate": float(kicked.fallen.mean())}
+        flags.metrics(walks)
+        | {name: MetricValue(time if np.isfinite(time) else None, env.num_envs, None, "redirected robots")
+           for name, time in times.items()}
+        | {"redirected_fall_rate": rate(redirected.fallen, "redirected robots"),
+           "kicked_fall_rate": rate(kicked.fallen, "kicked robots")}
         | speed_metrics(fast, direction)
         | gait.metrics(~straight.fallen),
         PAPER,

@@ -11,15 +11,16 @@ from jumper_warp.envs.gymnasium import GymVectorEnv
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.utils.errors import InputError
 
+ADAPTER = ("all_groups", "tensors", "render_mode", "render_size", "render_envs")  # arguments of `GymVectorEnv`
 
-def make_vector_env(
-    task: str, num_envs: int = 1, *, all_groups: bool = False, tensors: bool = False, **arguments: Any
-) -> GymVectorEnv:
-    """Return a vector environment of a task; arguments: of `Env`; all_groups, tensors: of `GymVectorEnv`.
+
+def make_vector_env(task: str, num_envs: int = 1, **arguments: Any) -> GymVectorEnv:
+    """Return a vector environment of a task; arguments: of `GymVectorEnv` (those named in `ADAPTER`) and of `Env`.
 
     Raises InputError: an unknown task, or arguments that `Env` or `GymVectorEnv` refuses.
     """
-    return GymVectorEnv(Env(make_task(task), num_envs, **arguments), all_groups=all_groups, tensors=tensors)
+    adapter = {name: arguments.pop(name) for name in ADAPTER if name in arguments}
+    return GymVectorEnv(Env(make_task(task), num_envs, **arguments), **adapter)
 
 
 def refuse_single_env(task: str, **arguments: Any) -> NoReturn:

@@ -17,7 +17,7 @@ import torch
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import DELAY, jump_commands, yaw_of
-from jumper_warp.evaluation.log import NO_END, EvaluationLog, Metrics, failed_by, finite, largest, mean, mean_and_max
+from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, finite, outcome_names
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
 from jumper_warp.policies.policy import Policy
@@ -26,6 +26,7 @@ from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import FALLS_FROM_FLIGHT, flight_skills
+from jumper_warp.utils.metrics import Metrics, largest, mean, rate
 from support.momentum import momentum
 
 JUMP, TURN = 0, 1  # Indices of the skills in `Env.skills`
@@ -36,7 +37,8 @@ HIGH = 0.7  # [m] Base height above which no paw can touch level ground
 UPRIGHT = 30.0  # [deg] Largest tilt of a successful landing
 CLEAR = 3  # Policy steps without contact that count as takeoff of a policy; open loop, one is enough
 AFTER = 1.5  # [s] Time after touchdown at which a landing is evaluated
-OUTCOMES = (*(term.name for term in FALLS_FROM_FLIGHT), "landed", "tilted", "no_takeoff")  # By index `FlightLog.end`
+OUTCOMES = tuple(outcome_names([term.name for term in FALLS_FROM_FLIGHT], "landed", "tilted", "no_takeoff").tolist())
+"""Outcomes by index `FlightLog.end`."""
 LEG_SIGNS = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
 """Sides of the legs FL, FR, BL, BR: 1 front or left, -1 back or right; columns: front, left."""
 
@@ -199,21 +201,25 @@ class FlightLog(EvaluationLog):
 
 def flight_metrics(flights: FlightLog) -> Metrics:
     """Return the metrics of flights; means are over the flights that took off or touched down."""
+    up, down, each = "flights that took off", "flights that touched down", "flights"
+    touchdown_tilt, touchdown_turn = np.degrees(flights.touchdown_tilt), np.degrees(flights.touchdown_turn)
+    error = {"apex_error_abs_mean_m": mean(abs(flights.height - flights.apex), each)}
     return {
-        "flights": len(flights.end),
-        "landed_upright_rate": float(flights.success.mean()),
-        "mean_takeoff_tilt_deg": mean(np.degrees(flights.takeoff_tilt)),
-        "mean_takeoff_spin_rad_s": mean(flights.takeoff_spin),
-        "mean_takeoff_angular_momentum_nm_s": mean(flights.takeoff_momentum),
-        "max_angular_momentum_change_in_flight_nm_s": largest(flights.drift),
-        "mean_flight_s": mean(flights.flight_time),
-        "mean_apex_m": mean(flights.height),
-        **({"mean_abs_height_error_m": mean(np.abs(flights.height - flights.apex))} if flights.late is None else {}),
-        "mean_largest_tilt_deg": mean(np.degrees(flights.largest_tilt)),
-        **mean_and_max("touchdown_tilt_deg", np.degrees(flights.touchdown_tilt)),
-        **mean_and_max("touchdown_turn_deg", np.degrees(flights.touchdown_turn)),
-        **failed_by(flights.outcomes[~flights.success]),
-        "failed_before_touchdown": int((~flights.success & np.isnan(flights.flight_time)).sum()),
+        "landed_upright_rate": rate(flights.success, each),
+        **ended_by(flights.outcomes, each),
+        "takeoff_tilt_mean_deg": mean(np.degrees(flights.takeoff_tilt), up),
+        "takeoff_spin_mean_rad_s": mean(flights.takeoff_spin, up),
+        "takeoff_angular_momentum_mean_nm_s": mean(flights.takeoff_momentum, up),
+        "angular_momentum_change_in_flight_max_nm_s": largest(flights.drift, each),
+        "flight_time_mean_s": mean(flights.flight_time, down),
+        "apex_mean_m": mean(flights.height, each),
+        **(error if flights.late is None else {}),
+        "largest_tilt_mean_deg": mean(np.degrees(flights.largest_tilt), each),
+        "touchdown_tilt_mean_deg": mean(touchdown_tilt, down),
+        "touchdown_tilt_max_deg": largest(touchdown_tilt, down),
+        "touchdown_turn_mean_deg": mean(touchdown_turn, down),
+        "touchdown_turn_max_deg": largest(touchdown_turn, down),
+        "failed_before_touchdown_rate": rate(~flights.success & np.isnan(flights.flight_time), each),
     }
 
 
@@ -278,14 +284,14 @@ class FlightRun(Run):
         conditions = self.conditions
         tasks, handovers = flight_skills(*(conditions.applied(task) for task in self.tasks))
         env = Env(
-            tasks, count, seed=conditions.seed, device=conditions.device, solver=conditions.solver,
-            randomize=conditions.sets_parameters, noise=conditions.noise, auto_reset=False, threads=conditions.threads,
-            handovers=handovers,
+            tasks, count, seed=conditions.seed, stream=conditions.stream, device=conditions.device,
+            solver=conditions.solver, randomize=conditions.sets_parameters, noise=conditions.noise, auto_reset=False,
+            threads=conditions.threads, handovers=handovers,
         )  # fmt: skip
         for policy in (self.turn, self.landing):
             if policy is not None:
                 policy.to(env.device)
-        self.setup_metrics["gravity_m_s2"] = env.task.gravity
+        self.settings["gravity_m_s2"] = env.task.gravity
         return env
 
     def fly(self, env: Env, flights: FlightLog, film: str) -> FlightLog:

@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from jumper_warp.evaluation.log import Metrics
 from jumper_warp.kernels.layout import BODIES
 from jumper_warp.robot.description import LEGS
+from jumper_warp.utils.metrics import Metrics, MetricValue
 
 
 @dataclass
@@ -73,15 +73,15 @@ def gait_metrics(
     touchdowns = int((contact[1:] & ~contact[:-1]).sum())
     transport = power.mean(axis=0)
     load, mean_speed = force.sum(axis=2) / weight, speed.mean(axis=0)
-    metrics: Metrics = {
+    metrics: dict[str, float | None] = {
         "steps_hz": touchdowns / (4.0 * robots * seconds),
-        "median_swing_apex_m": float(np.median(apexes)) if len(apexes) else None,
+        "swing_apex_median_m": float(np.median(apexes)) if len(apexes) else None,
         "cost_of_transport": float(np.mean(transport / (weight * mean_speed))) if mean_speed.min() > 0.05 else None,
-        "mean_speed_m_s": float(speed.mean()),
-        "largest_torque_nm": float(np.abs(torque).max()),
-        "rms_torque_nm": float(np.sqrt(np.mean(torque**2))),
+        "speed_mean_m_s": float(speed.mean()),
+        "torque_max_nm": float(np.abs(torque).max()),
+        "torque_rms_nm": float(np.sqrt(np.mean(torque**2))),
         "paw_force_ripple": float(load.std(axis=0).mean()),
-        "largest_paw_force_n": float(force.max()),
+        "paw_force_max_n": float(force.max()),
     }
     codes = (contact * [1, 2, 4, 8]).sum(axis=2)  # one bit per paw
     fractions = np.bincount(codes.ravel(), minlength=16) / codes.size
@@ -89,7 +89,7 @@ def gait_metrics(
         if fractions[code] >= 0.005:
             paws = "_".join(leg for k, leg in enumerate(LEGS) if code >> k & 1) or "none"
             metrics[f"share_down_{paws}"] = float(fractions[code])
-    return metrics
+    return {key: MetricValue(value, contact.shape[1], None, "straight walks") for key, value in metrics.items()}
 
 
 def swing_apexes(contact: np.ndarray, height: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jumper_warp.evaluation.log import Metrics
+from jumper_warp.utils.metrics import Metrics, largest, mean
 from jumper_warp.utils.rotations import CONJUGATE, rotate
 
 
@@ -72,10 +72,11 @@ class MomentumRecorder:
 
         diverged: (num_envs,) bool; inertia [kg m^2]: (num_envs, 3, 3), of `rotational_inertia`.
         """
-        drift = np.array(self.angular)[:, ~diverged]
+        drift, over = np.array(self.angular)[:, ~diverged], "turns that did not diverge"
         turned = np.linalg.solve(inertia[~diverged], drift.sum(axis=0)[..., None])[..., 0] * self.env.step_dt
         size, turn = np.linalg.norm(drift, axis=-1), np.degrees(np.linalg.norm(turned, axis=-1))
         return {
-            "max_angular_momentum_nm_s": float(size.max()), "mean_angular_momentum_at_end_nm_s": float(size[-1].mean()),
-            "mean_turn_by_drift_deg": float(turn.mean()), "max_turn_by_drift_deg": float(turn.max()),
+            "angular_momentum_max_nm_s": largest(size.max(axis=0), over),
+            "angular_momentum_at_end_mean_nm_s": mean(size[-1], over),
+            "turn_by_drift_mean_deg": mean(turn, over), "turn_by_drift_max_deg": largest(turn, over),
         }  # fmt: skip

@@ -13,8 +13,8 @@ import warp as wp
 
 from jumper_warp.diff.rollout import compact
 from jumper_warp.diff.torch_rollout import TorchTrajectory
-from jumper_warp.evaluation.film import ankles
 from jumper_warp.evaluation.plots import figure
+from jumper_warp.evaluation.recorder import ankles
 from jumper_warp.kernels.collision.robot import collision_kernel
 from jumper_warp.kernels.layout import COORDS
 from jumper_warp.robot.description import MOTOR_JOINTS

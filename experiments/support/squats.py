@@ -10,7 +10,8 @@ import numpy as np
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import jump_commands
-from jumper_warp.evaluation.log import EvaluationLog, Metrics, mean, mean_and_max
+from jumper_warp.evaluation.log import EvaluationLog
+from jumper_warp.utils.metrics import Metrics, MetricValue, largest, mean, rate
 
 CONTACT_FORCE = 0.1  # [N] Smallest force on a paw that is on the ground
 
@@ -94,12 +95,15 @@ def squat_goals(count: int, reach: tuple[float, float], *, up: bool) -> np.ndarr
 
 def squat_metrics(squats: SquatLog) -> Metrics:
     """Return the metrics of held squats by name; forces and torques are of the robots that hold to the end."""
-    spread, ripple = squats.force_range, squats.torque_ripple
+    spread, ripple, over = squats.force_range, squats.torque_ripple, "robots that held to the end"
+    median = float(np.median(spread)) if len(spread) else None
+    lost = squats.in_window(squats.forces) < CONTACT_FORCE
     return {
-        "squats": len(squats.ended),
-        "holding_rate": float((~squats.ended).mean()),
-        **mean_and_max("paw_force_range_n", spread),
-        "median_paw_force_range_n": float(np.median(spread)) if len(spread) else None,
-        "lost_paw_share": mean((squats.in_window(squats.forces) < CONTACT_FORCE).ravel()),
-        **mean_and_max("torque_ripple_nm", ripple),
+        "holding_rate": rate(~squats.ended, "robots"),
+        "paw_force_range_mean_n": mean(spread, over),
+        "paw_force_range_median_n": MetricValue(median, len(spread), None, over),
+        "paw_force_range_max_n": largest(spread, over),
+        "lost_paw_share_mean": mean(lost.mean(axis=(0, 2)), over),
+        "torque_ripple_mean_nm": mean(ripple, over),
+        "torque_ripple_max_nm": largest(ripple, over),
     }

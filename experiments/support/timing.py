@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import os
 import subprocess
 import sys
@@ -17,6 +16,7 @@ import numpy as np
 import warp as wp
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.output import read_values
 
 RATE = "steps_per_s"  # Part of the names of metrics that are compared with a baseline
 
@@ -64,7 +64,7 @@ def baseline_ratios(checkout: Path | None, script: str, args: Any, metrics: Mapp
         done = subprocess.run(command, cwd=checkout, env=env, capture_output=True, text=True, check=False)
         if done.returncode:
             raise InputError(f"{script} of {checkout} fails: {done.stderr.strip().splitlines()[-1:]}")
-        base = json.loads((Path(folder) / "metrics.json").read_text())
+        base = read_values(Path(folder))
     rates = [name for name, value in metrics.items() if RATE in name and isinstance(value, float) and base.get(name)]
     return {f"{name}_over_baseline": metrics[name] / base[name] for name in rates}
 

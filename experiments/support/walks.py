@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.log import Metrics
 from jumper_warp.evaluation.velocities import SETTLING_TIME, VelocityLog
+from jumper_warp.utils.metrics import Metrics, MetricValue
 
 REACH, STEP, KICK = 0.8, 0.8, 0.5
 """[m/s] and [rad/s] Limit of the commands; [m/s] step of a changed command; [m/s] step of a kicked velocity."""
@@ -16,8 +16,6 @@ DIRECTIONS = {"ahead": (0, 1.0, 4.0), "back": (0, -1.0, 4.0), "sideways": (1, 1.
 """Axis, sign and highest command [m/s] or [rad/s] of the test of top speed."""
 SETTLED = 0.1  # [m/s] Largest error of a robot that has settled on a new command
 SMOOTHING = 0.2  # [s] Window over which velocities are averaged for the settling time
-PAPER = {"rmse_vx_m_s": 0.17, "rmse_vy_m_s": 0.05, "rmse_yaw_rate_rad_s": 0.12}
-"""Tracking errors of the paper: one test on the robot with commands up to 0.8 by a person."""
 HOLD = 0.5  # [s] Time with an error below SETTLED after which a robot has settled, regardless of later pushes
 
 
@@ -52,7 +50,8 @@ def speed_metrics(walks: VelocityLog, direction: np.ndarray) -> Metrics:
     for i, (name, (axis, _, _)) in enumerate(DIRECTIONS.items()):
         unit = "rad_s" if axis == 2 else "m_s"
         kept = kept_speeds(walks, axis, KEEP, TOLERANCE)[direction == i]
-        metrics[f"top_{name}_{unit}"] = top_speed(np.abs(walks.commands[direction == i, -1, axis]), kept)
+        top = top_speed(np.abs(walks.commands[direction == i, -1, axis]), kept)
+        metrics[f"top_{name}_{unit}"] = MetricValue(top, len(kept), None, "robots")
     return metrics
 
 

@@ -26,7 +26,7 @@ usage: jumper {command} POLICY [flags]
 
 Flags depend on the task: jumper {command} POLICY --help lists them."""
 ABOUT = """\
-Measure a policy over many trials; writes metrics.json and a CSV file with one row for each trial.
+Measure a policy over many trials; writes metrics.json, with --save-trials also trials.npz.
 jumper evaluate POLICY --suite NAME [flags] runs a test of jumps instead, such as sweep, grid, ring or max."""
 SUITE = "--suite"
 

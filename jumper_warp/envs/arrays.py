@@ -16,6 +16,7 @@ from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.commands import check_commands
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.streams import PURPOSES, Purpose
 
 FIRST_STEP_COUNT = 2 * RING
 """Step count of every world at the start; ring buffers need a positive index for the steps before it."""
@@ -46,10 +47,10 @@ def robot_arrays(sim: Simulation, step_dt: float) -> Any:
     return robot
 
 
-def episode_arrays(num_envs: int, seed: int, skill: wp.array, device: Any) -> Any:
+def episode_arrays(num_envs: int, seed: int, stream: Purpose, skill: wp.array, device: Any) -> Any:
     """Return the kernels' `EpisodeArrays` before the first reset; skill: (num_envs,) index of each world's task."""
     episode = EpisodeArrays()
-    episode.seed, episode.skill = seed, skill
+    episode.seed, episode.purpose, episode.skill = seed, PURPOSES.index(stream), skill
     counts = ("requested_task", "has_command", "history_reset", "termination", "diverged", "bad_action", "level",
               "streak")  # fmt: skip
     allocate(episode, ("pending_command",), num_envs, wp.vec4, device)

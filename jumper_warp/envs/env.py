@@ -36,6 +36,7 @@ from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.checks import check_count, check_seed
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import load_kernels, records
+from jumper_warp.utils.streams import PURPOSES, Purpose
 
 CONTACT_TOLERANCE = 1.0e-4
 """[m/s] Stopping tolerance of the contact iteration; takes a fifth fewer sweeps than the solver's default."""
@@ -69,6 +70,7 @@ class Env(Stages):
         num_envs: int,
         *,
         seed: int = 0,
+        stream: Purpose = "training",
         device: str | torch.device | None = None,
         solver: SolverName = "jumper",
         randomize: bool = True,
@@ -85,17 +87,21 @@ class Env(Stages):
     ):
         """Allocate everything; call `reset` before the first step.
 
+        stream: purpose of all random numbers; numbers of two purposes differ for any seeds, also after `reset(seed)`.
         randomize, noise: enable domain randomisation, observation noise. auto_reset: reset ended episodes in `step`.
         ground, block: as in `Simulation`; by default the terrain of the first task that has one, else the tasks'
         sampled ground (SolverJumper with randomize), else a plane. skill: index of each world's first task, (num_envs,)
         or one for all. robot: differences from the robot description. threads: CPU threads, as in `Simulation`.
         refine: factor by which the physics step is shorter than in training.
         Raises InputError (a ValueError): see `checked_tasks` and `Simulation`, num_envs or refine no whole number of at
-        least 1, or a seed not in 0 to 2^31 - 1.
+        least 1, a seed not in 0 to 2^31 - 1, or no such stream.
         """
         check_count("num_envs", num_envs)
         check_count("refine", refine)
         check_seed(seed)
+        if stream not in PURPOSES:
+            raise InputError(f"stream must be one of {', '.join(PURPOSES)}, got {stream!r:.40}")
+        self.stream: Purpose = stream
         tasks = checked_tasks(task, handovers)
         self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
         self.handovers, self._overlay, self._conditions = tuple(handovers), robot, (randomize, noise)

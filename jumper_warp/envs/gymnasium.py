@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -13,8 +13,13 @@ from gymnasium.vector.utils import batch_space
 
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.vec_env import RAW_LIMIT, sanitise
-from jumper_warp.utils.checks import MOST_SEED
+from jumper_warp.robot.model import PHYSICS_DT
+from jumper_warp.sim.simulation import SUBSTEPS
+from jumper_warp.utils.checks import MOST_SEED, check_count
 from jumper_warp.utils.errors import InputError
+
+if TYPE_CHECKING:
+    from jumper_warp.envs.camera import WorldCamera
 
 Obs = Any  # Observations of all worlds: an array (num_envs, columns), or a dict of them by group
 
@@ -27,19 +32,37 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         final_info: `termination`, (num_envs,) index in `endings` (names of terminations), -1 elsewhere.
     With tensors=True, actions and all returned values are torch tensors on the environment's device, nothing waits for
     the device, and infos of every step have both entries, `final_obs` as observations of all worlds.
+    With render_mode="rgb_array", `render` draws the robots, for wrappers such as Gymnasium's vector `RecordVideo`.
     """
 
     metadata: ClassVar[dict[str, Any]] = {
         "autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP,
-        "render_modes": [],
+        "render_modes": ["rgb_array"],
+        "render_fps": round(1.0 / (SUBSTEPS * PHYSICS_DT)),
     }
 
-    def __init__(self, env: Env, *, all_groups: bool = False, tensors: bool = False) -> None:
+    def __init__(
+        self,
+        env: Env,
+        *,
+        all_groups: bool = False,
+        tensors: bool = False,
+        render_mode: str | None = None,
+        render_size: tuple[int, int] = (640, 480),
+        render_envs: int = 16,
+    ) -> None:
         """Wrap `env`; call `reset` before the first step.
 
         all_groups: observations are a dict with the groups `actor` and `critic`, else those of `actor` only. tensors:
-        see the class. Raises InputError (a ValueError): the environment has no auto_reset, or several tasks.
+        see the class. render_mode: "rgb_array", or None to draw nothing. render_size: width and height of an image
+        [px]. render_envs: number of worlds drawn, from the first on.
+        Raises InputError (a ValueError): the environment has no auto_reset, or several tasks; another render_mode, a
+        size outside 16 to 7680 px, or render_envs no whole number of at least 1.
         """
+        if render_mode not in (None, "rgb_array"):
+            raise InputError(f"render_mode must be 'rgb_array' or None, got {render_mode!r}")
+        _check_size(render_size)
+        check_count("render_envs", render_envs)
         if not env.auto_reset:
             raise InputError("Gymnasium's adapter needs an environment with auto_reset")
         if len(env.tasks) > 1:
@@ -47,6 +70,8 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         self.env, self.num_envs = env, env.num_envs
         self.endings = tuple(term.name for term in env.task.terminations)
         self._all_groups, self._tensors, self._was_reset = all_groups, tensors, False
+        self.render_mode, self._size, self._drawn = render_mode, render_size, min(render_envs, self.num_envs)
+        self._camera: WorldCamera | None = None  # opens at the first `render`
         self._termination = wp.to_torch(env.episodes.termination)
         widths = {"actor": env.num_obs, "critic": env.num_critic_obs}
         boxes = {group: Box(-RAW_LIMIT, RAW_LIMIT, (width,)) for group, width in widths.items()}
@@ -91,8 +116,32 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
             infos["_final_info"] = _copied(ended)
         return self._observation(step.obs), self._converted(reward), terminated, truncated, infos
 
+    def render(self) -> tuple[np.ndarray, ...] | None:
+        """Return an image of every world's robot, num_envs arrays (height, width, 3) uint8; None without render_mode.
+
+        The camera follows the robot. Where an episode ended, the image shows the new one. Only the first `render_envs`
+        worlds are drawn, the images of the others are black; with many worlds `RecordVideo` needs record_first_only.
+        The simulation does not change. Waits for the device. Raises gymnasium.error.ResetNeeded: not reset.
+        """
+        self._check_open()
+        if self.render_mode is None:
+            gymnasium.logger.warn('nothing is drawn: make the environment with render_mode="rgb_array"')
+            return None
+        if not self._was_reset:
+            raise gymnasium.error.ResetNeeded("call reset before the first render")
+        if self._camera is None:
+            from jumper_warp.envs.camera import WorldCamera
+
+            self._camera = WorldCamera(self.env.sim, self._drawn, self._size)
+        width, height = self._size
+        black = np.broadcast_to(np.uint8(0), (height, width, 3))
+        return (*self._camera.images(), *[black] * (self.num_envs - self._drawn))
+
     def close_extras(self, **kwargs: Any) -> None:
-        """Drop the references to the environment, called by `close`; kwargs are unused."""
+        """Close the renderer and drop the references to the environment, called by `close`; kwargs are unused."""
+        if self._camera is not None:
+            self._camera.close()
+            self._camera = None
         del self.env, self._termination
 
     def _check_open(self) -> None:
@@ -122,6 +171,12 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         for world in np.flatnonzero(worlds):
             rows[world] = {group: values[world] for group, values in obs.items()} if self._all_groups else obs[world]
         return rows
+
+
+def _check_size(size: tuple[int, int]) -> None:
+    """Raise InputError unless size is a width and a height of 16 to 7680 px."""
+    if not (len(size) == 2 and all(isinstance(length, int) and 16 <= length <= 7680 for length in size)):
+        raise InputError(f"render_size must be a width and a height of 16 to 7680 px, got {size}")
 
 
 def _copied(flags: Any) -> Any:

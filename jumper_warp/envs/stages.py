@@ -31,6 +31,7 @@ from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.slices import WorldRange
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.utils.kernels import Kernel
+from jumper_warp.utils.streams import Purpose
 
 BLOCK = 32  # Default threads of a block; small, to spread a few thousand heavy threads over all multiprocessors
 BLOCKS = {"reset": 128, "event": 256}  # Threads of a block of task kernels, by name, where it is not BLOCK
@@ -54,6 +55,7 @@ class Stages:
     tasks: tuple[TaskCfg, ...]
     num_envs: int
     seed: int
+    stream: Purpose
     step_dt: float
     wp_device: wp.Device
     auto_reset: bool
@@ -68,7 +70,7 @@ class Stages:
         self.skills = [TaskRuntime(task, i, n, self.step_dt, sim.substeps, device) for i, task in enumerate(tasks)]
         self.parameters = robot_parameters(sim, tuple(tasks), active)
         self.robot, self._scene = robot_arrays(sim, self.step_dt), scene_of(sim)
-        self.episodes = episode_arrays(n, self.seed, active, device)
+        self.episodes = episode_arrays(n, self.seed, self.stream, active, device)
         self.delays = delay_arrays(n, self.parameters.latency, sim.substeps, device)
         for each in self.skills:
             each.observations.latency = self.parameters.observation_latency

@@ -17,6 +17,7 @@ from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import records
 from jumper_warp.utils.state_checks import check_tensor, check_values
+from jumper_warp.utils.streams import purpose_seed
 
 if TYPE_CHECKING:
     from jumper_warp.envs.stages import Stages
@@ -26,7 +27,7 @@ CONSTANT = ("gravity", "default_angle", "paw_shapes")
 MOTORS = ("kp", "kd", "saturation", "peak", "no_load_speed", "cutoff_speed", "offset")
 """Saved arrays of the simulation's motors."""
 FINGERPRINT = "nominal"  # Key of the nominal parameters' fingerprint
-SEED = "seed"  # Key of the seed
+SEED = "seed"  # Key of the seed (`purpose_seed`)
 
 
 def save_state(env: Stages) -> dict[str, torch.Tensor]:
@@ -39,7 +40,7 @@ def save_state(env: Stages) -> dict[str, torch.Tensor]:
     for prefix, array in _records(env).items():
         fields = records(array)
         state |= {prefix + name: torch.from_numpy(np.array(fields[name])) for name in fields.dtype.names or ()}
-    return state | {FINGERPRINT: nominal_fingerprint(env), SEED: torch.tensor(env.seed)}
+    return state | {FINGERPRINT: nominal_fingerprint(env), SEED: torch.tensor(purpose_seed(env.stream, env.seed))}
 
 
 def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
@@ -77,9 +78,10 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     check_tensor(state[FINGERPRINT], nominal_fingerprint(env), f"saved {FINGERPRINT}")
     if not torch.equal(state[FINGERPRINT], nominal_fingerprint(env)):
         raise InputError("saved with other robots: the description or the task's motors differ")
-    check_tensor(state[SEED], torch.tensor(env.seed), f"saved {SEED}")
-    if int(state[SEED]) != env.seed:
-        raise InputError(f"saved with seed {int(state[SEED])}, this environment draws with seed {env.seed}")
+    seed = purpose_seed(env.stream, env.seed)
+    check_tensor(state[SEED], torch.tensor(seed), f"saved {SEED}")
+    if int(state[SEED]) != seed:
+        raise InputError(f"saved with seed {int(state[SEED])}, this environment draws with seed {seed}")
     for field, (prefix, name) in fields.items():
         saved[prefix][name] = state[field].numpy()
     for prefix, array in _records(env).items():

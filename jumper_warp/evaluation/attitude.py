@@ -9,19 +9,10 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.log import (
-    COLLIDED,
-    DIVERGED,
-    NO_END,
-    SUCCESS,
-    EvaluationLog,
-    Metrics,
-    failed_by,
-    finite,
-    mean,
-)
+from jumper_warp.evaluation.log import COLLIDED, DIVERGED, NO_END, SUCCESS, EvaluationLog, finite
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
 
 AXES = ("roll", "pitch", "yaw")
 DIRECTIONS = tuple(f"{axis}_{sign}" for axis in AXES for sign in ("plus", "minus"))
@@ -113,6 +104,13 @@ class AttitudeLog(EvaluationLog):
         return ~np.isnan(self.settling_time) & ~self.collided
 
     @property
+    def trials(self) -> dict[str, np.ndarray]:
+        """Sets of turns by name: masks (num_envs,)."""
+        return {"turns": np.full(self.count, True), "turns that settled": ~np.isnan(self.settling_time),
+                "turns that reached the goal": ~np.isnan(self.first_time),
+                "turns that did not diverge": ~self.diverged}  # fmt: skip
+
+    @property
     def outcomes(self) -> np.ndarray:
         """(num_envs,) Outcome of each turn: SUCCESS, COLLIDED, DIVERGED, or NO_END if not at the goal at the end."""
         ends = np.where(self.success, SUCCESS, np.where(self.collided, COLLIDED, NO_END))
@@ -137,29 +135,31 @@ class AttitudeLog(EvaluationLog):
         return {"turns_xyzw": self.turns[list(worlds)].tolist()}
 
 
-def turn_metrics(turns: AttitudeLog) -> Metrics:
-    """Return the metrics of turns by name, which ends with the unit; times are over settled turns, rates over all."""
-    settling, outcomes = turns.settling_time, turns.outcomes
-    metrics: Metrics = {
-        "turns": len(outcomes), "mean_angle_deg": mean(np.degrees(turns.angle)), "tolerance_deg": turns.tolerance,
-        "success_rate": float(turns.success.mean()),
-        "within_2_6_s_rate": float((turns.success & (np.nan_to_num(settling, nan=np.inf) <= HARDWARE_TIME)).mean()),
-        "mean_error_at_end_deg": mean(np.degrees(turns.error)), "mean_first_s": mean(turns.first_time),
-        "mean_settling_s": mean(settling),
-        "max_settling_s": mean(settling[settling == np.nanmax(settling)]) if np.isfinite(settling).any() else None,
-        "mean_spin_at_end_rad_s": mean(turns.angular_speeds[-1]), "collision_rate": float(turns.collided.mean()),
-        DIVERGED: int(turns.diverged.sum()),
-    }  # fmt: skip
-    return metrics | failed_by(outcomes[~turns.success])
+TURN_METRICS = (
+    Metric("settled_without_collision_rate", rate, "turns", lambda o: o.success),
+    Metric("settled_within_2_6_s_rate", rate, "turns", lambda o: o.success & ~(o.settling_time > HARDWARE_TIME)),
+    Metric("settling_time_mean_s", mean, "turns that settled", lambda o: o.settling_time),
+    Metric("settling_time_max_s", largest, "turns that settled", lambda o: o.settling_time),
+    Metric("first_time_mean_s", mean, "turns that reached the goal", lambda o: o.first_time),
+    Metric("error_at_end_mean_deg", mean, "turns that did not diverge", lambda o: np.degrees(o.error)),
+    Metric("spin_at_end_mean_rad_s", mean, "turns that did not diverge", lambda o: o.angular_speeds[-1]),
+    Metric("collision_rate", rate, "turns", lambda o: o.collided),
+    Metric("diverged_rate", rate, "turns", lambda o: o.diverged),
+)
+"""Metrics of turns; a turn has settled if it is within the tolerance from some time to the end."""
+
+
+def turn_metrics(turns: AttitudeLog, prefix: str = "", note: str = "") -> Metrics:
+    """Return TURN_METRICS of turns; prefix, note: as for `measure`."""
+    return measure(TURN_METRICS, turns, None, prefix, note)
 
 
 def axis_metrics(turns: AttitudeLog) -> Metrics:
-    """Return `<direction>_settling_s`, `_success_rate`, `_error_at_end_deg` for DIRECTIONS; turns: of `axis_turns`."""
-    metrics: Metrics = {}
+    """Return three of TURN_METRICS for each of DIRECTIONS, as `<direction>_<key>`; turns: of `axis_turns`."""
+    rows = chosen(TURN_METRICS, "settling_time_mean_s", "settled_without_collision_rate", "error_at_end_mean_deg")
+    number, metrics = np.arange(turns.count) % len(DIRECTIONS), {}
     for i, name in enumerate(DIRECTIONS):
-        metrics[f"{name}_settling_s"] = mean(turns.settling_time[i::6])
-        metrics[f"{name}_success_rate"] = mean(turns.success[i::6].astype(float))
-        metrics[f"{name}_error_at_end_deg"] = mean(np.degrees(turns.error[i::6]))
+        metrics |= measure(rows, turns, number == i, f"{name}_", name.replace("_", " "))
     return metrics
 
 

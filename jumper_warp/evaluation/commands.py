@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-import json
 import subprocess
 import sys
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Annotated, Any, Generic, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 
 import tyro
 from rich.console import Console
 from rich.table import Table
 
 from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_course
-from jumper_warp.evaluation.film import EnvRecorder, save_recording
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
+from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.evaluation.run import EvaluationRun, SkillRun
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.policies.conditions import Conditions
@@ -24,9 +23,11 @@ from jumper_warp.policies.runs import is_run
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import print_metrics
 from jumper_warp.utils.output import write_metrics
-from jumper_warp.viz.film import check_film, write_film
-from jumper_warp.viz.recording import Recording
+
+if TYPE_CHECKING:
+    from jumper_warp.viz.recording import Recording
 
 Flags = TypeVar("Flags")
 
@@ -39,51 +40,29 @@ class EvaluateCfg(Generic[Flags]):
     """Flags of the task's kind, `jumper_warp.evaluation.evaluations.EvaluationFlags`."""
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
     """Conditions of the evaluation."""
-    out: Path | None = None
-    """Folder for metrics.json and a CSV file with one row for each trial (default: outputs/evaluate/<time>)."""
+    out: Path | None = None  # Folder for metrics.json (default: outputs/evaluate/<time>)
+    save_trials: bool = False  # Also write the arrays of all trials, from which the rates follow, into trials.npz
     save_to_policy: bool = False  # Also save the metrics into the policy's folder
 
 
 def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
-    """Evaluate a policy, write `metrics.json` and one CSV row per trial, print and return the metrics by name.
+    """Evaluate a policy, write `metrics.json`, print the metrics, and return conditions and metrics by name.
 
-    Raises PolicyError: unusable policy, or `save_to_policy` for a run; OSError: the folder cannot be created.
+    Raises PolicyError: unusable policy, or `save_to_policy` for a run; InputError: `save_to_policy` for another stream
+    than reporting; OSError: the folder cannot be created.
     """
+    if cfg.save_to_policy and cfg.conditions.stream != "reporting":
+        raise InputError(f"save_to_policy is for the stream reporting, got {cfg.conditions.stream}")
     if cfg.save_to_policy and is_run(run.source):
         raise PolicyError(f"{run.source}: a run keeps no metrics; export it first")
-    run.prepare("evaluate", cfg.conditions, cfg.out)
-    log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.seed)
+    run.prepare("evaluate", cfg.conditions, cfg.out, save_trials=cfg.save_trials)
+    log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.stream_seed)
     run.run_episodes(run.env(log.count), log)
-    metrics = {
-        "task": run.policy.interface.task, **run.condition_metrics, "noise": cfg.conditions.noise,
-        **cfg.flags.metrics(log),
-    }  # fmt: skip
-    write_metrics(run.folder, metrics)
-    rows = f"{log.row_name}s.csv"
-    (run.folder / rows).write_text(csv_text(log))
+    values = run.report(cfg.flags.metrics(log), run.evaluation.paper)
     if cfg.save_to_policy:
-        files = {name: (run.folder / name).read_bytes() for name in ("metrics.json", "run.json", rows)}
+        files = {name: (run.folder / name).read_bytes() for name in ("metrics.json", "run.json")}
         add_files(find_policy(run.source), files)
-    print_metrics(metrics)
-    Console(stderr=True).print(f"{run.folder}/metrics.json", highlight=False, soft_wrap=True)
-    return metrics
-
-
-def csv_text(log: EvaluationLog) -> str:
-    """Return `log.columns()` as CSV text: a line of headings, then one line per row; None becomes an empty cell."""
-    columns = log.columns()
-    lines = [",".join(columns)]
-    for row in zip(*columns.values(), strict=True):
-        lines.append(",".join(f"{value:.6f}" if isinstance(value, float) else str(value or "") for value in row))
-    return "\n".join(lines) + "\n"
-
-
-def print_metrics(metrics: dict[str, Any]) -> None:
-    """Print a table of metrics by name to standard output, floats with four significant digits."""
-    table = Table("metric", "value", box=None)
-    for name, value in metrics.items():
-        table.add_row(name, f"{value:.4g}" if isinstance(value, float) else json.dumps(value))
-    Console().print(table)
+    return values
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -99,10 +78,14 @@ class FilmCfg:
 
     def __post_init__(self) -> None:
         if self.video is not None:
+            from jumper_warp.viz.film import check_film
+
             check_film(self.video, self.size, self.fps, self.speed, self.eye)
 
     def write(self, recording: Recording) -> Path:
         """Write the film; return its path."""
+        from jumper_warp.viz.film import write_film
+
         assert self.video is not None
         return write_film(recording, self.video, size=self.size, fps=self.fps, speed=self.speed, eye=self.eye)
 
@@ -180,7 +163,7 @@ def play_script(cfg: ScriptCfg) -> Path:
     run_evaluation(run.actor(env), env, course, on_step=recorder)
     plot_course(run.folder / "timeline.png", course, 0)
     metrics = {"outcome": str(course.outcomes[0]), **course_metrics(course)}
-    write_metrics(run.folder, metrics)
+    write_metrics(run.folder, metrics, run.condition_values)
     print_metrics(metrics)
     return show_recording(recorder.recording(), run.folder, "course", cfg)
 
@@ -208,9 +191,9 @@ def viewer_command(path: Path) -> list[str]:
 
 
 def print_rows(log: EvaluationLog) -> None:
-    """Print the columns of a log as a table to standard output, floats with three decimals."""
+    """Print the columns of a log as a table to standard output, a line for each, floats with three decimals."""
     columns = log.columns()
-    table = Table(*columns, box=None)
-    for row in zip(*columns.values(), strict=True):
-        table.add_row(*(f"{value:.3f}" if isinstance(value, float) else str(value) for value in row))
+    table = Table("", *(f"{log.row_name} {i}" for i in range(len(next(iter(columns.values()))))), box=None)
+    for name, values in columns.items():
+        table.add_row(name, *(f"{value:.3f}" if isinstance(value, float) else str(value) for value in values))
     Console().print(table)

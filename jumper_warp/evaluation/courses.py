@@ -15,14 +15,23 @@ from typing import Any
 
 import numpy as np
 
-from jumper_warp.evaluation.log import EvaluationLog, Metrics, failed_by, finite, largest, mean
+from jumper_warp.evaluation.log import EvaluationLog, ended_by, finite, outcome_names
 from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.scripts import ScriptStep
-from jumper_warp.evaluation.velocities import SETTLING_TIME, body_velocity, rmse_metrics, velocity_series
+from jumper_warp.evaluation.velocities import (
+    AXES,
+    SETTLING_TIME,
+    SLEW_RATE,
+    UNITS,
+    body_velocity,
+    square_sums,
+    velocity_series,
+)
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.tasks.switching import FALLS
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import Metrics, largest, mean, rate, rmse
 from jumper_warp.viz.style import ACTUAL_COLOR
 
 SKILLS = {
@@ -35,12 +44,11 @@ SKILLS = {
 BLOCK = BlockCfg(center=(1.0e3, 1.0e3), half=(0.55, 0.55), height=0.05, mass=10.0, friction=0.4)
 """Block to jump onto: initially 1 km away on both axes, moved under the goal when the jump skill takes over."""
 SQUAT_TIME = 0.5  # [s] Time from the jump skill's takeover, when it squats, to its command
-MAX_ACCELERATION = 1.25  # [m/s^2], [rad/s^2] Rate at which commanded velocities change
 NUDGE_AFTER, NUDGE_TIME = (2.0, 0.5)  # [s] Period at which a robot that waits for its jump walks a few steps; its time
 NUDGE = (0.25, 0.0, 0.0)  # [m/s], [rad/s] Commanded velocity of these steps
 JUMP_TIMEOUT = 15.0  # [s] Time after its request at which an unfinished jump has failed
 STUCK, DONE = len(FALLS), len(FALLS) + 1  # Indices in OUTCOMES; smaller ones are falls
-OUTCOMES = (*(term.name for term in FALLS), "stuck", "done")
+OUTCOMES = tuple(outcome_names([term.name for term in FALLS], "stuck", "done").tolist())
 GOAL_TOLERANCE = 0.1  # [m] Largest error of a jump that is on its goal
 FORCE_WINDOW = 0.2  # [s] Time before a handover to a jump over which paw forces are evaluated
 COLOURS = {JUMP_UP: "C4", JUMP_TO: "C3"}  # Shades of plots, by skill
@@ -137,7 +145,7 @@ class CourseLog(EvaluationLog):
         waits = running & jumping & (self._skill == WALK) & (waited >= NUDGE_AFTER)
         nudged = np.where((np.mod(waited, NUDGE_AFTER) < NUDGE_TIME)[:, None], NUDGE, 0.0)
         self._target_velocity[waits] = nudged[waits]
-        step = MAX_ACCELERATION * self.step_dt
+        step = SLEW_RATE * self.step_dt
         command = self._command + np.clip(self._target_velocity - self._command, -step, step)
         command[self._skill != WALK] = 0.0
         changed = (self._skill == WALK) & ((command != self._command).any(axis=1) | (previous != WALK))
@@ -252,6 +260,12 @@ class CourseLog(EvaluationLog):
         near = np.nan_to_num(error, nan=np.inf) <= GOAL_TOLERANCE
         return (self.finish_step >= 0) & ((self.target_skill == WALK) | near)
 
+    def square_errors(self) -> np.ndarray:
+        """Return sums of squared tracking errors and numbers of samples, (robots, 3, 2), where `is_tracked`."""
+        error = np.array(self.velocity, dtype=float) - np.array(self.commands, dtype=float)
+        error[~np.array(self.is_tracked)] = np.nan
+        return square_sums(error)
+
     def columns(self) -> dict[str, list]:
         """Return lists with one value per robot: end, commands_done, largest apex_error_m and landing_error_m."""
         worst = {"apex_error_m": _row_max(np.abs(self.apex_error)), "landing_error_m": _row_max(self.landing_error)}
@@ -293,48 +307,38 @@ def _row_max(values: np.ndarray) -> np.ndarray:
 def course_metrics(course: CourseLog) -> Metrics:
     """Return the metrics of all robots together.
 
-    `success_rate` is the fraction of robots that finished every command without a fall, whatever their errors;
-    `on_goal_rate` also requires all jumps within 0.1 m of their goals. Errors are means over finished jumps. Tracking
-    errors exclude the first second after each command.
+    `finished_rate` is the fraction of robots that finished every command without a fall, whatever their errors;
+    `finished_on_goal_rate` also requires all jumps within 0.1 m of their goals. Tracking errors are those of slewed
+    commands, without the first second after each.
     """
-    robots, up, to = len(course.end), course.target_skill == JUMP_UP, course.target_skill == JUMP_TO
-    jumps = up | to
-    made = jumps & (course.takeoff_step >= 0)
-    apex, landing = np.abs(course.apex_error), course.landing_error
-    waited = (course.takeoff_step - course.start_step)[made] * course.step_dt
-    stopped = (course.switch_step - course.start_step)[jumps & (course.switch_step >= 0)] * course.step_dt
-    done = course.outcomes == "done"
+    jumps = course.target_skill != WALK
+    made, switched = jumps & (course.takeoff_step >= 0), jumps & (course.switch_step >= 0)
+    finished = course.outcomes == "done"
+    squares = course.square_errors()
+    metrics = {
+        "finished_rate": rate(finished, "robots"),
+        "finished_on_goal_rate": rate(finished & course.on_goal.all(axis=1), "robots"),
+        "fall_rate": rate(course.fallen, "robots"),
+        **ended_by(course.outcomes, "robots"),
+        "jump_made_rate": rate(made[jumps & (course.start_step >= 0)], "requested jumps"),
+        "apex_error_abs_mean_m": mean(np.abs(course.apex_error), "finished jumps up"),
+        "apex_error_signed_mean_m": mean(course.apex_error, "finished jumps up"),
+        "apex_error_abs_max_m": largest(np.abs(course.apex_error), "finished jumps up"),
+        "goal_distance_at_handover_mean_m": mean(course.landing_error, "finished jumps to places"),
+        "goal_distance_at_handover_max_m": largest(course.landing_error, "finished jumps to places"),
+    }
+    for i, (axis, unit) in enumerate(zip(AXES, UNITS, strict=True)):
+        metrics[f"settled_slewed_rmse_{axis}_{unit}"] = rmse(squares[:, i], "robots")
     ripple, step = handover_forces(course)
-    return {
-        "robots": robots,
-        "success_rate": float(done.mean()),
-        "on_goal_rate": float((done & course.on_goal.all(axis=1)).mean()),
-        "fall_rate": float(course.fallen.mean()),
-        "stuck_rate": float((course.end == STUCK).mean()),
-        **rmse_metrics(tracking_error(course)),
-        "apex_error_m": mean(apex),
-        "max_apex_error_m": largest(apex),
-        "mean_signed_apex_error_m": mean(course.apex_error),
-        "landing_error_m": mean(landing),
-        "max_landing_error_m": largest(landing),
-        "jumps_asked": int((jumps & (course.start_step >= 0)).sum()),
-        "jumps_made": int(made.sum()),
-        "command_to_takeoff_s": mean(waited),
-        "max_command_to_takeoff_s": largest(waited),
-        "command_to_jump_skill_s": mean(stopped),
-        "max_command_to_jump_skill_s": largest(stopped),
-        "handover_force_ripple_n": mean(ripple),
-        "max_handover_force_ripple_n": largest(ripple),
-        "handover_force_step_n": mean(step),
-        "max_handover_force_step_n": largest(step),
-    } | failed_by(course.outcomes[~done])  # fmt: skip
-
-
-def tracking_error(course: CourseLog) -> np.ndarray:
-    """Return velocity minus command [m/s], [m/s], [rad/s], (steps, robots, 3); NaN where not `is_tracked`."""
-    error = np.array(course.velocity, dtype=float) - np.array(course.commands, dtype=float)
-    error[~np.array(course.is_tracked)] = np.nan
-    return error
+    takeoff, switch = (course.step_dt * (s - course.start_step) for s in (course.takeoff_step, course.switch_step))
+    for name, values, over in (
+        ("command_to_takeoff_{}_s", takeoff[made], "made jumps"),
+        ("command_to_jump_skill_{}_s", switch[switched], "handovers"),
+        ("handover_force_ripple_{}_n", ripple, "handovers"),
+        ("handover_force_step_{}_n", step, "handovers"),
+    ):
+        metrics |= {name.format("mean"): mean(values, over), name.format("max"): largest(values, over)}
+    return metrics
 
 
 def handover_forces(course: CourseLog) -> tuple[np.ndarray, np.ndarray]:

@@ -10,10 +10,11 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.log import NO_END, EvaluationLog, Metrics, finite, mean
+from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, finite, outcome_names
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.commands import layout_of
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import Metrics, mean, rate
 
 MAX_SECONDS = 600.0  # [s] Maximum length of an episode
 MAX_COMMAND_SIZE = 4  # Maximum number of values in a command
@@ -69,7 +70,7 @@ class EpisodeLog(EvaluationLog):
     @property
     def outcomes(self) -> np.ndarray:
         """(num_envs,) Name of the termination of each episode, NO_END if it still runs."""
-        return np.array([*(term.name for term in self.task.terminations), NO_END])[self.end]
+        return outcome_names([term.name for term in self.task.terminations], NO_END)[self.end]
 
     def ended_with(self, option: str) -> np.ndarray:
         """Return which episodes ended by a termination with the option `success` or `time_out`, (num_envs,) bool."""
@@ -96,20 +97,21 @@ class EpisodeLog(EvaluationLog):
 
 
 def episode_metrics(episodes: EpisodeLog) -> Metrics:
-    """Return rates [1] and means over all episodes, and `ended_by_<termination>`, the number of episodes."""
-    outcomes, running = episodes.outcomes, episodes.end < 0
+    """Return rates and means over all episodes; `ended_by_<outcome>_rate` is the rate of a termination."""
+    running, over = episodes.end < 0, "episodes"
     success, timed_out = episodes.ended_with("success"), episodes.ended_with("time_out")
-    distance = np.linalg.norm(episodes.displacement, axis=1)
-    metrics: Metrics = {
-        "episodes": len(outcomes), "mean_episode_s": mean(episodes.length), "success_rate": float(success.mean()),
-        "failure_rate": float((~running & ~success & ~timed_out).mean()), "no_end_rate": float(running.mean()),
-        "mean_base_height_m": mean(finite(episodes.mean_height)),
-        "mean_base_height_at_the_end_m": mean(finite(episodes.end_position[:, 2])),
-        "mean_distance_from_start_m": mean(finite(distance)),
-        "mean_moved_x_m": mean(finite(episodes.displacement[:, 0])),
-        "mean_moved_y_m": mean(finite(episodes.displacement[:, 1])),
-    }  # fmt: skip
-    return metrics | {f"ended_by_{name}": int((outcomes == name).sum()) for name in sorted(set(outcomes))}
+    displacement, distance = episodes.displacement, np.linalg.norm(episodes.displacement, axis=1)
+    return {
+        "success_termination_rate": rate(success, over),
+        "failure_termination_rate": rate(~running & ~success & ~timed_out, over),
+        **ended_by(episodes.outcomes, over),
+        "length_mean_s": mean(episodes.length, over),
+        "base_height_mean_m": mean(episodes.mean_height, over),
+        "base_height_at_end_mean_m": mean(episodes.end_position[:, 2], over),
+        "distance_from_start_mean_m": mean(distance, over),
+        "moved_x_signed_mean_m": mean(displacement[:, 0], over),
+        "moved_y_signed_mean_m": mean(displacement[:, 1], over),
+    }
 
 
 def check_episodes(count: int, command: tuple[float, ...], seconds: float) -> None:

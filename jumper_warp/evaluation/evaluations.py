@@ -2,19 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, Protocol
 
-from jumper_warp.evaluation import heights, landings
+from jumper_warp.evaluation import heights, landings, velocities
 from jumper_warp.evaluation.attitude import AttitudeFlags, AttitudePlayFlags
 from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodePlayFlags
 from jumper_warp.evaluation.heights import HeightFlags, HeightPlayFlags
+from jumper_warp.evaluation.jumps import with_jump_terminations
 from jumper_warp.evaluation.landings import LandingFlags, LandingPlayFlags
-from jumper_warp.evaluation.log import EvaluationLog, Metrics
+from jumper_warp.evaluation.log import EvaluationLog
 from jumper_warp.evaluation.velocities import VelocityFlags, VelocityPlayFlags
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.metrics import Metrics
 
 
 class EvaluationFlags(Protocol):
@@ -52,27 +54,28 @@ class Evaluation:
     """Function that returns a copy of the task with the terminations of the evaluation."""
     finetune_target: Literal["apex", "landing"] | None = None
     """Error that `jumper finetune` reduces; None: these policies cannot be fine-tuned."""
+    paper: Mapping[str, float] = field(default_factory=dict)  # Values in the paper of metrics with the same keys
 
 
-HEIGHT_EVALUATION = Evaluation(HeightFlags(), HeightPlayFlags(), heights.with_success_last, "apex")
-LANDING_EVALUATION = Evaluation(LandingFlags(), LandingPlayFlags(), landings.with_landing_terminations, "landing")
+HEIGHT_EVALUATION = Evaluation(HeightFlags(), HeightPlayFlags(), with_jump_terminations, "apex", heights.PAPER)
+LANDING_EVALUATION = Evaluation(LandingFlags(), LandingPlayFlags(), with_jump_terminations, "landing", landings.PAPER)
 EVALUATIONS: dict[str, Evaluation] = {
     "apex_height": HEIGHT_EVALUATION,
     "landing_position": LANDING_EVALUATION,
     "apex_height_mars": replace(
-        HEIGHT_EVALUATION, flags=HeightFlags(height_range=(1.0, 3.3), success_range=(1.0, 2.9)),
+        HEIGHT_EVALUATION, paper={}, flags=HeightFlags(height_range=(1.0, 3.3), success_range=(1.0, 2.9)),
         play=HeightPlayFlags((1.5, 2.3, 3.0), 6.0),
     ),
     "landing_position_mars": replace(
-        LANDING_EVALUATION, flags=LandingFlags(goal_x=(0.5, 4.2), success_range=(0.5, 3.9)),
+        LANDING_EVALUATION, paper={}, flags=LandingFlags(goal_x=(0.5, 4.2), success_range=(0.5, 3.9)),
         play=LandingPlayFlags(default_goals=((1.0, 0.0), (2.5, 0.0), (3.9, 0.0))),
     ),
     "omnidirectional": replace(
-        LANDING_EVALUATION, finetune_target=None,
+        LANDING_EVALUATION, paper={}, finetune_target=None,
         flags=LandingFlags(goal_x=(-0.7, 0.7), goal_y=(-0.7, 0.7), success_range=(0.0, 0.7)),
         play=LandingPlayFlags(default_goals=((0.5, 0.0), (0.0, 0.5), (-0.5, 0.0))),
     ),
-    "velocity": Evaluation(VelocityFlags(), VelocityPlayFlags(), TaskCfg.on_level_ground),
+    "velocity": Evaluation(VelocityFlags(), VelocityPlayFlags(), TaskCfg.on_level_ground, paper=velocities.PAPER),
     "attitude": Evaluation(AttitudeFlags(), AttitudePlayFlags()),
     "episode": Evaluation(EpisodeFlags(), EpisodePlayFlags()),
 }  # fmt: skip

@@ -29,6 +29,7 @@ from jumper_warp.trajectory.gauss_newton import Anchor, Network, gauss_newton_st
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.runtime import git_commit
+from jumper_warp.utils.streams import purpose_seed
 
 AHEAD = "goal_x"  # Observation of jumps to landing positions: distance to the goal ahead [m]
 DELAYS = (0.3, 0.7)  # [s] Range of the time until jumps are commanded
@@ -56,7 +57,7 @@ class FinetuneCfg:
     action_std: float = 0.02
     """[1] Change of the actions against the given policy, root of the sum of squares over the motors."""
     landing_std: float = 0.005  # [1] Change of the actions after touchdown that costs as much
-    seed: int = 0  # Seed of commands, latencies and robots
+    seed: int = 0  # Seed of commands, latencies and robots (stream: tuning)
     device: str | None = None  # Warp device (default: a GPU if there is one)
     threads: int | None = None  # CPU threads that share the worlds (default: all cores); they change no result
 
@@ -85,7 +86,7 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
     Goals are evenly spaced over the range of `cfg`. modules: the user's task modules. Raises InputError: the policy
     does not jump.
     """
-    rng, groups = np.random.default_rng(cfg.seed), []
+    rng, groups = np.random.default_rng(purpose_seed("tuning", cfg.seed)), []
 
     def on_level_ground(task: TaskCfg) -> TaskCfg:
         return evaluation_of(task).prepare_task(task).on_level_ground()
@@ -104,8 +105,9 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
     for name, count, std, randomize, change_task in kinds:
         if count:
             conditions = Conditions(
-                randomize=randomize, noise=name == "randomized", seed=cfg.seed, device=cfg.device, threads=cfg.threads
-            )
+                randomize=randomize, noise=name == "randomized", seed=cfg.seed, stream="tuning", device=cfg.device,
+                threads=cfg.threads,
+            )  # fmt: skip
             env = env_of_policy(policy, count, conditions, change=change_task, modules=modules)
             target = evaluation_of(env.task).finetune_target
             if target is None:
@@ -133,7 +135,7 @@ def collect_trust_region_samples(groups: list[JumpGroup], network: Network, cfg:
                 landed.append(group.env.task_arrays()["phase"] == LANDED)
                 group.env.step(network.act(group.env.obs))
     stds = np.where(np.concatenate(landed), cfg.landing_std, cfg.action_std).astype(np.float32)
-    sample = np.random.default_rng(cfg.seed).permutation(len(stds))[:TRUST_REGION_SAMPLES]
+    sample = np.random.default_rng(purpose_seed("tuning", cfg.seed)).permutation(len(stds))[:TRUST_REGION_SAMPLES]
     obs = torch.cat(observations)[torch.as_tensor(sample, device=observations[0].device)]
     return Anchor(network, obs, torch.as_tensor(stds[sample], device=obs.device))
 

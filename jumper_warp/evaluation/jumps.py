@@ -1,9 +1,9 @@
-"""Base class of the logs of jumps: one sequence of jumps per world, each from its command to rest after landing."""
+"""Jumps, each from its command to rest after landing: their outcome, and the base class of their logs."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, fields
 
 import numpy as np
 
@@ -11,32 +11,46 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.log import (
     COLLIDED,
     DIVERGED,
+    FALLS,
     NO_END,
+    SUCCESS,
     EvaluationLog,
-    Metrics,
-    largest,
-    mean,
-    mean_and_max,
+    finite,
+    outcome_names,
     success_index,
+    with_terminations,
 )
+from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 
 PHASES = ("stance", "flight", "landed")  # Names of the values of a jump's phase
 STANCE, LANDED = 0, 2  # Values of the jump's phase before takeoff and after touchdown
+TOLERANCE = 0.1  # [m] Largest distance from the goal of a jump that reaches it
 REST_SPEED = 0.1  # [m/s] Speed of the base's centre of mass below which the robot is at rest
+HOP_TIME = 0.05  # [s] After touchdown, longer without any paw on the ground is a hop; a paw lifted so long is a step
+TIME_EPS = 1.0e-6  # [s] Tolerance for rounding of sums of steps
 REST_TIME = 1.0  # [s] Time after touchdown at which the robot should be at rest
 DELAY = 0.5  # [s] Time until the first jump is commanded
-SOON_AFTER = 0.3  # [s] Time after touchdown at which the base position is recorded as well
-HOP_TIME = 0.05  # [s] After touchdown, longer without any paw on the ground is a hop; a paw lifted so long is a step
 TAKEOFF_SPEED = 0.25  # [m/s] Upward speed of the base, with no paw down, of a second takeoff (authors' configuration)
-TIME_EPS = 1.0e-6  # [s] Tolerance for rounding of sums of steps
-NOT_BEGUN = "not_begun"  # Outcome of a jump that was not commanded, as one before it failed
+NOT_BEGUN = "not_begun"  # End of a jump that was not commanded, because one before it failed
+TERMINATIONS = ("came_apart", "low_base", COLLIDED, "no_jump", SUCCESS)
+"""Terminations of an evaluated jump, in order of precedence; success is last, so that it hides no fall."""
+
+
+def with_jump_terminations(task: TaskCfg) -> TaskCfg:
+    """Return a copy of the task with only TERMINATIONS; its others, which shape training, are dropped."""
+    return with_terminations(task, TERMINATIONS)
 
 
 def paw_arrays(env: Env) -> dict[str, np.ndarray]:
-    """Return `paws_down` (num_envs, 4), whether FL, FR, BL, BR touch ground, and `up` (num_envs,), base speed [m/s]."""
+    """Return contacts and positions of the paws FL, FR, BL, BR, and the upward speed of the base.
+
+    `paws_down` (num_envs, 4): whether they touch ground; `paw_pos` (num_envs, 4, 2): centres x, y [m], world; `up`
+    (num_envs,) [m/s].
+    """
     force = np.linalg.norm(env.sim.paw_force.numpy(), axis=2)
-    return {"paws_down": (force > env.task.contact_force).T, "up": env.sim.base_velocity()[:, 2]}
+    pos = env.robot.paw_pos.numpy().transpose(1, 0, 2)[..., :2].copy()
+    return {"paws_down": (force > env.task.contact_force).T, "paw_pos": pos, "up": env.sim.base_velocity()[:, 2]}
 
 
 def jump_commands(goals: np.ndarray, delay: np.ndarray | float, step_dt: float) -> np.ndarray:
@@ -49,14 +63,98 @@ def jump_commands(goals: np.ndarray, delay: np.ndarray | float, step_dt: float) 
     return np.concatenate([goals, steps[:, None]], axis=1).astype(np.float32)
 
 
+@dataclass(frozen=True)
+class JumpOutcome:
+    """Outcome of jumps; arrays have shape (num_envs, jumps in a row)."""
+
+    commanded: np.ndarray  # Whether the jump was commanded
+    to_height: np.ndarray  # Whether the goal is an apex height, else a place
+    early: np.ndarray  # Whether the robot took off before the command
+    touched_down: np.ndarray  # Whether it touched down after a takeoff
+    reached: np.ndarray  # Whether the apex, or the base at rest, was within TOLERANCE of the goal
+    landed: np.ndarray  # Whether it touched down on its paws and nothing else touched anything until the end
+    at_rest: np.ndarray  # Whether it landed, and its speed was below REST_SPEED one second after touchdown
+    success: np.ndarray  # Whether it jumped on command, reached the goal, landed and came to rest
+    still: np.ndarray  # Whether it landed without lifting a paw again for HOP_TIME or longer
+    hopped: np.ndarray  # Whether all paws were off the ground for longer than HOP_TIME after touchdown
+    took_off_again: np.ndarray  # Whether it rose again with no paw on the ground
+    fell: np.ndarray  # Whether the base or a link other than a paw touched something, or the simulation diverged
+    collided: np.ndarray  # Whether it fell by a link that touched something
+    diverged: np.ndarray  # Whether the simulation diverged
+    missed: np.ndarray  # Whether it landed without reaching the goal
+    no_jump: np.ndarray  # Whether it did not take off in time
+    apex_m: np.ndarray  # Largest base height from takeoff to touchdown; without a takeoff the last one
+    apex_error_m: np.ndarray  # Apex minus commanded height
+    distance_at_end_m: np.ndarray  # From goal to base, horizontal, when the jump was over or failed
+    distance_at_touchdown_m: np.ndarray  # From goal to base, horizontal, at touchdown
+    distance_at_rest_m: np.ndarray  # From goal to base, horizontal, one second after touchdown
+    ahead_m: np.ndarray  # Base at rest minus goal, along the heading
+    left_m: np.ndarray  # Base at rest minus goal, to the left of the heading
+    distance_flown_m: np.ndarray  # Horizontal distance of the base from takeoff to touchdown
+    paw_to_paw_distance_m: np.ndarray  # Horizontal, from the paws at takeoff to those at touchdown, mean of four
+    tilt_deg: np.ndarray  # Largest tilt since touchdown
+    turn_deg: np.ndarray  # Size of the yaw at the end
+    drift_m: np.ndarray  # Horizontal distance of the base from its start at the end
+
+    @property
+    def trials(self) -> dict[str, np.ndarray]:
+        """Sets of trials by name: masks of the shape of the arrays."""
+        return {
+            "jumps": self.commanded, "jumps that touched down": self.touched_down, "landed jumps": self.landed,
+            "successful jumps": self.success, "jumps that did not diverge": self.commanded & ~self.diverged,
+        }  # fmt: skip
+
+    @property
+    def names(self) -> np.ndarray:
+        """Name of each outcome: success, early, missed or not_at_rest of a landed jump, else empty."""
+        kinds = [(self.success, SUCCESS), (self.landed & self.early, "early"), (self.missed, "missed")]
+        return np.select(*zip(*kinds, strict=True), default=np.where(self.landed, "not_at_rest", ""))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """Return the arrays by name, flattened to (jumps,)."""
+        return {field.name: getattr(self, field.name).ravel() for field in fields(self)}
+
+
+def jump_outcome(jumps: JumpLog) -> JumpOutcome:
+    """Return the outcome of recorded jumps; depends on nothing but the log's arrays."""
+    ends, to_height, commanded = jumps.ends, jumps.goals[..., 2] > 0.0, jumps.ends != NOT_BEGUN
+    landed, diverged = ends == SUCCESS, ends == DIVERGED
+
+    def known(values: np.ndarray) -> np.ndarray:
+        """Return values with NaN where the simulation diverged."""
+        return np.where(diverged | ~np.isfinite(values), np.nan, values)
+
+    def goal_distance(position: np.ndarray) -> np.ndarray:
+        """Return the distances of positions (..., 2) from the goals, NaN where the simulation diverged."""
+        return known(np.linalg.norm(position - jumps.goal_world, axis=-1))
+
+    x, y = np.moveaxis(jumps.rest_position - jumps.goal_world, -1, 0)
+    cos, sin = np.cos(jumps.heading), np.sin(jumps.heading)
+    apex_error, distance_at_rest = known(jumps.apex - jumps.goals[..., 2]), goal_distance(jumps.rest_position)
+    off = np.where(to_height, np.abs(apex_error), distance_at_rest)
+    reached = np.nan_to_num(off, nan=np.inf) <= TOLERANCE
+    at_rest = landed & (jumps.rest_speed < REST_SPEED)
+    return JumpOutcome(
+        commanded=commanded, to_height=to_height, early=jumps.early & commanded, reached=reached, landed=landed,
+        touched_down=np.isfinite(jumps.touchdown[..., 0]), at_rest=at_rest, success=reached & at_rest & ~jumps.early,
+        still=landed & (jumps.lift_time <= HOP_TIME - TIME_EPS), hopped=jumps.air_time > HOP_TIME + TIME_EPS,
+        took_off_again=jumps.takeoffs > 0, fell=np.isin(ends, FALLS), collided=ends == COLLIDED, diverged=diverged,
+        missed=landed & ~reached, no_jump=ends == "no_jump", apex_m=known(jumps.apex),
+        apex_error_m=np.where(to_height, apex_error, np.nan), distance_at_end_m=goal_distance(jumps.end_position),
+        distance_at_touchdown_m=goal_distance(jumps.touchdown), distance_at_rest_m=distance_at_rest,
+        ahead_m=known(cos * x + sin * y), left_m=known(cos * y - sin * x), drift_m=known(jumps.drift),
+        distance_flown_m=known(np.linalg.norm(jumps.touchdown - jumps.takeoff, axis=-1)),
+        paw_to_paw_distance_m=known(np.linalg.norm(jumps.paw_shift.mean(axis=-2), axis=-1)),
+        tilt_deg=known(np.degrees(jumps.tilt)), turn_deg=known(np.degrees(np.abs(jumps.yaw))),
+    )  # fmt: skip
+
+
 class JumpLog(EvaluationLog):
     """Log of a sequence of jumps per world; arrays have shape (num_envs, jumps in a row), NaN before the jump.
 
     The goal of the first jump is relative to start and heading, that of each further jump to base position and yaw at
     its command. A jump's entries do not change after its end.
     """
-
-    speed_time: float  # [s] Time after touchdown at which the base's speed is recorded
 
     def __init__(
         self,
@@ -79,26 +177,30 @@ class JumpLog(EvaluationLog):
         if goals.ndim != 3 or goals.shape[2] not in (2, 3):
             raise InputError(f"goals must have shape (num_envs, jumps, 2 or 3), got {goals.shape}")
         self.goals, self.terminations = np.pad(goals, ((0, 0), (0, 0), (0, 3 - goals.shape[2]))), terminations
-        self.headings, self.delay, self.rest, self.speed_time = headings, delay, rest, rest
+        self.headings, self.delay, self.rest = headings, delay, rest
         self.count, *_ = shape = goals.shape[:2]
         # (num_envs,) index of the jump under way; the number of jumps in a row after the last
         self.current = np.zeros(self.count, dtype=int)
         self.end = np.full(shape, -1)  # index in `terminations` of what ended the jump, -1 while under way
         self.end_position = np.full((*shape, 2), np.nan)  # [m] (..., 2) base position at the end, world
         self.goal_world = np.full((*shape, 2), np.nan)  # [m] (..., 2) goal, world
+        self.takeoff = np.full((*shape, 2), np.nan)  # [m] (..., 2) base position at takeoff, world
         self.touchdown = np.full((*shape, 2), np.nan)  # [m] (..., 2) base position at touchdown, world
-        self.position_soon = np.full((*shape, 2), np.nan)  # [m] (..., 2) base position SOON_AFTER touchdown, world
+        self.rest_position = np.full((*shape, 2), np.nan)  # [m] (..., 2) base position REST_TIME after touchdown, world
+        # [m] (..., 4, 2) from each paw's last contact before takeoff to its first contact after touchdown, world axes
+        self.paw_shift = np.full((*shape, 4, 2), np.nan)
         self.heading = np.full(shape, np.nan)  # [rad] heading of the jump
         self.yaw = np.full(shape, np.nan)  # [rad] yaw of the base at the end, relative to the heading
         self.drift = np.full(shape, np.nan)  # [m] horizontal distance of the base from its start at the end
-        self.apex = np.full(shape, np.nan)  # [m] largest base height
+        self.apex = np.full(shape, np.nan)  # [m] largest base height in flight; before takeoff the present one
         self.tilt = np.full(shape, np.nan)  # [rad] largest tilt since touchdown
-        self.rest_speed = np.full(shape, np.inf)  # [m/s] speed `speed_time` after touchdown; inf before
+        self.rest_speed = np.full(shape, np.inf)  # [m/s] speed REST_TIME after touchdown; inf before
         self.early = np.zeros(shape, dtype=bool)  # whether the jump began before the command
         self.air_time = np.zeros(shape)  # [s] longest time with no paw on the ground after touchdown
         self.lift_time = np.zeros(shape)  # [s] longest time off the ground of a paw after its own first contact
         self.takeoffs = np.zeros(shape, dtype=int)  # second takeoffs: upward at TAKEOFF_SPEED with no paw down
         self._air_time, self._paw_air_time = np.zeros(self.count), np.zeros((self.count, 4))
+        self._paw_start = np.full((self.count, 4, 2), np.nan)  # [m] last contacts before takeoff
         self._paw_touched, self._rising_flight = np.zeros((self.count, 4), dtype=bool), np.zeros(self.count, dtype=bool)
         self._success = success_index(terminations)
 
@@ -130,13 +232,16 @@ class JumpLog(EvaluationLog):
         row = np.flatnonzero(self.current < count)
         now = {name: values[row] for name, values in arrays.items()}
         at = (row, self.current[row])
-        self._record_early(arrays, at)
+        # a policy observes the command after the policy step `command_step`, and can take off in the next one
+        self.early[at] |= (now["took_off"] == 1) & (now["steps"] <= now["command_step"])
         self.end_position[at], self.goal_world[at] = now["base_pos"][:, :2], now["goal"][:, :2]
         self.heading[at] = now["heading"]
         self.yaw[at] = wrapped(yaw_of(now["base_quat"]) - now["heading"])
         self.drift[at] = np.linalg.norm((now["base_pos"] - now["start"])[:, :2], axis=1)
-        self.apex[at], self.tilt[at] = now["max_height"], now["peak_tilt"]
-        landed = now["phase"] == LANDED
+        landed, height, self.tilt[at] = now["phase"] == LANDED, now["base_pos"][:, 2], now["peak_tilt"]
+        begins = (now["phase"] == STANCE) | (now["took_off"] == 1)
+        rises = ~landed | (now["touched_down"] == 1)
+        self.apex[at] = np.where(begins, height, np.where(rises, np.fmax(self.apex[at], height), self.apex[at]))
         self._record_landing(now, at, landed, step_dt)
         failed = (now["termination"] >= 0) & (now["termination"] != self._success)
         rested = ~failed & landed & (now["phase_steps"] >= round(self.rest / step_dt))
@@ -144,14 +249,6 @@ class JumpLog(EvaluationLog):
         self.current[row[rested]] += 1
         self.current[row[failed]] = count
         return bool((self.current >= count).all())
-
-    def _record_early(self, arrays: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray]) -> None:
-        """Mark jumps that take off before the command.
-
-        arrays: of all worlds; at: indices (worlds, numbers in the row), (n,) each, of the n jumps under way.
-        """
-        takes_off = (arrays["took_off"] == 1) & (arrays["steps"] < arrays["command_step"])
-        self.early[at] |= takes_off[at[0]]
 
     def _record_landing(
         self, now: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray], landed: np.ndarray, step_dt: float
@@ -163,14 +260,19 @@ class JumpLog(EvaluationLog):
         """
         row, number = at
         steps, speed = now["phase_steps"], np.linalg.norm(now["base_vel"], axis=1)
-        for record, is_time, values in (
-            (self.touchdown, now["touched_down"] == 1, now["base_pos"][:, :2]),
-            (self.position_soon, steps == round(SOON_AFTER / step_dt), now["base_pos"][:, :2]),
-            (self.rest_speed, steps == round(self.speed_time / step_dt), speed),
+        at_rest, position = landed & (steps == round(min(self.rest, REST_TIME) / step_dt)), now["base_pos"][:, :2]
+        for record, due, values in (
+            (self.takeoff, now["took_off"] == 1, position),
+            (self.touchdown, landed & (now["touched_down"] == 1), position),
+            (self.rest_position, at_rest, position),
+            (self.rest_speed, at_rest, speed),
         ):
-            due = landed & is_time
             record[row[due], number[due]] = values[due]
-        down = landed[:, None] & now["paws_down"]
+        down, pushing = landed[:, None] & now["paws_down"], (now["phase"] == STANCE) | (now["took_off"] == 1)
+        standing = (pushing[:, None] & now["paws_down"])[..., None]
+        self._paw_start[row] = np.where(standing, now["paw_pos"], self._paw_start[row])
+        first = (down & ~self._paw_touched[row])[..., None]
+        self.paw_shift[at] = np.where(first, now["paw_pos"] - self._paw_start[row], self.paw_shift[at])
         airborne = landed & ~down.any(axis=1)
         self._air_time[row] = np.where(airborne, self._air_time[row] + step_dt, 0.0)
         self._paw_touched[row] = landed[:, None] & (self._paw_touched[row] | down)
@@ -183,39 +285,31 @@ class JumpLog(EvaluationLog):
 
     @property
     def ends(self) -> np.ndarray:
-        """(num_envs, jumps in a row) Name of the termination of each jump, NO_END or NOT_BEGUN."""
-        names = np.array([*self.terminations, NO_END], dtype=object)[self.end]
-        return np.where(self.begun, names, NOT_BEGUN)
+        """(num_envs, jumps in a row) What ended each jump: SUCCESS, another outcome, NO_END or NOT_BEGUN."""
+        return np.where(np.isnan(self.heading), NOT_BEGUN, outcome_names(self.terminations, NO_END)[self.end])
 
     @property
-    def begun(self) -> np.ndarray:
-        """Whether the jump was commanded."""
-        return ~np.isnan(self.heading)
+    def outcome(self) -> JumpOutcome:
+        """Outcome of the jumps."""
+        return jump_outcome(self)
 
     @property
-    def diverged(self) -> np.ndarray:
-        """Whether the simulation diverged."""
-        return self.ends == DIVERGED
+    def success(self) -> np.ndarray:
+        """Whether each jump succeeded."""
+        return self.outcome.success
 
     @property
-    def landed(self) -> np.ndarray:
-        """Whether the robot landed on its paws and stayed up until the jump was over, wherever it landed."""
-        return self.end == self._success
+    def outcomes(self) -> np.ndarray:
+        """Name of the outcome of each jump: SUCCESS, early, missed, not_at_rest, or its entry in `ends`."""
+        names = self.outcome.names
+        return np.where(names == "", self.ends, names)
 
-    @property
-    def hopped(self) -> np.ndarray:
-        """Whether all paws together were off the ground for longer than HOP_TIME after touchdown."""
-        return self.air_time > HOP_TIME + TIME_EPS
-
-    @property
-    def stepped(self) -> np.ndarray:
-        """Whether a paw was off the ground for HOP_TIME or longer after its first contact."""
-        return self.lift_time > HOP_TIME - TIME_EPS
-
-    @property
-    def still(self) -> np.ndarray:
-        """Whether the robot landed without a step, wherever it landed."""
-        return self.landed & ~self.stepped
+    def columns(self) -> dict[str, list]:
+        """Return goals, headings, the fields of `JumpOutcome` and outcomes, one value per jump, world after world."""
+        columns = {name: self.goals[..., i].ravel() for i, name in enumerate(("goal_x_m", "goal_y_m", "goal_height_m"))}
+        columns |= {"heading_deg": np.degrees(self.heading).ravel(), **self.outcome.arrays()}
+        lists = {name: values.tolist() if values.dtype == bool else finite(values) for name, values in columns.items()}
+        return lists | {"outcome": self.outcomes.ravel().tolist()}
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
         """Return the present base height [m] of some worlds."""
@@ -226,32 +320,6 @@ class JumpLog(EvaluationLog):
         """Return the phase of some worlds' jumps."""
         phases = self.arrays["phase"][list(worlds)]
         return {f"phase/{name}": PHASES[phase] for name, phase in zip(self.names(worlds), phases, strict=True)}
-
-
-def stance_metrics(jumps: JumpLog) -> Metrics:
-    """Return the rates of still landings and collisions among commanded jumps, tilt and turn [deg] of landed ones."""
-    begun, landed = jumps.begun, jumps.landed
-    return {
-        "still_landing_rate": mean(jumps.still[begun]),
-        "collision_rate": mean((jumps.ends == COLLIDED)[begun]),
-        "max_landing_tilt_deg": largest(np.degrees(jumps.tilt[landed])),
-        **mean_and_max("turn_deg", np.degrees(np.abs(jumps.yaw))[landed]),
-    }
-
-
-@dataclass(frozen=True)
-class JumpFlags:
-    """Jumps from standing still."""
-
-    num_jumps: int = 200  # Number of jumps
-    success_range: tuple[float, float] = field(default=(0.3, 1.4), kw_only=True)
-    """[m] Smallest and largest distance or height counted by `success_rate_in_range`."""
-
-    def __post_init__(self) -> None:
-        if self.num_jumps < 1:
-            raise InputError(f"num_jumps must be at least 1, got {self.num_jumps}")
-        if not 0.0 <= self.success_range[0] <= self.success_range[1] < 10.0:
-            raise InputError(f"success_range must be in [0, 10) m and rise, got {self.success_range}")
 
 
 def yaw_of(quat: np.ndarray) -> np.ndarray:

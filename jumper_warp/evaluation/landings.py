@@ -1,8 +1,4 @@
-"""Jumps to landing positions: log, metrics, and flags of `jumper evaluate` and `play`.
-
-The error of a jump is the horizontal distance between base and goal a second after touchdown, or at an earlier
-failure. Second hops and steps after touchdown are reported separately.
-"""
+"""Jumps to landing positions: log, metrics, and flags of `jumper evaluate` and `play`."""
 
 from __future__ import annotations
 
@@ -15,53 +11,32 @@ import numpy as np
 import tyro
 
 from jumper_warp.evaluation.heights import MAX_ROBOTS
-from jumper_warp.evaluation.jumps import REST_SPEED, REST_TIME, TAKEOFF_SPEED, JumpFlags, JumpLog, stance_metrics
-from jumper_warp.evaluation.log import (
-    COLLIDED,
-    DIVERGED,
-    SUCCESS,
-    Metrics,
-    failed_by,
-    finite,
-    mean,
-    mean_and_max,
-    termination_names,
-    with_terminations,
-    within,
-)
+from jumper_warp.evaluation.jump_metrics import JumpFlags
+from jumper_warp.evaluation.jumps import TAKEOFF_SPEED, JumpLog, with_jump_terminations
+from jumper_warp.evaluation.log import termination_names
 from jumper_warp.kernels.jump import terminations
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import TerminationTerm
 from jumper_warp.utils.errors import InputError
 
 Position2D = tuple[float, float]  # [m] Ahead and to the left
-SUCCESS_TOLERANCE = 0.1  # [m] Largest error of a successful jump
-LANDING_TERMINATIONS = (DIVERGED, "low_base", COLLIDED, "no_jump", SUCCESS)
-"""Terminations of a jump of an evaluation, in order of precedence; success is last, so that it hides no fall."""
-FALLS = (DIVERGED, "low_base", COLLIDED)  # Terminations that `fall_rate` counts
-MISSED = "missed"  # Outcome of a jump that landed, but beyond SUCCESS_TOLERANCE
-EARLY = "early"  # Outcome of a landed jump that began before its command
-AT_REST_AT_END = "below_0_1_m_s_at_the_end_rate"  # Metric: fraction of landed jumps with the base at rest at the end
+PAPER = {
+    "success_rate": 0.97, "in_range_success_rate": 1.0, "goal_distance_at_rest_mean_m": 0.026,
+    "goal_distance_at_end_mean_m": 0.026,
+}  # fmt: skip
+"""Values of the paper's simulation, by key."""
 JUMP_SECONDS, NEXT_JUMP_SECONDS = 3.5, 2.5  # [s] Length of a recording of one jump, and addition for each further jump
 
 
-def with_landing_terminations(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the task with only LANDING_TERMINATIONS; its others, which shape training, are dropped."""
-    return with_terminations(task, LANDING_TERMINATIONS)
-
-
 def with_second_takeoff(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the task with LANDING_TERMINATIONS and, before success, the authors' second takeoff."""
-    task = with_landing_terminations(task)
+    """Return a copy of the task with the terminations of a jump and, before success, the authors' second takeoff."""
+    task = with_jump_terminations(task)
     takeoff = TerminationTerm(terminations.second_takeoff, speed=TAKEOFF_SPEED)
     return replace(task, terminations=(*task.terminations[:-1], takeoff, task.terminations[-1]))
 
 
 class LandingLog(JumpLog):
-    """Log of jumps to landing positions; arrays as in `JumpLog`, (num_envs, jumps in a row, ...).
-
-    Success: begun on command and landed within SUCCESS_TOLERANCE.
-    """
+    """Log of jumps to landing positions; arrays as in `JumpLog`, (num_envs, jumps in a row, ...)."""
 
     spacing = 3.0
 
@@ -76,46 +51,11 @@ class LandingLog(JumpLog):
         return 1.0 + self.goals.shape[1] * (3.5 + self.rest) + float(np.max(self.delay))
 
     @property
-    def offset(self) -> np.ndarray:
-        """[m] (..., 2) Base minus goal at the end, ahead and to the left along the jump's heading."""
-        x, y = np.moveaxis(self.end_position - self.goal_world, -1, 0)
-        cos, sin = np.cos(-self.heading), np.sin(-self.heading)
-        return np.stack([cos * x - sin * y, sin * x + cos * y], axis=-1)
-
-    @property
     def landing(self) -> np.ndarray:
         """[m] (..., 2) Base position at the end, in the frame of `goal_positions`."""
-        return self.goal_positions + self.offset
-
-    @property
-    def error(self) -> np.ndarray:
-        """[m] (...) Horizontal distance of the base from the goal at the end; NaN if diverged or not begun."""
-        invalid = self.diverged | ~np.isfinite(self.end_position).all(axis=-1)
-        return np.where(invalid, np.nan, self.goal_distance(self.end_position))
-
-    def goal_distance(self, position: np.ndarray) -> np.ndarray:
-        """Return the distances [m], (num_envs, jumps in a row), of positions (..., 2) [m], world, from the goals."""
-        return np.linalg.norm(position - self.goal_world, axis=-1)
-
-    @property
-    def success(self) -> np.ndarray:
-        """Whether the jump began on command and landed within SUCCESS_TOLERANCE of its goal."""
-        return self.landed & (np.nan_to_num(self.error, nan=np.inf) <= SUCCESS_TOLERANCE) & ~self.early
-
-    @property
-    def outcomes(self) -> np.ndarray:
-        """Outcome of each jump: SUCCESS, MISSED or EARLY if it landed without success, else its entry in `ends`."""
-        missed = np.where(self.landed & ~self.success, np.where(self.early, EARLY, MISSED), self.ends)
-        return np.where(self.success, SUCCESS, missed)
-
-    def columns(self) -> dict[str, list]:
-        """Return goals, headings, landing positions, errors and outcomes, one value per jump, world after world."""
-        columns = {f"goal_{axis}_m": self.goal_positions[..., i] for i, axis in enumerate("xy")}
-        columns |= {"heading_deg": np.degrees(self.heading)}
-        columns |= {f"landing_{axis}_m": self.landing[..., i] for i, axis in enumerate("xy")}
-        columns |= {"error_m": self.error}
-        ends = {"end": self.outcomes.ravel().tolist()}
-        return {name: finite(values.ravel()) for name, values in columns.items()} | ends
+        x, y = np.moveaxis(self.end_position - self.goal_world, -1, 0)
+        cos, sin = np.cos(self.heading), np.sin(self.heading)
+        return self.goal_positions + np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
         """Return the base's height and its distance from the current goal [m] of some worlds."""
@@ -135,52 +75,6 @@ class LandingLog(JumpLog):
         """Return the first goals of some worlds in metres: "0.90 m" ahead, or "(0.80, 0.20) m" ahead and left."""
         goals = self.goal_positions[list(worlds), 0]
         return [f"{x:.2f} m" if y == 0.0 else f"({x:.2f}, {y:.2f}) m" for x, y in goals]
-
-
-def landing_metrics(landings: LandingLog, inside: np.ndarray | None = None) -> Metrics:
-    """Return the metrics of all commanded jumps of a log.
-
-    Errors include failed jumps, but not those whose simulation diverged, which `came_apart` counts. `ahead` and `left`
-    are signed. Tilts, turns, hops and steps are over landed jumps, `still_landing_rate` over all jumps and
-    `second_takeoff_rate` over those that touched down. `fall_rate` and `miss_rate` count disjoint jumps: a miss has
-    landed on its paws, but away from its goal.
-
-    inside: mask of the jumps that the `in_range` metrics count, shaped like `landings.end`; None: no such metrics.
-    """
-    begun, error, success, landed = landings.begun, landings.error, landings.success, landings.landed
-    offset = np.where(np.isnan(error)[..., None], np.nan, landings.offset)
-    at_rest = "at_rest_within_1_s_rate" if landings.rest == REST_TIME else AT_REST_AT_END
-    metrics: Metrics = {
-        "jumps": int(begun.sum()), **mean_and_max("error_m", error),
-        **mean_and_max("error_of_successes_m", error[success]), "mean_error_ahead_m": mean(offset[..., 0]),
-        "mean_error_left_m": mean(offset[..., 1]), "success_rate": mean(success[begun]),
-        "single_jump_success_rate": mean((success & ~landings.hopped)[begun]),
-        "step_free_success_rate": mean((success & ~landings.stepped)[begun]), "landing_rate": mean(landed[begun]),
-        "second_hop_rate": mean(landings.hopped[landed]), "step_rate": mean(landings.stepped[landed]),
-        "mean_error_at_touchdown_m": mean(landings.goal_distance(landings.touchdown)[landed]),
-        "mean_error_0_3_s_after_touchdown_m": mean(landings.goal_distance(landings.position_soon)[landed]),
-        **stance_metrics(landings),
-        "second_takeoff_rate": mean((landings.takeoffs > 0)[np.isfinite(landings.touchdown).all(axis=-1)]),
-        at_rest: mean((landings.rest_speed < REST_SPEED)[landed]),
-        "mean_landing_tilt_deg": mean(np.degrees(landings.tilt[landed])),
-        "fall_rate": mean(np.isin(landings.ends, FALLS)[begun]),
-        "miss_rate": mean((landings.outcomes == MISSED)[begun]), "early_rate": mean(landings.early[begun]),
-        DIVERGED: int(landings.diverged.sum()),
-    }  # fmt: skip
-    if inside is not None:
-        inside = begun & inside
-        metrics |= {
-            "mean_error_in_range_m": mean(error[inside]),
-            "success_rate_in_range": mean(success[inside]),
-            "still_landing_rate_in_range": mean(landings.still[inside]),
-        }
-    return metrics | failed_by(landings.outcomes[begun & ~success])
-
-
-def trained_range(task: TaskCfg) -> dict[str, float]:
-    """Return `trained_lower_m` and `trained_upper_m`, the range of goals straight ahead over all levels of a task."""
-    lower, upper = zip(*((level.goal_lower[0], level.goal_upper[0]) for level in task.levels), strict=True)
-    return {"trained_lower_m": max(min(lower), 0.0), "trained_upper_m": max(upper)}
 
 
 def random_headings(count: int, seed: int) -> np.ndarray:
@@ -213,12 +107,6 @@ class LandingFlags(JumpFlags):
         goals = np.stack([np.linspace(*self.goal_x, self.num_jumps), rng.uniform(*self.goal_y, self.num_jumps)], axis=1)
         headings = random_headings(self.num_jumps, seed) if self.heading == "any" else math.radians(self.heading)
         return LandingLog(goals[:, None], termination_names(task), headings)
-
-    def metrics(self, log: LandingLog) -> Metrics:
-        """Return `landing_metrics` and the range of its `in_range` metrics."""
-        inside = within(np.linalg.norm(log.goal_positions, axis=-1), self.success_range)
-        lower, upper = self.success_range
-        return landing_metrics(log, inside) | {"range_lower_m": lower, "range_upper_m": upper}
 
 
 @dataclass(frozen=True)

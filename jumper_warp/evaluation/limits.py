@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import torch
 
-from jumper_warp.evaluation.heights import SUCCESS_TOLERANCE, HeightLog
-from jumper_warp.evaluation.jumps import jump_commands
-from jumper_warp.evaluation.log import Metrics, mean, within
+from jumper_warp.evaluation.jump_metrics import HEIGHT_METRICS
+from jumper_warp.evaluation.jumps import TOLERANCE, JumpOutcome, jump_commands
+from jumper_warp.utils.metrics import Metrics, chosen, mean, measure, rate
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
@@ -17,7 +17,6 @@ if TYPE_CHECKING:
 RAMP, HOLD, EXTEND = 25, 50, 40  # Policy steps of the ramp into the squat, the held squat, and the full extension
 STAND = 31  # Policy steps in the default pose before the ramp, as before the command of a sweep's jumps
 COAST = 30  # Policy steps after the extension, within which the apex has passed
-INNER_RANGE = (0.6, 1.1)  # [m] Commanded heights with metrics of their own
 PUSH_PARAMS = ("events.push.force_", "events.push.torque_")  # Prefixes of parameters that set ranges of pushes
 
 
@@ -56,20 +55,21 @@ def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
     return np.where(diverged, np.nan, apex)
 
 
-def limit_metrics(jumps: HeightLog, limit: np.ndarray) -> Metrics:
-    """Return the metrics of jumps relative to `limit`, the same robots' open-loop apex [m], (num_envs,).
+def limit_metrics(outcome: JumpOutcome, target: np.ndarray, limit: np.ndarray, inside: np.ndarray) -> Metrics:
+    """Return the metrics of jumps to heights relative to `limit`, the same robots' open-loop apex [m], (num_envs, 1).
 
-    A height is reachable if at most SUCCESS_TOLERANCE above the open-loop apex; `success_rate_beyond_limit` counts the
-    other heights. `open_loop_mean_abs_error_m` is the error of ideal jumps that cannot exceed the limit.
+    A height is reachable if at most TOLERANCE above the open-loop apex. `open_loop_apex_error_abs_mean_m` is the error
+    of ideal jumps that cannot exceed the limit. target [m], inside: commanded heights and mask of those in range.
     """
-    target, near = jumps.commanded[:, 0], jumps.reached[:, 0]
-    reachable, below, inner = target <= limit + SUCCESS_TOLERANCE, target <= limit, within(target, INNER_RANGE)
+    reachable, note = target <= limit + TOLERANCE, "to reachable heights"
+    rates = chosen(HEIGHT_METRICS, "goal_reached_rate", "success_rate")
+    error = chosen(HEIGHT_METRICS, "apex_error_abs_mean_m")
     return {
-        "open_loop_limit_m": mean(limit), "lowest_open_loop_limit_m": float(np.nanmin(limit)),
-        "open_loop_mean_abs_error_m": mean(np.maximum(target - limit, 0.0)),
-        "mean_abs_error_up_to_limit_m": mean(np.abs(jumps.error[:, 0])[below]),
-        "success_rate_reachable": mean(near[reachable]), "reachable_share": mean(reachable),
-        "success_rate_beyond_limit": mean(near[~reachable]),
-        "success_rate_reachable_0_6_1_1": mean(near[reachable & inner]),
-        "reachable_share_0_6_1_1": mean(reachable[inner]),
-    }  # fmt: skip
+        "open_loop_apex_mean_m": mean(limit, "robots"),
+        "open_loop_apex_error_abs_mean_m": mean(np.maximum(target - limit, 0.0), "jumps"),
+        "reachable_rate": rate(reachable, "jumps"),
+        **measure(rates, outcome, reachable, "reachable_", note),
+        **measure(rates[:1], outcome, ~reachable, "unreachable_", "to other heights"),
+        **measure(rates, outcome, reachable & inside, "reachable_in_range_", f"{note} in range"),
+        **measure(error, outcome, target <= limit, "up_to_limit_", "up to the open-loop apex"),
+    }

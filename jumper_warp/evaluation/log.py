@@ -8,27 +8,27 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike
 
 from jumper_warp.envs.env import Env
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import Metrics, rate
 
 if TYPE_CHECKING:
     import torch
 
 SUCCESS = "success"  # Outcomes, also names of terminations
-DIVERGED = "came_apart"  # The state of the simulation is not finite or absurdly fast
+DIVERGED = "diverged"  # The state of the simulation is not finite or absurdly fast
 COLLIDED = "collided"  # A link other than a paw touched something
+FALLS = (DIVERGED, "low_base", "tilted", COLLIDED)  # Outcomes that count as falls
+OUTCOMES = {"came_apart": DIVERGED}  # Outcome by name of the termination, where they differ
 NO_END = "no_end"  # Outcome of an episode that was still running when the time was over
-
-Metrics = dict[str, float | int | None]  # Values by name, which ends with the unit; None if undefined
 
 
 class EvaluationLog(ABC):
     """Commands one episode per world and records its outcome; `run_evaluation` calls `begin`, then `record_step`."""
 
-    row_name = "jump"  # Noun for a row of `columns`; names the CSV file and the recording
+    row_name = "jump"  # Noun for a trial; names the recording
     spacing = 1.2  # [m] Distance between robots that a recording shows side by side
     count: int  # Number of worlds
     arrays: dict[str, np.ndarray]  # Result of the last `read_env`, one row per world
@@ -48,7 +48,7 @@ class EvaluationLog(ABC):
 
     @abstractmethod
     def columns(self) -> dict[str, list]:
-        """Return the columns of the CSV file by heading, lists of equal length; a row is one trial."""
+        """Return the values of all trials by name, lists of equal length; those of a name have one type, or None."""
 
     @abstractmethod
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
@@ -143,27 +143,14 @@ def within(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
     return (values >= limits[0] - 5e-4) & (values <= limits[1] + 5e-4)  # [m]
 
 
-def mean(values: ArrayLike | Sequence[float | None]) -> float | None:
-    """Return the mean of the values that are neither NaN nor None; None if no such value exists."""
-    numbers = np.asarray(values, dtype=float)
-    numbers = numbers[~np.isnan(numbers)]
-    return float(numbers.mean()) if len(numbers) else None
+def outcome_names(terminations: Sequence[str], *more: str) -> np.ndarray:
+    """Return the outcomes of episodes by index of the termination that ended them; more: names that follow."""
+    return np.array([*(OUTCOMES.get(name, name) for name in terminations), *more])
 
 
-def largest(values: np.ndarray) -> float | None:
-    """Return the largest of the values that are not NaN; None if no such value exists."""
-    values = values[~np.isnan(values)]
-    return float(values.max()) if len(values) else None
-
-
-def mean_and_max(name: str, values: np.ndarray) -> Metrics:
-    """Return mean and maximum of the values that are not NaN, as `mean_<name>` and `max_<name>`."""
-    return {f"mean_{name}": mean(values), f"max_{name}": largest(values)}
-
-
-def failed_by(outcomes: np.ndarray) -> Metrics:
-    """Return the number of episodes of each outcome, as `failed_by_<outcome>`; outcomes: of the failed episodes."""
-    return {f"failed_by_{name}": int((outcomes == name).sum()) for name in sorted(set(outcomes))}
+def ended_by(outcomes: np.ndarray, over: str, prefix: str = "ended_by_") -> Metrics:
+    """Return the rate of each outcome that occurs, as `<prefix><outcome>_rate`; over: what the trials are."""
+    return {f"{prefix}{name}_rate": rate(outcomes == name, over) for name in sorted(set(outcomes.ravel()))}
 
 
 def finite(values: np.ndarray) -> list[float | None]:

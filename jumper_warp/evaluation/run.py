@@ -16,13 +16,11 @@ from typing import Any, TypeVar
 import numpy as np
 import torch
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.evaluations import evaluation_of
-from jumper_warp.evaluation.film import EnvRecorder, save_recording
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
+from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.runs import open_policy
@@ -32,7 +30,8 @@ from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import output_dir, write_metrics
+from jumper_warp.utils.metrics import AnyMetrics, print_metrics
+from jumper_warp.utils.output import output_dir, read_values, write_metrics
 from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.threads import checked_threads
 
@@ -50,6 +49,7 @@ class EvaluationArgs(Conditions):
     noise: tyro.conf.Suppress[tyro.conf.Fixed[bool]] = False
     policy: str = "horizontal_jump"  # Name or folder of a policy, a run's folder, or a checkpoint
     num_recorded: int = 1  # Number of jumps to record for the Rerun viewer and, one of them, as a picture; 0: none
+    save_trials: bool = False  # Write the arrays of all trials, from which the rates follow, into trials.npz
     out: Path | None = None  # Folder for metrics, plots, pictures and recordings (default: outputs/<name>/<time>)
 
     def __post_init__(self) -> None:
@@ -75,7 +75,8 @@ class Run(ABC):
         """Start the clock of the report; call `prepare` before anything else."""
         self.started = time.perf_counter()
         self.conditions, self.record = Conditions(), 0  # Conditions of all episodes; number of worlds to record
-        self.setup_metrics: dict[str, Any] = {}  # Metrics of task and robot, reported with the conditions
+        self.save_trials = False  # Whether `run_episodes` writes trials.npz
+        self.settings: dict[str, Any] = {}  # Settings of task, robot and test, reported with the conditions
         self._latency: list[np.ndarray] = []  # [physics steps] (num_envs,) per `run_episodes`
         self._physics_dt = PHYSICS_DT
 
@@ -83,14 +84,17 @@ class Run(ABC):
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
         """Return the function from observations (num_envs, num_obs) to actions, argument `act` of `run_evaluation`."""
 
-    def prepare(self, name: str, conditions: Conditions, out: Path | None = None, *, record: int = 0) -> None:
+    def prepare(
+        self, name: str, conditions: Conditions, out: Path | None = None, *, record: int = 0, save_trials: bool = False
+    ) -> None:
         """Set the conditions, select the device and create the output folder, before anything is simulated.
 
-        name: of the folder outputs/<name>/<time>, unless `out` is given; record: number of worlds to record.
+        name: of the folder outputs/<name>/<time>, unless `out` is given; record: number of worlds to record;
+        save_trials: whether to write trials.npz.
         Raises InputError: no such device or number of threads; OSError: the folder cannot be created.
         """
         configure_device(conditions.device, conditions.threads)
-        self.conditions, self.record = conditions, record
+        self.conditions, self.record, self.save_trials = conditions, record, save_trials
         self.folder = output_dir(name, out)
 
     @property
@@ -102,22 +106,24 @@ class Run(ABC):
             words.append(f"latency {latency_text(self._latency[0], self._physics_dt)}")
         words += [] if conditions.gain_scale is None else ["kp × {:g}, kd × {:g}".format(*conditions.gain_scale)]
         words += [] if conditions.friction is None else [f"friction {conditions.friction:g}"]
+        words += [] if conditions.sensor_offset is None else [f"sensors ± {conditions.sensor_offset:g}°"]
         words += [] if conditions.gravity is None else [f"gravity {conditions.gravity:g} m/s²"]
         words += [] if conditions.robot is None else [f"robot of {conditions.robot.name}"]
         return ", ".join(words + (["pushed in flight too"] if conditions.push_in_flight else []))
 
     @property
-    def condition_metrics(self) -> dict[str, Any]:
-        """Conditions by metric name, without unset ones; latency is the simulated one of all episodes so far."""
-        conditions, values = self.conditions, {**self.setup_metrics}
-        values |= {name: getattr(conditions, name) for name in ("solver", "randomize", "seed")}
+    def condition_values(self) -> dict[str, Any]:
+        """Conditions by name, without unset ones; latency is the simulated one of all episodes so far."""
+        conditions, values = self.conditions, {**self.settings}
+        values |= {name: getattr(conditions, name) for name in ("solver", "randomize", "noise", "seed", "stream")}
         if conditions.randomize:
             values["push_in_flight"] = conditions.push_in_flight
         values |= {} if conditions.gain_scale is None else {"gains": list(conditions.gain_scale)}
         values |= {} if conditions.friction is None else {"friction": conditions.friction}
+        values |= {} if conditions.sensor_offset is None else {"sensor_offset_deg": conditions.sensor_offset}
         values |= {} if conditions.robot is None else {"robot": str(conditions.robot)}
         if self._latency:
-            values |= latency_metrics(np.concatenate(self._latency), self._physics_dt, conditions.latency)
+            values |= latency_values(np.concatenate(self._latency), self._physics_dt, conditions.latency)
         return values
 
     def run_episodes(
@@ -140,6 +146,8 @@ class Run(ABC):
         run_evaluation(self.actor(env), env, log, on_step=after_step)
         self._latency.append(env.parameters.latency.numpy().copy())
         self._physics_dt = env.physics_dt
+        if self.save_trials:
+            write_trials(self.folder, log, len(self._latency))
         if recorder is not None:
             save_recording(recorder.recording(), self.folder, film)
         return log
@@ -149,16 +157,12 @@ class Run(ABC):
         worlds = np.linspace(0, env.num_envs - 1, min(self.record, env.num_envs)).round().astype(int).tolist()
         return EnvRecorder(env, log, worlds, ground=scene.get("ground", "plane"), block=scene.get("block"))
 
-    def report(self, metrics: Mapping[str, Any], paper: Mapping[str, float]) -> dict[str, Any]:
-        """Write conditions and metrics to `metrics.json`, print them beside the paper's values, return them."""
-        values = self.condition_metrics | dict(metrics)
-        write_metrics(self.folder, values)
-        table = Table("metric", self.title, "paper")
-        for name, value in values.items():
-            table.add_row(name, format_value(value), str(paper.get(name, "")))
-        Console().print(table)
-        print(f"{time.perf_counter() - self.started:.1f} s; metrics, plots and recordings in {self.folder}")
-        return values
+    def report(self, metrics: AnyMetrics, paper: Mapping[str, float]) -> dict[str, Any]:
+        """Write conditions and metrics to `metrics.json`, print them beside the paper's values, return all values."""
+        write_metrics(self.folder, metrics, self.condition_values)
+        print_metrics(metrics, paper, self.condition_values, self.title)
+        print(f"{time.perf_counter() - self.started:.1f} s; results in {self.folder}")
+        return read_values(self.folder)
 
 
 class EvaluationRun(Run):
@@ -175,6 +179,7 @@ class EvaluationRun(Run):
         self.policy = open_policy(source)
         self.task = restored_task(self.policy.config, self.modules)
         self.evaluation = evaluation_of(self.task)
+        self.settings = {"task": self.task.name, **trained_range(self.task)}
 
     @classmethod
     def from_args(
@@ -191,8 +196,7 @@ class EvaluationRun(Run):
                 f"this needs a policy that is evaluated by {' or '.join(evaluations)}, "
                 f"{args.policy} is of {run.task.name}, by {run.task.evaluation_suite}"
             )
-        run.prepare(name, conditions_of(args), args.out, record=args.num_recorded)
-        run.setup_metrics = {"task": run.task.name} if len(evaluations) > 1 else {}
+        run.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
@@ -211,8 +215,8 @@ class EvaluationRun(Run):
         change, conditions = change or self.evaluation.prepare_task, conditions or self.conditions
         env = env_of_policy(self.policy, count, conditions, change=change, modules=self.modules, **scene)
         self.policy.to(env.device)
-        self.setup_metrics["gravity_m_s2"] = env.task.gravity
-        self.setup_metrics["torque_limit_nm"] = torque_limit(env)
+        self.settings["gravity_m_s2"] = env.task.gravity
+        self.settings["torque_limit_nm"] = torque_limit(env)
         return env
 
 
@@ -231,7 +235,7 @@ class SkillRun(Run):
         Raises PolicyError, CheckpointError or InputError.
         """
         run = cls(names)
-        run.prepare(name, conditions_of(args), args.out, record=args.num_recorded)
+        run.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
@@ -243,15 +247,38 @@ class SkillRun(Run):
         return self.skills.env(count, self.conditions, **scene)
 
 
-def latency_metrics(steps: np.ndarray, physics_dt: float, requested: float | None = None) -> dict[str, Any]:
-    """Return the simulated latency from action to motor: mean `latency_ms`, `latency` as text, `latency_asked_ms`.
+def trained_range(task: TaskCfg) -> dict[str, list[float]]:
+    """Return the range of commands over all levels of a task by name, empty unless it jumps or walks.
+
+    `trained_range_m`: smallest and largest apex height or distance straight ahead; `trained_velocities`: largest
+    velocities ahead, back, to either side [m/s] and about z [rad/s].
+    """
+    levels: Any = task.levels
+    if hasattr(levels[0], "goal_lower"):
+        axis = 2 if levels[0].goal_upper[2] > 0.0 else 0
+        lower, upper = ([getattr(level, name)[axis] for level in levels] for name in ("goal_lower", "goal_upper"))
+        return {"trained_range_m": [max(min(lower), 0.0), max(upper)]}
+    return {"trained_velocities": list(levels[-1].last_range)} if hasattr(levels[0], "last_range") else {}
+
+
+def write_trials(folder: Path, log: EvaluationLog, number: int) -> None:
+    """Write `log.columns()` as arrays (trials,) to trials.npz; number: of the test in the evaluation, from 1."""
+    columns: Any = {
+        name: np.array([np.nan if value is None else value for value in values])
+        for name, values in log.columns().items()
+    }
+    np.savez_compressed(folder / ("trials.npz" if number == 1 else f"trials_{number}.npz"), **columns)
+
+
+def latency_values(steps: np.ndarray, physics_dt: float, requested: float | None = None) -> dict[str, Any]:
+    """Return the simulated latency from action to motor: mean `latency_ms`, `latency` as text, `latency_requested_ms`.
 
     steps: latency of all worlds [physics steps], (num_envs,); physics_dt: physics step [s]; requested [ms]: value of
-    the flag `--latency`, None: without `latency_asked_ms`.
+    the flag `--latency`, None: without `latency_requested_ms`.
     """
-    metrics: dict[str, Any] = {} if requested is None else {"latency_asked_ms": requested}
+    values: dict[str, Any] = {} if requested is None else {"latency_requested_ms": requested}
     mean = 1000.0 * physics_dt * float(np.mean(steps))
-    return metrics | {"latency_ms": mean, "latency": latency_text(steps, physics_dt)}
+    return values | {"latency_ms": mean, "latency": latency_text(steps, physics_dt)}
 
 
 def latency_text(steps: np.ndarray, physics_dt: float) -> str:
@@ -267,10 +294,3 @@ def torque_limit(env: Env) -> float:
     """Return the smallest torque limit of the transversal motors [N m], scaled by a robot overlay if there is one."""
     limit = env.task.motors.transversal.saturation
     return limit if env.sim.robot is None else limit * float(env.sim.robot.saturation[:, TRANSVERSAL].min())
-
-
-def format_value(value: Any) -> str:
-    """Return a metric as text; floats, also in lists, have four significant digits."""
-    if isinstance(value, list):
-        return ", ".join(format_value(item) for item in value)
-    return f"{value:.4g}" if isinstance(value, float) else str(value)

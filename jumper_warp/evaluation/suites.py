@@ -1,26 +1,28 @@
 """Suites of jumps to landing positions other than the sweep, and the table of all suites.
 
-`jumper evaluate POLICY --suite NAME` runs one. Headings are sampled from the full circle; error and success are defined
-as in the sweep.
+`jumper evaluate POLICY --suite NAME` runs one. Headings are sampled from the full circle; `jump_metrics` defines the
+metrics.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from typing import Any, ClassVar
 
 import numpy as np
 
-from jumper_warp.evaluation.film import block_positions
-from jumper_warp.evaluation.heights import SUCCESS_TOLERANCE
-from jumper_warp.evaluation.landings import AT_REST_AT_END, FALLS, MISSED, LandingLog, landing_metrics, trained_range
-from jumper_warp.evaluation.log import largest, mean, within
+from jumper_warp.evaluation.jump_metrics import PLACE_METRICS, jump_metrics, range_metrics
+from jumper_warp.evaluation.jumps import TOLERANCE, JumpOutcome
+from jumper_warp.evaluation.landings import LandingLog
+from jumper_warp.evaluation.log import within
 from jumper_warp.evaluation.plots import BasePaths, plot_distances, plot_landings, plot_paths, regular_polygons
+from jumper_warp.evaluation.recorder import block_positions
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite, check
 from jumper_warp.robot.grounds import SIZE, BlockCfg, platform, uneven
+from jumper_warp.utils.metrics import Metrics, MetricValue, chosen, largest, mean, measure, rate
 
 AHEAD, ASIDE = (0.35, 1.4), (-0.35, 0.35)  # [m] Ranges of the grid's goals ahead and to the left
 SECTORS = ("ahead", "left", "back", "right")  # Quarters of a ring, each centred on its direction
@@ -28,11 +30,6 @@ PAIRS = {"diagonal": ((0.8, 0.2), (0.75, -0.2)), "straight": ((0.8, 0.0), (0.8, 
 """[m] Goals of the paper's two jumps in a row, each relative to the one before."""
 ROW_LOWER, ROW_UPPER, DELAYS = (0.4, -0.2), (0.9, 0.2), (0.3, 1.0)
 """[m] Range of goals in a long row; [s] range of the time until the first command of any row."""
-ROW_METRICS = (
-    "success_rate", "fall_rate", "miss_rate", "step_rate", "still_landing_rate", "second_takeoff_rate",
-    "max_landing_tilt_deg", AT_REST_AT_END,
-)  # fmt: skip
-"""Metrics that are also reported for the long rows of jumps, with the suffix `_ten`."""
 GROUND_LOWER, GROUND_UPPER = (0.8, -0.15), (1.4, 0.15)
 """[m] Range of goals off the platform or on the block; the paper's simulation always succeeds in it."""
 DROP, AMPLITUDE, FLAT_RADIUS = 0.15, 0.05, 0.35
@@ -40,15 +37,18 @@ DROP, AMPLITUDE, FLAT_RADIUS = 0.15, 0.05, 0.35
 BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION, BLOCK_BEYOND, BLOCK_WIDTH = 0.05, 10.0, 0.4, 0.40, 0.8
 """[m], [kg], [1] Height, mass, friction with the floor; [m] distance from goal to far side; [m] width along y."""
 BIN, IN_RANGE, LIMIT = 0.1, (1.0, 1.4), 9.0
-"""[m] Width of a bin of distances; range of distances of `success_rate_in_range`; largest `max_distance`."""
+"""[m] Width of a bin of distances; range of distances of the `in_range` metrics; largest `max_distance`."""
 GIVEN_UP, RELIABLE = 0.5, 0.95  # [1] Success rate below which no farther bin is tried; that of a reliable distance
-RATES = {"": "success_rate", "_without_hop": "single_jump_success_rate", "_without_step": "step_free_success_rate"}
-"""Success rate that defines each reliable distance, by the suffix of the distance's metric."""
-BIN_METRICS = (
-    *RATES.values(), "mean_error_m", "mean_error_of_successes_m", "mean_error_at_touchdown_m",
-    "mean_error_0_3_s_after_touchdown_m", "fall_rate", "miss_rate", "still_landing_rate", "max_landing_tilt_deg",
+RATES = {
+    "": "success_rate", "_without_hop": "success_without_hop_rate",
+    "_without_paw_lift": "success_without_paw_lift_rate",
+}  # fmt: skip
+"""Success rate that defines each reliable distance, by the suffix of the distance's name."""
+MEANS = (
+    *RATES.values(), "fall_rate", "miss_rate", "no_paw_lift_rate", "goal_distance_at_rest_mean_m",
+    "goal_distance_at_touchdown_mean_m", "distance_flown_mean_m", "paw_to_paw_distance_mean_m", "landing_tilt_max_deg",
 )  # fmt: skip
-"""Metrics of each bin of distances, reported as lists `bin_<name>`."""
+"""Metrics of each bin of distances, reported as lists `bin_<key>`."""
 PUBLISHED = {
     "Barkour (Caluwaerts et al. 2023)": 0.5, "Margolis et al. 2021": 0.66, "Liu et al. 2023": 0.8,
     "Cheng et al. 2024": 0.8, "Atanassov et al. 2024": 0.9, "Jumper, the paper's robot": 1.25,
@@ -68,7 +68,8 @@ class Grid(Suite):
     rows: int = 5  # Number of distances to the side
 
     name: ClassVar = "grid"
-    paper: ClassVar = {"mean_error_m": 0.025, "success_rate": 0.968, "success_rate_in_range": 1.0}
+    paper: ClassVar = {"goal_distance_at_rest_mean_m": 0.025, "goal_distance_at_end_mean_m": 0.025,
+                       "success_rate": 0.968, "in_range_success_rate": 1.0}  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -80,15 +81,16 @@ class Grid(Suite):
         x, y = np.meshgrid(np.linspace(*AHEAD, self.columns), np.linspace(*ASIDE, self.rows), indexing="ij")
         return np.repeat(np.stack([x.ravel(), y.ravel()], axis=1), self.num_jumps, axis=0)[:, None]
 
-    def measure(self, run: EvaluationRun) -> dict[str, Any]:
+    def measure(self, run: EvaluationRun) -> Metrics:
         """Run the jumps, plot the landing positions, and return the metrics."""
         landings = self.run_landings(run, self.goals, film="jumps")
         plot_landings(
-            run.folder / "grid.png", {"": landed_at(landings)}, tolerance=SUCCESS_TOLERANCE,
+            run.folder / "grid.png", {"": landed_at(landings)}, tolerance=TOLERANCE,
             title="Jumps to a grid of goals", conditions=f"{run.title}, {len(landings.end)} jumps",
         )  # fmt: skip
         inside = landings.goal_positions[..., 0] < AHEAD[1] - 1.0e-6
-        return {"goals": self.columns * self.rows, **landing_metrics(landings, inside)}
+        outcome = landings.outcome
+        return jump_metrics(outcome) | range_metrics(outcome, inside, "less than 1.4 m ahead")
 
 
 @dataclass(frozen=True)
@@ -105,21 +107,19 @@ class Ring(Suite):
         super().__post_init__()
         check(0.0 < self.radius < 3.0, f"radius must be in (0, 3) m, got {self.radius}")
 
-    def measure(self, run: EvaluationRun) -> dict[str, Any]:
+    def measure(self, run: EvaluationRun) -> Metrics:
         """Run the jumps, plot landing positions, return the metrics, with three rates per quarter of the ring."""
         angle = np.linspace(0.0, 2.0 * np.pi, self.num_jumps, endpoint=False)
         goals = self.radius * np.stack([np.cos(angle), np.sin(angle)], axis=-1)[:, None]
         landings = self.run_landings(run, goals, film="jumps")
         plot_landings(
-            run.folder / "landings.png", {"": landed_at(landings)}, tolerance=SUCCESS_TOLERANCE,
+            run.folder / "landings.png", {"": landed_at(landings)}, tolerance=TOLERANCE,
             title=f"Jumps over {self.radius:g} m", conditions=f"{run.title}, {self.num_jumps} jumps",
         )  # fmt: skip
         sector = np.round(np.arctan2(goals[..., 1], goals[..., 0]) / (0.5 * np.pi)).astype(int) % len(SECTORS)
-        fell, missed = np.isin(landings.ends, FALLS), landings.outcomes == MISSED
-        values = landing_metrics(landings)
+        rows, values = chosen(PLACE_METRICS, "success_rate", "fall_rate", "miss_rate"), jump_metrics(landings.outcome)
         for i, name in enumerate(SECTORS):
-            for rate, counts in (("success", landings.success), ("fall", fell), ("miss", missed)):
-                values[f"{rate}_rate_{name}"] = mean(counts[sector == i])
+            values |= measure(rows, landings.outcome, sector == i, f"{name}_", name)
         return values
 
 
@@ -128,10 +128,8 @@ class Consecutive(Suite):
     """Jumps in a row: the paper's pairs, and ten to random goals; the next is commanded a second after touchdown.
 
     A goal is relative to the robot's position and heading when the jump is commanded. Robots differ in heading and in
-    the delay of the first command. The error of a jump is the distance of the base from its goal when the next one is
-    commanded; after a fall or a collision no further jump counts. `ten_in_a_row_rate` is the fraction of rows without a
-    fall or collision, `row_all_on_goal_rate` the fraction in which every jump succeeded. `success_rate_in_range`
-    includes all goals.
+    the delay of the first command. After a fall or a collision no further jump counts. `row_all_landed_rate` is the
+    fraction of long rows without a fall or collision, `row_all_success_rate` that in which every jump succeeded.
     """
 
     num_jumps: int = 20  # Number of trials of each pair
@@ -139,16 +137,16 @@ class Consecutive(Suite):
     jumps_per_trial: int = 10  # Number of jumps in each of these trials
 
     name: ClassVar = "consecutive"
-    paper: ClassVar = {"mean_error_m": 0.0054}
+    paper: ClassVar = {"goal_distance_at_rest_mean_m": 0.0054}
 
     def __post_init__(self) -> None:
         super().__post_init__()
         trials, jumps = self.num_trials, self.jumps_per_trial
         check(min(trials, jumps) >= 1, f"need at least one trial and one jump in it, got {trials}, {jumps}")
 
-    def measure(self, run: EvaluationRun) -> dict[str, Any]:
+    def measure(self, run: EvaluationRun) -> Metrics:
         """Run pairs and long rows, plot the paths of the bases, and return the metrics."""
-        rng = np.random.default_rng(self.seed)
+        rng = np.random.default_rng(self.stream_seed)
         pairs = np.repeat(np.array(list(PAIRS.values())), self.num_jumps, axis=0)
         rows = rng.uniform(ROW_LOWER, ROW_UPPER, (self.num_trials, self.jumps_per_trial, 2))
         logs, paths = [], []
@@ -159,30 +157,27 @@ class Consecutive(Suite):
         parts = dict(zip((*PAIRS, f"{self.jumps_per_trial} in a row"), (*np.split(paths[0], 2), paths[1]), strict=True))
         words = f"{run.title}, {self.num_jumps} pairs of each kind, {self.num_trials} long rows"
         plot_paths(run.folder / "paths.png", parts, PAIRS, words)
-        return {"rest_s": self.rest_time} | consecutive_metrics(*logs)
+        run.settings["jumps_in_a_row"] = self.jumps_per_trial
+        return consecutive_metrics(*logs)
 
 
-def consecutive_metrics(pairs: LandingLog, row: LandingLog) -> dict[str, Any]:
-    """Return `landing_metrics` of pairs, and metrics of long rows; pairs: first half diagonal, second half straight."""
-    values, ten = (landing_metrics(landings) for landings in (pairs, row))
-    for metrics in (values, ten):
-        if "at_rest_within_1_s_rate" in metrics:
-            metrics[AT_REST_AT_END] = metrics.pop("at_rest_within_1_s_rate")
-    halves = zip(PAIRS, np.split(pairs.error, 2), strict=True)
-    return values | {
-        "success_rate_in_range": values["success_rate"],
-        **{f"mean_error_{name}_m": mean(error) for name, error in halves},
-        **{f"mean_error_jump_{i + 1}_m": mean(pairs.error[:, i]) for i in range(2)},
-        "both_landed_rate": mean(pairs.landed.all(axis=1)),
-        "row": row.goals.shape[1],
-        "trials": len(row.goals),
-        "ten_in_a_row_rate": mean(row.landed.all(axis=1)),
-        "row_all_on_goal_rate": mean(row.success.all(axis=1)),
-        "mean_jumps_until_the_end": mean(row.landed.sum(axis=1)),
-        "mean_error_ten_m": ten["mean_error_m"],
-        **{f"{name}_ten": ten[name] for name in ROW_METRICS},
-        "mean_error_by_number_m": [mean(error) for error in row.error.T],
-    }
+def consecutive_metrics(pairs: LandingLog, row: LandingLog) -> Metrics:
+    """Return the metrics of pairs, and `row_<key>` of long rows; pairs: first half diagonal, second half straight."""
+    first, rows = pairs.outcome, row.outcome
+    errors = chosen(PLACE_METRICS, "goal_distance_at_rest_mean_m")
+    halves, numbers = np.arange(2).repeat(len(first.landed) // 2)[:, None], np.arange(2)
+    return {
+        **jump_metrics(first),
+        **{key: value for i, name in enumerate(PAIRS)
+           for key, value in measure(errors, first, halves == i, f"{name}_", f"of {name} pairs").items()},
+        **{key: value for i in numbers
+           for key, value in measure(errors, first, numbers == i, f"jump_{i + 1}_", f"{i + 1} of 2").items()},
+        "both_landed_rate": rate(first.landed.all(axis=1), "pairs"),
+        "row_all_landed_rate": rate(rows.landed.all(axis=1), "rows"),
+        "row_all_success_rate": rate(rows.success.all(axis=1), "rows"),
+        "row_landed_jumps_mean": mean(rows.landed.sum(axis=1), "rows"),
+        **jump_metrics(rows, prefix="row_", note="of rows"),
+    }  # fmt: skip
 
 
 @dataclass(frozen=True)
@@ -191,8 +186,8 @@ class Platform(Suite):
 
     Most policies observe nothing of the ground but the base's height above the spot below it. Uneven ground has bumps
     of up to 0.05 m around a level start, and every robot jumps in a random direction. The block, 10 kg and 0.05 m
-    high, reaches from before the goal to beyond it and slides when the robot lands on it; the goal stays. The range of
-    `success_rate_in_range` is all goals. SolverMuJoCo has no sliding block: with it that scene is left out.
+    high, reaches from before the goal to beyond it and slides when the robot lands on it; the goal stays. SolverMuJoCo
+    has no sliding block: with it that scene is left out.
     """
 
     num_jumps: int = 100
@@ -229,29 +224,25 @@ class Platform(Suite):
             "block": (f"block of the median goal, {BLOCK_HEIGHT:g} m high", block),
         }
 
-    def measure(self, run: EvaluationRun) -> dict[str, Any]:
-        """Run the jumps of all scenes, plot them, return `<scene>_<metric>` and the means of metrics over scenes."""
-        rng = np.random.default_rng(self.seed)
-        goals, values = rng.uniform(GROUND_LOWER, GROUND_UPPER, (self.num_jumps, 2)), {}
+    def measure(self, run: EvaluationRun) -> Metrics:
+        """Run the jumps of all scenes, plot them, and return `<scene>_<key>`."""
+        rng = np.random.default_rng(self.stream_seed)
+        goals = rng.uniform(GROUND_LOWER, GROUND_UPPER, (self.num_jumps, 2))
+        run.settings["edge_m"], values = self.edge, {}
         done: dict[str, LandingLog] = {}
         for name, scene, headings in self.scenes(goals, rng):
             env = run.env(self.num_jumps, **scene)
             done[name] = self.run_landings(run, goals[:, None], env, headings=headings, film=name, film_scene=scene)
-            values |= {f"{name}_{metric}": value for metric, value in landing_metrics(done[name]).items()}
+            values |= jump_metrics(done[name].outcome, prefix=f"{name}_", note=f"({name})")
             if "block" in scene:
                 slide = np.linalg.norm(block_positions(env.sim) - scene["block"].center, axis=1)
-                values |= {"block_mean_slide_m": float(slide.mean()), "block_max_slide_m": float(slide.max())}
+                values |= {"block_slide_mean_m": mean(slide, "jumps"), "block_slide_max_m": largest(slide, "jumps")}
         plot_landings(
             run.folder / "landings.png", {name: landed_at(landings) for name, landings in done.items()},
-            tolerance=SUCCESS_TOLERANCE, outlines=self.outlines(goals), title="Jumps to other grounds",
+            tolerance=TOLERANCE, outlines=self.outlines(goals), title="Jumps to other grounds",
             conditions=f"{run.title}, {self.num_jumps} jumps each",
         )  # fmt: skip
-        names = ("mean_error_m", "success_rate", "fall_rate", "miss_rate", "still_landing_rate")
-        summary = {name: mean([values[f"{scene}_{name}"] for scene in done]) for name in names}
-        tilts = [values[f"{scene}_max_landing_tilt_deg"] for scene in done]
-        summary["success_rate_in_range"] = summary["success_rate"]
-        summary["max_landing_tilt_deg"] = max((tilt for tilt in tilts if tilt is not None), default=None)
-        return {"jumps": self.num_jumps * len(done), "edge_m": self.edge, **summary, **values}
+        return values
 
 
 @dataclass(frozen=True)
@@ -261,9 +252,8 @@ class Farthest(Suite):
     Goals of a bin lie in one direction, within 0.05 m of its middle. A far goal may be reached by steps or a second hop
     after the landing, so three distances are reported, each the largest middle of a bin up to which at least 95 % of
     the jumps succeed: at all; without a second hop, in which all paws are off the ground again for more than 0.05 s;
-    without a step, in which any paw that had come down is off it again for 0.05 s. `base_at_touchdown` is the distance
-    of the base from its start at touchdown, the mean of a bin's successes. Published distances were jumped by robots;
-    the paper's 1.25 m compares with `hop_free_distance_m`.
+    without a paw lifted again, for 0.05 s. Beside each stand the distance flown by the base and the distance from paws
+    to paws, means of that bin. Published distances were jumped by robots.
     """
 
     num_jumps: int = 100
@@ -272,7 +262,7 @@ class Farthest(Suite):
     direction: float = 0.0  # [deg] Direction of the goals from the robot: 0 ahead, 90 to the left, 180 back
 
     name: ClassVar = "max"
-    paper: ClassVar = {"hop_free_distance_m": 1.25}
+    paper: ClassVar = {"reliable_distance_without_hop_m": 1.25}
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -286,7 +276,7 @@ class Farthest(Suite):
         angle = math.radians(self.direction)
         return distance[:, None, None] * np.array([math.cos(angle), math.sin(angle)])
 
-    def measure(self, run: EvaluationRun) -> dict[str, Any]:
+    def measure(self, run: EvaluationRun) -> Metrics:
         """Run bins of growing distance until success is below GIVEN_UP, plot them, and return the metrics."""
         env, bins = run.env(self.num_jumps), {}
         for number in range(round((self.max_distance - self.min_distance) / BIN) + 1):
@@ -296,18 +286,18 @@ class Farthest(Suite):
             print(f"{middle:.1f} m: {success:.1%} success", flush=True)
             if success < GIVEN_UP:
                 break
-        values = distance_metrics(bins) | trained_range(env.task) | {"direction_deg": self.direction}
-        logs = bins.values()
+        run.settings["direction_deg"] = self.direction
+        outcomes = [log.outcome for log in bins.values()]
         successes = {
-            "success": np.array([log.success[:, 0] for log in logs]),
-            "success without a second hop": np.array([(log.success & ~log.hopped)[:, 0] for log in logs]),
-            "success without a step": np.array([(log.success & ~log.stepped)[:, 0] for log in logs]),
+            "success": np.array([outcome.success[:, 0] for outcome in outcomes]),
+            "success without a second hop": np.array([(o.success & ~o.hopped)[:, 0] for o in outcomes]),
+            "success without lifting a paw": np.array([(o.success & o.still)[:, 0] for o in outcomes]),
         }
-        errors = np.array([np.where(log.success, log.error, np.nan)[:, 0] for log in logs])
+        errors = np.array([np.where(o.success, o.distance_at_rest_m, np.nan)[:, 0] for o in outcomes])
         conditions = f"{run.title}, {self.num_jumps} jumps each"
         plot_distances(run.folder / "max_jump.png", [*bins], successes, errors, reliable=RELIABLE, published=PUBLISHED,
                        conditions=conditions)  # fmt: skip
-        return values
+        return distance_metrics(bins)
 
 
 def landed_at(landings: LandingLog) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -320,31 +310,29 @@ def rectangle(x0: float, x1: float, y0: float, y1: float) -> np.ndarray:
     return np.array([[(x0, y0), (x1, y0), (x1, y1), (x0, y1)]])
 
 
-def distance_metrics(bins: dict[float, LandingLog]) -> dict[str, Any]:
-    """Return means over all bins, reliable distances [m], and `bin_<metric>` lists with one entry per bin.
+def distance_metrics(bins: dict[float, LandingLog]) -> Metrics:
+    """Return the metrics over all bins, reliable distances, and `bin_<key>` lists with one entry per bin.
 
     bins: log by distance at the bin's middle [m], ascending.
     """
-    by_bin = [landing_metrics(landings) for landings in bins.values()]
-    lists: dict[str, list[Any]] = {name: [values[name] for values in by_bin] for name in BIN_METRICS}
-    flown = [mean(np.linalg.norm(log.touchdown[log.success], axis=-1)) for log in bins.values()]
-    landed = [landings.landing[landings.success][:, 0] for landings in bins.values()]
-    inside = [landings.success[within(landings.goal_positions[..., 0], IN_RANGE)] for landings in bins.values()]
-    values: dict[str, Any] = {
-        "jumps": sum(int(landings.begun.sum()) for landings in bins.values()),
-        "mean_error_m": mean(lists["mean_error_m"]),
-        "success_rate_in_range": mean(np.concatenate(inside)),
-        **{rate: mean(lists[rate]) for rate in (*RATES.values(), "fall_rate", "miss_rate", "still_landing_rate")},
-        "max_landing_tilt_deg": max((tilt for tilt in lists["max_landing_tilt_deg"] if tilt is not None), default=None),
-    }
-    for suffix, rate in RATES.items():
-        first_bad = next((i for i, success in enumerate(lists[rate]) if success < RELIABLE), len(bins))
-        values[f"largest_reliable{suffix}_m"] = list(bins)[first_bad - 1] if first_bad else None
-        values[f"base_at_touchdown{suffix}_m"] = flown[first_bad - 1] if first_bad else None
-    values["hop_free_distance_m"] = values["largest_reliable_without_hop_m"]
-    values["farthest_success_m"] = largest(np.concatenate(landed))
-    values |= {"bin_m": list(bins), "bin_base_at_touchdown_m": flown}
-    return values | {f"bin_{name}": column for name, column in lists.items()}
+    outcomes = [landings.outcome for landings in bins.values()]
+    together = JumpOutcome(**{name: np.concatenate([getattr(outcome, name) for outcome in outcomes])
+                              for name in (field.name for field in fields(JumpOutcome))})  # fmt: skip
+    goals = np.concatenate([landings.goal_positions for landings in bins.values()])
+    inside = within(goals[..., 0], IN_RANGE)
+    by_bin = [measure(chosen(PLACE_METRICS, *MEANS), outcome) for outcome in outcomes]
+    lists: dict[str, list[Any]] = {key: [metrics[key].value for metrics in by_bin] for key in MEANS}
+    values = jump_metrics(together) | range_metrics(together, inside, "over 1 to 1.4 m")
+    for suffix, key in RATES.items():
+        first_bad = next((i for i, success in enumerate(lists[key]) if success < RELIABLE), len(bins))
+        for name, column in (
+            ("reliable_distance", list(bins)),
+            ("reliable_distance_flown", lists["distance_flown_mean_m"]),
+            ("reliable_paw_to_paw_distance", lists["paw_to_paw_distance_mean_m"]),
+        ):
+            values[f"{name}{suffix}_m"] = MetricValue(column[first_bad - 1] if first_bad else None)
+    values["bin_m"] = MetricValue(list(bins))
+    return values | {f"bin_{key}": MetricValue(column) for key, column in lists.items()}
 
 
 SUITES: tuple[type[Suite], ...] = (HeightSweep, DistanceSweep, Grid, Ring, Consecutive, Platform, Farthest)

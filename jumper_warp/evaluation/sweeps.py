@@ -11,27 +11,22 @@ from typing import Any, ClassVar
 import numpy as np
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.heights import SUCCESS_TOLERANCE, HeightLog, sweep_metrics, with_sweep_terminations
-from jumper_warp.evaluation.jumps import DELAY, REST_TIME
-from jumper_warp.evaluation.landings import (
-    LandingLog,
-    landing_metrics,
-    random_headings,
-    trained_range,
-    with_landing_terminations,
-    with_second_takeoff,
-)
+from jumper_warp.evaluation import heights, landings
+from jumper_warp.evaluation.heights import HeightFlags
+from jumper_warp.evaluation.jump_metrics import PLACE_METRICS
+from jumper_warp.evaluation.jumps import DELAY, REST_TIME, TOLERANCE, with_jump_terminations
+from jumper_warp.evaluation.landings import LandingFlags, LandingLog, random_headings, with_second_takeoff
 from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
-from jumper_warp.evaluation.log import Metrics, mean, termination_names, within
+from jumper_warp.evaluation.log import termination_names, within
 from jumper_warp.evaluation.plots import Published, plot_sweep
-from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
+from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun, trained_range
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import Metrics, chosen, measure
 
-HEIGHTS_IN_RANGE, DISTANCES_IN_RANGE = (0.5, 1.1), (0.3, 1.4)  # [m] Ranges in which all jumps of the paper succeed
 PAPER_HEIGHTS = Published(mean_error=0.04, robot=((0.75, 0.0, 0.023), (1.0, 0.01, 0.0)), open_loop=1.075)
 PAPER_DISTANCES = Published(mean_error=0.026, robot=((1.25, 0.0, 0.004),))
-PAPER_TRAINED = (0.4, 1.0)  # [m] Range of goal distances in the paper's training, also of `success_rate_0_4_1_0`
+PAPER_TRAINED = (0.4, 1.0)  # [m] Range of goal distances in the paper's training
 
 
 def check(condition: bool, message: str) -> None:
@@ -59,8 +54,8 @@ class Suite(EvaluationArgs, ABC):
         check(rest <= self.rest_time <= 10.0, f"rest_time must be in [{rest:g}, 10] s, got {self.rest_time}")
 
     @abstractmethod
-    def measure(self, run: EvaluationRun) -> dict[str, Any]:
-        """Run the jumps, write plots into `run.folder`, and return the metrics by name."""
+    def measure(self, run: EvaluationRun) -> Metrics:
+        """Run the jumps, write plots into `run.folder`, and return the metrics by key."""
 
     def run(self, modules: Iterable[ModuleType] = ()) -> dict[str, Any]:
         """Evaluate the policy, report and return the metrics; modules: the user's task modules.
@@ -68,7 +63,14 @@ class Suite(EvaluationArgs, ABC):
         Raises PolicyError, CheckpointError or InputError as `EvaluationRun.from_args`.
         """
         run = EvaluationRun.from_args(self.name, self, self.evaluations, modules)
+        run.settings["rest_s"] = self.rest_time
         return run.report(self.measure(run), self.paper)
+
+    def run_flags(self, run: EvaluationRun, flags: Any, env: Env, film: str = "") -> Any:
+        """Run the jumps of `jumper evaluate` with some flags, and return their log; film: name of the recording."""
+        log = flags.log(env.task, self.stream_seed)
+        log.rest = self.rest_time
+        return run.run_episodes(env, log, film=film)
 
     def run_landings(
         self, run: EvaluationRun, goals: np.ndarray, env: Env | None = None, *, headings: np.ndarray | None = None,
@@ -80,31 +82,32 @@ class Suite(EvaluationArgs, ABC):
         keywords of `EvaluationRun.run_episodes`.
         """
         env = run.env(len(goals)) if env is None else env
-        headings = random_headings(len(goals), self.seed) if headings is None else headings
+        headings = random_headings(len(goals), self.stream_seed) if headings is None else headings
         log = LandingLog(goals, termination_names(env.task), headings, delay, self.rest_time)
         return run.run_episodes(env, log, **options)
 
-    def pushed_in_flight(self, run: EvaluationRun, measure: Callable[[Conditions], Metrics], *names: str) -> Metrics:
+    def pushed_in_flight(self, run: EvaluationRun, metrics: Callable[[Conditions], Metrics], *names: str) -> Metrics:
         """Return the named metrics of the same test with pushes in flight, as `pushed_in_flight_<name>`.
 
-        Empty for nominal robots, and if the test itself pushes in flight. measure: runs the test under conditions and
+        Empty for nominal robots, and if the test itself pushes in flight. metrics: runs the test under conditions and
         returns its metrics.
         """
         if not self.randomize or self.push_in_flight:
             return {}
-        values = measure(replace(run.conditions, push_in_flight=True))
-        return {f"pushed_in_flight_{name}": values[name] for name in names}
+        values = metrics(replace(run.conditions, push_in_flight=True))
+        pushed = {name: values[name]._replace(over=f"{values[name].over} of robots pushed in flight") for name in names}
+        return {f"pushed_in_flight_{name}": value for name, value in pushed.items()}
 
 
 @dataclass(frozen=True)
 class HeightSweep(Suite):
     """Jumps to heights spread evenly over 0.5 to 1.2 m, each once.
 
-    Every robot stands in the default pose and is commanded to jump after half a second. A jump succeeds if the highest
-    base height is within 0.1 m of the commanded one. A landing is good if nothing but the paws touched anything, the
-    base stayed within 10 degrees of level and was at rest a second after touchdown. A fall or a collision ends a jump:
-    its apex until then counts. Randomised robots are pushed while a paw is down; a second test pushes them in flight
-    too. The open-loop jump of the same robots (squat, hold, full extension) shows the height that each can reach.
+    Every robot stands in the default pose and is commanded to jump after half a second. A jump reaches its height if
+    the highest base height is within 0.1 m of the commanded one. It succeeds if it does so on command, nothing but the
+    paws touches anything, and the base is at rest a second after touchdown. A fall or a collision ends a jump: its apex
+    until then counts. Randomised robots are pushed while a paw is down; a second test pushes them in flight too. The
+    open-loop jump of the same robots (squat, hold, full extension) shows the height that each can reach.
     """
 
     policy: str = "vertical_jump"
@@ -113,39 +116,40 @@ class HeightSweep(Suite):
 
     name: ClassVar = "sweep"
     evaluations: ClassVar = HEIGHTS
-    paper: ClassVar = {"mean_abs_error_m": 0.04, "success_rate": 0.91, "success_rate_in_range": 1.0}
-    least: ClassVar = (3, REST_TIME)
+    paper: ClassVar = heights.PAPER
+    least: ClassVar = (3, 0.1)
 
     def __post_init__(self) -> None:
         super().__post_init__()
         low, high = self.height_range
         check(0.0 < low <= high < 10.0, f"height_range must be in (0, 10) m, got {self.height_range}")
 
-    def run_jumps(self, run: EvaluationRun, env: Env, film: str = "") -> HeightLog:
-        """Run one jump per height and return the log; film: name of the recording, empty for none."""
-        heights = np.linspace(*self.height_range, self.num_jumps)
-        return run.run_episodes(env, HeightLog(heights, termination_names(env.task), self.rest_time), film=film)
+    @property
+    def flags(self) -> HeightFlags:
+        """Flags of `jumper evaluate` with the same jumps."""
+        return HeightFlags(self.num_jumps, height_range=self.height_range)
 
-    def measure(self, run: EvaluationRun) -> dict[str, Any]:
+    def measure(self, run: EvaluationRun) -> Metrics:
         """Run the jumps and the open-loop jumps of the same robots, plot both, and return the metrics."""
-        env = run.env(self.num_jumps, with_sweep_terminations)
+        env, flags = run.env(self.num_jumps), self.flags
         initial_state = env.state_dict()
-        jumps = self.run_jumps(run, env, "jumps")
+        jumps = self.run_flags(run, flags, env, "jumps")
         limit = open_loop_limits(env, initial_state)
         plot_sweep(
             run.folder / "sweep.png", jumps.commanded[:, 0], jumps.apex[:, 0], jumps.reached[:, 0], limit=limit,
-            tolerance=SUCCESS_TOLERANCE, paper=PAPER_HEIGHTS, marks=("reached", "missed"), title="Jumps to heights",
+            tolerance=TOLERANCE, paper=PAPER_HEIGHTS, marks=("reached", "missed"), title="Jumps to heights",
             labels=("commanded base height [m]", "highest base height [m]"),
             conditions=f"{run.title}, {self.num_jumps} jumps",
         )  # fmt: skip
 
-        def measure_under(conditions: Conditions) -> Metrics:
-            pushed_env = run.env(self.num_jumps, with_sweep_terminations, conditions)
-            return sweep_metrics(self.run_jumps(run, pushed_env), HEIGHTS_IN_RANGE)
+        def pushed(conditions: Conditions) -> Metrics:
+            return flags.metrics(self.run_flags(run, flags, run.env(self.num_jumps, None, conditions)))
 
-        names = ("mean_abs_error_m", "success_rate", "success_rate_in_range", "fall_rate", "miss_rate", "landing_rate")
-        values = sweep_metrics(jumps, HEIGHTS_IN_RANGE) | limit_metrics(jumps, limit)
-        return {"rest_s": self.rest_time} | values | self.pushed_in_flight(run, measure_under, *names)
+        inside = within(jumps.commanded, flags.success_range)
+        values = flags.metrics(jumps) | limit_metrics(jumps.outcome, jumps.commanded, limit[:, None], inside)
+        names = ("success_rate", "goal_reached_rate", "in_range_goal_reached_rate", "landed_rate", "fall_rate",
+                 "miss_rate", "apex_error_abs_mean_m")  # fmt: skip
+        return values | self.pushed_in_flight(run, pushed, *names)
 
 
 @dataclass(frozen=True)
@@ -153,11 +157,10 @@ class DistanceSweep(Suite):
     """Jumps 0.3 to 1.5 m straight ahead, spread evenly, each once.
 
     Every robot stands in the default pose, with a heading sampled from the full circle, and is commanded to
-    jump after half a second. The error is the distance of the base from its goal in the plane a second after touchdown,
-    or where the jump failed before. A jump succeeds if it was begun on command, ends within 0.1 m of its goal, and
-    nothing but the paws touched anything. Steps, second hops and second takeoffs (upward at 0.25 m/s with no paw down)
-    in a landing are reported separately. Randomised robots are pushed while a paw is down; a second test pushes them in
-    flight too.
+    jump after half a second. A jump reaches its goal if the base is within 0.1 m of it in the plane a second after
+    touchdown. It succeeds if it does so on command, nothing but the paws touches anything, and the base is at rest.
+    Paws lifted again, second hops and second takeoffs (upward at 0.25 m/s with no paw down) are reported separately.
+    Randomised robots are pushed while a paw is down; a second test pushes them in flight too.
     """
 
     distance_range: tuple[float, float] = (0.3, 1.5)  # [m] Distance of the nearest and of the farthest goal
@@ -167,7 +170,7 @@ class DistanceSweep(Suite):
     num_recorded: int = 5
 
     name: ClassVar = "sweep"
-    paper: ClassVar = {"mean_error_m": 0.026, "success_rate": 0.97, "success_rate_in_range": 1.0}
+    paper: ClassVar = landings.PAPER
     least: ClassVar = (3, 0.1)
 
     def __post_init__(self) -> None:
@@ -176,35 +179,37 @@ class DistanceSweep(Suite):
         valid = 0.0 < near < far < 10.0 and 0.0 <= side < 10.0
         check(valid, f"goals must be within 10 m and rise, got {self.distance_range}, {side} to either side")
 
+    @property
+    def flags(self) -> LandingFlags:
+        """Flags of `jumper evaluate` with the same jumps."""
+        side = self.max_lateral_offset
+        return LandingFlags(self.num_jumps, goal_x=self.distance_range, goal_y=(-side, side))
+
     def run_jumps(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> LandingLog:
         """Run one jump per distance under some conditions, return the log; film: name of the recording, or empty."""
-        side, rng = self.max_lateral_offset, np.random.default_rng(self.seed + 1)
-        x, y = np.linspace(*self.distance_range, self.num_jumps), rng.uniform(-side, side, self.num_jumps)
-        goals = np.stack([x, y], axis=1)[:, None]
-        change = with_second_takeoff if self.end_at_second_takeoff else with_landing_terminations
-        return self.run_landings(run, goals, run.env(self.num_jumps, change, conditions), film=film)
+        change = with_second_takeoff if self.end_at_second_takeoff else with_jump_terminations
+        return self.run_flags(run, self.flags, run.env(self.num_jumps, change, conditions), film)
 
-    @staticmethod
-    def metrics(landings: LandingLog) -> Metrics:
-        """Return `landing_metrics` of the sweep, `in_range` over DISTANCES_IN_RANGE, and `success_rate_0_4_1_0`."""
-        distance = landings.goal_positions[..., 0]
-        values = landing_metrics(landings, within(distance, DISTANCES_IN_RANGE))
-        return values | {"success_rate_0_4_1_0": mean(landings.success[within(distance, PAPER_TRAINED)])}
+    def metrics(self, log: LandingLog) -> Metrics:
+        """Return the metrics of `jumper evaluate`, and the success over the distances of the paper's training."""
+        inside, note = within(log.goal_positions[..., 0], PAPER_TRAINED), "over 0.4 to 1 m"
+        success = chosen(PLACE_METRICS, "success_rate")
+        return self.flags.metrics(log) | measure(success, log.outcome, inside, "paper_training_range_", note)
 
-    def measure(self, run: EvaluationRun) -> dict[str, Any]:
+    def measure(self, run: EvaluationRun) -> Metrics:
         """Run the jumps, plot reached over commanded distance, and return the metrics."""
-        landings, trained = self.run_jumps(run, run.conditions, "jumps"), trained_range(run.task)
+        run.settings["end_at_second_takeoff"] = self.end_at_second_takeoff
+        landings, trained = self.run_jumps(run, run.conditions, "jumps"), trained_range(run.task)["trained_range_m"]
         plot_sweep(
             run.folder / "sweep.png", landings.goal_positions[:, 0, 0], landings.landing[:, 0, 0],
-            landings.success[:, 0], tolerance=SUCCESS_TOLERANCE, paper=PAPER_DISTANCES, marks=("on goal", "failed"),
-            trained={"paper: range of training": PAPER_TRAINED, "range of training": tuple(trained.values())},
+            landings.success[:, 0], tolerance=TOLERANCE, paper=PAPER_DISTANCES, marks=("on goal", "failed"),
+            trained={"paper: range of training": PAPER_TRAINED, "range of training": tuple(trained)},
             labels=("commanded distance [m]", "distance of the base at the end [m]"), title="Jumps ahead",
             conditions=f"{run.title}, {self.num_jumps} jumps",
         )  # fmt: skip
-        values = {"rest_s": self.rest_time, "end_at_second_takeoff": self.end_at_second_takeoff}
-        values |= self.metrics(landings)
         pushed = self.pushed_in_flight(
-            run, lambda conditions: self.metrics(self.run_jumps(run, conditions)), "mean_error_m", "success_rate",
-            "success_rate_in_range", "fall_rate", "miss_rate", "still_landing_rate", "max_landing_tilt_deg",
+            run, lambda conditions: self.metrics(self.run_jumps(run, conditions)), "success_rate",
+            "in_range_success_rate", "fall_rate", "miss_rate", "no_paw_lift_rate", "landing_tilt_max_deg",
+            "goal_distance_at_rest_mean_m",
         )  # fmt: skip
-        return values | trained | pushed
+        return self.metrics(landings) | pushed

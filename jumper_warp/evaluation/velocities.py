@@ -8,16 +8,24 @@ from typing import Any
 
 import numpy as np
 import tyro
+from numpy.typing import ArrayLike
 
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.log import EvaluationLog, Metrics, finite
+from jumper_warp.evaluation.jumps import wrapped, yaw_of
+from jumper_warp.evaluation.log import EvaluationLog, finite, outcome_names
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import Metric, Metrics, mean, measure, rate, rmse
 from jumper_warp.utils.rotations import CONJUGATE, rotate
 
 Velocity = tuple[float, float, float]  # Ahead, to the left [m/s], about z [rad/s]
 AXES = ("vx", "vy", "yaw_rate")
-SETTLING_TIME = 1.0  # [s] Time after each command that is excluded from tracking errors
+UNITS = ("m_s", "m_s", "rad_s")  # Units of AXES, as keys of metrics end
+PAPER = {"slewed_rmse_vx_m_s": 0.17, "slewed_rmse_vy_m_s": 0.05, "slewed_rmse_yaw_rate_rad_s": 0.12}
+"""Tracking errors of the paper: one test on the robot, with commands up to 0.8 by a person."""
+SETTLING_TIME = 1.0  # [s] Time after each command that is excluded from the settled tracking errors
+SLEW_RATE = 1.25  # [m/s^2], [rad/s^2] Rate at which the authors' commands change
+STANDING = 64  # Number of robots that are commanded to stand
 MAX_ROBOTS = 20_000  # Maximum number of robots in a test
 
 
@@ -30,6 +38,7 @@ class VelocityLog(EvaluationLog):
     seconds: float = 10.0  # [s] Simulated time
     times: np.ndarray = field(default_factory=lambda: np.zeros(1))  # [s] (commands,) Time of each command, first 0
     headings: np.ndarray | float = 0.0  # [rad] (robots,) Headings at the start, or one for all
+    slew: np.ndarray | float = np.inf  # [m/s^2], [rad/s^2] (robots,) Rate at which commands change, from 0 at the start
     kick_time: np.ndarray | None = None  # [s] (robots,) Time of a step change of each base's velocity, or None
     kick: np.ndarray | None = None  # [m/s] (robots, 2) Step change of the velocity at `kick_time`, world axes, or None
     velocity: list[np.ndarray] = field(default_factory=list, init=False)
@@ -45,6 +54,10 @@ class VelocityLog(EvaluationLog):
         self.end, self.fall_step = np.full(self.count, -1), np.zeros(self.count, dtype=int)
         self.times = np.asarray(self.times, dtype=float)
         self.step_dt = 0.0  # [s] Policy step; `begin` sets it
+        self._slew = np.broadcast_to(np.asarray(self.slew, dtype=float), self.count)
+        # (robots,) horizontal distance from the start [m], and yaw relative to the heading [rad]; until the fall
+        self.distance, self.yaw, self._start = np.zeros(self.count), np.zeros(self.count), np.zeros((self.count, 3))
+        self._command = np.zeros((self.count, 3))  # commands of the next policy step
         falls = [not term.options["time_out"] for term in self.task.terminations]
         self._is_fall = np.array([*falls, False])  # by index of the termination; the last entry is index -1
 
@@ -52,18 +65,31 @@ class VelocityLog(EvaluationLog):
         """Reset every robot to the default pose, with its first command and the gait phase of the task's reset."""
         self.step_dt = env.step_dt
         gait = np.full((len(self.commands), 1), getattr(self.task.reset.settings, "gait", 0.0))
-        env.evaluation_reset(np.concatenate([self.commands[:, 0], gait], axis=1), self.headings)
+        self._command = self._slewed(self._command, self.commands[:, 0])
+        env.evaluation_reset(np.concatenate([self._command, gait], axis=1), self.headings)
+        self._start = env.sim.joint_q()[:, :3].copy()
+
+    def _slewed(self, last: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """Return the commands (robots, 3) one policy step after `last`, on the way to `target`."""
+        limit = (self._slew * self.step_dt)[:, None]
+        return np.where(np.isinf(limit), target, last + np.clip(target - last, -limit, limit))
+
+    def _target(self, steps: ArrayLike) -> np.ndarray:
+        """Return the commands at policy steps (n,), (n, robots, 3), as if they changed at once."""
+        index = np.searchsorted(np.round(self.times / self.step_dt), steps, side="left") - 1
+        return self.commands[:, np.maximum(index, 0)].transpose(1, 0, 2)
 
     def read_env(self, env: Env) -> dict[str, np.ndarray]:
-        """Return base_quat (xyzw), base_vel, base_ang_vel (world) and termination; set due commands and kicks."""
+        """Return base_pos, base_quat (xyzw), base_vel, base_ang_vel (world), termination; set commands and kicks."""
         sim = env.sim
         q, qd = sim.joint_q(), sim.joint_qd()
-        arrays = {"base_quat": q[:, 3:7].copy(), "base_vel": sim.base_velocity(), "base_ang_vel": qd[:, 3:6].copy(),
-                  "termination": env.task_arrays()["termination"]}  # fmt: skip
+        arrays = {"base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_vel": sim.base_velocity(),
+                  "base_ang_vel": qd[:, 3:6].copy(), "termination": env.task_arrays()["termination"]}  # fmt: skip
         step = len(self.velocity) + 1
-        due = np.flatnonzero(np.round(self.times / env.step_dt).astype(int) == step)
-        if len(due) and due[-1] > 0:
-            env.command(self.commands[:, due[-1]])
+        command = self._slewed(self._command, self._target([step + 1])[0])
+        if (changed := (command != self._command).any(axis=1)).any():
+            env.command(command, changed)
+        self._command = command
         if self.kick is not None and self.kick_time is not None:
             kicked = np.round(self.kick_time / env.step_dt).astype(int) == step
             if kicked.any():
@@ -79,7 +105,9 @@ class VelocityLog(EvaluationLog):
         self.velocity.append(body_velocity(arrays).astype(np.float32))
         fell = standing & self._is_fall[arrays["termination"]]
         self.end[fell] = arrays["termination"][fell]
-        self.fall_step[self.end < 0] = len(self.velocity)
+        self.fall_step[up := self.end < 0] = len(self.velocity)
+        self.distance[up] = np.linalg.norm((arrays["base_pos"] - self._start)[up, :2], axis=1)
+        self.yaw[up] = wrapped(yaw_of(arrays["base_quat"]) - self.headings)[up]
         return bool((self.end >= 0).all())
 
     @property
@@ -90,7 +118,7 @@ class VelocityLog(EvaluationLog):
     @property
     def outcomes(self) -> np.ndarray:
         """(robots,) Name of the termination by which each robot fell, `walked` if it did not."""
-        return np.array([*(term.name for term in self.task.terminations), "walked"])[self.end]
+        return outcome_names([term.name for term in self.task.terminations], "walked")[self.end]
 
     def velocity_history(self) -> np.ndarray:
         """Return the velocities after every policy step, (steps, robots, 3), NaN from the fall on."""
@@ -100,20 +128,42 @@ class VelocityLog(EvaluationLog):
 
     def command_history(self) -> np.ndarray:
         """Return the command at every policy step, (steps, robots, 3); it applies from the step after its time."""
-        steps = np.arange(1, len(self.velocity) + 1)
-        index = np.searchsorted(np.round(self.times / self.step_dt), steps, side="left") - 1
-        return self.commands[:, np.maximum(index, 0)].transpose(1, 0, 2)
+        targets = self._target(np.arange(1, len(self.velocity) + 1))
+        if np.isinf(self._slew).all():
+            return targets
+        history = [np.zeros((self.count, 3))]
+        for target in targets:
+            history.append(self._slewed(history[-1], target))
+        return np.array(history[1:])
 
     def columns(self) -> dict[str, list]:
-        """Return lists with one value per robot: first command_<axis>, rms_error_<axis> of `errors`, end (outcome)."""
-        error = rms(self.errors(), axis=0)
+        """Return lists with one value per robot: first command_<axis>, rms_error_<axis> over all time, end."""
+        total, count = np.moveaxis(self.square_errors(settled=False), -1, 0)
+        error = np.sqrt(total / np.where(count > 0, count, np.nan))
         columns = {f"command_{axis}": self.commands[:, 0, i] for i, axis in enumerate(AXES)}
         columns |= {f"rms_error_{axis}": error[:, i] for i, axis in enumerate(AXES)}
         return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
 
-    def errors(self) -> np.ndarray:
-        """Return velocity minus command, (steps, robots, 3); NaN within SETTLING_TIME of a command and after a fall."""
+    @property
+    def trials(self) -> dict[str, np.ndarray]:
+        """Sets of robots by name: masks (robots,)."""
+        stands, slewed = ~self.commands.any(axis=(1, 2)), np.isfinite(self._slew)
+        return {"robots": np.full(self.count, True), "robots with commands at once": ~stands & ~slewed,
+                "robots with slewed commands": ~stands & slewed,
+                "robots that stood to the end": stands & ~self.fallen}  # fmt: skip
+
+    def square_errors(self, *, settled: bool) -> np.ndarray:
+        """Return sums of squared errors and numbers of samples, (robots, 3, 2); settled: as for `errors`."""
+        return square_sums(self.errors(settled=settled))
+
+    def errors(self, *, settled: bool = False) -> np.ndarray:
+        """Return velocity minus command, (steps, robots, 3), NaN after a fall; settled: also near commands' changes.
+
+        Changes are near for SETTLING_TIME.
+        """
         error = self.velocity_history() - self.command_history()
+        if not settled:
+            return error
         steps = np.arange(1, len(error) + 1)
         for time in self.times:
             since = steps - round(time / self.step_dt)
@@ -155,26 +205,30 @@ def velocity_series(velocity: np.ndarray, command: np.ndarray, names: Sequence[s
     return series
 
 
-def rmse_metrics(error: np.ndarray) -> Metrics:
-    """Return the RMS of velocity errors (steps, robots, 3) over steps and robots, without NaN, by component."""
-    names = ("rmse_vx_m_s", "rmse_vy_m_s", "rmse_yaw_rate_rad_s")
-    return dict(zip(names, finite(rms(error, axis=(0, 1))), strict=True))
+def square_sums(error: np.ndarray) -> np.ndarray:
+    """Return sums of squares and numbers of the values that are not NaN, (robots, 3, 2); error: (steps, robots, 3)."""
+    return np.stack([np.nansum(error**2, axis=0), np.isfinite(error).sum(axis=0)], axis=-1)
 
 
-def rms(values: np.ndarray, axis: int | tuple[int, ...] | None = None) -> np.ndarray:
-    """Return the root mean square of the finite values along axes (None: all), NaN where no value is finite."""
-    known = np.isfinite(values)
-    total, count = (np.where(known, values, 0.0) ** 2).sum(axis=axis), known.sum(axis=axis)
-    with np.errstate(invalid="ignore"):
-        return np.sqrt(total / np.where(count > 0, count, np.nan))
+def rmse_rows(prefix: str, over: str, *, settled: bool) -> list[Metric]:
+    """Return rows of a table: `<prefix>rmse_<axis>_<unit>` of `VelocityLog`, over a set of its robots."""
+    keys = [f"{prefix}rmse_{axis}_{unit}" for axis, unit in zip(AXES, UNITS, strict=True)]
+    return [
+        Metric(key, rmse, over, lambda o, i=i: o.square_errors(settled=settled)[:, i]) for i, key in enumerate(keys)
+    ]
 
 
-def tracking_metrics(walks: VelocityLog) -> Metrics:
-    """Return RMS tracking errors (`rmse_metrics` of `errors`), number and rate of falls, and falls by termination."""
-    robots, falls = walks.count, int(walks.fallen.sum())
-    metrics = rmse_metrics(walks.errors()) | {"robots": robots, "falls": falls, "fall_rate": falls / robots}
-    return metrics | {f"fell_by_{name}": int((walks.outcomes == name).sum())
-                      for name in sorted(set(walks.outcomes[walks.fallen]))}  # fmt: skip
+VELOCITY_METRICS = (
+    *rmse_rows("", "robots with commands at once", settled=False),
+    *rmse_rows("settled_", "robots with commands at once", settled=True),
+    *rmse_rows("slewed_", "robots with slewed commands", settled=False),
+    Metric("standing_drift_mean_m", mean, "robots that stood to the end", lambda o: o.distance),
+    Metric("standing_turn_abs_mean_deg", mean, "robots that stood to the end", lambda o: abs(np.degrees(o.yaw))),
+    Metric("fall_rate", rate, "robots", lambda o: o.fallen),
+)
+"""Metrics of walks. Errors are velocity minus command until a fall, over all time; `settled_`: without SETTLING_TIME
+after each command; `slewed_`: of commands that change by SLEW_RATE, as the authors' do. Drift is that of robots
+commanded to stand, over the whole walk."""
 
 
 def command_grid(per_axis: int, reach: Sequence[float]) -> np.ndarray:
@@ -185,26 +239,37 @@ def command_grid(per_axis: int, reach: Sequence[float]) -> np.ndarray:
 
 @dataclass(frozen=True)
 class VelocityFlags:
-    """Constant commands on a grid of all three velocities at once."""
+    """Commands on a grid of all three velocities at once; each robot gets another command of it at intervals.
+
+    Half of the robots get them at once, half slewed at 1.25 m/s^2 and rad/s^2; further ones are commanded to stand.
+    """
 
     commands_per_axis: int = 8
-    """Number of commands along each of the three axes of the grid; one robot for each combination."""
+    """Number of commands along each of the three axes of the grid; two robots for each combination."""
     max_velocity: tuple[float, float, float] = (0.8, 0.8, 0.8)
     """[m/s], [m/s], [rad/s] Largest command ahead, to the left and about z; the grid goes from minus to plus this."""
-    seconds: float = 10.0  # [s] Length of each walk; the first second does not count for the error
+    seconds: float = 9.0  # [s] Length of each walk
+    command_interval: float = 3.0  # [s] Time from one command to the next
 
     def __post_init__(self) -> None:
+        if not 0.1 <= self.command_interval <= 600.0:
+            raise InputError(f"command_interval must be in [0.1, 600] s, got {self.command_interval}")
         check_velocity_settings(self.commands_per_axis**3, self.seconds, *self.max_velocity)
         if self.commands_per_axis < 2:
             raise InputError(f"commands_per_axis must be at least 2, got {self.commands_per_axis}")
 
     def log(self, task: TaskCfg, seed: int) -> VelocityLog:
-        """Return the log of walks, one command of the grid per robot; seed has no effect."""
-        return VelocityLog(command_grid(self.commands_per_axis, self.max_velocity), task, self.seconds)
+        """Return the log of walks; seed: of the order of the commands after the first."""
+        rng, grid = np.random.default_rng(seed), command_grid(self.commands_per_axis, self.max_velocity)
+        times = np.arange(0.0, self.seconds - 1.0e-9, self.command_interval)
+        commands = np.concatenate([grid, *(rng.permutation(grid) for _ in times[1:])], axis=1)
+        slew = np.repeat([np.inf, SLEW_RATE, np.inf], [len(grid), len(grid), STANDING])
+        standing = np.zeros((STANDING, len(times), 3))
+        return VelocityLog(np.concatenate([commands, commands, standing]), task, self.seconds, times=times, slew=slew)
 
     def metrics(self, log: VelocityLog) -> Metrics:
-        """Return `tracking_metrics` of a finished log."""
-        return tracking_metrics(log)
+        """Return the metrics of a finished log."""
+        return measure(VELOCITY_METRICS, log)
 
 
 @dataclass(frozen=True)

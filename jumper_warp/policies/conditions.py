@@ -18,6 +18,7 @@ from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.saving import OPTIONAL
 from jumper_warp.utils.checks import check_seed
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.streams import purpose_seed
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
@@ -33,6 +34,8 @@ class Conditions:
     randomize: bool = False  # Sample masses, friction, motors, latency and pushes as in training
     noise: bool = False  # Add the training's observation noise
     seed: int = 0  # Seed of randomisation and noise, 0 to 2147483647
+    stream: Literal["tuning", "selection", "reporting"] = "reporting"
+    """Purpose of the test: robots, commands and noise differ from those of other purposes, whatever the seeds."""
     device: str | None = None  # Warp device (default: a GPU if there is one)
     threads: int | None = None  # CPU threads that share the worlds (default: all cores); they change no result
     robot: Path | None = None
@@ -44,6 +47,8 @@ class Conditions:
     """[1] Scales of kp and kd of all motors (default: 1, or sampled if randomised)."""
     friction: float | None = None
     """[1] Friction of the paws, static and dynamic (default: nominal, or sampled if randomised)."""
+    sensor_offset: float | None = None
+    """[deg] Largest constant error of the motors' position sensors (default: none, or sampled if randomised)."""
     gravity: float | None = None  # [m/s^2] Gravity, downward (default: the task's)
 
     def __post_init__(self) -> None:
@@ -59,9 +64,15 @@ class Conditions:
             raise InputError("push_in_flight needs randomize: without it there are no pushes")
 
     @property
+    def stream_seed(self) -> int:
+        """Seed of goals, headings and commands that are sampled on the host, `purpose_seed`."""
+        return purpose_seed(self.stream, self.seed)
+
+    @property
     def fixed_parameters(self) -> dict[str, Any]:
-        """Values of the parameters latency, gains and friction that are not None here, by name in RandomizationCfg."""
-        values = {"latency": self.latency, "gains": self.gain_scale, "friction": self.friction}
+        """Arguments of `RandomizationCfg.with_fixed` that are not None here, by name."""
+        values = {"latency": self.latency, "gains": self.gain_scale, "friction": self.friction,
+                  "sensor_offset": self.sensor_offset}  # fmt: skip
         return {name: value for name, value in values.items() if value is not None}
 
     def overlay(self, config: dict[str, Any]) -> RobotOverlay | None:
@@ -76,7 +87,7 @@ class Conditions:
 
     def env_settings(self, config: dict[str, Any]) -> dict[str, Any]:
         """Return keyword arguments of `Env` for these conditions. Argument and errors as for `overlay`."""
-        same = {name: getattr(self, name) for name in ("seed", "device", "solver", "noise", "threads")}
+        same = {name: getattr(self, name) for name in ("seed", "stream", "device", "solver", "noise", "threads")}
         return {**same, "randomize": self.sets_parameters, "auto_reset": False, "robot": self.overlay(config)}
 
     @property

@@ -143,16 +143,20 @@ class RandomizationCfg:
         return replace(self, resample_at="reset", **timing)
 
     def with_fixed(
-        self, *, latency: float | None = None, gains: tuple[float, float] | None = None, friction: float | None = None
-    ) -> RandomizationCfg:
+        self, *, latency: float | None = None, gains: tuple[float, float] | None = None, friction: float | None = None,
+        sensor_offset: float | None = None,
+    ) -> RandomizationCfg:  # fmt: skip
         """Return the ranges with fixed values: latency [ms], gains: scales of (kp, kd) [1], friction of the paws [1].
 
+        sensor_offset [deg]: largest error of a position sensor, sampled uniformly from minus to plus this per motor.
         Raises InputError: a value out of range.
         """
         kp, kd = gains or (None, None)
         fixed = {"latency": latency, "gains": kp, "damping_gains": kd, "dynamic_friction": friction,
                  "static_friction": friction}  # fmt: skip
-        return replace(self, **{name: (value, value) for name, value in fixed.items() if value is not None})
+        ranges = {name: (value, value) for name, value in fixed.items() if value is not None}
+        ranges |= {} if sensor_offset is None else {"joint_offset": (-sensor_offset, sensor_offset)}
+        return replace(self, **ranges)
 
     def events(self) -> tuple[EventTerm, ...]:
         """Return one event for each range, or pair of ranges, that is not None; numbers in SI units."""

@@ -1,5 +1,6 @@
-"""Output folders and metrics files of experiments."""
+"""Output folders, and the file `metrics.json` (layout: docs/metrics.schema.json)."""
 
+import json
 import math
 import sys
 from collections.abc import Mapping
@@ -11,9 +12,10 @@ import numpy as np
 
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import json_bytes, write_atomically
+from jumper_warp.utils.metrics import AnyMetrics, MetricValue, Scalar, unit_of
 from jumper_warp.utils.runtime import device_info, source_versions
 
-Scalar = float | int | str | bool | None  # type of a metric
+VERSION = 1  # Version of the layout of metrics.json
 
 
 def output_dir(name: str, out: Path | None = None) -> Path:
@@ -37,19 +39,45 @@ def output_dir(name: str, out: Path | None = None) -> Path:
     return folder
 
 
-def write_metrics(folder: Path, metrics: Mapping[str, Scalar | list[Scalar]]) -> Path:
+def write_metrics(folder: Path, metrics: AnyMetrics, conditions: Mapping[str, Any] | None = None) -> Path:
     """Write `metrics.json` and `run.json` (commit, dirty, versions, device, command); return the path of metrics.json.
 
-    Each file is written atomically. Environment variables are not saved.
-    folder: an existing folder. metrics: flat, with the unit in the name, as in `apex [m]`; NumPy scalars become Python
-    numbers. Raises InputError: a metric is not finite. TypeError: a value has another type. Both name the metric.
+    Each file is written atomically. Environment variables are not saved. NumPy scalars become Python numbers.
+    folder: an existing folder; conditions: of the evaluation, by name. Raises InputError: a value is not finite.
+    TypeError: a value has another type. Both name the metric.
     """
-    python_metrics = {key: _to_python(key, value) for key, value in metrics.items()}
+    entries = {key: _entry(key, value) for key, value in metrics.items()}
+    document = {
+        "schema": "jumper-warp metrics",
+        "version": VERSION,
+        "conditions": {name: _to_python(name, value) for name, value in (conditions or {}).items()},
+        "metrics": entries,
+    }
     command = [Path(sys.argv[0]).name, *sys.argv[1:]]
     run = source_versions() | {"device": device_info()._asdict(), "command": command}
-    for name, content in (("run.json", run), ("metrics.json", python_metrics)):
+    for name, content in (("run.json", run), ("metrics.json", document)):
         write_atomically(folder / name, json_bytes(content))
     return folder / "metrics.json"
+
+
+def read_metrics(folder: Path) -> dict[str, MetricValue]:
+    """Return the metrics of a file `metrics.json` that `write_metrics` wrote, by key."""
+    entries = json.loads((folder / "metrics.json").read_text())["metrics"]
+    return {key: MetricValue(*(entry[name] for name in MetricValue._fields)) for key, entry in entries.items()}
+
+
+def read_values(folder: Path) -> dict[str, Any]:
+    """Return the conditions of a file `metrics.json` and the values of its metrics, by name."""
+    conditions = json.loads((folder / "metrics.json").read_text())["conditions"]
+    return conditions | {key: metric.value for key, metric in read_metrics(folder).items()}
+
+
+def _entry(key: str, value: Any) -> dict[str, Any]:
+    """Return the object that metrics.json has for a metric. Raises TypeError or InputError as `write_metrics`."""
+    metric = value if isinstance(value, MetricValue) else MetricValue(value)
+    number = _to_python(key, metric.value)
+    interval = None if metric.interval is None else _to_python(key, list(metric.interval))
+    return {"value": number, "unit": unit_of(key), "trials": metric.trials, "interval": interval, "over": metric.over}
 
 
 def _to_python(name: str, value: Any) -> Scalar | list[Scalar]:

@@ -85,12 +85,15 @@ class Renderer(ABC):
     def __init__(
         self, shapes: Sequence[ShapeMesh], num_bodies: int, size: tuple[int, int], opacity: Sequence[float] = (1.0,)
     ) -> None:
-        """Prepare copies of the bodies; shapes that are fixed to the world exist once.
-
-        num_bodies: indices in `ShapeMesh.body` are below it. size: width and height of the images [px]. opacity: of
-        each copy, 0 to 1.
-        """
+        """Prepare images of a size, width and height [px]; the others: as in `load`."""
         self.size = size
+        self.load(shapes, num_bodies, opacity)
+
+    def load(self, shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float] = (1.0,)) -> None:
+        """Draw copies of these bodies from now on; shapes that are fixed to the world exist once.
+
+        num_bodies: indices in `ShapeMesh.body` are below it. opacity: of each copy, 0 to 1.
+        """
         self.model = _scene_model(shapes, num_bodies, opacity)
         self.state: State = self.model.state()
 
@@ -127,9 +130,8 @@ class GLRenderer(Renderer):
         self, shapes: Sequence[ShapeMesh], num_bodies: int, size: tuple[int, int], opacity: Sequence[float] = (1.0,)
     ) -> None:
         """As `Renderer`. Raises ImportError: pyglet is missing; RuntimeError: OpenGL is missing or too old."""
-        super().__init__(shapes, num_bodies, size, opacity)
         self._viewer = viewer = _gl_viewer(size)
-        viewer.set_model(self.model)
+        super().__init__(shapes, num_bodies, size, opacity)
         viewer.show_joints = viewer.show_com = False
         renderer = viewer.renderer
         renderer.spotlight_enabled, renderer.sky_upper, renderer.sky_lower = False, SKY, HORIZON
@@ -137,8 +139,15 @@ class GLRenderer(Renderer):
         renderer.shadow_extents = SHADOW_EXTENT
         renderer.line_width, renderer.arrow_scale = LINE_WIDTH * size[0], 0.6 * LINE_WIDTH * size[0]
 
+    def load(self, shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float] = (1.0,)) -> None:
+        """As `Renderer.load`."""
+        super().load(shapes, num_bodies, opacity)
+        self._viewer.renderer._make_current()
+        self._viewer.set_model(self.model)
+
     def _image(self, view: View, lines: Sequence[Line]) -> np.ndarray:
         viewer, camera = self._viewer, self._viewer.camera
+        viewer.renderer._make_current()  # another window may have drawn since
         camera.fov = view.field_of_view
         camera.pos = camera._as_vec3(view.eye)
         camera.look_at(view.target)
@@ -164,6 +173,12 @@ class RayTracer(Renderer):
     ) -> None:
         """As `Renderer`."""
         super().__init__(shapes, num_bodies, size, opacity)
+        self._rays: Any = None
+        self._field_of_view = 0.0  # [deg] of `_rays`
+
+    def load(self, shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float] = (1.0,)) -> None:
+        """As `Renderer.load`."""
+        super().load(shapes, num_bodies, opacity)
         self._sensor = SensorCamera(self.model)
         rays: Any = wp.vec3(*(-np.array(SUN) / np.linalg.norm(SUN)))
         self._sensor.create_default_light(direction=rays)
@@ -173,9 +188,7 @@ class RayTracer(Renderer):
         self._sensor.default_clear_data = clear
         self._sensor.default_render_config.enable_shadows = True
         self._sensor.default_render_config.anti_aliasing = SensorCamera.AntiAliasing.SSAA
-        self._pixels: Any = self._sensor.allocate_image_color(1, *size)
-        self._rays: Any = None
-        self._field_of_view = 0.0  # [deg] of `_rays`
+        self._pixels: Any = self._sensor.allocate_image_color(1, *self.size)
 
     def _image(self, view: View, lines: Sequence[Line]) -> np.ndarray:
         if view.field_of_view != self._field_of_view:

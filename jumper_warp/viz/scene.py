@@ -20,7 +20,7 @@ ABOVE = 0.25  # [m] free space above the base
 DEAD_ZONE = np.array([0.25, 0.25, 0.20])  # [m] how far a robot moves from the target before the camera follows
 SMOOTHING = 0.25  # [s] standard deviation of the filter of the camera's motion
 ARROW_SECONDS = 0.6  # [s] length of an arrow over the velocity that it shows
-SLOWEST = 0.02  # [m/s] below which no arrow is drawn
+SLOWEST = 0.05  # [m/s] below which no arrow is drawn
 VELOCITY_WINDOW = 0.2  # [s] over which the actual velocity is averaged
 FAR = 100.0  # [m] from the start, beyond which the simulation of a robot has diverged
 MARGIN = 0.94  # fraction of the image that robots may fill
@@ -128,7 +128,7 @@ def velocity_arrows(recording: Recording, frame: int, rank: int, start: np.ndarr
 
     The actual velocity is the mean over VELOCITY_WINDOW.
     """
-    if not len(recording.commands):
+    if not len(recording.commands) or not np.isfinite(recording.commands[frame, rank]).all():
         return []
     poses = recording.poses[:, recording.body_indices(rank)[0]].astype(float)
     x, y, z, w = poses[frame, 3:]
@@ -142,7 +142,7 @@ def velocity_arrows(recording: Recording, frame: int, rank: int, start: np.ndarr
     return [
         Line(np.stack([start, start + ARROW_SECONDS * velocity]) + [0.0, 0.0, above], color, arrow=True)
         for velocity, color, above in arrows
-        if np.linalg.norm(np.nan_to_num(velocity)) > SLOWEST
+        if np.linalg.norm(velocity) > SLOWEST
     ]
 
 

@@ -33,9 +33,10 @@ class NoSettings:
 class EpisodeArrays:
     """Episode state of all worlds, arrays of shape (num_worlds,)."""
 
-    seed: int  # of all random streams
+    seed: int  # of all random streams, as is `purpose`
+    purpose: int  # index in `jumper_warp.utils.streams.PURPOSES`
     first: int  # world of the first thread of a launch
-    step_count: wp.array(dtype=int)  # policy steps made; with the seed, the whole state of the random streams
+    step_count: wp.array(dtype=int)  # policy steps made; with seed and purpose, the whole state of the random streams
     skill: wp.array(dtype=int)  # index of a world's active task
     requested_task: wp.array(dtype=int)  # index of the requested task (`Env.request`), -1: none
     pending_command: wp.array(dtype=wp.vec4)  # command of the requested skill, set when it takes over

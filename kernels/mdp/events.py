@@ -50,7 +50,8 @@ def make_event_kernel(slots: list) -> wp.Kernel:
             return
         for i in range(wp.static(len(slots))):
             if row == i and (wp.static(bool(slots[i].parallel)) or lane == 0):
-                rng = make_stream(episode.seed, world, episode.step_count[world], EVENT + 100 * stage + i)
+                stream = EVENT + 100 * stage + i
+                rng = make_stream(episode.seed, episode.purpose, world, episode.step_count[world], stream)
                 if wp.static(bool(slots[i].parallel)):
                     rng.lane = lane
                     rng.lanes = lanes

@@ -146,6 +146,7 @@ class StepContext:
 
     world: int
     step_key: wp.uint32  # see `mdp.random`
+    purpose: int  # as in `EpisodeArrays`
     history_reset: int  # as in `EpisodeArrays`
     diverged: bool
     slot: int  # ring buffer slot of this policy step
@@ -162,6 +163,7 @@ def step_context(episode: EpisodeArrays, arrays: ObservationArrays, world: int) 
     m = StepContext()
     m.world = world
     m.step_key = step_key(episode.seed, world, step_count)
+    m.purpose = episode.purpose
     m.history_reset = episode.history_reset[world]
     m.diverged = episode.diverged[world] != 0
     m.slot = step_count % RING
@@ -200,7 +202,8 @@ def postprocess(
         value = delay_value(arrays, m, column.past, value)
     noise = p[column.noise]
     if noise > 0.0:
-        value += noise * clamped_normal(stream_at(m.step_key, m.world, OBSERVATION + column.group), column.oldest)
+        rng = stream_at(m.step_key, m.purpose, m.world, OBSERVATION + column.group)
+        value += noise * clamped_normal(rng, column.oldest)
     value = finite_or_zero(p[column.scale] * wp.clamp(value, -p[column.clip], p[column.clip]), m.diverged)
     i = column.start + m.world * column.stride + column.oldest
     keep_frames = after_reset != 0 and m.history_reset == COMMANDED

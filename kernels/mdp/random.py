@@ -1,4 +1,10 @@
-"""Counter-based random streams: a number depends on seed, world, step count, stream and index, on nothing else."""
+"""Counter-based random streams: a number depends on seed, purpose, world, step count, stream and index only.
+
+The index of a number is hashed into the 32 bits of its stream: state = pcg(stream + pcg(index)). Purposes (training,
+tuning, selection, reporting) have disjoint ranges of indices. Two streams s and t of different purposes have the same
+state for number i only if s - t = pcg(index of i for t) - pcg(index of i for s), modulo 2^32. These differences differ
+for all i below 20,000, so the streams share at most one number, whatever their seeds, worlds and step counts are.
+"""
 
 import warp as wp
 
@@ -9,16 +15,18 @@ OBSERVATION = wp.constant(100)  # plus the index of the observation group
 EVENT = wp.constant(1000)  # plus 100 times the stage (`mdp.events`) and the index of the event
 
 # indices in a stream; tasks and events use those from 0 on
+INDICES = wp.constant(1 << 28)  # size of the range of indices of each purpose
 INTERVAL = wp.constant(-1)  # time until an interval event is due next
 ANY_LEVEL = wp.constant(-2)  # curriculum level of a world that passed the last one
 
 
 @wp.struct
 class RngStream:
-    """A random stream of one world; `uniform(rng, i, ...)` depends on `seed` and index i only."""
+    """A random stream of one world; `uniform(rng, i, ...)` depends on `seed`, `start` and index i only."""
 
     world: int  # index of the world whose quantities are sampled
     seed: wp.uint32
+    start: int  # start of the range of indices of its purpose
     lane: int  # index of this thread among those that share the work of a world
     lanes: int  # number of these threads
 
@@ -30,19 +38,23 @@ def step_key(seed: int, world: int, step_count: int) -> wp.uint32:
 
 
 @wp.func
-def stream_at(key: wp.uint32, world: int, stream: int) -> RngStream:
-    """Return stream number `stream` of a world in the policy step of `key` (`step_key`), for one thread."""
+def stream_at(key: wp.uint32, purpose: int, world: int, stream: int) -> RngStream:
+    """Return stream number `stream` of a world in the policy step of `key` (`step_key`), for one thread.
+
+    purpose: index in `jumper_warp.utils.streams.PURPOSES`.
+    """
     rng = RngStream()
     rng.world = world
     rng.lanes = 1
     rng.seed = wp.rand_init(int(key), stream)
+    rng.start = purpose * INDICES
     return rng
 
 
 @wp.func
-def make_stream(seed: int, world: int, step_count: int, stream: int) -> RngStream:
+def make_stream(seed: int, purpose: int, world: int, step_count: int, stream: int) -> RngStream:
     """Return stream number `stream` of a world, for one thread; step_count: policy steps that the world has made."""
-    return stream_at(step_key(seed, world, step_count), world, stream)
+    return stream_at(step_key(seed, world, step_count), purpose, world, stream)
 
 
 @wp.func
@@ -56,7 +68,7 @@ def fold_in(rng: RngStream, i: int) -> RngStream:
 @wp.func
 def uniform(rng: RngStream, i: int, lower: float, upper: float) -> float:
     """Return the i-th number of a stream, uniform in [lower, upper)."""
-    return lower + (upper - lower) * wp.randf(wp.rand_init(int(rng.seed), i))
+    return lower + (upper - lower) * wp.randf(wp.rand_init(int(rng.seed), rng.start + i))
 
 
 @wp.func
@@ -68,4 +80,4 @@ def uniform_range(rng: RngStream, i: int, pair: wp.vec2) -> float:
 @wp.func
 def clamped_normal(rng: RngStream, i: int) -> float:
     """Return the i-th number of a stream, standard normal, clamped to [-1, 1]."""
-    return wp.clamp(wp.randn(wp.rand_init(int(rng.seed), i)), -1.0, 1.0)
+    return wp.clamp(wp.randn(wp.rand_init(int(rng.seed), rng.start + i)), -1.0, 1.0)

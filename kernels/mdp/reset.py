@@ -63,7 +63,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
             commanded = wp.static(due)(states[world])
         if not (begins or commanded):
             return
-        rng = make_stream(episode.seed, world, episode.step_count[world], RESET)
+        rng = make_stream(episode.seed, episode.purpose, world, episode.step_count[world], RESET)
         rng.lane = lane
         rng.lanes = lanes
         level = episode.level[world]
@@ -80,7 +80,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         elif wp.static(command is not None):
             if lane == 0:
                 robot = load_view(arrays, scene.ground, world)
-                fresh = make_stream(episode.seed, world, episode.step_count[world], COMMAND)
+                fresh = make_stream(episode.seed, episode.purpose, world, episode.step_count[world], COMMAND)
                 states[world] = wp.static(command)(robot, scene, states[world], levels[level], fresh)
                 episode.history_reset[world] = COMMANDED
 

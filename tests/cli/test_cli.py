@@ -29,6 +29,7 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.checkpoint import CheckpointError
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.output import read_values
 from landing_helpers import still_policy
 
 TRAIN = ["train", "vertical-jump", "--num-envs", "16", "--max-iterations", "2", "--no-tensorboard", "--device", "cpu"]
@@ -370,14 +371,24 @@ def test_exported_policy_equals_the_policy_of_the_run(trained_run):
 
 
 def test_evaluate_writes_metrics_and_saves_them_to_the_policy(trained_run, tmp_path, capsys):
-    args = ["--num-jumps", "3", "--noise", "--device", "cpu", "--out", str(tmp_path), "--save-to-policy"]
+    args = [
+        "--num-jumps",
+        "3",
+        "--noise",
+        "--device",
+        "cpu",
+        "--out",
+        str(tmp_path),
+        "--save-to-policy",
+        "--save-trials",
+    ]
     code, out, _ = run(capsys, "evaluate", str(trained_run / "policy"), *args)
-    metrics = json.loads((tmp_path / "metrics.json").read_text())
-    assert code == 0 and "success_rate_in_range" in out
-    assert (metrics["jumps"], metrics["noise"], metrics["success_rate"]) == (3, True, 0.0)
-    rows = (tmp_path / "jumps.csv").read_text().splitlines()
-    assert [row.split(",")[0] for row in rows] == ["target_m", "0.500000", "0.850000", "1.200000"]
-    assert json.loads((trained_run / "policy" / "metrics.json").read_text()) == metrics
+    metrics = read_values(tmp_path)
+    assert code == 0 and "in_range_success_rate" in out
+    assert (metrics["noise"], metrics["stream"], metrics["success_rate"]) == (True, "reporting", 0.0)
+    trials = np.load(tmp_path / "trials.npz")
+    assert trials["goal_height_m"].tolist() == [0.5, 0.85, 1.2] and trials["success"].tolist() == [False] * 3
+    assert read_values(trained_run / "policy") == metrics
     assert load_policy(trained_run / "policy")
 
 
@@ -392,15 +403,16 @@ def test_play_records_each_step_of_each_robot(trained_run, tmp_path, capsys):
 
 
 def test_evaluate_horizontal_jumps(still, tmp_path, capsys):
-    args = ["--num-jumps", "3", "--goal-x", "0.4", "0.8", "--heading", "90", "--device", "cpu", "--out", str(tmp_path)]
+    args = ["--num-jumps", "3", "--goal-x", "0.4", "0.8", "--heading", "90", "--device", "cpu", "--save-trials",
+            "--out", str(tmp_path)]  # fmt: skip
     code, out, _ = run(capsys, "evaluate", still, *args)
-    metrics = json.loads((tmp_path / "metrics.json").read_text())
-    assert code == 0 and "success_rate_in_range" in out
-    assert (metrics["jumps"], metrics["task"], metrics["failed_by_no_jump"]) == (3, "horizontal-jump", 3)
-    assert metrics["mean_error_m"] == pytest.approx(0.6, abs=0.02)  # the mean goal: the robot stays at its start
-    rows = [row.split(",") for row in (tmp_path / "jumps.csv").read_text().splitlines()]
-    assert [row[0] for row in rows] == ["goal_x_m", "0.400000", "0.600000", "0.800000"]
-    assert [float(row[2]) for row in rows[1:]] == pytest.approx([90.0] * 3, abs=1e-4)
+    metrics = read_values(tmp_path)
+    assert code == 0 and "in_range_success_rate" in out
+    assert (metrics["task"], metrics["no_jump_rate"]) == ("horizontal-jump", 1.0)
+    assert metrics["goal_distance_at_end_mean_m"] == pytest.approx(0.6, abs=0.02)  # mean goal: it stays in place
+    trials = np.load(tmp_path / "trials.npz")
+    assert trials["goal_x_m"] == pytest.approx([0.4, 0.6, 0.8])
+    assert trials["heading_deg"] == pytest.approx([90.0] * 3, abs=1e-4)
 
 
 def test_play_horizontal_jumps_records_distances_and_goal_markers(still, tmp_path, capsys):
@@ -456,8 +468,8 @@ def test_play_script_writes_recording_plot_and_metrics(tmp_path, capsys):
     script = tmp_path / "script.json"
     script.write_text('[{"walk": [0.5, 0, 0.3], "seconds": 0.2}, {"stand": 0.1}]')
     code, out, _ = run(capsys, "play", "--script", str(script), "--device", "cpu", "--out", str(tmp_path / "out"))
-    assert code == 0 and "success_rate" in out
-    assert json.loads((tmp_path / "out" / "metrics.json").read_text())["outcome"] == "done"
+    assert code == 0 and "finished_rate" in out
+    assert read_values(tmp_path / "out")["outcome"] == "done"
     assert (tmp_path / "out" / "course.rrd").stat().st_size > 10_000 and (tmp_path / "out" / "timeline.png").is_file()
 
 
@@ -505,6 +517,12 @@ def test_export_refuses_truncated_checkpoint(trained_run, tmp_path, capsys):
 def test_refuses_to_save_metrics_to_a_training_run(trained_run, capsys):
     code, _, err = run(capsys, "evaluate", str(trained_run), "--save-to-policy", "--device", "cpu")
     assert code == 2 and "export it first" in err[-1]
+
+
+def test_refuses_to_save_metrics_of_another_stream_than_reporting(trained_run, capsys):
+    args = [str(trained_run / "policy"), "--save-to-policy", "--stream", "selection", "--device", "cpu"]
+    code, _, err = run(capsys, "evaluate", *args)
+    assert code == 2 and err[-1].endswith("save_to_policy is for the stream reporting, got selection")
 
 
 def test_viewer_binds_to_loopback(tmp_path):

@@ -7,8 +7,9 @@ import pytest
 import torch
 
 from jump_helpers import edit_coordinates, edit_episodes, ending_names, make_env
-from jumper_warp.evaluation import heights, landings
-from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, latency_metrics, latency_text
+from jumper_warp.evaluation import landings
+from jumper_warp.evaluation.jumps import with_jump_terminations
+from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun, latency_text, latency_values
 from jumper_warp.kernels.jump.state import LANDED
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.folder import save_policy
@@ -34,10 +35,9 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 @pytest.mark.parametrize(
     ("name", "change"),
     [
-        ("horizontal-jump", landings.with_landing_terminations),
+        ("horizontal-jump", with_jump_terminations),
         ("horizontal-jump", landings.with_second_takeoff),
-        ("vertical-jump", heights.with_success_last),
-        ("vertical-jump", heights.with_sweep_terminations),
+        ("vertical-jump", with_jump_terminations),
     ],
 )
 def test_fall_takes_precedence_over_success(name, change):  # world 1 is too low
@@ -51,7 +51,7 @@ def test_fall_takes_precedence_over_success(name, change):  # world 1 is too low
 
 def test_only_with_second_takeoff_ends_landed_jump_above_limit_speed():
     names = {}
-    for change in (landings.with_landing_terminations, landings.with_second_takeoff):
+    for change in (with_jump_terminations, landings.with_second_takeoff):
         env = make_env(2, task=change(JUMP), auto_reset=False)
         env.evaluation_reset(np.zeros((2, 4)))
         edit_episodes(env, phase=LANDED, phase_steps=5)
@@ -59,7 +59,7 @@ def test_only_with_second_takeoff_ends_landed_jump_above_limit_speed():
             edit_coordinates(env, world, q={2: 1.0}, qd={2: up + 9.81 / 60.0})
         env.step(torch.zeros((2, 12)))
         names[change.__name__] = ending_names(env)
-    assert names == {"with_landing_terminations": ["", ""], "with_second_takeoff": ["second_takeoff", ""]}
+    assert names == {"with_jump_terminations": ["", ""], "with_second_takeoff": ["second_takeoff", ""]}
 
 
 # ---------------------------------------------------------------- pushes
@@ -82,7 +82,7 @@ def test_evaluation_replaces_constant_wrench_by_intermittent_pushes_and_keeps_tr
 def test_flying_robot_is_pushed_only_with_push_in_flight(in_flight):
     conditions = Conditions(randomize=True, push_in_flight=in_flight)
     task = conditions.applied(dataclasses.replace(HELD, randomization=RandomizationCfg(push_probability=1.0)))
-    env = make_env(2, task=landings.with_landing_terminations(task), randomize=True, auto_reset=False)
+    env = make_env(2, task=with_jump_terminations(task), randomize=True, auto_reset=False)
     env.evaluation_reset(np.zeros((2, 4)))
     edit_coordinates(env, 1, q={2: 1.0})  # [m] world 1 flies
     for _ in range(2):  # before the first step no paw has been in contact
@@ -109,7 +109,7 @@ def test_nominal_conditions_change_only_margins():
 
 def test_conditions_change_only_the_fixed_parameters():
     conditions = Conditions(latency=8.0, gain_scale=(0.6, 1.0), friction=0.4)
-    task = landings.with_landing_terminations(JUMP)
+    task = with_jump_terminations(JUMP)
     nominal = make_env(2, task=task, auto_reset=False)
     env = make_env(2, task=conditions.applied(task), randomize=conditions.sets_parameters, auto_reset=False)
     assert env.parameters.latency.numpy().tolist() == [4, 4]  # 8 ms are 3.84 physics steps
@@ -123,8 +123,18 @@ def test_conditions_change_only_the_fixed_parameters():
     assert not env.parameters.push.numpy().any()
 
 
+def test_sensor_offset_is_drawn_for_every_robot_and_motor_within_its_size():
+    conditions = Conditions(sensor_offset=4.0)
+    env = make_env(16, task=conditions.applied(JUMP), randomize=conditions.sets_parameters, auto_reset=False)
+    offset = np.degrees(env.sim.motors.offset.numpy())
+    assert len(np.unique(offset)) == offset.size == 16 * 12
+    assert 3.5 < np.abs(offset).max() <= 4.0 and abs(offset.mean()) < 1.0
+    drawn = Conditions(randomize=True, sensor_offset=4.0).applied(JUMP).randomization
+    assert (drawn.joint_offset, drawn.gains) == ((-4.0, 4.0), RandomizationCfg().gains)
+
+
 def test_fixing_a_parameter_at_its_nominal_value_is_bitwise_neutral():
-    conditions, task = Conditions(latency=0.0), landings.with_landing_terminations(JUMP)
+    conditions, task = Conditions(latency=0.0), with_jump_terminations(JUMP)
     pair = [make_env(2, task=task), make_env(2, task=conditions.applied(task), randomize=conditions.sets_parameters)]
     for env in pair:
         env.auto_reset = False
@@ -155,6 +165,7 @@ def test_randomised_conditions_keep_fixed_parameters():
         (lambda: Conditions(gain_scale=(0.0, 1.0)), "gains must be above 0"),
         (lambda: EvaluationArgs(gain_scale=(1.0, -1.0)), "damping_gains must be above 0"),
         (lambda: Conditions(friction=-0.1), "friction must not be negative"),
+        (lambda: Conditions(sensor_offset=-1.0), r"joint_offset must rise, got \(1\.0, -1\.0\)"),
         (lambda: EvaluationArgs(push_in_flight=True), "push_in_flight needs randomize"),
     ],
 )
@@ -167,8 +178,8 @@ def test_latency_text_rounds_to_physics_steps():
     assert latency_text(np.array([4, 4]), DT) == "8.33 ms (4 physics steps)"
     assert latency_text(np.array([1]), DT) == "2.08 ms (1 physics step)"
     assert latency_text(np.array([0, 8, 4]), DT) == "0 to 16.7 ms (0 to 8 physics steps), mean 8.33 ms"
-    assert latency_metrics(np.array([3, 3]), DT) == {"latency_ms": 6.25, "latency": "6.25 ms (3 physics steps)"}
-    assert latency_metrics(np.array([4]), DT, 8.0)["latency_asked_ms"] == 8.0
+    assert latency_values(np.array([3, 3]), DT) == {"latency_ms": 6.25, "latency": "6.25 ms (3 physics steps)"}
+    assert latency_values(np.array([4]), DT, 8.0)["latency_requested_ms"] == 8.0
 
 
 def test_run_reports_simulated_latency_in_metrics_and_title(tmp_path):
@@ -179,6 +190,6 @@ def test_run_reports_simulated_latency_in_metrics_and_title(tmp_path):
     log = landings.LandingLog(np.array([[[0.5, 0.0]]] * 2), tuple(term.name for term in env.task.terminations))
     run.run_episodes(env, log)
     values = run.report({}, {})
-    assert (values["latency_asked_ms"], values["latency"]) == (40.0, "39.6 ms (19 physics steps)")
+    assert (values["latency_requested_ms"], values["latency"]) == (40.0, "39.6 ms (19 physics steps)")
     assert values["latency_ms"] == pytest.approx(1000.0 * 19 / 480)
     assert run.title == "SolverJumper, nominal, latency 39.6 ms (19 physics steps)"

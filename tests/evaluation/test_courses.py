@@ -5,13 +5,14 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation.courses import JUMP_TIMEOUT, MAX_ACCELERATION, CourseLog, active_spans, course_metrics
+from jumper_warp.evaluation.courses import JUMP_TIMEOUT, SLEW_RATE, CourseLog, active_spans, course_metrics
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.utils.errors import InputError
+from metric_helpers import values
 
 DT = 1.0 / 60.0  # [s] Policy step
-SLEW_STEP = MAX_ACCELERATION * DT  # Largest change of a commanded velocity in a policy step
+SLEW_STEP = SLEW_RATE * DT  # Largest change of a commanded velocity in a policy step
 SCRIPT = (  # 120 policy steps of walking, a jump, 90 of walking
     ScriptStep("walk", (0.5, 0.1, -0.2), 2.0),
     ScriptStep("jump_up", (0.75,)),
@@ -100,22 +101,27 @@ def test_jump_is_requested_at_its_command_and_walking_resumes():
 
 def test_course_metrics_match_hand_computed_values():
     course, _ = run_course(error=(0.1, -0.2, 0.05))
-    metrics = course_metrics(course)
-    assert metrics["rmse_vx_m_s"] == pytest.approx(0.1) and metrics["rmse_vy_m_s"] == pytest.approx(0.2)
-    assert metrics["rmse_yaw_rate_rad_s"] == pytest.approx(0.05, rel=1e-5)
+    metrics = values(course_metrics(course))
+    rmse = [metrics[f"settled_slewed_rmse_{name}"] for name in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")]
+    assert rmse == pytest.approx([0.1, 0.2, 0.05], rel=1e-5)
     assert sum(np.array(course.is_tracked)[:, 0]) == 60 + 30  # the first second of each command does not count
-    assert metrics["apex_error_m"] == pytest.approx(0.03) and metrics["landing_error_m"] is None
-    assert metrics["command_to_takeoff_s"] == pytest.approx(75 * DT)
-    assert metrics["command_to_jump_skill_s"] == pytest.approx(50 * DT)
-    assert (metrics["success_rate"], metrics["on_goal_rate"], metrics["jumps_made"], metrics["robots"]) == (1, 1, 2, 2)
-    assert metrics["handover_force_ripple_n"] == pytest.approx(1.0) == metrics["handover_force_step_n"]
+    assert metrics["apex_error_abs_mean_m"] == pytest.approx(0.03)
+    assert metrics["goal_distance_at_handover_mean_m"] is None
+    assert metrics["command_to_takeoff_mean_s"] == pytest.approx(75 * DT)
+    assert metrics["command_to_jump_skill_mean_s"] == pytest.approx(50 * DT)
+    assert (metrics["finished_rate"], metrics["finished_on_goal_rate"], metrics["jump_made_rate"]) == (1, 1, 1)
+    assert metrics["handover_force_ripple_mean_n"] == pytest.approx(1.0) == metrics["handover_force_step_mean_n"]
 
 
 def test_landing_error_is_distance_from_goal_and_beyond_tolerance_off_goal():
     course, _ = run_course((ScriptStep("jump_to", (0.8, 0.0)), ScriptStep("stand", seconds=0.2)), n=1)
-    assert course_metrics(course)["landing_error_m"] == pytest.approx(0.05) and course.switch_step[0, 0] > 0
+    assert (
+        values(course_metrics(course))["goal_distance_at_handover_mean_m"] == pytest.approx(0.05)
+        and course.switch_step[0, 0] > 0
+    )
     course.offset[0, 0] = 0.2
-    assert course_metrics(course)["on_goal_rate"] == 0.0 and course_metrics(course)["success_rate"] == 1.0
+    assert values(course_metrics(course))["finished_on_goal_rate"] == 0.0
+    assert values(course_metrics(course))["finished_rate"] == 1.0
     assert [skill for skill, *_ in active_spans(course, 0)] == [WALK, JUMP_TO, WALK]
 
 
@@ -133,16 +139,21 @@ def test_block_is_placed_under_goal_when_jump_onto_it_starts():
 
 def test_fall_ends_course_and_its_samples():
     course, _ = run_course(falls_at=np.array([60, -1]))
-    metrics = course_metrics(course)
-    assert course.outcomes.tolist() == ["collided", "done"] and metrics["failed_by_collided"] == 1
-    assert (metrics["success_rate"], metrics["fall_rate"]) == (0.5, 0.5)
+    metrics = values(course_metrics(course))
+    assert course.outcomes.tolist() == ["collided", "done"] and metrics["ended_by_collided_rate"] == 0.5
+    assert (metrics["finished_rate"], metrics["fall_rate"]) == (0.5, 0.5)
     assert np.isnan(np.array(course.velocity)[60:, 0]).all() and not np.array(course.is_tracked)[60:, 0].any()
 
 
 def test_robot_that_never_stops_has_outcome_stuck():
     course, env = run_course(never_stops=True)
-    assert course.outcomes.tolist() == ["stuck", "stuck"] and course_metrics(course)["stuck_rate"] == 1.0
-    assert env.steps == 120 + round(JUMP_TIMEOUT / DT) and course_metrics(course)["command_to_takeoff_s"] is None
+    assert (
+        course.outcomes.tolist() == ["stuck", "stuck"] and values(course_metrics(course))["ended_by_stuck_rate"] == 1.0
+    )
+    assert (
+        env.steps == 120 + round(JUMP_TIMEOUT / DT)
+        and values(course_metrics(course))["command_to_takeoff_mean_s"] is None
+    )
 
 
 def test_goals_of_jumps_to_a_place_are_marked_when_the_jump_skill_takes_over():

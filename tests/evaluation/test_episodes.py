@@ -1,4 +1,3 @@
-import json
 from dataclasses import replace
 
 import numpy as np
@@ -9,7 +8,9 @@ from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeLog, EpisodePla
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.saving import task_to_json
+from jumper_warp.utils.output import read_values
 from landing_helpers import still_policy
+from metric_helpers import values
 
 DT = 0.5  # [s] Policy step of the stub
 TASK = make_task("vertical-jump")
@@ -53,22 +54,20 @@ def episodes():
 
 def test_episode_metrics_match_hand_computed_values(episodes):
     expected = {
-        "episodes": 4,
-        "mean_episode_s": (0.5 + 1.0 + 1.0 + 0.5) / 4,
-        "success_rate": 0.25,
-        "failure_rate": 0.5,
-        "no_end_rate": 0.25,
-        "mean_base_height_m": (0.4 + 0.1 + 0.3 + 9.0) / 4,
-        "mean_base_height_at_the_end_m": (0.4 + 0.0 + 0.3 + 9.0) / 4,
-        "mean_distance_from_start_m": (0.5 + 0.4 + 0.0) / 3,
-        "mean_moved_x_m": 0.5 / 3,
-        "mean_moved_y_m": 0.1,
-        "ended_by_success": 1,
-        "ended_by_low_base": 1,
-        "ended_by_no_end": 1,
-        "ended_by_came_apart": 1,
+        "length_mean_s": (0.5 + 1.0 + 1.0 + 0.5) / 4,
+        "success_termination_rate": 0.25,
+        "failure_termination_rate": 0.5,
+        "base_height_mean_m": (0.4 + 0.1 + 0.3 + 9.0) / 4,
+        "base_height_at_end_mean_m": (0.4 + 0.0 + 0.3 + 9.0) / 4,
+        "distance_from_start_mean_m": (0.5 + 0.4 + 0.0) / 3,
+        "moved_x_signed_mean_m": 0.5 / 3,
+        "moved_y_signed_mean_m": 0.1,
+        "ended_by_success_rate": 0.25,
+        "ended_by_low_base_rate": 0.25,
+        "ended_by_no_end_rate": 0.25,
+        "ended_by_diverged_rate": 0.25,
     }
-    assert episode_metrics(episodes) == pytest.approx(expected)
+    assert values(episode_metrics(episodes)) == pytest.approx(expected)
 
 
 def test_columns_have_one_row_per_episode_and_none_for_nan(episodes):
@@ -76,7 +75,7 @@ def test_columns_have_one_row_per_episode_and_none_for_nan(episodes):
     assert columns["command_0"] == [0.5] * 4 and columns["command_3"] == [0.0] * 4
     assert columns["length_s"] == [0.5, 1.0, 1.0, 0.5]
     assert columns["base_x_m"] == [1.5, 1.0, 1.0, None]
-    assert columns["end"] == ["success", "low_base", "no_end", "came_apart"]
+    assert columns["end"] == ["success", "low_base", "no_end", "diverged"]
     series = {"height/base, episode 1 [m]": 0.0, "distance/from start, episode 1 [m]": pytest.approx(0.4)}
     assert episodes.series([1]) == series
 
@@ -111,19 +110,23 @@ def policy(tmp_path_factory):
     return str(folder)
 
 
-def test_policy_of_any_task_is_evaluated_with_metrics_and_csv(policy, tmp_path):
+def test_policy_of_any_task_is_evaluated_with_metrics_and_trials(policy, tmp_path):
     evaluate.run(
-        [policy, *"--num-episodes 3 --command 0.5 0 0 30 --seconds 4 --device cpu --out".split(), str(tmp_path)], []
+        [
+            policy,
+            *"--num-episodes 3 --command 0.5 0 0 30 --seconds 4 --save-trials --device cpu --out".split(),
+            str(tmp_path),
+        ],
+        [],
     )
-    metrics = json.loads((tmp_path / "metrics.json").read_text())
-    assert (metrics["task"], metrics["episodes"], metrics["ended_by_no_jump"]) == ("any-task", 3, 3)
-    assert metrics["mean_base_height_m"] == pytest.approx(0.35, abs=0.02)
-    assert metrics["mean_episode_s"] < 4.0 and metrics["failure_rate"] == 1.0
-    rows = (tmp_path / "episodes.csv").read_text().splitlines()
-    assert len(rows) == 4 and rows[0].startswith("command_0,command_1") and rows[1].endswith("no_jump")
+    saved, trials = read_values(tmp_path), np.load(tmp_path / "trials.npz")
+    assert (saved["task"], saved["ended_by_no_jump_rate"]) == ("any-task", 1.0)
+    assert saved["base_height_mean_m"] == pytest.approx(0.35, abs=0.02)
+    assert saved["length_mean_s"] < 4.0 and saved["failure_termination_rate"] == 1.0
+    assert trials["end"].tolist() == ["no_jump"] * 3 and trials["command_0"].tolist() == [0.5] * 3
 
 
 def test_policy_of_any_task_is_recorded(policy, tmp_path):
     play.run([policy, *"--seconds 0.25 --device cpu --out".split(), str(tmp_path)], [])
     assert (tmp_path / "episode.rrd").stat().st_size > 1000
-    assert json.loads((tmp_path / "metrics.json").read_text())["end"] == ["no_end"]
+    assert read_values(tmp_path)["end"] == ["no_end"]

@@ -5,15 +5,12 @@ import numpy as np
 import pytest
 import warp as wp
 
-from jumper_warp.evaluation.jumps import wrapped, yaw_of
-from jumper_warp.evaluation.landings import (
-    LandingLog,
-    landing_metrics,
-    trained_range,
-    with_landing_terminations,
-    with_second_takeoff,
-)
+from jumper_warp.evaluation.jump_metrics import jump_metrics, range_metrics
+from jumper_warp.evaluation.jumps import with_jump_terminations, wrapped, yaw_of
+from jumper_warp.evaluation.landings import LandingLog, with_second_takeoff
+from jumper_warp.evaluation.run import trained_range
 from jumper_warp.registry import make_task
+from metric_helpers import values
 
 DT = 1.0 / 60.0  # [s] Policy step
 TERMINATIONS = ("success", "came_apart", "low_base", "collided", "no_jump")
@@ -33,12 +30,13 @@ class StubEnv:
         self.num_envs, self.step_dt, self.commanded = count, DT, []
         self.task = SimpleNamespace(contact_force=0.1)
         force = wp.full((4, count), wp.vec3(0.0, 0.0, 9.0), dtype=wp.vec3, device="cpu")
+        self.robot = SimpleNamespace(paw_pos=wp.zeros((4, count), dtype=wp.vec3, device="cpu"))
         self.sim = SimpleNamespace(paw_force=force, base_velocity=lambda: self.arrays["base_vel"])
         self.arrays = {
             "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (count, 1)), "start": np.zeros((count, 3)),
             "base_pos": np.zeros((count, 3)),
             "base_vel": np.zeros((count, 3)), "goal": np.zeros((count, 3)), "heading": np.zeros(count),
-            "max_height": np.zeros(count), "peak_tilt": np.zeros(count), "took_off": np.zeros(count, dtype=int),
+            "peak_tilt": np.zeros(count), "took_off": np.zeros(count, dtype=int),
             "steps": np.full(count, 40), "command_step": np.full(count, 30), "termination": np.full(count, -1),
             "touched_down": np.zeros(count, dtype=int),
             "phase": np.zeros(count, dtype=int), "phase_steps": np.zeros(count, dtype=int),
@@ -89,7 +87,7 @@ def five_jumps():
         base_quat=[quat_about_z(QUARTER + 0.1), quat_about_z(QUARTER - 0.3), *([[0.0, 0.0, 0.0, 1.0]] * 3)],
         base_vel=[[0.0, 0.06, 0.0], [0.2, 0.0, 0.0], *([[0.0] * 3] * 3)],
         phase=[2, 2, 1, 2, 0], phase_steps=[60, 60, 3, 20, 9], termination=[0, -1, 1, COLLIDED, NO_JUMP],
-        peak_tilt=[0.1, 0.2, 3.0, 1.0, 0.0], max_height=[0.6, 0.5, 9.0, 0.7, 0.3],
+        peak_tilt=[0.1, 0.2, 3.0, 1.0, 0.0],
     )  # fmt: skip
     assert landings.record_step(env)
     return landings
@@ -98,50 +96,72 @@ def five_jumps():
 def test_landing_offset_and_outcome_are_in_heading_frame():
     landings = five_jumps()
     assert landings.landing[:2, 0] == pytest.approx(np.array([[0.96, -0.03], [0.8, 0.2]]), abs=1e-6)
-    assert landings.offset[:2, 0] == pytest.approx(np.array([[-0.04, -0.03], [0.2, 0.0]]), abs=1e-6)
-    assert landings.outcomes[:, 0].tolist() == ["success", "missed", "came_apart", "collided", "no_jump"]
+    outcome = landings.outcome
+    assert outcome.ahead_m[:2, 0] == pytest.approx([-0.04, 0.2]) and outcome.left_m[:2, 0] == pytest.approx(
+        [-0.03, 0.0], abs=1e-6
+    )
+    assert landings.outcomes[:, 0].tolist() == ["success", "missed", "diverged", "collided", "no_jump"]
 
 
 def test_landing_metrics_match_hand_computed_values():
     landings = five_jumps()
     inside = np.array([True, True, True, False, False])[:, None]
     expected = {
-        "jumps": 5,
-        "mean_error_m": (0.05 + 0.2 + 0.3 + 0.5) / 4,
-        "mean_error_in_range_m": (0.05 + 0.2) / 2,
-        "mean_error_of_successes_m": 0.05,
-        "max_error_of_successes_m": 0.05,
-        "max_error_m": 0.5,
-        "mean_error_ahead_m": (-0.04 + 0.2 - 0.3 - 0.5) / 4,
-        "mean_error_left_m": -0.03 / 4,
+        "goal_distance_at_end_mean_m": (0.05 + 0.2 + 0.3 + 0.5) / 4,
+        "goal_distance_at_rest_mean_m": (0.05 + 0.2) / 2,
+        "goal_distance_at_rest_max_m": 0.2,
+        "goal_distance_at_touchdown_mean_m": (math.hypot(0.05, 0.1) + 0.2) / 2,
+        "goal_error_ahead_signed_mean_m": (-0.04 + 0.2) / 2,
+        "goal_error_left_signed_mean_m": -0.03 / 2,
+        "distance_flown_mean_m": None,
+        "paw_to_paw_distance_mean_m": None,
         "success_rate": 1 / 5,
-        "success_rate_in_range": 1 / 3,
-        "single_jump_success_rate": 1 / 5,
-        "step_free_success_rate": 1 / 5,
-        "landing_rate": 2 / 5,
-        "second_hop_rate": 0.0,
-        "step_rate": 0.0,
-        "mean_error_at_touchdown_m": (math.hypot(0.05, 0.1) + 0.2) / 2,
-        "mean_error_0_3_s_after_touchdown_m": (math.hypot(0.05, 0.07) + 0.1) / 2,
-        "still_landing_rate": 2 / 5,
-        "still_landing_rate_in_range": 2 / 3,
+        "goal_reached_rate": 1 / 5,
+        "landed_rate": 2 / 5,
+        "at_rest_rate": 1 / 5,
+        "no_paw_lift_rate": 2 / 5,
+        "success_without_hop_rate": 1 / 5,
+        "success_without_paw_lift_rate": 1 / 5,
         "second_takeoff_rate": 0.0,
-        "at_rest_within_1_s_rate": 1 / 2,
-        "mean_landing_tilt_deg": math.degrees(0.15),
-        "max_landing_tilt_deg": math.degrees(0.2),
-        "mean_turn_deg": math.degrees(0.2),
-        "max_turn_deg": math.degrees(0.3),
+        "landing_tilt_below_10_deg_rate": 1 / 2,
+        "landing_tilt_mean_deg": math.degrees(0.15),
+        "landing_tilt_max_deg": math.degrees(0.2),
+        "turn_abs_mean_deg": math.degrees(0.2),
+        "turn_abs_max_deg": math.degrees(0.3),
         "collision_rate": 1 / 5,
         "fall_rate": 2 / 5,
         "miss_rate": 1 / 5,
         "early_rate": 0.0,
-        "came_apart": 1,
-        "failed_by_missed": 1,
-        "failed_by_came_apart": 1,
-        "failed_by_collided": 1,
-        "failed_by_no_jump": 1,
+        "no_jump_rate": 1 / 5,
+        "diverged_rate": 1 / 5,
     }
-    assert landing_metrics(landings, inside) == pytest.approx(expected, abs=1e-6)
+    assert values(jump_metrics(landings.outcome)) == pytest.approx(expected, abs=1e-6)
+    in_range = range_metrics(landings.outcome, inside, "near")
+    assert {key: (metric.value, metric.trials) for key, metric in in_range.items()} == {
+        "in_range_success_rate": (1 / 3, 3), "in_range_goal_reached_rate": (1 / 3, 3),
+        "in_range_no_paw_lift_rate": (2 / 3, 3), "in_range_goal_distance_at_rest_mean_m": (pytest.approx(0.125), 2),
+    }  # fmt: skip
+    assert in_range["in_range_success_rate"].over == "jumps near"
+
+
+def test_distances_flown_and_from_paw_to_paw_are_horizontal():
+    landings, env = LandingLog(np.zeros((1, 1, 2)), TERMINATIONS), StubEnv(1)
+    landings.begin(env)
+    paws = np.zeros((4, 1, 3))
+    for changes, shift, down in (
+        ({}, [0.0, 0.0], (0, 1, 2, 3)),
+        ({"phase": 1, "took_off": 1, "base_pos": [0.1, 0.0, 0.6]}, [0.3, 0.0], ()),
+        ({"phase": 2, "took_off": 0, "touched_down": 1, "base_pos": [0.7, 0.8, 0.3]}, [1.2, 0.5], (0, 1)),
+        ({"phase_steps": 60, "touched_down": 0, "base_pos": [0.9, 0.8, 0.3]}, [1.2, 0.5], (0, 1, 2, 3)),
+    ):
+        env.set(**changes)
+        env.stand_on(*down)
+        paws[..., :2] = shift
+        env.robot.paw_pos.assign(paws)
+        landings.record_step(env)
+    metrics = values(jump_metrics(landings.outcome))
+    assert metrics["distance_flown_mean_m"] == pytest.approx(1.0)
+    assert metrics["paw_to_paw_distance_mean_m"] == pytest.approx(1.3)
 
 
 def test_log_does_not_change_after_all_jumps_ended():
@@ -160,9 +180,9 @@ def test_jump_before_command_is_not_a_success():
     assert not landings.record_step(env)
     env.set(took_off=0, steps=120, phase=2, phase_steps=60)
     assert landings.record_step(env)
-    metrics = landing_metrics(landings)
-    assert (metrics["success_rate"], metrics["early_rate"], metrics["landing_rate"]) == (0.0, 1.0, 1.0)
-    assert metrics["failed_by_early"] == 1
+    metrics = values(jump_metrics(landings.outcome))
+    assert (metrics["success_rate"], metrics["early_rate"], metrics["landed_rate"]) == (0.0, 1.0, 1.0)
+    assert landings.outcomes[0, 0] == "early"
 
 
 @pytest.mark.parametrize(("steps", "hopped"), [([3, 3], False), ([1, 4], True)])
@@ -178,9 +198,8 @@ def test_airtime_above_hop_time_after_touchdown_is_second_hop(steps, hopped):  #
     env.sim.paw_force.fill_(wp.vec3(0.0, 0.0, 9.0))
     assert landings.record_step(env)
     assert landings.air_time[0, 0] == pytest.approx(max(steps) * DT)
-    metrics = landing_metrics(landings)
-    assert (metrics["success_rate"], metrics["second_hop_rate"]) == (1.0, float(hopped))
-    assert metrics["single_jump_success_rate"] == float(not hopped)
+    metrics = values(jump_metrics(landings.outcome))
+    assert (metrics["success_rate"], metrics["success_without_hop_rate"]) == (1.0, float(not hopped))
 
 
 @pytest.mark.parametrize(
@@ -203,9 +222,9 @@ def test_paw_lifted_3_policy_steps_after_its_contact_is_a_step(contacts, stepped
                 assert not landings.record_step(env)
     env.set(phase_steps=60)
     assert landings.record_step(env)
-    metrics = landing_metrics(landings)
-    assert (metrics["success_rate"], metrics["second_hop_rate"]) == (1.0, 0.0)
-    assert (metrics["step_rate"], metrics["step_free_success_rate"]) == (float(stepped), float(not stepped))
+    metrics = values(jump_metrics(landings.outcome))
+    assert (metrics["success_rate"], metrics["success_without_hop_rate"]) == (1.0, 1.0)
+    assert metrics["no_paw_lift_rate"] == metrics["success_without_paw_lift_rate"] == float(not stepped)
 
 
 @pytest.mark.parametrize(
@@ -237,23 +256,23 @@ def test_second_takeoff_needs_upward_speed_and_no_contact(phases, takeoffs):
     env.stand_on(0, 1, 2, 3)
     assert landings.record_step(env)
     assert landings.takeoffs[0, 0] == takeoffs
-    metrics = landing_metrics(landings)
+    metrics = values(jump_metrics(landings.outcome))
     assert (metrics["success_rate"], metrics["second_takeoff_rate"]) == (1.0, float(takeoffs > 0))
 
 
-def test_longer_rest_time_counts_later_falls_and_renames_rest_metric():
+def test_longer_rest_time_counts_later_falls_but_not_later_speed():
     landings, env = LandingLog(np.zeros((2, 1, 2)), TERMINATIONS, rest=3.0), StubEnv(2)
     landings.begin(env)
     env.set(phase=2, phase_steps=60, termination=0)
     assert not landings.record_step(env)
-    env.set(phase_steps=120, termination=[0, 2])
+    env.set(phase_steps=120, termination=[0, 2], base_vel=0.5)
     assert not landings.record_step(env)
     env.set(phase_steps=180, termination=0)
     assert landings.record_step(env)
     assert landings.outcomes[:, 0].tolist() == ["success", "low_base"]
-    metrics = landing_metrics(landings)
+    metrics = values(jump_metrics(landings.outcome))
     assert (metrics["success_rate"], metrics["fall_rate"], metrics["miss_rate"]) == (0.5, 0.5, 0.0)
-    assert "at_rest_within_1_s_rate" not in metrics and metrics["below_0_1_m_s_at_the_end_rate"] == 1.0
+    assert metrics["at_rest_rate"] == 0.5
 
 
 def test_flight_of_next_jump_is_not_counted_as_step():
@@ -267,15 +286,15 @@ def test_flight_of_next_jump_is_not_counted_as_step():
         assert not landings.record_step(env)
     env.set(phase=2, phase_steps=60)
     assert landings.record_step(env)
-    assert landings.success.all() and not landings.stepped.any()
+    assert landings.success.all() and landings.outcome.still.all()
 
 
 def test_unfinished_jump_fails_at_last_position():
     landings, env = LandingLog(np.array([[[0.4, 0.0]]]), TERMINATIONS), StubEnv(1)
     landings.begin(env)
     assert not landings.record_step(env)
-    metrics = landing_metrics(landings)
-    assert metrics["mean_error_m"] == pytest.approx(0.4) and metrics["failed_by_no_end"] == 1
+    metrics = values(jump_metrics(landings.outcome))
+    assert metrics["goal_distance_at_end_mean_m"] == pytest.approx(0.4) and landings.outcomes[0, 0] == "no_end"
 
 
 def two_in_a_row():
@@ -300,13 +319,10 @@ def test_next_jump_has_error_outcome_and_marker_of_its_own_goal():
     landings, env = two_in_a_row()
     env.set(base_pos=[[1.48, 0.15, 0.3], [0.0, 0.0, 0.0]], phase=2, phase_steps=30, termination=0)
     assert landings.record_step(env)
-    assert landings.error[0] == pytest.approx([0.05, 0.02])
+    assert landings.outcome.distance_at_rest_m[0] == pytest.approx([0.05, 0.02])
     assert landings.outcomes.tolist() == [["success", "success"], ["collided", "not_begun"]]
-    metrics = landing_metrics(landings)
-    assert metrics["jumps"] == 3 and metrics["success_rate"] == pytest.approx(2 / 3)
-    assert "success_rate_in_range" not in metrics and "mean_error_in_range_m" not in metrics
-    everywhere = landing_metrics(landings, np.ones((2, 2), dtype=bool))
-    assert everywhere["success_rate_in_range"] == pytest.approx(2 / 3)
+    success = jump_metrics(landings.outcome)["success_rate"]
+    assert (success.value, success.trials) == (pytest.approx(2 / 3), 3)
     assert landings.goal_markers([0])[0, :, :2] == pytest.approx(np.array([[0.8, 0.2], [1.5, 0.15]]))
 
 
@@ -315,7 +331,7 @@ def test_columns_have_one_row_per_jump_and_none_for_error_of_jump_not_begun():
     columns = landings.columns()
     assert all(len(values) == 4 for values in columns.values())
     assert columns["goal_x_m"] == [0.8, 0.7, 0.8, 0.7]
-    assert columns["error_m"][3] is None and columns["end"][3] == "not_begun"
+    assert columns["distance_at_end_m"][3] is None and columns["outcome"][3] == "not_begun"
     assert landings.series([1])["distance/to goal, (0.80, 0.20) m [m]"] == pytest.approx(0.05)
 
 
@@ -328,15 +344,18 @@ def test_worlds_with_the_same_goal_have_distinct_names_in_series_and_states():
 
 
 def test_landing_evaluation_excludes_shaping_terminations():
-    terms = with_landing_terminations(make_task("horizontal-jump")).terminations
+    terms = with_jump_terminations(make_task("horizontal-jump")).terminations
     assert [term.name for term in terms] == ["came_apart", "low_base", "collided", "no_jump", "success"]
     terms = with_second_takeoff(make_task("horizontal-jump")).terminations
     assert [term.name for term in terms][-2:] == ["second_takeoff", "success"]
 
 
-@pytest.mark.parametrize(("task", "range_m"), [("horizontal-jump", [0.2, 2.2]), ("omnidirectional-jump", [0.0, 1.4])])
+@pytest.mark.parametrize(
+    ("task", "range_m"),
+    [("horizontal-jump", [0.2, 2.2]), ("omnidirectional-jump", [0.0, 1.4]), ("vertical-jump", [0.45, 1.15])],
+)
 def test_trained_range_covers_all_levels(task, range_m):
-    assert list(trained_range(make_task(task)).values()) == range_m
+    assert trained_range(make_task(task)) == {"trained_range_m": range_m}
 
 
 def test_command_delay_may_differ_between_worlds():

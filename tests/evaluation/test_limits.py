@@ -7,8 +7,7 @@ import pytest
 import torch
 
 from jump_helpers import make_env
-from jumper_warp.evaluation.heights import with_sweep_terminations
-from jumper_warp.evaluation.jumps import jump_commands
+from jumper_warp.evaluation.jumps import jump_commands, with_jump_terminations
 from jumper_warp.evaluation.limits import EXTEND, HOLD, RAMP, open_loop_limits
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.registry import make_task
@@ -23,7 +22,7 @@ pytestmark = pytest.mark.usefixtures("one_thread")
 
 def initial_env(conditions, worlds):
     """Return an environment without a begun episode under some conditions, and its `state_dict`."""
-    task = conditions.applied(with_sweep_terminations(make_task("vertical-jump")))
+    task = conditions.applied(with_jump_terminations(make_task("vertical-jump")))
     env = make_env(worlds, task=task, randomize=conditions.sets_parameters, auto_reset=False)
     return env, env.state_dict()
 

@@ -10,6 +10,8 @@ from jumper_warp.evaluation import velocities
 from jumper_warp.evaluation.velocities import VelocityFlags, VelocityLog, VelocityPlayFlags
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import measure
+from metric_helpers import values
 from support import gaits
 from support.walks import kept_speeds, settling_times, step_commands, top_speed, walked_fraction
 
@@ -35,36 +37,42 @@ def walk_log(velocity_of, *, seconds=2.0, falls=None, task=TASK, commands=None, 
         for robot, fall in (falls or {}).items():
             termination[robot] = NAMES.index("collided") if step >= fall else -1
         arrays = {"base_quat": turn.as_quat(), "base_vel": turn.apply(vel), "base_ang_vel": turn.apply(ang),
-                  "termination": termination}  # fmt: skip
+                  "base_pos": np.zeros((ROBOTS, 3)), "termination": termination}  # fmt: skip
         walks.update(arrays, DT)
     return walks
 
 
-def test_tracking_errors_are_rms_in_body_axes_without_first_second():
+def metrics_of(walks):
+    """Return the values of the metrics of walks."""
+    return values(measure(velocities.VELOCITY_METRICS, walks))
+
+
+def test_settled_tracking_errors_are_rms_in_body_axes_without_first_second():
     off = np.array([[0.1, 0.0, 0.0], [0.0, -0.2, 0.0], [0.2, 0.0, 0.3]])
     walks = walk_log(lambda t: np.array([0.5, -0.2, 0.4]) + off + (0.0 if t > 1.0 + 1e-6 else 5.0))
-    metrics = velocities.tracking_metrics(walks)
-    assert metrics["rmse_vx_m_s"] == pytest.approx(np.sqrt(0.05 / 3.0), rel=1e-5)
-    assert metrics["rmse_vy_m_s"] == pytest.approx(np.sqrt(0.04 / 3.0), rel=1e-5)
-    assert metrics["rmse_yaw_rate_rad_s"] == pytest.approx(np.sqrt(0.09 / 3.0), rel=1e-5)
-    assert (metrics["robots"], metrics["falls"]) == (3, 0)
-    assert walks.columns()["rms_error_vx"] == pytest.approx([0.1, 0.0, 0.2], abs=1e-6)
+    metrics = metrics_of(walks)
+    settled = [metrics[f"settled_rmse_{name}"] for name in ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")]
+    assert settled == pytest.approx(np.sqrt(np.array([0.05, 0.04, 0.09]) / 3.0), rel=1e-5)
+    # over all time, half of the samples are off by 5 more
+    squares = np.mean([[0.01, 0.0, 0.04], [5.1**2, 5.0**2, 5.2**2]])
+    assert metrics["rmse_vx_m_s"] == pytest.approx(np.sqrt(squares), rel=1e-5)
+    assert metrics["fall_rate"] == 0.0 and metrics["slewed_rmse_vx_m_s"] is None
 
 
 def test_samples_after_a_fall_are_ignored():
     walks = walk_log(lambda t: np.full((ROBOTS, 3), t > 1.5) + np.array([0.5, -0.2, 0.4]), falls={1: 90, 0: 30})
-    metrics = velocities.tracking_metrics(walks)
-    assert (metrics["falls"], metrics["fell_by_collided"], metrics["fall_rate"]) == (2, 2, pytest.approx(2.0 / 3.0))
+    metrics = metrics_of(walks)
+    assert metrics["fall_rate"] == pytest.approx(2.0 / 3.0)
     np.testing.assert_array_equal(walks.outcomes, ["collided", "collided", "walked"])
     np.testing.assert_array_equal(walks.fall_step, [29, 89, 120])
     # robot 1 counts without error from step 61 to 89, robot 2 from 61 to 120, wrong from 91 on
-    assert metrics["rmse_vx_m_s"] == pytest.approx(np.sqrt(30.0 / (29.0 + 60.0)), rel=1e-5)
+    assert metrics["settled_rmse_vx_m_s"] == pytest.approx(np.sqrt(30.0 / (29.0 + 60.0)), rel=1e-5)
 
 
 def test_time_out_is_not_a_fall():
     walks = VelocityLog(np.zeros((1, 1, 3)), TASK, 1.0)
-    arrays = {"base_quat": np.array([[0.0, 0.0, 0.0, 1.0]]), "base_vel": np.zeros((1, 3)),
-              "base_ang_vel": np.zeros((1, 3)), "termination": np.array([NAMES.index("finished")])}  # fmt: skip
+    arrays = {name: np.zeros((1, 3)) for name in ("base_pos", "base_vel", "base_ang_vel")}
+    arrays |= {"base_quat": np.array([[0.0, 0.0, 0.0, 1.0]]), "termination": np.array([NAMES.index("finished")])}
     walks.update(arrays, DT)
     assert not walks.fallen.any() and walks.outcomes[0] == "walked"
 
@@ -107,6 +115,37 @@ def test_command_history_starts_one_step_after_command():
     commands[:, 1, 0] = 1.0
     walks = walk_log(lambda t: np.zeros((ROBOTS, 3)), commands=commands, times=(0.0, 1.0))
     np.testing.assert_array_equal(walks.command_history()[:, 0, 0], [0.0] * 60 + [1.0] * 60)
+
+
+def test_slewed_commands_rise_at_their_rate_from_zero():
+    commands = np.zeros((ROBOTS, 2, 3))
+    commands[:, 0, 0], commands[:, 1, 0] = 0.5, -0.5
+    slew = np.array([1.25, 1.25, np.inf])
+    walks = walk_log(lambda t: np.zeros((ROBOTS, 3)), commands=commands, times=(0.0, 1.0), slew=slew)
+    history, time = walks.command_history()[..., 0], np.arange(1, 121) * DT
+    expected = np.where(time <= 1.0 + 1e-9, np.minimum(1.25 * time, 0.5), np.maximum(0.5 - 1.25 * (time - 1.0), -0.5))
+    assert history[:, 0] == pytest.approx(expected)
+    assert history[:, 2].tolist() == [0.5] * 60 + [-0.5] * 60
+    assert metrics_of(walks)["slewed_rmse_vx_m_s"] == pytest.approx(np.sqrt(np.mean(expected**2)))
+
+
+def test_drift_is_of_robots_commanded_to_stand_until_the_end():
+    commands = np.zeros((ROBOTS, 1, 3))
+    commands[0, 0, 0] = 0.5
+    walks = walk_log(lambda t: np.zeros((ROBOTS, 3)), commands=commands, falls={2: 30})
+    walks.distance[:], walks.yaw[:] = [9.0, 0.02, 9.0], [3.0, -0.1, 3.0]
+    metrics = measure(velocities.VELOCITY_METRICS, walks)
+    drift, turn = metrics["standing_drift_mean_m"], metrics["standing_turn_abs_mean_deg"]
+    assert (drift.value, drift.trials, turn.value) == (0.02, 1, pytest.approx(np.degrees(0.1)))
+
+
+def test_evaluated_walks_change_their_command_at_once_slewed_or_not_at_all():
+    log = VelocityFlags(2, (0.8, 0.6, 0.4), 7.0, 3.0).log(TASK, 0)
+    assert log.commands.shape == (8 + 8 + 64, 3, 3) and log.times.tolist() == [0.0, 3.0, 6.0]
+    np.testing.assert_array_equal(log.commands[:8], log.commands[8:16])
+    assert sorted(map(tuple, log.commands[:8, 1])) == sorted(map(tuple, log.commands[:8, 0]))
+    masks = log.trials
+    assert [int(masks[name].sum()) for name in list(masks)[1:]] == [8, 8, 64]
 
 
 def test_walked_fraction_stops_at_fall_and_is_at_most_1():
@@ -168,14 +207,14 @@ def test_gait_metrics_of_synthetic_trot():
     torque = np.zeros((steps, n, 12))
     torque[:, 0, 0], torque[7, 1, 3] = 2.0, -9.0
     power, speed, weight = np.full((steps, n), 30.0), np.full((steps, n), 0.5), np.full(n, 14.0 * 9.81)
-    metrics = gaits.gait_metrics(contact, height, force, torque, power, speed, weight, DT)
+    metrics = values(gaits.gait_metrics(contact, height, force, torque, power, speed, weight, DT))
     assert metrics["cost_of_transport"] == pytest.approx(30.0 / (14.0 * 9.81 * 0.5))
     assert metrics["share_down_FL_BR"] == metrics["share_down_FR_BL"] == pytest.approx(0.5)
-    assert metrics["largest_torque_nm"] == 9.0 and metrics["paw_force_ripple"] == pytest.approx(0.0, abs=1e-9)
-    assert metrics["rms_torque_nm"] == pytest.approx(np.sqrt((steps * 4.0 + 81.0) / (steps * n * 12)))
+    assert metrics["torque_max_nm"] == 9.0 and metrics["paw_force_ripple"] == pytest.approx(0.0, abs=1e-9)
+    assert metrics["torque_rms_nm"] == pytest.approx(np.sqrt((steps * 4.0 + 81.0) / (steps * n * 12)))
     assert metrics["steps_hz"] == pytest.approx((2 * 1 + 2 * 2) / 4.0 / 2.0)
     # FL and BR lift at 0.5 s and land at 1 s, a swing with the peak of 8 cm; FR and BL lift at 1 s, land at 1.5 s
-    assert metrics["median_swing_apex_m"] == pytest.approx(0.07)
+    assert metrics["swing_apex_median_m"] == pytest.approx(0.07)
 
 
 def test_gait_recorder_skips_first_seconds_and_has_no_metrics_without_robots():

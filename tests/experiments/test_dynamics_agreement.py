@@ -1,12 +1,11 @@
 """Comparison with Pinocchio of the described robot and an overlay, and its sensitivity to a wrong mass."""
 
-import json
-
 import numpy as np
 import pytest
 
 from experiments import dynamics_agreement
 from jumper_warp.robot.overlay import RobotOverlay
+from jumper_warp.utils.output import read_values
 from support.agreement import jumper_quantities, pinocchio_quantities, random_states
 
 OVERLAY = RobotOverlay(
@@ -24,7 +23,7 @@ def test_dynamics_agree_with_pinocchio_to_single_precision(tmp_path, overlay):
         path = tmp_path / "robot.json"
         overlay.save(path)
     values = dynamics_agreement.main(dynamics_agreement.Args(robot=path, states=8, out=tmp_path))
-    assert values == json.loads((tmp_path / "metrics.json").read_text())
+    assert values == read_values(tmp_path)
     relative = {name: value for name, value in values.items() if name.endswith("relative_difference")}
     assert len(relative) == 5 and max(relative.values()) < 1.0e-6
 

@@ -16,13 +16,17 @@ from experiments import (
     shac,
     soak_test,
 )
-from jumper_warp.evaluation.heights import HeightLog, run_jumps, sweep_metrics, with_sweep_terminations
+from jumper_warp.evaluation.heights import HeightFlags, HeightLog, run_jumps
+from jumper_warp.evaluation.jumps import with_jump_terminations
 from jumper_warp.evaluation.limits import limit_metrics
-from jumper_warp.evaluation.sweeps import HEIGHTS_IN_RANGE, HeightSweep
+from jumper_warp.evaluation.log import within
+from jumper_warp.evaluation.sweeps import HeightSweep
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.registry import make_task
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.output import read_values
 from landing_helpers import OPEN_LOOP_APEX, still_policy
+from metric_helpers import values
 from support.learning import LearningCurve
 from support.soak import SoakArgs, hardest
 from support.timing import baseline_ratios, changed_flags
@@ -48,7 +52,7 @@ def test_new_reward_is_logged_by_name(trained):
     line = json.loads((run / "metrics.jsonl").read_text().splitlines()[-1])
     assert values["episode_reward_even_load"] == line["Episode_Reward/even_load"]
     assert values["episode_reward_even_load"] > 0.0
-    assert json.loads((folder / "metrics.json").read_text())["iterations"] == 2
+    assert read_values(folder)["iterations"] == 2
 
 
 # ---------------------------------------------------------------- the sweep
@@ -72,48 +76,50 @@ def test_sweep_metrics_match_hand_computed_values():
         rest_speed=[0.01, 0.2, np.inf, 0.02, np.inf, 0.01, 0.01, 0.01],
         early=[False] * 6 + [True, False],
     )
-    metrics = sweep_metrics(jumps, HEIGHTS_IN_RANGE)
+    metrics = values(HeightFlags().metrics(jumps))
     # errors 0.09 0 0 -0.20 -0.02 -0.07 -0.09 -0.15
-    assert metrics["mean_abs_error_m"] == pytest.approx(0.62 / 8)
-    assert metrics["mean_abs_error_in_range_m"] == pytest.approx(0.31 / 5)
-    assert metrics["mean_error_m"] == pytest.approx(-0.44 / 8)
-    assert metrics["success_rate"] == pytest.approx(5 / 8)
-    assert metrics["success_rate_in_range"] == pytest.approx(4 / 5)
-    assert metrics["success_rate_0_6_1_1"] == pytest.approx(3 / 4)
-    assert metrics["largest_reached_m"] == pytest.approx(1.09)
-    assert metrics["landing_rate"] == pytest.approx(4 / 8)
-    assert metrics["success_and_landing_rate"] == pytest.approx(1 / 8)
-    assert metrics["largest_tilt_deg"] == pytest.approx(20.0)
-    assert (metrics["collision_rate"], metrics["fall_rate"], metrics["early_rate"]) == (1 / 8, 1 / 8, 1 / 8)
-    assert list(metrics).index("success_and_landing_rate") == list(metrics).index("success_rate") + 1
-    assert metrics["max_landing_tilt_deg"] == pytest.approx(11.0)
-    assert metrics["miss_rate"] == 2 / 8  # of 1.00 m and 1.20 m; the early jump is none
-    expected = {
-        "open_loop_limit_m": 1.0748,
-        "lowest_open_loop_limit_m": 1.0748,
-        "open_loop_mean_abs_error_m": (0.0252 + 0.0752 + 0.1052 + 0.1252) / 8,
-        "mean_abs_error_up_to_limit_m": 0.29 / 4,
-        "success_rate_reachable": 5 / 6,
-        "reachable_share": 6 / 8,
-        "success_rate_beyond_limit": 0.0,
-        "success_rate_reachable_0_6_1_1": 3 / 4,
-        "reachable_share_0_6_1_1": 1.0,
-    }
-    assert limit_metrics(jumps, np.full(8, 1.0748)) == pytest.approx(expected)
-    weak = limit_metrics(jumps, np.array([1.0, 0.49, 1.0, 1.0, 0.97, 1.0, 1.0, 1.05]))
-    assert weak["reachable_share"] == pytest.approx(3 / 8)  # 0.50, 0.80, 1.00
-    assert weak["success_rate_reachable"] == pytest.approx(2 / 3)
-    assert weak["success_rate_beyond_limit"] == pytest.approx(3 / 5)  # 0.60, 1.10, 1.15
-    assert (weak["lowest_open_loop_limit_m"], weak["reachable_share_0_6_1_1"]) == (0.49, 2 / 4)
+    assert metrics["apex_error_abs_mean_m"] == pytest.approx(0.62 / 8)
+    assert metrics["in_range_apex_error_abs_mean_m"] == pytest.approx(0.31 / 5)
+    assert metrics["apex_error_signed_mean_m"] == pytest.approx(-0.44 / 8)
+    assert metrics["goal_reached_rate"] == pytest.approx(6 / 8)  # all but 1.00 m and 1.20 m
+    assert metrics["in_range_goal_reached_rate"] == pytest.approx(4 / 5)
+    assert metrics["landed_rate"] == pytest.approx(6 / 8)
+    assert metrics["at_rest_rate"] == pytest.approx(5 / 8)  # 0.60 m moves
+    assert metrics["success_rate"] == pytest.approx(2 / 8)  # 0.50 m and 1.15 m; 1.18 m is early
+    assert metrics["apex_max_m"] == pytest.approx(1.09)
+    assert (metrics["collision_rate"], metrics["fall_rate"], metrics["early_rate"]) == (1 / 8, 2 / 8, 1 / 8)
+    assert metrics["landing_tilt_max_deg"] == pytest.approx(11.0)
+    assert metrics["miss_rate"] == 2 / 8
+    assert limits_of(jumps, np.full(8, 1.0748)) == pytest.approx({
+        "open_loop_apex_mean_m": 1.0748,
+        "open_loop_apex_error_abs_mean_m": (0.0252 + 0.0752 + 0.1052 + 0.1252) / 8,
+        "reachable_rate": 6 / 8,
+        "reachable_goal_reached_rate": 5 / 6,
+        "reachable_success_rate": 2 / 6,
+        "unreachable_goal_reached_rate": 1 / 2,
+        "reachable_in_range_goal_reached_rate": 4 / 5,
+        "reachable_in_range_success_rate": 1 / 5,
+        "up_to_limit_apex_error_abs_mean_m": 0.29 / 4,
+    })  # fmt: skip
+    weak = limits_of(jumps, np.array([1.0, 0.49, 1.0, 1.0, 0.97, 1.0, 1.0, 1.05]))
+    assert weak["reachable_rate"] == pytest.approx(3 / 8)  # 0.50, 0.80, 1.00
+    assert weak["reachable_goal_reached_rate"] == pytest.approx(2 / 3)
+    assert weak["unreachable_goal_reached_rate"] == pytest.approx(4 / 5)  # 0.60, 1.10, 1.15, 1.18
+
+
+def limits_of(jumps, limit):
+    """Return the values of `limit_metrics` for a log and open-loop apexes [m], (num_envs,)."""
+    inside = within(jumps.commanded, (0.5, 1.1))
+    return values(limit_metrics(jumps.outcome, jumps.commanded, limit[:, None], inside))
 
 
 def test_diverged_world_is_a_failure_excluded_from_errors():
     jumps = height_log([0.6, 0.8, 1.0], [0.65, 1e6, np.nan], [0, 1, 1], [1.0] * 3, [0.0] * 3)
-    metrics = sweep_metrics(jumps, HEIGHTS_IN_RANGE)
-    assert metrics["mean_abs_error_m"] == pytest.approx(0.05)
+    metrics = values(HeightFlags().metrics(jumps))
+    assert metrics["apex_error_abs_mean_m"] == pytest.approx(0.05)
     assert metrics["success_rate"] == pytest.approx(1 / 3)
-    assert metrics["came_apart"] == 2
-    assert metrics["largest_reached_m"] == pytest.approx(0.65)
+    assert metrics["diverged_rate"] == pytest.approx(2 / 3)
+    assert metrics["apex_max_m"] == pytest.approx(0.65)
 
 
 class OpenLoopPolicy:
@@ -131,32 +137,34 @@ class OpenLoopPolicy:
 
 @pytest.fixture(scope="module")
 def sweep_env():  # environment of three nominal robots with the terminations of the sweep
-    return env_of_policy(still_policy("vertical-jump"), 3, Conditions(device="cpu"), change=with_sweep_terminations)
+    return env_of_policy(still_policy("vertical-jump"), 3, Conditions(device="cpu"), change=with_jump_terminations)
 
 
 @pytest.mark.parametrize(("begin", "early"), [(31, False), (-45, True)])
 def test_scripted_jump_reaches_open_loop_height_and_is_early_before_command(sweep_env, begin, early):
     targets = np.array([0.5, 0.7, 1.05])
-    metrics = sweep_metrics(run_jumps(OpenLoopPolicy(begin).act, sweep_env, targets), HEIGHTS_IN_RANGE)
-    assert metrics["largest_reached_m"] == pytest.approx(OPEN_LOOP_APEX, abs=0.02)
-    assert metrics["landing_rate"] == 1.0
+    metrics = values(HeightFlags().metrics(run_jumps(OpenLoopPolicy(begin).act, sweep_env, targets)))
+    assert metrics["apex_max_m"] == pytest.approx(OPEN_LOOP_APEX, abs=0.02)
+    assert metrics["landed_rate"] == 1.0
     assert metrics["early_rate"] == (1.0 if early else 0.0)
     assert metrics["success_rate"] == pytest.approx(0.0 if early else 1 / 3)
 
 
 def test_sweep_of_a_run_writes_metrics_plot_recording_and_picture(trained, tmp_path):
-    values = HeightSweep(
+    reported = HeightSweep(
         policy=str(trained[2]), num_jumps=3, num_recorded=2, randomize=True, out=tmp_path, device="cpu"
     ).run()
-    saved = json.loads((tmp_path / "metrics.json").read_text())
-    assert saved == values
-    assert {"mean_abs_error_m", "success_rate", "success_rate_in_range", "success_rate_0_6_1_1"} <= saved.keys()
-    assert {"landing_rate", "largest_tilt_deg", "largest_reached_m"} <= saved.keys()
-    assert {"still_landing_rate", "max_drift_m", "max_turn_deg", "miss_rate", "max_landing_tilt_deg"} <= saved.keys()
-    assert {"reachable_share", "success_rate_reachable", "pushed_in_flight_success_rate"} <= saved.keys()
-    assert 0.7 < saved["lowest_open_loop_limit_m"] < saved["open_loop_limit_m"] < 1.3
+    saved = read_values(tmp_path)
+    assert saved == reported
+    assert {
+        *HeightSweep.paper,
+        "success_rate",
+        "open_loop_apex_mean_m",
+        "pushed_in_flight_success_rate",
+    } <= saved.keys()
+    assert 0.7 < saved["open_loop_apex_mean_m"] < 1.3 and saved["trained_range_m"] == [0.45, 1.15]
     assert saved["latency"].endswith(" ms") and 0.0 < saved["latency_ms"] < 17.0
-    assert (saved["jumps"], saved["torque_limit_nm"], saved["randomize"]) == (3, 18.0, True)
+    assert (saved["torque_limit_nm"], saved["randomize"]) == (18.0, True)
     for name in ("sweep.png", "jumps.rrd", "jumps.png"):
         assert (tmp_path / name).stat().st_size > 1000, name
 
@@ -176,7 +184,7 @@ def test_learning_curves_report_time_to_success_rates_and_refuse_unknown_variant
         height_range=(0.5, 0.9), out=tmp_path, device="cpu",
     )  # fmt: skip
     values = learning_curves.main(args)
-    assert values == json.loads((tmp_path / "metrics.json").read_text())
+    assert values == read_values(tmp_path)
     assert values["seconds_to_95_percent_eager_float32_0"] is None and values["ready_s_eager_float32_0"] > 0.0
     assert values["curve_steps_eager_float32_0"][-1] % (8 * 32) == 0
     assert values["seconds_to_95_percent_eager_float32_1"] == 4.0 and values["ready_s_eager_float32_1"] == 3.0
@@ -198,7 +206,7 @@ def test_benchmark_reports_solver_environment_and_both_trainers(tmp_path):
     )  # fmt: skip
     values = benchmark_training.main(args)
     assert values["ppo_steps_per_s_eager_bfloat16"] > 0.0
-    assert values == json.loads((tmp_path / "metrics.json").read_text())
+    assert values == read_values(tmp_path)
     rates = [values[f"{what}_steps_per_s_{n}"] for what in ("solver", "env") for n in (8, 16)]
     rates += [values["ppo_steps_per_s"], values["rsl_rl_steps_per_s"]]
     assert min(rates) > 0.0
@@ -212,7 +220,7 @@ def test_soak_of_simulation_and_environment_reports_no_invalid_worlds(tmp_path):
     for task in (None, "horizontal-jump"):
         args = SoakArgs(num_envs=8, steps=40, episode_steps=20, task=task, out=tmp_path, device="cpu")
         values = soak_test.main(args)
-        saved = json.loads((tmp_path / "metrics.json").read_text())
+        saved = read_values(tmp_path)
         assert saved == values | {"envs": 8, "filter": False, "seed": 0}
         assert (values["steps"], values["non_finite_worlds"], values["non_finite_rows"]) == (320, 0, 0)
         assert 0.01 < values["largest_speed_m_s"] < 10.0 and values["largest_joint_speed_rad_s"] > 1.0
@@ -251,9 +259,11 @@ def test_baseline_ratios_run_other_checkout_with_changed_flags_and_compare_rates
     script = tmp_path / "base" / "experiments" / "script.py"
     script.parent.mkdir(parents=True)
     script.write_text(
-        "import json, sys\n"
+        "import sys\n"
         "assert sys.argv[1:6] == ['--envs', '4', '8', '--no-noise', '--out'], sys.argv\n"
-        "json.dump({'steps_per_s_jump': 50.0, 'apex_m': 1.0}, open(sys.argv[6] + '/metrics.json', 'w'))"
+        "from pathlib import Path\n"
+        "from jumper_warp.utils.output import write_metrics\n"
+        "write_metrics(Path(sys.argv[6]), {'steps_per_s_jump': 50.0, 'apex_m': 1.0})"
     )
 
     @dataclass
@@ -281,7 +291,7 @@ def test_baseline_ratios_run_other_checkout_with_changed_flags_and_compare_rates
 def test_solver_benchmark_reports_both_solvers_and_ratio(tmp_path):
     args = benchmark_solver.Args(envs=[2], repeats=1, steps=2, out=tmp_path, device="cpu")
     values = benchmark_solver.main(args)
-    assert values == json.loads((tmp_path / "metrics.json").read_text())
+    assert values == read_values(tmp_path)
     for solver in ("jumper", "mujoco"):
         assert values[f"{solver}_apex_m"] > 0.8 and values[f"{solver}_steps_per_s_jump"] > 0.0
     expected = values["jumper_steps_per_s_standing"] / values["mujoco_steps_per_s_standing"]
@@ -303,7 +313,7 @@ def test_solver_benchmark_compares_thread_counts(tmp_path):
 
 def test_gradient_cost_reports_gradient_error_and_saved_bytes(tmp_path):
     values = gradient_cost.main(gradient_cost.Args(num_envs=2, repeats=1, out=tmp_path, device="cpu"))
-    assert values == json.loads((tmp_path / "metrics.json").read_text())
+    assert values == read_values(tmp_path)
     assert values["height_difference_m"] == 0.0 and values["kept_bytes_a_policy_step"] <= 2000.0
     expected = values["gradient_us_a_step"] / values["plain_us_a_step"]
     assert values["cpu_ratio"] == pytest.approx(expected)
@@ -317,7 +327,7 @@ def test_shac_experiment_reports_curves_and_gradient_noise_and_refuses_empty_win
         num_gradient_envs=4, out=tmp_path, device="cpu",
     )  # fmt: skip
     values = shac.main(args)
-    assert values == json.loads((tmp_path / "metrics.json").read_text())
+    assert values == read_values(tmp_path)
     for who in ("new", "trained"):
         for name in ("physics", "score"):
             assert all(x > 0.0 for x in values[f"deviation_{name}_{who}"])

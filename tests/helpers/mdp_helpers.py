@@ -44,7 +44,7 @@ def standing_robots(n: int):
 
 def new_worlds(n: int, seed: int = 0, skill=0):
     """Return the `EpisodeArrays` of n new worlds."""
-    return episode_arrays(n, seed, array(np.broadcast_to(skill, n), int), "cpu")
+    return episode_arrays(n, seed, "training", array(np.broadcast_to(skill, n), int), "cpu")
 
 
 def no_delays(n: int, steps=0):

@@ -11,8 +11,8 @@ QUIET = {"num_recorded": 0, "device": "cpu"}  # no recordings
 
 def test_omnidirectional_policy_reaches_goals_in_all_directions(tmp_path):
     values = Ring(num_jumps=16, radius=0.8, out=tmp_path, **QUIET).run()  # [m]
-    assert values["success_rate"] == 1.0 and values["still_landing_rate"] == 1.0
-    assert values["mean_error_m"] < 0.006  # 0.0031 m of 200 jumps
+    assert values["success_rate"] == 1.0 and values["no_paw_lift_rate"] == 1.0
+    assert values["goal_distance_at_end_mean_m"] < 0.006  # 0.0031 m of 200 jumps
 
 
 def test_sighted_policy_lands_on_blocks_that_a_blind_one_hits(tmp_path):
@@ -26,38 +26,40 @@ def test_sighted_policy_lands_on_blocks_that_a_blind_one_hits(tmp_path):
 def test_slippery_policy_lands_where_the_default_one_falls(tmp_path):
     flags, names = QUIET | {"num_jumps": 12, "friction": 0.3}, ("slippery_jump", "horizontal_jump")
     slippery, default = (DistanceSweep(policy=name, out=tmp_path / name, **flags).run() for name in names)
-    assert slippery["success_rate"] == 1.0 and slippery["mean_error_m"] < 0.015  # 0.0074 m of 500 jumps
+    assert slippery["success_rate"] == 1.0 and slippery["goal_distance_at_end_mean_m"] < 0.015  # 0.0074 m of 500 jumps
     assert default["success_rate"] < 0.8
 
 
 def test_waiting_policy_lands_on_slippery_ground(tmp_path):
     values = DistanceSweep(policy="slippery_waiting_jump", num_jumps=12, friction=0.4, out=tmp_path, **QUIET).run()
-    assert values["success_rate"] == 1.0 and values["mean_error_m"] < 0.015  # 0.0087 m of 1000 jumps
+    assert values["success_rate"] == 1.0 and values["goal_distance_at_end_mean_m"] < 0.015  # 0.0087 m of 1000 jumps
 
 
 def test_mars_horizontal_policy_reaches_its_distances(tmp_path):
     args = {"policy": "mars_horizontal_jump", "num_jumps": 8, "distance_range": (0.5, 5.0)}  # [m]
     values = DistanceSweep(out=tmp_path, **args, **QUIET).run()
-    assert values["success_rate"] == 1.0 and values["step_free_success_rate"] == 1.0
-    assert values["mean_error_m"] < 0.02 and values["gravity_m_s2"] == 3.71
+    assert values["success_rate"] == 1.0 and values["success_without_paw_lift_rate"] == 1.0
+    assert values["goal_distance_at_end_mean_m"] < 0.02 and values["gravity_m_s2"] == 3.71
 
 
 def test_mars_policy_with_springs_reaches_its_distances(tmp_path):
     args = {"policy": "mars_springs_jump", "num_jumps": 8, "distance_range": (0.5, 6.0)}  # [m]
     values = DistanceSweep(out=tmp_path, **args, **QUIET).run()
-    assert values["success_rate"] == 1.0 and values["single_jump_success_rate"] == 1.0
-    assert values["mean_error_m"] < 0.025  # 0.014 m of 200 jumps
+    assert values["success_rate"] == 1.0 and values["success_without_hop_rate"] == 1.0
+    assert values["goal_distance_at_end_mean_m"] < 0.025  # 0.014 m of 200 jumps
 
 
 def test_mars_vertical_policy_reaches_its_heights_and_keeps_its_heading(tmp_path):
     args = {"policy": "mars_vertical_jump", "num_jumps": 8, "height_range": (0.9, 3.6)}  # [m]
     values = HeightSweep(out=tmp_path, **args, **QUIET).run()
-    assert values["success_rate"] == 1.0 and values["largest_reached_m"] > 3.5
-    assert values["mean_abs_error_m"] < 0.02 and values["mean_turn_deg"] < 15.0  # 0.011 m, 4.6 degrees of 200 jumps
+    assert values["success_rate"] == 1.0 and values["apex_max_m"] > 3.5
+    assert (
+        values["apex_error_abs_mean_m"] < 0.02 and values["turn_abs_mean_deg"] < 15.0
+    )  # 0.011 m, 4.6 degrees of 200 jumps
 
 
 def test_mars_vertical_policy_with_stock_filter_reaches_its_heights_and_lands(tmp_path):
     args = {"policy": "mars_vertical_jump_stock", "num_jumps": 8, "height_range": (0.8, 2.9)}  # [m]
     values = HeightSweep(out=tmp_path, **args, **QUIET).run()
-    assert values["success_rate"] == 1.0 and values["mean_abs_error_m"] < 0.015  # 0.0055 m of 200 jumps
-    assert values["fall_rate"] == 0.0 and values["at_rest_within_1_s_rate"] == 1.0
+    assert values["success_rate"] == 1.0 and values["apex_error_abs_mean_m"] < 0.015  # 0.0055 m of 200 jumps
+    assert values["fall_rate"] == 0.0 and values["at_rest_rate"] == 1.0

@@ -3,12 +3,14 @@ import math
 import os
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 from rich.console import Console
 
 from jumper_warp.utils import output, runtime
+from jumper_warp.utils.metrics import MetricValue, unit_of
 
 
 def test_default_output_folder_is_name_and_time(tmp_path, monkeypatch):
@@ -39,12 +41,41 @@ def test_metrics_file_holds_the_given_metrics(tmp_path):
     metrics = {"apex [m]": 1.075, "worlds": 4096, "method": "open loop", "passed": True, "gap": None, "list": [18.0, 1]}
     path = output.write_metrics(tmp_path, metrics)
     assert path == tmp_path / "metrics.json"
-    assert json.loads(path.read_text(encoding="utf-8")) == metrics
+    assert output.read_values(tmp_path) == metrics
+
+
+def test_metrics_file_has_documented_layout(tmp_path):
+    jsonschema = pytest.importorskip("jsonschema")
+    rate = MetricValue(0.5, 4, (0.15, 0.85), "landed jumps")
+    output.write_metrics(tmp_path, {"fall_rate": rate, "apex [m]": 1.0, "bin_m": [1.0, None]}, {"solver": "mujoco"})
+    schema = json.loads((Path(__file__).parents[2] / "docs" / "metrics.schema.json").read_text())
+    document = json.loads((tmp_path / "metrics.json").read_text())
+    jsonschema.validate(document, schema)
+    with pytest.raises(jsonschema.ValidationError):
+        jsonschema.validate(document | {"version": 0}, schema)
+
+
+def test_metric_has_value_unit_trials_interval_and_set_of_trials(tmp_path):
+    path = output.write_metrics(tmp_path, {"drift_m": MetricValue(0.5, 4, (0.1, 0.9), "jumps")}, {"a": 1})
+    assert json.loads(path.read_text()) == {
+        "schema": "jumper-warp metrics", "version": 1, "conditions": {"a": 1},
+        "metrics": {"drift_m": {"value": 0.5, "unit": "m", "trials": 4, "interval": [0.1, 0.9], "over": "jumps"}},
+    }  # fmt: skip
+    assert output.read_metrics(tmp_path) == {"drift_m": MetricValue(0.5, 4, [0.1, 0.9], "jumps")}
+
+
+@pytest.mark.parametrize(
+    ("key", "unit"),
+    [("rmse_vx_m_s", "m/s"), ("spin_rad_s", "rad/s"), ("settling_s", "s"), ("tilt_deg", "deg"), ("jumps", None),
+     ("gravity_m_s2", "m/s^2"), ("torque_nm", "N m"), ("rate [poses/s]", "poses/s"), ("fall_rate", None)],
+)  # fmt: skip
+def test_unit_is_read_from_the_end_of_the_key(key, unit):
+    assert unit_of(key) == unit
 
 
 def test_numpy_scalars_are_written_as_numbers(tmp_path):
-    path = output.write_metrics(tmp_path, {"a": np.float32(0.5), "b": [np.int64(3)], "c": np.bool_(True)})
-    assert json.loads(path.read_text()) == {"a": 0.5, "b": [3], "c": True}
+    output.write_metrics(tmp_path, {"a": np.float32(0.5), "b": [np.int64(3)], "c": np.bool_(True)})
+    assert output.read_values(tmp_path) == {"a": 0.5, "b": [3], "c": True}
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf, np.float32("nan")])
@@ -70,7 +101,7 @@ def test_failed_write_keeps_the_old_metrics(tmp_path, monkeypatch):
     monkeypatch.setattr(os, "replace", full_disk)
     with pytest.raises(OSError, match="no space left"):
         output.write_metrics(tmp_path, {"apex": 2.0})
-    assert json.loads((tmp_path / "metrics.json").read_text()) == {"apex": 1.0}
+    assert output.read_values(tmp_path) == {"apex": 1.0}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["metrics.json", "run.json"]
 
 

@@ -29,7 +29,7 @@ CHANGEABLE = [name for name in RobotParameters.vars if not name.startswith("nomi
 def event_kernel(which: int, p: wp.array(dtype=float), robot: RobotParameters):
     """Run event FUNCS[which] with numbers p in every world, with two lanes per world."""
     world, lane = wp.tid()
-    rng = make_stream(11, world, 16, 100 + which)
+    rng = make_stream(11, 0, world, 16, 100 + which)
     rng.lane = lane
     rng.lanes = 2
     for i in range(wp.static(len(FUNCS))):

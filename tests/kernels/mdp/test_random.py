@@ -1,3 +1,4 @@
+import itertools
 import math
 
 import numpy as np
@@ -6,6 +7,7 @@ import warp as wp
 from scipy.stats import kstest
 
 from jumper_warp.kernels.mdp.random import clamped_normal, fold_in, make_stream, uniform, uniform_range
+from jumper_warp.utils.streams import PURPOSES
 from mdp_helpers import array
 
 WORLDS, COLUMNS = 4096, 8
@@ -16,6 +18,7 @@ CLAMPED_STD = math.sqrt(0.5161)
 @wp.kernel(enable_backward=False)
 def draw_kernel(
     seed: int,
+    purpose: int,
     worlds: wp.array(dtype=int),
     step_count: int,
     stream: int,
@@ -28,7 +31,7 @@ def draw_kernel(
 ):
     """Sample numbers with indices from `first` on; branch_of: number for `fold_in`, < 0: the stream itself."""
     i = wp.tid()
-    rng = make_stream(seed, worlds[i], step_count, stream)
+    rng = make_stream(seed, purpose, worlds[i], step_count, stream)
     if branch_of >= 0:
         rng = fold_in(rng, branch_of)
     seeds[i] = rng.seed
@@ -38,14 +41,18 @@ def draw_kernel(
         normal[i, j] = clamped_normal(rng, first + j)
 
 
-def samples(worlds=None, seed=7, step_count=16, stream=1, branch_of=-1, first=0, columns=COLUMNS):
+def samples(worlds=None, seed=7, step_count=16, stream=1, branch_of=-1, first=0, columns=COLUMNS, purpose=0):
     """Return stream seeds (worlds,), uniform numbers of [-2, 3) and clamped normal ones, (worlds, columns) each."""
     worlds = np.arange(WORLDS) if worlds is None else np.asarray(worlds)
     n = len(worlds)
     seeds = wp.zeros(n, dtype=wp.uint32, device="cpu")
     arrays = [wp.zeros((n, columns), dtype=float, device="cpu") for _ in range(3)]
     wp.launch(
-        draw_kernel, n, [seed, array(worlds, int), step_count, stream, branch_of, first], [seeds, *arrays], device="cpu"
+        draw_kernel,
+        n,
+        [seed, purpose, array(worlds, int), step_count, stream, branch_of, first],
+        [seeds, *arrays],
+        device="cpu",
     )
     uniforms, pairs, normal = (values.numpy() for values in arrays)
     np.testing.assert_array_equal(pairs, uniforms)
@@ -80,6 +87,22 @@ def test_numbers_are_a_hash_of_seed_world_step_count_stream_and_index(seed):
     np.testing.assert_allclose(uniform, -2.0 + 5.0 * unit, atol=1e-6)
 
 
+def test_streams_of_two_purposes_share_at_most_one_number_whatever_their_seeds():
+    """States of streams s and t are equal where s - t = pcg(index of t) - pcg(index of s): once if these all differ."""
+    indices = np.arange(-2, 20000)  # largest index: of an attempt to sample a start state
+    starts = [(purpose * 2**28 + indices) % 2**32 for purpose in range(len(PURPOSES))]
+    for first, second in itertools.combinations(starts, 2):
+        differences = pcg(second) - pcg(first)
+        assert len(np.unique(differences)) == len(differences)
+
+
+@pytest.mark.parametrize("purpose", range(len(PURPOSES)))
+def test_purposes_have_their_own_ranges_of_indices(purpose):
+    states, uniform, _ = samples(purpose=purpose)
+    unit = (pcg(hashed(states[:, None], purpose * 2**28 + np.arange(COLUMNS))) >> np.uint32(8)) / 2.0**24
+    np.testing.assert_allclose(uniform, -2.0 + 5.0 * unit, atol=1e-6)
+
+
 def test_a_number_does_not_depend_on_which_others_are_sampled():
     _, uniform, normal = samples()
     three = [5, 4000, 17]  # worlds
@@ -91,6 +114,7 @@ def test_a_number_does_not_depend_on_which_others_are_sampled():
 
 CHANGES = {
     "seed": {"seed": 8},
+    "purpose": {"purpose": 3},
     "step_count": {"step_count": 17},
     "far clock": {"step_count": 16 + 60 * 3600},
     "stream": {"stream": 2},
@@ -164,5 +188,5 @@ def truncated(x):
 
 
 def test_a_stream_and_its_branches_have_the_index_of_their_world():
-    rng = make_stream(seed=3, world=12, step_count=40, stream=1)
+    rng = make_stream(seed=3, purpose=0, world=12, step_count=40, stream=1)
     assert rng.world == 12 and fold_in(rng, 5).world == 12

@@ -10,10 +10,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import warp as wp
 
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
 from jumper_warp.robot.model import build_model
+from jumper_warp.sim.links import LinkReader
 from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.utils.rotations import rotate
 
@@ -26,25 +26,6 @@ if TYPE_CHECKING:
 
 SHOWN = 0.7  # Place of the world in a picture among the recorded ones, which are in the order of their goals, 0 to 1
 ANKLE = np.array([0.0, 0.0, -0.3])  # [m] Position of the ankle in the shank's frame
-
-
-class LinkReader:
-    """Computes poses and twists of all links from the joint coordinates, without changing the simulation."""
-
-    def __init__(self, env: Env) -> None:
-        """Allocate a separate state of the environment's model."""
-        self._sim, self._state = env.sim, env.sim.model.state()
-
-    def read(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return pose (num_envs, 21, 7) and twist (num_envs, 21, 6) of every link, world frame; waits for the device.
-
-        pose: position [m] and quaternion (xyzw); twist: velocity of the COM [m/s] and angular velocity [rad/s].
-        """
-        state, n = self._state, self._sim.num_worlds
-        wp.copy(state.joint_q, self._sim.state.joint_q)
-        wp.copy(state.joint_qd, self._sim.state.joint_qd)
-        self._sim.physics.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
-        return state.body_q.numpy().reshape(n, -1, 7), state.body_qd.numpy().reshape(n, -1, 6)
 
 
 class EnvRecorder:
@@ -62,7 +43,7 @@ class EnvRecorder:
         from jumper_warp.viz.recorder import Recorder
 
         self.env, self.log, self.worlds = env, log, list(worlds)
-        self.links = LinkReader(env)
+        self.links = LinkReader(env.sim)
         spacing = log.spacing if isinstance(ground, str) else 0.0  # robots on a heightfield keep their places
         model = build_model(len(worlds), ground=ground, device=env.wp_device)
         labels, notes = log.names(self.worlds), {**(notes or {}), **log.notes(self.worlds)}

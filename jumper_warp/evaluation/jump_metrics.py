@@ -1,0 +1,100 @@
+"""Tables of the metrics of jumps to heights and to places, and the flags that their evaluations share."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from jumper_warp.evaluation.jumps import JumpLog, JumpOutcome
+from jumper_warp.evaluation.log import within
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
+
+LEVEL_TILT = 10.0  # [deg] Tilt of the base below which a landing is level
+DRIFT, TURN = 0.2, 25.0  # [m], [deg] Drift and turn of the base beyond which the authors' configuration ends an episode
+
+JUMP_METRICS = (
+    Metric("success_rate", rate, "jumps", lambda o: o.success),
+    Metric("goal_reached_rate", rate, "jumps", lambda o: o.reached),
+    Metric("landed_rate", rate, "jumps", lambda o: o.landed),
+    Metric("at_rest_rate", rate, "jumps", lambda o: o.at_rest),
+    Metric("no_paw_lift_rate", rate, "jumps", lambda o: o.still),
+    Metric("success_without_paw_lift_rate", rate, "jumps", lambda o: o.success & o.still),
+    Metric("success_without_hop_rate", rate, "jumps", lambda o: o.success & ~o.hopped),
+    Metric("fall_rate", rate, "jumps", lambda o: o.fell),
+    Metric("collision_rate", rate, "jumps", lambda o: o.collided),
+    Metric("diverged_rate", rate, "jumps", lambda o: o.diverged),
+    Metric("miss_rate", rate, "jumps", lambda o: o.missed),
+    Metric("early_rate", rate, "jumps", lambda o: o.early),
+    Metric("no_jump_rate", rate, "jumps", lambda o: o.no_jump),
+    Metric("second_takeoff_rate", rate, "jumps that touched down", lambda o: o.took_off_again),
+    Metric("landing_tilt_below_10_deg_rate", rate, "landed jumps", lambda o: o.tilt_deg < LEVEL_TILT),
+    Metric("landing_tilt_mean_deg", mean, "landed jumps", lambda o: o.tilt_deg),
+    Metric("landing_tilt_max_deg", largest, "landed jumps", lambda o: o.tilt_deg),
+    Metric("turn_abs_mean_deg", mean, "landed jumps", lambda o: o.turn_deg),
+    Metric("turn_abs_max_deg", largest, "landed jumps", lambda o: o.turn_deg),
+)
+"""Metrics of all jumps; `JumpOutcome` defines their events."""
+HEIGHT_METRICS = (
+    *JUMP_METRICS[:7],
+    Metric("apex_error_abs_mean_m", mean, "jumps that did not diverge", lambda o: np.abs(o.apex_error_m)),
+    Metric("apex_error_signed_mean_m", mean, "jumps that did not diverge", lambda o: o.apex_error_m),
+    Metric("apex_error_abs_max_of_successes_m", largest, "successful jumps", lambda o: np.abs(o.apex_error_m)),
+    Metric("apex_max_m", largest, "jumps that did not diverge", lambda o: o.apex_m),
+    Metric("drift_mean_m", mean, "landed jumps", lambda o: o.drift_m),
+    Metric("drift_max_m", largest, "landed jumps", lambda o: o.drift_m),
+    Metric("beyond_authors_limits_rate", rate, "landed jumps", lambda o: (o.drift_m > DRIFT) | (o.turn_deg > TURN)),
+    *JUMP_METRICS[7:],
+)
+"""Metrics of jumps to heights; the authors' limits are those of drift and turn, DRIFT and TURN."""
+PLACE_METRICS = (
+    *JUMP_METRICS[:7],
+    Metric("goal_distance_at_rest_mean_m", mean, "landed jumps", lambda o: o.distance_at_rest_m),
+    Metric("goal_distance_at_touchdown_mean_m", mean, "jumps that touched down", lambda o: o.distance_at_touchdown_m),
+    Metric("goal_distance_at_end_mean_m", mean, "jumps that did not diverge", lambda o: o.distance_at_end_m),
+    Metric("goal_distance_at_rest_max_m", largest, "landed jumps", lambda o: o.distance_at_rest_m),
+    Metric("goal_error_ahead_signed_mean_m", mean, "landed jumps", lambda o: o.ahead_m),
+    Metric("goal_error_left_signed_mean_m", mean, "landed jumps", lambda o: o.left_m),
+    Metric("distance_flown_mean_m", mean, "jumps that touched down", lambda o: o.distance_flown_m),
+    Metric("paw_to_paw_distance_mean_m", mean, "landed jumps", lambda o: o.paw_to_paw_distance_m),
+    *JUMP_METRICS[7:],
+)
+"""Metrics of jumps to places."""
+IN_RANGE = ("success_rate", "goal_reached_rate", "no_paw_lift_rate", "apex_error_abs_mean_m",
+            "goal_distance_at_rest_mean_m")  # fmt: skip
+"""Keys that are also reported, with the prefix `in_range_`, of the goals within a range."""
+
+
+def jump_metrics(outcome: JumpOutcome, where: np.ndarray | None = None, prefix: str = "", note: str = "") -> Metrics:
+    """Return HEIGHT_METRICS or PLACE_METRICS of jumps; arguments as for `measure`."""
+    table = HEIGHT_METRICS if outcome.to_height.all() else PLACE_METRICS
+    return measure(table, outcome, where, prefix, note)
+
+
+def range_metrics(outcome: JumpOutcome, inside: np.ndarray, note: str) -> Metrics:
+    """Return the metrics IN_RANGE of the jumps in a mask, as `in_range_<key>`; note: says which these are."""
+    table = HEIGHT_METRICS if outcome.to_height.all() else PLACE_METRICS
+    return measure(chosen(table, *IN_RANGE), outcome, inside, "in_range_", note)
+
+
+@dataclass(frozen=True)
+class JumpFlags:
+    """Jumps from standing still."""
+
+    num_jumps: int = 200  # Number of jumps
+    success_range: tuple[float, float] = field(default=(0.3, 1.4), kw_only=True)
+    """[m] Smallest and largest distance or height counted by the `in_range` metrics."""
+
+    def __post_init__(self) -> None:
+        if self.num_jumps < 1:
+            raise InputError(f"num_jumps must be at least 1, got {self.num_jumps}")
+        if not 0.0 <= self.success_range[0] <= self.success_range[1] < 10.0:
+            raise InputError(f"success_range must be in [0, 10) m and rise, got {self.success_range}")
+
+    def metrics(self, log: JumpLog) -> Metrics:
+        """Return the metrics of a finished log: of all jumps, and of those within `success_range`."""
+        (low, high), outcome = self.success_range, log.outcome
+        size = np.linalg.norm(log.goals, axis=-1)  # [m] height or distance: the other one is 0
+        inside = within(size, self.success_range)
+        return jump_metrics(outcome) | range_metrics(outcome, inside, f"with goals of {low:g} to {high:g} m")

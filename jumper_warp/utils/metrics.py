@@ -1,0 +1,171 @@
+"""Tables of metrics, their values with 95 % confidence intervals, and how a terminal shows them."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping
+from typing import Any, NamedTuple, Protocol
+
+import numpy as np
+from numpy.typing import ArrayLike
+from rich.console import Console
+from rich.table import Column, Table
+
+Scalar = float | int | str | bool | None  # Type of a value, or of each item of a list of values
+UNITS = {
+    "_rad_s": "rad/s", "_m_s2": "m/s^2", "_nm_s": "N m s", "_m_s": "m/s", "_deg": "deg", "_mm": "mm", "_ms": "ms",
+    "_us": "us", "_nm": "N m", "_hz": "Hz", "_m": "m", "_s": "s", "_n": "N",
+}  # fmt: skip
+"""Unit by the end of a metric's key; longer ends come before the shorter ones that they contain."""
+
+
+class MetricValue(NamedTuple):
+    """Value of a metric, with the trials that it was computed from."""
+
+    value: Scalar | list[Scalar]  # None: undefined, such as a mean over no trials
+    trials: int | None = None  # Number of trials; None: not computed from trials
+    interval: tuple[float, float] | None = None  # 95 % confidence interval; None: undefined
+    over: str | None = None  # The trials, such as "landed jumps"
+
+
+AnyMetrics = Mapping[str, MetricValue | Scalar | list[Scalar]]  # Metrics by key, which ends in the unit
+Metrics = dict[str, MetricValue]  # Metrics by key
+Z = 1.959964  # [1] Two-sided 95 % quantile of the normal distribution
+RESAMPLES, BOOTSTRAP_SEED = 2000, 0  # Number of bootstrap samples of each mean, and seed of their draws
+BATCH = 4_000_000  # Number of values drawn at once, which limits the memory
+WIDTH = 80  # Characters in a line of a printed table
+
+
+class Outcome(Protocol):
+    """Arrays of trials that metrics are computed from."""
+
+    @property
+    def trials(self) -> Mapping[str, np.ndarray]:
+        """Sets of trials by name, such as "landed jumps": bool, of the shape of the arrays' first axes."""
+        ...
+
+
+class Metric(NamedTuple):
+    """Definition of a metric: a row of a table."""
+
+    key: str  # Says what is measured; ends in the unit, if there is one
+    statistic: Callable[[np.ndarray, str], MetricValue]  # `rate`, `mean`, `largest` or `rmse`
+    over: str  # Set of trials, a name in `Outcome.trials`
+    values: Callable[[Any], np.ndarray]  # Returns an array of an outcome, one entry per trial
+
+
+def unit_of(key: str) -> str | None:
+    """Return the unit in the end of a metric's key, as `_m_s` or ` [m/s]`; None: there is none, as in counts."""
+    if bracket := re.search(r"\[(.+)\]$", key):
+        return bracket[1]
+    return next((unit for end, unit in UNITS.items() if key.endswith(end)), None)
+
+
+def measure(
+    table: Iterable[Metric], outcome: Outcome, where: np.ndarray | None = None, prefix: str = "", note: str = ""
+) -> Metrics:
+    """Return the metrics of a table by key, each with `prefix` before it.
+
+    where: mask of the trials that count, default: all; note: says which these are, for the file.
+    """
+    metrics = {}
+    for key, statistic, over, values in table:
+        mask = outcome.trials[over] if where is None else outcome.trials[over] & where
+        metrics[prefix + key] = statistic(values(outcome)[mask], f"{over} {note}".strip())
+    return metrics
+
+
+def chosen(table: Iterable[Metric], *keys: str) -> list[Metric]:
+    """Return the rows of a table with these keys, in their order; keys that it lacks are skipped."""
+    rows = {metric.key: metric for metric in table}
+    return [rows[key] for key in keys if key in rows]
+
+
+def rate(values: ArrayLike, over: str = "") -> MetricValue:
+    """Return the fraction of true values (n,), with Wilson's interval; over: what the trials are."""
+    values = np.asarray(values, dtype=bool)
+    n, p = values.size, float(values.mean()) if values.size else None
+    if p is None:
+        return MetricValue(None, 0, None, over)
+    scale = 1.0 + Z * Z / n
+    center, half = p + 0.5 * Z * Z / n, Z * np.sqrt(p * (1.0 - p) / n + (0.5 * Z / n) ** 2)
+    low, high = (center - half) / scale, (center + half) / scale
+    return MetricValue(p, n, (max(float(low), 0.0), min(float(high), 1.0)), over)
+
+
+def mean(values: ArrayLike, over: str = "") -> MetricValue:
+    """Return the mean of the values (n,) that are finite, with a bootstrap interval; over: what the trials are."""
+    values = np.asarray(values, dtype=float).ravel()
+    known = np.isfinite(values)
+    return _ratio(np.stack([np.where(known, values, 0.0), known], axis=1), over)
+
+
+def rmse(squares: np.ndarray, over: str = "") -> MetricValue:
+    """Return the root mean square over all samples of all trials, with a bootstrap interval over trials.
+
+    squares: (trials, 2), sum of squared errors and number of samples of each trial.
+    """
+    return _ratio(np.asarray(squares, dtype=float), over, np.sqrt)
+
+
+def _ratio(rows: np.ndarray, over: str, function: Callable[[Any], Any] = lambda ratio: ratio) -> MetricValue:
+    """Return a function of the ratio of the sums of two columns, (trials, 2); the second holds numbers of samples."""
+    rows = rows[rows[:, 1] > 0]
+    if not len(rows):
+        return MetricValue(None, 0, None, over)
+    total, means = rows.sum(axis=0), resampled_means(rows)
+    low, high = np.quantile(function(means[:, 0] / means[:, 1]), (0.025, 0.975))
+    return MetricValue(float(function(total[0] / total[1])), len(rows), (float(low), float(high)), over)
+
+
+def largest(values: ArrayLike, over: str = "") -> MetricValue:
+    """Return the largest of the finite values; over: what the trials are."""
+    values = np.asarray(values, dtype=float).ravel()
+    values = values[np.isfinite(values)]
+    return MetricValue(float(values.max()) if len(values) else None, len(values), None, over)
+
+
+def resampled_means(rows: np.ndarray) -> np.ndarray:
+    """Return the means of RESAMPLES bootstrap samples of rows (n, columns), (RESAMPLES, columns)."""
+    rng, n = np.random.default_rng(BOOTSTRAP_SEED), len(rows)
+    at_once = max(1, min(RESAMPLES, BATCH // n))
+    sizes = [min(at_once, RESAMPLES - done) for done in range(0, RESAMPLES, at_once)]
+    return np.concatenate([rows[rng.integers(0, n, (size, n))].mean(axis=1) for size in sizes])
+
+
+def print_metrics(
+    metrics: AnyMetrics, paper: Mapping[str, float] | None = None, conditions: Mapping[str, Any] | None = None,
+    title: str = "",
+) -> None:  # fmt: skip
+    """Print conditions and metrics with intervals beside the paper's values, at most WIDTH characters a line.
+
+    Metrics whose value is a list are left out.
+    """
+    console, conditions = Console(width=WIDTH), conditions or {}
+    table = Table(
+        Column("metric", overflow="fold"),
+        "value",
+        "95 % interval",
+        *(["paper"] if paper else []),
+        box=None,
+        pad_edge=False,
+    )
+    for key, entry in metrics.items():
+        value, _, interval, _ = entry if isinstance(entry, MetricValue) else MetricValue(entry)
+        if not isinstance(value, list):
+            limits = "" if interval is None else "{:.4g} to {:.4g}".format(*interval)
+            known = [f"{paper[key]:g}" if key in paper else ""] if paper else []
+            table.add_row(key, format_value(value), limits, *known)
+    if title:
+        console.print(title)
+    if conditions:
+        text = "; ".join(f"{name} {format_value(value)}" for name, value in conditions.items())
+        console.print(text, highlight=False)
+    console.print(table)
+
+
+def format_value(value: Any) -> str:
+    """Return a value as text; floats, also in lists, have four significant digits."""
+    if isinstance(value, list):
+        return ", ".join(format_value(item) for item in value)
+    return f"{value:.4g}" if isinstance(value, float) else str(value)

@@ -1,0 +1,205 @@
+"""Images and videos of Gymnasium environments."""
+
+import gymnasium
+import imageio_ffmpeg
+import numpy as np
+import pytest
+import torch
+from gymnasium.wrappers.vector import RecordVideo
+from scipy.interpolate import RegularGridInterpolator
+
+from jumper_warp.envs.camera import WorldCamera
+from jumper_warp.envs.env import Env
+from jumper_warp.envs.gymnasium import GymVectorEnv
+from jumper_warp.gym import env_id
+from jumper_warp.registry import make_task
+from jumper_warp.robot.grounds import BlockCfg, uneven
+from jumper_warp.viz import renderer
+
+SIZE = (160, 120)  # [px] width and height
+ACTIONS = np.random.default_rng(0).uniform(-0.5, 0.5, (20, 2, 12)).astype(np.float32)
+
+
+def vector(task="vertical-jump", num_envs=2, **arguments):
+    """Return an environment of a task that draws small images."""
+    options = {"render_mode": "rgb_array", "render_size": SIZE, "device": "cpu", "seed": 3} | arguments
+    return gymnasium.make_vec(env_id(task), num_envs=num_envs, **options)
+
+
+@pytest.fixture
+def envs():
+    """Return two standing robots without randomisation on level ground."""
+    envs = vector(randomize=False)
+    envs.reset(seed=1)
+    envs.env.evaluation_reset(np.array([0.0, 0.0, 0.6]))
+    yield envs
+    envs.close()
+
+
+def middle(image):
+    """Return the middle third of an image."""
+    height, width = image.shape[:2]
+    return image[height // 3 : 2 * height // 3, width // 3 : 2 * width // 3]
+
+
+def brown(image):
+    """Return the number of pixels in the color of blocks."""
+    red, green, blue = image.astype(int).transpose(2, 0, 1)
+    return int(((red > green + 15) & (green > blue + 15) & (green > 90)).sum())
+
+
+# ---------------------------------------------------------------- videos
+
+
+@pytest.mark.filterwarnings("ignore:.*autoreset mode is same-step:UserWarning")
+def test_record_video_writes_a_film_of_all_robots(tmp_path):
+    pytest.importorskip("moviepy", reason="RecordVideo needs moviepy")
+    envs = RecordVideo(vector(), str(tmp_path / "videos"), video_aspect_ratio=(2, 1))
+    envs.reset(seed=1)
+    for action in ACTIONS:
+        envs.step(action)
+    envs.close()
+    reader = imageio_ffmpeg.read_frames(str(tmp_path / "videos" / "rl-video-episode-0.mp4"))
+    facts = next(reader)
+    frames = [np.frombuffer(frame, np.uint8).reshape(SIZE[1], 2 * SIZE[0], 3) for frame in reader]
+    assert (facts["size"], facts["fps"], len(frames)) == ((2 * SIZE[0], SIZE[1]), 60.0, len(ACTIONS) + 1)
+    for column in (slice(0, SIZE[0]), slice(SIZE[0], None)):
+        robot = [middle(frame[:, column]).astype(float) for frame in frames]
+        assert min(image.std() for image in robot) > 30.0
+        assert np.abs(robot[-1] - robot[0]).mean() > 3.0
+
+
+def test_frames_per_second_are_the_policys():
+    envs = vector()
+    assert envs.metadata["render_modes"] == ["rgb_array"]
+    assert envs.metadata["render_fps"] == pytest.approx(1.0 / envs.env.step_dt)
+
+
+# ---------------------------------------------------------------- images
+
+
+@pytest.mark.parametrize("tensors", [False, True])
+def test_drawing_does_not_change_the_simulation(tensors):
+    drawn, plain = (vector("horizontal-jump", tensors=tensors, render_mode=mode) for mode in ("rgb_array", None))
+    actions = torch.from_numpy(ACTIONS) if tensors else ACTIONS
+    for envs in (drawn, plain):
+        envs.reset(seed=5)
+    for action in actions:
+        images, results = drawn.render(), [envs.step(action) for envs in (drawn, plain)]
+        assert [(image.shape, image.dtype) for image in images] == [((*SIZE[::-1], 3), np.uint8)] * 2
+        for a, b in zip(results[0][:4], results[1][:4], strict=True):
+            np.testing.assert_array_equal(a, b)
+    for name in ("joint_q", "joint_qd", "body_q", "body_qd"):
+        states = [getattr(envs.env.sim.state, name).numpy() for envs in (drawn, plain)]
+        np.testing.assert_array_equal(*states)
+    drawn.close()
+
+
+def test_the_camera_follows_a_robot_over_any_distance(envs):
+    before = envs.render()[1].astype(int)
+    coordinates = envs.env.sim.joint_q().copy()
+    coordinates[1, 0] += 37.0  # [m] a whole number of periods of the drawn plane
+    envs.env.sim.state.joint_q.assign(coordinates.ravel())
+    after = envs.render()[1].astype(int)
+    assert np.abs(after - before).mean() < 0.5
+    coordinates[1, 0] += 0.2  # [m] within the dead zone
+    envs.env.sim.state.joint_q.assign(coordinates.ravel())
+    assert np.abs(envs.render()[1].astype(int) - before).mean() > 3.0
+
+
+def test_environments_draw_in_turn(envs):
+    other = vector(num_envs=1)
+    other.reset(seed=1)
+    before = envs.render(), other.render()
+    after = envs.render(), other.render()
+    for images, same in zip(before, after, strict=True):
+        np.testing.assert_array_equal(images, same)
+    other.close()
+    np.testing.assert_array_equal(envs.render(), before[0])
+
+
+def test_only_the_first_worlds_are_drawn():
+    envs = vector(num_envs=3, render_envs=2)
+    envs.reset(seed=1)
+    images = envs.render()
+    assert isinstance(images, tuple) and [image.shape for image in images] == [(*SIZE[::-1], 3)] * 3
+    assert [image.any() for image in images] == [True, True, False]
+    envs.close()
+
+
+def test_each_world_shows_its_own_block_also_after_a_change():
+    block = BlockCfg((0.6, 0.0), half=np.array([[0.15, 0.3], [0.05, 0.1]]))
+    envs = GymVectorEnv(
+        Env(make_task("vertical-jump"), 2, device="cpu", block=block), render_mode="rgb_array", render_size=SIZE
+    )
+    envs.reset(seed=1)
+    large, small = (brown(image) for image in envs.render())
+    assert large > 2 * small > 100
+    blocks = envs.env.sim.physics.dynamics.robot.ground.blocks
+    values = blocks.numpy()
+    values["exists"][0], values["half"][1] = 0, values["half"][0]
+    blocks.assign(values)
+    gone, grown = (brown(image) for image in envs.render())
+    assert gone < small / 2 and grown == pytest.approx(large, rel=0.2)
+    envs.close()
+
+
+@pytest.mark.parametrize("point", [(0.3, -0.6), (1.9, 1.7)])
+def test_drawn_heightfield_is_the_simulated_one(point):
+    field = uneven(0.08, seed=2, cell=0.03)
+    env = Env(make_task("vertical-jump"), 1, device="cpu", ground=field)
+    camera = WorldCamera(env.sim, 1, SIZE)
+    (mesh,) = camera._scenery_shapes(np.array([[*point, 0.0, 0.0, 0.0]]))
+    vertices = mesh.vertices.astype(float) + [*point, 0.0]
+    heights = field.min_z + field.data * (field.max_z - field.min_z)
+    axes = np.linspace(-field.hy, field.hy, field.nrow), np.linspace(-field.hx, field.hx, field.ncol)
+    inside = np.abs(vertices[:, :2]).max(axis=1) < field.hx
+    expected = RegularGridInterpolator(axes, heights)(vertices[inside][:, 1::-1])
+    np.testing.assert_allclose(vertices[inside, 2], expected, atol=1.0e-4)
+    assert inside.sum() > 1000 and np.ptp(vertices[inside, 2]) > 0.05
+    assert np.isfinite(vertices).all() and np.abs(vertices[:, :2] - point).max() == pytest.approx(5.0, abs=0.1)
+
+
+def test_rays_are_traced_without_opengl(envs, monkeypatch, capsys):
+    def missing(*arguments):
+        raise ImportError("no pyglet")
+
+    monkeypatch.setattr(renderer, "GLRenderer", missing)
+    images = envs.render()
+    assert min(middle(image).std() for image in images) > 30.0
+    assert capsys.readouterr().err.count("ray tracer") == 1
+
+
+# ---------------------------------------------------------------- refusals
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"render_mode": "human"}, "render_mode must be 'rgb_array' or None, got 'human'"),
+        ({"render_size": (640,)}, "render_size must be a width and a height"),
+        ({"render_size": (8, 480)}, "render_size must be a width and a height"),
+        ({"render_envs": 0}, "render_envs must be"),
+    ],
+)
+def test_what_cannot_be_drawn_is_refused(arguments, words):
+    with pytest.raises(ValueError, match=words):
+        vector(**arguments)
+
+
+def test_drawing_without_render_mode_warns():
+    envs = vector(render_mode=None)
+    envs.reset()
+    with pytest.warns(UserWarning, match="render_mode"):
+        assert envs.render() is None
+
+
+def test_drawing_out_of_order_is_refused():
+    envs = vector()
+    with pytest.raises(gymnasium.error.ResetNeeded):
+        envs.render()
+    envs.reset()
+    envs.render()
+    envs.close()
+    with pytest.raises(gymnasium.error.ClosedEnvironmentError):
+        envs.render()
