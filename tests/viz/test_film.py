@@ -161,6 +161,14 @@ def test_diverged_robot_is_shown_until_then(tmp_path, monkeypatch, tracing, valu
     assert min(shown[:4]) > 20 and max(shown[4:]) == 0  # [px] frames at 0, 4, 8, 12, 16 ... of the recording
 
 
+def test_trails_and_arrows_end_where_the_robot_diverges(tmp_path, canvas):
+    recording = box_recording(walk(0.5), commands=np.zeros((31, 1, 3), np.float32))
+    recording.poses[16:, :, :3] = recording.contact_points[16:] = 1.0e9  # [m]
+    write_film(recording, tmp_path / "lost.webp", size=SIZE)
+    points = np.concatenate([line.points for lines in canvas[0].lines for line in lines])
+    assert np.nanmax(np.abs(points)) < 2.0  # [m]
+
+
 def test_interpolated_poses_are_unit_quaternions_halfway_and_exact_at_recorded_times():
     recording = box_recording(walk(1.0))
     angles = np.array([0.0, 40.0, 80.0, 170.0])

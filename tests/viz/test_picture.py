@@ -66,7 +66,9 @@ def test_horizontal_jump_keeps_its_places_and_runs_to_the_right(heading):
 
 def test_each_of_two_jumps_in_a_row_has_its_apex():
     positions, forces = jump(1.0)
-    twice = np.concatenate([positions, positions + [1.0, 0.0, 0.0]])
+    later = positions + [1.0, 0.0, 0.0]
+    later[:, 0] = 1.0 + (later[:, 0] - 1.0) ** 2  # accelerated, so its apex is not midway
+    twice = np.concatenate([positions, later])
     scene = compose(box_recording(twice, forces=np.tile(forces, 2)))
     second = REST + 1
     assert scene.flights == [(TAKEOFF, TOUCHDOWN), (second + TAKEOFF, second + TOUCHDOWN)]
@@ -144,6 +146,14 @@ def test_blocks_move_with_their_world_and_do_not_change_the_moments(tmp_path):
         np.testing.assert_array_equal(compose(shown, rank).frames, compose(recording, rank).frames)
         with Image.open(write_picture(shown, tmp_path / "block.png", rank=rank, width=WIDTH)) as image:
             assert image.size[0] == WIDTH and colored(image, 1).any()
+
+
+@pytest.mark.parametrize(("top", "step"), [(0.3, 0.25), (1.4, 0.25), (2.9, 0.5), (5.0, 1.0), (90.0, 16.0)])
+def test_scale_of_heights_has_few_marks_up_to_the_apex(top, step):
+    recording = box_recording(np.stack([[distance, 0.0, top] for distance in (0.0, 1.0)]))
+    marks = picture._ticks(compose(recording))
+    assert np.diff(marks) == pytest.approx(step) and len(marks) <= 8
+    assert marks[0] == 0.0 and top - step < marks[-1] <= top + 0.1
 
 
 @pytest.mark.parametrize("frames", [1, 2, 30])
