@@ -20,7 +20,7 @@ def test_sighted_policy_lands_on_blocks_that_a_blind_one_hits(tmp_path):
     sighted = Platform(policy="sighted_jump", out=tmp_path / "sighted", **flags).run()
     blind = Platform(policy="horizontal_jump", out=tmp_path / "blind", **flags).run()
     assert sighted["block_success_rate"] == 1.0 and sighted["platform_success_rate"] == 1.0
-    assert blind["block_success_rate"] < 0.7
+    assert blind["block_success_rate"] < 0.9  # 0.69 of 100 jumps
 
 
 def test_slippery_policy_lands_where_the_default_one_falls(tmp_path):
