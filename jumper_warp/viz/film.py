@@ -21,7 +21,18 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.viz.props import goal_shapes
 from jumper_warp.viz.recording import Recording
 from jumper_warp.viz.renderer import Line, View, open_renderer
-from jumper_warp.viz.scene import Label, annotate, body_paths, corners, fit, follow, velocity_arrows, without_divergence
+from jumper_warp.viz.scene import (
+    ABOVE,
+    REACH,
+    Label,
+    annotate,
+    body_paths,
+    corners,
+    fit,
+    follow,
+    velocity_arrows,
+    without_divergence,
+)
 from jumper_warp.viz.shapes import ShapeMesh
 from jumper_warp.viz.style import BASE_COLOR, LEG_COLORS
 
@@ -89,7 +100,10 @@ def _images(
     frames = np.clip(np.searchsorted(recording.times, times - 1.0e-9), 0, len(recording.times) - 1)
     poses, paths = drawn_poses(recording, times), body_paths(recording, ranks)
     targets = follow(paths, float(np.mean(np.diff(recording.times))) if len(recording.times) > 1 else 1.0)
-    frame_view = _view(paths - targets[:, None], size, eye)
+    seen = paths - targets[:, None]
+    if not recording.contact_forces.any():  # the legs of a floating robot may point up
+        seen = np.concatenate([seen, seen + [0.0, 0.0, REACH - ABOVE]], axis=1)
+    frame_view = _view(seen, size, eye)
     targets, bases = _interpolated(recording, targets, times), _interpolated(recording, paths, times)
     console = Console(stderr=True)
     with open_renderer(_shapes(recording, ranks), len(recording.bodies), size) as renderer:

@@ -77,9 +77,9 @@ class Composition:
         along = corners(self.bases) @ self.right
         return float(along.min()) - 0.15, float(along.max()) + 0.15
 
-    def point(self, along: float, height: float, nearer: float = 0.0) -> np.ndarray:
-        """Return a point of the plane [m], (3,): `along` right, at a height, and nearer to the eye by a distance."""
-        depth = self.base[0] @ self.toward_eye + nearer
+    def point(self, along: float, height: float) -> np.ndarray:
+        """Return a point of the plane [m], (3,): `along` right, at a height."""
+        depth = self.base[0] @ self.toward_eye
         return along * self.right + depth * self.toward_eye + [0.0, 0.0, height]
 
 
