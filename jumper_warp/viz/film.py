@@ -101,7 +101,7 @@ def _images(
     poses, paths = drawn_poses(recording, times), body_paths(recording, ranks)
     targets = follow(paths, float(np.mean(np.diff(recording.times))) if len(recording.times) > 1 else 1.0)
     seen = paths - targets[:, None]
-    if not recording.contact_forces.any():  # the legs of a floating robot may point up
+    if len(recording.commands) or not recording.contact_forces.any():  # arrows; raised legs of a floating robot
         seen = np.concatenate([seen, seen + [0.0, 0.0, REACH - ABOVE]], axis=1)
     frame_view = _view(seen, size, eye)
     targets, bases = _interpolated(recording, targets, times), _interpolated(recording, paths, times)
