@@ -31,7 +31,7 @@ class WorldCamera:
     """Draws the first worlds of a simulation, with their ground and blocks, without changing the simulation.
 
     All worlds share a renderer, which opens at the first image and holds one robot and the scenery of every world. It
-    loads the scenery anew when a block gets another size, or a robot on a heightfield goes far.
+    loads the scenery again when a block gets another size, or a robot on a heightfield goes far.
     """
 
     def __init__(self, sim: Simulation, count: int, size: tuple[int, int]) -> None:
@@ -52,7 +52,7 @@ class WorldCamera:
         self._renderer: Renderer | None = None
 
     def images(self) -> list[np.ndarray]:
-        """Return an image of each world as it is now, (height, width, 3) uint8, RGB. Waits for the device."""
+        """Return a present image of each world, (height, width, 3) uint8, RGB. Waits for the device."""
         links = self._links.read()[0][: self._count].astype(float)
         self._follow(links[:, 0, :3])
         scenery, blocks = self._present_scenery()

@@ -40,7 +40,7 @@ class Reset:
     new state; writes coordinates and rates of world `rng.world`."""
     settings: Any = None
     """Frozen dataclass with `struct`, a `@wp.struct`, and `values(step_dt)` [s], which returns one; or None.
-    A property `max_episode_length_s` tells the time limit [s] of episodes that it ends (0: none)."""
+    A property `max_episode_length_s` is the time limit [s] of episodes that it ends (0: none)."""
     parallel: bool = False
     """Whether threads of a GPU share `func`'s attempts, `range(rng.lane, number, rng.lanes)`. Only `rng.lane` differs
     between the threads; apart from the attempts they must write equal values."""
