@@ -42,7 +42,7 @@ class Parameter:
         """Raise InputError: bounds that exclude the nominal value, or (ratio) 0 and below, or a prior not positive."""
         low, high = self.bounds
         if not (math.isfinite(low) and math.isfinite(high) and low <= self.nominal <= high and low < high):
-            raise InputError(f"parameter {self.name}: bounds {self.bounds} must be finite and hold {self.nominal}")
+            raise InputError(f"parameter {self.name}: bounds {self.bounds} must be finite and contain {self.nominal}")
         if not 0.0 < self.prior < math.inf:
             raise InputError(f"parameter {self.name}: prior must be positive and finite, got {self.prior}")
         if self.scale == "ratio" and not low > 0.0:
@@ -129,7 +129,7 @@ class ParameterSet:
         left_out, known = set(names), {*GROUPS, *self.names, *(p.quantity for p in self.parameters)}
         if left_out - known:
             raise InputError(
-                f"no parameter {min(left_out - known)!r:.60} to leave out; there are {', '.join(self.names)}"
+                f"unknown parameter {min(left_out - known)!r:.60} to exclude; expected one of {', '.join(self.names)}"
             )
         return ParameterSet(tuple(p for p in self.parameters if not left_out & {p.name, p.group, p.quantity}))
 
@@ -140,7 +140,7 @@ class ParameterSet:
         """
         unknown = set(changes) - set(self.names)
         if unknown:
-            raise InputError(f"no parameter {min(unknown)!r}; there are {', '.join(self.names)}")
+            raise InputError(f"unknown parameter {min(unknown)!r}; expected one of {', '.join(self.names)}")
         return ParameterSet(tuple(dataclasses.replace(p, **changes.get(p.name, {})) for p in self.parameters))
 
 
@@ -148,13 +148,13 @@ def jumper_parameters(groups: Sequence[str] = GROUPS, description: RobotDescript
     """Return the robot's parameters of some groups, by default all 79.
 
     motors: kp, kd, armature by motor; torque limit, cutoff and no-load speed by kind of motor. masses: mass, com and
-    inertia of the base, mass ratio by kind of link. friction: of each motor, the knees and the paws. latency: of the
-    targets. offsets: of the 12 angle sensors. Raises InputError: an unknown group or none.
+    inertia of the base, mass ratio by kind of link. friction: friction of each motor, the knees and the paws. latency:
+    latency of the targets. offsets: offsets of the 12 angle sensors. Raises InputError: an unknown group or none.
     """
     unknown = [group for group in groups if group not in GROUPS]
     if unknown or not groups:
         problem = f"unknown group of parameters {unknown[0]!r:.60}" if unknown else "no group of parameters"
-        raise InputError(f"{problem}; there are {', '.join(GROUPS)}")
+        raise InputError(f"{problem}; expected one of {', '.join(GROUPS)}")
     robot = load_description() if description is None else description
     every = (*motor_parameters(robot), *mass_parameters(robot), *friction_parameters(robot))
     every += (

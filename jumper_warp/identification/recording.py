@@ -61,7 +61,7 @@ def sample_plan(kind: Kind, rng: np.random.Generator, seconds: float = 1.25, tor
     elif kind in ("hung chirp", "standing chirp"):
         target = chirp_targets(ticks, rng, hung=kind == "hung chirp")
     else:
-        raise InputError(f"no kind of motion {kind!r:.60}; there are {', '.join(dict.fromkeys(KINDS))}")
+        raise InputError(f"unknown kind of motion {kind!r:.60}; expected one of {', '.join(dict.fromkeys(KINDS))}")
     return Plan(kind, target * DEGREES, torque_limit)
 
 
@@ -203,8 +203,8 @@ def measure(
 ) -> RecordedMotion:
     """Return the sensors' recording of a simulated motion: motors at 240 Hz, the base's pose every `base_every` rows.
 
-    name: of the motion. record: true motion of world 0; robots: its sensor offsets. rng: random numbers of the noise,
-    None for no noise. noise: its standard deviations. torque: whether motor torques are recorded.
+    name: name of the motion. record: true motion of world 0; robots: its sensor offsets. rng: random numbers of the
+    noise, None for no noise. noise: its standard deviations. torque: whether motor torques are recorded.
     """
     levels = channel_noise(noise or NoiseLevels())
     rows = len(plan.rows)

@@ -33,7 +33,7 @@ FIXED_AT_REST = (24, 25, 29, 32, 33, 34)
 
 
 class NothingMeasured(InputError):
-    """A motion has no measurement to compare with a replay."""
+    """Error for a motion without measurements to compare with a replay."""
 
 
 class Linearised(NamedTuple):
@@ -78,7 +78,7 @@ class MotionResiduals:
         if self.free and not self.initial.resting:
             self.valid[motion.time < motion.time[0] + SETTLING] = False
         if not self.valid.any():
-            raise NothingMeasured(f"motion {motion.name}: nothing is measured that a replay could be compared to")
+            raise NothingMeasured(f"motion {motion.name}: no measurements to compare with a replay")
         self.jacobian_worlds = self._plan_jacobian()
 
     def _make_grid(self, dt: float | None) -> float:
@@ -90,7 +90,7 @@ class MotionResiduals:
         gaps = np.diff(motion.time)
         if gaps.max() > LONGEST_GAP:
             row = int(np.argmax(gaps)) + 1
-            raise InputError(f"motion {motion.name}: {gaps.max():.3g} s pass before row {row}: split it there")
+            raise InputError(f"motion {motion.name}: gap of {gaps.max():.3g} s before row {row}: split it there")
         period = float(np.median(gaps))
         uniform = bool(
             np.abs(motion.time - motion.time[0] - period * np.arange(len(motion.time))).max() < 0.01 * period

@@ -29,7 +29,7 @@ class BlockCfg:
     half: tuple[float, float] | np.ndarray = (0.4, 0.4)
     """[m] Half extents along x and y."""
     height: float | np.ndarray = 0.1
-    """[m] Of the top above z = 0."""
+    """[m] Height of the top above z = 0."""
     mass: float | np.ndarray = 10.0
     """[kg]"""
     friction: float | np.ndarray = 0.4

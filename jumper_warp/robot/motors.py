@@ -68,7 +68,7 @@ class MotorCfg:
     def __post_init__(self) -> None:
         """Raise InputError unless 0 <= fade_start < fade_end, both finite."""
         if not 0.0 <= self.fade_start < self.fade_end < math.inf:
-            raise InputError(f"fade_start and fade_end must rise, got {self.fade_start}, {self.fade_end}")
+            raise InputError(f"need 0 <= fade_start < fade_end, finite, got {self.fade_start}, {self.fade_end}")
 
     @classmethod
     def from_description(
@@ -150,7 +150,7 @@ class LimitsCfg:
     def __post_init__(self) -> None:
         """Raise InputError: the limits do not rise or are not finite, or the zones are negative or overlap."""
         if not -math.inf < self.lower < self.upper < math.inf:
-            raise InputError(f"limits must be finite and rise, got {self.lower}, {self.upper}")
+            raise InputError(f"lower limit must be below upper limit, both finite, got {self.lower}, {self.upper}")
         if not (self.lower_zone >= 0.0 and self.upper_zone >= 0.0):
             raise InputError(f"hard zones must be >= 0, got {self.lower_zone}, {self.upper_zone}")
         if not self.lower_zone + self.upper_zone <= self.upper - self.lower:

@@ -120,7 +120,7 @@ class Motor:
 
 @dataclass(frozen=True, eq=False)
 class RobotDescription:
-    """Robot independent of a simulator: links, joints, loops, motors and poses; `dataclasses.replace` modifies it."""
+    """Description of a robot: links, joints, loops, motors and poses; `dataclasses.replace` returns a changed copy."""
 
     path: Path  # JSON file
     urdf_path: Path

@@ -24,7 +24,7 @@ class RobotValues:
     base_mass: np.ndarray  # (N, 1) [kg]
     base_com: np.ndarray  # (N, 3) [m], base frame
     base_inertia: np.ndarray
-    """(N, 1) [1] Scales the described inertia about the centre of mass, besides the ratio of the base masses."""
+    """(N, 1) [1] Factor on the described inertia about the centre of mass, in addition to the ratio of base masses."""
     link_mass: np.ndarray  # (N, 5) [1] Ratio to the described mass and inertia, one column per entry of `LINK_KINDS`
     armature: np.ndarray  # (N, 12) [kg m^2]
     motor_friction: np.ndarray  # (N, 12) [N m]

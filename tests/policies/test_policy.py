@@ -283,7 +283,7 @@ def make_external(model):
 
 F32 = np.float32
 NOT_REPRODUCIBLE = "the graph or the metadata of the ONNX file is not what these weights and config.json make"
-NEWER = "has version 4, this is version 3"
+NEWER = "has version 4, expected version 3"
 REFUSALS = {
     "manifest missing": (lambda f: (f / "manifest.json").unlink(), "manifest.json: cannot be read"),
     "manifest not JSON": (lambda f: (f / "manifest.json").write_text("{"), "manifest.json: not JSON"),
@@ -294,7 +294,7 @@ REFUSALS = {
     "newer config": (edit_config(lambda c: c.update(schema_version=4)), f"config.json: {NEWER}"),
     "older version": (
         edit_manifest(lambda m: m.update(schema_version=2)),
-        "has version 2, this is version 3; commit 05fa856 reads version 2",
+        "has version 2, expected version 3; commit 05fa856 reads version 2",
     ),
     "folder in place of a file": (
         lambda f: ((f / "policy.onnx").unlink(), (f / "policy.onnx").mkdir()),

@@ -165,7 +165,7 @@ def test_refuses_another_version_with_the_commit_that_reads_it(saved):
     _, config = saved
     for version in (3, 5):  # the present one is 4
         config["env"]["task"]["version"] = version
-        with pytest.raises(PolicyError, match=f"has version {version}, this is version 4; commit 05fa856"):
+        with pytest.raises(PolicyError, match=f"has version {version}, expected version 4; commit 05fa856"):
             restored_task(config)
 
 

@@ -135,7 +135,7 @@ def test_same_seed_gives_the_same_weights_and_a_loaded_state_resumes_bitwise():
 
 def test_refuses_a_state_without_learning_rate():
     state = shac().state_dict()
-    with pytest.raises(ValueError, match="lacks lr"):
+    with pytest.raises(ValueError, match="missing entries: lr"):
         shac().load_state_dict({name: value for name, value in state.items() if name != "lr"})
 
 

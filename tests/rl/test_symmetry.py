@@ -161,7 +161,7 @@ def test_symmetric_actor_resumes_only_with_the_same_symmetry():
     wrong["model"]["mirror_obs_order"] = wrong["model"]["mirror_obs_order"].flip(0)
     with pytest.raises(InputError, match="mirror_obs_order is of another observation"):
         second.load_state_dict(wrong)
-    with pytest.raises(InputError, match=r"has mirror_\w+, mirror_\w+, mirror_\w+ and 1 more besides"):
+    with pytest.raises(InputError, match=r"unexpected entries: mirror_\w+, mirror_\w+, mirror_\w+ and 1 more"):
         Ppo(PushTask(8), dataclasses.replace(CFG, symmetry="off")).load_state_dict(first.state_dict())
 
 

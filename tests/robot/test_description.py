@@ -67,7 +67,7 @@ def test_knee_angles_and_ankle_depth_of_a_symmetric_leg(description, leg, degree
 def test_refuses_leg_with_coinciding_knees_at_minus_14_9_degrees(description):
     angle = -math.asin(0.045 / 0.175)  # half the distance of the thigh axes over the thigh length
     assert math.degrees(angle) == pytest.approx(-14.9, abs=0.05)
-    with pytest.raises(ValueError, match="do not meet"):
+    with pytest.raises(ValueError, match="cannot connect knees"):
         knee_angles(leg_dimensions(description, "FL"), angle, angle)
 
 

@@ -138,8 +138,8 @@ def test_setting_that_json_cannot_restore_is_not_saved(value):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t.update(version=3), "the task has version 3, this is version 4; commit 05fa856 reads version 3"),
-        (lambda t: t.pop("version"), "the task has version None, this is version 4; commit 05fa856"),
+        (lambda t: t.update(version=3), "the task has version 3, expected version 4; commit 05fa856 reads version 3"),
+        (lambda t: t.pop("version"), "the task has version None, expected version 4; commit 05fa856"),
         (lambda t: t.pop("terminations"), "task.terminations is missing"),
         (lambda t: t.update(wings=2), "task: unknown setting 'wings'"),
         (lambda t: t["rewards"][3].pop("weight"), r"task.rewards\[3\]: a reward needs a weight"),
