@@ -50,7 +50,7 @@ def test_start_states_and_observation_noise_differ_by_purpose():
 
 
 def test_training_keeps_its_robots_start_states_and_noise():
-    """Literals are of the version before streams had purposes; its start states and noise are in the observation."""
+    """The literals were computed without purposes of streams; observations contain start states and noise."""
     jump, walk = (Env(make_task(name), 3, seed=5, device="cpu") for name in ("vertical-jump", "velocity-flat"))
     for env in (jump, walk):
         env.reset()
