@@ -47,7 +47,7 @@ def onnx_of(name):
 
 @pytest.fixture(scope="module")
 def page():
-    """Dict of the names that the page's Python code defines when it runs, and its output lines under `printed`."""
+    """Return the variables defined by the page's Python code by name, and its output lines under `printed`."""
     names, printed = {"print": lambda *values: printed.append(" ".join(map(str, values)))}, []
     for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL):
         exec(block, names)
@@ -139,7 +139,7 @@ def test_short_delay_of_the_commands_end_keeps_apex_and_one_takeoff(page):
     assert apex == pytest.approx(0.9, abs=0.005) and takeoffs == 1
 
 
-@pytest.mark.parametrize(("delay", "takeoffs"), [(12, 2), (480, 8)])  # 3 and 9 where the page's figures were made
+@pytest.mark.parametrize(("delay", "takeoffs"), [(12, 2), (480, 8)])  # 3 and 9 on the page, from another machine
 def test_command_that_stays_set_makes_the_robot_jump_again(page, delay, takeoffs):
     assert jump(page, delay=delay, ticks=480)[1] >= takeoffs
 

@@ -1,4 +1,4 @@
-"""Plots: errors below sweeps, intervals, outlines of grounds, legends beside the data."""
+"""Plots: errors below sweeps, intervals, outlines of grounds, legends outside the data."""
 
 import matplotlib.pyplot as plt
 import numpy as np

@@ -232,7 +232,7 @@ class Payload:
     """Object that creates a file when unpickled."""
 
     def __init__(self, path):
-        """path: of the file."""
+        """Store the path of the file to create."""
         self.path = path
 
     def __reduce__(self):

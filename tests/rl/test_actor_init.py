@@ -127,7 +127,7 @@ def test_initialised_actor_acts_as_the_policy(policy_symmetry, symmetry, hidden)
     for name, tensor in ppo.model.state_dict().items():
         assert name.startswith(("actor.", "obs_moments.")) or torch.equal(tensor, before[name]), name
     ppo.env.reset()
-    ppo.collect()  # uses the new weights, though the collector was built before
+    ppo.collect()  # uses the new weights, although the collector was built with the old ones
     torch.testing.assert_close(ppo.rollout.mean[0].clamp(-1.0, 1.0), model.act(ppo.rollout.obs[0]), atol=1e-5, rtol=0.0)
 
 

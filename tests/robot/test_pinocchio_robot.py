@@ -43,7 +43,7 @@ def test_ankle_depth_below_the_hips(robot, degrees, depth):
 
 
 def test_lateral_motor_swings_the_paw_outward(robot):
-    # at 90 degrees the ankle is 0.3718 m beside the hip and 0.0602 m above it; the right hip is at y = -0.105 m
+    # at 90 degrees the ankle is 0.3718 m outward of the hip and 0.0602 m above it; the right hip is at y = -0.105 m
     q = robot.configuration((0.0, 0.0, 0.0), LEVEL, np.tile(np.radians([90.0, 45.0, 45.0]), 4))
     assert robot.paw_positions(q)[1, 1:] == pytest.approx([-0.105 - 0.3718, 0.0602], abs=5e-5)
 

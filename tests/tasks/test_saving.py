@@ -74,7 +74,7 @@ def test_functions_of_a_loaded_but_not_passed_module_are_refused():
         task_from_json(content, [THIS])
 
 
-def test_refusal_says_that_a_passed_module_lacks_the_function():
+def test_refusal_reports_that_a_passed_module_lacks_the_function():
     content = saved(jump_with_user_reward())
     content["rewards"][9]["func"] = f"{__name__}:sleep"
     with pytest.raises(TaskError, match="there is no such one here"):

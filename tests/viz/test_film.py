@@ -22,7 +22,7 @@ GREEN = 1  # channel
 
 
 class Canvas:
-    """A renderer that draws nothing and keeps what it was given."""
+    """Stub of a renderer that draws nothing and stores its arguments."""
 
     name = "nothing"
 
@@ -42,7 +42,7 @@ class Canvas:
 
 @pytest.fixture
 def canvas(monkeypatch):
-    """List of the canvases that replace renderers."""
+    """Return the list of canvases that replace renderers."""
     opened = []
 
     def open_canvas(*args):

@@ -28,7 +28,7 @@ def poses(*positions):
 
 @pytest.fixture(scope="module")
 def opengl():
-    """Skip tests where pyglet itself cannot open a window; what fails after that is a fault of the renderer."""
+    """Skip tests if pyglet cannot open a window; any later failure is a fault of the renderer."""
     pyglet = pytest.importorskip("pyglet")
     pyglet.options["headless"] = True
     try:

@@ -104,7 +104,7 @@ def test_sums_over_episodes_are_exact_beyond_single_precision(probe):
 
 
 def test_episode_reward_is_the_mean_sum_of_ended_episodes_over_the_time_limit(probe):
-    """Worlds 0 to 15 end in the third step, 16 to 31 do and had their episode restarted after the first one."""
+    """Worlds 0 to 31 end in the third step; episodes of worlds 16 to 31 were restarted after the first step."""
     rewards = []
     for step in range(3):
         state = random_state(probe, seed=step)
