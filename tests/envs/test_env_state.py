@@ -205,7 +205,7 @@ def test_refusal_names_missing_and_unexpected_fields():
     env = make_env(2)
     state = env.state_dict()
     state["vertical-jump.cadence"] = state.pop("vertical-jump.phase")
-    with pytest.raises(ValueError, match=r"lacks \['vertical-jump.phase'\], has \['vertical-jump.cadence'\] besides"):
+    with pytest.raises(ValueError, match=r"'vertical-jump.phase'.*'vertical-jump.cadence'"):
         env.load_state_dict(state)
 
 
@@ -264,7 +264,7 @@ def test_loading_restores_changed_parameters_and_resets_the_others_to_the_task()
         expected[params.index(f"rewards.jump_height.{key}")] = value
     np.testing.assert_array_equal(numbers, expected)
     state["vertical-jump/changed"][0] = np.nan
-    with pytest.raises(ValueError, match="changed is not a number"):
+    with pytest.raises(ValueError, match="vertical-jump/changed is "):
         other.load_state_dict(state)
 
 

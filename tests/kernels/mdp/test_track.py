@@ -85,7 +85,7 @@ def seen_kernel(
 
 
 def paw_view(robot, sim):
-    """Return of each robot's view: contact (n, 4), first contact (n, 4), number of contacts (n,), collisions (n,)."""
+    """Return contact (n, 4), first contact (n, 4), number of contacts (n,) and collisions (n,) of the `RobotView`s."""
     n, ground = robot.diverged.shape[0], sim.physics.dynamics.robot.ground
     arrays = [wp.zeros(n, dtype=kind, device="cpu") for kind in (wp.vec4, wp.vec4, int, int)]
     wp.launch(seen_kernel, n, [robot, ground, *arrays], device="cpu")
