@@ -158,8 +158,8 @@ def load_motion(
     default: `angle/FL_outer [deg]`. Settings of a table are in a JSON file of the same name in its folder.
     torque_constant [N m/A]: torque at the joint per current, for tables with `current` instead of `torque`.
 
-    Raises InputError: an entry is missing, has another shape or unit, or is not finite; the message names it. OSError:
-    the file cannot be read.
+    Raises InputError: what is missing, of another shape or unit, or not finite; the message names it. OSError: the file
+    cannot be read.
     """
     path = Path(path)
     if path.suffix not in READERS:
