@@ -52,7 +52,7 @@ class Bench:
     torque: np.ndarray  # (n,) [N m] measured at the output shaft
 
     def __post_init__(self) -> None:
-        """Raise InputError: unequal columns, below 10 rows, not finite, falling times, or speeds above 300 rad/s."""
+        """Raise InputError for unequal columns, below 10 rows, NaN, falling times, or speeds above 300 rad/s."""
         n = len(self.time)
         for name in COLUMNS:
             values = getattr(self, name)

@@ -87,7 +87,7 @@ class Scorer:
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """Chosen motions and their expected information."""
+    """Chosen motions and their expected information about the parameters."""
 
     plans: tuple[Plan, ...]  # motions, in the order in which they were chosen
     gain: tuple[float, ...]  # [nat] Total information gained over the prior, 1/2 ln det, after each motion

@@ -52,7 +52,7 @@ class NoiseLevels:
     orientation: float = 0.5  # [deg] Of the base
 
     def check(self) -> None:
-        """Raise InputError: a level is not positive and finite."""
+        """Raise InputError unless all levels are positive and finite."""
         for name, value in vars(self).items():
             check_positive(f"noise {name}", value)
 
@@ -81,7 +81,7 @@ class RecordedMotion:
     notes: Mapping[str, Any] = field(default_factory=dict)  # Free-form metadata, saved with the motion
 
     def __post_init__(self) -> None:
-        """Raise InputError: a channel of another shape, not finite, or out of range, or a bad setting."""
+        """Raise InputError for a channel of another shape, not finite or out of range, or an invalid setting."""
         n, where = len(self.time), f"motion {self.name}"
         if n < 3 or self.time.ndim != 1:
             raise InputError(f"{where}: time must be one column of at least 3 rows, got shape {self.time.shape}")
@@ -104,7 +104,7 @@ class RecordedMotion:
         self._check_settings()
 
     def _check_settings(self) -> None:
-        """Raise InputError: quaternions not of length 1, nothing measured, or a setting out of range."""
+        """Raise InputError if quaternions are not of length 1, nothing is measured, or a setting is out of range."""
         where = f"motion {self.name}"
         if self.quaternion is not None:
             size = np.linalg.norm(self.quaternion, axis=1)

@@ -39,7 +39,7 @@ class Parameter:
     group: str = ""  # one of `GROUPS`
 
     def __post_init__(self) -> None:
-        """Raise InputError: bounds that exclude the nominal value, or (ratio) 0 and below, or a prior not positive."""
+        """Raise InputError if bounds exclude the nominal value, those of a ratio reach 0, or the prior is not positive."""
         low, high = self.bounds
         if not (math.isfinite(low) and math.isfinite(high) and low <= self.nominal <= high and low < high):
             raise InputError(f"parameter {self.name}: bounds {self.bounds} must be finite and contain {self.nominal}")
@@ -82,7 +82,7 @@ class ParameterSet:
     parameters: tuple[Parameter, ...]
 
     def __post_init__(self) -> None:
-        """Raise InputError: no parameters, or two parameters of one name."""
+        """Raise InputError if there are no parameters, or two of one name."""
         names = self.names
         if not names:
             raise InputError("there must be at least one parameter")

@@ -245,7 +245,7 @@ def channel_noise(noise: NoiseLevels) -> dict[str, tuple[float, int]]:
 
 
 def check_signs(motion: RecordedMotion) -> None:
-    """Raise InputError: a motor's angles are far from its targets, but less than half as far from the negated targets.
+    """Raise InputError if a motor's angles are far from its targets, but less than half as far from the negated targets.
 
     In motions of `recording` the distance to the negated targets is over four times that to the targets, so a factor of
     two separates both signs. Motors that stay near 0 pass.

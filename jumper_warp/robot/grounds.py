@@ -36,7 +36,7 @@ class BlockCfg:
     """[1] Coefficient of friction between block and floor."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: an extent or the mass is not positive, friction is negative, or a center is not finite."""
+        """Raise InputError if an extent or the mass is not positive, friction negative, or a center not finite."""
         for name in ("half", "height", "mass"):
             if not np.all(np.asarray(getattr(self, name)) > 0.0):
                 raise InputError(f"block {name} must be positive, got {getattr(self, name)}")

@@ -45,7 +45,7 @@ class MotorKindCfg:
     """[rad/s] Speed from which no driving torque is available."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: a value is negative or not finite, a torque limit is 0, or the speeds do not rise."""
+        """Raise InputError if a value is negative or not finite, a torque limit is 0, or no_load_speed is too low."""
         for name, value in vars(self).items():
             check_not_negative(f"motor {name}", value)
         if self.saturation == 0.0 or self.peak == 0.0:
@@ -148,7 +148,7 @@ class LimitsCfg:
     """[deg] Width of the hard zone before the upper limit."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: the limits do not rise or are not finite, or the zones are negative or overlap."""
+        """Raise InputError unless the limits are finite, lower < upper, and zones non-negative without overlap."""
         if not -math.inf < self.lower < self.upper < math.inf:
             raise InputError(f"lower limit must be below upper limit, both finite, got {self.lower}, {self.upper}")
         if not (self.lower_zone >= 0.0 and self.upper_zone >= 0.0):

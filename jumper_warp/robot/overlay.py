@@ -61,7 +61,7 @@ class RobotOverlay:
     """Origin of the values, free text."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: an unknown quantity or range, a wrong number of values, or one out of range."""
+        """Raise InputError for an unknown quantity or range, a wrong number of values, or a value out of range."""
         check_names("quantity", self.values, RANGES)
         check_names("range of randomisation", self.randomization, RANDOMIZED)
         nominal = vars(RobotValues.nominal(1))

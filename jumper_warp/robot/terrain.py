@@ -43,7 +43,7 @@ class TerrainCfg:
     """Seed of random ground."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: a count, length or slope is out of range, or a kind is unknown."""
+        """Raise InputError if a count, length or slope is out of range, or a kind is unknown."""
         if self.rows < 0 or self.seed < 0:
             raise InputError(f"terrain rows and seed must not be negative, got {self.rows}, {self.seed}")
         for kind in self.kinds or ("",):

@@ -46,7 +46,7 @@ class Outcome(Protocol):
 
 
 class Metric(NamedTuple):
-    """Definition of a metric: a row of a table."""
+    """Definition of a metric, a row of a table: key, statistic and the trials that it is computed from."""
 
     key: str  # Name of the measured quantity; ends in the unit, if there is one
     statistic: Callable[[np.ndarray, str], MetricValue]  # `rate`, `mean`, `largest` or `rmse`
