@@ -39,7 +39,7 @@ class Parameter:
     group: str = ""  # one of `GROUPS`
 
     def __post_init__(self) -> None:
-        """Raise InputError if bounds exclude the nominal value, those of a ratio reach 0, or the prior is not positive."""
+        """Raise InputError if bounds exclude the nominal value or (ratio) reach 0, or the prior is not positive."""
         low, high = self.bounds
         if not (math.isfinite(low) and math.isfinite(high) and low <= self.nominal <= high and low < high):
             raise InputError(f"parameter {self.name}: bounds {self.bounds} must be finite and contain {self.nominal}")
@@ -189,7 +189,7 @@ def relative(
 
 
 def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return the group motors: kp, kd, armature of 12 motors; torque limit and speeds by kind of motor."""
+    """Return the parameters of group motors: kp, kd, armature of 12 motors; torque limit, speeds by kind of motor."""
     parameters = []
     for quantity, prior in (("kp", 0.2), ("kd", 0.2)):
         parameters += [
@@ -210,7 +210,7 @@ def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
 
 
 def mass_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return the group masses: mass, com and inertia of the base, and mass ratios by kind of link."""
+    """Return the parameters of group masses: mass, com and inertia of the base, and mass ratios by kind of link."""
     base = robot.links[0]
     parameters = [relative("base_mass", "base_mass", (0,), "kg", base.mass, 0.15, "masses")]
     for i, axis in enumerate("xyz"):
@@ -226,7 +226,7 @@ def mass_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
 
 
 def friction_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return the group friction: Coulomb friction of 12 motors, damping of the knees, friction of the paws."""
+    """Return the parameters of group friction: Coulomb friction of 12 motors, knee damping, friction of the paws."""
     parameters = [
         ratio(
             f"motor_friction/{joint}", "motor_friction", (i,), "N m", robot.motors[i].coulomb_friction, 0.6, "friction"

@@ -127,7 +127,7 @@ def write_motors(parameters: dict[str, wp.array], motors: MotorCfg, robots: Robo
 
 
 def parameter_table(nominal: np.ndarray, robots: RobotValues) -> np.ndarray:
-    """Return N robots' parameter table (321, N), rows as in `kernels.layout`; nominal: as described, (321, 1)."""
+    """Return the parameter table (321, N) of N robots, rows as in `kernels.layout`; nominal: as described, (321, 1)."""
     table = np.repeat(nominal, len(robots.base_mass), axis=1)
     mass, com = robots.base_mass[:, 0], robots.base_com.T
     nominal_mass, nominal_moment = table[layout.BASE], table[layout.BASE + 1 : layout.BASE + 4]

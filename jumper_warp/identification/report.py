@@ -84,7 +84,7 @@ def write_results(result: Identification, folder: Path, source: str) -> None:
 
 
 def identified_overlay(result: Identification, source: str = "") -> RobotOverlay:
-    """Return the identified robot as an overlay, with 95 % intervals as randomisation ranges; source: text to save."""
+    """Return the identified robot as an overlay, with 95 % intervals as randomisation ranges; source: saved text."""
     quantities = tuple(dict.fromkeys(parameter.quantity for parameter in result.parameters))
     return overlay_of(result.robots(), quantities, randomization=randomization_ranges(result), source=source)
 

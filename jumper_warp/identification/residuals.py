@@ -58,7 +58,7 @@ class MotionResiduals:
         dt: float | None = None,
         span: tuple[int, int] | None = None,
     ):
-        """Prepare a motion; dt [s]: largest physics step, by default 1/480; span: first row and one past the last.
+        """Prepare the residuals of a motion; dt [s]: largest physics step, default 1/480; span: first row, end row.
 
         Raises InputError: angles of the wrong sign, gaps, or dt out of range; NothingMeasured.
         """
@@ -245,7 +245,7 @@ def channel_noise(noise: NoiseLevels) -> dict[str, tuple[float, int]]:
 
 
 def check_signs(motion: RecordedMotion) -> None:
-    """Raise InputError if a motor's angles are far from its targets, but less than half as far from the negated targets.
+    """Raise InputError if a motor's angles are far from its targets, and less than half as far from negated targets.
 
     In motions of `recording` the distance to the negated targets is over four times that to the targets, so a factor of
     two separates both signs. Motors that stay near 0 pass.
@@ -264,7 +264,7 @@ def check_signs(motion: RecordedMotion) -> None:
 
 
 def rows_of(motion: RecordedMotion, first: int, end: int) -> RecordedMotion:
-    """Return the motion with its rows from `first` to `end` - 1 alone."""
+    """Return a motion with the rows `first` to `end` - 1 of another."""
     if (first, end) == (0, len(motion.time)):
         return motion
     return replace(motion, **{name: values[first:end] for name, values in motion.columns().items()})

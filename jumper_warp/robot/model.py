@@ -152,7 +152,7 @@ def _paw_depth(leg: LegDimensions, lateral: float, ankle_z: float) -> float:
 def _robot_builder(
     description: RobotDescription, friction: float, gravity: float, visuals: bool
 ) -> newton.ModelBuilder:
-    """Return the builder of one robot in the default pose; friction: of the paws [1]; gravity: downward [m/s^2]."""
+    """Return the builder of one robot in the default pose; friction [1] of the paws; gravity [m/s^2]: downward."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     bodies = {}

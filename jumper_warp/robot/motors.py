@@ -143,9 +143,9 @@ class LimitsCfg:
     upper: float
     """[deg]"""
     lower_zone: float = 0.0
-    """[deg] Width of the hard zone before the lower limit."""
+    """[deg] Width of the hard zone inside the lower limit."""
     upper_zone: float = 0.0
-    """[deg] Width of the hard zone before the upper limit."""
+    """[deg] Width of the hard zone inside the upper limit."""
 
     def __post_init__(self) -> None:
         """Raise InputError unless the limits are finite, lower < upper, and zones non-negative without overlap."""
@@ -217,7 +217,7 @@ def filter_params(cfg: FilterCfg, *, module: ModuleType = command_filter) -> Any
 
 
 def filter_constants(cfg: FilterCfg | None) -> np.ndarray:
-    """Return a filter's constants, (14,), in the order and units of `FILTER_NAMES`; None: the vertical jump's."""
+    """Return a filter's constants, (14,), in the order and units of `FILTER_NAMES`; None: vertical jump."""
     cfg = cfg or vertical_jump_filter()
     angles = [getattr(getattr(cfg, angle), limit) for angle in ("lateral", "transversal", "sum") for limit in LIMITS]
     return np.array([*np.radians(angles), cfg.horizon, math.radians(cfg.speed_floor)])

@@ -152,7 +152,7 @@ class _Tile(NamedTuple):
         return np.clip(self.reach - self.off, 0.0, self.reach - self.cfg.start)
 
     def waves(self, shortest: float, longest: float, count: int) -> np.ndarray:
-        """Return the heights (n, n) [m] of `count` plane waves of random direction and wavelength [m].
+        """Return the heights (n, n) [m] of the sum of `count` plane waves of random direction and wavelength [m].
 
         Rim and middle are level; over 0.3 m the waves grow to full height, which is `difficulty * cfg.uneven`.
         """
