@@ -20,9 +20,9 @@ from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.errors import InputError
 
-MAX_JOINT_SPEED = 25.0  # [rad/s] of a safe motion: two thirds of the slowest motor's no-load speed
-MAX_TILT = 20.0  # [deg] of the base in a safe motion
-MIN_HEIGHT, MAX_HEIGHT = 0.15, 0.65  # [m] of a free base's origin above the ground in a safe motion
+MAX_JOINT_SPEED = 25.0  # [rad/s] largest in a safe motion: two thirds of the slowest motor's no-load speed
+MAX_TILT = 20.0  # [deg] largest tilt of the base in a safe motion
+MIN_HEIGHT, MAX_HEIGHT = 0.15, 0.65  # [m] range of a free base's origin above the ground in a safe motion
 MARGIN = 5.0  # [deg] between the angles of a safe motion and the filter's limits
 
 

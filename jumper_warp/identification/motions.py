@@ -45,11 +45,11 @@ EXAMPLE = (
 class NoiseLevels:
     """Standard deviations of the measurements."""
 
-    angle: float = 0.05  # [deg] Of motor angles
-    rate: float = 1.0  # [deg/s] Of motor rates
-    torque: float = 0.3  # [N m] Of motor torques
-    position: float = 5.0  # [mm] Of the base
-    orientation: float = 0.5  # [deg] Of the base
+    angle: float = 0.05  # [deg] Noise of motor angles
+    rate: float = 1.0  # [deg/s] Noise of motor rates
+    torque: float = 0.3  # [N m] Noise of motor torques
+    position: float = 5.0  # [mm] Noise of the base's position
+    orientation: float = 0.5  # [deg] Noise of the base's orientation
 
     def check(self) -> None:
         """Raise InputError unless all levels are positive and finite."""

@@ -15,7 +15,7 @@ from jumper_warp.robot.values import LATERAL, LINK_KINDS, MOTOR_QUANTITIES, PAW_
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 
-GROUPS = ("motors", "masses", "friction", "latency", "offsets")  # of parameters, see `jumper_parameters`
+GROUPS = ("motors", "masses", "friction", "latency", "offsets")  # Groups of parameters, see `jumper_parameters`
 BASE_ONLY = ("base_mass", "base_com", "base_inertia", "paw_friction")
 """Quantities without effect on the motion while the base is held and the paws hang free."""
 

@@ -26,7 +26,7 @@ KINDS: tuple[Kind, ...] = ("hung chirp", "hung chirp", "standing chirp", "small 
 TICK = 1.0 / 60.0  # [s] between targets
 SAMPLES = 4  # rows of a motion per tick: 240 Hz
 REST = 0.75  # [s] in the first pose before a motion is recorded, in which the robot comes to rest
-HELD_MASS = 1.0e4  # [kg] of a held base in `simulate_plan`, which also resets its pose after each step
+HELD_MASS = 1.0e4  # [kg] mass of a held base in `simulate_plan`, which also resets its pose after each step
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Plan:
 
     kind: Kind
     target: np.ndarray  # (ticks, 12) [rad] at 60 Hz
-    torque_limit: float  # [N m] of the motor controllers
+    torque_limit: float  # [N m] torque limit of the motor controllers
 
     @property
     def base(self) -> Literal["free", "fixed"]:
@@ -87,7 +87,7 @@ def chirp_targets(ticks: int, rng: np.random.Generator, hung: bool) -> np.ndarra
 def jump_targets(ticks: int, rng: np.random.Generator) -> np.ndarray:
     """Return targets [deg] (ticks, 12) of a squat, a push-off and a landing, with a random offset of each motor."""
     squat, push, land = rng.uniform(75.0, 95.0), rng.uniform(5.0, 25.0), rng.uniform(50.0, 65.0)
-    down, hold, up = 22, rng.integers(6, 12), rng.integers(9, 13)  # [ticks] of squatting, waiting, push-off
+    down, hold, up = 22, rng.integers(6, 12), rng.integers(9, 13)  # [ticks] durations of squatting, waiting, push-off
     target = np.zeros((ticks, 12))
     for tick in range(ticks):
         if tick < down + hold:

@@ -21,7 +21,7 @@ from jumper_warp.sim.slices import WorldRange
 from jumper_warp.utils.rotations import rotate
 from jumper_warp.utils.threads import checked_threads
 
-TOLERANCE = 1.0e-10  # [m/s] of the contact iteration; finite differences of replays inherit its error
+TOLERANCE = 1.0e-10  # [m/s] tolerance of the contact iteration, whose error finite differences of replays inherit
 
 
 @dataclass

@@ -21,7 +21,7 @@ pin: Any = pinocchio  # a compiled module without types
 PROXIMAL_ACCURACY = 1.0e-12  # residual at which Pinocchio's proximal iteration ends
 PROXIMAL_DAMPING = 1.0e-10  # proximal mu: keeps the solve regular, since a planar loop has three rows of rank two
 PROXIMAL_ITERATIONS = 20
-MAX_GAP = 1.0e-9  # [m] of a closed loop
+MAX_GAP = 1.0e-9  # [m] largest distance of the anchors of a closed loop
 
 
 @dataclass(frozen=True, eq=False)

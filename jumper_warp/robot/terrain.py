@@ -12,7 +12,7 @@ import numpy as np
 
 from jumper_warp.utils.errors import InputError
 
-KINDS = ("flat", "uneven", "waves", "slope", "bowl", "stairs", "pit", "blocks")  # of tiles
+KINDS = ("flat", "uneven", "waves", "slope", "bowl", "stairs", "pit", "blocks")  # Kinds of tiles
 
 
 @dataclass(frozen=True)

@@ -196,7 +196,7 @@ def test_final_obs_is_the_last_observation_and_obs_the_first_of_the_next_episode
         env.step(REST)
     ended = one.done == 1.0
     assert ended[:5].all() and not ended.all()
-    assert torch.equal(one.final_obs, other.final_obs)  # of an equal environment without auto_reset
+    assert torch.equal(one.final_obs, other.final_obs)  # those of an equal environment without auto_reset
     assert torch.equal(one.obs[~ended], one.final_obs[~ended])
     assert (one.obs[ended] != one.final_obs[ended]).any(dim=1).all()
     height = one.sim.joint_q()[:, 2]

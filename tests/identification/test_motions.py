@@ -12,7 +12,7 @@ from jumper_warp.identification.residuals import check_signs
 from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.utils.errors import InputError
 
-ROWS = 12  # of a motion
+ROWS = 12  # rows of a motion
 TORQUE_CONSTANT = 1.5  # [N m/A] of the motors in tables
 
 

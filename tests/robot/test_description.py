@@ -54,7 +54,7 @@ def test_leg_dimensions_of_the_back_right_leg(description):
 
 
 @pytest.mark.parametrize("leg", ["FL", "BR"])
-@pytest.mark.parametrize(("degrees", "depth"), [(0, 0.4716), (45, 0.3718)])  # of both thighs; [m]
+@pytest.mark.parametrize(("degrees", "depth"), [(0, 0.4716), (45, 0.3718)])  # both thighs; [m]
 def test_knee_angles_and_ankle_depth_of_a_symmetric_leg(description, leg, degrees, depth):
     angle = math.radians(degrees)
     outer_knee, inner_knee, ankle_z = knee_angles(leg_dimensions(description, leg), angle, angle)

@@ -36,7 +36,7 @@ def test_mass_motor_indices_and_armature(robot):
     assert not robot.model.armature[robot.knee_v].any()
 
 
-@pytest.mark.parametrize(("degrees", "depth"), [(0, 0.4716), (45, 0.3718)])  # of both thighs; [m]
+@pytest.mark.parametrize(("degrees", "depth"), [(0, 0.4716), (45, 0.3718)])  # both thighs; [m]
 def test_ankle_depth_below_the_hips(robot, degrees, depth):
     q = robot.configuration((0.0, 0.0, 0.0), LEVEL, np.tile(np.radians([0.0, degrees, degrees]), 4))
     assert -robot.paw_positions(q)[:, 2] == pytest.approx(np.full(4, depth), abs=5e-5)

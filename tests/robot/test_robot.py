@@ -17,7 +17,7 @@ from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.sim.mujoco import mujoco_solver
 from jumper_warp.sim.precision import float64_kernels
 
-COORDS, DOFS = 43, 38  # of a world
+COORDS, DOFS = 43, 38  # entries of joint_q and joint_qd per world
 LEGS = ("FL", "FR", "BL", "BR")
 FRONT = np.array([1, 1, -1, -1])  # sign of x by leg
 SIDE = np.array([1, -1, 1, -1])  # sign of y by leg

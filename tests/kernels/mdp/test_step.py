@@ -9,7 +9,7 @@ N = 64
 NAMES = ["first", "second", "third", "came_apart", "too_long"]  # terminations of the probe task
 FIRST, SECOND, THIRD, DIVERGED, LONG = range(5)
 NONE = -1
-GROWTH = 0.25  # of the state's value in a policy step
+GROWTH = 0.25  # increase of the state's value in a policy step
 
 
 @pytest.fixture
