@@ -153,7 +153,7 @@ def describe_direction(parameters: ParameterSet, vector: np.ndarray) -> str:
 
 
 def largest_members(parameters: Sequence[Parameter], vector: np.ndarray, quantity: str) -> str:
-    """Return ` (FL_outer, ...)`: up to four parameters of a quantity with the largest components of `vector` (P,).
+    """Return the largest components of `vector` (P,) in a quantity, up to four parameters, as text ` (FL_outer, ...)`.
 
     Empty if the quantity has only one parameter or all its components are below 0.3.
     """

@@ -1,4 +1,4 @@
-"""Output folders, and the file `metrics.json` (layout: docs/metrics.schema.json)."""
+"""Creation of output folders; writing and reading of `metrics.json` (layout: docs/metrics.schema.json)."""
 
 import json
 import math

@@ -214,8 +214,8 @@ class HopPolicy:
         self.step, self.begin = 0, 31
 
     def act(self, obs):  # actions (num_envs, 12), whatever the observations (num_envs, n)
-        since, self.step = self.step - self.begin, self.step + 1
-        level = 0.0 if since < 0 else min(since / 25, 1.0) if since < 60 else -1.0 if since < 80 else 0.0
+        elapsed, self.step = self.step - self.begin, self.step + 1
+        level = 0.0 if elapsed < 0 else min(elapsed / 25, 1.0) if elapsed < 60 else -1.0 if elapsed < 80 else 0.0
         return torch.tensor([0.0, level, level] * 4).repeat(len(obs), 1)
 
 
