@@ -47,7 +47,7 @@ def joint_friction(p: JointParams, rates: vec3) -> vec3:
 
 @wp.func
 def capped_damping(damping: real, rate: real, limit: real) -> real:
-    """Return the viscous coefficient [N m s/rad]: `damping`, but torque <= `limit` [N m] at `rate` [rad/s]."""
+    """Return the viscous coefficient [N m s/rad]: `damping`, reduced to a torque of `limit` [N m] at `rate` [rad/s]."""
     return wp.min(damping, limit / wp.max(wp.abs(rate), real(1.0e-6)))
 
 

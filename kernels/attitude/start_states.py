@@ -46,7 +46,7 @@ class AttitudeStart:
 
 @wp.func
 def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> AttitudeStart:
-    """Return `start`, the base of every attempt; in the last attempt with `default_legs` set.
+    """Return the base of an attempt: `start`, with the legs in the default pose in the last attempt.
 
     A `sample_base` of `mdp.attempts.sample_valid_state`; arrays and rng are unused.
     """

@@ -70,7 +70,7 @@ def advance_attitude(robot: RobotView, state: AttitudeState, tolerance: float) -
 
 @wp.func
 def carried_over(old: AttitudeState) -> AttitudeState:
-    """Return a state with the statistics alone, `old` added if it lasted to its end; the reset sets the rest."""
+    """Return a state with the statistics of `old` alone, updated if its episode was complete; reset sets the rest."""
     new = AttitudeState()
     new.episodes = old.episodes
     new.sum_error = old.sum_error

@@ -1,4 +1,4 @@
-"""The parts of a time step shared by `advance` and `advance_legs`: a leg's terms, a paw's contact, the base.
+"""Parts of a time step that `advance` and `advance_legs` share: a leg's terms, a paw's contact, the base.
 
 Semi-implicit Euler: forces and Jacobians are those at the start of the step, and positions move with the velocities at
 its end. Legs and paws k are 0 to 3 (FL, FR, BL, BR).
@@ -117,7 +117,7 @@ class Touch:
 
 @wp.func
 def block_law(model: RobotModel, world: int, base: BaseState, dt: real) -> BlockLaw:
-    """Return the law of a world's block for a step dt [s], in body axes; all zero where there is no block."""
+    """Return the constants of a world's block for a step dt [s], in body axes; all zero where there is no block."""
     law = BlockLaw()
     if model.ground.blocks.shape[0] > 0:
         block = model.ground.blocks[world]

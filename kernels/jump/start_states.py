@@ -23,7 +23,7 @@ from .state import NUM_START_MODES, vec_start_modes
 
 wp.set_module_options({"enable_backward": False})
 
-STANDING = wp.constant(0)  # at rest, squatting more or less, on sampled paw positions
+STANDING = wp.constant(0)  # at rest at a sampled height over sampled paw positions
 DEFAULT = wp.constant(1)  # default pose at rest
 IN_FLIGHT = wp.constant(2)  # on the ballistic flight to the goal
 TOUCHDOWN = wp.constant(3)  # in flight just before touchdown
@@ -43,9 +43,9 @@ class ResetRanges:
     lean: float  # largest distance of the base behind the paws' middle in the deepest squat; 0 at the highest
     heading: float  # half width of the heading
     front_x: wp.vec2  # front paws ahead of the base
-    front_y: wp.vec2  # front paws beside the base, absolute
+    front_y: wp.vec2  # front paws to the side of the base, absolute
     back_x: wp.vec2  # back paws behind the base, absolute
-    back_y: wp.vec2  # back paws beside the base, absolute
+    back_y: wp.vec2  # back paws to the side of the base, absolute
     takeoff_height: wp.vec2  # base above the ground
     takeoff_ahead: wp.vec2  # base ahead of its start, towards the goal
     takeoff_pitch: wp.vec2  # nose down, of states in flight and pushing off
@@ -84,7 +84,7 @@ class JumpStart:
 
 @wp.struct
 class JumpBase:
-    """The base in an attempt, see `sample_valid_state`; paws are placed around `spot`."""
+    """Sampled pose and velocity of the base in one attempt; paws are placed around `spot`."""
 
     pos: wp.vec3  # [m] base origin, world
     quat: wp.quat  # xyzw, body to world
@@ -305,8 +305,8 @@ def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, rng: RngStrea
     ranges = start.ranges
     if start.start_mode == IN_FLIGHT:
         return leg_in_flight(ranges, base, geo, rng, leg)
-    beside = sample_foot_offset(rng, leg, ranges.front_x, ranges.front_y, ranges.back_x, ranges.back_y)
-    spot = base.spot + rotate_yaw(beside, start.heading)
+    offset = sample_foot_offset(rng, leg, ranges.front_x, ranges.front_y, ranges.back_x, ranges.back_y)
+    spot = base.spot + rotate_yaw(offset, start.heading)
     paw = spot - base.pos
     if start.start_mode == TOUCHDOWN:
         # paws hang below the base, a little above the ground at least

@@ -1,7 +1,7 @@
 """The planar five-bar loop of one leg: position, velocity and bias acceleration in closed form.
 
 All points are (x, z) [m] in the motor housing frame. The two thighs turn about the transversal axes; a positive
-motor angle moves the thigh tip away from its twin. The loop constraint (paper, Eq. 1) holds by construction: the
+motor angle moves the thigh tip away from the other. The loop constraint (paper, Eq. 1) holds by construction: the
 ankle is the intersection of the two shank circles, on the branch below the knees. Rotation angles of links are about
 housing +y, 0 for a link that hangs along -z.
 """

@@ -68,7 +68,7 @@ def update_step_counts(robot: RobotView, state: VelocityState) -> VelocityState:
 
 @wp.func
 def advance_velocity(robot: RobotView, state: VelocityState, settle: float) -> VelocityState:
-    """Return the state after one more policy step; errors count later than `settle` policy steps after a command."""
+    """Return the state after one more policy step; errors count more than `settle` policy steps after a command."""
     t = update_step_counts(robot, state)
     t.steps = state.steps + 1
     t.command_steps = state.command_steps + 1
