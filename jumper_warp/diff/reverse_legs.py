@@ -29,7 +29,7 @@ class LegThreadReverse:
 
         All arguments are structs of the kernels. settings: `StepSettings`. motion: [`Timing`, `Actuation`, `Commands`,
         filtered targets (T, 12, num_worlds), `TrajectoryArrays`] of the rollout. cotangents: `TrajectoryArrays`, the
-        gradient of the loss by the rollout's.
+        gradient of the loss w.r.t. the rollout's.
         """
         robot, record, num = self._dynamics.robot, self._record, self._num
         legs, constants = self._modules.rollout_legs_adjoint, self._modules.constants_adjoint

@@ -213,7 +213,7 @@ class Simulation:
         self._physics(self.substeps, worlds)
 
     def _captured(self, name: str, body: Callable[[WorldRange], None]) -> None:
-        """Run `body` for all worlds: the first call of a name, or one in a capture, launches; others replay."""
+        """Run `body` for all worlds: launch it at the first call of a name or within a capture, else replay a graph."""
         if self.device.is_capturing:
             body(WorldRange(0, self.num_worlds))
             return

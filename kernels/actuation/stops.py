@@ -92,7 +92,7 @@ def stop_rates(p: StopParams, angles: vec3, dt: real) -> StopRates:
 
 @wp.func
 def beyond_stops(p: StopParams, angles: vec3) -> bool:
-    """Return whether motor angles [rad] are beyond any stop of the leg, or NaN; if not after a step, none was pressed."""
+    """Return whether motor angles [rad] are beyond any stop of the leg, or NaN; a step ending within presses none."""
     fold = angles[1] + angles[2]
     past = wp.max(p.sum_lower - fold, fold - p.sum_upper)
     for j in range(3):

@@ -94,7 +94,7 @@ def target_normal_velocity(gap: real, pressed: int, dt: real) -> real:
 
 @wp.func
 def couple_contact(contact: PawContact, point: vec3, leg: LegSolve, base: BaseInverse) -> PawContact:
-    """Return a contact with `from_lin` to `total` computed; point [m]: contact point from the base origin, body axes."""
+    """Return a contact with `from_lin` to `total` computed; point [m]: point of contact from the base origin, body."""
     c = contact
     eye = wp.identity(n=3, dtype=real)
     leg_response = leg.inverse * wp.transpose(c.jacobian)

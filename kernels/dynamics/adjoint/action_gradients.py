@@ -1,6 +1,6 @@
-"""Gradients of `leg_action` and `base_action` (`virtual_power`), and their constants; for CPU and GPU kernels.
+"""Gradients of the virtual power of a step (`leg_action`, `base_action`), for CPU and GPU kernels.
 
-"Gradient by x" means the partial derivative with respect to x, in the axes and the order of x.
+A gradient w.r.t. x has the axes and the order of x.
 """
 
 import warp as wp
@@ -24,25 +24,25 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class LegGradient:
-    """Gradient of `leg_action` by its arguments; the caller sums those by base and gravity over legs."""
+    """Gradient of `leg_action` w.r.t. its arguments; the caller sums those w.r.t. base and gravity over legs."""
 
     geometry: LegGeometry
     masses: LegMasses
     joints: JointParams
     spring: LegSpring
     stops: StopParams
-    mu: real  # by the friction coefficient
-    pos: vec3  # by the base's position, orientation and angular velocity (body axes)
+    mu: real  # w.r.t. the friction coefficient
+    pos: vec3  # w.r.t. the base's position, orientation and angular velocity (body axes)
     quat: quat
     omega: vec3
-    gravity: vec3  # by gravity in body axes
-    angles: vec3  # by the motors' angles and rates at the start of the step
+    gravity: vec3  # w.r.t. gravity in body axes
+    angles: vec3  # w.r.t. the motors' angles and rates at the start of the step
     rates: vec3
 
 
 @wp.struct
 class BaseGradient:
-    """Gradient of `base_action` by each of its arguments, axes as there."""
+    """Gradient of `base_action` w.r.t. each of its arguments, in the same axes."""
 
     body: MassMoments
     com: vec3
@@ -56,7 +56,7 @@ class BaseGradient:
 
 @wp.func
 def make_base_factors(base: BaseState, end: BaseState, virtual_lin: vec3, virtual_ang: vec3, dt: real) -> BaseFactors:
-    """Return the base's constants in a step dt [s] from `base` to `end`; virtual_*: see `BaseFactors`, body axes."""
+    """Return the `BaseFactors` of a step dt [s] from state `base` to `end`; virtual_*: multipliers, body axes."""
     factors = BaseFactors()
     factors.virtual_lin = virtual_lin
     factors.virtual_ang = virtual_ang
