@@ -11,7 +11,7 @@ PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def moment_rows(body: int) -> slice:
-    """Return a body's ten rows of the parameter table: mass, 3 first and 6 second moments, see `PAIRS`.
+    """Return the slice of a body's ten rows in the parameter table: mass, 3 first and 6 second moments, see `PAIRS`.
 
     body: 0 is the base; then 5 links of each leg FL, FR, BL, BR, as in the model.
     """

@@ -180,7 +180,7 @@ class ClosedLoop:
         return LoopState(**end, action=clamped, torque=trajectory.torque[-1], history=history)
 
     def motion(self, state: LoopState) -> RobotState:
-        """Return base and motors of a state, worlds first."""
+        """Return the `RobotState` (base and motors, worlds first) of a loop state."""
         q, qd = state.q.T, state.qd.T
         quat = q[:, 3:7] / q[:, 3:7].norm(dim=1, keepdim=True)
         ang = qd[:, 3:6]

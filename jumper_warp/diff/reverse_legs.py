@@ -12,7 +12,7 @@ SPAN = 4  # rows that one set of launches reverses
 
 
 class LegThreadReverse:
-    """Launches the kernels of `jumper_warp.kernels.dynamics.adjoint.rollout_legs_adjoint` and `constants_adjoint`."""
+    """Launcher of the kernels of `rollout_legs_adjoint` and `constants_adjoint` in `jumper_warp.kernels.dynamics`."""
 
     def __init__(self, dynamics: JumperDynamics, every: int):
         """Allocate the kernels' record of `SPAN` rows; every: physics steps between rows of a trajectory."""

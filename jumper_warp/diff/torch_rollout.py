@@ -20,7 +20,7 @@ OUTPUTS = ("q", "qd", "torque", "impulse", "filtered_target")  # differentiable 
 
 
 class TorchTrajectory(NamedTuple):
-    """A `Trajectory` as tensors with gradients, of T policy steps of S physics steps; do not change them in place."""
+    """Trajectory of a rollout as tensors with gradients, T policy steps of S physics steps; do not change in place."""
 
     q: torch.Tensor  # (K + 1, 19, num_worlds) as in `Trajectory`: base origin [m], quaternion xyzw, motor angles [rad]
     qd: torch.Tensor  # (K + 1, 18, num_worlds) velocity of the base's COM [m/s], angular velocity, motor rates [rad/s]

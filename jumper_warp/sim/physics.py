@@ -93,7 +93,7 @@ class Physics(ABC):
 
 
 class JumperPhysics(Physics):
-    """`SolverJumper`, which advances a whole policy step in one launch."""
+    """Physics of a simulation by `SolverJumper`, which advances a whole policy step in one launch."""
 
     sliced = True
     solver: SolverJumper
@@ -150,7 +150,7 @@ class JumperPhysics(Physics):
 
 
 class MujocoPhysics(Physics):
-    """Newton's SolverMuJoCo with this robot's motors and passive joints, several launches per physics step."""
+    """Physics of a simulation by Newton's SolverMuJoCo, with this robot's motors and passive joints as torques."""
 
     sliced = False
     solver: newton.solvers.SolverMuJoCo

@@ -28,7 +28,7 @@ FEASIBLE = 1.0e-3  # [1] constraints up to this value count as satisfied
 
 @dataclass
 class Progress:
-    """Best candidates of a descent so far."""
+    """Best candidate of each start of an optimisation so far, and its history."""
 
     x: np.ndarray  # (starts, n) Best feasible candidate of each start, or the least infeasible one if none was feasible
     objective: np.ndarray  # (starts,) Objective of `x`; infinite if no candidate was feasible

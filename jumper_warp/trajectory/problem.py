@@ -199,7 +199,7 @@ class Problem:
     """Number of policy steps of reverse passes so far, worlds times steps."""
 
     def __post_init__(self) -> None:
-        """Start with an empty cache of worlds, by number of candidates."""
+        """Create an empty cache of worlds, by number of candidates."""
         self._worlds: dict[int, _Worlds] = {}
 
     def rollout(self, num_worlds: int) -> Rollout:

@@ -1,4 +1,4 @@
-"""The motor command filter (paper, Section III): position targets are limited near the joint limits.
+"""Motor command filter (paper, Section III): position targets are limited near the joint limits.
 
 A quantity x (a motor angle, or the sum of a leg's two transversal angles) has limits [lower, upper]. With margins
 m_u = upper - x and m_l = x - lower, and the speed floor v_0, the time to violation is
@@ -38,7 +38,7 @@ class Limits:
 
 @wp.struct
 class FilterParams:
-    """Constants of the filter, the same for all legs and worlds."""
+    """Constants of the motor command filter, the same for all legs and worlds."""
 
     lateral: Limits
     transversal: Limits  # outer and inner alike

@@ -16,7 +16,7 @@ FRICTION_SPEED = wp.constant(real(0.01))
 
 @wp.struct
 class JointParams:
-    """Joint-space parameters of one leg; vectors are lateral, outer, inner."""
+    """Armature, friction and damping of the joints of one leg; vectors are lateral, outer, inner."""
 
     armature: vec3  # [kg m^2]
     friction: vec3  # [N m]

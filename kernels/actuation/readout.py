@@ -1,4 +1,4 @@
-"""Reading motor values, paw forces and the base's velocity out of Newton's arrays."""
+"""Kernels that read motor values, paw forces and the base's velocity from Newton's arrays."""
 
 import warp as wp
 

@@ -56,7 +56,7 @@ class StopRates:
 
 @wp.struct
 class StopForces:
-    """Pressed stops, implicit: torque [N m] at the current rates, and dt C [kg m^2] to add to the inertia."""
+    """Implicit forces of pressed stops: torque [N m] at the current rates, and dt C [kg m^2] to add to the inertia."""
 
     torque: vec3
     inertia: mat33
@@ -140,7 +140,7 @@ def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int,
 
 @wp.func
 def one_by_one(sets: int) -> bool:
-    """Return whether, after `sets` sets of a step, the next set may change one stop per world only."""
+    """Return whether a step that has tried `sets` sets may change only one stop per world in the next set."""
     return sets >= ONE_BY_ONE and sets < PRESS_ONLY
 
 
@@ -156,7 +156,7 @@ def change_one(pressed: int, required: int) -> int:
 
 @wp.func
 def row_torque(stop_rates: StopRates, i: int, rate: real, pressed: int) -> real:
-    """Return the torque [N m] of row i at its rate [rad/s] at the start of the step; 0 where no stop is pressed."""
+    """Return the torque [N m] of the stop in row i at rate [rad/s] at the start of the step; 0 if it is not pressed."""
     side = row_side(pressed, i)
     if side == 0:
         return real(0.0)

@@ -19,7 +19,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class AttitudeSettings:
-    """Ranges of start states; pairs are (lower, upper)."""
+    """Ranges from which start states of the attitude task are sampled; pairs are (lower, upper)."""
 
     episode_steps: wp.vec2  # policy steps that an episode lasts
     height: float  # [m] of the base above the ground

@@ -9,7 +9,7 @@ POLICY_RATE = wp.constant(60.0)  # policy steps in a second
 
 @wp.struct
 class AttitudeState:
-    """Task state of one world; the fields from `episodes` on accumulate over episodes until the host reads them."""
+    """State of the attitude task in one world; from `episodes` on fields accumulate until the host reads them."""
 
     goal: wp.quat  # xyzw, body to world: commanded orientation
     steps: int  # policy steps since the episode began

@@ -1,4 +1,4 @@
-"""Solution of the arrow-shaped system: eliminate the legs, solve the base's six equations, substitute back.
+"""Solution of the equations of motion, an arrow-shaped system: eliminate legs, solve six base equations, substitute.
 
 Equations and symbols (D, Bv, Bw, tau, h): see `leg_dynamics`. All vectors are in body axes.
 """

@@ -189,7 +189,7 @@ def add_block(contact: PawContact, block: BlockLaw) -> PawContact:
 
 @wp.struct
 class ContactState:
-    """Progress of the contact iteration; changes since the motion without contact, body axes."""
+    """State of the contact iteration; changes relative to the motion without contact, body axes."""
 
     lin: vec3  # change of the base's linear velocity [m/s]
     ang: vec3  # change of its angular velocity [rad/s]

@@ -54,7 +54,7 @@ class LegDynamics:
 
 @wp.struct
 class PawKinematics:
-    """Position and velocity maps of the paw centre (the ankle), body axes."""
+    """Position and Jacobians of the paw centre (the ankle), body axes."""
 
     position: vec3  # [m] from the base origin
     jacobian: mat33  # [m/rad] d position / d (lateral, outer, inner)

@@ -1,4 +1,4 @@
-"""Sums over the moving links of one leg, in the motor housing frame.
+"""Mass integrals over the moving links of one leg, in the motor housing frame.
 
 Each sum is an integral over the mass of a link of products of position r (about the hip) and its derivatives
 r_o, r_i with respect to the outer and inner motor angle. From them follow the leg's kinetic energy and, with
@@ -17,7 +17,7 @@ from .inertia import MassMoments, rotate_y, rotate_y_second, sym_outer
 
 @wp.struct
 class LinkSums:
-    """Integrals over link mass; subscripts o and i mean derivatives by the outer and inner motor angle.
+    """Integrals over link mass; subscripts o and i: derivatives w.r.t. the outer and inner motor angle.
 
     In the sums of one side of the leg, o is the motor of that side and i the other motor; `leg_sums` reorders them.
     """

@@ -44,7 +44,7 @@ class RobotModel:
 
 @wp.struct
 class StepSettings:
-    """Numerical settings of the step."""
+    """Numerical settings of time steps: step size, number of steps, contact tolerance."""
 
     dt: real  # [s]
     substeps: int  # steps of a launch
@@ -55,7 +55,7 @@ class StepSettings:
 
 @wp.struct
 class LegParams:
-    """Constants of one leg of one world."""
+    """Geometry, masses and joint constants of one leg of one world."""
 
     geometry: LegGeometry
     masses: LegMasses
@@ -108,7 +108,7 @@ def leg_terms(
 
 @wp.struct
 class Touch:
-    """Point of a surface that is nearest to a paw."""
+    """Nearest point of a surface to a paw: gap, normal and velocity."""
 
     gap: real  # [m] between surface and paw, negative inside
     normal: vec3  # unit, out of the surface, body axes

@@ -50,7 +50,7 @@ class Commands:
 
 @wp.struct
 class TrajectoryArrays:
-    """A trajectory, or the gradient with respect to one (empty array: zeros); K = T S / every, see `Timing`."""
+    """Arrays of a trajectory, or of the gradient w.r.t. one (empty: zeros); K = T S / every, see `Timing`."""
 
     q: wp.array3d(dtype=real)  # [m], [rad], (K + 1, ROW_COORDS, num_worlds)
     qd: wp.array3d(dtype=real)  # [m/s], [rad/s], (K + 1, ROW_RATES, num_worlds)

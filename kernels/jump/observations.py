@@ -43,7 +43,7 @@ def phase(robot: RobotView, state: JumpState) -> wp.vec3:
 
 @wp.func
 def phase_times(robot: RobotView, state: JumpState) -> wp.vec2:
-    """Time [s] in the present phase, at most 2, and since the command, clamped to -1..3."""
+    """Times [s] in the current phase, at most 2, and since the command, clamped to -1..3."""
     return wp.vec2(
         wp.min(float(state.phase_steps), 120.0) / 60.0,
         wp.clamp(float(state.steps - state.command_step), -60.0, 180.0) / 60.0,

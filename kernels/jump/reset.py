@@ -32,7 +32,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class JumpSettings:
-    """Ranges of start states and of sampled ground."""
+    """Ranges from which the reset of a jump samples start states and ground."""
 
     states: ResetRanges
     grounds: GroundRanges
@@ -40,7 +40,7 @@ class JumpSettings:
 
 @wp.struct
 class JumpLevel:
-    """One level of the curriculum; goals are sampled from a box."""
+    """One level of the jump curriculum; goals are sampled from a box."""
 
     goal_lower: wp.vec3  # [m] relative to start and heading: landing x, y, and base height at the apex (0: any)
     goal_upper: wp.vec3  # [m] opposite corner of the box

@@ -44,7 +44,7 @@ def height_closeness(error: float, std_fine: float, scale_sharp: float, std_wide
 
 @wp.func
 def jump_height(robot: RobotView, state: JumpState, std_fine: float, scale_sharp: float, std_wide: float) -> float:
-    """Jump height: `height_closeness` of the highest base height to the commanded one, once, at the apex."""
+    """Jump height: `height_closeness` of the highest base height to the commanded height, once, at the apex."""
     if state.at_apex == 0:
         return 0.0
     return height_closeness(state.max_height - state.goal[2], std_fine, scale_sharp, std_wide)
@@ -54,7 +54,7 @@ def jump_height(robot: RobotView, state: JumpState, std_fine: float, scale_sharp
 def estimated_jump_height(
     robot: RobotView, state: JumpState, std_fine: float, scale_sharp: float, std_wide: float
 ) -> float:
-    """Est jump height: `height_closeness` of the estimated apex to the commanded one, in flight until the apex."""
+    """Estimated jump height: `height_closeness` of the estimated apex to the commanded one, in flight before it."""
     if state.phase != FLIGHT or state.apex_passed != 0:
         return 0.0
     return height_closeness(
@@ -144,7 +144,7 @@ def tracking(robot: RobotView, state: JumpState, std_wide: float, std_fine: floa
 def estimated_tracking(
     robot: RobotView, state: JumpState, std_middle: float, std_wide: float, std_fine: float, height: float
 ) -> float:
-    """Est tracking: phi_middle + 0.1 phi_wide + 0.3 phi_fine of the estimated landing's distance from the goal [m].
+    """Estimated tracking: phi_middle + 0.1 phi_wide + 0.3 phi_fine of the estimated landing's distance to the goal [m].
 
     In flight. The ballistic landing is where the base falls through `height` [m] above the goal's ground.
     """
@@ -294,7 +294,7 @@ def capture_point(robot: RobotView, state: JumpState, std: float) -> float:
 
 @wp.func
 def resting_action_rate(robot: RobotView, state: JumpState) -> float:
-    """Quiet actions: sum over motors of the action's squared change in a policy step, while the robot should rest."""
+    """Action rate at rest: sum over motors of the action's squared change in a step, while the robot should rest."""
     if not should_rest(state):
         return 0.0
     return square_sum(robot.action - robot.prev_action)

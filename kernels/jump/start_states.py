@@ -33,7 +33,7 @@ PUSHING = wp.constant(5)  # in stance, accelerating toward takeoff
 
 @wp.struct
 class ResetRanges:
-    """Ranges of sampled states; pairs are (lower, upper), angles [rad], lengths [m]; half width w: from -w to w."""
+    """Ranges of sampled start states; pairs are (lower, upper), angles [rad], lengths [m]; half width w: -w to w."""
 
     start_probability: vec_start_modes  # of STANDING, DEFAULT, IN_FLIGHT, TOUCHDOWN, AFTER_LANDING, PUSHING
     by_steps: int  # 1: probabilities are fractions of a world's policy steps, 0: of its resets
@@ -71,7 +71,7 @@ class ResetRanges:
 
 @wp.struct
 class JumpStart:
-    """Values that all attempts at a start state share."""
+    """Values that all attempts to sample one start state of a jump share."""
 
     start_mode: int  # STANDING to PUSHING
     heading: float  # [rad] yaw

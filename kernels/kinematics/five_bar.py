@@ -1,4 +1,4 @@
-"""The planar five-bar loop of one leg: position, velocity and bias acceleration in closed form.
+"""Planar five-bar loop of one leg: position, velocity and bias acceleration in closed form.
 
 All points are (x, z) [m] in the motor housing frame. The two thighs turn about the transversal axes; a positive
 motor angle moves the thigh tip away from the other. The loop constraint (paper, Eq. 1) holds by construction: the

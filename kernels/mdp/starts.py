@@ -21,7 +21,7 @@ PAW_X, PAW_Y = 20, 24  # Indices in the stream of an attempt, each the first of 
 
 @wp.struct
 class LegSample:
-    """Sampled motor state of one leg."""
+    """Sampled angles and rates of the motors of one leg."""
 
     angles: wp.vec3  # [rad] of the lateral, outer and inner motor
     rates: wp.vec3  # [rad/s]

@@ -1,4 +1,4 @@
-"""The ground under the paws: a plane z = 0 or a heightfield, and in each world a block that slides on it.
+"""Ground under the paws: a plane z = 0 or a heightfield, and in each world a block that slides on it.
 
 Functions of a point take the ground of one world, whose block `world_ground` has copied to `Ground.block`.
 """
@@ -24,7 +24,7 @@ class Block:
 
 @wp.struct
 class Ground:
-    """A horizontal plane (`rows` = 0) or a grid of heights centred on (`center_x`, `center_y`), bilinear between nodes.
+    """Ground: a horizontal plane (`rows` = 0) or a grid of heights around `center_x`, `center_y`, bilinear in between.
 
     Outside the grid the surface continues at the height of the nearest edge. Row index follows y, column index x.
     """

@@ -31,7 +31,7 @@ class TileMap:
 
 @wp.struct
 class VelocitySettings:
-    """Ranges of start states; pairs are (lower, upper), half width w: sampled from -w to w."""
+    """Ranges of start states of velocity tracking; pairs are (lower, upper), half width w: sampled from -w to w."""
 
     map: TileMap
     episode_steps: int  # policy steps that an episode lasts
@@ -54,7 +54,7 @@ class VelocitySettings:
 
 @wp.struct
 class VelocityStart:
-    """Values that all attempts at a start state share."""
+    """Values that all attempts to sample one start state of velocity tracking share."""
 
     spot: wp.vec2  # [m] x, y around which the base is placed
     heading: float  # [rad] yaw

@@ -11,7 +11,7 @@ vec4l = wp.types.vector(length=4, dtype=wp.int64)
 
 @wp.struct
 class VelocityState:
-    """Task state of one world; the fields from `sum_xy` on accumulate over episodes until the host reads them."""
+    """State of velocity tracking in a world; from `sum_xy` on fields accumulate until the host reads them."""
 
     command: wp.vec3  # [m/s], [m/s], [rad/s] commanded velocity ahead, to the left and about z, body axes
     standing: int  # 1: commanded to stand

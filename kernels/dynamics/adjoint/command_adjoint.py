@@ -18,7 +18,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class MotorAdjoint:
-    """Derivatives of a motor's torque."""
+    """Derivatives of a motor's torque w.r.t. its target, joint state, constants and latency."""
 
     target: real  # [N m/rad] w.r.t. the target that it follows
     angle: real  # [N m/rad] w.r.t. the joint angle

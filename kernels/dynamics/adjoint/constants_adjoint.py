@@ -19,7 +19,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class SpanStep:
-    """Indices of a step of a span, and its weight in the sums of the thread that processes it."""
+    """Indices of a step within a span of rows, and its weight in the sums of the thread that processes it."""
 
     step: int  # of the rollout
     entry: int  # of the record

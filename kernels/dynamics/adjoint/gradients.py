@@ -76,13 +76,13 @@ def thread_sums(gradients: Gradients, world: int, writes: bool, over_steps: bool
 
 @wp.func
 def add_entry(sums: wp.array(dtype=real), row: int, x: real):
-    """Add x to a row of an array of one world, (GRADIENT_ROWS,)."""
+    """Add x to a row of the parameter gradient of one world, (GRADIENT_ROWS,)."""
     sums[row] = sums[row] + x
 
 
 @wp.func
 def add_entry(sums: ThreadSums, row: int, x: real):  # noqa: F811
-    """Add x to a row of the world of `sums`, weighted and summed over threads first; one atomic addition."""
+    """Add x, weighted and summed over threads, to a row of a world's parameter gradient; one atomic addition."""
     total = sums.weight * x
     if sums.over_steps:
         total = sum_step_threads(total)
@@ -94,7 +94,7 @@ def add_entry(sums: ThreadSums, row: int, x: real):  # noqa: F811
 
 @wp.func
 def add_vec3(sums: Any, row: int, v: vec3):
-    """Add a vector to three rows, from `row` on."""
+    """Add a vector to three rows of the parameter gradient, from `row` on."""
     for i in range(3):
         add_entry(sums, row + i, v[i])
 

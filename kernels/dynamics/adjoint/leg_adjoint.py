@@ -46,7 +46,7 @@ class LegAdjoint:
 
 @wp.func
 def leg_law(c: PawContact, law: PawLaw, impulse: vec3, point: vec3) -> LegLaw:
-    """Return the recorded part of a paw's contact law; impulse [N s], point [m] of contact: body axes."""
+    """Return a paw's contact law as it is recorded; impulse [N s], point [m] of contact: body axes."""
     recorded = LegLaw()
     recorded.mode = law.mode
     recorded.mu_row = law.mu_row
@@ -131,7 +131,7 @@ def any_leg(flag: bool) -> bool:
 
 @wp.func
 def law_block(c: PawContact, law: PawLaw, sent: PawContact, sent_law: PawLaw, leg: int, j: int) -> mat33:
-    """Return block (leg, j) of the matrix A^T of `step_adjoint`; all arguments but j are those of this thread's leg.
+    """Return block (leg, j) of the contact-law matrix A^T (`step_adjoint`); the arguments but j: of this thread's leg.
 
     sent, sent_law: c and law again, of which thread j sends its own to the other threads.
     """

@@ -87,7 +87,7 @@ class LegLaw:
 
 @wp.struct
 class LawRow:
-    """A paw's row of the inverse of A^T (12x12) of `step_adjoint`: a 3x3 block per paw."""
+    """Row of a paw in the inverse of the contact-law matrix A^T (12x12, `step_adjoint`): a 3x3 block per paw."""
 
     a: mat33  # FL
     b: mat33  # FR
@@ -107,7 +107,7 @@ def get_vec(record: LegRecord, entry: int, field: int, world: int, leg: int) -> 
 
 @wp.func
 def put_vec(record: LegRecord, entry: int, field: int, world: int, leg: int, v: vec3):
-    """Write three fields of a leg, from `field` on."""
+    """Write three fields of a leg to the record, from `field` on."""
     for i in range(3):
         record.legs[entry, field + i, world, leg] = v[i]
 
@@ -124,7 +124,7 @@ def get_mat(record: LegRecord, entry: int, field: int, world: int, leg: int) -> 
 
 @wp.func
 def put_mat(record: LegRecord, entry: int, field: int, world: int, leg: int, m: mat33):
-    """Write a matrix row by row to nine fields of a leg, from `field` on."""
+    """Write a matrix row by row to nine recorded fields of a leg, from `field` on."""
     for i in range(3):
         for j in range(3):
             record.legs[entry, field + 3 * i + j, world, leg] = m[i, j]
@@ -142,7 +142,7 @@ def get_base_mat(record: LegRecord, entry: int, field: int, world: int) -> mat33
 
 @wp.func
 def put_base_mat(record: LegRecord, entry: int, field: int, world: int, m: mat33):
-    """Write a matrix row by row to nine fields of the base, from `field` on."""
+    """Write a matrix row by row to nine recorded fields of the base, from `field` on."""
     for i in range(3):
         for j in range(3):
             record.base[entry, field + 3 * i + j, world] = m[i, j]

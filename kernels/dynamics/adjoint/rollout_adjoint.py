@@ -63,7 +63,7 @@ def store_adjoint_scalar(
 
 @wp.struct
 class RowCotangent:
-    """Gradient w.r.t. the base's entries of a row, see `TrajectoryArrays`; world axes."""
+    """Gradient w.r.t. the base's entries of a trajectory row, see `TrajectoryArrays`; world axes."""
 
     pos: vec3
     quat: quat
@@ -109,7 +109,7 @@ def add_row_cotangent(into: RowCotangent, cotangent: TrajectoryArrays, row: int,
 
 @wp.struct
 class RowBaseAdjoint:
-    """Gradient w.r.t. the base's state that was written to a row."""
+    """Gradient w.r.t. the base's state that was written to a trajectory row."""
 
     base: BaseState
     com: vec3  # w.r.t. the base's centre of mass, summed over rows

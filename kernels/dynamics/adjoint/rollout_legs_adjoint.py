@@ -37,7 +37,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class Span:
-    """Range of rows whose steps a launch processes."""
+    """Range of trajectory rows whose physics steps one launch processes."""
 
     begin: int  # first row
     end: int  # excluded
