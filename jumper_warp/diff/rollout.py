@@ -275,7 +275,7 @@ class Rollout:
         count = commands.target.shape[0]
         rows_of = (count * self.substeps // self.every + 1, 19, n)
         if trajectory.q.shape != rows_of or trajectory.q.dtype != self.real:
-            raise InputError(f"this rollout makes trajectories {rows_of}, got {trajectory.q.shape}")
+            raise InputError(f"trajectory.q must be {self.real.__name__} {rows_of}, got {trajectory.q.shape}")
         by_outputs = {"q": q, "qd": qd, "torque": torque, "impulse": impulse, "filtered_target": filtered_target}
         cotangents = self._cotangents(trajectory, by_outputs)
         rows = modules.trajectory.TrajectoryArrays()

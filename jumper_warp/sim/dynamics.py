@@ -53,9 +53,9 @@ def check_model(model: Model) -> None:
         raise NotThisRobotError("the model has no worlds; build it with jumper_warp.robot.model.build_model")
     for noun, labels, expected in (("body", model.body_label, bodies), ("joint", model.joint_label, joints)):
         names = [label.split("/")[-1] for label in labels]
-        stranger = next((label for label, name in zip(labels, names, strict=True) if name not in expected), None)
-        if stranger is not None and len(names) > count * len(expected):
-            raise NotThisRobotError(f"{noun} {stranger!r:.60} cannot be simulated: every world must hold {ALONE}")
+        unknown = next((label for label, name in zip(labels, names, strict=True) if name not in expected), None)
+        if unknown is not None and len(names) > count * len(expected):
+            raise NotThisRobotError(f"{noun} {unknown!r:.60} cannot be simulated: every world must hold {ALONE}")
         if len(names) != count * len(expected):
             raise NotThisRobotError(
                 f"{count} worlds of this robot have {count * len(expected)} {noun} labels, the model has {len(names)}"

@@ -94,7 +94,7 @@ class Simulation:
         if solver == "mujoco" and block is not None:
             raise InputError("a moving block needs solver='jumper', got 'mujoco'")
         if not isinstance(robot, RobotOverlay | RobotValues | None):
-            raise InputError(f"robot must be a RobotOverlay, as load_overlay reads a file, got {robot!r:.60}")
+            raise InputError(f"robot must be a RobotOverlay (see load_overlay) or RobotValues, got {robot!r:.60}")
         check_step(dt, substeps)
         check_tolerance(tolerance)
         threads = checked_threads(threads)

@@ -9,7 +9,7 @@ and a command c becomes, with T the horizon,
 
     c + w (clamp(c, lower, upper) - c),   w = clamp(1 - t / T, 0, 1)
 
-so that a command within the limits is never changed. Two rules override w, the second winning:
+so that a command within the limits is never changed. Two rules override w; the second has priority:
 
 1. within a hard zone before a limit (m < zone): w = 1 if c lies toward that limit from x, 0 if away from it;
 2. outside the limits: w = 1.

@@ -89,7 +89,7 @@ def motor_torque_kernel(
 ):
     """Write the motor torques [N m] to their entries of Newton's joint_f; launch over (12, num_worlds).
 
-    target [rad]: (12, num_worlds). joint_q, joint_qd, joint_f: flat over worlds; other entries of joint_f are kept.
+    target [rad]: (12, num_worlds). joint_q, joint_qd, joint_f: flat over worlds; other entries of joint_f stay.
     """
     motor, world = wp.tid()
     coord = coords_per_world * world + 7 + motor_slot(motor)

@@ -80,7 +80,7 @@ def write_start(
 ):
     """Write a weightless start state with orientation `quat` (xyzw, body to world) to world `rng.world`.
 
-    The base origin is at rest above the world's origin while the body spins; `skill` gives the motors' limits.
+    The base origin is at rest above the world's origin while the body spins; `skill` holds the motors' limits.
     """
     w = settings.spin
     start = AttitudeStart()

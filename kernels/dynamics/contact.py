@@ -80,8 +80,8 @@ def target_normal_velocity(gap: real, pressed: int, dt: real) -> real:
     """Return the smallest admissible normal velocity [m/s] at the end of a step dt [s] for a gap [m], < 0 inside.
 
     An open gap closes exactly; penetration is pushed out. pressed: the leg's pressed hard stops. On stops a leg is
-    stiff, and rounding errors of gaps would shift load between legs: gaps within `STIFF_BAND` are then kept, and those
-    slightly beyond it close by `PUSH_OUT` only.
+    stiff, and rounding errors of gaps would shift load between legs: gaps within `STIFF_BAND` then stay unchanged,
+    and gaps slightly beyond it close by `PUSH_OUT` only.
     """
     beyond = gap
     if pressed != 0:

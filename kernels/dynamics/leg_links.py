@@ -4,7 +4,7 @@ Each sum is an integral over the mass of a link of products of position r (about
 r_o, r_i with respect to the outer and inner motor angle. From them follow the leg's kinetic energy and, with
 Lagrange's equations, every inertial coupling and velocity-product force (`leg_dynamics`).
 
-The links move in the five-bar's plane, so derivatives of r and accelerations have no y: they are kept as (x, z).
+The links move in the five-bar's plane, so derivatives of r and accelerations have no y: they are stored as (x, z).
 """
 
 import warp as wp

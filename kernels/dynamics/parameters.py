@@ -254,7 +254,7 @@ def pack_springs_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write the springs of every leg to the table; one thread per (world, leg). springs: stiffness [N/m], length [m]."""
+    """Write every leg's springs to the table; one thread per (world, leg). springs: stiffness [N/m], length [m]."""
     world, leg = wp.tid()
     for j in range(2):
         table[leg * layout.LEG_ROWS + layout.SPRING + j, world] = real(springs[world][j])

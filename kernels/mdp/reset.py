@@ -51,7 +51,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         """Begin a new episode where mask != 0, else sample a command where one is due; launch over (worlds, lanes).
 
         Worlds of `skill` only; mask: (num_worlds,). All lanes of a world (one warp) run the task's reset, which splits
-        its work by `rng.lane`; lane 0 writes the state. A world that passed the last level gets a sampled one.
+        its work by `rng.lane`; lane 0 writes the state. A world that passed the last level uses a sampled one.
         """
         world, lane = wp.tid()
         world += episode.first

@@ -311,7 +311,7 @@ def test_refuses_impulse_of_another_shape_and_casts_single_precision(shape):
 
 def test_backward_refuses_another_rollouts_trajectory_and_other_types():
     trajectory = rollout().run(push_off(2), *squat())
-    with pytest.raises(ValueError, match="this rollout makes trajectories"):
+    with pytest.raises(ValueError, match=r"trajectory\.q must be float64 \(3, 19, 2\)"):
         rollout(2).backward(trajectory)
     with pytest.raises(ValueError, match=r"must be float64 of shape .*, got float32"):
         rollout().backward(trajectory, q=wp.zeros(trajectory.q.shape, dtype=wp.float32, device="cpu"))

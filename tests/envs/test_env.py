@@ -314,7 +314,7 @@ def test_mujoco_takes_the_same_steps():
         (lambda: Env(TASK, 0, device="cpu"), "num_envs must be a whole number of at least 1, got 0"),
         (lambda: Env(TASK, 16.0, device="cpu"), "num_envs must be a whole number of at least 1, got 16.0"),
         (lambda: Env(TASK, 1, device="cpu", seed=-1), r"seed must be in 0 \.\. 2147483647, got -1"),
-        (lambda: Env(TASK, 1, device="cpu", robot="robot.json"), "robot must be a RobotOverlay, .* got 'robot.json'"),
+        (lambda: Env(TASK, 1, device="cpu", robot="robot.json"), "robot must be a RobotOverlay .*, got 'robot.json'"),
         (lambda: Env(TASK, 1, device="cpu", solver="bullet"), "solver must be"),
     ],
 )

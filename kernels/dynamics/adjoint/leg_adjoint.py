@@ -67,7 +67,7 @@ def replay_leg(
 ):  # fmt: skip
     """Recompute a step of the rollout from entry i of the record, and write the state at its end to entry i + 1.
 
-    Entry i gets the inverse of the base's system, the leg's elimination, and its paw's law. force [N], moment [N m]:
+    Entry i stores the inverse of the base's system, the leg's elimination and its paw's law. force [N], moment [N m]:
     on the base at its com, world axes. first_impulse: as `Commands.impulse`. All four threads of a world write the same
     bits for the base; see `replay_step`.
     """
