@@ -76,7 +76,7 @@ def minimise(
 
 
 class _Descent:
-    """State of the descent of all starts; arguments as in `minimise`, tensors (starts, ...)."""
+    """State of a descent from all starts in parallel; arguments as in `minimise`, tensors (starts, ...)."""
 
     def __init__(self, problem: Problem, begin: np.ndarray, lower: float, upper: float, step: float, seed: int):
         real = torch.float64 if problem.double else torch.float32

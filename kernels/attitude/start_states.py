@@ -57,7 +57,7 @@ def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attem
 
 @wp.func
 def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return leg `leg` at rest, in the default pose or sampled; reachable if outer + inner angle is within limits."""
+    """Return the motor state of leg `leg`, at rest in the default pose or a sampled one; reachable if within limits."""
     sample = LegSample()
     if base.default_legs:
         for j in range(3):

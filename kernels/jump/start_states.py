@@ -279,7 +279,7 @@ def sample_base(start: JumpStart, arrays: RobotArrays, rng: RngStream, attempt: 
 
 @wp.func
 def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return leg `leg` in flight, at rest relative to the base; reachable if its paw is 0.01 m above the ground.
+    """Return the sampled leg `leg` in flight, motors at rest; reachable if its paw is 0.01 m above the ground.
 
     Its angles are within 0.03 rad (lateral) or 0.1 rad (outer, inner) of a value sampled once for all legs.
     """
@@ -301,7 +301,7 @@ def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: Rn
 
 @wp.func
 def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return leg `leg` of an attempt: in flight, or with its paw on (TOUCHDOWN: above) a sampled spot of the ground."""
+    """Return the sampled leg `leg`: in flight, or with its paw on (TOUCHDOWN: above) a sampled spot of the ground."""
     ranges = start.ranges
     if start.start_mode == IN_FLIGHT:
         return leg_in_flight(ranges, base, geo, rng, leg)

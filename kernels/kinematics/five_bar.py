@@ -15,7 +15,7 @@ from .trig import sin_cos
 
 @wp.struct
 class FiveBar:
-    """Configuration of the loop and its first derivatives with respect to the outer and inner motor angles."""
+    """Configuration of the five-bar loop and its first derivatives with respect to the outer and inner motor angles."""
 
     outer_sin_cos: vec2  # (sine, cosine) of the outer motor angle
     inner_sin_cos: vec2  # (sine, cosine) of the inner motor angle
@@ -36,7 +36,7 @@ class FiveBar:
 
 @wp.struct
 class FiveBarBias:
-    """Rates of the loop, and its accelerations at zero motor acceleration (velocity-product terms)."""
+    """Link rates of the five-bar loop, and its accelerations at zero motor acceleration (velocity-product terms)."""
 
     outer_thigh_rate: real  # [rad/s] about +y
     inner_thigh_rate: real

@@ -24,7 +24,7 @@ class Scene:
 
 @wp.struct
 class NoSettings:
-    """Placeholder struct for a reset without settings, or a task without levels."""
+    """Empty settings struct, for resets without settings and tasks without levels."""
 
     unused: float
 

@@ -122,7 +122,7 @@ def sample_base(start: VelocityStart, arrays: RobotArrays, rng: RngStream, attem
 
 @wp.func
 def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return leg `leg`: its paw at rest on the ground, or in the air with motors at rest with `swing_probability`."""
+    """Return the sampled leg `leg`: paw at rest on the ground, or with `swing_probability` in the air, rates 0."""
     settings = start.settings
     offset = sample_foot_offset(rng, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
     paw = base.pos + rotate_yaw(offset, start.heading)

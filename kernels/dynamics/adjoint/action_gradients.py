@@ -24,7 +24,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class LegGradient:
-    """Gradient of `leg_action` w.r.t. its arguments; the caller sums those w.r.t. base and gravity over legs."""
+    """Gradient of a leg's virtual power (`leg_action`); the caller sums gradients w.r.t. base and gravity over legs."""
 
     geometry: LegGeometry
     masses: LegMasses
@@ -42,7 +42,7 @@ class LegGradient:
 
 @wp.struct
 class BaseGradient:
-    """Gradient of `base_action` w.r.t. each of its arguments, in the same axes."""
+    """Gradient of the base's virtual power (`base_action`) w.r.t. each of its arguments, in the same axes."""
 
     body: MassMoments
     com: vec3
@@ -91,7 +91,7 @@ def leg_action_gradient(
     model: RobotModel, params: LegParams, world: int, leg: int, mu: real, base: BaseState, angles: vec3, rates: vec3,
     base_held: BaseFactors, leg_held: LegFactors, dt: real,
 ) -> LegGradient:  # fmt: skip
-    """Return the gradient of `leg_action` of leg 0 to 3 in a step dt [s]; mu: friction coefficient.
+    """Return the gradient of the virtual power (`leg_action`) of leg 0 to 3 in a step dt [s]; mu: friction coefficient.
 
     base, angles [rad], rates [rad/s]: at the start of the step. base_held, leg_held: constants of the differentiation.
     """
@@ -125,7 +125,7 @@ def base_action_gradient(
     model: RobotModel, world: int, force: vec3, moment: vec3, base: BaseState, held: BaseFactors,
     cotangent: BaseCotangent, dt: real,
 ) -> BaseGradient:  # fmt: skip
-    """Return the gradient of `base_action` in a step dt [s]; held, cotangent: constants of the differentiation.
+    """Return the gradient of the base's virtual power (`base_action`) in a step dt [s]; held, cotangent: constants.
 
     force [N], moment [N m]: at the com, world axes. base: at the start of the step.
     """

@@ -46,7 +46,7 @@ class LegAdjoint:
 
 @wp.func
 def leg_law(c: PawContact, law: PawLaw, impulse: vec3, point: vec3) -> LegLaw:
-    """Return a paw's contact law as it is recorded; impulse [N s], point [m] of contact: body axes."""
+    """Return the `LegLaw` of a paw's contact, for the record; impulse [N s], point [m] of contact: body axes."""
     recorded = LegLaw()
     recorded.mode = law.mode
     recorded.mu_row = law.mu_row

@@ -255,7 +255,7 @@ def write_laws(
 def add_laws(
     model: RobotModel, at: ReplayedStep, record: StepRecord, multipliers: Multipliers, legs: wp.array(dtype=LegReverse),
 ) -> Multipliers:  # fmt: skip
-    """Return `multipliers` plus the part of the contact laws, whose multipliers are in `legs`; updates `legs` too."""
+    """Return `multipliers` of the equations of motion plus the contact laws' part (from `legs`); updates `legs` too."""
     m = multipliers
     law_lin = vec3(real(0.0))
     law_ang = vec3(real(0.0))

@@ -64,7 +64,7 @@ def replay_legs_kernel(
     # out
     record: LegRecord,
 ):
-    """Recompute the steps after each row; launch over (rows of the span, count rounded up to a multiple of 8, 4).
+    """Recompute the steps after each trajectory row; launch over (rows of the span, count rounded up to 8 n, 4).
 
     count: number of worlds, from `settings.first` on. Threads beyond the last world repeat it and write the same bits.
     """

@@ -101,7 +101,7 @@ def add(a: MassMoments, b: MassMoments) -> MassMoments:  # noqa: F811
 
 @wp.func
 def second_moment_product(a: vec3, b: vec3) -> vec6:
-    """Return sym(a, b), the gradient of a^T S b by packed second moments S (xx yy zz xy xz yz)."""
+    """Return sym(a, b), the gradient of a^T S b w.r.t. packed second moments S (xx yy zz xy xz yz)."""
     return vec6(
         a[0] * b[0], a[1] * b[1], a[2] * b[2],
         a[0] * b[1] + a[1] * b[0], a[0] * b[2] + a[2] * b[0], a[1] * b[2] + a[2] * b[1],
