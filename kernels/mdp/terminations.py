@@ -17,7 +17,7 @@ def too_long(robot: RobotView, state: Any, steps: float) -> bool:
 
 
 @wp.func
-def came_apart(robot: RobotView, state: Any) -> bool:
+def diverged(robot: RobotView, state: Any) -> bool:
     """Terminate when the simulation diverges: state non-finite or beyond the speed limits of `has_diverged`."""
     return has_diverged(robot)
 

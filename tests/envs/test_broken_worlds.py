@@ -46,7 +46,7 @@ SUCCEEDING = {"phase": LANDED, "phase_steps": 100}
     [*((case, {}) for case in BROKEN), ("motor angle", SUCCEEDING), ("absurd velocity", SUCCEEDING)],
     ids=[*BROKEN, "motor angle at success", "absurd velocity at success"],
 )
-def test_a_world_that_came_apart_ends_at_once_and_touches_no_other(env, case, episode):
+def test_a_diverged_world_ends_at_once_and_touches_no_other(env, case, episode):
     outcomes = []
     for diverged in (False, True):
         env.episodes.step_count.fill_(FIRST_STEP_COUNT)  # the same draws
@@ -59,7 +59,7 @@ def test_a_world_that_came_apart_ends_at_once_and_touches_no_other(env, case, ep
         ended = (ending_names(env)[9], env.reward[9].item(), env.timeout[9].item())
         tensors = (env.obs, env.critic_obs, env.final_obs, env.final_critic_obs, env.reward)
         outcomes.append([*(tensor.clone() for tensor in tensors), env.robot.diverged.numpy().copy()])
-    assert ended == ("came_apart", 0.0, 0.0)
+    assert ended == ("diverged", 0.0, 0.0)
     others = [world for world in range(N) if world != 9]
     for whole, harmed in zip(outcomes[0][:-1], outcomes[1][:-1], strict=True):
         assert torch.equal(whole[others], harmed[others])
@@ -85,7 +85,7 @@ def test_an_action_that_is_not_finite_is_counted_and_ends_its_world_only(env, va
     for whole, harmed in zip(*outcomes, strict=True):
         np.testing.assert_array_equal(whole[others], harmed[others])
         assert np.isfinite(harmed).all()
-    assert ending_names(env) == ["" if world != 4 else "came_apart" for world in range(N)]
+    assert ending_names(env) == ["" if world != 4 else "diverged" for world in range(N)]
     assert (env.reward[4].item(), env.done[4].item(), env.timeout[4].item()) == (0.0, 1.0, 0.0)
     assert not env.final_obs[4].any() and env.metrics()["Metrics/bad_actions"] == 1.0
     env.step(REST)  # the next action is a sound one
