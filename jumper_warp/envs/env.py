@@ -186,7 +186,7 @@ class Env(Stages):
         """Advance one policy step; the next step overwrites the returned tensors, so clone what you keep.
 
         action: (num_envs, 12) floating point, clamped to -1..1; with several tasks (tasks, num_envs, 12), of which each
-        world uses the row of its task. A non-finite action ends the episode as `came_apart`.
+        world uses the row of its task. A non-finite action ends the episode as `diverged`.
         Raises InputError (a ValueError): an action of another shape, dtype or device. RuntimeError: no `reset` before.
         """
         if not self._started:

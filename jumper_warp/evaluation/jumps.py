@@ -33,7 +33,7 @@ REST_TIME = 1.0  # [s] Time after touchdown at which the robot should be at rest
 DELAY = 0.5  # [s] Time until the first jump is commanded
 TAKEOFF_SPEED = 0.25  # [m/s] Upward speed of the base, with no paw down, of a second takeoff (authors' configuration)
 NOT_BEGUN = "not_begun"  # End of a jump that was not commanded, because one before it failed
-TERMINATIONS = ("came_apart", "low_base", COLLIDED, "no_jump", SUCCESS)
+TERMINATIONS = (DIVERGED, "low_base", COLLIDED, "no_jump", SUCCESS)
 """Terminations of an evaluated jump, in order of precedence; success is last, so that it hides no fall."""
 
 

@@ -21,7 +21,6 @@ SUCCESS = "success"  # Outcomes, also names of terminations
 DIVERGED = "diverged"  # The state of the simulation is not finite or absurdly fast
 COLLIDED = "collided"  # A link other than a paw touched something
 FALLS = (DIVERGED, "low_base", "tilted", COLLIDED)  # Outcomes that count as falls
-OUTCOMES = {"came_apart": DIVERGED}  # Outcome by name of the termination, where they differ
 NO_END = "no_end"  # Outcome of an episode that was still running when the time was over
 
 
@@ -145,7 +144,7 @@ def within(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
 
 def outcome_names(terminations: Sequence[str], *more: str) -> np.ndarray:
     """Return the outcomes of episodes by index of the termination that ended them; more: names that follow."""
-    return np.array([*(OUTCOMES.get(name, name) for name in terminations), *more])
+    return np.array([*terminations, *more])
 
 
 def ended_by(outcomes: np.ndarray, over: str, prefix: str = "ended_by_") -> Metrics:

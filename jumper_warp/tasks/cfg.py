@@ -10,7 +10,7 @@ from typing import Any
 
 from jumper_warp.kernels.mdp.env import NoSettings
 from jumper_warp.kernels.mdp.starts import MIN_LINK_DISTANCE
-from jumper_warp.kernels.mdp.terminations import came_apart, too_long
+from jumper_warp.kernels.mdp.terminations import diverged, too_long
 from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
 from jumper_warp.tasks.params import TaskParams
@@ -129,8 +129,8 @@ class TaskCfg:
                     wanted = f"is for {term.of_state.key}, not {self.state.key}"
                     raise InputError(f"{self.name} {section}: {term.name} {wanted}")
         self._check_functions()
-        if came_apart not in [term.func for term in self.terminations]:
-            raise InputError(f"{self.name} needs the termination came_apart, for worlds whose state is no longer one")
+        if diverged not in [term.func for term in self.terminations]:
+            raise InputError(f"{self.name} needs the termination diverged, for worlds whose state is not finite")
         if not all(0.0 < scale < math.inf for scale in self.action_scale):
             raise InputError(f"{self.name}: action_scale must be positive and finite [deg], got {self.action_scale}")
         for metric in self.metrics:

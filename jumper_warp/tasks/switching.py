@@ -26,7 +26,7 @@ from jumper_warp.utils.errors import InputError
 
 FALLS, FALLS_FROM_FLIGHT = (
     (
-        TerminationTerm(terminations.came_apart),
+        TerminationTerm(terminations.diverged),
         TerminationTerm(terminations.collided),
         TerminationTerm(tilt, angle=60.0 * DEG),
         TerminationTerm(terminations.low_base, height=0.10),

@@ -59,7 +59,7 @@ def test_a_diverged_world_ends_at_once_and_changes_no_other(env, case, episode):
         ended = (ending_names(env)[9], env.reward[9].item(), env.timeout[9].item())
         tensors = (env.obs, env.critic_obs, env.final_obs, env.final_critic_obs, env.reward)
         outcomes.append([*(tensor.clone() for tensor in tensors), env.robot.diverged.numpy().copy()])
-    assert ended == ("came_apart", 0.0, 0.0)
+    assert ended == ("diverged", 0.0, 0.0)
     others = [world for world in range(N) if world != 9]
     for expected, found in zip(outcomes[0][:-1], outcomes[1][:-1], strict=True):
         assert torch.equal(expected[others], found[others])
@@ -85,7 +85,7 @@ def test_a_nonfinite_action_is_counted_and_ends_the_episode_of_its_world_only(en
     for expected, found in zip(*outcomes, strict=True):
         np.testing.assert_array_equal(expected[others], found[others])
         assert np.isfinite(found).all()
-    assert ending_names(env) == ["" if world != 4 else "came_apart" for world in range(N)]
+    assert ending_names(env) == ["" if world != 4 else "diverged" for world in range(N)]
     assert (env.reward[4].item(), env.done[4].item(), env.timeout[4].item()) == (0.0, 1.0, 0.0)
     assert not env.final_obs[4].any() and env.metrics()["Metrics/bad_actions"] == 1.0
     env.step(REST)  # the next action is finite

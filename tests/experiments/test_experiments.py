@@ -31,7 +31,7 @@ from support.learning import LearningCurve
 from support.soak import SoakArgs, hardest
 from support.timing import baseline_ratios, changed_flags
 
-SWEEP_ENDS = ("success", "came_apart", "low_base", "tilted", "collided", "no_jump", "too_long")
+SWEEP_ENDS = ("success", "diverged", "low_base", "tilted", "collided", "no_jump", "too_long")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 

@@ -179,7 +179,7 @@ def hold_height() -> mdp.TaskCfg:
         curriculum=mdp.Curriculum(height_error, tolerance=0.03, promote_after=2, counts=every_episode),
         rewards=(mdp.RewardTerm(near_goal, 60.0, width=0.05), mdp.RewardTerm(mdp.rewards.action_rate, -0.02)),
         terminations=(
-            mdp.TerminationTerm(mdp.terminations.came_apart),
+            mdp.TerminationTerm(mdp.terminations.diverged),
             mdp.TerminationTerm(mdp.terminations.low_base, height=0.12),
             mdp.TerminationTerm(mdp.terminations.tilted, angle=0.8),
             mdp.TerminationTerm(held, steps=100.0, time_out=True, success=True),

@@ -189,7 +189,7 @@ def probe_task(**changes) -> TaskCfg:
             TerminationTerm(other_above, limit=1.0e3, name="first"),
             TerminationTerm(other_above, limit=1.0e2, name="second", time_out=True),
             TerminationTerm(other_above, limit=1.0e1, name="third", time_out=True, success=True),
-            TerminationTerm(terminations.came_apart),
+            TerminationTerm(terminations.diverged),
             TerminationTerm(terminations.too_long, steps=100.0),
         ),
         observations=ObservationsCfg(

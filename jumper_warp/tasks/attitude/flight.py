@@ -57,7 +57,7 @@ REWARDS = (
 )
 
 TERMINATIONS = (
-    TerminationTerm(mdp_terminations.came_apart),
+    TerminationTerm(mdp_terminations.diverged),
     TerminationTerm(terminations.ended_clear, time_out=True, success=True),
     TerminationTerm(terminations.ended, time_out=True),
 )

@@ -49,7 +49,7 @@ REWARDS = (
 
 TERMINATIONS = (
     TerminationTerm(terminations.landed_for, name="success", steps=1.0 * SECOND, time_out=True, success=True),
-    TerminationTerm(mdp_terminations.came_apart),
+    TerminationTerm(mdp_terminations.diverged),
     TerminationTerm(terminations.early_takeoff),
     TerminationTerm(terminations.predicted_miss, tolerance=0.55, steps=0.1 * SECOND, height=LANDING_HEIGHT),
     TerminationTerm(terminations.missed_goal, tolerance=0.50),

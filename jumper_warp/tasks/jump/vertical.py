@@ -55,7 +55,7 @@ REWARDS = (
 
 TERMINATIONS = (
     TerminationTerm(terminations.landed_for, name="success", steps=1.0 * SECOND, time_out=True, success=True),
-    TerminationTerm(mdp_terminations.came_apart),
+    TerminationTerm(mdp_terminations.diverged),
     TerminationTerm(terminations.early_takeoff),
     TerminationTerm(terminations.wrong_height, tolerance=0.10),
     TerminationTerm(terminations.low_touchdown, height=0.20),

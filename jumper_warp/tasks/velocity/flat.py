@@ -76,7 +76,7 @@ REWARDS = (
 )
 
 TERMINATIONS = (
-    TerminationTerm(mdp_terminations.came_apart),
+    TerminationTerm(mdp_terminations.diverged),
     TerminationTerm(mdp_terminations.collided),
     TerminationTerm(mdp_terminations.tilted, angle=60.0 * DEG),
     TerminationTerm(terminations.finished, time_out=True, success=True),

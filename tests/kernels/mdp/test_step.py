@@ -6,7 +6,7 @@ from mdp_helpers import STEP_DT, write
 from probe_task import Probe, probe_task
 
 N = 64
-NAMES = ["first", "second", "third", "came_apart", "too_long"]  # terminations of the probe task
+NAMES = ["first", "second", "third", "diverged", "too_long"]  # terminations of the probe task
 FIRST, SECOND, THIRD, DIVERGED, LONG = range(5)
 NONE = -1
 GROWTH = 0.25  # increase of the state's value in a policy step
@@ -199,7 +199,7 @@ def make_diverge(probe, cause, world):
 
 @pytest.mark.parametrize("cause", ["diverged", "action", "fast", "nan"])
 @pytest.mark.parametrize("other", [0.0, 2.0e3])
-def test_a_diverged_world_ends_with_came_apart_and_reward_0(probe, cause, other):
+def test_a_diverged_world_ends_as_diverged_and_reward_0(probe, cause, other):
     probe.write(value=1.0, other=other)
     make_diverge(probe, cause, 3)
     probe.step()
