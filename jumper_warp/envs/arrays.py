@@ -63,7 +63,7 @@ def episode_arrays(num_envs: int, seed: int, stream: Purpose, skill: wp.array, d
 
 
 def delay_arrays(num_envs: int, latency: wp.array, substeps: int, device: Any) -> Any:
-    """Return the kernels' ring buffers `Delays`; latency: (num_envs,) int [physics steps]; substeps: per policy step."""
+    """Return the kernels' ring buffers `Delays`; latency: (num_envs,) int [physics steps]; substeps per policy step."""
     delays = Delays()
     allocate(delays, ("target_history",), (RING, 12, num_envs), float, device)
     allocate(delays, ("current_target", "prev_target"), (12, num_envs), float, device)
