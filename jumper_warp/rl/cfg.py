@@ -199,6 +199,6 @@ class TrainCfg:
             if self.trainer == "rsl-rl" and getattr(self, name):
                 raise InputError(f"{name} is not supported with trainer rsl-rl")
         if self.resume and self.resume != LATEST_OR_NEW and self.init_policy:
-            raise InputError("resume continues a training, init_policy begins one: pass only one of them")
+            raise InputError("pass resume, to continue a training, or init_policy, to begin one, not both")
         if self.trainer != "ppo" and self.ppo.symmetry != "off":
             raise InputError(f"symmetry is not supported with trainer {self.trainer}")

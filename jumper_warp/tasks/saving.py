@@ -283,7 +283,7 @@ def _check_kernel_types(task: dict[str, Any]) -> None:
     if not NAME.fullmatch(task["name"]):
         raise TaskError(f"task.name may contain letters, digits, _ . - and spaces, got {task['name']!r:.60}")
     if not isinstance(task["state"], Struct) or "steps" not in task["state"].vars:
-        raise TaskError("task.state must be a @wp.struct with a field `steps`")
+        raise TaskError("task.state must be a @wp.struct with a field steps")
     levels, settings = task.get("levels", ()), task["reset"].settings
     checked = [] if settings is None else [("reset.settings", settings)]
     for where, value in [*checked, *((f"levels[{i}]", level) for i, level in enumerate(levels))]:

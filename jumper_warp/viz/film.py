@@ -64,7 +64,7 @@ def write_film(
     check_film(path, size, fps, speed, eye)
     times = np.arange(recording.times[0], recording.times[-1] + 1.0e-9, speed / fps)
     if path.suffix != ".mp4" and len(times) > MAX_FRAMES:
-        raise InputError(f"{path}: {path.suffix} may have {MAX_FRAMES} frames, got {len(times)}; use .mp4 instead")
+        raise InputError(f"{path}: {path.suffix} may have up to {MAX_FRAMES} frames, got {len(times)}; use .mp4")
     ranks = range(len(recording.worlds)) if ranks is None else ranks
     recording = without_divergence(recording)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -87,7 +87,7 @@ def check_film(path: Path, size: tuple[int, int], fps: float, speed: float, eye:
     if not (64 <= min(size) and max(size) <= 7680 and 0.0 < fps <= 240.0 and 0.0 < speed <= 100.0):
         raise InputError(f"a film needs 64 to 7680 px, fps in (0, 240], speed in (0, 100]; got {size}, {fps}, {speed}")
     if path.suffix == ".gif" and fps > GIF_FPS:
-        raise InputError(f"{path}: a GIF may have {GIF_FPS:g} frames per second, got {fps:g}")
+        raise InputError(f"{path}: a GIF may have up to {GIF_FPS:g} frames per second, got {fps:g}")
     if eye is not None:
         _view(np.zeros((0, 0, 3)), size, eye).axes()
 

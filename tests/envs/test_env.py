@@ -285,7 +285,7 @@ def test_mujoco_takes_the_same_steps():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: dataclasses.replace(TASK, rewards=(*TASK.rewards, TASK.rewards[0])), "name of its own"),
+        (lambda: dataclasses.replace(TASK, rewards=(*TASK.rewards, TASK.rewards[0])), "names of terms must be unique"),
         (lambda: dataclasses.replace(TASK, terminations=()), "came_apart"),
         (lambda: dataclasses.replace(TASK, terminations=TASK.terminations[:1]), "came_apart"),
         (

@@ -159,8 +159,8 @@ def test_a_saved_state_does_not_change_with_the_environment():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"num_envs": 4}, "saved for 2 environments, there are 4"),
-        ({"seed": 9}, "saved with seed 1, this environment draws with seed 9"),
+        ({"num_envs": 4}, "saved with num_envs 2, this environment has 4"),
+        ({"seed": 9}, "saved with seed 1, this environment has seed 9"),
         ({"randomize": False}, "saved with other randomisation or events of vertical-jump"),
         ({"task": dataclasses.replace(make_task("vertical-jump"), motors=jumping_motors(12.0))}, "with other robots"),
         ({"solver": "mujoco"}, "lacks .*'solver.qacc_warmstart'"),
@@ -261,7 +261,7 @@ def test_numbers_that_were_set_come_back_and_the_others_are_the_tasks():
         expected[params.index(f"rewards.jump_height.{key}")] = value
     np.testing.assert_array_equal(numbers, expected)
     state["vertical-jump/changed"][0] = np.nan
-    with pytest.raises(ValueError, match="changed is not a number"):
+    with pytest.raises(ValueError, match="changed contains NaN"):
         other.load_state_dict(state)
 
 

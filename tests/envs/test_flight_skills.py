@@ -80,7 +80,7 @@ def test_failures_in_flight_are_told_from_those_after_it():
 
 
 def test_other_tasks_are_refused():
-    with pytest.raises(InputError, match="needs a task of JumpState"):
+    with pytest.raises(InputError, match="needs a task with JumpState"):
         flight_skills(make_task("attitude"), make_task("attitude"))
-    with pytest.raises(InputError, match="needs a task of AttitudeState"):
+    with pytest.raises(InputError, match="needs a task with AttitudeState"):
         flight_skills(make_task("vertical-jump-mars"), make_task("velocity-flat"))

@@ -117,11 +117,9 @@ def test_jumps_are_commanded_from_the_squat_after_they_took_over_and_walking_sta
 
 
 def test_policies_of_other_tasks_are_refused():
-    with pytest.raises(PolicyError, match=r"evaluated by velocity, got one of vertical-jump"):
+    with pytest.raises(PolicyError, match=r"suite velocity, got one of task vertical-jump"):
         SkillPolicies(SkillNames(walk="vertical_jump"))
-    with pytest.raises(
-        PolicyError, match=r"evaluated by landing_position or omnidirectional, got one of velocity-flat"
-    ):
+    with pytest.raises(PolicyError, match=r"suite landing_position or omnidirectional, got one of task velocity-flat"):
         SkillPolicies(SkillNames(jump_to="walking_flat"))
 
 

@@ -134,7 +134,7 @@ def test_logged_figures_are_ratios_of_what_worlds_counted(flat):
 
 
 def test_metric_of_an_unknown_field_is_refused():
-    with pytest.raises(InputError, match="metric Metrics/x needs 'speed', which its state has not"):
+    with pytest.raises(InputError, match="metric Metrics/x needs a field 'speed' of the state"):
         dataclasses.replace(make_task("velocity-flat"), metrics=(StateMetric("Metrics/x", "speed"),))
 
 

@@ -127,7 +127,7 @@ class ResetCfg:
 
     start_probability: StartProbability = StartProbability(0.60, 0.15, 0.20, after_landing=0.05)
     balance_by: Literal["resets", "steps"] = "resets"
-    """What `start_probability` divides: the resets, or the policy steps, which each world balances over its resets."""
+    """Quantity that `start_probability` divides: resets, or policy steps, which each world balances over its resets."""
     base_xy: float = 0.05
     """[m] Largest offset of the base along x and y at the start."""
     tilt: float = 5.0
