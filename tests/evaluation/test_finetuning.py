@@ -137,7 +137,7 @@ def test_refuses_invalid_settings(change):
 
 
 def test_refuses_policies_that_do_not_jump():
-    with pytest.raises(InputError, match="not for velocity-flat"):
+    with pytest.raises(InputError, match="not velocity-flat"):
         make_groups(open_policy("walking_flat"), FinetuneCfg(**FEW))
 
 

@@ -311,7 +311,7 @@ def test_sweep_without_recording_needs_no_viewer(policy, tmp_path):
 
 def test_refuses_policy_of_other_task(tmp_path):
     needed = "expected a policy with evaluation suite landing_position or omnidirectional or landing_position_mars"
-    message = f"{needed}, vertical_jump is of vertical-jump, by apex_height"
+    message = rf"{needed}, vertical_jump \(task vertical-jump\) has apex_height"
     with pytest.raises(PolicyError, match=message):
         EvaluationRun.from_args("test", EvaluationArgs(policy="vertical_jump", out=tmp_path, device="cpu"))
 
