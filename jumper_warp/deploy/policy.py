@@ -58,7 +58,7 @@ class DeployedPolicy:
         return self.filter_targets(self.default + self.scale * action, readings["angle"], readings["rate"])
 
     def observe(self, readings: Mapping[str, Any]) -> np.ndarray:
-        """Return the observation, (num_obs,), and append the readings to the history; arguments as for `targets`."""
+        """Return the observation, (num_obs,), and append the readings to the history; arguments: see `targets`."""
         different = sorted(set(readings) ^ (set(self.layout) - {LAST_ACTION}))
         if different:
             raise InputError(f"readings missing or unknown: {', '.join(different)}")

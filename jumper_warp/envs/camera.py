@@ -20,7 +20,7 @@ from jumper_warp.viz.renderer import Renderer, View, open_renderer
 from jumper_warp.viz.scene import DEAD_ZONE, corners, fit
 from jumper_warp.viz.shapes import CHECKER_CELL, ShapeMesh, shape_meshes
 
-PERIOD = 2.0 * CHECKER_CELL  # [m] after which the drawn plane repeats
+PERIOD = 2.0 * CHECKER_CELL  # [m] period of the drawn plane's pattern
 NEAR = 1.5  # [m] distance of a robot from the drawing's origin at which the origin moves to it
 REACH = 5.0  # [m] half the side of the part of a heightfield that is drawn
 NODES = 100  # largest number of nodes of this part on each side of its middle, along an axis

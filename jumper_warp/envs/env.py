@@ -39,7 +39,7 @@ from jumper_warp.utils.kernels import load_kernels, records
 from jumper_warp.utils.streams import PURPOSES, Purpose
 
 CONTACT_TOLERANCE = 1.0e-4
-"""[m/s] Stopping tolerance of the contact iteration, with a fifth fewer sweeps than the solver's default."""
+"""[m/s] Stopping tolerance of the contact iteration, looser than the solver's default, for a fifth fewer sweeps."""
 
 
 class Step(NamedTuple):

@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 CONSTANT = ("gravity", "default_angle", "paw_shapes")
 """Arrays of the kernels' structs that are not saved because they are constant, like those named `nominal_*`."""
 MOTORS = ("kp", "kd", "saturation", "peak", "no_load_speed", "cutoff_speed", "offset")
-"""Saved arrays of the simulation's motors."""
+"""Names of the saved arrays of the simulation's motors."""
 FINGERPRINT = "nominal"  # Key of the nominal parameters' fingerprint
 SEED = "seed"  # Key of the seed (`purpose_seed`)
 

@@ -76,8 +76,8 @@ class CourseLog(EvaluationLog):
         self.goal = np.array([[step.goal for step in script] for script in self.scripts])
         self.durations = np.array([[step.seconds for step in script] for script in self.scripts])
         self.count, self.step_dt = n, 1.0 / 60.0
-        self.end = np.full(n, -1)  # (robots,) index in OUTCOMES, -1 while under way
-        self.current = np.zeros(n, dtype=int)  # (robots,) index of the command under way
+        self.end = np.full(n, -1)  # (robots,) index in OUTCOMES, -1 until the end
+        self.current = np.zeros(n, dtype=int)  # (robots,) index of the current command
         self.start_step = np.full(shape, -1)  # (robots, commands) policy step in which a command began, or -1
         self.start_step[:, 0] = 0
         self.switch_step = np.full(shape, -1)  # (robots, commands) policy step in which the jump skill took over

@@ -73,7 +73,7 @@ def apex_heights(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np
 def ballistic_landing(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np.ndarray]) -> list[torch.Tensor]:
     """Return [x, y], (n,) each, the differentiable landing point [m], world, of the ballistic flight from the apex.
 
-    states, arrays: as for `apex_heights`. The base lands at LANDING_HEIGHT.
+    states, arrays: see `apex_heights`. The base lands at LANDING_HEIGHT.
     """
     reached = torch.as_tensor(arrays["max_height"], device=states[0].q.device)
     row = (torch.stack([state.q[2].detach() for state in states]) - reached).abs().argmin(0)
@@ -122,7 +122,7 @@ def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> Jum
 
 
 def _landing_errors(env: Env, network: Network) -> list[np.ndarray]:
-    """Continue until REST_TIME after touchdown, and return [x, y], (n,) each: base minus goal [m], world."""
+    """Continue the jumps until REST_TIME after touchdown; return [x, y], (n,) each: base minus goal [m], world."""
     rest = round(REST_TIME / env.step_dt)
     with torch.no_grad():
         for _ in range(3 * rest):  # on Mars the fall from the apex takes up to 1.4 s

@@ -179,9 +179,9 @@ class JumpLog(EvaluationLog):
         self.goals, self.terminations = np.pad(goals, ((0, 0), (0, 0), (0, 3 - goals.shape[2]))), terminations
         self.headings, self.delay, self.rest = headings, delay, rest
         self.count, *_ = shape = goals.shape[:2]
-        # (num_envs,) index of the jump under way; the number of jumps in a row after the last
+        # (num_envs,) index of the current jump; the number of jumps in a row after the last
         self.current = np.zeros(self.count, dtype=int)
-        self.end = np.full(shape, -1)  # index in `terminations` of what ended the jump, -1 while under way
+        self.end = np.full(shape, -1)  # index in `terminations` of the jump's end, -1 until then
         self.end_position = np.full((*shape, 2), np.nan)  # [m] (..., 2) base position at the end, world
         self.goal_world = np.full((*shape, 2), np.nan)  # [m] (..., 2) goal, world
         self.takeoff = np.full((*shape, 2), np.nan)  # [m] (..., 2) base position at takeoff, world

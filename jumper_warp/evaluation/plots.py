@@ -28,7 +28,7 @@ WINDOW, MOST_WINDOWS, RESAMPLES = (5, 40), 100, 1000
 
 @contextmanager
 def figure(path: Path, *shape: int, title: str = "", conditions: str = "", **settings: Any) -> Iterator[Any]:
-    """Yield the axes of a new figure; on exit, add a common legend below the axes and write the figure to `path`.
+    """Yield the axes of a new plot; on exit, add a common legend below the axes and write the plot to `path`.
 
     The legend has the labels of all axes without their own legend. title, conditions: lines above the axes; shape,
     settings: arguments of `plt.subplots`.

@@ -86,7 +86,7 @@ class Conditions:
         return None if saved is None else RobotOverlay.from_json(saved)
 
     def env_settings(self, config: dict[str, Any]) -> dict[str, Any]:
-        """Return keyword arguments of `Env` for these conditions. Argument and errors as for `overlay`."""
+        """Return keyword arguments of `Env` for these conditions. Argument and errors: see `overlay`."""
         same = {name: getattr(self, name) for name in ("seed", "stream", "device", "solver", "noise", "threads")}
         return {**same, "randomize": self.sets_parameters, "auto_reset": False, "robot": self.overlay(config)}
 

@@ -18,7 +18,7 @@ from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json
 def task_of_policy(
     policy: Policy, modules: Iterable[ModuleType] = (), *, leave_out: Collection[str] = OPTIONAL
 ) -> TaskCfg:
-    """Return the task in a policy's configuration; arguments and errors as for `restored_task`.
+    """Return the task in a policy's configuration; arguments and errors: see `restored_task`.
 
     Raises PolicyError also if the task's observation differs from the policy's.
     """

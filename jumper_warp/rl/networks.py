@@ -23,7 +23,7 @@ from jumper_warp.rl.mirror import MirrorMap, Symmetry, Weights
 from jumper_warp.utils.normalise import normalise
 
 NORMALISED_LIMIT = 10.0  # Normalised observations are clipped to ± this many standard deviations
-VARIANCE_EPS = 1.0e-5  # Added to a variance before its square root is taken
+VARIANCE_EPS = 1.0e-5  # Constant added to a variance under the square root
 ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}  # Activation modules by `PpoCfg.activation`
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}  # Data type of the hidden layers, by `PpoCfg.precision`
 
@@ -262,7 +262,7 @@ class ActorTensors(NamedTuple):
     symmetry: Symmetry | None  # its mirror map of observations is padded to the columns of the first weight
 
     def forward(self, x: torch.Tensor, dtype: torch.dtype) -> ActorOutput:
-        """Return the policy's mean for features x; arguments as for `Layers.forward`."""
+        """Return the policy's mean for features x; arguments: see `Layers.forward`."""
         if self.symmetry is None:
             mean, layer_inputs = self.layers.forward(x, dtype)
             return ActorOutput(mean, torch.zeros_like(mean), layer_inputs)

@@ -342,7 +342,7 @@ def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
 
 
 def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl | None, rank: Rank) -> TrainResult:
-    """Train with rsl-rl's PPO; arguments and result as for `train`."""
+    """Train with rsl-rl's PPO; arguments and result: see `train`."""
     if as_rsl_rl is None:
         raise InputError("trainer rsl-rl needs as_rsl_rl, which adapts the environment")
     from jumper_warp.rl.rsl_rl import train_rsl_rl

@@ -180,7 +180,7 @@ class BatchPacker:
         return self._compute_values_and_gae(self._rollout, self._critic, scalings, self._cfg, self._chunk_size)
 
     def _pack(self, scalings: Scalings, estimates: Estimates, advantage_scaling: Scaling) -> None:
-        """Write the rollout with its estimates to `rows`; arguments as for `write_rows`."""
+        """Write the rollout with its estimates to `rows`; arguments: see `write_rows`."""
         target_scaling = self._model.value_moments.scaling() if self._cfg.normalise_value else None
         self._write_rows(
             self.rows, self.layout, self._rollout, scalings, estimates, advantage_scaling, target_scaling,

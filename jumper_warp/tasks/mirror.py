@@ -39,14 +39,14 @@ _PLAIN: dict[Any, tuple[int, ...]] = {
     jump.phase_times: (1, 1), jump.height_errors: (1, 1), jump.landing_miss: (1, -1), jump.way: (1, -1),
     obs.drawn_mass: (1, 1), obs.drawn_com: VECTOR, obs.drawn_latency: (1,), obs.drawn_friction: (1, 1),
 }  # fmt: skip
-"""Signs of the columns by the term's function, for terms whose columns keep their order."""
+"""Column signs of mirrored observations by the term's function, for terms whose columns keep their order."""
 _SWAPPED: dict[Any, tuple[int, ...]] = {
     obs.angle: MOTORS, obs.rate: MOTORS, obs.last_action: MOTORS, obs.contacts: LEGS, obs.air_times: LEGS,
     obs.paw_forces: LEGS, velocity.contact_times: LEGS, velocity.paw_heights: LEGS, velocity.recent_steps: LEGS,
     velocity.ground_heights: ROWS, jump.block_ahead: RAYS, obs.drawn_gains: MOTORS,
     obs.drawn_speed_limits: MOTORS, obs.drawn_offset: MOTORS,
 }  # fmt: skip
-"""Orders of the columns by the term's function, for terms whose columns keep their signs."""
+"""Column orders of mirrored observations by the term's function, for terms whose columns keep their signs."""
 
 
 def mirror_of(task: TaskCfg, group: str) -> Mirror:

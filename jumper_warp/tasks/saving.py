@@ -1,6 +1,6 @@
 """Conversion of tasks to JSON and back. Functions and types are saved as `module:name`.
 
-Reading looks names up in the project's modules and those that the user passes; it imports no module for a name.
+Names are resolved in the project's modules and in those that the user passes; no module is imported for a name.
 """
 
 from __future__ import annotations

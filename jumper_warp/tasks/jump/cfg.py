@@ -31,17 +31,17 @@ class GroundCfg:
     block: float = 0.0
     """[1] Probability of a sliding block under the goal, where there is room for the start in front of it."""
     drop: Pair = (0.03, 0.20)
-    """[m] Height of the platform."""
+    """[m] Height of sampled platforms above the floor."""
     rise: Pair = (0.02, 0.08)
-    """[m] Height of the block."""
+    """[m] Height of sampled blocks above the floor."""
     room: float = 0.30
     """[m] Largest distance from the paws to an edge of the ground; the near edge of a block may be farther."""
     clearance: float = 0.12
     """[m] Smallest distance between the paws at the goal and an edge that the jump must cross."""
     mass: Pair = (5.0, 100.0)
-    """[kg] Mass of the block."""
+    """[kg] Mass of sampled blocks."""
     friction: Pair = (0.3, 1.0)
-    """[1] Friction coefficient between block and floor."""
+    """[1] Friction coefficient between sampled blocks and the floor."""
 
     def __post_init__(self) -> None:
         """Raise InputError if a probability or length is out of range, or a pair reversed or not positive."""
@@ -147,11 +147,11 @@ class ResetCfg:
     back_y: Pair = (0.20, 0.22)
     """[m] Distance of the back paws to either side of the base at the start."""
     takeoff_height: Pair = (0.40, 0.45)
-    """[m] Height of the base at takeoff."""
+    """[m] Height of the base at takeoff in starts in flight or during the push."""
     takeoff_ahead: Pair = (0.0, 0.0)
-    """[m] Distance of the base at takeoff from its start, towards the goal."""
+    """[m] Distance of the takeoff point from the start, towards the goal, in starts in flight or during the push."""
     takeoff_pitch: Pair = (0.0, 0.0)
-    """[deg] Mean pitch, nose down, in flight and while pushing off."""
+    """[deg] Mean pitch of the base (nose down) in starts in flight or during the push."""
     push_length: Pair = (0.0, 0.4)
     """[m] Distance of the base from its takeoff point, along a straight line, in starts during the push."""
     push_acceleration: Pair = (10.0, 20.0)
@@ -179,7 +179,7 @@ class ResetCfg:
     landed_ahead: Pair = (0.0, 0.0)
     """[m] Distance of the base ahead of the goal in after-landing starts."""
     landed_speed: Pair = (0.0, 1.0)
-    """[m/s] Downward speed in after-landing starts."""
+    """[m/s] Downward speed of the base in after-landing starts."""
     ground: GroundCfg = field(default_factory=GroundCfg)
     """Platforms and blocks that standing starts sample."""
     command_delay: float = 0.5
@@ -189,7 +189,7 @@ class ResetCfg:
     long_wait: float = 2.5
     """[s] Longest time from reset to the command to jump in episodes with a long wait."""
     next_jump_delay: Pair = (0.2, 0.7)
-    """[s] Time from touchdown to the next goal."""
+    """[s] Time from touchdown to the command of the next goal."""
 
     def __post_init__(self) -> None:
         """Raise InputError if a pair is reversed, or a number is not finite or out of range."""
