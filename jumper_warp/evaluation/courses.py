@@ -217,7 +217,7 @@ class CourseLog(EvaluationLog):
     def _append_history(
         self, arrays: dict[str, np.ndarray], running: np.ndarray, previous: np.ndarray, step: int
     ) -> None:
-        """Append a policy step to the histories.
+        """Append a policy step to the recorded histories.
 
         arrays: those of `read_env`; running: (robots,) whether the course had not ended; previous: (robots,) skill
         that was active in the step; step: its number, from 1.

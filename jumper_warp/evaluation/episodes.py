@@ -142,7 +142,7 @@ class EpisodeFlags:
         check_episodes(self.num_episodes, self.command, self.seconds)
 
     def log(self, task: TaskCfg, seed: int) -> EpisodeLog:
-        """Return the log of episodes that all have this command; seed has no effect."""
+        """Return a new log of episodes with the flags' command in all worlds; seed has no effect."""
         return EpisodeLog(tile_command(self.command, self.num_episodes, task), task, self.seconds)
 
     def metrics(self, log: EpisodeLog) -> Metrics:

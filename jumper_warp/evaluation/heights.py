@@ -88,7 +88,7 @@ class HeightFlags(JumpFlags):
             raise InputError(f"height_range must be in (0, 10) m and rise, got {self.height_range}")
 
     def log(self, task: TaskCfg, seed: int) -> HeightLog:
-        """Return the log of jumps to these heights, one per world; seed has no effect."""
+        """Return a new log of one jump per world to evenly spaced heights; seed has no effect."""
         return HeightLog(np.linspace(*self.height_range, self.num_jumps), termination_names(task))
 
 
@@ -104,5 +104,5 @@ class HeightPlayFlags:
             raise InputError(f"height takes 1 to {MAX_ROBOTS} numbers in (0, 10) m, got {self.height}")
 
     def log(self, task: TaskCfg) -> HeightLog:
-        """Return the log of the jumps, one per robot."""
+        """Return a new log of one recorded jump per robot."""
         return HeightLog(np.array(self.height), termination_names(task))

@@ -102,7 +102,7 @@ class LandingFlags(JumpFlags):
             raise InputError(f"heading must be finite or any, got {self.heading}")
 
     def log(self, task: TaskCfg, seed: int) -> LandingLog:
-        """Return the log of single jumps with these goals and headings, one per world."""
+        """Return a new log of one jump per world, with goals and headings from the flags."""
         rng = np.random.default_rng(seed)
         goals = np.stack([np.linspace(*self.goal_x, self.num_jumps), rng.uniform(*self.goal_y, self.num_jumps)], axis=1)
         headings = random_headings(self.num_jumps, seed) if self.heading == "any" else math.radians(self.heading)

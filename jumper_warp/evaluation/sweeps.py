@@ -126,7 +126,7 @@ class HeightSweep(Suite):
 
     @property
     def flags(self) -> HeightFlags:
-        """Flags of `jumper evaluate` with the same jumps."""
+        """Flags of `jumper evaluate` that define the jumps of this suite."""
         return HeightFlags(self.num_jumps, height_range=self.height_range)
 
     def measure(self, run: EvaluationRun) -> Metrics:
@@ -181,7 +181,7 @@ class DistanceSweep(Suite):
 
     @property
     def flags(self) -> LandingFlags:
-        """Flags of `jumper evaluate` with the same jumps."""
+        """Flags of `jumper evaluate` that define the jumps of this suite."""
         side = self.max_lateral_offset
         return LandingFlags(self.num_jumps, goal_x=self.distance_range, goal_y=(-side, side))
 

@@ -56,7 +56,7 @@ class Policy(nn.Module):
 
     @property
     def layers(self) -> Weights:
-        """Weight (out, in) and bias (out,) of each layer."""
+        """Weight (out, in) and bias (out,) of each layer of the actor network."""
         return linear_layers(self.actor)
 
     def tensors(self) -> dict[str, torch.Tensor]:

@@ -109,7 +109,7 @@ class AdamVectors(NamedTuple):
 
 
 class FlatAdam:
-    """Adam's state for a flat vector of parameters; agrees with `torch.optim.Adam` to rounding."""
+    """Adam optimiser of a flat vector of parameters; agrees with `torch.optim.Adam` to rounding."""
 
     def __init__(self, flat: FlatParameters, lr: float) -> None:
         """Allocate Adam's state, all zeros; lr: initial learning rate, stored on the device as `self.lr`."""

@@ -116,12 +116,12 @@ class RunningMoments(nn.Module):
 
     @torch.no_grad()
     def update(self, x: torch.Tensor) -> None:
-        """Update with a batch of finite samples (batch, *shape) of every rank."""
+        """Update the running moments with a batch of finite samples (batch, *shape) of every rank."""
         self.update_from_moments(all_reduce_moments([Moments.from_samples(x)])[0])
 
     @torch.no_grad()
     def update_from_moments(self, moments: Moments) -> None:
-        """Update with the moments of a batch of finite samples over all ranks."""
+        """Update the running moments with those of a batch of finite samples over all ranks."""
         mean, var, size = moments
         weight = size / (self.count + size)
         delta = mean - self.mean

@@ -47,7 +47,7 @@ class TaskParams:
         """Slots by section, one per term, in the order of the terms."""
         self.values: list[float] = []
         self.names: dict[str, int] = {}
-        """Index in `values` by dotted name; the first index if a randomisation and an event share a name."""
+        """Index of each number in `values` by dotted name; the first if a randomisation and an event share a name."""
         for section, terms in sections.items():
             for term in terms:
                 self.slots[section].append(TermSlot(term, len(self.values)))

@@ -129,7 +129,7 @@ class RewardTerm(Term):
 
     @property
     def weight(self) -> float:
-        """Factor of the term; negative: a penalty."""
+        """Factor of the reward term; negative: a penalty."""
         return self.numbers["weight"]
 
 

@@ -152,7 +152,7 @@ class _Writer:
             self._send(plot.entity, self.rr.Scalars.columns(scalars=plot.values))
 
     def log_states(self) -> None:
-        """Log the frames in which a state changes."""
+        """Log the states, as text, in the frames in which they change."""
         for name, words in self.recording.states.items():
             changes = [i for i, word in enumerate(words) if i == 0 or word != words[i - 1]]
             times = [self.rr.TimeColumn(TIMELINE, duration=self.recording.times[changes])]

@@ -22,7 +22,7 @@ from jumper_warp.tasks.velocity.cfg import CommandCfg
 from jumper_warp.tasks.velocity.flat import WITHOUT_HISTORY, velocity_flat
 
 COMMANDS = CommandCfg(first_range=(0.8, 0.6, 0.4, 0.8), last_range=(0.8, 0.6, 0.4, 0.8), levels=0)
-"""Ranges of commands on the map, one level."""
+"""Ranges of velocity commands on the terrain map, one level."""
 GROUNDS = (*KINDS, "pit", "blocks")  # Kinds of the map's columns; "pit" and "blocks" twice
 STEPS_UP = (
     RewardTerm(rewards.shank_lean, -5.0, threshold=35.0 * DEG, hip=0.045, thigh=0.175, shank=0.3),
