@@ -41,7 +41,7 @@ def test_jump_evaluations_check_success_after_failures():
 
 
 def test_refuses_unknown_evaluation():
-    with pytest.raises(PolicyError, match=r"asks for the evaluation 'walk'; there are \['apex_height', "):
+    with pytest.raises(PolicyError, match=r"unknown evaluation_suite 'walk'; known are \['apex_height', "):
         evaluation_of(replace(TASK, evaluation_suite="walk"))
 
 

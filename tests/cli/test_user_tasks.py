@@ -182,7 +182,7 @@ def test_play_does_not_need_training_functions(capsys, runs, tmp_path):
 
 def test_play_refuses_missing_termination_function(capsys, runs, path, tmp_path):
     code, _, err = run(capsys, *play(runs["low-jump"]))
-    assert code == 2 and len(err) == 1 and "needs 'my_jumps:too_high': name the file" in err[0]
+    assert code == 2 and len(err) == 1 and "needs 'my_jumps:too_high': pass the file" in err[0]
     assert "--task-module" in err[0] and "my_jumps" not in sys.modules
     assert run(capsys, *play(runs["low-jump"], "--task-module", path, "--out", str(tmp_path)))[0] == 0
 

@@ -164,7 +164,7 @@ def test_history_starts_with_the_first_reading_and_shifts_each_step(page):
     [
         ({"jump_comand": 1.0}, "readings missing or unknown: jump_comand"),
         ({"last_action": np.zeros(12)}, "readings missing or unknown: last_action"),
-        ({"lin_vel": np.zeros(2)}, r"lin_vel takes 3 numbers, got an array of shape \(2,\)"),
+        ({"lin_vel": np.zeros(2)}, r"lin_vel must have 3 values, got shape \(2,\)"),
     ],
 )
 def test_refuses_unknown_readings_and_wrong_sizes(change, message):

@@ -165,11 +165,11 @@ def test_the_ground_height_at_the_next_goal_uses_the_blocks_current_position(lan
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"platform": -0.1}, "shares must be >= 0 and add up to at most 1, got -0.1, 0.0"),
-        ({"block": -0.1}, "shares must be"),
-        ({"platform": 0.6, "block": 0.5}, "shares must be .* got 0.6, 0.5"),
-        ({"platform": math.nan}, "shares must be"),
-        ({"block": math.nan}, "shares must be"),
+        ({"platform": -0.1}, "probabilities must be >= 0, in sum at most 1, got -0.1, 0.0"),
+        ({"block": -0.1}, "probabilities must be"),
+        ({"platform": 0.6, "block": 0.5}, "probabilities must be .* got 0.6, 0.5"),
+        ({"platform": math.nan}, "probabilities must be"),
+        ({"block": math.nan}, "probabilities must be"),
         ({"drop": (0.2, 0.1)}, r"ground drop must be \(lower, upper\), positive and finite, got \(0.2, 0.1\)"),
         ({"rise": (0.0, 0.1)}, "ground rise must be"),
         ({"mass": (5.0, math.inf)}, "ground mass must be"),

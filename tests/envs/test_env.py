@@ -285,7 +285,7 @@ def test_standing_has_the_same_pose_and_reward_on_both_solvers():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: dataclasses.replace(TASK, rewards=(*TASK.rewards, TASK.rewards[0])), "name of its own"),
+        (lambda: dataclasses.replace(TASK, rewards=(*TASK.rewards, TASK.rewards[0])), "names of terms must be unique"),
         (lambda: dataclasses.replace(TASK, terminations=()), "diverged"),
         (lambda: dataclasses.replace(TASK, terminations=TASK.terminations[:1]), "diverged"),
         (

@@ -162,8 +162,8 @@ def test_a_saved_state_does_not_change_with_the_environment():
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"num_envs": 4}, "saved for 2 environments, there are 4"),
-        ({"seed": 9}, "saved with seed 1, this environment draws with seed 9"),
+        ({"num_envs": 4}, "saved with num_envs 2, this environment has 4"),
+        ({"seed": 9}, "saved with seed 1, this environment has seed 9"),
         ({"randomize": False}, "saved with other randomisation or events of vertical-jump"),
         ({"task": dataclasses.replace(make_task("vertical-jump"), motors=jumping_motors(12.0))}, "with other robots"),
         ({"solver": "mujoco"}, "lacks .*'solver.qacc_warmstart'"),
@@ -205,7 +205,7 @@ def test_refusal_names_missing_and_unexpected_fields():
     env = make_env(2)
     state = env.state_dict()
     state["vertical-jump.cadence"] = state.pop("vertical-jump.phase")
-    with pytest.raises(ValueError, match=r"'vertical-jump.phase'.*'vertical-jump.cadence'"):
+    with pytest.raises(ValueError, match=r"lacks \['vertical-jump.phase'\], has unknown \['vertical-jump.cadence'\]"):
         env.load_state_dict(state)
 
 
@@ -264,7 +264,7 @@ def test_loading_restores_changed_parameters_and_resets_the_others_to_the_task()
         expected[params.index(f"rewards.jump_height.{key}")] = value
     np.testing.assert_array_equal(numbers, expected)
     state["vertical-jump/changed"][0] = np.nan
-    with pytest.raises(ValueError, match="vertical-jump/changed is "):
+    with pytest.raises(ValueError, match="changed contains NaN"):
         other.load_state_dict(state)
 
 

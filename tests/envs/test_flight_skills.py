@@ -80,7 +80,7 @@ def test_failures_in_flight_are_counted_separately():
 
 
 def test_refuses_tasks_of_other_states():
-    with pytest.raises(InputError, match="needs a task of JumpState"):
+    with pytest.raises(InputError, match="needs a task with JumpState"):
         flight_skills(make_task("attitude"), make_task("attitude"))
-    with pytest.raises(InputError, match="needs a task of AttitudeState"):
+    with pytest.raises(InputError, match="needs a task with AttitudeState"):
         flight_skills(make_task("vertical-jump-mars"), make_task("velocity-flat"))

@@ -44,7 +44,7 @@ def test_refuses_gravity_out_of_range_or_different_between_skills():
             Simulation(1, gravity=bad, device="cpu")
         with pytest.raises(InputError, match="gravity must lie in 0 to 100"):
             Conditions(gravity=bad)
-    with pytest.raises(InputError, match=r"horizontal-jump has a gravity of 9.81 m/s\^2, vertical-jump of 3.71"):
+    with pytest.raises(InputError, match=r"gravity of horizontal-jump must be 3.71 m/s\^2, got 9.81"):
         Env((VERTICAL, make_task("horizontal-jump")), 1, device="cpu")
 
 

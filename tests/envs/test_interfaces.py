@@ -324,9 +324,9 @@ def test_a_changed_parameter_of_a_term_acts_in_captured_steps():
     ("name", "value", "message"),
     [
         ("rewards.orientation.weight", NAN, "rewards.orientation.weight must be finite, got nan"),
-        ("rewards.orientation.depth", 1.0, "no 'depth' of a rewards term 'orientation'"),
-        ("rewards.levitation.weight", 1.0, "no 'weight' of a rewards term 'levitation'"),
-        ("prizes.orientation.weight", 1.0, "no 'weight' of a prizes term 'orientation'"),
+        ("rewards.orientation.depth", 1.0, "no number 'depth' of a rewards term 'orientation'"),
+        ("rewards.levitation.weight", 1.0, "no number 'weight' of a rewards term 'levitation'"),
+        ("prizes.orientation.weight", 1.0, "no number 'weight' of a prizes term 'orientation'"),
         ("weight", 1.0, "names are like rewards.jump_height.weight"),
     ],
 )
@@ -367,14 +367,14 @@ def test_reset_of_some_worlds_changes_no_other(worlds):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"worlds": [0, 0]}, r"8 bools, or different indices below 8, got \[0, 0\]"),
-        ({"worlds": [N]}, "different indices below 8"),
+        ({"worlds": [0, 0]}, r"8 bools, or distinct indices below 8, got \[0, 0\]"),
+        ({"worlds": [N]}, "distinct indices below 8"),
         ({"worlds": np.zeros(N)}, "worlds must be bool of shape"),
-        ({"worlds": [0], "seed": 1}, "a seed is for all worlds"),
+        ({"worlds": [0], "seed": 1}, "a seed resets all worlds"),
         ({"seed": torch.zeros(N, dtype=torch.bool)}, "seed must be in 0"),
     ],
 )
 def test_refuses_invalid_resets_of_some_worlds(env, arguments, message):
     assert_refused(env, message, lambda: env.reset(**arguments))
-    with pytest.raises(RuntimeError, match="reset of all worlds"):
+    with pytest.raises(RuntimeError, match="reset all worlds before"):
         Env(TASK, 1, device="cpu").reset(worlds=[0])

@@ -331,13 +331,13 @@ def test_metrics_and_configuration_contain_all_skills():
 @pytest.mark.parametrize(
     ("make_env", "message"),
     [
-        (lambda: Env([], N), r"at least one task, each with a name of its own, got \[\]"),
-        (lambda: Env([HOLD, HOLD], N), "a name of its own, got .*'hold-height', 'hold-height'"),
+        (lambda: Env([], N), r"at least one task, and unique names, got \[\]"),
+        (lambda: Env([HOLD, HOLD], N), "unique names, got .*'hold-height', 'hold-height'"),
         (lambda: Env([JUMP, HOLD], N, skill=2), "skill must be an index below 2, got 2 to 2"),
         (lambda: Env([JUMP, HOLD], N, skill=-1), "skill must be an index below 2, got -1 to -1"),
         (
             lambda: Env([JUMP, HOLD], N, skill=np.zeros(N + 1, dtype=int)),
-            r"skill must be .* 16 whole ones, got int64 of shape \(17,\)",
+            r"skill must be .* 16 ints, got int64 of shape \(17,\)",
         ),
         (lambda: Env([JUMP, HOLD], N, skill=np.full(N, 0.5)), "skill must be .* got float64"),
         (lambda: Env([JUMP, make_task("horizontal-jump")], N, handovers=[TO_JUMP]), "hold-height to vertical-jump"),
@@ -354,5 +354,5 @@ def test_refuses_invalid_skills(make_env, message):
 def test_refuses_skills_with_motors_of_different_robots():
     motors = jumping_motors(18.0)
     other = dataclasses.replace(motors, transversal=dataclasses.replace(motors.transversal, peak=30.0))
-    with pytest.raises(ValueError, match=r"hold-height needs the peak torque .* of vertical-jump's motors"):
+    with pytest.raises(ValueError, match=r"hold-height and vertical-jump must have equal peak torque"):
         Env([JUMP, dataclasses.replace(HOLD, motors=other)], N, device="cpu")

@@ -78,5 +78,5 @@ def test_refuses_an_unknown_stream_and_a_state_of_another_one():
     with pytest.raises(InputError, match="stream must be one of training, tuning, selection, reporting, got 'test'"):
         Env(task, 2, device="cpu", stream="test")
     saved, other = (randomized(OFF, 2, stream=name) for name in ("tuning", "reporting"))
-    with pytest.raises(InputError, match="saved with seed 2147483648, this environment draws with seed 6442450944"):
+    with pytest.raises(InputError, match="saved with seed 2147483648, this environment has seed 6442450944"):
         other.load_state_dict(saved.state_dict())

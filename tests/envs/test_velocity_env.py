@@ -134,7 +134,7 @@ def test_metrics_are_ratios_of_sums_over_worlds(flat):
 
 
 def test_refuses_a_metric_of_an_unknown_field():
-    with pytest.raises(InputError, match="metric Metrics/x needs 'speed', which its state has not"):
+    with pytest.raises(InputError, match="metric Metrics/x needs a field 'speed' of the state"):
         dataclasses.replace(make_task("velocity-flat"), metrics=(StateMetric("Metrics/x", "speed"),))
 
 

@@ -169,7 +169,7 @@ def test_goals_of_jumps_to_a_place_are_marked_when_the_jump_skill_takes_over():
 
 
 def test_refuses_scripts_of_different_lengths():
-    with pytest.raises(InputError, match="one length"):
+    with pytest.raises(InputError, match="equal, positive lengths"):
         CourseLog([SCRIPT, SCRIPT[:1]])
 
 

@@ -137,10 +137,10 @@ def test_refuses_invalid_settings(change):
 
 
 def test_refuses_policies_that_do_not_jump():
-    with pytest.raises(InputError, match="not for velocity-flat"):
+    with pytest.raises(InputError, match="not velocity-flat"):
         make_groups(open_policy("walking_flat"), FinetuneCfg(**FEW))
 
 
 def test_refuses_zero_iterations_for_height_policies():
-    with pytest.raises(InputError, match="needs an iteration"):
+    with pytest.raises(InputError, match="needs at least 1 iteration"):
         finetune(open_policy("vertical_jump"), FinetuneCfg(**FEW | {"iterations": 0}))

@@ -165,7 +165,7 @@ def test_unchanged_checkpoint_is_resumed(saved):
 
 INVALID_PARTS = [  # keys to a part, its new value, and the error message
     (("iteration",), "late", "iteration must be int, got str"),
-    (("iteration",), 7, "of iteration 7, manifest.json says 1"),
+    (("iteration",), 7, "iteration is 7, in manifest.json 1"),
     (("rng", "cpu"), REMOVED, "rng lacks cpu"),
     (("rng", "cpu"), torch.zeros(5), "rng.cpu has shape (5,), expected (5056,)"),
     (("rng", "cpu"), torch.zeros(5056, dtype=torch.uint8), "rng is not the state of a generator"),
