@@ -41,6 +41,7 @@ def mjcf(description: RobotDescription, values: RobotValues | None = None) -> st
     add(root, "compiler", angle="radian", meshdir="meshes", autolimits="true")
     # Euler applies the motors' damping explicitly, as this project does on SolverMuJoCo
     add(root, "option", timestep=PHYSICS_DT, integrator="Euler", cone="pyramidal")
+    add(root, "statistic", center=(0, 0, 0.3), extent=0.8)  # [m], for viewers
     _add_defaults(root, values.paw_friction[0, 0])
     _add_assets(root, robot)
     _add_world(root, robot)
