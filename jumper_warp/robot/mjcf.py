@@ -72,7 +72,7 @@ def _text(value: Any) -> str:
 
 
 def _add_defaults(root: Element, paw_friction: float) -> None:
-    """Add the classes "visual", "paw" and "ground", and the stops; paw_friction: Coulomb coefficient [1]."""
+    """Add the classes "visual" and "paw", and the softness of stops; paw_friction: Coulomb coefficient [1]."""
     defaults = add(root, "default")
     add(defaults, "joint", solreflimit=(STIFFEST, 1))
     visual = add(defaults, "default", class_="visual")
