@@ -88,7 +88,7 @@ def _add_assets(root: Element, robot: RobotDescription) -> None:
     """Add the meshes, each once and named like its file, and the ground's material."""
     assets = add(root, "asset")
     for file in sorted(mesh_files(robot)):
-        add(assets, "mesh", name=file.stem, file=file.name, inertia="shell")
+        add(assets, "mesh", name=file.stem, file=file.name)
     darker = [0.8 * value for value in GROUND_COLOR]
     add(assets, "texture", name="ground", type="2d", builtin="checker", width="256", height="256", rgb1=GROUND_COLOR,
         rgb2=darker)  # fmt: skip
@@ -98,7 +98,7 @@ def _add_assets(root: Element, robot: RobotDescription) -> None:
 def _add_world(root: Element, robot: RobotDescription) -> None:
     """Add light, ground and the tree of bodies with their joints, shapes and sites."""
     world = add(root, "worldbody")
-    add(world, "light", pos=(0, 0, 3), dir=(0, 0, -1), type="directional")
+    add(world, "light", pos=(0, 0, 3), dir=(0, 0, -1), directional="true")
     add(world, "geom", name="ground", type="plane", size=(GROUND_EDGE, GROUND_EDGE, 0.1), contype="0", conaffinity="1",
         material="ground")  # fmt: skip
     motors = dict(zip(MOTOR_JOINTS, robot.motors, strict=True))
