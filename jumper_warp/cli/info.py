@@ -134,8 +134,10 @@ def properties(values: Mapping[str, str]) -> list[str]:
     """Return a line, or several, for each value that is not empty, with its name before it."""
     lines = []
     for name, value in values.items():
-        indents = {"initial_indent": f"{name:<{INDENT}}", "subsequent_indent": " " * INDENT}
-        lines += textwrap.wrap(value, 80, **indents, break_long_words=False, break_on_hyphens=False) if value else []
+        wrapped = textwrap.wrap(value, 80 - INDENT, break_long_words=False, break_on_hyphens=False)
+        lines += [
+            f"{title:<{INDENT}}{text}" for title, text in zip([name, *[""] * len(wrapped)], wrapped, strict=False)
+        ]
     return [line.replace(UNBROKEN, " ") for line in lines]
 
 
