@@ -135,9 +135,7 @@ def properties(values: Mapping[str, str]) -> list[str]:
     lines = []
     for name, value in values.items():
         wrapped = textwrap.wrap(value, 80 - INDENT, break_long_words=False, break_on_hyphens=False)
-        lines += [
-            f"{title:<{INDENT}}{text}" for title, text in zip([name, *[""] * len(wrapped)], wrapped, strict=False)
-        ]
+        lines += [f"{'' if i else name:<{INDENT}}{text}" for i, text in enumerate(wrapped)]
     return [line.replace(UNBROKEN, " ") for line in lines]
 
 

@@ -70,7 +70,7 @@ class Bench:
 def load_bench(path: Path) -> Bench:
     """Return the recording in a CSV file whose first line names at least the columns `COLUMNS`, in any order.
 
-    Raises InputError: a missing file or column, rows that are not numbers, or as `Bench`; OSError: the file cannot be read.
+    Raises InputError: a missing file or column, rows that are not numbers, or as `Bench`; OSError: it cannot be read.
     """
     rows = csv_rows(existing_file(path, "recording of a test bench"))
     names = [name.strip() for name in rows[0]] if rows else []
