@@ -90,9 +90,5 @@ def parse(
     flags, about = flags_of(opened.evaluation), kind.__doc__
     if hasattr(flags, "height_range"):
         args = join_height_range(args, flags.height_range)
-    program, settings = f"{command} {opened.source}", {"description": about, "default": kind(flags)}
-    cfg, unknown = parse_flags(kind[type(flags)], program, args, return_unknown_args=True, **settings)
-    if unknown:
-        message = f"{unknown[0]} is not for policies of {opened.task.name}"
-        raise UsageError(f"{message}; jumper {program} --help shows the flags that are")
-    return cfg
+    settings = {"description": about, "default": kind(flags), "subject": f"policies of {opened.task.name}"}
+    return parse_flags(kind[type(flags)], f"{command} {opened.source}", args, **settings)

@@ -151,8 +151,8 @@ def test_no_arguments_prints_usage_and_exits_with_2(capsys):
 
 def test_train_without_task_lists_tasks_and_exits_with_2(capsys):
     code, out, err = run(capsys, "train")
-    assert (code, out) == (2, "") and err[0] == "usage: jumper train TASK [flags]"
-    assert all(name in "\n".join(err) for name in TASKS)
+    assert (code, out, len(err)) == (2, "", 1) and "jumper train TASK [flags]" in err[0]
+    assert all(name in err[0] for name in TASKS)
 
 
 @pytest.mark.parametrize(
@@ -181,7 +181,7 @@ def test_input_error_prints_one_line(capsys, monkeypatch):
 def test_missing_file_prints_one_line(capsys, monkeypatch):
     monkeypatch.setattr("jumper_warp.cli.list.run", lambda *_: open("/no/such/file"))
     code, _, err = run(capsys, "list")
-    assert code == 2 and len(err) == 1 and "'/no/such/file'" in err[0]
+    assert code == 2 and err == ["jumper: /no/such/file: No such file or directory"]
 
 
 def test_keyboard_interrupt_exits_with_130(capsys, monkeypatch):
@@ -439,9 +439,9 @@ def test_play_horizontal_jumps_records_distances_and_goal_markers(still, tmp_pat
 @pytest.mark.parametrize(
     ("args", "message"),
     [
-        (["evaluate", "--height-range", "0.5", "1.2"], "--height-range is not for policies of horizontal"),  # default
-        (["play", "--height", "0.9"], "--height is not for policies of horizontal-jump"),
-        (["play", "--height", "0.6", "0.9", "1.1"], "--height is not for policies of horizontal-jump"),
+        (["evaluate", "--height-range", "0.5", "1.2"], "no flag --height-range for policies of horizontal"),  # default
+        (["play", "--height", "0.9"], "no flag --height for policies of horizontal-jump"),
+        (["play", "--height", "0.6", "0.9", "1.1"], "no flag --height for policies of horizontal-jump"),
         (["evaluate", "--goal-x", "0.8", "0.4"], "goal_x must be in"),
     ],
 )
