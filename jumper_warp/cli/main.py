@@ -1,4 +1,4 @@
-"""The command `jumper`: train, finetune, play, evaluate, export, sysid, list. `jumper COMMAND --help` shows the flags.
+"""The command `jumper`: train, play, evaluate and so on. `jumper COMMAND --help` shows the flags.
 
 A command imports only what it needs, so that help and usage errors print at once.
 """
@@ -34,7 +34,8 @@ COMMANDS = {
     "evaluate": "Measure a policy over many trials.",
     "export": "Make a policy's folder of a training run, or one ONNX file of a policy.",
     "sysid": "Identify the robot's parameters from recorded motions.",
-    "list": "Show the tasks and the project's policies.",
+    "list": "List the tasks and the project's policies.",
+    "info": "Describe a task or a policy: jumper info NAME.",
 }
 """Help text by command; each command is a module of `jumper_warp.cli` with run(args, modules)."""
 RED, RESET = "\033[31m", "\033[0m"  # Colour of the program's name before an error

@@ -17,7 +17,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import json_bytes, write_atomically
 
 HELP = f"""\
-usage: jumper sysid DATA ... [flags]
+usage: jumper sysid [fit] DATA ... [flags]
        jumper sysid excite [flags]
        jumper sysid actuator BENCH [flags]
 
@@ -108,7 +108,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     elif args[0] == "actuator":
         characterise(parse(ActuatorCfg, "sysid actuator", args[1:]))
     else:
-        sysid(parse(SysidCfg, "sysid", args))
+        sysid(parse(SysidCfg, "sysid", args[1:] if args[0] == "fit" else args))
 
 
 def split_names(text: str) -> list[str]:
