@@ -9,13 +9,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.envs.env import Env
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, rate
 
 if TYPE_CHECKING:
     import torch
+
+    from jumper_warp.envs.env import Env
 
 SUCCESS = "success"  # Outcomes, also names of terminations
 DIVERGED = "diverged"  # The state of the simulation is not finite or absurdly fast
