@@ -36,6 +36,7 @@ COMMANDS = {
     "sysid": "Identify the robot's parameters from recorded motions.",
     "list": "List the tasks and the project's policies.",
     "info": "Describe a task or a policy: jumper info NAME.",
+    "completion": "Print the script that completes commands and flags in bash or zsh.",
 }
 """Help text by command; each command is a module of `jumper_warp.cli` with run(args, modules)."""
 RED, RESET = "\033[31m", "\033[0m"  # Colour of the program's name before an error

@@ -1,4 +1,7 @@
-"""Implementation of `jumper evaluate` and `jumper play`: run episodes, write and print their metrics."""
+"""Implementation of `jumper evaluate` and `jumper play`: run episodes, write and print their metrics.
+
+Functions import what they need, so that the help of the settings needs neither PyTorch nor Newton.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +15,9 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_course
-from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
-from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
-from jumper_warp.evaluation.run import EvaluationRun, SkillRun
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.policies.catalog import find_policy
 from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.folder import add_files
-from jumper_warp.policies.runs import is_run
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
@@ -28,6 +25,8 @@ from jumper_warp.utils.metrics import print_metrics
 from jumper_warp.utils.output import write_metrics
 
 if TYPE_CHECKING:
+    from jumper_warp.evaluation.log import EvaluationLog
+    from jumper_warp.evaluation.run import EvaluationRun
     from jumper_warp.viz.recording import Recording
 
 Flags = TypeVar("Flags")
@@ -53,6 +52,9 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     Raises PolicyError: unusable policy, or `save_to_policy` for a run; InputError: `save_to_policy` for another stream
     than reporting; OSError: the folder cannot be created.
     """
+    from jumper_warp.policies.folder import add_files
+    from jumper_warp.policies.runs import is_run
+
     if cfg.save_to_policy and cfg.conditions.stream != "reporting":
         raise InputError(f"save_to_policy is for the stream reporting, got {cfg.conditions.stream}")
     if cfg.save_to_policy and is_run(run.source):
@@ -124,6 +126,9 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
 
     Raises PolicyError: the policy cannot be used; OSError: the folder cannot be created.
     """
+    from jumper_warp.evaluation.log import run_evaluation
+    from jumper_warp.evaluation.recorder import EnvRecorder
+
     flags, name = cfg.flags, run.policy.interface.task
     run.prepare("play", cfg.conditions, cfg.out)
     log = flags.log(run.evaluation.prepare_task(run.task))
@@ -155,6 +160,11 @@ def play_script(cfg: ScriptCfg) -> Path:
 
     Raises InputError: unusable script or device; PolicyError: unusable policy; OSError: the folder cannot be created.
     """
+    from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_course
+    from jumper_warp.evaluation.log import run_evaluation
+    from jumper_warp.evaluation.recorder import EnvRecorder
+    from jumper_warp.evaluation.run import SkillRun
+
     script = read_script(cfg.script)
     run = SkillRun(cfg.policies)
     run.prepare("play", cfg.conditions, cfg.out)
@@ -175,6 +185,8 @@ def show_recording(recording: Recording, folder: Path, name: str, cfg: Recording
 
     Returns the path of the .rrd file.
     """
+    from jumper_warp.evaluation.recorder import save_recording
+
     console = Console(stderr=True)
     path = save_recording(recording, folder, name)
     paths = [path, path.with_suffix(".png")]

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from jumper_warp.cli.main import main
-from jumper_warp.evaluation.finetuning import FinetuneCfg, finetune, make_groups, shift_goal_observation
+from jumper_warp.evaluation.finetuning import finetune, make_groups, shift_goal_observation
+from jumper_warp.evaluation.finetuning_cfg import FinetuneCfg
 from jumper_warp.evaluation.jump_errors import jump_errors
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.policy import Policy
