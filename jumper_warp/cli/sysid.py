@@ -100,9 +100,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     modules: unused, as all commands take it. Raises InputError or OSError: data or a flag is invalid.
     """
     if not args:
-        raise UsageError(
-            "the recorded motions come first: jumper sysid fit DATA ... [flags]; jumper sysid --help describes them"
-        )
+        raise UsageError("the recorded motions come first: jumper sysid fit DATA ...; see jumper sysid --help")
     if args[0] in ("-h", "--help"):
         print(HELP)
         raise SystemExit(0)
@@ -111,7 +109,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     elif args[0] == "actuator":
         characterise(parse(ActuatorCfg, "sysid actuator", args[1:]))
     else:
-        sysid(parse(SysidCfg, "sysid", args[1:] if args[0] == "fit" else args))
+        sysid(parse(SysidCfg, "sysid fit", args[1:] if args[0] == "fit" else args))
 
 
 def split_names(text: str) -> list[str]:

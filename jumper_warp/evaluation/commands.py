@@ -152,9 +152,8 @@ class ScriptCfg(RecordingCfg):
     """
 
     script: Path  # Script of commands, a JSON file
-    policies: Annotated[SkillNames, tyro.conf.arg(name="")] = field(
-        default_factory=SkillNames
-    )  # Policies of the three skills
+    policies: Annotated[SkillNames, tyro.conf.arg(name="")] = field(default_factory=SkillNames)
+    """Policies of the three skills."""
 
 
 def play_script(cfg: ScriptCfg) -> Path:
