@@ -26,12 +26,14 @@ usage: jumper {command} POLICY [flags]
 
 {about}
 
-  POLICY    name or folder of a policy, a training run's folder, or a checkpoint; `jumper list` shows the project's
+  POLICY    name or folder of a policy, folder of a training run, or checkpoint;
+            `jumper list` shows the names
 
 Flags depend on the task: jumper {command} POLICY --help lists them."""
 ABOUT = """\
-Measure a policy over many trials; writes metrics.json, with --save-trials also trials.npz.
-jumper evaluate POLICY --suite NAME [flags] runs a test of jumps instead, such as sweep, grid, ring or max."""
+Measure a policy over many trials, print its metrics and write metrics.json.
+jumper evaluate POLICY --suite NAME [flags] runs a test of jumps instead: sweep
+over heights or distances, grid, ring, consecutive, platform, or max distance."""
 SUITE = "--suite"
 
 
@@ -41,6 +43,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     args: the policy, then flags. Raises InputError or OSError: the policy or a flag is invalid. Exits as tyro does.
     """
     policy = policy_of("evaluate", ABOUT, args)
+    args = [part for arg in args for part in (arg.split("=", 1) if arg.startswith(f"{SUITE}=") else [arg])]
     task = saved_task(policy, modules)
     if SUITE in args:
         run_suite(task, args, modules)
@@ -58,7 +61,9 @@ def run_suite(task: TaskCfg, args: Sequence[str], modules: Sequence[ModuleType])
     flag = args.index(SUITE)
     suites, name = suites_for(task.evaluation_suite), "".join(args[flag + 1 : flag + 2])
     if name not in suites:
-        near = suggestion(name, suites) or f"; there are {', '.join(suites) or 'none'}"
+        if not suites:
+            raise UsageError(f"there are no suites for policies of {task.name}")
+        near = suggestion(name, suites) or f"; there are {', '.join(suites)}"
         raise UsageError(f"no suite {name!r:.60} for policies of {task.name}{near}")
     command, default = f"evaluate {args[0]} {SUITE} {name}", suites[name](policy=args[0])
     parse_flags(suites[name], command, [*args[1:flag], *args[flag + 2 :]], default=default).run(list(modules))
@@ -79,9 +84,12 @@ def policy_of(command: str, about: str, args: Sequence[str]) -> str:
 
 def open_run(policy: str, modules: Sequence[ModuleType]) -> EvaluationRun:
     """Open a policy for evaluation. Raises PolicyError or CheckpointError: it cannot be used."""
-    from jumper_warp.evaluation.run import EvaluationRun
+    from jumper_warp.utils.progress import phase
 
-    return EvaluationRun(policy, modules)
+    with phase(f"opening {policy}"):
+        from jumper_warp.evaluation.run import EvaluationRun
+
+        return EvaluationRun(policy, modules)
 
 
 def saved_task(source: str, modules: Sequence[ModuleType]) -> TaskCfg:
@@ -93,9 +101,9 @@ def saved_task(source: str, modules: Sequence[ModuleType]) -> TaskCfg:
     from jumper_warp.policies.restore import restored_task
 
     path = Path(source)
-    folder = path.parent.parent if path.suffix == ".pt" else path
+    folder = path.parent.parent if path.suffix == ".pt" else find_policy(source)
     try:
-        config = json.loads(((folder if (folder / CONFIG).is_file() else find_policy(source)) / CONFIG).read_bytes())
+        config = json.loads((folder / CONFIG).read_bytes())
     except (OSError, ValueError):
         return open_run(source, modules).task
     return restored_task(config, modules)

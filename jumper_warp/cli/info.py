@@ -15,6 +15,7 @@ import tyro
 
 from jumper_warp.cli.list import describe, size_text
 from jumper_warp.cli.main import parse
+from jumper_warp.utils.metrics import WIDTH
 
 if TYPE_CHECKING:
     from jumper_warp.policies.catalog import PolicySummary
@@ -75,21 +76,22 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 def policy_info(policy: PolicySummary) -> tuple[dict[str, Any], list[str]]:
     """Return the description of a policy as JSON data and as lines of text."""
     from jumper_warp.policies.catalog import PICTURE
-    from jumper_warp.utils.assets import policy_tasks
+    from jumper_warp.utils.assets import POLICIES, policy_tasks
 
-    own = policy.name in policy_tasks()
-    name, picture = policy.name if own else _shown(policy.folder), policy.folder / PICTURE
+    name = policy.name if policy.folder.parent == POLICIES else _shown(policy.folder)
+    picture = policy.folder / PICTURE
     content = describe(policy) | {"about": policy.about, "rows": policy.rows}
     content["picture"] = str(picture) if picture.is_file() else None
-    lines = [f"{policy.name}: policy for the task {policy.task}", "", *textwrap.wrap(policy.about, 80), ""]
+    lines = [f"{policy.name}: policy for the task {policy.task}", ""]
+    lines += [*textwrap.wrap(policy.about, WIDTH), ""] if policy.about else []
     lines += [*results_table(policy.rows), ""] if policy.rows else []
-    lines += properties({
+    last = {
         "folder": f"{_shown(policy.folder)}, network {size_text(policy.size_bytes)}",
         "picture": _shown(picture) if picture.is_file() else "",
         "play": f"jumper play {name}", "evaluate": f"jumper evaluate {name}",
         "task": f"jumper info {policy.task}" + " --task" * (policy.task in policy_tasks()),
-    })  # fmt: skip
-    return content, lines
+    }  # fmt: skip
+    return content, lines + [f"{title:<{INDENT}}{text}" for title, text in last.items() if text]
 
 
 def _shown(path: Path) -> str:
@@ -134,7 +136,7 @@ def properties(values: Mapping[str, str]) -> list[str]:
     """Return a line, or several, for each value that is not empty, with its name before it."""
     lines = []
     for name, value in values.items():
-        wrapped = textwrap.wrap(value, 80 - INDENT, break_long_words=False, break_on_hyphens=False)
+        wrapped = textwrap.wrap(value, WIDTH - INDENT, break_long_words=False, break_on_hyphens=False)
         lines += [f"{'' if i else name:<{INDENT}}{text}" for i, text in enumerate(wrapped)]
     return [line.replace(UNBROKEN, " ") for line in lines]
 
@@ -152,7 +154,7 @@ def task_info(name: str) -> tuple[dict[str, Any], list[str]]:
         "module": entry.origin, **contents_of(task),
     }  # fmt: skip
     sizes, rewards = content["observation_sizes"], content["rewards"]
-    lines = [f"{name}: {entry.description}", "", *textwrap.wrap(f"{content['details']}.", 80), ""]
+    lines = [f"{name}: {entry.description}", "", *textwrap.wrap(f"{content['details']}.", WIDTH), ""]
     lines += properties({
         "observation": f"{sizes['actor']} numbers: {', '.join(content['observations'])}",
         "critic": f"observes {sizes['critic']} numbers",

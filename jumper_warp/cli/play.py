@@ -12,8 +12,10 @@ from jumper_warp.cli.evaluate import open_run, parse, policy_of, saved_task
 from jumper_warp.cli.main import parse as parse_flags
 
 ABOUT = """\
-Run a policy and record it for the Rerun viewer; --viewer rerun opens the recording.
-jumper play --script FILE.json [flags] makes one robot walk and jump with several policies."""
+Simulate a policy, and write a picture and a recording for the Rerun viewer;
+--viewer rerun opens it, --video FILE writes a film.
+jumper play --script FILE.json [flags] makes one robot walk and jump with
+several policies."""
 SCRIPT = "--script"
 
 

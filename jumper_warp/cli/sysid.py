@@ -54,6 +54,7 @@ class SysidCfg:
     """[N m] Torque limit that the controllers were set to (default: as the files say, else 18)."""
     torque_constant: float = 0.0  # [N m/A] Torque at the joint over current, for files with currents
     out: Path | None = None  # Folder for the results (default: outputs/sysid/<time>)
+    json: bool = False  # Print report.json in place of a table
     device: str | None = None  # Warp device
     threads: int | None = None  # CPU threads (default: all cores)
 
@@ -124,6 +125,7 @@ def sysid(cfg: SysidCfg) -> None:
     from jumper_warp.identification.identify import identify, identify_by_evolution
     from jumper_warp.identification.report import write_results
     from jumper_warp.utils.output import output_dir
+    from jumper_warp.utils.progress import phase
     from jumper_warp.utils.runtime import configure_device
 
     cfg.noise.check()
@@ -138,7 +140,11 @@ def sysid(cfg: SysidCfg) -> None:
     else:
         result = identify(motions, parameters, **settings)
     folder = output_dir("sysid", cfg.out)
-    write_results(result, folder, f"jumper sysid of {', '.join(motion.name for motion in motions)}")
+    with phase("writing the report"):
+        write_results(result, folder, f"jumper sysid of {', '.join(motion.name for motion in motions)}")
+    if cfg.json:
+        print((folder / "report.json").read_text(encoding="utf-8"), end="")
+        return
     table = Table("parameter", "unit", "described", "found", "95 %", box=None)
     rows = zip(result.parameters, result.values, result.intervals, result.identified, strict=True)
     for parameter, value, (low, high), identified in rows:

@@ -43,6 +43,7 @@ class EvaluateCfg(Generic[Flags]):
     out: Path | None = None  # Folder for metrics.json (default: outputs/evaluate/<time>)
     save_trials: bool = False  # Also write the arrays of all trials, from which the rates follow, into trials.npz
     save_to_policy: bool = False  # Also save the metrics into the policy's folder
+    json: bool = False  # Print metrics.json in place of a table
 
 
 def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
@@ -58,7 +59,7 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
         raise InputError(f"save_to_policy is for the stream reporting, got {cfg.conditions.stream}")
     if cfg.save_to_policy and is_run(run.source):
         raise PolicyError(f"{run.source}: a run keeps no metrics; export it first")
-    run.prepare("evaluate", cfg.conditions, cfg.out, save_trials=cfg.save_trials)
+    run.prepare("evaluate", cfg.conditions, cfg.out, save_trials=cfg.save_trials, json=cfg.json)
     log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.stream_seed)
     run.run_episodes(run.env(log.count), log)
     values = run.report(cfg.flags.metrics(log), run.evaluation.paper)

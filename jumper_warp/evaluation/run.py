@@ -5,6 +5,7 @@ Experiments and the commands `jumper evaluate` and `jumper play` share it.
 
 from __future__ import annotations
 
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -50,6 +51,7 @@ class EvaluationArgs(Conditions):
     policy: str = "horizontal_jump"  # Name or folder of a policy, a run's folder, or a checkpoint
     num_recorded: int = 1  # Number of jumps to record for the Rerun viewer and, one of them, as a picture; 0: none
     save_trials: bool = False  # Write the arrays of all trials, from which the rates follow, into trials.npz
+    json: bool = False  # Print metrics.json in place of a table
     out: Path | None = None  # Folder for metrics, plots, pictures and recordings (default: outputs/<name>/<time>)
 
     def __post_init__(self) -> None:
@@ -76,6 +78,7 @@ class Run(ABC):
         self.started = time.perf_counter()
         self.conditions, self.record = Conditions(), 0  # Conditions of all episodes; number of worlds to record
         self.save_trials = False  # Whether `run_episodes` writes trials.npz
+        self.json = False  # Whether `report` prints metrics.json in place of a table
         self.settings: dict[str, Any] = {}  # Settings of task, robot and test, reported with the conditions
         self._latency: list[np.ndarray] = []  # [physics steps] (num_envs,) per `run_episodes`
         self._physics_dt = PHYSICS_DT
@@ -85,16 +88,17 @@ class Run(ABC):
         """Return the function from observations (num_envs, num_obs) to actions, argument `act` of `run_evaluation`."""
 
     def prepare(
-        self, name: str, conditions: Conditions, out: Path | None = None, *, record: int = 0, save_trials: bool = False
-    ) -> None:
+        self, name: str, conditions: Conditions, out: Path | None = None, *, record: int = 0,
+        save_trials: bool = False, json: bool = False,
+    ) -> None:  # fmt: skip
         """Set the conditions, select the device and create the output folder, before anything is simulated.
 
         name: of the folder outputs/<name>/<time>, unless `out` is given; record: number of worlds to record;
-        save_trials: whether to write trials.npz.
+        save_trials: whether to write trials.npz; json: whether to print metrics.json in place of a table.
         Raises InputError: no such device or number of threads; OSError: the folder cannot be created.
         """
         configure_device(conditions.device, conditions.threads)
-        self.conditions, self.record, self.save_trials = conditions, record, save_trials
+        self.conditions, self.record, self.save_trials, self.json = conditions, record, save_trials, json
         self.folder = output_dir(name, out)
 
     @property
@@ -159,9 +163,12 @@ class Run(ABC):
 
     def report(self, metrics: AnyMetrics, paper: Mapping[str, float]) -> dict[str, Any]:
         """Write conditions and metrics to `metrics.json`, print them beside the paper's values, return all values."""
-        write_metrics(self.folder, metrics, self.condition_values)
-        print_metrics(metrics, paper, self.condition_values, self.title)
-        print(f"{time.perf_counter() - self.started:.1f} s; results in {self.folder}")
+        path, done = write_metrics(self.folder, metrics, self.condition_values), f"results in {self.folder}"
+        if self.json:
+            print(path.read_text(encoding="utf-8"), end="")
+        else:
+            print_metrics(metrics, paper, self.condition_values, self.title)
+        print(f"{time.perf_counter() - self.started:.1f} s; {done}", file=sys.stderr if self.json else sys.stdout)
         return read_values(self.folder)
 
 
@@ -196,7 +203,8 @@ class EvaluationRun(Run):
                 f"this needs a policy that is evaluated by {' or '.join(evaluations)}, "
                 f"{args.policy} is of {run.task.name}, by {run.task.evaluation_suite}"
             )
-        run.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
+        settings = {"record": args.num_recorded, "save_trials": args.save_trials, "json": args.json}
+        run.prepare(name, conditions_of(args), args.out, **settings)
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
@@ -235,7 +243,8 @@ class SkillRun(Run):
         Raises PolicyError, CheckpointError or InputError.
         """
         run = cls(names)
-        run.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
+        settings = {"record": args.num_recorded, "save_trials": args.save_trials, "json": args.json}
+        run.prepare(name, conditions_of(args), args.out, **settings)
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:

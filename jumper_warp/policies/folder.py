@@ -46,7 +46,8 @@ def save_policy(
     """
     folder = checked_folder(folder)
     if folder.exists() and not (overwrite and (folder / MANIFEST).is_file()):
-        raise PolicyError(f"{folder} exists" + ("" if not overwrite else " and is no policy's"))
+        reason = " and is not a policy's folder" if overwrite else "; overwrite replaces it"
+        raise PolicyError(f"{folder} exists{reason}")
     config = {**source_versions(), **policy.config}
     config |= {"schema_version": SCHEMA_VERSION, "interface": policy.interface.to_json()}
     content = {
