@@ -156,7 +156,8 @@ def parse(
     options = {option for flag in flags for option in flag.options}
     for option in filter(None, map(option_of, args)):
         if option not in options:
-            near = suggestion(option, options) or f"; jumper {command} --help lists the flags"
+            near = suggestion(option[2:], (each[2:] for each in options)).replace("'", "'--", 1)
+            near = near or f"; jumper {command} --help lists the flags"
             raise UsageError(f"no flag {option} for {subject or command}{near}")
     import tyro
 
