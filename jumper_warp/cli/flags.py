@@ -98,7 +98,8 @@ def field_docs(kind: type) -> dict[str, str]:
             about = comment.partition("#")[2]
             if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
                 about = str(text.value.value)
-            docs[ast.unparse(field.target)] = " ".join(about.split())
+            name = ast.unparse(field.target)
+            docs[name] = " ".join(about.split()) or docs.get(name, "")
     return docs
 
 
