@@ -29,7 +29,7 @@ usage: jumper {command} POLICY [flags]
   POLICY    name or folder of a policy, folder of a training run, or checkpoint;
             `jumper list` shows the names
 
-Flags depend on the task: jumper {command} POLICY --help lists them."""
+jumper {command} POLICY --help lists the flags."""
 ABOUT = """\
 Measure a policy over many trials, print its metrics and write metrics.json.
 jumper evaluate POLICY --suite NAME [flags] runs a test of jumps instead: sweep

@@ -46,6 +46,11 @@ class Flag(NamedTuple):
         return [] if self.positional else [f"--{name}" for name in (self.name, *negative)]
 
     @property
+    def first_sentence(self) -> str:
+        """First sentence of the description, without its full stop."""
+        return self.about.split(". ")[0].rstrip(".")
+
+    @property
     def metavar(self) -> str:
         """Placeholder of the value, such as "INT" or "{off,actor}"; empty for a switch."""
         return "" if self.kind is bool else metavar(self.kind)

@@ -106,7 +106,7 @@ def row(flag: Flag, *, brief: bool = False) -> str:
         start, dot, last = flag.name.rpartition(".")
         name = f"--{start}{dot}[no-]{last}"
     left = f"  {name} {'' if flag.positional else flag.metavar}".rstrip()
-    about = flag.about.split(". ")[0] if brief else flag.about
+    about = flag.first_sentence if brief else flag.about
     default = "" if "(default" in about else default_text(flag.default)
     default = f"({'' if brief else 'default: '}{default})" if default else ""
     return columns(left, f"{about.rstrip('.')} {default}".strip()) if about else f"{left} {default}\n"

@@ -180,7 +180,7 @@ def parse_error(printed: str, flags: Sequence[Flag], args: Sequence[str]) -> str
     message = " ".join(itertools.takewhile(lambda line: not line.startswith("─"), lines))
     missing = [flag for flag in flags if flag.positional and flag.default is dataclasses.MISSING]
     if missing and message.startswith("Missing from"):
-        return f"{missing[0].name} is missing: {missing[0].about}"
+        return f"{missing[0].name} is missing: {missing[0].first_sentence}"
     options = {option: flag for flag in flags for option in flag.options}
     for word in re.findall(r"--[\w.-]+", message):
         if flag := options.get(word.rstrip(".")):

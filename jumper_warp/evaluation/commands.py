@@ -34,7 +34,7 @@ Flags = TypeVar("Flags")
 
 @dataclass(frozen=True)
 class EvaluateCfg(Generic[Flags]):
-    """Try a policy many times and report how well it did."""
+    """Measure a policy over many trials, print its metrics and write metrics.json."""
 
     flags: Annotated[Flags, tyro.conf.arg(name="")]
     """Flags of the task's kind, `jumper_warp.evaluation.evaluations.EvaluationFlags`."""
@@ -99,7 +99,7 @@ class RecordingCfg:
     """Flags that all recordings share."""
 
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
-    """What the policies are tried in."""
+    """Conditions of the simulation."""
     film: Annotated[FilmCfg, tyro.conf.arg(name="")] = field(default_factory=FilmCfg)
     """A film of the recording."""
     out: Path | None = None  # Folder for recording, picture, metrics.json and plots (default: outputs/play/<time>)
@@ -109,7 +109,7 @@ class RecordingCfg:
 
 @dataclass(frozen=True)
 class PlayCfg(RecordingCfg, Generic[Flags]):
-    """Let a policy act, and record it."""
+    """Simulate a policy, and write a recording, a picture, metrics and on request a film."""
 
     flags: Annotated[Flags, tyro.conf.arg(name="")]
     """Flags of the task's kind, `jumper_warp.evaluation.evaluations.PlayFlags`."""
@@ -144,15 +144,16 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
 
 @dataclass(frozen=True)
 class ScriptCfg(RecordingCfg):
-    """Let one robot walk and jump with several policies, as a script says, and record it.
+    """Simulate a script of walks and jumps of one robot, and write a recording, a picture, metrics and a plot.
 
     A script is a JSON list of {"walk": [vx, vy, yaw_rate], "seconds": s}, {"stand": s}, {"jump_up": height},
     {"jump_to": [ahead, left]} and {"jump_onto": [ahead, left]} (a block); SI units, as in
     assets/scripts/walk_jump_walk.json.
     """
 
-    script: Path  # File with the commands
-    policies: Annotated[SkillNames, tyro.conf.arg(name="")] = field(default_factory=SkillNames)  # Who carries them out
+    script: Path  # Script of commands, a JSON file
+    policies: Annotated[SkillNames, tyro.conf.arg(name="")] = field(default_factory=SkillNames)
+    """Policies of the three skills."""
 
 
 def play_script(cfg: ScriptCfg) -> Path:

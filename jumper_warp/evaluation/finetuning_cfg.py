@@ -44,7 +44,7 @@ class FinetuneCfg:
 
 @dataclass(frozen=True)
 class FinetuneArgs(FinetuneCfg):
-    """Make a jumping policy miss its heights or places by less, by gradients through physics, motors and network."""
+    """Reduce the errors of a jumping policy by gradients through physics, motors and network."""
 
     out: Path | None = None  # Folder of the new policy (default: <policy>_finetuned)
     overwrite: bool = False  # Replace a policy that is there already

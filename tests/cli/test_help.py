@@ -72,7 +72,7 @@ def test_flags_have_names_types_defaults_and_descriptions():
 
 
 def test_field_with_a_new_default_in_a_subclass_keeps_its_description():
-    assert [(flag.default, flag.about) for flag in list_flags(Motor)][0] == (4.0, "[kW] Largest power")
+    assert next((flag.default, flag.about) for flag in list_flags(Motor)) == (4.0, "[kW] Largest power")
 
 
 def test_flags_of_an_instance_have_its_values_as_defaults():
