@@ -101,9 +101,9 @@ def saved_task(source: str, modules: Sequence[ModuleType]) -> TaskCfg:
     from jumper_warp.policies.restore import restored_task
 
     path = Path(source)
-    folder = path.parent.parent if path.suffix == ".pt" else path
+    folder = path.parent.parent if path.suffix == ".pt" else find_policy(source)
     try:
-        config = json.loads(((folder if (folder / CONFIG).is_file() else find_policy(source)) / CONFIG).read_bytes())
+        config = json.loads((folder / CONFIG).read_bytes())
     except (OSError, ValueError):
         return open_run(source, modules).task
     return restored_task(config, modules)

@@ -22,7 +22,10 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """
     name = policy_of("finetune", ABOUT, args)
     from jumper_warp.evaluation.finetuning_cfg import FinetuneArgs
+    from jumper_warp.policies.catalog import find_policy
 
+    if Path(name).suffix != ".pt":
+        find_policy(name)  # a misspelt name is reported before PyTorch is imported
     parsed: FinetuneArgs = parse(FinetuneArgs, f"finetune {name}", args[1:])
     from jumper_warp.utils.progress import phase
 

@@ -24,9 +24,9 @@ WALK, JUMP_UP, JUMP_TO = range(3)  # Indices of the skills: walking, jump to a h
 class SkillNames:
     """Name or folder of the policy of each skill."""
 
-    walk: str = "walking_flat"  # Follows commanded velocities
-    jump_up: str = "vertical_jump"  # Jumps to a commanded height
-    jump_to: str = "horizontal_jump"  # Jumps to a commanded position
+    walk: str = "walking_flat"  # Policy that follows commanded velocities
+    jump_up: str = "vertical_jump"  # Policy that jumps to a commanded height
+    jump_to: str = "horizontal_jump"  # Policy that jumps to a commanded position
 
 
 class SkillPolicies:
