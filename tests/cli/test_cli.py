@@ -116,7 +116,7 @@ def test_each_command_prints_help(capsys, command):
         (["train", "swim"], "unknown task 'swim'; there are vertical-jump"),
         (["train", "walking-flat"], "'walking-flat' is a policy, not a task; its task is velocity-flat"),
         (["train", "vertical_jump", "--robot", "robot.json"], "robot.json: no such file (robot overlay, as"),
-        (["train", "vertical-jump", "--resume", "run"], "run: no such file or folder, no run to resume; give"),
+        (["train", "vertical-jump", "--resume", "run"], "run: no such file or folder, no run to resume; pass"),
         (["train", "vertical-jump", "--init-policy", "vertical_jmup"], "did you mean 'vertical_jump'?"),
         (["train", "--max-iterations", "3"], "the task comes first"),
         ([*TRAIN, "--task", "other"], "give the task once"),
@@ -524,7 +524,7 @@ def test_refuses_output_folder_before_simulating(tmp_path, capsys, command):
     save_policy(tmp_path / "policy", policy)
     (tmp_path / "file").touch()
     args = [command, str(tmp_path / "policy"), "--device", "cpu", "--out"]
-    assert "observation is not the one" in run(capsys, *args, str(tmp_path / "new"))[2][-1]
+    assert "observation differs from that of its task" in run(capsys, *args, str(tmp_path / "new"))[2][-1]
     code, _, err = run(capsys, *args, str(tmp_path / "file"))
     assert code == 2 and "File exists" in err[-1]
 
