@@ -187,7 +187,7 @@ def test_existing_policy_is_replaced_only_with_overwrite(folder, trained):
 
 def test_folder_without_a_policy_is_never_replaced(tmp_path, trained):
     (tmp_path / "mine.txt").touch()
-    with pytest.raises(PolicyError, match="no policy's"):
+    with pytest.raises(PolicyError, match="is not a policy's folder"):
         save_policy(tmp_path, trained, overwrite=True)
     assert (tmp_path / "mine.txt").exists()
 
@@ -303,7 +303,7 @@ def make_external(model):
 
 F32 = np.float32
 NOT_REPRODUCIBLE = "the graph or metadata of the ONNX file differs from that of its weights and config.json"
-NEWER = "has version 4, this is version 3"
+NEWER = "has version 4, expected version 3"
 REFUSALS = {
     "manifest missing": (lambda f: (f / "manifest.json").unlink(), "manifest.json: cannot be read"),
     "manifest not JSON": (lambda f: (f / "manifest.json").write_text("{"), "manifest.json: not JSON"),
