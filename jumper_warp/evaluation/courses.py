@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.evaluation.log import EvaluationLog, ended_by, finite, outcome_names
-from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.evaluation.velocities import (
     AXES,
@@ -32,6 +31,7 @@ from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.tasks.switching import FALLS
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, largest, mean, rate, rmse
+from jumper_warp.viz.plots import figure
 from jumper_warp.viz.style import ACTUAL_COLOR
 
 SKILLS = {

@@ -14,7 +14,7 @@ from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, me
 LEVEL_TILT = 10.0  # [deg] Tilt of the base below which a landing is level
 DRIFT, TURN = 0.2, 25.0  # [m], [deg] Drift and turn of the base beyond which the authors' configuration ends an episode
 
-JUMP_METRICS = (
+SUCCESS_METRICS = (
     Metric("success_rate", rate, "jumps", lambda o: o.success),
     Metric("goal_reached_rate", rate, "jumps", lambda o: o.reached),
     Metric("landed_rate", rate, "jumps", lambda o: o.landed),
@@ -22,6 +22,9 @@ JUMP_METRICS = (
     Metric("no_paw_lift_rate", rate, "jumps", lambda o: o.still),
     Metric("success_without_paw_lift_rate", rate, "jumps", lambda o: o.success & o.still),
     Metric("success_without_hop_rate", rate, "jumps", lambda o: o.success & ~o.hopped),
+)
+"""Table of the rates of successful jumps and of the parts of a success; `JumpOutcome` defines their events."""
+FAILURE_METRICS = (
     Metric("fall_rate", rate, "jumps", lambda o: o.fell),
     Metric("collision_rate", rate, "jumps", lambda o: o.collided),
     Metric("diverged_rate", rate, "jumps", lambda o: o.diverged),
@@ -35,9 +38,9 @@ JUMP_METRICS = (
     Metric("turn_abs_mean_deg", mean, "landed jumps", lambda o: o.turn_deg),
     Metric("turn_abs_max_deg", largest, "landed jumps", lambda o: o.turn_deg),
 )
-"""Table of the metrics common to all jumps; `JumpOutcome` defines their events."""
+"""Table of the rates of failures, and of tilt and turn after the landing."""
 HEIGHT_METRICS = (
-    *JUMP_METRICS[:7],
+    *SUCCESS_METRICS,
     Metric("apex_error_abs_mean_m", mean, "jumps that did not diverge", lambda o: np.abs(o.apex_error_m)),
     Metric("apex_error_signed_mean_m", mean, "jumps that did not diverge", lambda o: o.apex_error_m),
     Metric("apex_error_abs_max_of_successes_m", largest, "successful jumps", lambda o: np.abs(o.apex_error_m)),
@@ -45,11 +48,11 @@ HEIGHT_METRICS = (
     Metric("drift_mean_m", mean, "landed jumps", lambda o: o.drift_m),
     Metric("drift_max_m", largest, "landed jumps", lambda o: o.drift_m),
     Metric("beyond_authors_limits_rate", rate, "landed jumps", lambda o: (o.drift_m > DRIFT) | (o.turn_deg > TURN)),
-    *JUMP_METRICS[7:],
+    *FAILURE_METRICS,
 )
 """Table of the metrics of jumps to heights; the authors' limits on drift and turn are DRIFT and TURN."""
 PLACE_METRICS = (
-    *JUMP_METRICS[:7],
+    *SUCCESS_METRICS,
     Metric("goal_distance_at_rest_mean_m", mean, "landed jumps", lambda o: o.distance_at_rest_m),
     Metric("goal_distance_at_touchdown_mean_m", mean, "jumps that touched down", lambda o: o.distance_at_touchdown_m),
     Metric("goal_distance_at_end_mean_m", mean, "jumps that did not diverge", lambda o: o.distance_at_end_m),
@@ -58,7 +61,7 @@ PLACE_METRICS = (
     Metric("goal_error_left_signed_mean_m", mean, "landed jumps", lambda o: o.left_m),
     Metric("distance_flown_mean_m", mean, "jumps that touched down", lambda o: o.distance_flown_m),
     Metric("paw_to_paw_distance_mean_m", mean, "landed jumps", lambda o: o.paw_to_paw_distance_m),
-    *JUMP_METRICS[7:],
+    *FAILURE_METRICS,
 )
 """Table of the metrics of jumps to landing positions."""
 IN_RANGE = ("success_rate", "goal_reached_rate", "no_paw_lift_rate", "apex_error_abs_mean_m",

@@ -18,12 +18,12 @@ from jumper_warp.evaluation.jump_metrics import PLACE_METRICS, jump_metrics, ran
 from jumper_warp.evaluation.jumps import TOLERANCE, JumpOutcome
 from jumper_warp.evaluation.landings import LandingLog
 from jumper_warp.evaluation.log import within
-from jumper_warp.evaluation.plots import BasePaths, plot_distances, plot_landings, plot_paths, regular_polygons
 from jumper_warp.evaluation.recorder import block_positions
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite, check
 from jumper_warp.robot.grounds import SIZE, BlockCfg, platform, uneven
 from jumper_warp.utils.metrics import Metrics, MetricValue, chosen, largest, mean, measure, rate
+from jumper_warp.viz.plots import plot_distances, plot_landings, plot_paths, regular_polygons
 
 AHEAD, ASIDE = (0.35, 1.4), (-0.35, 0.35)  # [m] Ranges of the grid's goals ahead and to the left
 SECTORS = ("ahead", "left", "back", "right")  # Quarters of a ring, each centred on its direction
@@ -55,6 +55,27 @@ PUBLISHED = {
     "Cheng et al. 2024": 0.8, "Atanassov et al. 2024": 0.9, "Jumper, the paper's robot": 1.25,
 }  # fmt: skip
 """[m] Published jump distances of robots, from the paper's table."""
+
+
+class BasePaths:
+    """Recorder of the paths of all bases; call the object after every policy step."""
+
+    def __init__(self) -> None:
+        self.positions: list[np.ndarray] = []  # [m] x, y of every base, one array (worlds, 2) per step, world frame
+
+    def __call__(self, landings: LandingLog) -> None:
+        """Append the current base positions; NaN for worlds whose last jump has ended."""
+        running = landings.current < landings.goals.shape[1]
+        self.positions.append(np.where(running[:, None], landings.arrays["base_pos"][:, :2], np.nan))
+
+    def in_start_frame(self, headings: np.ndarray) -> np.ndarray:
+        """Return the paths [m], (worlds, steps, 2), ahead and to the left of the world's origin.
+
+        headings [rad]: headings of the robots at the start, (worlds,).
+        """
+        x, y = np.moveaxis(np.stack(self.positions, axis=1), -1, 0)
+        cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
+        return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
 
 @dataclass(frozen=True)

@@ -18,11 +18,11 @@ from jumper_warp.evaluation.jumps import DELAY, REST_TIME, TOLERANCE, with_jump_
 from jumper_warp.evaluation.landings import LandingFlags, LandingLog, random_headings, with_second_takeoff
 from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
 from jumper_warp.evaluation.log import termination_names, within
-from jumper_warp.evaluation.plots import Published, plot_sweep
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun, trained_range
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, chosen, measure
+from jumper_warp.viz.plots import Published, plot_sweep
 
 PAPER_HEIGHTS = Published(mean_error=0.04, robot=((0.75, 0.0, 0.023), (1.0, 0.01, 0.0)), open_loop=1.075)
 PAPER_DISTANCES = Published(mean_error=0.026, robot=((1.25, 0.0, 0.004),))

@@ -12,9 +12,16 @@ from experiments import paper_tests
 from jumper_warp.evaluation.jumps import TERMINATIONS
 from jumper_warp.evaluation.landings import LandingLog
 from jumper_warp.evaluation.log import run_evaluation, termination_names
-from jumper_warp.evaluation.plots import BasePaths
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.suites import Consecutive, Farthest, Grid, Platform, consecutive_metrics, distance_metrics
+from jumper_warp.evaluation.suites import (
+    BasePaths,
+    Consecutive,
+    Farthest,
+    Grid,
+    Platform,
+    consecutive_metrics,
+    distance_metrics,
+)
 from jumper_warp.evaluation.sweeps import DistanceSweep
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.folder import save_policy

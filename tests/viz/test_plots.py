@@ -4,7 +4,7 @@ import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation import plots
+from jumper_warp.viz import plots
 
 
 @pytest.fixture
@@ -64,12 +64,6 @@ def test_interval_of_running_mean_has_the_width_of_the_standard_error():
     low, high = np.ptp(band[np.isclose(band[:, 0], middle), 1]), 2 * 1.96 * 0.1 / np.sqrt(plots.WINDOW[1])
     plt.close()
     assert low == pytest.approx(high, rel=0.3)
-
-
-def test_rate_interval_is_wilsons():
-    good = np.arange(10) < np.array([[0], [5], [10]])
-    expected = [[0.0, 0.5, 1.0], [0.0, 0.2366, 0.7225], [0.2775, 0.7634, 1.0]]  # Wilson 1927, 10 trials
-    np.testing.assert_allclose(plots.rate_interval(good), expected, atol=1e-4)
 
 
 def test_landings_show_outline_of_a_platform_and_failures(drawn):

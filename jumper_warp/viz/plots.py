@@ -12,7 +12,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from jumper_warp.evaluation.jumps import JumpLog
+from jumper_warp.utils.metrics import rate
 from jumper_warp.viz.style import ACTUAL_COLOR, GOAL_COLOR
 
 matplotlib.use("Agg")
@@ -178,8 +178,9 @@ def plot_distances(
     settings = {"figsize": (8.0, 7.5), "sharex": True, "title": "Jumps to far goals", "conditions": conditions}
     with figure(path, 2, 1, height_ratios=(3, 2), **settings) as (top, bottom):
         for marker, (label, good) in zip("o^s", successes.items(), strict=False):
-            rate, low, high = rate_interval(good)
-            top.plot(distances, 100.0 * rate, marker=marker, label=label)
+            rates = [rate(row) for row in good]
+            low, high = np.transpose([value.interval for value in rates])
+            top.plot(distances, [100.0 * value.value for value in rates], marker=marker, label=label)
             top.fill_between(distances, 100.0 * low, 100.0 * high, alpha=0.15)
         top.axhline(100.0 * reliable, color="0.5", linestyle="--", linewidth=1.0, label="reliable")
         for work, distance in published.items():
@@ -191,34 +192,6 @@ def plot_distances(
         means = [np.nan if np.isnan(error).all() else np.nanmean(error) for error in errors]
         bottom.plot(distances, means, marker="o", color="black", label="mean")
         bottom.set(xlabel="commanded distance [m]", ylabel="error of successes [m]", ylim=(0.0, None))
-
-
-def rate_interval(good: np.ndarray) -> np.ndarray:
-    """Return success rates with the limits of Wilson's 95 % interval, (3, bins); good: (bins, trials) bool."""
-    n, rate, z = good.shape[1], good.mean(axis=1), 1.96
-    center, half = rate + z**2 / (2 * n), z * np.sqrt(rate * (1.0 - rate) / n + (z / (2 * n)) ** 2)
-    return np.stack([rate, (center - half) / (1.0 + z**2 / n), (center + half) / (1.0 + z**2 / n)])
-
-
-class BasePaths:
-    """Recorder of the paths of all bases; call the object after every policy step."""
-
-    def __init__(self) -> None:
-        self.positions: list[np.ndarray] = []  # [m] x, y of every base, one array (worlds, 2) per step, world frame
-
-    def __call__(self, landings: JumpLog) -> None:
-        """Append the current base positions; NaN for worlds whose last jump has ended."""
-        running = landings.current < landings.goals.shape[1]
-        self.positions.append(np.where(running[:, None], landings.arrays["base_pos"][:, :2], np.nan))
-
-    def in_start_frame(self, headings: np.ndarray) -> np.ndarray:
-        """Return the paths [m], (worlds, steps, 2), ahead and to the left of the world's origin.
-
-        headings [rad]: headings of the robots at the start, (worlds,).
-        """
-        x, y = np.moveaxis(np.stack(self.positions, axis=1), -1, 0)
-        cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
-        return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
 
 def plot_paths(path: Path, paths: dict[str, np.ndarray], goals: Mapping[str, Sequence], conditions: str) -> None:
