@@ -6,6 +6,7 @@ import shutil
 import pytest
 
 from cli_helpers import run
+from jumper_warp.cli.info import results_table
 from jumper_warp.policies.catalog import first_paragraph, summarise
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.utils.assets import POLICIES
@@ -69,6 +70,15 @@ def test_info_of_a_policy_fits_a_screen_and_has_its_metrics(capsys, name):
         assert nominal[1] == f"{100 * rate['value']:.1f}"
     assert f"evaluate      jumper evaluate {name}" in lines
     assert json.loads(run(capsys, "info", name, "--json")[1])["rows"][0]["metrics"] == metrics
+
+
+def test_table_of_a_policy_has_the_first_seed_of_each_condition():
+    def row(condition, seed, rate):
+        metric = {"value": rate, "unit": None, "trials": 10}
+        return {"condition": condition, "seed": seed, "conditions": {}, "metrics": {"success_rate": metric}}
+
+    rows = [row("nominal", 0, 0.5), row("nominal", 1, 0.6), row("gains_0.6", 0, None), row("gains_0.6", 1, 0.8)]
+    assert results_table(rows) == ["condition  success", "nominal     50.0 %", "gains 0.6         ", "10 trials a line"]
 
 
 @pytest.mark.parametrize("name", ["vertical-jump", "velocity_trot", "Olympus-Walk", "attitude"])
