@@ -1,7 +1,7 @@
 # make demo   the open-loop jump, 200 vertical and 200 horizontal jumps of the shipped policies, and one jump with a film:
 #             metrics, plots, pictures and recordings in outputs/demo
 # make test   all tests, and the import rules
-# make lint   style, format, import rules and types
+# make lint   style, format, words, import rules and types
 # Each makes .venv/ first if it is missing or older than pyproject.toml or constraints.txt.
 
 PYTHON ?= python3
@@ -24,6 +24,7 @@ test: $(STAMP)
 lint: $(STAMP)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/pre-commit run --all-files words
 	$(VENV)/bin/lint-imports --no-logo
 	$(VENV)/bin/basedpyright --pythonpath $(VENV)/bin/python
 

@@ -32,7 +32,7 @@ GROUP = "jumper_warp.tasks"
 
 @dataclass(frozen=True)
 class TaskEntry:
-    """Factory and training settings of a task."""
+    """Registry entry of a task: its factory function and training settings."""
 
     make: Callable[[], TaskCfg] | str
     """Function that returns the task, or `module:function`, which is imported when the task is made."""
@@ -78,10 +78,10 @@ def first_sentence(doc: str) -> str:
 
 
 WALKING = PpoCfg(num_steps=24, gamma=0.985, entropy_coef=0.0025, init_std=0.4, symmetry="actor")
-"""Training of velocity tracking."""
+"""PPO settings for velocity tracking."""
 HEIGHTS = PpoCfg(gamma=0.99)  # Training of vertical jumps
 ON_MARS = replace(HEIGHTS, symmetry="actor")
-"""Training of vertical jumps on Mars, with symmetry: there a small angular velocity turns the robot far."""
+"""PPO settings for vertical jumps on Mars, with symmetry: in long flights even a slow rotation turns the robot far."""
 PLACES = PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")  # Training of jumps to goal positions
 TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5, symmetry="actor")  # Training of turning in flight
 
@@ -133,7 +133,7 @@ TASKS: dict[str, TaskEntry] = {
         about="turn while floating",
     ),
 }  # fmt: skip
-"""Tasks by name: the project's, registered ones, and loaded ones of installed packages."""
+"""Registered tasks by name: those of the project, of the user, and of installed packages once loaded."""
 
 
 def make_task(name: str) -> TaskCfg:
@@ -146,7 +146,7 @@ def make_task(name: str) -> TaskCfg:
 
 
 def trainer_settings(name: str) -> PpoCfg:
-    """Return the default training settings of a task by name or alias; raises InputError as `find_task`."""
+    """Return the default PPO settings of a task by name or alias. Raises InputError: unknown task."""
     return find_task(name)[1].ppo
 
 
@@ -244,7 +244,7 @@ def load_installed(point: EntryPoint) -> None:
 
 
 def load_task_module(name: str) -> ModuleType:
-    """Import FILE.py, or a module by its name, which registers tasks; after an exception `TASKS` is unchanged.
+    """Import a user's FILE.py or module, which registers tasks; after an exception `TASKS` is unchanged.
 
     Raises InputError: it does not exist, its name is another module's, or it registers or defines an invalid task.
     OSError: the file cannot be read.

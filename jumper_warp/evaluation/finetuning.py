@@ -1,7 +1,7 @@
 """Fine-tuning of a jumping policy: Gauss-Newton on the errors of apex heights or landing positions.
 
-Nominal and randomised robots jump, and a trust region keeps the actions near those of the original policy. For landing
-positions the aim is corrected first: the observed goal is shifted by the mean error.
+Errors are those of nominal and of randomised robots. A trust region keeps the actions near those of the original
+policy. For landing positions the aim is corrected first: the observed goal is shifted by the mean error.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from jumper_warp.utils.progress import phase
 from jumper_warp.utils.runtime import git_commit
 from jumper_warp.utils.streams import purpose_seed
 
-AHEAD = "goal_x"  # Observation of jumps to landing positions: distance to the goal ahead [m]
+AHEAD = "goal_x"  # Name of the observed distance to the goal ahead [m] in jumps to landing positions
 DELAYS = (0.3, 0.7)  # [s] Range of the time until jumps are commanded
 TRUST_REGION_SECONDS = 3.5  # [s] Length of the episodes whose observations are sampled
 TRUST_REGION_SAMPLES = 4096  # Maximum number of these samples
@@ -40,9 +40,9 @@ AIM_ROUNDS = 3  # Maximum number of corrections of the aim
 
 
 def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] = ()) -> list[JumpGroup]:
-    """Return the groups `nominal`, `late` (with latency) and `randomized` of jumps, without empty ones.
+    """Return the groups of jumps `nominal`, `late` (with latency) and `randomized`, without empty ones.
 
-    Goals are evenly spaced over the range of `cfg`. modules: the user's task modules. Raises InputError: the policy
+    Goals are evenly spaced over the range in `cfg`. modules: the user's task modules. Raises InputError: the policy
     does not jump.
     """
     rng, groups = np.random.default_rng(purpose_seed("tuning", cfg.seed)), []
@@ -70,7 +70,7 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
             env = env_of_policy(policy, count, conditions, change=change_task, modules=modules)
             target = evaluation_of(env.task).finetune_target
             if target is None:
-                raise InputError(f"fine-tuning is for jumps to heights and places, not for {env.task.name}")
+                raise InputError(f"fine-tuning supports jumps to heights and positions, not {env.task.name}")
             goals, to_height = np.zeros((count, 3)), target == "apex"
             low, high = cfg.height_range if to_height else cfg.distance_range
             goals[:, 2 if to_height else 0] = np.linspace(low, high, count)
@@ -80,7 +80,7 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
 
 
 def collect_trust_region_samples(groups: list[JumpGroup], network: Network, cfg: FinetuneCfg) -> Anchor:
-    """Run the network on all groups, and return the trust region around its actions on a sample of observations.
+    """Return the trust region around the network's actions on a sample of observations from all groups.
 
     Observations are sampled from the first TRUST_REGION_SECONDS; after touchdown the allowed change of the actions is
     `cfg.landing_std`, before it `cfg.action_std`.
@@ -105,7 +105,7 @@ def mean_abs_errors(groups: list[JumpGroup], errors: list[JumpErrors]) -> dict[s
 
 
 def shift_goal_observation(policy: Policy, shift: float) -> Policy:
-    """Return a copy of the policy that observes its goals `shift` [m] farther ahead, by a change of its normaliser."""
+    """Return a copy of the policy whose normaliser is changed so that it observes goals `shift` [m] farther ahead."""
     mean = policy.mean.clone()
     mean[policy.interface.observation_names.index(AHEAD)] -= shift
     return Policy(policy.layers, mean, policy.std, policy.interface, policy.config)
@@ -114,7 +114,7 @@ def shift_goal_observation(policy: Policy, shift: float) -> Policy:
 def correct_aim(
     policy: Policy, groups: list[JumpGroup], log: Callable[[str], object]
 ) -> tuple[Policy, list[dict[str, dict[str, float]]]]:
-    """Return the policy with corrected aim at goals straight ahead, and the errors [m] before it and of each round.
+    """Correct a policy's aim at goals straight ahead; return the policy, and the errors [m] initially and per round.
 
     Every round subtracts the weighted mean error from the observed goal; a round that does not lower the cost is undone
     and ends the correction. A factor on the goal would have little effect: the observed distance is short at landing.
@@ -131,7 +131,7 @@ def correct_aim(
         means = {"ahead": {name: float(value.mean()) for name, value in ahead.items()}}
         means["mean_abs_miss_m"] = mean_abs_errors(groups, errors)
         words = ", ".join(f"{name} {1000.0 * miss:+.2f} mm" for name, miss in means["ahead"].items())
-        log(f"aim: cost {cost:.4g}, robots end ahead of their goals by {words}")
+        log(f"aim: cost {cost:.4g}, mean error ahead {words}")
         return cost, errors, means
 
     cost, errors, means = measure(policy)
@@ -152,7 +152,7 @@ def correct_aim(
 def tune_weights(
     groups: list[JumpGroup], network: Network, cfg: FinetuneCfg, log: Callable[[str], object], begin: float
 ) -> list[dict[str, Any]]:
-    """Take Gauss-Newton steps on the network's weights in place; return one dict before them and one after each step.
+    """Take Gauss-Newton steps on the network's weights in place; return one record before them and one per step.
 
     Keys: step, mean_abs_miss_m (by group [m]), cost, action_change (RMS [1]), seconds since `begin`, a value of
     `time.perf_counter`. A step that does not lower the cost is undone. log: prints a line of progress.
@@ -160,7 +160,7 @@ def tune_weights(
     anchor = collect_trust_region_samples(groups, network, cfg)
 
     def measure(derivatives: bool) -> tuple[float, list[JumpErrors]]:
-        """Run the jumps with the present weights; return the cost [1] with that of the trust region, and the errors."""
+        """Run the jumps with the current weights; return the cost [1], trust region included, and the errors."""
         errors = [jump_errors(group, network, derivatives=derivatives) for group in groups]
         pairs = zip(groups, errors, strict=True)
         total = sum(float((0.5 * group.importance(e) * e.value.square()).sum()) for group, e in pairs)
@@ -173,7 +173,7 @@ def tune_weights(
                "action_change": anchor.change(network.weights), "seconds": time.perf_counter() - begin}  # fmt: skip
         history.append(row)
         words = ", ".join(f"{name} {1000.0 * miss:.2f} mm" for name, miss in row["mean_abs_miss_m"].items())
-        log(f"step {step}: cost {cost:.4g}, {words}, actions moved {row['action_change']:.4f}, {row['seconds']:.0f} s")
+        log(f"step {step}: cost {cost:.4g}, {words}, action change {row['action_change']:.4f}, {row['seconds']:.0f} s")
         if step == cfg.iterations:
             break
         previous = network.weights
@@ -191,7 +191,7 @@ def tune_weights(
 def finetune(
     policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] = (), log: Callable[[str], object] = print
 ) -> tuple[Policy, dict]:
-    """Return the fine-tuned policy and its record: `settings`, `aims` (`correct_aim`), `steps` (`tune_weights`).
+    """Fine-tune a policy; return the new policy and a record: `settings`, `aims` (`correct_aim`), `steps`.
 
     modules: the user's task modules; log: prints a line of progress. Raises InputError as `ClosedLoop` and
     `make_groups`, and for a policy for heights without iterations.

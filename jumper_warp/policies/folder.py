@@ -1,4 +1,4 @@
-"""Saving and loading of a policy's folder.
+"""Saving and loading of policies as folders.
 
 It holds `policy.onnx` (weights, normaliser, interface), `config.json` (interface, environment, training, commit,
 versions), added files (`metrics.json`, a learning curve), and `manifest.json` with the SHA-256 of each of these. The

@@ -1,4 +1,4 @@
-"""Plots: errors below sweeps, intervals, outlines of grounds, legends beside the data."""
+"""Plots: errors below sweeps, intervals, outlines of grounds, legends outside the data."""
 
 import matplotlib.pyplot as plt
 import numpy as np
@@ -9,7 +9,7 @@ from jumper_warp.evaluation import plots
 
 @pytest.fixture
 def drawn(monkeypatch, tmp_path):
-    """Function that calls a plotting function with a path, and returns the axes of its figure."""
+    """Return a function that calls a plotting function with a path and returns the axes of the plot."""
     figures = []
     monkeypatch.setattr(plt, "close", figures.append)
 
@@ -99,7 +99,7 @@ def test_legend_is_below_the_axes_and_names_labels_once(drawn):
     assert legend.get_window_extent().y1 <= min(axis.get_tightbbox().y0 for axis in axes) + 1.0
 
 
-def test_figures_have_the_style_of_the_sheet_and_leave_others_alone(drawn):
+def test_plots_have_the_projects_style_and_do_not_change_other_plots(drawn):
     before = plt.rcParams["axes.grid"], plt.rcParams["font.size"]
     (top, *_) = sweep(drawn, np.zeros(10), np.ones(10, dtype=bool))
     assert not top.spines["top"].get_visible() and top.xaxis.label.get_size() == 12.0
