@@ -93,7 +93,7 @@ def settings_of(command: str) -> list[Any]:
 
 
 def options(flags: Iterable[Flag]) -> list[str]:
-    """Return flags as they are given, each once, and those of every command."""
+    """Return the spellings of flags, each once, and those of every command."""
     given = (option for flag in flags for option in flag.options)
     return list(dict.fromkeys([*given, TASK_MODULE, "--help", "--help-all"]))
 

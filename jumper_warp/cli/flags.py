@@ -41,7 +41,7 @@ class Flag(NamedTuple):
 
     @property
     def options(self) -> list[str]:
-        """The flag as it is given, with leading dashes; of a switch also its opposite."""
+        """Spellings on the command line, with leading dashes: the flag and, for a switch, its opposite."""
         negative = [re.sub(r"([^.]+)$", r"no-\1", self.name)] if self.has_negative else []
         return [] if self.positional else [f"--{name}" for name in (self.name, *negative)]
 

@@ -203,7 +203,7 @@ def finetune(
         with phase("correcting the aim", AIM_ROUNDS + 1) as advance:
             policy, aims = correct_aim(policy, groups, lambda line: (log(line), advance()))
     elif cfg.iterations == 0:
-        raise InputError("fine-tuning of jumps to heights needs at least 1 iteration")
+        raise InputError("iterations must be at least 1 for jumps to heights, which have no aim to correct, got 0")
     network = Network(policy, device=groups[0].env.device)
     with phase("fine-tuning", cfg.iterations + 1) as advance:
         history = tune_weights(groups, network, cfg, lambda line: (log(line), advance()), begin)

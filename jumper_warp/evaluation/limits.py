@@ -5,7 +5,6 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 
 from jumper_warp.evaluation.jump_metrics import HEIGHT_METRICS
 from jumper_warp.evaluation.jumps import TOLERANCE, JumpOutcome, jump_commands
@@ -37,6 +36,8 @@ def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
     env: environment of a jump task with squat at action 1 and full extension at -1; it stays at the end of the jump.
     initial_state: `env.state_dict()` before its first `evaluation_reset`.
     """
+    import torch
+
     env.load_state_dict(initial_state)
     params = env.skills[0].task.params
     pushes = {name: params.values[i] for name, i in params.names.items() if name.startswith(PUSH_PARAMS)}

@@ -12,22 +12,18 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import torch
 import tyro
 
-from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.evaluations import evaluation_of
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.restore import restored_task
-from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.skills import SkillNames, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
-from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
@@ -35,6 +31,11 @@ from jumper_warp.utils.metrics import AnyMetrics, print_metrics
 from jumper_warp.utils.output import output_dir, read_values, write_metrics
 from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.threads import checked_threads
+
+if TYPE_CHECKING:
+    import torch
+
+    from jumper_warp.envs.env import Env
 
 HEIGHTS = ("apex_height", "apex_height_mars")  # Keys of `EVALUATIONS` of policies that jump to a commanded height
 PLACES = ("landing_position", "omnidirectional", "landing_position_mars")
@@ -75,6 +76,8 @@ class Run(ABC):
 
     def __init__(self) -> None:
         """Start the clock of the report; call `prepare` before any other method."""
+        from jumper_warp.robot.model import PHYSICS_DT
+
         self.started = time.perf_counter()
         self.conditions, self.record = Conditions(), 0  # Conditions of all episodes; number of worlds to record
         self.save_trials = False  # Whether `run_episodes` writes trials.npz
@@ -183,6 +186,8 @@ class EvaluationRun(Run):
         """
         super().__init__()
         self.source, self.modules = source, list(modules)
+        from jumper_warp.policies.runs import open_policy
+
         self.policy = open_policy(source)
         self.task = restored_task(self.policy.config, self.modules)
         self.evaluation = evaluation_of(self.task)

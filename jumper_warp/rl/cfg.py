@@ -149,21 +149,22 @@ class TrainCfg:
     max_iterations: int = 2800
     """Number of iterations, including those before a resume."""
     max_seconds: float = 0.0
-    """Limit of the training time [s], over all resumes; 0: none. A process counts its time from the end of its first
-    iteration, so that building and compilation do not count; logging and saving do."""
+    """Limit of the training time [s], over all resumes; 0: none. Time is counted from the end of a process's first
+    iteration, without building and compilation, but with logging and saving."""
     seed: int = 1
-    """Seed of weights, noise and worlds. It is in 0 to 2^31 - 1; each process derives a different seed from it."""
+    """Random seed of weights, noise and worlds. Range 0 to 2^31 - 1; each process derives a different seed from it."""
     device: str | None = None
-    """Device, such as cpu or cuda:0 (default: a GPU if there is one)."""
+    """PyTorch device, such as cuda:0 or cpu (default: a GPU if there is one)."""
     threads: int | None = None
-    """CPU threads of each process (default: its part of the cores). Its worlds share them. Torch uses as many (default:
-    half the cores but at least two; OMP_NUM_THREADS overrides); their number changes the last digits of results."""
+    """CPU threads of each process (default: its part of the cores). Its worlds share them. PyTorch uses as many
+    (default: half the cores but at least two; OMP_NUM_THREADS overrides); their number changes the last digits of
+    results."""
     log_root: Path = Path("logs")
     """Folder of all runs. A run is written to log_root/<task>/<start time>."""
     log_interval: int = 10
-    """Iterations per line of the log."""
+    """Number of iterations between two logged iterations."""
     save_interval: int = 100
-    """Iterations per checkpoint."""
+    """Number of iterations between two checkpoints."""
     max_checkpoints: int = 3
     """Number of newest checkpoints to keep; the best checkpoint is never deleted."""
     best_metric: str = "Metrics/success"
@@ -177,7 +178,7 @@ class TrainCfg:
     a checkpoint. The training starts with its actor weights and observation statistics; critic, optimiser and noise
     are new."""
     trainer: Literal["ppo", "shac", "rsl-rl"] = "ppo"
-    """Algorithm: PPO, SHAC or rsl-rl-lib's PPO. SHAC uses gradients through the physics; rsl-rl-lib is for
+    """Training algorithm: PPO, SHAC or rsl-rl-lib's PPO. SHAC uses gradients through the physics; rsl-rl-lib is for
     comparison."""
     tensorboard: bool = True
     """Whether to write TensorBoard events."""

@@ -66,6 +66,7 @@ HEAVY = ("torch", "newton", "pinocchio", "rerun", "matplotlib", "scipy", "onnx")
         (["train", "vertical-jump", "--help"], HEAVY),
         (["train", "velocity-rough", "--help-all"], HEAVY),
         (["evaluate", "vertical_jump", "--help"], HEAVY),
+        (["evaluate", "vertical_jump", "--suite", "sweep", "--help"], HEAVY),
         (["play", "walking_flat", "--help"], HEAVY),
         (["play", "--script", "x", "--help"], HEAVY),
         (["finetune", "vertical_jump", "--help"], (*HEAVY, "warp")),

@@ -143,5 +143,5 @@ def test_refuses_policies_that_do_not_jump():
 
 
 def test_refuses_zero_iterations_for_height_policies():
-    with pytest.raises(InputError, match="needs at least 1 iteration"):
+    with pytest.raises(InputError, match="iterations must be at least 1"):
         finetune(open_policy("vertical_jump"), FinetuneCfg(**FEW | {"iterations": 0}))
