@@ -8,12 +8,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 from types import ModuleType
 
-from jumper_warp.cli.evaluate import open_run, parse, policy_of
+from jumper_warp.cli.evaluate import open_run, parse, policy_of, saved_task
 from jumper_warp.cli.main import parse as parse_flags
 
 ABOUT = """\
-Run a policy and record it for the Rerun viewer; --viewer rerun opens the recording.
-jumper play --script FILE.json [flags] makes one robot walk and jump with several policies."""
+Simulate a policy, and write a picture and a recording for the Rerun viewer;
+--viewer rerun opens it, --video FILE writes a film.
+jumper play --script FILE.json [flags] makes one robot walk and jump with
+several policies."""
 SCRIPT = "--script"
 
 
@@ -31,5 +33,5 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     policy = policy_of("play", ABOUT, args)
     from jumper_warp.evaluation.commands import PlayCfg, play
 
-    opened = open_run(policy, modules)
-    play(opened, parse("play", opened, args[1:], PlayCfg, lambda kind: kind.play))
+    cfg = parse("play", saved_task(policy, modules), args, PlayCfg, lambda kind: kind.play)
+    play(open_run(policy, modules), cfg)

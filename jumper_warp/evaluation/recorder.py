@@ -12,9 +12,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
-from jumper_warp.robot.model import build_model
-from jumper_warp.sim.links import LinkReader
-from jumper_warp.sim.solver import SolverJumper
+from jumper_warp.utils.progress import phase
 from jumper_warp.utils.rotations import rotate
 
 if TYPE_CHECKING:
@@ -40,6 +38,8 @@ class EnvRecorder:
         log: supplies series, states, commands, labels and goals; ground: as in `build_model`; block: the environment's
         sliding blocks, if any; notes: JSON metadata of the recording, added to those of the log.
         """
+        from jumper_warp.robot.model import build_model
+        from jumper_warp.sim.links import LinkReader
         from jumper_warp.viz.recorder import Recorder
 
         self.env, self.log, self.worlds = env, log, list(worlds)
@@ -94,13 +94,16 @@ def save_recording(recording: Recording, folder: Path, name: str) -> Path:
     from jumper_warp.viz.picture import write_picture
     from jumper_warp.viz.rerun import write_rrd
 
-    path = write_rrd(recording, folder / f"{name}.rrd")
+    with phase(f"writing {name}.rrd"):
+        path = write_rrd(recording, folder / f"{name}.rrd")
     write_picture(recording, folder / f"{name}.png", rank=round(SHOWN * (len(recording.worlds) - 1)))
     return path
 
 
 def block_positions(sim: Simulation) -> np.ndarray:
     """Return the positions x, y [m] of sliding blocks, (num_worlds, 2), world frame; only SolverJumper has blocks."""
+    from jumper_warp.sim.solver import SolverJumper
+
     assert isinstance(sim.solver, SolverJumper)
     return sim.solver.block_position()
 

@@ -5,28 +5,25 @@ Experiments and the commands `jumper evaluate` and `jumper play` use this module
 
 from __future__ import annotations
 
+import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import ModuleType
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
-import torch
 import tyro
 
-from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.evaluations import evaluation_of
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.restore import restored_task
-from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.skills import SkillNames, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
-from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
@@ -34,6 +31,11 @@ from jumper_warp.utils.metrics import AnyMetrics, print_metrics
 from jumper_warp.utils.output import output_dir, read_values, write_metrics
 from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.threads import checked_threads
+
+if TYPE_CHECKING:
+    import torch
+
+    from jumper_warp.envs.env import Env
 
 HEIGHTS = ("apex_height", "apex_height_mars")  # Keys of `EVALUATIONS` of policies that jump to a commanded height
 PLACES = ("landing_position", "omnidirectional", "landing_position_mars")
@@ -50,6 +52,7 @@ class EvaluationArgs(Conditions):
     policy: str = "horizontal_jump"  # Name or folder of a policy, a run's folder, or a checkpoint
     num_recorded: int = 1  # Number of jumps to record for the Rerun viewer and, one of them, as a picture; 0: none
     save_trials: bool = False  # Write the arrays of all trials, from which the metrics are computed, to trials.npz
+    json: bool = False  # Print metrics.json in place of a table
     out: Path | None = None  # Folder for metrics, plots, pictures and recordings (default: outputs/<name>/<time>)
 
     def __post_init__(self) -> None:
@@ -73,9 +76,12 @@ class Run(ABC):
 
     def __init__(self) -> None:
         """Start the clock of the report; call `prepare` before any other method."""
+        from jumper_warp.robot.model import PHYSICS_DT
+
         self.started = time.perf_counter()
         self.conditions, self.record = Conditions(), 0  # Conditions of all episodes; number of worlds to record
         self.save_trials = False  # Whether `run_episodes` writes trials.npz
+        self.json = False  # Whether `report` prints metrics.json in place of a table
         self.settings: dict[str, Any] = {}  # Settings of task, robot and test, reported with the conditions
         self._latency: list[np.ndarray] = []  # [physics steps] (num_envs,) per `run_episodes`
         self._physics_dt = PHYSICS_DT
@@ -85,16 +91,17 @@ class Run(ABC):
         """Return the policy as a function from observations (num_envs, num_obs) to actions, see `run_evaluation`."""
 
     def prepare(
-        self, name: str, conditions: Conditions, out: Path | None = None, *, record: int = 0, save_trials: bool = False
-    ) -> None:
+        self, name: str, conditions: Conditions, out: Path | None = None, *, record: int = 0,
+        save_trials: bool = False, json: bool = False,
+    ) -> None:  # fmt: skip
         """Set the conditions, select the device and create the output folder, before the simulation.
 
         name: of the folder outputs/<name>/<time>, unless `out` is passed; record: number of worlds to record;
-        save_trials: whether to write trials.npz.
+        save_trials: whether to write trials.npz; json: whether to print metrics.json in place of a table.
         Raises InputError: no such device or number of threads; OSError: the folder cannot be created.
         """
         configure_device(conditions.device, conditions.threads)
-        self.conditions, self.record, self.save_trials = conditions, record, save_trials
+        self.conditions, self.record, self.save_trials, self.json = conditions, record, save_trials, json
         self.folder = output_dir(name, out)
 
     @property
@@ -159,9 +166,12 @@ class Run(ABC):
 
     def report(self, metrics: AnyMetrics, paper: Mapping[str, float]) -> dict[str, Any]:
         """Write conditions and metrics to `metrics.json`, print them with the paper's values, return all values."""
-        write_metrics(self.folder, metrics, self.condition_values)
-        print_metrics(metrics, paper, self.condition_values, self.title)
-        print(f"{time.perf_counter() - self.started:.1f} s; results in {self.folder}")
+        path, done = write_metrics(self.folder, metrics, self.condition_values), f"results in {self.folder}"
+        if self.json:
+            print(path.read_text(encoding="utf-8"), end="")
+        else:
+            print_metrics(metrics, paper, self.condition_values, self.title)
+        print(f"{time.perf_counter() - self.started:.1f} s; {done}", file=sys.stderr if self.json else sys.stdout)
         return read_values(self.folder)
 
 
@@ -176,6 +186,8 @@ class EvaluationRun(Run):
         """
         super().__init__()
         self.source, self.modules = source, list(modules)
+        from jumper_warp.policies.runs import open_policy
+
         self.policy = open_policy(source)
         self.task = restored_task(self.policy.config, self.modules)
         self.evaluation = evaluation_of(self.task)
@@ -196,7 +208,8 @@ class EvaluationRun(Run):
                 f"expected a policy with evaluation suite {' or '.join(evaluations)}, "
                 f"{args.policy} (task {run.task.name}) has {run.task.evaluation_suite}"
             )
-        run.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
+        settings = {"record": args.num_recorded, "save_trials": args.save_trials, "json": args.json}
+        run.prepare(name, conditions_of(args), args.out, **settings)
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
@@ -235,7 +248,8 @@ class SkillRun(Run):
         Raises PolicyError, CheckpointError or InputError.
         """
         run = cls(names)
-        run.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
+        settings = {"record": args.num_recorded, "save_trials": args.save_trials, "json": args.json}
+        run.prepare(name, conditions_of(args), args.out, **settings)
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:

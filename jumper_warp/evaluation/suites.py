@@ -7,6 +7,7 @@ the metrics.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
@@ -304,7 +305,7 @@ class Farthest(Suite):
             middle = round(self.min_distance + number * BIN, 6)
             bins[middle] = self.run_landings(run, self.goals(middle), env, film=f"jump_{middle:.1f}_m")
             success = bins[middle].success.mean()
-            print(f"{middle:.1f} m: {success:.1%} success", flush=True)
+            print(f"{middle:.1f} m: {success:.1%} success", file=sys.stderr, flush=True)
             if success < GIVEN_UP:
                 break
         run.settings["direction_deg"] = self.direction

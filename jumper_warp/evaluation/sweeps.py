@@ -6,11 +6,10 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 from types import ModuleType
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
-from jumper_warp.envs.env import Env
 from jumper_warp.evaluation import heights, landings
 from jumper_warp.evaluation.heights import HeightFlags
 from jumper_warp.evaluation.jump_metrics import PLACE_METRICS
@@ -23,6 +22,9 @@ from jumper_warp.policies.conditions import Conditions
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, chosen, measure
 from jumper_warp.viz.plots import Published, plot_sweep
+
+if TYPE_CHECKING:
+    from jumper_warp.envs.env import Env
 
 PAPER_HEIGHTS = Published(mean_error=0.04, robot=((0.75, 0.0, 0.023), (1.0, 0.01, 0.0)), open_loop=1.075)
 PAPER_DISTANCES = Published(mean_error=0.026, robot=((1.25, 0.0, 0.004),))

@@ -23,7 +23,7 @@ class PpoCfg:
     epochs: int = 5
     """Passes over the batch of num_steps · num_envs samples per iteration."""
     minibatches: int = 8
-    """Optimiser steps per pass; divides num_steps · num_envs."""
+    """Optimiser steps per pass. Their number divides num_steps · num_envs."""
     gamma: float = 0.985
     """Discount per policy step."""
     lam: float = 0.95
@@ -145,21 +145,22 @@ class TrainCfg:
     task: str = "vertical-jump"
     """Name of the task, also of the folder of its runs."""
     num_envs: int = 8192
-    """Number of simulated worlds, in total over all processes."""
+    """Number of simulated robots (worlds), over all processes."""
     max_iterations: int = 2800
-    """Total number of iterations of the run, including those before a resume."""
+    """Number of iterations, including those before a resume."""
     max_seconds: float = 0.0
-    """Limit of the training time [s] over all resumes; 0: none. Time is counted from the end of a process's first
+    """Limit of the training time [s], over all resumes; 0: none. Time is counted from the end of a process's first
     iteration, without building and compilation, but with logging and saving."""
     seed: int = 1
-    """Random seed of weights, noise and worlds, 0 to 2^31 - 1; each process derives a different seed from it."""
+    """Random seed of weights, noise and worlds. Range 0 to 2^31 - 1; each process derives a different seed from it."""
     device: str | None = None
     """PyTorch device, such as cuda:0 or cpu (default: a GPU if there is one)."""
     threads: int | None = None
-    """CPU threads of each process, for its worlds (default: an equal part of the cores) and for PyTorch (default: half
-    the cores but at least two; OMP_NUM_THREADS overrides). PyTorch's number changes the last digits of results."""
+    """CPU threads of each process (default: its part of the cores). Its worlds share them. PyTorch uses as many
+    (default: half the cores but at least two; OMP_NUM_THREADS overrides); their number changes the last digits of
+    results."""
     log_root: Path = Path("logs")
-    """Folder for all runs; a run is written to log_root/<task>/<start time>."""
+    """Folder of all runs. A run is written to log_root/<task>/<start time>."""
     log_interval: int = 10
     """Number of iterations between two logged iterations."""
     save_interval: int = 100
@@ -169,14 +170,16 @@ class TrainCfg:
     best_metric: str = "Metrics/success"
     """Logged metric that selects the best checkpoint; higher is better."""
     resume: str | None = None
-    """Run to continue: a checkpoint, a run's folder, `latest` for the task's latest run with a checkpoint, or
-    `latest-or-new`, which starts a new run if there is none. `jumper train` uses the saved settings of that run except
-    device, threads, log_root, tensorboard and wandb; flags override them."""
+    """Run to continue: its folder, a checkpoint, latest or latest-or-new. `latest` is the task's latest run with a
+    checkpoint; `latest-or-new` starts a new run if there is none. `jumper train` uses the saved settings of that run
+    except device, threads, log_root, tensorboard and wandb; flags override them."""
     init_policy: str | None = None
-    """Policy that a new training starts from: a policy's name or folder, a run's folder (its best checkpoint) or a
-    checkpoint. Its actor weights and observation statistics are used; critic, optimiser and noise are new."""
+    """Policy, run or checkpoint to start from. It is a policy's name or folder, a run's folder (its best checkpoint) or
+    a checkpoint. The training starts with its actor weights and observation statistics; critic, optimiser and noise
+    are new."""
     trainer: Literal["ppo", "shac", "rsl-rl"] = "ppo"
-    """Training algorithm: this package's PPO; SHAC, with gradients through the physics; or PPO of rsl-rl-lib."""
+    """Training algorithm: PPO, SHAC or rsl-rl-lib's PPO. SHAC uses gradients through the physics; rsl-rl-lib is for
+    comparison."""
     tensorboard: bool = True
     """Whether to write TensorBoard events."""
     wandb: bool = False

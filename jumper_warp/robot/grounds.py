@@ -7,11 +7,14 @@ it, where the robot starts. Beyond their rim the ground keeps the height of the 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
-import newton
 import numpy as np
 
 from jumper_warp.utils.errors import InputError
+
+if TYPE_CHECKING:
+    import newton
 
 SIZE = 4.0  # [m] Edge of the square, by default: a jump of 2 m from its middle ends on it
 CELL = 0.02  # [m] Distance between nodes, by default: less than a paw's radius of 0.025 m
@@ -119,6 +122,8 @@ def _gaussian_field(rng: np.random.Generator, nodes: int, cell: float, length: f
 
 def _heightfield(heights: np.ndarray, size: float) -> newton.Heightfield:
     """Return a square heightfield of edge `size` [m]; heights: (n, n) [m], rows along y, columns along x."""
+    import newton
+
     rows, cols = heights.shape
     half = 0.5 * size
     return newton.Heightfield(data=heights.astype(np.float32), nrow=rows, ncol=cols, hx=half, hy=half)

@@ -9,15 +9,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import matplotlib
 import numpy as np
 
 from jumper_warp.utils.metrics import rate
 from jumper_warp.viz.style import ACTUAL_COLOR, GOAL_COLOR
-
-matplotlib.use("Agg")
-import matplotlib.pyplot as plt
-from matplotlib.collections import PolyCollection
 
 STYLE = "jumper_warp.viz.jumper"  # Style sheet jumper_warp/viz/jumper.mplstyle
 FAILED = {"color": "black", "marker": "x", "linewidth": 1.0, "clip_on": False}  # Marks of failed trials
@@ -33,6 +28,11 @@ def figure(path: Path, *shape: int, title: str = "", conditions: str = "", **set
     The legend has the labels of all axes without their own legend. title, conditions: lines above the axes; shape,
     settings: arguments of `plt.subplots`.
     """
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
     with plt.style.context(STYLE):
         fig, axes = plt.subplots(*shape, layout="compressed", **settings)
         lines = [title, *textwrap.wrap(conditions, int(10.5 * fig.get_figwidth()))]
@@ -136,6 +136,8 @@ def plot_landings(
     largest error of a success; outlines: of platforms, blocks or level ground, by key of `tests`: title that describes
     them, and corners [m] of polygons, (polygons, corners, 2).
     """
+    from matplotlib.collections import PolyCollection
+
     points = np.concatenate([np.nan_to_num(np.concatenate(values[:2])) for values in tests.values()])
     (x0, y0), (x1, y1) = np.minimum(points.min(axis=0), 0.0), np.maximum(points.max(axis=0), 0.0)
     margin, width = (3.0 if outlines else 1.5) * tolerance, max(7.0, 4.5 * len(tests))
