@@ -117,7 +117,7 @@ def test_each_command_prints_help(capsys, command):
         (["train", "swim"], "unknown task 'swim'; there are vertical-jump"),
         (["train", "walking-flat"], "'walking-flat' is a policy, not a task; its task is velocity-flat"),
         (["train", "vertical_jump", "--robot", "robot.json"], "robot.json: no such file (robot overlay, as"),
-        (["train", "vertical-jump", "--resume", "run"], "run: no such file or folder, no run to resume; give"),
+        (["train", "vertical-jump", "--resume", "run"], "run: no such file or folder, no run to resume; pass"),
         (["train", "vertical-jump", "--init-policy", "vertical_jmup"], "did you mean 'vertical_jump'?"),
         (["train", "--max-iterations", "3"], "the task comes first"),
         ([*TRAIN, "--task", "other"], "give the task once"),
