@@ -187,7 +187,7 @@ def test_existing_policy_is_replaced_only_with_overwrite(folder, trained):
 
 def test_folder_without_a_policy_is_never_replaced(tmp_path, trained):
     (tmp_path / "mine.txt").touch()
-    with pytest.raises(PolicyError, match="is not a policy's folder"):
+    with pytest.raises(PolicyError, match="not a policy's"):
         save_policy(tmp_path, trained, overwrite=True)
     assert (tmp_path / "mine.txt").exists()
 
