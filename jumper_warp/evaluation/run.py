@@ -30,20 +30,27 @@ from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.metrics import AnyMetrics, print_metrics
+from jumper_warp.utils.metrics import AnyMetrics, Metrics
 from jumper_warp.utils.output import output_dir, read_values, write_metrics
 from jumper_warp.utils.runtime import configure_device
+from jumper_warp.utils.summary import PrintFlags, print_summary
 from jumper_warp.utils.threads import checked_threads
 
 HEIGHTS = ("apex_height", "apex_height_mars")  # Keys of `EVALUATIONS` of policies that jump to a commanded height
 PLACES = ("landing_position", "omnidirectional", "landing_position_mars")
 """Keys of `EVALUATIONS` of policies that jump to a commanded landing position."""
+HEADLINES = (
+    "success_rate", "goal_reached_rate", "apex_error_abs_mean_m", "goal_distance_at_rest_mean_m", "slewed_rmse_vx_m_s",
+    "slewed_rmse_vy_m_s", "slewed_rmse_yaw_rate_rad_s", "settled_without_collision_rate", "settling_time_mean_s",
+    "success_termination_rate", "failure_termination_rate", "length_mean_s", "fall_rate",
+)  # fmt: skip
+"""Keys of the metrics in a summary, unless an evaluation has its own."""
 SOLVER_TITLES = {"jumper": "SolverJumper", "mujoco": "SolverMuJoCo"}  # By value of `Conditions.solver`
 Log = TypeVar("Log", bound=EvaluationLog)
 
 
 @dataclass(frozen=True)
-class EvaluationArgs(Conditions):
+class EvaluationArgs(Conditions, PrintFlags):
     """Flags of every experiment that evaluates a policy; randomised robots have observation noise too."""
 
     noise: tyro.conf.Suppress[tyro.conf.Fixed[bool]] = False
@@ -70,12 +77,14 @@ class Run(ABC):
     """Base class of evaluations: runs episodes, records some worlds, reports metrics. A subclass provides the actor."""
 
     folder: Path  # Output folder, set by `prepare`
+    source: str | Path = "several policies"  # Name or folder of a policy, a run's folder, or a checkpoint
 
     def __init__(self) -> None:
         """Start the clock of the report; call `prepare` before anything else."""
         self.started = time.perf_counter()
         self.conditions, self.record = Conditions(), 0  # Conditions of all episodes; number of worlds to record
         self.save_trials = False  # Whether `run_episodes` writes trials.npz
+        self.name, self.print_flags = "", PrintFlags()  # Name of the evaluation; what `report` prints
         self.settings: dict[str, Any] = {}  # Settings of task, robot and test, reported with the conditions
         self._latency: list[np.ndarray] = []  # [physics steps] (num_envs,) per `run_episodes`
         self._physics_dt = PHYSICS_DT
@@ -94,7 +103,7 @@ class Run(ABC):
         Raises InputError: no such device or number of threads; OSError: the folder cannot be created.
         """
         configure_device(conditions.device, conditions.threads)
-        self.conditions, self.record, self.save_trials = conditions, record, save_trials
+        self.conditions, self.record, self.save_trials, self.name = conditions, record, save_trials, name
         self.folder = output_dir(name, out)
 
     @property
@@ -157,12 +166,21 @@ class Run(ABC):
         worlds = np.linspace(0, env.num_envs - 1, min(self.record, env.num_envs)).round().astype(int).tolist()
         return EnvRecorder(env, log, worlds, ground=scene.get("ground", "plane"), block=scene.get("block"))
 
-    def report(self, metrics: AnyMetrics, paper: Mapping[str, float]) -> dict[str, Any]:
-        """Write conditions and metrics to `metrics.json`, print them beside the paper's values, return all values."""
+    def write(self, metrics: AnyMetrics) -> dict[str, Any]:
+        """Write conditions and metrics to `metrics.json`, and return all values by name."""
         write_metrics(self.folder, metrics, self.condition_values)
-        print_metrics(metrics, paper, self.condition_values, self.title)
-        print(f"{time.perf_counter() - self.started:.1f} s; results in {self.folder}")
         return read_values(self.folder)
+
+    def report(
+        self, metrics: Metrics, paper: Mapping[str, float], keys: Sequence[str] = HEADLINES
+    ) -> dict[str, Any]:  # fmt: skip
+        """Write the metrics, print those with the given keys beside the paper's values, and return all values."""
+        values = self.write(metrics)
+        counts = [f"{entry.trials:,} {entry.over}" for key in keys if (entry := metrics.get(key)) and entry.over]
+        what = f"{self.name.replace('_', ' ').capitalize()} of {self.source}: {', '.join([*counts[:1], self.title])}"
+        seconds = time.perf_counter() - self.started
+        print_summary(self.folder, what, keys, paper=paper, flags=self.print_flags, seconds=seconds)
+        return values
 
 
 class EvaluationRun(Run):
@@ -197,6 +215,7 @@ class EvaluationRun(Run):
                 f"{args.policy} is of {run.task.name}, by {run.task.evaluation_suite}"
             )
         run.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
+        run.print_flags = args
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
@@ -236,6 +255,7 @@ class SkillRun(Run):
         """
         run = cls(names)
         run.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
+        run.print_flags = args
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:

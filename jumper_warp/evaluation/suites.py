@@ -7,6 +7,7 @@ metrics.
 from __future__ import annotations
 
 import math
+import sys
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar
@@ -70,6 +71,7 @@ class Grid(Suite):
     name: ClassVar = "grid"
     paper: ClassVar = {"goal_distance_at_rest_mean_m": 0.025, "goal_distance_at_end_mean_m": 0.025,
                        "success_rate": 0.968, "in_range_success_rate": 1.0}  # fmt: skip
+    summary: ClassVar = DistanceSweep.summary
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -101,6 +103,7 @@ class Ring(Suite):
     radius: float = 0.5  # [m] Radius of the ring
 
     name: ClassVar = "ring"
+    summary: ClassVar = ("success_rate", "goal_distance_at_rest_mean_m", *(f"{name}_success_rate" for name in SECTORS))
     least: ClassVar = (len(SECTORS), 0.1)
 
     def __post_init__(self) -> None:
@@ -138,6 +141,8 @@ class Consecutive(Suite):
 
     name: ClassVar = "consecutive"
     paper: ClassVar = {"goal_distance_at_rest_mean_m": 0.0054}
+    summary: ClassVar = ("both_landed_rate", "goal_distance_at_rest_mean_m", "row_all_success_rate", "row_fall_rate",
+                         "row_goal_distance_at_rest_mean_m")  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -195,6 +200,8 @@ class Platform(Suite):
     """[m] From the start to the platform's edge, moved back to a multiple of 0.02 m, and to the block's near side."""
 
     name: ClassVar = "platform"
+    summary: ClassVar = tuple(f"{scene}_{key}" for scene in ("platform", "uneven", "block")
+                              for key in ("success_rate", "goal_distance_at_rest_mean_m", "fall_rate"))  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -263,6 +270,8 @@ class Farthest(Suite):
 
     name: ClassVar = "max"
     paper: ClassVar = {"reliable_distance_without_hop_m": 1.25}
+    summary: ClassVar = tuple(f"reliable_{name}{suffix}_m" for suffix in RATES
+                              for name in ("distance", "distance_flown"))  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -283,7 +292,7 @@ class Farthest(Suite):
             middle = round(self.min_distance + number * BIN, 6)
             bins[middle] = self.run_landings(run, self.goals(middle), env, film=f"jump_{middle:.1f}_m")
             success = bins[middle].success.mean()
-            print(f"{middle:.1f} m: {success:.1%} success", flush=True)
+            print(f"{middle:.1f} m: {success:.1%} success", file=sys.stderr, flush=True)
             if success < GIVEN_UP:
                 break
         run.settings["direction_deg"] = self.direction

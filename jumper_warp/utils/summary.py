@@ -1,0 +1,96 @@
+"""Printed summary of results: what was done, the main metrics beside published values, and the paths of files."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.console import Console
+from rich.table import Column, Table
+
+from jumper_warp.utils.metrics import WIDTH, MetricValue, format_value, print_metrics, split_unit
+from jumper_warp.utils.output import read_metrics
+
+KINDS = {"picture": (".png", ".webp"), "film": (".mp4", ".gif"), "recording": (".rrd",), "folder": ("",)}
+"""Ends of the names of files by kind, in the order of the summary."""
+IN_RANGE = "in_range_"  # Prefix of metrics of the goals within a range
+MOST_PATHS = 3  # Number of files of a kind above which only their folder is printed
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrintFlags:
+    """Flags that select what is printed about results."""
+
+    verbose: tyro.conf.FlagCreatePairsOff[bool] = False  # Print all metrics, not only the main ones
+    json: tyro.conf.FlagCreatePairsOff[bool] = False  # Print metrics.json instead of a summary
+
+
+def print_summary(
+    folder: Path, title: str, keys: Iterable[str], *, seconds: float, paper: Mapping[str, float] | None = None,
+    flags: PrintFlags | None = None,
+) -> None:  # fmt: skip
+    """Print what was done, the main metrics of a folder's `metrics.json`, and the paths of its files, 80 columns wide.
+
+    title: what was done; keys: of the main metrics, those that the file lacks are skipped; seconds: wall time of the
+    run; paper: published values by key; flags: print all metrics, or the file itself.
+    """
+    flags, paper, console = flags or PrintFlags(), paper or {}, Console(width=WIDTH, highlight=False, markup=False)
+    text = (folder / "metrics.json").read_text()
+    if flags.json:
+        print(text, end="")
+        return
+    metrics = read_metrics(folder)
+    console.print(title)
+    if flags.verbose:
+        print_metrics(metrics, paper, json.loads(text)["conditions"])
+    elif main := {key: metrics[key] for key in keys if key in metrics}:
+        console.print(_summary_table(main, paper))
+    for line in _file_lines(folder):
+        console.print(line, soft_wrap=True)
+    console.print(f"{'metrics':9}  {folder / 'metrics.json'}", soft_wrap=True)
+    hints = ["rerun FILE shows a recording"] if any(folder.glob("*.rrd")) else []
+    hints += [] if flags.verbose else [f"--verbose prints all {len(metrics)} metrics"]
+    console.print(f"{'time':9}  {seconds:.0f} s" + "".join(f"; {hint}" for hint in hints))
+
+
+def _summary_table(metrics: Mapping[str, MetricValue], paper: Mapping[str, float]) -> Table:
+    """Return a table of metrics in words, with their units, beside the paper's values if there are any."""
+    intervals, published = any(metric.interval for metric in metrics.values()), bool(paper.keys() & metrics.keys())
+    columns = [Column("", overflow="fold"), "value", *["95 % interval"] * intervals, *["paper"] * published]
+    table = Table(*columns, box=None, pad_edge=False)
+    for key, metric in metrics.items():
+        low_high = [] if metric.interval is None else [_text(key, limit) for limit in metric.interval]
+        row = [_text(key, metric.value, unit=True), *[" to ".join(low_high)] * intervals]
+        table.add_row(_words(key, metric), *row, *[_text(key, paper.get(key, ""))] * published)
+    return table
+
+
+def _words(key: str, metric: MetricValue) -> str:
+    """Return a metric's name in words, such as "apex error, mean size"; metrics of a range of goals name the range."""
+    name = split_unit(key)[0].removeprefix(IN_RANGE).replace("_", " ")
+    name = re.sub(r"( abs)? (mean|max|median)$", lambda found: f", {found[2]}" + " size" * bool(found[1]), name)
+    return name if not key.startswith(IN_RANGE) else f"{name}, {str(metric.over).split(' of ')[-1]}"
+
+
+def _text(key: str, value: Any, *, unit: bool = False) -> str:
+    """Return a value as text, a rate in percent; unit: append the unit of the metric's key."""
+    if value is None:
+        return "undefined"
+    percent = key.endswith("_rate") and isinstance(value, float | int)
+    text, of = (format_value(100.0 * value), "%") if percent else (format_value(value), split_unit(key)[1])
+    return f"{text} {of}" if unit and of else text
+
+
+def _file_lines(folder: Path) -> Iterable[str]:
+    """Yield a line for each picture, film, recording and folder in a folder, or one for each kind with many."""
+    for kind, ends in KINDS.items():
+        paths = sorted(path for path in folder.iterdir() if path.suffix in ends and path.is_dir() == (kind == "folder"))
+        if len(paths) > MOST_PATHS:
+            yield f"{kind + 's':9}  {len(paths)} in {folder}"
+        else:
+            yield from (f"{kind:9}  {path}" for path in paths)
