@@ -24,7 +24,7 @@ import tyro
 from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.folder import list_policies
+from jumper_warp.utils.assets import policy_tasks
 from jumper_warp.utils.errors import InputError
 from support.policy_conditions import CONDITIONS, commands_of, payload_overlay, undefined, with_trials
 from support.policy_page import write_page
@@ -39,7 +39,7 @@ class Args(ThreadArgs):
     """Flags."""
 
     out: Path = Path("outputs/policies")  # Folder of all rows
-    policies: tuple[str, ...] = list_policies()  # Names of the policies
+    policies: tuple[str, ...] = tuple(policy_tasks())  # Names of the policies
     conditions: tuple[str, ...] = tuple(CONDITIONS)  # Names of the conditions
     seeds: tuple[int, ...] = (0, 1)  # Seeds of sampled commands, robots and noise
     trials: int = 4096  # Least number of trials in a row
@@ -48,7 +48,7 @@ class Args(ThreadArgs):
     """Write the rows in `out` into metrics.json of the policies' folders; nothing is measured."""
 
     def __post_init__(self) -> None:
-        for names, known in ((self.policies, list_policies()), (self.conditions, tuple(CONDITIONS))):
+        for names, known in ((self.policies, tuple(policy_tasks())), (self.conditions, tuple(CONDITIONS))):
             if unknown := sorted(set(names) - set(known)):
                 raise InputError(f"no {unknown[0]!r:.40}; there are {', '.join(known)}")
         if not self.seeds or self.trials < 16:

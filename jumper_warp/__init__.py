@@ -6,6 +6,8 @@ import importlib
 import os
 from typing import TYPE_CHECKING, Any
 
+from jumper_warp.utils.version import __version__ as __version__
+
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env as Env
     from jumper_warp.policies.folder import load_policy as load_policy

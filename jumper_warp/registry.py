@@ -19,7 +19,9 @@ from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.assets import dashed, policy_tasks
+from jumper_warp.utils.errors import InputError, suggestion
+from jumper_warp.utils.files import existing_file
 
 if TYPE_CHECKING:
     from jumper_warp.tasks.cfg import TaskCfg
@@ -37,26 +39,42 @@ class TaskEntry:
     ppo: PpoCfg = field(default_factory=PpoCfg)  # Default settings of PPO for training
     aliases: tuple[str, ...] = ()  # other names of the task
     best_metric: str = "Metrics/success"  # Default metric of the log whose largest value selects the best checkpoint
+    about: str = ""  # What the robot does, in a few words, for `jumper list`; default: the factory's first sentence
 
     @property
     def origin(self) -> str:
         """Name of the module with the factory function."""
         return self.make.split(":")[0] if isinstance(self.make, str) else self.make.__module__
 
+    @property
+    def description(self) -> str:
+        """`about`, or the first sentence of the factory's docstring; the factory is not imported for it."""
+        doc = "" if isinstance(self.make, str) else getattr(self.make, "__doc__", None) or ""
+        return self.about or first_sentence(doc)
+
+    def factory(self) -> Callable[[], TaskCfg]:
+        """Import the factory function if it is given by name, and return it."""
+        if not isinstance(self.make, str):
+            return self.make
+        module, _, function = self.make.partition(":")
+        return getattr(importlib.import_module(module), function)
+
     def task(self, name: str) -> TaskCfg:
         """Make and return the task. Raises InputError: the result is no TaskCfg, or has another name."""
         from jumper_warp.tasks.cfg import TaskCfg
 
-        make = self.make
-        if isinstance(make, str):
-            module, _, function = make.partition(":")
-            make = getattr(importlib.import_module(module), function)
-        task = make()
+        task = self.factory()()
         if not isinstance(task, TaskCfg):
             raise InputError(f"task {name!r} of {self.origin}: expected a TaskCfg, got {type(task).__name__}")
         if task.name != name:
             raise InputError(f"task {name!r} of {self.origin} calls itself {task.name!r:.60}; give both the same name")
         return task
+
+
+def first_sentence(doc: str) -> str:
+    """Return the first sentence of a factory's docstring on one line, without "Return" before it and the full stop."""
+    sentence = " ".join(doc.split("\n\n")[0].split()).split(". ")[0].removeprefix("Return ").rstrip(".")
+    return sentence[:1].upper() + sentence[1:]
 
 
 WALKING = PpoCfg(num_steps=24, gamma=0.985, entropy_coef=0.0025, init_std=0.4, symmetry="actor")
@@ -68,35 +86,61 @@ PLACES = PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")  # Training o
 TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5, symmetry="actor")  # Training of turning in flight
 
 TASKS: dict[str, TaskEntry] = {
-    "vertical-jump": TaskEntry("jumper_warp.tasks.jump.vertical:vertical_jump", HEIGHTS, ("Olympus-Vertical-Jump",)),
+    "vertical-jump": TaskEntry(
+        "jumper_warp.tasks.jump.vertical:vertical_jump", HEIGHTS, ("Olympus-Vertical-Jump",), about="jump to a height",
+    ),
     "horizontal-jump": TaskEntry(
-        "jumper_warp.tasks.jump.horizontal:horizontal_jump", PLACES, ("Olympus-Horizontal-Jump",)
+        "jumper_warp.tasks.jump.horizontal:horizontal_jump", PLACES, ("Olympus-Horizontal-Jump",),
+        about="jump to a place ahead",
     ),
-    "horizontal-jump-slippery": TaskEntry("jumper_warp.tasks.jump.horizontal:horizontal_jump_slippery", PLACES),
-    "horizontal-jump-sighted": TaskEntry("jumper_warp.tasks.jump.horizontal:horizontal_jump_sighted", PLACES),
-    "omnidirectional-jump": TaskEntry("jumper_warp.tasks.jump.horizontal:omnidirectional_jump", PLACES),
+    "horizontal-jump-slippery": TaskEntry(
+        "jumper_warp.tasks.jump.horizontal:horizontal_jump_slippery", PLACES, about="jump on slippery ground",
+    ),
+    "horizontal-jump-sighted": TaskEntry(
+        "jumper_warp.tasks.jump.horizontal:horizontal_jump_sighted", PLACES, about="jump off and onto blocks",
+    ),
+    "omnidirectional-jump": TaskEntry(
+        "jumper_warp.tasks.jump.horizontal:omnidirectional_jump", PLACES, about="jump in any direction",
+    ),
     "vertical-jump-mars": TaskEntry(
-        "jumper_warp.tasks.jump.mars:vertical_jump_mars", ON_MARS, aliases=("Olympus-Vertical-Jump-Mars",)
+        "jumper_warp.tasks.jump.mars:vertical_jump_mars", ON_MARS, ("Olympus-Vertical-Jump-Mars",),
+        about="jump to a height, Mars",
     ),
-    "vertical-jump-mars-loose": TaskEntry("jumper_warp.tasks.jump.mars:vertical_jump_mars_loose", ON_MARS),
+    "vertical-jump-mars-loose": TaskEntry(
+        "jumper_warp.tasks.jump.mars:vertical_jump_mars_loose", ON_MARS, about="jump up to 3.6 m, Mars",
+    ),
     "horizontal-jump-mars": TaskEntry(
-        "jumper_warp.tasks.jump.mars:horizontal_jump_mars", PLACES, aliases=("Olympus-Jump-Mars",)
+        "jumper_warp.tasks.jump.mars:horizontal_jump_mars", PLACES, ("Olympus-Jump-Mars",),
+        about="jump to a place, Mars",
     ),
-    "horizontal-jump-mars-loose": TaskEntry("jumper_warp.tasks.jump.mars:horizontal_jump_mars_loose", PLACES),
+    "horizontal-jump-mars-loose": TaskEntry(
+        "jumper_warp.tasks.jump.mars:horizontal_jump_mars_loose", PLACES, about="jump farther, Mars",
+    ),
     "velocity-flat": TaskEntry(
-        "jumper_warp.tasks.velocity.flat:velocity_flat", WALKING, ("Olympus-Walk",), "Metrics/score"
+        "jumper_warp.tasks.velocity.flat:velocity_flat", WALKING, ("Olympus-Walk",), "Metrics/score",
+        "walk on level ground",
     ),
     "velocity-rough": TaskEntry(
-        "jumper_warp.tasks.velocity.rough:velocity_rough", WALKING, best_metric="Metrics/score"
+        "jumper_warp.tasks.velocity.rough:velocity_rough", WALKING, best_metric="Metrics/score",
+        about="walk on rough ground",
     ),
-    "velocity-trot": TaskEntry("jumper_warp.tasks.velocity.flat:velocity_trot", WALKING, best_metric="Metrics/score"),
-    "attitude": TaskEntry("jumper_warp.tasks.attitude.flight:attitude_in_flight", TURNS, best_metric="Metrics/settled"),
+    "velocity-trot": TaskEntry(
+        "jumper_warp.tasks.velocity.flat:velocity_trot", WALKING, best_metric="Metrics/score",
+        about="trot on level ground",
+    ),
+    "attitude": TaskEntry(
+        "jumper_warp.tasks.attitude.flight:attitude_in_flight", TURNS, best_metric="Metrics/settled",
+        about="turn while floating",
+    ),
 }  # fmt: skip
 """Tasks by name: the project's, registered ones, and loaded ones of installed packages."""
 
 
 def make_task(name: str) -> TaskCfg:
-    """Return a task by name or alias. Raises InputError: it is unknown, or its factory returns no such task."""
+    """Return a task by name or alias, where - counts as _.
+
+    Raises InputError: it is unknown, or its factory returns no such task.
+    """
     name, entry = find_task(name)
     return entry.task(name)
 
@@ -112,36 +156,64 @@ def task_names() -> tuple[str, ...]:
 
 
 def register_task(
-    name: str, make: Callable[[], TaskCfg], *, ppo: PpoCfg | None = None, aliases: tuple[str, ...] = ()
-) -> None:
-    """Register the task that `make` returns under its name and aliases; ppo: default training settings.
+    name: str, make: Callable[[], TaskCfg], *, ppo: PpoCfg | None = None, aliases: tuple[str, ...] = (),
+    about: str = "",
+) -> None:  # fmt: skip
+    """Register the task that `make` returns under its name and aliases.
 
+    ppo: default training settings; about: text for `jumper list` (default: the first sentence of make's docstring).
     Raises InputError: a name or alias is taken.
     """
-    _register(name, TaskEntry(make, PpoCfg() if ppo is None else ppo, tuple(aliases)))
+    _register(name, TaskEntry(make, PpoCfg() if ppo is None else ppo, tuple(aliases), about=about))
 
 
 def _register(name: str, entry: TaskEntry) -> None:
     """Add an entry to `TASKS`. Raises InputError: its name or an alias is taken."""
-    owners = {alias: task for task, known in TASKS.items() for alias in (task, *known.aliases)}
+    owners = _tasks_by_name()
     for alias in (name, *entry.aliases):
-        if alias in owners:
-            raise InputError(f"there is a task {alias!r:.60} already, of {TASKS[owners[alias]].origin}")
+        if owner := owners.get(dashed(alias)):
+            raise InputError(f"there is a task {alias!r:.60} already, of {TASKS[owner].origin}")
     TASKS[name] = entry
 
 
+def _tasks_by_name() -> dict[str, str]:
+    """Return the name of each task in `TASKS` by its name and aliases in dashed spelling."""
+    return {dashed(name): task for task, entry in TASKS.items() for name in (task, *entry.aliases)}
+
+
+def task_name(name: str) -> str | None:
+    """Return the registered name of a task by name or alias, where - counts as _; None if there is no such task.
+
+    Tasks of installed packages stay unloaded.
+    """
+    installed = {dashed(point.name): point.name for point in installed_tasks()}
+    return (installed | _tasks_by_name()).get(dashed(name))
+
+
 def find_task(name: str) -> tuple[str, TaskEntry]:
-    """Return (name, entry) of a task by name or alias, loading an installed one. Raises InputError: unknown."""
-    for known, entry in TASKS.items():
-        if name == known or name in entry.aliases:
-            return known, entry
-    points = [point for point in installed_tasks() if point.name == name]
-    if len(points) > 1:
-        raise InputError(f"task {name!r:.60} is in several packages: {', '.join(package_of(p) for p in points)}")
-    if not points:
-        raise InputError(f"unknown task {name!r:.60}; there are {', '.join(task_names())}")
-    load_installed(points[0])
-    return name, TASKS[name]
+    """Return (name, entry) of a task by name or alias, where - counts as _; an installed task is loaded.
+
+    Raises InputError: the task is unknown, or in several packages.
+    """
+    known = task_name(name)
+    if known is None:
+        raise InputError(_unknown_task(name))
+    if known not in TASKS:
+        points = [point for point in installed_tasks() if point.name == known]
+        if len(points) > 1:
+            raise InputError(f"task {name!r:.60} is in several packages: {', '.join(package_of(p) for p in points)}")
+        load_installed(points[0])
+    return known, TASKS[known]
+
+
+def _unknown_task(name: str) -> str:
+    """Return the message for a name that is no task: whether it is a policy, similar names, and --task-module."""
+    for policy, task in policy_tasks().items():
+        if dashed(name) == dashed(policy):
+            return f"{name!r} is a policy, not a task; its task is {task}"
+    similar = suggestion(name, {*task_names(), *_tasks_by_name()})
+    known = similar or f"; there are {', '.join(task_names())}"
+    return f"unknown task {name!r:.60}{known}; a task of your own needs --task-module FILE.py"
 
 
 def installed_tasks() -> tuple[EntryPoint, ...]:
@@ -187,14 +259,13 @@ def load_task_module(name: str) -> ModuleType:
         TASKS.clear()
         TASKS.update(before)
         if isinstance(error, ModuleNotFoundError) and f"{name}.".startswith(f"{error.name}."):
-            raise InputError(f"no module {name!r:.80}, give a FILE.py or the name of an installed module") from error
+            raise InputError(f"no module {name!r:.80}; give a FILE.py or the name of an installed module") from error
         raise
 
 
 def _load_file(path: Path) -> ModuleType:
     """Import a file as a module named by its stem, and return it; a loaded file is not run again. Raises InputError."""
-    if not path.is_file():
-        raise InputError(f"no file {str(path)!r:.200}")
+    existing_file(path, "tasks of your own")
     path, name = path.resolve(), path.stem
     if not name.isidentifier() or keyword.iskeyword(name):
         raise InputError(f"{path.name}: the name of a task's file must be one that Python can import")

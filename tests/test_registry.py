@@ -17,6 +17,7 @@ from jumper_warp.registry import (
     load_task_module,
     make_task,
     register_task,
+    task_name,
     task_names,
     trainer_settings,
 )
@@ -75,8 +76,43 @@ def test_tasks_are_found_by_name_and_alias():
 
 
 def test_refusal_of_an_unknown_task_lists_the_known_tasks():
-    with pytest.raises(InputError, match="unknown task 'swim'; there are vertical-jump, horizontal-jump"):
+    with pytest.raises(InputError, match=r"unknown task 'swim'; there are vertical-jump, .*, attitude; a"):
         make_task("swim")
+
+
+@pytest.mark.parametrize("name", ["vertical_jump_mars", "Olympus_Vertical-Jump_Mars", "vertical-jump_mars"])
+def test_dash_and_underscore_are_the_same_in_names_of_tasks(name):
+    assert find_task(name)[0] == task_name(name) == "vertical-jump-mars"
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("vertical_jmup", "did you mean 'vertical-jump'.; a task of your own needs --task-module FILE.py"),
+        ("Olympus-Wlak", "did you mean 'Olympus-Walk'"),
+        ("walking-flat", "'walking-flat' is a policy, not a task; its task is velocity-flat"),
+    ],
+)
+def test_refusal_of_an_unknown_task_gives_advice(name, message):
+    with pytest.raises(InputError, match=message):
+        make_task(name)
+
+
+@pytest.mark.parametrize(
+    ("doc", "sentence"),
+    [
+        ("Return the task. It jumps.", "The task"),
+        ("Jump to a\n    height 0.5 m up.\n\n    More.", "Jump to a height 0.5 m up"),
+        ("", ""),
+    ],
+)
+def test_description_without_about_is_the_factorys_first_sentence(doc, sentence):
+    def make():
+        pass
+
+    make.__doc__ = doc
+    assert TaskEntry(make).description == sentence
+    assert TaskEntry(make, about="jump").description == "jump"
 
 
 def test_trainer_settings_are_those_of_the_task():
@@ -94,6 +130,7 @@ def test_registered_task_has_its_name_alias_settings_and_origin():
 @pytest.mark.parametrize(
     ("name", "aliases", "taken"),
     [("vertical-jump", (), "vertical-jump"), ("Olympus-Vertical-Jump", (), "Olympus-Vertical-Jump"),
+     ("vertical_jump", (), "vertical_jump"),
      ("my-jump", ("horizontal-jump",), "horizontal-jump"), ("my-jump", ("Olympus-Vertical-Jump",), "Olympus")],
 )  # fmt: skip
 def test_name_that_is_taken_is_refused(name, aliases, taken):
@@ -166,7 +203,8 @@ def test_file_without_the_ending_of_python_is_refused(tmp_path):
 
 @pytest.mark.parametrize(
     ("name", "message"),
-    [("missing.py", "no file 'missing.py'"), ("missing/tasks", "no file"), ("no_such", "no module 'no_such'"),
+    [("missing.py", "missing.py: no such file .tasks of your own"), ("missing/tasks", "no such file"),
+     ("no_such", "no module 'no_such'"),
      ("no_such.tasks", "no module 'no_such.tasks'"), (".", "no module"), ("jumper_warp.no_such", "no module")],
 )  # fmt: skip
 def test_missing_file_or_module_is_refused(tmp_path, monkeypatch, name, message):
@@ -280,8 +318,9 @@ def test_package_cannot_replace_a_task_of_the_project(install):
     with pytest.raises(InputError, match="there is a task 'vertical-jump' already"):
         registry.load_installed(point)
     assert TASKS["vertical-jump"] == TaskEntry(
-        "jumper_warp.tasks.jump.vertical:vertical_jump", PpoCfg(gamma=0.99), aliases=("Olympus-Vertical-Jump",)
-    )
+        "jumper_warp.tasks.jump.vertical:vertical_jump", PpoCfg(gamma=0.99), aliases=("Olympus-Vertical-Jump",),
+        about="jump to a height",
+    )  # fmt: skip
 
 
 # ---------------------------------------------------------------------- public names

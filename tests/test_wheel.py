@@ -1,5 +1,6 @@
 """The wheel: built from a copy of the tree, unpacked, and used from another folder."""
 
+import json
 import os
 import shutil
 import subprocess
@@ -9,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from jumper_warp.policies.folder import list_policies
+from jumper_warp.utils.assets import policy_tasks
 
 ROOT = Path(__file__).parents[1]
 SOURCES = ("jumper_warp", "kernels", "assets", "setup.py", "pyproject.toml", "README.md", "LICENSE")
@@ -18,13 +19,14 @@ INSTALL = ("-m", "pip", "install", "--no-deps", "--no-index", "--disable-pip-ver
 USE = """
 import jumper_warp
 from jumper_warp.cli.main import main
-from jumper_warp.policies.folder import list_policies, load_policy
+from jumper_warp.policies.folder import load_policy
+from jumper_warp.utils.assets import policy_tasks
 from jumper_warp.robot.description import load_description
 
 print(jumper_warp.__file__)
-main(["list"])
+main(["list", "--json"])
 load_description()
-for name in list_policies():
+for name in policy_tasks():
     load_policy(name)  # checks every file
 """
 BOTH = """
@@ -85,7 +87,7 @@ def test_installed_package_finds_assets_and_policies_from_another_folder(wheel, 
     elsewhere.mkdir()
     package, *listed = run(USE, elsewhere, site)
     assert Path(package).is_relative_to(site)
-    assert [line.split()[1] for line in listed if line.startswith("policy")] == list(list_policies())
+    assert [policy["name"] for policy in json.loads("\n".join(listed))["policies"]] == list(policy_tasks())
 
 
 @pytest.mark.parametrize("ours_first", [True, False])

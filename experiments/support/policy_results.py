@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from jumper_warp.evaluation.run import HEIGHTS, SOLVER_TITLES, EvaluationRun
-from jumper_warp.policies.folder import POLICIES, add_files
+from jumper_warp.policies.folder import add_files
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.utils.assets import POLICIES
 from jumper_warp.utils.metrics import MetricValue
 from jumper_warp.utils.output import read_metrics
 from support.policy_conditions import CONDITIONS, undefined

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError
 from jumper_warp.cli.main import parse as parse_flags
 from jumper_warp.cli.renamed_flags import join_height_range
+from jumper_warp.utils.errors import suggestion
 
 if TYPE_CHECKING:
     from jumper_warp.evaluation.evaluations import Evaluation
@@ -22,12 +23,14 @@ usage: jumper {command} POLICY [flags]
 
 {about}
 
-  POLICY    name or folder of a policy, a training run's folder, or a checkpoint; `jumper list` shows the project's
+  POLICY    name or folder of a policy, folder of a training run, or checkpoint;
+            `jumper list` shows the names
 
 Flags depend on the task: jumper {command} POLICY --help lists them."""
 ABOUT = """\
-Measure a policy over many trials; writes metrics.json, with --save-trials also trials.npz.
-jumper evaluate POLICY --suite NAME [flags] runs a test of jumps instead, such as sweep, grid, ring or max."""
+Measure a policy over many trials, print its metrics and write metrics.json.
+jumper evaluate POLICY --suite NAME [flags] runs a test of jumps instead: sweep
+over heights or distances, grid, ring, consecutive, platform, or max distance."""
 SUITE = "--suite"
 
 
@@ -37,12 +40,13 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     args: the policy, then flags. Raises InputError or OSError: the policy or a flag is invalid. Exits as tyro does.
     """
     policy = policy_of("evaluate", ABOUT, args)
-    from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
-
+    args = [part for arg in args for part in (arg.split("=", 1) if arg.startswith(f"{SUITE}=") else [arg])]
     opened = open_run(policy, modules)
     if SUITE in args:
         run_suite(opened, args)
         return
+    from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
+
     evaluate(opened, parse("evaluate", opened, args[1:], EvaluateCfg, lambda kind: kind.flags))
 
 
@@ -53,8 +57,10 @@ def run_suite(opened: EvaluationRun, args: Sequence[str]) -> None:
     flag = args.index(SUITE)
     suites, name = suites_for(opened.task.evaluation_suite), "".join(args[flag + 1 : flag + 2])
     if name not in suites:
-        available = ", ".join(suites) or "none"
-        raise UsageError(f"no suite {name!r:.60} for policies of {opened.task.name}; there are {available}")
+        if not suites:
+            raise UsageError(f"there are no suites for policies of {opened.task.name}")
+        near = suggestion(name, suites) or f"; there are {', '.join(suites)}"
+        raise UsageError(f"no suite {name!r:.60} for policies of {opened.task.name}{near}")
     command, default = f"evaluate {opened.source} {SUITE} {name}", suites[name](policy=str(opened.source))
     parse_flags(suites[name], command, [*args[1:flag], *args[flag + 2 :]], default=default).run(opened.modules)
 
@@ -74,9 +80,12 @@ def policy_of(command: str, about: str, args: Sequence[str]) -> str:
 
 def open_run(policy: str, modules: Sequence[ModuleType]) -> EvaluationRun:
     """Open a policy for evaluation. Raises PolicyError or CheckpointError: it cannot be used."""
-    from jumper_warp.evaluation.run import EvaluationRun
+    from jumper_warp.utils.progress import phase
 
-    return EvaluationRun(policy, modules)
+    with phase(f"opening {policy}"):
+        from jumper_warp.evaluation.run import EvaluationRun
+
+        return EvaluationRun(policy, modules)
 
 
 def parse(
@@ -90,9 +99,5 @@ def parse(
     flags, about = flags_of(opened.evaluation), kind.__doc__
     if hasattr(flags, "height_range"):
         args = join_height_range(args, flags.height_range)
-    program, settings = f"{command} {opened.source}", {"description": about, "default": kind(flags)}
-    cfg, unknown = parse_flags(kind[type(flags)], program, args, return_unknown_args=True, **settings)
-    if unknown:
-        message = f"{unknown[0]} is not for policies of {opened.task.name}"
-        raise UsageError(f"{message}; jumper {program} --help shows the flags that are")
-    return cfg
+    settings = {"description": about, "default": kind(flags), "subject": f"policies of {opened.task.name}"}
+    return parse_flags(kind[type(flags)], f"{command} {opened.source}", args, **settings)

@@ -10,7 +10,9 @@ from types import ModuleType
 from jumper_warp.cli.evaluate import policy_of
 from jumper_warp.cli.main import parse
 
-ABOUT = "Make a jumping policy miss its heights or places by less, by gradients through physics, motors and network."
+ABOUT = """\
+Reduce the errors of a jumping policy by gradients through physics, motors and
+network, and save the result as a new policy."""
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
@@ -19,17 +21,20 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     Raises UsageError, InputError or OSError: the policy or a flag is invalid.
     """
     name = policy_of("finetune", ABOUT, args)
-    from jumper_warp.evaluation.finetuning import FinetuneArgs, finetune
-    from jumper_warp.policies.folder import checked_folder, save_policy
-    from jumper_warp.policies.runs import open_policy
-    from jumper_warp.policies.spec import PolicyError
-    from jumper_warp.utils.runtime import configure_device
+    from jumper_warp.utils.progress import phase
 
+    with phase(f"opening {name}"):
+        from jumper_warp.evaluation.finetuning import FinetuneArgs, finetune
+        from jumper_warp.policies.folder import checked_folder, save_policy
+        from jumper_warp.policies.runs import open_policy
+        from jumper_warp.policies.spec import PolicyError
+        from jumper_warp.utils.runtime import configure_device
+
+        policy = open_policy(name)
     parsed: FinetuneArgs = parse(FinetuneArgs, f"finetune {name}", args[1:])
     out = checked_folder(parsed.out or Path(f"{Path(name).name}_finetuned"))
     if out.exists() and not parsed.overwrite:
-        raise PolicyError(f"{out} exists")
-    policy = open_policy(name)
+        raise PolicyError(f"{out} exists; overwrite replaces it")
     configure_device(parsed.device, parsed.threads)
     policy, record = finetune(policy, parsed, modules)
     files = {"finetuning.json": (json.dumps(record, indent=1) + "\n").encode()}

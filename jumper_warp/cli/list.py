@@ -1,23 +1,52 @@
-"""`jumper list`: list the tasks, with their origin, and the project's policies."""
+"""`jumper list`: list all tasks and the project's policies, one a line."""
 
 from __future__ import annotations
 
+import json
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from types import ModuleType
+from typing import TYPE_CHECKING, Any
 
 from jumper_warp.cli.main import parse
+
+if TYPE_CHECKING:
+    from jumper_warp.policies.catalog import PolicySummary
+
+LEGEND = """\
+success, error: nominal robot. A jump succeeds within 0.1 m of its goal, landed
+and at rest; a walk without a fall; a turn if it settles. error: mean of jumps
+and turns, RMSE of the velocity ahead of walks. size: of the network's file.
+
+jumper info NAME shows a task or a policy."""
 
 
 @dataclass(frozen=True)
 class ListCfg:
-    """List the tasks, with their origin, and the project's policies."""
+    """List all tasks and the project's policies."""
+
+    json: bool = False  # Print JSON
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """Print tasks and policies, one a line; modules: the user's, whose tasks are registered already."""
-    parse(ListCfg, "list", args)
-    from jumper_warp.policies.folder import list_policies
+    cfg = parse(ListCfg, "list", args)
+    from jumper_warp.policies.catalog import summarise
+    from jumper_warp.utils.assets import POLICIES, policy_tasks
+
+    policies = [summarise(POLICIES / name) for name in policy_tasks()]
+    tasks, failures = describe_tasks(policies)
+    if cfg.json:
+        print(json.dumps({"tasks": tasks, "policies": [describe(policy) for policy in policies]}, indent=2))
+    else:
+        print_tables(tasks, policies)
+    for line in failures:
+        print(line, file=sys.stderr)
+
+
+def describe_tasks(policies: Sequence[PolicySummary]) -> tuple[list[dict[str, Any]], list[str]]:
+    """Return the description of every task as JSON data, and a line for each package whose task cannot be loaded."""
     from jumper_warp.registry import TASKS, installed_tasks, load_installed, package_of
 
     packages, failures = {}, []
@@ -25,14 +54,56 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         name, package = entry_point.name, package_of(entry_point)
         try:
             load_installed(entry_point)
-            packages[name] = f", package {package}"
+            packages[name] = package
         except Exception as error:  # an error in one package must not hide the tasks of others
             reason = " ".join(f"{type(error).__name__}: {error}".split())
-            failures.append(f"task    {name}  of package {package} is left out: {reason:.300}")
-    for name, entry in TASKS.items():
-        aliases = f" ({', '.join(entry.aliases)})" if entry.aliases else ""
-        print(f"task    {name}{aliases}  from {entry.origin}{packages.get(name, '')}")
-    for line in failures:
-        print(line)
-    for name in list_policies():
-        print(f"policy  {name}")
+            failures.append(f"task {name} of package {package} is left out: {reason:.300}")
+    tasks = [
+        {"name": name, "about": entry.description, "aliases": list(entry.aliases), "module": entry.origin,
+         "package": packages.get(name), "policies": [policy.name for policy in policies if policy.task == name]}
+        for name, entry in TASKS.items()
+    ]  # fmt: skip
+    return tasks, failures
+
+
+def describe(policy: PolicySummary) -> dict[str, Any]:
+    """Return the description of a policy as JSON data; success and error: of the nominal robot, None: not evaluated."""
+    return {"name": policy.name, "task": policy.task, "success_rate": policy.success, "error": policy.error,
+            "size_bytes": policy.size_bytes, "folder": str(policy.folder)}  # fmt: skip
+
+
+def print_tables(tasks: Sequence[dict[str, Any]], policies: Sequence[PolicySummary]) -> None:
+    """Print one table of the tasks and one of the policies, each under a heading."""
+    from rich.console import Console
+    from rich.table import Column, Table
+
+    from jumper_warp.utils.metrics import WIDTH
+
+    console = Console(width=WIDTH, highlight=False)
+    table = Table(
+        Column("TASK", no_wrap=True), Column("what the robot does", no_wrap=True, overflow="ellipsis"), "its policies",
+        box=None, pad_edge=False, padding=(0, 2, 0, 0),
+    )  # fmt: skip
+    for task in tasks:
+        table.add_row(task["name"], task["about"], ", ".join(task["policies"]))
+    console.print(table)
+    console.print()
+    table = Table("POLICY", "its task", *(Column(name, justify="right") for name in ("success", "error", "size")),
+                  box=None, pad_edge=False, padding=(0, 2, 0, 0))  # fmt: skip
+    for policy in policies:
+        success = "" if policy.success is None else f"{100.0 * policy.success:.1f} %"
+        table.add_row(policy.name, policy.task, success, quantity(policy.error), size_text(policy.size_bytes))
+    console.print(table)
+    console.print(f"\n{LEGEND}")
+
+
+def quantity(metric: dict[str, Any] | None) -> str:
+    """Return value and unit of a metric, as in metrics.json, with two significant digits; empty for None."""
+    if metric is None or metric["value"] is None:
+        return ""
+    return f"{metric['value']:.2g} {metric['unit'] or ''}".strip()
+
+
+def size_text(size_bytes: int) -> str:
+    """Return a file's size in kB or MB."""
+    return f"{size_bytes / 1e6:.1f} MB" if size_bytes >= 1e6 else f"{size_bytes / 1e3:.0f} kB"

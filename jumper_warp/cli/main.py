@@ -1,19 +1,29 @@
-"""The command `jumper`: train, finetune, play, evaluate, export, sysid, list. `jumper COMMAND --help` shows the flags.
+"""The command `jumper`: train, play, evaluate and so on. `jumper COMMAND --help` shows the flags.
 
 A command imports only what it needs, so that help and usage errors print at once.
 """
 
 from __future__ import annotations
 
+import contextlib
+import dataclasses
 import importlib
+import inspect
+import io
+import itertools
 import os
 import re
 import sys
 import traceback
 from collections.abc import Callable, Collection, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.errors import InputError, suggestion
+from jumper_warp.utils.version import __version__
+
+if TYPE_CHECKING:
+    from jumper_warp.cli.flags import Flag
+    from jumper_warp.cli.help import Short
 
 USAGE_ERROR = 2  # Exit code for input that cannot be used
 INTERRUPTED = 130  # Exit code after Ctrl-C
@@ -24,15 +34,18 @@ COMMANDS = {
     "evaluate": "Measure a policy over many trials.",
     "export": "Make a policy's folder of a training run, or one ONNX file of a policy.",
     "sysid": "Identify the robot's parameters from recorded motions.",
-    "list": "Show the tasks and the project's policies.",
+    "list": "List the tasks and the project's policies.",
+    "info": "Describe a task or a policy: jumper info NAME.",
 }
 """Help text by command; each command is a module of `jumper_warp.cli` with run(args, modules)."""
+RED, RESET = "\033[31m", "\033[0m"  # Colour of the program's name before an error
 CODEGEN = re.compile(r'Error while parsing function "(\w+)" at (.+):\d+:')
 """Function and file in Warp's message about a kernel that does not compile; the last match has the error."""
 TASK_MODULE = "--task-module"
 TASK_MODULE_HELP = f"""\
-Every command takes {TASK_MODULE} FILE_OR_MODULE, any number of times: a FILE.py or an installed module
-that registers tasks of your own, and has the functions that saved ones name."""
+Every command takes {TASK_MODULE} FILE_OR_MODULE, any number of times: a FILE.py or
+an installed module that registers tasks of your own."""
+EXIT_CODES = "Exit codes: 0 done, 1 a fault in jumper, 2 invalid input, 130 after Ctrl-C."
 
 
 class UsageError(InputError):
@@ -42,8 +55,9 @@ class UsageError(InputError):
 def usage() -> str:
     """Return the help text that lists all commands."""
     lines = ["usage: jumper COMMAND [arguments]", ""]
-    lines += [f"  {name:<10}{about}" for name, about in COMMANDS.items()]
-    return "\n".join([*lines, "", TASK_MODULE_HELP, "", "jumper COMMAND --help shows the arguments of one."])
+    lines += [f"  {name:<12}{about}" for name, about in COMMANDS.items()]
+    lines += ["", "jumper COMMAND --help shows the arguments of one; jumper --version the version."]
+    return "\n".join([*lines, TASK_MODULE_HELP, EXIT_CODES])
 
 
 def main(argv: Sequence[str] | None = None) -> None:
@@ -58,6 +72,9 @@ def main(argv: Sequence[str] | None = None) -> None:
     if args[0] in ("-h", "--help"):
         print(usage())
         raise SystemExit(0)
+    if args[0] in ("-V", "--version"):
+        print(f"jumper {__version__}")
+        raise SystemExit(0)
     run_command(lambda: dispatch(args))
 
 
@@ -68,7 +85,8 @@ def dispatch(args: Sequence[str]) -> None:
     """
     name = args[0]
     if name not in COMMANDS:
-        raise UsageError(f"no command {name!r:.60}; there are {', '.join(COMMANDS)}")
+        near = suggestion(name, COMMANDS) or f"; there are {', '.join(COMMANDS)}"
+        raise UsageError(f"no command {name!r:.60}{near}")
     rest, files = split_task_modules(args[1:])
     modules = []
     try:
@@ -111,19 +129,61 @@ def split_task_modules(args: Sequence[str]) -> tuple[list[str], list[str]]:
     return rest, names
 
 
-def parse(kind: Any, command: str, args: Sequence[str], **settings: Any) -> Any:
-    """Return a command's settings parsed from its arguments; exits with USAGE_ERROR if they are invalid.
+def parse(
+    kind: Any, command: str, args: Sequence[str], *, description: str | None = None, default: Any = None,
+    short: Short | None = None, subject: str | None = None,
+) -> Any:  # fmt: skip
+    """Return a command's settings parsed from its arguments; prints help and exits with 0 if they ask for it.
 
-    kind: dataclass of the settings. settings: keyword arguments of `tyro.cli`; default description: kind's docstring.
+    kind: dataclass of the settings. description: text for the help (default: kind's docstring). default: instance of
+    `kind`. short: flags of --help, as for `help_page` (default: all). subject: what has the flags, for errors (default:
+    the command).
+    Raises UsageError: there is no such flag, or a value is missing or of another type.
     """
-    import tyro
-
+    from jumper_warp.cli.flags import Flag, list_flags, option_of
+    from jumper_warp.cli.help import help_page, wants_help
     from jumper_warp.cli.renamed_flags import use_new_names
 
-    about = settings.pop("description", kind.__doc__)
-    description = f"{about}\n\n{TASK_MODULE_HELP}"
-    args = use_new_names(args, settings.get("default", kind))
-    return tyro.cli(kind, prog=f"jumper {command}", description=description, args=args, **settings)
+    task_module = Flag(
+        "task-module", "FILE_OR_MODULE", None, "File or installed module with tasks of your own; repeatable"
+    )
+    flags = [*list_flags(kind if default is None else default), task_module]
+    if wants_help(args):
+        print(help_page(command, description or inspect.getdoc(kind) or "", flags, args, short), end="")
+        raise SystemExit(0)
+    args = use_new_names(args, kind if default is None else default)
+    options = {option for flag in flags for option in flag.options}
+    for option in filter(None, map(option_of, args)):
+        if option not in options:
+            near = suggestion(option, options) or f"; jumper {command} --help lists the flags"
+            raise UsageError(f"no flag {option} for {subject or command}{near}")
+    import tyro
+
+    printed, settings = io.StringIO(), {} if default is None else {"default": default}
+    try:
+        with contextlib.redirect_stderr(printed):
+            parsed = tyro.cli(kind, args=args, **settings)
+    except SystemExit:
+        raise UsageError(parse_error(printed.getvalue(), flags, args)) from None
+    print(printed.getvalue(), end="", file=sys.stderr)
+    return parsed
+
+
+def parse_error(printed: str, flags: Sequence[Flag], args: Sequence[str]) -> str:
+    """Return one line about arguments that tyro refused; printed: tyro's message in its box."""
+    from jumper_warp.cli.flags import values_of
+
+    lines = [line.strip("│ ") for line in printed.splitlines()[1:]]
+    message = " ".join(itertools.takewhile(lambda line: not line.startswith("─"), lines))
+    missing = [flag for flag in flags if flag.positional and flag.default is dataclasses.MISSING]
+    if missing and message.startswith("Missing from"):
+        return f"{missing[0].name} is missing: {missing[0].about}"
+    options = {option: flag for flag in flags for option in flag.options}
+    for word in re.findall(r"--[\w.-]+", message):
+        if flag := options.get(word.rstrip(".")):
+            got = " ".join(values_of(word, args)) or "nothing"
+            return f"--{flag.name} takes {flag.metavar}, got {got}"
+    return re.sub(r"^Error parsing \w+: ", "", message).replace("Unrecognized options:", "unexpected argument")
 
 
 def run_command(command: Callable[[], object]) -> None:
@@ -141,5 +201,11 @@ def run_command(command: Callable[[], object]) -> None:
     except (InputError, OSError) as error:
         if isinstance(error, OSError) and error.filename is None:
             raise
-        print(f"jumper: {' '.join(str(error).split())}", file=sys.stderr)
+        colour = sys.stderr.isatty() and "NO_COLOR" not in os.environ
+        message = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
+        print(f"{RED if colour else ''}jumper:{RESET if colour else ''} {message}", file=sys.stderr)
         raise SystemExit(USAGE_ERROR) from None
+
+
+if __name__ == "__main__":
+    main()

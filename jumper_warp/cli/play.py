@@ -12,8 +12,10 @@ from jumper_warp.cli.evaluate import open_run, parse, policy_of
 from jumper_warp.cli.main import parse as parse_flags
 
 ABOUT = """\
-Run a policy and record it for the Rerun viewer; --viewer rerun opens the recording.
-jumper play --script FILE.json [flags] makes one robot walk and jump with several policies."""
+Simulate a policy, and write a picture and a recording for the Rerun viewer;
+--viewer rerun opens it, --video FILE writes a film.
+jumper play --script FILE.json [flags] makes one robot walk and jump with
+several policies."""
 SCRIPT = "--script"
 
 
@@ -29,7 +31,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         play_script(parse_flags(ScriptCfg, f"play {SCRIPT} FILE", args))
         return
     policy = policy_of("play", ABOUT, args)
+    opened = open_run(policy, modules)
     from jumper_warp.evaluation.commands import PlayCfg, play
 
-    opened = open_run(policy, modules)
     play(opened, parse("play", opened, args[1:], PlayCfg, lambda kind: kind.play))

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import itertools
 import re
 import sys
 from collections.abc import Sequence
-from typing import Any, get_type_hints
+from typing import Any
 
+from jumper_warp.cli.flags import list_flags
 from jumper_warp.utils.errors import InputError
 
 RENAMED = {
@@ -55,20 +55,6 @@ RENAMED_ENV_PARTS = {
 """Old to new parts, between dots, of a task's flags `--env.…`; the first combination that is a flag counts."""
 
 
-def flag_names(cfg: Any) -> set[str]:
-    """Return the names, without leading dashes, of tyro's flags for a dataclass or an instance; nested ones dotted."""
-    names, hints = set(), get_type_hints(cfg if isinstance(cfg, type) else type(cfg), include_extras=True)
-    for spec in dataclasses.fields(cfg):
-        value, marks = getattr(cfg, spec.name, spec.default_factory), getattr(hints[spec.name], "__metadata__", ())
-        given = [mark.name for mark in marks if getattr(mark, "name", None) is not None]
-        name = given[-1] if given else spec.name.replace("_", "-")
-        if dataclasses.is_dataclass(value):
-            names |= {f"{name}.{nested}" if name else nested for nested in flag_names(value)}
-        else:
-            names.add(name)
-    return names
-
-
 def name_of(arg: str) -> str:
     """Return the name of a flag, as `ppo.init-std` of `--ppo.no-init_std=1`; "" if the argument is no flag."""
     match = re.match(r"--([^=]+)", arg)
@@ -92,7 +78,7 @@ def use_new_names(args: Sequence[str], cfg: Any) -> list[str]:
     arg_names, new_args = [name_of(arg) for arg in args], list(args)
     if not any(name in RENAMED or name.startswith("env.") for name in arg_names):
         return new_args
-    current, renamed = flag_names(cfg), {}
+    current, renamed = {flag.name for flag in list_flags(cfg)}, {}
     for i, old in enumerate(arg_names):
         new = None if old in current else new_name(old, current)
         if new is None:

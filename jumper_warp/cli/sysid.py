@@ -17,7 +17,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import json_bytes, write_atomically
 
 HELP = f"""\
-usage: jumper sysid DATA ... [flags]
+usage: jumper sysid [fit] DATA ... [flags]
        jumper sysid excite [flags]
        jumper sysid actuator BENCH [flags]
 
@@ -54,6 +54,7 @@ class SysidCfg:
     """[N m] Torque limit that the controllers were set to (default: as the files say, else 18)."""
     torque_constant: float = 0.0  # [N m/A] Torque at the joint over current, for files with currents
     out: Path | None = None  # Folder for the results (default: outputs/sysid/<time>)
+    json: bool = False  # Print report.json in place of a table
     device: str | None = None  # Warp device
     threads: int | None = None  # CPU threads (default: all cores)
 
@@ -108,7 +109,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     elif args[0] == "actuator":
         characterise(parse(ActuatorCfg, "sysid actuator", args[1:]))
     else:
-        sysid(parse(SysidCfg, "sysid", args))
+        sysid(parse(SysidCfg, "sysid", args[1:] if args[0] == "fit" else args))
 
 
 def split_names(text: str) -> list[str]:
@@ -124,6 +125,7 @@ def sysid(cfg: SysidCfg) -> None:
     from jumper_warp.identification.identify import identify, identify_by_evolution
     from jumper_warp.identification.report import write_results
     from jumper_warp.utils.output import output_dir
+    from jumper_warp.utils.progress import phase
     from jumper_warp.utils.runtime import configure_device
 
     cfg.noise.check()
@@ -138,7 +140,11 @@ def sysid(cfg: SysidCfg) -> None:
     else:
         result = identify(motions, parameters, **settings)
     folder = output_dir("sysid", cfg.out)
-    write_results(result, folder, f"jumper sysid of {', '.join(motion.name for motion in motions)}")
+    with phase("writing the report"):
+        write_results(result, folder, f"jumper sysid of {', '.join(motion.name for motion in motions)}")
+    if cfg.json:
+        print((folder / "report.json").read_text(encoding="utf-8"), end="")
+        return
     table = Table("parameter", "unit", "described", "found", "95 %", box=None)
     rows = zip(result.parameters, result.values, result.intervals, result.identified, strict=True)
     for parameter, value, (low, high), identified in rows:

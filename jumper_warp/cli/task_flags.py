@@ -8,18 +8,15 @@ term's name in a section with one term, as `--env.curriculum.tolerance`; other s
 
 from __future__ import annotations
 
-import ast
 import dataclasses
-import functools
 import inspect
-import itertools
 import re
-import textwrap
 from typing import Annotated, Any, NamedTuple, get_args, get_type_hints
 
 import tyro
 import warp as wp
 
+from jumper_warp.cli.flags import field_docs
 from jumper_warp.tasks.cfg import Reset, TaskCfg
 from jumper_warp.tasks.terms import Term
 from jumper_warp.utils.errors import InputError
@@ -28,7 +25,7 @@ NO_SOURCE = __package__
 """Module name of the dataclasses made here: tyro parses its source, which is fast since the file is empty."""
 
 
-class Flag(NamedTuple):
+class Setting(NamedTuple):
     """A setting or a group of settings, as a field of a dataclass for tyro."""
 
     kind: Any  # type of the setting, for tyro
@@ -50,22 +47,7 @@ def flag_name(name: str) -> str:
     return re.sub(r"[^0-9A-Za-z]+", "-", name).strip("-").lower()
 
 
-@functools.cache
-def field_docs(kind: type) -> dict[str, str]:
-    """Return the docstrings of a dataclass's fields by field name; empty where there is no source."""
-    docs = {}
-    for base in reversed(kind.__mro__[:-1]):
-        try:
-            tree: Any = ast.parse(textwrap.dedent(inspect.getsource(base)))
-        except (OSError, TypeError, SyntaxError):
-            continue
-        for field, text in itertools.pairwise(tree.body[0].body):
-            if isinstance(field, ast.AnnAssign) and isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
-                docs[ast.unparse(field.target)] = " ".join(str(text.value.value).split())
-    return docs
-
-
-def _flag(value: Any, hint: Any, where: str) -> Flag | None:
+def _flag(value: Any, hint: Any, where: str) -> Setting | None:
     """Return the flag or group of flags of a part of a task, None if it has none; where: its path, for messages."""
     if isinstance(value, Term):
         return _flag_of_term(value, where)
@@ -77,10 +59,10 @@ def _flag(value: Any, hint: Any, where: str) -> Flag | None:
         flags = {name: _flag(part, Any, f"{where} {name}") for name, part in parts.items()}
         present = {name: flag for name, flag in flags.items() if flag is not None}
         return _group(None, present, where) if present else None
-    return Flag(hint, value) if _is_number(value, hint) else None
+    return Setting(hint, value) if _is_number(value, hint) else None
 
 
-def _flag_of_dataclass(value: Any, where: str) -> Flag | None:
+def _flag_of_dataclass(value: Any, where: str) -> Setting | None:
     """Return the flags of a dataclass's fields; fields that hold functions or names have none."""
     hints, docs, flags = get_type_hints(type(value)), field_docs(type(value)), {}
     for name, part in _parts(value).items():
@@ -90,16 +72,16 @@ def _flag_of_dataclass(value: Any, where: str) -> Flag | None:
     return _group(_first_paragraph(type(value).__doc__), flags, where) if flags else None
 
 
-def _flag_of_term(term: Term, where: str) -> Flag | None:
+def _flag_of_term(term: Term, where: str) -> Setting | None:
     """Return the flags of a term's numbers and integer options."""
     settings = {**term.settings, **term.options}
     numbers = term.numbers | {key: option for key, option in term.options.items() if type(option) is int}
     kinds = {int: int, tuple: tuple[float, float]}
-    flags = {key: Flag(kinds.get(type(settings.get(key)), float), value) for key, value in numbers.items()}
+    flags = {key: Setting(kinds.get(type(settings.get(key)), float), value) for key, value in numbers.items()}
     return _group(_first_paragraph(inspect.getdoc(term.func.func)), flags, where) if flags else None
 
 
-def _group(about: str | None, flags: dict[str, Flag], where: str) -> Flag:
+def _group(about: str | None, flags: dict[str, Setting], where: str) -> Setting:
     """Return flags as one group, an instance of a frozen dataclass. Raises InputError: two flags have one name."""
     names = [flag_name(name) for name in flags]
     if len(set(names)) < len(names) or "" in names:
@@ -111,7 +93,7 @@ def _group(about: str | None, flags: dict[str, Flag], where: str) -> Flag:
     ]  # fmt: skip
     kind = dataclasses.make_dataclass("Settings", fields, frozen=True, namespace={"__module__": NO_SOURCE})
     kind.__doc__ = about
-    return Flag(kind, kind(*(flag.value for flag in flags.values())), about)
+    return Setting(kind, kind(*(flag.value for flag in flags.values())), about)
 
 
 def _members(group: Any) -> dict[str, Any]:

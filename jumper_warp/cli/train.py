@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import json
 import os
 import shlex
-import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,7 +13,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import tyro
 
-from jumper_warp.cli.main import TASK_MODULE, TASK_MODULE_HELP, USAGE_ERROR, UsageError, parse
+from jumper_warp.cli.flags import option_of, values_of
+from jumper_warp.cli.help import wants_help
+from jumper_warp.cli.main import TASK_MODULE, UsageError, parse
 from jumper_warp.cli.renamed_flags import use_new_names
 from jumper_warp.registry import find_task, make_task, task_names
 from jumper_warp.rl.cfg import TrainCfg
@@ -32,6 +32,16 @@ if TYPE_CHECKING:
     from jumper_warp.tasks.cfg import TaskCfg
 
 
+SHORT_HELP = {
+    "Size and length": ("num-envs", "max-iterations", "max-seconds", "seed"),
+    "Physics and robot": ("randomize", "noise", "history", "solver", "robot"),
+    "Continue or start from a policy": ("resume", "init-policy"),
+    "Learning": ("trainer", "ppo.hidden", "ppo.lr", "ppo.gamma", "ppo.entropy-coef"),
+    "Machine and output": ("device", "threads", "log-root", "save-interval", "best-metric", "task-module"),
+}
+"""Flags on the page of `jumper train --help`, by heading."""
+
+
 @dataclass(frozen=True)
 class TrainArgs:
     """Train a policy on a task."""
@@ -39,13 +49,16 @@ class TrainArgs:
     cfg: Annotated[TrainCfg, tyro.conf.arg(name="")] = field(default_factory=TrainCfg)
     solver: Literal["jumper", "mujoco"] = "jumper"  # Physics: the dedicated solver, or Newton's SolverMuJoCo
     randomize: bool = True
-    """Randomise masses, friction, motors, latency and pushes for each world; ranges are under --env.randomization."""
+    """Randomise masses, friction, motors, latency and pushes. Each world has other values; the flags
+    --env.randomization set their ranges."""
     noise: bool = True  # Add noise to observations
     history: int | None = None
-    """Policy steps of velocities, gravity, angles and actions in the observation (default: the task's). With 1 it has
-    a third of the size, learns faster on few worlds, and is enough without randomisation and noise."""
+    """Policy steps in the observation (default: the task's). Velocities, gravity, angles and actions of these steps are
+    observed. With 1 the observation has a third of the size; the policy learns faster on few worlds, and 1 is enough
+    without randomisation and noise."""
     robot: Path | None = None
-    """Robot overlay, as `jumper sysid` writes it; its randomisation ranges override the task's, flags override both."""
+    """Robot overlay, a file that `jumper sysid` writes. Its randomisation ranges override the task's; flags override
+    both."""
     robot_of_run: Annotated[Any, tyro.conf.Suppress] = None  # Robot overlay of the run that is resumed
     checkpoint: Annotated[Any, tyro.conf.Suppress] = None  # Checkpoint that is resumed
 
@@ -57,24 +70,20 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
     Raises InputError: the task is missing, unknown or given twice, a setting is out of range, or there is no such run.
     """
     names = ", ".join(task_names())
-    if not args:
-        print(f"usage: jumper train TASK [flags]\n\ntasks: {names}\n\n{TASK_MODULE_HELP}", file=sys.stderr)
-        raise SystemExit(USAGE_ERROR)
-    if args[0] in ("-h", "--help"):
-        about = f"Train a policy on a task: {names}. Its own settings are --env flags: jumper train TASK --help."
-        parse(TrainArgs, "train TASK", ["--help"], description=about)
-    if args[0].startswith("-"):
+    if wants_help(args[:1]):
+        about = f"Train a policy on a task: {names}.\njumper train TASK --help also lists the task's own settings."
+        parse(TrainArgs, "train TASK", args, description=about, short=SHORT_HELP)
+    if not args or args[0].startswith("-"):
         raise UsageError(f"the task comes first: jumper train TASK [flags]; tasks: {names}")
     name, entry = find_task(args[0])
     default, task = TrainArgs(TrainCfg(task=name, ppo=entry.ppo, best_metric=entry.best_metric)), make_task(name)
-    session = {
-        name: value_of(f"--{name.replace('_', '-')}", args[1:]) for name in ("resume", "log_root", "init_policy")
-    }
-    if session["resume"]:
+    flags = {name: values_of(f"--{name.replace('_', '-')}", args) for name in ("resume", "log_root", "init_policy")}
+    session = {name: values[0] for name, values in flags.items() if values}
+    if "resume" in session:
         from jumper_warp.cli.resumed import settings_of_run
         from jumper_warp.rl.resume import find_checkpoint
 
-        named = dataclasses.replace(default.cfg, **{k: v for k, v in session.items() if v})
+        named = dataclasses.replace(default.cfg, **session)
         if checkpoint := find_checkpoint(named):
             settings, task = settings_of_run(checkpoint, default.cfg)
             default = dataclasses.replace(default, **settings)
@@ -97,19 +106,9 @@ def parse_settings(task: TaskCfg, default: TrainArgs, args: Sequence[str]) -> tu
     made: dict[str, Any] = {"bases": (TrainArgs,), "frozen": True, "namespace": {"__module__": __name__}}
     kind: Any = dataclasses.make_dataclass("TaskTrainArgs", [("env", type(flags), flags)], **made)
     defaults = {spec.name: getattr(default, spec.name) for spec in dataclasses.fields(default)}
-    about = f"Train a policy on {task.name}."
-    parsed = parse(kind, f"train {task.name}", args, default=kind(**defaults), description=about)
+    settings: dict[str, Any] = {"default": kind(**defaults), "short": SHORT_HELP}
+    parsed = parse(kind, f"train {task.name}", args, description=f"Train a policy on {task.name}.", **settings)
     return parsed, with_flags(task, parsed.env)
-
-
-def value_of(name: str, args: Sequence[str]) -> str | None:
-    """Return the last value of a flag (name with dashes) in unparsed arguments; None if it is not given."""
-    value = None
-    for arg, following in itertools.zip_longest(args, args[1:]):
-        flag, equals, text = arg.partition("=")
-        if flag.replace("_", "-") == name:
-            value = text if equals else following
-    return value
 
 
 def overlay_in(args: Sequence[str]) -> RobotOverlay | None:
@@ -117,12 +116,12 @@ def overlay_in(args: Sequence[str]) -> RobotOverlay | None:
 
     Raises InputError or OSError: the overlay is invalid.
     """
-    path = value_of("--robot", args)
-    if path is None:
+    path = values_of("--robot", args)
+    if not path:
         return None
     from jumper_warp.robot.overlay import load_overlay
 
-    return load_overlay(Path(path))
+    return load_overlay(Path(path[0]))
 
 
 def for_robot(task: TaskCfg, overlay: RobotOverlay | None) -> TaskCfg:
@@ -164,10 +163,9 @@ def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
     """
     kept, remaining = [], iter(args)
     for arg in remaining:
-        flag, equals, _ = arg.partition("=")
-        if flag.replace("_", "-") not in ("--resume", "--init-policy"):
+        if option_of(arg) not in ("--resume", "--init-policy"):
             kept.append(arg)
-        elif not equals:
+        elif "=" not in arg:
             next(remaining, None)
     for module in modules:
         name = module.__name__ if "." in module.__name__ or not module.__file__ else module.__file__

@@ -29,8 +29,10 @@ class DeployedPolicy:
     def __init__(self, file: str | Path) -> None:
         """Load `policy.onnx`; its metadata becomes `interface`, a dict of the fields of `PolicyInterface`.
 
-        Raises InputError, a ValueError: the metadata has no observation layout.
+        Raises InputError, a ValueError: the file is missing, or its metadata has no observation layout.
         """
+        if not Path(file).is_file():
+            raise InputError(f"{file}: no such file (ONNX file of a policy)")
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1  # more threads slow down small networks
         self._session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])

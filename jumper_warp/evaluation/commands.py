@@ -17,8 +17,9 @@ from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.evaluation.run import EvaluationRun, SkillRun
 from jumper_warp.evaluation.scripts import read_script
+from jumper_warp.policies.catalog import find_policy
 from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.folder import add_files, find_policy
+from jumper_warp.policies.folder import add_files
 from jumper_warp.policies.runs import is_run
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.policies.spec import PolicyError

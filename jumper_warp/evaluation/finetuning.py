@@ -28,6 +28,7 @@ from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.trajectory.gauss_newton import Anchor, Network, gauss_newton_step
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.progress import phase
 from jumper_warp.utils.runtime import git_commit
 from jumper_warp.utils.streams import purpose_seed
 
@@ -241,11 +242,13 @@ def finetune(
     groups = make_groups(policy, cfg, modules)
     aims = []
     if not groups[0].to_height:
-        policy, aims = correct_aim(policy, groups, log)
+        with phase("correcting the aim", AIM_ROUNDS + 1) as advance:
+            policy, aims = correct_aim(policy, groups, lambda line: (log(line), advance()))
     elif cfg.iterations == 0:
         raise InputError("a policy for heights has no aim to be taken apart: fine-tuning it needs an iteration")
     network = Network(policy, device=groups[0].env.device)
-    history = tune_weights(groups, network, cfg, log, begin)
+    with phase("fine-tuning", cfg.iterations + 1) as advance:
+        history = tune_weights(groups, network, cfg, lambda line: (log(line), advance()), begin)
     layers = network.layers(network.weights)
     settings = {name: value for name, value in asdict(cfg).items() if name not in ("out", "overwrite")}
     record = {"settings": json.loads(json.dumps(settings, default=str)), "aims": aims, "steps": history}

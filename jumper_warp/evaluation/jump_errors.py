@@ -17,6 +17,7 @@ from jumper_warp.diff.closed_loop import ClosedLoop, LoopState
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import LANDED, REST_TIME
 from jumper_warp.trajectory.gauss_newton import Network, Tape, per_world_gradients
+from jumper_warp.utils.progress import phase
 
 LANDING_HEIGHT = 0.30  # [m] Base height at which the ballistic flight lands
 LATEST = 2.5  # [s] Time after the last command at which all jumps are past their apex
@@ -96,16 +97,18 @@ def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> Jum
             env.step(network.act(env.obs))
     state, states, tape = loop.state(), [], Tape()
     arrays: dict[str, np.ndarray] = {}
-    for _ in range(begin, last):
-        if derivatives:
-            state, _ = loop.step(state, network.act(loop.observation(state), tape=tape))
-        else:
-            env.step(network.act(env.obs))
-            state = loop.state()
-        states.append(state)
-        arrays = env.task_arrays()
-        if (arrays["apex_passed"] > 0)[arrays["phase"] > 0].all() and (arrays["phase"] > 0).all():
-            break
+    with phase(f"simulating {len(group.commands)} {group.name} jumps", last - begin) as advance:
+        for _ in range(begin, last):
+            if derivatives:
+                state, _ = loop.step(state, network.act(loop.observation(state), tape=tape))
+            else:
+                env.step(network.act(env.obs))
+                state = loop.state()
+            states.append(state)
+            arrays = env.task_arrays()
+            if (arrays["apex_passed"] > 0)[arrays["phase"] > 0].all() and (arrays["phase"] > 0).all():
+                break
+            advance()
     valid = torch.as_tensor(arrays["phase"] > 0, device=env.device)
     if to_height:
         errors = [arrays["max_height"] - group.commands[:, 2]]

@@ -10,6 +10,7 @@ import torch
 from jumper_warp.evaluation.jump_metrics import HEIGHT_METRICS
 from jumper_warp.evaluation.jumps import TOLERANCE, JumpOutcome, jump_commands
 from jumper_warp.utils.metrics import Metrics, chosen, mean, measure, rate
+from jumper_warp.utils.progress import phase
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
@@ -43,13 +44,16 @@ def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
         env.set(name, 0.0)
     env.evaluation_reset(jump_commands(np.zeros((env.num_envs, 3)), 0.0, env.step_dt))
     apex, diverged = np.zeros(env.num_envs), np.zeros(env.num_envs, dtype=bool)
-    for step in range(STAND + RAMP + HOLD + EXTEND + COAST):
-        level = open_loop_action(step)
-        env.step(torch.tensor([0.0, level, level] * 4, device=env.device).repeat(env.num_envs, 1))
-        arrays = env.task_arrays()
-        diverged |= env.episodes.diverged.numpy() != 0
-        if step >= STAND + RAMP + HOLD:
-            apex = np.fmax(apex, arrays["base_pos"][:, 2])
+    steps = STAND + RAMP + HOLD + EXTEND + COAST
+    with phase(f"simulating {env.num_envs} open-loop jumps", steps) as advance:
+        for step in range(steps):
+            level = open_loop_action(step)
+            env.step(torch.tensor([0.0, level, level] * 4, device=env.device).repeat(env.num_envs, 1))
+            arrays = env.task_arrays()
+            diverged |= env.episodes.diverged.numpy() != 0
+            if step >= STAND + RAMP + HOLD:
+                apex = np.fmax(apex, arrays["base_pos"][:, 2])
+            advance()
     for name, value in pushes.items():
         env.set(name, value)
     return np.where(diverged, np.nan, apex)

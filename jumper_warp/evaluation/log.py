@@ -13,6 +13,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, rate
+from jumper_warp.utils.progress import phase
 
 if TYPE_CHECKING:
     import torch
@@ -111,13 +112,16 @@ def run_evaluation(
     time (default: the log's); on_step: called after every policy step; stop: False to continue to the end of the time.
     """
     log.begin(env)
-    for _ in range(round((log.seconds if seconds is None else seconds) / env.step_dt)):
-        env.step(act(env.obs))
-        ended = log.record_step(env)
-        if on_step is not None:
-            on_step()
-        if ended and stop:
-            return
+    steps = round((log.seconds if seconds is None else seconds) / env.step_dt)
+    with phase(f"simulating {log.count} {log.row_name}{'s' * (log.count > 1)}", steps) as advance:
+        for _ in range(steps):
+            env.step(act(env.obs))
+            ended = log.record_step(env)
+            if on_step is not None:
+                on_step()
+            if ended and stop:
+                return
+            advance()
 
 
 def success_index(terminations: Sequence[str]) -> int:

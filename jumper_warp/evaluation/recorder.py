@@ -15,6 +15,7 @@ from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.links import LinkReader
 from jumper_warp.sim.solver import SolverJumper
+from jumper_warp.utils.progress import phase
 from jumper_warp.utils.rotations import rotate
 
 if TYPE_CHECKING:
@@ -94,7 +95,8 @@ def save_recording(recording: Recording, folder: Path, name: str) -> Path:
     from jumper_warp.viz.picture import write_picture
     from jumper_warp.viz.rerun import write_rrd
 
-    path = write_rrd(recording, folder / f"{name}.rrd")
+    with phase(f"writing {name}.rrd"):
+        path = write_rrd(recording, folder / f"{name}.rrd")
     write_picture(recording, folder / f"{name}.png", rank=round(SHOWN * (len(recording.worlds) - 1)))
     return path
 

@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import Any
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import existing_file
 
 KINDS = {"walk": 3, "stand": 1, "jump_up": 1, "jump_to": 2, "jump_onto": 2}  # Number of values of each kind of command
 LIMITS = {"walk": 10.0, "stand": 600.0, "jump_up": 2.0, "jump_to": 5.0, "jump_onto": 5.0}
@@ -49,6 +50,7 @@ class ScriptStep:
 
 def read_script(path: Path) -> tuple[ScriptStep, ...]:
     """Return the commands of a script file. Raises InputError, with the path: unreadable, or a malformed command."""
+    existing_file(path, "script of commands")
     try:
         too_large = path.stat().st_size > MAX_BYTES
         content = None if too_large else json.loads(path.read_bytes())

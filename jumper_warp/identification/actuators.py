@@ -26,6 +26,7 @@ from jumper_warp.robot.description import load_description
 from jumper_warp.robot.motors import OVERSPEED_END, OVERSPEED_START
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import existing_file
 
 COLUMNS = ("test", "time", "command", "speed", "torque")
 """Columns of a bench's CSV: test number, time [s], commanded torque [N m], output speed [rad/s] and torque [N m]."""
@@ -69,9 +70,9 @@ class Bench:
 def load_bench(path: Path) -> Bench:
     """Return the recording in a CSV file whose first line names at least the columns `COLUMNS`, in any order.
 
-    Raises InputError: a missing column, rows that are not numbers, or as `Bench`; OSError: the file cannot be read.
+    Raises InputError: a missing file or column, rows that are not numbers, or as `Bench`; OSError: it cannot be read.
     """
-    rows = csv_rows(Path(path))
+    rows = csv_rows(existing_file(path, "recording of a test bench"))
     names = [name.strip() for name in rows[0]] if rows else []
     missing = [name for name in COLUMNS if name not in names]
     if missing:

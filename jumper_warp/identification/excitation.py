@@ -19,6 +19,7 @@ from jumper_warp.robot.motors import FilterCfg, walking_filter
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.progress import phase
 
 MAX_JOINT_SPEED = 25.0  # [rad/s] of a safe motion: two thirds of the slowest motor's no-load speed
 MAX_TILT = 20.0  # [deg] of the base in a safe motion
@@ -114,24 +115,24 @@ def choose(
     """
     rng, size = np.random.default_rng(seed), len(scorer.parameters)
     information, plans, gains, refused = np.eye(size), [], [], []
-    for kind in kinds:
-        best: tuple[float, Plan | None, np.ndarray] = (-math.inf, None, information)
-        for _ in range(candidates):
-            plan = sample_plan(kind, rng, seconds)
-            record = scorer.record(plan)
-            reason = unsafe_reason(plan, record)
-            if reason:
-                refused.append(f"{kind}: {reason}")
-                continue
-            after = information + scorer.information(plan, record)
-            gain = 0.5 * float(np.linalg.slogdet(after)[1])
-            if gain > best[0]:
-                best = (gain, plan, after)
-        if best[1] is None:
-            raise InputError(f"none of {candidates} candidates is safe; the last of them: {refused[-1]}")
-        information = best[2]
-        plans.append(best[1])
-        gains.append(best[0])
+    with phase("planning motions", len(kinds) * candidates) as advance:
+        for kind in kinds:
+            best: tuple[float, Plan | None, np.ndarray] = (-math.inf, None, information)
+            for _ in range(candidates):
+                plan = sample_plan(kind, rng, seconds)
+                record = scorer.record(plan)
+                if reason := unsafe_reason(plan, record):
+                    refused.append(f"{kind}: {reason}")
+                else:
+                    after = information + scorer.information(plan, record)
+                    gain = 0.5 * float(np.linalg.slogdet(after)[1])
+                    best = (gain, plan, after) if gain > best[0] else best
+                advance()
+            if best[1] is None:
+                raise InputError(f"none of {candidates} candidates is safe; the last of them: {refused[-1]}")
+            information = best[2]
+            plans.append(best[1])
+            gains.append(best[0])
     std = np.sqrt(np.diag(np.linalg.inv(information)))
     return Excitation(tuple(plans), tuple(gains), std, tuple(refused), scorer.parameters)
 
@@ -151,10 +152,10 @@ def record_motions(
     robots: the robot, N = 1. solver: physics solver. noise, rng, torque: see `measure`. Raises OSError.
     """
     motions = []
-    for i, plan in enumerate(chosen.plans):
-        name = f"{i}_{plan.kind.replace(' ', '_')}"
-        motions.append(
-            measure(plan, name, simulate_plan(plan, solver=solver, robots=robots), robots, rng, noise, torque=torque)
-        )
-        motions[-1].save(folder / f"{name}.npz")
+    with phase("recording motions", len(chosen.plans)) as advance:
+        for i, plan in enumerate(chosen.plans):
+            name, record = f"{i}_{plan.kind.replace(' ', '_')}", simulate_plan(plan, solver=solver, robots=robots)
+            motions.append(measure(plan, name, record, robots, rng, noise, torque=torque))
+            motions[-1].save(folder / f"{name}.npz")
+            advance()
     return motions

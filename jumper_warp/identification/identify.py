@@ -8,8 +8,9 @@ the parameters; then whole motions are fitted.
 
 from __future__ import annotations
 
+import math
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 import numpy as np
 import warp as wp
@@ -22,6 +23,7 @@ from jumper_warp.identification.residuals import Linearised, MotionResiduals, pi
 from jumper_warp.identification.results import DescentStep, Effort, Identification, summarise
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.progress import phase
 
 COARSE_DT = 1.0 / 480.0  # [s] lower bound of the physics step in all stages but the last one
 POPULATION = 128  # candidates in a generation of CMA-ES
@@ -63,14 +65,17 @@ def identify(
     noise = NoiseLevels() if noise is None else noise
     if replay is None:
         replay = MotionReplay(description=description, device=device, threads=threads)
-    descent = Descent(replay)
     robot, coarse_dt = replay.description, None if dt is None else max(dt, COARSE_DT)
     whole = [MotionResiduals(motion, parameters, noise, robot, dt) for motion in motions]
     coarse = whole if coarse_dt == dt else [MotionResiduals(m, parameters, noise, robot, coarse_dt) for m in motions]
     pieces = []
     if all(motion.free for motion in whole):
         pieces = [piece for motion in motions for piece in pieces_of(motion, parameters, noise, robot, coarse_dt)]
-    problem, point, normal = descend(descent, parameters, coarse, whole, pieces, prior_measurements)
+    num_free = sum(motion.free for motion in whole)
+    stages = bool(pieces) + (num_free < len(whole)) + len(HORIZONS) * num_free + 1
+    with phase("identifying parameters", stages) as advance:
+        descent = Descent(replay, advance)
+        problem, point, normal = descend(descent, parameters, coarse, whole, pieces, prior_measurements)
     return summarise(problem, point, normal, descent.steps, descent.effort)
 
 
@@ -107,14 +112,16 @@ def identify_by_evolution(
     search = cma.CMAEvolutionStrategy(point.z, FIRST_STD, options)
     starts = [np.repeat(start[None], population, axis=0) for start in point.starts]
     best, cost = point.z, np.inf
-    while descent.effort().seconds < max_seconds and not search.stop():
-        candidates = np.array(search.ask())
-        costs = problem.costs(candidates, starts)
-        search.tell(list(candidates), list(np.where(np.isfinite(costs), costs, 1.0e12)))
-        if costs.min() < cost:
-            best, cost = candidates[int(np.argmin(costs))], float(costs.min())
-        effort = descent.effort()
-        descent.steps.append(DescentStep(0, cost / problem.count, 0.0, effort.world_steps, effort.seconds))
+    with phase("identifying parameters by CMA-ES", math.ceil(max_seconds)) as advance:
+        while (seconds := descent.effort().seconds) < max_seconds and not search.stop():
+            candidates = np.array(search.ask())
+            costs = problem.costs(candidates, starts)
+            search.tell(list(candidates), list(np.where(np.isfinite(costs), costs, 1.0e12)))
+            if costs.min() < cost:
+                best, cost = candidates[int(np.argmin(costs))], float(costs.min())
+            effort = descent.effort()
+            descent.steps.append(DescentStep(0, cost / problem.count, 0.0, effort.world_steps, effort.seconds))
+            advance(effort.seconds - seconds)
     point = Point(np.clip(best, low, high), point.starts)
     return summarise(problem, point, problem.normal(point), descent.steps, descent.effort)
 
@@ -122,9 +129,12 @@ def identify_by_evolution(
 class Descent:
     """Runs the stages of a Levenberg-Marquardt optimisation (`minimise`) and logs its steps, time and physics steps."""
 
-    def __init__(self, replay: MotionReplay):
-        """Start the clocks at stage 0, with an empty log; replay: simulation whose physics steps are counted."""
-        self.replay, self.steps, self.stage = replay, [], 0
+    def __init__(self, replay: MotionReplay, advance: Callable[[], object] = lambda: None):
+        """Start the clocks at stage 0, with an empty log.
+
+        replay: simulation whose physics steps are counted; advance: called after every stage.
+        """
+        self.replay, self.steps, self.stage, self.advance = replay, [], 0, advance
         self.shortfall = 0.0  # Predicted minus actual decrease of the cost in the last step
         self._begin = (time.perf_counter(), time.process_time(), replay.world_steps)
 
@@ -155,10 +165,13 @@ class Descent:
             gain, predicted = normal.cost - trial.cost, trial.predicted_decrease
             self.shortfall = predicted - gain
             if gain < least and (new_jacobian or (decrease is not None and predicted < least)):
-                return trial.point, problem.assemble(trial.point, replace_residuals(normal.linearised, trial.residuals))
+                residuals = replace_residuals(normal.linearised, trial.residuals)
+                point, normal = trial.point, problem.assemble(trial.point, residuals)
+                break
             new_jacobian = gain < max(least, GOOD_STEP * predicted)
             normal = problem.normal(trial.point) if new_jacobian else problem.broyden_update(normal, point, trial)
             point = trial.point
+        self.advance()
         return point, normal
 
 

@@ -17,7 +17,7 @@ import numpy as np
 from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.files import existing_file, write_atomically
 
 PER_MOTOR = ("target", "angle", "rate", "torque")
 CHANNELS = ("angle", "rate", "torque", "position", "quaternion")
@@ -158,10 +158,10 @@ def load_motion(
     default: `angle/FL_outer [deg]`. Settings of a table lie in a JSON file of the same name beside it.
     torque_constant [N m/A]: torque at the joint per current, for tables with `current` instead of `torque`.
 
-    Raises InputError: what is missing, of another shape or unit, or not finite; the message names it. OSError: the file
-    cannot be read.
+    Raises InputError: the file or a channel is missing, of another shape or unit, or not finite; the message names it.
+    OSError: the file cannot be read.
     """
-    path = Path(path)
+    path = existing_file(path, "recorded motions")
     if path.suffix not in READERS:
         raise InputError(f"{path}: expected a file of {', '.join(READERS)}")
     channels, settings = READERS[path.suffix](path)

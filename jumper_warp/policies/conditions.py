@@ -18,6 +18,7 @@ from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.saving import OPTIONAL
 from jumper_warp.utils.checks import check_seed
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.progress import phase
 from jumper_warp.utils.streams import purpose_seed
 
 if TYPE_CHECKING:
@@ -132,4 +133,5 @@ def env_of_policy(
     leave_out = [section for section in OPTIONAL if section != "events" or not conditions.randomize]
     task = task_of_policy(policy, modules, leave_out=leave_out)
     task = conditions.applied(task if change is None else change(task))
-    return Env(task, num_envs, **conditions.env_settings(policy.config), **scene)
+    with phase(f"building {num_envs} robots"):
+        return Env(task, num_envs, **conditions.env_settings(policy.config), **scene)

@@ -20,21 +20,16 @@ from typing import Any
 
 import torch
 
+from jumper_warp.policies.catalog import CONFIG, MANIFEST, ONNX, README, find_policy
 from jumper_warp.policies.onnx import onnx_bytes, policy_from_onnx
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
-from jumper_warp.utils.assets import ASSETS
 from jumper_warp.utils.checks import version_error
 from jumper_warp.utils.files import json_bytes, write_atomically
 from jumper_warp.utils.runtime import source_versions
 
-POLICIES = ASSETS / "policies"  # Folder of the project's own policies
 FORMAT = "jumper-warp policy"
 SCHEMA_VERSION = 3
-MANIFEST = "manifest.json"
-CONFIG = "config.json"
-ONNX = "policy.onnx"
-README = "README.md"
 MAX_BYTES = 256 * 2**20  # Larger files are refused without reading
 FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 FILE_SUFFIXES = (".pt", ".pth", ".onnx", ".safetensors")  # Suffixes that a policy's folder may not have
@@ -51,7 +46,8 @@ def save_policy(
     """
     folder = checked_folder(folder)
     if folder.exists() and not (overwrite and (folder / MANIFEST).is_file()):
-        raise PolicyError(f"{folder} exists" + ("" if not overwrite else " and is no policy's"))
+        reason = " and is not a policy's folder" if overwrite else "; overwrite replaces it"
+        raise PolicyError(f"{folder} exists{reason}")
     config = {**source_versions(), **policy.config}
     config |= {"schema_version": SCHEMA_VERSION, "interface": policy.interface.to_json()}
     content = {
@@ -108,25 +104,6 @@ def _write(folder: Path, files: Mapping[str, bytes], checksums: Mapping[str, str
     manifest = {"format": FORMAT, "schema_version": SCHEMA_VERSION, "sha256": sha256}
     for name, data in {**files, MANIFEST: json_bytes(manifest)}.items():
         write_atomically(folder / name, data)
-
-
-def list_policies() -> tuple[str, ...]:
-    """Return the names of the project's own policies."""
-    return tuple(sorted(path.parent.name for path in POLICIES.glob(f"*/{MANIFEST}")))
-
-
-def find_policy(name: str | Path) -> Path:
-    """Return the folder of a policy: of the project's policy of this name (- counts as _), else `name` as a path.
-
-    Raises PolicyError: there is no such policy or folder.
-    """
-    text = str(name)
-    project_folder = POLICIES / text.replace("-", "_")
-    if FILE_NAME.fullmatch(text) and (project_folder / MANIFEST).is_file():
-        return project_folder
-    if not Path(name).is_dir():
-        raise PolicyError(f"no policy {text!r}: give a policy's folder or one of: {', '.join(list_policies()) or '-'}")
-    return Path(name)
 
 
 def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:

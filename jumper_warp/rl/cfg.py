@@ -23,7 +23,7 @@ class PpoCfg:
     epochs: int = 5
     """Passes over the batch of num_steps · num_envs samples per iteration."""
     minibatches: int = 8
-    """Optimiser steps per pass; divides num_steps · num_envs."""
+    """Optimiser steps per pass. Their number divides num_steps · num_envs."""
     gamma: float = 0.985
     """Discount per policy step."""
     lam: float = 0.95
@@ -144,38 +144,40 @@ class TrainCfg:
     task: str = "vertical-jump"
     """Name of the task; also the name of the folder of its runs."""
     num_envs: int = 8192
-    """Worlds, over all processes."""
+    """Number of simulated robots (worlds), over all processes."""
     max_iterations: int = 2800
-    """Iterations of the run in total, including iterations before a resume."""
+    """Number of iterations, including those before a resume."""
     max_seconds: float = 0.0
-    """Limit of the training time [s] over all resumes; 0: none. A process counts its time from the end of its first
+    """Limit of the training time [s], over all resumes; 0: none. A process counts its time from the end of its first
     iteration, so that building and compilation do not count; logging and saving do."""
     seed: int = 1
-    """Seed of weights, noise and worlds, 0 to 2^31 - 1; each process derives a different seed from it."""
+    """Seed of weights, noise and worlds. It is in 0 to 2^31 - 1; each process derives a different seed from it."""
     device: str | None = None
-    """Torch device (default: a GPU if there is one)."""
+    """Device, such as cpu or cuda:0 (default: a GPU if there is one)."""
     threads: int | None = None
-    """CPU threads of each process, for its worlds (default: an equal part of the cores) and for torch (default: half
-    the cores but at least two; OMP_NUM_THREADS overrides). Torch's number changes the last digits of results."""
+    """CPU threads of each process (default: its part of the cores). Its worlds share them. Torch uses as many (default:
+    half the cores but at least two; OMP_NUM_THREADS overrides); their number changes the last digits of results."""
     log_root: Path = Path("logs")
-    """A run is written to the folder log_root/<task>/<start time>."""
+    """Folder of all runs. A run is written to log_root/<task>/<start time>."""
     log_interval: int = 10
-    """Number of iterations per logged iteration."""
+    """Iterations per line of the log."""
     save_interval: int = 100
-    """Number of iterations per checkpoint."""
+    """Iterations per checkpoint."""
     max_checkpoints: int = 3
     """Number of newest checkpoints to keep; the best one is always kept."""
     best_metric: str = "Metrics/success"
     """Logged metric that selects the best checkpoint; higher is better."""
     resume: str | None = None
-    """A checkpoint, a run's folder, `latest` for the task's latest run with a checkpoint, or `latest-or-new`, which
-    starts a new run if there is none. `jumper train` uses the saved settings of that run except device, threads,
-    log_root, tensorboard and wandb; flags override them."""
+    """Run to continue: its folder, a checkpoint, latest or latest-or-new. `latest` is the task's latest run with a
+    checkpoint; `latest-or-new` starts a new run if there is none. `jumper train` uses the saved settings of that run
+    except device, threads, log_root, tensorboard and wandb; flags override them."""
     init_policy: str | None = None
-    """A policy's name or folder, a run's folder (its best checkpoint) or a checkpoint: a new training starts with its
-    actor weights and observation statistics; critic, optimiser and noise are new."""
+    """Policy, run or checkpoint to start from. It is a policy's name or folder, a run's folder (its best checkpoint) or
+    a checkpoint. The training starts with its actor weights and observation statistics; critic, optimiser and noise
+    are new."""
     trainer: Literal["ppo", "shac", "rsl-rl"] = "ppo"
-    """This package's PPO; SHAC, with gradients through the physics; or rsl-rl-lib's PPO for comparison."""
+    """Algorithm: PPO, SHAC or rsl-rl-lib's PPO. SHAC uses gradients through the physics; rsl-rl-lib is for
+    comparison."""
     tensorboard: bool = True
     """Write TensorBoard events."""
     wandb: bool = False

@@ -67,9 +67,9 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     Raises CheckpointError: the file is missing, has no checksum, differs from it, or is no checkpoint; or its iteration
     differs from the manifest.
     """
-    entry = _read_manifest(path.parent).get(path.name)
     if not path.is_file():
-        raise CheckpointError(f"{path}: no such checkpoint")
+        raise CheckpointError(f"{path}: no such file (checkpoint of a training)")
+    entry = _read_manifest(path.parent).get(path.name)
     if entry is None:
         raise CheckpointError(f"{path}: has no checksum in {MANIFEST}")
     try:

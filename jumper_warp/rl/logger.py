@@ -17,6 +17,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedCo
 
 from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.progress import format_duration
 
 REWARDS = ("Episode_Reward/", "Episode_Sum/")  # Parts of the names of metrics that are means of reward terms
 
@@ -162,14 +163,6 @@ def _non_finite_terms(metrics: dict[str, float]) -> list[str]:
     """Return the names of reward terms whose mean is not finite."""
     faulty = [name for name, value in metrics.items() if not math.isfinite(value)]
     return [name.replace(part, "") for name in faulty for part in REWARDS if part in name]
-
-
-def format_duration(seconds: float) -> str:
-    """Return a duration [s] as text such as `59 s`, `58 min` or `1 h 20 min`."""
-    if seconds < 59.5:
-        return f"{seconds:.0f} s"
-    hours, minutes = divmod(round(seconds / 60.0), 60)
-    return f"{hours} h {minutes} min" if hours else f"{minutes} min"
 
 
 def _event_writer(folder: Path, iteration: int) -> Any:

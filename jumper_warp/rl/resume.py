@@ -47,7 +47,8 @@ def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:
     path = Path(cfg.resume)
     folder = path.parent if path.suffix == ".pt" else path if path.name == CHECKPOINTS else path / CHECKPOINTS
     if not (folder / MANIFEST).is_file():
-        raise CheckpointError(f"{path}: no run to resume; give a run's folder, one of its checkpoints, or latest")
+        reason = "no run to resume" if path.exists() else "no such file or folder, no run to resume"
+        raise CheckpointError(f"{path}: {reason}; give a run's folder, one of its checkpoints, or latest")
     return Checkpoint(path, load_checkpoint(path), []) if path.suffix == ".pt" else latest_checkpoint(folder)
 
 

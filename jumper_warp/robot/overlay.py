@@ -16,7 +16,7 @@ from jumper_warp.robot.bounds import Range
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.files import existing_file, write_atomically
 
 SCHEMA = "jumper-warp robot overlay 1"
 RATIO = Range(0.05, 3.0, "times the described value")
@@ -151,9 +151,10 @@ def with_springs(stiffness: float, length: float) -> RobotOverlay:
 
 
 def load_overlay(path: Path) -> RobotOverlay:
-    """Return the overlay of a JSON file. Raises InputError: it is no overlay, or OSError: it cannot be read."""
+    """Return the overlay of a JSON file. Raises InputError: it is missing or no overlay; OSError: it cannot be read."""
+    file = existing_file(path, "robot overlay, as jumper sysid writes it")
     try:
-        return RobotOverlay.from_json(json.loads(Path(path).read_text(encoding="utf-8")))
+        return RobotOverlay.from_json(json.loads(file.read_text(encoding="utf-8")))
     except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
         raise InputError(f"{path}: expected JSON ({type(error).__name__})") from None
     except InputError as error:

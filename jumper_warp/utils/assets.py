@@ -1,5 +1,6 @@
 """Folder of the assets: the robot's description and the policies."""
 
+import json
 from pathlib import Path
 
 
@@ -10,3 +11,15 @@ def assets_folder(package: Path) -> Path:
 
 
 ASSETS = assets_folder(Path(__file__).resolve().parents[1])  # The project's assets folder
+POLICIES = ASSETS / "policies"  # Folder of the project's own policies
+
+
+def dashed(name: str) -> str:
+    """Return the name of a task or policy with - for every _; names that agree in it mean the same."""
+    return name.replace("_", "-")
+
+
+def policy_tasks() -> dict[str, str]:
+    """Return the name of the task of each of the project's policies, by the policy's name."""
+    files = sorted(POLICIES.glob("*/config.json"))
+    return {file.parent.name: json.loads(file.read_bytes())["interface"]["task"] for file in files}

@@ -1,4 +1,6 @@
-"""Base class of errors in user input."""
+"""Base class of errors in user input, and the end of such a message that names what the user may have meant."""
+
+from collections.abc import Iterable
 
 
 class InputError(ValueError):
@@ -10,3 +12,12 @@ class InputError(ValueError):
     def __init__(self, message: str) -> None:
         """message: text in which runs of whitespace become one space."""
         super().__init__(" ".join(message.split()))
+
+
+def suggestion(name: str, known: Iterable[str]) -> str:
+    """Return "; did you mean 'x'?" with the known name most like a misspelt one, or "" if none is close."""
+    import difflib
+
+    spellings = {word.lower().replace("_", "-"): word for word in known}
+    close = difflib.get_close_matches(name.lower().replace("_", "-"), spellings, n=1)
+    return f"; did you mean {spellings[close[0]]!r}?" if close else ""

@@ -1,10 +1,12 @@
-"""Atomic file writes."""
+"""Atomic file writes, and the check that a file exists."""
 
 import json
 import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
+
+from jumper_warp.utils.errors import InputError
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -34,3 +36,11 @@ def write_atomically(path: Path, data: bytes) -> None:
 def json_bytes(content: Mapping[str, Any]) -> bytes:
     """Return an object as the bytes of a JSON file. Raises ValueError: a number is not finite."""
     return (json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
+
+
+def existing_file(path: Path, purpose: str) -> Path:
+    """Return the path of an existing file. Raises InputError, with the purpose of the file: it does not exist."""
+    if not Path(path).is_file():
+        kind = "a folder, not a file" if Path(path).is_dir() else "no such file"
+        raise InputError(f"{path}: {kind} ({purpose})")
+    return Path(path)

@@ -10,6 +10,7 @@ import numpy as np
 import warp as wp
 from numpy.typing import NDArray
 
+from jumper_warp.utils.progress import phase
 from jumper_warp.utils.threads import available_threads, run_in_parallel
 
 if TYPE_CHECKING:  # Warp annotates its decorators as if they returned the decorated function
@@ -31,4 +32,5 @@ def load_kernels(kernels: Iterable[tuple[Kernel, int]], device: wp.Device) -> No
     """
     variants = {(kernel.module, block if device.is_cuda else None): None for kernel, block in kernels}
     loads = [partial(wp.force_load, device, [module], block, 0) for module, block in variants]
-    run_in_parallel(loads, available_threads())
+    with phase("loading kernels (the first run compiles them)"):
+        run_in_parallel(loads, available_threads())

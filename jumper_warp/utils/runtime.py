@@ -12,9 +12,10 @@ from rich.console import Console
 
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import checked_threads, set_threads
+from jumper_warp.utils.version import __version__
 
-PACKAGES = ("jumper-warp", "warp-lang", "newton", "mujoco", "mujoco-warp", "torch", "numpy", "rsl-rl-lib")
-"""Distributions whose version can change a result."""
+PACKAGES = ("warp-lang", "newton", "mujoco", "mujoco-warp", "torch", "numpy", "rsl-rl-lib")
+"""Installed distributions whose version can change a result."""
 
 
 class Commit(NamedTuple):
@@ -108,8 +109,8 @@ def source_versions() -> dict[str, Any]:
 
 
 def versions() -> dict[str, str | None]:
-    """Return the version of Python and of each of `PACKAGES`; None for one that is not installed."""
-    by_package: dict[str, str | None] = {"python": python_version()}
+    """Return the version of Python, this package and each of `PACKAGES`; None for one that is not installed."""
+    by_package: dict[str, str | None] = {"python": python_version(), "jumper-warp": __version__}
     for package in PACKAGES:
         try:
             by_package[package] = metadata.version(package)

@@ -26,8 +26,8 @@ MOST_PATHS = 3  # Number of files of a kind above which only their folder is pri
 class PrintFlags:
     """Flags that select what is printed about results."""
 
-    verbose: tyro.conf.FlagCreatePairsOff[bool] = False  # Print all metrics, not only the main ones
-    json: tyro.conf.FlagCreatePairsOff[bool] = False  # Print metrics.json instead of a summary
+    verbose: tyro.conf.FlagCreatePairsOff[bool] = False  # Print all metrics in place of a summary
+    json: tyro.conf.FlagCreatePairsOff[bool] = False  # Print metrics.json in place of a summary
 
 
 def print_summary(

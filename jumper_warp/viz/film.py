@@ -5,7 +5,6 @@ from __future__ import annotations
 import errno
 import os
 import subprocess
-import sys
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from importlib.util import find_spec
@@ -14,10 +13,9 @@ from typing import Any
 
 import numpy as np
 from PIL import Image
-from rich.console import Console
-from rich.progress import track
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.progress import phase
 from jumper_warp.viz.props import goal_shapes
 from jumper_warp.viz.recording import Recording
 from jumper_warp.viz.renderer import Line, View, open_renderer
@@ -105,15 +103,16 @@ def _images(
         seen = np.concatenate([seen, seen + [0.0, 0.0, REACH - ABOVE]], axis=1)
     frame_view = _view(seen, size, eye)
     targets, bases = _interpolated(recording, targets, times), _interpolated(recording, paths, times)
-    console = Console(stderr=True)
-    with open_renderer(_shapes(recording, ranks), len(recording.bodies), size) as renderer:
-        title = f"{name}, {renderer.name}"
-        bar = track(range(len(times)), title, console=console, disable=not sys.stderr.isatty())
-        for i, frame, time in zip(bar, frames, times, strict=True):
+    with (
+        open_renderer(_shapes(recording, ranks), len(recording.bodies), size) as renderer,
+        phase(f"drawing {name} with {renderer.name}", len(times)) as advance,
+    ):
+        for i, (frame, time) in enumerate(zip(frames, times, strict=True)):
             view = View(targets[i] + frame_view.eye, targets[i] + frame_view.target)
             image = renderer.draw(poses[i], view, _lines(recording, paths, bases[i], frame, ranks))
             labels = [] if len(ranks) == 1 else _world_labels(recording, bases[i], ranks)
             yield annotate(image, view, labels, _heading(recording, time, ranks))
+            advance()
 
 
 def _shapes(recording: Recording, ranks: Sequence[int]) -> list[ShapeMesh]:

@@ -10,6 +10,7 @@ import numpy as np
 
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.progress import phase
 from jumper_warp.viz.props import goal_shapes
 from jumper_warp.viz.recording import Recording
 from jumper_warp.viz.renderer import Line, View, open_renderer
@@ -173,7 +174,10 @@ def write_picture(
     view, size = _framed(points, np.array([np.cos(turn), np.sin(turn), ELEVATION]), width)
     poses = recording.body_poses(rank)[scene.frames].astype(float)
     poses[..., :3] += scene.shift[:, None, None] * scene.right
-    with open_renderer(_shapes(scene), poses.shape[1], size, _opacity(scene).tolist()) as renderer:
+    with (
+        open_renderer(_shapes(scene), poses.shape[1], size, _opacity(scene).tolist()) as renderer,
+        phase(f"drawing {path.name} with {renderer.name}"),
+    ):
         image = renderer.draw(poses, view, _lines(scene))
     heading = "   ".join([str(recording.notes.get("task", "")), recording.label(rank)]) if title is None else title
     data = io.BytesIO()

@@ -143,7 +143,8 @@ def test_refuses_paths_without_a_run(capsys, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     code, out, err = train(capsys, "--resume", name)
     assert (code, out) == (2, "")
-    assert err == [f"jumper: {name}: no run to resume; give a run's folder, one of its checkpoints, or latest"]
+    missing = "" if name == "." else "no such file or folder, "
+    assert err == [f"jumper: {name}: {missing}no run to resume; give a run's folder, one of its checkpoints, or latest"]
 
 
 def test_resume_without_value_exits_with_2(capsys):

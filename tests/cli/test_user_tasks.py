@@ -154,7 +154,7 @@ def test_list_shows_installed_tasks_and_errors_of_others(capsys, tmp_path, monke
 
 
 def test_help_lists_flags_of_the_users_task(capsys, path):
-    code, out, _ = run(capsys, "train", "Tame", "--task-module", path, "--help")
+    code, out, _ = run(capsys, "train", "Tame", "--task-module", path, "--help-all")
     assert code == 0 and "--env.rewards.base-at-rest.height FLOAT" in out and "--env.events.slow.lower FLOAT" in out
     assert "--ppo.gamma FLOAT" in out and "(default: 0.9)" in out
 

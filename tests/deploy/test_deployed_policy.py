@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 
 from jumper_warp.deploy.policy import DeployedPolicy, JumpCommand
+from jumper_warp.policies.catalog import find_policy
 from jumper_warp.policies.conditions import Conditions, env_of_policy
-from jumper_warp.policies.folder import find_policy, load_policy
+from jumper_warp.policies.folder import load_policy
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 PAGE = Path(__file__).parents[2] / "docs" / "deployment.md"

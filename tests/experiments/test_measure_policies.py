@@ -13,8 +13,9 @@ from jumper_warp.cli.main import main as jumper
 from jumper_warp.evaluation.evaluations import EVALUATIONS
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.folder import POLICIES, load_policy
+from jumper_warp.policies.folder import load_policy
 from jumper_warp.robot.overlay import with_springs
+from jumper_warp.utils.assets import POLICIES
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import MetricValue, mean, rate
 from jumper_warp.utils.output import read_metrics

@@ -113,6 +113,7 @@ def test_load_motion_refuses_unreadable_files_and_unknown_settings(tmp_path):
     np.savez(tmp_path / "walk.npz", time=np.zeros(3), goal=np.zeros((3, 12)))
     with pytest.raises(InputError, match="no channel 'goal'"):
         load_motion(tmp_path / "walk.npz")
+    (tmp_path / "walk.mat").touch()
     with pytest.raises(InputError, match=r"expected a file of \.npz"):
         load_motion(tmp_path / "walk.mat")
 

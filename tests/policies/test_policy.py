@@ -3,6 +3,7 @@ import json
 import math
 import os
 import pickle
+import re
 
 import numpy as np
 import onnx
@@ -10,12 +11,15 @@ import onnxruntime
 import pytest
 import torch
 
-from jumper_warp.policies import folder as folder_module
-from jumper_warp.policies.folder import add_files, find_policy, list_policies, load_policy, save_policy
+from jumper_warp.policies import catalog
+from jumper_warp.policies.catalog import find_policy
+from jumper_warp.policies.folder import add_files, load_policy, save_policy
 from jumper_warp.policies.onnx import export_onnx, onnx_bytes
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.rl.networks import ActorCritic, linear_layers
+from jumper_warp.utils import assets
+from jumper_warp.utils.assets import policy_tasks
 
 
 def make_interface(num_obs=1, num_actions=1, hidden=(1,), **changes):
@@ -220,12 +224,29 @@ def test_add_files_refuses_policy_files_and_altered_policies(folder):
 
 
 def test_project_policies_are_found_by_name(tmp_path, trained, monkeypatch):
-    monkeypatch.setattr(folder_module, "POLICIES", tmp_path)
+    for module in (assets, catalog):
+        monkeypatch.setattr(module, "POLICIES", tmp_path)
     save_policy(tmp_path / "vertical_jump", trained)
-    assert list_policies() == ("vertical_jump",)
+    assert policy_tasks() == {"vertical_jump": trained.interface.task}
     assert load_policy("vertical-jump").interface == trained.interface
-    with pytest.raises(PolicyError, match=r"no policy 'walk'.*vertical_jump"):
+    with pytest.raises(PolicyError, match=r"no policy 'walk'; there are vertical_jump$"):
         load_policy("walk")
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("vertical-jmup", "no policy 'vertical-jmup'; did you mean 'vertical_jump'?"),
+        ("horizontal-jump-mars-loose", "a task, not a policy; its policies: mars_horizontal_jump, mars_springs_jump"),
+        ("Olympus_Walk", "is a task, not a policy; its policies: walking_flat"),
+        ("velocity_trot", "is a task, not a policy; it has no policy yet: jumper train velocity-trot trains one"),
+        ("trained/policy", "trained/policy: no such folder (policy)"),
+        (__file__, "test_policy.py is a file; give the folder of a policy"),
+    ],
+)
+def test_name_of_no_policy_is_refused_with_advice(name, message):
+    with pytest.raises(PolicyError, match=re.escape(message)):
+        find_policy(name)
 
 
 class Payload:
@@ -430,7 +451,7 @@ def test_onnx_metadata_has_the_interface_in_full_precision(folder, trained):
     assert len(entries["observation_names"].split(",")) == 48
 
 
-@pytest.mark.parametrize("name", list_policies())
+@pytest.mark.parametrize("name", policy_tasks())
 def test_shipped_onnx_metadata_equals_the_interface(name):
     entries = {entry.key: entry.value for entry in onnx.load(find_policy(name) / "policy.onnx").metadata_props}
     full = json.loads(entries["jumper_warp"])

@@ -83,7 +83,7 @@ def break_manifest(path):
     [
         (flip, "differs from its checksum"),
         (cut, "differs from its checksum"),
-        (os.remove, "no such checkpoint"),
+        (os.remove, "no such file .checkpoint of a training"),
         (empty_manifest, "has no checksum"),
         (break_manifest, "manifest.json: not readable"),
         (lambda path: os.remove(path.parent / MANIFEST), "manifest.json: No such file"),

@@ -6,9 +6,10 @@ import resource
 import pytest
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from jumper_warp.rl.logger import TrainingLog, format_duration
+from jumper_warp.rl.logger import TrainingLog
 from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
 from jumper_warp.rl.runner import CHECKPOINTS, train
+from jumper_warp.utils.progress import format_duration
 from toy_task import PushTask, push_cfg
 
 METRICS = {"Perf/total_fps": 1234.0, "Metrics/success": 0.5}  # steps per second, fraction

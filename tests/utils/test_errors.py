@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.errors import InputError, suggestion
 
 ROOT = Path(__file__).resolve().parents[2]
 FILES = [*ROOT.glob("jumper_warp/**/*.py"), *ROOT.glob("experiments/*.py")]
@@ -12,6 +12,15 @@ FILES = [*ROOT.glob("jumper_warp/**/*.py"), *ROOT.glob("experiments/*.py")]
 def test_input_error_is_a_value_error_with_one_line():
     assert str(InputError("expected  a,\n\tgot b ")) == "expected a, got b"
     assert issubclass(InputError, ValueError)
+
+
+@pytest.mark.parametrize("name", ["vertical-jmup", "Vertical_Jump", "verticaljump"])
+def test_misspelt_name_suggests_the_closest_known_one(name):
+    assert suggestion(name, ["horizontal-jump", "vertical-jump", "attitude"]) == "; did you mean 'vertical-jump'?"
+
+
+def test_nothing_is_suggested_for_a_name_like_no_other():
+    assert suggestion("zebra", ["horizontal-jump", "vertical-jump"]) == ""
 
 
 @pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+import jumper_warp
 from jumper_warp.utils import output, runtime
 from jumper_warp.utils.metrics import MetricValue, unit_of
 
@@ -168,4 +169,5 @@ def test_device_report_is_one_line():
 def test_versions_include_python_and_none_for_a_missing_package(monkeypatch):
     monkeypatch.setattr(runtime, "PACKAGES", ("numpy", "no-such-package-here"))
     version = ".".join(map(str, sys.version_info[:3]))
-    assert runtime.versions() == {"python": version, "numpy": np.__version__, "no-such-package-here": None}
+    packages = {"jumper-warp": jumper_warp.__version__, "numpy": np.__version__, "no-such-package-here": None}
+    assert runtime.versions() == {"python": version, **packages}

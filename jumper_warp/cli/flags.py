@@ -1,0 +1,132 @@
+"""The flags that tyro makes of a dataclass, as a list: for help, suggestions, renamed flags and shell completion."""
+
+from __future__ import annotations
+
+import ast
+import dataclasses
+import functools
+import inspect
+import itertools
+import re
+import textwrap
+from collections.abc import Sequence
+from pathlib import Path
+from types import UnionType
+from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_origin, get_type_hints
+
+import tyro
+
+METAVARS: dict[Any, str] = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH", type(None): "None"}
+
+
+class Flag(NamedTuple):
+    """A flag, or a positional argument, of a command."""
+
+    name: str  # without leading dashes, nested ones dotted, as `ppo.init-std`; of a positional in upper case
+    kind: Any  # type of its value
+    default: Any  # dataclasses.MISSING: it must be given
+    about: str  # what it sets, as its dataclass says; may be empty
+    marks: tuple[Any, ...] = ()  # metadata of the annotation, such as tyro.conf.Positional
+    group_about: str = ""  # what the group of a nested flag sets
+
+    @property
+    def positional(self) -> bool:
+        """Whether its value is given without the name."""
+        return tyro.conf.Positional in self.marks
+
+    @property
+    def has_negative(self) -> bool:
+        """Whether there is a second flag with `no-` before the last part of the name."""
+        return self.kind is bool and tyro.conf.FlagCreatePairsOff not in self.marks
+
+    @property
+    def options(self) -> list[str]:
+        """The flag as it is given, with leading dashes; of a switch also its opposite."""
+        negative = [re.sub(r"([^.]+)$", r"no-\1", self.name)] if self.has_negative else []
+        return [] if self.positional else [f"--{name}" for name in (self.name, *negative)]
+
+    @property
+    def metavar(self) -> str:
+        """Placeholder of the value, such as "INT" or "{off,actor}"; empty for a switch."""
+        return "" if self.kind is bool else metavar(self.kind)
+
+
+def list_flags(cfg: Any, prefix: str = "", group_about: str = "") -> list[Flag]:
+    """Return the flags of a dataclass, or of an instance with the defaults, in the order of its fields.
+
+    prefix: of all names, with its dot. group_about: of those that are not nested further.
+    """
+    kind, flags = cfg if isinstance(cfg, type) else type(cfg), []
+    hints, docs = get_type_hints(kind, include_extras=True), field_docs(kind)
+    for spec in dataclasses.fields(cfg):
+        hint, *marks = get_args(hint) if get_origin(hint := hints[spec.name]) is Annotated else (hint,)
+        if tyro.conf.Suppress in marks:
+            continue
+        settings = {key: getattr(mark, key) for mark in marks for key in ("name", "help") if hasattr(mark, key)}
+        name = settings.get("name")
+        name = spec.name.replace("_", "-") if name is None else name
+        default = spec.default_factory() if callable(spec.default_factory) else spec.default
+        default = default if isinstance(cfg, type) else getattr(cfg, spec.name)
+        nested = hint if default is dataclasses.MISSING else default
+        about = settings.get("help") or docs.get(spec.name, "")
+        if dataclasses.is_dataclass(nested):
+            flags += list_flags(nested, f"{prefix}{name}.", about) if name else list_flags(nested, prefix, group_about)
+            continue
+        name = name.upper() if tyro.conf.Positional in marks else prefix + name
+        flags.append(Flag(name, hint, default, about, tuple(marks), group_about))
+    return flags
+
+
+@functools.cache
+def field_docs(kind: type) -> dict[str, str]:
+    """Return the descriptions of a dataclass's fields by name: a docstring below a field, else a comment after it.
+
+    Empty where there is no source.
+    """
+    docs: dict[str, str] = {}
+    for base in reversed(kind.__mro__[:-1]):
+        try:
+            source = textwrap.dedent(inspect.getsource(base))
+            tree: Any = ast.parse(source)
+        except (OSError, TypeError, SyntaxError):
+            continue
+        lines = source.splitlines()
+        for field, text in itertools.pairwise([*tree.body[0].body, None]):
+            if not isinstance(field, ast.AnnAssign):
+                continue
+            comment = lines[(field.end_lineno or 1) - 1].encode()[field.end_col_offset :].decode()
+            about = comment.partition("#")[2]
+            if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
+                about = str(text.value.value)
+            docs[ast.unparse(field.target)] = " ".join(about.split())
+    return docs
+
+
+def metavar(kind: Any) -> str:
+    """Return the placeholder of a value of a type: INT, {a,b}, FLOAT FLOAT, TEXT ..."""
+    origin, parts = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        return metavar(parts[0])
+    if origin is Literal:
+        return f"{{{','.join(str(part) for part in parts if part != '')}}}"
+    if origin in (Union, UnionType):
+        return "|".join(metavar(part) for part in parts if part is not type(None))
+    if origin is tuple:
+        return f"{metavar(parts[0])} ..." if Ellipsis in parts else " ".join(map(metavar, parts))
+    return METAVARS.get(kind, getattr(kind, "__name__", str(kind)).upper())
+
+
+def option_of(arg: str) -> str:
+    """Return the flag in an argument, as `--ppo.init-std` in `--ppo.init_std=1`; empty if the argument is a value."""
+    match = re.match(r"(--[A-Za-z][\w.-]*)(=|$)", arg)
+    return match[1].replace("_", "-") if match else ""
+
+
+def values_of(option: str, args: Sequence[str]) -> list[str]:
+    """Return the values after the last appearance of a flag (with dashes) in unparsed arguments."""
+    values: list[str] = []
+    for i, arg in enumerate(args):
+        if option_of(arg) == option:
+            values = [arg.partition("=")[2]] if "=" in arg else []
+            values += itertools.takewhile(lambda following: not option_of(following), args[i + 1 :])
+    return values

@@ -1,0 +1,113 @@
+"""Policies by name or folder: where they lie, and a summary of their metrics; read without PyTorch."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from jumper_warp.policies.spec import PolicyError
+from jumper_warp.registry import task_name
+from jumper_warp.utils.assets import POLICIES, policy_tasks
+from jumper_warp.utils.errors import suggestion
+
+MANIFEST = "manifest.json"
+CONFIG = "config.json"
+ONNX = "policy.onnx"
+README = "README.md"
+METRICS = "metrics.json"
+PICTURE = "picture.webp"
+SUCCESSES = ("success_rate", "settled_without_collision_rate")
+"""Keys of the success rate; a policy's is the first one that its metrics have."""
+ERRORS = (
+    "apex_error_abs_mean_m", "goal_distance_at_rest_mean_m", "settled_rmse_vx_m_s", "error_at_end_mean_deg",
+)  # fmt: skip
+"""Keys of the error; a policy's is the first one that its metrics have."""
+
+
+@dataclass(frozen=True)
+class PolicySummary:
+    """Description and metrics of a policy, from the files in its folder."""
+
+    name: str  # Name of the folder
+    folder: Path
+    task: str
+    about: str  # First paragraph of README.md, without markup
+    size_bytes: int  # Size of policy.onnx
+    rows: list[dict[str, Any]]
+    """Metrics by condition, as in metrics.json: condition, seed, conditions, metrics; empty: not evaluated."""
+
+    @property
+    def metrics(self) -> dict[str, Any]:
+        """Metrics of the first row, which is nominal in the project's policies, as in metrics.json; may be empty."""
+        return self.rows[0]["metrics"] if self.rows else {}
+
+    @property
+    def success(self) -> float | None:
+        """Success rate; of walking, the rate of robots that do not fall; None: not evaluated."""
+        rates = [self.metrics[key]["value"] for key in SUCCESSES if key in self.metrics]
+        if not rates and "fall_rate" in self.metrics:
+            return 1.0 - self.metrics["fall_rate"]["value"]
+        return rates[0] if rates else None
+
+    @property
+    def error(self) -> dict[str, Any] | None:
+        """Mean error as in metrics.json, with value and unit; None: not evaluated."""
+        return next((self.metrics[key] for key in ERRORS if key in self.metrics), None)
+
+
+def find_policy(name: str | Path) -> Path:
+    """Return the folder of a policy: of the project's policy of this name (- counts as _), else `name` as a path.
+
+    Raises PolicyError: there is no such policy or folder.
+    """
+    text, path = str(name), Path(name)
+    own = POLICIES / text.replace("-", "_")
+    if len(path.parts) == 1 and (own / MANIFEST).is_file():
+        return own
+    if not path.is_dir():
+        raise PolicyError(_no_policy(text, path))
+    return path
+
+
+def _no_policy(text: str, path: Path) -> str:
+    """Return the message for a name or path that is no policy: the task's policies, or similar names."""
+    if path.is_file():
+        return f"{path} is a file; give the folder of a policy or of a training run, or a checkpoint"
+    if len(path.parts) > 1 or path.suffix:
+        return f"{path}: no such folder (policy)"
+    tasks, task = policy_tasks(), task_name(text)
+    if task is not None:
+        names = ", ".join(policy for policy, trained_on in tasks.items() if trained_on == task)
+        hint = f"its policies: {names}" if names else f"it has no policy yet: jumper train {task} trains one"
+        return f"{text!r} is a task, not a policy; {hint}"
+    return f"no policy {text!r:.60}{suggestion(text, tasks) or '; there are ' + ', '.join(tasks)}"
+
+
+def summarise(folder: Path) -> PolicySummary:
+    """Return the summary of the policy in a folder. Raises PolicyError: it is no policy, or a file is malformed."""
+    try:
+        task = json.loads((folder / CONFIG).read_bytes())["interface"]["task"]
+        size, readme, metrics = (folder / ONNX).stat().st_size, folder / README, folder / METRICS
+        about = first_paragraph(readme.read_text(encoding="utf-8")) if readme.is_file() else ""
+        saved = json.loads(metrics.read_bytes()) if metrics.is_file() else {"rows": []}
+        rows = saved["rows"] if "rows" in saved else [{"condition": "as evaluated", "seed": 0, **saved}]
+        summary = PolicySummary(folder.resolve().name, folder, str(task), about, size, rows)
+        _ = summary.success, summary.error  # raise KeyError or TypeError for metrics of another format
+        return summary
+    except OSError as error:
+        reason = f"{Path(error.filename or folder).name}: {error.strerror}"
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
+        reason = f"{type(error).__name__}: {error}"
+    raise PolicyError(f"{folder}: not a policy's folder ({reason}); jumper export makes one of a training run")
+
+
+def first_paragraph(markdown: str) -> str:
+    """Return the first paragraph of a page on one line, without headings, pictures, code and the markup of links."""
+    for block in markdown.split("\n\n"):
+        if not block.startswith(("#", "!", "    ", "|", "-", "```")) and block.strip():
+            text = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", " ".join(block.split()))
+            return text.replace("`", "").replace("**", "")
+    return ""

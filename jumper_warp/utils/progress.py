@@ -1,0 +1,59 @@
+"""Progress of long work on standard error: title, elapsed time and, if the number of parts is known, the time left."""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from functools import partial
+
+from rich.console import Console
+from rich.progress import BarColumn, Progress, ProgressColumn, Task, TimeElapsedColumn
+from rich.text import Text
+
+_shown: Progress | None = None  # Display of the outermost phase, which shows the phases within it too
+
+
+def format_duration(seconds: float) -> str:
+    """Return a duration [s] as text such as `59 s`, `58 min` or `1 h 20 min`."""
+    if seconds < 59.5:
+        return f"{seconds:.0f} s"
+    hours, minutes = divmod(round(seconds / 60.0), 60)
+    return f"{hours} h {minutes} min" if hours else f"{minutes} min"
+
+
+class _TimeLeft(ProgressColumn):
+    """Estimated time left; empty if it is unknown."""
+
+    def render(self, task: Task) -> Text:
+        """Return the text of the column."""
+        seconds = task.time_remaining
+        return Text("" if seconds is None else f"{format_duration(seconds)} left")
+
+
+@contextmanager
+def phase(title: str, total: int | None = None) -> Iterator[Callable[..., object]]:
+    """Show a phase of long work while the block runs; nothing unless standard error is a terminal.
+
+    total: number of parts (default: unknown). Yields the function to call after each part, or with the number of parts
+    that have been done since the last call. Phases may be nested. The display disappears at the end.
+    """
+    global _shown
+    if not sys.stderr.isatty() or os.environ.get("RANK", "0") != "0":
+        yield lambda parts=1: None
+        return
+    progress, outer = _shown, _shown
+    if progress is None:
+        columns = ("{task.description}", BarColumn(24), TimeElapsedColumn(), _TimeLeft())
+        # prints to another file than the terminal must not be redirected to it
+        progress = Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=sys.stdout.isatty())
+        progress.start()
+    _shown, task = progress, progress.add_task(title, total=total)
+    try:
+        yield partial(progress.advance, task)
+    finally:
+        progress.remove_task(task)
+        _shown = outer
+        if outer is None:
+            progress.stop()

@@ -1,0 +1,170 @@
+import subprocess
+import sys
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Literal
+
+import pytest
+import tyro
+
+import jumper_warp
+from cli_helpers import run
+from jumper_warp.cli.flags import list_flags
+from jumper_warp.cli.main import parse
+from jumper_warp.cli.train import SHORT_HELP
+from jumper_warp.utils.errors import InputError
+
+
+@dataclass(frozen=True)
+class Engine:
+    power: float = 2.5  # [kW] Largest power
+    valves: tuple[int, int] = (2, 2)
+
+
+@dataclass(frozen=True)
+class Car:
+    """Drive a car."""
+
+    road: tyro.conf.Positional[str]  # Name of the road
+    seed: int = 3
+    """Seed of the traffic. A second sentence follows."""
+    fuel: Literal["petrol", "gas"] = "petrol"
+    lights: bool = True  # Switch the lights on
+    map: Path | None = None  # Map of the roads (default: none)
+    engine: Engine = field(default_factory=Engine)  # Settings of the engine
+    radio: Annotated[Engine, tyro.conf.arg(name="")] = Engine(power=0.1)
+    hidden: tyro.conf.Suppress[int] = 0
+
+
+def parse_car(*args):
+    """Return the car that `jumper drive` makes of arguments."""
+    return parse(Car, "drive", args)
+
+
+def page(capsys, *args):
+    """Return the help that `jumper drive` prints."""
+    with pytest.raises(SystemExit) as end:
+        parse_car(*args)
+    assert end.value.code == 0
+    return capsys.readouterr().out
+
+
+def test_flags_have_names_types_defaults_and_descriptions():
+    flags = {flag.name: flag for flag in list_flags(Car)}
+    assert list(flags) == ["ROAD", "seed", "fuel", "lights", "map", "engine.power", "engine.valves", "power", "valves"]
+    assert [flag.metavar for flag in flags.values()][1:7] == ["INT", "{petrol,gas}", "", "PATH", "FLOAT", "INT INT"]
+    assert flags["lights"].options == ["--lights", "--no-lights"] and flags["ROAD"].options == []
+    assert (flags["seed"].about, flags["ROAD"].about) == (
+        "Seed of the traffic. A second sentence follows.",
+        "Name of the road",
+    )
+    assert (flags["engine.power"].about, flags["engine.power"].group_about) == (
+        "[kW] Largest power",
+        "Settings of the engine",
+    )
+    assert (flags["engine.power"].default, flags["power"].default, flags["map"].default) == (2.5, 0.1, None)
+
+
+def test_flags_of_an_instance_have_its_values_as_defaults():
+    flags = {flag.name: flag.default for flag in list_flags(Car("A1", seed=5, engine=Engine(power=9.0)))}
+    assert (flags["ROAD"], flags["seed"], flags["engine.power"]) == ("A1", 5, 9.0)
+
+
+@pytest.mark.parametrize("columns", [40, 80, 200])
+def test_help_fits_the_width_of_the_terminal(capsys, monkeypatch, columns):
+    monkeypatch.setenv("COLUMNS", str(columns))
+    out = page(capsys, "--help")
+    assert max(map(len, out.splitlines())) <= min(columns, 100)
+    assert out.startswith("usage: jumper drive ROAD [flags]\n\nDrive a car.\n")
+
+
+def test_help_has_the_default_once_unless_it_is_none(capsys):
+    out = " ".join(page(capsys, "--help").split())
+    assert "--seed INT Seed of the traffic. A second sentence follows (default: 3)" in out
+    assert "--[no-]lights Switch the lights on (default: on)" in out
+    assert "--map PATH Map of the roads (default: none) --" in out
+    assert "--fuel {petrol,gas} (default: petrol)" in out and "engine: Settings of the engine" in out
+
+
+def test_help_of_a_group_has_its_flags_only(capsys):
+    assert page(capsys, "--help", "engine").split() == (
+        "engine: Settings of the engine --engine.power FLOAT [kW] Largest power (default: 2.5)"
+        " --engine.valves INT INT (default: 2 2)"
+    ).split()  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [("engin", "did you mean 'engine'?"), ("wheels", "no group of flags 'wheels'; there are engine")],
+)
+def test_help_of_an_unknown_group_suggests_one(name, message):
+    with pytest.raises(InputError, match=message.replace("?", r"\?")):
+        parse_car("--help", name)
+
+
+@pytest.mark.parametrize(
+    ("args", "message"),
+    [
+        (["A1", "--sed", "3"], r"no flag --sed for drive; did you mean '--seed'\?"),
+        (["A1", "--colour=red"], "no flag --colour for drive; jumper drive --help lists the flags"),
+        (["A1", "--seed", "x"], "--seed takes INT, got x"),
+        (["A1", "--seed=x"], "--seed takes INT, got x"),
+        (["A1", "--engine.valves", "2"], "--engine.valves takes INT INT, got 2"),
+        (["A1", "--seed"], "--seed takes INT, got nothing"),
+        (["A1", "--fuel", "wood"], "--fuel takes {petrol,gas}, got wood"),
+        (["A1", "A2"], "unexpected argument A2"),
+        (["--seed", "3"], "ROAD is missing: Name of the road"),
+    ],
+)  # fmt: skip
+def test_invalid_arguments_are_reported_in_one_line(args, message):
+    with pytest.raises(InputError, match=f"^{message}$"):
+        parse_car(*args)
+
+
+def test_arguments_set_nested_and_negated_flags():
+    car = parse_car("A1", "--engine.power", "3", "--no-lights", "--power", "0.2")
+    assert (car.road, car.engine.power, car.lights, car.radio.power) == ("A1", 3.0, False, 0.2)
+
+
+# ---------------------------------------------------------------------- jumper
+
+
+@pytest.mark.parametrize("task", [[], ["vertical-jump"], ["velocity-rough"]], ids=" ".join)
+def test_help_of_train_fits_60_lines_of_80_columns(capsys, monkeypatch, task):
+    monkeypatch.setenv("COLUMNS", "80")
+    code, out, _ = run(capsys, "train", *task, "--help")
+    lines = out.splitlines()
+    assert code == 0 and len(lines) <= 60 and max(map(len, lines)) <= 80
+    assert all(f"  --{name}" in out.replace("[no-]", "") for names in SHORT_HELP.values() for name in names)
+
+
+def test_help_all_has_each_flag_of_a_task(capsys):
+    _, out, _ = run(capsys, "train", "vertical-jump", "--help-all")
+    assert all(
+        name in out for name in ("--ppo.max-grad-norm", "--shac.lr", "--env.rewards.jump-height.weight", "--robot")
+    )
+
+
+def test_help_of_a_group_of_a_task(capsys):
+    code, out, _ = run(capsys, "train", "vertical-jump", "--help", "env.rewards")
+    assert code == 0 and "--env.rewards.jump-height.weight" in out and "--env.reset" not in out and "--ppo" not in out
+
+
+def test_misspelt_command_is_suggested(capsys):
+    assert run(capsys, "evalute") == (2, "", ["jumper: no command 'evalute'; did you mean 'evaluate'?"])
+
+
+@pytest.mark.parametrize("flag", ["-V", "--version"])
+def test_version(capsys, flag):
+    assert run(capsys, flag) == (0, f"jumper {jumper_warp.__version__}\n", [])
+
+
+@pytest.mark.parametrize("module", ["jumper_warp", "jumper_warp.cli.main"])
+def test_module_is_the_command(module):
+    done = subprocess.run([sys.executable, "-m", module, "fly"], capture_output=True, text=True)
+    assert done.returncode == 2 and done.stderr.startswith("jumper: no command 'fly'")
+
+
+def test_usage_lists_exit_codes(capsys):
+    _, out, _ = run(capsys, "--help")
+    assert all(f"{code} " in out.splitlines()[-1] for code in (0, 1, 2, 130))

@@ -1,0 +1,133 @@
+"""`jumper list` and `jumper info` against the files in the policies' folders and the tasks themselves."""
+
+import json
+import shutil
+
+import pytest
+
+from cli_helpers import run
+from jumper_warp.policies.catalog import first_paragraph, summarise
+from jumper_warp.registry import TASKS, make_task
+from jumper_warp.utils.assets import POLICIES
+
+NAMES = sorted(path.parent.name for path in POLICIES.glob("*/manifest.json"))
+ERROR_KEYS = {  # by policy
+    "vertical_jump": "apex_error_abs_mean_m", "horizontal_jump": "goal_distance_at_rest_mean_m",
+    "walking_rough": "settled_rmse_vx_m_s", "attitude": "error_at_end_mean_deg",
+}  # fmt: skip
+
+
+def nominal_metrics(name):
+    """Return the metrics of the nominal robot in a shipped policy's metrics.json, by key."""
+    rows = json.loads((POLICIES / name / "metrics.json").read_text())["rows"]
+    return next(row["metrics"] for row in rows if (row["condition"], row["seed"]) == ("nominal", 0))
+
+
+def listed(capsys):
+    """Return the output of `jumper list --json`: tasks and policies, each by name."""
+    code, out, err = run(capsys, "list", "--json")
+    assert (code, err) == (0, [])
+    return [{entry["name"]: entry for entry in entries} for entries in json.loads(out).values()]
+
+
+def test_list_has_a_line_about_each_task_and_each_policy(capsys):
+    code, out, _ = run(capsys, "list")
+    assert code == 0 and max(map(len, out.splitlines())) <= 80
+    tasks, policies = (part.splitlines() for part in out.split("\n\n")[:2])
+    assert [line.split()[0] for line in tasks[1:] if not line.startswith(" ")] == list(TASKS)
+    assert [line.split()[0] for line in policies[1:]] == NAMES
+    (line,) = (line for line in policies if line.startswith("vertical_jump "))
+    metrics = nominal_metrics("vertical_jump")
+    success, error = metrics["success_rate"]["value"], metrics["apex_error_abs_mean_m"]["value"]
+    assert line.split()[1:] == ["vertical-jump", f"{100 * success:.1f}", "%", f"{error:.2g}", "m", "367", "kB"]
+    assert (POLICIES / "vertical_jump/policy.onnx").stat().st_size // 1000 == 367
+
+
+def test_listed_values_are_those_of_metrics_json(capsys):
+    tasks, policies = listed(capsys)
+    assert list(tasks) == list(TASKS) and list(policies) == NAMES
+    for name, key in ERROR_KEYS.items():
+        assert policies[name]["error"] == nominal_metrics(name)[key]
+    assert (
+        policies["attitude"]["success_rate"] == nominal_metrics("attitude")["settled_without_collision_rate"]["value"]
+    )
+    assert policies["walking_rough"]["success_rate"] == 1.0 - nominal_metrics("walking_rough")["fall_rate"]["value"]
+    assert tasks["horizontal-jump-mars-loose"]["policies"] == ["mars_horizontal_jump", "mars_springs_jump"]
+    assert tasks["velocity-flat"]["aliases"] == ["Olympus-Walk"]
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_info_of_a_policy_fits_a_screen_and_has_its_metrics(capsys, name):
+    code, out, err = run(capsys, "info", name)
+    lines = out.splitlines()
+    assert (code, err) == (0, []) and len(lines) <= 40
+    assert max(len(line) for line in lines if not line.startswith(("folder", "picture"))) <= 80
+    (nominal,) = (line.split() for line in lines if line.startswith("nominal "))
+    metrics = nominal_metrics(name)
+    rate = metrics.get("success_rate", metrics.get("settled_without_collision_rate"))
+    if rate is not None:
+        assert nominal[1] == f"{100 * rate['value']:.1f}"
+    assert f"evaluate      jumper evaluate {name}" in lines
+    assert json.loads(run(capsys, "info", name, "--json")[1])["rows"][0]["metrics"] == metrics
+
+
+@pytest.mark.parametrize("name", ["vertical-jump", "velocity_trot", "Olympus-Walk", "attitude"])
+def test_info_of_a_task_has_its_sizes_terms_and_policies(capsys, name):
+    task, flag = make_task(name), ["--task"] if name == "attitude" else []
+    code, out, _ = run(capsys, "info", name, *flag)
+    assert code == 0 and max(map(len, out.splitlines())) <= 80 and len(out.splitlines()) <= 40
+    assert f"train         jumper train {task.name}" in out and f"{len(task.observation_names)} numbers" in out
+    content = json.loads(run(capsys, "info", name, "--json", *flag)[1])
+    assert content["rewards"] == {term.name: term.numbers["weight"] for term in task.rewards}
+    assert content["terminations"] == [term.name for term in task.terminations]
+    assert content["observation_sizes"]["actor"] == len(task.observation_names)
+
+
+@pytest.mark.parametrize(
+    ("args", "start"),
+    [
+        (["vertical_jump"], "vertical_jump: policy for the task vertical-jump"),
+        (["vertical-jump"], "vertical-jump: jump to a height"),
+        (["vertical_jump", "--task"], "vertical-jump: jump to a height"),
+        (["mars-springs-jump"], "mars_springs_jump: policy for"),
+        (["attitude"], "attitude: policy for"),
+        (["velocity_flat"], "velocity-flat: walk"),
+    ],
+)
+def test_spelling_decides_between_a_task_and_a_policy_of_one_name(capsys, args, start):
+    assert run(capsys, "info", *args)[1].startswith(start)
+
+
+def test_info_of_a_policy_without_metrics_or_page_shows_its_folder(capsys, tmp_path):
+    folder = tmp_path / "mine"
+    folder.mkdir()
+    for name in ("config.json", "policy.onnx"):
+        shutil.copy(POLICIES / "attitude" / name, folder / name)
+    code, out, _ = run(capsys, "info", str(folder))
+    assert code == 0 and f"jumper evaluate {folder}" in out and "nominal" not in out
+    assert summarise(folder).success is summarise(folder).error is None
+
+
+def test_info_shows_metrics_that_evaluate_saved(tmp_path, capsys):
+    for name in ("config.json", "policy.onnx"):
+        shutil.copy(POLICIES / "vertical_jump" / name, tmp_path / name)
+    row = json.loads((POLICIES / "vertical_jump/metrics.json").read_text())["rows"][0]
+    saved = {"schema": "jumper-warp metrics", "version": 1, "conditions": row["conditions"], "metrics": row["metrics"]}
+    (tmp_path / "metrics.json").write_text(json.dumps(saved))
+    assert summarise(tmp_path).success == row["metrics"]["success_rate"]["value"]
+    assert "as evaluated   96.7 %" in run(capsys, "info", str(tmp_path))[1]
+
+
+@pytest.mark.parametrize(("file", "text"), [("metrics.json", '{"metrics": 3}'), ("config.json", "{}")])
+def test_info_refuses_a_folder_with_malformed_files(tmp_path, capsys, file, text):
+    for name in ("config.json", "policy.onnx"):
+        shutil.copy(POLICIES / "attitude" / name, tmp_path / name)
+    (tmp_path / file).write_text(text)
+    code, out, err = run(capsys, "info", str(tmp_path))
+    assert (code, out) == (2, "") and len(err) == 1 and f"{tmp_path}: not a policy's folder" in err[0]
+
+
+def test_first_paragraph_is_text_without_markup():
+    page = "# Title\n\n![picture](a.webp)\n\nIt jumps `up`, see\n[the page](b.md#c).\n\nMore.\n"
+    assert first_paragraph(page) == "It jumps up, see the page."
+    assert first_paragraph("# Title\n") == ""
