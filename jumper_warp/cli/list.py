@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 import sys
 from collections.abc import Sequence
@@ -79,7 +80,8 @@ def print_tables(tasks: Sequence[dict[str, Any]], policies: Sequence[PolicySumma
 
     from jumper_warp.utils.metrics import WIDTH
 
-    console = Console(width=WIDTH, highlight=False)
+    text = io.StringIO()  # rich would exit with 1 where the reader closes a pipe
+    console = Console(file=text, width=WIDTH, highlight=False)
     table = Table(
         Column("TASK", no_wrap=True), Column("what the robot does", no_wrap=True, overflow="ellipsis"), "its policies",
         box=None, pad_edge=False, padding=(0, 2, 0, 0),
@@ -94,7 +96,7 @@ def print_tables(tasks: Sequence[dict[str, Any]], policies: Sequence[PolicySumma
         success = "" if policy.success is None else f"{100.0 * policy.success:.1f} %"
         table.add_row(policy.name, policy.task, success, quantity(policy.error), size_text(policy.size_bytes))
     console.print(table)
-    console.print(f"\n{LEGEND}")
+    print("\n".join(line.rstrip() for line in text.getvalue().splitlines()), LEGEND, sep="\n\n")
 
 
 def quantity(metric: dict[str, Any] | None) -> str:

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import os
 import shlex
-from collections.abc import Sequence
+import sys
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
@@ -32,6 +34,8 @@ if TYPE_CHECKING:
     from jumper_warp.tasks.cfg import TaskCfg
 
 
+CPU_STEPS_PER_SECOND = 10_000.0  # [1/s] Policy steps per thread, of all worlds, in a training on a CPU
+SHORT_TRAINING = 60.0  # [s] Time of a training on a CPU that is not announced
 SHORT_HELP = {
     "Size and length": ("num-envs", "max-iterations", "max-seconds", "seed"),
     "Physics and robot": ("randomize", "noise", "history", "solver", "robot"),
@@ -173,6 +177,22 @@ def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
     return shlex.join(["jumper", "train", *kept])
 
 
+def report_cpu_time(args: TrainArgs, presets: Iterable[str]) -> None:
+    """Print one line about the time of a training on a CPU, unless it is short; presets: names of the task's."""
+    from jumper_warp.rl.logger import format_duration
+    from jumper_warp.utils.threads import checked_threads
+
+    cfg, done = args.cfg, args.checkpoint.state["iteration"] if args.checkpoint else 0
+    steps = (cfg.max_iterations - done) * cfg.ppo.num_steps * cfg.num_envs
+    seconds = min(steps / (CPU_STEPS_PER_SECOND * checked_threads(cfg.threads)), cfg.max_seconds or math.inf)
+    if seconds < SHORT_TRAINING:
+        return
+    names = " or ".join(f"--preset {name}" for name in presets)
+    advice = f"; settings for such a machine: {names}" if names else ""
+    duration = f"{seconds / 3600.0:.0f} h" if seconds > 5400.0 else format_duration(seconds)
+    print(f"without a GPU this training takes about {duration}{advice}", file=sys.stderr)
+
+
 def check_saving(task: TaskCfg) -> None:
     """Raise InputError unless the task, saved as JSON and read back, is unchanged."""
     from jumper_warp.cli.resumed import loaded_modules
@@ -203,8 +223,8 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
 
         actor_init = actor_init_from_policy(parsed.cfg.init_policy, task, parsed.cfg.ppo)
     is_rank_0 = os.environ.get("RANK", "0") == "0"
-    if is_rank_0:
-        configure_device(parsed.cfg.device, parsed.cfg.threads)
+    if is_rank_0 and configure_device(parsed.cfg.device, parsed.cfg.threads).driver is None:
+        report_cpu_time(parsed, getattr(find_task(task.name)[1], "presets", ()))
     as_rsl_rl = None
     if parsed.cfg.trainer == "rsl-rl":
         from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl

@@ -1,7 +1,10 @@
 """Device, package versions and commit of a run."""
 
 import functools
+import os
 import subprocess
+import sys
+import tempfile
 from importlib import metadata
 from pathlib import Path
 from platform import python_version
@@ -14,6 +17,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import checked_threads, set_threads
 from jumper_warp.utils.version import __version__
 
+NO_DRIVER = "Could not find or load the NVIDIA CUDA driver"  # Part of Warp's notice
 PACKAGES = ("warp-lang", "newton", "mujoco", "mujoco-warp", "torch", "numpy", "rsl-rl-lib")
 """Installed distributions whose version can change a result."""
 
@@ -48,16 +52,15 @@ def device_info(device: wp.DeviceLike = None) -> DeviceInfo:
 def report_device(device: wp.DeviceLike = None, console: Console | None = None) -> DeviceInfo:
     """Print one line about a device, and return its properties (default: current device, standard error)."""
     info = device_info(device)
-    parts = [f"device {info.alias} ({info.name})"]
     if info.driver is None:
-        parts.append(f"threads {checked_threads(None)}")
-        parts.append("no CUDA device in use: large batches will be slow")
+        threads = checked_threads(None)
+        line = f"device: {info.alias} ({threads} thread{'s' if threads > 1 else ''})"
+        line += "" if wp.is_cuda_available() else "; no CUDA GPU found"
     else:
-        parts += [f"driver for CUDA {info.driver}", f"mempool {'on' if info.mempool else 'OFF'}"]
-    parts.append(f"graph capture {'on' if info.graphs else 'OFF: each kernel is launched on its own'}")
-    style = "green" if info.driver is not None and info.graphs else "yellow"
+        line = f"device: {info.alias} ({info.name}), driver for CUDA {info.driver}"
+    line += "" if info.graphs else "; graph capture is off without a memory pool: each kernel is launched on its own"
     console = console or Console(stderr=True)
-    console.print(", ".join(parts), style=style, markup=False, highlight=False, soft_wrap=True)
+    console.print(line, style=None if info.graphs else "yellow", markup=False, highlight=False, soft_wrap=True)
     return info
 
 
@@ -69,10 +72,30 @@ def configure_device(device: str | None, threads: int | None = None) -> DeviceIn
     """
     set_threads(threads)
     wp.config.log_level = wp.LOG_WARNING
+    init_warp()
     try:
         return report_device(device)
     except (ValueError, RuntimeError) as error:
         raise InputError(f"no device {device!r:.60}") from error
+
+
+def init_warp() -> None:
+    """Initialise Warp without its notice that there is no CUDA driver, which `report_device` includes.
+
+    Warp's native library prints it, so that the process's standard error is a file meanwhile.
+    """
+    sys.stderr.flush()
+    with tempfile.TemporaryFile() as printed:
+        stderr = os.dup(2)
+        os.dup2(printed.fileno(), 2)
+        try:
+            wp.init()
+        finally:
+            os.dup2(stderr, 2)
+            os.close(stderr)
+            printed.seek(0)
+            lines = [line for line in printed.read().decode(errors="replace").splitlines() if NO_DRIVER not in line]
+            print("".join(f"{line}\n" for line in lines), end="", file=sys.stderr)
 
 
 def git_commit(folder: Path | None = None) -> Commit | None:

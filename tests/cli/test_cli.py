@@ -437,6 +437,15 @@ def test_play_horizontal_jumps_records_distances_and_goal_markers(still, tmp_pat
 
 
 @pytest.mark.parametrize(
+    "args",
+    [["--num-jumps", "2"], "--suite max --num-jumps 2 --min-distance 0.5 --max-distance 0.5 --num-recorded 0".split()],
+)
+def test_json_flag_prints_metrics_json_and_nothing_else(still, tmp_path, capsys, args):
+    code, out, _ = run(capsys, "evaluate", still, *args, "--device", "cpu", "--out", str(tmp_path), "--json")
+    assert code == 0 and out == (tmp_path / "metrics.json").read_text()
+
+
+@pytest.mark.parametrize(
     ("args", "message"),
     [
         (["evaluate", "--height-range", "0.5", "1.2"], "no flag --height-range for policies of horizontal"),  # default

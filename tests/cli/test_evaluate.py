@@ -71,7 +71,7 @@ def test_heading_flag_in_degrees_sets_all_headings():
     ],
 )
 def test_refuses_flags_of_other_tasks(policies, task, args, flag):
-    with pytest.raises(InputError, match=f"{flag} is not for policies of {task}; jumper evaluate .* --help shows"):
+    with pytest.raises(InputError, match=f"no flag {flag} for policies of {task}"):
         evaluate.run([str(policies / task), *args], [])
 
 

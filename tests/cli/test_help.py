@@ -11,7 +11,8 @@ import jumper_warp
 from cli_helpers import run
 from jumper_warp.cli.flags import list_flags
 from jumper_warp.cli.main import parse
-from jumper_warp.cli.train import SHORT_HELP
+from jumper_warp.cli.train import SHORT_HELP, TrainArgs, report_cpu_time
+from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.utils.errors import InputError
 
 
@@ -168,3 +169,19 @@ def test_module_is_the_command(module):
 def test_usage_lists_exit_codes(capsys):
     _, out, _ = run(capsys, "--help")
     assert all(f"{code} " in out.splitlines()[-1] for code in (0, 1, 2, 130))
+
+
+@pytest.mark.parametrize(
+    ("args", "presets", "message"),
+    [
+        (TrainArgs(TrainCfg(threads=2)), (), "without a GPU this training takes about 10 h\n"),
+        (TrainArgs(TrainCfg(threads=1)), ("laptop",), "about 20 h; settings for such a machine: --preset laptop\n"),
+        (TrainArgs(TrainCfg(threads=1, max_seconds=120.0)), ("a", "b"),
+         "2 min; settings for such a machine: --preset a or --preset b\n"),
+        (TrainArgs(TrainCfg(threads=1, num_envs=64, max_iterations=2)), ("laptop",), ""),
+    ],
+)  # fmt: skip
+def test_time_of_a_training_without_gpu_is_announced_unless_short(capsys, args, presets, message):
+    report_cpu_time(args, presets)
+    err = capsys.readouterr().err
+    assert err.endswith(message) and err.count("\n") == (1 if message else 0)

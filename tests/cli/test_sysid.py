@@ -101,11 +101,12 @@ def test_refuses_negated_angles_without_warnings(recorded, capsys):
     assert "flipped: angles of FL_outer, FL_inner, FR_outer" in error and "negate angle" in error
 
 
-def test_cma_method_identifies_latency(recorded):
+def test_cma_method_identifies_latency_and_prints_its_report_as_json(recorded, capsys):
     pytest.importorskip("cma")
     out = recorded / "evolved"
     more = ["--method", "cma", "--max-seconds", "3", "--exclude", "offsets"]
-    main(["sysid", str(recorded / "motions" / "0_hung_chirp.npz"), *PARAMS, *more, "--out", str(out)])
+    main(["sysid", "fit", str(recorded / "motions" / "0_hung_chirp.npz"), *PARAMS, *more, "--json", "--out", str(out)])
+    assert capsys.readouterr().out == (out / "report.json").read_text()
     assert load_overlay(out / "identified.json").values["latency"][0] == pytest.approx(0.003, abs=1.0e-3)
 
 

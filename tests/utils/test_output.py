@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import warp as wp
 from rich.console import Console
 
 import jumper_warp
@@ -157,13 +158,21 @@ def test_commit_is_none_for_an_untracked_folder_of_another_project(tmp_path):
     assert runtime.git_commit(installed) is None
 
 
-def test_device_report_is_one_line():
+def test_device_report_is_one_line(monkeypatch):
+    monkeypatch.setattr("jumper_warp.utils.threads._default_threads", 3)
     console = Console(record=True, width=40, quiet=False)
     info = runtime.report_device("cpu", console)
     lines = console.export_text().splitlines()
     assert len(lines) == 1
     assert info == ("cpu", info.name, None, False, True)  # alias, name, driver, mempool, graphs
-    assert lines[0].startswith("device cpu") and "no CUDA device" in lines[0] and "graph capture on" in lines[0]
+    found = "" if wp.is_cuda_available() else "; no CUDA GPU found"
+    assert lines[0] == f"device: cpu (3 threads){found}"
+
+
+def test_warp_is_initialised_without_its_notice_about_a_missing_gpu():
+    code = "import warp as wp; from jumper_warp.utils.runtime import configure_device; configure_device('cpu')"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout == "" and len(done.stderr.splitlines()) == 1 and done.stderr.startswith("device: cpu (")
 
 
 def test_versions_include_python_and_none_for_a_missing_package(monkeypatch):
