@@ -26,7 +26,7 @@ from support.momentum import MomentumRecorder, rotational_inertia
 from support.scripts import run_script
 
 HARDWARE = {"settling_time_mean_s": 2.6}  # [s] Settling time of the authors' robot after 90 degrees
-SUMMARY = (*HARDWARE, "settled_without_collision_rate", "any_axis_settling_time_mean_s", "turn_by_drift_max_deg")
+SUMMARY = ("settled_without_collision_rate", *HARDWARE, "any_axis_settling_time_mean_s", "turn_by_drift_max_deg")
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.departure_runs import BASELINE, JUMP_TASKS, TESTS, JumpTask, evaluate, parse, train_or_load, write_table
 from support.departures import DEPARTURES, Ablation, ablation_flags
-from support.scripts import ThreadArgs, announce, prepare, report, run_script
+from support.scripts import ThreadArgs, announce, prepare, report, run_script, tracked
 
 
 @dataclass(frozen=True)
@@ -78,7 +78,7 @@ def main(args: Args) -> dict[str, Any]:
         parse(ablation, args.command(ablation, seed, Path(name)))
     folder, results = prepare("departures", args, args.threads), {}
     values: dict[str, Any] = {"task": args.task, "iterations": args.length, "envs": args.num_envs}
-    for name, seed, ablation in args.trainings():
+    for name, seed, ablation in tracked([*args.trainings()], "trainings"):
         checkpoint = train_or_load(ablation, args.command(ablation, seed, folder / f"{name}_{seed}"))
         if not args.measure:
             continue

@@ -27,7 +27,7 @@ from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from support.identification_methods import compare_methods
 from support.known_robots import make_case, plot_cases, policy_errors, run_case
-from support.scripts import OutputArgs, announce, report, run_script
+from support.scripts import OutputArgs, report, run_script, tracked
 
 SUMMARY = (
     "coverage", "kp_worst_percent", "offset_worst_deg", "latency_us", "held_out_deg", "held_out_nominal_deg",
@@ -68,10 +68,10 @@ def main(args: Args) -> dict[str, Any]:
     values: dict[str, Any] = {"parameters": len(parameters), "seconds_of_data": 1.25 * len(KINDS)}
 
     cases = []
-    for seed in range(args.num_matched if {"same", "methods", "policy"} & set(args.parts) else 0):
+    matched = range(args.num_matched if {"same", "methods", "policy"} & set(args.parts) else 0)
+    for seed in tracked(matched, "identifying robots"):
         case = make_case(parameters, seed, ours, replay)
         cases.append((case, *run_case(parameters, case, replay, ours)))
-        announce(f"robot {seed + 1} of {args.num_matched} identified, held out {cases[-1][1]['held_out_deg']:.3g} deg")
     rows = [metrics for _, metrics, _ in cases]
     if rows:
         values |= {name: float(np.median([row[name] for row in rows])) for name in rows[0]}
@@ -83,10 +83,9 @@ def main(args: Args) -> dict[str, Any]:
     for part, (simulate, model, dt) in mismatched.items():
         if part in args.parts:
             results = []
-            for seed in range(100, 100 + args.num_mismatched):
+            for seed in tracked(range(100, 100 + args.num_mismatched), f"identifying robots, {part}"):
                 case = make_case(parameters, seed, simulate, replay)
                 results.append(run_case(parameters, case, replay, model, dt)[0])
-                announce(f"robot {seed - 99} of {args.num_mismatched}, {part}, identified")
             values |= {f"{part}_{name}": value for name, value in results[0].items()}
             values |= {f"{part}_{name}_of_seeds": [row[name] for row in results] for name in ("coverage", "identified")}
     if "methods" in args.parts:

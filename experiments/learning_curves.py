@@ -25,7 +25,7 @@ from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.learning import TEST_HEIGHTS, LearningCurve, curve_metrics, plot_curves, train_and_time
-from support.scripts import DeviceArgs, announce, prepare, report, run_script
+from support.scripts import DeviceArgs, announce, prepare, report, run_script, tracked
 from support.variants import DEFAULT, variant
 
 TASK = "vertical-jump"
@@ -74,7 +74,7 @@ def main(args: Args) -> dict[str, Any]:
     values: dict[str, Any] = {"seconds": args.seconds, "envs": args.num_envs, "randomize": args.randomize}
     values |= {"seeds": list(args.seeds), "heights_m": list(args.height_range), "history": args.history}
     curves: dict[str, list[LearningCurve]] = {name: [] for name in args.variants}
-    for name, seed in itertools.product(args.variants, args.seeds):
+    for name, seed in tracked([*itertools.product(args.variants, args.seeds)], "trainings"):
         curve = train_in_process(args, name, seed)
         curves[name].append(curve)
         values |= curve_metrics(curve, f"{name}_{seed}") | {f"ready_s_{name}_{seed}": curve.ready}

@@ -22,6 +22,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.output import output_dir
+from jumper_warp.utils.runtime import configure_device
 from support.scripts import OutputArgs, report, run_script
 
 
@@ -46,7 +47,6 @@ def measure(args: Args) -> dict[str, float]:
 
     `building`: peak main memory of the process; `standing`: size of all arrays, which are the same on a GPU.
     """
-    wp.config.log_level = wp.LOG_WARNING
     env = Env(make_task(args.task), args.envs[0], device="cpu", solver=args.solver)
     env.reset()
     return {"building": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, "standing": array_bytes()}
@@ -54,6 +54,7 @@ def measure(args: Args) -> dict[str, float]:
 
 def main(args: Args) -> dict[str, float]:
     """Return `building_` and `standing_bytes_per_world` [byte]; for a single number of worlds, those of `measure`."""
+    configure_device("cpu")
     if len(args.envs) == 1:
         values = measure(args)
         print(json.dumps(values))

@@ -63,7 +63,7 @@ def main(args: Args) -> dict:
         "mean_reward": result.metrics.get("Train/mean_reward"),
         "iterations": result.iteration,
     }
-    return report(args, folder, values, f"Training with a new reward, in {result.folder}", values)
+    return report(args, folder, values, "Training with a reward term of this script", values)
 
 
 if __name__ == "__main__":

@@ -36,7 +36,7 @@ from jumper_warp.utils.files import write_atomically
 from jumper_warp.viz.film import write_film
 from jumper_warp.viz.picture import write_picture
 from jumper_warp.viz.recording import Recording
-from support.scripts import ThreadArgs, announce, prepare, report, run_script
+from support.scripts import ThreadArgs, announce, prepare, report, run_script, tracked
 
 COURSE = "walk_jump_walk"  # A script with three policies
 SCRIPT = Path(__file__).parents[1] / "assets/scripts/walk_jump_walk.json"
@@ -122,7 +122,7 @@ def main(args: Args) -> dict:
     """Draw all pictures and films, and return their sizes by name."""
     folder = prepare("policy_pictures", args, args.threads)
     sizes = {}
-    for name in args.policies:
+    for name in tracked(args.policies, "drawing policies"):
         recording = record(name)
         title = "walk, jump up, walk, jump ahead, walk" if name == COURSE else SHOTS[name].title
         picture = write_picture(recording, folder / f"{name}.webp", title=title)
@@ -137,7 +137,7 @@ def main(args: Args) -> dict:
         announce(f"{', '.join(path.name for path in paths)} drawn")
     if args.readme is not None:
         save_tile([folder / f"{name}.webp" for name in TILE], args.readme / "policies.webp")
-    return report(args, folder, sizes, f"Pictures of {len(args.policies)} policies", ())
+    return report(args, folder, sizes, f"Policies drawn: {len(args.policies)}", ())
 
 
 def save_tile(paths: list[Path], path: Path) -> None:

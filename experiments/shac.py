@@ -11,6 +11,7 @@ are time and steps to success rates.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -29,7 +30,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.gradient_variance import measure_stats, plot_variances, variance_metrics
 from support.learning import LearningCurve, curve_metrics, make_eval_env, plot_curves, train_and_evaluate
-from support.scripts import DeviceArgs, announce, prepare, report, run_script
+from support.scripts import DeviceArgs, announce, prepare, report, run_script, tracked
 
 TASK = "vertical-jump"
 
@@ -81,12 +82,11 @@ def train(args: Args, algorithm: str, seed: int) -> LearningCurve:
 def compare(args: Args, folder: Path) -> dict[str, Any]:
     """Train with every trainer and seed, plot the learning curves into `folder`, and return the metrics."""
     values, curves = {}, {trainer: [] for trainer in args.trainers}
-    for trainer in args.trainers:
-        for seed in args.seeds:
-            curves[trainer].append(train(args, trainer, seed))
-            values |= curve_metrics(curves[trainer][-1], f"{trainer}_{seed}")
-            write_metrics(folder, values)
-            announce(f"{trainer}, seed {seed}: {values[f'success_{trainer}_{seed}']:.1%} success")
+    for trainer, seed in tracked([*itertools.product(args.trainers, args.seeds)], "trainings"):
+        curves[trainer].append(train(args, trainer, seed))
+        values |= curve_metrics(curves[trainer][-1], f"{trainer}_{seed}")
+        write_metrics(folder, values)
+        announce(f"{trainer}, seed {seed}: {values[f'success_{trainer}_{seed}']:.1%} success")
     plot_curves(curves, folder / "curves.png")
     return values
 

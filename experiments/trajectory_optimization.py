@@ -32,7 +32,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.motion_replay import MotionReplay, plot_replays
 from support.optimized_jumps import FINE, JUMPS, LIMITED, noisy_variants, optimise
-from support.scripts import ThreadArgs, prepare, report, run_script
+from support.scripts import ThreadArgs, prepare, report, run_script, tracked
 
 ALL_JUMPS = JUMPS | LIMITED  # By name
 
@@ -84,7 +84,7 @@ def main(args: Args) -> dict[str, Any]:
     folder, best = prepare("trajectory_optimization", args, args.threads), {}
     replays: dict[str, MotionReplay] = {}
     values: dict[str, Any] = {}
-    for name in args.jumps:
+    for name in tracked(args.jumps, "optimising jumps"):
         row, replay = run_jump(name, args, folder, best)
         replays[ALL_JUMPS[name].label] = replay
         values |= {f"{name}_gradients_{key}": value for key, value in row.items()}

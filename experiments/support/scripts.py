@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
@@ -13,11 +13,13 @@ import tyro
 from jumper_warp.cli.main import run_command
 from jumper_warp.cli.renamed_flags import use_new_names
 from jumper_warp.utils.output import output_dir, write_metrics
+from jumper_warp.utils.progress import phase
 from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.summary import PrintFlags, print_summary
 from support.timing import process_age
 
 Args = TypeVar("Args")
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
@@ -64,6 +66,14 @@ def prepare(name: str, args: DeviceArgs, threads: int | None = None) -> Path:
 def announce(text: str) -> None:
     """Print what a script does or has done, with the time since its start, on standard error."""
     print(f"{process_age():4.0f} s  {text}", file=sys.stderr, flush=True)
+
+
+def tracked(items: Collection[Item], title: str) -> Iterator[Item]:
+    """Yield the items of a long loop; a terminal shows the progress and the time left."""
+    with phase(title, len(items)) as advance:
+        for item in items:
+            yield item
+            advance()
 
 
 def report(

@@ -30,7 +30,7 @@ from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.metrics import AnyMetrics, Metrics
+from jumper_warp.utils.metrics import AnyMetrics, Metrics, MetricValue
 from jumper_warp.utils.output import output_dir, read_values, write_metrics
 from jumper_warp.utils.runtime import configure_device
 from jumper_warp.utils.summary import PrintFlags, print_summary
@@ -176,8 +176,10 @@ class Run(ABC):
     ) -> dict[str, Any]:  # fmt: skip
         """Write the metrics, print those with the given keys beside the paper's values, and return all values."""
         values = self.write(metrics)
-        counts = [f"{entry.trials:,} {entry.over}" for key in keys if (entry := metrics.get(key)) and entry.over]
-        what = f"{self.name.replace('_', ' ').capitalize()} of {self.source}: {', '.join([*counts[:1], self.title])}"
+        printed = [metrics[key] for key in keys if key in metrics]
+        most = max(printed, key=lambda metric: metric.trials or 0, default=MetricValue(None))
+        count = f"{most.trials:,} {most.over}, " if most.trials else ""
+        what = f"{self.source}, {self.name.replace('_', ' ')}: {count}{self.title}"
         seconds = time.perf_counter() - self.started
         print_summary(self.folder, what, keys, paper=paper, flags=self.print_flags, seconds=seconds)
         return values

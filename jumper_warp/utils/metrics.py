@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import re
+import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, Protocol
 
@@ -13,8 +15,8 @@ from rich.table import Column, Table
 
 Scalar = float | int | str | bool | None  # Type of a value, or of each item of a list of values
 UNITS = {
-    "_per_s": "1/s", "_rad_s": "rad/s", "_m_s2": "m/s^2", "_nm_s": "N m s", "_m_s": "m/s", "_deg": "deg", "_mm": "mm",
-    "_ms": "ms", "_us": "us", "_nm": "N m", "_hz": "Hz", "_m": "m", "_s": "s", "_n": "N",
+    "_per_s": "1/s", "_n_m": "N/m", "_rad_s": "rad/s", "_m_s2": "m/s^2", "_nm_s": "N m s", "_m_s": "m/s", "_deg": "deg",
+    "_mm": "mm", "_ms": "ms", "_us": "us", "_nm": "N m", "_hz": "Hz", "_m": "m", "_s": "s", "_n": "N",
 }  # fmt: skip
 """Unit by the end of a metric's key; longer ends come before the shorter ones that they contain."""
 
@@ -143,7 +145,7 @@ def print_metrics(
     title: str = "",
 ) -> None:  # fmt: skip
     """Print conditions and metrics with intervals beside the paper's values, at most WIDTH characters a line."""
-    console, conditions, lists = Console(width=WIDTH), conditions or {}, {}
+    conditions, lists = conditions or {}, {}
     table = Table(
         Column("metric", overflow="fold"),
         "value",
@@ -160,14 +162,20 @@ def print_metrics(
             limits = "" if interval is None else "{:.4g} to {:.4g}".format(*interval)
             known = [f"{paper[key]:g}" if key in paper else ""] if paper else []
             table.add_row(key, format_value(value), limits, *known)
-    if title:
-        console.print(title)
-    if conditions:
-        text = "; ".join(f"{name} {format_value(value)}" for name, value in conditions.items())
-        console.print(text, highlight=False)
-    console.print(table)
+    text = "; ".join(f"{name} {format_value(value)}" for name, value in conditions.items())
+    for line in (title, text):
+        if line:
+            print(textwrap.fill(line, WIDTH))
+    print_table(table)
     for key, value in lists.items():
-        console.print(f"{key}: {format_value(value)}", highlight=False, markup=False)
+        print(textwrap.fill(f"{key}: {format_value(value)}", WIDTH))
+
+
+def print_table(table: Table) -> None:
+    """Print a table of at most WIDTH characters a line; a closed pipe raises BrokenPipeError."""
+    text = io.StringIO()  # rich itself exits with 1 when the reader closes the pipe
+    Console(file=text, width=WIDTH, highlight=False).print(table)
+    print("\n".join(line.rstrip() for line in text.getvalue().splitlines()))
 
 
 def format_value(value: Any) -> str:

@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import json
 import re
+import textwrap
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import tyro
-from rich.console import Console
 from rich.table import Column, Table
 
-from jumper_warp.utils.metrics import WIDTH, MetricValue, format_value, print_metrics, split_unit
+from jumper_warp.utils.metrics import WIDTH, MetricValue, format_value, print_metrics, print_table, split_unit
 from jumper_warp.utils.output import read_metrics
 
 KINDS = {"picture": (".png", ".webp"), "film": (".mp4", ".gif"), "recording": (".rrd",), "folder": ("",)}
@@ -39,23 +39,21 @@ def print_summary(
     title: what was done; keys: of the main metrics, those that the file lacks are skipped; seconds: wall time of the
     run; paper: published values by key; flags: print all metrics, or the file itself.
     """
-    flags, paper, console = flags or PrintFlags(), paper or {}, Console(width=WIDTH, highlight=False, markup=False)
-    text = (folder / "metrics.json").read_text()
+    flags, paper, path = flags or PrintFlags(), paper or {}, folder / "metrics.json"
     if flags.json:
-        print(text, end="")
+        print(path.read_text(), end="")
         return
     metrics = read_metrics(folder)
-    console.print(title)
+    main = {key: metrics[key] for key in keys if key in metrics}
+    print(textwrap.fill(title, WIDTH))
     if flags.verbose:
-        print_metrics(metrics, paper, json.loads(text)["conditions"])
-    elif main := {key: metrics[key] for key in keys if key in metrics}:
-        console.print(_summary_table(main, paper))
-    for line in _file_lines(folder):
-        console.print(line, soft_wrap=True)
-    console.print(f"{'metrics':9}  {folder / 'metrics.json'}", soft_wrap=True)
+        print_metrics(metrics, paper, json.loads(path.read_text())["conditions"])
+    elif main:
+        print_table(_summary_table(main, paper))
     hints = ["rerun FILE shows a recording"] if any(folder.glob("*.rrd")) else []
-    hints += [] if flags.verbose else [f"--verbose prints all {len(metrics)} metrics"]
-    console.print(f"{'time':9}  {seconds:.0f} s" + "".join(f"; {hint}" for hint in hints))
+    hints += [f"--verbose prints all {len(metrics)} metrics"] if not flags.verbose and len(metrics) > len(main) else []
+    end = "; ".join([f"{'time':9}  {seconds:.0f} s", *hints])
+    print(*_file_lines(folder), f"{'metrics':9}  {path}", end, sep="\n")
 
 
 def _summary_table(metrics: Mapping[str, MetricValue], paper: Mapping[str, float]) -> Table:
@@ -74,7 +72,8 @@ def _words(key: str, metric: MetricValue) -> str:
     """Return a metric's name in words, such as "apex error, mean size"; metrics of a range of goals name the range."""
     name = split_unit(key)[0].removeprefix(IN_RANGE).replace("_", " ")
     name = re.sub(r"( abs)? (mean|max|median)$", lambda found: f", {found[2]}" + " size" * bool(found[1]), name)
-    return name if not key.startswith(IN_RANGE) else f"{name}, {str(metric.over).split(' of ')[-1]}"
+    goals = re.sub(r"^jumps (with goals of )?", "", metric.over or "")
+    return f"{name}, {goals}" if key.startswith(IN_RANGE) else name
 
 
 def _text(key: str, value: Any, *, unit: bool = False) -> str:
