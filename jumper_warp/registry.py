@@ -211,9 +211,10 @@ def _unknown_task(name: str) -> str:
     for policy, task in policy_tasks().items():
         if dashed(name) == dashed(policy):
             return f"{name!r} is a policy, not a task; its task is {task}"
-    similar = suggestion(name, {*task_names(), *_tasks_by_name()})
-    known = similar or f"; there are {', '.join(task_names())}"
-    return f"unknown task {name!r:.60}{known}; a task of your own needs --task-module FILE.py"
+    own = "; a task of your own needs --task-module FILE.py"
+    if similar := suggestion(name, [*task_names(), *(alias for entry in TASKS.values() for alias in entry.aliases)]):
+        return f"unknown task {name!r:.60}{own}{similar}"
+    return f"unknown task {name!r:.60}; there are {', '.join(task_names())}{own}"
 
 
 def installed_tasks() -> tuple[EntryPoint, ...]:

@@ -88,7 +88,7 @@ def test_dash_and_underscore_are_the_same_in_names_of_tasks(name):
 @pytest.mark.parametrize(
     ("name", "message"),
     [
-        ("vertical_jmup", "did you mean 'vertical-jump'.; a task of your own needs --task-module FILE.py"),
+        ("vertical_jmup", "; a task of your own needs --task-module FILE.py; did you mean 'vertical-jump'"),
         ("Olympus-Wlak", "did you mean 'Olympus-Walk'"),
         ("walking-flat", "'walking-flat' is a policy, not a task; its task is velocity-flat"),
     ],

@@ -5,7 +5,9 @@ The policy comes first: its task decides which flags there are.
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
@@ -17,6 +19,7 @@ from jumper_warp.utils.errors import suggestion
 if TYPE_CHECKING:
     from jumper_warp.evaluation.evaluations import Evaluation
     from jumper_warp.evaluation.run import EvaluationRun
+    from jumper_warp.tasks.cfg import TaskCfg
 
 HELP = """\
 usage: jumper {command} POLICY [flags]
@@ -26,7 +29,7 @@ usage: jumper {command} POLICY [flags]
   POLICY    name or folder of a policy, folder of a training run, or checkpoint;
             `jumper list` shows the names
 
-Flags depend on the task: jumper {command} POLICY --help lists them."""
+jumper {command} POLICY --help lists the flags."""
 ABOUT = """\
 Measure a policy over many trials, print its metrics and write metrics.json.
 jumper evaluate POLICY --suite NAME [flags] runs a test of jumps instead: sweep
@@ -41,28 +44,29 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """
     policy = policy_of("evaluate", ABOUT, args)
     args = [part for arg in args for part in (arg.split("=", 1) if arg.startswith(f"{SUITE}=") else [arg])]
-    opened = open_run(policy, modules)
+    task = saved_task(policy, modules)
     if SUITE in args:
-        run_suite(opened, args)
+        run_suite(task, args, modules)
         return
     from jumper_warp.evaluation.commands import EvaluateCfg, evaluate
 
-    evaluate(opened, parse("evaluate", opened, args[1:], EvaluateCfg, lambda kind: kind.flags))
+    cfg = parse("evaluate", task, args, EvaluateCfg, lambda kind: kind.flags)
+    evaluate(open_run(policy, modules), cfg)
 
 
-def run_suite(opened: EvaluationRun, args: Sequence[str]) -> None:
-    """Run the suite named after --suite in args (policy, then flags). Raises UsageError: there is no such suite."""
+def run_suite(task: TaskCfg, args: Sequence[str], modules: Sequence[ModuleType]) -> None:
+    """Run the suite named after --suite in args (policy of the task, then flags). Raises UsageError: no such suite."""
     from jumper_warp.evaluation.suites import suites_for
 
     flag = args.index(SUITE)
-    suites, name = suites_for(opened.task.evaluation_suite), "".join(args[flag + 1 : flag + 2])
+    suites, name = suites_for(task.evaluation_suite), "".join(args[flag + 1 : flag + 2])
     if name not in suites:
         if not suites:
-            raise UsageError(f"there are no suites for policies of {opened.task.name}")
+            raise UsageError(f"there are no suites for policies of {task.name}")
         near = suggestion(name, suites) or f"; there are {', '.join(suites)}"
-        raise UsageError(f"no suite {name!r:.60} for policies of {opened.task.name}{near}")
-    command, default = f"evaluate {opened.source} {SUITE} {name}", suites[name](policy=str(opened.source))
-    parse_flags(suites[name], command, [*args[1:flag], *args[flag + 2 :]], default=default).run(opened.modules)
+        raise UsageError(f"no suite {name!r:.60} for policies of {task.name}{near}")
+    command, default = f"evaluate {args[0]} {SUITE} {name}", suites[name](policy=args[0])
+    parse_flags(suites[name], command, [*args[1:flag], *args[flag + 2 :]], default=default).run(list(modules))
 
 
 def policy_of(command: str, about: str, args: Sequence[str]) -> str:
@@ -88,16 +92,34 @@ def open_run(policy: str, modules: Sequence[ModuleType]) -> EvaluationRun:
         return EvaluationRun(policy, modules)
 
 
-def parse(
-    command: str, opened: EvaluationRun, args: Sequence[str], kind: Any, flags_of: Callable[[Evaluation], Any]
-) -> Any:
-    """Parse the flags of a command on an opened policy into settings; exits as tyro does.
+def saved_task(source: str, modules: Sequence[ModuleType]) -> TaskCfg:
+    """Return the task of a policy or of a training run, from config.json in its folder, without PyTorch.
+
+    Raises PolicyError or CheckpointError: it cannot be used.
+    """
+    from jumper_warp.policies.catalog import CONFIG, find_policy
+    from jumper_warp.policies.restore import restored_task
+
+    path = Path(source)
+    folder = path.parent.parent if path.suffix == ".pt" else find_policy(source)
+    try:
+        config = json.loads((folder / CONFIG).read_bytes())
+    except (OSError, ValueError):
+        return open_run(source, modules).task
+    return restored_task(config, modules)
+
+
+def parse(command: str, task: TaskCfg, args: Sequence[str], kind: Any, flags_of: Callable[[Evaluation], Any]) -> Any:
+    """Parse the flags of a command on a policy of a task into settings; args: the policy, then flags.
 
     kind: generic dataclass of the settings, such as `EvaluateCfg`. flags_of: returns the defaults of the task's flags.
     Raises UsageError: a flag belongs to other tasks only, or a setting is out of range.
     """
-    flags, about = flags_of(opened.evaluation), kind.__doc__
+    from jumper_warp.evaluation.evaluations import evaluation_of
+
+    policy, *args = args
+    flags = flags_of(evaluation_of(task))
     if hasattr(flags, "height_range"):
         args = join_height_range(args, flags.height_range)
-    settings = {"description": about, "default": kind(flags), "subject": f"policies of {opened.task.name}"}
-    return parse_flags(kind[type(flags)], f"{command} {opened.source}", args, **settings)
+    settings = {"description": kind.__doc__, "default": kind(flags), "subject": f"policies of {task.name}"}
+    return parse_flags(kind[type(flags)], f"{command} {policy}", args, **settings)

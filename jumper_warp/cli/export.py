@@ -16,13 +16,13 @@ from jumper_warp.cli.main import parse
 class ExportCfg:
     """Save the policy of a training run as a folder, or a policy as one ONNX file."""
 
-    source: tyro.conf.Positional[str]  # Folder of a run, checkpoint, or name or folder of a policy
+    source: tyro.conf.Positional[str]  # Name or folder of a policy, folder of a training run, or checkpoint
     out: Path | None = None
-    """File name that ends in .onnx, or folder of the new policy (default: policy/ in the run, or <task>.onnx)."""
+    """ONNX file, or folder of the new policy (default: policy/ in the run's folder; of a policy <task>.onnx)."""
     newest: bool = False  # Export the newest checkpoint of a run, not the best
     overwrite: bool = False  # Replace an existing policy with its metrics and README
     blend: tuple[str, float] | None = None
-    """Name or folder of a second policy, and its fraction, 0 to 1, in the weighted mean of both networks."""
+    """Second policy, and its weight, 0 to 1, in the weighted mean of both networks."""
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:

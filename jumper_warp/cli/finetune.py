@@ -21,17 +21,22 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     Raises UsageError, InputError or OSError: the policy or a flag is invalid.
     """
     name = policy_of("finetune", ABOUT, args)
+    from jumper_warp.evaluation.finetuning_cfg import FinetuneArgs
+    from jumper_warp.policies.catalog import find_policy
+
+    if Path(name).suffix != ".pt":
+        find_policy(name)  # a misspelt name is reported before PyTorch is imported
+    parsed: FinetuneArgs = parse(FinetuneArgs, f"finetune {name}", args[1:])
     from jumper_warp.utils.progress import phase
 
     with phase(f"opening {name}"):
-        from jumper_warp.evaluation.finetuning import FinetuneArgs, finetune
+        from jumper_warp.evaluation.finetuning import finetune
         from jumper_warp.policies.folder import checked_folder, save_policy
         from jumper_warp.policies.runs import open_policy
         from jumper_warp.policies.spec import PolicyError
         from jumper_warp.utils.runtime import configure_device
 
         policy = open_policy(name)
-    parsed: FinetuneArgs = parse(FinetuneArgs, f"finetune {name}", args[1:])
     out = checked_folder(parsed.out or Path(f"{Path(name).name}_finetuned"))
     if out.exists() and not parsed.overwrite:
         raise PolicyError(f"{out} exists; overwrite replaces it")

@@ -46,6 +46,11 @@ class Flag(NamedTuple):
         return [] if self.positional else [f"--{name}" for name in (self.name, *negative)]
 
     @property
+    def first_sentence(self) -> str:
+        """First sentence of the description, without its full stop."""
+        return self.about.split(". ")[0].rstrip(".")
+
+    @property
     def metavar(self) -> str:
         """Placeholder of the value, such as "INT" or "{off,actor}"; empty for a switch."""
         return "" if self.kind is bool else metavar(self.kind)
@@ -98,7 +103,8 @@ def field_docs(kind: type) -> dict[str, str]:
             about = comment.partition("#")[2]
             if isinstance(text, ast.Expr) and isinstance(text.value, ast.Constant):
                 about = str(text.value.value)
-            docs[ast.unparse(field.target)] = " ".join(about.split())
+            name = ast.unparse(field.target)
+            docs[name] = " ".join(about.split()) or docs.get(name, "")
     return docs
 
 

@@ -13,7 +13,7 @@ from jumper_warp.utils.errors import InputError, suggestion
 
 HELP, HELP_ALL = ("-h", "--help"), "--help-all"
 BRIEF = "Defaults are in parentheses.\n"
-MAX_LINES = 60  # A longer page of --help has the first sentence about each flag only
+MAX_LINES = 60  # A longer page of --help has the first paragraph, and the first sentence about each flag, only
 INDENT = 30  # Column of the descriptions
 MAX_WIDTH = 100  # Columns of a page on a wider terminal
 Short = Mapping[str, Sequence[str]]
@@ -31,16 +31,18 @@ def help_page(command: str, about: str, flags: Sequence[Flag], args: Sequence[st
     about: what the command does. short: flags of --help (default: all). Raises InputError: there is no such group.
     """
     words = " ".join(flag.name for flag in flags if flag.positional)
-    head = f"usage: jumper {command} {words + ' ' if words else ''}[flags]\n\n{wrap(about)}\n"
+    usage = f"usage: jumper {command} {words + ' ' if words else ''}[flags]\n\n"
+    full = f"{usage}{wrap(about)}\n\n{sections(flags)}"
     if HELP_ALL in args:
-        return f"{head}\n{sections(flags)}"
+        return full
     following = args[next(i for i, arg in enumerate(args) if arg in HELP) + 1 :][:1]
     if following and not following[0].startswith("-"):
         return sections(group_of(following[0], flags))
-    if short is not None:
-        return f"{head}{BRIEF}\n{short_sections(flags, short)}\n{more(flags)}"
-    page = f"{head}\n{sections(flags)}"
-    return page if page.count("\n") < MAX_LINES else f"{head}{BRIEF}\n{sections(flags, brief=True)}\n{more(flags)}"
+    if short is None and full.count("\n") <= MAX_LINES:
+        return full
+    rows = sections(flags, brief=True) if short is None else short_sections(flags, short)
+    about, _, _ = about.partition("\n\n")
+    return f"{usage}{wrap(about)}\n{BRIEF}\n{rows}\n{more(flags)}"
 
 
 def group_of(name: str, flags: Sequence[Flag]) -> list[Flag]:
@@ -104,7 +106,7 @@ def row(flag: Flag, *, brief: bool = False) -> str:
         start, dot, last = flag.name.rpartition(".")
         name = f"--{start}{dot}[no-]{last}"
     left = f"  {name} {'' if flag.positional else flag.metavar}".rstrip()
-    about = flag.about.split(". ")[0] if brief else flag.about
+    about = flag.first_sentence if brief else flag.about
     default = "" if "(default" in about else default_text(flag.default)
     default = f"({'' if brief else 'default: '}{default})" if default else ""
     return columns(left, f"{about.rstrip('.')} {default}".strip()) if about else f"{left} {default}\n"

@@ -29,13 +29,14 @@ USAGE_ERROR = 2  # Exit code for input that cannot be used
 INTERRUPTED = 130  # Exit code after Ctrl-C
 COMMANDS = {
     "train": "Train a policy: jumper train TASK.",
-    "finetune": "Make a jumping policy miss by less, by gradients through the physics.",
+    "finetune": "Reduce a jumping policy's errors by gradients through the physics.",
     "play": "Record a policy for the Rerun viewer.",
     "evaluate": "Measure a policy over many trials.",
-    "export": "Make a policy's folder of a training run, or one ONNX file of a policy.",
+    "export": "Save a training run as a policy, or a policy as one ONNX file.",
     "sysid": "Identify the robot's parameters from recorded motions.",
     "list": "List the tasks and the project's policies.",
     "info": "Describe a task or a policy: jumper info NAME.",
+    "completion": "Print the script that completes commands and flags in bash or zsh.",
 }
 """Help text by command; each command is a module of `jumper_warp.cli` with run(args, modules)."""
 RED, RESET = "\033[31m", "\033[0m"  # Colour of the program's name before an error
@@ -43,8 +44,8 @@ CODEGEN = re.compile(r'Error while parsing function "(\w+)" at (.+):\d+:')
 """Function and file in Warp's message about a kernel that does not compile; the last match has the error."""
 TASK_MODULE = "--task-module"
 TASK_MODULE_HELP = f"""\
-Every command takes {TASK_MODULE} FILE_OR_MODULE, any number of times: a FILE.py or
-an installed module that registers tasks of your own."""
+Every command takes {TASK_MODULE} FILE_OR_MODULE, any number of times: a
+FILE.py or an installed module that registers tasks of your own."""
 EXIT_CODES = "Exit codes: 0 done, 1 a fault in jumper, 2 invalid input, 130 after Ctrl-C."
 
 
@@ -155,7 +156,8 @@ def parse(
     options = {option for flag in flags for option in flag.options}
     for option in filter(None, map(option_of, args)):
         if option not in options:
-            near = suggestion(option, options) or f"; jumper {command} --help lists the flags"
+            near = suggestion(option[2:], (each[2:] for each in options)).replace("'", "'--", 1)
+            near = near or f"; jumper {command} --help lists the flags"
             raise UsageError(f"no flag {option} for {subject or command}{near}")
     import tyro
 
@@ -173,11 +175,12 @@ def parse_error(printed: str, flags: Sequence[Flag], args: Sequence[str]) -> str
     """Return one line about arguments that tyro refused; printed: tyro's message in its box."""
     from jumper_warp.cli.flags import values_of
 
+    printed = re.sub(r"\x1b\[[0-9;]*m", "", printed)  # colours, on a terminal
     lines = [line.strip("│ ") for line in printed.splitlines()[1:]]
     message = " ".join(itertools.takewhile(lambda line: not line.startswith("─"), lines))
     missing = [flag for flag in flags if flag.positional and flag.default is dataclasses.MISSING]
     if missing and message.startswith("Missing from"):
-        return f"{missing[0].name} is missing: {missing[0].about}"
+        return f"{missing[0].name} is missing: {missing[0].first_sentence}"
     options = {option: flag for flag in flags for option in flag.options}
     for word in re.findall(r"--[\w.-]+", message):
         if flag := options.get(word.rstrip(".")):

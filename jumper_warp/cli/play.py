@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from types import ModuleType
 
-from jumper_warp.cli.evaluate import open_run, parse, policy_of
+from jumper_warp.cli.evaluate import open_run, parse, policy_of, saved_task
 from jumper_warp.cli.main import parse as parse_flags
 
 ABOUT = """\
@@ -31,7 +31,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
         play_script(parse_flags(ScriptCfg, f"play {SCRIPT} FILE", args))
         return
     policy = policy_of("play", ABOUT, args)
-    opened = open_run(policy, modules)
     from jumper_warp.evaluation.commands import PlayCfg, play
 
-    play(opened, parse("play", opened, args[1:], PlayCfg, lambda kind: kind.play))
+    cfg = parse("play", saved_task(policy, modules), args, PlayCfg, lambda kind: kind.play)
+    play(open_run(policy, modules), cfg)

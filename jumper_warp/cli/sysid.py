@@ -26,7 +26,7 @@ usage: jumper sysid [fit] DATA ... [flags]
   actuator  limits, friction and latency of one motor from a test bench
 
 The result identified.json is for --robot of jumper train, evaluate and play.
-jumper sysid DATA --help shows the flags, and so do excite --help and actuator --help.
+jumper sysid fit --help, excite --help and actuator --help list the flags.
 
 {TASK_MODULE_HELP}"""
 
@@ -100,7 +100,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     modules: unused, as all commands take it. Raises InputError or OSError: data or a flag is invalid.
     """
     if not args:
-        raise UsageError("data comes first: jumper sysid DATA ... [flags]; jumper sysid --help lists the flags")
+        raise UsageError("the recorded motions come first: jumper sysid fit DATA ...; see jumper sysid --help")
     if args[0] in ("-h", "--help"):
         print(HELP)
         raise SystemExit(0)
@@ -109,7 +109,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     elif args[0] == "actuator":
         characterise(parse(ActuatorCfg, "sysid actuator", args[1:]))
     else:
-        sysid(parse(SysidCfg, "sysid", args[1:] if args[0] == "fit" else args))
+        sysid(parse(SysidCfg, "sysid fit", args[1:] if args[0] == "fit" else args))
 
 
 def split_names(text: str) -> list[str]:
@@ -145,18 +145,18 @@ def sysid(cfg: SysidCfg) -> None:
     if cfg.json:
         print((folder / "report.json").read_text(encoding="utf-8"), end="")
         return
-    table = Table("parameter", "unit", "described", "found", "95 %", box=None)
+    table = Table("parameter", "unit", "description", "identified", "95 % interval", box=None)
     rows = zip(result.parameters, result.values, result.intervals, result.identified, strict=True)
     for parameter, value, (low, high), identified in rows:
         row = (parameter.name, parameter.unit, f"{parameter.nominal:.5g}", f"{value:.5g}", f"{low:.5g} … {high:.5g}")
         table.add_row(*row, style=None if identified else "dim")
     Console().print(table)
     wider = f"; intervals {result.mismatch:.3g} times wider for the model's errors" if result.mismatch != 1.0 else ""
-    print(f"χ² {result.chi2:.4g} (described {result.nominal_chi2:.4g}), {result.effort.seconds:.1f} s{wider}")
+    print(f"χ² {result.chi2:.4g} (robot as described: {result.nominal_chi2:.4g}), {result.effort.seconds:.1f} s{wider}")
     for words in dict.fromkeys(direction.words for direction in result.directions):
-        print(f"open: {words}")
+        print(f"not identified: {words}")
     for line in result.warnings:
-        print(f"misfit: {line}")
+        print(f"warning: {line}")
     print(folder / "report.html")
 
 
@@ -189,7 +189,7 @@ def excite(cfg: ExciteCfg) -> None:
     write_atomically(folder / "excite.json", json_bytes({"mass_kg": mass} | chosen.to_json()))
     num_identified = int((chosen.std < 0.5).sum())
     print(f"{num_identified} of {len(parameters)} parameters are expected to be identified; motions in {folder}")
-    print(f"the recorded robot weighs {mass:.3f} kg: jumper sysid {folder} --mass {mass:.3f}")
+    print(f"the recorded robot weighs {mass:.3f} kg: jumper sysid fit {folder} --mass {mass:.3f}")
 
 
 def characterise(cfg: ActuatorCfg) -> None:

@@ -4,15 +4,17 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.log import COLLIDED, DIVERGED, NO_END, SUCCESS, EvaluationLog, finite
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, measure, rate
+
+if TYPE_CHECKING:
+    from jumper_warp.envs.env import Env
 
 AXES = ("roll", "pitch", "yaw")
 DIRECTIONS = tuple(f"{axis}_{sign}" for axis in AXES for sign in ("plus", "minus"))

@@ -1,4 +1,7 @@
-"""Implementation of `jumper evaluate` and `jumper play`: run episodes, write and print their metrics."""
+"""Implementation of `jumper evaluate` and `jumper play`: run episodes, write and print their metrics.
+
+Functions import what they need, so that the help of the settings needs neither PyTorch nor Newton.
+"""
 
 from __future__ import annotations
 
@@ -12,15 +15,9 @@ import tyro
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_course
-from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
-from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
-from jumper_warp.evaluation.run import EvaluationRun, SkillRun
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.policies.catalog import find_policy
 from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.folder import add_files
-from jumper_warp.policies.runs import is_run
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
@@ -29,6 +26,8 @@ from jumper_warp.utils.output import write_metrics
 from jumper_warp.utils.summary import PrintFlags
 
 if TYPE_CHECKING:
+    from jumper_warp.evaluation.log import EvaluationLog
+    from jumper_warp.evaluation.run import EvaluationRun
     from jumper_warp.viz.recording import Recording
 
 Flags = TypeVar("Flags")
@@ -36,7 +35,7 @@ Flags = TypeVar("Flags")
 
 @dataclass(frozen=True)
 class EvaluateCfg(Generic[Flags]):
-    """Try a policy many times and report how well it did."""
+    """Measure a policy over many trials, print its metrics and write metrics.json."""
 
     flags: Annotated[Flags, tyro.conf.arg(name="")]
     """Flags of the task's kind, `jumper_warp.evaluation.evaluations.EvaluationFlags`."""
@@ -55,6 +54,9 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
     Raises PolicyError: unusable policy, or `save_to_policy` for a run; InputError: `save_to_policy` for another stream
     than reporting; OSError: the folder cannot be created.
     """
+    from jumper_warp.policies.folder import add_files
+    from jumper_warp.policies.runs import is_run
+
     if cfg.save_to_policy and cfg.conditions.stream != "reporting":
         raise InputError(f"save_to_policy is for the stream reporting, got {cfg.conditions.stream}")
     if cfg.save_to_policy and is_run(run.source):
@@ -100,7 +102,7 @@ class RecordingCfg:
     """Flags that all recordings share."""
 
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
-    """What the policies are tried in."""
+    """Conditions of the simulation."""
     film: Annotated[FilmCfg, tyro.conf.arg(name="")] = field(default_factory=FilmCfg)
     """A film of the recording."""
     out: Path | None = None  # Folder for recording, picture, metrics.json and plots (default: outputs/play/<time>)
@@ -110,7 +112,7 @@ class RecordingCfg:
 
 @dataclass(frozen=True)
 class PlayCfg(RecordingCfg, Generic[Flags]):
-    """Let a policy act, and record it."""
+    """Simulate a policy, and write a recording, a picture, metrics and on request a film."""
 
     flags: Annotated[Flags, tyro.conf.arg(name="")]
     """Flags of the task's kind, `jumper_warp.evaluation.evaluations.PlayFlags`."""
@@ -127,6 +129,9 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
 
     Raises PolicyError: the policy cannot be used; OSError: the folder cannot be created.
     """
+    from jumper_warp.evaluation.log import run_evaluation
+    from jumper_warp.evaluation.recorder import EnvRecorder
+
     flags, name = cfg.flags, run.policy.interface.task
     run.prepare("play", cfg.conditions, cfg.out)
     log = flags.log(run.evaluation.prepare_task(run.task))
@@ -142,15 +147,16 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
 
 @dataclass(frozen=True)
 class ScriptCfg(RecordingCfg):
-    """Let one robot walk and jump with several policies, as a script says, and record it.
+    """Simulate a script of walks and jumps of one robot, and write a recording, a picture, metrics and a plot.
 
     A script is a JSON list of {"walk": [vx, vy, yaw_rate], "seconds": s}, {"stand": s}, {"jump_up": height},
     {"jump_to": [ahead, left]} and {"jump_onto": [ahead, left]} (a block); SI units, as in
     assets/scripts/walk_jump_walk.json.
     """
 
-    script: Path  # File with the commands
-    policies: Annotated[SkillNames, tyro.conf.arg(name="")] = field(default_factory=SkillNames)  # Who carries them out
+    script: Path  # Script of commands, a JSON file
+    policies: Annotated[SkillNames, tyro.conf.arg(name="")] = field(default_factory=SkillNames)
+    """Policies of the three skills."""
 
 
 def play_script(cfg: ScriptCfg) -> Path:
@@ -158,6 +164,11 @@ def play_script(cfg: ScriptCfg) -> Path:
 
     Raises InputError: unusable script or device; PolicyError: unusable policy; OSError: the folder cannot be created.
     """
+    from jumper_warp.evaluation.courses import CourseLog, course_metrics, plot_course
+    from jumper_warp.evaluation.log import run_evaluation
+    from jumper_warp.evaluation.recorder import EnvRecorder
+    from jumper_warp.evaluation.run import SkillRun
+
     script = read_script(cfg.script)
     run = SkillRun(cfg.policies)
     run.prepare("play", cfg.conditions, cfg.out)
@@ -178,6 +189,8 @@ def show_recording(recording: Recording, folder: Path, name: str, cfg: Recording
 
     Returns the path of the .rrd file.
     """
+    from jumper_warp.evaluation.recorder import save_recording
+
     console = Console(stderr=True)
     path = save_recording(recording, folder, name)
     paths = [path, path.with_suffix(".png")]

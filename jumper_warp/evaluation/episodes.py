@@ -5,16 +5,18 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, finite, outcome_names
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.commands import layout_of
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, mean, rate
+
+if TYPE_CHECKING:
+    from jumper_warp.envs.env import Env
 
 MAX_SECONDS = 600.0  # [s] Maximum length of an episode
 MAX_COMMAND_SIZE = 4  # Maximum number of values in a command

@@ -10,8 +10,7 @@ import json
 import math
 import time
 from collections.abc import Callable, Iterable
-from dataclasses import asdict, dataclass, replace
-from pathlib import Path
+from dataclasses import asdict, replace
 from types import ModuleType
 from typing import Any
 
@@ -19,6 +18,7 @@ import numpy as np
 import torch
 
 from jumper_warp.evaluation.evaluations import evaluation_of
+from jumper_warp.evaluation.finetuning_cfg import FinetuneCfg
 from jumper_warp.evaluation.jump_errors import JumpErrors, JumpGroup, jump_errors
 from jumper_warp.evaluation.jumps import LANDED, jump_commands
 from jumper_warp.policies.conditions import Conditions, env_of_policy
@@ -26,7 +26,6 @@ from jumper_warp.policies.policy import Policy
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.trajectory.gauss_newton import Anchor, Network, gauss_newton_step
-from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.progress import phase
 from jumper_warp.utils.runtime import git_commit
@@ -38,47 +37,6 @@ TRUST_REGION_SECONDS = 3.5  # [s] Length of the episodes whose observations are 
 TRUST_REGION_SAMPLES = 4096  # Maximum number of these samples
 DAMPING = 1.0e-2  # [1] Levenberg-Marquardt damping of the first step
 AIM_ROUNDS = 3  # Maximum number of corrections of the aim
-
-
-@dataclass(frozen=True)
-class FinetuneCfg:
-    """Settings of fine-tuning: numbers of jumps, ranges of goals, standard deviations that weight errors."""
-
-    num_goals: int = 64  # Number of jumps of the nominal robot, spread evenly over the goals
-    num_delayed: int = 32  # Number of jumps of the nominal robot with latencies drawn from the training's range
-    num_randomized: int = 64  # Number of jumps of robots randomised as in the training, with noise, latency and pushes
-    height_range: tuple[float, float] = (0.5, 1.075)
-    """[m] Lowest and highest commanded base height, of jumps to heights."""
-    distance_range: tuple[float, float] = (0.3, 1.4)  # [m] Nearest and farthest goal straight ahead, of jumps to places
-    iterations: int = 6  # Gauss-Newton steps; 0 for places: the aim alone
-    miss_std: float = 0.001
-    """[m] Miss of the nominal robot that costs as much as a change of the actions by --action-std."""
-    delayed_std: float = 0.003  # [m] Miss with latencies that costs as much
-    randomized_std: float = 0.01  # [m] Miss of a randomised robot that costs as much
-    action_std: float = 0.02
-    """[1] Change of the actions against the given policy, root of the sum of squares over the motors."""
-    landing_std: float = 0.005  # [1] Change of the actions after touchdown that costs as much
-    seed: int = 0  # Seed of commands, latencies and robots (stream: tuning)
-    device: str | None = None  # Warp device (default: a GPU if there is one)
-    threads: int | None = None  # CPU threads that share the worlds (default: all cores); they change no result
-
-    def __post_init__(self) -> None:
-        if self.num_goals < 2 or min(self.num_delayed, self.num_randomized, self.iterations) < 0:
-            raise InputError("fine-tuning needs at least 2 goals, and no negative number of jumps or steps")
-        for name in ("miss_std", "delayed_std", "randomized_std", "action_std", "landing_std"):
-            check_positive(name, getattr(self, name))
-        for name in ("height_range", "distance_range"):
-            low, high = getattr(self, name)
-            if not 0.0 < low < high < 10.0:
-                raise InputError(f"{name} must be in (0, 10) m and rise, got {low}, {high}")
-
-
-@dataclass(frozen=True)
-class FinetuneArgs(FinetuneCfg):
-    """Make a jumping policy miss its heights or places by less, by gradients through physics, motors and network."""
-
-    out: Path | None = None  # Folder of the new policy (default: <policy>_finetuned)
-    overwrite: bool = False  # Replace a policy that is there already
 
 
 def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] = ()) -> list[JumpGroup]:
@@ -245,7 +203,7 @@ def finetune(
         with phase("correcting the aim", AIM_ROUNDS + 1) as advance:
             policy, aims = correct_aim(policy, groups, lambda line: (log(line), advance()))
     elif cfg.iterations == 0:
-        raise InputError("a policy for heights has no aim to be taken apart: fine-tuning it needs an iteration")
+        raise InputError("iterations must be at least 1 for jumps to heights, which have no aim to correct, got 0")
     network = Network(policy, device=groups[0].env.device)
     with phase("fine-tuning", cfg.iterations + 1) as advance:
         history = tune_weights(groups, network, cfg, lambda line: (log(line), advance()), begin)

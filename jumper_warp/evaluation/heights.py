@@ -4,18 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import torch
 import tyro
 
-from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jump_metrics import JumpFlags
 from jumper_warp.evaluation.jumps import REST_TIME, JumpLog
 from jumper_warp.evaluation.log import run_evaluation, termination_names
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+
+if TYPE_CHECKING:
+    import torch
+
+    from jumper_warp.envs.env import Env
 
 PAPER = {"apex_error_abs_mean_m": 0.04, "goal_reached_rate": 0.91, "in_range_goal_reached_rate": 1.0}
 """Values of the paper's simulation, by key; it judges a jump by its apex alone."""

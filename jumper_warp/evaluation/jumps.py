@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.log import (
     COLLIDED,
     DIVERGED,
@@ -22,6 +22,9 @@ from jumper_warp.evaluation.log import (
 )
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+
+if TYPE_CHECKING:
+    from jumper_warp.envs.env import Env
 
 PHASES = ("stance", "flight", "landed")  # Names of the values of a jump's phase
 STANCE, LANDED = 0, 2  # Values of the jump's phase before takeoff and after touchdown

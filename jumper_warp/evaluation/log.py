@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from jumper_warp.envs.env import Env
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, rate
@@ -17,6 +16,8 @@ from jumper_warp.utils.progress import phase
 
 if TYPE_CHECKING:
     import torch
+
+    from jumper_warp.envs.env import Env
 
 SUCCESS = "success"  # Outcomes, also names of terminations
 DIVERGED = "diverged"  # The state of the simulation is not finite or absurdly fast

@@ -4,19 +4,21 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import tyro
 from numpy.typing import ArrayLike
 
-from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import wrapped, yaw_of
 from jumper_warp.evaluation.log import EvaluationLog, finite, outcome_names
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metric, Metrics, mean, measure, rate, rmse
 from jumper_warp.utils.rotations import CONJUGATE, rotate
+
+if TYPE_CHECKING:
+    from jumper_warp.envs.env import Env
 
 Velocity = tuple[float, float, float]  # Ahead, to the left [m/s], about z [rad/s]
 AXES = ("vx", "vy", "yaw_rate")

@@ -8,10 +8,8 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
-from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.restore import task_of_policy
 from jumper_warp.robot.gravity import check_gravity
-from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
@@ -23,8 +21,7 @@ from jumper_warp.utils.streams import purpose_seed
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
-
-SHORTEST_LATENCY = 500.0 * PHYSICS_DT  # [ms] Half a physics step; a shorter latency would round to 0
+    from jumper_warp.policies.policy import Policy
 
 
 @dataclass(frozen=True)
@@ -55,9 +52,13 @@ class Conditions:
     def __post_init__(self) -> None:
         """Raise InputError if a value is out of range, or push_in_flight is set without randomize."""
         check_seed(self.seed)
-        if self.latency is not None and 0.0 < self.latency < SHORTEST_LATENCY:
-            least = f"{SHORTEST_LATENCY:.3g} ms, half a physics step"
-            raise InputError(f"latency must be 0 or at least {least}, got {self.latency:g} ms")
+        if self.latency:
+            from jumper_warp.robot.model import PHYSICS_DT
+
+            shortest = 500.0 * PHYSICS_DT  # [ms] Half a physics step; a shorter latency would round to 0
+            if 0.0 < self.latency < shortest:
+                least = f"{shortest:.3g} ms, half a physics step"
+                raise InputError(f"latency must be 0 or at least {least}, got {self.latency:g} ms")
         if self.gravity is not None:
             check_gravity(self.gravity)
         self._with_fixed_parameters(RandomizationCfg.off())  # raises if a value is out of range

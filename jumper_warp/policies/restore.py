@@ -7,12 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Collection, Iterable
 from types import ModuleType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json
+
+if TYPE_CHECKING:
+    from jumper_warp.policies.policy import Policy
 
 
 def task_of_policy(

@@ -5,17 +5,16 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-import torch
-
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.restore import task_of_policy
-from jumper_warp.policies.runs import open_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.switching import skills_and_handovers
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
+    import torch
+
     from jumper_warp.envs.env import Env
 
 WALK, JUMP_UP, JUMP_TO = range(3)  # Indices of the skills: walking, jump to a height, jump to a position
@@ -25,9 +24,9 @@ WALK, JUMP_UP, JUMP_TO = range(3)  # Indices of the skills: walking, jump to a h
 class SkillNames:
     """Name or folder of the policy of each skill."""
 
-    walk: str = "walking_flat"  # Follows commanded velocities
-    jump_up: str = "vertical_jump"  # Jumps to a commanded height
-    jump_to: str = "horizontal_jump"  # Jumps to a commanded position
+    walk: str = "walking_flat"  # Policy that follows commanded velocities
+    jump_up: str = "vertical_jump"  # Policy that jumps to a commanded height
+    jump_to: str = "horizontal_jump"  # Policy that jumps to a commanded position
 
 
 class SkillPolicies:
@@ -38,6 +37,8 @@ class SkillPolicies:
 
         Raises PolicyError or CheckpointError: one cannot be used, or its task is not of this skill.
         """
+        from jumper_warp.policies.runs import open_policy
+
         self.names = SkillNames() if names is None else names
         sources = (self.names.walk, self.names.jump_up, self.names.jump_to)
         self.policies = [open_policy(source) for source in sources]
@@ -73,6 +74,8 @@ class SkillPolicies:
 
     def act(self, env: Env) -> torch.Tensor:
         """Return every skill's action for its observation, (skills, num_envs, 12), without host synchronisation."""
+        import torch
+
         return torch.stack(
             [policy.act(skill.obs["actor"]) for policy, skill in zip(self.policies, env.skills, strict=True)]
         )

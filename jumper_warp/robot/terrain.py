@@ -5,12 +5,14 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
-import newton
 import numpy as np
 
 from jumper_warp.utils.errors import InputError
+
+if TYPE_CHECKING:
+    import newton
 
 KINDS = ("flat", "uneven", "waves", "slope", "bowl", "stairs", "pit", "blocks")  # of tiles
 
@@ -77,6 +79,8 @@ def terrain_map(cfg: TerrainCfg) -> newton.Heightfield:
     The tile of row i and column j has its middle at x = (i + 1/2 - rows/2) tile, y = (j + 1/2 - cols/2) tile.
     Raises InputError for a configuration without rows.
     """
+    import newton
+
     if cfg.rows == 0:
         raise InputError("a map needs at least one row")
     nodes = math.ceil(cfg.tile / cfg.cell - 1.0e-9)
@@ -96,6 +100,8 @@ def terrain_map(cfg: TerrainCfg) -> newton.Heightfield:
 
 def single_tile(cfg: TerrainCfg, kind: str) -> newton.Heightfield:
     """Return one tile of full difficulty, centred on the origin. Raises InputError for a kind not in `KINDS`."""
+    import newton
+
     check_kind(kind)
     heights = tile_heights(cfg, kind, 1.0, np.random.default_rng(cfg.seed)).astype(np.float32)
     half = 0.5 * cfg.tile

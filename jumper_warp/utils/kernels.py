@@ -32,5 +32,5 @@ def load_kernels(kernels: Iterable[tuple[Kernel, int]], device: wp.Device) -> No
     """
     variants = {(kernel.module, block if device.is_cuda else None): None for kernel, block in kernels}
     loads = [partial(wp.force_load, device, [module], block, 0) for module, block in variants]
-    with phase("loading kernels (the first run compiles them)"):
+    with phase("compiling or loading kernels"):
         run_in_parallel(loads, available_threads())

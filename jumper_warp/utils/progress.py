@@ -45,7 +45,7 @@ def phase(title: str, total: int | None = None) -> Iterator[Callable[..., object
         return
     progress, outer = _shown, _shown
     if progress is None:
-        columns = ("{task.description}", BarColumn(24), TimeElapsedColumn(), _TimeLeft())
+        columns = ("{task.description}", BarColumn(20), TimeElapsedColumn(), _TimeLeft())
         # prints to another file than the terminal must not be redirected to it
         progress = Progress(*columns, console=Console(stderr=True), transient=True, redirect_stdout=sys.stdout.isatty())
         progress.start()

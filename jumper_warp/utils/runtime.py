@@ -76,7 +76,8 @@ def configure_device(device: str | None, threads: int | None = None) -> DeviceIn
     try:
         return _report_once(device, checked_threads(None))
     except (ValueError, RuntimeError) as error:
-        raise InputError(f"no device {device!r:.60}") from error
+        known = ", ".join(each.alias for each in wp.get_devices())
+        raise InputError(f"no device {device!r:.60}; available: {known}") from error
 
 
 @functools.cache

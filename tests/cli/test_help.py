@@ -10,7 +10,7 @@ import tyro
 import jumper_warp
 from cli_helpers import run
 from jumper_warp.cli.flags import list_flags
-from jumper_warp.cli.main import parse
+from jumper_warp.cli.main import parse, parse_error
 from jumper_warp.cli.train import SHORT_HELP, TrainArgs, report_cpu_time
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.utils.errors import InputError
@@ -20,6 +20,11 @@ from jumper_warp.utils.errors import InputError
 class Engine:
     power: float = 2.5  # [kW] Largest power
     valves: tuple[int, int] = (2, 2)
+
+
+@dataclass(frozen=True)
+class Motor(Engine):
+    power: float = 4.0
 
 
 @dataclass(frozen=True)
@@ -64,6 +69,10 @@ def test_flags_have_names_types_defaults_and_descriptions():
         "Settings of the engine",
     )
     assert (flags["engine.power"].default, flags["power"].default, flags["map"].default) == (2.5, 0.1, None)
+
+
+def test_field_with_a_new_default_in_a_subclass_keeps_its_description():
+    assert next((flag.default, flag.about) for flag in list_flags(Motor)) == (4.0, "[kW] Largest power")
 
 
 def test_flags_of_an_instance_have_its_values_as_defaults():
@@ -122,6 +131,12 @@ def test_invalid_arguments_are_reported_in_one_line(args, message):
         parse_car(*args)
 
 
+def test_colours_of_a_terminal_are_no_part_of_an_error():
+    red, end = "\x1b[31m", "\x1b[0m"
+    box = f"{red}╭─{end} Value error ─╮\n{red}│{end} Error \x1b[1mparsing{end} --seed: no {red}│{end}\n│ ──── │"
+    assert parse_error(box, list_flags(Car), ["--seed", "x"]) == "--seed takes INT, got x"
+
+
 def test_arguments_set_nested_and_negated_flags():
     car = parse_car("A1", "--engine.power", "3", "--no-lights", "--power", "0.2")
     assert (car.road, car.engine.power, car.lights, car.radio.power) == ("A1", 3.0, False, 0.2)
@@ -168,6 +183,7 @@ def test_module_is_the_command(module):
 
 def test_usage_lists_exit_codes(capsys):
     _, out, _ = run(capsys, "--help")
+    assert max(map(len, out.splitlines())) <= 80
     assert all(f"{code} " in out.splitlines()[-1] for code in (0, 1, 2, 130))
 
 

@@ -67,7 +67,7 @@ def test_sysid_writes_overlay_and_self_contained_report(recorded, capsys):
     links = re.findall(r"(?:src|href)\s*=\s*[\"']?([^\"'\s>]*)", page)
     assert links and all(link.startswith("data:") for link in links) and "<script" not in page  # embedded data only
     printed = capsys.readouterr().out
-    assert "χ²" in printed and "misfit" not in printed and report["doubts"] == []
+    assert "χ²" in printed and "warning" not in printed and report["doubts"] == []
 
 
 def test_documentation_gives_the_mass_of_the_described_robot():
@@ -77,17 +77,17 @@ def test_documentation_gives_the_mass_of_the_described_robot():
     assert masses and all(mass == pytest.approx(described, abs=0.002) for mass in masses)
 
 
-def test_prints_misfit_of_a_wrong_mass(recorded, capsys):
+def test_prints_warning_of_a_wrong_mass(recorded, capsys):
     args = ["--params", "masses", "--mass", "20", "--mass-std", "0.5", "--out", str(recorded / "heavy")]
     main(["sysid", str(recorded / "motions" / "2_standing_chirp.npz"), *args])
-    assert "misfit: total mass is given as 20 ± 0.5 but found as" in capsys.readouterr().out
+    assert "warning: total mass is given as 20 ± 0.5 but found as" in capsys.readouterr().out
 
 
-def test_prints_misfit_of_a_hung_robot_taken_as_free(recorded, capsys):
+def test_prints_warning_of_a_hung_robot_taken_as_free(recorded, capsys):
     write_csv_table(recorded / "hung.csv", load_motion(recorded / "motions" / "0_hung_chirp.npz"))
     main(["sysid", str(recorded / "hung.csv"), *PARAMS, "--out", str(recorded / "as_free")])
-    misfits = [line for line in capsys.readouterr().out.splitlines() if line.startswith("misfit")]
-    assert len(misfits) == 1 and "hung fits worst" in misfits[0] and "--base fixed" in misfits[0]
+    warnings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning")]
+    assert len(warnings) == 1 and "hung fits worst" in warnings[0] and "--base fixed" in warnings[0]
     assert "--base fixed" in (recorded / "as_free" / "report.html").read_text()
 
 
@@ -122,7 +122,7 @@ def test_actuator_fits_friction_from_bench_data(tmp_path):
 @pytest.mark.parametrize(
     ("args", "words"),
     [
-        ([], "data comes first"),
+        ([], "recorded motions come first"),
         (["nowhere.npz"], "nowhere.npz"),
         (["."], "no npz, csv or parquet file"),
         (["x.npz", "--params", "gears"], "unknown group of parameters 'gears'"),

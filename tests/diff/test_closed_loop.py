@@ -9,7 +9,8 @@ import torch
 
 from jumper_warp.diff.closed_loop import ClosedLoop, heading_of
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.finetuning import FinetuneCfg, make_groups
+from jumper_warp.evaluation.finetuning import make_groups
+from jumper_warp.evaluation.finetuning_cfg import FinetuneCfg
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.registry import make_task
 from jumper_warp.trajectory.gauss_newton import Network, Tape, per_world_gradients

@@ -7,7 +7,8 @@ import pytest
 import torch
 
 from jumper_warp.cli.main import main
-from jumper_warp.evaluation.finetuning import FinetuneCfg, finetune, make_groups, shift_goal_observation
+from jumper_warp.evaluation.finetuning import finetune, make_groups, shift_goal_observation
+from jumper_warp.evaluation.finetuning_cfg import FinetuneCfg
 from jumper_warp.evaluation.jump_errors import jump_errors
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.policy import Policy
@@ -74,7 +75,7 @@ def test_finetune_command_writes_a_loadable_policy_and_refuses_to_overwrite_it(t
     with pytest.raises(SystemExit) as end:
         main(["finetune", "vertical_jump", "--out", str(out)])
     assert end.value.code == 2
-    assert capsys.readouterr().err == f"jumper: {out} exists\n"
+    assert capsys.readouterr().err == f"jumper: {out} exists; overwrite replaces it\n"
 
 
 def test_landing_errors_on_mars_are_measured_at_rest():
@@ -142,5 +143,5 @@ def test_refuses_policies_that_do_not_jump():
 
 
 def test_refuses_zero_iterations_for_height_policies():
-    with pytest.raises(InputError, match="needs an iteration"):
+    with pytest.raises(InputError, match="iterations must be at least 1"):
         finetune(open_policy("vertical_jump"), FinetuneCfg(**FEW | {"iterations": 0}))

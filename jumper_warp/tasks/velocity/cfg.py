@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import newton
 import warp as wp
 
 from jumper_warp.kernels.velocity.commands import CommandRanges
@@ -15,6 +14,9 @@ from jumper_warp.robot.terrain import TerrainCfg, terrain_map
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
 from jumper_warp.utils.checks import check_finite, check_probabilities
 from jumper_warp.utils.errors import InputError
+
+if TYPE_CHECKING:
+    import newton
 
 Reach = tuple[float, float, float, float]  # largest speeds: ahead, back, sideways [m/s], turning [rad/s]
 

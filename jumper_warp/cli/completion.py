@@ -1,0 +1,112 @@
+"""`jumper completion SHELL`: print the script that completes commands, tasks, policies and flags in a shell.
+
+    jumper completion bash > ~/.local/share/bash-completion/completions/jumper
+
+The names are those of today's package; flags of a single task, --env, are left out.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
+from types import ModuleType
+from typing import Any, Literal, get_args, get_origin
+
+import tyro
+
+from jumper_warp.cli.flags import Flag, list_flags
+from jumper_warp.cli.main import COMMANDS, TASK_MODULE, parse
+
+SCRIPT = """\
+_jumper() {{
+    local cur=${{COMP_WORDS[COMP_CWORD]}} prev=${{COMP_WORDS[COMP_CWORD-1]}} words=
+    if [[ $COMP_CWORD == 1 ]]; then
+        words="{commands}"
+    elif [[ $cur == -* ]]; then
+        case ${{COMP_WORDS[1]}} in
+{flags}
+        esac
+    elif [[ $prev == -* ]]; then
+        case $prev in
+{values}
+        esac
+    elif [[ $COMP_CWORD == 2 ]]; then
+        case ${{COMP_WORDS[1]}} in
+{names}
+        esac
+    fi
+    COMPREPLY=($(compgen -W "$words" -- "$cur"))
+}}
+complete -o default -F _jumper jumper
+"""
+ZSH = "autoload -U +X compinit && compinit\nautoload -U +X bashcompinit && bashcompinit\n"
+
+
+@dataclass(frozen=True)
+class CompletionCfg:
+    """Print the script that completes commands, tasks, policies and flags in a shell.
+
+    bash: jumper completion bash > ~/.local/share/bash-completion/completions/jumper
+    zsh: jumper completion zsh >> ~/.zshrc
+    """
+
+    shell: tyro.conf.Positional[Literal["bash", "zsh"]]  # bash or zsh
+
+
+def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
+    """Print the script; modules: the user's, whose tasks are registered already."""
+    cfg = parse(CompletionCfg, "completion", args)
+    from jumper_warp.registry import task_names
+    from jumper_warp.utils.assets import policy_tasks
+
+    tasks, policies = task_names(), tuple(policy_tasks())
+    names: dict[str, Iterable[str]] = dict.fromkeys(("play", "evaluate", "finetune", "export"), policies)
+    names |= {"train": tasks, "info": (*tasks, *policies), "sysid": ("fit", "excite", "actuator")}
+    names["completion"] = ("bash", "zsh")
+    flags = {command: [flag for cfg in settings_of(command) for flag in list_flags(cfg)] for command in COMMANDS}
+    script = SCRIPT.format(
+        commands=" ".join(COMMANDS),
+        flags=cases({command: options(each) for command, each in flags.items()}),
+        values=cases(choices(flag for each in flags.values() for flag in each)),
+        names=cases(names),
+    )
+    print((ZSH if cfg.shell == "zsh" else "") + script, end="")
+
+
+def settings_of(command: str) -> list[Any]:
+    """Return the dataclasses, or instances of them, whose fields are the flags of a command, for tasks of any kind."""
+    from jumper_warp.cli import export, info, list, sysid, train
+    from jumper_warp.evaluation.commands import EvaluateCfg, PlayCfg, ScriptCfg
+    from jumper_warp.evaluation.evaluations import EVALUATIONS
+    from jumper_warp.evaluation.finetuning_cfg import FinetuneArgs
+
+    return {
+        "train": [train.TrainArgs],
+        "finetune": [FinetuneArgs],
+        "play": [*(PlayCfg(kind.play) for kind in EVALUATIONS.values()), ScriptCfg],
+        "evaluate": [EvaluateCfg(kind.flags) for kind in EVALUATIONS.values()],
+        "export": [export.ExportCfg],
+        "sysid": [sysid.SysidCfg, sysid.ExciteCfg, sysid.ActuatorCfg],
+        "list": [list.ListCfg],
+        "info": [info.InfoCfg],
+    }.get(command, [])
+
+
+def options(flags: Iterable[Flag]) -> list[str]:
+    """Return flags as they are given, each once, and those of every command."""
+    given = (option for flag in flags for option in flag.options)
+    return list(dict.fromkeys([*given, TASK_MODULE, "--help", "--help-all"]))
+
+
+def choices(flags: Iterable[Flag]) -> dict[str, list[str]]:
+    """Return the values of each flag that takes one of several words."""
+    return {
+        f"--{flag.name}": [str(value) for value in get_args(flag.kind) if value]
+        for flag in flags
+        if get_origin(flag.kind) is Literal
+    }
+
+
+def cases(words: dict[str, Iterable[str]] | dict[str, list[str]]) -> str:
+    """Return the branches of a `case` that set `words`."""
+    return "\n".join(f'            {name}) words="{" ".join(each)}" ;;' for name, each in words.items())

@@ -1,0 +1,50 @@
+"""Settings of `jumper finetune`; this module does not import PyTorch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+from jumper_warp.utils.checks import check_positive
+from jumper_warp.utils.errors import InputError
+
+
+@dataclass(frozen=True)
+class FinetuneCfg:
+    """Settings of fine-tuning: numbers of jumps, ranges of goals, standard deviations that weight errors."""
+
+    num_goals: int = 64  # Number of jumps of the nominal robot, spread evenly over the goals
+    num_delayed: int = 32  # Number of jumps of the nominal robot with latencies drawn from the training's range
+    num_randomized: int = 64  # Number of jumps of robots randomised as in the training, with noise, latency and pushes
+    height_range: tuple[float, float] = (0.5, 1.075)
+    """[m] Lowest and highest commanded base height, of jumps to heights."""
+    distance_range: tuple[float, float] = (0.3, 1.4)  # [m] Nearest and farthest goal straight ahead, of jumps to places
+    iterations: int = 6  # Gauss-Newton steps; 0 for places: the aim alone
+    miss_std: float = 0.001
+    """[m] Miss of the nominal robot that costs as much as a change of the actions by --action-std."""
+    delayed_std: float = 0.003  # [m] Miss with latencies that costs as much
+    randomized_std: float = 0.01  # [m] Miss of a randomised robot that costs as much
+    action_std: float = 0.02
+    """[1] Change of the actions against the given policy, root of the sum of squares over the motors."""
+    landing_std: float = 0.005  # [1] Change of the actions after touchdown that costs as much
+    seed: int = 0  # Seed of commands, latencies and robots (stream: tuning)
+    device: str | None = None  # Warp device (default: a GPU if there is one)
+    threads: int | None = None  # CPU threads that share the worlds (default: all cores); they change no result
+
+    def __post_init__(self) -> None:
+        if self.num_goals < 2 or min(self.num_delayed, self.num_randomized, self.iterations) < 0:
+            raise InputError("fine-tuning needs at least 2 goals, and no negative number of jumps or steps")
+        for name in ("miss_std", "delayed_std", "randomized_std", "action_std", "landing_std"):
+            check_positive(name, getattr(self, name))
+        for name in ("height_range", "distance_range"):
+            low, high = getattr(self, name)
+            if not 0.0 < low < high < 10.0:
+                raise InputError(f"{name} must be in (0, 10) m and rise, got {low}, {high}")
+
+
+@dataclass(frozen=True)
+class FinetuneArgs(FinetuneCfg):
+    """Reduce the errors of a jumping policy by gradients through physics, motors and network."""
+
+    out: Path | None = None  # Folder of the new policy (default: <policy>_finetuned)
+    overwrite: bool = False  # Replace a policy that is there already
