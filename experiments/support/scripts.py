@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import tyro
-
-from jumper_warp.cli.main import run_command
-from jumper_warp.cli.renamed_flags import use_new_names
+from jumper_warp.cli.main import parse, run_command
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.progress import phase
 from jumper_warp.utils.runtime import configure_device
@@ -51,10 +49,12 @@ def run_script(main: Callable[[Args], Any], kind: type[Args]) -> None:
 def parse_flags(kind: type[Args]) -> Args:
     """Return the flags of a script, an object of `kind`, from the command line; `--help` prints the script's docstring.
 
-    Raises InputError: a flag is given by both its former and its present name.
+    Raises InputError: there is no such flag, or a value is invalid.
     """
-    about = sys.modules["__main__"].__doc__
-    return tyro.cli(kind, description=about, args=use_new_names(sys.argv[1:], kind))
+    # lines of a paragraph or of an item of a list become one, which the help wraps at the terminal's width
+    about = re.sub(r"(?<!\n)\n {0,3}(?![\s-]|\d+\. )", " ", sys.modules["__main__"].__doc__ or "").strip()
+    name = Path(sys.argv[0]).name
+    return parse(kind, name, sys.argv[1:], description=about, program=f"python experiments/{name}")
 
 
 def prepare(name: str, args: DeviceArgs, threads: int | None = None) -> Path:
