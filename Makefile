@@ -1,5 +1,5 @@
 # make demo   the open-loop jump, 200 vertical and 200 horizontal jumps of the shipped policies, and one jump with a film:
-#             metrics, plots, pictures and recordings in outputs/demo
+#             metrics, plots, pictures and recordings in outputs/demo, in about a minute
 # make test   all tests, and the import rules
 # make lint   style, format, words, import rules and types
 # Each makes .venv/ first if it is missing or older than pyproject.toml or constraints.txt.
@@ -12,10 +12,7 @@ STAMP := $(VENV)/.installed
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
-	$(VENV)/bin/python experiments/open_loop_jump.py --out outputs/demo/open_loop
-	$(VENV)/bin/python experiments/vertical_jump_sweep.py --out outputs/demo/vertical_jump
-	$(VENV)/bin/python experiments/horizontal_jump_sweep.py --out outputs/demo/horizontal_jump
-	$(VENV)/bin/jumper play horizontal_jump --goal 1.3 0 --video outputs/demo/film/jump.mp4 --out outputs/demo/film
+	$(VENV)/bin/python experiments/demo.py --out outputs/demo
 
 test: $(STAMP)
 	$(VENV)/bin/lint-imports --no-logo

@@ -1,8 +1,9 @@
-"""Benchmark of inverse kinematics: robots per second in one launch, for reachable and for scattered paw targets.
+"""Measure how many inverse kinematics the device solves a second, and write metrics.
 
     python experiments/benchmark_ik.py --out outputs/benchmark_ik
 
-The result is checked before timing: every paw position of a pose within the limits must be reached.
+One launch solves the legs of many robots, for reachable and for scattered paw targets. The results are checked before
+the timing: every paw position of a pose within the limits must be reached.
 """
 
 from __future__ import annotations
@@ -22,13 +23,13 @@ from support.timing import median_time
 
 @dataclass(frozen=True)
 class Args(DeviceArgs):
-    """Flags."""
+    """Flags of the script."""
 
     poses: int = 65536  # Robots per launch, four legs each
     repeats: int = 5  # Number of timed launches; the median is reported
     scatter: float = 0.3
     """[m] Half edge of the cube around each paw's reachable position that the scattered targets fill."""
-    seed: int = 0
+    seed: int = 0  # Seed of the poses
 
 
 def main(args: Args) -> dict:
@@ -50,7 +51,8 @@ def main(args: Args) -> dict:
         "reachable_rate [poses/s]": n / times[0], "reachable_max_residual [m]": max_residual,
         "scattered_time [ms]": 1.0e3 * times[1], "scattered_reachable [%]": 100.0 * robots.reachable.numpy().mean(),
     }  # fmt: skip
-    return report(folder, values)
+    keys = ("reachable_rate [poses/s]", "reachable_time [ms]", "scattered_time [ms]")
+    return report(args, folder, values, f"Inverse kinematics of {n:,} robots in one launch, {info.name}", keys)
 
 
 if __name__ == "__main__":

@@ -1,11 +1,12 @@
-"""Benchmark of SolverJumper and Newton's SolverMuJoCo on the same robot: policy steps per second.
+"""Measure how fast SolverJumper and SolverMuJoCo simulate the same robots, and write metrics.
 
     python experiments/benchmark_solver.py --envs 4096 --out outputs/benchmark
 
-A policy step is 8 physics steps of 1/480 s, motors included. Both solvers replay a captured graph. The outcome is
-checked before timing: the robots must stand, or reach their apex. `--baseline PATH` also runs the script of another
-checkout and reports the speed ratio. `--threads 1 2` compares numbers of CPU threads, on physics and on whole
-environments; all other metrics are measured with the last number.
+Speeds are policy steps per second of all environments together. A policy step is 8 physics steps of 1/480 s, motors
+included. Both solvers replay a captured graph. The outcome is checked before the timing: the robots must stand, or
+reach their apex. `--baseline PATH` also runs the script of another checkout and reports the speed ratio. `--threads 1
+2` compares numbers of CPU threads, for physics and for whole environments; all other metrics are measured with the last
+number.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from support.timing import baseline_ratios
 
 @dataclass(frozen=True)
 class Args(DeviceArgs):
-    """Flags."""
+    """Flags of the script."""
 
     envs: list[int] = field(default_factory=lambda: [64])  # Numbers of environments, one run for each
     solvers: list[SolverName] = field(default_factory=lambda: ["jumper", "mujoco"])
@@ -58,7 +59,9 @@ def main(args: Args) -> dict:
         prefix = "" if len(args.envs) == 1 else f"envs_{envs}_"
         values |= {f"{prefix}{name}": value for name, value in metrics.items()}
     values |= {"envs": args.envs, **baseline_ratios(args.baseline, "experiments/benchmark_solver.py", args, values)}
-    return report(folder, values)
+    names = [f"{s}_steps_per_s_{phase}" for phase in ("standing", "jump") for s in args.solvers]
+    keys = [key for key in values if key.endswith((*names, "ratio_standing", "ratio_jump", "thread_speedup"))]
+    return report(args, folder, values, f"Policy steps per second, {values['device']}", keys)
 
 
 if __name__ == "__main__":

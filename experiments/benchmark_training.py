@@ -1,11 +1,12 @@
-"""Benchmark of training: speed of solver, environment and PPO, and fractions of time of their parts.
+"""Measure how fast training is and where its time is spent, and write metrics.
 
     python experiments/benchmark_training.py --envs 4096 8192 16384 --out outputs/benchmark_training
 
-Steps are policy steps of 1/60 s, 8 physics steps each, of all environments together. The solver is timed with standing
-robots; environment and training have random or learned actions, randomisation and noise. rsl-rl-lib trains on the same
-environment through the package's adapter. Outcomes are checked before timing.
-`--variants all` times PPO compiled or not and in either precision; `--only-ppo` nothing else.
+Speeds are policy steps of 1/60 s per second, 8 physics steps each, of all environments together. The solver is timed
+with standing robots; environment and training have random or learned actions, randomisation and noise. rsl-rl-lib
+trains on the same environment through the package's adapter. Outcomes are checked before the timing.
+
+`--variants all` times PPO compiled or not and in either precision. `--only-ppo` times PPO and its variants only.
 `--baseline PATH` also runs the script of another checkout and reports the speed ratio.
 """
 
@@ -28,7 +29,7 @@ from support.variants import VARIANTS, variant
 
 @dataclass(frozen=True)
 class Args(ThreadArgs):
-    """Flags."""
+    """Flags of the script."""
 
     envs: tuple[int, ...] | None = None
     """Numbers of environments for solver and environment (default: 4096 8192 16384 on a GPU, 64 on a CPU)."""
@@ -77,7 +78,9 @@ def main(args: Args) -> dict:
         values |= time_rsl_rl(train_envs, args.num_steps, args.iterations, args.device)
         values["ppo_over_rsl_rl"] = values["ppo_steps_per_s"] / values["rsl_rl_steps_per_s"]
     values |= baseline_ratios(args.baseline, "experiments/benchmark_training.py", args, values)
-    return report(folder, values)
+    keys = [f"{part}_steps_per_s_{train_envs}" for part in ("solver", "env")]
+    keys += ["ppo_steps_per_s", "ppo_collect_s", "ppo_update_s", "rsl_rl_steps_per_s", "ppo_over_rsl_rl"]
+    return report(args, folder, values, f"Training with {train_envs:,} environments, {info.name}", keys)
 
 
 if __name__ == "__main__":

@@ -1,14 +1,17 @@
-"""Ablation of a jump task's departures from the paper and its authors' configuration, one at a time.
+"""Train jumps without one departure from the paper each, and write metrics, a table, a plot and the trainings' runs.
 
     python experiments/departures.py --task vertical-jump --out outputs/departures
     python experiments/departures.py --task horizontal-jump --only bracing goals --seeds 1 2
 
-Trainings differ only in the departure that is undone (`support.departures`): they are equally long, randomised, and
-start from random weights (on Mars from the policy of Earth). The task with all departures, `kept`, is trained with each
-seed of `--baseline-seeds`, to show the spread between seeds. Each policy then makes nominal and randomised jumps as in
-`jumper evaluate`, where a fall or a collision after the landing is a failure, and nominal and randomised robots hold
-their squats for 3 s. Jumps are ended by the terminations of the task, regardless of those of the training. A training
-that is already in `--out` is loaded, so that an interrupted run continues; `--no-measure` only trains.
+A departure is a difference of a task from the paper and its authors' configuration (`support.departures`). Trainings
+differ only in the departure that is undone. They are equally long, randomised, and start from random weights (on Mars
+from the policy of Earth). The task with all departures, `kept`, is trained with each seed of `--baseline-seeds`, to
+show the spread between seeds.
+
+Each policy then makes nominal and randomised jumps as in `jumper evaluate`, where a fall or a collision after the
+landing is a failure. Nominal and randomised robots also hold their squats for 3 s. The task's terminations end the
+jumps, regardless of those of the training. A training that is already in `--out` is loaded, so that an interrupted run
+continues. `--no-measure` only trains.
 """
 
 from __future__ import annotations
@@ -19,18 +22,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from rich.console import Console
-
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
-from support.departure_runs import BASELINE, JUMP_TASKS, TESTS, WIDTH, JumpTask, evaluate, parse, report, train_or_load
+from support.departure_runs import BASELINE, JUMP_TASKS, TESTS, JumpTask, evaluate, parse, train_or_load, write_table
 from support.departures import DEPARTURES, Ablation, ablation_flags
-from support.scripts import ThreadArgs, prepare, run_script
+from support.scripts import ThreadArgs, announce, prepare, report, run_script, tracked
 
 
 @dataclass(frozen=True)
 class Args(ThreadArgs):
-    """Flags."""
+    """Flags of the script."""
 
     task: JumpTask = "vertical-jump"  # Task whose departures are undone
     only: tuple[str, ...] = ()  # Names of the departures to undo, or kept for none (default: all)
@@ -75,9 +76,9 @@ def main(args: Args) -> dict[str, Any]:
     """Train and evaluate each ablation, write the table and the plot, and return the metrics."""
     for name, seed, ablation in args.trainings():  # refuse wrong flags before the first training
         parse(ablation, args.command(ablation, seed, Path(name)))
-    folder, results, table = prepare("departures", args, args.threads), {}, None
+    folder, results = prepare("departures", args, args.threads), {}
     values: dict[str, Any] = {"task": args.task, "iterations": args.length, "envs": args.num_envs}
-    for name, seed, ablation in args.trainings():
+    for name, seed, ablation in tracked([*args.trainings()], "trainings"):
         checkpoint = train_or_load(ablation, args.command(ablation, seed, folder / f"{name}_{seed}"))
         if not args.measure:
             continue
@@ -85,11 +86,13 @@ def main(args: Args) -> dict[str, Any]:
         values[f"flags_{name}"] = ablation_flags(ablation)
         values |= {f"{test}_{key}_{name}_{seed}": tests[test][key] for test in TESTS for key in tests[test]}
         write_metrics(folder, values)
-        table = report(results, f"{args.task}, {args.length} iterations", folder)
-    if table is not None:
-        Console(width=WIDTH).print(table)
-    print(f"{'metrics, table, plot and ' if results else ''}runs in {folder}")
-    return values
+        write_table(results, f"{args.task}, {args.length} iterations", folder)
+        announce(f"{name}, seed {seed}: {tests['randomized']['success_rate']:.1%} success of randomised robots")
+    if not results:
+        announce(f"runs in {folder}")
+        return values
+    keys = [key for key in values if key.startswith("randomized_success_rate_")]
+    return report(args, folder, values, f"Departures of {args.task}, {args.length} iterations", keys)
 
 
 if __name__ == "__main__":

@@ -1,14 +1,14 @@
-"""Attitude control in long flights on Mars: tilted takeoffs and their landings, with and without a turning policy.
+"""Compare landings after tilted takeoffs on Mars with and without turning in flight, and write metrics and plots.
 
     python experiments/flight_attitude.py --policy attitude --num-flights 100 --out outputs/flight
     python experiments/flight_attitude.py --takeoff policy --landing-policy mars_vertical_jump --randomize
 
-Robots squat and extend their legs (24.8 N m, kp 20, 3.71 m/s^2), some legs a few milliseconds later than others, so
-that they take off tilted and rotating. In flight a policy trained to turn in zero gravity takes over, with the level
-orientation as its goal. 0.35 s before the landing the jump takes over again: the policy `--landing-policy`, or the
-default pose. A landing succeeds if only paws touch the ground and the base is within 30 degrees of level 1.5 s later.
-The same takeoffs without turning are the comparison. With `--takeoff policy` the landing policy also takes off, half a
-second after the start.
+Robots squat and extend their legs (24.8 N m, kp 20, 3.71 m/s^2). Some legs extend a few milliseconds later than others,
+so that robots take off tilted and rotating. In flight a policy trained in zero gravity turns the robot to level. The
+landing begins 0.35 s before touchdown, with the policy `--landing-policy` or in the default pose. A landing succeeds if
+only paws touch the ground and the base is within 30 degrees of level 1.5 s later. The same takeoffs without turning are
+the comparison. With `--takeoff policy` the landing policy also takes off, half a second after the start. A recording
+and a picture show one flight of each kind.
 """
 
 from __future__ import annotations
@@ -23,6 +23,11 @@ from jumper_warp.utils.errors import InputError
 from support.flights import FlightLog, FlightRun, extension_delays, flight_metrics, plot_flights
 from support.scripts import run_script
 
+SUMMARY = (
+    "landed_upright_rate", "without_turning_landed_upright_rate", "touchdown_tilt_mean_deg",
+    "without_turning_touchdown_tilt_mean_deg", "takeoff_tilt_mean_deg", "apex_mean_m",
+)  # fmt: skip
+
 
 @dataclass(frozen=True)
 class Args(EvaluationArgs):
@@ -35,7 +40,7 @@ class Args(EvaluationArgs):
     num_flights: int = 60  # Number of flights
     max_leg_delay: float = 15.0  # [ms] Largest delay with which the legs of one end, or side, extend after the others
     takeoff: Literal["open-loop", "policy"] = "open-loop"
-    """How robots take off: with legs that extend unequally, or by the policy that lands."""
+    """How robots take off: open loop, with legs that extend unequally, or by the policy that lands."""
     height_range: tuple[float, float] = (2.5, 2.5)
     """[m] Lowest and highest base height commanded to the policy that lands."""
 
@@ -64,7 +69,7 @@ def main(args: Args) -> dict:
     run.settings |= settings | ({} if late is None else {"late_ms": args.max_leg_delay})
     values = flight_metrics(flights["turning"])
     values |= {f"without_turning_{name}": value for name, value in flight_metrics(flights["without"]).items()}
-    return run.report(values, {})
+    return run.report(values, {}, SUMMARY)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""Cost of the gradient of a jump, relative to its simulation by the solver's own kernel.
+"""Measure how much a jump's gradient costs, in units of the jump's simulation, and write metrics.
 
     python experiments/gradient_cost.py --out outputs/gradient_cost
     python experiments/gradient_cost.py --device cuda --num-envs 4096
 
-The same jump (squat, push-off, flight; 36 policy steps of 8 physics steps) is run by the solver's kernel with the
-command filter, and as a rollout with its reverse pass, which differentiates by all parameters, targets and the initial
-state. Both run in single precision, with the solver's default tolerance, on one thread of a CPU. The errors of the
-gradient are relative to double precision.
+The same jump (squat, push-off, flight; 36 policy steps of 8 physics steps) is simulated twice: by the solver's kernel
+with the command filter, and as a rollout with its reverse pass. The reverse pass differentiates with respect to all
+parameters, targets and the initial state. Both run in single precision, with the solver's default tolerance, on one
+thread of a CPU. The errors of the gradient are relative to double precision.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from support.timing import device_memory, wall_time
 
 @dataclass(frozen=True)
 class Args(DeviceArgs):
-    """Flags."""
+    """Flags of the script."""
 
     num_envs: int | None = None  # Number of environments (default: 64 on a CPU, 4096 on a GPU)
     repeats: int = 7
-    """Number of timed repetitions; simulation and gradient alternate, and the fastest time of each is reported."""
+    """Number of timed repetitions; simulation and gradient alternate, and the fastest time of each counts."""
     double: bool = False  # Whether to compute in double precision
 
     def __post_init__(self) -> None:
@@ -76,7 +76,8 @@ def main(args: Args) -> dict:
     }
     if device.is_cuda:
         values["memory_kib_a_world"] = (device_memory(device) - before) / worlds / 1024.0
-    return report(folder, values)
+    keys = [key for key in values if key.endswith(("ratio", "us_a_step", "error_targets", "kib_a_world"))]
+    return report(args, folder, values, f"Gradient of a jump in {worlds:,} worlds, {name}", keys)
 
 
 if __name__ == "__main__":

@@ -1,8 +1,10 @@
-"""The paper's test of the horizontal jump: a policy jumps 0.3 to 1.5 m straight ahead, spread evenly, each once.
+"""Measure how exactly a policy jumps straight ahead, and write metrics, a plot, a picture and a recording.
 
     python experiments/horizontal_jump_sweep.py --policy horizontal_jump --num-jumps 200 --out outputs/sweep
 
-Runs the suite `sweep` of policies that jump to landing positions, as `jumper evaluate horizontal_jump --suite sweep`.
+This is the paper's test of the horizontal jump: goals spread evenly over 0.3 to 1.5 m ahead, one jump each. A jump
+succeeds if it starts on command, only paws touch anything, and a second after touchdown the base is at rest within 0.1
+m of the goal. `jumper evaluate horizontal_jump --suite sweep` runs the same test.
 """
 
 from jumper_warp.evaluation.sweeps import DistanceSweep

@@ -1,17 +1,20 @@
-"""Identification of known robots: by this project, with a finer step or SolverMuJoCo as truth, and by other methods.
+"""Measure how well identification finds the parameters of known robots, and write metrics, a plot and robot overlays.
 
     python experiments/identification.py --num-matched 20 --out outputs/identification
 
-Robots are sampled from the priors and execute two hung chirps, a standing chirp and a small jump of 1.25 s, recorded
-with noise (0.05 deg, 1 deg/s at 240 Hz; 5 mm, 0.5 deg at 120 Hz) and weighed (20 g). Initial states are unknown. A jump
-at 16 N m instead of 12 is held out: its angles and height are predicted from the targets alone.
+Robots are sampled from the priors. Each executes two hung chirps, a standing chirp and a small jump, 1.25 s each. The
+motions are recorded with noise (0.05 deg, 1 deg/s at 240 Hz; 5 mm, 0.5 deg at 120 Hz), and the robot is weighed (20 g).
+Initial states are unknown. A jump at 16 N m instead of 12 is held out: its angles and height are predicted from the
+targets alone.
+
+`--parts`: `same` identifies with the simulator that recorded. `fine` and `rough` record with a finer step, `mujoco` on
+SolverMuJoCo. `methods` compares CMA-ES and SciPy. `policy` predicts the jumps of a policy.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -24,15 +27,19 @@ from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.runtime import configure_device
 from support.identification_methods import compare_methods
 from support.known_robots import make_case, plot_cases, policy_errors, run_case
-from support.scripts import report, run_script
+from support.scripts import OutputArgs, report, run_script, tracked
 
+SUMMARY = (
+    "coverage", "kp_worst_percent", "offset_worst_deg", "latency_us", "held_out_deg", "held_out_nominal_deg",
+    "held_out_mm", "held_out_nominal_mm", "wall_s",
+)  # fmt: skip
 REFINE = 16  # Physics steps of the finer truth per step of the model
 Part = Literal["same", "fine", "rough", "mujoco", "methods", "policy"]
 
 
 @dataclass(frozen=True)
-class Args:
-    """Flags."""
+class Args(OutputArgs):
+    """Flags of the script."""
 
     num_matched: int = 20  # Number of robots that are identified with the simulator that recorded them
     num_mismatched: int = 1
@@ -42,7 +49,6 @@ class Args:
     """[s] Physics step of the model that identifies the robot recorded at a sixteenth of 1/480 s; "rough": 1/480."""
     policy: str = "vertical_jump"  # Policy whose jumps the identified robot is to predict
     num_jumps: int = 64  # Number of jumps to predict
-    out: Path | None = None  # Folder for metrics and plots (default: outputs/identification/<time>)
     threads: int | None = None  # CPU threads (default: all cores)
 
     def __post_init__(self) -> None:
@@ -62,10 +68,10 @@ def main(args: Args) -> dict[str, Any]:
     values: dict[str, Any] = {"parameters": len(parameters), "seconds_of_data": 1.25 * len(KINDS)}
 
     cases = []
-    for seed in range(args.num_matched if {"same", "methods", "policy"} & set(args.parts) else 0):
+    matched = range(args.num_matched if {"same", "methods", "policy"} & set(args.parts) else 0)
+    for seed in tracked(matched, "identifying robots"):
         case = make_case(parameters, seed, ours, replay)
         cases.append((case, *run_case(parameters, case, replay, ours)))
-        print(f"seed {seed}:", {name: round(value, 4) for name, value in cases[-1][1].items()}, flush=True)
     rows = [metrics for _, metrics, _ in cases]
     if rows:
         values |= {name: float(np.median([row[name] for row in rows])) for name in rows[0]}
@@ -77,10 +83,9 @@ def main(args: Args) -> dict[str, Any]:
     for part, (simulate, model, dt) in mismatched.items():
         if part in args.parts:
             results = []
-            for seed in range(100, 100 + args.num_mismatched):
+            for seed in tracked(range(100, 100 + args.num_mismatched), f"identifying robots, {part}"):
                 case = make_case(parameters, seed, simulate, replay)
                 results.append(run_case(parameters, case, replay, model, dt)[0])
-                print(part, {name: round(value, 4) for name, value in results[-1].items()}, flush=True)
             values |= {f"{part}_{name}": value for name, value in results[0].items()}
             values |= {f"{part}_{name}_of_seeds": [row[name] for row in results] for name in ("coverage", "identified")}
     if "methods" in args.parts:
@@ -89,7 +94,7 @@ def main(args: Args) -> dict[str, Any]:
         values |= policy_errors(args.policy, args.num_jumps, cases[0][0], cases[0][2], folder)
     if rows:
         plot_cases(rows, folder / "identification.png")
-    return report(folder, values)
+    return report(args, folder, values, f"Identification of {len(rows)} known robots: medians", SUMMARY)
 
 
 if __name__ == "__main__":

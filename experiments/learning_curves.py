@@ -1,13 +1,13 @@
-"""Learning curves of the vertical jump: success over wall time and over steps, for seeds and trainer variants.
+"""Measure how soon the vertical jump is learnt, for seeds and trainer variants, and write metrics and a plot.
 
     python experiments/learning_curves.py --seconds 60 --seeds 0 1 2 --variants default compiled_bfloat16
     python experiments/learning_curves.py --device cpu --num-envs 2048 --history 1 --variants small \
         --height-range 0.5 0.9 --seconds 450 --eval-interval 30                 # two cores of a CPU
 
 Trainings start from random weights, one after the other, each in a separate process. Every few seconds of training time
-the policy is evaluated on jumps to heights of 0.5 to 1.1 m. Reported are the training times to success rates up to
-100 %, and the time from the start of the process to the start of the training, when everything is compiled. Variants
-are those of `support.variants`; a second process loads compiled kernels and functions from the caches on disk.
+the policy is evaluated on jumps to heights of 0.5 to 1.1 m. The metrics are the training times to success rates up to
+100 %, and the time from the start of the process to the start of the training, when everything is compiled. A second
+process loads compiled kernels and functions from the caches on disk. Variants are those of `support.variants`.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.learning import TEST_HEIGHTS, LearningCurve, curve_metrics, plot_curves, train_and_time
-from support.scripts import DeviceArgs, prepare, run_script
+from support.scripts import DeviceArgs, announce, prepare, report, run_script, tracked
 from support.variants import DEFAULT, variant
 
 TASK = "vertical-jump"
@@ -33,7 +33,7 @@ TASK = "vertical-jump"
 
 @dataclass(frozen=True)
 class Args(DeviceArgs):
-    """Flags."""
+    """Flags of the script."""
 
     seconds: float = 60.0  # [s] Time of each training, its evaluations not counted
     eval_interval: float = 2.0  # [s] Training time between two evaluations
@@ -74,15 +74,15 @@ def main(args: Args) -> dict[str, Any]:
     values: dict[str, Any] = {"seconds": args.seconds, "envs": args.num_envs, "randomize": args.randomize}
     values |= {"seeds": list(args.seeds), "heights_m": list(args.height_range), "history": args.history}
     curves: dict[str, list[LearningCurve]] = {name: [] for name in args.variants}
-    for name, seed in itertools.product(args.variants, args.seeds):
+    for name, seed in tracked([*itertools.product(args.variants, args.seeds)], "trainings"):
         curve = train_in_process(args, name, seed)
         curves[name].append(curve)
         values |= curve_metrics(curve, f"{name}_{seed}") | {f"ready_s_{name}_{seed}": curve.ready}
-        print(f"ready after {curve.ready:.1f} s", flush=True)
+        announce(f"{name}, seed {seed}: {curve.success[-1]:.1%} success after {curve.seconds[-1]:.0f} s of training")
         write_metrics(folder, values)
         plot_curves(curves, folder / "learning_curves.png")
-    print(f"metrics and plot in {folder}")
-    return values
+    keys = [key for key in values if key.startswith(("success_", "seconds_to_95_percent_"))]
+    return report(args, folder, values, f"Learning curves of {TASK}, {args.num_envs:,} environments", keys)
 
 
 if __name__ == "__main__":

@@ -1,37 +1,34 @@
-"""Effect of springs between the knees of each leg on the open-loop jump, over stiffness and squat.
+"""Measure how much higher springs between the knees let the robot jump, and write metrics, a plot and recordings.
 
     python experiments/leg_springs.py --out outputs/springs
     python experiments/leg_springs.py --gravity 3.71 --torque-limit 24.8 --kp 20 --rest-length 0.17
 
-Every robot makes the jump of `open_loop_jump.py` (squat, hold, full extension) with another stiffness and squat; the
-highest jump of each stiffness is reported. A stretched spring pulls the knees together: up to 90 degrees it extends the
-leg, and the motors have to pull the robot into its squat; beyond 90 degrees it folds the leg, and the motors have to
-push the robot up. If a spring is too stiff for the motors, the robot stays standing or in its squat.
-The authors' sequel has 1000 N/m and 0.17 m.
+Every robot makes the jump of `open_loop_jump.py` (squat, hold, full extension) with another stiffness and squat. The
+highest jump of each stiffness counts. A stretched spring pulls the knees together. Up to 90 degrees this extends the
+leg, and the motors have to pull the robot into its squat. Beyond 90 degrees it folds the leg, and the motors have to
+push the robot up. If a spring is too stiff for the motors, the robot stays standing or in its squat. The authors'
+sequel has 1000 N/m and 0.17 m.
 """
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from typing import Any, Literal
-
-from rich.console import Console
-from rich.table import Table
 
 from jumper_warp.robot.gravity import EARTH, MARS
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.robot.overlay import with_springs
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import write_metrics
 from jumper_warp.viz.plots import figure
-from support.scripts import DeviceArgs, prepare, run_script
+from support.scripts import DeviceArgs, prepare, report, run_script
 from support.spring_jumps import FILTERS, SpringJumps
+
+SUMMARY = ("apex_without_springs_m", "highest_apex_height_m", "highest_stiffness_n_m")  # Ends of keys
 
 
 @dataclass(frozen=True)
 class Args(DeviceArgs):
-    """Flags."""
+    """Flags of the script."""
 
     stiffness: tuple[float, ...] = (0.0, 125.0, 250.0, 375.0, 500.0, 625.0, 750.0, 875.0, 1000.0, 1250.0, 1500.0)
     """[N/m] Stiffnesses of the springs to try; 0: no springs."""
@@ -59,14 +56,11 @@ class Args(DeviceArgs):
 
 def main(args: Args) -> dict:
     """Run the jumps of all springs and squats, plot apex over stiffness, and return the metrics."""
-    start = time.perf_counter()
     folder = prepare("leg_springs", args)
     values: dict[str, Any] = {"gravity_m_s2": args.gravity, "torque_limit_nm": args.torque_limit, "kp_nm_rad": args.kp,
                               "spring_length_m": args.rest_length, "stiffness_n_m": list(args.stiffness)}  # fmt: skip
     planet = {EARTH: "Earth", MARS: "Mars"}.get(args.gravity, f"{args.gravity:g} m/s^2")
     title = f"Open-loop apex in m, {planet}, {args.torque_limit:g} N m, springs {args.rest_length:g} m"
-    table = Table("stiffness [N/m]", title=title)
-    rows = [[f"{stiffness:g}"] for stiffness in args.stiffness]
     with figure(folder / "springs.png", figsize=(7, 5), title=title) as axis:
         for name in FILTERS if args.filter == "both" else (args.filter,):
             jumps = args.jumps(name)
@@ -75,19 +69,13 @@ def main(args: Args) -> dict:
             squats = [args.squat_angles[i] for i in apexes.argmax(axis=1)]
             values |= {f"{name}_apex_m": best.tolist(), f"{name}_squat_command_deg": squats,
                        f"{name}_highest_stiffness_n_m": args.stiffness[top]}  # fmt: skip
+            if 0.0 in args.stiffness:
+                values[f"{name}_apex_without_springs_m"] = float(best[args.stiffness.index(0.0)])
             recorded = jumps.record(args.stiffness[top], squats[top], folder)
             values |= {f"{name}_highest_{key}": value for key, value in recorded.items()}
             axis.plot(args.stiffness, best, marker="o", label=f"{name} filter")
-            table.add_column(f"{name} filter")
-            for row, apex in zip(rows, best, strict=True):
-                row.append(f"{apex:.3f}")
         axis.set(xlabel="stiffness between the knees [N/m]", ylabel="highest base height [m]")
-    for row in rows:
-        table.add_row(*row)
-    write_metrics(folder, values)
-    Console().print(table)
-    print(f"{time.perf_counter() - start:.1f} s; metrics, plot and recordings in {folder}")
-    return values
+    return report(args, folder, values, title, [key for key in values if key.endswith(SUMMARY)])
 
 
 if __name__ == "__main__":

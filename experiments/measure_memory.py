@@ -1,9 +1,10 @@
-"""Memory per world of a training: main memory while the environment is built, and its arrays on the device.
-
-Measured as the slope between two numbers of worlds, each in a separate process; the results are the constants of
-`jumper_warp.cli.training_memory`.
+"""Measure how much memory each world of a training takes, and write metrics.
 
     python experiments/measure_memory.py --solver mujoco
+
+`building` is the main memory while the environment is built, `standing` the size of its arrays on the device. Both are
+slopes between two numbers of worlds, each measured in a separate process. `jumper_warp.cli.training_memory` uses the
+results as constants.
 """
 
 from __future__ import annotations
@@ -14,25 +15,24 @@ import resource
 import subprocess
 import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import warp as wp
 
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.sim.simulation import SolverName
-from jumper_warp.utils.output import output_dir, write_metrics
-from support.scripts import run_script
+from jumper_warp.utils.output import output_dir
+from jumper_warp.utils.runtime import configure_device
+from support.scripts import OutputArgs, report, run_script
 
 
 @dataclass(frozen=True)
-class Args:
-    """Flags of the measurement of memory per world."""
+class Args(OutputArgs):
+    """Flags of the script."""
 
     solver: SolverName = "jumper"  # Physics solver
     task: str = "vertical-jump"  # Name of the task
     envs: tuple[int, ...] = (256, 2048)  # Numbers of worlds; a single one is measured in this process
-    out: Path | None = None  # Folder for metrics.json (default: outputs/measure_memory/<time>)
 
 
 def array_bytes() -> int:
@@ -47,7 +47,6 @@ def measure(args: Args) -> dict[str, float]:
 
     `building`: peak main memory of the process; `standing`: size of all arrays, which are the same on a GPU.
     """
-    wp.config.log_level = wp.LOG_WARNING
     env = Env(make_task(args.task), args.envs[0], device="cpu", solver=args.solver)
     env.reset()
     return {"building": 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, "standing": array_bytes()}
@@ -55,6 +54,7 @@ def measure(args: Args) -> dict[str, float]:
 
 def main(args: Args) -> dict[str, float]:
     """Return `building_` and `standing_bytes_per_world` [byte]; for a single number of worlds, those of `measure`."""
+    configure_device("cpu")
     if len(args.envs) == 1:
         values = measure(args)
         print(json.dumps(values))
@@ -64,9 +64,8 @@ def main(args: Args) -> dict[str, float]:
     runs = [subprocess.run([*common, str(n)], capture_output=True, text=True, check=True) for n in (few, many)]
     less, more = (json.loads(run.stdout.splitlines()[-1]) for run in runs)
     values = {f"{name}_bytes_per_world": (more[name] - less[name]) / (many - few) for name in less}
-    write_metrics(output_dir("measure_memory", args.out), {**values, "solver": args.solver, "task": args.task})
-    print(json.dumps(values))
-    return values
+    saved, folder = {**values, "solver": args.solver, "task": args.task}, output_dir("measure_memory", args.out)
+    return report(args, folder, saved, f"Memory per world of {args.task} on {args.solver}", values)
 
 
 if __name__ == "__main__":

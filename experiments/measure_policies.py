@@ -1,11 +1,11 @@
-"""Measures the shipped policies under all test conditions, and writes the tables of docs/results.md.
+"""Measure how well the shipped policies do under all test conditions, and write metrics and docs/results.md.
 
     python experiments/measure_policies.py --out outputs/policies
     python experiments/measure_policies.py --out outputs/policies --write-tables docs --save-to-policies
 
 The first command evaluates policies as `jumper evaluate` does, once per condition and seed (a row). It writes
-`OUT/POLICY/CONDITION-SEED/metrics.json` after each row, and skips rows that exist: work can be interrupted, split by
---policies and --conditions, and shared by processes. The second command reads these files; it simulates nothing.
+`OUT/POLICY/CONDITION-SEED/metrics.json` after each row, and skips existing rows. Work can be interrupted, split by
+--policies and --conditions, and shared by processes. The second command reads these files and simulates nothing.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ PROGRESS = ("success_rate", "settled_without_collision_rate", "fall_rate")  # Me
 
 @dataclass(frozen=True)
 class Args(ThreadArgs):
-    """Flags."""
+    """Flags of the script."""
 
     out: Path = Path("outputs/policies")  # Folder of all rows
     policies: tuple[str, ...] = tuple(policy_tasks())  # Names of the policies
@@ -103,7 +103,6 @@ def main(args: Args) -> int:
 def measure(args: Args) -> int:
     """Measure the missing rows, print the progress, and return their number."""
     rows, started = missing_rows(args), time.perf_counter()
-    print(f"{len(rows)} rows to measure", flush=True)
     for number, row in enumerate(rows, 1):
         values = measure_row(args, *row)
         gc.collect()  # frees the device memory of the environment
@@ -113,6 +112,7 @@ def measure(args: Args) -> int:
         rates = ", ".join(f"{key} {values[key]:.4g}" for key in PROGRESS if key in values)
         times = f"{spent / 60:.1f} min, {spent / number * (len(rows) - number) / 60:.1f} min left"
         print(f"{number}/{len(rows)} {' '.join(map(str, row))}: {rates}; {times}", flush=True)
+    print(f"{len(rows)} rows measured, in {args.out}; --write-tables FOLDER writes their tables")
     return len(rows)
 
 

@@ -1,17 +1,16 @@
-"""Example of a reward term that is defined in a script, without changes to the package.
+"""Train with a reward term that this script defines, as an example, and write the run and its reward as metrics.
 
     python experiments/new_reward.py --iterations 5
 
 A term is a pure Warp function of the robot (`mdp.RobotView`), the state of the task (`mdp.JumpState`; `Any` for a term
-that every task can use) and numbers by name, and a line that gives it a weight and these numbers. It is compiled into
-the task's one step kernel and logged by its name; weight and numbers can be changed while a training runs:
+that every task can use) and numbers by name. `RewardTerm` gives it a weight and these numbers. It is compiled into the
+task's one step kernel and logged by its name. Weight and numbers can be changed during a training:
 `env.set("rewards.even_load.weight", 2.0)`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import torch
 import warp as wp
@@ -19,8 +18,8 @@ import warp as wp
 from jumper_warp import Env, make_task, mdp
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.runner import train
-from jumper_warp.utils.output import output_dir, write_metrics
-from support.scripts import run_script
+from jumper_warp.utils.output import output_dir
+from support.scripts import DeviceArgs, report, run_script
 
 
 @wp.func
@@ -43,14 +42,12 @@ def make_env(num_envs: int, seed: int, device: torch.device) -> Env:
 
 
 @dataclass(frozen=True)
-class Args:
-    """Flags."""
+class Args(DeviceArgs):
+    """Flags of the script."""
 
     num_envs: int = 256  # Number of environments
     iterations: int = 5  # Training iterations
     num_steps: int = 32  # Policy steps of each environment in an iteration
-    out: Path | None = None  # Folder for the run and metrics.json (default: outputs/new_reward/<time>)
-    device: str | None = None  # Torch device
 
 
 def main(args: Args) -> dict:
@@ -66,9 +63,7 @@ def main(args: Args) -> dict:
         "mean_reward": result.metrics.get("Train/mean_reward"),
         "iterations": result.iteration,
     }
-    write_metrics(folder, values)
-    print(f"Episode_Reward/even_load {values['episode_reward_even_load']:.4f}; run in {result.folder}")
-    return values
+    return report(args, folder, values, "Training with a reward term of this script", values)
 
 
 if __name__ == "__main__":

@@ -1,10 +1,10 @@
-"""The paper's tests of jumps: results of given policies beside the paper's values.
+"""Run the paper's tests of jumps, print the results beside the paper's values, and write metrics, plots and recordings.
 
     python experiments/paper_tests.py --out outputs/paper
     python experiments/paper_tests.py --policies vertical_jump logs/horizontal-jump/RUN --randomize
 
-Every policy is evaluated by all suites of its task that have values in the paper (`jumper_warp.evaluation.suites`). The
-output folder has a subfolder for each.
+Every policy is evaluated by all suites of its task that have values in the paper (`jumper evaluate --suite`). Each has
+a folder in the output folder.
 """
 
 from __future__ import annotations
@@ -17,14 +17,14 @@ import tyro
 
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.suites import suites_for
-from jumper_warp.utils.metrics import Metrics, print_metrics
-from jumper_warp.utils.output import output_dir, read_metrics, read_values, write_metrics
-from support.scripts import run_script
+from jumper_warp.utils.metrics import Metrics
+from jumper_warp.utils.output import output_dir, read_values
+from support.scripts import report, run_script
 
 
 @dataclass(frozen=True)
 class Args(EvaluationArgs):
-    """Flags."""
+    """Flags of the script."""
 
     policy: tyro.conf.Suppress[str] = ""
     policies: tuple[str, ...] = ("vertical_jump", "horizontal_jump")
@@ -41,12 +41,11 @@ def main(args: Args) -> dict:
                 continue
             flags: dict[str, Any] = {key: value for key, value in asdict(args).items() if key != "policies"}
             prefix = f"{Path(policy).name}_{name}"
-            suite(**flags | {"policy": policy, "out": folder / prefix}).run()
-            values = read_metrics(folder / prefix)
+            run, values = suite(**flags | {"policy": policy, "out": folder / prefix}).evaluate()
+            run.write(values)
             metrics |= {f"{prefix}_{key}": values[key] for key in suite.paper}
             paper |= {f"{prefix}_{key}": value for key, value in suite.paper.items()}
-    write_metrics(folder, metrics)
-    print_metrics(metrics, paper)
+    report(args, folder, metrics, f"The paper's tests of {', '.join(args.policies)}", metrics, paper)
     return read_values(folder)
 
 

@@ -1,10 +1,10 @@
-"""A composite picture and a film of every policy, and the pictures of the README.
+"""Draw a composite picture and a film of every policy, and the pictures of the README.
 
     python experiments/policy_pictures.py --policies vertical_jump walking_flat --out outputs/pictures
     python experiments/policy_pictures.py --save-to-policies
 
-Every policy shows what it was trained for, once, on SolverJumper with nominal robots. `walk_jump_walk` is one robot
-with three policies. `--save-to-policies` writes `picture.webp` into the policies' folders.
+Every policy performs its task once, on SolverJumper with nominal robots. `walk_jump_walk` is one robot with three
+policies. `--save-to-policies` writes `picture.webp` into the policies' folders.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ from jumper_warp.utils.files import write_atomically
 from jumper_warp.viz.film import write_film
 from jumper_warp.viz.picture import write_picture
 from jumper_warp.viz.recording import Recording
-from support.scripts import ThreadArgs, prepare, run_script
+from support.scripts import ThreadArgs, announce, prepare, report, run_script, tracked
 
-COURSE = "walk_jump_walk"  # a script instead of a policy
+COURSE = "walk_jump_walk"  # A script with three policies
 SCRIPT = Path(__file__).parents[1] / "assets/scripts/walk_jump_walk.json"
 TILE = ("vertical_jump", "horizontal_jump", "walking_flat", "attitude", COURSE)
 TILE_WIDTH, FILM_SIZE, ANIMATION_SIZE = 800, (854, 480), (560, 316)  # [px]
@@ -46,7 +46,7 @@ TILE_WIDTH, FILM_SIZE, ANIMATION_SIZE = 800, (854, 480), (560, 316)  # [px]
 
 @dataclass(frozen=True)
 class Shot:
-    """What a policy does in its picture."""
+    """Task of a policy in its picture."""
 
     flags: PlayFlags
     title: str
@@ -82,7 +82,7 @@ SHOTS = {
     "vertical_jump": Shot(heights(1.0), "jump to a base height of 1 m"),
     "walking_flat": Shot(walk(0.8), "walk at 0.8 m/s"),
     "walking_rough": Shot(
-        walk(0.5), "walk at 0.5 m/s over stairs that it does not see",
+        walk(0.5), "walk at 0.5 m/s over stairs that it does not observe",
         lambda: single_tile(TerrainCfg(tile=8.0), "pit"),
     ),
 }  # fmt: skip
@@ -90,9 +90,9 @@ SHOTS = {
 
 @dataclass(frozen=True)
 class Args(ThreadArgs):
-    """Flags."""
+    """Flags of the script."""
 
-    policies: tuple[str, ...] = (*SHOTS, COURSE)  # Which to draw
+    policies: tuple[str, ...] = (*SHOTS, COURSE)  # Names of the policies to draw
     films: bool = True  # Also make films
     save_to_policies: bool = False  # Write picture.webp into the policies' folders
     readme: Path | None = None  # Folder for the README's tile and animation
@@ -119,10 +119,10 @@ def record(name: str) -> Recording:
 
 
 def main(args: Args) -> dict:
-    """Draw all pictures and films, and return their sizes [KiB] by name."""
+    """Draw all pictures and films, and return their sizes by name."""
     folder = prepare("policy_pictures", args, args.threads)
     sizes = {}
-    for name in args.policies:
+    for name in tracked(args.policies, "drawing policies"):
         recording = record(name)
         title = "walk, jump up, walk, jump ahead, walk" if name == COURSE else SHOTS[name].title
         picture = write_picture(recording, folder / f"{name}.webp", title=title)
@@ -133,12 +133,11 @@ def main(args: Args) -> dict:
             add_files(find_policy(name), {"picture.webp": picture.read_bytes()})
         if args.readme is not None and name == COURSE:
             paths.append(write_film(recording, args.readme / f"{name}.webp", size=ANIMATION_SIZE, fps=12.0))
-        for path in paths:
-            sizes[path.name] = path.stat().st_size / 1024
-            print(f"{path} {sizes[path.name]:.0f} KiB")
+        sizes |= {f"{path.name} [KiB]": path.stat().st_size / 1024 for path in paths}
+        announce(f"{', '.join(path.name for path in paths)} drawn")
     if args.readme is not None:
         save_tile([folder / f"{name}.webp" for name in TILE], args.readme / "policies.webp")
-    return sizes
+    return report(args, folder, sizes, f"Policies drawn: {len(args.policies)}", ())
 
 
 def save_tile(paths: list[Path], path: Path) -> None:

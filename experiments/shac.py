@@ -1,15 +1,17 @@
-"""Comparison of SHAC and PPO on the nominal vertical jump, and noise of gradients through contact.
+"""Compare trainings by SHAC and by PPO and the noise of their gradients, and write metrics and plots.
 
     python experiments/shac.py --num-envs 4096 --seconds 120 --out outputs/shac          # on a GPU
     python experiments/shac.py --num-envs 128 --seconds 300 --hidden 64 64 --history 1 --seeds 0     # on a CPU
 
-First the variance of the policy gradient between worlds is measured for windows of several lengths, through the physics
-and by the score function of PPO, for random and for trained weights. Then both train. Every few seconds of training
-time, the policy is evaluated on jumps to heights of 0.5 to 1.1 m; time and steps to success rates are reported.
+The task is the nominal vertical jump. First the variance of the policy gradient between worlds is measured for windows
+of several lengths, through the physics (SHAC) and by the score function (PPO), for random and for trained weights. Then
+both train. Every few seconds of training time the policy is evaluated on jumps to heights of 0.5 to 1.1 m. The metrics
+are time and steps to success rates.
 """
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, cast
@@ -26,16 +28,16 @@ from jumper_warp.rl.shac import Shac
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
-from support.gradient_variance import measure_stats, plot_variances, print_variances, variance_metrics
+from support.gradient_variance import measure_stats, plot_variances, variance_metrics
 from support.learning import LearningCurve, curve_metrics, make_eval_env, plot_curves, train_and_evaluate
-from support.scripts import DeviceArgs, prepare, run_script
+from support.scripts import DeviceArgs, announce, prepare, report, run_script, tracked
 
 TASK = "vertical-jump"
 
 
 @dataclass(frozen=True)
 class Args(DeviceArgs):
-    """Flags."""
+    """Flags of the script."""
 
     seconds: float = 120.0  # [s] Time of each training, its evaluations not counted; 0: none
     eval_interval: float = 5.0  # [s] Training time between two evaluations
@@ -80,11 +82,11 @@ def train(args: Args, algorithm: str, seed: int) -> LearningCurve:
 def compare(args: Args, folder: Path) -> dict[str, Any]:
     """Train with every trainer and seed, plot the learning curves into `folder`, and return the metrics."""
     values, curves = {}, {trainer: [] for trainer in args.trainers}
-    for trainer in args.trainers:
-        for seed in args.seeds:
-            curves[trainer].append(train(args, trainer, seed))
-            values |= curve_metrics(curves[trainer][-1], f"{trainer}_{seed}")
-            write_metrics(folder, values)
+    for trainer, seed in tracked([*itertools.product(args.trainers, args.seeds)], "trainings"):
+        curves[trainer].append(train(args, trainer, seed))
+        values |= curve_metrics(curves[trainer][-1], f"{trainer}_{seed}")
+        write_metrics(folder, values)
+        announce(f"{trainer}, seed {seed}: {values[f'success_{trainer}_{seed}']:.1%} success")
     plot_curves(curves, folder / "curves.png")
     return values
 
@@ -95,12 +97,10 @@ def main(args: Args) -> dict[str, Any]:
     values: dict[str, Any] = {"envs": args.num_envs, "window": args.window, "worlds": args.num_gradient_envs}
     stats = measure_stats(lambda: make_env(args, args.num_gradient_envs), args.horizons)
     plot_variances(stats, args.horizons, folder / "variance.png")
-    print_variances(stats, args.horizons)
     values |= {"horizons": list(args.horizons)} | variance_metrics(stats)
     values |= compare(args, folder) if args.seconds > 0.0 else {}
-    write_metrics(folder, values)
-    print(f"metrics and plots in {folder}")
-    return values
+    keys = [key for key in values if key.startswith(("success_", "seconds_to_95_percent_"))]
+    return report(args, folder, values, f"SHAC and PPO on {TASK}, {args.num_envs:,} environments", keys)
 
 
 if __name__ == "__main__":

@@ -1,12 +1,12 @@
-"""Soak test: random actions for a long time, to see whether any world becomes non-finite.
+"""Check that no world becomes non-finite under random actions for a long time, and write metrics.
 
     python experiments/soak_test.py --num-envs 4096 --steps 2500 --out outputs/soak
     python experiments/soak_test.py --num-envs 16384 --steps 61036 --task velocity-rough   # a billion steps
 
-Actions are random target angles of all motors within the limits of the jump. Worlds are reset every
-`--episode-steps`; masses and paw friction differ between worlds. With `--task` a whole randomised environment of any
-task takes random actions, and its episodes end and begin as in training; a map of grounds has only its hardest row. On
-a GPU the steps for which an action is held are one graph.
+Actions are random target angles of all motors within the limits of the jump. Worlds are reset every `--episode-steps`.
+Masses and paw friction differ between worlds. With `--task` a whole randomised environment of any task takes random
+actions, and its episodes end and begin as in training; a terrain map has only its hardest row. On a GPU the steps for
+which an action is held are one graph.
 """
 
 from __future__ import annotations
@@ -33,7 +33,9 @@ def main(args: SoakArgs) -> dict:
         task = hardest(make_task(args.task))
         env = Env(task, args.num_envs, seed=args.seed, device=args.device, threads=args.threads)
         metrics = soak_env(env, args) | {"task": args.task}
-    report(folder, metrics | {"envs": args.num_envs, "filter": args.command_filter, "seed": args.seed})
+    saved = metrics | {"envs": args.num_envs, "filter": args.command_filter, "seed": args.seed}
+    keys = ("non_finite_worlds", "share_of_steps_contact_unsolved", "largest_speed_m_s", "steps_per_s")
+    report(args, folder, saved, f"{metrics['steps']:,} policy steps with random actions", keys)
     return metrics
 
 

@@ -1,10 +1,10 @@
-"""Held squats: variation of paw forces and motor torques while a policy waits for the command to jump.
+"""Measure how quietly a policy waits for its command to jump, and write metrics, a plot and a recording.
 
     python experiments/squat_hold.py --policy vertical_jump --out outputs/hold
     python experiments/squat_hold.py --policy horizontal_jump --num-squats 500 --randomize
 
-Robots stand, get a goal but no command, and squat. Evaluated over the last second are the range of the force on each
-paw (largest value over physics steps, smallest over policy steps) and the ripple of the motor torques. Randomised
+Robots stand, get a goal but no command, and squat. Two metrics cover the last second: the range of the force on each
+paw (largest value over physics steps minus smallest over policy steps) and the ripple of the motor torques. Randomised
 robots have observation noise and are pushed by up to 10 N.
 """
 
@@ -70,7 +70,8 @@ def main(args: Args) -> dict:
     if not squats.ended.all():
         plot_squats(run, squats)
     run.settings["hold_s"] = args.hold_time
-    return run.report(squat_metrics(squats), {})
+    keys = ("holding_rate", "paw_force_range_median_n", "lost_paw_share_mean", "torque_ripple_mean_nm")
+    return run.report(squat_metrics(squats), {}, keys)
 
 
 if __name__ == "__main__":

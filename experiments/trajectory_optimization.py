@@ -1,13 +1,16 @@
-"""Optimisation of jumps by gradients through the simulation: farthest, highest, least work, still landing; and limits.
+"""Optimise jumps by gradients through the simulation, and write metrics, plots, targets and recordings of the best.
 
     python experiments/trajectory_optimization.py --out outputs/trajectories
     python experiments/trajectory_optimization.py --jumps farthest farthest_torque_24_8 farthest_filter
 
-Motor targets, equal left and right, pass through the command filter and motors of the tasks, from standing still. A
-search begins with random squats in parallel worlds, for the farthest flight with run-ups in place, descends along
-smoothed gradients (`trajectory.smoothing`) and ends with limited-memory BFGS inside an augmented Lagrangian
-(`trajectory.augmented_lagrangian`). Reported values come from a replay of the targets in the simulation that trains
-policies, at every physics step, where collisions of all links are counted.
+The jumps are the farthest flight, the highest jumps, the jump with the least work, and a still landing. Motor targets,
+equal left and right, pass through the command filter and motors of the tasks, from standing still.
+
+1. A search begins with random squats in parallel worlds, for the farthest flight with run-ups in place.
+2. It descends along smoothed gradients (`trajectory.smoothing`).
+3. It ends with limited-memory BFGS inside an augmented Lagrangian (`trajectory.augmented_lagrangian`).
+4. The best targets are replayed in the simulation that trains policies. The metrics come from this replay, at every
+   physics step; collisions of all links count.
 
 The farthest flight stays within 0.3 m of its start in stance, without a run-up, and lands within 30 degrees of level.
 `farthest_*` change one limit (`support.optimized_jumps.LIMITS`) and also start from the farthest flight if it was
@@ -24,21 +27,19 @@ from typing import Any
 
 import numpy as np
 import torch
-from rich.console import Console
-from rich.table import Table
 
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
 from support.motion_replay import MotionReplay, plot_replays
 from support.optimized_jumps import FINE, JUMPS, LIMITED, noisy_variants, optimise
-from support.scripts import ThreadArgs, prepare, run_script
+from support.scripts import ThreadArgs, prepare, report, run_script, tracked
 
 ALL_JUMPS = JUMPS | LIMITED  # By name
 
 
 @dataclass(frozen=True)
 class Args(ThreadArgs):
-    """Flags."""
+    """Flags of the script."""
 
     jumps: tuple[str, ...] = tuple(JUMPS)  # Names of the jumps to optimise
     samples: int | None = None  # Random candidates (default: those of each jump)
@@ -83,26 +84,20 @@ def main(args: Args) -> dict[str, Any]:
     folder, best = prepare("trajectory_optimization", args, args.threads), {}
     replays: dict[str, MotionReplay] = {}
     values: dict[str, Any] = {}
-    table = Table("jump", "reached", "violation", "simulated steps", "reverse steps", "processor [s]", "wall [s]")
-    for name in args.jumps:
+    for name in tracked(args.jumps, "optimising jumps"):
         row, replay = run_jump(name, args, folder, best)
         replays[ALL_JUMPS[name].label] = replay
         values |= {f"{name}_gradients_{key}": value for key, value in row.items()}
+        values[f"{name}_reached [{ALL_JUMPS[name].unit}]"] = row["value"]
         values |= {f"{name}_{key}": value for key, value in replay.metrics().items()}
         if name == "still":
             values |= {"still_longest_lift_s": replay.longest_lift, "still_highest_lift_m": replay.highest_lift}
         replay.recorder.save_rrd(folder / f"{name}.rrd")
         replay.recorder.save_picture(folder / f"{name}.png", title=ALL_JUMPS[name].label)
         write_metrics(folder, values)
-        table.add_row(
-            ALL_JUMPS[name].label, f"{row['value']:.3f} {ALL_JUMPS[name].unit}", f"{row['violation']:.4f}",
-            f"{row['simulated_steps'] / 1e6:.2f} M", f"{row['reverse_steps'] / 1e6:.2f} M", f"{row['cpu_s']:.0f}",
-            f"{row['wall_s']:.0f}",
-        )  # fmt: skip
     plot_replays(replays, folder / "trajectories.png")
-    Console().print(table)
-    print(f"metrics, plots, targets and recordings in {folder}")
-    return values
+    keys = [key for key in values if "_reached [" in key or key.endswith("_violation")]
+    return report(args, folder, values, f"Optimised jumps: {', '.join(replays)}", keys)
 
 
 if __name__ == "__main__":

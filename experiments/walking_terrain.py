@@ -1,11 +1,11 @@
-"""Distance that a walking policy covers on uneven ground, slopes and steps that it does not observe.
+"""Measure how far a policy walks on slopes, stairs and uneven ground, and write metrics, a plot and recordings.
 
     python experiments/walking_terrain.py --policy walking_rough --num-robots 500 --out outputs/terrain
 
 Robots start in the middle of a tile with random headings and are commanded to walk straight ahead at 0.5 m/s for 10 s.
-The metric of a terrain is the mean fraction of the commanded distance that they walk before they fall. Slopes and
-stairs descend from the start, bowls and pits ascend. `--randomize` adds the randomisation, noise and latency of the
-training; `--solver mujoco` evaluates on physics that the policy was not trained on.
+They do not observe the terrain. The metric of a terrain is the mean fraction of the commanded distance that they walk
+before they fall. Slopes and stairs descend from the start, bowls and pits ascend. `--randomize` adds the randomisation,
+noise and latency of the training. `--solver mujoco` evaluates on physics that the policy was not trained on.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SECONDS = 10.0  # [s] Time of each walk
 
 @dataclass(frozen=True)
 class Args(EvaluationArgs):
-    """Flags."""
+    """Flags of the script."""
 
     policy: str = "walking_rough"
     num_robots: int = 500  # Robots on each terrain
@@ -66,7 +66,7 @@ def main(args: Args) -> dict:
         axis.boxplot([fractions[kind] for kind in args.terrains], tick_labels=list(args.terrains), whis=(5, 95))
         axis.set(ylabel="share of the way [1]", ylim=(0.0, 1.05))
     run.settings["speed_m_s"] = args.speed
-    return run.report(metrics, {})
+    return run.report(metrics, {}, [*metrics])
 
 
 if __name__ == "__main__":

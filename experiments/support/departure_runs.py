@@ -113,15 +113,14 @@ def evaluate(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, A
     return tests
 
 
-def report(results: MetricsByTraining, title: str, folder: Path) -> Table:
-    """Write `departures.txt` and `departures.png` of all results into a folder, and return the table."""
+def write_table(results: MetricsByTraining, title: str, folder: Path) -> None:
+    """Write `departures.txt` and `departures.png` of all results into a folder."""
     table = Table("ablation, seed", *map(escape, COLUMNS), title=title)
     for (name, seed), tests in results.items():
         table.add_row(f"{name.replace('_', ' ')}, {seed}", *(cell(tests, *column) for column in COLUMNS.values()))
     with (folder / "departures.txt").open("w") as file:
         Console(file=file, width=WIDTH).print(table)
     plot_results(results, folder / "departures.png")
-    return table
 
 
 def cell(tests: dict[str, dict[str, Any]], name: str, scale: float) -> str:

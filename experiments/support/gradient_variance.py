@@ -9,8 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import torch
-from rich.console import Console
-from rich.table import Table
 
 from jumper_warp.diff.differentiable_env import DifferentiableEnv
 from jumper_warp.envs.env import Env
@@ -113,17 +111,6 @@ def variance_metrics(stats: StatsByPolicy) -> dict[str, Any]:
                 series = [getattr(one_horizon, field) for one_horizon in of_horizons]
                 values[f"{key}_{estimator}_{policy}"] = [x if math.isfinite(x) else None for x in series]
     return values
-
-
-def print_variances(stats: StatsByPolicy, horizons: tuple[int, ...]) -> None:
-    """Print a table of standard deviations and numbers of worlds by policy and horizon."""
-    columns = (f"{name}: {column}" for name in ESTIMATORS for column in ("deviation", "worlds"))
-    table = Table("policy", "steps", *columns)
-    for policy, by_estimator in stats.items():
-        for horizon, *pair in zip(horizons, *by_estimator.values(), strict=True):
-            cells = [f"{x:.3g}" for estimate in pair for x in (estimate.std, estimate.worlds_needed)]
-            table.add_row(policy, str(horizon), *cells)
-    Console().print(table)
 
 
 def plot_variances(stats: StatsByPolicy, horizons: tuple[int, ...], path: Path) -> None:

@@ -105,16 +105,13 @@ def train_and_time(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Learning
 
 
 def curve_metrics(curve: LearningCurve, name: str) -> dict[str, Any]:
-    """Return the metrics of one training, `<metric>_<name>`, and print time and steps to reach each of RATES."""
-    steps_per_s = curve.steps[-1] / curve.seconds[-1]
-    values = {f"success_{name}": curve.success[-1], f"steps_per_s_{name}": steps_per_s}
+    """Return the metrics of one training, `<metric>_<name>`, with time and steps to reach each of RATES."""
+    values = {f"success_{name}": curve.success[-1], f"steps_per_s_{name}": curve.steps[-1] / curve.seconds[-1]}
     values |= {f"curve_{series}_{name}": getattr(curve, series) for series in ("seconds", "steps", "success")}
     for rate in RATES:
         seconds, key = curve.seconds_to(rate), f"{100 * rate:g}_percent_{name}"
         steps = None if seconds is None else curve.steps[curve.seconds.index(seconds)]
         values |= {f"seconds_to_{key}": seconds, f"steps_to_{key}": steps}
-        print(f"{name}, {100 * rate:g} %: " + ("never" if steps is None else f"{seconds:.0f} s, {steps / 1e6:.2f} M"))
-    print(f"{name}: {100 * curve.success[-1]:.1f} % at the end, {steps_per_s:,.0f} steps a second", flush=True)
     return values
 
 

@@ -25,6 +25,7 @@ from jumper_warp.trajectory.augmented_lagrangian import Progress, minimise
 from jumper_warp.trajectory.problem import Knots, Problem, Term
 from jumper_warp.trajectory.smoothing import Stage, smoothed
 from support.motion_replay import TAKEOFF_SPEED, MotionReplay
+from support.scripts import announce
 
 PITCH, AWAY, AHEAD = math.radians(29.8), 0.2985, 0.045
 """[rad], [m], [m] Largest pitch at landing, distance of the base from its start in stance, and distance of hind paws on
@@ -228,7 +229,7 @@ def optimise(
         problem, record = problems[str(how)], lambda _, last: costs.append(last)
         candidates = smoothed(problem, candidates, stages=(stage,), seed=seed + number, callback=record)
         best = float(costs[-1][0])
-        print(f"{jump.label}, part {number + 1}: {len(candidates)} starts, cost with penalties {best:.3f}", flush=True)
+        announce(f"{jump.label}, stage {number + 1} of {len(jump.stages)}: cost with penalties {best:.3f}")
     progress = minimise(problems[str(FINE)], candidates, iterations=polish, step=0.01, seed=seed)
     return progress, {
         "simulated_steps": float(sum(problem.world_steps for problem in problems.values())),

@@ -1,29 +1,37 @@
-"""Flags and report shared by scripts."""
+"""Flags of scripts, their output folder, and the summary that they end with."""
 
 from __future__ import annotations
 
+import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-import tyro
-
-from jumper_warp.cli.main import run_command
-from jumper_warp.cli.renamed_flags import use_new_names
+from jumper_warp.cli.main import parse, run_command
 from jumper_warp.utils.output import output_dir, write_metrics
+from jumper_warp.utils.progress import phase
 from jumper_warp.utils.runtime import configure_device
+from jumper_warp.utils.summary import PrintFlags, print_summary
+from support.timing import process_age
 
 Args = TypeVar("Args")
+Item = TypeVar("Item")
 
 
 @dataclass(frozen=True)
-class DeviceArgs:
-    """Flags of a script that computes on one device."""
+class OutputArgs(PrintFlags):
+    """Flags of every script."""
 
     out: Path | None = None  # Folder for metrics.json, plots and recordings (default: outputs/<script>/<time>)
-    device: str | None = None  # Warp device
+
+
+@dataclass(frozen=True)
+class DeviceArgs(OutputArgs):
+    """Flags of a script that computes on one device."""
+
+    device: str | None = None  # Warp device, such as cpu or cuda:0 (default: a GPU if there is one)
 
 
 @dataclass(frozen=True)
@@ -39,11 +47,14 @@ def run_script(main: Callable[[Args], Any], kind: type[Args]) -> None:
 
 
 def parse_flags(kind: type[Args]) -> Args:
-    """Return the flags of a script, an object of `kind`, from the command line.
+    """Return the flags of a script, an object of `kind`, from the command line; `--help` prints the script's docstring.
 
-    Raises InputError: a flag is given by both its former and its present name.
+    Raises InputError: there is no such flag, or a value is invalid.
     """
-    return tyro.cli(kind, args=use_new_names(sys.argv[1:], kind))
+    # lines of a paragraph or of an item of a list become one, which the help wraps at the terminal's width
+    about = re.sub(r"(?<!\n)\n {0,3}(?![\s-]|\d+\. )", " ", sys.modules["__main__"].__doc__ or "").strip()
+    name = Path(sys.argv[0]).name
+    return parse(kind, name, sys.argv[1:], description=about, program=f"python experiments/{name}")
 
 
 def prepare(name: str, args: DeviceArgs, threads: int | None = None) -> Path:
@@ -52,18 +63,28 @@ def prepare(name: str, args: DeviceArgs, threads: int | None = None) -> Path:
     return output_dir(name, args.out)
 
 
-def report(folder: Path, values: dict[str, Any]) -> dict[str, Any]:
-    """Write metrics by name to `metrics.json` in a folder, print them and the folder, and return them."""
+def announce(text: str) -> None:
+    """Print what a script does or has done, with the time since its start, on standard error."""
+    print(f"{process_age():4.0f} s  {text}", file=sys.stderr, flush=True)
+
+
+def tracked(items: Collection[Item], title: str) -> Iterator[Item]:
+    """Yield the items of a long loop; a terminal shows the progress and the time left."""
+    with phase(title, len(items)) as advance:
+        for item in items:
+            yield item
+            advance()
+
+
+def report(
+    args: PrintFlags, folder: Path, values: dict[str, Any], done: str, keys: Iterable[str],
+    paper: Mapping[str, float] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Write metrics by name to `metrics.json` in a folder, print a summary, and return the metrics.
+
+    done: what was done, the first line; keys: of the metrics in the summary, missing ones are skipped; paper: published
+    values by key.
+    """
     write_metrics(folder, values)
-    for name, value in values.items():
-        items = value if isinstance(value, list | tuple) else [value]
-        print(f"{name:40} {', '.join(map(number_text, items))}")
-    print(f"metrics, plots and recordings in {folder}")
+    print_summary(folder, done, keys, paper=paper, flags=args, seconds=process_age())
     return values
-
-
-def number_text(value: Any) -> str:
-    """Return a value as text; floats below 1000 have four significant digits, others all digits but no decimals."""
-    if not isinstance(value, float):
-        return str(value)
-    return f"{value:,.0f}" if abs(value) >= 1.0e3 else f"{value:.4g}"

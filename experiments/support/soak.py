@@ -17,7 +17,7 @@ from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from support.scripts import ThreadArgs
+from support.scripts import ThreadArgs, tracked
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,7 @@ def simulation_steps(sim: Simulation, args: SoakArgs) -> Iterator[torch.Tensor]:
     lower, upper = (
         target.new_tensor([row] * 4).reshape(12, 1) for row in ([-lateral, low, low], [lateral, high, high])
     )
-    for step in range(args.steps):
+    for step in tracked(range(args.steps), "policy steps"):
         if step % args.hold_steps == 0:
             target.copy_(lower + (upper - lower) * torch.rand_like(target))
         sim.step()
@@ -156,7 +156,7 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
     run, rounds = CapturedProcedure(step_held, env.device.type == "cuda"), -(-args.steps // args.hold_steps)
     check_interval = max(args.episode_steps // args.hold_steps, 1)
     start = time.perf_counter()
-    for i in range(rounds):
+    for i in tracked(range(rounds), "rounds of random actions"):
         run()
         if (i + 1) % check_interval == 0 and (rows := counters.read().rows):
             raise RuntimeError(f"{rows} rows hold values that are not finite, by step {(i + 1) * args.hold_steps}")

@@ -25,13 +25,14 @@ def wants_help(args: Sequence[str]) -> bool:
     return any(arg in (*HELP, HELP_ALL) for arg in args)
 
 
-def help_page(command: str, about: str, flags: Sequence[Flag], args: Sequence[str], short: Short | None = None) -> str:
+def help_page(program: str, about: str, flags: Sequence[Flag], args: Sequence[str], short: Short | None = None) -> str:
     """Return the page that `--help`, `--help-all` or `--help GROUP` among the arguments requests.
 
-    about: what the command does. short: flags of --help (default: all). Raises InputError: there is no such group.
+    program: command line without flags. about: what it does. short: flags of --help (default: all).
+    Raises InputError: there is no such group.
     """
     words = " ".join(flag.name for flag in flags if flag.positional)
-    usage = f"usage: jumper {command} {words + ' ' if words else ''}[flags]\n\n"
+    usage = f"usage: {program} {words + ' ' if words else ''}[flags]\n\n"
     full = f"{usage}{wrap(about)}\n\n{sections(flags)}"
     if HELP_ALL in args:
         return full

@@ -132,13 +132,13 @@ def split_task_modules(args: Sequence[str]) -> tuple[list[str], list[str]]:
 
 def parse(
     kind: Any, command: str, args: Sequence[str], *, description: str | None = None, default: Any = None,
-    short: Short | None = None, subject: str | None = None,
+    short: Short | None = None, subject: str | None = None, program: str | None = None,
 ) -> Any:  # fmt: skip
     """Return a command's settings parsed from its arguments; prints help and exits with 0 if they ask for it.
 
     kind: dataclass of the settings. description: text for the help (default: kind's docstring). default: instance of
     `kind`. short: flags of --help, as for `help_page` (default: all). subject: what has the flags, for errors (default:
-    the command).
+    the command). program: command line of a script in place of `jumper COMMAND`, without --task-module.
     Raises UsageError: there is no such flag, or a value is missing or of another type.
     """
     from jumper_warp.cli.flags import Flag, list_flags, option_of
@@ -148,16 +148,17 @@ def parse(
     task_module = Flag(
         "task-module", "FILE_OR_MODULE", None, "File or installed module with tasks of your own; repeatable"
     )
-    flags = [*list_flags(kind if default is None else default), task_module]
+    flags = [*list_flags(kind if default is None else default), *([task_module] if program is None else [])]
+    program = program or f"jumper {command}"
     if wants_help(args):
-        print(help_page(command, description or inspect.getdoc(kind) or "", flags, args, short), end="")
+        print(help_page(program, description or inspect.getdoc(kind) or "", flags, args, short), end="")
         raise SystemExit(0)
     args = use_new_names(args, kind if default is None else default)
     options = {option for flag in flags for option in flag.options}
     for option in filter(None, map(option_of, args)):
         if option not in options:
             near = suggestion(option[2:], (each[2:] for each in options)).replace("'", "'--", 1)
-            near = near or f"; jumper {command} --help lists the flags"
+            near = near or f"; {program} --help lists the flags"
             raise UsageError(f"no flag {option} for {subject or command}{near}")
     import tyro
 

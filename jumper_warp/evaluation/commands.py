@@ -23,6 +23,7 @@ from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import print_metrics
 from jumper_warp.utils.output import write_metrics
+from jumper_warp.utils.summary import PrintFlags
 
 if TYPE_CHECKING:
     from jumper_warp.evaluation.log import EvaluationLog
@@ -41,13 +42,14 @@ class EvaluateCfg(Generic[Flags]):
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
     """Conditions of the evaluation."""
     out: Path | None = None  # Folder for metrics.json (default: outputs/evaluate/<time>)
+    printing: Annotated[PrintFlags, tyro.conf.arg(name="")] = field(default_factory=PrintFlags)
+    """What is printed about the results."""
     save_trials: bool = False  # Also write the arrays of all trials, from which the rates follow, into trials.npz
     save_to_policy: bool = False  # Also save the metrics into the policy's folder
-    json: bool = False  # Print metrics.json in place of a table
 
 
 def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
-    """Evaluate a policy, write `metrics.json`, print the metrics, and return conditions and metrics by name.
+    """Evaluate a policy, write `metrics.json`, print a summary, and return conditions and metrics by name.
 
     Raises PolicyError: unusable policy, or `save_to_policy` for a run; InputError: `save_to_policy` for another stream
     than reporting; OSError: the folder cannot be created.
@@ -59,7 +61,8 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
         raise InputError(f"save_to_policy is for the stream reporting, got {cfg.conditions.stream}")
     if cfg.save_to_policy and is_run(run.source):
         raise PolicyError(f"{run.source}: a run keeps no metrics; export it first")
-    run.prepare("evaluate", cfg.conditions, cfg.out, save_trials=cfg.save_trials, json=cfg.json)
+    run.prepare("evaluate", cfg.conditions, cfg.out, save_trials=cfg.save_trials)
+    run.print_flags = cfg.printing
     log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.stream_seed)
     run.run_episodes(run.env(log.count), log)
     values = run.report(cfg.flags.metrics(log), run.evaluation.paper)

@@ -5,7 +5,6 @@ Experiments and the commands `jumper evaluate` and `jumper play` use this module
 
 from __future__ import annotations
 
-import sys
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -27,9 +26,10 @@ from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.metrics import AnyMetrics, print_metrics
+from jumper_warp.utils.metrics import AnyMetrics, Metrics, MetricValue
 from jumper_warp.utils.output import output_dir, read_values, write_metrics
 from jumper_warp.utils.runtime import configure_device
+from jumper_warp.utils.summary import PrintFlags, print_summary
 from jumper_warp.utils.threads import checked_threads
 
 if TYPE_CHECKING:
@@ -40,19 +40,24 @@ if TYPE_CHECKING:
 HEIGHTS = ("apex_height", "apex_height_mars")  # Keys of `EVALUATIONS` of policies that jump to a commanded height
 PLACES = ("landing_position", "omnidirectional", "landing_position_mars")
 """Keys of `EVALUATIONS` of policies that jump to a commanded landing position."""
+HEADLINES = (
+    "success_rate", "goal_reached_rate", "apex_error_abs_mean_m", "goal_distance_at_rest_mean_m", "slewed_rmse_vx_m_s",
+    "slewed_rmse_vy_m_s", "slewed_rmse_yaw_rate_rad_s", "settled_without_collision_rate", "settling_time_mean_s",
+    "success_termination_rate", "failure_termination_rate", "length_mean_s", "fall_rate",
+)  # fmt: skip
+"""Keys of the metrics in a summary, unless an evaluation has its own."""
 SOLVER_TITLES = {"jumper": "SolverJumper", "mujoco": "SolverMuJoCo"}  # By value of `Conditions.solver`
 Log = TypeVar("Log", bound=EvaluationLog)
 
 
 @dataclass(frozen=True)
-class EvaluationArgs(Conditions):
+class EvaluationArgs(Conditions, PrintFlags):
     """Common flags of experiments that evaluate a policy; randomised robots also have observation noise."""
 
     noise: tyro.conf.Suppress[tyro.conf.Fixed[bool]] = False
     policy: str = "horizontal_jump"  # Name or folder of a policy, a run's folder, or a checkpoint
     num_recorded: int = 1  # Number of jumps to record for the Rerun viewer and, one of them, as a picture; 0: none
     save_trials: bool = False  # Write the arrays of all trials, from which the metrics are computed, to trials.npz
-    json: bool = False  # Print metrics.json in place of a table
     out: Path | None = None  # Folder for metrics, plots, pictures and recordings (default: outputs/<name>/<time>)
 
     def __post_init__(self) -> None:
@@ -73,6 +78,7 @@ class Run(ABC):
     """Base class of evaluations: runs episodes, records some worlds, reports metrics; subclasses provide the actor."""
 
     folder: Path  # Output folder, set by `prepare`
+    source: str | Path = "several policies"  # Name or folder of a policy, a run's folder, or a checkpoint
 
     def __init__(self) -> None:
         """Start the clock of the report; call `prepare` before any other method."""
@@ -81,7 +87,7 @@ class Run(ABC):
         self.started = time.perf_counter()
         self.conditions, self.record = Conditions(), 0  # Conditions of all episodes; number of worlds to record
         self.save_trials = False  # Whether `run_episodes` writes trials.npz
-        self.json = False  # Whether `report` prints metrics.json in place of a table
+        self.name, self.print_flags = "", PrintFlags()  # Name of the evaluation; what `report` prints
         self.settings: dict[str, Any] = {}  # Settings of task, robot and test, reported with the conditions
         self._latency: list[np.ndarray] = []  # [physics steps] (num_envs,) per `run_episodes`
         self._physics_dt = PHYSICS_DT
@@ -91,17 +97,16 @@ class Run(ABC):
         """Return the policy as a function from observations (num_envs, num_obs) to actions, see `run_evaluation`."""
 
     def prepare(
-        self, name: str, conditions: Conditions, out: Path | None = None, *, record: int = 0,
-        save_trials: bool = False, json: bool = False,
-    ) -> None:  # fmt: skip
+        self, name: str, conditions: Conditions, out: Path | None = None, *, record: int = 0, save_trials: bool = False
+    ) -> None:
         """Set the conditions, select the device and create the output folder, before the simulation.
 
         name: of the folder outputs/<name>/<time>, unless `out` is passed; record: number of worlds to record;
-        save_trials: whether to write trials.npz; json: whether to print metrics.json in place of a table.
+        save_trials: whether to write trials.npz.
         Raises InputError: no such device or number of threads; OSError: the folder cannot be created.
         """
         configure_device(conditions.device, conditions.threads)
-        self.conditions, self.record, self.save_trials, self.json = conditions, record, save_trials, json
+        self.conditions, self.record, self.save_trials, self.name = conditions, record, save_trials, name
         self.folder = output_dir(name, out)
 
     @property
@@ -164,15 +169,23 @@ class Run(ABC):
         worlds = np.linspace(0, env.num_envs - 1, min(self.record, env.num_envs)).round().astype(int).tolist()
         return EnvRecorder(env, log, worlds, ground=scene.get("ground", "plane"), block=scene.get("block"))
 
-    def report(self, metrics: AnyMetrics, paper: Mapping[str, float]) -> dict[str, Any]:
-        """Write conditions and metrics to `metrics.json`, print them with the paper's values, return all values."""
-        path, done = write_metrics(self.folder, metrics, self.condition_values), f"results in {self.folder}"
-        if self.json:
-            print(path.read_text(encoding="utf-8"), end="")
-        else:
-            print_metrics(metrics, paper, self.condition_values, self.title)
-        print(f"{time.perf_counter() - self.started:.1f} s; {done}", file=sys.stderr if self.json else sys.stdout)
+    def write(self, metrics: AnyMetrics) -> dict[str, Any]:
+        """Write conditions and metrics to `metrics.json`, and return all values by name."""
+        write_metrics(self.folder, metrics, self.condition_values)
         return read_values(self.folder)
+
+    def report(
+        self, metrics: Metrics, paper: Mapping[str, float], keys: Sequence[str] = HEADLINES
+    ) -> dict[str, Any]:  # fmt: skip
+        """Write the metrics, print those with the given keys beside the paper's values, and return all values."""
+        values = self.write(metrics)
+        printed = [metrics[key] for key in keys if key in metrics]
+        most = max(printed, key=lambda metric: metric.trials or 0, default=MetricValue(None))
+        count = f"{most.trials:,} {most.over}, " if most.trials else ""
+        what = f"{self.source}, {self.name.replace('_', ' ')}: {count}{self.title}"
+        seconds = time.perf_counter() - self.started
+        print_summary(self.folder, what, keys, paper=paper, flags=self.print_flags, seconds=seconds)
+        return values
 
 
 class EvaluationRun(Run):
@@ -208,8 +221,8 @@ class EvaluationRun(Run):
                 f"expected a policy with evaluation suite {' or '.join(evaluations)}, "
                 f"{args.policy} (task {run.task.name}) has {run.task.evaluation_suite}"
             )
-        settings = {"record": args.num_recorded, "save_trials": args.save_trials, "json": args.json}
-        run.prepare(name, conditions_of(args), args.out, **settings)
+        run.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
+        run.print_flags = args
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
@@ -248,8 +261,8 @@ class SkillRun(Run):
         Raises PolicyError, CheckpointError or InputError.
         """
         run = cls(names)
-        settings = {"record": args.num_recorded, "save_trials": args.save_trials, "json": args.json}
-        run.prepare(name, conditions_of(args), args.out, **settings)
+        run.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
+        run.print_flags = args
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:

@@ -92,6 +92,7 @@ class Grid(Suite):
     name: ClassVar = "grid"
     paper: ClassVar = {"goal_distance_at_rest_mean_m": 0.025, "goal_distance_at_end_mean_m": 0.025,
                        "success_rate": 0.968, "in_range_success_rate": 1.0}  # fmt: skip
+    summary: ClassVar = DistanceSweep.summary
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -123,6 +124,7 @@ class Ring(Suite):
     radius: float = 0.5  # [m] Radius of the ring
 
     name: ClassVar = "ring"
+    summary: ClassVar = ("success_rate", "goal_distance_at_rest_mean_m", *(f"{name}_success_rate" for name in SECTORS))
     least: ClassVar = (len(SECTORS), 0.1)
 
     def __post_init__(self) -> None:
@@ -160,6 +162,8 @@ class Consecutive(Suite):
 
     name: ClassVar = "consecutive"
     paper: ClassVar = {"goal_distance_at_rest_mean_m": 0.0054}
+    summary: ClassVar = ("both_landed_rate", "goal_distance_at_rest_mean_m", "row_all_success_rate", "row_fall_rate",
+                         "row_goal_distance_at_rest_mean_m")  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -217,6 +221,8 @@ class Platform(Suite):
     """[m] Distance from the start to the platform's edge, rounded down to 0.02 m, and to the block's near edge."""
 
     name: ClassVar = "platform"
+    summary: ClassVar = tuple(f"{scene}_{key}" for scene in ("platform", "uneven", "block")
+                              for key in ("success_rate", "goal_distance_at_rest_mean_m", "fall_rate"))  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -285,6 +291,8 @@ class Farthest(Suite):
 
     name: ClassVar = "max"
     paper: ClassVar = {"reliable_distance_without_hop_m": 1.25}
+    summary: ClassVar = tuple(f"reliable_{name}{suffix}_m" for suffix in RATES
+                              for name in ("distance", "distance_flown"))  # fmt: skip
 
     def __post_init__(self) -> None:
         super().__post_init__()

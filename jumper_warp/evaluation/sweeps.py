@@ -17,7 +17,7 @@ from jumper_warp.evaluation.jumps import DELAY, REST_TIME, TOLERANCE, with_jump_
 from jumper_warp.evaluation.landings import LandingFlags, LandingLog, random_headings, with_second_takeoff
 from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
 from jumper_warp.evaluation.log import termination_names, within
-from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun, trained_range
+from jumper_warp.evaluation.run import HEADLINES, HEIGHTS, PLACES, EvaluationArgs, EvaluationRun, trained_range
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, chosen, measure
@@ -47,6 +47,7 @@ class Suite(EvaluationArgs, ABC):
     name: ClassVar[str]  # Value of `jumper evaluate --suite`, and name of the output folder
     evaluations: ClassVar[tuple[str, ...]] = PLACES  # Keys of `EVALUATIONS` of the policies that the suite accepts
     paper: ClassVar[dict[str, float]] = {}  # Values in the paper of metrics with the same names
+    summary: ClassVar[tuple[str, ...]] = HEADLINES  # Keys of the metrics in the summary
     least: ClassVar[tuple[int, float]] = (1, 0.1)  # Minimum number of jumps and minimum rest [s]
 
     def __post_init__(self) -> None:
@@ -64,9 +65,14 @@ class Suite(EvaluationArgs, ABC):
 
         Raises PolicyError, CheckpointError or InputError, see `EvaluationRun.from_args`.
         """
+        run, metrics = self.evaluate(modules)
+        return run.report(metrics, self.paper, self.summary)
+
+    def evaluate(self, modules: Iterable[ModuleType] = ()) -> tuple[EvaluationRun, Metrics]:
+        """Return the finished evaluation and its metrics, which are neither written nor printed; as `run`."""
         run = EvaluationRun.from_args(self.name, self, self.evaluations, modules)
         run.settings["rest_s"] = self.rest_time
-        return run.report(self.measure(run), self.paper)
+        return run, self.measure(run)
 
     def run_flags(self, run: EvaluationRun, flags: Any, env: Env, film: str = "") -> Any:
         """Run the jumps that flags of `jumper evaluate` define, and return their log; film: name of the recording."""
@@ -119,6 +125,8 @@ class HeightSweep(Suite):
     name: ClassVar = "sweep"
     evaluations: ClassVar = HEIGHTS
     paper: ClassVar = heights.PAPER
+    summary: ClassVar = ("goal_reached_rate", "in_range_goal_reached_rate", "apex_error_abs_mean_m", "success_rate",
+                         "open_loop_apex_mean_m")  # fmt: skip
     least: ClassVar = (3, 0.1)
 
     def __post_init__(self) -> None:
@@ -173,6 +181,7 @@ class DistanceSweep(Suite):
 
     name: ClassVar = "sweep"
     paper: ClassVar = landings.PAPER
+    summary: ClassVar = ("success_rate", "in_range_success_rate", "goal_distance_at_rest_mean_m", "fall_rate")
     least: ClassVar = (3, 0.1)
 
     def __post_init__(self) -> None:

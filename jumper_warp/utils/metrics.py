@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import re
+import textwrap
 from collections.abc import Callable, Iterable, Mapping
 from typing import Any, NamedTuple, Protocol
 
@@ -13,8 +15,8 @@ from rich.table import Column, Table
 
 Scalar = float | int | str | bool | None  # Type of a value, or of each item of a list of values
 UNITS = {
-    "_rad_s": "rad/s", "_m_s2": "m/s^2", "_nm_s": "N m s", "_m_s": "m/s", "_deg": "deg", "_mm": "mm", "_ms": "ms",
-    "_us": "us", "_nm": "N m", "_hz": "Hz", "_m": "m", "_s": "s", "_n": "N",
+    "_per_s": "1/s", "_n_m": "N/m", "_rad_s": "rad/s", "_m_s2": "m/s^2", "_nm_s": "N m s", "_m_s": "m/s", "_deg": "deg",
+    "_mm": "mm", "_ms": "ms", "_us": "us", "_nm": "N m", "_hz": "Hz", "_m": "m", "_s": "s", "_n": "N",
 }  # fmt: skip
 """Unit by the end of a metric's key; longer ends come before the shorter ones that they contain."""
 
@@ -56,9 +58,14 @@ class Metric(NamedTuple):
 
 def unit_of(key: str) -> str | None:
     """Return the unit at the end of a metric's key, as `_m_s` or ` [m/s]`; None: without unit, such as a count."""
-    if bracket := re.search(r"\[(.+)\]$", key):
-        return bracket[1]
-    return next((unit for end, unit in UNITS.items() if key.endswith(end)), None)
+    return split_unit(key)[1]
+
+
+def split_unit(key: str) -> tuple[str, str | None]:
+    """Return a metric's key without its unit, and the unit, as `unit_of`."""
+    if bracket := re.search(r" *\[(.+)\]$", key):
+        return key[: bracket.start()], bracket[1]
+    return next(((key.removesuffix(end), unit) for end, unit in UNITS.items() if key.endswith(end)), (key, None))
 
 
 def measure(
@@ -137,11 +144,8 @@ def print_metrics(
     metrics: AnyMetrics, paper: Mapping[str, float] | None = None, conditions: Mapping[str, Any] | None = None,
     title: str = "",
 ) -> None:  # fmt: skip
-    """Print conditions and metrics with intervals next to the paper's values, at most WIDTH characters a line.
-
-    Metrics whose value is a list are left out.
-    """
-    console, conditions = Console(width=WIDTH), conditions or {}
+    """Print conditions and metrics with intervals next to the paper's values, at most WIDTH characters a line."""
+    conditions, lists = conditions or {}, {}
     table = Table(
         Column("metric", overflow="fold"),
         "value",
@@ -152,20 +156,32 @@ def print_metrics(
     )
     for key, entry in metrics.items():
         value, _, interval, _ = entry if isinstance(entry, MetricValue) else MetricValue(entry)
-        if not isinstance(value, list):
+        if isinstance(value, list):
+            lists[key] = value
+        else:
             limits = "" if interval is None else "{:.4g} to {:.4g}".format(*interval)
             known = [f"{paper[key]:g}" if key in paper else ""] if paper else []
             table.add_row(key, format_value(value), limits, *known)
-    if title:
-        console.print(title)
-    if conditions:
-        text = "; ".join(f"{name} {format_value(value)}" for name, value in conditions.items())
-        console.print(text, highlight=False)
-    console.print(table)
+    text = "; ".join(f"{name} {format_value(value)}" for name, value in conditions.items())
+    for line in (title, text):
+        if line:
+            print(textwrap.fill(line, WIDTH))
+    print_table(table)
+    for key, value in lists.items():
+        print(textwrap.fill(f"{key}: {format_value(value)}", WIDTH))
+
+
+def print_table(table: Table) -> None:
+    """Print a table of at most WIDTH characters a line; a closed pipe raises BrokenPipeError."""
+    text = io.StringIO()  # rich itself exits with 1 when the reader closes the pipe
+    Console(file=text, width=WIDTH, highlight=False).print(table)
+    print("\n".join(line.rstrip() for line in text.getvalue().splitlines()))
 
 
 def format_value(value: Any) -> str:
-    """Return a value as text; floats, also in lists, have four significant digits."""
+    """Return a value as text; floats, also in lists, have four significant digits, from 1000 on no decimals."""
     if isinstance(value, list):
         return ", ".join(format_value(item) for item in value)
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
+    if isinstance(value, float):
+        return f"{value:,.0f}" if abs(value) >= 1.0e3 else f"{value:.4g}"
+    return str(value)

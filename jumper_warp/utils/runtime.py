@@ -65,7 +65,7 @@ def report_device(device: wp.DeviceLike = None, console: Console | None = None) 
 
 
 def configure_device(device: str | None, threads: int | None = None) -> DeviceInfo:
-    """Set the number of threads, silence Warp's module messages, and print and return the device's properties.
+    """Set the number of threads, silence Warp's module messages, return the device's properties, and print them once.
 
     device: a Warp device (default: the current one). threads: CPU threads of simulations, as in `set_threads`.
     Raises InputError: there is no such device, or the number of threads is invalid.
@@ -74,10 +74,16 @@ def configure_device(device: str | None, threads: int | None = None) -> DeviceIn
     wp.config.log_level = wp.LOG_WARNING
     init_warp()
     try:
-        return report_device(device)
+        return _report_once(device, checked_threads(None))
     except (ValueError, RuntimeError) as error:
         known = ", ".join(each.alias for each in wp.get_devices())
         raise InputError(f"no device {device!r:.60}; available: {known}") from error
+
+
+@functools.cache
+def _report_once(device: str | None, threads: int) -> DeviceInfo:
+    """Call `report_device` at the first call with these arguments, and return the device's properties."""
+    return report_device(device)
 
 
 def init_warp() -> None:

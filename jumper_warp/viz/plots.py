@@ -181,8 +181,10 @@ def plot_distances(
     with figure(path, 2, 1, height_ratios=(3, 2), **settings) as (top, bottom):
         for marker, (label, good) in zip("o^s", successes.items(), strict=False):
             rates = [rate(row) for row in good]
-            low, high = np.transpose([value.interval for value in rates])
-            top.plot(distances, [100.0 * value.value for value in rates], marker=marker, label=label)
+            low, high = np.array([value.interval for value in rates], dtype=float).T
+            top.plot(
+                distances, 100.0 * np.array([value.value for value in rates], dtype=float), marker=marker, label=label
+            )
             top.fill_between(distances, 100.0 * low, 100.0 * high, alpha=0.15)
         top.axhline(100.0 * reliable, color="0.5", linestyle="--", linewidth=1.0, label="reliable")
         for work, distance in published.items():

@@ -403,7 +403,7 @@ def test_evaluate_writes_metrics_and_saves_them_to_the_policy(trained_run, tmp_p
     ]
     code, out, _ = run(capsys, "evaluate", str(trained_run / "policy"), *args)
     metrics = read_values(tmp_path)
-    assert code == 0 and "in_range_success_rate" in out
+    assert code == 0 and "success rate" in out
     assert (metrics["noise"], metrics["stream"], metrics["success_rate"]) == (True, "reporting", 0.0)
     trials = np.load(tmp_path / "trials.npz")
     assert trials["goal_height_m"].tolist() == [0.5, 0.85, 1.2] and trials["success"].tolist() == [False] * 3
@@ -426,7 +426,7 @@ def test_evaluate_horizontal_jumps(still, tmp_path, capsys):
             "--out", str(tmp_path)]  # fmt: skip
     code, out, _ = run(capsys, "evaluate", still, *args)
     metrics = read_values(tmp_path)
-    assert code == 0 and "in_range_success_rate" in out
+    assert code == 0 and "success rate" in out
     assert (metrics["task"], metrics["no_jump_rate"]) == ("horizontal-jump", 1.0)
     assert metrics["goal_distance_at_end_mean_m"] == pytest.approx(0.6, abs=0.02)  # mean goal: it stays in place
     trials = np.load(tmp_path / "trials.npz")

@@ -32,6 +32,6 @@ def test_one_percent_mass_error_changes_acceleration_but_not_jacobian():
     right, wrong, states = OVERLAY.robots(), OVERLAY.robots(), random_states(4, 1)
     wrong.base_mass *= 1.01
     actual, expected = jumper_quantities(right, states), pinocchio_quantities(wrong, states)
-    relative = dynamics_agreement.differences(actual["joint_acceleration"], expected["joint_acceleration"])[2]
+    relative = dynamics_agreement.differences(actual["joint_acceleration"], expected["joint_acceleration"])[1]
     assert 1.0e-4 < relative < 1.0e-1
-    assert dynamics_agreement.differences(actual["paw_jacobian"], expected["paw_jacobian"])[2] < 1.0e-6
+    assert dynamics_agreement.differences(actual["paw_jacobian"], expected["paw_jacobian"])[1] < 1.0e-6

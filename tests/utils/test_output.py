@@ -69,7 +69,8 @@ def test_metric_has_value_unit_trials_interval_and_set_of_trials(tmp_path):
 @pytest.mark.parametrize(
     ("key", "unit"),
     [("rmse_vx_m_s", "m/s"), ("spin_rad_s", "rad/s"), ("settling_s", "s"), ("tilt_deg", "deg"), ("jumps", None),
-     ("gravity_m_s2", "m/s^2"), ("torque_nm", "N m"), ("rate [poses/s]", "poses/s"), ("fall_rate", None)],
+     ("gravity_m_s2", "m/s^2"), ("torque_nm", "N m"), ("steps_per_s", "1/s"), ("stiffness_n_m", "N/m"),
+     ("rate [poses/s]", "poses/s"), ("fall_rate", None)],
 )  # fmt: skip
 def test_unit_is_read_from_the_end_of_the_key(key, unit):
     assert unit_of(key) == unit

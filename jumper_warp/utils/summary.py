@@ -1,0 +1,95 @@
+"""Printed summary of results: what was done, the main metrics beside published values, and the paths of files."""
+
+from __future__ import annotations
+
+import json
+import re
+import textwrap
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import tyro
+from rich.table import Column, Table
+
+from jumper_warp.utils.metrics import WIDTH, MetricValue, format_value, print_metrics, print_table, split_unit
+from jumper_warp.utils.output import read_metrics
+
+KINDS = {"picture": (".png", ".webp"), "film": (".mp4", ".gif"), "recording": (".rrd",), "folder": ("",)}
+"""Ends of the names of files by kind, in the order of the summary."""
+IN_RANGE = "in_range_"  # Prefix of metrics of the goals within a range
+MOST_PATHS = 3  # Number of files of a kind above which only their folder is printed
+
+
+@dataclass(frozen=True, kw_only=True)
+class PrintFlags:
+    """Flags that select what is printed about results."""
+
+    verbose: tyro.conf.FlagCreatePairsOff[bool] = False  # Print all metrics in place of a summary
+    json: tyro.conf.FlagCreatePairsOff[bool] = False  # Print metrics.json in place of a summary
+
+
+def print_summary(
+    folder: Path, title: str, keys: Iterable[str], *, seconds: float, paper: Mapping[str, float] | None = None,
+    flags: PrintFlags | None = None,
+) -> None:  # fmt: skip
+    """Print what was done, the main metrics of a folder's `metrics.json`, and the paths of its files, 80 columns wide.
+
+    title: what was done; keys: of the main metrics, those that the file lacks are skipped; seconds: wall time of the
+    run; paper: published values by key; flags: print all metrics, or the file itself.
+    """
+    flags, paper, path = flags or PrintFlags(), paper or {}, folder / "metrics.json"
+    if flags.json:
+        print(path.read_text(), end="")
+        return
+    metrics = read_metrics(folder)
+    main = {key: metrics[key] for key in keys if key in metrics}
+    print(textwrap.fill(title, WIDTH))
+    if flags.verbose:
+        print_metrics(metrics, paper, json.loads(path.read_text())["conditions"])
+    elif main:
+        print_table(_summary_table(main, paper))
+    hints = ["rerun FILE shows a recording"] if any(folder.glob("*.rrd")) else []
+    hints += [f"--verbose prints all {len(metrics)} metrics"] if not flags.verbose and len(metrics) > len(main) else []
+    end = "; ".join([f"{'time':9}  {seconds:.0f} s", *hints])
+    print(*_file_lines(folder), f"{'metrics':9}  {path}", end, sep="\n")
+
+
+def _summary_table(metrics: Mapping[str, MetricValue], paper: Mapping[str, float]) -> Table:
+    """Return a table of metrics in words, with their units, beside the paper's values if there are any."""
+    intervals, published = any(metric.interval for metric in metrics.values()), bool(paper.keys() & metrics.keys())
+    columns = [Column("", overflow="fold"), "value", *["95 % interval"] * intervals, *["paper"] * published]
+    table = Table(*columns, box=None, pad_edge=False)
+    for key, metric in metrics.items():
+        low_high = [] if metric.interval is None else [_text(key, limit) for limit in metric.interval]
+        row = [_text(key, metric.value, unit=True), *[" to ".join(low_high)] * intervals]
+        table.add_row(_words(key, metric), *row, *[_text(key, paper.get(key, ""))] * published)
+    return table
+
+
+def _words(key: str, metric: MetricValue) -> str:
+    """Return a metric's name in words, such as "apex error, mean size"; metrics of a range of goals name the range."""
+    name = split_unit(key)[0].removeprefix(IN_RANGE).replace("_", " ")
+    name = re.sub(r"( abs)? (mean|max|median)$", lambda found: f", {found[2]}" + " size" * bool(found[1]), name)
+    goals = re.sub(r"^jumps (with goals of )?", "", metric.over or "")
+    return f"{name}, {goals}" if key.startswith(IN_RANGE) else name
+
+
+def _text(key: str, value: Any, *, unit: bool = False) -> str:
+    """Return a value as text, a rate in percent; unit: append the unit of the metric's key."""
+    if value is None:
+        return "undefined"
+    percent = key.endswith("_rate") and isinstance(value, float | int)
+    text, of = (format_value(100.0 * value), "%") if percent else (format_value(value), split_unit(key)[1])
+    return f"{text} {of}" if unit and of else text
+
+
+def _file_lines(folder: Path) -> Iterable[str]:
+    """Yield a line for each picture, film, recording and folder in a folder, or one for each kind with many."""
+    for kind, ends in KINDS.items():
+        paths = sorted(path for path in folder.iterdir() if path.suffix in ends and path.is_dir() == (kind == "folder"))
+        if len(paths) > MOST_PATHS:
+            yield f"{kind + 's':9}  {len(paths)} in {folder}"
+        else:
+            yield from (f"{kind:9}  {path}" for path in paths)
