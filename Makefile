@@ -1,14 +1,16 @@
 # make demo   the open-loop jump, 200 vertical and 200 horizontal jumps of the shipped policies, and one jump with a film:
 #             metrics, plots, pictures and recordings in outputs/demo
 # make test   all tests, and the import rules
+# make clients  tests/clients with TorchRL, skrl, OpenVINO and W&B too, which it installs into .venv-clients
 # make lint   style, format, import rules and types
 # Each makes .venv/ first if it is missing or older than pyproject.toml or constraints.txt.
 
 PYTHON ?= python3
 VENV := .venv
+CLIENTS := .venv-clients
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint clean
+.PHONY: demo test clients lint clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -21,6 +23,11 @@ test: $(STAMP)
 	$(VENV)/bin/lint-imports --no-logo
 	$(VENV)/bin/python -m pytest --numprocesses auto --dist loadfile
 
+clients: $(STAMP)
+	$(PYTHON) -m venv $(CLIENTS)
+	$(CLIENTS)/bin/python -m pip install -q -c constraints.txt -e ".[dev]" torchrl skrl openvino wandb
+	$(CLIENTS)/bin/python -m pytest tests/clients
+
 lint: $(STAMP)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
@@ -28,7 +35,7 @@ lint: $(STAMP)
 	$(VENV)/bin/basedpyright --pythonpath $(VENV)/bin/python
 
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) $(CLIENTS)
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -75,7 +75,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         self.env, self.num_envs, self.device = env, env.num_envs, env.device
         self.metadata = {**RENDERING, "autoreset_mode": self.autoreset_mode}
         self.endings = tuple(term.name for term in env.task.terminations)
-        self._all_groups, self._tensors, self._was_reset = all_groups, tensors, False
+        self._all_groups, self.tensors, self._was_reset = all_groups, tensors, False
         self.render_mode, self._size, self._drawn = render_mode, render_size, min(render_envs, self.num_envs)
         self._to_reset = None if self.autoreset_mode is AutoresetMode.SAME_STEP else env.use_reset_mask()
         self._ended = self._converted(torch.zeros(self.num_envs, dtype=torch.bool, device=self.device))
@@ -121,7 +121,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         self._check_open()
         if not self._was_reset:
             raise gymnasium.error.ResetNeeded("call reset before the first step")
-        if self.autoreset_mode is AutoresetMode.DISABLED and not self._tensors and self._ended.any():
+        if self.autoreset_mode is AutoresetMode.DISABLED and not self.tensors and self._ended.any():
             raise gymnasium.error.ResetNeeded('reset ended episodes with options={"reset_mask": mask}')
         begun = self._ended if self.autoreset_mode is AutoresetMode.NEXT_STEP else None
         if begun is not None and self._to_reset is not None:
@@ -138,7 +138,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
             self._sums[1] += 1.0
             self._sums[2] += now - self._last_time
             self._last_time = now
-        infos = self._infos(step.extras["final_obs"], ended) if self._tensors or ended.any() else {}
+        infos = self._infos(step.extras["final_obs"], ended) if self.tensors or ended.any() else {}
         return self._observation(step.obs), reward, terminated, truncated, infos
 
     def _infos(self, final_obs: dict[str, torch.Tensor], ended: Any) -> dict[str, Any]:
@@ -150,7 +150,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         self._sums = self._sums * ~ended
         lengths = episodes[1].long() if isinstance(episodes, torch.Tensor) else episodes[1].astype(int)
         return {
-            "final_obs": final if self._tensors else self._final_rows(final, ended),
+            "final_obs": final if self.tensors else self._final_rows(final, ended),
             "_final_obs": _copied(ended),
             "final_info": {
                 "termination": termination,
@@ -205,7 +205,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
             raise InputError(
                 f"reset_mask must be bool of shape ({self.num_envs},) with a True, got {array.dtype} of {array.shape}"
             )
-        return torch.as_tensor(array, device=self.device) if self._tensors else array
+        return torch.as_tensor(array, device=self.device) if self.tensors else array
 
     def _checked_actions(self, actions: Any) -> torch.Tensor:
         """Return actions as a float32 tensor on the device. Raises InputError: another shape, or not numbers."""
@@ -216,7 +216,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
 
     def _converted(self, tensor: torch.Tensor) -> Any:
         """Return the tensor unchanged with `tensors`, else its values as a NumPy array."""
-        return tensor if self._tensors else tensor.cpu().numpy()
+        return tensor if self.tensors else tensor.cpu().numpy()
 
     def _observation(self, groups: dict[str, torch.Tensor]) -> Obs:
         """Return copies of observations in the form of the observation space, finite and within RAW_LIMIT."""
