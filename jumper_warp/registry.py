@@ -112,18 +112,29 @@ def task_names() -> tuple[str, ...]:
 
 
 def register_task(
-    name: str, make: Callable[[], TaskCfg], *, ppo: PpoCfg | None = None, aliases: tuple[str, ...] = ()
-) -> None:
+    name: str, make: Callable[[], TaskCfg], *, ppo: PpoCfg | None = None, aliases: tuple[str, ...] = (),
+    replace: bool = False,
+) -> None:  # fmt: skip
     """Register the task that `make` returns under its name and aliases; ppo: default training settings.
 
+    replace: whether to replace a task of this name; a function of the same name in the same module, as of a file or a
+    notebook's cell that runs again, always replaces its task.
     Raises InputError: a name or alias is taken.
     """
-    _register(name, TaskEntry(make, PpoCfg() if ppo is None else ppo, tuple(aliases)))
+    entry = TaskEntry(make, PpoCfg() if ppo is None else ppo, tuple(aliases))
+    _register(name, entry, replace or (name in TASKS and _is_same_function(make, TASKS[name].make)))
 
 
-def _register(name: str, entry: TaskEntry) -> None:
-    """Add an entry to `TASKS`. Raises InputError: its name or an alias is taken."""
-    owners = {alias: task for task, known in TASKS.items() for alias in (task, *known.aliases)}
+def _is_same_function(make: Any, other: Any) -> bool:
+    """Return whether two factory functions have the same module and name."""
+    names = [(getattr(f, "__module__", None), getattr(f, "__qualname__", None)) for f in (make, other)]
+    return names[0] == names[1] and None not in names[0]
+
+
+def _register(name: str, entry: TaskEntry, replace: bool = False) -> None:
+    """Add an entry to `TASKS`, or replace that of the same name. Raises InputError: its name or an alias is taken."""
+    others = {task: known for task, known in TASKS.items() if not (replace and task == name)}
+    owners = {alias: task for task, known in others.items() for alias in (task, *known.aliases)}
     for alias in (name, *entry.aliases):
         if alias in owners:
             raise InputError(f"there is a task {alias!r:.60} already, of {TASKS[owners[alias]].origin}")
