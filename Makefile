@@ -23,9 +23,10 @@ test: $(STAMP)
 	$(VENV)/bin/lint-imports --no-logo
 	$(VENV)/bin/python -m pytest --numprocesses auto --dist loadfile
 
-clients: $(STAMP)
+clients:
 	$(PYTHON) -m venv $(CLIENTS)
-	$(CLIENTS)/bin/python -m pip install -q -c constraints.txt -e ".[dev]" torchrl skrl openvino wandb
+	$(CLIENTS)/bin/python -m pip install -c constraints.txt -e ".[dev]"
+	$(CLIENTS)/bin/python -m pip install "torchrl==0.14.1" "skrl==2.1.1" "openvino==2026.4.1" "wandb==0.31.0"
 	$(CLIENTS)/bin/python -m pytest tests/clients
 
 lint: $(STAMP)
