@@ -80,9 +80,11 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         self._to_reset = None if self.autoreset_mode is AutoresetMode.SAME_STEP else env.use_reset_mask()
         self._ended = self._converted(torch.zeros(self.num_envs, dtype=torch.bool, device=self.device))
         """(num_envs,) bool, worlds whose episode the last step ended."""
-        self._sums = self._converted(torch.zeros((3, self.num_envs), dtype=torch.float64, device=self.device))
-        """(3, num_envs) return, steps and wall time [s] of the running episodes; of SAME_STEP only."""
-        self._last_time = 0.0  # [s] of the last step of SAME_STEP
+        rows = (torch.zeros((3, self.num_envs), dtype=torch.float64, device=self.device) for _ in range(2))
+        self._sums, self._increments = map(self._converted, rows)
+        """(3, num_envs) return, steps and wall time [s] of running episodes and of the last step; of SAME_STEP only."""
+        self._increments[1] = 1.0
+        self._last_time = 0.0  # [s]
         self._camera: WorldCamera | None = None  # opens at the first `render`
         self._termination = wp.to_torch(env.episodes.termination)
         widths = {"actor": env.num_obs, "critic": env.num_critic_obs}
@@ -105,10 +107,9 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         if seed is not None:
             seed %= MOST_SEED + 1
         obs, _ = self.env.reset(seed, worlds=mask)
-        kept = self._ended & False if mask is None else ~mask
-        self._ended, self._sums, self._was_reset = self._ended & kept, self._sums * kept, True
-        if mask is None:
-            self._last_time = time.perf_counter()
+        begun = self._ended | True if mask is None else mask
+        self._ended, self._was_reset = self._ended & ~begun, True
+        self._sums, self._last_time = self._sums * ~begun, time.perf_counter()
         return self._observation(obs), {}
 
     def step(self, actions: Any) -> tuple[Obs, Any, Any, Any, dict[str, Any]]:
@@ -134,10 +135,8 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         self._ended = ended = terminated | truncated
         if self._to_reset is None:
             now = time.perf_counter()
-            self._sums[0] += reward
-            self._sums[1] += 1.0
-            self._sums[2] += now - self._last_time
-            self._last_time = now
+            self._increments[0], self._increments[2], self._last_time = reward, now - self._last_time, now
+            self._sums += self._increments
         infos = self._infos(step.extras["final_obs"], ended) if self.tensors or ended.any() else {}
         return self._observation(step.obs), reward, terminated, truncated, infos
 
@@ -147,8 +146,8 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         if self._to_reset is not None:
             return {"termination": termination, "_termination": _copied(ended)}
         final, episodes = self._observation(final_obs), self._sums * ended
-        self._sums = self._sums * ~ended
-        lengths = episodes[1].long() if isinstance(episodes, torch.Tensor) else episodes[1].astype(int)
+        self._sums -= episodes
+        lengths = episodes[1].long() if isinstance(episodes, torch.Tensor) else episodes[1].astype(np.int64)
         return {
             "final_obs": final if self.tensors else self._final_rows(final, ended),
             "_final_obs": _copied(ended),
