@@ -2,7 +2,7 @@
 #             metrics, plots, pictures and recordings in outputs/demo
 # make test   all tests, and the import rules
 # make clients  tests/clients with TorchRL, skrl, OpenVINO and W&B too, which it installs into .venv-clients
-# make lint   style, format, import rules and types
+# make lint   style, format, words, import rules and types
 # Each makes .venv/ first if it is missing or older than pyproject.toml or constraints.txt.
 
 PYTHON ?= python3
@@ -32,6 +32,7 @@ clients:
 lint: $(STAMP)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
+	$(VENV)/bin/pre-commit run --all-files words
 	$(VENV)/bin/lint-imports --no-logo
 	$(VENV)/bin/basedpyright --pythonpath $(VENV)/bin/python
 

@@ -19,8 +19,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from jumper_warp.evaluation.attitude import DIRECTIONS, AttitudeFlags, AttitudeLog, random_turns, turn_metrics
-from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
+from jumper_warp.viz.plots import figure
 from support.momentum import MomentumRecorder, rotational_inertia
 from support.scripts import run_script
 

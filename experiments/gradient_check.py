@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from jumper_warp.diff.rollout import Trajectory
-from jumper_warp.evaluation.plots import figure
+from jumper_warp.viz.plots import figure
 from support.gradients import INNER, OUTER, TICKS, GradientJump, GradientPair, apex, check, schedule
 from support.scripts import DeviceArgs, prepare, report, run_script
 

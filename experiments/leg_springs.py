@@ -19,12 +19,12 @@ from typing import Any, Literal
 from rich.console import Console
 from rich.table import Table
 
-from jumper_warp.evaluation.plots import figure
 from jumper_warp.robot.gravity import EARTH, MARS
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.robot.overlay import with_springs
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
+from jumper_warp.viz.plots import figure
 from support.scripts import DeviceArgs, prepare, run_script
 from support.spring_jumps import FILTERS, SpringJumps
 

@@ -14,9 +14,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
 from jumper_warp.utils.errors import InputError
+from jumper_warp.viz.plots import figure
 from jumper_warp.viz.style import LEG_COLORS
 from support.scripts import run_script
 from support.squats import SquatLog, squat_goals, squat_metrics

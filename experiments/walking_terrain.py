@@ -15,12 +15,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from jumper_warp.evaluation.landings import random_headings
-from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import VelocityLog, check_velocity_settings
 from jumper_warp.robot.terrain import KINDS, TerrainCfg, single_tile
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import mean, rate
+from jumper_warp.viz.plots import figure
 from support.scripts import run_script
 from support.walks import walked_fraction
 

@@ -18,11 +18,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
 from jumper_warp.evaluation.velocities import AXES, PAPER, VelocityFlags, VelocityLog, check_velocity_settings
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import MetricValue, rate
+from jumper_warp.viz.plots import figure
 from jumper_warp.viz.style import ACTUAL_COLOR
 from support.gaits import GaitRecorder
 from support.scripts import run_script

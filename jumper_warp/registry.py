@@ -30,7 +30,7 @@ GROUP = "jumper_warp.tasks"
 
 @dataclass(frozen=True)
 class TaskEntry:
-    """Factory and training settings of a task."""
+    """Registry entry of a task: its factory function and training settings."""
 
     make: Callable[[], TaskCfg] | str
     """Function that returns the task, or `module:function`, which is imported when the task is made."""
@@ -60,10 +60,10 @@ class TaskEntry:
 
 
 WALKING = PpoCfg(num_steps=24, gamma=0.985, entropy_coef=0.0025, init_std=0.4, symmetry="actor")
-"""Training of velocity tracking."""
+"""PPO settings for velocity tracking."""
 HEIGHTS = PpoCfg(gamma=0.99)  # Training of vertical jumps
 ON_MARS = replace(HEIGHTS, symmetry="actor")
-"""Training of vertical jumps on Mars, with symmetry: there a small angular velocity turns the robot far."""
+"""PPO settings for vertical jumps on Mars, with symmetry: in long flights even a slow rotation turns the robot far."""
 PLACES = PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")  # Training of jumps to goal positions
 TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5, symmetry="actor")  # Training of turning in flight
 
@@ -92,7 +92,7 @@ TASKS: dict[str, TaskEntry] = {
     "velocity-trot": TaskEntry("jumper_warp.tasks.velocity.flat:velocity_trot", WALKING, best_metric="Metrics/score"),
     "attitude": TaskEntry("jumper_warp.tasks.attitude.flight:attitude_in_flight", TURNS, best_metric="Metrics/settled"),
 }  # fmt: skip
-"""Tasks by name: the project's, registered ones, and loaded ones of installed packages."""
+"""Registered tasks by name: those of the project, of the user, and of installed packages once loaded."""
 
 
 def make_task(name: str) -> TaskCfg:
@@ -102,7 +102,7 @@ def make_task(name: str) -> TaskCfg:
 
 
 def trainer_settings(name: str) -> PpoCfg:
-    """Return the default training settings of a task by name or alias; raises InputError as `find_task`."""
+    """Return the default PPO settings of a task by name or alias. Raises InputError: unknown task."""
     return find_task(name)[1].ppo
 
 
@@ -142,7 +142,7 @@ def _register(name: str, entry: TaskEntry, replace: bool = False) -> None:
 
 
 def find_task(name: str) -> tuple[str, TaskEntry]:
-    """Return (name, entry) of a task by name or alias, loading an installed one. Raises InputError: unknown."""
+    """Return (name, entry) of a task by name or alias; loads installed tasks. Raises InputError: unknown task."""
     for known, entry in TASKS.items():
         if name == known or name in entry.aliases:
             return known, entry
@@ -182,7 +182,7 @@ def load_installed(point: EntryPoint) -> None:
 
 
 def load_task_module(name: str) -> ModuleType:
-    """Import FILE.py, or a module by its name, which registers tasks; after an exception `TASKS` is unchanged.
+    """Import a user's FILE.py or module, which registers tasks; after an exception `TASKS` is unchanged.
 
     Raises InputError: it does not exist, its name is another module's, or it registers or defines an invalid task.
     OSError: the file cannot be read.

@@ -1,4 +1,4 @@
-"""Exchange of values between the threads of a GPU warp that share a world.
+"""Exchange of values between the threads of a GPU warp that simulate one world.
 
 A world has four threads (one per leg: FL, FR, BL, BR), or 32 (eight attempts of four); the leg index runs fastest. All
 threads of a warp must execute every call together: place none behind `and` or `or`, or in a branch that some threads

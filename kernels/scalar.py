@@ -1,4 +1,4 @@
-"""The scalar type of the physics kernels, and the small vectors and matrices made of it.
+"""Scalar type of the physics kernels, and the small vectors and matrices made of it.
 
 Every function of the robot's physics is written in terms of `real`. The package is single precision;
 `jumper_warp.sim.precision.float64_kernels()` loads the same files a second time under the name

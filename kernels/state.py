@@ -1,8 +1,8 @@
 """Reading and writing the robot's 18 coordinates in Newton's state arrays.
 
 Per world `joint_q` holds 43 coordinates: base position, base quaternion (xyzw), five angles a leg (lateral, outer,
-outer knee, inner, inner knee), and four loop-joint quaternions. `joint_qd` holds 38 rates in the same order; the base's
-are the velocity of its centre of mass and its angular velocity, both in the world frame.
+outer knee, inner, inner knee), and four loop-joint quaternions. `joint_qd` holds 38 rates in the same order. The
+base's rates are the velocity of its centre of mass and its angular velocity, both in the world frame.
 """
 
 import warp as wp
@@ -44,7 +44,7 @@ def load_base(joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real), com
 
 @wp.func
 def store_base(joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real), com: vec3, world: int, base: BaseState):
-    """Write the base state of a world; the inverse of `load_base`, arguments as there."""
+    """Write the base state of a world to Newton's arrays: the inverse of `load_base`, with the same arguments."""
     i = world * COORDS
     j = world * DOFS
     ang = wp.quat_rotate(base.quat, base.ang)
@@ -73,11 +73,11 @@ def store_motors(values: wp.array(dtype=real), first: int, motors: vec3):
 
 @wp.func
 def leg_coord(world: int, leg: int) -> int:
-    """Return the index of the first joint of leg 0 to 3 of a world in joint_q."""
+    """Return the index in joint_q of the first joint of a leg (0 to 3) of a world."""
     return world * COORDS + 7 + 5 * leg
 
 
 @wp.func
 def leg_dof(world: int, leg: int) -> int:
-    """Return the index of the first joint of leg 0 to 3 of a world in joint_qd."""
+    """Return the index in joint_qd of the first joint of a leg (0 to 3) of a world."""
     return world * DOFS + 6 + 5 * leg

@@ -17,7 +17,7 @@ from support.soak import hardest
 
 wp.config.log_level = wp.LOG_WARNING
 SHARED = ("vertical-jump", "horizontal-jump", "velocity-flat", "velocity-rough", "attitude")
-"""Tasks whose kernels many files need, besides that of `hold_height`."""
+"""Tasks whose kernels many files use, in addition to `hold_height`."""
 MUJOCO = """
 import warp as wp
 from jumper_warp.sim.simulation import Simulation

@@ -41,7 +41,7 @@ def python(*args, folder, paths=()):
 
 
 def run(code, folder, *paths):
-    """Run Python code in a folder without error, with `paths` as PYTHONPATH, and return the lines that it prints."""
+    """Run Python code in a folder, with `paths` as PYTHONPATH, and return its output lines; fail on an error."""
     returncode, printed, errors = python("-c", code, folder=folder, paths=paths)
     assert returncode == 0, errors
     return printed

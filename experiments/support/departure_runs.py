@@ -14,7 +14,6 @@ from rich.markup import escape
 from rich.table import Table
 
 from jumper_warp.cli.train import env_maker, parse_train
-from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationRun
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.warm_start import actor_init_from_policy
@@ -24,6 +23,7 @@ from jumper_warp.rl.runner import CONFIG, train
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
+from jumper_warp.viz.plots import figure
 from support.departures import Ablation
 from support.squats import SquatLog, squat_goals, squat_metrics
 

@@ -18,7 +18,6 @@ import torch
 from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import DELAY, jump_commands, yaw_of
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, finite, outcome_names
-from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.restore import restored_task
@@ -27,6 +26,7 @@ from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.switching import FALLS_FROM_FLIGHT, flight_skills
 from jumper_warp.utils.metrics import Metrics, largest, mean, rate
+from jumper_warp.viz.plots import figure
 from support.momentum import momentum
 
 JUMP, TURN = 0, 1  # Indices of the skills in `Env.skills`

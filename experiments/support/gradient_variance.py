@@ -14,11 +14,11 @@ from rich.table import Table
 
 from jumper_warp.diff.differentiable_env import DifferentiableEnv
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.plots import figure
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.rl.networks import ActorCritic, linear_layers
 from jumper_warp.trajectory.gauss_newton import Network, Tape, per_world_gradients
+from jumper_warp.viz.plots import figure
 
 NOISE = 0.2  # [1] Standard deviation of the actions in windows
 ESTIMATORS = ("physics", "score")  # Gradients through the physics, and by the score function

@@ -9,7 +9,6 @@ from pathlib import Path
 import numpy as np
 
 from jumper_warp.evaluation.heights import run_jumps
-from jumper_warp.evaluation.plots import figure
 from jumper_warp.identification.excitation import unsafe_reason
 from jumper_warp.identification.identify import identify
 from jumper_warp.identification.motions import RecordedMotion
@@ -22,6 +21,7 @@ from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.robot.overlay import overlay_of
 from jumper_warp.robot.values import RobotValues
+from jumper_warp.viz.plots import figure
 
 SPREAD, MOST = 0.7, 1.5  # [1] Standard deviation and limit of sampled parameters, in standard deviations of priors
 HELD_OUT_TORQUE = 16.0  # [N m] Torque limit of the held-out jump

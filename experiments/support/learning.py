@@ -15,11 +15,11 @@ import warp as wp
 from jumper_warp.envs.env import Env
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.evaluation.heights import run_jumps
-from jumper_warp.evaluation.plots import figure
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.shac import Shac
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.viz.plots import figure
 from support.timing import process_age
 
 RATES = (0.5, 0.8, 0.9, 0.95, 1.0)  # [1] Success rates for which the time to reach them is reported

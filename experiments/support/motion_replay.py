@@ -13,7 +13,6 @@ import warp as wp
 
 from jumper_warp.diff.rollout import compact
 from jumper_warp.diff.torch_rollout import TorchTrajectory
-from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.recorder import ankles
 from jumper_warp.kernels.collision.robot import collision_kernel
 from jumper_warp.kernels.layout import COORDS
@@ -21,6 +20,7 @@ from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.sim.simulation import Simulation, motor_values
 from jumper_warp.trajectory.problem import Problem, SimulatedMotion
+from jumper_warp.viz.plots import figure
 from jumper_warp.viz.style import LEG_COLORS
 from support.open_loop import plot_motors
 

@@ -142,7 +142,7 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
     reset) is NaN or infinite.
     """
     env.reset()
-    diverged = [term.name for term in env.task.terminations].index("came_apart")
+    diverged = [term.name for term in env.task.terminations].index("diverged")
     counters, action = SoakCounters(env.sim), torch.zeros_like(env.action)
     termination = wp.to_torch(env.episodes.termination)
 

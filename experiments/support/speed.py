@@ -127,8 +127,8 @@ def stepping_env(envs: int, device: str | None, threads: int | None = None) -> t
     for _ in range(100):
         step()
     metrics = env.metrics()
-    if not bool(env.obs.isfinite().all()) or metrics["Episode_Termination/came_apart"] > 0.01:
-        raise RuntimeError(f"{100 * metrics['Episode_Termination/came_apart']:.1f} % of the episodes diverged")
+    if not bool(env.obs.isfinite().all()) or metrics["Episode_Termination/diverged"] > 0.01:
+        raise RuntimeError(f"{100 * metrics['Episode_Termination/diverged']:.1f} % of the episodes diverged")
     return env, step
 
 

@@ -1,6 +1,6 @@
-"""Policy inference on a robot with NumPy and ONNX Runtime: sensor readings to observation, action and motor targets.
+"""Inference of a policy on a robot: sensor readings to observation, action and motor targets (NumPy, ONNX Runtime).
 
-From this package it imports `jumper_warp/utils/errors.py` only. `docs/deployment.md` defines each reading.
+This module imports only `jumper_warp/utils/errors.py` from the package. `docs/deployment.md` defines each reading.
 """
 
 from __future__ import annotations
@@ -21,13 +21,13 @@ LAST_ACTION = "last_action"  # Observation term that `DeployedPolicy` computes, 
 
 
 class DeployedPolicy:
-    """One policy on one robot; `targets` runs a policy step: `observe`, `act` and `filter_targets`.
+    """Policy that runs on a robot; `targets` performs a policy step: `observe`, `act` and `filter_targets`.
 
     Arrays with one value per motor, (12,), have the legs FL, FR, BL, BR in this order; each lateral, outer, inner.
     """
 
     def __init__(self, file: str | Path) -> None:
-        """Load `policy.onnx`; its metadata becomes `interface`, a dict of the fields of `PolicyInterface`.
+        """Load an ONNX policy; its metadata becomes `interface`, a dict of the fields of `PolicyInterface`.
 
         Raises InputError, a ValueError: the metadata has no observation layout.
         """
@@ -37,7 +37,7 @@ class DeployedPolicy:
         metadata = self._session.get_modelmeta().custom_metadata_map
         self.interface: dict[str, Any] = json.loads(metadata.get("jumper_warp", "{}"))
         if not self.interface.get("observation_layout"):
-            raise InputError(f"{file}: no observation_layout in its metadata: export the policy again")
+            raise InputError(f"{file}: the metadata lacks observation_layout: export the policy again")
         self.layout = self.interface["observation_layout"]
         self.scale = np.array(self.interface["action_scale"], dtype=np.float32)  # (12,) [rad] for an action of 1
         self.default = np.array(self.interface["default_joint_pos"], dtype=np.float32)  # (12,) [rad]
@@ -58,21 +58,21 @@ class DeployedPolicy:
         return self.filter_targets(self.default + self.scale * action, readings["angle"], readings["rate"])
 
     def observe(self, readings: Mapping[str, Any]) -> np.ndarray:
-        """Return the observation, (num_obs,), and append the readings to the history; arguments as for `targets`."""
+        """Return the observation, (num_obs,), and append the readings to the history; arguments: see `targets`."""
         different = sorted(set(readings) ^ (set(self.layout) - {LAST_ACTION}))
         if different:
             raise InputError(f"readings missing or unknown: {', '.join(different)}")
         return np.concatenate([self._term(name, term, readings) for name, term in self.layout.items()])
 
     def _term(self, name: str, term: Mapping[str, Any], readings: Mapping[str, Any]) -> np.ndarray:
-        """Append a reading, clipped and scaled, to a term's history, and return the history (history * width,).
+        """Append a reading, clipped and scaled, to a term's history; return the history, (history * width,).
 
         The oldest frame is first; the first reading after `reset` fills all frames. term: entry of `layout`.
         """
         value = self.action if name == LAST_ACTION else np.atleast_1d(np.asarray(readings[name], dtype=np.float32))
         width = (term["end"] - term["first"]) // term["history"]
         if value.shape != (width,):
-            raise InputError(f"{name} takes {width} numbers, got an array of shape {value.shape}")
+            raise InputError(f"{name} must have {width} values, got shape {value.shape}")
         value = value - self.default if name == "angle" else value
         value = np.float32(term["scale"]) * np.clip(value, -term["clip"], term["clip"])
         frames = self._frames.get(name)
@@ -81,7 +81,7 @@ class DeployedPolicy:
         return self._frames[name].ravel()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Return and store the action, (12,), clipped to [-1, 1] by the network; observation: (num_obs,) float32."""
+        """Compute, store and return the action, (12,), in [-1, 1]; observation: (num_obs,) float32."""
         self.action = np.asarray(self._session.run(["actions"], {"obs": observation[None]})[0])[0]
         return self.action
 
@@ -106,7 +106,7 @@ class DeployedPolicy:
 def limit_command(
     command: np.ndarray, pos: np.ndarray, vel: np.ndarray, limits: Mapping[str, float], settings: Mapping[str, Any]
 ) -> np.ndarray:
-    """Return commands [rad] with a fraction, `weight`, of their excess over the joint limits removed.
+    """Limit commands [rad] near joint limits: a fraction `weight` of their excess over a limit is removed.
 
     weight: 1 - (time until the joint reaches a limit) / horizon, in [0, 1]. Within the zone of a limit it is 1 for
     commands toward the limit, else 0; beyond a limit it is 1.
@@ -128,22 +128,22 @@ def limit_command(
 
 
 class JumpCommand:
-    """State of the observation term `jump_command` of vertical jumps: 1 from `request` until the landing, else 0.
+    """Jump command observed by vertical-jump policies (term `jump_command`): 1 from `request` to landing, else 0.
 
-    requested: a jump is commanded; in_flight: the robot has taken off and not landed.
+    requested: whether a jump is commanded; in_flight: whether the robot has taken off and not landed.
     """
 
     def __init__(self, takeoff_speed: float = 0.75) -> None:
-        """Start without a request; takeoff_speed: upward speed [m/s] above which a robot takes off."""
+        """Start without a request; takeoff_speed: upward speed [m/s] that counts as takeoff."""
         self._takeoff_speed = takeoff_speed
         self.requested, self.in_flight = False, False
 
     def request(self) -> None:
-        """Request a jump."""
+        """Command a jump from the next `update` on."""
         self.requested = True
 
     def update(self, vertical_velocity: float, paws_down: int) -> float:
-        """Return `jump_command`, 0 or 1, once a policy step.
+        """Update the state and return `jump_command`, 0 or 1; call it once per policy step.
 
         vertical_velocity: of the base, world frame, upward positive [m/s]. paws_down: number of paws on the ground.
         """

@@ -1,4 +1,4 @@
-"""Gradients by mass, centre of mass and inertia of the bodies, by the chain rule from the parameter table's moments."""
+"""Gradients w.r.t. masses, centres of mass and inertias of bodies, from the gradient w.r.t. the parameter table."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def moment_rows(body: int) -> slice:
-    """Return a body's ten rows of the parameter table: mass, 3 first and 6 second moments, see `PAIRS`.
+    """Return the slice of a body's ten rows in the parameter table: mass, 3 first and 6 second moments, see `PAIRS`.
 
     body: 0 is the base; then 5 links of each leg FL, FR, BL, BR, as in the model.
     """
@@ -21,11 +21,11 @@ def moment_rows(body: int) -> slice:
 
 
 def body_gradients(table: np.ndarray, gradient: np.ndarray) -> dict[str, np.ndarray]:
-    """Return gradients by each body's mass [kg], com [m] and inertia about its com [kg m^2], in link axes.
+    """Return gradients w.r.t. each body's mass [kg], com [m] and inertia about its com [kg m^2], in link axes.
 
-    table, gradient: parameter table and gradient by it, (321, num_worlds). The table holds first moments m c and second
-    moments S = 1/2 tr(I) 1 - I + m c c^T (parallel axes). Returned: mass (21, num_worlds), com (21, 3, num_worlds),
-    inertia (21, 6, num_worlds) in the order of `PAIRS`; an off-diagonal entry stands for both symmetric entries.
+    table, gradient: parameter table and gradient w.r.t. it, (321, num_worlds). The table holds first moments m c and
+    second moments S = 1/2 tr(I) 1 - I + m c c^T (parallel axes). Returned: mass (21, num_worlds), com (21, 3,
+    num_worlds), inertia (21, 6, num_worlds) as `PAIRS`; an off-diagonal entry stands for both symmetric entries.
     """
     worlds = table.shape[1]
     mass = np.zeros((int(BODIES), worlds))

@@ -1,7 +1,7 @@
 """Differentiable closed loop of a policy and the simulation, with observations computed in PyTorch.
 
 An environment provides robots, commands, noise and all values; a `Rollout` of the same robots provides the derivatives
-of every policy step by the action and by the previous state.
+of every policy step w.r.t. the action and the previous state.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ class LoopState(NamedTuple):
 
 
 class RobotState(NamedTuple):
-    """Base and motors as observations and rewards use them, worlds first."""
+    """State of base and motors from which observations and rewards are computed, worlds first."""
 
     pos: torch.Tensor  # (num_worlds, 3) [m] base origin, world axes
     quat: torch.Tensor  # (num_worlds, 4) xyzw, body to world
@@ -68,7 +68,7 @@ def heading_of(quat: torch.Tensor) -> torch.Tensor:
 
 
 def with_gradient_of(value: torch.Tensor, computed: torch.Tensor) -> torch.Tensor:
-    """Return the numbers of `value` with the derivatives of `computed`, of the same shape."""
+    """Return a tensor with the values of `value` and the derivatives of `computed`, of the same shape."""
     return value + (computed - computed.detach())
 
 
@@ -96,7 +96,7 @@ class ClosedLoop:
         actor = task.observations.actor
         for term in (*actor, *task.observations.critic):
             if term.options["history"] > 1 and (term.func.key not in STATE_TERMS or term not in actor):
-                raise InputError(f"{task.name}: gradients of a history need one of the robot's state, not {term.name}")
+                raise InputError(f"{task.name}: gradients need histories of the robot's state, not of {term.name}")
         self.env, self.num_worlds = env, env.num_envs
         self.rollout = Rollout(
             robots.model, task.motors, task.command_filter, double=double, dt=robots.dt, substeps=robots.substeps
@@ -127,7 +127,7 @@ class ClosedLoop:
         return parameters
 
     def state(self) -> LoopState:
-        """Return a copy of the environment's present state, without gradients."""
+        """Return a copy of the environment's current state, without gradients."""
         env: Snapshot = self.env.snapshot()
         history = self._history_of(self.env.obs)
         parts = (env.q, env.qd, env.initial_target, env.impulse, env.action, env.torque, history)
@@ -168,7 +168,7 @@ class ClosedLoop:
         """Return the state after one policy step; latencies must be at most a policy step.
 
         action: (num_worlds, 12), clamped to ±1. wrench: force [N] and moment [N m] on the base, (6, num_worlds).
-        parameters: from `read_parameters`, restored for the reverse pass; by default the rollout's present parameters.
+        parameters: from `read_parameters`, restored for the reverse pass; by default the rollout's current parameters.
         """
         clamped = action.clamp(-1.0, 1.0).T
         targets = clamped * self.scale[:, None] + self.default[:, None]
@@ -180,7 +180,7 @@ class ClosedLoop:
         return LoopState(**end, action=clamped, torque=trajectory.torque[-1], history=history)
 
     def motion(self, state: LoopState) -> RobotState:
-        """Return base and motors of a state, worlds first."""
+        """Return the `RobotState` (base and motors, worlds first) of a loop state."""
         q, qd = state.q.T, state.qd.T
         quat = q[:, 3:7] / q[:, 3:7].norm(dim=1, keepdim=True)
         ang = qd[:, 3:6]
@@ -206,7 +206,7 @@ class ClosedLoop:
         """Step the environment; return (next state after resets, state of the rollout before resets).
 
         The next state has the environment's values with derivatives; a world that was reset has no gradient. action:
-        (num_worlds, 12). state: the environment's present state, from the method `state` or the last `step`.
+        (num_worlds, 12). state: the environment's current state, from the method `state` or the last `step`.
         """
         env = self.env
         parameters = self.read_parameters() if self.randomizes else None
@@ -223,12 +223,12 @@ class ClosedLoop:
         return LoopState(*parts), simulated
 
     def observation(self, state: LoopState) -> torch.Tensor:
-        """Return the environment's observation (num_worlds, columns), noise included, with derivatives by the state."""
+        """Return the environment's observation (num_worlds, columns), with noise and derivatives w.r.t. `state`."""
         return with_gradient_of(self.env.obs.to(self.dtype), self.observe(state, self.env.obs))
 
 
 def _goal_offset(loop: ClosedLoop, motion: RobotState, state: LoopState, observed: torch.Tensor) -> torch.Tensor:
-    """Return the observed offset from base to goal (n, 2) [m], body yaw frame, with derivatives by the base's pose.
+    """Return the observed offset from base to goal (n, 2) [m], body yaw frame, with derivatives w.r.t. the base's pose.
 
     A goal observed at (0, 0) has no derivative.
     """
@@ -241,7 +241,7 @@ def _goal_offset(loop: ClosedLoop, motion: RobotState, state: LoopState, observe
 
 
 def _height_errors(loop: ClosedLoop, motion: RobotState, state: LoopState, observed: torch.Tensor) -> torch.Tensor:
-    """Return the observed height errors (n, 2) [m]; the second, of the ballistic apex, with derivatives."""
+    """Return the observed height errors (n, 2) [m]; the second one, of the ballistic apex, has derivatives."""
     apex = motion.pos[:, 2] + motion.lin_vel[:, 2].clamp(min=0.0).square() / (2.0 * loop.task.gravity)
     return torch.stack([observed[:, 0], with_gradient_of(observed[:, 1], apex)], 1)
 

@@ -1,4 +1,4 @@
-"""Environment whose observations and rewards have derivatives by the actions of a window of policy steps."""
+"""Environment whose observations and rewards have derivatives w.r.t. the actions of a window of policy steps."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ WORLD_NORM = 100.0  # default of `DifferentiableEnv.world_norm`
 
 
 class DifferentiableEnv:
-    """Environment with gradients, see `jumper_warp.envs.vec_env.DifferentiableVecEnv`.
+    """Environment with gradients of observations and rewards (`jumper_warp.envs.vec_env.DifferentiableVecEnv`).
 
     All other attributes are those of the wrapped environment.
     """
@@ -23,8 +23,8 @@ class DifferentiableEnv:
     def __init__(self, env: Any, world_norm: float = WORLD_NORM) -> None:
         """Wrap a `jumper_warp.envs.env.Env`.
 
-        world_norm: norm to which the gradient by each part of `LoopState` is clipped, by world and policy step. Raises
-        InputError: as `ClosedLoop`, or no reward has a derivative.
+        world_norm: norm to which the gradient w.r.t. each part of `LoopState` is clipped, by world and policy step.
+        Raises InputError: as `ClosedLoop`, or no reward has a derivative.
         """
         self.env, self.loop, self.world_norm = env, ClosedLoop(env), world_norm
         if not any(term.func.key in SMOOTH for term in self.loop.task.rewards):
@@ -37,11 +37,11 @@ class DifferentiableEnv:
         return getattr(self.env, name)
 
     def begin_window(self) -> None:
-        """Start a window: the present state becomes a constant, so that gradients end here."""
+        """Start a window: the current state becomes a constant, at which backpropagation ends."""
         self._state = self.loop.state()
 
     def observe(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return `obs` and `critic_obs`, (num_envs, columns) each, with derivatives by the window's earlier actions."""
+        """Return `obs`, `critic_obs` (num_envs, columns) with derivatives w.r.t. the window's earlier actions."""
         return self._observe_both(self._state, self.env.obs, self.env.critic_obs)
 
     def observe_final(self) -> tuple[torch.Tensor, torch.Tensor]:
@@ -51,7 +51,7 @@ class DifferentiableEnv:
     def _observe_both(
         self, state: LoopState, obs: torch.Tensor, critic_obs: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the values obs and critic_obs with their derivatives by `state`."""
+        """Return the values obs and critic_obs with their derivatives w.r.t. `state`."""
         critic = self.loop.observe(state, critic_obs, "critic")
         return with_gradient_of(obs, self.loop.observe(state, obs)), with_gradient_of(critic_obs, critic)
 
@@ -79,7 +79,7 @@ class DifferentiableEnv:
 
 
 def clip_norm(max_norm: float) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return a hook that clips the norm of each world's gradient, (rows, num_worlds), and zeroes one not finite."""
+    """Return a hook that clips the norm of each world's gradient (rows, num_worlds) and zeroes non-finite ones."""
 
     def clip(grad: torch.Tensor) -> torch.Tensor:
         grad = torch.where(grad.isfinite().all(0, keepdim=True), grad, 0.0)

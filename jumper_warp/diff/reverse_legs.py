@@ -12,7 +12,7 @@ SPAN = 4  # rows that one set of launches reverses
 
 
 class LegThreadReverse:
-    """Launches the kernels of `jumper_warp.kernels.dynamics.adjoint.rollout_legs_adjoint` and `constants_adjoint`."""
+    """Launcher of the kernels of `rollout_legs_adjoint` and `constants_adjoint` in `jumper_warp.kernels.dynamics`."""
 
     def __init__(self, dynamics: JumperDynamics, every: int):
         """Allocate the kernels' record of `SPAN` rows; every: physics steps between rows of a trajectory."""
@@ -29,7 +29,7 @@ class LegThreadReverse:
 
         All arguments are structs of the kernels. settings: `StepSettings`. motion: [`Timing`, `Actuation`, `Commands`,
         filtered targets (T, 12, num_worlds), `TrajectoryArrays`] of the rollout. cotangents: `TrajectoryArrays`, the
-        gradient of the loss by the rollout's.
+        gradient of the loss w.r.t. the rollout's.
         """
         robot, record, num = self._dynamics.robot, self._record, self._num
         legs, constants = self._modules.rollout_legs_adjoint, self._modules.constants_adjoint

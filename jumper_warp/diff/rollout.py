@@ -50,7 +50,7 @@ GEOMETRY_NAMES = (
 class Trajectory:
     """Trajectory of T policy steps of S physics steps, with a row every `every` physics steps, K = T S / every.
 
-    Arrays have the rollout's precision, worlds last. A cotangent, the gradient of a loss by an array, has its shape.
+    Arrays have the rollout's precision, worlds last. A cotangent (gradient of a loss w.r.t. an array) has its shape.
     Motors and paws are ordered by leg FL, FR, BL, BR; motors of a leg: lateral, outer, inner.
     """
 
@@ -67,7 +67,7 @@ class Trajectory:
     filtered_target: wp.array  # (T, 12, num_worlds) [rad] Targets after the command filter
     commands: Any  # The kernels' `Commands` of the rollout
     from_start: bool = False
-    """True: `initial_target` was left out, so that the gradient by q includes the gradient by initial_target."""
+    """True: `initial_target` was omitted, so that the gradient w.r.t. q includes that w.r.t. initial_target."""
 
     def end(self) -> dict[str, Any]:
         """Return the arguments of `Rollout.run` that continue after the last row: q, qd, initial_target, impulse."""
@@ -207,7 +207,7 @@ class Rollout:
             q: Initial coordinates, (19, num_worlds), as in `Trajectory.q`.
             qd: Initial rates, (18, num_worlds), as in `Trajectory.qd`.
             initial_target: Filtered targets [rad] in use until the first target arrives, (12, num_worlds); matters with
-                a latency. By default the initial angles; the gradient by q then includes this one.
+                a latency. By default the initial angles; the gradient w.r.t. q then includes this one.
             wrench: Force [N] and moment [N m] on the base at its com, world axes, in each policy step,
                 (T, 6, num_worlds).
             impulse: Contact impulses of the previous physics step, as in `Trajectory.impulse`, (4, num_worlds) vec3; by
@@ -261,13 +261,13 @@ class Rollout:
         impulse: wp.array | None = None,
         filtered_target: wp.array | None = None,
     ) -> dict[str, wp.array]:
-        """Return the gradient of each world's loss by the inputs of the rollout, given its gradient by the trajectory.
+        """Return the gradient of each world's loss w.r.t. the inputs of a rollout, given that w.r.t. the trajectory.
 
-        q, qd, torque, impulse, filtered_target: cotangents, the gradients of the loss by these arrays of `trajectory`,
-        of the same shapes and types; None: zero. The parameters must be those of the forward pass.
+        q, qd, torque, impulse, filtered_target: cotangents, the gradients of the loss w.r.t. these arrays of
+        `trajectory`, of the same shapes and types; None: zero. The parameters must be those of the forward pass.
 
         Returned by name, worlds last: targets, q, qd (initial rows), initial_target, wrench, the entries of
-        `parameters`, and `geometry` (4, 10, num_worlds) by the legs' lengths [m]. The gradient by the initial
+        `parameters`, and `geometry` (4, 10, num_worlds) w.r.t. the legs' lengths. The gradient w.r.t. the initial
         quaternion assumes that it is normalised first. Raises InputError: another rollout's trajectory or other shapes.
         """
         n, modules = self.num_worlds, self.dynamics.modules
@@ -275,7 +275,7 @@ class Rollout:
         count = commands.target.shape[0]
         rows_of = (count * self.substeps // self.every + 1, 19, n)
         if trajectory.q.shape != rows_of or trajectory.q.dtype != self.real:
-            raise InputError(f"this rollout makes trajectories {rows_of}, got {trajectory.q.shape}")
+            raise InputError(f"trajectory.q must be {self.real.__name__} {rows_of}, got {trajectory.q.shape}")
         by_outputs = {"q": q, "qd": qd, "torque": torque, "impulse": impulse, "filtered_target": filtered_target}
         cotangents = self._cotangents(trajectory, by_outputs)
         rows = modules.trajectory.TrajectoryArrays()
@@ -307,7 +307,7 @@ class Rollout:
         return by_inputs | {"initial_target": gradients.initial_target} | self._split_parameters(gradients.parameters)
 
     def _cotangents(self, trajectory: Trajectory, by_outputs: dict[str, wp.array | None]) -> Any:
-        """Return gradients by arrays of a trajectory as `TrajectoryArrays`; empty for None and filtered_target.
+        """Return gradients w.r.t. arrays of a trajectory as `TrajectoryArrays`; empty for None and filtered_target.
 
         Raises InputError: another shape or type than the trajectory's array.
         """
@@ -318,7 +318,7 @@ class Rollout:
             if array is not None and not alike:
                 got = f"{array.dtype.__name__} {array.shape}" if isinstance(array, wp.array) else type(array).__name__
                 raise InputError(
-                    f"the gradient by {name} must be like it, {like.dtype.__name__} {like.shape}, got {got}"
+                    f"the gradient w.r.t. {name} must be {like.dtype.__name__} of shape {like.shape}, got {got}"
                 )
             if name != "filtered_target":
                 empty = wp.zeros((0,) * like.ndim, dtype=like.dtype, device=self.device)

@@ -151,7 +151,7 @@ SMOOTH: dict[str, Smooth] = {
 
 
 def smooth_reward(task: Any, context: RewardContext) -> torch.Tensor:
-    """Return the weighted sum (n,) of rewards in `SMOOTH`; those with `scale_by_dt` times the policy step."""
+    """Return the weighted sum (n,) of rewards in `SMOOTH`, times the policy step where `scale_by_dt` is set."""
     total = torch.zeros_like(context.goal)
     for term in task.rewards:
         if term.func.key in SMOOTH:

@@ -20,7 +20,7 @@ OUTPUTS = ("q", "qd", "torque", "impulse", "filtered_target")  # differentiable 
 
 
 class TorchTrajectory(NamedTuple):
-    """A `Trajectory` as tensors with gradients, of T policy steps of S physics steps; do not change them in place."""
+    """Trajectory of a rollout as tensors with gradients, T policy steps of S physics steps; do not change in place."""
 
     q: torch.Tensor  # (K + 1, 19, num_worlds) as in `Trajectory`: base origin [m], quaternion xyzw, motor angles [rad]
     qd: torch.Tensor  # (K + 1, 18, num_worlds) velocity of the base's COM [m/s], angular velocity, motor rates [rad/s]
@@ -46,7 +46,7 @@ def simulate(
     trusted: bool = False,
     **parameters: torch.Tensor,
 ) -> TorchTrajectory:
-    """Return the trajectory of a rollout, differentiable once by all tensors except `impulse`.
+    """Return the trajectory of a rollout, differentiable once w.r.t. all tensors except `impulse`.
 
     Arguments and shapes are those of `Rollout.run`, with or without the axis of worlds. parameters: entries of
     `Rollout.parameters`, or `geometry` (4, 10) [m], the legs' lengths of all worlds; they are written to the rollout
@@ -125,12 +125,12 @@ class _Simulate(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: torch.Tensor | None) -> tuple:
-        """Run the reverse pass with the parameters of the forward pass; grads: by `OUTPUTS`, None for zero."""
+        """Run the reverse pass with the parameters of the forward pass; grads: w.r.t. `OUTPUTS`, None for zero."""
         rollout, trajectory = ctx.rollout, ctx.trajectory
         given = dict(zip(ctx.names, ctx.saved_tensors, strict=False))
         changed = {name for name, count in rollout.writes.items() if ctx.writes[name] != count}
         if lost := changed - given.keys():
-            raise InputError(f"{min(lost)} has been changed since this rollout: give it to each call of simulate")
+            raise InputError(f"{min(lost)} was changed after this rollout: pass it to each call of simulate")
         with _stream(rollout):
             _write_parameters(rollout, given, changed)
             cotangents = {name: _cotangent(trajectory, name, grad) for name, grad in zip(OUTPUTS, grads, strict=False)}
@@ -143,7 +143,7 @@ class _Simulate(torch.autograd.Function):
 
 
 def _cotangent(trajectory: Trajectory, name: str, grad: torch.Tensor | None) -> wp.array | None:
-    """Return the gradient by the trajectory's array `name` as a Warp array of its type; None (zero) stays None."""
+    """Return the gradient w.r.t. the trajectory's array `name` as a Warp array of its type; None (zero) stays None."""
     if grad is None:
         return None
     return wp.from_torch(grad.detach().contiguous(), dtype=getattr(trajectory, name).dtype)

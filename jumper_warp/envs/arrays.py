@@ -1,4 +1,4 @@
-"""Arrays that the stages of a policy step share, and checks of arguments of an environment."""
+"""Kernel arrays of an environment, and checks of its arguments."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.streams import PURPOSES, Purpose
 
 FIRST_STEP_COUNT = 2 * RING
-"""Step count of every world at the start; ring buffers need a positive index for the steps before it."""
+"""Step count of every world at the start; ring buffers need a positive index for earlier steps."""
 
 
 def allocate(struct: Any, names: Iterable[str], shape: int | tuple[int, ...], dtype: Any, device: Any) -> None:
@@ -29,7 +29,7 @@ def allocate(struct: Any, names: Iterable[str], shape: int | tuple[int, ...], dt
 
 
 def robot_arrays(sim: Simulation, step_dt: float) -> Any:
-    """Return the kernels' `RobotArrays`: views of a simulation's arrays, the rest new; step_dt [s]: policy step."""
+    """Return the kernels' `RobotArrays`: views of a simulation's arrays, and new ones; step_dt [s]: policy step."""
     n, device, robot = sim.num_worlds, sim.device, RobotArrays()
     robot.joint_q, robot.joint_qd, robot.body_f = sim.state.joint_q, sim.state.joint_qd, sim.state.body_f
     robot.body_com, robot.gravity = sim.model.body_com, sim.model.gravity
@@ -48,7 +48,7 @@ def robot_arrays(sim: Simulation, step_dt: float) -> Any:
 
 
 def episode_arrays(num_envs: int, seed: int, stream: Purpose, skill: wp.array, device: Any) -> Any:
-    """Return the kernels' `EpisodeArrays` before the first reset; skill: (num_envs,) index of each world's task."""
+    """Return new `EpisodeArrays` for the first reset; skill: (num_envs,) index of each world's task."""
     episode = EpisodeArrays()
     episode.seed, episode.purpose, episode.skill = seed, PURPOSES.index(stream), skill
     counts = ("requested_task", "has_command", "history_reset", "termination", "diverged", "bad_action", "level",
@@ -63,7 +63,7 @@ def episode_arrays(num_envs: int, seed: int, stream: Purpose, skill: wp.array, d
 
 
 def delay_arrays(num_envs: int, latency: wp.array, substeps: int, device: Any) -> Any:
-    """Return the kernels' `Delays`; latency [physics steps]: (num_envs,) int; substeps: physics steps a policy step."""
+    """Return the kernels' ring buffers `Delays`; latency: (num_envs,) int [physics steps]; substeps per policy step."""
     delays = Delays()
     allocate(delays, ("target_history",), (RING, 12, num_envs), float, device)
     allocate(delays, ("current_target", "prev_target"), (12, num_envs), float, device)
@@ -73,17 +73,17 @@ def delay_arrays(num_envs: int, latency: wp.array, substeps: int, device: Any) -
 
 
 def scene_of(sim: Simulation) -> Any:
-    """Return the kernels' `Scene` of a simulation."""
+    """Return the kernels' `Scene` (ground and robot constants) of a simulation."""
     scene, robot = Scene(), sim.physics.dynamics.robot
     scene.geometry, scene.ground, scene.reference_q = robot.geometry, robot.ground, sim.model.joint_q
     return scene
 
 
 def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ...]:
-    """Return the tasks of an environment as a tuple; task: a `TaskCfg` or several.
+    """Return the tasks of an environment as a tuple, checked; task: a `TaskCfg` or several.
 
-    Raises InputError (a ValueError): not a task, no task, two with the same name, with different peak torques or
-    over-speed protection of the motors, or with different gravities; or a handover from or to another task.
+    Raises InputError (a ValueError): `task` is no task or empty; two tasks have the same name, or differ in peak
+    torque, over-speed protection or gravity; or a handover refers to another task.
     """
     is_sequence = isinstance(task, Iterable) and not isinstance(task, str)
     tasks: tuple[Any, ...] = tuple(task) if is_sequence else (task,)
@@ -92,15 +92,15 @@ def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ..
             raise InputError(f"a task must be a TaskCfg, as make_task returns for a name, got {each!r:.60}")
     names = [each.name for each in tasks]
     if not tasks or len(set(names)) < len(names):
-        raise InputError(f"an environment needs at least one task, each with a name of its own, got {names}")
+        raise InputError(f"an environment needs at least one task, and unique names, got {names}")
     first = tasks[0].motors
     limits = (first.fade_start, first.fade_end, first.lateral.peak, first.transversal.peak)
     for each in tasks[1:]:
         motors = each.motors
         if (motors.fade_start, motors.fade_end, motors.lateral.peak, motors.transversal.peak) != limits:
-            raise InputError(f"{each.name} needs the peak torque and the over-speed protection of {names[0]}'s motors")
+            raise InputError(f"{each.name} and {names[0]} must have equal peak torque and over-speed protection")
         if each.gravity != tasks[0].gravity:
-            raise InputError(f"{each.name} has a gravity of {each.gravity} m/s^2, {names[0]} of {tasks[0].gravity}")
+            raise InputError(f"gravity of {each.name} must be {tasks[0].gravity} m/s^2, got {each.gravity}")
     for each in handovers:
         if each.source not in tasks or each.target not in tasks:
             raise InputError(f"a handover needs two of the tasks {names}, got {each.source.name} to {each.target.name}")
@@ -110,9 +110,9 @@ def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ..
 def prepared_tasks(
     tasks: Sequence[TaskCfg], randomize: bool, noise: bool, ground_may_vary: bool
 ) -> tuple[tuple[TaskCfg, ...], bool]:
-    """Return the tasks as an environment runs them, and whether any of them samples its ground.
+    """Apply the environment's options to its tasks; return them, and whether any of them samples its ground.
 
-    Without randomize they are nominal, without noise their observations are exact; ground is sampled only with
+    Without randomize tasks are nominal. Without noise their observations are exact. Ground is sampled only with
     randomize and ground_may_vary.
     """
     prepared, draws = [], False
@@ -126,7 +126,7 @@ def prepared_tasks(
 
 
 def checked_action(action: Any, shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
-    """Return `action` without gradient. Raises InputError: not a floating-point tensor of this shape and device."""
+    """Return `action` without gradient. Raises InputError: no floating-point tensor of this shape and device."""
     if not isinstance(action, torch.Tensor):
         raise InputError(f"an action must be a torch tensor, got {type(action).__name__}")
     if tuple(action.shape) != shape:
@@ -163,17 +163,17 @@ def checked_values(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray
 
 
 def checked_skill(skill: Any, num_envs: int, num_skills: int) -> np.ndarray:
-    """Return each world's task index, (num_envs,) int32; skill: one index or (num_envs,). Raises InputError if not."""
+    """Return each world's task index, (num_envs,) int32; skill: one index, or (num_envs,). Raises InputError."""
     array = np.asarray(skill)
     if array.shape not in ((), (num_envs,)) or array.dtype.kind not in "iu":
-        raise InputError(f"skill must be an index or {num_envs} whole ones, got {array.dtype} of shape {array.shape}")
+        raise InputError(f"skill must be one int or {num_envs} ints, got {array.dtype} of shape {array.shape}")
     if not ((array >= 0) & (array < num_skills)).all():
         raise InputError(f"skill must be an index below {num_skills}, got {array.min()} to {array.max()}")
     return np.ascontiguousarray(np.broadcast_to(array.astype(np.int32), num_envs))
 
 
 def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
-    """Return worlds, (num_envs,) bool or None for all, as float32 ones and zeros. Raises InputError: other shape."""
+    """Return a selection of worlds as float32 mask; worlds: (num_envs,) bool or None for all. Raises InputError."""
     if worlds is None:
         return np.ones(num_envs, dtype=np.float32)
     array = np.asarray(to_numpy(worlds))
@@ -183,22 +183,22 @@ def checked_mask(worlds: Any, num_envs: int) -> np.ndarray:
 
 
 def checked_worlds(worlds: Any, num_envs: int) -> np.ndarray:
-    """Return worlds, (num_envs,) bool or different indices, as float32 ones and zeros. Raises InputError: neither."""
+    """Return a selection of worlds as float32 mask; worlds: (num_envs,) bool or distinct indices. Raises InputError."""
     array = np.asarray(to_numpy(worlds))
     if array.dtype.kind not in "iu":
         return checked_mask(array, num_envs)
     fits = array.ndim == 1 and bool(((array >= 0) & (array < num_envs)).all())
     if not fits or len(np.unique(array)) < len(array):
-        raise InputError(f"worlds must be {num_envs} bools, or different indices below {num_envs}, got {worlds!r:.60}")
+        raise InputError(f"worlds must be {num_envs} bools, or distinct indices below {num_envs}, got {worlds!r:.60}")
     mask = np.zeros(num_envs, dtype=np.float32)
     mask[array] = 1.0
     return mask
 
 
 def checked_commands(commands: Any, mask: np.ndarray, tasks: Sequence[TaskCfg]) -> np.ndarray:
-    """Return commands as float32 (num_envs, 4), padded with 0; mask: (num_envs,), not 0 for worlds to command.
+    """Return commands as float32 (num_envs, 4), padded with 0; mask: (num_envs,), nonzero for worlds to command.
 
-    commands: one row or one a world, valid for the command of at least one task. Raises InputError: valid for none.
+    commands: one row, or one per world, valid for at least one task. Raises InputError: they are valid for none.
     """
     array, n, errors = as_float32(commands, "commands"), len(mask), []
     for task in tasks:

@@ -1,4 +1,4 @@
-"""Images of the robots of a simulation, one image a world, by a camera that follows each robot."""
+"""Camera that follows each robot of a simulation and draws one image per world."""
 
 from __future__ import annotations
 
@@ -20,18 +20,18 @@ from jumper_warp.viz.renderer import Renderer, View, open_renderer
 from jumper_warp.viz.scene import DEAD_ZONE, corners, fit
 from jumper_warp.viz.shapes import CHECKER_CELL, ShapeMesh, shape_meshes
 
-PERIOD = 2.0 * CHECKER_CELL  # [m] after which the drawn plane repeats
-NEAR = 1.5  # [m] how far a robot goes before the drawing's origin moves to it
+PERIOD = 2.0 * CHECKER_CELL  # [m] period of the drawn plane's pattern
+NEAR = 1.5  # [m] distance of a robot from the drawing's origin at which the origin moves to it
 REACH = 5.0  # [m] half the side of the part of a heightfield that is drawn
-NODES = 100  # most nodes of this part on each side of its middle, along an axis
+NODES = 100  # largest number of nodes of this part on each side of its middle, along an axis
 BELOW = -1000.0  # [m] height of the scenery of worlds that are not being drawn
 
 
 class WorldCamera:
-    """Draws the first worlds of a simulation, with their ground and blocks, without changing the simulation.
+    """Camera for the first worlds of a simulation, with their ground and blocks; it does not change the simulation.
 
     All worlds share a renderer, which opens at the first image and holds one robot and the scenery of every world. It
-    loads the scenery again when a block gets another size, or a robot on a heightfield goes far.
+    loads the scenery again when a block changes its size, or a robot on a heightfield moves by more than NEAR.
     """
 
     def __init__(self, sim: Simulation, count: int, size: tuple[int, int]) -> None:
@@ -46,13 +46,13 @@ class WorldCamera:
         if not self._is_field:
             self._shapes += shape_meshes(sim.model, ())
         self._offset = fit(corners(np.stack([-DEAD_ZONE, DEAD_ZONE])), np.array(DIRECTION), size)
-        self._targets = np.full((count, 3), np.inf)  # [m] where the camera looks, world frame
+        self._targets = np.full((count, 3), np.inf)  # [m] points that the camera is aimed at, world frame
         self._origins = np.full((count, 2), np.inf)  # [m] x and y of the drawing's origin, world frame
         self._scenery = np.empty(0)  # see `_present_scenery`
         self._renderer: Renderer | None = None
 
     def images(self) -> list[np.ndarray]:
-        """Return a present image of each world, (height, width, 3) uint8, RGB. Waits for the device."""
+        """Return an image of each world's current state, (height, width, 3) uint8, RGB. Waits for the device."""
         links = self._links.read()[0][: self._count].astype(float)
         self._follow(links[:, 0, :3])
         scenery, blocks = self._present_scenery()
@@ -66,7 +66,7 @@ class WorldCamera:
             self._renderer = None
 
     def _follow(self, bases: np.ndarray) -> None:
-        """Move targets and origins after the robots; bases: positions (count, 3) [m], world frame."""
+        """Move the camera's targets and origins to the robots; bases: positions (count, 3) [m], world frame."""
         targets = bases + np.clip(self._targets - bases, -DEAD_ZONE, DEAD_ZONE)
         jumped = np.abs(self._targets - bases).max(axis=1) > NEAR  # also at the first image
         self._targets = np.where(jumped[:, None], bases, targets)
@@ -74,9 +74,9 @@ class WorldCamera:
         self._origins[far] = PERIOD * np.round(bases[far, :2] / PERIOD)
 
     def _present_scenery(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return what the shapes of each world's scenery depend on, (count, 5), and centres of blocks, (count, 2) [m].
+        """Return parameters of each world's scenery, (count, 5) [m], and centres of blocks, (count, 2) [m].
 
-        Columns [m]: origin x, y of the drawn part of a heightfield, half extents x, y and height of the block, or 0.
+        Columns: origin x, y of the drawn part of a heightfield; half extents x, y and height of the block, or 0.
         """
         scenery, centers = np.zeros((self._count, 5)), np.zeros((self._count, 2))
         if self._is_field:
@@ -88,7 +88,7 @@ class WorldCamera:
         return scenery, centers
 
     def _renderer_of(self, scenery: np.ndarray) -> Renderer:
-        """Return the renderer of a scenery, as `_present_scenery`, which loads it if it changed."""
+        """Return the renderer for a scenery (see `_present_scenery`), after loading the scenery if it changed."""
         if self._renderer is None or not np.array_equal(scenery, self._scenery):
             bodies = [*self._shapes, *self._scenery_shapes(scenery)], self._num_links + 2 * self._count
             if self._renderer is None:
@@ -99,7 +99,7 @@ class WorldCamera:
         return self._renderer
 
     def _scenery_shapes(self, scenery: np.ndarray) -> list[ShapeMesh]:
-        """Return the shapes of every world's scenery; its bodies after the links are heightfield and block by world."""
+        """Return the shapes of every world's scenery; bodies after the links: heightfield and block of each world."""
         builder, bodies = newton.ModelBuilder(), []
         builder.default_shape_cfg = newton.ModelBuilder.ShapeConfig(has_shape_collision=False)
         for rank, (x, y, half_x, half_y, height) in enumerate(scenery):

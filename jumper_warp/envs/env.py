@@ -1,4 +1,4 @@
-"""The environment: tasks on a simulation, in one sequence of launches per policy step."""
+"""Reinforcement-learning environment: tasks on a simulation, in one sequence of kernel launches per policy step."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ from jumper_warp.utils.kernels import load_kernels, records
 from jumper_warp.utils.streams import PURPOSES, Purpose
 
 CONTACT_TOLERANCE = 1.0e-4
-"""[m/s] Stopping tolerance of the contact iteration; takes a fifth fewer sweeps than the solver's default."""
+"""[m/s] Stopping tolerance of the contact iteration, looser than the solver's default, for a fifth fewer sweeps."""
 
 
 class Step(NamedTuple):
     """Result of `Env.step`; tensors on the device that the next step overwrites."""
 
     obs: dict[str, torch.Tensor]
-    """(num_envs, columns) by group (`actor`, `critic`), for the next step; ended episodes are already reset."""
+    """Observations (num_envs, columns) by group (`actor`, `critic`), after resets of ended episodes."""
     reward: torch.Tensor  # (num_envs,)
     terminated: torch.Tensor  # (num_envs,) bool, whether the episode ended with failure
     truncated: torch.Tensor  # (num_envs,) bool, whether it ended without failure (time limit or success)
@@ -54,13 +54,14 @@ class Step(NamedTuple):
 
 
 class Env(Stages):
-    """One robot per world on one task, or on several of which each world has one. `step` never waits for the device.
+    """Vectorised environment with one robot per world, on one task or several. `step` never waits for the device.
 
-    Attributes, tensors on the device that `reset` and `step` overwrite, of the first task:
-        obs, critic_obs: (num_envs, columns), for the next step; ended episodes are already reset.
-        final_obs, final_critic_obs: the same before resets.
+    With several tasks each world has one at a time. Attributes are tensors on the device that `reset` and `step`
+    overwrite; observations and reward terms are those of the first task:
+        obs, critic_obs: (num_envs, columns), after resets of ended episodes.
+        final_obs, final_critic_obs: (num_envs, columns), before resets.
         reward_terms: (num_envs,) by name of the reward, weight and time step applied, of worlds on that task.
-        reward, done, timeout: (num_envs,); done 1 where an episode ended, timeout 1 where it did without failure.
+        reward, done, timeout: (num_envs,); done 1 where an episode ended, timeout 1 where it ended without failure.
     `Stages` holds the arrays and launches the kernels.
     """
 
@@ -85,7 +86,7 @@ class Env(Stages):
         threads: int | None = None,
         refine: int = 1,
     ):
-        """Allocate everything; call `reset` before the first step.
+        """Allocate simulation and arrays; call `reset` before the first step.
 
         stream: purpose of all random numbers; numbers of two purposes differ for any seeds, also after `reset(seed)`.
         randomize, noise: enable domain randomisation, observation noise. auto_reset: reset ended episodes in `step`.
@@ -120,14 +121,14 @@ class Env(Stages):
         if self.wp_device.is_cuda:
             torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(self.wp_device)))
         if self._draws_ground:
-            self.sim.physics.dynamics.robot.ground.blocks.zero_()  # until `reset` draws them
+            self.sim.physics.dynamics.robot.ground.blocks.zero_()  # until `reset` samples them
         self.physics_dt, self.step_dt = self.sim.dt, self.sim.dt * self.sim.substeps
         self._ends_episodes, self._started, self._compiled, self._graphs = True, False, False, {}
         self._allocate(run, skill, handovers)
         self._show()
 
     def _show(self) -> None:
-        """Set the public tensors: torch views of Warp's arrays, of the first task where tasks differ."""
+        """Set the public tensors: torch views of Warp arrays; observations and reward terms are the first task's."""
         self.num_actions, self.actions = 12, wp.to_torch(self._action)
         self.action, first = self.actions[0], self.skills[0]
         self.obs, self.critic_obs = first.obs["actor"], first.obs["critic"]
@@ -150,9 +151,9 @@ class Env(Stages):
         """
         mask = self._all if worlds is None else self._array(checked_worlds(worlds, self.num_envs))
         if worlds is not None and seed is not None:
-            raise InputError("a seed is for all worlds: reset(seed), or reset(worlds=...) without one")
+            raise InputError("a seed resets all worlds: call reset(seed), or reset(worlds=...) without a seed")
         if worlds is not None and not self._started:
-            raise RuntimeError("call reset of all worlds before the first of some")
+            raise RuntimeError("reset all worlds before the first reset of selected worlds")
         if seed is not None:
             check_seed(seed)
             self._start_over(seed)
@@ -182,7 +183,7 @@ class Env(Stages):
             self._compiled = True
 
     def _start_over(self, seed: int) -> None:
-        """Put episodes, curriculum and task states back to those of a new environment with this seed."""
+        """Restore episodes, curriculum and task states to those of a new environment with this seed."""
         self.seed = self.episodes.seed = seed
         self._started = False
         self._graphs.clear()  # they hold the old seed
@@ -195,11 +196,11 @@ class Env(Stages):
             skill.states.zero_()
 
     def step(self, action: torch.Tensor) -> Step:
-        """Advance one policy step; the next step overwrites the returned tensors, so clone what you keep.
+        """Advance one policy step; the next step overwrites the returned tensors, so clone those you need later.
 
         action: (num_envs, 12) floating point, clamped to -1..1; with several tasks (tasks, num_envs, 12), of which each
-        world uses the row of its task. A non-finite action ends the episode as `came_apart`.
-        Raises InputError (a ValueError): an action of another shape, dtype or device. RuntimeError: no `reset` before.
+        world uses the row of its task. A non-finite action ends the episode as `diverged`.
+        Raises InputError (a ValueError): an action of another shape, dtype or device. RuntimeError: not yet reset.
         """
         if not self._started:
             raise RuntimeError("call reset before the first step")
@@ -216,7 +217,7 @@ class Env(Stages):
         return self._step
 
     def set(self, name: str, value: float, skill: int = 0) -> None:
-        """Change a number of a task's term, from the next step on, also in captured graphs.
+        """Change a number of a task's term from the next step on, also in captured graphs.
 
         name: "section.term.number" such as `rewards.jump_height.weight`; skill: index of the task.
         Raises InputError (a ValueError): no such number or skill, or a value that is not finite.
@@ -229,7 +230,7 @@ class Env(Stages):
             raise InputError(f"skill must be an index below {len(self.skills)}, got {skill}")
 
     def evaluation_reset(self, commands: Any, headings: Any = 0.0, worlds: Any = None) -> None:
-        """Begin an episode with a given command in the default pose and first skill; ended episodes stay until `reset`.
+        """Begin an episode with a given command in the default pose and first skill; disables resets until `reset`.
 
         commands: one row a world or one for all, columns as in `jumper_warp.tasks.commands.layout_of`; headings [rad]:
         (num_envs,) or one for all; worlds: (num_envs,) bool, by default all.
@@ -257,7 +258,7 @@ class Env(Stages):
     def command(self, commands: Any, worlds: Any = None) -> None:
         """Set commands within running episodes and update `obs`.
 
-        commands: as in `evaluation_reset`, relative to the present base position and yaw; worlds: (num_envs,) bool, by
+        commands: as in `evaluation_reset`, relative to the current base position and yaw; worlds: (num_envs,) bool, by
         default all. Raises InputError (a ValueError): values of another shape, out of bounds or not finite.
         """
         chosen = checked_mask(worlds, self.num_envs)
@@ -299,7 +300,7 @@ class Env(Stages):
         return arrays | {name: getattr(self.episodes, name).numpy().copy() for name in ("done", "termination", "level")}
 
     def snapshot(self) -> Snapshot:
-        """Return the robots' present state and parameters for `jumper_warp.diff`; does not wait for the device."""
+        """Return the robots' current state and parameters for `jumper_warp.diff`; does not wait for the device."""
         sim, n = self.sim, self.num_envs
         past, step_count = wp.to_torch(self.delays.target_history), wp.to_torch(self.episodes.step_count).long()
         parameters = {name: wp.to_torch(getattr(sim.motors, name)) for name in MOTOR_CONSTANTS}
@@ -344,7 +345,7 @@ class Env(Stages):
         return mirror_of_action() if what == "action" else mirror_of(self.task, "actor")
 
     def config(self) -> dict:
-        """Return everything that defines the environment, ready for JSON.
+        """Return all settings that define the environment as JSON data.
 
         `task` and `interface` are those of the first task; with several tasks, `tasks`, `first_skill` and `handovers`
         (names of functions) are added, with a robot overlay, `robot`.
@@ -374,7 +375,7 @@ class Env(Stages):
         }
 
     def state_dict(self) -> dict[str, torch.Tensor]:
-        """Return everything that the next step depends on, see `jumper_warp.envs.state.save_state`."""
+        """Return the complete state that the next step depends on; see `jumper_warp.envs.state.save_state`."""
         return save_state(self)
 
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:

@@ -1,4 +1,4 @@
-"""`RobotParameters`, the arrays that domain randomisation writes, on the memory of a simulation."""
+"""`RobotParameters`: the arrays that domain randomisation writes, as views of a simulation's arrays."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ NOMINAL = {
 
 
 def robot_parameters(sim: Simulation, tasks: tuple[TaskCfg, ...], skill: wp.array) -> Any:
-    """Return the kernels' `RobotParameters`; the model's present values become the nominal ones.
+    """Return the kernels' `RobotParameters`; the model's current values become the nominal ones.
 
     skill: (num_worlds,) int, index in `tasks` of each world's active task.
     """

@@ -1,4 +1,4 @@
-"""One task in an environment: its kernels and its arrays of all worlds."""
+"""Kernels and arrays of one task in an environment."""
 
 from __future__ import annotations
 
@@ -26,13 +26,13 @@ _KERNELS: dict[tuple, Kernel] = {}
 
 
 class TaskRuntime:
-    """Kernels and arrays of one task in an environment; struct and array attributes are arguments of the kernels.
+    """Kernels and arrays of one task in an environment; attributes that are structs or arrays are kernel arguments.
 
     kernels: see `kernels_of`. obs, final_obs: torch views (num_envs, columns) by group, after and before resets.
     """
 
     def __init__(self, task: TaskCfg, index: int, num_envs: int, step_dt: float, substeps: int, device: Any) -> None:
-        """Allocate everything; index: of the task in the environment; step_dt [s]: policy step of `substeps`."""
+        """Allocate the arrays; index: the task's in the environment; step_dt [s]: policy step of `substeps`."""
         self.task, self.index, self.num_envs, self.device = task, index, num_envs, device
         self.kernels = kernels_of(task)
         self.params = ParamArrays(task.params, device)
@@ -57,7 +57,7 @@ class TaskRuntime:
         return counters
 
     def _structs(self, values: list, kind: Any = None) -> wp.array:
-        """Return structs (of type `kind`) as a Warp array, of one unused `NoSettings` if there are none."""
+        """Return structs (of type `kind`) as a Warp array; if there are none, one unused `NoSettings`."""
         values = values or [NoSettings()]
         return wp.array(values, dtype=kind or values[0]._cls, device=self.device)
 
@@ -87,7 +87,7 @@ class TaskRuntime:
         self.obs, self.final_obs = (self._views(a, widths) for a in (arrays.now, arrays.final))
 
     def _views(self, array: wp.array, widths: dict[str, int]) -> dict[str, torch.Tensor]:
-        """Return torch views (num_envs, columns) by group; array: flat, groups end to end; widths: columns by group."""
+        """Return torch views (num_envs, columns) by group; array: flat, group after group; widths: columns by group."""
         flat, first, views = wp.to_torch(array), 0, {}
         for group, width in widths.items():
             views[group] = flat[first : first + self.num_envs * width].view(self.num_envs, width)
@@ -115,7 +115,7 @@ class TaskRuntime:
     def metrics(self) -> dict[str, float]:
         """Return metrics by name since the last call, and clear the counters (waits for the device).
 
-        Means of nothing are 0. `Episode_Reward/<term>`: mean over the ended episodes of the term's sum over the
+        A mean without samples is 0. `Episode_Reward/<term>`: mean over the ended episodes of the term's sum over the
         episode, divided by the time limit [s]; `Episode_Sum/<term>`: the mean sum, of a task without a time limit.
         `Episode_Termination/<term>`: fraction of the ended episodes. `Metrics/success`: fraction of the episodes that
         the curriculum counts; `Metrics/error_of_successes_<unit>`: mean curriculum error of the successful ones.
@@ -139,7 +139,7 @@ class TaskRuntime:
         return metrics | self._state_metrics()
 
     def _state_metrics(self) -> dict[str, float]:
-        """Return the task's metrics of state fields: sum of `field` over sum of `per`, else the mean; clear both."""
+        """Return the task's `StateMetric`s (sum of `field` over sum of `per`, or the mean), and clear the sums."""
         metrics, values_by_name = self.task.metrics, {}
         if not metrics:
             return values_by_name
@@ -157,7 +157,7 @@ class TaskRuntime:
 
 
 def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
-    """Return a task's kernels by name; tasks that differ in numbers only share them."""
+    """Return a task's kernels by name; tasks that differ only in numbers share them."""
     slots = task.params.slots
     compiled = {section: tuple(slot.compiled for slot in section_slots) for section, section_slots in slots.items()}
     ends = tuple(compiled[section] for section in ("advance", "curriculum", "rewards", "terminations"))
@@ -174,7 +174,7 @@ def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
 
 
 def _kernel(make: Callable[[Any], Kernel], source: Any, *key_parts: Any) -> Kernel:
-    """Return make(source), cached by `make` and key_parts: everything in source that the kernel depends on."""
+    """Return the kernel make(source), cached by `make` and key_parts: all parts of source that it depends on."""
     if (key := (make, *key_parts)) not in _KERNELS:
         _KERNELS[key] = make(source)
     return _KERNELS[key]

@@ -1,4 +1,4 @@
-"""The stages of a policy step: kernels, their order and their arrays."""
+"""Stages of a policy step: kernels, their order and their arrays."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ from jumper_warp.utils.kernels import Kernel
 from jumper_warp.utils.streams import Purpose
 
 BLOCK = 32  # Default threads of a block; small, to spread a few thousand heavy threads over all multiprocessors
-BLOCKS = {"reset": 128, "event": 256}  # Threads of a block of task kernels, by name, where it is not BLOCK
+BLOCKS = {"reset": 128, "event": 256}  # Threads of a block of task kernels by name, where other than BLOCK
 POSTPROCESS_BLOCK = 256
 EVENT_BLOCKS = 264
-"""Largest number of blocks of event kernels: most threads are idle, and a new block costs more than another turn."""
+"""Largest number of blocks of event kernels. Most threads are idle, and a new block costs more than another pass."""
 
 
 class WorldSlice(NamedTuple):
-    """The worlds that a stage is launched for."""
+    """Contiguous range of worlds that a stage is launched for."""
 
     first: int
     count: int
@@ -63,7 +63,7 @@ class Stages:
     _ends_episodes: bool  # Whether ended episodes are reset; false after `evaluation_reset`
 
     def _allocate(self, tasks: Sequence[TaskCfg], skill: np.ndarray | int, handovers: Sequence[Handover]) -> None:
-        """Allocate all arrays and make all kernels; skill: index of each world's first task, (num_envs,) or one."""
+        """Allocate all arrays and build all kernels; skill: index of each world's first task, (num_envs,) or one."""
         n, device, sim = self.num_envs, self.wp_device, self.sim
         self._first_skill = checked_skill(skill, n, len(tasks))
         active, self._home = (wp.array(self._first_skill, dtype=int, device=device) for _ in range(2))
@@ -85,14 +85,14 @@ class Stages:
         ]
 
     def after_load_state(self) -> None:
-        """Update what depends on the arrays after `load_state` wrote them: start flag, terms' numbers and solver."""
+        """Update start flag, terms' numbers and solver after `load_state` wrote the arrays."""
         self._started = bool((self.episodes.step_count.numpy() > FIRST_STEP_COUNT).all())
         for skill in self.skills:
             skill.params.restore()
         self.sim.physics.parameters_changed()
 
     def kernels(self, draws: bool = True) -> list[tuple[Kernel, int]]:
-        """Return the kernels of `reset` and `step`, each with its block size; draws: include `reset`."""
+        """Return the kernels of `reset` and `step`, each with its block size; draws: include those of `reset`."""
         shared = [action_kernel, motors_kernel, clear_history_kernel, advance_rng_kernel, track_kernel]
         shared += [restore_task_kernel] if len(self.skills) > 1 else []
         shared += [set_skill_kernel] if self._reset_mask is not self.episodes.done else []
@@ -103,7 +103,7 @@ class Stages:
         return kernels + self.sim.physics.kernels()
 
     def _part(self, worlds: WorldRange | None = None) -> WorldSlice:
-        """Return a range of worlds, by default all, with the `EpisodeArrays` that begin at its first world."""
+        """Return a range of worlds (default: all) with the `EpisodeArrays` that begin at its first world."""
         if worlds is None or worlds.count == self.num_envs:
             return WorldSlice(0, self.num_envs, self.episodes)
         env = EpisodeArrays()
@@ -113,7 +113,7 @@ class Stages:
         return WorldSlice(*worlds, env)
 
     def _launch_step(self, worlds: WorldRange | None = None) -> None:
-        """Launch all stages of a policy step for a range of worlds, by default all."""
+        """Launch all stages of a policy step for a range of worlds (default: all)."""
         for stage in self.stages(worlds).values():
             stage()
 
@@ -129,7 +129,7 @@ class Stages:
                 "reset": lambda: self._reset_done(part)}  # fmt: skip
 
     def _apply_actions(self, part: WorldSlice) -> None:
-        """Turn actions into motor targets and wrenches, then run interval events."""
+        """Convert actions to motor targets and wrenches, then run interval events."""
         inputs = [self._action, self._settings, self.parameters.push, self.robot, part.episode, self.delays]
         self._launch(action_kernel, (4, part.count), inputs)
         self._events(part, AT_STEP, self._all)
@@ -179,7 +179,7 @@ class Stages:
             )  # fmt: skip
 
     def _reset_worlds(self, part: WorldSlice, mask: wp.array) -> None:
-        """Begin new episodes in the first skill where mask (num_envs,) is not 0, and sample commands where due."""
+        """Begin new episodes in the first skill where mask (num_envs,) is nonzero, and sample commands where due."""
         self._restore_first_task(part, mask)
         self._randomize(part, mask)
         for skill in self.skills:
@@ -192,12 +192,12 @@ class Stages:
         self._clear_history(part, mask)
 
     def _restore_first_task(self, part: WorldSlice, mask: wp.array) -> None:
-        """Reset worlds to their first skill, without a request, where mask is not 0."""
+        """Reset worlds to their first skill and clear their requests where mask is nonzero."""
         if len(self.skills) > 1:
             self._launch(restore_task_kernel, part.count, [mask, self._home, self.parameters, part.episode])
 
     def _randomize(self, part: WorldSlice, mask: wp.array) -> None:
-        """Run the reset events where mask is not 0; before the first reset, of all worlds, also the startup events."""
+        """Run the reset events where mask is nonzero, and before the very first reset also the startup events."""
         if not self._started:  # all worlds begin
             self._launch(motors_kernel, (12, self.num_envs), [self.parameters])
             self._events(part, STARTUP, self._all)
@@ -205,7 +205,7 @@ class Stages:
         self._events(part, AT_RESET, mask)
 
     def _events(self, part: WorldSlice, stage: int, mask: wp.array) -> None:
-        """Run the events due at a stage (STARTUP, AT_RESET, AT_STEP) where mask is not 0, and update the solver."""
+        """Run the events due at a stage (STARTUP, AT_RESET, AT_STEP) where mask is nonzero, and update the solver."""
         for skill in self.skills:
             slots = enumerate(skill.task.params.slots["events"])
             due = {i: slot for i, slot in slots if slot.term.due_at(stage)}
@@ -221,7 +221,7 @@ class Stages:
                 self.sim.physics.parameters_changed(mask, WorldRange(part.first, part.count))
 
     def _clear_history(self, part: WorldSlice, mask: wp.array) -> None:
-        """Clear actions, contacts, delays and the solver's memory where mask is not 0."""
+        """Clear actions, contacts, delays and the solver's warm start where mask is nonzero."""
         inputs = [part.first, mask, self._scene.geometry, self.robot, self.delays]
         self._launch(clear_history_kernel, (12, part.count), inputs)
         self.sim.physics.after_reset(mask)
@@ -230,7 +230,7 @@ class Stages:
         self._launch(advance_rng_kernel, self.num_envs, [mask, self.episodes])
 
     def _observe(self, part: WorldSlice, after_reset: int) -> None:
-        """Write observations; after_reset 1: only where an episode, skill or command has just begun, not `final`."""
+        """Write observations; after_reset 1: only where an episode, skill or command just began, not `final_obs`."""
         for skill in self.skills:
             arrays = skill.observations
             self._launch(
@@ -244,11 +244,11 @@ class Stages:
     def _launch(
         self, kernel: Kernel, dim: int | tuple[int, ...], inputs: list, block: int = BLOCK, blocks: int = 0
     ) -> None:
-        """Launch a kernel; block: threads of a block; blocks: largest number of blocks on a GPU, 0 for no limit."""
+        """Launch a kernel; block: threads per block; blocks: largest number of blocks on a GPU, 0 for no limit."""
         wp.launch(kernel, dim=dim, inputs=inputs, device=self.wp_device, block_dim=block, max_blocks=blocks)
 
     def _set_commands(self, mask: wp.array, begins: int, values: np.ndarray, headings: wp.array) -> None:
-        """Set commands (num_envs, 4) where mask is not 0; begins 1: of new episodes with headings [rad]."""
+        """Set commands (num_envs, 4) where mask is nonzero; begins 1: of new episodes with headings [rad]."""
         commands = wp.array(values, dtype=wp.vec4, device=self.wp_device)
         for skill in self.skills:
             self._launch(

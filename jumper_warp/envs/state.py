@@ -1,4 +1,4 @@
-"""Save and restore, bitwise, everything that the next step of an environment depends on."""
+"""Save and restore the complete state of an environment, so that later steps are bitwise the same."""
 
 from __future__ import annotations
 
@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     from jumper_warp.envs.stages import Stages
 
 CONSTANT = ("gravity", "default_angle", "paw_shapes")
-"""Arrays of the kernels' structs that are not saved because they never change, like those named `nominal_*`."""
+"""Arrays of the kernels' structs that are not saved because they are constant, like those named `nominal_*`."""
 MOTORS = ("kp", "kd", "saturation", "peak", "no_load_speed", "cutoff_speed", "offset")
-"""Saved arrays of the simulation's motors."""
+"""Names of the saved arrays of the simulation's motors."""
 FINGERPRINT = "nominal"  # Key of the nominal parameters' fingerprint
 SEED = "seed"  # Key of the seed (`purpose_seed`)
 
 
 def save_state(env: Stages) -> dict[str, torch.Tensor]:
-    """Return everything that the next step depends on, as CPU tensors by name (waits for the device).
+    """Return the complete state of an environment as CPU tensors by name (waits for the device).
 
     Keys: "struct.field" of the kernels' arrays, "task/name" and "task.field" of each task, `nominal` and `seed`.
     Nominal parameters are saved as a fingerprint only, numbers of terms only if `Env.set` changed them, counters never.
@@ -44,7 +44,7 @@ def save_state(env: Stages) -> dict[str, torch.Tensor]:
 
 
 def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
-    """Restore a state of `save_state`, so that the next step is the one that followed it.
+    """Restore a state of `save_state`, so that the following steps are bitwise the same.
 
     Raises InputError (a ValueError), and changes nothing: another num_envs, task, solver, robot, seed or version.
     """
@@ -56,11 +56,11 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     if names != state.keys():
         raise InputError(
             f"saved by another version, task or solver: lacks {sorted(names - state.keys())[:5]}, "
-            f"has {sorted(state.keys() - names)[:5]} besides"
+            f"has unknown {sorted(state.keys() - names)[:5]}"
         )
     done = state["env.done"]
     if isinstance(done, torch.Tensor) and done.dim() == 1 and len(done) != env.num_envs:
-        raise InputError(f"saved for {len(done)} environments, there are {env.num_envs}")
+        raise InputError(f"saved with num_envs {len(done)}, this environment has {env.num_envs}")
     for skill in env.skills:
         name = skill.task.name
         timer, changed = state[f"{name}/timer"], state[f"{name}/changed"]
@@ -69,7 +69,7 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
         if isinstance(changed, torch.Tensor) and changed.dim() == 1 and len(changed) != skill.params.changed.shape[0]:
             raise InputError(f"saved with other terms of {name}")
         if isinstance(changed, torch.Tensor) and bool((changed.isnan() | changed.isneginf()).any()):
-            raise InputError(f"saved {name}/changed is not a number")
+            raise InputError(f"saved {name}/changed contains NaN")
     for name, tensor in tensors.items():
         check_tensor(state[name], tensor, f"saved {name}")
     for field, (prefix, name) in fields.items():
@@ -81,7 +81,7 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
     seed = purpose_seed(env.stream, env.seed)
     check_tensor(state[SEED], torch.tensor(seed), f"saved {SEED}")
     if int(state[SEED]) != seed:
-        raise InputError(f"saved with seed {int(state[SEED])}, this environment draws with seed {seed}")
+        raise InputError(f"saved with seed {int(state[SEED])}, this environment has seed {seed}")
     for field, (prefix, name) in fields.items():
         saved[prefix][name] = state[field].numpy()
     for prefix, array in _records(env).items():
@@ -92,7 +92,7 @@ def load_state(env: Stages, state: dict[str, torch.Tensor]) -> None:
 
 
 def _check_indices(env: Stages, state: dict[str, torch.Tensor]) -> None:
-    """Raise InputError where a saved index (level, skill, step count, latency) is out of bounds."""
+    """Raise InputError if a saved index (level, skill, step count, latency) is out of bounds."""
     longest = (RING - 2) * env.sim.substeps  # [physics steps] latency that the ring buffers can hold
     bounds = {
         "env.level": (0, max(len(skill.task.levels) for skill in env.skills)),
@@ -117,7 +117,7 @@ def nominal_fingerprint(env: Stages) -> torch.Tensor:
 
 
 def _records(env: Stages) -> dict[str, wp.array]:
-    """Return the environment's arrays of structs (task states, blocks if any) by the prefix of their fields' keys."""
+    """Return the environment's arrays of structs (task states, any blocks) by the prefix of their fields' keys."""
     blocks = env.sim.physics.dynamics.robot.ground.blocks
     states = {f"{skill.task.name}.": skill.states for skill in env.skills}
     return states | ({"block.": blocks} if blocks.shape[0] else {})

@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 
 RAW_LIMIT = 100.0
-"""Raw observations are clamped to plus and minus this, so that one diverging world cannot spoil the statistics."""
+"""Bound to which raw observations are clamped, so that one diverging world cannot spoil the statistics."""
 
 
 class VecEnv(Protocol):
@@ -25,19 +25,19 @@ class VecEnv(Protocol):
     device: torch.device
     """Device of all tensors, the action included."""
     obs: torch.Tensor
-    """(num_envs, num_obs) float32, the actor's observation; of the new episode where one has ended."""
+    """Observation of the actor, (num_envs, num_obs) float32; of the new episode where one has ended."""
     critic_obs: torch.Tensor
-    """(num_envs, num_critic_obs) float32, the critic's observation; of the new episode where one has ended."""
+    """Observation of the critic, (num_envs, num_critic_obs) float32; of the new episode where one has ended."""
     reward: torch.Tensor
-    """(num_envs,) float32, of the last step."""
+    """Reward of the last step, (num_envs,) float32."""
     done: torch.Tensor
-    """(num_envs,) float32, 1 where the last step ended the episode, else 0."""
+    """Whether the last step ended the episode, (num_envs,) float32, 1 or 0."""
     timeout: torch.Tensor
-    """(num_envs,) float32, 1 where it ended without failure, so that the final state's value is bootstrapped."""
+    """Whether an episode ended without failure and its last value is bootstrapped, (num_envs,) float32, 1 or 0."""
     final_obs: torch.Tensor
-    """(num_envs, num_obs) float32, the actor's observation before resets."""
+    """Observation of the actor before resets, (num_envs, num_obs) float32."""
     final_critic_obs: torch.Tensor
-    """(num_envs, num_critic_obs) float32, the critic's observation before resets."""
+    """Observation of the critic before resets, (num_envs, num_critic_obs) float32."""
 
     def reset(self) -> Any:
         """Begin a new episode in all worlds, and write its first `obs` and `critic_obs`; the return value is unused."""
@@ -53,15 +53,15 @@ class VecEnv(Protocol):
         ...
 
     def config(self) -> dict[str, Any]:
-        """Return all settings that define the environment, ready for JSON."""
+        """Return all settings that define the environment as JSON data."""
         ...
 
     def state_dict(self) -> dict[str, Any]:
-        """Return everything that the next step depends on, as tensors that later steps do not change."""
+        """Return the complete state that the next step depends on, as tensors that later steps do not change."""
         ...
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore a state of `state_dict`; the next step, without a `reset`, is the one that followed it.
+        """Restore a state of `state_dict`, so that the following steps, without a `reset`, are the same.
 
         Raises ValueError: the state does not fit this environment.
         """
@@ -69,7 +69,7 @@ class VecEnv(Protocol):
 
 @runtime_checkable
 class MirroredVecEnv(Protocol):
-    """Additional method that PPO needs to train a left-right symmetric policy."""
+    """Environment with mirror images, which PPO needs to train a left-right symmetric policy."""
 
     def mirror(self, what: str) -> tuple[Sequence[int], Sequence[float]]:
         """Return (order, signs) of the mirror image `signs * x[order]` of an "observation" or an "action" x.
@@ -80,28 +80,28 @@ class MirroredVecEnv(Protocol):
 
 
 class DifferentiableVecEnv(VecEnv, Protocol):
-    """Environment for SHAC: observations and rewards with derivatives with respect to earlier actions of a window.
+    """Environment for SHAC: observations and rewards are differentiable with respect to earlier actions of a window.
 
     Values are those of `obs`, `critic_obs`, `final_obs`, `final_critic_obs` and `reward`; returned tensors are new in
     every call.
     """
 
     def begin_window(self) -> None:
-        """Begin a window: later derivatives do not reach actions before this call."""
+        """Begin a window of differentiation: later derivatives do not reach actions before this call."""
 
     def observe(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return `obs` and `critic_obs` with derivatives, which are 0 where an episode has just begun."""
+        """Return differentiable `obs` and `critic_obs`; derivatives are 0 where an episode has just begun."""
         ...
 
     def observe_final(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return `final_obs` and `final_critic_obs` of the last step with derivatives."""
+        """Return differentiable `final_obs` and `final_critic_obs` of the last step."""
         ...
 
     def step_with_gradient(self, action: torch.Tensor) -> torch.Tensor:
-        """Advance as `step`; return the reward (num_envs,) with derivatives where its terms have any."""
+        """Advance one policy step; return the reward (num_envs,), differentiable where its terms are."""
         ...
 
 
 def sanitise(obs: torch.Tensor, out: torch.Tensor | None = None) -> torch.Tensor:
-    """Return a copy of observations (in `out` if given): non-finite entries are 0, others clamped to ±RAW_LIMIT."""
+    """Return observations (in `out` if given) with non-finite entries set to 0, others clamped to ±RAW_LIMIT."""
     return torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0, out=out).clamp_(-RAW_LIMIT, RAW_LIMIT)

@@ -1,4 +1,4 @@
-"""Commanded turns in free flight: log, metrics, and flags of `jumper evaluate` and `play`."""
+"""Evaluation of commanded turns in free flight: log, metrics, and flags of `jumper evaluate` and `play`."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, me
 
 AXES = ("roll", "pitch", "yaw")
 DIRECTIONS = tuple(f"{axis}_{sign}" for axis in AXES for sign in ("plus", "minus"))
-"""Turns about the body's x, y and z axes: roll_plus, roll_minus, pitch_plus, ...; plus is right-handed."""
+"""Names of turns about the body's x, y and z axes: roll_plus, roll_minus, pitch_plus, ...; plus is right-handed."""
 HARDWARE_TIME = 2.6  # [s] Settling time of the authors' robot for a turn by 90 degrees
 
 
@@ -44,10 +44,10 @@ class AttitudeLog(EvaluationLog):
     tolerance: float = 5.0  # [deg] Largest error of a robot at its goal
     seconds: float = 5.0  # [s] Simulated time of every turn
     errors: list[np.ndarray] = field(default_factory=list, init=False)
-    """[rad] Angle to the goal, one array (num_envs,) per policy step; NaN once the world has diverged."""
+    """Angle to the goal [rad], one array (num_envs,) per policy step; NaN once the world has diverged."""
     angular_speeds: list[np.ndarray] = field(default_factory=list, init=False)
-    """[rad/s] Angular speed of the base, one array (num_envs,) per policy step; NaN once the world has diverged."""
-    collided: np.ndarray = field(init=False)  # (num_envs,) Whether a link but the paws touched ground, or links touched
+    """Angular speed of the base [rad/s], one array (num_envs,) per policy step; NaN once the world has diverged."""
+    collided: np.ndarray = field(init=False)  # (num_envs,) Whether a link other than a paw, or two links, touched
     diverged: np.ndarray = field(init=False)  # (num_envs,) Whether the simulation diverged
 
     row_name = "turn"
@@ -77,42 +77,42 @@ class AttitudeLog(EvaluationLog):
 
     @property
     def angle(self) -> np.ndarray:
-        """[rad] (num_envs,) Commanded angle."""
+        """Commanded angle of each turn [rad], (num_envs,)."""
         return 2.0 * np.arctan2(np.linalg.norm(self.turns[:, :3], axis=1), np.abs(self.turns[:, 3]))
 
     @property
     def error(self) -> np.ndarray:
-        """[rad] (num_envs,) Angle to the goal at the end."""
+        """Angle to the goal at the end [rad], (num_envs,)."""
         return self.errors[-1]
 
     @property
     def first_time(self) -> np.ndarray:
-        """[s] (num_envs,) Time at which the error first was within `tolerance`; NaN if it never was."""
+        """Time at which the error first was within `tolerance` [s], (num_envs,); NaN if it never was."""
         inside = np.array(self.errors) <= np.radians(self.tolerance)
         return np.where(inside.any(axis=0), (inside.argmax(axis=0) + 1) * self.step_dt, np.nan)
 
     @property
     def settling_time(self) -> np.ndarray:
-        """[s] (num_envs,) Time from which the error stayed within `tolerance`; NaN if it was larger at the end."""
+        """Settling time, from which the error stayed within `tolerance` [s], (num_envs,); NaN if larger at the end."""
         inside = np.array(self.errors) <= np.radians(self.tolerance)
         outside = np.where((~inside).any(axis=0), len(inside) - (~inside)[::-1].argmax(axis=0), 0)
         return np.where(inside[-1], (outside + 1) * self.step_dt, np.nan)
 
     @property
     def success(self) -> np.ndarray:
-        """(num_envs,) Whether the error was within `tolerance` at the end, without any collision."""
+        """Whether each turn succeeded, (num_envs,): error within `tolerance` at the end, and no collision."""
         return ~np.isnan(self.settling_time) & ~self.collided
 
     @property
     def trials(self) -> dict[str, np.ndarray]:
-        """Sets of turns by name: masks (num_envs,)."""
+        """Sets of turns that metrics refer to, by name: masks (num_envs,)."""
         return {"turns": np.full(self.count, True), "turns that settled": ~np.isnan(self.settling_time),
                 "turns that reached the goal": ~np.isnan(self.first_time),
                 "turns that did not diverge": ~self.diverged}  # fmt: skip
 
     @property
     def outcomes(self) -> np.ndarray:
-        """(num_envs,) Outcome of each turn: SUCCESS, COLLIDED, DIVERGED, or NO_END if not at the goal at the end."""
+        """Outcome of each turn, (num_envs,): SUCCESS, COLLIDED, DIVERGED, or NO_END if not at the goal at the end."""
         ends = np.where(self.success, SUCCESS, np.where(self.collided, COLLIDED, NO_END))
         return np.where(self.diverged, DIVERGED, ends)
 
@@ -123,7 +123,7 @@ class AttitudeLog(EvaluationLog):
         return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the last angle to the goal [deg] and angular speed [rad/s] of some worlds, 0 in place of NaN."""
+        """Return the current angle to the goal [deg] and angular speed [rad/s] of some worlds; NaN is replaced by 0."""
         series = {}
         for name, world in zip(self.names(worlds), worlds, strict=True):
             series[f"error/angle to goal, {name} [deg]"] = float(np.degrees(np.nan_to_num(self.errors[-1][world])))
@@ -146,16 +146,16 @@ TURN_METRICS = (
     Metric("collision_rate", rate, "turns", lambda o: o.collided),
     Metric("diverged_rate", rate, "turns", lambda o: o.diverged),
 )
-"""Metrics of turns; a turn has settled if it is within the tolerance from some time to the end."""
+"""Table of the metrics of turns; a turn has settled if its error stays within the tolerance until the end."""
 
 
 def turn_metrics(turns: AttitudeLog, prefix: str = "", note: str = "") -> Metrics:
-    """Return TURN_METRICS of turns; prefix, note: as for `measure`."""
+    """Return the metrics TURN_METRICS of a log of turns; prefix, note: see `measure`."""
     return measure(TURN_METRICS, turns, None, prefix, note)
 
 
 def axis_metrics(turns: AttitudeLog) -> Metrics:
-    """Return three of TURN_METRICS for each of DIRECTIONS, as `<direction>_<key>`; turns: of `axis_turns`."""
+    """Return three of TURN_METRICS for each of DIRECTIONS, as `<direction>_<key>`; turns: log of `axis_turns`."""
     rows = chosen(TURN_METRICS, "settling_time_mean_s", "settled_without_collision_rate", "error_at_end_mean_deg")
     number, metrics = np.arange(turns.count) % len(DIRECTIONS), {}
     for i, name in enumerate(DIRECTIONS):
@@ -165,11 +165,11 @@ def axis_metrics(turns: AttitudeLog) -> Metrics:
 
 @dataclass(frozen=True)
 class AttitudeFlags:
-    """Turns about the body's axes, each way, from rest in the default pose."""
+    """Flags of turns about the body's axes, in both directions, from rest in the default pose."""
 
     num_turns: int = 60  # Number of turns
     angle: float = 90.0  # [deg] Angle of every turn
-    tolerance: float = 5.0  # [deg] Error up to which a robot is at its goal
+    tolerance: float = 5.0  # [deg] Largest error of a robot that has reached its goal
     seconds: float = 5.0  # [s] Length of every turn's episode
 
     def __post_init__(self) -> None:
@@ -191,7 +191,7 @@ class AttitudeFlags:
 
 @dataclass(frozen=True)
 class AttitudePlayFlags:
-    """Turns that are recorded, about the body's axes, each way."""
+    """Flags of recorded turns about the body's axes, in both directions."""
 
     angle: float = 90.0  # [deg] Angle of every turn
 

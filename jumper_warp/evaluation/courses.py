@@ -1,8 +1,8 @@
-"""Courses: one robot per world executes a script of walks and jumps by switching between skills.
+"""Evaluation of courses: one robot per world executes a script of walks and jumps by switching between skills.
 
 Before a jump the robot is commanded to stand, and the jump is requested with its goal. The jump skill takes over once
-the robot is at rest, and returns control to walking (`kernels.skills.handovers`). A robot that does not come to rest
-walks a few steps. Commanded velocities change at a limited rate.
+the robot is at rest, and later returns control to walking (`kernels.skills.handovers`). A robot that does not come to
+rest walks a few steps. Commanded velocities change at a limited rate.
 """
 
 from __future__ import annotations
@@ -16,7 +16,6 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.evaluation.log import EvaluationLog, ended_by, finite, outcome_names
-from jumper_warp.evaluation.plots import figure
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.evaluation.velocities import (
     AXES,
@@ -32,6 +31,7 @@ from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.tasks.switching import FALLS
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, largest, mean, rate, rmse
+from jumper_warp.viz.plots import figure
 from jumper_warp.viz.style import ACTUAL_COLOR
 
 SKILLS = {
@@ -42,9 +42,9 @@ SKILLS = {
     "jump_onto": JUMP_TO,
 }  # By kind of command
 BLOCK = BlockCfg(center=(1.0e3, 1.0e3), half=(0.55, 0.55), height=0.05, mass=10.0, friction=0.4)
-"""Block to jump onto: initially 1 km away on both axes, moved under the goal when the jump skill takes over."""
+"""Block to jump onto, initially 1 km away on both axes; it is moved under the goal when the jump skill takes over."""
 SQUAT_TIME = 0.5  # [s] Time from the jump skill's takeover, when it squats, to its command
-NUDGE_AFTER, NUDGE_TIME = (2.0, 0.5)  # [s] Period at which a robot that waits for its jump walks a few steps; its time
+NUDGE_AFTER, NUDGE_TIME = (2.0, 0.5)  # [s] Period and duration of the steps of a robot that waits for its jump
 NUDGE = (0.25, 0.0, 0.0)  # [m/s], [rad/s] Commanded velocity of these steps
 JUMP_TIMEOUT = 15.0  # [s] Time after its request at which an unfinished jump has failed
 STUCK, DONE = len(FALLS), len(FALLS) + 1  # Indices in OUTCOMES; smaller ones are falls
@@ -65,10 +65,10 @@ class CourseLog(EvaluationLog):
     spacing = 2.0
 
     def __post_init__(self) -> None:
-        """Start with no command finished. Raises InputError: scripts of different lengths, or empty."""
+        """Allocate the log. Raises InputError: scripts are empty or of different lengths."""
         lengths = {len(script) for script in self.scripts}
         if len(lengths) != 1 or 0 in lengths:
-            raise InputError(f"a course needs scripts of one length, got {sorted(lengths)} commands")
+            raise InputError(f"scripts must have equal, positive lengths, got {sorted(lengths)} commands")
         n, k = shape = len(self.scripts), lengths.pop()
         # (robots, commands) each: whether the command is jump_onto, its skill, goal (..., 3) and time [s]
         self.onto_block = np.array([[step.kind == "jump_onto" for step in script] for script in self.scripts])
@@ -76,8 +76,8 @@ class CourseLog(EvaluationLog):
         self.goal = np.array([[step.goal for step in script] for script in self.scripts])
         self.durations = np.array([[step.seconds for step in script] for script in self.scripts])
         self.count, self.step_dt = n, 1.0 / 60.0
-        self.end = np.full(n, -1)  # (robots,) index in OUTCOMES, -1 while under way
-        self.current = np.zeros(n, dtype=int)  # (robots,) index of the command under way
+        self.end = np.full(n, -1)  # (robots,) index in OUTCOMES, -1 until the end
+        self.current = np.zeros(n, dtype=int)  # (robots,) index of the current command
         self.start_step = np.full(shape, -1)  # (robots, commands) policy step in which a command began, or -1
         self.start_step[:, 0] = 0
         self.switch_step = np.full(shape, -1)  # (robots, commands) policy step in which the jump skill took over
@@ -97,12 +97,12 @@ class CourseLog(EvaluationLog):
 
     @property
     def block(self) -> BlockCfg | None:
-        """Argument `block` of `Env` for these scripts: BLOCK if any command is a jump onto it, else None."""
+        """Block of these scripts for `Env(block=...)`: BLOCK if any command is a jump onto it, else None."""
         return BLOCK if self.onto_block.any() else None
 
     @property
     def seconds(self) -> float:
-        """[s] Maximum simulated time."""
+        """Maximum simulated time [s]."""
         return float((self.durations.sum(axis=1) + JUMP_TIMEOUT * (self.target_skill != WALK).sum(axis=1)).max()) + 1.0
 
     def begin(self, env: Any) -> None:
@@ -117,7 +117,7 @@ class CourseLog(EvaluationLog):
         """Return arrays (robots, ...) by name: base state, active skill, termination, paw forces [N], `jump_` state.
 
         Base position [m], quaternion (xyzw), velocity [m/s] and angular velocity [rad/s] are in world axes. `jump_`
-        arrays are fields of the jump skill of the present command, of JUMP_UP while it walks.
+        arrays are fields of the current command's jump skill, or of JUMP_UP while the robot walks.
         """
         q, qd = env.sim.joint_q(), env.sim.joint_qd()
         arrays = {
@@ -165,7 +165,7 @@ class CourseLog(EvaluationLog):
             env.sim.solver.place_blocks(goals, begins.tolist())
 
     def _request_jumps(self, env: Any, worlds: np.ndarray) -> None:
-        """Request the jump of every robot in `worlds`, (robots,) bool, whose present command is a jump."""
+        """Request the jump of every robot in `worlds`, (robots,) bool, whose current command is a jump."""
         rows, at = np.arange(len(worlds)), np.minimum(self.current, self.target_skill.shape[1] - 1)
         for skill in (JUMP_UP, JUMP_TO):
             requested = worlds & (self.target_skill[rows, at] == skill)
@@ -217,10 +217,10 @@ class CourseLog(EvaluationLog):
     def _append_history(
         self, arrays: dict[str, np.ndarray], running: np.ndarray, previous: np.ndarray, step: int
     ) -> None:
-        """Append a policy step to the histories.
+        """Append a policy step to the recorded histories.
 
-        arrays: of `read_env`; running: (robots,) whether the course had not ended; previous: (robots,) skill that was
-        active in the step; step: its number, from 1.
+        arrays: those of `read_env`; running: (robots,) whether the course had not ended; previous: (robots,) skill
+        that was active in the step; step: its number, from 1.
         """
         rows = np.arange(len(running))
         at = np.minimum(self.current, self.target_skill.shape[1] - 1)
@@ -235,27 +235,27 @@ class CourseLog(EvaluationLog):
 
     @property
     def fallen(self) -> np.ndarray:
-        """(robots,) Whether each robot fell."""
+        """Whether each robot fell, (robots,)."""
         return (self.end >= 0) & (self.end < STUCK)
 
     @property
     def outcomes(self) -> np.ndarray:
-        """(robots,) Outcome of each robot's course, one of OUTCOMES or "under_way"."""
+        """Outcome of each robot's course, (robots,): one of OUTCOMES or "under_way"."""
         return np.array([*OUTCOMES, "under_way"])[self.end]
 
     @property
     def apex_error(self) -> np.ndarray:
-        """[m] (robots, commands) Apex minus commanded height; NaN unless the command is a finished jump up."""
+        """Apex minus commanded height [m], (robots, commands); NaN unless the command is a finished jump up."""
         return np.where(self.target_skill == JUMP_UP, self.apex - self.goal[..., 2], np.nan)
 
     @property
     def landing_error(self) -> np.ndarray:
-        """[m] (robots, commands) Distance of the base from the goal when walking takes over; NaN for other commands."""
+        """Distance from base to goal when walking takes over [m], (robots, commands); NaN unless a jump to a place."""
         return np.where(self.target_skill == JUMP_TO, np.linalg.norm(self.offset, axis=-1), np.nan)
 
     @property
     def on_goal(self) -> np.ndarray:
-        """(robots, commands) Whether a command finished, and, if a jump, within GOAL_TOLERANCE of its goal."""
+        """Whether each command finished, jumps within GOAL_TOLERANCE of their goal, (robots, commands)."""
         error = np.where(self.target_skill == JUMP_UP, np.abs(self.apex_error), self.landing_error)
         near = np.nan_to_num(error, nan=np.inf) <= GOAL_TOLERANCE
         return (self.finish_step >= 0) & ((self.target_skill == WALK) | near)
@@ -273,7 +273,7 @@ class CourseLog(EvaluationLog):
         return done | {name: finite(values) for name, values in worst.items()}
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the last velocity, command and base height [m] of some robots."""
+        """Return the current velocity, command and base height [m] of some robots."""
         rows, names = list(worlds), self.names(worlds)
         series = velocity_series(self.velocity[-1][rows], self.velocity_commands(worlds), names)
         return series | {
@@ -286,7 +286,7 @@ class CourseLog(EvaluationLog):
         return {f"skill/{name}": NAMES[skill] for name, skill in zip(self.names(worlds), skills, strict=True)}
 
     def velocity_commands(self, worlds: Sequence[int]) -> np.ndarray:
-        """Return the last commands of some robots, (worlds, 3), 0 while a robot does not walk."""
+        """Return the current commands of some robots, (worlds, 3), 0 while a robot does not walk."""
         return np.nan_to_num(self.commands[-1][list(worlds)])
 
     def goal_markers(self, worlds: Sequence[int]) -> np.ndarray:
@@ -305,9 +305,9 @@ def _row_max(values: np.ndarray) -> np.ndarray:
 
 
 def course_metrics(course: CourseLog) -> Metrics:
-    """Return the metrics of all robots together.
+    """Return the metrics of a course over all robots.
 
-    `finished_rate` is the fraction of robots that finished every command without a fall, whatever their errors;
+    `finished_rate` is the fraction of robots that finished every command without a fall; it ignores errors.
     `finished_on_goal_rate` also requires all jumps within 0.1 m of their goals. Tracking errors are those of slewed
     commands, without the first second after each.
     """
@@ -359,14 +359,14 @@ def handover_forces(course: CourseLog) -> tuple[np.ndarray, np.ndarray]:
 
 
 def active_spans(course: CourseLog, world: int) -> list[tuple[int, float, float]]:
-    """Return a robot's successive active skills as tuples: skill (WALK, JUMP_UP, JUMP_TO), beginning and end [s]."""
+    """Return the sequence of a robot's active skills: tuples of skill (WALK, JUMP_UP, JUMP_TO), begin and end [s]."""
     skills = np.array(course.skills)[:, world]
     edges = [0, *(np.flatnonzero(np.diff(skills)) + 1).tolist(), len(skills)]
     return [(int(skills[a]), a * course.step_dt, b * course.step_dt) for a, b in pairwise(edges)]
 
 
 def plot_course(path: Path, course: CourseLog, world: int, conditions: str = "") -> None:
-    """Plot velocities with commands, and base height, of one robot (its world's index) over time; jumps are shaded."""
+    """Plot a robot's velocities with commands, and base height, over time; jumps are shaded; world: its index."""
     settings = {"figsize": (10.0, 9.0), "sharex": True, "title": "Walk and jump", "conditions": conditions}
     with figure(path, 4, 1, **settings) as axes:
         time = course.step_dt * np.arange(1, len(course.skills) + 1)

@@ -1,4 +1,4 @@
-"""Episodes of any task: log and metrics of length, termination and base position."""
+"""Evaluation of any task by single episodes: log and metrics of length, termination and base position."""
 
 from __future__ import annotations
 
@@ -59,21 +59,21 @@ class EpisodeLog(EvaluationLog):
 
     @property
     def mean_height(self) -> np.ndarray:
-        """[m] (num_envs,) Mean base height over the episode, NaN before the first step."""
+        """Mean base height over the episode [m], (num_envs,); NaN before the first step."""
         return np.where(self._steps > 0, self._height_sum / np.maximum(self._steps, 1), np.nan)
 
     @property
     def displacement(self) -> np.ndarray:
-        """[m] (num_envs, 2) Horizontal displacement of the base from start to end, world frame."""
+        """Horizontal displacement of the base from start to end [m], world frame, (num_envs, 2)."""
         return (self.end_position - self.start_position)[:, :2]
 
     @property
     def outcomes(self) -> np.ndarray:
-        """(num_envs,) Name of the termination of each episode, NO_END if it still runs."""
+        """Name of the termination of each episode, (num_envs,); NO_END if it has not ended."""
         return outcome_names([term.name for term in self.task.terminations], NO_END)[self.end]
 
     def ended_with(self, option: str) -> np.ndarray:
-        """Return which episodes ended by a termination with the option `success` or `time_out`, (num_envs,) bool."""
+        """Return whether each episode ended by a termination with an option, `success` or `time_out`, (num_envs,)."""
         return np.array([*(bool(term.options[option]) for term in self.task.terminations), False])[self.end]
 
     def columns(self) -> dict[str, list]:
@@ -84,7 +84,7 @@ class EpisodeLog(EvaluationLog):
         return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the present base height and horizontal distance from the start [m] of some worlds."""
+        """Return the current base height and horizontal distance from the start [m] of some worlds."""
         series, pos = {}, self.arrays["base_pos"]
         for name, world in zip(self.names(worlds), worlds, strict=True):
             series[f"height/base, {name} [m]"] = pos[world, 2]
@@ -97,7 +97,7 @@ class EpisodeLog(EvaluationLog):
 
 
 def episode_metrics(episodes: EpisodeLog) -> Metrics:
-    """Return rates and means over all episodes; `ended_by_<outcome>_rate` is the rate of a termination."""
+    """Return the metrics of a log of episodes; `ended_by_<outcome>_rate` is the rate of a termination."""
     running, over = episodes.end < 0, "episodes"
     success, timed_out = episodes.ended_with("success"), episodes.ended_with("time_out")
     displacement, distance = episodes.displacement, np.linalg.norm(episodes.displacement, axis=1)
@@ -125,24 +125,24 @@ def check_episodes(count: int, command: tuple[float, ...], seconds: float) -> No
 
 
 def tile_command(command: tuple[float, ...], count: int, task: TaskCfg) -> np.ndarray:
-    """Return the command for `count` worlds, (count, n), padded with zeros to the size n of the task's command."""
+    """Repeat a command for `count` worlds, padded with zeros to the size n of the task's command: (count, n)."""
     missing = max(layout_of(task).counts[-1] - len(command), 0)
     return np.tile(np.pad(np.array(command, dtype=float), (0, missing)), (count, 1))
 
 
 @dataclass(frozen=True)
 class EpisodeFlags:
-    """Episodes from standing still."""
+    """Flags of episodes that start at rest in the default pose."""
 
     num_episodes: int = 200  # Number of episodes
     command: tuple[float, ...] = ()  # Up to four values of the task's command; omitted ones are 0
-    seconds: float = 10.0  # [s] Largest length of an episode
+    seconds: float = 10.0  # [s] Maximum length of an episode
 
     def __post_init__(self) -> None:
         check_episodes(self.num_episodes, self.command, self.seconds)
 
     def log(self, task: TaskCfg, seed: int) -> EpisodeLog:
-        """Return the log of episodes that all have this command; seed has no effect."""
+        """Return a new log of episodes with the flags' command in all worlds; seed has no effect."""
         return EpisodeLog(tile_command(self.command, self.num_episodes, task), task, self.seconds)
 
     def metrics(self, log: EpisodeLog) -> Metrics:
@@ -152,7 +152,7 @@ class EpisodeFlags:
 
 @dataclass(frozen=True)
 class EpisodePlayFlags:
-    """An episode that is recorded."""
+    """Flags of a recorded episode."""
 
     command: tuple[float, ...] = ()  # Up to four values of the task's command; omitted ones are 0
 

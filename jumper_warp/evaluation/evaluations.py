@@ -1,4 +1,4 @@
-"""Table EVALUATIONS: flags, terminations and metrics of `jumper evaluate`, by `TaskCfg.evaluation_suite`."""
+"""Table EVALUATIONS of the evaluations of tasks (flags, terminations, metrics), by `TaskCfg.evaluation_suite`."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ from jumper_warp.utils.metrics import Metrics
 
 
 class EvaluationFlags(Protocol):
-    """Flags of `jumper evaluate` for a kind of task; a frozen dataclass."""
+    """Protocol of the flags of `jumper evaluate` for a kind of task; a frozen dataclass."""
 
     def log(self, task: TaskCfg, seed: int) -> EvaluationLog:
-        """Return a new log with the commands of all worlds; seed: of sampled commands."""
+        """Return a new log with the commands of all worlds; seed: seed of sampled commands."""
         ...
 
     def metrics(self, log: Any) -> Metrics:
@@ -32,11 +32,11 @@ class EvaluationFlags(Protocol):
 
 
 class PlayFlags(Protocol):
-    """Flags of `jumper play` for a kind of task; a frozen dataclass."""
+    """Protocol of the flags of `jumper play` for a kind of task; a frozen dataclass."""
 
     @property
     def length(self) -> float:
-        """[s] Default length of the recording."""
+        """Default length of the recording [s]."""
         ...
 
     def log(self, task: TaskCfg) -> EvaluationLog:
@@ -79,12 +79,12 @@ EVALUATIONS: dict[str, Evaluation] = {
     "attitude": Evaluation(AttitudeFlags(), AttitudePlayFlags()),
     "episode": Evaluation(EpisodeFlags(), EpisodePlayFlags()),
 }  # fmt: skip
-"""Evaluations by key; a user's module may add entries."""
+"""Evaluations of tasks by name; a user's module may add entries."""
 
 
 def evaluation_of(task: TaskCfg) -> Evaluation:
     """Return the evaluation of a task. Raises PolicyError: EVALUATIONS lacks its `evaluation_suite`."""
     if task.evaluation_suite not in EVALUATIONS:
-        known = f"there are {[*EVALUATIONS]}"
-        raise PolicyError(f"{task.name} asks for the evaluation {task.evaluation_suite!r:.60}; {known}")
+        known = f"known are {[*EVALUATIONS]}"
+        raise PolicyError(f"{task.name}: unknown evaluation_suite {task.evaluation_suite!r:.60}; {known}")
     return EVALUATIONS[task.evaluation_suite]

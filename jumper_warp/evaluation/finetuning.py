@@ -1,7 +1,7 @@
 """Fine-tuning of a jumping policy: Gauss-Newton on the errors of apex heights or landing positions.
 
-Nominal and randomised robots jump, and a trust region keeps the actions near those of the original policy. For landing
-positions the aim is corrected first: the observed goal is shifted by the mean error.
+Errors are those of nominal and of randomised robots. A trust region keeps the actions near those of the original
+policy. For landing positions the aim is corrected first: the observed goal is shifted by the mean error.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.runtime import git_commit
 from jumper_warp.utils.streams import purpose_seed
 
-AHEAD = "goal_x"  # Observation of jumps to landing positions: distance to the goal ahead [m]
+AHEAD = "goal_x"  # Name of the observed distance to the goal ahead [m] in jumps to landing positions
 DELAYS = (0.3, 0.7)  # [s] Range of the time until jumps are commanded
 TRUST_REGION_SECONDS = 3.5  # [s] Length of the episodes whose observations are sampled
 TRUST_REGION_SAMPLES = 4096  # Maximum number of these samples
@@ -41,29 +41,29 @@ AIM_ROUNDS = 3  # Maximum number of corrections of the aim
 
 @dataclass(frozen=True)
 class FinetuneCfg:
-    """Settings of fine-tuning: numbers of jumps, ranges of goals, standard deviations that weight errors."""
+    """Settings of fine-tuning: numbers of jumps, ranges of goals, and standard deviations that weight errors."""
 
     num_goals: int = 64  # Number of jumps of the nominal robot, spread evenly over the goals
-    num_delayed: int = 32  # Number of jumps of the nominal robot with latencies drawn from the training's range
+    num_delayed: int = 32  # Number of jumps of the nominal robot with latencies sampled from the training's range
     num_randomized: int = 64  # Number of jumps of robots randomised as in the training, with noise, latency and pushes
     height_range: tuple[float, float] = (0.5, 1.075)
-    """[m] Lowest and highest commanded base height, of jumps to heights."""
-    distance_range: tuple[float, float] = (0.3, 1.4)  # [m] Nearest and farthest goal straight ahead, of jumps to places
-    iterations: int = 6  # Gauss-Newton steps; 0 for places: the aim alone
+    """[m] Lowest and highest commanded base height in jumps to heights."""
+    distance_range: tuple[float, float] = (0.3, 1.4)  # [m] Nearest and farthest goal ahead in jumps to positions
+    iterations: int = 6  # Number of Gauss-Newton steps; 0, for landing positions only: correct the aim alone
     miss_std: float = 0.001
-    """[m] Miss of the nominal robot that costs as much as a change of the actions by --action-std."""
-    delayed_std: float = 0.003  # [m] Miss with latencies that costs as much
-    randomized_std: float = 0.01  # [m] Miss of a randomised robot that costs as much
+    """[m] Error of the nominal robot that costs as much as a change of the actions by --action-std."""
+    delayed_std: float = 0.003  # [m] Error of a robot with latency that costs as much as --action-std
+    randomized_std: float = 0.01  # [m] Error of a randomised robot that costs as much as --action-std
     action_std: float = 0.02
-    """[1] Change of the actions against the given policy, root of the sum of squares over the motors."""
-    landing_std: float = 0.005  # [1] Change of the actions after touchdown that costs as much
+    """[1] Standard deviation of the change of the actions, root of the sum of squares over the motors."""
+    landing_std: float = 0.005  # [1] Standard deviation of the change of the actions after touchdown
     seed: int = 0  # Seed of commands, latencies and robots (stream: tuning)
     device: str | None = None  # Warp device (default: a GPU if there is one)
-    threads: int | None = None  # CPU threads that share the worlds (default: all cores); they change no result
+    threads: int | None = None  # CPU threads that share the worlds (default: all cores); results do not depend on it
 
     def __post_init__(self) -> None:
         if self.num_goals < 2 or min(self.num_delayed, self.num_randomized, self.iterations) < 0:
-            raise InputError("fine-tuning needs at least 2 goals, and no negative number of jumps or steps")
+            raise InputError("fine-tuning needs at least 2 goals; numbers of jumps and steps must not be negative")
         for name in ("miss_std", "delayed_std", "randomized_std", "action_std", "landing_std"):
             check_positive(name, getattr(self, name))
         for name in ("height_range", "distance_range"):
@@ -74,16 +74,16 @@ class FinetuneCfg:
 
 @dataclass(frozen=True)
 class FinetuneArgs(FinetuneCfg):
-    """Make a jumping policy miss its heights or places by less, by gradients through physics, motors and network."""
+    """Reduce the errors of a jumping policy, by gradients through physics, motors and network."""
 
     out: Path | None = None  # Folder of the new policy (default: <policy>_finetuned)
-    overwrite: bool = False  # Replace a policy that is there already
+    overwrite: bool = False  # Replace an existing policy in that folder
 
 
 def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] = ()) -> list[JumpGroup]:
-    """Return the groups `nominal`, `late` (with latency) and `randomized` of jumps, without empty ones.
+    """Return the groups of jumps `nominal`, `late` (with latency) and `randomized`, without empty ones.
 
-    Goals are evenly spaced over the range of `cfg`. modules: the user's task modules. Raises InputError: the policy
+    Goals are evenly spaced over the range in `cfg`. modules: the user's task modules. Raises InputError: the policy
     does not jump.
     """
     rng, groups = np.random.default_rng(purpose_seed("tuning", cfg.seed)), []
@@ -111,7 +111,7 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
             env = env_of_policy(policy, count, conditions, change=change_task, modules=modules)
             target = evaluation_of(env.task).finetune_target
             if target is None:
-                raise InputError(f"fine-tuning is for jumps to heights and places, not for {env.task.name}")
+                raise InputError(f"fine-tuning supports jumps to heights and positions, not {env.task.name}")
             goals, to_height = np.zeros((count, 3)), target == "apex"
             low, high = cfg.height_range if to_height else cfg.distance_range
             goals[:, 2 if to_height else 0] = np.linspace(low, high, count)
@@ -121,7 +121,7 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
 
 
 def collect_trust_region_samples(groups: list[JumpGroup], network: Network, cfg: FinetuneCfg) -> Anchor:
-    """Run the network on all groups, and return the trust region around its actions on a sample of observations.
+    """Return the trust region around the network's actions on a sample of observations from all groups.
 
     Observations are sampled from the first TRUST_REGION_SECONDS; after touchdown the allowed change of the actions is
     `cfg.landing_std`, before it `cfg.action_std`.
@@ -146,7 +146,7 @@ def mean_abs_errors(groups: list[JumpGroup], errors: list[JumpErrors]) -> dict[s
 
 
 def shift_goal_observation(policy: Policy, shift: float) -> Policy:
-    """Return a copy of the policy that observes its goals `shift` [m] farther ahead, by a change of its normaliser."""
+    """Return a copy of the policy whose normaliser is changed so that it observes goals `shift` [m] farther ahead."""
     mean = policy.mean.clone()
     mean[policy.interface.observation_names.index(AHEAD)] -= shift
     return Policy(policy.layers, mean, policy.std, policy.interface, policy.config)
@@ -155,7 +155,7 @@ def shift_goal_observation(policy: Policy, shift: float) -> Policy:
 def correct_aim(
     policy: Policy, groups: list[JumpGroup], log: Callable[[str], object]
 ) -> tuple[Policy, list[dict[str, dict[str, float]]]]:
-    """Return the policy with corrected aim at goals straight ahead, and the errors [m] before it and of each round.
+    """Correct a policy's aim at goals straight ahead; return the policy, and the errors [m] initially and per round.
 
     Every round subtracts the weighted mean error from the observed goal; a round that does not lower the cost is undone
     and ends the correction. A factor on the goal would have little effect: the observed distance is short at landing.
@@ -172,7 +172,7 @@ def correct_aim(
         means = {"ahead": {name: float(value.mean()) for name, value in ahead.items()}}
         means["mean_abs_miss_m"] = mean_abs_errors(groups, errors)
         words = ", ".join(f"{name} {1000.0 * miss:+.2f} mm" for name, miss in means["ahead"].items())
-        log(f"aim: cost {cost:.4g}, robots end ahead of their goals by {words}")
+        log(f"aim: cost {cost:.4g}, mean error ahead {words}")
         return cost, errors, means
 
     cost, errors, means = measure(policy)
@@ -193,7 +193,7 @@ def correct_aim(
 def tune_weights(
     groups: list[JumpGroup], network: Network, cfg: FinetuneCfg, log: Callable[[str], object], begin: float
 ) -> list[dict[str, Any]]:
-    """Take Gauss-Newton steps on the network's weights in place; return one dict before them and one after each step.
+    """Take Gauss-Newton steps on the network's weights in place; return one record before them and one per step.
 
     Keys: step, mean_abs_miss_m (by group [m]), cost, action_change (RMS [1]), seconds since `begin`, a value of
     `time.perf_counter`. A step that does not lower the cost is undone. log: prints a line of progress.
@@ -201,7 +201,7 @@ def tune_weights(
     anchor = collect_trust_region_samples(groups, network, cfg)
 
     def measure(derivatives: bool) -> tuple[float, list[JumpErrors]]:
-        """Run the jumps with the present weights; return the cost [1] with that of the trust region, and the errors."""
+        """Run the jumps with the current weights; return the cost [1], trust region included, and the errors."""
         errors = [jump_errors(group, network, derivatives=derivatives) for group in groups]
         pairs = zip(groups, errors, strict=True)
         total = sum(float((0.5 * group.importance(e) * e.value.square()).sum()) for group, e in pairs)
@@ -214,7 +214,7 @@ def tune_weights(
                "action_change": anchor.change(network.weights), "seconds": time.perf_counter() - begin}  # fmt: skip
         history.append(row)
         words = ", ".join(f"{name} {1000.0 * miss:.2f} mm" for name, miss in row["mean_abs_miss_m"].items())
-        log(f"step {step}: cost {cost:.4g}, {words}, actions moved {row['action_change']:.4f}, {row['seconds']:.0f} s")
+        log(f"step {step}: cost {cost:.4g}, {words}, action change {row['action_change']:.4f}, {row['seconds']:.0f} s")
         if step == cfg.iterations:
             break
         previous = network.weights
@@ -232,7 +232,7 @@ def tune_weights(
 def finetune(
     policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] = (), log: Callable[[str], object] = print
 ) -> tuple[Policy, dict]:
-    """Return the fine-tuned policy and its record: `settings`, `aims` (`correct_aim`), `steps` (`tune_weights`).
+    """Fine-tune a policy; return the new policy and a record: `settings`, `aims` (`correct_aim`), `steps`.
 
     modules: the user's task modules; log: prints a line of progress. Raises InputError as `ClosedLoop` and
     `make_groups`, and for a policy for heights without iterations.
@@ -243,7 +243,7 @@ def finetune(
     if not groups[0].to_height:
         policy, aims = correct_aim(policy, groups, log)
     elif cfg.iterations == 0:
-        raise InputError("a policy for heights has no aim to be taken apart: fine-tuning it needs an iteration")
+        raise InputError("fine-tuning of jumps to heights needs at least 1 iteration")
     network = Network(policy, device=groups[0].env.device)
     history = tune_weights(groups, network, cfg, log, begin)
     layers = network.layers(network.weights)

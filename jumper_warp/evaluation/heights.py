@@ -1,4 +1,4 @@
-"""Jumps to apex heights: log, metrics, and flags of `jumper evaluate` and `play`."""
+"""Evaluation of jumps to apex heights: log, metrics, and flags of `jumper evaluate` and `play`."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
 
 PAPER = {"apex_error_abs_mean_m": 0.04, "goal_reached_rate": 0.91, "in_range_goal_reached_rate": 1.0}
-"""Values of the paper's simulation, by key; it judges a jump by its apex alone."""
+"""Metrics of the paper's simulation by key; the paper evaluates the apex only."""
 MAX_ROBOTS = 64  # Maximum number of robots in one recording
 
 
@@ -26,9 +26,9 @@ class HeightLog(JumpLog):
     """Log of one jump to an apex height per world; arrays of `JumpLog` have shape (num_envs, 1)."""
 
     def __init__(self, heights: np.ndarray, terminations: tuple[str, ...], rest: float = REST_TIME) -> None:
-        """Start with no jump ended.
+        """Create a log of jumps that have not begun.
 
-        heights [m]: commanded base heights at the apex, (num_envs,), above the ground; terminations, rest: as in
+        heights [m]: commanded base heights at the apex, (num_envs,), above the ground; terminations, rest: see
         `JumpLog`.
         """
         goals = np.zeros((len(heights), 1, 3))
@@ -37,21 +37,21 @@ class HeightLog(JumpLog):
 
     @property
     def seconds(self) -> float:
-        """[s] Maximum simulated time."""
+        """Maximum simulated time [s]."""
         return 7.0 + self.rest
 
     @property
     def commanded(self) -> np.ndarray:
-        """[m] (num_envs, 1) Commanded base height at the apex."""
+        """Commanded base height at the apex [m], (num_envs, 1)."""
         return self.goals[..., 2]
 
     @property
     def reached(self) -> np.ndarray:
-        """(num_envs, 1) Whether the apex was within 0.1 m of the command."""
+        """Whether the apex was within 0.1 m of the command, (num_envs, 1)."""
         return self.outcome.reached
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the base's present and commanded height [m] of some worlds."""
+        """Return the current and the commanded base height [m] of some worlds."""
         targets = zip(self.names(worlds), self.commanded[list(worlds), 0], strict=True)
         return super().series(worlds) | {f"height/command, {name} [m]": height for name, height in targets}
 
@@ -69,7 +69,7 @@ class HeightLog(JumpLog):
 
 
 def run_jumps(act: Callable[[torch.Tensor], torch.Tensor], env: Env, heights: np.ndarray) -> HeightLog:
-    """Run one jump per world to commanded heights [m], (num_envs,), return the log; act: as in `run_evaluation`."""
+    """Run one jump per world to commanded heights [m], (num_envs,), return the log; act: see `run_evaluation`."""
     jumps = HeightLog(heights, termination_names(env.task))
     run_evaluation(act, env, jumps)
     return jumps
@@ -77,7 +77,7 @@ def run_jumps(act: Callable[[torch.Tensor], torch.Tensor], env: Env, heights: np
 
 @dataclass(frozen=True)
 class HeightFlags(JumpFlags):
-    """Jumps to evenly spaced heights."""
+    """Flags of jumps to evenly spaced heights."""
 
     success_range: tuple[float, float] = field(default=(0.5, 1.1), kw_only=True)
     height_range: tuple[float, float] = (0.5, 1.2)  # [m] Lowest and highest commanded base height
@@ -88,13 +88,13 @@ class HeightFlags(JumpFlags):
             raise InputError(f"height_range must be in (0, 10) m and rise, got {self.height_range}")
 
     def log(self, task: TaskCfg, seed: int) -> HeightLog:
-        """Return the log of jumps to these heights, one per world; seed has no effect."""
+        """Return a new log of one jump per world to evenly spaced heights; seed has no effect."""
         return HeightLog(np.linspace(*self.height_range, self.num_jumps), termination_names(task))
 
 
 @dataclass(frozen=True)
 class HeightPlayFlags:
-    """Jumps to heights that are recorded."""
+    """Flags of recorded jumps to heights."""
 
     height: tuple[float, ...] = (0.6, 0.9, 1.1)  # [m] Commanded base heights, one robot each
     length: tyro.conf.Suppress[float] = 3.5  # [s] Length of the recording, unless `jumper play --seconds` sets it
@@ -104,5 +104,5 @@ class HeightPlayFlags:
             raise InputError(f"height takes 1 to {MAX_ROBOTS} numbers in (0, 10) m, got {self.height}")
 
     def log(self, task: TaskCfg) -> HeightLog:
-        """Return the log of the jumps, one per robot."""
+        """Return a new log of one recorded jump per robot."""
         return HeightLog(np.array(self.height), termination_names(task))

@@ -1,8 +1,8 @@
-"""Errors of many jumps at once (apex height or landing position), and their derivatives by the policy's weights.
+"""Errors of jumps (apex height or landing position), and their derivatives with respect to the policy's weights.
 
 Whole jumps are simulated with physics, motors, latency, command filter and network, as in an evaluation. Derivatives
-reach from the apex back to the command; contact after the apex is left out. The value of a landing error is where the
-robot comes to rest, its derivative that of the landing point of the ballistic flight from the apex.
+reach from the apex back to the command; contact after the apex is omitted. A landing error is evaluated where the robot
+comes to rest; its derivative is that of the landing point of the ballistic flight from the apex.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from jumper_warp.trajectory.gauss_newton import Network, Tape, per_world_gradien
 
 LANDING_HEIGHT = 0.30  # [m] Base height at which the ballistic flight lands
 LATEST = 2.5  # [s] Time after the last command at which all jumps are past their apex
-HUBER = 0.02  # [m] Threshold of the Huber weight: larger errors, of jumps that a weak robot cannot make, count less
+HUBER = 0.02  # [m] Threshold of the Huber weight: larger errors, as of robots too weak for a jump, count less
 
 
 class JumpErrors(NamedTuple):
     """Errors of a group of n jumps; m = n for apex heights, m = 2n for landing positions (all x, then all y, world)."""
 
     value: torch.Tensor  # (m,) [m] Errors, 0 where not valid
-    jacobian: torch.Tensor  # (m, weights) [m] Derivatives by the network's weights; empty if not requested
+    jacobian: torch.Tensor  # (m, weights) [m] Derivatives with respect to the network's weights; empty if not requested
     valid: torch.Tensor  # (m,) Whether the jump took off and its error is finite
 
 
 @dataclass
 class JumpGroup:
-    """Jumps of one environment with fixed commands."""
+    """Group of jumps in one environment with fixed commands."""
 
     name: str  # Name of the group in logs and records
     env: Env  # Environment of n worlds, one jump each
@@ -54,7 +54,7 @@ class JumpGroup:
         self.loop.read_parameters()
 
     def importance(self, errors: JumpErrors) -> torch.Tensor:
-        """Return the weights of the errors in the cost, (m,): Huber weight over `std` squared and number of errors."""
+        """Return the weights of the errors in the cost, (m,): Huber weight / (std² · number of errors)."""
         huber = (HUBER / errors.value.abs().clamp(min=1.0e-9)).clamp(max=1.0)
         return torch.where(errors.valid, huber, 0.0) / (self.std**2 * len(errors.value))
 
@@ -73,7 +73,7 @@ def apex_heights(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np
 def ballistic_landing(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np.ndarray]) -> list[torch.Tensor]:
     """Return [x, y], (n,) each, the differentiable landing point [m], world, of the ballistic flight from the apex.
 
-    states, arrays: as for `apex_heights`. The base lands at LANDING_HEIGHT.
+    states, arrays: see `apex_heights`. The base lands at LANDING_HEIGHT.
     """
     reached = torch.as_tensor(arrays["max_height"], device=states[0].q.device)
     row = (torch.stack([state.q[2].detach() for state in states]) - reached).abs().argmin(0)
@@ -122,7 +122,7 @@ def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> Jum
 
 
 def _landing_errors(env: Env, network: Network) -> list[np.ndarray]:
-    """Continue until REST_TIME after touchdown, and return [x, y], (n,) each: base minus goal [m], world."""
+    """Continue the jumps until REST_TIME after touchdown; return [x, y], (n,) each: base minus goal [m], world."""
     rest = round(REST_TIME / env.step_dt)
     with torch.no_grad():
         for _ in range(3 * rest):  # on Mars the fall from the apex takes up to 1.4 s

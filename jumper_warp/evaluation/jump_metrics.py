@@ -1,4 +1,4 @@
-"""Tables of the metrics of jumps to heights and to places, and the flags that their evaluations share."""
+"""Metrics of jumps to heights and to landing positions, and the common flags of their evaluations."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jumper_warp.utils.metrics import Metric, Metrics, chosen, largest, mean, me
 LEVEL_TILT = 10.0  # [deg] Tilt of the base below which a landing is level
 DRIFT, TURN = 0.2, 25.0  # [m], [deg] Drift and turn of the base beyond which the authors' configuration ends an episode
 
-JUMP_METRICS = (
+SUCCESS_METRICS = (
     Metric("success_rate", rate, "jumps", lambda o: o.success),
     Metric("goal_reached_rate", rate, "jumps", lambda o: o.reached),
     Metric("landed_rate", rate, "jumps", lambda o: o.landed),
@@ -22,6 +22,9 @@ JUMP_METRICS = (
     Metric("no_paw_lift_rate", rate, "jumps", lambda o: o.still),
     Metric("success_without_paw_lift_rate", rate, "jumps", lambda o: o.success & o.still),
     Metric("success_without_hop_rate", rate, "jumps", lambda o: o.success & ~o.hopped),
+)
+"""Table of the rates of successful jumps and of the parts of a success; `JumpOutcome` defines their events."""
+FAILURE_METRICS = (
     Metric("fall_rate", rate, "jumps", lambda o: o.fell),
     Metric("collision_rate", rate, "jumps", lambda o: o.collided),
     Metric("diverged_rate", rate, "jumps", lambda o: o.diverged),
@@ -35,9 +38,9 @@ JUMP_METRICS = (
     Metric("turn_abs_mean_deg", mean, "landed jumps", lambda o: o.turn_deg),
     Metric("turn_abs_max_deg", largest, "landed jumps", lambda o: o.turn_deg),
 )
-"""Metrics of all jumps; `JumpOutcome` defines their events."""
+"""Table of the rates of failures, and of tilt and turn after the landing."""
 HEIGHT_METRICS = (
-    *JUMP_METRICS[:7],
+    *SUCCESS_METRICS,
     Metric("apex_error_abs_mean_m", mean, "jumps that did not diverge", lambda o: np.abs(o.apex_error_m)),
     Metric("apex_error_signed_mean_m", mean, "jumps that did not diverge", lambda o: o.apex_error_m),
     Metric("apex_error_abs_max_of_successes_m", largest, "successful jumps", lambda o: np.abs(o.apex_error_m)),
@@ -45,11 +48,11 @@ HEIGHT_METRICS = (
     Metric("drift_mean_m", mean, "landed jumps", lambda o: o.drift_m),
     Metric("drift_max_m", largest, "landed jumps", lambda o: o.drift_m),
     Metric("beyond_authors_limits_rate", rate, "landed jumps", lambda o: (o.drift_m > DRIFT) | (o.turn_deg > TURN)),
-    *JUMP_METRICS[7:],
+    *FAILURE_METRICS,
 )
-"""Metrics of jumps to heights; the authors' limits are those of drift and turn, DRIFT and TURN."""
+"""Table of the metrics of jumps to heights; the authors' limits on drift and turn are DRIFT and TURN."""
 PLACE_METRICS = (
-    *JUMP_METRICS[:7],
+    *SUCCESS_METRICS,
     Metric("goal_distance_at_rest_mean_m", mean, "landed jumps", lambda o: o.distance_at_rest_m),
     Metric("goal_distance_at_touchdown_mean_m", mean, "jumps that touched down", lambda o: o.distance_at_touchdown_m),
     Metric("goal_distance_at_end_mean_m", mean, "jumps that did not diverge", lambda o: o.distance_at_end_m),
@@ -58,29 +61,29 @@ PLACE_METRICS = (
     Metric("goal_error_left_signed_mean_m", mean, "landed jumps", lambda o: o.left_m),
     Metric("distance_flown_mean_m", mean, "jumps that touched down", lambda o: o.distance_flown_m),
     Metric("paw_to_paw_distance_mean_m", mean, "landed jumps", lambda o: o.paw_to_paw_distance_m),
-    *JUMP_METRICS[7:],
+    *FAILURE_METRICS,
 )
-"""Metrics of jumps to places."""
+"""Table of the metrics of jumps to landing positions."""
 IN_RANGE = ("success_rate", "goal_reached_rate", "no_paw_lift_rate", "apex_error_abs_mean_m",
             "goal_distance_at_rest_mean_m")  # fmt: skip
-"""Keys that are also reported, with the prefix `in_range_`, of the goals within a range."""
+"""Keys of metrics that are also reported for goals within a range, with the prefix `in_range_`."""
 
 
 def jump_metrics(outcome: JumpOutcome, where: np.ndarray | None = None, prefix: str = "", note: str = "") -> Metrics:
-    """Return HEIGHT_METRICS or PLACE_METRICS of jumps; arguments as for `measure`."""
+    """Return the metrics of jumps, HEIGHT_METRICS or PLACE_METRICS; arguments: see `measure`."""
     table = HEIGHT_METRICS if outcome.to_height.all() else PLACE_METRICS
     return measure(table, outcome, where, prefix, note)
 
 
 def range_metrics(outcome: JumpOutcome, inside: np.ndarray, note: str) -> Metrics:
-    """Return the metrics IN_RANGE of the jumps in a mask, as `in_range_<key>`; note: says which these are."""
+    """Return the metrics IN_RANGE of selected jumps, as `in_range_<key>`; inside: mask; note: its description."""
     table = HEIGHT_METRICS if outcome.to_height.all() else PLACE_METRICS
     return measure(chosen(table, *IN_RANGE), outcome, inside, "in_range_", note)
 
 
 @dataclass(frozen=True)
 class JumpFlags:
-    """Jumps from standing still."""
+    """Flags of jumps from rest in the default pose."""
 
     num_jumps: int = 200  # Number of jumps
     success_range: tuple[float, float] = field(default=(0.3, 1.4), kw_only=True)
@@ -95,6 +98,6 @@ class JumpFlags:
     def metrics(self, log: JumpLog) -> Metrics:
         """Return the metrics of a finished log: of all jumps, and of those within `success_range`."""
         (low, high), outcome = self.success_range, log.outcome
-        size = np.linalg.norm(log.goals, axis=-1)  # [m] height or distance: the other one is 0
+        size = np.linalg.norm(log.goals, axis=-1)  # [m] height or distance; the other is 0
         inside = within(size, self.success_range)
         return jump_metrics(outcome) | range_metrics(outcome, inside, f"with goals of {low:g} to {high:g} m")

@@ -1,4 +1,4 @@
-"""Jumps, each from its command to rest after landing: their outcome, and the base class of their logs."""
+"""Outcomes of jumps, each from its command to rest after landing, and the base class of their logs."""
 
 from __future__ import annotations
 
@@ -27,18 +27,18 @@ PHASES = ("stance", "flight", "landed")  # Names of the values of a jump's phase
 STANCE, LANDED = 0, 2  # Values of the jump's phase before takeoff and after touchdown
 TOLERANCE = 0.1  # [m] Largest distance from the goal of a jump that reaches it
 REST_SPEED = 0.1  # [m/s] Speed of the base's centre of mass below which the robot is at rest
-HOP_TIME = 0.05  # [s] After touchdown, longer without any paw on the ground is a hop; a paw lifted so long is a step
+HOP_TIME = 0.05  # [s] Least time without any paw on the ground of a hop after touchdown, and of a paw of a step
 TIME_EPS = 1.0e-6  # [s] Tolerance for rounding of sums of steps
 REST_TIME = 1.0  # [s] Time after touchdown at which the robot should be at rest
 DELAY = 0.5  # [s] Time until the first jump is commanded
 TAKEOFF_SPEED = 0.25  # [m/s] Upward speed of the base, with no paw down, of a second takeoff (authors' configuration)
-NOT_BEGUN = "not_begun"  # End of a jump that was not commanded, because one before it failed
-TERMINATIONS = ("came_apart", "low_base", COLLIDED, "no_jump", SUCCESS)
-"""Terminations of an evaluated jump, in order of precedence; success is last, so that it hides no fall."""
+NOT_BEGUN = "not_begun"  # End of a jump that was not commanded, because an earlier jump failed
+TERMINATIONS = (DIVERGED, "low_base", COLLIDED, "no_jump", SUCCESS)
+"""Terminations of an evaluated jump in order of precedence; success is last, so that falls take precedence."""
 
 
 def with_jump_terminations(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the task with only TERMINATIONS; its others, which shape training, are dropped."""
+    """Return a copy of the task with only TERMINATIONS, without those for training."""
     return with_terminations(task, TERMINATIONS)
 
 
@@ -54,7 +54,7 @@ def paw_arrays(env: Env) -> dict[str, np.ndarray]:
 
 
 def jump_commands(goals: np.ndarray, delay: np.ndarray | float, step_dt: float) -> np.ndarray:
-    """Return commands of jump tasks, (num_envs, 4): goal x, y, z [m] and number of the policy step of the command.
+    """Return commands of jump tasks, (num_envs, 4): goal x, y, z [m] and policy step of the command.
 
     goals [m]: (num_envs, 3), landing x, y relative to start and heading, and base height at the apex, 0 for any;
     delay [s]: time until the jump is commanded, (num_envs,) or one for all.
@@ -65,7 +65,7 @@ def jump_commands(goals: np.ndarray, delay: np.ndarray | float, step_dt: float) 
 
 @dataclass(frozen=True)
 class JumpOutcome:
-    """Outcome of jumps; arrays have shape (num_envs, jumps in a row)."""
+    """Outcomes of jumps: events and errors, arrays of shape (num_envs, jumps in a row)."""
 
     commanded: np.ndarray  # Whether the jump was commanded
     to_height: np.ndarray  # Whether the goal is an apex height, else a place
@@ -85,7 +85,7 @@ class JumpOutcome:
     no_jump: np.ndarray  # Whether it did not take off in time
     apex_m: np.ndarray  # Largest base height from takeoff to touchdown; without a takeoff the last one
     apex_error_m: np.ndarray  # Apex minus commanded height
-    distance_at_end_m: np.ndarray  # From goal to base, horizontal, when the jump was over or failed
+    distance_at_end_m: np.ndarray  # From goal to base, horizontal, when the jump ended or failed
     distance_at_touchdown_m: np.ndarray  # From goal to base, horizontal, at touchdown
     distance_at_rest_m: np.ndarray  # From goal to base, horizontal, one second after touchdown
     ahead_m: np.ndarray  # Base at rest minus goal, along the heading
@@ -98,7 +98,7 @@ class JumpOutcome:
 
     @property
     def trials(self) -> dict[str, np.ndarray]:
-        """Sets of trials by name: masks of the shape of the arrays."""
+        """Sets of jumps that metrics refer to, by name: masks of the shape of the arrays."""
         return {
             "jumps": self.commanded, "jumps that touched down": self.touched_down, "landed jumps": self.landed,
             "successful jumps": self.success, "jumps that did not diverge": self.commanded & ~self.diverged,
@@ -106,22 +106,22 @@ class JumpOutcome:
 
     @property
     def names(self) -> np.ndarray:
-        """Name of each outcome: success, early, missed or not_at_rest of a landed jump, else empty."""
+        """Name of the outcome of each landed jump: success, early, missed or not_at_rest; empty for other jumps."""
         kinds = [(self.success, SUCCESS), (self.landed & self.early, "early"), (self.missed, "missed")]
         return np.select(*zip(*kinds, strict=True), default=np.where(self.landed, "not_at_rest", ""))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return the arrays by name, flattened to (jumps,)."""
+        """Return all arrays by name, flattened to (jumps,)."""
         return {field.name: getattr(self, field.name).ravel() for field in fields(self)}
 
 
 def jump_outcome(jumps: JumpLog) -> JumpOutcome:
-    """Return the outcome of recorded jumps; depends on nothing but the log's arrays."""
+    """Compute the outcomes of recorded jumps from the log's arrays."""
     ends, to_height, commanded = jumps.ends, jumps.goals[..., 2] > 0.0, jumps.ends != NOT_BEGUN
     landed, diverged = ends == SUCCESS, ends == DIVERGED
 
     def known(values: np.ndarray) -> np.ndarray:
-        """Return values with NaN where the simulation diverged."""
+        """Replace values by NaN where the simulation diverged."""
         return np.where(diverged | ~np.isfinite(values), np.nan, values)
 
     def goal_distance(position: np.ndarray) -> np.ndarray:
@@ -152,8 +152,8 @@ def jump_outcome(jumps: JumpLog) -> JumpOutcome:
 class JumpLog(EvaluationLog):
     """Log of a sequence of jumps per world; arrays have shape (num_envs, jumps in a row), NaN before the jump.
 
-    The goal of the first jump is relative to start and heading, that of each further jump to base position and yaw at
-    its command. A jump's entries do not change after its end.
+    The goal of the first jump is relative to start and heading. Goals of further jumps are relative to base position
+    and yaw at their command. A jump's entries do not change after its end.
     """
 
     def __init__(
@@ -164,12 +164,12 @@ class JumpLog(EvaluationLog):
         delay: np.ndarray | float = DELAY,
         rest: float = REST_TIME,
     ) -> None:
-        """Start with no jump ended.
+        """Create a log of jumps that have not begun.
 
         goals [m]: landing positions ahead and to the left, (num_envs, jumps in a row, 2 or 3), third the base height at
         the apex, 0 for any; terminations: names of the task's terminations, SUCCESS among them; headings [rad]:
         (num_envs,) or one for all; delay [s]: time until the first jump is commanded, likewise; rest [s]: time from
-        touchdown until the jump is over and the next one is commanded. Raises InputError: another shape, or no SUCCESS.
+        touchdown to the end of the jump and the next command. Raises InputError: another shape, or no SUCCESS.
 
         Below, arrays have shape (num_envs, jumps in a row, ...).
         """
@@ -179,9 +179,9 @@ class JumpLog(EvaluationLog):
         self.goals, self.terminations = np.pad(goals, ((0, 0), (0, 0), (0, 3 - goals.shape[2]))), terminations
         self.headings, self.delay, self.rest = headings, delay, rest
         self.count, *_ = shape = goals.shape[:2]
-        # (num_envs,) index of the jump under way; the number of jumps in a row after the last
+        # (num_envs,) index of the current jump; the number of jumps in a row after the last
         self.current = np.zeros(self.count, dtype=int)
-        self.end = np.full(shape, -1)  # index in `terminations` of what ended the jump, -1 while under way
+        self.end = np.full(shape, -1)  # index in `terminations` of the jump's end, -1 until then
         self.end_position = np.full((*shape, 2), np.nan)  # [m] (..., 2) base position at the end, world
         self.goal_world = np.full((*shape, 2), np.nan)  # [m] (..., 2) goal, world
         self.takeoff = np.full((*shape, 2), np.nan)  # [m] (..., 2) base position at takeoff, world
@@ -192,7 +192,7 @@ class JumpLog(EvaluationLog):
         self.heading = np.full(shape, np.nan)  # [rad] heading of the jump
         self.yaw = np.full(shape, np.nan)  # [rad] yaw of the base at the end, relative to the heading
         self.drift = np.full(shape, np.nan)  # [m] horizontal distance of the base from its start at the end
-        self.apex = np.full(shape, np.nan)  # [m] largest base height in flight; before takeoff the present one
+        self.apex = np.full(shape, np.nan)  # [m] largest base height in flight; before takeoff the current one
         self.tilt = np.full(shape, np.nan)  # [rad] largest tilt since touchdown
         self.rest_speed = np.full(shape, np.inf)  # [m/s] speed REST_TIME after touchdown; inf before
         self.early = np.zeros(shape, dtype=bool)  # whether the jump began before the command
@@ -230,54 +230,54 @@ class JumpLog(EvaluationLog):
         """
         count = self.goals.shape[1]
         row = np.flatnonzero(self.current < count)
-        now = {name: values[row] for name, values in arrays.items()}
+        jump = {name: values[row] for name, values in arrays.items()}
         at = (row, self.current[row])
         # a policy observes the command after the policy step `command_step`, and can take off in the next one
-        self.early[at] |= (now["took_off"] == 1) & (now["steps"] <= now["command_step"])
-        self.end_position[at], self.goal_world[at] = now["base_pos"][:, :2], now["goal"][:, :2]
-        self.heading[at] = now["heading"]
-        self.yaw[at] = wrapped(yaw_of(now["base_quat"]) - now["heading"])
-        self.drift[at] = np.linalg.norm((now["base_pos"] - now["start"])[:, :2], axis=1)
-        landed, height, self.tilt[at] = now["phase"] == LANDED, now["base_pos"][:, 2], now["peak_tilt"]
-        begins = (now["phase"] == STANCE) | (now["took_off"] == 1)
-        rises = ~landed | (now["touched_down"] == 1)
+        self.early[at] |= (jump["took_off"] == 1) & (jump["steps"] <= jump["command_step"])
+        self.end_position[at], self.goal_world[at] = jump["base_pos"][:, :2], jump["goal"][:, :2]
+        self.heading[at] = jump["heading"]
+        self.yaw[at] = wrapped(yaw_of(jump["base_quat"]) - jump["heading"])
+        self.drift[at] = np.linalg.norm((jump["base_pos"] - jump["start"])[:, :2], axis=1)
+        landed, height, self.tilt[at] = jump["phase"] == LANDED, jump["base_pos"][:, 2], jump["peak_tilt"]
+        begins = (jump["phase"] == STANCE) | (jump["took_off"] == 1)
+        rises = ~landed | (jump["touched_down"] == 1)
         self.apex[at] = np.where(begins, height, np.where(rises, np.fmax(self.apex[at], height), self.apex[at]))
-        self._record_landing(now, at, landed, step_dt)
-        failed = (now["termination"] >= 0) & (now["termination"] != self._success)
-        rested = ~failed & landed & (now["phase_steps"] >= round(self.rest / step_dt))
-        self.end[at] = np.where(failed, now["termination"], np.where(rested, self._success, -1))
+        self._record_landing(jump, at, landed, step_dt)
+        failed = (jump["termination"] >= 0) & (jump["termination"] != self._success)
+        rested = ~failed & landed & (jump["phase_steps"] >= round(self.rest / step_dt))
+        self.end[at] = np.where(failed, jump["termination"], np.where(rested, self._success, -1))
         self.current[row[rested]] += 1
         self.current[row[failed]] = count
         return bool((self.current >= count).all())
 
     def _record_landing(
-        self, now: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray], landed: np.ndarray, step_dt: float
+        self, jump: dict[str, np.ndarray], at: tuple[np.ndarray, np.ndarray], landed: np.ndarray, step_dt: float
     ) -> None:
         """Record base positions, speeds and paw contacts after touchdown.
 
-        now: arrays (n, ...) of the n worlds whose jumps are under way; at: indices (worlds, numbers in the row) of
+        jump: arrays (n, ...) of the n worlds with a current jump; at: indices (worlds, numbers in the row) of
         these jumps; landed: (n,) whether each has touched down; step_dt [s]: policy step.
         """
         row, number = at
-        steps, speed = now["phase_steps"], np.linalg.norm(now["base_vel"], axis=1)
-        at_rest, position = landed & (steps == round(min(self.rest, REST_TIME) / step_dt)), now["base_pos"][:, :2]
+        steps, speed = jump["phase_steps"], np.linalg.norm(jump["base_vel"], axis=1)
+        at_rest, position = landed & (steps == round(min(self.rest, REST_TIME) / step_dt)), jump["base_pos"][:, :2]
         for record, due, values in (
-            (self.takeoff, now["took_off"] == 1, position),
-            (self.touchdown, landed & (now["touched_down"] == 1), position),
+            (self.takeoff, jump["took_off"] == 1, position),
+            (self.touchdown, landed & (jump["touched_down"] == 1), position),
             (self.rest_position, at_rest, position),
             (self.rest_speed, at_rest, speed),
         ):
             record[row[due], number[due]] = values[due]
-        down, pushing = landed[:, None] & now["paws_down"], (now["phase"] == STANCE) | (now["took_off"] == 1)
-        standing = (pushing[:, None] & now["paws_down"])[..., None]
-        self._paw_start[row] = np.where(standing, now["paw_pos"], self._paw_start[row])
+        down, pushing = landed[:, None] & jump["paws_down"], (jump["phase"] == STANCE) | (jump["took_off"] == 1)
+        standing = (pushing[:, None] & jump["paws_down"])[..., None]
+        self._paw_start[row] = np.where(standing, jump["paw_pos"], self._paw_start[row])
         first = (down & ~self._paw_touched[row])[..., None]
-        self.paw_shift[at] = np.where(first, now["paw_pos"] - self._paw_start[row], self.paw_shift[at])
+        self.paw_shift[at] = np.where(first, jump["paw_pos"] - self._paw_start[row], self.paw_shift[at])
         airborne = landed & ~down.any(axis=1)
         self._air_time[row] = np.where(airborne, self._air_time[row] + step_dt, 0.0)
         self._paw_touched[row] = landed[:, None] & (self._paw_touched[row] | down)
         self._paw_air_time[row] = np.where(self._paw_touched[row] & ~down, self._paw_air_time[row] + step_dt, 0.0)
-        rising_flight = airborne & (self._rising_flight[row] | (now["up"] > TAKEOFF_SPEED))
+        rising_flight = airborne & (self._rising_flight[row] | (jump["up"] > TAKEOFF_SPEED))
         self.takeoffs[at] += rising_flight & ~self._rising_flight[row]
         self._rising_flight[row] = rising_flight
         self.air_time[at] = np.maximum(self.air_time[at], self._air_time[row])
@@ -285,22 +285,22 @@ class JumpLog(EvaluationLog):
 
     @property
     def ends(self) -> np.ndarray:
-        """(num_envs, jumps in a row) What ended each jump: SUCCESS, another outcome, NO_END or NOT_BEGUN."""
+        """End of each jump, (num_envs, jumps in a row): SUCCESS, another outcome, NO_END or NOT_BEGUN."""
         return np.where(np.isnan(self.heading), NOT_BEGUN, outcome_names(self.terminations, NO_END)[self.end])
 
     @property
     def outcome(self) -> JumpOutcome:
-        """Outcome of the jumps."""
+        """Outcomes of the recorded jumps."""
         return jump_outcome(self)
 
     @property
     def success(self) -> np.ndarray:
-        """Whether each jump succeeded."""
+        """Whether each jump succeeded, (num_envs, jumps in a row)."""
         return self.outcome.success
 
     @property
     def outcomes(self) -> np.ndarray:
-        """Name of the outcome of each jump: SUCCESS, early, missed, not_at_rest, or its entry in `ends`."""
+        """Name of each jump's outcome: SUCCESS, early, missed, not_at_rest, or its entry in `ends`."""
         names = self.outcome.names
         return np.where(names == "", self.ends, names)
 
@@ -312,12 +312,12 @@ class JumpLog(EvaluationLog):
         return lists | {"outcome": self.outcomes.ravel().tolist()}
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the present base height [m] of some worlds."""
+        """Return the current base height [m] of some worlds."""
         heights = self.arrays["base_pos"][list(worlds), 2]
         return {f"height/base, {name} [m]": height for name, height in zip(self.names(worlds), heights, strict=True)}
 
     def states(self, worlds: Sequence[int]) -> dict[str, str]:
-        """Return the phase of some worlds' jumps."""
+        """Return the current phase of some worlds' jumps, an entry of PHASES."""
         phases = self.arrays["phase"][list(worlds)]
         return {f"phase/{name}": PHASES[phase] for name, phase in zip(self.names(worlds), phases, strict=True)}
 

@@ -1,4 +1,4 @@
-"""Jumps to landing positions: log, metrics, and flags of `jumper evaluate` and `play`."""
+"""Evaluation of jumps to landing positions: log, metrics, and flags of `jumper evaluate` and `play`."""
 
 from __future__ import annotations
 
@@ -24,41 +24,41 @@ PAPER = {
     "success_rate": 0.97, "in_range_success_rate": 1.0, "goal_distance_at_rest_mean_m": 0.026,
     "goal_distance_at_end_mean_m": 0.026,
 }  # fmt: skip
-"""Values of the paper's simulation, by key."""
+"""Metrics of the paper's simulation by key."""
 JUMP_SECONDS, NEXT_JUMP_SECONDS = 3.5, 2.5  # [s] Length of a recording of one jump, and addition for each further jump
 
 
 def with_second_takeoff(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the task with the terminations of a jump and, before success, the authors' second takeoff."""
+    """Return a copy of a task with the authors' termination at a second takeoff, which precedes success."""
     task = with_jump_terminations(task)
     takeoff = TerminationTerm(terminations.second_takeoff, speed=TAKEOFF_SPEED)
     return replace(task, terminations=(*task.terminations[:-1], takeoff, task.terminations[-1]))
 
 
 class LandingLog(JumpLog):
-    """Log of jumps to landing positions; arrays as in `JumpLog`, (num_envs, jumps in a row, ...)."""
+    """Log of jumps to landing positions; arrays have shape (num_envs, jumps in a row, ...), see `JumpLog`."""
 
     spacing = 3.0
 
     @property
     def goal_positions(self) -> np.ndarray:
-        """[m] (num_envs, jumps in a row, 2) Goals ahead and to the left of the start of each jump."""
+        """Goals ahead and to the left of the start of each jump [m], (num_envs, jumps in a row, 2)."""
         return self.goals[..., :2]
 
     @property
     def seconds(self) -> float:
-        """[s] Maximum simulated time: each jump waits, squats and flies for at most 3.5 s."""
+        """Maximum simulated time [s]: each jump waits, squats and flies for at most 3.5 s."""
         return 1.0 + self.goals.shape[1] * (3.5 + self.rest) + float(np.max(self.delay))
 
     @property
     def landing(self) -> np.ndarray:
-        """[m] (..., 2) Base position at the end, in the frame of `goal_positions`."""
+        """Base position at the end of each jump [m], in the frame of `goal_positions`, (..., 2)."""
         x, y = np.moveaxis(self.end_position - self.goal_world, -1, 0)
         cos, sin = np.cos(self.heading), np.sin(self.heading)
         return self.goal_positions + np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the base's height and its distance from the current goal [m] of some worlds."""
+        """Return the current base height, and distance of the base from the current goal, [m] of some worlds."""
         offset = (self.arrays["base_pos"] - self.arrays["goal"])[list(worlds), :2]
         distances = zip(self.names(worlds), np.linalg.norm(offset, axis=1), strict=True)
         return super().series(worlds) | {f"distance/to goal, {name} [m]": distance for name, distance in distances}
@@ -78,13 +78,13 @@ class LandingLog(JumpLog):
 
 
 def random_headings(count: int, seed: int) -> np.ndarray:
-    """Return headings [rad] in -pi..pi, (count,), uniformly random."""
+    """Return uniformly random headings [rad] in -pi..pi, (count,)."""
     return np.random.default_rng(seed).uniform(-math.pi, math.pi, count)
 
 
 @dataclass(frozen=True)
 class LandingFlags(JumpFlags):
-    """Jumps to places from standing still."""
+    """Flags of jumps to landing positions from rest in the default pose."""
 
     goal_x: tuple[float, float] = (0.3, 1.5)
     """[m] Smallest and largest distance of the goal ahead; goals are evenly spaced."""
@@ -102,7 +102,7 @@ class LandingFlags(JumpFlags):
             raise InputError(f"heading must be finite or any, got {self.heading}")
 
     def log(self, task: TaskCfg, seed: int) -> LandingLog:
-        """Return the log of single jumps with these goals and headings, one per world."""
+        """Return a new log of one jump per world, with goals and headings from the flags."""
         rng = np.random.default_rng(seed)
         goals = np.stack([np.linspace(*self.goal_x, self.num_jumps), rng.uniform(*self.goal_y, self.num_jumps)], axis=1)
         headings = random_headings(self.num_jumps, seed) if self.heading == "any" else math.radians(self.heading)
@@ -111,29 +111,29 @@ class LandingFlags(JumpFlags):
 
 @dataclass(frozen=True)
 class LandingPlayFlags:
-    """Jumps to places that are recorded."""
+    """Flags of recorded jumps to landing positions."""
 
     goal: tyro.conf.UseAppendAction[tuple[Position2D, ...]] = ()
-    """[m] Goal of a robot, ahead and to the left; give it once for each robot (default: three goals)."""
+    """[m] Goal of a robot, ahead and to the left; repeat the flag for each robot (default: three goals)."""
     next_goals: tyro.conf.UseAppendAction[tuple[Position2D, ...]] = ()
-    """[m] Goal of all robots' next jump, ahead and to the left, a second after touchdown; give it once a jump."""
+    """[m] Goal of all robots' next jump, ahead and to the left, a second after touchdown; repeat it for each jump."""
     default_goals: tyro.conf.Suppress[tuple[Position2D, ...]] = ((0.5, 0.0), (0.9, 0.0), (1.3, 0.0))
-    """[m] Goals if there are none; flags that are given several times would be added to a default."""
+    """[m] Goals if `goal` is not passed; a default of `goal` itself would be kept when the flag is passed."""
 
     def __post_init__(self) -> None:
         for name in ("goal", "next_goals"):
             places = getattr(self, name)
             if len(places) > MAX_ROBOTS or not all(-10.0 < value < 10.0 for place in places for value in place):
-                raise InputError(f"{name} takes up to {MAX_ROBOTS} places in (-10, 10) m, got {places}")
+                raise InputError(f"{name} takes up to {MAX_ROBOTS} positions in (-10, 10) m, got {places}")
 
     @property
     def goals(self) -> tuple[Position2D, ...]:
-        """[m] First goals, one per robot."""
+        """First goal of each robot [m], ahead and to the left."""
         return self.goal or self.default_goals
 
     @property
     def length(self) -> float:
-        """[s] Length of the recording."""
+        """Length of the recording [s]."""
         return JUMP_SECONDS + NEXT_JUMP_SECONDS * len(self.next_goals)
 
     def log(self, task: TaskCfg) -> LandingLog:

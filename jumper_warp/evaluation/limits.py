@@ -1,4 +1,4 @@
-"""Apex height of the open-loop jump (squat, hold, full extension) of each robot of an environment."""
+"""Open-loop jumps (squat, hold, full extension): the apex height that each robot of an environment can reach."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
 
 RAMP, HOLD, EXTEND = 25, 50, 40  # Policy steps of the ramp into the squat, the held squat, and the full extension
-STAND = 31  # Policy steps in the default pose before the ramp, as before the command of a sweep's jumps
+STAND = 31  # Policy steps in the default pose before the ramp, as many as before the command in a sweep
 COAST = 30  # Policy steps after the extension, within which the apex has passed
 PUSH_PARAMS = ("events.push.force_", "events.push.torque_")  # Prefixes of parameters that set ranges of pushes
 
 
 def open_loop_action(step: int) -> float:
-    """Return the open-loop action [1] of all transversal motors at a policy step: 0 stand, 1 squat, -1 extension."""
+    """Return the action [1] of the transversal motors at a policy step of the open-loop jump: 1 squat, -1 extension."""
     ramp_step = step - STAND
     if ramp_step >= RAMP + HOLD:
         return -1.0 if ramp_step < RAMP + HOLD + EXTEND else 0.0
@@ -29,11 +29,11 @@ def open_loop_action(step: int) -> float:
 
 
 def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
-    """Return the apex (largest base height) [m] of the open-loop jump of each robot, (num_envs,), NaN if it diverges.
+    """Simulate the open-loop jump of each robot; return the largest base heights [m], (num_envs,), NaN if diverged.
 
     The robots have the parameters that their first `evaluation_reset` samples, latency included, but no pushes.
 
-    env: of a jump task whose actions of ±1 are full extension and squat; it is left at the end of the jump.
+    env: environment of a jump task with squat at action 1 and full extension at -1; it stays at the end of the jump.
     initial_state: `env.state_dict()` before its first `evaluation_reset`.
     """
     env.load_state_dict(initial_state)
@@ -56,10 +56,10 @@ def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
 
 
 def limit_metrics(outcome: JumpOutcome, target: np.ndarray, limit: np.ndarray, inside: np.ndarray) -> Metrics:
-    """Return the metrics of jumps to heights relative to `limit`, the same robots' open-loop apex [m], (num_envs, 1).
+    """Return the metrics of jumps to heights over reachable heights, i.e. at most TOLERANCE above the open-loop apex.
 
-    A height is reachable if at most TOLERANCE above the open-loop apex. `open_loop_apex_error_abs_mean_m` is the error
-    of ideal jumps that cannot exceed the limit. target [m], inside: commanded heights and mask of those in range.
+    limit [m]: open-loop apex of the same robots, (num_envs, 1). `open_loop_apex_error_abs_mean_m` is the error of ideal
+    jumps that cannot exceed the limit. target [m], inside: commanded heights and mask of those in range.
     """
     reachable, note = target <= limit + TOLERANCE, "to reachable heights"
     rates = chosen(HEIGHT_METRICS, "goal_reached_rate", "success_rate")

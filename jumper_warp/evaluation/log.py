@@ -18,15 +18,14 @@ if TYPE_CHECKING:
     import torch
 
 SUCCESS = "success"  # Outcomes, also names of terminations
-DIVERGED = "diverged"  # The state of the simulation is not finite or absurdly fast
+DIVERGED = "diverged"  # The state of the simulation is not finite or beyond the speed limits
 COLLIDED = "collided"  # A link other than a paw touched something
 FALLS = (DIVERGED, "low_base", "tilted", COLLIDED)  # Outcomes that count as falls
-OUTCOMES = {"came_apart": DIVERGED}  # Outcome by name of the termination, where they differ
-NO_END = "no_end"  # Outcome of an episode that was still running when the time was over
+NO_END = "no_end"  # Outcome of an episode that had not ended within the simulated time
 
 
 class EvaluationLog(ABC):
-    """Commands one episode per world and records its outcome; `run_evaluation` calls `begin`, then `record_step`."""
+    """Base class of logs that command one episode per world and record its outcome, driven by `run_evaluation`."""
 
     row_name = "jump"  # Noun for a trial; names the recording
     spacing = 1.2  # [m] Distance between robots that a recording shows side by side
@@ -36,7 +35,7 @@ class EvaluationLog(ABC):
     @property
     @abstractmethod
     def seconds(self) -> float:
-        """[s] Maximum simulated time; an episode that has not ended by then has the outcome NO_END."""
+        """Maximum simulated time [s]; an episode that has not ended by then has the outcome NO_END."""
 
     @abstractmethod
     def begin(self, env: Env) -> None:
@@ -48,11 +47,11 @@ class EvaluationLog(ABC):
 
     @abstractmethod
     def columns(self) -> dict[str, list]:
-        """Return the values of all trials by name, lists of equal length; those of a name have one type, or None."""
+        """Return the values of all trials as columns by name: lists of equal length, each of one type or None."""
 
     @abstractmethod
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the present values of some worlds (indices), by `group/quantity, name of the world [unit]`."""
+        """Return current values to plot of some worlds (indices), by `group/quantity, name of the world [unit]`."""
 
     def goal_markers(self, worlds: Sequence[int]) -> np.ndarray | None:
         """Return goal positions [m] to mark in a recording, world frame, (worlds, goals per world, 3), or None."""
@@ -67,7 +66,7 @@ class EvaluationLog(ABC):
         return [f"{self.row_name} {world}" for world in worlds]
 
     def names(self, worlds: Sequence[int]) -> list[str]:
-        """Return distinct names of some worlds: their labels, a repeated one with its world's index in parentheses."""
+        """Return distinct names of some worlds: their labels, with the world's index if a label is repeated."""
         labels = self.labels(worlds)
         return [
             label if labels.count(label) == 1 else f"{label} ({world})"
@@ -75,11 +74,11 @@ class EvaluationLog(ABC):
         ]
 
     def states(self, worlds: Sequence[int]) -> dict[str, str]:
-        """Return the present state of some worlds in words, such as the phase of a jump, by `quantity/name`."""
+        """Return current states of some worlds as text, such as the phase of a jump, by `quantity/name`."""
         return {}
 
     def velocity_commands(self, worlds: Sequence[int]) -> np.ndarray | None:
-        """Return present commanded velocities ahead, left [m/s], about z [rad/s], body axes, (worlds, 3), or None."""
+        """Return current commanded velocities ahead, left [m/s], about z [rad/s], body axes, (worlds, 3), or None."""
         return None
 
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
@@ -87,7 +86,7 @@ class EvaluationLog(ABC):
         return {}
 
     def read_env(self, env: Env) -> dict[str, np.ndarray]:
-        """Return the arrays that `update` needs, by name, (num_envs, ...) each; by default `Env.task_arrays`."""
+        """Return the arrays that `update` needs by name, each (num_envs, ...); by default `Env.task_arrays`."""
         return env.task_arrays()
 
     def record_step(self, env: Env) -> bool:
@@ -123,12 +122,12 @@ def run_evaluation(
 def success_index(terminations: Sequence[str]) -> int:
     """Return the index of SUCCESS among termination names. Raises InputError: it is missing."""
     if SUCCESS not in terminations:
-        raise InputError(f"this evaluation needs a termination {SUCCESS!r}, the task has {', '.join(terminations)}")
+        raise InputError(f"the evaluation needs a termination {SUCCESS!r}, the task has {', '.join(terminations)}")
     return list(terminations).index(SUCCESS)
 
 
 def with_terminations(task: TaskCfg, names: Sequence[str]) -> TaskCfg:
-    """Return the task with only the named terminations, in the order of `names`; names that it lacks are skipped."""
+    """Return a copy of the task with only the named terminations, in this order; unknown names are ignored."""
     terms = {term.name: term for term in task.terminations}
     return replace(task, terminations=tuple(terms[name] for name in names if name in terms))
 
@@ -139,20 +138,20 @@ def termination_names(task: TaskCfg) -> tuple[str, ...]:
 
 
 def within(values: np.ndarray, limits: tuple[float, float]) -> np.ndarray:
-    """Return which values [m] are between two limits, as bool of the same shape, with tolerance for rounding."""
+    """Return whether each value [m] is between two limits, bool of the same shape, with tolerance for rounding."""
     return (values >= limits[0] - 5e-4) & (values <= limits[1] + 5e-4)  # [m]
 
 
 def outcome_names(terminations: Sequence[str], *more: str) -> np.ndarray:
-    """Return the outcomes of episodes by index of the termination that ended them; more: names that follow."""
-    return np.array([*(OUTCOMES.get(name, name) for name in terminations), *more])
+    """Return the names of outcomes by index of the termination that ended an episode; more: names to append."""
+    return np.array([*terminations, *more])
 
 
 def ended_by(outcomes: np.ndarray, over: str, prefix: str = "ended_by_") -> Metrics:
-    """Return the rate of each outcome that occurs, as `<prefix><outcome>_rate`; over: what the trials are."""
+    """Return the rate of each outcome that occurs, as `<prefix><outcome>_rate`; over: noun for the trials."""
     return {f"{prefix}{name}_rate": rate(outcomes == name, over) for name in sorted(set(outcomes.ravel()))}
 
 
 def finite(values: np.ndarray) -> list[float | None]:
-    """Return values (n,) as a list of floats for JSON, None in place of NaN and infinity."""
+    """Convert values (n,) to a list of floats for JSON, with None for NaN and infinity."""
     return [float(value) if np.isfinite(value) else None for value in values]

@@ -1,4 +1,4 @@
-"""Recordings of some worlds of an environment, for films, composite pictures and the Rerun viewer.
+"""Recording of some worlds of an environment, for films, composite pictures and the Rerun viewer.
 
 Viewer and renderer are imported only when something is recorded.
 """
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from jumper_warp.sim.simulation import Simulation
     from jumper_warp.viz.recording import Recording
 
-SHOWN = 0.7  # Place of the world in a picture among the recorded ones, which are in the order of their goals, 0 to 1
+SHOWN = 0.7  # [1] Position of the world to show in the picture among the recorded ones, which are ordered by goal
 ANKLE = np.array([0.0, 0.0, -0.3])  # [m] Position of the ankle in the shank's frame
 
 
@@ -44,7 +44,7 @@ class EnvRecorder:
 
         self.env, self.log, self.worlds = env, log, list(worlds)
         self.links = LinkReader(env.sim)
-        spacing = log.spacing if isinstance(ground, str) else 0.0  # robots on a heightfield keep their places
+        spacing = log.spacing if isinstance(ground, str) else 0.0  # robots on a heightfield are not moved apart
         model = build_model(len(worlds), ground=ground, device=env.wp_device)
         labels, notes = log.names(self.worlds), {**(notes or {}), **log.notes(self.worlds)}
         self.recorder = Recorder(model, range(len(worlds)), spacing=spacing, notes=notes, labels=labels)
@@ -53,7 +53,7 @@ class EnvRecorder:
         self.block_positions: list[np.ndarray] = []
 
     def __call__(self) -> None:
-        """Append the environment's present state as a frame: link poses, series, ankle positions, paw forces."""
+        """Append the environment's current state as a frame: link poses, series, ankle positions, paw forces."""
         sim, log = self.env.sim, self.log
         poses = self.links.read()[0][self.worlds]
         forces = sim.paw_force.numpy().transpose(1, 0, 2)[self.worlds]
@@ -66,7 +66,7 @@ class EnvRecorder:
         )  # fmt: skip
 
     def _motor_series(self) -> dict[str, float]:
-        """Return values of the first recorded world by name of the series: of its paws and its 12 motors.
+        """Return values of the first recorded world's paws and motors, by name of the series.
 
         Largest force [N] on each paw in any physics step of the policy step; torque [N m] and action [1] of each motor.
         """
@@ -78,7 +78,7 @@ class EnvRecorder:
         return series | {f"action/{name} [1]": action[i] for i, name in enumerate(MOTOR_JOINTS)}
 
     def recording(self) -> Recording:
-        """Return the recording so far, with the goals of the log and the blocks."""
+        """Return a recording of all frames so far, with the goals of the log and the blocks."""
         from jumper_warp.viz.props import with_blocks
 
         goals, heights = self.log.goal_markers(self.worlds), self.log.goal_heights(self.worlds)
@@ -100,7 +100,7 @@ def save_recording(recording: Recording, folder: Path, name: str) -> Path:
 
 
 def block_positions(sim: Simulation) -> np.ndarray:
-    """Return x and y [m] of the sliding blocks' centres, (num_worlds, 2), world frame; only SolverJumper has blocks."""
+    """Return the positions x, y [m] of sliding blocks, (num_worlds, 2), world frame; only SolverJumper has blocks."""
     assert isinstance(sim.solver, SolverJumper)
     return sim.solver.block_position()
 

@@ -1,6 +1,6 @@
 """Evaluation of a policy: its environment, recorded runs of episodes, and the report of their metrics.
 
-Experiments and the commands `jumper evaluate` and `jumper play` share it.
+Experiments and the commands `jumper evaluate` and `jumper play` use this module.
 """
 
 from __future__ import annotations
@@ -44,12 +44,12 @@ Log = TypeVar("Log", bound=EvaluationLog)
 
 @dataclass(frozen=True)
 class EvaluationArgs(Conditions):
-    """Flags of every experiment that evaluates a policy; randomised robots have observation noise too."""
+    """Common flags of experiments that evaluate a policy; randomised robots also have observation noise."""
 
     noise: tyro.conf.Suppress[tyro.conf.Fixed[bool]] = False
     policy: str = "horizontal_jump"  # Name or folder of a policy, a run's folder, or a checkpoint
     num_recorded: int = 1  # Number of jumps to record for the Rerun viewer and, one of them, as a picture; 0: none
-    save_trials: bool = False  # Write the arrays of all trials, from which the rates follow, into trials.npz
+    save_trials: bool = False  # Write the arrays of all trials, from which the metrics are computed, to trials.npz
     out: Path | None = None  # Folder for metrics, plots, pictures and recordings (default: outputs/<name>/<time>)
 
     def __post_init__(self) -> None:
@@ -60,19 +60,19 @@ class EvaluationArgs(Conditions):
 
 
 def conditions_of(args: EvaluationArgs) -> Conditions:
-    """Return the conditions that an experiment's flags set; randomised robots have observation noise."""
+    """Return the test conditions from an experiment's flags; randomised robots have observation noise."""
     values: dict[str, Any] = {spec.name: getattr(args, spec.name) for spec in fields(Conditions)}
     values["noise"] = args.randomize
     return Conditions(**values)
 
 
 class Run(ABC):
-    """Base class of evaluations: runs episodes, records some worlds, reports metrics. A subclass provides the actor."""
+    """Base class of evaluations: runs episodes, records some worlds, reports metrics; subclasses provide the actor."""
 
     folder: Path  # Output folder, set by `prepare`
 
     def __init__(self) -> None:
-        """Start the clock of the report; call `prepare` before anything else."""
+        """Start the clock of the report; call `prepare` before any other method."""
         self.started = time.perf_counter()
         self.conditions, self.record = Conditions(), 0  # Conditions of all episodes; number of worlds to record
         self.save_trials = False  # Whether `run_episodes` writes trials.npz
@@ -82,14 +82,14 @@ class Run(ABC):
 
     @abstractmethod
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return the function from observations (num_envs, num_obs) to actions, argument `act` of `run_evaluation`."""
+        """Return the policy as a function from observations (num_envs, num_obs) to actions, see `run_evaluation`."""
 
     def prepare(
         self, name: str, conditions: Conditions, out: Path | None = None, *, record: int = 0, save_trials: bool = False
     ) -> None:
-        """Set the conditions, select the device and create the output folder, before anything is simulated.
+        """Set the conditions, select the device and create the output folder, before the simulation.
 
-        name: of the folder outputs/<name>/<time>, unless `out` is given; record: number of worlds to record;
+        name: of the folder outputs/<name>/<time>, unless `out` is passed; record: number of worlds to record;
         save_trials: whether to write trials.npz.
         Raises InputError: no such device or number of threads; OSError: the folder cannot be created.
         """
@@ -99,7 +99,7 @@ class Run(ABC):
 
     @property
     def title(self) -> str:
-        """Solver, robots and changed conditions as text, separated by commas, for tables and plots."""
+        """Description of solver, robots and changed conditions, separated by commas, for tables and plots."""
         conditions = self.conditions
         words = [SOLVER_TITLES[conditions.solver], "randomised" if conditions.randomize else "nominal"]
         if conditions.latency is not None and self._latency:
@@ -113,7 +113,7 @@ class Run(ABC):
 
     @property
     def condition_values(self) -> dict[str, Any]:
-        """Conditions by name, without unset ones; latency is the simulated one of all episodes so far."""
+        """Conditions by name, without unset ones; the latency is that simulated in all episodes so far."""
         conditions, values = self.conditions, {**self.settings}
         values |= {name: getattr(conditions, name) for name in ("solver", "randomize", "noise", "seed", "stream")}
         if conditions.randomize:
@@ -133,7 +133,7 @@ class Run(ABC):
         """Run one episode per world with the commands of a log, and return the log.
 
         film: name of the recording and picture of some worlds; empty: none. film_scene: the environment's `ground`
-        and `block`, to show them in the recording. on_step: called with the log after every policy step.
+        and `block` for the recording. on_step: called with the log after every policy step.
         """
         recorder = self._make_recorder(env, log, film_scene or {}) if film and self.record else None
 
@@ -153,12 +153,12 @@ class Run(ABC):
         return log
 
     def _make_recorder(self, env: Env, log: EvaluationLog, scene: Mapping[str, Any]) -> EnvRecorder:
-        """Return a recorder of `record` evenly spaced worlds; scene: as for `run_episodes`."""
+        """Return a recorder of `record` evenly spaced worlds; scene: `film_scene` of `run_episodes`."""
         worlds = np.linspace(0, env.num_envs - 1, min(self.record, env.num_envs)).round().astype(int).tolist()
         return EnvRecorder(env, log, worlds, ground=scene.get("ground", "plane"), block=scene.get("block"))
 
     def report(self, metrics: AnyMetrics, paper: Mapping[str, float]) -> dict[str, Any]:
-        """Write conditions and metrics to `metrics.json`, print them beside the paper's values, return all values."""
+        """Write conditions and metrics to `metrics.json`, print them with the paper's values, return all values."""
         write_metrics(self.folder, metrics, self.condition_values)
         print_metrics(metrics, paper, self.condition_values, self.title)
         print(f"{time.perf_counter() - self.started:.1f} s; results in {self.folder}")
@@ -166,10 +166,10 @@ class Run(ABC):
 
 
 class EvaluationRun(Run):
-    """Evaluation of one policy."""
+    """Evaluation of one policy in its task."""
 
     def __init__(self, source: str | Path, modules: Iterable[ModuleType] = ()) -> None:
-        """Open a policy; call `prepare` before anything else.
+        """Load a policy; call `prepare` before any other method.
 
         source: name or folder of a policy, a run's folder, or a checkpoint; modules: the user's task modules.
         Raises PolicyError, also for an unknown evaluation, or CheckpointError.
@@ -185,7 +185,7 @@ class EvaluationRun(Run):
     def from_args(
         cls, name: str, args: EvaluationArgs, evaluations: Sequence[str] = PLACES, modules: Iterable[ModuleType] = ()
     ) -> EvaluationRun:
-        """Return the prepared evaluation of the policy `args.policy` under the flags of an experiment.
+        """Return a prepared evaluation of the policy `args.policy` with the flags of an experiment.
 
         name: of the output folder; evaluations: accepted keys of `EVALUATIONS`, else PolicyError; modules: the user's
         task modules. Also raises the errors of the constructor and `prepare`.
@@ -193,21 +193,21 @@ class EvaluationRun(Run):
         run = cls(args.policy, modules)
         if run.task.evaluation_suite not in evaluations:
             raise PolicyError(
-                f"this needs a policy that is evaluated by {' or '.join(evaluations)}, "
-                f"{args.policy} is of {run.task.name}, by {run.task.evaluation_suite}"
+                f"expected a policy with evaluation suite {' or '.join(evaluations)}, "
+                f"{args.policy} (task {run.task.name}) has {run.task.evaluation_suite}"
             )
         run.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return the policy's `act`."""
+        """Return the function `act` of the policy."""
         return self.policy.act
 
     def env(
         self, count: int, change: Callable[[TaskCfg], TaskCfg] | None = None, conditions: Conditions | None = None,
         **scene: Any,
     ) -> Env:  # fmt: skip
-        """Return an environment of the policy's task with `count` worlds. Raises PolicyError as `env_of_policy`.
+        """Return an environment of the policy's task with `count` worlds. Raises PolicyError, see `env_of_policy`.
 
         change: function that returns the task with other terminations (default: `Evaluation.prepare_task`); conditions:
         replace the run's; scene: further arguments of `Env`, such as `ground` or `block`.
@@ -224,13 +224,13 @@ class SkillRun(Run):
     """Evaluation of three policies (walk, jump up, jump to) on one robot."""
 
     def __init__(self, names: SkillNames | None = None) -> None:
-        """Open the policies; call `prepare` before anything else. Raises PolicyError or CheckpointError."""
+        """Load the policies; call `prepare` before any other method. Raises PolicyError or CheckpointError."""
         super().__init__()
         self.skills = SkillPolicies(names)
 
     @classmethod
     def from_args(cls, name: str, args: EvaluationArgs, names: SkillNames) -> SkillRun:
-        """Return the prepared evaluation of the named policies under the flags of an experiment; name: of the folder.
+        """Return a prepared evaluation of the named policies with the flags of an experiment; name: of the folder.
 
         Raises PolicyError, CheckpointError or InputError.
         """
@@ -239,16 +239,16 @@ class SkillRun(Run):
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return a function of any argument that returns the actions of all skills, (skills, num_envs, 12)."""
+        """Return a function that ignores its argument and returns all skills' actions, (skills, num_envs, 12)."""
         return lambda obs: self.skills.act(env)
 
     def env(self, count: int, **scene: Any) -> Env:
-        """Return an environment with all skills and `count` worlds; scene: further arguments of `Env`, as `block`."""
+        """Return an environment with all skills and `count` worlds; scene: further arguments of `Env`, e.g. `block`."""
         return self.skills.env(count, self.conditions, **scene)
 
 
 def trained_range(task: TaskCfg) -> dict[str, list[float]]:
-    """Return the range of commands over all levels of a task by name, empty unless it jumps or walks.
+    """Return the range of commands that a task samples at any level, by name; empty unless it jumps or walks.
 
     `trained_range_m`: smallest and largest apex height or distance straight ahead; `trained_velocities`: largest
     velocities ahead, back, to either side [m/s] and about z [rad/s].
@@ -262,7 +262,7 @@ def trained_range(task: TaskCfg) -> dict[str, list[float]]:
 
 
 def write_trials(folder: Path, log: EvaluationLog, number: int) -> None:
-    """Write `log.columns()` as arrays (trials,) to trials.npz; number: of the test in the evaluation, from 1."""
+    """Write the columns of a log as arrays (trials,) to trials.npz; number: of the test in the evaluation, from 1."""
     columns: Any = {
         name: np.array([np.nan if value is None else value for value in values])
         for name, values in log.columns().items()
@@ -274,7 +274,7 @@ def latency_values(steps: np.ndarray, physics_dt: float, requested: float | None
     """Return the simulated latency from action to motor: mean `latency_ms`, `latency` as text, `latency_requested_ms`.
 
     steps: latency of all worlds [physics steps], (num_envs,); physics_dt: physics step [s]; requested [ms]: value of
-    the flag `--latency`, None: without `latency_requested_ms`.
+    the flag `--latency`; None: omit `latency_requested_ms`.
     """
     values: dict[str, Any] = {} if requested is None else {"latency_requested_ms": requested}
     mean = 1000.0 * physics_dt * float(np.mean(steps))
@@ -282,7 +282,7 @@ def latency_values(steps: np.ndarray, physics_dt: float, requested: float | None
 
 
 def latency_text(steps: np.ndarray, physics_dt: float) -> str:
-    """Return latencies (num_envs,) [steps of physics_dt s] as text in ms and steps: one value, or range and mean."""
+    """Format latencies (num_envs,) [physics steps of physics_dt s] in ms and steps: one value, or range and mean."""
     least, most = int(np.min(steps)), int(np.max(steps))
     low, high, mean = (f"{1000.0 * physics_dt * float(value):.3g}" for value in (least, most, np.mean(steps)))
     if least == most:

@@ -2,7 +2,7 @@
 
 A script is a JSON list of commands: `{"walk": [vx, vy, yaw_rate], "seconds": s}` ([m/s], [rad/s], [s]),
 `{"stand": seconds}`, `{"jump_up": height}` (of the base at the apex [m]), `{"jump_to": [ahead, left]}` ([m]), and
-`{"jump_onto": [ahead, left]}` ([m]), where a block then lies.
+`{"jump_onto": [ahead, left]}` ([m], onto a block).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ class ScriptStep:
 
     kind: str  # One of `KINDS`
     values: tuple[float, ...] = (0.0, 0.0, 0.0)
-    """walk: velocity ahead, to the left [m/s], about z [rad/s]; jump_up: height [m]; jump_to, jump_onto: x, y [m]."""
+    """Arguments. walk: velocity ahead, left [m/s], about z [rad/s]; jump_up: height [m]; jump_to, _onto: x, y [m]."""
     seconds: float = 0.0  # [s] Time of walking or standing; 0 for jumps
 
     @property
@@ -40,7 +40,7 @@ class ScriptStep:
 
     @property
     def goal(self) -> tuple[float, float, float]:
-        """Velocity [m/s], [m/s], [rad/s], or for a jump its landing position x, y and apex height z [m]; unused: 0."""
+        """Commanded velocity [m/s], [m/s], [rad/s], or landing position x, y and apex height z [m] of a jump."""
         if self.kind == "jump_up":
             return (0.0, 0.0, self.values[0])
         x, y, z = (*self.values, 0.0, 0.0, 0.0)[:3]
@@ -48,7 +48,7 @@ class ScriptStep:
 
 
 def read_script(path: Path) -> tuple[ScriptStep, ...]:
-    """Return the commands of a script file. Raises InputError, with the path: unreadable, or a malformed command."""
+    """Read the commands of a script file. Raises InputError, with the path: unreadable, or a malformed command."""
     try:
         too_large = path.stat().st_size > MAX_BYTES
         content = None if too_large else json.loads(path.read_bytes())
@@ -65,7 +65,7 @@ def read_script(path: Path) -> tuple[ScriptStep, ...]:
 
 
 def parse_script(content: Any) -> tuple[ScriptStep, ...]:
-    """Return the commands of a parsed JSON script. Raises InputError: a malformed command, or too many or too long."""
+    """Convert JSON data to the commands of a script. Raises InputError: malformed, too many or too long commands."""
     if not isinstance(content, list) or not 1 <= len(content) <= MAX_COMMANDS:
         raise InputError(f"a script is a list of 1 to {MAX_COMMANDS} commands, such as {{'walk': [0.5, 0, 0.3]}}")
     steps = tuple(_step(i, item) for i, item in enumerate(content))
@@ -76,7 +76,7 @@ def parse_script(content: Any) -> tuple[ScriptStep, ...]:
 
 
 def _step(index: int, item: Any) -> ScriptStep:
-    """Return the command at an index (from 0) from its JSON object `item`. Raises InputError: it is malformed."""
+    """Convert a JSON object to a command; index: its place in the script, from 0. Raises InputError: malformed."""
     where = f"command {index + 1}"
     kinds = [key for key in item if key in KINDS] if isinstance(item, dict) else []
     if len(kinds) != 1:
@@ -97,7 +97,7 @@ def _step(index: int, item: Any) -> ScriptStep:
 
 
 def _seconds(where: str, value: Any) -> float:
-    """Return `value` as a positive time [s] up to MAX_SECONDS. Raises InputError; where: prefix of its message."""
+    """Check and return a positive time [s] up to MAX_SECONDS; where: prefix of messages. Raises InputError."""
     (seconds,) = _numbers(f"{where}: seconds", [value], 1, MAX_SECONDS)
     if not seconds > 0.0:
         raise InputError(f"{where}: seconds must be positive, got {seconds:g}")
@@ -105,7 +105,7 @@ def _seconds(where: str, value: Any) -> float:
 
 
 def _numbers(where: str, values: Sequence[Any], count: int, most: float) -> tuple[float, ...]:
-    """Return `values` as `count` finite floats within ±most. Raises InputError; where: prefix of its message."""
+    """Check and return `count` finite floats within ±most; where: prefix of messages. Raises InputError."""
     good = len(values) == count and all(
         isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and abs(v) <= most for v in values
     )

@@ -1,7 +1,7 @@
-"""Suites of jumps to landing positions other than the sweep, and the table of all suites.
+"""Test suites of jumps to landing positions other than the sweep, and the table of all suites.
 
-`jumper evaluate POLICY --suite NAME` runs one. Headings are sampled from the full circle; `jump_metrics` defines the
-metrics.
+`jumper evaluate POLICY --suite NAME` runs a suite. Headings are sampled from the full circle; `jump_metrics` defines
+the metrics.
 """
 
 from __future__ import annotations
@@ -17,28 +17,28 @@ from jumper_warp.evaluation.jump_metrics import PLACE_METRICS, jump_metrics, ran
 from jumper_warp.evaluation.jumps import TOLERANCE, JumpOutcome
 from jumper_warp.evaluation.landings import LandingLog
 from jumper_warp.evaluation.log import within
-from jumper_warp.evaluation.plots import BasePaths, plot_distances, plot_landings, plot_paths, regular_polygons
 from jumper_warp.evaluation.recorder import block_positions
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.evaluation.sweeps import DistanceSweep, HeightSweep, Suite, check
 from jumper_warp.robot.grounds import SIZE, BlockCfg, platform, uneven
 from jumper_warp.utils.metrics import Metrics, MetricValue, chosen, largest, mean, measure, rate
+from jumper_warp.viz.plots import plot_distances, plot_landings, plot_paths, regular_polygons
 
 AHEAD, ASIDE = (0.35, 1.4), (-0.35, 0.35)  # [m] Ranges of the grid's goals ahead and to the left
 SECTORS = ("ahead", "left", "back", "right")  # Quarters of a ring, each centred on its direction
 PAIRS = {"diagonal": ((0.8, 0.2), (0.75, -0.2)), "straight": ((0.8, 0.0), (0.8, 0.0))}
-"""[m] Goals of the paper's two jumps in a row, each relative to the one before."""
+"""[m] Goals of the paper's pairs of jumps in a row, each relative to the previous one."""
 ROW_LOWER, ROW_UPPER, DELAYS = (0.4, -0.2), (0.9, 0.2), (0.3, 1.0)
 """[m] Range of goals in a long row; [s] range of the time until the first command of any row."""
 GROUND_LOWER, GROUND_UPPER = (0.8, -0.15), (1.4, 0.15)
-"""[m] Range of goals off the platform or on the block; the paper's simulation always succeeds in it."""
+"""[m] Range of goals off the platform or on the block, in which all jumps of the paper's simulation succeed."""
 DROP, AMPLITUDE, FLAT_RADIUS = 0.15, 0.05, 0.35
 """[m] Height of the platform; amplitude of the uneven ground; radius of level ground around its start."""
 BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION, BLOCK_BEYOND, BLOCK_WIDTH = 0.05, 10.0, 0.4, 0.40, 0.8
 """[m], [kg], [1] Height, mass, friction with the floor; [m] distance from goal to far side; [m] width along y."""
 BIN, IN_RANGE, LIMIT = 0.1, (1.0, 1.4), 9.0
 """[m] Width of a bin of distances; range of distances of the `in_range` metrics; largest `max_distance`."""
-GIVEN_UP, RELIABLE = 0.5, 0.95  # [1] Success rate below which no farther bin is tried; that of a reliable distance
+GIVEN_UP, RELIABLE = 0.5, 0.95  # [1] Success rate that ends the search for farther bins; rate of a reliable distance
 RATES = {
     "": "success_rate", "_without_hop": "success_without_hop_rate",
     "_without_paw_lift": "success_without_paw_lift_rate",
@@ -48,19 +48,40 @@ MEANS = (
     *RATES.values(), "fall_rate", "miss_rate", "no_paw_lift_rate", "goal_distance_at_rest_mean_m",
     "goal_distance_at_touchdown_mean_m", "distance_flown_mean_m", "paw_to_paw_distance_mean_m", "landing_tilt_max_deg",
 )  # fmt: skip
-"""Metrics of each bin of distances, reported as lists `bin_<key>`."""
+"""Keys of the metrics that are reported for each bin of distances, as lists `bin_<key>`."""
 PUBLISHED = {
     "Barkour (Caluwaerts et al. 2023)": 0.5, "Margolis et al. 2021": 0.66, "Liu et al. 2023": 0.8,
     "Cheng et al. 2024": 0.8, "Atanassov et al. 2024": 0.9, "Jumper, the paper's robot": 1.25,
 }  # fmt: skip
-"""[m] Jump distances of robots, from the paper's table."""
+"""[m] Published jump distances of robots, from the paper's table."""
+
+
+class BasePaths:
+    """Recorder of the paths of all bases; call the object after every policy step."""
+
+    def __init__(self) -> None:
+        self.positions: list[np.ndarray] = []  # [m] x, y of every base, one array (worlds, 2) per step, world frame
+
+    def __call__(self, landings: LandingLog) -> None:
+        """Append the current base positions; NaN for worlds whose last jump has ended."""
+        running = landings.current < landings.goals.shape[1]
+        self.positions.append(np.where(running[:, None], landings.arrays["base_pos"][:, :2], np.nan))
+
+    def in_start_frame(self, headings: np.ndarray) -> np.ndarray:
+        """Return the paths [m], (worlds, steps, 2), ahead and to the left of the world's origin.
+
+        headings [rad]: headings of the robots at the start, (worlds,).
+        """
+        x, y = np.moveaxis(np.stack(self.positions, axis=1), -1, 0)
+        cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
+        return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
 
 
 @dataclass(frozen=True)
 class Grid(Suite):
-    """Jumps to goals on a grid 0.35 to 1.4 m ahead and 0.35 m to either side, two each.
+    """Jumps to goals on a grid 0.35 to 1.4 m ahead and up to 0.35 m to either side, two per goal.
 
-    In range are goals less than 1.4 m ahead, where the paper's jumps all succeed.
+    Goals less than 1.4 m ahead, where all jumps of the paper succeed, are in range.
     """
 
     num_jumps: int = 2
@@ -77,7 +98,7 @@ class Grid(Suite):
 
     @property
     def goals(self) -> np.ndarray:
-        """[m] Goals ahead and to the left, (columns * rows * jumps, 1, 2)."""
+        """Goals of the grid ahead and to the left [m], (columns * rows * jumps, 1, 2)."""
         x, y = np.meshgrid(np.linspace(*AHEAD, self.columns), np.linspace(*ASIDE, self.rows), indexing="ij")
         return np.repeat(np.stack([x.ravel(), y.ravel()], axis=1), self.num_jumps, axis=0)[:, None]
 
@@ -125,11 +146,11 @@ class Ring(Suite):
 
 @dataclass(frozen=True)
 class Consecutive(Suite):
-    """Jumps in a row: the paper's pairs, and ten to random goals; the next is commanded a second after touchdown.
+    """Jumps in a row, each commanded a second after the last touchdown: the paper's pairs, and ten to random goals.
 
     A goal is relative to the robot's position and heading when the jump is commanded. Robots differ in heading and in
     the delay of the first command. After a fall or a collision no further jump counts. `row_all_landed_rate` is the
-    fraction of long rows without a fall or collision, `row_all_success_rate` that in which every jump succeeded.
+    fraction of long rows without a fall or collision, `row_all_success_rate` the fraction with successful jumps only.
     """
 
     num_jumps: int = 20  # Number of trials of each pair
@@ -162,7 +183,7 @@ class Consecutive(Suite):
 
 
 def consecutive_metrics(pairs: LandingLog, row: LandingLog) -> Metrics:
-    """Return the metrics of pairs, and `row_<key>` of long rows; pairs: first half diagonal, second half straight."""
+    """Return the metrics of pairs (first half diagonal, second half straight), and of long rows as `row_<key>`."""
     first, rows = pairs.outcome, row.outcome
     errors = chosen(PLACE_METRICS, "goal_distance_at_rest_mean_m")
     halves, numbers = np.arange(2).repeat(len(first.landed) // 2)[:, None], np.arange(2)
@@ -184,15 +205,15 @@ def consecutive_metrics(pairs: LandingLog, row: LandingLog) -> Metrics:
 class Platform(Suite):
     """Jumps off a platform of 0.15 m, onto uneven ground, and onto a sliding block.
 
-    Most policies observe nothing of the ground but the base's height above the spot below it. Uneven ground has bumps
-    of up to 0.05 m around a level start, and every robot jumps in a random direction. The block, 10 kg and 0.05 m
-    high, reaches from before the goal to beyond it and slides when the robot lands on it; the goal stays. SolverMuJoCo
-    has no sliding block: with it that scene is left out.
+    Most policies observe only the base's height above the ground below it. Uneven ground has bumps of up to 0.05 m
+    around a level start, and every robot jumps in a random direction. The block, 10 kg and 0.05 m high, lies under the
+    goal and slides when the robot lands on it; the goal does not move. With SolverMuJoCo, which has no sliding block,
+    that scene is omitted.
     """
 
     num_jumps: int = 100
     edge: float = 0.40
-    """[m] From the start to the platform's edge, moved back to a multiple of 0.02 m, and to the block's near side."""
+    """[m] Distance from the start to the platform's edge, rounded down to 0.02 m, and to the block's near edge."""
 
     name: ClassVar = "platform"
 
@@ -214,7 +235,7 @@ class Platform(Suite):
             yield "block", {"block": BlockCfg(center, half, BLOCK_HEIGHT, BLOCK_MASS, BLOCK_FRICTION)}, straight
 
     def outlines(self, goals: np.ndarray) -> dict[str, tuple[str, np.ndarray]]:
-        """Return the argument `outlines` of `plot_landings`: platform, median block, and level ground of the bumps."""
+        """Return the outlines of platform, median block, and level ground among bumps, for `plot_landings`."""
         x, y = np.median(goals, axis=0)
         block = rectangle(self.edge, x + BLOCK_BEYOND, y - 0.5 * BLOCK_WIDTH, y + 0.5 * BLOCK_WIDTH)
         level = regular_polygons(np.zeros((1, 2)), FLAT_RADIUS)
@@ -225,7 +246,7 @@ class Platform(Suite):
         }
 
     def measure(self, run: EvaluationRun) -> Metrics:
-        """Run the jumps of all scenes, plot them, and return `<scene>_<key>`."""
+        """Run the jumps of all scenes, plot them, and return the metrics as `<scene>_<key>`."""
         rng = np.random.default_rng(self.stream_seed)
         goals = rng.uniform(GROUND_LOWER, GROUND_UPPER, (self.num_jumps, 2))
         run.settings["edge_m"], values = self.edge, {}
@@ -247,13 +268,13 @@ class Platform(Suite):
 
 @dataclass(frozen=True)
 class Farthest(Suite):
-    """Jumps to bins of goals 0.1 m wide, from 1 m on, until fewer than half of the jumps of a bin succeed.
+    """Jumps to ever farther goals, in bins 0.1 m wide from 1 m on, until fewer than half of a bin's jumps succeed.
 
     Goals of a bin lie in one direction, within 0.05 m of its middle. A far goal may be reached by steps or a second hop
-    after the landing, so three distances are reported, each the largest middle of a bin up to which at least 95 % of
-    the jumps succeed: at all; without a second hop, in which all paws are off the ground again for more than 0.05 s;
-    without a paw lifted again, for 0.05 s. Beside each stand the distance flown by the base and the distance from paws
-    to paws, means of that bin. Published distances were jumped by robots.
+    after the landing. Therefore three reliable distances are reported, the largest middle of a bin up to which at least
+    95 % of the jumps succeed: by any means; without a second hop (all paws off the ground again for more than 0.05 s);
+    without lifting a paw again (for 0.05 s). For each, the bin's mean distance flown by the base, and mean distance
+    from paws to paws, are reported too. Published distances are those of real robots.
     """
 
     num_jumps: int = 100
@@ -271,7 +292,7 @@ class Farthest(Suite):
         check(-180.0 <= self.direction <= 180.0, f"direction must be in -180..180 deg, got {self.direction}")
 
     def goals(self, middle: float) -> np.ndarray:
-        """Return the goals [m], (num_jumps, 1, 2), ahead and left, of the bin around the distance `middle` [m]."""
+        """Return the goals of a bin ahead and to the left [m], (num_jumps, 1, 2); middle: distance of the bin [m]."""
         distance = middle + BIN * (np.linspace(0.0, 1.0, self.num_jumps) - 0.5 if self.num_jumps > 1 else np.zeros(1))
         angle = math.radians(self.direction)
         return distance[:, None, None] * np.array([math.cos(angle), math.sin(angle)])
@@ -301,7 +322,7 @@ class Farthest(Suite):
 
 
 def landed_at(landings: LandingLog) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return goals [m], landing positions [m], (worlds, 2), and success (worlds,) of first jumps, to be plotted."""
+    """Return goals [m], landing positions [m], (worlds, 2) each, and success (worlds,) of first jumps, for plots."""
     return landings.goal_positions[:, 0], landings.landing[:, 0], landings.success[:, 0]
 
 
@@ -311,9 +332,9 @@ def rectangle(x0: float, x1: float, y0: float, y1: float) -> np.ndarray:
 
 
 def distance_metrics(bins: dict[float, LandingLog]) -> Metrics:
-    """Return the metrics over all bins, reliable distances, and `bin_<key>` lists with one entry per bin.
+    """Return the metrics over all bins, reliable distances, and lists `bin_<key>` with one entry per bin.
 
-    bins: log by distance at the bin's middle [m], ascending.
+    bins: logs by distance at the bin's middle [m], ascending.
     """
     outcomes = [landings.outcome for landings in bins.values()]
     together = JumpOutcome(**{name: np.concatenate([getattr(outcome, name) for outcome in outcomes])

@@ -1,4 +1,4 @@
-"""Base class of the suites of jump tests, and the paper's two sweeps: over heights and over distances."""
+"""Base class of the test suites of jumps, and the paper's two sweeps, over heights and over distances."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from jumper_warp.evaluation.jumps import DELAY, REST_TIME, TOLERANCE, with_jump_
 from jumper_warp.evaluation.landings import LandingFlags, LandingLog, random_headings, with_second_takeoff
 from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
 from jumper_warp.evaluation.log import termination_names, within
-from jumper_warp.evaluation.plots import Published, plot_sweep
 from jumper_warp.evaluation.run import HEIGHTS, PLACES, EvaluationArgs, EvaluationRun, trained_range
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, chosen, measure
+from jumper_warp.viz.plots import Published, plot_sweep
 
 PAPER_HEIGHTS = Published(mean_error=0.04, robot=((0.75, 0.0, 0.023), (1.0, 0.01, 0.0)), open_loop=1.075)
 PAPER_DISTANCES = Published(mean_error=0.026, robot=((1.25, 0.0, 0.004),))
@@ -37,10 +37,10 @@ def check(condition: bool, message: str) -> None:
 
 @dataclass(frozen=True)
 class Suite(EvaluationArgs, ABC):
-    """A test of jumping policies: its flags (also those of `EvaluationArgs`), runs and metrics."""
+    """Test suite of jumping policies: its flags (also those of `EvaluationArgs`), runs and metrics."""
 
-    num_jumps: int = 200  # Number of jumps (where there are several scenes, bins or goals on a grid, of each)
-    rest_time: float = REST_TIME  # [s] Time from touchdown until a jump is over
+    num_jumps: int = 200  # Number of jumps (per scene, bin or goal of a grid, where there are several)
+    rest_time: float = REST_TIME  # [s] Time from touchdown to the end of a jump
 
     name: ClassVar[str]  # Value of `jumper evaluate --suite`, and name of the output folder
     evaluations: ClassVar[tuple[str, ...]] = PLACES  # Keys of `EVALUATIONS` of the policies that the suite accepts
@@ -60,14 +60,14 @@ class Suite(EvaluationArgs, ABC):
     def run(self, modules: Iterable[ModuleType] = ()) -> dict[str, Any]:
         """Evaluate the policy, report and return the metrics; modules: the user's task modules.
 
-        Raises PolicyError, CheckpointError or InputError as `EvaluationRun.from_args`.
+        Raises PolicyError, CheckpointError or InputError, see `EvaluationRun.from_args`.
         """
         run = EvaluationRun.from_args(self.name, self, self.evaluations, modules)
         run.settings["rest_s"] = self.rest_time
         return run.report(self.measure(run), self.paper)
 
     def run_flags(self, run: EvaluationRun, flags: Any, env: Env, film: str = "") -> Any:
-        """Run the jumps of `jumper evaluate` with some flags, and return their log; film: name of the recording."""
+        """Run the jumps that flags of `jumper evaluate` define, and return their log; film: name of the recording."""
         log = flags.log(env.task, self.stream_seed)
         log.rest = self.rest_time
         return run.run_episodes(env, log, film=film)
@@ -78,7 +78,7 @@ class Suite(EvaluationArgs, ABC):
     ) -> LandingLog:  # fmt: skip
         """Run jumps to goals [m], (num_envs, jumps in a row, 2), ahead and to the left, and return their log.
 
-        env: default: `run.env`; headings [rad]: (num_envs,), default: random; delay [s]: as in `LandingLog`; options:
+        env: default: `run.env`; headings [rad]: (num_envs,), default: random; delay [s]: see `LandingLog`; options:
         keywords of `EvaluationRun.run_episodes`.
         """
         env = run.env(len(goals)) if env is None else env
@@ -87,7 +87,7 @@ class Suite(EvaluationArgs, ABC):
         return run.run_episodes(env, log, **options)
 
     def pushed_in_flight(self, run: EvaluationRun, metrics: Callable[[Conditions], Metrics], *names: str) -> Metrics:
-        """Return the named metrics of the same test with pushes in flight, as `pushed_in_flight_<name>`.
+        """Repeat a test with pushes in flight; return the named metrics as `pushed_in_flight_<name>`.
 
         Empty for nominal robots, and if the test itself pushes in flight. metrics: runs the test under conditions and
         returns its metrics.
@@ -101,13 +101,13 @@ class Suite(EvaluationArgs, ABC):
 
 @dataclass(frozen=True)
 class HeightSweep(Suite):
-    """Jumps to heights spread evenly over 0.5 to 1.2 m, each once.
+    """Sweep of jumps to evenly spaced heights from 0.5 to 1.2 m, one each.
 
     Every robot stands in the default pose and is commanded to jump after half a second. A jump reaches its height if
-    the highest base height is within 0.1 m of the commanded one. It succeeds if it does so on command, nothing but the
-    paws touches anything, and the base is at rest a second after touchdown. A fall or a collision ends a jump: its apex
-    until then counts. Randomised robots are pushed while a paw is down; a second test pushes them in flight too. The
-    open-loop jump of the same robots (squat, hold, full extension) shows the height that each can reach.
+    the largest base height is within 0.1 m of the commanded height. It succeeds if it also starts on command, no other
+    part than the paws touches anything, and the base is at rest a second after touchdown. A fall or a collision ends a
+    jump, whose apex until then is evaluated. Randomised robots are pushed while a paw is down; a second test pushes
+    them in flight too. The open-loop jump of each robot (squat, hold, full extension) gives the height it can reach.
     """
 
     policy: str = "vertical_jump"
@@ -126,7 +126,7 @@ class HeightSweep(Suite):
 
     @property
     def flags(self) -> HeightFlags:
-        """Flags of `jumper evaluate` with the same jumps."""
+        """Flags of `jumper evaluate` that define the jumps of this suite."""
         return HeightFlags(self.num_jumps, height_range=self.height_range)
 
     def measure(self, run: EvaluationRun) -> Metrics:
@@ -154,19 +154,19 @@ class HeightSweep(Suite):
 
 @dataclass(frozen=True)
 class DistanceSweep(Suite):
-    """Jumps 0.3 to 1.5 m straight ahead, spread evenly, each once.
+    """Sweep of jumps to evenly spaced goals 0.3 to 1.5 m straight ahead, one each.
 
-    Every robot stands in the default pose, with a heading sampled from the full circle, and is commanded to
-    jump after half a second. A jump reaches its goal if the base is within 0.1 m of it in the plane a second after
-    touchdown. It succeeds if it does so on command, nothing but the paws touches anything, and the base is at rest.
-    Paws lifted again, second hops and second takeoffs (upward at 0.25 m/s with no paw down) are reported separately.
+    Every robot stands in the default pose, with a heading sampled from the full circle, and is commanded to jump after
+    half a second. A jump reaches its goal if the base is within 0.1 m of it in the plane a second after touchdown. It
+    succeeds if it also starts on command, no other part than the paws touches anything, and the base is at rest. Paws
+    lifted again, second hops and second takeoffs (upward at 0.25 m/s with no paw down) are reported separately.
     Randomised robots are pushed while a paw is down; a second test pushes them in flight too.
     """
 
     distance_range: tuple[float, float] = (0.3, 1.5)  # [m] Distance of the nearest and of the farthest goal
     max_lateral_offset: float = 0.0  # [m] Largest offset of a goal to either side; offsets are sampled
     end_at_second_takeoff: bool = False
-    """A second takeoff after landing ends a jump, as a failure, as in the authors' configuration."""
+    """Whether a second takeoff after landing ends a jump as a failure, as in the authors' configuration."""
     num_recorded: int = 5
 
     name: ClassVar = "sweep"
@@ -181,17 +181,17 @@ class DistanceSweep(Suite):
 
     @property
     def flags(self) -> LandingFlags:
-        """Flags of `jumper evaluate` with the same jumps."""
+        """Flags of `jumper evaluate` that define the jumps of this suite."""
         side = self.max_lateral_offset
         return LandingFlags(self.num_jumps, goal_x=self.distance_range, goal_y=(-side, side))
 
     def run_jumps(self, run: EvaluationRun, conditions: Conditions, film: str = "") -> LandingLog:
-        """Run one jump per distance under some conditions, return the log; film: name of the recording, or empty."""
+        """Run one jump per distance in given conditions, return the log; film: name of the recording, or empty."""
         change = with_second_takeoff if self.end_at_second_takeoff else with_jump_terminations
         return self.run_flags(run, self.flags, run.env(self.num_jumps, change, conditions), film)
 
     def metrics(self, log: LandingLog) -> Metrics:
-        """Return the metrics of `jumper evaluate`, and the success over the distances of the paper's training."""
+        """Return the metrics of `jumper evaluate`, and the success rate over the paper's range of training."""
         inside, note = within(log.goal_positions[..., 0], PAPER_TRAINED), "over 0.4 to 1 m"
         success = chosen(PLACE_METRICS, "success_rate")
         return self.flags.metrics(log) | measure(success, log.outcome, inside, "paper_training_range_", note)

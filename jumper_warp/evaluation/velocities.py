@@ -1,4 +1,4 @@
-"""Velocity tracking: log, metrics, and flags of `jumper evaluate` and `play`."""
+"""Evaluation of velocity tracking: log, metrics, and flags of `jumper evaluate` and `play`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ Velocity = tuple[float, float, float]  # Ahead, to the left [m/s], about z [rad/
 AXES = ("vx", "vy", "yaw_rate")
 UNITS = ("m_s", "m_s", "rad_s")  # Units of AXES, as keys of metrics end
 PAPER = {"slewed_rmse_vx_m_s": 0.17, "slewed_rmse_vy_m_s": 0.05, "slewed_rmse_yaw_rate_rad_s": 0.12}
-"""Tracking errors of the paper: one test on the robot, with commands up to 0.8 by a person."""
+"""Tracking errors of the paper: one test on the robot, with commands up to 0.8 m/s or rad/s given by a person."""
 SETTLING_TIME = 1.0  # [s] Time after each command that is excluded from the settled tracking errors
 SLEW_RATE = 1.25  # [m/s^2], [rad/s^2] Rate at which the authors' commands change
 STANDING = 64  # Number of robots that are commanded to stand
@@ -42,7 +42,7 @@ class VelocityLog(EvaluationLog):
     kick_time: np.ndarray | None = None  # [s] (robots,) Time of a step change of each base's velocity, or None
     kick: np.ndarray | None = None  # [m/s] (robots, 2) Step change of the velocity at `kick_time`, world axes, or None
     velocity: list[np.ndarray] = field(default_factory=list, init=False)
-    """Velocity in the components of `commands`, one array (robots, 3) per policy step."""
+    """Measured velocity in the components of `commands`, one array (robots, 3) per policy step."""
     end: np.ndarray = field(init=False)  # (robots,) Index of the termination of a fall, -1 if not fallen
     fall_step: np.ndarray = field(init=False)  # (robots,) Policy step of the fall, else the number of steps
 
@@ -70,12 +70,12 @@ class VelocityLog(EvaluationLog):
         self._start = env.sim.joint_q()[:, :3].copy()
 
     def _slewed(self, last: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """Return the commands (robots, 3) one policy step after `last`, on the way to `target`."""
+        """Return the commands (robots, 3) one policy step after `last`, changed towards `target` at the slew rate."""
         limit = (self._slew * self.step_dt)[:, None]
         return np.where(np.isinf(limit), target, last + np.clip(target - last, -limit, limit))
 
     def _target(self, steps: ArrayLike) -> np.ndarray:
-        """Return the commands at policy steps (n,), (n, robots, 3), as if they changed at once."""
+        """Return the commands without slewing at policy steps (n,), (n, robots, 3)."""
         index = np.searchsorted(np.round(self.times / self.step_dt), steps, side="left") - 1
         return self.commands[:, np.maximum(index, 0)].transpose(1, 0, 2)
 
@@ -112,16 +112,16 @@ class VelocityLog(EvaluationLog):
 
     @property
     def fallen(self) -> np.ndarray:
-        """(robots,) Whether each robot fell."""
+        """Whether each robot fell, (robots,)."""
         return self.end >= 0
 
     @property
     def outcomes(self) -> np.ndarray:
-        """(robots,) Name of the termination by which each robot fell, `walked` if it did not."""
+        """Outcome of each robot, (robots,): name of the termination by which it fell, `walked` if it did not fall."""
         return outcome_names([term.name for term in self.task.terminations], "walked")[self.end]
 
     def velocity_history(self) -> np.ndarray:
-        """Return the velocities after every policy step, (steps, robots, 3), NaN from the fall on."""
+        """Return the velocities after every policy step, (steps, robots, 3); NaN after a fall."""
         velocity = np.array(self.velocity, dtype=float).reshape(-1, len(self.commands), 3)
         velocity[np.arange(len(velocity))[:, None] >= self.fall_step] = np.nan
         return velocity
@@ -137,7 +137,7 @@ class VelocityLog(EvaluationLog):
         return np.array(history[1:])
 
     def columns(self) -> dict[str, list]:
-        """Return lists with one value per robot: first command_<axis>, rms_error_<axis> over all time, end."""
+        """Return lists with one value per robot: first command_<axis>, rms_error_<axis> over the walk, end."""
         total, count = np.moveaxis(self.square_errors(settled=False), -1, 0)
         error = np.sqrt(total / np.where(count > 0, count, np.nan))
         columns = {f"command_{axis}": self.commands[:, 0, i] for i, axis in enumerate(AXES)}
@@ -146,20 +146,20 @@ class VelocityLog(EvaluationLog):
 
     @property
     def trials(self) -> dict[str, np.ndarray]:
-        """Sets of robots by name: masks (robots,)."""
+        """Sets of robots that metrics refer to, by name: masks (robots,)."""
         stands, slewed = ~self.commands.any(axis=(1, 2)), np.isfinite(self._slew)
         return {"robots": np.full(self.count, True), "robots with commands at once": ~stands & ~slewed,
                 "robots with slewed commands": ~stands & slewed,
                 "robots that stood to the end": stands & ~self.fallen}  # fmt: skip
 
     def square_errors(self, *, settled: bool) -> np.ndarray:
-        """Return sums of squared errors and numbers of samples, (robots, 3, 2); settled: as for `errors`."""
+        """Return sums of squared errors and numbers of samples, (robots, 3, 2); settled: see `errors`."""
         return square_sums(self.errors(settled=settled))
 
     def errors(self, *, settled: bool = False) -> np.ndarray:
-        """Return velocity minus command, (steps, robots, 3), NaN after a fall; settled: also near commands' changes.
+        """Return velocity minus command, (steps, robots, 3); NaN after a fall.
 
-        Changes are near for SETTLING_TIME.
+        settled: also NaN for SETTLING_TIME after each command.
         """
         error = self.velocity_history() - self.command_history()
         if not settled:
@@ -171,7 +171,7 @@ class VelocityLog(EvaluationLog):
         return error
 
     def series(self, worlds: Sequence[int]) -> dict[str, float]:
-        """Return the last velocities and commands of some robots."""
+        """Return the current velocities and commands of some robots."""
         rows = list(worlds)
         return velocity_series(self.velocity[-1][rows], self.command_history()[-1][rows], self.names(worlds))
 
@@ -180,7 +180,7 @@ class VelocityLog(EvaluationLog):
         return {"commands": self.commands[list(worlds)].tolist(), "times_s": self.times.tolist()}
 
     def velocity_commands(self, worlds: Sequence[int]) -> np.ndarray:
-        """Return the present commands of some robots, (worlds, 3)."""
+        """Return the current commands of some robots, (worlds, 3)."""
         return self.command_history()[-1][list(worlds)]
 
 
@@ -196,7 +196,7 @@ def body_velocity(arrays: dict[str, np.ndarray]) -> np.ndarray:
 
 
 def velocity_series(velocity: np.ndarray, command: np.ndarray, names: Sequence[str]) -> dict[str, float]:
-    """Return velocities and commands, (robots, 3) each, of named robots as values of `EvaluationLog.series`."""
+    """Return velocities and commands, (robots, 3) each, of named robots in the form of `EvaluationLog.series`."""
     series = {}
     for robot, name in enumerate(names):
         for i, (axis, unit) in enumerate(zip(AXES, ("m/s", "m/s", "rad/s"), strict=True)):
@@ -206,12 +206,12 @@ def velocity_series(velocity: np.ndarray, command: np.ndarray, names: Sequence[s
 
 
 def square_sums(error: np.ndarray) -> np.ndarray:
-    """Return sums of squares and numbers of the values that are not NaN, (robots, 3, 2); error: (steps, robots, 3)."""
+    """Return sums of squares, and numbers, of values other than NaN, (robots, 3, 2); error: (steps, robots, 3)."""
     return np.stack([np.nansum(error**2, axis=0), np.isfinite(error).sum(axis=0)], axis=-1)
 
 
 def rmse_rows(prefix: str, over: str, *, settled: bool) -> list[Metric]:
-    """Return rows of a table: `<prefix>rmse_<axis>_<unit>` of `VelocityLog`, over a set of its robots."""
+    """Return the metrics `<prefix>rmse_<axis>_<unit>` of a `VelocityLog`; over: name of a set of its robots."""
     keys = [f"{prefix}rmse_{axis}_{unit}" for axis, unit in zip(AXES, UNITS, strict=True)]
     return [
         Metric(key, rmse, over, lambda o, i=i: o.square_errors(settled=settled)[:, i]) for i, key in enumerate(keys)
@@ -226,28 +226,29 @@ VELOCITY_METRICS = (
     Metric("standing_turn_abs_mean_deg", mean, "robots that stood to the end", lambda o: abs(np.degrees(o.yaw))),
     Metric("fall_rate", rate, "robots", lambda o: o.fallen),
 )
-"""Metrics of walks. Errors are velocity minus command until a fall, over all time; `settled_`: without SETTLING_TIME
-after each command; `slewed_`: of commands that change by SLEW_RATE, as the authors' do. Drift is that of robots
-commanded to stand, over the whole walk."""
+"""Table of the metrics of walks. Errors are velocity minus command until a fall; `settled_`: without SETTLING_TIME
+after each command; `slewed_`: of commands that change at SLEW_RATE, like the authors'. Drift is the final distance from
+the start of robots commanded to stand."""
 
 
 def command_grid(per_axis: int, reach: Sequence[float]) -> np.ndarray:
-    """Return commands on a grid from -reach to reach, (per_axis^3, 1, 3); reach: [m/s], [m/s], [rad/s]."""
+    """Return velocity commands on a grid from -reach to reach, (per_axis^3, 1, 3); reach: [m/s], [m/s], [rad/s]."""
     axes = [np.linspace(-limit, limit, per_axis) for limit in reach]
     return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 1, 3)
 
 
 @dataclass(frozen=True)
 class VelocityFlags:
-    """Commands on a grid of all three velocities at once; each robot gets another command of it at intervals.
+    """Flags of walks: commands from a grid of three velocities; each robot receives a new command at intervals.
 
-    Half of the robots get them at once, half slewed at 1.25 m/s^2 and rad/s^2; further ones are commanded to stand.
+    Half of the robots receive steps of the command, half a command slewed at 1.25 m/s^2 and rad/s^2. Additional robots
+    are commanded to stand.
     """
 
     commands_per_axis: int = 8
-    """Number of commands along each of the three axes of the grid; two robots for each combination."""
+    """Number of commands along each of the three axes of the grid; two robots per combination."""
     max_velocity: tuple[float, float, float] = (0.8, 0.8, 0.8)
-    """[m/s], [m/s], [rad/s] Largest command ahead, to the left and about z; the grid goes from minus to plus this."""
+    """[m/s], [m/s], [rad/s] Largest command ahead, to the left and about z, in both directions."""
     seconds: float = 9.0  # [s] Length of each walk
     command_interval: float = 3.0  # [s] Time from one command to the next
 
@@ -259,7 +260,7 @@ class VelocityFlags:
             raise InputError(f"commands_per_axis must be at least 2, got {self.commands_per_axis}")
 
     def log(self, task: TaskCfg, seed: int) -> VelocityLog:
-        """Return the log of walks; seed: of the order of the commands after the first."""
+        """Return the log of walks; seed: for the order of the commands after the first."""
         rng, grid = np.random.default_rng(seed), command_grid(self.commands_per_axis, self.max_velocity)
         times = np.arange(0.0, self.seconds - 1.0e-9, self.command_interval)
         commands = np.concatenate([grid, *(rng.permutation(grid) for _ in times[1:])], axis=1)
@@ -274,14 +275,14 @@ class VelocityFlags:
 
 @dataclass(frozen=True)
 class VelocityPlayFlags:
-    """A walk that is recorded: commands one after the other."""
+    """Flags of a recorded walk with a sequence of commands."""
 
     velocity: tyro.conf.UseAppendAction[tuple[Velocity, ...]] = ()
-    """[m/s], [m/s], [rad/s] Ahead, to the left, about z; give it once for each command (default: six commands)."""
+    """[m/s], [m/s], [rad/s] Velocity ahead, to the left, about z; repeat the flag per command (default: six)."""
     default_velocities: tyro.conf.Suppress[tuple[Velocity, ...]] = (
         (0.8, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0), (0.6, 0.3, 0.6), (0.0, 0.0, 0.0),
     )  # fmt: skip
-    """Commands if there are none; flags that are given several times would be added to a default."""
+    """Commands if `velocity` is not passed; a default of `velocity` itself would be kept when the flag is passed."""
     command_interval: float = 2.5  # [s] Time from one command to the next
 
     def __post_init__(self) -> None:
@@ -289,16 +290,16 @@ class VelocityPlayFlags:
 
     @property
     def velocities(self) -> tuple[Velocity, ...]:
-        """Successive commands: the flag, or the default."""
+        """Sequence of commands: those of the flag, or the default."""
         return self.velocity or self.default_velocities
 
     @property
     def length(self) -> float:
-        """[s] Length of the recording."""
+        """Length of the recording [s]."""
         return self.command_interval * len(self.velocities)
 
     def log(self, task: TaskCfg) -> VelocityLog:
-        """Return the log of one robot's walk with `velocities` one after the other."""
+        """Return the log of one robot's walk with the commands `velocities` in sequence."""
         commands = np.array(self.velocities, dtype=float)[None]
         return VelocityLog(commands, task, self.length, times=self.command_interval * np.arange(commands.shape[1]))
 

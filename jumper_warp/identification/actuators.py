@@ -1,6 +1,6 @@
-"""Limits, friction and latency of one motor from a test bench: torque against speed, and steps of torque.
+"""Identification of one motor's limits, friction and latency from torque sweeps and torque steps on a test bench.
 
-A bench drives the output shaft at a speed and measures the output torque while the motor is commanded. With
+The bench drives the output shaft at a speed and measures the output torque while the motor is commanded. With
 speed w [rad/s] and a commanded torque c [N m], after the latency,
 
     torque = fade(w) clamp(c, -limit(-w), limit(w)) - friction sign(w),
@@ -52,7 +52,7 @@ class Bench:
     torque: np.ndarray  # (n,) [N m] measured at the output shaft
 
     def __post_init__(self) -> None:
-        """Raise InputError: unequal columns, below 10 rows, not finite, falling times, or speeds above 300 rad/s."""
+        """Raise InputError for unequal columns, below 10 rows, NaN, falling times, or speeds above 300 rad/s."""
         n = len(self.time)
         for name in COLUMNS:
             values = getattr(self, name)
@@ -163,7 +163,7 @@ def characterise_motor(
     """
     check_positive("torque noise", torque_noise)
     if np.ptp(bench.command) == 0.0:
-        raise InputError("bench: the command never changes, which tells nothing of the motor")
+        raise InputError("bench: the command must change to determine the motor's constants")
     nominal, names = described_constants(kind), list(PRIORS)
     prior_std = np.array([PRIORS[name][0] for name in names])
 
@@ -177,7 +177,7 @@ def characterise_motor(
         return np.concatenate([(bench_torque(constants(z), bench) - bench.torque) / torque_noise, z])
 
     starts = [np.zeros(len(names))]
-    for latency in (-1.5, 1.0):  # far from the minimum a delay and a slow rise look alike
+    for latency in (-1.5, 1.0):  # far from the minimum a delay and a slow rise have similar effects
         starts.append(np.where(np.array(names) == "latency", latency, 0.0))
     fits = [least_squares(residuals, start, diff_step=1.0e-5, x_scale="jac", max_nfev=100) for start in starts]
     best = min(fits, key=lambda fit: fit.cost)

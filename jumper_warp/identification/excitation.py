@@ -20,16 +20,16 @@ from jumper_warp.robot.values import RobotValues
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.utils.errors import InputError
 
-MAX_JOINT_SPEED = 25.0  # [rad/s] of a safe motion: two thirds of the slowest motor's no-load speed
-MAX_TILT = 20.0  # [deg] of the base in a safe motion
-MIN_HEIGHT, MAX_HEIGHT = 0.15, 0.65  # [m] of a free base's origin above the ground in a safe motion
+MAX_JOINT_SPEED = 25.0  # [rad/s] largest in a safe motion: two thirds of the slowest motor's no-load speed
+MAX_TILT = 20.0  # [deg] largest tilt of the base in a safe motion
+MIN_HEIGHT, MAX_HEIGHT = 0.15, 0.65  # [m] range of a free base's origin above the ground in a safe motion
 MARGIN = 5.0  # [deg] between the angles of a safe motion and the filter's limits
 
 
 def unsafe_reason(plan: Plan, record: Record, limits: FilterCfg | None = None) -> str:
     """Return the reason why the motion in a plan's record is unsafe, or an empty string if it is safe.
 
-    record: of one world. limits: on motor angles, by default the walking filter's.
+    record: motion of one world. limits: limits of motor angles, by default the walking filter's.
     """
     limits = walking_filter() if limits is None else limits
     angle, rate = record.angle[..., 0] / DEGREES, np.abs(record.rate[..., 0]).max()
@@ -59,7 +59,7 @@ def unsafe_reason(plan: Plan, record: Record, limits: FilterCfg | None = None) -
 
 
 class Scorer:
-    """Simulates planned motions of the described robot and returns their Fisher information about parameters."""
+    """Scorer of planned motions: simulates them on the described robot, and returns their Fisher information."""
 
     def __init__(self, parameters: ParameterSet, noise: NoiseLevels | None = None, replay: MotionReplay | None = None):
         """Score by `parameters` and sensor `noise`; replay: simulation, by default of the project's description."""
@@ -68,7 +68,7 @@ class Scorer:
         self._nominal = parameters.robots(np.zeros((1, len(parameters))))
 
     def record(self, plan: Plan) -> Record:
-        """Return the described robot's motion in a plan, one world, from rest in the pose of the first targets."""
+        """Return the described robot's motion under a plan, one world, from rest in the pose of the first targets."""
         return replay_plan(self.replay, plan, self._nominal)
 
     def information(self, plan: Plan, record: Record) -> np.ndarray:
@@ -87,7 +87,7 @@ class Scorer:
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """Chosen motions and their expected information."""
+    """Chosen motions and their expected information about the parameters."""
 
     plans: tuple[Plan, ...]  # motions, in the order in which they were chosen
     gain: tuple[float, ...]  # [nat] Total information gained over the prior, 1/2 ln det, after each motion
@@ -128,7 +128,7 @@ def choose(
             if gain > best[0]:
                 best = (gain, plan, after)
         if best[1] is None:
-            raise InputError(f"none of {candidates} candidates is safe; the last of them: {refused[-1]}")
+            raise InputError(f"none of {candidates} candidates is safe; reason for the last one: {refused[-1]}")
         information = best[2]
         plans.append(best[1])
         gains.append(best[0])

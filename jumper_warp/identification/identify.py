@@ -120,7 +120,7 @@ def identify_by_evolution(
 
 
 class Descent:
-    """Runs the stages of a Levenberg-Marquardt optimisation (`minimise`) and logs its steps, time and physics steps."""
+    """Levenberg-Marquardt optimisation in stages (`minimise`), with a log of its steps, time and physics steps."""
 
     def __init__(self, replay: MotionReplay):
         """Start the clocks at stage 0, with an empty log; replay: simulation whose physics steps are counted."""

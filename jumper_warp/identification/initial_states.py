@@ -118,7 +118,7 @@ def motors_at_rest(rate: np.ndarray | None) -> bool:
 def first_values(
     values: np.ndarray | None, default: np.ndarray, measured_std: float, default_std: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first value of each column and its standard deviation, (columns,) each; unmeasured: the default's.
+    """Return the first measured value of each column and its standard deviation, (columns,) each, or the default's.
 
     values: (n, columns), NaN where not measured, or None; only the first `FIRST_ROWS` count. default: (columns,).
     """

@@ -259,7 +259,10 @@ class LeastSquares:
         return np.flatnonzero(~((z <= self._low) & (gradient > 0.0) | (z >= self._high) & (gradient < 0.0)))
 
     def _best_trial(self, z: np.ndarray, starts: list[np.ndarray], predicted: float) -> Trial:
-        """Return the result at the best of K points z (K, P), starts (K, I) by motion; predicted: cost decrease."""
+        """Return the `Trial` at the point with the least cost of K points z (K, P), starts (K, I) by motion.
+
+        predicted: decrease of the cost predicted by the linear model.
+        """
         costs, residuals = self._costs(z, starts)
         best = int(np.argmin(costs))
         moved = Point(z[best], [start[best] for start in starts])

@@ -45,14 +45,14 @@ EXAMPLE = (
 class NoiseLevels:
     """Standard deviations of the measurements."""
 
-    angle: float = 0.05  # [deg] Of motor angles
-    rate: float = 1.0  # [deg/s] Of motor rates
-    torque: float = 0.3  # [N m] Of motor torques
-    position: float = 5.0  # [mm] Of the base
-    orientation: float = 0.5  # [deg] Of the base
+    angle: float = 0.05  # [deg] Noise of motor angles
+    rate: float = 1.0  # [deg/s] Noise of motor rates
+    torque: float = 0.3  # [N m] Noise of motor torques
+    position: float = 5.0  # [mm] Noise of the base's position
+    orientation: float = 0.5  # [deg] Noise of the base's orientation
 
     def check(self) -> None:
-        """Raise InputError: a level is not positive and finite."""
+        """Raise InputError unless all levels are positive and finite."""
         for name, value in vars(self).items():
             check_positive(f"noise {name}", value)
 
@@ -81,41 +81,41 @@ class RecordedMotion:
     notes: Mapping[str, Any] = field(default_factory=dict)  # Free-form metadata, saved with the motion
 
     def __post_init__(self) -> None:
-        """Raise InputError: a channel of another shape, not finite, or out of range, or a bad setting."""
-        n, what = len(self.time), f"motion {self.name}"
+        """Raise InputError for a channel of another shape, not finite or out of range, or an invalid setting."""
+        n, where = len(self.time), f"motion {self.name}"
         if n < 3 or self.time.ndim != 1:
-            raise InputError(f"{what}: time must be one column of at least 3 rows, got shape {self.time.shape}")
+            raise InputError(f"{where}: time must be one column of at least 3 rows, got shape {self.time.shape}")
         if not np.isfinite(self.time).all() or not (np.diff(self.time) > 0.0).all():
             row = int(np.argmin(np.concatenate([[1.0], np.nan_to_num(np.diff(self.time), nan=-1.0)]) > 0.0))
-            raise InputError(f"{what}: time must be finite and rise, it does not in row {row}")
+            raise InputError(f"{where}: time must be finite and rise, it does not in row {row}")
         for name, width in (*((name, 12) for name in PER_MOTOR), ("position", 3), ("quaternion", 4)):
             values = getattr(self, name)
             if values is None:
                 continue
             if values.shape != (n, width):
-                raise InputError(f"{what}: {name} must have shape ({n}, {width}), got {values.shape}")
+                raise InputError(f"{where}: {name} must have shape ({n}, {width}), got {values.shape}")
             if np.isinf(values).any() or (name == "target" and np.isnan(values).any()):
                 row = int(np.argwhere(~np.isfinite(values) if name == "target" else np.isinf(values))[0][0])
-                raise InputError(f"{what}: {name} is not finite in row {row}")
+                raise InputError(f"{where}: {name} is not finite in row {row}")
             largest = np.nanmax(np.abs(values)) if not np.isnan(values).all() else 0.0
             if largest > LARGEST_PLAUSIBLE.get(name, math.inf):
                 unit = next(iter(UNITS[name]))
-                raise InputError(f"{what}: {name} reaches {largest:.4g} {unit}: is its unit given in the name?")
+                raise InputError(f"{where}: {name} reaches {largest:.4g} {unit}: give its unit, such as [deg]")
         self._check_settings()
 
     def _check_settings(self) -> None:
-        """Raise InputError: quaternions not of length 1, nothing measured, or a setting out of range."""
-        what = f"motion {self.name}"
+        """Raise InputError if quaternions are not of length 1, nothing is measured, or a setting is out of range."""
+        where = f"motion {self.name}"
         if self.quaternion is not None:
             size = np.linalg.norm(self.quaternion, axis=1)
             if (np.abs(size[np.isfinite(size)] - 1.0) > 1.0e-2).any():
-                raise InputError(f"{what}: quaternions must have length 1")
+                raise InputError(f"{where}: quaternions must have length 1")
         if all(getattr(self, name) is None for name in CHANNELS):
-            raise InputError(f"{what}: nothing is measured; expected one of {', '.join(CHANNELS)}")
+            raise InputError(f"{where}: nothing is measured; expected one of {', '.join(CHANNELS)}")
         if self.base not in ("free", "fixed") or self.gains not in ("jumping", "walking"):
-            raise InputError(f"{what}: base must be free or fixed and gains jumping or walking")
+            raise InputError(f"{where}: base must be free or fixed and gains jumping or walking")
         if not 0.1 <= self.torque_limit <= 1000.0:
-            raise InputError(f"{what}: torque_limit must lie in 0.1 to 1000 N m, got {self.torque_limit}")
+            raise InputError(f"{where}: torque_limit must lie in 0.1 to 1000 N m, got {self.torque_limit}")
 
     @property
     def duration(self) -> float:
@@ -155,7 +155,7 @@ def load_motion(
 
     npz: arrays named as the fields of `RecordedMotion`, settings as JSON in `settings`. CSV and Parquet: columns named
     `time`, `target/FL_lateral`, `position/x`, `quaternion/w` and so on, each with its unit in brackets if it is not the
-    default: `angle/FL_outer [deg]`. Settings of a table lie in a JSON file of the same name beside it.
+    default: `angle/FL_outer [deg]`. Settings of a table are in a JSON file of the same name in its folder.
     torque_constant [N m/A]: torque at the joint per current, for tables with `current` instead of `torque`.
 
     Raises InputError: what is missing, of another shape or unit, or not finite; the message names it. OSError: the file
@@ -175,7 +175,7 @@ def load_motion(
     known = {f.name for f in fields(RecordedMotion)} - {"name", *channels}
     unknown = set(settings) - known
     if unknown:
-        raise InputError(f"{path}: no setting {min(unknown)!r:.60} of a motion; there are {', '.join(sorted(known))}")
+        raise InputError(f"{path}: unknown setting {min(unknown)!r:.60}; expected one of {', '.join(sorted(known))}")
     try:
         return RecordedMotion(name=path.stem, **channels, **settings)
     except (InputError, TypeError) as error:
@@ -196,7 +196,7 @@ def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     known = ("time", *PER_MOTOR, "current", "position", "quaternion")
     for name in arrays:
         if name not in known:
-            raise InputError(f"{path}: no channel {name!r:.60}; there are {', '.join(known)}")
+            raise InputError(f"{path}: unknown channel {name!r:.60}; expected one of {', '.join(known)}")
     for name in ("time", "target"):
         if name not in arrays:
             raise InputError(f"{path}: array {name} is missing")
@@ -254,7 +254,7 @@ def first_non_number(row: list[str]) -> str:
 def read_parquet(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
     """Return (arrays by channel in SI units, settings by name) of a Parquet file.
 
-    Raises InputError: not such a file, or pyarrow is not installed; OSError.
+    Raises InputError: not a Parquet file, or pyarrow is not installed; OSError.
     """
     try:
         import pyarrow

@@ -15,7 +15,7 @@ from jumper_warp.robot.values import LATERAL, LINK_KINDS, MOTOR_QUANTITIES, PAW_
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 
-GROUPS = ("motors", "masses", "friction", "latency", "offsets")  # of parameters, see `jumper_parameters`
+GROUPS = ("motors", "masses", "friction", "latency", "offsets")  # Groups of parameters, see `jumper_parameters`
 BASE_ONLY = ("base_mass", "base_com", "base_inertia", "paw_friction")
 """Quantities without effect on the motion while the base is held and the paws hang free."""
 
@@ -39,10 +39,10 @@ class Parameter:
     group: str = ""  # one of `GROUPS`
 
     def __post_init__(self) -> None:
-        """Raise InputError: bounds that exclude the nominal value, or (ratio) 0 and below, or a prior not positive."""
+        """Raise InputError if bounds exclude the nominal value or (ratio) reach 0, or the prior is not positive."""
         low, high = self.bounds
         if not (math.isfinite(low) and math.isfinite(high) and low <= self.nominal <= high and low < high):
-            raise InputError(f"parameter {self.name}: bounds {self.bounds} must be finite and hold {self.nominal}")
+            raise InputError(f"parameter {self.name}: bounds {self.bounds} must be finite and contain {self.nominal}")
         if not 0.0 < self.prior < math.inf:
             raise InputError(f"parameter {self.name}: prior must be positive and finite, got {self.prior}")
         if self.scale == "ratio" and not low > 0.0:
@@ -82,7 +82,7 @@ class ParameterSet:
     parameters: tuple[Parameter, ...]
 
     def __post_init__(self) -> None:
-        """Raise InputError: no parameters, or two parameters of one name."""
+        """Raise InputError if there are no parameters, or two of one name."""
         names = self.names
         if not names:
             raise InputError("there must be at least one parameter")
@@ -129,7 +129,7 @@ class ParameterSet:
         left_out, known = set(names), {*GROUPS, *self.names, *(p.quantity for p in self.parameters)}
         if left_out - known:
             raise InputError(
-                f"no parameter {min(left_out - known)!r:.60} to leave out; there are {', '.join(self.names)}"
+                f"unknown parameter {min(left_out - known)!r:.60} to exclude; expected one of {', '.join(self.names)}"
             )
         return ParameterSet(tuple(p for p in self.parameters if not left_out & {p.name, p.group, p.quantity}))
 
@@ -140,7 +140,7 @@ class ParameterSet:
         """
         unknown = set(changes) - set(self.names)
         if unknown:
-            raise InputError(f"no parameter {min(unknown)!r}; there are {', '.join(self.names)}")
+            raise InputError(f"unknown parameter {min(unknown)!r}; expected one of {', '.join(self.names)}")
         return ParameterSet(tuple(dataclasses.replace(p, **changes.get(p.name, {})) for p in self.parameters))
 
 
@@ -148,13 +148,13 @@ def jumper_parameters(groups: Sequence[str] = GROUPS, description: RobotDescript
     """Return the robot's parameters of some groups, by default all 79.
 
     motors: kp, kd, armature by motor; torque limit, cutoff and no-load speed by kind of motor. masses: mass, com and
-    inertia of the base, mass ratio by kind of link. friction: of each motor, the knees and the paws. latency: of the
-    targets. offsets: of the 12 angle sensors. Raises InputError: an unknown group or none.
+    inertia of the base, mass ratio by kind of link. friction: friction of each motor, the knees and the paws. latency:
+    latency of the targets. offsets: offsets of the 12 angle sensors. Raises InputError: an unknown group or none.
     """
     unknown = [group for group in groups if group not in GROUPS]
     if unknown or not groups:
         problem = f"unknown group of parameters {unknown[0]!r:.60}" if unknown else "no group of parameters"
-        raise InputError(f"{problem}; there are {', '.join(GROUPS)}")
+        raise InputError(f"{problem}; expected one of {', '.join(GROUPS)}")
     robot = load_description() if description is None else description
     every = (*motor_parameters(robot), *mass_parameters(robot), *friction_parameters(robot))
     every += (
@@ -189,7 +189,7 @@ def relative(
 
 
 def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return the group motors: kp, kd, armature of 12 motors; torque limit and speeds by kind of motor."""
+    """Return the parameters of group motors: kp, kd, armature of 12 motors; torque limit, speeds by kind of motor."""
     parameters = []
     for quantity, prior in (("kp", 0.2), ("kd", 0.2)):
         parameters += [
@@ -210,7 +210,7 @@ def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
 
 
 def mass_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return the group masses: mass, com and inertia of the base, and mass ratios by kind of link."""
+    """Return the parameters of group masses: mass, com and inertia of the base, and mass ratios by kind of link."""
     base = robot.links[0]
     parameters = [relative("base_mass", "base_mass", (0,), "kg", base.mass, 0.15, "masses")]
     for i, axis in enumerate("xyz"):
@@ -226,7 +226,7 @@ def mass_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
 
 
 def friction_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return the group friction: Coulomb friction of 12 motors, damping of the knees, friction of the paws."""
+    """Return the parameters of group friction: Coulomb friction of 12 motors, knee damping, friction of the paws."""
     parameters = [
         ratio(
             f"motor_friction/{joint}", "motor_friction", (i,), "N m", robot.motors[i].coulomb_friction, 0.6, "friction"

@@ -26,7 +26,7 @@ KINDS: tuple[Kind, ...] = ("hung chirp", "hung chirp", "standing chirp", "small 
 TICK = 1.0 / 60.0  # [s] between targets
 SAMPLES = 4  # rows of a motion per tick: 240 Hz
 REST = 0.75  # [s] in the first pose before a motion is recorded, in which the robot comes to rest
-HELD_MASS = 1.0e4  # [kg] of a held base in `simulate_plan`, which also resets its pose after each step
+HELD_MASS = 1.0e4  # [kg] mass of a held base in `simulate_plan`, which also resets its pose after each step
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +35,7 @@ class Plan:
 
     kind: Kind
     target: np.ndarray  # (ticks, 12) [rad] at 60 Hz
-    torque_limit: float  # [N m] of the motor controllers
+    torque_limit: float  # [N m] torque limit of the motor controllers
 
     @property
     def base(self) -> Literal["free", "fixed"]:
@@ -61,7 +61,7 @@ def sample_plan(kind: Kind, rng: np.random.Generator, seconds: float = 1.25, tor
     elif kind in ("hung chirp", "standing chirp"):
         target = chirp_targets(ticks, rng, hung=kind == "hung chirp")
     else:
-        raise InputError(f"no kind of motion {kind!r:.60}; there are {', '.join(dict.fromkeys(KINDS))}")
+        raise InputError(f"unknown kind of motion {kind!r:.60}; expected one of {', '.join(dict.fromkeys(KINDS))}")
     return Plan(kind, target * DEGREES, torque_limit)
 
 
@@ -87,7 +87,7 @@ def chirp_targets(ticks: int, rng: np.random.Generator, hung: bool) -> np.ndarra
 def jump_targets(ticks: int, rng: np.random.Generator) -> np.ndarray:
     """Return targets [deg] (ticks, 12) of a squat, a push-off and a landing, with a random offset of each motor."""
     squat, push, land = rng.uniform(75.0, 95.0), rng.uniform(5.0, 25.0), rng.uniform(50.0, 65.0)
-    down, hold, up = 22, rng.integers(6, 12), rng.integers(9, 13)  # [ticks] of squatting, waiting, push-off
+    down, hold, up = 22, rng.integers(6, 12), rng.integers(9, 13)  # [ticks] durations of squatting, waiting, push-off
     target = np.zeros((ticks, 12))
     for tick in range(ticks):
         if tick < down + hold:
@@ -203,8 +203,8 @@ def measure(
 ) -> RecordedMotion:
     """Return the sensors' recording of a simulated motion: motors at 240 Hz, the base's pose every `base_every` rows.
 
-    name: of the motion. record: true motion of world 0; robots: its sensor offsets. rng: random numbers of the noise,
-    None for no noise. noise: its standard deviations. torque: whether motor torques are recorded.
+    name: name of the motion. record: true motion of world 0; robots: its sensor offsets. rng: random numbers of the
+    noise, None for no noise. noise: its standard deviations. torque: whether motor torques are recorded.
     """
     levels = channel_noise(noise or NoiseLevels())
     rows = len(plan.rows)

@@ -21,7 +21,7 @@ from jumper_warp.sim.slices import WorldRange
 from jumper_warp.utils.rotations import rotate
 from jumper_warp.utils.threads import checked_threads
 
-TOLERANCE = 1.0e-10  # [m/s] of the contact iteration; finite differences of replays inherit its error
+TOLERANCE = 1.0e-10  # [m/s] tolerance of the contact iteration, whose error finite differences of replays inherit
 
 
 @dataclass
@@ -37,12 +37,12 @@ class Record:
 
 
 class MotionReplay:
-    """Replays motor targets in parallel worlds; caches a `Rollout` for each number of worlds and physics step."""
+    """Replay of motor targets in parallel worlds; caches a `Rollout` for each number of worlds and physics step."""
 
     def __init__(
         self, *, description: RobotDescription | None = None, device: wp.DeviceLike = None, threads: int | None = None
     ):
-        """Prepare; description: of the robot, by default the project's; threads: of the CPU."""
+        """Prepare without simulating; description: the robot, by default the project's; threads: CPU threads."""
         self.description = load_description() if description is None else description
         self.world_steps = 0  # Physics steps of all worlds so far
         self._device, self._threads = device, checked_threads(threads)
@@ -65,7 +65,7 @@ class MotionReplay:
         """Return the motion of N worlds, one for each of `robots` and `starts`, without initial contact impulses.
 
         target: motor targets [rad], one row for each physics step of dt [s], (lead + steps, 12); the first `lead` are
-        sent before the start and act late by the latency. rows: number of rows, `stride` physics steps apart; row 0 is
+        sent before the start; each acts after the latency. rows: number of rows, `stride` physics steps apart; row 0 is
         the start. base: "fixed" holds the base at its initial pose. gains, torque_limit [N m]: of the described motors,
         which the ratios of `robots` scale.
         """
@@ -127,7 +127,7 @@ def write_motors(parameters: dict[str, wp.array], motors: MotorCfg, robots: Robo
 
 
 def parameter_table(nominal: np.ndarray, robots: RobotValues) -> np.ndarray:
-    """Return N robots' parameter table (321, N), rows as in `kernels.layout`; nominal: as described, (321, 1)."""
+    """Return the parameter table (321, N) of N robots, rows as in `kernels.layout`; nominal: as described, (321, 1)."""
     table = np.repeat(nominal, len(robots.base_mass), axis=1)
     mass, com = robots.base_mass[:, 0], robots.base_com.T
     nominal_mass, nominal_moment = table[layout.BASE], table[layout.BASE + 1 : layout.BASE + 4]

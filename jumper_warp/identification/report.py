@@ -39,7 +39,7 @@ th:first-child, td:first-child { text-align: left; }
 
 
 def to_json(result: Identification) -> dict[str, Any]:
-    """Return the content of `report.json`: parameters, fit, open combinations of parameters, steps and effort."""
+    """Return the content of `report.json`: parameters and undetermined combinations of them, fit, steps and effort."""
     rows = []
     for i, parameter in enumerate(result.parameters):
         low, high = result.intervals[i]
@@ -84,7 +84,7 @@ def write_results(result: Identification, folder: Path, source: str) -> None:
 
 
 def identified_overlay(result: Identification, source: str = "") -> RobotOverlay:
-    """Return the identified robot as an overlay, with 95 % intervals as ranges of randomisation; source: its origin."""
+    """Return the identified robot as an overlay, with 95 % intervals as randomisation ranges; source: saved text."""
     quantities = tuple(dict.fromkeys(parameter.quantity for parameter in result.parameters))
     return overlay_of(result.robots(), quantities, randomization=randomization_ranges(result), source=source)
 
@@ -149,19 +149,19 @@ def summary(result: Identification) -> str:
     )
     if result.mismatch > 1.0:
         text += (
-            f"</p><p class=note>The model does not explain the data to its noise: intervals are "
-            f"{result.mismatch:.3g} times as wide as noise alone would make them."
+            f"</p><p class=note>The model does not fit the data within the noise: intervals are "
+            f"{result.mismatch:.3g} times as wide as from noise alone."
         )
     notes = "".join(f"<p class=note>{html.escape(line)}</p>" for line in result.warnings)
     return f"<p>{text}</p>{notes}"
 
 
 def open_directions(result: Identification) -> str:
-    """Return an HTML list of the combinations of parameters that the data leaves open."""
+    """Return an HTML list of the combinations of parameters that the data does not determine."""
     if not result.directions:
         return "<p>The data determines every combination of the parameters.</p>"
     lines = "".join(f"<li>{html.escape(words)}</li>" for words in dict.fromkeys(d.words for d in result.directions))
-    return f"<h2>What the data leaves open</h2><ul>{lines}</ul>"
+    return f"<h2>Undetermined combinations of parameters</h2><ul>{lines}</ul>"
 
 
 def html_table(heads: Sequence[str], rows: Sequence[tuple[str, Sequence[str]]]) -> str:
@@ -181,7 +181,7 @@ def parameter_table(result: Identification) -> str:
         cells = (parameter.name, parameter.unit, *(f"{x:.5g}" for x in (parameter.nominal, value, low, high)))
         rows.append(("" if identified else "open", cells))
     heads = ("parameter", "unit", "described", "found", "from", "to (95 %)")
-    return html_table(heads, rows) + "<p class=open>Grey: the prior says more than the data.</p>"
+    return html_table(heads, rows) + "<p class=open>Grey: not identified, the prior determines the value.</p>"
 
 
 def fit_table(result: Identification) -> str:
@@ -209,7 +209,7 @@ def new_figure(width: float, height: float) -> Any:
 
 
 def parameter_plot(result: Identification) -> Any:
-    """Return a figure of all parameters with their 95 % intervals, in standard deviations of their priors."""
+    """Return a plot (Matplotlib figure) of all parameters with 95 % intervals, in prior standard deviations."""
     figure = new_figure(10.0, 3.2)
     axis = figure.subplots()
     place = np.arange(len(result.z))
@@ -224,12 +224,12 @@ def parameter_plot(result: Identification) -> Any:
 
 
 def progress_plot(result: Identification) -> Any:
-    """Return a figure of χ² over the physics steps of the optimisation, a line for each stage."""
+    """Return a plot (Matplotlib figure) of χ² over the physics steps of the optimisation, a line for each stage."""
     figure = new_figure(6.0, 2.6)
     axis = figure.subplots()
     for stage in sorted({step.stage for step in result.steps}):
         steps = [step for step in result.steps if step.stage == stage]
-        label = "all, to the end" if stage == result.steps[-1].stage else f"stage {stage}"
+        label = "final" if stage == result.steps[-1].stage else f"stage {stage}"
         axis.semilogy([s.world_steps / 1e6 for s in steps], [s.chi2 for s in steps], "o-", label=label)
     axis.set(xlabel="million physics steps of all worlds", ylabel="χ² per value")
     axis.legend(fontsize=8)
@@ -237,7 +237,7 @@ def progress_plot(result: Identification) -> Any:
 
 
 def motion_plot(result: Identification, motion: MotionResiduals, start: np.ndarray) -> Any:
-    """Return a figure of one motion; start: coordinates of its initial state, (I,).
+    """Return plots (a Matplotlib figure) of one motion; start: coordinates of its initial state, (I,).
 
     Above: measured and simulated values of the first channel at three motors (or axes). Below: residuals of channels.
     """

@@ -33,7 +33,7 @@ FIXED_AT_REST = (24, 25, 29, 32, 33, 34)
 
 
 class NothingMeasured(InputError):
-    """A motion has no measurement to compare with a replay."""
+    """Error for a motion without measurements to compare with a replay."""
 
 
 class Linearised(NamedTuple):
@@ -58,7 +58,7 @@ class MotionResiduals:
         dt: float | None = None,
         span: tuple[int, int] | None = None,
     ):
-        """Prepare a motion; dt [s]: largest physics step, by default 1/480; span: first row and one past the last.
+        """Prepare the residuals of a motion; dt [s]: largest physics step, default 1/480; span: first row, end row.
 
         Raises InputError: angles of the wrong sign, gaps, or dt out of range; NothingMeasured.
         """
@@ -78,7 +78,7 @@ class MotionResiduals:
         if self.free and not self.initial.resting:
             self.valid[motion.time < motion.time[0] + SETTLING] = False
         if not self.valid.any():
-            raise NothingMeasured(f"motion {motion.name}: nothing is measured that a replay could be compared to")
+            raise NothingMeasured(f"motion {motion.name}: no measurements to compare with a replay")
         self.jacobian_worlds = self._plan_jacobian()
 
     def _make_grid(self, dt: float | None) -> float:
@@ -90,7 +90,7 @@ class MotionResiduals:
         gaps = np.diff(motion.time)
         if gaps.max() > LONGEST_GAP:
             row = int(np.argmax(gaps)) + 1
-            raise InputError(f"motion {motion.name}: {gaps.max():.3g} s pass before row {row}: split it there")
+            raise InputError(f"motion {motion.name}: gap of {gaps.max():.3g} s before row {row}: split it there")
         period = float(np.median(gaps))
         uniform = bool(
             np.abs(motion.time - motion.time[0] - period * np.arange(len(motion.time))).max() < 0.01 * period
@@ -245,7 +245,7 @@ def channel_noise(noise: NoiseLevels) -> dict[str, tuple[float, int]]:
 
 
 def check_signs(motion: RecordedMotion) -> None:
-    """Raise InputError: a motor's angles are far from its targets, but less than half as far from the negated targets.
+    """Raise InputError if a motor's angles are far from its targets, and less than half as far from negated targets.
 
     In motions of `recording` the distance to the negated targets is over four times that to the targets, so a factor of
     two separates both signs. Motors that stay near 0 pass.
@@ -264,7 +264,7 @@ def check_signs(motion: RecordedMotion) -> None:
 
 
 def rows_of(motion: RecordedMotion, first: int, end: int) -> RecordedMotion:
-    """Return the motion with its rows from `first` to `end` - 1 alone."""
+    """Return a motion with the rows `first` to `end` - 1 of another."""
     if (first, end) == (0, len(motion.time)):
         return motion
     return replace(motion, **{name: values[first:end] for name, values in motion.columns().items()})

@@ -66,7 +66,7 @@ class Identification:
     nominal_chi2: float  # [1] χ² of the described robot at the nominal initial states
     count: int  # number of measured values
     fits: tuple[Fit, ...]  # fit of each channel of each motion
-    directions: tuple[Direction, ...]  # combinations of parameters that the data leaves open
+    directions: tuple[Direction, ...]  # combinations of parameters that the data does not determine
     steps: tuple[DescentStep, ...]
     dt: float  # [s] Physics step
     effort: Effort
@@ -110,8 +110,8 @@ class Identification:
                 "fixed": "fixed; if the robot was on the ground: --base free",
             }[base]
             lines.append(
-                f"χ² {self.chi2:.4g} is far above 1, do not trust what was found: {worst.motion} fits worst "
-                f"({worst.channel} {worst.chi2:.4g}), its base is taken as {hint}; else check signs, units, gains and "
+                f"χ² {self.chi2:.4g} is far above 1, do not trust the result: {worst.motion} fits worst "
+                f"({worst.channel} {worst.chi2:.4g}), its base is assumed {hint}; else check signs, units, gains and "
                 "torque limit"
             )
         for prior in self.prior_measurements:
@@ -120,12 +120,12 @@ class Identification:
             if error > LARGEST_PRIOR_ERROR:
                 lines.append(
                     f"{prior.name} is given as {prior.value:.5g} ± {prior.std:.2g} but found as {identified:.5g}, "
-                    f"{error:.1f} deviations apart: check it, intervals do not hold if it is wrong"
+                    f"{error:.1f} deviations apart: check it, the intervals are invalid if it is wrong"
                 )
         return tuple(lines)
 
     def robots(self, count: int = 1) -> RobotValues:
-        """Return the identified robot `count` times, one row a world to simulate."""
+        """Return the identified robot `count` times, one row for each world."""
         return self.parameters.robots(np.repeat(self.z[None], count, axis=0))
 
 

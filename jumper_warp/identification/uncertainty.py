@@ -1,4 +1,4 @@
-"""Uncertainty of an identification: mismatch of the model, and combinations of parameters that the data leaves open."""
+"""Uncertainty of an identification: mismatch of the model, and undetermined combinations of parameters."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from jumper_warp.identification.least_squares import NormalEquations
 from jumper_warp.identification.parameters import Parameter, ParameterSet
 
 WEAK = 3.0
-"""[1] Data information over prior information below which a direction is open: at 3 the std is half the prior's."""
+"""[1] Data over prior information below which a direction is undetermined: at 3 the std is half the prior's."""
 TORQUE_SCALE = (
     "base_mass", "link_mass", "kp", "kd", "saturation", "armature", "motor_friction", "knee_damping",
 )  # fmt: skip
@@ -28,18 +28,18 @@ ADVICE = {
     "motor_friction": "the motors hardly move slowly: add a slow motion in the air",
     "armature": "armature and the inertia of the links cannot be separated: add a fast motion, or torques",
     "link_mass": "masses of neighbouring links cannot be separated: weigh a leg's links",
-    "knee_damping": "the knees' damping hides behind the gains: add a motion with the motors off",
+    "knee_damping": "the knees' damping cannot be separated from the gains: add a motion with the motors off",
     "kd": "damping by the motors and other losses cannot be separated: add torques",
-    "kp": "gains cannot be separated from what the legs carry: add a weighed mass or torques",
+    "kp": "gains cannot be separated from the load of the legs: add a weighed mass or torques",
     "latency": "the targets hardly change: add steps or a faster motion",
-    "offset": "the motions do not tell the sensors' zeros: add the pose of the base, or another pose of the legs",
+    "offset": "the motions do not determine the sensors' zeros: add the pose of the base, or another pose of the legs",
 }
-"""Reason why the data leaves a quantity open, and the measurement that would determine it, by quantity."""
+"""Reason why the data does not determine a quantity, and a measurement that would determine it, by quantity."""
 
 
 @dataclass(frozen=True)
 class Direction:
-    """A combination of parameters that the data leaves open."""
+    """A combination of parameters that the data does not determine."""
 
     information: float
     """[1] Fisher information of the data along the direction over the prior's; 0: only the prior determines it."""
@@ -114,7 +114,7 @@ def _jackknife_variance(changes: Sequence[np.ndarray]) -> np.ndarray:
 
 
 def weak_directions(parameters: ParameterSet, information: np.ndarray) -> tuple[Direction, ...]:
-    """Return the combinations of parameters that the data leaves open (information below `WEAK`), most uncertain first.
+    """Return the combinations of parameters that the data does not determine (below `WEAK`), most uncertain first.
 
     information: Fisher information of the data about the normalised parameters, without priors, (P, P).
     """
@@ -133,7 +133,7 @@ def weak_directions(parameters: ParameterSet, information: np.ndarray) -> tuple[
 
 
 def describe_direction(parameters: ParameterSet, vector: np.ndarray) -> str:
-    """Return an English description of an open direction, with advice on a measurement that would determine it.
+    """Return an English description of an undetermined direction, with a measurement that would determine it.
 
     vector: unit vector in normalised parameters, (P,).
     """
@@ -153,7 +153,7 @@ def describe_direction(parameters: ParameterSet, vector: np.ndarray) -> str:
 
 
 def largest_members(parameters: Sequence[Parameter], vector: np.ndarray, quantity: str) -> str:
-    """Return ` (FL_outer, ...)`: up to four parameters of a quantity with the largest components of `vector` (P,).
+    """Return the largest components of `vector` (P,) in a quantity, up to four parameters, as text ` (FL_outer, ...)`.
 
     Empty if the quantity has only one parameter or all its components are below 0.3.
     """

@@ -1,7 +1,7 @@
 """Weight averaging of two policies (Wortsman et al. 2022, Robust fine-tuning of zero-shot models).
 
-If one policy was fine-tuned from the other, or both from a third, the interpolated networks work as policies too, and
-trade off what each does better.
+If one policy was fine-tuned from the other, or both from a third, the interpolated networks are usable policies too.
+They trade off the strengths of both.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from jumper_warp.rl.actor_init import rescale_inputs
 
 
 def blend(policy: Policy, other: Policy, fraction: float) -> Policy:
-    """Return the policy with the weights (1 - fraction) * policy + fraction * other, and the normaliser of `policy`.
+    """Average the weights of two policies: (1 - fraction) * policy + fraction * other, with the normaliser of `policy`.
 
-    The first layer of `other` is rescaled to that normaliser before. The configuration is a copy of `policy.config`
+    First the first layer of `other` is rescaled to that normaliser. The configuration is a copy of `policy.config`
     with the entry `blended`: the keys share (the fraction), and commit and iteration of `other`.
     fraction: 0 gives `policy`; 1 acts like `other` wherever neither policy clips its normalised observation.
     Raises PolicyError: the interfaces differ, or the fraction is not in [0, 1].

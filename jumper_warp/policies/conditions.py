@@ -1,4 +1,4 @@
-"""Test conditions of a policy, and the environment of a policy in these conditions."""
+"""Conditions in which policies are tested, and the environment of a policy in such conditions."""
 
 from __future__ import annotations
 
@@ -23,33 +23,33 @@ from jumper_warp.utils.streams import purpose_seed
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env
 
-SHORTEST_LATENCY = 500.0 * PHYSICS_DT  # [ms] Half a physics step; a shorter latency would round to 0
+SHORTEST_LATENCY = 500.0 * PHYSICS_DT  # [ms] Half a physics step; shorter latencies would round to 0
 
 
 @dataclass(frozen=True)
 class Conditions:
-    """Conditions of a test: physics, randomisation, and parameters with a fixed value; see `env_of_policy`."""
+    """Conditions of a test: physics, randomisation, seed, and parameters with fixed values; see `env_of_policy`."""
 
     solver: Literal["jumper", "mujoco"] = "jumper"  # Physics: the dedicated solver, or Newton's SolverMuJoCo
     randomize: bool = False  # Sample masses, friction, motors, latency and pushes as in training
     noise: bool = False  # Add the training's observation noise
     seed: int = 0  # Seed of randomisation and noise, 0 to 2147483647
     stream: Literal["tuning", "selection", "reporting"] = "reporting"
-    """Purpose of the test: robots, commands and noise differ from those of other purposes, whatever the seeds."""
+    """Purpose of the test. For any seeds, robots, commands and noise differ from those of other purposes."""
     device: str | None = None  # Warp device (default: a GPU if there is one)
-    threads: int | None = None  # CPU threads that share the worlds (default: all cores); they change no result
+    threads: int | None = None  # CPU threads that share the worlds (default: all cores); results do not depend on it
     robot: Path | None = None
-    """Robot overlay, as `jumper sysid` writes it (default: the training's overlay, if it had one)."""
-    push_in_flight: bool = False  # Push the robot of a randomised test in flight too, not only while a paw is down
+    """Robot overlay file, as written by `jumper sysid` (default: the overlay of the training, if it had one)."""
+    push_in_flight: bool = False  # In randomised tests, push the robot in flight too, not only while a paw is down
     latency: float | None = None
-    """[ms] Latency from action to motor, to the nearest physics step (default: none, or sampled if randomised)."""
+    """[ms] Latency from action to motor, rounded to a physics step (default: none, or sampled if randomised)."""
     gain_scale: tuple[float, float] | None = None
-    """[1] Scales of kp and kd of all motors (default: 1, or sampled if randomised)."""
+    """[1] Factors on kp and kd of all motors (default: 1, or sampled if randomised)."""
     friction: float | None = None
-    """[1] Friction of the paws, static and dynamic (default: nominal, or sampled if randomised)."""
+    """[1] Static and dynamic friction coefficient of the paws (default: nominal, or sampled if randomised)."""
     sensor_offset: float | None = None
     """[deg] Largest constant error of the motors' position sensors (default: none, or sampled if randomised)."""
-    gravity: float | None = None  # [m/s^2] Gravity, downward (default: the task's)
+    gravity: float | None = None  # [m/s^2] Downward gravitational acceleration (default: the task's)
 
     def __post_init__(self) -> None:
         """Raise InputError if a value is out of range, or push_in_flight is set without randomize."""
@@ -65,12 +65,12 @@ class Conditions:
 
     @property
     def stream_seed(self) -> int:
-        """Seed of goals, headings and commands that are sampled on the host, `purpose_seed`."""
+        """Seed of goals, headings and commands that are sampled on the host; see `purpose_seed`."""
         return purpose_seed(self.stream, self.seed)
 
     @property
     def fixed_parameters(self) -> dict[str, Any]:
-        """Arguments of `RandomizationCfg.with_fixed` that are not None here, by name."""
+        """Parameters with fixed values by name, as arguments of `RandomizationCfg.with_fixed`."""
         values = {"latency": self.latency, "gains": self.gain_scale, "friction": self.friction,
                   "sensor_offset": self.sensor_offset}  # fmt: skip
         return {name: value for name, value in values.items() if value is not None}
@@ -86,7 +86,7 @@ class Conditions:
         return None if saved is None else RobotOverlay.from_json(saved)
 
     def env_settings(self, config: dict[str, Any]) -> dict[str, Any]:
-        """Return keyword arguments of `Env` for these conditions. Argument and errors as for `overlay`."""
+        """Return keyword arguments of `Env` for these conditions. Argument and errors: see `overlay`."""
         same = {name: getattr(self, name) for name in ("seed", "stream", "device", "solver", "noise", "threads")}
         return {**same, "randomize": self.sets_parameters, "auto_reset": False, "robot": self.overlay(config)}
 
@@ -96,11 +96,11 @@ class Conditions:
         return self.randomize or bool(self.fixed_parameters)
 
     def _with_fixed_parameters(self, ranges: RandomizationCfg) -> RandomizationCfg:
-        """Return a copy of randomisation ranges, in which each of `fixed_parameters` is always its value."""
+        """Return a copy of randomisation ranges, in which each of `fixed_parameters` is constant."""
         return ranges.with_fixed(**self.fixed_parameters)
 
     def applied(self, task: TaskCfg) -> TaskCfg:
-        """Return a copy of a task in these conditions: gravity, randomisation, events, and no margins.
+        """Return a copy of a task with the gravity, randomisation and events of these conditions, without margins.
 
         With fixed parameters and no randomisation it is on level ground, without the task's events.
         """
@@ -120,12 +120,12 @@ def env_of_policy(
     policy: Policy, num_envs: int, conditions: Conditions, *, change: Callable[[TaskCfg], TaskCfg] | None = None,
     modules: Iterable[ModuleType] = (), **scene: Any,
 ) -> Env:  # fmt: skip
-    """Return the environment of a policy's task in some test conditions.
+    """Return the environment of a policy's task in the given test conditions.
 
-    It has no rewards and no critic observation, and events only if randomised: their functions are not looked up.
+    It has no rewards, no critic observation, and events only if randomised, so that functions of these may be missing.
     policy: its configuration holds the task. change: returns a modified task before the conditions are applied.
     modules: user modules in which the task's functions are looked up. scene: further arguments of `Env`.
-    Raises PolicyError: the task cannot be restored, or its observation is not the policy's.
+    Raises PolicyError: the task cannot be restored, or its observation differs from the policy's.
     """
     from jumper_warp.envs.env import Env
 

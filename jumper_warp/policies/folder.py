@@ -1,4 +1,4 @@
-"""Saving and loading of a policy's folder.
+"""Saving and loading of policies as folders.
 
 It holds `policy.onnx` (weights, normaliser, interface), `config.json` (interface, environment, training, commit,
 versions), added files (`metrics.json`, a learning curve), and `manifest.json` with the SHA-256 of each of these. The
@@ -116,7 +116,7 @@ def list_policies() -> tuple[str, ...]:
 
 
 def find_policy(name: str | Path) -> Path:
-    """Return the folder of a policy: of the project's policy of this name (- counts as _), else `name` as a path.
+    """Return the folder of a policy by the name of a project's policy (- counts as _), else by path.
 
     Raises PolicyError: there is no such policy or folder.
     """

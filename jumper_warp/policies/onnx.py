@@ -1,8 +1,7 @@
 """ONNX files of policies: weights, normaliser and clipping as a graph, and the interface as metadata.
 
-The file is the only place where a policy's weights are saved. A weight of a mirror-symmetric actor is block diagonal
-with two equal blocks: the file stores one block, and the graph pads it to the whole weight, which runtimes evaluate
-once, on loading.
+A policy's weights are saved only in this file. A weight of a mirror-symmetric actor is block diagonal with two equal
+blocks. The file stores one block, and the graph pads it to the whole weight, which runtimes evaluate once, on loading.
 """
 
 from __future__ import annotations
@@ -30,16 +29,16 @@ OPERATORS = {"elu": "Elu", "relu": "Relu", "tanh": "Tanh"}
 METADATA_VERSION = 2
 CONFIG_KEYS = ("commit", "dirty")  # Entries of a policy's configuration that are copied to the metadata
 NORMALISER_TENSORS = {"mean": "normaliser.mean", "std": "normaliser.std"}
-"""Names of the normaliser's tensors by initialiser."""
+"""Names of the normaliser's tensors in `Policy.tensors`, by ONNX initialiser."""
 LAYER_INITIALISER = re.compile(r"actor_(\d+)_(weight|bias|block)")
-"""Names of initialisers with a layer's weight, bias or repeated block."""
+"""Pattern of the names of initialisers that hold a layer's weight, bias or repeated block."""
 
 
 class _GraphBuilder:
-    """Collects the nodes and constants of an ONNX graph; every method returns the name of its output."""
+    """Builder of an ONNX graph: collects nodes and constants; every method returns the name of its output."""
 
     def __init__(self) -> None:
-        """Begin with an empty graph."""
+        """Create an empty graph."""
         self.nodes: list[onnx.NodeProto] = []
         self.constants: list[onnx.TensorProto] = []
 
@@ -54,7 +53,7 @@ class _GraphBuilder:
         return output
 
     def weight(self, layer: int, value: np.ndarray) -> str:
-        """Add the weight of a layer, (out, in), as one padded block if it has two equal blocks on its diagonal."""
+        """Add the weight of a layer, (out, in); if two equal blocks are its diagonal, as one padded block."""
         name, block = f"actor_{layer}_weight", _repeated_block(value)
         if block is None:
             return self.constant(name, value)
@@ -67,7 +66,7 @@ class _GraphBuilder:
 
 
 def _repeated_block(weight: np.ndarray) -> np.ndarray | None:
-    """Return B (out / 2, in / 2) if a weight is bitwise the block diagonal matrix of B and B, else None."""
+    """Return the block B (out / 2, in / 2) of a weight that is bitwise block diagonal with B and B, else None."""
     rows, columns = (size // 2 for size in weight.shape)
     bits = weight.view(np.int32)
     if weight.shape != (2 * rows, 2 * columns) or bits[:rows, columns:].any() or bits[rows:, :columns].any():
@@ -117,11 +116,11 @@ def onnx_model(policy: Policy, config: Mapping[str, Any] | None = None) -> onnx.
 
 
 def metadata(policy: Policy, config: Mapping[str, Any]) -> dict[str, str]:
-    """Return the entries of the ONNX model's metadata, texts by key.
+    """Return the entries of the ONNX model's metadata, strings by key.
 
-    `jumper_warp` is JSON with the whole `PolicyInterface`; the other entries repeat parts of it, comma-separated and
-    unrounded, under the names that common deployment tools read. The network has no memory: past frames are part of the
-    observation, as `observation_layout` specifies.
+    `jumper_warp` is JSON with the whole `PolicyInterface`. The other entries repeat parts of it, comma-separated and
+    unrounded, under the names that common deployment tools read. The network has no internal state: past frames are
+    part of the observation, see `observation_layout`.
     """
     interface = policy.interface
     joints = ("joint_names", "joint_stiffness", "joint_damping", "default_joint_pos", "action_scale")
@@ -133,14 +132,14 @@ def metadata(policy: Policy, config: Mapping[str, Any]) -> dict[str, str]:
 
 
 def onnx_bytes(policy: Policy, config: Mapping[str, Any] | None = None) -> bytes:
-    """Return the ONNX file's content, validated and deterministic; arguments as for `onnx_model`."""
+    """Return the ONNX file's content, validated and deterministic; arguments: see `onnx_model`."""
     model = onnx_model(policy, config)
     onnx.checker.check_model(model, full_check=True)
     return model.SerializeToString(deterministic=True)
 
 
 def policy_from_onnx(data: bytes, interface: PolicyInterface, config: Mapping[str, Any]) -> Policy:
-    """Return the policy whose weights an ONNX file holds; inverts `onnx_bytes` bitwise.
+    """Load the policy in an ONNX file; inverts `onnx_bytes` bitwise.
 
     data: content of the file. interface, config: from config.json; graph and metadata must agree with them.
     Raises PolicyError: the file is damaged, its weights are not valid for the interface, or its graph, opset or
@@ -156,12 +155,12 @@ def policy_from_onnx(data: bytes, interface: PolicyInterface, config: Mapping[st
     layers = [(tensors[f"actor.{i}.weight"], tensors[f"actor.{i}.bias"]) for i in range(len(interface.sizes) - 1)]
     policy = Policy(layers, tensors["normaliser.mean"], tensors["normaliser.std"], interface, config)
     if onnx_model(policy).SerializeToString(deterministic=True) != model.SerializeToString(deterministic=True):
-        raise PolicyError("the graph or the metadata of the ONNX file is not what these weights and config.json make")
+        raise PolicyError("the graph or metadata of the ONNX file differs from that of its weights and config.json")
     return policy
 
 
 def _read_tensors(initialisers: Iterable[TensorProto]) -> dict[str, torch.Tensor]:
-    """Return the tensors of normaliser and layers among initialisers, float32, by the names of `Policy.tensors`.
+    """Return the tensors of normaliser and layers in initialisers, float32, by the names of `Policy.tensors`.
 
     Raises PolicyError: an initialiser is malformed.
     """
@@ -176,10 +175,10 @@ def _read_tensors(initialisers: Iterable[TensorProto]) -> dict[str, torch.Tensor
         try:
             tensor = torch.from_numpy(np.frombuffer(stored.raw_data, "<f4").reshape(tuple(stored.dims)).copy())
         except (ValueError, OverflowError) as error:
-            raise PolicyError(f"{name} does not hold as many numbers as its shape needs") from error
+            raise PolicyError(f"{name}: number of values does not match its shape") from error
         if name.endswith(".block"):
             if tensor.dim() != 2:
-                raise PolicyError(f"{name} must be a matrix, it has shape {tuple(tensor.shape)!s:.60}")
+                raise PolicyError(f"{name} must be a matrix, got shape {tuple(tensor.shape)!s:.60}")
             name, tensor = name.replace("block", "weight"), torch.block_diag(tensor, tensor)
         tensors[name] = tensor
     return tensors

@@ -1,4 +1,4 @@
-"""Trained policies: the actor network with its observation normaliser."""
+"""Trained policies: actor networks with their observation normalisers."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Policy(nn.Module):
         self, layers: Weights, mean: torch.Tensor, std: torch.Tensor, interface: PolicyInterface,
         config: Mapping[str, Any] | None = None,
     ) -> None:  # fmt: skip
-        """Copy the tensors, as float32.
+        """Create a policy from copies of the tensors, as float32.
 
         layers: weight (out, in) and bias (out,) of each layer. mean, std: (num_obs,) of raw observations. interface:
         layout of observation and action, and network sizes. config: JSON configuration of environment and training.
@@ -56,7 +56,7 @@ class Policy(nn.Module):
 
     @property
     def layers(self) -> Weights:
-        """Weight (out, in) and bias (out,) of each layer."""
+        """Weight (out, in) and bias (out,) of each layer of the actor network."""
         return linear_layers(self.actor)
 
     def tensors(self) -> dict[str, torch.Tensor]:
@@ -75,10 +75,10 @@ class Policy(nn.Module):
         Raises InputError, a ValueError: obs is not a tensor, or its last axis does not have num_obs entries.
         """
         if not isinstance(obs, torch.Tensor):
-            raise InputError(f"the policy reads a torch tensor, got {type(obs).__name__}: torch.as_tensor makes one")
+            raise InputError(f"the observation must be a torch tensor, got {type(obs).__name__}: use torch.as_tensor")
         if not obs.dim() or obs.shape[-1] != len(self.mean):
-            got = f"observations of {obs.shape[-1]}" if obs.dim() else "a single number"
-            raise InputError(f"the policy reads {len(self.mean)} numbers, got {got}")
+            got = obs.shape[-1] if obs.dim() else "a scalar"
+            raise InputError(f"the observation must have {len(self.mean)} columns, got {got}")
         limit = self.interface.observation_limit
         finite = torch.nan_to_num(obs, nan=0.0, posinf=0.0, neginf=0.0).clamp(-limit, limit).to(self.mean.dtype)
         limit = self.interface.normalised_limit
@@ -86,18 +86,18 @@ class Policy(nn.Module):
 
 
 def check_tensors(tensors: Mapping[str, torch.Tensor], interface: PolicyInterface) -> None:
-    """Raise PolicyError unless names (as `Policy.tensors`), shapes and values of tensors are valid for an interface."""
+    """Raise PolicyError unless names (see `Policy.tensors`), shapes and values of tensors fit an interface."""
     sizes = interface.sizes
     expected = {"normaliser.mean": (sizes[0],), "normaliser.std": (sizes[0],)}
     for i in range(len(sizes) - 1):
         expected |= {f"actor.{i}.weight": (sizes[i + 1], sizes[i]), f"actor.{i}.bias": (sizes[i + 1],)}
     different = sorted(set(expected) ^ set(tensors))
     if different:
-        raise PolicyError(f"its configuration asks for layers {sizes}; missing or unknown: {', '.join(different):.200}")
+        raise PolicyError(f"configured layers are {sizes}; missing or unknown: {', '.join(different):.200}")
     for name, shape in expected.items():
         tensor = tensors[name]
         if tuple(tensor.shape) != shape:
-            raise PolicyError(f"its configuration asks for {name} of shape {shape}, it has {tuple(tensor.shape)}")
+            raise PolicyError(f"{name} must have the configured shape {shape}, got {tuple(tensor.shape)}")
         if not tensor.isfinite().all():
             raise PolicyError(f"{name} is not finite")
     if not (tensors["normaliser.std"] > 0.0).all():

@@ -1,4 +1,4 @@
-"""Restoring of the task that a policy's or a run's configuration holds.
+"""Restoring of the task in a saved configuration of a policy or a run.
 
 Configurations are data: functions are looked up in the project's modules and in the modules that the user names.
 """
@@ -18,13 +18,13 @@ from jumper_warp.tasks.saving import OPTIONAL, TaskError, task_from_json
 def task_of_policy(
     policy: Policy, modules: Iterable[ModuleType] = (), *, leave_out: Collection[str] = OPTIONAL
 ) -> TaskCfg:
-    """Return a policy's task by `restored_task`, with the same arguments and errors.
+    """Return the task in a policy's configuration; arguments and errors: see `restored_task`.
 
-    Raises PolicyError too if the task's observation is not the policy's.
+    Raises PolicyError also if the task's observation differs from the policy's.
     """
     task = restored_task(policy.config, modules, leave_out=leave_out)
     if task.observation_names != policy.interface.observation_names:
-        raise PolicyError("the policy's observation is not the one that this version of its task gives")
+        raise PolicyError("the policy's observation differs from that of its task in this version")
     return task
 
 

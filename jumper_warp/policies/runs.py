@@ -32,7 +32,7 @@ CURVE = (
 RSL_RL = re.compile(r"model_(\d+)\.pt")  # Names of rsl-rl's checkpoints, with the iteration
 RSL_RL_EPS = 0.01  # rsl-rl adds this to the standard deviation of observations
 RSL_RL_LIMIT = 1.0e6  # Bound of normalised observations, which rsl-rl does not clip
-CURVE_ROWS = 60  # Maximum number of its rows, evenly spaced
+CURVE_ROWS = 60  # Maximum number of rows of a saved learning curve, evenly spaced
 
 
 def is_run(source: str | Path) -> bool:
@@ -77,7 +77,7 @@ def open_policy(source: str | Path, *, newest: bool = False) -> Policy:
 
 @dataclass(frozen=True)
 class CheckpointContents:
-    """Contents of a training checkpoint that make up its policy."""
+    """Policy data in a training checkpoint: configuration, interface, weights and observation statistics."""
 
     config: dict[str, Any]  # configuration of the policy: of the run, with commit, dirty and iteration
     interface: dict[str, Any]  # result of `jumper_warp.tasks.interface.interface`: observation, joints, filter
@@ -142,10 +142,10 @@ class CheckpointContents:
             raise
         except DECODE_ERRORS as error:
             reason = f"{type(error).__name__}: {one_line_message(error)}"
-            raise CheckpointError(f"not of a training of this project ({reason})") from error
+            raise CheckpointError(f"not a training checkpoint of this project ({reason})") from error
 
     def policy(self) -> Policy:
-        """Return the policy. Raises PolicyError: interface, layers and statistics contradict each other."""
+        """Build the policy. Raises PolicyError: interface, layers and statistics contradict each other."""
         description = {**self.interface, "observation_limit": RAW_LIMIT, "normalised_limit": self.limit}
         network = {"hidden": self.hidden, "activation": self.activation}
         interface = make_interface(description, policy_dt=self.policy_dt, physics_dt=self.physics_dt, **network)
@@ -198,15 +198,15 @@ def _symmetry(model: dict[str, torch.Tensor]) -> Symmetry | None:
 
 
 def learning_curve(source: Path) -> bytes | None:
-    """Return the learning curve of a run or a checkpoint's run as `thinned_curve`; None without a metrics file."""
+    """Return the thinned learning curve of a run, or of a checkpoint's run; None without a metrics file."""
     path = run_folder(source) / METRICS_FILE
     return thinned_curve(path.read_bytes()) if path.is_file() else None
 
 
 def thinned_curve(metrics: bytes) -> bytes:
-    """Return the columns CURVE of a metrics file, one JSON object a line, in at most CURVE_ROWS evenly spaced lines.
+    """Reduce a metrics file to the columns CURVE and at most CURVE_ROWS evenly spaced lines of JSON.
 
-    The first and the last line are among them; malformed lines are left out.
+    The first and the last line are included, malformed lines are omitted.
     """
     rows = [row for line in metrics.splitlines() if (row := _curve_row(line))]
     last = len(rows) - 1

@@ -23,7 +23,7 @@ WALK, JUMP_UP, JUMP_TO = range(3)  # Indices of the skills: walking, jump to a h
 
 @dataclass(frozen=True)
 class SkillNames:
-    """Name or folder of the policy of each skill."""
+    """Names or folders of the policies of the three skills."""
 
     walk: str = "walking_flat"  # Follows commanded velocities
     jump_up: str = "vertical_jump"  # Jumps to a commanded height
@@ -34,9 +34,9 @@ class SkillPolicies:
     """Policies of the three skills, in the order WALK, JUMP_UP, JUMP_TO, with the environment that they act in."""
 
     def __init__(self, names: SkillNames | None = None) -> None:
-        """Open the policies (default names: `SkillNames()`).
+        """Load the policies (default names: `SkillNames()`).
 
-        Raises PolicyError or CheckpointError: one cannot be used, or its task is not of this skill.
+        Raises PolicyError or CheckpointError: one cannot be used, or is for another kind of skill.
         """
         self.names = SkillNames() if names is None else names
         sources = (self.names.walk, self.names.jump_up, self.names.jump_to)
@@ -46,11 +46,11 @@ class SkillPolicies:
         for task, accepted in zip(self.tasks, suites, strict=True):
             if task.evaluation_suite not in accepted:
                 needed = " or ".join(accepted)
-                raise PolicyError(f"this needs a policy that is evaluated by {needed}, got one of {task.name}")
+                raise PolicyError(f"expected a policy with evaluation suite {needed}, got one of task {task.name}")
         self.skills, self.handovers = self._skills_and_handovers(Conditions())
 
     def _skills_and_handovers(self, conditions: Conditions) -> tuple[list[TaskCfg], list[Handover]]:
-        """Return the tasks in some conditions, and the handovers between them. Raises PolicyError: tasks do not fit."""
+        """Return the tasks in given conditions, and handovers between them. Raises PolicyError: tasks do not fit."""
         walk, *jumps = (conditions.applied(task) for task in self.tasks)
         try:
             return skills_and_handovers(walk, tuple(jumps))

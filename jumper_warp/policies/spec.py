@@ -1,4 +1,4 @@
-"""Interface of a policy: observation, action, motors and time steps; all that a robot needs besides the weights."""
+"""Interface of a policy: observation, action, motors and time steps, i.e. all data of a policy but its weights."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ JOINT_BOUNDS = {
     "joint_damping": (0.0, 1.0e3),  # [N m s/rad]
     "torque_limit": (1.0e-3, 1.0e4),  # [N m]
 }
-"""Lower and upper bound of the fields with one value per joint."""
+"""Lower and upper bounds of the interface's fields with one value per joint."""
 SCALAR_BOUNDS = {
     "policy_dt": (1.0e-4, 1.0),  # [s]
     "physics_dt": (1.0e-6, 1.0),  # [s]
     "observation_limit": (1.0e-3, 1.0e6),
     "normalised_limit": (1.0e-3, 1.0e6),
 }
-"""Lower and upper bound of the scalar fields."""
+"""Lower and upper bounds of the interface's scalar fields."""
 LAYOUT_FIELDS = ("first", "end", "scale", "clip", "history")  # Fields of each term in an observation layout
 
 
 class PolicyError(InputError):
-    """A policy is missing, damaged, or does not fit its configuration; the message is one line."""
+    """Error: a policy is missing, damaged, or does not fit its configuration. The message is one line."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class PolicyInterface:
     """Observation layout, network sizes, and motor settings of a policy.
 
     Observations are in SI units and rad; velocities and gravity in body axes, angles relative to `default_joint_pos`.
-    A term is clipped, then scaled, and holds past frames, as `observation_layout` specifies. An action a in [-1, 1]
-    commands the motor angle a · action_scale + default_joint_pos.
+    `observation_layout` specifies the clipping, scaling and history of each term; clipping precedes scaling. An action
+    a in [-1, 1] commands the motor angle a · action_scale + default_joint_pos.
     """
 
     task: str  # name of the task
@@ -58,24 +58,24 @@ class PolicyInterface:
     hidden: tuple[int, ...]  # widths of the hidden layers
     activation: str = "elu"
     observation_layout: dict[str, Any] = field(default_factory=dict)
-    """Terms by name, each with first and end column, scale, clip and history; empty if unknown."""
+    """Observation terms by name, each with first and end column, scale, clip and history; empty if unknown."""
     observation_limit: float = 100.0  # raw observations are clamped to ± this; entries that are not finite count as 0
     normalised_limit: float = 10.0  # normalised observations are clamped to ± this many standard deviations
     quaternion_order: str = "xyzw"
 
     def __post_init__(self) -> None:
-        """Check ranges, and that the fields fit each other. Raises PolicyError."""
+        """Raise PolicyError if a field is out of range, or fields contradict each other."""
         for name in ("observation_names", "joint_names"):
             names = getattr(self, name)
             if not names or len(set(names)) < len(names):
                 raise PolicyError(f"{name} must be distinct and not empty")
         for name in (self.task, *self.observation_names, *self.joint_names):
             if not NAME.fullmatch(name):
-                raise PolicyError(f"names must be of letters, digits, and _ . - or spaces, got {name!r:.60}")
+                raise PolicyError(f"names may contain letters, digits, _ . - and spaces, got {name!r:.60}")
         for name, (low, high) in (JOINT_BOUNDS | SCALAR_BOUNDS).items():
             values = getattr(self, name)
             if name in JOINT_BOUNDS and len(values) != len(self.joint_names):
-                raise PolicyError(f"{name} needs {len(self.joint_names)} numbers, one a joint, got {len(values)}")
+                raise PolicyError(f"{name} needs {len(self.joint_names)} numbers, one per joint, got {len(values)}")
             for value in values if name in JOINT_BOUNDS else (values,):
                 if not low <= value <= high:
                     raise PolicyError(f"{name} must lie in {low:.4g} to {high:.4g}, got {value:.4g}")
@@ -112,9 +112,9 @@ class PolicyInterface:
 
 
 def _parse_field(name: str, value: Any, hint: str) -> Any:
-    """Return a JSON value in the type of a hint, such as `tuple[float, ...]`. Raises PolicyError: it has another.
+    """Convert a JSON value to the type of a hint, such as `tuple[float, ...]`. Raises PolicyError: another type.
 
-    Numbers beyond ±1e300 become infinite. name: of the field, for messages.
+    Numbers beyond ±1e300 become infinite. name: the field's, for messages.
     """
     kind = next(k for k in ("dict", "str", "float", "int") if k in hint)
     types = {"str": str, "float": (float, int), "int": int, "dict": dict}[kind]
@@ -140,7 +140,7 @@ def _check_filter(fields: dict[str, Any]) -> None:
 
 
 def _check_layout(layout: dict[str, Any], width: int) -> None:
-    """Raise PolicyError unless a layout is empty, or its terms are valid and fill `width` columns without gaps."""
+    """Raise PolicyError unless an observation layout is empty, or its terms fill `width` columns without gaps."""
     first = 0
     for name, term in layout.items():
         numbers = list(term.values()) if isinstance(term, dict) and set(term) == set(LAYOUT_FIELDS) else [None]

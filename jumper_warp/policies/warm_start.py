@@ -1,4 +1,4 @@
-"""Warm start of a training from a policy: check of its interface, and initialisation of the actor."""
+"""Warm start of a training from a policy: checks of its interface, and initialisation of the actor."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ from jumper_warp.utils.errors import InputError
 
 
 def actor_init_from_policy(source: str | Path, task: TaskCfg, cfg: PpoCfg) -> ActorInit:
-    """Return the initial actor for a training of `task` that acts as the policy `source` (see `open_policy`).
+    """Return the initialisation of a training's actor from the policy `source` (see `open_policy`).
 
     Observation and joints must agree; action scale, gains, torque limits and time steps may differ.
     Raises PolicyError or CheckpointError: there is no such policy, or it cannot be used. Raises InputError: its
-    observation or its joints are not the task's, or as `make_actor_init`.
+    observation or joints differ from the task's, or an error of `make_actor_init`.
     """
     policy = open_policy(source)
     check_interface(policy.interface, interface(task))
@@ -39,7 +39,7 @@ def task_symmetry(task: TaskCfg) -> Symmetry:
 
 
 def check_interface(policy: PolicyInterface, task: dict[str, Any]) -> None:
-    """Raise InputError with the first difference in observation or joints between a policy and a task.
+    """Raise InputError with the first difference, if a policy and a task differ in observation or joints.
 
     task: its description by `jumper_warp.tasks.interface`.
     """
@@ -49,7 +49,7 @@ def check_interface(policy: PolicyInterface, task: dict[str, Any]) -> None:
 
 
 def _compared_values(policy: PolicyInterface, task: dict[str, Any]) -> Iterator[tuple[str, Any, Any]]:
-    """Yield each quantity that must agree: its name for messages, the policy's value and the task's value."""
+    """Yield the quantities that must agree between policy and task, as (name, policy's value, task's value)."""
     for label, field in (("observation", "observation_names"), ("action", "joint_names")):
         for column, names in enumerate(zip_longest(getattr(policy, field), task[field], fillvalue="none")):
             yield f"{label} {column}", names[0], names[1]

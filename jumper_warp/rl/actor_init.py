@@ -1,4 +1,4 @@
-"""Initialisation of a training's actor from a policy instead of random weights."""
+"""Initialisation of an actor from a trained policy instead of random weights."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ from jumper_warp.rl.networks import VARIANCE_EPS, ActorCritic, linear_layers
 from jumper_warp.utils.errors import InputError
 
 PRIOR_ITERATIONS = 100
-"""Weight of the policy's observation statistics [iterations of samples]; many, so that they change slowly."""
+"""Weight of the policy's observation statistics [iterations of samples]; large, so that they change slowly."""
 
 SYMMETRY_TOLERANCE = 0.05
-"""Largest distance from the mirror-symmetric form, relative to the norm of a layer's weights, that is projected."""
+"""Largest distance from a mirror-symmetric actor, relative to the norm of a layer's weights, that is projected."""
 
 
 class ActorInit(NamedTuple):
@@ -32,7 +32,7 @@ def make_actor_init(
     layers: Weights, mean: torch.Tensor, std: torch.Tensor, activation: str, cfg: PpoCfg,
     symmetry: Symmetry | None = None,
 ) -> ActorInit:  # fmt: skip
-    """Return the actor initialisation with which a training with settings `cfg` acts as a given policy.
+    """Return the initialisation that makes the actor of a training with settings `cfg` equal to a given policy.
 
     With `symmetry`, a policy g that is nearly mirror-symmetric is projected to the nearest symmetric policy; any other
     becomes (g(x) + N g(M x)) / 2, in the notation of `jumper_warp.rl.mirror`.
@@ -42,8 +42,8 @@ def make_actor_init(
     """
     if activation != cfg.activation:
         raise InputError(
-            f"init_policy: the policy has activation {activation}, these settings make {cfg.activation}: "
-            f"give --ppo.activation {activation}"
+            f"init_policy: the policy has activation {activation}, the settings {cfg.activation}: "
+            f"pass --ppo.activation {activation}"
         )
     policy_widths = [len(bias) for _, bias in layers[:-1]]
     contracted = None if symmetry is None else _contracted_layers(layers, mean, std, symmetry)
@@ -51,12 +51,12 @@ def make_actor_init(
     if required != list(cfg.hidden):
         settings_widths = [width if contracted is None else 2 * width for width in cfg.hidden]
         raise InputError(
-            f"init_policy: the policy has hidden layers {_joined(policy_widths)}, these settings make "
-            f"{_joined(settings_widths)}: give --ppo.hidden {_joined(required, ' ')}"
+            f"init_policy: the policy has hidden layers {_joined(policy_widths)}, the settings "
+            f"{_joined(settings_widths)}: pass --ppo.hidden {_joined(required, ' ')}"
         )
     least = VARIANCE_EPS**0.5
     if not (std.double().square() > 0.999 * VARIANCE_EPS).all():
-        raise InputError(f"init_policy: the policy divides an observation by {std.min():.3g}, least is {least:.3g}")
+        raise InputError(f"init_policy: an observation's std must be at least {least:.3g}, got {std.min():.3g}")
     if contracted is not None and symmetry is not None:
         return ActorInit(contracted, mean, std, "" if _is_symmetric(layers, symmetry) else "made mirror-symmetric")
     if symmetry is None:
@@ -87,7 +87,7 @@ def apply_actor_init(actor_init: ActorInit, model: ActorCritic, samples: int) ->
 
 
 def _contracted_layers(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> Weights | None:
-    """Return the nearest symmetric actor's layers, of half the widths; None if layers or statistics are not close."""
+    """Return the layers, of half the widths, of the nearest symmetric actor; None if layers or statistics differ."""
     widths = [len(bias) for _, bias in layers[:-1]]
     mean_symmetric = torch.allclose(symmetry.obs.apply(mean), mean, atol=1e-5)
     symmetric = mean_symmetric and torch.allclose(std[symmetry.obs.order], std)
@@ -100,7 +100,7 @@ def _contracted_layers(layers: Weights, mean: torch.Tensor, std: torch.Tensor, s
 
 
 def _is_symmetric(layers: Weights, symmetry: Symmetry) -> bool:
-    """Return whether the layers are a symmetric actor in the form of `expand_layers`."""
+    """Return whether the layers have the form of `expand_layers`, that of a symmetric actor."""
     try:
         contract_layers(layers, symmetry)
     except InputError:
@@ -109,7 +109,7 @@ def _is_symmetric(layers: Weights, symmetry: Symmetry) -> bool:
 
 
 def _averaged(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> ActorInit:
-    """Return the symmetric actor with the network f = g: the policy's layers, rescaled to symmetric statistics."""
+    """Return the symmetric actor whose network f is the policy g, its layers rescaled to symmetric statistics."""
     new_mean, new_var = symmetry.obs.symmetrise_moments(mean.double(), std.double().square())
     rescaled = rescale_inputs(layers, mean, std, new_mean, new_var.sqrt())
     new_layers = [(weight.to(mean.dtype), bias.to(mean.dtype)) for weight, bias in rescaled]
@@ -120,7 +120,7 @@ def _averaged(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: 
 def rescale_inputs(
     layers: Weights, mean: torch.Tensor, std: torch.Tensor, new_mean: torch.Tensor, new_std: torch.Tensor
 ) -> Weights:
-    """Return layers, float64, with the same output for observations normalised by new_mean and new_std.
+    """Return layers (float64) that give the same output for observations normalised by new_mean and new_std.
 
     All statistics are (num_obs,). Only the first layer changes: W (x - mean) / std + b stays the same for all x.
     """

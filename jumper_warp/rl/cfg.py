@@ -1,4 +1,4 @@
-"""Settings of a training; this module does not import PyTorch."""
+"""Settings of a training (this module does not import PyTorch)."""
 
 from __future__ import annotations
 
@@ -31,52 +31,53 @@ class PpoCfg:
     clip: float = 0.2
     """Clipping range of the probability ratio, and of the value in standard deviations of the return."""
     value_coef: float = 2.0
-    """Weight of the value loss."""
+    """Weight of the value loss in the total loss."""
     asymmetric_critic: bool = True
-    """Whether the critic observes simulation states that no sensor measures, instead of the actor's observation."""
+    """Whether the critic also observes privileged simulation states, instead of the actor's observation only."""
     clip_value: bool = True
     """Whether the value loss is clipped."""
     normalise_value: bool = True
     """Whether the critic predicts returns normalised by their running mean and standard deviation."""
     entropy_coef: float = 0.0015
-    """Weight of the entropy bonus."""
+    """Weight of the entropy bonus in the loss of PPO."""
     final_entropy_coef: float | None = None
-    """Final entropy_coef, approached linearly over the second half of a training (default: constant entropy_coef)."""
+    """Entropy coefficient at the end, approached linearly in the second half of a training (default: constant)."""
     lr: float = 1.0e-3
     """Initial learning rate of Adam."""
     min_lr: float = 1.0e-6
-    """Lower bound of the learning rate."""
+    """Lower bound of the adaptive learning rate."""
     max_lr: float = 1.0e-2
-    """Upper bound of the learning rate."""
+    """Upper bound of the adaptive learning rate."""
     desired_kl: float = 0.01
-    """Target KL divergence [nat]: above twice of it the learning rate falls, below half it rises; 0: fixed rate."""
+    """Target KL divergence per update [nat]. Above twice this value the learning rate falls, below half of it the
+    learning rate rises. 0: fixed learning rate."""
     final_desired_kl: float = 0.002
-    """Final desired_kl, approached linearly over the second half of a training."""
+    """Target KL divergence at the end [nat], approached linearly in the second half of a training."""
     max_grad_norm: float = 1.0
-    """Gradients of the actor and of the critic are each clipped to this norm."""
+    """Norm to which the gradients of actor and critic are each clipped."""
     init_std: float = 1.0
     """Initial standard deviation of the exploration noise, in units of the action."""
     reward_scale: float = 0.6
     """Factor on every reward."""
     hidden: tuple[int, ...] = (256, 128, 128)
-    """Widths of the hidden layers."""
+    """Widths of the hidden layers of actor and critic."""
     activation: str = "elu"
-    """elu, relu or tanh."""
+    """Activation of the hidden layers: elu, relu or tanh."""
     symmetry: Literal["off", "actor"] = "off"
-    """Left-right symmetry: with `actor`, mirrored observations give mirrored actions for any weights. The task must
-    define the mirror image of its observation."""
+    """Left-right symmetry of the policy. With `actor`, mirrored observations give mirrored actions for any weights; the
+    task must define the mirror image of its observation."""
     tf32: bool = True
-    """Whether matrix products on a GPU may round their factors to 10 mantissa bits."""
+    """Whether matrix products on a GPU may use TF32, which rounds their factors to 10 mantissa bits."""
     precision: Literal["float32", "bfloat16"] = "float32"
     """Data type of the hidden layers; the last layers, losses and statistics are float32."""
     compile: Literal["auto", "on", "off"] = "auto"
-    """Whether torch.compile fuses elementwise operations; auto: on a GPU only, since a CPU gains nothing. It needs a
-    C++ compiler, and caches compiled code on disk."""
+    """Whether torch.compile fuses elementwise operations; auto: on a GPU only. It needs a C++ compiler, and caches
+    compiled code on disk."""
     graphs: bool = True
     """Whether to capture an iteration as CUDA graphs and replay them; no effect on a CPU."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a setting is out of range."""
+        """Raise InputError (a ValueError) if a setting of PPO is out of range."""
         for name in ("num_steps", "epochs", "minibatches", "lr", "max_grad_norm", "init_std", "clip", "reward_scale"):
             check_positive(name, getattr(self, name))
         for name in ("value_coef", "entropy_coef", "desired_kl", "final_desired_kl"):
@@ -99,7 +100,7 @@ class PpoCfg:
     def batch_size(self, num_envs: int) -> int:
         """Return the number of samples in an iteration of num_envs worlds, num_steps · num_envs.
 
-        Raises ValueError: there is only one, which has no standard deviation, or the minibatches do not divide them.
+        Raises InputError: there is only one sample, or the minibatches do not divide the samples.
         """
         size = self.num_steps * num_envs
         if size < 2:
@@ -111,25 +112,25 @@ class PpoCfg:
 
 @dataclass(frozen=True)
 class ShacCfg:
-    """Settings of SHAC besides `PpoCfg`: num_steps, gamma, lam, networks, reward_scale and init_std."""
+    """Settings of SHAC. It also uses these of `PpoCfg`: num_steps, gamma, lam, networks, reward_scale, init_std."""
 
     lr: float = 1.0e-3
-    """Initial learning rate of the actor; falls linearly to a tenth of it."""
+    """Initial learning rate of the actor, reduced linearly to a tenth of it over the training."""
     critic_lr: float = 1.0e-3
-    """Learning rate of the critic, constant."""
+    """Constant learning rate of the critic."""
     max_grad_norm: float = 1.0
-    """The actor's gradient is clipped to this norm."""
+    """Norm to which the actor's gradient is clipped."""
     target_rate: float = 0.2
-    """Fraction of the difference to the critic that the target critic moves per iteration."""
+    """Fraction of its difference to the critic by which the target critic changes per iteration."""
     critic_epochs: int = 8
     """Passes of the critic over a window of num_steps policy steps."""
     critic_minibatches: int = 4
-    """Optimiser steps per pass."""
+    """Optimiser steps of the critic per pass over a window."""
     entropy_coef: float = 0.0
-    """Weight of the entropy bonus, per policy step."""
+    """Weight of the entropy bonus per policy step in the actor's loss of SHAC."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a setting is out of range."""
+        """Raise InputError (a ValueError) if a setting of SHAC is out of range."""
         for name in ("lr", "critic_lr", "max_grad_norm", "critic_epochs", "critic_minibatches"):
             check_positive(name, getattr(self, name))
         check_not_negative("entropy_coef", self.entropy_coef)
@@ -139,54 +140,54 @@ class ShacCfg:
 
 @dataclass(frozen=True)
 class TrainCfg:
-    """Settings of a training."""
+    """Settings of a training: task, length, files, trainer and its hyperparameters."""
 
     task: str = "vertical-jump"
-    """Name of the task; also the name of the folder of its runs."""
+    """Name of the task, also of the folder of its runs."""
     num_envs: int = 8192
-    """Worlds, over all processes."""
+    """Number of simulated worlds, in total over all processes."""
     max_iterations: int = 2800
-    """Iterations of the run in total, including iterations before a resume."""
+    """Total number of iterations of the run, including those before a resume."""
     max_seconds: float = 0.0
-    """Limit of the training time [s] over all resumes; 0: none. A process counts its time from the end of its first
-    iteration, so that building and compilation do not count; logging and saving do."""
+    """Limit of the training time [s] over all resumes; 0: none. Time is counted from the end of a process's first
+    iteration, without building and compilation, but with logging and saving."""
     seed: int = 1
-    """Seed of weights, noise and worlds, 0 to 2^31 - 1; each process derives a different seed from it."""
+    """Random seed of weights, noise and worlds, 0 to 2^31 - 1; each process derives a different seed from it."""
     device: str | None = None
-    """Torch device (default: a GPU if there is one)."""
+    """PyTorch device, such as cuda:0 or cpu (default: a GPU if there is one)."""
     threads: int | None = None
-    """CPU threads of each process, for its worlds (default: an equal part of the cores) and for torch (default: half
-    the cores but at least two; OMP_NUM_THREADS overrides). Torch's number changes the last digits of results."""
+    """CPU threads of each process, for its worlds (default: an equal part of the cores) and for PyTorch (default: half
+    the cores but at least two; OMP_NUM_THREADS overrides). PyTorch's number changes the last digits of results."""
     log_root: Path = Path("logs")
-    """A run is written to the folder log_root/<task>/<start time>."""
+    """Folder for all runs; a run is written to log_root/<task>/<start time>."""
     log_interval: int = 10
-    """Number of iterations per logged iteration."""
+    """Number of iterations between two logged iterations."""
     save_interval: int = 100
-    """Number of iterations per checkpoint."""
+    """Number of iterations between two checkpoints."""
     max_checkpoints: int = 3
-    """Number of newest checkpoints to keep; the best one is always kept."""
+    """Number of newest checkpoints to keep; the best checkpoint is never deleted."""
     best_metric: str = "Metrics/success"
     """Logged metric that selects the best checkpoint; higher is better."""
     resume: str | None = None
-    """A checkpoint, a run's folder, `latest` for the task's latest run with a checkpoint, or `latest-or-new`, which
-    starts a new run if there is none. `jumper train` uses the saved settings of that run except device, threads,
-    log_root, tensorboard and wandb; flags override them."""
+    """Run to continue: a checkpoint, a run's folder, `latest` for the task's latest run with a checkpoint, or
+    `latest-or-new`, which starts a new run if there is none. `jumper train` uses the saved settings of that run except
+    device, threads, log_root, tensorboard and wandb; flags override them."""
     init_policy: str | None = None
-    """A policy's name or folder, a run's folder (its best checkpoint) or a checkpoint: a new training starts with its
-    actor weights and observation statistics; critic, optimiser and noise are new."""
+    """Policy that a new training starts from: a policy's name or folder, a run's folder (its best checkpoint) or a
+    checkpoint. Its actor weights and observation statistics are used; critic, optimiser and noise are new."""
     trainer: Literal["ppo", "shac", "rsl-rl"] = "ppo"
-    """This package's PPO; SHAC, with gradients through the physics; or rsl-rl-lib's PPO for comparison."""
+    """Training algorithm: this package's PPO; SHAC, with gradients through the physics; or PPO of rsl-rl-lib."""
     tensorboard: bool = True
-    """Write TensorBoard events."""
+    """Whether to write TensorBoard events."""
     wandb: bool = False
-    """Upload to Weights & Biases."""
+    """Whether to upload metrics to Weights & Biases."""
     ppo: PpoCfg = field(default_factory=PpoCfg)
-    """Settings of PPO; SHAC and rsl-rl use some of them."""
+    """Hyperparameters of PPO; SHAC and rsl-rl use some of them."""
     shac: ShacCfg = field(default_factory=ShacCfg)
-    """Further settings of SHAC."""
+    """Further hyperparameters of SHAC."""
 
     def __post_init__(self) -> None:
-        """Raises ValueError: a setting is out of range."""
+        """Raise InputError (a ValueError) if a setting of the training is out of range."""
         object.__setattr__(self, "log_root", Path(self.log_root))
         for name in ("num_envs", "max_iterations", "log_interval", "save_interval", "max_checkpoints"):
             if getattr(self, name) < 1:
@@ -196,8 +197,8 @@ class TrainCfg:
         check_seed(self.seed)
         for name in ("resume", "init_policy"):
             if self.trainer == "rsl-rl" and getattr(self, name):
-                raise InputError(f"{name} is not offered with trainer rsl-rl")
+                raise InputError(f"{name} is not supported with trainer rsl-rl")
         if self.resume and self.resume != LATEST_OR_NEW and self.init_policy:
-            raise InputError("give resume, to continue a training, or init_policy, to begin one, not both")
+            raise InputError("pass resume, to continue a training, or init_policy, to begin one, not both")
         if self.trainer != "ppo" and self.ppo.symmetry != "off":
-            raise InputError(f"symmetry is not offered with trainer {self.trainer}")
+            raise InputError(f"symmetry is not supported with trainer {self.trainer}")

@@ -14,7 +14,7 @@ import torch
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_atomically
 
-MANIFEST = "manifest.json"  # File beside the checkpoints with SHA-256, iteration and score of each
+MANIFEST = "manifest.json"  # File in the checkpoints' folder with SHA-256, iteration and score of each
 REQUIRED = {"iteration": int, "ppo": dict, "env": dict, "rng": dict, "config": str}
 """Required keys of a checkpoint, and the types of their values."""
 DECODE_ERRORS = (LookupError, TypeError, ValueError, AttributeError, RuntimeError)
@@ -22,11 +22,11 @@ DECODE_ERRORS = (LookupError, TypeError, ValueError, AttributeError, RuntimeErro
 
 
 class CheckpointError(InputError):
-    """A checkpoint cannot be used; the message is one line."""
+    """Error: a checkpoint cannot be used. The message is one line."""
 
 
 class Checkpoint(NamedTuple):
-    """A loaded checkpoint."""
+    """Loaded checkpoint: its path and contents, and the newer ones that cannot be used."""
 
     path: Path
     state: dict[str, Any]  # contents, with at least the keys of REQUIRED
@@ -38,7 +38,7 @@ def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = N
 
     folder: created if missing. state: tensors, numbers and strings, with at least the keys of REQUIRED. score: higher
     is better, NaN counts as None; the best checkpoint is never removed. max_checkpoints: number of newest checkpoints
-    to keep besides, at least 1.
+    to keep, at least 1.
     Raises OSError: the disk is full or the folder cannot be written.
     """
     folder.mkdir(parents=True, exist_ok=True)
@@ -64,7 +64,7 @@ def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = N
 def load_checkpoint(path: Path) -> dict[str, Any]:
     """Return the state that `save_checkpoint` saved, on the CPU.
 
-    Raises CheckpointError: the file is missing, has no checksum, differs from it, or is no checkpoint; or its iteration
+    Raises CheckpointError: the file is missing, damaged, without checksum, or no checkpoint; or its iteration
     differs from the manifest.
     """
     entry = _read_manifest(path.parent).get(path.name)
@@ -85,7 +85,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         if type(state[key]) is not expected:
             raise CheckpointError(f"{path}: {key} must be {expected.__name__}, got {type(state[key]).__name__}")
     if state["iteration"] != entry["iteration"]:
-        raise CheckpointError(f"{path}: of iteration {state['iteration']}, {MANIFEST} says {entry['iteration']}")
+        raise CheckpointError(f"{path}: its iteration is {state['iteration']}, in {MANIFEST} {entry['iteration']}")
     return state
 
 
@@ -137,7 +137,7 @@ def best_checkpoint(folder: Path) -> Path:
 
 
 def _best(manifest: dict[str, dict[str, Any]]) -> str | None:
-    """Return the file name with the highest finite score; None without one."""
+    """Return the file name with the highest finite score; None if there is none."""
     scored = [name for name, entry in manifest.items() if entry["score"] is not None and math.isfinite(entry["score"])]
     return max(scored, key=lambda name: manifest[name]["score"], default=None)
 

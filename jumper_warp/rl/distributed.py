@@ -28,7 +28,7 @@ def wait_for_ranks() -> None:
 
 
 def all_reduce_max(values: list[int]) -> list[int]:
-    """Return the elementwise maximum over all processes of lists of one length (blocking)."""
+    """Return the elementwise maximum of a list over all processes (blocking); all lists have equal length."""
     if world_size() == 1:
         return values
     vector = torch.tensor(values, device="cuda" if torch.distributed.get_backend() == "nccl" else "cpu")
@@ -48,7 +48,7 @@ def same_on_all_ranks(text: str) -> bool:
 
 
 def local_rank_zero_first(procedure: Callable[[], None]) -> None:
-    """Run a procedure on local rank 0 of each machine, then on its other ranks, which can read the files it cached."""
+    """Run a procedure on local rank 0 of each machine, then on the other ranks, which read the files it cached."""
     if world_size() == 1:
         procedure()
         return

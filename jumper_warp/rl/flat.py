@@ -1,4 +1,4 @@
-"""Weights, gradients and Adam moments of actor and critic, each as one flat vector, and Adam's step on them."""
+"""Adam optimiser on flat vectors: parameters, gradients and moments of actor and critic are one vector each."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ class Segment(NamedTuple):
 
     @property
     def size(self) -> int:
-        """Entries up to the start of the next parameter."""
+        """Number of entries up to the start of the next parameter, padding included."""
         return aligned(math.prod(self.padded_shape), ALIGNMENT)
 
     def padded_view(self, vector: torch.Tensor) -> torch.Tensor:
@@ -44,13 +44,13 @@ class Segment(NamedTuple):
 
 
 class FlatParameters:
-    """All parameters of an `ActorCritic` as views of `value`, their gradients as views of `gradient`.
+    """Flat vectors of an `ActorCritic`: its parameters are views of `value`, their gradients views of `gradient`.
 
     Order: actor, noise (log_std), critic. The padding between parameters is zero and stays zero.
     """
 
     def __init__(self, model: ActorCritic, activation: str) -> None:
-        """Move the parameters of a model into one vector on its device; activation: of the hidden layers."""
+        """Move the parameters of a model into one vector on its device; activation: that of the hidden layers."""
         actor = [*model.actor.parameters(), model.log_std]
         self.params = [*actor, *model.critic.parameters()]
         input_weights = (model.actor[0].weight, model.critic[0].weight)
@@ -63,13 +63,13 @@ class FlatParameters:
             self.segments.append(Segment(start, padded_shape, shape))
             start += self.segments[-1].size
         self.size, self.actor_size = start, self.segments[len(actor)].start
-        """Entries of the whole vector; entries of actor and noise, which come first."""
+        """Number of entries of the whole vector, and of its first part, actor and noise."""
         device = model.log_std.device
         self.value = torch.zeros(self.size, device=device)
         self.all_reduced = torch.zeros(self.size + ALIGNMENT, device=device)
-        """(size + ALIGNMENT,) averaged over ranks in one all-reduce: the gradient, and `kl` as the last entry."""
+        """Gradient with `kl` as the last entry, (size + ALIGNMENT,), averaged over ranks in one all-reduce."""
         self.gradient, self.kl = self.all_reduced[: self.size], self.all_reduced[-1]
-        """(size,) in the order of `value`; () KL(old ‖ new) of the minibatch."""
+        """Gradient (size,) in the order of `value`, and KL(old ‖ new) () of the minibatch."""
         self.actor_gradient, self.critic_gradient = self.gradient.split((self.actor_size, self.size - self.actor_size))
         for param, segment in zip(self.params, self.segments, strict=True):
             view = segment.view(self.value)
@@ -109,10 +109,10 @@ class AdamVectors(NamedTuple):
 
 
 class FlatAdam:
-    """Adam's state for a flat vector of parameters; agrees with `torch.optim.Adam` to rounding."""
+    """Adam optimiser of a flat vector of parameters; agrees with `torch.optim.Adam` to rounding."""
 
     def __init__(self, flat: FlatParameters, lr: float) -> None:
-        """lr: initial learning rate, kept on the device as `self.lr`."""
+        """Allocate Adam's state, all zeros; lr: initial learning rate, stored on the device as `self.lr`."""
         self.flat = flat
         self.exp_avg, self.exp_avg_sq = torch.zeros_like(flat.value), torch.zeros_like(flat.value)
         self.step, self.lr = (torch.full((), x, device=flat.value.device) for x in (0.0, lr))
@@ -138,7 +138,7 @@ class FlatAdam:
 
 
 def adapted_lr(lr: torch.Tensor, kl: torch.Tensor, cfg: PpoCfg, desired_kl: torch.Tensor | float) -> torch.Tensor:
-    """Return the learning rate () adapted to the KL divergence: / 1.5 above 2 desired_kl, · 1.5 below desired_kl / 2.
+    """Return the learning rate (), divided by 1.5 if kl > 2 desired_kl, multiplied by 1.5 if kl < desired_kl / 2.
 
     It stays within cfg.min_lr and cfg.max_lr, and is fixed if cfg.desired_kl is 0.
     """

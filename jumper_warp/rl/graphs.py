@@ -15,14 +15,14 @@ BACKEND = "inductor"  # Backend of torch.compile
 
 
 class Compiler:
-    """Wraps functions with torch.compile if enabled; after a failure it prints one warning and runs them eagerly.
+    """Wrapper of functions with torch.compile; after a failure it prints one warning and runs them eagerly.
 
     A function is compiled, or read from Inductor's cache on disk, at its first call. The shapes of its tensors and its
     other arguments must stay the same afterwards.
     """
 
     def __init__(self, enabled: bool) -> None:
-        """enabled: whether to compile at all."""
+        """Create a compiler; if not `enabled`, it returns functions unchanged."""
         self.enabled = enabled
 
     def __call__(self, function: Callable[..., Any]) -> Callable[..., Any]:
@@ -32,7 +32,7 @@ class Compiler:
         compiled: Callable[..., Any] | None = None
 
         def call(*args: Any) -> Any:
-            """Call the compiled function; eagerly if compilation failed."""
+            """Call the compiled function, or the eager function if compilation failed."""
             nonlocal compiled
             if compiled is not None:
                 return compiled(*args)
@@ -43,7 +43,7 @@ class Compiler:
                 result = tried(*args)
             except Exception as error:  # compilers raise many types
                 self.enabled = False
-                print(f"not compiled, training is slower: {_failure_reason(error)}", file=sys.stderr)
+                print(f"torch.compile failed, training is slower: {_failure_reason(error)}", file=sys.stderr)
                 return function(*args)
             compiled = tried
             return result
@@ -52,7 +52,7 @@ class Compiler:
 
 
 def _options() -> dict[str, str | int | bool | Callable[..., Any]] | None:
-    """Return Inductor's options: deterministic, i.e. without choosing kernels of another summation order by timing.
+    """Return Inductor's options for deterministic results: timing must not select kernels that sum in another order.
 
     ATEN_CPU_CAPABILITY limits its vectors too: PyTorch 2.13 would compile AVX-512 code against headers of the limit.
     """
@@ -77,13 +77,13 @@ def _failure_reason(error: Exception) -> str:
 
 
 class CapturedProcedure:
-    """A procedure that runs eagerly once, and is captured and replayed as a CUDA graph afterwards, if enabled.
+    """Procedure that runs eagerly once; if enabled, it is then captured and replayed as a CUDA graph.
 
-    If the capture fails on any rank, all ranks run it eagerly, and print a warning.
+    If the capture fails on any rank, all ranks run the procedure eagerly, and print a warning.
     """
 
     def __init__(self, procedure: Callable[[], object], enabled: bool) -> None:
-        """procedure: reads and writes the same tensors in every call, without synchronising with the host."""
+        """Wrap a procedure; it uses the same tensors in every call and does not synchronise with the host."""
         self._procedure = procedure
         self.enabled = enabled
         self._graph: torch.cuda.CUDAGraph | None = None
@@ -94,7 +94,7 @@ class CapturedProcedure:
         self._graph = None
 
     def __call__(self) -> None:
-        """Run the procedure once."""
+        """Run the procedure once, as a graph if it has been captured."""
         if self.enabled and self._warm and self._graph is None:
             self._capture()
         if self._graph is not None:
@@ -120,4 +120,4 @@ class CapturedProcedure:
         if self.enabled:
             self._graph = graph
         else:
-            print(f"not captured as a CUDA graph, training is slower{reason}", file=sys.stderr)
+            print(f"CUDA graph capture failed, training is slower{reason}", file=sys.stderr)

@@ -22,20 +22,20 @@ REWARDS = ("Episode_Reward/", "Episode_Sum/")  # Parts of the names of metrics t
 
 
 class Stopwatch:
-    """Measures the device time of the parts of an iteration (lap); it synchronises with the device only in `read`."""
+    """Stopwatch for the device time of the parts of an iteration (lap); only `read` synchronises with the device."""
 
     def __init__(self, device: torch.device) -> None:
-        """device: whose time is measured, by CUDA events on a GPU and the host's clock on a CPU."""
+        """Measure the time of `device`, with CUDA events on a GPU and the host's clock on a CPU."""
         self._cuda, self._since = device.type == "cuda", time.perf_counter()
         self._laps: list[list[Any]] = []  # marks of each lap: CUDA events, or times [s]
 
     def start(self) -> None:
-        """Begin a lap, and its first part."""
+        """Begin a lap and its first part."""
         self._laps.append([])
         self.mark()
 
     def mark(self) -> None:
-        """End a part of the current lap, and begin the next one."""
+        """End a part of the current lap and begin the next part."""
         mark: Any = torch.cuda.Event(enable_timing=True) if self._cuda else time.perf_counter()
         if self._cuda:
             mark.record()
@@ -57,16 +57,17 @@ class Stopwatch:
 
 
 class TrainingLog:
-    """Context manager that logs metrics. A failure to write prints one warning, and the training continues."""
+    """Context manager that logs metrics of a training. A failure to write prints one warning, training continues."""
 
     def __init__(
         self, folder: Path, config: dict[str, Any], total: int, tensorboard: bool = True, wandb: bool = False,
         iteration: int = 0,
     ) -> None:  # fmt: skip
-        """folder: the run's existing folder. config: JSON-ready configuration of the run.
+        """Open the outputs; folder: the run's existing folder.
 
-        total: iterations at the run's end. tensorboard: whether to write events. wandb: whether to upload to Weights &
-        Biases. iteration: iterations so far; logged lines of later iterations are removed.
+        config: JSON-ready configuration of the run. total: iterations at the run's end. tensorboard: whether to write
+        events. wandb: whether to upload to Weights & Biases. iteration: iterations so far; lines logged of later
+        iterations are removed.
         Raises InputError: Weights & Biases is requested but not installed. OSError: the metrics file cannot be used.
         """
         self._console = _PipeSafeConsole(stderr=True)
@@ -84,7 +85,7 @@ class TrainingLog:
         """Show the progress bar; report lines that were removed from the metrics file."""
         self._progress.start()
         if self._file.dropped:
-            self.print_line(f"{self._file.path}: dropped {self._file.dropped} lines, cut or of later iterations")
+            self.print_line(f"{self._file.path}: removed {self._file.dropped} incomplete or later lines")
         return self
 
     def __exit__(
@@ -111,7 +112,7 @@ class TrainingLog:
         except OSError as error:
             if not self._disk_full:
                 path = self._file.path
-                self.print_line(f"{path}: {error.strerror}; training continues, the metrics follow when there is room")
+                self.print_line(f"{path}: {error.strerror}; training continues, the metrics are written later")
             self._disk_full = True
         self._write_events(iteration, metrics)
         if self._wandb:
@@ -121,7 +122,7 @@ class TrainingLog:
         if not self._console.is_terminal:
             self.print_line(f"iteration {iteration}/{self._total}: {summary}, {format_duration(remaining)} left")
         for name in _non_finite_terms(metrics):
-            self.print_line(f"reward term {name} was not finite in some steps, where it counts as 0: correct it")
+            self.print_line(f"reward term {name} was not finite in some steps and counted as 0: check its function")
 
     def _write_events(self, iteration: int, metrics: dict[str, float]) -> None:
         """Write TensorBoard events; the first failure disables them."""
@@ -133,7 +134,7 @@ class TrainingLog:
             self._events.flush()
         except OSError as error:
             self.print_line(
-                f"no TensorBoard events from iteration {iteration} on: {error.strerror}; {METRICS_FILE} has them all"
+                f"no TensorBoard events from iteration {iteration} on: {error.strerror}; see {METRICS_FILE} instead"
             )
             with suppress(OSError):
                 self._events.close()
@@ -149,7 +150,7 @@ class _PipeSafeConsole(Console):
 
 
 def _summary(metrics: dict[str, float]) -> str:
-    """Return steps per second, mean reward of an episode and success rate as one line, as far as metrics has them."""
+    """Return one line with steps per second and, if in metrics, mean reward of an episode and success rate."""
     parts = [f"{metrics['Perf/total_fps']:,.0f} steps/s"]
     if (total := metrics.get("Train/mean_reward")) is not None:
         parts.append(f"reward {total:.2f}")

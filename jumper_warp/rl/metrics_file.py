@@ -1,4 +1,4 @@
-"""The metrics file of a run: one JSON object a line, in the order of the iterations, without partial lines."""
+"""Metrics file of a run: one JSON object per line, in the order of the iterations, without partial lines."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ METRICS_FILE = "metrics.jsonl"  # File in a run's folder, with one JSON object p
 
 
 class MetricsFile:
-    """Appends lines of metrics atomically; lines that could not be written are appended with the next one."""
+    """Metrics file with atomic appends; lines that could not be written are appended with the next one."""
 
     def __init__(self, path: Path, iteration: int) -> None:
         """Open the file to continue after `iteration`; lines of later iterations and malformed lines are removed.

@@ -1,8 +1,8 @@
 """Left-right symmetry of the actor.
 
 A mirror map takes a vector x to its mirror image `signs * x[order]`; it is its own inverse. Let M be the mirror map of
-observations, N the one of actions, and f the network. The policy's mean is (f(x) + N f(M x)) / 2, which maps M x to the
-mirror image of its output for x, whatever the weights.
+observations, N the mirror map of actions, and f the network. The policy's mean is (f(x) + N f(M x)) / 2. For any
+weights it maps M x to the mirror image of its output for x.
 
 The forward and backward pass run once over twice the rows, x and M x. As N is a signed permutation and its own inverse,
 the gradient of a loss by f(M x) is N times the gradient by N f(M x).
@@ -87,14 +87,14 @@ def symmetry_of(env: VecEnv) -> Symmetry:
         raise InputError("symmetry needs an environment that defines mirror images of observation and action")
     obs, action = (mirror_map(*env.mirror(name), name, env.device) for name in ("observation", "action"))
     if (len(obs.order), len(action.order)) != (env.num_obs, env.num_actions):
-        raise InputError("the mirror images are not of this environment's observation and action")
+        raise InputError("the sizes of the mirror images differ from this environment's observation and action")
     return Symmetry(obs, action)
 
 
 def expand_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return the layers of a plain network, hidden widths doubled, with the same output as the symmetric actor.
+    """Return the layers of a plain network of twice the hidden widths with the output of the symmetric actor.
 
-    layers: of f, with activations between. A symmetric policy is saved and exported in this form.
+    layers: those of f, with activations between. A symmetric policy is saved and exported in this form.
     """
     obs, action = symmetry.obs.matrix(), symmetry.action.matrix()
     expanded = []
@@ -112,9 +112,9 @@ def expand_layers(layers: Weights, symmetry: Symmetry) -> Weights:
 
 
 def nearest_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return the layers in the form of `expand_layers` with the least squared distance to `layers`; same shapes.
+    """Project layers to the nearest symmetric actor, in the form of `expand_layers`, by least squared distance.
 
-    layers: at least two, hidden layers of even widths. Blocks that must be equal are averaged, other blocks set to 0.
+    layers: at least two, hidden layers of even widths. Blocks that must be equal are averaged, the others set to 0.
     """
     obs, action = symmetry.obs.matrix().to(layers[0][0]), symmetry.action.matrix().to(layers[0][0])
     halves = []
@@ -130,7 +130,7 @@ def nearest_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
 
 
 def contract_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return copies of the layers of f, hidden widths halved: the inverse of `expand_layers`.
+    """Invert `expand_layers`: return copies of the layers of f, which have half the hidden widths.
 
     f's last bias is recovered up to a part that cancels in the policy. Raises InputError: layers have another form.
     """

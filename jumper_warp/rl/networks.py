@@ -1,9 +1,9 @@
 """Actor, critic, exploration noise, and the running statistics that normalise observations and values.
 
 `Layers` implements the forward and backward pass of a multilayer perceptron without autograd, as functions of tensors
-that compile into few kernels. The backward pass needs only the input of each layer, which is the output of the one
-below. With y a layer's output, x its input and s = ∂L/∂(Wx + b): ∂L/∂W = sᵀx, ∂L/∂b = Σs, ∂L/∂x = sW, and the
-derivative of each activation follows from y alone: elu' = 1 + min(y, 0), relu' = [y > 0], tanh' = 1 - y².
+that compile into few kernels. The backward pass needs only the input of each layer, which is the output of the layer
+below. With y a layer's output, x its input and s = ∂L/∂(Wx + b): ∂L/∂W = sᵀx, ∂L/∂b = Σs, ∂L/∂x = sW. The
+derivative of each activation is a function of y: elu' = 1 + min(y, 0), relu' = [y > 0], tanh' = 1 - y².
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from jumper_warp.rl.mirror import MirrorMap, Symmetry, Weights
 from jumper_warp.utils.normalise import normalise
 
 NORMALISED_LIMIT = 10.0  # Normalised observations are clipped to ± this many standard deviations
-VARIANCE_EPS = 1.0e-5  # Added to a variance before its square root is taken
+VARIANCE_EPS = 1.0e-5  # Constant added to a variance under the square root
 ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}  # Activation modules by `PpoCfg.activation`
 DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}  # Data type of the hidden layers, by `PpoCfg.precision`
 
@@ -39,7 +39,7 @@ class Moments(NamedTuple):
     def from_samples(x: torch.Tensor, chunk_size: int | None = None) -> Moments:
         """Return the moments over the first axis of x (batch, ...).
 
-        chunk_size: rows at a time, in two passes, six times as fast on a CPU (default: all rows, in one pass).
+        chunk_size: rows per chunk, in two passes, six times as fast on a CPU (default: all rows, in one pass).
         """
         if chunk_size is None:
             var, mean = torch.var_mean(x, dim=0, correction=0)
@@ -51,13 +51,13 @@ class Moments(NamedTuple):
 
 
 class Scaling(NamedTuple):
-    """Mean and standard deviation that normalise samples, float32, each of one sample's shape."""
+    """Normalisation by mean and standard deviation, float32, each of one sample's shape."""
 
     mean: torch.Tensor
     std: torch.Tensor
 
     def normalise(self, x: torch.Tensor) -> torch.Tensor:
-        """Return (x - mean) / std."""
+        """Return x normalised: (x - mean) / std."""
         return (x - self.mean) / self.std
 
     def denormalise(self, x: torch.Tensor) -> torch.Tensor:
@@ -71,7 +71,7 @@ class Scaling(NamedTuple):
 
 
 def all_reduce_moments(local: Sequence[Moments]) -> list[Moments]:
-    """Return the moments, float64, over the batches of all ranks, in one all-reduce.
+    """Combine moments over the batches of all ranks in one all-reduce, and return them as float64.
 
     local: moments of quantities of any shape over this rank's batch, which has the same size on every rank. In float64
     the cancellation in E[x²] - E[x]² is negligible.
@@ -101,14 +101,14 @@ def gaussian_kl(
 
 
 class RunningMoments(nn.Module):
-    """Running mean and variance of all samples so far, float64 buffers; the initial scaling is the identity."""
+    """Running mean and variance of all samples, float64 buffers; the initial scaling is the identity."""
 
     mean: torch.Tensor  # shape of one sample
     var: torch.Tensor  # shape of one sample, population variance
     count: torch.Tensor  # () number of samples
 
     def __init__(self, shape: Sequence[int] = ()) -> None:
-        """shape: shape of one sample; () for a scalar."""
+        """Create moments without samples; shape: shape of one sample, () for a scalar."""
         super().__init__()
         self.register_buffer("mean", torch.zeros(tuple(shape), dtype=torch.float64))
         self.register_buffer("var", torch.full(tuple(shape), 1.0 - VARIANCE_EPS, dtype=torch.float64))
@@ -116,12 +116,12 @@ class RunningMoments(nn.Module):
 
     @torch.no_grad()
     def update(self, x: torch.Tensor) -> None:
-        """Update with a batch of finite samples (batch, *shape) of every rank."""
+        """Update the running moments with a batch of finite samples (batch, *shape) of every rank."""
         self.update_from_moments(all_reduce_moments([Moments.from_samples(x)])[0])
 
     @torch.no_grad()
     def update_from_moments(self, moments: Moments) -> None:
-        """Update with the moments of a batch of finite samples over all ranks."""
+        """Update the running moments with those of a batch of finite samples over all ranks."""
         mean, var, size = moments
         weight = size / (self.count + size)
         delta = mean - self.mean
@@ -137,7 +137,7 @@ class RunningMoments(nn.Module):
 def mlp(sizes: Sequence[int], activation: str, out_gain: float) -> nn.Sequential:
     """Return a multilayer perceptron with orthogonal weights and zero biases; no activation after the last layer.
 
-    sizes: widths of input, hidden layers and output. activation: a key of ACTIVATIONS. out_gain: of the last weight.
+    sizes: widths of input, hidden layers and output. activation: a key of ACTIVATIONS. out_gain: of the last layer.
     """
     layers: list[nn.Module] = []
     for index, (num_in, num_out) in enumerate(pairwise(sizes)):
@@ -161,10 +161,11 @@ class ActorCritic(nn.Module):
         self, num_obs: int, num_actions: int, hidden: Sequence[int], activation: str = "elu", init_std: float = 1.0,
         num_critic_obs: int | None = None, symmetry: Symmetry | None = None,
     ) -> None:  # fmt: skip
-        """num_obs, num_critic_obs (default: num_obs): sizes of the observations of actor and critic.
+        """Create networks with random weights and empty statistics.
 
-        hidden: widths of the hidden layers of both networks. activation: a key of ACTIVATIONS. init_std: initial
-        standard deviation of the noise on every action. symmetry: makes the policy mirror-symmetric (default: not).
+        num_obs, num_critic_obs (default: num_obs): sizes of the observations of actor and critic. hidden: widths of
+        the hidden layers of both networks. activation: a key of ACTIVATIONS. init_std: initial standard deviation of
+        the noise on every action. symmetry: makes the policy mirror-symmetric (default: not).
         """
         super().__init__()
         num_critic_obs = num_obs if num_critic_obs is None else num_critic_obs
@@ -181,7 +182,7 @@ class ActorCritic(nn.Module):
 
     @property
     def symmetry(self) -> Symmetry | None:
-        """Symmetry of the policy, on the device of the weights; None without one."""
+        """Symmetry of the policy, on the device of the weights; None if it is not symmetric."""
         if not self._symmetric:
             return None
         parts = [
@@ -201,11 +202,11 @@ class ActorCritic(nn.Module):
         return self.obs_moments.scaling().features(sanitise(obs), obs.shape[-1])
 
     def critic_features(self, critic_obs: torch.Tensor) -> torch.Tensor:
-        """Return the critic's input for its raw observations (..., num_critic_obs), as `features`."""
+        """Return the critic's input for raw observations (..., num_critic_obs): normalised and clipped."""
         return self.critic_moments.scaling().features(sanitise(critic_obs), critic_obs.shape[-1])
 
     def value_head(self, critic_features: torch.Tensor) -> torch.Tensor:
-        """Return the critic's output (...) [standard deviations of the return] for (..., num_critic_obs) features."""
+        """Return the critic's output (...) [standard deviations of the return] for features (..., num_critic_obs)."""
         return self.critic(critic_features).squeeze(-1)
 
     def value(self, critic_obs: torch.Tensor) -> torch.Tensor:
@@ -219,11 +220,11 @@ class ActorCritic(nn.Module):
 
 
 class Layers(NamedTuple):
-    """A multilayer perceptron as tensors, with its forward and backward pass."""
+    """Multilayer perceptron as tensors, with its forward and backward pass."""
 
     weights: tuple[torch.Tensor, ...]  # (outputs, inputs) each; the first is zero-padded to `flat.ROW_ALIGNMENT`
     biases: tuple[torch.Tensor, ...]  # (outputs,) each
-    activation: str  # of all layers but the last: elu, relu or tanh
+    activation: str  # elu, relu or tanh, after all layers but the last
 
     def forward(self, x: torch.Tensor, dtype: torch.dtype) -> tuple[torch.Tensor, list[torch.Tensor]]:
         """Return the network's output (batch, outputs), float32, and the input of each layer for `backward`.
@@ -241,7 +242,7 @@ class Layers(NamedTuple):
     def backward(self, layer_inputs: list[torch.Tensor], grad: torch.Tensor, dtype: torch.dtype) -> list[torch.Tensor]:
         """Return the gradients of weight and bias of each layer, first to last, float32.
 
-        layer_inputs: from `forward`; grad: (batch, outputs) gradient of the loss by the network's output.
+        layer_inputs: from `forward`; grad: (batch, outputs) gradient of the loss with respect to the output.
         """
         gradients: list[torch.Tensor] = []
         for index in reversed(range(len(layer_inputs))):
@@ -254,14 +255,14 @@ class Layers(NamedTuple):
 
 
 class ActorTensors(NamedTuple):
-    """The policy as tensors, with its forward and backward pass; notation of `jumper_warp.rl.mirror`."""
+    """Policy network as tensors, with its forward and backward pass; notation of `jumper_warp.rl.mirror`."""
 
     layers: Layers
     log_std: torch.Tensor  # (num_actions,) of the exploration noise
     symmetry: Symmetry | None  # its mirror map of observations is padded to the columns of the first weight
 
     def forward(self, x: torch.Tensor, dtype: torch.dtype) -> ActorOutput:
-        """Return the policy's mean for features x; arguments as for `Layers.forward`."""
+        """Return the policy's mean for features x; arguments: see `Layers.forward`."""
         if self.symmetry is None:
             mean, layer_inputs = self.layers.forward(x, dtype)
             return ActorOutput(mean, torch.zeros_like(mean), layer_inputs)
@@ -271,9 +272,9 @@ class ActorTensors(NamedTuple):
         return ActorOutput(0.5 * (output + image), output - image, layer_inputs)
 
     def backward(self, layer_inputs: list[torch.Tensor], grad: torch.Tensor, dtype: torch.dtype) -> list[torch.Tensor]:
-        """Return the gradients of weights and biases as `Layers.backward`.
+        """Return the gradients of weight and bias of each layer, first to last, float32.
 
-        layer_inputs: from `forward`; grad: (batch, num_actions) gradient of the loss by `ActorOutput.mean`.
+        layer_inputs: from `forward`; grad: (batch, num_actions) gradient with respect to `ActorOutput.mean`.
         """
         if self.symmetry is None:
             return self.layers.backward(layer_inputs, grad, dtype)
@@ -290,7 +291,7 @@ class ActorOutput(NamedTuple):
 
 
 def _activation_backward(activation: str, grad: torch.Tensor, output: torch.Tensor) -> torch.Tensor:
-    """Return the gradient by an activation's input from the gradient by its output and the output, of one shape."""
+    """Return the gradient with respect to an activation's input; grad: with respect to its output; same shapes."""
     if activation == "elu":
         return torch.addcmul(grad, grad, output.clamp(max=0.0))
     if activation == "relu":

@@ -1,4 +1,4 @@
-"""Proximal policy optimisation. One iteration is `collect` and then `update`: CUDA graphs on a GPU, eager on a CPU.
+"""Proximal policy optimisation (PPO). An iteration is `collect`, then `update`: CUDA graphs on a GPU, eager on a CPU.
 
 There is no host synchronisation within an iteration. Surrogate: Schulman et al. 2017; advantage: Schulman et al. 2016.
 Observations, returns and advantages are normalised; the learning rate adapts to the KL divergence.
@@ -35,7 +35,7 @@ from jumper_warp.utils.state_checks import check_parts, check_tensor, check_valu
 
 
 class ActorLosses(NamedTuple):
-    """Losses of the actor on a minibatch, each ()."""
+    """Losses of the actor on a minibatch, each a scalar tensor ()."""
 
     surrogate: torch.Tensor  # clipped surrogate loss, lower is better
     entropy: torch.Tensor  # entropy of the policy [nat]
@@ -44,7 +44,7 @@ class ActorLosses(NamedTuple):
 
 
 class StepStatistics(NamedTuple):
-    """Statistics of an optimiser step, each (); losses and divergence are from before the step (`ActorLosses`)."""
+    """Statistics of an optimiser step, each (); losses and divergence are those at its start (`ActorLosses`)."""
 
     surrogate: torch.Tensor
     value: torch.Tensor  # value loss before weighting [variances of the return]
@@ -109,7 +109,7 @@ class Ppo:
         self._roll()
 
     def update(self) -> None:
-        """Optimise the networks on the rollout, for all epochs."""
+        """Optimise the networks on the rollout for all epochs."""
         self._batch()
         self._optimise()
 
@@ -142,7 +142,7 @@ class Ppo:
 
     @torch.no_grad()
     def _run_epochs(self) -> None:
-        """Run one optimiser step per minibatch, for all epochs."""
+        """Run one optimiser step per minibatch for all epochs."""
         for order in self._orders:
             for samples in order.chunk(self.cfg.minibatches):
                 torch.index_select(self.packer.rows, 0, samples, out=self._minibatch)
@@ -167,9 +167,9 @@ class Ppo:
         )
 
     def set_progress(self, progress: float) -> None:
-        """Set desired KL and entropy coefficient for a progress of the training from 0 to 1; asynchronous.
+        """Set desired KL and entropy coefficient for the training's progress (0 to 1), without synchronisation.
 
-        Both are constant in the first half, and interpolated linearly to their final values in the second.
+        Both are constant in the first half, and interpolated linearly to their final values in the second half.
         """
         cfg, decay = self.cfg, min(max(2.0 * progress - 1.0, 0.0), 1.0)
         self._desired_kl.fill_((1.0 - decay) * cfg.desired_kl + decay * min(cfg.final_desired_kl, cfg.desired_kl))
@@ -191,7 +191,7 @@ class Ppo:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Load the result of `state_dict`.
+        """Restore the result of `state_dict`.
 
         Raises InputError: a part is missing, unknown, of another shape or type, or not finite; nothing is changed.
         """
@@ -202,7 +202,7 @@ class Ppo:
         self.collector.episode.copy_(state["episode"])
 
     def _check_state(self, state: Any) -> None:
-        """Raise InputError unless `load_state_dict` can load a state: finite parts of the right shapes and types."""
+        """Raise InputError unless all parts of a state are finite and have the right shapes and types."""
         check_parts(state, ("model", "optimiser", "lr", "episode"), "ppo")
         model = self.model.state_dict()
         check_parts(state["model"], model, "ppo.model")
@@ -210,7 +210,7 @@ class Ppo:
             value, where = state["model"][name], f"ppo.model.{name}"
             check_tensor(value, like, where)
             if name.startswith("mirror_") and not torch.equal(value, like.to(value.device)):
-                raise InputError(f"{where} is of another observation or action")
+                raise InputError(f"{where} is for another observation or action")
             check_values(value, where, 0.0 if name.endswith((".var", ".count")) else -math.inf)
         check_parts(state["optimiser"], range(len(self.flat.params)), "ppo.optimiser")
         for index, param in enumerate(self.flat.params):
@@ -236,7 +236,7 @@ def critic_gradient(
 ) -> torch.Tensor:
     """Write the gradient of the weighted value loss to `out`, and return the value loss () before weighting.
 
-    The loss is the squared error; with `clip_value` the maximum of it and the squared error of the value clipped to
+    The loss is the squared error; with `clip_value` the maximum of this and of the squared error of a value clipped to
     within `clip` of the rollout's value.
 
     rows: (batch, columns of `layout`); out: the critic's slice of the flat gradient.
@@ -305,8 +305,8 @@ def take_averages(
 ) -> dict[str, float]:
     """Return metrics averaged since the last call, and reset their sums; synchronises with the device.
 
-    names: of the statistics; sums: (len(names) + 1,) their sums and the number of steps; finished: (3, ...) as
-    `Collector.finished`; lr: (); log_std: (num_actions,).
+    names: names of the statistics; sums: (len(names) + 1,) their sums and the number of steps; finished: (3, ...) as
+    in `Collector.finished`; lr: (); log_std: (num_actions,).
     """
     (*totals, count), finished_sums = sums.tolist(), finished.view(3, -1).sum(1).tolist()
     metrics = {f"Loss/{name}": total / max(count, 1.0) for name, total in zip(names, totals, strict=True)}

@@ -1,4 +1,4 @@
-"""Resuming a training: the choice of the checkpoint, changed settings, and the state of random generators."""
+"""Resuming of a training: choice of the checkpoint, changed settings, and state of random generators."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ DERIVED = ("interface", "num_envs", "seed")  # Entries of an environment's confi
 
 
 def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:
-    """Return the checkpoint of `TrainCfg.resume`; None for a new run. Raises CheckpointError: it cannot be used."""
+    """Return the checkpoint that `TrainCfg.resume` names; None: new run. Raises CheckpointError: it cannot be used."""
     if not cfg.resume:
         return None
     if cfg.resume in (LATEST, LATEST_OR_NEW):
@@ -47,7 +47,7 @@ def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:
     path = Path(cfg.resume)
     folder = path.parent if path.suffix == ".pt" else path if path.name == CHECKPOINTS else path / CHECKPOINTS
     if not (folder / MANIFEST).is_file():
-        raise CheckpointError(f"{path}: no run to resume; give a run's folder, one of its checkpoints, or latest")
+        raise CheckpointError(f"{path}: no run to resume; pass a run's folder, one of its checkpoints, or latest")
     return Checkpoint(path, load_checkpoint(path), []) if path.suffix == ".pt" else latest_checkpoint(folder)
 
 
@@ -60,7 +60,7 @@ def rank_state(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
     if not isinstance(others, list):
         raise InputError(f"others must be a list, got {type(others).__name__}")
     if 1 + len(others) != rank.size:
-        raise InputError(f"saved by {1 + len(others)} processes, there are {rank.size}")
+        raise InputError(f"saved by {1 + len(others)} processes, resumed by {rank.size}")
     if rank.index == 0:
         return state
     local = others[rank.index - 1]
@@ -69,7 +69,7 @@ def rank_state(state: dict[str, Any], rank: Rank) -> dict[str, Any]:
 
 
 def saved_init_policy(state: dict[str, Any]) -> str | None:
-    """Return the policy that a checkpoint's run was initialised with; None for random weights or if unknown."""
+    """Return the policy that a checkpoint's run started from; None: random weights or unknown."""
     try:
         settings = json.loads(state["config"])["train"]
         return str(settings["init_policy"]) if settings.get("init_policy") else None
@@ -78,7 +78,7 @@ def saved_init_policy(state: dict[str, Any]) -> str | None:
 
 
 def changed_settings(state: dict[str, Any], config: dict[str, Any]) -> list[str]:
-    """Return a line `flag old -> new` for each setting that differs between a checkpoint's configuration and `config`.
+    """List the settings that differ between a checkpoint's configuration and `config`, as lines `flag old -> new`.
 
     Empty if the checkpoint has no readable configuration.
     """
@@ -91,7 +91,7 @@ def changed_settings(state: dict[str, Any], config: dict[str, Any]) -> list[str]
 
 
 def changed_user_files(state: dict[str, Any], config: dict[str, Any]) -> list[str]:
-    """Return a line for each user file whose content changed after the checkpoint was saved."""
+    """List the user files whose content changed after the checkpoint was saved, one line each."""
     try:
         return changed_sources(json.loads(state["config"])["sources"], config["sources"])
     except DECODE_ERRORS:
@@ -99,18 +99,18 @@ def changed_user_files(state: dict[str, Any], config: dict[str, Any]) -> list[st
 
 
 def _settings(config: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings in a run's configuration by flag name, without dashes in front."""
+    """Return the settings in a run's configuration by flag name, without leading dashes."""
     train = {name: value for name, value in config["train"].items() if name not in (*SESSION, "task")}
     env = {name: value for name, value in config["env"].items() if name not in (*DERIVED, "task")}
     task = dict(config["env"].get("task", {}))
     reset = dict(task.get("reset", {}))
-    settings = reset.pop("settings", None) or {}  # their flags leave this level out
+    settings = reset.pop("settings", None) or {}  # their flags omit this level
     task["reset"] = reset | settings
     return _flat(train) | _flat(env) | _flat(task, "env")
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    """Return the leaves of nested dicts by dotted name, as `ppo.num-steps`; entries of lists by their key `name`."""
+    """Return the leaves of nested dicts by dotted name, e.g. `ppo.num-steps`; entries of lists by their key `name`."""
     if isinstance(value, list) and any(isinstance(part, dict) for part in value):
         value = {part.get("name", str(i)): part for i, part in enumerate(value)}
     if not isinstance(value, dict):

@@ -1,4 +1,4 @@
-"""Rollout collection: the policy acts in all worlds, and a buffer records the transitions."""
+"""Rollout collection: run the policy in all worlds, and record the transitions in a buffer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jumper_warp.rl.networks import DTYPES, ActorCritic, ActorTensors, Scaling
 
 
 class RolloutBuffer(NamedTuple):
-    """Transitions of all worlds over num_steps policy steps; `at` returns one step, without the first axis."""
+    """Transitions of all worlds over num_steps policy steps."""
 
     obs: torch.Tensor  # (num_steps + 1, num_envs, num_obs) sanitised
     critic_obs: torch.Tensor  # (num_steps + 1, num_envs, num_critic_obs) sanitised; obs without `asymmetric_critic`
@@ -27,12 +27,12 @@ class RolloutBuffer(NamedTuple):
     timeout: torch.Tensor  # (num_steps, num_envs) 1 where the episode was truncated
 
     def at(self, step: int) -> RolloutBuffer:
-        """Return views of one step."""
+        """Return views of one step, without the first axis."""
         return self._replace(**{name: x[step] for name, x in self._asdict().items() if name != "log_std"})
 
 
 def make_rollout_buffer(num_steps: int, env: VecEnv, num_critic_obs: int) -> RolloutBuffer:
-    """Return a zeroed buffer on the environment's device; num_critic_obs: size of the critic's observation."""
+    """Return a rollout buffer of zeros on the environment's device; num_critic_obs: size of critic observations."""
 
     def zeros(*shape: int) -> torch.Tensor:
         """Return zeros on the environment's device."""
@@ -46,10 +46,10 @@ def make_rollout_buffer(num_steps: int, env: VecEnv, num_critic_obs: int) -> Rol
 
 
 class Collector:
-    """Steps the environment with the current policy, and records the transitions in `rollout`."""
+    """Collector of rollouts: steps the environment with the current policy, and records transitions in `rollout`."""
 
     def __init__(self, env: VecEnv, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, compiler: Compiler) -> None:
-        """model: has the observation statistics; flat: parameters of `model`; compiler: compiles the functions."""
+        """Allocate the rollout; model: has the observation statistics; flat: parameters of `model`."""
         self.env, self.cfg = env, cfg
         self._critic_obs = env.critic_obs if cfg.asymmetric_critic else env.obs
         self._final_critic_obs = env.final_critic_obs if cfg.asymmetric_critic else env.final_obs
@@ -59,14 +59,14 @@ class Collector:
         self._scaling = Scaling(*(torch.zeros(env.num_obs, device=env.device) for _ in Scaling._fields))
         counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
         self.episode = torch.zeros(2, env.num_envs, **counts)
-        """(2, num_envs) return and length of each world's current episode."""
+        """Return and length of each world's current episode, (2, num_envs)."""
         self.finished = torch.zeros(3, env.num_envs, **counts)
-        """(3, num_envs) sum of returns, sum of lengths and number of the finished episodes."""
+        """Sum of returns, sum of lengths and number of the finished episodes, (3, num_envs)."""
         self._sample_action, self._record = compiler(sample_action), compiler(record_transition)
 
     @torch.no_grad()
     def roll(self) -> None:
-        """Fill the rollout: act for `num_steps` policy steps."""
+        """Fill the rollout by acting for `num_steps` policy steps."""
         env, rollout = self.env, self.rollout
         for scaling, value in zip(self._scaling, self._moments.scaling(), strict=True):
             scaling.copy_(value)

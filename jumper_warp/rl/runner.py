@@ -36,18 +36,18 @@ from jumper_warp.utils.threads import set_threads
 
 CONFIG = "config.json"  # File in a run's folder with all settings, versions and the commit
 PERF = ("Perf/total_fps", "Perf/collection_time", "Perf/learning_time", "Perf/elapsed_s")
-"""Performance metrics: policy steps per second of rollout and update, time of each [s], training time [s]."""
+"""Performance metrics: policy steps per second, time of the rollout and of the update [s], training time [s]."""
 LEARNING = ("Loss/learning_rate", "Policy/mean_std", "Train/mean_reward", "Train/mean_episode_length")
-"""Learning metrics besides the losses; Train/ only if an episode has ended."""
+"""Learning metrics in addition to the losses; those of Train/ exist only if an episode has ended."""
 INTERRUPTED = 130  # Exit code of a training that a signal stopped
 MakeEnv = Callable[[int, int, torch.device], VecEnv]
-"""Makes an environment from the number of worlds, the seed and the device."""
+"""Function that makes an environment from the number of worlds, the seed and the device."""
 AsRslRl = Callable[[VecEnv, int], Any]
-"""Wraps an environment for rsl-rl; the second argument is the number of policy steps between metrics."""
+"""Function that wraps an environment for rsl-rl; the second argument is the number of policy steps between metrics."""
 
 
 class TrainResult(NamedTuple):
-    """Result of a finished training."""
+    """Result of a training: its folder, length and last metrics."""
 
     folder: Path  # the run's folder
     iteration: int  # number of iterations, over all resumes
@@ -79,11 +79,11 @@ def train(
     cfg: TrainCfg, make_env: MakeEnv, command: str | None = None, as_rsl_rl: AsRslRl | None = None,
     actor_init: ActorInit | None = None, checkpoint: Checkpoint | None = None,
 ) -> TrainResult:  # fmt: skip
-    """Train to the last iteration or the time limit, save, and return the result.
+    """Train to the last iteration or the time limit, save a checkpoint, and return the result.
 
     command: command line printed for resuming, without `--resume` (default: `jumper train TASK`). as_rsl_rl: required
-    by trainer rsl-rl. actor_init: of the policy cfg.init_policy, required with it. checkpoint: the loaded checkpoint of
-    cfg.resume (default: it is loaded here).
+    by trainer rsl-rl. actor_init: initialisation from cfg.init_policy, required with it. checkpoint: the loaded
+    checkpoint of cfg.resume (default: loaded here).
     Raises InputError: a setting does not fit the environment or the machine. CheckpointError: no usable checkpoint to
     resume from, or the last one could not be saved. SystemExit with code INTERRUPTED: stopped by Ctrl-C or SIGTERM,
     after a checkpoint was saved.
@@ -94,7 +94,7 @@ def train(
     try:
         _check_processes(cfg, rank)
         if checkpoint is None and bool(cfg.init_policy) != (actor_init is not None):
-            raise InputError("init_policy and actor_init, of the policy that it names, need each other")
+            raise InputError("init_policy and actor_init, which is made from it, must be passed together")
         env = make_env(cfg.num_envs // rank.size, (cfg.seed + 1000 * rank.index) % 2**31, rank.device)
         if cfg.trainer == "rsl-rl":
             return _train_rsl_rl(cfg, env, as_rsl_rl, rank)
@@ -116,7 +116,7 @@ def train(
 def _check_processes(cfg: TrainCfg, rank: Rank) -> None:
     """Raise InputError unless trainer, number of worlds and batch size are valid for the number of processes."""
     if cfg.trainer != "ppo" and rank.size > 1:
-        raise InputError(f"trainer {cfg.trainer} is offered for one process only")
+        raise InputError(f"trainer {cfg.trainer} supports one process only")
     if cfg.num_envs % rank.size:
         raise InputError(f"num_envs {cfg.num_envs} is not divisible by {rank.size} processes")
     if cfg.trainer == "ppo":
@@ -131,7 +131,7 @@ def _check_best_metric(name: str, logged: set[str]) -> None:
 
 
 def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
-    """Return the configuration of a run, JSON-ready: settings, environment, versions, commit, user files."""
+    """Return the configuration of a run as JSON data: settings, environment, versions, commit, user files."""
     settings = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
     commit, env_config = git_commit(), env.config()
     return {
@@ -146,7 +146,7 @@ def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
 
 
 class TrainingRun:
-    """A training in this process: algorithm (`ppo`, a Ppo or Shac), environment, folder, iteration and time."""
+    """State of a training in this process: algorithm (`ppo`: Ppo or Shac), environment, folder, iteration, time."""
 
     def __init__(
         self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, actor_init: ActorInit | None = None,
@@ -169,7 +169,7 @@ class TrainingRun:
         self.notes: list[str] = []
         checkpoint = checkpoint or resume.find_checkpoint(cfg)
         if not distributed.same_on_all_ranks(str(checkpoint and (checkpoint.path, checkpoint.state["iteration"]))):
-            raise InputError("the processes found different checkpoints: log_root must be a folder that all can read")
+            raise InputError("the processes found different checkpoints: log_root must be a folder shared by all")
         if actor_init is not None and checkpoint is None:
             apply_actor_init(actor_init, self.ppo.model, cfg.num_envs * cfg.ppo.num_steps)
             self.notes.append(", ".join(filter(None, (f"starts from {cfg.init_policy}", actor_init.change))))
@@ -215,7 +215,7 @@ class TrainingRun:
             if is_last:
                 seconds = f"--max-seconds {cfg.max_seconds:g}"
                 limit = f"--max-iterations {cfg.max_iterations}" if self.iteration >= cfg.max_iterations else seconds
-                log.print_line(f"nothing is left to train after iteration {self.iteration}: give more than {limit}")
+                log.print_line(f"the training is complete at iteration {self.iteration}: raise {limit} to continue")
             while not is_last:
                 watch.start()
                 ppo.set_progress(self._progress())
@@ -235,7 +235,7 @@ class TrainingRun:
         return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.metrics)
 
     def _open_log(self) -> TrainingLog | _NoLog:
-        """Return a `TrainingLog` on rank 0, a log that discards everything elsewhere."""
+        """Return a `TrainingLog` on rank 0, and a log that discards everything on other ranks."""
         if self.rank.index != 0:
             return _NoLog()
         cfg = self.cfg
@@ -248,7 +248,7 @@ class TrainingRun:
         self._clock_start = time.perf_counter() - self.seconds
 
     def _elapsed(self) -> float:
-        """Return the training time [s] over all resumes, as `TrainCfg.max_seconds` counts it."""
+        """Return the training time [s] over all resumes, counted as for `TrainCfg.max_seconds`."""
         return self.seconds if self._clock_start is None else time.perf_counter() - self._clock_start
 
     def _progress(self) -> float:
@@ -266,9 +266,9 @@ class TrainingRun:
         return remaining
 
     def sync_stop_request(self, stop: StopRequest) -> bool:
-        """Return whether to end early: a process has a stop request or has reached the time limit.
+        """Return whether to end the training: a process has a stop request or has reached the time limit.
 
-        Several processes synchronise this, and `stop.requested`, only in iterations that they log.
+        Several processes synchronise this, and `stop.requested`, only in logged iterations.
         """
         over_time = 0.0 < self.cfg.max_seconds <= self._elapsed()
         if distributed.world_size() > 1:
@@ -284,7 +284,7 @@ class TrainingRun:
         return {**self.ppo.statistics(), **self.env.metrics(), **dict(zip(PERF, perf, strict=True))}
 
     def _save(self, log: TrainingLog | _NoLog, is_last: bool, stop: StopRequest) -> None:
-        """Save a checkpoint on rank 0; a failure prints a warning, and raises CheckpointError at the last one."""
+        """Save a checkpoint on rank 0; on failure print a warning, or raise CheckpointError if it is the last one."""
         seconds = self._elapsed()
         local = {"ppo": self.ppo.state_dict(), "env": self.env.state_dict(), "rng": resume.random_state()}
         others = self._other_ranks(local)
@@ -297,15 +297,15 @@ class TrainingRun:
             path = save_checkpoint(folder, state, self.metrics.get(self.cfg.best_metric), self.cfg.max_checkpoints)
         except OSError as error:
             if is_last:
-                raise CheckpointError(f"{folder}: not saved: {error.strerror}") from error
-            log.print_line(f"{folder}: not saved, will try again: {error.strerror}")
+                raise CheckpointError(f"{folder}: checkpoint not saved: {error.strerror}") from error
+            log.print_line(f"{folder}: checkpoint not saved, retried later: {error.strerror}")
             return
         if is_last:
             hint = f", continue with: {self._command} --resume {shlex.quote(str(self.folder))}"
             log.print_line(f"saved {path}{hint if stop.requested else ''}")
 
     def _other_ranks(self, local: dict[str, Any]) -> list[dict[str, Any]]:
-        """Return on rank 0 the states of the other ranks: env, ppo (only episode) and rng; an empty list elsewhere."""
+        """Return the other ranks' states (env, rng, and of ppo the episode) on rank 0; an empty list elsewhere."""
         if distributed.world_size() == 1:
             return []
         return distributed.gather_states({**local, "ppo": {"episode": local["ppo"]["episode"].cpu()}}, self.rank)[1:]
@@ -317,7 +317,7 @@ def is_last_iteration(iteration: int, cfg: TrainCfg, end_early: bool) -> bool:
 
 
 class _NoLog:
-    """Stands in for `TrainingLog` on all ranks but 0, and discards everything."""
+    """Null object for `TrainingLog` on all ranks but 0: it discards everything."""
 
     def __enter__(self) -> _NoLog:
         """Return this log."""
@@ -342,7 +342,7 @@ def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
 
 
 def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl | None, rank: Rank) -> TrainResult:
-    """Train with rsl-rl's PPO; arguments and result as for `train`."""
+    """Train with rsl-rl's PPO; arguments and result: see `train`."""
     if as_rsl_rl is None:
         raise InputError("trainer rsl-rl needs as_rsl_rl, which adapts the environment")
     from jumper_warp.rl.rsl_rl import train_rsl_rl

@@ -1,4 +1,4 @@
-"""Rollout to training batch: values, advantages (GAE) and returns, packed into one row of memory a sample."""
+"""Conversion of a rollout to a training batch: values, advantages (GAE) and returns, one row of memory per sample."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ from jumper_warp.rl.mirror import MirrorMap
 from jumper_warp.rl.networks import DTYPES, ActorCritic, Layers, Moments, Scaling, all_reduce_moments, gaussian_log_prob
 from jumper_warp.rl.rollout import RolloutBuffer
 
-CPU_CHUNK_SIZE = 4096  # Samples that a CPU processes at a time, so that intermediate tensors stay in its caches
+CPU_CHUNK_SIZE = 4096  # Samples per chunk on a CPU, so that intermediate tensors stay in its caches
 
 
 class Batch(NamedTuple):
-    """Samples of one or all minibatches; first axis: sample."""
+    """Training samples of one or all minibatches; the first axis is the sample."""
 
     features: torch.Tensor  # (batch, num_obs) normalised observations
     critic_features: torch.Tensor  # (batch, num_critic_obs) normalised observations of the critic
@@ -32,7 +32,7 @@ class Batch(NamedTuple):
 
 
 class RolloutMoments(NamedTuple):
-    """Mean, variance and count over the samples of a rollout."""
+    """Moments (mean, variance, count) over the samples of a rollout."""
 
     advantage: Moments  # () each
     target: Moments  # () each
@@ -50,7 +50,7 @@ class Estimates(NamedTuple):
 
 
 class Scalings(NamedTuple):
-    """Mean and standard deviation that normalise observations and values."""
+    """Normalisations of observations and values."""
 
     obs: Scaling  # (num_obs,)
     critic_obs: Scaling  # (num_critic_obs,)
@@ -58,10 +58,10 @@ class Scalings(NamedTuple):
 
 
 class RowLayout(NamedTuple):
-    """Columns of a sample's row: actor features, critic features, then the rest of `Batch`.
+    """Layout of the columns of a sample's row: actor features, critic features, then the rest of `Batch`.
 
-    Each of the three groups begins at a multiple of ROW_ALIGNMENT. A row is written once an iteration and gathered once
-    a minibatch.
+    Each of the three groups begins at a multiple of ROW_ALIGNMENT. A row is written once per iteration and gathered
+    once per epoch.
     """
 
     num_obs: int  # numbers of entries without padding
@@ -70,7 +70,7 @@ class RowLayout(NamedTuple):
 
     @property
     def widths(self) -> tuple[int, int, int]:
-        """Columns of actor features, critic features and the rest, each padded to ROW_ALIGNMENT."""
+        """Numbers of columns of actor features, critic features and the rest, each padded to ROW_ALIGNMENT."""
         obs, critic_obs = aligned(self.num_obs, ROW_ALIGNMENT), aligned(self.num_critic_obs, ROW_ALIGNMENT)
         return obs, critic_obs, aligned(2 * self.num_actions + 4, ROW_ALIGNMENT)
 
@@ -106,7 +106,7 @@ class RowLayout(NamedTuple):
 def gae(
     reward: torch.Tensor, done: torch.Tensor, value: torch.Tensor, gamma: float, lam: float
 ) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return advantages and returns, each (steps, num_envs), by generalised advantage estimation.
+    """Compute advantages and returns, each (steps, num_envs), by generalised advantage estimation (GAE).
 
     Schulman et al. 2016, eq. 16. The recurrence A[t] = δ[t] + w[t] A[t+1] is solved by doubling: log2(steps) passes
     over all steps at once.
@@ -127,19 +127,19 @@ def gae(
 
 
 class BatchPacker:
-    """Computes values, advantages and returns of a rollout, and packs its samples into `rows`."""
+    """Packer of a rollout: computes values, advantages and returns, and writes its samples to `rows`."""
 
     def __init__(
         self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, compiler: Compiler,
         obs_mirror: MirrorMap | None = None,
     ) -> None:  # fmt: skip
-        """flat: parameters of `model`. obs_mirror: mirror map that makes observation statistics symmetric, if given."""
+        """Allocate the rows; flat: parameters of `model`; obs_mirror: map that symmetrises observation statistics."""
         self._obs_mirror = obs_mirror
         self._rollout, self._cfg, self._model, self._critic = rollout, cfg, model, flat.critic
         steps, worlds, num_actions = rollout.action.shape
         self.layout = RowLayout(rollout.obs.shape[2], rollout.critic_obs.shape[2], num_actions)
         self.rows = rollout.obs.new_zeros(steps * worlds, sum(self.layout.widths))
-        """(steps · worlds, columns of `layout`), time-major."""
+        """Packed samples, (steps · worlds, columns of `layout`), time-major."""
         self.old_log_std = torch.zeros_like(rollout.log_std)  # (num_actions,) of the policy that acted
         self._chunk_size = CPU_CHUNK_SIZE if self.rows.device.type == "cpu" else None
         self._compute_values_and_gae, self._write_rows = compiler(compute_values_and_gae), compiler(write_rows)
@@ -166,7 +166,7 @@ class BatchPacker:
 
     @torch.no_grad()
     def warm_up(self) -> None:
-        """Compile all functions by packing the present buffer; overwrites `rows`."""
+        """Compile all functions by packing the rollout once; overwrites `rows`."""
         scalings = self._scalings()
         self._pack(scalings, self._estimates(scalings), advantage_scaling=scalings.value)
 
@@ -176,11 +176,11 @@ class BatchPacker:
         return Scalings(*(each.scaling() for each in (model.obs_moments, model.critic_moments, model.value_moments)))
 
     def _estimates(self, scalings: Scalings) -> Estimates:
-        """Return values, advantages and returns of the rollout."""
+        """Compute values, advantages and returns of the rollout."""
         return self._compute_values_and_gae(self._rollout, self._critic, scalings, self._cfg, self._chunk_size)
 
     def _pack(self, scalings: Scalings, estimates: Estimates, advantage_scaling: Scaling) -> None:
-        """Write the rollout with its estimates to `rows`; arguments as for `write_rows`."""
+        """Write the rollout with its estimates to `rows`; arguments: see `write_rows`."""
         target_scaling = self._model.value_moments.scaling() if self._cfg.normalise_value else None
         self._write_rows(
             self.rows, self.layout, self._rollout, scalings, estimates, advantage_scaling, target_scaling,
@@ -193,7 +193,7 @@ def compute_values_and_gae(
 ) -> Estimates:
     """Return values, advantages and returns (num_steps · num_envs,) of a rollout, and moments of its samples.
 
-    A timeout adds the discounted value of the final observation. chunk_size: samples the critic evaluates at a time.
+    A timeout adds the discounted value of the final observation. chunk_size: samples per evaluation of the critic.
     """
     columns, dtype = critic.weights[0].shape[1], DTYPES[cfg.precision]
 
@@ -231,5 +231,5 @@ def write_rows(
 
 
 def _chunks(x: torch.Tensor, chunk_size: int | None) -> tuple[torch.Tensor, ...]:
-    """Return views of x (batch, ...) with `chunk_size` rows each, the last with the rest; None: all rows in one."""
+    """Split x (batch, ...) into views of `chunk_size` rows, the last with the remainder; None: one view of all rows."""
     return x.split(chunk_size or x.shape[0])

@@ -1,8 +1,8 @@
-"""Short-horizon actor-critic: the policy climbs the gradient of short windows of reward through the physics.
+"""Short-horizon actor-critic (SHAC): gradient ascent of short windows of reward, differentiated through the physics.
 
 A window has H policy steps of all worlds, with the policy's noise reparametrised. The actor's loss is minus the mean
-over worlds of sum_t g^t r_t + g^H V(s_H), differentiated through rewards, physics and policy; V is a target critic that
-follows the critic slowly. Where an episode ends the sum restarts, with the value of the final state after a timeout.
+over worlds of sum_t g^t r_t + g^H V(s_H), differentiated through rewards, physics and policy. V is a target critic,
+which follows the critic slowly. Where an episode ends the sum restarts, with the final state's value after a timeout.
 The critic is fitted to TD(lambda) returns of the same window. After Xu et al. 2022, Accelerated policy learning with
 parallel differentiable simulation.
 """
@@ -67,10 +67,10 @@ class Shac:
         self._sums = torch.zeros(len(STATISTICS) + 1, dtype=torch.float64)  # and the number of iterations
 
     def compile(self) -> None:
-        """Do nothing; present for the interface of `Ppo`."""
+        """Do nothing; SHAC compiles no functions (part of the interface of `Ppo`)."""
 
     def close(self) -> None:
-        """Do nothing; there are no CUDA graphs."""
+        """Do nothing; SHAC has no CUDA graphs (part of the interface of `Ppo`)."""
 
     def iterate(self, mark: Callable[[], None] = lambda: None) -> None:
         """Run one iteration; mark: called after the actor's and after the critic's update."""
@@ -84,7 +84,7 @@ class Shac:
         self._sums += torch.tensor([float(window.loss.detach()), value_loss, actor_norm, critic_norm, 1.0]).double()
 
     def window(self) -> Window:
-        """Act for `num_steps` policy steps, and return the actor's loss and the critic's samples."""
+        """Run the policy for `num_steps` steps; return the actor's loss and the critic's samples."""
         env, cfg, model = self.env, self.cfg, self.model
         samples: list[tuple[torch.Tensor, ...]] = []
         discount, total = torch.ones(env.num_envs, device=env.device), torch.zeros(env.num_envs, device=env.device)
@@ -154,7 +154,7 @@ class Shac:
         return sum(losses) / len(losses), sum(norms) / len(norms)
 
     def _optimiser_step(self, name: str, params: Sequence[torch.Tensor], loss: torch.Tensor, max_norm: float) -> float:
-        """Run a step of an optimiser by name, none if the gradient is not finite; return its norm before clipping."""
+        """Run an optimiser step unless the gradient is not finite; return the gradient's norm before clipping."""
         optimiser = self.optimisers[name]
         optimiser.zero_grad()
         loss.backward(inputs=params)
@@ -164,7 +164,7 @@ class Shac:
         return norm
 
     def set_progress(self, progress: float) -> None:
-        """Set the actor's learning rate for a progress of the training from 0 to 1."""
+        """Set the actor's learning rate for the training's progress (0 to 1)."""
         self.lr.fill_(self.shac.lr * (1.0 - 0.9 * min(max(progress, 0.0), 1.0)))
 
     def statistics(self) -> dict[str, float]:
@@ -172,7 +172,7 @@ class Shac:
         return take_averages(STATISTICS, self._sums, self._finished, self.lr, self.model.log_std)
 
     def _parts(self) -> dict[str, torch.Tensor]:
-        """Return all tensors of the state by dotted name, not copied; missing optimiser states become zeros."""
+        """Return all tensors of the state by dotted name, uncopied; missing optimiser states become zeros."""
         parts = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         parts |= {f"target.{name}": value for name, value in self.target.state_dict().items()}
         for name, optimiser in self.optimisers.items():
@@ -190,7 +190,7 @@ class Shac:
         return {"model": {name: value.clone() for name, value in self.model.state_dict().items()}, **rest}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Load the result of `state_dict`. Raises InputError: a part is missing, unknown, of another shape or type."""
+        """Restore the result of `state_dict`. Raises InputError: a part is missing, unknown or of another form."""
         flat = {f"model.{name}": value for name, value in state["model"].items()}
         flat |= {name: value for name, value in state.items() if name != "model"}
         parts = self._parts()

@@ -1,4 +1,4 @@
-"""Plausible ranges of a description's values, from a toy to a robot that carries a person; they reveal wrong units."""
+"""Plausible ranges of the values in a robot description, which reveal wrong units; the robot may carry a person."""
 
 from __future__ import annotations
 
@@ -39,15 +39,15 @@ PEAK_TORQUE = Range(0.1, 1.0e3, "N m")
 MOTOR_SPEED = Range(0.1, 1.0e3, "rad/s")  # At the output of the gear; 1000 rad/s are 9500 rpm
 GEAR_RATIO = Range(1.0, 1.0e3, "")
 ROTOR_INERTIA = Range(1.0e-8, 1.0e-2, "kg m^2")  # From a rotor of a gram and 3 mm radius to one of 2 kg and 0.1 m
-ARMATURE = Range(1.0e-6, 1.0, "kg m^2")  # Behind the gear; 1 kg m^2 is ten times a whole stretched leg
+ARMATURE = Range(1.0e-6, 1.0, "kg m^2")  # At the gear's output; 1 kg m^2 is ten times the inertia of a stretched leg
 MOTOR_FRICTION = Range(0.0, 10.0, "N m")
 PROPORTIONAL_GAIN = Range(0.1, 1.0e4, "N m/rad")
-"""Below, no motor moves a leg in time; above, it is nearly as hard as the stops."""
+"""Lower gains are too weak to move a leg; higher gains are nearly as stiff as the hard stops."""
 DERIVATIVE_GAIN = Range(1.0e-2, 1.0e2, "N m s/rad")
 KNEE_DAMPING = Range(1.0e-6, 10.0, "N m s/rad")
 KNEE_DAMPING_LIMIT = Range(1.0e-3, 1.0e3, "N m")
 SPRING_STIFFNESS = Range(0.0, 1.0e4, "N/m")
-"""Ten times that of the authors' springs, a third of the swing that the step of 1/480 s follows."""
+"""Upper end: ten times the authors' springs; they swing at a third of the highest stable frequency at 1/480 s."""
 SPRING_LENGTH = Range(0.0, 1.0, "m")
 COLOR = Range(0.0, 1.0, "")
 
@@ -82,12 +82,12 @@ def refuse_outside(file: Path, part: str, checks: Iterable[RangeCheck]) -> None:
     """Raise RobotDescriptionError for the first value outside its range or NaN; file, part: place in the message."""
     for name, value, (low, high, unit) in checks:
         if not low <= value <= high:
-            problem = f"expected {name} in {low:.4g} to {high:.4g}{unit and ' '}{unit}, found {value:.6g}"
+            problem = f"{name} must be between {low:.4g} and {high:.4g}{unit and ' '}{unit}, got {value:.6g}"
             raise RobotDescriptionError(file, part, problem)
 
 
 def point_checks(name: str, point: np.ndarray) -> Iterator[RangeCheck]:
-    """Return the checks of the x, y, z of a point (3,) [m] in its link's frame; name: of the point, for messages."""
+    """Return the checks of the x, y, z of a point (3,) [m] in its link's frame; name: of this point, for messages."""
     return (RangeCheck(f"{axis} of {name}", float(value), PLACE) for axis, value in zip("xyz", point, strict=True))
 
 
@@ -150,7 +150,7 @@ def motor_checks(motor: Motor) -> Iterator[RangeCheck]:
     yield RangeCheck("cutoff speed", motor.cutoff_speed, MOTOR_SPEED)
     yield RangeCheck("no-load speed", motor.no_load_speed, MOTOR_SPEED)
     yield RangeCheck("coulomb_friction", motor.coulomb_friction, MOTOR_FRICTION)
-    yield RangeCheck("coulomb_friction", motor.coulomb_friction, Range(0.0, motor.peak_torque, "N m, its peak_torque"))
+    yield RangeCheck("coulomb_friction", motor.coulomb_friction, Range(0.0, motor.peak_torque, "N m (peak_torque)"))
     for use, gains in (("jumping", motor.jumping), ("walking", motor.walking)):
         yield RangeCheck(f"{use} kp", gains.kp, PROPORTIONAL_GAIN)
         yield RangeCheck(f"{use} kd", gains.kd, DERIVATIVE_GAIN)

@@ -63,7 +63,7 @@ def knee_angles(leg: LegDimensions, outer: float, inner: float) -> tuple[float, 
     span = outer_knee - inner_knee
     distance = math.hypot(*span)
     if not 1.0e-6 < distance < 2.0 * leg.shank:
-        raise InputError(f"the shanks of {leg.shank} m do not meet, the knees are {distance:.4f} m apart")
+        raise InputError(f"two shanks of {leg.shank} m cannot connect knees {distance:.4f} m apart")
     rise = math.sqrt(leg.shank**2 - 0.25 * distance**2) / distance
     ankle = 0.5 * (outer_knee + inner_knee) + leg.front * rise * np.array([span[1], -span[0]])
     # tilt of each shank from -z toward +front
@@ -106,9 +106,9 @@ def in_tree_order(description: RobotDescription) -> RobotDescription:
     for name, ends in expected.items():
         require(name in joints, file, f"joint {name}", "missing")
         actual = joints[name].parent, joints[name].child
-        require(actual == ends, file, f"joint {name}", "expected to lead from {} to {}".format(*ends))
+        require(actual == ends, file, f"joint {name}", "expected parent {} and child {}".format(*ends))
     for name in sorted(joints.keys() - expected.keys()):
-        raise RobotDescriptionError(file, f"joint {name}", "expected no joint of this name")
+        raise RobotDescriptionError(file, f"joint {name}", "unknown joint name")
     order = ["body", *(child for _, child in expected.values())]
     ordered_links = tuple(links[name] for name in order)
     return dataclasses.replace(description, links=ordered_links, joints=tuple(joints[name] for name in expected))
@@ -162,10 +162,10 @@ def check_leg(description: RobotDescription, leg: str) -> None:
     knee = outer_knee.origin
     on_axis = knee[2] < 0.0 and abs(knee[0]) <= TOLERANCE and close(knee, inner_knee.origin)
     for joint, holds, problem in (
-        (lateral, in_quarter, "expected the hip in its own quarter of the body"),
-        (outer, outer_farther, "expected farther from the body centre than its twin"),
+        (lateral, in_quarter, "expected the hip in the leg's own quadrant of the body"),
+        (outer, outer_farther, "expected the outer axis farther from the body centre than the inner one"),
         (inner, in_housing_plane, "expected both transversal axes at one y and at z 0"),
-        (outer_knee, on_axis, "expected both knees alike, on the thighs' -z axes"),
+        (outer_knee, on_axis, "expected both knees at one distance along the thighs' -z axes"),
     ):
         require(holds, file, f"joint {joint.name}", problem)
     loop = description.loops[LEGS.index(leg)]
@@ -175,7 +175,7 @@ def check_leg(description: RobotDescription, leg: str) -> None:
         require(counted, file, f"link {link.name}", f"expected {count} collision shape(s)")
     paw = description.link(loop.parent).collisions[0]
     at_ankle = paw.kind == "sphere" and close(paw.position, loop.parent_anchor)
-    require(at_ankle, file, f"link {loop.parent}", "expected its collision sphere, the paw, at the ankle")
+    require(at_ankle, file, f"link {loop.parent}", "expected the paw's collision sphere at the ankle")
     require(not description.link("body").collisions, file, "link body", "expected no collision shape")
 
 
@@ -186,7 +186,7 @@ def check_lengths(description: RobotDescription, leg: str) -> None:
     for file, part, name, value, limits in (
         (urdf, f"joint {leg}_lateral", "hip x", abs(dimensions.hip[0]), LENGTH),
         (urdf, f"joint {leg}_lateral", "hip y", abs(dimensions.hip[1]), LENGTH),
-        (urdf, f"joint {leg}_outer", "distance from its twin's axis", axes, LENGTH),
+        (urdf, f"joint {leg}_outer", "distance from the inner axis", axes, LENGTH),
         (urdf, f"joint {leg}_outer_knee", "thigh length", dimensions.thigh, LENGTH),
         (description.path, f"loop {leg}_ankle", "shank length", dimensions.shank, LENGTH),
         (urdf, f"link {leg}_inner_shank", "paw radius", dimensions.paw_radius, PAW_RADIUS),
@@ -225,7 +225,7 @@ def check_motors(description: RobotDescription) -> None:
         joint = description.joint(name)
         limits = (("effort", joint.effort, motor.peak_torque), ("velocity", joint.velocity, motor.no_load_speed))
         for word, limit, constant in limits:
-            problem = f"expected {word} {constant:.4g} as of motor {motor.type}, found {limit:.4g}"
+            problem = f"expected {word} {constant:.4g} of motor {motor.type}, found {limit:.4g}"
             require(abs(limit - constant) <= 1.0e-3 * constant, description.urdf_path, f"joint {name}", problem)
 
 

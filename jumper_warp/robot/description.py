@@ -77,7 +77,7 @@ _cached_description = functools.cache(_read_description)
 
 
 class JsonReader:
-    """Reads the JSON file of a description. Every method raises RobotDescriptionError on bad input.
+    """Reader of a description's JSON file. Every method raises RobotDescriptionError on bad input.
 
     Parameters: table, a JSON object; key, its entry; part, the place that an error message names ("" for the root).
     """
@@ -97,7 +97,7 @@ class JsonReader:
         self.require(isinstance(self.root, dict), "", "expected a JSON object")
 
     def require(self, holds: bool, part: str, problem: str) -> None:
-        """Raise RobotDescriptionError for this file unless `holds`; problem: of the message."""
+        """Raise RobotDescriptionError for this file unless `holds`; problem: text of the message."""
         require(holds, self.file, part, problem)
 
     def unique_keys(self, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
@@ -105,7 +105,7 @@ class JsonReader:
         table = dict(pairs)
         if len(table) < len(pairs):
             double = Counter(key for key, _ in pairs).most_common(1)[0][0]
-            raise RobotDescriptionError(self.file, double, "expected one entry, found it twice")
+            raise RobotDescriptionError(self.file, double, "expected one entry, found two")
         return table
 
     def refuse_constant(self, name: str) -> None:

@@ -29,14 +29,14 @@ class BlockCfg:
     half: tuple[float, float] | np.ndarray = (0.4, 0.4)
     """[m] Half extents along x and y."""
     height: float | np.ndarray = 0.1
-    """[m] Of the top above z = 0."""
+    """[m] Height of the top above z = 0."""
     mass: float | np.ndarray = 10.0
     """[kg]"""
     friction: float | np.ndarray = 0.4
     """[1] Coefficient of friction between block and floor."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: an extent or the mass is not positive, friction is negative, or a center is not finite."""
+        """Raise InputError if an extent or the mass is not positive, friction negative, or a center not finite."""
         for name in ("half", "height", "mass"):
             if not np.all(np.asarray(getattr(self, name)) > 0.0):
                 raise InputError(f"block {name} must be positive, got {getattr(self, name)}")

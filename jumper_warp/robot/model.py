@@ -31,14 +31,14 @@ CONTACT_DAMPING = 476.0
 """Contact `ke` [N/m] and `kd` [N s/m]: MuJoCo's solref becomes (2 / kd, kd / (2 sqrt(ke))), critically damped over two
 physics steps. Softer contacts cost jump height."""
 CONTACT_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)  # MuJoCo's solimp: dmin, dmax, width [m], midpoint, power
-GROUND_FRICTION = 1.0e-4  # [1] Nearly 0: a contact takes the larger of its two coefficients, so the paw's
-MAX_FRICTION = 10.0  # [1] Of the paws: ten times that of rubber on concrete
+GROUND_FRICTION = 1.0e-4  # [1] Nearly 0: a contact uses the larger of its two coefficients, here the paw's
+MAX_FRICTION = 10.0  # [1] Largest coefficient of the paws, ten times that of rubber on concrete
 GROUND_COLOR = (0.42, 0.46, 0.48)  # red, green, blue, 0 to 1
 LIMIT_STIFFNESS = CONTACT_STIFFNESS
 """[N m/rad] Stiffness of hard stops: plastic for SolverJumper, critically damped over two physics steps for MuJoCo."""
 LIMIT_DAMPING = CONTACT_DAMPING  # [N m s/rad]
 NO_EFFORT_LIMIT = 1.0e6
-"""[N m] Effort limit of motor joints, never reached: motor models saturate torque. A knee's limit is its damping's."""
+"""[N m] Effort limit of motor joints, never reached, as motor models saturate torque. Knees: limit of the damping."""
 KNEE_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (2, 4)]
 """Indices of a world's eight knees in its 38 `joint_qd`: outer, inner of each leg."""
 PAWS = tuple(f"{leg}_paw" for leg in LEGS)  # Labels of the paws' shapes, without the world's prefix
@@ -66,14 +66,14 @@ def build_model(
         description: The robot; by default the project's own.
         ground: "plane" (z = 0), a heightfield, or None for free flight.
         friction: Coulomb friction coefficient of the paws [1].
-        gravity: Downward, of every world [m/s^2]; `model.gravity` (num_worlds + 1,) vec3 can differ by world.
+        gravity: Downward gravity of all worlds [m/s^2]; `model.gravity`, (num_worlds + 1,) vec3, can differ by world.
         requires_grad: Whether the model's arrays carry gradients.
         visuals: Whether to add shapes that only viewers see. Without them large batches build faster.
         extras: Function that adds the caller's sites and shapes to the builder of one robot; it is called once, and
             every world gets a copy whose labels start with `world_i/`. A link's index is
             `builder.body_label.index("FL_inner_shank")`. Sites and shapes that do not collide work with every solver.
             Colliding shapes and obstacles (body -1) act in Newton's solvers; SolverJumper ignores them with a warning.
-            It refuses bodies, joints and particles.
+            SolverJumper refuses bodies, joints and particles.
 
     Raises:
         InputError: `num_worlds` no whole number above 0, `friction` not in 0 to 10, `gravity` not in 0 to 100, or an
@@ -152,7 +152,7 @@ def _paw_depth(leg: LegDimensions, lateral: float, ankle_z: float) -> float:
 def _robot_builder(
     description: RobotDescription, friction: float, gravity: float, visuals: bool
 ) -> newton.ModelBuilder:
-    """Return the builder of one robot in the default pose; friction: of the paws [1]; gravity: downward [m/s^2]."""
+    """Return the builder of one robot in the default pose; friction [1] of the paws; gravity [m/s^2]: downward."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     bodies = {}

@@ -45,7 +45,7 @@ class MotorKindCfg:
     """[rad/s] Speed from which no driving torque is available."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: a value is negative or not finite, a torque limit is 0, or the speeds do not rise."""
+        """Raise InputError if a value is negative or not finite, a torque limit is 0, or no_load_speed is too low."""
         for name, value in vars(self).items():
             check_not_negative(f"motor {name}", value)
         if self.saturation == 0.0 or self.peak == 0.0:
@@ -68,7 +68,7 @@ class MotorCfg:
     def __post_init__(self) -> None:
         """Raise InputError unless 0 <= fade_start < fade_end, both finite."""
         if not 0.0 <= self.fade_start < self.fade_end < math.inf:
-            raise InputError(f"fade_start and fade_end must rise, got {self.fade_start}, {self.fade_end}")
+            raise InputError(f"need 0 <= fade_start < fade_end, finite, got {self.fade_start}, {self.fade_end}")
 
     @classmethod
     def from_description(
@@ -143,14 +143,14 @@ class LimitsCfg:
     upper: float
     """[deg]"""
     lower_zone: float = 0.0
-    """[deg] Width of the hard zone before the lower limit."""
+    """[deg] Width of the hard zone inside the lower limit."""
     upper_zone: float = 0.0
-    """[deg] Width of the hard zone before the upper limit."""
+    """[deg] Width of the hard zone inside the upper limit."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: the limits do not rise or are not finite, or the zones are negative or overlap."""
+        """Raise InputError unless the limits are finite, lower < upper, and zones non-negative without overlap."""
         if not -math.inf < self.lower < self.upper < math.inf:
-            raise InputError(f"limits must be finite and rise, got {self.lower}, {self.upper}")
+            raise InputError(f"lower limit must be below upper limit, both finite, got {self.lower}, {self.upper}")
         if not (self.lower_zone >= 0.0 and self.upper_zone >= 0.0):
             raise InputError(f"hard zones must be >= 0, got {self.lower_zone}, {self.upper_zone}")
         if not self.lower_zone + self.upper_zone <= self.upper - self.lower:
@@ -217,7 +217,7 @@ def filter_params(cfg: FilterCfg, *, module: ModuleType = command_filter) -> Any
 
 
 def filter_constants(cfg: FilterCfg | None) -> np.ndarray:
-    """Return a filter's constants, (14,), in the order and units of `FILTER_NAMES`; None: the vertical jump's."""
+    """Return a filter's constants, (14,), in the order and units of `FILTER_NAMES`; None: vertical jump."""
     cfg = cfg or vertical_jump_filter()
     angles = [getattr(getattr(cfg, angle), limit) for angle in ("lateral", "transversal", "sum") for limit in LIMITS]
     return np.array([*np.radians(angles), cfg.horizon, math.radians(cfg.speed_floor)])

@@ -61,7 +61,7 @@ class RobotOverlay:
     """Origin of the values, free text."""
 
     def __post_init__(self) -> None:
-        """Raises InputError: an unknown quantity or range, a wrong number of values, or one out of range."""
+        """Raise InputError for an unknown quantity or range, a wrong number of values, or a value out of range."""
         check_names("quantity", self.values, RANGES)
         check_names("range of randomisation", self.randomization, RANDOMIZED)
         nominal = vars(RobotValues.nominal(1))
@@ -108,7 +108,7 @@ class RobotOverlay:
             sections[section] = {name: finite_tuple(f"{section} {name}", values) for name, values in table.items()}
         for name, pair in sections["randomization"].items():
             if len(pair) != 2 or pair[0] > pair[1]:
-                raise InputError(f"robot overlay: randomization {name!r:.60} must be two rising numbers, got {pair}")
+                raise InputError(f"robot overlay: randomization {name!r:.60} must be [lower, upper], got {pair}")
         return cls(**sections, source=str(saved.get("source", "")))
 
     def save(self, path: Path) -> None:
@@ -120,13 +120,13 @@ def check_names(noun: str, names: Iterable[str], known: Iterable[str]) -> None:
     """Raise InputError for a name that is not among the known ones; noun: kind of name, for the message."""
     for name in names:
         if name not in known:
-            raise InputError(f"robot overlay: no {noun} {name!r:.60}; there are {', '.join(known)}")
+            raise InputError(f"robot overlay: unknown {noun} {name!r:.60}; expected one of {', '.join(known)}")
 
 
 def check_range(name: str, values: tuple[float, ...]) -> None:
     """Raise InputError for a value outside RANGES[name]."""
     low, high, unit = RANGES[name]
-    hint = " (a ratio: 1 is as described)" if RANGES[name] is RATIO else ""
+    hint = " (1: as described)" if RANGES[name] is RATIO else ""
     for value in values:
         if not low <= value <= high:
             limits = f"{low:g} to {high:g}{unit and ' '}{unit}{hint}"
@@ -161,6 +161,6 @@ def load_overlay(path: Path) -> RobotOverlay:
 
 
 def overlay_of(values: RobotValues, quantities: tuple[str, ...], **fields: Any) -> RobotOverlay:
-    """Return the overlay of the named quantities of the first of N robots; fields: other fields of `RobotOverlay`."""
+    """Return the overlay with the named quantities of the first robot in `values`; fields: others of `RobotOverlay`."""
     selected = {name: tuple(float(x) for x in np.asarray(getattr(values, name))[0]) for name in quantities}
     return RobotOverlay(selected, **fields)

@@ -19,7 +19,7 @@ MOTOR_JOINTS = tuple(f"{leg}_{joint}" for leg in LEGS for joint in ("lateral", "
 
 
 class RobotDescriptionError(InputError):
-    """An unusable robot description. The message is one line: "FILE: PART: PROBLEM", without PART if it is empty."""
+    """Error in a robot description. The message is one line: "FILE: PART: PROBLEM", without PART if it is empty."""
 
     def __init__(self, file: Path, part: str, problem: str):
         place = f"{file}: {part}" if part else f"{file}"
@@ -34,7 +34,7 @@ def require(holds: bool, file: Path, part: str, problem: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """A triangle mesh."""
+    """Triangle mesh of a shape."""
 
     vertices: np.ndarray  # (n, 3) [m], shape frame
     triangles: np.ndarray  # (m, 3) int32, indices of vertices
@@ -54,7 +54,7 @@ class Shape:
 
 @dataclass(frozen=True, eq=False)
 class Link:
-    """A rigid body."""
+    """Rigid body of the robot, with its mass and shapes."""
 
     name: str
     mass: float  # [kg]
@@ -66,7 +66,7 @@ class Link:
 
 @dataclass(frozen=True, eq=False)
 class Joint:
-    """A hinge. The child link's frame sits at `origin` and is parallel to the parent's at angle zero."""
+    """Hinge between two links. The child link's frame is at `origin` and parallel to the parent's at angle zero."""
 
     name: str
     parent: str  # name of the link
@@ -120,7 +120,7 @@ class Motor:
 
 @dataclass(frozen=True, eq=False)
 class RobotDescription:
-    """Robot independent of a simulator: links, joints, loops, motors and poses; `dataclasses.replace` modifies it."""
+    """Description of a robot: links, joints, loops, motors and poses; `dataclasses.replace` returns a changed copy."""
 
     path: Path  # JSON file
     urdf_path: Path

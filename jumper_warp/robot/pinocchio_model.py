@@ -21,7 +21,7 @@ pin: Any = pinocchio  # a compiled module without types
 PROXIMAL_ACCURACY = 1.0e-12  # residual at which Pinocchio's proximal iteration ends
 PROXIMAL_DAMPING = 1.0e-10  # proximal mu: keeps the solve regular, since a planar loop has three rows of rank two
 PROXIMAL_ITERATIONS = 20
-MAX_GAP = 1.0e-9  # [m] of a closed loop
+MAX_GAP = 1.0e-9  # [m] largest distance of the anchors of a closed loop
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,7 +43,7 @@ class PinocchioRobot:
     knee_v: np.ndarray  # (8,) index into v of the knees
 
     def configuration(self, base_pos: np.ndarray, base_quat_xyzw: np.ndarray, motors: np.ndarray) -> np.ndarray:
-        """Return q, (27,), with the knee angles that close the loops, ankles below the knees.
+        """Return the configuration q, (27,), with knee angles that close the loops, ankles below the knees.
 
         base_pos: body origin (3,) [m], world frame. base_quat_xyzw: (4,) body to world, unit. motors: angles (12,)
         [rad] in motor order. Raises InputError: a loop cannot be closed.
@@ -96,7 +96,7 @@ class PinocchioRobot:
         return np.stack([self.paw_velocities(q, self.closed_velocity(q, np.zeros(6), rate)) for rate in rates], axis=2)
 
     def closed_velocity(self, q: np.ndarray, base_twist: np.ndarray, motor_rates: np.ndarray) -> np.ndarray:
-        """Return v, shape (26,), with the knee rates that keep the loops of a configuration (27,) closed.
+        """Return the velocity v, (26,), with knee rates that keep the loops of a configuration q (27,) closed.
 
         base_twist: (6,) linear velocity [m/s] of the body origin, then angular velocity [rad/s], body frame.
         motor_rates: (12,) [rad/s], motor order.
@@ -127,7 +127,7 @@ class PinocchioRobot:
         ).copy()
 
     def _knees(self, leg: str, outer: float, inner: float) -> tuple[float, float]:
-        """Return outer and inner knee angle [rad] from the thigh angles [rad], by the triangle knee, knee, ankle."""
+        """Return outer and inner knee angle [rad] from the thigh angles [rad], by the triangle of knees and ankle."""
         origin = {name: self.model.jointPlacements[self.model.getJointId(f"{leg}_{name}")].translation
                   for name in ("outer", "inner", "outer_knee")}  # fmt: skip
         separation = abs(origin["outer"][0] - origin["inner"][0])

@@ -12,7 +12,7 @@ import numpy as np
 
 from jumper_warp.utils.errors import InputError
 
-KINDS = ("flat", "uneven", "waves", "slope", "bowl", "stairs", "pit", "blocks")  # of tiles
+KINDS = ("flat", "uneven", "waves", "slope", "bowl", "stairs", "pit", "blocks")  # Kinds of tiles
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class TerrainCfg:
     """Seed of random ground."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: a count, length or slope is out of range, or a kind is unknown."""
+        """Raise InputError if a count, length or slope is out of range, or a kind is unknown."""
         if self.rows < 0 or self.seed < 0:
             raise InputError(f"terrain rows and seed must not be negative, got {self.rows}, {self.seed}")
         for kind in self.kinds or ("",):
@@ -152,7 +152,7 @@ class _Tile(NamedTuple):
         return np.clip(self.reach - self.off, 0.0, self.reach - self.cfg.start)
 
     def waves(self, shortest: float, longest: float, count: int) -> np.ndarray:
-        """Return the heights (n, n) [m] of `count` plane waves of random direction and wavelength [m].
+        """Return the heights (n, n) [m] of the sum of `count` plane waves of random direction and wavelength [m].
 
         Rim and middle are level; over 0.3 m the waves grow to full height, which is `difficulty * cfg.uneven`.
         """

@@ -14,7 +14,7 @@ from jumper_warp.robot.parts import Joint, Link, RobotDescriptionError, Shape, T
 
 MAX_FILE_BYTES = 8_000_000
 SHAPE_SIZES = {"box": ("size", 3), "cylinder": ("radius length", 1), "sphere": ("radius", 1)}
-"""By tag of the shape: its attributes, and how many numbers [m] each holds."""
+"""By tag of the shape: its attributes, and the count of numbers [m] in each."""
 
 
 def read_text(file: Path) -> str:
@@ -53,7 +53,7 @@ def parse_xml(file: Path, text: str) -> Element:
 
 
 class UrdfReader:
-    """Reads one URDF text into links and joints. Every method raises RobotDescriptionError on bad input.
+    """Reader of a URDF text's links and joints. Every method raises RobotDescriptionError on bad input.
 
     Parameters: element, an XML element; part, the place that an error message names, as "link body".
     """
@@ -69,7 +69,7 @@ class UrdfReader:
             self.colors[material.get("name")] = tuple(self.numbers(color, "rgba", 4, "material")[:3])
 
     def require(self, holds: bool, part: str, problem: str) -> None:
-        """Raise RobotDescriptionError for this file unless `holds`; problem: of the message."""
+        """Raise RobotDescriptionError for this file unless `holds`; problem: text of the message."""
         require(holds, self.file, part, problem)
 
     def links(self) -> tuple[Link, ...]:

@@ -19,12 +19,12 @@ MOTOR_QUANTITIES = (
 
 @dataclass
 class RobotValues:
-    """Values of N robots: arrays (N, columns). Motors: legs FL, FR, BL, BR, each lateral, outer, inner."""
+    """Values of N robots, arrays (N, columns). Motors: legs FL, FR, BL, BR, each lateral, outer, inner."""
 
     base_mass: np.ndarray  # (N, 1) [kg]
     base_com: np.ndarray  # (N, 3) [m], base frame
     base_inertia: np.ndarray
-    """(N, 1) [1] Scales the described inertia about the centre of mass, besides the ratio of the base masses."""
+    """(N, 1) [1] Factor on the described inertia about the centre of mass, in addition to the ratio of base masses."""
     link_mass: np.ndarray  # (N, 5) [1] Ratio to the described mass and inertia, one column per entry of `LINK_KINDS`
     armature: np.ndarray  # (N, 12) [kg m^2]
     motor_friction: np.ndarray  # (N, 12) [N m]
@@ -42,7 +42,7 @@ class RobotValues:
 
     @classmethod
     def nominal(cls, count: int, description: RobotDescription | None = None) -> RobotValues:
-        """Return the values of `count` equal robots as described, by default as the project's description."""
+        """Return `count` equal robots with the values of a description, by default the project's."""
         robot = load_description() if description is None else description
         motors, base = robot.motors, robot.links[0]
         single = cls(

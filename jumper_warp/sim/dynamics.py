@@ -1,4 +1,4 @@
-"""The dedicated dynamics on the arrays of a Newton model, in single or double precision."""
+"""Dedicated dynamics of the Jumper on the arrays of a Newton model, in single or double precision."""
 
 from __future__ import annotations
 
@@ -29,15 +29,15 @@ KERNEL_MODULES = (
     "dynamics.world.advance", "dynamics.world.rollout", "kinematics.full_state", "kinematics.geometry",
     "layout", "scalar", "state", "terrain.ground",
 )  # fmt: skip
-ALONE = "this robot alone, shapes and sites aside"
+ALONE = "this robot alone, besides shapes and sites"
 
 
 class NotThisRobotError(InputError):
-    """A Newton model whose bodies, joints or shapes are not those of this robot."""
+    """Error raised for a Newton model whose bodies, joints or shapes are not those of this robot."""
 
 
 def kernel_modules(double: bool = False) -> SimpleNamespace:
-    """Return the modules `KERNEL_MODULES`, as attributes named by the last part, in single or double precision."""
+    """Return the modules `KERNEL_MODULES` as attributes named after each module, in single or double precision."""
     package = float64_kernels().__name__ if double else "jumper_warp.kernels"
     return SimpleNamespace(
         **{name.split(".")[-1]: importlib.import_module(f"{package}.{name}") for name in KERNEL_MODULES}
@@ -53,9 +53,9 @@ def check_model(model: Model) -> None:
         raise NotThisRobotError("the model has no worlds; build it with jumper_warp.robot.model.build_model")
     for noun, labels, expected in (("body", model.body_label, bodies), ("joint", model.joint_label, joints)):
         names = [label.split("/")[-1] for label in labels]
-        stranger = next((label for label, name in zip(labels, names, strict=True) if name not in expected), None)
-        if stranger is not None and len(names) > count * len(expected):
-            raise NotThisRobotError(f"{noun} {stranger!r:.60} cannot be simulated: every world must hold {ALONE}")
+        unknown = next((label for label, name in zip(labels, names, strict=True) if name not in expected), None)
+        if unknown is not None and len(names) > count * len(expected):
+            raise NotThisRobotError(f"{noun} {unknown!r:.60} cannot be simulated: every world must hold {ALONE}")
         if len(names) != count * len(expected):
             raise NotThisRobotError(
                 f"{count} worlds of this robot have {count * len(expected)} {noun} labels, the model has {len(names)}"
@@ -216,7 +216,7 @@ class JumperDynamics:
         return record
 
     def pack(self) -> None:
-        """Read masses, joints, friction and gravity of every world from the model, and `leg_springs`."""
+        """Copy masses, joints, friction, gravity and `leg_springs` of every world to the parameter table."""
         self.pack_masses()
         self.pack_joints()
         self.pack_friction()
@@ -224,13 +224,13 @@ class JumperDynamics:
         self.pack_springs()
 
     def pack_masses(self) -> None:
-        """Read masses, centres of mass and inertias of all links from the model."""
+        """Copy masses, centres of mass and inertias of all links from the model to the parameter table."""
         m = self.model
         arrays = [m.body_mass, m.body_com, m.body_inertia]
         self._launch(self.modules.parameters.pack_masses_kernel, (self.num_worlds, 21), arrays)
 
     def pack_joints(self) -> None:
-        """Read armature, friction, damping and hard stops of all joints from the model."""
+        """Copy armature, friction, damping and hard stops of all joints from the model to the parameter table."""
         m = self.model
         lower, upper = self.description.transversal_sum
         self._launch(
@@ -241,7 +241,7 @@ class JumperDynamics:
         )  # fmt: skip
 
     def pack_friction(self) -> None:
-        """Read the friction coefficients of paws and ground from the model, and `static_friction_ratio`."""
+        """Copy friction coefficients of paws and ground, and `static_friction_ratio`, to the parameter table."""
         self._launch(
             self.modules.parameters.pack_friction_kernel,
             (self.num_worlds, 4),
@@ -249,7 +249,7 @@ class JumperDynamics:
         )
 
     def repack(self, mask: wp.array, worlds: WorldRange | None = None) -> None:
-        """Read masses, armature, motor and paw friction from the model, where mask (num_worlds,) float is not 0.
+        """Copy masses, armature and friction from the model to the table, where mask (num_worlds,) float is not 0.
 
         worlds: range in which the mask is read, by default all.
         """
@@ -262,11 +262,11 @@ class JumperDynamics:
         )  # fmt: skip
 
     def pack_gravity(self) -> None:
-        """Read gravity of every world from the model."""
+        """Copy gravity of every world from the model to the parameter table."""
         self._launch(self.modules.parameters.pack_gravity_kernel, self.num_worlds, [self.model.gravity])
 
     def pack_springs(self) -> None:
-        """Read `leg_springs` into the parameter table."""
+        """Copy `leg_springs` to the parameter table."""
         self._launch(self.modules.parameters.pack_springs_kernel, (self.num_worlds, 4), [self.leg_springs])
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list) -> None:

@@ -9,7 +9,7 @@ from jumper_warp.sim.simulation import Simulation
 
 
 class LinkReader:
-    """Computes poses and twists of all links from the joint coordinates, without changing the simulation."""
+    """Reader of poses and twists of all links of a simulation, computed from the joint coordinates."""
 
     def __init__(self, sim: Simulation) -> None:
         """Allocate a separate state of the simulation's model."""

@@ -62,7 +62,7 @@ def write_springs(dynamics: JumperDynamics, robots: RobotValues) -> None:
 
 
 def write_motors(motors: Any, robots: RobotValues) -> None:
-    """Scale kp, kd and saturation of `MotorArrays` that hold described values, and set speeds and sensor offsets.
+    """Scale kp, kd and saturation of `MotorArrays` with the description's values; write speeds and sensor offsets.
 
     robots: N = 1 for all worlds, or N = num_worlds.
     """

@@ -35,7 +35,7 @@ RANDOMIZED_FLAGS = (
 
 
 class Physics(ABC):
-    """A solver with motors for the worlds of a `Simulation`. Arrays are never reallocated; legs FL, FR, BL, BR."""
+    """Solver and motors of all worlds of a `Simulation`. Arrays are never reallocated; legs FL, FR, BL, BR."""
 
     sliced: bool  # Whether `advance` supports a range of worlds
     solver: newton.solvers.SolverBase
@@ -84,7 +84,7 @@ class Physics(ABC):
         self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
 
     def kernels(self) -> list[tuple[wp.Kernel, int]]:
-        """Return (kernel, threads per block) of a policy step's launches, to compile in advance."""
+        """Return the kernels that a policy step launches, to compile in advance, as (kernel, threads per block)."""
         return []
 
     def carried(self) -> dict[str, wp.array]:
@@ -93,7 +93,7 @@ class Physics(ABC):
 
 
 class JumperPhysics(Physics):
-    """`SolverJumper`, which advances a whole policy step in one launch."""
+    """Physics of a simulation by `SolverJumper`, which advances a whole policy step in one launch."""
 
     sliced = True
     solver: SolverJumper
@@ -112,7 +112,7 @@ class JumperPhysics(Physics):
         self, substeps: int, target: wp.array, previous: wp.array | None = None, delay: wp.array | None = None,
         bodies: bool = True, worlds: WorldRange | None = None,
     ) -> None:  # fmt: skip
-        """See `Physics.advance`."""
+        """Launch `substeps` physics steps of SolverJumper; see `Physics.advance`."""
         state, sim = self._sim.state, self._sim
         q, qd, momenta = state.joint_q, state.joint_qd, self._momenta
         if momenta is not None:
@@ -127,7 +127,7 @@ class JumperPhysics(Physics):
                 self.dynamics.full_state(q, qd, state.body_q, state.body_qd, worlds)
 
     def parameters_changed(self, mask: wp.array | None = None, worlds: WorldRange | None = None) -> None:
-        """See `Physics.parameters_changed`."""
+        """Copy changed parameters from the model; see `Physics.parameters_changed`."""
         if mask is None:
             self.dynamics.pack()
         else:
@@ -137,20 +137,20 @@ class JumperPhysics(Physics):
         """Do nothing: the solver reads base and motor coordinates alone."""
 
     def forget(self, mask: wp.array) -> None:
-        """See `Physics.forget`."""
+        """Clear contact history and diverged flags and reset blocks; see `Physics.forget`."""
         self.solver.reset(self._sim.state, mask, flags=newton.StateFlags.NONE)
         if self._sim.block is not None:
             self.solver.reset_blocks(mask)
 
     def kernels(self) -> list[tuple[wp.Kernel, int]]:
-        """See `Physics.kernels`; with `keep_momentum` also the projection's kernels."""
+        """Return the kernels that a policy step launches, with `keep_momentum` also the projection's."""
         momentum = self.dynamics.modules.momentum
         projection = [(momentum.momentum_kernel, 32), (momentum.project_momentum_kernel, 32)]
         return [self.dynamics.advance_kernel(), *(projection if self._momenta is not None else [])]
 
 
 class MujocoPhysics(Physics):
-    """Newton's SolverMuJoCo with this robot's motors and passive joints, several launches per physics step."""
+    """Physics of a simulation by Newton's SolverMuJoCo, with this robot's motors and passive joints as torques."""
 
     sliced = False
     solver: newton.solvers.SolverMuJoCo
@@ -189,7 +189,7 @@ class MujocoPhysics(Physics):
         self, substeps: int, target: wp.array, previous: wp.array | None = None, delay: wp.array | None = None,
         bodies: bool = True, worlds: WorldRange | None = None,
     ) -> None:  # fmt: skip
-        """See `Physics.advance`; ignores `bodies` and `worlds`: it advances all worlds and writes all bodies."""
+        """Launch `substeps` physics steps of SolverMuJoCo for all worlds and bodies; ignores `bodies` and `worlds`."""
         for i in range(substeps):
             if delay is not None:
                 self._launch(
@@ -213,7 +213,7 @@ class MujocoPhysics(Physics):
             )
 
     def parameters_changed(self, mask: wp.array | None = None, worlds: WorldRange | None = None) -> None:
-        """See `Physics.parameters_changed`; ignores mask and range: MuJoCo reads all worlds."""
+        """Make SolverMuJoCo read changed parameters of all worlds; ignores mask and range."""
         self.solver.notify_model_changed(RANDOMIZED_FLAGS)
 
     def after_reset(self, mask: wp.array) -> None:
@@ -223,13 +223,13 @@ class MujocoPhysics(Physics):
         self.write_bodies()
 
     def forget(self, mask: wp.array) -> None:
-        """See `Physics.forget`; also clears the last step's velocities, which the constraint rows of the loops read."""
+        """Clear contact history, and the last step's velocities, which the constraint rows of the loops read."""
         self.solver.reset(self._sim.state, mask, flags=newton.StateFlags.NONE)
         for stale in (self.solver.mjw_data.cvel, self.solver.mjw_data.cdof_dot):
             self._launch(zero_worlds_kernel, stale.shape, [mask], [stale])
 
     def carried(self) -> dict[str, wp.array]:
-        """See `Physics.carried`: MuJoCo's warm start and velocities, and the bodies' poses and velocities."""
+        """Return MuJoCo's warm start and velocities, and the bodies' poses and velocities; see `Physics.carried`."""
         data = self.solver.mjw_data
         names = ("qacc_warmstart", "cvel", "cdof_dot")
         bodies = {"body_q": self._sim.state.body_q, "body_qd": self._sim.state.body_qd}

@@ -1,4 +1,4 @@
-"""A double-precision build of the kernels, for reference."""
+"""Double-precision build of the kernels, a reference for rounding errors and gradients."""
 
 import importlib.util
 import sys

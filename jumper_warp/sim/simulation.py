@@ -94,7 +94,7 @@ class Simulation:
         if solver == "mujoco" and block is not None:
             raise InputError("a moving block needs solver='jumper', got 'mujoco'")
         if not isinstance(robot, RobotOverlay | RobotValues | None):
-            raise InputError(f"robot must be a RobotOverlay, as load_overlay reads a file, got {robot!r:.60}")
+            raise InputError(f"robot must be a RobotOverlay (see load_overlay) or RobotValues, got {robot!r:.60}")
         check_step(dt, substeps)
         check_tolerance(tolerance)
         threads = checked_threads(threads)
@@ -213,7 +213,7 @@ class Simulation:
         self._physics(self.substeps, worlds)
 
     def _captured(self, name: str, body: Callable[[WorldRange], None]) -> None:
-        """Run `body` for all worlds: the first call of a name, or one in a capture, launches; others replay."""
+        """Run `body` for all worlds: launch it at the first call of a name or within a capture, else replay a graph."""
         if self.device.is_capturing:
             body(WorldRange(0, self.num_worlds))
             return

@@ -17,7 +17,7 @@ import warp as wp
 from jumper_warp.utils.threads import run_in_parallel
 
 MIN_WORLDS = 16
-"""Smallest slice: a thread costs more than it gains for fewer worlds, and slices share no cache line of a row."""
+"""Smallest slice: for fewer worlds a thread costs more than it saves, and slices would share cache lines."""
 
 
 class WorldRange(NamedTuple):
@@ -35,7 +35,7 @@ def slices_of(num_worlds: int, threads: int) -> list[WorldRange]:
 
 
 class SlicedGraph:
-    """Graphs of the same launches, one for each slice of worlds."""
+    """Captured graphs of the same launches, one for each slice of worlds."""
 
     def __init__(self, launch: Callable[[WorldRange], None], slices: list[WorldRange], device: wp.Device) -> None:
         """Capture `launch(slice)` for each slice; launch: function that launches kernels, whose modules are loaded."""

@@ -66,7 +66,7 @@ def warn_of_colliders(model: Model) -> None:
     if len(ignored) > 0:
         warnings.warn(
             f"SolverJumper ignores the collisions of {len(ignored)} shapes, such as "
-            f"{model.shape_label[ignored[0]]!r:.60}: only the paws touch, ground and blocks",
+            f"{model.shape_label[ignored[0]]!r:.60}: only paws, ground and blocks have contact",
             stacklevel=3,
         )
 
@@ -82,8 +82,8 @@ class SolverJumper(SolverBase):
 
     Reads base and motor coordinates of `joint_q`/`joint_qd`, `control.joint_f` of base and motors (world wrench [N],
     [N m] at the base's com; motor torques [N m]) and `state.body_f` of the base. Writes every joint, loop joint and
-    body. Forces on other bodies and passive joints are not read. On a CPU a thread owns a world, on a GPU four
-    threads share one and add up in a fixed order, so results repeat bit for bit on a device.
+    body. Forces on other bodies and passive joints are not read. On a CPU one thread simulates a world, on a GPU
+    four threads share a world and sum in a fixed order, so that results on a device are bitwise reproducible.
 
     Where the states carry gradients (`finalize(requires_grad=True)`) `wp.Tape` can differentiate `step`, given a
     separate state for every step (see `jumper_warp.sim.tape`). Record `dynamics.pack_masses()` or `pack_joints()` on
@@ -96,7 +96,7 @@ class SolverJumper(SolverBase):
     contacts of the paws (`update_contacts`), where its observables request `contact_f`.
 
     Shapes of the model other than paws and ground do not collide; a warning names the first such shape. Sites and
-    shapes that do not collide serve sensors and viewers.
+    shapes that do not collide are for sensors and viewers.
 
     A diverged (non-finite) world is flagged in `diverged` and frozen at rest in the model's reference pose until
     `reset` clears it.

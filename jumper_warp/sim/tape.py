@@ -18,7 +18,7 @@ class DifferentiableStep:
     """
 
     def __init__(self, dynamics: JumperDynamics, max_sweeps: int, tolerance: float):
-        """max_sweeps, tolerance [m/s]: of the contact iteration, whose error the gradients inherit."""
+        """Allocate the buffers; max_sweeps, tolerance [m/s]: of the contact iteration, whose error gradients have."""
         self._dynamics = dynamics
         self._max_sweeps = max_sweeps
         self._tolerance = tolerance

@@ -1,4 +1,4 @@
-"""Definition of a task as data: state, tables of terms, reset, command, curriculum and randomisation."""
+"""Definition of a task as data: state, terms, reset, command, curriculum and randomisation."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from typing import Any
 
 from jumper_warp.kernels.mdp.env import NoSettings
 from jumper_warp.kernels.mdp.starts import MIN_LINK_DISTANCE
-from jumper_warp.kernels.mdp.terminations import came_apart, too_long
+from jumper_warp.kernels.mdp.terminations import diverged, too_long
 from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
 from jumper_warp.tasks.params import TaskParams
@@ -33,17 +33,17 @@ from jumper_warp.utils.kernels import Function
 
 @dataclass(frozen=True)
 class Reset:
-    """How an episode begins."""
+    """Function that samples the state at the start of an episode, with its settings."""
 
     func: Function
-    """@wp.func (arrays: RobotArrays, scene: Scene, skill: SkillSettings, old state, settings, level, rng: RngStream) ->
-    new state; writes coordinates and rates of world `rng.world`."""
+    """Function that resets world `rng.world`: @wp.func (arrays: RobotArrays, scene: Scene, skill: SkillSettings, state,
+    settings, level, rng: RngStream) -> new state. It writes the world's joint coordinates and velocities."""
     settings: Any = None
-    """Frozen dataclass with `struct`, a `@wp.struct`, and `values(step_dt)` [s], which returns one; or None.
-    A property `max_episode_length_s` is the time limit [s] of episodes that it ends (0: none)."""
+    """Settings of `func`: a frozen dataclass with `struct`, a `@wp.struct`, and `values(step_dt)` [s], which returns an
+    instance; or None. A property `max_episode_length_s` is the time limit [s] of episodes that it ends (0: none)."""
     parallel: bool = False
-    """Whether threads of a GPU share `func`'s attempts, `range(rng.lane, number, rng.lanes)`. Only `rng.lane` differs
-    between the threads; apart from the attempts they must write equal values."""
+    """Whether GPU threads share the attempts of `func`: each makes `range(rng.lane, number, rng.lanes)`. The threads
+    differ in `rng.lane` only; apart from the attempts they must write equal values."""
 
 
 @dataclass(frozen=True)
@@ -51,14 +51,14 @@ class Command:
     """Functions that set a task's command from outside and resample it within an episode."""
 
     set: Function
-    """@wp.func (robot, scene: Scene, state, values: wp.vec4, heading [rad]) -> state with the command `values`."""
+    """Function that sets a command: @wp.func (robot, scene: Scene, state, values: wp.vec4, heading [rad]) -> state."""
     resample_due: Function | None = None
-    """@wp.func (state) -> bool, whether to sample a new command in this step; None: never."""
+    """Condition to sample a new command in this step: @wp.func (state) -> bool; None: never."""
     resample: Function | None = None
-    """@wp.func (robot, scene: Scene, state, level, rng: RngStream) -> state with a sampled command."""
+    """Function that samples a command: @wp.func (robot, scene: Scene, state, level, rng: RngStream) -> state."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: one of resample_due and resample is missing."""
+        """Raise InputError if only one of resample_due and resample is given."""
         if (self.resample_due is None) != (self.resample is None):
             raise InputError("a command needs both resample_due and resample, or neither")
 
@@ -73,7 +73,7 @@ class ObservationsCfg:
 
 @dataclass(frozen=True)
 class TaskCfg:
-    """A task on the robot: everything that an environment needs, as data."""
+    """Definition of a task: everything that an environment needs, as data."""
 
     name: str
     state: Any
@@ -84,19 +84,19 @@ class TaskCfg:
     curriculum: Curriculum
     rewards: tuple[RewardTerm, ...]
     terminations: tuple[TerminationTerm, ...]
-    """In this order; the first that is true ends the episode and is logged."""
+    """Terminations in order of priority; the first that is true ends the episode and is logged."""
     observations: ObservationsCfg
     motors: MotorCfg
     command_filter: FilterCfg
     action_scale: Pair
-    """[deg] Change of the motor target per unit of action: lateral, transversal motors."""
+    """[deg] Change of the motor target per unit of action, for (lateral, transversal) motors."""
     levels: tuple[Any, ...] = ()
     """Levels of the curriculum, easiest first: frozen dataclasses of one type with `struct` and `values()`."""
     events: tuple[EventTerm, ...] = ()
     """Events in addition to those of `randomization`."""
     randomization: RandomizationCfg = field(default_factory=RandomizationCfg)
     gravity: float = EARTH
-    """[m/s^2] Downward, of every world; estimates of flights use it too."""
+    """[m/s^2] Downward gravitational acceleration of every world, also used to estimate flights."""
     keep_momentum: bool = False
     """Whether gravity alone changes the momentum of robots in free flight; see `Simulation`."""
     eval_height_offset: float = 0.0
@@ -106,36 +106,36 @@ class TaskCfg:
     self_collision_margin: float = 0.0
     """[m] Distance below which links collide in training; in evaluation it is 0."""
     obstacle_margin: float = 0.0
-    """[m] Growth of blocks in width and height, for collisions with links, in training; in evaluation it is 0."""
+    """[m] Margin added to width and height of blocks for collisions with links in training; in evaluation it is 0."""
     reward_floor: float | None = 0.0
     """Least total reward of a step; None: no floor."""
     metrics: tuple[StateMetric, ...] = ()
-    """Logged metrics of the state, in addition to the means of all terms."""
+    """Logged metrics of the task's state, in addition to the means of all terms."""
     evaluation_suite: str = "episode"
-    """Evaluation and playback of policies: a key of `jumper_warp.evaluation.evaluations.EVALUATIONS`."""
+    """Name of the suite that evaluates and plays policies, a key of `evaluation.evaluations.EVALUATIONS`."""
 
     groups = ("actor", "critic")
     """Names of the observation groups."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: two terms share a name, a function does not fit the state, or a setting is out of range."""
+        """Raise InputError if terms share a name, a function does not fit the state, or a setting is out of range."""
         for section in ("rewards", "terminations", "observations.actor", "observations.critic", "events"):
             names = [term.name for term in operator.attrgetter(section)(self)]
             if len(set(names)) < len(names):
-                raise InputError(f"every term of {self.name}'s {section} needs a name of its own, got {names}")
+                raise InputError(f"{self.name} {section}: names of terms must be unique, got {names}")
         for section, slots in self.params.slots.items():
             for term in (slot.term for slot in slots):
                 if term.of_state not in (Any, self.state):
                     wanted = f"is for {term.of_state.key}, not {self.state.key}"
                     raise InputError(f"{self.name} {section}: {term.name} {wanted}")
         self._check_functions()
-        if came_apart not in [term.func for term in self.terminations]:
-            raise InputError(f"{self.name} needs the termination came_apart, for worlds whose state is no longer one")
+        if diverged not in [term.func for term in self.terminations]:
+            raise InputError(f"{self.name} needs the termination diverged, which ends diverged simulations")
         if not all(0.0 < scale < math.inf for scale in self.action_scale):
             raise InputError(f"{self.name}: action_scale must be positive and finite [deg], got {self.action_scale}")
         for metric in self.metrics:
             for field_name in {metric.field, metric.per or metric.field} - set(self.state.vars):
-                raise InputError(f"{self.name}: metric {metric.name} needs {field_name!r}, which its state has not")
+                raise InputError(f"{self.name}: metric {metric.name} needs a field {field_name!r} of the state")
         check_gravity(self.gravity)
         for name in ("eval_height_offset", "contact_force", "obstacle_margin"):
             check_not_negative(f"{self.name}: {name}", getattr(self, name))
@@ -150,9 +150,9 @@ class TaskCfg:
         return replace(self, self_collision_margin=0.0, obstacle_margin=0.0)
 
     def _check_functions(self) -> None:
-        """Raise InputError: reset, command or curriculum takes other structs than this task's."""
+        """Raise InputError if functions of reset, command or curriculum take structs of another task."""
         if len({level.struct for level in self.levels}) > 1:
-            raise InputError(f"{self.name}: all levels must be of one kind")
+            raise InputError(f"{self.name}: all levels must be of one type")
         state, level = self.state, self.level_type
         expected = {  # by place: the function, and the struct of each argument by its index
             "reset": (self.reset.func, {3: state, 4: self.settings_type, 5: level}),
@@ -173,7 +173,7 @@ class TaskCfg:
 
     @functools.cached_property
     def params(self) -> TaskParams:
-        """Numbers of all terms, by section: "advance", "curriculum", "rewards", "observations.actor" and so on."""
+        """Parameters of all terms by section: "advance", "curriculum", "rewards", "observations.actor" and so on."""
         sections = {"advance": (self.advance,), "curriculum": (self.curriculum,), "rewards": self.rewards,
                     "terminations": self.terminations, "observations.actor": self.observations.actor,
                     "observations.critic": self.observations.critic,
@@ -189,7 +189,7 @@ class TaskCfg:
         return columns
 
     def max_episode_length_s(self, step_dt: float) -> float:
-        """Return the time limit of episodes [s], of the reset and the termination `too_long`; 0: no limit.
+        """Return the time limit of episodes [s], set by the reset or the termination `too_long`; 0: no limit.
 
         step_dt [s]: policy step.
         """
@@ -204,18 +204,18 @@ class TaskCfg:
 
     @property
     def settings_type(self) -> Any:
-        """The `@wp.struct` of the reset's settings, `NoSettings` without any."""
+        """The `@wp.struct` of the reset's settings; `NoSettings` if it has none."""
         return NoSettings if self.reset.settings is None else self.reset.settings.struct
 
     @property
     def level_type(self) -> Any:
-        """The `@wp.struct` of a curriculum level, `NoSettings` without levels."""
+        """The `@wp.struct` of a curriculum level; `NoSettings` if there are no levels."""
         return self.levels[0].struct if self.levels else NoSettings
 
     def with_terms(self, section: str, **changes: dict[str, Any]) -> TaskCfg:
-        """Return the task with changed terms; changes: by name of the term, its new numbers and options by name.
+        """Return a copy of the task with changed terms; changes: new numbers and options, by name of the term.
 
-        section: "rewards", "terminations" or "events". Raises InputError for an unknown term or number.
+        section: "rewards", "terminations" or "events". Raises InputError: a term or number is unknown.
         """
         terms: tuple[Term, ...] = getattr(self, section)
         unknown = set(changes) - {term.name for term in terms}
@@ -252,10 +252,11 @@ class TaskCfg:
 
 @dataclass(frozen=True)
 class Handover:
-    """Condition and function of a world's switch from one task to another; the robot's state does not change."""
+    """Switch of a world from one task to another, with its condition; the robot's state does not change."""
 
     source: TaskCfg
     target: TaskCfg
     when: Function  # @wp.func (robot, state of source, requested: bool) -> bool, whether to switch in this step
     begin: Function
-    """@wp.func (robot, state of source) -> state of target; then `Command.set` if the request has a command."""
+    """Function that begins the target task: @wp.func (robot, state of source) -> state of target; then `Command.set`
+    if the request has a command."""

@@ -1,4 +1,4 @@
-"""Layouts of the tasks' commands, by the function that sets them, and checks of commands from outside."""
+"""Layouts of the tasks' commands, and checks of commands that users pass."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jumper_warp.utils.kernels import Function
 
 @dataclass(frozen=True)
 class CommandValue:
-    """One number of a command."""
+    """Name, lower bound and optionality of one number of a command."""
 
     name: str  # With its unit, as `x [m]`
     least: float = -math.inf  # Smallest allowed number, in its unit
@@ -38,7 +38,7 @@ class CommandLayout:
         return tuple(range(required, len(self.values) + 1))
 
     def __str__(self) -> str:
-        """Return the names with units, for messages."""
+        """Return the names of the numbers with units, for messages."""
         return ", ".join(f"{value.name}{' (optional)' if value.optional else ''}" for value in self.values)
 
 
@@ -61,7 +61,7 @@ LAYOUTS: dict[Function, CommandLayout] = {
     ),
     set_turn: CommandLayout(tuple(CommandValue(f"quaternion {axis} [1]") for axis in "xyzw"), nonzero=True),
 }
-"""By `Command.set` of a task; any other function has `ANY_NUMBERS`."""
+"""Layouts of commands by the function `Command.set` of a task; any other function has `ANY_NUMBERS`."""
 ANY_NUMBERS = CommandLayout((CommandValue("a number"), *(CommandValue("a number", optional=True) for _ in range(3))))
 
 
@@ -71,9 +71,9 @@ def layout_of(task: TaskCfg) -> CommandLayout:
 
 
 def check_commands(commands: np.ndarray, task: TaskCfg, num_envs: int, worlds: np.ndarray) -> None:
-    """Raise InputError unless commands, (num_envs, n) or (n,) for all worlds, fit the layout of the task's command.
+    """Raise InputError unless commands fit the layout of the task's command.
 
-    worlds: (num_envs,) bool, worlds whose numbers must be within their bounds.
+    commands: (num_envs, n), or (n,) for all worlds. worlds: (num_envs,) bool, worlds where bounds are checked.
     """
     layout = layout_of(task)
     subject = f"commands of {task.name} are {layout}"

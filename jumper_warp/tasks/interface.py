@@ -15,7 +15,7 @@ def interface(task: TaskCfg) -> dict[str, Any]:
     """Return a policy's interface as JSON data; lists of 12 are in the order of `joint_names`.
 
     Units: action_scale, default_joint_pos [rad]; joint_stiffness [N m/rad]; joint_damping [N m s/rad]; torque_limit
-    [N m]; command_filter [deg], [deg/s] and [s]. observation_layout: by term its columns first to end - 1.
+    [N m]; command_filter [deg], [deg/s] and [s]. observation_layout: half-open column range by term.
     """
 
     def per_motor(lateral: float, transversal: float) -> list[float]:

@@ -1,7 +1,7 @@
 """Left-right mirror images of observations and actions, as permutations and signs.
 
 `signs * x[order]` is the observation x, or the action, of the robot mirrored about its x-z plane. Lateral angles are
-positive outward and transversal ones away from the twin on both sides, so motors swap sides and keep their signs.
+positive outward, and transversal angles away from the leg's other link, so motors swap sides and keep their signs.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from jumper_warp.utils.errors import InputError
 
 
 class Mirror(NamedTuple):
-    """The mirror image of a vector x: `signs * x[order]`."""
+    """Left-right mirror image of a vector x, as permutation and signs: `signs * x[order]`."""
 
     order: np.ndarray  # (columns,) int, source column of each column
     signs: np.ndarray  # (columns,) float32, 1 or -1
@@ -39,18 +39,18 @@ _PLAIN: dict[Any, tuple[int, ...]] = {
     jump.phase_times: (1, 1), jump.height_errors: (1, 1), jump.landing_miss: (1, -1), jump.way: (1, -1),
     obs.drawn_mass: (1, 1), obs.drawn_com: VECTOR, obs.drawn_latency: (1,), obs.drawn_friction: (1, 1),
 }  # fmt: skip
-"""Signs by function of the term, for terms whose columns keep their order."""
+"""Column signs of mirrored observations by the term's function, for terms whose columns keep their order."""
 _SWAPPED: dict[Any, tuple[int, ...]] = {
     obs.angle: MOTORS, obs.rate: MOTORS, obs.last_action: MOTORS, obs.contacts: LEGS, obs.air_times: LEGS,
     obs.paw_forces: LEGS, velocity.contact_times: LEGS, velocity.paw_heights: LEGS, velocity.recent_steps: LEGS,
     velocity.ground_heights: ROWS, jump.block_ahead: RAYS, obs.drawn_gains: MOTORS,
     obs.drawn_speed_limits: MOTORS, obs.drawn_offset: MOTORS,
 }  # fmt: skip
-"""Orders by function of the term, for terms whose columns keep their signs."""
+"""Column orders of mirrored observations by the term's function, for terms whose columns keep their signs."""
 
 
 def mirror_of(task: TaskCfg, group: str) -> Mirror:
-    """Return the mirror image of the rows of a group, "actor" or "critic". Raises InputError for an unknown term."""
+    """Return the mirror image of an observation; group: "actor" or "critic". Raises InputError: unknown term."""
     order: list[int] = []
     signs: list[int] = []
     for term in getattr(task.observations, group):

@@ -17,7 +17,7 @@ ROBOT = (
     ObservationTerm(obs.rate, noise=10.0 * DEG),
     ObservationTerm(obs.last_action),
 )
-"""Velocities, gravity direction, motors and last action: the paper's common policy observations."""
+"""Observation terms common to the paper's policies: velocities, gravity direction, motors and last action."""
 
 DRAWN = (
     ObservationTerm(obs.drawn_mass),
@@ -29,14 +29,14 @@ DRAWN = (
     ObservationTerm(obs.drawn_offset),
     ObservationTerm(obs.drawn_push),
 )
-"""Randomised parameters of the world, for critics."""
+"""Observation terms of a world's randomised parameters, for critics."""
 
 REMEMBERED = ("lin_vel", "ang_vel", "gravity", "angle", "last_action")
 """Names of the terms that `remembered` extends over several policy steps."""
 
 
 def remembered(terms: tuple[ObservationTerm, ...], steps: int = 4) -> tuple[ObservationTerm, ...]:
-    """Return terms with a history of `steps` policy steps in those that `REMEMBERED` names."""
+    """Return copies of the terms; those named in `REMEMBERED` have a history of `steps` policy steps."""
     return tuple(term.replace(history=steps) if term.name in REMEMBERED else term for term in terms)
 
 
@@ -48,5 +48,5 @@ def with_history(task: TaskCfg, steps: int | None) -> TaskCfg:
 
 
 def exact(terms: tuple[ObservationTerm, ...]) -> tuple[ObservationTerm, ...]:
-    """Return terms without noise and without delay."""
+    """Return copies of the terms without noise and delay."""
     return tuple(term.replace(noise=0.0, delayed=False) for term in terms)

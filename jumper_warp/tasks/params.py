@@ -1,6 +1,6 @@
-"""Numbers of a task's terms in one array, by name: `rewards.jump_height.weight`, `observations.actor.lin_vel.noise`.
+"""Parameters of a task's terms in one array, by name: `rewards.jump_height.weight`, `observations.actor.lin_vel.noise`.
 
-Flags change them before an environment is made, `Env.set` changes them while it runs; kernels index them by `TermSlot`.
+Flags change them before an environment is made; `Env.set` changes them while it runs. Kernels index them by `TermSlot`.
 """
 
 from __future__ import annotations
@@ -18,14 +18,14 @@ from jumper_warp.utils.errors import InputError
 
 
 class TermSlot(SimpleNamespace):
-    """A term for kernels: where its numbers lie in the array p of `TaskParams.values`.
+    """Indices of a term's numbers in the array p of `TaskParams.values`, and its options, for kernels.
 
     Each name in the term's `settings` is an attribute, the index of its value (of a pair: the first): `p[slot.weight]`.
     Each name in its `options` is an attribute with the option's value.
     """
 
     def __init__(self, term: Any, offset: int) -> None:
-        """offset: index of the term's first number in the array."""
+        """Store the term's indices and options; offset: index of the term's first number in the array."""
         numbers = list(term.flat_numbers)
         settings = numbers[: len(numbers) - term.num_params]
         super().__init__(**term.options, **{name.removesuffix(".lower"): offset + i for i, name in enumerate(settings)})
@@ -34,20 +34,20 @@ class TermSlot(SimpleNamespace):
         self.start, self.stop = offset + len(settings), offset + len(numbers)
         """Half-open range of the function's parameters: `*p[slot.start : slot.stop]`."""
         self.compiled = (term.func, offset, self.start, self.stop, *term.options.items())
-        """Everything of the term that is compiled into a kernel; tasks with equal tuples share the kernel."""
+        """Parts of the term that are compiled into a kernel; tasks with equal tuples share the kernel."""
 
 
 class TaskParams:
     """Numbers of all terms of a task in one list, and the index of each by name."""
 
     def __init__(self, task: str, sections: Mapping[str, Sequence[Term]]) -> None:
-        """task: name, for messages; sections: terms by name of their section."""
+        """Collect the numbers of all terms; task: name, for messages; sections: terms by name of their section."""
         self.task = task
         self.slots: dict[str, list[TermSlot]] = {section: [] for section in sections}
-        """By section, one slot per term, in the order of the terms."""
+        """Slots by section, one per term, in the order of the terms."""
         self.values: list[float] = []
         self.names: dict[str, int] = {}
-        """Index in `values` by dotted name; the first index if a randomisation and an event share a name."""
+        """Index of each number in `values` by dotted name; the first if a randomisation and an event share a name."""
         for section, terms in sections.items():
             for term in terms:
                 self.slots[section].append(TermSlot(term, len(self.values)))
@@ -60,20 +60,20 @@ class TaskParams:
         if name not in self.names:
             section, _, rest = name.partition(".")
             term, _, key = rest.rpartition(".")
-            missing = f"has no {key!r} of a {section} term {term!r}"
+            missing = f"has no number {key!r} of a {section} term {term!r}"
             raise InputError(f"{self.task} {missing}; names are like rewards.jump_height.weight")
         return self.names[name]
 
 
 class ParamArrays:
-    """Numbers of a task on a device, where captured graphs read changed values."""
+    """Device array of a task's numbers; captured graphs read changed values from it."""
 
     def __init__(self, params: TaskParams, device: Any) -> None:
-        """params: names and initial values; device: of Warp."""
+        """Copy the initial values to the device; params: names and values; device: Warp device."""
         self.params = params
         self.values = wp.array(params.values, dtype=float, device=device)
         self.changed = wp.full(len(params.values), math.inf, dtype=float, device=device)
-        """(len(values),): the value where `set` changed a number, infinity elsewhere."""
+        """Numbers changed by `set`, (len(values),); infinity elsewhere."""
 
     def set(self, name: str, value: float) -> None:
         """Change a number by its dotted name. Raises InputError: there is none, or the value is not finite."""

@@ -1,4 +1,4 @@
-"""Domain randomisation as data (paper, Table V): ranges by name, which `events` turns into terms."""
+"""Domain randomisation (paper, Table V): ranges of physical parameters, and the events that sample them."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ NOMINAL_FRICTION = 0.9  # [1] Friction coefficient of the paws where it is not r
 MEAN_FRICTION = 0.85
 """[1] Friction coefficient of the paws in nominal evaluations of policies trained with randomised friction."""
 LONGEST_LATENCY = 100.0
-"""[ms] Capacity of the ring buffers of past targets and observations: 48 physics steps, six policy steps."""
+"""[ms] Longest latency that the ring buffers of targets and observations hold: 48 physics steps, six policy steps."""
 PUSH_INTERVAL = (0.2, 0.5)  # [s] Time from one sample of the push to the next (authors' configuration)
 PUSH_PROBABILITY = 0.25  # [1] Probability of a push in such an interval (authors' configuration)
 
 
 @cache
 def _base_mass() -> float:
-    """Return the described mass of the base link [kg]."""
+    """Return the mass of the base link in the robot description [kg]."""
     return load_description().links[0].mass
 
 
 def _least(name: str) -> tuple[float, bool]:
-    """Return the lower bound of a field's range, in its unit, and whether the range must stay above it."""
+    """Return the lower bound of a field's range, in its unit, and whether the bound itself is excluded."""
     if name == "base_mass":
         return -_base_mass(), True
     if name in ("link_mass", "gains", "damping_gains", "no_load_speed", "cutoff_speed", "armature", "push_interval"):
@@ -42,57 +42,57 @@ def _least(name: str) -> tuple[float, bool]:
 
 @dataclass(frozen=True)
 class RandomizationCfg:
-    """Ranges (lower, upper) of uniform distributions; None: the described value. The defaults are for jumping.
+    """Ranges (lower, upper) of uniformly sampled parameters; None: the nominal value. The defaults are for jumping.
 
     Masses and scales must be positive; friction and latency may be 0.
     """
 
     static_friction: Range = (0.9, 1.2)
-    """[1] Coefficient of the paws; raised to the world's dynamic coefficient if below it."""
+    """[1] Static friction coefficient of the paws; raised to the world's dynamic coefficient if below it."""
     dynamic_friction: Range = (0.8, 0.9)
-    """[1] Coefficient of the paws."""
+    """[1] Dynamic friction coefficient of the paws."""
     base_mass: Range = (-1.0, 2.0)
-    """[kg] Added to the base's mass."""
+    """[kg] Mass added to the base."""
     link_mass: Range = (0.8, 1.2)
-    """[1] Scales mass and inertia of each link."""
+    """[1] Factor on mass and inertia of each link."""
     com_shift: Range = (-0.03, 0.03)
     """[m] Shift of the base's centre of mass along each body axis."""
     gains: Range = (0.6, 1.4)
-    """[1] Scales kp of each motor, and kd too unless `damping_gains` is set."""
+    """[1] Factor on kp of each motor, and on kd unless `damping_gains` is set."""
     no_load_speed: Range = (0.8, 1.2)
-    """[1] Scales the no-load speed of each motor."""
+    """[1] Factor on the no-load speed of each motor."""
     cutoff_speed: Range = (0.8, 1.4)
-    """[1] Scales the cutoff speed of each motor, which stays below its no-load speed."""
+    """[1] Factor on the cutoff speed of each motor, which stays below its no-load speed."""
     motor_friction: Range = (0.005, 0.04)
     """[N m] Coulomb friction of each motor."""
     armature: Range = (0.6, 1.4)
-    """[1] Scales the armature of each motor."""
+    """[1] Factor on the armature (rotor inertia) of each motor."""
     joint_offset: Range = (-2.0, 2.0)
     """[deg] Constant error of each motor's position sensor."""
     latency: Range = (0.0, 16.0)
-    """[ms] From action to motor, rounded to the nearest physics step."""
+    """[ms] Delay from action to motor, rounded to the nearest physics step."""
     observation_latency: Range = None
-    """[ms] From sensor to policy, rounded to the nearest physics step."""
+    """[ms] Delay from sensor to policy, rounded to the nearest physics step."""
     zero_latency_probability: float = 0.0
-    """[1] Probability of zero latency, for either latency. Without it, training hardly contains the nominal case, and
-    a policy may chatter there."""
+    """[1] Probability of zero latency, for either latency. At 0 training rarely samples the nominal case, where the
+    policy may then chatter."""
     push_force: Range = (-5.0, 5.0)
-    """[N] On the base, along each world axis, while a paw is on the ground."""
+    """[N] Push on the base along each world axis, while a paw is on the ground."""
     push_torque: Range = (-3.0, 3.0)
-    """[N m] On the base, about each world axis, while a paw is on the ground."""
+    """[N m] Torque of a push on the base about each world axis, while a paw is on the ground."""
     push_interval: Range = PUSH_INTERVAL
     """[s] Time from one sample of the push to the next; None: one push for the whole episode."""
     push_probability: float = PUSH_PROBABILITY
-    """[1] Probability of a push in an interval."""
+    """[1] Probability of a push in each interval of `push_interval`."""
     push_in_flight: bool = False
     """Whether pushes also act while no paw is on the ground."""
     damping_gains: Range = None
-    """[1] Scales kd of each motor; None: as `gains`."""
+    """[1] Factor on kd of each motor; None: the same factor as on kp."""
     resample_at: Literal["startup", "reset"] = "reset"
-    """When all values but pushes are sampled: once at startup, or at every reset of a world."""
+    """When parameters other than pushes are sampled: once at startup, or at every reset of a world."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: a range falls, is not finite or out of bounds, or a probability is not in 0 to 1."""
+        """Raise InputError if a range is reversed, not finite or out of bounds, or a probability is not in 0 to 1."""
         for name, value in vars(self).items():
             if not isinstance(value, tuple):
                 continue
@@ -118,7 +118,7 @@ class RandomizationCfg:
 
     @classmethod
     def walking(cls) -> RandomizationCfg:
-        """Return the paper's ranges for walking, with zero latency at a probability of 0.2."""
+        """Return the paper's ranges for walking, with a probability of 0.2 of zero latency."""
         return cls(
             static_friction=(0.8, 0.95),
             dynamic_friction=(0.7, 0.8),
@@ -146,9 +146,9 @@ class RandomizationCfg:
         self, *, latency: float | None = None, gains: tuple[float, float] | None = None, friction: float | None = None,
         sensor_offset: float | None = None,
     ) -> RandomizationCfg:  # fmt: skip
-        """Return the ranges with fixed values: latency [ms], gains: scales of (kp, kd) [1], friction of the paws [1].
+        """Return a copy with fixed latency [ms], gains (factors on kp and kd [1]) or friction of the paws [1].
 
-        sensor_offset [deg]: largest error of a position sensor, sampled uniformly from minus to plus this per motor.
+        sensor_offset [deg]: largest error of a position sensor, sampled uniformly within plus and minus this per motor.
         Raises InputError: a value out of range.
         """
         kp, kd = gains or (None, None)
@@ -159,7 +159,7 @@ class RandomizationCfg:
         return replace(self, **ranges)
 
     def events(self) -> tuple[EventTerm, ...]:
-        """Return one event for each range, or pair of ranges, that is not None; numbers in SI units."""
+        """Return the events that sample the ranges that are not None; their numbers are in SI units."""
         terms = []
 
         def add(func: Any, pair: Range, scale: float = 1.0, parallel: bool = False, **numbers: float) -> None:

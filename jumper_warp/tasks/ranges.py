@@ -1,4 +1,4 @@
-"""Configurations of numbers and ranges: their checks, and conversion to the kernels' structs of equal fields."""
+"""Checks of configurations of numbers and ranges, and their conversion to kernel structs with the same fields."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ Pair = tuple[float, float]  # (lower, upper) end of a range
 
 
 def check_ranges(prefix: str, cfg: Any, skip: Collection[str] = (), not_negative: Collection[str] = ()) -> None:
-    """Raise InputError: a number of a dataclass is not finite, a pair falls, or a field in `not_negative` is below 0.
+    """Raise InputError if a dataclass has a number that is not finite or out of range, or a reversed pair.
 
-    prefix: of the names in messages. skip: fields that are neither numbers nor pairs.
+    prefix: before field names in messages. skip: fields to leave unchecked. not_negative: fields that must be >= 0.
     """
     for name, value in vars(cfg).items():
         if name in skip:
@@ -31,9 +31,9 @@ def check_ranges(prefix: str, cfg: Any, skip: Collection[str] = (), not_negative
 
 
 def filled(struct: Any, cfg: Any, skip: Collection[str] = (), degrees: Collection[str] = ()) -> Any:
-    """Return `struct`, a kernels' struct, with the fields of a dataclass written to it: numbers, and pairs as vec2.
+    """Copy the fields of a dataclass to a kernel struct and return it; pairs become vec2.
 
-    skip: fields to leave out; degrees: fields [deg] to convert to [rad].
+    skip: fields to omit; degrees: fields [deg] to convert to [rad].
     """
     for name, value in vars(cfg).items():
         if name not in skip:

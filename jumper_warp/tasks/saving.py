@@ -1,6 +1,6 @@
-"""Tasks as JSON, and back. Functions and types are saved as `module:name`.
+"""Conversion of tasks to JSON and back. Functions and types are saved as `module:name`.
 
-Reading looks names up in the project's modules and those that the user passes; it imports no module for a name.
+Names are resolved in the project's modules and in those that the user passes; no module is imported for a name.
 """
 
 from __future__ import annotations
@@ -109,12 +109,15 @@ class Finder:
     """Look-up of functions and types by `module:name`, in the project's modules and the user's."""
 
     def __init__(self, modules: Iterable[ModuleType] = ()) -> None:
-        """modules: the user's loaded modules."""
+        """Look names up in the project's modules and in `modules`, the user's loaded ones."""
         load_project_tasks()
         self.modules = {module.__name__: module for module in modules}
 
     def __call__(self, name: Any, where: str) -> Any:
-        """Return a Warp function, struct, dataclass or subclass of `Term`; where: of messages. Raises TaskError."""
+        """Return the Warp function, struct, dataclass or subclass of `Term` called `name`; where: place for messages.
+
+        Raises TaskError: there is none.
+        """
         if not isinstance(name, str) or name.count(":") != 1:
             raise TaskError(f"{where}: expected module:name, got {shown(name)}")
         module_name, _, attribute = name.partition(":")
@@ -127,7 +130,7 @@ class Finder:
             usable = dataclasses.is_dataclass(value) or issubclass(value, Term)
         if not usable:
             known = module is not None or module_name.startswith(PROJECT_PREFIXES)
-            hint = "there is no such one here" if known else "name the file that defines it with --task-module"
+            hint = "no such function or type" if known else "pass the file that defines it with --task-module"
             raise TaskError(f"{where} needs {name!r:.80}: {hint}")
         return value
 
@@ -212,7 +215,7 @@ def _tuple(saved: Any, hint: Any, where: str, find: Finder) -> tuple[Any, ...]:
 
 
 def _object(saved: dict[str, Any], hint: Any, where: str, find: Finder) -> Any:
-    """Return a saved term or dataclass of its entry "type", by default of the hint, and a subclass of the hint."""
+    """Return a saved term or dataclass; its entry "type" (default: the hint) must name a subclass of the hint."""
     base = object if hint is Any else hint
     kind = hint if "type" not in saved and dataclasses.is_dataclass(hint) else find(saved.get("type"), where)
     if not (isinstance(kind, type) and isinstance(base, type) and issubclass(kind, base)):
@@ -226,7 +229,7 @@ def _term(kind: type[Term], saved: dict[str, Any], where: str, find: Finder) -> 
     func = _value(saved.pop("func", None), wp.Function, where, find)
     name = saved.get("name", "")
     if not isinstance(name, str) or (name and not NAME.fullmatch(name)):
-        raise TaskError(f"{where}: a name is of letters, digits, and _ . - or spaces, got {shown(name)}")
+        raise TaskError(f"{where}: a name may contain letters, digits, _ . - and spaces, got {shown(name)}")
     for key, default in kind.options.items():
         if key not in saved:
             continue
@@ -276,15 +279,15 @@ def _word(hint: Any) -> str:
 
 
 def _check_kernel_types(task: dict[str, Any]) -> None:
-    """Raise TaskError unless name, state, reset settings and levels of a task's fields fit files and kernels."""
+    """Raise TaskError unless a task's name is valid and kernels accept its state, reset settings and levels."""
     if not NAME.fullmatch(task["name"]):
-        raise TaskError(f"task.name is of letters, digits, and _ . - or spaces, got {task['name']!r:.60}")
+        raise TaskError(f"task.name may contain letters, digits, _ . - and spaces, got {task['name']!r:.60}")
     if not isinstance(task["state"], Struct) or "steps" not in task["state"].vars:
-        raise TaskError("task.state is not a struct that counts steps")
+        raise TaskError("task.state must be a @wp.struct with a field steps")
     levels, settings = task.get("levels", ()), task["reset"].settings
     checked = [] if settings is None else [("reset.settings", settings)]
     for where, value in [*checked, *((f"levels[{i}]", level) for i, level in enumerate(levels))]:
         if not isinstance(getattr(value, "struct", None), Struct) or not callable(getattr(value, "values", None)):
-            raise TaskError(f"task.{where}: {shown(value)} is not for the kernels: it needs struct and values()")
+            raise TaskError(f"task.{where}: {shown(value)} must have the attributes struct and values()")
     if len({type(level) for level in levels}) > 1:
-        raise TaskError("task.levels must all be of one kind")
+        raise TaskError("task.levels must all be of one type")

@@ -1,8 +1,8 @@
-"""One robot with several skills, walking, jumps and turning in flight, and the handovers between them.
+"""Tasks of a robot with several skills (walking, jumps, turning in flight), and the handovers between them.
 
 A jump starts as in its training: at rest on four paws near the default pose, which walking reaches when it is commanded
-to stand. The jump command is set at the handover, since walking stands more quietly than the jump policies hold a
-squat. Walking takes over once the robot has landed and rests, or after a failed landing. Each skill has its own
+to stand. The jump command is set at the handover, since the walking policy stands with less motion than a waiting jump
+policy. Walking takes over once the robot has landed and rests, or after a failed landing. Each skill has its own
 observation, action scale, gains, torque limits and command filter.
 
 On request a jump hands over to turning in a long flight. Turning brings the base level, in the jump's heading, and
@@ -26,14 +26,14 @@ from jumper_warp.utils.errors import InputError
 
 FALLS, FALLS_FROM_FLIGHT = (
     (
-        TerminationTerm(terminations.came_apart),
+        TerminationTerm(terminations.diverged),
         TerminationTerm(terminations.collided),
         TerminationTerm(tilt, angle=60.0 * DEG),
         TerminationTerm(terminations.low_base, height=0.10),
     )
     for tilt in (terminations.tilted, terminations.fallen)
 )
-"""Terminations of a robot that switches between skills; in the second, a tilt in flight is no fall."""
+"""Terminations of a robot that switches between skills; in the second tuple, a tilt in flight is no fall."""
 
 
 def for_switching(
@@ -41,7 +41,7 @@ def for_switching(
 ) -> TaskCfg:
     """Return a task for switching: on level ground, ended by falls alone, without rewards, critic, events and metrics.
 
-    randomization: of the robot, equal in all its skills.
+    randomization: ranges for the robot, the same in all its skills.
     """
     task = replace(
         task,
@@ -63,7 +63,7 @@ def flight_skills(jump: TaskCfg, turning: TaskCfg) -> tuple[list[TaskCfg], list[
     """
     for task, state in ((jump, JumpState), (turning, AttitudeState)):
         if task.state is not state:
-            raise InputError(f"turning in flight needs a task of {state.key} here, got {task.name}")
+            raise InputError(f"turning in flight needs a task with {state.key}, got {task.name}")
     randomization = replace(jump.randomization, resample_at="reset")
     jump, turning = (
         for_switching(
@@ -87,7 +87,7 @@ def skills_and_handovers(walking: TaskCfg, jumps: tuple[TaskCfg, ...]) -> tuple[
     """
     for task, state in ((walking, VelocityState), *((jump, JumpState) for jump in jumps)):
         if task.state is not state:
-            raise InputError(f"switching needs a task of {state.key} here, got {task.name}")
+            raise InputError(f"switching needs a task with {state.key}, got {task.name}")
     randomization = replace((jumps[-1] if jumps else walking).randomization, resample_at="reset")
     walk = for_switching(walking, randomization)
     tasks, switches = [walk], []

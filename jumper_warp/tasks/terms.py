@@ -41,9 +41,9 @@ class Term:
     """Defaults of values that are compiled into the kernel; on an instance, its values."""
 
     def __init__(self, func: Function, *, name: str = "", **values: Any) -> None:
-        """func: @wp.func with the class's signature. name: for logs and flags (default: the function's name).
+        """Create a term from a function; values: its numbers and options by name.
 
-        values: numbers and options by name.
+        func: @wp.func with the class's signature. name: for logs and flags (default: the function's name).
         Raises InputError: a number is missing, unknown or not finite, or the function does not fit the class.
         """
         kind = type(self).__name__
@@ -87,7 +87,7 @@ class Term:
             raise InputError(f"{where}: the function must return {self.returns[0].__name__}, it returns {returned}")
 
     def replace(self, **changes: Any) -> Any:
-        """Return the term with changed function, name, numbers or options; raises InputError as the constructor."""
+        """Return a copy with changed function, name, numbers or options; raises InputError like the constructor."""
         return type(self)(**{"func": self.func, "name": self.name, **self.numbers, **self.options, **changes})
 
     @property
@@ -118,7 +118,7 @@ class Term:
 
 
 class RewardTerm(Term):
-    """(robot: RobotView, state, ...) -> float, multiplied by weight and, with `scale_by_dt`, by the policy step [s]."""
+    """Reward, (robot: RobotView, state, ...) -> float, times weight and, with `scale_by_dt`, the policy step [s]."""
 
     settings: ClassVar = {"weight": REQUIRED}
     options: Mapping[str, Any] = {"scale_by_dt": True}
@@ -129,15 +129,15 @@ class RewardTerm(Term):
 
     @property
     def weight(self) -> float:
-        """Factor of the term; negative: a penalty."""
+        """Factor of the reward term; negative: a penalty."""
         return self.numbers["weight"]
 
 
 class TerminationTerm(Term):
-    """(robot: RobotView, state, ...) -> bool, whether the episode ends.
+    """Condition that ends an episode, (robot: RobotView, state, ...) -> bool.
 
     time_out: whether the end is no failure, so that the value of the last state is bootstrapped. success: whether the
-    success rate and the curriculum count the end.
+    success rate and the curriculum count the end as a success.
     """
 
     options: Mapping[str, Any] = {"time_out": False, "success": False}
@@ -145,7 +145,7 @@ class TerminationTerm(Term):
 
 
 class ObservationTerm(Term):
-    """(robot: RobotView, state, ...) -> float or vector, one frame of columns.
+    """Part of an observation, (robot: RobotView, state, ...) -> float or vector, one frame of columns.
 
     Other signatures: (parameters: RobotParameters, world: int, ...) and, to read the ground, (arrays: RobotArrays,
     ground: Ground, world: int, ...). noise: standard deviation of Gaussian noise, cut at one standard deviation, in the
@@ -187,7 +187,7 @@ class ObservationTerm(Term):
 
 
 class EventTerm(Term):
-    """(parameters: RobotParameters, rng: RngStream, ...), writes parameters of world `rng.world`.
+    """Function (parameters: RobotParameters, rng: RngStream, ...) that writes parameters of world `rng.world`.
 
     mode: "startup": once; "reset": at every reset; "interval": at resets and then at intervals sampled from
     `interval_range_s` [s]. update_solver: whether the solver must read the model again; pushes and latencies need not.
@@ -216,14 +216,14 @@ class EventTerm(Term):
 
 
 class Advance(Term):
-    """(robot: RobotView, state, ...) -> state after one policy step: the task's state machine."""
+    """State machine of a task, (robot: RobotView, state, ...) -> state after one policy step."""
 
 
 class Curriculum(Term):
-    """(robot: RobotView, state) -> float, error of an ended episode in `unit`.
+    """Error of an ended episode in `unit`, (robot: RobotView, state) -> float, and the rule to raise a world's level.
 
     `promote_after` episodes in a row that end with success and an error up to `tolerance` raise the world's level.
-    counts: @wp.func (state) -> bool, whether an episode counts at all. unit: suffix of the logged error's name.
+    counts: @wp.func (state) -> bool, whether an episode is counted. unit: suffix of the logged error's name.
     """
 
     settings: ClassVar = {"tolerance": REQUIRED, "promote_after": 5}

@@ -1,4 +1,4 @@
-"""Units that the tables of tasks are written in."""
+"""Units in which the constants of tasks are written."""
 
 DEG = 0.017453292519943295  # [rad]
 G = 9.81  # [m/s^2] or [N/kg], on Earth

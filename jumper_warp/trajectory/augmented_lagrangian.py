@@ -1,4 +1,4 @@
-"""Augmented Lagrangian with limited-memory BFGS in a box, for many starts at once.
+"""Augmented Lagrangian method with limited-memory BFGS steps in a box, for many starts in parallel.
 
 Every start has its own curvature, step length and multipliers. Step lengths are tried in parallel worlds of one
 rollout, together with a few random steps, which cross the kinks of contacts. Nocedal and Wright, Numerical
@@ -28,7 +28,7 @@ FEASIBLE = 1.0e-3  # [1] constraints up to this value count as satisfied
 
 @dataclass
 class Progress:
-    """Best candidates of a descent so far."""
+    """Best candidate of each start of an optimisation so far, and its history."""
 
     x: np.ndarray  # (starts, n) Best feasible candidate of each start, or the least infeasible one if none was feasible
     objective: np.ndarray  # (starts,) Objective of `x`; infinite if no candidate was feasible
@@ -76,7 +76,7 @@ def minimise(
 
 
 class _Descent:
-    """State of the descent of all starts; arguments as in `minimise`, tensors (starts, ...)."""
+    """State of a descent from all starts in parallel; arguments as in `minimise`, tensors (starts, ...)."""
 
     def __init__(self, problem: Problem, begin: np.ndarray, lower: float, upper: float, step: float, seed: int):
         real = torch.float64 if problem.double else torch.float32
@@ -164,7 +164,7 @@ class _Descent:
         d = torch.where(out, 0.0, -d)
         uphill = (d * free).sum(1) >= 0.0
         d = torch.where(uphill[:, None], -free, d)
-        # without curvature the largest entry is the step's
+        # without curvature the largest entry of a step is `step`
         plain = uphill | (torch.stack([pair[2] for pair in self.pairs]).sum(0) == 0.0 if self.pairs else uphill | True)
         largest = d.abs().amax(1).clamp_min(1.0e-12)
         return torch.where(plain[:, None], d * (self.step / largest)[:, None], d)

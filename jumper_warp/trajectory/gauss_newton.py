@@ -1,13 +1,13 @@
 """Gauss-Newton steps on the weights of a policy's network, in a trust region around its original actions.
 
-With errors e, their importance W, their Jacobian J by the network's weights, the network's actions a over recorded
+With errors e, their importance W, their Jacobian J w.r.t. the network's weights, the network's actions a over recorded
 observations, original actions a0 and damping c, a step d solves by conjugate gradients
 
     (J^T W J + A^T S A + c I) d = -(J^T W e + A^T S (a - a0)),
 
-where A is the derivative of a by the weights and S = 1 / (m s^2), with m observations and s the allowed change of the
-actions. The terms with S are the Gauss-Newton terms of the mean squared change of the actions, which is proportional to
-the KL divergence from the original policy; A^T S A is the metric of the natural gradient.
+where A is the derivative of a w.r.t. the weights and S = 1 / (m s^2), with m observations and s the allowed change of
+the actions. The terms with S are the Gauss-Newton terms of the mean squared change of the actions, which is
+proportional to the KL divergence from the original policy; A^T S A is the metric of the natural gradient.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Network:
     def act(self, obs: torch.Tensor, weights: torch.Tensor | None = None, tape: Tape | None = None) -> torch.Tensor:
         """Return actions (n, 12), clamped to ±1, for raw observations (n, num_obs).
 
-        weights: (num_weights,), by default the network's. tape: gets one more entry, inputs and outputs of layers.
+        weights: (num_weights,), by default the network's. tape: receives one entry, inputs and outputs of the layers.
         """
         limit, normalised = self.limits
         x = normalise(obs.clamp(-limit, limit), self.mean, self.std, normalised)
@@ -80,7 +80,7 @@ class Network:
 
 
 def per_world_gradients(total: torch.Tensor, tape: Tape) -> torch.Tensor:
-    """Return the gradient of each world's loss by the weights, (worlds, num_weights), ordered as `Network.weights`.
+    """Return the gradient of each world's loss w.r.t. the weights, (worlds, num_weights), as `Network.weights`.
 
     total: scalar sum of the losses of all worlds, each a function of that world's steps alone; its graph is kept.
     tape: of all policy steps, filled by `Network.act`.
@@ -125,7 +125,7 @@ class Anchor:
         """Record the network's actions at raw observations obs (m, num_obs) as the original actions.
 
         action_std: (m,) allowed change s of the actions, as the norm over motors [1]; if it occurs at all observations,
-        `cost` is 1/2, as for a weighed error of 1.
+        `cost` is 1/2, as for a weighted error of 1.
         """
         self.network, self.obs = network, obs
         self.scale = 1.0 / (action_std[:, None] * math.sqrt(len(obs)))

@@ -178,7 +178,7 @@ def upright(limit: float, at_end: bool = True) -> Term:
 
 
 def reaches(height: float) -> Term:
-    """Return the constraint: the base's apex, see `highest`, is at least at `height` [m]."""
+    """Return the constraint: the base's apex, see `highest`, is at least `height` [m]."""
     return lambda motion: height + highest()(motion)
 
 

@@ -78,7 +78,7 @@ class Knots:
 
 
 class SimulatedMotion:
-    """Motion of `num` worlds with derived quantities, which are computed once.
+    """Simulated motion of `num` worlds, and quantities derived from it, each computed once.
 
     Row 0 is the start, row i the end of policy step i; coordinates are last. Positions and velocities: world frame.
     """
@@ -199,7 +199,7 @@ class Problem:
     """Number of policy steps of reverse passes so far, worlds times steps."""
 
     def __post_init__(self) -> None:
-        """Start with an empty cache of worlds, by number of candidates."""
+        """Create an empty cache of worlds, by number of candidates."""
         self._worlds: dict[int, _Worlds] = {}
 
     def rollout(self, num_worlds: int) -> Rollout:
@@ -222,7 +222,7 @@ class Problem:
         return self._worlds[num_worlds]
 
     def motion(self, x: torch.Tensor) -> SimulatedMotion:
-        """Return the simulated motion of candidates x (n, len(knots)), one world each, differentiable by x."""
+        """Return the simulated motion of candidates x (n, len(knots)), one world each, differentiable w.r.t. x."""
         rollout, body, q, qd, start = self._worlds_of(len(x))
         targets = self.knots.targets(x)
         self.world_steps += targets.shape[0] * len(x)

@@ -1,4 +1,4 @@
-"""Global search: sampled starts, and descent along smoothed gradients, of many starts at once.
+"""Global search by descent along smoothed gradients, from many sampled starts at once.
 
 Contacts that begin and end make an objective rough at small scales, where its exact gradient is large and useless. The
 descent follows gradients at randomly displaced points, one per step, whose running mean is the gradient of the
@@ -128,7 +128,7 @@ class _BestPoints:
         self.x, self.merit = x, merit_of(problem, x, stage.merit)
 
     def update(self, x: torch.Tensor, slack: float) -> torch.Tensor:
-        """Keep points x (n, len(knots)) that improve; return which exceed the best by over `slack`, bool (n, 1)."""
+        """Store points x (n, len(knots)) that improve; return whether each exceeds its best by `slack`, bool (n, 1)."""
         merit = merit_of(self.problem, x, self.stage.merit)
         better = merit < self.merit
         self.x, self.merit = torch.where(better[:, None], x, self.x), torch.where(better, merit, self.merit)

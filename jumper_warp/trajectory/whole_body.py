@@ -247,7 +247,7 @@ class WholeBody:
         return self.clearance_of(q, *self.points(q))
 
     def clearance_of(self, q: torch.Tensor, pos: torch.Tensor, ankle: torch.Tensor) -> torch.Tensor:
-        """Return `clearance` (..., 4, 4) [m], given q (..., 19) and the result `pos`, `ankle` of `points`."""
+        """Return the heights [m] of `clearance`, (..., 4, 4), from q (..., 19) and `pos`, `ankle` of `points`."""
         height, ankle = pos[..., 2], ankle[..., 2]
         tip = height[..., 0] + rotation_matrices(q[..., 3:7])[..., 2, 0, None] * self._front * float(HOUSING_LENGTH)
         axes, knees = height[..., 1::2], height[..., 2::2]

@@ -10,9 +10,9 @@ MAX_FREE, MAX_HEAP_BLOCK = 1 << 30, 32 << 20
 
 
 def keep_freed_memory() -> bool:
-    """Let this process keep up to 1 GiB of freed memory; return whether glibc accepted the settings.
+    """Configure glibc to keep up to 1 GiB of this process's freed memory; return whether glibc accepted the settings.
 
-    Otherwise every temporary array of a minibatch may cost one page fault per page.
+    With glibc's defaults every temporary array of a minibatch may cost one page fault per page.
     """
     try:
         mallopt = ctypes.CDLL(None).mallopt

@@ -4,7 +4,7 @@ from pathlib import Path
 
 
 def assets_folder(package: Path) -> Path:
-    """Return the assets folder of a package: inside it (wheel) if it exists there, else beside it (clone)."""
+    """Return the assets folder of a package: inside it (wheel) if it exists there, else next to it (clone)."""
     inside = package / "assets"
     return inside if inside.is_dir() else package.parent / "assets"
 

@@ -64,6 +64,6 @@ def check_seed(value: Any) -> None:
 
 
 def version_error(version: str, known: int) -> str:
-    """Return the message that a file has format version `version`, not `known`, with the commit for `known - 1`."""
+    """Return the error message for a file of format `version`, with the commit that reads the format `known - 1`."""
     previous = f"commit {LAST_OF_PREVIOUS_VERSION} reads version {known - 1}"
-    return f"has version {version}, this is version {known}; {previous}"
+    return f"has version {version}, expected version {known}; {previous}"

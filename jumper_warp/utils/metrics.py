@@ -1,4 +1,4 @@
-"""Tables of metrics, their values with 95 % confidence intervals, and how a terminal shows them."""
+"""Definitions of metrics, their values with 95 % confidence intervals, and printed tables of them."""
 
 from __future__ import annotations
 
@@ -46,16 +46,16 @@ class Outcome(Protocol):
 
 
 class Metric(NamedTuple):
-    """Definition of a metric: a row of a table."""
+    """Definition of a metric, a row of a table: key, statistic and the trials that it is computed from."""
 
-    key: str  # Says what is measured; ends in the unit, if there is one
+    key: str  # Name of the measured quantity; ends in the unit, if there is one
     statistic: Callable[[np.ndarray, str], MetricValue]  # `rate`, `mean`, `largest` or `rmse`
     over: str  # Set of trials, a name in `Outcome.trials`
     values: Callable[[Any], np.ndarray]  # Returns an array of an outcome, one entry per trial
 
 
 def unit_of(key: str) -> str | None:
-    """Return the unit in the end of a metric's key, as `_m_s` or ` [m/s]`; None: there is none, as in counts."""
+    """Return the unit at the end of a metric's key, as `_m_s` or ` [m/s]`; None: without unit, such as a count."""
     if bracket := re.search(r"\[(.+)\]$", key):
         return bracket[1]
     return next((unit for end, unit in UNITS.items() if key.endswith(end)), None)
@@ -66,7 +66,7 @@ def measure(
 ) -> Metrics:
     """Return the metrics of a table by key, each with `prefix` before it.
 
-    where: mask of the trials that count, default: all; note: says which these are, for the file.
+    where: mask of the trials to use, default: all; note: description of these trials, for the file.
     """
     metrics = {}
     for key, statistic, over, values in table:
@@ -82,7 +82,7 @@ def chosen(table: Iterable[Metric], *keys: str) -> list[Metric]:
 
 
 def rate(values: ArrayLike, over: str = "") -> MetricValue:
-    """Return the fraction of true values (n,), with Wilson's interval; over: what the trials are."""
+    """Return the fraction of true values (n,), with Wilson's interval; over: description of the trials."""
     values = np.asarray(values, dtype=bool)
     n, p = values.size, float(values.mean()) if values.size else None
     if p is None:
@@ -94,7 +94,7 @@ def rate(values: ArrayLike, over: str = "") -> MetricValue:
 
 
 def mean(values: ArrayLike, over: str = "") -> MetricValue:
-    """Return the mean of the values (n,) that are finite, with a bootstrap interval; over: what the trials are."""
+    """Return the mean of the finite values of (n,), with a bootstrap interval; over: description of the trials."""
     values = np.asarray(values, dtype=float).ravel()
     known = np.isfinite(values)
     return _ratio(np.stack([np.where(known, values, 0.0), known], axis=1), over)
@@ -119,7 +119,7 @@ def _ratio(rows: np.ndarray, over: str, function: Callable[[Any], Any] = lambda 
 
 
 def largest(values: ArrayLike, over: str = "") -> MetricValue:
-    """Return the largest of the finite values; over: what the trials are."""
+    """Return the largest of the finite values; over: description of the trials."""
     values = np.asarray(values, dtype=float).ravel()
     values = values[np.isfinite(values)]
     return MetricValue(float(values.max()) if len(values) else None, len(values), None, over)
@@ -137,7 +137,7 @@ def print_metrics(
     metrics: AnyMetrics, paper: Mapping[str, float] | None = None, conditions: Mapping[str, Any] | None = None,
     title: str = "",
 ) -> None:  # fmt: skip
-    """Print conditions and metrics with intervals beside the paper's values, at most WIDTH characters a line.
+    """Print conditions and metrics with intervals next to the paper's values, at most WIDTH characters a line.
 
     Metrics whose value is a list are left out.
     """

@@ -1,4 +1,4 @@
-"""Output folders, and the file `metrics.json` (layout: docs/metrics.schema.json)."""
+"""Creation of output folders; writing and reading of `metrics.json` (layout: docs/metrics.schema.json)."""
 
 import json
 import math
@@ -21,7 +21,7 @@ VERSION = 1  # Version of the layout of metrics.json
 def output_dir(name: str, out: Path | None = None) -> Path:
     """Create and return the folder for one run's results.
 
-    name: of the experiment, one path component. out: the folder, which may exist (default:
+    name: name of the experiment, one path component. out: the folder, which may exist (default:
     `outputs/<name>/<YYYY-mm-dd_HH-MM-SS>`, with a number appended if two runs start in the same second).
     Raises InputError: `name` is empty or has a path separator. FileExistsError: `out` is a file.
     """
@@ -43,8 +43,8 @@ def write_metrics(folder: Path, metrics: AnyMetrics, conditions: Mapping[str, An
     """Write `metrics.json` and `run.json` (commit, dirty, versions, device, command); return the path of metrics.json.
 
     Each file is written atomically. Environment variables are not saved. NumPy scalars become Python numbers.
-    folder: an existing folder; conditions: of the evaluation, by name. Raises InputError: a value is not finite.
-    TypeError: a value has another type. Both name the metric.
+    folder: an existing folder; conditions: conditions of the evaluation by name. Raises InputError: a value is not
+    finite. TypeError: a value has another type. Both name the metric.
     """
     entries = {key: _entry(key, value) for key, value in metrics.items()}
     document = {

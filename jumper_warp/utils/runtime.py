@@ -88,7 +88,7 @@ def git_commit(folder: Path | None = None) -> Commit | None:
 
 @functools.cache
 def _package_commit() -> Commit | None:
-    """Return the commit of this package's source tree; cached, since imported modules do not change either."""
+    """Return the commit of this package's source tree, cached at the first call."""
     return git_commit(Path(__file__).parent)
 
 

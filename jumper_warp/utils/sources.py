@@ -31,7 +31,7 @@ def changed_sources(old: Any, new: dict[str, str]) -> list[str]:
     """
     saved = old if isinstance(old, dict) else {}
     return [
-        f"{module} has changed since: its present functions are used, with the run's settings"
+        f"{module} has changed since the run was saved: its current functions are used with the saved settings"
         for module, checksum in new.items()
         if saved.get(module, checksum) != checksum
     ]

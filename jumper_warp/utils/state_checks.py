@@ -18,13 +18,13 @@ def check_parts(value: Any, names: Iterable[Any], where: str) -> None:
     names = set(names)
     missing, unknown = sorted(map(str, names - value.keys())), sorted(map(str, value.keys() - names))
     if missing or unknown:
-        raise InputError(f"{where} lacks {_listed(missing)}, has {_listed(unknown)} besides")
+        raise InputError(f"{where}: missing entries: {_listed(missing)}; unexpected entries: {_listed(unknown)}")
 
 
 def _listed(names: list[str]) -> str:
-    """Return the first three names as text with the number of the others, or "nothing" for an empty list."""
+    """Return the first three names as text with the number of the others, or "none" for an empty list."""
     shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
-    return shown or "nothing"
+    return shown or "none"
 
 
 def check_tensor(value: Any, like: torch.Tensor, where: str, dtypes: Iterable[torch.dtype] = ()) -> None:

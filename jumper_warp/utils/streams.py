@@ -1,4 +1,4 @@
-"""Random streams by purpose: a robot sampled for a report is never a robot sampled for tuning, whatever the seeds."""
+"""Random seeds by purpose: robots sampled for reporting differ from those sampled for tuning, whatever the seeds."""
 
 from typing import Literal, get_args
 
@@ -11,8 +11,8 @@ PURPOSES: tuple[Purpose, ...] = get_args(Purpose)  # The kernels' streams take t
 def purpose_seed(purpose: Purpose, seed: int) -> int:
     """Return the seed of a purpose's random numbers on the host: `seed` plus 2^31 times the index of the purpose.
 
-    No two pairs of purpose and seed have the same, and training keeps `seed`. An `Env` takes purpose and seed
-    separately: `jumper_warp.kernels.mdp.random` describes its streams. Raises InputError: seed not in 0 to 2^31 - 1.
+    The result differs for every pair of purpose and seed; for training it is `seed`. `Env` takes purpose and seed
+    separately, see `jumper_warp.kernels.mdp.random`. Raises InputError: seed not in 0 to 2^31 - 1.
     """
     check_seed(seed)
     return PURPOSES.index(purpose) * (MOST_SEED + 1) + int(seed)

@@ -31,7 +31,7 @@ def checked_threads(threads: int | None) -> int:
 
 
 def set_threads(threads: int | None) -> None:
-    """Set the default number of threads of new simulations (None: `available_threads`); errors as `checked_threads`."""
+    """Set the default number of threads of new simulations (None: `available_threads`); raises as `checked_threads`."""
     global _default_threads
     _default_threads = None if threads is None else checked_threads(threads)
 
@@ -46,7 +46,7 @@ def run_in_parallel(jobs: Iterable[Callable[[], object]], threads: int) -> None:
     remaining, errors = iter(jobs), SimpleQueue()
 
     def work() -> None:
-        """Run remaining jobs, and put the exception that ended this, or None, into `errors`."""
+        """Run remaining jobs, and put the exception that ended them, or None, into `errors`."""
         error = None
         try:
             for job in remaining:

@@ -1,4 +1,4 @@
-"""Films of recordings: H.264 in MP4, animated WebP or GIF."""
+"""Export of recordings as films: H.264 in MP4, animated WebP or GIF."""
 
 from __future__ import annotations
 
@@ -37,9 +37,9 @@ from jumper_warp.viz.shapes import ShapeMesh
 from jumper_warp.viz.style import BASE_COLOR, LEG_COLORS
 
 SUFFIXES = (".mp4", ".webp", ".gif")
-DIRECTION = (0.62, -1.0, 0.28)  # from the robots to the eye, world frame: on their right, ahead, above
+DIRECTION = (0.62, -1.0, 0.28)  # from the robots to the camera, world frame: on their right, ahead, above
 MAX_FRAMES = 1800  # of WebP and GIF, which are encoded in memory
-GIF_FPS = 50.0  # [1/s] most frames per second of a GIF: players slow down images that are shorter than 20 ms
+GIF_FPS = 50.0  # [1/s] largest frame rate of a GIF: players slow down images shorter than 20 ms
 TRAIL_SECONDS = 1.5  # [s] length of the trails of base and paws
 
 
@@ -53,18 +53,18 @@ def write_film(
     eye: Sequence[float] | None = None,
     ranks: Sequence[int] | None = None,
 ) -> Path:
-    """Write a film whose camera follows the robots; return its path. The suffix .mp4, .webp or .gif sets the format.
+    """Write a film whose camera follows the robots; return its path. The suffix .mp4, .webp or .gif is the format.
 
-    size: width and height [px], rounded up to even numbers. fps: frames per second of the film. speed: of the playback,
-    0.25 for slow motion. eye: offset [m] of the camera from the robots' mean position, world frame (default: beside
-    them, near enough that all stay in view). ranks: indices in `recording.worlds`, shown side by side (default: all).
-    Raises InputError: as `check_film`, or too many frames for the format; OSError.
+    size: width and height [px], rounded up to even numbers. fps: frames per second of the film. speed: playback speed,
+    0.25 for slow motion. eye: offset [m] of the camera from the robots' mean position, world frame (default: to their
+    right, at the least distance that shows all). ranks: indices in `recording.worlds`, shown side by side (default:
+    all). Raises InputError: see `check_film`, or too many frames for the format; OSError.
     """
     path, size = Path(path), (size[0] + size[0] % 2, size[1] + size[1] % 2)
     check_film(path, size, fps, speed, eye)
     times = np.arange(recording.times[0], recording.times[-1] + 1.0e-9, speed / fps)
     if path.suffix != ".mp4" and len(times) > MAX_FRAMES:
-        raise InputError(f"{path}: {len(times)} frames are too many for {path.suffix}; up to {MAX_FRAMES}, or use .mp4")
+        raise InputError(f"{path}: {path.suffix} may have up to {MAX_FRAMES} frames, got {len(times)}; use .mp4")
     ranks = range(len(recording.worlds)) if ranks is None else ranks
     recording = without_divergence(recording)
     path.parent.mkdir(parents=True, exist_ok=True)
@@ -81,13 +81,13 @@ def write_film(
 def check_film(path: Path, size: tuple[int, int], fps: float, speed: float, eye: Sequence[float] | None = None) -> None:
     """Raise InputError unless a film can be written with these arguments of `write_film`."""
     if path.suffix not in SUFFIXES:
-        raise InputError(f"{path}: a film ends with {', '.join(SUFFIXES)}")
+        raise InputError(f"{path}: the suffix of a film must be one of {', '.join(SUFFIXES)}")
     if path.suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:
         raise InputError("MP4 films need imageio-ffmpeg: pip install jumper-warp[video]")
     if not (64 <= min(size) and max(size) <= 7680 and 0.0 < fps <= 240.0 and 0.0 < speed <= 100.0):
         raise InputError(f"a film needs 64 to 7680 px, fps in (0, 240], speed in (0, 100]; got {size}, {fps}, {speed}")
     if path.suffix == ".gif" and fps > GIF_FPS:
-        raise InputError(f"{path}: a GIF shows up to {GIF_FPS:g} frames per second, got {fps:g}")
+        raise InputError(f"{path}: a GIF may have up to {GIF_FPS:g} frames per second, got {fps:g}")
     if eye is not None:
         _view(np.zeros((0, 0, 3)), size, eye).axes()
 
@@ -96,7 +96,7 @@ def _images(
     recording: Recording, times: np.ndarray, size: tuple[int, int], eye: Sequence[float] | None, ranks: Sequence[int],
     name: str,
 ) -> Iterator[Image.Image]:  # fmt: skip
-    """Yield the annotated images of a film at `times` [s], with a progress bar; name: of the film, for the bar."""
+    """Yield the annotated images of a film at `times` [s], with a progress bar; name: label of the bar."""
     frames = np.clip(np.searchsorted(recording.times, times - 1.0e-9), 0, len(recording.times) - 1)
     poses, paths = drawn_poses(recording, times), body_paths(recording, ranks)
     targets = follow(paths, float(np.mean(np.diff(recording.times))) if len(recording.times) > 1 else 1.0)
@@ -117,20 +117,20 @@ def _images(
 
 
 def _shapes(recording: Recording, ranks: Sequence[int]) -> list[ShapeMesh]:
-    """Return the shapes of some worlds, of their goals, and those that all worlds share."""
+    """Return the shapes to draw: those of some worlds, their goals, and shapes shared by all worlds."""
     bodies = {-1}.union(*(recording.body_indices(rank) for rank in ranks))
     goals = [shape for shape in goal_shapes(recording) if int(shape.name.split("_")[1]) in ranks]
     return [shape for shape in recording.shapes if shape.body in bodies] + goals
 
 
 def _interpolated(recording: Recording, values: np.ndarray, times: np.ndarray) -> np.ndarray:
-    """Return values of the recording's frames, (num_frames, ...), at times [s], (times, ...)."""
+    """Interpolate values of the recording's frames, (num_frames, ...), to times [s]; return (times, ...)."""
     columns = [np.interp(times, recording.times, column) for column in values.reshape(len(values), -1).T]
     return np.stack(columns, axis=1).reshape(len(times), *values.shape[1:])
 
 
 def drawn_poses(recording: Recording, times: np.ndarray) -> np.ndarray:
-    """Return the bodies' poses at times [s], interpolated, with worlds apart as drawn, (times, bodies, 7)."""
+    """Return the bodies' poses as drawn, (times, bodies, 7): interpolated to times [s], with worlds spaced apart."""
     after = np.clip(np.searchsorted(recording.times, times), 1, max(1, len(recording.times) - 1))
     after = np.minimum(after, len(recording.times) - 1)
     before = np.maximum(after - 1, 0)
@@ -147,7 +147,7 @@ def drawn_poses(recording: Recording, times: np.ndarray) -> np.ndarray:
 
 
 def _view(paths: np.ndarray, size: tuple[int, int], eye: Sequence[float] | None) -> View:
-    """Return the view, relative to the camera's target, that shows the robots in all frames, or that from `eye`.
+    """Return the view relative to the camera's target: from `eye`, or by default one that shows all robots always.
 
     paths: base positions relative to the target [m], (num_frames, worlds, 3).
     """
@@ -178,7 +178,7 @@ def _world_labels(recording: Recording, bases: np.ndarray, ranks: Sequence[int])
 
 
 def _heading(recording: Recording, time: float, ranks: Sequence[int]) -> str:
-    """Return task, goal of a single world, and time as text."""
+    """Return the film's heading: task, goal of a single world, and time."""
     words = [str(recording.notes.get("task", "")), recording.label(ranks[0]) if len(ranks) == 1 else ""]
     return "   ".join([*(word for word in words if word), f"{time:.2f} s"])
 
@@ -202,7 +202,7 @@ def _encode_mp4(path: Path, images: Iterator[Image.Image], size: tuple[int, int]
 
 
 def _encode_animation(path: Path, images: Iterator[Image.Image], size: tuple[int, int], fps: float, count: int) -> None:
-    """Write images as animated WebP or GIF that repeats, by the path's suffix."""
+    """Write images as a repeating animation, WebP or GIF by the path's suffix."""
     pictures = list(images)
     tick = 10 if path.suffix == ".gif" else 1  # [ms] unit of the durations in the file
     ends = tick * np.round(1000.0 / fps / tick * np.arange(count + 1)).astype(int)

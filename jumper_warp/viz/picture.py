@@ -1,4 +1,4 @@
-"""Composite pictures: one scene with the robot at several moments of a recording, heights and goals marked."""
+"""Composite pictures: one scene with the robot at several moments of a recording, and marks of heights and goals."""
 
 from __future__ import annotations
 
@@ -21,21 +21,21 @@ WIDTH = 1600  # [px] default width
 HEIGHTS = (380, 1400)  # [px] least and largest height for that width
 ELEVATION = 0.13  # [1] height of the eye over its horizontal distance
 FIELD_OF_VIEW = 16.0  # [deg] narrow, so that near and far moments have nearly the same scale
-GAP = 0.28  # [m] least distance in the picture between the bases of two moments of a jump
+GAP = 0.28  # [m] least distance between the bases of two moments of a jump in the picture
 SIDE_BY_SIDE = 0.8  # [m] least distance between two moments of a walk
-APART = (0.6, 0.6)  # [m] distance to the right or up from which two moments do not hide each other
+APART = (0.6, 0.6)  # [m] distance, to the right or up, from which two moments do not hide each other
 GHOST = 0.4  # opacity of moments that would hide others
 SPREAD = 0.95  # [m] distance between moments of a robot that stays in place
 STAYS = 0.6  # [m] horizontal distance up to which a robot stays in place
 RISE = 0.1  # [m] of the base during a flight, above which the flight is a jump
 CONTACT = 1.0  # [N] paw force above which a paw touches
-MOST = 7  # moments in a picture
+MOST = 7  # largest number of moments in a picture
 FORMATS = {".png": {}, ".webp": {"quality": 88, "method": 6}, ".jpg": {"quality": 90}}  # Pillow's options by suffix
 
 
 @dataclass(frozen=True)
 class Composition:
-    """The moments of one world in one scene, in a vertical plane through its path."""
+    """Scene with several moments of one recorded world, drawn in a vertical plane through its path."""
 
     recording: Recording
     rank: int  # index in `recording.worlds`
@@ -43,16 +43,16 @@ class Composition:
     right: np.ndarray  # (3,) horizontal unit vector of the path, to the right in the picture
     frames: np.ndarray  # (moments,) indices of the shown frames
     flights: list[tuple[int, int]]  # first and last frame of each flight of a jump
-    shift: np.ndarray  # (moments,) [m] along `right`, by which each moment is drawn away from its place
+    shift: np.ndarray  # (moments,) [m] offset along `right` of each moment as drawn from its true position
 
     @property
     def bases(self) -> np.ndarray:
-        """[m] (moments, 3) Base positions as drawn."""
+        """Base positions as drawn [m], (moments, 3)."""
         return self.base[self.frames] + self.shift[:, None] * self.right
 
     @property
     def heights(self) -> np.ndarray:
-        """[m] (n,) Commanded heights, at most one."""
+        """Commanded base heights [m], (n,), at most one."""
         heights = self.recording.heights[self.rank : self.rank + 1]
         return heights[np.isfinite(heights)]
 
@@ -63,34 +63,34 @@ class Composition:
 
     @property
     def lowest(self) -> float:
-        """[m] Lowest height of a paw, 0 without paws."""
+        """Lowest height of a paw in the recording [m], 0 if it has no paws."""
         points = self.recording.contact_points[:, self.rank, :, 2]
         return float(points.min()) if points.size else 0.0
 
     @property
     def toward_eye(self) -> np.ndarray:
-        """(3,) Horizontal unit vector from the path to the eye."""
+        """Horizontal unit vector from the path to the camera, (3,)."""
         return np.array([self.right[1], -self.right[0], 0.0])
 
     def span(self) -> tuple[float, float]:
-        """Return the least and the largest coordinate along `right` [m] of what is shown."""
+        """Return the least and the largest coordinate of the picture's content along `right` [m]."""
         along = corners(self.bases) @ self.right
         return float(along.min()) - 0.15, float(along.max()) + 0.15
 
     def point(self, along: float, height: float) -> np.ndarray:
-        """Return a point of the plane [m], (3,): `along` right, at a height."""
+        """Return the point of the plane at a coordinate `along` right [m] and a height [m], (3,) [m], world frame."""
         depth = self.base[0] @ self.toward_eye
         return along * self.right + depth * self.toward_eye + [0.0, 0.0, height]
 
 
 def compose(recording: Recording, rank: int = 0) -> Composition:
-    """Return the composition of the rank-th recorded world. A robot that stays in place is spread to the right.
+    """Choose the moments of the rank-th recorded world to show; those of a robot in place are spread to the right.
 
-    Frames after `valid_frames` are left out. Raises InputError: no frame is left.
+    Frames after `valid_frames` are ignored. Raises InputError: no frame remains.
     """
     count = valid_frames(recording, rank)
     if count == 0:
-        raise InputError(f"{recording.label(rank)} has no finite pose in its first frame, so there is no picture")
+        raise InputError(f"{recording.label(rank)}: no picture, the poses of the first frame are not finite")
     fields = ("times", "poses", "contact_points", "contact_forces", "commands")
     recording = replace(recording, **{name: getattr(recording, name)[:count] for name in fields})
     base = recording.body_poses(rank)[:, 0, :3].astype(float)
@@ -122,14 +122,14 @@ def _flights(recording: Recording, rank: int) -> list[tuple[int, int]]:
 
 
 def _events(height: np.ndarray, takeoff: int, touchdown: int) -> np.ndarray:
-    """Return the frames of a jump in place: squat, takeoff, rise, apex, fall, touchdown, rest."""
+    """Return the frames that show a jump in place: squat, takeoff, rise, apex, fall, touchdown, rest."""
     apex = takeoff + int(np.argmax(height[takeoff : touchdown + 1]))
     squat = int(np.argmin(height[: takeoff + 1]))
     return np.array([squat, takeoff, (takeoff + apex) // 2, apex, (apex + touchdown) // 2, touchdown, len(height) - 1])
 
 
 def _distinct(places: np.ndarray, flights: list[tuple[int, int]]) -> np.ndarray:
-    """Return up to MOST frames whose places are GAP apart: apexes, end, start, touchdowns and takeoffs first.
+    """Choose up to MOST frames at least GAP apart in the picture: apexes, end, start, touchdowns and takeoffs first.
 
     places: base positions in the picture [m], (num_frames, 2), to the right and up.
     """
@@ -149,7 +149,7 @@ def _distinct(places: np.ndarray, flights: list[tuple[int, int]]) -> np.ndarray:
 
 
 def _evenly_moved(poses: np.ndarray, count: int) -> np.ndarray:
-    """Return `count` frames between which the bodies move equally far; poses: (num_frames, bodies, 3 or more)."""
+    """Choose `count` frames with equal motion of the bodies between them; poses: (num_frames, bodies, 3 or more)."""
     steps = np.linalg.norm(np.diff(poses[..., :3], axis=0), axis=-1).sum(axis=1)
     moved = np.concatenate([[0.0], np.cumsum(steps)])
     return np.searchsorted(moved, np.linspace(0.0, 0.99 * moved[-1], count))
@@ -158,15 +158,15 @@ def _evenly_moved(poses: np.ndarray, count: int) -> np.ndarray:
 def write_picture(
     recording: Recording, path: Path, *, rank: int = 0, width: int = WIDTH, angle: float = 0.0, title: str | None = None
 ) -> Path:
-    """Write a composite picture of one world of a recording; return its path. The suffix .png, .webp or .jpg counts.
+    """Write a composite picture (.png, .webp or .jpg) of one world of a recording; return its path.
 
-    rank: index in `recording.worlds`. width: of the picture [px]; its height follows from the motion. angle [deg]: of
-    the eye about z, from the right of the path towards its end. title: default: task and name of the world.
+    rank: index in `recording.worlds`. width: of the picture [px]; its height depends on the motion. angle [deg]: of
+    the camera about z, from the right of the path towards its end. title: default: task and name of the world.
     Raises InputError: another suffix or width; OSError.
     """
     path = Path(path)
     if path.suffix not in FORMATS or not 200 <= width <= 8000:
-        raise InputError(f"{path}: a picture ends with {', '.join(FORMATS)} and is 200 to 8000 px wide, got {width}")
+        raise InputError(f"{path}: a picture needs suffix {', '.join(FORMATS)} and width 200 to 8000 px, got {width}")
     scene = compose(recording, rank)
     turn = np.arctan2(scene.toward_eye[1], scene.toward_eye[0]) + np.radians(angle)
     points = _extent(scene)
@@ -203,7 +203,7 @@ def _opacity(scene: Composition) -> np.ndarray:
 
 
 def _extent(scene: Composition) -> np.ndarray:
-    """Return points [m], (n, 3), that the picture must show: robots with their labels, scale and bars."""
+    """Return the points that the picture must show, (n, 3) [m]: robots with their labels, scale and bars."""
     low, high = scene.span()
     ground = scene.lowest - 0.1
     heights = [*scene.heights, *([ground] if scene.grounded else [])]
@@ -218,7 +218,7 @@ def _extent(scene: Composition) -> np.ndarray:
 
 
 def _framed(points: np.ndarray, direction: np.ndarray, width: int) -> tuple[View, tuple[int, int]]:
-    """Return view and image size [px] that show points from a direction, with the height that they need."""
+    """Return the view from a direction that shows all points, and the image size [px], as high as necessary."""
     size = (width, HEIGHTS[1] * width // WIDTH)
     pixels = fit(points, direction, size, FIELD_OF_VIEW).project(points, size)
     needed = float(np.ptp(pixels[:, 1]) / np.ptp(pixels[:, 0])) * width
@@ -229,7 +229,7 @@ def _framed(points: np.ndarray, direction: np.ndarray, width: int) -> tuple[View
 
 
 def _shapes(scene: Composition) -> list[ShapeMesh]:
-    """Return the shapes of one robot, of the ground, and rings at its goals if it is drawn at its true place."""
+    """Return the shapes to draw: robot, ground, and rings at the goals if the robot is at its true position."""
     own = {body: i for i, body in enumerate(scene.recording.body_indices(scene.rank))} | {-1: -1}
     shapes = [replace(shape, body=own[shape.body]) for shape in scene.recording.shapes if shape.body in own]
     if scene.shift.any():
@@ -239,7 +239,7 @@ def _shapes(scene: Composition) -> list[ShapeMesh]:
 
 
 def _lines(scene: Composition) -> list[Line]:
-    """Return the base's path, bars at commanded heights, a scale of heights, and one of distances on the ground."""
+    """Return the lines to draw: path of the base, bars at commanded heights, scales of height and ground distance."""
     low, high = scene.span()
     first, last = scene.frames[0], scene.frames[-1]
     frames = np.arange(first, last + 1)
@@ -256,7 +256,7 @@ def _lines(scene: Composition) -> list[Line]:
 
 
 def _ticks(scene: Composition) -> np.ndarray:
-    """Return the heights [m] of the scale's marks: every 0.25 m, or more above 1.5 m; none without ground."""
+    """Return the heights [m] of the scale's marks: every 0.25 m, wider above 1.5 m; none without ground."""
     if not scene.grounded:
         return np.zeros(0)
     top = max(float(scene.bases[:, 2].max()), *scene.heights, 0.25)
@@ -265,7 +265,7 @@ def _ticks(scene: Composition) -> np.ndarray:
 
 
 def _labels(scene: Composition) -> list[Label]:
-    """Return time and, in jumps, base height above each moment, and the numbers of scale and bars."""
+    """Return the labels: time (and base height of a jump) above each moment, and the numbers of scale and bars."""
     low, high = scene.span()
     jumps, labels = bool(scene.flights), []
     for frame, base, opacity in zip(scene.frames, scene.bases, _opacity(scene), strict=True):

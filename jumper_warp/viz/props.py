@@ -1,4 +1,4 @@
-"""Additions to a recording: markers of goals and commanded heights, and moving blocks."""
+"""Shapes added to a recording: markers of goals and commanded heights, and moving blocks."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ from jumper_warp.viz.shapes import ShapeMesh
 from jumper_warp.viz.style import GOAL_COLOR
 
 RING_RADIUS = 0.1  # [m] outer radius of a goal's ring: largest error of a successful jump
-RING_WIDTH, RING_HEIGHT = 0.012, 0.006  # [m] of the ring's rectangular cross-section
+RING_WIDTH, RING_HEIGHT = 0.012, 0.006  # [m] sides of the ring's rectangular cross-section
 BAR_SIZE = (1.2, 0.012, 0.012)  # [m] extents of a bar at the commanded height, along x, y, z
 BAR_OFFSET = 0.45  # [m] distance along y from the base's start to the bar
 BLOCK_COLOR = (0.55, 0.45, 0.35)  # RGB, each in [0, 1]
 
 
 def goal_shapes(recording: Recording) -> list[ShapeMesh]:
-    """Return a ring around each goal on the ground and a bar at each world's commanded height, world frame.
+    """Return the markers of goals (rings on the ground) and of commanded heights (bars), world frame.
 
-    The bar is parallel to x, to the left of the base's first position. Shapes of later worlds are moved along y by the
-    recording's spacing. Names: `goal_<rank>_<number>`, `height_<rank>`; NaN goals and heights have none.
+    A bar is parallel to x, to the left of the base's first position. Markers of later worlds are moved along y by the
+    recording's spacing. Names: `goal_<rank>_<number>`, `height_<rank>`; NaN goals and heights have no marker.
     """
     shapes = []
     for rank, goals in enumerate(recording.goals):
@@ -41,7 +41,7 @@ def goal_shapes(recording: Recording) -> list[ShapeMesh]:
 
 
 def with_blocks(recording: Recording, centers: np.ndarray, half: np.ndarray, height: np.ndarray) -> Recording:
-    """Return the recording with a moving block, body `world_<i>/block`, in each world, standing on z = 0.
+    """Add a moving block, body `world_<i>/block`, standing on z = 0, to each world of a recording; return the copy.
 
     centers: x and y [m], world frame, (frames, recorded worlds, 2). half: half extents along x and y [m], (recorded
     worlds, 2). height: [m], (recorded worlds,).
@@ -60,7 +60,7 @@ def with_blocks(recording: Recording, centers: np.ndarray, half: np.ndarray, hei
 
 
 def _shape(name: str, body: int, color: tuple[float, float, float], mesh: trimesh.Trimesh) -> ShapeMesh:
-    """Return a mesh [m] in the body's frame as a shape."""
+    """Convert a mesh [m] in the body's frame to a shape."""
     smooth = mesh.smooth_shaded
     surface = (np.asarray(smooth.vertices, np.float32), np.asarray(smooth.vertex_normals, np.float32))
     return ShapeMesh(name, body, color, *surface, np.asarray(smooth.faces, np.int32))

@@ -1,4 +1,4 @@
-"""Recorder of a running simulation."""
+"""Recorder of a running simulation's frames."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -15,7 +15,7 @@ from jumper_warp.viz.shapes import ShapeMesh, shape_meshes
 
 
 class Recorder:
-    """Collects frames (body poses, series, contact forces) of a running Newton model into a `Recording`.
+    """Recorder that collects frames (body poses, series, contact forces) of a running Newton model.
 
     ```python
     recorder = Recorder(model)
@@ -33,10 +33,10 @@ class Recorder:
         notes: Mapping[str, Any] | None = None,
         labels: Sequence[str] = (),
     ) -> None:
-        """Prepare to record some worlds of a model; its bodies and shapes are read once, here.
+        """Prepare to record some worlds of a model, whose bodies and shapes are read once, here.
 
-        spacing: distance [m] along y between the drawings of consecutive worlds; zero keeps the true positions, as a
-        heightfield needs. notes: metadata of JSON types, saved with the recording. labels: names of the worlds.
+        spacing: distance [m] along y between the drawings of consecutive worlds; 0 for true positions, required for a
+        heightfield. notes: metadata of JSON types, saved with the recording. labels: names of the worlds.
         Raises InputError: a world has no bodies, or a visible shape cannot be drawn.
         """
         world_of_body = model.body_world.numpy()
@@ -74,7 +74,7 @@ class Recorder:
     ) -> None:
         """Add a frame at a time [s] after the previous frame's.
 
-        body_poses: of all bodies of the model, as in `state.body_q`: (body_count, 7), position [m] and quaternion xyzw.
+        body_poses: of all bodies of the model, like `state.body_q`: (body_count, 7), position [m] and quaternion xyzw.
         series: values by name, `group/quantity [unit]`, the same names in every frame. contact_points [m] and
         contact_forces [N] on the robot: world frame, (num_worlds, contacts_per_world, 3), or (contacts, 3) for one
         world, the same number in every frame. states: words by name, such as a phase, the same names in every frame.
@@ -96,7 +96,7 @@ class Recorder:
             self._commands.append(np.array(commands, dtype=np.float32).reshape(len(self._worlds), 3))
 
     def _append_series(self, series: Mapping[str, float]) -> None:
-        """Append a frame's values by name. Raises InputError: a malformed, new or missing name."""
+        """Append a frame's values of the series, by name. Raises InputError: a malformed, new or missing name."""
         values = {name: float(value) for name, value in series.items()}
         if self._series is None:
             malformed = [name for name in series if not SERIES_NAME.fullmatch(name)]
@@ -110,12 +110,12 @@ class Recorder:
             self._series[name].append(value)
 
     def _checked_contacts(self, points: np.ndarray | None, forces: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-        """Return float32 copies of a frame's contacts, (num_worlds, contacts_per_world, 3) each; none if both are None.
+        """Check and copy a frame's contacts, (num_worlds, contacts_per_world, 3) each; no contacts if both are None.
 
         Raises InputError: only one is given, or a shape is wrong or differs from earlier frames.
         """
         if (points is None) != (forces is None):
-            raise InputError("contact_points and contact_forces come together")
+            raise InputError("pass contact_points and contact_forces together, or neither")
         if points is None:
             points = forces = np.zeros((len(self._worlds), 0, 3))
         points, forces = (np.array(given, dtype=np.float32) for given in (points, forces))
@@ -130,12 +130,12 @@ class Recorder:
         return points, forces
 
     def recording(self, *, goals: np.ndarray | None = None, heights: np.ndarray | None = None) -> Recording:
-        """Return a recording of all frames so far. Raises InputError: there is no frame.
+        """Return a recording of all frames recorded so far. Raises InputError: there is no frame.
 
         goals [m]: on the ground, world frame, (worlds, goals, 3); heights [m]: commanded, (worlds,); NaN: none.
         """
         if not self._times:
-            raise InputError("nothing was recorded")
+            raise InputError("the recording has no frames")
         return Recording(
             times=np.array(self._times),
             worlds=self._worlds,
@@ -157,21 +157,21 @@ class Recorder:
         )
 
     def save_npz(self, path: Path) -> Path:
-        """Write all frames so far as a NumPy archive, which `load_npz` reads; return its path."""
+        """Write the recording as a NumPy archive, which `load_npz` reads; return its path."""
         return self.recording().save_npz(path)
 
     def save_rrd(self, path: Path) -> Path:
-        """Write all frames so far as a file of the Rerun viewer; return its path."""
+        """Write the recording as a file of the Rerun viewer; return its path."""
         return write_rrd(self.recording(), Path(path))
 
     def save_film(self, path: Path, **options: Any) -> Path:
-        """Write all frames so far as a film (.mp4, .webp or .gif); return its path; options: of `write_film`."""
+        """Write the recording as a film (.mp4, .webp or .gif); return its path; options: those of `write_film`."""
         from jumper_warp.viz.film import write_film
 
         return write_film(self.recording(), Path(path), **options)
 
     def save_picture(self, path: Path, **options: Any) -> Path:
-        """Write a composite picture (.png, .webp or .jpg); return its path; options: of `write_picture`."""
+        """Write a composite picture (.png, .webp or .jpg); return its path; options: those of `write_picture`."""
         from jumper_warp.viz.picture import write_picture
 
         return write_picture(self.recording(), Path(path), **options)

@@ -32,16 +32,16 @@ ARRAYS = (
 )  # fields of `Recording` that are arrays
 SURFACE = ("vertices", "normals", "triangles")  # fields of `ShapeMesh` that are arrays
 SERIES_NAME = re.compile(r"[^/\[\]]+/[^/\[\]]+ \[[^\[\]]+\]")
-"""Pattern of a series' name, `group/quantity [unit]`; the unit of a pure number is 1."""
+"""Pattern of a series' name, `group/quantity [unit]`; the unit of a dimensionless quantity is 1."""
 
 
 class RecordingError(InputError):
-    """A file is not a complete recording. The message is one line and names the file."""
+    """Error: a file is not a complete recording. The message is one line and names the file."""
 
 
 @dataclass(frozen=True)
 class Recording:
-    """One rollout of one or a few worlds, with a fixed set of bodies, series and contacts."""
+    """Recorded rollout of one or several worlds, with a fixed set of bodies, series and contacts."""
 
     times: np.ndarray  # (num_frames,) float64 [s], increasing
     worlds: tuple[int, ...]  # indices of the recorded worlds in the model
@@ -50,18 +50,18 @@ class Recording:
     series: dict[str, np.ndarray]  # (num_frames,) float64 by name, `group/quantity [unit]`
     contact_points: np.ndarray  # (num_frames, num_worlds, contacts_per_world, 3) float32 [m], world frame
     contact_forces: np.ndarray
-    """(num_frames, num_worlds, contacts_per_world, 3) float32 [N], force on the robot, world frame."""
+    """Contact force on the robot [N], world frame, (num_frames, num_worlds, contacts_per_world, 3) float32."""
     spacing: float = 0.0  # [m] Distance along y between the drawings of consecutive worlds; the data are not moved
     shapes: tuple[ShapeMesh, ...] = ()  # meshes to draw; their `body` is an index of `bodies`, -1 for the world
     notes: dict[str, Any] = field(default_factory=dict)  # metadata of JSON types, such as seed, gains and commit
     labels: tuple[str, ...] = ()  # names of the worlds to show, such as their goals; default `world_<i>`
-    states: dict[str, list[str]] = field(default_factory=dict)  # a word for each frame, such as a phase, by name
+    states: dict[str, list[str]] = field(default_factory=dict)  # by name, a text for each frame, such as a phase
     goals: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
-    """(num_worlds, goals, 3) [m] goals on the ground, world frame, NaN where there is none; no worlds: no goals."""
+    """Goals on the ground [m], world frame, (num_worlds, goals, 3), NaN where there is none; no worlds: no goals."""
     heights: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
-    """(num_worlds,) [m] commanded heights of the base at the apex, above z = 0; NaN or no worlds: none."""
+    """Commanded heights of the base at the apex [m], above z = 0, (num_worlds,); NaN or no worlds: none."""
     commands: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
-    """(num_frames, num_worlds, 3) commanded velocity ahead, to the left [m/s] and about z [rad/s]; no frames: none."""
+    """Commanded velocity ahead, to the left [m/s] and about z [rad/s], (num_frames, num_worlds, 3); no frames: none."""
 
     def label(self, rank: int) -> str:
         """Return the name of the rank-th recorded world."""
@@ -102,7 +102,7 @@ class Recording:
 
 
 def load_npz(path: Path) -> Recording:
-    """Return the recording in a file of `Recording.save_npz`.
+    """Load a recording from a file written by `Recording.save_npz`.
 
     Raises RecordingError (an InputError): the file is missing, damaged, of another kind or of another version.
     """
@@ -119,7 +119,7 @@ def load_npz(path: Path) -> Recording:
 
 
 def _from_archive(header: dict[str, Any], archive: Mapping[str, np.ndarray]) -> Recording:
-    """Return the recording in a NumPy archive; header: its decoded JSON entry `header`."""
+    """Build a recording from a NumPy archive; header: its decoded JSON entry `header`."""
     shapes = tuple(
         ShapeMesh(
             shape["name"], shape["body"], tuple(shape["color"]), *(archive[f"shape{index}_{part}"] for part in SURFACE)

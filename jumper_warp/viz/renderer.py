@@ -1,4 +1,4 @@
-"""Images of triangle meshes without a display: OpenGL, or ray tracing where OpenGL is missing.
+"""Rendering of triangle meshes without a display, with OpenGL or, where it is missing, ray tracing.
 
 OpenGL (Newton's `ViewerGL`) draws soft shadows, lines and transparent bodies. The ray tracer (Newton's `SensorCamera`)
 is four times slower and draws neither lines nor transparency.
@@ -38,7 +38,7 @@ NO_GL = f"pip install jumper-warp[video], and on Debian {GL_PACKAGES}"
 
 @dataclass(frozen=True)
 class View:
-    """A pinhole camera that looks from `eye` at `target`, with z up in the image."""
+    """Pinhole camera at `eye`, aimed at `target`, with z up in the image."""
 
     eye: np.ndarray  # (3,) [m] world frame
     target: np.ndarray  # (3,) [m] world frame, at the image's centre
@@ -53,12 +53,12 @@ class View:
         right = np.cross(ahead, [0.0, 0.0, 1.0])
         if np.linalg.norm(right) < 1.0e-6 * max(1.0, float(np.linalg.norm(ahead))):
             eye, target = (tuple(np.asarray(point, dtype=float).tolist()) for point in (self.eye, self.target))
-            raise InputError(f"cannot look from {eye} to {target}: no horizontal distance")
+            raise InputError(f"the view from {eye} to {target} is vertical")
         ahead, right = ahead / np.linalg.norm(ahead), right / np.linalg.norm(right)
         return np.stack([right, np.cross(right, ahead), ahead])
 
     def project(self, points: np.ndarray, size: tuple[int, int]) -> np.ndarray:
-        """Return pixels (n, 2) of points (n, 3) [m], world frame, from the image's upper left corner.
+        """Project points (n, 3) [m], world frame, to pixels (n, 2) from the image's upper left corner.
 
         size: width and height [px]. Points behind the camera become NaN.
         """
@@ -70,7 +70,7 @@ class View:
 
 @dataclass(frozen=True)
 class Line:
-    """A polyline of one color, without thickness in the world."""
+    """Polyline of one color, with a constant width in the image."""
 
     points: np.ndarray  # (n, 3) [m], world frame
     color: tuple[float, float, float]  # RGB, each in [0, 1]
@@ -78,27 +78,27 @@ class Line:
 
 
 class Renderer(ABC):
-    """Draws bodies with triangle meshes at given poses. Use as a context manager, or call `close`."""
+    """Renderer of bodies with triangle meshes at given poses. Use it as a context manager, or call `close`."""
 
     name: str  # in words, for messages
 
     def __init__(
         self, shapes: Sequence[ShapeMesh], num_bodies: int, size: tuple[int, int], opacity: Sequence[float] = (1.0,)
     ) -> None:
-        """Prepare images of a size, width and height [px]; the others: as in `load`."""
+        """Prepare images of a size, width and height [px]; other arguments: see `load`."""
         self.size = size
         self.load(shapes, num_bodies, opacity)
 
     def load(self, shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float] = (1.0,)) -> None:
-        """Draw copies of these bodies from now on; shapes that are fixed to the world exist once.
+        """Load copies of bodies to be drawn; shapes that are fixed to the world exist once.
 
-        num_bodies: indices in `ShapeMesh.body` are below it. opacity: of each copy, 0 to 1.
+        num_bodies: number of bodies that `ShapeMesh.body` indexes. opacity: of each copy, 0 to 1.
         """
         self.model = _scene_model(shapes, num_bodies, opacity)
         self.state: State = self.model.state()
 
     def draw(self, poses: np.ndarray, view: View, lines: Sequence[Line] = ()) -> np.ndarray:
-        """Return an image, (height, width, 3) uint8, RGB, row 0 on top.
+        """Draw an image, (height, width, 3) uint8, RGB, row 0 on top.
 
         poses: of the bodies of every copy, (copies * num_bodies, 7), position [m] and quaternion xyzw, world frame.
         Raises InputError: a vertical view.
@@ -109,10 +109,10 @@ class Renderer(ABC):
 
     @abstractmethod
     def _image(self, view: View, lines: Sequence[Line]) -> np.ndarray:
-        """Return an image of `state`, as `draw`."""
+        """Return an image of the poses in `state`, (height, width, 3) uint8, RGB."""
 
     def close(self) -> None:  # noqa: B027, nothing to free by default
-        """Free the renderer's resources; it draws no more."""
+        """Free the renderer's resources; it cannot draw afterwards."""
 
     def __enter__(self) -> Renderer:
         return self
@@ -122,9 +122,9 @@ class Renderer(ABC):
 
 
 class GLRenderer(Renderer):
-    """Renderer with OpenGL, by Newton's viewer in an invisible window.
+    """Renderer with OpenGL: Newton's viewer in an invisible window.
 
-    A closed renderer leaves its window to the next one of its size, as closing a window does not free its memory.
+    The next renderer of the same size reuses the window of a closed one, since closing a window leaks its memory.
     """
 
     _idle: ClassVar[dict[tuple[int, int], list[Any]]] = {}  # viewers without a renderer, by size [px]
@@ -134,7 +134,7 @@ class GLRenderer(Renderer):
     def __init__(
         self, shapes: Sequence[ShapeMesh], num_bodies: int, size: tuple[int, int], opacity: Sequence[float] = (1.0,)
     ) -> None:
-        """As `Renderer`. Raises ImportError: pyglet is missing; RuntimeError: OpenGL is missing or too old."""
+        """Prepare images, see `Renderer`. Raises ImportError: no pyglet; RuntimeError: OpenGL is missing or too old."""
         idle = self._idle.setdefault(size, [])
         self._viewer: Any = idle.pop() if idle else _gl_viewer(size)
         super().__init__(shapes, num_bodies, size, opacity)
@@ -147,7 +147,7 @@ class GLRenderer(Renderer):
         renderer.line_width, renderer.arrow_scale = LINE_WIDTH * size[0], 0.6 * LINE_WIDTH * size[0]
 
     def load(self, shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float] = (1.0,)) -> None:
-        """As `Renderer.load`."""
+        """Load copies of bodies to be drawn; see `Renderer.load`."""
         super().load(shapes, num_bodies, opacity)
         self._viewer.renderer._make_current()
         self._viewer.set_model(self.model)
@@ -166,7 +166,7 @@ class GLRenderer(Renderer):
         return viewer.get_frame().numpy().copy()
 
     def close(self) -> None:
-        """Free the bodies, and leave the window to the next renderer."""
+        """Free the bodies, and store the window for the next renderer."""
         viewer, self._viewer = self._viewer, None
         if viewer is not None:
             viewer.renderer._make_current()
@@ -175,20 +175,20 @@ class GLRenderer(Renderer):
 
 
 class RayTracer(Renderer):
-    """Renderer without OpenGL; draws neither lines nor transparency."""
+    """Renderer by ray tracing, without OpenGL; it draws neither lines nor transparency."""
 
     name = "ray tracing"
 
     def __init__(
         self, shapes: Sequence[ShapeMesh], num_bodies: int, size: tuple[int, int], opacity: Sequence[float] = (1.0,)
     ) -> None:
-        """As `Renderer`."""
+        """Prepare images; see `Renderer`."""
         super().__init__(shapes, num_bodies, size, opacity)
         self._rays: Any = None
         self._field_of_view = 0.0  # [deg] of `_rays`
 
     def load(self, shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float] = (1.0,)) -> None:
-        """As `Renderer.load`."""
+        """Load copies of bodies to be drawn; see `Renderer.load`."""
         super().load(shapes, num_bodies, opacity)
         self._sensor = SensorCamera(self.model)
         rays: Any = wp.vec3(*(-np.array(SUN) / np.linalg.norm(SUN)))
@@ -219,12 +219,12 @@ class RayTracer(Renderer):
 def open_renderer(
     shapes: Sequence[ShapeMesh], num_bodies: int, size: tuple[int, int], opacity: Sequence[float] = (1.0,)
 ) -> Renderer:
-    """Return a renderer with OpenGL, or, with a line on standard error, one that traces rays; as `Renderer`."""
+    """Return an OpenGL renderer or, with a notice on standard error, a ray tracer; arguments: see `Renderer`."""
     try:
         return GLRenderer(shapes, num_bodies, size, opacity)
     except (ImportError, RuntimeError, OSError) as error:
         reason = " ".join(str(error).split())[:100]
-        print(f"no OpenGL ({reason}), so the slow ray tracer draws: {NO_GL}", file=sys.stderr)
+        print(f"no OpenGL ({reason}), using the slow ray tracer; to install OpenGL: {NO_GL}", file=sys.stderr)
         return RayTracer(shapes, num_bodies, size, opacity)
 
 
@@ -245,7 +245,7 @@ def _gl_viewer(size: tuple[int, int]) -> Any:
 
 
 def _scene_model(shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float]) -> Model:
-    """Return a Newton model of `len(opacity)` copies of the bodies, only to be drawn."""
+    """Return a Newton model of `len(opacity)` copies of the bodies, for drawing only."""
     builder = newton.ModelBuilder()
     builder.default_shape_cfg = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False)
     meshes = [
@@ -265,7 +265,7 @@ def _scene_model(shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence
 
 
 def _segments(lines: Sequence[Line]) -> tuple[wp.array | None, wp.array | None, wp.array | None]:
-    """Return starts, ends and colors of all segments of lines, vec3 each; an arrow is one segment."""
+    """Convert lines to segments: return starts, ends and colors, vec3 each; an arrow is one segment."""
     if not lines:
         return None, None, None
     parts = [line.points[[0, -1]] if line.arrow else line.points for line in lines]

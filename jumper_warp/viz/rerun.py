@@ -1,4 +1,4 @@
-"""Recordings as files of the Rerun viewer: `rerun FILE.rrd` shows them.
+"""Export of recordings as files of the Rerun viewer: `rerun FILE.rrd` shows them.
 
 Entities, where <world> is the label of a world, or `world_<i>` if two worlds have the same label:
     scene/<shape>                       ground, goals, and other shapes that are fixed to the world
@@ -7,9 +7,9 @@ Entities, where <world> is the label of a world, or `world_<i>` if two worlds ha
     scene/<world>/trail                 paths of the base and of the contact points
     scene/<world>/contact_forces
     scene/<world>/commanded_velocity, actual_velocity
-    scene/view_target                   point that the eye follows
+    scene/view_target                   point that the camera follows
     series/<group>/<quantity [unit]>    one curve, or one for each leg in the order of LEG_COLORS
-    states/<quantity>/<world>           words over time
+    states/<quantity>/<world>           state, as text, over time
 
 No viewer is started and no port is opened.
 """
@@ -42,7 +42,7 @@ EYE_DIRECTION = np.array([0.70, 0.63, 0.336])  # from the target of the view to 
 EYE_DISTANCE = 1.8  # [m] smallest distance of the eye from its target
 LEGEND_SHARE = 0.35  # free time axis behind the curves, where the legend is, over the recording's length
 LEG_QUANTITY = re.compile(rf"({'|'.join(LEG_COLORS)})(?:_(\w+))? (\[.+\])")
-"""Pattern of a quantity of one leg: leg, motor if any, unit in brackets."""
+"""Pattern of the name of a quantity of one leg: leg, motor if any, unit in brackets."""
 
 
 def write_rrd(recording: "Recording", path: Path) -> Path:
@@ -81,13 +81,13 @@ class _Writer:
     """Writer of one recording to a Rerun stream, with one call for all frames of an entity."""
 
     def __init__(self, rr: ModuleType, stream: Any, recording: "Recording") -> None:
-        """Prepare to write; rr: the module rerun, stream: its `RecordingStream`."""
+        """Prepare to write a recording; rr: the module rerun, stream: its `RecordingStream`."""
         self.rr, self.stream, self.recording = rr, stream, recording
         self.worlds = _world_names(recording)
         self.times = [rr.TimeColumn(TIMELINE, duration=recording.times)]
 
     def log_scene(self) -> None:
-        """Log all shapes once, the poses of all bodies, and the target of the eye."""
+        """Log the scene: all shapes once, and over time the poses of all bodies and the camera's target."""
         rr, recording = self.rr, self.recording
         parents = []
         for body in recording.bodies:
@@ -108,7 +108,7 @@ class _Writer:
         self._send(["scene", "view_target"], rr.Transform3D.columns(translation=target))
 
     def log_world(self, rank: int) -> None:
-        """Log place, trail, contact forces and velocities of the rank-th recorded world."""
+        """Log position, trail, contact forces and velocities of the rank-th recorded world."""
         rr, recording, parent = self.rr, self.recording, ["scene", self.worlds[rank]]
         offset = rr.Transform3D(translation=[0.0, rank * recording.spacing, 0.0])
         self.stream.log(rr.new_entity_path(parent), offset, static=True)
@@ -152,7 +152,7 @@ class _Writer:
             self._send(plot.entity, self.rr.Scalars.columns(scalars=plot.values))
 
     def log_states(self) -> None:
-        """Log the frames in which a state changes."""
+        """Log the states, as text, in the frames in which they change."""
         for name, words in self.recording.states.items():
             changes = [i for i, word in enumerate(words) if i == 0 or word != words[i - 1]]
             times = [self.rr.TimeColumn(TIMELINE, duration=self.recording.times[changes])]
@@ -160,7 +160,7 @@ class _Writer:
             self.stream.send_columns(self.rr.new_entity_path(["states", *name.split("/", 1)]), times, columns)
 
     def _send(self, entity: list[str], columns: Any) -> None:
-        """Log one value in each frame of the recording."""
+        """Log an entity's values, one per frame of the recording."""
         self.stream.send_columns(self.rr.new_entity_path(entity), self.times, columns)
 
 
@@ -171,7 +171,7 @@ def _world_names(recording: "Recording") -> list[str]:
 
 
 def _mesh(rr: ModuleType, shape: ShapeMesh) -> Any:
-    """Return a shape as Rerun's mesh, in the body's frame, with an opaque color."""
+    """Convert a shape to a Rerun mesh, in the body's frame, with an opaque color."""
     return rr.Mesh3D(
         vertex_positions=shape.vertices,
         vertex_normals=shape.normals,
@@ -181,7 +181,7 @@ def _mesh(rr: ModuleType, shape: ShapeMesh) -> Any:
 
 
 def _rgb(colors: Iterable[tuple[float, float, float]]) -> np.ndarray:
-    """Return colors (n, 3) in [0, 1] as bytes."""
+    """Convert colors (n, 3) in [0, 1] to bytes."""
     return np.round(255.0 * np.clip(list(colors), 0.0, 1.0)).astype(np.uint8)
 
 
@@ -202,9 +202,9 @@ def velocities(recording: "Recording", rank: int) -> tuple[np.ndarray, np.ndarra
 
 
 def view_targets(recording: "Recording") -> tuple[np.ndarray, float]:
-    """Return the point that the eye looks at [m], world frame, (frames, 3), and the eye's distance from it [m].
+    """Return the camera's target [m], world frame, (frames, 3), and the camera's distance from it [m].
 
-    The point follows the mean horizontal position of the worlds' bases, at the mean of their extreme heights.
+    The target follows the mean horizontal position of the worlds' bases, at the mean of their extreme heights.
     """
     count = len(recording.worlds)
     base = np.stack([recording.body_poses(rank)[:, 0, :3] for rank in range(count)], axis=1).astype(float)
@@ -219,7 +219,7 @@ def view_targets(recording: "Recording") -> tuple[np.ndarray, float]:
 
 @dataclass(frozen=True)
 class _Plot:
-    """Curves of one entity."""
+    """Plot: the curves of one Rerun entity."""
 
     group: str  # of the series
     title: str  # `quantity [unit]`
@@ -231,14 +231,15 @@ class _Plot:
 
     @property
     def entity(self) -> list[str]:
-        """Parts of the entity's path."""
+        """Path of the plot's entity, as a list of its parts."""
         return ["series", self.group, self.title]
 
 
 def _plots(recording: "Recording") -> dict[str, list[_Plot]]:
-    """Return the series by group; those of all legs' same motor, or of the paws, are one plot, in the order of legs.
+    """Return the plots of the series by group; one plot shows the same motor of all legs, or all paws.
 
-    Colors: of the leg; for several worlds, of the world; else of commanded or actual quantities.
+    Curves are in the order of legs. Their colors are those of the leg, of the world if there are several, or else
+    those of commanded and actual quantities.
     """
     plots: dict[str, list[_Plot]] = {}
     legs: dict[tuple[str, str], dict[str, np.ndarray]] = {}  # by group and title, then by leg
@@ -259,7 +260,7 @@ def _plots(recording: "Recording") -> dict[str, list[_Plot]]:
 
 
 def _curve(recording: "Recording", group: str, quantity: str, values: np.ndarray) -> _Plot:
-    """Return the plot of one series, values (frames,); its legend leaves out the label of the only world."""
+    """Return the plot of one series, values (frames,); its legend omits the label of the only world."""
     commanded = quantity.startswith("command")
     color, label, worlds = COMMAND_COLOR if commanded else ACTUAL_COLOR, quantity, _world_names(recording)
     for rank, world in enumerate(worlds):
@@ -271,9 +272,9 @@ def _curve(recording: "Recording", group: str, quantity: str, values: np.ndarray
 
 
 def _blueprint(recording: "Recording") -> Any:
-    """Return the viewer's layout: scene and states on the left, on the right plots, those of motors in tabs.
+    """Return the viewer's layout: scene and states on the left, plots on the right, plots of motors in tabs.
 
-    It plays in a loop from the beginning, with all panels collapsed.
+    The viewer plays in a loop from the beginning, with all panels collapsed.
     """
     import rerun as rr
     import rerun.blueprint as rrb
@@ -298,7 +299,7 @@ def _blueprint(recording: "Recording") -> Any:
 
 
 def _group_views(group: str, plots: list[_Plot], axis: Any) -> list[Any]:
-    """Return a view for each motor of a group of series, or one for the whole group; axis: Rerun's time axis.
+    """Return the views of a group of series, one per motor or one for the whole group; axis: Rerun's time axis.
 
     Legends are in the free part of the time axis; of the motors' views only the first has one.
     """
@@ -318,7 +319,7 @@ def _group_views(group: str, plots: list[_Plot], axis: Any) -> list[Any]:
 
 
 def _scene_view(recording: "Recording") -> Any:
-    """Return the view of the scene, whose eye follows `scene/view_target`."""
+    """Return the view of the scene, whose camera follows `scene/view_target`."""
     import rerun.blueprint as rrb
 
     targets, distance = view_targets(recording)

@@ -1,4 +1,4 @@
-"""Where a camera stands and what is written into its images: framing, following, labels."""
+"""Camera framing, camera motion that follows robots, and labels in images."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from jumper_warp.viz.style import ACTUAL_COLOR, COMMAND_COLOR
 
 REACH = 0.45  # [m] half the length and width of a standing robot, with legs
 ABOVE = 0.25  # [m] free space above the base
-DEAD_ZONE = np.array([0.25, 0.25, 0.20])  # [m] how far a robot moves from the target before the camera follows
+DEAD_ZONE = np.array([0.25, 0.25, 0.20])  # [m] distance of a robot from the target from which the camera follows
 SMOOTHING = 0.25  # [s] standard deviation of the filter of the camera's motion
 ARROW_SECONDS = 0.6  # [s] length of an arrow over the velocity that it shows
 SLOWEST = 0.05  # [m/s] below which no arrow is drawn
@@ -28,7 +28,7 @@ MARGIN = 0.94  # fraction of the image that robots may fill
 
 @dataclass(frozen=True)
 class Label:
-    """Text at a point of the world."""
+    """Text label at a point of the world."""
 
     text: str
     point: np.ndarray  # (3,) [m] world frame
@@ -36,7 +36,7 @@ class Label:
 
 
 def valid_frames(recording: Recording, rank: int) -> int:
-    """Return the number of frames before a world's first pose that is not finite, or FAR from its start."""
+    """Return the number of frames before a world diverges: a pose is not finite, or FAR from its start."""
     poses = recording.body_poses(rank)
     start = np.append(poses[0, 0, :3], np.zeros(4))
     near = (np.abs(poses - start) < FAR).all(axis=(1, 2))  # false for NaN
@@ -44,7 +44,7 @@ def valid_frames(recording: Recording, rank: int) -> int:
 
 
 def without_divergence(recording: Recording) -> Recording:
-    """Return the recording with poses and contact points of NaN, which are not drawn, after `valid_frames`."""
+    """Return a copy in which poses and contact points after `valid_frames` are NaN, so that they are not drawn."""
     poses, points = recording.poses.copy(), recording.contact_points.copy()
     for rank in range(len(recording.worlds)):
         count = valid_frames(recording, rank)
@@ -65,9 +65,9 @@ def body_paths(recording: Recording, ranks: Sequence[int]) -> np.ndarray:
 
 
 def corners(bases: np.ndarray, ground: float = -np.inf) -> np.ndarray:
-    """Return the corners [m], (n, 3), of boxes that enclose robots with base positions (..., 3), and their paws.
+    """Return the corners [m], (n, 3), of boxes that enclose robots with base positions (..., 3) and their paws.
 
-    ground [m]: height below which nothing needs to be seen.
+    ground [m]: lower bound of the boxes' height.
     """
     half = np.array([REACH, REACH, 0.0])
     signs = np.array([[x, y, 0.0] for x in (-1.0, 1.0) for y in (-1.0, 1.0)])
@@ -110,7 +110,7 @@ def _nearest(
 
 
 def follow(paths: np.ndarray, dt: float) -> np.ndarray:
-    """Return where a camera looks that follows robots with a dead zone, (num_frames, 3) [m], world frame.
+    """Return the targets of a camera that follows robots with a dead zone, (num_frames, 3) [m], world frame.
 
     paths: base positions [m], (num_frames, worlds, 3); dt [s]: between frames. The target moves smoothly, and only
     while the robots' mean position is further than DEAD_ZONE from it.
@@ -124,7 +124,7 @@ def follow(paths: np.ndarray, dt: float) -> np.ndarray:
 
 
 def velocity_arrows(recording: Recording, frame: int, rank: int, start: np.ndarray) -> list[Line]:
-    """Return arrows of commanded and actual horizontal velocity of a world from a point [m], world frame, if any.
+    """Return arrows of a world's commanded and actual horizontal velocity at a point [m], world frame, if any.
 
     The actual velocity is the mean over VELOCITY_WINDOW.
     """
@@ -149,9 +149,9 @@ def velocity_arrows(recording: Recording, frame: int, rank: int, start: np.ndarr
 def annotate(
     image: np.ndarray, view: View, labels: Sequence[Label], heading: str = "", size: float = 0.03
 ) -> Image.Image:
-    """Return an image (height, width, 3) uint8 with labels at their points, and a heading in its upper left corner.
+    """Draw labels at their points, and a heading at the upper left, on an image (height, width, 3) uint8; return it.
 
-    size: height of the text over that of the image.
+    size: height of the text relative to the image's height.
     """
     picture = Image.fromarray(image)
     draw, pixels = ImageDraw.Draw(picture), max(11, round(size * picture.height))

@@ -18,7 +18,7 @@ CHECKER_COLORS = ((0.80, 0.81, 0.83), (0.70, 0.71, 0.74))  # RGB of light and da
 
 @dataclass(frozen=True)
 class ShapeMesh:
-    """Triangle mesh and color of one shape."""
+    """Triangle mesh, color and body of one shape."""
 
     name: str
     body: int  # index of the body in the model; -1: fixed to the world
@@ -29,7 +29,7 @@ class ShapeMesh:
 
 
 def shape_meshes(model: Model, worlds: tuple[int, ...]) -> list[ShapeMesh]:
-    """Return the meshes of the visible shapes of some worlds, and of visible shapes shared by all worlds (ground).
+    """Return the meshes of a model's visible shapes: those of some worlds, and those shared by all (ground).
 
     worlds: indices in the model. Raises InputError: a visible shape of a kind that cannot be drawn (a cone or a splat).
     """
@@ -89,7 +89,7 @@ def _heightfield(field: newton.Heightfield, scale: np.ndarray) -> trimesh.Trimes
 
 
 def _checker(label: str, size: np.ndarray) -> list[tuple[str, tuple[float, float, float], trimesh.Trimesh]]:
-    """Return (name, RGB, mesh) of the light and of the dark fields of a plane, in the shape's frame.
+    """Return the checkerboard of a plane as (name, RGB, mesh) of its light and dark fields, in the shape's frame.
 
     label: of the shape. size: width along x and length along y [m], 0 if infinite.
     """
@@ -112,7 +112,7 @@ def _checker(label: str, size: np.ndarray) -> list[tuple[str, tuple[float, float
 def _placed(
     name: str, body: int, color: tuple[float, float, float], mesh: trimesh.Trimesh, placement: np.ndarray
 ) -> ShapeMesh:
-    """Return a mesh in the shape's frame as a `ShapeMesh` in the body's frame.
+    """Convert a mesh in the shape's frame to a `ShapeMesh` in the body's frame.
 
     placement: pose of the shape in the body's frame, position [m] and quaternion xyzw, (7,).
     """

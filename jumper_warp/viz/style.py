@@ -1,6 +1,6 @@
-"""Colors of legs, commands and measurements in plots and scenes: RGB, each in [0, 1], safe for color-blind readers.
+"""Colors of legs, commands and measurements in plots and scenes: RGB, each in [0, 1].
 
-They are of the palette of Okabe and Ito.
+They are from the palette of Okabe and Ito, which color-blind readers can distinguish.
 """
 
 LEG_COLORS = {

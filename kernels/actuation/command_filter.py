@@ -1,4 +1,4 @@
-"""The motor command filter (paper, Section III): position targets are limited near the joint limits.
+"""Motor command filter (paper, Section III): position targets are limited near the joint limits.
 
 A quantity x (a motor angle, or the sum of a leg's two transversal angles) has limits [lower, upper]. With margins
 m_u = upper - x and m_l = x - lower, and the speed floor v_0, the time to violation is
@@ -9,12 +9,12 @@ and a command c becomes, with T the horizon,
 
     c + w (clamp(c, lower, upper) - c),   w = clamp(1 - t / T, 0, 1)
 
-so that a command within the limits is never touched. Two rules override w, the second winning:
+so that a command within the limits is never changed. Two rules override w; the second has priority:
 
 1. within a hard zone before a limit (m < zone): w = 1 if c lies toward that limit from x, 0 if away from it;
 2. outside the limits: w = 1.
 
-The result is continuous in c, x and x' except where a command that violates a limit meets the border of a hard zone,
+The result is continuous in c, x and x' except where a command that violates a limit reaches the border of a hard zone,
 or where x leaves the limits on one side while c lies beyond the other.
 """
 
@@ -38,7 +38,7 @@ class Limits:
 
 @wp.struct
 class FilterParams:
-    """Constants of the filter, the same for all legs and worlds."""
+    """Constants of the motor command filter, the same for all legs and worlds."""
 
     lateral: Limits
     transversal: Limits  # outer and inner alike

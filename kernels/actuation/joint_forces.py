@@ -16,7 +16,7 @@ FRICTION_SPEED = wp.constant(real(0.01))
 
 @wp.struct
 class JointParams:
-    """Joint-space parameters of one leg; vectors are lateral, outer, inner."""
+    """Armature, friction and damping of the joints of one leg; vectors are lateral, outer, inner."""
 
     armature: vec3  # [kg m^2]
     friction: vec3  # [N m]
@@ -47,7 +47,7 @@ def joint_friction(p: JointParams, rates: vec3) -> vec3:
 
 @wp.func
 def capped_damping(damping: real, rate: real, limit: real) -> real:
-    """Return the viscous coefficient [N m s/rad]: `damping`, but torque <= `limit` [N m] at `rate` [rad/s]."""
+    """Return the viscous coefficient [N m s/rad]: `damping`, reduced to a torque of `limit` [N m] at `rate` [rad/s]."""
     return wp.min(damping, limit / wp.max(wp.abs(rate), real(1.0e-6)))
 
 

@@ -1,4 +1,4 @@
-"""The motors: position control, torque-speed envelope and over-speed protection."""
+"""Motor model: position control, torque-speed envelope and over-speed protection."""
 
 import warp as wp
 
@@ -13,12 +13,12 @@ class MotorParams:
     kp: real  # [N m/rad]
     kd: real  # [N m s/rad]
     saturation: real  # [N m] largest torque that the controller commands, either way
-    peak: real  # [N m] largest torque that the motor gives, up to the cutoff speed
+    peak: real  # [N m] largest torque that the motor delivers, up to the cutoff speed
     cutoff_speed: real  # [rad/s] full driving torque up to here
     no_load_speed: real  # [rad/s] no driving torque from here, > cutoff_speed
     offset: real  # [rad] added by the position sensor to the true angle
-    fade_start: real  # [rad/s] over-speed protection takes torque away from here
-    fade_end: real  # [rad/s] and has taken all of it here, > fade_start
+    fade_start: real  # [rad/s] over-speed protection reduces the torque from here
+    fade_end: real  # [rad/s] no torque from here, > fade_start
 
 
 @wp.struct
@@ -56,8 +56,8 @@ def load_motor(motors: MotorArrays, motor: int, world: int) -> MotorParams:
 def envelope(direction: real, vel: real, motor: MotorParams) -> real:
     """Return the largest torque [N m], >= 0, along `direction` (+1 or -1) at joint speed `vel` [rad/s].
 
-    The motor brakes with its peak torque. Driving it keeps the peak up to the cutoff speed, then loses it linearly
-    until the no-load speed. The controller commands at most the saturation torque.
+    The motor brakes with its peak torque. Its driving torque is at most the peak up to the cutoff speed, and falls
+    linearly to 0 at the no-load speed. The controller commands at most the saturation torque.
     """
     headroom = (motor.no_load_speed - direction * vel) / (motor.no_load_speed - motor.cutoff_speed)
     return wp.min(motor.saturation, motor.peak * wp.clamp(headroom, real(0.0), real(1.0)))
@@ -89,7 +89,7 @@ def motor_torque_kernel(
 ):
     """Write the motor torques [N m] to their entries of Newton's joint_f; launch over (12, num_worlds).
 
-    target [rad]: (12, num_worlds). joint_q, joint_qd, joint_f: flat over worlds; other entries of joint_f are kept.
+    target [rad]: (12, num_worlds). joint_q, joint_qd, joint_f: flat over worlds; other entries of joint_f stay.
     """
     motor, world = wp.tid()
     coord = coords_per_world * world + 7 + motor_slot(motor)

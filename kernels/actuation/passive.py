@@ -1,6 +1,6 @@
-"""Passive forces that general solvers lack, as explicit torques: damped knees with a cap, stops of the fold, springs.
+"""Passive forces that general solvers lack, as explicit torques: capped knee damping, stops of angle sums, springs.
 
-`SolverJumper` has them built in, damping and stops implicitly (`joint_forces`, `stops`, `springs`).
+`SolverJumper` includes them, damping and stops implicitly (`joint_forces`, `stops`, `springs`).
 """
 
 import warp as wp

@@ -1,4 +1,4 @@
-"""Reading motor values, paw forces and the base's velocity out of Newton's arrays."""
+"""Kernels that read motor values, paw forces and the base's velocity from Newton's arrays."""
 
 import warp as wp
 
@@ -33,7 +33,7 @@ def paw_force_kernel(
     """Copy the paws' contact forces [N] to shape (4, num_worlds) and update the peaks; one thread per world.
 
     total_force (4 num_worlds,): a contact sensor's, paws FL, FR, BL, BR of each world. peak_paw_force (4, num_worlds)
-    is the largest magnitude of each paw, peak_force that of the sum of the four; restart != 0 drops earlier peaks.
+    is the largest magnitude of each paw, peak_force that of the sum of the four; restart != 0 discards earlier peaks.
     """
     world = wp.tid()
     total = wp.vec3(0.0)

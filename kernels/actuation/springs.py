@@ -14,7 +14,7 @@ from ..scalar import real, vec3
 
 @wp.struct
 class LegSpring:
-    """The spring of one leg."""
+    """Constants of the spring between the knees of one leg."""
 
     stiffness: real  # [N/m]; 0: no spring, and no gradient with respect to the stiffness
     length: real  # [m] at rest

@@ -4,7 +4,7 @@ A stop is a spring with a damper on the penetration x = max(0, -gap), taken at t
 
     torque = max(0, ke x(t + dt) + kd (x(t + dt) - x(t)) / dt).
 
-It gives back no more than the spring took. With s the speed away from the stop at the end of the step that is
+It returns no more energy than the spring stored. With s the speed away from the stop at the end of the step that is
 
     0 <= torque  complementary to  s + torque / c - goal >= 0,    c = dt ke + kd,
 
@@ -13,7 +13,7 @@ torque = c (goal - s) is linear in the rates, so that it joins the leg's inertia
 
 The pressed stops are found together with contact: a step is solved with a set of pressed stops, and again with
 another one until the set is the one that the resulting rates require (`pressed_stops`). Most steps need one set, few
-three. Friction can make sets cycle, in a violent impact on jammed legs: stops are then pressed and no more released.
+three. Friction can make sets cycle, in a violent impact on jammed legs: after `PRESS_ONLY` sets, stops are only added.
 """
 
 import warp as wp
@@ -35,7 +35,7 @@ SLACK = wp.constant(real(10.0))
 
 @wp.struct
 class StopParams:
-    """The stops of one leg; vectors are lateral, outer, inner."""
+    """Limits, stiffness and damping of the hard stops of one leg; vectors are lateral, outer, inner."""
 
     lower: vec3  # [rad]
     upper: vec3
@@ -56,7 +56,7 @@ class StopRates:
 
 @wp.struct
 class StopForces:
-    """Pressed stops, implicit: torque [N m] at the current rates, and dt C [kg m^2] to add to the inertia."""
+    """Implicit forces of pressed stops: torque [N m] at the current rates, and dt C [kg m^2] to add to the inertia."""
 
     torque: vec3
     inertia: mat33
@@ -92,7 +92,7 @@ def stop_rates(p: StopParams, angles: vec3, dt: real) -> StopRates:
 
 @wp.func
 def beyond_stops(p: StopParams, angles: vec3) -> bool:
-    """Return whether motor angles [rad] are beyond any stop of the leg, or NaN. A step ending within presses none."""
+    """Return whether motor angles [rad] are beyond any stop of the leg, or NaN; a step ending within presses none."""
     fold = angles[1] + angles[2]
     past = wp.max(p.sum_lower - fold, fold - p.sum_upper)
     for j in range(3):
@@ -102,7 +102,7 @@ def beyond_stops(p: StopParams, angles: vec3) -> bool:
 
 @wp.func
 def row_side(pressed: int, i: int) -> int:
-    """Return which stop of row i the set `pressed` holds: 0, LOWER_STOP or UPPER_STOP."""
+    """Return the pressed stop of row i in the set `pressed`: 0 (none), LOWER_STOP or UPPER_STOP."""
     return (pressed >> (ROW_BITS * i)) & ROW_MASK
 
 
@@ -127,7 +127,7 @@ def pressed_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int)
 
 @wp.func
 def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int, sets: int) -> int:
-    """Return the set to try next, after `sets` sets; `pressed`, the last one, gave `rates` [rad/s]; slack [rad/s]."""
+    """Return the set of stops to try after `sets` sets; the last, `pressed`, led to `rates` [rad/s]; slack [rad/s]."""
     required = pressed_stops(stop_rates, rates, slack, pressed)
     if required == pressed or sets < PRESS_ONLY:
         return required
@@ -140,7 +140,7 @@ def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int,
 
 @wp.func
 def one_by_one(sets: int) -> bool:
-    """Return whether, after `sets` sets of a step, the next set may change one stop per world only."""
+    """Return whether a step that has tried `sets` sets may change only one stop per world in the next set."""
     return sets >= ONE_BY_ONE and sets < PRESS_ONLY
 
 
@@ -156,7 +156,7 @@ def change_one(pressed: int, required: int) -> int:
 
 @wp.func
 def row_torque(stop_rates: StopRates, i: int, rate: real, pressed: int) -> real:
-    """Return the torque [N m] of row i at its rate [rad/s] at the start of the step; 0 where no stop is pressed."""
+    """Return the torque [N m] of the stop in row i at rate [rad/s] at the start of the step; 0 if it is not pressed."""
     side = row_side(pressed, i)
     if side == 0:
         return real(0.0)

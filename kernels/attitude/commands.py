@@ -13,7 +13,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class TurnRanges:
-    """Ranges of sampled rotations, body axes."""
+    """Ranges of sampled rotations to the goal orientation, body axes."""
 
     angle: wp.vec2  # [rad] (smallest, largest)
     body_axis_probability: float  # of an axis +-x, +-y or +-z; else the axis is uniform over the sphere

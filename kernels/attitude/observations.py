@@ -21,5 +21,5 @@ def time_left(robot: RobotView, state: AttitudeState) -> float:
 
 @wp.func
 def in_collision(robot: RobotView, state: AttitudeState) -> float:
-    """1 if links touch each other or anything but a paw touches the ground, else 0."""
+    """Collision flag: 1 if links touch each other or anything but a paw touches the ground, else 0."""
     return wp.where(robot.collisions != 0, 1.0, 0.0)

@@ -22,7 +22,7 @@ def reset_attitude(
 ) -> AttitudeState:  # fmt: skip
     """Write a sampled start state to world `rng.world`, and return the task state of its new episode.
 
-    old: state of the previous episode, whose statistics are kept. level: ranges of the rotation to the goal.
+    old: state of the previous episode, whose statistics carry over. level: ranges of the rotation to the goal.
     """
     new = carried_over(old)
     rest_block(scene.ground, rng.world)

@@ -19,7 +19,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class AttitudeSettings:
-    """Ranges of start states; pairs are (lower, upper)."""
+    """Ranges from which start states of the attitude task are sampled; pairs are (lower, upper)."""
 
     episode_steps: wp.vec2  # policy steps that an episode lasts
     height: float  # [m] of the base above the ground
@@ -46,7 +46,7 @@ class AttitudeStart:
 
 @wp.func
 def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> AttitudeStart:
-    """Return `start`, the base of every attempt; in the last attempt with `default_legs` set.
+    """Return the base of an attempt: `start`, with the legs in the default pose in the last attempt.
 
     A `sample_base` of `mdp.attempts.sample_valid_state`; arrays and rng are unused.
     """
@@ -57,7 +57,7 @@ def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attem
 
 @wp.func
 def sample_leg(start: AttitudeStart, base: AttitudeStart, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return leg `leg` at rest, in the default pose or sampled; reachable if outer + inner angle is within limits."""
+    """Return the motor state of leg `leg`, at rest in the default pose or a sampled one; reachable if within limits."""
     sample = LegSample()
     if base.default_legs:
         for j in range(3):
@@ -80,7 +80,7 @@ def write_start(
 ):
     """Write a weightless start state with orientation `quat` (xyzw, body to world) to world `rng.world`.
 
-    The base origin is at rest above the world's origin while the body spins; `skill` gives the motors' limits.
+    The base origin is at rest above the world's origin while the body spins; `skill` holds the motors' limits.
     """
     w = settings.spin
     start = AttitudeStart()

@@ -9,7 +9,7 @@ POLICY_RATE = wp.constant(60.0)  # policy steps in a second
 
 @wp.struct
 class AttitudeState:
-    """Task state of one world; the fields from `episodes` on accumulate over episodes until the host reads them."""
+    """State of the attitude task in one world; from `episodes` on fields accumulate until the host reads them."""
 
     goal: wp.quat  # xyzw, body to world: commanded orientation
     steps: int  # policy steps since the episode began
@@ -70,7 +70,7 @@ def advance_attitude(robot: RobotView, state: AttitudeState, tolerance: float) -
 
 @wp.func
 def carried_over(old: AttitudeState) -> AttitudeState:
-    """Return a state with the statistics alone, `old` added if it lasted to its end; the reset sets the rest."""
+    """Return a state with the statistics of `old` alone, updated if its episode was complete; reset sets the rest."""
     new = AttitudeState()
     new.episodes = old.episodes
     new.sum_error = old.sum_error

@@ -8,11 +8,11 @@ from .state import AttitudeState
 
 @wp.func
 def ended_clear(robot: RobotView, state: AttitudeState) -> bool:
-    """Episode of `state.episode_steps` policy steps without a collision; never if that is 0."""
+    """Terminate an episode without collisions after `state.episode_steps` policy steps; never if that is 0."""
     return state.episode_steps > 0 and state.steps >= state.episode_steps and state.collisions == 0
 
 
 @wp.func
 def ended(robot: RobotView, state: AttitudeState) -> bool:
-    """Episode of `state.episode_steps` policy steps; never if that is 0."""
+    """Terminate an episode after `state.episode_steps` policy steps; never if that is 0."""
     return state.episode_steps > 0 and state.steps >= state.episode_steps

@@ -20,7 +20,7 @@ def segment_segment_sq(start_a: vec3, end_a: vec3, start_b: vec3, end_b: vec3) -
     ab = wp.dot(a, b)
     a_between = wp.dot(a, start_offset)
     b_between = wp.dot(b, start_offset)
-    # for (nearly) parallel segments the floor on the determinant turns the division into a step downhill
+    # for (nearly) parallel segments a floor on the determinant keeps the step finite and downhill
     det = wp.max(aa * bb - ab * ab, real(1.0e-7) * aa * bb)
     along_a = wp.clamp((ab * b_between - a_between * bb) / det, real(0.0), real(1.0))
     along_b = wp.clamp((ab * along_a + b_between) / bb, real(0.0), real(1.0))
@@ -39,8 +39,8 @@ def outside_box(point: vec3, half: vec3) -> vec3:
 def segment_box_sq(start: vec3, end: vec3, half: vec3) -> real:
     """Return the squared distance [m^2] between a segment and an axis-aligned box of half extents `half` at the origin.
 
-    Along the segment the squared distance is convex and piecewise quadratic, with a seam where the segment crosses
-    the plane of a face. Its slope finds the piece that holds the minimum; within that piece the slope is linear.
+    Along the segment the squared distance is convex and piecewise quadratic, with breaks where the segment crosses the
+    plane of a face. Its slope finds the piece that holds the minimum; within that piece the slope is linear.
     """
     step = end - start
     low = real(0.0)

@@ -1,4 +1,4 @@
-"""Forbidden contacts: of links with the ground, with other legs, with their own leg and with the shell.
+"""Forbidden contacts of a robot: links with the ground, with other legs, with their own leg and with the shell.
 
 Paws may touch the ground; that contact belongs to the dynamics. Each leg is five capsules (two thighs, two shanks,
 the paw as a capsule of zero length) whose ends come from the five-bar in closed form, the housings are capsules
@@ -35,7 +35,7 @@ HOUSING_RADIUS = wp.constant(real(0.048))  # [m]
 THIGH_RADIUS = wp.constant(real(0.019))  # [m], knees too
 SHANK_RADIUS = wp.constant(real(0.012))  # [m]
 SHANK_FREE = wp.constant(real(0.9))  # fraction of a shank, from the knee, that must not touch the ground
-SHANK_APART = wp.constant(real(0.5))  # fraction of a shank, from the knee, that must not touch its twin
+SHANK_APART = wp.constant(real(0.5))  # fraction of a shank, from the knee, that must not touch the other shank
 FAR = wp.constant(real(1.0e6))  # [m] start value of a minimum of distances
 
 mat53 = wp.types.matrix(shape=(5, 3), dtype=real)
@@ -49,7 +49,7 @@ SHELL_HALF = wp.constant(mat43(0.343, 0.05, 0.074, 0.144, 0.112, 0.074, 0.0315, 
 
 @wp.struct
 class LegCapsules:
-    """The capsules of one leg, in the body frame."""
+    """Capsules that model the links of one leg, in the body frame."""
 
     ends: mat53  # [m] rows: outer transversal axis, inner transversal axis, outer knee, inner knee, ankle
     low: vec3  # [m] smallest x, y and z of the ends
@@ -152,7 +152,7 @@ def leg_box_distance(capsules: LegCapsules, box: int, bound: real) -> real:
 
 @wp.func
 def leg_shell_distance(capsules: LegCapsules, bound: real) -> real:
-    """Return the distance [m] of a leg to the shell less the drums at the leg's end; at most `bound` (>= 0) [m]."""
+    """Return the distance [m] of a leg from the shell without the drums at its end, at most `bound` (>= 0) [m]."""
     drums = wp.where(capsules.front > real(0.0), 3, 2)
     nearest = wp.min(leg_box_distance(capsules, 0, bound), leg_box_distance(capsules, 1, bound))
     return wp.min(nearest, leg_box_distance(capsules, drums, bound))
@@ -276,8 +276,8 @@ def world_collisions(
     """Return the forbidden contacts of one robot and its smallest distance [m], at most `margin`.
 
     geometry: the four legs. ground: of the robot's world, see `world_ground`. joint_q: base position [m] and
-    quaternion xyzw, then five coordinates a leg [rad], from index `start`. margin [m], >= 0: larger distances are cut
-    off to it, which is fast; with 0 only the flags are meaningful. Flags of a non-finite state are undefined.
+    quaternion xyzw, then five coordinates a leg [rad], from index `start`. margin [m], >= 0: larger distances are
+    clamped to it, which is fast; with 0 only the flags are meaningful. Flags of a non-finite state are undefined.
     """
     pos = vec3(real(joint_q[start]), real(joint_q[start + 1]), real(joint_q[start + 2]))
     rotation = wp.quat_to_matrix(

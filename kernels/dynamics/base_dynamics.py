@@ -1,4 +1,4 @@
-"""Solution of the arrow-shaped system: eliminate the legs, solve the base's six equations, substitute back.
+"""Solution of the equations of motion, an arrow-shaped system: eliminate legs, solve six base equations, substitute.
 
 Equations and symbols (D, Bv, Bw, tau, h): see `leg_dynamics`. All vectors are in body axes.
 """
@@ -43,7 +43,7 @@ class BaseInverse:
 
 @wp.func
 def eliminate_leg(leg: LegDynamics, implicit: mat33, torque: vec3) -> LegSolve:
-    """Return the leg's elimination; implicit: matrix to add to D [kg m^2]; torque: tau [N m], motor space."""
+    """Return a leg with its motors eliminated; implicit: matrix added to D [kg m^2]; torque: tau [N m], motor space."""
     solve = LegSolve()
     inverse = inverse_symmetric(leg.inertia + implicit)
     solve.inverse = inverse
@@ -55,7 +55,7 @@ def eliminate_leg(leg: LegDynamics, implicit: mat33, torque: vec3) -> LegSolve:
 
 @wp.func
 def base_link_system(body: MassMoments, omega: vec3, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
-    """Return the system of the base link alone.
+    """Return the equations of motion of the base link without its legs.
 
     omega: angular velocity [rad/s]; g: gravity [m/s^2]; force [N], moment [N m] about the origin: external; all in body
     axes.

@@ -27,7 +27,7 @@ from .leg_dynamics import PawKinematics
 PUSH_OUT = wp.constant(real(0.2))  # fraction of a penetration that is pushed out per step
 PUSH_OUT_SPEED = wp.constant(real(1.0))  # largest speed of that push [m/s]
 CONTACT_MARGIN = wp.constant(real(0.02))  # [m] a paw is solved for if its free motion leaves a smaller gap
-STIFF_BAND = wp.constant(real(2.0e-6))  # [m] a paw of a leg on a hard stop keeps gaps of this size, + or -
+STIFF_BAND = wp.constant(real(2.0e-6))  # [m] gaps up to this size, + or -, stay unchanged if the leg is on a hard stop
 STICK_SPEED = wp.constant(real(0.01))  # [m/s] contacts slower than this start the step with static friction
 FRICTION_STEP = wp.constant(real(0.6))  # `scale` of `sliding_impulse` per sum of the two tangential responses
 
@@ -38,7 +38,7 @@ SLIDE = wp.constant(2)
 
 @wp.struct
 class PawContact:
-    """One paw in the contact problem; vectors in body axes, motors lateral, outer, inner."""
+    """Terms of one paw in the contact problem; vectors in body axes, motors lateral, outer, inner."""
 
     active: int  # 0: too far from the ground to touch within the step, and the impulse is 0
     on_block: int  # 1: the paw's nearest surface is the sliding block
@@ -60,7 +60,7 @@ class PawContact:
 
 @wp.struct
 class BlockLaw:
-    """Constants of the velocity of a sliding block at the end of a step, see `block_velocity`; body axes."""
+    """Constants that determine a sliding block's velocity at the end of a step (`block_velocity`), body axes."""
 
     velocity: vec3  # at the start of the step [m/s]
     up: vec3  # world z
@@ -80,8 +80,8 @@ def target_normal_velocity(gap: real, pressed: int, dt: real) -> real:
     """Return the smallest admissible normal velocity [m/s] at the end of a step dt [s] for a gap [m], < 0 inside.
 
     An open gap closes exactly; penetration is pushed out. pressed: the leg's pressed hard stops. On stops a leg is
-    stiff, and rounding errors of gaps would shift load between legs: gaps within `STIFF_BAND` are then kept, and those
-    slightly beyond it close by `PUSH_OUT` only.
+    stiff, and rounding errors of gaps would shift load between legs: gaps within `STIFF_BAND` then stay unchanged,
+    and gaps slightly beyond it close by `PUSH_OUT` only.
     """
     beyond = gap
     if pressed != 0:
@@ -94,7 +94,7 @@ def target_normal_velocity(gap: real, pressed: int, dt: real) -> real:
 
 @wp.func
 def couple_contact(contact: PawContact, point: vec3, leg: LegSolve, base: BaseInverse) -> PawContact:
-    """Return the contact with `from_lin` to `total` written; point [m]: contact point from the base origin."""
+    """Return a contact with `from_lin` to `total` computed; point [m]: point of contact from the base origin, body."""
     c = contact
     eye = wp.identity(n=3, dtype=real)
     leg_response = leg.inverse * wp.transpose(c.jacobian)
@@ -114,7 +114,7 @@ def couple_contact(contact: PawContact, point: vec3, leg: LegSolve, base: BaseIn
 def sliding_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
     """Return the next impulse [N s] of a sliding paw, which satisfies the normal condition of its contact.
 
-    impulse [N s], velocity [m/s]: present values at the paw. The new friction is (present friction - slip / scale),
+    impulse [N s], velocity [m/s]: current values at the paw. The new friction is (current friction - slip / scale),
     cut off at the friction cone. The fixed point is the cone's edge opposite to the slip; friction is never stretched
     to the cone, which would make friction along the slip a fixed point too. The steps converge if scale exceeds half
     the largest tangential response, and fastest if it is half the sum of both.
@@ -138,7 +138,7 @@ def sliding_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
 def local_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
     """Return the impulse [N s] that solves one paw's contact law while the impulses of the other paws are fixed.
 
-    impulse [N s] and velocity [m/s]: present values at this paw. A sliding paw takes one step, see `sliding_impulse`.
+    impulse [N s] and velocity [m/s]: current values at this paw. A sliding paw takes one step, see `sliding_impulse`.
     """
     n = c.normal
     stick = impulse + c.total_inv * (c.goal * n - velocity)
@@ -179,7 +179,7 @@ def block_velocity(block: BlockLaw, push: vec3) -> vec3:
 
 @wp.func
 def add_block(contact: PawContact, block: BlockLaw) -> PawContact:
-    """Return the contact as one with the block: `on_block` is 1, and `total` includes the block's response."""
+    """Return a paw's contact with the sliding block: `on_block` is 1, and `total` includes the block's response."""
     c = contact
     c.on_block = 1
     c.total += (wp.identity(n=3, dtype=real) - wp.outer(block.up, block.up)) / block.mass
@@ -189,7 +189,7 @@ def add_block(contact: PawContact, block: BlockLaw) -> PawContact:
 
 @wp.struct
 class ContactState:
-    """Progress of the contact iteration; changes since the motion without contact, body axes."""
+    """State of the contact iteration; changes relative to the motion without contact, body axes."""
 
     lin: vec3  # change of the base's linear velocity [m/s]
     ang: vec3  # change of its angular velocity [rad/s]

@@ -15,7 +15,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class PawLaw:
-    """A paw's contact law R(impulse, velocity) = 0 at the solution, see `contact_residual`; body axes."""
+    """Contact law R(impulse, velocity) = 0 of a paw at the solution, see `contact_residual`; body axes."""
 
     mode: int  # SEPARATE, STICK or SLIDE
     mu_row: int  # row of the friction coefficient in the parameter table

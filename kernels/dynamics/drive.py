@@ -41,7 +41,7 @@ class LegDrive:
 
 @wp.struct
 class Workspace:
-    """Arrays that the solver writes, and keeps from launch to launch; per-world arrays are (num_worlds,)."""
+    """Arrays that the solver writes and that persist between launches; per-world arrays are (num_worlds,)."""
 
     impulse: wp.array2d(dtype=vec3)  # [N s] of each paw in the last step, world frame, (4, num_worlds)
     contact_force: wp.array2d(dtype=vec3)  # [N] on each paw in the last step, world frame, (4, num_worlds)

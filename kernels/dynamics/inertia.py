@@ -11,7 +11,7 @@ from ..scalar import mat33, real, vec2, vec3, vec5, vec6
 
 @wp.struct
 class MassMoments:
-    """Moments of one or more links; the user of the struct states the point and the axes."""
+    """Mass moments of one or more links; the user of the struct states the point and the axes."""
 
     mass: real  # [kg]
     first: vec3  # [kg m]

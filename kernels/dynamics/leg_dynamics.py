@@ -54,7 +54,7 @@ class LegDynamics:
 
 @wp.struct
 class PawKinematics:
-    """Position and velocity maps of the paw centre (the ankle), body axes."""
+    """Position and Jacobians of the paw centre (the ankle), body axes."""
 
     position: vec3  # [m] from the base origin
     jacobian: mat33  # [m/rad] d position / d (lateral, outer, inner)
@@ -123,7 +123,7 @@ def leg_body(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> Mass
 
 @wp.func
 def couple_leg(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> LegDynamics:
-    """Return a leg's dynamics with `inertia` and couplings written, all else zero; cosine, sine: see `LegPose`."""
+    """Return a leg's dynamics with inertia and couplings only, all else zero; cosine, sine: see `LegPose`."""
     leg = LegDynamics()
     second = sums.second
     lateral_ang = geo.side * vec3(second[1] + second[2], -second[3], -second[4])  # of a unit rate about x

@@ -1,10 +1,10 @@
-"""Sums over the moving links of one leg, in the motor housing frame.
+"""Mass integrals over the moving links of one leg, in the motor housing frame.
 
 Each sum is an integral over the mass of a link of products of position r (about the hip) and its derivatives
 r_o, r_i with respect to the outer and inner motor angle. From them follow the leg's kinetic energy and, with
 Lagrange's equations, every inertial coupling and velocity-product force (`leg_dynamics`).
 
-The links move in the five-bar's plane, so derivatives of r and accelerations have no y: they are kept as (x, z).
+The links move in the five-bar's plane, so derivatives of r and accelerations have no y: they are stored as (x, z).
 """
 
 import warp as wp
@@ -17,7 +17,7 @@ from .inertia import MassMoments, rotate_y, rotate_y_second, sym_outer
 
 @wp.struct
 class LinkSums:
-    """Integrals over link mass; subscripts o and i mean derivatives by the outer and inner motor angle.
+    """Integrals over link mass; subscripts o and i: derivatives w.r.t. the outer and inner motor angle.
 
     In the sums of one side of the leg, o is the motor of that side and i the other motor; `leg_sums` reorders them.
     """
@@ -85,7 +85,7 @@ def shank_sums(
     knee_acc: vec2,
     rotation_acc: real,
 ) -> LinkSums:
-    """Return the sums of a shank, whose frame has its origin at its knee and rotates about housing +y.
+    """Return the mass integrals of a shank, whose frame has its origin at its knee and rotates about housing +y.
 
     link: moments in that frame. knee [m], direction (unit, knee to ankle): in the housing frame. Derivatives: knee_do
     [m/rad] by the motor of the shank's side; rotation_do, rotation_di [1] of the shank's angle by that motor and by
@@ -133,7 +133,7 @@ def shank_sums(
 def add_thigh(
     shank: LinkSums, link: MassMoments, axis: vec2, cosine: real, sine: real, rate: real, sign: real
 ) -> LinkSums:
-    """Return the sums `shank` plus those of the thigh above it; link: the thigh's moments in its own frame.
+    """Return the mass integrals `shank` plus those of the thigh above it; link: the thigh's moments in its frame.
 
     The thigh rotates about its transversal axis, at x and y `axis` [m], z = 0 in the housing frame, by `sign` (-1 or
     +1) times its motor's angle; cosine, sine: of that rotation about +y; rate [rad/s]: of the rotation.
@@ -167,7 +167,7 @@ def add_thigh(
 
 @wp.func
 def outer_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: FiveBar, bias: FiveBarBias) -> LinkSums:
-    """Return the sums of the outer thigh and shank; o: outer motor, i: inner motor."""
+    """Return the mass integrals of the outer thigh and shank; o: outer motor, i: inner motor."""
     sin_cos = loop.outer_sin_cos
     knee = vec3(loop.outer_knee[0], geo.plane_y + geo.knee_y, loop.outer_knee[1])
     shank_part = shank_sums(
@@ -180,7 +180,7 @@ def outer_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: F
 
 @wp.func
 def inner_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: FiveBar, bias: FiveBarBias) -> LinkSums:
-    """Return the sums of the inner thigh and shank; o: inner motor, i: outer motor."""
+    """Return the mass integrals of the inner thigh and shank; o: inner motor, i: outer motor."""
     sin_cos = loop.inner_sin_cos
     knee = vec3(loop.inner_knee[0], geo.plane_y + geo.knee_y, loop.inner_knee[1])
     shank_part = shank_sums(
@@ -193,7 +193,7 @@ def inner_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: F
 
 @wp.func
 def leg_sums(housing: MassMoments, outer: LinkSums, inner: LinkSums) -> LinkSums:
-    """Return the sums of a whole leg (o: outer motor, i: inner motor); the housing does not move in its own frame."""
+    """Return the mass integrals of a whole leg (o: outer, i: inner motor); the housing is at rest in its own frame."""
     c = LinkSums()
     c.mass = housing.mass + outer.mass + inner.mass
     c.first = housing.first + outer.first + inner.first

@@ -126,7 +126,7 @@ def pack_masses_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write the mass moments of every body; one thread per (world, body). Inputs: Newton's, flat over worlds."""
+    """Write the mass moments of every body to the table; one thread per (world, body). Inputs: as in Newton's model."""
     world, body = wp.tid()
     i = world * layout.BODIES + body
     store_link(table, body_row(body), world, body_mass[i], body_com[i], body_inertia[i])
@@ -148,7 +148,7 @@ def pack_joints_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write armature, friction, damping and hard stops of every leg; one thread per (world, leg).
+    """Write armature, friction, damping and hard stops of every leg to the table; one thread per (world, leg).
 
     Arrays: Newton's per-dof model arrays, (38 num_worlds,), [rad], [N m] and their rates as in `JointParams` and
     `StopParams`; effort_limit [N m] caps the knees' damping. sum_lower, sum_upper [rad]: stops of outer + inner.
@@ -177,7 +177,7 @@ def pack_joints_kernel(
 def paw_friction(
     paw_shapes: wp.array(dtype=int), ground_shape: int, shape_mu: wp.array(dtype=float), world: int, leg: int
 ) -> float:
-    """Return the friction coefficient [1] of a paw on the ground: the larger of their two, as in MuJoCo.
+    """Return the friction coefficient [1] of a paw on the ground: the larger of both surfaces', as in MuJoCo.
 
     paw_shapes (4 num_worlds,), ground_shape: indices into shape_mu; ground_shape < 0: the paw's coefficient alone.
     """
@@ -204,7 +204,7 @@ def pack_friction_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write the friction coefficients of every paw, see `paw_friction`; one thread per (world, leg)."""
+    """Write the friction coefficients of every paw (`paw_friction`) to the table; one thread per (world, leg)."""
     world, leg = wp.tid()
     store_friction(table, leg, world, paw_friction(paw_shapes, ground_shape, shape_mu, world, leg), static_ratio[world])
 
@@ -254,7 +254,7 @@ def pack_springs_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write the springs of every leg; one thread per (world, leg). springs: (stiffness [N/m], length [m]) a world."""
+    """Write every leg's springs to the table; one thread per (world, leg). springs: stiffness [N/m], length [m]."""
     world, leg = wp.tid()
     for j in range(2):
         table[leg * layout.LEG_ROWS + layout.SPRING + j, world] = real(springs[world][j])
@@ -267,7 +267,7 @@ def pack_gravity_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write gravity [m/s^2], (num_worlds,), world frame; one thread per world."""
+    """Write gravity [m/s^2], (num_worlds,), world frame, to the table; one thread per world."""
     world = wp.tid()
     for j in range(3):
         table[layout.GRAVITY + j, world] = real(gravity[world][j])

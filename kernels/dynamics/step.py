@@ -1,4 +1,4 @@
-"""The parts of a time step shared by `advance` and `advance_legs`: a leg's terms, a paw's contact, the base.
+"""Parts of a time step that `advance` and `advance_legs` share: a leg's terms, a paw's contact, the base.
 
 Semi-implicit Euler: forces and Jacobians are those at the start of the step, and positions move with the velocities at
 its end. Legs and paws k are 0 to 3 (FL, FR, BL, BR).
@@ -44,7 +44,7 @@ class RobotModel:
 
 @wp.struct
 class StepSettings:
-    """Numerical settings of the step."""
+    """Numerical settings of time steps: step size, number of steps, contact tolerance."""
 
     dt: real  # [s]
     substeps: int  # steps of a launch
@@ -55,7 +55,7 @@ class StepSettings:
 
 @wp.struct
 class LegParams:
-    """Constants of one leg of one world."""
+    """Geometry, masses and joint constants of one leg of one world."""
 
     geometry: LegGeometry
     masses: LegMasses
@@ -108,7 +108,7 @@ def leg_terms(
 
 @wp.struct
 class Touch:
-    """Point of a surface that is nearest to a paw."""
+    """Nearest point of a surface to a paw: gap, normal and velocity."""
 
     gap: real  # [m] between surface and paw, negative inside
     normal: vec3  # unit, out of the surface, body axes
@@ -117,7 +117,7 @@ class Touch:
 
 @wp.func
 def block_law(model: RobotModel, world: int, base: BaseState, dt: real) -> BlockLaw:
-    """Return the law of a world's block for a step dt [s], in body axes; all zero where there is no block."""
+    """Return the constants of a world's block for a step dt [s], in body axes; all zero where there is no block."""
     law = BlockLaw()
     if model.ground.blocks.shape[0] > 0:
         block = model.ground.blocks[world]

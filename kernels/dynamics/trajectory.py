@@ -20,7 +20,7 @@ FILTER_ROWS = wp.constant(14)
 
 @wp.struct
 class Timing:
-    """Lengths of a rollout."""
+    """Numbers of policy and physics steps of a rollout, and the spacing of its recorded rows."""
 
     steps: int  # T, policy steps
     substeps: int  # S, physics steps in a policy step
@@ -50,7 +50,7 @@ class Commands:
 
 @wp.struct
 class TrajectoryArrays:
-    """A trajectory, or the gradient with respect to one (empty array: zeros); K = T S / every, see `Timing`."""
+    """Arrays of a trajectory, or of the gradient w.r.t. one (empty: zeros); K = T S / every, see `Timing`."""
 
     q: wp.array3d(dtype=real)  # [m], [rad], (K + 1, ROW_COORDS, num_worlds)
     qd: wp.array3d(dtype=real)  # [m/s], [rad/s], (K + 1, ROW_RATES, num_worlds)
@@ -149,7 +149,7 @@ def load_world_motor(actuation: Actuation, motor: int, world: int) -> MotorParam
 
 @wp.struct
 class Arrival:
-    """Weights of the mean target that a motor follows in a physics step, between two delayed policy targets."""
+    """Interpolation of a motor's target in a physics step, between two delayed policy targets."""
 
     older: int  # policy step of the target at the start of the physics step; -1: `Commands.initial_target`
     newer: int  # policy step of the target at the end of the physics step

@@ -11,7 +11,7 @@ from .start_states import ResetRanges
 wp.set_module_options({"enable_backward": False})
 
 MIN_EDGE_DISTANCE = wp.constant(0.05)  # [m] between the paws' centres and an edge of a block
-DEFAULT_PAWS = wp.constant(wp.vec2(0.24, 0.2102))  # [m] of a paw from the base, ahead and beside, in the default pose
+DEFAULT_PAWS = wp.constant(wp.vec2(0.24, 0.2102))  # [m] |x|, |y| of a paw from the base in the default pose
 
 
 @wp.struct
@@ -30,7 +30,7 @@ class GroundRanges:
 
 @wp.func
 def footprint(ranges: ResetRanges, heading: float) -> wp.vec2:
-    """Return the half extents [m] along world x and y of the paws' centres at `heading` [rad], widest stance."""
+    """Return half extents [m] along world x, y of a box around the paws' centres, widest stance at `heading` [rad]."""
     half_length = wp.max(wp.max(ranges.front_x[1], ranges.back_x[1]), DEFAULT_PAWS[0])
     half_width = wp.max(wp.max(ranges.front_y[1], ranges.back_y[1]), DEFAULT_PAWS[1])
     c = wp.abs(wp.cos(heading))
@@ -72,8 +72,8 @@ def sample_platform(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: w
 def sample_block(rng: RngStream, ranges: GroundRanges, foot: wp.vec2, goal: wp.vec3) -> Block:
     """Return a sampled block under the goal, or no block if its near side fits nowhere between start and goal paws.
 
-    The near side crosses the axis (x or y) along which the goal is farther. Its distance is u^2 of the free length from
-    the nearest place on, u uniform, so that a third lies in the first ninth. foot, goal: as in `sample_platform`.
+    The near side crosses the axis (x or y) along which the goal is farther. Beyond the nearest place its distance is
+    u^2 times the free length, u uniform in [0, 1): near blocks are frequent. foot, goal: as in `sample_platform`.
     """
     along = wp.where(wp.abs(goal[0]) >= wp.abs(goal[1]), 0, 1)  # axis: 0 x, 1 y
     distance = wp.abs(goal[along])

@@ -1,4 +1,4 @@
-"""Observation terms of jumps; the policy gets measurable ones, the critic also those that need a simulation."""
+"""Observation terms of jumps: measurable terms for actor and critic, and terms for the critic alone."""
 
 import warp as wp
 
@@ -20,7 +20,7 @@ def wanted_height(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def jump_command(robot: RobotView, state: JumpState) -> float:
-    """1 while a jump is commanded and not yet landed, else 0 (the paper's c)."""
+    """Jump command (the paper's c): 1 from the command until touchdown, else 0."""
     return wp.where(commanded(state), 1.0, 0.0)
 
 
@@ -43,7 +43,7 @@ def phase(robot: RobotView, state: JumpState) -> wp.vec3:
 
 @wp.func
 def phase_times(robot: RobotView, state: JumpState) -> wp.vec2:
-    """Time [s] in the present phase, at most 2, and since the command, clamped to -1..3."""
+    """Times [s] in the current phase, at most 2, and since the command, clamped to -1..3."""
     return wp.vec2(
         wp.min(float(state.phase_steps), 120.0) / 60.0,
         wp.clamp(float(state.steps - state.command_step), -60.0, 180.0) / 60.0,
@@ -52,7 +52,7 @@ def phase_times(robot: RobotView, state: JumpState) -> wp.vec2:
 
 @wp.func
 def height_errors(robot: RobotView, state: JumpState) -> wp.vec2:
-    """Highest base height so far, and ballistic estimate of the apex, both less the commanded apex [m]."""
+    """Height errors [m]: highest base height so far, and ballistic estimate of the apex, less the commanded apex."""
     apex = estimated_apex(robot.pos, robot.lin_vel, robot.gravity_magnitude)
     return wp.vec2(state.max_height - state.goal[2], apex - state.goal[2])
 
@@ -67,7 +67,7 @@ def landing_miss(robot: RobotView, state: JumpState) -> wp.vec2:
 
 @wp.func
 def way(robot: RobotView, state: JumpState) -> wp.vec2:
-    """As `goal` [m], but also before the command."""
+    """Horizontal vector from base to goal [m], ahead and to the left in the base's heading, in every phase."""
     offset = rotate_yaw(goal_offset(robot, state), -yaw_of(robot.quat))
     return wp.vec2(offset[0], offset[1])
 
@@ -88,7 +88,7 @@ def span_of_ray(offset: float, half: float, direction: float) -> wp.vec2:
 
 @wp.func
 def edges_of_block(block: Block, from_x: float, from_y: float, heading: float) -> wp.vec2:
-    """Return the distances [m] at which a ray from (from_x, from_y) [m] along `heading` [rad] enters, leaves a block.
+    """Return the distances [m] at which a ray from (from_x, from_y) [m] at `heading` [rad] enters and leaves a block.
 
     Both are clamped to +-SIGHT_RANGE, and are SIGHT_RANGE if the ray misses the block or there is none.
     """

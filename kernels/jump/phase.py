@@ -25,25 +25,25 @@ def time_to_height(z: float, vz: float, height: float, g: float) -> float:
 
 @wp.func
 def estimated_landing(pos: wp.vec3, lin_vel: wp.vec3, height: float, g: float) -> wp.vec2:
-    """Return where (x, y) [m] a projectile falls through `height` [m]; pos [m], lin_vel [m/s]: world, g > 0 [m/s^2]."""
+    """Return the point (x, y) [m] where a projectile falls through `height` [m]; pos [m], lin_vel [m/s], g [m/s^2]."""
     t = time_to_height(pos[2], lin_vel[2], height, g)
     return wp.vec2(pos[0] + t * lin_vel[0], pos[1] + t * lin_vel[1])
 
 
 @wp.func
 def landing_error_estimate(robot: RobotView, state: JumpState, height: float) -> float:
-    """Return the distance [m] between goal and ballistic landing: base at `height` [m] above the goal's ground."""
+    """Return the distance [m] of the goal from the ballistic landing, base `height` [m] above the goal's ground."""
     landing = estimated_landing(robot.pos, robot.lin_vel, height + state.goal_ground, robot.gravity_magnitude)
     return wp.length(wp.vec2(state.goal[0] - landing[0], state.goal[1] - landing[1]))
 
 
 @wp.func
 def next_phase(state: JumpState, robot: RobotView, takeoff_speed: float) -> int:
-    """Return the phase after this policy step.
+    """Return the phase of a jump (STANCE, FLIGHT or LANDED) after this policy step.
 
     A jump takes off when no paw is in contact and the base rises faster than takeoff_speed [m/s]. It touches down when
-    a paw is in contact and the base does not rise faster than that. At higher speed the contact belongs to the push-off
-    (compliant contact can break for some steps of it) or is a clipped edge: the robot stays in flight.
+    a paw is in contact and the base does not rise faster than that. Contact at a higher upward speed belongs to the
+    push-off (compliant contact can break during it) or to a clipped edge: the robot stays in flight.
     """
     rises = robot.lin_vel[2] > takeoff_speed
     if state.phase == STANCE and robot.contacts == 0 and rises:
@@ -57,7 +57,7 @@ def next_phase(state: JumpState, robot: RobotView, takeoff_speed: float) -> int:
 def advance_jump(robot: RobotView, state: JumpState, takeoff_speed: float) -> JumpState:
     """Return the jump's state after one more policy step; takeoff_speed [m/s]: least upward speed of a takeoff.
 
-    Contact in flight that is no touchdown moves the takeoff to its step: the flight and its apex begin there.
+    Contact in flight that is no touchdown moves the takeoff to its step: flight and apex are counted from there.
     """
     t = state
     t.steps = state.steps + 1

@@ -32,7 +32,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class JumpSettings:
-    """Ranges of start states and of sampled ground."""
+    """Ranges from which the reset of a jump samples start states and ground."""
 
     states: ResetRanges
     grounds: GroundRanges
@@ -40,7 +40,7 @@ class JumpSettings:
 
 @wp.struct
 class JumpLevel:
-    """One level of the curriculum; goals are sampled from a box."""
+    """One level of the jump curriculum; goals are sampled from a box."""
 
     goal_lower: wp.vec3  # [m] relative to start and heading: landing x, y, and base height at the apex (0: any)
     goal_upper: wp.vec3  # [m] opposite corner of the box
@@ -78,7 +78,7 @@ def sample_goal(rng: RngStream, level: JumpLevel) -> wp.vec3:
 
 @wp.func
 def sample_next_jump_step(rng: RngStream, delay: wp.vec2, probability: float) -> int:
-    """Return policy steps from touchdown to another goal, from range `delay`, with `probability`; else 0: none."""
+    """Return the policy steps from touchdown to the next goal, sampled from `delay` with `probability`, else 0."""
     steps = int(uniform_range(rng, streams.AGAIN_STEP, delay))
     return wp.where(uniform(rng, streams.AGAIN, 0.0, 1.0) < probability, wp.max(steps, 1), 0)
 
@@ -98,7 +98,7 @@ def begin_jump(
     rng: RngStream, ranges: ResetRanges, start_mode: int, goal: wp.vec3, pos: wp.vec3, vz: float,
     next_jump_probability: float,
 ) -> JumpState:  # fmt: skip
-    """Return the task state of a new episode in phase and with the command that fit its start mode.
+    """Return the task state of a new episode, with the phase and the command step of its start mode.
 
     goal [m]: world axes; pos [m], vz [m/s]: position and vertical velocity of the base.
     """
@@ -173,7 +173,7 @@ def reset_jump(
 ) -> JumpState:  # fmt: skip
     """Write a sampled start state of a jump to world `rng.world`, and return the task state of its new episode.
 
-    old: state of the previous episode, whose steps count for its start mode.
+    old: state of the previous episode, whose policy steps count toward its start mode.
     """
     world = rng.world
     ranges = settings.states
@@ -198,7 +198,7 @@ def reset_jump(
 
 @wp.func
 def next_jump_due(state: JumpState) -> bool:
-    """Return whether a landed robot gets its next goal in this policy step."""
+    """Return whether a landed robot receives its next goal in this policy step."""
     return state.phase == LANDED and state.next_jump_step > 0 and state.phase_steps >= state.next_jump_step
 
 

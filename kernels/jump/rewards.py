@@ -38,13 +38,13 @@ def should_rest(state: JumpState) -> bool:
 
 @wp.func
 def height_closeness(error: float, std_fine: float, scale_sharp: float, std_wide: float) -> float:
-    """Return phi_fine + 3 psi_sharp + phi_wide of a height error, all [m]; phi_wide gives low jumps a slope."""
+    """Return phi_fine + 3 psi_sharp + phi_wide of a height error, all [m]; phi_wide gives low jumps a gradient."""
     return phi(error, std_fine) + 3.0 * psi(error, scale_sharp) + phi(error, std_wide)
 
 
 @wp.func
 def jump_height(robot: RobotView, state: JumpState, std_fine: float, scale_sharp: float, std_wide: float) -> float:
-    """Jump height: `height_closeness` of the highest base height to the commanded one, once, at the apex."""
+    """Jump height: `height_closeness` of the highest base height to the commanded height, once, at the apex."""
     if state.at_apex == 0:
         return 0.0
     return height_closeness(state.max_height - state.goal[2], std_fine, scale_sharp, std_wide)
@@ -54,7 +54,7 @@ def jump_height(robot: RobotView, state: JumpState, std_fine: float, scale_sharp
 def estimated_jump_height(
     robot: RobotView, state: JumpState, std_fine: float, scale_sharp: float, std_wide: float
 ) -> float:
-    """Est jump height: `height_closeness` of the estimated apex to the commanded one, in flight until the apex."""
+    """Estimated jump height: `height_closeness` of the estimated apex to the commanded one, in flight before it."""
     if state.phase != FLIGHT or state.apex_passed != 0:
         return 0.0
     return height_closeness(
@@ -67,7 +67,7 @@ def estimated_jump_height(
 
 @wp.func
 def horizontal_velocity(robot: RobotView, state: JumpState, speed_scale: float, waiting_scale: float) -> float:
-    """Staying over the spot: exp(-|v_xy| / speed_scale), twice that off stance; speed_scale [m/s]."""
+    """Horizontal velocity: exp(-|v_xy| / speed_scale), doubled in flight and after touchdown; speed_scale [m/s]."""
     speed = wp.length(wp.vec2(robot.lin_vel[0], robot.lin_vel[1]))
     return (
         wp.exp(-speed / speed_scale) * wp.where(state.phase == STANCE, 1.0, 2.0) * waiting_weight(state, waiting_scale)
@@ -144,7 +144,7 @@ def tracking(robot: RobotView, state: JumpState, std_wide: float, std_fine: floa
 def estimated_tracking(
     robot: RobotView, state: JumpState, std_middle: float, std_wide: float, std_fine: float, height: float
 ) -> float:
-    """Est tracking: phi_middle + 0.1 phi_wide + 0.3 phi_fine of the estimated landing's distance from the goal [m].
+    """Estimated tracking: phi_middle + 0.1 phi_wide + 0.3 phi_fine of the estimated landing's distance to the goal [m].
 
     In flight. The ballistic landing is where the base falls through `height` [m] above the goal's ground.
     """
@@ -191,7 +191,7 @@ def standing_posture(robot: RobotView, state: JumpState, std: float, shift: floa
 
 @wp.func
 def soft_impact(robot: RobotView, state: JumpState, limit: float) -> float:
-    """Soft impact: max(0, 1 - base deceleration / limit [m/s^2]), 0.3 s from touchdown."""
+    """Soft impact: max(0, 1 - base deceleration / limit [m/s^2]), for 0.3 s from touchdown."""
     if not just_landed(state):
         return 0.0
     return wp.max(0.0, 1.0 + base_deceleration(robot) / limit)
@@ -258,7 +258,7 @@ def descent_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
 
 @wp.func
 def lifted_again(robot: RobotView, state: JumpState, threshold: float) -> float:
-    """Still landing: number of paws, 0 to 4, in the air for more than `threshold` [s] since they had landed."""
+    """Lifted paws: number of paws, 0 to 4, that landed and are in the air again for more than `threshold` [s]."""
     count = float(0.0)
     if state.phase == LANDED:
         for k in range(4):
@@ -269,7 +269,7 @@ def lifted_again(robot: RobotView, state: JumpState, threshold: float) -> float:
 
 @wp.func
 def paws_down(robot: RobotView, state: JumpState) -> float:
-    """Still landing: number of paws on the ground, 0 to 4, after touchdown."""
+    """Paws down: number of paws on the ground, 0 to 4, after touchdown."""
     if state.phase != LANDED:
         return 0.0
     return float(robot.contacts)
@@ -277,9 +277,9 @@ def paws_down(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def capture_point(robot: RobotView, state: JumpState, std: float) -> float:
-    """Bracing: phi_std of the horizontal distance [m] between capture point and middle of the paws, after touchdown.
+    """Capture point: phi_std of its horizontal distance [m] from the middle of the paws, after touchdown.
 
-    Capture point: p + v sqrt(h / g), where a pendulum with the base's position p, velocity v and height h stops.
+    It is p + v sqrt(h / g), where an inverted pendulum with the base's position p, velocity v and height h stops.
     """
     if state.phase != LANDED:
         return 0.0
@@ -294,7 +294,7 @@ def capture_point(robot: RobotView, state: JumpState, std: float) -> float:
 
 @wp.func
 def resting_action_rate(robot: RobotView, state: JumpState) -> float:
-    """Quiet actions: sum over motors of the action's squared change in a policy step, while the robot should rest."""
+    """Action rate at rest: sum over motors of the action's squared change in a step, while the robot should rest."""
     if not should_rest(state):
         return 0.0
     return square_sum(robot.action - robot.prev_action)
@@ -310,7 +310,7 @@ def torque_ripple(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def force_ripple(robot: RobotView, state: JumpState, weight_force: float) -> float:
-    """Force ripple: sum over paws of ((peak - last force of the step) / weight_force [N])^2, while it should rest."""
+    """Force ripple: sum over paws of ((peak - last force) / weight_force [N])^2, while the robot should rest."""
     if not should_rest(state):
         return 0.0
     excess = robot.peak_force - robot.paw_force

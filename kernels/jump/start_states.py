@@ -23,7 +23,7 @@ from .state import NUM_START_MODES, vec_start_modes
 
 wp.set_module_options({"enable_backward": False})
 
-STANDING = wp.constant(0)  # at rest, squatting more or less, on sampled paw positions
+STANDING = wp.constant(0)  # at rest at a sampled height over sampled paw positions
 DEFAULT = wp.constant(1)  # default pose at rest
 IN_FLIGHT = wp.constant(2)  # on the ballistic flight to the goal
 TOUCHDOWN = wp.constant(3)  # in flight just before touchdown
@@ -33,7 +33,7 @@ PUSHING = wp.constant(5)  # in stance, accelerating toward takeoff
 
 @wp.struct
 class ResetRanges:
-    """Ranges of sampled states; pairs are (lower, upper), angles [rad], lengths [m]; half width w: from -w to w."""
+    """Ranges of sampled start states; pairs are (lower, upper), angles [rad], lengths [m]; half width w: -w to w."""
 
     start_probability: vec_start_modes  # of STANDING, DEFAULT, IN_FLIGHT, TOUCHDOWN, AFTER_LANDING, PUSHING
     by_steps: int  # 1: probabilities are fractions of a world's policy steps, 0: of its resets
@@ -43,9 +43,9 @@ class ResetRanges:
     lean: float  # largest distance of the base behind the paws' middle in the deepest squat; 0 at the highest
     heading: float  # half width of the heading
     front_x: wp.vec2  # front paws ahead of the base
-    front_y: wp.vec2  # front paws beside the base, absolute
+    front_y: wp.vec2  # front paws to the side of the base, absolute
     back_x: wp.vec2  # back paws behind the base, absolute
-    back_y: wp.vec2  # back paws beside the base, absolute
+    back_y: wp.vec2  # back paws to the side of the base, absolute
     takeoff_height: wp.vec2  # base above the ground
     takeoff_ahead: wp.vec2  # base ahead of its start, towards the goal
     takeoff_pitch: wp.vec2  # nose down, of states in flight and pushing off
@@ -71,7 +71,7 @@ class ResetRanges:
 
 @wp.struct
 class JumpStart:
-    """Values that all attempts at a start state share."""
+    """Values that all attempts to sample one start state of a jump share."""
 
     start_mode: int  # STANDING to PUSHING
     heading: float  # [rad] yaw
@@ -84,7 +84,7 @@ class JumpStart:
 
 @wp.struct
 class JumpBase:
-    """The base in an attempt, see `sample_valid_state`; paws are placed around `spot`."""
+    """Sampled pose and velocity of the base in one attempt; paws are placed around `spot`."""
 
     pos: wp.vec3  # [m] base origin, world
     quat: wp.quat  # xyzw, body to world
@@ -279,7 +279,7 @@ def sample_base(start: JumpStart, arrays: RobotArrays, rng: RngStream, attempt: 
 
 @wp.func
 def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return leg `leg` in flight, at rest relative to the base; reachable if its paw is 0.01 m above the ground.
+    """Return the sampled leg `leg` in flight, motors at rest; reachable if its paw is 0.01 m above the ground.
 
     Its angles are within 0.03 rad (lateral) or 0.1 rad (outer, inner) of a value sampled once for all legs.
     """
@@ -301,12 +301,12 @@ def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: Rn
 
 @wp.func
 def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return leg `leg` of an attempt: in flight, or with its paw on (TOUCHDOWN: above) a sampled spot of the ground."""
+    """Return the sampled leg `leg`: in flight, or with its paw on (TOUCHDOWN: above) a sampled spot of the ground."""
     ranges = start.ranges
     if start.start_mode == IN_FLIGHT:
         return leg_in_flight(ranges, base, geo, rng, leg)
-    beside = sample_foot_offset(rng, leg, ranges.front_x, ranges.front_y, ranges.back_x, ranges.back_y)
-    spot = base.spot + rotate_yaw(beside, start.heading)
+    offset = sample_foot_offset(rng, leg, ranges.front_x, ranges.front_y, ranges.back_x, ranges.back_y)
+    spot = base.spot + rotate_yaw(offset, start.heading)
     paw = spot - base.pos
     if start.start_mode == TOUCHDOWN:
         # paws hang below the base, a little above the ground at least

@@ -32,7 +32,7 @@ class JumpState:
     touchdown_vel: wp.vec3  # [m/s] world, velocity of the base in the step before touchdown
     peak_tilt: float  # [rad] largest angle between body and world z since touchdown
     start_mode: int  # start mode of the episode (`start_states`)
-    next_jump_step: int  # policy steps after touchdown at which another goal comes, 0: never
+    next_jump_step: int  # policy steps after touchdown at which the next goal is commanded, 0: never
     next_jump_delay: wp.vec2  # [policy steps] range from which the `next_jump_step` of the next jump is sampled
     jumps: int  # jumps of this episode that were followed by another
     paws_landed: int  # bit k: paw k has been in contact since touchdown

@@ -7,7 +7,7 @@ Alternatives share indices: a start samples only those of its mode, an episode o
 START_MODE, HEADING = 1, 13
 GOAL = 50  # three indices, 50 to 52
 COMMAND_STEP, LANDED_STEPS = 9, 9  # policy steps until the command; since touchdown, of those just landed
-AGAIN, AGAIN_STEP = 18, 19  # whether, and when, another goal comes
+AGAIN, AGAIN_STEP = 18, 19  # whether, and when, the next goal is commanded
 GROUND, BLOCK_HEIGHT = 60, 63
 PLATFORM_ROOM_X, PLATFORM_ROOM_Y = 61, 62
 BLOCK_NEAR_SIDE, BLOCK_FAR_ROOM, BLOCK_SIDE_ROOM, BLOCK_MASS, BLOCK_FRICTION = 61, 62, 64, 65, 66

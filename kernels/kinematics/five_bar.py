@@ -1,7 +1,7 @@
-"""The planar five-bar loop of one leg: position, velocity and bias acceleration in closed form.
+"""Planar five-bar loop of one leg: position, velocity and bias acceleration in closed form.
 
 All points are (x, z) [m] in the motor housing frame. The two thighs turn about the transversal axes; a positive
-motor angle moves the thigh tip away from its twin. The loop constraint (paper, Eq. 1) holds by construction: the
+motor angle moves the thigh tip away from the other. The loop constraint (paper, Eq. 1) holds by construction: the
 ankle is the intersection of the two shank circles, on the branch below the knees. Rotation angles of links are about
 housing +y, 0 for a link that hangs along -z.
 """
@@ -15,7 +15,7 @@ from .trig import sin_cos
 
 @wp.struct
 class FiveBar:
-    """Configuration of the loop and its first derivatives with respect to the outer and inner motor angles."""
+    """Configuration of the five-bar loop and its first derivatives with respect to the outer and inner motor angles."""
 
     outer_sin_cos: vec2  # (sine, cosine) of the outer motor angle
     inner_sin_cos: vec2  # (sine, cosine) of the inner motor angle
@@ -36,7 +36,7 @@ class FiveBar:
 
 @wp.struct
 class FiveBarBias:
-    """Rates of the loop, and its accelerations at zero motor acceleration (velocity-product terms)."""
+    """Link rates of the five-bar loop, and its accelerations at zero motor acceleration (velocity-product terms)."""
 
     outer_thigh_rate: real  # [rad/s] about +y
     inner_thigh_rate: real

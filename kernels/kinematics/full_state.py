@@ -98,7 +98,7 @@ def store_passive(
     geo: LegGeometry, bias: FiveBarBias, outer: real, inner: real, outer_thigh: real, inner_thigh: real, k: int,
     coord: int, dof: int, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real),
 ):  # fmt: skip
-    """Write the knees and the loop joint of leg k.
+    """Write the coordinates of the passive knees and of the loop joint of leg k.
 
     outer, inner, outer_thigh, inner_thigh [rad]: rotations of shanks and thighs about housing +y. coord, dof: indices
     of the leg's first joint in joint_q and joint_qd.
@@ -131,7 +131,7 @@ def full_state_kernel(
     body_q: wp.array(dtype=wp.transform),
     body_qd: wp.array(dtype=wp.spatial_vector),
 ):
-    """Write knees, loop joints and bodies from the base and motor coordinates; one thread per (world, leg).
+    """Write the states of knees, loop joints and bodies from base and motor coordinates; one thread per (world, leg).
 
     first: world of the first thread. Arrays are Newton's, flat over worlds; body_com [m]: in each body's frame.
     """

@@ -52,7 +52,7 @@ class LegPose:
 
 @wp.func
 def clamp_transversal(limits: LegLimits, outer: real, inner: real) -> vec2:
-    """Return (outer, inner) [rad] clamped to limits; where the sum is out of limits, `inner` gives way."""
+    """Return (outer, inner) [rad] clamped to limits; where the sum is out of limits, only `inner` is corrected."""
     lower = limits.transversal_lower
     upper = limits.transversal_upper
     clamped_outer = wp.clamp(outer, wp.max(lower, limits.sum_lower - upper), wp.min(upper, limits.sum_upper - lower))
@@ -129,7 +129,7 @@ def grid_thighs(limits: LegLimits, row: int, col: int) -> vec2:
 def nearest_reachable(geo: LegGeometry, limits: LegLimits, target: vec3, guess: vec2) -> vec3:
     """Return the reachable ankle position nearest to `target`, both [m] relative to the hip, body axes.
 
-    guess: (outer, inner) [rad] within limits. The search is over thigh angles; see the module's text.
+    guess: (outer, inner) [rad] within limits. The search is over thigh angles; see the module docstring.
     """
     directions = 9  # a variable: a loop over a constant would be unrolled
     best = vec2(guess[0], guess[1])

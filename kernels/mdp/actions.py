@@ -29,7 +29,7 @@ def begin_policy_step(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vecto
 
 @wp.func
 def select_delayed_target(delays: Delays, step_count: int, world: int, m: int):
-    """Write the two targets [rad] that motor m follows in this policy step, and the physics step of the switch.
+    """Write the two targets [rad] that motor m follows in this policy step, and the physics step at which it switches.
 
     step_count: policy steps of the world so far. The latency is `delays.steps` physics steps.
     """

@@ -1,7 +1,7 @@
 """Rejection sampling of start states: up to 8 attempts in one thread, or on a GPU all at once in 8 x 4 threads.
 
 Joint angles come from the closed-form inverse kinematics and joint rates from the leg's Jacobian, so that every state
-satisfies the loops. A sample is rejected if a paw is out of reach within limits or a link collides. On a GPU the 32
+satisfies the leg loops. A sample is rejected if a paw is out of reach within limits or a link collides. On a GPU the 32
 threads of a world are one warp: lane 4 a + l (`RngStream.lane`) samples leg l of attempt a, and all threads reach each
 exchange of `lanes` together. Each thread has coordinates of one world to itself until an attempt is accepted.
 """
@@ -50,7 +50,7 @@ def all_legs(rng: RngStream, flag: bool) -> bool:
 
 @wp.func
 def vec_from_leg(v: vec3, leg: int) -> vec3:
-    """Return the `v` of the thread that samples leg `leg`, in all four threads of an attempt."""
+    """Return, in all four threads of an attempt, the vector `v` of the thread that samples leg `leg`."""
     return vec3(from_leg_of_attempt(v[0], leg), from_leg_of_attempt(v[1], leg), from_leg_of_attempt(v[2], leg))
 
 
@@ -73,14 +73,14 @@ def pose_is_valid(
     geometry: wp.array(dtype=LegGeometry), ground: Ground, rng: RngStream, sample: LegSample, reachable: bool,
     joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
-    """Return whether all legs of an attempt are reachable and free of collisions; first gathers them from all threads.
+    """Return whether all legs of an attempt are reachable and collision-free, after gathering them from all threads.
 
     sample: last leg that this thread sampled; reachable: whether all legs of this thread are. joint_q (COORDS,) and
     joint_qd (DOFS,): coordinates of the attempt, completed here.
     """
     all_reachable = all_legs(rng, reachable)
     if rng.lanes == 1 and not all_reachable:
-        return False  # several threads must all reach the exchange below
+        return False  # several lanes must all reach the exchange below
     if rng.lanes > 1:
         gathered = LegSample()
         for leg in range(geometry.shape[0]):

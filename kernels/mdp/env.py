@@ -8,7 +8,7 @@ from ..terrain.ground import Ground
 from .view import vec12
 
 BEGUN = wp.constant(1)  # `history_reset`: an episode or skill began in this step, so observations have no history
-COMMANDED = wp.constant(2)  # `history_reset`: a command came within an episode
+COMMANDED = wp.constant(2)  # `history_reset`: a new command was set within an episode
 RING = wp.constant(8)
 """Length [policy steps] of the ring buffers of targets and observations; a constant, since kernels divide by it."""
 
@@ -24,7 +24,7 @@ class Scene:
 
 @wp.struct
 class NoSettings:
-    """Placeholder struct for a reset without settings, or a task without levels."""
+    """Empty settings struct, for resets without settings and tasks without levels."""
 
     unused: float
 
@@ -56,7 +56,7 @@ class EpisodeArrays:
 
 @wp.struct
 class Counters:
-    """Statistics that accumulate until the host reads and clears them."""
+    """Episode statistics that accumulate on the device until the host reads and clears them."""
 
     term_sum: wp.array2d(dtype=wp.float64)  # (rewards, num_worlds) `episode_sum`, summed over ended episodes
     termination_count: wp.array2d(dtype=int)  # (terminations, num_worlds) ended episodes by termination term
@@ -81,7 +81,7 @@ class SkillSettings:
 
 @wp.struct
 class Delays:
-    """Actuation latency: the last motor targets, and the two that motors follow within a policy step."""
+    """Actuation latency: the last motor targets, and the two targets that motors follow within a policy step."""
 
     target_history: wp.array3d(dtype=float)  # [rad] (RING, 12, num_worlds) filtered targets by policy step % RING
     steps: wp.array(dtype=int)  # [physics steps] (num_worlds,) latency from action to motor

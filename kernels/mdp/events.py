@@ -1,4 +1,4 @@
-"""The stage that changes parameters: at the start, at resets, and at intervals within an episode."""
+"""Kernel stage that runs a task's events (changes of robot parameters): at startup, at resets and at intervals."""
 
 import warp as wp
 
@@ -14,7 +14,7 @@ MODES = {"startup": STARTUP, "reset": AT_RESET, "interval": AT_STEP}  # Stage of
 
 @wp.func
 def steps_until(rng: RngStream, least: float, most: float, step_dt: float) -> int:
-    """Return a sampled number of policy steps, at least one: a time uniform from least to most [s] over step_dt [s]."""
+    """Return a sampled interval of at least 1 policy step: uniform from least to most [s], over step_dt [s]."""
     return wp.max(int(wp.round(uniform(rng, INTERVAL, least, most) / step_dt)), 1)
 
 

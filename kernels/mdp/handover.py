@@ -93,8 +93,8 @@ def make_handover_kernel(handover: Any) -> wp.Kernel:
     ):
         """Hand over worlds from skill `source` to `target` where `when` holds; one thread per world.
 
-        A pending command of the target is set. moved: (num_worlds,) 1 where a world was handed over in this step; such
-        worlds, and ended ones, stay. sources, targets: (num_worlds,) task states of both skills.
+        A pending command of the target is set. moved: (num_worlds,) 1 where a world was handed over in this step; these
+        worlds and ended ones keep their skill. sources, targets: (num_worlds,) task states of both skills.
         """
         world = episode.first + wp.tid()
         if episode.skill[world] != source or episode.done[world] != 0.0 or moved[world] != 0:

@@ -1,4 +1,4 @@
-"""Observation terms that any task can use: of the robot's state, or of its randomised parameters (`drawn_*`)."""
+"""Observation terms that any task can use: robot state, and randomised robot parameters (`drawn_*`)."""
 
 from typing import Any
 
@@ -63,13 +63,13 @@ def paw_forces(robot: RobotView, state: Any) -> wp.vec4:
 
 @wp.func
 def air_times(robot: RobotView, state: Any) -> wp.vec4:
-    """Time that each paw has been in the air [s]; at its first contact the length of the swing, then 0."""
+    """Air time of each paw [s]: at its first contact the duration of the swing, afterwards 0."""
     return robot.air_time
 
 
 @wp.func
 def contacts(robot: RobotView, state: Any) -> wp.vec4:
-    """1 for each paw on the ground, else 0."""
+    """Contact flag of each paw: 1 on the ground, else 0."""
     return robot.contact
 
 

@@ -103,7 +103,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
     ):
         """Write the terms' values to raw (components, num_worlds); one thread per (chunk of terms, world of `skill`).
 
-        after_reset 1: only where an episode or the skill has just begun, or a new command came.
+        after_reset 1: only where an episode or the skill has just begun, or a new command was set.
         """
         chunk, world = wp.tid()
         world += episode.first
@@ -150,7 +150,7 @@ class StepContext:
     history_reset: int  # as in `EpisodeArrays`
     diverged: bool
     slot: int  # ring buffer slot of this policy step
-    newer: int  # slot of the delay rounded down to policy steps
+    newer: int  # slot of the value at the delay rounded down to policy steps
     older: int  # slot one policy step before `newer`
     fraction: float  # [1] weight of `older`, 0 to 1; `newer` has the rest
 
@@ -234,7 +234,7 @@ def postprocess_obs_kernel(
     """Turn raw values into observations; launch over (num_worlds, LANES).
 
     Non-finite values, and all rows and history of diverged worlds, are 0. after_reset 1: only where an episode or
-    skill has just begun, or a new command came; `final` stays, and so do the older frames after a command.
+    skill has just begun, or a new command was set; `final` stays, and so do the older frames after a command.
     """
     world, lane = wp.tid()
     world += episode.first

@@ -92,7 +92,7 @@ def armature(robot: RobotParameters, rng: RngStream, lower: float, upper: float)
 
 @wp.func
 def motor_friction(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Give each motor a Coulomb friction from lower to upper [N m]."""
+    """Set the Coulomb friction of each motor to a sampled value from lower to upper [N m]."""
     for m in range(rng.lane, 12, rng.lanes):
         robot.joint_friction[rng.world * DOFS + 6 + motor_slot(m)] = uniform(rng, m, lower, upper)
 
@@ -179,7 +179,7 @@ def friction(
     robot: RobotParameters, rng: RngStream, dynamic_lower: float, dynamic_upper: float, static_lower: float,
     static_upper: float,
 ):  # fmt: skip
-    """Sample the dynamic friction coefficient [1] of a robot's paws, and the static one, raised to it if lower."""
+    """Sample the friction coefficients [1] of a robot's paws; the static one is at least the dynamic one."""
     dynamic = uniform(rng, 0, dynamic_lower, dynamic_upper)
     static = wp.max(uniform(rng, 1, static_lower, static_upper), dynamic)
     for k in range(4):
@@ -190,7 +190,7 @@ def friction(
 
 @wp.func
 def physics_steps(robot: RobotParameters, seconds: float) -> int:
-    """Return a time [s] as the nearest whole number of physics steps."""
+    """Return a time [s] rounded to whole physics steps."""
     return int(wp.round(seconds / robot.physics_dt))
 
 
@@ -204,7 +204,7 @@ def drawn_delay(robot: RobotParameters, rng: RngStream, lower: float, upper: flo
 
 @wp.func
 def action_latency(robot: RobotParameters, rng: RngStream, lower: float, upper: float, zero_probability: float = 0.0):
-    """Delay actions by a latency from lower to upper [s], with `zero_probability` by 0."""
+    """Sample the latency of actions from lower to upper [s]; with `zero_probability` it is 0."""
     robot.latency[rng.world] = drawn_delay(robot, rng, lower, upper, zero_probability)
 
 
@@ -212,7 +212,7 @@ def action_latency(robot: RobotParameters, rng: RngStream, lower: float, upper: 
 def observation_latency(
     robot: RobotParameters, rng: RngStream, lower: float, upper: float, zero_probability: float = 0.0
 ):
-    """Delay delayed observation terms by a latency from lower to upper [s], with `zero_probability` by 0."""
+    """Sample the latency of delayed observation terms from lower to upper [s]; with `zero_probability` it is 0."""
     robot.observation_latency[rng.world] = drawn_delay(robot, rng, lower, upper, zero_probability)
 
 
@@ -221,7 +221,7 @@ def push(
     robot: RobotParameters, rng: RngStream, probability: float, force_lower: float, force_upper: float,
     torque_lower: float, torque_upper: float,
 ):  # fmt: skip
-    """Push the base with `probability`, else not: a sampled force [N] and torque [N m] for each world axis."""
+    """Set the push on the base: with `probability` a sampled force [N] and torque [N m] per world axis, else 0."""
     wrench = wp.spatial_vector()
     if uniform(rng, 6, 0.0, 1.0) < probability:
         for i in range(3):

@@ -21,7 +21,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def previous_state(old: Any, done: float):
-    """Return the task state `old` of the previous episode, with `steps` 0 if `Env.reset` cut it off (done = 0)."""
+    """Return the task state `old` of the previous episode; `steps` is 0 if `Env.reset` interrupted it (done = 0)."""
     state = old
     if done == 0.0:
         state.steps = 0
@@ -51,7 +51,7 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
         """Begin a new episode where mask != 0, else sample a command where one is due; launch over (worlds, lanes).
 
         Worlds of `skill` only; mask: (num_worlds,). All lanes of a world (one warp) run the task's reset, which splits
-        its work by `rng.lane`; lane 0 writes the state. A world that passed the last level gets a sampled one.
+        its work by `rng.lane`; lane 0 writes the state. A world that passed the last level uses a sampled one.
         """
         world, lane = wp.tid()
         world += episode.first
@@ -164,7 +164,7 @@ def default_pose_kernel(
     # in, out
     arrays: RobotArrays,
 ):
-    """Write the default pose, with yaw `headings` [rad], where mask != 0; its block returns to its start.
+    """Write the default pose with yaw `headings` [rad], and the start position of the block, where mask != 0.
 
     The robot is above the ground by the `eval_height_offset` of the world's skill; one thread per world.
     """

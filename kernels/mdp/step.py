@@ -5,9 +5,9 @@ from typing import Any
 import warp as wp
 
 from ..terrain.ground import Ground
+from . import terminations
 from .env import BEGUN, Counters, EpisodeArrays
 from .options import FAST
-from .terminations import came_apart
 from .view import RobotArrays, has_diverged, load_view
 
 NOT_TERMINATED = wp.constant(-1)  # `EpisodeArrays.termination` of an episode that has not ended
@@ -60,7 +60,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
     """Return the kernel that ends a policy step; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
     (advance,), endings, rewards = (task.params.slots[name] for name in ("advance", "terminations", "rewards"))
     (curriculum,) = task.params.slots["curriculum"]
-    diverged_ending = [slot.func for slot in endings].index(came_apart)
+    diverged_ending = [slot.func for slot in endings].index(terminations.diverged)
     floor = task.reward_floor
 
     @wp.kernel(module="unique", module_options=FAST)

@@ -12,35 +12,35 @@ from .view import RobotView, has_diverged, tilt
 
 @wp.func
 def too_long(robot: RobotView, state: Any, steps: float) -> bool:
-    """Episode of at least `steps` policy steps."""
+    """Terminate an episode after `steps` policy steps."""
     return state.steps >= int(steps)
 
 
 @wp.func
-def came_apart(robot: RobotView, state: Any) -> bool:
-    """Diverged simulation: state non-finite or beyond the speed limits of `has_diverged`."""
+def diverged(robot: RobotView, state: Any) -> bool:
+    """Terminate when the simulation diverges: state non-finite or beyond the speed limits of `has_diverged`."""
     return has_diverged(robot)
 
 
 @wp.func
 def low_base(robot: RobotView, state: Any, height: float) -> bool:
-    """Base origin less than `height` [m] above the ground below it."""
+    """Terminate when the base origin is less than `height` [m] above the ground below it."""
     return robot.height < height
 
 
 @wp.func
 def tilted(robot: RobotView, state: Any, angle: float) -> bool:
-    """Body z more than `angle` [rad] from world z."""
+    """Terminate when body z is more than `angle` [rad] from world z."""
     return tilt(robot) > angle
 
 
 @wp.func
 def fallen(robot: RobotView, state: Any, angle: float) -> bool:
-    """Body z more than `angle` [rad] from world z while a paw is on the ground."""
+    """Terminate when body z is more than `angle` [rad] from world z while a paw is on the ground."""
     return robot.contacts > 0 and tilt(robot) > angle
 
 
 @wp.func
 def collided(robot: RobotView, state: Any) -> bool:
-    """Anything but a paw touched the ground, or links touched each other."""
+    """Terminate when anything but a paw touches the ground, or links touch each other."""
     return robot.collisions != 0

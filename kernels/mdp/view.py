@@ -178,7 +178,7 @@ def has_diverged(robot: RobotView) -> bool:
     total = wp.length_sq(robot.pos) + wp.length_sq(robot.lin_vel) + wp.length_sq(robot.ang_vel)
     for m in range(12):
         fastest = wp.max(fastest, wp.abs(robot.rate[m]))
-        total += robot.rate[m] * robot.rate[m] + robot.angle[m] * robot.angle[m]  # max() would pass over a NaN
+        total += robot.rate[m] * robot.rate[m] + robot.angle[m] * robot.angle[m]  # max() would ignore a NaN
     if not wp.isfinite(total):
         return True
     return wp.length(robot.lin_vel) > 15.0 or wp.length(robot.ang_vel) > 40.0 or fastest > 120.0

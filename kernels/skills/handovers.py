@@ -1,6 +1,6 @@
 """Handovers between walking, jumping and turning in flight: conditions (`*_due`) and initial task states (`begin_*`).
 
-Neither changes the robot. requested: whether `Env.request` asked for the target skill.
+Neither function changes the robot's state. requested: whether `Env.request` requested the target skill.
 """
 
 import warp as wp

@@ -1,4 +1,4 @@
-"""The ground under the paws: a plane z = 0 or a heightfield, and in each world a block that slides on it.
+"""Ground under the paws: a plane z = 0 or a heightfield, and in each world a block that slides on it.
 
 Functions of a point take the ground of one world, whose block `world_ground` has copied to `Ground.block`.
 """
@@ -10,7 +10,7 @@ from ..scalar import real, vec2, vec3
 
 @wp.struct
 class Block:
-    """One world's block: upright walls and a level top. It slides without turning and never leaves the floor."""
+    """Block on the floor of one world: upright walls and a level top. It slides without turning and never lifts off."""
 
     exists: int  # 0: no block
     start: vec2  # [m] centre, world, after a reset
@@ -24,7 +24,7 @@ class Block:
 
 @wp.struct
 class Ground:
-    """A horizontal plane (`rows` = 0) or a grid of heights centred on (`center_x`, `center_y`), bilinear between nodes.
+    """Ground: a horizontal plane (`rows` = 0) or a grid of heights around `center_x`, `center_y`, bilinear in between.
 
     Outside the grid the surface continues at the height of the nearest edge. Row index follows y, column index x.
     """
@@ -154,7 +154,7 @@ def floor_distance(ground: Ground, point: vec3) -> real:
 
 @wp.func
 def outside_block(block: Block, point: vec3) -> vec3:
-    """Return how far [m] a point (world) lies beyond the walls along x and y and above the top; negative inside."""
+    """Return the distances [m] of a point (world) beyond the walls along x, y and above the top; negative inside."""
     return vec3(
         wp.abs(point[0] - block.center[0]) - block.half[0],
         wp.abs(point[1] - block.center[1]) - block.half[1],

@@ -39,7 +39,7 @@ def command_limits(ranges: CommandRanges, level: int) -> wp.vec4:
 def sample_velocity_command(rng: RngStream, ranges: CommandRanges, level: int) -> wp.vec3:
     """Return a sampled command of a level: velocity ahead, to the left [m/s], yaw rate [rad/s], body axes.
 
-    Above level 0, lateral velocity and yaw rate shrink with the speed ahead as on an ellipse, to at least 0.2 of them.
+    Above level 0, lateral velocity and yaw rate are scaled down with the forward speed, by an ellipse, to at least 0.2.
     """
     kind = uniform(rng, streams.KIND, 0.0, 1.0)
     if kind < ranges.standing_probability:

@@ -1,4 +1,4 @@
-"""Observation terms of velocity tracking; the critic also gets those that need a simulation."""
+"""Observation terms of velocity tracking: measurable terms for actor and critic, and terms for the critic alone."""
 
 import warp as wp
 
@@ -32,7 +32,7 @@ def command_age(robot: RobotView, state: VelocityState) -> float:
 
 @wp.func
 def contact_times(robot: RobotView, state: VelocityState) -> wp.vec4:
-    """Time that each paw has been on the ground [s], at most 1; 0 in the air."""
+    """Contact time of each paw [s], at most 1; 0 in the air."""
     return wp.min(robot.contact_time, wp.vec4(1.0))
 
 

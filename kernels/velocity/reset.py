@@ -28,10 +28,10 @@ def map_limit(map: TileMap) -> wp.vec2:
 def carried_over(
     old: VelocityState, pos: wp.vec3, tolerance: float, command_levels: int, terrain_levels: int
 ) -> VelocityState:  # fmt: skip
-    """Return a state with the statistics and the updated curriculum levels alone; the reset sets the rest.
+    """Return a state with the statistics of `old` and its updated curriculum levels alone; the reset sets the rest.
 
-    pos [m]: base at the end of the old one. A full episode with a mean error up to `tolerance` [m/s] raises both levels
-    by 1, a fall lowers them by 1. command_levels, terrain_levels: largest levels.
+    pos [m]: base at the end of the old episode. A full episode with a mean error up to `tolerance` [m/s] raises both
+    levels by 1, a fall lowers them by 1. command_levels, terrain_levels: largest levels.
     """
     new = VelocityState()
     new.sum_xy = old.sum_xy

@@ -177,8 +177,8 @@ def shank_lean(
 ) -> float:
     """Shank lean: sum over both shanks of legs in contact of max(0, angle from vertical - threshold)^2 [rad^2].
 
-    A shank that leans far over its paw hits the edge of a step beside it. Angles are in the leg's plane and include the
-    pitch of the base. hip: half the distance of the transversal axes [m]; thigh, shank: lengths [m].
+    A shank that leans far over its paw can hit the edge of an adjacent step. Angles are in the leg's plane and include
+    the pitch of the base. hip: half the distance of the transversal axes [m]; thigh, shank: lengths [m].
     """
     down = wp.vec2(robot.projected_gravity[0], robot.projected_gravity[2])
     total = float(0.0)

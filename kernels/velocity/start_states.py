@@ -31,7 +31,7 @@ class TileMap:
 
 @wp.struct
 class VelocitySettings:
-    """Ranges of start states; pairs are (lower, upper), half width w: sampled from -w to w."""
+    """Ranges of start states of velocity tracking; pairs are (lower, upper), half width w: sampled from -w to w."""
 
     map: TileMap
     episode_steps: int  # policy steps that an episode lasts
@@ -42,9 +42,9 @@ class VelocitySettings:
     tilt: float  # [rad] half width of roll and pitch
     heading: float  # [rad] half width of the yaw
     front_x: wp.vec2  # [m] front paws ahead of the base
-    front_y: wp.vec2  # [m] front paws beside the base, absolute
+    front_y: wp.vec2  # [m] front paws to the side of the base, absolute
     back_x: wp.vec2  # [m] back paws behind the base, absolute
-    back_y: wp.vec2  # [m] back paws beside the base, absolute
+    back_y: wp.vec2  # [m] back paws to the side of the base, absolute
     max_swing_height: float  # [m] largest height of a paw in the air above the ground
     swing_probability: float  # of a paw being in the air
     lin_vel: float  # [m/s] half width of the base's velocity along each axis
@@ -54,7 +54,7 @@ class VelocitySettings:
 
 @wp.struct
 class VelocityStart:
-    """Values that all attempts at a start state share."""
+    """Values that all attempts to sample one start state of velocity tracking share."""
 
     spot: wp.vec2  # [m] x, y around which the base is placed
     heading: float  # [rad] yaw
@@ -65,7 +65,7 @@ class VelocityStart:
 
 @wp.struct
 class VelocityBase:
-    """The base in an attempt, see `sample_valid_state`."""
+    """Sampled pose and velocity of the base in one attempt."""
 
     pos: wp.vec3  # [m] base origin, world
     quat: wp.quat  # xyzw, body to world
@@ -122,10 +122,10 @@ def sample_base(start: VelocityStart, arrays: RobotArrays, rng: RngStream, attem
 
 @wp.func
 def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return leg `leg`: its paw at rest on the ground, or in the air with motors at rest with `swing_probability`."""
+    """Return the sampled leg `leg`: paw at rest on the ground, or with `swing_probability` in the air, rates 0."""
     settings = start.settings
-    beside = sample_foot_offset(rng, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
-    paw = base.pos + rotate_yaw(beside, start.heading)
+    offset = sample_foot_offset(rng, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
+    paw = base.pos + rotate_yaw(offset, start.heading)
     lifted = uniform(rng, streams.LIFTED + leg, 0.0, 1.0) < settings.swing_probability
     up = float(0.0)
     if lifted:

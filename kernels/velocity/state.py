@@ -11,7 +11,7 @@ vec4l = wp.types.vector(length=4, dtype=wp.int64)
 
 @wp.struct
 class VelocityState:
-    """Task state of one world; the fields from `sum_xy` on accumulate over episodes until the host reads them."""
+    """State of velocity tracking in a world; from `sum_xy` on fields accumulate until the host reads them."""
 
     command: wp.vec3  # [m/s], [m/s], [rad/s] commanded velocity ahead, to the left and about z, body axes
     standing: int  # 1: commanded to stand
@@ -68,7 +68,7 @@ def update_step_counts(robot: RobotView, state: VelocityState) -> VelocityState:
 
 @wp.func
 def advance_velocity(robot: RobotView, state: VelocityState, settle: float) -> VelocityState:
-    """Return the state after one more policy step; errors count later than `settle` policy steps after a command."""
+    """Return the state after one more policy step; errors count more than `settle` policy steps after a command."""
     t = update_step_counts(robot, state)
     t.steps = state.steps + 1
     t.command_steps = state.command_steps + 1

@@ -8,7 +8,7 @@ from .state import VelocityState
 
 @wp.func
 def finished(robot: RobotView, state: VelocityState) -> bool:
-    """Episode of `state.episode_steps` policy steps; never if that is 0."""
+    """Terminate an episode after `state.episode_steps` policy steps; never if that is 0."""
     return state.episode_steps > 0 and state.steps >= state.episode_steps
 
 
@@ -20,5 +20,5 @@ def off_map(pos: wp.vec3, limit: wp.vec2) -> bool:
 
 @wp.func
 def left_map(robot: RobotView, state: VelocityState) -> bool:
-    """Base origin beyond the edge of the map; never without a map."""
+    """Terminate when the base origin leaves the map; never without a map."""
     return off_map(robot.pos, state.limit)

@@ -497,7 +497,7 @@ def test_refuses_output_folder_before_simulating(tmp_path, capsys, command):
     save_policy(tmp_path / "policy", policy)
     (tmp_path / "file").touch()
     args = [command, str(tmp_path / "policy"), "--device", "cpu", "--out"]
-    assert "observation is not the one" in run(capsys, *args, str(tmp_path / "new"))[2][-1]
+    assert "observation differs from that of its task" in run(capsys, *args, str(tmp_path / "new"))[2][-1]
     code, _, err = run(capsys, *args, str(tmp_path / "file"))
     assert code == 2 and "File exists" in err[-1]
 

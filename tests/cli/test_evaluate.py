@@ -41,7 +41,7 @@ def test_jump_evaluations_check_success_after_failures():
 
 
 def test_refuses_unknown_evaluation():
-    with pytest.raises(PolicyError, match=r"asks for the evaluation 'walk'; there are \['apex_height', "):
+    with pytest.raises(PolicyError, match=r"unknown evaluation_suite 'walk'; known are \['apex_height', "):
         evaluation_of(replace(TASK, evaluation_suite="walk"))
 
 
@@ -125,7 +125,7 @@ def test_height_goals_are_evenly_spaced():
 
 
 def test_every_rate_follows_from_saved_trials(tmp_path):
-    jumps = HeightLog(np.array([0.5, 0.8, 1.0]), ("success", "came_apart", "low_base"))
+    jumps = HeightLog(np.array([0.5, 0.8, 1.0]), ("success", "diverged", "low_base"))
     jumps.end[:, 0], jumps.apex[:, 0], jumps.heading[:] = [0, 1, 2], [0.52, np.nan, 1.05], 0.0
     jumps.rest_speed[0], jumps.touchdown[[0, 2]] = 0.0, 0.0
     write_trials(tmp_path, jumps, 1)

@@ -119,7 +119,7 @@ def test_settings_missing_from_the_run_have_defaults(capsys, run):
 
 def test_finished_run_names_the_flag_that_extends_it(capsys, run):
     code, _, err = train(capsys, "--resume", str(run))
-    assert code == 0 and err[-1] == "nothing is left to train after iteration 1: give more than --max-iterations 1"
+    assert code == 0 and err[-1] == "the training is complete at iteration 1: raise --max-iterations 1 to continue"
 
 
 def test_refuses_settings_that_do_not_fit_the_checkpoint(capsys, run):
@@ -143,7 +143,7 @@ def test_refuses_paths_without_a_run(capsys, tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     code, out, err = train(capsys, "--resume", name)
     assert (code, out) == (2, "")
-    assert err == [f"jumper: {name}: no run to resume; give a run's folder, one of its checkpoints, or latest"]
+    assert err == [f"jumper: {name}: no run to resume; pass a run's folder, one of its checkpoints, or latest"]
 
 
 def test_resume_without_value_exits_with_2(capsys):

@@ -125,7 +125,7 @@ def test_actuator_fits_friction_from_bench_data(tmp_path):
         (["nowhere.npz"], "nowhere.npz"),
         (["."], "no npz, csv or parquet file"),
         (["x.npz", "--params", "gears"], "unknown group of parameters 'gears'"),
-        (["x.npz", "--exclude", "kd,kq"], "no parameter 'kq' to leave out"),
+        (["x.npz", "--exclude", "kd,kq"], "unknown parameter 'kq' to exclude"),
         (["x.npz", "--mass", "14500"], "must be in 7.25 to 29 kg (the robot is described with 14.5 kg), got 14500 kg"),
         (["x.npz", "--noise.angle", "0"], "noise angle must be positive"),
     ],

@@ -182,7 +182,7 @@ def test_play_does_not_need_training_functions(capsys, runs, tmp_path):
 
 def test_play_refuses_missing_termination_function(capsys, runs, path, tmp_path):
     code, _, err = run(capsys, *play(runs["low-jump"]))
-    assert code == 2 and len(err) == 1 and "needs 'my_jumps:too_high': name the file" in err[0]
+    assert code == 2 and len(err) == 1 and "needs 'my_jumps:too_high': pass the file" in err[0]
     assert "--task-module" in err[0] and "my_jumps" not in sys.modules
     assert run(capsys, *play(runs["low-jump"], "--task-module", path, "--out", str(tmp_path)))[0] == 0
 
@@ -231,7 +231,7 @@ def test_resume_warns_about_a_changed_file_and_keeps_settings(capsys, runs, path
     args = ["--device", "cpu", "--max-iterations", "2", "--resume", str(folder)]
     code, _, err = run(capsys, "train", "tame-jump", "--task-module", str(edited), *args)
     assert code == 0, err
-    warning = "my_jumps has changed since: its present functions are used, with the run's settings"
+    warning = "my_jumps has changed since the run was saved: its current functions are used with the saved settings"
     assert err.count(warning) == 1 and "max-iterations 1 -> 2" in err
     config = json.loads((folder / "config.json").read_text())
     assert config["sources"] == {"my_jumps": hashlib.sha256(edited.read_bytes()).hexdigest()}
@@ -264,7 +264,7 @@ def test_refuses_run_of_an_older_version(capsys, tmp_path, task, command):
     source = ["vertical-jump", "--resume"] if command == "train" else []
     code, out, err = run(capsys, command, *source, str(tmp_path / "run"))
     assert (code, out) == (2, "") and len(err) == 1
-    assert f"the task has version {task.get('version')}, this is version 4; commit 05fa856 reads version 3" in err[0]
+    assert f"the task has version {task.get('version')}, expected version 4; commit 05fa856 reads version 3" in err[0]
 
 
 @pytest.mark.parametrize(

@@ -47,7 +47,7 @@ def onnx_of(name):
 
 @pytest.fixture(scope="module")
 def page():
-    """Dict of the names that the page's Python code defines when it runs, and its output lines under `printed`."""
+    """Return the variables defined by the page's Python code by name, and its output lines under `printed`."""
     names, printed = {"print": lambda *values: printed.append(" ".join(map(str, values)))}, []
     for block in re.findall(r"```python\n(.*?)```", PAGE.read_text(encoding="utf-8"), re.DOTALL):
         exec(block, names)
@@ -139,7 +139,7 @@ def test_short_delay_of_the_commands_end_keeps_apex_and_one_takeoff(page):
     assert apex == pytest.approx(0.9, abs=0.005) and takeoffs == 1
 
 
-@pytest.mark.parametrize(("delay", "takeoffs"), [(12, 2), (480, 8)])  # 3 and 9 where the page's figures were made
+@pytest.mark.parametrize(("delay", "takeoffs"), [(12, 2), (480, 8)])  # 3 and 9 on the page, from another machine
 def test_command_that_stays_set_makes_the_robot_jump_again(page, delay, takeoffs):
     assert jump(page, delay=delay, ticks=480)[1] >= takeoffs
 
@@ -164,7 +164,7 @@ def test_history_starts_with_the_first_reading_and_shifts_each_step(page):
     [
         ({"jump_comand": 1.0}, "readings missing or unknown: jump_comand"),
         ({"last_action": np.zeros(12)}, "readings missing or unknown: last_action"),
-        ({"lin_vel": np.zeros(2)}, r"lin_vel takes 3 numbers, got an array of shape \(2,\)"),
+        ({"lin_vel": np.zeros(2)}, r"lin_vel must have 3 values, got shape \(2,\)"),
     ],
 )
 def test_refuses_unknown_readings_and_wrong_sizes(change, message):

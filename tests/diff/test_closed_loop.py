@@ -35,7 +35,7 @@ def jumps():
 
 @pytest.mark.parametrize(("name", "acting"), [("vertical-jump", "vertical_jump"), ("horizontal-jump", "slippery_jump")])
 def test_randomised_robots_match_the_environments_states_and_observations(name, acting):
-    """Masses, friction, motors, offsets, latency, filter and pushes are random; worlds start at all phases of a jump.
+    """The worlds have random masses, friction, motors, offsets, latency, filter and pushes, in all phases of a jump.
 
     Rates differ by more (0.07 rad/s) where rounding lets a motor reach its stop a physics step later, as it does with
     `horizontal_jump` in one of 288 steps; these jumps reach no stop.

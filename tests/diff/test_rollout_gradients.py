@@ -163,7 +163,7 @@ def test_gradients_of_a_hung_robot_match_differences():
 
 
 def test_gradients_by_bodies_match_differences_of_their_moments():
-    """Mass at fixed inertia about the com, com, and inertia of a shank, by hand through the parallel axis theorem."""
+    """Gradients by mass, com and inertia about the com of a shank follow from moments by the parallel axis theorem."""
     rng = np.random.default_rng(2)
     gradient = rng.normal(size=(int(GRAVITY) + 3, 1))
     table = rollout().parameters["table"].numpy()[:, :1].astype(float)
@@ -192,7 +192,7 @@ def test_gradients_by_bodies_match_differences_of_their_moments():
 
 
 def test_single_precision_gradients_match_double_precision():
-    """Of the height in flight, to 1e-3 of the largest entry; the largest measured difference is 2.4e-4."""
+    """Gradients of the height in flight agree to 1e-3 of the largest entry; the largest difference is 2.4e-4."""
     values = defaults()
     height = {"q": np.zeros((len(push_off()) + 1, 19, 1))}
     height["q"][30, 2] = 1.0  # z after policy step 30

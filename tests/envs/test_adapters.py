@@ -24,7 +24,7 @@ from toy_task import SMALL
 N, STEPS = 8, 40
 TASK = make_task("vertical-jump")
 SHORT = TASK.with_terms("terminations", too_long={"steps": 12.0}, tilted={"angle": 0.15})
-"""Episodes that end by time and by failure within a few steps."""
+"""Task whose episodes end by time and by failure within a few steps."""
 ACTIONS = 2.0 * np.random.default_rng(0).random((STEPS, N, 12), dtype=np.float32) - 1.0
 
 pytestmark = pytest.mark.filterwarnings("error::UserWarning:gymnasium")
@@ -35,7 +35,7 @@ def jumper(num_envs=N, task=SHORT, **arguments) -> Env:
 
 
 def played(envs, actions=ACTIONS):
-    """Return what every step gives."""
+    """Return the results of all steps."""
     return [envs.step(action) for action in actions]
 
 
@@ -49,13 +49,13 @@ def assert_same(first, second):
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_gymnasium_knows_every_task_by_name(task):
+def test_every_task_is_registered_with_gymnasium(task):
     spec = gymnasium.spec(env_id(task))
     assert (spec.kwargs, spec.vector_entry_point) == ({"task": task}, "jumper_warp.gym:make_vector_env")
     assert spec.entry_point == "jumper_warp.gym:make_env"
 
 
-def test_names_are_registered_once():
+def test_registering_twice_changes_nothing():
     before = dict(gymnasium.registry)
     register_envs()
     assert gymnasium.registry == before
@@ -71,7 +71,7 @@ def test_gymnasium_makes_the_named_task():
 
 
 @pytest.mark.parametrize("all_groups", [False, True])
-def test_what_a_step_gives_is_in_its_space(all_groups):
+def test_step_results_are_in_their_spaces(all_groups):
     envs = GymVectorEnv(jumper(), all_groups=all_groups)
     assert envs.single_action_space == gymnasium.spaces.Box(-1.0, 1.0, (12,))
     space = envs.single_observation_space
@@ -88,7 +88,7 @@ def test_what_a_step_gives_is_in_its_space(all_groups):
     assert all(row in space for row in finals)
 
 
-def test_gymnasiums_own_checks_pass():
+def test_checks_of_gymnasium_pass():
     envs = GymVectorEnv(jumper(1))
     for space, kind in ((envs.single_observation_space, "observation"), (envs.single_action_space, "action")):
         getattr(env_checker, f"check_{kind}_space")(space)
@@ -99,30 +99,30 @@ def test_gymnasiums_own_checks_pass():
 
 
 @pytest.mark.parametrize("tensors", [False, True])
-def test_gymnasium_gets_copies(tensors):
+def test_step_results_are_copies(tensors):
     envs = GymVectorEnv(jumper(), tensors=tensors)
     actions = torch.from_numpy(ACTIONS) if tensors else ACTIONS
     obs, infos = envs.reset(seed=2)
-    given = [obs]
+    results = [obs]
     for action in actions[:13]:
         *values, step_infos = envs.step(action)
-        given += values
+        results += values
         infos = step_infos or infos
-    given += [
+    results += [
         infos["_final_obs"],
         infos["_final_info"],
         infos["final_info"]["termination"],
         infos["final_info"]["_termination"],
     ]
-    given += infos["final_info"]["episode"].values()
-    given += [infos["final_obs"]] if tensors else [row for row in infos["final_obs"] if row is not None]
-    shown = [value.clone() if tensors else value.copy() for value in given]
+    results += infos["final_info"]["episode"].values()
+    results += [infos["final_obs"]] if tensors else [row for row in infos["final_obs"] if row is not None]
+    copies = [value.clone() if tensors else value.copy() for value in results]
     played(envs, actions[13:])
-    for value, copy in zip(given, shown, strict=True):
+    for value, copy in zip(results, copies, strict=True):
         np.testing.assert_array_equal(value, copy)
 
 
-def test_absurd_observations_and_rewards_are_kept_out():
+def test_nonfinite_and_huge_values_are_replaced():
     envs = GymVectorEnv(jumper())
     envs.reset()
     original = envs.env.step
@@ -143,7 +143,7 @@ def test_absurd_observations_and_rewards_are_kept_out():
 # ---------------------------------------------------------------- Gymnasium: episodes
 
 
-def test_an_ended_episode_begins_anew_in_the_same_step():
+def test_an_ended_episode_is_reset_in_the_same_step():
     envs, unreset, reset = GymVectorEnv(jumper(seed=3)), jumper(seed=3, auto_reset=False), jumper(seed=3)
     assert envs.metadata["autoreset_mode"] is gymnasium.vector.AutoresetMode.SAME_STEP
     envs.reset()
@@ -170,7 +170,7 @@ def test_an_ended_episode_begins_anew_in_the_same_step():
     assert not first.any() and (seen > 0).all(), seen
 
 
-def test_final_infos_tell_why_an_episode_ended():
+def test_final_info_names_the_termination():
     envs = GymVectorEnv(jumper())
     envs.reset()
     seen = set()
@@ -183,7 +183,7 @@ def test_final_infos_tell_why_an_episode_ended():
     assert {"too_long", "tilted"} <= seen
 
 
-def test_tensors_are_what_arrays_are():
+def test_tensors_equal_arrays():
     arrays, tensors = GymVectorEnv(jumper(seed=3), all_groups=True), GymVectorEnv(
         jumper(seed=3), all_groups=True, tensors=True
     )  # fmt: skip
@@ -202,7 +202,7 @@ def test_tensors_are_what_arrays_are():
             np.testing.assert_array_equal(infos["final_info"]["termination"], other_infos["final_info"]["termination"])
 
 
-def test_statistics_of_a_wrapper_are_those_counted_by_hand():
+def test_wrapper_statistics_equal_sums_over_steps():
     plain, envs = GymVectorEnv(jumper(seed=4)), RecordEpisodeStatistics(GymVectorEnv(jumper(seed=4)))
     plain.reset()
     envs.reset()
@@ -223,7 +223,7 @@ def test_statistics_of_a_wrapper_are_those_counted_by_hand():
     assert list(envs.length_queue) == expected and 12 in expected
 
 
-def test_wrappers_stack():
+def test_wrappers_can_be_nested():
     envs = NormalizeReward(RecordEpisodeStatistics(GymVectorEnv(jumper())))
     obs, _ = envs.reset(seed=1)
     assert obs in envs.observation_space
@@ -235,18 +235,18 @@ def test_wrappers_stack():
 
 
 @pytest.mark.parametrize("resample_at", ["reset", "startup"])
-def test_a_seed_makes_what_a_new_environment_of_it_makes(resample_at):
+def test_reset_with_a_seed_equals_a_new_environment_with_it(resample_at):
     task = dataclasses.replace(SHORT, randomization=RandomizationCfg(resample_at=resample_at))
     envs, new = (GymVectorEnv(jumper(task=task, seed=seed)) for seed in (1, 5))
     envs.reset()
     played(envs)
-    envs.env.episodes.level.fill_(2)  # as if the curriculum had gone on
+    envs.env.episodes.level.fill_(2)  # as after promotions by the curriculum
     np.testing.assert_array_equal(envs.reset(seed=5)[0], new.reset()[0])
     assert_same(played(envs), played(new))
     np.testing.assert_array_equal(envs.reset()[0], new.reset()[0])
 
 
-def test_a_seed_brings_every_world_back_to_its_first_task():
+def test_reset_with_a_seed_returns_worlds_to_their_first_task():
     env = jumper(2, task=[TASK, dataclasses.replace(TASK, name="other")], skill=np.array([1, 0]))
     env.reset()
     env.episodes.skill.zero_()
@@ -256,23 +256,23 @@ def test_a_seed_brings_every_world_back_to_its_first_task():
     assert env.episodes.requested_task.numpy().tolist() == [-1, -1]
 
 
-def test_seeds_reproduce_and_differ():
+def test_equal_seeds_reproduce_and_others_differ():
     envs = GymVectorEnv(jumper())
     first, other, again = (envs.reset(seed=seed)[0] for seed in (5, 6, 5))
     np.testing.assert_array_equal(first, again)
     assert (first != other).any(axis=1).all()
-    assert (envs.reset()[0] != first).any(axis=1).all()  # draws go on
+    assert (envs.reset()[0] != first).any(axis=1).all()  # without a seed the random numbers continue
 
 
 @pytest.mark.parametrize(("seed", "taken"), [(2**31 - 1, 2**31 - 1), (2**31, 0), (2**40 + 3, 3)])
-def test_large_seeds_are_taken_too(seed, taken):
+def test_large_seeds_are_accepted(seed, taken):
     envs = GymVectorEnv(jumper(1))
     envs.reset(seed=seed)
     assert envs.env.seed == taken
 
 
 @pytest.mark.parametrize("seed", [-1, 1.5])
-def test_what_is_no_seed_is_refused(seed):
+def test_refuses_an_invalid_seed(seed):
     envs = GymVectorEnv(jumper(1))
     with pytest.raises(gymnasium.error.Error, match="Seed must be"):
         envs.reset(seed=seed)
@@ -285,14 +285,14 @@ def test_what_is_no_seed_is_refused(seed):
     "actions",
     [np.zeros((N, 11)), np.zeros(12), np.zeros((N + 1, 12)), np.full((N, 12), "1"), np.zeros((N, 12), dtype=complex)],
 )
-def test_wrong_actions_are_refused(actions):
+def test_refuses_invalid_actions(actions):
     envs = GymVectorEnv(jumper())
     envs.reset()
     with pytest.raises(ValueError, match=rf"actions must be numbers of shape \({N}, 12\), got "):
         envs.step(actions)
 
 
-def test_wrong_tensors_are_refused():
+def test_refuses_invalid_action_tensors():
     envs = GymVectorEnv(jumper(), tensors=True)
     envs.reset()
     for actions in (torch.zeros(N, 11), torch.zeros(N, 12, dtype=torch.int64)):
@@ -300,14 +300,14 @@ def test_wrong_tensors_are_refused():
             envs.step(actions)
 
 
-def test_numbers_of_other_kinds_are_taken():
+def test_accepts_integers_and_lists_as_actions():
     envs = GymVectorEnv(jumper())
     envs.reset()
     for actions in (np.zeros((N, 12), dtype=int), [[0.0] * 12] * N):
         assert envs.step(actions)[0] in envs.observation_space
 
 
-def test_what_comes_out_of_order_is_refused():
+def test_refuses_calls_before_reset_and_after_close():
     envs = GymVectorEnv(jumper())
     with pytest.raises(gymnasium.error.ResetNeeded):
         envs.step(ACTIONS[0])
@@ -321,7 +321,7 @@ def test_what_comes_out_of_order_is_refused():
             call()
 
 
-def test_environments_that_do_not_fit_are_refused():
+def test_refuses_environments_without_auto_reset_or_of_several_tasks():
     with pytest.raises(ValueError, match="needs an environment with auto_reset"):
         GymVectorEnv(jumper(1, auto_reset=False))
     with pytest.raises(ValueError, match="needs an environment of one task, this one has 2"):
@@ -331,7 +331,7 @@ def test_environments_that_do_not_fit_are_refused():
 # ---------------------------------------------------------------- rsl-rl
 
 
-def test_rsl_rl_sees_the_environments_groups():
+def test_rsl_rl_gets_the_observation_groups():
     env = jumper()
     adapter = RslRlVecEnv(env, metrics_every=100)
     obs, extras = adapter.reset()
@@ -379,7 +379,7 @@ def test_rsl_rl_bootstraps_time_outs_but_not_failures(one_thread):
     assert (stored - reward)[time_out.bool()].abs().min() > 1.0e-4
 
 
-def test_rsl_rl_and_this_packages_trainer_log_the_same_keys(tmp_path, one_thread):
+def test_rsl_rl_logs_the_keys_of_this_packages_trainer(tmp_path, one_thread):
     adapter = RslRlVecEnv(jumper(4), metrics_every=SMALL.num_steps)
     adapter.reset()
     train_rsl_rl(adapter, SMALL, 2, save_interval=1, seed=0, folder=tmp_path)

@@ -1,4 +1,4 @@
-"""Turning in free flight: starts, goals, what is seen and counted, how turns are measured, and momentum that stays."""
+"""Attitude control in free flight: starts, goals, observations, success, metrics of turns, and conserved momentum."""
 
 import dataclasses
 
@@ -27,7 +27,7 @@ DEG = np.pi / 180.0
 
 @pytest.fixture(scope="module")
 def env():
-    """Nominal worlds with half a second in an episode; each test resets them."""
+    """Nominal worlds with episodes of half a second; each test resets them."""
     task = make_task("attitude")
     task = dataclasses.replace(
         task,
@@ -38,11 +38,11 @@ def env():
 
 
 def rotate_yaw(quat, goal):
-    """Return the rotations from orientations to goals, body axes."""
+    """Return the rotations from orientations to goals, both quaternions xyzw (n, 4), in body axes."""
     return Rotation.from_quat(quat).inv() * Rotation.from_quat(goal)
 
 
-def test_episodes_begin_afloat_at_rest_in_any_attitude_with_a_turn_of_the_level(env):
+def test_episodes_begin_at_rest_in_the_air_in_any_attitude_with_a_goal_of_the_level(env):
     env.reset()
     arrays, q = env.task_arrays(), env.sim.joint_q()
     angle = rotate_yaw(arrays["base_quat"], arrays["goal"]).magnitude() / DEG
@@ -60,7 +60,7 @@ def test_episodes_begin_afloat_at_rest_in_any_attitude_with_a_turn_of_the_level(
     assert not env.robot.collisions.numpy().any()
 
 
-def test_the_policy_sees_the_rotation_that_is_left(env):
+def test_the_remaining_rotation_is_observed(env):
     obs = env.reset()[0]["actor"].numpy()
     arrays = env.task_arrays()
     first, end = env.task.layout("actor")["turn_left"]
@@ -72,7 +72,7 @@ def test_the_policy_sees_the_rotation_that_is_left(env):
     np.testing.assert_allclose((mirror.signs * obs[:, mirror.order])[:, first:end], reflected, atol=1e-5)
 
 
-def test_an_episode_succeeds_within_tolerance_and_without_touching(env):
+def test_an_episode_succeeds_within_tolerance_and_without_collision(env):
     env.reset()
     records = env.skills[0].states.numpy().copy()
     records["goal"] = env.task_arrays()["base_quat"]
@@ -96,7 +96,7 @@ def test_an_episode_succeeds_within_tolerance_and_without_touching(env):
     assert metrics["Metrics/error_at_end_rad"] == pytest.approx(30.0 * DEG / N, abs=2e-3)
 
 
-def test_momentum_is_that_of_pinocchio(env):
+def test_momentum_and_inertia_agree_with_pinocchio(env):
     env.reset()
     for _ in range(5):
         env.step(torch.rand(N, 12) - 0.5)
@@ -117,14 +117,14 @@ def test_momentum_is_that_of_pinocchio(env):
 
 
 def stroke(seconds, hertz=2.0, reach=0.35):
-    """Return the action (12,) that leads all paws round in the sagittal plane, stretched one way, folded the other."""
+    """Return the action (12,) of paws circling in the sagittal plane, with legs stretched in one direction."""
     angle = 2.0 * np.pi * hertz * seconds
     front = np.array([1.0, 1.0, -1.0, -1.0])[:, None]
     swing, fold = front * reach * np.sin(angle), reach * np.cos(angle)
     return np.hstack([np.zeros((4, 1)), fold + swing, fold - swing]).ravel()
 
 
-def test_leg_motions_turn_the_robot_but_give_it_no_momentum(env):
+def test_leg_motions_turn_the_robot_without_angular_momentum(env):
     env.evaluation_reset([0.0, 0.0, 0.0, 1.0])
     start, drift = env.task_arrays()["base_quat"], []
     backward = np.where(np.arange(N) % 2 == 0, 1.0, -1.0)
@@ -134,10 +134,10 @@ def test_leg_motions_turn_the_robot_but_give_it_no_momentum(env):
         drift.append(np.linalg.norm(momentum(env.sim)[1], axis=1))
     angle = rotate_yaw(start, env.task_arrays()["base_quat"]).as_euler("YXZ", degrees=True)[:, 0]
     assert (angle * backward).max() < -15.0
-    assert np.max(drift) < 1.0e-5  # 0.010 kg m^2/s without the correction
+    assert np.max(drift) < 1.0e-5  # [kg m^2/s]; 0.010 without the momentum projection
 
 
-def test_turns_are_followed_until_they_settle(env):
+def test_turn_metrics_have_error_settling_time_and_success(env):
     turns = AttitudeLog(axis_turns(N, 90.0), seconds=0.2)
     run_evaluation(lambda obs: torch.zeros(N, 12), env, turns)
     np.testing.assert_allclose(env.task_arrays()["base_pos"][:, 2], 2.35, atol=0.05)
@@ -156,7 +156,7 @@ def test_turns_are_followed_until_they_settle(env):
     assert success() == 0.75
 
 
-def test_what_cannot_be_is_refused():
+def test_refuses_settings_out_of_range():
     with pytest.raises(InputError, match="within 0 to 180"):
         TurnCfg((20.0, 200.0))
     with pytest.raises(InputError, match=r"must be \(lower, upper\)"):

@@ -1,4 +1,4 @@
-"""Worlds that come apart, and numbers that are not finite: they end the episode and reach nobody."""
+"""Diverged worlds and non-finite actions: they end their own episode and change no other world."""
 
 import math
 
@@ -18,7 +18,7 @@ REST = torch.zeros((N, 12))
 
 @pytest.fixture(scope="module")
 def env():
-    """Standing starts, nominal, without noise."""
+    """Return N nominal worlds without noise that start in the default pose."""
     return make_env(N, reset=only("default"))
 
 
@@ -46,10 +46,10 @@ SUCCEEDING = {"phase": LANDED, "phase_steps": 100}
     [*((case, {}) for case in BROKEN), ("motor angle", SUCCEEDING), ("absurd velocity", SUCCEEDING)],
     ids=[*BROKEN, "motor angle at success", "absurd velocity at success"],
 )
-def test_a_world_that_came_apart_ends_at_once_and_touches_no_other(env, case, episode):
+def test_a_diverged_world_ends_at_once_and_changes_no_other(env, case, episode):
     outcomes = []
     for diverged in (False, True):
-        env.episodes.step_count.fill_(FIRST_STEP_COUNT)  # the same draws
+        env.episodes.step_count.fill_(FIRST_STEP_COUNT)  # the same random numbers
         env.reset()
         edit_episodes(env, command_step=1000)
         if diverged:
@@ -59,17 +59,17 @@ def test_a_world_that_came_apart_ends_at_once_and_touches_no_other(env, case, ep
         ended = (ending_names(env)[9], env.reward[9].item(), env.timeout[9].item())
         tensors = (env.obs, env.critic_obs, env.final_obs, env.final_critic_obs, env.reward)
         outcomes.append([*(tensor.clone() for tensor in tensors), env.robot.diverged.numpy().copy()])
-    assert ended == ("came_apart", 0.0, 0.0)
+    assert ended == ("diverged", 0.0, 0.0)
     others = [world for world in range(N) if world != 9]
-    for whole, harmed in zip(outcomes[0][:-1], outcomes[1][:-1], strict=True):
-        assert torch.equal(whole[others], harmed[others])
-        assert torch.isfinite(harmed).all()
-    assert outcomes[1][0].abs().max() < 50.0  # a new episode's
+    for expected, found in zip(outcomes[0][:-1], outcomes[1][:-1], strict=True):
+        assert torch.equal(expected[others], found[others])
+        assert torch.isfinite(found).all()
+    assert outcomes[1][0].abs().max() < 50.0  # observations of a new episode
     assert not outcomes[1][-1].any()
 
 
 @pytest.mark.parametrize("value", [NAN, INF, -INF])
-def test_an_action_that_is_not_finite_is_counted_and_ends_its_world_only(env, value):
+def test_a_nonfinite_action_is_counted_and_ends_the_episode_of_its_world_only(env, value):
     outcomes = []
     for wrong in (0.0, value):
         env.episodes.step_count.fill_(FIRST_STEP_COUNT)
@@ -82,11 +82,11 @@ def test_an_action_that_is_not_finite_is_counted_and_ends_its_world_only(env, va
         tensors = (env.obs, env.critic_obs, env.final_obs, env.final_critic_obs, env.reward)
         outcomes.append([*(tensor.clone().numpy() for tensor in tensors), env.sim.joint_q().copy()])
     others = [world for world in range(N) if world != 4]
-    for whole, harmed in zip(*outcomes, strict=True):
-        np.testing.assert_array_equal(whole[others], harmed[others])
-        assert np.isfinite(harmed).all()
-    assert ending_names(env) == ["" if world != 4 else "came_apart" for world in range(N)]
+    for expected, found in zip(*outcomes, strict=True):
+        np.testing.assert_array_equal(expected[others], found[others])
+        assert np.isfinite(found).all()
+    assert ending_names(env) == ["" if world != 4 else "diverged" for world in range(N)]
     assert (env.reward[4].item(), env.done[4].item(), env.timeout[4].item()) == (0.0, 1.0, 0.0)
     assert not env.final_obs[4].any() and env.metrics()["Metrics/bad_actions"] == 1.0
-    env.step(REST)  # the next action is a sound one
+    env.step(REST)  # the next action is finite
     assert ending_names(env) == [""] * N and env.metrics()["Metrics/bad_actions"] == 0.0

@@ -1,4 +1,4 @@
-"""Compiling side by side what an environment launches."""
+"""`Env.kernels` against the kernels that an environment launches."""
 
 import pytest
 import torch
@@ -10,7 +10,7 @@ from jumper_warp.registry import make_task
 
 @pytest.fixture
 def launched(monkeypatch):
-    """Collect the modules of all kernels that are launched."""
+    """Return a dict that collects the modules of all launched kernels, with the name of a kernel of each."""
     modules = {}
     launch = wp.launch
 
@@ -27,7 +27,7 @@ def compiled(env, **options):
 
 
 @pytest.mark.parametrize("task", ["vertical-jump", "velocity-flat"])
-def test_all_that_reset_and_step_launch_is_compiled_before(task, launched):
+def test_kernels_lists_all_modules_that_reset_and_step_launch(task, launched):
     env = Env(make_task(task), 2, seed=1, device="cpu")
     launched.clear()
     env.reset()
@@ -39,7 +39,7 @@ def test_all_that_reset_and_step_launch_is_compiled_before(task, launched):
     }
 
 
-def test_an_evaluation_does_not_compile_the_draw_of_starts(launched):
+def test_an_evaluation_does_not_compile_the_sampling_of_starts(launched):
     env = Env(make_task("vertical-jump"), 2, seed=1, device="cpu")
     launched.clear()
     env.evaluation_reset([0.0, 0.0, 0.7])

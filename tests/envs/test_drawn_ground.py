@@ -1,4 +1,4 @@
-"""When an environment draws the ground of its episodes, and what knows of the ground then."""
+"""Sampled ground: when an environment samples it, and the ground heights used by episodes and evaluations."""
 
 import dataclasses
 import math
@@ -19,11 +19,11 @@ from simulation_helpers import PAW_RADIUS, paw_centres
 N = 16
 REST = torch.zeros((N, 12))
 HALF_SPACE = BlockCfg((5.0, 0.0), half=(4.5, 6.0), height=0.06, mass=1.0e6)
-"""From x = 0.5 m on."""
+"""Fixed block, 0.06 m high, that covers the ground from x = 0.5 m on."""
 
 
 def ground_task(**shares) -> TaskCfg:
-    """Return the horizontal jump with far goals, whose starts have drawn grounds."""
+    """Return the horizontal jump with far goals and sampled ground; shares: of `GroundCfg`, default: all blocks."""
     task = make_task("horizontal-jump")
     task = dataclasses.replace(task, levels=task.levels[-1:])
     return resetting(task, dataclasses.replace(task.reset.settings, ground=GroundCfg(**(shares or {"block": 1.0}))))
@@ -33,10 +33,10 @@ def blocks_of(env: Env) -> np.ndarray:
     return env.sim.physics.dynamics.robot.ground.blocks.numpy()
 
 
-# ---------------------------------------------------------------- when
+# ---------------------------------------------------------------- sampling
 
 
-def test_a_randomised_training_draws_its_ground_from_the_first_reset_on():
+def test_a_randomised_environment_samples_ground_from_the_first_reset_on():
     env = Env(ground_task(), N, device="cpu")
     assert not blocks_of(env)["exists"].any() and len(blocks_of(env)) == N
     env.reset()
@@ -55,12 +55,12 @@ def test_a_randomised_training_draws_its_ground_from_the_first_reset_on():
     ],
     ids=["nominal", "mujoco", "heightfield", "no ground", "no share", "vertical"],
 )
-def test_nothing_is_drawn_otherwise(arguments):
+def test_no_ground_is_sampled_otherwise(arguments):
     env = make_env(2, **({"task": ground_task(), "randomize": True} | arguments))
     assert not resets_of(env).ground.drawn and env.sim.block is None and len(blocks_of(env)) == 0
 
 
-def test_a_block_that_is_given_stays_as_it_is():
+def test_a_configured_block_is_not_sampled():
     env = make_env(2, task=ground_task(), randomize=True, block=HALF_SPACE)
     found = blocks_of(env)
     assert not resets_of(env).ground.drawn and found["exists"].all()
@@ -68,7 +68,7 @@ def test_a_block_that_is_given_stays_as_it_is():
     np.testing.assert_allclose(found["height"], 0.06)
 
 
-def test_an_evaluation_levels_the_ground_and_a_reset_draws_it_again():
+def test_an_evaluation_levels_the_ground_and_a_reset_samples_it_again():
     ground = GroundCfg(platform=0.5, block=0.5)
     env = make_env(N, task=ground_task(), reset=only("default", ResetCfg(ground=ground)), randomize=True)
     assert blocks_of(env)["exists"].any()
@@ -84,7 +84,7 @@ def test_an_evaluation_levels_the_ground_and_a_reset_draws_it_again():
 # ---------------------------------------------------------------- evaluations and further jumps
 
 
-def test_an_evaluation_stands_robots_on_the_block_below_them():
+def test_an_evaluation_starts_robots_on_the_block_below_them():
     tops = np.linspace(0.02, 0.2, N)
     block = BlockCfg((0.1, 0.0), half=(0.5, 0.5), height=tops, mass=1.0e6, friction=1.0)
     env = make_env(N, task=make_task("horizontal-jump"), block=block)
@@ -104,14 +104,14 @@ def test_an_evaluation_stands_robots_on_the_block_below_them():
     np.testing.assert_allclose(paw_centres(env.sim)[..., 2], tops[:, None] + PAW_RADIUS + np.zeros(4), atol=2e-3)
 
 
-def test_an_evaluation_stands_robots_on_the_floor_beside_a_block():
+def test_an_evaluation_starts_robots_on_the_floor_outside_a_block():
     env = make_env(2, task=make_task("horizontal-jump"), block=HALF_SPACE)
     env.evaluation_reset([[0.45, 0.0, 0.0], [0.55, 0.0, 0.0]])
     np.testing.assert_allclose(env.sim.joint_q()[:, 2], env.sim.model.joint_q.numpy()[2], atol=1e-6)
     np.testing.assert_allclose(env.task_arrays()["goal_ground"], [0.0, 0.06], atol=1e-6)
 
 
-def test_an_evaluation_knows_the_height_of_uneven_ground_at_its_goals():
+def test_an_evaluation_sets_the_height_of_uneven_ground_at_its_goals():
     env = make_env(3, task=make_task("horizontal-jump"), ground=platform(-0.15, edge=0.5))
     env.evaluation_reset([[0.45, 0.0, 0.0], [0.8, 0.0, 0.0], [0.8, 0.0, 0.0]], headings=np.array([0.0, 0.0, np.pi]))
     np.testing.assert_allclose(env.task_arrays()["goal_ground"], [0.0, -0.15, 0.0], atol=1e-5)
@@ -119,7 +119,7 @@ def test_an_evaluation_knows_the_height_of_uneven_ground_at_its_goals():
 
 @pytest.fixture
 def landed():
-    """Robots that have landed at x = 0, 0.1, ... m before or on the block."""
+    """Return an environment of robots that landed at x = 0, 0.1, ... m, before or on the block."""
     env = make_env(N, task=make_task("horizontal-jump"), reset=only("default", heading=180.0), block=HALF_SPACE)
     for world in range(N):
         edit_coordinates(env, world, q={0: 0.1 * world})
@@ -128,11 +128,11 @@ def landed():
 
 
 def on_block(goal: np.ndarray) -> np.ndarray:
-    """Height [m] of the ground at goals."""
+    """Return the height [m] of the ground at goals (n, 3)."""
     return np.where(goal[:, 0] > 0.5, 0.06, 0.0)
 
 
-def test_the_next_jump_of_an_evaluation_knows_the_ground_at_its_goal(landed):
+def test_the_next_jump_of_an_evaluation_has_the_ground_height_at_its_goal(landed):
     goals = np.tile([0.75, 0.3, 0.0], (N, 1))
     landed.command(goals, np.arange(N) > 1)
     found = landed.task_arrays()
@@ -142,7 +142,7 @@ def test_the_next_jump_of_an_evaluation_knows_the_ground_at_its_goal(landed):
     assert len(set(found["goal_ground"][2:])) == 2
 
 
-def test_another_jump_of_an_episode_knows_the_ground_at_its_goal(landed):
+def test_the_next_jump_of_an_episode_has_the_ground_height_at_its_goal(landed):
     edit_episodes(landed, next_jump_step=5, level=4)
     landed._reset_worlds(landed._part(), landed.episodes.done)
     found = landed.task_arrays()
@@ -151,7 +151,7 @@ def test_another_jump_of_an_episode_knows_the_ground_at_its_goal(landed):
     assert len(set(found["goal_ground"])) == 2
 
 
-def test_another_jump_looks_for_its_goal_on_the_block_where_it_is_now(landed):
+def test_the_ground_height_at_the_next_goal_uses_the_blocks_current_position(landed):
     moved = blocks_of(landed)
     moved["center"][:, 0] += 20.0
     landed.sim.physics.dynamics.robot.ground.blocks.assign(moved)
@@ -165,11 +165,11 @@ def test_another_jump_looks_for_its_goal_on_the_block_where_it_is_now(landed):
 @pytest.mark.parametrize(
     ("values", "message"),
     [
-        ({"platform": -0.1}, "shares must be >= 0 and add up to at most 1, got -0.1, 0.0"),
-        ({"block": -0.1}, "shares must be"),
-        ({"platform": 0.6, "block": 0.5}, "shares must be .* got 0.6, 0.5"),
-        ({"platform": math.nan}, "shares must be"),
-        ({"block": math.nan}, "shares must be"),
+        ({"platform": -0.1}, "probabilities must be >= 0, in sum at most 1, got -0.1, 0.0"),
+        ({"block": -0.1}, "probabilities must be"),
+        ({"platform": 0.6, "block": 0.5}, "probabilities must be .* got 0.6, 0.5"),
+        ({"platform": math.nan}, "probabilities must be"),
+        ({"block": math.nan}, "probabilities must be"),
         ({"drop": (0.2, 0.1)}, r"ground drop must be \(lower, upper\), positive and finite, got \(0.2, 0.1\)"),
         ({"rise": (0.0, 0.1)}, "ground rise must be"),
         ({"mass": (5.0, math.inf)}, "ground mass must be"),
@@ -180,19 +180,19 @@ def test_another_jump_looks_for_its_goal_on_the_block_where_it_is_now(landed):
         ({"clearance": math.nan}, "ground clearance must be"),
     ],
 )
-def test_impossible_grounds_are_refused(values, message):
+def test_refuses_invalid_ground_settings(values, message):
     with pytest.raises(ValueError, match=message) as caught:
         GroundCfg(**values)
     assert "\n" not in str(caught.value)
 
 
 @pytest.mark.parametrize(("platform_share", "block_share"), [(1.0, 0.0), (0.0, 1.0), (0.5, 0.5)])
-def test_shares_up_to_all_starts_are_taken(platform_share, block_share):
+def test_accepts_shares_that_add_up_to_1(platform_share, block_share):
     assert GroundCfg(platform=platform_share, block=block_share).drawn
     assert not GroundCfg().drawn
 
 
-def test_settings_reach_the_kernels_by_name():
+def test_ground_settings_reach_the_kernel_struct_by_name():
     cfg = GroundCfg(
         platform=0.25, block=0.5, drop=(0.125, 0.25), rise=(0.0625, 0.5), room=0.75, clearance=0.375,
         mass=(2.0, 4.0), friction=(0.5, 0.625),

@@ -39,14 +39,14 @@ def my_own_term(robot: RobotView, state: JumpState, scale: float) -> float:
 
 
 def stand(env: Env, **fields) -> None:
-    """Begin episodes in the default pose, and overwrite fields of all of them."""
+    """Reset all worlds, and overwrite fields of their states."""
     env.reset()
     edit_episodes(env, **fields)
 
 
 @pytest.fixture(scope="module")
 def env():
-    """Standing starts, nominal, without noise; the tests begin with `stand`."""
+    """Return N nominal worlds without noise that start in the default pose; the tests begin with `stand`."""
     return make_env(N, reset=only("default"))
 
 
@@ -55,7 +55,7 @@ def env():
 
 @pytest.fixture(scope="module")
 def rollout():
-    """Logged and expected terms of jumps from all starts, (steps, terms, worlds), with rewards and phases."""
+    """Return logged and expected terms of jumps from all starts, (steps, terms, worlds), with rewards and phases."""
     env = make_env(64, seed=3)
     logged, expected, rewarded, phases = [], [], [], []
     noise = 0.2 * random_actions(64, 150)
@@ -73,7 +73,7 @@ def rollout():
     return np.array(logged), np.array(expected), np.array(rewarded), np.array(phases)
 
 
-def test_the_rollout_meets_every_phase_and_term(rollout):
+def test_the_rollout_contains_every_phase_and_pays_every_term(rollout):
     logged, _, _, phases = rollout
     assert {int(STANCE), int(FLIGHT), int(LANDED)} == set(np.unique(phases).tolist())
     paid = {term.name for term, values in zip(TASK.rewards, logged.transpose(1, 0, 2), strict=True) if values.any()}
@@ -81,14 +81,14 @@ def test_the_rollout_meets_every_phase_and_term(rollout):
 
 
 @pytest.mark.parametrize("index", range(len(TASK.rewards)), ids=[term.name for term in TASK.rewards])
-def test_a_term_is_logged_as_computed_by_hand(rollout, index):
+def test_a_logged_term_equals_the_numpy_oracle(rollout, index):
     logged, expected, _, _ = rollout
     scale = np.abs(expected[:, index]).max()
     np.testing.assert_allclose(logged[:, index], expected[:, index], rtol=2e-3, atol=2e-4 * scale)
 
 
 ENDING_CASES = {
-    "success": {"phase": LANDED, "phase_steps": 59, "steps": 5000},  # holds together with too_long
+    "success": {"phase": LANDED, "phase_steps": 59, "steps": 5000},  # at the same time as too_long
     "low_base": {},
     "moved_away": {"start": (0.3, 0.0, 0.3)},
     "no_jump": {"steps": 180, "command_step": 0},
@@ -109,21 +109,21 @@ def test_a_termination_ends_the_episode(env, termination):
     assert env.timeout.tolist() == [float(world == 3 and without_failure) for world in range(N)]
 
 
-def test_counters_are_means_of_the_episodes_that_ended(env):
+def test_metrics_are_means_over_ended_episodes(env):
     stand(env, command_step=1000)
     env.metrics()
     edit_episodes(env, slice(0, 3), phase=LANDED, phase_steps=59, max_height=0.8, goal=(0.0, 0.0, 0.77))
     edit_episodes(env, slice(3, 7), steps=200, command_step=0)
-    edit_episodes(env, slice(7, 9), phase=LANDED, phase_steps=59, start_mode=4)  # begun just landed: not counted
+    edit_episodes(env, slice(7, 9), phase=LANDED, phase_steps=59, start_mode=4)  # start_mode landed: not counted
     env.step(REST)
     total = env.skills[0].term_value.numpy()[:, :9].sum(axis=1)
-    figures = env.metrics()
-    assert figures["Metrics/success"] == pytest.approx(3.0 / 7.0)
-    assert figures["Metrics/error_of_successes_m"] == pytest.approx(0.03, abs=1e-6)
-    assert figures["Episode_Termination/success"] == pytest.approx(5.0 / 9.0)
-    assert figures["Episode_Termination/no_jump"] == pytest.approx(4.0 / 9.0)
+    metrics = env.metrics()
+    assert metrics["Metrics/success"] == pytest.approx(3.0 / 7.0)
+    assert metrics["Metrics/error_of_successes_m"] == pytest.approx(0.03, abs=1e-6)
+    assert metrics["Episode_Termination/success"] == pytest.approx(5.0 / 9.0)
+    assert metrics["Episode_Termination/no_jump"] == pytest.approx(4.0 / 9.0)
     for term, value in zip(TASK.rewards, total, strict=True):
-        assert figures[f"Episode_Reward/{term.name}"] == pytest.approx(value / 9.0 / 20.0, rel=1e-4, abs=1e-7)
+        assert metrics[f"Episode_Reward/{term.name}"] == pytest.approx(value / 9.0 / 20.0, rel=1e-4, abs=1e-7)
     cleared = env.metrics()
     assert not any(value for name, value in cleared.items() if not name.startswith("Curriculum"))
 
@@ -142,18 +142,18 @@ def finish(env, worlds, success: bool) -> None:
 
 @pytest.mark.parametrize("start_mode", [2, 3, 4])
 @pytest.mark.parametrize("success", [True, False])
-def test_other_starts_do_not_count_for_the_curriculum(env, start_mode, success):
+def test_starts_in_flight_touchdown_or_landed_do_not_count_for_the_curriculum(env, start_mode, success):
     stand(env, level=1, streak=3, command_step=1000)
     edit_episodes(env, [0], start_mode=start_mode)
     finish(env, [0], success)
     assert (episodes_of(env)["level"][0], episodes_of(env)["streak"][0]) == (1, 3)
 
 
-# ---------------------------------------------------------------- beginning anew
+# ---------------------------------------------------------------- resets
 
 
 def drawn_of(env) -> dict[str, np.ndarray]:
-    """Return the drawn parameters; the world is the last index."""
+    """Return the randomised parameters by name; the world is the last index."""
     parameters, motors = env.parameters, env.parameters.motors
     found = {name: getattr(parameters, name).numpy().copy() for name in ("latency", "static_ratio")}
     found |= {name: getattr(motors, name).numpy().copy() for name in ("kp", "kd", "no_load_speed", "offset")}
@@ -162,7 +162,7 @@ def drawn_of(env) -> dict[str, np.ndarray]:
 
 
 def twins(**arguments):
-    """Return two equal environments, some steps into equal episodes."""
+    """Return two equal environments after some equal steps."""
     pair = [make_env(N, seed=5, noise=True, randomize=True, **arguments) for _ in range(2)]
     for action in random_actions(N, 3):
         for env in pair:
@@ -170,7 +170,7 @@ def twins(**arguments):
     return pair
 
 
-def test_a_new_episode_leaves_other_worlds_alone():
+def test_a_reset_changes_no_other_world():
     one, other = twins()
     edit_episodes(one, 7, phase=LANDED, phase_steps=59)
     for env in (one, other):
@@ -188,7 +188,7 @@ def test_a_new_episode_leaves_other_worlds_alone():
     assert (one.skills[0].states.numpy()[rest] == other.skills[0].states.numpy()[rest]).all()
 
 
-def test_the_last_observation_of_an_episode_is_kept_beside_the_first_of_the_next():
+def test_final_obs_is_the_last_observation_and_obs_the_first_of_the_next_episode():
     one, other = twins()
     other.auto_reset = False
     for env in (one, other):
@@ -196,14 +196,14 @@ def test_the_last_observation_of_an_episode_is_kept_beside_the_first_of_the_next
         env.step(REST)
     ended = one.done == 1.0
     assert ended[:5].all() and not ended.all()
-    assert torch.equal(one.final_obs, other.final_obs)  # of a twin that does not begin anew
+    assert torch.equal(one.final_obs, other.final_obs)  # those of an equal environment without auto_reset
     assert torch.equal(one.obs[~ended], one.final_obs[~ended])
     assert (one.obs[ended] != one.final_obs[ended]).any(dim=1).all()
     height = one.sim.joint_q()[:, 2]
     assert np.abs(one.obs[:, 2].numpy() - height).max() <= 0.005 + 1e-6
 
 
-def test_a_new_episode_forgets_the_old_one():
+def test_a_reset_clears_histories_and_counters():
     env = make_env(N, reset=only("standing"), seed=2)
     for action in random_actions(N, 10):
         env.step(action)
@@ -222,15 +222,15 @@ def test_a_new_episode_forgets_the_old_one():
     np.testing.assert_array_equal(env.delays.target_history.numpy(), np.broadcast_to(angles.T, (8, 12, N)))
 
 
-def test_commands_of_a_measurement_may_come_one_by_one(env):
-    delays = np.arange(N) / 120.0  # every other one between two policy steps
+def test_an_evaluation_may_delay_commands_by_world(env):
+    delays = np.arange(N) / 120.0  # [s] every second delay is between two policy steps
     env.evaluation_reset(jump_commands(np.zeros((N, 3)), delays, env.step_dt))
     found = env.task_arrays()["command_step"]
     np.testing.assert_array_equal(found[::2], np.arange(len(found[::2])))
     assert (np.abs(found - 60.0 * delays) <= 0.5).all()
 
 
-def test_a_policy_is_measured_from_equal_starts(env):
+def test_an_evaluation_starts_all_worlds_in_the_default_pose(env):
     goals = np.zeros((N, 3))
     goals[:, 2] = np.linspace(0.5, 1.2, N)
     env.evaluation_reset(jump_commands(goals, 0.25, env.step_dt))
@@ -241,7 +241,7 @@ def test_a_policy_is_measured_from_equal_starts(env):
     np.testing.assert_allclose(env.obs[:, 0], goals[:, 2], atol=1e-6)
 
 
-# ---------------------------------------------------------------- the sequence of launches
+# ---------------------------------------------------------------- reproducibility and solvers
 
 
 def run(env, actions):
@@ -252,7 +252,7 @@ def run(env, actions):
     return trace
 
 
-def test_the_same_seed_gives_the_same_hundred_steps_and_another_does_not():
+def test_hundred_steps_are_bitwise_equal_for_equal_seeds_only():
     actions = random_actions(N, 100)
     first, again, other = (
         run(make_env(N, seed=seed, noise=True, randomize=True), actions) for seed in (11, 11, 12)
@@ -262,8 +262,8 @@ def test_the_same_seed_gives_the_same_hundred_steps_and_another_does_not():
     assert sum(done.sum() for done in first[3::4]) > 10
 
 
-def test_mujoco_takes_the_same_steps():
-    """A stand of half a second: both solvers end in the same pose and pay alike."""
+def test_standing_has_the_same_pose_and_reward_on_both_solvers():
+    """The robot stands for half a second."""
     ends = []
     for solver in ("jumper", "mujoco"):
         env = make_env(2, reset=only("default", command_delay=0.0), solver=solver)
@@ -279,15 +279,15 @@ def test_mujoco_takes_the_same_steps():
     np.testing.assert_allclose(ends[0][1], ends[1][1], rtol=0.05)
 
 
-# ---------------------------------------------------------------- tables
+# ---------------------------------------------------------------- configuration
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: dataclasses.replace(TASK, rewards=(*TASK.rewards, TASK.rewards[0])), "name of its own"),
-        (lambda: dataclasses.replace(TASK, terminations=()), "came_apart"),
-        (lambda: dataclasses.replace(TASK, terminations=TASK.terminations[:1]), "came_apart"),
+        (lambda: dataclasses.replace(TASK, rewards=(*TASK.rewards, TASK.rewards[0])), "names of terms must be unique"),
+        (lambda: dataclasses.replace(TASK, terminations=()), "diverged"),
+        (lambda: dataclasses.replace(TASK, terminations=TASK.terminations[:1]), "diverged"),
         (
             lambda: dataclasses.replace(TASK, levels=()),
             "argument 6 of reset_jump is JumpLevel, the task has NoSettings",
@@ -314,16 +314,16 @@ def test_mujoco_takes_the_same_steps():
         (lambda: Env(TASK, 0, device="cpu"), "num_envs must be a whole number of at least 1, got 0"),
         (lambda: Env(TASK, 16.0, device="cpu"), "num_envs must be a whole number of at least 1, got 16.0"),
         (lambda: Env(TASK, 1, device="cpu", seed=-1), r"seed must be in 0 \.\. 2147483647, got -1"),
-        (lambda: Env(TASK, 1, device="cpu", robot="robot.json"), "robot must be a RobotOverlay, .* got 'robot.json'"),
+        (lambda: Env(TASK, 1, device="cpu", robot="robot.json"), "robot must be a RobotOverlay .*, got 'robot.json'"),
         (lambda: Env(TASK, 1, device="cpu", solver="bullet"), "solver must be"),
     ],
 )
-def test_impossible_configurations_are_refused(make, message):
+def test_refuses_invalid_configurations(make, message):
     with pytest.raises(ValueError, match=message):
         make()
 
 
-def test_the_configuration_names_its_functions(env):
+def test_the_saved_configuration_names_the_terms_functions(env):
     config = env.config()
     assert isinstance(env.task, TaskCfg) and config["task"]["rewards"][0]["func"].endswith(":jump_height")
     assert config["policy_dt_s"] == pytest.approx(1.0 / 60.0)

@@ -24,7 +24,7 @@ ALL_ON = {"randomize": True, "noise": True}
 
 
 class Recorded(Env):
-    """Keeps the rewards of all steps."""
+    """Environment that stores the rewards of all steps."""
 
     def step(self, action):
         result = super().step(action)
@@ -33,7 +33,7 @@ class Recorded(Env):
 
 
 def train_jump(cfg):
-    """Train on the vertical jump with everything random; return the environment and the last checkpoint."""
+    """Train on the randomised vertical jump; return the environment and the last checkpoint."""
     made = []
 
     def make(num_envs, seed, device):
@@ -52,7 +52,7 @@ def cfg(tmp_path):
     )  # fmt: skip
 
 
-def test_a_resumed_training_goes_on_bit_for_bit(cfg):
+def test_a_resumed_training_continues_bitwise(cfg):
     whole, expected = train_jump(cfg)
     assert sum(state.sum() for state in whole.rewards) > 0.0
     (path,) = cfg.log_root.glob("jump/*/checkpoints/iteration_000002.pt")
@@ -67,7 +67,7 @@ def test_a_resumed_training_goes_on_bit_for_bit(cfg):
         assert equal(found[part], expected[part]), part
 
 
-def test_the_same_seed_trains_the_same_and_another_does_not(cfg):
+def test_trainings_are_bitwise_equal_for_equal_seeds_only(cfg):
     cfg = dataclasses.replace(cfg, max_iterations=3)
     first, again, other = (train_jump(dataclasses.replace(cfg, seed=seed)) for seed in (1, 1, 2))
     assert all(torch.equal(a, b) for a, b in zip(first[0].rewards, again[0].rewards, strict=True))
@@ -77,11 +77,14 @@ def test_the_same_seed_trains_the_same_and_another_does_not(cfg):
     assert not torch.equal(*weights)
 
 
-# ---------------------------------------------------------------- the environment alone
+# ---------------------------------------------------------------- environment
 
 
-def go_on_alike(saved, fresh):
-    """Step two environments with the same actions, which must stay the same and end some episodes; yields each step."""
+def assert_equal_steps(saved, fresh):
+    """Step two environments with the same actions, assert that they stay equal, and yield the index of each step.
+
+    At least one episode must end.
+    """
     ended = 0.0
     for step, action in enumerate(random_actions(saved.num_envs, 25, seed=1)):
         for env in (saved, fresh):
@@ -98,7 +101,7 @@ def go_on_alike(saved, fresh):
 
 
 @pytest.mark.parametrize("solver", ["jumper", "mujoco"])
-def test_an_environment_goes_on_from_a_saved_state_bit_for_bit(solver):
+def test_an_environment_continues_bitwise_from_a_saved_state(solver):
     count = 8 if solver == "mujoco" else N
     saved, fresh = (make_env(count, seed=1, solver=solver, **ALL_ON) for _ in range(2))
     for action in random_actions(count, 5):
@@ -106,19 +109,19 @@ def test_an_environment_goes_on_from_a_saved_state_bit_for_bit(solver):
     edit_episodes(saved, level=np.arange(count) % 4, streak=np.arange(count) % 5)
     saved.metrics()
     fresh.load_state_dict(saved.state_dict())
-    assert len(list(go_on_alike(saved, fresh))) == 25
+    assert len(list(assert_equal_steps(saved, fresh))) == 25
     assert fresh.metrics() == saved.metrics()
 
 
 def ground_env(count=N, platform=0.4, block=0.6, **arguments):
-    """Environment of far goals, whose starts have a platform or a block where there is room."""
+    """Return an environment with far goals, whose starts have a platform or a block where there is room."""
     task = make_task("horizontal-jump")
     ground = dataclasses.replace(task.reset.settings, ground=GroundCfg(platform=platform, block=block))
     task = resetting(dataclasses.replace(task, levels=task.levels[-1:]), ground)
     return make_env(count, task=task, **({"seed": 1} | ALL_ON | arguments))
 
 
-def test_an_environment_goes_on_with_its_drawn_grounds_bit_for_bit():
+def test_an_environment_continues_bitwise_with_sampled_ground():
     saved, fresh = ground_env(), ground_env()
     for action in random_actions(N, 5):
         saved.step(action)
@@ -128,7 +131,7 @@ def test_an_environment_goes_on_with_its_drawn_grounds_bit_for_bit():
     sliding["velocity"] = 0.3 * sliding["exists"][:, None]
     blocks.assign(sliding)
     fresh.load_state_dict(saved.state_dict())
-    for step in go_on_alike(saved, fresh):
+    for step in assert_equal_steps(saved, fresh):
         found, expected = (env.sim.physics.dynamics.robot.ground.blocks.numpy() for env in (fresh, saved))
         assert (found == expected).all(), step
         if step == 0:
@@ -137,7 +140,7 @@ def test_an_environment_goes_on_with_its_drawn_grounds_bit_for_bit():
 
 
 @pytest.mark.parametrize(("blocks", "message"), [(True, "lacks .*'block.center'"), (False, "has .*'block.center'")])
-def test_blocks_in_only_one_of_state_and_environment_are_refused(blocks, message):
+def test_refuses_a_state_with_blocks_in_an_environment_without_and_vice_versa(blocks, message):
     with_blocks, level = ground_env(2), ground_env(2, platform=0.0, block=0.0)
     env, other = (with_blocks, level) if blocks else (level, with_blocks)
     before = env.state_dict()
@@ -150,23 +153,23 @@ def test_blocks_in_only_one_of_state_and_environment_are_refused(blocks, message
 def test_a_saved_state_does_not_change_with_the_environment():
     env = make_env(2)
     state = env.state_dict()
-    kept = {name: value.clone() for name, value in state.items()}
+    copies = {name: value.clone() for name, value in state.items()}
     env.step(torch.ones((2, 12)))
-    assert equal(state, kept)
+    assert equal(state, copies)
     assert all(value.device.type == "cpu" for value in state.values())
 
 
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"num_envs": 4}, "saved for 2 environments, there are 4"),
-        ({"seed": 9}, "saved with seed 1, this environment draws with seed 9"),
+        ({"num_envs": 4}, "saved with num_envs 2, this environment has 4"),
+        ({"seed": 9}, "saved with seed 1, this environment has seed 9"),
         ({"randomize": False}, "saved with other randomisation or events of vertical-jump"),
         ({"task": dataclasses.replace(make_task("vertical-jump"), motors=jumping_motors(12.0))}, "with other robots"),
         ({"solver": "mujoco"}, "lacks .*'solver.qacc_warmstart'"),
     ],
 )
-def test_a_state_that_does_not_fit_is_refused_and_nothing_changes(change, message):
+def test_refuses_a_state_of_another_environment_without_changes(change, message):
     state = make_env(2, seed=1, randomize=True).state_dict()
     arguments = {"num_envs": 2, "seed": 1, "randomize": True} | change
     env = make_env(arguments.pop("num_envs"), **arguments)
@@ -189,7 +192,7 @@ def test_a_state_that_does_not_fit_is_refused_and_nothing_changes(change, messag
         ("parameters.observation_latency", -1, "saved parameters.observation_latency must not be below 0, got -1"),
     ],
 )
-def test_a_number_that_points_out_of_an_array_is_refused_and_nothing_changes(name, value, message):
+def test_refuses_an_index_out_of_range_without_changes(name, value, message):
     env = make_env(2)
     before, state = env.state_dict(), env.state_dict()
     state[name][1] = value
@@ -198,27 +201,27 @@ def test_a_number_that_points_out_of_an_array_is_refused_and_nothing_changes(nam
     assert equal(env.state_dict(), before)
 
 
-def test_a_field_that_came_or_went_is_told():
+def test_refusal_names_missing_and_unexpected_fields():
     env = make_env(2)
     state = env.state_dict()
     state["vertical-jump.cadence"] = state.pop("vertical-jump.phase")
-    with pytest.raises(ValueError, match=r"lacks \['vertical-jump.phase'\], has \['vertical-jump.cadence'\] besides"):
+    with pytest.raises(ValueError, match=r"lacks \['vertical-jump.phase'\], has unknown \['vertical-jump.cadence'\]"):
         env.load_state_dict(state)
 
 
-def test_every_drawn_parameter_is_saved_and_the_fingerprint_does_not_see_it():
-    """A drawn parameter that differs changes the state; put back, it is what it was, in the solver too."""
+def test_every_randomised_parameter_is_restored_and_is_not_in_the_fingerprint():
+    """A changed parameter changes the state; loading restores it, in the solver too."""
     env = make_env(2)
     whole = env.state_dict()
     model, motors, parameters = env.sim.model, env.sim.motors, env.parameters
-    drawn = (
+    arrays = (
         model.body_mass, model.body_com, model.body_inertia, model.joint_armature, model.joint_friction,
         model.shape_material_mu, motors.kp, motors.kd, motors.saturation, motors.no_load_speed, motors.cutoff_speed,
         motors.offset, parameters.push, parameters.static_ratio, parameters.latency, parameters.observation_latency,
         parameters.gain_ratio, parameters.speed_ratio, parameters.torque_ratio,
     )  # fmt: skip
     table = env.sim.physics.dynamics.robot.table.numpy().copy()
-    for array in drawn:
+    for array in arrays:
         values = array.numpy().copy()
         array.assign(values + 1)
         env.sim.physics.parameters_changed()
@@ -229,13 +232,13 @@ def test_every_drawn_parameter_is_saved_and_the_fingerprint_does_not_see_it():
         np.testing.assert_array_equal(env.sim.physics.dynamics.robot.table.numpy(), table)
 
 
-def test_an_environment_goes_on_with_late_observations_and_history_bit_for_bit():
-    """Latency to and from the policy, frames of the past, pushes that come and go, all redrawn at every reset."""
+def test_an_environment_continues_bitwise_with_observation_latency_and_history():
+    """Latencies, histories and intermittent pushes are sampled again at every reset."""
     saved, fresh = (Env(hold_height(), N, seed=1, device="cpu") for _ in range(2))
     saved.reset()
     states = saved.skills[0].states
     records = states.numpy().copy()
-    records["steps"] = 120 - np.linspace(10, 62, N)  # a part ends before the saving, the others after it
+    records["steps"] = 120 - np.linspace(10, 62, N)  # some episodes end before saving, the others afterwards
     states.assign(wp.array(records, dtype=states.dtype, device="cpu"))
     drawn = []
     for action in random_actions(N, 37):
@@ -245,10 +248,10 @@ def test_an_environment_goes_on_with_late_observations_and_history_bit_for_bit()
     fresh.load_state_dict(saved.state_dict())
     for name in ("obs", "critic_obs"):
         assert torch.equal(getattr(saved, name), getattr(fresh, name))
-    assert len(list(go_on_alike(saved, fresh))) == 25
+    assert len(list(assert_equal_steps(saved, fresh))) == 25
 
 
-def test_numbers_that_were_set_come_back_and_the_others_are_the_tasks():
+def test_loading_restores_changed_parameters_and_resets_the_others_to_the_task():
     env, other = (make_env(4, **settings) for settings in ({}, {"task": make_task("vertical-jump").with_terms(
         "rewards", orientation={"weight": 3.5})}))  # fmt: skip
     env.skills[0].set("rewards", "jump_height", weight=7.0, std_fine=0.2)
@@ -261,11 +264,11 @@ def test_numbers_that_were_set_come_back_and_the_others_are_the_tasks():
         expected[params.index(f"rewards.jump_height.{key}")] = value
     np.testing.assert_array_equal(numbers, expected)
     state["vertical-jump/changed"][0] = np.nan
-    with pytest.raises(ValueError, match="changed is not a number"):
+    with pytest.raises(ValueError, match="changed contains NaN"):
         other.load_state_dict(state)
 
 
-def test_a_state_of_before_the_first_reset_begins_as_a_new_environment_does():
+def test_a_state_saved_without_a_reset_starts_like_a_new_environment():
     task = dataclasses.replace(make_task("vertical-jump"), randomization=RandomizationCfg(resample_at="startup"))
     saved, fresh = (Env(task, 2, seed=1, device="cpu") for _ in range(2))
     fresh.load_state_dict(saved.state_dict())

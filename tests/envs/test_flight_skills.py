@@ -1,4 +1,4 @@
-"""Turning as a skill in the flight of a jump: when it takes over, what it is to do, and when it hands back."""
+"""Attitude control as a skill in the flight of a jump: handovers to and from the jump, goal, and metrics."""
 
 import numpy as np
 import pytest
@@ -19,7 +19,7 @@ MARS = 3.71
 
 @pytest.fixture(scope="module")
 def flown():
-    """Robots that jump tilted and do nothing in flight: the environment, the flights, and their skills over time."""
+    """Return environment, flight log and states by step of robots that take off with a tilt, with legs held still."""
     tasks, handovers = flight_skills(make_task("vertical-jump-mars"), make_task("attitude"))
     env = Env(tasks, N, device="cpu", randomize=False, noise=False, auto_reset=False, handovers=handovers)
     flights, seen = FlightLog(np.full(len(LATE), 2.5), LATE), []
@@ -35,7 +35,7 @@ def flown():
     return env, flights, seen
 
 
-def test_turning_takes_over_in_flight_and_hands_back_before_the_landing(flown):
+def test_turning_takes_over_in_flight_and_hands_back_before_touchdown(flown):
     _, flights, seen = flown
     skills = np.array([skill for skill, *_ in seen])
     for world in range(N):
@@ -43,14 +43,14 @@ def test_turning_takes_over_in_flight_and_hands_back_before_the_landing(flown):
         assert [skills[change, world] for change in changes] == [TURN, JUMP]
         up, down = changes
         assert seen[up][4][world] > 2.0 and seen[down][4][world] < -2.0
-        # from there it falls to 0.45 m in a little less than 0.35 s
+        # time to fall to 0.45 m: a little less than 0.35 s
         height, rise = seen[down][3][world], seen[down][4][world]
         under_root = rise**2 + 2.0 * MARS * (height - 0.45)
         assert 0.30 < (rise + np.sqrt(under_root)) / MARS <= 0.35
     assert (skills[-1] == JUMP).all() and flights.flight_time.min() > 2.0
 
 
-def test_the_goal_is_level_in_the_jumps_heading_and_the_jump_goes_on(flown):
+def test_the_goal_is_level_in_the_jumps_heading_and_the_jump_continues_after_it(flown):
     _, _, seen = flown
     turning = next(turn for skill, turn, *_ in seen if (skill == TURN).all())
     euler = Rotation.from_quat(turning["goal"]).as_euler("ZYX")
@@ -61,7 +61,7 @@ def test_the_goal_is_level_in_the_jumps_heading_and_the_jump_goes_on(flown):
     assert (landing["phase"] >= 1).all() and (landing["max_height"] > 2.0).all()
 
 
-def test_legs_that_push_later_tilt_the_robot(flown):
+def test_legs_that_push_off_later_tilt_the_robot(flown):
     _, flights, _ = flown
     assert flights.takeoff_spin[:3].min() > 0.2 > flights.takeoff_spin[3]
     assert np.degrees(flights.touchdown_tilt[:3]).min() > 5.0 > np.degrees(flights.touchdown_tilt[3])
@@ -71,7 +71,7 @@ def test_legs_that_push_later_tilt_the_robot(flown):
     assert change < 1.0e-4 < 0.1 * flights.takeoff_momentum.max()
 
 
-def test_failures_in_flight_are_told_from_those_after_it():
+def test_failures_in_flight_are_counted_separately():
     flights = FlightLog(np.full(4, 2.5))
     flights.end[:] = [OUTCOMES.index(name) for name in ("collided", "collided", "landed", "tilted")]
     flights.flight_time[1:] = 2.0
@@ -79,8 +79,8 @@ def test_failures_in_flight_are_told_from_those_after_it():
     assert metrics["ended_by_collided_rate"] == 0.5 and metrics["failed_before_touchdown_rate"] == 0.25
 
 
-def test_other_tasks_are_refused():
-    with pytest.raises(InputError, match="needs a task of JumpState"):
+def test_refuses_tasks_of_other_states():
+    with pytest.raises(InputError, match="needs a task with JumpState"):
         flight_skills(make_task("attitude"), make_task("attitude"))
-    with pytest.raises(InputError, match="needs a task of AttitudeState"):
+    with pytest.raises(InputError, match="needs a task with AttitudeState"):
         flight_skills(make_task("vertical-jump-mars"), make_task("velocity-flat"))

@@ -1,4 +1,4 @@
-"""Gravity is the world's: in both solvers, in what a task draws and estimates, and from every command line."""
+"""Gravity per world: in both solvers, in start states and estimates of tasks, and as a flag of commands."""
 
 import dataclasses
 
@@ -23,7 +23,7 @@ HORIZONTAL = dataclasses.replace(make_task("horizontal-jump"), gravity=MARS)
 
 
 @pytest.mark.parametrize("solver", ["jumper", "mujoco"])
-def test_a_thrown_robot_falls_as_its_gravity_says(solver):
+def test_a_thrown_robot_follows_the_parabola_of_its_gravity(solver):
     sim = Simulation(1, solver=solver, ground=None, gravity=MARS, visuals=False, device="cpu")
     sim.state.joint_qd.assign(np.eye(38)[2].astype(np.float32) * UP)
     sim.physics.write_bodies()
@@ -38,13 +38,13 @@ def test_a_thrown_robot_falls_as_its_gravity_says(solver):
     assert com() - before == pytest.approx(0.25 * UP - 0.5 * MARS * 0.25**2, abs=2e-3)
 
 
-def test_a_simulation_refuses_what_is_no_gravity():
+def test_refuses_gravity_out_of_range_or_different_between_skills():
     for bad in (-1.0, 200.0, float("nan")):
         with pytest.raises(InputError, match="gravity must lie in 0 to 100"):
             Simulation(1, gravity=bad, device="cpu")
         with pytest.raises(InputError, match="gravity must lie in 0 to 100"):
             Conditions(gravity=bad)
-    with pytest.raises(InputError, match=r"horizontal-jump has a gravity of 9.81 m/s\^2, vertical-jump of 3.71"):
+    with pytest.raises(InputError, match=r"gravity of horizontal-jump must be 3.71 m/s\^2, got 9.81"):
         Env((VERTICAL, make_task("horizontal-jump")), 1, device="cpu")
 
 

@@ -69,7 +69,7 @@ def test_record_video_writes_a_film_of_all_robots(tmp_path):
         assert np.abs(robot[-1] - robot[0]).mean() > 3.0
 
 
-def test_frames_per_second_are_the_policys():
+def test_frame_rate_is_the_policy_rate():
     envs = vector()
     assert envs.metadata["render_modes"] == ["rgb_array"]
     assert envs.metadata["render_fps"] == pytest.approx(1.0 / envs.env.step_dt)
@@ -107,7 +107,7 @@ def test_the_camera_follows_a_robot_over_any_distance(envs):
     assert np.abs(envs.render()[1].astype(int) - before).mean() > 3.0
 
 
-def test_an_environment_draws_on_after_another_closed(envs):
+def test_an_environment_can_draw_after_another_was_closed(envs):
     first, third = vector(render_size=(96, 64)), vector(render_size=(96, 64))
     for other in (first, third):
         other.reset(seed=1)
@@ -145,7 +145,7 @@ def test_each_world_shows_its_own_block_also_after_a_change():
 
 
 @pytest.mark.parametrize("point", [(0.3, -0.6), (1.9, 1.7)])
-def test_drawn_heightfield_is_the_simulated_one(point):
+def test_drawn_heightfield_equals_the_simulated_one(point):
     field = uneven(0.08, seed=2, cell=0.03)
     env = Env(make_task("vertical-jump"), 1, device="cpu", ground=field)
     camera = WorldCamera(env.sim, 1, SIZE)
@@ -160,7 +160,7 @@ def test_drawn_heightfield_is_the_simulated_one(point):
     assert np.isfinite(vertices).all() and np.abs(vertices[:, :2] - point).max() == pytest.approx(5.0, abs=0.1)
 
 
-def test_rays_are_traced_without_opengl(envs, monkeypatch, capsys):
+def test_ray_tracer_is_used_without_opengl(envs, monkeypatch, capsys):
     def missing(*arguments):
         raise ImportError("no pyglet")
 
@@ -174,7 +174,7 @@ def test_rays_are_traced_without_opengl(envs, monkeypatch, capsys):
 
 
 @pytest.mark.parametrize(
-    ("arguments", "words"),
+    ("arguments", "message"),
     [
         ({"render_mode": "human"}, "render_mode must be 'rgb_array' or None, got 'human'"),
         ({"render_size": (640,)}, "render_size must be a width and a height"),
@@ -182,8 +182,8 @@ def test_rays_are_traced_without_opengl(envs, monkeypatch, capsys):
         ({"render_envs": 0}, "render_envs must be"),
     ],
 )
-def test_what_cannot_be_drawn_is_refused(arguments, words):
-    with pytest.raises(ValueError, match=words):
+def test_refuses_invalid_render_settings(arguments, message):
+    with pytest.raises(ValueError, match=message):
         vector(**arguments)
 
 
@@ -194,7 +194,7 @@ def test_drawing_without_render_mode_warns():
         assert envs.render() is None
 
 
-def test_drawing_out_of_order_is_refused():
+def test_refuses_drawing_before_reset_and_after_close():
     envs = vector()
     with pytest.raises(gymnasium.error.ResetNeeded):
         envs.render()

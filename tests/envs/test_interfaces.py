@@ -1,4 +1,4 @@
-"""What an environment takes from outside, and what it refuses in one line, as it stands."""
+"""Inputs of an environment: actions, commands, worlds, devices and settings, and one-line refusals of invalid ones."""
 
 import math
 
@@ -20,12 +20,12 @@ NAN, INF = math.nan, math.inf
 
 @pytest.fixture(scope="module")
 def env():
-    """Standing starts, nominal, without noise."""
+    """Return N nominal worlds without noise that start in the default pose."""
     return make_env(N, reset=only("default"))
 
 
-def refused(env, message, call, *arguments):
-    """Whether a call raises one line that matches, and leaves the environment as it was."""
+def assert_refused(env, message, call, *arguments):
+    """Assert that a call raises a one-line error that matches, and does not change the environment's state."""
     before = env.state_dict()
     with pytest.raises(ValueError, match=message) as caught:
         call(*arguments)
@@ -56,12 +56,12 @@ def refused(env, message, call, *arguments):
     ],
     ids=lambda value: value[:40] if isinstance(value, str) else "",
 )
-def test_an_action_that_is_none_is_refused(env, action, message):
-    refused(env, "an action must .*" + message, env.step, action)
+def test_refuses_invalid_actions(env, action, message):
+    assert_refused(env, "an action must .*" + message, env.step, action)
 
 
 @pytest.mark.parametrize("kind", [torch.float64, torch.float16])
-def test_an_action_may_be_of_any_precision(kind):
+def test_accepts_actions_of_any_precision(kind):
     one, other = (make_env(N, reset=only("default")) for _ in range(2))
     action = torch.full((N, 12), 0.25)
     one.step(action)
@@ -69,7 +69,7 @@ def test_an_action_may_be_of_any_precision(kind):
     assert torch.equal(one.obs, other.obs)
 
 
-def test_an_action_may_carry_a_gradient_that_ends_here(env):
+def test_actions_with_gradient_give_results_without(env):
     action = torch.zeros((N, 12), requires_grad=True)
     for _ in range(2):
         step = env.step(action * 2.0)
@@ -77,26 +77,26 @@ def test_an_action_may_carry_a_gradient_that_ends_here(env):
     assert all(not obs.requires_grad for obs in step.obs.values())
 
 
-def test_an_action_is_not_written_to(env):
+def test_a_step_does_not_change_the_action(env):
     action = 3.0 * random_actions(N, 1)[0]
-    kept = action.clone()
+    copy = action.clone()
     env.step(action)
-    assert torch.equal(action, kept)
+    assert torch.equal(action, copy)
 
 
-# ---------------------------------------------------------------- what a step gives
+# ---------------------------------------------------------------- results of a step
 
 
-def test_a_step_gives_the_tensors_of_the_environment():
-    """Views, rewritten in place, that agree with each other."""
+def test_step_results_are_views_of_the_environments_tensors():
+    """They are overwritten in place and agree with each other."""
     env = make_env(N, noise=True, randomize=True, seed=3)
     obs, extras = env.reset()
     assert obs["actor"] is env.obs and obs["critic"] is env.critic_obs and extras == {}
-    kept, ends = None, torch.zeros(2)
+    previous, ends = None, torch.zeros(2)
     for action in random_actions(N, 200):
         step = env.step(action)
-        assert kept is None or all(a is b for a, b in zip(step, kept, strict=True))
-        kept = step
+        assert previous is None or all(a is b for a, b in zip(step, previous, strict=True))
+        previous = step
         assert step.obs["actor"] is env.obs and step.extras["final_obs"]["critic"] is env.final_critic_obs
         assert step.reward is env.reward and step.extras["time_outs"] is env.timeout
         assert step.terminated.dtype == step.truncated.dtype == torch.bool
@@ -107,7 +107,7 @@ def test_a_step_gives_the_tensors_of_the_environment():
     assert (ends > 5).all()
 
 
-def test_the_reward_of_a_step_is_told_by_term():
+def test_reward_terms_add_up_to_the_reward():
     env = make_env(N)
     terms = env.reward_terms
     for action in random_actions(N, 5):
@@ -155,25 +155,25 @@ WRONG_HEADINGS = [
 
 
 @pytest.mark.parametrize(("commands", "message"), WRONG_COMMANDS)
-def test_commands_that_are_none_are_refused(env, commands, message):
-    refused(env, message, env.evaluation_reset, commands)
-    refused(env, message, env.command, commands)
+def test_refuses_invalid_commands(env, commands, message):
+    assert_refused(env, message, env.evaluation_reset, commands)
+    assert_refused(env, message, env.command, commands)
 
 
 @pytest.mark.parametrize(("worlds", "message"), WRONG_WORLDS)
-def test_worlds_that_are_none_are_refused(env, worlds, message):
+def test_refuses_invalid_worlds(env, worlds, message):
     commands = np.zeros((N, 3))
-    refused(env, message, env.evaluation_reset, commands, 0.0, worlds)
-    refused(env, message, env.command, commands, worlds)
-    refused(env, message, env.request, 0, worlds)
+    assert_refused(env, message, env.evaluation_reset, commands, 0.0, worlds)
+    assert_refused(env, message, env.command, commands, worlds)
+    assert_refused(env, message, env.request, 0, worlds)
 
 
 @pytest.mark.parametrize(("headings", "message"), WRONG_HEADINGS)
-def test_headings_that_are_none_are_refused(env, headings, message):
-    refused(env, message, env.evaluation_reset, np.zeros((N, 3)), headings)
+def test_refuses_invalid_headings(env, headings, message):
+    assert_refused(env, message, env.evaluation_reset, np.zeros((N, 3)), headings)
 
 
-def test_what_was_refused_leaves_episodes_ending_as_before(env):
+def test_episodes_still_end_after_a_refused_evaluation(env):
     env.reset()
     with pytest.raises(ValueError, match="headings"):
         env.evaluation_reset(np.zeros((N, 3)), NAN)
@@ -183,7 +183,7 @@ def test_what_was_refused_leaves_episodes_ending_as_before(env):
 
 
 @pytest.mark.parametrize("kind", [np.asarray, torch.as_tensor, list])
-def test_commands_may_come_in_any_container(kind):
+def test_accepts_commands_as_array_tensor_or_list(kind):
     env = make_env(N, reset=only("default"))
     heights, headings = np.linspace(0.5, 0.9, N), np.linspace(-1.0, 1.0, N)
     chosen = np.arange(N) % 2 == 0
@@ -196,31 +196,31 @@ def test_commands_may_come_in_any_container(kind):
     assert (found["goal"][~chosen, 2] != heights[~chosen]).all()
 
 
-def test_one_command_is_for_all_worlds(env):
+def test_one_command_applies_to_all_worlds(env):
     env.evaluation_reset([0.0, 0.0, 0.7])
     np.testing.assert_allclose(env.task_arrays()["goal"], np.tile([0.0, 0.0, 0.7], (N, 1)), rtol=1e-6)
 
 
-def test_numbers_of_other_worlds_may_be_anything_finite(env):
+def test_values_of_unselected_worlds_may_be_out_of_range(env):
     commands = np.tile([0.0, 0.0, 0.7], (N, 1))
     commands[0, 2] = -1.0
     env.evaluation_reset(commands, worlds=np.arange(N) > 0)
 
 
-def test_turns_are_quaternions_of_some_length():
+def test_attitude_commands_are_normalised_quaternions():
     env = Env(make_task("attitude"), 2, randomize=False, noise=False)
     env.evaluation_reset([0.0, 0.0, 0.0, 1.0])
     env.command([0.0, 0.0, 3.0, 3.0])
     np.testing.assert_allclose(env.task_arrays()["goal"], [[0.0, 0.0, 0.5**0.5, 0.5**0.5]] * 2, atol=1e-6)
-    refused(env, "commands of attitude are quaternion x .*: not all may be 0", env.command, np.zeros((2, 4)))
-    refused(env, r"quaternion w \[1\], 2 rows or one for all, got shape \(2, 1\)", env.command, [[0.1], [0.1]])
+    assert_refused(env, "commands of attitude are quaternion x .*: not all may be 0", env.command, np.zeros((2, 4)))
+    assert_refused(env, r"quaternion w \[1\], 2 rows or one for all, got shape \(2, 1\)", env.command, [[0.1], [0.1]])
 
 
 # ---------------------------------------------------------------- evaluation and training
 
 
-def test_an_evaluation_ends_no_episode_until_reset():
-    """In the environment that a training goes on with: its episodes end again, in the same launches as before."""
+def test_an_evaluation_resets_no_ended_episode_until_reset():
+    """After `reset`, a training continues: episodes are reset again, in the same captured graph."""
     env = make_env(N, reset=only("default"))
     for begin, ends in ((env.reset, True), (None, False), (env.reset, True), (None, False)):
         if begin is None:
@@ -235,7 +235,7 @@ def test_an_evaluation_ends_no_episode_until_reset():
     assert set(env._graphs) == {True, False}
 
 
-def test_an_environment_that_begins_nothing_by_itself_never_does_and_can_be_given_new_beginnings():
+def test_without_auto_reset_only_reset_begins_episodes():
     env = make_env(N, reset=only("default"), auto_reset=False)
     edit_episodes(env, 0, phase=LANDED, phase_steps=59)
     for steps in (1, 2):
@@ -245,7 +245,7 @@ def test_an_environment_that_begins_nothing_by_itself_never_does_and_can_be_give
     assert env.task_arrays()["steps"].tolist() == [0] + [2] * (N - 1)
 
 
-def test_a_part_of_the_worlds_may_be_evaluated_anew():
+def test_an_evaluation_can_start_in_some_worlds():
     env = make_env(N, reset=only("default"))
     for action in random_actions(N, 5):
         env.step(action)
@@ -260,11 +260,11 @@ def test_a_part_of_the_worlds_may_be_evaluated_anew():
     np.testing.assert_array_equal(env.sim.joint_q()[chosen], standing[chosen])
 
 
-# ---------------------------------------------------------------- making one
+# ---------------------------------------------------------------- construction
 
 
 @pytest.mark.parametrize("device", [torch.device("cpu"), "cpu"])
-def test_a_device_may_be_one_of_torch(device):
+def test_accepts_a_torch_device_or_its_name(device):
     env = Env(TASK, 2, device=device)
     env.reset()
     env.step(torch.zeros((2, 12)))
@@ -282,7 +282,7 @@ def test_a_device_may_be_one_of_torch(device):
         ((), "at least one task"),
     ],
 )
-def test_a_task_that_is_none_is_refused_at_once(task, message):
+def test_refuses_invalid_tasks(task, message):
     with pytest.raises(ValueError, match=message) as caught:
         Env(task, 4)
     assert "\n" not in str(caught.value)
@@ -302,10 +302,10 @@ def test_the_first_step_needs_a_reset():
     loaded.step(torch.zeros((2, 12)))
 
 
-# ---------------------------------------------------------------- numbers of terms while it runs
+# ---------------------------------------------------------------- parameters of terms
 
 
-def test_a_number_of_a_term_may_change_in_captured_steps():
+def test_a_changed_parameter_of_a_term_acts_in_captured_steps():
     index, term = next((i, term) for i, term in enumerate(TASK.rewards) if term.name == "orientation")
     env = make_env(N, reset=only("default"))
     edit_episodes(env, command_step=1000)
@@ -324,13 +324,13 @@ def test_a_number_of_a_term_may_change_in_captured_steps():
     ("name", "value", "message"),
     [
         ("rewards.orientation.weight", NAN, "rewards.orientation.weight must be finite, got nan"),
-        ("rewards.orientation.depth", 1.0, "no 'depth' of a rewards term 'orientation'"),
-        ("rewards.levitation.weight", 1.0, "no 'weight' of a rewards term 'levitation'"),
-        ("prizes.orientation.weight", 1.0, "no 'weight' of a prizes term 'orientation'"),
+        ("rewards.orientation.depth", 1.0, "no number 'depth' of a rewards term 'orientation'"),
+        ("rewards.levitation.weight", 1.0, "no number 'weight' of a rewards term 'levitation'"),
+        ("prizes.orientation.weight", 1.0, "no number 'weight' of a prizes term 'orientation'"),
         ("weight", 1.0, "names are like rewards.jump_height.weight"),
     ],
 )
-def test_a_number_that_is_none_is_refused(env, name, value, message):
+def test_refuses_invalid_parameters_of_terms(env, name, value, message):
     before = env.skills[0].params.values.numpy().copy()
     with pytest.raises(ValueError, match=message):
         env.set(name, value)
@@ -339,42 +339,42 @@ def test_a_number_that_is_none_is_refused(env, name, value, message):
     np.testing.assert_array_equal(env.skills[0].params.values.numpy(), before)
 
 
-# ---------------------------------------------------------------- worlds that begin anew
+# ---------------------------------------------------------------- reset of some worlds
 
 
 @pytest.mark.parametrize("worlds", [[1, 5], torch.tensor([5, 1]), np.isin(np.arange(N), (1, 5))])
-def test_some_worlds_may_begin_anew(worlds):
+def test_reset_of_some_worlds_changes_no_other(worlds):
     env, chosen = make_env(N, noise=True, randomize=True, seed=3), np.isin(np.arange(N), (1, 5))
     env.reset()
     env.episodes.level.fill_(2)
     for action in 0.1 * random_actions(N, 4):
         env.step(action)
-    before, motions, kept = env.task_arrays(), env.sim.joint_q().copy(), env.obs.clone()
+    before, motions, old_obs = env.task_arrays(), env.sim.joint_q().copy(), env.obs.clone()
     obs, extras = env.reset(worlds=worlds)
     found = env.task_arrays()
     assert obs["actor"] is env.obs and extras == {} and (found["level"] == 2).all()
     assert (found["steps"][chosen] == 0).all()
     changed = (env.sim.joint_q() != motions).any(axis=1)
-    assert changed.tolist() == chosen.tolist() == (env.obs != kept).any(dim=1).tolist()
+    assert changed.tolist() == chosen.tolist() == (env.obs != old_obs).any(dim=1).tolist()
     assert all(np.array_equal(found[name][~chosen], before[name][~chosen], equal_nan=True) for name in before)
     env.step(REST)
     assert (env.task_arrays()["steps"][~chosen] == before["steps"][~chosen] + 1).all()
     states = env.sim.joint_q()[chosen]
     env.reset(worlds=worlds)
-    assert (env.sim.joint_q()[chosen] != states).any(axis=1).all()  # drawn anew
+    assert (env.sim.joint_q()[chosen] != states).any(axis=1).all()  # sampled again
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"worlds": [0, 0]}, r"8 bools, or different indices below 8, got \[0, 0\]"),
-        ({"worlds": [N]}, "different indices below 8"),
+        ({"worlds": [0, 0]}, r"8 bools, or distinct indices below 8, got \[0, 0\]"),
+        ({"worlds": [N]}, "distinct indices below 8"),
         ({"worlds": np.zeros(N)}, "worlds must be bool of shape"),
-        ({"worlds": [0], "seed": 1}, "a seed is for all worlds"),
+        ({"worlds": [0], "seed": 1}, "a seed resets all worlds"),
         ({"seed": torch.zeros(N, dtype=torch.bool)}, "seed must be in 0"),
     ],
 )
-def test_worlds_that_cannot_begin_anew_are_refused(env, arguments, message):
-    refused(env, message, lambda: env.reset(**arguments))
-    with pytest.raises(RuntimeError, match="reset of all worlds"):
+def test_refuses_invalid_resets_of_some_worlds(env, arguments, message):
+    assert_refused(env, message, lambda: env.reset(**arguments))
+    with pytest.raises(RuntimeError, match="reset all worlds before"):
         Env(TASK, 1, device="cpu").reset(worlds=[0])

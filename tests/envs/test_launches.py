@@ -1,4 +1,4 @@
-"""How much is launched and allocated in a policy step: as little as now, and no more in later steps."""
+"""Numbers of launches, copies and allocations in a policy step, which are the same in every step."""
 
 import contextlib
 import dataclasses
@@ -20,7 +20,7 @@ N = 4
 
 @contextlib.contextmanager
 def counted(monkeypatch):
-    """Count Warp's launches, copies, memory that is set, read or written by the host, and allocations, by name."""
+    """Count Warp's launches, copies, host accesses to arrays (set, read, write) and allocations, by name."""
     counts = Counter()
 
     def counting(name, original):
@@ -41,7 +41,7 @@ def counted(monkeypatch):
 
 
 def eager_counts(env, monkeypatch, steps=30):
-    """Return the counts of each of some steps that are launched one by one, with episodes that end in between."""
+    """Return the counts of each of `steps` uncaptured steps, some of which end an episode."""
     found = []
     for step, action in enumerate(random_actions(env.num_envs, steps)):
         env.actions.copy_(action)
@@ -56,20 +56,20 @@ def eager_counts(env, monkeypatch, steps=30):
 JUMP, HOLD = make_task("vertical-jump"), hold_height.hold_height()
 WALKING = dataclasses.replace(JUMP, randomization=RandomizationCfg.walking())
 CASES = {
-    # action, physics, track, step, 2 to observe; then reset, forget, 2 to observe what has begun
+    # action, physics, track, step, 2 observations; then reset, clear history, 2 observations of new episodes
     "nominal": ((JUMP,), {"randomize": False, "noise": False}, 10),
     "measured": ((JUMP,), {"auto_reset": False}, 7),
-    # events, in every step too, and packing what they drew
+    # also events after the reset and in every step, and packing of the sampled parameters
     "randomised": ((JUMP,), {}, 13),
     "pushed": ((WALKING,), {}, 13),
-    # of the second skill: events in every step, step, 2 to observe; then home, events, packing, reset, 2 to observe
+    # second skill: events in every step, step, 2 observations; then home, events, packing, reset, 2 observations
     "two skills": ((JUMP, HOLD), {}, 23),
 }
-"""Tasks, settings and number of launches."""
+"""Tasks, settings and number of launches by name of the case."""
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_a_step_has_so_many_launches_and_no_allocation(case, monkeypatch):
+def test_a_step_has_the_expected_launches_and_no_allocation(case, monkeypatch):
     tasks, arguments, launches = CASES[case]
     env = Env(tasks if len(tasks) > 1 else tasks[0], N, device="cpu", **arguments)
     env.reset()
@@ -87,16 +87,16 @@ def test_a_captured_step_is_one_launch(monkeypatch):
         assert counts == {"capture_launch": 1}
 
 
-def test_a_step_makes_no_tensor_of_the_environment_anew():
+def test_steps_and_resets_reuse_the_environments_arrays():
     env = make_env(N, randomize=True, noise=True)
 
-    def places():
+    def addresses():
         tensors = [env.reward, env.done, env.timeout, env.actions, *env.skills[0].obs.values()]
         arrays = [env.sim.state.joint_q, env.robot.torque, env.parameters.push, env.skills[0].states]
         return [t.data_ptr() for t in tensors] + [array.ptr for array in arrays]
 
-    before = places()
+    before = addresses()
     for action in random_actions(N, 20):
         env.step(action)
     env.reset()
-    assert places() == before
+    assert addresses() == before

@@ -1,4 +1,4 @@
-"""A task that is not the package's (`hold_height`) trains, is saved, and is read back where its file is named."""
+"""User-defined task `hold_height`: training, its state and terms, and loading its saved configuration with its file."""
 
 import importlib.util
 import json
@@ -33,33 +33,33 @@ def states_of(env) -> np.ndarray:
 
 
 def edit(env, worlds=slice(None), **fields) -> None:
-    """Overwrite fields of worlds' states."""
+    """Overwrite fields of the states of worlds."""
     records = states_of(env)
     for name, value in fields.items():
         records[name][worlds] = value
     env.skills[0].states.assign(records)
 
 
-# ---------------------------------------------------------------- it works
+# ---------------------------------------------------------------- training and terms
 
 
 def mean_error(env, ppo) -> float:
-    """Distance from the commanded height [m] of the policy without exploration, from 0.25 s after a command on."""
+    """Return the mean height error [m] of the policy without exploration, later than 0.25 s after each command."""
     env.reset()
     errors = []
     with torch.no_grad():
         for _ in range(110):
             env.step(ppo.model.actor(ppo.model.features(env.obs)))
             states = env.skills[0].states.numpy()
-            settled = states["age"] >= 15
-            errors.append(np.abs(env.sim.joint_q()[:, 2] - states["goal"])[settled])
+            is_late = states["age"] >= 15
+            errors.append(np.abs(env.sim.joint_q()[:, 2] - states["goal"])[is_late])
     return float(np.concatenate(errors).mean())
 
 
-def test_it_learns_to_hold_heights(one_thread):
-    """123,000 steps, everything random; the error over that of before, against a bound between sound and broken.
+def test_training_halves_the_height_error(one_thread):
+    """The training has 123,000 randomised steps.
 
-    Seeds 1 to 3: 5.5 to 2.0 cm, 5.5 to 1.9 and 5.4 to 1.7; with a step size of 1e-6 it stays above 5.0.
+    Errors with seeds 1 to 3: 5.5 to 2.0 cm, 5.5 to 1.9 and 5.4 to 1.7; with a learning rate of 1e-6 above 5.0.
     """
     torch.manual_seed(1)
     env = make_env(128)
@@ -72,7 +72,7 @@ def test_it_learns_to_hold_heights(one_thread):
     assert mean_error(env, ppo) < 0.5 * before
 
 
-def test_its_state_settings_and_levels_are_its_own():
+def test_user_defined_state_settings_and_levels_are_used():
     env = make_env(64)
     states = states_of(env)
     assert set(states["lasts"]) == {30} and not states["steps"].any()
@@ -81,9 +81,10 @@ def test_its_state_settings_and_levels_are_its_own():
     for _ in range(30):
         env.step(torch.zeros((64, 12)))
     found = states_of(env)
-    going_on = env.done.numpy() == 0.0
-    assert going_on.sum() > 32 and (found["steps"][going_on] == 30).all()
-    assert not found["age"][going_on].any() and (found["goal"] != states["goal"])[going_on].all()  # commanded anew
+    is_running = env.done.numpy() == 0.0
+    assert is_running.sum() > 32 and (found["steps"][is_running] == 30).all()
+    assert not found["age"][is_running].any()  # a new command
+    assert (found["goal"] != states["goal"])[is_running].all()
     env.episodes.level.fill_(1)
     env.reset()
     assert states_of(env)["goal"].min() < 0.22
@@ -98,7 +99,7 @@ def test_a_command_reaches_reward_and_observation():
     assert (states_of(env)["goal"] == goals[:, 0]).tolist() == chosen.tolist()
     env.evaluation_reset(goals)
     np.testing.assert_allclose(env.obs[:, 0], 5.0 * goals[:, 0], rtol=1e-6)
-    np.testing.assert_allclose(env.obs[:, 1:4], np.tile(5.0 * height[0], (N, 3)), rtol=1e-5)  # history, begun anew
+    np.testing.assert_allclose(env.obs[:, 1:4], np.tile(5.0 * height[0], (N, 3)), rtol=1e-5)  # history: first frame
     env.step(torch.zeros((N, 12)))
     height = env.sim.joint_q()[:, 2]
     np.testing.assert_allclose(env.reward, np.exp(-np.abs(height - goals[:, 0]) / 0.05), rtol=1e-4)
@@ -106,7 +107,7 @@ def test_a_command_reaches_reward_and_observation():
     assert (states_of(env)["goal"] == goals[:, 0]).all() and (env.obs[:, 1:3] == env.obs[0, 1]).all()
 
 
-def test_its_terminations_and_curriculum_are_its_own():
+def test_user_defined_terminations_and_curriculum_are_used():
     env = make_env(randomize=False, noise=False)
     goal = states_of(env)["goal"]
     height = env.sim.joint_q()[0, 2]
@@ -125,7 +126,7 @@ def test_its_terminations_and_curriculum_are_its_own():
     assert env.metrics()["Metrics/success"] == 0.5
 
 
-def test_its_own_event_is_drawn_at_every_reset_of_a_world():
+def test_user_defined_event_is_sampled_at_every_reset_of_a_world():
     task = hold_height.hold_height()
     env = make_env(task=task)
     nominal = np.tile([task.motors.lateral.saturation, *2 * [task.motors.transversal.saturation]], 4)[:, None]
@@ -142,7 +143,7 @@ def test_its_own_event_is_drawn_at_every_reset_of_a_world():
     assert (make_env(task=task, randomize=False).sim.motors.saturation.numpy() == nominal.astype(np.float32)).all()
 
 
-# ---------------------------------------------------------------- saved and read back
+# ---------------------------------------------------------------- saving and loading
 
 FRESH = """
 import importlib.util, json, sys
@@ -167,7 +168,7 @@ for action in torch.from_numpy(np.load(sys.argv[3])):
     rewards.append(env.reward.numpy().copy())
 np.save(sys.argv[4], rewards)
 """
-"""Of a process that knows the task from its file and its saved configuration alone."""
+"""Code of a process that loads the task from its file and its saved configuration, and saves the rewards of a run."""
 
 UNNAMED = """
 import json, sys
@@ -182,11 +183,11 @@ for each in saved:
         print(error)
 assert "hold_height" not in sys.modules and "trap" not in sys.modules
 """
-"""Of a process to which no module is named; says what is wrong with each of some tasks."""
+"""Code of a process that loads tasks without a module, and prints the error of each."""
 
 
 def python(code: str, *arguments: Path, path: Path | None = None) -> str:
-    """Run code in a new process and return what it prints; path: where modules could be imported from besides."""
+    """Run code in a new process and return its output; path: additional folder of modules."""
     paths = [str(ROOT), *([str(path)] if path else [])]
     environment = {"PYTHONPATH": ":".join(paths), "PATH": "", "HOME": str(Path.home())}
     command = [sys.executable, "-c", code, *map(str, arguments)]
@@ -197,14 +198,14 @@ def python(code: str, *arguments: Path, path: Path | None = None) -> str:
 
 @pytest.fixture
 def saved(tmp_path) -> Path:
-    """A task with a number and a range changed, as JSON on the disk."""
+    """Return a JSON file of the task with a changed reward term."""
     task = hold_height.hold_height().with_terms("rewards", near_goal={"weight": 50.0, "width": 0.04})
     path = tmp_path / "task.json"
     path.write_text(json.dumps(task_to_json(task)))
     return path
 
 
-def test_a_new_process_that_is_told_its_file_gives_the_same_rewards(saved, tmp_path):
+def test_a_task_loaded_in_a_new_process_gives_the_same_rewards(saved, tmp_path):
     actions = 0.5 * (2.0 * torch.rand((150, N, 12), generator=torch.Generator().manual_seed(0)) - 1.0)
     np.save(tmp_path / "actions.npy", actions.numpy())
     python(FRESH, FILE, saved, tmp_path / "actions.npy", tmp_path / "rewards.npy")
@@ -216,11 +217,11 @@ def test_a_new_process_that_is_told_its_file_gives_the_same_rewards(saved, tmp_p
     assert ended >= N and len(np.unique(expected)) == N
 
 
-# ---------------------------------------------------------------- nothing is imported
+# ---------------------------------------------------------------- no imports
 
 
 def places(saved, path=()):
-    """Yield where functions and types are named in a saved task."""
+    """Yield the path of keys to each name of a function or type in a saved task."""
     entries = saved.items() if isinstance(saved, dict) else enumerate(saved)
     for key, value in entries:
         if isinstance(value, dict | list):
@@ -230,7 +231,7 @@ def places(saved, path=()):
 
 
 def replaced(saved, place, value):
-    """Return a saved task with another entry at a place."""
+    """Return a copy of a saved task with another value at a path of keys."""
     copy = json.loads(json.dumps(saved))
     inner = copy
     for key in place[:-1]:
@@ -243,23 +244,23 @@ SAVED = task_to_json(hold_height.hold_height())
 
 
 @pytest.mark.parametrize("place", list(places(SAVED)), ids=lambda place: ".".join(map(str, place)))
-def test_a_name_that_is_in_no_named_module_is_refused(place):
+def test_refuses_a_name_outside_the_given_modules(place):
     for name in ("os:system", "builtins:exec", "trap:advance_hold", "hold_height:os", "jumper_warp.tasks.saving:sys"):
         with pytest.raises(TaskError) as caught:
             task_from_json(replaced(SAVED, place, name), [hold_height])
         assert "\n" not in str(caught.value) and f"needs {name!r}" in str(caught.value)
 
 
-def test_a_configuration_imports_nothing(tmp_path):
-    """Not even where a module of that name lies on the path: it would leave a file behind."""
+def test_loading_a_configuration_imports_no_module(tmp_path):
+    """A module of that name is on the path; its import would create a file."""
     mark = tmp_path / "imported"
     (tmp_path / "trap.py").write_text(f"open({str(mark)!r}, 'w').close()\n")
     for name in ("trap:advance_hold", "os:system"):
         path = tmp_path / "task.json"
         path.write_text(json.dumps([replaced(SAVED, place, name) for place in places(SAVED)]))
-        said = python(UNNAMED, path, path=tmp_path).splitlines()
-        assert len(said) == len(list(places(SAVED))) and all("--task-module" in line for line in said)
+        lines = python(UNNAMED, path, path=tmp_path).splitlines()
+        assert len(lines) == len(list(places(SAVED))) and all("--task-module" in line for line in lines)
     assert not mark.exists()
     spec = importlib.util.spec_from_file_location("trap", tmp_path / "trap.py")
     spec.loader.exec_module(importlib.util.module_from_spec(spec))
-    assert mark.exists()  # the trap works
+    assert mark.exists()  # importing the module creates the file

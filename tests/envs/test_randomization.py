@@ -1,4 +1,4 @@
-"""What is drawn for every world: from which range, and what it changes of solver, motors and environment."""
+"""Randomised parameters of a world: their ranges, and their effect on solver, motors and environment."""
 
 import dataclasses
 import math
@@ -26,24 +26,24 @@ from randomization_helpers import (
 
 @pytest.fixture(scope="module")
 def nominal():
-    """Parameters with every row off."""
+    """Return the parameters with every row off."""
     return read(randomized(OFF))
 
 
 @pytest.fixture(scope="module")
 def drawn():
-    """Parameters with every row on, in 512 worlds."""
+    """Return the parameters of 512 worlds with every row on."""
     return read(randomized(RandomizationCfg(observation_latency=(0.0, 16.0), **HELD), 512))
 
 
-def test_the_ranges_are_the_papers():
+def test_ranges_equal_those_of_the_paper():
     assert vars(RandomizationCfg()) == PAPER | BEYOND
     walking = vars(RandomizationCfg.walking())
     assert {name: walking[name] for name in WALKING} == WALKING
     assert set(walking) == {*PAPER, *BEYOND}
 
 
-def test_off_is_the_robot_as_described(nominal):
+def test_parameters_without_randomisation_are_those_of_the_description(nominal):
     first = {name: values[..., :1] for name, values in nominal.items()}
     for name, values in nominal.items():
         np.testing.assert_array_equal(values, np.broadcast_to(first[name], values.shape), err_msg=name)
@@ -60,12 +60,12 @@ def test_off_is_the_robot_as_described(nominal):
 
 @pytest.mark.parametrize("row", ROWS)
 def test_a_row_reaches_the_solver_and_fills_its_range(drawn, nominal, row):
-    then = {name: values[..., :1] for name, values in nominal.items()}
-    assert fills(ROWS[row](drawn, then), *PAPER[row])
+    reference = {name: values[..., :1] for name, values in nominal.items()}
+    assert fills(ROWS[row](drawn, reference), *PAPER[row])
 
 
-def test_draws_are_independent(drawn, nominal):
-    """Of links, motors, axes and rows; only the paws of a world share their friction."""
+def test_samples_are_independent_between_links_motors_axes_and_rows(drawn, nominal):
+    """Only the paws of a world share their friction."""
     rows = [
         drawn["base_mass"][None], drawn["link_mass"], drawn["com_shift"], drawn["kp"], drawn["kd"],
         drawn["no_load_speed"], drawn["armature"], drawn["motor_friction"], drawn["joint_offset"], drawn["push_force"],
@@ -80,7 +80,7 @@ def test_static_friction_is_not_below_dynamic(drawn):
     assert (drawn["static_friction"] >= drawn["dynamic_friction"] * (1.0 - 1e-6)).all()
 
 
-def test_a_link_gains_mass_and_inertia_alike(drawn, nominal):
+def test_mass_and_inertia_of_a_link_have_the_same_scale(drawn, nominal):
     scale = drawn["link_mass"] / nominal["link_mass"][:, :1]
     expected = nominal["link_moments"][..., :1] * scale[:, None, :]
     np.testing.assert_allclose(drawn["link_moments"], expected, rtol=1e-4, atol=1e-8)
@@ -91,19 +91,18 @@ AFFECTED = {
     "dynamic_friction": ["dynamic_friction", "static_friction"],
     **{row: [row] for row in ("no_load_speed", "cutoff_speed", "push_force", "push_torque")},
 }
-"""What the rows change that share an event with another."""
+"""Parameters changed by each row that shares its event with another row, by row."""
 
 
 @pytest.mark.parametrize("row", AFFECTED)
-def test_a_row_that_shares_its_event_changes_nothing_else(nominal, row):
-    """Not one bit."""
+def test_a_row_that_shares_its_event_changes_no_other_parameter(nominal, row):
     found = read(randomized(dataclasses.replace(OFF, **{row: ALL[row]}), 4))
     changed = [name for name in found if not np.array_equal(found[name], nominal[name][..., :4])]
     assert set(changed) <= set(AFFECTED[row]) and AFFECTED[row][0] in changed
 
 
 @pytest.mark.parametrize("row", AFFECTED)
-def test_a_row_off_is_nominal(nominal, row):
+def test_parameters_of_a_row_that_is_off_are_nominal(nominal, row):
     found = read(randomized(dataclasses.replace(RandomizationCfg(**ALL, **HELD), **{row: None}), 4))
     if row == "static_friction":
         np.testing.assert_allclose(found[row], found["dynamic_friction"])
@@ -114,7 +113,7 @@ def test_a_row_off_is_nominal(nominal, row):
 
 
 @pytest.mark.parametrize("row", sorted(set(ALL) - set(AFFECTED)))
-def test_any_other_row_is_an_event_of_its_own(row):
+def test_every_other_row_has_its_own_event(row):
     (alone,) = dataclasses.replace(OFF, **{row: ALL[row]}).events()
     assert alone.func is getattr(parameters, "action_latency" if row == "latency" else row)
     every = RandomizationCfg(**ALL, **HELD)
@@ -122,7 +121,7 @@ def test_any_other_row_is_an_event_of_its_own(row):
     assert [event.func for event in rest] == [event.func for event in every.events() if event.func is not alone.func]
 
 
-def test_the_same_seed_draws_the_same_and_another_does_not():
+def test_parameters_are_equal_for_equal_seeds_only():
     one, same, other = (read(randomized(RandomizationCfg(**ALL, **HELD), 8, seed=seed)) for seed in (3, 3, 4))
     for name in one:
         np.testing.assert_array_equal(one[name], same[name], err_msg=name)
@@ -132,14 +131,14 @@ def test_the_same_seed_draws_the_same_and_another_does_not():
 # ---------------------------------------------------------------- MuJoCo
 
 
-def test_it_reaches_mujoco_too():
+def test_randomised_parameters_reach_mujoco():
     env = randomized(RandomizationCfg(), 2, solver="mujoco")
     for _ in range(2):
         model, solver, found = env.sim.model, env.sim.solver.mjw_model, own_model(env)
         bodies = {name: getattr(model, name).numpy().reshape(2, 21, -1) for name in ("body_mass", "body_com")}
         np.testing.assert_allclose(found["body_mass"][:, 1:], bodies["body_mass"][..., 0], rtol=1e-6)
         np.testing.assert_allclose(found["body_ipos"][:, 1:], bodies["body_com"], atol=1e-7)
-        # MuJoCo keeps principal moments, in an order of its own
+        # MuJoCo stores principal moments in another order
         inertia = np.linalg.eigvalsh(model.body_inertia.numpy().astype(float)).reshape(2, 21, 3)
         np.testing.assert_allclose(np.sort(found["body_inertia"][:, 1:], axis=2), inertia, rtol=1e-3, atol=1e-9)
         for world in range(2):
@@ -160,6 +159,6 @@ def test_it_reaches_mujoco_too():
 
 
 @pytest.mark.parametrize("value", [(1.0, 0.5), (math.nan, 1.0), (0.0, math.inf)])
-def test_impossible_ranges_are_refused(value):
+def test_refuses_invalid_ranges(value):
     with pytest.raises(ValueError, match="base_mass"):
         RandomizationCfg(base_mass=value)

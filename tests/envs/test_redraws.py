@@ -1,4 +1,4 @@
-"""When parameters are drawn, and what the drawn ones do."""
+"""Times at which parameters are sampled, and effects of sampled parameters."""
 
 import dataclasses
 
@@ -15,28 +15,28 @@ from randomization_helpers import ALL, HELD, OFF, ROWS, TASK, fills, own_model, 
 
 @pytest.fixture(scope="module")
 def nominal():
-    """Parameters with every row off."""
+    """Return the parameters with every row off."""
     return read(randomized(OFF))
 
 
-# ---------------------------------------------------------------- when
+# ---------------------------------------------------------------- times
 
 
-def test_drawing_again_begins_with_the_nominal_values(nominal):
+def test_samples_start_from_the_nominal_values_at_every_reset(nominal):
     env = randomized(RandomizationCfg(**ALL, **HELD))
     before = read(env)
     for _ in range(3):
         env.reset()
     after = read(env)
-    then = {name: values[..., :1] for name, values in nominal.items()}
+    reference = {name: values[..., :1] for name, values in nominal.items()}
     for row, value in ROWS.items():
-        assert not np.array_equal(value(before, then), value(after, then)), row
-        assert within(value(after, then), *ALL[row]), row
+        assert not np.array_equal(value(before, reference), value(after, reference)), row
+        assert within(value(after, reference), *ALL[row]), row
 
 
 @pytest.mark.parametrize("solver", ["jumper", "mujoco"])
-def test_a_world_draws_anew_at_its_reset_and_at_no_other_time(solver):
-    """Over 30 steps of random actions, in which some worlds end by themselves."""
+def test_a_world_samples_parameters_at_its_resets_only(solver):
+    """Some episodes end during 30 steps of random actions."""
     env = randomized(RandomizationCfg(**ALL, **HELD), 12, solver=solver)
     ended = np.zeros(12, dtype=bool)
     for step, action in enumerate(random_actions(12, 30)):
@@ -48,7 +48,7 @@ def test_a_world_draws_anew_at_its_reset_and_at_no_other_time(solver):
         for name in before:
             changed = (before[name] != after[name]).reshape(-1, 12).any(axis=0)
             np.testing.assert_array_equal(changed & ~done, False, err_msg=name)
-            if name not in ("latency", "observation_latency"):  # whole numbers may be drawn twice
+            if name not in ("latency", "observation_latency"):  # integers may repeat
                 np.testing.assert_array_equal(changed, done, err_msg=name)
         for name, values in own_model(env).items():
             changed = (values != of_solver[name]).reshape(12, -1).any(axis=1)
@@ -58,7 +58,7 @@ def test_a_world_draws_anew_at_its_reset_and_at_no_other_time(solver):
 
 
 @pytest.mark.parametrize("solver", ["jumper", "mujoco"])
-def test_drawn_at_the_start_stays(solver):
+def test_parameters_sampled_at_startup_do_not_change(solver):
     env = randomized(RandomizationCfg(**ALL, **HELD, resample_at="startup"), 4, solver=solver)
     first, of_solver = seen(env), own_model(env)
     assert len(np.unique(env.sim.model.body_mass.numpy())) == 84
@@ -69,7 +69,7 @@ def test_drawn_at_the_start_stays(solver):
     env.reset()
     found = seen(env)
     for name in first:
-        if name in ("push_force", "push_torque"):  # a push is of an episode
+        if name in ("push_force", "push_torque"):  # pushes are sampled at every reset
             assert not np.array_equal(found[name], first[name])
         else:
             np.testing.assert_array_equal(found[name], first[name], err_msg=name)
@@ -77,7 +77,7 @@ def test_drawn_at_the_start_stays(solver):
         np.testing.assert_array_equal(values, of_solver[name], err_msg=name)
 
 
-def test_an_evaluation_draws_for_its_worlds_only():
+def test_an_evaluation_samples_parameters_of_its_worlds_only():
     env = randomized(RandomizationCfg(**ALL, **HELD), 6)
     before, chosen = read(env), np.arange(6) % 2 == 0
     env.evaluation_reset(np.zeros((6, 4)), worlds=chosen)
@@ -88,8 +88,8 @@ def test_an_evaluation_draws_for_its_worlds_only():
 
 
 @pytest.mark.parametrize(("cfg", "newton"), [(RandomizationCfg.walking(), 10.0), (RandomizationCfg(), 5.0)])
-def test_pushes_come_and_go(cfg, newton):
-    """In a quarter of the intervals, of 0.2 to 0.5 s each; of walking in flight too, of jumps on the ground."""
+def test_a_push_acts_with_probability_0_25_in_intervals_of_0_2_to_0_5_s(cfg, newton):
+    """Pushes of walking robots also act in flight, those of jumping robots only with a paw in contact."""
     task = dataclasses.replace(TASK, randomization=cfg)
     env = make_env(48, task=resetting(task, only("default")), randomize=True)
     env.auto_reset = False
@@ -116,11 +116,11 @@ def test_pushes_come_and_go(cfg, newton):
     assert fills(found[:, :3], -newton, newton) and fills(found[:, 3:], -3.0, 3.0)
 
 
-# ---------------------------------------------------------------- what they do
+# ---------------------------------------------------------------- effects
 
 
-def test_a_push_accelerates_the_robot():
-    """Lifted off the ground but still counted as standing: momentum grows by force times time."""
+def test_a_push_increases_momentum_by_force_times_time():
+    """The robot is in the air, with contact times set as if it were standing."""
     env = randomized(OFF, 2)
     push = np.zeros((2, 6))
     push[1, :3] = [4.0, -3.0, 5.0]
@@ -137,24 +137,24 @@ def test_a_push_accelerates_the_robot():
 
 
 def test_a_sensor_offset_acts_on_the_motor_and_on_the_observation():
-    """A motor whose sensor reads too high by d ends where an honest one told to go d lower does."""
-    wrong, honest = randomized(OFF, 1), randomized(OFF, 1)
+    """A motor whose sensor reads d too high moves like an exact one whose target is d lower."""
+    offset_env, exact_env = randomized(OFF, 1), randomized(OFF, 1)
     offset = np.zeros((12, 1), dtype=np.float32)
     offset[4] = 2.0 * DEG
-    wrong.parameters.motors.offset.assign(offset)
+    offset_env.parameters.motors.offset.assign(offset)
     action = torch.zeros((1, 12))
     lower = action.clone()
     lower[0, 4] = -2.0 / 90.0
     for _ in range(20):
-        wrong.step(action)
-        honest.step(lower)
-    np.testing.assert_allclose(wrong.sim.joint_q(), honest.sim.joint_q(), atol=1e-4)
-    _, end = wrong.task.layout("actor")["angle"]
-    seen = (wrong.obs - honest.obs)[0, end - 12 : end].numpy()
-    np.testing.assert_allclose(seen, offset[:, 0], atol=1e-4)
+        offset_env.step(action)
+        exact_env.step(lower)
+    np.testing.assert_allclose(offset_env.sim.joint_q(), exact_env.sim.joint_q(), atol=1e-4)
+    _, end = offset_env.task.layout("actor")["angle"]
+    difference = (offset_env.obs - exact_env.obs)[0, end - 12 : end].numpy()
+    np.testing.assert_allclose(difference, offset[:, 0], atol=1e-4)
 
 
-def test_motor_and_observation_share_their_sensor():
+def test_motor_and_observation_use_the_same_sensor_offset():
     env = randomized(RandomizationCfg(), 2)
     assert env.sim.motors.offset.ptr == env.robot.joint_offset.ptr == env.parameters.motors.offset.ptr
     assert env.sim.motors.offset.numpy().all()

@@ -1,4 +1,4 @@
-"""Attempts side by side (for GPUs) give what attempts in turn give; on the CPU blocks of 32 threads take turns."""
+"""Reset with several threads per world (for GPUs) against one thread per world, both on the CPU."""
 
 import numpy as np
 import pytest
@@ -13,7 +13,7 @@ N = 96
 
 
 def reset_by(env, lanes):
-    """Return coordinates, rates and states of the worlds after a reset with so many threads a world."""
+    """Return coordinates, rates and states of the worlds after a reset with `lanes` threads per world."""
     skill = env.skills[0]
     env.sim.state.joint_q.assign(np.tile(env.sim.model.joint_q.numpy()[:43], N))
     skill.states.zero_()
@@ -24,7 +24,7 @@ def reset_by(env, lanes):
 
 
 @pytest.mark.parametrize("name", ["velocity-rough", "horizontal-jump", "attitude"])
-def test_threads_of_a_world_find_what_one_finds(name, monkeypatch):
+def test_several_threads_per_world_sample_the_same_starts_as_one(name, monkeypatch):
     env = Env(hardest(make_task(name)), N, seed=3, device="cpu", randomize=False, noise=False)
     env.reset()
     alone = reset_by(env, 1)
@@ -35,4 +35,4 @@ def test_threads_of_a_world_find_what_one_finds(name, monkeypatch):
     for field in shared[2].dtype.names:
         np.testing.assert_array_equal(shared[2][field], alone[2][field], err_msg=field)
     default = env.sim.model.joint_q.numpy()[7:43]
-    assert (alone[0][:, 7:] != default).any(axis=1).sum() > N // 2  # drawn, not the default pose
+    assert (alone[0][:, 7:] != default).any(axis=1).sum() > N // 2  # sampled, not the default pose

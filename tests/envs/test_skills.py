@@ -1,4 +1,4 @@
-"""Several tasks on one simulation: each world has one, and goes from one to another without a jolt."""
+"""Several tasks (skills) in one environment: one active skill per world, and handovers between them."""
 
 import dataclasses
 
@@ -16,7 +16,7 @@ from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.tasks.cfg import Handover
 from jumper_warp.tasks.randomization import RandomizationCfg
-from skill_helpers import begin_hold, begin_jump, when_asked_to_hold, when_asked_to_jump
+from skill_helpers import begin_hold, begin_jump, hold_requested, jump_requested
 
 N = 16
 DEG = np.pi / 180.0
@@ -32,12 +32,12 @@ def always(robot: RobotView, state: HoldState, requested: bool) -> bool:
 
 
 @wp.func
-def go_on_holding(robot: RobotView, state: HoldState) -> HoldState:
+def keep_holding(robot: RobotView, state: HoldState) -> HoldState:
     return state
 
 
-TO_JUMP = Handover(HOLD, JUMP, when_asked_to_jump, begin_jump)
-TO_HOLD = Handover(JUMP, HOLD, when_asked_to_hold, begin_hold)
+TO_JUMP = Handover(HOLD, JUMP, jump_requested, begin_jump)
+TO_HOLD = Handover(JUMP, HOLD, hold_requested, begin_hold)
 
 
 def make(*tasks, **arguments) -> Env:
@@ -47,7 +47,7 @@ def make(*tasks, **arguments) -> Env:
 
 
 def parameters_of(env) -> dict[str, np.ndarray]:
-    """Return everything that is drawn for a world; the world is the last index."""
+    """Return the randomised parameters by name; the world is the last index."""
     parameters, motors = env.parameters, env.sim.motors
     names = ("kp", "kd", "saturation", "peak", "no_load_speed", "cutoff_speed", "offset")
     found = {name: getattr(motors, name).numpy().copy() for name in names}
@@ -60,13 +60,13 @@ def coordinates(env) -> np.ndarray:
     return np.concatenate([env.sim.joint_q(), env.sim.joint_qd()], axis=1)
 
 
-# ---------------------------------------------------------------- side by side
+# ---------------------------------------------------------------- without handovers
 
 
 @pytest.mark.parametrize("nominal", [False, True], ids=["drawn", "nominal"])
 @pytest.mark.parametrize("index", [0, 1])
-def test_worlds_of_a_skill_are_those_of_an_environment_with_that_skill_alone(index, nominal):
-    """Bit for bit; the other skill's actions are not even numbers."""
+def test_worlds_of_a_skill_equal_those_of_an_environment_with_one_skill_bitwise(index, nominal):
+    """Actions of a skill in worlds of the other skill are NaN."""
     arguments = {"randomize": not nominal, "noise": not nominal}
     both = make(JUMP, HOLD, skill=SKILL.astype(int), **arguments)
     alone = make(both.tasks[index], **arguments)
@@ -94,7 +94,7 @@ def test_worlds_of_a_skill_are_those_of_an_environment_with_that_skill_alone(ind
     np.testing.assert_array_equal(both.episodes.skill.numpy(), SKILL)
 
 
-def test_every_skill_counts_its_own():
+def test_every_skill_counts_its_own_terminations():
     env = make(JUMP, HOLD, skill=SKILL.astype(int))
     ended = np.zeros(N)
     for action in random_actions(N, 130):
@@ -105,13 +105,16 @@ def test_every_skill_counts_its_own():
         np.testing.assert_array_equal(counted, np.where(index == SKILL, ended, 0.0))
 
 
-# ---------------------------------------------------------------- handing over
+# ---------------------------------------------------------------- handovers
 
-ASKED = np.arange(N) < 6
+CHOSEN = np.arange(N) < 6  # worlds in which a handover is requested
 
 
-def followed(env, actions, request_at=None, skill=0, worlds=ASKED):
-    """Step with the same action for every skill; returns coordinates and skills after every step."""
+def followed(env, actions, request_at=None, skill=0, worlds=CHOSEN):
+    """Step with the same action for every skill; return coordinates and skills after every step.
+
+    A handover to `skill` is requested in `worlds` before step `request_at`.
+    """
     trace, skills = [], []
     for step, action in enumerate(actions):
         if step == request_at:
@@ -122,53 +125,53 @@ def followed(env, actions, request_at=None, skill=0, worlds=ASKED):
     return np.array(trace), np.array(skills)
 
 
-def test_worlds_that_are_asked_for_switch_once_and_others_never():
+def test_worlds_with_a_request_switch_once_and_others_never():
     env = make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD))
     trace, skills = followed(env, 0.2 * random_actions(N, 12), request_at=5)
-    assert (skills[:5] == 1).all() and (skills[5:] == ~ASKED).all()
+    assert (skills[:5] == 1).all() and (skills[5:] == ~CHOSEN).all()
     assert (env.episodes.requested_task.numpy() == -1).all() and not env.done.any()
     states = env.skills[0].states.numpy()
-    assert (states["steps"][ASKED] == 6).all() and not states["steps"][~ASKED].any()
-    np.testing.assert_allclose(states["start"][ASKED], trace[5, ASKED, :3])
-    np.testing.assert_allclose(states["goal"][ASKED, 2], 0.6 + env.skills[1].states.numpy()["goal"][ASKED], rtol=1e-6)
+    assert (states["steps"][CHOSEN] == 6).all() and not states["steps"][~CHOSEN].any()
+    np.testing.assert_allclose(states["start"][CHOSEN], trace[5, CHOSEN, :3])
+    np.testing.assert_allclose(states["goal"][CHOSEN, 2], 0.6 + env.skills[1].states.numpy()["goal"][CHOSEN], rtol=1e-6)
 
 
-def test_a_switch_leaves_the_robot_and_all_other_worlds_as_they_are():
-    """Against an environment that nobody asks for anything."""
-    asked, twin = (make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD)) for _ in range(2))
+def test_a_handover_changes_neither_the_robot_nor_other_worlds():
+    """The reference is an equal environment without requests."""
+    env, reference = (make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD)) for _ in range(2))
     for step, action in enumerate(0.3 * random_actions(N, 40)):
         if step == 5:
-            asked.request(0, ASKED)
-        for env in (asked, twin):
-            env.step(action.repeat(2, 1, 1))
-        if step == 5:  # the coordinates at the switch
-            np.testing.assert_array_equal(coordinates(asked), coordinates(twin))
-        for name, values in parameters_of(asked).items():
-            unchanged = slice(None) if name in ("table", "offset", "latency", "observation_latency") else ~ASKED
+            env.request(0, CHOSEN)
+        for each in (env, reference):
+            each.step(action.repeat(2, 1, 1))
+        if step == 5:  # the step of the handover
+            np.testing.assert_array_equal(coordinates(env), coordinates(reference))
+        for name, values in parameters_of(env).items():
+            unchanged = slice(None) if name in ("table", "offset", "latency", "observation_latency") else ~CHOSEN
             if step <= 5:
-                np.testing.assert_array_equal(values[..., unchanged], parameters_of(twin)[name][..., unchanged])
-        rest = ~ASKED
-        np.testing.assert_array_equal(coordinates(asked)[rest], coordinates(twin)[rest])
-        assert torch.equal(asked.reward[rest], twin.reward[rest])
-        assert torch.equal(asked.skills[1].obs["actor"][rest], twin.skills[1].obs["actor"][rest])
-    assert (coordinates(asked)[ASKED] != coordinates(twin)[ASKED]).any()  # other motors, filter and scales
+                np.testing.assert_array_equal(values[..., unchanged], parameters_of(reference)[name][..., unchanged])
+        rest = ~CHOSEN
+        np.testing.assert_array_equal(coordinates(env)[rest], coordinates(reference)[rest])
+        assert torch.equal(env.reward[rest], reference.reward[rest])
+        assert torch.equal(env.skills[1].obs["actor"][rest], reference.skills[1].obs["actor"][rest])
+    assert (coordinates(env)[CHOSEN] != coordinates(reference)[CHOSEN]).any()  # other motors, filter and scales
 
 
-def test_a_switch_between_skills_of_equal_motors_changes_no_step_at_all():
-    """The same targets with a switch and without: masses, latency and pushes are those of before."""
-    there = Handover(HOLD, AGAIN, when_asked_to_jump, go_on_holding)
-    back = Handover(AGAIN, HOLD, when_asked_to_jump, go_on_holding)
+def test_a_handover_between_skills_with_equal_motors_changes_no_motion():
+    """Masses, latencies and pushes do not change, so equal targets give bitwise equal motions."""
+    there = Handover(HOLD, AGAIN, jump_requested, keep_holding)
+    back = Handover(AGAIN, HOLD, jump_requested, keep_holding)
     actions = 0.1 * random_actions(N, 10)
-    quiet, asked = (make(HOLD, AGAIN, handovers=(there, back)) for _ in range(2))
-    expected, _ = followed(quiet, actions)
-    found, skills = followed(asked, actions, request_at=3, skill=1)
-    assert (skills[3:] == ASKED).all() and not asked.done.any() and not quiet.done.any()
+    reference, env = (make(HOLD, AGAIN, handovers=(there, back)) for _ in range(2))
+    expected, _ = followed(reference, actions)
+    found, skills = followed(env, actions, request_at=3, skill=1)
+    assert (skills[3:] == CHOSEN).all() and not env.done.any() and not reference.done.any()
     np.testing.assert_array_equal(found, expected)
-    for name, values in parameters_of(quiet).items():
-        np.testing.assert_array_equal(parameters_of(asked)[name], values, err_msg=name)
+    for name, values in parameters_of(reference).items():
+        np.testing.assert_array_equal(parameters_of(env)[name], values, err_msg=name)
 
 
-def test_motors_filter_and_scales_become_those_of_the_new_skill_and_drawn_ratios_stay():
+def test_a_handover_changes_motors_filter_and_scales_and_keeps_sampled_ratios():
     task = dataclasses.replace(JUMP, motors=dataclasses.replace(
         JUMP.motors, transversal=dataclasses.replace(JUMP.motors.transversal, kp=30.0, no_load_speed=35.0))
     )  # fmt: skip
@@ -176,21 +179,21 @@ def test_motors_filter_and_scales_become_those_of_the_new_skill_and_drawn_ratios
     hold = dataclasses.replace(
         HOLD, events=(), randomization=dataclasses.replace(still, push_force=None, push_torque=None)
     )
-    env = make(task, hold, skill=1, handovers=(Handover(hold, task, when_asked_to_jump, begin_jump),))
+    env = make(task, hold, skill=1, handovers=(Handover(hold, task, jump_requested, begin_jump),))
     before, action = parameters_of(env), torch.zeros((2, N, 12))
     action[:, :, ::3] = 1.0  # lateral
     env.step(action)
     np.testing.assert_allclose(env.robot.filtered_target.numpy()[::3], 40.0 * DEG, rtol=1e-6)
-    env.request(0, ASKED)
+    env.request(0, CHOSEN)
     env.step(action)
     assert not env.done.any()
     held = env.robot.filtered_target.numpy() - env.robot.default_angle.numpy()[:, None]
     scale = np.tile([40.0, 90.0, 90.0], 4)[:, None] * DEG
-    np.testing.assert_allclose(env.robot.action.numpy()[:, ASKED], (held / scale)[:, ASKED], atol=1e-6)
+    np.testing.assert_allclose(env.robot.action.numpy()[:, CHOSEN], (held / scale)[:, CHOSEN], atol=1e-6)
     after = parameters_of(env)
     for name, values in after.items():
         switched = name in ("kp", "kd", "saturation", "no_load_speed", "cutoff_speed")
-        np.testing.assert_array_equal(values[..., ~ASKED], before[name][..., ~ASKED], err_msg=name)
+        np.testing.assert_array_equal(values[..., ~CHOSEN], before[name][..., ~CHOSEN], err_msg=name)
         if not switched:
             np.testing.assert_array_equal(values, before[name], err_msg=name)
     for name in ("kp", "kd", "no_load_speed", "saturation"):
@@ -198,41 +201,41 @@ def test_motors_filter_and_scales_become_those_of_the_new_skill_and_drawn_ratios
             np.tile([getattr(motors.lateral, name), *2 * [getattr(motors.transversal, name)]], 4)[:, None]
             for motors in (hold.motors, task.motors)
         )
-        np.testing.assert_allclose(after[name][:, ASKED] / new, before[name][:, ASKED] / old, rtol=1e-5, err_msg=name)
+        np.testing.assert_allclose(after[name][:, CHOSEN] / new, before[name][:, CHOSEN] / old, rtol=1e-5, err_msg=name)
     assert (after["cutoff_speed"] <= 0.95 * after["no_load_speed"] + 1e-5).all()
     env.step(action)
     lateral = env.robot.filtered_target.numpy()[::3] / DEG
     np.testing.assert_allclose(env.robot.target.numpy()[::3], 40.0 * DEG, rtol=1e-6)
-    near = lateral[:, ASKED] < 15.0 + 1e-4  # the filter binds where the limit is near
-    assert near.mean() > 0.3 and (np.abs(lateral[:, ASKED][~near] - 40.0) < 1e-4).all()
-    assert (np.abs(lateral[:, ~ASKED] - 40.0) < 1e-4).all()
+    near = lateral[:, CHOSEN] < 15.0 + 1e-4  # the filter acts near the limit
+    assert near.mean() > 0.3 and (np.abs(lateral[:, CHOSEN][~near] - 40.0) < 1e-4).all()
+    assert (np.abs(lateral[:, ~CHOSEN] - 40.0) < 1e-4).all()
 
 
-def test_a_new_skill_sees_nothing_of_before_its_beginning():
-    """The history of observations and what sensors give late, also of a skill that the world was in before."""
+def test_a_new_skill_observes_nothing_from_before_the_handover():
+    """Observation history and delayed terms are cleared, also for a skill that was active in the world earlier."""
     env = make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD), noise=False)
     first, end = HOLD.layout("actor")["height"]
     actions = 0.3 * random_actions(N, 30)
     followed(env, actions[:8], request_at=5)  # to jumping
-    kept = env.skills[1].obs["actor"].clone()
+    old_obs = env.skills[1].obs["actor"].clone()
     followed(env, actions[8:15], request_at=6, skill=1)  # and back
     assert (env.episodes.skill.numpy() == 1).all() and not env.done.any()
-    seen = env.skills[1].obs["actor"][ASKED, first:end].numpy()
-    height = env.sim.joint_q()[ASKED, 2]
+    seen = env.skills[1].obs["actor"][CHOSEN, first:end].numpy()
+    height = env.sim.joint_q()[CHOSEN, 2]
     np.testing.assert_allclose(seen, np.repeat(5.0 * height[:, None], 3, axis=1), rtol=1e-5)
-    assert (seen != kept[ASKED, first:end].numpy()).all()
+    assert (seen != old_obs[CHOSEN, first:end].numpy()).all()
     followed(env, actions[15:16])
-    following = env.skills[1].obs["actor"][ASKED, first:end].numpy()
+    following = env.skills[1].obs["actor"][CHOSEN, first:end].numpy()
     np.testing.assert_array_equal(following[:, :2], seen[:, 1:])
     last_first, last_end = HOLD.layout("actor")["last_action"]
-    np.testing.assert_array_equal(env.skills[1].obs["actor"][ASKED, last_first:last_end], actions[15][ASKED])
+    np.testing.assert_array_equal(env.skills[1].obs["actor"][CHOSEN, last_first:last_end], actions[15][CHOSEN])
 
 
-def test_a_world_goes_over_at_most_once_a_step_and_not_where_its_episode_ends():
-    handovers = (Handover(HOLD, AGAIN, always, go_on_holding), Handover(AGAIN, HOLD, always, go_on_holding))
+def test_a_world_switches_at_most_once_a_step_and_not_when_its_episode_ends():
+    handovers = (Handover(HOLD, AGAIN, always, keep_holding), Handover(AGAIN, HOLD, always, keep_holding))
     env = make(HOLD, AGAIN, handovers=handovers)
     records = env.skills[0].states.numpy().copy()
-    records["steps"][2] = 119  # ends now, and begins anew in the skill that it is in
+    records["steps"][2] = 119  # the episode ends in this step, and the next one has the same skill
     env.skills[0].states.assign(records)
     skills = followed(env, torch.zeros((5, N, 12)))[1]
     rest = np.arange(N) != 2
@@ -240,18 +243,18 @@ def test_a_world_goes_over_at_most_once_a_step_and_not_where_its_episode_ends():
     assert skills[:, 2].tolist() == [0, 1, 0, 1, 0]
 
 
-def test_an_environment_with_handovers_goes_on_from_a_saved_state():
+def test_an_environment_with_handovers_continues_bitwise_from_a_saved_state():
     saved, fresh = (make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD)) for _ in range(2))
     actions = 0.3 * random_actions(N, 60)
     followed(saved, actions[:12], request_at=5)
-    saved.request(1, ASKED)
+    saved.request(1, CHOSEN)
     fresh.load_state_dict(saved.state_dict())
     for found, expected in zip(followed(fresh, actions[12:]), followed(saved, actions[12:]), strict=True):
         np.testing.assert_array_equal(found, expected)
     assert torch.equal(fresh.reward, saved.reward) and (saved.episodes.skill.numpy() == 1).all()
 
 
-def test_beginning_with_a_seed_puts_the_skills_and_their_motors_back():
+def test_reset_with_a_seed_restores_first_skills_and_their_motors():
     env, fresh = (make(JUMP, HOLD, skill=1, handovers=(TO_JUMP,), randomize=False) for _ in range(2))
     followed(env, torch.zeros((3, N, 12)), request_at=1)
     assert set(env.episodes.skill.numpy()) == {0, 1}
@@ -261,27 +264,27 @@ def test_beginning_with_a_seed_puts_the_skills_and_their_motors_back():
         np.testing.assert_array_equal(parameters_of(env)[name], values, err_msg=name)
 
 
-def test_a_command_that_came_with_the_request_is_given_as_the_skill_takes_over():
+def test_a_command_in_the_request_is_given_at_the_handover():
     env = make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD), randomize=False, noise=False)
     followed(env, torch.zeros((3, N, 12)))
     commands = np.zeros((N, 3))
     commands[:, 2] = np.linspace(0.6, 0.9, N)
-    env.request(0, ASKED, commands)
+    env.request(0, CHOSEN, commands)
     env.request(0, np.arange(N) == 7)
     followed(env, torch.zeros((1, N, 12)))
     states = env.skills[0].states.numpy()
-    np.testing.assert_allclose(states["goal"][ASKED, 2], commands[ASKED, 2], rtol=1e-6)
-    assert (states["command_step"][ASKED] == 0).all() and states["command_step"][7] == 1000
+    np.testing.assert_allclose(states["goal"][CHOSEN, 2], commands[CHOSEN, 2], rtol=1e-6)
+    assert (states["command_step"][CHOSEN] == 0).all() and states["command_step"][7] == 1000
     first, _ = JUMP.layout("actor")["wanted_height"]
-    np.testing.assert_allclose(env.skills[0].obs["actor"][ASKED, first], commands[ASKED, 2], rtol=1e-6)
-    assert not env.episodes.has_command.numpy()[ASKED].any() and (env.episodes.skill.numpy()[8:] == 1).all()
+    np.testing.assert_allclose(env.skills[0].obs["actor"][CHOSEN, first], commands[CHOSEN, 2], rtol=1e-6)
+    assert not env.episodes.has_command.numpy()[CHOSEN].any() and (env.episodes.skill.numpy()[8:] == 1).all()
     with pytest.raises(ValueError, match=r"16 rows or one for all, got shape \(3, 2\)"):
-        env.request(0, ASKED, np.zeros((3, 2)))
+        env.request(0, CHOSEN, np.zeros((3, 2)))
 
 
 @pytest.mark.parametrize("begin", ["reset", "evaluation_reset", "ended"])
-def test_new_episodes_begin_in_the_first_skill_and_forget_requests(begin):
-    """Worlds of the last case end by themselves; its others stay as they are."""
+def test_new_episodes_begin_in_the_first_skill_without_requests(begin):
+    """In the case "ended" one episode ends by its termination; other worlds do not change."""
     env, fresh = (make(JUMP, HOLD, skill=1, handovers=(TO_JUMP, TO_HOLD), randomize=False) for _ in range(2))
     followed(env, torch.zeros((3, N, 12)), request_at=1)
     env.request(1, np.arange(N) == 4, np.ones((N, 1)))
@@ -300,12 +303,12 @@ def test_new_episodes_begin_in_the_first_skill_and_forget_requests(begin):
         assert env.done[3]
     assert (env.episodes.skill.numpy()[new] == 1).all() and (env.episodes.requested_task.numpy()[new] == -1).all()
     assert not env.episodes.has_command.numpy()[new].any()
-    assert (env.episodes.skill.numpy()[(~new) & ASKED & (np.arange(N) != 4)] == 0).all()
+    assert (env.episodes.skill.numpy()[(~new) & CHOSEN & (np.arange(N) != 4)] == 0).all()
     for name, values in parameters_of(fresh).items():
         np.testing.assert_array_equal(parameters_of(env)[name][..., new], values[..., new], err_msg=name)
 
 
-def test_figures_and_configuration_are_of_all_skills():
+def test_metrics_and_configuration_contain_all_skills():
     env = make(JUMP, HOLD, skill=SKILL.astype(int), handovers=(TO_JUMP, TO_HOLD))
     followed(env, 0.5 * random_actions(N, 130))
     ended = {
@@ -313,28 +316,28 @@ def test_figures_and_configuration_are_of_all_skills():
     }
     assert min(ended.values()) > 0.9
     followed(env, 0.5 * random_actions(N, 130))
-    figures = env.metrics()
-    assert "Episode_Reward/jump_height" in figures and "hold-height/Episode_Reward/near_goal" in figures
-    assert sum(v for k, v in figures.items() if k.startswith("hold-height/Episode_Termination")) == pytest.approx(1.0)
+    metrics = env.metrics()
+    assert "Episode_Reward/jump_height" in metrics and "hold-height/Episode_Reward/near_goal" in metrics
+    assert sum(v for k, v in metrics.items() if k.startswith("hold-height/Episode_Termination")) == pytest.approx(1.0)
     config = env.config()
     assert [task["name"] for task in config["tasks"]] == ["vertical-jump", "hold-height"]
     assert config["first_skill"] == SKILL.astype(int).tolist()
-    assert config["handovers"][0]["when"].endswith(":when_asked_to_jump")
+    assert config["handovers"][0]["when"].endswith(":jump_requested")
 
 
-# ---------------------------------------------------------------- what cannot be
+# ---------------------------------------------------------------- refusals
 
 
 @pytest.mark.parametrize(
     ("make_env", "message"),
     [
-        (lambda: Env([], N), r"at least one task, each with a name of its own, got \[\]"),
-        (lambda: Env([HOLD, HOLD], N), "a name of its own, got .*'hold-height', 'hold-height'"),
+        (lambda: Env([], N), r"at least one task, and unique names, got \[\]"),
+        (lambda: Env([HOLD, HOLD], N), "unique names, got .*'hold-height', 'hold-height'"),
         (lambda: Env([JUMP, HOLD], N, skill=2), "skill must be an index below 2, got 2 to 2"),
         (lambda: Env([JUMP, HOLD], N, skill=-1), "skill must be an index below 2, got -1 to -1"),
         (
             lambda: Env([JUMP, HOLD], N, skill=np.zeros(N + 1, dtype=int)),
-            r"skill must be .* 16 whole ones, got int64 of shape \(17,\)",
+            r"skill must be .* 16 ints, got int64 of shape \(17,\)",
         ),
         (lambda: Env([JUMP, HOLD], N, skill=np.full(N, 0.5)), "skill must be .* got float64"),
         (lambda: Env([JUMP, make_task("horizontal-jump")], N, handovers=[TO_JUMP]), "hold-height to vertical-jump"),
@@ -342,14 +345,14 @@ def test_figures_and_configuration_are_of_all_skills():
         (lambda: make(JUMP, HOLD).step(torch.zeros((N, 12))), r"shape \(2, 16, 12\), got \(16, 12\)"),
     ],
 )
-def test_impossible_skills_are_refused(make_env, message):
+def test_refuses_invalid_skills(make_env, message):
     with pytest.raises(ValueError, match=message) as caught:
         make_env()
     assert "\n" not in str(caught.value)
 
 
-def test_skills_whose_motors_are_not_of_one_robot_are_refused():
+def test_refuses_skills_with_motors_of_different_robots():
     motors = jumping_motors(18.0)
     other = dataclasses.replace(motors, transversal=dataclasses.replace(motors.transversal, peak=30.0))
-    with pytest.raises(ValueError, match=r"hold-height needs the peak torque .* of vertical-jump's motors"):
+    with pytest.raises(ValueError, match=r"hold-height and vertical-jump must have equal peak torque"):
         Env([JUMP, dataclasses.replace(HOLD, motors=other)], N, device="cpu")

@@ -50,7 +50,7 @@ def test_start_states_and_observation_noise_differ_by_purpose():
 
 
 def test_training_keeps_its_robots_start_states_and_noise():
-    """Literals are of the version before streams had purposes; its start states and noise are in the observation."""
+    """The literals were computed without purposes of streams; observations contain start states and noise."""
     jump, walk = (Env(make_task(name), 3, seed=5, device="cpu") for name in ("vertical-jump", "velocity-flat"))
     for env in (jump, walk):
         env.reset()
@@ -78,5 +78,5 @@ def test_refuses_an_unknown_stream_and_a_state_of_another_one():
     with pytest.raises(InputError, match="stream must be one of training, tuning, selection, reporting, got 'test'"):
         Env(task, 2, device="cpu", stream="test")
     saved, other = (randomized(OFF, 2, stream=name) for name in ("tuning", "reporting"))
-    with pytest.raises(InputError, match="saved with seed 2147483648, this environment draws with seed 6442450944"):
+    with pytest.raises(InputError, match="saved with seed 2147483648, this environment has seed 6442450944"):
         other.load_state_dict(saved.state_dict())

@@ -1,4 +1,4 @@
-"""The shipped policies on one robot: which skill follows which, and that a switch touches nothing but the skill."""
+"""Handovers between the shipped policies on one robot: their order, and the state after them."""
 
 import dataclasses
 
@@ -30,7 +30,7 @@ def coordinates(env) -> np.ndarray:
 
 
 class Switch:
-    """What there was of a world at a switch."""
+    """State, observation and next filtered target of a world at a handover."""
 
     def __init__(self, env: Env, world: int) -> None:
         self.world, self.target = world, int(env.episodes.skill.numpy()[world])
@@ -42,7 +42,7 @@ class Switch:
 
 @pytest.fixture(scope="module")
 def followed():
-    """Return policies, environment, course and all switches of a nominal run whose stages are launched one by one."""
+    """Return policies, environment, course and all handovers of a nominal run whose stages are launched one by one."""
     policies = SkillPolicies()
     env = policies.env(N, Conditions(device="cpu", threads=1))
     course, switches, fresh = CourseLog(SCRIPTS), [], []
@@ -64,7 +64,7 @@ def followed():
     return policies, env, course, switches
 
 
-def test_skills_follow_each_other_as_the_scripts_say(followed):
+def test_skills_have_the_order_of_the_scripts(followed):
     _, _, course, switches = followed
     order = [[s.target for s in switches if s.world == w] for w in range(N)]
     assert order == [[JUMP_UP, WALK, JUMP_TO, WALK], [JUMP_TO, WALK, JUMP_UP, WALK]]
@@ -72,7 +72,7 @@ def test_skills_follow_each_other_as_the_scripts_say(followed):
     assert abs(course.apex_error[0, 1]) < 0.02 and np.nanmax(course.landing_error) < 0.05
 
 
-def test_after_a_switch_observation_and_filter_are_those_of_a_fresh_environment_in_the_same_state(followed):
+def test_observation_and_filter_after_a_handover_equal_those_of_a_new_environment_in_the_same_state(followed):
     policies, _, _, switches = followed
     for target in (WALK, JUMP_UP, JUMP_TO):
         cases = [s for s in switches if s.target == target]
@@ -101,7 +101,7 @@ def test_after_a_switch_observation_and_filter_are_those_of_a_fresh_environment_
             np.testing.assert_array_equal(alone.robot.filtered_target.numpy()[:, 0], s.next_safe)
 
 
-def test_jumps_are_commanded_from_the_squat_after_they_took_over_and_walking_stands_first(followed):
+def test_jumps_are_commanded_squat_time_after_the_handover_and_walking_starts_standing(followed):
     _, env, course, switches = followed
     for s in switches:
         if s.target == WALK:
@@ -116,12 +116,10 @@ def test_jumps_are_commanded_from_the_squat_after_they_took_over_and_walking_sta
     assert np.linalg.norm(way) == pytest.approx(0.7 if first.world else np.hypot(0.6, 0.1), abs=1e-5)
 
 
-def test_policies_of_other_tasks_are_refused():
-    with pytest.raises(PolicyError, match=r"evaluated by velocity, got one of vertical-jump"):
+def test_refuses_policies_of_other_tasks():
+    with pytest.raises(PolicyError, match=r"suite velocity, got one of task vertical-jump"):
         SkillPolicies(SkillNames(walk="vertical_jump"))
-    with pytest.raises(
-        PolicyError, match=r"evaluated by landing_position or omnidirectional, got one of velocity-flat"
-    ):
+    with pytest.raises(PolicyError, match=r"suite landing_position or omnidirectional, got one of task velocity-flat"):
         SkillPolicies(SkillNames(jump_to="walking_flat"))
 
 

@@ -1,4 +1,4 @@
-"""CPU threads that share the worlds: the same bits, whatever their number."""
+"""CPU threads: results do not depend on their number bitwise, and errors reach the caller."""
 
 import dataclasses
 import os
@@ -28,7 +28,7 @@ from jumper_warp.tasks.cfg import Handover
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.utils import threads as pool
 from jumper_warp.utils.errors import InputError
-from skill_helpers import begin_hold, begin_jump, when_asked_to_jump
+from skill_helpers import begin_hold, begin_jump, jump_requested
 
 N = 3 * MIN_WORLDS + 2
 JUMP = dataclasses.replace(
@@ -48,8 +48,8 @@ def all_cores():
     pool.set_threads(None)
 
 
-def story(threads, steps=240, task=JUMP, **arguments):
-    """Return rows of results, (steps, N, columns), of random actions, the state and metrics after them, and the Env."""
+def run(threads, steps=240, task=JUMP, **arguments):
+    """Step with random actions; return results (steps, N, columns), the state and metrics at the end, and the Env."""
     env = Env(task, N, seed=3, device="cpu", threads=threads, **arguments)
     assert len(env.sim.slices) == threads
     for skill in env.skills:
@@ -66,7 +66,7 @@ def story(threads, steps=240, task=JUMP, **arguments):
 
 
 def assert_same(found, expected):
-    """Two results of `story` are the same bit for bit."""
+    """Assert that two results of `run` are bitwise equal."""
     assert torch.equal(found[0], expected[0])
     for name, value in found[1].items():
         np.testing.assert_array_equal(value.numpy(), expected[1][name].numpy(), err_msg=name)
@@ -75,23 +75,23 @@ def assert_same(found, expected):
 
 @pytest.fixture(scope="module")
 def alone():
-    return story(1)
+    return run(1)
 
 
 @pytest.mark.parametrize("threads", [2, 3])
-def test_an_environment_has_the_same_bits_on_any_number_of_threads(alone, threads):
-    """Randomised, with noise, pushes, episodes that end, and a curriculum."""
+def test_an_environment_is_bitwise_equal_on_any_number_of_threads(alone, threads):
+    """The environment is randomised, with noise, pushes, ended episodes and a curriculum."""
     rows, env = alone[0], alone[-1]
     assert (rows[..., -2].sum(0) > 1).all() and rows[..., -2].sum(0).unique().numel() > 1
     assert len(np.unique(env.parameters.push.numpy(), axis=0)) > N // 4
     assert env.episodes.level.numpy().max() > 0
-    assert_same(story(threads), alone)
+    assert_same(run(threads), alone)
 
 
-def test_skills_and_their_handovers_have_the_same_bits():
-    there, back = Handover(HOLD, JUMP, when_asked_to_jump, begin_jump), Handover(JUMP, HOLD, in_the_air, begin_hold)
+def test_handovers_are_bitwise_equal_on_any_number_of_threads():
+    there, back = Handover(HOLD, JUMP, jump_requested, begin_jump), Handover(JUMP, HOLD, in_the_air, begin_hold)
     expected, found = (
-        story(threads, 120, (JUMP, HOLD), skill=np.arange(N) % 2, handovers=(there, back)) for threads in (1, 3)
+        run(threads, 120, (JUMP, HOLD), skill=np.arange(N) % 2, handovers=(there, back)) for threads in (1, 3)
     )
     assert len(np.unique(expected[1]["env.skill"])) == 2
     assert not np.array_equal(expected[1]["env.skill"], np.arange(N) % 2)
@@ -99,7 +99,7 @@ def test_skills_and_their_handovers_have_the_same_bits():
 
 
 @pytest.mark.parametrize("filtered", [False, True])
-def test_a_simulation_has_the_same_bits_on_any_number_of_threads(filtered):
+def test_a_simulation_is_bitwise_equal_on_any_number_of_threads(filtered):
     def moved(threads):
         command_filter = vertical_jump_filter() if filtered else None
         sim = Simulation(N, command_filter=command_filter, visuals=False, device="cpu", threads=threads)
@@ -120,7 +120,7 @@ def test_a_simulation_has_the_same_bits_on_any_number_of_threads(filtered):
             np.testing.assert_array_equal(array, wanted)
 
 
-def test_a_training_has_the_same_bits_on_any_number_of_threads(tmp_path, one_thread):
+def test_a_training_is_bitwise_equal_on_any_number_of_threads(tmp_path, one_thread):
     def trained(threads):
         cfg = TrainCfg(
             num_envs=N, max_iterations=3, device="cpu", threads=threads, log_root=tmp_path / str(threads),
@@ -156,7 +156,7 @@ def flat(state, prefix=""):
 
 
 @pytest.mark.parametrize(("worlds", "threads"), [(1, 8), (31, 2), (32, 2), (50, 3), (1000, 7), (4096, 64), (20, 1)])
-def test_slices_hold_each_world_once_and_are_about_equal(worlds, threads):
+def test_slices_contain_each_world_once_and_are_about_equal(worlds, threads):
     slices = slices_of(worlds, threads)
     assert [world for each in slices for world in range(each.first, each.first + each.count)] == list(range(worlds))
     assert len(slices) == max(1, min(threads, worlds // MIN_WORLDS))
@@ -176,8 +176,8 @@ def test_mujoco_has_one_slice():
 
 
 def test_jobs_run_at_the_same_time():
-    meeting = threading.Barrier(3, timeout=30.0)
-    pool.run_in_parallel([meeting.wait] * 3, 3)
+    barrier = threading.Barrier(3, timeout=30.0)
+    pool.run_in_parallel([barrier.wait] * 3, 3)
 
 
 def test_each_job_runs_once_whatever_the_number_of_threads():
@@ -188,7 +188,7 @@ def test_each_job_runs_once_whatever_the_number_of_threads():
 
 
 @pytest.mark.parametrize("failing", [0, 1])
-def test_what_a_job_raises_reaches_the_caller_when_the_others_have_ended(failing):
+def test_the_exception_of_a_job_is_raised_after_all_started_jobs_have_ended(failing):
     started, ended = threading.Barrier(2, timeout=30.0), []
 
     def fail():
@@ -205,16 +205,16 @@ def test_what_a_job_raises_reaches_the_caller_when_the_others_have_ended(failing
     with pytest.raises(FloatingPointError, match="a slice failed"):
         pool.run_in_parallel(jobs, 2)
     assert ended == [True]
-    pool.run_in_parallel([lambda: ended.append(True)] * 2, 2)  # the threads go on
+    pool.run_in_parallel([lambda: ended.append(True)] * 2, 2)  # the threads still run
     assert len(ended) == 3
 
 
-def test_a_failing_slice_reaches_the_caller_of_a_step():
+def test_a_step_raises_the_exception_of_a_slice():
     env = Env(JUMP, 2 * MIN_WORLDS, device="cpu", threads=2)
     env.reset()
     env.step(torch.zeros(2 * MIN_WORLDS, 12))
     (graph,) = env._graphs.values()
-    graph._graphs[1].apic_state = object()  # not a graph's
+    graph._graphs[1].apic_state = object()  # not the state of a graph
     with pytest.raises(Exception, match="argument"):
         env.step(torch.zeros(2 * MIN_WORLDS, 12))
 
@@ -230,7 +230,7 @@ def test_all_cores_are_used_and_shared_by_the_processes_of_a_machine(monkeypatch
 
 
 @pytest.mark.parametrize("threads", [0, -1, 1.5, True, "2"])
-def test_a_number_of_threads_that_is_none_is_refused(threads):
+def test_refuses_an_invalid_number_of_threads(threads):
     message = "threads must be a whole number of at least 1, got"
     for use in (pool.set_threads, lambda n: TrainCfg(threads=n), lambda n: Simulation(1, device="cpu", threads=n)):
         with pytest.raises(InputError, match=message):
@@ -241,6 +241,6 @@ def test_a_number_of_threads_that_is_none_is_refused(threads):
 def test_a_command_refuses_bad_threads_in_one_line(command, capsys):
     with pytest.raises(SystemExit) as caught:
         main([*command, "--threads", "0"])
-    told = capsys.readouterr().err.strip().splitlines()
+    lines = capsys.readouterr().err.strip().splitlines()
     assert caught.value.code == 2
-    assert told == ["jumper: threads must be a whole number of at least 1, got 0"]
+    assert lines == ["jumper: threads must be a whole number of at least 1, got 0"]

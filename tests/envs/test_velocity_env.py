@@ -1,4 +1,4 @@
-"""Velocity tracking as an environment: on a plane and on a map, what it logs, ends by, sees and saves."""
+"""Environment of velocity tracking, on a plane and on a map: observations, terminations, commands and metrics."""
 
 import dataclasses
 
@@ -28,7 +28,7 @@ def on_small_map() -> TaskCfg:
 
 @pytest.fixture(scope="module")
 def rough():
-    """The rough task, randomised, on a small map."""
+    """Return N randomised worlds of velocity-rough on a small map."""
     return walking_env(N, task=on_small_map(), randomize=True)
 
 
@@ -38,7 +38,7 @@ def flat():
 
 
 def height_at(x, y):
-    """Height of the map [m], bilinear between nodes."""
+    """Return the height of the map [m], bilinear between nodes."""
     field = terrain_map(MAP)
     z = heights(field)
     u = np.clip((np.asarray(x) + field.hx) / 0.1, 0, z.shape[1] - 1.001)
@@ -63,15 +63,15 @@ def test_robots_begin_on_tiles_of_their_level(rough):
     np.testing.assert_array_equal(states_of(rough)["limit"], np.tile([4.0, 16.0], (N, 1)))
 
 
-def test_paws_and_ground_around_are_measured_on_the_map(rough):
+def test_paw_heights_and_ground_heights_around_the_base_are_those_of_the_map(rough):
     rough.reset()
     for action in random_actions(N, 8):
         rough.step(0.2 * action)
     paws = rough.robot.paw_pos.numpy()
     wanted = paws[..., 2] - height_at(paws[..., 0], paws[..., 1]) - 0.025
-    going_on = rough.done.numpy() == 0.0
-    assert going_on.sum() > N // 2
-    np.testing.assert_allclose(rough.robot.paw_height.numpy()[:, going_on], wanted[:, going_on], atol=1e-4)
+    is_running = rough.done.numpy() == 0.0
+    assert is_running.sum() > N // 2
+    np.testing.assert_allclose(rough.robot.paw_height.numpy()[:, is_running], wanted[:, is_running], atol=1e-4)
 
     q = rough.sim.joint_q().astype(float)
     x, y, z, w = q[:, 3:7].T
@@ -87,7 +87,7 @@ def test_paws_and_ground_around_are_measured_on_the_map(rough):
 
 
 def test_shank_in_a_step_ends_the_episode(rough):
-    """A robot that stands beside the stairs, moved so that its front shanks are within a step."""
+    """A robot is placed in front of the stairs, with its front shanks inside a step."""
     edit(rough, terrain_level=0, steps=0)
     rough.reset()
     action = torch.zeros((N, 12))
@@ -98,7 +98,7 @@ def test_shank_in_a_step_ends_the_episode(rough):
     assert SHANK_GROUND > 0 and ending_names(rough)[3] == "collided"
 
 
-def test_robot_that_leaves_the_map_ends_without_blame(rough):
+def test_leaving_the_map_ends_the_episode_as_a_time_out(rough):
     edit(rough, steps=0)
     rough.reset()
     edit_coordinates(rough, 5, q={0: 4.2, 1: 0.0, 2: 0.6})
@@ -114,31 +114,31 @@ def test_nominal_environment_is_on_a_plane():
     assert np.abs(env.sim.joint_q()[:, :2]).max() <= 0.1 and not states_of(env)["limit"].any()
 
 
-def test_logged_figures_are_ratios_of_what_worlds_counted(flat):
+def test_metrics_are_ratios_of_sums_over_worlds(flat):
     flat.reset(seed=1)
     flat.metrics()
     worlds = np.arange(8)
     edit(flat, sum_xy=0.1 * worlds, sum_yaw=0.2 * worlds, sum_settled=2.0, falls=(worlds == 3) * 1.0, minutes=0.25,
          apexes=0.3, touchdowns=4.0, seconds_walking=2.0, score=worlds * 1.0, all_steps=10.0,
          command_level=worlds)  # fmt: skip
-    figures = flat.metrics()
+    metrics = flat.metrics()
     expected = {
         "Metrics/error_vel_xy_settled_m_s": 2.8 / 16.0, "Metrics/error_vel_yaw_settled_rad_s": 5.6 / 16.0,
         "Metrics/falls_per_minute": 0.5, "Metrics/swing_apex_m": 0.075, "Metrics/steps_hz": 2.0, "Metrics/score": 0.35,
         "Curriculum/command_level": 3.5,
     }  # fmt: skip
-    assert {name: figures[name] for name in expected} == pytest.approx(expected, rel=1e-5)
-    assert "Metrics/error_of_successes_m_s" in figures
+    assert {name: metrics[name] for name in expected} == pytest.approx(expected, rel=1e-5)
+    assert "Metrics/error_of_successes_m_s" in metrics
     again = flat.metrics()
     assert again["Metrics/error_vel_xy_settled_m_s"] == 0.0 and again["Curriculum/command_level"] == 3.5
 
 
-def test_metric_of_an_unknown_field_is_refused():
-    with pytest.raises(InputError, match="metric Metrics/x needs 'speed', which its state has not"):
+def test_refuses_a_metric_of_an_unknown_field():
+    with pytest.raises(InputError, match="metric Metrics/x needs a field 'speed' of the state"):
         dataclasses.replace(make_task("velocity-flat"), metrics=(StateMetric("Metrics/x", "speed"),))
 
 
-def test_episode_ends_with_its_time_and_a_command_with_its_own(flat):
+def test_episode_and_command_end_at_their_own_times(flat):
     flat.reset(seed=1)
     flat.evaluation_reset(np.zeros((8, 3)))
     flat._ends_episodes = True
@@ -154,7 +154,7 @@ def test_episode_ends_with_its_time_and_a_command_with_its_own(flat):
     assert set(names) == {"finished"} and flat.timeout.all()
 
 
-def test_another_command_comes_within_the_episode(flat):
+def test_a_new_command_is_sampled_when_the_old_one_ends(flat):
     flat.evaluation_reset(np.tile([0.3, 0.1, 0.2], (8, 1)))
     flat._ends_episodes = True
     edit(flat, command_lasts=50, command_steps=49)
@@ -167,7 +167,7 @@ def test_another_command_comes_within_the_episode(flat):
     np.testing.assert_array_equal(flat.obs[:, :3].numpy(), state["command"])
 
 
-def test_command_from_outside_stays(flat):
+def test_a_command_of_the_caller_does_not_change(flat):
     flat.evaluation_reset(np.tile([0.3, 0.1, 0.2], (8, 1)))
     state = states_of(flat)
     np.testing.assert_allclose(state["command"], np.tile([0.3, 0.1, 0.2], (8, 1)), rtol=1e-6)
@@ -179,7 +179,7 @@ def test_command_from_outside_stays(flat):
     assert not state["command"][:4].any() and state["command"][4:].all()
 
 
-def test_same_seed_same_bits(rough):
+def test_steps_are_bitwise_reproducible_with_a_seed(rough):
     def play():
         rough.reset(seed=9)
         for action in 0.5 * random_actions(N, 10):

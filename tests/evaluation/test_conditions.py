@@ -55,7 +55,7 @@ def test_only_with_second_takeoff_ends_landed_jump_above_limit_speed():
         env = make_env(2, task=change(JUMP), auto_reset=False)
         env.evaluation_reset(np.zeros((2, 4)))
         edit_episodes(env, phase=LANDED, phase_steps=5)
-        for world, up in ((0, 0.5), (1, 0.2)):  # [m/s] upward speed after the step, beside the limit of 0.25
+        for world, up in ((0, 0.5), (1, 0.2)):  # [m/s] upward speed after the step; limit: 0.25
             edit_coordinates(env, world, q={2: 1.0}, qd={2: up + 9.81 / 60.0})
         env.step(torch.zeros((2, 12)))
         names[change.__name__] = ending_names(env)

@@ -24,9 +24,9 @@ class ScriptedEnv:
     """Robots that stop 50 steps after a jump is requested, take off 25 steps later and finish 40 steps after that."""
 
     def __init__(self, n: int, error=(0.1, 0.0, 0.0), falls_at=None, never_stops=False):
-        """Stand n robots; error: velocity minus command; falls_at: (n,) policy step of each fall, -1: none."""
+        """Create n standing robots; error: velocity error; falls_at: (n,) policy step of each fall, -1: none."""
         self.n, self.error, self.falls_at, self.never_stops = n, np.array(error), falls_at, never_stops
-        self.skill, self.commands, self.since, self.command_values = np.zeros(n, int), np.full(n, -1), np.zeros(n), None
+        self.skill, self.commands, self.age, self.command_values = np.zeros(n, int), np.full(n, -1), np.zeros(n), None
         self.step_dt, self.steps, self.velocity, self.requests = DT, 0, np.zeros((n, 3)), []
         goals = np.zeros(n, dtype=[("goal", float, 3)])
         goals["goal"] = np.arange(3 * n).reshape(n, 3)
@@ -47,18 +47,18 @@ class ScriptedEnv:
         self.goals = commands.copy()
         self.requests += [(self.steps, skill, int(w)) for w in np.flatnonzero(worlds)]
         self.commands[worlds] = skill
-        self.since[worlds] = 0
+        self.age[worlds] = 0
 
     def step(self):
         """Advance by a policy step, and return the arrays of `CourseLog.read_env`."""
         self.steps += 1
-        self.since += 1
-        took_off = (self.skill >= JUMP_UP) & (self.since == 25)
+        self.age += 1
+        took_off = (self.skill >= JUMP_UP) & (self.age == 25)
         for w in range(self.n):
-            if self.skill[w] == WALK and self.commands[w] >= 0 and self.since[w] >= 50 and not self.never_stops:
-                self.skill[w], self.commands[w], self.since[w] = self.commands[w], -1, 0
-            elif self.skill[w] >= JUMP_UP and self.since[w] >= 65:
-                self.skill[w], self.since[w] = WALK, 0
+            if self.skill[w] == WALK and self.commands[w] >= 0 and self.age[w] >= 50 and not self.never_stops:
+                self.skill[w], self.commands[w], self.age[w] = self.commands[w], -1, 0
+            elif self.skill[w] >= JUMP_UP and self.age[w] >= 65:
+                self.skill[w], self.age[w] = WALK, 0
         termination = np.where(self.falls_at == self.steps, 1, -1) * np.ones(self.n, int)
         return {
             "base_pos": np.tile([0.05, 0.0, 0.4], (self.n, 1)), "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (self.n, 1)),
@@ -169,7 +169,7 @@ def test_goals_of_jumps_to_a_place_are_marked_when_the_jump_skill_takes_over():
 
 
 def test_refuses_scripts_of_different_lengths():
-    with pytest.raises(InputError, match="one length"):
+    with pytest.raises(InputError, match="equal, positive lengths"):
         CourseLog([SCRIPT, SCRIPT[:1]])
 
 

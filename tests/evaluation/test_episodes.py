@@ -43,7 +43,7 @@ def episodes():
     log, env = EpisodeFlags(4, command=(0.5, 0.1)).log(TASK, 0), StubEnv()
     log.begin(env)
     assert env.commands.tolist() == [[0.5, 0.1, 0.0, 0.0]] * 4
-    env.set(termination=[0, -1, -1, ENDS.index("came_apart")])
+    env.set(termination=[0, -1, -1, ENDS.index("diverged")])
     env.set(base_pos=[[1.5, 0.0, 0.4], [1.0, 0.1, 0.2], [1.0, 0.0, 0.3], [np.nan, 0.0, 9.0]])
     assert not log.record_step(env)
     env.set(termination=[ENDS.index("tilted"), ENDS.index("low_base"), -1, -1])

@@ -115,7 +115,7 @@ def test_policy_with_shifted_goal_observation_acts_as_for_shifted_goal():
 
 def test_correct_aim_removes_constant_overshoot():
     """A policy that observes goals 40 mm too far misses by less than the original after the correction alone."""
-    # 16 goals: of 8 a single jump that slips can outweigh the rest, and then no aim is taken
+    # 16 goals: with 8, a single jump that slips can outweigh the others, and no aim correction is chosen
     policy, cfg = open_policy("slippery_jump"), FinetuneCfg(**FEW | {"num_goals": 16, "iterations": 0})
     untouched = jump_errors(make_groups(policy, cfg)[0], Network(policy), derivatives=False).value
     aimed, record = finetune(shift_goal_observation(policy, 0.04), cfg, log=lambda line: None)
@@ -137,10 +137,10 @@ def test_refuses_invalid_settings(change):
 
 
 def test_refuses_policies_that_do_not_jump():
-    with pytest.raises(InputError, match="not for velocity-flat"):
+    with pytest.raises(InputError, match="not velocity-flat"):
         make_groups(open_policy("walking_flat"), FinetuneCfg(**FEW))
 
 
 def test_refuses_zero_iterations_for_height_policies():
-    with pytest.raises(InputError, match="needs an iteration"):
+    with pytest.raises(InputError, match="needs at least 1 iteration"):
         finetune(open_policy("vertical_jump"), FinetuneCfg(**FEW | {"iterations": 0}))

@@ -13,7 +13,7 @@ from jumper_warp.registry import make_task
 from metric_helpers import values
 
 DT = 1.0 / 60.0  # [s] Policy step
-TERMINATIONS = ("success", "came_apart", "low_base", "collided", "no_jump")
+TERMINATIONS = ("success", "diverged", "low_base", "collided", "no_jump")
 COLLIDED, NO_JUMP = 3, 4  # Indices in TERMINATIONS
 QUARTER = math.radians(90.0)
 
@@ -345,7 +345,7 @@ def test_worlds_with_the_same_goal_have_distinct_names_in_series_and_states():
 
 def test_landing_evaluation_excludes_shaping_terminations():
     terms = with_jump_terminations(make_task("horizontal-jump")).terminations
-    assert [term.name for term in terms] == ["came_apart", "low_base", "collided", "no_jump", "success"]
+    assert [term.name for term in terms] == ["diverged", "low_base", "collided", "no_jump", "success"]
     terms = with_second_takeoff(make_task("horizontal-jump")).terminations
     assert [term.name for term in terms][-2:] == ["second_takeoff", "success"]
 

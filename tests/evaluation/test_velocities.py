@@ -82,9 +82,9 @@ def test_settling_time_is_from_command_until_mean_velocity_stays_near_it():
     commands[:, 1, 0] = 0.8
 
     def velocity(t):
-        since, v = t - 1.0, np.zeros((ROBOTS, 3))
-        v[0, 0] = np.clip(0.8 * since / 0.5, 0.0, 0.8)  # a ramp of half a second
-        v[1, 0] = 0.8 * (since > 1e-6)  # at once
+        elapsed, v = t - 1.0, np.zeros((ROBOTS, 3))
+        v[0, 0] = np.clip(0.8 * elapsed / 0.5, 0.0, 0.8)  # a ramp of half a second
+        v[1, 0] = 0.8 * (elapsed > 1e-6)  # at once
         v[2, 0] = 0.5  # never
         return v
 

@@ -66,7 +66,7 @@ def test_refuses_invalid_flags_and_policies_of_other_tasks(tmp_path):
         flight_attitude.Args(takeoff="policy")
     with pytest.raises(InputError, match="height_range must be in"):
         flight_attitude.Args(height_range=(2.0, 1.0))
-    with pytest.raises(PolicyError, match="evaluated by attitude"):
+    with pytest.raises(PolicyError, match="suite attitude"):
         attitude.main(attitude.Args(policy="vertical_jump", out=tmp_path, device="cpu"))
     with pytest.raises(PolicyError, match="needs a policy that turns in flight"):
         flight_attitude.main(flight_attitude.Args(policy="vertical_jump", out=tmp_path, device="cpu"))

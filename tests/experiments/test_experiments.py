@@ -31,7 +31,7 @@ from support.learning import LearningCurve
 from support.soak import SoakArgs, hardest
 from support.timing import baseline_ratios, changed_flags
 
-SWEEP_ENDS = ("success", "came_apart", "low_base", "tilted", "collided", "no_jump", "too_long")
+SWEEP_ENDS = ("success", "diverged", "low_base", "tilted", "collided", "no_jump", "too_long")
 pytestmark = pytest.mark.usefixtures("one_thread")
 
 
@@ -129,9 +129,9 @@ class OpenLoopPolicy:
         self.begin, self.step = begin, 0
 
     def act(self, obs):  # actions (num_envs, 12), whatever the observations (num_envs, n)
-        since = self.step - self.begin
+        elapsed = self.step - self.begin
         self.step += 1
-        level = 0.0 if since < 0 else min(since / 25, 1.0) if since < 60 else -1.0 if since < 80 else 0.0
+        level = 0.0 if elapsed < 0 else min(elapsed / 25, 1.0) if elapsed < 60 else -1.0 if elapsed < 80 else 0.0
         return torch.tensor([0.0, level, level] * 4).repeat(len(obs), 1)
 
 

@@ -12,9 +12,16 @@ from experiments import paper_tests
 from jumper_warp.evaluation.jumps import TERMINATIONS
 from jumper_warp.evaluation.landings import LandingLog
 from jumper_warp.evaluation.log import run_evaluation, termination_names
-from jumper_warp.evaluation.plots import BasePaths
 from jumper_warp.evaluation.run import EvaluationArgs, EvaluationRun
-from jumper_warp.evaluation.suites import Consecutive, Farthest, Grid, Platform, consecutive_metrics, distance_metrics
+from jumper_warp.evaluation.suites import (
+    BasePaths,
+    Consecutive,
+    Farthest,
+    Grid,
+    Platform,
+    consecutive_metrics,
+    distance_metrics,
+)
 from jumper_warp.evaluation.sweeps import DistanceSweep
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.folder import save_policy
@@ -214,8 +221,8 @@ class HopPolicy:
         self.step, self.begin = 0, 31
 
     def act(self, obs):  # actions (num_envs, 12), whatever the observations (num_envs, n)
-        since, self.step = self.step - self.begin, self.step + 1
-        level = 0.0 if since < 0 else min(since / 25, 1.0) if since < 60 else -1.0 if since < 80 else 0.0
+        elapsed, self.step = self.step - self.begin, self.step + 1
+        level = 0.0 if elapsed < 0 else min(elapsed / 25, 1.0) if elapsed < 60 else -1.0 if elapsed < 80 else 0.0
         return torch.tensor([0.0, level, level] * 4).repeat(len(obs), 1)
 
 
@@ -310,8 +317,8 @@ def test_sweep_without_recording_needs_no_viewer(policy, tmp_path):
 
 
 def test_refuses_policy_of_other_task(tmp_path):
-    needed = "needs a policy that is evaluated by landing_position or omnidirectional or landing_position_mars"
-    message = f"{needed}, vertical_jump is of vertical-jump, by apex_height"
+    needed = "expected a policy with evaluation suite landing_position or omnidirectional or landing_position_mars"
+    message = rf"{needed}, vertical_jump \(task vertical-jump\) has apex_height"
     with pytest.raises(PolicyError, match=message):
         EvaluationRun.from_args("test", EvaluationArgs(policy="vertical_jump", out=tmp_path, device="cpu"))
 
@@ -327,7 +334,7 @@ def test_script_refuses_a_policy_of_another_task_in_one_line_with_code_2(policy)
     done = subprocess.run(command, cwd=root, capture_output=True, text=True)
     (line,) = done.stderr.splitlines()
     assert (done.returncode, done.stdout) == (2, "")
-    assert line.startswith("jumper: this needs a policy that is evaluated by apex_height")
+    assert line.startswith("jumper: expected a policy with evaluation suite apex_height")
 
 
 @pytest.mark.parametrize(

@@ -37,7 +37,7 @@ def test_replay_measures_paws_lifted_after_touchdown():
 
 
 def test_replay_matches_objective_and_constraints_of_problem():
-    """Distance [m] and largest violation of forward jumps, replayed in the simulation and rolled out in the problem."""
+    """Replay and problem agree in distance [m] and largest constraint violation of forward jumps."""
     jump = JUMPS["farthest"]
     made = jump.make(device="cpu", threads=1)
     x = torch.as_tensor(run_ups(made.knots, 32, np.random.default_rng(0)))

@@ -44,5 +44,5 @@ def test_scripts_have_specified_commands_and_are_reproducible():
 def test_refuses_invalid_flags_and_policy_of_other_task(tmp_path):
     with pytest.raises(InputError, match="robots"):
         walk_jump_walk.Args(num_robots=0)
-    with pytest.raises(PolicyError, match="evaluated by velocity"):
+    with pytest.raises(PolicyError, match="suite velocity"):
         walk_jump_walk.main(walk_jump_walk.Args(policy="vertical_jump", out=tmp_path, device="cpu"))

@@ -66,7 +66,7 @@ def test_kicked_and_sped_up_walks_have_specified_kicks_and_speeds():
 
 
 def test_refuses_policy_of_other_task_and_invalid_settings(policies, tmp_path):
-    with pytest.raises(PolicyError, match="evaluated by velocity"):
+    with pytest.raises(PolicyError, match="suite velocity"):
         walking_tracking.main(
             walking_tracking.Args(policy=str(policies / "horizontal-jump"), out=tmp_path, device="cpu")
         )

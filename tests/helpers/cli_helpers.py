@@ -1,4 +1,4 @@
-"""Running commands in tests, and reading the recorded time series."""
+"""Functions that run commands, and read recorded time series."""
 
 import numpy as np
 from rerun.chunk import RrdReader

@@ -17,7 +17,7 @@ Pair = tuple[float, float]
 class HoldState:
     """State of one world's episode."""
 
-    goal: float  # [m] wanted height of the base
+    goal: float  # [m] commanded height of the base
     steps: int  # policy steps since the episode began
     age: int  # policy steps since the command
     lasts: int  # policy steps from command to command, 0: one for the whole episode
@@ -26,7 +26,7 @@ class HoldState:
 
 @wp.struct
 class HoldSettings:
-    """How an episode begins."""
+    """Settings of the reset, as the kernels read them."""
 
     heading: float  # [rad] largest, to either side
     lasts: int  # policy steps from command to command
@@ -34,19 +34,19 @@ class HoldSettings:
 
 @wp.struct
 class HoldLevel:
-    """One level of the curriculum."""
+    """Level of the curriculum, as the kernels read it."""
 
     goal: wp.vec2  # [m] range of commands
 
 
 @dataclass(frozen=True)
 class HoldResetCfg:
-    """How an episode begins."""
+    """Settings of the reset."""
 
     heading: float = 3.0
     """[rad] Largest, to either side."""
     lasts: float = 0.5
-    """[s] From command to command."""
+    """[s] Time between commands."""
 
     struct = HoldSettings
 
@@ -59,7 +59,7 @@ class HoldResetCfg:
 
 @dataclass(frozen=True)
 class HoldLevelCfg:
-    """One level of the curriculum."""
+    """Level of the curriculum."""
 
     goal: Pair
     """[m] Range of commands."""
@@ -75,7 +75,7 @@ class HoldLevelCfg:
 
 @wp.func
 def advance_hold(robot: mdp.RobotView, state: HoldState, tolerance: float) -> HoldState:
-    """Count steps, and those near the goal up to a tolerance [m]."""
+    """Count policy steps, and consecutive steps within a tolerance [m] of the goal."""
     new = state
     new.steps = state.steps + 1
     new.age = state.age + 1
@@ -88,7 +88,7 @@ def reset_hold(
     robot: mdp.RobotArrays, scene: mdp.Scene, skill: mdp.SkillSettings, old: HoldState, settings: HoldSettings,
     level: HoldLevel, rng: mdp.RngStream,
 ) -> HoldState:  # fmt: skip
-    """Stand in the default pose with any heading."""
+    """Reset the robot to the default pose with a random heading, and sample a goal."""
     mdp.write_default_pose(robot, scene, rng.world, mdp.uniform(rng, 0, -settings.heading, settings.heading), 0.0)
     new = HoldState()
     new.goal = mdp.uniform_range(rng, 1, level.goal)
@@ -98,7 +98,7 @@ def reset_hold(
 
 @wp.func
 def give_hold(robot: mdp.RobotView, scene: mdp.Scene, state: HoldState, values: wp.vec4, heading: float) -> HoldState:
-    """Command a height [m], the first of the values, until another comes."""
+    """Command the height values[0] [m] until the next command."""
     new = state
     new.goal = values[0]
     new.age = 0
@@ -108,7 +108,7 @@ def give_hold(robot: mdp.RobotView, scene: mdp.Scene, state: HoldState, values: 
 
 @wp.func
 def another_goal_due(state: HoldState) -> bool:
-    """Whether the command has lasted long enough."""
+    """Return whether the next command is due."""
     return state.lasts > 0 and state.age >= state.lasts
 
 
@@ -116,7 +116,7 @@ def another_goal_due(state: HoldState) -> bool:
 def sample_goal(
     robot: mdp.RobotView, scene: mdp.Scene, state: HoldState, level: HoldLevel, rng: mdp.RngStream
 ) -> HoldState:
-    """Command another height."""
+    """Sample a new command of the height."""
     new = state
     new.goal = mdp.uniform_range(rng, 1, level.goal)
     new.age = 0
@@ -125,31 +125,31 @@ def sample_goal(
 
 @wp.func
 def height_error(robot: mdp.RobotView, state: HoldState) -> float:
-    """Distance from the commanded height [m]."""
+    """Return the distance of the base from the commanded height [m]."""
     return wp.abs(robot.height - state.goal)
 
 
 @wp.func
 def every_episode(state: HoldState) -> bool:
-    """All episodes count."""
+    """Return that every episode counts for the curriculum."""
     return True
 
 
 @wp.func
 def near_goal(robot: mdp.RobotView, state: HoldState, width: float) -> float:
-    """Closeness to the commanded height; width [m]: of the kernel."""
+    """Return the closeness to the commanded height, 0 to 1; width [m]: width of the reward kernel."""
     return mdp.rewards.psi(robot.height - state.goal, width)
 
 
 @wp.func
 def held(robot: mdp.RobotView, state: HoldState, steps: float) -> bool:
-    """Near the goal for so many policy steps in a row."""
+    """Return whether the base was near the goal for `steps` consecutive policy steps."""
     return state.near >= int(steps)
 
 
 @wp.func
 def wanted_height(robot: mdp.RobotView, state: HoldState) -> float:
-    """The commanded height [m]."""
+    """Return the commanded height [m]."""
     return state.goal
 
 
@@ -162,7 +162,7 @@ def weak_motors(robot: mdp.RobotParameters, rng: mdp.RngStream, lower: float, up
 
 
 def hold_height() -> mdp.TaskCfg:
-    """Return the task."""
+    """Return the task `hold-height`."""
     actor = (
         mdp.ObservationTerm(wanted_height, scale=5.0),
         mdp.ObservationTerm(mdp.observations.height, noise=0.002, scale=5.0, history=3, delayed=True),
@@ -179,7 +179,7 @@ def hold_height() -> mdp.TaskCfg:
         curriculum=mdp.Curriculum(height_error, tolerance=0.03, promote_after=2, counts=every_episode),
         rewards=(mdp.RewardTerm(near_goal, 60.0, width=0.05), mdp.RewardTerm(mdp.rewards.action_rate, -0.02)),
         terminations=(
-            mdp.TerminationTerm(mdp.terminations.came_apart),
+            mdp.TerminationTerm(mdp.terminations.diverged),
             mdp.TerminationTerm(mdp.terminations.low_base, height=0.12),
             mdp.TerminationTerm(mdp.terminations.tilted, angle=0.8),
             mdp.TerminationTerm(held, steps=100.0, time_out=True, success=True),

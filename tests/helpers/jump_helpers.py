@@ -1,4 +1,4 @@
-"""Hand-made robots and episodes, and ways to bring an environment's worlds into a chosen state, for its tests."""
+"""Robots and episodes with chosen states for tests of jump tasks, and functions that edit worlds of an environment."""
 
 import dataclasses
 import inspect
@@ -23,14 +23,14 @@ from mdp_helpers import DEFAULT_ANGLE, MOTOR_SLOTS, STEP_DT, SUBSTEPS, array, ne
 
 DEG = np.pi / 180.0
 START_MODES = ("standing", "default", "in_flight", "touchdown", "after_landing", "pushing")
-OF_WORLD = ("level", "streak")  # What a world keeps from episode to episode
+OF_WORLD = ("level", "streak")  # Fields of a world that last over episodes
 
 
 class Table:
-    """Functions of (robot, state, ...), compiled into one kernel as a task's are, to be called one at a time."""
+    """Functions of (robot, state, ...), compiled into one kernel like the terms of a task, and called by name."""
 
     def __init__(self, funcs, returns: type, state=JumpState):
-        """funcs: of terms of the state's task or of any; returns: float or bool."""
+        """funcs: functions of terms; returns: float or bool; state: struct of the task's state."""
         funcs, self._state = list(funcs), state
         self._params = {func.func.__name__: list(inspect.signature(func.func).parameters)[2:] for func in funcs}
         self._returns = returns
@@ -57,7 +57,7 @@ class Table:
         return self._returns(self.all(name, [robot], [task], **numbers)[0])
 
     def all(self, name: str, views: list, tasks: list, **numbers: float) -> np.ndarray:
-        """Return the values of one function, one a robot and its episode; numbers: all of its own, by name."""
+        """Return the values of one function, one per robot and episode; numbers: all its parameters by name."""
         params = self._params[name]
         assert numbers.keys() == set(params), f"{name} has {params}, got {list(numbers)}"
         most = max(map(len, self._params.values()))
@@ -96,16 +96,16 @@ def make_episode(**fields) -> JumpState:
 
 
 def without_draws(task: TaskCfg) -> TaskCfg:
-    """Return a jump without history whose critic sees nothing drawn: 48 columns as the actor, 15 of its own."""
+    """Return a jump without history, whose critic observes no randomised parameters: 48 actor columns and 15 more."""
     actor = tuple(term.replace(history=1) for term in task.observations.actor)
     return dataclasses.replace(task, observations=ObservationsCfg(actor=actor, critic=(*exact(actor), *EPISODE)))
 
 
 class Robots:
-    """Robots that stand at rest in the default pose, to be changed by the tests, and what is observed of them."""
+    """Robots at rest in the default pose, whose state tests may change, and their observations."""
 
     def __init__(self, task: TaskCfg, n: int = 1):
-        """task: of jumping; what is drawn for a world is left out."""
+        """task: a jump task; observations of randomised parameters are left out; n: number of robots."""
         task = without_draws(task)
         self.skill, self.n = TaskRuntime(task, 0, n, STEP_DT, SUBSTEPS, "cpu"), n
         self.numbers = {True: array(task.params.values), False: array(task.without_noise().params.values)}
@@ -117,7 +117,7 @@ class Robots:
         self.episodes = new_worlds(n, seed=7919)
 
     def observe(self, noise: bool = False) -> np.ndarray:
-        """Return the actor's observations, (n, 48); draws go on from call to call."""
+        """Return the actor's observations, (n, 48); each call has new noise."""
         return self.both(noise)[0]
 
     def both(self, noise: bool = False) -> tuple[np.ndarray, np.ndarray]:
@@ -144,18 +144,18 @@ def tilted_by(angle: float, axis=(1.0, 0.0, 0.0)) -> dict:
 
 
 def only(start_mode: str, reset: ResetCfg | None = None, **ranges) -> ResetCfg:
-    """Return resets that all follow one scheme, otherwise as `reset`."""
+    """Return the reset settings `reset` with probability 1 of one start mode; ranges: other changed fields."""
     probability = StartProbability(**{start_mode: 1.0})
     return dataclasses.replace(ResetCfg() if reset is None else reset, start_probability=probability, **ranges)
 
 
 def resetting(task: TaskCfg, reset: ResetCfg) -> TaskCfg:
-    """Return a jump whose episodes begin otherwise."""
+    """Return a jump task with other reset settings."""
     return dataclasses.replace(task, reset=dataclasses.replace(task.reset, settings=reset))
 
 
 def make_env(num_envs: int, *, seed: int = 0, reset: ResetCfg | None = None, task=None, **arguments) -> Env:
-    """Return the vertical jump's environment on the CPU, begun; nominal and without noise unless asked for."""
+    """Return a reset environment on the CPU, by default of the vertical jump, nominal and without noise."""
     task = make_task("vertical-jump") if task is None else task
     task = task if reset is None else resetting(task, reset)
     env = Env(task, num_envs, seed=seed, device="cpu", **({"randomize": False, "noise": False} | arguments))
@@ -164,19 +164,19 @@ def make_env(num_envs: int, *, seed: int = 0, reset: ResetCfg | None = None, tas
 
 
 def begin_by(env: Env, reset: ResetCfg) -> None:
-    """Let the next episodes begin by other settings, in captured steps too."""
+    """Change the reset settings of an environment, also in captured steps."""
     env.skills[0].settings.assign(wp.array([reset.values(env.step_dt)], dtype=JumpSettings, device="cpu"))
 
 
 def set_levels(env: Env, *levels: Level) -> None:
-    """Give an environment other levels, as many as it has, or one for all."""
+    """Replace the levels of an environment, by as many or by one for all."""
     levels = levels if len(levels) > 1 else levels * len(env.task.levels)
     values = [level.values() for level in levels]
     env.skills[0].levels.assign(wp.array(values, dtype=JumpLevel, device="cpu"))
 
 
 def resets_of(env: Env) -> ResetCfg:
-    """Return the settings by which an environment's episodes were made to begin."""
+    """Return the reset settings that an environment was constructed with."""
     return env.skills[0].task.reset.settings
 
 
@@ -186,10 +186,10 @@ def edit_episodes(env: Env, worlds=slice(None), **fields) -> None:
     records = states.numpy().copy()
     for name, value in fields.items():
         if name in OF_WORLD:
-            kept = getattr(env.episodes, name)
-            values = kept.numpy().copy()
+            array_of_worlds = getattr(env.episodes, name)
+            values = array_of_worlds.numpy().copy()
             values[worlds] = value
-            kept.assign(values)
+            array_of_worlds.assign(values)
         else:
             records[name][worlds] = value
     states.assign(wp.array(records, dtype=JumpState, device="cpu"))

@@ -18,10 +18,10 @@ ANKLE = np.array([0.0, 0.0, -0.3])  # [m] Position of a paw's centre in the fram
 
 
 class Starts:
-    """Start states of one scheme, with the levels spread over the worlds; exact: starts are at the origin."""
+    """Start states of one start mode, with the levels spread over the worlds; exact: starts are at the origin."""
 
     def __init__(self, env: Env, start_mode: str, exact: bool = False, **settings):
-        """settings: of the reset, besides the scheme."""
+        """Reset an environment; settings: other fields of its reset settings."""
         settings |= {"base_xy": 0.0} if exact else {}
         begin_by(env, only(start_mode, resets_of(env), **settings))
         self.level = np.arange(env.num_envs) % len(env.task.levels)
@@ -43,7 +43,7 @@ class Starts:
 
     @cached_property
     def paws(self) -> np.ndarray:
-        """Centres of the paws FL, FR, BL, BR [m], world frame, (selected worlds, 4, 3)."""
+        """Return the centres of the paws FL, FR, BL, BR [m], world frame, (selected worlds, 4, 3)."""
         return paws_of(self._model, self.q, self.qd)
 
     def split(self, vectors: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

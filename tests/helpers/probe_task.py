@@ -1,4 +1,4 @@
-"""A task whose every number is in the hands of a test: its terms read what the test writes into its state."""
+"""Probe task: its terms return values that a test writes into its state."""
 
 import dataclasses
 from typing import Any
@@ -33,21 +33,21 @@ class ProbeState:
 
 @wp.struct
 class ProbeSettings:
-    """How an episode begins."""
+    """Settings of the reset, as the kernels read them."""
 
     value: float
 
 
 @wp.struct
 class ProbeLevel:
-    """One level of the curriculum."""
+    """Level of the curriculum, as the kernels read it."""
 
     number: int
 
 
 @dataclasses.dataclass(frozen=True)
 class ProbeReset:
-    """How an episode begins."""
+    """Settings of the reset."""
 
     value: float = 2.5
 
@@ -62,7 +62,7 @@ class ProbeReset:
 
 @dataclasses.dataclass(frozen=True)
 class ProbeLevelCfg:
-    """One level of the curriculum."""
+    """Level of the curriculum."""
 
     number: int
 
@@ -77,7 +77,7 @@ class ProbeLevelCfg:
 
 @wp.func
 def advance_probe(robot: RobotView, state: ProbeState, growth: float) -> ProbeState:
-    """Let the value grow."""
+    """Count the policy step, and add `growth` to the value."""
     new = state
     new.steps = state.steps + 1
     new.value = state.value + growth
@@ -89,7 +89,7 @@ def reset_probe(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: ProbeState, settings: ProbeSettings,
     level: ProbeLevel, rng: RngStream,
 ) -> ProbeState:  # fmt: skip
-    """Stand; keep a draw in `other` and the level in `counts`."""
+    """Reset the robot to the default pose; store a random number in `other` and the level in `counts`."""
     write_default_pose(arrays, scene, rng.world, 0.5, 0.25)
     new = ProbeState()
     new.value = settings.value
@@ -100,7 +100,7 @@ def reset_probe(
 
 @wp.func
 def give_probe(robot: RobotView, scene: Scene, state: ProbeState, values: wp.vec4, heading: float) -> ProbeState:
-    """Take over the first value and the heading."""
+    """Store the first value in `value` and the heading in `other`."""
     new = state
     new.value = values[0]
     new.other = heading
@@ -109,13 +109,13 @@ def give_probe(robot: RobotView, scene: Scene, state: ProbeState, values: wp.vec
 
 @wp.func
 def command_due(state: ProbeState) -> bool:
-    """Due at a value of 7."""
+    """Return whether a command is due, which it is at a value of 7."""
     return state.value == 7.0
 
 
 @wp.func
 def draw_command(robot: RobotView, scene: Scene, state: ProbeState, level: ProbeLevel, rng: RngStream) -> ProbeState:
-    """Keep a draw in `other` and the level in `counts`."""
+    """Store a random number in `other` and the level in `counts`."""
     new = state
     new.other = uniform(rng, 0, 0.0, 1.0)
     new.counts = level.number
@@ -124,54 +124,54 @@ def draw_command(robot: RobotView, scene: Scene, state: ProbeState, level: Probe
 
 @wp.func
 def value(robot: RobotView, state: ProbeState) -> float:
-    """The value."""
+    """Return the field `value`."""
     return state.value
 
 
 @wp.func
 def offset_square(robot: RobotView, state: ProbeState, offset: float, scale: float) -> float:
-    """Squared distance of the value from an offset, times a scale."""
+    """Return scale * (value - offset)^2."""
     return scale * (state.value - offset) * (state.value - offset)
 
 
 @wp.func
 def other(robot: RobotView, state: ProbeState) -> float:
-    """The other number."""
+    """Return the field `other`."""
     return state.other
 
 
 @wp.func
 def base_height(robot: RobotView, state: Any) -> float:
-    """Height of the base [m]."""
+    """Return the height of the base [m]."""
     return robot.height
 
 
 @wp.func
 def other_above(robot: RobotView, state: ProbeState, limit: float) -> bool:
-    """Whether the other number is above a limit."""
+    """Return whether the field `other` is above a limit."""
     return state.other > limit
 
 
 @wp.func
 def counts(state: ProbeState) -> bool:
-    """Whether the episode counts for the curriculum."""
+    """Return whether the episode counts for the curriculum."""
     return state.counts != 0
 
 
 @wp.func
 def both(robot: RobotView, state: ProbeState) -> wp.vec2:
-    """Both numbers."""
+    """Return the fields `value` and `other`."""
     return wp.vec2(state.value, state.other)
 
 
 @wp.func
 def latency_of(robot: RobotParameters, world: int) -> float:
-    """Latency of a world's actions."""
+    """Return the latency of a world's actions [physics steps]."""
     return float(robot.latency[world])
 
 
 def probe_task(**changes) -> TaskCfg:
-    """Return the task; changes: of its fields."""
+    """Return the probe task; changes: new values of its fields."""
     task = TaskCfg(
         name="probe",
         state=ProbeState,
@@ -189,7 +189,7 @@ def probe_task(**changes) -> TaskCfg:
             TerminationTerm(other_above, limit=1.0e3, name="first"),
             TerminationTerm(other_above, limit=1.0e2, name="second", time_out=True),
             TerminationTerm(other_above, limit=1.0e1, name="third", time_out=True, success=True),
-            TerminationTerm(terminations.came_apart),
+            TerminationTerm(terminations.diverged),
             TerminationTerm(terminations.too_long, steps=100.0),
         ),
         observations=ObservationsCfg(
@@ -218,7 +218,7 @@ class Probe:
     """Worlds of the task with all their arrays, the robots at rest, and launches of its stages."""
 
     def __init__(self, n: int, task: TaskCfg | None = None, index: int = 0, seed: int = 0):
-        """index: of the skill."""
+        """n: number of worlds; index: index of the skill."""
         self.n, self.task = n, probe_task() if task is None else task
         self.skill = TaskRuntime(self.task, index, n, STEP_DT, SUBSTEPS, "cpu")
         self.robot, self.episodes, self.delays = standing_robots(n), new_worlds(n, seed), no_delays(n)
@@ -257,7 +257,7 @@ class Probe:
         observe(self.skill, self.robot, self.parameters, self.ground, self.episodes, states, numbers, after_reset)
 
     def next_clock(self) -> None:
-        """Let all worlds be one policy step further on, and no longer new."""
+        """Increment the step count of all worlds, and clear their `history_reset`."""
         self.episodes.step_count.assign(self.episodes.step_count.numpy() + 1)
         self.episodes.history_reset.zero_()
 

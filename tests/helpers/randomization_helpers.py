@@ -103,16 +103,16 @@ def fills(values, lower, upper):
 
 
 ROWS = {
-    "base_mass": lambda now, then: now["base_mass"] - then["base_mass"],
-    "link_mass": lambda now, then: now["link_mass"] / then["link_mass"],
-    "com_shift": lambda now, then: now["com_shift"] - then["com_shift"],
-    "gains": lambda now, then: np.stack([now["kp"] / then["kp"], now["kd"] / then["kd"]]),
-    "no_load_speed": lambda now, then: now["no_load_speed"] / then["no_load_speed"],
-    "motor_friction": lambda now, then: now["motor_friction"],
-    "armature": lambda now, then: now["armature"] / then["armature"],
-    "joint_offset": lambda now, then: now["joint_offset"] / DEG,
-    "push_force": lambda now, then: now["push_force"],
-    "push_torque": lambda now, then: now["push_torque"],
-    "dynamic_friction": lambda now, then: now["dynamic_friction"],
-    "static_friction": lambda now, then: now["static_friction"],
+    "base_mass": lambda sampled, nominal: sampled["base_mass"] - nominal["base_mass"],
+    "link_mass": lambda sampled, nominal: sampled["link_mass"] / nominal["link_mass"],
+    "com_shift": lambda sampled, nominal: sampled["com_shift"] - nominal["com_shift"],
+    "gains": lambda sampled, nominal: np.stack([sampled["kp"] / nominal["kp"], sampled["kd"] / nominal["kd"]]),
+    "no_load_speed": lambda sampled, nominal: sampled["no_load_speed"] / nominal["no_load_speed"],
+    "motor_friction": lambda sampled, nominal: sampled["motor_friction"],
+    "armature": lambda sampled, nominal: sampled["armature"] / nominal["armature"],
+    "joint_offset": lambda sampled, nominal: sampled["joint_offset"] / DEG,
+    "push_force": lambda sampled, nominal: sampled["push_force"],
+    "push_torque": lambda sampled, nominal: sampled["push_torque"],
+    "dynamic_friction": lambda sampled, nominal: sampled["dynamic_friction"],
+    "static_friction": lambda sampled, nominal: sampled["static_friction"],
 }

@@ -1,4 +1,4 @@
-"""Driving a simulation by hand in tests, and reading paws out of it."""
+"""Functions that set states and commands of a simulation, and read its paws."""
 
 import dataclasses
 import math
@@ -36,21 +36,21 @@ def command(sim, angles):
 
 
 def paw_forces(sim):
-    """Ground forces on the paws [N], (num_worlds, 4, 3)."""
+    """Return the ground forces on the paws [N], (num_worlds, 4, 3)."""
     return sim.paw_force.numpy().transpose(1, 0, 2).astype(float)
 
 
 def paw_centres(sim):
-    """Paw centres [m], (num_worlds, 4, 3)."""
+    """Return the paw centres [m], (num_worlds, 4, 3)."""
     poses = sim.state.body_q.numpy().reshape(-1, BODIES, 7)[:, SHANKS].astype(float)
     arm = Rotation.from_quat(poses[..., 3:].reshape(-1, 4)).apply([0.0, 0.0, -0.3]).reshape(-1, 4, 3)
     return poses[..., :3] + arm
 
 
 def slip_velocities(sim, joint_q):
-    """Velocities [m/s] of the material points at the bottom of the paws, at present rates, (num_worlds, 4, 3).
+    """Return the velocities [m/s] of the lowest material points of the paws, (num_worlds, 4, 3), at current rates.
 
-    joint_q: coordinates at which the contact was solved, those before the last step.
+    joint_q: coordinates at the start of the last step, where the contact was solved.
     """
     model, q, qd = sim.model, wp.array(joint_q.ravel(), dtype=float, device="cpu"), wp.clone(sim.state.joint_qd)
     body_q, body_qd = wp.empty_like(sim.state.body_q), wp.empty_like(sim.state.body_qd)
@@ -64,7 +64,7 @@ def slip_velocities(sim, joint_q):
 
 
 def thrown(sim, seed, height=(0.4, 1.0), speed=1.5, joint_rate=4.0):
-    """Throw all robots in random attitudes, command random angles."""
+    """Set random attitudes, positions and velocities of all robots, and command random angles."""
     n = sim.num_worlds
     rng, states = np.random.default_rng(seed), random_states(n, seed, joint_rate=joint_rate)
     states.pos = rng.uniform([-1.0, -1.0, height[0]], [1.0, 1.0, height[1]], (n, 3))
@@ -76,14 +76,14 @@ def thrown(sim, seed, height=(0.4, 1.0), speed=1.5, joint_rate=4.0):
 
 
 def slope(degrees, height=0.0):
-    """A plane that rises along x, as a heightfield."""
+    """Return a heightfield with a plane that rises along x."""
     x = np.linspace(-20.0, 20.0, 41)
     heights = np.tile(height + math.tan(math.radians(degrees)) * x, (41, 1))
     return newton.Heightfield(data=heights.astype(np.float32), nrow=41, ncol=41, hx=20.0, hy=20.0)
 
 
 def tilted(sim, degrees):
-    """Stand all robots on a slope, the base parallel to it, and return its rotation."""
+    """Place all robots on a slope, the base parallel to it, and return its rotation."""
     q, turn = sim.joint_q().copy(), Rotation.from_euler("y", -degrees, degrees=True)
     q[:, :3], q[:, 3:7] = turn.apply([0.0, 0.0, q[0, 2]]), turn.as_quat()
     write_state(sim, q)
@@ -91,7 +91,7 @@ def tilted(sim, degrees):
 
 
 def stiff_motors():
-    """Motors that hold the legs' shape."""
+    """Return motors with gains so high that the legs keep their shape."""
     motors = jumping_motors(24.8)
     return dataclasses.replace(
         motors,

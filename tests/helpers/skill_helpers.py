@@ -8,12 +8,12 @@ from jumper_warp.kernels.mdp.view import RobotView
 
 
 @wp.func
-def when_asked_to_jump(robot: RobotView, state: HoldState, requested: bool) -> bool:
+def jump_requested(robot: RobotView, state: HoldState, requested: bool) -> bool:
     return requested
 
 
 @wp.func
-def when_asked_to_hold(robot: RobotView, state: JumpState, requested: bool) -> bool:
+def hold_requested(robot: RobotView, state: JumpState, requested: bool) -> bool:
     return requested
 
 

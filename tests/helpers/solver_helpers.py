@@ -1,4 +1,4 @@
-"""The dedicated solver in both precisions on chosen states, and Pinocchio on the same states, for its tests."""
+"""SolverJumper in both precisions and Pinocchio on the same states, for tests of the solver."""
 
 import dataclasses
 
@@ -32,20 +32,20 @@ class States:
     rates: np.ndarray  # (n, 12) [rad/s]
 
     def joint_q(self) -> np.ndarray:
-        """Newton's joint_q with zeros for the passive joints, (n * 43,)."""
+        """Return Newton's joint_q with zeros for the passive joints, (n * 43,)."""
         q = np.zeros((len(self.pos), COORDS))
         q[:, :3], q[:, 3:7], q[:, MOTOR_Q] = self.pos, self.quat, self.angles
         return q.ravel()
 
     def joint_qd(self) -> np.ndarray:
-        """Newton's joint_qd with zeros for the passive joints, (n * 38,)."""
+        """Return Newton's joint_qd with zeros for the passive joints, (n * 38,)."""
         qd = np.zeros((len(self.pos), DOFS))
         qd[:, :3], qd[:, 3:6], qd[:, MOTOR_V] = self.com_vel, self.ang_vel, self.rates
         return qd.ravel()
 
     @classmethod
     def read(cls, joint_q: np.ndarray, joint_qd: np.ndarray) -> "States":
-        """Take the 18 coordinates out of Newton's arrays."""
+        """Return the states in Newton's arrays."""
         q = joint_q.reshape(-1, COORDS).astype(float)
         qd = joint_qd.reshape(-1, DOFS).astype(float)
         quat = q[:, 3:7] / np.linalg.norm(q[:, 3:7], axis=1, keepdims=True)
@@ -79,10 +79,10 @@ def bare_model(num_worlds: int, **arguments):
 
 
 class Flight:
-    """The dynamics of a model in single or double precision, on states of this file's kind."""
+    """The dynamics of a model in single or double precision, on `States`."""
 
     def __init__(self, model, *, double: bool):
-        """Read the model."""
+        """Pack the parameters of a model; double: whether the precision is double."""
         self.model = model
         self.dynamics = JumperDynamics(model, double=double)
         self.dtype = wp.float64 if double else wp.float32
@@ -109,7 +109,7 @@ class Reference:
     """Pinocchio with the masses, armatures and gravity of a Newton model's worlds."""
 
     def __init__(self, model):
-        """Take over what all worlds share; `use_world` sets the masses."""
+        """Set armatures and gravity, which all worlds share; `use_world` sets the masses."""
         self.robot = build_pinocchio()
         description = load_description()
         joints = [1] + [self.robot.model.getJointId(joint.name) for joint in description.joints]
@@ -123,7 +123,7 @@ class Reference:
         self.use_world(0)
 
     def use_world(self, world: int) -> None:
-        """Take the masses of a world."""
+        """Set the masses to those of a world."""
         for body, joint in enumerate(self._joint_of_body):
             i = world * BODIES + body
             self.robot.model.inertias[joint] = pin.Inertia(self._mass[i], self._com[i], self._inertia[i])

@@ -69,7 +69,7 @@ class PushTask:
         self.show_critic(self.critic_obs, self.obs)
 
     def mirror(self, what: str) -> tuple[list[int], list[float]]:
-        """Left and right: the mirror image of position, velocity and acceleration is the negative."""
+        """Return the mirror map (order, signs): the image of position, velocity and acceleration is the negative."""
         return ([0, 1], [-1.0, -1.0]) if what == "observation" else ([0], [-1.0])
 
     def metrics(self) -> dict[str, float]:
@@ -129,7 +129,7 @@ def join(rank: int, port: int) -> None:
 
 
 def update_half(rank: int, port: int, cfg: PpoCfg, path: str) -> None:
-    """One of two processes: learn from half of the worlds and save the outcome to path + rank."""
+    """Update from half of the worlds in one of two processes, and save the state to path + rank."""
     join(rank, port)
     torch.distributed.init_process_group("gloo")
     torch.manual_seed(0)
@@ -142,7 +142,7 @@ def update_half(rank: int, port: int, cfg: PpoCfg, path: str) -> None:
 
 
 def train_rank(rank: int, port: int, cfg: TrainCfg, path: str) -> None:
-    """One of two processes of a training; saves the networks to path + rank."""
+    """Train in one of two processes, and save the networks to path + rank."""
     join(rank, port)
     made = []
 
@@ -164,7 +164,7 @@ def train_rank(rank: int, port: int, cfg: TrainCfg, path: str) -> None:
 
 
 def train_twice(rank: int, ports: tuple[int, int], cfg: TrainCfg) -> None:
-    """One of two processes: train to the end, then again from the middle; episodes outlast an iteration."""
+    """Train in one of two processes, then again from the middle; episodes are longer than an iteration."""
 
     def make(num_envs: int, seed: int, device: torch.device) -> PushTask:
         return PushTask(num_envs, seed, device, episode_length=20 + 7 * rank)

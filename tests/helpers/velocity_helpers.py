@@ -1,4 +1,4 @@
-"""Environments of velocity tracking for tests, and ways to change what their worlds do."""
+"""Environments of velocity tracking, and functions that read and edit states of their worlds."""
 
 import numpy as np
 import warp as wp
@@ -11,7 +11,7 @@ FIELDS = tuple(VelocityState.vars)
 
 
 def walking_env(num_envs: int, name: str = "velocity-flat", task=None, **arguments) -> Env:
-    """Return an environment on the CPU that has begun, nominal and without noise unless asked for."""
+    """Return a reset environment on the CPU, by default nominal and without noise."""
     settings = {"seed": 1, "randomize": False, "noise": False} | arguments
     env = Env(make_task(name) if task is None else task, num_envs, device="cpu", **settings)
     env.reset()

@@ -104,7 +104,7 @@ def test_initial_states_of_a_standing_robot_keep_all_paws_on_the_ground(standing
 
 
 def test_residuals_of_a_standing_robot_are_linear_in_its_initial_state(standing, replay):
-    """Within the posterior of the initial state, their change differs by less than 5 % from Jacobian times step."""
+    """The change of the residuals within the posterior differs by less than 5 % from Jacobian times step."""
     problem, truth = standing
     size, start = len(truth), np.zeros(problem.start_size)
     for _ in range(2):  # Gauss-Newton steps to the start that fits the measurements
@@ -157,7 +157,7 @@ def identified(replay):
 
 
 def test_known_parameters_are_identified_within_four_standard_deviations(identified):
-    """With a fit at the noise's level: χ² near 1 and no mismatch."""
+    """The fit is at the level of the noise: χ² is near 1, without mismatch."""
     result, truth, _ = identified
     assert result.nominal_chi2 > 20.0
     assert 0.93 < result.chi2 < 1.05
@@ -171,7 +171,7 @@ def test_known_parameters_are_identified_within_four_standard_deviations(identif
 
 
 def test_jacobian_with_shared_worlds_matches_central_differences(replay):
-    """Of a hung robot, whose four legs share worlds; within 1 % of the column's norm."""
+    """The four legs of a hung robot share worlds; columns agree within 1 % of their norm."""
     parameters, rng = jumper_parameters(["motors"]), np.random.default_rng(3)
     plan = sample_plan("hung chirp", rng, seconds=0.5)
     robots = parameters.robots(sample_z(parameters))

@@ -12,7 +12,7 @@ from jumper_warp.identification.residuals import check_signs
 from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.utils.errors import InputError
 
-ROWS = 12  # of a motion
+ROWS = 12  # rows of a motion
 TORQUE_CONSTANT = 1.5  # [N m/A] of the motors in tables
 
 
@@ -85,7 +85,7 @@ def test_load_motion_reads_npz_csv_and_parquet_and_overrides_settings(tmp_path):
         (lambda c: c | {"rate/FL_outer [rpm]": c["time [ms]"]}, "expected a unit of rad/s, deg/s"),
         (lambda c: {k: v for k, v in c.items() if k != "target/BL_inner"}, "target/BL_inner is missing"),
         (lambda c: {k: v for k, v in c.items() if "time" not in k}, "column time is missing"),
-        (lambda c: c | {"target/FL_outer": 40.0 + c["target/FL_outer"]}, "is its unit given in the name"),
+        (lambda c: c | {"target/FL_outer": 40.0 + c["target/FL_outer"]}, "give its unit"),
         (lambda c: c | {"time [ms]": c["time [ms]"][::-1]}, "time must be finite and rise, it does not in row 1"),
         (lambda c: c | {"quaternion/w": 2.0 + c["quaternion/w"]}, "quaternions must have length 1"),
         (lambda c: c | {"target/FL_outer": np.full(ROWS, math.inf)}, "target is not finite in row 0"),
@@ -105,13 +105,13 @@ def test_load_motion_refuses_unreadable_files_and_unknown_settings(tmp_path):
     with pytest.raises(InputError, match="current needs the torque constant"):
         load_motion(tmp_path / "walk.csv")
     write_csv(tmp_path / "walk.csv", columns, {"stand": "high"})
-    with pytest.raises(InputError, match="no setting 'stand'"):
+    with pytest.raises(InputError, match="unknown setting 'stand'"):
         load_motion(tmp_path / "walk.csv", torque_constant=TORQUE_CONSTANT)
     (tmp_path / "walk.npz").write_bytes(b"PK nothing")
     with pytest.raises(InputError, match="not an npz file"):
         load_motion(tmp_path / "walk.npz")
     np.savez(tmp_path / "walk.npz", time=np.zeros(3), goal=np.zeros((3, 12)))
-    with pytest.raises(InputError, match="no channel 'goal'"):
+    with pytest.raises(InputError, match="unknown channel 'goal'"):
         load_motion(tmp_path / "walk.npz")
     with pytest.raises(InputError, match=r"expected a file of \.npz"):
         load_motion(tmp_path / "walk.mat")

@@ -23,14 +23,14 @@ class Refit:
         self.data = [rng.normal(size=ROWS) + rng.normal(size=CHANNELS)[CHANNEL] for _ in range(MOTIONS)]
         self.weights = [rng.uniform(0.2, 1.0, ROWS) for _ in range(MOTIONS)]
 
-    def solve(self, kept):
-        """Return parameters (PARAMETERS,) and starts (MOTIONS, starts) fitted to rows kept, bool (MOTIONS, ROWS)."""
+    def solve(self, mask):
+        """Return parameters (PARAMETERS,) and starts (MOTIONS, starts) fitted to rows in a mask (MOTIONS, ROWS)."""
         matrix = np.eye(PARAMETERS + MOTIONS * self.starts)
         slope = np.zeros(len(matrix))
         for i in range(MOTIONS):
             first = PARAMETERS + i * self.starts
             place = [*range(PARAMETERS), *range(first, first + self.starts)]
-            weighed = (self.weights[i] * kept[i])[:, None] * self.jacobians[i]
+            weighed = (self.weights[i] * mask[i])[:, None] * self.jacobians[i]
             matrix[np.ix_(place, place)] += weighed.T @ self.jacobians[i]
             slope[place] += weighed.T @ self.data[i]
         solution = np.linalg.solve(matrix, slope)
@@ -61,8 +61,8 @@ def test_systematic_std_matches_refits_without_a_channel_or_a_motion(starts, rto
         changes = []
         for motion in range(MOTIONS):
             for rows in groups:
-                kept = all_rows.copy()
-                kept[motion] &= ~rows
-                changes.append(refit.solve(kept)[0] - best)
+                mask = all_rows.copy()
+                mask[motion] &= ~rows
+                changes.append(refit.solve(mask)[0] - best)
         variance += (len(changes) - 1) / len(changes) * np.square(changes).sum(0)
     np.testing.assert_allclose(std, np.sqrt(variance), rtol=rtol)

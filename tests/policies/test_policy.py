@@ -137,7 +137,7 @@ def test_non_finite_observation_counts_as_zero(bad):
 
 
 def test_refuses_an_observation_of_another_size():
-    with pytest.raises(ValueError, match="reads 1 numbers, got observations of 2"):
+    with pytest.raises(ValueError, match="must have 1 columns, got 2"):
         scalar_policy().act(torch.zeros(3, 2))
 
 
@@ -154,8 +154,7 @@ def test_float64_observations_are_clamped_before_conversion():
 
 
 @pytest.mark.parametrize(
-    ("obs", "message"),
-    [(np.zeros((1, 1)), "reads a torch tensor, got ndarray"), (torch.tensor(1.0), "got a single number")],
+    ("obs", "message"), [(np.zeros((1, 1)), "must be a torch tensor, got ndarray"), (torch.tensor(1.0), "got a scalar")]
 )
 def test_refuses_observations_that_are_not_vectors_in_tensors(obs, message):
     with pytest.raises(ValueError, match=message):
@@ -232,7 +231,7 @@ class Payload:
     """Object that creates a file when unpickled."""
 
     def __init__(self, path):
-        """path: of the file."""
+        """Store the path of the file to create."""
         self.path = path
 
     def __reduce__(self):
@@ -282,7 +281,7 @@ def make_external(model):
 
 
 F32 = np.float32
-NOT_REPRODUCIBLE = "the graph or the metadata of the ONNX file is not what these weights and config.json make"
+NOT_REPRODUCIBLE = "the graph or metadata of the ONNX file differs from that of its weights and config.json"
 NEWER = "has version 4, this is version 3"
 REFUSALS = {
     "manifest missing": (lambda f: (f / "manifest.json").unlink(), "manifest.json: cannot be read"),
@@ -294,7 +293,7 @@ REFUSALS = {
     "newer config": (edit_config(lambda c: c.update(schema_version=4)), f"config.json: {NEWER}"),
     "older version": (
         edit_manifest(lambda m: m.update(schema_version=2)),
-        "has version 2, this is version 3; commit 05fa856 reads version 2",
+        "has version 2, expected version 3; commit 05fa856 reads version 2",
     ),
     "folder in place of a file": (
         lambda f: ((f / "policy.onnx").unlink(), (f / "policy.onnx").mkdir()),
@@ -314,11 +313,11 @@ REFUSALS = {
     "truncated, valid checksum": (edit_onnx(lambda data: data[:-4]), "the ONNX file cannot be read"),
     "layer of another shape": (
         change_tensors(actor_1_weight=np.zeros((32, 65), F32)),
-        r"asks for actor.1.weight of shape \(32, 64\), it has \(32, 65\)",
+        r"actor.1.weight must have the configured shape \(32, 64\), got \(32, 65\)",
     ),
     "block with one axis": (
         change_tensors(actor_1_block=np.zeros(3, F32)),
-        r"actor.1.block must be a matrix, it has shape \(3,\)",
+        r"actor.1.block must be a matrix, got shape \(3,\)",
     ),
     "extra layer": (change_tensors(actor_3_weight=np.zeros((12, 12), F32)), "missing or unknown: actor.3.weight"),
     "NaN": (change_tensors(actor_0_bias=np.full(64, np.nan, F32)), "actor.0.bias is not finite"),
@@ -326,7 +325,7 @@ REFUSALS = {
     "float64": (change_tensors(std=np.ones(48)), "normaliser.std must hold floating-point numbers of 32 bits"),
     "fewer numbers than the shape": (
         change_model(lambda m: initialiser(m, "actor_0_weight").dims.append(2)),
-        "actor.0.weight does not hold as many numbers as its shape needs",
+        "actor.0.weight: number of values does not match its shape",
     ),
     "name not UTF-8": (
         edit_onnx(lambda data: data.replace(b"actor_0_bias", b"actor_0_bia\xff")),
@@ -374,8 +373,8 @@ def test_pickle_in_place_of_the_weights_is_not_executed(folder, tmp_path):
     ("change", "message"),
     [
         ({"joint_names": ("a", "a")}, "joint_names must be distinct"),
-        ({"joint_names": ("a,b",)}, "names must be of letters, digits"),
-        ({"task": "../jump"}, "names must be of letters, digits"),
+        ({"joint_names": ("a,b",)}, "names may contain letters, digits"),
+        ({"task": "../jump"}, "names may contain letters, digits"),
         ({"torque_limit": (0.0,)}, "torque_limit must lie in 0.001 to 1e"),
         ({"joint_damping": (-1.0,)}, "joint_damping must lie in 0 to 1000, got -1"),
         ({"physics_dt": 0.1}, "physics_dt must be at most policy_dt"),

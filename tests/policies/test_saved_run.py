@@ -88,7 +88,7 @@ def test_missing_setting_gets_its_default(saved):
 def test_refuses_an_unknown_reward_unless_rewards_are_left_out(saved):
     _, config = saved
     config["env"]["task"]["rewards"].append({"type": "jumper_warp.tasks.terms:RewardTerm", "func": "mine:my_own"})
-    with pytest.raises(PolicyError, match=r"task.rewards\[23\] needs 'mine:my_own': name the file"):
+    with pytest.raises(PolicyError, match=r"task.rewards\[23\] needs 'mine:my_own': pass the file"):
         whole(config)
     assert restored_task(config).name == "vertical-jump"
 
@@ -138,7 +138,7 @@ def test_refuses_a_function_that_is_not_a_termination(saved, name, prefix):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t.update(name=""), "task.name is of letters"),
+        (lambda t: t.update(name=""), "task.name may contain letters"),
         (lambda t: t.pop("terminations"), "task.terminations is missing"),
         (lambda t: t["terminations"][1].update(func="os:system"), r"task.terminations\[1\] needs 'os:system'"),
         (
@@ -165,7 +165,7 @@ def test_refuses_another_version_with_the_commit_that_reads_it(saved):
     _, config = saved
     for version in (3, 5):  # the present one is 4
         config["env"]["task"]["version"] = version
-        with pytest.raises(PolicyError, match=f"has version {version}, this is version 4; commit 05fa856"):
+        with pytest.raises(PolicyError, match=f"has version {version}, expected version 4; commit 05fa856"):
             restored_task(config)
 
 

@@ -45,7 +45,7 @@ def test_initialised_actor_acts_as_the_shipped_policy(name, task, change):
     ("name", "task", "change", "message"),
     [
         ("horizontal_jump", "horizontal-jump", {"symmetry": "off"},
-         "hidden layers 512, 256, 256, these settings make 256, 128, 128: give --ppo.hidden 512 256 256"),
+         "hidden layers 512, 256, 256, the settings 256, 128, 128: pass --ppo.hidden 512 256 256"),
         ("vertical_jump", "horizontal-jump", {}, r"observation \d+: the policy has \w+, the task \w+"),
         ("horizontal_jump", "horizontal-jump-sighted", {}, r"observation 147: the policy has none, the task block_\w+"),
     ],

@@ -127,18 +127,18 @@ def test_initialised_actor_acts_as_the_policy(policy_symmetry, symmetry, hidden)
     for name, tensor in ppo.model.state_dict().items():
         assert name.startswith(("actor.", "obs_moments.")) or torch.equal(tensor, before[name]), name
     ppo.env.reset()
-    ppo.collect()  # uses the new weights, though the collector was built before
+    ppo.collect()  # uses the new weights, although the collector was built with the old ones
     torch.testing.assert_close(ppo.rollout.mean[0].clamp(-1.0, 1.0), model.act(ppo.rollout.obs[0]), atol=1e-5, rtol=0.0)
 
 
 @pytest.mark.parametrize(
     ("symmetric", "change", "message"),
     [
-        (False, {"hidden": (16, 8)}, "has hidden layers 32, 32, these settings make 16, 8: give --ppo.hidden 32 32"),
-        (True, {}, "has hidden layers 64, 64, these settings make 32, 32: give --ppo.hidden 64 64"),
-        (True, {"symmetry": "actor", "hidden": (9,)}, "layers 64, 64, these settings make 18: give --ppo.hidden 32 32"),
-        (False, {"symmetry": "actor", "hidden": (9,)}, "layers 32, 32, these settings make 9: give --ppo.hidden 32 32"),
-        (False, {"activation": "tanh"}, "has activation elu, these settings make tanh: give --ppo.activation elu"),
+        (False, {"hidden": (16, 8)}, "has hidden layers 32, 32, the settings 16, 8: pass --ppo.hidden 32 32"),
+        (True, {}, "has hidden layers 64, 64, the settings 32, 32: pass --ppo.hidden 64 64"),
+        (True, {"symmetry": "actor", "hidden": (9,)}, "layers 64, 64, the settings 18: pass --ppo.hidden 32 32"),
+        (False, {"symmetry": "actor", "hidden": (9,)}, "layers 32, 32, the settings 9: pass --ppo.hidden 32 32"),
+        (False, {"activation": "tanh"}, "has activation elu, the settings tanh: pass --ppo.activation elu"),
     ],
 )
 def test_refuses_settings_of_another_network_in_one_line(symmetric, change, message):
@@ -183,7 +183,7 @@ def test_nearly_symmetric_policy_is_projected_to_the_nearest_symmetric_one():
     nearest = nearest_expanded_layers(near, SYMMETRY)
     for expected, result in zip(nearest, expand_layers(start.layers, SYMMETRY), strict=True):
         torch.testing.assert_close(result, expected)
-    with pytest.raises(InputError, match=r"give --ppo\.hidden 64 64"):  # the average with the image keeps full widths
+    with pytest.raises(InputError, match=r"pass --ppo\.hidden 64 64"):  # the average with the image keeps full widths
         make_actor_init(far, *scaling, "elu", SYMMETRIC, SYMMETRY)
 
 
@@ -192,7 +192,7 @@ def test_refuses_a_standard_deviation_below_the_variance_epsilon():
     model.obs_moments.var.zero_()
     apply_actor_init(actor_init_of(model), model, samples=1)
     assert (model.obs_moments.var >= 0.0).all() and (model.obs_moments.var < 0.01 * VARIANCE_EPS).all()
-    with pytest.raises(InputError, match=r"divides an observation by 0\.001, least is 0\.00316"):
+    with pytest.raises(InputError, match=r"std must be at least 0\.00316, got 0\.001"):
         make_actor_init(layers_of(model), torch.zeros(2), torch.tensor([1.0, 1e-3]), "elu", SMALL)
 
 
@@ -247,5 +247,5 @@ def test_resumes_a_checkpoint_that_started_from_random_weights(cfg, lacks_settin
 
 def test_policy_name_and_actor_init_need_each_other(cfg):
     for init_policy, start in (("pusher", None), (None, actor_init_of(actor()))):
-        with pytest.raises(InputError, match=r"init_policy and actor_init.* need each other"):
+        with pytest.raises(InputError, match=r"init_policy and actor_init.* must be passed together"):
             train(dataclasses.replace(cfg, init_policy=init_policy), make_env, actor_init=start)

@@ -69,7 +69,7 @@ def cut(path):
 
 
 def empty_manifest(path):
-    """Remove all entries from the manifest beside a checkpoint."""
+    """Remove all entries from the manifest in a checkpoint's folder."""
     (path.parent / MANIFEST).write_text("{}")
 
 

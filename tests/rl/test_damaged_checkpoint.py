@@ -165,13 +165,13 @@ def test_unchanged_checkpoint_is_resumed(saved):
 
 INVALID_PARTS = [  # keys to a part, its new value, and the error message
     (("iteration",), "late", "iteration must be int, got str"),
-    (("iteration",), 7, "of iteration 7, manifest.json says 1"),
+    (("iteration",), 7, "iteration is 7, in manifest.json 1"),
     (("rng", "cpu"), REMOVED, "rng lacks cpu"),
     (("rng", "cpu"), torch.zeros(5), "rng.cpu has shape (5,), expected (5056,)"),
     (("rng", "cpu"), torch.zeros(5056, dtype=torch.uint8), "rng is not the state of a generator"),
     (("ppo",), [], "ppo must be dict, got list"),
-    (("ppo", "optimiser"), {}, "ppo.optimiser lacks 0, 1, 10 and 10 more, has nothing besides"),
-    (("ppo", "optimiser", 0, "step"), REMOVED, "ppo.optimiser.0 lacks step, has nothing besides"),
+    (("ppo", "optimiser"), {}, "ppo.optimiser: missing entries: 0, 1, 10 and 10 more; unexpected entries: none"),
+    (("ppo", "optimiser", 0, "step"), REMOVED, "ppo.optimiser.0: missing entries: step; unexpected entries: none"),
     (("ppo", "optimiser", 0, "exp_avg"), torch.zeros(2), "ppo.optimiser.0.exp_avg has shape (2,), expected (8, 147)"),
     (("ppo", "optimiser", 1, "exp_avg_sq"), torch.full((8,), -1.0), "ppo.optimiser.1.exp_avg_sq must not be below 0"),
     (("ppo", "model", "actor.0.bias"), torch.full((8,), float("nan")), "ppo.model.actor.0.bias is not finite"),
@@ -205,7 +205,7 @@ def test_error_message_names_missing_parts_of_another_rank(saved):
     rank_1 = {"ppo": {"episode": saved.state["ppo"]["episode"]}, "env": saved.state["env"]}
     saved.save({**saved.state, "others": [rank_1]})
     cfg = TrainCfg(**{**vars(saved.cfg), "resume": str(saved.path)})
-    with pytest.raises(CheckpointError, match=r"others\.0 lacks rng, has nothing besides"):
+    with pytest.raises(CheckpointError, match=r"others\.0: missing entries: rng; unexpected entries: none"):
         TrainingRun(cfg, saved.env, Rank(1, 2, torch.device("cpu")))
 
 

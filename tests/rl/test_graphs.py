@@ -31,5 +31,5 @@ def test_failed_capture_runs_eagerly_and_warns_once(capsys):
         captured()
     assert len(calls) == 4
     assert capsys.readouterr().err.splitlines() == [
-        "not captured as a CUDA graph, training is slower: operation not permitted when stream is capturing"
+        "CUDA graph capture failed, training is slower: operation not permitted when stream is capturing"
     ]

@@ -59,5 +59,5 @@ def test_logged_rewards_are_means_over_the_episodes_that_ended_since_the_last_lo
     ("name", "seconds"),
     [("vertical-jump", 20.0), ("horizontal-jump", 20.0), ("velocity-flat", 20.0), ("attitude", 4.0)],
 )
-def test_a_task_knows_its_time_limit(name, seconds):
+def test_time_limit_of_a_task_is_that_of_its_termination(name, seconds):
     assert make_task(name).max_episode_length_s(1.0 / 60.0) == pytest.approx(seconds)

@@ -64,7 +64,7 @@ def feed(theirs, rollout):
 
 @pytest.fixture(scope="module")
 def pair():
-    """Our PPO, its batch, rsl-rl's PPO, its losses and our statistics, after one update on the same samples.
+    """Return our PPO and batch, rsl-rl's PPO and losses, and our statistics, after one update on the same samples.
 
     The weights differ from the weights that acted, so that the probability ratio is not 1.
     """

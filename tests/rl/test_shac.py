@@ -49,7 +49,7 @@ def shac(num_envs=32, seed=0, **changes):
 
 
 def test_gradient_agrees_with_finite_differences_of_the_loss():
-    """Oracle: central difference along the gradient. Episodes end within the window; the target critic is trained."""
+    """The oracle is a central difference along the gradient; episodes end in the window, the critic is trained."""
     algorithm = shac(num_envs=8)
     algorithm.iterate()
     start, noise = algorithm.env.state_dict(), torch.get_rng_state()
@@ -73,7 +73,7 @@ def test_gradient_agrees_with_finite_differences_of_the_loss():
 
 
 def test_loss_agrees_with_a_loop_over_worlds():
-    """Oracle: discounted sums world by world. Episodes end by timeout and, for a mass that starts fast, termination."""
+    """The oracle sums discounted rewards by world; episodes end by timeout and, for a fast mass, by termination."""
     algorithm = shac(num_envs=6, num_steps=14, asymmetric_critic=False)
     env, model, gamma = algorithm.env, algorithm.model, algorithm.cfg.gamma
     env.start[0] = torch.tensor([4.5, 3.0])  # beyond the limit of 5 after one step of each episode
@@ -106,7 +106,7 @@ def test_loss_agrees_with_a_loop_over_worlds():
 
 
 def test_shac_learns_to_push_the_mass_to_the_origin():
-    """Mean distance after ten steps: 1.04 with initial weights, 0.26 after training."""
+    """The mean distance after ten steps is 1.04 with initial weights and 0.26 after training."""
     algorithm, means = shac(init_std=0.1), []
     for iterations in (0, 60):
         for _ in range(iterations):
@@ -135,7 +135,7 @@ def test_same_seed_gives_the_same_weights_and_a_loaded_state_resumes_bitwise():
 
 def test_refuses_a_state_without_learning_rate():
     state = shac().state_dict()
-    with pytest.raises(ValueError, match="lacks lr"):
+    with pytest.raises(ValueError, match="missing entries: lr"):
         shac().load_state_dict({name: value for name, value in state.items() if name != "lr"})
 
 

@@ -159,9 +159,9 @@ def test_symmetric_actor_resumes_only_with_the_same_symmetry():
     assert torch.equal(first.flat.value, second.flat.value)
     wrong = first.state_dict()
     wrong["model"]["mirror_obs_order"] = wrong["model"]["mirror_obs_order"].flip(0)
-    with pytest.raises(InputError, match="mirror_obs_order is of another observation"):
+    with pytest.raises(InputError, match="mirror_obs_order is for another observation"):
         second.load_state_dict(wrong)
-    with pytest.raises(InputError, match=r"has mirror_\w+, mirror_\w+, mirror_\w+ and 1 more besides"):
+    with pytest.raises(InputError, match=r"unexpected entries: mirror_\w+, mirror_\w+, mirror_\w+ and 1 more"):
         Ppo(PushTask(8), dataclasses.replace(CFG, symmetry="off")).load_state_dict(first.state_dict())
 
 
@@ -187,5 +187,5 @@ def test_refuses_symmetry_for_an_env_without_mirror_map_or_of_another_size():
 
 
 def test_refuses_symmetry_with_another_trainer():
-    with pytest.raises(InputError, match="symmetry is not offered with trainer rsl-rl"):
+    with pytest.raises(InputError, match="symmetry is not supported with trainer rsl-rl"):
         TrainCfg(trainer="rsl-rl", ppo=CFG)

@@ -190,7 +190,7 @@ def test_failed_save_is_reported_and_training_continues(cfg, capsys):
 
     with pytest.raises(CheckpointError, match="not saved"):
         train(cfg, BlockingTask)
-    assert "will try again" in capsys.readouterr().err
+    assert "retried later" in capsys.readouterr().err
     (metrics,) = cfg.log_root.glob(f"push/*/{METRICS_FILE}")
     assert len(metrics.read_text().splitlines()) == 2
 
@@ -224,7 +224,7 @@ def test_each_rank_resumes_its_own_worlds(cfg):
     for part in ("ppo", "env", "rng", "others"):
         assert equal(state[part], expected[part]), part
     alone = dataclasses.replace(cfg, num_envs=cfg.num_envs // 2, resume=str(folder / "iteration_000002.pt"))
-    with pytest.raises(CheckpointError, match="saved by 2 processes, there are 1"):
+    with pytest.raises(CheckpointError, match="saved by 2 processes, resumed by 1"):
         train(alone, lambda n, seed, device: PushTask(n, seed))
 
 
@@ -237,7 +237,7 @@ def test_each_rank_resumes_its_own_worlds(cfg):
         ({"max_seconds": math.inf}, "max_seconds must be finite and not negative, got inf"),
         ({"seed": -1}, r"seed must be in 0 \.\. 2147483647, got -1"),
         ({"seed": 2**31}, "seed must be in"),
-        ({"trainer": "rsl-rl", "resume": "latest"}, "resume is not offered"),
+        ({"trainer": "rsl-rl", "resume": "latest"}, "resume is not supported"),
     ],
 )
 def test_refuses_settings_out_of_range(change, message):

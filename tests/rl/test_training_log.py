@@ -98,7 +98,7 @@ def test_non_finite_reward_term_is_reported_and_logged_as_null(tmp_path, capsys)
         for iteration in (2, 3):
             log.log(iteration, metrics, remaining=5.0)
             stderr = capsys.readouterr().err
-            assert "reward term tilt was not finite in some steps, where it counts as 0" in stderr
+            assert "reward term tilt was not finite in some steps and counted as 0" in stderr
             assert "reward term hop/fall was not finite" in stderr and stderr.count("reward term") == 2
 
     def fail(constant):
@@ -134,7 +134,7 @@ def test_resumed_run_drops_partial_lines_and_later_iterations(cfg, capsys):
     assert iterations(path) == [1, 2, 3, 4, 5, 6]
     assert path.read_text().splitlines()[:2] == kept
     stderr = [line for line in capsys.readouterr().err.splitlines() if str(path) in line]
-    assert stderr == [f"{path}: dropped 2 lines, cut or of later iterations"]
+    assert stderr == [f"{path}: removed 2 incomplete or later lines"]
 
 
 @pytest.mark.parametrize(

@@ -236,7 +236,7 @@ def test_failed_compilation_runs_eagerly_and_warns_once(capsys, monkeypatch):
     monkeypatch.setattr(graphs, "BACKEND", broken_backend)
     assert torch.equal(trained("on"), expected)
     lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and lines[0].startswith("not compiled, training is slower: ")
+    assert len(lines) == 1 and lines[0].startswith("torch.compile failed, training is slower: ")
     assert lines[0].endswith("OSError: no compiler here")
 
 

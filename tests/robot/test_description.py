@@ -54,7 +54,7 @@ def test_leg_dimensions_of_the_back_right_leg(description):
 
 
 @pytest.mark.parametrize("leg", ["FL", "BR"])
-@pytest.mark.parametrize(("degrees", "depth"), [(0, 0.4716), (45, 0.3718)])  # of both thighs; [m]
+@pytest.mark.parametrize(("degrees", "depth"), [(0, 0.4716), (45, 0.3718)])  # both thighs; [m]
 def test_knee_angles_and_ankle_depth_of_a_symmetric_leg(description, leg, degrees, depth):
     angle = math.radians(degrees)
     outer_knee, inner_knee, ankle_z = knee_angles(leg_dimensions(description, leg), angle, angle)
@@ -67,7 +67,7 @@ def test_knee_angles_and_ankle_depth_of_a_symmetric_leg(description, leg, degree
 def test_refuses_leg_with_coinciding_knees_at_minus_14_9_degrees(description):
     angle = -math.asin(0.045 / 0.175)  # half the distance of the thigh axes over the thigh length
     assert math.degrees(angle) == pytest.approx(-14.9, abs=0.05)
-    with pytest.raises(ValueError, match="do not meet"):
+    with pytest.raises(ValueError, match="cannot connect knees"):
         knee_angles(leg_dimensions(description, "FL"), angle, angle)
 
 

@@ -36,14 +36,14 @@ def test_mass_motor_indices_and_armature(robot):
     assert not robot.model.armature[robot.knee_v].any()
 
 
-@pytest.mark.parametrize(("degrees", "depth"), [(0, 0.4716), (45, 0.3718)])  # of both thighs; [m]
+@pytest.mark.parametrize(("degrees", "depth"), [(0, 0.4716), (45, 0.3718)])  # both thighs; [m]
 def test_ankle_depth_below_the_hips(robot, degrees, depth):
     q = robot.configuration((0.0, 0.0, 0.0), LEVEL, np.tile(np.radians([0.0, degrees, degrees]), 4))
     assert -robot.paw_positions(q)[:, 2] == pytest.approx(np.full(4, depth), abs=5e-5)
 
 
 def test_lateral_motor_swings_the_paw_outward(robot):
-    # at 90 degrees the ankle is 0.3718 m beside the hip and 0.0602 m above it; the right hip is at y = -0.105 m
+    # at 90 degrees the ankle is 0.3718 m outward of the hip and 0.0602 m above it; the right hip is at y = -0.105 m
     q = robot.configuration((0.0, 0.0, 0.0), LEVEL, np.tile(np.radians([90.0, 45.0, 45.0]), 4))
     assert robot.paw_positions(q)[1, 1:] == pytest.approx([-0.105 - 0.3718, 0.0602], abs=5e-5)
 

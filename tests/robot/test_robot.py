@@ -17,7 +17,7 @@ from jumper_warp.robot.pinocchio_model import build_pinocchio
 from jumper_warp.sim.mujoco import mujoco_solver
 from jumper_warp.sim.precision import float64_kernels
 
-COORDS, DOFS = 43, 38  # of a world
+COORDS, DOFS = 43, 38  # entries of joint_q and joint_qd per world
 LEGS = ("FL", "FR", "BL", "BR")
 FRONT = np.array([1, 1, -1, -1])  # sign of x by leg
 SIDE = np.array([1, -1, 1, -1])  # sign of y by leg
@@ -140,7 +140,7 @@ def test_nominal_pose_stands_at_the_nominal_height(description):
 def test_standing_height_with_the_legs_swung_outward(model, description):
     swung = dataclasses.replace(description, poses={"swung": (math.radians(30.0), math.radians(60.0))})
     paws = far_ends(model, standing_configuration(swung, "swung"), 4, 0.3)
-    # the hips are level, and the legs alike
+    # the hips are level, and all legs have equal angles
     assert paws[:, 2] == pytest.approx(np.full(4, 0.025), abs=1e-6)
 
 

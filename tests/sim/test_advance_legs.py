@@ -138,7 +138,7 @@ def test_contact_iteration_ends_at_tolerance_and_reports_residual():
 
 @pytest.mark.parametrize("friction", [0.2, 0.5, 1.0])
 def test_sliding_paws_converge_in_few_rounds(friction):
-    """A friction step by the summed response of all paws would take 10 to 13 rounds, one paw at a time more than 9."""
+    """Steps by the summed response of all paws take 10 to 13 rounds; steps of one paw at a time take more than 9."""
     model = build_model(N, friction=friction)
     dynamics = JumperDynamics(model, double=True)
     found = advance(dynamics, *states(model, 0.34), by_legs=True, tolerance=1.0e-5)

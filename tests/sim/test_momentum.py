@@ -35,15 +35,15 @@ def moving_legs(keep: bool, *, height: float, push: float = 0.0, reach: float = 
 
 @pytest.fixture(scope="module")
 def flights():
-    """(simulation, momenta) in free flight, by `keep_momentum`."""
+    """Return (simulation, momenta) of a free flight, by value of `keep_momentum`."""
     return {keep: moving_legs(keep, height=5.0) for keep in (False, True)}
 
 
 def test_momentum_changes_by_gravity_alone_in_flight(flights):
-    sim, kept = flights[True]
+    sim, projected = flights[True]
     mass = sim.model.body_mass.numpy()[:21].sum()
     time = np.arange(STEPS + 1) / 60.0
-    linear, angular = (np.array([pair[i] for pair in kept]) for i in (0, 1))  # (STEPS + 1, N, 3)
+    linear, angular = (np.array([pair[i] for pair in projected]) for i in (0, 1))  # (STEPS + 1, N, 3)
     np.testing.assert_allclose(linear[:, :, 2] - linear[0, :, 2], np.outer(-mass * MARS * time, np.ones(N)), atol=1e-3)
     np.testing.assert_allclose(linear[:, :, :2], np.tile(linear[0, :, :2], (STEPS + 1, 1, 1)), atol=1e-4)
     np.testing.assert_allclose(angular, np.tile(angular[0], (STEPS + 1, 1, 1)), atol=2e-5)

@@ -159,10 +159,10 @@ def test_static_friction_holds_where_dynamic_friction_slides():
     before = paw_centres(sim)
     for _ in range(60):
         sim.step()
-    settled = paw_centres(sim)
+    start = paw_centres(sim)
     for _ in range(60):
         sim.step()
-    assert np.abs(paw_centres(sim) - settled)[0].max() < 1e-3
+    assert np.abs(paw_centres(sim) - start)[0].max() < 1e-3
     moved = np.abs(paw_centres(sim) - before).max(axis=(1, 2))
     # 0.5 (sin 12.4 - 0.2 cos 12.4) g t^2 = 0.38 m for t = 2 s
     assert moved[1] == pytest.approx(0.38, rel=0.1)

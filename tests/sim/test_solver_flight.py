@@ -194,9 +194,9 @@ def test_damping_and_friction_always_reduce_energy(gentle):
     for _ in range(50):
         states = flight.run(states, 1e-5, 2000)
         assert inside_stops(states)
-        now = np.array([reference.energy(states, i) for i in range(n)])
-        assert (now < before).all()
-        before = now
+        energy = np.array([reference.energy(states, i) for i in range(n)])
+        assert (energy < before).all()
+        before = energy
     assert (before < start - 1e-3).all()
 
 

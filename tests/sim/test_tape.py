@@ -87,7 +87,7 @@ def gradient(arrays, name):
     [("q", 3e-9, 1e-6), ("qd", 1e-6, 1e-6), ("joint_f", 1e-4, 1e-6), ("table", 1e-6, 1e-5), ("body_f", 2.0**-7, 1e-4)],
 )
 def test_gradients_match_central_differences(steps, name, h, rel):
-    """Derivatives along random directions; wrenches have single precision, so h is a power of two."""
+    """Derivatives are along random directions; wrenches have single precision, so h is a power of two."""
     tape, arrays, ends = steps.record(steps.values)
     tape.zero()
     steps.backward(tape, ends)
@@ -114,7 +114,7 @@ def test_gradients_accumulate_until_zeroed(steps):
 
 
 def test_tape_records_solver_steps_and_packed_model():
-    """Single precision: gradients with respect to a force on a flying robot's base, and to masses."""
+    """In single precision, gradients exist with respect to masses and a force on a flying robot's base."""
     model = build_model(1, visuals=False, requires_grad=True, ground=None, device="cpu")
     solver, control, before, after = SolverJumper(model), model.control(), model.state(), model.state()
     before.joint_q.assign(model.joint_q)

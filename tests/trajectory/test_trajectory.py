@@ -77,7 +77,7 @@ def test_air_time_matches_projectile():
 
 
 def test_momentum_in_flight_follows_a_parabola(jump):
-    """Six policy steps after takeoff: constant gravity, and conserved angular momentum."""
+    """For six policy steps after takeoff gravity is the only force, and angular momentum is conserved."""
     _, _, motion = jump
     row, takes_off = motion.takeoff(0.25)  # [m/s]
     assert takes_off.all() and motion.q.shape[0] - int(row) > 6
@@ -119,7 +119,7 @@ def test_positive_work_matches_sum_over_physics_steps(jump):
 
 
 def test_highest_ignores_a_second_hop():
-    """After a small hop, a squat in the air and a jump, the apex is the hop's."""
+    """The motion is a small hop, a squat in the air and a jump; the apex is that of the hop."""
     jump_problem = problem()
     jump_problem.knots = Knots((0.0, 7.0, 8.0, 30.0, 31.0), steps=56)
     x = torch.full((1, 5, 4), -1.0, dtype=torch.float64)  # knots 0 and 1: push-off
@@ -146,7 +146,7 @@ TERMS = {  # (num,) each; constraints of several rows are summed
 
 
 def test_gradients_of_terms_match_central_differences():
-    """Along three random directions around `SQUAT_AND_PUSH`; every term is a constraint, so that its value is kept."""
+    """Derivatives are along three random directions at `SQUAT_AND_PUSH`; terms are constraints, so each is returned."""
     rng, h = np.random.default_rng(1), 1.0e-6
     x = SQUAT_AND_PUSH.reshape(1, -1) + 0.02 * rng.normal(size=(1, len(KNOTS)))
     directions = rng.normal(size=(3, len(KNOTS)))
@@ -265,7 +265,7 @@ def test_returned_starts_take_smaller_steps():
 
 
 def test_crossings_join_a_beginning_with_another_end():
-    """Three parents of 12 knots, with entries of knot + 100 times parent, and 66 crossings of each parent."""
+    """Three parents of 12 knots (entries: knot + 100 times parent) have 66 crossings each."""
     knots = Knots(tuple(map(float, range(12))), steps=12)
     rows = torch.arange(12.0)[:, None] + torch.tensor([0.0, 100.0, 200.0])[:, None, None]
     whole = crossed(knots, rows.expand(3, 12, 4).flatten(1), 66, np.random.default_rng(0)).reshape(198, 12, 4)

@@ -1,4 +1,4 @@
-"""Intervals of metrics beside SciPy's, and the printed table."""
+"""Intervals of metrics against SciPy, and the printed table."""
 
 from types import SimpleNamespace
 

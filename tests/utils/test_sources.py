@@ -20,5 +20,5 @@ def test_source_checksums_cover_only_modules_outside_the_project():
 
 def test_changed_sources_reports_only_known_modules():
     (line,) = changed_sources({"mine": "a", "other": "b"}, {"mine": "c", "other": "b", "new": "d"})
-    assert line.startswith("mine has changed since")
+    assert line.startswith("mine has changed since the run was saved")
     assert changed_sources(None, {"mine": "c"}) == changed_sources({}, {}) == []

@@ -22,7 +22,7 @@ GREEN = 1  # channel
 
 
 class Canvas:
-    """A renderer that draws nothing and keeps what it was given."""
+    """Stub of a renderer that draws nothing and stores its arguments."""
 
     name = "nothing"
 
@@ -42,7 +42,7 @@ class Canvas:
 
 @pytest.fixture
 def canvas(monkeypatch):
-    """List of the canvases that replace renderers."""
+    """Return the list of canvases that replace renderers."""
     opened = []
 
     def open_canvas(*args):
@@ -193,8 +193,8 @@ def test_poses_outside_the_recorded_times_are_the_first_and_the_last():
 @pytest.mark.parametrize(
     ("name", "options", "message"),
     [
-        ("walk.avi", {}, r"walk\.avi: a film ends with \.mp4, \.webp, \.gif"),
-        ("walk", {}, r"walk: a film ends with"),
+        ("walk.avi", {}, r"walk\.avi: the suffix of a film must be one of \.mp4, \.webp, \.gif"),
+        ("walk", {}, r"walk: the suffix of a film must be"),
         ("walk.mp4", {"size": (96, 32)}, "64 to 7680 px"),
         ("walk.mp4", {"size": (9000, 64)}, "64 to 7680 px"),
         ("walk.mp4", {"fps": 0.0}, "fps in"),
@@ -202,8 +202,8 @@ def test_poses_outside_the_recorded_times_are_the_first_and_the_last():
         ("walk.gif", {"fps": 60.0}, "up to 50 frames per second"),
         ("walk.mp4", {"speed": 0.0}, "speed in"),
         ("walk.mp4", {"speed": math.inf}, "speed in"),
-        ("walk.webp", {"speed": 0.001}, r"walk\.webp: 15001 frames are too many for \.webp; up to 1800, or use \.mp4"),
-        ("walk.mp4", {"eye": (0.0, 0.0, 2.0)}, "no horizontal distance"),
+        ("walk.webp", {"speed": 0.001}, r"walk\.webp: \.webp may have up to 1800 frames, got 15001; use \.mp4"),
+        ("walk.mp4", {"eye": (0.0, 0.0, 2.0)}, "is vertical"),
     ],
 )
 def test_bad_arguments_are_refused_in_one_line_before_anything_is_drawn(tmp_path, canvas, name, options, message):

@@ -185,7 +185,7 @@ def test_diverged_robot_is_shown_until_then(tmp_path, distance, first, value):
 def test_recording_without_a_finite_pose_is_refused_in_one_line_and_still_written_for_the_viewer(tmp_path):
     recording = jump_recording()
     recording.poses[:] = np.nan
-    with pytest.raises(InputError, match="world_0 has no finite pose in its first frame") as error:
+    with pytest.raises(InputError, match="world_0: no picture, the poses of the first frame are not finite") as error:
         save_recording(recording, tmp_path, "lost")
     assert "\n" not in str(error.value) and [file.name for file in tmp_path.iterdir()] == ["lost.rrd"]
 
@@ -204,7 +204,7 @@ def test_file_has_the_format_of_its_suffix_and_the_width(tmp_path, suffix, kind)
 def test_bad_suffix_and_width_are_refused_before_drawing(tmp_path, monkeypatch, name, width):
     monkeypatch.setattr(picture, "open_renderer", None)
     with pytest.raises(
-        InputError, match=rf"{name}: a picture ends with \.png, \.webp, \.jpg and is 200 to 8000 px wide"
+        InputError, match=rf"{name}: a picture needs suffix \.png, \.webp, \.jpg and width 200 to 8000 px"
     ):
         write_picture(jump_recording(), tmp_path / name, width=width)
     assert not list(tmp_path.iterdir())

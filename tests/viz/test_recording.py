@@ -294,7 +294,7 @@ def test_load_npz_of_a_damaged_archive_raises_nothing_but_recording_errors(model
         ({"time": float("nan")}, "time must increase"),
         ({"body_poses": np.zeros((3, 7))}, r"shape \(4, 7\)"),
         ({"series": {"base/height [m]": 1.0}}, "new or missing.*torque"),
-        ({"contact_points": None}, "come together"),
+        ({"contact_points": None}, "together, or neither"),
         ({"contact_points": np.zeros((2, 3)), "contact_forces": np.zeros((2, 3))}, "every frame needs"),
         ({"contact_forces": np.zeros((4, 3))}, "contacts must have shape"),
     ],
@@ -320,5 +320,5 @@ def test_record_refuses_series_without_group_or_unit(model, name):
 def test_recorder_refuses_a_missing_world_and_an_empty_recording(model):
     with pytest.raises(ValueError, match="world 2 has no bodies"):
         Recorder(model, (0, 2))
-    with pytest.raises(ValueError, match="nothing was recorded"):
+    with pytest.raises(ValueError, match="the recording has no frames"):
         Recorder(model).recording()

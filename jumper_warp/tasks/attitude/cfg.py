@@ -19,12 +19,12 @@ class TurnCfg:
     """Range of sampled turns: one level of the curriculum."""
 
     angle: Pair
-    """[deg] Of a commanded turn."""
+    """[deg] Angle of a commanded turn."""
     body_axis_probability: float = 0.5
     """[1] Probability of a turn about body x, y or z; other turns have a uniformly random axis."""
 
     struct = TurnRanges
-    """Kernels' struct that `values` returns."""
+    """Type of the kernel struct that `values` returns."""
 
     def __post_init__(self) -> None:
         """Raise InputError unless 0 <= lower <= upper <= 180 deg and the probability is in 0 to 1."""
@@ -42,23 +42,23 @@ class AttitudeResetCfg:
     """Ranges of the state at the start of an episode, in any orientation; angles in degrees."""
 
     episode: Pair = (2.0, 4.0)
-    """[s] Length of an episode; sampled, so that worlds are at different stages."""
+    """[s] Length of an episode, sampled so that worlds do not reset all at once."""
     height: float = 2.0
-    """[m] Height of the base above the ground."""
+    """[m] Height of the base above the ground at the start."""
     default_pose_probability: float = 0.3
     """[1] Probability of a start in the default pose."""
     lateral: Pair = (-20.0, 80.0)
-    """[deg] Lateral motor angles in other starts."""
+    """[deg] Lateral motor angles in starts outside the default pose."""
     transversal: Pair = (0.0, 105.0)
-    """[deg] Outer and inner motor angles in other starts."""
+    """[deg] Outer and inner motor angles in starts outside the default pose."""
     spin: float = 0.0
-    """[rad/s] Half width of the angular velocity about each axis; 0: no angular momentum."""
+    """[rad/s] Largest angular velocity about each axis at the start; 0: no angular momentum."""
 
     struct = AttitudeSettings
-    """Kernels' struct that `values` returns."""
+    """Type of the kernel struct that `values` returns."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: a pair is reversed, a number not finite or out of range."""
+        """Raise InputError if a pair is reversed, or a number is not finite or out of range."""
         check_ranges("reset", self, not_negative=("spin",))
         check_positive("reset episode", *self.episode)
         check_positive("reset height", self.height)

@@ -1,10 +1,10 @@
 """Turning in free flight: a floating robot moves its legs so that its base reaches a commanded orientation.
 
-No force acts, so angular momentum stays zero: the base turns while legs move, and stays turned after a closed cycle of
-the legs, stretched in one direction and folded in the other. Weights and limits are of the order of the authors' sequel
-(attitude wide and narrow 2.5 and 1.5, collision -100, 8 N m), which does not publish the terms' forms. `approach` pays
-for every degree of progress, also far from the goal, where the other kernels are flat. A collision costs reward and
-fails the episode at its end but does not terminate it, since legs collide in every episode early in training.
+No force acts, so angular momentum stays zero: the base turns while legs move. It stays turned after a closed cycle in
+which the legs are stretched on the way out and folded on the way back. Weights and limits are of the order of those in
+the authors' sequel (attitude wide and narrow 2.5 and 1.5, collision -100, 8 N m), which does not publish the terms.
+`approach` rewards every degree of progress, also far from the goal, where the other kernels are flat. A collision costs
+reward and makes the episode a failure, but does not end it, since legs collide in every episode early in training.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from jumper_warp.tasks.terms import Advance, Curriculum, ObservationTerm, Reward
 from jumper_warp.tasks.units import DEG
 
 TORQUE = 8.0  # [N m] limit of all motors
-TOLERANCE = 5.0  # [deg] largest error of a settled robot
+TOLERANCE = 5.0  # [deg] largest orientation error of a robot that has reached its goal
 
 ACTOR = (
     ObservationTerm(attitude.turn_left, noise=0.02),
@@ -39,7 +39,7 @@ CRITIC = (
     ObservationTerm(attitude.in_collision),
     *(term for term in DRAWN if term.name not in ("drawn_friction", "drawn_push")),
 )
-"""Critic observation: the actor's without noise, plus values that only a simulation has."""
+"""Critic observation: the actor's without noise, plus privileged values."""
 
 REWARDS = (
     RewardTerm(rewards.approach, 15.0),
@@ -57,7 +57,7 @@ REWARDS = (
 )
 
 TERMINATIONS = (
-    TerminationTerm(mdp_terminations.came_apart),
+    TerminationTerm(mdp_terminations.diverged),
     TerminationTerm(terminations.ended_clear, time_out=True, success=True),
     TerminationTerm(terminations.ended, time_out=True),
 )
@@ -71,7 +71,7 @@ METRICS = (
 
 
 def attitude_in_flight() -> TaskCfg:
-    """Return the task in zero gravity, with motors limited to 8 N m and the legs' full range between the hard stops."""
+    """Return the task of turning in zero gravity, with motors limited to 8 N m and the legs' full range of motion."""
     return TaskCfg(
         name="attitude",
         state=AttitudeState,

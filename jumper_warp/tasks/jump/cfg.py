@@ -1,4 +1,4 @@
-"""Configuration of jumps: reference states at the start, grounds and levels of the curriculum."""
+"""Configuration of jumps: states at the start of episodes, grounds, and levels of the curriculum."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ class GroundCfg:
     """
 
     platform: float = 0.0
-    """[1] Probability of a start on a platform, if the paws have room to land beside it."""
+    """[1] Probability of a start on a platform, where the paws have room to land next to it."""
     block: float = 0.0
-    """[1] Probability of a sliding block under the goal, if there is room before it."""
+    """[1] Probability of a sliding block under the goal, where there is room for the start in front of it."""
     drop: Pair = (0.03, 0.20)
-    """[m] Height of the platform."""
+    """[m] Height of sampled platforms above the floor."""
     rise: Pair = (0.02, 0.08)
-    """[m] Height of the block."""
+    """[m] Height of sampled blocks above the floor."""
     room: float = 0.30
-    """[m] Largest distance from the paws to an edge, each way; a block's near side may be farther."""
+    """[m] Largest distance from the paws to an edge of the ground; the near edge of a block may be farther."""
     clearance: float = 0.12
-    """[m] Smallest distance from an edge that must be crossed to the paws at the goal."""
+    """[m] Smallest distance between the paws at the goal and an edge that the jump must cross."""
     mass: Pair = (5.0, 100.0)
-    """[kg] Mass of the block."""
+    """[kg] Mass of sampled blocks."""
     friction: Pair = (0.3, 1.0)
-    """[1] Friction coefficient between block and floor."""
+    """[1] Friction coefficient between sampled blocks and the floor."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: probabilities or lengths out of range, or a pair reversed, not positive or not finite."""
+        """Raise InputError if a probability or length is out of range, or a pair reversed or not positive."""
         if not (min(self.platform, self.block) >= 0.0 and self.platform + self.block <= 1.0):
-            raise InputError(f"ground shares must be >= 0 and add up to at most 1, got {self.platform}, {self.block}")
+            raise InputError(f"ground probabilities must be >= 0, in sum at most 1, got {self.platform}, {self.block}")
         for name, value in vars(self).items():
             if isinstance(value, tuple) and not 0.0 < value[0] <= value[1] < math.inf:
                 raise InputError(f"ground {name} must be (lower, upper), positive and finite, got {value}")
@@ -79,7 +79,7 @@ class Level:
     struct = JumpLevel  # Kernels' struct that `values` returns
 
     def __post_init__(self) -> None:
-        """Raise InputError: a range falls or is not finite, or a height or probability is out of range."""
+        """Raise InputError if a range is reversed or not finite, or a height or probability is out of range."""
         pairs = [*zip(self.goal_lower, self.goal_upper, strict=True), self.base_height]
         if not all(-math.inf < low <= high < math.inf for low, high in pairs):
             raise InputError(f"a level's ranges must be finite and rise, got {self}")
@@ -96,7 +96,7 @@ class Level:
 
 
 def cross_levels(goals: Sequence[Level], starts: Sequence[Pair]) -> tuple[Level, ...]:
-    """Return len(goals) * len(starts) levels: each goal level with all ranges of standing starts [m], easiest first.
+    """Return len(goals) * len(starts) levels: each level of goals with each range of base heights [m], easiest first.
 
     The curriculum of starts restarts with every level of goals, as in the authors' training.
     """
@@ -115,7 +115,7 @@ class StartProbability:
     pushing: float = 0.0  # During the push of a takeoff
 
     def __post_init__(self) -> None:
-        """Raise InputError: one is negative, or they do not add up to 1."""
+        """Raise InputError if a probability is negative, or they do not add up to 1."""
         values = tuple(vars(self).values())
         if not min(values) >= 0.0 or not abs(sum(values) - 1.0) < 1.0e-6:
             raise InputError(f"start_probability must be >= 0 and add up to 1, got {vars(self)}")
@@ -127,49 +127,49 @@ class ResetCfg:
 
     start_probability: StartProbability = StartProbability(0.60, 0.15, 0.20, after_landing=0.05)
     balance_by: Literal["resets", "steps"] = "resets"
-    """Quantity with these probabilities: resets, or policy steps, which each world balances over its resets."""
+    """Quantity that `start_probability` divides: resets, or policy steps, which each world balances over its resets."""
     base_xy: float = 0.05
-    """[m] Half width of the base's x and y."""
+    """[m] Largest offset of the base along x and y at the start."""
     tilt: float = 5.0
-    """[deg] Half width of roll, pitch and yaw."""
+    """[deg] Largest roll, pitch and yaw to either side at the start."""
     forward_pitch: float = 0.0
-    """[deg] Largest mean pitch (nose down) of standing states."""
+    """[deg] Largest mean pitch (nose down) of standing starts."""
     lean: float = 0.0
     """[m] Largest distance of the base behind the middle of the paws, away from the goal, in the deepest squats."""
     heading: float = 0.0
-    """[deg] Half width of the heading."""
+    """[deg] Largest heading to either side at the start."""
     front_x: Pair = (0.20, 0.22)
-    """[m] Distance of the front paws ahead of the base."""
+    """[m] Distance of the front paws ahead of the base at the start."""
     front_y: Pair = (0.15, 0.17)
-    """[m] Distance of the front paws to either side."""
+    """[m] Distance of the front paws to either side of the base at the start."""
     back_x: Pair = (0.20, 0.22)
-    """[m] Distance of the back paws behind the base."""
+    """[m] Distance of the back paws behind the base at the start."""
     back_y: Pair = (0.20, 0.22)
-    """[m] Distance of the back paws to either side."""
+    """[m] Distance of the back paws to either side of the base at the start."""
     takeoff_height: Pair = (0.40, 0.45)
-    """[m] Height of the base at takeoff."""
+    """[m] Height of the base at takeoff in starts in flight or during the push."""
     takeoff_ahead: Pair = (0.0, 0.0)
-    """[m] Distance of the base at takeoff from its start, towards the goal."""
+    """[m] Distance of the takeoff point from the start, towards the goal, in starts in flight or during the push."""
     takeoff_pitch: Pair = (0.0, 0.0)
-    """[deg] Mean pitch, nose down, in flight and while pushing off."""
+    """[deg] Mean pitch of the base (nose down) in starts in flight or during the push."""
     push_length: Pair = (0.0, 0.4)
-    """[m] Distance of a pushing base from its takeoff point, along a straight line."""
+    """[m] Distance of the base from its takeoff point, along a straight line, in starts during the push."""
     push_acceleration: Pair = (10.0, 20.0)
-    """[m/s^2] Acceleration along this line."""
+    """[m/s^2] Acceleration of the base towards its takeoff point in starts during the push."""
     takeoff_angle: Pair = (50.0, 75.0)
     """[deg] Takeoff direction above the horizontal, for goals without an apex height."""
     highest_apex: float = 1.0
-    """[m] Largest apex height of the base with a sampled takeoff angle."""
+    """[m] Largest apex height of the base where the takeoff angle is sampled."""
     landing_height: float = 0.42
-    """[m] Height of the base at the end of the ballistic flight."""
+    """[m] Height of the base at the end of the sampled ballistic flight."""
     flight_time: Pair = (0.01, 0.95)
     """[1] Fraction of the flight time that has passed in in-flight starts."""
     flight_lateral: float = 10.0
-    """[deg] Half width of lateral motor angles in flight."""
+    """[deg] Largest lateral motor angle to either side in in-flight starts."""
     flight_transversal: Pair = (0.0, 90.0)
-    """[deg] Outer and inner motor angles in flight."""
+    """[deg] Outer and inner motor angles in in-flight starts."""
     touchdown_time: Pair = (0.03, 0.15)
-    """[s] Time before landing of touchdown starts."""
+    """[s] Time from a touchdown start to the landing."""
     touchdown_behind: Pair = (0.0, 0.0)
     """[m] Distance of the base behind the ballistic path in touchdown starts, so that the paws are ahead of it."""
     paw_depth: Pair = (0.30, 0.45)
@@ -179,20 +179,20 @@ class ResetCfg:
     landed_ahead: Pair = (0.0, 0.0)
     """[m] Distance of the base ahead of the goal in after-landing starts."""
     landed_speed: Pair = (0.0, 1.0)
-    """[m/s] Downward speed in after-landing starts."""
+    """[m/s] Downward speed of the base in after-landing starts."""
     ground: GroundCfg = field(default_factory=GroundCfg)
-    """Sampled platforms and blocks of standing starts."""
+    """Platforms and blocks that standing starts sample."""
     command_delay: float = 0.5
     """[s] Longest time from reset to the command to jump."""
     long_wait_probability: float = 0.0
-    """[1] Probability of `long_wait` in place of `command_delay`; policies learn to wait; most episodes are short."""
+    """[1] Probability that `long_wait` replaces `command_delay`, so that policies learn to wait in a few episodes."""
     long_wait: float = 2.5
-    """[s] Longest time to the command in such episodes."""
+    """[s] Longest time from reset to the command to jump in episodes with a long wait."""
     next_jump_delay: Pair = (0.2, 0.7)
-    """[s] Time from touchdown to the next goal."""
+    """[s] Time from touchdown to the command of the next goal."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: a pair is reversed, a number not finite or out of range."""
+        """Raise InputError if a pair is reversed, or a number is not finite or out of range."""
         positive = ("command_delay", "long_wait", "next_jump_delay", "lean", "push_length", "push_acceleration")
         check_ranges("reset", self, skip=("start_probability", "ground", "balance_by"), not_negative=positive)
         check_probabilities("reset", self, "long_wait_probability")
@@ -200,7 +200,7 @@ class ResetCfg:
             raise InputError(f"reset balance_by must be resets or steps, got {self.balance_by!r:.40}")
 
     struct = JumpSettings
-    """Kernels' struct that `values` returns."""
+    """Type of the kernel struct that `values` returns."""
 
     def values(self, step_dt: float) -> Any:
         """Return the kernels' `JumpSettings`: angles in radians, delays in policy steps of step_dt [s]."""

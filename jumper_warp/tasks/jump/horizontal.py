@@ -1,7 +1,7 @@
-"""The horizontal jump: one jump to a goal position in the plane, and standing there.
+"""Horizontal jump: one jump to a goal position in the plane, then standing there.
 
-Forms and constants are the paper's and its authors' training configuration; `docs/tasks.md` lists all differences,
-their reasons and how to undo them.
+Terms and constants are those of the paper and of its authors' training configuration. `docs/tasks.md` lists all
+differences, their reasons and how to undo them.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ REWARDS = (
 
 TERMINATIONS = (
     TerminationTerm(terminations.landed_for, name="success", steps=1.0 * SECOND, time_out=True, success=True),
-    TerminationTerm(mdp_terminations.came_apart),
+    TerminationTerm(mdp_terminations.diverged),
     TerminationTerm(terminations.early_takeoff),
     TerminationTerm(terminations.predicted_miss, tolerance=0.55, steps=0.1 * SECOND, height=LANDING_HEIGHT),
     TerminationTerm(terminations.missed_goal, tolerance=0.50),
@@ -88,12 +88,12 @@ RESET = ResetCfg(
 
 
 def level(x: tuple[float, float], y: float, next_jump_probability: float = NEXT_JUMP_PROBABILITY) -> Level:
-    """Return a level with goals x = (lower, upper) [m] ahead and up to y [m] to either side, and the first starts."""
+    """Return a level with goals x = (lower, upper) [m] ahead and up to y [m] to either side, from `STARTS[0]`."""
     return Level((x[0], -y, 0.0), (x[1], y, 0.0), STARTS[0], next_jump_probability)
 
 
 def level_all_around(ahead: float, aside: float, back: float) -> Level:
-    """Return a level with goals in an ellipse with these half axes [m] ahead, to either side and back."""
+    """Return a level with goals in an ellipse; arguments: its half axes [m] ahead, to either side and back."""
     return Level((-back, -aside, 0.0), (ahead, aside, 0.0), STARTS[0], NEXT_JUMP_PROBABILITY, elliptical=True)
 
 

@@ -1,9 +1,10 @@
 """Jumps on Mars: 3.71 m/s^2, 24.8 N m and a transversal kp of 20 N m/rad, as in the authors' sequel, without springs.
 
-The open-loop jump reaches 2.96 m with the filter of the jumps on Earth and 3.70 m with the loose one: each has a task.
-Weights of the vertical jump are the sequel's, except for the angular velocity, since flights take up to 2.7 s. The
-sequel's levels start at 1.8 m; these start lower, have smaller steps, and all include low jumps. Limits on impacts are
-those on Earth, since they protect the same robot. Limits on misses grow by the factor FARTHER, as a takeoff error does.
+The open-loop jump reaches 2.96 m with the filter of the jumps on Earth and 3.70 m with the loose filter. Each filter
+has a task. Weights of the vertical jump are the sequel's, except for the angular velocity, since flights take up to
+2.7 s. The sequel's levels start at 1.8 m; these start lower, have smaller steps, and all include low jumps. Limits on
+impacts are those on Earth, since the robot is the same. Limits on landing errors grow by the factor FARTHER, like the
+effect of a takeoff error.
 """
 
 from __future__ import annotations

@@ -26,7 +26,7 @@ EPISODE = (
     ObservationTerm(jump.way),
     ObservationTerm(obs.paw_forces),
 )
-"""State of the jump that only a simulation knows, for critics."""
+"""Observation terms of the jump's progress, which only a simulation can measure, for critics."""
 
 
 def critic(policy: tuple[ObservationTerm, ...], *extra: ObservationTerm) -> tuple[ObservationTerm, ...]:

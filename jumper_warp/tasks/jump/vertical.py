@@ -1,7 +1,7 @@
-"""The vertical jump: reach a commanded base height, and land.
+"""Vertical jump: reach a commanded base height, then land.
 
-Forms and constants are the paper's and its authors' training configuration; `docs/tasks.md` lists all differences,
-their reasons and how to undo them.
+Terms and constants are those of the paper and of its authors' training configuration. `docs/tasks.md` lists all
+differences, their reasons and how to undo them.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from jumper_warp.tasks.observations import remembered
 from jumper_warp.tasks.terms import Advance, Curriculum, RewardTerm, TerminationTerm
 from jumper_warp.tasks.units import DEG, SECOND, G
 
-WAITING_SCALE = 0.1  # [1] factor of the always-paid terms from the jump command to the takeoff
+WAITING_SCALE = 0.1  # [1] factor on the terms of all phases from the jump command to the takeoff
 TAKEOFF_SPEED = 0.75  # [m/s] smallest upward speed of a takeoff; a second takeoff ends the episode
 
 QUIET = (
@@ -26,7 +26,7 @@ QUIET = (
     RewardTerm(rewards.torque_ripple, -0.01),
     RewardTerm(rewards.force_ripple, -5.0, weight_force=14.5 * G),
 )
-"""Penalties of restless standing, before the command and after the landing."""
+"""Penalties of motion while standing before the command and after the landing."""
 
 REWARDS = (
     RewardTerm(rewards.jump_height, 40.0, std_fine=0.10, scale_sharp=0.05, std_wide=0.4, scale_by_dt=False),
@@ -55,7 +55,7 @@ REWARDS = (
 
 TERMINATIONS = (
     TerminationTerm(terminations.landed_for, name="success", steps=1.0 * SECOND, time_out=True, success=True),
-    TerminationTerm(mdp_terminations.came_apart),
+    TerminationTerm(mdp_terminations.diverged),
     TerminationTerm(terminations.early_takeoff),
     TerminationTerm(terminations.wrong_height, tolerance=0.10),
     TerminationTerm(terminations.low_touchdown, height=0.20),

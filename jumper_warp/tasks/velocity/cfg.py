@@ -21,14 +21,15 @@ Reach = tuple[float, float, float, float]  # largest speeds: ahead, back, sidewa
 
 @dataclass(frozen=True)
 class CommandCfg:
-    """Ranges of sampled commands. A range is (ahead, back, to either side [m/s], turning to either side [rad/s])."""
+    """Ranges of sampled velocity commands: (ahead, back, to either side [m/s], turning to either side [rad/s])."""
 
     first_range: Reach = (0.8, 0.8, 0.8, 0.8)
-    """Range at the first level."""
+    """Command range at the first curriculum level: largest speeds ahead, back, sideways [m/s] and turning [rad/s]."""
     last_range: Reach = (2.2, 1.6, 1.0, 1.4)
-    """Range at the last level. Above the first level, a fast command along x limits the sideways and turning speeds."""
+    """Command range at the last curriculum level, as `first_range`. Above the first level, a fast command along x
+    limits the sideways and turning speeds."""
     levels: int = 10
-    """Number of steps from the first level to the last; 0: first level only."""
+    """Number of curriculum steps from the first level to the last; 0: first level only."""
     first_range_probability: float = 0.5
     """[1] Probability of a command from `first_range` at higher levels."""
     standing_probability: float = 0.12
@@ -39,10 +40,10 @@ class CommandCfg:
     """[s] Time from one command to the next."""
 
     struct = CommandRanges
-    """Kernels' struct that `values` returns."""
+    """Type of the kernel struct that `values` returns."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: a range shrinks or is not positive, or a count, time or probability is out of range."""
+        """Raise InputError if a range shrinks or is not positive, or a count, time or probability is out of range."""
         check_finite("command reach", *self.first_range, *self.last_range)
         if not all(0.0 < low <= high for low, high in zip(self.first_range, self.last_range, strict=True)):
             raise InputError(f"command ranges must be positive and grow, got {self.first_range}, {self.last_range}")
@@ -76,39 +77,39 @@ class VelocityResetCfg:
     default_pose_probability: float = 0.1
     """[1] Probability of a start in the default pose at rest."""
     base_xy: float = 0.1
-    """[m] Half width of the base's x and y."""
+    """[m] Largest offset of the base along x and y at the start."""
     height: Pair = (0.30, 0.50)
-    """[m] Height of the base above the ground."""
+    """[m] Height of the base above the ground at the start."""
     tilt: float = 5.0
-    """[deg] Half width of roll and pitch."""
+    """[deg] Largest roll and pitch to either side at the start."""
     heading: float = 180.0
-    """[deg] Half width of the heading."""
+    """[deg] Largest heading to either side at the start."""
     front_x: Pair = (0.12, 0.32)
-    """[m] Distance of the front paws ahead of the base."""
+    """[m] Distance of the front paws ahead of the base at the start."""
     front_y: Pair = (0.12, 0.24)
-    """[m] Distance of the front paws to either side."""
+    """[m] Distance of the front paws to either side of the base at the start."""
     back_x: Pair = (0.12, 0.32)
-    """[m] Distance of the back paws behind the base."""
+    """[m] Distance of the back paws behind the base at the start."""
     back_y: Pair = (0.16, 0.28)
-    """[m] Distance of the back paws to either side."""
+    """[m] Distance of the back paws to either side of the base at the start."""
     max_swing_height: float = 0.10
-    """[m] Largest height of paws in the air."""
+    """[m] Largest height of a paw that is in the air at the start."""
     swing_probability: float = 0.3
-    """[1] Probability of each paw being in the air."""
+    """[1] Probability that a paw is in the air at the start."""
     lin_vel: float = 0.5
-    """[m/s] Half width of the base's velocity along x and y; along z it is 0.3 times as wide."""
+    """[m/s] Largest speed of the base along x and y at the start; along z it is 0.3 times as large."""
     ang_vel: float = 0.5
-    """[rad/s] Half width of the base's angular velocity about each axis."""
+    """[rad/s] Largest angular velocity of the base about each axis at the start."""
     tolerance: float = 0.18
-    """[m/s] Largest mean error of an episode that raises the levels: velocity error plus 0.3 m times yaw rate error."""
+    """[m/s] Largest mean error of an episode that raises the level: velocity error plus 0.3 m times yaw rate error."""
     terrain: TerrainCfg = field(default_factory=TerrainCfg.none)
     """Terrain map on which episodes start."""
 
     struct = VelocitySettings
-    """Kernels' struct that `values` returns."""
+    """Type of the kernel struct that `values` returns."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: a pair is reversed, a number not finite or out of range."""
+        """Raise InputError if a pair is reversed, or a number is not finite or out of range."""
         check_ranges("reset", self, skip=("terrain",), not_negative=vars(self))
         check_probabilities("reset", self, "default_pose_probability", "swing_probability")
 

@@ -1,12 +1,12 @@
 """Velocity tracking on a plane: walk ahead, back and sideways, and turn, as commanded.
 
-Forms and constants are the paper's and its authors' training configuration, except: tracking terms have second, narrow
-kernels, since the wide ones are flat at errors of a few cm/s. Air time has sixteen times the weight, which makes the
-robot trot without short quick steps. Rapid stepping grows linearly, since the clamped exponential has no slope at the
-start of training. Swing height, slip and touchdown speed have terms. Torques, joint accelerations and changes of the
-action are penalised (the configuration lists these weights but sets them to 0), as are second differences of the
-action, which distinguish chatter from walking. Commands are resampled every few seconds, so that policies learn
-transients, and their range grows with the tracking score.
+Terms and constants are those of the paper and of its authors' training configuration, with these exceptions. Tracking
+terms have second, narrow kernels, since the wide ones are flat at errors of a few cm/s. Air time has sixteen times the
+weight, which makes the robot trot without short quick steps. The penalty of rapid stepping grows linearly, since the
+clamped exponential has no slope at the start of training. Swing height, slip and touchdown speed have terms. Torques,
+joint accelerations and changes of the action are penalised (the configuration lists these weights but sets them to 0).
+Second differences of the action, which distinguish chatter from walking, are penalised too. Commands are resampled
+every few seconds, so that policies learn transients, and their range grows with the tracking score.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ CRITIC = (
     ObservationTerm(velocity.push),
     *(term for term in DRAWN if term.func is not obs.drawn_push),  # in world axes, whatever the heading
 )
-"""Critic observation: the actor's without noise and delay, plus values that only a simulation has."""
+"""Critic observation: the actor's without noise and delay, plus privileged values."""
 
 REWARDS = (
     RewardTerm(rewards.linear_velocity, 2.5, std=0.5),
@@ -76,7 +76,7 @@ REWARDS = (
 )
 
 TERMINATIONS = (
-    TerminationTerm(mdp_terminations.came_apart),
+    TerminationTerm(mdp_terminations.diverged),
     TerminationTerm(mdp_terminations.collided),
     TerminationTerm(mdp_terminations.tilted, angle=60.0 * DEG),
     TerminationTerm(terminations.finished, time_out=True, success=True),
@@ -120,7 +120,7 @@ def velocity_flat() -> TaskCfg:
 
 
 def velocity_trot() -> TaskCfg:
-    """Return velocity tracking on a plane with an observed 2 Hz gait clock and a reward for trotting in its time."""
+    """Return velocity tracking on a plane with an observed 2 Hz gait clock and a reward for trotting in phase."""
     flat = velocity_flat()
     gait_phase = ObservationTerm(velocity.gait_phase)
     return replace(

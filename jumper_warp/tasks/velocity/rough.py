@@ -1,10 +1,10 @@
 """Velocity tracking on uneven ground, slopes and steps; only the critic observes the ground.
 
 It differs from the task on a plane by a terrain map, slower commands, higher swings and smaller penalties of tilt and
-vertical speed. On the map each world moves to harder tiles as it tracks its commands, and back when it falls. Robots
-fail mostly at steps up, where the shank of a planted paw hits the edge as the base moves on. So lean of a shank over a
-planted paw is penalised, a collision costs a second's reward and ends the episode, and kinds of ground with steps up
-have two columns each.
+vertical speed. A world moves to harder tiles of the map while it tracks its commands, and to easier ones when it falls.
+Robots fail mostly at steps up, where the shank of a planted paw hits the edge as the base moves on. Therefore the lean
+of a shank over a planted paw is penalised, a collision costs a second's reward and ends the episode, and grounds with
+steps up have two columns each.
 """
 
 from __future__ import annotations
@@ -22,13 +22,13 @@ from jumper_warp.tasks.velocity.cfg import CommandCfg
 from jumper_warp.tasks.velocity.flat import WITHOUT_HISTORY, velocity_flat
 
 COMMANDS = CommandCfg(first_range=(0.8, 0.6, 0.4, 0.8), last_range=(0.8, 0.6, 0.4, 0.8), levels=0)
-"""Ranges of commands on the map, one level."""
+"""Ranges of velocity commands on the terrain map, one level."""
 GROUNDS = (*KINDS, "pit", "blocks")  # Kinds of the map's columns; "pit" and "blocks" twice
 STEPS_UP = (
     RewardTerm(rewards.shank_lean, -5.0, threshold=35.0 * DEG, hip=0.045, thigh=0.175, shank=0.3),
     RewardTerm(mdp_rewards.collision, -4.0, scale_by_dt=False),
 )
-"""Penalties of shanks near edges of steps. They need `reward_floor=None`, or a collision would cost nothing."""
+"""Penalties against shanks hitting edges of steps. They need `reward_floor=None`, or a collision would cost nothing."""
 
 
 def velocity_rough() -> TaskCfg:

@@ -1,6 +1,6 @@
-"""Gradients of `leg_action` and `base_action` (`virtual_power`), and their constants; for CPU and GPU kernels.
+"""Gradients of the virtual power of a step (`leg_action`, `base_action`), for CPU and GPU kernels.
 
-"Gradient by x" means the partial derivative with respect to x, in the axes and the order of x.
+A gradient w.r.t. x has the axes and the order of x.
 """
 
 import warp as wp
@@ -24,25 +24,25 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class LegGradient:
-    """Gradient of `leg_action` by its arguments; the caller sums those by base and gravity over legs."""
+    """Gradient of a leg's virtual power (`leg_action`); the caller sums gradients w.r.t. base and gravity over legs."""
 
     geometry: LegGeometry
     masses: LegMasses
     joints: JointParams
     spring: LegSpring
     stops: StopParams
-    mu: real  # by the friction coefficient
-    pos: vec3  # by the base's position, orientation and angular velocity (body axes)
+    mu: real  # w.r.t. the friction coefficient
+    pos: vec3  # w.r.t. the base's position, orientation and angular velocity (body axes)
     quat: quat
     omega: vec3
-    gravity: vec3  # by gravity in body axes
-    angles: vec3  # by the motors' angles and rates at the start of the step
+    gravity: vec3  # w.r.t. gravity in body axes
+    angles: vec3  # w.r.t. the motors' angles and rates at the start of the step
     rates: vec3
 
 
 @wp.struct
 class BaseGradient:
-    """Gradient of `base_action` by each of its arguments, axes as there."""
+    """Gradient of the base's virtual power (`base_action`) w.r.t. each of its arguments, in the same axes."""
 
     body: MassMoments
     com: vec3
@@ -56,7 +56,7 @@ class BaseGradient:
 
 @wp.func
 def make_base_factors(base: BaseState, end: BaseState, virtual_lin: vec3, virtual_ang: vec3, dt: real) -> BaseFactors:
-    """Return the base's constants in a step dt [s] from `base` to `end`; virtual_*: see `BaseFactors`, body axes."""
+    """Return the `BaseFactors` of a step dt [s] from state `base` to `end`; virtual_*: multipliers, body axes."""
     factors = BaseFactors()
     factors.virtual_lin = virtual_lin
     factors.virtual_ang = virtual_ang
@@ -91,7 +91,7 @@ def leg_action_gradient(
     model: RobotModel, params: LegParams, world: int, leg: int, mu: real, base: BaseState, angles: vec3, rates: vec3,
     base_held: BaseFactors, leg_held: LegFactors, dt: real,
 ) -> LegGradient:  # fmt: skip
-    """Return the gradient of `leg_action` of leg 0 to 3 in a step dt [s]; mu: friction coefficient.
+    """Return the gradient of the virtual power (`leg_action`) of leg 0 to 3 in a step dt [s]; mu: friction coefficient.
 
     base, angles [rad], rates [rad/s]: at the start of the step. base_held, leg_held: constants of the differentiation.
     """
@@ -125,7 +125,7 @@ def base_action_gradient(
     model: RobotModel, world: int, force: vec3, moment: vec3, base: BaseState, held: BaseFactors,
     cotangent: BaseCotangent, dt: real,
 ) -> BaseGradient:  # fmt: skip
-    """Return the gradient of `base_action` in a step dt [s]; held, cotangent: constants of the differentiation.
+    """Return the gradient of the base's virtual power (`base_action`) in a step dt [s]; held, cotangent: constants.
 
     force [N], moment [N m]: at the com, world axes. base: at the start of the step.
     """

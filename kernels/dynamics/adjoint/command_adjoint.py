@@ -1,4 +1,4 @@
-"""Reverse pass of motors, latency and command filter: from gradients by torques to those by targets and constants.
+"""Reverse pass of motors, latency and command filter: gradients w.r.t. targets and constants from those of torques.
 
 Motors are 0 to 11 (legs FL, FR, BL, BR; each lateral, outer, inner).
 """
@@ -18,28 +18,28 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class MotorAdjoint:
-    """Derivatives of a motor's torque."""
+    """Derivatives of a motor's torque w.r.t. its target, joint state, constants and latency."""
 
-    target: real  # [N m/rad] by the target that it follows
-    angle: real  # [N m/rad] by the joint angle
-    rate: real  # [N m s/rad] by the joint rate
+    target: real  # [N m/rad] w.r.t. the target that it follows
+    angle: real  # [N m/rad] w.r.t. the joint angle
+    rate: real  # [N m s/rad] w.r.t. the joint rate
     constants: MotorParams  # [N m] per unit of each constant
-    latency: real  # [N m/s] by the latency
+    latency: real  # [N m/s] w.r.t. the latency
 
 
 @wp.struct
 class FilterAdjoint:
-    """Gradient by the inputs of a leg's command filter; vectors are lateral, outer, inner."""
+    """Gradient w.r.t. the inputs of a leg's command filter; vectors are lateral, outer, inner."""
 
-    target: vec3  # by the raw targets
-    angles: vec3  # by the measured angles
+    target: vec3  # w.r.t. the raw targets
+    angles: vec3  # w.r.t. the measured angles
     rates: vec3
-    constants: FilterParams  # by each of them
+    constants: FilterParams  # w.r.t. each of them
 
 
 @wp.func
 def add_target(gradients: Gradients, step: int, motor: int, world: int, gradient: real):
-    """Add to the gradient by a motor's filtered target of policy step `step`, or for step -1 by its initial target."""
+    """Add to the gradient w.r.t. a motor's filtered target of policy step `step` (-1: its initial target)."""
     if step < 0:
         # atomic to avoid a load: no other thread writes here
         wp.atomic_add(gradients.initial_target, motor, world, gradient)
@@ -76,7 +76,7 @@ def motor_gradient(
 
 @wp.func
 def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, gradient: real):
-    """Add the gradient by the mean target that a motor follows to those by the two policy targets of the mean."""
+    """Add the gradient w.r.t. a motor's interpolated target to those w.r.t. the two policy targets around it."""
     add_target(gradients, arrived.newer, motor, world, arrived.weight * gradient)
     if arrived.newer > arrived.older:
         add_target(gradients, arrived.older, motor, world, (real(1.0) - arrived.weight) * gradient)
@@ -84,9 +84,9 @@ def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, 
 
 @wp.func
 def add_motor_constants(sums: Any, shared: Any, motor: int, cotangent: real, adjoint: MotorAdjoint):
-    """Add cotangent times the derivatives by a motor's constants to `sums`, and that by the latency to `shared`.
+    """Add cotangent times the derivatives w.r.t. a motor's constants to `sums`, and w.r.t. the latency to `shared`.
 
-    cotangent: gradient by the motor's torque. sums, shared: rows of GRADIENT_ROWS, see `add_entry`.
+    cotangent: gradient w.r.t. the motor's torque. sums, shared: rows of GRADIENT_ROWS, see `add_entry`.
     """
     add_motor(sums, shared, motor, cotangent, adjoint.constants)
     add_entry(shared, LATENCY_GRADIENT, cotangent * adjoint.latency)
@@ -103,10 +103,10 @@ def filter_gradient(
     commands: Commands, actuation: Actuation, step: int, leg: int, world: int, angles: vec3, rates: vec3,
     gradients: Gradients,
 ) -> FilterAdjoint:  # fmt: skip
-    """Return the gradients by the inputs of a leg's command filter in policy step `step`.
+    """Return the gradients w.r.t. the inputs of a leg's command filter in policy step `step`.
 
-    Reads the gradient by the filtered targets from `gradients`. angles [rad], rates [rad/s]: of the leg's motors at the
-    start of the policy step. Without a filter the gradient passes to the target unchanged.
+    Reads the gradient w.r.t. the filtered targets from `gradients`. angles [rad], rates [rad/s]: of the leg's motors at
+    the start of the policy step. Without a filter the gradient passes to the target unchanged.
     """
     m = 3 * leg
     adjoint = FilterAdjoint()
@@ -128,5 +128,5 @@ def filter_gradient(
 
 @wp.func
 def add_offsets(sums: Any, leg: int, by_angles: vec3):
-    """Add `by_angles`, the gradient by the angles that a leg's filter reads, to that by the sensors' offsets."""
+    """Add `by_angles`, the gradient w.r.t. a leg's measured angles, to that w.r.t. the sensors' offsets."""
     add_vec3(sums, MOTOR_GRADIENT + 72 + 3 * leg, by_angles)

@@ -1,4 +1,4 @@
-"""Gradients of a rollout by constants of legs and motors, for GPUs: all steps in parallel, from the multipliers."""
+"""Gradients of a rollout w.r.t. constants of legs and motors, on GPUs: all steps in parallel, from the multipliers."""
 
 import warp as wp
 
@@ -19,7 +19,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class SpanStep:
-    """Indices of a step of a span, and its weight in the sums of the thread that processes it."""
+    """Indices of a step within a span of rows, and its weight in the sums of the thread that processes it."""
 
     step: int  # of the rollout
     entry: int  # of the record
@@ -59,7 +59,7 @@ def leg_constants_kernel(
     # in, out
     gradients: Gradients,
 ):
-    """Add the gradients of a span's steps by the constants of legs; launch over (worlds, threads_per_leg, 4).
+    """Add the gradients of a span's steps w.r.t. constants of legs; launch over (worlds, threads_per_leg, 4).
 
     threads_per_leg: threads that divide the steps of a leg, 8 on a GPU (a warp per world) and 1 on a CPU. Worlds count
     from `settings.first`.
@@ -100,7 +100,7 @@ def motor_constants_kernel(
     # in, out
     gradients: Gradients,
 ):
-    """Add the gradients of a span's steps by the constants of motors; launch as `leg_constants_kernel`.
+    """Add the gradients of a span's steps w.r.t. constants of motors; launch as `leg_constants_kernel`.
 
     The kernels are separate, because one would need more memory per thread than a GPU's L1 cache holds.
     """

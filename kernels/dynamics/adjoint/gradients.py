@@ -27,7 +27,7 @@ wp.set_module_options({"enable_backward": False})
 # rows of a leg's geometry: hip (3), then the lengths in the order of `LegGeometry`, without `front` and `side`
 GEOMETRY_ROWS = wp.constant(10)
 
-# rows of the gradient by a world's parameters: first the PARAMETER_ROWS of the table of `layout`
+# rows of the gradient w.r.t. a world's parameters: first the PARAMETER_ROWS of the table of `layout`
 MOTOR_GRADIENT = wp.constant(layout.PARAMETER_ROWS)  # 7 x 12: kp, kd, saturation, peak, cutoff, no_load, offset
 FADE_GRADIENT = wp.constant(MOTOR_GRADIENT + 84)  # 2: start and end
 LATENCY_GRADIENT = wp.constant(FADE_GRADIENT + 2)
@@ -38,7 +38,7 @@ GRADIENT_ROWS = wp.constant(GEOMETRY_GRADIENT + 40)
 
 @wp.struct
 class Gradients:
-    """Gradient of one scalar per world by all inputs of a rollout; units: the scalar's per the input's."""
+    """Gradient of one scalar per world w.r.t. all inputs of a rollout; units: the scalar's over the input's."""
 
     q: wp.array2d(dtype=real)  # of row 0, (ROW_COORDS, num_worlds)
     qd: wp.array2d(dtype=real)  # (ROW_RATES, num_worlds)
@@ -51,7 +51,7 @@ class Gradients:
 
 @wp.struct
 class ThreadSums:
-    """Destination of a thread's gradients by parameters, and the threads of its warp to sum them over first."""
+    """Destination of a thread's gradients w.r.t. parameters, and the threads of its warp to sum them over first."""
 
     parameters: wp.array2d(dtype=real)  # (GRADIENT_ROWS, num_worlds)
     world: int
@@ -76,13 +76,13 @@ def thread_sums(gradients: Gradients, world: int, writes: bool, over_steps: bool
 
 @wp.func
 def add_entry(sums: wp.array(dtype=real), row: int, x: real):
-    """Add x to a row of an array of one world, (GRADIENT_ROWS,)."""
+    """Add x to a row of the parameter gradient of one world, (GRADIENT_ROWS,)."""
     sums[row] = sums[row] + x
 
 
 @wp.func
 def add_entry(sums: ThreadSums, row: int, x: real):  # noqa: F811
-    """Add x to a row of the world of `sums`, weighted and summed over threads first; one atomic addition."""
+    """Add x, weighted and summed over threads, to a row of a world's parameter gradient; one atomic addition."""
     total = sums.weight * x
     if sums.over_steps:
         total = sum_step_threads(total)
@@ -94,14 +94,14 @@ def add_entry(sums: ThreadSums, row: int, x: real):  # noqa: F811
 
 @wp.func
 def add_vec3(sums: Any, row: int, v: vec3):
-    """Add a vector to three rows, from `row` on."""
+    """Add a vector to three rows of the parameter gradient, from `row` on."""
     for i in range(3):
         add_entry(sums, row + i, v[i])
 
 
 @wp.func
 def add_moments(sums: Any, row: int, m: MassMoments):
-    """Add the gradient by a link's mass moments to MOMENT_ROWS rows, from `row` on."""
+    """Add the gradient w.r.t. a link's mass moments to MOMENT_ROWS rows, from `row` on."""
     add_entry(sums, row, m.mass)
     add_vec3(sums, row + 1, m.first)
     for i in range(6):
@@ -110,7 +110,7 @@ def add_moments(sums: Any, row: int, m: MassMoments):
 
 @wp.func
 def add_masses(sums: Any, leg: int, masses: LegMasses):
-    """Add the gradient by the mass moments of a leg's links."""
+    """Add the gradient w.r.t. the mass moments of a leg's links."""
     row = leg * layout.LEG_ROWS
     add_moments(sums, row + layout.HOUSING, masses.housing)
     add_moments(sums, row + layout.OUTER_THIGH, masses.outer_thigh)
@@ -121,7 +121,7 @@ def add_masses(sums: Any, leg: int, masses: LegMasses):
 
 @wp.func
 def add_joints(sums: Any, leg: int, p: JointParams):
-    """Add the gradient by armature, friction and damping of a leg."""
+    """Add the gradient w.r.t. armature, friction and damping of a leg."""
     row = leg * layout.LEG_ROWS
     add_vec3(sums, row + layout.ARMATURE, p.armature)
     add_vec3(sums, row + layout.FRICTION, p.friction)
@@ -134,7 +134,7 @@ def add_joints(sums: Any, leg: int, p: JointParams):
 
 @wp.func
 def add_spring(sums: Any, leg: int, p: LegSpring):
-    """Add the gradient by the spring of a leg."""
+    """Add the gradient w.r.t. the spring of a leg."""
     row = leg * layout.LEG_ROWS + layout.SPRING
     add_entry(sums, row, p.stiffness)
     add_entry(sums, row + 1, p.length)
@@ -142,7 +142,7 @@ def add_spring(sums: Any, leg: int, p: LegSpring):
 
 @wp.func
 def add_stops(sums: Any, leg: int, p: StopParams):
-    """Add the gradient by the hard stops of a leg."""
+    """Add the gradient w.r.t. the hard stops of a leg."""
     row = leg * layout.LEG_ROWS
     add_vec3(sums, row + layout.LOWER, p.lower)
     add_vec3(sums, row + layout.UPPER, p.upper)
@@ -154,7 +154,7 @@ def add_stops(sums: Any, leg: int, p: StopParams):
 
 @wp.func
 def add_geometry(sums: Any, leg: int, geo: LegGeometry):
-    """Add the gradient by a leg's hip position and lengths."""
+    """Add the gradient w.r.t. a leg's hip position and lengths."""
     row = GEOMETRY_GRADIENT + leg * GEOMETRY_ROWS
     add_vec3(sums, row, geo.hip)
     add_entry(sums, row + 3, geo.outer_x)
@@ -168,7 +168,7 @@ def add_geometry(sums: Any, leg: int, geo: LegGeometry):
 
 @wp.func
 def add_leg_parameters(sums: Any, leg: int, gradient: LegGradient):
-    """Add the gradient by all parameters of a leg except its friction coefficients."""
+    """Add the gradient w.r.t. all parameters of a leg except its friction coefficients."""
     add_geometry(sums, leg, gradient.geometry)
     add_masses(sums, leg, gradient.masses)
     add_joints(sums, leg, gradient.joints)
@@ -178,14 +178,14 @@ def add_leg_parameters(sums: Any, leg: int, gradient: LegGradient):
 
 @wp.func
 def add_com(sums: Any, mass: real, com: vec3, gradient: vec3):
-    """Add `gradient` by the base's centre of mass com [m] to those by its mass [kg] and first moment mass * com."""
+    """Add `gradient`, w.r.t. the base's com [m], to those w.r.t. its mass [kg] and first moment mass * com."""
     add_entry(sums, layout.BASE, -wp.dot(gradient, com) / mass)
     add_vec3(sums, layout.BASE + 1, gradient / mass)
 
 
 @wp.func
 def add_motor(sums: Any, shared: Any, motor: int, scale: real, p: MotorParams):
-    """Add scale times the gradient p by a motor's constants to `sums`; fade_start and fade_end go to `shared`."""
+    """Add scale times the gradient p w.r.t. a motor's constants to `sums`; fade_start and fade_end go to `shared`."""
     row = MOTOR_GRADIENT + motor
     add_entry(sums, row, scale * p.kp)
     add_entry(sums, row + 12, scale * p.kd)
@@ -200,14 +200,14 @@ def add_motor(sums: Any, shared: Any, motor: int, scale: real, p: MotorParams):
 
 @wp.func
 def add_limits(sums: Any, row: int, limits: Limits):
-    """Add the gradient by the limits of one quantity; the gradient by its hard zones, mere switches, is 0."""
+    """Add the gradient w.r.t. the limits of one quantity; that w.r.t. its hard zones, which only switch, is 0."""
     add_entry(sums, row, limits.lower)
     add_entry(sums, row + 1, limits.upper)
 
 
 @wp.func
 def add_filter(sums: Any, p: FilterParams):
-    """Add the gradient by the constants of the command filter."""
+    """Add the gradient w.r.t. the constants of the command filter."""
     add_limits(sums, FILTER_GRADIENT, p.lateral)
     add_limits(sums, FILTER_GRADIENT + 4, p.transversal)
     add_limits(sums, FILTER_GRADIENT + 8, p.sum)

@@ -1,8 +1,8 @@
-"""`step_adjoint` for GPUs, with a thread per leg; each of a world's four threads also computes the base's part.
+"""Reverse pass of a time step on GPUs, with a thread per leg; all four threads of a world compute the base's part.
 
 1. `replay_leg` recomputes the motion and inverts the system of the contact laws' multipliers, many steps in parallel.
 2. `reverse_leg` goes backwards from step to step and records multipliers.
-3. `add_leg_constants` adds the gradients by parameters, computed from these, many steps in parallel.
+3. `add_leg_constants` adds the gradients w.r.t. parameters, computed from these, many steps in parallel.
 """
 
 import warp as wp
@@ -31,22 +31,22 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class LegAdjoint:
-    """Gradient by a world's state and inputs, the part of one leg's thread; axes and order as those of the value."""
+    """Gradient w.r.t. a world's state and inputs, the part of one leg's thread; axes and order as in the value."""
 
-    base: BaseState  # by the base's state at the start of the step
-    angles: vec3  # by the motors' angles at the start of the step: lateral, outer, inner
-    rates: vec3  # by the motors' rates at the start of the step
-    torque: vec3  # by the motors' torques in the step
-    force: vec3  # by the wrench on the base at its com, world axes; summed over steps as are the next four
+    base: BaseState  # w.r.t. the base's state at the start of the step
+    angles: vec3  # w.r.t. the motors' angles at the start of the step: lateral, outer, inner
+    rates: vec3  # w.r.t. the motors' rates at the start of the step
+    torque: vec3  # w.r.t. the motors' torques in the step
+    force: vec3  # w.r.t. the wrench on the base at its com, world axes; summed over steps as are the next four
     moment: vec3
-    body: MassMoments  # by the base link's mass moments
-    com: vec3  # by the base's centre of mass
-    gravity: vec3  # by gravity, world axes
+    body: MassMoments  # w.r.t. the base link's mass moments
+    com: vec3  # w.r.t. the base's centre of mass
+    gravity: vec3  # w.r.t. gravity, world axes
 
 
 @wp.func
 def leg_law(c: PawContact, law: PawLaw, impulse: vec3, point: vec3) -> LegLaw:
-    """Return the recorded part of a paw's contact law; impulse [N s], point [m] of contact: body axes."""
+    """Return the `LegLaw` of a paw's contact, for the record; impulse [N s], point [m] of contact: body axes."""
     recorded = LegLaw()
     recorded.mode = law.mode
     recorded.mu_row = law.mu_row
@@ -67,7 +67,7 @@ def replay_leg(
 ):  # fmt: skip
     """Recompute a step of the rollout from entry i of the record, and write the state at its end to entry i + 1.
 
-    Entry i gets the inverse of the base's system, the leg's elimination, and its paw's law. force [N], moment [N m]:
+    Entry i stores the inverse of the base's system, the leg's elimination and its paw's law. force [N], moment [N m]:
     on the base at its com, world axes. first_impulse: as `Commands.impulse`. All four threads of a world write the same
     bits for the base; see `replay_step`.
     """
@@ -131,7 +131,7 @@ def any_leg(flag: bool) -> bool:
 
 @wp.func
 def law_block(c: PawContact, law: PawLaw, sent: PawContact, sent_law: PawLaw, leg: int, j: int) -> mat33:
-    """Return block (leg, j) of the matrix A^T of `step_adjoint`; all arguments but j are those of this thread's leg.
+    """Return block (leg, j) of the contact-law matrix A^T (`step_adjoint`); the arguments but j: of this thread's leg.
 
     sent, sent_law: c and law again, of which thread j sends its own to the other threads.
     """
@@ -191,7 +191,7 @@ def inverted_laws(c: PawContact, law: PawLaw, leg: int) -> LawRow:
 
 @wp.func
 def multiplier(row: LawRow, impulse_cotangent: vec3) -> vec3:
-    """Return the multiplier l of the law of this thread's paw; impulse_cotangent: gradient by the paw's impulse.
+    """Return the multiplier l of the law of this thread's paw; impulse_cotangent: gradient w.r.t. the paw's impulse.
 
     row: see `inverted_laws`. Threads of separated paws must pass 0.
     """
@@ -201,7 +201,7 @@ def multiplier(row: LawRow, impulse_cotangent: vec3) -> vec3:
 
 @wp.func
 def base_factors(record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights) -> BaseFactors:
-    """Return the base's constants in the step dt [s] at entry i of the record; base: state at its start."""
+    """Return the `BaseFactors` of the step dt [s] at entry i of the record; base: state at its start."""
     return make_base_factors(base, leg_record.get_base(record, i + 1, world), weights.lin, weights.ang, dt)
 
 
@@ -210,7 +210,7 @@ def leg_factors(
     record: LegRecord, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, world: int, step: int, i: int,
     leg: int, dt: real, law: LegLaw, weights: LegWeights,
 ) -> LegFactors:  # fmt: skip
-    """Return a leg's constants in step `step` of the rollout, of dt [s], whose entry in the record is i."""
+    """Return a leg's `LegFactors` in step `step` of the rollout, of dt [s], whose entry in the record is i."""
     push = vec3(real(0.0))
     if cotangent.impulse.shape[0] > 0:
         push = cotangent.impulse[step, leg, world]
@@ -222,13 +222,13 @@ def leg_factors(
 
 @wp.struct
 class StepWeights:
-    """Multipliers of a step's equations, and the gradients by the velocities at its start that follow from them."""
+    """Multipliers of a step's equations, and the gradients w.r.t. the velocities at its start that follow from them."""
 
     base: BaseWeights
     leg: LegWeights
-    lin: vec3  # by the base's linear velocity, body axes
-    ang: vec3  # by its angular velocity
-    rates: vec3  # by the motors' rates
+    lin: vec3  # w.r.t. the base's linear velocity, body axes
+    ang: vec3  # w.r.t. its angular velocity
+    rates: vec3  # w.r.t. the motors' rates
 
 
 @wp.func
@@ -236,10 +236,10 @@ def find_weights(
     record: LegRecord, world: int, leg: int, cotangent: TrajectoryArrays, step: int, i: int, base: BaseState,
     law: LegLaw, lin_cotangent: vec3, ang_cotangent: vec3, rate_cotangent: vec3,
 ) -> StepWeights:  # fmt: skip
-    """Return the multipliers of a step, given the gradients by the velocities at its end; see `find_multipliers`.
+    """Return the multipliers of a step, given the gradients w.r.t. the velocities at its end; see `find_multipliers`.
 
-    lin_cotangent, ang_cotangent: by the base's velocities, in the body axes of the step's start; rate_cotangent: by the
-    motors' rates. i: the step's entry in the record.
+    lin_cotangent, ang_cotangent: w.r.t. the base's velocities, in the body axes of the step's start. rate_cotangent:
+    w.r.t. the motors' rates. i: the step's entry in the record.
     """
     inverse = leg_record.get_inverse(record, i, world)
     solve = leg_record.get_solve(record, i, world, leg)
@@ -283,7 +283,7 @@ def reverse_leg(
     trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, step: int, i: int, record: LegRecord, adj: LegAdjoint,
     writes_record: bool,
 ) -> LegAdjoint:  # fmt: skip
-    """Return the gradient by the state at the start of a step, given `adj`, that by the state at its end.
+    """Return the gradient w.r.t. the state at the start of a step; adj: gradient w.r.t. the state at its end.
 
     See `reverse_step`. i: the step's entry in the record, step: its number in the rollout. force [N], moment [N m]: on
     the base at its com, world axes. writes_record: whether this thread writes the step's multipliers to the record.
@@ -331,7 +331,7 @@ def reverse_leg(
 
 @wp.func
 def add_leg_constants(sums: ThreadSums, leg: int, law: LegLaw, gradient: LegGradient):
-    """Add the gradient of a step by the parameters of a leg, friction coefficients included."""
+    """Add the gradient of a step w.r.t. the parameters of a leg, friction coefficients included."""
     add_leg_parameters(sums, leg, gradient)
     for row in range(2):  # the step depends on one of the two coefficients
         mu_row = leg * LEG_ROWS + wp.where(row == 0, int(MU_STATIC), int(MU_DYNAMIC))

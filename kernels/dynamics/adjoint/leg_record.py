@@ -32,13 +32,13 @@ LEG_WEIGHTS = wp.constant(45)  # 2 x 3: `LegWeights`
 PUSH = wp.constant(51)  # 2 x 3: `LegLaw.impulse`, `LegLaw.point`
 PAW = wp.constant(57)  # 4 x 9: `LegLaw.jacobian`, `to_lin`, `to_ang`, `by_velocity`
 LAWS = wp.constant(93)  # 4 x 9: `LawRow`
-FILTER = wp.constant(129)  # gradient by the angles that the filter reads, where a policy step begins
+FILTER = wp.constant(129)  # gradient w.r.t. the angles that the filter reads, where a policy step begins
 LEG_FIELDS = wp.constant(132)
 
 
 @wp.struct
 class LegRecord:
-    """Entries of successive steps, and a last entry for the state at the end of the last step."""
+    """Record of successive steps, one entry each, and a last entry for the state at the end of the last step."""
 
     base: wp.array3d(dtype=real)  # (entries, BASE_FIELDS, num_worlds)
     legs: wp.array4d(dtype=real)  # (entries, LEG_FIELDS, num_worlds, 4)
@@ -72,7 +72,7 @@ class MotorSlopes:
 
 @wp.struct
 class LegLaw:
-    """A paw's contact law at the solution."""
+    """Contact law of a paw at the solution of a step."""
 
     mode: int  # SEPARATE, STICK or SLIDE
     mu_row: int  # row of the friction coefficient in the parameter table
@@ -82,12 +82,12 @@ class LegLaw:
     jacobian: mat33  # contact velocity per motor rate [m/rad]
     to_lin: mat33  # change of the base's linear velocity per impulse [1/kg]
     to_ang: mat33  # change of its angular velocity per impulse [1/(kg m)]
-    by_velocity: mat33  # derivative of the law by the contact velocity, see `contact_laws.PawLaw`
+    by_velocity: mat33  # derivative of the law w.r.t. the contact velocity, see `contact_laws.PawLaw`
 
 
 @wp.struct
 class LawRow:
-    """A paw's row of the inverse of A^T (12x12) of `step_adjoint`: a 3x3 block per paw."""
+    """Row of a paw in the inverse of the contact-law matrix A^T (12x12, `step_adjoint`): a 3x3 block per paw."""
 
     a: mat33  # FL
     b: mat33  # FR
@@ -97,7 +97,7 @@ class LawRow:
 
 @wp.func
 def get_vec(record: LegRecord, entry: int, field: int, world: int, leg: int) -> vec3:
-    """Return three fields of a leg, from `field` on."""
+    """Return three recorded fields of a leg, from `field` on."""
     return vec3(
         record.legs[entry, field, world, leg],
         record.legs[entry, field + 1, world, leg],
@@ -107,14 +107,14 @@ def get_vec(record: LegRecord, entry: int, field: int, world: int, leg: int) -> 
 
 @wp.func
 def put_vec(record: LegRecord, entry: int, field: int, world: int, leg: int, v: vec3):
-    """Write three fields of a leg, from `field` on."""
+    """Write three fields of a leg to the record, from `field` on."""
     for i in range(3):
         record.legs[entry, field + i, world, leg] = v[i]
 
 
 @wp.func
 def get_mat(record: LegRecord, entry: int, field: int, world: int, leg: int) -> mat33:
-    """Return nine fields of a leg, from `field` on, as a matrix (row by row)."""
+    """Return nine recorded fields of a leg, from `field` on, as a matrix (row by row)."""
     return wp.matrix_from_rows(
         get_vec(record, entry, field, world, leg),
         get_vec(record, entry, field + 3, world, leg),
@@ -124,7 +124,7 @@ def get_mat(record: LegRecord, entry: int, field: int, world: int, leg: int) -> 
 
 @wp.func
 def put_mat(record: LegRecord, entry: int, field: int, world: int, leg: int, m: mat33):
-    """Write a matrix row by row to nine fields of a leg, from `field` on."""
+    """Write a matrix row by row to nine recorded fields of a leg, from `field` on."""
     for i in range(3):
         for j in range(3):
             record.legs[entry, field + 3 * i + j, world, leg] = m[i, j]
@@ -132,7 +132,7 @@ def put_mat(record: LegRecord, entry: int, field: int, world: int, leg: int, m: 
 
 @wp.func
 def get_base_mat(record: LegRecord, entry: int, field: int, world: int) -> mat33:
-    """Return nine fields of the base, from `field` on, as a matrix (row by row)."""
+    """Return nine recorded fields of the base, from `field` on, as a matrix (row by row)."""
     return wp.matrix_from_rows(
         row_vec3(record.base, entry, field, world),
         row_vec3(record.base, entry, field + 3, world),
@@ -142,7 +142,7 @@ def get_base_mat(record: LegRecord, entry: int, field: int, world: int) -> mat33
 
 @wp.func
 def put_base_mat(record: LegRecord, entry: int, field: int, world: int, m: mat33):
-    """Write a matrix row by row to nine fields of the base, from `field` on."""
+    """Write a matrix row by row to nine recorded fields of the base, from `field` on."""
     for i in range(3):
         for j in range(3):
             record.base[entry, field + 3 * i + j, world] = m[i, j]
@@ -150,7 +150,7 @@ def put_base_mat(record: LegRecord, entry: int, field: int, world: int, m: mat33
 
 @wp.func
 def get_base(record: LegRecord, entry: int, world: int) -> BaseState:
-    """Return the base's state at the start of the step."""
+    """Return the recorded state of the base at the start of a step."""
     base = BaseState()
     base.pos = row_vec3(record.base, entry, 0, world)
     base.quat = row_quat(record.base, entry, 3, world)
@@ -161,7 +161,7 @@ def get_base(record: LegRecord, entry: int, world: int) -> BaseState:
 
 @wp.func
 def put_base(record: LegRecord, entry: int, world: int, base: BaseState):
-    """Write the base's state at the start of the step."""
+    """Write the base's state at the start of a step to the record."""
     store_row_vec3(record.base, entry, 0, world, base.pos)
     for i in range(4):
         record.base[entry, 3 + i, world] = base.quat[i]
@@ -171,7 +171,7 @@ def put_base(record: LegRecord, entry: int, world: int, base: BaseState):
 
 @wp.func
 def get_inverse(record: LegRecord, entry: int, world: int) -> BaseInverse:
-    """Return the inverse of the base's system."""
+    """Return the recorded inverse of the base's system of equations."""
     inverse = BaseInverse()
     inverse.lin = get_base_mat(record, entry, BASE_INVERSE, world)
     inverse.cross = get_base_mat(record, entry, BASE_INVERSE + 9, world)
@@ -181,7 +181,7 @@ def get_inverse(record: LegRecord, entry: int, world: int) -> BaseInverse:
 
 @wp.func
 def put_inverse(record: LegRecord, entry: int, world: int, inverse: BaseInverse):
-    """Write the inverse of the base's system."""
+    """Write the inverse of the base's system of equations to the record."""
     put_base_mat(record, entry, BASE_INVERSE, world, inverse.lin)
     put_base_mat(record, entry, BASE_INVERSE + 9, world, inverse.cross)
     put_base_mat(record, entry, BASE_INVERSE + 18, world, inverse.ang)
@@ -189,7 +189,7 @@ def put_inverse(record: LegRecord, entry: int, world: int, inverse: BaseInverse)
 
 @wp.func
 def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
-    """Return a leg's elimination with `free` zero, which is not recorded."""
+    """Return a leg's recorded `LegSolve`; `free` is not recorded and is 0."""
     solve = LegSolve()
     solve.inverse = get_mat(record, entry, SOLVE, world, leg)
     solve.to_lin = get_mat(record, entry, SOLVE + 9, world, leg)
@@ -199,7 +199,7 @@ def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
 
 @wp.func
 def put_solve(record: LegRecord, entry: int, world: int, leg: int, solve: LegSolve):
-    """Write a leg's elimination without `free`."""
+    """Write a leg's `LegSolve` to the record, without `free`."""
     put_mat(record, entry, SOLVE, world, leg, solve.inverse)
     put_mat(record, entry, SOLVE + 9, world, leg, solve.to_lin)
     put_mat(record, entry, SOLVE + 18, world, leg, solve.to_ang)
@@ -207,7 +207,7 @@ def put_solve(record: LegRecord, entry: int, world: int, leg: int, solve: LegSol
 
 @wp.func
 def get_slopes(record: LegRecord, entry: int, world: int, leg: int) -> MotorSlopes:
-    """Return the derivatives of the motors' torques."""
+    """Return the recorded derivatives of a leg's motor torques."""
     slopes = MotorSlopes()
     slopes.target = get_vec(record, entry, SLOPES, world, leg)
     slopes.angle = get_vec(record, entry, SLOPES + 3, world, leg)
@@ -217,7 +217,7 @@ def get_slopes(record: LegRecord, entry: int, world: int, leg: int) -> MotorSlop
 
 @wp.func
 def put_slopes(record: LegRecord, entry: int, world: int, leg: int, slopes: MotorSlopes):
-    """Write the derivatives of the motors' torques."""
+    """Write the derivatives of a leg's motor torques to the record."""
     put_vec(record, entry, SLOPES, world, leg, slopes.target)
     put_vec(record, entry, SLOPES + 3, world, leg, slopes.angle)
     put_vec(record, entry, SLOPES + 6, world, leg, slopes.rate)
@@ -225,7 +225,7 @@ def put_slopes(record: LegRecord, entry: int, world: int, leg: int, slopes: Moto
 
 @wp.func
 def get_law(record: LegRecord, entry: int, world: int, leg: int) -> LegLaw:
-    """Return a paw's contact law; all fields but `mode` are 0 where it is SEPARATE."""
+    """Return a paw's recorded contact law; all fields but `mode` are 0 where it is SEPARATE."""
     law = LegLaw()
     law.mode = int(record.legs[entry, MODE, world, leg])
     if law.mode != SEPARATE:
@@ -242,7 +242,7 @@ def get_law(record: LegRecord, entry: int, world: int, leg: int) -> LegLaw:
 
 @wp.func
 def put_law(record: LegRecord, entry: int, world: int, leg: int, law: LegLaw):
-    """Write a paw's contact law; only `mode` where it is SEPARATE."""
+    """Write a paw's contact law to the record; only `mode` where it is SEPARATE."""
     record.legs[entry, MODE, world, leg] = real(law.mode)
     if law.mode != SEPARATE:
         record.legs[entry, MU_ROW, world, leg] = real(law.mu_row)
@@ -257,7 +257,7 @@ def put_law(record: LegRecord, entry: int, world: int, leg: int, law: LegLaw):
 
 @wp.func
 def get_law_row(record: LegRecord, entry: int, world: int, leg: int) -> LawRow:
-    """Return a paw's `LawRow`; it is defined only where a paw of the world touches."""
+    """Return a paw's recorded `LawRow`; it is defined only where a paw of the world touches the ground."""
     row = LawRow()
     row.a = get_mat(record, entry, LAWS, world, leg)
     row.b = get_mat(record, entry, LAWS + 9, world, leg)
@@ -268,7 +268,7 @@ def get_law_row(record: LegRecord, entry: int, world: int, leg: int) -> LawRow:
 
 @wp.func
 def put_law_row(record: LegRecord, entry: int, world: int, leg: int, row: LawRow):
-    """Write a paw's `LawRow`."""
+    """Write a paw's `LawRow` to the record."""
     put_mat(record, entry, LAWS, world, leg, row.a)
     put_mat(record, entry, LAWS + 9, world, leg, row.b)
     put_mat(record, entry, LAWS + 18, world, leg, row.c)
@@ -277,7 +277,7 @@ def put_law_row(record: LegRecord, entry: int, world: int, leg: int, row: LawRow
 
 @wp.func
 def get_leg_weights(record: LegRecord, entry: int, world: int, leg: int) -> LegWeights:
-    """Return a leg's multipliers."""
+    """Return a leg's recorded multipliers."""
     weights = LegWeights()
     weights.rates = get_vec(record, entry, LEG_WEIGHTS, world, leg)
     weights.law = get_vec(record, entry, LEG_WEIGHTS + 3, world, leg)
@@ -286,14 +286,14 @@ def get_leg_weights(record: LegRecord, entry: int, world: int, leg: int) -> LegW
 
 @wp.func
 def put_leg_weights(record: LegRecord, entry: int, world: int, leg: int, weights: LegWeights):
-    """Write a leg's multipliers."""
+    """Write a leg's multipliers to the record."""
     put_vec(record, entry, LEG_WEIGHTS, world, leg, weights.rates)
     put_vec(record, entry, LEG_WEIGHTS + 3, world, leg, weights.law)
 
 
 @wp.func
 def get_base_weights(record: LegRecord, entry: int, world: int) -> BaseWeights:
-    """Return the base's multipliers."""
+    """Return the base's recorded multipliers."""
     weights = BaseWeights()
     weights.lin = row_vec3(record.base, entry, BASE_WEIGHTS, world)
     weights.ang = row_vec3(record.base, entry, BASE_WEIGHTS + 3, world)
@@ -305,7 +305,7 @@ def get_base_weights(record: LegRecord, entry: int, world: int) -> BaseWeights:
 
 @wp.func
 def put_base_weights(record: LegRecord, entry: int, world: int, weights: BaseWeights):
-    """Write the base's multipliers."""
+    """Write the base's multipliers to the record."""
     store_row_vec3(record.base, entry, BASE_WEIGHTS, world, weights.lin)
     store_row_vec3(record.base, entry, BASE_WEIGHTS + 3, world, weights.ang)
     store_row_vec3(record.base, entry, BASE_WEIGHTS + 6, world, weights.cotangent.velocity)

@@ -49,23 +49,23 @@ class ReplayedStep:
 
 @wp.struct
 class LegReverse:
-    """Scratch of a leg in the reverse pass: gradients by its motors (lateral, outer, inner), multipliers, contact."""
+    """Scratch of a leg in the reverse pass: gradients w.r.t. motors (lateral, outer, inner), multipliers, contact."""
 
-    angles: vec3  # by the angles at the end of the step; after `reverse_step` at its start
-    rates: vec3  # by the rates at the end of the step; after `reverse_step` at its start
-    torque: vec3  # by the torques in the step
+    angles: vec3  # w.r.t. the angles at the end of the step; after `reverse_step` at its start
+    rates: vec3  # w.r.t. the rates at the end of the step; after `reverse_step` at its start
+    torque: vec3  # w.r.t. the torques in the step
     virtual_rates: vec3  # multipliers of the motors' equations
     contact: PawContact  # of its paw at the solution
     law: PawLaw  # of its paw at the solution
-    multiplier: vec3  # of the paw's law; before `solve_laws` the gradient by the paw's impulse
+    multiplier: vec3  # of the paw's law; before `solve_laws` the gradient w.r.t. the paw's impulse
 
 
 @wp.struct
 class Multipliers:
     """Multipliers m of the base's equations in a step, and the gradients y in M m = y (M: mass matrix); body axes."""
 
-    lin_cotangent: vec3  # y: by the base's linear velocity at the end of the step, contact laws included
-    ang_cotangent: vec3  # y: by the base's angular velocity
+    lin_cotangent: vec3  # y: w.r.t. the base's linear velocity at the end of the step, contact laws included
+    ang_cotangent: vec3  # y: w.r.t. the base's angular velocity
     lin: vec3  # m of the linear equations
     ang: vec3  # m of the angular equations
 
@@ -74,7 +74,7 @@ class Multipliers:
 def solve_system(
     record: StepRecord, at: ReplayedStep, lin_cotangent: vec3, ang_cotangent: vec3, legs: wp.array(dtype=LegReverse)
 ) -> Multipliers:
-    """Return the base's m of M m = y and write the motors' m to `legs`; y: *_cotangent (base), `legs[k].rates`."""
+    """Solve M m = y (`Multipliers`); return the base's m, write the motors'; y: *_cotangent, `legs[k].rates`."""
     m = Multipliers()
     m.lin_cotangent = lin_cotangent
     m.ang_cotangent = ang_cotangent
@@ -176,7 +176,7 @@ def solve_linear(a: wp.array2d(dtype=real), b: wp.array(dtype=real), n: int):
 
 @wp.func
 def solve_laws(legs: wp.array(dtype=LegReverse)):
-    """Replace `multiplier` of all legs: from the gradient by the paw's impulse to the multiplier of its law, or 0."""
+    """Replace `multiplier` of all legs, the gradient w.r.t. a paw's impulse, by the multiplier of its law, or 0."""
     matrix = wp.zeros(shape=(12, 12), dtype=real)
     vector = wp.zeros(shape=(12,), dtype=real)
     row = int(0)
@@ -215,10 +215,10 @@ def write_laws(
     model: RobotModel, at: ReplayedStep, first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays,
     record: StepRecord, m: Multipliers, cotangent: TrajectoryArrays, legs: wp.array(dtype=LegReverse),
 ) -> bool:  # fmt: skip
-    """Write the paws' contacts and laws at the solution, and the gradients by their impulses, to `legs`.
+    """Write the paws' contacts and laws at the solution, and the gradients w.r.t. their impulses, to `legs`.
 
     Returns whether any paw touches. m: from `solve_system`. first_impulse: as `Commands.impulse`. cotangent: gradient
-    by the trajectory.
+    w.r.t. the trajectory.
     """
     world, i = at.world, at.entry
     base = record.base[world, i]
@@ -255,7 +255,7 @@ def write_laws(
 def add_laws(
     model: RobotModel, at: ReplayedStep, record: StepRecord, multipliers: Multipliers, legs: wp.array(dtype=LegReverse),
 ) -> Multipliers:  # fmt: skip
-    """Return `multipliers` plus the part of the contact laws, whose multipliers are in `legs`; updates `legs` too."""
+    """Return `multipliers` of the equations of motion plus the contact laws' part (from `legs`); updates `legs` too."""
     m = multipliers
     law_lin = vec3(real(0.0))
     law_ang = vec3(real(0.0))
@@ -284,10 +284,10 @@ def find_multipliers(
     cotangent: TrajectoryArrays, record: StepRecord, lin_cotangent: vec3, ang_cotangent: vec3,
     legs: wp.array(dtype=LegReverse),
 ) -> Multipliers:  # fmt: skip
-    """Return the multipliers of a step's equations (`step_adjoint`), given the gradients by the velocities at its end.
+    """Return the multipliers of a step's equations (`step_adjoint`) for the gradients w.r.t. its end velocities.
 
-    lin_cotangent, ang_cotangent: by the base's velocities, body axes. legs: `rates` are the gradients by the motors'
-    rates, to which the contact laws' part is added; multipliers, contacts and laws are written.
+    lin_cotangent, ang_cotangent: w.r.t. the base's velocities, body axes. legs: `rates` are the gradients w.r.t. the
+    motors' rates, to which the contact laws' part is added; multipliers, contacts and laws are written.
     """
     m = solve_system(record, at, lin_cotangent, ang_cotangent, legs)
     if write_laws(model, at, first_impulse, trajectory, record, m, cotangent, legs):
@@ -298,7 +298,7 @@ def find_multipliers(
 
 @wp.func
 def base_factors(at: ReplayedStep, record: StepRecord, m: Multipliers) -> BaseFactors:
-    """Return the base's constants in the recomputed step `at`; m: from `find_multipliers`."""
+    """Return the `BaseFactors` of the recomputed step `at`; m: from `find_multipliers`."""
     base = record.base[at.world, at.entry]
     return make_base_factors(base, record.base[at.world, at.entry + 1], m.lin, m.ang, at.dt)
 
@@ -308,7 +308,7 @@ def leg_factors(
     at: ReplayedStep, k: int, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord,
     legs: wp.array(dtype=LegReverse),
 ) -> LegFactors:  # fmt: skip
-    """Return the constants of leg k (0 to 3) in the recomputed step `at`, after `find_multipliers`."""
+    """Return the `LegFactors` of leg k (0 to 3) in the recomputed step `at`, after `find_multipliers`."""
     push = vec3(real(0.0))
     if cotangent.impulse.shape[0] > 0:
         push = cotangent.impulse[at.step, k, at.world]

@@ -1,4 +1,4 @@
-"""The reverse pass of a rollout: all its steps in one launch, with one thread per world.
+"""Reverse pass of a rollout: all its steps in one launch, with one thread per world.
 
 The rows are visited backwards: the steps between two rows are recomputed with the impulses of the rollout, then run
 backwards one by one (`step_adjoint`, `virtual_power`).
@@ -63,22 +63,22 @@ def store_adjoint_scalar(
 
 @wp.struct
 class RowCotangent:
-    """Gradient by the base's entries of a row, see `TrajectoryArrays`; world axes."""
+    """Gradient w.r.t. the base's entries of a trajectory row, see `TrajectoryArrays`; world axes."""
 
     pos: vec3
     quat: quat
-    lin: vec3  # by the com's velocity, world axes
-    ang: vec3  # by the angular velocity, world axes
-    com: vec3  # by the base's centre of mass, summed over rows
+    lin: vec3  # w.r.t. the com's velocity, world axes
+    ang: vec3  # w.r.t. the angular velocity, world axes
+    com: vec3  # w.r.t. the base's centre of mass, summed over rows
 
 
 @wp.func
 def load_row_base_adjoint(
     trajectory: TrajectoryArrays, model: RobotModel, row: int, world: int, adj: BaseState, later_com: vec3
 ) -> RowCotangent:
-    """Return the gradient by a row's entries; adj: gradient by the base's state that was read from the row.
+    """Return the gradient w.r.t. a row's entries; adj: gradient w.r.t. the base's state that was read from the row.
 
-    later_com: gradient by the base's centre of mass, summed over the later rows.
+    later_com: gradient w.r.t. the base's centre of mass, summed over the later rows.
     """
     com = base_com(model.table, world)
     pos, orientation, lin, ang, com_adj, _cotangent = wp.grad(row_adjoint_scalar)(
@@ -96,7 +96,7 @@ def load_row_base_adjoint(
 
 @wp.func
 def add_row_cotangent(into: RowCotangent, cotangent: TrajectoryArrays, row: int, world: int) -> RowCotangent:
-    """Return `into` plus the loss's own gradient by the base entries of a row, from `cotangent`."""
+    """Return `into` plus the gradient of the loss w.r.t. the base entries of a row, from `cotangent`."""
     s = into
     if cotangent.q.shape[0] > 0:
         s.pos += row_vec3(cotangent.q, row, 0, world)
@@ -109,15 +109,15 @@ def add_row_cotangent(into: RowCotangent, cotangent: TrajectoryArrays, row: int,
 
 @wp.struct
 class RowBaseAdjoint:
-    """Gradient by the base's state that a row was written from."""
+    """Gradient w.r.t. the base's state that was written to a trajectory row."""
 
     base: BaseState
-    com: vec3  # by the base's centre of mass, summed over rows
+    com: vec3  # w.r.t. the base's centre of mass, summed over rows
 
 
 @wp.func
 def store_row_base_adjoint(model: RobotModel, world: int, base: BaseState, cotangent: RowCotangent) -> RowBaseAdjoint:
-    """Return the gradient by the base's state `base` that a row was written from; cotangent: by the row's entries."""
+    """Return the gradient w.r.t. the state `base` that was written to a row; cotangent: w.r.t. the row's entries."""
     com = base_com(model.table, world)
     orientation, lin, ang, com_adj, _lin, _ang = wp.grad(store_adjoint_scalar)(
         base.quat, base.lin, base.ang, com, cotangent.lin, cotangent.ang
@@ -133,7 +133,7 @@ def store_row_base_adjoint(model: RobotModel, world: int, base: BaseState, cotan
 
 @wp.func
 def add_motor_rows(legs: wp.array(dtype=LegReverse), cotangent: TrajectoryArrays, row: int, world: int):
-    """Add the loss's own gradient by the angles and rates of a row, from `cotangent`, to `legs`."""
+    """Add the gradient of the loss w.r.t. the angles and rates of a row, from `cotangent`, to `legs`."""
     for k in range(legs.shape[0]):
         if cotangent.q.shape[0] > 0:
             legs[k].angles = legs[k].angles + row_vec3(cotangent.q, row, 7 + 3 * k, world)
@@ -183,7 +183,7 @@ def replay_row(
 
 @wp.func
 def add_wrench(gradients: Gradients, t: int, world: int, force: vec3, moment: vec3):
-    """Add force and moment to the gradient by the wrench on the base in policy step t."""
+    """Add force and moment to the gradient w.r.t. the wrench on the base in policy step t."""
     store_row_vec3(gradients.wrench, t, 0, world, row_vec3(gradients.wrench, t, 0, world) + force)
     store_row_vec3(gradients.wrench, t, 3, world, row_vec3(gradients.wrench, t, 3, world) + moment)
 
@@ -193,9 +193,9 @@ def add_motor_adjoint(
     by_motor: MotorAdjoint, arrived: Arrival, at: ReplayedStep, motor: int, cotangent: TrajectoryArrays,
     gradients: Gradients, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
 ):  # fmt: skip
-    """Add the gradients by the inputs of the torque of motor 0 to 11 in a step: targets, constants, angle, rate.
+    """Add the gradients w.r.t. the inputs of the torque of motor 0 to 11 in a step: targets, constants, angle, rate.
 
-    `legs[k].torque` and cotangent.torque are the gradient by the torque; angle and rate go to `legs`, constants to
+    `legs[k].torque` and cotangent.torque are the gradient w.r.t. the torque; angle and rate go to `legs`, constants to
     `sums`, targets to `gradients`.
     """
     k = motor / 3
@@ -218,7 +218,7 @@ def add_filter_adjoint(
     by_filter: FilterAdjoint, t: int, k: int, world: int, gradients: Gradients, legs: wp.array(dtype=LegReverse),
     sums: wp.array(dtype=real),
 ):  # fmt: skip
-    """Add the gradients by the inputs of leg k's filter in policy step t: raw targets, constants, angles and rates."""
+    """Add the gradients w.r.t. the inputs of leg k's filter in policy step t: targets, constants, angles and rates."""
     store_row_vec3(gradients.target, t, 3 * k, world, by_filter.target)
     command_adjoint.add_offsets(sums, k, by_filter.angles)
     add_filter(sums, by_filter.constants)
@@ -228,7 +228,7 @@ def add_filter_adjoint(
 
 @wp.func
 def store_base_entries(gradients: Gradients, world: int, entries: RowCotangent):
-    """Write the gradient by a row's base entries to `gradients.q` and `gradients.qd`."""
+    """Write the gradient w.r.t. a row's base entries to `gradients.q` and `gradients.qd`."""
     for i in range(3):
         gradients.q[i, world] = entries.pos[i]
         gradients.qd[i, world] = entries.lin[i]
@@ -239,7 +239,7 @@ def store_base_entries(gradients: Gradients, world: int, entries: RowCotangent):
 
 @wp.func
 def store_motor_entries(gradients: Gradients, world: int, leg: int, angles: vec3, rates: vec3):
-    """Write the gradient by a row's angles and rates of one leg's motors to `gradients.q` and `gradients.qd`."""
+    """Write the gradient w.r.t. a row's angles and rates of one leg's motors to `gradients.q` and `gradients.qd`."""
     for i in range(3):
         gradients.q[7 + 3 * leg + i, world] = angles[i]
         gradients.qd[6 + 3 * leg + i, world] = rates[i]
@@ -260,9 +260,9 @@ def reverse_kernel(
     record: StepRecord,
     gradients: Gradients,
 ):
-    """Write the gradient of a scalar to `gradients`, given its gradient by the trajectory; one thread per world.
+    """Write the gradient of a scalar to `gradients`, given its gradient w.r.t. the trajectory; one thread per world.
 
-    cotangent: gradient by the trajectory. filtered_target [rad]: (T, 12, num_worlds), from the forward pass, like
+    cotangent: gradient w.r.t. the trajectory. filtered_target [rad]: (T, 12, num_worlds), from the forward pass, like
     `trajectory`. record: scratch for `timing.every` steps. Worlds count from `settings.first`.
     """
     world = settings.first + wp.tid()

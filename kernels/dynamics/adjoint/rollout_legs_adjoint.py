@@ -1,7 +1,7 @@
-"""`rollout_adjoint` for GPUs, with four threads per world, one per leg; spans of rows are processed last to first.
+"""Reverse pass of a rollout on GPUs, with four threads per world, one per leg; the last span of rows comes first.
 
 Each span takes four launches: `replay_legs_kernel` recomputes its steps, all rows in parallel; `reverse_legs_kernel`
-runs backwards step by step; the two kernels of `constants_adjoint` add the gradients by parameters, all steps in
+runs backwards step by step; the two kernels of `constants_adjoint` add the gradients w.r.t. parameters, all steps in
 parallel.
 """
 
@@ -37,7 +37,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class Span:
-    """Range of rows whose steps a launch processes."""
+    """Range of trajectory rows whose physics steps one launch processes."""
 
     begin: int  # first row
     end: int  # excluded
@@ -64,7 +64,7 @@ def replay_legs_kernel(
     # out
     record: LegRecord,
 ):
-    """Recompute the steps after each row; launch over (rows of the span, count rounded up to a multiple of 8, 4).
+    """Recompute the steps after each trajectory row; launch over (rows of the span, count rounded up to 8 n, 4).
 
     count: number of worlds, from `settings.first` on. Threads beyond the last world repeat it and write the same bits.
     """
@@ -108,7 +108,7 @@ def replay_legs_kernel(
 
 @wp.func
 def load_entries(gradients: Gradients, world: int) -> RowCotangent:
-    """Return the gradient by the base's entries of the row after a span, from `gradients.q` and `gradients.qd`."""
+    """Return the gradient w.r.t. the base's entries of the row after a span, from `gradients.q` and `gradients.qd`."""
     entries = RowCotangent()
     entries.pos = vec3(gradients.q[0, world], gradients.q[1, world], gradients.q[2, world])
     entries.quat = quat(gradients.q[3, world], gradients.q[4, world], gradients.q[5, world], gradients.q[6, world])
@@ -119,7 +119,7 @@ def load_entries(gradients: Gradients, world: int) -> RowCotangent:
 
 @wp.func
 def load_motor_entries(gradients: Gradients, world: int, leg: int) -> LegAdjoint:
-    """Return the gradient by a leg's angles and rates in the row after a span; all else is 0."""
+    """Return the gradient w.r.t. a leg's angles and rates in the row after a span; all else is 0."""
     m = 3 * leg
     adj = LegAdjoint()
     adj.angles = vec3(gradients.q[7 + m, world], gradients.q[8 + m, world], gradients.q[9 + m, world])
@@ -132,9 +132,9 @@ def reverse_motors(
     old: LegAdjoint, slopes: MotorSlopes, arrived: Arrival, cotangent: TrajectoryArrays, step: int, leg: int,
     world: int, gradients: Gradients, writes: bool,
 ) -> LegAdjoint:  # fmt: skip
-    """Return `old` plus the gradient through the motors' torques by angles and rates of a leg in a physics step.
+    """Return `old` plus the gradient through the motors' torques w.r.t. a leg's angles and rates in a physics step.
 
-    slopes: derivatives of the torques. writes: whether this thread adds the gradient by the targets to `gradients`.
+    slopes: derivatives of the torques. writes: whether this thread adds the gradient w.r.t. the targets to `gradients`.
     """
     adj = old
     torque_cotangent = adj.torque
@@ -168,8 +168,8 @@ def reverse_legs_kernel(
 ):
     """Run the steps of a span backwards; launch over (count rounded up to a multiple of 8, 4).
 
-    gradients.q and gradients.qd hold the gradient by the row after the span, and are replaced by that by its first row.
-    Of the gradients by parameters those of base, gravity and filter are added. count: number of worlds, from
+    gradients.q and gradients.qd hold the gradient w.r.t. the row after the span, and are replaced by that w.r.t. its
+    first row. Adds the gradients w.r.t. the parameters of base, gravity and filter. count: number of worlds, from
     `settings.first` on; threads beyond the last world repeat it and write nothing.
     """
     index, leg = wp.tid()

@@ -29,10 +29,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class StepAdjoint:
-    """Gradient by the base's state at the start of a step, and by the wrench on it."""
+    """Gradient w.r.t. the base's state at the start of a step, and w.r.t. the wrench on it."""
 
     base: BaseState  # axes as those of the state
-    force: vec3  # by the force at the com, world axes
+    force: vec3  # w.r.t. the force at the com, world axes
     moment: vec3
 
 
@@ -40,9 +40,9 @@ class StepAdjoint:
 def add_leg_gradient(
     gradient: LegGradient, k: int, dt: real, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real)
 ):
-    """Add leg k's gradient by its motors to `legs` and by its parameters to `sums`; write that by its torques.
+    """Add leg k's gradient w.r.t. its motors to `legs`, w.r.t. its parameters to `sums`; write that w.r.t. torques.
 
-    dt [s]: of the step. legs (4,): scratch. sums (GRADIENT_ROWS,): gradient by parameters.
+    dt [s]: of the step. legs (4,): scratch. sums (GRADIENT_ROWS,): gradient w.r.t. parameters.
     """
     add_leg_parameters(sums, k, gradient)
     if legs[k].law.mode != SEPARATE:
@@ -58,11 +58,11 @@ def reverse_step(
     trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord, adj: BaseState,
     legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
 ) -> StepAdjoint:  # fmt: skip
-    """Return the gradient by the base's state at the start of a step; adj: that by its state at the end.
+    """Return the gradient w.r.t. the base's state at the start of a step; adj: gradient w.r.t. its state at the end.
 
-    legs (4,): gradients by `angles` and `rates` at the end are replaced by those at the start, `torque` is written, the
-    rest is scratch. sums (GRADIENT_ROWS,): gradient by parameters, added to. first_impulse: as `Commands.impulse`.
-    trajectory, cotangent: of the rollout, and the gradient by it. record: written by `replay_step`.
+    legs (4,): gradients w.r.t. `angles` and `rates` at the end are replaced by those at the start, `torque` is written,
+    the rest is scratch. sums (GRADIENT_ROWS,): gradient w.r.t. parameters, added to. first_impulse: as in `Commands`.
+    trajectory, cotangent: of the rollout, and the gradient w.r.t. it. record: written by `replay_step`.
     """
     dt, world = at.dt, at.world
     base = record.base[world, at.entry]

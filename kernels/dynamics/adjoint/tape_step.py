@@ -1,10 +1,10 @@
-"""The step of `advance` for Warp's tape: solved once, then two launches that the tape runs backwards.
+"""Time step for Warp's tape: one launch solves it, and two more are recorded and run backwards.
 
     solve_kernel (not recorded) -> power_kernel -> integrate_kernel
 
-In the reverse pass, `integrate_kernel` passes the gradient by the velocities at the end of the step to
+In the reverse pass, `integrate_kernel` passes the gradient w.r.t. the velocities at the end of the step to
 `find_multipliers`. `power_kernel` computes the virtual power of the equations of motion, weighted with these
-multipliers: its derivatives by the inputs of the step are the gradient of the step (see `step_adjoint`).
+multipliers: its derivatives w.r.t. the inputs of the step are the gradient of the step (see `step_adjoint`).
 """
 
 import warp as wp
@@ -34,9 +34,9 @@ class SolvedStep:
     rates: wp.array2d(dtype=vec3)  # [rad/s] of the motors at the end of the step
     base: wp.array(dtype=BaseFactors)
     cotangent: wp.array(dtype=BaseCotangent)
-    ang_cotangent: wp.array(dtype=vec3)  # gradient by the base's angular velocity at the start
+    ang_cotangent: wp.array(dtype=vec3)  # gradient w.r.t. the base's angular velocity at the start
     legs: wp.array2d(dtype=LegFactors)
-    rate_cotangent: wp.array2d(dtype=vec3)  # gradient by the motors' rates at the start
+    rate_cotangent: wp.array2d(dtype=vec3)  # gradient w.r.t. the motors' rates at the start
     mu_row: wp.array2d(dtype=int)  # row of the friction coefficient in the parameter table
 
 
@@ -152,7 +152,7 @@ def adj_end_velocities(
     joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), solved: SolvedStep, record: StepRecord,
     power: wp.array2d(dtype=real), world: int, adj_ret: EndVelocities,
 ):  # fmt: skip
-    """Write multipliers for `power_kernel` to `solved`, add 1 to the gradient by `power`; adj_ret: by the result."""
+    """Write multipliers for `power_kernel` to `solved`, add 1 to the adjoint of `power`; adj_ret: of the result."""
     params = wp.zeros(shape=(4,), dtype=LegParams)
     legs = wp.zeros(shape=(4,), dtype=LegReverse)
     wrench = base_wrench(joint_f, body_f, world)

@@ -42,7 +42,7 @@ from ..leg_dynamics import LegMasses, PawKinematics, leg_pose, paw_kinematics
 
 @wp.struct
 class BaseFactors:
-    """Constants of the base in the scalar: multipliers, accelerations, new velocities; body axes of its start."""
+    """Constants of the base in the virtual power: multipliers, accelerations, new velocities; axes at its start."""
 
     virtual_lin: vec3  # multipliers of the base's linear equations
     virtual_ang: vec3  # multipliers of the base's angular equations
@@ -54,7 +54,7 @@ class BaseFactors:
 
 @wp.struct
 class LegFactors:
-    """Constants of a leg in the scalar; vectors are lateral, outer, inner, or those of its paw's contact."""
+    """Constants of a leg in the virtual power; vectors are lateral, outer, inner, or those of its paw's contact."""
 
     virtual_rates: vec3  # multipliers of the motors' equations
     acc: vec3  # [rad/s^2] over the step, contact included
@@ -101,7 +101,7 @@ def add(a: MassMoments, b: MassMoments) -> MassMoments:  # noqa: F811
 
 @wp.func
 def second_moment_product(a: vec3, b: vec3) -> vec6:
-    """Return sym(a, b), the gradient of a^T S b by packed second moments S (xx yy zz xy xz yz)."""
+    """Return sym(a, b), the gradient of a^T S b w.r.t. packed second moments S (xx yy zz xy xz yz)."""
     return vec6(
         a[0] * b[0], a[1] * b[1], a[2] * b[2],
         a[0] * b[1] + a[1] * b[0], a[0] * b[2] + a[2] * b[0], a[1] * b[2] + a[2] * b[1],
@@ -203,7 +203,7 @@ def adj_link_motion(
     housing: FrameMotion, origin: vec3, vel: vec2, acc: vec2, virtual: vec2, about_y: vec3, cosine: real, sine: real,
     adj_ret: FrameMotion,
 ):  # fmt: skip
-    """Add the gradient of `link_motion` to `wp.adjoint`; adj_ret: by its result; adj_* locals: in housing axes."""
+    """Add the gradient of `link_motion` to `wp.adjoint`; adj_ret: w.r.t. its result; adj_* locals: in housing axes."""
     w = housing.ang
     # in housing axes
     relative_vel = wp.cross(w, origin) + real(2.0) * planar(vel)
@@ -288,7 +288,7 @@ def contact_action(
     geo: LegGeometry, ground: Ground, mu: real, pos: vec3, orientation: quat, paw: PawKinematics, base: BaseFactors,
     leg: LegFactors, dt: real,
 ) -> real:  # fmt: skip
-    """Return a paw's part of the scalar: impulse . virtual velocity + multiplier . law + cotangent . impulse.
+    """Return a paw's part of the virtual power: impulse . virtual velocity + multiplier . law + cotangent . impulse.
 
     mu: friction coefficient. pos [m], orientation (xyzw): of the base, world, at the start of the step dt [s].
     """
@@ -312,7 +312,7 @@ def leg_action(
     mu: real, pos: vec3, orientation: quat, omega: vec3, g: vec3, angles: vec3, rates: vec3, base: BaseFactors,
     leg: LegFactors, dt: real,
 ) -> real:  # fmt: skip
-    """Return a leg's part of the scalar: links, passive forces, spring and contact; its motors' torques are left out.
+    """Return a leg's part of the virtual power: links, passive forces, spring and contact, without motor torques.
 
     mu: friction coefficient. pos [m], orientation (xyzw): of the base, world. omega: its angular velocity [rad/s], g:
     gravity [m/s^2], both in body axes. angles [rad], rates [rad/s]: lateral, outer, inner, at the start of the step.
@@ -375,11 +375,11 @@ def leg_action(
 
 @wp.struct
 class BaseCotangent:
-    """Gradients by further quantities that depend on the base's orientation and velocity, for `base_action`."""
+    """Gradients w.r.t. further quantities that depend on the base's orientation and velocity, for `base_action`."""
 
-    velocity: vec3  # by its linear velocity at the start of the step, body axes
-    new_velocity: vec3  # by its linear velocity at the end of the step, world axes
-    gravity: vec3  # by gravity in body axes
+    velocity: vec3  # w.r.t. its linear velocity at the start of the step, body axes
+    new_velocity: vec3  # w.r.t. its linear velocity at the end of the step, world axes
+    gravity: vec3  # w.r.t. gravity in body axes
 
 
 @wp.func
@@ -387,7 +387,7 @@ def base_action(
     body: MassMoments, com: vec3, gravity: vec3, force: vec3, moment: vec3, orientation: quat, lin: vec3, omega: vec3,
     base: BaseFactors, cotangent: BaseCotangent, dt: real,
 ) -> real:  # fmt: skip
-    """Return the base link's part of the scalar, plus `cotangent` . (gravity in body axes and the base's velocities).
+    """Return the base's part of the virtual power, plus `cotangent` . (gravity in body axes and the base's velocities).
 
     gravity [m/s^2], external force [N] and moment [N m] at the com, lin [m/s]: world axes; com [m], omega [rad/s]: body
     axes; orientation: xyzw.

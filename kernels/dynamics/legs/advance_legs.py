@@ -1,4 +1,4 @@
-"""`advance` for GPUs: four threads per world, one per leg, which exchange sums for the base and the contacts.
+"""Physics steps on GPUs: four threads per world, one per leg, which exchange sums for the base and the contacts.
 
 A thread holds one leg and a copy of the base; the base's equations are sums over the four threads. The contact law is
 the one in `contact`. In each round all paws compute their next impulse at once, and all apply it, which converges
@@ -72,7 +72,7 @@ class LegState:
 
 @wp.struct
 class PawSolution:
-    """The contact problem's solution: the thread's paw impulse, and the base's change of velocity; body axes."""
+    """Solution of the contact problem: impulse on the thread's paw, and the base's change of velocity; body axes."""
 
     impulse: vec3  # [N s] on the paw, body axes
     lin: vec3  # change of the base's linear velocity [m/s]
@@ -127,7 +127,7 @@ def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_round
 
 @wp.struct
 class StopAttempt:
-    """The set of pressed stops that a leg tries in a step, see `stops`."""
+    """Set of pressed stops that a leg tries in a step, and the rates at which its stops press."""
 
     stop_rates: StopRates  # zero where no stop is near
     pressed: int
@@ -135,7 +135,7 @@ class StopAttempt:
 
 @wp.func
 def stop_attempt(model: RobotModel, world: int, leg: int, old: LegState, dt: real) -> StopAttempt:
-    """Return the leg's stops for the present attempt at a step of dt [s] from the state `old`."""
+    """Return the leg's stops for the current attempt at a step of dt [s] from the state `old`."""
     attempt = StopAttempt()
     attempt.pressed = old.pressed
     if attempt.pressed != 0 or old.sets == 0:

@@ -1,4 +1,4 @@
-"""`rollout` for GPUs: four threads per world, one per leg."""
+"""Rollouts on GPUs: four threads per world, one per leg."""
 
 import warp as wp
 
@@ -40,7 +40,10 @@ def rollout_legs_kernel(
     filtered_target: wp.array3d(dtype=real),
     trajectory: TrajectoryArrays,
 ):
-    """Run a rollout as `rollout_kernel`; launch over (count, the number of worlds, rounded up to 8 n; 4)."""
+    """Run a rollout like `rollout_kernel`, on four threads per world.
+
+    Launch over (count rounded up to a multiple of 8, 4); count: number of worlds, from `settings.first` on.
+    """
     index, leg = wp.tid()
     world = settings.first + wp.min(index, count - 1)  # threads beyond the last world repeat it
     com = base_com(model.table, world)

@@ -1,4 +1,4 @@
-"""The kernel for CPUs that advances every world by several steps in one launch, with one thread per world.
+"""Kernel for CPUs that advances every world by several steps in one launch, with one thread per world.
 
 On one CPU core `advance_legs`, with a thread per leg, takes 4.1 to 4.8 times as long per policy step (64 and 512
 worlds, standing and jumping).

@@ -1,4 +1,4 @@
-"""The velocities at the end of a step of one world: legs eliminated, contacts and hard stops solved together."""
+"""Solution of one step of a world for its end velocities: legs eliminated, contacts and hard stops solved together."""
 
 import warp as wp
 
@@ -17,7 +17,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class LegStep:
-    """A leg in a step: input (angles, rates, torque), scratch and results; motors are lateral, outer, inner."""
+    """Data of one leg in a step: input (angles, rates, torque), scratch, results; motors are lateral, outer, inner."""
 
     angles: vec3  # [rad] at the start of the step
     rates: vec3  # [rad/s] at the start of the step
@@ -45,7 +45,7 @@ def solve_with_stops(
     model: RobotModel, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
     impulse: wp.array2d(dtype=vec3), legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact),
 ) -> StepSolution:  # fmt: skip
-    """Solve a step with the sets `legs[k].pressed` and their `stop_rates`; arguments and results as `solve_step`."""
+    """Solve a step with fixed sets of pressed stops, `legs[k].pressed`; arguments and results as in `solve_step`."""
     dt = settings.dt
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     system = base_system(model, world, base, g, force, moment)

@@ -24,7 +24,7 @@ from jumper_warp.tasks.randomization import RandomizationCfg
 from simulation_helpers import WEIGHT, paw_centres, paw_forces
 
 N = 8192
-PAWS = np.array([0.24, 0.22])  # [m] largest distance of a paw ahead (default pose) and beside (squats) the base
+PAWS = np.array([0.24, 0.22])  # [m] largest distance of a paw from the base, ahead (default pose) and lateral (squats)
 MARGIN, ROOM, CLEARANCE = 0.05, 0.30, 0.12  # [m] MIN_EDGE_DISTANCE, and `GroundCfg` of the tasks, as the next line
 DROP, RISE, MASS, FRICTION = (0.03, 0.20), (0.02, 0.08), (5.0, 100.0), (0.3, 1.0)  # [m], [m], [kg], [1]
 KINDS = {"platform": GroundCfg(platform=1.0), "block": GroundCfg(block=1.0)}
@@ -144,11 +144,11 @@ def test_a_block_extends_beyond_all_paws_at_the_goal_by_independent_distances(bl
     inside = block_starts.block_field("half") - outermost - block_starts.foot[has_block]  # [m] paws from the edges
     assert has_block.sum() > 500 and inside.min() >= MARGIN - 1e-4
     rows = np.arange(has_block.sum())
-    beside = inside[rows, 1 - block_starts.across[has_block]]
-    assert covers(beside, MARGIN, ROOM)
+    lateral = inside[rows, 1 - block_starts.across[has_block]]
+    assert covers(lateral, MARGIN, ROOM)
     far = np.abs(block_starts.block_field("center")) + block_starts.block_field("half")
     behind = far[rows, block_starts.across[has_block]] - block_starts.way[has_block] - block_starts.reach[has_block]
-    assert covers(behind, MARGIN, ROOM) and np.abs(np.corrcoef(behind, beside)[0, 1]) < 0.2
+    assert covers(behind, MARGIN, ROOM) and np.abs(np.corrcoef(behind, lateral)[0, 1]) < 0.2
 
 
 def test_robots_stand_on_the_floor_outside_the_block(block_starts):

@@ -193,7 +193,7 @@ def test_paws_of_a_push_are_at_rest_while_the_base_moves(env):
 
 
 def test_start_modes_take_their_fractions_of_policy_steps_whatever_their_episode_length():
-    """Jumps that begin standing last 3 s here, in flight 1.5 s, landed 1 s: of resets the fractions are others."""
+    """Jumps that begin standing last 3 s, in flight 1.5 s, landed 1 s, so fractions of resets and of steps differ."""
     length = np.array([180, 120, 90, 60, 60, 45])  # policy steps of an episode, by start mode
     task = make_task("horizontal-jump")
     env = make_env(64, task=task, seed=3)

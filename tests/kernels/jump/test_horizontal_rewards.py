@@ -34,7 +34,7 @@ reward = Table([term.func for term in TASK.rewards], float)
     [(0.0, 1.6), (0.03, E(-0.04) + 0.6 * E(-1.0)), (0.15, E(-1.0) + 0.6 * E(-25.0)), (0.30, E(-4.0))],
 )
 def test_tracking_has_a_wide_and_a_narrow_kernel_and_is_paid_after_takeoff(miss, expected):
-    # 3-4-5 beside the goal; the height does not matter
+    # horizontal miss by a 3-4-5 triangle; the height does not matter
     view = make_view(pos=(1.0 + 0.6 * miss, -2.0 + 0.8 * miss, 0.7))
     widths = {"std_wide": 0.15, "std_fine": 0.03, "fine_weight": 0.6}
     for phase in (FLIGHT, LANDED):
@@ -192,7 +192,7 @@ def test_a_logged_reward_term_equals_the_numpy_oracle(rollout, index):
 
 
 def test_lifted_again_counts_paws_in_the_air_after_their_own_first_contact():
-    """Of FL, FR, BL, BR: down; up for 0.1 s after it was down; up for 0.02 s; still to come down."""
+    """Paws: FL down; FR up for 0.1 s after contact; BL up for 0.02 s after contact; BR without contact yet."""
     view = make_view(contact=(1.0, 0.0, 0.0, 0.0), air_time=(0.0, 0.1, 0.02, 0.4))
     landed = make_episode(phase=LANDED, paws_landed=0b0111)
     assert reward("lifted_again", view, landed, threshold=0.05) == 1.0

@@ -108,7 +108,7 @@ def test_noise_has_the_papers_size_and_is_clamped_at_one_sigma(noise_samples):
     scaled, raw = noise_samples
     assert not raw[..., SCALES == 0.0].any()  # commanded height, command and last actions have no noise
     assert np.abs(scaled).max() <= 1.0 + 1e-4
-    # of a Gaussian, 31.7 % lie beyond one sigma; clamped, its variance is 0.5161; bounds: 4 standard errors
+    # 31.7 % of a Gaussian lie beyond one sigma; clamped, its variance is 0.5161; bounds: 4 standard errors
     cells = scaled.shape[0] * scaled.shape[1]
     assert np.mean(np.abs(scaled) > 0.9999, axis=(0, 1)) == pytest.approx(0.3173, abs=4.0 * 0.466 / math.sqrt(cells))
     assert scaled.std(axis=(0, 1)) == pytest.approx(math.sqrt(0.5161), abs=4.0 * 0.4 / math.sqrt(cells))

@@ -198,7 +198,7 @@ def test_no_state_collides_and_paws_are_not_under_the_ground(sampled):
 
 
 def test_colliding_samples_are_rejected(reset_with):
-    # bases so low that shanks lie on the ground, and thighs so far in that they meet
+    # bases so low that shanks lie on the ground, and thighs so far inward that they touch
     level = Level((0.0, 0.0, 0.5), (0.0, 0.0, 0.6), (0.10, 0.30))
     for reset in (only("standing"), only("in_flight", flight_transversal=(-30.0, 60.0))):
         env = reset_with(reset, level)

@@ -162,7 +162,7 @@ def test_paw_positions_of_default_pose_by_hand(build):
 def test_positive_lateral_angle_swings_paws_outward_about_the_hip(build):
     motors = np.tile(np.radians([90.0, 0.0, 0.0]), 4)[:, None]
     ankle = build.legs_at(motors)[0][:, 0]
-    # a quarter turn about the hip: out by the leg's 0.4716, and the plane's offset of 0.0602 now points up
+    # a quarter turn about the hip: out by the leg's 0.4716, and the plane's offset of 0.0602 points up
     assert ankle[:, 1] == pytest.approx([0.105 + 0.4716, -0.105 - 0.4716, 0.15 + 0.4716, -0.15 - 0.4716], abs=5.0e-5)
     assert ankle[:, 2] == pytest.approx(0.0602, abs=5.0e-5)
 
@@ -276,7 +276,7 @@ def test_reachable_flag_is_set_where_the_residual_is_below_10_micrometres(build)
 
 
 def test_target_below_reach_gives_stretched_leg(build):
-    # 0.1 m below the deepest point, 0.4716 below the axes in a plane 0.0602 beside the hip
+    # 0.1 m below the deepest point, 0.4716 below the axes in a plane 0.0602 outward of the hip
     geo = leg_geometry(load_description())[0]
     below = np.array(geo["hip"]) + [0.0967, 0.0602, -0.5716]
     motors, _, reachable, residual = build.solve(np.tile(below, (4, 1, 1)))
@@ -299,7 +299,7 @@ def test_every_pose_is_within_limits(build):
 def test_target_far_below_stretches_the_legs_under_the_hips(build, depth):
     motors, _, reachable, _ = build.solve(np.tile([0.0, 0.0, -depth], (4, 1, 1)))
     assert not reachable.any()
-    # the ankle, 0.4716 below and 0.0602 beside the hip in the housing, swings in below it by their ratio's angle
+    # the ankle, 0.4716 below and 0.0602 outward of the hip, swings below the hip by atan of their ratio
     np.testing.assert_allclose(motors[0::3], -math.atan2(0.0602, 0.4716), atol=math.radians(2.0))
     np.testing.assert_allclose(motors[1::3], 0.0, atol=math.radians(2.0))
     np.testing.assert_allclose(motors[2::3], 0.0, atol=math.radians(2.0))

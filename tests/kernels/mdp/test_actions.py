@@ -123,7 +123,7 @@ def test_a_nonfinite_action_counts_as_0_and_sets_bad_action(bad):
 
 
 def test_motors_follow_targets_delayed_by_the_latency_in_physics_steps():
-    """One world per latency; targets change in every policy step and are the default pose before the first."""
+    """Each world has its own latency; targets change in every policy step, and start at the default pose."""
     commands = Commands(len(DELAYS), delay=DELAYS)
     steps = 30
     actions = 0.2 * np.random.default_rng(0).uniform(-1.0, 1.0, (steps, 12))
@@ -157,7 +157,7 @@ def test_delayed_targets_are_right_at_step_counts_around_a_million():
 
 
 def test_simulated_motors_follow_delayed_targets():
-    """Oracle: the same robots advanced one physics step at a time with targets that the test delays."""
+    """The oracle advances the same robots by single physics steps with targets delayed in NumPy."""
     delays = np.array([0, 1, 7, 8, 13, 16, 31, 48])
     env, oracle = (make_env(len(delays), reset=only("default")) for _ in range(2))
     env.parameters.latency.assign(delays)

@@ -164,7 +164,7 @@ def test_a_reset_runs_an_interval_event_and_restarts_its_interval():
 
 
 def test_an_interval_without_a_reset_starts_with_the_first_step():
-    """This is the case of a world that was handed over to the skill."""
+    """A world without a reset is one that was handed over to the skill."""
     events, ran = Events("regular"), []
     for _ in range(7):
         events.next_clock()

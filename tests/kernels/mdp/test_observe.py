@@ -132,7 +132,7 @@ def test_a_reset_fills_the_history_with_the_new_frame_and_keeps_final_observatio
 
 
 def test_a_delayed_term_is_interpolated_linearly_between_past_frames(probe):
-    """One latency per world, 0 to 48 physics steps of 1/8 policy step; oracle: `np.interp`."""
+    """Worlds have latencies of 0 to 48 physics steps (1/8 policy step each); `np.interp` is the oracle."""
     latency = np.arange(N)
     probe.latency.assign(latency)
     values, others = sequence(24)

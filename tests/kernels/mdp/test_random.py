@@ -156,7 +156,7 @@ def test_neighbouring_worlds_and_columns_are_independent():
 
 
 def test_streams_rarely_share_a_seed():
-    """Of n = 4096 worlds times 64 step counts, n^2 / 2^33 = 8 pairs share one by chance."""
+    """By chance n^2 / 2^33 = 8 pairs share a seed, n = 4096 worlds times 64 step counts."""
     states = np.concatenate([samples(step_count=step_count, columns=1)[0] for step_count in range(16, 80)])
     pairs = len(states) - len(np.unique(states))
     assert pairs < 8 + 5 * math.sqrt(8)

@@ -296,7 +296,7 @@ def test_clear_history_sets_arrays_to_0_or_the_present_state(stage):
 
 
 def test_clear_history_writes_paw_positions_and_velocities_of_the_present_state():
-    """Oracle: `track_kernel` in the same state."""
+    """The oracle is `track_kernel` in the same state."""
     stage = Stage()
     stage.scramble()
     stage.clear_history(MASK)

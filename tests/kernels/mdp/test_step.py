@@ -6,10 +6,10 @@ from mdp_helpers import STEP_DT, write
 from probe_task import Probe, probe_task
 
 N = 64
-NAMES = ["first", "second", "third", "came_apart", "too_long"]  # terminations of the probe task
+NAMES = ["first", "second", "third", "diverged", "too_long"]  # terminations of the probe task
 FIRST, SECOND, THIRD, DIVERGED, LONG = range(5)
 NONE = -1
-GROWTH = 0.25  # of the state's value in a policy step
+GROWTH = 0.25  # increase of the state's value in a policy step
 
 
 @pytest.fixture
@@ -104,7 +104,7 @@ def test_sums_over_episodes_are_exact_beyond_single_precision(probe):
 
 
 def test_episode_reward_is_the_mean_sum_of_ended_episodes_over_the_time_limit(probe):
-    """Worlds 0 to 15 end in the third step, 16 to 31 do and had their episode restarted after the first one."""
+    """Worlds 0 to 31 end in the third step; episodes of worlds 16 to 31 were restarted after the first step."""
     rewards = []
     for step in range(3):
         state = random_state(probe, seed=step)
@@ -199,7 +199,7 @@ def make_diverge(probe, cause, world):
 
 @pytest.mark.parametrize("cause", ["diverged", "action", "fast", "nan"])
 @pytest.mark.parametrize("other", [0.0, 2.0e3])
-def test_a_diverged_world_ends_with_came_apart_and_reward_0(probe, cause, other):
+def test_a_diverged_world_ends_as_diverged_and_reward_0(probe, cause, other):
     probe.write(value=1.0, other=other)
     make_diverge(probe, cause, 3)
     probe.step()

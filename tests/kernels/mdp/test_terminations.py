@@ -6,7 +6,7 @@ import pytest
 from jump_helpers import DEG, Table, functions, make_episode, make_view, tilted_by
 from jumper_warp.kernels.mdp import terminations
 
-holds = Table(functions(terminations, "too_long came_apart low_base tilted collided"), bool)
+holds = Table(functions(terminations, "too_long diverged low_base tilted collided"), bool)
 """holds(name, view, episode, **numbers): whether a termination holds."""
 
 
@@ -32,8 +32,8 @@ def test_too_long_holds_from_its_number_of_policy_steps_on():
         ({"angle": np.where(np.arange(12) == 7, math.nan, 0.0)}, True),
     ],
 )
-def test_came_apart_holds_beyond_speed_limits_and_for_nonfinite_values(robot, diverged):
-    assert holds("came_apart", make_view(**robot), make_episode()) is diverged
+def test_diverged_holds_beyond_speed_limits_and_for_nonfinite_values(robot, diverged):
+    assert holds("diverged", make_view(**robot), make_episode()) is diverged
 
 
 def test_low_base_compares_the_height_above_the_ground_below():

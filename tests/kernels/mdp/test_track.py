@@ -85,7 +85,7 @@ def seen_kernel(
 
 
 def paw_view(robot, sim):
-    """Return of each robot's view: contact (n, 4), first contact (n, 4), number of contacts (n,), collisions (n,)."""
+    """Return contact (n, 4), first contact (n, 4), number of contacts (n,) and collisions (n,) of the `RobotView`s."""
     n, ground = robot.diverged.shape[0], sim.physics.dynamics.robot.ground
     arrays = [wp.zeros(n, dtype=kind, device="cpu") for kind in (wp.vec4, wp.vec4, int, int)]
     wp.launch(seen_kernel, n, [robot, ground, *arrays], device="cpu")
@@ -100,7 +100,7 @@ def set_paw_forces(robot, down, force=50.0):
 
 
 def test_times_and_first_contacts_follow_a_scripted_gait(sim, robots):
-    """The paws: always down, always in the air, landing twice, bouncing every step; tables are (leg, policy step)."""
+    """Paws are always down, always in the air, land twice, or bounce every step; tables are (leg, policy step)."""
     script = np.array([[1, 1, 1, 1, 1, 1, 1, 1], [0, 0, 0, 0, 0, 0, 0, 0], [0, 0, 1, 1, 1, 0, 0, 1],
                        [0, 1, 0, 1, 0, 1, 0, 1]])  # fmt: skip
     contact_steps = [[1, 2, 3, 4, 5, 6, 7, 8], [0] * 8, [0, 0, 1, 2, 3, 0, 0, 1], [0, 1, 0, 1, 0, 1, 0, 1]]

@@ -1,15 +1,15 @@
-"""Plots: errors below sweeps, intervals, outlines of grounds, legends beside the data."""
+"""Plots: errors below sweeps, intervals, outlines of grounds, legends outside the data."""
 
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
 
-from jumper_warp.evaluation import plots
+from jumper_warp.viz import plots
 
 
 @pytest.fixture
 def drawn(monkeypatch, tmp_path):
-    """Function that calls a plotting function with a path, and returns the axes of its figure."""
+    """Return a function that calls a plotting function with a path and returns the axes of the plot."""
     figures = []
     monkeypatch.setattr(plt, "close", figures.append)
 
@@ -66,12 +66,6 @@ def test_interval_of_running_mean_has_the_width_of_the_standard_error():
     assert low == pytest.approx(high, rel=0.3)
 
 
-def test_rate_interval_is_wilsons():
-    good = np.arange(10) < np.array([[0], [5], [10]])
-    expected = [[0.0, 0.5, 1.0], [0.0, 0.2366, 0.7225], [0.2775, 0.7634, 1.0]]  # Wilson 1927, 10 trials
-    np.testing.assert_allclose(plots.rate_interval(good), expected, atol=1e-4)
-
-
 def test_landings_show_outline_of_a_platform_and_failures(drawn):
     goals, good = np.array([[0.8, 0.0], [1.2, 0.1]]), np.array([True, False])
     corners = np.array([[(-1.0, -1.0), (0.4, -1.0), (0.4, 1.0), (-1.0, 1.0)]])
@@ -99,7 +93,7 @@ def test_legend_is_below_the_axes_and_names_labels_once(drawn):
     assert legend.get_window_extent().y1 <= min(axis.get_tightbbox().y0 for axis in axes) + 1.0
 
 
-def test_figures_have_the_style_of_the_sheet_and_leave_others_alone(drawn):
+def test_plots_have_the_projects_style_and_do_not_change_other_plots(drawn):
     before = plt.rcParams["axes.grid"], plt.rcParams["font.size"]
     (top, *_) = sweep(drawn, np.zeros(10), np.ones(10, dtype=bool))
     assert not top.spines["top"].get_visible() and top.xaxis.label.get_size() == 12.0

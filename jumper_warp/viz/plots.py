@@ -1,4 +1,4 @@
-"""Plots that several experiments and suites share; they take plain arrays, and have the style `STYLE`."""
+"""Common plots of experiments and suites, from plain arrays, in the style `STYLE`."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from typing import Any
 import matplotlib
 import numpy as np
 
-from jumper_warp.evaluation.jumps import JumpLog
+from jumper_warp.utils.metrics import rate
 from jumper_warp.viz.style import ACTUAL_COLOR, GOAL_COLOR
 
 matplotlib.use("Agg")
@@ -28,9 +28,9 @@ WINDOW, MOST_WINDOWS, RESAMPLES = (5, 40), 100, 1000
 
 @contextmanager
 def figure(path: Path, *shape: int, title: str = "", conditions: str = "", **settings: Any) -> Iterator[Any]:
-    """Yield the axes of a new figure; on exit, add a legend below it and write it to `path`.
+    """Yield the axes of a new plot; on exit, add a common legend below the axes and write the plot to `path`.
 
-    The legend has the labels of all axes without a legend of their own. title, conditions: lines above the axes; shape,
+    The legend has the labels of all axes without their own legend. title, conditions: lines above the axes; shape,
     settings: arguments of `plt.subplots`.
     """
     with plt.style.context(STYLE):
@@ -49,7 +49,7 @@ def figure(path: Path, *shape: int, title: str = "", conditions: str = "", **set
 
 @dataclass(frozen=True)
 class Published:
-    """Results that the paper prints for a sweep."""
+    """Results of a sweep in the paper, to be plotted."""
 
     mean_error: float  # [m] Mean error in simulation
     robot: tuple[tuple[float, float, float], ...]
@@ -62,9 +62,9 @@ def plot_sweep(
     limit: np.ndarray | None = None, trained: Mapping[str, Sequence[float]] | None = None,
     labels: tuple[str, str], marks: tuple[str, str], title: str, conditions: str,
 ) -> None:  # fmt: skip
-    """Plot reached over commanded values, and below them the errors with their running mean.
+    """Plot reached over commanded values of a sweep, and below them the errors with their running mean.
 
-    Errors beyond the lower axes are marked at its edge.
+    Errors beyond the range of the lower axes are marked at its edge.
 
     commanded, reached [m], good (bool, success): (jumps,) each; tolerance [m]: largest error of a success; limit [m]:
     apexes of open-loop jumps of the same robots, (jumps,); trained [m]: ranges of commands by label; labels: of the
@@ -104,7 +104,7 @@ def plot_sweep(
 
 
 def plot_robot(axis: Any, jumps: Sequence[tuple[float, float, float]], *, ideal: bool) -> None:
-    """Mark jumps of the paper's robot (`Published.robot`); ideal: over the commands instead of over zero."""
+    """Plot jumps of the paper's robot (`Published.robot`); ideal: reached values instead of errors."""
     command, error, size = np.array(jumps).T
     style = {"color": "C1", "markersize": 8.0, "markeredgecolor": "black", "capsize": 3.0, "zorder": 3}
     axis.errorbar(command, error + ideal * command, yerr=size, fmt="*", label="paper, robot", **style)
@@ -172,14 +172,15 @@ def plot_distances(
 ) -> None:  # fmt: skip
     """Plot success rates and mean errors of bins of distances, with their 95 % intervals.
 
-    distances [m]: of the bins' middles; successes (bool) by label, errors [m] (NaN: not counted): (bins, jumps) each;
+    distances [m]: middles of the bins; successes (bool) by label, errors [m] (NaN: not counted): (bins, jumps) each;
     reliable [1]: rate of a reliable distance; published [m]: distances of other works, by name.
     """
     settings = {"figsize": (8.0, 7.5), "sharex": True, "title": "Jumps to far goals", "conditions": conditions}
     with figure(path, 2, 1, height_ratios=(3, 2), **settings) as (top, bottom):
         for marker, (label, good) in zip("o^s", successes.items(), strict=False):
-            rate, low, high = rate_interval(good)
-            top.plot(distances, 100.0 * rate, marker=marker, label=label)
+            rates = [rate(row) for row in good]
+            low, high = np.transpose([value.interval for value in rates])
+            top.plot(distances, [100.0 * value.value for value in rates], marker=marker, label=label)
             top.fill_between(distances, 100.0 * low, 100.0 * high, alpha=0.15)
         top.axhline(100.0 * reliable, color="0.5", linestyle="--", linewidth=1.0, label="reliable")
         for work, distance in published.items():
@@ -193,38 +194,10 @@ def plot_distances(
         bottom.set(xlabel="commanded distance [m]", ylabel="error of successes [m]", ylim=(0.0, None))
 
 
-def rate_interval(good: np.ndarray) -> np.ndarray:
-    """Return the rates of true values (bins, trials) with the limits of Wilson's 95 % interval, (3, bins)."""
-    n, rate, z = good.shape[1], good.mean(axis=1), 1.96
-    center, half = rate + z**2 / (2 * n), z * np.sqrt(rate * (1.0 - rate) / n + (z / (2 * n)) ** 2)
-    return np.stack([rate, (center - half) / (1.0 + z**2 / n), (center + half) / (1.0 + z**2 / n)])
-
-
-class BasePaths:
-    """Recorder of the path of every base; call the object after every policy step."""
-
-    def __init__(self) -> None:
-        self.positions: list[np.ndarray] = []  # [m] x, y of every base, one array (worlds, 2) per step, world frame
-
-    def __call__(self, landings: JumpLog) -> None:
-        """Append the present base positions; NaN for worlds whose last jump has ended."""
-        running = landings.current < landings.goals.shape[1]
-        self.positions.append(np.where(running[:, None], landings.arrays["base_pos"][:, :2], np.nan))
-
-    def in_start_frame(self, headings: np.ndarray) -> np.ndarray:
-        """Return the paths [m], (worlds, steps, 2), ahead and to the left of the world's origin.
-
-        headings [rad]: of the robots at the start, (worlds,).
-        """
-        x, y = np.moveaxis(np.stack(self.positions, axis=1), -1, 0)
-        cos, sin = np.cos(headings)[:, None], np.sin(headings)[:, None]
-        return np.stack([cos * x + sin * y, cos * y - sin * x], axis=-1)
-
-
 def plot_paths(path: Path, paths: dict[str, np.ndarray], goals: Mapping[str, Sequence], conditions: str) -> None:
-    """Plot base paths from above, one panel per test, with the goals of tests in which all robots have the same.
+    """Plot base paths from above, one panel per test, and the goals of tests in which all robots have equal goals.
 
-    paths [m]: by test, of `BasePaths.in_start_frame`; goals [m]: by test, (jumps, 2), each relative to the one before.
+    paths [m]: result of `BasePaths.in_start_frame` by test; goals [m]: by test, (jumps, 2), each relative to the last.
     """
     limits = [path_limits(values) for values in paths.values()]
     height = 6.2 * sum(np.ptp(y) / np.ptp(x) for x, y in limits)
@@ -242,7 +215,7 @@ def plot_paths(path: Path, paths: dict[str, np.ndarray], goals: Mapping[str, Seq
 
 
 def path_limits(paths: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the limits [m] of both axes around paths [m], (paths, steps, 2), at least a fifth as high as wide."""
+    """Return the limits [m] of both axes around paths [m], (paths, steps, 2); the height is at least width / 5."""
     low, high = (limit(paths, axis=(0, 1)) for limit in (np.nanmin, np.nanmax))
     middle, size = 0.5 * (low + high), np.maximum(1.1 * (high - low), 0.2)
     size[1] = max(size[1], 0.2 * size[0])
