@@ -111,7 +111,7 @@ def test_checkpoint_of_another_observation_layout_is_refused(trained, tmp_path):
     path = tmp_path / "model_7.pt"
     path.write_bytes((trained[0] / "model_1.pt").read_bytes())
     adapter("attitude").write_config(tmp_path)
-    with pytest.raises(PolicyError, match="its configuration asks for"):
+    with pytest.raises(PolicyError, match="must have the configured shape"):
         open_policy(path)
 
 
