@@ -263,7 +263,7 @@ def test_vector_wrapper_works_in_the_modes_that_gymnasium_has_it_for(name, mode,
         pytest.importorskip(module)
     if name in CONVERSIONS and mode is AutoresetMode.SAME_STEP:
         pytest.skip("converts no arrays of objects, which final_obs is in Gymnasium; there is tensors=True")
-    film = {"render_mode": "rgb_array", "render_size": (64, 48)} if name == "RecordVideo" else {}
+    film = {"render_mode": "rgb_array", "render_size": (64, 48), "render_envs": 2} if name == "RecordVideo" else {}
     envs = vector(mode, all_groups=name in ("FilterObservation", "FlattenObservation"), **film)
     arguments = dict(WRAPPERS[name])
     if name == "ReshapeObservation":
