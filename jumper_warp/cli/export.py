@@ -26,7 +26,12 @@ class ExportCfg:
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Run `jumper export` with the given arguments; raises as `export`. modules: unused."""
+    """Run `jumper export` or `jumper export robot`; raises as `export` or `export_robot`. modules: unused."""
+    if args[:1] == ["robot"]:
+        from jumper_warp.cli import export_robot
+
+        export_robot.run(args[1:])
+        return
     export(parse(ExportCfg, "export", args))
 
 

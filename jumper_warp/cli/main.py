@@ -22,7 +22,7 @@ COMMANDS = {
     "finetune": "Make a jumping policy miss by less, by gradients through the physics.",
     "play": "Record a policy for the Rerun viewer.",
     "evaluate": "Measure a policy over many trials.",
-    "export": "Make a policy's folder of a training run, or one ONNX file of a policy.",
+    "export": "Make a policy's folder of a training run, or one ONNX file of a policy; export robot: MJCF, URDF, USD.",
     "sysid": "Identify the robot's parameters from recorded motions.",
     "list": "Show the tasks and the project's policies.",
 }

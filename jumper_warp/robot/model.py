@@ -31,6 +31,7 @@ CONTACT_DAMPING = 476.0
 """Contact `ke` [N/m] and `kd` [N s/m]: MuJoCo's solref becomes (2 / kd, kd / (2 sqrt(ke))), critically damped over two
 physics steps. Softer contacts cost jump height."""
 CONTACT_IMPEDANCE = (0.95, 0.99, 0.001, 0.5, 2.0)  # MuJoCo's solimp: dmin, dmax, width [m], midpoint, power
+LOOP_IMPEDANCE = (0.99, 0.999, 0.001, 0.5, 2.0)  # MuJoCo's solimp of the ankles' loops
 GROUND_FRICTION = 1.0e-4  # [1] Nearly 0: a contact uses the larger of its two coefficients, here the paw's
 MAX_FRICTION = 10.0  # [1] Largest coefficient of the paws, ten times that of rubber on concrete
 GROUND_COLOR = (0.42, 0.46, 0.48)  # red, green, blue, 0 to 1

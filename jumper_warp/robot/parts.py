@@ -34,10 +34,11 @@ def require(holds: bool, file: Path, part: str, problem: str) -> None:
 
 @dataclass(frozen=True, eq=False)
 class TriangleMesh:
-    """Triangle mesh of a shape."""
+    """Triangle mesh that an OBJ file holds."""
 
     vertices: np.ndarray  # (n, 3) [m], shape frame
     triangles: np.ndarray  # (m, 3) int32, indices of vertices
+    file: Path  # OBJ file
 
 
 @dataclass(frozen=True, eq=False)
@@ -155,6 +156,11 @@ class RobotDescription:
         """Return the motor angles (12,) [rad] of a named pose, in motor order. Raises KeyError."""
         lateral, transversal = self.poses[name]
         return np.tile([lateral, transversal, transversal], 4)
+
+
+def mesh_files(robot: RobotDescription) -> set[Path]:
+    """Return the files of all meshes of a robot's visual shapes."""
+    return {shape.mesh.file for link in robot.links for shape in link.visuals if shape.mesh is not None}
 
 
 def make_read_only(part: Any) -> None:

@@ -14,7 +14,8 @@ import numpy as np
 import pinocchio
 
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS, RobotDescription, load_description
-from jumper_warp.robot.values import LINK_KINDS, RobotValues
+from jumper_warp.robot.urdf_writer import urdf
+from jumper_warp.robot.values import RobotValues, described
 from jumper_warp.utils.errors import InputError
 
 pin: Any = pinocchio  # a compiled module without types
@@ -151,12 +152,12 @@ def build_pinocchio(description: RobotDescription | None = None, values: RobotVa
     """
     description = load_description() if description is None else description
     values = RobotValues.nominal(1, description) if values is None else values
-    model = pin.buildModelFromXML(description.urdf, pin.JointModelFreeFlyer())
-    _write_masses(model, description, values)
+    robot = described(values, description)
+    model = pin.buildModelFromXML(urdf(robot), pin.JointModelFreeFlyer())
     joints = [model.joints[model.getJointId(name)] for name in MOTOR_JOINTS]
     knees = [model.joints[model.getJointId(f"{leg}_{bar}_knee")] for leg in LEGS for bar in ("outer", "inner")]
     armature = np.zeros(model.nv)
-    armature[[joint.idx_v for joint in joints]] = values.armature[0]
+    armature[[joint.idx_v for joint in joints]] = [motor.armature for motor in robot.motors]
     model.armature = armature
     constraints = pin.StdVec_RigidConstraintModel()
     constraint_data = pin.StdVec_RigidConstraintData()
@@ -178,15 +179,3 @@ def build_pinocchio(description: RobotDescription | None = None, values: RobotVa
         knee_q=np.array([knee.idx_q for knee in knees]),
         knee_v=np.array([knee.idx_v for knee in knees]),
     )
-
-
-def _write_masses(model: Any, description: RobotDescription, values: RobotValues) -> None:
-    """Write masses, centres of mass and inertias of the first robot in `values` into a Pinocchio model."""
-    base, ratio = description.links[0], values.base_mass[0, 0] / description.links[0].mass
-    inertia = ratio * values.base_inertia[0, 0] * base.inertia
-    model.inertias[1] = pin.Inertia(values.base_mass[0, 0], values.base_com[0], inertia)
-    ratios: dict[str, float] = dict(zip(LINK_KINDS, values.link_mass[0], strict=True))
-    for joint in description.joints:
-        link, scale = description.link(joint.child), ratios[joint.child[3:]]
-        link_inertia = pin.Inertia(scale * link.mass, link.com, scale * link.inertia)
-        model.inertias[model.getJointId(joint.name)] = link_inertia

@@ -220,7 +220,7 @@ def read_obj(file: Path) -> TriangleMesh:
     require(between, file, "", f"expected triangles between the {len(vertices)} vertices")
     points = np.array(vertices)
     require(bool(np.isfinite(points).all()), file, "", "expected finite vertices")
-    return TriangleMesh(points, np.array(triangles, dtype=np.int32))
+    return TriangleMesh(points, np.array(triangles, dtype=np.int32), file)
 
 
 def quat_from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:

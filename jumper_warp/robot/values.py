@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from jumper_warp.robot.description import RobotDescription, load_description
+from jumper_warp.robot.description import MOTOR_JOINTS, RobotDescription, load_description
+from jumper_warp.robot.parts import Gains, Motor
 
 LINK_KINDS = ("housing", "outer_thigh", "outer_shank", "inner_thigh", "inner_shank")
 """Kinds of a leg's links; the four links of a kind share one mass ratio."""
@@ -65,3 +67,41 @@ class RobotValues:
             spring_length=np.zeros(1),
         )
         return cls(**{name: np.tile(value, (count, 1)) for name, value in vars(single).items()})
+
+
+def described(values: RobotValues, description: RobotDescription) -> RobotDescription:
+    """Return a description with the masses, motors and knee damping of the first robot of `values`.
+
+    A motor joint's speed limit becomes the no-load speed, its effort limit is scaled by `saturation`. The URDF text is
+    kept. A description has no place for friction of the paws, springs, sensor offsets and latency.
+    """
+    base = description.links[0]
+    ratios: dict[str, float] = dict(zip(LINK_KINDS, map(float, values.link_mass[0]), strict=True))
+    scale = values.base_mass[0, 0] / base.mass * values.base_inertia[0, 0]
+    links = [replace(base, mass=float(values.base_mass[0, 0]), com=values.base_com[0], inertia=scale * base.inertia)]
+    for link in description.links[1:]:
+        ratio = ratios[link.name[3:]]
+        links.append(replace(link, mass=ratio * link.mass, inertia=ratio * link.inertia))
+    motors, joints = [], {joint.name: joint for joint in description.joints}
+    for index, (name, motor) in enumerate(zip(MOTOR_JOINTS, description.motors, strict=True)):
+        value = {quantity: float(getattr(values, quantity)[0, index]) for quantity in MOTOR_QUANTITIES}
+        motors.append(_described_motor(motor, value))
+        effort = value["saturation"] * joints[name].effort
+        joints[name] = replace(joints[name], effort=effort, velocity=value["no_load_speed"])
+    damping = float(values.knee_damping[0, 0])
+    parts = {"links": tuple(links), "joints": tuple(joints.values()), "motors": tuple(motors)}
+    return replace(description, **parts, knee_damping=damping)
+
+
+def _described_motor(motor: Motor, value: Mapping[str, float]) -> Motor:
+    """Return a motor with one robot's armature, friction, gains and speeds; value: by name in `MOTOR_QUANTITIES`."""
+    jumping, walking = (Gains(value["kp"] * pd.kp, value["kd"] * pd.kd) for pd in (motor.jumping, motor.walking))
+    return replace(
+        motor,
+        rotor_inertia=value["armature"] / motor.gear_ratio**2,
+        coulomb_friction=value["motor_friction"],
+        no_load_speed=value["no_load_speed"],
+        cutoff_speed=value["cutoff_speed"],
+        jumping=jumping,
+        walking=walking,
+    )

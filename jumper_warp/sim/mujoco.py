@@ -5,7 +5,7 @@ import math
 import newton
 import warp as wp
 
-from jumper_warp.robot.model import PAWS, PHYSICS_DT, other_colliders
+from jumper_warp.robot.model import LOOP_IMPEDANCE, PAWS, PHYSICS_DT, other_colliders
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
 
@@ -19,8 +19,11 @@ def mujoco_solver(model: Model, *, dt: float = PHYSICS_DT, **overrides) -> newto
     MuJoCo has neither a damper with a torque limit nor a stop of the sum of two angles: here the knees' damping is
     unlimited and outer + inner has no stop. `Simulation` adds both as torques (`kernels.actuation.passive`).
 
-    overrides: arguments of `newton.solvers.SolverMuJoCo`. Raises InputError: paw friction below `MUJOCO_FRICTION`.
+    overrides: arguments of `newton.solvers.SolverMuJoCo`. Raises InputError: paw friction below `MUJOCO_FRICTION`, or
+    `save_to_mjcf`, whose file has open loops: it anchors them where the joint angles are 0.
     """
+    if overrides.get("save_to_mjcf"):
+        raise InputError("save_to_mjcf writes open loops; use: jumper export robot --format mjcf --out FOLDER")
     paws = [index for index, label in enumerate(model.shape_label) if label.split("/")[-1] in PAWS]
     friction = model.shape_material_mu.numpy()[paws].min(initial=math.inf)
     if not friction >= MUJOCO_FRICTION:
@@ -39,6 +42,6 @@ def mujoco_solver(model: Model, *, dt: float = PHYSICS_DT, **overrides) -> newto
     solver.mjw_model.opt.warn_overflow = 0
     solver.mjw_model.eq_solref.fill_(wp.vec2(2.0 * dt, 1.0))
     impedance = solver.mjw_model.eq_solimp.numpy()
-    impedance[:] = (0.99, 0.999, 0.001, 0.5, 2.0)  # of the loops: dmin, dmax, width [m], midpoint, power
+    impedance[:] = LOOP_IMPEDANCE
     solver.mjw_model.eq_solimp.assign(impedance)
     return solver

@@ -1,0 +1,58 @@
+"""The robot as files of other simulators: MJCF, URDF with its loops, or USD."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Literal
+
+from jumper_warp.robot.description import RobotDescription, load_description
+from jumper_warp.robot.mjcf import mjcf
+from jumper_warp.robot.model import standing_configuration
+from jumper_warp.robot.overlay import RobotOverlay
+from jumper_warp.robot.parts import mesh_files
+from jumper_warp.robot.urdf_writer import loop_closures, urdf
+from jumper_warp.robot.usd import write_usd
+from jumper_warp.robot.values import RobotValues, described
+from jumper_warp.utils.files import write_atomically
+
+RobotFormat = Literal["mjcf", "urdf", "usd"]
+LOST = {
+    "mjcf": ("offset", "latency", "no_load_speed", "cutoff_speed"),
+    "urdf": ("offset", "latency", "cutoff_speed", "kp", "kd", "armature", "motor_friction", "knee_damping",
+             "paw_friction", "spring_stiffness", "spring_length"),
+    "usd": ("offset", "latency", "cutoff_speed", "spring_stiffness", "spring_length"),
+}  # fmt: skip
+"""Quantities of an overlay that a format has no place for, by format."""
+
+
+def export_robot(
+    kind: RobotFormat, folder: Path, overlay: RobotOverlay | None = None, description: RobotDescription | None = None
+) -> Path:
+    """Write the robot's file and what belongs beside it to a folder, and return the file's path.
+
+    Existing files are replaced. overlay: values that replace those of the description, by default the project's.
+    Raises InputError: USD without the package `usd-core`; OSError: the folder cannot be written.
+    """
+    description = load_description() if description is None else description
+    values = RobotValues.nominal(1, description) if overlay is None else overlay.robots(description)
+    robot = described(values, description)
+    if kind == "usd":
+        return write_usd(folder / "jumper.usda", robot, float(values.paw_friction[0, 0]))
+    meshes = folder / "meshes"
+    meshes.mkdir(parents=True, exist_ok=True)
+    for file in mesh_files(robot):
+        shutil.copyfile(file, meshes / file.name)
+    if kind == "mjcf":
+        path, text = folder / "jumper.xml", mjcf(description, values)
+    else:
+        path, text = folder / "jumper.urdf", description.urdf if overlay is None else urdf(robot)
+        write_atomically(folder / "loop_closures.yaml", loop_closures(robot, standing_angles(robot)).encode())
+    write_atomically(path, text.encode())
+    return path
+
+
+def standing_angles(robot: RobotDescription) -> dict[str, float]:
+    """Return the angle [rad] of each joint in the standing default pose, by name."""
+    angles = standing_configuration(robot)[7 : 7 + len(robot.joints)]
+    return {joint.name: float(angle) for joint, angle in zip(robot.joints, angles, strict=True)}

@@ -1,0 +1,67 @@
+"""The URDF of a robot whose masses or motors differ from the described ones, and the loops that a URDF cannot hold."""
+
+from __future__ import annotations
+
+from xml.etree.ElementTree import Element, TreeBuilder, XMLParser, fromstring, tostring
+
+import numpy as np
+
+from jumper_warp.robot.parts import Joint, Link, RobotDescription
+
+LOOPS_HEADER = """\
+# Loops of the robot Jumper, which a URDF cannot hold. In each of them two points coincide, as in a ball joint.
+# links: the bodies. joints: the URDF joints that move them, of which the loop determines the two knees.
+# points: [m], each in the frame of its link, which is the frame of its joint's child in the URDF.
+# At joint angles of 0 the loops are open. default_pose: joint angles [rad] that close them, standing.
+"""
+
+
+def urdf(robot: RobotDescription) -> str:
+    """Return the URDF's text with the masses, inertias and motor limits of `robot`; its comments are kept."""
+    root = fromstring(robot.urdf, XMLParser(target=TreeBuilder(insert_comments=True)))
+    for element in root.findall("link"):
+        _write_inertial(_child(element, "inertial"), robot.link(element.get("name", "")))
+    for element in root.findall("joint"):
+        _write_limit(_child(element, "limit"), robot.joint(element.get("name", "")))
+    return f'<?xml version="1.0"?>\n{tostring(root, encoding="unicode")}\n'
+
+
+def _child(element: Element, tag: str) -> Element:
+    """Return the child of a checked URDF's element with a tag."""
+    return next(element.iter(tag))
+
+
+def _write_inertial(inertial: Element, link: Link) -> None:
+    """Write mass [kg], centre of mass [m] and moments of inertia [kg m^2] to an <inertial> element."""
+    _child(inertial, "mass").set("value", repr(float(link.mass)))
+    _child(inertial, "origin").set("xyz", " ".join(repr(float(x)) for x in link.com))
+    moments = _child(inertial, "inertia")
+    for key in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"):
+        row, column = ("xyz".index(axis) for axis in key[1:])
+        moments.set(key, repr(float(link.inertia[row, column])))
+
+
+def _write_limit(limit: Element, joint: Joint) -> None:
+    """Write torque [N m] and speed [rad/s] to a <limit> element."""
+    limit.set("effort", repr(float(joint.effort)))
+    limit.set("velocity", repr(float(joint.velocity)))
+
+
+def loop_closures(robot: RobotDescription, pose: dict[str, float]) -> str:
+    """Return the loops as YAML text. pose: angle [rad] of each joint in the standing pose, by name."""
+    moved_by = {joint.child: joint.name for joint in robot.joints}
+    lines = [LOOPS_HEADER + "loops:"]
+    for loop in robot.loops:
+        lines += [
+            f"  - name: {loop.name}",
+            f"    links: [{loop.parent}, {loop.child}]",
+            f"    joints: [{moved_by[loop.parent]}, {moved_by[loop.child]}]",
+            f"    points: [{_numbers(loop.parent_anchor)}, {_numbers(loop.child_anchor)}]",
+        ]
+    lines += ["default_pose:", *(f"  {name}: {angle:.12g}" for name, angle in pose.items())]
+    return "\n".join(lines) + "\n"
+
+
+def _numbers(values: np.ndarray) -> str:
+    """Return numbers as a YAML list."""
+    return f"[{', '.join(f'{float(value):.12g}' for value in values)}]"
