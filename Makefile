@@ -1,14 +1,16 @@
 # make demo   the open-loop jump, 200 vertical and 200 horizontal jumps of the shipped policies, and one jump with a film:
 #             metrics, plots, pictures and recordings in outputs/demo, in about a minute
 # make test   all tests, and the import rules
+# make clients  tests/clients with TorchRL, skrl, OpenVINO and W&B too, which it installs into .venv-clients
 # make lint   style, format, words, import rules and types
 # Each makes .venv/ first if it is missing or older than pyproject.toml or constraints.txt.
 
 PYTHON ?= python3
 VENV := .venv
+CLIENTS := .venv-clients
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test lint clean
+.PHONY: demo test clients lint clean
 .DELETE_ON_ERROR:
 
 demo: $(STAMP)
@@ -18,6 +20,12 @@ test: $(STAMP)
 	$(VENV)/bin/lint-imports --no-logo
 	$(VENV)/bin/python -m pytest --numprocesses auto --dist loadfile
 
+clients:
+	$(PYTHON) -m venv $(CLIENTS)
+	$(CLIENTS)/bin/python -m pip install -c constraints.txt -e ".[dev]"
+	$(CLIENTS)/bin/python -m pip install "torchrl==0.14.1" "skrl==2.1.1" "openvino==2026.4.1" "wandb==0.31.0"
+	$(CLIENTS)/bin/python -m pytest tests/clients
+
 lint: $(STAMP)
 	$(VENV)/bin/ruff check .
 	$(VENV)/bin/ruff format --check .
@@ -26,7 +34,7 @@ lint: $(STAMP)
 	$(VENV)/bin/basedpyright --pythonpath $(VENV)/bin/python
 
 clean:
-	rm -rf $(VENV)
+	rm -rf $(VENV) $(CLIENTS)
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

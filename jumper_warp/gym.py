@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Any, NoReturn
+from typing import Any
 
 import gymnasium
 
 from jumper_warp.envs.env import Env
-from jumper_warp.envs.gymnasium import GymVectorEnv
+from jumper_warp.envs.gymnasium import GymEnv, GymVectorEnv
 from jumper_warp.registry import TASKS, make_task
-from jumper_warp.utils.errors import InputError
 
-ADAPTER = ("all_groups", "tensors", "render_mode", "render_size", "render_envs")  # arguments of `GymVectorEnv`
+ADAPTER = ("all_groups", "tensors", "autoreset_mode", "render_mode", "render_size", "render_envs")
+"""Arguments of `GymVectorEnv`."""
 
 
 def make_vector_env(task: str, num_envs: int = 1, **arguments: Any) -> GymVectorEnv:
@@ -23,9 +23,13 @@ def make_vector_env(task: str, num_envs: int = 1, **arguments: Any) -> GymVector
     return GymVectorEnv(Env(make_task(task), num_envs, **arguments), **adapter)
 
 
-def refuse_single_env(task: str, **arguments: Any) -> NoReturn:
-    """Raise InputError that recommends `gymnasium.make_vec`; `gymnasium.make` calls this entry point."""
-    raise InputError(f"robots come as a vector: gymnasium.make_vec({env_id(task)!r}, num_envs=1), not gymnasium.make")
+def make_env(task: str, **arguments: Any) -> GymEnv:
+    """Return an environment of a task with one world; arguments: of `GymEnv` and of `Env`.
+
+    Raises InputError: an unknown task, or arguments that `Env` or `GymEnv` refuses.
+    """
+    adapter = {name: arguments.pop(name) for name in ADAPTER if name in arguments}
+    return GymEnv(Env(make_task(task), 1, **arguments), **adapter)
 
 
 def env_id(task: str) -> str:
@@ -39,7 +43,7 @@ def register_envs() -> None:
         if env_id(task) not in gymnasium.registry:
             gymnasium.register(
                 env_id(task),
-                "jumper_warp.gym:refuse_single_env",
+                "jumper_warp.gym:make_env",
                 vector_entry_point="jumper_warp.gym:make_vector_env",
                 kwargs={"task": task},
             )

@@ -40,6 +40,7 @@ class TaskEntry:
     aliases: tuple[str, ...] = ()  # other names of the task
     best_metric: str = "Metrics/success"  # Default metric of the log whose largest value selects the best checkpoint
     about: str = ""  # What the robot does, in a few words, for `jumper list`; default: the factory's first sentence
+    presets: dict[str, str] = field(default_factory=dict)  # Groups of flags of `jumper train` by name, such as `laptop`
 
     @property
     def origin(self) -> str:
@@ -85,13 +86,22 @@ ON_MARS = replace(HEIGHTS, symmetry="actor")
 PLACES = PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")  # Training of jumps to goal positions
 TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5, symmetry="actor")  # Training of turning in flight
 
+NOMINAL = "--no-randomize --no-noise --history 1 --ppo.hidden 128 64 64"
+"""Flags of trainings on two CPU cores: no randomisation, no noise, a short observation and a small network."""
+LAPTOP_JUMP = f"{NOMINAL} --num-envs 1024 --env.curriculum.promote-after 2 --ppo.desired-kl 0.02"
+LAPTOP_WALK = f"{NOMINAL} --num-envs 512 --ppo.symmetry off --ppo.desired-kl 0.02 --ppo.minibatches 4"
+
 TASKS: dict[str, TaskEntry] = {
     "vertical-jump": TaskEntry(
         "jumper_warp.tasks.jump.vertical:vertical_jump", HEIGHTS, ("Olympus-Vertical-Jump",), about="jump to a height",
+        presets={
+            "laptop": f"{LAPTOP_JUMP} --ppo.final-desired-kl 0.005 --ppo.entropy-coef 0.0003 --max-seconds 330"
+        },
     ),
     "horizontal-jump": TaskEntry(
         "jumper_warp.tasks.jump.horizontal:horizontal_jump", PLACES, ("Olympus-Horizontal-Jump",),
         about="jump to a place ahead",
+        presets={"laptop": f"{LAPTOP_JUMP} --ppo.final-desired-kl 0.005 --max-seconds 680"},
     ),
     "horizontal-jump-slippery": TaskEntry(
         "jumper_warp.tasks.jump.horizontal:horizontal_jump_slippery", PLACES, about="jump on slippery ground",
@@ -119,6 +129,7 @@ TASKS: dict[str, TaskEntry] = {
     "velocity-flat": TaskEntry(
         "jumper_warp.tasks.velocity.flat:velocity_flat", WALKING, ("Olympus-Walk",), "Metrics/score",
         "walk on level ground",
+        {"laptop": f"{LAPTOP_WALK} --ppo.final-desired-kl 0.01 --ppo.entropy-coef 0.006 --max-seconds 860"},
     ),
     "velocity-rough": TaskEntry(
         "jumper_warp.tasks.velocity.rough:velocity_rough", WALKING, best_metric="Metrics/score",
@@ -157,19 +168,27 @@ def task_names() -> tuple[str, ...]:
 
 def register_task(
     name: str, make: Callable[[], TaskCfg], *, ppo: PpoCfg | None = None, aliases: tuple[str, ...] = (),
-    about: str = "",
+    about: str = "", replace: bool = False,
 ) -> None:  # fmt: skip
     """Register the task that `make` returns under its name and aliases.
 
-    ppo: default training settings; about: text for `jumper list` (default: the first sentence of make's docstring).
-    Raises InputError: a name or alias is taken.
+    ppo: default training settings; about: text for `jumper list` (default: the first sentence of make's docstring);
+    replace: whether to replace a task of this name. A function of the same name in the same module, as of a file or a
+    notebook's cell that runs again, always replaces its task. Raises InputError: a name or alias is taken.
     """
-    _register(name, TaskEntry(make, PpoCfg() if ppo is None else ppo, tuple(aliases), about=about))
+    entry = TaskEntry(make, PpoCfg() if ppo is None else ppo, tuple(aliases), about=about)
+    _register(name, entry, replace or (name in TASKS and _is_same_function(make, TASKS[name].make)))
 
 
-def _register(name: str, entry: TaskEntry) -> None:
-    """Add an entry to `TASKS`. Raises InputError: its name or an alias is taken."""
-    owners = _tasks_by_name()
+def _is_same_function(make: Any, other: Any) -> bool:
+    """Return whether two factory functions have the same module and name."""
+    names = [(getattr(f, "__module__", None), getattr(f, "__qualname__", None)) for f in (make, other)]
+    return names[0] == names[1] and None not in names[0]
+
+
+def _register(name: str, entry: TaskEntry, replace: bool = False) -> None:
+    """Add an entry to `TASKS`, or replace that of the same name. Raises InputError: its name or an alias is taken."""
+    owners = {alias: task for alias, task in _tasks_by_name().items() if not (replace and task == name)}
     for alias in (name, *entry.aliases):
         if owner := owners.get(dashed(alias)):
             raise InputError(f"there is a task {alias!r:.60} already, of {TASKS[owner].origin}")

@@ -139,6 +139,42 @@ def test_name_that_is_taken_is_refused(name, aliases, taken):
     assert tuple(TASKS) == PROJECT_TASKS
 
 
+CELL = """
+from jumper_warp.registry import make_task, register_task
+import dataclasses
+
+def low_jump():
+    return dataclasses.replace(make_task("vertical-jump"), name="low-jump", gravity=GRAVITY)
+
+register_task("low-jump", low_jump, aliases=("Low",))
+"""
+
+
+def test_cell_that_runs_again_replaces_its_task():
+    notebook = {"__name__": "__main__"}
+    for gravity in (9.81, 3.71):  # [m/s^2]
+        exec(CELL.replace("GRAVITY", str(gravity)), notebook)
+        assert make_task("Low").gravity == gravity
+    assert list(TASKS).count("low-jump") == 1
+
+
+@pytest.mark.parametrize("origin", ["another function", "another module"])
+def test_task_of_another_origin_is_replaced_on_request_only(origin):
+    exec(CELL.replace("GRAVITY", "9.81"), {"__name__": "__main__"})
+    source = CELL.replace("GRAVITY", "3.71")
+    source = source.replace("low_jump", "lower_jump") if origin == "another function" else source
+    module = {"__name__": "__main__" if origin == "another function" else "my_tasks"}
+    with pytest.raises(InputError, match="there is a task 'low-jump' already, of __main__"):
+        exec(source, module)
+    exec(source.replace('("Low",)', '("Low",), replace=True'), module)
+    assert make_task("low-jump").gravity == 3.71
+
+
+def test_replaced_task_takes_no_name_of_another():
+    with pytest.raises(InputError, match="there is a task 'horizontal-jump' already"):
+        register_task("vertical-jump", renamed("vertical-jump"), aliases=("horizontal-jump",), replace=True)
+
+
 def test_task_with_another_name_than_registered_is_refused():
     register_task("my-jump", renamed("vertical-jump"))
     with pytest.raises(InputError, match=r"'my-jump' of .* calls itself 'vertical-jump'"):

@@ -44,7 +44,7 @@ def export(cfg: ExportCfg) -> Path:
     from jumper_warp.policies.blend import blend
     from jumper_warp.policies.folder import checked_folder, save_policy
     from jumper_warp.policies.onnx import export_onnx
-    from jumper_warp.policies.runs import is_run, learning_curve, open_policy
+    from jumper_warp.policies.runs import is_run, learning_curve, open_policy, run_folder
 
     source = Path(cfg.source)
     if cfg.out is not None and cfg.out.suffix != ".onnx":
@@ -55,8 +55,7 @@ def export(cfg: ExportCfg) -> Path:
         policy = blend(policy, open_policy(cfg.blend[0]), cfg.blend[1])
     out = cfg.out
     if out is None:
-        run = source.parents[1] if source.suffix == ".pt" else source
-        out = run / "policy" if trained else Path(f"{policy.interface.task}.onnx")
+        out = run_folder(source) / "policy" if trained else Path(f"{policy.interface.task}.onnx")
     if out.suffix == ".onnx":
         path = export_onnx(policy, out)
     else:

@@ -163,6 +163,7 @@ def task_info(name: str) -> tuple[dict[str, Any], list[str]]:
         "terminations": ", ".join(content["terminations"]),
         "policies": ", ".join(content["policies"]), "aliases": ", ".join(entry.aliases), "module": entry.origin,
         "train": f"jumper train {name}",
+        "presets": ", ".join(f"--preset {preset}" for preset in entry.presets),
     })  # fmt: skip
     return content, lines
 

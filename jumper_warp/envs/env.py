@@ -164,6 +164,18 @@ class Env(Stages):
         self._observe(self._part(), after_reset=int(worlds is not None))
         return self._step.obs, {}
 
+    def use_reset_mask(self) -> torch.Tensor:
+        """Let `step` reset worlds by a mask instead of ended ones; return the mask, (num_envs,) float32, 0 at first.
+
+        Where the mask is not 0, a step ignores the action and begins a new episode; it counts in no metric, and
+        `reward`, `done` and the like keep their values. Call this before the first reset.
+        Raises InputError (a ValueError): the environment has several tasks.
+        """
+        if len(self.tasks) > 1:
+            raise InputError(f"a reset mask needs an environment of one task, this one has {len(self.tasks)}")
+        self._reset_mask = wp.zeros(self.num_envs, dtype=float, device=self.wp_device)
+        return wp.to_torch(self._reset_mask)
+
     def compile(self) -> None:
         """Compile all kernels of `reset` and `step` in parallel; the first `reset` calls this itself."""
         if not self._compiled:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import json
+from pathlib import Path
 from typing import Any
 
 import torch
@@ -9,10 +11,21 @@ from rsl_rl.env import VecEnv as RslRlEnv
 from tensordict import TensorDict
 
 from jumper_warp.envs.vec_env import VecEnv, sanitise
+from jumper_warp.utils.files import write_atomically
+
+
+class EnvConfig(dict):
+    """Configuration of an environment, in the form that rsl-rl's loggers expect."""
+
+    def to_dict(self) -> dict[str, Any]:
+        """Return the entries as a plain dict."""
+        return dict(self)
 
 
 class RslRlVecEnv(RslRlEnv):
     """A `VecEnv` as rsl-rl's `VecEnv`; returns copies, because rsl-rl keeps references over the next step."""
+
+    cfg: EnvConfig
 
     def __init__(self, env: VecEnv, metrics_every: int = 24, max_episode_length: int = 1200) -> None:
         """Wrap `env`; unless it was reset, call `reset` of the adapter before training.
@@ -24,10 +37,28 @@ class RslRlVecEnv(RslRlEnv):
         self.num_envs, self.num_actions = env.num_envs, env.num_actions
         self.max_episode_length = max_episode_length
         self.device = env.device
-        self.cfg = env.config()
+        self.cfg = EnvConfig(env.config())
         self._episode_length = torch.zeros(env.num_envs, dtype=torch.long, device=env.device)
         self._metrics_every = metrics_every
         self._steps = 0
+
+    @property
+    def unwrapped(self) -> RslRlVecEnv:
+        """The adapter itself, where rsl-rl looks for `step_dt`."""
+        return self
+
+    @property
+    def step_dt(self) -> float:
+        """Time of a policy step [s]."""
+        return self.cfg["policy_dt_s"]
+
+    def write_config(self, folder: str | Path, activation: str = "elu") -> None:
+        """Write `config.json`, by which the checkpoints in a log folder of rsl-rl are evaluated, played and exported.
+
+        activation: of the actor's network. Raises OSError: the file cannot be written.
+        """
+        config = {"env": self.cfg, "train": {"ppo": {"activation": activation}}}
+        write_atomically(Path(folder) / "config.json", json.dumps(config, indent=1).encode())
 
     @property
     def episode_length_buf(self) -> torch.Tensor:

@@ -22,7 +22,7 @@ from jumper_warp.kernels.mdp import attempts, events
 from jumper_warp.kernels.mdp.actions import action_kernel
 from jumper_warp.kernels.mdp.env import EpisodeArrays, SkillSettings
 from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, STARTUP
-from jumper_warp.kernels.mdp.handover import make_handover_kernel, restore_task_kernel
+from jumper_warp.kernels.mdp.handover import NONE, make_handover_kernel, restore_task_kernel, set_skill_kernel
 from jumper_warp.kernels.mdp.observe import LANES, postprocess_obs_kernel
 from jumper_warp.kernels.mdp.parameters import motors_kernel
 from jumper_warp.kernels.mdp.reset import advance_rng_kernel, clear_history_kernel
@@ -79,6 +79,7 @@ class Stages:
         self._action = wp.zeros((len(tasks), n, 12), dtype=float, device=device)
         self._all = wp.full(n, 1.0, dtype=float, device=device)
         self._moved = wp.zeros(n, dtype=int, device=device)
+        self._reset_mask = self.episodes.done  # worlds that `step` resets, by `Env.use_reset_mask` an array of its own
         self._handovers = [
             (make_handover_kernel(h), self.tasks.index(h.source), self.tasks.index(h.target)) for h in handovers
         ]
@@ -94,6 +95,7 @@ class Stages:
         """Return the kernels of `reset` and `step`, each with its block size; draws: include those of `reset`."""
         shared = [action_kernel, motors_kernel, clear_history_kernel, advance_rng_kernel, track_kernel]
         shared += [restore_task_kernel] if len(self.skills) > 1 else []
+        shared += [set_skill_kernel] if self._reset_mask is not self.episodes.done else []
         shared += [kernel for kernel, _, _ in self._handovers]
         names = [name for name in self.skills[0].kernels if draws or name != "reset"]
         kernels = [(skill.kernels[name], BLOCKS.get(name, BLOCK)) for skill in self.skills for name in names]
@@ -144,19 +146,24 @@ class Stages:
 
     def _compute_rewards_and_dones(self, part: WorldSlice) -> None:
         """Advance the task states, and evaluate terminations, rewards and curriculum of every task."""
+        ended_before = self._reset_mask is not self.episodes.done
+        if ended_before:
+            self._launch(set_skill_kernel, part.count, [self._reset_mask, NONE, part.episode])
         for skill in self.skills:
             self._launch(
                 skill.kernels["step"], part.count,
                 [skill.index, self.robot, self._scene.ground, len(skill.task.levels), skill.params.values, part.episode,
                  skill.states, skill.episode_sum, skill.term_value, skill.counters],
             )  # fmt: skip
+        if ended_before:
+            self._launch(set_skill_kernel, part.count, [self._reset_mask, 0, part.episode])
 
     def _reset_done(self, part: WorldSlice) -> None:
         """Hand over worlds where due, reset ended episodes (with auto_reset), and observe both again."""
         self._hand_over(part)
         begins = self.auto_reset and self._ends_episodes
         if begins:
-            self._reset_worlds(part, self.episodes.done)
+            self._reset_worlds(part, self._reset_mask)
         if self._handovers or begins:
             self._observe(part, after_reset=1)
 

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import json
+import re
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,40 +17,62 @@ from jumper_warp.policies.folder import load_policy
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, make_interface
 from jumper_warp.rl import checkpoint as checkpoints
-from jumper_warp.rl.checkpoint import DECODE_ERRORS, CheckpointError, one_line_message
+from jumper_warp.rl.checkpoint import DECODE_ERRORS, CheckpointError, load_foreign_checkpoint, one_line_message
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.mirror import Symmetry, Weights, expand_layers, mirror_map
 from jumper_warp.rl.networks import NORMALISED_LIMIT, VARIANCE_EPS
 from jumper_warp.rl.resume import CHECKPOINTS
+from jumper_warp.rl.runner import CONFIG
 from jumper_warp.tasks.saving import TaskError, check_version
 
 CURVE = (
     "iteration", "Perf/elapsed_s", "Train/mean_reward", "Train/mean_episode_length", "Metrics/success", "Metrics/score",
 )  # fmt: skip
 """Columns of a saved learning curve."""
+RSL_RL = re.compile(r"model_(\d+)\.pt")  # Names of rsl-rl's checkpoints, with the iteration
+RSL_RL_EPS = 0.01  # rsl-rl adds this to the standard deviation of observations
+RSL_RL_LIMIT = 1.0e6  # Bound of normalised observations, which rsl-rl does not clip
 CURVE_ROWS = 60  # Maximum number of rows of a saved learning curve, evenly spaced
 
 
 def is_run(source: str | Path) -> bool:
     """Return whether `source` is a training run's folder or a checkpoint."""
     source = Path(source)
-    return source.suffix == ".pt" or (source / CHECKPOINTS).is_dir()
+    return source.suffix == ".pt" or (source / CHECKPOINTS).is_dir() or bool(_rsl_rl_checkpoints(source))
+
+
+def run_folder(source: Path) -> Path:
+    """Return the folder of a run, or of a checkpoint's run."""
+    if source.suffix != ".pt":
+        return source
+    return source.parent if RSL_RL.fullmatch(source.name) else source.parents[1]
+
+
+def _rsl_rl_checkpoints(folder: Path) -> list[Path]:
+    """Return the checkpoints in a log folder of rsl-rl, by iteration."""
+    found = {int(match[1]): path for path in folder.glob("model_*.pt") if (match := RSL_RL.fullmatch(path.name))}
+    return [found[iteration] for iteration in sorted(found)]
 
 
 def open_policy(source: str | Path, *, newest: bool = False) -> Policy:
     """Return a policy; source: name or folder of a policy, path of a checkpoint, or folder of a training run.
 
-    newest: whether to use the newest checkpoint of a run, not the best.
+    newest: whether to use the newest checkpoint of a run, not the best; of rsl-rl's runs it is always the newest.
+    rsl-rl's checkpoints `model_N.pt` need a `config.json` beside them, see `RslRlVecEnv.write_config`.
     Raises PolicyError or CheckpointError: there is no such policy, or it cannot be used.
     """
     if not is_run(source):
         return load_policy(source)
     path = Path(source)
+    if path.suffix != ".pt" and (theirs := _rsl_rl_checkpoints(path)):
+        path = theirs[-1]
+    if RSL_RL.fullmatch(path.name):
+        return _policy_of_rsl_rl(path)
     if path.suffix != ".pt" and newest:
         checkpoint = checkpoints.latest_checkpoint(path / CHECKPOINTS)
-        return _policy_of_checkpoint(checkpoint.path, checkpoint.state)
+        return _policy_of_checkpoint(checkpoint.path, partial(CheckpointContents.from_dict, checkpoint.state))
     path = path if path.suffix == ".pt" else checkpoints.best_checkpoint(path / CHECKPOINTS)
-    return _policy_of_checkpoint(path, checkpoints.load_checkpoint(path))
+    return _policy_of_checkpoint(path, partial(CheckpointContents.from_dict, checkpoints.load_checkpoint(path)))
 
 
 @dataclass(frozen=True)
@@ -63,6 +88,34 @@ class CheckpointContents:
     layers: Weights  # weight (out, in) and bias (out,) of each layer of the actor as a plain network
     mean: torch.Tensor  # (num_obs,) mean of raw observations
     std: torch.Tensor  # (num_obs,) standard deviation that observations are divided by
+    limit: float = NORMALISED_LIMIT  # normalised observations are clamped to ± this
+
+    @classmethod
+    def from_rsl_rl(cls, state: Any, config: Any) -> CheckpointContents:
+        """Return the contents of a loaded checkpoint of rsl-rl; config: `env`, as `Env.config`, and perhaps `train`.
+
+        Raises TaskError: the task has another version. CheckpointError: a part is missing or of another type.
+        """
+        try:
+            env, actor = config["env"], state["actor_state_dict"]
+            check_version(env["task"])
+            layers = _actor_layers(actor, "mlp.")
+            mean, std = torch.zeros(layers[0][0].shape[1]), torch.ones(layers[0][0].shape[1])
+            if "obs_normalizer._mean" in actor:
+                mean = _tensor(actor, "obs_normalizer._mean")[0]
+                std = _tensor(actor, "obs_normalizer._std")[0] + RSL_RL_EPS
+            activation = config.get("train", {}).get("ppo", {}).get("activation", "elu")
+            commit = config.get("commit") or {"hash": None, "dirty": None}
+            config = {**config, "commit": commit["hash"], "dirty": commit["dirty"], "iteration": int(state["iter"])}
+            return cls(
+                config, dict(env["interface"]), env["policy_dt_s"], env["physics_dt_s"], activation,
+                tuple(len(bias) for _, bias in layers[:-1]), layers, mean, std, RSL_RL_LIMIT,
+            )  # fmt: skip
+        except TaskError:
+            raise
+        except DECODE_ERRORS as error:
+            reason = f"{type(error).__name__}: {one_line_message(error)}"
+            raise CheckpointError(f"not of rsl-rl 5 on an environment of this project ({reason})") from error
 
     @classmethod
     def from_dict(cls, state: dict[str, Any]) -> CheckpointContents:
@@ -93,16 +146,28 @@ class CheckpointContents:
 
     def policy(self) -> Policy:
         """Build the policy. Raises PolicyError: interface, layers and statistics contradict each other."""
-        description = {**self.interface, "observation_limit": RAW_LIMIT, "normalised_limit": NORMALISED_LIMIT}
+        description = {**self.interface, "observation_limit": RAW_LIMIT, "normalised_limit": self.limit}
         network = {"hidden": self.hidden, "activation": self.activation}
         interface = make_interface(description, policy_dt=self.policy_dt, physics_dt=self.physics_dt, **network)
         return Policy(self.layers, self.mean, self.std, interface, self.config)
 
 
-def _policy_of_checkpoint(path: Path, state: dict[str, Any]) -> Policy:
-    """Return the policy of a loaded checkpoint. Raises PolicyError or CheckpointError, with its path."""
+def _policy_of_rsl_rl(path: Path) -> Policy:
+    """Return the policy of a checkpoint of rsl-rl. Raises PolicyError or CheckpointError, with its path."""
+    file = path.parent / CONFIG
     try:
-        return CheckpointContents.from_dict(state).policy()
+        config = json.loads(file.read_text())
+    except OSError as error:
+        raise CheckpointError(f"{path}: needs {CONFIG} beside it, see RslRlVecEnv.write_config") from error
+    except (ValueError, RecursionError) as error:
+        raise CheckpointError(f"{file}: not readable") from error
+    return _policy_of_checkpoint(path, partial(CheckpointContents.from_rsl_rl, load_foreign_checkpoint(path), config))
+
+
+def _policy_of_checkpoint(path: Path, read: Callable[[], CheckpointContents]) -> Policy:
+    """Return the policy of a checkpoint's contents. Raises PolicyError or CheckpointError, with its path."""
+    try:
+        return read().policy()
     except PolicyError as error:
         raise PolicyError(f"{path}: {error}") from error
     except (TaskError, CheckpointError) as error:
@@ -117,9 +182,9 @@ def _tensor(model: dict[str, Any], name: str) -> torch.Tensor:
     return tensor
 
 
-def _actor_layers(model: dict[str, Any]) -> Weights:
+def _actor_layers(model: dict[str, Any], prefix: str = "actor.") -> Weights:
     """Return weight (out, in) and bias (out,) of the actor's layers, first to last, from a model's state_dict."""
-    names = [key for key in model if key.startswith("actor.") and key.endswith(".weight")]
+    names = [key for key in model if key.startswith(prefix) and key.endswith(".weight")]
     names.sort(key=lambda key: int(key.split(".")[1]))
     return [(_tensor(model, name), _tensor(model, name.removesuffix("weight") + "bias")) for name in names]
 
@@ -134,8 +199,7 @@ def _symmetry(model: dict[str, torch.Tensor]) -> Symmetry | None:
 
 def learning_curve(source: Path) -> bytes | None:
     """Return the thinned learning curve of a run, or of a checkpoint's run; None without a metrics file."""
-    run = source.parents[1] if source.suffix == ".pt" else source
-    path = run / METRICS_FILE
+    path = run_folder(source) / METRICS_FILE
     return thinned_curve(path.read_bytes()) if path.is_file() else None
 
 

@@ -78,10 +78,7 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
         raise CheckpointError(f"{path}: {error.strerror}") from error
     if hashlib.sha256(data).hexdigest() != entry["sha256"]:
         raise CheckpointError(f"{path}: differs from its checksum in {MANIFEST}")
-    try:
-        state = torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
-    except Exception as error:  # a damaged pickle raises anything
-        raise CheckpointError(f"{path}: not readable as tensors: {one_line_message(error)}") from error
+    state = _decoded(path, data)
     if missing := [key for key in REQUIRED if not isinstance(state, dict) or key not in state]:
         raise CheckpointError(f"{path}: lacks {', '.join(missing)}")
     for key, expected in REQUIRED.items():
@@ -90,6 +87,25 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     if state["iteration"] != entry["iteration"]:
         raise CheckpointError(f"{path}: its iteration is {state['iteration']}, in {MANIFEST} {entry['iteration']}")
     return state
+
+
+def load_foreign_checkpoint(path: Path) -> Any:
+    """Return the tensors, numbers and text of another program's checkpoint, on the CPU.
+
+    Raises CheckpointError: the file cannot be read, or holds something else.
+    """
+    try:
+        return _decoded(path, path.read_bytes())
+    except OSError as error:
+        raise CheckpointError(f"{path}: {error.strerror}") from error
+
+
+def _decoded(path: Path, data: bytes) -> Any:
+    """Return the tensors, numbers and text in a checkpoint's data, on the CPU. Raises CheckpointError."""
+    try:
+        return torch.load(io.BytesIO(data), map_location="cpu", weights_only=True)
+    except Exception as error:  # a damaged pickle raises anything
+        raise CheckpointError(f"{path}: not readable as tensors: {one_line_message(error)}") from error
 
 
 def one_line_message(error: Exception) -> str:

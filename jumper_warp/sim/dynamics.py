@@ -167,8 +167,8 @@ class JumperDynamics:
         self.real = self.modules.scalar.real
         self.device = model.device
         self.num_worlds = model.world_count
-        self._paws = wp.array(find_paws(model).flatten(), dtype=int, device=self.device)
-        self._ground_shape = find_ground(model)
+        self.paws = wp.array(find_paws(model).flatten(), dtype=int, device=self.device)
+        self.ground_shape = find_ground(model)
         self.static_friction_ratio = wp.full(self.num_worlds, 1.0, dtype=float, device=self.device)
         """Static over dynamic friction coefficient [1], shape (num_worlds,); call `pack_friction` after a change."""
         self.leg_springs = wp.zeros(self.num_worlds, dtype=wp.vec2, device=self.device)
@@ -184,7 +184,7 @@ class JumperDynamics:
             device=self.device,
             requires_grad=model.requires_grad,
         )
-        self.robot.ground = ground_struct(model, self._ground_shape, self.modules.ground)
+        self.robot.ground = ground_struct(model, self.ground_shape, self.modules.ground)
         self.robot.ground.blocks = block_array(block, self.num_worlds, self.modules, self.device)
         self.robot.held = wp.zeros(0, dtype=int, device=self.device)
         self.work = self._workspace()
@@ -245,7 +245,7 @@ class JumperDynamics:
         self._launch(
             self.modules.parameters.pack_friction_kernel,
             (self.num_worlds, 4),
-            [self._paws, self._ground_shape, self.model.shape_material_mu, self.static_friction_ratio],
+            [self.paws, self.ground_shape, self.model.shape_material_mu, self.static_friction_ratio],
         )
 
     def repack(self, mask: wp.array, worlds: WorldRange | None = None) -> None:
@@ -257,8 +257,8 @@ class JumperDynamics:
         self._launch(
             self.modules.parameters.repack_kernel,
             (count, 25),
-            [first, mask, m.body_mass, m.body_com, m.body_inertia, m.joint_armature, m.joint_friction, self._paws,
-             self._ground_shape, m.shape_material_mu, self.static_friction_ratio],
+            [first, mask, m.body_mass, m.body_com, m.body_inertia, m.joint_armature, m.joint_friction, self.paws,
+             self.ground_shape, m.shape_material_mu, self.static_friction_ratio],
         )  # fmt: skip
 
     def pack_gravity(self) -> None:

@@ -15,6 +15,7 @@ from newton import ModelFlags, StateFlags
 from newton.solvers import SolverBase
 
 from jumper_warp.kernels.actuation.readout import body_acceleration_kernel
+from jumper_warp.kernels.collision.paw_contacts import ContactRows, PawShapes, paw_contacts_kernel
 from jumper_warp.kernels.dynamics.restore import (
     StateArrays,
     clear_contact_kernel,
@@ -91,6 +92,9 @@ class SolverJumper(SolverBase):
     With `block`, each world has a block that the paws can push over the floor. A paw touches floor or block, whichever
     is nearer. Steps with blocks have no gradients.
 
+    For Newton's sensors: accelerations of all bodies, where a step's observables or `state_out.body_qdd` request them;
+    contacts of the paws (`update_contacts`), where its observables request `contact_f`.
+
     Shapes of the model other than paws and ground do not collide; a warning names the first such shape. Sites and
     shapes that do not collide are for sensors and viewers.
 
@@ -99,7 +103,7 @@ class SolverJumper(SolverBase):
     """
 
     model: Model
-    SUPPORTED_OBSERVABLES = frozenset({SolverBase.ObservableKind.BODY_QDD})
+    SUPPORTED_OBSERVABLES = frozenset({SolverBase.ObservableKind.BODY_QDD, SolverBase.ObservableKind.CONTACT_F})
 
     def __init__(
         self,
@@ -145,9 +149,10 @@ class SolverJumper(SolverBase):
         self, state_in: State, state_out: State, control: Control | None, contacts: newton.Contacts | None, dt: float,
         *, observables: SolverBase.Observables | None = None,
     ) -> None:  # fmt: skip
-        """Advance every world by dt [s]. `contacts` is not used: the solver finds the paws' contacts itself.
+        """Advance every world by dt [s]. The solver finds the paws' contacts itself.
 
-        Raises InputError for a dt that is not finite and positive.
+        contacts: not read; filled as by `update_contacts` where `observables` requests `contact_f`.
+        Raises InputError for a dt that is not finite and positive, or as `update_contacts`.
         """
         self.validate_observables(observables, contacts)
         drive = self.dynamics.drive(*self._forces(state_in, control))
@@ -157,18 +162,21 @@ class SolverJumper(SolverBase):
         self, state_in: State, state_out: State, motors: Any, target: wp.array, dt: float, substeps: int, *,
         control: Control | None = None, previous: wp.array | None = None, delay: wp.array | None = None,
         bodies: bool = True, observables: SolverBase.Observables | None = None, worlds: WorldRange | None = None,
+        contacts: newton.Contacts | None = None,
     ) -> None:  # fmt: skip
         """Advance every world by `substeps` steps of dt [s] in one launch, with motors that follow targets.
 
         motors: `MotorArrays`, as `jumper_warp.robot.motors.motor_arrays` returns them. target: motor angles [rad],
         (12, num_worlds), constant during the call; with delay [physics steps], (num_worlds,), the motors follow
         `previous` (12, num_worlds) until the target arrives. control: additional joint forces, constant. bodies:
-        whether to write passive joints, loop joints and bodies, which the solver does not read. observables: over the
-        whole call. worlds: range to advance, by default all. `state_out` may be `state_in`.
+        whether to write passive joints, loop joints and bodies, which the solver does not read. observables: mean
+        accelerations over the whole call, and contacts of the last step, as in `step`. worlds: range to advance, by
+        default all. `state_out` may be `state_in`.
 
-        Raises InputError: dt is not finite and positive, or substeps no whole number of at least 1.
+        Raises InputError: dt is not finite and positive, substeps no whole number of at least 1, or as
+        `update_contacts`.
         """
-        self.validate_observables(observables)
+        self.validate_observables(observables, contacts)
         drive = self.dynamics.drive(*self._forces(state_in, control), motors, target, previous, delay)
         self._advance(state_in, state_out, drive, dt, substeps, observables, bodies, worlds)
 
@@ -183,9 +191,11 @@ class SolverJumper(SolverBase):
     ) -> None:  # fmt: skip
         """Advance a range of worlds by `substeps` steps of dt [s]; drive: kernels' `Drive`; rest: see `step_motors`."""
         check_step(dt, substeps)
-        qdd = None
-        if observables is not None and observables.is_requested(SolverBase.ObservableKind.BODY_QDD):
-            qdd = observables.body_qdd
+        qdd, contact_f = state_out.body_qdd, None
+        if observables is not None:
+            qdd = qdd if observables.body_qdd is None else observables.body_qdd
+            contact_f = observables.contact_f
+        if qdd is not None:
             wp.copy(self._old_body_qd, state_in.body_qd)
         coordinates = (state_in.joint_q, state_in.joint_qd)
         out = (state_out.joint_q, state_out.joint_qd)
@@ -196,7 +206,7 @@ class SolverJumper(SolverBase):
         else:
             settings = self.dynamics.settings(dt, substeps, self.max_sweeps, self.tolerance)
             self.dynamics.advance(settings, drive, *coordinates, *out, worlds)
-        if bodies or qdd is not None:
+        if bodies or qdd is not None or contact_f is not None:
             self.dynamics.full_state(*out, state_out.body_q, state_out.body_qd, worlds)
         if qdd is not None:
             wp.launch(
@@ -206,6 +216,41 @@ class SolverJumper(SolverBase):
                 outputs=[qdd],
                 device=self.model.device,
             )
+
+        if observables is not None and contact_f is not None and observables.contacts is not None:
+            self._write_contacts(observables.contacts, state_out, contact_f)
+
+    def update_contacts(self, contacts: newton.Contacts, state: State | None = None) -> None:
+        """Write the paws' contacts of the last step: four rows a world, FL, FR, BL, BR, touching or not.
+
+        Shape 0 is the paw, shape 1 the ground, on which a block counts as ground; without ground there are no rows.
+        state: the last step's. `contacts.force`, if allocated, gets the force of the ground on the paw [N], world.
+        Raises InputError: there is no state, or the contacts hold fewer rows.
+        """
+        if state is None:
+            raise InputError("update_contacts needs the state of the last step")
+        force = contacts.force
+        if force is None:
+            force = wp.zeros(contacts.rigid_contact_max, dtype=wp.spatial_vectorf, device=self.model.device)
+        self._write_contacts(contacts, state, force)
+
+    def _write_contacts(self, contacts: newton.Contacts, state: State, contact_f: wp.array) -> None:
+        """Write contacts as `update_contacts`, and their forces to contact_f. Raises InputError: too few rows."""
+        dynamics, n, device = self.dynamics, self.model.world_count, self.model.device
+        if contacts.rigid_contact_max < 4 * n:
+            raise InputError(f"contacts must hold {4 * n} rows, four a world, got {contacts.rigid_contact_max}")
+        if dynamics.ground_shape < 0:
+            contacts.rigid_contact_count.zero_()
+            return
+        rows, shapes = ContactRows(), PawShapes()
+        for name in rows._cls.vars:
+            setattr(rows, name, getattr(contacts, f"rigid_contact_{name}"))
+        shapes.paws, shapes.ground = dynamics.paws, dynamics.ground_shape
+        for name in ("body", "transform", "scale"):
+            setattr(shapes, name, getattr(self.model, f"shape_{name}"))
+        contact_f.zero_()
+        inputs = [shapes, dynamics.robot.ground, state.body_q, self.contact_force]
+        wp.launch(paw_contacts_kernel, dim=(4, n), inputs=inputs, outputs=[rows, contact_f], device=device)
 
     def block_position(self) -> np.ndarray:
         """Return the centres of the blocks [m], world frame, (num_worlds, 2). Raises InputError without blocks."""

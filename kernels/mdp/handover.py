@@ -10,7 +10,7 @@ from .view import RobotArrays, load_view, yaw_of
 
 wp.set_module_options({"enable_backward": False})
 
-NONE = wp.constant(-1)  # `requested_task` without a request
+NONE = wp.constant(-1)  # `requested_task` without a request, `skill` of a world that no task steps
 
 
 @wp.func
@@ -33,6 +33,20 @@ def hand_over(
         arrays.prev_action[m, world] = action
         arrays.prev_prev_action[m, world] = action
         set_motor(parameters, world, m)
+
+
+@wp.kernel
+def set_skill_kernel(
+    # in
+    mask: wp.array(dtype=float),
+    skill: int,
+    # in, out
+    episode: EpisodeArrays,
+):
+    """Set the active skill of worlds with mask != 0, NONE to leave them out of all tasks; one thread per world."""
+    world = episode.first + wp.tid()
+    if mask[world] != 0.0:
+        episode.skill[world] = skill
 
 
 @wp.kernel

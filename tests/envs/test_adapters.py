@@ -52,12 +52,7 @@ def assert_same(first, second):
 def test_every_task_is_registered_with_gymnasium(task):
     spec = gymnasium.spec(env_id(task))
     assert (spec.kwargs, spec.vector_entry_point) == ({"task": task}, "jumper_warp.gym:make_vector_env")
-
-
-@pytest.mark.parametrize("make", [gymnasium.make, lambda name: gymnasium.make_vec(name, vectorization_mode="sync")])
-def test_refusal_of_a_single_environment_names_the_vector_environment(make):
-    with pytest.raises(ValueError, match=r"gymnasium\.make_vec\('jumper_warp/VerticalJump-v0', num_envs=1\)"):
-        make("jumper_warp/VerticalJump-v0")
+    assert spec.entry_point == "jumper_warp.gym:make_env"
 
 
 def test_registering_twice_changes_nothing():
@@ -119,6 +114,7 @@ def test_step_results_are_copies(tensors):
         infos["final_info"]["termination"],
         infos["final_info"]["_termination"],
     ]
+    results += infos["final_info"]["episode"].values()
     results += [infos["final_obs"]] if tensors else [row for row in infos["final_obs"] if row is not None]
     copies = [value.clone() if tensors else value.copy() for value in results]
     played(envs, actions[13:])
@@ -299,7 +295,7 @@ def test_refuses_invalid_actions(actions):
 def test_refuses_invalid_action_tensors():
     envs = GymVectorEnv(jumper(), tensors=True)
     envs.reset()
-    for actions in (torch.zeros(N, 11), torch.zeros(N, 12, dtype=torch.int64), np.zeros((N, 12))):
+    for actions in (torch.zeros(N, 11), torch.zeros(N, 12, dtype=torch.int64)):
         with pytest.raises(ValueError, match="an action must"):
             envs.step(actions)
 
@@ -315,8 +311,8 @@ def test_refuses_calls_before_reset_and_after_close():
     envs = GymVectorEnv(jumper())
     with pytest.raises(gymnasium.error.ResetNeeded):
         envs.step(ACTIONS[0])
-    with pytest.raises(ValueError, match="reset takes no options, got 'reset_mask'"):
-        envs.reset(options={"reset_mask": np.ones(N, dtype=bool)})
+    with pytest.raises(ValueError, match="reset takes no options but 'reset_mask', got 'mask'"):
+        envs.reset(options={"mask": np.ones(N, dtype=bool)})
     envs.reset()
     envs.close()
     envs.close()

@@ -256,11 +256,11 @@ def test_bodies_match_newton_kinematics(pair):
     assert sim.loop_gap().max() < 1e-6
 
 
-def test_body_accelerations_are_observable_and_contact_forces_are_not():
+def test_body_accelerations_are_observable_and_joint_forces_are_not():
     sim = simulation(1, ground=None)
     observables = sim.solver.observables({SolverBase.ObservableKind.BODY_QDD})
     sim.solver.step(sim.state, sim.state, None, None, DT, observables=observables)
     fall = np.tile([0.0, 0.0, -9.81, 0.0, 0.0, 0.0], (BODIES, 1))
     assert observables.body_qdd.numpy() == pytest.approx(fall, abs=5e-3)
-    with pytest.raises(ValueError, match="contact_f"):
-        sim.solver.observables({"contact_f"})
+    with pytest.raises(ValueError, match="body_parent_f"):
+        sim.solver.observables({"body_parent_f"})
