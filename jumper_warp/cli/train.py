@@ -40,8 +40,8 @@ SHORT_HELP = {
     "Size and length": ("preset", "num-envs", "max-iterations", "max-seconds", "seed"),
     "Physics and robot": ("randomize", "noise", "history", "solver", "robot"),
     "Continue or start from a policy": ("resume", "init-policy"),
-    "Learning": ("trainer", "ppo.hidden", "ppo.lr", "ppo.gamma", "ppo.entropy-coef"),
-    "Machine and output": ("device", "threads", "log-root", "save-interval", "best-metric", "task-module"),
+    "Learning": ("trainer", "ppo.hidden", "ppo.lr", "ppo.entropy-coef"),
+    "Machine and output": ("device", "threads", "log-root", "save-interval", "task-module"),
 }
 """Flags on the page of `jumper train --help`, by heading."""
 

@@ -11,7 +11,8 @@ import jumper_warp
 from cli_helpers import run
 from jumper_warp.cli.flags import list_flags
 from jumper_warp.cli.main import parse, parse_error
-from jumper_warp.cli.train import SHORT_HELP, TrainArgs, report_cpu_time
+from jumper_warp.cli.train import SHORT_HELP, TrainArgs, parse_train, report_cpu_time
+from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.utils.errors import InputError
 
@@ -201,3 +202,17 @@ def test_time_of_a_training_without_gpu_is_announced_unless_short(capsys, args, 
     report_cpu_time(args, presets)
     err = capsys.readouterr().err
     assert err.endswith(message) and err.count("\n") == (1 if message else 0)
+
+
+@pytest.mark.parametrize("task", [name for name, entry in TASKS.items() if entry.presets])
+def test_preset_sets_flags_and_other_flags_override_it(task):
+    parsed, made = parse_train([task.replace("-", "_"), "--num-envs", "8", "--preset", "laptop", "--noise"])
+    assert (parsed.cfg.num_envs, parsed.randomize, parsed.noise) == (8, False, True)
+    assert parsed.cfg.ppo.hidden == (128, 64, 64) and parsed.cfg.ppo.desired_kl == 0.02
+    widths = [max(end for _, end in each.layout("actor").values()) for each in (made, make_task(task))]
+    assert widths[0] < widths[1]  # one step of observations
+
+
+def test_unknown_preset_is_refused_with_the_tasks_that_have_presets(capsys):
+    code, _, err = run(capsys, "train", "attitude", "--preset", "laptop")
+    assert code == 2 and "attitude has no preset 'laptop'" in err and "vertical-jump (laptop)" in err
