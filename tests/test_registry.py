@@ -351,12 +351,10 @@ def test_package_cannot_replace_a_task_of_the_project(install):
     install("their_tasks", {"vertical-jump": "their_tasks:low_jump"})
     assert make_task("vertical-jump").name == "vertical-jump" and "their_tasks" not in sys.modules
     (point,) = registry.installed_tasks()
+    entry = TASKS["vertical-jump"]
     with pytest.raises(InputError, match="there is a task 'vertical-jump' already"):
         registry.load_installed(point)
-    assert TASKS["vertical-jump"] == TaskEntry(
-        "jumper_warp.tasks.jump.vertical:vertical_jump", PpoCfg(gamma=0.99), aliases=("Olympus-Vertical-Jump",),
-        about="jump to a height",
-    )  # fmt: skip
+    assert TASKS["vertical-jump"] is entry and entry.make == "jumper_warp.tasks.jump.vertical:vertical_jump"
 
 
 # ---------------------------------------------------------------------- public names

@@ -83,11 +83,11 @@ def print_tables(tasks: Sequence[dict[str, Any]], policies: Sequence[PolicySumma
     text = io.StringIO()  # rich would exit with 1 where the reader closes a pipe
     console = Console(file=text, width=WIDTH, highlight=False)
     table = Table(
-        Column("TASK", no_wrap=True), Column("what the robot does", no_wrap=True, overflow="ellipsis"), "its policies",
-        box=None, pad_edge=False, padding=(0, 2, 0, 0),
+        Column("TASK", no_wrap=True), "what the robot does", Column("its policies", no_wrap=True), box=None,
+        pad_edge=False, padding=(0, 2, 0, 0),
     )  # fmt: skip
     for task in tasks:
-        table.add_row(task["name"], task["about"], ", ".join(task["policies"]))
+        table.add_row(task["name"], task["about"], ",\n".join(task["policies"]))
     console.print(table)
     console.print()
     table = Table("POLICY", "its task", *(Column(name, justify="right") for name in ("success", "error", "size")),

@@ -32,7 +32,7 @@ COMMANDS = {
     "finetune": "Reduce a jumping policy's errors by gradients through the physics.",
     "play": "Record a policy for the Rerun viewer.",
     "evaluate": "Measure a policy over many trials.",
-    "export": "Save a policy as a folder or ONNX file, or the robot as MJCF, URDF or USD.",
+    "export": "Save a policy, or the robot for other simulators.",
     "sysid": "Identify the robot's parameters from recorded motions.",
     "list": "List the tasks and the project's policies.",
     "info": "Describe a task or a policy: jumper info NAME.",

@@ -215,4 +215,4 @@ def test_preset_sets_flags_and_other_flags_override_it(task):
 
 def test_unknown_preset_is_refused_with_the_tasks_that_have_presets(capsys):
     code, _, err = run(capsys, "train", "attitude", "--preset", "laptop")
-    assert code == 2 and "attitude has no preset 'laptop'" in err and "vertical-jump (laptop)" in err
+    assert code == 2 and "attitude has no preset 'laptop'" in err[-1] and "vertical-jump (laptop)" in err[-1]

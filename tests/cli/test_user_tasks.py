@@ -132,12 +132,11 @@ def test_task_modules_are_split_from_other_arguments():
     assert split_task_modules(args) == (["a", "--b", "c"], ["x.py", "pack.age", "y.py"])
 
 
-def test_list_shows_tasks_aliases_origins_and_policies(capsys, path):
+def test_list_shows_tasks_of_a_module_and_policies(capsys, path):
     code, out, _ = run(capsys, "list", f"--task-module={path}")
     lines = [" ".join(line.split()) for line in out.splitlines()]
-    assert code == 0 and "task tame-jump (Tame) from my_jumps" in lines
-    assert "task vertical-jump (Olympus-Vertical-Jump) from jumper_warp.tasks.jump.vertical" in lines
-    assert "policy vertical_jump" in lines
+    assert code == 0 and any(line.startswith("tame-jump ") for line in lines)
+    assert "vertical-jump jump to a height vertical_jump" in lines
 
 
 def test_list_shows_installed_tasks_and_errors_of_others(capsys, tmp_path, monkeypatch):
@@ -148,9 +147,13 @@ def test_list_shows_installed_tasks_and_errors_of_others(capsys, tmp_path, monke
     (info / "entry_points.txt").write_text(points)
     (tmp_path / "my_jumps_installed.py").write_text(TASK[: TASK.index("register_task(")] + "def bad(): 1 / 0\n")
     monkeypatch.syspath_prepend(tmp_path)
-    code, out, _ = run(capsys, "list")
-    assert code == 0 and "low-jump  from my_jumps_installed, package their-tasks" in out
-    assert "bad-jump  of package their-tasks is left out: ZeroDivisionError" in out and "policy  vertical_jump" in out
+    code, out, err = run(capsys, "list", "--json")
+    tasks = {task["name"]: task for task in json.loads(out)["tasks"]}
+    assert code == 0 and (tasks["low-jump"]["module"], tasks["low-jump"]["package"]) == (
+        "my_jumps_installed", "their-tasks",
+    )  # fmt: skip
+    assert "bad-jump" not in tasks
+    assert "task bad-jump of package their-tasks is left out: ZeroDivisionError: division by zero" in err
 
 
 def test_help_lists_flags_of_the_users_task(capsys, path):

@@ -303,7 +303,7 @@ def test_filter_reduces_overshoot_of_commands_beyond_the_limits():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: LimitsCfg(lower=10.0, upper=10.0), "rise"),
+        (lambda: LimitsCfg(lower=10.0, upper=10.0), "lower limit must be below upper limit"),
         (lambda: LimitsCfg(lower=math.nan, upper=10.0), "finite"),
         (lambda: LimitsCfg(lower=0.0, upper=10.0, lower_zone=-1.0), "hard zones"),
         (lambda: LimitsCfg(lower=0.0, upper=10.0, lower_zone=6.0, upper_zone=6.0), "overlap"),
