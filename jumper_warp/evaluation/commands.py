@@ -43,8 +43,8 @@ class EvaluateCfg(Generic[Flags]):
     """Conditions of the evaluation."""
     out: Path | None = None  # Folder for metrics.json (default: outputs/evaluate/<time>)
     printing: Annotated[PrintFlags, tyro.conf.arg(name="")] = field(default_factory=PrintFlags)
-    """What is printed about the results."""
-    save_trials: bool = False  # Also write the arrays of all trials, from which the rates follow, into trials.npz
+    """Format of the printed results."""
+    save_trials: bool = False  # Also write the arrays of all trials, from which the metrics are computed, to trials.npz
     save_to_policy: bool = False  # Also save the metrics into the policy's folder
 
 
@@ -61,11 +61,8 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
         raise InputError(f"save_to_policy is for the stream reporting, got {cfg.conditions.stream}")
     if cfg.save_to_policy and is_run(run.source):
         raise PolicyError(f"{run.source}: a run keeps no metrics; export it first")
-    run.prepare("evaluate", cfg.conditions, cfg.out, save_trials=cfg.save_trials)
     run.print_flags = cfg.printing
-    log = cfg.flags.log(run.evaluation.prepare_task(run.task), cfg.conditions.stream_seed)
-    run.run_episodes(run.env(log.count), log)
-    values = run.report(cfg.flags.metrics(log), run.evaluation.paper)
+    values = run.evaluate(cfg.flags, cfg.conditions, cfg.out, save_trials=cfg.save_trials)
     if cfg.save_to_policy:
         files = {name: (run.folder / name).read_bytes() for name in ("metrics.json", "run.json")}
         add_files(find_policy(run.source), files)
@@ -74,14 +71,14 @@ def evaluate(run: EvaluationRun, cfg: EvaluateCfg) -> dict[str, Any]:
 
 @dataclass(frozen=True, kw_only=True)
 class FilmCfg:
-    """A film of the recording."""
+    """Settings of a film of the recording."""
 
     video: Path | None = None  # Film to write: .mp4 (H.264), .webp or .gif (default: none)
     size: tuple[int, int] = (854, 480)  # [px] Width and height
     fps: float = 30.0  # [1/s] Frames per second
     speed: float = 1.0  # Speed of the playback; 0.25 for slow motion
     eye: tuple[float, float, float] | None = None
-    """[m] Camera's offset from the robot, world axes: ahead, to the left, up (default: beside the robot)."""
+    """[m] Camera's offset from the robot, world axes: ahead, to the left, up (default: at the robot's side)."""
 
     def __post_init__(self) -> None:
         if self.video is not None:
@@ -104,7 +101,7 @@ class RecordingCfg:
     conditions: Annotated[Conditions, tyro.conf.arg(name="")] = field(default_factory=Conditions)
     """Conditions of the simulation."""
     film: Annotated[FilmCfg, tyro.conf.arg(name="")] = field(default_factory=FilmCfg)
-    """A film of the recording."""
+    """Film of the recording to write."""
     out: Path | None = None  # Folder for recording, picture, metrics.json and plots (default: outputs/play/<time>)
     viewer: Literal["none", "rerun"] = "none"
     """Open the recording in Rerun's viewer, which then listens on this machine's loopback address only."""

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any, TypeVar
 import numpy as np
 import tyro
 
-from jumper_warp.evaluation.evaluations import evaluation_of
+from jumper_warp.evaluation.evaluations import EvaluationFlags, evaluation_of
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
 from jumper_warp.policies.conditions import Conditions, env_of_policy
@@ -224,6 +224,15 @@ class EvaluationRun(Run):
         run.prepare(name, conditions_of(args), args.out, record=args.num_recorded, save_trials=args.save_trials)
         run.print_flags = args
         return run
+
+    def evaluate(
+        self, flags: EvaluationFlags, conditions: Conditions, out: Path | None, *, save_trials: bool
+    ) -> dict[str, Any]:
+        """Run the trials that flags define, write and print their metrics, and return all values; see `prepare`."""
+        self.prepare("evaluate", conditions, out, save_trials=save_trials)
+        log = flags.log(self.evaluation.prepare_task(self.task), conditions.stream_seed)
+        self.run_episodes(self.env(log.count), log)
+        return self.report(flags.metrics(log), self.evaluation.paper)
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
         """Return the function `act` of the policy."""
