@@ -88,7 +88,7 @@ TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5, symmetry="actor")  
 
 NOMINAL = "--no-randomize --no-noise --history 1 --ppo.hidden 128 64 64"
 """Flags of trainings on two CPU cores: no randomisation, no noise, a short observation and a small network."""
-LAPTOP_JUMP = f"{NOMINAL} --num-envs 1024 --env.curriculum.promote-after 2 --ppo.desired-kl 0.02"
+LAPTOP_JUMP = f"{NOMINAL} --num-envs 1024 --env.curriculum.promote-after 1 --ppo.desired-kl 0.02"
 LAPTOP_WALK = f"{NOMINAL} --num-envs 512 --ppo.symmetry off --ppo.desired-kl 0.02 --ppo.minibatches 4"
 
 TASKS: dict[str, TaskEntry] = {
