@@ -16,7 +16,10 @@ class Wrench:
 
 @wp.func
 def external_wrench(base: BaseState, com: vec3, force_at_com: vec3, moment: vec3) -> Wrench:
-    """Return the wrench about the base origin, body axes; force [N], moment [N m]: world axes, at com [m] (body)."""
+    """Return an external wrench, given at the base's com, moved to the base's origin and rotated to body axes.
+
+    force [N], moment [N m]: world axes; com [m]: body frame.
+    """
     wrench = Wrench()
     wrench.force = wp.quat_rotate_inv(base.quat, force_at_com)
     wrench.moment = wp.quat_rotate_inv(base.quat, moment) + wp.cross(com, wrench.force)
