@@ -43,10 +43,10 @@ def paw_contacts_kernel(
     rows: ContactRows,
     contact_f: wp.array(dtype=wp.spatial_vector),
 ):
-    """Write a row for each paw, touching or not: shape 0 the paw, shape 1 the ground; launch over (4, num_worlds).
+    """Write every paw's contact with the ground, touching or not, to a row of a `newton.Contacts`.
 
-    force: of the ground on each paw [N], world, (4, num_worlds). contact_f: force [N] and torque [N m] on the paw,
-    world. A block counts as ground.
+    Shape 0 is the paw, shape 1 the ground; launch over (4, num_worlds). force: of the ground on each paw [N], world,
+    (4, num_worlds). contact_f: force [N] and torque [N m] on the paw, world. A block counts as ground.
     """
     leg, world = wp.tid()
     row = 4 * world + leg

@@ -26,10 +26,7 @@ class LegSolve:
 
 @wp.struct
 class BaseSystem:
-    """The base's six equations of motion in 3x3 blocks, for its acceleration: matrix, force and moment.
-
-    [lin cross; cross^T ang] [a; alpha] = [force; moment].
-    """
+    """The base's six equations of motion, in 3x3 blocks: [lin cross; cross^T ang] [a; alpha] = [force; moment]."""
 
     lin: mat33  # [kg]
     cross: mat33  # [kg m]

@@ -74,10 +74,7 @@ class BlockLaw:
 
 @wp.func
 def contact_jacobian(paw: PawKinematics, arm: vec3) -> mat33:
-    """Return the Jacobian of a paw's contact point: its velocity per motor rate [m/rad], body axes.
-
-    arm [m]: from paw centre to point, body axes.
-    """
+    """Return the Jacobian of a paw's contact point w.r.t. motor angles [m/rad]; arm [m]: paw centre to point, body."""
     return paw.jacobian - skew(arm) * paw.spin
 
 

@@ -63,10 +63,7 @@ class ThreadSums:
 
 @wp.func
 def thread_sums(gradients: Gradients, world: int, writes: bool, over_steps: bool, over_legs: bool) -> ThreadSums:
-    """Return the destination of a thread's gradients w.r.t. parameters, `gradients.parameters`, with weight 1.
-
-    Arguments: see the fields of `ThreadSums`.
-    """
+    """Return the destination of a thread's gradients w.r.t. parameters, `gradients.parameters`, with weight 1."""
     sums = ThreadSums()
     sums.parameters = gradients.parameters
     sums.world = world
@@ -209,10 +206,7 @@ def add_motor(sums: Any, shared: Any, motor: int, scale: real, p: MotorParams):
 
 @wp.func
 def add_limits(sums: Any, row: int, limits: Limits):
-    """Add the gradient w.r.t. the command filter's limits of one angle or sum of angles to the parameter gradient.
-
-    That w.r.t. the hard zones, which only switch, is 0.
-    """
+    """Add the gradient w.r.t. the command filter's limits of one angle or sum; that w.r.t. its hard zones is 0."""
     add_entry(sums, row, limits.lower)
     add_entry(sums, row + 1, limits.upper)
 

@@ -159,10 +159,7 @@ def load_parts(
 
 @wp.func
 def replayed_step(commands: Commands, t: int, dt: real, world: int) -> ReplayedStep:
-    """Return time step, world and base wrench of the physics steps of policy step t, for their recomputation.
-
-    `step` and `entry` are still 0.
-    """
+    """Return time step, world and base wrench to recompute the physics steps of policy step t; all else is 0."""
     at = ReplayedStep()
     at.dt = dt
     at.world = world
@@ -176,10 +173,7 @@ def replay_row(
     model: RobotModel, params: wp.array(dtype=LegParams), policy_step: ReplayedStep, trajectory: TrajectoryArrays,
     row: int, every: int, com: vec3, record: StepRecord,
 ):  # fmt: skip
-    """Recompute the physics steps from one trajectory row to the next, and write them to the record.
-
-    every: their number; com [m]: of the base, body frame.
-    """
+    """Recompute and record the `every` physics steps between two trajectory rows; com [m]: of the base, body frame."""
     at = policy_step
     record.base[at.world, 0] = load_row_base(trajectory, row, at.world, com)
     for k in range(record.angles.shape[2]):
@@ -228,10 +222,7 @@ def add_filter_adjoint(
     by_filter: FilterAdjoint, t: int, k: int, world: int, gradients: Gradients, legs: wp.array(dtype=LegReverse),
     sums: wp.array(dtype=real),
 ):  # fmt: skip
-    """Add the gradients of the loss w.r.t. the inputs of leg k's command filter in policy step t.
-
-    The inputs are raw targets, constants, measured angles and rates.
-    """
+    """Add the gradients w.r.t. targets, constants, angles and rates through leg k's command filter in policy step t."""
     store_row_vec3(gradients.target, t, 3 * k, world, by_filter.target)
     command_adjoint.add_offsets(sums, k, by_filter.angles)
     add_filter(sums, by_filter.constants)

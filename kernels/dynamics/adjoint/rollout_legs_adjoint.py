@@ -45,10 +45,7 @@ class Span:
 
 @wp.func
 def first_entry(timing: Timing, span: Span, row: int) -> int:
-    """Return the index in the record of the first physics step after a trajectory row.
-
-    A row has `every` + 1 entries, the last for its end.
-    """
+    """Return the record's index of the first step after a trajectory row; rows have `every` + 1 entries, one the end."""
     return (row - span.begin) * (timing.every + 1)
 
 

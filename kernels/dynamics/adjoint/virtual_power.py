@@ -107,10 +107,7 @@ def add(a: MassMoments, b: MassMoments) -> MassMoments:  # noqa: F811
 
 @wp.func
 def second_moment_product(a: vec3, b: vec3) -> vec6:
-    """Return the gradient of a^T S b w.r.t. a matrix S of packed second moments (xx yy zz xy xz yz).
-
-    The result is sym(a, b) in the module's docstring.
-    """
+    """Return the gradient of a^T S b w.r.t. packed second moments S (xx yy zz xy xz yz): sym(a, b) of the module."""
     return vec6(
         a[0] * b[0], a[1] * b[1], a[2] * b[2],
         a[0] * b[1] + a[1] * b[0], a[0] * b[2] + a[2] * b[0], a[1] * b[2] + a[2] * b[1],
@@ -289,10 +286,7 @@ def housing_motion(
 def passive_power(
     joints: JointParams, loop: FiveBar, front: real, rates: vec3, stop_rates: StopRates, leg: LegFactors, dt: real
 ) -> real:
-    """Return the virtual power of a leg's passive forces and armature: friction, damping and pressed hard stops.
-
-    Arguments as in `joint_forces`.
-    """
+    """Return the virtual power of a leg's friction, damping, pressed stops and armature; inputs as in `joint_forces`."""
     passive = joint_forces(joints, loop, front, rates, stop_rates, leg.pressed, dt)
     implicit = passive.inertia * leg.acc + wp.cw_mul(joints.armature, leg.acc)
     return wp.dot(leg.virtual_rates, passive.torque - implicit)
