@@ -80,7 +80,7 @@ def limit_command(command: real, pos: real, vel: real, limits: Limits, horizon: 
 
 @wp.func
 def filter_leg(target: vec3, pos: vec3, vel: vec3, params: FilterParams) -> vec3:
-    """Return the filtered targets [rad] of one leg; all vectors are (lateral, outer, inner), vel [rad/s].
+    """Return one leg's motor targets [rad] after the command filter; vectors are (lateral, outer, inner), vel [rad/s].
 
     The limits of each motor act first. The limits of the transversal sum then act on the sum of the two results, and
     each transversal command takes half of that correction.

@@ -71,7 +71,7 @@ class Collisions:
 
 @wp.func
 def leg_capsules(geo: LegGeometry, lateral: real, outer: real, inner: real) -> LegCapsules:
-    """Return the capsules of one leg in the body frame, for its motor angles [rad]."""
+    """Return the capsules that model the links of one leg, in the body frame, for its motor angles [rad]."""
     loop = five_bar(geo, outer, inner)
     normal = vec3(real(0.0), wp.cos(lateral), geo.side * wp.sin(lateral))
     up = vec3(real(0.0), -normal[2], normal[1])
@@ -182,7 +182,7 @@ def leg_leg_distance(leg: LegCapsules, neighbour: LegCapsules, bound: real) -> r
 
 @wp.func
 def body_ground_distance(ground: Ground, pos: vec3, rotation: mat33) -> real:
-    """Return the smallest `ground_distance` [m] of the shell: signed, along the ground's normal, negative inside.
+    """Return the smallest signed distance [m] of the shell from the ground, along the ground's normal, negative inside.
 
     Only the four lower corners of each shell box are tested: exact over a plane, but bumps of a heightfield between
     the corners (at most 0.2 m apart along x) are missed. pos: base position [m], world; rotation: body to world.
@@ -201,7 +201,7 @@ def body_ground_distance(ground: Ground, pos: vec3, rotation: mat33) -> real:
 
 @wp.func
 def leg_ground_distances(ground: Ground, capsules: LegCapsules, pos: vec3, rotation: mat33) -> vec4:
-    """Return the smallest `ground_distance` [m] of one leg's (housing, thighs, knees, shanks), negative inside.
+    """Return the smallest distances [m] of a leg's housing, thighs, knees and shanks from the ground, negative inside.
 
     A knee is the end of its thigh; the thigh counts from its axis to its middle, the shank down to `SHANK_FREE`.
     Exact over a plane; over a heightfield links are tested every 0.09 m. pos: base position [m], world; rotation: body

@@ -41,7 +41,7 @@ def exp_rotation(rotation_vector: vec3) -> quat:
 
 @wp.func
 def integrate_base(base: BaseState, lin: vec3, ang: vec3, dt: real) -> BaseState:
-    """Return the base state after dt [s]; lin [m/s], ang [rad/s]: twist at the end of the step, old body axes."""
+    """Return the base state integrated over dt [s] with the twist at its end; lin [m/s], ang [rad/s]: old body axes."""
     moved = BaseState()
     moved.lin = wp.quat_rotate(base.quat, lin)
     moved.ang = ang

@@ -55,7 +55,7 @@ def contact_point(model: RobotModel, k: int, paw: PawKinematics, contact: PawCon
 def paw_law(
     model: RobotModel, world: int, k: int, contact: PawContact, old_velocity: vec3, velocity: vec3, old_impulse: vec3
 ) -> PawLaw:
-    """Return the contact law of paw k (0 to 3), linearised at the solution.
+    """Return the contact law of paw k (0 to 3), linearised at the solution of a step.
 
     old_velocity, velocity [m/s]: of the contact point at the start and the end of the step; old_impulse [N s]: in the
     preceding step; all in body axes.

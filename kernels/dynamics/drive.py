@@ -27,7 +27,7 @@ class Drive:
 
 @wp.struct
 class LegDrive:
-    """Inputs of one leg of one world over a launch; vectors are lateral, outer, inner."""
+    """Motor targets, motor constants and added torques of one leg in a launch; vectors are lateral, outer, inner."""
 
     closed_loop: int  # as in `Drive`
     lateral: MotorParams

@@ -48,7 +48,7 @@ def load_masses(table: wp.array2d(dtype=real), leg: int, world: int) -> LegMasse
 
 @wp.func
 def load_stops(table: wp.array2d(dtype=real), leg: int, world: int) -> StopParams:
-    """Return the hard stops of a leg."""
+    """Return the constants of the hard stops of a leg from the parameter table."""
     row = leg * layout.LEG_ROWS
     p = StopParams()
     p.lower = load_vec3(table, row + layout.LOWER, world)
@@ -77,7 +77,7 @@ def load_joint_params(table: wp.array2d(dtype=real), leg: int, world: int) -> Jo
 
 @wp.func
 def load_spring(table: wp.array2d(dtype=real), leg: int, world: int) -> LegSpring:
-    """Return the spring between the knees of a leg."""
+    """Return the constants of the spring between the knees of a leg from the parameter table."""
     row = leg * layout.LEG_ROWS + layout.SPRING
     spring = LegSpring()
     spring.stiffness = table[row, world]

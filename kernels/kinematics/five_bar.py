@@ -71,7 +71,7 @@ def solve_projections(a: vec2, b: vec2, along_a: real, along_b: real) -> vec2:
 
 @wp.func
 def five_bar(geo: LegGeometry, outer: real, inner: real) -> FiveBar:
-    """Return the loop's configuration and derivatives at the motor angles `outer` and `inner` [rad]."""
+    """Return the five-bar's configuration and derivatives at the motor angles `outer` and `inner` [rad]."""
     f = geo.front
     loop = FiveBar()
     outer_sin_cos, inner_sin_cos = sin_cos(outer), sin_cos(inner)

@@ -45,7 +45,7 @@ class Span:
 
 @wp.func
 def first_entry(timing: Timing, span: Span, row: int) -> int:
-    """Return the record's index of the first step after a trajectory row; rows have `every` + 1 entries, one the end."""
+    """Return the record's entry of the first step after a trajectory row; each row has `every` + 1, one for its end."""
     return (row - span.begin) * (timing.every + 1)
 
 

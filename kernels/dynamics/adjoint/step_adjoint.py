@@ -1,4 +1,4 @@
-"""Reverse pass of one time step of one world.
+"""Reverse pass of one time step of one world, from the gradient w.r.t. its end state to that w.r.t. its inputs.
 
 The step solves M (v' - v) = dt f + J^T p for the velocities v' at its end, with impulses p that satisfy the contact law
 R(p, v') = 0 in fixed modes (separated, sticking, sliding). For a gradient y by v' and z by p, the multipliers l, m are

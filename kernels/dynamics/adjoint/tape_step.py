@@ -161,7 +161,7 @@ def adj_end_velocities(
     joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), solved: SolvedStep, record: StepRecord,
     power: wp.array2d(dtype=real), world: int, adj_ret: EndVelocities,
 ):  # fmt: skip
-    """Adjoint of `end_velocities`: solve for the multipliers of the step, which `power_kernel` then reads.
+    """Adjoint of `end_velocities`: solve for the multipliers of the step, for the reverse pass of `power_kernel`.
 
     Writes them to `solved` and adds 1 to the adjoint of `power`; adj_ret: gradient w.r.t. the end velocities.
     """

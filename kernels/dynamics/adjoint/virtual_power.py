@@ -286,7 +286,7 @@ def housing_motion(
 def passive_power(
     joints: JointParams, loop: FiveBar, front: real, rates: vec3, stop_rates: StopRates, leg: LegFactors, dt: real
 ) -> real:
-    """Return the virtual power of a leg's friction, damping, pressed stops and armature; inputs as in `joint_forces`."""
+    """Return the virtual power of a leg's friction, damping, pressed stops and armature; inputs: `joint_forces`."""
     passive = joint_forces(joints, loop, front, rates, stop_rates, leg.pressed, dt)
     implicit = passive.inertia * leg.acc + wp.cw_mul(joints.armature, leg.acc)
     return wp.dot(leg.virtual_rates, passive.torque - implicit)

@@ -1,4 +1,4 @@
-"""Rollouts on GPUs: four threads per world, one per leg."""
+"""Kernel that runs rollouts of policy and physics steps on GPUs, with four threads per world, one per leg."""
 
 import warp as wp
 
