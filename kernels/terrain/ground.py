@@ -24,7 +24,7 @@ class Block:
 
 @wp.struct
 class Ground:
-    """Ground of the worlds: a plane (`rows` = 0) or a grid of heights, bilinear in between, with a block per world.
+    """Ground of the worlds: a plane (`rows` = 0) or a grid of heights, bilinear in between, and optional blocks.
 
     The grid's centre is `center_x`, `center_y`. Outside the grid the surface continues at the height of the nearest
     edge. Row index follows y, column index x.
