@@ -11,10 +11,11 @@ from .scalar import mat33, quat, real, vec3
 
 
 def _exchange(gpu: str, sent: str, received: str, threads: int = 4) -> str:
-    """Return the C++ code of an exchange: `gpu` for CUDA, otherwise write `sent` to a box, wait, and read `received`.
+    """Return the C++ code with which the threads of a world exchange values, for CUDA and for the CPU.
 
-    gpu: CUDA statements that return the result. sent, received: C++ expressions; `received` may read all of
-    `box[threads]`, which holds the value `sent` of every thread of a world.
+    The code is `gpu` for CUDA; otherwise it writes `sent` to a box, waits, and reads `received`. gpu: CUDA statements
+    that return the result. sent, received: C++ expressions; `received` may read all of `box[threads]`, which holds the
+    value `sent` of every thread of a world.
     """
     return f"""
 #if defined(__CUDA_ARCH__)
@@ -80,13 +81,13 @@ _SYNC = """
 
 @wp.func_native(_SUM)
 def sum_legs(x: real) -> real:
-    """Return the sum of x over the four legs of a world; all four threads get the same bits."""
+    """Return the sum of a value x over the four legs' threads of a world; all four get the same bits."""
     ...
 
 
 @wp.func_native(_STEP_THREADS)
 def sum_step_threads(x: real) -> real:
-    """Return the sum of x over the eight threads of a leg in a warp of (8 threads, 4 legs) of one world; x on a CPU."""
+    """Return the sum of x over the eight threads of a leg in a warp of (8 threads, 4 legs) of a world; x on a CPU."""
     ...
 
 
@@ -98,31 +99,31 @@ def max_legs(x: real) -> real:
 
 @wp.func_native(_FROM)
 def from_leg(x: real, leg: int) -> real:
-    """Return the x of the thread of leg `leg` (0 to 3) of the same world."""
+    """Return the value x of the thread of leg `leg` (0 to 3) of the same world."""
     ...
 
 
 @wp.func_native(_FIRST)
 def first_leg(flag: bool) -> int:
-    """Return the smallest leg index (0 to 3) of the world whose flag is set, 0 if none is."""
+    """Return the smallest index (0 to 3) of a world's legs whose threads set the flag, 0 if none does."""
     ...
 
 
 @wp.func_native(_LEAST)
 def least_of_attempts(x: int) -> int:
-    """Return the smallest x among the 32 threads of a world; every x must be >= 0."""
+    """Return the smallest x among the 32 threads (8 sampling attempts, 4 legs) of a world; every x must be >= 0."""
     ...
 
 
 @wp.func_native(_ALL)
 def all_of_attempt(flag: bool) -> bool:
-    """Return whether the flag is set in all four threads of an attempt; the four must make this call together."""
+    """Return whether the flag is set in all four threads of a sampling attempt, which must make this call together."""
     ...
 
 
 @wp.func_native(_FROM_TRY)
 def from_leg_of_attempt(x: float, leg: int) -> float:
-    """Return the x of leg `leg` (0 to 3) of the same attempt, whose four threads must make this call together."""
+    """Return the x of leg `leg` (0 to 3) of the same sampling attempt, whose threads must make this call together."""
     ...
 
 
@@ -140,19 +141,19 @@ def sync_lanes():
 
 @wp.func
 def sum_vec(v: vec3) -> vec3:
-    """Return the sum of v over the four legs of a world."""
+    """Return the sum of a vector v over the threads of the four legs of a world."""
     return vec3(sum_legs(v[0]), sum_legs(v[1]), sum_legs(v[2]))
 
 
 @wp.func
 def vec_from_leg(v: vec3, leg: int) -> vec3:
-    """Return the v of the thread of leg `leg` (0 to 3) of the same world."""
+    """Return the vector v of the thread of leg `leg` (0 to 3) of the same world."""
     return vec3(from_leg(v[0], leg), from_leg(v[1], leg), from_leg(v[2], leg))
 
 
 @wp.func
 def mat_from_leg(m: mat33, leg: int) -> mat33:
-    """Return the m of the thread of leg `leg` (0 to 3) of the same world."""
+    """Return the matrix m of the thread of leg `leg` (0 to 3) of the same world."""
     return mat33(
         from_leg(m[0, 0], leg), from_leg(m[0, 1], leg), from_leg(m[0, 2], leg),
         from_leg(m[1, 0], leg), from_leg(m[1, 1], leg), from_leg(m[1, 2], leg),
@@ -162,13 +163,13 @@ def mat_from_leg(m: mat33, leg: int) -> mat33:
 
 @wp.func
 def sum_quat(q: quat) -> quat:
-    """Return the entrywise sum of q over the four legs of a world, as for gradients; not normalised."""
+    """Return the entrywise sum of a quaternion q over the four legs of a world, as for gradients; not normalised."""
     return quat(sum_legs(q[0]), sum_legs(q[1]), sum_legs(q[2]), sum_legs(q[3]))
 
 
 @wp.func
 def sum_symmetric(m: mat33) -> mat33:
-    """Return the sum of m over the four legs of a world, m symmetric: six sums, of the upper triangle."""
+    """Return the sum of a symmetric matrix m over the four legs of a world: six sums, of the upper triangle."""
     xx, yy, zz = sum_legs(m[0, 0]), sum_legs(m[1, 1]), sum_legs(m[2, 2])
     xy, xz, yz = sum_legs(m[0, 1]), sum_legs(m[0, 2]), sum_legs(m[1, 2])
     return mat33(xx, xy, xz, xy, yy, yz, xz, yz, zz)
@@ -176,7 +177,7 @@ def sum_symmetric(m: mat33) -> mat33:
 
 @wp.func
 def sum_matrix(m: mat33) -> mat33:
-    """Return the sum of m over the four legs of a world, for any 3x3 matrices: nine sums."""
+    """Return the sum of any 3x3 matrix m over the four legs of a world: nine sums."""
     return mat33(
         sum_legs(m[0, 0]), sum_legs(m[0, 1]), sum_legs(m[0, 2]),
         sum_legs(m[1, 0]), sum_legs(m[1, 1]), sum_legs(m[1, 2]),

@@ -44,6 +44,6 @@ COORDS = wp.constant(43)  # per world: 7 base, 5 a leg, 4 a loop joint
 
 @wp.func
 def motor_slot(motor: int) -> int:
-    """Return the index of motor 0 to 11 among a world's 20 leg joints: joints 0, 1 and 3 of each leg's five."""
+    """Return the index of motor 0 to 11 among a world's 20 leg joints; motors are joints 0, 1, 3 of a leg's five."""
     kind = motor % 3
     return 5 * (motor // 3) + kind + kind // 2

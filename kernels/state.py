@@ -59,13 +59,13 @@ def store_base(joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real), co
 
 @wp.func
 def load_motors(values: wp.array(dtype=real), first: int) -> vec3:
-    """Return (lateral, outer, inner) of the leg whose five joint values start at index `first`, see `leg_coord`."""
+    """Return a leg's motor values (lateral, outer, inner) from its five joint values, from `first` on (`leg_coord`)."""
     return vec3(values[first], values[first + 1], values[first + 3])
 
 
 @wp.func
 def store_motors(values: wp.array(dtype=real), first: int, motors: vec3):
-    """Write (lateral, outer, inner) of the leg whose five joint values start at index `first`; knees stay unchanged."""
+    """Write a leg's motor values (lateral, outer, inner) to its five joint values, from `first` on; knees are kept."""
     values[first] = motors[0]
     values[first + 1] = motors[1]
     values[first + 3] = motors[2]

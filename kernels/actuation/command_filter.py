@@ -49,9 +49,10 @@ class FilterParams:
 
 @wp.func
 def limit_weight(command: real, pos: real, vel: real, limits: Limits, horizon: real, speed_floor: real) -> real:
-    """Return the weight w [1] of the limits, from 0 (ignored) to 1 (in force); see the module for the rules.
+    """Return the weight [1] with which the command filter enforces a quantity's limits, from 0 (not) to 1 (fully).
 
-    command, pos [rad], vel [rad/s]: of the limited quantity; horizon [s], speed_floor [rad/s]: see `FilterParams`.
+    See the module for the rules. command, pos [rad], vel [rad/s]: of the limited quantity; horizon [s], speed_floor
+    [rad/s]: see `FilterParams`.
     """
     upper_margin = limits.upper - pos
     lower_margin = pos - limits.lower
@@ -69,14 +70,17 @@ def limit_weight(command: real, pos: real, vel: real, limits: Limits, horizon: r
 
 @wp.func
 def limit_command(command: real, pos: real, vel: real, limits: Limits, horizon: real, speed_floor: real) -> real:
-    """Return the filtered command [rad] of a quantity at `pos` [rad], `vel` [rad/s]; see `limit_weight`."""
+    """Return the command [rad] of a motor angle or sum of angles after the filter; the quantity is at `pos`, `vel`.
+
+    pos [rad], vel [rad/s]; see `limit_weight`.
+    """
     weight = limit_weight(command, pos, vel, limits, horizon, speed_floor)
     return command + weight * (wp.clamp(command, limits.lower, limits.upper) - command)
 
 
 @wp.func
 def filter_leg(target: vec3, pos: vec3, vel: vec3, params: FilterParams) -> vec3:
-    """Return the filtered targets [rad] of one leg; all vectors are (lateral, outer, inner), vel [rad/s].
+    """Return one leg's motor targets [rad] after the command filter; vectors are (lateral, outer, inner), vel [rad/s].
 
     The limits of each motor act first. The limits of the transversal sum then act on the sum of the two results, and
     each transversal command takes half of that correction.

@@ -29,7 +29,10 @@ class JointParams:
 
 @wp.struct
 class JointForces:
-    """Implicit motor-space forces: torque [N m] at the current rates, and dt C [kg m^2] to add to the inertia."""
+    """Implicit passive forces of a leg in motor space: torque [N m], and matrix [kg m^2] that they add to the inertia.
+
+    torque is that at the current rates, the matrix is dt C.
+    """
 
     torque: vec3
     inertia: mat33
@@ -37,7 +40,7 @@ class JointForces:
 
 @wp.func
 def joint_friction(p: JointParams, rates: vec3) -> vec3:
-    """Return the viscous coefficients [N m s/rad] of motor damping and Coulomb friction at `rates` [rad/s]."""
+    """Return damping coefficients [N m s/rad] for a leg's motor damping and Coulomb friction at `rates` [rad/s]."""
     return vec3(
         p.damping[0] + p.friction[0] / wp.max(wp.abs(rates[0]), FRICTION_SPEED),
         p.damping[1] + p.friction[1] / wp.max(wp.abs(rates[1]), FRICTION_SPEED),
@@ -47,7 +50,7 @@ def joint_friction(p: JointParams, rates: vec3) -> vec3:
 
 @wp.func
 def capped_damping(damping: real, rate: real, limit: real) -> real:
-    """Return the viscous coefficient [N m s/rad]: `damping`, reduced to a torque of `limit` [N m] at `rate` [rad/s]."""
+    """Return a damping coefficient [N m s/rad], reduced to at most the torque `limit` [N m] at `rate` [rad/s]."""
     return wp.min(damping, limit / wp.max(wp.abs(rate), real(1.0e-6)))
 
 
@@ -67,7 +70,7 @@ def knee_damping(p: JointParams, loop: FiveBar, front: real, rates: vec3) -> mat
 def joint_forces(
     p: JointParams, loop: FiveBar, front: real, rates: vec3, stop_rates: StopRates, pressed: int, dt: real
 ) -> JointForces:
-    """Return friction, knee damping and pressed hard stops of one leg, in motor space.
+    """Return the passive forces of one leg in motor space: friction, knee damping and pressed hard stops.
 
     front: +1 front leg, -1 back leg. rates [rad/s]: lateral, outer, inner, at the start of the step dt [s]. stop_rates,
     pressed: the leg's hard stops, see `stops`.

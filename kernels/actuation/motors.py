@@ -54,7 +54,7 @@ def load_motor(motors: MotorArrays, motor: int, world: int) -> MotorParams:
 
 @wp.func
 def envelope(direction: real, vel: real, motor: MotorParams) -> real:
-    """Return the largest torque [N m], >= 0, along `direction` (+1 or -1) at joint speed `vel` [rad/s].
+    """Return a motor's largest torque [N m], >= 0, along `direction` (+1 or -1) at joint speed `vel` [rad/s].
 
     The motor brakes with its peak torque. Its driving torque is at most the peak up to the cutoff speed, and falls
     linearly to 0 at the no-load speed. The controller commands at most the saturation torque.
@@ -65,7 +65,7 @@ def envelope(direction: real, vel: real, motor: MotorParams) -> real:
 
 @wp.func
 def motor_torque(target: real, pos: real, vel: real, motor: MotorParams) -> real:
-    """Return the torque [N m] at the joint for a target [rad], the true position [rad] and speed [rad/s].
+    """Return a motor's torque [N m] at the joint for a target [rad], the true position [rad] and speed [rad/s].
 
     Position control, bounded by the torque-speed envelope; then over-speed protection fades driving and braking alike.
     """

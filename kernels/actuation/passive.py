@@ -44,11 +44,12 @@ def passive_torque_kernel(
     # in, out
     joint_f: wp.array(dtype=real),
 ):
-    """Write the knees' damping torques, add torques of sum stops and springs [N m]; one thread per (world, leg).
+    """Compute the passive torques [N m] of every leg: knee damping, hard stops of angle sums, and springs.
 
-    knee_damping [N m s/rad] acts up to knee_limit [N m]. sum_lower, sum_upper [rad]: stops of outer + inner angle;
-    stop_ke [N m/rad], stop_kd [N m s/rad] must be soft enough for explicit integration. springs (num_worlds,):
-    stiffness [N/m] and rest length [m]. joint_q, joint_qd, joint_f: Newton's, flat over worlds.
+    Those of the knees are written to joint_f, the others added; one thread per (world, leg). knee_damping [N m s/rad]
+    acts up to knee_limit [N m]. sum_lower, sum_upper [rad]: stops of outer + inner angle; stop_ke [N m/rad], stop_kd
+    [N m s/rad] must be soft enough for explicit integration. springs (num_worlds,): stiffness [N/m] and rest length
+    [m]. joint_q, joint_qd, joint_f: Newton's, flat over worlds.
     """
     world, leg = wp.tid()
     q = world * COORDS + 7 + 5 * leg  # joints: lateral, outer motor, outer knee, inner motor, inner knee

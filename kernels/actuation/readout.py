@@ -15,7 +15,7 @@ def motor_values_kernel(
     # out
     motor_values: wp.array2d(dtype=float),
 ):
-    """Copy the motors' entries of `joint_values` (38 num_worlds,) to (12, num_worlds); launch over that shape."""
+    """Copy the motors' values from an array of all joints (38 num_worlds,) to (12, num_worlds), the launch shape."""
     motor, world = wp.tid()
     motor_values[motor, world] = joint_values[DOFS * world + 6 + motor_slot(motor)]
 
@@ -59,9 +59,10 @@ def arrived_target_kernel(
     # out
     arrived: wp.array2d(dtype=float),
 ):
-    """Write the target [rad] of each motor in physics step `step`: `previous` until `delay` [steps], then `target`.
+    """Write the target [rad] that each motor follows in physics step `step`, delayed by the latency of its world.
 
-    Launch over (12, num_worlds), the shape of all targets. delay: (num_worlds,). step counts from the new target.
+    It is `previous` until `delay` [steps], then `target`. Launch over (12, num_worlds), the shape of all targets.
+    delay: (num_worlds,). step counts from the new target.
     """
     motor, world = wp.tid()
     arrived[motor, world] = wp.where(step < delay[world], previous[motor, world], target[motor, world])

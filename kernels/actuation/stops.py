@@ -47,7 +47,7 @@ class StopParams:
 
 @wp.struct
 class StopRates:
-    """Rates at which the stops of one leg press in a step; rows are lateral, outer, inner, outer + inner."""
+    """Motor rates beyond which a leg's hard stops press in a step; rows are lateral, outer, inner, outer + inner."""
 
     lower: vec4  # [rad/s] rate at the end of the step above which the lower stop is free
     upper: vec4  # [rad/s] rate at the end of the step below which the upper stop is free
@@ -56,7 +56,10 @@ class StopRates:
 
 @wp.struct
 class StopForces:
-    """Implicit forces of pressed stops: torque [N m] at the current rates, and dt C [kg m^2] to add to the inertia."""
+    """Implicit forces of a leg's pressed hard stops: torque [N m], and matrix [kg m^2] that they add to the inertia.
+
+    torque is that at the current rates, the matrix is dt C.
+    """
 
     torque: vec3
     inertia: mat33
@@ -64,7 +67,7 @@ class StopForces:
 
 @wp.func
 def stop_rates(p: StopParams, angles: vec3, dt: real) -> StopRates:
-    """Return the rates at which the stops press in a step dt [s] from motor angles [rad]: lateral, outer, inner."""
+    """Return the motor rates beyond which a leg's hard stops press in a step dt [s] from angles [rad] of its motors."""
     damping = wp.max(dt * p.ke + p.kd, real(1.0e-9))
     inside = p.ke / damping
     outside = real(1.0) / dt
@@ -92,7 +95,7 @@ def stop_rates(p: StopParams, angles: vec3, dt: real) -> StopRates:
 
 @wp.func
 def beyond_stops(p: StopParams, angles: vec3) -> bool:
-    """Return whether motor angles [rad] are beyond any stop of the leg, or NaN; a step ending within presses none."""
+    """Return whether motor angles [rad] are beyond a hard stop of a leg, or NaN; a step ending within presses none."""
     fold = angles[1] + angles[2]
     past = wp.max(p.sum_lower - fold, fold - p.sum_upper)
     for j in range(3):
@@ -102,13 +105,13 @@ def beyond_stops(p: StopParams, angles: vec3) -> bool:
 
 @wp.func
 def row_side(pressed: int, i: int) -> int:
-    """Return the pressed stop of row i in the set `pressed`: 0 (none), LOWER_STOP or UPPER_STOP."""
+    """Return which stop of row i (a motor or their sum) is in the set `pressed`: 0 (none), LOWER_STOP or UPPER_STOP."""
     return (pressed >> (ROW_BITS * i)) & ROW_MASK
 
 
 @wp.func
 def pressed_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int) -> int:
-    """Return the set of stops that a leg presses if its motors end the step at `rates` [rad/s].
+    """Return the set of hard stops that a leg presses if its motors end the step at `rates` [rad/s].
 
     pressed: the set with which `rates` was solved; a stop is added or removed only beyond the slack [rad/s].
     """
@@ -127,7 +130,10 @@ def pressed_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int)
 
 @wp.func
 def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int, sets: int) -> int:
-    """Return the set of stops to try after `sets` sets; the last, `pressed`, led to `rates` [rad/s]; slack [rad/s]."""
+    """Return the active set of hard joint stops with which a leg's step is solved next, after `sets` sets were tried.
+
+    The last set, `pressed`, led to `rates` [rad/s]; slack [rad/s].
+    """
     required = pressed_stops(stop_rates, rates, slack, pressed)
     if required == pressed or sets < PRESS_ONLY:
         return required
@@ -140,13 +146,13 @@ def revised_stops(stop_rates: StopRates, rates: vec3, slack: real, pressed: int,
 
 @wp.func
 def one_by_one(sets: int) -> bool:
-    """Return whether a step that has tried `sets` sets may change only one stop per world in the next set."""
+    """Return whether only one hard stop per world may change in the active set that a step tries after `sets` sets."""
     return sets >= ONE_BY_ONE and sets < PRESS_ONLY
 
 
 @wp.func
 def change_one(pressed: int, required: int) -> int:
-    """Return the set `pressed` with the first row that differs from the set `required` replaced by that row."""
+    """Return the set of hard stops `pressed`, changed toward the set `required` in the first row that differs."""
     for i in range(ROWS):
         bits = ROW_MASK << (ROW_BITS * i)
         if (pressed ^ required) & bits != 0:
@@ -156,7 +162,7 @@ def change_one(pressed: int, required: int) -> int:
 
 @wp.func
 def row_torque(stop_rates: StopRates, i: int, rate: real, pressed: int) -> real:
-    """Return the torque [N m] of the stop in row i at rate [rad/s] at the start of the step; 0 if it is not pressed."""
+    """Return the torque [N m] of the hard stop in row i at rate [rad/s] at the step's start; 0 if it is not pressed."""
     side = row_side(pressed, i)
     if side == 0:
         return real(0.0)
@@ -165,7 +171,7 @@ def row_torque(stop_rates: StopRates, i: int, rate: real, pressed: int) -> real:
 
 @wp.func
 def stop_forces(stop_rates: StopRates, rates: vec3, pressed: int, dt: real) -> StopForces:
-    """Return the forces of the stops in the set `pressed`; rates [rad/s]: at the start of the step dt [s]."""
+    """Return the implicit forces of a leg's pressed hard stops; rates [rad/s]: at the start of the step dt [s]."""
     forces = StopForces()
     if pressed == 0:
         return forces

@@ -9,7 +9,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class ContactRows:
-    """Arrays of a `newton.Contacts`, by row; points in the frame of the shape's body."""
+    """Arrays of a `newton.Contacts`, one row per contact; points in the frame of the shape's body."""
 
     count: wp.array(dtype=int)  # (1,)
     shape0: wp.array(dtype=int)
@@ -23,7 +23,7 @@ class ContactRows:
 
 @wp.struct
 class PawShapes:
-    """Shapes of a model that can touch, and the model's arrays of all shapes."""
+    """Indices of the shapes of paws and ground in a model, and the model's arrays of all shapes."""
 
     paws: wp.array(dtype=int)  # (4 num_worlds,) shape index, FL, FR, BL, BR of each world
     ground: int  # shape index
@@ -43,10 +43,10 @@ def paw_contacts_kernel(
     rows: ContactRows,
     contact_f: wp.array(dtype=wp.spatial_vector),
 ):
-    """Write a row for each paw, touching or not: shape 0 the paw, shape 1 the ground; launch over (4, num_worlds).
+    """Write every paw's contact with the ground, touching or not, to a row of a `newton.Contacts`.
 
-    force: of the ground on each paw [N], world, (4, num_worlds). contact_f: force [N] and torque [N m] on the paw,
-    world. A block counts as ground.
+    Shape 0 is the paw, shape 1 the ground; launch over (4, num_worlds). force: of the ground on each paw [N], world,
+    (4, num_worlds). contact_f: force [N] and torque [N m] on the paw, world. A block counts as ground.
     """
     leg, world = wp.tid()
     row = 4 * world + leg

@@ -63,7 +63,7 @@ class LegCapsules:
 
 @wp.struct
 class Collisions:
-    """Forbidden contacts of one robot."""
+    """Forbidden contacts of one robot as bit flags, and the smallest distance of all pairs that are checked."""
 
     flags: int  # bitmask of BODY_GROUND to LEG_SHELL
     clearance: real  # [m] smallest distance of all, negative in contact
@@ -71,7 +71,7 @@ class Collisions:
 
 @wp.func
 def leg_capsules(geo: LegGeometry, lateral: real, outer: real, inner: real) -> LegCapsules:
-    """Return the capsules of one leg in the body frame, for its motor angles [rad]."""
+    """Return the capsules that model the links of one leg, in the body frame, for its motor angles [rad]."""
     loop = five_bar(geo, outer, inner)
     normal = vec3(real(0.0), wp.cos(lateral), geo.side * wp.sin(lateral))
     up = vec3(real(0.0), -normal[2], normal[1])
@@ -97,7 +97,10 @@ def leg_capsules(geo: LegGeometry, lateral: real, outer: real, inner: real) -> L
 
 @wp.func
 def capsule_end(k: int) -> int:
-    """Return the row of `LegCapsules.ends` where link k ends; it starts at row k. Links as in `capsule_radius`."""
+    """Return the row of `LegCapsules.ends` that holds the far end of link k; the near end is in row k.
+
+    Links as in `capsule_radius`.
+    """
     return wp.min(k + 2, 4)
 
 
@@ -179,7 +182,7 @@ def leg_leg_distance(leg: LegCapsules, neighbour: LegCapsules, bound: real) -> r
 
 @wp.func
 def body_ground_distance(ground: Ground, pos: vec3, rotation: mat33) -> real:
-    """Return the smallest `ground_distance` [m] of the shell: signed, along the ground's normal, negative inside.
+    """Return the smallest signed distance [m] of the shell from the ground, along the ground's normal, negative inside.
 
     Only the four lower corners of each shell box are tested: exact over a plane, but bumps of a heightfield between
     the corners (at most 0.2 m apart along x) are missed. pos: base position [m], world; rotation: body to world.
@@ -198,7 +201,7 @@ def body_ground_distance(ground: Ground, pos: vec3, rotation: mat33) -> real:
 
 @wp.func
 def leg_ground_distances(ground: Ground, capsules: LegCapsules, pos: vec3, rotation: mat33) -> vec4:
-    """Return the smallest `ground_distance` [m] of one leg's (housing, thighs, knees, shanks), negative inside.
+    """Return the smallest distances [m] of a leg's housing, thighs, knees and shanks from the ground, negative inside.
 
     A knee is the end of its thigh; the thigh counts from its axis to its middle, the shank down to `SHANK_FREE`.
     Exact over a plane; over a heightfield links are tested every 0.09 m. pos: base position [m], world; rotation: body
@@ -226,7 +229,7 @@ def leg_ground_distances(ground: Ground, capsules: LegCapsules, pos: vec3, rotat
 
 @wp.func
 def add_distance(collisions: Collisions, distance: real, least: real, flag: int) -> Collisions:
-    """Return `collisions` updated by one distance [m]: the clearance, and `flag` (a bit) if distance < least [m]."""
+    """Update a robot's forbidden contacts by one distance [m]: clearance, and `flag` (a bit) if it is < least [m]."""
     result = Collisions()
     result.flags = collisions.flags | wp.where(distance < least, flag, 0)
     result.clearance = wp.min(collisions.clearance, distance)
@@ -237,7 +240,7 @@ def add_distance(collisions: Collisions, distance: real, least: real, flag: int)
 def load_leg(
     geometry: wp.array(dtype=LegGeometry), joint_q: wp.array(dtype=wp.float32), start: int, leg: int
 ) -> LegCapsules:
-    """Return the capsules of leg 0 to 3 of the world whose joint coordinates begin at index `start` of joint_q."""
+    """Return the capsules that model leg 0 to 3 of a world, whose coordinates begin at index `start` of joint_q."""
     motor = start + 7 + 5 * leg
     return leg_capsules(geometry[leg], real(joint_q[motor]), real(joint_q[motor + 1]), real(joint_q[motor + 3]))
 
@@ -253,7 +256,7 @@ def add_leg_distances(
     collisions: Collisions, ground: Ground, leg: LegCapsules, neighbour: LegCapsules, pos: vec3, rotation: mat33,
     min_distance: real,
 ) -> Collisions:  # fmt: skip
-    """Return `collisions` updated by one leg: its distances to the ground, itself, the shell and `neighbour`.
+    """Return `collisions` updated by one leg's distances to the ground, itself, the shell and the leg `neighbour`.
 
     pos [m], rotation: see `leg_ground_distances`. min_distance [m]: links closer than this to another link raise flags.
     """
@@ -300,7 +303,7 @@ def leg_collisions(
     geometry: wp.array(dtype=LegGeometry), ground: Ground, joint_q: wp.array(dtype=wp.float32), start: int, order: int,
     min_distance: real,
 ) -> int:  # fmt: skip
-    """Return the flags of the leg at position `order` (0 to 3) around the body, see `next_leg`.
+    """Return the flags of the forbidden contacts of one leg, at position `order` (0 to 3) around the body.
 
     The union over all four orders equals the flags of `world_collisions` if min_distance is 0. min_distance [m]: links
     closer than this to another link raise flags.
@@ -329,7 +332,10 @@ def collision_kernel(
     flags: wp.array(dtype=wp.int32),
     clearance: wp.array(dtype=wp.float32),
 ):
-    """Write `world_collisions` per world, clearance in [m]; joint_q: Newton's, flat, `coords_per_world` per world."""
+    """Write every robot's forbidden contacts and clearance [m] from `world_collisions`; one thread per world.
+
+    joint_q: Newton's, flat, `coords_per_world` per world.
+    """
     world = wp.tid()
     here = world_ground(ground, world)
     collisions = world_collisions(geometry, here, joint_q, world * coords_per_world, margin)

@@ -13,7 +13,10 @@ from .leg_dynamics import LegDynamics
 
 @wp.struct
 class LegSolve:
-    """One leg with its motors eliminated: q'' = free - to_lin a - to_ang alpha; rows are lateral, outer, inner."""
+    """A leg's motor accelerations as a linear function of the base's acceleration, after their elimination.
+
+    q'' = free - to_lin a - to_ang alpha; rows are lateral, outer, inner.
+    """
 
     inverse: mat33  # inverse of D, implicit terms included [1/(kg m^2)]
     free: vec3  # D^-1 (tau - h) [rad/s^2]
@@ -23,7 +26,7 @@ class LegSolve:
 
 @wp.struct
 class BaseSystem:
-    """Equations of the base, in 3x3 blocks: [lin cross; cross^T ang] [a; alpha] = [force; moment]."""
+    """The base's six equations of motion, in 3x3 blocks: [lin cross; cross^T ang] [a; alpha] = [force; moment]."""
 
     lin: mat33  # [kg]
     cross: mat33  # [kg m]
@@ -34,7 +37,7 @@ class BaseSystem:
 
 @wp.struct
 class BaseInverse:
-    """Inverse of the matrix of `BaseSystem`, in the same 3x3 blocks."""
+    """Inverse of the 6x6 matrix of the base's equations of motion (`BaseSystem`), in the same 3x3 blocks."""
 
     lin: mat33  # [1/kg]
     cross: mat33  # [1/(kg m)]
@@ -43,7 +46,10 @@ class BaseInverse:
 
 @wp.func
 def eliminate_leg(leg: LegDynamics, implicit: mat33, torque: vec3) -> LegSolve:
-    """Return a leg with its motors eliminated; implicit: matrix added to D [kg m^2]; torque: tau [N m], motor space."""
+    """Eliminate a leg's motor accelerations from the equations of motion, as a function of the base's acceleration.
+
+    implicit: matrix added to D [kg m^2]; torque: tau [N m], motor space.
+    """
     solve = LegSolve()
     inverse = inverse_symmetric(leg.inertia + implicit)
     solve.inverse = inverse
@@ -71,7 +77,7 @@ def base_link_system(body: MassMoments, omega: vec3, g: vec3, force: vec3, momen
 
 @wp.func
 def add_leg(system: BaseSystem, leg: LegDynamics, solve: LegSolve) -> BaseSystem:
-    """Return `system` plus the terms of one leg, whose motors `solve` has eliminated."""
+    """Return the base's equations of motion (`system`) plus the terms of one leg, its motors eliminated (`solve`)."""
     s = BaseSystem()
     s.lin = system.lin + wp.diag(vec3(leg.body.mass)) - leg.coupling_lin * solve.to_lin
     s.cross = system.cross - skew(leg.body.first) - leg.coupling_lin * solve.to_ang
@@ -83,7 +89,7 @@ def add_leg(system: BaseSystem, leg: LegDynamics, solve: LegSolve) -> BaseSystem
 
 @wp.func
 def invert(system: BaseSystem) -> BaseInverse:
-    """Return the inverse of a symmetric positive definite system by block elimination."""
+    """Return the inverse of the base's equations (a symmetric positive definite 6x6 matrix) by block elimination."""
     lin_inv = inverse_symmetric(system.lin)
     across = lin_inv * system.cross
     inverse = BaseInverse()
@@ -97,13 +103,19 @@ def invert(system: BaseSystem) -> BaseInverse:
 
 @wp.func
 def solve_lin(inverse: BaseInverse, force: vec3, moment: vec3) -> vec3:
-    """Return the linear part of inverse (force, moment): an acceleration [m/s^2], or for impulses a velocity [m/s]."""
+    """Return the base's linear acceleration [m/s^2] under a force and moment.
+
+    For a linear and an angular impulse it is a velocity [m/s].
+    """
     return inverse.lin * force + inverse.cross * moment
 
 
 @wp.func
 def solve_ang(inverse: BaseInverse, force: vec3, moment: vec3) -> vec3:
-    """Return the angular part of inverse (force, moment): [rad/s^2], or for impulses a velocity [rad/s]."""
+    """Return the base's angular acceleration [rad/s^2] under a force and moment.
+
+    For a linear and an angular impulse it is a velocity [rad/s].
+    """
     return wp.transpose(inverse.cross) * force + inverse.ang * moment
 
 
@@ -115,7 +127,10 @@ def motor_acceleration(solve: LegSolve, lin: vec3, ang: vec3) -> vec3:
 
 @wp.func
 def sum_systems(base: BaseSystem, leg: BaseSystem) -> BaseSystem:
-    """Return `base` plus the sum of `leg` over the four threads of a world, each of which passes its own leg."""
+    """Sum the base's equations of motion and the legs' terms, each from its own thread, over a world's four threads.
+
+    Returns `base` plus the sum of `leg`.
+    """
     s = BaseSystem()
     s.lin = base.lin + sum_symmetric(leg.lin)
     s.cross = base.cross + sum_matrix(leg.cross)

@@ -16,7 +16,10 @@ class Wrench:
 
 @wp.func
 def external_wrench(base: BaseState, com: vec3, force_at_com: vec3, moment: vec3) -> Wrench:
-    """Return the wrench about the base origin, body axes; force [N], moment [N m]: world axes, at com [m] (body)."""
+    """Return an external wrench, given at the base's com, moved to the base's origin and rotated to body axes.
+
+    force [N], moment [N m]: world axes; com [m]: body frame.
+    """
     wrench = Wrench()
     wrench.force = wp.quat_rotate_inv(base.quat, force_at_com)
     wrench.moment = wp.quat_rotate_inv(base.quat, moment) + wp.cross(com, wrench.force)
@@ -38,7 +41,7 @@ def exp_rotation(rotation_vector: vec3) -> quat:
 
 @wp.func
 def integrate_base(base: BaseState, lin: vec3, ang: vec3, dt: real) -> BaseState:
-    """Return the base state after dt [s]; lin [m/s], ang [rad/s]: twist at the end of the step, old body axes."""
+    """Return the base state integrated over dt [s] with the twist at its end; lin [m/s], ang [rad/s]: old body axes."""
     moved = BaseState()
     moved.lin = wp.quat_rotate(base.quat, lin)
     moved.ang = ang

@@ -38,7 +38,10 @@ SLIDE = wp.constant(2)
 
 @wp.struct
 class PawContact:
-    """Terms of one paw in the contact problem; vectors in body axes, motors lateral, outer, inner."""
+    """Contact problem of one paw in a step: normal, friction, Jacobian and velocity responses to impulses.
+
+    Vectors in body axes, motors lateral, outer, inner.
+    """
 
     active: int  # 0: too far from the ground to touch within the step, and the impulse is 0
     on_block: int  # 1: the paw's nearest surface is the sliding block
@@ -71,7 +74,7 @@ class BlockLaw:
 
 @wp.func
 def contact_jacobian(paw: PawKinematics, arm: vec3) -> mat33:
-    """Return the contact point's velocity per motor rate [m/rad]; arm [m]: from paw centre to point, body axes."""
+    """Return the Jacobian of a paw's contact point w.r.t. motor angles [m/rad]; arm [m]: paw centre to point, body."""
     return paw.jacobian - skew(arm) * paw.spin
 
 
@@ -94,7 +97,10 @@ def target_normal_velocity(gap: real, pressed: int, dt: real) -> real:
 
 @wp.func
 def couple_contact(contact: PawContact, point: vec3, leg: LegSolve, base: BaseInverse) -> PawContact:
-    """Return a contact with `from_lin` to `total` computed; point [m]: point of contact from the base origin, body."""
+    """Compute how impulses on a paw change its contact velocity, through the leg and through the base.
+
+    Returns the contact with `from_lin` to `total` set; point [m]: point of contact from the base origin, body axes.
+    """
     c = contact
     eye = wp.identity(n=3, dtype=real)
     leg_response = leg.inverse * wp.transpose(c.jacobian)
@@ -112,12 +118,13 @@ def couple_contact(contact: PawContact, point: vec3, leg: LegSolve, base: BaseIn
 
 @wp.func
 def sliding_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
-    """Return the next impulse [N s] of a sliding paw, which satisfies the normal condition of its contact.
+    """Return the next iterate of a sliding paw's impulse [N s], by a friction step that is cut off at the cone.
 
-    impulse [N s], velocity [m/s]: current values at the paw. The new friction is (current friction - slip / scale),
-    cut off at the friction cone. The fixed point is the cone's edge opposite to the slip; friction is never stretched
-    to the cone, which would make friction along the slip a fixed point too. The steps converge if scale exceeds half
-    the largest tangential response, and fastest if it is half the sum of both.
+    The impulse satisfies the normal condition of the contact. impulse [N s], velocity [m/s]: current values at the paw.
+    The new friction is (current friction - slip / scale), cut off at the friction cone. The fixed point is the cone's
+    edge opposite to the slip; friction is never stretched to the cone, which would make friction along the slip a fixed
+    point too. The steps converge if scale exceeds half the largest tangential response, and fastest if it is half the
+    sum of both.
     """
     n = c.normal
     across = c.total * n
@@ -154,7 +161,7 @@ def local_impulse(c: PawContact, impulse: vec3, velocity: vec3) -> vec3:
 
 @wp.func
 def push_on_block(contacts: wp.array(dtype=PawContact)) -> vec3:
-    """Return the sum of the paws' impulses [N s] on the block; contacts: the (4,) of a world."""
+    """Return the sum of the paws' impulses [N s] on the sliding block; contacts: the (4,) of a world."""
     push = vec3(real(0.0))
     for k in range(contacts.shape[0]):
         if contacts[k].on_block != 0:
@@ -179,7 +186,10 @@ def block_velocity(block: BlockLaw, push: vec3) -> vec3:
 
 @wp.func
 def add_block(contact: PawContact, block: BlockLaw) -> PawContact:
-    """Return a paw's contact with the sliding block: `on_block` is 1, and `total` includes the block's response."""
+    """Turn a paw's contact into one with the sliding block, and include the block's response to impulses.
+
+    `on_block` is 1, and `total` includes the response.
+    """
     c = contact
     c.on_block = 1
     c.total += (wp.identity(n=3, dtype=real) - wp.outer(block.up, block.up)) / block.mass
@@ -189,7 +199,10 @@ def add_block(contact: PawContact, block: BlockLaw) -> PawContact:
 
 @wp.struct
 class ContactState:
-    """State of the contact iteration; changes relative to the motion without contact, body axes."""
+    """State of the Gauss-Seidel iteration of a world's contacts: change of the base's velocity, and convergence.
+
+    Changes are relative to the motion without contact, body axes.
+    """
 
     lin: vec3  # change of the base's linear velocity [m/s]
     ang: vec3  # change of its angular velocity [rad/s]
@@ -199,7 +212,10 @@ class ContactState:
 
 @wp.func
 def sweep_contacts(contacts: wp.array(dtype=PawContact), block: BlockLaw, state: ContactState) -> ContactState:
-    """Run one Gauss-Seidel sweep over the active paws; updates the impulses in `contacts` (4,), returns the state."""
+    """Run one Gauss-Seidel sweep of the contact solver over the active paws; updates their impulses in `contacts` (4,).
+
+    Returns the new state of the iteration.
+    """
     s = state
     s.change = real(0.0)
     s.sweeps = state.sweeps + 1
@@ -222,10 +238,11 @@ def sweep_contacts(contacts: wp.array(dtype=PawContact), block: BlockLaw, state:
 def solve_contacts(
     contacts: wp.array(dtype=PawContact), block: BlockLaw, max_sweeps: int, tolerance: real
 ) -> ContactState:
-    """Solve the contact problem of a world; returns the change of the base twist and the residual.
+    """Solve the contact problem of a world's four paws by block Gauss-Seidel sweeps.
 
-    contacts (4,): impulses are the first guess and are replaced by the solution. Ends after `max_sweeps`, or when a
-    sweep changes no contact velocity by more than `tolerance` [m/s].
+    Returns the change of the base twist and the residual. contacts (4,): impulses are the first guess and are replaced
+    by the solution. Ends after `max_sweeps`, or when a sweep changes no contact velocity by more than `tolerance`
+    [m/s].
     """
     state = ContactState()
     for k in range(contacts.shape[0]):
@@ -240,7 +257,10 @@ def solve_contacts(
 
 @wp.func
 def contact_mode(impulse: vec3, normal: vec3, mu: real) -> int:
-    """Return SEPARATE, STICK or SLIDE for a solved impulse [N s]; normal: unit, out of the ground; mu: friction."""
+    """Classify a paw's solved contact as SEPARATE, STICK or SLIDE from its impulse [N s].
+
+    normal: unit, out of the ground; mu: friction coefficient.
+    """
     size = wp.dot(impulse, normal)
     if size <= real(0.0):
         return SEPARATE

@@ -15,7 +15,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class PawLaw:
-    """Contact law R(impulse, velocity) = 0 of a paw at the solution, see `contact_residual`; body axes."""
+    """Contact law of a paw, linearised at the solution of a step: mode, friction and derivatives; body axes.
+
+    R(impulse, velocity) = 0, see `contact_residual`.
+    """
 
     mode: int  # SEPARATE, STICK or SLIDE
     mu_row: int  # row of the friction coefficient in the parameter table
@@ -28,7 +31,10 @@ class PawLaw:
 def contact_at(
     model: RobotModel, k: int, base: BaseState, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, impulse: vec3
 ) -> PawContact:
-    """Return the contact of paw k (0 to 3) with the floor, responses to impulses included; impulse [N s]: body axes."""
+    """Return the contact of paw k with the floor at the solution of a step, with velocity responses to impulses.
+
+    k: 0 to 3. impulse [N s]: body axes.
+    """
     contact = PawContact()
     contact.active = 1
     contact.impulse = impulse
@@ -49,7 +55,7 @@ def contact_point(model: RobotModel, k: int, paw: PawKinematics, contact: PawCon
 def paw_law(
     model: RobotModel, world: int, k: int, contact: PawContact, old_velocity: vec3, velocity: vec3, old_impulse: vec3
 ) -> PawLaw:
-    """Return the contact law of paw k (0 to 3), linearised at the solution.
+    """Return the contact law of paw k (0 to 3), linearised at the solution of a step.
 
     old_velocity, velocity [m/s]: of the contact point at the start and the end of the step; old_impulse [N s]: in the
     preceding step; all in body axes.
@@ -74,10 +80,10 @@ def paw_law(
 
 @wp.func
 def contact_residual(impulse: vec3, velocity: vec3, normal: vec3, goal: real, mu: real, mode: int) -> vec3:
-    """Return the residual R of the contact law of `mode`, zero where impulse [N s] and velocity [m/s] satisfy it.
+    """Return the residual of a paw's contact law, zero where impulse [N s] and velocity [m/s] satisfy it.
 
-    SEPARATE: R = p. STICK: R = v - goal n. SLIDE: normal part v_n - goal, tangential part |v_t| p_t + mu p_n v_t.
-    goal [m/s]: see `PawContact`.
+    R by mode: SEPARATE: R = p. STICK: R = v - goal n. SLIDE: normal part v_n - goal, tangential part |v_t| p_t + mu p_n
+    v_t. goal [m/s]: see `PawContact`.
     """
     if mode == SEPARATE:
         return impulse

@@ -27,7 +27,7 @@ class Drive:
 
 @wp.struct
 class LegDrive:
-    """Inputs of one leg of one world over a launch; vectors are lateral, outer, inner."""
+    """Motor targets, motor constants and added torques of one leg in a launch; vectors are lateral, outer, inner."""
 
     closed_loop: int  # as in `Drive`
     lateral: MotorParams
@@ -58,7 +58,7 @@ class Workspace:
 def freeze_diverged_world(
     model: RobotModel, work: Workspace, world: int, joint_q: wp.array(dtype=real), joint_qd: wp.array(dtype=real)
 ):
-    """Write the world's reference pose with zero velocities and contact forces, and reset its block."""
+    """Put a diverged world at rest in its reference pose, without contact forces, and reset its block."""
     rest_block(model.ground, world)
     for i in range(int(COORDS)):
         joint_q[world * COORDS + i] = work.reference_q[world * COORDS + i]
@@ -71,7 +71,7 @@ def freeze_diverged_world(
 
 @wp.func
 def load_leg_drive(drive: Drive, world: int, k: int) -> LegDrive:
-    """Return the inputs of leg k (0 to 3) of a world."""
+    """Return the motor targets, motor constants and added torques of leg k (0 to 3) of a world."""
     leg = LegDrive()
     leg.extra = load_motors(drive.joint_f, leg_dof(world, k))
     leg.closed_loop = drive.closed_loop

@@ -26,7 +26,7 @@ def trace(s: vec6) -> real:
 
 @wp.func
 def mul(s: vec6, v: vec3) -> vec3:
-    """Return S v for packed second moments S."""
+    """Return the product S v of a matrix S of packed second moments and a vector."""
     return vec3(
         s[0] * v[0] + s[3] * v[1] + s[4] * v[2],
         s[3] * v[0] + s[1] * v[1] + s[5] * v[2],
@@ -36,7 +36,7 @@ def mul(s: vec6, v: vec3) -> vec3:
 
 @wp.func
 def mul_plane(s: vec5, v: vec3) -> vec3:
-    """Return S v for packed second moments S with yy = 0, stored as (xx, zz, xy, xz, yz)."""
+    """Return the product S v of packed second moments S with yy = 0, stored as (xx, zz, xy, xz, yz), and a vector."""
     return vec3(
         s[0] * v[0] + s[2] * v[1] + s[3] * v[2], s[2] * v[0] + s[4] * v[2], s[3] * v[0] + s[4] * v[1] + s[1] * v[2]
     )
@@ -44,7 +44,7 @@ def mul_plane(s: vec5, v: vec3) -> vec3:
 
 @wp.func
 def inertia_mul(s: vec6, v: vec3) -> vec3:
-    """Return I v for the inertia tensor I of packed second moments."""
+    """Return the product I v of the inertia tensor I of packed second moments and a vector."""
     return trace(s) * v - mul(s, v)
 
 
@@ -60,7 +60,7 @@ def inertia_matrix(s: vec6) -> mat33:
 
 @wp.func
 def sym_outer(a: vec3, b: vec3) -> vec6:
-    """Return a b^T + b a^T, packed as (xx, yy, zz, xy, xz, yz)."""
+    """Return the symmetric matrix a b^T + b a^T of two vectors, packed as (xx, yy, zz, xy, xz, yz)."""
     two = real(2.0)
     return vec6(
         two * a[0] * b[0], two * a[1] * b[1], two * a[2] * b[2],
@@ -116,7 +116,7 @@ def rotate_x_second(m: vec6, c: real, s: real) -> vec6:
 
 @wp.func
 def rotate_x_plane(v: vec2, c: real, s: real) -> vec3:
-    """Return (v[0], 0, v[1]) rotated about +x by the angle with cosine c and sine s."""
+    """Return a vector of the xz plane, (v[0], 0, v[1]), rotated about +x by the angle with cosine c and sine s."""
     return vec3(v[0], -s * v[1], c * v[1])
 
 

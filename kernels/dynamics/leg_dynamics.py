@@ -41,7 +41,10 @@ class LegPose:
 
 @wp.struct
 class LegDynamics:
-    """Inertial couplings and bias forces of one leg; columns of Bv, Bw and D are lateral, outer, inner."""
+    """Inertia of one leg in motor space, its inertial couplings to the base, and its bias (velocity, gravity) forces.
+
+    Columns of Bv, Bw and D are lateral, outer, inner.
+    """
 
     body: MassMoments  # of the whole leg about the base origin
     coupling_lin: mat33  # Bv: linear momentum per motor rate [kg m]
@@ -63,7 +66,7 @@ class PawKinematics:
 
 @wp.func
 def leg_pose(geo: LegGeometry, angles: vec3) -> LegPose:
-    """Return a leg's pose for its motor angles [rad]: lateral, outer, inner."""
+    """Return a leg's configuration, five-bar and housing rotation, for motor angles [rad] lateral, outer, inner."""
     lateral_sin_cos = sin_cos(angles[0])
     pose = LegPose()
     pose.loop = five_bar(geo, angles[1], angles[2])
@@ -74,7 +77,7 @@ def leg_pose(geo: LegGeometry, angles: vec3) -> LegPose:
 
 @wp.func
 def columns(a: vec3, b: vec3, c: vec3) -> mat33:
-    """Return the matrix with columns a, b, c."""
+    """Return the 3x3 matrix whose columns are the vectors a, b, c."""
     return mat33(a[0], b[0], c[0], a[1], b[1], c[1], a[2], b[2], c[2])
 
 
@@ -99,9 +102,10 @@ def paw_kinematics(geo: LegGeometry, pose: LegPose) -> PawKinematics:
 
 @wp.func
 def centrifugal(second_j: vec5, w: vec3) -> real:
-    """Return 1/2 w^T (dI/dq_j) w, the centrifugal torque [N m] on motor j (outer or inner).
+    """Return the centrifugal torque [N m] on a motor (outer or inner) from the rotation of its leg's housing.
 
-    second_j: d S / d q_j as in `LinkSums`; w [rad/s]: angular velocity of the housing, housing axes.
+    It is 1/2 w^T (dI/dq_j) w. second_j: d S / d q_j as in `LinkSums`; w [rad/s]: angular velocity of the housing,
+    housing axes.
     """
     return real(0.5) * ((second_j[0] + second_j[1]) * wp.dot(w, w) - wp.dot(w, mul_plane(second_j, w)))
 
@@ -123,7 +127,7 @@ def leg_body(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> Mass
 
 @wp.func
 def couple_leg(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> LegDynamics:
-    """Return a leg's dynamics with inertia and couplings only, all else zero; cosine, sine: see `LegPose`."""
+    """Return a leg's inertia and couplings to the base, with all bias forces zero; cosine, sine: see `LegPose`."""
     leg = LegDynamics()
     second = sums.second
     lateral_ang = geo.side * vec3(second[1] + second[2], -second[3], -second[4])  # of a unit rate about x
@@ -149,7 +153,7 @@ def couple_leg(geo: LegGeometry, sums: LinkSums, cosine: real, sine: real) -> Le
 def assemble_leg(
     geo: LegGeometry, sums: LinkSums, cosine: real, sine: real, rates: vec3, omega: vec3, g: vec3
 ) -> LegDynamics:
-    """Return the leg's dynamics from its link sums.
+    """Return a leg's inertia, couplings to the base and bias forces from the mass integrals of its links.
 
     rates: motor rates [rad/s]; omega: base angular velocity [rad/s], g: gravity [m/s^2], both in body axes; cosine,
     sine: see `LegPose`.
@@ -204,7 +208,10 @@ def assemble_leg(
 
 @wp.func
 def leg_dynamics(geo: LegGeometry, masses: LegMasses, pose: LegPose, rates: vec3, omega: vec3, g: vec3) -> LegDynamics:
-    """Return a leg's dynamics; motor rates [rad/s]; omega [rad/s], g [m/s^2]: base rate and gravity, body axes."""
+    """Return a leg's inertia, couplings to the base and bias forces for its pose, its motor rates and the base's rate.
+
+    rates [rad/s]: of the motors; omega [rad/s], g [m/s^2]: base rate and gravity, body axes.
+    """
     bias = five_bar_bias(geo, pose.loop, rates[1], rates[2])
     outer = outer_sums(geo, masses.outer_thigh, masses.outer_shank, pose.loop, bias)
     inner = inner_sums(geo, masses.inner_thigh, masses.inner_shank, pose.loop, bias)

@@ -17,9 +17,10 @@ from .inertia import MassMoments, rotate_y, rotate_y_second, sym_outer
 
 @wp.struct
 class LinkSums:
-    """Integrals over link mass; subscripts o and i: derivatives w.r.t. the outer and inner motor angle.
+    """Mass integrals over moving links of a leg, which give its inertia, couplings to the base and bias forces.
 
-    In the sums of one side of the leg, o is the motor of that side and i the other motor; `leg_sums` reorders them.
+    Subscripts o and i: derivatives w.r.t. the outer and inner motor angle. In the sums of one side of the leg, o is the
+    motor of that side and i the other motor; `leg_sums` reorders them.
     """
 
     mass: real  # [kg]
@@ -43,32 +44,38 @@ class LinkSums:
 
 @wp.func
 def cross_y(v: vec3) -> vec2:
-    """Return (x, z) of e_y x v."""
+    """Return the cross product of the unit vector along y and v, as (x, z)."""
     return vec2(v[2], -v[0])
 
 
 @wp.func
 def cross_y_second(s: vec6) -> vec5:
-    """Return d S / d angle (xx zz xy xz yz) of packed second moments S that rotate about +y; its yy is 0."""
+    """Return the derivative of packed second moments w.r.t. their rotation angle about +y, without its yy, which is 0.
+
+    Order: xx zz xy xz yz.
+    """
     two = real(2.0)
     return vec5(two * s[4], -two * s[4], s[5], s[2] - s[0], -s[3])
 
 
 @wp.func
 def spin_y(s: vec6) -> vec3:
-    """Return the integral of r x (e_y x r) [kg m^2]: angular momentum per unit rate about +y; s: packed moments."""
+    """Return the angular momentum [kg m^2] per unit rate about +y of masses with packed second moments s.
+
+    It is the integral of r x (e_y x r).
+    """
     return vec3(-s[3], s[0] + s[2], -s[5])
 
 
 @wp.func
 def cross_plane(a: vec3, b: vec2) -> vec3:
-    """Return a x (b[0], 0, b[1])."""
+    """Return the cross product of a vector a and a vector of the xz plane: a x (b[0], 0, b[1])."""
     return vec3(a[1] * b[1], a[2] * b[0] - a[0] * b[1], -a[1] * b[0])
 
 
 @wp.func
 def sym_outer_plane(a: vec2, b: vec3) -> vec5:
-    """Return a b^T + b a^T for a = (x, z) in the plane, packed without yy: xx zz xy xz yz."""
+    """Return a b^T + b a^T for a vector a = (x, z) of the plane and a vector b, packed without yy: xx zz xy xz yz."""
     two = real(2.0)
     return vec5(two * a[0] * b[0], two * a[1] * b[2], a[0] * b[1], a[0] * b[2] + a[1] * b[0], a[1] * b[1])
 
@@ -133,7 +140,7 @@ def shank_sums(
 def add_thigh(
     shank: LinkSums, link: MassMoments, axis: vec2, cosine: real, sine: real, rate: real, sign: real
 ) -> LinkSums:
-    """Return the mass integrals `shank` plus those of the thigh above it; link: the thigh's moments in its frame.
+    """Add the mass integrals of a thigh to those of the shank below it; link: the thigh's moments in its frame.
 
     The thigh rotates about its transversal axis, at x and y `axis` [m], z = 0 in the housing frame, by `sign` (-1 or
     +1) times its motor's angle; cosine, sine: of that rotation about +y; rate [rad/s]: of the rotation.
@@ -167,7 +174,7 @@ def add_thigh(
 
 @wp.func
 def outer_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: FiveBar, bias: FiveBarBias) -> LinkSums:
-    """Return the mass integrals of the outer thigh and shank; o: outer motor, i: inner motor."""
+    """Return the mass integrals of the outer thigh and shank together; o: outer motor, i: inner motor."""
     sin_cos = loop.outer_sin_cos
     knee = vec3(loop.outer_knee[0], geo.plane_y + geo.knee_y, loop.outer_knee[1])
     shank_part = shank_sums(
@@ -180,7 +187,7 @@ def outer_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: F
 
 @wp.func
 def inner_sums(geo: LegGeometry, thigh: MassMoments, shank: MassMoments, loop: FiveBar, bias: FiveBarBias) -> LinkSums:
-    """Return the mass integrals of the inner thigh and shank; o: inner motor, i: outer motor."""
+    """Return the mass integrals of the inner thigh and shank together; o: inner motor, i: outer motor."""
     sin_cos = loop.inner_sin_cos
     knee = vec3(loop.inner_knee[0], geo.plane_y + geo.knee_y, loop.inner_knee[1])
     shank_part = shank_sums(

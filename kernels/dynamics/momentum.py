@@ -62,9 +62,10 @@ def robot_momentum(
 
 @wp.func
 def base_with_momentum(base: BaseState, momentum: RobotMomentum, lin: vec3, ang: vec3) -> BaseState:
-    """Return `base` with the twist that changes the robot's momentum from `momentum` to lin, ang (world axes).
+    """Return the base state with its twist corrected so that the robot's momentum becomes lin, ang (world axes).
 
-    lin [kg m/s], ang [kg m^2/s] about the robot's centre of mass; the rates of the motors stay unchanged.
+    momentum: that of the robot before the correction. lin [kg m/s], ang [kg m^2/s] about the robot's centre of mass;
+    the rates of the motors stay unchanged.
     """
     mass = momentum.body.mass
     com = momentum.body.first / mass

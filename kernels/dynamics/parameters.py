@@ -16,13 +16,13 @@ from .leg_dynamics import LegMasses
 
 @wp.func
 def load_vec3(table: wp.array2d(dtype=real), row: int, world: int) -> vec3:
-    """Return three consecutive rows of the table, from `row` on, as a vector."""
+    """Return three consecutive parameters of a world as a vector: rows of the parameter table, from `row` on."""
     return vec3(table[row, world], table[row + 1, world], table[row + 2, world])
 
 
 @wp.func
 def load_moments(table: wp.array2d(dtype=real), row: int, world: int) -> MassMoments:
-    """Return the mass moments of a link, stored in MOMENT_ROWS rows of the table from `row` on."""
+    """Return the mass moments of a link of a world from the parameter table, MOMENT_ROWS rows from `row` on."""
     m = MassMoments()
     m.mass = table[row, world]
     m.first = load_vec3(table, row + 1, world)
@@ -48,7 +48,7 @@ def load_masses(table: wp.array2d(dtype=real), leg: int, world: int) -> LegMasse
 
 @wp.func
 def load_stops(table: wp.array2d(dtype=real), leg: int, world: int) -> StopParams:
-    """Return the hard stops of a leg."""
+    """Return the constants of the hard stops of a leg from the parameter table."""
     row = leg * layout.LEG_ROWS
     p = StopParams()
     p.lower = load_vec3(table, row + layout.LOWER, world)
@@ -77,7 +77,7 @@ def load_joint_params(table: wp.array2d(dtype=real), leg: int, world: int) -> Jo
 
 @wp.func
 def load_spring(table: wp.array2d(dtype=real), leg: int, world: int) -> LegSpring:
-    """Return the spring between the knees of a leg."""
+    """Return the constants of the spring between the knees of a leg from the parameter table."""
     row = leg * layout.LEG_ROWS + layout.SPRING
     spring = LegSpring()
     spring.stiffness = table[row, world]
@@ -87,7 +87,10 @@ def load_spring(table: wp.array2d(dtype=real), leg: int, world: int) -> LegSprin
 
 @wp.func
 def store_link(table: wp.array2d(dtype=real), row: int, world: int, mass: float, com: wp.vec3, inertia: wp.mat33):
-    """Write a link's mass moments about its frame's origin, from mass [kg], com [m] and inertia at the com [kg m^2]."""
+    """Write a link's mass moments about its frame's origin to the parameter table.
+
+    From mass [kg], com [m] and inertia at the com [kg m^2]; rows from `row` on.
+    """
     half_trace = real(0.5) * (real(inertia[0, 0]) + real(inertia[1, 1]) + real(inertia[2, 2]))
     m = real(mass)
     c = vec3(real(com[0]), real(com[1]), real(com[2]))
@@ -105,7 +108,7 @@ def store_link(table: wp.array2d(dtype=real), row: int, world: int, mass: float,
 
 @wp.func
 def body_row(body: int) -> int:
-    """Return the first row of the mass moments of body 0 (base) to 20 of a world."""
+    """Return the parameter table's first row of the mass moments of a body, 0 (base) to 20, of a world."""
     if body == 0:
         return layout.BASE
     return ((body - 1) // layout.LEG_BODIES) * layout.LEG_ROWS + ((body - 1) % layout.LEG_BODIES) * layout.MOMENT_ROWS
@@ -113,7 +116,7 @@ def body_row(body: int) -> int:
 
 @wp.func
 def motor_dof(leg: int, motor: int) -> int:
-    """Return the index of a motor among the 38 rates of its world; motor: 0 lateral, 1 outer, 2 inner."""
+    """Return the index of a motor among the 38 joint rates of its world; motor: 0 lateral, 1 outer, 2 inner."""
     return 6 + layout.motor_slot(3 * leg + motor)
 
 
@@ -126,7 +129,7 @@ def pack_masses_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write the mass moments of every body to the table; one thread per (world, body). Inputs: as in Newton's model."""
+    """Write the mass moments of every body from Newton's model to the parameter table; one thread per (world, body)."""
     world, body = wp.tid()
     i = world * layout.BODIES + body
     store_link(table, body_row(body), world, body_mass[i], body_com[i], body_inertia[i])
@@ -148,7 +151,7 @@ def pack_joints_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write armature, friction, damping and hard stops of every leg to the table; one thread per (world, leg).
+    """Write armature, friction, damping and hard stops of every leg to the parameter table; thread per (world, leg).
 
     Arrays: Newton's per-dof model arrays, (38 num_worlds,), [rad], [N m] and their rates as in `JointParams` and
     `StopParams`; effort_limit [N m] caps the knees' damping. sum_lower, sum_upper [rad]: stops of outer + inner.
@@ -189,7 +192,7 @@ def paw_friction(
 
 @wp.func
 def store_friction(table: wp.array2d(dtype=real), leg: int, world: int, mu: float, static_ratio: float):
-    """Write a paw's dynamic friction coefficient mu and its static one, mu * static_ratio."""
+    """Write a paw's dynamic friction coefficient mu and its static one, mu * static_ratio, to the parameter table."""
     table[leg * layout.LEG_ROWS + layout.MU_DYNAMIC, world] = real(mu)
     table[leg * layout.LEG_ROWS + layout.MU_STATIC, world] = real(mu * static_ratio)
 
@@ -204,7 +207,7 @@ def pack_friction_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write the friction coefficients of every paw (`paw_friction`) to the table; one thread per (world, leg)."""
+    """Write the friction coefficients of every paw (`paw_friction`) to the parameter table; thread per (world, leg)."""
     world, leg = wp.tid()
     store_friction(table, leg, world, paw_friction(paw_shapes, ground_shape, shape_mu, world, leg), static_ratio[world])
 
@@ -226,7 +229,7 @@ def repack_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write the parameters that domain randomisation samples, in worlds whose mask (num_worlds,) is not 0.
+    """Rewrite the parameters that domain randomisation samples, in the worlds whose mask (num_worlds,) is not 0.
 
     Launch over (worlds from `first` on, 25): threads 0 to 20 of a world write the mass moments of a body each, the
     other four a leg's armature, friction torques and paw friction. Inputs as in the pack kernels.
@@ -254,7 +257,7 @@ def pack_springs_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write every leg's springs to the table; one thread per (world, leg). springs: stiffness [N/m], length [m]."""
+    """Write every leg's springs (stiffness [N/m], length [m]) to the parameter table; one thread per (world, leg)."""
     world, leg = wp.tid()
     for j in range(2):
         table[leg * layout.LEG_ROWS + layout.SPRING + j, world] = real(springs[world][j])
@@ -267,7 +270,7 @@ def pack_gravity_kernel(
     # out
     table: wp.array2d(dtype=real),
 ):
-    """Write gravity [m/s^2], (num_worlds,), world frame, to the table; one thread per world."""
+    """Write gravity [m/s^2], (num_worlds,), world frame, to the parameter table; one thread per world."""
     world = wp.tid()
     for j in range(3):
         table[layout.GRAVITY + j, world] = real(gravity[world][j])

@@ -26,7 +26,7 @@ def restore_state_kernel(
     # out
     state: StateArrays,
 ):
-    """Copy the state of the masked worlds from `start`; launch over (num_worlds, 43)."""
+    """Reset joint and body states of the masked worlds to those in `start`; launch over (num_worlds, 43)."""
     world, i = wp.tid()
     if not mask[world]:
         return
@@ -53,7 +53,7 @@ def restore_motors_kernel(
     paw_force: wp.array2d(dtype=wp.vec3),
     peak_force: wp.array(dtype=float),
 ):
-    """Write standing angles [rad] to the targets of masked worlds and zero their forces; one thread per world.
+    """Reset the motors of masked worlds: targets to standing angles [rad], torques and forces to 0; thread per world.
 
     standing, target, filtered_target, torque: (12, num_worlds). paw_force: (4, num_worlds).
     """
@@ -76,7 +76,7 @@ def zero_worlds_kernel(
     # out
     values: wp.array2d(dtype=wp.spatial_vector),
 ):
-    """Zero the rows of `values`, (num_worlds, n), of masked worlds; launch over that shape."""
+    """Zero the rows of masked worlds in an array `values` of shape (num_worlds, n); launch over that shape."""
     world, i = wp.tid()
     if mask[world]:
         values[world, i] = wp.spatial_vector()
@@ -89,7 +89,7 @@ def mask_kernel(
     # out
     chosen: wp.array(dtype=wp.bool),
 ):
-    """Convert a float mask to bool (true where it is not 0); one thread per world."""
+    """Convert a float mask of worlds to bool (true where it is not 0); one thread per world."""
     world = wp.tid()
     chosen[world] = mask[world] != 0.0
 
@@ -103,7 +103,7 @@ def clear_contact_kernel(
     contact_force: wp.array2d(dtype=wp.vec3),
     diverged: wp.array(dtype=int),
 ):
-    """Zero impulses and contact forces (4, num_worlds) and `diverged` of masked worlds; one thread per world."""
+    """Zero impulses and contact forces (4, num_worlds) and divergence flags of masked worlds; one thread per world."""
     world = wp.tid()
     if mask[world]:
         diverged[world] = 0

@@ -1,4 +1,4 @@
-"""Parts of a time step that `advance` and `advance_legs` share: a leg's terms, a paw's contact, the base.
+"""Parts of a physics step that `advance` and `advance_legs` share: a leg's terms, a paw's contact, the base.
 
 Semi-implicit Euler: forces and Jacobians are those at the start of the step, and positions move with the velocities at
 its end. Legs and paws k are 0 to 3 (FL, FR, BL, BR).
@@ -64,7 +64,7 @@ class LegParams:
 
 @wp.struct
 class LegTerms:
-    """Terms of one leg in the equations of a step: its dynamics, its elimination and its paw."""
+    """Terms of one leg in the equations of motion of a step: dynamics, elimination of its motors, paw kinematics."""
 
     dynamics: LegDynamics
     solve: LegSolve
@@ -73,7 +73,7 @@ class LegTerms:
 
 @wp.func
 def load_leg(model: RobotModel, world: int, k: int) -> LegParams:
-    """Return the parameters of leg k of a world."""
+    """Return the geometry, masses and joint constants of leg k of a world."""
     params = LegParams()
     params.geometry = model.geometry[k]
     params.masses = load_masses(model.table, k, world)
@@ -86,10 +86,11 @@ def leg_terms(
     params: LegParams, spring: LegSpring, angles: vec3, rates: vec3, torque: vec3, stop_rates: StopRates, pressed: int,
     omega: vec3, g: vec3, dt: real,
 ) -> LegTerms:  # fmt: skip
-    """Return a leg's dynamics, its elimination with the pressed stops, and its paw, in body axes.
+    """Return a leg's terms in the equations of motion of a step: dynamics, elimination of its motors, paw kinematics.
 
-    angles [rad], rates [rad/s], torque [N m] of the motors: lateral, outer, inner, at the start of the step dt [s].
-    omega [rad/s], g [m/s^2]: of the base, body axes. stop_rates, pressed: see `stops`.
+    In body axes; passive forces and pressed stops are included. angles [rad], rates [rad/s], torque [N m] of the
+    motors: lateral, outer, inner, at the start of the step dt [s]. omega [rad/s], g [m/s^2]: of the base, body axes.
+    stop_rates, pressed: see `stops`.
     """
     geo = params.geometry
     joints = params.joints
@@ -108,7 +109,7 @@ def leg_terms(
 
 @wp.struct
 class Touch:
-    """Nearest point of a surface to a paw: gap, normal and velocity."""
+    """Surface point nearest to a paw: its gap, normal and velocity."""
 
     gap: real  # [m] between surface and paw, negative inside
     normal: vec3  # unit, out of the surface, body axes
@@ -117,7 +118,7 @@ class Touch:
 
 @wp.func
 def block_law(model: RobotModel, world: int, base: BaseState, dt: real) -> BlockLaw:
-    """Return the constants of a world's block for a step dt [s], in body axes; all zero where there is no block."""
+    """Return the constants of a sliding block's motion in a step dt [s], body axes; zero in a world without one."""
     law = BlockLaw()
     if model.ground.blocks.shape[0] > 0:
         block = model.ground.blocks[world]
@@ -131,7 +132,7 @@ def block_law(model: RobotModel, world: int, base: BaseState, dt: real) -> Block
 
 @wp.func
 def touch_floor(model: RobotModel, k: int, base: BaseState, paw: PawKinematics) -> Touch:
-    """Return the point of the floor that is nearest to paw k; the floor is at rest."""
+    """Return gap and normal of the point of the floor that is nearest to paw k; the floor is at rest."""
     centre = base.pos + wp.quat_rotate(base.quat, paw.position)
     touch = Touch()
     touch.gap = floor_distance(model.ground, centre) - model.geometry[k].paw_radius
@@ -141,7 +142,7 @@ def touch_floor(model: RobotModel, k: int, base: BaseState, paw: PawKinematics) 
 
 @wp.func
 def touch_block(model: RobotModel, world: int, k: int, base: BaseState, paw: PawKinematics, law: BlockLaw) -> Touch:
-    """Return the point of the world's block that is nearest to paw k; law: see `block_law`."""
+    """Return gap, normal and velocity of the point of the world's block nearest to paw k; law: see `block_law`."""
     centre = base.pos + wp.quat_rotate(base.quat, paw.position)
     block = model.ground.blocks[world]
     touch = Touch()
@@ -153,7 +154,7 @@ def touch_block(model: RobotModel, world: int, k: int, base: BaseState, paw: Paw
 
 @wp.func
 def friction_row(k: int, velocity: vec3, impulse: vec3, normal: vec3) -> int:
-    """Return the table row of paw k's friction coefficient: MU_STATIC where it stuck before the step, or MU_DYNAMIC.
+    """Return the table row of paw k's friction coefficient: static where it stuck before the step, else dynamic.
 
     velocity [m/s]: of the contact point relative to the ground at the start of the step; impulse [N s]: in the
     preceding step; normal: unit; all in the same axes.
@@ -169,7 +170,7 @@ def paw_contact(
     model: RobotModel, world: int, k: int, base: BaseState, lin: vec3, ang: vec3, rates: vec3, old_rates: vec3,
     impulse: vec3, pressed: int, paw: PawKinematics, leg: LegSolve, inverse: BaseInverse, block: BlockLaw, dt: real,
 ) -> PawContact:  # fmt: skip
-    """Return paw k's contact problem with floor or block, whichever is nearer.
+    """Return the contact problem of paw k in a step, with floor or block, whichever is nearer.
 
     lin [m/s], ang [rad/s], rates [rad/s]: base twist (body axes) and motor rates at the end of the step dt [s] without
     contact; old_rates, base: at its start; impulse [N s]: of the preceding step, world axes, the first guess; pressed:
@@ -206,14 +207,17 @@ def paw_contact(
 
 @wp.func
 def base_system(model: RobotModel, world: int, base: BaseState, g: vec3, force: vec3, moment: vec3) -> BaseSystem:
-    """Return the base link's equations; g [m/s^2]: body axes; force [N], moment [N m]: external, at com, world axes."""
+    """Return the equations of motion of the base without its legs, under gravity and an external wrench.
+
+    g [m/s^2]: body axes; force [N], moment [N m]: external, at com, world axes.
+    """
     wrench = external_wrench(base, base_com(model.table, world), force, moment)
     return base_link_system(load_moments(model.table, BASE, world), base.ang, g, wrench.force, wrench.moment)
 
 
 @wp.func
 def hold_base(model: RobotModel, world: int, inverse: BaseInverse) -> BaseInverse:
-    """Return the inverse of a world's base system, or zero (no acceleration) where the base is held."""
+    """Return the inverse of the base's equations, or zero where a world's base is held, which prevents acceleration."""
     if model.held.shape[0] > 0:
         if model.held[world] != 0:
             return BaseInverse()

@@ -40,7 +40,7 @@ class Actuation:
 
 @wp.struct
 class Commands:
-    """Inputs of a rollout of T policy steps."""
+    """Inputs of a rollout of T policy steps: motor targets, wrenches on the base and the paws' initial impulses."""
 
     target: wp.array3d(dtype=real)  # [rad], (T, 12, num_worlds)
     initial_target: wp.array2d(dtype=real)  # [rad], (12, num_worlds), followed until the first target arrives
@@ -50,7 +50,10 @@ class Commands:
 
 @wp.struct
 class TrajectoryArrays:
-    """Arrays of a trajectory, or of the gradient w.r.t. one (empty: zeros); K = T S / every, see `Timing`."""
+    """Recorded states, torques, paw impulses and pressed stops of a rollout, or the gradient w.r.t. these.
+
+    Empty gradients mean zeros; K = T S / every, see `Timing`.
+    """
 
     q: wp.array3d(dtype=real)  # [m], [rad], (K + 1, ROW_COORDS, num_worlds)
     qd: wp.array3d(dtype=real)  # [m/s], [rad/s], (K + 1, ROW_RATES, num_worlds)
@@ -61,7 +64,7 @@ class TrajectoryArrays:
 
 @wp.func
 def row_base(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3) -> BaseState:
-    """Return the base's state from the entries of a row: pos [m], orientation (xyzw), com_lin [m/s], ang [rad/s].
+    """Convert a trajectory row's entries to the base's state: pos [m], orientation (xyzw), com_lin [m/s], ang [rad/s].
 
     com_lin: velocity of the com; com [m]: centre of mass in the base's frame; all others in world axes.
     """
@@ -75,13 +78,13 @@ def row_base(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3) 
 
 @wp.func
 def row_vec3(values: wp.array3d(dtype=real), row: int, first: int, world: int) -> vec3:
-    """Return three entries of a row, from index `first`; values: (rows, entries, num_worlds)."""
+    """Return three consecutive entries of a trajectory row, from index `first`; values: (rows, entries, num_worlds)."""
     return vec3(values[row, first, world], values[row, first + 1, world], values[row, first + 2, world])
 
 
 @wp.func
 def row_quat(values: wp.array3d(dtype=real), row: int, first: int, world: int) -> quat:
-    """Return four entries (xyzw) of a row, from index `first`; values: (rows, entries, num_worlds)."""
+    """Return a quaternion (xyzw) from a trajectory row, from index `first` on; values: (rows, entries, num_worlds)."""
     return quat(
         values[row, first, world], values[row, first + 1, world], values[row, first + 2, world],
         values[row, first + 3, world],
@@ -90,14 +93,14 @@ def row_quat(values: wp.array3d(dtype=real), row: int, first: int, world: int) -
 
 @wp.func
 def store_row_vec3(values: wp.array3d(dtype=real), row: int, first: int, world: int, v: vec3):
-    """Write v to three entries of a row, from index `first`; values: (rows, entries, num_worlds)."""
+    """Write v to three entries of a trajectory row, from index `first`; values: (rows, entries, num_worlds)."""
     for i in range(3):
         values[row, first + i, world] = v[i]
 
 
 @wp.func
 def load_row_base(trajectory: TrajectoryArrays, row: int, world: int, com: vec3) -> BaseState:
-    """Return the base's state stored in a row; com [m]: the base's centre of mass in its frame."""
+    """Return the base's state stored in a trajectory row; com [m]: the base's centre of mass in its frame."""
     return row_base(
         row_vec3(trajectory.q, row, 0, world), row_quat(trajectory.q, row, 3, world),
         row_vec3(trajectory.qd, row, 0, world), row_vec3(trajectory.qd, row, 3, world), com,
@@ -106,7 +109,7 @@ def load_row_base(trajectory: TrajectoryArrays, row: int, world: int, com: vec3)
 
 @wp.func
 def store_row_base(trajectory: TrajectoryArrays, row: int, world: int, com: vec3, base: BaseState):
-    """Write the base's state to a row; com [m]: the base's centre of mass in its frame."""
+    """Write the base's state to a trajectory row; com [m]: the base's centre of mass in its frame."""
     ang = wp.quat_rotate(base.quat, base.ang)
     store_row_vec3(trajectory.q, row, 0, world, base.pos)
     for i in range(4):
@@ -117,7 +120,10 @@ def store_row_base(trajectory: TrajectoryArrays, row: int, world: int, com: vec3
 
 @wp.func
 def load_limits(table: wp.array2d(dtype=real), row: int, world: int) -> Limits:
-    """Return the filter's limits [rad] of one quantity, rows `row` to `row` + 3 of table (FILTER_ROWS, num_worlds)."""
+    """Return the command filter's limits [rad] of one angle or sum of angles from the table of filter constants.
+
+    Rows `row` to `row` + 3 of table (FILTER_ROWS, num_worlds).
+    """
     limits = Limits()
     limits.lower = table[row, world]
     limits.upper = table[row + 1, world]
@@ -128,7 +134,7 @@ def load_limits(table: wp.array2d(dtype=real), row: int, world: int) -> Limits:
 
 @wp.func
 def load_filter(table: wp.array2d(dtype=real), world: int) -> FilterParams:
-    """Return the filter's constants of a world; table: (FILTER_ROWS, num_worlds)."""
+    """Return the command filter's constants of a world; table: (FILTER_ROWS, num_worlds)."""
     params = FilterParams()
     params.lateral = load_limits(table, 0, world)
     params.transversal = load_limits(table, 4, world)
@@ -158,10 +164,11 @@ class Arrival:
 
 @wp.func
 def arrival(step: int, substeps: int, delay: real) -> Arrival:
-    """Return the targets in effect during physics step `step` (from 0); delay: latency in physics steps, a real >= 0.
+    """Return the delayed policy targets, and their weights, between which a motor's target lies in physics step `step`.
 
-    substeps: physics steps per policy step. A target that arrives exactly at the start of the step has weight 1, and
-    the one-sided derivative toward a larger latency. No target arrives before it is sent.
+    step counts from 0. delay: latency in physics steps, a real >= 0. substeps: physics steps per policy step. A target
+    that arrives exactly at the start of the step has weight 1, and the one-sided derivative toward a larger latency. No
+    target arrives before it is sent.
     """
     begin = real(step) - delay
     size = real(substeps)
@@ -201,7 +208,7 @@ def leg_torque(
     commands: Commands, actuation: Actuation, filtered_target: wp.array3d(dtype=real), arrived: Arrival, leg: int,
     world: int, angles: vec3, rates: vec3,
 ) -> vec3:  # fmt: skip
-    """Return a leg's torques [N m] (lateral, outer, inner) in a physics step, at angles [rad] and rates [rad/s]."""
+    """Return a leg's motor torques [N m], lateral, outer, inner, in a physics step at angles [rad], rates [rad/s]."""
     torque = vec3(real(0.0))
     for j in range(3):
         motor = 3 * leg + j
@@ -215,9 +222,10 @@ def filter_commands(
     commands: Commands, actuation: Actuation, step: int, leg: int, world: int, angles: vec3, rates: vec3,
     filtered_target: wp.array3d(dtype=real),
 ):  # fmt: skip
-    """Write a leg's filtered targets [rad] of policy step `step`, for angles [rad], rates [rad/s] at its start.
+    """Apply the command filter to a leg's targets [rad] of policy step `step`, and write the filtered targets.
 
-    filtered_target: (T, 12, num_worlds). Without a filter the targets are copied.
+    angles [rad], rates [rad/s]: at the start of the policy step. filtered_target: (T, 12, num_worlds). Without a filter
+    the targets are copied.
     """
     m = 3 * leg
     target = row_vec3(commands.target, step, m, world)

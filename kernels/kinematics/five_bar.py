@@ -51,16 +51,17 @@ class FiveBarBias:
 
 @wp.func
 def rotation_rate(direction: vec2, velocity: vec2, length: real) -> real:
-    """Return the rate about +y [rad/s] of a link whose far end moves at `velocity` [m/s] relative to its near end.
+    """Return the rate about +y [rad/s] of a link of the five-bar, from the velocity [m/s] of its far end.
 
-    direction: unit vector (x, z) from the near end to the far end; length [m]. Accelerations give [rad/s^2] likewise.
+    velocity: relative to the link's near end. direction: unit vector (x, z) from the near end to the far end; length
+    [m]. Accelerations give [rad/s^2] likewise.
     """
     return (direction[1] * velocity[0] - direction[0] * velocity[1]) / length
 
 
 @wp.func
 def solve_projections(a: vec2, b: vec2, along_a: real, along_b: real) -> vec2:
-    """Return the vector x with a.x = along_a and b.x = along_b, for unit vectors a and b."""
+    """Return the plane vector x with given projections on two unit vectors: a.x = along_a and b.x = along_b."""
     det = a[0] * b[1] - a[1] * b[0]
     # the shanks are parallel only where the knees coincide: keep the division finite there
     if wp.abs(det) < real(1.0e-4):
@@ -70,7 +71,7 @@ def solve_projections(a: vec2, b: vec2, along_a: real, along_b: real) -> vec2:
 
 @wp.func
 def five_bar(geo: LegGeometry, outer: real, inner: real) -> FiveBar:
-    """Return the loop's configuration and derivatives at the motor angles `outer` and `inner` [rad]."""
+    """Return the five-bar's configuration and derivatives at the motor angles `outer` and `inner` [rad]."""
     f = geo.front
     loop = FiveBar()
     outer_sin_cos, inner_sin_cos = sin_cos(outer), sin_cos(inner)
@@ -110,7 +111,7 @@ def five_bar(geo: LegGeometry, outer: real, inner: real) -> FiveBar:
 
 @wp.func
 def five_bar_bias(geo: LegGeometry, loop: FiveBar, outer_rate: real, inner_rate: real) -> FiveBarBias:
-    """Return the loop's rates and velocity-product accelerations for the motor rates [rad/s]."""
+    """Return the five-bar's link rates and velocity-product accelerations for the motor rates [rad/s]."""
     f = geo.front
     bias = FiveBarBias()
     outer_knee_vel = outer_rate * loop.outer_knee_do

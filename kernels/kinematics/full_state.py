@@ -39,7 +39,7 @@ def shank_angle(direction: vec2) -> real:
 
 @wp.func
 def housing_frame(base: BaseState, geo: LegGeometry, angle: real, rate: real) -> Frame:
-    """Return the motor housing's world frame for the lateral motor's angle [rad] and rate [rad/s]."""
+    """Return pose and velocity of a leg's motor housing in the world, for lateral angle [rad] and rate [rad/s]."""
     frame = Frame()
     arm = wp.quat_rotate(base.quat, geo.hip)
     ang = wp.quat_rotate(base.quat, base.ang)
@@ -52,7 +52,7 @@ def housing_frame(base: BaseState, geo: LegGeometry, angle: real, rate: real) ->
 
 @wp.func
 def link_frame(housing: Frame, origin: vec3, velocity: vec3, angle: real, rate: real) -> Frame:
-    """Return the world frame of a link of the five-bar plane.
+    """Return pose and velocity in the world of the frame of a link in the five-bar's plane.
 
     origin [m], velocity [m/s]: of its origin in the housing frame; angle [rad], rate [rad/s]: about housing y.
     """
@@ -84,7 +84,7 @@ def store_body(
 
 @wp.func
 def base_frame(base: BaseState) -> Frame:
-    """Return the world frame of the base link."""
+    """Return pose and velocity of the base link's frame in the world."""
     frame = Frame()
     frame.pos = base.pos
     frame.quat = base.quat

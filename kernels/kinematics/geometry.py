@@ -7,7 +7,7 @@ from ..scalar import real, vec3
 
 @wp.struct
 class LegGeometry:
-    """Constants of one leg, in the body frame (x forward, y left, z up) and the motor housing frame.
+    """Geometric constants of one leg, in the body frame (x forward, y left, z up) and the motor housing frame.
 
     The housing frame has its origin on the lateral motor's axis (the hip), x along body x, and turns about x with
     the lateral motor. The five-bar loop lies in the housing's x-z plane, at `plane_y`.

@@ -52,7 +52,10 @@ class LegPose:
 
 @wp.func
 def clamp_transversal(limits: LegLimits, outer: real, inner: real) -> vec2:
-    """Return (outer, inner) [rad] clamped to limits; where the sum is out of limits, only `inner` is corrected."""
+    """Return the thigh angles (outer, inner) [rad] clamped to joint limits.
+
+    Where the sum is out of limits, only `inner` is corrected.
+    """
     lower = limits.transversal_lower
     upper = limits.transversal_upper
     clamped_outer = wp.clamp(outer, wp.max(lower, limits.sum_lower - upper), wp.min(upper, limits.sum_upper - lower))
@@ -94,7 +97,10 @@ def thigh_angle(geo: LegGeometry, away: real, z: real) -> real:
 
 @wp.func
 def clamped_closed_form(geo: LegGeometry, limits: LegLimits, target: vec3) -> vec3:
-    """Return motor angles [rad] in limits for an ankle target [m] from the hip, body axes; a guess if out of reach."""
+    """Return the closed-form motor angles [rad] for an ankle target [m], clamped to limits; a guess if out of reach.
+
+    target: from the hip, body axes.
+    """
     plane = geo.plane_y + geo.knee_y
     z = -wp.sqrt(wp.max(target[1] * target[1] + target[2] * target[2] - plane * plane, real(0.0)))
     outer = thigh_angle(geo, geo.front * (target[0] - geo.outer_x), z)
@@ -105,14 +111,14 @@ def clamped_closed_form(geo: LegGeometry, limits: LegLimits, target: vec3) -> ve
 
 @wp.func
 def nearest_ankle(geo: LegGeometry, limits: LegLimits, target: vec3, thighs: vec2) -> vec3:
-    """Return the ankle position nearest to `target` for thigh angles [rad]; both [m] relative to the hip, body axes."""
+    """Return the ankle position nearest to `target` for fixed thigh angles [rad]; both [m] from the hip, body axes."""
     ankle = ankle_in_housing(geo, five_bar(geo, thighs[0], thighs[1]))
     return rotate_lateral(geo, nearest_lateral(geo, limits, target, ankle[2]), ankle)
 
 
 @wp.func
 def grid_thighs(limits: LegLimits, row: int, col: int) -> vec2:
-    """Return (outer, inner) [rad] at row, col (each 0 to GRID - 1) of a grid over the limits, edges included."""
+    """Return thigh angles [rad], outer and inner, at row, col (< GRID) of a grid over the limits, edges included."""
     lower = limits.transversal_lower
     upper = limits.transversal_upper
     along_row = real(row) / real(GRID - 1)

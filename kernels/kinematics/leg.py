@@ -25,20 +25,20 @@ def rotate_lateral(geo: LegGeometry, lateral: real, housing_vector: vec3) -> vec
 
 @wp.func
 def ankle_in_housing(geo: LegGeometry, loop: FiveBar) -> vec3:
-    """Return the ankle [m] in the housing frame, whose origin is the hip."""
+    """Return the position [m] of the ankle in the housing frame, whose origin is the hip."""
     return vec3(loop.ankle[0], geo.plane_y + geo.knee_y, loop.ankle[1])
 
 
 @wp.func
 def leg_forward_kinematics(geo: LegGeometry, lateral: real, outer: real, inner: real) -> vec3:
-    """Return the ankle [m] in the body frame, for the motor angles [rad]."""
+    """Return the position [m] of the ankle in the body frame, for the motor angles [rad]."""
     loop = five_bar(geo, outer, inner)
     return geo.hip + rotate_lateral(geo, lateral, ankle_in_housing(geo, loop))
 
 
 @wp.func
 def leg_jacobian(geo: LegGeometry, lateral: real, outer: real, inner: real) -> mat33:
-    """Return d ankle / d (lateral, outer, inner) [m/rad], 3x3: rows body x, y, z; columns motors; angles [rad]."""
+    """Return the Jacobian of the ankle position (body axes) w.r.t. lateral, outer, inner [m/rad], 3x3; angles [rad]."""
     loop = five_bar(geo, outer, inner)
     arm = rotate_lateral(geo, lateral, ankle_in_housing(geo, loop))
     by_outer = rotate_lateral(geo, lateral, vec3(loop.ankle_do[0], real(0.0), loop.ankle_do[1]))
@@ -52,10 +52,11 @@ def leg_jacobian(geo: LegGeometry, lateral: real, outer: real, inner: real) -> m
 
 @wp.func
 def damped_ratio(speed: real, lever: real) -> real:
-    """Return the thigh rate speed / lever [rad/s], damped to speed lever / LEVER_FLOOR^2 where |lever| < LEVER_FLOOR.
+    """Return a thigh's rate [rad/s] for an ankle speed along its shank, damped where both links are nearly aligned.
 
-    speed [m/s]: of the ankle along the shank; lever [m/rad]: knee speed along the shank per thigh rate. |lever| is
-    below LEVER_FLOOR where thigh and shank are within 3.3 degrees of one line, and no bounded rate reaches the speed.
+    It is speed / lever, or speed lever / LEVER_FLOOR^2 where |lever| < LEVER_FLOOR. speed [m/s]: of the ankle along the
+    shank; lever [m/rad]: knee speed along the shank per thigh rate. |lever| is below LEVER_FLOOR where thigh and shank
+    are within 3.3 degrees of one line, and no bounded rate reaches the speed.
     """
     return speed * lever / wp.max(lever * lever, LEVER_FLOOR * LEVER_FLOOR)
 

@@ -24,9 +24,10 @@ class Block:
 
 @wp.struct
 class Ground:
-    """Ground: a horizontal plane (`rows` = 0) or a grid of heights around `center_x`, `center_y`, bilinear in between.
+    """Ground of the worlds: a plane (`rows` = 0) or a grid of heights, bilinear in between, and optional blocks.
 
-    Outside the grid the surface continues at the height of the nearest edge. Row index follows y, column index x.
+    The grid's centre is `center_x`, `center_y`. Outside the grid the surface continues at the height of the nearest
+    edge. Row index follows y, column index x.
     """
 
     rows: int

@@ -24,7 +24,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class LegGradient:
-    """Gradient of a leg's virtual power (`leg_action`); the caller sums gradients w.r.t. base and gravity over legs."""
+    """Gradient of a leg's virtual power in a time step (`leg_action`) w.r.t. each of its inputs.
+
+    The caller sums the gradients w.r.t. base and gravity over legs.
+    """
 
     geometry: LegGeometry
     masses: LegMasses
@@ -42,7 +45,7 @@ class LegGradient:
 
 @wp.struct
 class BaseGradient:
-    """Gradient of the base's virtual power (`base_action`) w.r.t. each of its arguments, in the same axes."""
+    """Gradient of the base's virtual power in a step (`base_action`) w.r.t. each of its inputs, in the same axes."""
 
     body: MassMoments
     com: vec3
@@ -56,7 +59,10 @@ class BaseGradient:
 
 @wp.func
 def make_base_factors(base: BaseState, end: BaseState, virtual_lin: vec3, virtual_ang: vec3, dt: real) -> BaseFactors:
-    """Return the `BaseFactors` of a step dt [s] from state `base` to `end`; virtual_*: multipliers, body axes."""
+    """Return the base's multipliers, accelerations and end velocities, constants of its virtual power in a step.
+
+    The step takes dt [s], from state `base` to `end`. virtual_*: multipliers, body axes.
+    """
     factors = BaseFactors()
     factors.virtual_lin = virtual_lin
     factors.virtual_ang = virtual_ang
@@ -72,7 +78,10 @@ def make_leg_factors(
     rates: vec3, new_rates: vec3, virtual_rates: vec3, mode: int, pressed: int, impulse: vec3, law: vec3, push: vec3,
     dt: real,
 ) -> LegFactors:  # fmt: skip
-    """Return a leg's `LegFactors`; rates, new_rates [rad/s]: of the motors at start and end of a step of dt [s]."""
+    """Return a leg's multipliers, motor motion and contact impulse, constants of its virtual power in a step.
+
+    rates, new_rates [rad/s]: of the motors at the start and the end of the step of dt [s].
+    """
     factors = LegFactors()
     factors.virtual_rates = virtual_rates
     factors.rates = new_rates
@@ -91,9 +100,10 @@ def leg_action_gradient(
     model: RobotModel, params: LegParams, world: int, leg: int, mu: real, base: BaseState, angles: vec3, rates: vec3,
     base_held: BaseFactors, leg_held: LegFactors, dt: real,
 ) -> LegGradient:  # fmt: skip
-    """Return the gradient of the virtual power (`leg_action`) of leg 0 to 3 in a step dt [s]; mu: friction coefficient.
+    """Return the gradient of a leg's virtual power in a step (`leg_action`) w.r.t. its state and constants.
 
-    base, angles [rad], rates [rad/s]: at the start of the step. base_held, leg_held: constants of the differentiation.
+    leg: 0 to 3. dt [s]: of the step. mu: friction coefficient. base, angles [rad], rates [rad/s]: at the start of the
+    step. base_held, leg_held: constants of the differentiation.
     """
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     gradient = LegGradient()
@@ -125,9 +135,10 @@ def base_action_gradient(
     model: RobotModel, world: int, force: vec3, moment: vec3, base: BaseState, held: BaseFactors,
     cotangent: BaseCotangent, dt: real,
 ) -> BaseGradient:  # fmt: skip
-    """Return the gradient of the base's virtual power (`base_action`) in a step dt [s]; held, cotangent: constants.
+    """Return the gradient of the base's virtual power in a step (`base_action`) w.r.t. its state, mass and forces.
 
-    force [N], moment [N m]: at the com, world axes. base: at the start of the step.
+    dt [s]: of the step. held, cotangent: constants of the differentiation. force [N], moment [N m]: at the com, world
+    axes. base: at the start of the step.
     """
     body, com, gravity, force_adj, moment_adj, quat_adj, lin, omega, _held, _cotangent, _dt = wp.grad(base_action)(
         load_moments(model.table, BASE, world), base_com(model.table, world), load_vec3(model.table, GRAVITY, world),

@@ -29,7 +29,7 @@ class MotorAdjoint:
 
 @wp.struct
 class FilterAdjoint:
-    """Gradient w.r.t. the inputs of a leg's command filter; vectors are lateral, outer, inner."""
+    """Gradient of the loss w.r.t. the inputs of a leg's command filter; vectors are lateral, outer, inner."""
 
     target: vec3  # w.r.t. the raw targets
     angles: vec3  # w.r.t. the measured angles
@@ -39,7 +39,10 @@ class FilterAdjoint:
 
 @wp.func
 def add_target(gradients: Gradients, step: int, motor: int, world: int, gradient: real):
-    """Add to the gradient w.r.t. a motor's filtered target of policy step `step` (-1: its initial target)."""
+    """Add to the stored gradient of the loss w.r.t. a motor's filtered target of one policy step.
+
+    step: policy step, -1 for the initial target.
+    """
     if step < 0:
         # atomic to avoid a load: no other thread writes here
         wp.atomic_add(gradients.initial_target, motor, world, gradient)
@@ -52,9 +55,10 @@ def motor_gradient(
     params: MotorParams, delay: real, commands: Commands, filtered_target: wp.array3d(dtype=real), timing: Timing,
     dt: real, step: int, motor: int, world: int, angle: real, rate: real,
 ) -> MotorAdjoint:  # fmt: skip
-    """Return the derivatives of the torque of a motor in physics step `step` of dt [s], at angle [rad], rate [rad/s].
+    """Return the derivatives of a motor's torque in a physics step w.r.t. target, joint state, constants and latency.
 
-    params: the motor's constants. delay: latency in physics steps. filtered_target [rad]: (T, 12, num_worlds).
+    step: physics step of dt [s], at angle [rad], rate [rad/s]. params: the motor's constants. delay: latency in physics
+    steps. filtered_target [rad]: (T, 12, num_worlds).
     """
     adjoint = MotorAdjoint()
     arrived = arrival(step, timing.substeps, delay)
@@ -76,7 +80,7 @@ def motor_gradient(
 
 @wp.func
 def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, gradient: real):
-    """Add the gradient w.r.t. a motor's interpolated target to those w.r.t. the two policy targets around it."""
+    """Split the gradient w.r.t. a motor's interpolated target between the two policy targets around it, and add it."""
     add_target(gradients, arrived.newer, motor, world, arrived.weight * gradient)
     if arrived.newer > arrived.older:
         add_target(gradients, arrived.older, motor, world, (real(1.0) - arrived.weight) * gradient)
@@ -84,9 +88,10 @@ def add_targets(gradients: Gradients, arrived: Arrival, motor: int, world: int, 
 
 @wp.func
 def add_motor_constants(sums: Any, shared: Any, motor: int, cotangent: real, adjoint: MotorAdjoint):
-    """Add cotangent times the derivatives w.r.t. a motor's constants to `sums`, and w.r.t. the latency to `shared`.
+    """Add the gradient of the loss w.r.t. a motor's constants and latency, through its torque in a step.
 
-    cotangent: gradient w.r.t. the motor's torque. sums, shared: rows of GRADIENT_ROWS, see `add_entry`.
+    That w.r.t. constants goes to `sums`, that w.r.t. the latency to `shared`. cotangent: gradient w.r.t. the motor's
+    torque. sums, shared: rows of GRADIENT_ROWS, see `add_entry`.
     """
     add_motor(sums, shared, motor, cotangent, adjoint.constants)
     add_entry(shared, LATENCY_GRADIENT, cotangent * adjoint.latency)
@@ -94,7 +99,7 @@ def add_motor_constants(sums: Any, shared: Any, motor: int, cotangent: real, adj
 
 @wp.func
 def filter_adjoint_scalar(target: vec3, angles: vec3, rates: vec3, params: FilterParams, cotangent: vec3) -> real:
-    """Return cotangent . (filtered targets of a leg [rad]), see `filter_leg`; differentiated by `wp.grad`."""
+    """Return a scalar for `wp.grad`, the adjoint of `filter_leg`: cotangent . (filtered targets of a leg [rad])."""
     return wp.dot(cotangent, filter_leg(target, angles, rates, params))
 
 
@@ -103,7 +108,7 @@ def filter_gradient(
     commands: Commands, actuation: Actuation, step: int, leg: int, world: int, angles: vec3, rates: vec3,
     gradients: Gradients,
 ) -> FilterAdjoint:  # fmt: skip
-    """Return the gradients w.r.t. the inputs of a leg's command filter in policy step `step`.
+    """Return the gradient of the loss w.r.t. the inputs of a leg's command filter (`filter_leg`) in a policy step.
 
     Reads the gradient w.r.t. the filtered targets from `gradients`. angles [rad], rates [rad/s]: of the leg's motors at
     the start of the policy step. Without a filter the gradient passes to the target unchanged.
@@ -128,5 +133,5 @@ def filter_gradient(
 
 @wp.func
 def add_offsets(sums: Any, leg: int, by_angles: vec3):
-    """Add `by_angles`, the gradient w.r.t. a leg's measured angles, to that w.r.t. the sensors' offsets."""
+    """Add the gradient w.r.t. a leg's measured angles to that w.r.t. the offsets of its position sensors."""
     add_vec3(sums, MOTOR_GRADIENT + 72 + 3 * leg, by_angles)

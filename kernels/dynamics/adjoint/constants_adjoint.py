@@ -1,4 +1,7 @@
-"""Gradients of a rollout w.r.t. constants of legs and motors, on GPUs: all steps in parallel, from the multipliers."""
+"""Kernels for GPUs that add the gradient of a rollout w.r.t. constants of legs and motors, all steps in parallel.
+
+They read the multipliers that `reverse_legs_kernel` has recorded.
+"""
 
 import warp as wp
 
@@ -19,7 +22,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class SpanStep:
-    """Indices of a step within a span of rows, and its weight in the sums of the thread that processes it."""
+    """Indices of a physics step in a rollout and in its record, and its weight in the sums of its thread."""
 
     step: int  # of the rollout
     entry: int  # of the record
@@ -28,13 +31,13 @@ class SpanStep:
 
 @wp.func
 def steps_per_thread(timing: Timing, span: Span, threads_per_leg: int) -> int:
-    """Return the number of steps of a span that each of the `threads_per_leg` threads of a leg processes."""
+    """Return how many physics steps of a span of trajectory rows each of a leg's `threads_per_leg` threads takes."""
     return ((span.end - span.begin) * timing.every + threads_per_leg - 1) / threads_per_leg
 
 
 @wp.func
 def span_step(timing: Timing, span: Span, k: int) -> SpanStep:
-    """Return the k-th step (from 0) of a span, or the last one with weight 0 if k is beyond it."""
+    """Return physics step k (from 0) of a span of trajectory rows, or the last one with weight 0 if k is beyond."""
     step = SpanStep()
     end = span.end * timing.every
     step.step = span.begin * timing.every + k
@@ -59,10 +62,10 @@ def leg_constants_kernel(
     # in, out
     gradients: Gradients,
 ):
-    """Add the gradients of a span's steps w.r.t. constants of legs; launch over (worlds, threads_per_leg, 4).
+    """Add the gradient of the loss w.r.t. constants of the legs, summed over the physics steps of a span of rows.
 
-    threads_per_leg: threads that divide the steps of a leg, 8 on a GPU (a warp per world) and 1 on a CPU. Worlds count
-    from `settings.first`.
+    Launch over (worlds, threads_per_leg, 4). threads_per_leg: threads that divide the steps of a leg, 8 on a GPU (a
+    warp per world) and 1 on a CPU. Worlds count from `settings.first`.
     """
     index, thread, leg = wp.tid()
     world = settings.first + index
@@ -100,9 +103,10 @@ def motor_constants_kernel(
     # in, out
     gradients: Gradients,
 ):
-    """Add the gradients of a span's steps w.r.t. constants of motors; launch as `leg_constants_kernel`.
+    """Add the gradient of the loss w.r.t. constants of the motors, summed over the physics steps of a span of rows.
 
-    The kernels are separate, because one would need more memory per thread than a GPU's L1 cache holds.
+    Launch as `leg_constants_kernel`. The kernels are separate, because one would need more memory per thread than a
+    GPU's L1 cache holds.
     """
     index, thread, leg = wp.tid()
     world = settings.first + index

@@ -1,4 +1,4 @@
-"""Arrays of the gradients of a rollout, and functions that add to them.
+"""Arrays of the gradient of a rollout's loss w.r.t. its inputs, and functions that add to them.
 
 `add_*` take `sums`, an array (GRADIENT_ROWS,) of one world or `ThreadSums`, and add a struct of gradients, entry by
 entry, to the rows of the parameters it names; leg: 0 to 3, motor: 0 to 11.
@@ -51,7 +51,7 @@ class Gradients:
 
 @wp.struct
 class ThreadSums:
-    """Destination of a thread's gradients w.r.t. parameters, and the threads of its warp to sum them over first."""
+    """Array to which a GPU thread adds gradients w.r.t. parameters, and the threads of its warp to sum over first."""
 
     parameters: wp.array2d(dtype=real)  # (GRADIENT_ROWS, num_worlds)
     world: int
@@ -63,7 +63,7 @@ class ThreadSums:
 
 @wp.func
 def thread_sums(gradients: Gradients, world: int, writes: bool, over_steps: bool, over_legs: bool) -> ThreadSums:
-    """Return `ThreadSums` of weight 1 that add to `gradients.parameters`; arguments: see its fields."""
+    """Return the destination of a thread's gradients w.r.t. parameters, `gradients.parameters`, with weight 1."""
     sums = ThreadSums()
     sums.parameters = gradients.parameters
     sums.world = world
@@ -76,13 +76,13 @@ def thread_sums(gradients: Gradients, world: int, writes: bool, over_steps: bool
 
 @wp.func
 def add_entry(sums: wp.array(dtype=real), row: int, x: real):
-    """Add x to a row of the parameter gradient of one world, (GRADIENT_ROWS,)."""
+    """Add a number to the gradient of one world w.r.t. one parameter: row `row` of `sums`, (GRADIENT_ROWS,)."""
     sums[row] = sums[row] + x
 
 
 @wp.func
 def add_entry(sums: ThreadSums, row: int, x: real):  # noqa: F811
-    """Add x, weighted and summed over threads, to a row of a world's parameter gradient; one atomic addition."""
+    """Sum x, weighted, over threads of a warp, and add it to a world's gradient w.r.t. one parameter, atomically."""
     total = sums.weight * x
     if sums.over_steps:
         total = sum_step_threads(total)
@@ -94,14 +94,14 @@ def add_entry(sums: ThreadSums, row: int, x: real):  # noqa: F811
 
 @wp.func
 def add_vec3(sums: Any, row: int, v: vec3):
-    """Add a vector to three rows of the parameter gradient, from `row` on."""
+    """Add a vector to a world's gradient w.r.t. three consecutive parameters, rows from `row` on."""
     for i in range(3):
         add_entry(sums, row + i, v[i])
 
 
 @wp.func
 def add_moments(sums: Any, row: int, m: MassMoments):
-    """Add the gradient w.r.t. a link's mass moments to MOMENT_ROWS rows, from `row` on."""
+    """Add the gradient w.r.t. a link's mass moments to a world's parameter gradient, MOMENT_ROWS rows from `row` on."""
     add_entry(sums, row, m.mass)
     add_vec3(sums, row + 1, m.first)
     for i in range(6):
@@ -110,7 +110,7 @@ def add_moments(sums: Any, row: int, m: MassMoments):
 
 @wp.func
 def add_masses(sums: Any, leg: int, masses: LegMasses):
-    """Add the gradient w.r.t. the mass moments of a leg's links."""
+    """Add the gradient w.r.t. the mass moments of a leg's links to a world's parameter gradient."""
     row = leg * layout.LEG_ROWS
     add_moments(sums, row + layout.HOUSING, masses.housing)
     add_moments(sums, row + layout.OUTER_THIGH, masses.outer_thigh)
@@ -121,7 +121,7 @@ def add_masses(sums: Any, leg: int, masses: LegMasses):
 
 @wp.func
 def add_joints(sums: Any, leg: int, p: JointParams):
-    """Add the gradient w.r.t. armature, friction and damping of a leg."""
+    """Add the gradient w.r.t. armature, friction and damping of a leg to a world's parameter gradient."""
     row = leg * layout.LEG_ROWS
     add_vec3(sums, row + layout.ARMATURE, p.armature)
     add_vec3(sums, row + layout.FRICTION, p.friction)
@@ -134,7 +134,7 @@ def add_joints(sums: Any, leg: int, p: JointParams):
 
 @wp.func
 def add_spring(sums: Any, leg: int, p: LegSpring):
-    """Add the gradient w.r.t. the spring of a leg."""
+    """Add the gradient w.r.t. the constants of a leg's knee spring to a world's parameter gradient."""
     row = leg * layout.LEG_ROWS + layout.SPRING
     add_entry(sums, row, p.stiffness)
     add_entry(sums, row + 1, p.length)
@@ -142,7 +142,7 @@ def add_spring(sums: Any, leg: int, p: LegSpring):
 
 @wp.func
 def add_stops(sums: Any, leg: int, p: StopParams):
-    """Add the gradient w.r.t. the hard stops of a leg."""
+    """Add the gradient w.r.t. the constants of a leg's hard stops to a world's parameter gradient."""
     row = leg * layout.LEG_ROWS
     add_vec3(sums, row + layout.LOWER, p.lower)
     add_vec3(sums, row + layout.UPPER, p.upper)
@@ -154,7 +154,7 @@ def add_stops(sums: Any, leg: int, p: StopParams):
 
 @wp.func
 def add_geometry(sums: Any, leg: int, geo: LegGeometry):
-    """Add the gradient w.r.t. a leg's hip position and lengths."""
+    """Add the gradient w.r.t. a leg's hip position and lengths to a world's parameter gradient."""
     row = GEOMETRY_GRADIENT + leg * GEOMETRY_ROWS
     add_vec3(sums, row, geo.hip)
     add_entry(sums, row + 3, geo.outer_x)
@@ -168,7 +168,7 @@ def add_geometry(sums: Any, leg: int, geo: LegGeometry):
 
 @wp.func
 def add_leg_parameters(sums: Any, leg: int, gradient: LegGradient):
-    """Add the gradient w.r.t. all parameters of a leg except its friction coefficients."""
+    """Add the gradient w.r.t. all constants of a leg, friction coefficients aside, to a world's parameter gradient."""
     add_geometry(sums, leg, gradient.geometry)
     add_masses(sums, leg, gradient.masses)
     add_joints(sums, leg, gradient.joints)
@@ -178,14 +178,20 @@ def add_leg_parameters(sums: Any, leg: int, gradient: LegGradient):
 
 @wp.func
 def add_com(sums: Any, mass: real, com: vec3, gradient: vec3):
-    """Add `gradient`, w.r.t. the base's com [m], to those w.r.t. its mass [kg] and first moment mass * com."""
+    """Convert the gradient w.r.t. the base's centre of mass to gradients w.r.t. mass and first moment, and add these.
+
+    gradient: w.r.t. com [m]. mass [kg]: of the base, its first moment is mass * com.
+    """
     add_entry(sums, layout.BASE, -wp.dot(gradient, com) / mass)
     add_vec3(sums, layout.BASE + 1, gradient / mass)
 
 
 @wp.func
 def add_motor(sums: Any, shared: Any, motor: int, scale: real, p: MotorParams):
-    """Add scale times the gradient p w.r.t. a motor's constants to `sums`; fade_start and fade_end go to `shared`."""
+    """Add a motor's gradient w.r.t. its constants, times `scale`, to a world's parameter gradient.
+
+    p: that gradient; fade_start and fade_end, common to all motors, go to `shared`, the others to `sums`.
+    """
     row = MOTOR_GRADIENT + motor
     add_entry(sums, row, scale * p.kp)
     add_entry(sums, row + 12, scale * p.kd)
@@ -200,14 +206,14 @@ def add_motor(sums: Any, shared: Any, motor: int, scale: real, p: MotorParams):
 
 @wp.func
 def add_limits(sums: Any, row: int, limits: Limits):
-    """Add the gradient w.r.t. the limits of one quantity; that w.r.t. its hard zones, which only switch, is 0."""
+    """Add the gradient w.r.t. the command filter's limits of one angle or sum; that w.r.t. its hard zones is 0."""
     add_entry(sums, row, limits.lower)
     add_entry(sums, row + 1, limits.upper)
 
 
 @wp.func
 def add_filter(sums: Any, p: FilterParams):
-    """Add the gradient w.r.t. the constants of the command filter."""
+    """Add the gradient w.r.t. the constants of the command filter to a world's parameter gradient."""
     add_limits(sums, FILTER_GRADIENT, p.lateral)
     add_limits(sums, FILTER_GRADIENT + 4, p.transversal)
     add_limits(sums, FILTER_GRADIENT + 8, p.sum)

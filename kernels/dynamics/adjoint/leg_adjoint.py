@@ -31,7 +31,10 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class LegAdjoint:
-    """Gradient w.r.t. a world's state and inputs, the part of one leg's thread; axes and order as in the value."""
+    """Gradient of the loss w.r.t. a world's state and inputs: the part that the thread of one leg computes.
+
+    Axes and order as in the value.
+    """
 
     base: BaseState  # w.r.t. the base's state at the start of the step
     angles: vec3  # w.r.t. the motors' angles at the start of the step: lateral, outer, inner
@@ -46,7 +49,10 @@ class LegAdjoint:
 
 @wp.func
 def leg_law(c: PawContact, law: PawLaw, impulse: vec3, point: vec3) -> LegLaw:
-    """Return the `LegLaw` of a paw's contact, for the record; impulse [N s], point [m] of contact: body axes."""
+    """Pack the contact law of a paw, its impulse, point and Jacobians for the record of the reverse pass.
+
+    impulse [N s], point [m] of contact: body axes.
+    """
     recorded = LegLaw()
     recorded.mode = law.mode
     recorded.mu_row = law.mu_row
@@ -65,11 +71,12 @@ def replay_leg(
     model: RobotModel, params: LegParams, dt: real, world: int, leg: int, force: vec3, moment: vec3,
     first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays, step: int, i: int, record: LegRecord,
 ):  # fmt: skip
-    """Recompute a step of the rollout from entry i of the record, and write the state at its end to entry i + 1.
+    """Recompute one physics step of a rollout, with a thread per leg, and record what its reverse pass needs.
 
-    Entry i stores the inverse of the base's system, the leg's elimination and its paw's law. force [N], moment [N m]:
-    on the base at its com, world axes. first_impulse: as `Commands.impulse`. All four threads of a world write the same
-    bits for the base; see `replay_step`.
+    Starts from the state in entry i of the record and writes the state at the end of the step to entry i + 1. Entry i
+    stores the inverse of the base's system, the leg's elimination and its paw's law. force [N], moment [N m]: on the
+    base at its com, world axes. first_impulse: as `Commands.impulse`. All four threads of a world write the same bits
+    for the base; see `replay_step`.
     """
     base = leg_record.get_base(record, i, world)
     rates = leg_record.get_vec(record, i, RATES, world, leg)
@@ -131,9 +138,10 @@ def any_leg(flag: bool) -> bool:
 
 @wp.func
 def law_block(c: PawContact, law: PawLaw, sent: PawContact, sent_law: PawLaw, leg: int, j: int) -> mat33:
-    """Return block (leg, j) of the contact-law matrix A^T (`step_adjoint`); the arguments but j: of this thread's leg.
+    """Return a 3x3 block of the matrix of the paws' contact-law multipliers: row of paw `leg`, column of paw j.
 
-    sent, sent_law: c and law again, of which thread j sends its own to the other threads.
+    The matrix is A^T of `step_adjoint`. The arguments but j are those of this thread's leg. sent, sent_law: c and law
+    again, of which thread j sends its own to the other threads.
     """
     to_lin = mat_from_leg(sent.to_lin * wp.transpose(sent_law.by_velocity), j)
     to_ang = mat_from_leg(sent.to_ang * wp.transpose(sent_law.by_velocity), j)
@@ -146,7 +154,7 @@ def law_block(c: PawContact, law: PawLaw, sent: PawContact, sent_law: PawLaw, le
 
 @wp.func
 def reduce_block(block: mat33, factor: mat33, pivot: mat33, j: int, leg: int) -> mat33:
-    """Return `block` of this thread's row (leg) after Gauss-Jordan elimination with row j.
+    """Return a 3x3 block of this thread's matrix row after one step of block Gauss-Jordan elimination, with row j.
 
     factor: this row's block in column j. pivot: in thread j, the block of row j scaled by the inverse diagonal block.
     """
@@ -158,7 +166,10 @@ def reduce_block(block: mat33, factor: mat33, pivot: mat33, j: int, leg: int) ->
 
 @wp.func
 def inverted_laws(c: PawContact, law: PawLaw, leg: int) -> LawRow:
-    """Return row `leg` of the inverse of A^T (12x12) of `step_adjoint`: Gauss-Jordan by 3x3 blocks, a row a thread."""
+    """Invert the contact-law matrix by block Gauss-Jordan elimination over four threads, and return row `leg`.
+
+    The matrix is A^T (12x12) of `step_adjoint`; each thread holds a row of 3x3 blocks.
+    """
     eye = wp.identity(n=3, dtype=real)
     none = mat33(real(0.0))
     a0 = law_block(c, law, c, law, leg, 0)
@@ -191,9 +202,10 @@ def inverted_laws(c: PawContact, law: PawLaw, leg: int) -> LawRow:
 
 @wp.func
 def multiplier(row: LawRow, impulse_cotangent: vec3) -> vec3:
-    """Return the multiplier l of the law of this thread's paw; impulse_cotangent: gradient w.r.t. the paw's impulse.
+    """Return the multiplier of the contact law of this thread's paw, from the gradient w.r.t. all paws' impulses.
 
-    row: see `inverted_laws`. Threads of separated paws must pass 0.
+    impulse_cotangent: gradient w.r.t. this paw's impulse. row: see `inverted_laws`. Threads of separated paws must pass
+    0.
     """
     total = row.a * vec_from_leg(impulse_cotangent, 0) + row.b * vec_from_leg(impulse_cotangent, 1)
     return -(total + row.c * vec_from_leg(impulse_cotangent, 2) + row.d * vec_from_leg(impulse_cotangent, 3))
@@ -201,7 +213,10 @@ def multiplier(row: LawRow, impulse_cotangent: vec3) -> vec3:
 
 @wp.func
 def base_factors(record: LegRecord, world: int, i: int, dt: real, base: BaseState, weights: BaseWeights) -> BaseFactors:
-    """Return the `BaseFactors` of the step dt [s] at entry i of the record; base: state at its start."""
+    """Return the base's multipliers and motion in a recorded step, constants of its virtual power.
+
+    i: entry of the step, of dt [s], in the record; base: state at its start.
+    """
     return make_base_factors(base, leg_record.get_base(record, i + 1, world), weights.lin, weights.ang, dt)
 
 
@@ -210,7 +225,10 @@ def leg_factors(
     record: LegRecord, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, world: int, step: int, i: int,
     leg: int, dt: real, law: LegLaw, weights: LegWeights,
 ) -> LegFactors:  # fmt: skip
-    """Return a leg's `LegFactors` in step `step` of the rollout, of dt [s], whose entry in the record is i."""
+    """Return a leg's multipliers, motor motion and contact impulse in a recorded step, constants of its virtual power.
+
+    step: its number in the rollout; dt [s]; i: its entry in the record.
+    """
     push = vec3(real(0.0))
     if cotangent.impulse.shape[0] > 0:
         push = cotangent.impulse[step, leg, world]
@@ -222,7 +240,7 @@ def leg_factors(
 
 @wp.struct
 class StepWeights:
-    """Multipliers of a step's equations, and the gradients w.r.t. the velocities at its start that follow from them."""
+    """Multipliers of a step's equations of motion and contact laws, and gradients w.r.t. the velocities before it."""
 
     base: BaseWeights
     leg: LegWeights
@@ -236,10 +254,10 @@ def find_weights(
     record: LegRecord, world: int, leg: int, cotangent: TrajectoryArrays, step: int, i: int, base: BaseState,
     law: LegLaw, lin_cotangent: vec3, ang_cotangent: vec3, rate_cotangent: vec3,
 ) -> StepWeights:  # fmt: skip
-    """Return the multipliers of a step, given the gradients w.r.t. the velocities at its end; see `find_multipliers`.
+    """Return the multipliers of a step's motion and contact equations, from the gradients w.r.t. its end velocities.
 
-    lin_cotangent, ang_cotangent: w.r.t. the base's velocities, in the body axes of the step's start. rate_cotangent:
-    w.r.t. the motors' rates. i: the step's entry in the record.
+    Like `find_multipliers`, with a thread per leg. lin_cotangent, ang_cotangent: w.r.t. the base's velocities, in the
+    body axes of the step's start. rate_cotangent: w.r.t. the motors' rates. i: the step's entry in the record.
     """
     inverse = leg_record.get_inverse(record, i, world)
     solve = leg_record.get_solve(record, i, world, leg)
@@ -283,10 +301,11 @@ def reverse_leg(
     trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, step: int, i: int, record: LegRecord, adj: LegAdjoint,
     writes_record: bool,
 ) -> LegAdjoint:  # fmt: skip
-    """Return the gradient w.r.t. the state at the start of a step; adj: gradient w.r.t. the state at its end.
+    """Run one time step backwards with a thread per leg: return the gradient w.r.t. the state at its start.
 
-    See `reverse_step`. i: the step's entry in the record, step: its number in the rollout. force [N], moment [N m]: on
-    the base at its com, world axes. writes_record: whether this thread writes the step's multipliers to the record.
+    adj: gradient w.r.t. the state at the end. See `reverse_step`. i: the step's entry in the record, step: its number
+    in the rollout. force [N], moment [N m]: on the base at its com, world axes. writes_record: whether this thread
+    writes the step's multipliers to the record.
     """
     base = leg_record.get_base(record, i, world)
     law = leg_record.get_law(record, i, world, leg)
@@ -331,7 +350,7 @@ def reverse_leg(
 
 @wp.func
 def add_leg_constants(sums: ThreadSums, leg: int, law: LegLaw, gradient: LegGradient):
-    """Add the gradient of a step w.r.t. the parameters of a leg, friction coefficients included."""
+    """Add the gradient of a step w.r.t. all constants of a leg, friction coefficients included, to `sums`."""
     add_leg_parameters(sums, leg, gradient)
     for row in range(2):  # the step depends on one of the two coefficients
         mu_row = leg * LEG_ROWS + wp.where(row == 0, int(MU_STATIC), int(MU_DYNAMIC))

@@ -1,4 +1,4 @@
-"""Record of a few steps for the reverse pass with a thread per leg.
+"""Record of a few recomputed physics steps, for the reverse pass of a rollout with a thread per leg.
 
 `get_*` and `put_*` read and write the fields of one entry (a step) and world; indices of world and leg come last for
 coalesced access.
@@ -38,7 +38,7 @@ LEG_FIELDS = wp.constant(132)
 
 @wp.struct
 class LegRecord:
-    """Record of successive steps, one entry each, and a last entry for the state at the end of the last step."""
+    """Record of successive physics steps for the reverse pass: an entry per step, and one for the final state."""
 
     base: wp.array3d(dtype=real)  # (entries, BASE_FIELDS, num_worlds)
     legs: wp.array4d(dtype=real)  # (entries, LEG_FIELDS, num_worlds, 4)
@@ -63,7 +63,7 @@ class LegWeights:
 
 @wp.struct
 class MotorSlopes:
-    """Derivatives of the torque of each of a leg's motors (lateral, outer, inner), no cross terms."""
+    """Derivatives of each of a leg's motor torques w.r.t. its own target, angle and rate; lateral, outer, inner."""
 
     target: vec3  # [N m/rad]
     angle: vec3  # [N m/rad]
@@ -72,7 +72,7 @@ class MotorSlopes:
 
 @wp.struct
 class LegLaw:
-    """Contact law of a paw at the solution of a step."""
+    """Contact law of a paw, linearised at the solution of a step, as the reverse pass records it."""
 
     mode: int  # SEPARATE, STICK or SLIDE
     mu_row: int  # row of the friction coefficient in the parameter table
@@ -87,7 +87,7 @@ class LegLaw:
 
 @wp.struct
 class LawRow:
-    """Row of a paw in the inverse of the contact-law matrix A^T (12x12, `step_adjoint`): a 3x3 block per paw."""
+    """One paw's row in the inverse of the 12x12 contact-law matrix A^T (`step_adjoint`): a 3x3 block per paw."""
 
     a: mat33  # FL
     b: mat33  # FR
@@ -97,7 +97,7 @@ class LawRow:
 
 @wp.func
 def get_vec(record: LegRecord, entry: int, field: int, world: int, leg: int) -> vec3:
-    """Return three recorded fields of a leg, from `field` on."""
+    """Read a vector of a leg from the record: three fields, from `field` on."""
     return vec3(
         record.legs[entry, field, world, leg],
         record.legs[entry, field + 1, world, leg],
@@ -107,14 +107,14 @@ def get_vec(record: LegRecord, entry: int, field: int, world: int, leg: int) -> 
 
 @wp.func
 def put_vec(record: LegRecord, entry: int, field: int, world: int, leg: int, v: vec3):
-    """Write three fields of a leg to the record, from `field` on."""
+    """Write a vector of a leg to the record: three fields, from `field` on."""
     for i in range(3):
         record.legs[entry, field + i, world, leg] = v[i]
 
 
 @wp.func
 def get_mat(record: LegRecord, entry: int, field: int, world: int, leg: int) -> mat33:
-    """Return nine recorded fields of a leg, from `field` on, as a matrix (row by row)."""
+    """Read a 3x3 matrix of a leg from the record: nine fields, from `field` on, row by row."""
     return wp.matrix_from_rows(
         get_vec(record, entry, field, world, leg),
         get_vec(record, entry, field + 3, world, leg),
@@ -124,7 +124,7 @@ def get_mat(record: LegRecord, entry: int, field: int, world: int, leg: int) -> 
 
 @wp.func
 def put_mat(record: LegRecord, entry: int, field: int, world: int, leg: int, m: mat33):
-    """Write a matrix row by row to nine recorded fields of a leg, from `field` on."""
+    """Write a 3x3 matrix of a leg to the record: nine fields, from `field` on, row by row."""
     for i in range(3):
         for j in range(3):
             record.legs[entry, field + 3 * i + j, world, leg] = m[i, j]
@@ -132,7 +132,7 @@ def put_mat(record: LegRecord, entry: int, field: int, world: int, leg: int, m: 
 
 @wp.func
 def get_base_mat(record: LegRecord, entry: int, field: int, world: int) -> mat33:
-    """Return nine recorded fields of the base, from `field` on, as a matrix (row by row)."""
+    """Read a 3x3 matrix of the base from the record: nine fields, from `field` on, row by row."""
     return wp.matrix_from_rows(
         row_vec3(record.base, entry, field, world),
         row_vec3(record.base, entry, field + 3, world),
@@ -142,7 +142,7 @@ def get_base_mat(record: LegRecord, entry: int, field: int, world: int) -> mat33
 
 @wp.func
 def put_base_mat(record: LegRecord, entry: int, field: int, world: int, m: mat33):
-    """Write a matrix row by row to nine recorded fields of the base, from `field` on."""
+    """Write a 3x3 matrix of the base to the record: nine fields, from `field` on, row by row."""
     for i in range(3):
         for j in range(3):
             record.base[entry, field + 3 * i + j, world] = m[i, j]
@@ -171,7 +171,7 @@ def put_base(record: LegRecord, entry: int, world: int, base: BaseState):
 
 @wp.func
 def get_inverse(record: LegRecord, entry: int, world: int) -> BaseInverse:
-    """Return the recorded inverse of the base's system of equations."""
+    """Return the recorded inverse of the matrix of the base's equations of motion in a step."""
     inverse = BaseInverse()
     inverse.lin = get_base_mat(record, entry, BASE_INVERSE, world)
     inverse.cross = get_base_mat(record, entry, BASE_INVERSE + 9, world)
@@ -181,7 +181,7 @@ def get_inverse(record: LegRecord, entry: int, world: int) -> BaseInverse:
 
 @wp.func
 def put_inverse(record: LegRecord, entry: int, world: int, inverse: BaseInverse):
-    """Write the inverse of the base's system of equations to the record."""
+    """Write the inverse of the matrix of the base's equations of motion in a step to the record."""
     put_base_mat(record, entry, BASE_INVERSE, world, inverse.lin)
     put_base_mat(record, entry, BASE_INVERSE + 9, world, inverse.cross)
     put_base_mat(record, entry, BASE_INVERSE + 18, world, inverse.ang)
@@ -189,7 +189,7 @@ def put_inverse(record: LegRecord, entry: int, world: int, inverse: BaseInverse)
 
 @wp.func
 def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
-    """Return a leg's recorded `LegSolve`; `free` is not recorded and is 0."""
+    """Return the recorded elimination of a leg's motors from the equations of motion, with `free` 0."""
     solve = LegSolve()
     solve.inverse = get_mat(record, entry, SOLVE, world, leg)
     solve.to_lin = get_mat(record, entry, SOLVE + 9, world, leg)
@@ -199,7 +199,7 @@ def get_solve(record: LegRecord, entry: int, world: int, leg: int) -> LegSolve:
 
 @wp.func
 def put_solve(record: LegRecord, entry: int, world: int, leg: int, solve: LegSolve):
-    """Write a leg's `LegSolve` to the record, without `free`."""
+    """Write the elimination of a leg's motors from the equations of motion to the record, without `free`."""
     put_mat(record, entry, SOLVE, world, leg, solve.inverse)
     put_mat(record, entry, SOLVE + 9, world, leg, solve.to_lin)
     put_mat(record, entry, SOLVE + 18, world, leg, solve.to_ang)
@@ -207,7 +207,7 @@ def put_solve(record: LegRecord, entry: int, world: int, leg: int, solve: LegSol
 
 @wp.func
 def get_slopes(record: LegRecord, entry: int, world: int, leg: int) -> MotorSlopes:
-    """Return the recorded derivatives of a leg's motor torques."""
+    """Return the recorded derivatives of a leg's motor torques w.r.t. targets, angles and rates."""
     slopes = MotorSlopes()
     slopes.target = get_vec(record, entry, SLOPES, world, leg)
     slopes.angle = get_vec(record, entry, SLOPES + 3, world, leg)
@@ -217,7 +217,7 @@ def get_slopes(record: LegRecord, entry: int, world: int, leg: int) -> MotorSlop
 
 @wp.func
 def put_slopes(record: LegRecord, entry: int, world: int, leg: int, slopes: MotorSlopes):
-    """Write the derivatives of a leg's motor torques to the record."""
+    """Write the derivatives of a leg's motor torques w.r.t. targets, angles and rates to the record."""
     put_vec(record, entry, SLOPES, world, leg, slopes.target)
     put_vec(record, entry, SLOPES + 3, world, leg, slopes.angle)
     put_vec(record, entry, SLOPES + 6, world, leg, slopes.rate)
@@ -257,7 +257,7 @@ def put_law(record: LegRecord, entry: int, world: int, leg: int, law: LegLaw):
 
 @wp.func
 def get_law_row(record: LegRecord, entry: int, world: int, leg: int) -> LawRow:
-    """Return a paw's recorded `LawRow`; it is defined only where a paw of the world touches the ground."""
+    """Return a paw's recorded row of the inverse contact-law matrix, defined only where a paw of the world touches."""
     row = LawRow()
     row.a = get_mat(record, entry, LAWS, world, leg)
     row.b = get_mat(record, entry, LAWS + 9, world, leg)
@@ -268,7 +268,7 @@ def get_law_row(record: LegRecord, entry: int, world: int, leg: int) -> LawRow:
 
 @wp.func
 def put_law_row(record: LegRecord, entry: int, world: int, leg: int, row: LawRow):
-    """Write a paw's `LawRow` to the record."""
+    """Write a paw's row of the inverse contact-law matrix to the record."""
     put_mat(record, entry, LAWS, world, leg, row.a)
     put_mat(record, entry, LAWS + 9, world, leg, row.b)
     put_mat(record, entry, LAWS + 18, world, leg, row.c)
@@ -277,7 +277,7 @@ def put_law_row(record: LegRecord, entry: int, world: int, leg: int, row: LawRow
 
 @wp.func
 def get_leg_weights(record: LegRecord, entry: int, world: int, leg: int) -> LegWeights:
-    """Return a leg's recorded multipliers."""
+    """Return the recorded multipliers of a leg's equations of motion and of its paw's contact law."""
     weights = LegWeights()
     weights.rates = get_vec(record, entry, LEG_WEIGHTS, world, leg)
     weights.law = get_vec(record, entry, LEG_WEIGHTS + 3, world, leg)
@@ -286,14 +286,14 @@ def get_leg_weights(record: LegRecord, entry: int, world: int, leg: int) -> LegW
 
 @wp.func
 def put_leg_weights(record: LegRecord, entry: int, world: int, leg: int, weights: LegWeights):
-    """Write a leg's multipliers to the record."""
+    """Write the multipliers of a leg's equations of motion and of its paw's contact law to the record."""
     put_vec(record, entry, LEG_WEIGHTS, world, leg, weights.rates)
     put_vec(record, entry, LEG_WEIGHTS + 3, world, leg, weights.law)
 
 
 @wp.func
 def get_base_weights(record: LegRecord, entry: int, world: int) -> BaseWeights:
-    """Return the base's recorded multipliers."""
+    """Return the recorded multipliers of the base's equations of motion."""
     weights = BaseWeights()
     weights.lin = row_vec3(record.base, entry, BASE_WEIGHTS, world)
     weights.ang = row_vec3(record.base, entry, BASE_WEIGHTS + 3, world)
@@ -305,7 +305,7 @@ def get_base_weights(record: LegRecord, entry: int, world: int) -> BaseWeights:
 
 @wp.func
 def put_base_weights(record: LegRecord, entry: int, world: int, weights: BaseWeights):
-    """Write the base's multipliers to the record."""
+    """Write the multipliers of the base's equations of motion to the record."""
     store_row_vec3(record.base, entry, BASE_WEIGHTS, world, weights.lin)
     store_row_vec3(record.base, entry, BASE_WEIGHTS + 3, world, weights.ang)
     store_row_vec3(record.base, entry, BASE_WEIGHTS + 6, world, weights.cotangent.velocity)

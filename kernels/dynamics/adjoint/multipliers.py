@@ -25,7 +25,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class StepRecord:
-    """Steps between two rows of a rollout, recomputed for the reverse pass; indices: world, step, leg."""
+    """Physics steps between two rows of a rollout, recomputed for its reverse pass; indices: world, step, leg."""
 
     base: wp.array2d(dtype=BaseState)  # (num_worlds, steps + 1)
     angles: wp.array3d(dtype=vec3)  # [rad], (num_worlds, steps + 1, 4)
@@ -49,7 +49,10 @@ class ReplayedStep:
 
 @wp.struct
 class LegReverse:
-    """Scratch of a leg in the reverse pass: gradients w.r.t. motors (lateral, outer, inner), multipliers, contact."""
+    """Working data of a leg in the reverse pass: gradients w.r.t. its motors, multipliers, and its paw's contact.
+
+    Vectors of motors are lateral, outer, inner.
+    """
 
     angles: vec3  # w.r.t. the angles at the end of the step; after `reverse_step` at its start
     rates: vec3  # w.r.t. the rates at the end of the step; after `reverse_step` at its start
@@ -62,7 +65,10 @@ class LegReverse:
 
 @wp.struct
 class Multipliers:
-    """Multipliers m of the base's equations in a step, and the gradients y in M m = y (M: mass matrix); body axes."""
+    """Multipliers of the base's equations of motion in a step, and the gradients from which they are solved.
+
+    The multipliers are m, the gradients y in M m = y (M: mass matrix); body axes.
+    """
 
     lin_cotangent: vec3  # y: w.r.t. the base's linear velocity at the end of the step, contact laws included
     ang_cotangent: vec3  # y: w.r.t. the base's angular velocity
@@ -74,7 +80,10 @@ class Multipliers:
 def solve_system(
     record: StepRecord, at: ReplayedStep, lin_cotangent: vec3, ang_cotangent: vec3, legs: wp.array(dtype=LegReverse)
 ) -> Multipliers:
-    """Solve M m = y (`Multipliers`); return the base's m, write the motors'; y: *_cotangent, `legs[k].rates`."""
+    """Solve for the multipliers of the equations of motion of base and motors, contact laws aside.
+
+    Solves M m = y (`Multipliers`) for y = *_cotangent, `legs[k].rates`; returns the base's m, writes the motors'.
+    """
     m = Multipliers()
     m.lin_cotangent = lin_cotangent
     m.ang_cotangent = ang_cotangent
@@ -98,8 +107,9 @@ def replay_step(
     model: RobotModel, params: wp.array(dtype=LegParams), at: ReplayedStep, trajectory: TrajectoryArrays,
     record: StepRecord,
 ):  # fmt: skip
-    """Recompute a step from its entry of the record, with the torques, impulses and pressed stops of the trajectory.
+    """Recompute one physics step of a rollout, for its reverse pass, with the recorded torques, impulses and stops.
 
+    The step starts from its entry of the record; torques, impulses and pressed stops are those of the trajectory.
     Writes to `record` the leg and base terms of the step (entry `at.entry`) and the state at its end (the next entry).
     """
     dt, world, step, i = at.dt, at.world, at.step, at.entry
@@ -145,7 +155,10 @@ def replay_step(
 
 @wp.func
 def solve_linear(a: wp.array2d(dtype=real), b: wp.array(dtype=real), n: int):
-    """Write the solution x of a x = b (first n rows and columns) to b; Gaussian elimination with row pivots in a."""
+    """Solve a linear system a x = b by Gaussian elimination with row pivoting; x replaces b.
+
+    Uses the first n rows and columns, and overwrites a.
+    """
     for col in range(n):
         best = col
         for row in range(col + 1, n):
@@ -176,7 +189,10 @@ def solve_linear(a: wp.array2d(dtype=real), b: wp.array(dtype=real), n: int):
 
 @wp.func
 def solve_laws(legs: wp.array(dtype=LegReverse)):
-    """Replace `multiplier` of all legs, the gradient w.r.t. a paw's impulse, by the multiplier of its law, or 0."""
+    """Solve for the multipliers of all paws' contact laws, one linear system, by Gaussian elimination.
+
+    `multiplier` of each leg is the gradient w.r.t. its paw's impulse before, and the multiplier (0 if separated) after.
+    """
     matrix = wp.zeros(shape=(12, 12), dtype=real)
     vector = wp.zeros(shape=(12,), dtype=real)
     row = int(0)
@@ -215,7 +231,7 @@ def write_laws(
     model: RobotModel, at: ReplayedStep, first_impulse: wp.array2d(dtype=vec3), trajectory: TrajectoryArrays,
     record: StepRecord, m: Multipliers, cotangent: TrajectoryArrays, legs: wp.array(dtype=LegReverse),
 ) -> bool:  # fmt: skip
-    """Write the paws' contacts and laws at the solution, and the gradients w.r.t. their impulses, to `legs`.
+    """Write each paw's contact and linearised contact law, and the gradient w.r.t. its impulse, to `legs`.
 
     Returns whether any paw touches. m: from `solve_system`. first_impulse: as `Commands.impulse`. cotangent: gradient
     w.r.t. the trajectory.
@@ -255,7 +271,10 @@ def write_laws(
 def add_laws(
     model: RobotModel, at: ReplayedStep, record: StepRecord, multipliers: Multipliers, legs: wp.array(dtype=LegReverse),
 ) -> Multipliers:  # fmt: skip
-    """Return `multipliers` of the equations of motion plus the contact laws' part (from `legs`); updates `legs` too."""
+    """Add the contact laws' part to the multipliers of the equations of motion.
+
+    Returns those of the base; updates the motors' in `legs`, which holds the laws.
+    """
     m = multipliers
     law_lin = vec3(real(0.0))
     law_ang = vec3(real(0.0))
@@ -284,10 +303,11 @@ def find_multipliers(
     cotangent: TrajectoryArrays, record: StepRecord, lin_cotangent: vec3, ang_cotangent: vec3,
     legs: wp.array(dtype=LegReverse),
 ) -> Multipliers:  # fmt: skip
-    """Return the multipliers of a step's equations (`step_adjoint`) for the gradients w.r.t. its end velocities.
+    """Return the multipliers of a step's motion and contact equations, from the gradients w.r.t. its end velocities.
 
-    lin_cotangent, ang_cotangent: w.r.t. the base's velocities, body axes. legs: `rates` are the gradients w.r.t. the
-    motors' rates, to which the contact laws' part is added; multipliers, contacts and laws are written.
+    See `step_adjoint`. lin_cotangent, ang_cotangent: w.r.t. the base's velocities, body axes. legs: `rates` are the
+    gradients w.r.t. the motors' rates, to which the contact laws' part is added; multipliers, contacts and laws are
+    written.
     """
     m = solve_system(record, at, lin_cotangent, ang_cotangent, legs)
     if write_laws(model, at, first_impulse, trajectory, record, m, cotangent, legs):
@@ -298,7 +318,10 @@ def find_multipliers(
 
 @wp.func
 def base_factors(at: ReplayedStep, record: StepRecord, m: Multipliers) -> BaseFactors:
-    """Return the `BaseFactors` of the recomputed step `at`; m: from `find_multipliers`."""
+    """Return the base's multipliers and motion in the recomputed step `at`, constants of its virtual power.
+
+    m: from `find_multipliers`.
+    """
     base = record.base[at.world, at.entry]
     return make_base_factors(base, record.base[at.world, at.entry + 1], m.lin, m.ang, at.dt)
 
@@ -308,7 +331,10 @@ def leg_factors(
     at: ReplayedStep, k: int, trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord,
     legs: wp.array(dtype=LegReverse),
 ) -> LegFactors:  # fmt: skip
-    """Return the `LegFactors` of leg k (0 to 3) in the recomputed step `at`, after `find_multipliers`."""
+    """Return a leg's multipliers, motion and contact impulse in a recomputed step, constants of its virtual power.
+
+    k: leg 0 to 3. Needs the results of `find_multipliers`.
+    """
     push = vec3(real(0.0))
     if cotangent.impulse.shape[0] > 0:
         push = cotangent.impulse[at.step, k, at.world]

@@ -39,7 +39,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def row_adjoint_scalar(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, com: vec3, cotangent: BaseState) -> real:
-    """Return cotangent . `row_base` (the base's state from the entries of a row); differentiated by `wp.grad`."""
+    """Return a scalar for `wp.grad`, the adjoint of `row_base`: cotangent . (base state read from a trajectory row)."""
     base = row_base(pos, orientation, com_lin, ang, com)
     return (
         wp.dot(cotangent.pos, base.pos)
@@ -53,7 +53,7 @@ def row_adjoint_scalar(pos: vec3, orientation: quat, com_lin: vec3, ang: vec3, c
 def store_adjoint_scalar(
     orientation: quat, lin: vec3, omega: vec3, com: vec3, lin_cotangent: vec3, ang_cotangent: vec3
 ) -> real:
-    """Return the cotangents . (velocities that `store_row_base` writes for a base state); differentiated by `wp.grad`.
+    """Return a scalar for `wp.grad`, the adjoint of `store_row_base`: cotangents . (velocities written to a row).
 
     orientation (xyzw), lin [m/s], omega [rad/s]: of the `BaseState`; com [m]: body frame; cotangents: world axes.
     """
@@ -63,7 +63,7 @@ def store_adjoint_scalar(
 
 @wp.struct
 class RowCotangent:
-    """Gradient w.r.t. the base's entries of a trajectory row, see `TrajectoryArrays`; world axes."""
+    """Gradient of the loss w.r.t. the base's entries of a trajectory row, see `TrajectoryArrays`; world axes."""
 
     pos: vec3
     quat: quat
@@ -76,9 +76,10 @@ class RowCotangent:
 def load_row_base_adjoint(
     trajectory: TrajectoryArrays, model: RobotModel, row: int, world: int, adj: BaseState, later_com: vec3
 ) -> RowCotangent:
-    """Return the gradient w.r.t. a row's entries; adj: gradient w.r.t. the base's state that was read from the row.
+    """Return the gradient w.r.t. a trajectory row's base entries: the adjoint of `load_row_base`.
 
-    later_com: gradient w.r.t. the base's centre of mass, summed over the later rows.
+    adj: gradient w.r.t. the base's state that was read from the row. later_com: gradient w.r.t. the base's centre of
+    mass, summed over the later rows.
     """
     com = base_com(model.table, world)
     pos, orientation, lin, ang, com_adj, _cotangent = wp.grad(row_adjoint_scalar)(
@@ -96,7 +97,7 @@ def load_row_base_adjoint(
 
 @wp.func
 def add_row_cotangent(into: RowCotangent, cotangent: TrajectoryArrays, row: int, world: int) -> RowCotangent:
-    """Return `into` plus the gradient of the loss w.r.t. the base entries of a row, from `cotangent`."""
+    """Return `into` plus the gradient of the loss w.r.t. the base entries of a trajectory row, from `cotangent`."""
     s = into
     if cotangent.q.shape[0] > 0:
         s.pos += row_vec3(cotangent.q, row, 0, world)
@@ -109,7 +110,7 @@ def add_row_cotangent(into: RowCotangent, cotangent: TrajectoryArrays, row: int,
 
 @wp.struct
 class RowBaseAdjoint:
-    """Gradient w.r.t. the base's state that was written to a trajectory row."""
+    """Gradient of the loss w.r.t. the base's state that was written to a trajectory row."""
 
     base: BaseState
     com: vec3  # w.r.t. the base's centre of mass, summed over rows
@@ -117,7 +118,10 @@ class RowBaseAdjoint:
 
 @wp.func
 def store_row_base_adjoint(model: RobotModel, world: int, base: BaseState, cotangent: RowCotangent) -> RowBaseAdjoint:
-    """Return the gradient w.r.t. the state `base` that was written to a row; cotangent: w.r.t. the row's entries."""
+    """Return the gradient w.r.t. the base state that was written to a trajectory row: the adjoint of `store_row_base`.
+
+    base: that state. cotangent: gradient w.r.t. the row's entries.
+    """
     com = base_com(model.table, world)
     orientation, lin, ang, com_adj, _lin, _ang = wp.grad(store_adjoint_scalar)(
         base.quat, base.lin, base.ang, com, cotangent.lin, cotangent.ang
@@ -133,7 +137,7 @@ def store_row_base_adjoint(model: RobotModel, world: int, base: BaseState, cotan
 
 @wp.func
 def add_motor_rows(legs: wp.array(dtype=LegReverse), cotangent: TrajectoryArrays, row: int, world: int):
-    """Add the gradient of the loss w.r.t. the angles and rates of a row, from `cotangent`, to `legs`."""
+    """Add the gradient of the loss w.r.t. motor angles and rates of a trajectory row, from `cotangent`, to `legs`."""
     for k in range(legs.shape[0]):
         if cotangent.q.shape[0] > 0:
             legs[k].angles = legs[k].angles + row_vec3(cotangent.q, row, 7 + 3 * k, world)
@@ -146,7 +150,7 @@ def load_parts(
     model: RobotModel, actuation: Actuation, world: int, params: wp.array(dtype=LegParams),
     motors: wp.array(dtype=MotorParams),
 ):  # fmt: skip
-    """Write the parameters of a world's legs to params (4,) and of its motors to motors (12,)."""
+    """Load the parameters of a world's legs into params (4,) and of its motors into motors (12,)."""
     for k in range(params.shape[0]):
         params[k] = load_leg(model, world, k)
     for i in range(motors.shape[0]):
@@ -155,7 +159,7 @@ def load_parts(
 
 @wp.func
 def replayed_step(commands: Commands, t: int, dt: real, world: int) -> ReplayedStep:
-    """Return a `ReplayedStep` for the physics steps of policy step t, with `step` and `entry` still 0."""
+    """Return time step, world and base wrench to recompute the physics steps of policy step t; all else is 0."""
     at = ReplayedStep()
     at.dt = dt
     at.world = world
@@ -169,7 +173,7 @@ def replay_row(
     model: RobotModel, params: wp.array(dtype=LegParams), policy_step: ReplayedStep, trajectory: TrajectoryArrays,
     row: int, every: int, com: vec3, record: StepRecord,
 ):  # fmt: skip
-    """Recompute the `every` steps after a row and write them to the record; com [m]: of the base, body frame."""
+    """Recompute and record the `every` physics steps between two trajectory rows; com [m]: of the base, body frame."""
     at = policy_step
     record.base[at.world, 0] = load_row_base(trajectory, row, at.world, com)
     for k in range(record.angles.shape[2]):
@@ -183,7 +187,7 @@ def replay_row(
 
 @wp.func
 def add_wrench(gradients: Gradients, t: int, world: int, force: vec3, moment: vec3):
-    """Add force and moment to the gradient w.r.t. the wrench on the base in policy step t."""
+    """Add force and moment to the stored gradient of the loss w.r.t. the wrench on the base in policy step t."""
     store_row_vec3(gradients.wrench, t, 0, world, row_vec3(gradients.wrench, t, 0, world) + force)
     store_row_vec3(gradients.wrench, t, 3, world, row_vec3(gradients.wrench, t, 3, world) + moment)
 
@@ -193,10 +197,10 @@ def add_motor_adjoint(
     by_motor: MotorAdjoint, arrived: Arrival, at: ReplayedStep, motor: int, cotangent: TrajectoryArrays,
     gradients: Gradients, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
 ):  # fmt: skip
-    """Add the gradients w.r.t. the inputs of the torque of motor 0 to 11 in a step: targets, constants, angle, rate.
+    """Add the gradients of the loss w.r.t. a motor's target, constants, angle and rate, through its torque in a step.
 
-    `legs[k].torque` and cotangent.torque are the gradient w.r.t. the torque; angle and rate go to `legs`, constants to
-    `sums`, targets to `gradients`.
+    motor: 0 to 11. `legs[k].torque` and cotangent.torque are the gradient w.r.t. the torque; angle and rate go to
+    `legs`, constants to `sums`, targets to `gradients`.
     """
     k = motor / 3
     c = motor - 3 * k
@@ -218,7 +222,7 @@ def add_filter_adjoint(
     by_filter: FilterAdjoint, t: int, k: int, world: int, gradients: Gradients, legs: wp.array(dtype=LegReverse),
     sums: wp.array(dtype=real),
 ):  # fmt: skip
-    """Add the gradients w.r.t. the inputs of leg k's filter in policy step t: targets, constants, angles and rates."""
+    """Add the gradients w.r.t. targets, constants, angles and rates through leg k's command filter in policy step t."""
     store_row_vec3(gradients.target, t, 3 * k, world, by_filter.target)
     command_adjoint.add_offsets(sums, k, by_filter.angles)
     add_filter(sums, by_filter.constants)
@@ -228,7 +232,7 @@ def add_filter_adjoint(
 
 @wp.func
 def store_base_entries(gradients: Gradients, world: int, entries: RowCotangent):
-    """Write the gradient w.r.t. a row's base entries to `gradients.q` and `gradients.qd`."""
+    """Write the gradient w.r.t. the base entries of a trajectory row to `gradients.q` and `gradients.qd`."""
     for i in range(3):
         gradients.q[i, world] = entries.pos[i]
         gradients.qd[i, world] = entries.lin[i]
@@ -239,7 +243,7 @@ def store_base_entries(gradients: Gradients, world: int, entries: RowCotangent):
 
 @wp.func
 def store_motor_entries(gradients: Gradients, world: int, leg: int, angles: vec3, rates: vec3):
-    """Write the gradient w.r.t. a row's angles and rates of one leg's motors to `gradients.q` and `gradients.qd`."""
+    """Write the gradient w.r.t. a leg's motor angles and rates in a trajectory row to `gradients.q`, `gradients.qd`."""
     for i in range(3):
         gradients.q[7 + 3 * leg + i, world] = angles[i]
         gradients.qd[6 + 3 * leg + i, world] = rates[i]
@@ -260,7 +264,7 @@ def reverse_kernel(
     record: StepRecord,
     gradients: Gradients,
 ):
-    """Write the gradient of a scalar to `gradients`, given its gradient w.r.t. the trajectory; one thread per world.
+    """Compute the gradient of a loss w.r.t. all inputs of a rollout, from that w.r.t. its trajectory; thread per world.
 
     cotangent: gradient w.r.t. the trajectory. filtered_target [rad]: (T, 12, num_worlds), from the forward pass, like
     `trajectory`. record: scratch for `timing.every` steps. Worlds count from `settings.first`.
@@ -322,7 +326,10 @@ def adjoint_roots(
     factors: LegFactors, base: BaseFactors, base_cotangent: BaseCotangent, model: RobotModel, actuation: Actuation,
     trajectory: TrajectoryArrays, state: BaseState, world: int,
 ) -> real:  # fmt: skip
-    """Return a sum of calls of all functions that the reverse pass differentiates; see `generate_adjoints`."""
+    """Call every function that the reverse pass differentiates, so that Warp generates the adjoints of all of them.
+
+    Returns a sum of the results, which has no meaning; see `generate_adjoints`.
+    """
     params = load_leg(model, world, 0)
     v = row_vec3(trajectory.q, 0, 0, world)
     q = row_quat(trajectory.q, 0, 3, world)

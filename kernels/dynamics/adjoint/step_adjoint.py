@@ -1,4 +1,4 @@
-"""Reverse pass of one time step of one world.
+"""Reverse pass of one time step of one world, from the gradient w.r.t. its end state to that w.r.t. its inputs.
 
 The step solves M (v' - v) = dt f + J^T p for the velocities v' at its end, with impulses p that satisfy the contact law
 R(p, v') = 0 in fixed modes (separated, sticking, sliding). For a gradient y by v' and z by p, the multipliers l, m are
@@ -29,7 +29,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class StepAdjoint:
-    """Gradient w.r.t. the base's state at the start of a step, and w.r.t. the wrench on it."""
+    """Gradient of the loss w.r.t. the base's state at the start of a step, and w.r.t. the wrench on it."""
 
     base: BaseState  # axes as those of the state
     force: vec3  # w.r.t. the force at the com, world axes
@@ -40,9 +40,10 @@ class StepAdjoint:
 def add_leg_gradient(
     gradient: LegGradient, k: int, dt: real, legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real)
 ):
-    """Add leg k's gradient w.r.t. its motors to `legs`, w.r.t. its parameters to `sums`; write that w.r.t. torques.
+    """Add the gradient of leg k's virtual power w.r.t. its motors to `legs`, and w.r.t. its parameters to `sums`.
 
-    dt [s]: of the step. legs (4,): scratch. sums (GRADIENT_ROWS,): gradient w.r.t. parameters.
+    Also writes the gradient w.r.t. the motors' torques to `legs`. dt [s]: of the step. legs (4,): scratch. sums
+    (GRADIENT_ROWS,): gradient w.r.t. parameters.
     """
     add_leg_parameters(sums, k, gradient)
     if legs[k].law.mode != SEPARATE:
@@ -58,11 +59,12 @@ def reverse_step(
     trajectory: TrajectoryArrays, cotangent: TrajectoryArrays, record: StepRecord, adj: BaseState,
     legs: wp.array(dtype=LegReverse), sums: wp.array(dtype=real),
 ) -> StepAdjoint:  # fmt: skip
-    """Return the gradient w.r.t. the base's state at the start of a step; adj: gradient w.r.t. its state at the end.
+    """Run one time step of a world backwards: return the gradient w.r.t. the base's state at its start.
 
-    legs (4,): gradients w.r.t. `angles` and `rates` at the end are replaced by those at the start, `torque` is written,
-    the rest is scratch. sums (GRADIENT_ROWS,): gradient w.r.t. parameters, added to. first_impulse: as in `Commands`.
-    trajectory, cotangent: of the rollout, and the gradient w.r.t. it. record: written by `replay_step`.
+    adj: gradient w.r.t. the base's state at the end. legs (4,): gradients w.r.t. `angles` and `rates` at the end are
+    replaced by those at the start, `torque` is written, the rest is scratch. sums (GRADIENT_ROWS,): gradient w.r.t.
+    parameters, added to. first_impulse: as in `Commands`. trajectory, cotangent: of the rollout, and the gradient
+    w.r.t. it. record: written by `replay_step`.
     """
     dt, world = at.dt, at.world
     base = record.base[world, at.entry]

@@ -25,7 +25,7 @@ from .virtual_power import BaseCotangent, BaseFactors, LegFactors, base_action, 
 
 @wp.struct
 class SolvedStep:
-    """A step on the tape, arrays by world or by (leg, world): its solution, and multipliers of the reverse pass."""
+    """Solution of a time step on Warp's tape, and multipliers of its reverse pass; arrays by world or (leg, world)."""
 
     trajectory: TrajectoryArrays  # torques, impulses and pressed stops, shape (1, ..., num_worlds)
     old_impulse: wp.array2d(dtype=vec3)  # [N s] on each paw in the step before, world axes
@@ -53,7 +53,10 @@ def solve_kernel(
     # out
     solved: SolvedStep,
 ):
-    """Write the solution of a step of every world to `solved` and `work`, without blocks; torques: drive.joint_f."""
+    """Solve a time step of every world, without recording on the tape, and write the solution to `solved` and `work`.
+
+    Blocks are ignored; torques: drive.joint_f.
+    """
     world = wp.tid()
     base = load_base(joint_q, joint_qd, base_com(model.table, world), world)
     legs = wp.zeros(shape=(4,), dtype=LegStep)
@@ -93,7 +96,10 @@ def power_kernel(
     # out
     power: wp.array2d(dtype=real),
 ):
-    """Write the virtual power of each leg to power (4, num_worlds), leg 0 with the base; thread per (leg, world)."""
+    """Compute the virtual power of each leg in a step, so that the tape's gradient of it is the step's gradient.
+
+    power: (4, num_worlds), leg 0 with the base; one thread per (leg, world).
+    """
     k, world = wp.tid()
     com = base_com(model.table, world)
     base = load_base(joint_q, joint_qd, com, world)
@@ -137,7 +143,10 @@ def end_velocities(
     joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), solved: SolvedStep, record: StepRecord,
     power: wp.array2d(dtype=real), world: int,
 ) -> EndVelocities:  # fmt: skip
-    """Return the velocities in `solved`; the other arguments are for `adj_end_velocities`, its reverse pass."""
+    """Return the solved velocities at the end of a step, whose reverse pass is the custom `adj_end_velocities`.
+
+    The arguments other than `solved` and `world` are for that reverse pass.
+    """
     end = EndVelocities()
     end.lin = solved.lin[world]
     end.ang = solved.ang[world]
@@ -152,7 +161,10 @@ def adj_end_velocities(
     joint_f: wp.array(dtype=real), body_f: wp.array(dtype=wp.spatial_vector), solved: SolvedStep, record: StepRecord,
     power: wp.array2d(dtype=real), world: int, adj_ret: EndVelocities,
 ):  # fmt: skip
-    """Write multipliers for `power_kernel` to `solved`, add 1 to the adjoint of `power`; adj_ret: of the result."""
+    """Adjoint of `end_velocities`: solve for the multipliers of the step, for the reverse pass of `power_kernel`.
+
+    Writes them to `solved` and adds 1 to the adjoint of `power`; adj_ret: gradient w.r.t. the end velocities.
+    """
     params = wp.zeros(shape=(4,), dtype=LegParams)
     legs = wp.zeros(shape=(4,), dtype=LegReverse)
     wrench = base_wrench(joint_f, body_f, world)
@@ -199,7 +211,7 @@ def integrate_kernel(
     joint_q_out: wp.array(dtype=real),
     joint_qd_out: wp.array(dtype=real),
 ):
-    """Write the coordinates after a step dt [s] at the velocities of its end; one thread per world."""
+    """Integrate the robots' coordinates over a step dt [s] with the velocities at its end; one thread per world."""
     world = wp.tid()
     com = base_com(model.table, world)
     base = load_base(joint_q, joint_qd, com, world)

@@ -42,7 +42,10 @@ from ..leg_dynamics import LegMasses, PawKinematics, leg_pose, paw_kinematics
 
 @wp.struct
 class BaseFactors:
-    """Constants of the base in the virtual power: multipliers, accelerations, new velocities; axes at its start."""
+    """Multipliers and motion of the base in a step, held constant while its virtual power is differentiated.
+
+    Axes are those of the base at the start of the step.
+    """
 
     virtual_lin: vec3  # multipliers of the base's linear equations
     virtual_ang: vec3  # multipliers of the base's angular equations
@@ -54,7 +57,10 @@ class BaseFactors:
 
 @wp.struct
 class LegFactors:
-    """Constants of a leg in the virtual power; vectors are lateral, outer, inner, or those of its paw's contact."""
+    """Multipliers, motor motion and contact of a leg, held constant while its virtual power is differentiated.
+
+    Vectors are lateral, outer, inner, or those of its paw's contact.
+    """
 
     virtual_rates: vec3  # multipliers of the motors' equations
     acc: vec3  # [rad/s^2] over the step, contact included
@@ -79,7 +85,7 @@ class FrameMotion:
 
 @wp.func
 def add(a: FrameMotion, b: FrameMotion) -> FrameMotion:
-    """Return a + b; Warp calls it for `wp.adjoint[frame] += ...`."""
+    """Return the sum of two frame motions, a + b; Warp calls it for `wp.adjoint[frame] += ...`."""
     c = FrameMotion()
     c.virtual_lin = a.virtual_lin + b.virtual_lin
     c.virtual_ang = a.virtual_ang + b.virtual_ang
@@ -91,7 +97,7 @@ def add(a: FrameMotion, b: FrameMotion) -> FrameMotion:
 
 @wp.func
 def add(a: MassMoments, b: MassMoments) -> MassMoments:  # noqa: F811
-    """Return a + b; Warp calls it for `wp.adjoint[body] += ...`."""
+    """Return the sum of two sets of mass moments, a + b; Warp calls it for `wp.adjoint[body] += ...`."""
     c = MassMoments()
     c.mass = a.mass + b.mass
     c.first = a.first + b.first
@@ -101,7 +107,7 @@ def add(a: MassMoments, b: MassMoments) -> MassMoments:  # noqa: F811
 
 @wp.func
 def second_moment_product(a: vec3, b: vec3) -> vec6:
-    """Return sym(a, b), the gradient of a^T S b w.r.t. packed second moments S (xx yy zz xy xz yz)."""
+    """Return the gradient of a^T S b w.r.t. packed second moments S (xx yy zz xy xz yz): sym(a, b) of the module."""
     return vec6(
         a[0] * b[0], a[1] * b[1], a[2] * b[2],
         a[0] * b[1] + a[1] * b[0], a[0] * b[2] + a[2] * b[0], a[1] * b[2] + a[2] * b[1],
@@ -110,7 +116,7 @@ def second_moment_product(a: vec3, b: vec3) -> vec6:
 
 @wp.func
 def inertia_power(body: MassMoments, frame: FrameMotion) -> real:
-    """Return P, the virtual power of the inertia of a link, see the module; body: moments in the link's frame."""
+    """Return the virtual power of a link's inertia: P in the module's docstring; body: moments in the link's frame."""
     acc, ang, ang_acc = frame.acc, frame.ang, frame.ang_acc
     force = body.mass * acc + wp.cross(ang_acc, body.first) + wp.cross(ang, wp.cross(ang, body.first))
     moment = (
@@ -123,7 +129,7 @@ def inertia_power(body: MassMoments, frame: FrameMotion) -> real:
 
 @wp.func_grad(inertia_power)
 def adj_inertia_power(body: MassMoments, frame: FrameMotion, adj_ret: real):
-    """Add adj_ret times the partial derivatives of `inertia_power` to `wp.adjoint`; u, h: see the module."""
+    """Adjoint of `inertia_power`: add adj_ret times its partial derivatives to `wp.adjoint`; u, h: see the module."""
     acc, ang, ang_acc = frame.acc, frame.ang, frame.ang_acc
     lin_v, ang_v, first = frame.virtual_lin, frame.virtual_ang, body.first
     u = wp.cross(ang, first)
@@ -153,19 +159,19 @@ def adj_inertia_power(body: MassMoments, frame: FrameMotion, adj_ret: real):
 
 @wp.func
 def planar(v: vec2) -> vec3:
-    """Return the vector (v[0], 0, v[1]) of a point (x, z) in the five-bar's plane."""
+    """Return a vector (x, z) of the five-bar's plane as a 3D vector (x, 0, z) in housing axes."""
     return vec3(v[0], real(0.0), v[1])
 
 
 @wp.func
 def planar_dot(a: vec3, b: vec3) -> real:
-    """Return a_x b_x + a_z b_z."""
+    """Return the dot product of two vectors in the five-bar's plane: a_x b_x + a_z b_z."""
     return a[0] * b[0] + a[2] * b[2]
 
 
 @wp.func
 def planar_cross(a: vec3, b: vec3) -> real:
-    """Return a_z b_x - a_x b_z."""
+    """Return the y component of the cross product of two vectors in the five-bar's plane: a_z b_x - a_x b_z."""
     return a[2] * b[0] - a[0] * b[2]
 
 
@@ -173,7 +179,7 @@ def planar_cross(a: vec3, b: vec3) -> real:
 def link_motion(
     housing: FrameMotion, origin: vec3, vel: vec2, acc: vec2, virtual: vec2, about_y: vec3, cosine: real, sine: real
 ) -> FrameMotion:
-    """Return the motion of a link's frame in the housing, in the link's axes.
+    """Return motion and virtual velocity of a link's frame from those of its leg's motor housing, in the link's axes.
 
     origin [m], vel [m/s], acc [m/s^2], virtual velocity: of the link frame's origin relative to the housing, in housing
     axes; the last three in the five-bar's plane, (x, z). about_y: the link's rate [rad/s], acceleration [rad/s^2] and
@@ -203,7 +209,10 @@ def adj_link_motion(
     housing: FrameMotion, origin: vec3, vel: vec2, acc: vec2, virtual: vec2, about_y: vec3, cosine: real, sine: real,
     adj_ret: FrameMotion,
 ):  # fmt: skip
-    """Add the gradient of `link_motion` to `wp.adjoint`; adj_ret: w.r.t. its result; adj_* locals: in housing axes."""
+    """Adjoint of `link_motion`: add the gradient w.r.t. its arguments to `wp.adjoint`.
+
+    adj_ret: gradient w.r.t. its result; adj_* locals: in housing axes.
+    """
     w = housing.ang
     # in housing axes
     relative_vel = wp.cross(w, origin) + real(2.0) * planar(vel)
@@ -252,7 +261,7 @@ def adj_link_motion(
 def housing_motion(
     geo: LegGeometry, rate: real, omega: vec3, g: vec3, c: real, s: real, base: BaseFactors, leg: LegFactors
 ) -> FrameMotion:
-    """Return the motion of a leg's housing frame, in housing axes.
+    """Return motion and virtual velocity of a leg's motor housing frame, in housing axes.
 
     rate [rad/s]: of the lateral motor. omega [rad/s], g [m/s^2]: of the base, body axes. c, s: cosine and sine of the
     housing's rotation about body x.
@@ -277,7 +286,7 @@ def housing_motion(
 def passive_power(
     joints: JointParams, loop: FiveBar, front: real, rates: vec3, stop_rates: StopRates, leg: LegFactors, dt: real
 ) -> real:
-    """Return the virtual power of friction, damping, pressed stops and armature; arguments as in `joint_forces`."""
+    """Return the virtual power of a leg's friction, damping, pressed stops and armature; inputs: `joint_forces`."""
     passive = joint_forces(joints, loop, front, rates, stop_rates, leg.pressed, dt)
     implicit = passive.inertia * leg.acc + wp.cw_mul(joints.armature, leg.acc)
     return wp.dot(leg.virtual_rates, passive.torque - implicit)
@@ -288,9 +297,10 @@ def contact_action(
     geo: LegGeometry, ground: Ground, mu: real, pos: vec3, orientation: quat, paw: PawKinematics, base: BaseFactors,
     leg: LegFactors, dt: real,
 ) -> real:  # fmt: skip
-    """Return a paw's part of the virtual power: impulse . virtual velocity + multiplier . law + cotangent . impulse.
+    """Return a paw contact's part of the virtual power of a step, which the reverse pass differentiates.
 
-    mu: friction coefficient. pos [m], orientation (xyzw): of the base, world, at the start of the step dt [s].
+    It is impulse . virtual velocity + multiplier . law + cotangent . impulse. mu: friction coefficient. pos [m],
+    orientation (xyzw): of the base, world, at the start of the step dt [s].
     """
     centre = pos + wp.quat_rotate(orientation, paw.position)
     normal = wp.quat_rotate_inv(orientation, floor_normal(ground, centre))
@@ -312,7 +322,7 @@ def leg_action(
     mu: real, pos: vec3, orientation: quat, omega: vec3, g: vec3, angles: vec3, rates: vec3, base: BaseFactors,
     leg: LegFactors, dt: real,
 ) -> real:  # fmt: skip
-    """Return a leg's part of the virtual power: links, passive forces, spring and contact, without motor torques.
+    """Return a leg's part of a step's virtual power: links, passive forces, spring and contact, without motor torques.
 
     mu: friction coefficient. pos [m], orientation (xyzw): of the base, world. omega: its angular velocity [rad/s], g:
     gravity [m/s^2], both in body axes. angles [rad], rates [rad/s]: lateral, outer, inner, at the start of the step.
@@ -375,7 +385,7 @@ def leg_action(
 
 @wp.struct
 class BaseCotangent:
-    """Gradients w.r.t. further quantities that depend on the base's orientation and velocity, for `base_action`."""
+    """Gradients w.r.t. gravity and velocities that the base's orientation rotates to other axes, for `base_action`."""
 
     velocity: vec3  # w.r.t. its linear velocity at the start of the step, body axes
     new_velocity: vec3  # w.r.t. its linear velocity at the end of the step, world axes
@@ -387,7 +397,7 @@ def base_action(
     body: MassMoments, com: vec3, gravity: vec3, force: vec3, moment: vec3, orientation: quat, lin: vec3, omega: vec3,
     base: BaseFactors, cotangent: BaseCotangent, dt: real,
 ) -> real:  # fmt: skip
-    """Return the base's part of the virtual power, plus `cotangent` . (gravity in body axes and the base's velocities).
+    """Return the base's part of a step's virtual power, plus `cotangent` . (gravity and velocities in rotated axes).
 
     gravity [m/s^2], external force [N] and moment [N m] at the com, lin [m/s]: world axes; com [m], omega [rad/s]: body
     axes; orientation: xyzw.
@@ -412,5 +422,8 @@ def base_action(
 
 @wp.func
 def rotation_adjoint_scalar(orientation: quat, ang: vec3, dt: real, cotangent: quat) -> real:
-    """Return cotangent . (orientation (xyzw) after dt [s] at ang [rad/s], body axes); differentiated by `wp.grad`."""
+    """Return a scalar for `wp.grad`, the adjoint of integrating the base's orientation (xyzw) over dt [s].
+
+    It is cotangent . (orientation after dt at ang [rad/s], body axes).
+    """
     return wp.dot(cotangent, wp.normalize(orientation * exp_rotation(dt * ang)))

@@ -53,7 +53,7 @@ wp.set_module_options({"enable_backward": False, "fast_math": True})
 
 @wp.struct
 class LegState:
-    """State of a thread between steps: its leg, and a copy of the base; vectors are lateral, outer, inner."""
+    """State of a thread between physics steps: its leg, and a copy of the base; vectors are lateral, outer, inner."""
 
     base: BaseState
     angles: vec3  # [rad] of its leg's motors
@@ -83,9 +83,10 @@ class PawSolution:
 
 @wp.func
 def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_rounds: int, tolerance: real) -> PawSolution:
-    """Return the solution of a world's contact problem, iterated for all paws at once, see the module; body axes.
+    """Solve a world's contact problem iteratively; in each round, four threads compute their paws' impulses at once.
 
-    c: contact of this thread's leg 0 to 3. blocks: whether any world has a block. tolerance [m/s]: see the module.
+    See the module; body axes. c: contact of this thread's leg 0 to 3. blocks: whether any world has a block. tolerance
+    [m/s]: see the module.
     """
     s = PawSolution()
     s.impulse = c.impulse
@@ -127,7 +128,7 @@ def solve_paws(c: PawContact, blocks: bool, block: BlockLaw, leg: int, max_round
 
 @wp.struct
 class StopAttempt:
-    """Set of pressed stops that a leg tries in a step, and the rates at which its stops press."""
+    """Active set of hard joint stops with which a leg attempts a step, and the rates at which they press."""
 
     stop_rates: StopRates  # zero where no stop is near
     pressed: int
@@ -135,7 +136,7 @@ class StopAttempt:
 
 @wp.func
 def stop_attempt(model: RobotModel, world: int, leg: int, old: LegState, dt: real) -> StopAttempt:
-    """Return the leg's stops for the current attempt at a step of dt [s] from the state `old`."""
+    """Return the active set of hard joint stops with which a leg attempts a step of dt [s] from the state `old`."""
     attempt = StopAttempt()
     attempt.pressed = old.pressed
     if attempt.pressed != 0 or old.sets == 0:
@@ -151,9 +152,10 @@ def stop_attempt(model: RobotModel, world: int, leg: int, old: LegState, dt: rea
 def required_stops(
     model: RobotModel, settings: StepSettings, world: int, leg: int, angles: vec3, rates: vec3, pressed: int, sets: int
 ) -> int:
-    """Return the set of stops to try next if the attempt with set `pressed` ends at `rates` [rad/s].
+    """Return the active set of hard joint stops that a leg requires, given the motor rates at which an attempt ended.
 
-    angles [rad]: at the start of the step. sets: number of sets tried. The limits are reloaded to save registers.
+    The attempt had the set `pressed` and ended at `rates` [rad/s]. angles [rad]: at the start of the step. sets: number
+    of sets tried. The limits are reloaded to save registers.
     """
     limits = load_stops(model.table, leg, world)
     required = int(0)
@@ -168,7 +170,7 @@ def completed_step(
     old: LegState, base: BaseState, angles: vec3, rates: vec3, torque: vec3, solved: PawSolution, total: vec3,
     pressed: int,
 ) -> LegState:  # fmt: skip
-    """Return the state after a completed step, from the state `old` before it and the results of the step.
+    """Return a thread's state after a completed physics step, from its state `old` before it and the step's results.
 
     base, angles [rad], rates [rad/s]: at the end. total [N s]: sum of the paws' impulses. pressed: the leg's set.
     """
@@ -191,9 +193,10 @@ def completed_step(
 
 @wp.func
 def next_attempt(old: LegState, pressed: int, required: int, changes: bool) -> LegState:
-    """Return the state `old` with the next set to try for the same step: the set `required`, or one change toward it.
+    """Return a thread's state for another attempt at the same physics step, with a revised active set of joint stops.
 
-    pressed: the set just tried. changes: whether this leg is the one to change where only one may (`one_by_one`).
+    From the state `old`; the set is `required`, or one change toward it. pressed: the set just tried. changes: whether
+    this leg is the one to change where only one may (`one_by_one`).
     """
     new = old
     new.sets = old.sets + 1
@@ -210,7 +213,7 @@ def advance_leg(
     model: RobotModel, settings: StepSettings, drive: Drive, params: LegParams, motors: LegDrive, world: int, leg: int,
     old: LegState, writes: bool,
 ) -> LegState:  # fmt: skip
-    """Return the thread's state after a step, or `old` with another set of stops to try for the same step.
+    """Attempt a physics step of a world, a thread per leg; return the new state, or `old` with other joint stops.
 
     A world that has completed all its steps keeps its state. params, motors: of this thread's leg. writes: whether this
     thread moves its world's block.
@@ -276,9 +279,10 @@ def advance_legs_kernel(
     joint_q_out: wp.array(dtype=real),
     joint_qd_out: wp.array(dtype=real),
 ):
-    """Advance every world by `settings.substeps` steps; launch over (count rounded up to a multiple of 8, 4).
+    """Advance every world by `settings.substeps` physics steps on a GPU, with a thread per leg.
 
-    count: number of worlds, from `settings.first` on. Equals `advance_kernel` up to the contact tolerance.
+    Launch over (count rounded up to a multiple of 8, 4). count: number of worlds, from `settings.first` on. Equals
+    `advance_kernel` up to the contact tolerance.
     """
     index, leg = wp.tid()
     world = settings.first + wp.min(index, count - 1)  # threads beyond the last world repeat it, and write nothing

@@ -1,4 +1,4 @@
-"""Rollouts on GPUs: four threads per world, one per leg."""
+"""Kernel that runs rollouts of policy and physics steps on GPUs, with four threads per world, one per leg."""
 
 import warp as wp
 
@@ -40,7 +40,7 @@ def rollout_legs_kernel(
     filtered_target: wp.array3d(dtype=real),
     trajectory: TrajectoryArrays,
 ):
-    """Run a rollout like `rollout_kernel`, on four threads per world.
+    """Run a rollout of policy and physics steps in every world, like `rollout_kernel`, with a thread per leg.
 
     Launch over (count rounded up to a multiple of 8, 4); count: number of worlds, from `settings.first` on.
     """

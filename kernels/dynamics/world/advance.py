@@ -23,11 +23,12 @@ def advance_once(
     model: RobotModel, settings: StepSettings, drive: Drive, work: Workspace, world: int, step: int, base: BaseState,
     legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact),
 ) -> BaseState:  # fmt: skip
-    """Advance one world by `settings.dt`; overwrites `legs` and `contacts`, returns the new base state.
+    """Advance one world by one physics step, motors, contacts and block included; return the new base state.
 
-    step: of the launch, from 0; the last one writes torques and paw forces to `work`. legs, contacts (4,): the thread's
-    scratch, see `solve_step`; `angles` and `rates` of the legs are input, and are replaced by those at the end of the
-    step. Also moves the world's block in `model.ground` and updates impulses and peak values in `work`.
+    The step takes `settings.dt`; `legs` and `contacts` are overwritten. step: of the launch, from 0; the last one
+    writes torques and paw forces to `work`. legs, contacts (4,): the thread's scratch, see `solve_step`; `angles` and
+    `rates` of the legs are input, and are replaced by those at the end of the step. Also moves the world's block in
+    `model.ground` and updates impulses and peak values in `work`.
     """
     dt = settings.dt
     last = step == settings.substeps - 1
@@ -90,7 +91,7 @@ def advance_kernel(
     joint_q_out: wp.array(dtype=real),
     joint_qd_out: wp.array(dtype=real),
 ):
-    """Advance every world by `settings.substeps` steps; one thread per world, from `settings.first` on.
+    """Advance every world by `settings.substeps` physics steps; one thread per world, from `settings.first` on.
 
     Writes the base and motor coordinates; `full_state_kernel` completes the passive ones.
     """

@@ -46,9 +46,10 @@ def rollout_kernel(
     filtered_target: wp.array3d(dtype=real),
     trajectory: TrajectoryArrays,
 ):
-    """Run a rollout from the state in row 0 of `trajectory`; one thread per world, from `settings.first` on.
+    """Run a rollout of policy and physics steps in every world, with one thread per world.
 
-    settings.substeps must be 1; drive.joint_f is overwritten. filtered_target [rad]: (T, 12, num_worlds).
+    It starts from the state in row 0 of `trajectory`. Worlds count from `settings.first`. settings.substeps must be 1;
+    drive.joint_f is overwritten. filtered_target [rad]: (T, 12, num_worlds).
     """
     world = settings.first + wp.tid()
     com = base_com(model.table, world)

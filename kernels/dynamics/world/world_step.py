@@ -1,4 +1,4 @@
-"""Solution of one step of a world for its end velocities: legs eliminated, contacts and hard stops solved together."""
+"""Solution of one physics step of a world for its end velocities: base, legs, contacts and hard stops together."""
 
 import warp as wp
 
@@ -17,7 +17,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.struct
 class LegStep:
-    """Data of one leg in a step: input (angles, rates, torque), scratch, results; motors are lateral, outer, inner."""
+    """Inputs, intermediate and final results of one leg in the solution of a step; motors are lateral, outer, inner."""
 
     angles: vec3  # [rad] at the start of the step
     rates: vec3  # [rad/s] at the start of the step
@@ -32,7 +32,7 @@ class LegStep:
 
 @wp.struct
 class StepSolution:
-    """Velocities of the base at the end of a step, in the body axes of the start of the step, and statistics."""
+    """Solution of a step: end velocities of the base, in the body axes of the start of the step, and statistics."""
 
     lin: vec3  # [m/s]
     ang: vec3  # [rad/s]
@@ -45,7 +45,10 @@ def solve_with_stops(
     model: RobotModel, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
     impulse: wp.array2d(dtype=vec3), legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact),
 ) -> StepSolution:  # fmt: skip
-    """Solve a step with fixed sets of pressed stops, `legs[k].pressed`; arguments and results as in `solve_step`."""
+    """Solve a physics step of a world for its end velocities, with a fixed active set of hard stops for each leg.
+
+    The sets are `legs[k].pressed`; arguments and results as in `solve_step`.
+    """
     dt = settings.dt
     g = wp.quat_rotate_inv(base.quat, load_vec3(model.table, GRAVITY, world))
     system = base_system(model, world, base, g, force, moment)
@@ -85,7 +88,7 @@ def solve_with_stops(
 
 @wp.func
 def revise_stops(legs: wp.array(dtype=LegStep), slack: real, sets: int) -> bool:
-    """Replace each leg's set of pressed stops by the one its new rates require; returns whether any set changed.
+    """Replace each leg's active set of hard stops by the one its new rates require; return whether any set changed.
 
     slack [rad/s]: see `pressed_stops`; sets: number of sets tried in this step.
     """
@@ -106,11 +109,12 @@ def solve_step(
     model: RobotModel, settings: StepSettings, world: int, base: BaseState, force: vec3, moment: vec3, block: BlockLaw,
     impulse: wp.array2d(dtype=vec3), legs: wp.array(dtype=LegStep), contacts: wp.array(dtype=PawContact),
 ) -> StepSolution:  # fmt: skip
-    """Solve a step of one world, and write every leg's pressed stops, contact and motor rates at the end of the step.
+    """Solve a physics step of a world for its end velocities, with contacts and the active set of hard joint stops.
 
-    force [N], moment [N m]: external, at the base's com, world axes. impulse: first guess [N s], world axes,
-    (4, num_worlds). legs, contacts: local to the thread, (4,); `angles`, `rates` and `torque` of the legs are read, and
-    all else but `peak_sq` is written. The first set tried holds the stops that the rates at the start would press.
+    Writes every leg's pressed stops, contact and motor rates at the end of the step. force [N], moment [N m]: external,
+    at the base's com, world axes. impulse: first guess [N s], world axes, (4, num_worlds). legs, contacts: local to the
+    thread, (4,); `angles`, `rates` and `torque` of the legs are read, and all else but `peak_sq` is written. The first
+    set tried holds the stops that the rates at the start would press.
     """
     dt = settings.dt
     for k in range(legs.shape[0]):
