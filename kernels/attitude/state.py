@@ -56,7 +56,10 @@ def with_goal(state: AttitudeState, quat: wp.quat, goal: wp.quat) -> AttitudeSta
 
 @wp.func
 def advance_attitude(robot: RobotView, state: AttitudeState, tolerance: float) -> AttitudeState:
-    """Return the state after one more policy step; tolerance [rad]: largest error that counts as at the goal."""
+    """Return the state of the attitude task (errors, counters) updated by one policy step.
+
+    tolerance [rad]: largest error that counts as at the goal.
+    """
     t = state
     t.steps = state.steps + 1
     t.old_error = state.error
@@ -70,7 +73,10 @@ def advance_attitude(robot: RobotView, state: AttitudeState, tolerance: float) -
 
 @wp.func
 def carried_over(old: AttitudeState) -> AttitudeState:
-    """Return a state with the statistics of `old` alone, updated if its episode was complete; reset sets the rest."""
+    """Return a new episode's state that has only the statistics of `old`, the state of the previous episode.
+
+    They include that episode if it was complete. The reset sets the other fields.
+    """
     new = AttitudeState()
     new.episodes = old.episodes
     new.sum_error = old.sum_error

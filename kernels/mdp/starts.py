@@ -30,7 +30,10 @@ class LegSample:
 
 @wp.func
 def leg_ik(geo: LegGeometry, limits: LegLimits, ankle: wp.vec3) -> LegSample:
-    """Return a leg at rest from inverse kinematics; ankle [m]: its position from the base origin, body axes."""
+    """Return the motor angles, at rest, that put a leg's ankle at a position, by inverse kinematics.
+
+    ankle [m]: position from the base origin, body axes.
+    """
     sample = LegSample()
     angles = clamped_closed_form(geo, limits, ankle - geo.hip)
     sample.angles = angles

@@ -68,7 +68,10 @@ def update_step_counts(robot: RobotView, state: VelocityState) -> VelocityState:
 
 @wp.func
 def advance_velocity(robot: RobotView, state: VelocityState, settle: float) -> VelocityState:
-    """Return the state after one more policy step; errors count more than `settle` policy steps after a command."""
+    """Return the state of velocity tracking (errors, steps, gait phase) updated by one policy step.
+
+    Errors count more than `settle` policy steps after a command.
+    """
     t = update_step_counts(robot, state)
     t.steps = state.steps + 1
     t.command_steps = state.command_steps + 1
@@ -101,7 +104,7 @@ def mean_error(state: VelocityState) -> float:
 
 @wp.func
 def tracking_error(robot: RobotView, state: VelocityState) -> float:
-    """Return `mean_error` of the episode [m/s]; `robot` is unused (signature of curriculum errors)."""
+    """Return the episode's mean velocity error [m/s]; `robot` is unused (signature of curriculum errors)."""
     return mean_error(state)
 
 
