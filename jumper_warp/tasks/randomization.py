@@ -30,7 +30,10 @@ def _base_mass() -> float:
 
 
 def _least(name: str) -> tuple[float, bool]:
-    """Return the lower bound of a field's range, in its unit, and whether the bound itself is excluded."""
+    """Return the smallest value that a range may contain, in its unit, and whether that value itself is excluded.
+
+    name: the range's field in `RandomizationCfg`.
+    """
     if name == "base_mass":
         return -_base_mass(), True
     if name in ("link_mass", "gains", "damping_gains", "no_load_speed", "cutoff_speed", "armature", "push_interval"):
