@@ -45,7 +45,7 @@ def _least(name: str) -> tuple[float, bool]:
 
 @dataclass(frozen=True)
 class RandomizationCfg:
-    """Ranges (lower, upper) of uniformly sampled parameters; None: the nominal value. The defaults are for jumping.
+    """Ranges (lower, upper) of uniformly sampled robot parameters; None: nominal. The defaults are for jumping.
 
     Masses and scales must be positive; friction and latency may be 0.
     """
@@ -162,7 +162,7 @@ class RandomizationCfg:
         return replace(self, **ranges)
 
     def events(self) -> tuple[EventTerm, ...]:
-        """Return the events that sample the ranges that are not None; their numbers are in SI units."""
+        """Return the events that sample robot parameters from the ranges that are not None; numbers are in SI units."""
         terms = []
 
         def add(func: Any, pair: Range, scale: float = 1.0, parallel: bool = False, **numbers: float) -> None:

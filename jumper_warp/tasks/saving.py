@@ -251,7 +251,10 @@ def _term(kind: type[Term], saved: dict[str, Any], where: str, find: Finder) -> 
 
 
 def _scalar(saved: Any, hint: Any, where: str) -> Any:
-    """Return a number, string or bool that fits the hint: float, int, str, bool, a Literal or Any. Raises TaskError."""
+    """Return a saved number, string or bool that fits a type hint. Raises TaskError.
+
+    The hint is float, int, str, bool, a Literal or Any.
+    """
     kinds = {float: (float, int), int: (int,), str: (str,), bool: (bool,)}.get(hint)
     if get_args(hint) and not kinds:  # a Literal
         if saved not in get_args(hint):

@@ -161,7 +161,10 @@ def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3,
 
 @wp.func
 def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, rng: RngStream) -> Ground:
-    """Sample the block of a world, or reset it if `grounds` has no probabilities, and return the world's ground."""
+    """Sample the block of a world, or move it to its start position, and return the world's ground.
+
+    The block is moved if both probabilities of `grounds` are 0.
+    """
     if grounds.platform + grounds.block > 0.0:
         block = Block()
         if start.start_mode == STANDING or start.start_mode == DEFAULT:

@@ -36,7 +36,7 @@ def first_leg(rng: RngStream) -> int:
 
 @wp.func
 def leg_step(rng: RngStream) -> int:
-    """Return the stride of this thread's loop over legs: 1 (all legs) with one lane, 4 (one leg) with 32 lanes."""
+    """Return the stride of this thread's loop over legs: 1 (all legs) with one thread a world, 4 (one leg) with 32."""
     return wp.min(rng.lanes, 4)
 
 

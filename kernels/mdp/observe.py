@@ -179,7 +179,7 @@ def step_context(episode: EpisodeArrays, arrays: ObservationArrays, world: int) 
 
 @wp.func
 def delay_value(arrays: ObservationArrays, m: StepContext, column: int, value: float) -> float:
-    """Delay a component by the world's observation latency: store its new value, and return an earlier one.
+    """Delay an observation component by the world's latency: store its new value, and return an earlier one.
 
     column: index in the ring buffer. The delayed value is linear between policy steps. Where an episode or skill
     begins, the ring is filled with value.
@@ -198,7 +198,7 @@ def delay_value(arrays: ObservationArrays, m: StepContext, column: int, value: f
 def postprocess(
     arrays: ObservationArrays, column: ObservationColumn, p: wp.array(dtype=float), m: StepContext, after_reset: int
 ):
-    """Write a component's observation (delayed, with noise, clipped, then scaled) as newest frame of its history.
+    """Write an observation component (delayed, with noise, clipped, then scaled) as newest frame of its history.
 
     p: numbers of the task's terms. after_reset: as in `postprocess_obs_kernel`.
     """
