@@ -9,7 +9,10 @@ POLICY_RATE = wp.constant(60.0)  # policy steps in a second
 
 @wp.struct
 class AttitudeState:
-    """State of the attitude task in one world; from `episodes` on fields accumulate until the host reads them."""
+    """State of the attitude task in one world: goal orientation, error, collisions and statistics.
+
+    Fields from `episodes` on accumulate until the host reads them.
+    """
 
     goal: wp.quat  # xyzw, body to world: commanded orientation
     steps: int  # policy steps since the episode began
@@ -45,7 +48,7 @@ def angle_between(quat: wp.quat, goal: wp.quat) -> float:
 
 @wp.func
 def with_goal(state: AttitudeState, quat: wp.quat, goal: wp.quat) -> AttitudeState:
-    """Return the state with a new goal; quat, goal: present and commanded orientation (xyzw, body to world)."""
+    """Return the state with a new goal orientation; quat, goal: present and new orientation (xyzw, body to world)."""
     new = state
     new.goal = goal
     new.error = angle_between(quat, goal)

@@ -84,7 +84,7 @@ class JumpStart:
 
 @wp.struct
 class JumpBase:
-    """Sampled pose and velocity of the base in one attempt; paws are placed around `spot`."""
+    """Sampled pose and velocity of the base in one attempt at a start state; paws are placed around `spot`."""
 
     pos: wp.vec3  # [m] base origin, world
     quat: wp.quat  # xyzw, body to world

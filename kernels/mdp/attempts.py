@@ -63,7 +63,7 @@ def sync_attempts(rng: RngStream):
 
 @wp.func
 def store_leg(leg: int, sample: LegSample, joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float)):
-    """Write motor angles [rad] and rates [rad/s] of a leg to coordinates of one world, (COORDS,) and (DOFS,)."""
+    """Write a leg's motor angles [rad] and rates [rad/s] to joint coordinates of one world, (COORDS,) and (DOFS,)."""
     store_motors(joint_q, leg_coord(0, leg), sample.angles)
     store_motors(joint_qd, leg_dof(0, leg), sample.rates)
 

@@ -70,7 +70,7 @@ def sample_foot_offset(
 
 @wp.func
 def quat_from_ypr(yaw: float, pitch: float, roll: float) -> wp.quat:
-    """Return the orientation (xyzw, body to world) Rz(yaw) Ry(pitch) Rx(roll); angles [rad]."""
+    """Return the orientation (xyzw, body to world) of yaw, pitch and roll [rad]: Rz(yaw) Ry(pitch) Rx(roll)."""
     return (
         wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
         * wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), pitch)

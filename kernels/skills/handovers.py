@@ -118,7 +118,7 @@ def begin_turn(robot: RobotView, state: JumpState) -> AttitudeState:
 
 @wp.func
 def begin_landing(robot: RobotView, state: AttitudeState) -> JumpState:
-    """Return the state of the jump whose flight the turn was part of: in flight, past its apex."""
+    """Return the initial state of a jump after turning in its flight: in flight, past its apex."""
     new = JumpState()
     new.phase = FLIGHT
     new.start = state.jump_start

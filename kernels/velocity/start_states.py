@@ -65,7 +65,7 @@ class VelocityStart:
 
 @wp.struct
 class VelocityBase:
-    """Sampled pose and velocity of the base in one attempt."""
+    """Sampled pose and velocity of the base in one attempt at a start state."""
 
     pos: wp.vec3  # [m] base origin, world
     quat: wp.quat  # xyzw, body to world

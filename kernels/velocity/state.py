@@ -11,7 +11,10 @@ vec4l = wp.types.vector(length=4, dtype=wp.int64)
 
 @wp.struct
 class VelocityState:
-    """State of velocity tracking in a world; from `sum_xy` on fields accumulate until the host reads them."""
+    """State of velocity tracking in a world: command, gait, tracking errors, curriculum levels and statistics.
+
+    Fields from `sum_xy` on accumulate until the host reads them.
+    """
 
     command: wp.vec3  # [m/s], [m/s], [rad/s] commanded velocity ahead, to the left and about z, body axes
     standing: int  # 1: commanded to stand
@@ -98,7 +101,7 @@ def advance_velocity(robot: RobotView, state: VelocityState, settle: float) -> V
 
 @wp.func
 def mean_error(state: VelocityState) -> float:
-    """Return the episode's mean error [m/s]: horizontal velocity error + 0.3 m times yaw rate error [rad/s]."""
+    """Return the episode's mean velocity error [m/s]: horizontal error + 0.3 m times yaw rate error [rad/s]."""
     return (state.error_xy + 0.3 * state.error_yaw) / wp.max(state.settled, 1.0)
 
 
