@@ -162,7 +162,7 @@ def as_float32(values: Any, name: str) -> np.ndarray:
 
 
 def checked_values(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
-    """Return values (a scalar or of `shape`) as float32 of `shape`. Raises InputError: other shape, or not finite."""
+    """Return a scalar or array as float32 array of `shape`. Raises InputError: other shape, or not finite."""
     array = as_float32(values, name)
     if array.ndim and array.shape != shape:
         raise InputError(f"{name} must have shape {shape}, got {array.shape}")

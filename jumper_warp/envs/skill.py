@@ -32,7 +32,7 @@ class TaskRuntime:
     """
 
     def __init__(self, task: TaskCfg, index: int, num_envs: int, step_dt: float, substeps: int, device: Any) -> None:
-        """Allocate the arrays; index: the task's in the environment; step_dt [s]: policy step of `substeps`."""
+        """Allocate the task's arrays; index: its index in the environment; step_dt [s]: policy step of `substeps`."""
         self.task, self.index, self.num_envs, self.device = task, index, num_envs, device
         self.kernels = kernels_of(task)
         self.params = ParamArrays(task.params, device)

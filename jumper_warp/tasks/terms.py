@@ -182,7 +182,7 @@ class ObservationTerm(Term):
 
     @property
     def width(self) -> int:
-        """Number of columns of one frame."""
+        """Number of columns of one frame of the observation term."""
         returned = get_type_hints(self.func.func)["return"]
         return 1 if returned in (float, wp.float32) else returned._length_
 
