@@ -15,28 +15,19 @@ def approach(robot: RobotView, state: AttitudeState) -> float:
 
 @wp.func
 def attitude(robot: RobotView, state: AttitudeState, std: float) -> float:
-    """Reward for an orientation close to the goal, 1 at the goal.
-
-    It is `phi` of the angle to it, of width std [rad].
-    """
+    """Reward for an orientation close to the goal, 1 at the goal. It is phi of the angle to it; std [rad]: width."""
     return phi(state.error, std)
 
 
 @wp.func
 def hold(robot: RobotView, state: AttitudeState, std: float, std_ang_vel: float) -> float:
-    """Reward for resting at the goal orientation, at most 1.
-
-    It is phi(angle to the goal; std [rad]) times phi(angular speed; std_ang_vel [rad/s]).
-    """
+    """Reward for rest at the goal orientation: phi(angle; std [rad]) phi(angular speed; std_ang_vel [rad/s])."""
     return phi(state.error, std) * phi(wp.length(robot.ang_vel), std_ang_vel)
 
 
 @wp.func
 def landing_posture(robot: RobotView, state: AttitudeState, std: float, std_posture: float) -> float:
-    """Reward for holding the legs in the default pose at the goal orientation, ready for landing.
-
-    It is phi(angle to the goal; std [rad]) times phi(rms motor offset from default; std_posture [rad]).
-    """
+    """Reward for the default pose at the goal orientation: phi(angle; std [rad]) phi(rms offset; std_posture [rad])."""
     return phi(state.error, std) * phi(posture_offset(robot, 0.0), std_posture)
 
 

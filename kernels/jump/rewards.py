@@ -77,10 +77,7 @@ def estimated_jump_height(
 
 @wp.func
 def horizontal_velocity(robot: RobotView, state: JumpState, speed_scale: float, waiting_scale: float) -> float:
-    """Reward for little horizontal speed of the base, doubled in flight and after touchdown.
-
-    It is exp(-|v_xy| / speed_scale), speed_scale [m/s].
-    """
+    """Reward for little horizontal base speed, doubled after takeoff. It is exp(-|v_xy| / speed_scale [m/s])."""
     speed = wp.length(wp.vec2(robot.lin_vel[0], robot.lin_vel[1]))
     return (
         wp.exp(-speed / speed_scale) * wp.where(state.phase == STANCE, 1.0, 2.0) * waiting_weight(state, waiting_scale)
@@ -105,10 +102,7 @@ def angular_velocity(robot: RobotView, state: JumpState, std: float, waiting_sca
 def joint_symmetry(
     robot: RobotView, state: JumpState, std_variance: float, std_lateral: float, waiting_scale: float
 ) -> float:
-    """Reward for equal angles of all transversal motors and lateral angles near 0.
-
-    It is phi(variance of transversal angles [rad^2]) times phi(norm of lateral angles [rad]).
-    """
+    """Reward for equal transversal angles, and small lateral ones. phi(variance [rad^2]) phi(norm of lateral [rad])."""
     total = float(0.0)
     total_sq = float(0.0)
     lateral_sq = float(0.0)
@@ -125,7 +119,7 @@ def joint_symmetry(
 
 @wp.func
 def ground_posture(robot: RobotView, state: JumpState, std: float, shift: float, waiting_scale: float) -> float:
-    """Reward for motor angles near a desired pose, except in flight: default pose, transversal angles plus `shift`.
+    """Reward for motor angles near a pose, except in flight: default pose, transversal angles plus `shift` [rad].
 
     It is phi_std of the rms motor offset [rad].
     """
@@ -144,7 +138,7 @@ def air_posture(robot: RobotView, state: JumpState, std: float) -> float:
 
 @wp.func
 def post_landing_posture(robot: RobotView, state: JumpState, std: float, shift: float) -> float:
-    """Reward for retracting the legs after landing, to the default pose plus `shift`, for 0.3 s.
+    """Reward for retracting the legs after landing, to the default pose plus `shift` [rad], for 0.3 s.
 
     It is phi_std of the rms motor offset [rad] from that pose.
     """
@@ -155,10 +149,7 @@ def post_landing_posture(robot: RobotView, state: JumpState, std: float, shift: 
 
 @wp.func
 def tracking(robot: RobotView, state: JumpState, std_wide: float, std_fine: float, fine_weight: float) -> float:
-    """Reward for a base close to the goal position after takeoff.
-
-    It is phi_wide + fine_weight phi_fine of their horizontal distance [m].
-    """
+    """Reward for a base close to the goal after takeoff. It is phi_wide + fine_weight phi_fine of the distance [m]."""
     if state.phase == STANCE:
         return 0.0
     error = wp.length(goal_offset(robot, state))
@@ -182,10 +173,7 @@ def estimated_tracking(
 
 @wp.func
 def flight_orientation(robot: RobotView, state: JumpState, std: float) -> float:
-    """Reward for a level base in the jump's heading, in flight toward the goal.
-
-    It is phi_std of the rotation angle [rad] from that orientation.
-    """
+    """Reward for a level base in the jump's heading, in flight toward the goal: phi_std of the angle [rad] from it."""
     if state.phase != FLIGHT or wp.dot(robot.lin_vel, goal_offset(robot, state)) <= 0.0:
         return 0.0
     return phi(angle_from_level(robot.quat, state.heading), std)
@@ -212,7 +200,7 @@ def left_right_symmetry(robot: RobotView, state: JumpState, std: float, waiting_
 
 @wp.func
 def standing_posture(robot: RobotView, state: JumpState, std: float, shift: float) -> float:
-    """Reward for a standing pose while the robot should rest: default pose, transversal angles plus `shift`.
+    """Reward for a standing pose while the robot should rest: default pose, transversal angles plus `shift` [rad].
 
     It is phi_std of the rms motor offset [rad].
     """
@@ -349,10 +337,7 @@ def torque_ripple(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def force_ripple(robot: RobotView, state: JumpState, weight_force: float) -> float:
-    """Penalty of varying paw forces while the robot should rest.
-
-    It is the sum over paws of ((peak - last force) / weight_force [N])^2.
-    """
+    """Penalty of varying paw forces while the robot should rest: sum of ((peak - last force) / weight_force [N])^2."""
     if not should_rest(state):
         return 0.0
     excess = robot.peak_force - robot.paw_force

@@ -39,10 +39,7 @@ def posture_offset(robot: RobotView, shift: float) -> float:
 
 @wp.func
 def ground_force(robot: RobotView, state: Any, weight_force: float) -> float:
-    """Penalty of large ground forces on the paws.
-
-    It is the sum over paws of squared force over squared weight [1]; weight_force: robot's weight [N].
-    """
+    """Penalty of large ground forces: sum over paws of squared force over squared weight; weight_force: weight [N]."""
     return wp.dot(robot.paw_force, robot.paw_force) / (weight_force * weight_force)
 
 

@@ -54,10 +54,7 @@ def flat_orientation_l2(robot: RobotView, state: VelocityState) -> float:
 
 @wp.func
 def standing_posture(robot: RobotView, state: VelocityState, std: float) -> float:
-    """Reward for transversal motors near the default pose when commanded to stand.
-
-    It is phi_std of their rms offset [rad].
-    """
+    """Reward for transversal motors near the default pose when commanded to stand: phi_std of rms offset [rad]."""
     if state.standing == 0:
         return 0.0
     total = float(0.0)
@@ -99,10 +96,7 @@ def transversal_position(robot: RobotView, state: VelocityState, steepness: floa
 
 @wp.func
 def air_time(robot: RobotView, state: VelocityState, threshold: float) -> float:
-    """Reward for long swings of the paws when commanded to move.
-
-    It is the sum over paws that touch down of swing duration less `threshold` [s].
-    """
+    """Reward for long swings when commanded to move: swing duration less `threshold` [s], of paws that touch down."""
     total = float(0.0)
     for k in range(4):
         total += robot.first_contact[k] * (robot.air_time[k] - threshold)
@@ -188,7 +182,7 @@ def trot_schedule(robot: RobotView, state: VelocityState, duty: float) -> float:
 def shank_lean(
     robot: RobotView, state: VelocityState, threshold: float, hip: float, thigh: float, shank: float
 ) -> float:
-    """Penalty of shanks that lean far over a paw on the ground.
+    """Penalty of shanks that lean more than `threshold` [rad] over a paw on the ground.
 
     It is the sum over both shanks of legs in contact of max(0, angle from vertical - threshold)^2 [rad^2]. A shank that
     leans far over its paw can hit the edge of an adjacent step. Angles are in the leg's plane and include the pitch of
