@@ -49,7 +49,10 @@ class TaskEntry:
 
     @property
     def description(self) -> str:
-        """`about`, or the first sentence of the factory's docstring; the factory is not imported for it."""
+        """Short description of the task: `about`, or the first sentence of the factory's docstring.
+
+        The factory is not imported for it.
+        """
         doc = "" if isinstance(self.make, str) else getattr(self.make, "__doc__", None) or ""
         return self.about or first_sentence(doc)
 
@@ -196,7 +199,7 @@ def _register(name: str, entry: TaskEntry, replace: bool = False) -> None:
 
 
 def _tasks_by_name() -> dict[str, str]:
-    """Return the name of each task in `TASKS` by its name and aliases in dashed spelling."""
+    """Return a map from the names and aliases of the tasks in `TASKS`, in dashed spelling, to their names."""
     return {dashed(name): task for task, entry in TASKS.items() for name in (task, *entry.aliases)}
 
 
@@ -226,7 +229,10 @@ def find_task(name: str) -> tuple[str, TaskEntry]:
 
 
 def _unknown_task(name: str) -> str:
-    """Return the message for a name that is no task: whether it is a policy, similar names, and --task-module."""
+    """Return the error message for a name that is no task.
+
+    It says whether the name is a policy, and mentions similar names and --task-module.
+    """
     for policy, task in policy_tasks().items():
         if dashed(name) == dashed(policy):
             return f"{name!r} is a policy, not a task; its task is {task}"

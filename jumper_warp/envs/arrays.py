@@ -29,7 +29,10 @@ def allocate(struct: Any, names: Iterable[str], shape: int | tuple[int, ...], dt
 
 
 def robot_arrays(sim: Simulation, step_dt: float) -> Any:
-    """Return the kernels' `RobotArrays`: views of a simulation's arrays, and new ones; step_dt [s]: policy step."""
+    """Return the arrays of all robots' states that the kernels use: views of a simulation's arrays, and new ones.
+
+    step_dt [s]: policy step.
+    """
     n, device, robot = sim.num_worlds, sim.device, RobotArrays()
     robot.joint_q, robot.joint_qd, robot.body_f = sim.state.joint_q, sim.state.joint_qd, sim.state.body_f
     robot.body_com, robot.gravity = sim.model.body_com, sim.model.gravity
@@ -48,7 +51,10 @@ def robot_arrays(sim: Simulation, step_dt: float) -> Any:
 
 
 def episode_arrays(num_envs: int, seed: int, stream: Purpose, skill: wp.array, device: Any) -> Any:
-    """Return new `EpisodeArrays` for the first reset; skill: (num_envs,) index of each world's task."""
+    """Return new arrays of every world's episode state (`EpisodeArrays`), ready for the first reset.
+
+    skill: (num_envs,) index of each world's task.
+    """
     episode = EpisodeArrays()
     episode.seed, episode.purpose, episode.skill = seed, PURPOSES.index(stream), skill
     counts = ("requested_task", "has_command", "history_reset", "termination", "diverged", "bad_action", "level",
@@ -63,7 +69,10 @@ def episode_arrays(num_envs: int, seed: int, stream: Purpose, skill: wp.array, d
 
 
 def delay_arrays(num_envs: int, latency: wp.array, substeps: int, device: Any) -> Any:
-    """Return the kernels' ring buffers `Delays`; latency: (num_envs,) int [physics steps]; substeps per policy step."""
+    """Return the ring buffers that delay motor targets in the kernels (`Delays`).
+
+    latency: (num_envs,) int [physics steps]; substeps: physics steps in a policy step.
+    """
     delays = Delays()
     allocate(delays, ("target_history",), (RING, 12, num_envs), float, device)
     allocate(delays, ("current_target", "prev_target"), (12, num_envs), float, device)
@@ -110,7 +119,7 @@ def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ..
 def prepared_tasks(
     tasks: Sequence[TaskCfg], randomize: bool, noise: bool, ground_may_vary: bool
 ) -> tuple[tuple[TaskCfg, ...], bool]:
-    """Apply the environment's options to its tasks; return them, and whether any of them samples its ground.
+    """Return tasks with the environment's randomisation and noise options applied, and whether any samples its ground.
 
     Without randomize tasks are nominal. Without noise their observations are exact. Ground is sampled only with
     randomize and ground_may_vary.
@@ -126,7 +135,7 @@ def prepared_tasks(
 
 
 def checked_action(action: Any, shape: tuple[int, ...], device: torch.device) -> torch.Tensor:
-    """Return `action` without gradient. Raises InputError: no floating-point tensor of this shape and device."""
+    """Return a policy action without gradient. Raises InputError: no floating-point tensor of this shape and device."""
     if not isinstance(action, torch.Tensor):
         raise InputError(f"an action must be a torch tensor, got {type(action).__name__}")
     if tuple(action.shape) != shape:
@@ -153,7 +162,7 @@ def as_float32(values: Any, name: str) -> np.ndarray:
 
 
 def checked_values(values: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
-    """Return values (a scalar or of `shape`) as float32 of `shape`. Raises InputError: other shape, or not finite."""
+    """Return a scalar or array as float32 array of `shape`. Raises InputError: other shape, or not finite."""
     array = as_float32(values, name)
     if array.ndim and array.shape != shape:
         raise InputError(f"{name} must have shape {shape}, got {array.shape}")

@@ -43,7 +43,7 @@ CONTACT_TOLERANCE = 1.0e-4
 
 
 class Step(NamedTuple):
-    """Result of `Env.step`; tensors on the device that the next step overwrites."""
+    """Observations, reward and end flags of `Env.step`; tensors on the device that the next step overwrites."""
 
     obs: dict[str, torch.Tensor]
     """Observations (num_envs, columns) by group (`actor`, `critic`), after resets of ended episodes."""
@@ -128,7 +128,10 @@ class Env(Stages):
         self._show()
 
     def _show(self) -> None:
-        """Set the public tensors: torch views of Warp arrays; observations and reward terms are the first task's."""
+        """Set the environment's public tensors (observations, reward, flags) to torch views of Warp arrays.
+
+        Observations and reward terms are the first task's.
+        """
         self.num_actions, self.actions = 12, wp.to_torch(self._action)
         self.action, first = self.actions[0], self.skills[0]
         self.obs, self.critic_obs = first.obs["actor"], first.obs["critic"]
@@ -217,7 +220,7 @@ class Env(Stages):
         return self._step
 
     def set(self, name: str, value: float, skill: int = 0) -> None:
-        """Change a number of a task's term from the next step on, also in captured graphs.
+        """Change a parameter of a task's term, such as a weight, from the next step on, also in captured graphs.
 
         name: "section.term.number" such as `rewards.jump_height.weight`; skill: index of the task.
         Raises InputError (a ValueError): no such number or skill, or a value that is not finite.

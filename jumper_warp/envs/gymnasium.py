@@ -54,7 +54,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         render_size: tuple[int, int] = (640, 480),
         render_envs: int = 16,
     ) -> None:
-        """Wrap `env`; call `reset` before the first step.
+        """Make a Gymnasium vector environment from `env`; call `reset` before the first step.
 
         all_groups: observations are a dict with the groups `actor` and `critic`, else those of `actor` only. tensors,
         autoreset_mode: see the class; the modes' values "SameStep", "NextStep", "Disabled" are accepted too.
@@ -141,7 +141,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         return self._observation(step.obs), reward, terminated, truncated, infos
 
     def _infos(self, final_obs: dict[str, torch.Tensor], ended: Any) -> dict[str, Any]:
-        """Return the infos of a step, see the class; final_obs: by group, before resets."""
+        """Return the infos of a step, such as final observations. See the class; final_obs: by group, before resets."""
         termination = self._converted(self._termination.where(torch.as_tensor(ended, device=self.device), -1))
         if self._to_reset is not None:
             return {"termination": termination, "_termination": _copied(ended)}
@@ -193,7 +193,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
             raise gymnasium.error.ClosedEnvironmentError("the environment is closed")
 
     def _checked_mask(self, options: dict[str, Any]) -> Any:
-        """Return the mask in the options of a reset, None without one. Raises InputError: other options, or no mask."""
+        """Return a reset's mask of worlds from its options, or None. Raises InputError: other options, or no mask."""
         mask = options.pop("reset_mask", None)
         if options:
             raise InputError(f"reset takes no options but 'reset_mask', got {', '.join(map(repr, options))}")
@@ -214,7 +214,7 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         return torch.from_numpy(np.array(array, dtype=np.float32)).to(self.env.device)
 
     def _converted(self, tensor: torch.Tensor) -> Any:
-        """Return the tensor unchanged with `tensors`, else its values as a NumPy array."""
+        """Return a tensor in the form that the user chose: unchanged with `tensors`, else as a NumPy array."""
         return tensor if self.tensors else tensor.cpu().numpy()
 
     def _observation(self, groups: dict[str, torch.Tensor]) -> Obs:
@@ -224,7 +224,10 @@ class GymVectorEnv(gymnasium.vector.VectorEnv):
         return {group: self._converted(sanitise(groups[group])) for group in ("actor", "critic")}
 
     def _final_rows(self, obs: Obs, worlds: np.ndarray) -> np.ndarray:
-        """Return an object array (num_envs,): a world's observation where worlds (num_envs,) bool is set, else None."""
+        """Return the last observations of ended episodes as an object array (num_envs,), None for other worlds.
+
+        worlds: (num_envs,) bool, where an episode ended.
+        """
         rows = np.full(self.num_envs, None, dtype=object)
         for world in np.flatnonzero(worlds):
             rows[world] = {group: values[world] for group, values in obs.items()} if self._all_groups else obs[world]
@@ -238,9 +241,10 @@ class GymEnv(gymnasium.Env):
     """
 
     def __init__(self, env: Env, **arguments: Any) -> None:
-        """Wrap `env` with one world; arguments: all_groups, render_mode and render_size as of `GymVectorEnv`.
+        """Make a Gymnasium environment from `env` with one world.
 
-        Raises InputError (a ValueError): more than one world, or as `GymVectorEnv`.
+        arguments: all_groups, render_mode and render_size as of `GymVectorEnv`. Raises InputError (a ValueError): more
+        than one world, or as `GymVectorEnv`.
         """
         if env.num_envs != 1:
             raise InputError(f"gymnasium.make needs one world, got {env.num_envs}; gymnasium.make_vec takes num_envs")
@@ -276,7 +280,7 @@ def _first(obs: Obs) -> Any:
 
 
 def _checked_mode(mode: Any) -> AutoresetMode:
-    """Return the autoreset mode of a member or its value. Raises InputError: there is no such mode."""
+    """Return Gymnasium's autoreset mode from the enum's member or value. Raises InputError: there is no such mode."""
     try:
         return AutoresetMode(mode)
     except ValueError as error:

@@ -25,9 +25,10 @@ NOMINAL = {
 
 
 def robot_parameters(sim: Simulation, tasks: tuple[TaskCfg, ...], skill: wp.array) -> Any:
-    """Return the kernels' `RobotParameters`; the model's current values become the nominal ones.
+    """Return the arrays of robot parameters that domain randomisation writes, as views of a simulation's arrays.
 
-    skill: (num_worlds,) int, index in `tasks` of each world's active task.
+    The model's current values become the nominal ones. skill: (num_worlds,) int, index in `tasks` of each world's
+    active task.
     """
     model, n, device = sim.model, sim.num_worlds, sim.device
     robot = RobotParameters()

@@ -23,12 +23,12 @@ class EnvConfig(dict):
 
 
 class RslRlVecEnv(RslRlEnv):
-    """A `VecEnv` as rsl-rl's `VecEnv`; returns copies, because rsl-rl keeps references over the next step."""
+    """Adapter of a `VecEnv` to rsl-rl's `VecEnv`; returns copies, as rsl-rl keeps references over the next step."""
 
     cfg: EnvConfig
 
     def __init__(self, env: VecEnv, metrics_every: int = 24, max_episode_length: int = 1200) -> None:
-        """Wrap `env`; unless it was reset, call `reset` of the adapter before training.
+        """Adapt `env` to rsl-rl; unless it was reset, call `reset` of the adapter before training.
 
         metrics_every: policy steps between two reads of the metrics, which wait for the device; with the number of
             steps per iteration they are logged once per iteration. max_episode_length: policy steps; only reported.
@@ -62,7 +62,7 @@ class RslRlVecEnv(RslRlEnv):
 
     @property
     def episode_length_buf(self) -> torch.Tensor:
-        """(num_envs,) int64, policy steps since each episode began; assigning copies, and changes no episode."""
+        """Policy steps of each running episode, (num_envs,) int64; assigned values are copied and change no episode."""
         return self._episode_length
 
     @episode_length_buf.setter

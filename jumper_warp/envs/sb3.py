@@ -14,14 +14,17 @@ from jumper_warp.utils.errors import InputError
 
 
 class Sb3VecEnv(VecEnv):
-    """`GymVectorEnv` as Stable-Baselines3's `VecEnv`.
+    """Adapter of `GymVectorEnv` to Stable-Baselines3's `VecEnv`.
 
     The info of a world whose episode ended has terminal_observation, `TimeLimit.truncated`, termination (its name) and
     episode (return `r`, length `l` [steps], duration `t` [s]); the others' are empty.
     """
 
     def __init__(self, envs: GymVectorEnv) -> None:
-        """Wrap `envs`. Raises InputError: it returns tensors, or its autoreset mode is not SAME_STEP."""
+        """Adapt `envs` to Stable-Baselines3.
+
+        Raises InputError: it returns tensors, or its autoreset mode is not SAME_STEP.
+        """
         if envs.tensors or envs.autoreset_mode is not AutoresetMode.SAME_STEP:
             raise InputError("Stable-Baselines3 needs arrays and autoreset_mode 'SameStep'")
         self.envs, self._actions = envs, np.zeros(0)

@@ -32,7 +32,7 @@ class TaskRuntime:
     """
 
     def __init__(self, task: TaskCfg, index: int, num_envs: int, step_dt: float, substeps: int, device: Any) -> None:
-        """Allocate the arrays; index: the task's in the environment; step_dt [s]: policy step of `substeps`."""
+        """Allocate the task's arrays; index: its index in the environment; step_dt [s]: policy step of `substeps`."""
         self.task, self.index, self.num_envs, self.device = task, index, num_envs, device
         self.kernels = kernels_of(task)
         self.params = ParamArrays(task.params, device)
@@ -48,7 +48,7 @@ class TaskRuntime:
         self._allocate_observations(substeps)
 
     def _counters(self) -> Any:
-        """Return the kernels' `Counters`, all 0."""
+        """Return the counters of episode statistics for the kernels, all 0."""
         n, task, counters = self.num_envs, self.task, Counters()
         allocate(counters, ("term_sum",), (max(len(task.rewards), 1), n), wp.float64, self.device)
         allocate(counters, ("termination_count",), (len(task.terminations), n), int, self.device)
@@ -57,12 +57,15 @@ class TaskRuntime:
         return counters
 
     def _structs(self, values: list, kind: Any = None) -> wp.array:
-        """Return structs (of type `kind`) as a Warp array; if there are none, one unused `NoSettings`."""
+        """Return kernel structs (settings or curriculum levels) as a Warp array of type `kind`.
+
+        If there are none, it has one unused `NoSettings`.
+        """
         values = values or [NoSettings()]
         return wp.array(values, dtype=kind or values[0]._cls, device=self.device)
 
     def _allocate_observations(self, substeps: int) -> None:
-        """Set the index table of components, the observation arrays and their torch views by group."""
+        """Allocate the observation arrays, their torch views by group, and the index table of components."""
         n, task = self.num_envs, self.task
         layouts = {group: task.layout(group) for group in task.groups}
         widths = {group: max((end for _, end in layout.values()), default=0) for group, layout in layouts.items()}
@@ -95,7 +98,7 @@ class TaskRuntime:
         return views
 
     def settings_of_skill(self) -> Any:
-        """Return the kernels' `SkillSettings` of the task."""
+        """Return the task's constants for the kernels: action scale, command filter, margins."""
         lateral, transversal = (math.radians(scale) for scale in self.task.action_scale)
         settings = SkillSettings()
         settings.action_scale = vec12(*(4 * (lateral, transversal, transversal)))
@@ -108,7 +111,7 @@ class TaskRuntime:
         return settings
 
     def set(self, section: str, name: str, **numbers: float) -> None:
-        """Change numbers of term `section.name`, each as `Env.set` does; raises InputError as `Env.set`."""
+        """Change parameters of term `section.name`, each as `Env.set` does; raises InputError as `Env.set`."""
         for key, value in numbers.items():
             self.params.set(f"{section}.{name}.{key}", value)
 
@@ -139,7 +142,10 @@ class TaskRuntime:
         return metrics | self._state_metrics()
 
     def _state_metrics(self) -> dict[str, float]:
-        """Return the task's `StateMetric`s (sum of `field` over sum of `per`, or the mean), and clear the sums."""
+        """Return the metrics of the training log that come from the worlds' task states, and clear their sums.
+
+        A `StateMetric` is the sum of `field` over the sum of `per`, or the mean.
+        """
         metrics, values_by_name = self.task.metrics, {}
         if not metrics:
             return values_by_name
@@ -174,7 +180,10 @@ def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
 
 
 def _kernel(make: Callable[[Any], Kernel], source: Any, *key_parts: Any) -> Kernel:
-    """Return the kernel make(source), cached by `make` and key_parts: all parts of source that it depends on."""
+    """Return the kernel that `make` builds from `source`, built once and cached.
+
+    Key: `make` and key_parts, all parts of source that the kernel depends on.
+    """
     if (key := (make, *key_parts)) not in _KERNELS:
         _KERNELS[key] = make(source)
     return _KERNELS[key]

@@ -85,7 +85,7 @@ class Stages:
         ]
 
     def after_load_state(self) -> None:
-        """Update start flag, terms' numbers and solver after `load_state` wrote the arrays."""
+        """Update start flag, parameters of terms, and solver after `load_state` wrote the arrays."""
         self._started = bool((self.episodes.step_count.numpy() > FIRST_STEP_COUNT).all())
         for skill in self.skills:
             skill.params.restore()
@@ -197,7 +197,10 @@ class Stages:
             self._launch(restore_task_kernel, part.count, [mask, self._home, self.parameters, part.episode])
 
     def _randomize(self, part: WorldSlice, mask: wp.array) -> None:
-        """Run the reset events where mask is nonzero, and before the very first reset also the startup events."""
+        """Randomise robot parameters where mask is nonzero, by the reset events.
+
+        Before the very first reset run the startup events too.
+        """
         if not self._started:  # all worlds begin
             self._launch(motors_kernel, (12, self.num_envs), [self.parameters])
             self._events(part, STARTUP, self._all)
@@ -205,7 +208,10 @@ class Stages:
         self._events(part, AT_RESET, mask)
 
     def _events(self, part: WorldSlice, stage: int, mask: wp.array) -> None:
-        """Run the events due at a stage (STARTUP, AT_RESET, AT_STEP) where mask is nonzero, and update the solver."""
+        """Run the events (changes of robot parameters) that are due where mask is nonzero, and update the solver.
+
+        stage: STARTUP, AT_RESET or AT_STEP.
+        """
         for skill in self.skills:
             slots = enumerate(skill.task.params.slots["events"])
             due = {i: slot for i, slot in slots if slot.term.due_at(stage)}

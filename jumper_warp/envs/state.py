@@ -117,14 +117,14 @@ def nominal_fingerprint(env: Stages) -> torch.Tensor:
 
 
 def _records(env: Stages) -> dict[str, wp.array]:
-    """Return the environment's arrays of structs (task states, any blocks) by the prefix of their fields' keys."""
+    """Return the saved arrays of structs (task states, any blocks) by the prefix of their fields' keys."""
     blocks = env.sim.physics.dynamics.robot.ground.blocks
     states = {f"{skill.task.name}.": skill.states for skill in env.skills}
     return states | ({"block.": blocks} if blocks.shape[0] else {})
 
 
 def _tensors(env: Stages) -> dict[str, torch.Tensor]:
-    """Return torch views of the environment's other saved arrays by key."""
+    """Return torch views of the environment's saved arrays, except arrays of structs, by key."""
     arrays: dict[str, Any] = {}
     structs = (("robot", RobotArrays, env.robot), ("env", EpisodeArrays, env.episodes), ("delays", Delays, env.delays),
                ("parameters", RobotParameters, env.parameters))  # fmt: skip

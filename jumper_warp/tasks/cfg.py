@@ -181,7 +181,10 @@ class TaskCfg:
         return TaskParams(self.name, sections)
 
     def layout(self, group: str) -> dict[str, tuple[int, int]]:
-        """Return the half-open column range (first, end) of each term by its name; group: "actor" or "critic"."""
+        """Return the half-open column range (first, end) of each term of an observation by its name.
+
+        group: "actor" or "critic".
+        """
         columns, first = {}, 0
         for term in getattr(self.observations, group):
             end = first + term.width * term.options["history"]

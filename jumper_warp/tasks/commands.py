@@ -17,7 +17,7 @@ from jumper_warp.utils.kernels import Function
 
 @dataclass(frozen=True)
 class CommandValue:
-    """Name, lower bound and optionality of one number of a command."""
+    """One component of a task's command: name, lower bound, and whether it may be omitted."""
 
     name: str  # With its unit, as `x [m]`
     least: float = -math.inf  # Smallest allowed number, in its unit
@@ -26,19 +26,19 @@ class CommandValue:
 
 @dataclass(frozen=True)
 class CommandLayout:
-    """The one to four numbers of a task's command, in order."""
+    """Layout of a task's command: its one to four components, in order."""
 
     values: tuple[CommandValue, ...]
     nonzero: bool = False  # Whether at least one number must differ from 0
 
     @property
     def counts(self) -> tuple[int, ...]:
-        """Allowed lengths of a command: with all, some or none of the optional numbers."""
+        """Allowed numbers of components of a command: with all, some or none of the optional ones."""
         required = sum(not value.optional for value in self.values)
         return tuple(range(required, len(self.values) + 1))
 
     def __str__(self) -> str:
-        """Return the names of the numbers with units, for messages."""
+        """Return the names of the command's components with units, for messages."""
         return ", ".join(f"{value.name}{' (optional)' if value.optional else ''}" for value in self.values)
 
 
@@ -66,7 +66,7 @@ ANY_NUMBERS = CommandLayout((CommandValue("a number"), *(CommandValue("a number"
 
 
 def layout_of(task: TaskCfg) -> CommandLayout:
-    """Return the layout of a task's command."""
+    """Return the layout of a task's command: names, bounds and order of its components."""
     return LAYOUTS.get(task.command.set, ANY_NUMBERS)
 
 

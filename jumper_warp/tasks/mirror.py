@@ -50,7 +50,7 @@ _SWAPPED: dict[Any, tuple[int, ...]] = {
 
 
 def mirror_of(task: TaskCfg, group: str) -> Mirror:
-    """Return the mirror image of an observation; group: "actor" or "critic". Raises InputError: unknown term."""
+    """Return the mirror image of a task's observation; group: "actor" or "critic". Raises InputError: unknown term."""
     order: list[int] = []
     signs: list[int] = []
     for term in getattr(task.observations, group):

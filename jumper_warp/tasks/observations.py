@@ -36,7 +36,7 @@ REMEMBERED = ("lin_vel", "ang_vel", "gravity", "angle", "last_action")
 
 
 def remembered(terms: tuple[ObservationTerm, ...], steps: int = 4) -> tuple[ObservationTerm, ...]:
-    """Return copies of the terms; those named in `REMEMBERED` have a history of `steps` policy steps."""
+    """Return observation terms with a history of `steps` policy steps for those named in `REMEMBERED`."""
     return tuple(term.replace(history=steps) if term.name in REMEMBERED else term for term in terms)
 
 
@@ -48,5 +48,5 @@ def with_history(task: TaskCfg, steps: int | None) -> TaskCfg:
 
 
 def exact(terms: tuple[ObservationTerm, ...]) -> tuple[ObservationTerm, ...]:
-    """Return copies of the terms without noise and delay."""
+    """Return copies of observation terms without noise and delay."""
     return tuple(term.replace(noise=0.0, delayed=False) for term in terms)

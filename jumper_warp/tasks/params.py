@@ -18,10 +18,11 @@ from jumper_warp.utils.errors import InputError
 
 
 class TermSlot(SimpleNamespace):
-    """Indices of a term's numbers in the array p of `TaskParams.values`, and its options, for kernels.
+    """Indices of a term's parameters (such as a reward's weight) in the task's parameter array, and its options.
 
-    Each name in the term's `settings` is an attribute, the index of its value (of a pair: the first): `p[slot.weight]`.
-    Each name in its `options` is an attribute with the option's value.
+    Kernels use it; the array p is that of `TaskParams.values`. Each name in the term's `settings` is an attribute, the
+    index of its value (of a pair: the first): `p[slot.weight]`. Each name in its `options` is an attribute with the
+    option's value.
     """
 
     def __init__(self, term: Any, offset: int) -> None:
@@ -38,10 +39,10 @@ class TermSlot(SimpleNamespace):
 
 
 class TaskParams:
-    """Numbers of all terms of a task in one list, and the index of each by name."""
+    """Parameters of all terms of a task, such as weights of rewards, in one list, and the index of each by name."""
 
     def __init__(self, task: str, sections: Mapping[str, Sequence[Term]]) -> None:
-        """Collect the numbers of all terms; task: name, for messages; sections: terms by name of their section."""
+        """Collect the parameters of all terms; task: name, for messages; sections: terms by name of their section."""
         self.task = task
         self.slots: dict[str, list[TermSlot]] = {section: [] for section in sections}
         """Slots by section, one per term, in the order of the terms."""
@@ -56,7 +57,7 @@ class TaskParams:
                     self.values.append(float(value))
 
     def index(self, name: str) -> int:
-        """Return the index of a number by its dotted name. Raises InputError: there is none."""
+        """Return the index of a parameter by its dotted name. Raises InputError: there is none."""
         if name not in self.names:
             section, _, rest = name.partition(".")
             term, _, key = rest.rpartition(".")
@@ -66,17 +67,17 @@ class TaskParams:
 
 
 class ParamArrays:
-    """Device array of a task's numbers; captured graphs read changed values from it."""
+    """Device array of the parameters of a task's terms; captured graphs read changed values from it."""
 
     def __init__(self, params: TaskParams, device: Any) -> None:
-        """Copy the initial values to the device; params: names and values; device: Warp device."""
+        """Copy the initial parameters to the device; params: names and values; device: Warp device."""
         self.params = params
         self.values = wp.array(params.values, dtype=float, device=device)
         self.changed = wp.full(len(params.values), math.inf, dtype=float, device=device)
         """Numbers changed by `set`, (len(values),); infinity elsewhere."""
 
     def set(self, name: str, value: float) -> None:
-        """Change a number by its dotted name. Raises InputError: there is none, or the value is not finite."""
+        """Change a parameter by its dotted name. Raises InputError: there is none, or the value is not finite."""
         if not math.isfinite(value):
             raise InputError(f"{name} must be finite, got {value}")
         i = self.params.index(name)
@@ -84,6 +85,6 @@ class ParamArrays:
             array[i : i + 1].fill_(value)
 
     def restore(self) -> None:
-        """Reset all numbers to `params.values` except those that `set` changed. Waits for the device."""
+        """Reset all parameters to `params.values` except those that `set` changed. Waits for the device."""
         changed = self.changed.numpy()
         self.values.assign(np.where(np.isinf(changed), np.array(self.params.values, dtype=np.float32), changed))

@@ -30,7 +30,10 @@ def _base_mass() -> float:
 
 
 def _least(name: str) -> tuple[float, bool]:
-    """Return the lower bound of a field's range, in its unit, and whether the bound itself is excluded."""
+    """Return the smallest value that a range may contain, in its unit, and whether that value itself is excluded.
+
+    name: the range's field in `RandomizationCfg`.
+    """
     if name == "base_mass":
         return -_base_mass(), True
     if name in ("link_mass", "gains", "damping_gains", "no_load_speed", "cutoff_speed", "armature", "push_interval"):
@@ -42,7 +45,7 @@ def _least(name: str) -> tuple[float, bool]:
 
 @dataclass(frozen=True)
 class RandomizationCfg:
-    """Ranges (lower, upper) of uniformly sampled parameters; None: the nominal value. The defaults are for jumping.
+    """Ranges (lower, upper) of uniformly sampled robot parameters; None: nominal. The defaults are for jumping.
 
     Masses and scales must be positive; friction and latency may be 0.
     """
@@ -159,7 +162,7 @@ class RandomizationCfg:
         return replace(self, **ranges)
 
     def events(self) -> tuple[EventTerm, ...]:
-        """Return the events that sample the ranges that are not None; their numbers are in SI units."""
+        """Return the events that sample robot parameters from the ranges that are not None; numbers are in SI units."""
         terms = []
 
         def add(func: Any, pair: Range, scale: float = 1.0, parallel: bool = False, **numbers: float) -> None:

@@ -215,7 +215,7 @@ def _tuple(saved: Any, hint: Any, where: str, find: Finder) -> tuple[Any, ...]:
 
 
 def _object(saved: dict[str, Any], hint: Any, where: str, find: Finder) -> Any:
-    """Return a saved term or dataclass; its entry "type" (default: the hint) must name a subclass of the hint."""
+    """Return the term or dataclass of a JSON object; its "type" (default: the hint) names a subclass of the hint."""
     base = object if hint is Any else hint
     kind = hint if "type" not in saved and dataclasses.is_dataclass(hint) else find(saved.get("type"), where)
     if not (isinstance(kind, type) and isinstance(base, type) and issubclass(kind, base)):
@@ -251,7 +251,10 @@ def _term(kind: type[Term], saved: dict[str, Any], where: str, find: Finder) -> 
 
 
 def _scalar(saved: Any, hint: Any, where: str) -> Any:
-    """Return a number, string or bool that fits the hint: float, int, str, bool, a Literal or Any. Raises TaskError."""
+    """Return a saved number, string or bool that fits a type hint. Raises TaskError.
+
+    The hint is float, int, str, bool, a Literal or Any.
+    """
     kinds = {float: (float, int), int: (int,), str: (str,), bool: (bool,)}.get(hint)
     if get_args(hint) and not kinds:  # a Literal
         if saved not in get_args(hint):

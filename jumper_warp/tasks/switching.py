@@ -39,9 +39,9 @@ FALLS, FALLS_FROM_FLIGHT = (
 def for_switching(
     task: TaskCfg, randomization: RandomizationCfg, falls: tuple[TerminationTerm, ...] = FALLS
 ) -> TaskCfg:
-    """Return a task for switching: on level ground, ended by falls alone, without rewards, critic, events and metrics.
+    """Return a task for a robot that switches between skills: on level ground, ended by falls alone.
 
-    randomization: ranges for the robot, the same in all its skills.
+    It has no rewards, critic, events and metrics. randomization: ranges for the robot, the same in all its skills.
     """
     task = replace(
         task,

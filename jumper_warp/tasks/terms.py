@@ -1,4 +1,4 @@
-"""Terms of a task: a Warp function and its numbers by name, checked when a term is created.
+"""Terms of a task, such as rewards: a Warp function and its parameters by name, checked when a term is created.
 
 The first arguments of a function come from the kernel; its other parameters, all float, are numbers of the term. All
 numbers of a task lie in one array on the device, so that each can change while a captured graph replays.
@@ -27,7 +27,10 @@ MOTORS = tuple(f"{leg}_{motor}" for leg in LEGS for motor in ("lateral", "outer"
 
 
 class Term:
-    """A Warp function with its numbers. Equal terms have the same function, name, numbers and options."""
+    """Part of a task, such as a reward or a termination: a Warp function and values of its parameters.
+
+    Equal terms have the same function, name, numbers and options.
+    """
 
     context: int = 2
     """Number of leading arguments that the kernel passes; the others are the term's numbers."""
@@ -41,7 +44,7 @@ class Term:
     """Defaults of values that are compiled into the kernel; on an instance, its values."""
 
     def __init__(self, func: Function, *, name: str = "", **values: Any) -> None:
-        """Create a term from a function; values: its numbers and options by name.
+        """Create a term from a function; values: its parameters (numbers and options) by name.
 
         func: @wp.func with the class's signature. name: for logs and flags (default: the function's name).
         Raises InputError: a number is missing, unknown or not finite, or the function does not fit the class.
@@ -87,12 +90,18 @@ class Term:
             raise InputError(f"{where}: the function must return {self.returns[0].__name__}, it returns {returned}")
 
     def replace(self, **changes: Any) -> Any:
-        """Return a copy with changed function, name, numbers or options; raises InputError like the constructor."""
+        """Return a copy of the term with changed function, name, numbers or options.
+
+        Raises InputError like the constructor.
+        """
         return type(self)(**{"func": self.func, "name": self.name, **self.numbers, **self.options, **changes})
 
     @property
     def flat_numbers(self) -> dict[str, float]:
-        """Numbers by name in the order of the device array, settings first; a pair as `name.lower` and `name.upper`."""
+        """Parameters of the term by name, in the order of the device array.
+
+        Settings are first; a pair has the names `name.lower` and `name.upper`.
+        """
         flat: dict[str, float] = {}
         for key, value in self.numbers.items():
             pair = isinstance(value, tuple)
@@ -118,7 +127,10 @@ class Term:
 
 
 class RewardTerm(Term):
-    """Reward, (robot: RobotView, state, ...) -> float, times weight and, with `scale_by_dt`, the policy step [s]."""
+    """Term of the reward: a function's value times a weight and, with `scale_by_dt`, the policy step [s].
+
+    Function: (robot: RobotView, state, ...) -> float.
+    """
 
     settings: ClassVar = {"weight": REQUIRED}
     options: Mapping[str, Any] = {"scale_by_dt": True}
@@ -134,10 +146,10 @@ class RewardTerm(Term):
 
 
 class TerminationTerm(Term):
-    """Condition that ends an episode, (robot: RobotView, state, ...) -> bool.
+    """Condition that ends an episode.
 
-    time_out: whether the end is no failure, so that the value of the last state is bootstrapped. success: whether the
-    success rate and the curriculum count the end as a success.
+    Function: (robot: RobotView, state, ...) -> bool. time_out: whether the end is no failure, so that the value of the
+    last state is bootstrapped. success: whether the success rate and the curriculum count the end as a success.
     """
 
     options: Mapping[str, Any] = {"time_out": False, "success": False}
@@ -145,12 +157,13 @@ class TerminationTerm(Term):
 
 
 class ObservationTerm(Term):
-    """Part of an observation, (robot: RobotView, state, ...) -> float or vector, one frame of columns.
+    """Part of an observation: a scalar or a vector, with noise, limits, scale, history and delay.
 
-    Other signatures: (parameters: RobotParameters, world: int, ...) and, to read the ground, (arrays: RobotArrays,
-    ground: Ground, world: int, ...). noise: standard deviation of Gaussian noise, cut at one standard deviation, in the
-    function's unit; then values are clipped to [-clip, clip] and multiplied by scale. history: number of frames, oldest
-    first. delayed: whether the world's observation latency applies.
+    Function: (robot: RobotView, state, ...) -> float or vector, one frame of columns. Other signatures: (parameters:
+    RobotParameters, world: int, ...) and, to read the ground, (arrays: RobotArrays, ground: Ground, world: int, ...).
+    noise: standard deviation of Gaussian noise, cut at one standard deviation, in the function's unit; then values are
+    clipped to [-clip, clip] and multiplied by scale. history: number of frames, oldest first. delayed: whether the
+    world's observation latency applies.
     """
 
     settings: ClassVar = {"noise": 0.0, "scale": 1.0, "clip": 100.0}
@@ -169,7 +182,7 @@ class ObservationTerm(Term):
 
     @property
     def width(self) -> int:
-        """Number of columns of one frame."""
+        """Number of columns of one frame of the observation term."""
         returned = get_type_hints(self.func.func)["return"]
         return 1 if returned in (float, wp.float32) else returned._length_
 
@@ -187,9 +200,10 @@ class ObservationTerm(Term):
 
 
 class EventTerm(Term):
-    """Function (parameters: RobotParameters, rng: RngStream, ...) that writes parameters of world `rng.world`.
+    """Event that changes a world's robot parameters at startup, at resets or at intervals, as in domain randomisation.
 
-    mode: "startup": once; "reset": at every reset; "interval": at resets and then at intervals sampled from
+    Function: (parameters: RobotParameters, rng: RngStream, ...), which writes parameters of world `rng.world`. mode:
+    "startup": once; "reset": at every reset; "interval": at resets and then at intervals sampled from
     `interval_range_s` [s]. update_solver: whether the solver must read the model again; pushes and latencies need not.
     parallel: whether threads share its loop over range(rng.lane, end, rng.lanes); not with "interval".
     """
@@ -216,14 +230,18 @@ class EventTerm(Term):
 
 
 class Advance(Term):
-    """State machine of a task, (robot: RobotView, state, ...) -> state after one policy step."""
+    """Update of a task's state by a policy step, such as the phases of a jump.
+
+    Function: (robot: RobotView, state, ...) -> state.
+    """
 
 
 class Curriculum(Term):
-    """Error of an ended episode in `unit`, (robot: RobotView, state) -> float, and the rule to raise a world's level.
+    """Rule that raises a world's curriculum level when its episodes end with success and small errors.
 
-    `promote_after` episodes in a row that end with success and an error up to `tolerance` raise the world's level.
-    counts: @wp.func (state) -> bool, whether an episode is counted. unit: suffix of the logged error's name.
+    Function: (robot: RobotView, state) -> float, error of an ended episode in `unit`. `promote_after` episodes in a row
+    that end with success and an error up to `tolerance` raise the world's level. counts: @wp.func (state) -> bool,
+    whether an episode is counted. unit: suffix of the logged error's name.
     """
 
     settings: ClassVar = {"tolerance": REQUIRED, "promote_after": 5}

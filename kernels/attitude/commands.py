@@ -32,7 +32,10 @@ def sample_unit_quat(rng: RngStream) -> wp.quat:
 
 @wp.func
 def sample_axis(rng: RngStream, body_axis_probability: float) -> wp.vec3:
-    """Return a unit vector, body axes: +-x, +-y or +-z with the probability, else uniform over the sphere."""
+    """Return the sampled axis of a commanded turn, a unit vector in body axes.
+
+    It is +-x, +-y or +-z with `body_axis_probability`, else uniform over the sphere.
+    """
     sign = wp.where(uniform(rng, streams.SIGN, 0.0, 1.0) < 0.5, -1.0, 1.0)
     if uniform(rng, streams.ALONG_BODY, 0.0, 1.0) < body_axis_probability:
         axis = wp.vec3(0.0)
@@ -46,7 +49,7 @@ def sample_axis(rng: RngStream, body_axis_probability: float) -> wp.vec3:
 
 @wp.func
 def sample_rotation(rng: RngStream, ranges: TurnRanges) -> wp.quat:
-    """Return a rotation (xyzw) about a sampled axis of the body by an angle sampled from `ranges.angle`."""
+    """Return the sampled rotation (xyzw) to a goal orientation: axis of the body, angle from `ranges.angle`."""
     axis = sample_axis(fold_in(rng, streams.AXIS_BRANCH), ranges.body_axis_probability)
     return wp.quat_from_axis_angle(axis, uniform_range(rng, streams.ANGLE, ranges.angle))
 

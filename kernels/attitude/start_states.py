@@ -31,7 +31,7 @@ class AttitudeSettings:
 
 @wp.struct
 class AttitudeStart:
-    """Values that all attempts at a start state share: base pose and velocity, limits and ground."""
+    """Inputs that all attempts to sample one start state share: base pose and velocity, limits and ground."""
 
     pos: wp.vec3  # [m] of the base
     quat: wp.quat  # xyzw, body to world
@@ -46,7 +46,7 @@ class AttitudeStart:
 
 @wp.func
 def sample_base(start: AttitudeStart, arrays: RobotArrays, rng: RngStream, attempt: int) -> AttitudeStart:
-    """Return the base of an attempt: `start`, with the legs in the default pose in the last attempt.
+    """Return the base state of a sampling attempt: that of `start`, in the last attempt with legs in the default pose.
 
     A `sample_base` of `mdp.attempts.sample_valid_state`; arrays and rng are unused.
     """

@@ -9,7 +9,10 @@ POLICY_RATE = wp.constant(60.0)  # policy steps in a second
 
 @wp.struct
 class AttitudeState:
-    """State of the attitude task in one world; from `episodes` on fields accumulate until the host reads them."""
+    """State of the attitude task in one world: goal orientation, error, collisions and statistics.
+
+    Fields from `episodes` on accumulate until the host reads them.
+    """
 
     goal: wp.quat  # xyzw, body to world: commanded orientation
     steps: int  # policy steps since the episode began
@@ -45,7 +48,7 @@ def angle_between(quat: wp.quat, goal: wp.quat) -> float:
 
 @wp.func
 def with_goal(state: AttitudeState, quat: wp.quat, goal: wp.quat) -> AttitudeState:
-    """Return the state with a new goal; quat, goal: present and commanded orientation (xyzw, body to world)."""
+    """Return the state with a new goal orientation; quat, goal: present and new orientation (xyzw, body to world)."""
     new = state
     new.goal = goal
     new.error = angle_between(quat, goal)
@@ -56,7 +59,10 @@ def with_goal(state: AttitudeState, quat: wp.quat, goal: wp.quat) -> AttitudeSta
 
 @wp.func
 def advance_attitude(robot: RobotView, state: AttitudeState, tolerance: float) -> AttitudeState:
-    """Return the state after one more policy step; tolerance [rad]: largest error that counts as at the goal."""
+    """Return the state of the attitude task (errors, counters) updated by one policy step.
+
+    tolerance [rad]: largest error that counts as at the goal.
+    """
     t = state
     t.steps = state.steps + 1
     t.old_error = state.error
@@ -70,7 +76,10 @@ def advance_attitude(robot: RobotView, state: AttitudeState, tolerance: float) -
 
 @wp.func
 def carried_over(old: AttitudeState) -> AttitudeState:
-    """Return a state with the statistics of `old` alone, updated if its episode was complete; reset sets the rest."""
+    """Return a new episode's state that has only the statistics of `old`, the state of the previous episode.
+
+    They include that episode if it was complete. The reset sets the other fields.
+    """
     new = AttitudeState()
     new.episodes = old.episodes
     new.sum_error = old.sum_error

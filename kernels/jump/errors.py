@@ -14,5 +14,5 @@ def height_error(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def landing_error(robot: RobotView, state: JumpState) -> float:
-    """Return the horizontal distance [m] between base origin and goal."""
+    """Return the landing error of a jump: horizontal distance [m] between base origin and goal."""
     return wp.length(goal_offset(robot, state))

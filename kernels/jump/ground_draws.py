@@ -30,7 +30,10 @@ class GroundRanges:
 
 @wp.func
 def footprint(ranges: ResetRanges, heading: float) -> wp.vec2:
-    """Return half extents [m] along world x, y of a box around the paws' centres, widest stance at `heading` [rad]."""
+    """Return half extents [m] along world x, y of a box around the paws' centres in the widest stance.
+
+    heading [rad]: yaw of the stance.
+    """
     half_length = wp.max(wp.max(ranges.front_x[1], ranges.back_x[1]), DEFAULT_PAWS[0])
     half_width = wp.max(wp.max(ranges.front_y[1], ranges.back_y[1]), DEFAULT_PAWS[1])
     c = wp.abs(wp.cos(heading))

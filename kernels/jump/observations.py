@@ -20,7 +20,7 @@ def wanted_height(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def jump_command(robot: RobotView, state: JumpState) -> float:
-    """Jump command (the paper's c): 1 from the command until touchdown, else 0."""
+    """Flag of a commanded jump (the paper's c): 1 from the command until touchdown, else 0."""
     return wp.where(commanded(state), 1.0, 0.0)
 
 
@@ -74,7 +74,7 @@ def way(robot: RobotView, state: JumpState) -> wp.vec2:
 
 @wp.func
 def span_of_ray(offset: float, half: float, direction: float) -> wp.vec2:
-    """Return the distances [m] along a ray at which it enters and leaves a slab, along one world axis.
+    """Return the distances [m] at which a horizontal ray enters and leaves a slab normal to one world axis.
 
     offset [m]: slab's middle less ray's origin; half [m]: half width; direction: ray's component along the axis [1].
     A ray parallel to the slab gives (-1e6, 1e6) inside it, (1e6, -1e6) outside.

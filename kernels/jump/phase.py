@@ -32,7 +32,10 @@ def estimated_landing(pos: wp.vec3, lin_vel: wp.vec3, height: float, g: float) -
 
 @wp.func
 def landing_error_estimate(robot: RobotView, state: JumpState, height: float) -> float:
-    """Return the distance [m] of the goal from the ballistic landing, base `height` [m] above the goal's ground."""
+    """Return the horizontal distance [m] between the goal and the predicted ballistic landing of the base.
+
+    The landing is where the base falls through `height` [m] above the goal's ground.
+    """
     landing = estimated_landing(robot.pos, robot.lin_vel, height + state.goal_ground, robot.gravity_magnitude)
     return wp.length(wp.vec2(state.goal[0] - landing[0], state.goal[1] - landing[1]))
 
@@ -55,9 +58,10 @@ def next_phase(state: JumpState, robot: RobotView, takeoff_speed: float) -> int:
 
 @wp.func
 def advance_jump(robot: RobotView, state: JumpState, takeoff_speed: float) -> JumpState:
-    """Return the jump's state after one more policy step; takeoff_speed [m/s]: least upward speed of a takeoff.
+    """Return the state of a jump (phase, apex, landing) updated by one policy step.
 
-    Contact in flight that is no touchdown moves the takeoff to its step: flight and apex are counted from there.
+    takeoff_speed [m/s]: least upward speed of a takeoff. Contact in flight that is no touchdown moves the takeoff to
+    its step: flight and apex are counted from there.
     """
     t = state
     t.steps = state.steps + 1

@@ -78,14 +78,20 @@ def sample_goal(rng: RngStream, level: JumpLevel) -> wp.vec3:
 
 @wp.func
 def sample_next_jump_step(rng: RngStream, delay: wp.vec2, probability: float) -> int:
-    """Return the policy steps from touchdown to the next goal, sampled from `delay` with `probability`, else 0."""
+    """Return the sampled number of policy steps from touchdown to the next goal; 0: there is no further jump.
+
+    delay: range of the number; probability: of a further jump.
+    """
     steps = int(uniform_range(rng, streams.AGAIN_STEP, delay))
     return wp.where(uniform(rng, streams.AGAIN, 0.0, 1.0) < probability, wp.max(steps, 1), 0)
 
 
 @wp.func
 def sample_command_step(rng: RngStream, ranges: ResetRanges) -> int:
-    """Return the policy step of the jump command: 0 to `long_wait` with its probability, else 0 to `command_delay`."""
+    """Return the sampled policy step at which the jump is commanded.
+
+    It is up to `long_wait` with `long_wait_probability`, else up to `command_delay`.
+    """
     u = uniform(rng, streams.COMMAND_STEP, 0.0, 1.0)
     probability = ranges.long_wait_probability
     soon = (u - probability) / wp.max(1.0 - probability, 1.0e-6) * (float(ranges.command_delay) + 0.999)
@@ -155,7 +161,10 @@ def begin_next_jump(old: JumpState, ground: Ground, goal: wp.vec3, pos: wp.vec3,
 
 @wp.func
 def place_ground(ground: Ground, start: JumpStart, grounds: GroundRanges, rng: RngStream) -> Ground:
-    """Sample the block of a world, or reset it if `grounds` has no probabilities, and return the world's ground."""
+    """Sample the block of a world, or move it to its start position, and return the world's ground.
+
+    The block is moved if both probabilities of `grounds` are 0.
+    """
     if grounds.platform + grounds.block > 0.0:
         block = Block()
         if start.start_mode == STANDING or start.start_mode == DEFAULT:

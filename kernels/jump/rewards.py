@@ -1,8 +1,9 @@
-"""Reward terms of jumps (paper, Tables I to III): pure functions of the robot, the jump and named numbers.
+"""Reward terms of jumps (paper, Tables I to III), as functions of the robot's state, the jump's state and parameters.
 
-Times are counted in policy steps of 1/60 s. phi, psi: Gaussian and Laplacian kernels of `mdp.rewards`; std_* and
-scale_*: their widths, in the unit of their argument. shift [rad]: added to the default angles of transversal motors.
-waiting_scale: factor on rewards that do not need a jump, while a commanded jump has not begun.
+Penalties have negative weights in the tasks, unless their values are negative. Times are counted in policy steps of
+1/60 s. phi, psi: Gaussian and Laplacian kernels of `mdp.rewards`; std_* and scale_*: their widths, in the unit of their
+argument. shift [rad]: added to the default angles of transversal motors. waiting_scale: factor on rewards that do not
+need a jump, while a commanded jump has not begun.
 """
 
 import warp as wp
@@ -18,7 +19,7 @@ REST_STEPS = wp.constant(30)  # policy steps (0.5 s) after touchdown from which 
 
 @wp.func
 def waiting_weight(state: JumpState, waiting_scale: float) -> float:
-    """Return `waiting_scale` while a commanded jump has not begun, else 1."""
+    """Return the factor on rewards that need no jump: `waiting_scale` while a commanded jump has not begun, else 1."""
     return wp.where(waiting(state), waiting_scale, 1.0)
 
 
@@ -38,13 +39,19 @@ def should_rest(state: JumpState) -> bool:
 
 @wp.func
 def height_closeness(error: float, std_fine: float, scale_sharp: float, std_wide: float) -> float:
-    """Return phi_fine + 3 psi_sharp + phi_wide of a height error, all [m]; phi_wide gives low jumps a gradient."""
+    """Return a reward for a height close to the commanded one, largest at an error of 0 m.
+
+    It is phi_fine + 3 psi_sharp + phi_wide of the error, all [m]; phi_wide gives low jumps a gradient.
+    """
     return phi(error, std_fine) + 3.0 * psi(error, scale_sharp) + phi(error, std_wide)
 
 
 @wp.func
 def jump_height(robot: RobotView, state: JumpState, std_fine: float, scale_sharp: float, std_wide: float) -> float:
-    """Jump height: `height_closeness` of the highest base height to the commanded height, once, at the apex."""
+    """Reward for a jump whose highest base height is close to the commanded one, given once, at the apex.
+
+    It is `height_closeness` of their difference [m].
+    """
     if state.at_apex == 0:
         return 0.0
     return height_closeness(state.max_height - state.goal[2], std_fine, scale_sharp, std_wide)
@@ -54,7 +61,10 @@ def jump_height(robot: RobotView, state: JumpState, std_fine: float, scale_sharp
 def estimated_jump_height(
     robot: RobotView, state: JumpState, std_fine: float, scale_sharp: float, std_wide: float
 ) -> float:
-    """Estimated jump height: `height_closeness` of the estimated apex to the commanded one, in flight before it."""
+    """Reward for a predicted apex of the base close to the commanded height, in flight before the apex.
+
+    It is `height_closeness` of the difference [m] between the ballistic estimate and the command.
+    """
     if state.phase != FLIGHT or state.apex_passed != 0:
         return 0.0
     return height_closeness(
@@ -67,7 +77,7 @@ def estimated_jump_height(
 
 @wp.func
 def horizontal_velocity(robot: RobotView, state: JumpState, speed_scale: float, waiting_scale: float) -> float:
-    """Horizontal velocity: exp(-|v_xy| / speed_scale), doubled in flight and after touchdown; speed_scale [m/s]."""
+    """Reward for little horizontal base speed, doubled after takeoff. It is exp(-|v_xy| / speed_scale [m/s])."""
     speed = wp.length(wp.vec2(robot.lin_vel[0], robot.lin_vel[1]))
     return (
         wp.exp(-speed / speed_scale) * wp.where(state.phase == STANCE, 1.0, 2.0) * waiting_weight(state, waiting_scale)
@@ -76,7 +86,7 @@ def horizontal_velocity(robot: RobotView, state: JumpState, speed_scale: float, 
 
 @wp.func
 def orientation(robot: RobotView, state: JumpState, std: float, waiting_scale: float) -> float:
-    """Orientation error: phi_std of the horizontal part of projected gravity [1] (sine of the tilt)."""
+    """Reward for a level base. It is phi_std of the sine of the tilt [1] (horizontal part of projected gravity)."""
     return phi(wp.length(wp.vec2(robot.projected_gravity[0], robot.projected_gravity[1])), std) * waiting_weight(
         state, waiting_scale
     )
@@ -84,7 +94,7 @@ def orientation(robot: RobotView, state: JumpState, std: float, waiting_scale: f
 
 @wp.func
 def angular_velocity(robot: RobotView, state: JumpState, std: float, waiting_scale: float) -> float:
-    """Angular velocity: phi_std of the base's angular speed [rad/s]."""
+    """Reward for a base that does not rotate. It is phi_std of its angular speed [rad/s]."""
     return phi(wp.length(robot.ang_vel), std) * waiting_weight(state, waiting_scale)
 
 
@@ -92,7 +102,7 @@ def angular_velocity(robot: RobotView, state: JumpState, std: float, waiting_sca
 def joint_symmetry(
     robot: RobotView, state: JumpState, std_variance: float, std_lateral: float, waiting_scale: float
 ) -> float:
-    """Joint symmetry: phi(variance of transversal angles [rad^2]) times phi(norm of lateral angles [rad])."""
+    """Reward for equal transversal angles, and small lateral ones. phi(variance [rad^2]) phi(norm of lateral [rad])."""
     total = float(0.0)
     total_sq = float(0.0)
     lateral_sq = float(0.0)
@@ -109,7 +119,10 @@ def joint_symmetry(
 
 @wp.func
 def ground_posture(robot: RobotView, state: JumpState, std: float, shift: float, waiting_scale: float) -> float:
-    """Desired joint position on the ground: phi_std of the rms motor offset [rad] from default plus shift."""
+    """Reward for motor angles near a pose, except in flight: default pose, transversal angles plus `shift` [rad].
+
+    It is phi_std of the rms motor offset [rad].
+    """
     if state.phase == FLIGHT:
         return 0.0
     return phi(posture_offset(robot, shift), std) * waiting_weight(state, waiting_scale)
@@ -117,7 +130,7 @@ def ground_posture(robot: RobotView, state: JumpState, std: float, shift: float,
 
 @wp.func
 def air_posture(robot: RobotView, state: JumpState, std: float) -> float:
-    """Desired joint position in the air: phi_std of the rms motor offset [rad] from default, in flight."""
+    """Reward for motor angles near the default pose in flight. It is phi_std of the rms motor offset [rad]."""
     if state.phase != FLIGHT:
         return 0.0
     return phi(posture_offset(robot, 0.0), std)
@@ -125,7 +138,10 @@ def air_posture(robot: RobotView, state: JumpState, std: float) -> float:
 
 @wp.func
 def post_landing_posture(robot: RobotView, state: JumpState, std: float, shift: float) -> float:
-    """Retracting after landing: phi_std of the rms motor offset [rad] from default plus shift, for 0.3 s."""
+    """Reward for retracting the legs after landing, to the default pose plus `shift` [rad], for 0.3 s.
+
+    It is phi_std of the rms motor offset [rad] from that pose.
+    """
     if not just_landed(state):
         return 0.0
     return phi(posture_offset(robot, shift), std)
@@ -133,7 +149,7 @@ def post_landing_posture(robot: RobotView, state: JumpState, std: float, shift: 
 
 @wp.func
 def tracking(robot: RobotView, state: JumpState, std_wide: float, std_fine: float, fine_weight: float) -> float:
-    """Tracking: phi_wide + fine_weight phi_fine of the distance from the goal [m], after takeoff."""
+    """Reward for a base close to the goal after takeoff. It is phi_wide + fine_weight phi_fine of the distance [m]."""
     if state.phase == STANCE:
         return 0.0
     error = wp.length(goal_offset(robot, state))
@@ -144,9 +160,10 @@ def tracking(robot: RobotView, state: JumpState, std_wide: float, std_fine: floa
 def estimated_tracking(
     robot: RobotView, state: JumpState, std_middle: float, std_wide: float, std_fine: float, height: float
 ) -> float:
-    """Estimated tracking: phi_middle + 0.1 phi_wide + 0.3 phi_fine of the estimated landing's distance to the goal [m].
+    """Reward for a predicted landing of the base close to the goal position, in flight.
 
-    In flight. The ballistic landing is where the base falls through `height` [m] above the goal's ground.
+    It is phi_middle + 0.1 phi_wide + 0.3 phi_fine of their distance [m]. The ballistic landing is where the base falls
+    through `height` [m] above the goal's ground.
     """
     if state.phase != FLIGHT:
         return 0.0
@@ -156,7 +173,7 @@ def estimated_tracking(
 
 @wp.func
 def flight_orientation(robot: RobotView, state: JumpState, std: float) -> float:
-    """Orientation error: phi_std of the rotation angle [rad] from level at the heading, in flight toward the goal."""
+    """Reward for a level base in the jump's heading, in flight toward the goal: phi_std of the angle [rad] from it."""
     if state.phase != FLIGHT or wp.dot(robot.lin_vel, goal_offset(robot, state)) <= 0.0:
         return 0.0
     return phi(angle_from_level(robot.quat, state.heading), std)
@@ -164,7 +181,7 @@ def flight_orientation(robot: RobotView, state: JumpState, std: float) -> float:
 
 @wp.func
 def flight_angular_velocity(robot: RobotView, state: JumpState, std: float) -> float:
-    """Angular velocity: phi_std of the base's angular speed [rad/s], in flight."""
+    """Reward for a base that does not rotate in flight. It is phi_std of its angular speed [rad/s]."""
     if state.phase != FLIGHT:
         return 0.0
     return phi(wp.length(robot.ang_vel), std)
@@ -172,7 +189,7 @@ def flight_angular_velocity(robot: RobotView, state: JumpState, std: float) -> f
 
 @wp.func
 def left_right_symmetry(robot: RobotView, state: JumpState, std: float, waiting_scale: float) -> float:
-    """Joint symmetry: phi_std of the rms left-right difference of transversal motor angles [rad]."""
+    """Reward for equal transversal motor angles left and right. It is phi_std of the rms difference [rad]."""
     total = float(0.0)
     for m in range(12):
         if m % 3 != 0 and (m / 3) % 2 == 0:  # transversal motors of left legs; the right leg is 3 motors later
@@ -183,7 +200,10 @@ def left_right_symmetry(robot: RobotView, state: JumpState, std: float, waiting_
 
 @wp.func
 def standing_posture(robot: RobotView, state: JumpState, std: float, shift: float) -> float:
-    """Stance: phi_std of the rms motor offset [rad] from default plus shift, while the robot should rest."""
+    """Reward for a standing pose while the robot should rest: default pose, transversal angles plus `shift` [rad].
+
+    It is phi_std of the rms motor offset [rad].
+    """
     if not should_rest(state):
         return 0.0
     return phi(posture_offset(robot, shift), std)
@@ -191,7 +211,7 @@ def standing_posture(robot: RobotView, state: JumpState, std: float, shift: floa
 
 @wp.func
 def soft_impact(robot: RobotView, state: JumpState, limit: float) -> float:
-    """Soft impact: max(0, 1 - base deceleration / limit [m/s^2]), for 0.3 s from touchdown."""
+    """Reward for a soft impact, for 0.3 s from touchdown. It is max(0, 1 - base deceleration / limit [m/s^2])."""
     if not just_landed(state):
         return 0.0
     return wp.max(0.0, 1.0 + base_deceleration(robot) / limit)
@@ -199,7 +219,7 @@ def soft_impact(robot: RobotView, state: JumpState, limit: float) -> float:
 
 @wp.func
 def stance_impact(robot: RobotView, state: JumpState, limit: float) -> float:
-    """Stance impact: minus base deceleration / limit [m/s^2], clamped to -1..0, in stance."""
+    """Penalty of decelerating the base in stance, -1 to 0. It is minus deceleration / limit [m/s^2], clamped."""
     if state.phase != STANCE:
         return 0.0
     return wp.clamp(base_deceleration(robot) / limit, -1.0, 0.0)
@@ -207,7 +227,7 @@ def stance_impact(robot: RobotView, state: JumpState, limit: float) -> float:
 
 @wp.func
 def catch_landing(robot: RobotView, state: JumpState) -> float:
-    """Catch landing: downward base speed [m/s], clamped to 0..1, for 0.3 s from touchdown."""
+    """Reward for a base that still moves down, for 0.3 s from touchdown. It is the downward speed [m/s], 0 to 1."""
     if not just_landed(state):
         return 0.0
     return wp.clamp(-robot.lin_vel[2], 0.0, 1.0)
@@ -215,7 +235,10 @@ def catch_landing(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def damp_landing(robot: RobotView, state: JumpState) -> float:
-    """Damp landing: mean over transversal motors of the rate [rad/s], clamped to 0..1 (legs fold), for 0.3 s."""
+    """Reward for folding the legs, for 0.3 s from touchdown.
+
+    It is the mean over transversal motors of the rate [rad/s], clamped to 0..1.
+    """
     if not just_landed(state):
         return 0.0
     total = float(0.0)
@@ -227,7 +250,7 @@ def damp_landing(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def base_at_rest(robot: RobotView, state: JumpState, std_lin_vel: float, std_ang_vel: float) -> float:
-    """Rest: phi(base speed [m/s]) times phi(angular speed [rad/s]), while the robot should rest."""
+    """Reward for a motionless base while the robot should rest. It is phi(speed [m/s]) phi(angular speed [rad/s])."""
     if not should_rest(state):
         return 0.0
     return phi(wp.length(robot.lin_vel), std_lin_vel) * phi(wp.length(robot.ang_vel), std_ang_vel)
@@ -235,14 +258,14 @@ def base_at_rest(robot: RobotView, state: JumpState, std_lin_vel: float, std_ang
 
 @wp.func
 def tilt_over(robot: RobotView, angle: float) -> float:
-    """Return (sin(tilt) / sin(angle))^2; tilt: angle between body z and world z; angle [rad]."""
+    """Return the base's squared tilt relative to a reference tilt `angle` [rad]: (sin(tilt) / sin(angle))^2."""
     sine = wp.length(wp.vec2(robot.projected_gravity[0], robot.projected_gravity[1])) / wp.sin(angle)
     return sine * sine
 
 
 @wp.func
 def landing_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
-    """Tilt after touchdown: (sin(tilt) / sin(angle))^2; angle [rad]."""
+    """Penalty of the base's tilt after touchdown. It is (sin(tilt) / sin(angle))^2; angle [rad]."""
     if state.phase != LANDED:
         return 0.0
     return tilt_over(robot, angle)
@@ -250,7 +273,7 @@ def landing_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
 
 @wp.func
 def descent_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
-    """Tilt while the base falls in flight: (sin(tilt) / sin(angle))^2; angle [rad]."""
+    """Penalty of the base's tilt while it falls in flight. It is (sin(tilt) / sin(angle))^2; angle [rad]."""
     if state.phase != FLIGHT or robot.lin_vel[2] > 0.0:
         return 0.0
     return tilt_over(robot, angle)
@@ -258,7 +281,10 @@ def descent_tilt(robot: RobotView, state: JumpState, angle: float) -> float:
 
 @wp.func
 def lifted_again(robot: RobotView, state: JumpState, threshold: float) -> float:
-    """Lifted paws: number of paws, 0 to 4, that landed and are in the air again for more than `threshold` [s]."""
+    """Penalty of paws that leave the ground again after landing.
+
+    It is their number, 0 to 4; they count after `threshold` [s] in the air.
+    """
     count = float(0.0)
     if state.phase == LANDED:
         for k in range(4):
@@ -269,7 +295,7 @@ def lifted_again(robot: RobotView, state: JumpState, threshold: float) -> float:
 
 @wp.func
 def paws_down(robot: RobotView, state: JumpState) -> float:
-    """Paws down: number of paws on the ground, 0 to 4, after touchdown."""
+    """Reward for paws on the ground after touchdown. It is their number, 0 to 4."""
     if state.phase != LANDED:
         return 0.0
     return float(robot.contacts)
@@ -277,9 +303,10 @@ def paws_down(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def capture_point(robot: RobotView, state: JumpState, std: float) -> float:
-    """Capture point: phi_std of its horizontal distance [m] from the middle of the paws, after touchdown.
+    """Reward for keeping the capture point close to the middle of the paws after touchdown.
 
-    It is p + v sqrt(h / g), where an inverted pendulum with the base's position p, velocity v and height h stops.
+    It is phi_std of their horizontal distance [m]. The capture point is p + v sqrt(h / g), where an inverted pendulum
+    with the base's position p, velocity v and height h stops.
     """
     if state.phase != LANDED:
         return 0.0
@@ -294,7 +321,7 @@ def capture_point(robot: RobotView, state: JumpState, std: float) -> float:
 
 @wp.func
 def resting_action_rate(robot: RobotView, state: JumpState) -> float:
-    """Action rate at rest: sum over motors of the action's squared change in a step, while the robot should rest."""
+    """Penalty of changes of the action while the robot should rest. It is the sum of their squares in a step."""
     if not should_rest(state):
         return 0.0
     return square_sum(robot.action - robot.prev_action)
@@ -302,7 +329,7 @@ def resting_action_rate(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def torque_ripple(robot: RobotView, state: JumpState) -> float:
-    """Torque ripple: sum over motors of the torque's squared change [N^2 m^2], while the robot should rest."""
+    """Penalty of changes of motor torque while the robot should rest. It is the sum of their squares [N^2 m^2]."""
     if not should_rest(state):
         return 0.0
     return square_sum(robot.torque - robot.prev_torque)
@@ -310,7 +337,7 @@ def torque_ripple(robot: RobotView, state: JumpState) -> float:
 
 @wp.func
 def force_ripple(robot: RobotView, state: JumpState, weight_force: float) -> float:
-    """Force ripple: sum over paws of ((peak - last force) / weight_force [N])^2, while the robot should rest."""
+    """Penalty of varying paw forces while the robot should rest: sum of ((peak - last force) / weight_force [N])^2."""
     if not should_rest(state):
         return 0.0
     excess = robot.peak_force - robot.paw_force

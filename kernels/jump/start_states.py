@@ -71,7 +71,7 @@ class ResetRanges:
 
 @wp.struct
 class JumpStart:
-    """Values that all attempts to sample one start state of a jump share."""
+    """Inputs that all attempts to sample one start state of a jump share: start mode, goal, ranges and ground."""
 
     start_mode: int  # STANDING to PUSHING
     heading: float  # [rad] yaw
@@ -84,7 +84,7 @@ class JumpStart:
 
 @wp.struct
 class JumpBase:
-    """Sampled pose and velocity of the base in one attempt; paws are placed around `spot`."""
+    """Sampled pose and velocity of the base in one attempt at a start state; paws are placed around `spot`."""
 
     pos: wp.vec3  # [m] base origin, world
     quat: wp.quat  # xyzw, body to world
@@ -98,7 +98,10 @@ class JumpBase:
 
 @wp.func
 def start_mode_at(probability: vec_start_modes, u: float) -> int:
-    """Return the start mode in whose interval u in [0, 1) lies; mode i's interval has length probability[i]."""
+    """Return the start mode that a random number u, uniform in [0, 1), selects.
+
+    Mode i has the probability `probability[i]`.
+    """
     start_mode = int(0)
     rest = u
     for i in range(NUM_START_MODES):
@@ -110,7 +113,10 @@ def start_mode_at(probability: vec_start_modes, u: float) -> int:
 
 @wp.func
 def least_sampled_mode(probability: vec_start_modes, steps_per_mode: vec_start_modes) -> int:
-    """Return the start mode whose policy steps fall farthest short of probability times all policy steps."""
+    """Return the start mode whose policy steps so far fall farthest short of its share of all policy steps.
+
+    probability: shares of the modes, which add up to 1.
+    """
     total = float(0.0)
     for i in range(NUM_START_MODES):
         total += steps_per_mode[i]
@@ -159,7 +165,10 @@ def goal_direction(start: JumpStart) -> wp.vec3:
 
 @wp.func
 def standing_base(start: JumpStart, rng: RngStream) -> JumpBase:
-    """Return a base at rest over paws around the origin; a deeper squat may lean farther back (`lean`)."""
+    """Return the sampled base state of a standing start: at rest over paws around the origin.
+
+    A deeper squat may lean farther back (`lean`).
+    """
     ranges = start.ranges
     lower = start.base_height[0]
     upper = start.base_height[1]
@@ -174,7 +183,7 @@ def standing_base(start: JumpStart, rng: RngStream) -> JumpBase:
 
 @wp.func
 def landed_base(start: JumpStart, rng: RngStream) -> JumpBase:
-    """Return a base just after landing: over paws around the goal, moving down without horizontal velocity."""
+    """Return the sampled base state just after landing: over paws around the goal, moving straight down."""
     ranges = start.ranges
     base = JumpBase()
     base.quat = sample_quat(rng, ranges, start.heading, 0.0)
@@ -203,9 +212,10 @@ def takeoff_speed(rng: RngStream, ranges: ResetRanges, height: float, distance: 
 
 @wp.func
 def flight_base(start: JumpStart, rng: RngStream, g: float) -> JumpBase:
-    """Return a base on the ballistic flight to the goal: anywhere (IN_FLIGHT), near its end, or at takeoff (PUSHING).
+    """Return the sampled base state on the ballistic flight to the goal.
 
-    g [m/s^2]. Heights are above the ground at the origin.
+    It is anywhere on the flight (IN_FLIGHT), near its end (TOUCHDOWN) or at takeoff (PUSHING). g [m/s^2]. Heights are
+    above the ground at the origin.
     """
     ranges = start.ranges
     along = goal_direction(start)
@@ -231,7 +241,10 @@ def flight_base(start: JumpStart, rng: RngStream, g: float) -> JumpBase:
 
 @wp.func
 def touchdown_base(start: JumpStart, flight: JumpBase, rng: RngStream) -> JumpBase:
-    """Return `flight` with the base moved back from the goal; its paws (`spot`) stay below the projectile."""
+    """Return the base state shortly before touchdown: behind its ballistic flight, so that the paws are ahead of it.
+
+    flight: base on the flight; the paws (`spot`) stay below it.
+    """
     base = flight
     base.spot = wp.vec3(flight.pos[0], flight.pos[1], 0.0)
     behind = uniform_range(rng, streams.TOUCHDOWN_BEHIND, start.ranges.touchdown_behind)
@@ -241,9 +254,10 @@ def touchdown_base(start: JumpStart, flight: JumpBase, rng: RngStream) -> JumpBa
 
 @wp.func
 def pushing_base(start: JumpStart, takeoff: JumpBase, rng: RngStream) -> JumpBase:
-    """Return a base that reaches the state `takeoff` on a straight line with constant acceleration.
+    """Return the base state during push-off: on a straight line to the takeoff, with constant acceleration.
 
-    Its position and speed are those `push_length` [m] before takeoff; its paws are around the origin.
+    takeoff: state at the end of the line. Its position and speed are those `push_length` [m] before takeoff; its paws
+    are around the origin.
     """
     base = takeoff
     back = uniform_range(rng, streams.PUSH_LENGTH, start.ranges.push_length)
@@ -279,7 +293,7 @@ def sample_base(start: JumpStart, arrays: RobotArrays, rng: RngStream, attempt: 
 
 @wp.func
 def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return the sampled leg `leg` in flight, motors at rest; reachable if its paw is 0.01 m above the ground.
+    """Return sampled motor angles of leg `leg` in flight, at rest; reachable if its paw is 0.01 m above the ground.
 
     Its angles are within 0.03 rad (lateral) or 0.1 rad (outer, inner) of a value sampled once for all legs.
     """
@@ -301,7 +315,10 @@ def leg_in_flight(ranges: ResetRanges, base: JumpBase, geo: LegGeometry, rng: Rn
 
 @wp.func
 def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return the sampled leg `leg`: in flight, or with its paw on (TOUCHDOWN: above) a sampled spot of the ground."""
+    """Return sampled motor angles and rates of leg `leg`: in flight, or with its paw on a sampled spot of the ground.
+
+    Before touchdown (TOUCHDOWN) the paw is above the spot.
+    """
     ranges = start.ranges
     if start.start_mode == IN_FLIGHT:
         return leg_in_flight(ranges, base, geo, rng, leg)
@@ -325,7 +342,10 @@ def sample_leg(start: JumpStart, base: JumpBase, geo: LegGeometry, rng: RngStrea
 
 @wp.func
 def write_start(arrays: RobotArrays, scene: Scene, start: JumpStart, rng: RngStream) -> int:
-    """Write a start state to world `rng.world`, and return its mode, which is DEFAULT if no attempt is valid."""
+    """Write a sampled start state of a jump to world `rng.world`, and return its start mode.
+
+    The mode is DEFAULT if no attempt is valid.
+    """
     if start.start_mode != DEFAULT:
         if sample_valid_state(sample_base, sample_leg, start, arrays, scene, rng):
             return start.start_mode

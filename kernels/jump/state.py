@@ -13,7 +13,7 @@ vec_start_modes = wp.types.vector(length=6, dtype=wp.float32)
 
 @wp.struct
 class JumpState:
-    """Task state of one world in a jump episode."""
+    """State of the jump task in one world: goal, command, phase, and counters."""
 
     goal: wp.vec3  # [m] world: base x, y at landing, and commanded base height at the apex (0: any)
     start: wp.vec3  # [m] world, base origin where the jump began

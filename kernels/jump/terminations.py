@@ -1,4 +1,4 @@
-"""Terminations of jumps: pure functions of robot, jump and named numbers; times in policy steps of 1/60 s."""
+"""Termination terms of jumps, as functions of robot, jump and parameters; times in policy steps of 1/60 s."""
 
 import warp as wp
 

@@ -12,7 +12,7 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def begin_policy_step(arrays: RobotArrays, push: wp.array(dtype=wp.spatial_vector), push_in_flight: int, world: int):
-    """Store the base's velocity as `prev_lin_vel`, and write the base wrench: the push, or 0 if it must not act.
+    """Begin a policy step of a world: store the base's velocity as `prev_lin_vel`, and apply the push to the base.
 
     push [N], [N m]: (num_worlds,), world axes; without a paw in contact it acts only if push_in_flight is 1.
     """
@@ -51,9 +51,10 @@ def action_kernel(
     episode: EpisodeArrays,
     delays: Delays,
 ):
-    """Clamp, scale and filter the action (skills, num_worlds, 12) of each world's skill; one thread per (leg, world).
+    """Turn the policy's action into motor targets (clamp, scale, filter, delay); one thread per (leg, world).
 
-    A non-finite action counts as 0 and sets `bad_action` of its world. push: see `begin_policy_step`.
+    policy_action: (skills, num_worlds, 12), of which each world uses that of its skill. A non-finite action counts as 0
+    and sets `bad_action` of its world. push: see `begin_policy_step`.
     """
     leg, world = wp.tid()
     world += episode.first

@@ -36,7 +36,7 @@ def first_leg(rng: RngStream) -> int:
 
 @wp.func
 def leg_step(rng: RngStream) -> int:
-    """Return the stride over legs of this thread: 1 (all legs) with one lane, 4 (one leg) with 32."""
+    """Return the stride of this thread's loop over legs: 1 (all legs) with one thread a world, 4 (one leg) with 32."""
     return wp.min(rng.lanes, 4)
 
 
@@ -50,7 +50,7 @@ def all_legs(rng: RngStream, flag: bool) -> bool:
 
 @wp.func
 def vec_from_leg(v: vec3, leg: int) -> vec3:
-    """Return, in all four threads of an attempt, the vector `v` of the thread that samples leg `leg`."""
+    """Send the vector `v` of the thread that samples leg `leg` to all four threads of its attempt, and return it."""
     return vec3(from_leg_of_attempt(v[0], leg), from_leg_of_attempt(v[1], leg), from_leg_of_attempt(v[2], leg))
 
 
@@ -63,7 +63,7 @@ def sync_attempts(rng: RngStream):
 
 @wp.func
 def store_leg(leg: int, sample: LegSample, joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float)):
-    """Write motor angles [rad] and rates [rad/s] of a leg to coordinates of one world, (COORDS,) and (DOFS,)."""
+    """Write a leg's motor angles [rad] and rates [rad/s] to joint coordinates of one world, (COORDS,) and (DOFS,)."""
     store_motors(joint_q, leg_coord(0, leg), sample.angles)
     store_motors(joint_qd, leg_dof(0, leg), sample.rates)
 
@@ -73,7 +73,7 @@ def pose_is_valid(
     geometry: wp.array(dtype=LegGeometry), ground: Ground, rng: RngStream, sample: LegSample, reachable: bool,
     joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
-    """Return whether all legs of an attempt are reachable and collision-free, after gathering them from all threads.
+    """Return whether a sampled pose is valid: all legs, gathered from all threads, reachable and collision-free.
 
     sample: last leg that this thread sampled; reachable: whether all legs of this thread are. joint_q (COORDS,) and
     joint_qd (DOFS,): coordinates of the attempt, completed here.
@@ -98,9 +98,10 @@ def write_sample_and_check(
     sample_base: wp.Function, sample_leg: wp.Function, start: Any, arrays: RobotArrays, scene: Scene, rng: RngStream,
     attempt: int, joint_q: wp.array(dtype=float), joint_qd: wp.array(dtype=float),
 ) -> bool:  # fmt: skip
-    """Sample attempt `attempt` into joint_q (COORDS,) and joint_qd (DOFS,), and return whether it is valid.
+    """Sample base and legs of one attempt at a start state, and return whether the pose is valid.
 
-    sample_base, sample_leg, start: see `sample_valid_state`. rng: stream of the attempt.
+    joint_q (COORDS,), joint_qd (DOFS,): coordinates of attempt `attempt`, written here. sample_base, sample_leg, start:
+    see `sample_valid_state`. rng: stream of the attempt.
     """
     base = sample_base(start, arrays, rng, attempt)
     for j in range(3):
@@ -146,11 +147,12 @@ def write_first_valid(
 def sample_valid_state(
     sample_base: wp.Function, sample_leg: wp.Function, start: Any, arrays: RobotArrays, scene: Scene, rng: RngStream
 ) -> bool:
-    """Write the first valid sample of `ATTEMPTS` to world `rng.world`; return whether any is valid (else no write).
+    """Sample a start state by rejection: write the first valid one of `ATTEMPTS` attempts to world `rng.world`.
 
-    A task's `start_states` define start: struct of values that all attempts share, with the `ground` of the world;
-    sample_base: (start, arrays, rng, attempt) -> struct with pos [m], quat (xyzw), com_vel [m/s] and ang_vel [rad/s] of
-    the base, world axes; sample_leg: (start, base, geometry, rng, leg) -> `LegSample`.
+    Return whether any is valid; else nothing is written. A task's `start_states` define start: struct of values that
+    all attempts share, with the `ground` of the world; sample_base: (start, arrays, rng, attempt) -> struct with pos
+    [m], quat (xyzw), com_vel [m/s] and ang_vel [rad/s] of the base, world axes; sample_leg: (start, base, geometry,
+    rng, leg) -> `LegSample`.
     """
     attempt_q = wp.zeros(shape=(COORDS,), dtype=float)
     attempt_qd = wp.zeros(shape=(DOFS,), dtype=float)

@@ -14,7 +14,10 @@ MODES = {"startup": STARTUP, "reset": AT_RESET, "interval": AT_STEP}  # Stage of
 
 @wp.func
 def steps_until(rng: RngStream, least: float, most: float, step_dt: float) -> int:
-    """Return a sampled interval of at least 1 policy step: uniform from least to most [s], over step_dt [s]."""
+    """Return a sampled number of policy steps, at least 1, until an interval event is due again.
+
+    It is uniform from least to most [s], over step_dt [s].
+    """
     return wp.max(int(wp.round(uniform(rng, INTERVAL, least, most) / step_dt)), 1)
 
 
@@ -37,11 +40,12 @@ def make_event_kernel(slots: list) -> wp.Kernel:
         timer: wp.array2d(dtype=int),
         robot: RobotParameters,
     ):
-        """Run the events due at a stage in worlds of `skill` with mask != 0; launch over (events, lanes, num_worlds).
+        """Run the events (changes of robot parameters) due at a stage in worlds of `skill` with mask != 0.
 
-        first: event of the first thread. The lanes share the loops of `parallel` events; lane 0 runs all others.
-        mask: (num_worlds,). p: numbers of the task's terms. timer: (events, num_worlds), policy steps until an interval
-        event is due, 0: not set, as after a handover. An interval event is also due at a reset.
+        Launch over (events, lanes, num_worlds). first: event of the first thread. The lanes share the loops of
+        `parallel` events; lane 0 runs all others. mask: (num_worlds,). p: numbers of the task's terms. timer: (events,
+        num_worlds), policy steps until an interval event is due, 0: not set, as after a handover. An interval event is
+        also due at a reset.
         """
         row, lane, world = wp.tid()
         row += first

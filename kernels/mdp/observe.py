@@ -19,7 +19,7 @@ LANES = wp.constant(32)  # Threads that share the components of a world, so that
 
 @wp.struct
 class ObservationColumn:
-    """Index table of one component of an observation term: its source, and its columns in its group."""
+    """Indices of one scalar component of an observation term: where its value is read and written."""
 
     raw: int  # row in `ObservationArrays.raw`
     group: int  # index of the group
@@ -49,7 +49,10 @@ class ObservationArrays:
 
 @wp.func
 def load_column(columns: wp.array2d(dtype=int), component: int) -> ObservationColumn:
-    """Return the `ObservationColumn` of a component; columns: (fields of `ObservationColumn`, components)."""
+    """Return where an observation component is read and written, from the index table `columns`.
+
+    columns: (fields of `ObservationColumn`, components).
+    """
     column = ObservationColumn()
     column.raw = columns[0, component]
     column.group = columns[1, component]
@@ -68,13 +71,13 @@ def load_column(columns: wp.array2d(dtype=int), component: int) -> ObservationCo
 
 @wp.func
 def store(value: float, row: int, world: int, out: wp.array2d(dtype=float)):
-    """Write a scalar to out[row, world]."""
+    """Write the scalar value of an observation term in a world to out[row, world]."""
     out[row, world] = value
 
 
 @wp.func
 def store(value: Any, row: int, world: int, out: wp.array2d(dtype=float)):  # noqa: F811
-    """Write vector element j to out[row + j, world]."""
+    """Write element j of the vector value of an observation term in a world to out[row + j, world]."""
     for j in range(len(value)):
         out[row + j, world] = value[j]
 
@@ -101,9 +104,10 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
         # out
         raw: wp.array2d(dtype=float),
     ):
-        """Write the terms' values to raw (components, num_worlds); one thread per (chunk of terms, world of `skill`).
+        """Evaluate a task's observation terms, and write their values to raw (components, num_worlds).
 
-        after_reset 1: only where an episode or the skill has just begun, or a new command was set.
+        One thread per (chunk of terms, world of `skill`). after_reset 1: only where an episode or the skill has just
+        begun, or a new command was set.
         """
         chunk, world = wp.tid()
         world += episode.first
@@ -134,7 +138,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
 
 @wp.func
 def finite_or_zero(value: float, diverged: bool) -> float:
-    """Return value, or 0 if its world diverged or value is not finite."""
+    """Return the value of an observation, or 0 if its world diverged or the value is not finite."""
     if diverged or not wp.isfinite(value):
         return 0.0
     return value
@@ -157,7 +161,7 @@ class StepContext:
 
 @wp.func
 def step_context(episode: EpisodeArrays, arrays: ObservationArrays, world: int) -> StepContext:
-    """Return the `StepContext` of a world in this policy step."""
+    """Return what all observation components of a world share in a policy step: random key, flags and delay."""
     step_count = episode.step_count[world]
     steps = arrays.latency[world] // arrays.substeps
     m = StepContext()
@@ -175,9 +179,10 @@ def step_context(episode: EpisodeArrays, arrays: ObservationArrays, world: int) 
 
 @wp.func
 def delay_value(arrays: ObservationArrays, m: StepContext, column: int, value: float) -> float:
-    """Store value in ring buffer column `column`, and return the value delayed by the observation latency.
+    """Delay an observation component by the world's latency: store its new value, and return an earlier one.
 
-    The delayed value is linear between policy steps. Where an episode or skill begins, the ring is filled with value.
+    column: index in the ring buffer. The delayed value is linear between policy steps. Where an episode or skill
+    begins, the ring is filled with value.
     """
     if m.history_reset == BEGUN:
         for i in range(RING):
@@ -193,7 +198,7 @@ def delay_value(arrays: ObservationArrays, m: StepContext, column: int, value: f
 def postprocess(
     arrays: ObservationArrays, column: ObservationColumn, p: wp.array(dtype=float), m: StepContext, after_reset: int
 ):
-    """Write a component's observation (delayed, with noise, clipped, then scaled) as newest frame of its history.
+    """Write an observation component (delayed, with noise, clipped, then scaled) as newest frame of its history.
 
     p: numbers of the task's terms. after_reset: as in `postprocess_obs_kernel`.
     """
@@ -231,7 +236,7 @@ def postprocess_obs_kernel(
     # in, out
     arrays: ObservationArrays,
 ):
-    """Turn raw values into observations; launch over (num_worlds, LANES).
+    """Turn values of observation terms into observations: delay, noise, clip, scale; launch over (num_worlds, LANES).
 
     Non-finite values, and all rows and history of diverged worlds, are 0. after_reset 1: only where an episode or
     skill has just begun, or a new command was set; `final` stays, and so do the older frames after a command.

@@ -16,7 +16,7 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 1})  # long loops
 
 @wp.struct
 class RobotParameters:
-    """Parameters of all worlds, and their values without randomisation (`nominal_*`)."""
+    """Robot parameters of all worlds that randomisation changes, and their nominal values (`nominal_*`)."""
 
     body_mass: wp.array(dtype=float)  # [kg] (21 num_worlds,) of Newton's model, like all up to shape_mu
     body_inv_mass: wp.array(dtype=float)  # [1/kg]
@@ -190,7 +190,7 @@ def friction(
 
 @wp.func
 def physics_steps(robot: RobotParameters, seconds: float) -> int:
-    """Return a time [s] rounded to whole physics steps."""
+    """Return the number of physics steps in a time [s], rounded to the nearest."""
     return int(wp.round(seconds / robot.physics_dt))
 
 

@@ -33,13 +33,13 @@ class RngStream:
 
 @wp.func
 def step_key(seed: int, world: int, step_count: int) -> wp.uint32:
-    """Return the key from which all streams of a world in one policy step derive; step_count: policy steps made."""
+    """Return the key of all random streams of a world in one policy step; step_count: policy steps made."""
     return wp.rand_init(int(wp.rand_init(seed, world)), step_count)
 
 
 @wp.func
 def stream_at(key: wp.uint32, purpose: int, world: int, stream: int) -> RngStream:
-    """Return stream number `stream` of a world in the policy step of `key` (`step_key`), for one thread.
+    """Return random stream number `stream` of a world in the policy step of `key` (`step_key`), for one thread.
 
     purpose: index in `jumper_warp.utils.streams.PURPOSES`.
     """
@@ -53,13 +53,13 @@ def stream_at(key: wp.uint32, purpose: int, world: int, stream: int) -> RngStrea
 
 @wp.func
 def make_stream(seed: int, purpose: int, world: int, step_count: int, stream: int) -> RngStream:
-    """Return stream number `stream` of a world, for one thread; step_count: policy steps that the world has made."""
+    """Return random stream number `stream` of a world, for one thread; step_count: policy steps made by the world."""
     return stream_at(step_key(seed, world, step_count), purpose, world, stream)
 
 
 @wp.func
 def fold_in(rng: RngStream, i: int) -> RngStream:
-    """Return a stream derived from another one, independent for every i (as `jax.random.fold_in`)."""
+    """Return a random stream derived from another one, independent for every i (as `jax.random.fold_in`)."""
     branch = rng
     branch.seed = wp.rand_init(int(rng.seed), 7919 + i)
     return branch
@@ -67,17 +67,17 @@ def fold_in(rng: RngStream, i: int) -> RngStream:
 
 @wp.func
 def uniform(rng: RngStream, i: int, lower: float, upper: float) -> float:
-    """Return the i-th number of a stream, uniform in [lower, upper)."""
+    """Return the i-th random number of a stream, uniform in [lower, upper)."""
     return lower + (upper - lower) * wp.randf(wp.rand_init(int(rng.seed), rng.start + i))
 
 
 @wp.func
 def uniform_range(rng: RngStream, i: int, pair: wp.vec2) -> float:
-    """Return the i-th number of a stream, uniform in [pair[0], pair[1])."""
+    """Return the i-th random number of a stream, uniform in [pair[0], pair[1])."""
     return uniform(rng, i, pair[0], pair[1])
 
 
 @wp.func
 def clamped_normal(rng: RngStream, i: int) -> float:
-    """Return the i-th number of a stream, standard normal, clamped to [-1, 1]."""
+    """Return the i-th random number of a stream, standard normal, clamped to [-1, 1]."""
     return wp.clamp(wp.randn(wp.rand_init(int(rng.seed), rng.start + i)), -1.0, 1.0)

@@ -21,7 +21,10 @@ wp.set_module_options({"enable_backward": False})
 
 @wp.func
 def previous_state(old: Any, done: float):
-    """Return the task state `old` of the previous episode; `steps` is 0 if `Env.reset` interrupted it (done = 0)."""
+    """Return the previous episode's task state for a reset, with `steps` 0 if `Env.reset` interrupted the episode.
+
+    old: its state; done: 0 if it was interrupted.
+    """
     state = old
     if done == 0.0:
         state.steps = 0
@@ -29,7 +32,10 @@ def previous_state(old: Any, done: float):
 
 
 def make_reset_kernel(task: Any) -> wp.Kernel:
-    """Return the kernel that resets a task's worlds; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
+    """Return the kernel that begins episodes of a task and samples its commands within episodes.
+
+    task: see `jumper_warp.tasks.cfg.TaskCfg`.
+    """
     reset, due, command = task.reset.func, task.command.resample_due, task.command.resample
     settings_type, level_type = task.settings_type, task.level_type
 

@@ -1,4 +1,4 @@
-"""Reward terms that any task can use: pure functions of the robot, the task's state and named numbers."""
+"""Reward terms that any task can use, as functions of the robot's state, the task's state and parameters."""
 
 from typing import Any
 
@@ -9,19 +9,19 @@ from .view import RobotView, vec12
 
 @wp.func
 def phi(x: float, s: float) -> float:
-    """Return the Gaussian kernel phi_s(x) = exp(-x^2 / s^2) of the paper's tables; x and s in the same unit."""
+    """Return a Gaussian kernel of x, 1 at zero: phi_s(x) = exp(-x^2 / s^2) of the paper; s: width in x's unit."""
     return wp.exp(-x * x / (s * s))
 
 
 @wp.func
 def psi(x: float, s: float) -> float:
-    """Return the Laplacian kernel psi_s(x) = exp(-|x| / s) of the paper's tables; x and s in the same unit."""
+    """Return a Laplacian kernel of x, 1 at zero: psi_s(x) = exp(-|x| / s) of the paper; s: width in x's unit."""
     return wp.exp(-wp.abs(x) / s)
 
 
 @wp.func
 def square_sum(v: vec12) -> float:
-    """Return the sum of squares of the 12 elements."""
+    """Return the sum of squares of a vector of 12 motor values."""
     return wp.dot(v, v)
 
 
@@ -39,41 +39,41 @@ def posture_offset(robot: RobotView, shift: float) -> float:
 
 @wp.func
 def ground_force(robot: RobotView, state: Any, weight_force: float) -> float:
-    """Ground force L2: sum over paws of squared force over squared weight [1]; weight_force: robot's weight [N]."""
+    """Penalty of large ground forces: sum over paws of squared force over squared weight; weight_force: weight [N]."""
     return wp.dot(robot.paw_force, robot.paw_force) / (weight_force * weight_force)
 
 
 @wp.func
 def action_clip(robot: RobotView, state: Any) -> float:
-    """Action clip: sum over motors of the squared change of the target by the command filter [rad^2]."""
+    """Penalty of actions that the command filter changes. It is the sum of squared changes of targets [rad^2]."""
     return robot.clipped
 
 
 @wp.func
 def motor_torque_sq(robot: RobotView, state: Any) -> float:
-    """Motor torque: sum over motors of squared torque [N^2 m^2]."""
+    """Penalty of motor torque. It is the sum over motors of squared torque [N^2 m^2]."""
     return square_sum(robot.torque)
 
 
 @wp.func
 def joint_acceleration(robot: RobotView, state: Any) -> float:
-    """Joint acceleration: sum over motors of squared acceleration [rad^2/s^4]."""
+    """Penalty of motor acceleration. It is the sum over motors of squared acceleration [rad^2/s^4]."""
     return square_sum(robot.joint_acc)
 
 
 @wp.func
 def action_rate(robot: RobotView, state: Any) -> float:
-    """Action rate: sum over motors of the action's squared change since the previous policy step [1]."""
+    """Penalty of changes of the action. It is the sum of their squares since the previous policy step [1]."""
     return square_sum(robot.action - robot.prev_action)
 
 
 @wp.func
 def action_acceleration(robot: RobotView, state: Any) -> float:
-    """Action acceleration: sum over motors of the action's squared second difference over policy steps [1]."""
+    """Penalty of jerky actions. It is the sum of squares of the action's second difference over policy steps [1]."""
     return square_sum(robot.action - 2.0 * robot.prev_action + robot.prev_prev_action)
 
 
 @wp.func
 def collision(robot: RobotView, state: Any) -> float:
-    """Collision: 1 if anything but a paw touched the ground or links touched each other, else 0."""
+    """Penalty of collisions: 1 if anything but a paw touched the ground or links touched each other, else 0."""
     return wp.where(robot.collisions != 0, 1.0, 0.0)

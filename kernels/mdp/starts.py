@@ -30,7 +30,10 @@ class LegSample:
 
 @wp.func
 def leg_ik(geo: LegGeometry, limits: LegLimits, ankle: wp.vec3) -> LegSample:
-    """Return a leg at rest from inverse kinematics; ankle [m]: its position from the base origin, body axes."""
+    """Return the motor angles, at rest, that put a leg's ankle at a position, by inverse kinematics.
+
+    ankle [m]: position from the base origin, body axes.
+    """
     sample = LegSample()
     angles = clamped_closed_form(geo, limits, ankle - geo.hip)
     sample.angles = angles
@@ -67,7 +70,7 @@ def sample_foot_offset(
 
 @wp.func
 def quat_from_ypr(yaw: float, pitch: float, roll: float) -> wp.quat:
-    """Return the orientation (xyzw, body to world) Rz(yaw) Ry(pitch) Rx(roll); angles [rad]."""
+    """Return the orientation (xyzw, body to world) of yaw, pitch and roll [rad]: Rz(yaw) Ry(pitch) Rx(roll)."""
     return (
         wp.quat_from_axis_angle(wp.vec3(0.0, 0.0, 1.0), yaw)
         * wp.quat_from_axis_angle(wp.vec3(0.0, 1.0, 0.0), pitch)

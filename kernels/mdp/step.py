@@ -57,7 +57,10 @@ def write_step_result(
 
 
 def make_step_kernel(task: Any) -> wp.Kernel:
-    """Return the kernel that ends a policy step; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
+    """Return the kernel that ends a policy step of a task: state update, terminations, rewards and curriculum.
+
+    task: see `jumper_warp.tasks.cfg.TaskCfg`.
+    """
     (advance,), endings, rewards = (task.params.slots[name] for name in ("advance", "terminations", "rewards"))
     (curriculum,) = task.params.slots["curriculum"]
     diverged_ending = [slot.func for slot in endings].index(terminations.diverged)

@@ -1,4 +1,4 @@
-"""Terminations that any task can use: pure functions of the robot, the task's state and named numbers.
+"""Termination terms that any task can use, as functions of the robot's state, the task's state and parameters.
 
 A task's state has the number of policy steps of the episode in `steps`.
 """

@@ -107,7 +107,7 @@ def base_quat(arrays: RobotArrays, world: int) -> wp.quat:
 
 @wp.func
 def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
-    """Return the `RobotView` of a world with the fields of the base only; those of motors and paws are 0."""
+    """Return the state of a world's robot (`RobotView`) with the base's fields only; those of motors and paws are 0."""
     j = world * DOFS
     robot = RobotView()
     robot.world = world
@@ -128,7 +128,7 @@ def load_base_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView
 
 @wp.func
 def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
-    """Return the complete `RobotView` of a world."""
+    """Return the complete state of a world's robot for rewards, terminations and observations (`RobotView`)."""
     robot = load_base_view(arrays, ground, world)
     contacts = int(0)
     collisions = int(0)
@@ -173,7 +173,10 @@ def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
 
 @wp.func
 def has_diverged(robot: RobotView) -> bool:
-    """Return whether a state is not finite, or faster than 15 m/s or 40 rad/s (base) or 120 rad/s (any motor)."""
+    """Return whether the simulation of a robot diverged: its state is not finite or too fast.
+
+    Too fast is more than 15 m/s or 40 rad/s of the base, or 120 rad/s of any motor.
+    """
     fastest = float(0.0)
     total = wp.length_sq(robot.pos) + wp.length_sq(robot.lin_vel) + wp.length_sq(robot.ang_vel)
     for m in range(12):

@@ -96,7 +96,7 @@ def jump_to_turn_due(robot: RobotView, state: JumpState, requested: bool) -> boo
 
 @wp.func
 def turn_to_jump_due(robot: RobotView, state: AttitudeState, requested: bool) -> bool:
-    """Return whether turning hands back to its jump, requested or not: a paw is down, or soon (LANDING_TIME)."""
+    """Return whether turning hands back to its jump, requested or not: at contact, or shortly before the landing."""
     if robot.contacts > 0:
         return True
     if robot.gravity_magnitude <= 0.0 or robot.lin_vel[2] > 0.0:
@@ -118,7 +118,7 @@ def begin_turn(robot: RobotView, state: JumpState) -> AttitudeState:
 
 @wp.func
 def begin_landing(robot: RobotView, state: AttitudeState) -> JumpState:
-    """Return the state of the jump whose flight the turn was part of: in flight, past its apex."""
+    """Return the initial state of a jump after turning in its flight: in flight, past its apex."""
     new = JumpState()
     new.phase = FLIGHT
     new.start = state.jump_start

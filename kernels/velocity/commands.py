@@ -28,7 +28,10 @@ class CommandRanges:
 
 @wp.func
 def command_limits(ranges: CommandRanges, level: int) -> wp.vec4:
-    """Return the limits (ahead, back, side [m/s], yaw rate [rad/s]) at a level, linear from first to last range."""
+    """Return the largest commanded speeds at a curriculum level: ahead, back, side [m/s], yaw rate [rad/s].
+
+    They are linear in the level, from first to last range.
+    """
     if ranges.levels == 0:
         return ranges.first_range
     fraction = float(wp.min(level, ranges.levels)) / float(ranges.levels)

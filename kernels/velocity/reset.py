@@ -20,7 +20,7 @@ FALL_PENALTY = wp.constant(60.0)  # [m/s] subtracted from the score for a fall, 
 
 @wp.func
 def map_limit(map: TileMap) -> wp.vec2:
-    """Return the half extents [m] of the map along x and y, 0 without a map."""
+    """Return the half extents [m] of the terrain map along x and y, 0 without a map."""
     return 0.5 * map.tile * wp.vec2(float(map.rows), float(map.cols))
 
 
@@ -28,10 +28,10 @@ def map_limit(map: TileMap) -> wp.vec2:
 def carried_over(
     old: VelocityState, pos: wp.vec3, tolerance: float, command_levels: int, terrain_levels: int
 ) -> VelocityState:  # fmt: skip
-    """Return a state with the statistics of `old` and its updated curriculum levels alone; the reset sets the rest.
+    """Return a new episode's state that has only the statistics of `old` and the updated curriculum levels.
 
-    pos [m]: base at the end of the old episode. A full episode with a mean error up to `tolerance` [m/s] raises both
-    levels by 1, a fall lowers them by 1. command_levels, terrain_levels: largest levels.
+    The reset sets the other fields. pos [m]: base at the end of the old episode. A full episode with a mean error up to
+    `tolerance` [m/s] raises both levels by 1, a fall lowers them by 1. command_levels, terrain_levels: largest levels.
     """
     new = VelocityState()
     new.sum_xy = old.sum_xy

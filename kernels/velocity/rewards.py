@@ -1,6 +1,7 @@
-"""Reward terms of velocity tracking (paper, Tables III and IV): pure functions of robot, command and numbers.
+"""Reward terms of velocity tracking (paper, Tables III and IV), as functions of robot, command and parameters.
 
-phi: Gaussian kernel of `mdp.rewards`; std: its width, in the unit of its argument.
+Penalties have negative weights in the tasks, unless their values are negative. phi: Gaussian kernel of `mdp.rewards`;
+std: its width, in the unit of its argument.
 """
 
 import warp as wp
@@ -18,33 +19,33 @@ def moving(state: VelocityState) -> float:
 
 @wp.func
 def linear_velocity(robot: RobotView, state: VelocityState, std: float) -> float:
-    """Linear velocity tracking: phi_std of the horizontal velocity error [m/s], body axes."""
+    """Reward for tracking the commanded horizontal velocity. It is phi_std of the error [m/s], body axes."""
     error = velocity_error(robot, state)
     return phi(wp.length(wp.vec2(error[0], error[1])), std)
 
 
 @wp.func
 def yaw_rate(robot: RobotView, state: VelocityState, std: float) -> float:
-    """Yaw rate tracking: phi_std of the yaw rate error [rad/s]."""
+    """Reward for tracking the commanded yaw rate. It is phi_std of the error [rad/s]."""
     return phi(velocity_error(robot, state)[2], std)
 
 
 @wp.func
 def lin_vel_z_l2(robot: RobotView, state: VelocityState) -> float:
-    """Vertical velocity: square of the base's velocity along body z [m^2/s^2]."""
+    """Penalty of vertical motion of the base. It is its squared velocity along body z [m^2/s^2]."""
     up = wp.quat_rotate_inv(robot.quat, robot.lin_vel)[2]
     return up * up
 
 
 @wp.func
 def ang_vel_xy_l2(robot: RobotView, state: VelocityState) -> float:
-    """Lateral stability: sum of squared angular velocities about body x and y [rad^2/s^2]."""
+    """Penalty of rolling and pitching. It is the sum of squared angular velocities about body x and y [rad^2/s^2]."""
     return robot.ang_vel[0] * robot.ang_vel[0] + robot.ang_vel[1] * robot.ang_vel[1]
 
 
 @wp.func
 def flat_orientation_l2(robot: RobotView, state: VelocityState) -> float:
-    """Flat orientation: squared horizontal part of projected gravity [1], the squared sine of the tilt."""
+    """Penalty of the base's tilt. It is the squared sine of the tilt (horizontal part of projected gravity) [1]."""
     return (
         robot.projected_gravity[0] * robot.projected_gravity[0]
         + robot.projected_gravity[1] * robot.projected_gravity[1]
@@ -53,7 +54,7 @@ def flat_orientation_l2(robot: RobotView, state: VelocityState) -> float:
 
 @wp.func
 def standing_posture(robot: RobotView, state: VelocityState, std: float) -> float:
-    """Stance: phi_std of the rms offset [rad] of transversal motors from default, when commanded to stand."""
+    """Reward for transversal motors near the default pose when commanded to stand: phi_std of rms offset [rad]."""
     if state.standing == 0:
         return 0.0
     total = float(0.0)
@@ -66,7 +67,10 @@ def standing_posture(robot: RobotView, state: VelocityState, std: float) -> floa
 
 @wp.func
 def lateral_position(robot: RobotView, state: VelocityState, steepness: float) -> float:
-    """Lateral position: sum over lateral motors of exp(-steepness offset^8) - 1, -4 to 0; offset from default [rad]."""
+    """Penalty of lateral motors far from the default pose, -4 to 0.
+
+    It is the sum over them of exp(-steepness offset^8) - 1; offset from default [rad].
+    """
     total = float(0.0)
     for m in range(12):
         if m % 3 == 0:
@@ -77,9 +81,9 @@ def lateral_position(robot: RobotView, state: VelocityState, steepness: float) -
 
 @wp.func
 def transversal_position(robot: RobotView, state: VelocityState, steepness: float, shift: float) -> float:
-    """Transversal position: sum over transversal motors of exp(-steepness offset^20) - 1, -8 to 0.
+    """Penalty of transversal motors far from the default pose plus `shift` [rad], -8 to 0.
 
-    offset [rad]: from default plus shift [rad].
+    It is the sum over them of exp(-steepness offset^20) - 1; offset [rad].
     """
     total = float(0.0)
     for m in range(12):
@@ -92,7 +96,7 @@ def transversal_position(robot: RobotView, state: VelocityState, steepness: floa
 
 @wp.func
 def air_time(robot: RobotView, state: VelocityState, threshold: float) -> float:
-    """Air time: sum over paws that touch down of swing duration less `threshold` [s], when commanded to move."""
+    """Reward for long swings when commanded to move: swing duration less `threshold` [s], of paws that touch down."""
     total = float(0.0)
     for k in range(4):
         total += robot.first_contact[k] * (robot.air_time[k] - threshold)
@@ -101,7 +105,7 @@ def air_time(robot: RobotView, state: VelocityState, threshold: float) -> float:
 
 @wp.func
 def rapid_stepping(robot: RobotView, state: VelocityState, threshold: float) -> float:
-    """Rapid stepping: sum over paws of max(0, touchdowns in the last 0.75 s - threshold)."""
+    """Penalty of rapid stepping. It is the sum over paws of max(0, touchdowns in the last 0.75 s - threshold)."""
     total = float(0.0)
     for k in range(4):
         total += wp.max(state.recent_steps[k] - threshold, 0.0)
@@ -110,13 +114,16 @@ def rapid_stepping(robot: RobotView, state: VelocityState, threshold: float) -> 
 
 @wp.func
 def restless_stand(robot: RobotView, state: VelocityState) -> float:
-    """Restless stand: number of paws off the ground, 0 to 4, when commanded to stand."""
+    """Penalty of lifted paws when commanded to stand. It is the number of paws off the ground, 0 to 4."""
     return float(4 - robot.contacts) * (1.0 - moving(state))
 
 
 @wp.func
 def foot_clearance(robot: RobotView, state: VelocityState, target_height: float) -> float:
-    """Foot clearance: sum over paws in the air of (height - target_height [m])^2 times horizontal speed [m/s]."""
+    """Penalty of swinging paws above or below `target_height` [m].
+
+    It is the sum over paws in the air of (height - target_height [m])^2 times horizontal speed [m/s].
+    """
     total = float(0.0)
     for k in range(4):
         error = robot.paw_height[k] - target_height
@@ -127,7 +134,7 @@ def foot_clearance(robot: RobotView, state: VelocityState, target_height: float)
 
 @wp.func
 def slip(robot: RobotView, state: VelocityState) -> float:
-    """Slip: sum of squared horizontal speeds of paws on the ground [m^2/s^2]."""
+    """Penalty of paws that slip on the ground. It is the sum of their squared horizontal speeds [m^2/s^2]."""
     total = float(0.0)
     for k in range(4):
         total += robot.contact[k] * (
@@ -138,7 +145,7 @@ def slip(robot: RobotView, state: VelocityState) -> float:
 
 @wp.func
 def touchdown(robot: RobotView, state: VelocityState) -> float:
-    """Touchdown: sum over paws that touch down of squared downward speed [m^2/s^2]."""
+    """Penalty of hard touchdowns. It is the sum over paws that touch down of squared downward speed [m^2/s^2]."""
     total = float(0.0)
     for k in range(4):
         total += robot.first_contact[k] * robot.touchdown_speed[k] * robot.touchdown_speed[k]
@@ -147,7 +154,7 @@ def touchdown(robot: RobotView, state: VelocityState) -> float:
 
 @wp.func
 def torque_sign_changes(robot: RobotView, state: VelocityState) -> float:
-    """Jerk: number of motors whose torque changed its sign since the previous policy step, 0 to 12."""
+    """Penalty of jerky motor torques. It is the number of motors whose torque changed its sign in a policy step."""
     total = float(0.0)
     for m in range(12):
         total += wp.where(wp.sign(robot.torque[m]) != wp.sign(robot.prev_torque[m]), 1.0, 0.0)
@@ -156,7 +163,7 @@ def torque_sign_changes(robot: RobotView, state: VelocityState) -> float:
 
 @wp.func
 def trot_schedule(robot: RobotView, state: VelocityState, duty: float) -> float:
-    """Trot: fraction of paws whose contact fits the gait's phase, when commanded to move.
+    """Reward for trotting in phase when commanded to move: fraction of paws whose contact fits the gait's phase.
 
     FL and BR should be down in the first `duty` [1] of the cycle, FR and BL half a cycle later.
     """
@@ -175,10 +182,11 @@ def trot_schedule(robot: RobotView, state: VelocityState, duty: float) -> float:
 def shank_lean(
     robot: RobotView, state: VelocityState, threshold: float, hip: float, thigh: float, shank: float
 ) -> float:
-    """Shank lean: sum over both shanks of legs in contact of max(0, angle from vertical - threshold)^2 [rad^2].
+    """Penalty of shanks that lean more than `threshold` [rad] over a paw on the ground.
 
-    A shank that leans far over its paw can hit the edge of an adjacent step. Angles are in the leg's plane and include
-    the pitch of the base. hip: half the distance of the transversal axes [m]; thigh, shank: lengths [m].
+    It is the sum over both shanks of legs in contact of max(0, angle from vertical - threshold)^2 [rad^2]. A shank that
+    leans far over its paw can hit the edge of an adjacent step. Angles are in the leg's plane and include the pitch of
+    the base. hip: half the distance of the transversal axes [m]; thigh, shank: lengths [m].
     """
     down = wp.vec2(robot.projected_gravity[0], robot.projected_gravity[2])
     total = float(0.0)

@@ -54,7 +54,7 @@ class VelocitySettings:
 
 @wp.struct
 class VelocityStart:
-    """Values that all attempts to sample one start state of velocity tracking share."""
+    """Inputs that all attempts to sample one start state of velocity tracking share: place, ranges and ground."""
 
     spot: wp.vec2  # [m] x, y around which the base is placed
     heading: float  # [rad] yaw
@@ -65,7 +65,7 @@ class VelocityStart:
 
 @wp.struct
 class VelocityBase:
-    """Sampled pose and velocity of the base in one attempt."""
+    """Sampled pose and velocity of the base in one attempt at a start state."""
 
     pos: wp.vec3  # [m] base origin, world
     quat: wp.quat  # xyzw, body to world
@@ -77,7 +77,10 @@ class VelocityBase:
 
 @wp.func
 def sample_tile(rng: RngStream, map: TileMap, level: int) -> wp.vec2:
-    """Return the centre (x, y) [m] of a tile: row `level` (sampled if past the last), sampled column; 0 without map."""
+    """Return the centre (x, y) [m] of a sampled terrain tile in row `level` of the map, or 0 without a map.
+
+    The row is sampled too if `level` is past the last.
+    """
     if map.rows == 0:
         return wp.vec2(0.0)
     row = level
@@ -122,7 +125,10 @@ def sample_base(start: VelocityStart, arrays: RobotArrays, rng: RngStream, attem
 
 @wp.func
 def sample_leg(start: VelocityStart, base: VelocityBase, geo: LegGeometry, rng: RngStream, leg: int) -> LegSample:
-    """Return the sampled leg `leg`: paw at rest on the ground, or with `swing_probability` in the air, rates 0."""
+    """Return sampled motor angles and rates of leg `leg`: paw at rest on the ground, or lifted with rates 0.
+
+    It is lifted with `swing_probability`.
+    """
     settings = start.settings
     offset = sample_foot_offset(rng, leg, settings.front_x, settings.front_y, settings.back_x, settings.back_y)
     paw = base.pos + rotate_yaw(offset, start.heading)
@@ -145,7 +151,10 @@ def write_start(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, settings: VelocitySettings, terrain_level: int,
     rng: RngStream,
 ):  # fmt: skip
-    """Write a start state to world `rng.world`: a sampled one, or with `default_pose_probability` the default pose."""
+    """Write a start state of velocity tracking to world `rng.world`.
+
+    It is sampled, or with `default_pose_probability` the default pose.
+    """
     world = rng.world
     start = VelocityStart()
     start.spot = sample_tile(rng, settings.map, terrain_level)

@@ -11,7 +11,10 @@ vec4l = wp.types.vector(length=4, dtype=wp.int64)
 
 @wp.struct
 class VelocityState:
-    """State of velocity tracking in a world; from `sum_xy` on fields accumulate until the host reads them."""
+    """State of velocity tracking in a world: command, gait, tracking errors, curriculum levels and statistics.
+
+    Fields from `sum_xy` on accumulate until the host reads them.
+    """
 
     command: wp.vec3  # [m/s], [m/s], [rad/s] commanded velocity ahead, to the left and about z, body axes
     standing: int  # 1: commanded to stand
@@ -68,7 +71,10 @@ def update_step_counts(robot: RobotView, state: VelocityState) -> VelocityState:
 
 @wp.func
 def advance_velocity(robot: RobotView, state: VelocityState, settle: float) -> VelocityState:
-    """Return the state after one more policy step; errors count more than `settle` policy steps after a command."""
+    """Return the state of velocity tracking (errors, steps, gait phase) updated by one policy step.
+
+    Errors count more than `settle` policy steps after a command.
+    """
     t = update_step_counts(robot, state)
     t.steps = state.steps + 1
     t.command_steps = state.command_steps + 1
@@ -95,13 +101,13 @@ def advance_velocity(robot: RobotView, state: VelocityState, settle: float) -> V
 
 @wp.func
 def mean_error(state: VelocityState) -> float:
-    """Return the episode's mean error [m/s]: horizontal velocity error + 0.3 m times yaw rate error [rad/s]."""
+    """Return the episode's mean velocity error [m/s]: horizontal error + 0.3 m times yaw rate error [rad/s]."""
     return (state.error_xy + 0.3 * state.error_yaw) / wp.max(state.settled, 1.0)
 
 
 @wp.func
 def tracking_error(robot: RobotView, state: VelocityState) -> float:
-    """Return `mean_error` of the episode [m/s]; `robot` is unused (signature of curriculum errors)."""
+    """Return the episode's mean velocity error [m/s]; `robot` is unused (signature of curriculum errors)."""
     return mean_error(state)
 
 

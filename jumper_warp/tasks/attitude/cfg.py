@@ -33,7 +33,7 @@ class TurnCfg:
         check_probabilities("turn", self, "body_axis_probability")
 
     def values(self) -> Any:
-        """Return the kernels' `TurnRanges`, angles in radians."""
+        """Return the range of sampled turns as a kernel struct, `TurnRanges`, angles in radians."""
         return filled(TurnRanges(), self, degrees=("angle",))
 
 
@@ -70,7 +70,10 @@ class AttitudeResetCfg:
         return self.episode[1]
 
     def values(self, step_dt: float) -> Any:
-        """Return the kernels' `AttitudeSettings`: angles in radians, times in policy steps of step_dt [s]."""
+        """Return the ranges of start states as a kernel struct, `AttitudeSettings`.
+
+        Angles are in radians, times in policy steps of step_dt [s].
+        """
         settings = filled(AttitudeSettings(), self, skip=("episode",), degrees=("lateral", "transversal"))
         settings.episode_steps = wp.vec2(*(seconds / step_dt for seconds in self.episode))
         return settings

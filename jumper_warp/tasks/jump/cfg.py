@@ -60,7 +60,7 @@ class GroundCfg:
         return self.platform + self.block > 0.0
 
     def ranges(self) -> Any:
-        """Return the kernels' `GroundRanges`."""
+        """Return the ranges of platforms and blocks as a kernel struct, `GroundRanges`."""
         return filled(GroundRanges(), self)
 
 
@@ -87,7 +87,7 @@ class Level:
         check_probabilities("level", self, "next_jump_probability")
 
     def values(self) -> Any:
-        """Return the kernels' `JumpLevel`."""
+        """Return the curriculum level as a kernel struct, `JumpLevel`."""
         level = JumpLevel()
         level.goal_lower, level.goal_upper = wp.vec3(*self.goal_lower), wp.vec3(*self.goal_upper)
         level.base_height, level.next_jump_probability = wp.vec2(*self.base_height), self.next_jump_probability
@@ -96,9 +96,10 @@ class Level:
 
 
 def cross_levels(goals: Sequence[Level], starts: Sequence[Pair]) -> tuple[Level, ...]:
-    """Return len(goals) * len(starts) levels: each level of goals with each range of base heights [m], easiest first.
+    """Return a curriculum of each level of goals with each range of base heights [m] at the start, easiest first.
 
-    The curriculum of starts restarts with every level of goals, as in the authors' training.
+    It has len(goals) * len(starts) levels. The curriculum of starts restarts with every level of goals, as in the
+    authors' training.
     """
     return tuple(replace(goal, base_height=start) for goal, start in product(goals, starts))
 
@@ -203,7 +204,10 @@ class ResetCfg:
     """Type of the kernel struct that `values` returns."""
 
     def values(self, step_dt: float) -> Any:
-        """Return the kernels' `JumpSettings`: angles in radians, delays in policy steps of step_dt [s]."""
+        """Return the ranges of start states and grounds as a kernel struct, `JumpSettings`.
+
+        Angles are in radians, delays in policy steps of step_dt [s].
+        """
         settings = JumpSettings()
         settings.states, settings.grounds = self._ranges(step_dt), self.ground.ranges()
         return settings
@@ -218,7 +222,7 @@ class ResetCfg:
         return replace(self, ground=GroundCfg())
 
     def _ranges(self, step_dt: float) -> Any:
-        """Return the kernels' `ResetRanges`; step_dt: policy step [s]."""
+        """Return the ranges of start states as a kernel struct, `ResetRanges`; step_dt: policy step [s]."""
         degrees = (
             "tilt", "forward_pitch", "heading", "takeoff_angle", "takeoff_pitch", "flight_lateral",
             "flight_transversal",

@@ -88,12 +88,18 @@ RESET = ResetCfg(
 
 
 def level(x: tuple[float, float], y: float, next_jump_probability: float = NEXT_JUMP_PROBABILITY) -> Level:
-    """Return a level with goals x = (lower, upper) [m] ahead and up to y [m] to either side, from `STARTS[0]`."""
+    """Return a curriculum level with goals x = (lower, upper) [m] ahead and up to y [m] to either side.
+
+    Standing starts are those of `STARTS[0]`.
+    """
     return Level((x[0], -y, 0.0), (x[1], y, 0.0), STARTS[0], next_jump_probability)
 
 
 def level_all_around(ahead: float, aside: float, back: float) -> Level:
-    """Return a level with goals in an ellipse; arguments: its half axes [m] ahead, to either side and back."""
+    """Return a curriculum level with goals in an ellipse.
+
+    Arguments: its half axes [m] ahead, to either side and back.
+    """
     return Level((-back, -aside, 0.0), (ahead, aside, 0.0), STARTS[0], NEXT_JUMP_PROBABILITY, elliptical=True)
 
 

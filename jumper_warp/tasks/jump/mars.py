@@ -26,7 +26,7 @@ FARTHER = EARTH / MARS  # [1] ratio of heights and distances after the same take
 
 
 def mars_motors(lateral_torque: float) -> MotorCfg:
-    """Return the jumping motors with kp = KP and the limit TORQUE; lateral_torque: limit of the lateral ones [N m]."""
+    """Return the motors of jumps on Mars: transversal kp KP, limit TORQUE; lateral_torque: lateral limit [N m]."""
     motors = jumping_motors(TORQUE, lateral_torque=lateral_torque)
     return replace(motors, transversal=replace(motors.transversal, kp=KP))
 

@@ -60,7 +60,7 @@ class CommandCfg:
             raise InputError(f"resampling_time_range must be (lower, upper), positive and finite, got ({low}, {high})")
 
     def values(self) -> Any:
-        """Return the kernels' `CommandRanges`, times in policy steps of 1/60 s."""
+        """Return the ranges of commands as a kernel struct, `CommandRanges`, times in policy steps of 1/60 s."""
         ranges = filled(CommandRanges(), self, skip=("first_range", "last_range", "levels", "resampling_time_range"))
         ranges.first_range, ranges.last_range = wp.vec4(*self.first_range), wp.vec4(*self.last_range)
         ranges.levels = self.levels
@@ -121,7 +121,10 @@ class VelocityResetCfg:
         return self.episode
 
     def values(self, step_dt: float) -> Any:
-        """Return the kernels' `VelocitySettings`: angles in radians, times in policy steps of step_dt [s]."""
+        """Return the ranges of start states as a kernel struct, `VelocitySettings`.
+
+        Angles are in radians, times in policy steps of step_dt [s].
+        """
         settings = filled(VelocitySettings(), self, skip=("episode", "gait", "terrain"), degrees=("tilt", "heading"))
         settings.episode_steps, settings.pace = round(self.episode / step_dt), self.gait * step_dt
         tiles = TileMap()
