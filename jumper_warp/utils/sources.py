@@ -12,7 +12,7 @@ PROJECT_PREFIX = "jumper_warp."  # Prefix of the project's modules, whose conten
 
 
 def source_checksums(saved: Any) -> dict[str, str]:
-    """Return the SHA-256 by module name of the files outside the project that `saved` refers to as `module:name`.
+    """Return SHA-256 checksums, by module, of the files outside the project that `saved` refers to. As `module:name`.
 
     saved: nested dicts and lists, such as a task as JSON. Modules that are not loaded or have no file are left out.
     """
@@ -25,7 +25,7 @@ def source_checksums(saved: Any) -> dict[str, str]:
 
 
 def changed_sources(old: Any, new: dict[str, str]) -> list[str]:
-    """Return a message for each module whose checksum changed.
+    """Return a message for each user module whose file has changed since its checksum was saved.
 
     old, new: results of `source_checksums`; if `old` is not a dict, or lacks a module, nothing is reported for it.
     """
@@ -38,7 +38,7 @@ def changed_sources(old: Any, new: dict[str, str]) -> list[str]:
 
 
 def _modules(saved: Any) -> Iterator[str]:
-    """Yield the part before the colon of each string with a colon in nested dicts and lists."""
+    """Yield the modules that saved data names: the part before the colon of each string with a colon."""
     if isinstance(saved, str):
         module, colon, _ = saved.partition(":")
         if colon:
