@@ -142,7 +142,7 @@ class JumpCommand:
     """
 
     def __init__(self, takeoff_speed: float = 0.75) -> None:
-        """Start without a request; takeoff_speed: upward speed [m/s] that counts as takeoff."""
+        """Start with no jump commanded; takeoff_speed: upward speed [m/s] that counts as takeoff."""
         self._takeoff_speed = takeoff_speed
         self.requested, self.in_flight = False, False
 
@@ -151,7 +151,7 @@ class JumpCommand:
         self.requested = True
 
     def update(self, vertical_velocity: float, paws_down: int) -> float:
-        """Update the state and return `jump_command`, 0 or 1; call it once per policy step.
+        """Follow the jump through takeoff and landing, and return `jump_command`, 0 or 1. Call it once per policy step.
 
         vertical_velocity: of the base, world frame, upward positive [m/s]. paws_down: number of paws on the ground.
         """

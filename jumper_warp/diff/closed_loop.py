@@ -89,7 +89,7 @@ class ClosedLoop:
     """
 
     def __init__(self, env: Any, *, double: bool = False) -> None:
-        """Copy the robots of a `jumper_warp.envs.env.Env`; see `read_parameters`.
+        """Prepare a differentiable simulation of the robots of a `jumper_warp.envs.env.Env`. See `read_parameters`.
 
         Raises InputError: several tasks, another solver, moving blocks, sensor latency, or a history of a term that is
         not a function of the robot's state alone.
@@ -146,7 +146,7 @@ class ClosedLoop:
         return LoopState(*(part.to(self.dtype, copy=True).contiguous() for part in parts))
 
     def _history_of(self, obs: torch.Tensor) -> torch.Tensor:
-        """Return the earlier frames of terms with a history, cut from the policy's observation.
+        """Cut the earlier frames of observation terms with a history from the policy's observation.
 
         As in `LoopState.history`. obs: (num_worlds, columns of the actor).
         """

@@ -1,4 +1,4 @@
-"""Reverse pass of a differentiable rollout with one GPU thread per leg.
+"""Reverse pass of a differentiable rollout with one thread per leg.
 
 Four launches for every `SPAN` saved rows of the trajectory.
 """

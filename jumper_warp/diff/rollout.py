@@ -71,7 +71,7 @@ class Trajectory:
     """True: `initial_target` was omitted, so that the gradient w.r.t. q includes that w.r.t. initial_target."""
 
     def end(self) -> dict[str, Any]:
-        """Return the arguments of `Rollout.run` that continue after the last row: q, qd, initial_target, impulse."""
+        """Return the final state as arguments of `Rollout.run` that continue it: q, qd, initial_target, impulse."""
         state = {"q": self.q[-1], "qd": self.qd[-1], "initial_target": self.filtered_target[-1]}
         return state | {"impulse": self.impulse[self.impulse.shape[0] - 1]}
 

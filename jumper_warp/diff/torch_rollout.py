@@ -32,7 +32,7 @@ class TorchTrajectory(NamedTuple):
     filtered_target: torch.Tensor  # (T, 12, num_worlds) [rad] targets after the command filter
 
     def end(self) -> dict[str, torch.Tensor]:
-        """Return the arguments of `simulate` that continue after the last row; `impulse` has no gradient."""
+        """Return the final state as arguments of `simulate` that continue it; `impulse` has no gradient."""
         state = {"q": self.q[-1], "qd": self.qd[-1], "initial_target": self.filtered_target[-1]}
         return state | {"impulse": self.impulse[-1].detach()}
 

@@ -72,7 +72,7 @@ class Parameter:
         return (np.asarray(value) - self.nominal) / self.prior
 
     def std(self, z: float, z_std: float) -> float:
-        """Return the standard deviation [unit] of the value at z, given the standard deviation z_std of z."""
+        """Return the standard deviation [unit] of the parameter's value at z, given that of z, z_std."""
         return z_std * self.prior * (float(self.value(np.array(z))) if self.scale == "ratio" else 1.0)
 
 

@@ -39,7 +39,7 @@ class Plan:
 
     @property
     def base(self) -> Literal["free", "fixed"]:
-        """ "free": the robot stands on the ground; "fixed": it hangs from a stand."""
+        """Mounting of the robot: "free" on the ground, or "fixed" to a stand on which it hangs."""
         return "fixed" if self.kind == "hung chirp" else "free"
 
     @property
@@ -100,7 +100,7 @@ def jump_targets(ticks: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def initial_state(replay: MotionReplay, plan: Plan, robots: RobotValues) -> InitialStates:
-    """Return the initial state of a planned motion, at rest in the pose of the first targets; if free, 1 mm up."""
+    """Return a planned motion's initial state, at rest in the pose of the first targets; if free, 1 mm in the air."""
     angle, rest = plan.target[:1] - robots.offset, np.zeros((1, 12))
     height, quaternion = HANGING_HEIGHT, np.array([[0.0, 0.0, 0.0, 1.0]])
     if plan.base == "free":

@@ -1,4 +1,4 @@
-"""Residuals between a recorded motion and its simulation, over the noise, and their Jacobian by finite differences."""
+"""Residuals between a recorded motion and its simulation, divided by the noise, and their Jacobian."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ class NothingMeasured(InputError):
 
 
 class Linearised(NamedTuple):
-    """Residuals of one motion over their noise, and their Jacobian w.r.t. the normalised unknowns."""
+    """Residuals of one motion, divided by the noise, and their Jacobian w.r.t. the normalised unknowns."""
 
     residual: np.ndarray  # (m,)
     jacobian: np.ndarray  # (m, P + I) by the P parameters and the I coordinates of the initial state
 
 
 class MotionResiduals:
-    """Residuals between a recorded motion and its simulation: m differences of measured values, over the noise.
+    """The m residuals of a recorded motion: simulated minus measured values, divided by the sensor noise.
 
     Unknowns are normalised: P parameters and the I coordinates of an initial state, see `InitialStatePrior`.
     """
@@ -167,7 +167,7 @@ class MotionResiduals:
         return Linearised(residuals[:, 0], jacobian)
 
     def residuals(self, replay: MotionReplay, z: np.ndarray, start: np.ndarray) -> np.ndarray:
-        """Simulate the motion in N worlds, and return its residuals over their noise (m, N).
+        """Simulate the motion in N worlds, and return its residuals divided by the noise, (m, N).
 
         z: (N, P), start: (N, I). Infinite where a world diverges.
         """

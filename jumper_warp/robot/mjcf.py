@@ -149,7 +149,7 @@ def _add_geom(body: Element, shape: Shape, **attributes: Any) -> None:
 
 
 def _add_tendons(root: Element, robot: RobotDescription, values: RobotValues) -> None:
-    """Add the stops of each leg's outer + inner angle to the MJCF model, and springs between knees if stiff."""
+    """Add the stops of each leg's outer + inner angle to the MJCF model, and springs between its knees, if any."""
     tendons = add(root, "tendon")
     for leg in LEGS:
         stop = add(tendons, "fixed", name=f"{leg}_sum", range=robot.transversal_sum, solreflimit=(STIFFEST, 1))

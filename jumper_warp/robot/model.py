@@ -107,7 +107,7 @@ def other_colliders(model: Model) -> np.ndarray:
 def leg_geometry(description: RobotDescription) -> list[dict]:
     """Return the lengths that define each leg's geometry, one dict per leg in FL, FR, BL, BR order.
 
-    Keys: `LegGeometry`.
+    By the names of the fields of the kernels' `LegGeometry`.
     """
     return [dataclasses.asdict(leg_dimensions(description, leg)) for leg in LEGS]
 
@@ -216,9 +216,9 @@ def _add_joints(builder: newton.ModelBuilder, bodies: dict[str, int], descriptio
 def _add_paw(
     builder: newton.ModelBuilder, body: int, paw: Shape, label: str, friction: float, *, visible: bool
 ) -> None:
-    """Add a paw's collision sphere to a body of a Newton builder; visible: whether viewers show it.
+    """Add a paw's collision sphere to a body of a Newton builder.
 
-    friction: Coulomb [1].
+    friction: Coulomb coefficient [1]; visible: whether viewers show it.
     """
     config = newton.ModelBuilder.ShapeConfig(
         density=0.0,

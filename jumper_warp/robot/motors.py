@@ -207,7 +207,7 @@ def loose_filter() -> FilterCfg:
 def filter_params(cfg: FilterCfg, *, module: ModuleType = command_filter) -> Any:
     """Return the motor command filter's settings as the struct that the kernels read, angles in radians.
 
-    module: either precision.
+    module: `command_filter` in either precision.
     """
     params = module.FilterParams()
     for name in ("lateral", "transversal", "sum"):
@@ -223,7 +223,7 @@ def filter_params(cfg: FilterCfg, *, module: ModuleType = command_filter) -> Any
 def filter_constants(cfg: FilterCfg | None) -> np.ndarray:
     """Return the command filter's settings as an array (14,), in the order and units of `FILTER_NAMES`.
 
-    None: vertical jump.
+    cfg: None for the filter of vertical jumps.
     """
     cfg = cfg or vertical_jump_filter()
     angles = [getattr(getattr(cfg, angle), limit) for angle in ("lateral", "transversal", "sum") for limit in LIMITS]

@@ -99,8 +99,8 @@ class PinocchioRobot:
     def closed_velocity(self, q: np.ndarray, base_twist: np.ndarray, motor_rates: np.ndarray) -> np.ndarray:
         """Return Pinocchio's velocity v, (26,), of base and motors, with knee rates that keep the loops closed.
 
-        q: (27,). base_twist: (6,) linear velocity [m/s] of the body origin, then angular velocity [rad/s], body frame.
-        motor_rates: (12,) [rad/s], motor order.
+        q: configuration (27,). base_twist: (6,) linear velocity [m/s] of the body origin, then angular velocity
+        [rad/s], body frame. motor_rates: (12,) [rad/s], motor order.
         """
         v = np.zeros(self.model.nv)
         v[self.motor_v] = motor_rates

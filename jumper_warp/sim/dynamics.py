@@ -235,7 +235,7 @@ class JumperDynamics:
         return record
 
     def pack(self) -> None:
-        """Copy masses, joints, friction, gravity and knee springs of all worlds to the kernels' table."""
+        """Copy masses, joints, friction, gravity and knee springs of all worlds to the parameter table."""
         self.pack_masses()
         self.pack_joints()
         self.pack_friction()
@@ -243,13 +243,13 @@ class JumperDynamics:
         self.pack_springs()
 
     def pack_masses(self) -> None:
-        """Copy masses, centres of mass and inertias of all links from the model to the kernels' table."""
+        """Copy masses, centres of mass and inertias of all links from the model to the parameter table."""
         m = self.model
         arrays = [m.body_mass, m.body_com, m.body_inertia]
         self._launch(self.modules.parameters.pack_masses_kernel, (self.num_worlds, 21), arrays)
 
     def pack_joints(self) -> None:
-        """Copy armature, friction, damping and hard stops of all joints from the model to the kernels' table."""
+        """Copy armature, friction, damping and hard stops of all joints from the model to the parameter table."""
         m = self.model
         lower, upper = self.description.transversal_sum
         self._launch(
@@ -260,7 +260,7 @@ class JumperDynamics:
         )  # fmt: skip
 
     def pack_friction(self) -> None:
-        """Copy friction coefficients of paws and ground, and `static_friction_ratio`, to the kernels' table."""
+        """Copy friction coefficients of paws and ground, and `static_friction_ratio`, to the parameter table."""
         self._launch(
             self.modules.parameters.pack_friction_kernel,
             (self.num_worlds, 4),

@@ -134,7 +134,7 @@ class Anchor:
             self.actions = network.act(obs)
 
     def residuals(self, weights: torch.Tensor) -> torch.Tensor:
-        """Return the changes of the network's actions from the original ones, over action_std sqrt(m), (m, 12)."""
+        """Return changes of the network's actions from the original, divided by action_std sqrt(m), (m, 12)."""
         return self.scale * (self.network.act(self.obs, weights) - self.actions)
 
     def cost(self, weights: torch.Tensor) -> float:

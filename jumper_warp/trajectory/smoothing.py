@@ -92,7 +92,7 @@ def lagrangian(values: Values, multipliers: torch.Tensor, penalty: float) -> tor
 
 
 def crossed(knots: Knots, x: torch.Tensor, count: int, rng: np.random.Generator) -> torch.Tensor:
-    """Combine each start with other starts at random: first knots of one, last knots of another.
+    """Combine each start of the search with other starts at random: first knots of one, last knots of another.
 
     Returned: `count` crossings of each start x (n, len(knots)), (count, n, len(knots)); the other start's knots are
     shifted in time by up to `SHIFT` knots.
@@ -114,7 +114,7 @@ def _best_crossed(problem: Problem, x: torch.Tensor, stage: Stage, rng: np.rando
 
 
 def _first_multipliers(problem: Problem, x: torch.Tensor, stage: Stage) -> torch.Tensor:
-    """Return initial Lagrange multipliers (n, m) with the penalty's gradient at x; without `dual`, zeros (n, 1)."""
+    """Return initial Lagrange multipliers (n, m) with the penalty's gradient at x; if not `dual`, zeros (n, 1)."""
     if not stage.dual:
         return x.new_zeros(len(x), 1)
     with torch.no_grad():

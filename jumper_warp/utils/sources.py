@@ -12,9 +12,10 @@ PROJECT_PREFIX = "jumper_warp."  # Prefix of the project's modules, whose conten
 
 
 def source_checksums(saved: Any) -> dict[str, str]:
-    """Return SHA-256 checksums, by module, of the files outside the project that `saved` refers to. As `module:name`.
+    """Return SHA-256 checksums of the user's modules that a saved task names, by module.
 
-    saved: nested dicts and lists, such as a task as JSON. Modules that are not loaded or have no file are left out.
+    `saved` refers to them as `module:name`; files of the project are left out. saved: nested dicts and lists, such as a
+    task as JSON. Modules that are not loaded or have no file are left out.
     """
     checksums = {}
     for module in sorted(set(_modules(saved))):
