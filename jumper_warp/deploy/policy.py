@@ -1,6 +1,7 @@
-"""Inference of a policy on a robot: sensor readings to observation, action and motor targets (NumPy, ONNX Runtime).
+"""Inference of a policy on a real robot: sensor readings to observation, action and motor targets.
 
-This module imports only `jumper_warp/utils/errors.py` from the package. `docs/deployment.md` defines each reading.
+It uses NumPy and ONNX Runtime. This module imports only `jumper_warp/utils/errors.py` from the package.
+`docs/deployment.md` defines each reading.
 """
 
 from __future__ import annotations
@@ -21,9 +22,10 @@ LAST_ACTION = "last_action"  # Observation term that `DeployedPolicy` computes, 
 
 
 class DeployedPolicy:
-    """Policy that runs on a robot; `targets` performs a policy step: `observe`, `act` and `filter_targets`.
+    """Policy that runs on a real robot: `targets` turns sensor readings into motor targets.
 
-    Arrays with one value per motor, (12,), have the legs FL, FR, BL, BR in this order; each lateral, outer, inner.
+    It is a policy step: `observe`, `act` and `filter_targets`. Arrays with one value per motor, (12,), have the legs
+    FL, FR, BL, BR in this order; each lateral, outer, inner.
     """
 
     def __init__(self, file: str | Path) -> None:
@@ -46,7 +48,7 @@ class DeployedPolicy:
         self.reset()
 
     def reset(self) -> None:
-        """Clear last action and history; call it whenever the robot restarts."""
+        """Clear the policy's last action and its history of observations; call it whenever the robot restarts."""
         self.action = np.zeros(len(self.scale), dtype=np.float32)
         self._frames: dict[str, np.ndarray] = {}  # (history, columns) of each term by name, oldest frame first
 
@@ -60,16 +62,20 @@ class DeployedPolicy:
         return self.filter_targets(self.default + self.scale * action, readings["angle"], readings["rate"])
 
     def observe(self, readings: Mapping[str, Any]) -> np.ndarray:
-        """Return the observation, (num_obs,), and append the readings to the history; arguments: see `targets`."""
+        """Return the policy's observation, (num_obs,), and append the readings to the history.
+
+        Arguments: see `targets`.
+        """
         different = sorted(set(readings) ^ (set(self.layout) - {LAST_ACTION}))
         if different:
             raise InputError(f"readings missing or unknown: {', '.join(different)}")
         return np.concatenate([self._term(name, term, readings) for name, term in self.layout.items()])
 
     def _term(self, name: str, term: Mapping[str, Any], readings: Mapping[str, Any]) -> np.ndarray:
-        """Append a reading, clipped and scaled, to a term's history; return the history, (history * width,).
+        """Append a reading, clipped and scaled, to an observation term's history, and return the history.
 
-        The oldest frame is first; the first reading after `reset` fills all frames. term: entry of `layout`.
+        Shape (history * width,). The oldest frame is first; the first reading after `reset` fills all frames. term:
+        entry of `layout`.
         """
         value = self.action if name == LAST_ACTION else np.atleast_1d(np.asarray(readings[name], dtype=np.float32))
         width = (term["end"] - term["first"]) // term["history"]
@@ -83,12 +89,12 @@ class DeployedPolicy:
         return self._frames[name].ravel()
 
     def act(self, observation: np.ndarray) -> np.ndarray:
-        """Compute, store and return the action, (12,), in [-1, 1]; observation: (num_obs,) float32."""
+        """Run the policy's network and return the action, (12,), in [-1, 1]; observation: (num_obs,) float32."""
         self.action = np.asarray(self._session.run(["actions"], {"obs": observation[None]})[0])[0]
         return self.action
 
     def filter_targets(self, target: np.ndarray, angle: Any, rate: Any) -> np.ndarray:
-        """Return motor targets [rad], (12,), limited near the joint limits (`kernels/actuation/command_filter.py`).
+        """Limit motor targets [rad], (12,), near the joint limits, as `kernels/actuation/command_filter.py` does.
 
         Each angle is limited, then each leg's sum of outer and inner angle. target, angle: (12,) [rad]; rate: [rad/s].
         """
@@ -136,7 +142,7 @@ class JumpCommand:
     """
 
     def __init__(self, takeoff_speed: float = 0.75) -> None:
-        """Start without a request; takeoff_speed: upward speed [m/s] that counts as takeoff."""
+        """Start with no jump commanded; takeoff_speed: upward speed [m/s] that counts as takeoff."""
         self._takeoff_speed = takeoff_speed
         self.requested, self.in_flight = False, False
 
@@ -145,7 +151,7 @@ class JumpCommand:
         self.requested = True
 
     def update(self, vertical_velocity: float, paws_down: int) -> float:
-        """Update the state and return `jump_command`, 0 or 1; call it once per policy step.
+        """Follow the jump through takeoff and landing, and return `jump_command`, 0 or 1. Call it once per policy step.
 
         vertical_velocity: of the base, world frame, upward positive [m/s]. paws_down: number of paws on the ground.
         """

@@ -11,9 +11,10 @@ PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
 
 
 def moment_rows(body: int) -> slice:
-    """Return the slice of a body's ten rows in the parameter table: mass, 3 first and 6 second moments, see `PAIRS`.
+    """Return the rows of the parameter table that hold a body's mass and first and second moments of mass.
 
-    body: 0 is the base; then 5 links of each leg FL, FR, BL, BR, as in the model.
+    A slice of ten rows: mass, 3 first and 6 second moments, see `PAIRS`. body: 0 is the base; then 5 links of each leg
+    FL, FR, BL, BR, as in the model.
     """
     leg, link = divmod(body - 1, int(LEG_BODIES))
     first = int(BASE) if body == 0 else leg * int(LEG_ROWS) + link * MOMENT_ROWS
@@ -21,11 +22,12 @@ def moment_rows(body: int) -> slice:
 
 
 def body_gradients(table: np.ndarray, gradient: np.ndarray) -> dict[str, np.ndarray]:
-    """Return gradients w.r.t. each body's mass [kg], com [m] and inertia about its com [kg m^2], in link axes.
+    """Convert a gradient w.r.t. the parameter table to gradients w.r.t. mass, centre of mass and inertia of each body.
 
-    table, gradient: parameter table and gradient w.r.t. it, (321, num_worlds). The table holds first moments m c and
-    second moments S = 1/2 tr(I) 1 - I + m c c^T (parallel axes). Returned: mass (21, num_worlds), com (21, 3,
-    num_worlds), inertia (21, 6, num_worlds) as `PAIRS`; an off-diagonal entry stands for both symmetric entries.
+    They are w.r.t. mass [kg], com [m] and inertia about the com [kg m^2], in link axes. table, gradient: parameter
+    table and gradient w.r.t. it, (321, num_worlds). The table holds first moments m c and second moments S = 1/2 tr(I)
+    1 - I + m c c^T (parallel axes). Returned: mass (21, num_worlds), com (21, 3, num_worlds), inertia (21, 6,
+    num_worlds) as `PAIRS`; an off-diagonal entry stands for both symmetric entries.
     """
     worlds = table.shape[1]
     mass = np.zeros((int(BODIES), worlds))

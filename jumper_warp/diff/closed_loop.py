@@ -22,7 +22,10 @@ DOWN = (0.0, 0.0, -1.0)  # direction of gravity, world axes
 
 
 class LoopState(NamedTuple):
-    """State at the beginning of a policy step, worlds last, in the layout of `jumper_warp.diff.rollout.Trajectory`."""
+    """State of robots and policy at the beginning of a policy step, worlds last.
+
+    In the layout of `jumper_warp.diff.rollout.Trajectory`.
+    """
 
     q: torch.Tensor  # (19, num_worlds) base origin [m], orientation xyzw, motor angles [rad]
     qd: torch.Tensor  # (18, num_worlds) velocity of the base's COM [m/s], angular velocity, motor rates [rad/s]
@@ -33,7 +36,7 @@ class LoopState(NamedTuple):
     history: torch.Tensor  # (columns, num_worlds) earlier frames of the policy's terms with a history, oldest first
 
     def detach(self) -> LoopState:
-        """Return the state without gradients."""
+        """Return the state of robots and policy detached from the graph of PyTorch's autograd."""
         return LoopState(*(tensor.detach() for tensor in self))
 
 
@@ -50,14 +53,20 @@ class RobotState(NamedTuple):
 
 
 def rotate_inverse(quat: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-    """Return world vectors v (n, 3) in the body axes of orientations quat (n, 4), xyzw, body to world."""
+    """Rotate vectors from the world frame into the body frame of given orientations.
+
+    v: (n, 3); quat: (n, 4), xyzw, body to world.
+    """
     u, w = -quat[:, :3], quat[:, 3:]
     twice = 2.0 * torch.linalg.cross(u, v)
     return v + w * twice + torch.linalg.cross(u, twice)
 
 
 def rotate(quat: torch.Tensor, v: torch.Tensor) -> torch.Tensor:
-    """Return body vectors v (n, 3) in world axes, given orientations quat (n, 4), xyzw, body to world."""
+    """Rotate vectors from the body frame of given orientations into the world frame.
+
+    v: (n, 3); quat: (n, 4), xyzw, body to world.
+    """
     return rotate_inverse(quat * quat.new_tensor([-1.0, -1.0, -1.0, 1.0]), v)
 
 
@@ -80,7 +89,7 @@ class ClosedLoop:
     """
 
     def __init__(self, env: Any, *, double: bool = False) -> None:
-        """Copy the robots of a `jumper_warp.envs.env.Env`; see `read_parameters`.
+        """Prepare a differentiable simulation of the robots of a `jumper_warp.envs.env.Env`. See `read_parameters`.
 
         Raises InputError: several tasks, another solver, moving blocks, sensor latency, or a history of a term that is
         not a function of the robot's state alone.
@@ -117,7 +126,10 @@ class ClosedLoop:
         self.read_parameters()
 
     def read_parameters(self) -> dict[str, torch.Tensor]:
-        """Copy the robots' parameters into the rollout; return copies by name, shapes as in `Rollout.parameters`."""
+        """Copy the environment's robot parameters, such as masses, into the differentiable rollout, and return copies.
+
+        By name, shapes as in `Rollout.parameters`.
+        """
         robots: Snapshot = self.env.snapshot()
         parameters = {name: tensor.to(self.dtype, copy=True) for name, tensor in robots.parameters.items()}
         for name, tensor in parameters.items():
@@ -134,24 +146,30 @@ class ClosedLoop:
         return LoopState(*(part.to(self.dtype, copy=True).contiguous() for part in parts))
 
     def _history_of(self, obs: torch.Tensor) -> torch.Tensor:
-        """Return `LoopState.history` from the policy's observation (num_worlds, columns of the actor)."""
+        """Cut the earlier frames of observation terms with a history from the policy's observation.
+
+        As in `LoopState.history`. obs: (num_worlds, columns of the actor).
+        """
         ends = [(first, end - term.width) for term, first, end in self._history_terms]
         return torch.cat([obs[:, first:last] for first, last in ends] or [obs[:, :0]], 1).T
 
     def _histories(self, state: LoopState) -> list[torch.Tensor]:
-        """Return the earlier frames of each of `_history_terms`, (num_worlds, term's frames * width) each."""
+        """Return the earlier frames of each observation term that has a history, (num_worlds, frames * width) each."""
         counts = [end - first - term.width for term, first, end in self._history_terms]
         return list(state.history.T.split(counts, 1)) if counts else []
 
     def _next_history(self, state: LoopState) -> torch.Tensor:
-        """Return the next `LoopState.history`: each term drops its oldest frame and appends its frame at `state`."""
+        """Return the observation history for the next policy step.
+
+        Each term drops its oldest frame and appends its frame at `state`, as in `LoopState.history`.
+        """
         motion, frames = self.motion(state), []
         for (term, _, _), past in zip(self._history_terms, self._histories(state), strict=True):
             frames += [past[:, term.width :], self._frame(term, motion, state, past[:, : term.width])]
         return torch.cat(frames, 1).T if frames else state.history
 
     def _frame(self, term: Any, motion: RobotState, state: LoopState, observed: torch.Tensor) -> torch.Tensor:
-        """Return a term's scaled and clipped observation at a state, (num_worlds, width).
+        """Return one observation term computed from the robot's state, scaled and clipped, (num_worlds, width).
 
         motion: of the state. observed: the environment's observation of the term, (num_worlds, width).
         """
@@ -165,10 +183,11 @@ class ClosedLoop:
         wrench: torch.Tensor | None = None,
         parameters: dict[str, torch.Tensor] | None = None,
     ) -> LoopState:
-        """Return the state after one policy step; latencies must be at most a policy step.
+        """Return the state of robots and policy after one differentiable policy step.
 
-        action: (num_worlds, 12), clamped to ±1. wrench: force [N] and moment [N m] on the base, (6, num_worlds).
-        parameters: from `read_parameters`, restored for the reverse pass; by default the rollout's current parameters.
+        Latencies must be at most a policy step. action: (num_worlds, 12), clamped to ±1. wrench: force [N] and moment
+        [N m] on the base, (6, num_worlds). parameters: from `read_parameters`, restored for the reverse pass; by
+        default the rollout's current parameters.
         """
         clamped = action.clamp(-1.0, 1.0).T
         targets = clamped * self.scale[:, None] + self.default[:, None]
@@ -180,7 +199,7 @@ class ClosedLoop:
         return LoopState(**end, action=clamped, torque=trajectory.torque[-1], history=history)
 
     def motion(self, state: LoopState) -> RobotState:
-        """Return the `RobotState` (base and motors, worlds first) of a loop state."""
+        """Return pose, velocity and motor angles of the robots, worlds first, from the state of the closed loop."""
         q, qd = state.q.T, state.qd.T
         quat = q[:, 3:7] / q[:, 3:7].norm(dim=1, keepdim=True)
         ang = qd[:, 3:6]
@@ -189,9 +208,10 @@ class ClosedLoop:
         return RobotState(q[:, :3], quat, lin_vel, rotate_inverse(quat, ang), gravity, q[:, 7:], qd[:, 6:])
 
     def observe(self, state: LoopState, observed: torch.Tensor, group: str = "actor") -> torch.Tensor:
-        """Return the observation of a group, "actor" or "critic", at a state, (num_worlds, columns), without noise.
+        """Return the observation of the actor or critic as a differentiable function of the state, without noise.
 
-        observed: the environment's observation of the group, for columns without derivatives, such as commands.
+        group: "actor" or "critic". Returned: (num_worlds, columns). observed: the environment's observation of the
+        group, for columns without derivatives, such as commands.
         """
         motion, columns, histories = self.motion(state), [], iter(self._histories(state))
         for term, first, end in self._columns[group]:
@@ -203,10 +223,11 @@ class ClosedLoop:
         return torch.cat(columns, 1)
 
     def step(self, state: LoopState, action: torch.Tensor) -> tuple[LoopState, LoopState]:
-        """Step the environment; return (next state after resets, state of the rollout before resets).
+        """Step the environment and the differentiable rollout, and return their states after the step.
 
-        The next state has the environment's values with derivatives; a world that was reset has no gradient. action:
-        (num_worlds, 12). state: the environment's current state, from the method `state` or the last `step`.
+        Returned: (next state after resets, state of the rollout before resets). The next state has the environment's
+        values with derivatives; a world that was reset has no gradient. action: (num_worlds, 12). state: the
+        environment's current state, from the method `state` or the last `step`.
         """
         env = self.env
         parameters = self.read_parameters() if self.randomizes else None
@@ -223,14 +244,17 @@ class ClosedLoop:
         return LoopState(*parts), simulated
 
     def observation(self, state: LoopState) -> torch.Tensor:
-        """Return the environment's observation (num_worlds, columns), with noise and derivatives w.r.t. `state`."""
+        """Return the environment's observation with noise, and with derivatives w.r.t. `state`.
+
+        Shape (num_worlds, columns).
+        """
         return with_gradient_of(self.env.obs.to(self.dtype), self.observe(state, self.env.obs))
 
 
 def _goal_offset(loop: ClosedLoop, motion: RobotState, state: LoopState, observed: torch.Tensor) -> torch.Tensor:
-    """Return the observed offset from base to goal (n, 2) [m], body yaw frame, with derivatives w.r.t. the base's pose.
+    """Return the observed offset from base to goal [m], with derivatives w.r.t. the base's pose.
 
-    A goal observed at (0, 0) has no derivative.
+    Shape (n, 2), body yaw frame. A goal observed at (0, 0) has no derivative.
     """
     heading = heading_of(motion.quat)
     cos, sin = torch.cos(heading), torch.sin(heading)
@@ -241,7 +265,10 @@ def _goal_offset(loop: ClosedLoop, motion: RobotState, state: LoopState, observe
 
 
 def _height_errors(loop: ClosedLoop, motion: RobotState, state: LoopState, observed: torch.Tensor) -> torch.Tensor:
-    """Return the observed height errors (n, 2) [m]; the second one, of the ballistic apex, has derivatives."""
+    """Return the observed height errors of a jump [m], of which that of the ballistic apex has derivatives.
+
+    Shape (n, 2); the apex is the second one.
+    """
     apex = motion.pos[:, 2] + motion.lin_vel[:, 2].clamp(min=0.0).square() / (2.0 * loop.task.gravity)
     return torch.stack([observed[:, 0], with_gradient_of(observed[:, 1], apex)], 1)
 

@@ -15,9 +15,9 @@ WORLD_NORM = 100.0  # default of `DifferentiableEnv.world_norm`
 
 
 class DifferentiableEnv:
-    """Environment with gradients of observations and rewards (`jumper_warp.envs.vec_env.DifferentiableVecEnv`).
+    """Environment whose observations and rewards PyTorch can differentiate w.r.t. the actions.
 
-    All other attributes are those of the wrapped environment.
+    See `jumper_warp.envs.vec_env.DifferentiableVecEnv`. All other attributes are those of the wrapped environment.
     """
 
     def __init__(self, env: Any, world_norm: float = WORLD_NORM) -> None:
@@ -37,26 +37,35 @@ class DifferentiableEnv:
         return getattr(self.env, name)
 
     def begin_window(self) -> None:
-        """Start a window: the current state becomes a constant, at which backpropagation ends."""
+        """Start a window of policy steps; the current state becomes a constant, at which backpropagation ends."""
         self._state = self.loop.state()
 
     def observe(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return `obs`, `critic_obs` (num_envs, columns) with derivatives w.r.t. the window's earlier actions."""
+        """Return the observations of actor and critic, with derivatives w.r.t. the window's earlier actions.
+
+        `obs`, `critic_obs` (num_envs, columns).
+        """
         return self._observe_both(self._state, self.env.obs, self.env.critic_obs)
 
     def observe_final(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return `final_obs` and `final_critic_obs` of the last step, before resets, with derivatives as `observe`."""
+        """Return the observations of actor and critic after the last step, before resets, with derivatives.
+
+        `final_obs` and `final_critic_obs`, derivatives as `observe`.
+        """
         return self._observe_both(self._final, self.env.final_obs, self.env.final_critic_obs)
 
     def _observe_both(
         self, state: LoopState, obs: torch.Tensor, critic_obs: torch.Tensor
     ) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return the values obs and critic_obs with their derivatives w.r.t. `state`."""
+        """Return the observations of actor and critic with their derivatives w.r.t. `state`.
+
+        Values are those of obs and critic_obs.
+        """
         critic = self.loop.observe(state, critic_obs, "critic")
         return with_gradient_of(obs, self.loop.observe(state, obs)), with_gradient_of(critic_obs, critic)
 
     def step_with_gradient(self, action: torch.Tensor) -> torch.Tensor:
-        """Step the environment; return the reward (num_envs,) with the derivatives of its terms in `SMOOTH`.
+        """Step the environment, and return the reward (num_envs,) with derivatives of its terms in `SMOOTH`.
 
         action: (num_envs, 12), clamped to ±1. The last reward of an episode has no derivative. Call `begin_window`
         first, and no `step` within a window.
@@ -70,7 +79,7 @@ class DifferentiableEnv:
         return with_gradient_of(env.reward.clone(), smooth)
 
     def _clip_gradient(self, part: torch.Tensor) -> torch.Tensor:
-        """Return a copy of a part of `LoopState` whose gradient is clipped by `clip_norm`."""
+        """Return a copy of one array of the state whose gradient is clipped in the reverse pass."""
         if not part.requires_grad:
             return part
         part = part * 1.0  # a new tensor, whose gradient sums all uses
@@ -79,7 +88,10 @@ class DifferentiableEnv:
 
 
 def clip_norm(max_norm: float) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Return a hook that clips the norm of each world's gradient (rows, num_worlds) and zeroes non-finite ones."""
+    """Return a gradient hook that limits the gradient's norm in each world and zeroes non-finite gradients.
+
+    Gradients: (rows, num_worlds).
+    """
 
     def clip(grad: torch.Tensor) -> torch.Tensor:
         grad = torch.where(grad.isfinite().all(0, keepdim=True), grad, 0.0)

@@ -1,4 +1,7 @@
-"""Reverse pass of a rollout with a thread per leg: four launches for every `SPAN` rows."""
+"""Reverse pass of a differentiable rollout with one thread per leg.
+
+Four launches for every `SPAN` saved rows of the trajectory.
+"""
 
 from __future__ import annotations
 
@@ -12,10 +15,16 @@ SPAN = 4  # rows that one set of launches reverses
 
 
 class LegThreadReverse:
-    """Launcher of the kernels of `rollout_legs_adjoint` and `constants_adjoint` in `jumper_warp.kernels.dynamics`."""
+    """Launcher of the kernels that backpropagate through a rollout with a thread per leg.
+
+    The kernels are `rollout_legs_adjoint` and `constants_adjoint` in `jumper_warp.kernels.dynamics`.
+    """
 
     def __init__(self, dynamics: JumperDynamics, every: int):
-        """Allocate the kernels' record of `SPAN` rows; every: physics steps between rows of a trajectory."""
+        """Allocate the record of `SPAN` rows of the trajectory that the reverse kernels recompute.
+
+        every: physics steps between rows of a trajectory.
+        """
         self._dynamics, self._modules = dynamics, dynamics.modules
         self._device, self._num = dynamics.model.device, dynamics.model.world_count
         module, shape = self._modules.leg_record, {"dtype": dynamics.real, "device": self._device}
@@ -25,11 +34,12 @@ class LegThreadReverse:
         self._record.legs = wp.zeros((entries, int(module.LEG_FIELDS), self._num, 4), **shape)
 
     def run(self, settings: Any, motion: list[Any], cotangents: Any, gradients: Any) -> None:
-        """Add the rollout's gradients to `gradients` (`Gradients`); its q and qd must hold the last row's cotangents.
+        """Backpropagate through a rollout, and add the gradients w.r.t. its inputs to `gradients`.
 
-        All arguments are structs of the kernels. settings: `StepSettings`. motion: [`Timing`, `Actuation`, `Commands`,
-        filtered targets (T, 12, num_worlds), `TrajectoryArrays`] of the rollout. cotangents: `TrajectoryArrays`, the
-        gradient of the loss w.r.t. the rollout's.
+        `gradients`: `Gradients`; its q and qd must hold the last row's cotangents. All arguments are structs of the
+        kernels. settings: `StepSettings`. motion: [`Timing`, `Actuation`, `Commands`, filtered targets (T, 12,
+        num_worlds), `TrajectoryArrays`] of the rollout. cotangents: `TrajectoryArrays`, the gradient of the loss w.r.t.
+        the rollout's.
         """
         robot, record, num = self._dynamics.robot, self._record, self._num
         legs, constants = self._modules.rollout_legs_adjoint, self._modules.constants_adjoint

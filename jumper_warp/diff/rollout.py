@@ -48,10 +48,11 @@ GEOMETRY_NAMES = (
 
 @dataclass(frozen=True)
 class Trajectory:
-    """Trajectory of T policy steps of S physics steps, with a row every `every` physics steps, K = T S / every.
+    """Recorded states, torques and impulses of a rollout over policy steps, for all worlds.
 
-    Arrays have the rollout's precision, worlds last. A cotangent (gradient of a loss w.r.t. an array) has its shape.
-    Motors and paws are ordered by leg FL, FR, BL, BR; motors of a leg: lateral, outer, inner.
+    T policy steps of S physics steps; a row every `every` physics steps, K = T S / every. Arrays have the rollout's
+    precision, worlds last. A cotangent (gradient of a loss w.r.t. an array) has its shape. Motors and paws are ordered
+    by leg FL, FR, BL, BR; motors of a leg: lateral, outer, inner.
     """
 
     q: wp.array
@@ -70,17 +71,17 @@ class Trajectory:
     """True: `initial_target` was omitted, so that the gradient w.r.t. q includes that w.r.t. initial_target."""
 
     def end(self) -> dict[str, Any]:
-        """Return the arguments of `Rollout.run` that continue after the last row: q, qd, initial_target, impulse."""
+        """Return the final state as arguments of `Rollout.run` that continue it: q, qd, initial_target, impulse."""
         state = {"q": self.q[-1], "qd": self.qd[-1], "initial_target": self.filtered_target[-1]}
         return state | {"impulse": self.impulse[self.impulse.shape[0] - 1]}
 
 
 class Rollout:
-    """Forward and reverse simulation of worlds over policy steps, in single or double precision.
+    """Differentiable simulation of many worlds over policy steps: forward and reverse pass.
 
-    Gradients are exact at the contact modes and branches of filter and motors of the forward pass
-    (`adjoint.step_adjoint`). The worlds' parameters are the arrays in `parameters`; write to them only between a
-    reverse pass and the next forward pass.
+    In single or double precision. Gradients are exact at the contact modes and branches of filter and motors of the
+    forward pass (`adjoint.step_adjoint`). The worlds' parameters are the arrays in `parameters`; write to them only
+    between a reverse pass and the next forward pass.
 
     Args:
         model: The robot's worlds, as `jumper_warp.robot.model.build_model` returns it, without moving blocks.
@@ -149,7 +150,10 @@ class Rollout:
         self._launched: set[str] = set()
 
     def _make_actuation(self, cfg: MotorCfg, command_filter: FilterCfg | None) -> Any:
-        """Return the kernels' `Actuation` of all worlds' motors and command filter, with zero latency."""
+        """Return the constants of motors, latency and command filter of all worlds as the struct that the kernels read.
+
+        The latency is zero.
+        """
         modules, n = self.dynamics.modules, self.num_worlds
         actuation = modules.trajectory.Actuation()
         actuation.motors = motor_arrays(cfg, n, module=modules.motors, device=self.device)
@@ -160,7 +164,10 @@ class Rollout:
         return actuation
 
     def standing(self) -> tuple[np.ndarray, np.ndarray]:
-        """Return q (19, num_worlds) and qd (18, num_worlds) of the model's initial pose at rest, see `Trajectory`."""
+        """Return the model's initial standing pose at rest, as coordinates and rates of base and motors.
+
+        q (19, num_worlds) and qd (18, num_worlds), see `Trajectory`.
+        """
         return compact(self.dynamics.model.joint_q.numpy(), np.zeros(38 * self.num_worlds), self.num_worlds)
 
     def hold(self, worlds: Any = True) -> None:
@@ -174,12 +181,18 @@ class Rollout:
         self.dynamics.robot.held = wp.array(held, dtype=int, device=self.device)
 
     def geometry(self) -> np.ndarray:
-        """Return the legs' lengths [m], (4 legs, 10 `GEOMETRY_NAMES`), which all worlds share."""
+        """Return the lengths [m] that define the geometry of the four legs, which all worlds share.
+
+        Shape (4 legs, 10 `GEOMETRY_NAMES`).
+        """
         legs = self.dynamics.robot.geometry.numpy()
         return np.column_stack([legs["hip"], *(legs[name] for name in GEOMETRY_NAMES[3:])]).astype(np.float64)
 
     def set_geometry(self, lengths: np.ndarray) -> None:
-        """Write the legs' lengths (4, 10) [m], see `geometry`. Raises InputError: another shape, or not finite."""
+        """Set the lengths [m] that define the geometry of the four legs in all worlds.
+
+        lengths: (4, 10), see `geometry`. Raises InputError: another shape, or not finite.
+        """
         if np.shape(lengths) != (4, len(GEOMETRY_NAMES)):
             raise InputError(f"geometry must have shape (4, {len(GEOMETRY_NAMES)}), got {np.shape(lengths)}")
         if not np.isfinite(lengths).all():
@@ -200,7 +213,7 @@ class Rollout:
         wrench: Any = None,
         impulse: wp.array | None = None,
     ) -> Trajectory:
-        """Return the trajectory of all worlds over T policy steps.
+        """Simulate all worlds over T policy steps, and return their trajectory.
 
         Args (arrays of Warp or NumPy; a NumPy array without the last axis holds for all worlds):
             targets: Motor targets before the command filter [rad], (T, 12, num_worlds).
@@ -261,7 +274,7 @@ class Rollout:
         impulse: wp.array | None = None,
         filtered_target: wp.array | None = None,
     ) -> dict[str, wp.array]:
-        """Return the gradient of each world's loss w.r.t. the inputs of a rollout, given that w.r.t. the trajectory.
+        """Return the gradients of the worlds' losses w.r.t. the rollout's inputs, from those w.r.t. its trajectory.
 
         q, qd, torque, impulse, filtered_target: cotangents, the gradients of the loss w.r.t. these arrays of
         `trajectory`, of the same shapes and types; None: zero. The parameters must be those of the forward pass.
@@ -307,9 +320,9 @@ class Rollout:
         return by_inputs | {"initial_target": gradients.initial_target} | self._split_parameters(gradients.parameters)
 
     def _cotangents(self, trajectory: Trajectory, by_outputs: dict[str, wp.array | None]) -> Any:
-        """Return gradients w.r.t. arrays of a trajectory as `TrajectoryArrays`; empty for None and filtered_target.
+        """Collect the gradients of the loss w.r.t. the arrays of a trajectory in a struct for the reverse kernels.
 
-        Raises InputError: another shape or type than the trajectory's array.
+        Empty for None and filtered_target. Raises InputError: another shape or type than the trajectory's array.
         """
         cotangents = self.dynamics.modules.trajectory.TrajectoryArrays()
         for name, array in by_outputs.items():
@@ -327,7 +340,10 @@ class Rollout:
         return cotangents
 
     def _split_parameters(self, gradient: Any) -> dict[str, wp.array]:
-        """Return views of gradient (GRADIENT_ROWS, num_worlds) by name, shaped as `parameters` and `geometry`."""
+        """Split the gradient w.r.t. all robot parameters into views by parameter name.
+
+        gradient: (GRADIENT_ROWS, num_worlds); views are shaped as `parameters` and `geometry`.
+        """
         names, first = {}, 0
         for name, array in self.parameters.items():
             count = 1 if array.ndim == 1 else array.shape[0]
@@ -336,13 +352,13 @@ class Rollout:
         return names | {"geometry": gradient[first:].reshape((4, len(GEOMETRY_NAMES), self.num_worlds))}
 
     def _timing(self, count: int) -> Any:
-        """Return the `Timing` of `count` policy steps; `every`: physics steps between saved rows."""
+        """Return the numbers of policy and physics steps of a rollout as the struct that the kernels read."""
         timing = self.dynamics.modules.trajectory.Timing()
         timing.steps, timing.substeps, timing.every = count, self.substeps, self.every
         return timing
 
     def _rows(self, count: int) -> Any:
-        """Return uninitialised `TrajectoryArrays` for a `Trajectory` of `count` policy steps."""
+        """Allocate the arrays of a `Trajectory` of `count` policy steps, uninitialised."""
         steps, n = count * self.substeps, self.num_worlds
         rows = self.dynamics.modules.trajectory.TrajectoryArrays()
         rows.q, rows.qd = (self._empty(steps // self.every + 1, size, n) for size in (19, 18))
@@ -377,9 +393,10 @@ class Rollout:
         self._launched.add(kernel.key)
 
     def _input(self, name: str, values: Any, shape: tuple[int, ...]) -> wp.array:
-        """Return an argument `name` of `run` as a Warp array (*shape, num_worlds); NumPy values may lack the last axis.
+        """Return an argument of `run` as a Warp array, after a check of its shape, type and values.
 
-        Raises InputError: another shape or type, or NumPy values that are not finite.
+        Shape (*shape, num_worlds); NumPy values may lack the last axis. name: of the argument, for messages. Raises
+        InputError: another shape or type, or NumPy values that are not finite.
         """
         full = (*shape, self.num_worlds)
         if isinstance(values, wp.array):
@@ -413,9 +430,10 @@ class Rollout:
 
 
 def compact(joint_q: np.ndarray, joint_qd: np.ndarray, num_worlds: int = 1) -> tuple[np.ndarray, np.ndarray]:
-    """Return q (19, num_worlds) and qd (18, num_worlds), as in `Trajectory`, from Newton's coordinates and rates.
+    """Extract coordinates and rates of base and motors from Newton's joint arrays.
 
-    joint_q: 43 values for each world; joint_qd: 38 for each world; both of any shape, world by world.
+    Returned: q (19, num_worlds) and qd (18, num_worlds), as in `Trajectory`. joint_q: 43 values for each world;
+    joint_qd: 38 for each world; both of any shape, world by world.
     """
     joint_q, joint_qd = np.reshape(joint_q, (num_worlds, 43)), np.reshape(joint_qd, (num_worlds, 38))
     q = np.concatenate([joint_q[:, :7], motor_values(joint_q[:, 7:])], axis=1)

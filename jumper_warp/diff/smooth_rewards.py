@@ -1,4 +1,4 @@
-"""Rewards of the vertical jump as smooth functions of the robot's state, for their derivatives.
+"""Rewards of the vertical jump as differentiable functions of the robot's state.
 
 Reward values always come from the environment. Terms that count steps or events (lifted paws) or depend on forces and
 decelerations at impacts have no derivative. Phases (stance, flight, landed) switch terms without depending on the
@@ -20,7 +20,10 @@ LANDING, RECOVERED = 18, 30  # policy steps after touchdown that count as landin
 
 
 class RewardContext(NamedTuple):
-    """Inputs of the rewards of a policy step, n worlds; phases and flags are those at the end of the step."""
+    """Quantities from which the rewards of a policy step are computed, n worlds.
+
+    Phases and flags are those at the end of the step.
+    """
 
     motion: RobotState  # at the end of the step
     prev_motion: RobotState  # at the beginning of the step
@@ -41,7 +44,10 @@ class RewardContext(NamedTuple):
 def make_context(
     loop: ClosedLoop, state: LoopState, prev_state: LoopState, arrays: Mapping[str, np.ndarray]
 ) -> RewardContext:
-    """Return the rewards' inputs of a policy step from prev_state to state; arrays: `Env.task_arrays` before resets."""
+    """Collect the quantities from which the rewards of a policy step are computed.
+
+    The step leads from prev_state to state; arrays: `Env.task_arrays` before resets.
+    """
 
     def tensor(values: np.ndarray) -> torch.Tensor:
         return torch.as_tensor(np.ascontiguousarray(values), device=state.q.device)
@@ -59,7 +65,10 @@ def make_context(
 
 
 def gaussian(squared: torch.Tensor, std: float) -> torch.Tensor:
-    """Return exp(-squared / std^2), of the shape of `squared`; std: width in the unit of the error."""
+    """Gaussian kernel of an error, 1 at zero error: exp(-squared / std^2).
+
+    Shape of `squared`, the squared error; std: width in the unit of the error.
+    """
     return torch.exp(-squared / std**2)
 
 
@@ -87,23 +96,23 @@ def height_closeness(ctx: RewardContext, const: Mapping[str, float]) -> torch.Te
 
 
 def waiting_scale(ctx: RewardContext, const: Mapping[str, float]) -> torch.Tensor:
-    """Return the factor of a reward, (n,): the constant `waiting_scale` while a jump is due, else 1."""
+    """Return the factor that scales a reward while a jump is due: the constant `waiting_scale`, else 1. Shape (n,)."""
     return torch.where(ctx.jump_due, const["waiting_scale"], 1.0)
 
 
 def posture(ctx: RewardContext, const: Mapping[str, float], shift: float) -> torch.Tensor:
-    """Return the closeness [1] of the angles to the default pose, (n,); shift [rad]: added to transversal motors.
+    """Return a measure of closeness [1] of the motor angles to the default pose, 1 at the pose.
 
-    Constants: std [rad].
+    Shape (n,); shift [rad]: added to transversal motors. Constants: std [rad].
     """
     shifts = ctx.default.new_tensor(4 * [0.0, shift, shift])
     return gaussian((ctx.motion.angle - ctx.default - shifts).square().mean(1), const["std"])
 
 
 def symmetry(ctx: RewardContext, const: Mapping[str, float]) -> torch.Tensor:
-    """Return the closeness [1] of transversal angles to each other, times that of lateral angles to 0, (n,).
+    """Return a measure of symmetry [1] of the legs: equal transversal angles and lateral angles of 0.
 
-    Constants: std_variance [rad^2], std_lateral [rad], waiting_scale [1].
+    Shape (n,), the product of both closenesses. Constants: std_variance [rad^2], std_lateral [rad], waiting_scale [1].
     """
     legs = ctx.motion.angle.view(-1, 4, 3)
     spread = legs[:, :, 1:].flatten(1).var(1, correction=0)
@@ -151,7 +160,10 @@ SMOOTH: dict[str, Smooth] = {
 
 
 def smooth_reward(task: Any, context: RewardContext) -> torch.Tensor:
-    """Return the weighted sum (n,) of rewards in `SMOOTH`, times the policy step where `scale_by_dt` is set."""
+    """Return the differentiable part of the reward: the weighted sum (n,) of the terms in `SMOOTH`.
+
+    Times the policy step where `scale_by_dt` is set.
+    """
     total = torch.zeros_like(context.goal)
     for term in task.rewards:
         if term.func.key in SMOOTH:

@@ -1,4 +1,4 @@
-"""Snapshot of an environment for gradients: its robots, their parameters and their state."""
+"""Snapshot of an environment's robots: state and parameters from which gradients are computed."""
 
 from __future__ import annotations
 
@@ -37,9 +37,10 @@ class Snapshot(NamedTuple):
 
 
 def compact_columns(joint_values: torch.Tensor, base: int) -> torch.Tensor:
-    """Return base and motor values, (base + 12, num_worlds), of Newton's coordinates or rates (num_worlds, columns).
+    """Select the values of base and motors from Newton's joint coordinates or rates.
 
-    base: number of base columns, 7 coordinates or 6 rates; 20 columns of leg joints follow.
+    joint_values: (num_worlds, columns). Returned: (base + 12, num_worlds). base: number of base columns, 7 coordinates
+    or 6 rates; 20 columns of leg joints follow.
     """
     legs = joint_values[:, base : base + 20].unflatten(1, (4, 5))
     motors = torch.cat([legs[..., :2], legs[..., 3:4]], -1).flatten(1)

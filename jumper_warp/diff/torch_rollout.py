@@ -1,4 +1,4 @@
-"""PyTorch bridge: a rollout as a differentiable function of tensors."""
+"""PyTorch bridge: the robot's simulation over policy steps as a differentiable function of tensors."""
 
 from __future__ import annotations
 
@@ -20,7 +20,10 @@ OUTPUTS = ("q", "qd", "torque", "impulse", "filtered_target")  # differentiable 
 
 
 class TorchTrajectory(NamedTuple):
-    """Trajectory of a rollout as tensors with gradients, T policy steps of S physics steps; do not change in place."""
+    """Simulated states, torques and impulses over policy steps as PyTorch tensors with gradients.
+
+    T policy steps of S physics steps; do not change in place.
+    """
 
     q: torch.Tensor  # (K + 1, 19, num_worlds) as in `Trajectory`: base origin [m], quaternion xyzw, motor angles [rad]
     qd: torch.Tensor  # (K + 1, 18, num_worlds) velocity of the base's COM [m/s], angular velocity, motor rates [rad/s]
@@ -29,7 +32,7 @@ class TorchTrajectory(NamedTuple):
     filtered_target: torch.Tensor  # (T, 12, num_worlds) [rad] targets after the command filter
 
     def end(self) -> dict[str, torch.Tensor]:
-        """Return the arguments of `simulate` that continue after the last row; `impulse` has no gradient."""
+        """Return the final state as arguments of `simulate` that continue it; `impulse` has no gradient."""
         state = {"q": self.q[-1], "qd": self.qd[-1], "initial_target": self.filtered_target[-1]}
         return state | {"impulse": self.impulse[-1].detach()}
 
@@ -46,12 +49,13 @@ def simulate(
     trusted: bool = False,
     **parameters: torch.Tensor,
 ) -> TorchTrajectory:
-    """Return the trajectory of a rollout, differentiable once w.r.t. all tensors except `impulse`.
+    """Simulate all worlds over policy steps as a PyTorch function, and return their trajectory.
 
-    Arguments and shapes are those of `Rollout.run`, with or without the axis of worlds. parameters: entries of
-    `Rollout.parameters`, or `geometry` (4, 10) [m], the legs' lengths of all worlds; they are written to the rollout
-    and stay there, and have gradients only from the calls that they are passed to. trusted: do not check the values;
-    otherwise on a GPU only the latency is checked, which waits for the device.
+    It can be differentiated once w.r.t. all tensors except `impulse`. Arguments and shapes are those of `Rollout.run`,
+    with or without the axis of worlds. parameters: entries of `Rollout.parameters`, or `geometry` (4, 10) [m], the
+    legs' lengths of all worlds; they are written to the rollout and stay there, and have gradients only from the calls
+    that they are passed to. trusted: do not check the values; otherwise on a GPU only the latency is checked, which
+    waits for the device.
 
     A policy in the loop runs one policy step per call, each from `end()` of the previous one. Raises InputError:
     unknown parameter, not a tensor, wrong shape, not finite, or a latency outside of `LATENCY_RANGE`. The reverse pass
@@ -94,7 +98,10 @@ def simulate(
 
 
 def _check_numbers(given: dict[str, torch.Tensor]) -> None:
-    """Raise InputError: a latency out of range; on a CPU also commands that are not finite or parameters with NaN."""
+    """Check tensor inputs of a rollout: raise InputError for a latency out of range.
+
+    On a CPU also for commands that are not finite or parameters with NaN.
+    """
     if "latency" in given:
         check_within("latency [s]", given["latency"].detach().cpu().numpy(), LATENCY_RANGE)
     for name, tensor in given.items():
@@ -108,7 +115,10 @@ class _Simulate(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, rollout: Rollout, names: tuple[str, ...], impulse: Any, *tensors: torch.Tensor) -> tuple:
-        """Write the parameters, run the rollout and return the tensors `OUTPUTS`; names: of `tensors`, in order."""
+        """Simulate the forward pass of a rollout, and return its trajectory as tensors.
+
+        First the parameters are written. names: of `tensors`, in order. Returned: `OUTPUTS`.
+        """
         with _stream(rollout):
             given = dict(zip(names, tensors, strict=True))
             _write_parameters(rollout, given)
@@ -125,7 +135,10 @@ class _Simulate(torch.autograd.Function):
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, *grads: torch.Tensor | None) -> tuple:
-        """Run the reverse pass with the parameters of the forward pass; grads: w.r.t. `OUTPUTS`, None for zero."""
+        """Return the gradients w.r.t. the inputs of a rollout, by its reverse pass.
+
+        It uses the parameters of the forward pass; grads: w.r.t. `OUTPUTS`, None for zero.
+        """
         rollout, trajectory = ctx.rollout, ctx.trajectory
         given = dict(zip(ctx.names, ctx.saved_tensors, strict=False))
         changed = {name for name, count in rollout.writes.items() if ctx.writes[name] != count}
@@ -143,14 +156,20 @@ class _Simulate(torch.autograd.Function):
 
 
 def _cotangent(trajectory: Trajectory, name: str, grad: torch.Tensor | None) -> wp.array | None:
-    """Return the gradient w.r.t. the trajectory's array `name` as a Warp array of its type; None (zero) stays None."""
+    """Convert the gradient w.r.t. an array of the trajectory from a tensor to a Warp array.
+
+    name: of the array, whose type it gets; None (zero) stays None.
+    """
     if grad is None:
         return None
     return wp.from_torch(grad.detach().contiguous(), dtype=getattr(trajectory, name).dtype)
 
 
 def _write_parameters(rollout: Rollout, given: dict[str, torch.Tensor], new: Container[str] | None = None) -> None:
-    """Write the parameters among `given` to the rollout; new: names to count in `Rollout.writes`, by default all."""
+    """Write the given robot parameters to the arrays of a rollout.
+
+    new: names to count in `Rollout.writes`, by default all.
+    """
     for name, tensor in given.items():
         if name in rollout.writes and (new is None or name in new):
             rollout.writes[name] += 1

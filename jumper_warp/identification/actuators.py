@@ -44,7 +44,10 @@ no_load_speed; fade_start, fade_end: speeds between which all torque fades to 0;
 
 @dataclass(frozen=True, eq=False)
 class Bench:
-    """Recording of a test bench, n rows; command and speed of a test's first row also hold before that row."""
+    """Test-bench recording of a motor's commanded torque, speed and measured torque, n rows.
+
+    Command and speed of a test's first row also hold before that row.
+    """
 
     test: np.ndarray  # (n,) number of the test that a row belongs to
     time: np.ndarray  # (n,) [s], rising within a test
@@ -68,7 +71,7 @@ class Bench:
 
 
 def load_bench(path: Path) -> Bench:
-    """Return the recording in a CSV file whose first line names at least the columns `COLUMNS`, in any order.
+    """Read a test-bench recording from a CSV file. The first line names at least the columns `COLUMNS`, in any order.
 
     Raises InputError: a missing file or column, rows that are not numbers, or as `Bench`; OSError: it cannot be read.
     """
@@ -88,9 +91,9 @@ def load_bench(path: Path) -> Bench:
 
 
 def torque_law(constants: Mapping[str, float], command: np.ndarray, speed: np.ndarray) -> np.ndarray:
-    """Return the steady output torque [N m] for commanded torques [N m] and output speeds [rad/s], all of one shape.
+    """Return a motor's steady output torque [N m] from its commanded torque [N m] and output speed [rad/s].
 
-    constants: by the names and units of `PRIORS`. A positive torque accelerates a positive speed.
+    All of one shape. constants: by the names and units of `PRIORS`. A positive torque accelerates a positive speed.
     """
     driving_speed = np.sign(command) * speed
     headroom = (constants["no_load_speed"] - driving_speed) / (constants["no_load_speed"] - constants["cutoff_speed"])
@@ -102,7 +105,7 @@ def torque_law(constants: Mapping[str, float], command: np.ndarray, speed: np.nd
 
 
 def bench_torque(constants: Mapping[str, float], bench: Bench) -> np.ndarray:
-    """Return the noiseless torques [N m] that `bench` would measure of a motor, (n,); constants: as in `PRIORS`."""
+    """Simulate the noiseless torques [N m] that a test bench measures on a motor, (n,); constants: as in `PRIORS`."""
     torque = np.zeros(len(bench.time))
     for test in np.unique(bench.test):
         rows = np.flatnonzero(bench.test == test)
@@ -120,7 +123,7 @@ def bench_torque(constants: Mapping[str, float], bench: Bench) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Actuator:
-    """Identified constants of a motor."""
+    """Identified limits, friction and latency of a motor, with their uncertainty."""
 
     kind: str  # "lateral" or "transversal"
     constants: Mapping[str, float]  # By the names and units of `PRIORS`
@@ -129,11 +132,11 @@ class Actuator:
     chi2: float  # [1] Mean over rows of (torque error / torque noise)^2; 1 if the law fits to the noise
 
     def rows(self) -> dict[str, tuple[float, float, float, str]]:
-        """Return (value, low, high, unit) by name of the constant; low and high bound the 95 % interval."""
+        """Return the identified constants of a motor and their 95 % intervals, as (value, low, high, unit) by name."""
         return {name: (value, *self.intervals[name], PRIORS[name][1]) for name, value in self.constants.items()}
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of `actuator.json`."""
+        """Return the identified constants of a motor as the content of `actuator.json`."""
         rows = {
             name: {"value": value, "interval_95": [low, high], "unit": unit, "identified": name not in self.open}
             for name, (value, low, high, unit) in self.rows().items()
@@ -142,9 +145,9 @@ class Actuator:
 
 
 def described_constants(kind: Literal["lateral", "transversal"]) -> dict[str, float]:
-    """Return a motor's constants before identification, by the names and in the units of `PRIORS`.
+    """Return the robot description's constants of a motor, the starting point of its identification.
 
-    Speeds, peak and friction are the robot description's.
+    By the names and in the units of `PRIORS`. Speeds, peak and friction are the robot description's.
     """
     motor = load_description().motors[0 if kind == "lateral" else 1]
     return {
@@ -157,7 +160,7 @@ def described_constants(kind: Literal["lateral", "transversal"]) -> dict[str, fl
 def characterise_motor(
     bench: Bench, kind: Literal["lateral", "transversal"] = "transversal", torque_noise: float = 0.1
 ) -> Actuator:
-    """Return the least-squares constants of a motor from a bench's data.
+    """Identify limits, friction and latency of a motor from a bench recording by least squares.
 
     kind: motor whose described constants are the prior's means. torque_noise [N m]: standard deviation of the torque
     sensor. Raises InputError: noise that is not positive, or a command that never changes.

@@ -1,4 +1,4 @@
-"""Planning of safe, informative motions: random candidates are scored by their information about the parameters."""
+"""Choice of safe, informative motions for identification: the best of random candidates by Fisher information."""
 
 from __future__ import annotations
 
@@ -28,9 +28,10 @@ MARGIN = 5.0  # [deg] between the angles of a safe motion and the filter's limit
 
 
 def unsafe_reason(plan: Plan, record: Record, limits: FilterCfg | None = None) -> str:
-    """Return the reason why the motion in a plan's record is unsafe, or an empty string if it is safe.
+    """Return the reason why a simulated identification motion is unsafe, or an empty string if it is safe.
 
-    record: motion of one world. limits: limits of motor angles, by default the walking filter's.
+    plan: its motor targets; record: motion of one world. limits: limits of motor angles, by default the walking
+    filter's.
     """
     limits = walking_filter() if limits is None else limits
     angle, rate = record.angle[..., 0] / DEGREES, np.abs(record.rate[..., 0]).max()
@@ -60,16 +61,19 @@ def unsafe_reason(plan: Plan, record: Record, limits: FilterCfg | None = None) -
 
 
 class Scorer:
-    """Scorer of planned motions: simulates them on the described robot, and returns their Fisher information."""
+    """Scorer of candidate motions by their Fisher information about the robot's parameters, from simulation."""
 
     def __init__(self, parameters: ParameterSet, noise: NoiseLevels | None = None, replay: MotionReplay | None = None):
-        """Score by `parameters` and sensor `noise`; replay: simulation, by default of the project's description."""
+        """Score motions for `parameters` and sensor `noise`; replay: simulation, by default of the described robot."""
         self.parameters, self.noise = parameters, noise or NoiseLevels()
         self.replay = replay or MotionReplay()
         self._nominal = parameters.robots(np.zeros((1, len(parameters))))
 
     def record(self, plan: Plan) -> Record:
-        """Return the described robot's motion under a plan, one world, from rest in the pose of the first targets."""
+        """Simulate the described robot under the motor targets of a plan, and return its motion.
+
+        One world, from rest in the pose of the first targets.
+        """
         return replay_plan(self.replay, plan, self._nominal)
 
     def information(self, plan: Plan, record: Record) -> np.ndarray:
@@ -88,7 +92,7 @@ class Scorer:
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """Chosen motions and their expected information about the parameters."""
+    """Motions chosen for an identification, and their expected information about the parameters."""
 
     plans: tuple[Plan, ...]  # motions, in the order in which they were chosen
     gain: tuple[float, ...]  # [nat] Total information gained over the prior, 1/2 ln det, after each motion
@@ -97,7 +101,7 @@ class Excitation:
     parameters: ParameterSet
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of `excite.json` except the robot's mass: gain_nat, refused, and parameters by name."""
+        """Return the content of `excite.json`: information gain, refused motions and parameters, but no robot mass."""
         expected = {
             p.name: {"unit": p.unit, "expected_deviation": p.std(0.0, float(d)), "of_prior": float(d)}
             for p, d in zip(self.parameters, self.std, strict=True)
@@ -108,7 +112,7 @@ class Excitation:
 def choose(
     scorer: Scorer, kinds: Sequence[Kind] = KINDS, *, candidates: int = 4, seconds: float = 1.25, seed: int = 0
 ) -> Excitation:
-    """Return one safe motion for each entry of `kinds`, the most informative of several random candidates.
+    """Choose the most informative safe motion of several random candidates for each entry of `kinds`.
 
     A candidate's score is the information of all motions chosen earlier and of itself. candidates: number tried by
     motion; seconds [s]: duration of a motion. Raises InputError: no candidate of a kind is safe.
@@ -147,7 +151,7 @@ def record_motions(
     rng: np.random.Generator | None = None,
     torque: bool = False,
 ) -> list[RecordedMotion]:
-    """Record chosen motions on a simulated robot, write each to `folder` as `<number>_<kind>.npz`, and return them.
+    """Record chosen motions on a simulated robot, and write each to `folder` as `<number>_<kind>.npz`. Returns them.
 
     robots: the robot, N = 1. solver: physics solver. noise, rng, torque: see `measure`. Raises OSError.
     """

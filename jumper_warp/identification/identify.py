@@ -54,7 +54,7 @@ def identify(
     device: wp.DeviceLike = None,
     threads: int | None = None,
 ) -> Identification:
-    """Return the identification of the parameters with the least cost, by staged Levenberg-Marquardt.
+    """Identify the robot's parameters from recorded motions by Levenberg-Marquardt in stages.
 
     prior_measurements: such as a weighed mass. dt [s]: largest physics step, by default 1/480. replay: simulation to
     reuse from an earlier call; it overrides description, device and threads (of the CPU). Raises InputError: no
@@ -92,10 +92,10 @@ def identify_by_evolution(
     device: wp.DeviceLike = None,
     threads: int | None = None,
 ) -> Identification:
-    """Return the identification by CMA-ES; initial states stay at their first measurement.
+    """Identify the robot's parameters from recorded motions by CMA-ES, an evolution strategy.
 
-    max_seconds [s]: wall time of the search. population: candidates in a generation. Other arguments as in `identify`.
-    Raises InputError: as `identify`, or `cma` is not installed.
+    Initial states stay at their first measurement. max_seconds [s]: wall time of the search. population: candidates in
+    a generation. Other arguments as in `identify`. Raises InputError: as `identify`, or `cma` is not installed.
     """
     try:
         import cma
@@ -130,7 +130,7 @@ class Descent:
     """Levenberg-Marquardt optimisation in stages (`minimise`), with a log of its steps, time and physics steps."""
 
     def __init__(self, replay: MotionReplay, advance: Callable[[], object] = lambda: None):
-        """Start the clocks at stage 0, with an empty log.
+        """Start the clocks and an empty log of the optimisation at stage 0.
 
         replay: simulation whose physics steps are counted; advance: called after every stage.
         """
@@ -139,7 +139,7 @@ class Descent:
         self._begin = (time.perf_counter(), time.process_time(), replay.world_steps)
 
     def effort(self) -> Effort:
-        """Return wall time, CPU time and physics steps since the object was made."""
+        """Return wall time, CPU time and physics steps that the optimisation has taken so far."""
         seconds, cpu, steps = self._begin
         return Effort(time.perf_counter() - seconds, time.process_time() - cpu, self.replay.world_steps - steps)
 
@@ -151,11 +151,11 @@ class Descent:
     def minimise(
         self, problem: LeastSquares, point: Point, normal: NormalEquations, decrease: float | None = None
     ) -> tuple[Point, NormalEquations]:
-        """Return the point after one stage of Levenberg-Marquardt steps, and the normal equations there.
+        """Minimise a least-squares problem by one stage of Levenberg-Marquardt steps.
 
-        decrease: the stage ends at the first step that lowers the cost by less than this fraction; None: at the first
-        step with a new Jacobian that lowers it by less than `CONVERGED`. While steps are `GOOD_STEP`, Broyden's update
-        replaces a new Jacobian.
+        Returned: the point after the stage, and the normal equations there. decrease: the stage ends at the first step
+        that lowers the cost by less than this fraction; None: at the first step with a new Jacobian that lowers it by
+        less than `CONVERGED`. While steps are `GOOD_STEP`, Broyden's update replaces a new Jacobian.
         """
         new_jacobian, self.stage = decrease is not None, self.stage + 1
         for _ in range(MAX_STEPS):
@@ -183,10 +183,11 @@ def descend(
     pieces: Sequence[MotionResiduals],
     prior_measurements: Sequence[PriorMeasurement],
 ) -> tuple[LeastSquares, Point, NormalEquations]:
-    """Return the least-squares problem of all motions, its minimum, and the normal equations there, after all stages.
+    """Fit parameters and initial states to all motions by all stages of Levenberg-Marquardt.
 
-    coarse, whole: all motions, with the physics steps of the first stages and of the last stage. pieces: short pieces
-    of the motions for a first stage, empty to skip it. Raises InputError: the simulation diverges in a motion.
+    Returned: the least-squares problem of all motions, its minimum, and the normal equations there. coarse, whole: all
+    motions, with the physics steps of the first stages and of the last stage. pieces: short pieces of the motions for a
+    first stage, empty to skip it. Raises InputError: the simulation diverges in a motion.
     """
     replay, z = descent.replay, np.zeros(len(parameters))
     if pieces:
@@ -214,10 +215,11 @@ def add_motions(
     prior_measurements: Sequence[PriorMeasurement],
     z: np.ndarray,
 ) -> tuple[Point, list[Linearised]]:
-    """Return the minimum of the robust cost over all motions and the Jacobians there, adding motions one by one.
+    """Fit the parameters to a growing set of motions with a robust cost, adding motions one by one.
 
-    z: parameters to start from, (P,), normalised. Motions with a held base come first, as their legs do not interact;
-    then always the motion with the least misfit. The robust cost limits outliers, such as a paw that strikes 1 ms late.
+    Returned: the minimum over all motions and the Jacobians there. z: parameters to start from, (P,), normalised.
+    Motions with a held base come first, as their legs do not interact; then always the motion with the least misfit.
+    The robust cost limits outliers, such as a paw that strikes 1 ms late.
     """
     point, added, linearised = Point(z, []), [], []
     while len(added) < len(motions):
@@ -237,7 +239,7 @@ def add_motions(
 
 
 def misfit(motion: MotionResiduals, replay: MotionReplay, z: np.ndarray) -> float:
-    """Return the mean of ln(1 + r^2) over a motion's residuals r at parameters z (P,) and the nominal initial state."""
+    """Return the misfit of a motion at parameters z (P,) and nominal initial state: mean ln(1 + residual^2)."""
     residuals = motion.residuals(replay, z[None], np.zeros((1, motion.start_size)))
     with np.errstate(over="ignore"):
         return float(np.mean(np.log1p(np.nan_to_num(residuals, posinf=1.0e100) ** 2)))

@@ -26,7 +26,10 @@ TRUST = 3.0
 
 @dataclass
 class InitialStates:
-    """States at the first row of a motion, N worlds; motors by leg FL, FR, BL, BR, each lateral, outer, inner."""
+    """Poses and velocities of base and motors of N robots at the first row of a motion.
+
+    Motors by leg FL, FR, BL, BR, each lateral, outer, inner.
+    """
 
     position: np.ndarray  # (N, 3) [m] of the base's origin, world frame
     quaternion: np.ndarray  # (N, 4) xyzw, base to world
@@ -37,14 +40,15 @@ class InitialStates:
 
 
 class InitialStatePrior:
-    """Prior of a motion's initial state, from its first rows; the state has I = 27 or 36 normalised coordinates.
+    """Prior distribution of a motion's initial state, estimated from its first measured rows.
 
-    Coordinates are deviations from the measured state, in prior standard deviations: 12 motor readings, 12 rates, the
-    base's rotation vector (3), and for a free base its position, velocity and spin (3 each, world frame).
+    The state has I = 27 or 36 normalised coordinates. Coordinates are deviations from the measured state, in prior
+    standard deviations: 12 motor readings, 12 rates, the base's rotation vector (3), and for a free base its position,
+    velocity and spin (3 each, world frame).
     """
 
     def __init__(self, motion: RecordedMotion, noise: NoiseLevels, description: RobotDescription):
-        """Estimate the state of the first row, and its standard deviations, from the first rows and the stance."""
+        """Estimate the initial state and its standard deviations from a motion's first rows and the robot's stance."""
         self.free, self.description = motion.base == "free", description
         self.size = 36 if self.free else 27  # Number I of coordinates
         rows = min(FIRST_ROWS, len(motion.time))
@@ -80,9 +84,10 @@ class InitialStatePrior:
         self._std = np.concatenate([angle_std, rate_std, tilt_std, *base_std])
 
     def states(self, z: np.ndarray, robots: RobotValues) -> InitialStates:
-        """Return the states of N worlds at normalised coordinates z (N, I); true angles are readings minus offsets.
+        """Convert normalised coordinates z (N, I) of the initial state to poses and velocities of N robots.
 
-        A standing robot's base is placed so that all paws are on the ground; its base coordinates are added afterwards.
+        True angles are readings minus offsets. A standing robot's base is placed so that all paws are on the ground;
+        its base coordinates are added afterwards.
         """
         mean, deviation = self._mean, z * self._std
         state = InitialStates(*(np.repeat(getattr(mean, name), len(z), axis=0) for name in vars(mean)))
@@ -106,9 +111,9 @@ class InitialStatePrior:
 
 
 def motors_at_rest(rate: np.ndarray | None) -> bool:
-    """Return whether all 12 mean rates over the first `QUIET_ROWS` of rates (n, 12) [rad/s] are below `QUIET`.
+    """Return whether all 12 motors are at rest, by their mean rates over the first `QUIET_ROWS` of rates (n, 12).
 
-    False without rates, or if a motor has none in these rows.
+    At rest: below `QUIET` [rad/s]. False without rates, or if a motor has none in these rows.
     """
     if rate is None or np.isnan(rate[:QUIET_ROWS]).all(axis=0).any():
         return False
@@ -118,9 +123,10 @@ def motors_at_rest(rate: np.ndarray | None) -> bool:
 def first_values(
     values: np.ndarray | None, default: np.ndarray, measured_std: float, default_std: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return the first measured value of each column and its standard deviation, (columns,) each, or the default's.
+    """Return the first measured value of each column and its standard deviation, or a default without measurement.
 
-    values: (n, columns), NaN where not measured, or None; only the first `FIRST_ROWS` count. default: (columns,).
+    (columns,) each. values: (n, columns), NaN where not measured, or None; only the first `FIRST_ROWS` count. default:
+    (columns,).
     """
     if values is None:
         return default.copy(), np.full(len(default), default_std)
@@ -146,7 +152,7 @@ def column_slopes(time: np.ndarray, values: np.ndarray) -> np.ndarray:
 
 
 class Stance(NamedTuple):
-    """Pose and velocity of a base over four resting paws, N robots."""
+    """Pose and velocity of N robots' bases whose four paws rest on the ground."""
 
     height: np.ndarray  # (N,) [m] of the base's origin above the ground
     up: np.ndarray  # (N, 3) unit vector of world z, base frame
@@ -178,7 +184,7 @@ def paw_positions(description: RobotDescription, angle: np.ndarray) -> np.ndarra
 
 
 def stance(description: RobotDescription, angle: np.ndarray, rate: np.ndarray) -> Stance:
-    """Return pose and velocity of bases over paws at rest on level ground; angle [rad], rate [rad/s]: (N, 12)."""
+    """Compute pose and velocity of bases whose paws rest on level ground; angle [rad], rate [rad/s]: (N, 12)."""
     paws = paw_positions(description, angle)
     ahead, behind = (paw_positions(description, angle + sign * STEP * rate) for sign in (1.0, -1.0))
     paw_velocity = (ahead - behind) / (2 * STEP)
@@ -214,7 +220,7 @@ def unevenness(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
 
 
 def levelling_direction(description: RobotDescription, angle: np.ndarray) -> np.ndarray:
-    """Return the smallest change of motor angles by `unevenness`, (12,) [rad/m], at angles (12,) [rad]."""
+    """Return the smallest change of motor angles per change of `unevenness`, (12,) [rad/m], at angles (12,) [rad]."""
     ahead, behind = (unevenness(description, angle + sign * STEP * np.eye(12)) for sign in (1.0, -1.0))
     slope = (ahead - behind) / (2.0 * STEP)
     return slope / (slope @ slope)
@@ -223,7 +229,7 @@ def levelling_direction(description: RobotDescription, angle: np.ndarray) -> np.
 def levelled(
     description: RobotDescription, angle: np.ndarray, rate: np.ndarray, direction: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return motor angles [rad] and rates [rad/s], (N, 12), corrected so that all paws lie and stay in one plane.
+    """Correct motor angles [rad] and rates [rad/s], (N, 12), so that all paws lie and stay in one plane.
 
     direction: of the correction of angles and rates, (12,) [rad/m], from `levelling_direction`.
     """

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt on recorded motions; parallel worlds try all damping values of a step at once."""
+"""Levenberg-Marquardt for recorded motions; parallel worlds try all damping values of a step at once."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ LARGEST_CHANGE = 0.01  # largest step of a finite difference, in standard deviat
 
 @dataclass
 class Point:
-    """Values of all unknowns, normalised by their priors."""
+    """Parameters and initial states of all motions at one iterate of the optimisation, normalised by their priors."""
 
     z: np.ndarray  # (P,) parameters
     starts: list[np.ndarray]  # by motion: (I,) coordinates of the initial state
@@ -35,9 +35,10 @@ class Point:
 
 @dataclass
 class NormalEquations:
-    """Normal equations at a point. Initial states of different motions are coupled only through the parameters.
+    """Normal equations of the least-squares problem at one iterate.
 
-    Gradients and matrices are those of half the cost. P parameters; each motion has I coordinates and m residuals.
+    Initial states of different motions are coupled only through the parameters. Gradients and matrices are those of
+    half the cost. P parameters; each motion has I coordinates and m residuals.
     """
 
     cost: float  # sum of squares (robust: of losses) of residuals, prior measurements and priors
@@ -60,10 +61,10 @@ class NormalEquations:
     def solve(
         self, damping: float, free: np.ndarray, gradient: np.ndarray, start_gradients: Sequence[np.ndarray]
     ) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Return the damped step of the parameters (P,), zero except at `free`, and of initial states, (I,) by motion.
+        """Return the damped Levenberg-Marquardt step of the parameters and of all initial states.
 
-        damping [1]: relative to the diagonal. free: indices of parameters that may move. gradient (P,) and
-        start_gradients ((I,) by motion): right-hand sides.
+        Parameters (P,), zero except at `free`; initial states (I,) by motion. damping [1]: relative to the diagonal.
+        free: indices of parameters that may move. gradient (P,) and start_gradients ((I,) by motion): right-hand sides.
         """
         matrix = self.matrix[np.ix_(free, free)] + np.eye(len(free))
         matrix += damping * np.diag(np.diag(matrix))
@@ -83,9 +84,10 @@ class NormalEquations:
 
 
 def transposed_product(left: np.ndarray, right: np.ndarray) -> np.ndarray:
-    """Return left.T @ right (a, b) of tall arrays (m, a) and (m, b), summed in blocks of `BLOCK` rows.
+    """Return left.T @ right of tall arrays, with the same rounding for any number of threads.
 
-    BLAS multiplies blocks this small on one thread, so that results do not depend on the number of threads.
+    Shape (a, b) of (m, a) and (m, b), summed in blocks of `BLOCK` rows. BLAS multiplies blocks this small on one
+    thread, so that results do not depend on the number of threads.
     """
     product = np.zeros((left.shape[1], right.shape[1]))
     for row in range(0, len(left), BLOCK):
@@ -104,7 +106,7 @@ class Trial(NamedTuple):
 
 
 def replace_residuals(linearised: Sequence[Linearised], residuals: Sequence[np.ndarray]) -> list[Linearised]:
-    """Return copies of `linearised` with the same Jacobians and new residuals, (m,) by motion."""
+    """Replace the residuals of linearised motions, (m,) by motion, and keep their Jacobians."""
     return [Linearised(residual, old.jacobian) for residual, old in zip(residuals, linearised, strict=True)]
 
 
@@ -119,7 +121,7 @@ class LeastSquares:
         prior_measurements: Sequence[PriorMeasurement] = (),
         robust: bool = False,
     ):
-        """Lay out the unknowns; robust: Cauchy loss of residuals, so that outliers such as late contacts count less."""
+        """Collect the unknowns of the problem; robust: Cauchy loss, in which outliers (late contacts) count less."""
         self.parameters, self.motions, self.replay = parameters, motions, replay
         self.prior_measurements, self.robust = prior_measurements, robust
         self._typical = math.inf
@@ -132,9 +134,10 @@ class LeastSquares:
         return Point(np.zeros(len(self.parameters)), [np.zeros(motion.start_size) for motion in self.motions])
 
     def normal(self, point: Point, known: Sequence[Linearised] = ()) -> NormalEquations:
-        """Return the normal equations at a point; known: residuals and Jacobians of the first motions, not recomputed.
+        """Linearise all motions at a point and return the normal equations of a Gauss-Newton step.
 
-        Raises InputError: the simulation diverges in a motion.
+        known: residuals and Jacobians of the first motions, not recomputed. Raises InputError: the simulation diverges
+        in a motion.
         """
         linearised = list(known)
         for motion, start, change in list(zip(self.motions, point.starts, self._change, strict=True))[len(known) :]:
@@ -146,7 +149,7 @@ class LeastSquares:
         return self.assemble(point, linearised)
 
     def assemble(self, point: Point, linearised: Sequence[Linearised]) -> NormalEquations:
-        """Return the normal equations at a point; linearised: residuals and Jacobians of all motions there.
+        """Assemble the normal equations at a point from residuals and Jacobians of all motions there, `linearised`.
 
         Also sets the steps of the next finite differences, and of a robust problem the typical residual.
         """
@@ -178,9 +181,9 @@ class LeastSquares:
         return normal
 
     def broyden_update(self, normal: NormalEquations, old: Point, trial: Trial) -> NormalEquations:
-        """Return the normal equations at `trial`, with Broyden's update of the Jacobians of `normal` at `old`.
+        """Return the normal equations after a step, with Jacobians updated by Broyden's formula.
 
-        The update's norm weighs the unknowns by their curvature.
+        At `trial`, from the Jacobians of `normal` at `old`. The update's norm weighs the unknowns by their curvature.
         """
         linearised, new = [], trial.point
         parts = zip(normal.linearised, trial.residuals, old.starts, new.starts, normal.start_matrices, strict=True)
@@ -198,7 +201,7 @@ class LeastSquares:
         return [residuals[:, 0] for residuals in self._costs(point.z[None], starts)[1]]
 
     def _weight(self, residual: np.ndarray) -> np.ndarray:
-        """Return the weights (m,) in the normal equations of residuals (m,): 1, or those of the Cauchy loss."""
+        """Return the weights (m,) that residuals (m,) have in the normal equations: 1, or those of the Cauchy loss."""
         return 1.0 / (1.0 + (residual / (CAUCHY_WIDTH * self._typical)) ** 2) if self.robust else np.ones_like(residual)
 
     def _loss(self, residual: np.ndarray) -> np.ndarray:
@@ -209,7 +212,7 @@ class LeastSquares:
         return limit**2 * np.log1p((residual / limit) ** 2)
 
     def prior_residuals(self, z: np.ndarray) -> list[tuple[float, np.ndarray]]:
-        """Return (residual over its standard deviation, gradient (P,)) of each prior measurement at parameters (P,)."""
+        """Return (residual over its std, gradient (P,)) of each prior measurement, as a weighed mass, at z (P,)."""
         step = 1.0e-6
         robots = self.parameters.robots(np.concatenate([z[None], z + step * np.eye(len(z))]), self.replay.description)
         residuals = []
@@ -219,11 +222,11 @@ class LeastSquares:
         return residuals
 
     def costs(self, z: np.ndarray, starts: Sequence[np.ndarray]) -> np.ndarray:
-        """Return the costs (K,) of K points z (K, P) and starts, (K, I) by motion; infinite where a world diverges."""
+        """Return the costs (K,) of K candidates z (K, P), starts (K, I) by motion; infinite where a world diverges."""
         return self._costs(z, starts)[0]
 
     def _costs(self, z: np.ndarray, starts: Sequence[np.ndarray]) -> tuple[np.ndarray, list[np.ndarray]]:
-        """Return `costs` (K,) of K points, and the residuals, (m, K) by motion."""
+        """Return the costs (K,) of K candidate points and the residuals of each motion there, (m, K) by motion."""
         cost = np.sum(z**2, axis=1) + sum(np.sum(start**2, axis=1) for start in starts)
         robots, residuals = self.parameters.robots(z, self.replay.description), []
         for prior in self.prior_measurements:
@@ -236,7 +239,7 @@ class LeastSquares:
         return np.where(np.isfinite(cost), cost, math.inf), residuals
 
     def step(self, point: Point, normal: NormalEquations, geodesic: bool = True) -> Trial:
-        """Return the result of the best step over all `DAMPINGS`; the point stays if no step lowers the cost.
+        """Take the best Levenberg-Marquardt step over all `DAMPINGS`; the point stays if no step lowers the cost.
 
         geodesic: also try each step with geodesic acceleration, which follows the curvature of the residuals.
         """
@@ -259,9 +262,9 @@ class LeastSquares:
         return np.flatnonzero(~((z <= self._low) & (gradient > 0.0) | (z >= self._high) & (gradient < 0.0)))
 
     def _best_trial(self, z: np.ndarray, starts: list[np.ndarray], predicted: float) -> Trial:
-        """Return the `Trial` at the point with the least cost of K points z (K, P), starts (K, I) by motion.
+        """Return the point with the least cost of K candidates, with its cost and residuals.
 
-        predicted: decrease of the cost predicted by the linear model.
+        Candidates z (K, P), starts (K, I) by motion. predicted: decrease of the cost predicted by the linear model.
         """
         costs, residuals = self._costs(z, starts)
         best = int(np.argmin(costs))
@@ -272,10 +275,11 @@ class LeastSquares:
     def _accelerated(
         self, point: Point, normal: NormalEquations, free: np.ndarray, plain: list[tuple[np.ndarray, list[np.ndarray]]]
     ) -> list[tuple[np.ndarray, list[np.ndarray]]]:
-        """Return the steps with geodesic acceleration; plain: step by damping, parameters (P,) and (I,) by motion.
+        """Add geodesic acceleration to Levenberg-Marquardt steps with different damping.
 
-        Parallel worlds measure the curvature of the residuals at the fraction `PROBE` of each step. A step is returned
-        unchanged if its acceleration is longer than the step, or a world diverges.
+        plain: step by damping, parameters (P,) and (I,) by motion. Parallel worlds measure the curvature of the
+        residuals at the fraction `PROBE` of each step. A step is returned unchanged if its acceleration is longer than
+        the step, or a world diverges.
         """
         size = len(point.z)
         ahead = np.clip(point.z + PROBE * np.array([move for move, _ in plain]), self._low, self._high)

@@ -43,7 +43,7 @@ EXAMPLE = (
 
 @dataclass(frozen=True)
 class NoiseLevels:
-    """Standard deviations of the measurements."""
+    """Standard deviations of the sensor noise of motor angles, rates, torques and the base's pose."""
 
     angle: float = 0.05  # [deg] Noise of motor angles
     rate: float = 1.0  # [deg/s] Noise of motor rates
@@ -52,7 +52,7 @@ class NoiseLevels:
     orientation: float = 0.5  # [deg] Noise of the base's orientation
 
     def check(self) -> None:
-        """Raise InputError unless all levels are positive and finite."""
+        """Raise InputError unless all standard deviations of the noise are positive and finite."""
         for name, value in vars(self).items():
             check_positive(f"noise {name}", value)
 
@@ -81,7 +81,7 @@ class RecordedMotion:
     notes: Mapping[str, Any] = field(default_factory=dict)  # Free-form metadata, saved with the motion
 
     def __post_init__(self) -> None:
-        """Raise InputError for a channel of another shape, not finite or out of range, or an invalid setting."""
+        """Raise InputError for a measured channel of wrong shape, not finite or out of range, or an invalid setting."""
         n, where = len(self.time), f"motion {self.name}"
         if n < 3 or self.time.ndim != 1:
             raise InputError(f"{where}: time must be one column of at least 3 rows, got shape {self.time.shape}")
@@ -123,7 +123,7 @@ class RecordedMotion:
         return float(self.time[-1] - self.time[0])
 
     def columns(self) -> dict[str, Any]:
-        """Return all fields that are arrays by name: time, target and the measured channels."""
+        """Return all array fields of the motion by name: time, target and the measured channels."""
         return {f.name: getattr(self, f.name) for f in fields(self) if isinstance(getattr(self, f.name), np.ndarray)}
 
     def save(self, path: Path) -> None:
@@ -136,7 +136,7 @@ class RecordedMotion:
 
 
 def load_motions(data: Sequence[Path], **settings: Any) -> list[RecordedMotion]:
-    """Return the motions of the files `data`; a folder stands for all its npz, CSV and Parquet files, sorted by name.
+    """Read recorded motions from files; a folder stands for all its npz, CSV and Parquet files, sorted by name.
 
     settings: keyword arguments of `load_motion`. Raises InputError as `load_motion`, and if there is no file.
     """
@@ -151,12 +151,13 @@ def load_motions(data: Sequence[Path], **settings: Any) -> list[RecordedMotion]:
 def load_motion(
     path: Path, *, base: str = "", gains: str = "", torque_limit: float = 0.0, torque_constant: float = 0.0
 ) -> RecordedMotion:
-    """Return the motion of a file; base, gains and torque_limit [N m] override the file's settings unless "" or 0.
+    """Read a recorded motion from an npz, CSV or Parquet file.
 
-    npz: arrays named as the fields of `RecordedMotion`, settings as JSON in `settings`. CSV and Parquet: columns named
-    `time`, `target/FL_lateral`, `position/x`, `quaternion/w` and so on, each with its unit in brackets if it is not the
-    default: `angle/FL_outer [deg]`. Settings of a table are in a JSON file of the same name in its folder.
-    torque_constant [N m/A]: torque at the joint per current, for tables with `current` instead of `torque`.
+    base, gains and torque_limit [N m] override the file's settings unless "" or 0. npz: arrays named as the fields of
+    `RecordedMotion`, settings as JSON in `settings`. CSV and Parquet: columns named `time`, `target/FL_lateral`,
+    `position/x`, `quaternion/w` and so on, each with its unit in brackets if it is not the default: `angle/FL_outer
+    [deg]`. Settings of a table are in a JSON file of the same name in its folder. torque_constant [N m/A]: torque at
+    the joint per current, for tables with `current` instead of `torque`.
 
     Raises InputError: the file or a channel is missing, of another shape or unit, or not finite; the message names it.
     OSError: the file cannot be read.
@@ -183,7 +184,7 @@ def load_motion(
 
 
 def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return (arrays by channel in SI units, settings by name) of an npz file. Raises InputError or OSError."""
+    """Read arrays by channel [SI] and settings by name from a motion's npz file. Raises InputError or OSError."""
     try:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
@@ -206,7 +207,7 @@ def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def parse_settings(path: Path, text: str) -> dict[str, Any]:
-    """Return the settings in a JSON text; path: file named in errors. Raises InputError: not a JSON object."""
+    """Parse a motion's settings from a JSON text; path: file named in errors. Raises InputError: not a JSON object."""
     try:
         settings = json.loads(text)
     except json.JSONDecodeError as error:
@@ -226,7 +227,7 @@ def csv_rows(path: Path) -> list[list[str]]:
 
 
 def read_csv(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return (arrays by channel in SI units, settings by name) of a CSV file. Raises InputError or OSError."""
+    """Read arrays by channel [SI] and settings by name from a motion's CSV file. Raises InputError or OSError."""
     rows = csv_rows(path)
     if len(rows) < 2:
         raise InputError(f"{path}: expected a line of names and rows of numbers")
@@ -252,9 +253,10 @@ def first_non_number(row: list[str]) -> str:
 
 
 def read_parquet(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Return (arrays by channel in SI units, settings by name) of a Parquet file.
+    """Read channels and settings of a recorded motion from a Parquet file.
 
-    Raises InputError: not a Parquet file, or pyarrow is not installed; OSError.
+    Returns (arrays by channel in SI units, settings by name). Raises InputError: not a Parquet file, or pyarrow is not
+    installed; OSError.
     """
     try:
         import pyarrow
@@ -275,19 +277,20 @@ def read_parquet(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 
 def sidecar_settings(path: Path) -> dict[str, Any]:
-    """Return the settings in the JSON file next to a table, `walk.json` for `walk.csv`; empty if it does not exist.
+    """Return the settings of a motion in the JSON file next to its table, `walk.json` for `walk.csv`.
 
-    Raises InputError or OSError.
+    Empty if it does not exist. Raises InputError or OSError.
     """
     file = path.with_suffix(".json")
     return parse_settings(file, file.read_text(encoding="utf-8")) if file.exists() else {}
 
 
 def channels_of(path: Path, names: list[str], table: np.ndarray) -> dict[str, np.ndarray]:
-    """Return arrays by channel, (n,) for time, else (n, 3, 4 or 12), in SI units; unmeasured columns are NaN.
+    """Sort the columns of a recorded table into arrays by measured channel, in SI units.
 
-    names: of the columns, such as `angle/FL_outer [deg]`. table: (n, columns). Raises InputError: an unknown name or
-    unit, a column twice, or time or targets that are missing.
+    Arrays: (n,) for time, else (n, 3, 4 or 12); unmeasured columns are NaN. names: of the columns, such as
+    `angle/FL_outer [deg]`. table: (n, columns). Raises InputError: an unknown name or unit, a column twice, or time or
+    targets that are missing.
     """
     parts = {
         "time": [""], "position": list("xyz"), "quaternion": list("xyzw"),

@@ -22,10 +22,11 @@ BASE_ONLY = ("base_mass", "base_com", "base_inertia", "paw_friction")
 
 @dataclass(frozen=True)
 class Parameter:
-    """Unknown parameter: one value that is written to some columns of a quantity of `RobotValues`.
+    """Unknown parameter of the robot with prior and bounds.
 
-    The optimiser works on z = (value - nominal) / prior, or for a ratio on z = ln(value / nominal) / prior; the prior
-    of z is a normal distribution of mean 0 and standard deviation 1.
+    It is one value that is written to some columns of a quantity of `RobotValues`. The optimiser works on z = (value -
+    nominal) / prior, or for a ratio on z = ln(value / nominal) / prior; the prior of z is a normal distribution of mean
+    0 and standard deviation 1.
     """
 
     name: str
@@ -55,34 +56,34 @@ class Parameter:
 
     @property
     def z_per_growth(self) -> float:
-        """Derivative of z by the relative change of the value, at the nominal value."""
+        """Derivative of the normalised coordinate z by the relative change of the value, at the nominal value."""
         return (1.0 if self.scale == "ratio" else self.nominal) / self.prior
 
     def value(self, z: np.ndarray) -> np.ndarray:
-        """Return the values [unit] at normalised coordinates z, in the shape of z."""
+        """Convert normalised coordinates z to values of the parameter [unit], in the shape of z."""
         if self.scale == "ratio":
             return self.nominal * np.exp(self.prior * z)
         return self.nominal + self.prior * z
 
     def normalised(self, value: np.ndarray | float) -> np.ndarray:
-        """Return the normalised coordinates z of values [unit], in the shape of `value`; inverse of `value`."""
+        """Convert values of the parameter [unit] to normalised coordinates z, in the shape of `value`."""
         if self.scale == "ratio":
             return np.log(np.asarray(value) / self.nominal) / self.prior
         return (np.asarray(value) - self.nominal) / self.prior
 
     def std(self, z: float, z_std: float) -> float:
-        """Return the standard deviation [unit] of the value at z, given the standard deviation z_std of z."""
+        """Return the standard deviation [unit] of the parameter's value at z, given that of z, z_std."""
         return z_std * self.prior * (float(self.value(np.array(z))) if self.scale == "ratio" else 1.0)
 
 
 @dataclass(frozen=True)
 class ParameterSet:
-    """The P parameters of an identification, in the order of the vector z; iterable."""
+    """The P unknown parameters of an identification, in the order of the vector z; iterable."""
 
     parameters: tuple[Parameter, ...]
 
     def __post_init__(self) -> None:
-        """Raise InputError if there are no parameters, or two of one name."""
+        """Raise InputError if there are no parameters, or two parameters of one name."""
         names = self.names
         if not names:
             raise InputError("there must be at least one parameter")
@@ -106,15 +107,15 @@ class ParameterSet:
         return np.array(low), np.array(high)
 
     def values(self, z: np.ndarray) -> np.ndarray:
-        """Return values [unit of each parameter] (..., P) at normalised coordinates z (..., P)."""
+        """Convert normalised coordinates z (..., P) to values of the parameters, each in its unit, (..., P)."""
         return np.stack([p.value(z[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
 
     def normalised(self, values: np.ndarray) -> np.ndarray:
-        """Return normalised coordinates z (..., P) of values [unit of each parameter] (..., P)."""
+        """Convert values of the parameters, each in its unit, (..., P) to normalised coordinates z (..., P)."""
         return np.stack([p.normalised(values[..., i]) for i, p in enumerate(self.parameters)], axis=-1)
 
     def robots(self, z: np.ndarray, description: RobotDescription | None = None) -> RobotValues:
-        """Return N robots with parameters at normalised coordinates z (N, P); other values are the description's."""
+        """Return N robots whose parameters have normalised coordinates z (N, P); other values are the description's."""
         z = np.atleast_2d(z)
         robots, values = RobotValues.nominal(len(z), description), self.values(z)
         for i, parameter in enumerate(self.parameters):
@@ -122,7 +123,7 @@ class ParameterSet:
         return robots
 
     def without(self, names: Iterable[str]) -> ParameterSet:
-        """Return the set without the parameters whose name, group or quantity is in `names`.
+        """Return the parameter set without the parameters whose name, group or quantity is in `names`.
 
         Raises InputError: a name that is none of these.
         """
@@ -134,7 +135,7 @@ class ParameterSet:
         return ParameterSet(tuple(p for p in self.parameters if not left_out & {p.name, p.group, p.quantity}))
 
     def changed(self, **changes: dict) -> ParameterSet:
-        """Return the set with some fields replaced, by parameter name: `latency={"prior": 0.001}`.
+        """Return the parameter set with some fields replaced, by parameter name: `latency={"prior": 0.001}`.
 
         Raises InputError: an unknown name, or fields as in `Parameter`.
         """
@@ -145,7 +146,7 @@ class ParameterSet:
 
 
 def jumper_parameters(groups: Sequence[str] = GROUPS, description: RobotDescription | None = None) -> ParameterSet:
-    """Return the robot's parameters of some groups, by default all 79.
+    """Return the unknown parameters of the robot in some groups, by default all 79.
 
     motors: kp, kd, armature by motor; torque limit, cutoff and no-load speed by kind of motor. masses: mass, com and
     inertia of the base, mass ratio by kind of link. friction: friction of each motor, the knees and the paws. latency:
@@ -171,7 +172,10 @@ def jumper_parameters(groups: Sequence[str] = GROUPS, description: RobotDescript
 def ratio(
     name: str, quantity: str, places: Sequence[int], unit: str, nominal: float, prior: float, group: str
 ) -> Parameter:
-    """Return a positive parameter with prior std `prior` [1] of ln(value / nominal); bounds: 5 std, at most tenfold."""
+    """Return a positive parameter whose ratio to its nominal value has a lognormal prior.
+
+    prior: std [1] of ln(value / nominal); bounds: 5 std, at most tenfold.
+    """
     wide = math.exp(min(5.0 * prior, math.log(10.0)))
     return Parameter(name, quantity, tuple(places), unit, nominal, prior, (nominal / wide, nominal * wide), group=group)
 
@@ -179,17 +183,18 @@ def ratio(
 def relative(
     name: str, quantity: str, places: Sequence[int], unit: str, nominal: float, prior: float, group: str
 ) -> Parameter:
-    """Return a positive parameter with prior std `prior` [1] of value / nominal; bounds: 5 std, at least a tenth.
+    """Return a positive parameter whose ratio to its nominal value has a normal prior.
 
-    Equations of motion are linear in masses, gains and armature: combinations that the motions do not determine lie
-    along straight lines of z, which steps of the optimiser follow.
+    prior: std [1] of value / nominal; bounds: 5 std, at least a tenth. Equations of motion are linear in masses, gains
+    and armature: combinations that the motions do not determine lie along straight lines of z, which steps of the
+    optimiser follow.
     """
     low, high = nominal * max(1.0 - 5.0 * prior, 0.1), nominal * (1.0 + 5.0 * prior)
     return Parameter(name, quantity, tuple(places), unit, nominal, prior * nominal, (low, high), "absolute", group)
 
 
 def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return the parameters of group motors: kp, kd, armature of 12 motors; torque limit, speeds by kind of motor."""
+    """Return the motor parameters: kp, kd and armature of 12 motors; torque limit and speeds by kind of motor."""
     parameters = []
     for quantity, prior in (("kp", 0.2), ("kd", 0.2)):
         parameters += [
@@ -210,7 +215,7 @@ def motor_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
 
 
 def mass_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return the parameters of group masses: mass, com and inertia of the base, and mass ratios by kind of link."""
+    """Return the mass parameters: mass, com and inertia of the base, and mass ratios by kind of link."""
     base = robot.links[0]
     parameters = [relative("base_mass", "base_mass", (0,), "kg", base.mass, 0.15, "masses")]
     for i, axis in enumerate("xyz"):
@@ -226,7 +231,7 @@ def mass_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
 
 
 def friction_parameters(robot: RobotDescription) -> tuple[Parameter, ...]:
-    """Return the parameters of group friction: Coulomb friction of 12 motors, knee damping, friction of the paws."""
+    """Return the friction parameters: Coulomb friction of 12 motors, knee damping, friction of the paws."""
     parameters = [
         ratio(
             f"motor_friction/{joint}", "motor_friction", (i,), "N m", robot.motors[i].coulomb_friction, 0.6, "friction"
@@ -249,13 +254,13 @@ class PriorMeasurement:
 
 
 def total_mass(robots: RobotValues) -> np.ndarray:
-    """Return the mass [kg] of N robots, (N,)."""
+    """Return the total mass of each of N robots [kg], (N,)."""
     leg = [load_description().link(f"FL_{kind}").mass for kind in LINK_KINDS]
     return robots.base_mass[:, 0] + 4.0 * robots.link_mass @ np.array(leg)
 
 
 def weighed_mass(mass: float, std: float = 0.02) -> PriorMeasurement:
-    """Return a measurement of the whole robot's mass [kg]; std [kg]: standard deviation of the scale.
+    """Return the weighed mass of the whole robot [kg] as a prior measurement; std [kg]: of the scale.
 
     Raises InputError: std is not positive, or the mass is not within 0.5 to 2 times the described one.
     """

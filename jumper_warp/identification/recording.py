@@ -31,7 +31,7 @@ HELD_MASS = 1.0e4  # [kg] mass of a held base in `simulate_plan`, which also res
 
 @dataclass(frozen=True, eq=False)
 class Plan:
-    """Planned motor targets of a motion; motors by leg FL, FR, BL, BR, each lateral, outer, inner."""
+    """Planned motor targets of an identification motion. Motors by leg FL, FR, BL, BR, each lateral, outer, inner."""
 
     kind: Kind
     target: np.ndarray  # (ticks, 12) [rad] at 60 Hz
@@ -39,19 +39,19 @@ class Plan:
 
     @property
     def base(self) -> Literal["free", "fixed"]:
-        """ "free": the robot stands on the ground; "fixed": it hangs from a stand."""
+        """Mounting of the robot: "free" on the ground, or "fixed" to a stand on which it hangs."""
         return "fixed" if self.kind == "hung chirp" else "free"
 
     @property
     def rows(self) -> np.ndarray:
-        """Targets [rad] of the rows at 240 Hz, (SAMPLES * ticks, 12)."""
+        """Planned motor targets [rad] at the 240 Hz of the recording, (SAMPLES * ticks, 12)."""
         return np.repeat(self.target, SAMPLES, axis=0)
 
 
 def sample_plan(kind: Kind, rng: np.random.Generator, seconds: float = 1.25, torque_limit: float = 12.0) -> Plan:
-    """Return random targets for a motion of a kind, `seconds` [s] long; torque_limit [N m].
+    """Sample random motor targets for an identification motion of a kind, such as a small jump.
 
-    Raises InputError: an unknown kind, or a duration outside 0.5 to 60 s.
+    Duration `seconds` [s]; torque_limit [N m]. Raises InputError: an unknown kind, or a duration outside 0.5 to 60 s.
     """
     ticks = round(seconds / TICK)
     if ticks < 30 or not seconds < 60.0:
@@ -66,7 +66,7 @@ def sample_plan(kind: Kind, rng: np.random.Generator, seconds: float = 1.25, tor
 
 
 def chirp_targets(ticks: int, rng: np.random.Generator, hung: bool) -> np.ndarray:
-    """Return targets [deg] (ticks, 12) of a chirp with a random phase by motor; smaller and slower unless `hung`."""
+    """Sample motor targets [deg] (ticks, 12) of a chirp with a random phase by motor; smaller, slower unless `hung`."""
     time = TICK * np.arange(ticks)
     slow, fast = rng.uniform(0.3, 0.8), rng.uniform(5.0, 9.0) if hung else rng.uniform(2.5, 4.5)
     cycles = slow * time + 0.5 * (fast - slow) * time**2 / time[-1]
@@ -85,7 +85,7 @@ def chirp_targets(ticks: int, rng: np.random.Generator, hung: bool) -> np.ndarra
 
 
 def jump_targets(ticks: int, rng: np.random.Generator) -> np.ndarray:
-    """Return targets [deg] (ticks, 12) of a squat, a push-off and a landing, with a random offset of each motor."""
+    """Sample motor targets [deg] (ticks, 12) of a squat, push-off and landing, with random offsets of each motor."""
     squat, push, land = rng.uniform(75.0, 95.0), rng.uniform(5.0, 25.0), rng.uniform(50.0, 65.0)
     down, hold, up = 22, rng.integers(6, 12), rng.integers(9, 13)  # [ticks] durations of squatting, waiting, push-off
     target = np.zeros((ticks, 12))
@@ -100,7 +100,7 @@ def jump_targets(ticks: int, rng: np.random.Generator) -> np.ndarray:
 
 
 def initial_state(replay: MotionReplay, plan: Plan, robots: RobotValues) -> InitialStates:
-    """Return the state of one robot at rest in the pose of the first targets; a free robot starts 1 mm in the air."""
+    """Return a planned motion's initial state, at rest in the pose of the first targets; if free, 1 mm in the air."""
     angle, rest = plan.target[:1] - robots.offset, np.zeros((1, 12))
     height, quaternion = HANGING_HEIGHT, np.array([[0.0, 0.0, 0.0, 1.0]])
     if plan.base == "free":
@@ -110,7 +110,7 @@ def initial_state(replay: MotionReplay, plan: Plan, robots: RobotValues) -> Init
 
 
 def replay_plan(replay: MotionReplay, plan: Plan, robots: RobotValues, refine: int = 1) -> Record:
-    """Return the replay of a plan by one robot, from rest, rows at 240 Hz; refine: physics steps per 1/480 s."""
+    """Simulate one robot under planned motor targets, from rest, rows at 240 Hz; refine: steps per 1/480 s."""
     period, stride = TICK / SAMPLES, 2 * refine
     rest, rows = round(REST / period), plan.rows
     target = np.repeat(np.concatenate([np.repeat(rows[:1], rest, axis=0), rows]), stride, axis=0)
@@ -125,7 +125,7 @@ def replay_plan(replay: MotionReplay, plan: Plan, robots: RobotValues, refine: i
 def simulate_plan(
     plan: Plan, robots: RobotValues | None = None, *, solver: SolverName = "jumper", dt: float = 1.0 / 480.0
 ) -> Record:
-    """Return the simulated motion of one robot under a plan, from rest, rows at 240 Hz, by `Simulation` with a solver.
+    """Simulate one robot under planned motor targets from rest by `Simulation`, rows at 240 Hz.
 
     robots: N = 1, by default as described. dt [s]: physics step. Raises InputError: dt does not divide 1/240 s.
     """
@@ -201,10 +201,11 @@ def measure(
     torque: bool = False,
     base_every: int = 2,
 ) -> RecordedMotion:
-    """Return the sensors' recording of a simulated motion: motors at 240 Hz, the base's pose every `base_every` rows.
+    """Turn a simulated motion into a recording with sensor offsets and noise.
 
-    name: name of the motion. record: true motion of world 0; robots: its sensor offsets. rng: random numbers of the
-    noise, None for no noise. noise: its standard deviations. torque: whether motor torques are recorded.
+    Motors at 240 Hz, the base's pose every `base_every` rows. name: name of the motion. record: true motion of world 0;
+    robots: its sensor offsets. rng: random numbers of the noise, None for no noise. noise: its standard deviations.
+    torque: whether motor torques are recorded.
     """
     levels = channel_noise(noise or NoiseLevels())
     rows = len(plan.rows)

@@ -1,4 +1,4 @@
-"""Replay of recorded targets in parallel worlds with different robots and initial states, in double precision."""
+"""Replay of recorded motor targets in parallel worlds with different robots and initial states, in double precision."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ TOLERANCE = 1.0e-10  # [m/s] tolerance of the contact iteration, whose error fin
 
 @dataclass
 class Record:
-    """True motion in a replay, without sensor errors: R rows, N worlds; motors by leg FL, FR, BL, BR."""
+    """True motions of N robots during a replay, R rows, without sensor errors; motors by leg FL, FR, BL, BR."""
 
     angle: np.ndarray  # (R, 12, N) [rad] motor angles; of each leg lateral, outer, inner
     rate: np.ndarray  # (R, 12, N) [rad/s] motor rates
@@ -37,12 +37,12 @@ class Record:
 
 
 class MotionReplay:
-    """Replay of motor targets in parallel worlds; caches a `Rollout` for each number of worlds and physics step."""
+    """Simulation of recorded motor targets in parallel worlds; caches a `Rollout` by worlds and physics step."""
 
     def __init__(
         self, *, description: RobotDescription | None = None, device: wp.DeviceLike = None, threads: int | None = None
     ):
-        """Prepare without simulating; description: the robot, by default the project's; threads: CPU threads."""
+        """Store the robot, by default the project's, and the number of CPU threads for later simulations."""
         self.description = load_description() if description is None else description
         self.world_steps = 0  # Physics steps of all worlds so far
         self._device, self._threads = device, checked_threads(threads)
@@ -62,12 +62,13 @@ class MotionReplay:
         gains: Literal["jumping", "walking"] = "jumping",
         torque_limit: float = 18.0,
     ) -> Record:
-        """Return the motion of N worlds, one for each of `robots` and `starts`, without initial contact impulses.
+        """Simulate N robots from given initial states under the same motor targets, and return their motions.
 
-        target: motor targets [rad], one row for each physics step of dt [s], (lead + steps, 12); the first `lead` are
-        sent before the start; each acts after the latency. rows: number of rows, `stride` physics steps apart; row 0 is
-        the start. base: "fixed" holds the base at its initial pose. gains, torque_limit [N m]: of the described motors,
-        which the ratios of `robots` scale.
+        One world for each of `robots` and `starts`, without initial contact impulses. target: motor targets [rad], one
+        row for each physics step of dt [s], (lead + steps, 12); the first `lead` are sent before the start; each acts
+        after the latency. rows: number of rows, `stride` physics steps apart; row 0 is the start. base: "fixed" holds
+        the base at its initial pose. gains, torque_limit [N m]: of the described motors, which the ratios of `robots`
+        scale.
         """
         count, steps = len(starts.angle), (rows - 1) * stride + 1  # the last row's torques take one more step
         rollout, nominal = self._rollout(count, dt)
@@ -88,7 +89,7 @@ class MotionReplay:
         return Record(q[:, 7:], qd[:, 6:], torque, q[:, :3], q[:, 3:7], valid)
 
     def _rollout(self, count: int, dt: float) -> tuple[Rollout, np.ndarray]:
-        """Return the cached rollout of `count` worlds, and the described robot's parameter table, (321, 1)."""
+        """Return the cached simulation of `count` worlds, and the described robot's parameter table, (321, 1)."""
         if (count, dt) not in self._rollouts:
             model = build_model(count, description=self.description, visuals=False, device=self._device)
             rollout = Rollout(
@@ -103,10 +104,11 @@ class MotionReplay:
 
 
 def delayed_targets(target: np.ndarray, latency: np.ndarray, lead: int, steps: int) -> np.ndarray:
-    """Return the targets that act in each physics step, (steps, 12, N), from the sent targets (S, 12).
+    """Delay sent motor targets by the latency of each robot.
 
-    latency: (N,) [physics steps], may be fractional: a step uses the mean target over its duration, which is continuous
-    in the latency. lead: rows of `target` before the first step.
+    Returned: the targets that act in each physics step, (steps, 12, N), from the sent targets (S, 12). latency: (N,)
+    [physics steps], may be fractional: a step uses the mean target over its duration, which is continuous in the
+    latency. lead: rows of `target` before the first step.
     """
     delay, world = np.unique(latency, return_inverse=True)
     whole = np.floor(delay).astype(int)
@@ -117,7 +119,7 @@ def delayed_targets(target: np.ndarray, latency: np.ndarray, lead: int, steps: i
 
 
 def write_motors(parameters: dict[str, wp.array], motors: MotorCfg, robots: RobotValues) -> None:
-    """Write gains, limits and sensor offsets of N robots' motors into `Rollout.parameters`, (12, N) each."""
+    """Write gains, limits and sensor offsets of N robots' motors to the parameters of a rollout, (12, N) each."""
     kinds = [motors.lateral, motors.transversal, motors.transversal] * 4
     ratios = {"kp": robots.kp, "kd": robots.kd, "saturation": robots.saturation, "peak": np.ones_like(robots.kp)}
     for name, ratio in ratios.items():
@@ -127,7 +129,10 @@ def write_motors(parameters: dict[str, wp.array], motors: MotorCfg, robots: Robo
 
 
 def parameter_table(nominal: np.ndarray, robots: RobotValues) -> np.ndarray:
-    """Return the parameter table (321, N) of N robots, rows as in `kernels.layout`; nominal: as described, (321, 1)."""
+    """Return the kernels' table of masses, joints and friction (321, N) of N robots.
+
+    Rows as in `kernels.layout`; nominal: as described, (321, 1).
+    """
     table = np.repeat(nominal, len(robots.base_mass), axis=1)
     mass, com = robots.base_mass[:, 0], robots.base_com.T
     nominal_mass, nominal_moment = table[layout.BASE], table[layout.BASE + 1 : layout.BASE + 4]

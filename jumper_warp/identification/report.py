@@ -39,7 +39,7 @@ th:first-child, td:first-child { text-align: left; }
 
 
 def to_json(result: Identification) -> dict[str, Any]:
-    """Return the content of `report.json`: parameters and undetermined combinations of them, fit, steps and effort."""
+    """Return the content of `report.json`: identified and undetermined parameters, fit, steps and effort."""
     rows = []
     for i, parameter in enumerate(result.parameters):
         low, high = result.intervals[i]
@@ -90,9 +90,10 @@ def identified_overlay(result: Identification, source: str = "") -> RobotOverlay
 
 
 def randomization_ranges(result: Identification) -> dict[str, tuple[float, float]]:
-    """Return (low, high) by row of `RandomizationCfg`, in its units, so that the 95 % intervals of all parameters fit.
+    """Return randomisation ranges of the environment that contain the 95 % intervals of all identified parameters.
 
-    Ratios, masses [kg], com [m] and offsets [deg] are relative to the identified values; friction and latency [ms] not.
+    (low, high) by row of `RandomizationCfg`, in its units. Ratios, masses [kg], com [m] and offsets [deg] are relative
+    to the identified values; friction and latency [ms] not.
     """
     rows: dict[str, tuple[float, float]] = {}
 
@@ -140,7 +141,7 @@ def write_html(result: Identification, folder: Path) -> None:
 
 
 def summary(result: Identification) -> str:
-    """Return the first HTML paragraphs of the report: counts, χ², effort and warnings."""
+    """Return the first HTML paragraphs of the identification report: counts, χ², effort and warnings."""
     text = (
         f"{int(result.identified.sum())} of {len(result.parameters)} parameters are identified from {result.count} "
         f"measured values. Mean squared weighed residual {result.chi2:.3f} (as described {result.nominal_chi2:.4g}). "
@@ -185,7 +186,7 @@ def parameter_table(result: Identification) -> str:
 
 
 def fit_table(result: Identification) -> str:
-    """Return the HTML table of χ² and rms error of each motion and channel."""
+    """Return the HTML table of the fit: χ² and rms error of each motion and channel."""
     rows = []
     for fit in result.fits:
         unit, factor = UNITS[fit.channel]
@@ -195,7 +196,7 @@ def fit_table(result: Identification) -> str:
 
 
 def image(figure: Any) -> str:
-    """Return a Matplotlib figure as an HTML image with embedded PNG data."""
+    """Embed a Matplotlib figure as a PNG image in HTML."""
     data = io.BytesIO()
     figure.savefig(data, format="png", dpi=110, bbox_inches="tight")
     return f'<img alt="" src="data:image/png;base64,{base64.b64encode(data.getvalue()).decode()}">'
@@ -237,8 +238,9 @@ def progress_plot(result: Identification) -> Any:
 
 
 def motion_plot(result: Identification, motion: MotionResiduals, start: np.ndarray) -> Any:
-    """Return plots (a Matplotlib figure) of one motion; start: coordinates of its initial state, (I,).
+    """Plot one motion, measured and simulated, and its residuals; start: coordinates of its initial state, (I,).
 
+    Above: measured and simulated values of the first channel at three motors (or axes). Below: residuals of channels.
     Above: measured and simulated values of the first channel at three motors (or axes). Below: residuals of channels.
     """
     figure = new_figure(10.0, 4.6)
@@ -264,6 +266,6 @@ def motion_plot(result: Identification, motion: MotionResiduals, start: np.ndarr
 
 
 def shown_channels(channels: Sequence[tuple[str, slice]]) -> list[tuple[str, slice]]:
-    """Return the first three of channels (name, columns) in the order of the report, whose residuals are plotted."""
+    """Choose the measured channels (name, columns) whose residuals are plotted: the first three in report order."""
     order = {name: i for i, name in enumerate(("angle", "rate", "torque", "position", "orientation"))}
     return sorted(channels, key=lambda channel: order[channel[0]])[:3]

@@ -1,4 +1,4 @@
-"""Residuals of a recorded motion against its replay, over the noise, and their Jacobian by parallel differences."""
+"""Residuals between a recorded motion and its simulation, divided by the noise, and their Jacobian."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ class NothingMeasured(InputError):
 
 
 class Linearised(NamedTuple):
-    """Residuals of one motion over their noise, and their Jacobian by the normalised unknowns."""
+    """Residuals of one motion, divided by the noise, and their Jacobian w.r.t. the normalised unknowns."""
 
     residual: np.ndarray  # (m,)
     jacobian: np.ndarray  # (m, P + I) by the P parameters and the I coordinates of the initial state
 
 
 class MotionResiduals:
-    """The m residuals of a recorded motion: simulated minus measured values, over the noise.
+    """The m residuals of a recorded motion: simulated minus measured values, divided by the sensor noise.
 
     Unknowns are normalised: P parameters and the I coordinates of an initial state, see `InitialStatePrior`.
     """
@@ -58,9 +58,10 @@ class MotionResiduals:
         dt: float | None = None,
         span: tuple[int, int] | None = None,
     ):
-        """Prepare the residuals of a motion; dt [s]: largest physics step, default 1/480; span: first row, end row.
+        """Prepare the residuals of a recorded motion.
 
-        Raises InputError: angles of the wrong sign, gaps, or dt out of range; NothingMeasured.
+        dt [s]: largest physics step, default 1/480; span: first row, end row. Raises InputError: angles of the wrong
+        sign, gaps, or dt out of range; NothingMeasured.
         """
         check_signs(motion)
         whole, (first, end) = motion, span or (0, len(motion.time))
@@ -82,7 +83,7 @@ class MotionResiduals:
         self.jacobian_worlds = self._plan_jacobian()
 
     def _make_grid(self, dt: float | None) -> float:
-        """Place the rows on a grid of physics steps (dt [s] at most); return the median time between rows [s].
+        """Align the rows of a recording with physics steps of at most dt [s]; return the median time between rows [s].
 
         Sets stride, dt, rows and the row's position on the grid. Raises InputError: a gap above `LONGEST_GAP`.
         """
@@ -103,7 +104,10 @@ class MotionResiduals:
         return period
 
     def _collect_measurements(self, noise: NoiseLevels) -> None:
-        """Set `measured` and `valid` (n, columns), `sigma` (columns,) [SI] and `channels`, (name, columns) each."""
+        """Collect the measured values of the motion with their noise, and mark missing ones.
+
+        Sets `measured` and `valid` (n, columns), `sigma` (columns,) [SI] and `channels`, (name, columns) each.
+        """
         motion, columns = self.motion, []
         self.channels: list[tuple[str, slice]] = []
         sigma, legs, first = [], [], 0
@@ -123,7 +127,7 @@ class MotionResiduals:
         self.sigma, self._leg = np.array(sigma), np.array(legs)
 
     def first_part(self, fraction: float) -> MotionResiduals:
-        """Return the residuals of the first fraction (0 to 1) of the rows, with the same prior of the initial state."""
+        """Return the residuals of the first `fraction` (0 to 1) of the motion's rows, with the same initial prior."""
         if fraction >= 1.0:
             return self
         part = copy.copy(self)
@@ -136,9 +140,10 @@ class MotionResiduals:
     def linearise(
         self, replay: MotionReplay, z: np.ndarray, start: np.ndarray, change: np.ndarray | float = DIFFERENCE
     ) -> Linearised:
-        """Return residuals and Jacobian at parameters z (P,) and initial state start (I,), by one-sided differences.
+        """Compute the residuals of the motion and their Jacobian w.r.t. the unknowns by one-sided differences.
 
-        change: step by unknown, (P + I,) or one for all. The whole Jacobian is NaN if any world diverges.
+        At parameters z (P,) and initial state start (I,). change: step by unknown, (P + I,) or one for all. The whole
+        Jacobian is NaN if any world diverges.
         """
         change = np.broadcast_to(change, len(z) + len(start))
         many_z, many_start = (np.repeat(x[None], len(self.jacobian_worlds) + 1, axis=0) for x in (z, start))
@@ -162,7 +167,10 @@ class MotionResiduals:
         return Linearised(residuals[:, 0], jacobian)
 
     def residuals(self, replay: MotionReplay, z: np.ndarray, start: np.ndarray) -> np.ndarray:
-        """Return residuals over their noise (m, N) at z (N, P) and start (N, I); infinite where a world diverges."""
+        """Simulate the motion in N worlds, and return its residuals divided by the noise, (m, N).
+
+        z: (N, P), start: (N, I). Infinite where a world diverges.
+        """
         record, robots = self.run(replay, z, start)
         error = self.sensor_readings(record, robots) - self.measured[:, :, None]
         residuals = (error / self.sigma[:, None])[self.valid]
@@ -170,7 +178,7 @@ class MotionResiduals:
         return residuals
 
     def run(self, replay: MotionReplay, z: np.ndarray, start: np.ndarray) -> tuple[Record, RobotValues]:
-        """Return the replay of N worlds and their robots at parameters z (N, P) and initial states start (N, I)."""
+        """Simulate the motion in N worlds at parameters z (N, P), states start (N, I); return replay and robots."""
         robots = self.parameters.robots(z, self.description)
         motion = self.motion
         record = replay.run(
@@ -205,9 +213,10 @@ class MotionResiduals:
         return np.concatenate(columns, axis=1)
 
     def _plan_jacobian(self) -> list[list[tuple[int, int | None]]]:
-        """Return the unknowns that each world of the Jacobian changes, as (index, leg or None for all legs).
+        """Distribute the unknowns of the Jacobian's finite differences over parallel worlds.
 
-        While the base is held the legs do not interact: the same unknown of the four legs shares a world.
+        Returned: by world, (index, leg or None for all legs). While the base is held the legs do not interact: the same
+        unknown of the four legs shares a world.
         """
         size, single, shared = len(self.parameters), [], {}
         fixed = FIXED_AT_REST if self.initial.resting else ()
@@ -230,7 +239,7 @@ class MotionResiduals:
 
 
 def channel_noise(noise: NoiseLevels) -> dict[str, tuple[float, int]]:
-    """Return (standard deviation [SI], number of columns) by channel of the residuals.
+    """Return noise (standard deviation [SI]) and number of columns of each measured channel.
 
     Raises InputError: a level is not positive and finite.
     """
@@ -245,10 +254,11 @@ def channel_noise(noise: NoiseLevels) -> dict[str, tuple[float, int]]:
 
 
 def check_signs(motion: RecordedMotion) -> None:
-    """Raise InputError if a motor's angles are far from its targets, and less than half as far from negated targets.
+    """Raise InputError if a motor's recorded angles appear to have the wrong sign.
 
-    In motions of `recording` the distance to the negated targets is over four times that to the targets, so a factor of
-    two separates both signs. Motors that stay near 0 pass.
+    That is if they are far from its targets, and less than half as far from negated targets. In motions of `recording`
+    the distance to the negated targets is over four times that to the targets, so a factor of two separates both signs.
+    Motors that stay near 0 pass.
     """
     if motion.angle is None:
         return
@@ -277,9 +287,9 @@ def pieces_of(
     description: RobotDescription,
     dt: float | None,
 ) -> list[MotionResiduals]:
-    """Return the residuals of consecutive pieces of a motion, about `PIECE` long; unmeasured pieces are left out.
+    """Cut a motion into consecutive pieces about `PIECE` long, and return their residuals.
 
-    dt [s]: as in `MotionResiduals`.
+    Unmeasured pieces are left out. dt [s]: as in `MotionResiduals`.
     """
     rows = len(motion.time)
     number = max(1, min(round(motion.duration / PIECE), rows // 4))
@@ -294,9 +304,10 @@ def pieces_of(
 
 
 def grid_steps(period: float, dt: float | None) -> tuple[int, float]:
-    """Return (physics steps in a period [s], step [s]), the step at most dt, by default 1/480 s.
+    """Divide the time between two rows into physics steps of at most dt.
 
-    Raises InputError: dt outside 1e-6 to 0.01 s.
+    Returns (number of steps in a period [s], step [s]); dt: by default 1/480 s. Raises InputError: dt outside 1e-6 to
+    0.01 s.
     """
     longest = 1.0 / 480.0 if dt is None else dt
     if not 1.0e-6 <= longest <= 0.01:

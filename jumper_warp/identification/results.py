@@ -43,7 +43,7 @@ class Effort(NamedTuple):
 
 @dataclass(frozen=True)
 class Fit:
-    """Fit of one channel of one motion."""
+    """Agreement of measurement and simulation in one measured channel of one motion."""
 
     motion: str
     channel: str
@@ -76,18 +76,18 @@ class Identification:
 
     @property
     def values(self) -> np.ndarray:
-        """Values [unit of each parameter], (P,)."""
+        """Identified values of all parameters, (P,), each in its unit."""
         return self.parameters.values(self.z)
 
     @property
     def std(self) -> np.ndarray:
-        """Standard deviations of z (the prior's is 1), including errors of the model, at most 1, (P,)."""
+        """Standard deviations of the normalised parameters, with errors of the model, at most the prior's 1, (P,)."""
         noise = self.mismatch * np.sqrt(np.diag(self.covariance))
         return np.minimum(np.hypot(noise, self.systematic), 1.0)
 
     @property
     def intervals(self) -> np.ndarray:
-        """Lower and upper end of the 95 % intervals [unit of each parameter], within the bounds, (P, 2)."""
+        """95 % intervals of all parameters (lower, upper), each in its unit, within the bounds, (P, 2)."""
         low, high = self.parameters.bounds()
         reach = CONFIDENCE * self.std
         edges = (np.clip(self.z - reach, low, high), np.clip(self.z + reach, low, high))
@@ -95,12 +95,12 @@ class Identification:
 
     @property
     def identified(self) -> np.ndarray:
-        """Whether each standard deviation is below half the prior's, (P,) bool."""
+        """Whether the data determines each parameter: its standard deviation is below half the prior's, (P,) bool."""
         return self.std < 0.5
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """One line for each misfit of motions or prior measurements, with its likely cause."""
+        """Warnings about motions or prior measurements that do not fit, one line each, with the likely cause."""
         lines = []
         if not self.chi2 <= LARGEST_CHI2:
             worst = max(self.fits, key=lambda fit: fit.chi2)
@@ -125,12 +125,12 @@ class Identification:
         return tuple(lines)
 
     def robots(self, count: int = 1) -> RobotValues:
-        """Return the identified robot `count` times, one row for each world."""
+        """Return `count` copies of the identified robot, one row for each world."""
         return self.parameters.robots(np.repeat(self.z[None], count, axis=0))
 
 
 class ChannelError(NamedTuple):
-    """Errors of one channel of one motion."""
+    """Differences between measured and simulated values in one channel of one motion."""
 
     motion: str  # name of the motion
     channel: str  # name of the channel
@@ -140,7 +140,7 @@ class ChannelError(NamedTuple):
 
 
 def channel_errors(problem: LeastSquares, point: Point) -> list[ChannelError]:
-    """Return the errors at a point of each channel of each motion that has measured values."""
+    """Return the differences between measurement and simulation at a point, by motion and measured channel."""
     errors = []
     for motion, start in zip(problem.motions, point.starts, strict=True):
         table = np.full(motion.valid.shape, math.nan)
@@ -160,9 +160,9 @@ def summarise(
     steps: Sequence[DescentStep],
     effort: Callable[[], Effort],
 ) -> Identification:
-    """Return the result of an identification that ended at `point` with the normal equations `normal`.
+    """Summarise an identification that ended at `point`: estimate, uncertainty and fit.
 
-    steps: log of the optimisation. effort: called after all evaluations.
+    normal: the normal equations there. steps: log of the optimisation. effort: called after all evaluations.
     """
     nominal, errors = (channel_errors(problem, at) for at in (problem.nominal_point(), point))
     fits = [

@@ -39,7 +39,7 @@ ADVICE = {
 
 @dataclass(frozen=True)
 class Direction:
-    """A combination of parameters that the data does not determine."""
+    """A combination of parameters that the recorded motions do not determine."""
 
     information: float
     """[1] Fisher information of the data along the direction over the prior's; 0: only the prior determines it."""
@@ -101,9 +101,9 @@ def systematic_std(normal: NormalEquations, columns: Sequence[np.ndarray], covar
 
 
 def _leave_out_change(information: np.ndarray, jacobian: np.ndarray, residual: np.ndarray) -> np.ndarray:
-    """Return the first-order change (P,) of the fitted parameters if residuals (m,) with Jacobian (m, P) are left out.
+    """Return the first-order change (P,) of the fitted parameters when some residuals are left out.
 
-    information: Fisher information of all data and priors, (P, P).
+    The residuals (m,) have the Jacobian (m, P). information: Fisher information of all data and priors, (P, P).
     """
     return np.linalg.solve(information - jacobian.T @ jacobian, jacobian.T @ residual)
 
@@ -133,7 +133,7 @@ def weak_directions(parameters: ParameterSet, information: np.ndarray) -> tuple[
 
 
 def describe_direction(parameters: ParameterSet, vector: np.ndarray) -> str:
-    """Return an English description of an undetermined direction, with a measurement that would determine it.
+    """Describe an undetermined combination of parameters in English, with a measurement that would determine it.
 
     vector: unit vector in normalised parameters, (P,).
     """
@@ -153,9 +153,9 @@ def describe_direction(parameters: ParameterSet, vector: np.ndarray) -> str:
 
 
 def largest_members(parameters: Sequence[Parameter], vector: np.ndarray, quantity: str) -> str:
-    """Return the largest components of `vector` (P,) in a quantity, up to four parameters, as text ` (FL_outer, ...)`.
+    """Name the parameters of a quantity that dominate an undetermined combination, up to four, as ` (FL_outer, ...)`.
 
-    Empty if the quantity has only one parameter or all its components are below 0.3.
+    vector: (P,). Empty if the quantity has only one parameter or all its components are below 0.3.
     """
     components = [
         (abs(c), p.name.partition("/")[2]) for p, c in zip(parameters, vector, strict=True) if p.quantity == quantity

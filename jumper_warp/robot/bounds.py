@@ -1,4 +1,4 @@
-"""Plausible ranges of the values in a robot description, which reveal wrong units; the robot may carry a person."""
+"""Checks that values of a robot description are plausible, which reveal wrong units; the robot may carry a person."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from jumper_warp.robot.parts import Joint, Link, Motor, RobotDescription, RobotD
 
 
 class Range(NamedTuple):
-    """A closed range [low, high] of a quantity."""
+    """Range of plausible values of a quantity, closed interval [low, high]."""
 
     low: float  # in the unit
     high: float  # in the unit
@@ -53,7 +53,7 @@ COLOR = Range(0.0, 1.0, "")
 
 
 class RangeCheck(NamedTuple):
-    """Value of a description with its name and allowed range."""
+    """A value of a robot description to check, with its name and its range of plausible values."""
 
     name: str  # for messages
     value: float  # in the range's unit
@@ -79,7 +79,7 @@ def check_bounds(description: RobotDescription) -> None:
 
 
 def refuse_outside(file: Path, part: str, checks: Iterable[RangeCheck]) -> None:
-    """Raise RobotDescriptionError for the first value outside its range or NaN; file, part: place in the message."""
+    """Raise RobotDescriptionError for the first value outside its range or NaN; file, part: where the value is."""
     for name, value, (low, high, unit) in checks:
         if not low <= value <= high:
             problem = f"{name} must be between {low:.4g} and {high:.4g}{unit and ' '}{unit}, got {value:.6g}"
@@ -87,12 +87,12 @@ def refuse_outside(file: Path, part: str, checks: Iterable[RangeCheck]) -> None:
 
 
 def point_checks(name: str, point: np.ndarray) -> Iterator[RangeCheck]:
-    """Return the checks of the x, y, z of a point (3,) [m] in its link's frame; name: of this point, for messages."""
+    """Return the range checks of the coordinates of a point (3,) [m] in its link's frame; name: of the point."""
     return (RangeCheck(f"{axis} of {name}", float(value), PLACE) for axis, value in zip("xyz", point, strict=True))
 
 
 def joint_checks(joint: Joint) -> Iterator[RangeCheck]:
-    """Yield the checks of a joint's origin [m], stops [rad], effort [N m] and speed [rad/s]."""
+    """Yield the range checks of a joint's origin [m], stops [rad], effort [N m] and speed [rad/s]."""
     yield from point_checks("origin", joint.origin)
     yield RangeCheck("lower", joint.lower, STOP)
     yield RangeCheck("upper", joint.upper, STOP)
@@ -101,7 +101,7 @@ def joint_checks(joint: Joint) -> Iterator[RangeCheck]:
 
 
 def link_checks(link: Link, anchors: list[np.ndarray]) -> Iterator[RangeCheck]:
-    """Yield the checks of a link's mass, shapes, size and inertia; anchors: points (3,) [m] as in `check_bounds`."""
+    """Yield the range checks of a link's mass, shapes, size and inertia; anchors: points (3,) [m] of the link."""
     yield RangeCheck("mass", link.mass, LINK_MASS)
     yield from point_checks("centre of mass", link.com)
     for shape in (*link.visuals, *link.collisions):
@@ -115,7 +115,7 @@ def link_checks(link: Link, anchors: list[np.ndarray]) -> Iterator[RangeCheck]:
 
 
 def shape_checks(shape: Shape) -> Iterator[RangeCheck]:
-    """Yield the checks of a shape's position, sizes, mesh coordinates [m] and color channels."""
+    """Yield the range checks of a shape's position, sizes, mesh coordinates [m] and color channels."""
     yield from point_checks(f"{shape.kind} position", shape.position)
     for size in shape.size:
         yield RangeCheck(f"{shape.kind} size", size, SHAPE_SIZE)
@@ -127,7 +127,7 @@ def shape_checks(shape: Shape) -> Iterator[RangeCheck]:
 
 
 def shape_corners(shape: Shape) -> np.ndarray:
-    """Return the corners (8, 3) [m], in the link frame, of the bounding box along the shape's own axes."""
+    """Return the corners (8, 3) [m] of a shape's bounding box, in the link frame; the box is along the shape's axes."""
     if shape.mesh is not None:
         low, high = shape.mesh.vertices.min(axis=0), shape.mesh.vertices.max(axis=0)
     else:
@@ -142,7 +142,7 @@ def shape_corners(shape: Shape) -> np.ndarray:
 
 
 def motor_checks(motor: Motor) -> Iterator[RangeCheck]:
-    """Yield the checks of a motor type's constants, at the output of its gear, and of its two sets of gains."""
+    """Yield the range checks of a motor type's constants, at the output of its gear, and of its two sets of gains."""
     yield RangeCheck("gear_ratio", motor.gear_ratio, GEAR_RATIO)
     yield RangeCheck("rotor_inertia", motor.rotor_inertia, ROTOR_INERTIA)
     yield RangeCheck("rotor_inertia behind the gear", motor.armature, ARMATURE)
@@ -157,7 +157,7 @@ def motor_checks(motor: Motor) -> Iterator[RangeCheck]:
 
 
 def common_checks(description: RobotDescription) -> Iterator[RangeCheck]:
-    """Yield the checks of knee damping and of the stops of outer + inner angle, which all legs share."""
+    """Yield the range checks of knee damping and of the stops of outer + inner angle, which all legs share."""
     yield RangeCheck("knee_damping", description.knee_damping, KNEE_DAMPING)
     yield RangeCheck("knee_damping_limit", description.knee_damping_limit, KNEE_DAMPING_LIMIT)
     for name, angle in zip(("lower", "upper"), description.transversal_sum, strict=True):

@@ -20,7 +20,10 @@ INERTIA_TOLERANCE = 1.0e-9  # [kg m^2] Largest deviation of mirrored moments of 
 
 @dataclass(frozen=True)
 class LegDimensions:
-    """Constants of one leg, as in the kernels' `LegGeometry`; housing frame: on the lateral axis, x forward, y left."""
+    """Lengths and positions that define one leg's geometry.
+
+    Housing frame: on the lateral axis, x forward, y left. Names are those of the kernels' `LegGeometry`.
+    """
 
     hip: tuple[float, float, float]  # [m] lateral axis, body frame
     front: float  # +1 front leg, -1 back leg
@@ -74,7 +77,7 @@ def knee_angles(leg: LegDimensions, outer: float, inner: float) -> tuple[float, 
 
 
 def check_description(description: RobotDescription) -> RobotDescription:
-    """Return the description with links and joints in tree order. Raises RobotDescriptionError if a check fails."""
+    """Check a robot description, and return it with links and joints in tree order. Raises RobotDescriptionError."""
     check_bounds(description)
     description = in_tree_order(description)
     check_loops(description)
@@ -88,7 +91,7 @@ def check_description(description: RobotDescription) -> RobotDescription:
 
 
 def in_tree_order(description: RobotDescription) -> RobotDescription:
-    """Return the description with its links and joints in the order of `tree_layout`; refuse any other tree."""
+    """Sort the links and joints of a robot description in the order of `tree_layout`; refuse any other tree."""
     file = description.urdf_path
     links = {link.name: link for link in description.links}
     joints = {joint.name: joint for joint in description.joints}
@@ -115,7 +118,7 @@ def in_tree_order(description: RobotDescription) -> RobotDescription:
 
 
 def tree_layout() -> dict[str, tuple[str, str]]:
-    """Return (parent link, child link) of every tree joint by its name, in tree order: leg by leg, outer bar first."""
+    """Return the links that each joint of the robot's tree connects: (parent, child) by joint, in tree order."""
     layout = {}
     for leg in LEGS:
         layout[f"{leg}_lateral"] = ("body", f"{leg}_housing")
@@ -126,7 +129,7 @@ def tree_layout() -> dict[str, tuple[str, str]]:
 
 
 def check_loops(description: RobotDescription) -> None:
-    """Refuse loops that do not join a leg's two shanks at the same point of their -z axes."""
+    """Raise RobotDescriptionError for a loop that does not join a leg's shanks at one point of their -z axes."""
     file, links = description.path, {link.name for link in description.links}
     for leg, loop in zip(LEGS, description.loops, strict=True):
         part = f"loop {loop.name}"
@@ -141,12 +144,12 @@ def check_loops(description: RobotDescription) -> None:
 
 
 def close(actual: Any, expected: Any, tolerance: float = TOLERANCE) -> bool:
-    """Return whether every entry of `actual` is within `tolerance` (same unit) of `expected`; the shapes broadcast."""
+    """Return whether arrays agree: every entry of `actual` within `tolerance` of `expected`; the shapes broadcast."""
     return bool(np.abs(np.asarray(actual) - expected).max() <= tolerance)
 
 
 def check_leg(description: RobotDescription, leg: str) -> None:
-    """Refuse a leg that is not a planar five-bar with the documented axes and a paw at its ankle."""
+    """Raise RobotDescriptionError for a leg that is not a planar five-bar with the documented axes and a paw."""
     file = description.urdf_path
     front, side = (1.0 if leg[0] == "F" else -1.0), (1.0 if leg[1] == "L" else -1.0)
     names = ("lateral", "outer", "inner", "outer_knee", "inner_knee")
@@ -180,7 +183,7 @@ def check_leg(description: RobotDescription, leg: str) -> None:
 
 
 def check_lengths(description: RobotDescription, leg: str) -> None:
-    """Refuse a leg with a length [m] outside `LENGTH`, or a paw radius outside `PAW_RADIUS`."""
+    """Raise RobotDescriptionError for a leg with a length [m] outside `LENGTH` or a paw radius outside `PAW_RADIUS`."""
     dimensions, urdf = leg_dimensions(description, leg), description.urdf_path
     axes = abs(dimensions.outer_x - dimensions.inner_x)
     for file, part, name, value, limits in (
@@ -195,7 +198,7 @@ def check_lengths(description: RobotDescription, leg: str) -> None:
 
 
 def check_mirror(description: RobotDescription, leg: str) -> None:
-    """Refuse a leg that is no mirror image of the front left one; the y of front and back hips may differ."""
+    """Raise RobotDescriptionError for a leg that is no mirror image of the front left one; y of the hips may differ."""
     flip = np.array([1.0 if leg[0] == "F" else -1.0, 1.0 if leg[1] == "L" else -1.0, 1.0])  # signs of x, y, z
     file = description.urdf_path
     for link in (link for link in description.links if link.name.startswith(leg)):
@@ -217,7 +220,7 @@ def check_mirror(description: RobotDescription, leg: str) -> None:
 
 
 def check_motors(description: RobotDescription) -> None:
-    """Refuse motors whose type differs between legs, or whose limits differ from their joint's by over 0.1 %."""
+    """Raise RobotDescriptionError for motors that differ between legs, or from their joint's limits by over 0.1 %."""
     for index, (name, motor) in enumerate(zip(MOTOR_JOINTS, description.motors, strict=True)):
         kind = description.motors[index % 3].type
         problem = f"expected {kind} as on the FL leg, found {motor.type}"
@@ -230,7 +233,7 @@ def check_motors(description: RobotDescription) -> None:
 
 
 def check_poses(description: RobotDescription) -> None:
-    """Refuse a pose outside the stops or whose loops cannot close, and a description without a pose named default."""
+    """Raise RobotDescriptionError for poses outside the stops or with open loops, or without a pose named default."""
     file, leg = description.path, leg_dimensions(description, "FL")
     require("default" in description.poses, file, "poses", "expected a pose named default")
     for name, (lateral, transversal) in description.poses.items():

@@ -1,4 +1,4 @@
-"""The robot description: a URDF for the tree, and a JSON file for loops, motors and poses, which a URDF cannot hold.
+"""Reading of the robot description: a URDF of the tree, and a JSON file of loops, motors and poses.
 
 Angles of the legs: lateral positive swings the paw outward; outer and inner thigh positive move the thigh tip away
 from its twin. Quaternions are xyzw.
@@ -43,7 +43,7 @@ RAD_PER_S_PER_RPM = 2.0 * math.pi / 60.0
 
 
 def load_description(path: Path | None = None) -> RobotDescription:
-    """Return the checked robot description of a JSON file; without a path the project's, which is read once and cached.
+    """Read and check a robot description; without a path the project's, which is read once and cached.
 
     Raises RobotDescriptionError for anything missing, malformed or implausible.
     """
@@ -51,7 +51,7 @@ def load_description(path: Path | None = None) -> RobotDescription:
 
 
 def _read_description(path: Path) -> RobotDescription:
-    """Return the checked, read-only robot description of a JSON file and of the URDF that it names."""
+    """Read and check a robot description: a JSON file and the URDF that it names."""
     reader = JsonReader(path)
     urdf_file = file_inside(path, reader.get(reader.root, "urdf", "", str), "urdf")
     urdf_text = read_text(urdf_file)
@@ -97,11 +97,11 @@ class JsonReader:
         self.require(isinstance(self.root, dict), "", "expected a JSON object")
 
     def require(self, holds: bool, part: str, problem: str) -> None:
-        """Raise RobotDescriptionError for this file unless `holds`; problem: text of the message."""
+        """Raise RobotDescriptionError, which names this file, unless `holds`; problem: text of the message."""
         require(holds, self.file, part, problem)
 
     def unique_keys(self, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        """Return the (key, value) pairs of a JSON object as a dict; refuse a key that occurs twice."""
+        """Convert the (key, value) pairs of a JSON object to a dict; refuse a key that occurs twice."""
         table = dict(pairs)
         if len(table) < len(pairs):
             double = Counter(key for key, _ in pairs).most_common(1)[0][0]
@@ -109,11 +109,11 @@ class JsonReader:
         return table
 
     def refuse_constant(self, name: str) -> None:
-        """Raise RobotDescriptionError; `json` calls it for the constants NaN and Infinity."""
+        """Raise RobotDescriptionError for the JSON constants NaN and Infinity; `json` calls it."""
         raise RobotDescriptionError(self.file, "", f"expected finite numbers, found {name}")
 
     def get(self, table: dict, key: str, part: str, kind: type) -> Any:
-        """Return the entry `key` of a JSON object; refuse one that is missing or not of the Python type `kind`."""
+        """Return an entry of a JSON object; refuse one that is missing or not of the Python type `kind`."""
         value = table.get(key)
         found = "nothing" if value is None else type(value).__name__
         self.require(isinstance(value, kind), part, f"expected {key} to be a {kind.__name__}, found {found}")
@@ -126,25 +126,25 @@ class JsonReader:
         return float(value)
 
     def positive(self, table: dict, key: str, part: str) -> float:
-        """Return the entry `key`, a finite number above 0, in the unit of the file."""
+        """Return an entry of a JSON object that must be a finite number above 0, in the unit of the file."""
         number = self.number(table.get(key), key, part)
         self.require(number > 0.0, part, f"expected {key} > 0, found {number}")
         return number
 
     def vector(self, table: dict, key: str, count: int, part: str) -> list[float]:
-        """Return the entry `key`, a list of `count` finite numbers."""
+        """Return an entry of a JSON object that must be a list of `count` finite numbers."""
         values = self.get(table, key, part, list)
         self.require(len(values) == count, part, f"expected {count} numbers in {key}, found {len(values)}")
         return [self.number(value, key, part) for value in values]
 
     def range_deg(self, key: str) -> tuple[float, float]:
-        """Return the root's entry `key`, a pair [lower, upper] in degrees, as (lower, upper) in radians."""
+        """Return an angle range of the description in radians, from the entry `key` [lower, upper] in degrees."""
         lower, upper = self.vector(self.root, key, 2, "")
         self.require(lower < upper, key, f"expected lower < upper, found {lower} and {upper}")
         return math.radians(lower), math.radians(upper)
 
     def motors(self) -> tuple[Motor, ...]:
-        """Return the 12 motors in motor order."""
+        """Return the robot's 12 motors from the JSON file, in motor order."""
         types = {
             name: self.motor_type(name, self.get(self.root["motor_types"], name, "motor_types", dict))
             for name in self.get(self.root, "motor_types", "", dict)
@@ -157,14 +157,14 @@ class JsonReader:
         return tuple(motors)
 
     def table_of(self, noun: str, names: Sequence[str]) -> dict:
-        """Return the root's object "motors" or "loops" (noun: singular); refuse keys that are not among `names`."""
+        """Return the JSON object of motors or loops by name (noun: singular); refuse names that are not in `names`."""
         table = self.get(self.root, f"{noun}s", "", dict)
         for name in table:
             self.require(name in names, f"{noun} {name}", f"expected one of {', '.join(names)}")
         return table
 
     def motor_type(self, name: str, table: dict) -> Motor:
-        """Return the constants of a motor type from its JSON object, whose speeds are in rpm."""
+        """Read the constants of a motor type from its JSON object, whose speeds are in rpm."""
         part = f"motor type {name}"
         gains = self.get(table, "gains", part, dict)
         motor = Motor(
@@ -183,12 +183,12 @@ class JsonReader:
         return motor
 
     def gains(self, table: dict, use: str, part: str) -> Gains:
-        """Return kp [N m/rad] and kd [N m s/rad] of the entry `use`, "jumping" or "walking"."""
+        """Read a motor's position gains kp [N m/rad] and kd [N m s/rad] for a use, "jumping" or "walking"."""
         gains = self.get(table, use, part, dict)
         return Gains(self.positive(gains, "kp", f"{part} {use}"), self.positive(gains, "kd", f"{part} {use}"))
 
     def loops(self) -> tuple[Loop, ...]:
-        """Return the four ankle loops in leg order, anchors (3,) [m]."""
+        """Return the four loops that close the legs at the ankles, in leg order, anchors (3,) [m]."""
         names = [f"{leg}_ankle" for leg in LEGS]
         table, loops = self.table_of("loop", names), []
         for name in names:
@@ -199,7 +199,7 @@ class JsonReader:
         return tuple(loops)
 
     def poses(self) -> dict[str, tuple[float, float]]:
-        """Return (lateral, transversal) angle [rad] of every leg by the name of the pose."""
+        """Return the standing poses by name, each (lateral, transversal) angle [rad] of every leg."""
         poses = {}
         for name in self.get(self.root, "poses", "", dict):
             pose = self.get(self.root["poses"], name, "poses", dict)

@@ -1,4 +1,4 @@
-"""The robot as files of other simulators: MJCF, URDF with its loops, or USD."""
+"""Export of the robot to files of other simulators: MJCF, URDF with its loops, or USD."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ LOST = {
 def export_robot(
     kind: RobotFormat, folder: Path, overlay: RobotOverlay | None = None, description: RobotDescription | None = None
 ) -> Path:
-    """Write the robot's file and what belongs beside it to a folder, and return the file's path.
+    """Export the robot as MJCF, URDF or USD, with the files that belong to it, and return the main file's path.
 
     Existing files are replaced. overlay: values that replace those of the description, by default the project's.
     Raises InputError: USD without the package `usd-core`; OSError: the folder cannot be written.

@@ -1,4 +1,4 @@
-"""Gravity of planets, and its allowed range."""
+"""Gravitational acceleration of planets, and the range that simulations allow."""
 
 from __future__ import annotations
 
@@ -10,6 +10,6 @@ MAX_GRAVITY = 100.0  # [m/s^2] four times Jupiter's
 
 
 def check_gravity(gravity: float) -> None:
-    """Raise InputError unless gravity, downward [m/s^2], is in 0 to MAX_GRAVITY."""
+    """Raise InputError unless the downward gravity [m/s^2] of a simulation is in 0 to MAX_GRAVITY."""
     if not 0.0 <= gravity <= MAX_GRAVITY:
         raise InputError(f"gravity must lie in 0 to {MAX_GRAVITY:g} m/s^2, downward, got {gravity}")

@@ -49,9 +49,10 @@ class BlockCfg:
             raise InputError(f"block center must be finite, got {self.center}")
 
     def per_world(self, num_worlds: int) -> dict[str, np.ndarray]:
-        """Return the fields by name as arrays: `center`, `half` (num_worlds, 2) [m], the others (num_worlds,).
+        """Return the block's properties of every world as arrays by name.
 
-        Raises InputError for arrays of another number of worlds.
+        `center`, `half` (num_worlds, 2) [m], the others (num_worlds,). Raises InputError for arrays of another number
+        of worlds.
         """
         shapes = {name: (num_worlds, 2) if name in ("center", "half") else (num_worlds,) for name in vars(self)}
         try:
@@ -61,7 +62,7 @@ class BlockCfg:
 
 
 def platform(height: float, *, edge: float = 0.5, size: float = SIZE, cell: float = CELL) -> newton.Heightfield:
-    """Return level ground with a step at x = `edge` [m]: z = 0 before it, `height` [m] behind it, negative for a drop.
+    """Return a heightfield with a step at x = `edge` [m]: z = 0 before it, `height` [m] behind it, negative for a drop.
 
     The edge moves back to the nearest node, and the wall takes one cell. size: edge of the square [m]; cell: largest
     distance between nodes [m]. Raises InputError: `height` is zero or not finite, an edge not between 0 and the rim,
@@ -85,7 +86,7 @@ def uneven(
     size: float = SIZE,
     cell: float = CELL,
 ) -> newton.Heightfield:
-    """Return smooth random bumps up to `amplitude` [m] high and deep, level within `flat_radius` [m] of the origin.
+    """Return a heightfield of smooth random bumps up to `amplitude` [m], level within `flat_radius` [m] of the origin.
 
     length: correlation length [m], at which the correlation of two heights is 1/e; the bumps grow to full height within
     two lengths beyond `flat_radius`. size: edge of the square [m]; cell: largest distance between nodes [m]. With the
@@ -106,14 +107,17 @@ def uneven(
 
 
 def _nodes(size: float, cell: float) -> np.ndarray:
-    """Return the node coordinates [m] along an axis, from -size/2 to size/2, at most `cell` [m] apart."""
+    """Return the grid coordinates of a heightfield along an axis [m], from -size/2 to size/2, at most `cell` apart."""
     if not (size > 0.0 and 0.0 < cell <= 0.5 * size):
         raise InputError(f"a ground needs size > 0 and 0 < cell <= size / 2, got {size} and {cell}")
     return np.linspace(-0.5 * size, 0.5 * size, int(np.ceil(size / cell - 1.0e-9)) + 1)
 
 
 def _gaussian_field(rng: np.random.Generator, nodes: int, cell: float, length: float) -> np.ndarray:
-    """Return a random field (nodes, nodes), mean 0, correlation exp(-(distance / length)^2); cell, length: [m]."""
+    """Return smooth random heights (nodes, nodes) with a Gaussian correlation exp(-(distance / length)^2), mean 0.
+
+    cell, length: [m].
+    """
     padded = nodes + int(np.ceil(4.0 * length / cell))  # the transform is periodic: opposite rims must not correlate
     wave = 2.0 * np.pi * np.fft.fftfreq(padded, cell)
     spectrum = np.exp(-0.125 * length**2 * (wave[:, None] ** 2 + wave[None, :] ** 2))

@@ -1,4 +1,4 @@
-"""The robot as an MJCF model of MuJoCo: loops closed between sites, stops, position servos, ground and default pose."""
+"""Export of the robot as an MJCF model of MuJoCo: closed loops, stops, position servos, ground and default pose."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ ABOUT = """
 
 
 def mjcf(description: RobotDescription, values: RobotValues | None = None) -> str:
-    """Return the MJCF text of a robot that stands on a plane; its meshes are files in the folder meshes/.
+    """Return an MJCF model, as text, of a robot that stands on a plane; its meshes are files in the folder meshes/.
 
     values: of the robot (N = 1), as `RobotOverlay.robots()` returns them; by default the described ones. MJCF has no
     place for their sensor offset, latency and the motors' speeds. Raises KeyError without a default pose.
@@ -57,13 +57,16 @@ def mjcf(description: RobotDescription, values: RobotValues | None = None) -> st
 
 
 def add(parent: Element, tag: str, **attributes: Any) -> Element:
-    """Add and return a child element; numbers and lists of numbers become text, attributes of None are left out."""
+    """Add a child element to an XML element and return it.
+
+    Numbers and lists of numbers become text, attributes of None are left out.
+    """
     text = {name.rstrip("_"): _text(value) for name, value in attributes.items() if value is not None}
     return SubElement(parent, tag, text)
 
 
 def _text(value: Any) -> str:
-    """Return an attribute's text; numbers have twelve digits."""
+    """Return an XML attribute's value as text; numbers have twelve digits."""
     if isinstance(value, str):
         return value
     if isinstance(value, Iterable):
@@ -72,7 +75,7 @@ def _text(value: Any) -> str:
 
 
 def _add_defaults(root: Element, paw_friction: float) -> None:
-    """Add the classes "visual" and "paw", and the softness of stops; paw_friction: Coulomb coefficient [1]."""
+    """Add the default classes "visual" and "paw" and the softness of stops to the MJCF model; paw_friction: [1]."""
     defaults = add(root, "default")
     add(defaults, "joint", solreflimit=(STIFFEST, 1))
     visual = add(defaults, "default", class_="visual")
@@ -85,7 +88,7 @@ def _add_defaults(root: Element, paw_friction: float) -> None:
 
 
 def _add_assets(root: Element, robot: RobotDescription) -> None:
-    """Add the meshes, each once and named like its file, and the ground's material."""
+    """Add the meshes, each once and named like its file, and the ground's material to the MJCF model."""
     assets = add(root, "asset")
     for file in sorted(mesh_files(robot)):
         add(assets, "mesh", name=file.stem, file=file.name)
@@ -96,7 +99,7 @@ def _add_assets(root: Element, robot: RobotDescription) -> None:
 
 
 def _add_world(root: Element, robot: RobotDescription) -> None:
-    """Add light, ground and the tree of bodies with their joints, shapes and sites."""
+    """Add light, ground and the tree of bodies with their joints, shapes and sites to the MJCF model."""
     world = add(root, "worldbody")
     add(world, "light", pos=(0, 0, 3), dir=(0, 0, -1), directional="true")
     add(world, "geom", name="ground", type="plane", size=(GROUND_EDGE, GROUND_EDGE, 0.1), contype="0", conaffinity="1",
@@ -121,7 +124,7 @@ def _add_world(root: Element, robot: RobotDescription) -> None:
 
 
 def _add_shapes(body: Element, link: Link) -> None:
-    """Add a link's inertia, visual shapes and paw to its body."""
+    """Add a link's inertia, visual shapes and paw to its MJCF body."""
     inertia = link.inertia
     moments = (inertia[0, 0], inertia[1, 1], inertia[2, 2], inertia[0, 1], inertia[0, 2], inertia[1, 2])
     add(body, "inertial", pos=link.com, mass=link.mass, fullinertia=moments)
@@ -132,7 +135,7 @@ def _add_shapes(body: Element, link: Link) -> None:
 
 
 def _add_geom(body: Element, shape: Shape, **attributes: Any) -> None:
-    """Add a shape to a body; attributes: of the geom."""
+    """Add a shape of a link to its MJCF body as a geom; attributes: of the geom."""
     x, y, z, w = shape.rotation
     size = list(shape.size)
     if shape.kind == "box":
@@ -146,7 +149,7 @@ def _add_geom(body: Element, shape: Shape, **attributes: Any) -> None:
 
 
 def _add_tendons(root: Element, robot: RobotDescription, values: RobotValues) -> None:
-    """Add the stops of each leg's outer + inner angle, and the springs between its knees if they are stiff."""
+    """Add the stops of each leg's outer + inner angle to the MJCF model, and springs between its knees, if any."""
     tendons = add(root, "tendon")
     for leg in LEGS:
         stop = add(tendons, "fixed", name=f"{leg}_sum", range=robot.transversal_sum, solreflimit=(STIFFEST, 1))
@@ -162,7 +165,7 @@ def _add_tendons(root: Element, robot: RobotDescription, values: RobotValues) ->
 
 
 def _add_actuators(root: Element, robot: RobotDescription) -> None:
-    """Add a position servo for each motor, with its jumping gains and torque limit, then the knees' capped dampers."""
+    """Add a position servo with jumping gains and torque limit for each motor, and the knees' capped dampers."""
     actuators = add(root, "actuator")
     for name, motor in zip(MOTOR_JOINTS, robot.motors, strict=True):
         limit = robot.joint(name).effort

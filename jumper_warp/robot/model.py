@@ -1,4 +1,4 @@
-"""The robot as a Newton model, and as the constants that the kernels read.
+"""Construction of the robot's Newton model and of the leg constants that the kernels read.
 
 Per world, `joint_q` holds the base (position [m], quaternion xyzw), then per leg in FL, FR, BL, BR order the angles
 [rad] lateral, outer, outer knee, inner, inner knee, then per leg the quaternion of the ankle's loop joint.
@@ -105,14 +105,17 @@ def other_colliders(model: Model) -> np.ndarray:
 
 
 def leg_geometry(description: RobotDescription) -> list[dict]:
-    """Return the fields of the kernels' `LegGeometry` by name, one dict per leg in FL, FR, BL, BR order."""
+    """Return the lengths that define each leg's geometry, one dict per leg in FL, FR, BL, BR order.
+
+    By the names of the fields of the kernels' `LegGeometry`.
+    """
     return [dataclasses.asdict(leg_dimensions(description, leg)) for leg in LEGS]
 
 
 def leg_geometry_array(
     description: RobotDescription, geometry_module: ModuleType, device: wp.DeviceLike = None
 ) -> wp.array:
-    """Return the legs' `LegGeometry`, (4,); geometry_module: `kernels.kinematics.geometry` in either precision."""
+    """Return the legs' geometry as an array (4,) of structs for the kernels; geometry_module: either precision."""
     legs = []
     for fields in leg_geometry(description):
         leg = geometry_module.LegGeometry()
@@ -123,9 +126,9 @@ def leg_geometry_array(
 
 
 def standing_configuration(description: RobotDescription, pose: str = "default") -> np.ndarray:
-    """Return one world's `joint_q`, (43,), in a named pose: level base at x = y = 0, the lowest paws touching z = 0.
+    """Return one world's joint coordinates in a standing pose: level base at x = y = 0, lowest paws touching z = 0.
 
-    Raises KeyError for an unknown pose.
+    Shape (43,), as `joint_q`. Raises KeyError for an unknown pose.
     """
     angles = description.pose(pose).reshape(4, 3)
     joints, loops, depths = [], [], []
@@ -153,7 +156,7 @@ def _paw_depth(leg: LegDimensions, lateral: float, ankle_z: float) -> float:
 def _robot_builder(
     description: RobotDescription, friction: float, gravity: float, visuals: bool
 ) -> newton.ModelBuilder:
-    """Return the builder of one robot in the default pose; friction [1] of the paws; gravity [m/s^2]: downward."""
+    """Return a Newton builder of one robot in the default pose; friction [1] of the paws; gravity [m/s^2]: downward."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
     bodies = {}
@@ -177,7 +180,7 @@ def _robot_builder(
 
 
 def _add_joints(builder: newton.ModelBuilder, bodies: dict[str, int], description: RobotDescription) -> None:
-    """Add base and hinges as one articulation, then the loop joints outside it; bodies: indices by link name."""
+    """Add base and hinges to a Newton builder as one articulation, then the loop joints; bodies: index by link."""
     motors = dict(zip(MOTOR_JOINTS, description.motors, strict=True))
     tree = [builder.add_joint_free(bodies["body"], label="base")]
     for joint in description.joints:
@@ -213,7 +216,10 @@ def _add_joints(builder: newton.ModelBuilder, bodies: dict[str, int], descriptio
 def _add_paw(
     builder: newton.ModelBuilder, body: int, paw: Shape, label: str, friction: float, *, visible: bool
 ) -> None:
-    """Add a paw's collision sphere to a body; friction: Coulomb coefficient [1]; visible: whether viewers show it."""
+    """Add a paw's collision sphere to a body of a Newton builder.
+
+    friction: Coulomb coefficient [1]; visible: whether viewers show it.
+    """
     config = newton.ModelBuilder.ShapeConfig(
         density=0.0,
         mu=friction,
@@ -233,7 +239,7 @@ def _add_paw(
 
 
 def _add_visuals(builder: newton.ModelBuilder, body: int, link: Link, meshes: dict[int, newton.Mesh]) -> None:
-    """Add a link's massless, non-colliding shapes to a body; meshes: cache by id of the description's mesh."""
+    """Add a link's shapes, visible only, to a body of a Newton builder; meshes: cache by id of the mesh."""
     config = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False, has_particle_collision=False)
     for index, shape in enumerate(link.visuals):
         common = {
@@ -258,7 +264,7 @@ def _add_visuals(builder: newton.ModelBuilder, body: int, link: Link, meshes: di
 
 
 def _add_ground(builder: newton.ModelBuilder, ground: str | newton.Heightfield | None) -> None:
-    """Add the ground that all worlds share: "plane", a heightfield or None. Raises InputError for anything else."""
+    """Add the ground that all worlds share to a Newton builder: "plane", a heightfield or None. Raises InputError."""
     config = newton.ModelBuilder.ShapeConfig(density=0.0, mu=GROUND_FRICTION, ke=CONTACT_STIFFNESS, kd=CONTACT_DAMPING)
     common = {
         "cfg": config,

@@ -29,7 +29,7 @@ FILTER_NAMES = (*(f"{angle}.{limit}" for angle in ("lateral", "transversal", "su
 
 @dataclass(frozen=True)
 class MotorKindCfg:
-    """Constants of one kind of motor, at the joint."""
+    """Gains, torque limits and speeds of one kind of motor, lateral or transversal, at the joint."""
 
     kp: float
     """[N m/rad]"""
@@ -56,7 +56,7 @@ class MotorKindCfg:
 
 @dataclass(frozen=True)
 class MotorCfg:
-    """Settings of the twelve motors."""
+    """Settings of the robot's twelve motors: gains and limits of both kinds, and over-speed protection."""
 
     lateral: MotorKindCfg
     transversal: MotorKindCfg
@@ -66,7 +66,7 @@ class MotorCfg:
     """[rad/s] Speed from which the torque is 0."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless 0 <= fade_start < fade_end, both finite."""
+        """Raise InputError unless the over-speed protection has finite speeds 0 <= fade_start < fade_end."""
         if not 0.0 <= self.fade_start < self.fade_end < math.inf:
             raise InputError(f"need 0 <= fade_start < fade_end, finite, got {self.fade_start}, {self.fade_end}")
 
@@ -89,7 +89,7 @@ class MotorCfg:
 
 
 def motor_kind(motor: Motor, gains: Literal["jumping", "walking"], torque: float) -> MotorKindCfg:
-    """Return a motor type's constants with one set of gains, limited to `torque` [N m] and its peak torque."""
+    """Return a motor type's gains, speeds and torque limits, cut to `torque` [N m] and its peak torque."""
     pd = getattr(motor, gains)
     saturation, peak = min(torque, motor.peak_torque), motor.peak_torque
     return MotorKindCfg(pd.kp, pd.kd, saturation, peak, motor.cutoff_speed, motor.no_load_speed)
@@ -114,9 +114,10 @@ def motor_arrays(
     device: wp.DeviceLike = None,
     requires_grad: bool = False,
 ) -> Any:
-    """Return the `MotorArrays` of `num_worlds` equal worlds, arrays (12, num_worlds), without sensor offsets.
+    """Return the motor constants of `num_worlds` equal worlds as a struct of arrays for the kernels.
 
-    module: `jumper_warp.kernels.actuation.motors` in either precision. Raises InputError for less than one world.
+    Arrays are (12, num_worlds), without sensor offsets. module: `jumper_warp.kernels.actuation.motors` in either
+    precision. Raises InputError for less than one world.
     """
     check_count("num_worlds", num_worlds)
 
@@ -136,7 +137,7 @@ def motor_arrays(
 
 @dataclass(frozen=True)
 class LimitsCfg:
-    """Limits of one angle, or sum of angles, that the filter enforces."""
+    """Limits of one motor angle, or sum of angles, that the motor command filter enforces."""
 
     lower: float
     """[deg]"""
@@ -148,7 +149,7 @@ class LimitsCfg:
     """[deg] Width of the hard zone inside the upper limit."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless the limits are finite, lower < upper, and zones non-negative without overlap."""
+        """Raise InputError unless the angle's limits are finite, lower < upper, and zones >= 0 without overlap."""
         if not -math.inf < self.lower < self.upper < math.inf:
             raise InputError(f"lower limit must be below upper limit, both finite, got {self.lower}, {self.upper}")
         if not (self.lower_zone >= 0.0 and self.upper_zone >= 0.0):
@@ -171,7 +172,7 @@ class FilterCfg:
     """[deg/s] Least speed assumed toward a limit."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless horizon and speed floor are finite and above 0."""
+        """Raise InputError unless horizon and speed floor of the command filter are finite and above 0."""
         for name in ("horizon", "speed_floor"):
             if not 0.0 < getattr(self, name) < math.inf:
                 raise InputError(f"filter {name} must be finite and > 0, got {getattr(self, name)}")
@@ -182,29 +183,32 @@ JUMP_TRANSVERSAL = LimitsCfg(-30.0, 140.0, lower_zone=10.0, upper_zone=15.0)
 
 
 def vertical_jump_filter() -> FilterCfg:
-    """Return the filter for vertical jumps; horizon: 8 policy steps."""
+    """Return the motor command filter for vertical jumps; horizon: 8 policy steps."""
     return FilterCfg(JUMP_LATERAL, JUMP_TRANSVERSAL, sum=LimitsCfg(0.0, 240.0, 35.0, 45.0), horizon=8.0 / 60.0)
 
 
 def horizontal_jump_filter() -> FilterCfg:
-    """Return the filter for horizontal jumps."""
+    """Return the motor command filter for horizontal jumps."""
     return FilterCfg(JUMP_LATERAL, JUMP_TRANSVERSAL, sum=LimitsCfg(0.0, 220.0, 30.0, 30.0), horizon=8.0 / 60.0)
 
 
 def walking_filter() -> FilterCfg:
-    """Return the filter for walking: no hard zones, lateral limits at the robot's hard stops."""
+    """Return the motor command filter for walking: no hard zones, lateral limits at the robot's hard stops."""
     lateral, transversal = LimitsCfg(-50.0, 110.0), LimitsCfg(-30.0, 140.0)
     return FilterCfg(lateral, transversal, sum=LimitsCfg(0.0, 220.0), horizon=5.0 / 60.0)
 
 
 def loose_filter() -> FilterCfg:
-    """Return a filter with a horizon of two policy steps and no hard zones, for the highest jumps."""
+    """Return the motor command filter for the highest jumps: a horizon of two policy steps and no hard zones."""
     lateral, transversal = LimitsCfg(-15.0, 15.0), LimitsCfg(-30.0, 140.0)
     return FilterCfg(lateral, transversal, sum=LimitsCfg(0.0, 240.0), horizon=2.0 / 60.0)
 
 
 def filter_params(cfg: FilterCfg, *, module: ModuleType = command_filter) -> Any:
-    """Return the kernels' `FilterParams`, angles in radians; module: `command_filter` in either precision."""
+    """Return the motor command filter's settings as the struct that the kernels read, angles in radians.
+
+    module: `command_filter` in either precision.
+    """
     params = module.FilterParams()
     for name in ("lateral", "transversal", "sum"):
         limits = module.Limits()
@@ -217,7 +221,10 @@ def filter_params(cfg: FilterCfg, *, module: ModuleType = command_filter) -> Any
 
 
 def filter_constants(cfg: FilterCfg | None) -> np.ndarray:
-    """Return a filter's constants, (14,), in the order and units of `FILTER_NAMES`; None: vertical jump."""
+    """Return the command filter's settings as an array (14,), in the order and units of `FILTER_NAMES`.
+
+    cfg: None for the filter of vertical jumps.
+    """
     cfg = cfg or vertical_jump_filter()
     angles = [getattr(getattr(cfg, angle), limit) for angle in ("lateral", "transversal", "sum") for limit in LIMITS]
     return np.array([*np.radians(angles), cfg.horizon, math.radians(cfg.speed_floor)])

@@ -74,7 +74,7 @@ class RobotOverlay:
             raise InputError("robot overlay: each cutoff_speed must be below the no_load_speed")
 
     def robots(self, description: RobotDescription | None = None) -> RobotValues:
-        """Return all values of the robot, N = 1; those that the overlay lacks come from the description."""
+        """Return the values of the robot (N = 1); those that the overlay does not replace come from the description."""
         robot = RobotValues.nominal(1, description)
         for name, values in self.values.items():
             getattr(robot, name)[0] = values
@@ -86,7 +86,7 @@ class RobotOverlay:
         return self.values["latency"][0] if "latency" in self.values else None
 
     def to_json(self) -> dict[str, Any]:
-        """Return the content of the JSON file, with the keys `SECTIONS`."""
+        """Return the overlay as the content of a JSON file, with the keys `SECTIONS`."""
         return {
             "schema": SCHEMA,
             "source": self.source,
@@ -96,7 +96,10 @@ class RobotOverlay:
 
     @classmethod
     def from_json(cls, saved: Any) -> RobotOverlay:
-        """Return the overlay that `to_json` wrote as `saved`. Raises InputError for anything else."""
+        """Read an overlay from the content of its JSON file, written by `to_json`.
+
+        Raises InputError for anything else.
+        """
         if not isinstance(saved, dict) or saved.get("schema") != SCHEMA:
             raise InputError(f"not a robot overlay: expected an object with schema {SCHEMA!r}")
         check_names("section", saved, SECTIONS)
@@ -124,7 +127,7 @@ def check_names(noun: str, names: Iterable[str], known: Iterable[str]) -> None:
 
 
 def check_range(name: str, values: tuple[float, ...]) -> None:
-    """Raise InputError for a value outside RANGES[name]."""
+    """Raise InputError for a value of a quantity outside its range in `RANGES`."""
     low, high, unit = RANGES[name]
     hint = " (1: as described)" if RANGES[name] is RATIO else ""
     for value in values:
@@ -134,7 +137,7 @@ def check_range(name: str, values: tuple[float, ...]) -> None:
 
 
 def finite_tuple(name: str, values: Any) -> tuple[float, ...]:
-    """Return a list of finite numbers as a tuple. Raises InputError for anything else; name: for the message."""
+    """Convert a list of finite numbers to a tuple. Raises InputError for anything else; name: for the message."""
     if not isinstance(values, list) or any(isinstance(x, bool) or not isinstance(x, int | float) for x in values):
         raise InputError(f"robot overlay: {name!r:.60} must be a list of numbers")
     if not all(math.isfinite(x) for x in values):
@@ -151,7 +154,10 @@ def with_springs(stiffness: float, length: float) -> RobotOverlay:
 
 
 def load_overlay(path: Path) -> RobotOverlay:
-    """Return the overlay of a JSON file. Raises InputError: it is missing or no overlay; OSError: it cannot be read."""
+    """Read a robot overlay from a JSON file.
+
+    Raises InputError: it is missing or no overlay; OSError: it cannot be read.
+    """
     file = existing_file(path, "robot overlay, as jumper sysid writes it")
     try:
         return RobotOverlay.from_json(json.loads(file.read_text(encoding="utf-8")))
@@ -162,6 +168,6 @@ def load_overlay(path: Path) -> RobotOverlay:
 
 
 def overlay_of(values: RobotValues, quantities: tuple[str, ...], **fields: Any) -> RobotOverlay:
-    """Return the overlay with the named quantities of the first robot in `values`; fields: others of `RobotOverlay`."""
+    """Return an overlay with some quantities of the first robot in `values`; fields: others of `RobotOverlay`."""
     selected = {name: tuple(float(x) for x in np.asarray(getattr(values, name))[0]) for name in quantities}
     return RobotOverlay(selected, **fields)

@@ -27,7 +27,7 @@ class RobotDescriptionError(InputError):
 
 
 def require(holds: bool, file: Path, part: str, problem: str) -> None:
-    """Raise RobotDescriptionError(file, part, problem) unless `holds`."""
+    """Raise RobotDescriptionError, which names a file and a part of it, unless `holds`."""
     if not holds:
         raise RobotDescriptionError(file, part, problem)
 
@@ -43,7 +43,7 @@ class TriangleMesh:
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A piece of geometry fixed to a link."""
+    """Geometric shape fixed to a link, for viewers or for collision."""
 
     kind: str  # "box", "cylinder", "sphere" or "mesh"
     size: tuple[float, ...]  # [m] box: three full edges; cylinder (axis z): radius, length; sphere: radius; mesh: empty
@@ -82,7 +82,7 @@ class Joint:
 
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A joint that closes a loop: the two anchor points coincide."""
+    """Joint that closes a kinematic loop of the robot: the two anchor points coincide."""
 
     name: str
     parent: str  # name of the link
@@ -101,7 +101,7 @@ class Gains:
 
 @dataclass(frozen=True)
 class Motor:
-    """Constants of one motor type, at the output of its gear."""
+    """Torque limits, speeds, friction, inertia and gains of one motor type, at the output of its gear."""
 
     type: str  # name, as "AK70-10"
     gear_ratio: float  # [1] rotor speed over output speed
@@ -159,7 +159,7 @@ class RobotDescription:
 
 
 def mesh_files(robot: RobotDescription) -> set[Path]:
-    """Return the files of all meshes of a robot's visual shapes."""
+    """Return the paths of all mesh files that a robot's visual shapes use."""
     return {shape.mesh.file for link in robot.links for shape in link.visuals if shape.mesh is not None}
 
 

@@ -27,7 +27,7 @@ MAX_GAP = 1.0e-9  # [m] largest distance of the anchors of a closed loop
 
 @dataclass(frozen=True, eq=False)
 class PinocchioRobot:
-    """Pinocchio's model of the robot with its rigid loop constraints.
+    """Pinocchio model of the robot with rigid constraints that close its loops.
 
     Velocities follow Pinocchio: the base's six are the linear velocity of the body origin [m/s] and the angular
     velocity [rad/s], both in the body frame. Joints are in Pinocchio's own order; the index arrays map to it.
@@ -44,10 +44,10 @@ class PinocchioRobot:
     knee_v: np.ndarray  # (8,) index into v of the knees
 
     def configuration(self, base_pos: np.ndarray, base_quat_xyzw: np.ndarray, motors: np.ndarray) -> np.ndarray:
-        """Return the configuration q, (27,), with knee angles that close the loops, ankles below the knees.
+        """Return Pinocchio's configuration q, (27,), of base and motors, with knee angles that close the loops.
 
-        base_pos: body origin (3,) [m], world frame. base_quat_xyzw: (4,) body to world, unit. motors: angles (12,)
-        [rad] in motor order. Raises InputError: a loop cannot be closed.
+        Ankles are below the knees. base_pos: body origin (3,) [m], world frame. base_quat_xyzw: (4,) body to world,
+        unit. motors: angles (12,) [rad] in motor order. Raises InputError: a loop cannot be closed.
         """
         q = pin.neutral(self.model)
         q[0:3] = base_pos
@@ -97,10 +97,10 @@ class PinocchioRobot:
         return np.stack([self.paw_velocities(q, self.closed_velocity(q, np.zeros(6), rate)) for rate in rates], axis=2)
 
     def closed_velocity(self, q: np.ndarray, base_twist: np.ndarray, motor_rates: np.ndarray) -> np.ndarray:
-        """Return the velocity v, (26,), with knee rates that keep the loops of a configuration q (27,) closed.
+        """Return Pinocchio's velocity v, (26,), of base and motors, with knee rates that keep the loops closed.
 
-        base_twist: (6,) linear velocity [m/s] of the body origin, then angular velocity [rad/s], body frame.
-        motor_rates: (12,) [rad/s], motor order.
+        q: configuration (27,). base_twist: (6,) linear velocity [m/s] of the body origin, then angular velocity
+        [rad/s], body frame. motor_rates: (12,) [rad/s], motor order.
         """
         v = np.zeros(self.model.nv)
         v[self.motor_v] = motor_rates
@@ -113,7 +113,7 @@ class PinocchioRobot:
         return v
 
     def forward_dynamics(self, q: np.ndarray, v: np.ndarray, motor_torques: np.ndarray) -> np.ndarray:
-        """Return the acceleration dv/dt, shape (26,), of the robot in free flight under gravity, loops rigid.
+        """Return the acceleration of the robot in free flight under gravity, loops rigid, dv/dt, (26,).
 
         The first six entries are time derivatives of the base's body-frame components: add omega x v to the linear
         three for the acceleration of the origin. q: (27,), loops closed; v: (26,), which keeps them closed;
@@ -128,7 +128,7 @@ class PinocchioRobot:
         ).copy()
 
     def _knees(self, leg: str, outer: float, inner: float) -> tuple[float, float]:
-        """Return outer and inner knee angle [rad] from the thigh angles [rad], by the triangle of knees and ankle."""
+        """Return the knee angles (outer, inner) [rad] that close a leg's loop at given thigh angles [rad]."""
         origin = {name: self.model.jointPlacements[self.model.getJointId(f"{leg}_{name}")].translation
                   for name in ("outer", "inner", "outer_knee")}  # fmt: skip
         separation = abs(origin["outer"][0] - origin["inner"][0])
@@ -145,7 +145,7 @@ class PinocchioRobot:
 
 
 def build_pinocchio(description: RobotDescription | None = None, values: RobotValues | None = None) -> PinocchioRobot:
-    """Return a described robot, by default the project's, in Pinocchio, with a free-flying base.
+    """Build the Pinocchio model of a described robot, by default the project's, with a free-flying base.
 
     values: a robot that differs from the description, as `RobotOverlay.robots()` returns it. Of the first robot,
     `base_mass`, `base_com`, `base_inertia`, `link_mass` and `armature` are used.

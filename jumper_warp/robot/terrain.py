@@ -19,7 +19,10 @@ KINDS = ("flat", "uneven", "waves", "slope", "bowl", "stairs", "pit", "blocks") 
 
 @dataclass(frozen=True)
 class TerrainCfg:
-    """Terrain map: rows (along x) of growing difficulty, and a column (along y) for each entry of `kinds`."""
+    """Settings of a terrain map of square tiles: size, difficulty and kinds of ground.
+
+    Rows (along x) have growing difficulty, and there is a column (along y) for each entry of `kinds`.
+    """
 
     rows: int = 10
     """Number of difficulties: row i has (i + 1) / rows of the heights and slopes below; 0: no map."""
@@ -45,7 +48,7 @@ class TerrainCfg:
     """Seed of random ground."""
 
     def __post_init__(self) -> None:
-        """Raise InputError if a count, length or slope is out of range, or a kind is unknown."""
+        """Raise InputError if a count, length or slope of the map is out of range, or a kind of ground is unknown."""
         if self.rows < 0 or self.seed < 0:
             raise InputError(f"terrain rows and seed must not be negative, got {self.rows}, {self.seed}")
         for kind in self.kinds or ("",):
@@ -64,17 +67,17 @@ class TerrainCfg:
 
     @classmethod
     def none(cls) -> TerrainCfg:
-        """Return a configuration without a map."""
+        """Return a configuration without a terrain map."""
         return cls(rows=0)
 
     @property
     def cols(self) -> int:
-        """Number of columns, 0 without a map."""
+        """Number of tile columns, one for each entry of `kinds`, 0 without a map."""
         return len(self.kinds) if self.rows else 0
 
 
 def terrain_map(cfg: TerrainCfg) -> newton.Heightfield:
-    """Return the map as a heightfield centred on the origin, its data with rows along y.
+    """Build the terrain map of all tiles as a heightfield centred on the origin, its data with rows along y.
 
     The tile of row i and column j has its middle at x = (i + 1/2 - rows/2) tile, y = (j + 1/2 - cols/2) tile.
     Raises InputError for a configuration without rows.
@@ -99,7 +102,7 @@ def terrain_map(cfg: TerrainCfg) -> newton.Heightfield:
 
 
 def single_tile(cfg: TerrainCfg, kind: str) -> newton.Heightfield:
-    """Return one tile of full difficulty, centred on the origin. Raises InputError for a kind not in `KINDS`."""
+    """Build one terrain tile of full difficulty, centred on the origin. Raises InputError for a kind not in `KINDS`."""
     import newton
 
     check_kind(kind)
@@ -109,20 +112,20 @@ def single_tile(cfg: TerrainCfg, kind: str) -> newton.Heightfield:
 
 
 def check_kind(kind: str) -> None:
-    """Raise InputError for an unknown kind of tile."""
+    """Raise InputError for an unknown kind of terrain tile."""
     if kind not in KINDS:
         raise InputError(f"terrain must be one of {', '.join(KINDS)}, got {kind!r:.40}")
 
 
 def tile_heights(cfg: TerrainCfg, kind: str, difficulty: float, rng: np.random.Generator) -> np.ndarray:
-    """Return the heights [m] of a tile's nodes, (n, n), rows along y, 0 on its rim; difficulty: 0 to 1."""
+    """Return the heights [m] of a terrain tile's nodes, (n, n), rows along y, 0 on its rim; difficulty: 0 to 1."""
     nodes = math.ceil(cfg.tile / cfg.cell - 1.0e-9) + 1
     axis = np.linspace(-0.5 * cfg.tile, 0.5 * cfg.tile, nodes)
     return _SHAPES[kind](_Tile(cfg, difficulty, rng, *np.meshgrid(axis, axis)))
 
 
 class _Tile(NamedTuple):
-    """One tile, whose methods return the heights of its nodes."""
+    """One terrain tile, whose methods return the heights of its nodes for each kind of ground."""
 
     cfg: TerrainCfg
     difficulty: float  # 0 to 1
@@ -132,17 +135,17 @@ class _Tile(NamedTuple):
 
     @property
     def off(self) -> np.ndarray:
-        """Distance of each node from the middle, (n, n) [m]: the larger of |x| and |y|."""
+        """Distance of each node from the tile's middle, (n, n) [m]: the larger of |x| and |y|."""
         return np.maximum(np.abs(self.x), np.abs(self.y))
 
     @property
     def reach(self) -> float:
-        """Distance [m] from the middle to the inner edge of the level rim."""
+        """Distance [m] from the tile's middle to the inner edge of its level rim."""
         return 0.5 * self.cfg.tile - self.cfg.rim
 
     @property
     def step(self) -> float:
-        """Height of a step [m] at this difficulty."""
+        """Height of a stair or block [m] at this difficulty."""
         return self.cfg.step[0] + self.difficulty * (self.cfg.step[1] - self.cfg.step[0])
 
     def slope(self) -> np.ndarray:

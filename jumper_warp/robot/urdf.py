@@ -69,19 +69,19 @@ class UrdfReader:
             self.colors[material.get("name")] = tuple(self.numbers(color, "rgba", 4, "material")[:3])
 
     def require(self, holds: bool, part: str, problem: str) -> None:
-        """Raise RobotDescriptionError for this file unless `holds`; problem: text of the message."""
+        """Raise RobotDescriptionError, which names this URDF file, unless `holds`; problem: text of the message."""
         require(holds, self.file, part, problem)
 
     def links(self) -> tuple[Link, ...]:
-        """Return all links in file order."""
+        """Read all links of the URDF, in file order."""
         return tuple(self.link(element) for element in self.named("link"))
 
     def joints(self) -> tuple[Joint, ...]:
-        """Return all joints in file order."""
+        """Read all joints of the URDF, in file order."""
         return tuple(self.joint(element) for element in self.named("joint"))
 
     def named(self, tag: str) -> list[Element]:
-        """Return the root's child elements with a tag; refuse missing or repeated names."""
+        """Return the root's XML elements with a tag, such as all links; refuse missing or repeated names."""
         elements = self.root.findall(tag)
         for name, count in Counter(element.get("name") for element in elements).items():
             self.require(bool(name), tag, "expected a name")
@@ -89,13 +89,13 @@ class UrdfReader:
         return elements
 
     def child(self, element: Element, tag: str, part: str) -> Element:
-        """Return the only child element with a tag; refuse none or several."""
+        """Return the only child of an XML element with a tag; refuse none or several."""
         children = element.findall(tag)
         self.require(len(children) == 1, part, f"expected one <{tag}>, found {len(children)}")
         return children[0]
 
     def numbers(self, element: Element, attribute: str, count: int, part: str, default: str = "") -> list[float]:
-        """Return an attribute's `count` finite numbers; default: text of a missing attribute."""
+        """Return an XML attribute as a list of `count` finite numbers; default: text of a missing attribute."""
         text = element.get(attribute, default)
         try:
             values = [float(word) for word in text.split()]
@@ -118,7 +118,7 @@ class UrdfReader:
         return np.array(self.numbers(origin, "xyz", 3, part, default="0 0 0")), quat_from_rpy(*angles)
 
     def link(self, element: Element) -> Link:
-        """Return the link of a <link> element, with its mass and inertia checked."""
+        """Read a link from its <link> element, and check mass and inertia."""
         name = element.get("name", "")
         part = f"link {name}"
         inertial = self.child(element, "inertial", part)
@@ -135,7 +135,7 @@ class UrdfReader:
         return Link(name, mass, com, inertia, visuals, collisions)
 
     def check_inertia(self, inertia: np.ndarray, part: str) -> None:
-        """Refuse an inertia tensor (3, 3) [kg m^2] that no mass distribution has."""
+        """Raise RobotDescriptionError for an inertia tensor (3, 3) [kg m^2] that no mass distribution has."""
         self.require(np.abs(inertia).max() <= 1.0e6, part, "expected moments of inertia below 1e6 kg m^2")
         low, middle, high = np.linalg.eigvalsh(inertia)
         self.require(low > 0.0, part, f"expected a positive inertia, found a moment of {low:.3g}")
@@ -143,7 +143,7 @@ class UrdfReader:
         self.require(low + middle >= high * (1.0 - 1.0e-9), part, problem)
 
     def joint(self, element: Element) -> Joint:
-        """Return the hinge of a <joint> element, with its axis and limits checked."""
+        """Read a hinge from its <joint> element, and check axis and limits."""
         name = element.get("name", "")
         part = f"joint {name}"
         kind = element.get("type")
@@ -160,7 +160,7 @@ class UrdfReader:
         return Joint(name, parent, child, origin, axis, lower, upper, effort, velocity)
 
     def shape(self, element: Element, part: str) -> Shape:
-        """Return the shape of a <visual> or <collision> element."""
+        """Read a shape from its <visual> or <collision> element."""
         geometry = self.child(element, "geometry", part)
         known = len(geometry) == 1 and geometry[0].tag in (*SHAPE_SIZES, "mesh")
         self.require(known, part, "expected one box, cylinder, sphere or mesh in <geometry>")
@@ -179,7 +179,7 @@ class UrdfReader:
         return Shape(kind, tuple(size), position, rotation, color, mesh)
 
     def mesh(self, name: str, part: str) -> TriangleMesh:
-        """Return the mesh of an OBJ file, named relative to the URDF's folder; each file is read once."""
+        """Read a mesh from an OBJ file, named relative to the URDF's folder; each file is read once."""
         if name not in self.meshes:
             file = file_inside(self.file, name, part)
             self.require(file.suffix == ".obj", part, f"expected an .obj mesh, found {name!r}")
@@ -188,7 +188,10 @@ class UrdfReader:
 
 
 def file_inside(source: Path, name: str, part: str) -> Path:
-    """Return the path of a file `name`, relative to `source`'s folder and inside it. Raises RobotDescriptionError."""
+    """Return the path of a file that a robot file names, which must be inside the robot file's folder.
+
+    Raises RobotDescriptionError.
+    """
     folder = source.parent.resolve()
     try:
         file = (folder / name).resolve()
@@ -202,7 +205,7 @@ def file_inside(source: Path, name: str, part: str) -> Path:
 
 
 def read_obj(file: Path) -> TriangleMesh:
-    """Return the triangles of a Wavefront OBJ file of `v` and triangular `f` lines. Raises RobotDescriptionError."""
+    """Read a triangle mesh from a Wavefront OBJ file of `v` and triangular `f` lines. Raises RobotDescriptionError."""
     vertices, triangles = [], []
     for number, line in enumerate(read_text(file).splitlines(), start=1):
         word, *values = line.split() or [""]
@@ -224,7 +227,7 @@ def read_obj(file: Path) -> TriangleMesh:
 
 
 def quat_from_rpy(roll: float, pitch: float, yaw: float) -> np.ndarray:
-    """Return the quaternion (4,) xyzw of a URDF's fixed-axis roll, pitch, yaw [rad]."""
+    """Convert a URDF's fixed-axis roll, pitch, yaw [rad] to a quaternion (4,) xyzw."""
     (cr, sr), (cp, sp), (cy, sy) = ((math.cos(0.5 * angle), math.sin(0.5 * angle)) for angle in (roll, pitch, yaw))
     x, y = sr * cp * cy - cr * sp * sy, cr * sp * cy + sr * cp * sy
     return np.array([x, y, cr * cp * sy - sr * sp * cy, cr * cp * cy + sr * sp * sy])

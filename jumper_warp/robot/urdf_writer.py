@@ -1,4 +1,4 @@
-"""The URDF of a robot whose masses or motors differ from the described ones, and the loops that a URDF cannot hold."""
+"""Writer of a URDF for a robot with other masses or motors, and of the loops that a URDF cannot hold."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ LOOPS_HEADER = """\
 
 
 def urdf(robot: RobotDescription) -> str:
-    """Return the URDF's text with the masses, inertias and motor limits of `robot`; its comments are kept."""
+    """Return the robot's URDF as text, with its own masses, inertias and motor limits; comments are kept."""
     root = fromstring(robot.urdf, XMLParser(target=TreeBuilder(insert_comments=True)))
     for element in root.findall("link"):
         _write_inertial(_child(element, "inertial"), robot.link(element.get("name", "")))
@@ -27,12 +27,12 @@ def urdf(robot: RobotDescription) -> str:
 
 
 def _child(element: Element, tag: str) -> Element:
-    """Return the child of a checked URDF's element with a tag."""
+    """Return the child of an XML element with a tag, in a checked URDF."""
     return next(element.iter(tag))
 
 
 def _write_inertial(inertial: Element, link: Link) -> None:
-    """Write mass [kg], centre of mass [m] and moments of inertia [kg m^2] to an <inertial> element."""
+    """Write a link's mass [kg], centre of mass [m] and moments of inertia [kg m^2] to its <inertial> element."""
     _child(inertial, "mass").set("value", repr(float(link.mass)))
     _child(inertial, "origin").set("xyz", " ".join(repr(float(x)) for x in link.com))
     moments = _child(inertial, "inertia")
@@ -42,13 +42,16 @@ def _write_inertial(inertial: Element, link: Link) -> None:
 
 
 def _write_limit(limit: Element, joint: Joint) -> None:
-    """Write torque [N m] and speed [rad/s] to a <limit> element."""
+    """Write a joint's torque limit [N m] and speed limit [rad/s] to its <limit> element."""
     limit.set("effort", repr(float(joint.effort)))
     limit.set("velocity", repr(float(joint.velocity)))
 
 
 def loop_closures(robot: RobotDescription, pose: dict[str, float]) -> str:
-    """Return the loops as YAML text. pose: angle [rad] of each joint in the standing pose, by name."""
+    """Return the joints that close the robot's loops as YAML text.
+
+    pose: angle [rad] of each joint in the standing pose, by name.
+    """
     moved_by = {joint.child: joint.name for joint in robot.joints}
     lines = [LOOPS_HEADER + "loops:"]
     for loop in robot.loops:

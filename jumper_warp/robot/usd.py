@@ -1,4 +1,4 @@
-"""The robot as a USD stage: an articulation in the standing pose, its loops as joints outside the articulation."""
+"""Export of the robot as a USD stage: an articulation in the standing pose, its loops as joints outside of it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def write_usd(path: Path, robot: RobotDescription, paw_friction: float) -> Path:
 
 
 class UsdStage:
-    """Writer of a robot to a stage: z up, metres, kilograms; angles of USD's joints are in degrees."""
+    """Writer of a robot to a USD stage: z up, metres, kilograms; angles of USD's joints are in degrees."""
 
     def __init__(self, stage: Any, robot: RobotDescription) -> None:
         """Prepare an empty `pxr.Usd.Stage` for a robot."""
@@ -51,7 +51,7 @@ class UsdStage:
             self.frames[joint.child] = (place + rotate(quat, joint.origin), turned)
 
     def write(self, paw_friction: float) -> None:
-        """Write links, joints and loops under the default prim /jumper; paw_friction: Coulomb coefficient [1]."""
+        """Write links, joints and loops to the USD stage under the default prim /jumper; paw_friction: Coulomb [1]."""
         self.geom.SetStageUpAxis(self.stage, self.geom.Tokens.z)
         self.geom.SetStageMetersPerUnit(self.stage, 1.0)
         self.physics.SetStageKilogramsPerUnit(self.stage, 1.0)
@@ -75,18 +75,18 @@ class UsdStage:
             self._add_loop(loop)
 
     def _quat(self, xyzw: np.ndarray) -> Any:
-        """Return a `Gf.Quatf`."""
+        """Convert a quaternion xyzw to USD's `Gf.Quatf`."""
         x, y, z, w = map(float, xyzw)
         return self.gf.Quatf(w, x, y, z)
 
     def _place(self, prim: Any, position: np.ndarray, rotation: np.ndarray) -> None:
-        """Write a prim's position [m] and rotation xyzw in its parent's frame."""
+        """Write the position [m] and rotation xyzw of a USD prim in its parent's frame."""
         xform = self.geom.Xformable(prim)
         xform.AddTranslateOp().Set(self.gf.Vec3d(*map(float, position)))
         xform.AddOrientOp().Set(self._quat(rotation))
 
     def _add_link(self, link: Link, rubber: Any) -> None:
-        """Add a rigid body with its mass, its shapes and, on inner shanks, the paw of material `rubber`."""
+        """Add a link to the USD stage as a rigid body, with shapes and, on inner shanks, the paw of `rubber`."""
         prim = self.geom.Xform.Define(self.stage, f"/jumper/{link.name}").GetPrim()
         self._place(prim, *self.frames[link.name])
         self.physics.RigidBodyAPI.Apply(prim)
@@ -107,7 +107,7 @@ class UsdStage:
             self.shade.MaterialBindingAPI.Apply(prim).Bind(rubber, materialPurpose="physics")
 
     def _add_shape(self, path: str, shape: Shape) -> Any:
-        """Add a shape under its link, and return its prim."""
+        """Add a shape to the USD stage under its link, and return its prim."""
         if shape.mesh is not None:
             gprim = self.geom.Mesh.Define(self.stage, path)
             triangles = shape.mesh.triangles
@@ -133,7 +133,7 @@ class UsdStage:
         return gprim.GetPrim()
 
     def _add_joint(self, schema: Any, name: str, ends: list[tuple[str, np.ndarray]], rotation: np.ndarray) -> Any:
-        """Add a joint between (link, point [m] in its frame) of two links; rotation: of the joint in both frames."""
+        """Add a joint of two links to the USD stage; ends: (link, point [m] in its frame); rotation: in both frames."""
         joint = schema.Define(self.stage, f"/jumper/joints/{name}")
         for index, (link, point) in enumerate(ends):
             getattr(joint, f"CreateBody{index}Rel")().SetTargets([f"/jumper/{link}"])
@@ -142,7 +142,10 @@ class UsdStage:
         return joint
 
     def _add_hinge(self, hinge: Joint, motor: Motor | None) -> None:
-        """Add a hinge with stops, armature, friction and a drive: a motor's, or a knee's damping up to its limit."""
+        """Add a hinge to the USD stage with stops, armature, friction and a drive.
+
+        The drive is a motor's, or a knee's damping up to its limit.
+        """
         robot, angle = self.robot, self.angles[hinge.name]
         axis = hinge.axis
         # the joint's x axis turned onto the hinge's axis, which is along x or y
@@ -170,7 +173,7 @@ class UsdStage:
             prim.CreateAttribute(name, self.sdf.ValueTypeNames.Float).Set(value)
 
     def _add_loop(self, loop: Loop) -> None:
-        """Add a ball joint that closes a loop, outside the articulation."""
+        """Add a ball joint that closes a loop to the USD stage, outside the articulation."""
         ends = [(loop.parent, loop.parent_anchor), (loop.child, loop.child_anchor)]
         joint = self._add_joint(self.physics.SphericalJoint, loop.name, ends, IDENTITY)
         joint.CreateExcludeFromArticulationAttr(True)

@@ -21,7 +21,10 @@ MOTOR_QUANTITIES = (
 
 @dataclass
 class RobotValues:
-    """Values of N robots, arrays (N, columns). Motors: legs FL, FR, BL, BR, each lateral, outer, inner."""
+    """Masses, joint, motor and spring constants of N robots, (N, columns) each; motors FL, FR, BL, BR.
+
+    Motors of a leg: lateral, outer, inner.
+    """
 
     base_mass: np.ndarray  # (N, 1) [kg]
     base_com: np.ndarray  # (N, 3) [m], base frame
@@ -44,7 +47,7 @@ class RobotValues:
 
     @classmethod
     def nominal(cls, count: int, description: RobotDescription | None = None) -> RobotValues:
-        """Return `count` equal robots with the values of a description, by default the project's."""
+        """Return the values of a robot description, by default the project's, for `count` equal robots."""
         robot = load_description() if description is None else description
         motors, base = robot.motors, robot.links[0]
         single = cls(
@@ -94,7 +97,7 @@ def described(values: RobotValues, description: RobotDescription) -> RobotDescri
 
 
 def _described_motor(motor: Motor, value: Mapping[str, float]) -> Motor:
-    """Return a motor with one robot's armature, friction, gains and speeds; value: by name in `MOTOR_QUANTITIES`."""
+    """Return a motor type with one robot's armature, friction, gains and speeds; value: by `MOTOR_QUANTITIES`."""
     jumping, walking = (Gains(value["kp"] * pd.kp, value["kd"] * pd.kd) for pd in (motor.jumping, motor.walking))
     return replace(
         motor,

@@ -1,4 +1,7 @@
-"""Dedicated dynamics of the Jumper on the arrays of a Newton model, in single or double precision."""
+"""Dynamics of the quadruped Jumper in dedicated Warp kernels, which work on the arrays of a Newton model.
+
+In single or double precision.
+"""
 
 from __future__ import annotations
 
@@ -37,7 +40,10 @@ class NotThisRobotError(InputError):
 
 
 def kernel_modules(double: bool = False) -> SimpleNamespace:
-    """Return the modules `KERNEL_MODULES` as attributes named after each module, in single or double precision."""
+    """Return the Warp kernel modules of the robot's dynamics, compiled in single or double precision.
+
+    Each is an attribute, named after the module, for those in `KERNEL_MODULES`.
+    """
     package = float64_kernels().__name__ if double else "jumper_warp.kernels"
     return SimpleNamespace(
         **{name.split(".")[-1]: importlib.import_module(f"{package}.{name}") for name in KERNEL_MODULES}
@@ -79,7 +85,10 @@ def check_model(model: Model) -> None:
 
 
 def find_paws(model: Model) -> np.ndarray:
-    """Return the shape indices of the paws, (num_worlds, 4) int32, legs FL, FR, BL, BR. Raises NotThisRobotError."""
+    """Return the shape indices of the four paws in every world of a Newton model.
+
+    Shape (num_worlds, 4) int32, legs FL, FR, BL, BR. Raises NotThisRobotError.
+    """
     paws = {leg: [] for leg in LEGS}
     for i, label in enumerate(model.shape_label):
         name = label.split("/")[-1]
@@ -111,7 +120,10 @@ def find_ground(model: Model) -> int:
 
 
 def ground_struct(model: Model, shape: int, ground_module: ModuleType) -> Any:
-    """Return the kernels' `Ground` of a shape index from `find_ground`; for -1 a plane that nothing reaches."""
+    """Return the ground of a Newton model, a plane or heightfield, as the struct that the contact kernels read.
+
+    shape: index from `find_ground`; for -1 a plane that nothing reaches.
+    """
     ground = ground_module.Ground()
     heights = np.zeros((1, 1), dtype=np.float32)
     if shape < 0:
@@ -129,7 +141,10 @@ def ground_struct(model: Model, shape: int, ground_module: ModuleType) -> Any:
 
 
 def block_array(cfg: BlockCfg | None, num_worlds: int, modules: SimpleNamespace, device: wp.DeviceLike) -> wp.array:
-    """Return the kernels' `Block` of every world, (num_worlds,), at rest at its start; (0,) if cfg is None."""
+    """Return the sliding blocks of all worlds as an array of structs for the kernels, at rest at their starts.
+
+    Shape (num_worlds,), or (0,) if cfg is None.
+    """
     block = modules.ground.Block
     fields = {} if cfg is None else cfg.per_world(num_worlds)
     values: Any = np.zeros(num_worlds if fields else 0, dtype=block.numpy_dtype())
@@ -142,7 +157,7 @@ def block_array(cfg: BlockCfg | None, num_worlds: int, modules: SimpleNamespace,
 
 
 class JumperDynamics:
-    """Parameters, geometry and work arrays of the dedicated dynamics for every world of a model.
+    """Dedicated dynamics of the Jumper for every world of a Newton model: parameters, work arrays and kernel launches.
 
     `SolverJumper` uses it in single precision. Tests use it in double precision, as the reference for rounding errors
     and gradients. q, qd: flat arrays of `real` in the layout of `joint_q` (43 a world) and `joint_qd` (38 a world).
@@ -156,9 +171,10 @@ class JumperDynamics:
         block: BlockCfg | None = None,
         double: bool = False,
     ):
-        """Read all parameters from the model; block: a moving block for every world; double: whether in float64.
+        """Read all robot parameters from a Newton model, and allocate the work arrays of the kernels.
 
-        Raises NotThisRobotError: the model is not this robot, InputError: `block` has another number of worlds.
+        block: a moving block for every world; double: whether in float64. Raises NotThisRobotError: the model is not
+        this robot, InputError: `block` has another number of worlds.
         """
         check_model(model)
         self.model = model
@@ -191,7 +207,10 @@ class JumperDynamics:
         self.pack()
 
     def _workspace(self) -> Any:
-        """Return the kernels' `Workspace`, zeroed, with the model's `joint_q` as reference pose."""
+        """Allocate the arrays that the solver's kernels write, such as impulses, forces and torques, all zero.
+
+        The reference pose is the model's `joint_q`. Returned as the kernels' `Workspace`.
+        """
         scalar, n = self.modules.scalar, self.num_worlds
         work = self.modules.drive.Workspace()
         for names, shape, dtype in (
@@ -207,7 +226,7 @@ class JumperDynamics:
         return work
 
     def step_record(self, steps: int) -> Any:
-        """Return the kernels' `StepRecord`, zeroed, for the steps that a reverse pass recomputes."""
+        """Allocate the record of the time steps that a reverse pass recomputes, all zero."""
         record, n = self.modules.multipliers.StepRecord(), self.num_worlds
         for name, var in record._cls.vars.items():
             shape = (n, steps + (name in ("base", "angles", "rates")))
@@ -216,7 +235,7 @@ class JumperDynamics:
         return record
 
     def pack(self) -> None:
-        """Copy masses, joints, friction, gravity and `leg_springs` of every world to the parameter table."""
+        """Copy masses, joints, friction, gravity and knee springs of all worlds to the parameter table."""
         self.pack_masses()
         self.pack_joints()
         self.pack_friction()
@@ -249,9 +268,9 @@ class JumperDynamics:
         )
 
     def repack(self, mask: wp.array, worlds: WorldRange | None = None) -> None:
-        """Copy masses, armature and friction from the model to the table, where mask (num_worlds,) float is not 0.
+        """Update masses, armature and friction in the kernels' parameter table from the model, in some worlds.
 
-        worlds: range in which the mask is read, by default all.
+        mask: (num_worlds,) float, not 0 in worlds to update. worlds: range in which the mask is read, by default all.
         """
         m, (first, count) = self.model, worlds or (0, self.num_worlds)
         self._launch(
@@ -262,19 +281,22 @@ class JumperDynamics:
         )  # fmt: skip
 
     def pack_gravity(self) -> None:
-        """Copy gravity of every world from the model to the parameter table."""
+        """Copy gravity of every world from the model to the parameter table of the kernels."""
         self._launch(self.modules.parameters.pack_gravity_kernel, self.num_worlds, [self.model.gravity])
 
     def pack_springs(self) -> None:
-        """Copy `leg_springs` to the parameter table."""
+        """Copy stiffness and rest length of the springs between knees to the parameter table of the kernels."""
         self._launch(self.modules.parameters.pack_springs_kernel, (self.num_worlds, 4), [self.leg_springs])
 
     def _launch(self, kernel: wp.Kernel, dim: int | tuple[int, ...], inputs: list) -> None:
-        """Launch a kernel that writes the parameter table (PARAMETER_ROWS, num_worlds)."""
+        """Launch a kernel that writes to the table of robot parameters, (PARAMETER_ROWS, num_worlds)."""
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=[self.robot.table], device=self.device)
 
     def settings(self, dt: float, substeps: int, max_sweeps: int, tolerance: float) -> Any:
-        """Return the kernels' `StepSettings`; dt [s]; max_sweeps and tolerance [m/s] end the contact iteration."""
+        """Return step size, number of steps and contact tolerance as the struct that the step kernels read.
+
+        dt [s]; max_sweeps and tolerance [m/s] end the contact iteration.
+        """
         settings = self.modules.step.StepSettings()
         settings.dt, settings.substeps = dt, substeps
         settings.max_sweeps, settings.tolerance = max_sweeps, tolerance
@@ -284,9 +306,10 @@ class JumperDynamics:
         self, joint_f: wp.array, body_f: wp.array, motors: Any = None, target: wp.array | None = None,
         previous: wp.array | None = None, delay: wp.array | None = None,
     ) -> Any:  # fmt: skip
-        """Return the kernels' `Drive`; joint_f: (num_worlds * 38,), body_f: wrenches (num_worlds * 21,), as in Newton.
+        """Return the inputs of a physics launch as a struct: joint forces, wrench on the base, and motor targets.
 
-        With motors (`MotorArrays`) they follow target [rad], (12, num_worlds); with delay [physics steps],
+        The struct is the kernels' `Drive`. joint_f: (num_worlds * 38,), body_f: wrenches (num_worlds * 21,), as in
+        Newton. With motors (`MotorArrays`) they follow target [rad], (12, num_worlds); with delay [physics steps],
         (num_worlds,), they follow `previous`, shaped as target, until the target arrives.
         """
         drive = self.modules.drive.Drive()
@@ -298,7 +321,7 @@ class JumperDynamics:
         return drive
 
     def advance_kernel(self, by_legs: bool | None = None) -> tuple[wp.Kernel, int]:
-        """Return the kernel that `advance` launches, and its threads per block; by_legs: see `advance`."""
+        """Return the kernel that advances the physics, and its threads per block. by_legs: see `advance`."""
         if self.device.is_cuda if by_legs is None else by_legs:
             return self.modules.advance_legs.advance_legs_kernel, 32 if self.device.is_cuda else 4
         return self.modules.advance.advance_kernel, 32 if self.device.is_cuda else 1
@@ -307,10 +330,11 @@ class JumperDynamics:
         self, settings: Any, drive: Any, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array,
         worlds: WorldRange | None = None, by_legs: bool | None = None,
     ) -> None:  # fmt: skip
-        """Write base and motor coordinates after `settings.substeps` steps to q_out and qd_out, which may be q and qd.
+        """Advance all robots by `settings.substeps` physics steps.
 
-        worlds: range to advance, by default all. by_legs: whether each leg has a thread (default on a GPU) or each
-        world (default on a CPU).
+        Base and motor coordinates after the steps are written to q_out and qd_out, which may be q and qd. worlds: range
+        to advance, by default all. by_legs: whether each leg has a thread (default on a GPU) or each world (default on
+        a CPU).
         """
         settings.first, count = worlds or (0, self.num_worlds)
         inputs, outputs = [self.robot, settings, drive, q, qd, self.work], [q_out, qd_out]
@@ -320,14 +344,20 @@ class JumperDynamics:
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device, block_dim=block_dim)
 
     def momenta(self) -> Any:
-        """Return the kernels' `Momenta`, zeroed: `lin` [kg m/s] and `ang` [kg m^2/s], vec3 of shape (num_worlds,)."""
+        """Allocate the linear and angular momentum of every robot, all zero.
+
+        Returned as the kernels' `Momenta`: `lin` [kg m/s] and `ang` [kg m^2/s], vec3 of shape (num_worlds,).
+        """
         momenta = self.modules.momentum.Momenta()
         for name in ("lin", "ang"):
             setattr(momenta, name, wp.zeros(self.num_worlds, dtype=self.modules.scalar.vec3, device=self.device))
         return momenta
 
     def read_momenta(self, q: wp.array, qd: wp.array, momenta: Any, worlds: WorldRange | None = None) -> None:
-        """Write the robots' momenta at q, qd, in world axes, to `momenta`; worlds: range, by default all."""
+        """Compute the linear and angular momentum of every robot at q, qd, in world axes, and write it to `momenta`.
+
+        worlds: range, by default all.
+        """
         first, count = worlds or (0, self.num_worlds)
         inputs = [first, self.robot, q, qd, momenta]
         wp.launch(self.modules.momentum.momentum_kernel, count, inputs, device=self.device, block_dim=32)
@@ -347,9 +377,10 @@ class JumperDynamics:
     def full_state(
         self, q: wp.array, qd: wp.array, body_q: wp.array, body_qd: wp.array, worlds: WorldRange | None = None
     ) -> None:
-        """Compute passive and loop joints (in q, qd) and all bodies from the base and motor coordinates in q, qd.
+        """Compute passive and loop joints and the poses and velocities of all links from base and motor coordinates.
 
-        body_q: poses [m], xyzw; body_qd: velocities [m/s], [rad/s]. worlds: range, by default all.
+        All joint coordinates are in q, qd: those of base and motors are read, the others written. body_q: poses [m],
+        xyzw; body_qd: velocities [m/s], [rad/s]. worlds: range, by default all.
         """
         first, count = worlds or (0, self.num_worlds)
         wp.launch(

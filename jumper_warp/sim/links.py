@@ -12,7 +12,7 @@ class LinkReader:
     """Reader of poses and twists of all links of a simulation, computed from the joint coordinates."""
 
     def __init__(self, sim: Simulation) -> None:
-        """Allocate a separate state of the simulation's model."""
+        """Allocate a state of the simulation's model for the poses and twists of the links."""
         self._sim, self._state = sim, sim.model.state()
 
     def read(self) -> tuple[np.ndarray, np.ndarray]:

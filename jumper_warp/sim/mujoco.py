@@ -14,7 +14,7 @@ MUJOCO_FRICTION = 0.005
 
 
 def mujoco_solver(model: Model, *, dt: float = PHYSICS_DT, **overrides) -> newton.solvers.SolverMuJoCo:
-    """Return Newton's MuJoCo solver with stiff loops for physics steps of `dt` [s].
+    """Return Newton's MuJoCo solver, set so that the robot's closed leg loops stay stiff at physics steps of `dt` [s].
 
     MuJoCo has neither a damper with a torque limit nor a stop of the sum of two angles: here the knees' damping is
     unlimited and outer + inner has no stop. `Simulation` adds both as torques (`kernels.actuation.passive`).

@@ -1,4 +1,4 @@
-"""Writing of `RobotValues` into Newton's model, the springs and the motors of a simulation."""
+"""Replacement of masses, joints, springs and motors of a simulation by those of other robots (`RobotValues`)."""
 
 from __future__ import annotations
 
@@ -18,9 +18,10 @@ MOTOR_DOFS = [6 + 5 * leg + joint for leg in range(4) for joint in (0, 1, 3)]
 
 
 def write_model(model: Model, robots: RobotValues, *, paws: bool = True) -> None:
-    """Write masses, joints and paw friction into a model of the described robot, before a solver reads it.
+    """Replace masses, joint constants and paw friction of a Newton model by those of given robots.
 
-    robots: N = 1 for all worlds, or N = num_worlds. paws: whether to write the paws' friction.
+    Call it before a solver reads the model, which must be of the described robot. robots: N = 1 for all worlds, or N =
+    num_worlds. paws: whether to write the paws' friction.
     """
     n = model.world_count
     mass = model.body_mass.numpy().reshape(n, -1)
@@ -55,16 +56,20 @@ def write_model(model: Model, robots: RobotValues, *, paws: bool = True) -> None
 
 
 def write_springs(dynamics: JumperDynamics, robots: RobotValues) -> None:
-    """Write and pack the springs between knees; robots: N = 1 for all worlds, or N = num_worlds."""
+    """Set stiffness and rest length of the springs between the knees of each leg to those of given robots.
+
+    robots: N = 1 for all worlds, or N = num_worlds. The kernels' parameter table is updated.
+    """
     values = np.hstack([robots.spring_stiffness, robots.spring_length])
     dynamics.leg_springs.assign(np.broadcast_to(values, (dynamics.num_worlds, 2)).astype(np.float32))
     dynamics.pack_springs()
 
 
 def write_motors(motors: Any, robots: RobotValues) -> None:
-    """Scale kp, kd and saturation of `MotorArrays` with the description's values; write speeds and sensor offsets.
+    """Set gains, torque limits, speeds and sensor offsets of the motors to those of given robots.
 
-    robots: N = 1 for all worlds, or N = num_worlds.
+    kp, kd and saturation of `MotorArrays`, which hold the description's values, are scaled. robots: N = 1 for all
+    worlds, or N = num_worlds.
     """
     for name in ("kp", "kd", "saturation"):
         array: wp.array = getattr(motors, name)

@@ -35,7 +35,10 @@ RANDOMIZED_FLAGS = (
 
 
 class Physics(ABC):
-    """Solver and motors of all worlds of a `Simulation`. Arrays are never reallocated; legs FL, FR, BL, BR."""
+    """Interface of the solver and motors that advance all worlds of a `Simulation`.
+
+    Arrays are never reallocated; legs FL, FR, BL, BR.
+    """
 
     sliced: bool  # Whether `advance` supports a range of worlds
     solver: newton.solvers.SolverBase
@@ -49,7 +52,7 @@ class Physics(ABC):
     peak_paw_force: wp.array  # (4, num_worlds) [N] Largest force on each paw in the last call of `advance`
 
     def __init__(self, sim: Any) -> None:
-        """Attach to a `Simulation`, whose model, state, control and motors are allocated."""
+        """Keep a reference to a `Simulation`, whose model, state, control and motors are allocated."""
         self._sim = sim
 
     @abstractmethod
@@ -65,9 +68,10 @@ class Physics(ABC):
 
     @abstractmethod
     def parameters_changed(self, mask: wp.array | None = None, worlds: WorldRange | None = None) -> None:
-        """Read masses, joints and friction from the model, where mask (num_worlds,) float is not 0; None: all worlds.
+        """Make the solver use masses, joints and friction that were changed in the model.
 
-        worlds: range in which the mask is read, by default all.
+        mask: (num_worlds,) float, not 0 in changed worlds; None: all worlds. worlds: range in which the mask is read,
+        by default all.
         """
 
     @abstractmethod
@@ -84,11 +88,17 @@ class Physics(ABC):
         self.dynamics.full_state(state.joint_q, state.joint_qd, state.body_q, state.body_qd)
 
     def kernels(self) -> list[tuple[wp.Kernel, int]]:
-        """Return the kernels that a policy step launches, to compile in advance, as (kernel, threads per block)."""
+        """Return the kernels that a policy step launches, to compile them in advance.
+
+        As (kernel, threads per block).
+        """
         return []
 
     def carried(self) -> dict[str, wp.array]:
-        """Return by name the arrays, besides joint_q, joint_qd and `impulse`, on which the next step depends."""
+        """Return the solver's memory between steps: the arrays by name on which the next step depends.
+
+        Besides joint_q, joint_qd and `impulse`.
+        """
         return {}
 
 
@@ -99,7 +109,7 @@ class JumperPhysics(Physics):
     solver: SolverJumper
 
     def __init__(self, sim: Any, block: BlockCfg | None, tolerance: float, keep_momentum: bool) -> None:
-        """Make the solver for a simulation's model; raises ValueError as `SolverJumper`."""
+        """Create the `SolverJumper` of a simulation's model. Raises ValueError as `SolverJumper`."""
         super().__init__(sim)
         self.solver = SolverJumper(sim.model, block=block, tolerance=tolerance)
         self.dynamics = self.solver.dynamics
@@ -127,23 +137,23 @@ class JumperPhysics(Physics):
                 self.dynamics.full_state(q, qd, state.body_q, state.body_qd, worlds)
 
     def parameters_changed(self, mask: wp.array | None = None, worlds: WorldRange | None = None) -> None:
-        """Copy changed parameters from the model; see `Physics.parameters_changed`."""
+        """Copy changed masses, joints and friction from the model to SolverJumper; see `Physics.parameters_changed`."""
         if mask is None:
             self.dynamics.pack()
         else:
             self.dynamics.repack(mask, worlds)
 
     def after_reset(self, mask: wp.array) -> None:
-        """Do nothing: the solver reads base and motor coordinates alone."""
+        """Do nothing after a reset, as SolverJumper reads base and motor coordinates alone."""
 
     def forget(self, mask: wp.array) -> None:
-        """Clear contact history and diverged flags and reset blocks; see `Physics.forget`."""
+        """Clear contact history and diverged flags of SolverJumper and reset blocks; see `Physics.forget`."""
         self.solver.reset(self._sim.state, mask, flags=newton.StateFlags.NONE)
         if self._sim.block is not None:
             self.solver.reset_blocks(mask)
 
     def kernels(self) -> list[tuple[wp.Kernel, int]]:
-        """Return the kernels that a policy step launches, with `keep_momentum` also the projection's."""
+        """Return the kernels that a policy step launches; with `keep_momentum` also those that correct the momentum."""
         momentum = self.dynamics.modules.momentum
         projection = [(momentum.momentum_kernel, 32), (momentum.project_momentum_kernel, 32)]
         return [self.dynamics.advance_kernel(), *(projection if self._momenta is not None else [])]
@@ -156,7 +166,10 @@ class MujocoPhysics(Physics):
     solver: newton.solvers.SolverMuJoCo
 
     def __init__(self, sim: Any, observe_forces: bool) -> None:
-        """Make the solver, with knee damping as an explicit torque; observe_forces: see `Simulation`."""
+        """Create Newton's MuJoCo solver for a simulation, with knee damping as an explicit torque.
+
+        observe_forces: see `Simulation`.
+        """
         super().__init__(sim)
         n, device, model = sim.num_worlds, sim.device, sim.model
         self.dynamics = JumperDynamics(model)  # refuses another robot
@@ -198,7 +211,10 @@ class MujocoPhysics(Physics):
             self._step(target if delay is None else self._arrived, restart=i == 0)
 
     def _step(self, target: wp.array, restart: bool) -> None:
-        """Advance one physics step towards target [rad], (12, num_worlds); restart: whether to reset peak forces."""
+        """Advance one physics step of SolverMuJoCo towards motor targets [rad], (12, num_worlds).
+
+        restart: whether to reset peak forces.
+        """
         sim, state, joint_f = self._sim, self._sim.state, self._sim.control.joint_f
         q, qd, motors = state.joint_q, state.joint_qd, (12, sim.num_worlds)
         self._launch(motor_torque_kernel, motors, [target, q, qd, COORDS, DOFS, sim.motors], [joint_f])

@@ -8,9 +8,10 @@ from jumper_warp import kernels
 
 
 def float64_kernels() -> ModuleType:
-    """Return `jumper_warp.kernels_float64`: the files of `jumper_warp.kernels`, loaded again with a float64 `real`.
+    """Return a copy of the package `jumper_warp.kernels` whose kernels compute in double precision.
 
-    It registers the package, so that `importlib.import_module("jumper_warp.kernels_float64.layout")` works afterwards.
+    It consists of the same files, loaded again with a float64 `real`, and is registered, so that
+    `importlib.import_module("jumper_warp.kernels_float64.layout")` works afterwards.
     """
     name = "jumper_warp.kernels_float64"
     if name not in sys.modules:

@@ -126,7 +126,10 @@ class Simulation:
         self._start = state_arrays(start)
 
     def _write_robot(self, robot: RobotOverlay | RobotValues | None) -> RobotValues | None:
-        """Write a robot's values into model and motors, and return them; None: the described robot."""
+        """Replace model and motor parameters by those of an overlay or of given robots, and return these values.
+
+        None: the described robot.
+        """
         values = robot.robots() if isinstance(robot, RobotOverlay) else robot
         if values is not None:
             paws = not isinstance(robot, RobotOverlay) or "paw_friction" in robot.values
@@ -177,7 +180,10 @@ class Simulation:
         self._launch(restore_motors_kernel, self.num_worlds, [self._mask, self._standing], results)
 
     def _take_mask(self, mask: Sequence[bool] | np.ndarray | torch.Tensor | wp.array | None) -> None:
-        """Copy a mask, bool of shape (num_worlds,), to the device; None: all True. Raises InputError."""
+        """Copy the mask of the worlds to reset to the device.
+
+        mask: bool of shape (num_worlds,); None: all True. Raises InputError.
+        """
         if mask is None:
             self._mask.fill_(True)
             return
@@ -213,7 +219,10 @@ class Simulation:
         self._physics(self.substeps, worlds)
 
     def _captured(self, name: str, body: Callable[[WorldRange], None]) -> None:
-        """Run `body` for all worlds: launch it at the first call of a name or within a capture, else replay a graph."""
+        """Run a sequence of kernel launches for all worlds, captured as a graph from the second call of a name on.
+
+        body: launches them for a range of worlds. Within a capture it is called directly.
+        """
         if self.device.is_capturing:
             body(WorldRange(0, self.num_worlds))
             return
@@ -290,5 +299,8 @@ class Simulation:
 
 
 def motor_values(joint_values: np.ndarray) -> np.ndarray:
-    """Return the 12 motors' entries, (..., 12), of values of all joints after the base, (..., 20 or more)."""
+    """Return the 12 motors' entries of an array with one value for each joint.
+
+    joint_values: (..., 20 or more), the joints after the base. Returned: (..., 12).
+    """
     return joint_values[..., [5 * leg + j for leg in range(4) for j in (0, 1, 3)]]

@@ -35,10 +35,13 @@ def slices_of(num_worlds: int, threads: int) -> list[WorldRange]:
 
 
 class SlicedGraph:
-    """Captured graphs of the same launches, one for each slice of worlds."""
+    """Kernel launches captured as one graph for each slice of worlds, to replay them together."""
 
     def __init__(self, launch: Callable[[WorldRange], None], slices: list[WorldRange], device: wp.Device) -> None:
-        """Capture `launch(slice)` for each slice; launch: function that launches kernels, whose modules are loaded."""
+        """Capture the kernel launches of each slice of worlds as a graph.
+
+        launch: function that launches kernels for a slice; their modules must be loaded.
+        """
         self._device, self._graphs = device, []
         for worlds in slices:
             with wp.ScopedCapture(device=device) as capture:
@@ -46,7 +49,10 @@ class SlicedGraph:
             self._graphs.append(capture.graph)
 
     def replay(self) -> None:
-        """Launch all graphs; several graphs run concurrently on a CPU, and all have ended when this returns."""
+        """Replay the captured kernel launches of all slices, concurrently on a CPU.
+
+        With several graphs all have ended when this returns.
+        """
         if len(self._graphs) == 1:
             wp.capture_launch(self._graphs[0])
         else:

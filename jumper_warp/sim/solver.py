@@ -53,7 +53,10 @@ def check_tolerance(tolerance: float) -> None:
 
 
 def state_arrays(state: State | Model) -> Any:
-    """Return the kernels' `StateArrays` of a state, or of a model's reference pose."""
+    """Return the joint and body arrays of a Newton state as the struct that the kernels read.
+
+    For a model: the arrays of its reference pose.
+    """
     arrays = StateArrays()
     arrays.joint_q, arrays.joint_qd = state.joint_q, state.joint_qd
     arrays.body_q, arrays.body_qd = state.body_q, state.body_qd
@@ -181,7 +184,7 @@ class SolverJumper(SolverBase):
         self._advance(state_in, state_out, drive, dt, substeps, observables, bodies, worlds)
 
     def _forces(self, state: State, control: Control | None) -> tuple[wp.array, wp.array]:
-        """Return `joint_f` of a control and `body_f` of a state, or zeros where they are None."""
+        """Return the joint forces of a control and the body wrenches of a state, or zeros where they are None."""
         control = self._default_control if control is None else control
         return control.joint_f, self._no_body_f if state.body_f is None else state.body_f
 
@@ -235,7 +238,10 @@ class SolverJumper(SolverBase):
         self._write_contacts(contacts, state, force)
 
     def _write_contacts(self, contacts: newton.Contacts, state: State, contact_f: wp.array) -> None:
-        """Write contacts as `update_contacts`, and their forces to contact_f. Raises InputError: too few rows."""
+        """Write the paws' contacts of the last step to `contacts`, and their forces to `contact_f`.
+
+        As `update_contacts`. Raises InputError: too few rows.
+        """
         dynamics, n, device = self.dynamics, self.model.world_count, self.model.device
         if contacts.rigid_contact_max < 4 * n:
             raise InputError(f"contacts must hold {4 * n} rows, four a world, got {contacts.rigid_contact_max}")
@@ -284,18 +290,24 @@ class SolverJumper(SolverBase):
         wp.launch(rest_blocks_kernel, dim=n, inputs=[mask, self.dynamics.robot.ground], device=device)
 
     def _block_values(self) -> Any:
-        """Return the blocks as a structured array (num_worlds,) of `Block`. Raises InputError without blocks."""
+        """Return positions, velocities and properties of all blocks as a structured array, (num_worlds,).
+
+        Raises InputError without blocks.
+        """
         return self._blocks().numpy()
 
     def _blocks(self) -> wp.array:
-        """Return the kernels' `Block` of every world, (num_worlds,). Raises InputError without blocks."""
+        """Return the device array of the blocks that the paws can push, (num_worlds,).
+
+        Raises InputError without blocks.
+        """
         blocks = self.dynamics.robot.ground.blocks
         if blocks.shape[0] == 0:
             raise InputError("the solver was made without a block")
         return blocks
 
     def notify_model_changed(self, flags: ModelFlags | int) -> None:
-        """Read the parameters that `flags` names from the model again."""
+        """Update the solver after parameters of the model, named by `flags`, have changed."""
         if flags & ModelFlags.BODY_INERTIAL_PROPERTIES:
             self.dynamics.pack_masses()
         if flags & (

@@ -1,4 +1,4 @@
-"""One time step of the dedicated dynamics on Warp's tape."""
+"""Time step of the robot's dynamics that Warp's tape can differentiate."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ from jumper_warp.utils.errors import InputError
 
 
 class DifferentiableStep:
-    """One time step that `wp.Tape` can differentiate; each call allocates its buffers.
+    """Time step of the robot's dynamics that `wp.Tape` can differentiate; each call allocates its buffers.
 
     Gradients reach the state, the joint forces, the external wrench and the parameter table. They are exact at the
     contact modes and pressed stops of the step; see `kernels.dynamics.adjoint.tape_step`.
     """
 
     def __init__(self, dynamics: JumperDynamics, max_sweeps: int, tolerance: float):
-        """Allocate the buffers; max_sweeps, tolerance [m/s]: of the contact iteration, whose error gradients have."""
+        """Prepare differentiable time steps of the robot's dynamics.
+
+        max_sweeps, tolerance [m/s]: of the contact iteration, whose error gradients have.
+        """
         self._dynamics = dynamics
         self._max_sweeps = max_sweeps
         self._tolerance = tolerance
@@ -28,7 +31,7 @@ class DifferentiableStep:
         self, q: wp.array, qd: wp.array, joint_f: wp.array, body_f: wp.array, q_out: wp.array, qd_out: wp.array,
         dt: float,
     ) -> None:  # fmt: skip
-        """Write base and motor coordinates after one step of dt [s] to q_out and qd_out.
+        """Advance all robots by one step of dt [s], and write base and motor coordinates to q_out and qd_out.
 
         q, qd: as in `JumperDynamics.advance`; joint_f, body_f: as in `JumperDynamics.drive`. Raises InputError: an
         output is an input, or there are moving blocks.
@@ -50,7 +53,7 @@ class DifferentiableStep:
         wp.launch(kernels.integrate_kernel, n, [*inputs, self._record, power], [q_out, qd_out], device=device)
 
     def _solved(self) -> Any:
-        """Return the kernels' `SolvedStep`, zeroed: contact modes, impulses and torques of one step of all worlds."""
+        """Allocate the results of solving one step of all worlds: contact modes, impulses and torques, all zero."""
         dynamics, n = self._dynamics, self._dynamics.num_worlds
         solved, trajectory = dynamics.modules.tape_step.SolvedStep(), dynamics.modules.trajectory.TrajectoryArrays()
         for name, shape in {"torque": (1, 12, n), "impulse": (1, 4, n), "pressed": (1, 4, n)}.items():

@@ -52,10 +52,11 @@ def minimise(
     step: float = 0.1,
     seed: int = 0,
 ) -> Progress:
-    """Return the best candidates of a descent from `begin` (starts, n = len(problem.knots)), within lower and upper.
+    """Minimise a trajectory optimisation problem by the augmented Lagrangian method, from many starts in parallel.
 
-    An iteration takes one gradient and `len(LENGTHS) + RANDOM` simulations for each start. step [1]: largest entry of
-    the first steps. seed: of the random steps. Raises InputError: `begin` has another shape.
+    Returns the best candidates. begin: (starts, n = len(problem.knots)); lower, upper: bounds of all entries. An
+    iteration takes one gradient and `len(LENGTHS) + RANDOM` simulations for each start. step [1]: largest entry of the
+    first steps. seed: of the random steps. Raises InputError: `begin` has another shape.
     """
     if begin.ndim != 2 or begin.shape[1] != len(problem.knots) or len(begin) < 1:
         raise InputError(f"starts must have shape (starts, {len(problem.knots)}), got {begin.shape}")
@@ -76,7 +77,7 @@ def minimise(
 
 
 class _Descent:
-    """State of a descent from all starts in parallel; arguments as in `minimise`, tensors (starts, ...)."""
+    """State of the augmented Lagrangian method for all starts in parallel; arguments as in `minimise`."""
 
     def __init__(self, problem: Problem, begin: np.ndarray, lower: float, upper: float, step: float, seed: int):
         real = torch.float64 if problem.double else torch.float32
@@ -102,7 +103,7 @@ class _Descent:
         return values.objective + 0.5 * (penalty * (pressed.square() - shift.square())).sum(1)
 
     def iterate(self, number: int) -> None:
-        """Take one step of every start; number: of the iteration, every `OUTER` of which update the multipliers."""
+        """Take one L-BFGS step of every start; every `OUTER`-th iteration (`number`) also updates the multipliers."""
         values, gradient = self.problem.gradient(self.x, self.merit)
         self._keep_best(self.x, values, 1)
         if number and number % OUTER == 0:
@@ -138,7 +139,7 @@ class _Descent:
         self.step = (self.step * torch.where(better, factor, 0.3)).clamp(MIN_STEP, MAX_STEP)
 
     def _add_pair(self, gradient: torch.Tensor) -> None:
-        """Append the last step and change of the gradient to the BFGS pairs, with 1 / product, 0 if not convex."""
+        """Store the last step and its change of the gradient for L-BFGS, with 1 / product, 0 if not convex."""
         if self.previous is None:
             return
         moved, change = self.x - self.previous[0], gradient - self.previous[1]
@@ -170,7 +171,7 @@ class _Descent:
         return torch.where(plain[:, None], d * (self.step / largest)[:, None], d)
 
     def _update_multipliers(self, values: Values) -> None:
-        """Update the multipliers; multiply penalties by `GROWTH` where the largest violation did not halve."""
+        """Update the Lagrange multipliers; multiply penalties by `GROWTH` where the largest violation did not halve."""
         assert self.multipliers is not None
         worst = values.constraints.clamp_min(0.0).amax(1) if values.constraints.shape[1] else self.violation * 0.0
         self.multipliers = (self.multipliers + self.penalty[:, None] * values.constraints).clamp_min(0.0)
@@ -179,7 +180,7 @@ class _Descent:
         self.violation = worst
 
     def _keep_best(self, x: torch.Tensor, values: Values, count: int) -> None:
-        """Update `progress` with candidates x (starts * count, n), `count` consecutive ones by start."""
+        """Update the best point of each start so far from `count` candidates by start, x (starts * count, n)."""
         objective = values.objective.cpu().numpy().reshape(-1, count)
         constraints = values.constraints.cpu().numpy()
         worst = (constraints.max(axis=1, initial=0.0)).reshape(-1, count)

@@ -55,7 +55,7 @@ class Network:
         self.weights = torch.cat(parts).to(device, dtype, copy=True)
 
     def layers(self, weights: torch.Tensor) -> list[tuple[torch.Tensor, torch.Tensor]]:
-        """Return weight (out, in) and bias (out,) of each layer as views of a weight vector (num_weights,)."""
+        """Return weight (out, in) and bias (out,) of each network layer as views of a weight vector (num_weights,)."""
         parts = weights.split([math.prod(shape) for shape in self.shapes])
         views = [part.view(shape) for part, shape in zip(parts, self.shapes, strict=True)]
         return list(zip(views[::2], views[1::2], strict=True))
@@ -99,9 +99,10 @@ def per_world_gradients(total: torch.Tensor, tape: Tape) -> torch.Tensor:
 def conjugate_gradients(
     apply: Callable[[torch.Tensor], torch.Tensor], right: torch.Tensor, iterations: int, accuracy: float
 ) -> torch.Tensor:
-    """Return x (n,) with A x = right (n,) for a positive definite matrix A; apply: returns A v for v (n,).
+    """Solve A x = right for a positive definite matrix A by conjugate gradients.
 
-    Stops after `iterations`, or when the residual's norm is below `accuracy` times the norm of `right`.
+    x, right: (n,); apply: returns A v for v (n,). Stops after `iterations`, or when the residual's norm is below
+    `accuracy` times the norm of `right`.
     """
     x, residual = torch.zeros_like(right), right.clone()
     direction, size = residual.clone(), residual @ residual
@@ -133,11 +134,11 @@ class Anchor:
             self.actions = network.act(obs)
 
     def residuals(self, weights: torch.Tensor) -> torch.Tensor:
-        """Return changes of the actions over action_std sqrt(m), (m, 12), at a weight vector (num_weights,)."""
+        """Return changes of the network's actions from the original, divided by action_std sqrt(m), (m, 12)."""
         return self.scale * (self.network.act(self.obs, weights) - self.actions)
 
     def cost(self, weights: torch.Tensor) -> float:
-        """Return half the sum of squared `residuals`."""
+        """Return the penalty on changed actions: half the sum of squared `residuals`."""
         with torch.no_grad():
             return 0.5 * float(self.residuals(weights).square().sum())
 
@@ -157,10 +158,11 @@ def gauss_newton_step(
     iterations: int = 40,
     accuracy: float = 1.0e-3,
 ) -> torch.Tensor:
-    """Return the step d (num_weights,) from `weights` that solves the module's equation by `conjugate_gradients`.
+    """Return the Gauss-Newton step of a network's weights in the trust region of an `Anchor`.
 
-    By group of worlds: jacobians: J, (n, num_weights); errors: e, (n,); importance: the diagonal of W, (n,).
-    damping: c [1]. iterations, accuracy: limits of the conjugate gradients.
+    The step d (num_weights,) from `weights` solves the module's equation by `conjugate_gradients`. By group of worlds:
+    jacobians: J, (n, num_weights); errors: e, (n,); importance: the diagonal of W, (n,). damping: c [1]. iterations,
+    accuracy: limits of the conjugate gradients.
     """
     change, back = vjp(anchor.residuals, weights)[:2]
     right = -back(change)[0]

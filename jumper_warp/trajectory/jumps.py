@@ -16,7 +16,7 @@ MARGIN = 0.004  # [m] default clearance of links over the ground
 
 
 def air_time(up: torch.Tensor, drop: torch.Tensor, gravity: float) -> torch.Tensor:
-    """Return the time [s] until a projectile has fallen by `drop` [m]; about the time to its apex if it never does.
+    """Return the time [s] until a projectile has fallen by `drop` [m]. If it never does, about the time to its apex.
 
     up: upward speed [m/s], of the shape of drop. gravity [m/s^2]: positive. The root is constant below 1e-4 m^2/s^2, so
     that gradients are finite.
@@ -42,14 +42,15 @@ def flight(motion: SimulatedMotion, speed: float, height: float) -> tuple[torch.
 
 
 def farthest(speed: float = 0.25, height: float = 0.30) -> Term:
-    """Return the objective: minus the distance [m] of `flight` to a landing with the base at `height` [m]."""
+    """Return the objective of the farthest jump: minus the distance [m] to a landing with the base at `height` [m]."""
     return lambda motion: -flight(motion, speed, height)[0]
 
 
 def highest() -> Term:
-    """Return the objective: minus the base's apex height [m] between takeoff (0.25 m/s) and the first touchdown.
+    """Return the objective of the highest jump: minus the base's apex height [m] before the first touchdown.
 
-    The apex lies on the parabola through position and velocity of the base in its highest row.
+    Counted from takeoff (0.25 m/s) on. The apex lies on the parabola through position and velocity of the base in its
+    highest row.
     """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
@@ -76,7 +77,7 @@ def positive_work() -> Term:
 
 
 def before_takeoff(motion: SimulatedMotion, speed: float) -> torch.Tensor:
-    """Return whether each row is before takeoff, bool (steps + 1, num)."""
+    """Return whether the robot has not taken off yet at each policy step of a motion, bool (steps + 1, num)."""
     row = motion.takeoff(speed)[0]
     return torch.arange(motion.q.shape[0], device=row.device)[:, None] < row
 
@@ -102,7 +103,7 @@ def landing_pitch(limit: float, speed: float = 0.25, height: float = 0.30) -> Te
 
 
 def stays(limit: float, speed: float = 0.25) -> Term:
-    """Return the constraint: until takeoff the base's horizontal distance from its start is at most `limit` [m]."""
+    """Return the constraint of a jump on the spot: until takeoff the base moves horizontally by at most `limit` [m]."""
     drift = drifts(limit)
     return lambda motion: torch.where(before_takeoff(motion, speed), drift(motion), 0.0)
 
@@ -118,7 +119,7 @@ def leans_back(limit: float, speed: float = 0.25) -> Term:
 
 
 def drifts(limit: float) -> Term:
-    """Return the constraint: in every row the base's horizontal distance from its start is at most `limit` [m]."""
+    """Return the constraint: during the whole motion the base moves horizontally by at most `limit` [m]."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         offset = motion.q[..., :2] - motion.q[0, :, :2]
@@ -153,7 +154,7 @@ def no_run_up(limit: float = 0.04, speed: float = 0.25) -> Term:
 
 
 def takes_off(speed: float = 0.25, lift: float = 0.01) -> Term:
-    """Return the constraint: the robot takes off; else the lowest paw must rise to `lift` [m] in the last row.
+    """Return the constraint: the robot takes off; else the lowest paw must rise to `lift` [m] at the end of the motion.
 
     The second condition has a gradient; its value is scaled to 0.1 m and stays above 0.
     """
@@ -167,7 +168,7 @@ def takes_off(speed: float = 0.25, lift: float = 0.01) -> Term:
 
 
 def upright(limit: float, at_end: bool = True) -> Term:
-    """Return the constraint: the base's tilt is at most `limit` [rad], in the last row or (not at_end) in all rows."""
+    """Return the constraint: the base's tilt is at most `limit` [rad], at the end or (not at_end) at all times."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         quat = motion.q[-1:, :, 3:7] if at_end else motion.q[..., 3:7]
@@ -178,7 +179,7 @@ def upright(limit: float, at_end: bool = True) -> Term:
 
 
 def reaches(height: float) -> Term:
-    """Return the constraint: the base's apex, see `highest`, is at least `height` [m]."""
+    """Return the constraint of a high jump: the base's apex, see `highest`, is at least `height` [m]."""
     return lambda motion: height + highest()(motion)
 
 
@@ -191,9 +192,9 @@ def touchdowns(motion: SimulatedMotion, speed: float = 0.25) -> torch.Tensor:
 
 
 def soft(limit: float, speed: float = 0.25) -> Term:
-    """Return the constraint: after takeoff the base accelerates upward by at most `limit` [g], scaled to 10 g.
+    """Return the constraint of a soft landing: after takeoff the base accelerates upward by at most `limit` [g].
 
-    The acceleration is the mean over a policy step.
+    It is scaled to 10 g. The acceleration is the mean over a policy step.
     """
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
@@ -206,7 +207,7 @@ def soft(limit: float, speed: float = 0.25) -> Term:
 
 
 def lifted(dead_band: float = 0.001) -> Term:
-    """Return the objective: height of paws lifted after touchdown, summed over paws and time, in units of 10 mm s.
+    """Return the objective: height of paws that lift again after touchdown, over paws and time, in units of 10 mm s.
 
     Heights are counted above `dead_band` [m]. Each paw's height in the last row is added in units of 10 mm.
     """
@@ -220,7 +221,7 @@ def lifted(dead_band: float = 0.001) -> Term:
 
 
 def rest() -> Term:
-    """Return the objective: squared speed [m^2/s^2] + squared angular velocity [rad^2/s^2] / 10 in the last row."""
+    """Return the objective of ending at rest: squared speed [m^2/s^2] + angular velocity [rad^2/s^2] / 10."""
 
     def term(motion: SimulatedMotion) -> torch.Tensor:
         last = motion.qd[-1]

@@ -43,14 +43,14 @@ class Knots:
     """True: left and right legs are equal and lateral motors at 0; False: all twelve motors are free."""
 
     def __post_init__(self) -> None:
-        """Raise InputError: knots that do not rise from 0, or end after the motion."""
+        """Raise InputError unless the times of the knots rise from 0 and end within the motion."""
         rise = len(self.at) > 1 and self.at[0] == 0.0 and bool(np.all(np.diff(self.at) > 0.0))
         if not rise or not max(self.at) < self.steps:
             raise InputError(f"knots must rise from 0 and end before step {self.steps}, got {self.at}")
 
     @property
     def motors(self) -> int:
-        """Actions of a knot: 4 (front outer, front inner, hind outer, hind inner) if symmetric, else all 12 motors."""
+        """Number of actions at a knot: 4 (front outer, front inner, hind outer, hind inner) if symmetric, else 12."""
         return 4 if self.symmetric else 12
 
     def __len__(self) -> int:
@@ -93,14 +93,14 @@ class SimulatedMotion:
         self.num = self.q.shape[1]
 
     def once(self, key: Any, make: Callable[[], Any]) -> Any:
-        """Return `make()`, computed at the first call with this hashable key and cached for all terms."""
+        """Return a quantity of the motion, computed by `make` at the first call with this hashable key, then cached."""
         if key not in self._cache:
             self._cache[key] = make()
         return self._cache[key]
 
     @cached_property
     def points(self) -> tuple[torch.Tensor, torch.Tensor]:
-        """Links' origins (steps + 1, num, 4, 5, 3) and paws' centres (steps + 1, num, 4, 3) [m]: `WholeBody.points`."""
+        """Positions of the links' origins and of the paws' centres [m] during the motion, see `WholeBody.points`."""
         return self.body.points(self.q)
 
     @property
@@ -132,9 +132,10 @@ class SimulatedMotion:
         return (self.dt * (torque * rate).clamp_min(0.0)).sum((1, 2)).cumsum(0)
 
     def takeoff(self, speed: float) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return (row of takeoff (num,), whether the robot takes off, bool (num,)); without takeoff, the last row.
+        """Return the policy step at which each world's robot takes off, and whether it does.
 
-        Takeoff as in the jump tasks: the first row with no paw in contact and the base rising faster than speed [m/s].
+        Row of takeoff (num,), without takeoff the last one, and bool (num,). Takeoff as in the jump tasks: the first
+        row with no paw in contact and the base rising faster than speed [m/s].
         """
         return self.once(("takeoff", speed), lambda: self._takeoff(speed))
 
@@ -148,12 +149,12 @@ class SimulatedMotion:
         return self.body.base_velocity(self.q, self.qd)
 
     def momentum_at(self, row: torch.Tensor) -> Momentum:
-        """Return the momentum of each world, (num, ...), in the world's row of `row` (num,)."""
+        """Return centre of mass and momentum of each world's robot at the policy step `row` (num,) of that world."""
         worlds = torch.arange(self.num, device=row.device)
         return self.body.momentum(self.q[row, worlds], self.qd[row, worlds])
 
     def momentum_at_takeoff(self, speed: float) -> Momentum:
-        """Return the momentum of each world at `takeoff`; speed [m/s]."""
+        """Return centre of mass and momentum of each world's robot at `takeoff`; speed [m/s]."""
         return self.once(("momentum", speed), lambda: self.momentum_at(self.takeoff(speed)[0]))
 
 
@@ -162,14 +163,14 @@ Term = Callable[[SimulatedMotion], torch.Tensor]
 
 
 class Values(NamedTuple):
-    """Objective and constraints of n candidates."""
+    """Values of objective and constraints for n candidate solutions of a trajectory optimisation problem."""
 
     objective: torch.Tensor  # (n,) to minimise
     constraints: torch.Tensor  # (n, m) satisfied where <= 0
 
 
 class _Worlds(NamedTuple):
-    """Rollout and initial state of n candidates, standing in the default pose."""
+    """Differentiable simulation and initial state of n candidate motions, standing in the default pose."""
 
     rollout: Rollout
     body: WholeBody
@@ -199,15 +200,15 @@ class Problem:
     """Number of policy steps of reverse passes so far, worlds times steps."""
 
     def __post_init__(self) -> None:
-        """Create an empty cache of worlds, by number of candidates."""
+        """Create an empty cache of simulations, by number of candidates."""
         self._worlds: dict[int, _Worlds] = {}
 
     def rollout(self, num_worlds: int) -> Rollout:
-        """Return the rollout of `num_worlds` worlds, built at first use and cached."""
+        """Return the differentiable simulation of `num_worlds` candidates, built at first use and cached."""
         return self._worlds_of(num_worlds).rollout
 
     def _worlds_of(self, num_worlds: int) -> _Worlds:
-        """Return rollout and initial state of `num_worlds` worlds, built at first use and cached."""
+        """Return simulation and initial state of `num_worlds` candidates, built at first use and cached."""
         if num_worlds not in self._worlds:
             model = build_model(
                 num_worlds, visuals=False, friction=self.friction, gravity=self.gravity, device=self.device
@@ -229,7 +230,7 @@ class Problem:
         return SimulatedMotion(simulate(rollout, targets, q, qd, trusted=True), body, rollout, self.gravity, start)
 
     def motion_of(self, trajectory: TorchTrajectory) -> SimulatedMotion:
-        """Return the motion of a one-world trajectory from another simulation of the same robot, for `values`."""
+        """Wrap a one-world trajectory from another simulation of the same robot as a motion, for `values`."""
         rollout, body, _, _, start = self._worlds_of(1)
         return SimulatedMotion(trajectory, body, rollout, self.gravity, start)
 
@@ -246,7 +247,7 @@ class Problem:
         return Values(torch.where(diverged, torch.inf, objective), torch.where(diverged[:, None], 0.0, constraints))
 
     def gradient(self, x: torch.Tensor, merit: Callable[[Values], torch.Tensor]) -> tuple[Values, torch.Tensor]:
-        """Return the values of candidates x (n, len(knots)) and the gradient of their merit, of the same shape.
+        """Return the values of candidates x (n, len(knots)) and the gradient of their merit w.r.t. x.
 
         merit: returns (n,) to minimise, given `Values`. The gradient is zero for candidates that diverge.
         """

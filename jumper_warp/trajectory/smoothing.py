@@ -1,4 +1,4 @@
-"""Global search by descent along smoothed gradients, from many sampled starts at once.
+"""Global trajectory optimisation by descent along smoothed gradients, from many sampled starts at once.
 
 Contacts that begin and end make an objective rough at small scales, where its exact gradient is large and useless. The
 descent follows gradients at randomly displaced points, one per step, whose running mean is the gradient of the
@@ -47,7 +47,7 @@ class Stage:
     """Number of crossings by start, of which the best replaces the start before the stage, see `crossed`."""
 
     def merit(self, values: Values) -> torch.Tensor:
-        """Return the merit (n,), lower is better, of undisplaced candidates: `exact` if `dual`, else `penalised`."""
+        """Return the merit (n,) that ranks candidates, lower is better: `exact` if `dual`, else `penalised`."""
         return exact(values) if self.dual else penalised(values, self.penalty)
 
 
@@ -60,7 +60,7 @@ STAGES = (
 
 
 def penalised(values: Values, penalty: float = 20.0) -> torch.Tensor:
-    """Return the objective plus `penalty` times the sum of squared violations, (n,)."""
+    """Return the quadratic penalty function (n,): the objective plus `penalty` times the sum of squared violations."""
     return values.objective + penalty * values.constraints.clamp_min(0.0).square().sum(1)
 
 
@@ -70,7 +70,7 @@ def exact(values: Values) -> torch.Tensor:
 
 
 def merit_of(problem: Problem, x: torch.Tensor, merit: Callable[[Values], torch.Tensor]) -> torch.Tensor:
-    """Return the merit (n,), lower is better, of candidates x (n, len(problem.knots)); NaN becomes infinite."""
+    """Simulate candidates x (n, len(problem.knots)); return their merit (n,), lower is better, infinite for NaN."""
     with torch.no_grad():
         merits = torch.cat([merit(problem.evaluate(part)) for part in x.split(BATCH)])
     return torch.nan_to_num(merits, torch.inf)
@@ -92,9 +92,10 @@ def lagrangian(values: Values, multipliers: torch.Tensor, penalty: float) -> tor
 
 
 def crossed(knots: Knots, x: torch.Tensor, count: int, rng: np.random.Generator) -> torch.Tensor:
-    """Return `count` random crossings of each start x (n, len(knots)) with another start, (count, n, len(knots)).
+    """Combine each start of the search with other starts at random: first knots of one, last knots of another.
 
-    A crossing has the start's first knots, and the other start's last knots, shifted in time by up to `SHIFT` knots.
+    Returned: `count` crossings of each start x (n, len(knots)), (count, n, len(knots)); the other start's knots are
+    shifted in time by up to `SHIFT` knots.
     """
     whole, rows, shape = x.unflatten(1, (len(knots.at), -1)), np.arange(len(knots.at)), (count, len(x), 1)
     first = np.arange(len(x))[None, :, None]
@@ -105,7 +106,7 @@ def crossed(knots: Knots, x: torch.Tensor, count: int, rng: np.random.Generator)
 
 
 def _best_crossed(problem: Problem, x: torch.Tensor, stage: Stage, rng: np.random.Generator) -> torch.Tensor:
-    """Return starts x (n, len(knots)) sorted by merit, each replaced by its best crossing if that is better."""
+    """Replace each start x (n, len(knots)) by its best crossing with another start if that is better; sort by merit."""
     tried = torch.cat([x[None], crossed(problem.knots, x, stage.crossings, rng)])
     merits = merit_of(problem, tried.flatten(0, 1), stage.merit).unflatten(0, tried.shape[:2])
     best, chosen = merits.min(0)
@@ -113,7 +114,7 @@ def _best_crossed(problem: Problem, x: torch.Tensor, stage: Stage, rng: np.rando
 
 
 def _first_multipliers(problem: Problem, x: torch.Tensor, stage: Stage) -> torch.Tensor:
-    """Return multipliers (n, m) that give the penalty's gradient at x (n, len(knots)); without `dual`, zeros (n, 1)."""
+    """Return initial Lagrange multipliers (n, m) with the penalty's gradient at x; if not `dual`, zeros (n, 1)."""
     if not stage.dual:
         return x.new_zeros(len(x), 1)
     with torch.no_grad():
@@ -121,7 +122,7 @@ def _first_multipliers(problem: Problem, x: torch.Tensor, stage: Stage) -> torch
 
 
 class _BestPoints:
-    """Best point x (n, len(knots)) and lowest merit (n,) of each start so far."""
+    """Best point x (n, len(knots)) and lowest merit (n,) that the descent from each start has found so far."""
 
     def __init__(self, problem: Problem, x: torch.Tensor, stage: Stage):  # x: starts
         self.problem, self.stage = problem, stage
@@ -136,7 +137,7 @@ class _BestPoints:
 
 
 def descend(problem: Problem, x: torch.Tensor, stage: Stage, rng: np.random.Generator) -> torch.Tensor:
-    """Return starts x (n, len(knots)) after one stage of smoothed descent: last points, or with `slack` the best."""
+    """Run one stage of smoothed descent from starts x (n, len(knots)); return last points, or with `slack` the best."""
     mean, square = torch.zeros_like(x), torch.zeros_like(x)
     best = _BestPoints(problem, x, stage) if stage.slack < inf else None
     multipliers, scale = _first_multipliers(problem, x, stage), x.new_ones(len(x), 1)
@@ -170,10 +171,11 @@ def smoothed(
     seed: int = 0,
     callback: Callable[[int, torch.Tensor], None] | None = None,
 ) -> np.ndarray:
-    """Return the candidates after all stages, lowest merit first, (keep of the last stage, len(problem.knots)).
+    """Minimise a trajectory optimisation problem by smoothed descent in several stages.
 
-    begin: candidates (n, len(problem.knots)), of which the first stage keeps the best. callback: called after each
-    stage with its index and the merits (keep,) of its candidates.
+    Returned: candidates, lowest merit first, (keep of the last stage, len(problem.knots)). begin: candidates (n,
+    len(problem.knots)), of which the first stage keeps the best. callback: called after each stage with its index and
+    the merits (keep,) of its candidates.
     """
     real = torch.float64 if problem.double else torch.float32
     x = torch.as_tensor(begin, dtype=real, device=str(problem.rollout(min(len(begin), BATCH)).device))

@@ -102,9 +102,10 @@ class WholeBody:
         self.mass = float(self._mass.sum())  # [kg] of the whole robot
 
     def _base(self, q: torch.Tensor, qd: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        """Return the base's rotation (..., 3, 3), origin [m], its velocity [m/s], and angular velocity [rad/s].
+        """Return rotation, origin, velocity and angular velocity of the base.
 
-        Arguments q (..., 19), qd (..., 18). Vectors: (..., 3), world frame.
+        Rotation (..., 3, 3), origin [m], its velocity [m/s], angular velocity [rad/s]. Arguments q (..., 19), qd (...,
+        18). Vectors: (..., 3), world frame.
         """
         rotation, ang = rotation_matrices(q[..., 3:7]), qd[..., 3:6]
         vel = qd[..., :3] - _cross(ang, _apply(rotation, (self._first[0] / self._mass[0]).expand_as(ang)))
@@ -166,10 +167,11 @@ class WholeBody:
     def _planar_rates(
         self, angle: torch.Tensor, rate: torch.Tensor, shank_dir: torch.Tensor
     ) -> tuple[torch.Tensor, ...]:
-        """Return velocities of the origins of `_planar`, and cosines, sines and rates of the links' rotation about y.
+        """Return velocities and rotation of the five-bars' links in their housing frames.
 
         angle [rad], rate [rad/s]: (..., 4, 2); shank_dir: (..., 4, 2, 2), see `_planar`. Returned, in the housing
-        frame: velocities (..., 4, 4, 3) [m/s]; cosines, sines and rates [rad/s], (..., 4, 4) each.
+        frame: velocities (..., 4, 4, 3) [m/s] of the origins of `_planar`; cosines, sines and rates [rad/s] of the
+        links' rotation about y, (..., 4, 4) each.
         """
         sin, cos, thigh, shank = angle.sin(), angle.cos(), self._thigh[:, None], self._shank[:, None]
         knee_vx, knee_vz = self._flip * thigh * cos * rate, thigh * sin * rate
@@ -226,7 +228,10 @@ class WholeBody:
         return Momentum(com, com_vel, spin.sum(-2), _inertia(outer.sum(-3)))
 
     def points(self, q: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
-        """Return `LegFrames.pos` (..., 4, 5, 3) and `LegFrames.ankle` (..., 4, 3) [m], world frame. q: (..., 19)."""
+        """Return positions of the links' origins and of the paws' centres [m], world frame.
+
+        `LegFrames.pos` (..., 4, 5, 3) and `LegFrames.ankle` (..., 4, 3). q: (..., 19).
+        """
         rotation = rotation_matrices(q[..., 3:7]).unsqueeze(-3)
         angle = q[..., 7:].unflatten(-1, (4, 3))
         origins, ankle = self._planar(angle[..., 1:])[:2]
@@ -247,7 +252,10 @@ class WholeBody:
         return self.clearance_of(q, *self.points(q))
 
     def clearance_of(self, q: torch.Tensor, pos: torch.Tensor, ankle: torch.Tensor) -> torch.Tensor:
-        """Return the heights [m] of `clearance`, (..., 4, 4), from q (..., 19) and `pos`, `ankle` of `points`."""
+        """Return heights of the legs' links above level ground [m] from link positions that are already known.
+
+        As `clearance`, (..., 4, 4), from q (..., 19) and `pos`, `ankle` of `points`.
+        """
         height, ankle = pos[..., 2], ankle[..., 2]
         tip = height[..., 0] + rotation_matrices(q[..., 3:7])[..., 2, 0, None] * self._front * float(HOUSING_LENGTH)
         axes, knees = height[..., 1::2], height[..., 2::2]
@@ -263,6 +271,6 @@ class WholeBody:
 
 
 def _inertia(second: torch.Tensor) -> torch.Tensor:
-    """Return inertias (..., 3, 3) [kg m^2] of second moments of mass, the integral of r r^T dm, (..., 3, 3)."""
+    """Convert second moments of mass, the integral of r r^T dm, to inertia tensors (..., 3, 3) [kg m^2]."""
     trace = second.diagonal(dim1=-2, dim2=-1).sum(-1)
     return trace[..., None, None] * torch.eye(3, dtype=second.dtype, device=second.device) - second

@@ -5,7 +5,7 @@ from pathlib import Path
 
 
 def assets_folder(package: Path) -> Path:
-    """Return the assets folder of a package: inside it (wheel) if it exists there, else next to it (clone)."""
+    """Return the folder of descriptions and policies of a package: inside it (wheel), else next to it (clone)."""
     inside = package / "assets"
     return inside if inside.is_dir() else package.parent / "assets"
 
@@ -15,7 +15,7 @@ POLICIES = ASSETS / "policies"  # Folder of the project's own policies
 
 
 def dashed(name: str) -> str:
-    """Return the name of a task or policy with - for every _; names that agree in it mean the same."""
+    """Return the name of a task or policy with - for every _, so that both spellings compare equal."""
     return name.replace("_", "-")
 
 

@@ -1,4 +1,4 @@
-"""Range checks of settings; each raises InputError, a ValueError, with a one-line message that begins with `name`."""
+"""Range checks of settings; each raises InputError with a one-line message that begins with `name`."""
 
 from __future__ import annotations
 
@@ -64,6 +64,6 @@ def check_seed(value: Any) -> None:
 
 
 def version_error(version: str, known: int) -> str:
-    """Return the error message for a file of format `version`, with the commit that reads the format `known - 1`."""
+    """Return the error message for a file of unsupported format `version`, with the commit that reads `known - 1`."""
     previous = f"commit {LAST_OF_PREVIOUS_VERSION} reads version {known - 1}"
     return f"has version {version}, expected version {known}; {previous}"

@@ -1,21 +1,21 @@
-"""Base class of errors in user input, and the end of such a message that names what the user may have meant."""
+"""Base class of errors in user input, and suggestions for misspelt names in their messages."""
 
 from collections.abc import Iterable
 
 
 class InputError(ValueError):
-    """Invalid input; the message is one line with the expected and the actual value.
+    """Error for invalid input of the user; the message is one line with the expected and the actual value.
 
     Commands and experiments print it and exit with code 2; any other exception propagates with its traceback.
     """
 
     def __init__(self, message: str) -> None:
-        """message: text in which runs of whitespace become one space."""
+        """Store the message of the error. message: text in which runs of whitespace become one space."""
         super().__init__(" ".join(message.split()))
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:
-    """Return "; did you mean 'x'?" with the known name most like a misspelt one, or "" if none is close."""
+    """Return the end of an error message, "; did you mean 'x'?", for a misspelt name, or "" if none is close."""
     import difflib
 
     spellings = {word.lower().replace("_", "-"): word for word in known}

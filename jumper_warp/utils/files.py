@@ -34,12 +34,15 @@ def write_atomically(path: Path, data: bytes) -> None:
 
 
 def json_bytes(content: Mapping[str, Any]) -> bytes:
-    """Return an object as the bytes of a JSON file. Raises ValueError: a number is not finite."""
+    """Convert an object to the bytes of a JSON file. Raises ValueError: a number is not finite."""
     return (json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
 def existing_file(path: Path, purpose: str) -> Path:
-    """Return the path of an existing file. Raises InputError, with the purpose of the file: it does not exist."""
+    """Check that a file exists, and return its path.
+
+    Raises InputError, with the purpose of the file: it does not exist.
+    """
     if not Path(path).is_file():
         kind = "a folder, not a file" if Path(path).is_dir() else "no such file"
         raise InputError(f"{path}: {kind} ({purpose})")

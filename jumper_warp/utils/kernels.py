@@ -21,7 +21,7 @@ else:
 
 
 def records(structs: wp.array) -> NDArray[np.void]:
-    """Return a copy of an array of structs as a NumPy record array of its shape; synchronises with the device."""
+    """Copy a Warp array of structs to a NumPy record array of its shape; synchronises with the device."""
     return cast("NDArray[np.void]", structs.numpy())
 
 

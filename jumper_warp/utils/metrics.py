@@ -22,7 +22,7 @@ UNITS = {
 
 
 class MetricValue(NamedTuple):
-    """Value of a metric, with the trials that it was computed from."""
+    """Value of an evaluation metric, with its confidence interval and number of trials."""
 
     value: Scalar | list[Scalar]  # None: undefined, such as a mean over no trials
     trials: int | None = None  # Number of trials; None: not computed from trials
@@ -39,16 +39,19 @@ WIDTH = 80  # Characters in a line of a printed table
 
 
 class Outcome(Protocol):
-    """Arrays of trials that metrics are computed from."""
+    """Interface of an evaluation's results: arrays over trials from which metrics are computed."""
 
     @property
     def trials(self) -> Mapping[str, np.ndarray]:
-        """Sets of trials by name, such as "landed jumps": bool, of the shape of the arrays' first axes."""
+        """Masks of the trials that metrics are computed from, by name such as "landed jumps".
+
+        Bool, shape of the arrays' first axes.
+        """
         ...
 
 
 class Metric(NamedTuple):
-    """Definition of a metric, a row of a table: key, statistic and the trials that it is computed from."""
+    """Definition of an evaluation metric: name, statistic and the trials that it is computed from."""
 
     key: str  # Name of the measured quantity; ends in the unit, if there is one
     statistic: Callable[[np.ndarray, str], MetricValue]  # `rate`, `mean`, `largest` or `rmse`
@@ -62,7 +65,7 @@ def unit_of(key: str) -> str | None:
 
 
 def split_unit(key: str) -> tuple[str, str | None]:
-    """Return a metric's key without its unit, and the unit, as `unit_of`."""
+    """Split a metric's key into the key without its unit, and the unit, as `unit_of`."""
     if bracket := re.search(r" *\[(.+)\]$", key):
         return key[: bracket.start()], bracket[1]
     return next(((key.removesuffix(end), unit) for end, unit in UNITS.items() if key.endswith(end)), (key, None))
@@ -71,9 +74,10 @@ def split_unit(key: str) -> tuple[str, str | None]:
 def measure(
     table: Iterable[Metric], outcome: Outcome, where: np.ndarray | None = None, prefix: str = "", note: str = ""
 ) -> Metrics:
-    """Return the metrics of a table by key, each with `prefix` before it.
+    """Compute the metrics that a table defines from the results of an evaluation.
 
-    where: mask of the trials to use, default: all; note: description of these trials, for the file.
+    Returned by key, each with `prefix` before it. where: mask of the trials to use, default: all; note: description of
+    these trials, for the file.
     """
     metrics = {}
     for key, statistic, over, values in table:
@@ -83,13 +87,13 @@ def measure(
 
 
 def chosen(table: Iterable[Metric], *keys: str) -> list[Metric]:
-    """Return the rows of a table with these keys, in their order; keys that it lacks are skipped."""
+    """Select the metric definitions with these keys, in their order; keys that the table lacks are skipped."""
     rows = {metric.key: metric for metric in table}
     return [rows[key] for key in keys if key in rows]
 
 
 def rate(values: ArrayLike, over: str = "") -> MetricValue:
-    """Return the fraction of true values (n,), with Wilson's interval; over: description of the trials."""
+    """Return the fraction of true values (n,) as a metric with Wilson's interval; over: description of the trials."""
     values = np.asarray(values, dtype=bool)
     n, p = values.size, float(values.mean()) if values.size else None
     if p is None:
@@ -101,14 +105,14 @@ def rate(values: ArrayLike, over: str = "") -> MetricValue:
 
 
 def mean(values: ArrayLike, over: str = "") -> MetricValue:
-    """Return the mean of the finite values of (n,), with a bootstrap interval; over: description of the trials."""
+    """Return the mean of the finite values as a metric with a bootstrap interval; over: description of the trials."""
     values = np.asarray(values, dtype=float).ravel()
     known = np.isfinite(values)
     return _ratio(np.stack([np.where(known, values, 0.0), known], axis=1), over)
 
 
 def rmse(squares: np.ndarray, over: str = "") -> MetricValue:
-    """Return the root mean square over all samples of all trials, with a bootstrap interval over trials.
+    """Return the root mean square error over all samples as a metric, with a bootstrap interval over trials.
 
     squares: (trials, 2), sum of squared errors and number of samples of each trial.
     """
@@ -116,7 +120,10 @@ def rmse(squares: np.ndarray, over: str = "") -> MetricValue:
 
 
 def _ratio(rows: np.ndarray, over: str, function: Callable[[Any], Any] = lambda ratio: ratio) -> MetricValue:
-    """Return a function of the ratio of the sums of two columns, (trials, 2); the second holds numbers of samples."""
+    """Return a metric from the ratio of the sums of two columns, with a bootstrap interval.
+
+    rows: (trials, 2), the second column numbers of samples; function: of the ratio.
+    """
     rows = rows[rows[:, 1] > 0]
     if not len(rows):
         return MetricValue(None, 0, None, over)
@@ -126,14 +133,14 @@ def _ratio(rows: np.ndarray, over: str, function: Callable[[Any], Any] = lambda 
 
 
 def largest(values: ArrayLike, over: str = "") -> MetricValue:
-    """Return the largest of the finite values; over: description of the trials."""
+    """Return the largest of the finite values as a metric; over: description of the trials."""
     values = np.asarray(values, dtype=float).ravel()
     values = values[np.isfinite(values)]
     return MetricValue(float(values.max()) if len(values) else None, len(values), None, over)
 
 
 def resampled_means(rows: np.ndarray) -> np.ndarray:
-    """Return the means of RESAMPLES bootstrap samples of rows (n, columns), (RESAMPLES, columns)."""
+    """Return the means of RESAMPLES bootstrap samples of trials: (RESAMPLES, columns) from (n, columns)."""
     rng, n = np.random.default_rng(BOOTSTRAP_SEED), len(rows)
     at_once = max(1, min(RESAMPLES, BATCH // n))
     sizes = [min(at_once, RESAMPLES - done) for done in range(0, RESAMPLES, at_once)]

@@ -6,5 +6,5 @@ import torch
 
 
 def normalise(obs: torch.Tensor, mean: torch.Tensor, std: torch.Tensor, limit: float) -> torch.Tensor:
-    """Return (obs - mean) / std, clamped to ± limit, of shape (..., n); obs: (..., n); mean, std: (n,)."""
+    """Normalise observations (..., n) by mean and standard deviation (n,), and clamp them to ± limit."""
     return ((obs - mean) / std).clamp(-limit, limit)

@@ -40,11 +40,11 @@ def output_dir(name: str, out: Path | None = None) -> Path:
 
 
 def write_metrics(folder: Path, metrics: AnyMetrics, conditions: Mapping[str, Any] | None = None) -> Path:
-    """Write `metrics.json` and `run.json` (commit, dirty, versions, device, command); return the path of metrics.json.
+    """Write the metrics of a run and its commit, versions and command, as `metrics.json` and `run.json`.
 
-    Each file is written atomically. Environment variables are not saved. NumPy scalars become Python numbers.
-    folder: an existing folder; conditions: conditions of the evaluation by name. Raises InputError: a value is not
-    finite. TypeError: a value has another type. Both name the metric.
+    Returns the path of metrics.json. Each file is written atomically. Environment variables are not saved. NumPy
+    scalars become Python numbers. folder: an existing folder; conditions: conditions of the evaluation by name. Raises
+    InputError: a value is not finite. TypeError: a value has another type. Both name the metric.
     """
     entries = {key: _entry(key, value) for key, value in metrics.items()}
     document = {
@@ -61,19 +61,19 @@ def write_metrics(folder: Path, metrics: AnyMetrics, conditions: Mapping[str, An
 
 
 def read_metrics(folder: Path) -> dict[str, MetricValue]:
-    """Return the metrics of a file `metrics.json` that `write_metrics` wrote, by key."""
+    """Read the metrics in a run's `metrics.json`, by key."""
     entries = json.loads((folder / "metrics.json").read_text())["metrics"]
     return {key: MetricValue(*(entry[name] for name in MetricValue._fields)) for key, entry in entries.items()}
 
 
 def read_values(folder: Path) -> dict[str, Any]:
-    """Return the conditions of a file `metrics.json` and the values of its metrics, by name."""
+    """Read the conditions of an evaluation and the values of its metrics from `metrics.json`, by name."""
     conditions = json.loads((folder / "metrics.json").read_text())["conditions"]
     return conditions | {key: metric.value for key, metric in read_metrics(folder).items()}
 
 
 def _entry(key: str, value: Any) -> dict[str, Any]:
-    """Return the object that metrics.json has for a metric. Raises TypeError or InputError as `write_metrics`."""
+    """Return a metric as its JSON object in metrics.json. Raises TypeError or InputError as `write_metrics`."""
     metric = value if isinstance(value, MetricValue) else MetricValue(value)
     number = _to_python(key, metric.value)
     interval = None if metric.interval is None else _to_python(key, list(metric.interval))
@@ -81,7 +81,7 @@ def _entry(key: str, value: Any) -> dict[str, Any]:
 
 
 def _to_python(name: str, value: Any) -> Scalar | list[Scalar]:
-    """Return a metric as a Python scalar or list of scalars. Raises TypeError or InputError as `write_metrics`."""
+    """Convert a metric's value to a Python scalar or list. Raises TypeError or InputError as `write_metrics`."""
     if not isinstance(name, str):
         raise TypeError(f"the name of a metric must be a string, got {name!r}")
     if isinstance(value, list):
@@ -90,7 +90,7 @@ def _to_python(name: str, value: Any) -> Scalar | list[Scalar]:
 
 
 def _to_python_scalar(name: str, value: Any) -> Scalar:
-    """Return a scalar as a Python object. Raises TypeError or InputError: another type, or not finite."""
+    """Convert a scalar of a metric to a Python object. Raises TypeError or InputError: another type, or not finite."""
     if isinstance(value, np.generic):
         value = value.item()
     if not isinstance(value, Scalar):

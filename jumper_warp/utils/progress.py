@@ -1,4 +1,4 @@
-"""Progress of long work on standard error: title, elapsed time and, if the number of parts is known, the time left."""
+"""Progress display of long work on standard error: title, elapsed time and, if known, the time left."""
 
 from __future__ import annotations
 
@@ -24,17 +24,17 @@ def format_duration(seconds: float) -> str:
 
 
 class _TimeLeft(ProgressColumn):
-    """Estimated time left; empty if it is unknown."""
+    """Column of the progress display with the estimated time left; empty if it is unknown."""
 
     def render(self, task: Task) -> Text:
-        """Return the text of the column."""
+        """Return the estimated time left of a task as text."""
         seconds = task.time_remaining
         return Text("" if seconds is None else f"{format_duration(seconds)} left")
 
 
 @contextmanager
 def phase(title: str, total: int | None = None) -> Iterator[Callable[..., object]]:
-    """Show a phase of long work while the block runs; nothing unless standard error is a terminal.
+    """Show the progress of long work while the block runs, if standard error is a terminal.
 
     total: number of parts (default: unknown). Yields the function to call after each part, or with the number of parts
     that have been done since the last call. Phases may be nested. The display disappears at the end.

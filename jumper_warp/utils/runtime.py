@@ -1,4 +1,4 @@
-"""Device, package versions and commit of a run."""
+"""Device, package versions and git commit of a run, for its output."""
 
 import functools
 import os
@@ -23,7 +23,7 @@ PACKAGES = ("warp-lang", "newton", "mujoco", "mujoco-warp", "torch", "numpy", "r
 
 
 class Commit(NamedTuple):
-    """Commit and state of a source tree."""
+    """Git commit of a source tree, and whether the tree has changes."""
 
     hash: str  # full hash of the checked-out commit
     dirty: bool  # whether there are modified or untracked files
@@ -65,10 +65,11 @@ def report_device(device: wp.DeviceLike = None, console: Console | None = None) 
 
 
 def configure_device(device: str | None, threads: int | None = None) -> DeviceInfo:
-    """Set the number of threads, silence Warp's module messages, return the device's properties, and print them once.
+    """Set up Warp's device and the CPU threads of a command, and print the device once.
 
-    device: a Warp device (default: the current one). threads: CPU threads of simulations, as in `set_threads`.
-    Raises InputError: there is no such device, or the number of threads is invalid.
+    Silences Warp's module messages and returns the device's properties. device: a Warp device (default: the current
+    one). threads: CPU threads of simulations, as in `set_threads`. Raises InputError: there is no such device, or the
+    number of threads is invalid.
     """
     set_threads(threads)
     wp.config.log_level = wp.LOG_WARNING
@@ -82,7 +83,7 @@ def configure_device(device: str | None, threads: int | None = None) -> DeviceIn
 
 @functools.cache
 def _report_once(device: str | None, threads: int) -> DeviceInfo:
-    """Call `report_device` at the first call with these arguments, and return the device's properties."""
+    """Print a device once, at the first call with these arguments, and return the device's properties."""
     return report_device(device)
 
 
@@ -106,7 +107,7 @@ def init_warp() -> None:
 
 
 def git_commit(folder: Path | None = None) -> Commit | None:
-    """Return the commit of the source tree in `folder` (default: this package's folder, cached at the first call).
+    """Return the git commit of the source tree in `folder`, by default this package's folder, cached then.
 
     None without git, outside a git tree, in a tree without commits, and if the enclosing tree does not track the
     folder, as for a package installed inside another project.
@@ -119,7 +120,7 @@ def git_commit(folder: Path | None = None) -> Commit | None:
 
 @functools.cache
 def _package_commit() -> Commit | None:
-    """Return the commit of this package's source tree, cached at the first call."""
+    """Return the git commit of this package's source tree, cached at the first call."""
     return git_commit(Path(__file__).parent)
 
 
@@ -133,13 +134,13 @@ def _git(folder: Path, *arguments: str) -> str | None:
 
 
 def source_versions() -> dict[str, Any]:
-    """Return the dict of `commit` (hash or None), `dirty` (bool or None) and `versions` for this package."""
+    """Return git commit (hash or None), whether the tree is dirty, and package versions, by name, for this package."""
     commit = git_commit()
     return {"commit": commit and commit.hash, "dirty": commit and commit.dirty, "versions": versions()}
 
 
 def versions() -> dict[str, str | None]:
-    """Return the version of Python, this package and each of `PACKAGES`; None for one that is not installed."""
+    """Return the versions of Python, this package and each of `PACKAGES`; None for one that is not installed."""
     by_package: dict[str, str | None] = {"python": python_version(), "jumper-warp": __version__}
     for package in PACKAGES:
         try:

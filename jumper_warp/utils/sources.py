@@ -12,9 +12,10 @@ PROJECT_PREFIX = "jumper_warp."  # Prefix of the project's modules, whose conten
 
 
 def source_checksums(saved: Any) -> dict[str, str]:
-    """Return the SHA-256 by module name of the files outside the project that `saved` refers to as `module:name`.
+    """Return SHA-256 checksums of the user's modules that a saved task names, by module.
 
-    saved: nested dicts and lists, such as a task as JSON. Modules that are not loaded or have no file are left out.
+    `saved` refers to them as `module:name`; files of the project are left out. saved: nested dicts and lists, such as a
+    task as JSON. Modules that are not loaded or have no file are left out.
     """
     checksums = {}
     for module in sorted(set(_modules(saved))):
@@ -25,7 +26,7 @@ def source_checksums(saved: Any) -> dict[str, str]:
 
 
 def changed_sources(old: Any, new: dict[str, str]) -> list[str]:
-    """Return a message for each module whose checksum changed.
+    """Return a message for each user module whose file has changed since its checksum was saved.
 
     old, new: results of `source_checksums`; if `old` is not a dict, or lacks a module, nothing is reported for it.
     """
@@ -38,7 +39,7 @@ def changed_sources(old: Any, new: dict[str, str]) -> list[str]:
 
 
 def _modules(saved: Any) -> Iterator[str]:
-    """Yield the part before the colon of each string with a colon in nested dicts and lists."""
+    """Yield the modules that saved data names: the part before the colon of each string with a colon."""
     if isinstance(saved, str):
         module, colon, _ = saved.partition(":")
         if colon:

@@ -1,4 +1,4 @@
-"""Checks of a saved state; each raises InputError, a ValueError, with a one-line message that begins with `where`."""
+"""Checks of a saved state, such as a checkpoint; each raises InputError with a message that begins with `where`."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def check_parts(value: Any, names: Iterable[Any], where: str) -> None:
 
 
 def _listed(names: list[str]) -> str:
-    """Return the first three names as text with the number of the others, or "none" for an empty list."""
+    """List names in an error message: the first three and the number of the others, or "none"."""
     shown = ", ".join(names[:3]) + (f" and {len(names) - 3} more" if len(names) > 3 else "")
     return shown or "none"
 

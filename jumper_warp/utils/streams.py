@@ -1,4 +1,4 @@
-"""Random seeds by purpose: robots sampled for reporting differ from those sampled for tuning, whatever the seeds."""
+"""Random seeds by purpose: random robots for reporting differ from those for tuning, whatever the seeds."""
 
 from typing import Literal, get_args
 
@@ -9,10 +9,10 @@ PURPOSES: tuple[Purpose, ...] = get_args(Purpose)  # The kernels' streams take t
 
 
 def purpose_seed(purpose: Purpose, seed: int) -> int:
-    """Return the seed of a purpose's random numbers on the host: `seed` plus 2^31 times the index of the purpose.
+    """Return a seed that differs for every pair of purpose and seed: `seed` plus 2^31 times the purpose's index.
 
-    The result differs for every pair of purpose and seed; for training it is `seed`. `Env` takes purpose and seed
-    separately, see `jumper_warp.kernels.mdp.random`. Raises InputError: seed not in 0 to 2^31 - 1.
+    For training it is `seed`. It is for random numbers on the host; `Env` takes purpose and seed separately, see
+    `jumper_warp.kernels.mdp.random`. Raises InputError: seed not in 0 to 2^31 - 1.
     """
     check_seed(seed)
     return PURPOSES.index(purpose) * (MOST_SEED + 1) + int(seed)

@@ -24,7 +24,7 @@ MOST_PATHS = 3  # Number of files of a kind above which only their folder is pri
 
 @dataclass(frozen=True, kw_only=True)
 class PrintFlags:
-    """Flags that select what is printed about results."""
+    """Options that select what is printed about a run's results."""
 
     verbose: tyro.conf.FlagCreatePairsOff[bool] = False  # Print all metrics in place of a summary
     json: tyro.conf.FlagCreatePairsOff[bool] = False  # Print metrics.json in place of a summary
@@ -34,7 +34,7 @@ def print_summary(
     folder: Path, title: str, keys: Iterable[str], *, seconds: float, paper: Mapping[str, float] | None = None,
     flags: PrintFlags | None = None,
 ) -> None:  # fmt: skip
-    """Print what was done, the main metrics of a folder's `metrics.json`, and the paths of its files, 80 columns wide.
+    """Print a summary of a run: what was done, its main metrics, and the paths of its files, 80 columns wide.
 
     title: what was done; keys: of the main metrics, those that the file lacks are skipped; seconds: wall time of the
     run; paper: published values by key; flags: print all metrics, or the file itself.
@@ -57,7 +57,7 @@ def print_summary(
 
 
 def _summary_table(metrics: Mapping[str, MetricValue], paper: Mapping[str, float]) -> Table:
-    """Return a table of metrics in words, with their units, beside the paper's values if there are any."""
+    """Return a printable table of metrics in words, with units, beside the paper's values if there are any."""
     intervals, published = any(metric.interval for metric in metrics.values()), bool(paper.keys() & metrics.keys())
     columns = [Column("", overflow="fold"), "value", *["95 % interval"] * intervals, *["paper"] * published]
     table = Table(*columns, box=None, pad_edge=False)
@@ -77,7 +77,7 @@ def _words(key: str, metric: MetricValue) -> str:
 
 
 def _text(key: str, value: Any, *, unit: bool = False) -> str:
-    """Return a value as text, a rate in percent; unit: append the unit of the metric's key."""
+    """Return a metric's value as text, a rate in percent; unit: append the unit of the metric's key."""
     if value is None:
         return "undefined"
     percent = key.endswith("_rate") and isinstance(value, float | int)
@@ -86,7 +86,7 @@ def _text(key: str, value: Any, *, unit: bool = False) -> str:
 
 
 def _file_lines(folder: Path) -> Iterable[str]:
-    """Yield a line for each picture, film, recording and folder in a folder, or one for each kind with many."""
+    """Yield a printed line for each picture, film, recording and folder in a folder, or one for each kind with many."""
     for kind, ends in KINDS.items():
         paths = sorted(path for path in folder.iterdir() if path.suffix in ends and path.is_dir() == (kind == "folder"))
         if len(paths) > MOST_PATHS:

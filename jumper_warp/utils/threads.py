@@ -22,7 +22,10 @@ def available_threads() -> int:
 
 
 def checked_threads(threads: int | None) -> int:
-    """Return a number of threads; None: the default of `set_threads`. Raises InputError: it is not positive."""
+    """Check a number of CPU threads and return it; None: the default of `set_threads`.
+
+    Raises InputError: it is not positive.
+    """
     if threads is None:
         return available_threads() if _default_threads is None else _default_threads
     if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
@@ -37,7 +40,7 @@ def set_threads(threads: int | None) -> None:
 
 
 def run_in_parallel(jobs: Iterable[Callable[[], object]], threads: int) -> None:
-    """Run jobs on `threads` threads, including the calling thread, and return when all have finished.
+    """Run jobs in parallel on `threads` threads, including the calling thread, and wait until all have finished.
 
     If a job raises, jobs that have not started are skipped, and its exception is raised here.
     """
@@ -46,7 +49,7 @@ def run_in_parallel(jobs: Iterable[Callable[[], object]], threads: int) -> None:
     remaining, errors = iter(jobs), SimpleQueue()
 
     def work() -> None:
-        """Run remaining jobs, and put the exception that ended them, or None, into `errors`."""
+        """Run jobs that remain, and put the exception that ended them, or None, into `errors`."""
         error = None
         try:
             for job in remaining:
@@ -69,6 +72,6 @@ def run_in_parallel(jobs: Iterable[Callable[[], object]], threads: int) -> None:
 
 
 def _run_jobs() -> None:
-    """Run jobs from the queue in an endless loop, as a worker thread."""
+    """Run jobs of all `run_in_parallel` calls from the queue, as a worker thread that never ends."""
     while True:
         _jobs.get()()
