@@ -188,7 +188,10 @@ class Consecutive(Suite):
 
 
 def consecutive_metrics(pairs: LandingLog, row: LandingLog) -> Metrics:
-    """Return the metrics of pairs (first half diagonal, second half straight), and of long rows as `row_<key>`."""
+    """Return the metrics of pairs of jumps, and of long sequences of jumps as `row_<key>`.
+
+    pairs: the first half diagonal, the second half straight.
+    """
     first, rows = pairs.outcome, row.outcome
     errors = chosen(PLACE_METRICS, "goal_distance_at_rest_mean_m")
     halves, numbers = np.arange(2).repeat(len(first.landed) // 2)[:, None], np.arange(2)
@@ -341,7 +344,7 @@ def rectangle(x0: float, x1: float, y0: float, y1: float) -> np.ndarray:
 
 
 def distance_metrics(bins: dict[float, LandingLog]) -> Metrics:
-    """Return the metrics over all bins, reliable distances, and lists `bin_<key>` with one entry per bin.
+    """Return reliable jump distances, the metrics of all jumps, and those of each bin as lists `bin_<key>`.
 
     bins: logs by distance at the bin's middle [m], ascending.
     """

@@ -92,7 +92,7 @@ def add_files(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def _write(folder: Path, files: Mapping[str, bytes], checksums: Mapping[str, str]) -> None:
-    """Write files (name to content), then the manifest. Raises PolicyError: a name is malformed.
+    """Write a policy's files (name to content), then its manifest. Raises PolicyError: a name is malformed.
 
     checksums: SHA-256 by name of the files that the folder has already; the manifest keeps them.
     """
@@ -125,7 +125,10 @@ def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
 
 
 def _verified_checksums(folder: Path) -> dict[str, str]:
-    """Return the manifest's SHA-256 by file name, after verifying version and files. Raises PolicyError."""
+    """Verify a policy's version and files, and return the manifest's SHA-256 by file name.
+
+    Raises PolicyError.
+    """
     path = folder / MANIFEST
     manifest = _parse_json(path, _read_bytes(path))
     if manifest.get("format") != FORMAT:

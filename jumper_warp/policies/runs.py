@@ -204,8 +204,9 @@ def learning_curve(source: Path) -> bytes | None:
 
 
 def thinned_curve(metrics: bytes) -> bytes:
-    """Reduce a metrics file to the columns CURVE and at most CURVE_ROWS evenly spaced lines of JSON.
+    """Reduce a metrics file to a short learning curve: columns CURVE, at most CURVE_ROWS lines of JSON.
 
+    The lines are evenly spaced.
     The first and the last line are included, malformed lines are omitted.
     """
     rows = [row for line in metrics.splitlines() if (row := _curve_row(line))]
@@ -215,7 +216,7 @@ def thinned_curve(metrics: bytes) -> bytes:
 
 
 def _curve_row(line: bytes) -> dict[str, Any]:
-    """Return the entries CURVE of a line of metrics; empty for a malformed line."""
+    """Return the learning curve's values (keys CURVE) in one line of metrics; empty for a malformed line."""
     try:
         row = json.loads(line)
         return {name: row[name] for name in CURVE if name in row}

@@ -65,8 +65,9 @@ class Symmetry(NamedTuple):
 
 
 def mirror_map(order: Vector, signs: Vector, name: str, device: Any = None) -> MirrorMap:
-    """Return the mirror map `signs * x[order]`; order, signs: (n,); name: of the vectors, for messages.
+    """Build the mirror map `signs * x[order]`, and check that it is its own inverse.
 
+    order, signs: (n,); name: of the vectors, for messages.
     Raises InputError, a ValueError: it is not its own inverse.
     """
     index = torch.as_tensor(order, dtype=torch.int64, device=device)
@@ -130,8 +131,9 @@ def nearest_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
 
 
 def contract_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Invert `expand_layers`: return copies of the layers of f, which have half the hidden widths.
+    """Recover the symmetric actor's network, of half the widths, from the layers of `expand_layers`.
 
+    The result is a copy of the layers of f.
     f's last bias is recovered up to a part that cancels in the policy. Raises InputError: layers have another form.
     """
     contracted = []

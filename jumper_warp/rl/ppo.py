@@ -234,8 +234,9 @@ class Ppo:
 def critic_gradient(
     rows: torch.Tensor, layout: RowLayout, critic: Layers, cfg: PpoCfg, out: torch.Tensor
 ) -> torch.Tensor:
-    """Write the gradient of the weighted value loss to `out`, and return the value loss () before weighting.
+    """Compute the gradient of PPO's value loss with respect to the critic's parameters.
 
+    Writes the gradient of the weighted loss to `out`, and returns the value loss () before weighting.
     The loss is the squared error; with `clip_value` the maximum of this and of the squared error of a value clipped to
     within `clip` of the rollout's value.
 
@@ -259,8 +260,9 @@ def actor_gradient(
     rows: torch.Tensor, layout: RowLayout, actor: ActorTensors, old_log_std: torch.Tensor, entropy_coef: torch.Tensor,
     cfg: PpoCfg, out: torch.Tensor,
 ) -> ActorLosses:  # fmt: skip
-    """Write the gradient of surrogate loss and entropy bonus to `out`, and return the losses.
+    """Compute the gradient of PPO's surrogate loss and entropy bonus with respect to actor and noise.
 
+    Writes it to `out`, and returns the losses.
     The clipped surrogate of Schulman et al. 2017, eq. 7, as a loss: -E[min(r A, clip(r) A)] with r = π(a) / π_old(a).
     Where r A is the smaller, ∂/∂log π = -r A / batch, else 0.
 
@@ -303,7 +305,7 @@ def optimiser_step(
 def take_averages(
     names: Sequence[str], sums: torch.Tensor, finished: torch.Tensor, lr: torch.Tensor, log_std: torch.Tensor
 ) -> dict[str, float]:
-    """Return metrics averaged since the last call, and reset their sums; synchronises with the device.
+    """Return training metrics averaged since the last call, and reset their sums; waits for the device.
 
     names: names of the statistics; sums: (len(names) + 1,) their sums and the number of steps; finished: (3, ...) as
     in `Collector.finished`; lr: (); log_std: (num_actions,).
