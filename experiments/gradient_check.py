@@ -25,7 +25,7 @@ ASCENT_CHANGE = 0.05  # [rad] Largest change of a target in a step of the ascent
 
 @dataclass
 class Ascent:
-    """Result of the gradient ascent."""
+    """Result of the gradient ascent on a jump's apex."""
 
     apex: list[float]  # [m] Apex height before each step and after the last
     before: np.ndarray  # [rad] (TICKS, 12) Motor targets before the first step

@@ -265,7 +265,7 @@ def _scene_model(shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence
 
 
 def _segments(lines: Sequence[Line]) -> tuple[wp.array | None, wp.array | None, wp.array | None]:
-    """Convert lines to segments: return starts, ends and colors, vec3 each; an arrow is one segment."""
+    """Convert polylines to line segments: return starts, ends and colors, vec3 each; an arrow is one segment."""
     if not lines:
         return None, None, None
     parts = [line.points[[0, -1]] if line.arrow else line.points for line in lines]
