@@ -71,7 +71,7 @@ def plot_gradients(jump: Trajectory, actions: GradientPair, ascent: Ascent, path
 
 
 def main(args: DeviceArgs) -> dict:
-    """Check the gradients, run the ascent, plot both, and return the metrics."""
+    """Check the gradients of a jump's apex, raise the apex by them, plot both, and return the metrics."""
     folder = prepare("gradient_check", args)
     jump, checks = check(args.device)
     ascent = ascend(args.device)

@@ -119,7 +119,7 @@ def record(name: str) -> Recording:
 
 
 def main(args: Args) -> dict:
-    """Draw all pictures and films, and return their sizes by name."""
+    """Draw the pictures and films of all policies, and return their sizes by name."""
     folder = prepare("policy_pictures", args, args.threads)
     sizes = {}
     for name in tracked(args.policies, "drawing policies"):

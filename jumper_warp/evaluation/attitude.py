@@ -196,7 +196,7 @@ class AttitudeFlags:
         return AttitudeLog(axis_turns(self.num_turns, self.angle), self.tolerance, self.seconds)
 
     def metrics(self, log: AttitudeLog) -> Metrics:
-        """Return `turn_metrics` and `axis_metrics` of a finished log."""
+        """Return the metrics of a finished log of turns, together and for each axis and direction."""
         return turn_metrics(log) | axis_metrics(log)
 
 

@@ -212,7 +212,7 @@ class JumpLog(EvaluationLog):
         env.evaluation_reset(jump_commands(self.goals[:, 0], self.delay, env.step_dt), self.headings)
 
     def read_env(self, env: Env) -> dict[str, np.ndarray]:
-        """Return `Env.task_arrays` and `paw_arrays`."""
+        """Return the task's arrays, and contacts, positions and upward speed of `paw_arrays`, for `update`."""
         return env.task_arrays() | paw_arrays(env)
 
     def record_step(self, env: Env) -> bool:

@@ -286,7 +286,7 @@ class VelocityFlags:
         return VelocityLog(np.concatenate([commands, commands, standing]), task, self.seconds, times=times, slew=slew)
 
     def metrics(self, log: VelocityLog) -> Metrics:
-        """Return the metrics of a finished log."""
+        """Return tracking errors, drift and fall rate of a finished log of walks, VELOCITY_METRICS."""
         return measure(VELOCITY_METRICS, log)
 
 
