@@ -201,7 +201,10 @@ class FlightLog(EvaluationLog):
 
 
 def flight_metrics(flights: FlightLog) -> Metrics:
-    """Return the metrics of flights; means are over the flights that took off or touched down."""
+    """Return the rate of upright landings, and tilts, spins, momenta and apexes of the flights as metrics.
+
+    Means are over the flights that took off or touched down.
+    """
     up, down, each = "flights that took off", "flights that touched down", "flights"
     touchdown_tilt, touchdown_turn = np.degrees(flights.touchdown_tilt), np.degrees(flights.touchdown_turn)
     error = {"apex_error_abs_mean_m": mean(abs(flights.height - flights.apex), each)}

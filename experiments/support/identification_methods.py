@@ -64,7 +64,7 @@ def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
         return np.nan_to_num(residual, posinf=1.0e6)
 
     def jacobian(x: np.ndarray) -> np.ndarray:
-        """Return the derivatives of `residuals`, (residuals, variables)."""
+        """Return the Jacobian of `residuals` with respect to SciPy's variables, (residuals, variables)."""
         point = to_point(x)
         table = np.zeros((problem.count + 1 + len(x), len(x)))
         row = 0

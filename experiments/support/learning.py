@@ -105,7 +105,10 @@ def train_and_time(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Learning
 
 
 def curve_metrics(curve: LearningCurve, name: str) -> dict[str, Any]:
-    """Return the metrics of one training, `<metric>_<name>`, with time and steps to reach each of RATES."""
+    """Return final success, and time and steps to reach each of RATES, of one training's learning curve.
+
+    Keys: `<metric>_<name>`.
+    """
     values = {f"success_{name}": curve.success[-1], f"steps_per_s_{name}": curve.steps[-1] / curve.seconds[-1]}
     values |= {f"curve_{series}_{name}": getattr(curve, series) for series in ("seconds", "steps", "success")}
     for rate in RATES:

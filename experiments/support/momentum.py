@@ -34,7 +34,7 @@ def rotational_inertia(sim: Any) -> np.ndarray:
 
 
 class LinkStates(NamedTuple):
-    """State of all links, (num_worlds, links, ...) each."""
+    """Masses, poses and velocities of all links, (num_worlds, links, ...) each."""
 
     mass: np.ndarray  # (..., 1) [kg]
     inertia: np.ndarray  # (..., 3, 3) [kg m^2] about the link's COM, link axes

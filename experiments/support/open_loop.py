@@ -135,7 +135,7 @@ def plot_trace(path: Path, trace: Trace, conditions: str, hardware: float) -> No
 
 
 def plot_motors(axes: np.ndarray, time: np.ndarray, angle: np.ndarray, torque: np.ndarray) -> None:
-    """Plot the transversal motors of two left legs over time [s], (n,), onto two axes.
+    """Plot angles and torques of the transversal motors of two left legs over time [s], (n,), onto two axes.
 
     angle [rad], torque [N m]: of all motors, (n, 12).
     """

@@ -171,7 +171,7 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
 
 
 def soak_metrics(counters: SoakCounters, count: int, wall: float) -> dict:
-    """Return the metrics of a soak test by name.
+    """Return the totals and the speed of a soak test as metrics by name.
 
     count: policy steps of all worlds together; wall: time for them [s].
     """

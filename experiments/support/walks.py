@@ -26,7 +26,10 @@ def redirected_walks(env: Env, rng: np.random.Generator) -> VelocityLog:
 
 
 def sped_up_walks(env: Env) -> tuple[VelocityLog, np.ndarray]:
-    """Return a new log of walks whose command rises to a speed, and each robot's index in DIRECTIONS, (robots,)."""
+    """Return a new log of walks whose commanded velocity rises along one of DIRECTIONS, and these directions.
+
+    The directions are each robot's index in DIRECTIONS, (robots,).
+    """
     direction = np.arange(env.num_envs) % len(DIRECTIONS)
     commands = np.zeros((env.num_envs, 7, 3))
     for i, (axis, sign, highest) in enumerate(DIRECTIONS.values()):

@@ -31,7 +31,7 @@ class Flag(NamedTuple):
 
     @property
     def positional(self) -> bool:
-        """Whether the argument is positional, i.e. given as a value without the flag's name."""
+        """Whether the argument is positional: its value is given without the name."""
         return tyro.conf.Positional in self.marks
 
     @property

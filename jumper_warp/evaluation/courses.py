@@ -65,7 +65,7 @@ class CourseLog(EvaluationLog):
     spacing = 2.0
 
     def __post_init__(self) -> None:
-        """Allocate the log. Raises InputError: scripts are empty or of different lengths."""
+        """Allocate the log of all robots. Raises InputError: scripts are empty or of different lengths."""
         lengths = {len(script) for script in self.scripts}
         if len(lengths) != 1 or 0 in lengths:
             raise InputError(f"scripts must have equal, positive lengths, got {sorted(lengths)} commands")
@@ -308,7 +308,7 @@ def _row_max(values: np.ndarray) -> np.ndarray:
 
 
 def course_metrics(course: CourseLog) -> Metrics:
-    """Return the metrics of a course over all robots.
+    """Return rates of finished courses and falls, errors of jumps and tracking, and forces at handovers.
 
     `finished_rate` is the fraction of robots that finished every command without a fall; it ignores errors.
     `finished_on_goal_rate` also requires all jumps within 0.1 m of their goals. Tracking errors are those of slewed

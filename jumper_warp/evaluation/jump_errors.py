@@ -25,7 +25,10 @@ HUBER = 0.02  # [m] Threshold of the Huber weight: larger errors, as of robots t
 
 
 class JumpErrors(NamedTuple):
-    """Errors of a group of n jumps; m = n for apex heights, m = 2n for landing positions (all x, then all y, world)."""
+    """Errors of a group of n jumps in apex height or landing position, with derivatives.
+
+    m = n for apex heights, m = 2n for landing positions (all x, then all y, world).
+    """
 
     value: torch.Tensor  # (m,) [m] Errors, 0 where not valid
     jacobian: torch.Tensor  # (m, weights) [m] Derivatives with respect to the network's weights; empty if not requested

@@ -41,7 +41,10 @@ TERMINATIONS = (DIVERGED, "low_base", COLLIDED, "no_jump", SUCCESS)
 
 
 def with_jump_terminations(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the task with only TERMINATIONS, without those for training."""
+    """Return a copy of the task with the terminations of evaluated jumps, TERMINATIONS.
+
+    Terminations for training are left out.
+    """
     return with_terminations(task, TERMINATIONS)
 
 

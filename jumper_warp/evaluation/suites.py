@@ -171,7 +171,7 @@ class Consecutive(Suite):
         check(min(trials, jumps) >= 1, f"need at least one trial and one jump in it, got {trials}, {jumps}")
 
     def measure(self, run: EvaluationRun) -> Metrics:
-        """Run pairs and long rows, plot the paths of the bases, and return the metrics."""
+        """Run pairs and long sequences of jumps, plot the paths of the bases, and return the metrics."""
         rng = np.random.default_rng(self.stream_seed)
         pairs = np.repeat(np.array(list(PAIRS.values())), self.num_jumps, axis=0)
         rows = rng.uniform(ROW_LOWER, ROW_UPPER, (self.num_trials, self.jumps_per_trial, 2))
@@ -310,7 +310,7 @@ class Farthest(Suite):
         return distance[:, None, None] * np.array([math.cos(angle), math.sin(angle)])
 
     def measure(self, run: EvaluationRun) -> Metrics:
-        """Run bins of growing distance until success is below GIVEN_UP, plot them, and return the metrics."""
+        """Run jumps to ever farther goals until success is below GIVEN_UP, plot them, and return the metrics."""
         env, bins = run.env(self.num_jumps), {}
         for number in range(round((self.max_distance - self.min_distance) / BIN) + 1):
             middle = round(self.min_distance + number * BIN, 6)

@@ -71,7 +71,10 @@ def save_policy(
 
 
 def checked_folder(folder: Path) -> Path:
-    """Return the path of a policy's folder. Raises PolicyError: it has the suffix of a file."""
+    """Check the path of a policy's folder, and return it.
+
+    Raises PolicyError: it has the suffix of a file.
+    """
     folder = Path(folder)
     if folder.suffix.lower() in FILE_SUFFIXES:
         raise PolicyError(f"a policy is saved as a folder, whose name cannot end in {folder.suffix}: got {folder}")
@@ -151,7 +154,10 @@ def _check_version(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _read_verified(path: Path, digest: Any) -> bytes:
-    """Return a file's content. Raises PolicyError: it cannot be read, or its SHA-256 is not `digest`."""
+    """Read a policy's file, and verify its SHA-256.
+
+    Raises PolicyError: it cannot be read, or its SHA-256 is not `digest`.
+    """
     data = _read_bytes(path)
     if hashlib.sha256(data).hexdigest() != digest:
         raise PolicyError(f"{path}: truncated or altered, its SHA-256 is not the manifest's")
@@ -159,7 +165,10 @@ def _read_verified(path: Path, digest: Any) -> bytes:
 
 
 def _read_bytes(path: Path) -> bytes:
-    """Return a file's content. Raises PolicyError: it cannot be read, is not a regular file, or is too large."""
+    """Read a regular file of limited size.
+
+    Raises PolicyError: it cannot be read, is not a regular file, or is too large.
+    """
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):

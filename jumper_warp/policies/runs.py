@@ -92,8 +92,9 @@ class CheckpointContents:
 
     @classmethod
     def from_rsl_rl(cls, state: Any, config: Any) -> CheckpointContents:
-        """Return the contents of a loaded checkpoint of rsl-rl; config: `env`, as `Env.config`, and perhaps `train`.
+        """Read the policy data in a loaded checkpoint of rsl-rl.
 
+        config: `env`, as `Env.config`, and perhaps `train`.
         Raises TaskError: the task has another version. CheckpointError: a part is missing or of another type.
         """
         try:
@@ -119,7 +120,7 @@ class CheckpointContents:
 
     @classmethod
     def from_dict(cls, state: dict[str, Any]) -> CheckpointContents:
-        """Return the contents of a loaded checkpoint.
+        """Read the policy data in a loaded checkpoint of this package.
 
         Raises TaskError: its task has another version. CheckpointError: a part is missing or of another type.
         """
@@ -145,7 +146,10 @@ class CheckpointContents:
             raise CheckpointError(f"not a training checkpoint of this project ({reason})") from error
 
     def policy(self) -> Policy:
-        """Build the policy. Raises PolicyError: interface, layers and statistics contradict each other."""
+        """Build the policy from the checkpoint's data.
+
+        Raises PolicyError: interface, layers and statistics contradict each other.
+        """
         description = {**self.interface, "observation_limit": RAW_LIMIT, "normalised_limit": self.limit}
         network = {"hidden": self.hidden, "activation": self.activation}
         interface = make_interface(description, policy_dt=self.policy_dt, physics_dt=self.physics_dt, **network)

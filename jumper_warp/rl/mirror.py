@@ -93,8 +93,9 @@ def symmetry_of(env: VecEnv) -> Symmetry:
 
 
 def expand_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return the layers of a plain network of twice the hidden widths with the output of the symmetric actor.
+    """Convert a symmetric actor to a plain network of twice the hidden widths; return its layers.
 
+    Both have the same output.
     layers: those of f, with activations between. A symmetric policy is saved and exported in this form.
     """
     obs, action = symmetry.obs.matrix(), symmetry.action.matrix()

@@ -63,7 +63,7 @@ class Ppo:
     """PPO on one environment: `collect` fills the rollout, `update` optimises the networks, `iterate` does both."""
 
     def __init__(self, env: VecEnv, cfg: PpoCfg) -> None:
-        """Build networks and buffers on the environment's device; the weights follow torch's CPU seed.
+        """Build actor, critic and rollout buffers on the environment's device; weights follow torch's CPU seed.
 
         Raises InputError as `PpoCfg.batch_size`, and as `symmetry_of` if symmetry is requested.
         """
@@ -191,7 +191,7 @@ class Ppo:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the result of `state_dict`.
+        """Restore networks, optimiser, learning rate and episode counts from the result of `state_dict`.
 
         Raises InputError: a part is missing, unknown, of another shape or type, or not finite; nothing is changed.
         """

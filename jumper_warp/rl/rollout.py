@@ -106,7 +106,7 @@ def sample_action(
     scaling: Scaling,
     dtype: torch.dtype,
 ) -> None:
-    """Write observations, the policy's mean and a sampled action to `step`.
+    """Sample every world's action from the policy, and write it, its mean and the observations to `step`.
 
     obs, critic_obs: (num_envs, n) raw. step: `RolloutBuffer.at`; its action holds standard normal noise on entry.
     scaling: normalises obs. dtype: of the hidden layers.

@@ -175,7 +175,7 @@ class Shac:
         return take_averages(STATISTICS, self._sums, self._finished, self.lr, self.model.log_std)
 
     def _parts(self) -> dict[str, torch.Tensor]:
-        """Return all tensors of the state by dotted name, uncopied; missing optimiser states become zeros."""
+        """Return all tensors of the training state by dotted name, uncopied; missing optimiser states become zeros."""
         parts = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         parts |= {f"target.{name}": value for name, value in self.target.state_dict().items()}
         for name, optimiser in self.optimisers.items():
@@ -193,7 +193,10 @@ class Shac:
         return {"model": {name: value.clone() for name, value in self.model.state_dict().items()}, **rest}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the result of `state_dict`. Raises InputError: a part is missing, unknown or of another form."""
+        """Restore networks, optimisers and episode counts from the result of `state_dict`.
+
+        Raises InputError: a part is missing, unknown or of another form.
+        """
         flat = {f"model.{name}": value for name, value in state["model"].items()}
         flat |= {name: value for name, value in state.items() if name != "model"}
         parts = self._parts()
