@@ -230,8 +230,7 @@ def flight_metrics(flights: FlightLog) -> Metrics:
 def extension_delays(count: int, most: float, seed: int) -> np.ndarray:
     """Return random delays [s] with which front and left legs extend at takeoff, (count, 2).
 
-    They are vectors of length most / 2 to most [s].
-    A negative delay is one of the back or right legs.
+    They are vectors of length most / 2 to most [s]. A negative delay is one of the back or right legs.
     """
     rng = np.random.default_rng(seed)
     size, angle = rng.uniform(0.5 * most, most, count), rng.uniform(0.0, 2.0 * np.pi, count)

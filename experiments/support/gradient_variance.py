@@ -53,9 +53,9 @@ def gradient_stats(rows: torch.Tensor) -> GradientStats:
 def gradients(env: DifferentiableEnv, network: Network, horizon: int, std: float) -> tuple[torch.Tensor, torch.Tensor]:
     """Compute each world's policy gradient (worlds, weights), through the physics and by the score function.
 
-    It is the gradient of the sum of rewards in a window with respect to the network's weights.
-    The window of `horizon` policy steps starts at the present state; rewards of a world count until its episode ends.
-    std: of action noise [1]. The advantage of the score function is the remaining reward minus its mean over worlds.
+    It is the gradient of the sum of rewards in a window with respect to the network's weights. The window of `horizon`
+    policy steps starts at the present state; rewards of a world count until its episode ends. std: of action noise [1].
+    The advantage of the score function is the remaining reward minus its mean over worlds.
     """
     env.begin_window()
     tape, score_tape, scores, rewards = Tape(), Tape(), [], []

@@ -58,8 +58,8 @@ def squats(knots: Knots, count: int, rng: np.random.Generator, push: int = 32) -
 def run_ups(knots: Knots, count: int, rng: np.random.Generator, push: int = 40) -> np.ndarray:
     """Return random candidates of jumps with a run-up in place: actions [1], (count, len(knots)).
 
-    The robot leans back, falls forward, crouches, extends the hind legs, then the front legs.
-    Postures scatter around POSTURES, times are random; the hind legs push around step `push`; left and right are equal.
+    The robot leans back, falls forward, crouches, extends the hind legs, then the front legs. Postures scatter around
+    POSTURES, times are random; the hind legs push around step `push`; left and right are equal.
     """
     step, shape = np.array(knots.at)[None, :, None], (count, 1, 1)
     lean, fall, crouch = np.clip(POSTURES[:, None, None] + SCATTER * rng.normal(size=(3, count, 1, 4)), -1.0, 1.0)
@@ -75,8 +75,8 @@ def run_ups(knots: Knots, count: int, rng: np.random.Generator, push: int = 40) 
 def noisy_variants(solution: np.ndarray, knots: Knots, rng: np.random.Generator) -> np.ndarray:
     """Return 64 candidates around a solution of the optimisation, (64, len(knots)).
 
-    They are the solution (n,) plus noise of standard deviation 0 to 0.2.
-    The solution may be of a shorter motion; missing knots are 0 before the noise.
+    They are the solution (n,) plus noise of standard deviation 0 to 0.2. The solution may be of a shorter motion;
+    missing knots are 0 before the noise.
     """
     actions = np.zeros((len(knots.at), 4))
     actions[: len(solution) // 4] = solution.reshape(-1, 4)

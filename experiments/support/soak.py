@@ -144,9 +144,8 @@ def soak_simulation(sim: Simulation, args: SoakArgs) -> dict:
 def soak_env(env: Env, args: SoakArgs) -> dict:
     """Soak-test an environment under random actions, and return the metrics.
 
-    On a GPU, `args.hold_steps` steps are one graph.
-    Worlds that diverged are flagged. Raises RuntimeError: a coordinate, rate, reward or observation after the step (and
-    reset) is NaN or infinite.
+    On a GPU, `args.hold_steps` steps are one graph. Worlds that diverged are flagged. Raises RuntimeError: a
+    coordinate, rate, reward or observation after the step (and reset) is NaN or infinite.
     """
     env.reset()
     diverged = [term.name for term in env.task.terminations].index("diverged")

@@ -42,9 +42,8 @@ AIM_ROUNDS = 3  # Maximum number of corrections of the aim
 def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] = ()) -> list[JumpGroup]:
     """Build the groups of simulated jumps for fine-tuning: `nominal`, `late` (with latency), `randomized`.
 
-    Empty groups are left out.
-    Goals are evenly spaced over the range in `cfg`. modules: the user's task modules. Raises InputError: the policy
-    does not jump.
+    Empty groups are left out. Goals are evenly spaced over the range in `cfg`. modules: the user's task modules. Raises
+    InputError: the policy does not jump.
     """
     rng, groups = np.random.default_rng(purpose_seed("tuning", cfg.seed)), []
 

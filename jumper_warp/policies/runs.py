@@ -210,8 +210,7 @@ def learning_curve(source: Path) -> bytes | None:
 def thinned_curve(metrics: bytes) -> bytes:
     """Reduce a metrics file to a short learning curve: columns CURVE, at most CURVE_ROWS lines of JSON.
 
-    The lines are evenly spaced.
-    The first and the last line are included, malformed lines are omitted.
+    The lines are evenly spaced. The first and the last line are included, malformed lines are omitted.
     """
     rows = [row for line in metrics.splitlines() if (row := _curve_row(line))]
     last = len(rows) - 1

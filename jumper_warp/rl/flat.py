@@ -140,8 +140,8 @@ class FlatAdam:
 def adapted_lr(lr: torch.Tensor, kl: torch.Tensor, cfg: PpoCfg, desired_kl: torch.Tensor | float) -> torch.Tensor:
     """Adapt the learning rate () to the KL divergence of the policy update.
 
-    It is divided by 1.5 if kl > 2 desired_kl, and multiplied by 1.5 if kl < desired_kl / 2.
-    It stays within cfg.min_lr and cfg.max_lr, and is fixed if cfg.desired_kl is 0.
+    It is divided by 1.5 if kl > 2 desired_kl, and multiplied by 1.5 if kl < desired_kl / 2. It stays within cfg.min_lr
+    and cfg.max_lr, and is fixed if cfg.desired_kl is 0.
     """
     if cfg.desired_kl <= 0.0:
         return lr

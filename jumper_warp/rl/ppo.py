@@ -236,9 +236,9 @@ def critic_gradient(
 ) -> torch.Tensor:
     """Compute the gradient of PPO's value loss with respect to the critic's parameters.
 
-    Writes the gradient of the weighted loss to `out`, and returns the value loss () before weighting.
-    The loss is the squared error; with `clip_value` the maximum of this and of the squared error of a value clipped to
-    within `clip` of the rollout's value.
+    Writes the gradient of the weighted loss to `out`, and returns the value loss () before weighting. The loss is the
+    squared error; with `clip_value` the maximum of this and of the squared error of a value clipped to within `clip` of
+    the rollout's value.
 
     rows: (batch, columns of `layout`); out: the critic's slice of the flat gradient.
     """
@@ -262,9 +262,8 @@ def actor_gradient(
 ) -> ActorLosses:  # fmt: skip
     """Compute the gradient of PPO's surrogate loss and entropy bonus with respect to actor and noise.
 
-    Writes it to `out`, and returns the losses.
-    The clipped surrogate of Schulman et al. 2017, eq. 7, as a loss: -E[min(r A, clip(r) A)] with r = π(a) / π_old(a).
-    Where r A is the smaller, ∂/∂log π = -r A / batch, else 0.
+    Writes it to `out`, and returns the losses. The clipped surrogate of Schulman et al. 2017, eq. 7, as a loss:
+    -E[min(r A, clip(r) A)] with r = π(a) / π_old(a). Where r A is the smaller, ∂/∂log π = -r A / batch, else 0.
 
     rows: (batch, columns of `layout`); entropy_coef: (); out: the slice of actor and noise of the flat gradient.
     """

@@ -90,8 +90,8 @@ class Composition:
 def compose(recording: Recording, rank: int = 0) -> Composition:
     """Choose the times of a recording at which a composite picture shows the robot of the rank-th world.
 
-    A robot in place is drawn spread to the right.
-    Frames after `valid_frames` are ignored. Raises InputError: no frame remains.
+    A robot in place is drawn spread to the right. Frames after `valid_frames` are ignored. Raises InputError: no frame
+    remains.
     """
     count = valid_frames(recording, rank)
     if count == 0:
