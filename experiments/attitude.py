@@ -31,7 +31,7 @@ SUMMARY = ("settled_without_collision_rate", *HARDWARE, "any_axis_settling_time_
 
 @dataclass(frozen=True)
 class Args(EvaluationArgs, AttitudeFlags):
-    """Flags of the script; `num_turns` turns about body axes, and as many about random axes."""
+    """Flags of the test of turns: `num_turns` turns about body axes, and as many about random axes."""
 
     policy: str = "attitude"
     keep_momentum: bool = True  # Conserve the momentum of free flight exactly, regardless of the training's setting

@@ -23,7 +23,7 @@ from support.timing import median_time
 
 @dataclass(frozen=True)
 class Args(DeviceArgs):
-    """Flags of the script."""
+    """Flags of the benchmark of inverse kinematics."""
 
     poses: int = 65536  # Robots per launch, four legs each
     repeats: int = 5  # Number of timed launches; the median is reported
@@ -33,7 +33,10 @@ class Args(DeviceArgs):
 
 
 def main(args: Args) -> dict:
-    """Run the benchmark, write and return its metrics. Raises RuntimeError: a reachable target is not reached."""
+    """Time the inverse kinematics of many robots, write and return the metrics.
+
+    Raises RuntimeError: a reachable target is not reached.
+    """
     info, device, n = configure_device(args.device), wp.get_device(args.device), args.poses
     folder = output_dir("benchmark_ik", args.out)
     description, rng = load_description(), np.random.default_rng(args.seed)

@@ -28,7 +28,7 @@ from support.timing import baseline_ratios
 
 @dataclass(frozen=True)
 class Args(DeviceArgs):
-    """Flags of the script."""
+    """Flags of the benchmark of the physics solvers."""
 
     envs: list[int] = field(default_factory=lambda: [64])  # Numbers of environments, one run for each
     solvers: list[SolverName] = field(default_factory=lambda: ["jumper", "mujoco"])
@@ -43,7 +43,10 @@ class Args(DeviceArgs):
 
 
 def main(args: Args) -> dict:
-    """Run the benchmark, write and return its metrics. Raises InputError: threads compared on a GPU."""
+    """Time the simulation of robots by both solvers, write and return the metrics.
+
+    Raises InputError: threads compared on a GPU.
+    """
     values: dict = {"device": configure_device(args.device, args.threads[-1] if args.threads else None).name}
     if args.threads and wp.get_device(args.device).is_cuda:
         raise InputError("threads are compared on a CPU; add --device cpu")

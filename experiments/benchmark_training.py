@@ -29,7 +29,7 @@ from support.variants import VARIANTS, variant
 
 @dataclass(frozen=True)
 class Args(ThreadArgs):
-    """Flags of the script."""
+    """Flags of the benchmark of training."""
 
     envs: tuple[int, ...] | None = None
     """Numbers of environments for solver and environment (default: 4096 8192 16384 on a GPU, 64 on a CPU)."""
@@ -52,7 +52,7 @@ class Args(ThreadArgs):
             variant(PpoCfg(), name)
 
     def names(self) -> tuple[str, ...]:
-        """Return the names of the variants to time."""
+        """Return the names of the trainer's variants to time."""
         return tuple(VARIANTS) if self.variants == ("all",) else self.variants
 
 

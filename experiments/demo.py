@@ -31,7 +31,7 @@ SUMMARY = (
 
 @dataclass(frozen=True)
 class Args(DeviceArgs):
-    """Flags of the script."""
+    """Flags of the demonstration of jumps."""
 
     num_jumps: int = 200  # Number of vertical and of horizontal jumps
     goal: float = 1.3  # [m] Distance of the filmed jump
@@ -52,7 +52,7 @@ def film_jump(args: Args, folder: Path) -> LandingLog:
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Run all parts, print one summary, and return the metrics."""
+    """Simulate open-loop jump, paper's tests and filmed jump, print one summary, and return the metrics."""
     folder, values = prepare("demo", args), {}
     announce("open-loop jump; the first run compiles kernels for up to a minute")
     (folder / "open_loop").mkdir(exist_ok=True)

@@ -31,7 +31,7 @@ from support.scripts import ThreadArgs, announce, prepare, report, run_script, t
 
 @dataclass(frozen=True)
 class Args(ThreadArgs):
-    """Flags of the script."""
+    """Flags of the trainings without one departure from the paper each."""
 
     task: JumpTask = "vertical-jump"  # Task whose departures are undone
     only: tuple[str, ...] = ()  # Names of the departures to undo, or kept for none (default: all)
@@ -73,7 +73,7 @@ class Args(ThreadArgs):
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Train and evaluate each ablation, write the table and the plot, and return the metrics."""
+    """Train and evaluate each ablation of a jump task, write the table and the plot, and return the metrics."""
     for name, seed, ablation in args.trainings():  # refuse wrong flags before the first training
         parse(ablation, args.command(ablation, seed, Path(name)))
     folder, results = prepare("departures", args, args.threads), {}

@@ -34,7 +34,7 @@ UNITS = {  # by quantity of `support.agreement`
 
 @dataclass(frozen=True)
 class Args(OutputArgs):
-    """Flags of the script."""
+    """Flags of the comparison of dynamics with Pinocchio."""
 
     robot: Path | None = None  # Robot overlay (docs/robot_overlays.md; default: the robot as described)
     states: int = 200  # Number of random states
@@ -46,8 +46,9 @@ class Args(OutputArgs):
 
 
 def differences(ours: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
-    """Return two maxima over states: difference, and difference over the state's largest value.
+    """Compare arrays of one quantity: return the largest difference over all states, absolute and relative.
 
+    A relative difference is the difference over the state's largest value.
     ours, expected: (states, ...) values of one quantity in its unit.
     """
     size, difference = (np.abs(rows.reshape(len(rows), -1)).max(axis=1) for rows in (expected, ours - expected))
@@ -55,7 +56,7 @@ def differences(ours: np.ndarray, expected: np.ndarray) -> tuple[float, float]:
 
 
 def main(args: Args) -> dict:
-    """Compare all quantities, and return the metrics."""
+    """Compare accelerations, paw positions and paw Jacobians with Pinocchio, and return the metrics."""
     configure_device("cpu")
     folder = output_dir("dynamics_agreement", args.out)
     values = RobotValues.nominal(1) if args.robot is None else load_overlay(args.robot).robots()

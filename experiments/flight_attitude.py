@@ -31,7 +31,7 @@ SUMMARY = (
 
 @dataclass(frozen=True)
 class Args(EvaluationArgs):
-    """Flags."""
+    """Flags of the comparison of flights with and without turning."""
 
     policy: str = "attitude"  # Name or folder of the policy that turns, a run's folder, or a checkpoint
     landing_policy: str = ""
@@ -56,7 +56,7 @@ class Args(EvaluationArgs):
 
 
 def main(args: Args) -> dict:
-    """Run the same flights with and without turning, plot them, and return the metrics."""
+    """Simulate the same flights with and without turning, plot tilts and heights, and return the metrics."""
     run = FlightRun(args, args.landing_policy, args.jump_task)
     env, heights = run.env(args.num_flights), np.linspace(*args.height_range, args.num_flights)
     max_delay = 1.0e-3 * args.max_leg_delay

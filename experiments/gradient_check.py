@@ -25,7 +25,7 @@ ASCENT_CHANGE = 0.05  # [rad] Largest change of a target in a step of the ascent
 
 @dataclass
 class Ascent:
-    """Result of the gradient ascent."""
+    """Result of the gradient ascent on a jump's apex."""
 
     apex: list[float]  # [m] Apex height before each step and after the last
     before: np.ndarray  # [rad] (TICKS, 12) Motor targets before the first step
@@ -71,7 +71,7 @@ def plot_gradients(jump: Trajectory, actions: GradientPair, ascent: Ascent, path
 
 
 def main(args: DeviceArgs) -> dict:
-    """Check the gradients, run the ascent, plot both, and return the metrics."""
+    """Check the gradients of a jump's apex, raise the apex by them, plot both, and return the metrics."""
     folder = prepare("gradient_check", args)
     jump, checks = check(args.device)
     ascent = ascend(args.device)

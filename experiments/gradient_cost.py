@@ -28,7 +28,7 @@ from support.timing import device_memory, wall_time
 
 @dataclass(frozen=True)
 class Args(DeviceArgs):
-    """Flags of the script."""
+    """Flags of the timing of a jump's gradient."""
 
     num_envs: int | None = None  # Number of environments (default: 64 on a CPU, 4096 on a GPU)
     repeats: int = 7
@@ -41,7 +41,7 @@ class Args(DeviceArgs):
 
 
 def main(args: Args) -> dict:
-    """Time simulation, rollout and gradient, compare the gradient with double precision, and return the metrics."""
+    """Time a jump's simulation and gradient, compare the gradient with double precision, return the metrics."""
     name, device = configure_device(args.device, 1).name, wp.get_device(args.device)
     folder = output_dir("gradient_cost", args.out)
     worlds = args.num_envs or (4096 if device.is_cuda else 64)

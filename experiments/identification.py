@@ -39,7 +39,7 @@ Part = Literal["same", "fine", "rough", "mujoco", "methods", "policy"]
 
 @dataclass(frozen=True)
 class Args(OutputArgs):
-    """Flags of the script."""
+    """Flags of the test of identification on known robots."""
 
     num_matched: int = 20  # Number of robots that are identified with the simulator that recorded them
     num_mismatched: int = 1
@@ -58,7 +58,10 @@ class Args(OutputArgs):
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Run the parts of the experiment on the CPU, write and return their metrics."""
+    """Identify known robots, and test the predictions, in all chosen parts; write and return the metrics.
+
+    The computation is on the CPU.
+    """
     configure_device("cpu", args.threads)
     folder, parameters = output_dir("identification", args.out), jumper_parameters()
     replay = MotionReplay(device="cpu", threads=args.threads)

@@ -33,7 +33,7 @@ TASK = "vertical-jump"
 
 @dataclass(frozen=True)
 class Args(DeviceArgs):
-    """Flags of the script."""
+    """Flags of the measurement of learning curves."""
 
     seconds: float = 60.0  # [s] Time of each training, its evaluations not counted
     eval_interval: float = 2.0  # [s] Training time between two evaluations

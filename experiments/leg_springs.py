@@ -28,7 +28,7 @@ SUMMARY = ("apex_without_springs_m", "highest_apex_height_m", "highest_stiffness
 
 @dataclass(frozen=True)
 class Args(DeviceArgs):
-    """Flags of the script."""
+    """Flags of the jumps with springs between the knees."""
 
     stiffness: tuple[float, ...] = (0.0, 125.0, 250.0, 375.0, 500.0, 625.0, 750.0, 875.0, 1000.0, 1250.0, 1500.0)
     """[N/m] Stiffnesses of the springs to try; 0: no springs."""
@@ -48,7 +48,7 @@ class Args(DeviceArgs):
             with_springs(stiffness, self.rest_length)
 
     def jumps(self, name: str) -> SpringJumps:
-        """Return the jumps with these flags and the command filter `name`, a key of FILTERS."""
+        """Return the spring jumps with these flags and the command filter `name`, a key of FILTERS."""
         motors = jumping_motors(self.torque_limit)
         motors = replace(motors, transversal=replace(motors.transversal, kp=self.kp))
         return SpringJumps(motors, name, self.gravity, self.rest_length, self.device)

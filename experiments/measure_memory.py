@@ -28,7 +28,7 @@ from support.scripts import OutputArgs, report, run_script
 
 @dataclass(frozen=True)
 class Args(OutputArgs):
-    """Flags of the script."""
+    """Flags of the measurement of a training's memory."""
 
     solver: SolverName = "jumper"  # Physics solver
     task: str = "vertical-jump"  # Name of the task
@@ -53,7 +53,10 @@ def measure(args: Args) -> dict[str, float]:
 
 
 def main(args: Args) -> dict[str, float]:
-    """Return `building_` and `standing_bytes_per_world` [byte]; for a single number of worlds, those of `measure`."""
+    """Measure the memory of each world of a training [byte], and return it as metrics.
+
+    Keys: `building_` and `standing_bytes_per_world`; for a single number of worlds, those of `measure`.
+    """
     configure_device("cpu")
     if len(args.envs) == 1:
         values = measure(args)

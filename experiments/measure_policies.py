@@ -36,7 +36,7 @@ PROGRESS = ("success_rate", "settled_without_collision_rate", "fall_rate")  # Me
 
 @dataclass(frozen=True)
 class Args(ThreadArgs):
-    """Flags of the script."""
+    """Flags of the measurement of the shipped policies."""
 
     out: Path = Path("outputs/policies")  # Folder of all rows
     policies: tuple[str, ...] = tuple(policy_tasks())  # Names of the policies
@@ -55,12 +55,15 @@ class Args(ThreadArgs):
             raise InputError(f"need a seed and at least 16 trials, got {self.seeds} and {self.trials}")
 
     def row(self, policy: str, condition: str, seed: int) -> Path:
-        """Return the folder of a row."""
+        """Return the folder with the results of a policy in one condition with one seed (a row)."""
         return self.out / policy / f"{condition}-{seed}"
 
 
 def missing_rows(args: Args) -> list[tuple[str, str, int]]:
-    """Return policy, condition and seed of the rows without a metrics.json, where the condition is defined."""
+    """Return the evaluations that are still to be done: policy, condition and seed.
+
+    These have no metrics.json, and the condition is defined for the policy.
+    """
     tasks = tasks_of(args.policies)
     return [
         (policy, condition, seed)
@@ -73,7 +76,7 @@ def missing_rows(args: Args) -> list[tuple[str, str, int]]:
 
 
 def measure_row(args: Args, policy: str, condition: str, seed: int) -> dict[str, Any]:
-    """Evaluate a policy in a condition, write the row's metrics.json, and return conditions and metrics by name."""
+    """Evaluate a policy in one condition, write its metrics.json, and return conditions and metrics by name."""
     run, folder, values = EvaluationRun(policy), args.row(policy, condition, seed), dict(CONDITIONS[condition].values)
     if payload := values.pop("payload", None):
         run.settings["payload_kg"], values["robot"] = payload, folder / "payload.json"
@@ -87,7 +90,10 @@ def measure_row(args: Args, policy: str, condition: str, seed: int) -> dict[str,
 
 
 def main(args: Args) -> int:
-    """Measure the missing rows, or write tables and policies' files from existing ones; return the number of rows."""
+    """Evaluate policies in missing conditions, or write tables and policies' files from existing results.
+
+    Returns the number of evaluations (rows).
+    """
     if args.write_tables is None and not args.save_to_policies:
         return measure(args)
     rows, tasks = read_rows(args.out, args.policies), tasks_of(args.policies)
@@ -101,7 +107,7 @@ def main(args: Args) -> int:
 
 
 def measure(args: Args) -> int:
-    """Measure the missing rows, print the progress, and return their number."""
+    """Evaluate policies in all missing conditions, print the progress, and return the number of evaluations."""
     rows, started = missing_rows(args), time.perf_counter()
     for number, row in enumerate(rows, 1):
         values = measure_row(args, *row)

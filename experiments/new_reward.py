@@ -24,7 +24,10 @@ from support.scripts import DeviceArgs, report, run_script
 
 @wp.func
 def even_load(robot: mdp.RobotView, state: mdp.JumpState, spread: float) -> float:  # pyright: ignore[reportGeneralTypeIssues]
-    """Even load [0..1]: exp(-norm(paw forces - their mean) / spread); 0 in flight. spread: [N]."""
+    """Reward for an even load of the paws on the ground, 0 to 1, and 0 in flight.
+
+    It is exp(-norm(paw forces - their mean) / spread); spread: [N].
+    """
     if state.phase == mdp.FLIGHT:
         return 0.0
     force = robot.paw_force
@@ -37,13 +40,13 @@ TASK = replace(TASK, rewards=(*TASK.rewards, mdp.RewardTerm(even_load, weight=5.
 
 
 def make_env(num_envs: int, seed: int, device: torch.device) -> Env:
-    """Return an environment with the new term; argument of `train`."""
+    """Return a training environment with the reward term for an even load; argument of `train`."""
     return Env(TASK, num_envs, seed=seed, device=str(device))
 
 
 @dataclass(frozen=True)
 class Args(DeviceArgs):
-    """Flags of the script."""
+    """Flags of the training with a new reward term."""
 
     num_envs: int = 256  # Number of environments
     iterations: int = 5  # Training iterations

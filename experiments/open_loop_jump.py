@@ -33,7 +33,7 @@ SUMMARY = ("apex_height_m", "takeoff_speed_m_s", "squat_height_m", "peak_torque_
 
 @dataclass(frozen=True)
 class Args(DeviceArgs):
-    """Flags of the script."""
+    """Flags of the open-loop jump."""
 
     solver: Literal["jumper", "mujoco"] = "jumper"  # Physics: the dedicated solver, or Newton's SolverMuJoCo
     torque_limit: float = 18.0  # [N m] Torque saturation of the motors; lateral motors give 18 at most
@@ -51,7 +51,7 @@ class Args(DeviceArgs):
 
 
 def measure(args: Args, folder: Path) -> tuple[dict[str, Any], str]:
-    """Simulate the jump, write its plots and recording into a folder, and return the metrics and a title."""
+    """Simulate the open-loop jump, write its plots and recording into a folder, return metrics and a title."""
     variant = {"solver": args.solver, "gravity_m_s2": args.gravity, "torque_limit_nm": args.torque_limit,
                "kp_nm_rad": args.kp, "loose_filter": args.loose, "squat_command_deg": args.squat_angle}  # fmt: skip
     robot = None if args.robot is None else load_overlay(args.robot)
@@ -81,7 +81,7 @@ def measure(args: Args, folder: Path) -> tuple[dict[str, Any], str]:
 
 
 def main(args: Args) -> dict:
-    """Simulate the jump, write and print results, and return the metrics."""
+    """Simulate the open-loop jump, write and print results, and return the metrics."""
     folder = prepare("open_loop_jump", args)
     values, title = measure(args, folder)
     known = values["hardware_apex_height_m"]

@@ -24,7 +24,7 @@ from support.scripts import report, run_script
 
 @dataclass(frozen=True)
 class Args(EvaluationArgs):
-    """Flags of the script."""
+    """Flags of the paper's tests of jumps."""
 
     policy: tyro.conf.Suppress[str] = ""
     policies: tuple[str, ...] = ("vertical_jump", "horizontal_jump")
@@ -32,7 +32,10 @@ class Args(EvaluationArgs):
 
 
 def main(args: Args) -> dict:
-    """Run all suites, print and return the metrics with a value in the paper, `<policy>_<suite>_<key>`."""
+    """Run all test suites of the policies' tasks, print and return the metrics with a value in the paper.
+
+    Keys: `<policy>_<suite>_<key>`.
+    """
     folder, paper = output_dir("paper_tests", args.out), {}
     metrics: Metrics = {}
     for policy in args.policies:

@@ -46,7 +46,7 @@ TILE_WIDTH, FILM_SIZE, ANIMATION_SIZE = 800, (854, 480), (560, 316)  # [px]
 
 @dataclass(frozen=True)
 class Shot:
-    """Task of a policy in its picture."""
+    """Motion that a policy performs in its picture: flags of `jumper play`, title and ground."""
 
     flags: PlayFlags
     title: str
@@ -54,17 +54,17 @@ class Shot:
 
 
 def heights(*values: float) -> HeightPlayFlags:
-    """Return jumps to heights [m]."""
+    """Return flags of a recording of jumps to heights [m]."""
     return HeightPlayFlags(values, 6.0)
 
 
 def goal(ahead: float, left: float = 0.0) -> LandingPlayFlags:
-    """Return a jump to a place [m]."""
+    """Return flags of a recording of one jump to a landing position [m]."""
     return LandingPlayFlags(goal=((ahead, left),))
 
 
 def walk(ahead: float) -> VelocityPlayFlags:
-    """Return a straight walk of 6 s at a velocity [m/s]."""
+    """Return flags of a recording of a straight walk of 6 s at a velocity [m/s]."""
     return VelocityPlayFlags(velocity=((ahead, 0.0, 0.0),), command_interval=6.0)
 
 
@@ -90,7 +90,7 @@ SHOTS = {
 
 @dataclass(frozen=True)
 class Args(ThreadArgs):
-    """Flags of the script."""
+    """Flags of the drawing of policies."""
 
     policies: tuple[str, ...] = (*SHOTS, COURSE)  # Names of the policies to draw
     films: bool = True  # Also make films
@@ -104,7 +104,7 @@ class Args(ThreadArgs):
 
 
 def record(name: str) -> Recording:
-    """Return a recording of one episode of a policy's shot, or of the course."""
+    """Simulate and record one episode of a policy's motion for its picture, or of the course of three policies."""
     if name == COURSE:
         run, log = SkillRun(), CourseLog([read_script(SCRIPT)])
         env, ground = run.env(1), "plane"
@@ -119,7 +119,7 @@ def record(name: str) -> Recording:
 
 
 def main(args: Args) -> dict:
-    """Draw all pictures and films, and return their sizes by name."""
+    """Draw the pictures and films of all policies, and return their sizes by name."""
     folder = prepare("policy_pictures", args, args.threads)
     sizes = {}
     for name in tracked(args.policies, "drawing policies"):

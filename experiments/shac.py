@@ -37,7 +37,7 @@ TASK = "vertical-jump"
 
 @dataclass(frozen=True)
 class Args(DeviceArgs):
-    """Flags of the script."""
+    """Flags of the comparison of SHAC and PPO."""
 
     seconds: float = 120.0  # [s] Time of each training, its evaluations not counted; 0: none
     eval_interval: float = 5.0  # [s] Training time between two evaluations
@@ -80,7 +80,7 @@ def train(args: Args, algorithm: str, seed: int) -> LearningCurve:
 
 
 def compare(args: Args, folder: Path) -> dict[str, Any]:
-    """Train with every trainer and seed, plot the learning curves into `folder`, and return the metrics."""
+    """Train with SHAC and PPO for every seed, plot the learning curves into `folder`, return the metrics."""
     values, curves = {}, {trainer: [] for trainer in args.trainers}
     for trainer, seed in tracked([*itertools.product(args.trainers, args.seeds)], "trainings"):
         curves[trainer].append(train(args, trainer, seed))
@@ -92,7 +92,7 @@ def compare(args: Args, folder: Path) -> dict[str, Any]:
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Measure gradient noise, train, plot both, and return the metrics."""
+    """Measure the noise of policy gradients, train with SHAC and PPO, plot both, and return the metrics."""
     folder = prepare("shac", args)
     values: dict[str, Any] = {"envs": args.num_envs, "window": args.window, "worlds": args.num_gradient_envs}
     stats = measure_stats(lambda: make_env(args, args.num_gradient_envs), args.horizons)

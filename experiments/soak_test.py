@@ -22,7 +22,7 @@ from support.soak import SoakArgs, hardest, soak_env, soak_simulation
 
 
 def main(args: SoakArgs) -> dict:
-    """Run the soak test and return its metrics."""
+    """Run a simulation or an environment under random actions for a long time, and return the metrics."""
     folder = prepare("soak_test", args, args.threads)
     torch.manual_seed(args.seed)
     if args.task is None:

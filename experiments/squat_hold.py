@@ -24,7 +24,7 @@ from support.squats import SquatLog, squat_goals, squat_metrics
 
 @dataclass(frozen=True)
 class Args(EvaluationArgs):
-    """Flags."""
+    """Flags of the test of held squats."""
 
     policy: str = "vertical_jump"  # Name or folder of a policy that jumps, a run's folder, or a checkpoint
     num_squats: int = 100  # Number of robots
@@ -61,7 +61,7 @@ def plot_squats(run: EvaluationRun, squats: SquatLog) -> None:
 
 
 def main(args: Args) -> dict:
-    """Run the squats, plot them unless all robots fall, and return the metrics."""
+    """Simulate the held squats, plot them unless all robots fall, and return the metrics."""
     run = EvaluationRun.from_args("squat_hold", args, (*HEIGHTS, *PLACES))
     env = run.env(args.num_squats)
     up = run.task.evaluation_suite in HEIGHTS

@@ -39,7 +39,7 @@ ALL_JUMPS = JUMPS | LIMITED  # By name
 
 @dataclass(frozen=True)
 class Args(ThreadArgs):
-    """Flags of the script."""
+    """Flags of the optimisation of jumps."""
 
     jumps: tuple[str, ...] = tuple(JUMPS)  # Names of the jumps to optimise
     samples: int | None = None  # Random candidates (default: those of each jump)

@@ -41,7 +41,7 @@ PROBABILITIES = (0.35, 0.2, 0.15, 0.15, 0.15)  # Probabilities of walking, turni
 
 @dataclass(frozen=True)
 class Args(EvaluationArgs):
-    """Flags of the script."""
+    """Flags of the test of walking and jumping in turns."""
 
     policy: str = "walking_flat"  # Policy that walks: name or folder, a run's folder, or a checkpoint
     jump_up: str = "vertical_jump"  # Policy that jumps to heights
@@ -69,7 +69,7 @@ def paper_script(rng: np.random.Generator) -> list[ScriptStep]:
 
 
 def random_script(rng: np.random.Generator, blocks: bool = True) -> list[ScriptStep]:
-    """Return COMMANDS commands in random order: one jump of each kind, the others random.
+    """Return a script of COMMANDS random walks, turns and jumps, with at least one jump of each kind.
 
     blocks: False to replace jumps onto a block by jumps to a position.
     """
@@ -91,13 +91,13 @@ def random_script(rng: np.random.Generator, blocks: bool = True) -> list[ScriptS
 
 
 def scripts(args: Args) -> list[list[ScriptStep]]:
-    """Return one script per robot."""
+    """Return one script of walks and jumps per robot."""
     rng, blocks = np.random.default_rng(args.stream_seed), args.blocks and args.solver == "jumper"
     return [random_script(rng, blocks) if args.course else paper_script(rng) for _ in range(args.num_robots)]
 
 
 def main(args: Args) -> dict:
-    """Run the test, plot the course of robot 0, and return the metrics."""
+    """Simulate robots that walk and jump by scripts, plot the course of robot 0, and return the metrics."""
     name = "course" if args.course else "walk_jump_walk"
     run = SkillRun.from_args(name, args, SkillNames(args.policy, args.jump_up, args.jump_to))
     course = CourseLog(scripts(args), random_headings(args.num_robots, args.stream_seed))

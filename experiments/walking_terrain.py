@@ -29,7 +29,7 @@ SECONDS = 10.0  # [s] Time of each walk
 
 @dataclass(frozen=True)
 class Args(EvaluationArgs):
-    """Flags of the script."""
+    """Flags of the test of walking on terrains."""
 
     policy: str = "walking_rough"
     num_robots: int = 500  # Robots on each terrain

@@ -47,7 +47,7 @@ SUMMARY = (*PAPER, "fall_rate", "settling_time_median_s", "top_ahead_m_s", "kick
 
 @dataclass(frozen=True)
 class Args(EvaluationArgs):
-    """Flags of the script."""
+    """Flags of the tests of walking by commanded velocities."""
 
     policy: str = "walking_flat"
     commands_per_axis: int = 13
@@ -85,7 +85,7 @@ def plot_tracking(run: EvaluationRun, walks: VelocityLog, settling: np.ndarray) 
 
 
 def main(args: Args) -> dict:
-    """Run all tests, plot tracking and settling times, and return the metrics."""
+    """Run all tests of walking, plot tracking and settling times, and return the metrics."""
     run, rng = EvaluationRun.from_args("walking_tracking", args, ("velocity",)), np.random.default_rng(args.stream_seed)
     flags = VelocityFlags(args.commands_per_axis, (REACH, REACH, REACH))
     log = flags.log(run.task, args.stream_seed)

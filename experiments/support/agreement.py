@@ -26,7 +26,7 @@ Quantities = dict[str, np.ndarray]  # Keys: those of `UNITS` in `experiments/dyn
 
 
 def random_states(n: int, seed: int) -> States:
-    """Return n random states by name.
+    """Return n random states of the robot in flight by name.
 
     quat (n, 4), xyzw, com_vel (n, 3) [m/s], ang_vel (n, 3) [rad/s] of the base, world axes; angles [rad], rates
     [rad/s], torque [N m] of the motors, (n, 12).
@@ -41,7 +41,10 @@ def random_states(n: int, seed: int) -> States:
 
 
 def jumper_quantities(values: RobotValues, states: States) -> Quantities:
-    """Return all quantities of states by this project's dynamics, with the first robot of `values`."""
+    """Compute accelerations, paw positions and Jacobians in given states by this project's dynamics.
+
+    These are the quantities of the module, of the first robot of `values`.
+    """
     n = len(states["angles"])
     model = build_model(n, ground=None, visuals=False, device="cpu")
     write_model(model, values)
@@ -54,7 +57,7 @@ def jumper_quantities(values: RobotValues, states: States) -> Quantities:
     force[:, MOTOR_DOFS] = states["torque"]
 
     def array(rows: np.ndarray) -> wp.array:
-        """Return rows as a flat Warp array in double precision."""
+        """Convert a matrix to a flat Warp array in double precision."""
         return wp.array(rows.ravel(), dtype=wp.float64, device="cpu")
 
     def base_velocity(q: np.ndarray, qd: np.ndarray) -> tuple[Rotation, np.ndarray, np.ndarray]:
@@ -77,8 +80,9 @@ def jumper_quantities(values: RobotValues, states: States) -> Quantities:
 
 
 def jumper_paws(dynamics: JumperDynamics, q: np.ndarray) -> Quantities:
-    """Return `paw_position` (n, 4, 3) [m] and `paw_jacobian` (n, 4, 3, 3) [m/rad], with the base level at the origin.
+    """Compute the paws' positions and their Jacobians by this project's dynamics, base level at the origin.
 
+    Keys: `paw_position` (n, 4, 3) [m] and `paw_jacobian` (n, 4, 3, 3) [m/rad].
     q: joint coordinates (n, 43), whose base orientation is overwritten.
     """
     n, model = len(q), dynamics.model
@@ -101,7 +105,10 @@ def jumper_paws(dynamics: JumperDynamics, q: np.ndarray) -> Quantities:
 
 
 def pinocchio_quantities(values: RobotValues, states: States) -> Quantities:
-    """Return all quantities of states by Pinocchio, with the first robot of `values`."""
+    """Compute accelerations, paw positions and Jacobians in given states by Pinocchio.
+
+    These are the quantities of the module, of the first robot of `values`.
+    """
     robot, rows = build_pinocchio(values=values), []
     for quat, com_vel, ang_vel, angles, rates, torque in zip(*states.values(), strict=True):
         turn = Rotation.from_quat(quat)

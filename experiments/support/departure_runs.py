@@ -1,4 +1,4 @@
-"""Trainings of ablations (`support.departures`), evaluation of their policies, and the report."""
+"""Trainings of ablations (tasks with one departure from the paper undone), their evaluation, and the report."""
 
 from __future__ import annotations
 
@@ -65,7 +65,7 @@ JUMP_TASKS: dict[JumpTask, DepartureCfg] = {
 
 
 def parse(ablation: Ablation, arguments: list[str]) -> tuple[Any, TaskCfg]:
-    """Return the settings parsed from the arguments of `jumper train`, and its task with the ablation."""
+    """Parse the arguments of `jumper train`: return the settings, and the task with an ablation."""
     parsed, task = parse_train(arguments)
     return parsed, task if isinstance(ablation, str) else ablation(task)
 
@@ -90,7 +90,7 @@ def train_or_load(ablation: Ablation, arguments: list[str]) -> Path:
 
 
 def evaluate(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, Any]]:
-    """Return the scalar metrics of a policy's jumps and held squats, by name, for each of TESTS.
+    """Evaluate a policy's jumps and held squats: return the scalar metrics by name, for each of TESTS.
 
     args: `Args` of `experiments/departures.py`; folder: for outputs of the run.
     """
@@ -114,7 +114,7 @@ def evaluate(checkpoint: Path, args: Any, folder: Path) -> dict[str, dict[str, A
 
 
 def write_table(results: MetricsByTraining, title: str, folder: Path) -> None:
-    """Write `departures.txt` and `departures.png` of all results into a folder."""
+    """Write the results of all ablations into a folder, as table `departures.txt` and plot `departures.png`."""
     table = Table("ablation, seed", *map(escape, COLUMNS), title=title)
     for (name, seed), tests in results.items():
         table.add_row(f"{name.replace('_', ' ')}, {seed}", *(cell(tests, *column) for column in COLUMNS.values()))
@@ -124,13 +124,16 @@ def write_table(results: MetricsByTraining, title: str, folder: Path) -> None:
 
 
 def cell(tests: dict[str, dict[str, Any]], name: str, scale: float) -> str:
-    """Return a metric of both tests times `scale` as text `nominal / randomized`; tests: metrics by test and name."""
+    """Format a metric of nominal and randomised jumps for the table, as `nominal / randomized`, times `scale`.
+
+    tests: metrics by test and name.
+    """
     values = (tests[test][name] for test in TESTS)
     return " / ".join("-" if value is None else f"{scale * value:.3g}" for value in values)
 
 
 def plot_results(results: MetricsByTraining, path: Path) -> None:
-    """Plot success and error of every training; grey lines mark the trainings with all departures."""
+    """Plot success and error of every ablation's policy; grey lines mark the trainings with all departures."""
     rows = [*results]
     with figure(path, 1, 2, figsize=(11, 2.0 + 0.3 * len(rows)), sharey=True, title="Ablations") as axes:
         for axis, name, scale in zip(axes, ("success_rate", "error_m"), (100.0, 1000.0), strict=True):

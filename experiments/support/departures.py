@@ -16,14 +16,15 @@ Point = tuple[float, float, float]  # [m] x, y, z of a goal
 
 
 def may_jump_early(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the task without the termination `early_takeoff`."""
+    """Return a copy of the task that allows takeoffs before the command, without `early_takeoff`."""
     terminations = tuple(term for term in task.terminations if term.name != "early_takeoff")
     return replace(task, terminations=terminations)
 
 
 def with_goals(task: TaskCfg, goals: Sequence[tuple[Point, Point]], starts: int) -> TaskCfg:
-    """Return a copy of the task with new levels: every goal range with each of the last `starts` start height ranges.
+    """Return a copy of a jump task with other goals in its curriculum levels.
 
+    The levels are every goal range with each of the last `starts` start height ranges.
     goals [m]: lower and upper point of each range; all other fields are those of the task's last level.
     """
     last, heights = task.levels[-1], [*dict.fromkeys(level.base_height for level in task.levels)][-starts:]
@@ -50,7 +51,10 @@ def places_of_sequel(task: TaskCfg) -> TaskCfg:
 
 
 def alike_all_around(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the task whose elliptical goal ranges are circles with the radius of the reach ahead."""
+    """Return a copy of the task with circular instead of elliptical goal ranges.
+
+    The radius is the reach ahead.
+    """
     levels = list(task.levels)
     for i, level in enumerate(levels):
         reach = level.goal_upper[0]
@@ -60,7 +64,7 @@ def alike_all_around(task: TaskCfg) -> TaskCfg:
 
 
 def without_another_goal(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the task in which a landed robot never gets a next goal."""
+    """Return a copy of the task in which a landed robot never gets a goal for a next jump."""
     return replace(task, levels=tuple(replace(level, next_jump_probability=0.0) for level in task.levels))
 
 
@@ -124,5 +128,5 @@ DEPARTURES: dict[str, dict[str, Ablation]] = {
 
 
 def ablation_flags(ablation: Ablation) -> str:
-    """Return the flags of an ablation of `jumper train`, empty if it is a function."""
+    """Return the flags of `jumper train` that make an ablation, empty if it is a function."""
     return ablation if isinstance(ablation, str) else ""

@@ -78,8 +78,9 @@ class FlightLog(EvaluationLog):
         env.evaluation_reset(jump_commands(goals, DELAY if self.late is None else 0.0, env.step_dt))
 
     def open_loop(self, late: np.ndarray) -> np.ndarray:
-        """Return the open-loop transversal angles [deg] of the next policy step, (num_envs, 4), legs FL, FR, BL, BR.
+        """Return the transversal motor angles [deg] of the open-loop takeoff at the next policy step.
 
+        The result is (num_envs, 4), legs FL, FR, BL, BR.
         late: the field `late`.
         """
         step, n = len(self.tilts), len(self.apex)
@@ -107,7 +108,7 @@ class FlightLog(EvaluationLog):
         return action
 
     def read_env(self, env: Any) -> dict[str, np.ndarray]:
-        """Return arrays (num_envs, ...) by name, world axes.
+        """Return the robots' motion, contacts and termination by name for `update`, (num_envs, ...), world axes.
 
         base_pos [m], tilt [rad], turn (size of the yaw [rad]), rise (upward speed [m/s]), spin (angular speed [rad/s]),
         down (whether any paw is on the ground), termination (index), momentum (angular, about the COM [kg m^2/s]).
@@ -169,12 +170,12 @@ class FlightLog(EvaluationLog):
 
     @property
     def success(self) -> np.ndarray:
-        """(num_envs,) Whether each robot landed and was within UPRIGHT of level AFTER seconds later."""
+        """Whether each robot landed and was within UPRIGHT of level AFTER seconds later, (num_envs,)."""
         return self.end == OUTCOMES.index("landed")
 
     @property
     def outcomes(self) -> np.ndarray:
-        """(num_envs,) Outcome of each flight, one of OUTCOMES or NO_END."""
+        """Outcome of each flight, one of OUTCOMES or NO_END, (num_envs,)."""
         return np.array([*OUTCOMES, NO_END])[self.end]
 
     def columns(self) -> dict[str, list]:
@@ -200,7 +201,10 @@ class FlightLog(EvaluationLog):
 
 
 def flight_metrics(flights: FlightLog) -> Metrics:
-    """Return the metrics of flights; means are over the flights that took off or touched down."""
+    """Return the rate of upright landings, and tilts, spins, momenta and apexes of the flights as metrics.
+
+    Means are over the flights that took off or touched down.
+    """
     up, down, each = "flights that took off", "flights that touched down", "flights"
     touchdown_tilt, touchdown_turn = np.degrees(flights.touchdown_tilt), np.degrees(flights.touchdown_turn)
     error = {"apex_error_abs_mean_m": mean(abs(flights.height - flights.apex), each)}
@@ -224,9 +228,9 @@ def flight_metrics(flights: FlightLog) -> Metrics:
 
 
 def extension_delays(count: int, most: float, seed: int) -> np.ndarray:
-    """Return random delays of front and left legs [s], (count, 2), vectors of length most / 2 to most [s].
+    """Return random delays [s] with which front and left legs extend at takeoff, (count, 2).
 
-    A negative delay is one of the back or right legs.
+    They are vectors of length most / 2 to most [s]. A negative delay is one of the back or right legs.
     """
     rng = np.random.default_rng(seed)
     size, angle = rng.uniform(0.5 * most, most, count), rng.uniform(0.0, 2.0 * np.pi, count)
@@ -269,7 +273,10 @@ class FlightRun(Run):
         self.prepare("flight_attitude", conditions_of(args), args.out, record=args.num_recorded)
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return a function of any argument that returns the actions of JUMP and TURN, (2, num_envs, 12)."""
+        """Return a function that returns the actions of jump and turning skill, (2, num_envs, 12).
+
+        Its argument is ignored.
+        """
         scale = env.skills[JUMP].task.action_scale[1]
 
         def act(obs: torch.Tensor) -> torch.Tensor:

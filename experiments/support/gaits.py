@@ -30,7 +30,7 @@ class GaitRecorder:
     steps: int = 0  # Number of policy steps so far, skipped ones included
 
     def __call__(self, *_: Any) -> None:
-        """Append a sample, unless within `skip` of the start."""
+        """Append a sample of the gait, unless within `skip` of the start."""
         self.steps += 1
         if self.steps <= round(self.skip / self.env.step_dt):
             return
@@ -45,7 +45,10 @@ class GaitRecorder:
         self.speed.append(np.linalg.norm(sim.base_velocity()[:, :2], axis=1))
 
     def metrics(self, standing: np.ndarray) -> Metrics:
-        """Return `gait_metrics` of the robots that have not fallen, {} if there are none; standing: (robots,) bool."""
+        """Return the gait metrics of the robots that have not fallen, {} if there are none.
+
+        standing: (robots,) bool, the robots that have not fallen.
+        """
         if not standing.any():
             return {}
         model = self.env.sim.model
@@ -62,8 +65,9 @@ def gait_metrics(
     contact: np.ndarray, paw_height: np.ndarray, force: np.ndarray, torque: np.ndarray, power: np.ndarray,
     speed: np.ndarray, weight: np.ndarray, step_dt: float,
 ) -> Metrics:  # fmt: skip
-    """Return the metrics of a gait from the lists of `GaitRecorder` as arrays (steps, robots, ...).
+    """Compute step frequency, swing height, contact patterns, torques and cost of transport of walks.
 
+    The arrays are the lists of `GaitRecorder`, (steps, robots, ...).
     weight [N]: (robots,); step_dt [s]: policy step. The cost of transport is mean power / (weight * mean speed); None
     if a robot does not move. `share_down_<paws>` is the fraction of time in which exactly these paws touch the ground.
     """

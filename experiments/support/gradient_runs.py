@@ -1,4 +1,4 @@
-"""The same jump by the solver's own kernel, and as a rollout with its reverse pass, for timing."""
+"""One jump simulated by the solver's own kernel, and as a differentiable rollout, for timing."""
 
 from __future__ import annotations
 
@@ -15,10 +15,13 @@ from support.gradients import PUSH, schedule, start
 
 
 class PlainJump:
-    """The jump by the solver's kernel, as a captured graph of filter and physics of all policy steps."""
+    """Jump without gradients, by the solver's kernel: a captured graph of filter and physics of all policy steps."""
 
     def __init__(self, rollout: Rollout, targets: np.ndarray):
-        """Capture the graph with model and parameters of the rollout; targets: motor targets [rad], (steps, 12)."""
+        """Capture the jump's graph; model and parameters are those of the rollout.
+
+        targets: motor targets [rad], (steps, 12).
+        """
         self._rollout, n = rollout, rollout.num_worlds
         dynamics, modules = rollout.dynamics, rollout.dynamics.modules
         self._start = [rollout.array(np.tile(values, n)) for values in start()]
@@ -32,7 +35,7 @@ class PlainJump:
         settings = dynamics.settings(PHYSICS_DT, SUBSTEPS, MAX_SWEEPS, TOLERANCE)
 
         def run() -> None:
-            """Simulate from the start, one command filter launch and SUBSTEPS physics steps per target."""
+            """Simulate the jump from its start: per target one command filter launch and SUBSTEPS physics steps."""
             dynamics.work.impulse.zero_()
             for current, initial in zip((self._q, self._qd), self._start, strict=True):
                 wp.copy(current, initial)
@@ -50,7 +53,7 @@ class PlainJump:
         self._graph, self._arrays = capture.graph, (drive, filtered, wrench)  # a graph on a GPU keeps no arrays alive
 
     def run(self) -> None:
-        """Simulate the jump."""
+        """Simulate the jump by replaying the graph."""
         wp.capture_launch(self._graph)
 
     def heights(self) -> np.ndarray:
@@ -59,7 +62,7 @@ class PlainJump:
 
 
 class GradientRun:
-    """The jump as a rollout, and the gradient of its final height by the reverse pass."""
+    """Jump as a differentiable rollout, with the gradient of its final height by the reverse pass."""
 
     def __init__(self, worlds: int, double: bool, device: str | None):
         """Build the rollout and its inputs for a number of worlds; double: compute in double precision."""
@@ -75,9 +78,12 @@ class GradientRun:
         self._cotangent = self.rollout.array(cotangent)
 
     def forward(self) -> Trajectory:
-        """Simulate the jump and return the trajectory."""
+        """Simulate the jump by the rollout, and return the trajectory."""
         return self.rollout.run(self._targets, self._q, self._qd)
 
     def run(self) -> dict[str, wp.array]:
-        """Simulate the jump, return the gradients of the final base height by input, as `Rollout.backward`."""
+        """Simulate the jump, and return the gradients of the final base height with respect to all inputs.
+
+        Keys: as `Rollout.backward`.
+        """
         return self.rollout.backward(self.forward(), q=self._cotangent)

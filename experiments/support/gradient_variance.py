@@ -26,7 +26,7 @@ METRICS = {"deviation": "std", "signal": "signal", "worlds_needed": "worlds_need
 
 @dataclass(frozen=True)
 class GradientStats:
-    """Statistics over worlds of one estimator's gradients, (weights,) each."""
+    """Statistics over worlds of one estimator's policy gradients, (weights,) each."""
 
     std: float  # Square root of the sum over weights of the variance between worlds
     signal: float  # Norm of the mean over worlds, without the part expected from noise alone; 0 if noise explains it
@@ -34,7 +34,7 @@ class GradientStats:
 
     @property
     def worlds_needed(self) -> float:
-        """Number of worlds over which the mean has noise of the norm of the signal; infinite without signal."""
+        """Number of worlds whose mean gradient has as much noise as signal; infinite without signal."""
         return (self.std / self.signal) ** 2 if self.signal > 0.0 else float("inf")
 
 
@@ -42,7 +42,7 @@ StatsByPolicy = dict[str, dict[str, list[GradientStats]]]  # Statistics by polic
 
 
 def gradient_stats(rows: torch.Tensor) -> GradientStats:
-    """Return the statistics of gradients (worlds, weights) over the worlds whose gradient is finite."""
+    """Compute the statistics of policy gradients (worlds, weights) over the worlds with finite gradient."""
     finite = rows.isfinite().all(1)
     valid = rows[finite].double()
     variance = float(valid.var(0).sum())
@@ -51,10 +51,11 @@ def gradient_stats(rows: torch.Tensor) -> GradientStats:
 
 
 def gradients(env: DifferentiableEnv, network: Network, horizon: int, std: float) -> tuple[torch.Tensor, torch.Tensor]:
-    """Return each world's gradient of the reward of a window, (worlds, weights), by physics and by the score function.
+    """Compute each world's policy gradient (worlds, weights), through the physics and by the score function.
 
-    The window of `horizon` policy steps starts at the present state; rewards of a world count until its episode ends.
-    std: of action noise [1]. The advantage of the score function is the remaining reward minus its mean over worlds.
+    It is the gradient of the sum of rewards in a window with respect to the network's weights. The window of `horizon`
+    policy steps starts at the present state; rewards of a world count until its episode ends. std: of action noise [1].
+    The advantage of the score function is the remaining reward minus its mean over worlds.
     """
     env.begin_window()
     tape, score_tape, scores, rewards = Tape(), Tape(), [], []
@@ -74,7 +75,10 @@ def gradients(env: DifferentiableEnv, network: Network, horizon: int, std: float
 
 
 def policies() -> dict[str, Policy]:
-    """Return the shipped policy as `trained`, and as `new` a policy with random weights and the same interface."""
+    """Return the two policies to measure: `trained`, as shipped, and `new`, with random weights.
+
+    Both have the same interface.
+    """
     trained = open_policy("vertical_jump")
     interface = trained.interface
     torch.manual_seed(0)
@@ -85,7 +89,7 @@ def policies() -> dict[str, Policy]:
 def stats_over_horizons(
     policy: Policy, env: DifferentiableEnv, horizons: tuple[int, ...]
 ) -> dict[str, list[GradientStats]]:
-    """Return the statistics of a policy's gradients by estimator, one per horizon [policy steps]."""
+    """Measure a policy's gradients: return their statistics by estimator, one per horizon [policy steps]."""
     network, stats = Network(policy, device=env.device), []
     for horizon in horizons:
         torch.manual_seed(1)
@@ -95,7 +99,10 @@ def stats_over_horizons(
 
 
 def measure_stats(make_env: Callable[[], Env], horizons: tuple[int, ...]) -> StatsByPolicy:
-    """Return the statistics of all gradients, by policy and estimator, one per horizon [policy steps]."""
+    """Measure the gradients of both policies: return statistics by policy and estimator, one per horizon.
+
+    Horizons are in policy steps.
+    """
     return {
         name: stats_over_horizons(policy, DifferentiableEnv(make_env(), world_norm=math.inf), horizons)
         for name, policy in policies().items()
@@ -103,7 +110,10 @@ def measure_stats(make_env: Callable[[], Env], horizons: tuple[int, ...]) -> Sta
 
 
 def variance_metrics(stats: StatsByPolicy) -> dict[str, Any]:
-    """Return `<metric>_<estimator>_<policy>`, lists over horizons of all METRICS; None where not finite."""
+    """Return the statistics of policy gradients as metrics `<metric>_<estimator>_<policy>`.
+
+    Each is the list over horizons of one of METRICS; None where not finite.
+    """
     values = {}
     for policy, by_estimator in stats.items():
         for estimator, of_horizons in by_estimator.items():
@@ -114,7 +124,10 @@ def variance_metrics(stats: StatsByPolicy) -> dict[str, Any]:
 
 
 def plot_variances(stats: StatsByPolicy, horizons: tuple[int, ...], path: Path) -> None:
-    """Plot standard deviation and number of worlds over the horizon, a color per policy, a line style per estimator."""
+    """Plot the gradients' standard deviation, and the worlds needed, over the horizon.
+
+    A color per policy, a line style per estimator.
+    """
     with figure(path, 1, 2, figsize=(11, 5), title="Noise of policy gradients") as axes:
         for i, (policy, by_estimator) in enumerate(stats.items()):
             for name, of_horizons in by_estimator.items():

@@ -29,7 +29,10 @@ GradientPair = tuple[np.ndarray, np.ndarray]  # Derivatives of the apex: gradien
 
 
 def schedule(push: tuple[float, float]) -> np.ndarray:
-    """Return the motor targets [rad], (TICKS, 12), of a push-off to outer and inner transversal angles [deg]."""
+    """Return the motor targets [rad], (TICKS, 12), of a jump: squat, then push-off.
+
+    push: outer and inner transversal angles of the push-off [deg].
+    """
     targets = np.zeros((TICKS, 4, 3))
     targets[:2, :, 1:] = SQUAT
     targets[2:, :, 1:] = np.radians(push)
@@ -37,7 +40,10 @@ def schedule(push: tuple[float, float]) -> np.ndarray:
 
 
 def start() -> tuple[np.ndarray, np.ndarray]:
-    """Return coordinates (43,) and rates (38,) of the squat, 0.1 mm into the ground, so that contacts do not switch."""
+    """Return the jump's initial state, a squat: coordinates (43,) and rates (38,).
+
+    The paws are 0.1 mm in the ground, so that contacts do not switch.
+    """
     squat = dataclasses.replace(load_description(), poses={"squat": (0.0, SQUAT)})
     q = standing_configuration(squat, "squat")
     q[2] -= 1.0e-4
@@ -45,13 +51,13 @@ def start() -> tuple[np.ndarray, np.ndarray]:
 
 
 class GradientJump:
-    """Simulates the jump from inputs by name.
+    """Differentiable simulation of a jump in parallel worlds, from inputs by name.
 
     targets [rad] (TICKS, 12), coordinates q (19,), rates qd (18,), parameters table (rows,), saturation [N m] (12,).
     """
 
     def __init__(self, num_worlds: int, double: bool, device: str | None):
-        """Build the rollout and the default inputs, `values`; double: compute in double precision."""
+        """Build the rollout and the jump's default inputs, `values`; double: compute in double precision."""
         self.num_worlds = num_worlds
         model = build_model(num_worlds, visuals=False, device=device)
         self.rollout = Rollout(model, jumping_motors(), vertical_jump_filter(), double=double, every=1)
@@ -60,7 +66,10 @@ class GradientJump:
         self.values |= {name: self.rollout.parameters[name].numpy()[:, 0].astype(float) for name in PARAMETERS}
 
     def run(self, inputs: dict[str, np.ndarray]) -> Trajectory:
-        """Simulate with `inputs` in place of defaults; an input that differs between worlds has them as first axis."""
+        """Simulate the jump with `inputs` in place of defaults; return the trajectory.
+
+        An input that differs between worlds has them as first axis.
+        """
         by_world = {}
         for name, value in (self.values | inputs).items():
             rows = np.broadcast_to(value, (self.num_worlds, *value.shape[-self.values[name].ndim :]))
@@ -70,8 +79,9 @@ class GradientJump:
         return self.rollout.run(by_world["targets"], by_world["q"], by_world["qd"])
 
     def gradients(self, inputs: dict[str, np.ndarray]) -> tuple[Trajectory, dict[str, np.ndarray]]:
-        """Return the jump in one world and the gradients of its apex by each input, shaped as it, and by `mass` (21,).
+        """Simulate a jump in one world; return it and the gradients of its apex with respect to all inputs.
 
+        A gradient has the shape of its input; `mass` (21,) is added.
         inputs: as for `run`; mass: of each body [m/kg].
         """
         jump = self.run(inputs)
@@ -91,8 +101,9 @@ def apex(jump: Trajectory) -> np.ndarray:
 def differences(
     inputs: dict[str, np.ndarray], name: str, directions: np.ndarray, step: float, device: str | None
 ) -> np.ndarray:
-    """Return central differences of the apex [m per unit] along directions (n, ...) of the input `name`, (n,).
+    """Compute central differences of a jump's apex with respect to the input `name`, [m per unit], (n,).
 
+    directions: (n, ...), along which the input changes.
     inputs: as for `GradientJump.run`; step: half the distance of the two points. All 2 n jumps run in parallel worlds.
     """
     batch = GradientJump(2 * len(directions), double=True, device=device)
@@ -103,7 +114,10 @@ def differences(
 
 
 def unit_directions(shape: tuple[int, ...], indices: list) -> np.ndarray:
-    """Return unit directions (n, *shape) along the entries of an input of a shape at n indices."""
+    """Return unit vectors along single entries of an input, (n, *shape).
+
+    shape: of the input; indices: n of its entries.
+    """
     directions = np.zeros((len(indices), *shape))
     for direction, entry in zip(directions, indices, strict=True):
         direction[entry] = 1.0
@@ -124,8 +138,9 @@ def mass_directions(table: np.ndarray) -> np.ndarray:
 
 
 def check(device: str | None) -> tuple[Trajectory, dict[str, GradientPair]]:
-    """Return the jump, and pairs of gradient and differences of its apex by kind of input.
+    """Compute the gradients of a jump's apex by the reverse pass and by central differences.
 
+    Returns the jump, and pairs (gradient, differences) by kind of input.
     Kinds: actions (targets of OUTER and INNER), mass, torque_limit, friction (on the slippery ground), initial_state.
     """
     jump = GradientJump(1, double=True, device=device)
@@ -134,11 +149,11 @@ def check(device: str | None) -> tuple[Trajectory, dict[str, GradientPair]]:
     coords, rates = [2, 3, 4, 5, *range(7, 19)], list(range(18))
 
     def compare(gradient: np.ndarray, name: str, directions: np.ndarray, step: float, inputs: dict) -> GradientPair:
-        """Pair derivatives along directions of an input with their central differences."""
+        """Pair derivatives of the apex along directions of an input with their central differences."""
         return gradient, differences(inputs, name, directions, step, device)
 
     def at_entries(name: str, indices: list, step: float, gradient: np.ndarray, inputs: dict) -> GradientPair:
-        """Pair derivatives by entries of an input with their central differences."""
+        """Pair derivatives of the apex by entries of an input with their central differences."""
         directions = unit_directions(gradient.shape, indices)
         return compare(np.array([gradient[index] for index in indices]), name, directions, step, inputs)
 

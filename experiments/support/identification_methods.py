@@ -1,4 +1,4 @@
-"""Other methods of identification on the same data and the same parallel worlds: SciPy and CMA-ES."""
+"""Identification by other methods, SciPy and CMA-ES, on the same data and in the same parallel worlds."""
 
 from __future__ import annotations
 
@@ -18,7 +18,10 @@ from support.known_robots import Case, Simulate, prediction_errors
 
 
 def make_problem(parameters: ParameterSet, case: Case, replay: MotionReplay) -> LeastSquares:
-    """Return the least-squares problem of a case's motions and weighed mass; replay: simulates them."""
+    """Return the least-squares problem of identifying a robot from its motions and weighed mass.
+
+    replay: simulates the motions.
+    """
     residuals = [MotionResiduals(motion, parameters, NoiseLevels(), replay.description) for motion in case.motions]
     return LeastSquares(parameters, residuals, replay, [case.mass])
 
@@ -29,21 +32,27 @@ def chi2_at(problem: LeastSquares, point: Point) -> float:
 
 
 def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
-    """Return the best point that SciPy's trust-region method finds within `seconds`, with the problem's Jacobians."""
+    """Identify the robot by SciPy's trust-region method within `seconds`, and return the best point.
+
+    SciPy uses the problem's Jacobians.
+    """
     begin, size, ends = problem.nominal_point(), len(problem.parameters), time.perf_counter() + seconds
     edges = np.cumsum([size, *(len(start) for start in begin.starts)])
     best = (np.inf, begin)
 
     class OutOfTime(Exception):
-        """The time is over."""
+        """Raised to end SciPy's search when its time is over."""
 
     def to_point(x: np.ndarray) -> Point:
-        """Split the variables: normalised parameters, then the initial state of each motion."""
+        """Split SciPy's variables into normalised parameters and the initial state of each motion."""
         z, *starts = np.split(x.copy(), edges[:-1])
         return Point(z, starts)
 
     def residuals(x: np.ndarray) -> np.ndarray:
-        """Return all residuals: motions, weighed mass, priors; remember the best point. Raises OutOfTime."""
+        """Return all residuals of the fit: motions, weighed mass, priors; remember the best point.
+
+        Raises OutOfTime.
+        """
         nonlocal best
         point = to_point(x)
         residual = np.concatenate([*problem.residuals(point), [problem.prior_residuals(point.z)[0][0]], x])
@@ -55,7 +64,7 @@ def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
         return np.nan_to_num(residual, posinf=1.0e6)
 
     def jacobian(x: np.ndarray) -> np.ndarray:
-        """Return the derivatives of `residuals`, (residuals, variables)."""
+        """Return the Jacobian of `residuals` with respect to SciPy's variables, (residuals, variables)."""
         point = to_point(x)
         table = np.zeros((problem.count + 1 + len(x), len(x)))
         row = 0
@@ -82,8 +91,9 @@ def scipy_fit(problem: LeastSquares, seconds: float) -> Point:
 
 
 def compare_methods(parameters: ParameterSet, case: Case, replay: MotionReplay, ours: Simulate, seconds: float) -> dict:
-    """Return χ² and held-out errors [deg], [mm] of CMA-ES and SciPy, each run for `seconds`.
+    """Identify a robot by CMA-ES and by SciPy, each for `seconds`; return χ² and prediction errors.
 
+    Errors are those of the held-out jump [deg], [mm].
     replay: simulates the motions for SciPy; ours: simulates a plan, for the predictions.
     """
     problem = make_problem(parameters, case, replay)

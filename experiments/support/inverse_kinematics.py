@@ -14,8 +14,9 @@ from jumper_warp.robot.model import leg_geometry_array
 
 
 def random_motors(description: RobotDescription, n: int, rng: np.random.Generator, margin: float = 0.0) -> np.ndarray:
-    """Return random motor angles [rad], (12, n), uniform between the stops, at least a margin [rad] away from them.
+    """Return random motor angles [rad], (12, n), at least a margin [rad] away from the joint stops.
 
+    They are uniform between the stops.
     Rows: legs FL, FR, BL, BR; each lateral, outer, inner. Outer and inner angles also respect the stops of their sum.
     """
     lateral, outer = (description.joint(name) for name in MOTOR_JOINTS[:2])
@@ -41,7 +42,7 @@ class InverseKinematics:
     """Forward and inverse kinematics of the legs FL, FR, BL, BR of n robots."""
 
     def __init__(self, description: RobotDescription, n: int, device: wp.Device) -> None:
-        """Allocate the outputs for n robots on a device."""
+        """Allocate the results of the kinematics of n robots on a device."""
         self._legs, self._limits = leg_geometry_array(description, geometry, device), leg_limits(description)
         self._base = [wp.zeros(n, dtype=kind, device=device) for kind in (wp.vec3, wp.quat)]
         self._angles = [wp.zeros((rows, n), dtype=float, device=device) for rows in (12, 8)]

@@ -44,7 +44,10 @@ Simulate = Callable[[Plan, RobotValues], Record]  # Returns the trajectory of a 
 
 
 def make_case(parameters: ParameterSet, seed: int, simulate: Simulate, replay: MotionReplay) -> Case:
-    """Return a random robot with its recorded motions; simulate: replaces the real robot; replay: checks safety."""
+    """Sample a random robot, and simulate the recording of its motions, its weighing and a held-out jump.
+
+    simulate: replaces the real robot; replay: checks that the motions are safe.
+    """
     rng = np.random.default_rng(seed)
     z = np.clip(SPREAD * rng.normal(size=len(parameters)), -MOST, MOST)
     late = parameters.names.index("latency")
@@ -71,7 +74,7 @@ def prediction_errors(case: Case, robots: RobotValues, simulate: Simulate) -> tu
 
 
 def accuracy(parameters: ParameterSet, case: Case, result: Identification) -> dict[str, float]:
-    """Return the largest error of each quantity, the coverage of the 95 % intervals, and the mismatch.
+    """Compare identified parameters with the true ones: largest errors, coverage of 95 % intervals, mismatch.
 
     result: identified from the case. Keys end with the unit; coverage, error_over_deviation_rms, mismatch are [1].
     """
@@ -97,7 +100,7 @@ def accuracy(parameters: ParameterSet, case: Case, result: Identification) -> di
 def run_case(
     parameters: ParameterSet, case: Case, replay: MotionReplay, ours: Simulate, dt: float | None = None
 ) -> tuple[dict[str, float], Identification]:
-    """Identify the robot of a case, and return the metrics and the identification.
+    """Identify a known robot, and return the accuracy, prediction errors and effort as metrics, and the result.
 
     replay: simulates the motions of the identification; ours: simulates a plan with the model, for the predictions;
     dt [s]: physics step of the model, None: the default.
@@ -118,8 +121,9 @@ def run_case(
 
 
 def policy_errors(name: str, jumps: int, case: Case, result: Identification, folder: Path) -> dict[str, float]:
-    """Return mean errors [m] of the apexes of a policy's jumps predicted by the described and the identified robot.
+    """Compare a policy's jumps on the nominal and the identified robot with those on the true robot.
 
+    Returns the mean errors of the predicted apexes [m].
     name: of the policy; jumps: number of them, to heights of 0.5 to 1.0 m; result: identified from the case. Robots
     are saved as overlays into `folder`. `policy_success_<robot>` is the rate of reached heights.
     """
@@ -144,7 +148,10 @@ def policy_errors(name: str, jumps: int, case: Case, result: Identification, fol
 
 
 def plot_cases(rows: list[dict[str, float]], path: Path) -> None:
-    """Plot χ², coverage, held-out errors and time over seeds; rows: metrics of `run_case`, one per seed."""
+    """Plot χ², coverage, prediction errors and time of the identified robots over seeds.
+
+    rows: metrics of `run_case`, one per seed.
+    """
     panels = (
         ("χ² per value", {"": "chi2"}, {}),
         ("fraction within 95 % interval", {"": "coverage"}, {"ylim": (0.0, 1.0)}),

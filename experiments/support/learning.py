@@ -28,7 +28,7 @@ TEST_HEIGHTS = (0.5, 1.1)  # [m] Default range of the heights of the evaluated j
 
 @dataclass
 class LearningCurve:
-    """Success of one training over its time; lists have one entry per evaluation."""
+    """Learning curve: success of one training over its time; lists have one entry per evaluation."""
 
     seconds: list[float] = field(default_factory=list)  # [s] Training time so far
     success: list[float] = field(default_factory=list)  # [1] Success rate
@@ -89,7 +89,7 @@ def train_and_evaluate(
 
 
 def train_and_time(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> LearningCurve:
-    """Train with PPO and return the learning curve, whose `ready` counts from the start of this process.
+    """Train with PPO and return the learning curve, with the time from process start to training start.
 
     args: `Args` of `experiments/learning_curves.py`; seed: of weights, noise and worlds.
     """
@@ -105,7 +105,10 @@ def train_and_time(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Learning
 
 
 def curve_metrics(curve: LearningCurve, name: str) -> dict[str, Any]:
-    """Return the metrics of one training, `<metric>_<name>`, with time and steps to reach each of RATES."""
+    """Return final success, and time and steps to reach each of RATES, of one training's learning curve.
+
+    Keys: `<metric>_<name>`.
+    """
     values = {f"success_{name}": curve.success[-1], f"steps_per_s_{name}": curve.steps[-1] / curve.seconds[-1]}
     values |= {f"curve_{series}_{name}": getattr(curve, series) for series in ("seconds", "steps", "success")}
     for rate in RATES:

@@ -34,7 +34,7 @@ def rotational_inertia(sim: Any) -> np.ndarray:
 
 
 class LinkStates(NamedTuple):
-    """State of all links, (num_worlds, links, ...) each."""
+    """Masses, poses and velocities of all links, (num_worlds, links, ...) each."""
 
     mass: np.ndarray  # (..., 1) [kg]
     inertia: np.ndarray  # (..., 3, 3) [kg m^2] about the link's COM, link axes
@@ -68,8 +68,9 @@ class MomentumRecorder:
         self.angular.append(momentum(self.env.sim)[1])
 
     def metrics(self, diverged: np.ndarray, inertia: np.ndarray) -> Metrics:
-        """Return the angular momentum, which should be 0, and the turn that it causes, of the robots not diverged.
+        """Return metrics of the drift of the angular momentum, which should be 0, and of the turn it causes.
 
+        Diverged robots are left out.
         diverged: (num_envs,) bool; inertia [kg m^2]: (num_envs, 3, 3), of `rotational_inertia`.
         """
         drift, over = np.array(self.angular)[:, ~diverged], "turns that did not diverge"

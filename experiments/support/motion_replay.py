@@ -64,7 +64,10 @@ class MotionReplay:
         self._evaluate()
 
     def _physics_step(self, number: int) -> tuple:
-        """Advance by a physics step, return its row of the measured arrays; number: of physics steps before it."""
+        """Advance by a physics step, and return the measurements after it, a row of the measured arrays.
+
+        number: of physics steps before it.
+        """
         sim = self.sim
         before = motor_values(sim.joint_qd()[0, 6:])
         sim.physics_step()
@@ -82,7 +85,10 @@ class MotionReplay:
         )  # fmt: skip
 
     def _record(self, row: tuple) -> None:
-        """Record a policy step: state, link poses, collision flags and a frame; row: of its last physics step."""
+        """Record a policy step: state, link poses, collision flags and a frame of the recording.
+
+        row: measurements of its last physics step.
+        """
         sim = self.sim
         pose = sim.state.body_q.numpy().copy()
         self.states.append(compact(sim.joint_q(), sim.joint_qd()))
@@ -99,7 +105,7 @@ class MotionReplay:
         self.recorder.record(row[0], sim.state.body_q, series, ankles(pose[None])[0], sim.paw_force.numpy()[:, 0])
 
     def _evaluate(self) -> None:
-        """Compute takeoff, work, apex, landing acceleration, and paws lifted after touchdown."""
+        """Compute the jump's takeoff, work, apex, landing acceleration, and paws lifted after touchdown."""
         down = self.force > CONTACT_FORCE
         ticks = slice(self.sim.substeps - 1, None, self.sim.substeps)
         free = ~down[ticks].any(axis=1) & (self.up[ticks] > TAKEOFF_SPEED)

@@ -24,7 +24,10 @@ SQUAT = 135.0  # [deg] Commanded transversal angle of the squat, which the comma
 
 
 def transversal_command(tick: int, squat: float = SQUAT) -> float:
-    """Return the commanded transversal angle [rad] at policy step `tick`; squat [deg]: commanded angle of the squat."""
+    """Return the angle [rad] that the open-loop jump commands to the transversal motors at a policy step.
+
+    tick: the policy step; squat [deg]: commanded angle of the squat.
+    """
     degrees = 45.0 + (squat - 45.0) * np.clip((tick - STAND) / RAMP, 0.0, 1.0)
     if tick >= STAND + RAMP + HOLD:
         degrees = -45.0 if tick < STAND + RAMP + HOLD + EXTEND else 45.0
@@ -33,7 +36,7 @@ def transversal_command(tick: int, squat: float = SQUAT) -> float:
 
 @dataclass
 class Trace:
-    """Measurements of the jump, one row per physics step; motors and paws in the order of legs FL, FR, BL, BR."""
+    """Measurements of the open-loop jump at every physics step; motors and paws in the order of legs FL, FR, BL, BR."""
 
     time: np.ndarray  # (n,) [s]
     height: np.ndarray  # (n,) [m] of the base
@@ -46,7 +49,7 @@ class Trace:
 
 
 def simulate_jump(sim: Simulation, notes: Mapping[str, Any], squat: float = SQUAT) -> tuple[Trace, Recorder]:
-    """Simulate the jump in world 0; return measurements and a recording at 60 Hz.
+    """Simulate the open-loop jump in world 0; return measurements and a recording at 60 Hz.
 
     notes: JSON metadata of the recording; squat [deg]: commanded transversal angle of the squat.
     """
@@ -72,7 +75,7 @@ def simulate_jump(sim: Simulation, notes: Mapping[str, Any], squat: float = SQUA
 
 
 def record(recorder: Recorder, poses: np.ndarray, row: tuple) -> None:
-    """Add a frame to the recording; poses: of the links, (21, 7); row: fields of `Trace` at one physics step."""
+    """Add a frame to the jump's recording; poses: of the links, (21, 7); row: fields of `Trace` at one physics step."""
     now, height, speed, angle, rate, torque, force, _ = row
     series = {"base/height [m]": height, "base/vertical speed [m s⁻¹]": speed}
     for i, name in enumerate(MOTOR_JOINTS):
@@ -85,7 +88,10 @@ def record(recorder: Recorder, poses: np.ndarray, row: tuple) -> None:
 
 
 def trace_metrics(trace: Trace) -> dict[str, float]:
-    """Return the metrics of the jump by name, which ends with the unit; times count from the extension's command."""
+    """Return the metrics of the open-loop jump by name, which ends with the unit.
+
+    Times count from the extension's command.
+    """
     contact = np.linalg.norm(trace.force, axis=2).max(axis=1) > 0.1
     extend_s = (STAND + RAMP + HOLD) / 60.0  # [s] command of the extension
     apex = int(np.argmax(np.where(trace.time > extend_s, trace.height, 0.0)))
@@ -111,7 +117,10 @@ def trace_metrics(trace: Trace) -> dict[str, float]:
 
 
 def plot_trace(path: Path, trace: Trace, conditions: str, hardware: float) -> None:
-    """Plot height, vertical speed, angles, torques and paw forces over time; hardware [m]: apex of the real robot."""
+    """Plot height, vertical speed, angles, torques and paw forces of the open-loop jump over time.
+
+    hardware [m]: apex of the real robot.
+    """
     with figure(path, 5, 1, figsize=(9, 12), sharex=True, title="Open-loop jump", conditions=conditions) as axes:
         axes[0].plot(trace.time, trace.height)
         axes[0].axhline(hardware, color="0.4", linestyle=":", label="paper, robot: 18 N m")
@@ -126,7 +135,7 @@ def plot_trace(path: Path, trace: Trace, conditions: str, hardware: float) -> No
 
 
 def plot_motors(axes: np.ndarray, time: np.ndarray, angle: np.ndarray, torque: np.ndarray) -> None:
-    """Plot the transversal motors of two left legs over time [s], (n,), onto two axes.
+    """Plot angles and torques of the transversal motors of two left legs over time [s], (n,), onto two axes.
 
     angle [rad], torque [N m]: of all motors, (n, 12).
     """

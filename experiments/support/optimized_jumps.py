@@ -44,7 +44,7 @@ SCATTER = 0.35  # [1] Standard deviation of these postures
 
 
 def squats(knots: Knots, count: int, rng: np.random.Generator, push: int = 32) -> np.ndarray:
-    """Return random candidates of actions [1], (count, len(knots)): two postures, then extension of the legs.
+    """Return random candidates of squat jumps: actions [1], (count, len(knots)), two postures, then extension.
 
     The extension begins around step `push`, separately for front and hind legs; left and right are equal.
     """
@@ -56,9 +56,10 @@ def squats(knots: Knots, count: int, rng: np.random.Generator, push: int = 32) -
 
 
 def run_ups(knots: Knots, count: int, rng: np.random.Generator, push: int = 40) -> np.ndarray:
-    """Return random candidates of actions, (count, len(knots)): lean back, fall forward, crouch, extend hind, front.
+    """Return random candidates of jumps with a run-up in place: actions [1], (count, len(knots)).
 
-    Postures scatter around POSTURES, times are random; the hind legs push around step `push`; left and right are equal.
+    The robot leans back, falls forward, crouches, extends the hind legs, then the front legs. Postures scatter around
+    POSTURES, times are random; the hind legs push around step `push`; left and right are equal.
     """
     step, shape = np.array(knots.at)[None, :, None], (count, 1, 1)
     lean, fall, crouch = np.clip(POSTURES[:, None, None] + SCATTER * rng.normal(size=(3, count, 1, 4)), -1.0, 1.0)
@@ -72,9 +73,10 @@ def run_ups(knots: Knots, count: int, rng: np.random.Generator, push: int = 40) 
 
 
 def noisy_variants(solution: np.ndarray, knots: Knots, rng: np.random.Generator) -> np.ndarray:
-    """Return 64 candidates (64, len(knots)): a solution (n,) plus noise of standard deviation 0 to 0.2.
+    """Return 64 candidates around a solution of the optimisation, (64, len(knots)).
 
-    The solution may be of a shorter motion; missing knots are 0 before the noise.
+    They are the solution (n,) plus noise of standard deviation 0 to 0.2. The solution may be of a shorter motion;
+    missing knots are 0 before the noise.
     """
     actions = np.zeros((len(knots.at), 4))
     actions[: len(solution) // 4] = solution.reshape(-1, 4)
@@ -97,11 +99,11 @@ class Jump:
     after: str = ""  # Key in `JUMPS` of the jump whose solution is also a candidate; empty: none
 
     def replay(self, targets: np.ndarray, device: str | None = None) -> MotionReplay:
-        """Return the replay of targets [rad], (steps, 12)."""
+        """Replay the jump with motor targets [rad], (steps, 12), in the simulation that trains policies."""
         return MotionReplay(targets, self.make(**FINE, device=device, threads=1), notes={"jump": self.label})
 
     def scaled(self, effort: float) -> Jump:
-        """Return a copy with the iterations of all stages (not `polish`) multiplied by `effort` [1], at least 1."""
+        """Return a copy with the iterations of all search stages (not `polish`) times `effort` [1], at least 1."""
         stages = ((made, replace(s, iterations=max(1, round(effort * s.iterations)))) for made, s in self.stages)
         return replace(self, stages=tuple(stages))
 
@@ -110,7 +112,10 @@ FORWARD_KNOTS = Knots((0.0, 8.0, 16.0, *map(float, range(24, 48))), steps=53)  #
 
 
 def motors_of(torque: float, speed: float = 1.0) -> MotorCfg:
-    """Return motors with a torque limit [N m]; speed [1]: factor on all speed limits of the transversal motors."""
+    """Return the settings of motors with a torque limit [N m].
+
+    speed [1]: factor on all speed limits of the transversal motors.
+    """
     motors = jumping_motors(torque, lateral_torque=12.0)
     stock = motors.transversal
     faster = replace(stock, cutoff_speed=speed * stock.cutoff_speed, no_load_speed=speed * stock.no_load_speed)
@@ -121,7 +126,7 @@ def _far(
     lean: float = 0.0, *, torque: float = 18.0, speed: float = 1.0, pitch: float = PITCH, away: float = AWAY,
     command_filter: Callable[[], FilterCfg] = horizontal_jump_filter, **settings: Any,
 ) -> Problem:  # fmt: skip
-    """Return the problem of the farthest flight.
+    """Return the optimisation problem of the farthest flight.
 
     lean [1]: weight of leaning back before it, up to BACK; torque [N m] and speed [1]: as for `motors_of`; pitch [rad],
     away [m]: limits PITCH, AWAY; settings: further arguments of `Problem`.
@@ -144,7 +149,7 @@ LANDING = Knots((*UP.at, 48.0, 52.0, *map(float, range(54, 74, 2)), 80.0, 90.0, 
 def _vertical(
     objective: Term, *more: Term, torque: float = 18.0, knots: Knots = UP, **settings: Any
 ) -> Problem:  # fmt: skip
-    """Return the problem of a vertical jump; more: constraints beyond the common ones; torque [N m]: limit."""
+    """Return the optimisation problem of a vertical jump; more: additional constraints; torque [N m]: limit."""
     constraints = (jumps.clear(), jumps.upright(TILT, at_end=False), jumps.drifts(DRIFT), *more)
     return Problem(knots, objective, constraints, jumping_motors(torque), vertical_jump_filter(), **settings)
 
@@ -217,8 +222,9 @@ LIMITED = {
 def optimise(
     jump: Jump, begin: np.ndarray, seed: int, polish: int, **settings: Any
 ) -> tuple[Progress, dict[str, float]]:
-    """Run all stages of the search; return the last descent, and `simulated_steps` and `reverse_steps` of all worlds.
+    """Optimise a jump by all stages of the search; return the last descent and the numbers of simulated steps.
 
+    Keys: `simulated_steps` and `reverse_steps`, of all worlds.
     begin: candidates, (n, len(knots)); seed: of displacements; polish: iterations of the last descent; settings:
     device, threads.
     """

@@ -18,7 +18,7 @@ LEVEL = 0.01  # [1] Level of significance after correction
 
 
 class SeedTest(NamedTuple):
-    """Test of the difference of one metric between two seeds."""
+    """Significance test of the difference of one metric between two seeds."""
 
     policy: str
     condition: str
@@ -28,7 +28,7 @@ class SeedTest(NamedTuple):
 
 
 class OldKey(NamedTuple):
-    """Old key of a metric, and its new one."""
+    """Old and new key of a metric whose definition or name changed."""
 
     title: str
     old: str
@@ -92,7 +92,10 @@ OLD_COMMANDS = {
 
 
 def proportions_p(a: MetricValue, b: MetricValue) -> float:
-    """Return the two-sided p of equal rates by the two-proportion test with pooled variance."""
+    """Return the two-sided p-value of the hypothesis that two rates are equal.
+
+    It is the two-proportion test with pooled variance.
+    """
     (p, n), (q, m) = _value_and_trials(a), _value_and_trials(b)
     pooled = (p * n + q * m) / (n + m)
     error = math.sqrt(pooled * (1.0 - pooled) * (1.0 / n + 1.0 / m))
@@ -100,7 +103,10 @@ def proportions_p(a: MetricValue, b: MetricValue) -> float:
 
 
 def means_p(a: MetricValue, b: MetricValue) -> float:
-    """Return the two-sided p of equal means by Welch's t-test; standard errors follow from the 95 % intervals."""
+    """Return the two-sided p-value of the hypothesis that two means are equal, by Welch's t-test.
+
+    Standard errors follow from the 95 % intervals.
+    """
     (p, n), (q, m) = _value_and_trials(a), _value_and_trials(b)
     v, w = (((x.interval[1] - x.interval[0]) / (2.0 * Z)) ** 2 if x.interval else 0.0 for x in (a, b))
     if v + w == 0.0:
@@ -116,7 +122,10 @@ def _value_and_trials(metric: MetricValue) -> tuple[float, int]:
 
 
 def seed_tests(rows: Sequence[Row]) -> list[SeedTest]:
-    """Return a test for every metric with an interval and LEAST trials, between the first two seeds of each row."""
+    """Test every metric for a difference between the first two seeds of each policy and condition.
+
+    Metrics without an interval or with fewer than LEAST trials are left out.
+    """
     pairs: dict[tuple[str, str], list[Row]] = {}
     for row in rows:
         pairs.setdefault(row[:2], []).append(row)
@@ -131,7 +140,7 @@ def seed_tests(rows: Sequence[Row]) -> list[SeedTest]:
 
 
 def seed_section(rows: Sequence[Row]) -> str:
-    """Return the comparison of two seeds: number of tests, and the differences that are significant at LEVEL."""
+    """Return the text that compares two seeds: number of tests, and differences significant at LEVEL."""
     tests = sorted(seed_tests(rows), key=lambda test: test.p)
     if not tests:
         return f"No row has two seeds and at least {LEAST} trials.\n"
@@ -156,13 +165,16 @@ def seed_section(rows: Sequence[Row]) -> str:
 
 
 def _words(condition: str) -> str:
-    """Return a condition in words, with its solver if that is SolverMuJoCo."""
+    """Return a test condition in words, with its solver if that is SolverMuJoCo."""
     known = CONDITIONS[condition]
     return known.words + (", SolverMuJoCo" if known.values.get("solver") == "mujoco" else "")
 
 
 def old_section(rows: Sequence[Row], tasks: Mapping[str, TaskCfg]) -> str:
-    """Return the comparison of old and new definitions, a table for each kind of task; rows: of one seed."""
+    """Return the tables that compare old and new definitions of metrics, one for each kind of task.
+
+    rows: of one seed.
+    """
     sections = []
     for kind, keys in OLD_KEYS.items():
         lines = [line for row in rows if kind_of(tasks[row.policy]) == kind if (line := _old_line(row, tasks, keys))]
@@ -175,7 +187,7 @@ def old_section(rows: Sequence[Row], tasks: Mapping[str, TaskCfg]) -> str:
 
 
 def _old_line(row: Row, tasks: Mapping[str, TaskCfg], keys: Sequence[OldKey]) -> list[str]:
-    """Return the line of a row in the table of old and new definitions, empty if its condition has no old metrics."""
+    """Return one policy's line in a table of old and new metrics, empty if its condition has no old metrics."""
     suites = earlier_metrics(row.policy)
     names = [name for name in OLD_SUITES.get(row.condition, ()) if name in suites]
     old: dict[str, Any] = suites[names[0]] if names else {}
@@ -189,7 +201,10 @@ def _old_line(row: Row, tasks: Mapping[str, TaskCfg], keys: Sequence[OldKey]) ->
 
 
 def _old_cell(key: OldKey, old: float | None, new: MetricValue, other_commands: bool) -> str:
-    """Return old and new value as text, with the letters of the reasons if the old one is outside the new interval."""
+    """Format the old and the new value of a metric for a table.
+
+    Letters give the reasons if the old one is outside the new interval.
+    """
     if old is None or not isinstance(new.value, int | float):
         return "–"
     low, high = new.interval or (new.value, new.value)

@@ -15,7 +15,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 
 
 class TestCondition(NamedTuple):
-    """Condition of a row."""
+    """Test condition in which policies are evaluated: its name in tables and its settings."""
 
     words: str  # Name in tables
     values: dict[str, Any]  # Fields of `Conditions`; `payload` [kg] becomes a robot overlay
@@ -63,7 +63,7 @@ def with_trials(flags: Any, trials: int) -> Any:
 
 
 def commands_of(flags: Any) -> str:
-    """Return the commands of an evaluation in words."""
+    """Describe the commands of an evaluation in words; flags: of `jumper evaluate`."""
     if isinstance(flags, AttitudeFlags):
         return f"turns by {flags.angle:g}°"
     if isinstance(flags, VelocityFlags):

@@ -1,4 +1,4 @@
-"""Page with the results of the shipped policies, written from measured rows."""
+"""Page results.md with the measured results of the shipped policies."""
 
 from __future__ import annotations
 
@@ -50,7 +50,10 @@ old value outside the present 95 % interval. D: other definition; C: other comma
 
 
 def write_page(folder: Path, rows: Sequence[Row], tasks: Mapping[str, TaskCfg]) -> Path:
-    """Write results.md into a folder and return its path; rows: as `read_rows` returns them, tasks: by policy."""
+    """Write the page results.md with all policies' results into a folder, and return its path.
+
+    rows: as `read_rows` returns them; tasks: by policy.
+    """
     first = [row for row in rows if row.seed == min(each.seed for each in rows if each[:2] == row[:2])]
     own = {policy: [row for row in first if row.policy == policy] for policy in tasks}
     sections = [policy_section(policy, tasks[policy], measured) for policy, measured in own.items() if measured]

@@ -1,4 +1,4 @@
-"""Results of the shipped policies: measured rows, their tables, and the policies' metrics.json."""
+"""Results of the shipped policies: measured metrics by condition, their tables, and the policies' metrics.json."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ RMSE_AXES = ("vx_m_s", "vy_m_s", "yaw_rate_rad_s")
 
 
 class Row(NamedTuple):
-    """Metrics of a policy in a condition."""
+    """Measured metrics of a policy in one condition with one seed."""
 
     policy: str
     condition: str  # Key of CONDITIONS
@@ -32,7 +32,7 @@ class Row(NamedTuple):
 
 
 class TableColumn(NamedTuple):
-    """Column of a policy's table."""
+    """Column of the table of a policy's results."""
 
     title: str
     keys: tuple[str, ...]  # Metrics, separated by slashes
@@ -88,7 +88,7 @@ PUBLISHED: dict[str, tuple[tuple[str, dict[str, float]], ...]] = {
 
 
 def read_rows(folder: Path, policies: Sequence[str]) -> list[Row]:
-    """Return the rows in a folder, in the order of policies, CONDITIONS and seeds."""
+    """Read the measured results of policies in a folder, in the order of policies, CONDITIONS and seeds."""
     rows = []
     for policy in policies:
         for path in (folder / policy).glob(f"*/{METRICS}"):
@@ -100,13 +100,13 @@ def read_rows(folder: Path, policies: Sequence[str]) -> list[Row]:
 
 
 def kind_of(task: TaskCfg) -> str:
-    """Return the key of COLUMNS for a task."""
+    """Return the kind of a task that selects the columns of its table, a key of COLUMNS."""
     suite = task.evaluation_suite
     return suite if suite in COLUMNS else "height" if suite in HEIGHTS else "place"
 
 
 def trained_on(task: TaskCfg, values: dict[str, Any]) -> str:
-    """Return the range of commands in the training of a task; values: conditions of a row."""
+    """Return the range of commands that a task samples in training, as text; values: conditions of a row."""
     if pair := values.get("trained_range_m"):
         return "{:g} to {:g} m".format(*pair)
     if limits := values.get("trained_velocities"):
@@ -116,7 +116,7 @@ def trained_on(task: TaskCfg, values: dict[str, Any]) -> str:
 
 
 def number(key: str, value: Any) -> str:
-    """Return the value of a metric as text: a rate in per cent, seconds and degrees with two decimals, else four."""
+    """Format a metric's value: a rate in per cent, seconds and degrees with two decimals, else four."""
     if value is None:
         return "–"
     if key.endswith("_rate"):
@@ -125,7 +125,7 @@ def number(key: str, value: Any) -> str:
 
 
 def cell(column: TableColumn, metrics: dict[str, MetricValue]) -> str:
-    """Return the text of a cell; empty if the metrics lack all of the column's keys."""
+    """Format a cell of a policy's table; empty if the metrics lack all of the column's keys."""
     known = [key for key in column.keys if key in metrics]
     text = " / ".join(number(key, metrics[key].value) for key in known)
     interval = metrics[known[0]].interval if known and column.interval else None
@@ -133,13 +133,16 @@ def cell(column: TableColumn, metrics: dict[str, MetricValue]) -> str:
 
 
 def markdown(titles: Sequence[str], lines: Iterable[Sequence[str]]) -> str:
-    """Return a table."""
+    """Return a Markdown table with column titles and lines of cells."""
     table = [titles, ["---"] * len(titles), *lines]
     return "\n".join(f"| {' | '.join(line)} |" for line in table) + "\n"
 
 
 def policy_section(policy: str, task: TaskCfg, rows: Sequence[Row]) -> str:
-    """Return heading, table and undefined conditions of a policy; rows: its rows of one seed."""
+    """Return a policy's section of the page: heading, table, and conditions that are undefined for it.
+
+    rows: its results with one seed.
+    """
     columns = COLUMNS[kind_of(task)]
     lines = [
         [CONDITIONS[row.condition].words, SOLVER_TITLES[row.values["solver"]], str(row.values["commands"]),
@@ -168,7 +171,10 @@ def earlier_metrics(policy: str) -> dict[str, Any]:
 
 
 def save_to_policies(rows: Sequence[Row], tasks: dict[str, TaskCfg]) -> None:
-    """Write the rows into metrics.json of the policies' folders, with the earlier metrics; updates their manifests."""
+    """Write measured results into metrics.json of the policies' folders, and update their manifests.
+
+    The earlier metrics are kept.
+    """
     for policy, task in tasks.items():
         document = {
             "schema": SCHEMA,
@@ -183,6 +189,6 @@ def save_to_policies(rows: Sequence[Row], tasks: dict[str, TaskCfg]) -> None:
 
 
 def _saved(row: Row) -> dict[str, Any]:
-    """Return a row as the object that a policy's metrics.json has for it; without the path of a payload's overlay."""
+    """Convert a result to its JSON object in metrics.json, without the path of a payload's overlay."""
     values = {name: value for name, value in row.values.items() if name != "robot" or "payload_kg" not in row.values}
     return {"condition": row.condition, "seed": row.seed, "conditions": values, "metrics": row.entries}

@@ -22,21 +22,21 @@ Item = TypeVar("Item")
 
 @dataclass(frozen=True)
 class OutputArgs(PrintFlags):
-    """Flags of every script."""
+    """Flags that every experiment script has."""
 
     out: Path | None = None  # Folder for metrics.json, plots and recordings (default: outputs/<script>/<time>)
 
 
 @dataclass(frozen=True)
 class DeviceArgs(OutputArgs):
-    """Flags of a script that computes on one device."""
+    """Flags of an experiment script that computes on one device."""
 
     device: str | None = None  # Warp device, such as cpu or cuda:0 (default: a GPU if there is one)
 
 
 @dataclass(frozen=True)
 class ThreadArgs(DeviceArgs):
-    """Flags of a script whose worlds may share CPU threads."""
+    """Flags of an experiment script whose worlds may share CPU threads."""
 
     threads: int | None = None  # CPU threads that share the worlds (default: all cores); they change no result
 

@@ -56,7 +56,7 @@ def randomize(sim: Simulation, rng: np.random.Generator) -> None:
 
 
 def simulation_steps(sim: Simulation, args: SoakArgs) -> Iterator[torch.Tensor]:
-    """Step a simulation under random targets; yield after each step which worlds to count as non-finite, (n,) bool.
+    """Step a simulation under random motor targets; yield after each step which worlds diverged, (n,) bool.
 
     Flags stay set until the reset after `args.episode_steps` and are yielded once, before it.
     """
@@ -98,7 +98,7 @@ class SoakTotals(NamedTuple):
 
 
 class SoakCounters:
-    """Counts invalid worlds and unsolved contacts, and keeps the largest speeds, on the device."""
+    """Counters of invalid worlds and unsolved contacts, and of the largest speeds, on the device."""
 
     def __init__(self, sim: Simulation) -> None:
         """Start all counters at 0; sim: simulation whose state is read."""
@@ -111,7 +111,10 @@ class SoakCounters:
         self._step_speeds = self._rates.new_zeros(2)  # the same of one step
 
     def update(self, flagged: torch.Tensor, *rows: torch.Tensor) -> None:
-        """Count a policy step. flagged: (num_worlds,) bool; rows: (num_worlds, ...) values that should be finite."""
+        """Count the invalid worlds and unsolved contacts after a policy step, and update the largest speeds.
+
+        flagged: (num_worlds,) bool; rows: (num_worlds, ...) values that should be finite.
+        """
         self._step_speeds[0] = self._rates[:, :3].square().sum(dim=1).max().sqrt()
         self._step_speeds[1] = self._rates[:, 6:26].abs().max()
         torch.maximum(self._speeds, self._step_speeds, out=self._speeds)
@@ -126,7 +129,10 @@ class SoakCounters:
 
 
 def soak_simulation(sim: Simulation, args: SoakArgs) -> dict:
-    """Step a simulation under random targets, and return the metrics. Raises RuntimeError: unflagged NaN or inf."""
+    """Soak-test a simulation under random motor targets, and return the metrics.
+
+    Raises RuntimeError: NaN or infinity in a world without a flag.
+    """
     counters, start = SoakCounters(sim), time.perf_counter()
     for step, flagged in enumerate(simulation_steps(sim, args)):
         counters.update(flagged)
@@ -136,10 +142,10 @@ def soak_simulation(sim: Simulation, args: SoakArgs) -> dict:
 
 
 def soak_env(env: Env, args: SoakArgs) -> dict:
-    """Step an environment under random actions, `args.hold_steps` steps as one graph, and return the metrics.
+    """Soak-test an environment under random actions, and return the metrics.
 
-    Worlds that diverged are flagged. Raises RuntimeError: a coordinate, rate, reward or observation after the step (and
-    reset) is NaN or infinite.
+    On a GPU, `args.hold_steps` steps are one graph. Worlds that diverged are flagged. Raises RuntimeError: a
+    coordinate, rate, reward or observation after the step (and reset) is NaN or infinite.
     """
     env.reset()
     diverged = [term.name for term in env.task.terminations].index("diverged")
@@ -147,7 +153,7 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
     termination = wp.to_torch(env.episodes.termination)
 
     def step_held() -> None:
-        """Hold one random action for all steps, and count each."""
+        """Step the environment with one random action for `args.hold_steps` steps, and count after each."""
         action.uniform_(-1.0, 1.0)
         for _ in range(args.hold_steps):
             env.step(action)
@@ -164,7 +170,10 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
 
 
 def soak_metrics(counters: SoakCounters, count: int, wall: float) -> dict:
-    """Return the metrics by name; count: policy steps of all worlds together; wall: time for them [s]."""
+    """Return the totals and the speed of a soak test as metrics by name.
+
+    count: policy steps of all worlds together; wall: time for them [s].
+    """
     totals = counters.read()
     return {
         "steps": count, "non_finite_worlds": totals.flagged, "non_finite_rows": totals.rows,

@@ -27,7 +27,7 @@ CALLS = 3  # Number of launches of a part of a policy step per repetition
 
 
 def command(sim: Simulation, degrees: float, steps: int) -> float:
-    """Command all transversal motors to an angle [deg] for some policy steps; return the wall time per step [s]."""
+    """Simulate robots with all transversal motors commanded to an angle [deg]; return the wall time per step [s]."""
     target = np.tile([0.0, 1.0, 1.0], 4) * np.radians(degrees)
     sim.target.assign(np.repeat(target[:, None], sim.num_worlds, axis=1).astype(np.float32))
     return wall_time(sim.step, sim.device, steps)
@@ -41,8 +41,9 @@ def check_standing(sim: Simulation, highest: float) -> None:
 
 
 def time_standing(sim: Simulation, steps: int, repeats: int) -> float:
-    """Return the median wall time per policy step [s] while standing. Raises RuntimeError: a robot does not stand.
+    """Time the simulation of standing robots: return the median wall time per policy step [s].
 
+    Raises RuntimeError: a robot does not stand.
     steps: policy steps in each of `repeats` repetitions.
     """
     command(sim, DEFAULT, 90)
@@ -51,7 +52,7 @@ def time_standing(sim: Simulation, steps: int, repeats: int) -> float:
 
 
 def time_jump(sim: Simulation, repeats: int) -> tuple[float, float]:
-    """Return the median wall time per policy step [s] of `repeats` jumps, and the mean apex [m].
+    """Time the simulation of jumping robots: return the median wall time per policy step [s] and the mean apex [m].
 
     Raises RuntimeError: a robot does not reach 0.8 m.
     """
@@ -73,7 +74,10 @@ def time_jump(sim: Simulation, repeats: int) -> tuple[float, float]:
 
 
 def time_solver(solver: SolverName, envs: int, steps: int, repeats: int, device: str | None) -> dict[str, float]:
-    """Return the metrics of one solver with `envs` environments; steps: in each repetition of standing."""
+    """Time one solver with standing and jumping robots, and return the metrics.
+
+    envs: number of environments; steps: in each repetition of standing.
+    """
     build_model(1, device=device)  # Newton's own modules are not part of the metrics
     before, sims = device_memory(wp.get_device(device)), []
 
@@ -133,7 +137,7 @@ def stepping_env(envs: int, device: str | None, threads: int | None = None) -> t
 
 
 def time_threads(envs: int, threads: Sequence[int], steps: int, repeats: int) -> dict[str, float]:
-    """Return policy steps per second on a CPU by number of threads, and the speedup of the last over the first.
+    """Measure policy steps per second on a CPU by number of threads, and the speedup of last over first.
 
     Repetitions alternate and the fastest counts, as other load only slows them down. `thread_speedup` is the smaller
     speedup of physics and environment.
@@ -153,7 +157,10 @@ def time_threads(envs: int, threads: Sequence[int], steps: int, repeats: int) ->
 
 
 def time_stages(envs: int, device: str | None, repeats: int) -> dict[str, float]:
-    """Return the median wall time [s] of each part of a policy step, by name in `Env.stages`, from one same state."""
+    """Time each part of a policy step of the environment: return the median wall times [s] by name.
+
+    Names are those of `Env.stages`; every part begins from the same state.
+    """
     env, _ = stepping_env(envs, device)
     saved, parts = env.state_dict(), {}
     for name in env.stages():
@@ -164,8 +171,9 @@ def time_stages(envs: int, device: str | None, repeats: int) -> dict[str, float]
 
 
 def time_parts(envs: Sequence[int], train_envs: int, steps: int, repeats: int, device: str | None) -> dict[str, float]:
-    """Return `solver_` and `env_steps_per_s_<n>` for numbers of environments, and time `<part>_us`, `<part>_share`.
+    """Time solver and environment for numbers of environments, and the parts of a policy step.
 
+    Keys: `solver_` and `env_steps_per_s_<n>`, `<part>_us` and `<part>_share`.
     envs, train_envs: numbers of environments; parts of a policy step are timed with train_envs.
     """
     values: dict[str, float] = {}
@@ -181,8 +189,9 @@ def time_parts(envs: Sequence[int], train_envs: int, steps: int, repeats: int, d
 
 
 def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dict[str, float]:
-    """Return metrics of training with this package's PPO. Raises RuntimeError: policy unchanged or not finite.
+    """Time training with this package's PPO, and return the metrics.
 
+    Raises RuntimeError: policy unchanged or not finite.
     `ppo_device_memory_gib`: total memory in use on the GPU. `ppo_ready_s`: time of compilation and first iterations,
     until all graphs are captured.
     """
@@ -212,7 +221,7 @@ def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dic
 
 
 def time_rsl_rl(envs: int, num_steps: int, iterations: int, device: str | None) -> dict[str, float]:
-    """Return metrics of training with rsl-rl-lib on the same environment with the same settings."""
+    """Time training with rsl-rl-lib on the same environment and settings, and return the metrics."""
     from jumper_warp.envs.rsl_rl import RslRlVecEnv
     from jumper_warp.rl.rsl_rl import train_rsl_rl
 

@@ -35,7 +35,7 @@ class SpringJumps:
                           robot=robot, device=self.device, **settings)  # fmt: skip
 
     def apexes(self, stiffness: Sequence[float], squats: Sequence[float]) -> np.ndarray:
-        """Return the largest base height [m] of each jump, (len(stiffness), len(squats)).
+        """Simulate the jumps: return the largest base height [m] of each, (len(stiffness), len(squats)).
 
         stiffness [N/m]: of the springs; squats [deg]: commanded transversal angles of the squat.
         """

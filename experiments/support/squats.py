@@ -35,7 +35,7 @@ class SquatLog(EvaluationLog):
 
     @property
     def seconds(self) -> float:
-        """[s] Simulated time."""
+        """Simulated time [s]."""
         return self.hold
 
     def begin(self, env: Env) -> None:
@@ -44,7 +44,10 @@ class SquatLog(EvaluationLog):
         env.evaluation_reset(jump_commands(self.goals, self.hold + 1.0, env.step_dt))
 
     def read_env(self, env: Any) -> dict[str, np.ndarray]:
-        """Return `peak` and `force` (num_envs, 4) [N], `torque` (num_envs, 12) [N m], `termination` (num_envs,)."""
+        """Return paw forces, motor torques and termination of the robots by name, for `update`.
+
+        `peak` and `force` (num_envs, 4) [N], `torque` (num_envs, 12) [N m], `termination` (num_envs,).
+        """
         return {
             "peak": env.sim.physics.peak_paw_force.numpy().T.copy(),
             "force": np.linalg.norm(env.sim.paw_force.numpy(), axis=2).T.copy(),
@@ -59,17 +62,26 @@ class SquatLog(EvaluationLog):
         return bool(self.ended.all())
 
     def in_window(self, values: list[np.ndarray]) -> np.ndarray:
-        """Return a history (arrays per policy step) within the window, of robots not ended, (steps, robots, ...)."""
+        """Return the part of a history within the evaluated window, of the robots not ended.
+
+        values: arrays per policy step; the result is (steps, robots, ...).
+        """
         return np.array(values[-round(self.window / self.step_dt) :])[:, ~self.ended]
 
     @property
     def force_range(self) -> np.ndarray:
-        """[N] (robots not ended,) Largest minus smallest force on a paw within the window, maximum over the paws."""
+        """Largest minus smallest force on a paw within the window [N], maximum over the paws.
+
+        One value for each robot that has not ended.
+        """
         return (self.in_window(self.peaks).max(axis=0) - self.in_window(self.forces).min(axis=0)).max(axis=1)
 
     @property
     def torque_ripple(self) -> np.ndarray:
-        """[N m] (robots not ended,) Standard deviation of a motor's torque within the window, RMS over motors."""
+        """Standard deviation of a motor's torque within the window [N m], RMS over motors.
+
+        One value for each robot that has not ended.
+        """
         return np.sqrt(self.in_window(self.torques).var(axis=0).mean(axis=1))
 
     def columns(self) -> dict[str, list]:

@@ -48,8 +48,9 @@ def device_memory(device: wp.Device) -> int:
 
 
 def baseline_ratios(checkout: Path | None, script: str, args: Any, metrics: Mapping[str, Any]) -> dict[str, float]:
-    """Run the same script of another checkout; return `<metric>_over_baseline`, ratios of all metrics with RATE.
+    """Run the same benchmark script of another checkout, and return this run's speeds relative to it.
 
+    Keys: `<metric>_over_baseline` for all metrics with RATE.
     checkout: root of the other checkout, None: no comparison; script: path within; args: dataclass with the flags of
     this run; metrics: of this run. Raises InputError: there is no such script, or it fails.
     """

@@ -25,7 +25,10 @@ VARIANTS: dict[str, dict[str, Any]] = {
 
 
 def variant(cfg: PpoCfg, name: str) -> PpoCfg:
-    """Return a copy of the settings with the changes of a variant. Raises InputError: `name` is not in VARIANTS."""
+    """Return a copy of the trainer's settings with the changes of a variant.
+
+    Raises InputError: `name` is not in VARIANTS.
+    """
     if name not in VARIANTS:
         raise InputError(f"variants are {', '.join(VARIANTS)}, got {name!r:.60}")
     return dataclasses.replace(cfg, **VARIANTS[name])

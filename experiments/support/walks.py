@@ -20,13 +20,16 @@ HOLD = 0.5  # [s] Time with an error below SETTLED after which a robot has settl
 
 
 def redirected_walks(env: Env, rng: np.random.Generator) -> VelocityLog:
-    """Return a new log of walks of 7 s whose random command (`step_commands`) changes after 3 s."""
+    """Return a new log of walks of 7 s whose commanded velocity changes after 3 s, see `step_commands`."""
     commands = step_commands(rng, env.num_envs, REACH, STEP)
     return VelocityLog(commands, env.task, 7.0, times=np.array([0.0, 3.0]))
 
 
 def sped_up_walks(env: Env) -> tuple[VelocityLog, np.ndarray]:
-    """Return a new log of walks whose command rises to a speed, and each robot's index in DIRECTIONS, (robots,)."""
+    """Return a new log of walks whose commanded velocity rises along one of DIRECTIONS, and these directions.
+
+    The directions are each robot's index in DIRECTIONS, (robots,).
+    """
     direction = np.arange(env.num_envs) % len(DIRECTIONS)
     commands = np.zeros((env.num_envs, 7, 3))
     for i, (axis, sign, highest) in enumerate(DIRECTIONS.values()):
@@ -45,7 +48,10 @@ def kicked_walks(env: Env, rng: np.random.Generator) -> VelocityLog:
 
 
 def speed_metrics(walks: VelocityLog, direction: np.ndarray) -> Metrics:
-    """Return `top_<direction>_<unit>` for DIRECTIONS; walks, direction: of `sped_up_walks`."""
+    """Return the top speed that robots keep in each of DIRECTIONS, as `top_<direction>_<unit>`.
+
+    walks, direction: of `sped_up_walks`.
+    """
     metrics: Metrics = {}
     for i, (name, (axis, _, _)) in enumerate(DIRECTIONS.items()):
         unit = "rad_s" if axis == 2 else "m_s"
@@ -94,8 +100,9 @@ def settling_times(walks: VelocityLog, hold: float | None = None) -> np.ndarray:
 
 
 def kept_speeds(walks: VelocityLog, axis: int, seconds: float, tolerance: float) -> np.ndarray:
-    """Return which robots kept their last command along an axis, (robots,) bool: mean over the last `seconds`.
+    """Return which robots kept their last commanded velocity along an axis, (robots,) bool.
 
+    A robot's velocity is the mean over the last `seconds`.
     axis: index of the component, the other two are ignored; tolerance [1]: relative error.
     """
     last = walks.velocity_history()[-round(seconds / walks.step_dt) :, :, axis].mean(axis=0)

@@ -54,7 +54,7 @@ class CompletionCfg:
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
-    """Print the script; modules: the user's, whose tasks are registered already."""
+    """Print the completion script of a shell; modules: the user's, whose tasks are registered already."""
     cfg = parse(CompletionCfg, "completion", args)
     from jumper_warp.registry import task_names
     from jumper_warp.utils.assets import policy_tasks
@@ -93,7 +93,7 @@ def settings_of(command: str) -> list[Any]:
 
 
 def options(flags: Iterable[Flag]) -> list[str]:
-    """Return the spellings of flags, each once, and those of every command."""
+    """Return the spellings of flags for completion, each once, and of the flags that every command has."""
     given = (option for flag in flags for option in flag.options)
     return list(dict.fromkeys([*given, TASK_MODULE, "--help", "--help-all"]))
 
@@ -108,5 +108,5 @@ def choices(flags: Iterable[Flag]) -> dict[str, list[str]]:
 
 
 def cases(words: dict[str, Iterable[str]] | dict[str, list[str]]) -> str:
-    """Return the branches of a `case` that set `words`."""
+    """Return the branches of the script's `case` statement: for each name, the words that complete it."""
     return "\n".join(f'            {name}) words="{" ".join(each)}" ;;' for name, each in words.items())

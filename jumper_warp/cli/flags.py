@@ -31,7 +31,7 @@ class Flag(NamedTuple):
 
     @property
     def positional(self) -> bool:
-        """Whether its value is given without the name."""
+        """Whether the argument is positional: its value is given without the name."""
         return tyro.conf.Positional in self.marks
 
     @property
@@ -52,7 +52,7 @@ class Flag(NamedTuple):
 
     @property
     def metavar(self) -> str:
-        """Placeholder of the value, such as "INT" or "{off,actor}"; empty for a switch."""
+        """Placeholder of the flag's value in help pages, such as "INT" or "{off,actor}"; empty for a switch."""
         return "" if self.kind is bool else metavar(self.kind)
 
 
@@ -109,7 +109,7 @@ def field_docs(kind: type) -> dict[str, str]:
 
 
 def metavar(kind: Any) -> str:
-    """Return the placeholder of a value of a type: INT, {a,b}, FLOAT FLOAT, TEXT ..."""
+    """Return the placeholder of a type's values in help pages: INT, {a,b}, FLOAT FLOAT, TEXT ..."""
     origin, parts = get_origin(kind), get_args(kind)
     if origin is Annotated:
         return metavar(parts[0])

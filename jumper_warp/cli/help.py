@@ -21,12 +21,12 @@ Short = Mapping[str, Sequence[str]]
 
 
 def wants_help(args: Sequence[str]) -> bool:
-    """Return whether the arguments ask for help."""
+    """Return whether command-line arguments ask for help."""
     return any(arg in (*HELP, HELP_ALL) for arg in args)
 
 
 def help_page(program: str, about: str, flags: Sequence[Flag], args: Sequence[str], short: Short | None = None) -> str:
-    """Return the page that `--help`, `--help-all` or `--help GROUP` among the arguments requests.
+    """Return the help page that `--help`, `--help-all` or `--help GROUP` among the arguments requests.
 
     program: command line without flags. about: what it does. short: flags of --help (default: all).
     Raises InputError: there is no such group.
@@ -58,7 +58,7 @@ def group_of(name: str, flags: Sequence[Flag]) -> list[Flag]:
 
 
 def top_groups(flags: Iterable[Flag]) -> dict[str, int]:
-    """Return the number of flags by first part of dotted names; of the group env by its first two parts."""
+    """Count the flags of each top-level group: the first part of dotted names, in `env` the first two parts."""
     groups: dict[str, int] = {}
     for flag in flags:
         parts = flag.name.split(".")
@@ -70,7 +70,7 @@ def top_groups(flags: Iterable[Flag]) -> dict[str, int]:
 
 
 def more(flags: Sequence[Flag]) -> str:
-    """Return the lines about the pages with further flags."""
+    """Return the lines at the end of a help page that name the pages with further flags."""
     lines = [f"--help-all prints all {len(flags)} flags in full."]
     if groups := ", ".join(f"{group} ({count})" for group, count in top_groups(flags).items()):
         lines[:0] = ["More flags, by group; --help GROUP prints one:", wrap(groups, indent=2)]
@@ -78,7 +78,7 @@ def more(flags: Sequence[Flag]) -> str:
 
 
 def short_sections(flags: Sequence[Flag], short: Short) -> str:
-    """Return the chosen flags below their headings, each with the first sentence of its description."""
+    """Return a short help text: chosen flags below headings, each with its description's first sentence."""
     by_name = {flag.name: flag for flag in flags}
     return "\n".join(
         f"{heading}:\n" + "".join(row(by_name[name], brief=True) for name in names) for heading, names in short.items()
@@ -86,7 +86,7 @@ def short_sections(flags: Sequence[Flag], short: Short) -> str:
 
 
 def sections(flags: Sequence[Flag], *, brief: bool = False) -> str:
-    """Return all flags below the names of their groups; flags of no group come first."""
+    """Return the help text of all flags, below the names of their groups; flags of no group come first."""
     groups: dict[str, list[Flag]] = {"": []}
     for flag in flags:
         groups.setdefault(flag.name.rpartition(".")[0], []).append(flag)
@@ -98,7 +98,7 @@ def sections(flags: Sequence[Flag], *, brief: bool = False) -> str:
 
 
 def row(flag: Flag, *, brief: bool = False) -> str:
-    """Return the lines of a flag: name and value on the left, description and default on the right.
+    """Return the help text of one flag: name and value on the left, description and default on the right.
 
     brief: with the first sentence of the description only.
     """
@@ -114,7 +114,7 @@ def row(flag: Flag, *, brief: bool = False) -> str:
 
 
 def columns(left: str, right: str) -> str:
-    """Return text in two columns, ending in a new line; a long left column has a line of its own."""
+    """Format help text in two columns, ending in a new line; a long left column has a line of its own."""
     lines = wrap(right, indent=INDENT).splitlines() or [""]
     if len(left) < INDENT:
         lines[0] = left.ljust(INDENT) + lines[0].lstrip()

@@ -26,7 +26,7 @@ UNBROKEN = "\N{NO-BREAK SPACE}"  # Printed as a space
 
 
 class Column(NamedTuple):
-    """Column of a policy's table."""
+    """Column of the table of a policy's results."""
 
     title: str
     key: str  # Of the metric in metrics.json
@@ -101,7 +101,7 @@ def _shown(path: Path) -> str:
 
 
 def results_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
-    """Return the lines of a policy's table: a line for each condition, of the first seed.
+    """Return the lines of the table of a policy's results: a line for each condition, of the first seed.
 
     rows: as in the policy's metrics.json.
     """
@@ -124,7 +124,7 @@ def results_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
 
 
 def _cell(key: str, metric: Mapping[str, Any] | None) -> str:
-    """Return a metric as text: a rate in per cent, else the value with its unit; empty if undefined."""
+    """Format a metric for a table: a rate in per cent, else the value with its unit; empty if undefined."""
     if metric is None or metric["value"] is None:
         return ""
     if key.endswith("_rate"):
@@ -133,7 +133,7 @@ def _cell(key: str, metric: Mapping[str, Any] | None) -> str:
 
 
 def properties(values: Mapping[str, str]) -> list[str]:
-    """Return a line, or several, for each value that is not empty, with its name before it."""
+    """Format named values as wrapped lines of text, each name before its value; empty values are left out."""
     lines = []
     for name, value in values.items():
         wrapped = textwrap.wrap(value, WIDTH - INDENT, break_long_words=False, break_on_hyphens=False)

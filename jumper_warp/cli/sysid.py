@@ -77,7 +77,7 @@ class ExciteCfg:
     threads: int | None = None  # CPU threads (default: all cores)
 
     def __post_init__(self) -> None:
-        """Raises InputError: a number is out of range."""
+        """Raise InputError if the number of candidates or of sets of motions is out of range."""
         if not (1 <= self.num_candidates <= 1000 and 1 <= self.num_sets <= 100):
             given = f"{self.num_candidates}, {self.num_sets}"
             raise InputError(f"num_candidates must be in 1 to 1000 and num_sets in 1 to 100, got {given}")
@@ -118,7 +118,10 @@ def split_names(text: str) -> list[str]:
 
 
 def sysid(cfg: SysidCfg) -> None:
-    """Identify the parameters, write the report and print a table of the results; raises as `run`."""
+    """Identify the robot's parameters from recorded motions, write the report and print the results as a table.
+
+    Raises as `run`.
+    """
     from rich.console import Console
     from rich.table import Table
 
@@ -161,7 +164,10 @@ def sysid(cfg: SysidCfg) -> None:
 
 
 def excite(cfg: ExciteCfg) -> None:
-    """Plan motions, record them on a simulated robot, and write npz files and excite.json; raises as `run`."""
+    """Plan motions for identification, record them on a simulated robot, and write npz files and excite.json.
+
+    Raises as `run`.
+    """
     import numpy as np
 
     from jumper_warp.identification.excitation import Scorer, choose, record_motions
@@ -193,7 +199,10 @@ def excite(cfg: ExciteCfg) -> None:
 
 
 def characterise(cfg: ActuatorCfg) -> None:
-    """Fit one motor's constants, print them with 95 % intervals, and write actuator.json; raises as `run`."""
+    """Fit one motor's constants to test-bench data, print them with 95 % intervals, write actuator.json.
+
+    Raises as `run`.
+    """
     from jumper_warp.identification.actuators import characterise_motor, load_bench
     from jumper_warp.utils.output import output_dir
 

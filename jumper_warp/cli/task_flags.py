@@ -26,7 +26,7 @@ NO_SOURCE = __package__
 
 
 class Setting(NamedTuple):
-    """A setting or a group of settings, as a field of a dataclass for tyro."""
+    """Setting of a task, or a group of settings, as a field of a dataclass that tyro turns into flags."""
 
     kind: Any  # type of the setting, for tyro
     value: Any  # default; of a group, an instance of its dataclass
@@ -73,7 +73,7 @@ def _flag_of_dataclass(value: Any, where: str) -> Setting | None:
 
 
 def _flag_of_term(term: Term, where: str) -> Setting | None:
-    """Return the flags of a term's numbers and integer options."""
+    """Return the flags of a task term's numerical settings and integer options."""
     settings = {**term.settings, **term.options}
     numbers = term.numbers | {key: option for key, option in term.options.items() if type(option) is int}
     kinds = {int: int, tuple: tuple[float, float]}
@@ -82,7 +82,7 @@ def _flag_of_term(term: Term, where: str) -> Setting | None:
 
 
 def _group(about: str | None, flags: dict[str, Setting], where: str) -> Setting:
-    """Return flags as one group, an instance of a frozen dataclass. Raises InputError: two flags have one name."""
+    """Combine flags into one group, an instance of a frozen dataclass. Raises InputError: two flags have one name."""
     names = [flag_name(name) for name in flags]
     if len(set(names)) < len(names) or "" in names:
         raise InputError(f"{where}: the names of {', '.join(flags)} make the same flags")
@@ -97,7 +97,7 @@ def _group(about: str | None, flags: dict[str, Setting], where: str) -> Setting:
 
 
 def _members(group: Any) -> dict[str, Any]:
-    """Return the values of a group, an instance of a dataclass by `_group`, by flag name."""
+    """Return the values of a group of flags by name; group: an instance of a dataclass by `_group`."""
     return {spec.metadata["flag"]: getattr(group, spec.name) for spec in dataclasses.fields(group)}
 
 

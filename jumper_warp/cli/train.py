@@ -103,7 +103,10 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
 
 
 def with_preset(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
-    """Return a task's unparsed flags after those of their --preset. Raises UsageError: the task has no such preset."""
+    """Put the flags of a task's --preset before the other unparsed flags, which have precedence.
+
+    Raises UsageError: the task has no such preset.
+    """
     names = values_of("--preset", args)
     if not names:
         return list(args)

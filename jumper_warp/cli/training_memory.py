@@ -41,7 +41,7 @@ class MemoryPool(NamedTuple):
     need: MemoryNeed
 
     def max_worlds(self) -> int:
-        """Return the number of worlds that fit."""
+        """Return the number of worlds whose training fits into the free memory."""
         return (self.free - self.need.fixed) // self.need.per_world
 
 

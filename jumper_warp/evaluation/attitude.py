@@ -66,7 +66,10 @@ class AttitudeLog(EvaluationLog):
         env.evaluation_reset(self.turns)
 
     def read_env(self, env: Any) -> dict[str, np.ndarray]:
-        """Return `Env.task_arrays`, and `base_ang_vel` (num_envs, 3): angular velocity [rad/s], world axes."""
+        """Return the task's arrays and the base's angular velocity [rad/s] by name, for `update`.
+
+        `Env.task_arrays`, and `base_ang_vel` (num_envs, 3), world axes.
+        """
         return env.task_arrays() | {"base_ang_vel": env.sim.joint_qd()[:, 3:6].copy()}
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
@@ -107,7 +110,7 @@ class AttitudeLog(EvaluationLog):
 
     @property
     def trials(self) -> dict[str, np.ndarray]:
-        """Sets of turns that metrics refer to, by name: masks (num_envs,)."""
+        """Subsets of the turns over which metrics are computed, by name: masks (num_envs,)."""
         return {"turns": np.full(self.count, True), "turns that settled": ~np.isnan(self.settling_time),
                 "turns that reached the goal": ~np.isnan(self.first_time),
                 "turns that did not diverge": ~self.diverged}  # fmt: skip
@@ -152,12 +155,18 @@ TURN_METRICS = (
 
 
 def turn_metrics(turns: AttitudeLog, prefix: str = "", note: str = "") -> Metrics:
-    """Return the metrics TURN_METRICS of a log of turns; prefix, note: see `measure`."""
+    """Return success rate, settling times, errors and failures of a log of turns, the metrics TURN_METRICS.
+
+    prefix, note: see `measure`.
+    """
     return measure(TURN_METRICS, turns, None, prefix, note)
 
 
 def axis_metrics(turns: AttitudeLog) -> Metrics:
-    """Return three of TURN_METRICS for each of DIRECTIONS, as `<direction>_<key>`; turns: log of `axis_turns`."""
+    """Return success rate, settling time and final error of turns about each body axis and direction.
+
+    Keys: `<direction>_<key>` for DIRECTIONS; turns: log of `axis_turns`.
+    """
     rows = chosen(TURN_METRICS, "settling_time_mean_s", "settled_without_collision_rate", "error_at_end_mean_deg")
     number, metrics = np.arange(turns.count) % len(DIRECTIONS), {}
     for i, name in enumerate(DIRECTIONS):
@@ -187,7 +196,7 @@ class AttitudeFlags:
         return AttitudeLog(axis_turns(self.num_turns, self.angle), self.tolerance, self.seconds)
 
     def metrics(self, log: AttitudeLog) -> Metrics:
-        """Return `turn_metrics` and `axis_metrics` of a finished log."""
+        """Return the metrics of a finished log of turns, together and for each axis and direction."""
         return turn_metrics(log) | axis_metrics(log)
 
 

@@ -65,7 +65,7 @@ class CourseLog(EvaluationLog):
     spacing = 2.0
 
     def __post_init__(self) -> None:
-        """Allocate the log. Raises InputError: scripts are empty or of different lengths."""
+        """Allocate the log of all robots. Raises InputError: scripts are empty or of different lengths."""
         lengths = {len(script) for script in self.scripts}
         if len(lengths) != 1 or 0 in lengths:
             raise InputError(f"scripts must have equal, positive lengths, got {sorted(lengths)} commands")
@@ -97,7 +97,7 @@ class CourseLog(EvaluationLog):
 
     @property
     def block(self) -> BlockCfg | None:
-        """Block of these scripts for `Env(block=...)`: BLOCK if any command is a jump onto it, else None."""
+        """Block that the scripts' jumps land on, for `Env(block=...)`; None if no command is a jump onto it."""
         return BLOCK if self.onto_block.any() else None
 
     @property
@@ -267,7 +267,10 @@ class CourseLog(EvaluationLog):
         return square_sums(error)
 
     def columns(self) -> dict[str, list]:
-        """Return lists with one value per robot: end, commands_done, largest apex_error_m and landing_error_m."""
+        """Return results as lists with one value per robot: end, commands done, largest errors of jumps [m].
+
+        Keys: end, commands_done, apex_error_m, landing_error_m.
+        """
         worst = {"apex_error_m": _row_max(np.abs(self.apex_error)), "landing_error_m": _row_max(self.landing_error)}
         done = {"end": self.outcomes.tolist(), "commands_done": (self.finish_step >= 0).sum(axis=1).tolist()}
         return done | {name: finite(values) for name, values in worst.items()}
@@ -299,13 +302,13 @@ class CourseLog(EvaluationLog):
 
 
 def _row_max(values: np.ndarray) -> np.ndarray:
-    """Return the largest finite value of each row of values (rows, columns), NaN for rows without one."""
+    """Return the largest finite value in each row of a matrix (rows, columns), NaN for rows without one."""
     known = np.isfinite(values)
     return np.where(known.any(axis=1), np.where(known, values, -np.inf).max(axis=1), np.nan)
 
 
 def course_metrics(course: CourseLog) -> Metrics:
-    """Return the metrics of a course over all robots.
+    """Return rates of finished courses and falls, errors of jumps and tracking, and forces at handovers.
 
     `finished_rate` is the fraction of robots that finished every command without a fall; it ignores errors.
     `finished_on_goal_rate` also requires all jumps within 0.1 m of their goals. Tracking errors are those of slewed

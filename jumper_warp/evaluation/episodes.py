@@ -99,7 +99,10 @@ class EpisodeLog(EvaluationLog):
 
 
 def episode_metrics(episodes: EpisodeLog) -> Metrics:
-    """Return the metrics of a log of episodes; `ended_by_<outcome>_rate` is the rate of a termination."""
+    """Return rates of outcomes, and mean length, base height and displacement, of a log of episodes.
+
+    `ended_by_<outcome>_rate` is the rate of a termination.
+    """
     running, over = episodes.end < 0, "episodes"
     success, timed_out = episodes.ended_with("success"), episodes.ended_with("time_out")
     displacement, distance = episodes.displacement, np.linalg.norm(episodes.displacement, axis=1)
@@ -148,7 +151,7 @@ class EpisodeFlags:
         return EpisodeLog(tile_command(self.command, self.num_episodes, task), task, self.seconds)
 
     def metrics(self, log: EpisodeLog) -> Metrics:
-        """Return `episode_metrics` of a finished log."""
+        """Return lengths, heights and outcomes of a finished log of episodes as metrics."""
         return episode_metrics(log)
 
 

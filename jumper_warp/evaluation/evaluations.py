@@ -83,7 +83,7 @@ EVALUATIONS: dict[str, Evaluation] = {
 
 
 def evaluation_of(task: TaskCfg) -> Evaluation:
-    """Return the evaluation of a task. Raises PolicyError: EVALUATIONS lacks its `evaluation_suite`."""
+    """Return how policies of a task are evaluated. Raises PolicyError: EVALUATIONS lacks `evaluation_suite`."""
     if task.evaluation_suite not in EVALUATIONS:
         known = f"known are {[*EVALUATIONS]}"
         raise PolicyError(f"{task.name}: unknown evaluation_suite {task.evaluation_suite!r:.60}; {known}")

@@ -40,10 +40,10 @@ AIM_ROUNDS = 3  # Maximum number of corrections of the aim
 
 
 def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] = ()) -> list[JumpGroup]:
-    """Return the groups of jumps `nominal`, `late` (with latency) and `randomized`, without empty ones.
+    """Build the groups of simulated jumps for fine-tuning: `nominal`, `late` (with latency), `randomized`.
 
-    Goals are evenly spaced over the range in `cfg`. modules: the user's task modules. Raises InputError: the policy
-    does not jump.
+    Empty groups are left out. Goals are evenly spaced over the range in `cfg`. modules: the user's task modules. Raises
+    InputError: the policy does not jump.
     """
     rng, groups = np.random.default_rng(purpose_seed("tuning", cfg.seed)), []
 
@@ -152,8 +152,9 @@ def correct_aim(
 def tune_weights(
     groups: list[JumpGroup], network: Network, cfg: FinetuneCfg, log: Callable[[str], object], begin: float
 ) -> list[dict[str, Any]]:
-    """Take Gauss-Newton steps on the network's weights in place; return one record before them and one per step.
+    """Reduce the errors of jumps by Gauss-Newton steps on the network's weights, in place.
 
+    Returns one record before the steps and one per step.
     Keys: step, mean_abs_miss_m (by group [m]), cost, action_change (RMS [1]), seconds since `begin`, a value of
     `time.perf_counter`. A step that does not lower the cost is undone. log: prints a line of progress.
     """

@@ -25,7 +25,10 @@ HUBER = 0.02  # [m] Threshold of the Huber weight: larger errors, as of robots t
 
 
 class JumpErrors(NamedTuple):
-    """Errors of a group of n jumps; m = n for apex heights, m = 2n for landing positions (all x, then all y, world)."""
+    """Errors of a group of n jumps in apex height or landing position, with derivatives.
+
+    m = n for apex heights, m = 2n for landing positions (all x, then all y, world).
+    """
 
     value: torch.Tensor  # (m,) [m] Errors, 0 where not valid
     jacobian: torch.Tensor  # (m, weights) [m] Derivatives with respect to the network's weights; empty if not requested
@@ -55,13 +58,16 @@ class JumpGroup:
         self.loop.read_parameters()
 
     def importance(self, errors: JumpErrors) -> torch.Tensor:
-        """Return the weights of the errors in the cost, (m,): Huber weight / (std² · number of errors)."""
+        """Return the weights (m,) of the jumps' errors in the fine-tuning cost.
+
+        A weight is the Huber weight / (std² · number of errors), 0 for an invalid jump.
+        """
         huber = (HUBER / errors.value.abs().clamp(min=1.0e-9)).clamp(max=1.0)
         return torch.where(errors.valid, huber, 0.0) / (self.std**2 * len(errors.value))
 
 
 def apex_heights(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np.ndarray]) -> list[torch.Tensor]:
-    """Return [heights], the differentiable base heights at the apex [m], (n,).
+    """Return the differentiable base heights at the apex [m], in a list with one entry (n,).
 
     states: of every policy step; arrays: `env.task_arrays` after the last one, whose `max_height` picks the step.
     """
@@ -72,8 +78,9 @@ def apex_heights(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np
 
 
 def ballistic_landing(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np.ndarray]) -> list[torch.Tensor]:
-    """Return [x, y], (n,) each, the differentiable landing point [m], world, of the ballistic flight from the apex.
+    """Return the differentiable landing point [m] of the ballistic flight from the apex, [x, y].
 
+    Each is (n,), world frame.
     states, arrays: see `apex_heights`. The base lands at LANDING_HEIGHT.
     """
     reached = torch.as_tensor(arrays["max_height"], device=states[0].q.device)
@@ -125,7 +132,10 @@ def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> Jum
 
 
 def _landing_errors(env: Env, network: Network) -> list[np.ndarray]:
-    """Continue the jumps until REST_TIME after touchdown; return [x, y], (n,) each: base minus goal [m], world."""
+    """Continue the jumps until REST_TIME after touchdown; return the bases' distances from the goals [m].
+
+    The result is [x, y], (n,) each: base minus goal, world axes.
+    """
     rest = round(REST_TIME / env.step_dt)
     with torch.no_grad():
         for _ in range(3 * rest):  # on Mars the fall from the apex takes up to 1.4 s

@@ -70,13 +70,19 @@ IN_RANGE = ("success_rate", "goal_reached_rate", "no_paw_lift_rate", "apex_error
 
 
 def jump_metrics(outcome: JumpOutcome, where: np.ndarray | None = None, prefix: str = "", note: str = "") -> Metrics:
-    """Return the metrics of jumps, HEIGHT_METRICS or PLACE_METRICS; arguments: see `measure`."""
+    """Return success rates, errors and failures of jumps to heights or to landing positions.
+
+    These are HEIGHT_METRICS or PLACE_METRICS; arguments: see `measure`.
+    """
     table = HEIGHT_METRICS if outcome.to_height.all() else PLACE_METRICS
     return measure(table, outcome, where, prefix, note)
 
 
 def range_metrics(outcome: JumpOutcome, inside: np.ndarray, note: str) -> Metrics:
-    """Return the metrics IN_RANGE of selected jumps, as `in_range_<key>`; inside: mask; note: its description."""
+    """Return success rates and mean errors of the jumps with goals within a range, as `in_range_<key>`.
+
+    Keys: IN_RANGE; inside: mask of these jumps; note: description of the range.
+    """
     table = HEIGHT_METRICS if outcome.to_height.all() else PLACE_METRICS
     return measure(chosen(table, *IN_RANGE), outcome, inside, "in_range_", note)
 

@@ -41,7 +41,10 @@ TERMINATIONS = (DIVERGED, "low_base", COLLIDED, "no_jump", SUCCESS)
 
 
 def with_jump_terminations(task: TaskCfg) -> TaskCfg:
-    """Return a copy of the task with only TERMINATIONS, without those for training."""
+    """Return a copy of the task with the terminations of evaluated jumps, TERMINATIONS.
+
+    Terminations for training are left out.
+    """
     return with_terminations(task, TERMINATIONS)
 
 
@@ -68,7 +71,7 @@ def jump_commands(goals: np.ndarray, delay: np.ndarray | float, step_dt: float) 
 
 @dataclass(frozen=True)
 class JumpOutcome:
-    """Outcomes of jumps: events and errors, arrays of shape (num_envs, jumps in a row)."""
+    """Outcomes of simulated jumps: events and errors, arrays of shape (num_envs, jumps in a row)."""
 
     commanded: np.ndarray  # Whether the jump was commanded
     to_height: np.ndarray  # Whether the goal is an apex height, else a place
@@ -101,7 +104,7 @@ class JumpOutcome:
 
     @property
     def trials(self) -> dict[str, np.ndarray]:
-        """Sets of jumps that metrics refer to, by name: masks of the shape of the arrays."""
+        """Subsets of the jumps over which metrics are computed, by name: masks of the shape of the arrays."""
         return {
             "jumps": self.commanded, "jumps that touched down": self.touched_down, "landed jumps": self.landed,
             "successful jumps": self.success, "jumps that did not diverge": self.commanded & ~self.diverged,
@@ -114,7 +117,7 @@ class JumpOutcome:
         return np.select(*zip(*kinds, strict=True), default=np.where(self.landed, "not_at_rest", ""))
 
     def arrays(self) -> dict[str, np.ndarray]:
-        """Return all arrays by name, flattened to (jumps,)."""
+        """Return events and errors of all jumps by name, flattened to (jumps,)."""
         return {field.name: getattr(self, field.name).ravel() for field in fields(self)}
 
 
@@ -212,7 +215,7 @@ class JumpLog(EvaluationLog):
         env.evaluation_reset(jump_commands(self.goals[:, 0], self.delay, env.step_dt), self.headings)
 
     def read_env(self, env: Env) -> dict[str, np.ndarray]:
-        """Return `Env.task_arrays` and `paw_arrays`."""
+        """Return the task's arrays, and contacts, positions and upward speed of `paw_arrays`, for `update`."""
         return env.task_arrays() | paw_arrays(env)
 
     def record_step(self, env: Env) -> bool:

@@ -61,8 +61,9 @@ def open_loop_limits(env: Env, initial_state: dict[str, Any]) -> np.ndarray:
 
 
 def limit_metrics(outcome: JumpOutcome, target: np.ndarray, limit: np.ndarray, inside: np.ndarray) -> Metrics:
-    """Return the metrics of jumps to heights over reachable heights, i.e. at most TOLERANCE above the open-loop apex.
+    """Return metrics of jumps to heights, by whether the robot's open-loop jump reaches that height.
 
+    A height is reachable if it is at most TOLERANCE above the open-loop apex.
     limit [m]: open-loop apex of the same robots, (num_envs, 1). `open_loop_apex_error_abs_mean_m` is the error of ideal
     jumps that cannot exceed the limit. target [m], inside: commanded heights and mask of those in range.
     """

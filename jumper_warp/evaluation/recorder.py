@@ -90,7 +90,7 @@ class EnvRecorder:
 
 
 def save_recording(recording: Recording, folder: Path, name: str) -> Path:
-    """Write `<name>.rrd` for the Rerun viewer and `<name>.png`, a composite picture of one world; return the first."""
+    """Write a recording as `<name>.rrd` (Rerun) and `<name>.png` (picture of one world); return the first."""
     from jumper_warp.viz.picture import write_picture
     from jumper_warp.viz.rerun import write_rrd
 

@@ -235,7 +235,7 @@ class EvaluationRun(Run):
         return self.report(flags.metrics(log), self.evaluation.paper)
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return the function `act` of the policy."""
+        """Return the policy's function from observations to actions, `Policy.act`."""
         return self.policy.act
 
     def env(
@@ -275,7 +275,10 @@ class SkillRun(Run):
         return run
 
     def actor(self, env: Env) -> Callable[[torch.Tensor], torch.Tensor]:
-        """Return a function that ignores its argument and returns all skills' actions, (skills, num_envs, 12)."""
+        """Return a function that returns the actions of all skills, (skills, num_envs, 12).
+
+        Its argument is ignored: every skill reads its own observation of `env`.
+        """
         return lambda obs: self.skills.act(env)
 
     def env(self, count: int, **scene: Any) -> Env:

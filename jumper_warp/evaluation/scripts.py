@@ -99,7 +99,10 @@ def _step(index: int, item: Any) -> ScriptStep:
 
 
 def _seconds(where: str, value: Any) -> float:
-    """Check and return a positive time [s] up to MAX_SECONDS; where: prefix of messages. Raises InputError."""
+    """Check and return a duration [s] in a script: positive, at most MAX_SECONDS. Raises InputError.
+
+    where: prefix of messages.
+    """
     (seconds,) = _numbers(f"{where}: seconds", [value], 1, MAX_SECONDS)
     if not seconds > 0.0:
         raise InputError(f"{where}: seconds must be positive, got {seconds:g}")
@@ -107,7 +110,10 @@ def _seconds(where: str, value: Any) -> float:
 
 
 def _numbers(where: str, values: Sequence[Any], count: int, most: float) -> tuple[float, ...]:
-    """Check and return `count` finite floats within ±most; where: prefix of messages. Raises InputError."""
+    """Check and return the numbers of a script's command: `count` finite floats within ±most.
+
+    where: prefix of messages. Raises InputError.
+    """
     good = len(values) == count and all(
         isinstance(v, int | float) and not isinstance(v, bool) and math.isfinite(v) and abs(v) <= most for v in values
     )

@@ -171,7 +171,7 @@ class Consecutive(Suite):
         check(min(trials, jumps) >= 1, f"need at least one trial and one jump in it, got {trials}, {jumps}")
 
     def measure(self, run: EvaluationRun) -> Metrics:
-        """Run pairs and long rows, plot the paths of the bases, and return the metrics."""
+        """Run pairs and long sequences of jumps, plot the paths of the bases, and return the metrics."""
         rng = np.random.default_rng(self.stream_seed)
         pairs = np.repeat(np.array(list(PAIRS.values())), self.num_jumps, axis=0)
         rows = rng.uniform(ROW_LOWER, ROW_UPPER, (self.num_trials, self.jumps_per_trial, 2))
@@ -188,7 +188,10 @@ class Consecutive(Suite):
 
 
 def consecutive_metrics(pairs: LandingLog, row: LandingLog) -> Metrics:
-    """Return the metrics of pairs (first half diagonal, second half straight), and of long rows as `row_<key>`."""
+    """Return the metrics of pairs of jumps, and of long sequences of jumps as `row_<key>`.
+
+    pairs: the first half diagonal, the second half straight.
+    """
     first, rows = pairs.outcome, row.outcome
     errors = chosen(PLACE_METRICS, "goal_distance_at_rest_mean_m")
     halves, numbers = np.arange(2).repeat(len(first.landed) // 2)[:, None], np.arange(2)
@@ -307,7 +310,7 @@ class Farthest(Suite):
         return distance[:, None, None] * np.array([math.cos(angle), math.sin(angle)])
 
     def measure(self, run: EvaluationRun) -> Metrics:
-        """Run bins of growing distance until success is below GIVEN_UP, plot them, and return the metrics."""
+        """Run jumps to ever farther goals until success is below GIVEN_UP, plot them, and return the metrics."""
         env, bins = run.env(self.num_jumps), {}
         for number in range(round((self.max_distance - self.min_distance) / BIN) + 1):
             middle = round(self.min_distance + number * BIN, 6)
@@ -341,7 +344,7 @@ def rectangle(x0: float, x1: float, y0: float, y1: float) -> np.ndarray:
 
 
 def distance_metrics(bins: dict[float, LandingLog]) -> Metrics:
-    """Return the metrics over all bins, reliable distances, and lists `bin_<key>` with one entry per bin.
+    """Return reliable jump distances, the metrics of all jumps, and those of each bin as lists `bin_<key>`.
 
     bins: logs by distance at the bin's middle [m], ascending.
     """

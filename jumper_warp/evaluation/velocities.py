@@ -77,12 +77,18 @@ class VelocityLog(EvaluationLog):
         return np.where(np.isinf(limit), target, last + np.clip(target - last, -limit, limit))
 
     def _target(self, steps: ArrayLike) -> np.ndarray:
-        """Return the commands without slewing at policy steps (n,), (n, robots, 3)."""
+        """Return the commanded velocities before the limit on their rate, at policy steps (n,).
+
+        The result is (n, robots, 3).
+        """
         index = np.searchsorted(np.round(self.times / self.step_dt), steps, side="left") - 1
         return self.commands[:, np.maximum(index, 0)].transpose(1, 0, 2)
 
     def read_env(self, env: Env) -> dict[str, np.ndarray]:
-        """Return base_pos, base_quat (xyzw), base_vel, base_ang_vel (world), termination; set commands and kicks."""
+        """Return base state and termination of the robots for `update`, and set due commands and kicks.
+
+        Keys: base_pos, base_quat (xyzw), base_vel, base_ang_vel (world axes), termination.
+        """
         sim = env.sim
         q, qd = sim.joint_q(), sim.joint_qd()
         arrays = {"base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_vel": sim.base_velocity(),
@@ -148,18 +154,21 @@ class VelocityLog(EvaluationLog):
 
     @property
     def trials(self) -> dict[str, np.ndarray]:
-        """Sets of robots that metrics refer to, by name: masks (robots,)."""
+        """Subsets of the robots over which metrics are computed, by name: masks (robots,)."""
         stands, slewed = ~self.commands.any(axis=(1, 2)), np.isfinite(self._slew)
         return {"robots": np.full(self.count, True), "robots with commands at once": ~stands & ~slewed,
                 "robots with slewed commands": ~stands & slewed,
                 "robots that stood to the end": stands & ~self.fallen}  # fmt: skip
 
     def square_errors(self, *, settled: bool) -> np.ndarray:
-        """Return sums of squared errors and numbers of samples, (robots, 3, 2); settled: see `errors`."""
+        """Return sums of squared tracking errors and numbers of samples, (robots, 3, 2).
+
+        settled: see `errors`.
+        """
         return square_sums(self.errors(settled=settled))
 
     def errors(self, *, settled: bool = False) -> np.ndarray:
-        """Return velocity minus command, (steps, robots, 3); NaN after a fall.
+        """Return the tracking errors, velocity minus command, (steps, robots, 3); NaN after a fall.
 
         settled: also NaN for SETTLING_TIME after each command.
         """
@@ -208,12 +217,18 @@ def velocity_series(velocity: np.ndarray, command: np.ndarray, names: Sequence[s
 
 
 def square_sums(error: np.ndarray) -> np.ndarray:
-    """Return sums of squares, and numbers, of values other than NaN, (robots, 3, 2); error: (steps, robots, 3)."""
+    """Sum the squares of tracking errors over time, and count the values, without NaN: (robots, 3, 2).
+
+    error: (steps, robots, 3).
+    """
     return np.stack([np.nansum(error**2, axis=0), np.isfinite(error).sum(axis=0)], axis=-1)
 
 
 def rmse_rows(prefix: str, over: str, *, settled: bool) -> list[Metric]:
-    """Return the metrics `<prefix>rmse_<axis>_<unit>` of a `VelocityLog`; over: name of a set of its robots."""
+    """Return the definitions of the RMS tracking errors of each axis as metrics of a `VelocityLog`.
+
+    Keys: `<prefix>rmse_<axis>_<unit>`; over: name of a set of its robots, in `VelocityLog.trials`.
+    """
     keys = [f"{prefix}rmse_{axis}_{unit}" for axis, unit in zip(AXES, UNITS, strict=True)]
     return [
         Metric(key, rmse, over, lambda o, i=i: o.square_errors(settled=settled)[:, i]) for i, key in enumerate(keys)
@@ -271,7 +286,7 @@ class VelocityFlags:
         return VelocityLog(np.concatenate([commands, commands, standing]), task, self.seconds, times=times, slew=slew)
 
     def metrics(self, log: VelocityLog) -> Metrics:
-        """Return the metrics of a finished log."""
+        """Return tracking errors, drift and fall rate of a finished log of walks, VELOCITY_METRICS."""
         return measure(VELOCITY_METRICS, log)
 
 

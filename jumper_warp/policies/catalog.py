@@ -41,7 +41,10 @@ class PolicySummary:
 
     @property
     def metrics(self) -> dict[str, Any]:
-        """Metrics of the first row, which is nominal in the project's policies, as in metrics.json; may be empty."""
+        """Metrics of the policy's first test condition, as in metrics.json; may be empty.
+
+        In the project's policies this is the nominal robot.
+        """
         return self.rows[0]["metrics"] if self.rows else {}
 
     @property
@@ -54,7 +57,7 @@ class PolicySummary:
 
     @property
     def error(self) -> dict[str, Any] | None:
-        """Mean error as in metrics.json, with value and unit; None: not evaluated."""
+        """Mean error of the policy at its task, with value and unit as in metrics.json; None: not evaluated."""
         return next((self.metrics[key] for key in ERRORS if key in self.metrics), None)
 
 

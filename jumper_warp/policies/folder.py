@@ -71,7 +71,10 @@ def save_policy(
 
 
 def checked_folder(folder: Path) -> Path:
-    """Return the path of a policy's folder. Raises PolicyError: it has the suffix of a file."""
+    """Check the path of a policy's folder, and return it.
+
+    Raises PolicyError: it has the suffix of a file.
+    """
     folder = Path(folder)
     if folder.suffix.lower() in FILE_SUFFIXES:
         raise PolicyError(f"a policy is saved as a folder, whose name cannot end in {folder.suffix}: got {folder}")
@@ -92,7 +95,7 @@ def add_files(folder: Path, files: Mapping[str, bytes]) -> None:
 
 
 def _write(folder: Path, files: Mapping[str, bytes], checksums: Mapping[str, str]) -> None:
-    """Write files (name to content), then the manifest. Raises PolicyError: a name is malformed.
+    """Write a policy's files (name to content), then its manifest. Raises PolicyError: a name is malformed.
 
     checksums: SHA-256 by name of the files that the folder has already; the manifest keeps them.
     """
@@ -125,7 +128,10 @@ def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
 
 
 def _verified_checksums(folder: Path) -> dict[str, str]:
-    """Return the manifest's SHA-256 by file name, after verifying version and files. Raises PolicyError."""
+    """Verify a policy's version and files, and return the manifest's SHA-256 by file name.
+
+    Raises PolicyError.
+    """
     path = folder / MANIFEST
     manifest = _parse_json(path, _read_bytes(path))
     if manifest.get("format") != FORMAT:
@@ -148,7 +154,10 @@ def _check_version(path: Path, content: Mapping[str, Any]) -> None:
 
 
 def _read_verified(path: Path, digest: Any) -> bytes:
-    """Return a file's content. Raises PolicyError: it cannot be read, or its SHA-256 is not `digest`."""
+    """Read a policy's file, and verify its SHA-256.
+
+    Raises PolicyError: it cannot be read, or its SHA-256 is not `digest`.
+    """
     data = _read_bytes(path)
     if hashlib.sha256(data).hexdigest() != digest:
         raise PolicyError(f"{path}: truncated or altered, its SHA-256 is not the manifest's")
@@ -156,7 +165,10 @@ def _read_verified(path: Path, digest: Any) -> bytes:
 
 
 def _read_bytes(path: Path) -> bytes:
-    """Return a file's content. Raises PolicyError: it cannot be read, is not a regular file, or is too large."""
+    """Read a regular file of limited size.
+
+    Raises PolicyError: it cannot be read, is not a regular file, or is too large.
+    """
     try:
         status = path.stat()
         if not stat.S_ISREG(status.st_mode):

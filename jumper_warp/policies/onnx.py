@@ -53,7 +53,7 @@ class _GraphBuilder:
         return output
 
     def weight(self, layer: int, value: np.ndarray) -> str:
-        """Add the weight of a layer, (out, in); if two equal blocks are its diagonal, as one padded block."""
+        """Add a layer's weight, (out, in), to the graph; two equal blocks on its diagonal are stored once."""
         name, block = f"actor_{layer}_weight", _repeated_block(value)
         if block is None:
             return self.constant(name, value)
@@ -66,7 +66,10 @@ class _GraphBuilder:
 
 
 def _repeated_block(weight: np.ndarray) -> np.ndarray | None:
-    """Return the block B (out / 2, in / 2) of a weight that is bitwise block diagonal with B and B, else None."""
+    """Return the block that a mirror-symmetric layer's weight has twice on its diagonal, else None.
+
+    The comparison is bitwise; the block is (out / 2, in / 2), and the rest of the weight zero.
+    """
     rows, columns = (size // 2 for size in weight.shape)
     bits = weight.view(np.int32)
     if weight.shape != (2 * rows, 2 * columns) or bits[:rows, columns:].any() or bits[rows:, :columns].any():

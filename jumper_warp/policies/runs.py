@@ -92,8 +92,9 @@ class CheckpointContents:
 
     @classmethod
     def from_rsl_rl(cls, state: Any, config: Any) -> CheckpointContents:
-        """Return the contents of a loaded checkpoint of rsl-rl; config: `env`, as `Env.config`, and perhaps `train`.
+        """Read the policy data in a loaded checkpoint of rsl-rl.
 
+        config: `env`, as `Env.config`, and perhaps `train`.
         Raises TaskError: the task has another version. CheckpointError: a part is missing or of another type.
         """
         try:
@@ -119,7 +120,7 @@ class CheckpointContents:
 
     @classmethod
     def from_dict(cls, state: dict[str, Any]) -> CheckpointContents:
-        """Return the contents of a loaded checkpoint.
+        """Read the policy data in a loaded checkpoint of this package.
 
         Raises TaskError: its task has another version. CheckpointError: a part is missing or of another type.
         """
@@ -145,7 +146,10 @@ class CheckpointContents:
             raise CheckpointError(f"not a training checkpoint of this project ({reason})") from error
 
     def policy(self) -> Policy:
-        """Build the policy. Raises PolicyError: interface, layers and statistics contradict each other."""
+        """Build the policy from the checkpoint's data.
+
+        Raises PolicyError: interface, layers and statistics contradict each other.
+        """
         description = {**self.interface, "observation_limit": RAW_LIMIT, "normalised_limit": self.limit}
         network = {"hidden": self.hidden, "activation": self.activation}
         interface = make_interface(description, policy_dt=self.policy_dt, physics_dt=self.physics_dt, **network)
@@ -204,9 +208,9 @@ def learning_curve(source: Path) -> bytes | None:
 
 
 def thinned_curve(metrics: bytes) -> bytes:
-    """Reduce a metrics file to the columns CURVE and at most CURVE_ROWS evenly spaced lines of JSON.
+    """Reduce a metrics file to a short learning curve: columns CURVE, at most CURVE_ROWS lines of JSON.
 
-    The first and the last line are included, malformed lines are omitted.
+    The lines are evenly spaced. The first and the last line are included, malformed lines are omitted.
     """
     rows = [row for line in metrics.splitlines() if (row := _curve_row(line))]
     last = len(rows) - 1
@@ -215,7 +219,7 @@ def thinned_curve(metrics: bytes) -> bytes:
 
 
 def _curve_row(line: bytes) -> dict[str, Any]:
-    """Return the entries CURVE of a line of metrics; empty for a malformed line."""
+    """Return the learning curve's values (keys CURVE) in one line of metrics; empty for a malformed line."""
     try:
         row = json.loads(line)
         return {name: row[name] for name in CURVE if name in row}

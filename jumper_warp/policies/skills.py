@@ -51,7 +51,10 @@ class SkillPolicies:
         self.skills, self.handovers = self._skills_and_handovers(Conditions())
 
     def _skills_and_handovers(self, conditions: Conditions) -> tuple[list[TaskCfg], list[Handover]]:
-        """Return the tasks in given conditions, and handovers between them. Raises PolicyError: tasks do not fit."""
+        """Return the skills' tasks in test conditions, and the handovers between skills.
+
+        Raises PolicyError: the tasks do not fit.
+        """
         walk, *jumps = (conditions.applied(task) for task in self.tasks)
         try:
             return skills_and_handovers(walk, tuple(jumps))

@@ -96,12 +96,15 @@ class PolicyInterface:
         return (len(self.observation_names), *self.hidden, len(self.joint_names))
 
     def to_json(self) -> dict[str, Any]:
-        """Return the fields as a JSON object."""
+        """Return the interface's fields as a JSON object."""
         return dataclasses.asdict(self)
 
     @classmethod
     def from_json(cls, data: Any) -> PolicyInterface:
-        """Return the interface from the result of `to_json`. Raises PolicyError: fields are missing or invalid."""
+        """Restore a policy's interface from the JSON object that `to_json` returns.
+
+        Raises PolicyError: fields are missing or invalid.
+        """
         if not isinstance(data, dict):
             raise PolicyError("the interface must be a JSON object")
         hints = get_type_hints(cls)

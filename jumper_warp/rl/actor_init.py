@@ -66,7 +66,7 @@ def make_actor_init(
 
 @torch.no_grad()
 def apply_actor_init(actor_init: ActorInit, model: ActorCritic, samples: int) -> None:
-    """Copy the weights and observation statistics into a model, in place; noise and critic are unchanged.
+    """Copy initial weights and observation statistics into a model's actor; noise and critic are unchanged.
 
     samples: num_steps · num_envs of an iteration. Raises InputError: layers have other shapes; nothing is changed.
     """
@@ -87,7 +87,10 @@ def apply_actor_init(actor_init: ActorInit, model: ActorCritic, samples: int) ->
 
 
 def _contracted_layers(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> Weights | None:
-    """Return the layers, of half the widths, of the nearest symmetric actor; None if layers or statistics differ."""
+    """Project a policy to the nearest symmetric actor, and return its layers, of half the widths.
+
+    Returns None if the layers are not nearly mirror-symmetric, or the observation statistics are not symmetric.
+    """
     widths = [len(bias) for _, bias in layers[:-1]]
     mean_symmetric = torch.allclose(symmetry.obs.apply(mean), mean, atol=1e-5)
     symmetric = mean_symmetric and torch.allclose(std[symmetry.obs.order], std)
@@ -100,7 +103,7 @@ def _contracted_layers(layers: Weights, mean: torch.Tensor, std: torch.Tensor, s
 
 
 def _is_symmetric(layers: Weights, symmetry: Symmetry) -> bool:
-    """Return whether the layers have the form of `expand_layers`, that of a symmetric actor."""
+    """Return whether a network's layers are those of a mirror-symmetric actor, as `expand_layers` returns."""
     try:
         contract_layers(layers, symmetry)
     except InputError:
@@ -109,7 +112,10 @@ def _is_symmetric(layers: Weights, symmetry: Symmetry) -> bool:
 
 
 def _averaged(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: Symmetry) -> ActorInit:
-    """Return the symmetric actor whose network f is the policy g, its layers rescaled to symmetric statistics."""
+    """Make a policy mirror-symmetric: average its actions with the mirror images for mirrored observations.
+
+    Its network becomes that of the symmetric actor, its layers rescaled to mirror-symmetric observation statistics.
+    """
     new_mean, new_var = symmetry.obs.symmetrise_moments(mean.double(), std.double().square())
     rescaled = rescale_inputs(layers, mean, std, new_mean, new_var.sqrt())
     new_layers = [(weight.to(mean.dtype), bias.to(mean.dtype)) for weight, bias in rescaled]
@@ -120,8 +126,9 @@ def _averaged(layers: Weights, mean: torch.Tensor, std: torch.Tensor, symmetry: 
 def rescale_inputs(
     layers: Weights, mean: torch.Tensor, std: torch.Tensor, new_mean: torch.Tensor, new_std: torch.Tensor
 ) -> Weights:
-    """Return layers (float64) that give the same output for observations normalised by new_mean and new_std.
+    """Adapt a network to other observation statistics, with unchanged outputs; return its layers (float64).
 
+    mean, std: with which observations were normalised; new_mean, new_std: with which they will be.
     All statistics are (num_obs,). Only the first layer changes: W (x - mean) / std + b stays the same for all x.
     """
     (weight, bias), *others = ((weight.double(), bias.double()) for weight, bias in layers)

@@ -112,7 +112,10 @@ class PpoCfg:
 
 @dataclass(frozen=True)
 class ShacCfg:
-    """Settings of SHAC. It also uses these of `PpoCfg`: num_steps, gamma, lam, networks, reward_scale, init_std."""
+    """Settings of short-horizon actor-critic (SHAC).
+
+    It also uses these of `PpoCfg`: num_steps, gamma, lam, networks, reward_scale, init_std.
+    """
 
     lr: float = 1.0e-3
     """Initial learning rate of the actor, reduced linearly to a tenth of it over the training."""

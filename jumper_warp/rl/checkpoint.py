@@ -137,7 +137,7 @@ def best_checkpoint(folder: Path) -> Path:
 
 
 def _best(manifest: dict[str, dict[str, Any]]) -> str | None:
-    """Return the file name with the highest finite score; None if there is none."""
+    """Return the file name of the checkpoint with the highest finite score; None if there is none."""
     scored = [name for name, entry in manifest.items() if entry["score"] is not None and math.isfinite(entry["score"])]
     return max(scored, key=lambda name: manifest[name]["score"], default=None)
 
@@ -159,7 +159,7 @@ def _read_manifest(folder: Path, missing_ok: bool = False) -> dict[str, dict[str
 
 
 def _is_entry(entry: Any) -> bool:
-    """Return whether a manifest entry has SHA-256, iteration and score, each of the right type."""
+    """Return whether a checkpoint's manifest entry has SHA-256, iteration and score, each of the right type."""
     if not isinstance(entry, dict) or not {"sha256", "iteration", "score"} <= entry.keys():
         return False
     valid_score = type(entry["score"]) in (int, float, type(None))

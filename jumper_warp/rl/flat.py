@@ -17,7 +17,7 @@ ADAM_EPS = 1.0e-8  # Added to the square root of Adam's second moment
 
 
 def aligned(count: int, to: int) -> int:
-    """Return the least multiple of `to` that is at least `count`."""
+    """Round `count` up to a multiple of `to`."""
     return -(-count // to) * to
 
 
@@ -34,11 +34,11 @@ class Segment(NamedTuple):
         return aligned(math.prod(self.padded_shape), ALIGNMENT)
 
     def padded_view(self, vector: torch.Tensor) -> torch.Tensor:
-        """Return the parameter in a vector as a view of `padded_shape`."""
+        """Return this parameter's part of a flat vector as a view of `padded_shape`."""
         return vector[self.start : self.start + math.prod(self.padded_shape)].view(self.padded_shape)
 
     def view(self, vector: torch.Tensor) -> torch.Tensor:
-        """Return the parameter in a vector as a view of `shape`."""
+        """Return this parameter's part of a flat vector as a view of `shape`, without padding."""
         view = self.padded_view(vector)
         return view[:, : self.shape[1]] if len(self.shape) == 2 else view
 
@@ -93,7 +93,7 @@ def flatten_aligned(gradients: list[torch.Tensor]) -> torch.Tensor:
 
 
 def _layers(params: list[torch.Tensor], activation: str) -> Layers:
-    """Return a network from its parameters in the order weight (out, in), bias (out,) of each layer."""
+    """Group a network's parameters, in the order weight (out, in), bias (out,) of each layer, into `Layers`."""
     return Layers(tuple(params[::2]), tuple(params[1::2]), activation)
 
 
@@ -130,7 +130,7 @@ class FlatAdam:
         }
 
     def load_state_dict(self, state: dict[int, dict[str, Any]]) -> None:
-        """Load the result of `state_dict`; parameter 0's step count is used for all parameters."""
+        """Restore Adam's state from the result of `state_dict`; parameter 0's step count applies to all."""
         for index, segment in enumerate(self.flat.segments):
             segment.view(self.exp_avg).copy_(state[index]["exp_avg"])
             segment.view(self.exp_avg_sq).copy_(state[index]["exp_avg_sq"])
@@ -138,9 +138,10 @@ class FlatAdam:
 
 
 def adapted_lr(lr: torch.Tensor, kl: torch.Tensor, cfg: PpoCfg, desired_kl: torch.Tensor | float) -> torch.Tensor:
-    """Return the learning rate (), divided by 1.5 if kl > 2 desired_kl, multiplied by 1.5 if kl < desired_kl / 2.
+    """Adapt the learning rate () to the KL divergence of the policy update.
 
-    It stays within cfg.min_lr and cfg.max_lr, and is fixed if cfg.desired_kl is 0.
+    It is divided by 1.5 if kl > 2 desired_kl, and multiplied by 1.5 if kl < desired_kl / 2. It stays within cfg.min_lr
+    and cfg.max_lr, and is fixed if cfg.desired_kl is 0.
     """
     if cfg.desired_kl <= 0.0:
         return lr

@@ -83,7 +83,7 @@ class TrainingLog:
         self._task = self._progress.add_task("training", total=total)
 
     def __enter__(self) -> TrainingLog:
-        """Show the progress bar; report lines that were removed from the metrics file."""
+        """Show the training's progress bar; report lines that were removed from the metrics file."""
         self._progress.start()
         if self._file.dropped:
             self.print_line(f"{self._file.path}: removed {self._file.dropped} incomplete or later lines")
@@ -92,7 +92,7 @@ class TrainingLog:
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
-        """Close all outputs."""
+        """Close all outputs of the log: file, terminal, TensorBoard and Weights & Biases."""
         self._progress.stop()
         for file in (self._file, self._events):
             with suppress(OSError):
@@ -146,7 +146,7 @@ class _PipeSafeConsole(Console):
     """Console that stops printing on a broken pipe, where `rich.console.Console` would end the process."""
 
     def on_broken_pipe(self) -> None:
-        """Stop printing; called by rich."""
+        """Stop printing after a broken pipe; called by rich."""
         self.quiet = True
 
 

@@ -65,8 +65,9 @@ class Symmetry(NamedTuple):
 
 
 def mirror_map(order: Vector, signs: Vector, name: str, device: Any = None) -> MirrorMap:
-    """Return the mirror map `signs * x[order]`; order, signs: (n,); name: of the vectors, for messages.
+    """Build the mirror map `signs * x[order]`, and check that it is its own inverse.
 
+    order, signs: (n,); name: of the vectors, for messages.
     Raises InputError, a ValueError: it is not its own inverse.
     """
     index = torch.as_tensor(order, dtype=torch.int64, device=device)
@@ -92,8 +93,9 @@ def symmetry_of(env: VecEnv) -> Symmetry:
 
 
 def expand_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Return the layers of a plain network of twice the hidden widths with the output of the symmetric actor.
+    """Convert a symmetric actor to a plain network of twice the hidden widths; return its layers.
 
+    Both have the same output.
     layers: those of f, with activations between. A symmetric policy is saved and exported in this form.
     """
     obs, action = symmetry.obs.matrix(), symmetry.action.matrix()
@@ -130,8 +132,9 @@ def nearest_expanded_layers(layers: Weights, symmetry: Symmetry) -> Weights:
 
 
 def contract_layers(layers: Weights, symmetry: Symmetry) -> Weights:
-    """Invert `expand_layers`: return copies of the layers of f, which have half the hidden widths.
+    """Recover the symmetric actor's network, of half the widths, from the layers of `expand_layers`.
 
+    The result is a copy of the layers of f.
     f's last bias is recovered up to a part that cancels in the policy. Raises InputError: layers have another form.
     """
     contracted = []

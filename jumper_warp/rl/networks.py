@@ -61,7 +61,7 @@ class Scaling(NamedTuple):
         return (x - self.mean) / self.std
 
     def denormalise(self, x: torch.Tensor) -> torch.Tensor:
-        """Return x · std + mean, the inverse of `normalise`."""
+        """Undo `normalise`: return x · std + mean."""
         return x * self.std + self.mean
 
     def features(self, obs: torch.Tensor, columns: int) -> torch.Tensor:
@@ -94,7 +94,10 @@ def gaussian_log_prob(x: torch.Tensor, mean: torch.Tensor, log_std: torch.Tensor
 def gaussian_kl(
     mean: torch.Tensor, log_std: torch.Tensor, new_mean: torch.Tensor, new_log_std: torch.Tensor
 ) -> torch.Tensor:
-    """Return KL(old ‖ new) [nat], (...), of independent Gaussians with means (..., n) and log_std (n,)."""
+    """Return the KL divergence from old to new independent Gaussians [nat], KL(old ‖ new), (...).
+
+    means: (..., n); log_std: (n,).
+    """
     var_ratio = (2.0 * (log_std - new_log_std)).exp()
     mean_term = ((mean - new_mean) * torch.exp(-new_log_std)).square()
     return (new_log_std - log_std + 0.5 * (var_ratio + mean_term - 1.0)).sum(-1)
@@ -130,7 +133,7 @@ class RunningMoments(nn.Module):
         self.count.add_(size)
 
     def scaling(self) -> Scaling:
-        """Return mean and standard deviation, float32."""
+        """Return the normalisation by the running mean and standard deviation, float32."""
         return Scaling(self.mean.float(), (self.var + VARIANCE_EPS).sqrt().float())
 
 
@@ -192,7 +195,7 @@ class ActorCritic(nn.Module):
         return Symmetry(*parts)
 
     def mean(self, features: torch.Tensor) -> torch.Tensor:
-        """Return the policy's mean, (..., num_actions), for normalised observations (..., num_obs)."""
+        """Return the policy's mean action, (..., num_actions), for normalised observations (..., num_obs)."""
         if (symmetry := self.symmetry) is None:
             return self.actor(features)
         return 0.5 * (self.actor(features) + symmetry.action.apply(self.actor(symmetry.obs.apply(features))))
@@ -240,7 +243,7 @@ class Layers(NamedTuple):
         return functional.linear(layer_inputs[-1], self.weights[-1], self.biases[-1]), layer_inputs
 
     def backward(self, layer_inputs: list[torch.Tensor], grad: torch.Tensor, dtype: torch.dtype) -> list[torch.Tensor]:
-        """Return the gradients of weight and bias of each layer, first to last, float32.
+        """Backward pass of `forward`: return the loss gradients of each layer's weight and bias, float32.
 
         layer_inputs: from `forward`; grad: (batch, outputs) gradient of the loss with respect to the output.
         """
@@ -262,7 +265,7 @@ class ActorTensors(NamedTuple):
     symmetry: Symmetry | None  # its mirror map of observations is padded to the columns of the first weight
 
     def forward(self, x: torch.Tensor, dtype: torch.dtype) -> ActorOutput:
-        """Return the policy's mean for features x; arguments: see `Layers.forward`."""
+        """Return the policy's mean action for normalised observations x; arguments: see `Layers.forward`."""
         if self.symmetry is None:
             mean, layer_inputs = self.layers.forward(x, dtype)
             return ActorOutput(mean, torch.zeros_like(mean), layer_inputs)
@@ -272,7 +275,7 @@ class ActorTensors(NamedTuple):
         return ActorOutput(0.5 * (output + image), output - image, layer_inputs)
 
     def backward(self, layer_inputs: list[torch.Tensor], grad: torch.Tensor, dtype: torch.dtype) -> list[torch.Tensor]:
-        """Return the gradients of weight and bias of each layer, first to last, float32.
+        """Backward pass of `forward`: return the loss gradients of each layer's weight and bias, float32.
 
         layer_inputs: from `forward`; grad: (batch, num_actions) gradient with respect to `ActorOutput.mean`.
         """
@@ -291,7 +294,10 @@ class ActorOutput(NamedTuple):
 
 
 def _activation_backward(activation: str, grad: torch.Tensor, output: torch.Tensor) -> torch.Tensor:
-    """Return the gradient with respect to an activation's input; grad: with respect to its output; same shapes."""
+    """Backward pass of an activation function: return the loss gradient with respect to its input.
+
+    grad: gradient with respect to its output; output: its output; all have the same shape.
+    """
     if activation == "elu":
         return torch.addcmul(grad, grad, output.clamp(max=0.0))
     if activation == "relu":

@@ -63,7 +63,7 @@ class Ppo:
     """PPO on one environment: `collect` fills the rollout, `update` optimises the networks, `iterate` does both."""
 
     def __init__(self, env: VecEnv, cfg: PpoCfg) -> None:
-        """Build networks and buffers on the environment's device; the weights follow torch's CPU seed.
+        """Build actor, critic and rollout buffers on the environment's device; weights follow torch's CPU seed.
 
         Raises InputError as `PpoCfg.batch_size`, and as `symmetry_of` if symmetry is requested.
         """
@@ -191,7 +191,7 @@ class Ppo:
         }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the result of `state_dict`.
+        """Restore networks, optimiser, learning rate and episode counts from the result of `state_dict`.
 
         Raises InputError: a part is missing, unknown, of another shape or type, or not finite; nothing is changed.
         """
@@ -234,10 +234,11 @@ class Ppo:
 def critic_gradient(
     rows: torch.Tensor, layout: RowLayout, critic: Layers, cfg: PpoCfg, out: torch.Tensor
 ) -> torch.Tensor:
-    """Write the gradient of the weighted value loss to `out`, and return the value loss () before weighting.
+    """Compute the gradient of PPO's value loss with respect to the critic's parameters.
 
-    The loss is the squared error; with `clip_value` the maximum of this and of the squared error of a value clipped to
-    within `clip` of the rollout's value.
+    Writes the gradient of the weighted loss to `out`, and returns the value loss () before weighting. The loss is the
+    squared error; with `clip_value` the maximum of this and of the squared error of a value clipped to within `clip` of
+    the rollout's value.
 
     rows: (batch, columns of `layout`); out: the critic's slice of the flat gradient.
     """
@@ -259,10 +260,10 @@ def actor_gradient(
     rows: torch.Tensor, layout: RowLayout, actor: ActorTensors, old_log_std: torch.Tensor, entropy_coef: torch.Tensor,
     cfg: PpoCfg, out: torch.Tensor,
 ) -> ActorLosses:  # fmt: skip
-    """Write the gradient of surrogate loss and entropy bonus to `out`, and return the losses.
+    """Compute the gradient of PPO's surrogate loss and entropy bonus with respect to actor and noise.
 
-    The clipped surrogate of Schulman et al. 2017, eq. 7, as a loss: -E[min(r A, clip(r) A)] with r = π(a) / π_old(a).
-    Where r A is the smaller, ∂/∂log π = -r A / batch, else 0.
+    Writes it to `out`, and returns the losses. The clipped surrogate of Schulman et al. 2017, eq. 7, as a loss:
+    -E[min(r A, clip(r) A)] with r = π(a) / π_old(a). Where r A is the smaller, ∂/∂log π = -r A / batch, else 0.
 
     rows: (batch, columns of `layout`); entropy_coef: (); out: the slice of actor and noise of the flat gradient.
     """
@@ -303,7 +304,7 @@ def optimiser_step(
 def take_averages(
     names: Sequence[str], sums: torch.Tensor, finished: torch.Tensor, lr: torch.Tensor, log_std: torch.Tensor
 ) -> dict[str, float]:
-    """Return metrics averaged since the last call, and reset their sums; synchronises with the device.
+    """Return training metrics averaged since the last call, and reset their sums; waits for the device.
 
     names: names of the statistics; sums: (len(names) + 1,) their sums and the number of steps; finished: (3, ...) as
     in `Collector.finished`; lr: (); log_std: (num_actions,).

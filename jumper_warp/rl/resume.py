@@ -100,7 +100,7 @@ def changed_user_files(state: dict[str, Any], config: dict[str, Any]) -> list[st
 
 
 def _settings(config: dict[str, Any]) -> dict[str, Any]:
-    """Return the settings in a run's configuration by flag name, without leading dashes."""
+    """Return the settings in a run's configuration as a flat dict by flag name, without leading dashes."""
     train = {name: value for name, value in config["train"].items() if name not in (*SESSION, "task")}
     env = {name: value for name, value in config["env"].items() if name not in (*DERIVED, "task")}
     task = dict(config["env"].get("task", {}))
@@ -111,7 +111,10 @@ def _settings(config: dict[str, Any]) -> dict[str, Any]:
 
 
 def _flat(value: Any, name: str = "") -> dict[str, Any]:
-    """Return the leaves of nested dicts by dotted name, e.g. `ppo.num-steps`; entries of lists by their key `name`."""
+    """Flatten nested dicts: return their leaves by dotted name, such as `ppo.num-steps`.
+
+    Entries of lists are named by their key `name`.
+    """
     if isinstance(value, list) and any(isinstance(part, dict) for part in value):
         value = {part.get("name", str(i)): part for i, part in enumerate(value)}
     if not isinstance(value, dict):

@@ -27,7 +27,7 @@ class RolloutBuffer(NamedTuple):
     timeout: torch.Tensor  # (num_steps, num_envs) 1 where the episode was truncated
 
     def at(self, step: int) -> RolloutBuffer:
-        """Return views of one step, without the first axis."""
+        """Return views of the transitions of one policy step, without the time axis."""
         return self._replace(**{name: x[step] for name, x in self._asdict().items() if name != "log_std"})
 
 
@@ -35,7 +35,7 @@ def make_rollout_buffer(num_steps: int, env: VecEnv, num_critic_obs: int) -> Rol
     """Return a rollout buffer of zeros on the environment's device; num_critic_obs: size of critic observations."""
 
     def zeros(*shape: int) -> torch.Tensor:
-        """Return zeros on the environment's device."""
+        """Return a tensor of zeros of a shape on the environment's device."""
         return torch.zeros(*shape, device=env.device)
 
     steps, worlds, actions = num_steps, env.num_envs, env.num_actions
@@ -106,7 +106,7 @@ def sample_action(
     scaling: Scaling,
     dtype: torch.dtype,
 ) -> None:
-    """Write observations, the policy's mean and a sampled action to `step`.
+    """Sample every world's action from the policy, and write it, its mean and the observations to `step`.
 
     obs, critic_obs: (num_envs, n) raw. step: `RolloutBuffer.at`; its action holds standard normal noise on entry.
     scaling: normalises obs. dtype: of the hidden layers.

@@ -324,13 +324,13 @@ class _NoLog:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Do nothing."""
+        """Do nothing, since no output is open."""
 
     def print_line(self, line: str) -> None:
-        """Do nothing."""
+        """Discard the line."""
 
     def log(self, iteration: int, metrics: dict[str, float], remaining: float) -> None:
-        """Do nothing."""
+        """Discard the metrics."""
 
 
 def new_folder(cfg: TrainCfg, rank: Rank) -> Path:

@@ -58,7 +58,7 @@ class Scalings(NamedTuple):
 
 
 class RowLayout(NamedTuple):
-    """Layout of the columns of a sample's row: actor features, critic features, then the rest of `Batch`.
+    """Layout of a training sample in one row of memory: actor features, critic features, other data of `Batch`.
 
     Each of the three groups begins at a multiple of ROW_ALIGNMENT. A row is written once per iteration and gathered
     once per epoch.
@@ -75,15 +75,21 @@ class RowLayout(NamedTuple):
         return obs, critic_obs, aligned(2 * self.num_actions + 4, ROW_ALIGNMENT)
 
     def features(self, rows: torch.Tensor) -> torch.Tensor:
-        """Return the actor's features with zero padding, (batch, columns of its first weight)."""
+        """Return the actor's normalised observations in packed samples, zero-padded.
+
+        The result is (batch, columns of the first weight); rows: (batch, columns).
+        """
         return rows[:, : self.widths[0]]
 
     def critic_features(self, rows: torch.Tensor) -> torch.Tensor:
-        """Return the critic's features with zero padding, (batch, columns of its first weight)."""
+        """Return the critic's normalised observations in packed samples, zero-padded.
+
+        The result is (batch, columns of the first weight); rows: (batch, columns).
+        """
         return rows[:, self.widths[0] : sum(self.widths[:2])]
 
     def split(self, rows: torch.Tensor) -> Batch:
-        """Return the parts of rows (batch, columns) as views, without padding."""
+        """Split packed samples (batch, columns) into the fields of `Batch`, as views without padding."""
         sizes = (self.num_obs, self.widths[0] - self.num_obs, self.num_critic_obs, self.widths[1] - self.num_critic_obs,
                  self.num_actions, self.num_actions, 1, 1, 1, 1)  # fmt: skip
         starts = list(accumulate(sizes, initial=0))
@@ -92,7 +98,7 @@ class RowLayout(NamedTuple):
         return Batch(features, critic_features, action, mean, *(each[:, 0] for each in scalars))
 
     def pack(self, batch: Batch) -> torch.Tensor:
-        """Return a batch as new rows (batch, columns), zero-padded; inverts `split`."""
+        """Pack training samples into one zero-padded row each, (batch, columns); inverts `split`."""
         scalars = torch.stack([batch.log_prob, batch.value, batch.advantage, batch.target], dim=-1)
         groups = ([batch.features], [batch.critic_features], [batch.action, batch.mean, scalars])
         pieces: list[torch.Tensor] = []
@@ -127,13 +133,16 @@ def gae(
 
 
 class BatchPacker:
-    """Packer of a rollout: computes values, advantages and returns, and writes its samples to `rows`."""
+    """Packer of a rollout into training samples with values, advantages and returns, one in each of `rows`."""
 
     def __init__(
         self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, compiler: Compiler,
         obs_mirror: MirrorMap | None = None,
     ) -> None:  # fmt: skip
-        """Allocate the rows; flat: parameters of `model`; obs_mirror: map that symmetrises observation statistics."""
+        """Allocate memory for the packed samples.
+
+        flat: parameters of `model`; obs_mirror: map that symmetrises observation statistics.
+        """
         self._obs_mirror = obs_mirror
         self._rollout, self._cfg, self._model, self._critic = rollout, cfg, model, flat.critic
         steps, worlds, num_actions = rollout.action.shape
@@ -146,7 +155,7 @@ class BatchPacker:
 
     @torch.no_grad()
     def pack(self) -> None:
-        """Write the rollout to `rows`, and update the running statistics with it."""
+        """Pack the rollout's samples into `rows`, and update the running statistics with them."""
         model = self._model
         scalings = self._scalings()  # those that actor and critic used in the rollout
         estimates = self._estimates(scalings)
@@ -180,7 +189,7 @@ class BatchPacker:
         return self._compute_values_and_gae(self._rollout, self._critic, scalings, self._cfg, self._chunk_size)
 
     def _pack(self, scalings: Scalings, estimates: Estimates, advantage_scaling: Scaling) -> None:
-        """Write the rollout with its estimates to `rows`; arguments: see `write_rows`."""
+        """Pack the rollout's samples and estimates into `rows`; arguments: see `write_rows`."""
         target_scaling = self._model.value_moments.scaling() if self._cfg.normalise_value else None
         self._write_rows(
             self.rows, self.layout, self._rollout, scalings, estimates, advantage_scaling, target_scaling,
@@ -216,8 +225,9 @@ def write_rows(
     rows: torch.Tensor, layout: RowLayout, buffer: RolloutBuffer, scalings: Scalings, estimates: Estimates,
     advantage_scaling: Scaling, target_scaling: Scaling | None, chunk_size: int | None,
 ) -> None:  # fmt: skip
-    """Write the samples of a rollout to rows (batch, columns of `layout`), `chunk_size` at a time (None: all).
+    """Pack the samples of a rollout into memory, one row per sample: rows (batch, columns of `layout`).
 
+    chunk_size: samples packed at a time (None: all).
     scalings normalise observations, advantage_scaling and target_scaling (None: not) advantages and returns.
     """
     target = estimates.target if target_scaling is None else target_scaling.normalise(estimates.target)

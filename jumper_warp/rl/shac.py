@@ -28,7 +28,7 @@ STATISTICS = ("actor", "value", "gradient_actor", "gradient_critic")
 
 
 class Window(NamedTuple):
-    """Actor loss of a window, and its samples for the critic."""
+    """Actor loss of a short window of simulation, and the window's samples for the critic."""
 
     loss: torch.Tensor  # () actor loss, differentiable
     obs: torch.Tensor  # (num_steps, num_envs, num_obs)
@@ -39,7 +39,7 @@ class Window(NamedTuple):
 
 
 class Shac:
-    """SHAC on one environment, with the interface of `Ppo` that `TrainingRun` uses."""
+    """Short-horizon actor-critic (SHAC) on one environment, with the interface of `Ppo` that `TrainingRun` uses."""
 
     def __init__(self, env: DifferentiableVecEnv, cfg: PpoCfg, shac: ShacCfg) -> None:
         """Build networks on the environment's device; the weights follow torch's CPU seed.
@@ -84,7 +84,7 @@ class Shac:
         self._sums += torch.tensor([float(window.loss.detach()), value_loss, actor_norm, critic_norm, 1.0]).double()
 
     def window(self) -> Window:
-        """Run the policy for `num_steps` steps; return the actor's loss and the critic's samples."""
+        """Simulate the policy for `num_steps` steps; return the actor's loss and the critic's samples."""
         env, cfg, model = self.env, self.cfg, self.model
         samples: list[tuple[torch.Tensor, ...]] = []
         discount, total = torch.ones(env.num_envs, device=env.device), torch.zeros(env.num_envs, device=env.device)
@@ -154,7 +154,10 @@ class Shac:
         return sum(losses) / len(losses), sum(norms) / len(norms)
 
     def _optimiser_step(self, name: str, params: Sequence[torch.Tensor], loss: torch.Tensor, max_norm: float) -> float:
-        """Run an optimiser step unless the gradient is not finite; return the gradient's norm before clipping."""
+        """Update actor or critic by a gradient step on a loss; return the gradient's norm before clipping.
+
+        A gradient that is not finite is skipped.
+        """
         optimiser = self.optimisers[name]
         optimiser.zero_grad()
         loss.backward(inputs=params)
@@ -172,7 +175,7 @@ class Shac:
         return take_averages(STATISTICS, self._sums, self._finished, self.lr, self.model.log_std)
 
     def _parts(self) -> dict[str, torch.Tensor]:
-        """Return all tensors of the state by dotted name, uncopied; missing optimiser states become zeros."""
+        """Return all tensors of the training state by dotted name, uncopied; missing optimiser states become zeros."""
         parts = {f"model.{name}": value for name, value in self.model.state_dict().items()}
         parts |= {f"target.{name}": value for name, value in self.target.state_dict().items()}
         for name, optimiser in self.optimisers.items():
@@ -190,7 +193,10 @@ class Shac:
         return {"model": {name: value.clone() for name, value in self.model.state_dict().items()}, **rest}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Restore the result of `state_dict`. Raises InputError: a part is missing, unknown or of another form."""
+        """Restore networks, optimisers and episode counts from the result of `state_dict`.
+
+        Raises InputError: a part is missing, unknown or of another form.
+        """
         flat = {f"model.{name}": value for name, value in state["model"].items()}
         flat |= {name: value for name, value in state.items() if name != "model"}
         parts = self._parts()

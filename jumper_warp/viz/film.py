@@ -129,7 +129,10 @@ def _interpolated(recording: Recording, values: np.ndarray, times: np.ndarray) -
 
 
 def drawn_poses(recording: Recording, times: np.ndarray) -> np.ndarray:
-    """Return the bodies' poses as drawn, (times, bodies, 7): interpolated to times [s], with worlds spaced apart."""
+    """Return the bodies' poses in a film, (times, bodies, 7), interpolated to times [s].
+
+    Worlds are spaced apart.
+    """
     after = np.clip(np.searchsorted(recording.times, times), 1, max(1, len(recording.times) - 1))
     after = np.minimum(after, len(recording.times) - 1)
     before = np.maximum(after - 1, 0)
@@ -146,7 +149,7 @@ def drawn_poses(recording: Recording, times: np.ndarray) -> np.ndarray:
 
 
 def _view(paths: np.ndarray, size: tuple[int, int], eye: Sequence[float] | None) -> View:
-    """Return the view relative to the camera's target: from `eye`, or by default one that shows all robots always.
+    """Return the camera's view relative to its target: from `eye`, or one that always shows all robots.
 
     paths: base positions relative to the target [m], (num_frames, worlds, 3).
     """
@@ -177,7 +180,7 @@ def _world_labels(recording: Recording, bases: np.ndarray, ranks: Sequence[int])
 
 
 def _heading(recording: Recording, time: float, ranks: Sequence[int]) -> str:
-    """Return the film's heading: task, goal of a single world, and time."""
+    """Return the text at the top of a film: task, goal of a single world, and time."""
     words = [str(recording.notes.get("task", "")), recording.label(ranks[0]) if len(ranks) == 1 else ""]
     return "   ".join([*(word for word in words if word), f"{time:.2f} s"])
 

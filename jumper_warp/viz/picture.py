@@ -1,4 +1,4 @@
-"""Composite pictures: one scene with the robot at several moments of a recording, and marks of heights and goals."""
+"""Composite pictures: one scene with the robot at several times of a recording, and marks of heights and goals."""
 
 from __future__ import annotations
 
@@ -36,7 +36,10 @@ FORMATS = {".png": {}, ".webp": {"quality": 88, "method": 6}, ".jpg": {"quality"
 
 @dataclass(frozen=True)
 class Composition:
-    """Scene with several moments of one recorded world, drawn in a vertical plane through its path."""
+    """Scene of a composite picture: one robot at several times of a recording, in a vertical plane.
+
+    The plane contains the robot's path.
+    """
 
     recording: Recording
     rank: int  # index in `recording.worlds`
@@ -48,12 +51,12 @@ class Composition:
 
     @property
     def bases(self) -> np.ndarray:
-        """Base positions as drawn [m], (moments, 3)."""
+        """Base positions in the picture [m], one for each drawn time, (moments, 3)."""
         return self.base[self.frames] + self.shift[:, None] * self.right
 
     @property
     def heights(self) -> np.ndarray:
-        """Commanded base heights [m], (n,), at most one."""
+        """Commanded base heights of the recorded jump [m], (n,), at most one."""
         heights = self.recording.heights[self.rank : self.rank + 1]
         return heights[np.isfinite(heights)]
 
@@ -70,7 +73,7 @@ class Composition:
 
     @property
     def toward_eye(self) -> np.ndarray:
-        """Horizontal unit vector from the path to the camera, (3,)."""
+        """Horizontal unit vector from the robot's path to the camera, (3,)."""
         return np.array([self.right[1], -self.right[0], 0.0])
 
     def span(self) -> tuple[float, float]:
@@ -85,9 +88,10 @@ class Composition:
 
 
 def compose(recording: Recording, rank: int = 0) -> Composition:
-    """Choose the moments of the rank-th recorded world to show; those of a robot in place are spread to the right.
+    """Choose the times of a recording at which a composite picture shows the robot of the rank-th world.
 
-    Frames after `valid_frames` are ignored. Raises InputError: no frame remains.
+    A robot in place is drawn spread to the right. Frames after `valid_frames` are ignored. Raises InputError: no frame
+    remains.
     """
     count = valid_frames(recording, rank)
     if count == 0:
@@ -191,8 +195,9 @@ def write_picture(
 
 
 def _opacity(scene: Composition) -> np.ndarray:
-    """Return the opacity of each moment, (moments,): GHOST for those that would hide a more important one, else 1.
+    """Return the robot's opacity at each drawn time, (moments,): GHOST where it would hide another, else 1.
 
+    Only less important times get GHOST.
     Apexes, start and end are the most important.
     """
     places = np.stack([scene.bases @ scene.right, scene.bases[:, 2]], axis=1)
@@ -269,7 +274,7 @@ def _ticks(scene: Composition) -> np.ndarray:
 
 
 def _labels(scene: Composition) -> list[Label]:
-    """Return the labels: time (and base height of a jump) above each moment, and the numbers of scale and bars."""
+    """Return the labels: time (and base height of a jump) above each drawn robot, numbers of scale and bars."""
     low, high = scene.span()
     jumps, labels = bool(scene.flights), []
     for frame, base, opacity in zip(scene.frames, scene.bases, _opacity(scene), strict=True):

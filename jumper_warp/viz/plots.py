@@ -49,7 +49,7 @@ def figure(path: Path, *shape: int, title: str = "", conditions: str = "", **set
 
 @dataclass(frozen=True)
 class Published:
-    """Results of a sweep in the paper, to be plotted."""
+    """Results of a sweep of jumps in the paper, to be plotted."""
 
     mean_error: float  # [m] Mean error in simulation
     robot: tuple[tuple[float, float, float], ...]
@@ -104,7 +104,10 @@ def plot_sweep(
 
 
 def plot_robot(axis: Any, jumps: Sequence[tuple[float, float, float]], *, ideal: bool) -> None:
-    """Plot jumps of the paper's robot (`Published.robot`); ideal: reached values instead of errors."""
+    """Plot the jumps that the paper's real robot made in a sweep (`Published.robot`).
+
+    ideal: reached values instead of errors.
+    """
     command, error, size = np.array(jumps).T
     style = {"color": "C1", "markersize": 8.0, "markeredgecolor": "black", "capsize": 3.0, "zorder": 3}
     axis.errorbar(command, error + ideal * command, yerr=size, fmt="*", label="paper, robot", **style)

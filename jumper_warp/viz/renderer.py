@@ -134,7 +134,10 @@ class GLRenderer(Renderer):
     def __init__(
         self, shapes: Sequence[ShapeMesh], num_bodies: int, size: tuple[int, int], opacity: Sequence[float] = (1.0,)
     ) -> None:
-        """Prepare images, see `Renderer`. Raises ImportError: no pyglet; RuntimeError: OpenGL is missing or too old."""
+        """Prepare rendering with OpenGL, with the arguments of `Renderer`.
+
+        Raises ImportError: no pyglet; RuntimeError: OpenGL is missing or too old.
+        """
         idle = self._idle.setdefault(size, [])
         self._viewer: Any = idle.pop() if idle else _gl_viewer(size)
         super().__init__(shapes, num_bodies, size, opacity)
@@ -182,7 +185,7 @@ class RayTracer(Renderer):
     def __init__(
         self, shapes: Sequence[ShapeMesh], num_bodies: int, size: tuple[int, int], opacity: Sequence[float] = (1.0,)
     ) -> None:
-        """Prepare images; see `Renderer`."""
+        """Prepare rendering by ray tracing, with the arguments of `Renderer`."""
         super().__init__(shapes, num_bodies, size, opacity)
         self._rays: Any = None
         self._field_of_view = 0.0  # [deg] of `_rays`
@@ -265,7 +268,7 @@ def _scene_model(shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence
 
 
 def _segments(lines: Sequence[Line]) -> tuple[wp.array | None, wp.array | None, wp.array | None]:
-    """Convert lines to segments: return starts, ends and colors, vec3 each; an arrow is one segment."""
+    """Convert polylines to line segments: return starts, ends and colors, vec3 each; an arrow is one segment."""
     if not lines:
         return None, None, None
     parts = [line.points[[0, -1]] if line.arrow else line.points for line in lines]

@@ -69,7 +69,7 @@ def write_rrd(recording: "Recording", path: Path) -> Path:
 
 
 def _import_rerun() -> ModuleType:
-    """Return the module rerun. Raises ImportError, with the command that installs it."""
+    """Return the Rerun module `rerun`. Raises ImportError, with the command that installs it."""
     try:
         import rerun
     except ImportError as error:
@@ -219,7 +219,7 @@ def view_targets(recording: "Recording") -> tuple[np.ndarray, float]:
 
 @dataclass(frozen=True)
 class _Plot:
-    """Plot: the curves of one Rerun entity."""
+    """Plot in the Rerun viewer: the curves of one entity."""
 
     group: str  # of the series
     title: str  # `quantity [unit]`
@@ -272,7 +272,7 @@ def _curve(recording: "Recording", group: str, quantity: str, values: np.ndarray
 
 
 def _blueprint(recording: "Recording") -> Any:
-    """Return the viewer's layout: scene and states on the left, plots on the right, plots of motors in tabs.
+    """Return the Rerun viewer's layout: scene and states on the left, plots on the right, motors in tabs.
 
     The viewer plays in a loop from the beginning, with all panels collapsed.
     """
@@ -299,8 +299,9 @@ def _blueprint(recording: "Recording") -> Any:
 
 
 def _group_views(group: str, plots: list[_Plot], axis: Any) -> list[Any]:
-    """Return the views of a group of series, one per motor or one for the whole group; axis: Rerun's time axis.
+    """Return the viewer's plots of a group of series, one per motor or one for the whole group.
 
+    axis: Rerun's time axis.
     Legends are in the free part of the time axis; of the motors' views only the first has one.
     """
     import rerun as rr

@@ -78,7 +78,7 @@ def corners(bases: np.ndarray, ground: float = -np.inf) -> np.ndarray:
 
 
 def fit(points: np.ndarray, direction: np.ndarray, size: tuple[int, int], field_of_view: float = FIELD_OF_VIEW) -> View:
-    """Return the nearest view from a direction that shows all points (n, 3) [m], world frame.
+    """Return the nearest camera view from a direction that shows all points (n, 3) [m], world frame.
 
     direction: from the target to the eye, (3,), world frame; size: width and height of the image [px].
     """
