@@ -110,7 +110,9 @@ def initial_state(replay: MotionReplay, plan: Plan, robots: RobotValues) -> Init
 
 
 def replay_plan(replay: MotionReplay, plan: Plan, robots: RobotValues, refine: int = 1) -> Record:
-    """Simulate one robot under planned motor targets, from rest, rows at 240 Hz; refine: steps per 1/480 s."""
+    """Simulate one robot that follows planned motor targets from rest, and return its motion, sampled at 240 Hz.
+
+    refine: physics steps per 1/480 s."""
     period, stride = TICK / SAMPLES, 2 * refine
     rest, rows = round(REST / period), plan.rows
     target = np.repeat(np.concatenate([np.repeat(rows[:1], rest, axis=0), rows]), stride, axis=0)

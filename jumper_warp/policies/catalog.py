@@ -49,7 +49,7 @@ class PolicySummary:
 
     @property
     def success(self) -> float | None:
-        """Success rate; of walking, the rate of robots that do not fall; None: not evaluated."""
+        """Success rate of the nominal robot in the saved metrics, for walking the rate without a fall, or None."""
         rates = [self.metrics[key]["value"] for key in SUCCESSES if key in self.metrics]
         if not rates and "fall_rate" in self.metrics:
             return 1.0 - self.metrics["fall_rate"]["value"]

@@ -82,7 +82,9 @@ class Composition:
         return float(along.min()) - 0.15, float(along.max()) + 0.15
 
     def point(self, along: float, height: float) -> np.ndarray:
-        """Return the point of the plane at a coordinate `along` right [m] and a height [m], (3,) [m], world frame."""
+        """Return a point of the picture's vertical plane [m], (3,), world frame, from its two coordinates.
+
+        along: distance to the right of the plane's origin [m]; height: above the ground [m]."""
         depth = self.base[0] @ self.toward_eye
         return along * self.right + depth * self.toward_eye + [0.0, 0.0, height]
 

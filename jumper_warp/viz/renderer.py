@@ -248,7 +248,7 @@ def _gl_viewer(size: tuple[int, int]) -> Any:
 
 
 def _scene_model(shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float]) -> Model:
-    """Return a Newton model of `len(opacity)` copies of the bodies, for drawing only."""
+    """Build a Newton model of all robots to draw, one copy of the robot's links for each entry of `opacity`."""
     builder = newton.ModelBuilder()
     builder.default_shape_cfg = newton.ModelBuilder.ShapeConfig(density=0.0, has_shape_collision=False)
     meshes = [

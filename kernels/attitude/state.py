@@ -98,7 +98,7 @@ def carried_over(old: AttitudeState) -> AttitudeState:
 
 @wp.func
 def attitude_error(robot: RobotView, state: AttitudeState) -> float:
-    """Return the angle of the rotation to the goal [rad]; `robot` is unused (signature of curriculum errors)."""
+    """Return the angle [rad] of the rotation from the base's orientation to the goal; `robot` is unused."""
     return state.error
 
 

@@ -286,7 +286,7 @@ def get_leg_weights(record: LegRecord, entry: int, world: int, leg: int) -> LegW
 
 @wp.func
 def put_leg_weights(record: LegRecord, entry: int, world: int, leg: int, weights: LegWeights):
-    """Write the multipliers of a leg's equations of motion and of its paw's contact law to the record."""
+    """Write a leg's adjoint multipliers (of its motion and of its paw's contact law) to the backward record."""
     put_vec(record, entry, LEG_WEIGHTS, world, leg, weights.rates)
     put_vec(record, entry, LEG_WEIGHTS + 3, world, leg, weights.law)
 
