@@ -106,11 +106,10 @@ class CheckpointContents:
                 mean = _tensor(actor, "obs_normalizer._mean")[0]
                 std = _tensor(actor, "obs_normalizer._std")[0] + RSL_RL_EPS
             activation = config.get("train", {}).get("ppo", {}).get("activation", "elu")
-            commit = config.get("commit") or {"hash": None, "dirty": None}
-            config = {**config, "commit": commit["hash"], "dirty": commit["dirty"], "iteration": int(state["iter"])}
             return cls(
-                config, dict(env["interface"]), env["policy_dt_s"], env["physics_dt_s"], activation,
-                tuple(len(bias) for _, bias in layers[:-1]), layers, mean, std, RSL_RL_LIMIT,
+                _with_source(config, int(state["iter"])), dict(env["interface"]), env["policy_dt_s"],
+                env["physics_dt_s"], activation, tuple(len(bias) for _, bias in layers[:-1]),
+                layers, mean, std, RSL_RL_LIMIT,
             )  # fmt: skip
         except TaskError:
             raise
@@ -129,15 +128,14 @@ class CheckpointContents:
             env, ppo = config["env"], config["train"]["ppo"]
             check_version(env["task"])
             model = state["ppo"]["model"]
-            commit = config.get("commit") or {"hash": None, "dirty": None}
-            config |= {"commit": commit["hash"], "dirty": commit["dirty"], "iteration": state["iteration"]}
             layers, hidden = _actor_layers(model), tuple(ppo["hidden"])
             if symmetry := _symmetry(model):
                 layers, hidden = expand_layers(layers, symmetry), tuple(2 * width for width in hidden)
             mean, var = _tensor(model, "obs_moments.mean"), _tensor(model, "obs_moments.var")
             return cls(
-                config, dict(env["interface"]), env["policy_dt_s"], env["physics_dt_s"], ppo["activation"], hidden,
-                layers, mean.float(), (var + VARIANCE_EPS).sqrt().float(),
+                _with_source(config, state["iteration"]), dict(env["interface"]), env["policy_dt_s"],
+                env["physics_dt_s"], ppo["activation"], hidden, layers, mean.float(),
+                (var + VARIANCE_EPS).sqrt().float(),
             )  # fmt: skip
         except TaskError:
             raise
@@ -154,6 +152,12 @@ class CheckpointContents:
         network = {"hidden": self.hidden, "activation": self.activation}
         interface = make_interface(description, policy_dt=self.policy_dt, physics_dt=self.physics_dt, **network)
         return Policy(self.layers, self.mean, self.std, interface, self.config)
+
+
+def _with_source(config: dict[str, Any], iteration: int) -> dict[str, Any]:
+    """Return a run's configuration with the flat entries `commit`, `dirty` and `iteration` of a policy."""
+    commit = config.get("commit") or {"hash": None, "dirty": None}
+    return {**config, "commit": commit["hash"], "dirty": commit["dirty"], "iteration": iteration}
 
 
 def _policy_of_rsl_rl(path: Path) -> Policy:

@@ -230,6 +230,9 @@ WRAPPERS = {
 }  # fmt: skip
 """Arguments of every other vector wrapper."""
 CONVERSIONS = {"ArrayConversion", "NumpyToTorch"}
+CASES = [(name, mode) for name in WRAPPERS for mode in MODES
+         if not (name in CONVERSIONS and mode is AutoresetMode.SAME_STEP)]  # fmt: skip
+"""Wrappers with modes; conversions have no array of objects, which `final_obs` is in SAME_STEP."""
 
 
 def test_every_vector_wrapper_is_listed():
@@ -256,13 +259,10 @@ def gymnasiums_refusal(wrap, envs, mode):
     return None
 
 
-@pytest.mark.parametrize("mode", MODES)
-@pytest.mark.parametrize("name", WRAPPERS)
+@pytest.mark.parametrize(("name", "mode"), CASES)
 def test_vector_wrapper_works_in_the_modes_that_gymnasium_has_it_for(name, mode, tmp_path):
     if module := {"RecordVideo": "moviepy", **dict.fromkeys(CONVERSIONS, "array_api_compat")}.get(name):
         pytest.importorskip(module)
-    if name in CONVERSIONS and mode is AutoresetMode.SAME_STEP:
-        pytest.skip("converts no arrays of objects, which final_obs is in Gymnasium; there is tensors=True")
     film = {"render_mode": "rgb_array", "render_size": (64, 48), "render_envs": 2} if name == "RecordVideo" else {}
     envs = vector(mode, all_groups=name in ("FilterObservation", "FlattenObservation"), **film)
     arguments = dict(WRAPPERS[name])
