@@ -88,7 +88,8 @@ class ActuatorCfg:
     """Fit limits, friction and latency of one motor to data of a test bench: writes actuator.json."""
 
     bench: Annotated[Path, tyro.conf.Positional]
-    """CSV file with columns test, time [s], command [N m], speed [rad/s], torque [N m]; see docs/identification.md."""
+    """CSV file with columns test, time [s], command [N m], speed [rad/s], torque [N m]; see
+    docs/tutorials/identification.md."""
     motor: Literal["lateral", "transversal"] = "transversal"  # Kind of motor; its described constants are the prior
     torque_noise: float = 0.1  # [N m] Noise of the bench's torque sensor, standard deviation
     out: Path | None = None  # Folder for the results (default: outputs/actuator/<time>)
