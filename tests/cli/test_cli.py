@@ -562,6 +562,13 @@ def test_refuses_to_save_metrics_of_another_stream_than_reporting(trained_run, c
     assert code == 2 and err[-1].endswith("save_to_policy is for the stream reporting, got selection")
 
 
+def test_finetune_prints_its_record_as_json_and_nothing_else(tmp_path, capsys):
+    few = "--iterations 0 --num-goals 2 --num-delayed 0 --num-randomized 0 --device cpu --json".split()
+    code, out, err = run(capsys, "finetune", "horizontal_jump", *few, "--out", str(tmp_path / "tuned"))
+    assert code == 0 and out == (tmp_path / "tuned" / "finetuning.json").read_text()
+    assert any(line.startswith("aim: cost") for line in err) and "json" not in json.loads(out)["settings"]
+
+
 def test_viewer_binds_to_loopback(tmp_path):
     command = viewer_command(tmp_path / "jump.rrd")
     assert command[-2:] == ["--bind", "127.0.0.1"]
