@@ -221,7 +221,7 @@ def finetune(
     with phase("fine-tuning", cfg.iterations + 1) as advance:
         history = tune_weights(groups, network, cfg, lambda line: (log(line), advance()), begin)
     layers = network.layers(network.weights)
-    settings = {name: value for name, value in asdict(cfg).items() if name not in ("out", "overwrite")}
+    settings = {name: value for name, value in asdict(cfg).items() if name not in ("out", "overwrite", "json")}
     record = {"settings": json.loads(json.dumps(settings, default=str)), "aims": aims, "steps": history}
     config = policy.config | {"finetuned": record | {"commit": (commit := git_commit()) and commit.hash}}
     return Policy(layers, policy.mean, policy.std, policy.interface, config), record

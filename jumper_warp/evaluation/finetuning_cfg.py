@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import tyro
+
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 
@@ -51,3 +53,4 @@ class FinetuneArgs(FinetuneCfg):
 
     out: Path | None = None  # Folder of the new policy (default: <policy>_finetuned)
     overwrite: bool = False  # Replace an existing policy in that folder
+    json: tyro.conf.FlagCreatePairsOff[bool] = False  # Print finetuning.json; progress goes to standard error

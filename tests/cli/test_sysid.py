@@ -110,12 +110,14 @@ def test_cma_method_identifies_latency_and_prints_its_report_as_json(recorded, c
     assert load_overlay(out / "identified.json").values["latency"][0] == pytest.approx(0.003, abs=1.0e-3)
 
 
-def test_actuator_fits_friction_from_bench_data(tmp_path):
+def test_actuator_fits_friction_from_bench_data(tmp_path, capsys):
     bench = synthetic_bench(described_constants("transversal") | {"friction": 0.3}, np.random.default_rng(0))
     rows = zip(*(getattr(bench, name) for name in COLUMNS), strict=True)
     (tmp_path / "bench.csv").write_text("\n".join([",".join(COLUMNS), *(",".join(map(str, row)) for row in rows)]))
-    main(["sysid", "actuator", str(tmp_path / "bench.csv"), "--out", str(tmp_path)])
-    friction = json.loads((tmp_path / "actuator.json").read_text())["constants"]["friction"]
+    main(["sysid", "actuator", str(tmp_path / "bench.csv"), "--out", str(tmp_path), "--json"])
+    printed = capsys.readouterr().out
+    assert printed == (tmp_path / "actuator.json").read_text()
+    friction = json.loads(printed)["constants"]["friction"]
     assert friction["value"] == pytest.approx(0.3, abs=0.02) and friction["identified"]
 
 
