@@ -39,7 +39,7 @@ class Parsed(BaseException):
 
 def command_lines(source, first_line):
     """Return (line number, list of words) of each command in a fence; operators such as | separate commands."""
-    commands, text = [], ""
+    commands, text, start = [], "", first_line
     for number, line in enumerate(source.splitlines(), first_line):
         start = number if not text else start
         text += line

@@ -21,11 +21,11 @@ from importlib.util import find_spec
 from pathlib import Path
 
 import warp as wp
+from snippet_commands import ROOT, CommandError, Commands, command_lines
 from sybil import Sybil
 from sybil.parsers.markdown.lexers import FencedCodeBlockLexer
 
 from jumper_warp.registry import TASKS
-from snippet_commands import ROOT, CommandError, Commands, command_lines
 
 COMMENT = re.compile(r"<!--\s*(run|needs|skip|file)\b:?\s*(.*?)\s*-->")
 FILE_NAME = re.compile(r"#\s*([\w./-]+\.\w+)\s*\n")  # first line of a Python fence
@@ -98,7 +98,7 @@ class Page:
             raise self.fail(lines[-1] if lines else line, f"{type(error).__name__}: {error}") from error
 
     def evaluate_bash(self, line, source, notes):
-        """Check each command of a fence that opens at a line, or run it. Raises PageError: a command that ran failed."""
+        """Check each command of a fence that opens at a line, or run it. Raises PageError: a run failed."""
         for number, words in command_lines(source, line + 1):
             forget_modules(Path.cwd())  # as in a new process
             try:

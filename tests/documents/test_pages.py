@@ -1,7 +1,6 @@
 """Every snippet of the README, the site and the policies' pages runs or parses."""
 
 import pytest
-
 from snippet_commands import ROOT
 from snippets import Page
 

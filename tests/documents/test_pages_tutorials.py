@@ -1,7 +1,6 @@
 """Every snippet of docs/tutorials runs or parses."""
 
 import pytest
-
 from snippet_commands import ROOT
 from snippets import Page
 

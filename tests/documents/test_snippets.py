@@ -3,9 +3,9 @@
 import sys
 
 import pytest
+from snippets import Page, PageError
 
 from jumper_warp.registry import TASKS
-from snippets import Page, PageError
 
 TASK = """```python
 # my_task.py
