@@ -1,8 +1,4 @@
-"""The snippets of docs/clients.md, and what the page says of `newton.ik`."""
-
-import re
-from importlib.util import find_spec
-from pathlib import Path
+"""Newton's inverse kinematics with the robot's loops."""
 
 import newton
 import newton.ik as ik
@@ -10,40 +6,7 @@ import numpy as np
 import pytest
 import warp as wp
 
-from jumper_warp.rl.rsl_rl import rsl_rl_config
 from jumper_warp.sim.simulation import Simulation
-from toy_task import SMALL
-
-ROOT = Path(__file__).parents[2]
-SNIPPETS = re.findall(r"^## (.*?)$|```python\n(.*?)```", (ROOT / "docs" / "clients.md").read_text(), re.M | re.S)
-NEEDS = {"Stable-Baselines3": "stable_baselines3", "TorchRL": "torchrl", "skrl": "skrl", "OpenVINO": "openvino"}
-
-
-def snippets():
-    """Return (heading, code) of every snippet."""
-    found, heading = [], ""
-    for title, code in SNIPPETS:
-        heading = title or heading
-        found += [(heading, code)] if code else []
-    return found
-
-
-@pytest.mark.parametrize(("heading", "code"), [pytest.param(*each, id=each[0]) for each in snippets()])
-def test_snippet_runs(heading, code, tmp_path, monkeypatch, one_thread):
-    if heading in NEEDS and find_spec(NEEDS[heading]) is None:
-        pytest.skip(f"{NEEDS[heading]} is not installed")
-    if heading == "CleanRL":
-        import gymnasium
-
-        code = code.replace("args.env_id", '"jumper_warp.gym:jumper_warp/VerticalJump-v0"')
-        code = code.replace("args.num_envs", "4")
-        code = code.replace("args.gamma", "0.99")
-    monkeypatch.chdir(tmp_path)
-    (tmp_path / "assets").symlink_to(ROOT / "assets")
-    (tmp_path / "logs" / "mine").mkdir(parents=True)
-    assert len([line for line in code.splitlines() if line]) <= 10
-    code = code.replace("100_000", "2048").replace("learn(100)", "learn(1)").replace("64", "8")
-    exec(code, {"config": rsl_rl_config(SMALL, 1, 0), "gym": gymnasium if heading == "CleanRL" else None})
 
 
 def ankle_ends(model):

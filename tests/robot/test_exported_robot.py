@@ -1,6 +1,5 @@
-"""The examples of docs/robot_in_other_simulators.md, on exported files, where the simulator is installed."""
+"""The exported robot in other simulators, where they are installed: its jump, loops, masses and stops."""
 
-import re
 from pathlib import Path
 
 import mujoco
@@ -8,54 +7,93 @@ import newton
 import numpy as np
 import pytest
 
+import urdf_swings
 from jumper_warp.robot.export import export_robot
 from jumper_warp.robot.model import build_model
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation, motor_values
 from jumper_warp.utils.rotations import CONJUGATE, rotate
 
-ROOT = Path(__file__).parents[2]
-PAGE = ROOT / "docs" / "robot_in_other_simulators.md"
+POLICY = Path(__file__).parents[2] / "assets" / "policies" / "vertical_jump" / "policy.onnx"
+LEGS = ("FL", "FR", "BL", "BR")
 
 
 @pytest.fixture(scope="module")
-def exported(tmp_path_factory):
-    """Folder with the exported MJCF and URDF under the page's names, and a link to the assets."""
+def files(tmp_path_factory):
+    """Folder with the exported MJCF, URDF and USD."""
     folder = tmp_path_factory.mktemp("simulators")
     for kind in ("mjcf", "urdf"):
         export_robot(kind, folder / f"robot_{kind}")
-    (folder / "assets").symlink_to(ROOT / "assets")
     return folder
 
 
 @pytest.fixture
-def run_section(exported, monkeypatch):
-    """Function that runs the Python code under a heading, edited by `change`, and returns the names that it defines."""
-    monkeypatch.chdir(exported)
-
-    def run(heading, change=lambda code: code):
-        section = re.split(rf"^#+ {heading}$", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE)[1]
-        section = re.split(r"^##", section, flags=re.MULTILINE)[0]
-        names = {}
-        exec(change("\n".join(re.findall(r"```python\n(.*?)```", section, re.DOTALL))), names)
-        return names
-
-    return run
+def exported(files, monkeypatch):
+    """The folder with the exported files, as the current one."""
+    monkeypatch.chdir(files)
+    return files
 
 
 @pytest.mark.parametrize(("rate", "gap"), [(480, 1.0e-3), (1920, 1.0e-4)])  # [1/s], [m]
-def test_documented_jump_in_mujoco_reaches_its_height_with_closed_loops(run_section, rate, gap):
+def test_jump_in_mujoco_reaches_its_height_with_closed_loops(exported, rate, gap):
     pytest.importorskip("onnxruntime")
-    data = "data = mujoco.MjData(model)"
-    names = run_section("MuJoCo", lambda code: code.replace(data, f"model.opt.timestep = 1 / {rate}\n{data}"))
-    assert names["gap"] < gap
-    assert names["apex"] == pytest.approx(apex_in_solver_mujoco(rate), abs=0.005)  # [m]
+    apex, largest_gap = jump_in_mujoco(rate)
+    assert largest_gap < gap
+    assert apex == pytest.approx(apex_in_solver_mujoco(rate), abs=0.005)  # [m]
+
+
+def jump_in_mujoco(rate):
+    """Return apex and largest loop gap [m] of the policy's jump to 0.9 m; rate: physics steps a second."""
+    deploy = pytest.importorskip("jumper_warp.deploy.policy")
+    policy, command = deploy.DeployedPolicy(POLICY), deploy.JumpCommand()
+    model = mujoco_model_of(policy)
+    model.opt.timestep = 1.0 / rate
+    data = mujoco.MjData(model)
+    mujoco.mj_resetDataKeyframe(model, data, model.key("default").id)
+    mujoco.mj_forward(model, data)
+    joints = [model.joint(name) for name in policy.interface["joint_names"]]
+    angles, rates = (np.array([getattr(joint, address)[0] for joint in joints]) for address in ("qposadr", "dofadr"))
+    apex = gap = 0.0
+    for tick in range(180):
+        to_body = data.body("body").xmat.reshape(3, 3).T
+        if tick == 30:
+            command.request()
+        readings = {
+            "height": data.qpos[2],
+            "lin_vel": to_body @ data.qvel[:3],
+            "ang_vel": data.qvel[3:6],  # MuJoCo has it in body axes
+            "gravity": to_body @ [0.0, 0.0, -1.0],
+            "angle": data.qpos[angles],
+            "rate": data.qvel[rates],
+            "wanted_height": 0.9,
+            "jump_command": command.update(data.qvel[2], data.ncon),  # only paws collide
+        }
+        data.ctrl[:12] = policy.targets(readings)
+        for _ in range(rate // 60):
+            mujoco.mj_step(model, data)
+            apex, gap = max(apex, data.qpos[2]), max(gap, *(ankle_gap(data, leg) for leg in LEGS))
+    return apex, gap
+
+
+def mujoco_model_of(policy):
+    """Return the exported MuJoCo model with the gains and torque limits of a policy."""
+    model = mujoco.MjModel.from_xml_path("robot_mjcf/jumper.xml")
+    kp, kd, limit = (np.array(policy.interface[name]) for name in ("joint_stiffness", "joint_damping", "torque_limit"))
+    model.actuator_gainprm[:12, 0], model.actuator_biasprm[:12, 1], model.actuator_biasprm[:12, 2] = kp, -kp, -kd
+    model.actuator_forcerange[:12] = np.stack([-limit, limit], axis=1)
+    return model
+
+
+def ankle_gap(data, leg):
+    """Return the distance [m] between the two ends of a leg's ankle in MuJoCo."""
+    first, second = (data.site(f"{leg}_ankle_{end}").xpos for end in ("parent", "child"))
+    return np.linalg.norm(first - second)
 
 
 def apex_in_solver_mujoco(rate):
     """Return the apex [m] of the jump to 0.9 m on this project's SolverMuJoCo; rate: physics steps a second."""
     deploy = pytest.importorskip("jumper_warp.deploy.policy")
-    policy, command = deploy.DeployedPolicy(ROOT / "assets/policies/vertical_jump/policy.onnx"), deploy.JumpCommand()
+    policy, command = deploy.DeployedPolicy(POLICY), deploy.JumpCommand()
     motors = jumping_motors(18.0, lateral_torque=10.0)
     robot = Simulation(1, solver="mujoco", motors=motors, dt=1.0 / rate, substeps=rate // 60, device="cpu")
     apex = 0.0
@@ -75,15 +113,15 @@ def apex_in_solver_mujoco(rate):
 
 
 @pytest.mark.parametrize(
-    ("heading", "package", "gap"),
-    [("Pinocchio", "pinocchio", 1e-5), ("Drake", "pydrake", 1e-4), ("PyBullet", "pybullet", 1e-4)],
+    ("swing", "package", "bound"),
+    [("pinocchio_swing", "pinocchio", 1e-5), ("drake_swing", "pydrake", 1e-4), ("pybullet_swing", "pybullet", 1e-4)],
 )
-def test_loops_of_the_urdf_stay_closed_and_legs_swing_as_in_mujoco(run_section, exported, heading, package, gap):
+def test_loops_of_the_urdf_stay_closed_and_legs_swing_as_in_mujoco(exported, swing, package, bound):
     pytest.importorskip(package)
     pytest.importorskip("yaml")
-    names = run_section(heading)
-    assert names["gap"] < gap  # [m]
-    assert names["outer"] == pytest.approx(swing_in_mujoco(exported / "robot_mjcf" / "jumper.xml"), abs=0.01)  # [rad]
+    outer, gap = getattr(urdf_swings, swing)()
+    assert gap < bound  # [m]
+    assert outer == pytest.approx(swing_in_mujoco(exported / "robot_mjcf" / "jumper.xml"), abs=0.01)  # [rad]
 
 
 def swing_in_mujoco(file):
@@ -101,8 +139,10 @@ def swing_in_mujoco(file):
     return data.joint("FL_outer").qpos[0]
 
 
-def test_mujoco_keeps_all_masses_of_the_urdf_and_the_base_can_be_freed(run_section):
-    tree = run_section("MuJoCo, Isaac Gym and others")["tree"]
+def test_mujoco_keeps_all_masses_of_the_urdf_and_the_base_can_be_freed(exported):
+    spec = mujoco.MjSpec.from_file("robot_urdf/jumper.urdf")
+    spec.body("body").add_freejoint()
+    tree = spec.compile()
     fixed = mujoco.MjModel.from_xml_path("robot_urdf/jumper.urdf")
     assert (fixed.nv, tree.nq, tree.nv) == (20, 27, 26)
     for model in (fixed, tree):
@@ -110,11 +150,14 @@ def test_mujoco_keeps_all_masses_of_the_urdf_and_the_base_can_be_freed(run_secti
         assert model.nbody == 22 and model.nmesh == 4
 
 
-def test_newton_reads_masses_stops_and_loops_from_usd(run_section, exported):
+def test_newton_reads_masses_stops_and_loops_from_usd(exported):
     pytest.importorskip("pxr")
     pytest.importorskip("newton_usd_schemas")
     export_robot("usd", exported / "robot_usd")
-    read, described = run_section("USD")["model"], build_model(1, ground=None, device="cpu")
+    builder, usd = newton.ModelBuilder(), newton.usd
+    resolvers = [usd.SchemaResolverNewton(), usd.SchemaResolverPhysx()]
+    builder.add_usd("robot_usd/jumper.usda", schema_resolvers=resolvers)
+    read, described = builder.finalize(device="cpu"), build_model(1, ground=None, device="cpu")
     bodies, joints = ([by_name(model, kind) for model in (read, described)] for kind in ("body", "joint"))
     for name, index in bodies[1].items():
         for quantity, tolerance in (("body_mass", 1e-6), ("body_com", 1e-7), ("body_inertia", 1e-8)):
