@@ -8,14 +8,10 @@ import numpy as np
 import pytest
 
 from experiments import departures
-from jumper_warp import load_policy
 from jumper_warp.cli.train import parse_train
 from jumper_warp.evaluation.jumps import TERMINATIONS, jump_commands
 from jumper_warp.policies.conditions import Conditions, env_of_policy
-<<<<<<< HEAD
 from jumper_warp.policies.folder import load_policy
-=======
->>>>>>> doc-g
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.saving import task_from_json, task_to_json
 from jumper_warp.utils.errors import InputError
@@ -86,16 +82,10 @@ def test_ablations_of_mars_and_omnidirectional_jumps_have_levels_and_limits_of_t
     assert around[0] == plain.levels[0]
 
 
-<<<<<<< HEAD
 @pytest.mark.parametrize("randomize", [False, True])
 def test_paws_penetrate_the_ground_by_less_than_a_millimetre(randomize):
     policy = load_policy("vertical_jump")
     env = env_of_policy(policy, 20, Conditions(randomize=randomize, noise=randomize, device="cpu"))
-=======
-def test_paws_sink_less_than_one_millimetre_at_touchdown():
-    policy = load_policy("vertical_jump")
-    env = env_of_policy(policy, 20, Conditions(randomize=False, noise=False, device="cpu"))
->>>>>>> doc-g
     goals = np.zeros((20, 3))
     goals[:, 2] = np.linspace(0.5, 1.05, 20)
     env.evaluation_reset(jump_commands(goals, 0.5, env.step_dt))
