@@ -23,6 +23,7 @@ from plain_text import to_markdown
 from stock_terms import SPACES, helpers, stock_terms, task_terms, tasks_by_function
 
 MDP = mdp.__name__
+STRUCT = type(mdp.RobotView)  # type of what @wp.struct returns
 INNER_STRUCTS = (Block, FilterParams, LegGeometry, Limits, MotorArrays)
 """Structs that are fields of public ones."""
 UNIT = re.compile(r"(\[[^\]]+\](?:, \[[^\]]+\])*),? ?")
@@ -42,7 +43,7 @@ def mdp_page() -> str:
     functions = {name: value for name, value in public.items() if isinstance(value, wp.Function)}
     for space in SPACES:
         functions |= helpers(space)
-    structs = {name: value for name, value in public.items() if isinstance(value, wp.Struct)}
+    structs = {name: value for name, value in public.items() if isinstance(value, STRUCT)}
     structs |= {f"{struct.cls.__module__}.{struct.key}": struct for struct in INNER_STRUCTS}
     classes = {name: value for name, value in public.items() if inspect.isclass(value)}
     used = tasks_by_function()
@@ -108,7 +109,7 @@ def function_entry(name: str, func: Any, tasks: Sequence[str] | None = None) -> 
     return described("function", name, f"({ast.unparse(tree.args)}){returns}", about, names)
 
 
-def struct_entry(name: str, struct: wp.Struct) -> Entry:
+def struct_entry(name: str, struct: Any) -> Entry:
     """Return the entry of a Warp struct, with the table of its fields."""
     docs, rows = field_docs(struct.cls), []
     for field in parsed(struct.cls).body:
