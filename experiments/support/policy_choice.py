@@ -1,0 +1,71 @@
+"""Table of the page "Which policy should I use?"."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+from jumper_warp.tasks.cfg import TaskCfg
+from support.policy_results import Row
+from support.policy_tables import TableColumn, cell, columns, first_seed, kind_of, markdown, trained_on
+
+
+class Need(NamedTuple):
+    """Need of a user, the policy for it, and when not to use that policy."""
+
+    words: str
+    policy: str
+    unless: str
+    tests: tuple[str, str, str] = ("nominal", "randomised", "friction_0.4")
+    """Conditions of the three columns of success; the error is that of the first."""
+
+
+SIDE = ("side", "", "side_friction_0.4")
+NEEDS = (
+    Need("jump up", "vertical_jump", "heights above 1.08 m; two jumps in a row"),
+    Need("jump to a place ahead", "horizontal_jump", "slippery floor; goals to the side or behind"),
+    Need("jump in any direction", "omnidirectional_jump", "goals beyond 0.7 m"),
+    Need("jump straight to the side, also on a slippery floor", "omnidirectional_jump", "goals beyond 0.7 m", SIDE),
+    Need("jump ahead on a slippery floor", "slippery_jump", "the command comes later than 0.5 s after the reset"),
+    Need("jump ahead and up to 0.5 m aside on a slippery floor", "slippery_jump", "goals straight to the side",
+         ("diagonal", "diagonal_friction_0.4_randomised", "diagonal_friction_0.4")),
+    Need("wait for the command on a slippery floor", "slippery_waiting_jump", "friction below 0.35"),
+    Need("jump onto or off blocks ahead", "sighted_jump", "slippery floor; no sensor for the edges"),
+    Need("walk on level ground", "walking_flat", "steps of 6 cm; slopes"),
+    Need("walk on rough ground", "walking_rough", "speeds above 0.8 m/s"),
+    Need("jump up on Mars", "mars_vertical_jump", "the command filter of Earth: mars_vertical_jump_stock"),
+    Need("jump ahead on Mars", "mars_horizontal_jump", "latency of 25 ms; friction 0.4"),
+    Need("jump ahead on Mars with leg springs", "mars_springs_jump", "latency of 25 ms; springs above 600 N/m"),
+    Need("turn in flight", "attitude", "angles above 140°; on the ground"),
+)  # fmt: skip
+"""Needs in the order of the table; links of policies are made from their names."""
+PAGES = {"height": "vertical_jump", "place": "horizontal_jump", "velocity": "walking", "attitude": "attitude"}
+RATES = {"velocity": TableColumn("", ("fall_rate",)), "attitude": TableColumn("", ("settled_without_collision_rate",))}
+ERRORS = {
+    "height": columns(("", "in_range_apex_error_abs_mean_m")), "place": columns(("", "goal_distance_at_rest_mean_m")),
+    "velocity": columns(("", "settled_rmse_vx_m_s")), "attitude": columns(("", "error_at_end_mean_deg")),
+}  # fmt: skip
+UNITS = {"height": "m", "place": "m", "velocity": "m/s", "attitude": "deg"}
+
+
+def choice_table(tasks: Mapping[str, TaskCfg]) -> str:
+    """Return the table of NEEDS: policy, range of training, success in three conditions, error, and when not."""
+    lines = []
+    for words, policy, unless, tests in NEEDS:
+        rows, task = first_seed(policy), tasks[policy]
+        kind = kind_of(task)
+        page = "mars" if policy.startswith("mars") else PAGES[kind]
+        rates = [_success(rows.get(test), kind) for test in tests]
+        error = f"{cell(ERRORS[kind][0], rows[tests[0]].metrics)} {UNITS[kind]}" if tests[0] in rows else ""
+        trained = trained_on(task, rows["nominal"].values)
+        lines.append([words, f"[{policy}]({page}.md)", trained, *rates, error, unless])
+    titles = ("need", "policy", "trained on", "nominal", "randomised", "friction 0.4", "error, nominal", "not for")
+    return markdown(titles, lines)
+
+
+def _success(row: Row | None, kind: str) -> str:
+    """Format the success of a row, for walking the falls; empty if it was not measured."""
+    if row is None:
+        return ""
+    text = cell(RATES.get(kind, TableColumn("", ("success_rate",))), row.metrics)
+    return f"{text} fall" if kind == "velocity" else text
