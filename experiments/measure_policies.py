@@ -7,8 +7,8 @@
 The first command evaluates policies as `jumper evaluate` does, once per condition and seed (a row), and runs the
 further tests (`support/policy_tests.py`) with the first seed. It writes `OUT/POLICY/CONDITION-SEED/metrics.json` after
 each row, and skips existing rows. Work can be interrupted, split by --policies and --conditions, and shared by
-processes. The second command saves these rows in the policies' folders. The third one makes the tables in docs/ and the policies'
-pages from the saved rows. Only the first one simulates.
+processes. The second command saves these rows in the policies' folders. The third one makes the tables in docs/ and the
+policies' pages from the saved rows. Only the first one simulates.
 """
 
 from __future__ import annotations

@@ -204,7 +204,7 @@ TEST_TABLES = {
     "diagonal": TestTable(("diagonal",), GOALS),
     "paper": TestTable(("grid", "consecutive"), (SUCCESS, *columns(
         ("error at rest [m]", "goal_distance_at_rest_mean_m"), ("ten in a row, all succeed", "row_all_success_rate")))),
-    "grounds": TestTable(("grounds_0.35", "grounds_0.40", "grounds_0.45", "grounds_0.50"), columns(
+    "grounds": TestTable(("grounds_0.35", "grounds_0.45", "grounds_0.50"), columns(
         ("onto a block", "block_success_rate"), ("off a platform", "platform_success_rate"),
         ("uneven ground", "uneven_success_rate"), ("falls, block", "block_fall_rate"))),
     "farthest": TestTable(("farthest", "farthest_randomised", "farthest_ahead", "farthest_left", "farthest_back",
