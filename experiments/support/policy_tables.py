@@ -115,7 +115,13 @@ def kind_of(task: TaskCfg) -> str:
 def trained_on(task: TaskCfg, values: Mapping[str, Any]) -> str:
     """Return the range of commands that a task samples in training, as text; values: conditions of a row."""
     if pair := values.get("trained_range_m"):
-        return "{:g} to {:g} m".format(*pair)
+        levels: Any = task.levels
+        aside, back = max(level.goal_upper[1] for level in levels), -min(level.goal_lower[0] for level in levels)
+        if kind_of(task) == "height":
+            return "{:g} to {:g} m".format(*pair)
+        if back > 0.0:
+            return f"up to {pair[1]:g} m ahead, {aside:g} m aside, {back:g} m back"
+        return f"{pair[0]:g} to {pair[1]:g} m ahead, {aside:g} m aside"
     if limits := values.get("trained_velocities"):
         return "{:g} / -{:g} m/s, ±{:g} m/s, ±{:g} rad/s".format(*limits)
     angles = [angle for level in task.levels for angle in level.angle]
