@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from jumper_warp.tasks.cfg import TaskCfg
 from support.policy_results import Row
-from support.policy_tables import TableColumn, cell, columns, first_seed, kind_of, markdown, trained_on
+from support.policy_tables import first_seed, kind_of, markdown, number, trained_on
 
 
 class Need(NamedTuple):
@@ -17,7 +17,7 @@ class Need(NamedTuple):
     policy: str
     unless: str
     tests: tuple[str, str, str] = ("nominal", "randomised", "friction_0.4")
-    """Conditions of the three columns of success; the errors are those of the first and third."""
+    """Conditions of the three columns of success and error."""
 
 
 SIDE = ("side", "side_friction_0.4_randomised", "side_friction_0.4")
@@ -40,38 +40,35 @@ NEEDS = (
 )  # fmt: skip
 """Needs in the order of the table; links of policies are made from their names."""
 PAGES = {"height": "vertical_jump", "place": "horizontal_jump", "velocity": "walking", "attitude": "attitude"}
-RATES = {"velocity": TableColumn("", ("fall_rate",)), "attitude": TableColumn("", ("settled_without_collision_rate",))}
+RATES = {"velocity": "fall_rate", "attitude": "settled_without_collision_rate"}  # By kind; else success_rate
 ERRORS = {
-    "height": columns(("", "in_range_apex_error_abs_mean_m")), "place": columns(("", "goal_distance_at_rest_mean_m")),
-    "velocity": columns(("", "settled_rmse_vx_m_s")), "attitude": columns(("", "error_at_end_mean_deg")),
-}  # fmt: skip
-UNITS = {"height": "m", "place": "m", "velocity": "m/s", "attitude": "deg"}
+    "height": ("in_range_apex_error_abs_mean_m", 1000.0, "{:.1f} mm"),
+    "place": ("goal_distance_at_rest_mean_m", 1000.0, "{:.1f} mm"),
+    "velocity": ("settled_rmse_vx_m_s", 1.0, "{:.3f} m/s"),
+    "attitude": ("error_at_end_mean_deg", 1.0, "{:.1f}°"),
+}
+"""Key of the error, factor and format by kind."""
 
 
 def choice_table(tasks: Mapping[str, TaskCfg]) -> str:
-    """Return the table of NEEDS: policy, range of training, success in three conditions, error, and when not."""
+    """Return the table of NEEDS: policy, range of training, success and error in three conditions, and when not."""
     lines = []
     for words, policy, unless, tests in NEEDS:
         rows, task = first_seed(policy), tasks[policy]
         kind = kind_of(task)
         page = "mars" if policy.startswith("mars") else PAGES[kind]
-        rates = [_success(rows.get(test), kind) for test in tests]
-        errors = [_error(rows.get(test), kind) for test in (tests[0], tests[2])]
         trained = trained_on(task, rows["nominal"].values)
-        lines.append([words, f"[{policy}]({page}.md)", trained, *rates, *errors, unless])
-    titles = ("need", "policy", "trained on", "nominal", "randomised", "friction 0.4", "error, nominal",
-              "error, friction 0.4", "not for")  # fmt: skip
-    return markdown(titles, lines)
+        cells = [_success(rows.get(test), kind) for test in tests]
+        lines.append([words, f"[{policy}]({page}.md)", *cells, trained, unless])
+    return markdown(("need", "policy", "nominal", "randomised", "friction 0.4", "trained on", "not for"), lines)
 
 
 def _success(row: Row | None, kind: str) -> str:
-    """Format the success of a row, for walking the falls; empty if it was not measured."""
+    """Format success, for walking the falls, and mean error of a row; empty if it was not measured."""
     if row is None:
         return ""
-    text = cell(RATES.get(kind, TableColumn("", ("success_rate",))), row.metrics)
-    return f"{text} fall" if kind == "velocity" else text
-
-
-def _error(row: Row | None, kind: str) -> str:
-    """Format the mean error of a row with its unit; empty if it was not measured."""
-    return "" if row is None else f"{cell(ERRORS[kind][0], row.metrics)} {UNITS[kind]}"
+    rate, (key, factor, text) = RATES.get(kind, "success_rate"), ERRORS[kind]
+    value = row.metrics[key].value
+    assert isinstance(value, float)
+    falls = " fall" if kind == "velocity" else ""
+    return f"{number(rate, row.metrics[rate].value)}{falls}, {text.format(factor * value)}"

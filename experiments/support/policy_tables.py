@@ -95,6 +95,7 @@ ROBOT: dict[str, tuple[tuple[str, dict[str, float]], ...]] = {
     "attitude": (("authors' robot, turn by 90°", {"settling_time_mean_s": HARDWARE_TIME}),),
 }  # fmt: skip
 """Published values of the real robot that no evaluation prints, by `TaskCfg.evaluation_suite`."""
+ON_ROBOT = "paper, robot, "  # Beginning of the words of results on the paper's robot
 KEYS = {"heights": HEIGHT_METRICS, "places": PLACE_METRICS, "walks": VELOCITY_METRICS, "turns": TURN_METRICS}
 
 
@@ -167,12 +168,20 @@ def main_table(policy: str, task: TaskCfg) -> str:
     """Return the main table of a policy: metrics as rows, conditions and published results as columns."""
     rows, paper = first_seed(policy), published(task)
     shown = [(title, rows[name].metrics) for name, title in zip(SHOWN, SHORT, strict=True) if name in rows]
-    lines = [[line.title, *(cell(line, metrics) for _, metrics in (*shown, *paper))] for line in MAIN[kind_of(task)]]
+    tests = [words.removeprefix(ON_ROBOT) for words, _ in paper if words.startswith(ON_ROBOT)]
+    titles = ["", *dict.fromkeys(ON_ROBOT.strip(", ") if words.startswith(ON_ROBOT) else words
+                                 for words, _ in (*shown, *paper))]  # fmt: skip
+    lines = []
+    for line in MAIN[kind_of(task)]:
+        cells = [cell(line, metrics) for words, metrics in (*shown, *paper) if not words.startswith(ON_ROBOT)]
+        robot = [cell(line, metrics) for words, metrics in paper if words.startswith(ON_ROBOT)]
+        lines.append([line.title, *cells, *([" / ".join(filter(None, robot))] if tests else [])])
     nominal = rows["nominal"]
     note = f"{trials_of(nominal):,} trials a column; commands: {nominal.values['commands']}"
     if kind_of(task) == "height":
         note += "; in range: " + str(nominal.metrics["in_range_success_rate"].over).partition("goals of ")[2]
-    return markdown(["", *(words for words, _ in (*shown, *paper))], lines) + f"\n{note}.\n"
+    note += f".\n{ON_ROBOT.strip(', ').capitalize()}: {' / '.join(tests)}" if tests else ""
+    return markdown(titles, lines) + f"\n{note}.\n"
 
 
 def all_conditions(policy: str, task: TaskCfg) -> str:
@@ -184,8 +193,8 @@ def all_conditions(policy: str, task: TaskCfg) -> str:
     values = rows["nominal"].values
     reasons = [f"Not measured: {CONDITIONS[name].title}, since {reason}.\n"
                for name in CONDITIONS if (reason := undefined(task, name))]  # fmt: skip
-    note = f"{trials_of(rows['nominal']):,} trials a row; commands: {values['commands']}; "
-    note += f"trained on {trained_on(task, values)}.\n"
+    note = f"{trials_of(rows['nominal']):,} trials a row; commands: {values['commands']}.\n"
+    note += f"Trained on {trained_on(task, values)}.\n"
     return "\n".join([markdown(["condition", *(column.title for column in wide)], lines), note, *reasons])
 
 

@@ -142,6 +142,7 @@ def test_main_table_has_the_conditions_as_columns_beside_the_paper(tasks):
     row = next(row for row in saved_rows("vertical_jump") if (row.condition, row.seed) == ("randomised", 0))
     values = dict(zip(titles, error, strict=True))
     assert values[""] == "error [m]" and values["paper, simulation"] == "0.0400"
+    assert values["paper, robot"] == "0.0230 / 0.0100"
     assert values["randomised"] == f"{row.metrics['apex_error_abs_mean_m'].value:.4f}"
 
 
