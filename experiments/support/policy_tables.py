@@ -210,7 +210,8 @@ class TestTable(NamedTuple):
 
 GOALS = (SUCCESS, *columns(("error at rest [m]", "goal_distance_at_rest_mean_m"), ("falls", "fall_rate"),
                            ("missed", "miss_rate"), ("no paw lifted", "no_paw_lift_rate")))  # fmt: skip
-KINDS = ("flat", "random", "waves", "slope_down", "slope_up", "stairs_down", "stairs_up", "blocks")
+GROUNDS = {"flat": "flat", "uneven": "bumps", "waves": "waves", "slope": "down a slope", "bowl": "up a slope",
+           "stairs": "down steps", "pit": "up steps", "blocks": "blocks"}  # fmt: skip
 TEST_TABLES = {
     "slippery": TestTable(("friction_0.4", "diagonal_friction_0.4", "diagonal_friction_0.4_randomised",
                            "friction_0.3"), GOALS,
@@ -235,8 +236,8 @@ TEST_TABLES = {
     "wait": TestTable(("wait", "wait_randomised"), columns(
         ("hold 3 s", "holding_rate"), ("range of the paw force, mean [N]", "paw_force_range_mean_n"),
         ("ripple of the torque, mean [N m]", "torque_ripple_mean_nm"))),
-    "terrain": TestTable(("terrain", "terrain_randomised"), tuple(
-        TableColumn(kind.replace("_", " "), (f"{kind}_fall_rate",)) for kind in KINDS)),
+    "terrain": TestTable(("terrain", "terrain_randomised"), columns(
+        *((words, f"{kind}_fall_rate") for kind, words in GROUNDS.items()))),
     "tracking": TestTable(("tracking", "tracking_randomised"), columns(
         ("within 0.1 m/s after [s]", "settling_time_median_s"), ("top speed ahead [m/s]", "top_ahead_m_s"),
         ("back", "top_back_m_s"), ("sideways", "top_sideways_m_s"), ("turning [rad/s]", "top_turning_rad_s"),
