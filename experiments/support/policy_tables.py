@@ -246,8 +246,8 @@ TEST_TABLES = {
         ("upright", "landed_upright_rate"), ("upright without turning", "without_turning_landed_upright_rate"),
         ("tilt at touchdown [deg]", "touchdown_tilt_mean_deg"),
         ("without turning [deg]", "without_turning_touchdown_tilt_mean_deg"))),
-    "combined": TestTable(("walk_jump_walk", "walk_jump_walk_randomised", "walk_jump_walk_mujoco", "course",
-                           "course_randomised"), columns(
+    "combined": TestTable(("walk_jump_walk", "walk_jump_walk_randomised", "walk_jump_walk_mujoco",
+                           "course_level", "course_level_randomised", "course", "course_randomised"), columns(
         ("finished", "finished_rate"), ("all jumps on goal", "finished_on_goal_rate"), ("falls", "fall_rate"),
         ("apex error [m]", "apex_error_abs_mean_m"), ("error of the place [m]", "goal_distance_at_handover_mean_m"),
         ("RMSE settled, ahead [m/s]", "settled_slewed_rmse_vx_m_s"), ("aside [m/s]", "settled_slewed_rmse_vy_m_s"),

@@ -80,8 +80,12 @@ TESTS = {
     "walk_jump_walk": PolicyTest("walk, jump up, walk, jump ahead, walk; nominal", (COMBINED,), COURSE),
     "walk_jump_walk_randomised": PolicyTest("the same, randomised", (COMBINED,), f"{COURSE} --randomize"),
     "walk_jump_walk_mujoco": PolicyTest("the same, SolverMuJoCo", (COMBINED,), f"{COURSE} --solver mujoco"),
-    "course": PolicyTest("ten random commands; nominal", (COMBINED,), f"{COURSE} --course"),
-    "course_randomised": PolicyTest("ten random commands; randomised", (COMBINED,), f"{COURSE} --course --randomize"),
+    "course_level": PolicyTest("ten random commands, no blocks; nominal", (COMBINED,),
+                               f"{COURSE} --course --no-blocks"),
+    "course_level_randomised": PolicyTest("the same, randomised", (COMBINED,),
+                                          f"{COURSE} --course --no-blocks --randomize"),
+    "course": PolicyTest("ten random commands with blocks; nominal", (COMBINED,), f"{COURSE} --course"),
+    "course_randomised": PolicyTest("the same, randomised", (COMBINED,), f"{COURSE} --course --randomize"),
 }  # fmt: skip
 """Tests by name, in the order of the tables."""
 
