@@ -23,19 +23,19 @@ class Need(NamedTuple):
 SIDE = ("side", "side_friction_0.4_randomised", "side_friction_0.4")
 NEEDS = (
     Need("jump up", "vertical_jump", "heights above 1.08 m"),
-    Need("jump to a place ahead", "horizontal_jump", "slippery floor; goals to the side or behind"),
+    Need("jump to a place ahead", "horizontal_jump", "slippery floor; sideways; back"),
     Need("jump in any direction", "omnidirectional_jump", "goals beyond 1 m"),
-    Need("jump straight to the side, also on a slippery floor", "omnidirectional_jump", "goals beyond 1 m", SIDE),
-    Need("jump ahead on a slippery floor", "slippery_jump", "the command comes later than 0.5 s after the reset"),
-    Need("jump ahead and up to 0.5 m aside on a slippery floor", "slippery_jump", "goals straight to the side",
+    Need("jump sideways, also on a slippery floor", "omnidirectional_jump", "goals beyond 1 m", SIDE),
+    Need("jump ahead on a slippery floor", "slippery_jump", "late commands (0.5 s after the reset)"),
+    Need("jump diagonally on a slippery floor", "slippery_jump", "sideways goals",
          ("diagonal", "diagonal_friction_0.4_randomised", "diagonal_friction_0.4")),
-    Need("wait for the command on a slippery floor", "slippery_waiting_jump", "friction below 0.35"),
-    Need("jump onto or off blocks ahead", "sighted_jump", "slippery floor; no sensor for the edges"),
+    Need("wait, then jump on a slippery floor", "slippery_waiting_jump", "friction below 0.35"),
+    Need("jump onto or off blocks ahead", "sighted_jump", "slippery floor"),
     Need("walk on level ground", "walking_flat", "steps of 6 cm; slopes"),
     Need("walk on rough ground", "walking_rough", "speeds above 0.8 m/s"),
-    Need("jump up on Mars", "mars_vertical_jump", "the command filter of Earth: mars_vertical_jump_stock"),
+    Need("jump up on Mars", "mars_vertical_jump", "the command filter of Earth"),
     Need("jump ahead on Mars", "mars_horizontal_jump", "latency of 25 ms; friction 0.4"),
-    Need("jump ahead on Mars with leg springs", "mars_springs_jump", "latency of 25 ms; springs above 600 N/m"),
+    Need("jump ahead on Mars with leg springs", "mars_springs_jump", "latency of 25 ms"),
     Need("turn in flight", "attitude", "angles above 140°; on the ground"),
 )  # fmt: skip
 """Needs in the order of the table; links of policies are made from their names."""
@@ -71,4 +71,5 @@ def _success(row: Row | None, kind: str) -> str:
     value = row.metrics[key].value
     assert isinstance(value, float)
     falls = " fall" if kind == "velocity" else ""
-    return f"{number(rate, row.metrics[rate].value)}{falls}, {text.format(factor * value)}"
+    share = f"{number(rate, row.metrics[rate].value).replace('100.0', '100')}{falls}"
+    return ", ".join(part.replace(" ", "\N{NO-BREAK SPACE}") for part in (share, text.format(factor * value)))
