@@ -1,11 +1,14 @@
-"""Measure how well the shipped policies do under all test conditions, and write metrics and docs/results.md.
+"""Measure the shipped policies in all conditions and tests, and write metrics.json and the tables of the pages.
 
     python experiments/measure_policies.py --out outputs/policies
-    python experiments/measure_policies.py --out outputs/policies --write-tables docs --save-to-policies
+    python experiments/measure_policies.py --out outputs/policies --save-to-policies
+    python experiments/measure_policies.py --write-tables
 
-The first command evaluates policies as `jumper evaluate` does, once per condition and seed (a row). It writes
-`OUT/POLICY/CONDITION-SEED/metrics.json` after each row, and skips existing rows. Work can be interrupted, split by
---policies and --conditions, and shared by processes. The second command reads these files and simulates nothing.
+The first command evaluates policies as `jumper evaluate` does, once per condition and seed (a row), and runs the
+further tests (`support/policy_tests.py`) with the first seed. It writes `OUT/POLICY/CONDITION-SEED/metrics.json` after
+each row, and skips existing rows. Work can be interrupted, split by --policies and --conditions, and shared by
+processes. The second command saves these rows in the policies' folders. The third one makes the tables in docs/ and the
+policies' pages from the saved rows. Only the first one simulates.
 """
 
 from __future__ import annotations
@@ -26,9 +29,11 @@ from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.utils.assets import policy_tasks
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.output import read_values
 from support.policy_conditions import CONDITIONS, commands_of, payload_overlay, undefined, with_trials
-from support.policy_page import write_page
+from support.policy_page import pages, write_pages
 from support.policy_results import METRICS, read_rows, save_to_policies, tasks_of
+from support.policy_tests import COMBINED, TESTS, run_test
 from support.scripts import ThreadArgs, run_script
 
 PROGRESS = ("success_rate", "settled_without_collision_rate", "fall_rate")  # Metrics in the lines of progress
@@ -39,16 +44,18 @@ class Args(ThreadArgs):
     """Flags of the measurement of the shipped policies."""
 
     out: Path = Path("outputs/policies")  # Folder of all rows
-    policies: tuple[str, ...] = tuple(policy_tasks())  # Names of the policies
-    conditions: tuple[str, ...] = tuple(CONDITIONS)  # Names of the conditions
+    policies: tuple[str, ...] = (*policy_tasks(), COMBINED)
+    """Names of the policies; combined: the three policies that walk and jump in turns."""
+    conditions: tuple[str, ...] = (*CONDITIONS, *TESTS)  # Names of the conditions and further tests
     seeds: tuple[int, ...] = (0, 1)  # Seeds of sampled commands, robots and noise
     trials: int = 4096  # Least number of trials in a row
-    write_tables: Path | None = None  # Folder for results.md, from the rows in `out`; nothing is measured
+    write_tables: tyro.conf.FlagCreatePairsOff[bool] = False
+    """Make the tables in docs/ and the policies' pages from the saved rows; nothing is measured."""
     save_to_policies: tyro.conf.FlagCreatePairsOff[bool] = False
     """Write the rows in `out` into metrics.json of the policies' folders; nothing is measured."""
 
     def __post_init__(self) -> None:
-        for names, known in ((self.policies, tuple(policy_tasks())), (self.conditions, tuple(CONDITIONS))):
+        for names, known in ((self.policies, (*policy_tasks(), COMBINED)), (self.conditions, (*CONDITIONS, *TESTS))):
             if unknown := sorted(set(names) - set(known)):
                 raise InputError(f"no {unknown[0]!r:.40}; there are {', '.join(known)}")
         if not self.seeds or self.trials < 16:
@@ -65,18 +72,23 @@ def missing_rows(args: Args) -> list[tuple[str, str, int]]:
     These have no metrics.json, and the condition is defined for the policy.
     """
     tasks = tasks_of(args.policies)
-    return [
+    defined = [
         (policy, condition, seed)
         for policy in args.policies
         for condition in args.conditions
-        if undefined(tasks[policy], condition) is None
-        for seed in args.seeds
-        if not (args.row(policy, condition, seed) / METRICS).is_file()
-    ]
+        for seed in (args.seeds[:1] if condition in TESTS else args.seeds)
+        if (policy in TESTS[condition].policies if condition in TESTS
+            else policy in tasks and undefined(tasks[policy], condition) is None)
+    ]  # fmt: skip
+    return [row for row in defined if not (args.row(*row) / METRICS).is_file()]
 
 
 def measure_row(args: Args, policy: str, condition: str, seed: int) -> dict[str, Any]:
     """Evaluate a policy in one condition, write its metrics.json, and return conditions and metrics by name."""
+    if condition in TESTS:
+        flags = ["--seed", str(seed), *(["--device", args.device] if args.device else [])]
+        run_test(policy, condition, args.row(policy, condition, seed), flags)
+        return read_values(args.row(policy, condition, seed))
     run, folder, values = EvaluationRun(policy), args.row(policy, condition, seed), dict(CONDITIONS[condition].values)
     if payload := values.pop("payload", None):
         run.settings["payload_kg"], values["robot"] = payload, folder / "payload.json"
@@ -92,17 +104,18 @@ def measure_row(args: Args, policy: str, condition: str, seed: int) -> dict[str,
 def main(args: Args) -> int:
     """Evaluate policies in missing conditions, or write tables and policies' files from existing results.
 
-    Returns the number of evaluations (rows).
+    Returns the number of evaluations (rows), or of pages that changed.
     """
-    if args.write_tables is None and not args.save_to_policies:
+    if args.write_tables:
+        changed = write_pages(tasks_of(policy_tasks()), pages())
+        print("\n".join(map(str, changed)) or "no table changed")
+        return len(changed)
+    if not args.save_to_policies:
         return measure(args)
-    rows, tasks = read_rows(args.out, args.policies), tasks_of(args.policies)
+    rows = read_rows(args.out, args.policies)
     if not rows:
         raise InputError(f"{args.out} has no rows of these policies")
-    if args.write_tables is not None:
-        print(write_page(args.write_tables, rows, tasks))
-    if args.save_to_policies:
-        save_to_policies(rows, tasks)
+    save_to_policies(rows, tasks_of(args.policies))
     return len(rows)
 
 
@@ -118,7 +131,7 @@ def measure(args: Args) -> int:
         rates = ", ".join(f"{key} {values[key]:.4g}" for key in PROGRESS if key in values)
         times = f"{spent / 60:.1f} min, {spent / number * (len(rows) - number) / 60:.1f} min left"
         print(f"{number}/{len(rows)} {' '.join(map(str, row))}: {rates}; {times}", flush=True)
-    print(f"{len(rows)} rows measured, in {args.out}; --write-tables FOLDER writes their tables")
+    print(f"{len(rows)} rows measured, in {args.out}; --save-to-policies saves them")
     return len(rows)
 
 

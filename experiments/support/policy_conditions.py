@@ -22,6 +22,11 @@ class TestCondition(NamedTuple):
 
     __test__ = False  # not a test class of pytest
 
+    @property
+    def title(self) -> str:
+        """Description, with the solver if that is SolverMuJoCo."""
+        return self.words + (", SolverMuJoCo" if self.values.get("solver") == "mujoco" else "")
+
 
 RANDOMISED = {"randomize": True, "noise": True}
 CONDITIONS = {

@@ -103,8 +103,10 @@ def _shown(path: Path) -> str:
 def results_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the lines of the table of a policy's results: a line for each condition, of the first seed.
 
-    rows: as in the policy's metrics.json.
+    Tests with other commands than the first row's are left out. rows: as in the policy's metrics.json.
     """
+    commands = rows[0]["conditions"].get("commands")
+    rows = [row for row in rows if row["conditions"].get("commands") == commands]
     first = {row["condition"]: row for row in reversed(rows)}
     shown = [row for row in rows if first[row["condition"]] is row]
     columns = [column for column in COLUMNS if column.key in shown[0]["metrics"]]
@@ -116,7 +118,6 @@ def results_table(rows: Sequence[Mapping[str, Any]]) -> list[str]:
     text = ["  ".join([line[0].ljust(widths[0]), *(cell.rjust(width) for cell, width in zip(line[1:], widths[1:],
             strict=True))]) for line in lines]  # fmt: skip
     trials = max(metric["trials"] or 0 for metric in shown[0]["metrics"].values())
-    commands = shown[0]["conditions"].get("commands")
     notes = [f"{trials:,} trials a line" + (f"; commands: {commands}" if commands else "")]
     if any("mujoco" in row["condition"] for row in shown):
         notes.append("mujoco: on Newton's SolverMuJoCo; all others on SolverJumper")

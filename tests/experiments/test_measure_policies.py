@@ -1,4 +1,4 @@
-"""Conditions, tables and comparisons of the shipped policies, and the experiment at a tiny size."""
+"""Conditions, tables and two seeds of the shipped policies, and the experiment at a tiny size."""
 
 import json
 import shutil
@@ -15,14 +15,18 @@ from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.folder import load_policy
 from jumper_warp.robot.overlay import with_springs
-from jumper_warp.utils.assets import POLICIES
+from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import MetricValue, mean, rate
 from jumper_warp.utils.output import read_metrics
-from support import policy_results
-from support.policy_comparisons import OldKey, _old_cell, means_p, proportions_p, seed_section, seed_tests
+from support import policy_results, policy_tests
+from support.policy_choice import NEEDS
+from support.policy_comparisons import means_p, proportions_p, seed_section, seed_tests
 from support.policy_conditions import CONDITIONS, payload_overlay, undefined, with_trials
-from support.policy_results import Row
+from support.policy_page import filled, pages
+from support.policy_results import Row, saved_rows, tasks_of
+from support.policy_tables import TEST_TABLES, main_table
+from support.policy_tests import COMBINED, TESTS
 
 pytestmark = pytest.mark.usefixtures("one_thread")
 
@@ -105,22 +109,58 @@ def test_seeds_are_compared_by_all_metrics_with_an_interval_and_enough_trials():
 
 
 def test_differences_are_significant_after_correction_for_the_number_of_tests():
-    assert "**1 differences are significant.**" in seed_section([row(0, 500), row(1, 580)])
+    assert "1 differences are significant" in seed_section([row(0, 500), row(1, 580)])
     many = [row(seed, 500, condition) for condition in CONDITIONS for seed in (0, 1) if condition != "nominal"]
     text = seed_section([row(0, 500), row(1, 565), *many])  # p = 0.0036, of 20 tests
-    assert "10 rows have two seeds. They give 20 tests" in text and "**0 differences are significant.**" in text
+    assert "10 rows have two seeds: 20 two-proportion tests" in text and "0 differences are significant" in text
 
 
-# ---------------------------------------------------------------- old and new definitions
+# ---------------------------------------------------------------- tables of the pages
 
 
-@pytest.mark.parametrize(("old", "change", "commands", "text"), [
-    (0.5, "other definition", True, "50.0 % → 50.0 %"), (0.9, "other definition", True, "90.0 % → 50.0 % DC"),
-    (0.9, "", True, "90.0 % → 50.0 % C"), (0.9, "", False, "90.0 % → 50.0 % S"), (None, "", False, "–"),
-])  # fmt: skip
-def test_old_value_outside_the_interval_has_its_reason(old, change, commands, text):
-    key = OldKey("success", "success_rate", "success_rate", change)
-    assert _old_cell(key, old, rate(np.arange(100) < 50), commands) == text
+@pytest.fixture(scope="module")
+def tasks():
+    """Tasks of all shipped policies by name."""
+    return tasks_of(policy_tasks())
+
+
+@pytest.mark.parametrize("page", pages(), ids=lambda page: f"{page.parent.name}-{page.stem}")
+def test_tables_of_the_pages_are_those_of_metrics_json(page, tasks):
+    text = page.read_text(encoding="utf-8")
+    assert filled(text, tasks) == text, "run python experiments/measure_policies.py --write-tables"
+
+
+def test_page_without_a_table_stays_and_an_unknown_table_is_refused(tasks):
+    assert filled("text\n", tasks) == "text\n"
+    with pytest.raises(InputError, match="no table 'main high_jump'"):
+        filled("<!-- table: main high_jump -->\n<!-- end of table -->\n", tasks)
+
+
+def test_main_table_has_the_conditions_as_columns_beside_the_paper(tasks):
+    lines = main_table("vertical_jump", tasks["vertical_jump"]).splitlines()
+    titles, error = ([cell.strip() for cell in line.split("|")[1:-1]] for line in (lines[0], lines[4]))
+    row = next(row for row in saved_rows("vertical_jump") if (row.condition, row.seed) == ("randomised", 0))
+    values = dict(zip(titles, error, strict=True))
+    assert values[""] == "error [m]" and values["paper, simulation"] == "0.0400"
+    assert values["paper, robot"] == "0.0230 / 0.0100"
+    assert values["randomised"] == f"{row.metrics['apex_error_abs_mean_m'].value:.4f}"
+
+
+def test_every_test_has_its_place_in_a_table_and_names_known_policies():
+    shown = {name for table in TEST_TABLES.values() for name in table.tests}
+    chosen = {name for need in NEEDS for name in need.tests}
+    assert set(TESTS) <= shown | chosen
+    assert {policy for test in TESTS.values() for policy in test.policies} <= {*policy_tasks(), COMBINED}
+
+
+def test_commands_of_the_tests_are_valid(monkeypatch, tmp_path):
+    calls = []
+    monkeypatch.setattr(policy_tests.subprocess, "run", lambda command, **_: calls.append(command))
+    policy_tests.run_test("slippery_jump", "side_friction_0.4", tmp_path, ["--seed", "1"])
+    assert calls[0][1:5] == ["-m", "jumper_warp", "evaluate", "slippery_jump"]
+    assert calls[0][-4:] == ["--seed", "1", "--out", str(tmp_path)]
+    assert all((POLICIES.parents[1] / test.command.split()[0]).is_file() or test.command.startswith("jumper ")
+               for test in TESTS.values())  # fmt: skip
 
 
 # ---------------------------------------------------------------- the experiment
@@ -152,35 +192,24 @@ def test_rows_have_the_metrics_of_jumper_evaluate(measured, tmp_path):
     assert read_metrics(row_folder) == read_metrics(tmp_path)
 
 
-def test_page_has_a_line_for_each_row_and_reasons_for_missing_ones(measured, tmp_path):
-    args, _ = measured
-    flags = {"out": args.out, "policies": args.policies, "write_tables": tmp_path}
-    assert measure_policies.main(measure_policies.Args(**flags)) == 5
-    text = (tmp_path / "results.md").read_text()
-    metrics = read_metrics(args.out / "vertical_jump/payload_3_kg-0")
-    (line,) = [line for line in text.splitlines() if line.startswith("| payload of 3 kg") and "0.5 to 1.2 m" in line]
-    success, error = metrics["success_rate"].value, metrics["apex_error_abs_mean_m"].value
-    assert f"| {100.0 * success:.1f} % (" in line and f"| {error:.4f} / " in line
-    assert "Not measured: randomised, pushed in flight too, since its randomisation has no pushes." in text
-    assert "| vertical_jump | nominal | 200 → 16 | 96.5 % → " in text
-
-
-def test_policies_get_all_rows_and_keep_their_earlier_metrics(measured, tmp_path, monkeypatch):
+def test_policies_get_new_rows_and_keep_their_other_rows_and_earlier_metrics(measured, tmp_path, monkeypatch):
     args, _ = measured
     for name in args.policies:
         shutil.copytree(POLICIES / name, tmp_path / name)
     monkeypatch.setattr(policy_results, "POLICIES", tmp_path)
     before = policy_results.earlier_metrics("vertical_jump")
+    kept = [row[1:3] for row in saved_rows("vertical_jump")]
     flags = {"out": args.out, "policies": args.policies, "save_to_policies": True}
     for _ in range(2):
         measure_policies.main(measure_policies.Args(**flags))
         load_policy(tmp_path / "vertical_jump")  # verifies checksums
         saved = json.loads((tmp_path / "vertical_jump/metrics.json").read_text())
         assert saved["earlier"] == {"definition": "old definition", "suites": before}
-        assert [row["condition"] for row in saved["rows"]] == ["nominal", "payload_3_kg", "push_in_flight"]
-    conditions = saved["rows"][1]["conditions"]
-    assert conditions["payload_kg"] == 3.0 and "robot" not in conditions
-    assert saved["rows"][1]["metrics"]["success_rate"]["trials"] == 16
+        assert [(row["condition"], row["seed"]) for row in saved["rows"]] == kept
+    rows = {(row["condition"], row["seed"]): row for row in saved["rows"]}
+    payload, other = rows["payload_3_kg", 0], rows["payload_3_kg", 1]
+    assert payload["conditions"]["payload_kg"] == 3.0 and "robot" not in payload["conditions"]
+    assert [row["metrics"]["success_rate"]["trials"] for row in (payload, other)] == [16, 4096]
     jsonschema = pytest.importorskip("jsonschema")
     schema = json.loads((Path(__file__).parents[2] / "docs/metrics.schema.json").read_text())
     jsonschema.validate(saved, schema)
@@ -195,4 +224,4 @@ def test_refuses_invalid_flags(tmp_path):
     with pytest.raises(InputError, match="at least 16 trials"):
         measure_policies.Args(trials=15)
     with pytest.raises(InputError, match="has no rows"):
-        measure_policies.main(measure_policies.Args(out=tmp_path, write_tables=tmp_path))
+        measure_policies.main(measure_policies.Args(out=tmp_path, save_to_policies=True))
