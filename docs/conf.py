@@ -1,11 +1,11 @@
 """Settings of the documentation site; `make docs` builds it.
 
-Links. A page links to any file of the repository by its relative path, as on a repository host, and the site resolves it:
+Links. A page links to any file of the repository by its relative path, as on a repository host. The site resolves it:
 
-- a page of docs/, and a file that is a page of the site (`repository_pages`: CONTRIBUTING.md, the policies' READMEs), is
-  a link to the page;
-- another file of docs/ is a download;
-- another file or folder is a link to `repository`, or its path as code while `repository` is empty.
+- a page of docs/, or a file that is a page of the site (`repository_pages`: CONTRIBUTING.md, the policies' READMEs): a
+  link to the page;
+- another file of docs/: a download;
+- another file or folder: a link to `repository`, or its path as code while `repository` is empty.
 
 A target that does not exist is a warning, and `make docs` stops at warnings. In an included file links are relative to
 that file.
@@ -28,7 +28,7 @@ from jumper_warp.utils.version import __version__  # noqa: E402
 
 project = "jumper-warp"
 author = "The jumper-warp authors"
-copyright = author  # noqa: A001
+copyright = author
 release = version = __version__
 
 repository = ""
@@ -41,7 +41,7 @@ repository_pages = {
 }
 
 extensions = [
-    "myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton", "sphinx_design", "api_pages", "repository",
+    "myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton", "sphinx_design", "api_pages", "mathml", "repository",
 ]  # fmt: skip
 exclude_patterns = ["_build", "_generated", "_ext"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
@@ -50,7 +50,7 @@ myst_heading_anchors = 3
 myst_links_external_new_tab = True
 suppress_warnings = ["ref.python"]  # a type in a signature with the name of several classes
 
-autodoc_default_options = {"members": True, "undoc-members": True, "show-inheritance": True, "member-order": "bysource"}
+autodoc_default_options = {"members": True, "undoc-members": True, "member-order": "bysource"}
 autodoc_typehints = "signature"
 autodoc_typehints_format = "short"
 autodoc_class_signature = "mixed"
@@ -60,6 +60,8 @@ python_use_unqualified_type_names = True
 python_maximum_signature_line_length = 72
 toc_object_entries_show_parents = "hide"
 
+smartquotes = False  # -- is part of flags
+html_math_renderer = "mathml"
 html_theme = "furo"
 html_title = "jumper-warp"
 html_static_path = ["_static"]

@@ -12,8 +12,8 @@ from plain_text import to_rst
 
 AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
     "environments": ("Environments", (
-        "envs.env", "envs.vec_env", "envs.skill", "envs.state", "envs.parameters", "envs.camera", "envs.gymnasium", "gym",
-        "envs.rsl_rl", "envs.sb3",
+        "envs.env", "envs.vec_env", "envs.skill", "envs.state", "envs.parameters", "envs.camera", "envs.gymnasium",
+        "gym", "envs.rsl_rl", "envs.sb3",
     )),
     "simulation": ("Simulation and solvers", (
         "sim.simulation", "sim.solver", "sim.mujoco", "sim.physics", "sim.dynamics", "sim.tape",
@@ -24,41 +24,46 @@ AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
     )),
     "tasks": ("Tasks", (
         "registry", "tasks.jump.cfg", "tasks.jump.vertical", "tasks.jump.horizontal", "tasks.jump.mars",
-        "tasks.velocity.cfg", "tasks.velocity.flat", "tasks.velocity.rough", "tasks.attitude.cfg", "tasks.attitude.flight",
-        "tasks.commands", "tasks.interface", "tasks.switching", "tasks.observations", "tasks.mirror", "tasks.saving",
+        "tasks.velocity.cfg", "tasks.velocity.flat", "tasks.velocity.rough", "tasks.attitude.cfg",
+        "tasks.attitude.flight", "tasks.commands", "tasks.interface", "tasks.switching", "tasks.observations",
+        "tasks.mirror", "tasks.saving",
     )),
     "gradients": ("Gradients", (
         "diff.rollout", "diff.torch_rollout", "diff.closed_loop", "diff.differentiable_env", "diff.smooth_rewards",
     )),
     "training": ("Training", (
-        "rl.cfg", "rl.runner", "rl.ppo", "rl.shac", "rl.networks", "rl.checkpoint", "rl.resume", "rl.logger", "rl.mirror",
-        "rl.distributed",
+        "rl.cfg", "rl.runner", "rl.ppo", "rl.shac", "rl.networks", "rl.checkpoint", "rl.resume", "rl.logger",
+        "rl.mirror", "rl.distributed",
     )),
     "policies": ("Policies", (
         "policies.folder", "policies.policy", "policies.spec", "policies.catalog", "policies.conditions",
-        "policies.skills", "policies.runs", "policies.onnx", "policies.blend", "policies.warm_start", "deploy.policy",
+        "policies.skills", "policies.runs", "policies.onnx", "policies.blend", "policies.warm_start",
+        "deploy.policy",
     )),
     "evaluation": ("Evaluation", (
         "evaluation.run", "evaluation.evaluations", "evaluation.log", "evaluation.commands", "evaluation.suites",
-        "evaluation.sweeps", "evaluation.episodes", "evaluation.heights", "evaluation.landings", "evaluation.velocities",
-        "evaluation.attitude", "evaluation.jumps", "evaluation.courses", "evaluation.scripts", "evaluation.recorder",
-        "evaluation.limits", "evaluation.finetuning", "evaluation.finetuning_cfg",
+        "evaluation.sweeps", "evaluation.episodes", "evaluation.heights", "evaluation.landings",
+        "evaluation.velocities", "evaluation.attitude", "evaluation.jumps", "evaluation.courses",
+        "evaluation.scripts", "evaluation.recorder", "evaluation.limits", "evaluation.finetuning",
+        "evaluation.finetuning_cfg",
     )),
     "identification": ("Identification", (
-        "identification.identify", "identification.parameters", "identification.recording", "identification.motions",
-        "identification.excitation", "identification.actuators", "identification.residuals",
-        "identification.least_squares", "identification.initial_states", "identification.uncertainty",
-        "identification.results", "identification.report", "identification.replay",
+        "identification.identify", "identification.parameters", "identification.recording",
+        "identification.motions", "identification.excitation", "identification.actuators",
+        "identification.residuals", "identification.least_squares", "identification.initial_states",
+        "identification.uncertainty", "identification.results", "identification.report", "identification.replay",
     )),
     "trajectory": ("Trajectory optimization", (
         "trajectory.problem", "trajectory.jumps", "trajectory.gauss_newton", "trajectory.augmented_lagrangian",
         "trajectory.smoothing", "trajectory.whole_body",
     )),
     "viz": ("Recordings and pictures", (
-        "viz.recorder", "viz.recording", "viz.film", "viz.picture", "viz.plots", "viz.rerun", "viz.renderer", "viz.scene",
-        "viz.props", "viz.style",
+        "viz.recorder", "viz.recording", "viz.film", "viz.picture", "viz.plots", "viz.rerun", "viz.renderer",
+        "viz.scene", "viz.props", "viz.style",
     )),
-    "utils": ("Errors and output", ("utils.errors", "utils.metrics", "utils.output", "utils.runtime", "utils.streams")),
+    "utils": ("Errors and output", (
+        "utils.errors", "utils.metrics", "utils.output", "utils.runtime", "utils.streams",
+    )),
 }  # fmt: skip
 """Title and modules of each page, by its file name."""
 

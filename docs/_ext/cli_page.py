@@ -62,9 +62,13 @@ def cli_page() -> str:
 
 def summary() -> str:
     """Return the table of all commands."""
-    anchors = {"train": "train-task", "finetune": "finetune-policy", "play": "play-policy", "evaluate": "evaluate-policy",
-               "export": "export-source", "sysid": "sysid-fit-data", "info": "info-name", "completion": "completion-shell"}  # fmt: skip
-    rows = [f"| [`{name}`](#jumper-{anchors.get(name, name)}) | {paragraph(about)} |" for name, about in COMMANDS.items()]
+    anchors = {
+        "train": "train-task", "finetune": "finetune-policy", "play": "play-policy", "evaluate": "evaluate-policy",
+        "export": "export-source", "sysid": "sysid-fit-data", "info": "info-name", "completion": "completion-shell",
+    }  # fmt: skip
+    rows = [
+        f"| [`{name}`](#jumper-{anchors.get(name, name)}) | {paragraph(about)} |" for name, about in COMMANDS.items()
+    ]
     return "\n".join(["| Command | Purpose |", "|---|---|", *rows])
 
 

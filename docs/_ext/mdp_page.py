@@ -27,7 +27,7 @@ STRUCT = type(mdp.RobotView)  # type of what @wp.struct returns
 INNER_STRUCTS = (Block, FilterParams, LegGeometry, Limits, MotorArrays)
 """Structs that are fields of public ones."""
 UNIT = re.compile(r"(\[[^\]]+\](?:, \[[^\]]+\])*),? ?")
-SHAPE = re.compile(r"(\([^()]*,[^()]*\)),? ?")
+SHAPE = re.compile(r"(\([^()]*,[^()]*\))[,;]? ?")
 
 
 class Entry(NamedTuple):
@@ -55,7 +55,9 @@ def mdp_page() -> str:
         "Functions": [function_entry(name, func) for name, func in functions.items()],
     }
     for space in SPACES:
-        kinds[f"Stock {space}"] = [function_entry(name, func, used.get(func)) for name, func in stock_terms(space).items()]
+        kinds[f"Stock {space}"] = [
+            function_entry(name, func, used.get(func)) for name, func in stock_terms(space).items()
+        ]
     for space in SPACES:
         if terms := task_terms(space):
             title = f"{space.capitalize()} of the project's tasks"
@@ -79,7 +81,9 @@ def described(kind: str, name: str, signature: str, *paragraphs: str) -> Entry:
     """Return an entry: a directive `py:<kind>` of a full name, a signature, and paragraphs of Markdown."""
     local = name.removeprefix(f"{MDP}.").removeprefix("jumper_warp.kernels.")
     body = "\n\n".join(paragraph for paragraph in paragraphs if paragraph)
-    return Entry(name, f"````{{py:{kind}}} {local}{signature}\n:module: {name.removesuffix(f'.{local}')}\n\n{body}\n````")
+    return Entry(
+        name, f"````{{py:{kind}}} {local}{signature}\n:module: {name.removesuffix(f'.{local}')}\n\n{body}\n````"
+    )
 
 
 def parsed(thing: Any) -> Any:
@@ -141,15 +145,14 @@ def task_class(name: str, kind: type) -> Entry:
     """Return the entry of a dataclass, with the table of its fields."""
     docs, rows = field_docs(kind), []
     for field in dataclasses.fields(kind):
-        unit, about = split(UNIT, docs.get(field.name, ""))
         default = "required"
         if field.default is not dataclasses.MISSING:
             default = f"`{field.default!r}`"
         elif field.default_factory is not dataclasses.MISSING:
             default = f"`{field.type}()`"
         types = f"`{field.type}`".replace("|", "\\|")
-        rows.append((f"`{field.name}`", types, default, to_markdown(unit), to_markdown(about)))
-    fields = table(("Field", "Type", "Default", "Unit", "Meaning"), rows)
+        rows.append((f"`{field.name}`", f"{types}, {default}", to_markdown(docs.get(field.name, ""))))
+    fields = table(("Field", "Type, default", "Meaning"), rows)
     return described("class", name, "", to_markdown(inspect.getdoc(kind) or ""), fields)
 
 

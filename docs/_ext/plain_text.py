@@ -15,7 +15,9 @@ def paragraphs(doc: str) -> list[str]:
 def escaped(text: str, special: str) -> str:
     """Return text with a backslash before special characters, except in code between backticks."""
     parts = CODE.split(text)
-    return "".join(part if i % 2 else re.sub(f"([\\\\{re.escape(special)}])", r"\\\1", part) for i, part in enumerate(parts))
+    return "".join(
+        part if i % 2 else re.sub(f"([\\\\{re.escape(special)}])", r"\\\1", part) for i, part in enumerate(parts)
+    )
 
 
 def to_markdown(doc: str) -> str:

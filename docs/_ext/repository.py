@@ -22,6 +22,7 @@ def relocated(text: str, source: str, target: str) -> str:
 
     Links in code stay. source, target: relative to one folder, with /.
     """
+
     def moved(match: re.Match[str]) -> str:
         return match[1] + posixpath.relpath(posixpath.join(source, match[2]), target or ".")
 
@@ -36,7 +37,7 @@ def relocate_included(app: Sphinx, path: Path, parent: str, content: list[str]) 
 
 
 class RepositoryLinks(SphinxTransform):
-    """Replace links to files and folders outside docs/ by links to their pages, to the repository, or by their paths."""
+    """Replace links to files outside docs/ by links to their pages, links to the repository, or their paths."""
 
     default_priority = 400  # before Sphinx collects downloads and resolves references
 

@@ -13,7 +13,9 @@ import warp as wp
 from jumper_warp import mdp
 from jumper_warp.registry import TASKS, make_task
 
-SPACES: dict[str, ModuleType] = {name: getattr(mdp, name) for name in ("rewards", "terminations", "observations", "events")}
+SPACES: dict[str, ModuleType] = {
+    name: getattr(mdp, name) for name in ("rewards", "terminations", "observations", "events")
+}
 """Namespaces of stock terms."""
 TASK_KINDS = ("attitude", "jump", "velocity")
 EMPTY = inspect.Signature.empty
@@ -27,7 +29,10 @@ def is_term(space: str, func: Any) -> bool:
         return names[:2] == ["robot", "rng"] and returns is EMPTY
     if space == "observations":
         return names in (["robot", "state"], ["robot", "world"], ["arrays", "ground", "world"])
-    return names[:2] == ["robot", "state"] and returns in {"rewards": (float, wp.float32), "terminations": (bool, wp.bool)}[space]
+    return (
+        names[:2] == ["robot", "state"]
+        and returns in {"rewards": (float, wp.float32), "terminations": (bool, wp.bool)}[space]
+    )
 
 
 def functions_of(module: ModuleType, fits: Callable[[Any], bool]) -> dict[str, Any]:

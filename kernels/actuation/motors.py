@@ -23,17 +23,17 @@ class MotorParams:
 
 @wp.struct
 class MotorArrays:
-    """Constants of all motors, arrays of shape (12, num_worlds), legs FL, FR, BL, BR; units as in `MotorParams`."""
+    """Constants of all motors; motors of the legs FL, FR, BL, BR."""
 
-    kp: wp.array2d(dtype=real)
-    kd: wp.array2d(dtype=real)
-    saturation: wp.array2d(dtype=real)
-    peak: wp.array2d(dtype=real)
-    cutoff_speed: wp.array2d(dtype=real)
-    no_load_speed: wp.array2d(dtype=real)
-    offset: wp.array2d(dtype=real)
-    fade_start: real  # the same for all motors, as is `fade_end`
-    fade_end: real
+    kp: wp.array2d(dtype=real)  # [N m/rad] (12, num_worlds)
+    kd: wp.array2d(dtype=real)  # [N m s/rad] (12, num_worlds)
+    saturation: wp.array2d(dtype=real)  # [N m] (12, num_worlds) largest torque that the controller commands
+    peak: wp.array2d(dtype=real)  # [N m] (12, num_worlds) largest torque that the motor delivers
+    cutoff_speed: wp.array2d(dtype=real)  # [rad/s] (12, num_worlds) full driving torque up to here
+    no_load_speed: wp.array2d(dtype=real)  # [rad/s] (12, num_worlds) no driving torque from here
+    offset: wp.array2d(dtype=real)  # [rad] (12, num_worlds) added by the position sensor to the true angle
+    fade_start: real  # [rad/s] over-speed protection reduces the torque of every motor from here
+    fade_end: real  # [rad/s] no torque from here
 
 
 @wp.func

@@ -18,34 +18,34 @@ wp.set_module_options({"enable_backward": False, "max_unroll": 1})  # long loops
 class RobotParameters:
     """Robot parameters of all worlds that randomisation changes, and their nominal values (`nominal_*`)."""
 
-    body_mass: wp.array(dtype=float)  # [kg] (21 num_worlds,) of Newton's model, like all up to shape_mu
-    body_inv_mass: wp.array(dtype=float)  # [1/kg]
-    body_com: wp.array(dtype=wp.vec3)  # [m] body axes
-    body_inertia: wp.array(dtype=wp.mat33)  # [kg m^2] body axes
-    body_inv_inertia: wp.array(dtype=wp.mat33)
-    joint_armature: wp.array(dtype=float)  # [kg m^2] (38 num_worlds,), 6 dofs of the base first, like joint_friction
-    joint_friction: wp.array(dtype=float)  # [N m]
-    shape_mu: wp.array(dtype=float)  # [1] dynamic friction coefficient of each shape
+    body_mass: wp.array(dtype=float)  # [kg] (21 num_worlds,) of Newton's model
+    body_inv_mass: wp.array(dtype=float)  # [1/kg] (21 num_worlds,)
+    body_com: wp.array(dtype=wp.vec3)  # [m] (21 num_worlds,) body axes
+    body_inertia: wp.array(dtype=wp.mat33)  # [kg m^2] (21 num_worlds,) body axes
+    body_inv_inertia: wp.array(dtype=wp.mat33)  # [1/(kg m^2)] (21 num_worlds,) body axes
+    joint_armature: wp.array(dtype=float)  # [kg m^2] (38 num_worlds,) 6 dofs of the base first
+    joint_friction: wp.array(dtype=float)  # [N m] (38 num_worlds,) 6 dofs of the base first
+    shape_mu: wp.array(dtype=float)  # [1] (shapes,) dynamic friction coefficient of each shape
     paw_shapes: wp.array(dtype=int)  # (4 num_worlds,) indices of the paws in shape_mu
     static_ratio: wp.array(dtype=float)  # [1] (num_worlds,) static over dynamic friction
-    motors: MotorArrays
+    motors: MotorArrays  # constants of all motors
     latency: wp.array(dtype=int)  # [physics steps] (num_worlds,) from action to motor
     observation_latency: wp.array(dtype=int)  # [physics steps] (num_worlds,) from sensor to policy
     push: wp.array(dtype=wp.spatial_vector)  # [N], [N m] (num_worlds,) on the base at its com, world axes
     gain_ratio: wp.array2d(dtype=wp.vec2)  # [1] (12, num_worlds) kp, kd over the active skill's nominal values
     speed_ratio: wp.array2d(dtype=wp.vec2)  # [1] (12, num_worlds) no-load, cutoff speed over nominal values
     torque_ratio: wp.array2d(dtype=float)  # [1] (12, num_worlds) torque limit over nominal value
-    physics_dt: float  # [s]
-    nominal_mass: wp.array(dtype=float)  # (21,) of one world, like all up to nominal_inv_inertia
-    nominal_com: wp.array(dtype=wp.vec3)
-    nominal_inertia: wp.array(dtype=wp.mat33)
-    nominal_inv_inertia: wp.array(dtype=wp.mat33)
-    nominal_armature: wp.array(dtype=float)  # (38,)
-    nominal_kp: wp.array2d(dtype=float)  # [N m/rad] (skills, 12), like all up to nominal_saturation
-    nominal_kd: wp.array2d(dtype=float)  # [N m s/rad]
-    nominal_no_load: wp.array2d(dtype=float)  # [rad/s]
-    nominal_cutoff: wp.array2d(dtype=float)  # [rad/s]
-    nominal_saturation: wp.array2d(dtype=float)  # [N m]
+    physics_dt: float  # [s] physics step
+    nominal_mass: wp.array(dtype=float)  # [kg] (21,) of one world
+    nominal_com: wp.array(dtype=wp.vec3)  # [m] (21,) body axes
+    nominal_inertia: wp.array(dtype=wp.mat33)  # [kg m^2] (21,) body axes
+    nominal_inv_inertia: wp.array(dtype=wp.mat33)  # [1/(kg m^2)] (21,) body axes
+    nominal_armature: wp.array(dtype=float)  # [kg m^2] (38,) of one world
+    nominal_kp: wp.array2d(dtype=float)  # [N m/rad] (skills, 12)
+    nominal_kd: wp.array2d(dtype=float)  # [N m s/rad] (skills, 12)
+    nominal_no_load: wp.array2d(dtype=float)  # [rad/s] (skills, 12) no-load speed
+    nominal_cutoff: wp.array2d(dtype=float)  # [rad/s] (skills, 12) cutoff speed
+    nominal_saturation: wp.array2d(dtype=float)  # [N m] (skills, 12) torque limit
     nominal_offset: wp.array(dtype=float)  # [rad] (12,) of the position sensors
     skill: wp.array(dtype=int)  # (num_worlds,) index of the active skill
 

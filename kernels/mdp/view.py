@@ -30,8 +30,8 @@ class RobotView:
     torque: vec12  # [N m] last physics step
     prev_torque: vec12  # [N m] last physics step of the previous policy step
     action: vec12  # [1] within -1..1
-    prev_action: vec12  # one policy step earlier
-    prev_prev_action: vec12  # two policy steps earlier
+    prev_action: vec12  # [1] one policy step earlier
+    prev_prev_action: vec12  # [1] two policy steps earlier
     clipped: float  # [rad^2] sum over motors of the squared change of the target by the command filter
     default_angle: vec12  # [rad] motor angles of the default pose
     contacts: int  # number of paws on the ground
@@ -50,7 +50,7 @@ class RobotView:
 
 @wp.struct
 class RobotArrays:
-    """State of all robots; the `prev_` arrays hold the values of the previous policy step. Units as in `RobotView`."""
+    """State of all robots; the `prev_` arrays hold the values of the previous policy step."""
 
     joint_q: wp.array(dtype=float)  # (COORDS num_worlds,) base position [m], quaternion (xyzw), joint angles [rad]
     joint_qd: wp.array(dtype=float)  # (DOFS num_worlds,) base com [m/s], angular velocity, joints [rad/s]; world axes
@@ -59,25 +59,25 @@ class RobotArrays:
     gravity: wp.array(dtype=wp.vec3)  # [m/s^2] (num_worlds + 1,), world axes
     diverged: wp.array(dtype=int)  # (num_worlds,) 1: the solver froze the world because its state diverged
     impulse: wp.array2d(dtype=wp.vec3)  # [N s] (4, num_worlds) contact impulses, first guess of the next physics step
-    paw_force: wp.array2d(dtype=wp.vec3)  # [N] (4, num_worlds), like all up to collisions; world axes
-    peak_force: wp.array2d(dtype=float)  # [N]
-    paw_pos: wp.array2d(dtype=wp.vec3)
-    paw_vel: wp.array2d(dtype=wp.vec3)
-    contact_time: wp.array2d(dtype=float)  # [s] 0 in the air
-    air_time: wp.array2d(dtype=float)
-    touchdown_speed: wp.array2d(dtype=float)
-    collisions: wp.array2d(dtype=int)
-    torque: wp.array2d(dtype=float)  # (12, num_worlds), like all below
-    prev_torque: wp.array2d(dtype=float)
-    action: wp.array2d(dtype=float)
-    prev_action: wp.array2d(dtype=float)
-    prev_prev_action: wp.array2d(dtype=float)
-    target: wp.array2d(dtype=float)  # [rad] before the filter
-    filtered_target: wp.array2d(dtype=float)  # [rad] after it
-    prev_rate: wp.array2d(dtype=float)
-    joint_offset: wp.array2d(dtype=float)  # [rad] constant error of each motor's position sensor
-    prev_lin_vel: wp.array(dtype=wp.vec3)  # (num_worlds,)
-    default_angle: wp.array(dtype=float)  # (12,)
+    paw_force: wp.array2d(dtype=wp.vec3)  # [N] (4, num_worlds) contact force on each paw, last physics step, world axes
+    peak_force: wp.array2d(dtype=float)  # [N] (4, num_worlds) largest contact force of the policy step
+    paw_pos: wp.array2d(dtype=wp.vec3)  # [m] (4, num_worlds) centre of each paw, world
+    paw_vel: wp.array2d(dtype=wp.vec3)  # [m/s] (4, num_worlds) centre of each paw, world
+    contact_time: wp.array2d(dtype=float)  # [s] (4, num_worlds) since touchdown; 0 in the air
+    air_time: wp.array2d(dtype=float)  # [s] (4, num_worlds) as in `RobotView`
+    touchdown_speed: wp.array2d(dtype=float)  # [m/s] (4, num_worlds) as in `RobotView`
+    collisions: wp.array2d(dtype=int)  # (4, num_worlds) bits of each leg, see `RobotView`
+    torque: wp.array2d(dtype=float)  # [N m] (12, num_worlds) last physics step
+    prev_torque: wp.array2d(dtype=float)  # [N m] (12, num_worlds)
+    action: wp.array2d(dtype=float)  # [1] (12, num_worlds) within -1..1
+    prev_action: wp.array2d(dtype=float)  # [1] (12, num_worlds)
+    prev_prev_action: wp.array2d(dtype=float)  # [1] (12, num_worlds) two policy steps earlier
+    target: wp.array2d(dtype=float)  # [rad] (12, num_worlds) motor targets before the filter
+    filtered_target: wp.array2d(dtype=float)  # [rad] (12, num_worlds) motor targets after the filter
+    prev_rate: wp.array2d(dtype=float)  # [rad/s] (12, num_worlds) motor rates
+    joint_offset: wp.array2d(dtype=float)  # [rad] (12, num_worlds) constant error of each motor's position sensor
+    prev_lin_vel: wp.array(dtype=wp.vec3)  # [m/s] (num_worlds,) base origin, world
+    default_angle: wp.array(dtype=float)  # [rad] (12,) motor angles of the default pose
     step_dt: float  # [s] policy step
     paw_height: wp.array2d(dtype=float)  # [m] (4, num_worlds) above the ground
 

@@ -1,0 +1,110 @@
+"""Generators of the documentation site: references, links and docstrings."""
+
+import tomllib
+from pathlib import Path
+
+import pytest
+
+import api_pages
+import cli_page
+import mdp_page
+import plain_text
+import stock_terms
+from jumper_warp import mdp
+from jumper_warp.cli.main import COMMANDS
+from jumper_warp.cli.train import SHORT_HELP
+from repository import relocated
+
+ROOT = Path(__file__).parents[2]
+
+
+@pytest.fixture(scope="module")
+def types_and_terms():
+    return mdp_page.mdp_page()
+
+
+@pytest.fixture(scope="module")
+def command_line():
+    return cli_page.cli_page()
+
+
+def test_every_public_name_and_stock_term_is_described(types_and_terms):
+    spaces = set(stock_terms.SPACES)
+    public = {f"jumper_warp.mdp.{name}" for name in mdp.__all__ if name not in spaces and name != "vec12"}
+    terms = {name for space in spaces for terms in (stock_terms.stock_terms(space), stock_terms.task_terms(space))
+             for name in terms}  # fmt: skip
+    assert len(terms) > 80
+    assert [name for name in public | terms if f"{{py:obj}}`~{name}`" not in types_and_terms] == []
+
+
+@pytest.mark.parametrize(
+    "row",
+    [
+        r"| `lin_vel` | vec3 | \[m/s\] | base origin, world |",
+        r"| `torque` | array2d of float, `(12, num_worlds)` | \[N m\] | last physics step |",
+        r"| `body_com` | array of vec3, `(21 num_worlds,)` | \[m\] | body axes |",
+        r"| `time_out` | option | `False` |",
+        r"| `latency` | `Range`, `(0.0, 16.0)` | \[ms\] Delay from action to motor",
+        "ground_force(robot: RobotView, state: Any, weight_force: float) -> float",
+        r"Angular velocity of the base \[rad/s\], body axes.",
+    ],
+)
+def test_fields_and_terms_have_shapes_units_and_signatures(types_and_terms, row):
+    assert row in types_and_terms
+
+
+def test_terms_name_the_tasks_that_use_them(types_and_terms):
+    text = types_and_terms.partition("jump.rewards.jump_height(")[2].partition("````")[0]
+    assert "Used by `vertical-jump`" in text
+
+
+def test_every_command_has_a_section_with_its_common_flags_before_the_collapsed_ones(command_line):
+    assert [name for name in COMMANDS if f"## `jumper {name}" not in command_line] == []
+    common = command_line.partition("## `jumper train TASK`")[2].partition("{dropdown}")[0]
+    names = [name for group in SHORT_HELP.values() for name in group if name != "task-module"]
+    assert [name for name in names if f"--{name}" not in common and f"--[no-]{name}" not in common] == []
+    assert "`--num-envs INT`\n: Number of simulated robots (worlds), over all processes. Default: `8192`." in common
+
+
+def test_exit_codes_are_a_table(command_line):
+    assert "| 2 | invalid input |" in command_line and "| 130 | after Ctrl-C |" in command_line
+
+
+def test_modules_of_the_api_exist():
+    modules = [module for _, modules in api_pages.AREAS.values() for module in modules]
+    assert len(set(modules)) == len(modules)
+    assert [name for name in modules if not (ROOT / "jumper_warp" / f"{name.replace('.', '/')}.py").is_file()] == []
+
+
+@pytest.mark.parametrize(
+    ("doc", "rst", "markdown"),
+    [
+        ("Return *all* of `a_b`s.", r"Return \*all\* of ``a_b``\ s.", r"Return \*all\* of `a_b`s."),
+        ("Speed [m/s] of x_2.", r"Speed [m/s] of x\_2.", r"Speed \[m/s\] of x\_2."),
+        ("Use:\n\n    a = 2 * b", "Use:\n\n::\n\n    a = 2 * b", "Use:\n\n    a = 2 * b"),
+    ],
+)
+def test_plain_docstrings_keep_their_text(doc, rst, markdown):
+    assert plain_text.to_rst(doc) == rst
+    assert plain_text.to_markdown(doc) == markdown
+
+
+def test_links_of_an_included_file_lead_from_the_including_page():
+    text = "[a](picture.webp) [`b`](../x/README.md#top) [c](#here) [d](https://e.org) `[e](f)`"
+    moved = relocated(text, "../assets/policies/y", "results/policies")
+    assert moved == (
+        "[a](../../../assets/policies/y/picture.webp) [`b`](../../../assets/policies/x/README.md#top)"
+        " [c](#here) [d](https://e.org) `[e](f)`"
+    )
+
+
+def test_generated_folders_are_ignored_by_git():
+    ignored = (ROOT / ".gitignore").read_text().splitlines()
+    assert {"/docs/_build/", "/docs/_generated/", "/docs/reference/api/", "/docs/results/policies/"} <= set(ignored)
+
+
+def test_citation_has_the_version_of_the_package():
+    version = next(line for line in (ROOT / "CITATION.cff").read_text().splitlines() if line.startswith("version:"))
+    name = tomllib.loads((ROOT / "pyproject.toml").read_text())["tool"]["setuptools"]["dynamic"]["version"]["attr"]
+    assert name == "jumper_warp.utils.version.__version__"
+    assert f'__version__ = "{version.split()[1]}"' in (ROOT / "jumper_warp/utils/version.py").read_text()
