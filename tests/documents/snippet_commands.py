@@ -102,7 +102,7 @@ class Commands:
         scripts = [i for i, word in enumerate(words) if word.endswith(".py")]
         if name == "jumper":
             self.check_jumper(words)
-        elif name in ("python", "python3", "torchrun") and scripts:
+        elif name in ("python", "python3", "torchrun") and scripts and "-m" not in words[: scripts[0]]:
             self.check_script(words[scripts[0]], words[scripts[0] + 1 :])
         elif name == "make":
             targets = {line.split(":")[0] for line in (ROOT / "Makefile").read_text().splitlines() if ":" in line}

@@ -54,7 +54,8 @@ def bash(*lines, note=""):
         ["jumper sysid excite --out motions", "jumper sysid motions --mass 14.5 --out found",
          "jumper train vertical-jump --robot found/identified.json"],
         ["torchrun --nproc-per-node 2 -m jumper_warp train vertical-jump", "jumper --version"],
-        ["python experiments/vertical_jump_sweep.py --num-jumps 10", "make test", 'pip install -e ".[gymnasium]"'],
+        ["python experiments/vertical_jump_sweep.py --num-jumps 10", "make test", "python -m pytest tests/test_mdp.py",
+         'pip install -e ".[gymnasium]"'],
     ],
 )  # fmt: skip
 def test_correct_commands_pass_and_do_not_run(run, tmp_path, lines):
