@@ -1,44 +1,38 @@
-# make demo   the open-loop jump, 200 vertical and 200 horizontal jumps of the shipped policies, and one jump with a film:
-#             metrics, plots, pictures and recordings in outputs/demo, in about a minute
-# make test   all tests, and the import rules
-# make clients  tests/clients with TorchRL, skrl, OpenVINO and W&B too, which it installs into .venv-clients
-# make docs   the documentation site in docs/_build/html; a warning, such as a link without target, is an error
-# make lint   style, format, words, import rules and types
-# Each makes .venv/ first if it is missing or older than pyproject.toml or constraints.txt.
+# `make` lists the targets. Each makes .venv/ first if it is missing or older than pyproject.toml or constraints.txt.
 
 PYTHON ?= python3
 VENV := .venv
 CLIENTS := .venv-clients
 STAMP := $(VENV)/.installed
 
-.PHONY: demo test clients docs lint clean
+.DEFAULT_GOAL := help
+.PHONY: help demo test docs lint clients clean
 .DELETE_ON_ERROR:
 
-demo: $(STAMP)
+help: ## list the targets
+	@awk -F ':.*## ' '/^[a-z]+:.*## / { printf "make %-8s %s\n", $$1, $$2 }' $(MAKEFILE_LIST)
+
+demo: $(STAMP) ## simulate jumps; writes metrics, plots, pictures, a film and recordings to outputs/demo
 	$(VENV)/bin/python experiments/demo.py --out outputs/demo
 
-test: $(STAMP)
+test: $(STAMP) ## run all tests, and check the import rules
 	$(VENV)/bin/lint-imports --no-logo
 	$(VENV)/bin/python -m pytest --numprocesses auto --dist loadfile
 
-clients:
-	$(PYTHON) -m venv $(CLIENTS)
-	$(CLIENTS)/bin/python -m pip install -c constraints.txt -e ".[dev]"
-	$(CLIENTS)/bin/python -m pip install "torchrl==0.14.1" "skrl==2.1.1" "openvino==2026.4.1" "wandb==0.31.0"
-	$(CLIENTS)/bin/python -m pytest tests/clients
-
-docs: $(STAMP)
+docs: $(STAMP) ## build the documentation site in docs/_build/html; warnings are errors
 	$(VENV)/bin/python -m sphinx -b html -q -W --keep-going -j 2 docs docs/_build/html
 	@echo "open docs/_build/html/index.html"
 
-lint: $(STAMP)
-	$(VENV)/bin/ruff check .
-	$(VENV)/bin/ruff format --check .
-	$(VENV)/bin/pre-commit run --all-files words
-	$(VENV)/bin/lint-imports --no-logo
-	$(VENV)/bin/basedpyright --pythonpath $(VENV)/bin/python
+lint: $(STAMP) ## check style, words, import rules and types
+	$(VENV)/bin/pre-commit run --all-files
 
-clean:
+clients: ## test the use with TorchRL, skrl, OpenVINO and W&B, installed in .venv-clients
+	$(PYTHON) -m venv $(CLIENTS)
+	$(CLIENTS)/bin/python -m pip install -c constraints.txt -e ".[dev]"
+	$(CLIENTS)/bin/python -m pip install "torchrl==0.14.1" "skrl==2.1.1" "openvino==2026.4.1" "wandb==0.31.0"
+	$(CLIENTS)/bin/python -m pytest tests/clients tests/documents
+
+clean: ## delete environments and built documentation
 	rm -rf $(VENV) $(CLIENTS) docs/_build docs/_generated docs/reference/api docs/results/policies
 
 $(STAMP): pyproject.toml constraints.txt

@@ -6,7 +6,6 @@ A table stands between the lines `<!-- table: NAME -->` and `<!-- end of table -
 `tests/robot/test_parameter_tables.py` checks that the pages are up to date.
 """
 
-
 from __future__ import annotations
 
 import math
