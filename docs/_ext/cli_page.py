@@ -33,7 +33,7 @@ COMMON = {
     "sysid excite": ("params", "seconds", "robot", "seed", "out"),
 }
 """Names of the flags that stand before the list of all flags."""
-FULL_LIST = 10  # A command with at most so many flags has no second list
+FULL_LIST = 10  # Largest number of flags without a second list
 
 
 def cli_page() -> str:
