@@ -36,7 +36,7 @@ UNITS = {  # by quantity of `support.agreement`
 class Args(OutputArgs):
     """Flags of the comparison of dynamics with Pinocchio."""
 
-    robot: Path | None = None  # Robot overlay (docs/robot_overlays.md; default: the robot as described)
+    robot: Path | None = None  # Robot overlay (docs/reference/overlays.md; default: the robot as described)
     states: int = 200  # Number of random states
     seed: int = 0  # Seed of the states
 

@@ -1,6 +1,6 @@
 """Departures of the jumps from the paper and its authors' configuration, undone one at a time.
 
-`docs/tasks.md` has their reasons and their effects, measured by `experiments/departures.py`.
+`docs/results/paper.md` has their reasons and their effects, measured by `experiments/departures.py`.
 """
 
 from __future__ import annotations

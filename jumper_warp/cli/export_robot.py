@@ -18,7 +18,7 @@ class ExportRobotCfg:
     """Folder to write to; existing files are replaced."""
     format: Literal["mjcf", "urdf", "usd"] = "mjcf"
     robot: Path | None = None
-    """Robot overlay, as in docs/robot_overlays.md; by default the described robot."""
+    """Robot overlay, as in docs/reference/overlays.md; by default the described robot."""
 
 
 def run(args: Sequence[str]) -> None:

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from types import ModuleType
 
@@ -41,6 +43,8 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     if out.exists() and not parsed.overwrite:
         raise PolicyError(f"{out} exists; overwrite replaces it")
     configure_device(parsed.device, parsed.threads)
-    policy, record = finetune(policy, parsed, modules)
-    files = {"finetuning.json": (json.dumps(record, indent=1) + "\n").encode()}
-    print(save_policy(out, policy, files=files, overwrite=parsed.overwrite))
+    log = partial(print, file=sys.stderr if parsed.json else sys.stdout)
+    policy, record = finetune(policy, parsed, modules, log)
+    content = json.dumps(record, indent=1) + "\n"
+    folder = save_policy(out, policy, files={"finetuning.json": content.encode()}, overwrite=parsed.overwrite)
+    print(content if parsed.json else f"{folder}\n", end="")

@@ -70,12 +70,6 @@ def main(argv: Sequence[str] | None = None) -> None:
     if not args:
         print(usage(), file=sys.stderr)
         raise SystemExit(USAGE_ERROR)
-    if args[0] in ("-h", "--help"):
-        print(usage())
-        raise SystemExit(0)
-    if args[0] in ("-V", "--version"):
-        print(f"jumper {__version__}")
-        raise SystemExit(0)
     run_command(lambda: dispatch(args))
 
 
@@ -85,6 +79,12 @@ def dispatch(args: Sequence[str]) -> None:
     Raises UsageError: there is no such command. Other exceptions are the command's.
     """
     name = args[0]
+    if name in ("-h", "--help"):
+        print(usage())
+        return
+    if name in ("-V", "--version"):
+        print(f"jumper {__version__}")
+        return
     if name not in COMMANDS:
         near = suggestion(name, COMMANDS) or f"; there are {', '.join(COMMANDS)}"
         raise UsageError(f"no command {name!r:.60}{near}")
@@ -193,10 +193,16 @@ def parse_error(printed: str, flags: Sequence[Flag], args: Sequence[str]) -> str
 def run_command(command: Callable[[], object]) -> None:
     """Call a command or an experiment; exits with code 2 and one line on standard error if its input is invalid.
 
-    InputError, and OSError about a file, are printed as one line; any other exception propagates.
+    InputError, and OSError about a file, are printed as one line; a closed output pipe ends the command quietly with
+    code 0; any other exception propagates.
     """
     try:
-        command()
+        try:
+            command()
+        except SystemExit as end:  # after help
+            if not end.code:
+                sys.stdout.flush()
+            raise
         sys.stdout.flush()
     except KeyboardInterrupt:
         raise SystemExit(INTERRUPTED) from None

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -54,7 +55,7 @@ class SysidCfg:
     """[N m] Torque limit that the controllers were set to (default: as the files say, else 18)."""
     torque_constant: float = 0.0  # [N m/A] Torque at the joint over current, for files with currents
     out: Path | None = None  # Folder for the results (default: outputs/sysid/<time>)
-    json: bool = False  # Print report.json in place of a table
+    json: tyro.conf.FlagCreatePairsOff[bool] = False  # Print report.json in place of a table
     device: str | None = None  # Warp device
     threads: int | None = None  # CPU threads (default: all cores)
 
@@ -74,6 +75,7 @@ class ExciteCfg:
     record_torque: bool = False  # Also record the motors' torques
     seed: int = 0  # Seed of motions and noise
     out: Path | None = None  # Folder for the motions and excite.json (default: outputs/excite/<time>)
+    json: tyro.conf.FlagCreatePairsOff[bool] = False  # Print excite.json in place of a summary
     threads: int | None = None  # CPU threads (default: all cores)
 
     def __post_init__(self) -> None:
@@ -88,10 +90,12 @@ class ActuatorCfg:
     """Fit limits, friction and latency of one motor to data of a test bench: writes actuator.json."""
 
     bench: Annotated[Path, tyro.conf.Positional]
-    """CSV file with columns test, time [s], command [N m], speed [rad/s], torque [N m]; see docs/identification.md."""
+    """CSV file with columns test, time [s], command [N m], speed [rad/s], torque [N m]; see
+    docs/tutorials/identification.md."""
     motor: Literal["lateral", "transversal"] = "transversal"  # Kind of motor; its described constants are the prior
     torque_noise: float = 0.1  # [N m] Noise of the bench's torque sensor, standard deviation
     out: Path | None = None  # Folder for the results (default: outputs/actuator/<time>)
+    json: tyro.conf.FlagCreatePairsOff[bool] = False  # Print actuator.json in place of a table
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
@@ -127,6 +131,7 @@ def sysid(cfg: SysidCfg) -> None:
 
     from jumper_warp.identification.identify import identify, identify_by_evolution
     from jumper_warp.identification.report import write_results
+    from jumper_warp.utils.metrics import print_table
     from jumper_warp.utils.output import output_dir
     from jumper_warp.utils.progress import phase
     from jumper_warp.utils.runtime import configure_device
@@ -153,7 +158,10 @@ def sysid(cfg: SysidCfg) -> None:
     for parameter, value, (low, high), identified in rows:
         row = (parameter.name, parameter.unit, f"{parameter.nominal:.5g}", f"{value:.5g}", f"{low:.5g} … {high:.5g}")
         table.add_row(*row, style=None if identified else "dim")
-    Console().print(table)
+    if sys.stdout.isatty():
+        Console().print(table)
+    else:
+        print_table(table)  # rich itself exits with 1 when the reader closes the pipe
     wider = f"; intervals {result.mismatch:.3g} times wider for the model's errors" if result.mismatch != 1.0 else ""
     print(f"χ² {result.chi2:.4g} (robot as described: {result.nominal_chi2:.4g}), {result.effort.seconds:.1f} s{wider}")
     for words in dict.fromkeys(direction.words for direction in result.directions):
@@ -189,10 +197,14 @@ def excite(cfg: ExciteCfg) -> None:
     motions = record_motions(
         chosen, folder, robots=robots, noise=cfg.noise, solver=cfg.solver, rng=rng, torque=cfg.record_torque
     )
+    mass = float(total_mass(robots)[0])
+    content = json_bytes({"mass_kg": mass} | chosen.to_json())
+    write_atomically(folder / "excite.json", content)
+    if cfg.json:
+        print(content.decode(), end="")
+        return
     for motion, gain in zip(motions, chosen.gain, strict=True):
         print(f"{motion.name}: {len(motion.time) / 240.0:.2f} s, information up to here {gain:.1f} nat")
-    mass = float(total_mass(robots)[0])
-    write_atomically(folder / "excite.json", json_bytes({"mass_kg": mass} | chosen.to_json()))
     num_identified = int((chosen.std < 0.5).sum())
     print(f"{num_identified} of {len(parameters)} parameters are expected to be identified; motions in {folder}")
     print(f"the recorded robot weighs {mass:.3f} kg: jumper sysid fit {folder} --mass {mass:.3f}")
@@ -208,7 +220,11 @@ def characterise(cfg: ActuatorCfg) -> None:
 
     result = characterise_motor(load_bench(cfg.bench), cfg.motor, cfg.torque_noise)
     folder = output_dir("actuator", cfg.out)
-    write_atomically(folder / "actuator.json", json_bytes(result.to_json()))
+    content = json_bytes(result.to_json())
+    write_atomically(folder / "actuator.json", content)
+    if cfg.json:
+        print(content.decode(), end="")
+        return
     for name, (value, low, high, unit) in result.rows().items():
         print(f"{name:<16}{value:10.5g} {unit:<6} 95 % {low:.5g} … {high:.5g}")
     print(folder / "actuator.json")

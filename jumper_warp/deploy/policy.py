@@ -1,7 +1,7 @@
 """Inference of a policy on a real robot: sensor readings to observation, action and motor targets.
 
 It uses NumPy and ONNX Runtime. This module imports only `jumper_warp/utils/errors.py` from the package.
-`docs/deployment.md` defines each reading.
+`docs/tutorials/on_a_robot.md` defines each reading.
 """
 
 from __future__ import annotations

@@ -55,8 +55,9 @@ class RslRlVecEnv(RslRlEnv):
     def write_config(self, folder: str | Path, activation: str = "elu") -> None:
         """Write `config.json`, by which the checkpoints in a log folder of rsl-rl are evaluated, played and exported.
 
-        activation: of the actor's network. Raises OSError: the file cannot be written.
+        folder: made if it is missing; activation: of the actor's network. Raises OSError: the file cannot be written.
         """
+        Path(folder).mkdir(parents=True, exist_ok=True)
         config = {"env": self.cfg, "train": {"ppo": {"activation": activation}}}
         write_atomically(Path(folder) / "config.json", json.dumps(config, indent=1).encode())
 

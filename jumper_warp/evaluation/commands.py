@@ -7,13 +7,12 @@ from __future__ import annotations
 
 import subprocess
 import sys
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Generic, Literal, TypeVar
 
 import tyro
-from rich.console import Console
-from rich.table import Table
 
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.policies.catalog import find_policy
@@ -21,16 +20,20 @@ from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.skills import SkillNames
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.metrics import print_metrics
+from jumper_warp.utils.metrics import MetricValue
 from jumper_warp.utils.output import write_metrics
 from jumper_warp.utils.summary import PrintFlags
 
 if TYPE_CHECKING:
-    from jumper_warp.evaluation.log import EvaluationLog
-    from jumper_warp.evaluation.run import EvaluationRun
+    from jumper_warp.evaluation.run import EvaluationRun, Run
     from jumper_warp.viz.recording import Recording
 
 Flags = TypeVar("Flags")
+SCRIPT_SUMMARY = (
+    "outcome", "jump_made_rate", "apex_error_abs_mean_m", "goal_distance_at_handover_mean_m",
+    "settled_slewed_rmse_vx_m_s", "settled_slewed_rmse_vy_m_s", "settled_slewed_rmse_yaw_rate_rad_s",
+)  # fmt: skip
+"""Keys of the metrics in the summary of `jumper play --script`."""
 
 
 @dataclass(frozen=True)
@@ -102,14 +105,16 @@ class RecordingCfg:
     """Conditions of the simulation."""
     film: Annotated[FilmCfg, tyro.conf.arg(name="")] = field(default_factory=FilmCfg)
     """Film of the recording to write."""
-    out: Path | None = None  # Folder for recording, picture, metrics.json and plots (default: outputs/play/<time>)
+    out: Path | None = None  # Folder for all results (default: outputs/play/<time>)
     viewer: Literal["none", "rerun"] = "none"
-    """Open the recording in Rerun's viewer, which then listens on this machine's loopback address only."""
+    """Open the recording in Rerun's viewer. It listens on this machine's loopback address only."""
+    printing: Annotated[PrintFlags, tyro.conf.arg(name="")] = field(default_factory=PrintFlags)
+    """Format of the printed results."""
 
 
 @dataclass(frozen=True)
 class PlayCfg(RecordingCfg, Generic[Flags]):
-    """Simulate a policy, and write a recording, a picture, metrics and on request a film."""
+    """Simulate a policy, and write a recording, a picture, metrics and a film."""
 
     flags: Annotated[Flags, tyro.conf.arg(name="")]
     """Flags of the task's kind, `jumper_warp.evaluation.evaluations.PlayFlags`."""
@@ -122,7 +127,9 @@ class PlayCfg(RecordingCfg, Generic[Flags]):
 
 
 def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
-    """Simulate a policy, write a recording and `metrics.json` (the columns of the log), return the recording's path.
+    """Simulate a policy, write a recording and `metrics.json` (the columns of the log), print a summary.
+
+    Returns the path of the recording.
 
     Raises PolicyError: the policy cannot be used; OSError: the folder cannot be created.
     """
@@ -137,9 +144,11 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     recorder = EnvRecorder(env, log, worlds, notes=notes)
     seconds, stop = cfg.seconds or flags.length, cfg.seconds is None
     run_evaluation(run.policy.act, env, log, seconds=seconds, on_step=recorder, stop=stop)
-    write_metrics(run.folder, log.columns())
-    print_rows(log)
-    return show_recording(recorder.recording(), run.folder, log.row_name, cfg)
+    columns = log.columns()
+    write_metrics(run.folder, columns)
+    count = len(next(iter(columns.values())))
+    words = f"{count} {log.row_name}{'s' * (count > 1)}"
+    return show_recording(run, recorder.recording(), log.row_name, cfg, words, log.main_columns or columns)
 
 
 @dataclass(frozen=True)
@@ -177,24 +186,27 @@ def play_script(cfg: ScriptCfg) -> Path:
     plot_course(run.folder / "timeline.png", course, 0)
     metrics = {"outcome": str(course.outcomes[0]), **course_metrics(course)}
     write_metrics(run.folder, metrics, run.condition_values)
-    print_metrics(metrics)
-    return show_recording(recorder.recording(), run.folder, "course", cfg)
+    defined = [
+        key for key in SCRIPT_SUMMARY if not isinstance(metrics[key], MetricValue) or metrics[key].value is not None
+    ]
+    words = f"{len(script)} command{'s' * (len(script) > 1)} of {cfg.script}"
+    return show_recording(run, recorder.recording(), "course", cfg, words, defined)
 
 
-def show_recording(recording: Recording, folder: Path, name: str, cfg: RecordingCfg) -> Path:
-    """Write a recording as .rrd, picture and, on request, film; print their paths, open the viewer on request.
+def show_recording(
+    run: Run, recording: Recording, name: str, cfg: RecordingCfg, count: str, keys: Iterable[str]
+) -> Path:  # fmt: skip
+    """Write a recording as .rrd, picture and, on request, film; print a summary, open the viewer on request.
 
-    Returns the path of the .rrd file.
+    name: of the files and of a trial; count, keys: number of trials and main metrics, for the summary. Returns the path
+    of the .rrd file.
     """
     from jumper_warp.evaluation.recorder import save_recording
 
-    console = Console(stderr=True)
-    path = save_recording(recording, folder, name)
-    paths = [path, path.with_suffix(".png")]
-    if cfg.film.video is not None:
-        paths.append(cfg.film.write(recording))
-    for written in paths:
-        console.print(str(written), highlight=False, soft_wrap=True)
+    path = save_recording(recording, run.folder, name)
+    films = [] if cfg.film.video is None else [cfg.film.write(recording)]
+    run.print_flags = cfg.printing
+    run.summarise(count, keys, trial=name, films=films)
     if cfg.viewer == "rerun":
         subprocess.run(viewer_command(path), check=False)
     return path
@@ -203,12 +215,3 @@ def show_recording(recording: Recording, folder: Path, name: str, cfg: Recording
 def viewer_command(path: Path) -> list[str]:
     """Return the command that opens a recording in the Rerun viewer, listening on loopback only."""
     return [sys.executable, "-m", "rerun", str(path), "--bind", "127.0.0.1"]
-
-
-def print_rows(log: EvaluationLog) -> None:
-    """Print the columns of a log as a table to standard output, a line for each, floats with three decimals."""
-    columns = log.columns()
-    table = Table("", *(f"{log.row_name} {i}" for i in range(len(next(iter(columns.values()))))), box=None)
-    for name, values in columns.items():
-        table.add_row(name, *(f"{value:.3f}" if isinstance(value, float) else str(value) for value in values))
-    Console().print(table)

@@ -11,6 +11,7 @@ import math
 import time
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, replace
+from pathlib import Path
 from types import ModuleType
 from typing import Any
 
@@ -23,6 +24,7 @@ from jumper_warp.evaluation.jump_errors import JumpErrors, JumpGroup, jump_error
 from jumper_warp.evaluation.jumps import LANDED, jump_commands
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.policy import Policy
+from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.trajectory.gauss_newton import Anchor, Network, gauss_newton_step
@@ -189,15 +191,25 @@ def tune_weights(
     return history
 
 
+def on_robot(policy: Policy, overlay: Path) -> Policy:
+    """Return a copy of a policy whose configuration holds a robot overlay, so that its environments are of this robot.
+
+    overlay: JSON file. Raises InputError or OSError: it cannot be used.
+    """
+    env = policy.config.get("env", {}) | {"robot": load_overlay(overlay).to_json()}
+    return Policy(policy.layers, policy.mean, policy.std, policy.interface, policy.config | {"env": env})
+
+
 def finetune(
     policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] = (), log: Callable[[str], object] = print
 ) -> tuple[Policy, dict]:
     """Fine-tune a policy; return the new policy and a record: `settings`, `aims` (`correct_aim`), `steps`.
 
     modules: the user's task modules; log: prints a line of progress. Raises InputError as `ClosedLoop` and
-    `make_groups`, and for a policy for heights without iterations.
+    `make_groups`, for a policy for heights without iterations, and for an overlay that cannot be used.
     """
     begin = time.perf_counter()
+    policy = policy if cfg.robot is None else on_robot(policy, cfg.robot)
     groups = make_groups(policy, cfg, modules)
     aims = []
     if not groups[0].to_height:
@@ -209,7 +221,7 @@ def finetune(
     with phase("fine-tuning", cfg.iterations + 1) as advance:
         history = tune_weights(groups, network, cfg, lambda line: (log(line), advance()), begin)
     layers = network.layers(network.weights)
-    settings = {name: value for name, value in asdict(cfg).items() if name not in ("out", "overwrite")}
+    settings = {name: value for name, value in asdict(cfg).items() if name not in ("out", "overwrite", "json")}
     record = {"settings": json.loads(json.dumps(settings, default=str)), "aims": aims, "steps": history}
     config = policy.config | {"finetuned": record | {"commit": (commit := git_commit()) and commit.hash}}
     return Policy(layers, policy.mean, policy.std, policy.interface, config), record

@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
+import tyro
+
 from jumper_warp.utils.checks import check_positive
 from jumper_warp.utils.errors import InputError
 
@@ -30,6 +32,9 @@ class FinetuneCfg:
     seed: int = 0  # Seed of commands, latencies and robots (stream: tuning)
     device: str | None = None  # Warp device (default: a GPU if there is one)
     threads: int | None = None  # CPU threads that share the worlds (default: all cores); results do not depend on it
+    robot: Path | None = None
+    """Robot overlay file, as written by `jumper sysid`, to adapt to (default: the overlay of the training, if it had
+    one)."""
 
     def __post_init__(self) -> None:
         if self.num_goals < 2 or min(self.num_delayed, self.num_randomized, self.iterations) < 0:
@@ -48,3 +53,4 @@ class FinetuneArgs(FinetuneCfg):
 
     out: Path | None = None  # Folder of the new policy (default: <policy>_finetuned)
     overwrite: bool = False  # Replace an existing policy in that folder
+    json: tyro.conf.FlagCreatePairsOff[bool] = False  # Print finetuning.json; progress goes to standard error

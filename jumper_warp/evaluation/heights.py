@@ -28,6 +28,8 @@ MAX_ROBOTS = 64  # Maximum number of robots in one recording
 class HeightLog(JumpLog):
     """Log of one jump to an apex height per world; arrays of `JumpLog` have shape (num_envs, 1)."""
 
+    main_columns = ("goal_height_m", "apex_m", "apex_error_m", "tilt_deg", "outcome")
+
     def __init__(self, heights: np.ndarray, terminations: tuple[str, ...], rest: float = REST_TIME) -> None:
         """Create a log of jumps that have not begun.
 

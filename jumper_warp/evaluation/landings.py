@@ -39,6 +39,7 @@ class LandingLog(JumpLog):
     """Log of jumps to landing positions; arrays have shape (num_envs, jumps in a row, ...), see `JumpLog`."""
 
     spacing = 3.0
+    main_columns = ("goal_x_m", "goal_y_m", "distance_at_rest_m", "apex_m", "tilt_deg", "outcome")
 
     @property
     def goal_positions(self) -> np.ndarray:

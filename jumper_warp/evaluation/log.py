@@ -30,6 +30,7 @@ class EvaluationLog(ABC):
     """Base class of logs that command one episode per world and record its outcome, driven by `run_evaluation`."""
 
     row_name = "jump"  # Noun for a trial; names the recording
+    main_columns: Sequence[str] = ()  # Names of the columns in the summary of `jumper play`; empty: all
     spacing = 1.2  # [m] Distance between robots that a recording shows side by side
     count: int  # Number of worlds
     arrays: dict[str, np.ndarray]  # Result of the last `read_env`, one row per world

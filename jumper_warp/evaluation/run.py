@@ -174,6 +174,13 @@ class Run(ABC):
         write_metrics(self.folder, metrics, self.condition_values)
         return read_values(self.folder)
 
+    def summarise(self, count: str, keys: Iterable[str], **settings: Any) -> None:
+        """Print the summary of `metrics.json`; count: number and kind of trials; settings: of `print_summary`."""
+        name, count = self.name.replace("_", " "), f"{count}, " if count else ""
+        seconds = time.perf_counter() - self.started
+        what = f"{self.source}, {name}: {count}{self.title}"
+        print_summary(self.folder, what, keys, flags=self.print_flags, seconds=seconds, **settings)
+
     def report(
         self, metrics: Metrics, paper: Mapping[str, float], keys: Sequence[str] = HEADLINES
     ) -> dict[str, Any]:  # fmt: skip
@@ -181,10 +188,7 @@ class Run(ABC):
         values = self.write(metrics)
         printed = [metrics[key] for key in keys if key in metrics]
         most = max(printed, key=lambda metric: metric.trials or 0, default=MetricValue(None))
-        count = f"{most.trials:,} {most.over}, " if most.trials else ""
-        what = f"{self.source}, {self.name.replace('_', ' ')}: {count}{self.title}"
-        seconds = time.perf_counter() - self.started
-        print_summary(self.folder, what, keys, paper=paper, flags=self.print_flags, seconds=seconds)
+        self.summarise(f"{most.trials:,} {most.over}" if most.trials else "", keys, paper=paper)
         return values
 
 

@@ -35,7 +35,7 @@ class Conditions:
     stream: Literal["tuning", "selection", "reporting"] = "reporting"
     """Purpose of the test. For any seeds, robots, commands and noise differ from those of other purposes."""
     device: str | None = None  # Warp device (default: a GPU if there is one)
-    threads: int | None = None  # CPU threads that share the worlds (default: all cores); results do not depend on it
+    threads: int | None = None  # CPU threads (default: all cores); results do not depend on it
     robot: Path | None = None
     """Robot overlay file, as written by `jumper sysid` (default: the overlay of the training, if it had one)."""
     push_in_flight: bool = False  # In randomised tests, push the robot in flight too, not only while a paw is down
@@ -47,7 +47,7 @@ class Conditions:
     """[1] Static and dynamic friction coefficient of the paws (default: nominal, or sampled if randomised)."""
     sensor_offset: float | None = None
     """[deg] Largest constant error of the motors' position sensors (default: none, or sampled if randomised)."""
-    gravity: float | None = None  # [m/s^2] Downward gravitational acceleration (default: the task's)
+    gravity: float | None = None  # [m/s^2] Gravity (default: the task's)
 
     def __post_init__(self) -> None:
         """Raise InputError if a value is out of range, or push_in_flight is set without randomize."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import re
 import textwrap
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +19,7 @@ from jumper_warp.utils.output import read_metrics
 KINDS = {"picture": (".png", ".webp"), "film": (".mp4", ".gif"), "recording": (".rrd",), "folder": ("",)}
 """Ends of the names of files by kind, in the order of the summary."""
 IN_RANGE = "in_range_"  # Prefix of metrics of the goals within a range
+MOST_COLUMNS = 6  # Number of trials above which their values share one column
 MOST_PATHS = 3  # Number of files of a kind above which only their folder is printed
 
 
@@ -32,12 +33,13 @@ class PrintFlags:
 
 def print_summary(
     folder: Path, title: str, keys: Iterable[str], *, seconds: float, paper: Mapping[str, float] | None = None,
-    flags: PrintFlags | None = None,
+    flags: PrintFlags | None = None, trial: str = "trial", films: Iterable[Path] = (),
 ) -> None:  # fmt: skip
     """Print a summary of a run: what was done, its main metrics, and the paths of its files, 80 columns wide.
 
     title: what was done; keys: of the main metrics, those that the file lacks are skipped; seconds: wall time of the
-    run; paper: published values by key; flags: print all metrics, or the file itself.
+    run; paper: published values by key; flags: print all metrics, or the file itself; trial: noun for the items of
+    metrics that are lists; films: films of the run, in any folder.
     """
     flags, paper, path = flags or PrintFlags(), paper or {}, folder / "metrics.json"
     if flags.json:
@@ -49,11 +51,12 @@ def print_summary(
     if flags.verbose:
         print_metrics(metrics, paper, json.loads(path.read_text())["conditions"])
     elif main:
-        print_table(_summary_table(main, paper))
+        table = _columns_table(main, trial) if _has_columns(main) else _summary_table(main, paper)
+        print_table(table)
     hints = ["rerun FILE shows a recording"] if any(folder.glob("*.rrd")) else []
     hints += [f"--verbose prints all {len(metrics)} metrics"] if not flags.verbose and len(metrics) > len(main) else []
     end = "; ".join([f"{'time':9}  {seconds:.0f} s", *hints])
-    print(*_file_lines(folder), f"{'metrics':9}  {path}", end, sep="\n")
+    print(*_file_lines(folder, list(films)), f"{'metrics':9}  {path}", end, sep="\n")
 
 
 def _summary_table(metrics: Mapping[str, MetricValue], paper: Mapping[str, float]) -> Table:
@@ -65,6 +68,22 @@ def _summary_table(metrics: Mapping[str, MetricValue], paper: Mapping[str, float
         low_high = [] if metric.interval is None else [_text(key, limit) for limit in metric.interval]
         row = [_text(key, metric.value, unit=True), *[" to ".join(low_high)] * intervals]
         table.add_row(_words(key, metric), *row, *[_text(key, paper.get(key, ""))] * published)
+    return table
+
+
+def _has_columns(metrics: Mapping[str, MetricValue]) -> bool:
+    """Return whether each metric is a list of one value per trial, for few trials."""
+    sizes = {len(metric.value) if isinstance(metric.value, list) else 0 for metric in metrics.values()}
+    return len(sizes) == 1 and 0 < max(sizes) <= MOST_COLUMNS
+
+
+def _columns_table(metrics: Mapping[str, MetricValue], trial: str) -> Table:
+    """Return a printable table of metrics in words, with units, and a column for each trial."""
+    values = {key: metric.value for key, metric in metrics.items() if isinstance(metric.value, list)}
+    names = [f"{trial} {i + 1}" for i in range(len(next(iter(values.values()))))]
+    table = Table("", *names, box=None, pad_edge=False)
+    for key, row in values.items():
+        table.add_row(_words(key, metrics[key]), *(_text(key, value, unit=True) for value in row))
     return table
 
 
@@ -80,16 +99,22 @@ def _text(key: str, value: Any, *, unit: bool = False) -> str:
     """Return a metric's value as text, a rate in percent; unit: append the unit of the metric's key."""
     if value is None:
         return "undefined"
-    percent = key.endswith("_rate") and isinstance(value, float | int)
+    percent = key.endswith("_rate") and not key.endswith("yaw_rate") and isinstance(value, float | int)
     text, of = (format_value(100.0 * value), "%") if percent else (format_value(value), split_unit(key)[1])
     return f"{text} {of}" if unit and of else text
 
 
-def _file_lines(folder: Path) -> Iterable[str]:
-    """Yield a printed line for each picture, film, recording and folder in a folder, or one for each kind with many."""
+def _file_lines(folder: Path, films: Sequence[Path]) -> Iterable[str]:
+    """Yield a printed line for each picture, film, recording and folder in a folder, or one for each kind with many.
+
+    films: a line for each of these, which may have the suffix of a picture.
+    """
+    yield from (f"{'film':9}  {path}" for path in films)
+    known = {path.resolve() for path in films}
+    paths = [path for path in folder.iterdir() if path.resolve() not in known]
     for kind, ends in KINDS.items():
-        paths = sorted(path for path in folder.iterdir() if path.suffix in ends and path.is_dir() == (kind == "folder"))
-        if len(paths) > MOST_PATHS:
-            yield f"{kind + 's':9}  {len(paths)} in {folder}"
+        found = sorted(path for path in paths if path.suffix in ends and path.is_dir() == (kind == "folder"))
+        if len(found) > MOST_PATHS:
+            yield f"{kind + 's':9}  {len(found)} in {folder}"
         else:
-            yield from (f"{kind:9}  {path}" for path in paths)
+            yield from (f"{kind:9}  {path}" for path in found)

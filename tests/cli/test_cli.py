@@ -29,7 +29,7 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.checkpoint import CheckpointError
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.output import read_values
+from jumper_warp.utils.output import read_values, write_metrics
 from landing_helpers import still_policy
 
 TRAIN = ["train", "vertical-jump", "--num-envs", "16", "--max-iterations", "2", "--no-tensorboard", "--device", "cpu"]
@@ -414,7 +414,7 @@ def test_evaluate_writes_metrics_and_saves_them_to_the_policy(trained_run, tmp_p
 def test_play_records_each_step_of_each_robot(trained_run, tmp_path, capsys):
     args = ["--height", "0.6", "0.9", "--seconds", "0.25", "--device", "cpu", "--out", str(tmp_path)]
     code, out, _ = run(capsys, "play", str(trained_run), *args)
-    assert code == 0 and "0.900" in out
+    assert code == 0 and "0.9 m" in out and f"recording  {tmp_path / 'jump.rrd'}" in out
     series = {name.split("/")[-1]: values for name, values in curves(tmp_path / "jump.rrd").items()}
     assert [len(series[f"base, {name} [m]"]) for name in ("0.60 m", "0.90 m")] == [15, 15]  # 0.25 s at 60 Hz
     assert series["command, 0.90 m [m]"] == pytest.approx([0.9] * 15)
@@ -471,8 +471,11 @@ def test_refuses_flags_of_other_tasks_and_falling_ranges(still, capsys, args, me
 def test_play_writes_film_and_picture_and_prints_their_paths(still, tmp_path, capsys):
     film, folder = tmp_path / "films" / "jump.webp", tmp_path / "out"
     args = ["--goal", "0.8", "0.2", "--seconds", "0.5", "--video", str(film), "--size", "96", "64", "--fps", "10"]
-    code, _, err = run(capsys, "play", still, *args, "--speed", "0.5", "--device", "cpu", "--out", str(folder))
-    assert code == 0 and err[-3:] == [str(folder / "jump.rrd"), str(folder / "jump.png"), str(film)]
+    code, out, _ = run(capsys, "play", still, *args, "--speed", "0.5", "--device", "cpu", "--out", str(folder))
+    files = {"film": film, "picture": folder / "jump.png", "recording": folder / "jump.rrd"}
+    assert code == 0 and [line.split() for line in out.splitlines() if line.split()[0] in files] == [
+        [kind, str(path)] for kind, path in files.items()
+    ]
     with Image.open(film) as animation, Image.open(folder / "jump.png") as picture:
         assert (animation.n_frames, animation.size, picture.size[0]) == (10, (96, 64), 1600)  # 0.48 s at half speed
 
@@ -486,17 +489,23 @@ def test_play_refuses_bad_films_before_the_simulation(still, tmp_path, capsys, f
 def test_play_walks_for_the_given_time(tmp_path, capsys):
     args = ["--velocity", "0.5", "0", "0.3", "--seconds", "0.25", "--device", "cpu", "--out", str(tmp_path)]
     code, out, _ = run(capsys, "play", "walking_flat", *args)
-    assert code == 0 and "walked" in out and "0.500" in out and "0.300" in out
+    assert code == 0 and "walked" in out and "command yaw rate    0.3" in out
     series = curves(tmp_path / "robot.rrd")
     (yaw_rate_command,) = (values for name, values in series.items() if "yaw_rate/command" in name)
     assert yaw_rate_command == pytest.approx([0.3] * 15)
+
+
+def test_play_prints_metrics_json_and_nothing_else(still, tmp_path, capsys):
+    args = ["--goal", "0.5", "0", "--seconds", "0.05", "--device", "cpu", "--out", str(tmp_path), "--json"]
+    code, out, _ = run(capsys, "play", still, *args)
+    assert code == 0 and out == (tmp_path / "metrics.json").read_text()
 
 
 def test_play_script_writes_recording_plot_and_metrics(tmp_path, capsys):
     script = tmp_path / "script.json"
     script.write_text('[{"walk": [0.5, 0, 0.3], "seconds": 0.2}, {"stand": 0.1}]')
     code, out, _ = run(capsys, "play", "--script", str(script), "--device", "cpu", "--out", str(tmp_path / "out"))
-    assert code == 0 and "finished_rate" in out
+    assert code == 0 and out.startswith("several policies, play: 2 commands of") and "timeline.png" in out
     assert read_values(tmp_path / "out")["outcome"] == "done"
     assert (tmp_path / "out" / "course.rrd").stat().st_size > 10_000 and (tmp_path / "out" / "timeline.png").is_file()
 
@@ -553,15 +562,50 @@ def test_refuses_to_save_metrics_of_another_stream_than_reporting(trained_run, c
     assert code == 2 and err[-1].endswith("save_to_policy is for the stream reporting, got selection")
 
 
+def test_finetune_prints_its_record_as_json_and_nothing_else(tmp_path, capsys):
+    few = "--iterations 0 --num-goals 2 --num-delayed 0 --num-randomized 0 --device cpu --json".split()
+    code, out, err = run(capsys, "finetune", "horizontal_jump", *few, "--out", str(tmp_path / "tuned"))
+    assert code == 0 and out == (tmp_path / "tuned" / "finetuning.json").read_text()
+    assert any(line.startswith("aim: cost") for line in err) and "json" not in json.loads(out)["settings"]
+
+
 def test_viewer_binds_to_loopback(tmp_path):
     command = viewer_command(tmp_path / "jump.rrd")
     assert command[-2:] == ["--bind", "127.0.0.1"]
 
 
-def test_closed_output_pipe_exits_with_0():
+@pytest.mark.parametrize(
+    "args",
+    [
+        ["list"],
+        ["--help"],
+        ["--version"],
+        ["train", "vertical-jump", "--help"],
+        ["evaluate", "--help"],
+        ["sysid", "-h"],
+    ],
+    ids=" ".join,
+)
+def test_closed_output_pipe_exits_with_0(args):
+    assert_quiet_on_closed_pipe(f"from jumper_warp.cli.main import main; main({args})")
+
+
+@pytest.mark.parametrize("flags", [{}, {"verbose": True}, {"json": True}], ids=str)
+def test_summary_on_a_closed_output_pipe_exits_with_0(tmp_path, flags):
+    write_metrics(tmp_path, {"apex_m": 1.0})
+    lines = [
+        "from pathlib import Path", "from jumper_warp.cli.main import run_command",
+        "from jumper_warp.utils.summary import PrintFlags, print_summary",
+        f"flags = PrintFlags(**{flags}); folder = Path({str(tmp_path)!r})",
+        "run_command(lambda: print_summary(folder, 'a jump', ['apex_m'], seconds=1.0, flags=flags))",
+    ]  # fmt: skip
+    assert_quiet_on_closed_pipe("\n".join(lines))
+
+
+def assert_quiet_on_closed_pipe(code):
+    """Assert that Python code exits with 0, without errors, if nobody reads its output."""
     reader, writer = os.pipe()
     os.close(reader)
-    code = "from jumper_warp.cli.main import main; main(['list'])"
     process = subprocess.run([sys.executable, "-c", code], stdout=writer, stderr=subprocess.PIPE, text=True)
     os.close(writer)
     assert process.returncode == 0 and process.stderr == ""

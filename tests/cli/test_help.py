@@ -155,6 +155,15 @@ def test_help_of_train_fits_60_lines_of_80_columns(capsys, monkeypatch, task):
     assert all(f"  --{name}" in out.replace("[no-]", "") for names in SHORT_HELP.values() for name in names)
 
 
+@pytest.mark.parametrize("policy", ["horizontal_jump", "vertical_jump", "walking_flat"])
+@pytest.mark.parametrize("command", ["play", "evaluate"])
+def test_help_of_a_policy_fits_60_lines_of_80_columns(capsys, monkeypatch, command, policy):
+    monkeypatch.setenv("COLUMNS", "80")
+    code, out, _ = run(capsys, command, policy, "--help")
+    lines = out.splitlines()
+    assert code == 0 and len(lines) <= 60 and max(map(len, lines)) <= 80
+
+
 def test_help_all_has_each_flag_of_a_task(capsys):
     _, out, _ = run(capsys, "train", "vertical-jump", "--help-all")
     assert all(

@@ -2,12 +2,11 @@
 
 import re
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import pytest
 
 from cli_helpers import run
-from jumper_warp.cli.renamed_flags import RENAMED, join_height_range, use_new_names
+from jumper_warp.cli.renamed_flags import join_height_range, use_new_names
 from jumper_warp.cli.sysid import ExciteCfg, SysidCfg
 from jumper_warp.cli.train import TrainArgs
 from jumper_warp.evaluation.sweeps import HeightSweep
@@ -99,14 +98,6 @@ def test_script_accepts_old_flags(capsys, monkeypatch):
     assert capsys.readouterr().err.splitlines() == [
         "jumper: --envs is now --num-envs", "jumper: --filter is now --command-filter",
     ]  # fmt: skip
-
-
-def test_documentation_lists_all_renamed_flags():
-    text = (Path(__file__).parents[2] / "docs" / "renames.md").read_text(encoding="utf-8")
-    rows = [line.split("|") for line in text.split("\n## ")[1].splitlines() if line.startswith("|")]
-    old, new = (set(re.findall(r"--([a-z][a-z.-]*)", " ".join(row[column] for row in rows))) for column in (2, 3))
-    assert old == RENAMED.keys() | {"lower", "upper"}
-    assert new == {name for names in RENAMED.values() for name in names.split()}
 
 
 def test_negated_flag_of_a_group_keeps_its_negation():

@@ -15,7 +15,6 @@ from jumper_warp.identification.motions import load_motion
 from jumper_warp.identification.parameters import total_mass
 from jumper_warp.robot.description import MOTOR_JOINTS
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
-from jumper_warp.robot.values import RobotValues
 from synthetic_bench import synthetic_bench
 
 PARAMS = ["--params", "latency,offsets"]
@@ -70,11 +69,12 @@ def test_sysid_writes_overlay_and_self_contained_report(recorded, capsys):
     assert "χ²" in printed and "warning" not in printed and report["doubts"] == []
 
 
-def test_documentation_gives_the_mass_of_the_described_robot():
-    page = (Path(__file__).parents[2] / "docs" / "identification.md").read_text()
-    described = float(total_mass(RobotValues.nominal(1))[0])
-    masses = [float(mass) for mass in re.findall(r"--mass ([0-9.]+)", page)]
-    assert masses and all(mass == pytest.approx(described, abs=0.002) for mass in masses)
+def test_tutorial_gives_the_mass_of_its_robot():
+    page = (Path(__file__).parents[2] / "docs" / "tutorials" / "identification.md").read_text(encoding="utf-8")
+    (base_mass,) = re.findall(r'"base_mass": \(([0-9.]+),\)', page)
+    mass = float(total_mass(RobotOverlay({"base_mass": (float(base_mass),)}).robots())[0])
+    masses = [float(given) for given in re.findall(r"--mass ([0-9.]+)", page)]
+    assert masses and all(given == pytest.approx(mass, abs=0.002) for given in masses)
 
 
 def test_prints_warning_of_a_wrong_mass(recorded, capsys):
@@ -110,12 +110,14 @@ def test_cma_method_identifies_latency_and_prints_its_report_as_json(recorded, c
     assert load_overlay(out / "identified.json").values["latency"][0] == pytest.approx(0.003, abs=1.0e-3)
 
 
-def test_actuator_fits_friction_from_bench_data(tmp_path):
+def test_actuator_fits_friction_from_bench_data(tmp_path, capsys):
     bench = synthetic_bench(described_constants("transversal") | {"friction": 0.3}, np.random.default_rng(0))
     rows = zip(*(getattr(bench, name) for name in COLUMNS), strict=True)
     (tmp_path / "bench.csv").write_text("\n".join([",".join(COLUMNS), *(",".join(map(str, row)) for row in rows)]))
-    main(["sysid", "actuator", str(tmp_path / "bench.csv"), "--out", str(tmp_path)])
-    friction = json.loads((tmp_path / "actuator.json").read_text())["constants"]["friction"]
+    main(["sysid", "actuator", str(tmp_path / "bench.csv"), "--out", str(tmp_path), "--json"])
+    printed = capsys.readouterr().out
+    assert printed == (tmp_path / "actuator.json").read_text()
+    friction = json.loads(printed)["constants"]["friction"]
     assert friction["value"] == pytest.approx(0.3, abs=0.02) and friction["identified"]
 
 

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import re
 import shutil
 import sys
 from pathlib import Path
@@ -22,6 +21,7 @@ from jumper_warp.registry import TASKS, load_task_module, make_task
 from jumper_warp.rl.checkpoint import save_checkpoint
 from jumper_warp.tasks.saving import TaskError
 
+LEVEL_JUMP = Path(__file__).parents[1] / "helpers" / "level_jump.py"
 TASK = '''\
 """Two jumps with a `base_at_rest` that is not the project's."""
 
@@ -273,14 +273,13 @@ def test_refuses_run_of_an_older_version(capsys, tmp_path, task, command):
 @pytest.mark.parametrize(
     ("right", "wrong", "message"),
     [
-        ("import warp as wp\n", "import warp as wp\nimport not_there\n", "own_faults.py:6: ModuleNotFoundError"),
+        ("import warp as wp\n", "import warp as wp\nimport not_there\n", "own_faults.py:7: ModuleNotFoundError"),
         ("weight=2.0, ", "", "own_faults.py:{line}: TypeError: RewardTerm.__init__() missing"),
         ("tilt(robot)", "tilt(robot.quad)", "own_faults.py, function level: `quad` is not an attribute of 'robot'"),
     ],
 )
 def test_error_in_a_users_file_prints_one_line(right, wrong, message, tmp_path, monkeypatch, capsys):
-    text = (Path(__file__).parents[2] / "README.md").read_text(encoding="utf-8")
-    text = re.search(r"```python\n(# my_task\.py.*?)```", text, re.DOTALL)[1].replace("level-jump", "own-faults")
+    text = LEVEL_JUMP.read_text(encoding="utf-8").replace("level-jump", "own-faults")
     assert right in text
     path = tmp_path / "own_faults.py"
     path.write_text(text.replace(right, wrong, 1))

@@ -46,6 +46,11 @@ def trained(tmp_path_factory, one_thread):
     return folder, runner
 
 
+def test_config_is_written_to_a_new_folder(tmp_path):
+    adapter("attitude").write_config(tmp_path / "logs" / "mine")
+    assert (tmp_path / "logs" / "mine" / "config.json").is_file()
+
+
 def test_random_network_distillation_trains(one_thread):
     rnd = {"rnd_cfg": {"weight": 2.0, "num_outputs": 4, "predictor_hidden_dims": [8], "target_hidden_dims": [8]}}
     runner = OnPolicyRunner(adapter(), settings(**rnd), log_dir=None, device="cpu")

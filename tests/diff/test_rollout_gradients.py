@@ -9,7 +9,7 @@ import pytest
 import warp as wp
 
 from jumper_warp.diff.bodies import body_gradients, moment_rows
-from jumper_warp.diff.rollout import GEOMETRY_NAMES
+from jumper_warp.diff.rollout import GEOMETRY_NAMES, Rollout
 from jumper_warp.kernels.layout import (
     ARMATURE,
     BASE,
@@ -27,6 +27,8 @@ from jumper_warp.kernels.layout import (
     STOP_KD,
     STOP_KE,
 )
+from jumper_warp.robot.model import build_model
+from jumper_warp.robot.motors import vertical_jump_filter
 from tests.helpers.rollout_helpers import (
     DT,
     defaults,
@@ -254,3 +256,17 @@ def test_zero_cotangent_gives_zero_gradients():
     trajectory = run(rollout(), jump())
     gradient_by = rollout().backward(trajectory, q=wp.zeros_like(trajectory.q))
     assert not any(array.numpy().any() for array in gradient_by.values())
+
+
+def test_gradient_by_stiffness_of_many_worlds_matches_a_forward_difference():
+    many = Rollout(build_model(64, visuals=False), command_filter=vertical_jump_filter(), double=True)
+    many.parameters["latency"].fill_(0.006)  # [s]
+    targets, start = np.tile([0.0, 0.3, 0.3], (30, 4)), many.standing()
+    jump = many.run(targets, *start)
+    by_state = np.zeros(jump.q.shape)
+    by_state[-1, 2] = 1.0  # the last base heights
+    gradient = many.backward(jump, q=wp.array(by_state, dtype=jump.q.dtype, device=many.device))
+    by_stiffness, heights = gradient["kp"].numpy(), jump.q.numpy()[-1, 2]
+    many.parameters["kp"].assign(many.parameters["kp"].numpy() + 1.0e-4)
+    higher = many.run(targets, *start).q.numpy()[-1, 2]
+    assert (higher - heights) / 1.0e-4 == pytest.approx(by_stiffness.sum(axis=0), rel=1.0e-3)

@@ -11,6 +11,7 @@ import pytest
 import torch
 
 import hold_height
+from jumper_warp import registry
 from jumper_warp.envs.env import Env
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.ppo import Ppo
@@ -155,6 +156,7 @@ sys.modules["hold_height"] = module = importlib.util.module_from_spec(
 )
 module.__spec__.loader.exec_module(module)
 
+from jumper_warp import registry
 from jumper_warp.envs.env import Env
 from jumper_warp.tasks.saving import task_from_json
 
@@ -264,3 +266,15 @@ def test_loading_a_configuration_imports_no_module(tmp_path):
     spec = importlib.util.spec_from_file_location("trap", tmp_path / "trap.py")
     spec.loader.exec_module(importlib.util.module_from_spec(spec))
     assert mark.exists()  # importing the module creates the file
+
+
+def test_a_users_reward_for_a_level_base_is_one_for_a_standing_robot(monkeypatch):
+    monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    registry.load_task_module(str(ROOT / "tests/helpers/level_jump.py"))
+    task = registry.make_task("level-jump")
+    env = Env(task, 4, randomize=False, noise=False, device="cpu")
+    env.evaluation_reset([0.0, 0.0, 0.9])
+    env.step(torch.zeros(4, 12))
+    row = [term.name for term in task.rewards].index("level")
+    # e^0 = 1 of weight 2 over a step of 1/60 s
+    assert env.skills[0].term_value.numpy()[row] == pytest.approx(np.full(4, 2.0 / 60.0), rel=0.05)

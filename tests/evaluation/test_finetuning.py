@@ -13,6 +13,7 @@ from jumper_warp.evaluation.jump_errors import jump_errors
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.runs import open_policy
+from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.trajectory.gauss_newton import Network
 from jumper_warp.utils.errors import InputError
 
@@ -55,6 +56,20 @@ def test_one_iteration_halves_error_of_biased_policy_with_small_change_of_action
     assert before > 0.003  # [m]
     assert after < 0.5 * before
     assert 0.0 < record["steps"][1]["action_change"] < 0.01
+
+
+def test_finetuning_to_another_robot_keeps_its_overlay(tmp_path):
+    overlay = RobotOverlay({"base_mass": (7.43,), "kp": 12 * (0.88,), "kd": 12 * (1.15,)})
+    overlay.save(tmp_path / "robot.json")
+    policy, record = finetune(
+        open_policy("vertical_jump"), FinetuneCfg(**FEW | {"height_range": (0.6, 0.9)}, robot=tmp_path / "robot.json"),
+        log=lambda line: None,
+    )  # fmt: skip
+    assert policy.config["env"]["robot"] == overlay.to_json()
+    before, after = (step["mean_abs_miss_m"]["nominal"] for step in record["steps"])
+    assert after < 0.5 * before and before > 0.002  # [m]
+    env = env_of_policy(policy, 4, Conditions(device="cpu"))
+    assert env.sim.model.body_mass.numpy()[0] == pytest.approx(7.43)
 
 
 def test_finetuning_is_bitwise_reproducible(tuned):

@@ -6,7 +6,7 @@ import torch
 import warp as wp
 
 from jumper_warp.robot.grounds import BlockCfg
-from jumper_warp.robot.motors import vertical_jump_filter
+from jumper_warp.robot.motors import jumping_motors, vertical_jump_filter
 from jumper_warp.sim.simulation import Simulation
 
 SOLVERS = ("jumper", "mujoco")
@@ -233,3 +233,14 @@ def test_set_targets_broadcasts_and_refuses_bad_targets():
     ):
         with pytest.raises(ValueError, match=message):
             sim.set_targets(wrong)
+
+
+def test_motors_commanded_beyond_a_squat_give_way_until_virtual_work_balances():
+    sim = Simulation(1, motors=jumping_motors(18.0), command_filter=vertical_jump_filter(), device="cpu")
+    sim.set_targets(np.tile([0.0, 1.0, 1.0], 4))
+    for _ in range(60):
+        sim.step()
+    # Motors of 17 N m/rad commanded to 1 rad give way under the weight of 14.5 kg, 35.6 N per leg: with the ankle
+    # 0.175 cos(t) + sqrt(0.3^2 - (0.045 + 0.175 sin(t))^2) below the hips, virtual work balances at t = 1.232 rad,
+    # ankle 0.272 m and paw 0.297 m below. (A little less is borne by the motors: shanks and paws rest on the ground.)
+    assert sim.joint_q()[0, 2] == pytest.approx(0.297, abs=0.02)

@@ -1,12 +1,9 @@
 """The jump tasks as data: curricula of goals and starts, the tasks on Mars, and flags that undo differences."""
 
 import dataclasses
-import re
-from pathlib import Path
 
 import pytest
 
-from jumper_warp.cli.task_flags import flags_of
 from jumper_warp.cli.train import parse_train
 from jumper_warp.registry import make_task
 from jumper_warp.robot.motors import loose_filter, vertical_jump_filter
@@ -75,20 +72,3 @@ def test_flags_undo_differences_from_the_paper():
     assert not any(
         term.weight for term in task.rewards if term.name in ("lifted_again", "capture_point", "torque_ripple")
     )
-
-
-def flags(group, prefix="--env"):
-    """Yield the names of all flags of a dataclass of task settings, recursively."""
-    for spec in dataclasses.fields(group):
-        name, value = f"{prefix}.{spec.metadata['flag']}", getattr(group, spec.name)
-        yield from flags(value, name) if dataclasses.is_dataclass(value) else (name,)
-
-
-def test_flags_in_the_table_of_differences_exist():
-    tasks = ("vertical-jump", "horizontal-jump", "omnidirectional-jump", "attitude")
-    known = {flag for name in tasks for flag in flags(flags_of(make_task(name)))}
-    table = (Path(__file__).parents[2] / "docs" / "tasks.md").read_text()
-    named = [name for name in re.findall(r"--env\.[a-z0-9.-]*[a-z0-9]", table) if "rewards.TERM" not in name]
-    named = [name for name in named if name not in ("--env.rewards", "--env.terminations", "--env.levels")]
-    assert len(named) > 25
-    assert not sorted(set(named) - known)

@@ -60,6 +60,15 @@ def test_summary_counts_files_of_a_kind_if_there_are_many(summary):
     assert f"pictures   4 in {folder}\n" in text and "0.png" not in text and "rerun" not in text
 
 
+def test_summary_of_lists_has_a_column_for_each_trial(tmp_path, capsys):
+    write_metrics(tmp_path, {"apex_m": [0.5, None], "outcome": ["success", "tilted"]})
+    film = tmp_path / "films" / "jump.webp"
+    print_summary(tmp_path, "2 jumps", ["apex_m", "outcome"], seconds=1.0, trial="jump", films=[film])
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert lines[1:4] == ["jump 1 jump 2".split(), "apex 0.5 m undefined".split(), "outcome success tilted".split()]
+    assert ["film", str(film)] in lines and not any("picture" in line for line in lines)
+
+
 def test_verbose_prints_conditions_and_all_metrics_by_key(summary):
     text, _ = summary(keys=(), verbose=True)
     assert "solver jumper" in text and all(key in text for key in METRICS) and "--verbose" not in text

@@ -1,7 +1,7 @@
 """Vertical jump: reach a commanded base height, then land.
 
-Terms and constants are those of the paper and of its authors' training configuration. `docs/tasks.md` lists all
-differences, their reasons and how to undo them.
+Terms and constants are those of the paper and of its authors' training configuration. `docs/results/paper.md` lists
+all differences, their reasons and how to undo them.
 """
 
 from __future__ import annotations

@@ -1,0 +1,110 @@
+"""Pages of the Python API: a page for each area with autodoc of its modules, and plain-text docstrings for autodoc."""
+
+from __future__ import annotations
+
+import importlib
+from typing import Any
+
+from sphinx.application import Sphinx
+
+from jumper_warp.cli.flags import field_docs
+from plain_text import to_rst
+
+AREAS: dict[str, tuple[str, tuple[str, ...]]] = {
+    "environments": ("Environments", (
+        "envs.env", "envs.vec_env", "envs.skill", "envs.state", "envs.parameters", "envs.camera", "envs.gymnasium", "gym",
+        "envs.rsl_rl", "envs.sb3",
+    )),
+    "simulation": ("Simulation and solvers", (
+        "sim.simulation", "sim.solver", "sim.mujoco", "sim.physics", "sim.dynamics", "sim.tape",
+    )),
+    "robot": ("Robot", (
+        "robot.model", "robot.description", "robot.motors", "robot.overlay", "robot.bounds", "robot.grounds",
+        "robot.terrain", "robot.gravity", "robot.export", "robot.pinocchio_model",
+    )),
+    "tasks": ("Tasks", (
+        "registry", "tasks.jump.cfg", "tasks.jump.vertical", "tasks.jump.horizontal", "tasks.jump.mars",
+        "tasks.velocity.cfg", "tasks.velocity.flat", "tasks.velocity.rough", "tasks.attitude.cfg", "tasks.attitude.flight",
+        "tasks.commands", "tasks.interface", "tasks.switching", "tasks.observations", "tasks.mirror", "tasks.saving",
+    )),
+    "gradients": ("Gradients", (
+        "diff.rollout", "diff.torch_rollout", "diff.closed_loop", "diff.differentiable_env", "diff.smooth_rewards",
+    )),
+    "training": ("Training", (
+        "rl.cfg", "rl.runner", "rl.ppo", "rl.shac", "rl.networks", "rl.checkpoint", "rl.resume", "rl.logger", "rl.mirror",
+        "rl.distributed",
+    )),
+    "policies": ("Policies", (
+        "policies.folder", "policies.policy", "policies.spec", "policies.catalog", "policies.conditions",
+        "policies.skills", "policies.runs", "policies.onnx", "policies.blend", "policies.warm_start", "deploy.policy",
+    )),
+    "evaluation": ("Evaluation", (
+        "evaluation.run", "evaluation.evaluations", "evaluation.log", "evaluation.commands", "evaluation.suites",
+        "evaluation.sweeps", "evaluation.episodes", "evaluation.heights", "evaluation.landings", "evaluation.velocities",
+        "evaluation.attitude", "evaluation.jumps", "evaluation.courses", "evaluation.scripts", "evaluation.recorder",
+        "evaluation.limits", "evaluation.finetuning", "evaluation.finetuning_cfg",
+    )),
+    "identification": ("Identification", (
+        "identification.identify", "identification.parameters", "identification.recording", "identification.motions",
+        "identification.excitation", "identification.actuators", "identification.residuals",
+        "identification.least_squares", "identification.initial_states", "identification.uncertainty",
+        "identification.results", "identification.report", "identification.replay",
+    )),
+    "trajectory": ("Trajectory optimization", (
+        "trajectory.problem", "trajectory.jumps", "trajectory.gauss_newton", "trajectory.augmented_lagrangian",
+        "trajectory.smoothing", "trajectory.whole_body",
+    )),
+    "viz": ("Recordings and pictures", (
+        "viz.recorder", "viz.recording", "viz.film", "viz.picture", "viz.plots", "viz.rerun", "viz.renderer", "viz.scene",
+        "viz.props", "viz.style",
+    )),
+    "utils": ("Errors and output", ("utils.errors", "utils.metrics", "utils.output", "utils.runtime", "utils.streams")),
+}  # fmt: skip
+"""Title and modules of each page, by its file name."""
+
+
+def module_text(module: str) -> str:
+    """Return the reStructuredText that documents a module of `jumper_warp`."""
+    name = f"jumper_warp.{module}"
+    title = f"``{name}``"
+    return "\n".join([title, "-" * len(title), "", f".. automodule:: {name}", "   :members:", ""])
+
+
+def api_pages() -> dict[str, str]:
+    """Return the pages in reStructuredText by file name."""
+    pages = {}
+    for name, (title, modules) in AREAS.items():
+        parts = [title, "=" * len(title), "", *map(module_text, modules)]
+        pages[f"{name}.rst"] = "\n".join(parts)
+    return pages
+
+
+def api_table() -> str:
+    """Return the table of all pages and their modules, and the table of contents, in Markdown."""
+    rows = [f"| [{title}](../reference/api/{name}.rst) | {', '.join(f'`{module}`' for module in modules)} |"
+            for name, (title, modules) in AREAS.items()]  # fmt: skip
+    contents = ["```{toctree}", ":hidden:", *(f"api/{name}" for name in AREAS), "```"]
+    return "\n".join(["| Page | Modules of `jumper_warp` |", "|---|---|", *rows, "", *contents]) + "\n"
+
+
+def plain_docstring(app: Sphinx, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:
+    """Replace a docstring by reStructuredText with the same appearance; a field without one has its comment."""
+    if what == "attribute" and (not lines or lines[0].startswith("Alias for field number")):
+        lines[:] = [_field_comment(name)]
+    lines[:] = to_rst("\n".join(lines)).splitlines()
+
+
+def _field_comment(name: str) -> str:
+    """Return the comment after a field of a class by its full name; empty if there is none."""
+    owner, _, field = name.rpartition(".")
+    module, _, kind = owner.rpartition(".")
+    try:
+        return field_docs(getattr(importlib.import_module(module), kind)).get(field, "")
+    except (ImportError, AttributeError):
+        return ""
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Register the conversion of docstrings."""
+    app.connect("autodoc-process-docstring", plain_docstring)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}

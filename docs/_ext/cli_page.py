@@ -1,0 +1,166 @@
+"""Page of the command line, as MyST Markdown from the settings of the commands."""
+
+from __future__ import annotations
+
+import dataclasses
+import inspect
+from collections.abc import Iterable, Sequence
+from typing import Any
+
+from jumper_warp.cli.completion import CompletionCfg, settings_of
+from jumper_warp.cli.evaluate import ABOUT as ABOUT_EVALUATE
+from jumper_warp.cli.export import ExportCfg
+from jumper_warp.cli.export_robot import ExportRobotCfg
+from jumper_warp.cli.flags import Flag, list_flags
+from jumper_warp.cli.help import default_text
+from jumper_warp.cli.main import COMMANDS, EXIT_CODES
+from jumper_warp.cli.play import ABOUT as ABOUT_PLAY
+from jumper_warp.cli.sysid import ActuatorCfg, ExciteCfg, SysidCfg
+from jumper_warp.cli.task_flags import flags_of
+from jumper_warp.cli.train import SHORT_HELP
+from jumper_warp.evaluation.commands import EvaluateCfg, PlayCfg, ScriptCfg
+from jumper_warp.evaluation.evaluations import EVALUATIONS
+from jumper_warp.evaluation.suites import SUITES
+from jumper_warp.registry import make_task
+from plain_text import to_markdown
+
+EXAMPLE_TASK = "vertical-jump"
+COMMON = {
+    "finetune": ("num-goals", "height-range", "distance-range", "iterations", "out", "overwrite"),
+    "play": ("seconds", "solver", "robot", "gravity", "video", "viewer", "out"),
+    "evaluate": ("solver", "randomize", "noise", "seed", "robot", "gravity", "friction", "save-trials", "out"),
+    "sysid fit": ("params", "mass", "torque-limit", "gain-preset", "out"),
+    "sysid excite": ("params", "seconds", "robot", "seed", "out"),
+}
+"""Names of the flags that stand before the list of all flags."""
+FULL_LIST = 10  # A command with at most so many flags has no second list
+
+
+def cli_page() -> str:
+    """Return the Markdown of the page: one section for each command, then exit codes and completion."""
+    train = settings_of("train")[0]
+    parts = [
+        section("train TASK", COMMANDS["train"], list_flags(train), headings=SHORT_HELP,
+                more={f"Flags of a task, here {EXAMPLE_TASK}": list_flags(flags_of(make_task(EXAMPLE_TASK)), "env.")}),
+        section("finetune POLICY", COMMANDS["finetune"], list_flags(settings_of("finetune")[0])),
+        of_kinds("play", ABOUT_PLAY, {name: list_flags(PlayCfg(kind.play)) for name, kind in EVALUATIONS.items()},
+                 {"Flags with --script": list_flags(ScriptCfg)}),
+        of_kinds("evaluate", ABOUT_EVALUATE,
+                 {name: list_flags(EvaluateCfg(kind.flags)) for name, kind in EVALUATIONS.items()},
+                 {f"Flags with --suite {suite.name}": list_flags(suite) for suite in SUITES}),
+        section("export SOURCE", doc(ExportCfg), list_flags(ExportCfg)),
+        section("export robot", doc(ExportRobotCfg), list_flags(ExportRobotCfg)),
+        section("sysid fit DATA ...", doc(SysidCfg), list_flags(SysidCfg)),
+        section("sysid excite", doc(ExciteCfg), list_flags(ExciteCfg)),
+        section("sysid actuator BENCH", doc(ActuatorCfg), list_flags(ActuatorCfg)),
+        section("list", COMMANDS["list"], list_flags(settings_of("list")[0])),
+        section("info NAME", COMMANDS["info"], list_flags(settings_of("info")[0])),
+        section("completion SHELL", COMMANDS["completion"], list_flags(CompletionCfg)),
+    ]  # fmt: skip
+    return "\n\n".join([summary(), *parts, completion(), exit_codes()]) + "\n"
+
+
+def summary() -> str:
+    """Return the table of all commands."""
+    anchors = {"train": "train-task", "finetune": "finetune-policy", "play": "play-policy", "evaluate": "evaluate-policy",
+               "export": "export-source", "sysid": "sysid-fit-data", "info": "info-name", "completion": "completion-shell"}  # fmt: skip
+    rows = [f"| [`{name}`](#jumper-{anchors.get(name, name)}) | {paragraph(about)} |" for name, about in COMMANDS.items()]
+    return "\n".join(["| Command | Purpose |", "|---|---|", *rows])
+
+
+def doc(kind: Any) -> str:
+    """Return the description of a command from the docstring of its settings."""
+    return inspect.getdoc(kind) or ""
+
+
+def section(
+    command: str, about: str, flags: Sequence[Flag], *, headings: Any = None, more: dict[str, list[Flag]] | None = None
+) -> str:
+    """Return the section of a command: description, common flags, and all flags in a collapsed block.
+
+    command: with its positional arguments. headings: names of the common flags by heading. more: further flags, each
+    list in a collapsed block of its own.
+    """
+    name = command.split(" POLICY")[0].split(" DATA")[0]
+    by_name = {flag.name: flag for flag in flags}
+    if headings is None and name in COMMON:
+        headings = {"Common flags": COMMON[name]}
+    if headings is None or len(flags) <= FULL_LIST:
+        shown = definitions(flags)
+    else:
+        positional = definitions(flag for flag in flags if flag.positional)
+        common = [f"**{title}**\n\n{definitions(by_name[each] for each in names if each in by_name)}"
+                  for title, names in headings.items()]  # fmt: skip
+        shown = "\n\n".join([*filter(None, [positional]), *common, dropdown("All flags", grouped(flags))])
+    rest = [dropdown(title, grouped(list_of)) for title, list_of in (more or {}).items()]
+    return "\n\n".join([f"## `jumper {command}`", paragraph(about), shown, *rest])
+
+
+def of_kinds(command: str, about: str, kinds: dict[str, list[Flag]], more: dict[str, list[Flag]]) -> str:
+    """Return the section of a command whose flags depend on the policy; kinds: flags by kind of evaluation."""
+    first, *others = kinds.values()
+    common = [flag for flag in first if all(flag.name in {each.name for each in flags} for flags in others)]
+    shared = {flag.name for flag in common}
+    own: dict[str, list[Flag]] = {}
+    for name, flags in kinds.items():
+        title = f"Flags for policies of the kind {name.replace('_', ' ')}"
+        own[title] = [flag for flag in flags if flag.name not in shared]
+    return section(f"{command} POLICY", about, common, headings={"Common flags": COMMON[command]}, more=own | more)
+
+
+def grouped(flags: Sequence[Flag]) -> str:
+    """Return the definitions of flags below the names of their groups."""
+    groups: dict[str, list[Flag]] = {}
+    for flag in flags:
+        groups.setdefault(flag.name.rpartition(".")[0], []).append(flag)
+    parts = []
+    for group, members in groups.items():
+        about = to_markdown(members[0].group_about)
+        title = f"**`{group}`** {about}\n\n" if group else ""
+        parts.append(title + definitions(members))
+    return "\n\n".join(parts)
+
+
+def definitions(flags: Iterable[Flag]) -> str:
+    """Return the definition list of flags: name and value, then description and default."""
+    return "\n\n".join(f"`{spelling(flag)}`\n: {meaning(flag)}" for flag in flags)
+
+
+def spelling(flag: Flag) -> str:
+    """Return a flag as on the command line, with a placeholder of its value."""
+    if flag.positional:
+        return flag.name
+    start, dot, last = flag.name.rpartition(".")
+    return f"--{start}{dot}[no-]{last}" if flag.has_negative else f"--{flag.name} {flag.metavar}".rstrip()
+
+
+def meaning(flag: Flag) -> str:
+    """Return the description of a flag with its default."""
+    default = "" if "(default" in flag.about or flag.default is dataclasses.MISSING else default_text(flag.default)
+    about = to_markdown(flag.about.rstrip(".") + "." if flag.about else "")
+    return f"{about} Default: `{default}`.".strip() if default else about or "No description."
+
+
+def dropdown(title: str, content: str) -> str:
+    """Return a collapsed block."""
+    return f":::::{{dropdown}} {title}\n\n{content}\n:::::"
+
+
+def paragraph(text: str) -> str:
+    """Return a command's description as Markdown."""
+    return to_markdown(" ".join(text.split(": jumper ")[0].rstrip(".").split()) + ".")
+
+
+def completion() -> str:
+    """Return the section about shell completion, from the docstring of its settings."""
+    lines = [line.strip() for line in doc(CompletionCfg).splitlines() if ": jumper " in line]
+    commands = "\n".join(line.partition(": ")[2] for line in lines)
+    shells = " and ".join(line.partition(":")[0] for line in lines)
+    return f"## Shell completion\n\nFor {shells}:\n\n```bash\n{commands}\n```"
+
+
+def exit_codes() -> str:
+    """Return the section about exit codes."""
+    codes = EXIT_CODES.removeprefix("Exit codes: ").rstrip(".").split(", ")
+    rows = [f"| {code.split(' ', 1)[0]} | {code.split(' ', 1)[1]} |" for code in codes]
+    return "\n".join(["## Exit codes", "", "| Code | Meaning |", "|---|---|", *rows])

@@ -1,0 +1,70 @@
+"""The Warp functions of `jumper_warp.mdp` and of the project's tasks, by kind of term."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any
+
+import warp as wp
+
+from jumper_warp import mdp
+from jumper_warp.registry import TASKS, make_task
+
+SPACES: dict[str, ModuleType] = {name: getattr(mdp, name) for name in ("rewards", "terminations", "observations", "events")}
+"""Namespaces of stock terms."""
+TASK_KINDS = ("attitude", "jump", "velocity")
+EMPTY = inspect.Signature.empty
+
+
+def is_term(space: str, func: Any) -> bool:
+    """Return whether a Warp function has the signature of the terms of a namespace."""
+    signature = inspect.signature(func.func)
+    names, returns = list(signature.parameters), signature.return_annotation
+    if space == "events":
+        return names[:2] == ["robot", "rng"] and returns is EMPTY
+    if space == "observations":
+        return names in (["robot", "state"], ["robot", "world"], ["arrays", "ground", "world"])
+    return names[:2] == ["robot", "state"] and returns in {"rewards": (float, wp.float32), "terminations": (bool, wp.bool)}[space]
+
+
+def functions_of(module: ModuleType, fits: Callable[[Any], bool]) -> dict[str, Any]:
+    """Return the Warp functions that a module defines and that fit, by name."""
+    defined = {name: value for name, value in vars(module).items() if isinstance(value, wp.Function)}
+    return {name: func for name, func in defined.items() if func.func.__module__ == module.__name__ and fits(func)}
+
+
+def stock_terms(space: str) -> dict[str, Any]:
+    """Return the stock terms of a namespace by full name, such as `jumper_warp.mdp.rewards.action_rate`."""
+    terms = functions_of(SPACES[space], lambda func: is_term(space, func))
+    return {f"{mdp.__name__}.{space}.{name}": func for name, func in terms.items()}
+
+
+def helpers(space: str) -> dict[str, Any]:
+    """Return the functions of a namespace of stock terms that are no terms, by full name."""
+    others = functions_of(SPACES[space], lambda func: not is_term(space, func))
+    return {f"{mdp.__name__}.{space}.{name}": func for name, func in others.items()}
+
+
+def task_terms(space: str) -> dict[str, Any]:
+    """Return the terms that only some of the project's tasks can use, by full name."""
+    terms = {}
+    for kind in TASK_KINDS if space != "events" else ():
+        module = importlib.import_module(f"jumper_warp.kernels.{kind}.{space}")
+        found = functions_of(module, lambda func: is_term(space, func))
+        terms |= {f"{module.__name__}.{name}": func for name, func in found.items()}
+    return terms
+
+
+def tasks_by_function() -> dict[Any, list[str]]:
+    """Return the names of the project's tasks that use a function in a term, by function."""
+    used: dict[Any, list[str]] = {}
+    for name in TASKS:
+        task = make_task(name)
+        terms = [*task.rewards, *task.terminations, *task.observations.actor, *task.observations.critic]
+        terms += [*task.randomization.events(), *task.events]
+        for func in dict.fromkeys(term.func for term in terms):
+            used.setdefault(func, []).append(name)
+    return used

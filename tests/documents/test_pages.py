@@ -1,0 +1,27 @@
+"""Every snippet of the README, the site and the policies' pages runs or parses."""
+
+import shlex
+
+import pytest
+from markdown_it import MarkdownIt
+from snippet_commands import ROOT, Commands
+from snippets import Page
+
+PATTERNS = ("README.md", "CONTRIBUTING.md", "docs/**/*.md", "assets/policies/*/README.md", "experiments/README.md")
+APART = ("docs/tutorials", "docs/howto")  # in files of their own, for workers that take a file each
+PAGES = [str(path.relative_to(ROOT)) for pattern in PATTERNS for path in sorted(ROOT.glob(pattern))]
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if not page.startswith(APART)])
+def test_page(page, tmp_path, one_thread):
+    Page(ROOT / page).run(tmp_path)
+
+
+def test_commands_below_the_pictures_of_the_readme_parse(monkeypatch):
+    monkeypatch.chdir(ROOT)
+    tokens = MarkdownIt("commonmark").enable("table").parse((ROOT / "README.md").read_text())
+    codes = [child.content for token in tokens for child in token.children or () if child.type == "code_inline"]
+    commands = [shlex.split(code) for code in codes if code.startswith("jumper ")]
+    assert 6 <= len(commands) <= 9
+    for words in commands:
+        Commands().check(words)
