@@ -5,9 +5,15 @@ from pathlib import Path
 
 import warp as wp
 
+import hold_height
 from jumper_warp import mdp
 
 ROOT = Path(__file__).parents[1]
+
+
+def test_the_curriculum_counts_every_episode_by_default():
+    curriculum = mdp.Curriculum(hold_height.height_error, tolerance=0.1)
+    assert curriculum.options["counts"].func(None) is True
 
 
 def test_every_public_name_resolves_and_namespaces_hold_stock_functions():

@@ -15,6 +15,7 @@ import warp as wp
 
 from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, MODES
 from jumper_warp.kernels.mdp.parameters import RobotParameters
+from jumper_warp.kernels.mdp.step import every_episode
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.utils.checks import FLOAT32_MAX
 from jumper_warp.utils.errors import InputError
@@ -241,11 +242,11 @@ class Curriculum(Term):
 
     Function: (robot: RobotView, state) -> float, error of an ended episode in `unit`. `promote_after` episodes in a row
     that end with success and an error up to `tolerance` raise the world's level. counts: @wp.func (state) -> bool,
-    whether an episode is counted. unit: suffix of the logged error's name.
+    whether an episode is counted (default: every episode is). unit: suffix of the logged error's name.
     """
 
     settings: ClassVar = {"tolerance": REQUIRED, "promote_after": 5}
-    options: Mapping[str, Any] = {"counts": REQUIRED, "unit": "m"}
+    options: Mapping[str, Any] = {"counts": every_episode, "unit": "m"}
     returns: ClassVar = (float, wp.float32)
 
     def __init__(self, func: Function, **values: Any) -> None:

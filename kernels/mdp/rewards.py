@@ -4,7 +4,7 @@ from typing import Any
 
 import warp as wp
 
-from .view import RobotView, vec12
+from .view import RobotView, tilt, vec12
 
 
 @wp.func
@@ -35,6 +35,18 @@ def posture_offset(robot: RobotView, shift: float) -> float:
             offset = offset - shift
         total += offset * offset
     return wp.sqrt(total / 12.0)
+
+
+@wp.func
+def level(robot: RobotView, state: Any, width: float) -> float:
+    """Reward for a level base. It is phi of the base's tilt [rad]; width [rad]: width of the kernel."""
+    return phi(tilt(robot), width)
+
+
+@wp.func
+def horizontal_speed_sq(robot: RobotView, state: Any) -> float:
+    """Penalty of horizontal motion. It is the squared horizontal speed of the base [m^2/s^2]."""
+    return robot.lin_vel[0] * robot.lin_vel[0] + robot.lin_vel[1] * robot.lin_vel[1]
 
 
 @wp.func

@@ -14,6 +14,12 @@ NOT_TERMINATED = wp.constant(-1)  # `EpisodeArrays.termination` of an episode th
 
 
 @wp.func
+def every_episode(state: Any) -> bool:
+    """Return True: the curriculum counts every episode."""
+    return True
+
+
+@wp.func
 def update_curriculum(
     episode: EpisodeArrays, counters: Counters, world: int, success: bool, error: float, promote_after: float,
     num_levels: int,

@@ -6,7 +6,10 @@ import pytest
 from jump_helpers import Table, functions, make_episode, make_view
 from jumper_warp.kernels.mdp import rewards
 
-NAMES = "ground_force action_clip motor_torque_sq joint_acceleration action_rate action_acceleration collision"
+NAMES = (
+    "level horizontal_speed_sq ground_force action_clip motor_torque_sq joint_acceleration action_rate "
+    "action_acceleration collision"
+)
 reward = Table(functions(rewards, NAMES), float)
 E = math.exp
 
@@ -37,3 +40,10 @@ def test_regularisation_terms_are_sums_of_squares_in_every_phase(phase):
     assert reward("action_rate", view, task) == pytest.approx(12.0)
     assert reward("action_acceleration", view, task) == pytest.approx(12.0 * 1.75**2)
     assert reward("collision", view, task) == float(phase == 1)
+
+
+def test_level_is_gaussian_in_the_tilt_and_horizontal_motion_costs_its_squared_speed():
+    view = make_view(projected_gravity=(0.0, -math.sin(0.2), -math.cos(0.2)), lin_vel=(0.3, -0.4, 2.0))
+    assert reward("level", view, make_episode(), width=0.1) == pytest.approx(E(-4.0), rel=1e-3)
+    assert reward("level", make_view(), make_episode(), width=0.1) == pytest.approx(1.0)
+    assert reward("horizontal_speed_sq", view, make_episode()) == pytest.approx(0.25)
