@@ -43,6 +43,7 @@ def mdp_page() -> str:
     functions = {name: value for name, value in public.items() if isinstance(value, wp.Function)}
     for space in SPACES:
         functions |= helpers(space)
+    factories = {name: value for name, value in public.items() if inspect.isfunction(value)}
     structs = {name: value for name, value in public.items() if isinstance(value, STRUCT)}
     structs |= {f"{struct.cls.__module__}.{struct.key}": struct for struct in INNER_STRUCTS}
     classes = {name: value for name, value in public.items() if inspect.isclass(value)}
@@ -53,6 +54,7 @@ def mdp_page() -> str:
         "Structs": [struct_entry(name, struct) for name, struct in structs.items()],
         "Constants": [constant(name, value) for name, value in public.items() if isinstance(value, int)],
         "Functions": [function_entry(name, func) for name, func in functions.items()],
+        "Motors and filters": [factory(name, value) for name, value in factories.items()],
     }
     for space in SPACES:
         kinds[f"Stock {space}"] = [
@@ -111,6 +113,12 @@ def function_entry(name: str, func: Any, tasks: Sequence[str] | None = None) -> 
     names = f"Used by {', '.join(f'`{task}`' for task in tasks)}." if tasks else ""
     about = to_markdown(inspect.getdoc(func.func) or "")
     return described("function", name, f"({ast.unparse(tree.args)}){returns}", about, names)
+
+
+def factory(name: str, function: Any) -> Entry:
+    """Return the entry of a Python function that returns settings of a task."""
+    return described("function", name, str(inspect.signature(function)).replace("'", ""),
+                     to_markdown(inspect.getdoc(function) or ""))  # fmt: skip
 
 
 def struct_entry(name: str, struct: Any) -> Entry:
