@@ -171,15 +171,16 @@ def task_names() -> tuple[str, ...]:
 
 def register_task(
     name: str, make: Callable[[], TaskCfg], *, ppo: PpoCfg | None = None, aliases: tuple[str, ...] = (),
-    about: str = "", replace: bool = False,
+    about: str = "", presets: dict[str, str] | None = None, replace: bool = False,
 ) -> None:  # fmt: skip
     """Register the task that `make` returns under its name and aliases.
 
     ppo: default training settings; about: text for `jumper list` (default: the first sentence of make's docstring);
-    replace: whether to replace a task of this name. A function of the same name in the same module, as of a file or a
-    notebook's cell that runs again, always replaces its task. Raises InputError: a name or alias is taken.
+    presets: groups of flags of `jumper train` by name, as {"laptop": LAPTOP_JUMP}; replace: whether to replace a task
+    of this name. A function of the same name in the same module, as of a file or a notebook's cell that runs again,
+    always replaces its task. Raises InputError: a name or alias is taken.
     """
-    entry = TaskEntry(make, PpoCfg() if ppo is None else ppo, tuple(aliases), about=about)
+    entry = TaskEntry(make, PpoCfg() if ppo is None else ppo, tuple(aliases), about=about, presets=presets or {})
     _register(name, entry, replace or (name in TASKS and _is_same_function(make, TASKS[name].make)))
 
 
