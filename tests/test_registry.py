@@ -122,7 +122,10 @@ def test_trainer_settings_are_those_of_the_task():
 
 
 def test_registered_task_has_its_name_alias_settings_and_origin():
-    register_task("my-jump", renamed("my-jump"), ppo=PpoCfg(gamma=0.5), aliases=("Mine",))
+    register_task(
+        "my-jump", renamed("my-jump"), ppo=PpoCfg(gamma=0.5), aliases=("Mine",), presets={"quick": "--num-envs 8"}
+    )
+    assert registry.TASKS["my-jump"].presets == {"quick": "--num-envs 8"}
     assert make_task("Mine").name == "my-jump" and trainer_settings("my-jump").gamma == 0.5
     assert "my-jump" in task_names() and TASKS["my-jump"].origin == __name__
 

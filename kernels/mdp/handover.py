@@ -5,6 +5,7 @@ from typing import Any
 import warp as wp
 
 from .env import BEGUN, EpisodeArrays, Scene, SkillSettings
+from .options import kernel_name
 from .parameters import RobotParameters, set_motor
 from .view import RobotArrays, load_view, yaw_of
 
@@ -76,7 +77,9 @@ def make_handover_kernel(handover: Any) -> wp.Kernel:
     """Return the kernel that performs a handover (a `jumper_warp.tasks.cfg.Handover`) where it is due."""
     when, begin, set_command = handover.when, handover.begin, handover.target.command.set
 
-    @wp.kernel(module="unique", enable_backward=False)
+    name = kernel_name("handover_kernel", handover.source.state, handover.target.state)
+
+    @wp.kernel(name=name, module="unique", enable_backward=False)
     def handover_kernel(
         # in
         source: int,

@@ -6,7 +6,7 @@ import warp as wp
 
 from ..terrain.ground import Ground
 from .env import BEGUN, COMMANDED, RING, EpisodeArrays
-from .options import FAST
+from .options import FAST, kernel_name
 from .parameters import RobotParameters
 from .random import OBSERVATION, clamped_normal, step_key, stream_at
 from .view import RobotArrays, load_view
@@ -90,7 +90,7 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
     reads_ground = [kind is RobotArrays for kind in input_types]
     rows = [sum(slot.term.width for slot in slots[:i]) for i in range(len(slots))]
 
-    @wp.kernel(module="unique", module_options=FAST)
+    @wp.kernel(name=kernel_name("observe_kernel", task.state), module="unique", module_options=FAST)
     def observe_kernel(
         # in
         skill: int,

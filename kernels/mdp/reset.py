@@ -11,7 +11,7 @@ from ..layout import COORDS, DOFS, motor_slot
 from ..terrain.ground import rest_block, surface, world_ground
 from .attempts import sync_attempts
 from .env import BEGUN, COMMANDED, RING, Delays, EpisodeArrays, Scene, SkillSettings
-from .options import FAST
+from .options import FAST, kernel_name
 from .random import ANY_LEVEL, COMMAND, RESET, make_stream, uniform
 from .track import update_paw_kinematics
 from .view import RobotArrays, base_quat, base_velocity, load_view, yaw_of
@@ -39,7 +39,9 @@ def make_reset_kernel(task: Any) -> wp.Kernel:
     reset, due, command = task.reset.func, task.command.resample_due, task.command.resample
     settings_type, level_type = task.settings_type, task.level_type
 
-    @wp.kernel(module="unique", module_options=FAST)
+    name = kernel_name("reset_kernel", task.state, settings_type, level_type)
+
+    @wp.kernel(name=name, module="unique", module_options=FAST)
     def reset_kernel(
         # in
         skill: int,
@@ -97,7 +99,7 @@ def make_set_command_kernel(task: Any) -> wp.Kernel:
     """Return the kernel that sets a task's commands from the host; task: see `jumper_warp.tasks.cfg.TaskCfg`."""
     set_command = task.command.set
 
-    @wp.kernel(module="unique", enable_backward=False)
+    @wp.kernel(name=kernel_name("set_command_kernel", task.state), module="unique", enable_backward=False)
     def set_command_kernel(
         # in
         skill: int,

@@ -7,7 +7,7 @@ import warp as wp
 from ..terrain.ground import Ground
 from . import terminations
 from .env import BEGUN, Counters, EpisodeArrays
-from .options import FAST
+from .options import FAST, kernel_name
 from .view import RobotArrays, has_diverged, load_view
 
 NOT_TERMINATED = wp.constant(-1)  # `EpisodeArrays.termination` of an episode that has not ended
@@ -72,7 +72,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
     diverged_ending = [slot.func for slot in endings].index(terminations.diverged)
     floor = task.reward_floor
 
-    @wp.kernel(module="unique", module_options=FAST)
+    @wp.kernel(name=kernel_name("step_kernel", task.state), module="unique", module_options=FAST)
     def step_kernel(
         # in
         skill: int,

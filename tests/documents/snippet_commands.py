@@ -147,7 +147,9 @@ class Commands:
         default = f"{args[1]}_finetuned" if args[0] == "finetune" else None
         if path := getattr(settings, "out", None) or default:
             policy = args[0] in ("finetune", "export") and args[1] != "robot"
-            self.made[str(path)] = task or (saved_task(args[1], []) if policy else None)
+            if policy and not task:  # that of a user's module is the last training's
+                task = self.task if "--task-module" in args else saved_task(args[1], [])
+            self.made[str(path)] = task
 
     def check_script(self, script, args):
         """Parse the flags of a script in experiments/; other scripts only have to exist. Raises CommandError."""

@@ -73,6 +73,18 @@ def test_training_halves_the_height_error(one_thread):
     assert mean_error(env, ppo) < 0.5 * before
 
 
+def test_a_task_defined_again_has_kernels_for_its_new_structs():
+    for _ in range(2):  # as a notebook's cell that runs again
+        spec = importlib.util.spec_from_file_location("task_defined_again", FILE)
+        module = importlib.util.module_from_spec(spec)
+        sys.modules["task_defined_again"] = module
+        spec.loader.exec_module(module)
+        env = make_env(2, module.hold_height())
+        env.evaluation_reset([0.3])
+        env.step(torch.zeros(2, 12))
+        assert list(states_of(env)["steps"]) == [1, 1]
+
+
 def test_user_defined_state_settings_and_levels_are_used():
     env = make_env(64)
     states = states_of(env)
