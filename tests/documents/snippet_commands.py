@@ -170,7 +170,7 @@ class Commands:
             for item in value if isinstance(value, tuple) else (value,):
                 if isinstance(item, Path) and field.name not in OUTPUTS:
                     self.require(item)
-                elif isinstance(item, str) and item and field.name in (*POLICIES, "blend"):
+                elif isinstance(item, str) and item and value != field.default and field.name in (*POLICIES, "blend"):
                     self.task_of(item)
 
     def is_made(self, path):
