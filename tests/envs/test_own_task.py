@@ -280,8 +280,9 @@ def test_loading_a_configuration_imports_no_module(tmp_path):
     assert mark.exists()  # importing the module creates the file
 
 
-def test_a_users_reward_for_a_level_base_is_one_for_a_standing_robot(monkeypatch):
+def test_a_users_reward_for_a_level_base_is_one_for_a_standing_robot(monkeypatch, request):
     monkeypatch.setattr(registry, "TASKS", dict(registry.TASKS))
+    request.addfinalizer(lambda: sys.modules.pop("level_jump"))
     registry.load_task_module(str(ROOT / "tests/helpers/level_jump.py"))
     task = registry.make_task("level-jump")
     env = Env(task, 4, randomize=False, noise=False, device="cpu")
