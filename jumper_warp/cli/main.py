@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from jumper_warp.cli.help import Short
 
 USAGE_ERROR = 2  # Exit code for input that cannot be used
+INCONSISTENT = 3  # Exit code of `jumper sysid` for a fit that is not consistent with the data
 INTERRUPTED = 130  # Exit code after Ctrl-C
 COMMANDS = {
     "train": "Train a policy: jumper train TASK.",
@@ -46,7 +47,9 @@ TASK_MODULE = "--task-module"
 TASK_MODULE_HELP = f"""\
 Every command takes {TASK_MODULE} FILE_OR_MODULE, any number of times: a
 FILE.py or an installed module that registers tasks of your own."""
-EXIT_CODES = "Exit codes: 0 done, 1 a fault in jumper, 2 invalid input, 130 after Ctrl-C."
+EXIT_CODES = (
+    "Exit codes: 0 done, 1 a fault in jumper, 2 invalid input, 3 an inconsistent fit (sysid), 130 after Ctrl-C."
+)
 
 
 class UsageError(InputError):

@@ -15,12 +15,28 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import warp as wp
 
-from jumper_warp.identification.least_squares import LeastSquares, NormalEquations, Point, Trial, replace_residuals
+from jumper_warp.identification.consistency import fit_tests
+from jumper_warp.identification.least_squares import (
+    LeastSquares,
+    NormalEquations,
+    Point,
+    Trial,
+    replace_residuals,
+    smaller_derivatives,
+)
 from jumper_warp.identification.motions import NoiseLevels, RecordedMotion
 from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement
 from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.residuals import Linearised, MotionResiduals, pieces_of
-from jumper_warp.identification.results import DescentStep, Effort, Identification, summarise
+from jumper_warp.identification.results import (
+    DescentStep,
+    Effort,
+    Identification,
+    Minimum,
+    excess_costs,
+    starts_agree,
+    summarise,
+)
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.progress import phase
@@ -35,10 +51,13 @@ CONVERGED = 0.5
 GOOD_STEP = 0.3  # Actual over predicted decrease of the cost above which a step is good enough to reuse the Jacobian
 HORIZONS = (0.4, 0.7, 1.0)
 """Fractions of a motion on the ground that are fitted in turn, as a paw's motion depends on all earlier contacts."""
-ATTEMPTS = 2  # largest number of passes over all motions
-STUCK = 20.0
-"""Predicted minus actual decrease of the last step, in mean squared residuals, above which contact kinks block it: the
-motions are then added one after another again, starting from the fitted parameters."""
+MAX_STARTS = 3  # largest number of starts; two suffice if they agree
+DISPLACEMENT = 0.1  # Standard deviation, in those of the priors, of the parameters of a start from an earlier minimum
+FRICTION = "paw_friction"
+"""Parameter that can be trapped: while a paw sticks, the motion does not depend on its friction. `Descent.refine`
+tries the values at `FRICTION_MOVES`, standard deviations of the prior from the minimum."""
+FRICTION_MOVES = np.array([-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0])
+MAX_ESCAPES = 4  # largest number of times that a start leaves a point where it stopped
 MAX_STEPS = 40  # largest number of Levenberg-Marquardt steps in a stage
 
 
@@ -75,8 +94,8 @@ def identify(
     stages = bool(pieces) + (num_free < len(whole)) + len(HORIZONS) * num_free + 1
     with phase("identifying parameters", stages) as advance:
         descent = Descent(replay, advance)
-        problem, point, normal = descend(descent, parameters, coarse, whole, pieces, prior_measurements)
-    return summarise(problem, point, normal, descent.steps, descent.effort)
+        problem, minima = descend(descent, parameters, coarse, whole, pieces, prior_measurements)
+    return summarise(problem, minima, descent.steps, descent.effort)
 
 
 def identify_by_evolution(
@@ -123,7 +142,7 @@ def identify_by_evolution(
             descent.steps.append(DescentStep(0, cost / problem.count, 0.0, effort.world_steps, effort.seconds))
             advance(effort.seconds - seconds)
     point = Point(np.clip(best, low, high), point.starts)
-    return summarise(problem, point, problem.normal(point), descent.steps, descent.effort)
+    return summarise(problem, [Minimum(point, problem.normal(point))], descent.steps, descent.effort)
 
 
 class Descent:
@@ -135,7 +154,6 @@ class Descent:
         replay: simulation whose physics steps are counted; advance: called after every stage.
         """
         self.replay, self.steps, self.stage, self.advance = replay, [], 0, advance
-        self.shortfall = 0.0  # Predicted minus actual decrease of the cost in the last step
         self._begin = (time.perf_counter(), time.process_time(), replay.world_steps)
 
     def effort(self) -> Effort:
@@ -159,11 +177,10 @@ class Descent:
         """
         new_jacobian, self.stage = decrease is not None, self.stage + 1
         for _ in range(MAX_STEPS):
-            least = max((decrease or 0.0) * normal.cost, CONVERGED * max(1.0, normal.data_cost / problem.count))
+            least = max((decrease or 0.0) * normal.cost, CONVERGED * problem.scale(normal))
             trial = problem.step(point, normal, geodesic=new_jacobian)
             self.record_step(problem, trial)
             gain, predicted = normal.cost - trial.cost, trial.predicted_decrease
-            self.shortfall = predicted - gain
             if gain < least and (new_jacobian or (decrease is not None and predicted < least)):
                 residuals = replace_residuals(normal.linearised, trial.residuals)
                 point, normal = trial.point, problem.assemble(trial.point, residuals)
@@ -174,6 +191,30 @@ class Descent:
         self.advance()
         return point, normal
 
+    def refine(self, problem: LeastSquares, point: Point, normal: NormalEquations, known: float = math.inf) -> Minimum:
+        """Minimise the last stage's problem, and leave points at which Levenberg-Marquardt stops above the minimum.
+
+        These are points where a paw sticks that slipped on the robot, or beside a jump of the residuals. normal: the
+        normal equations at the point. known: cost of a minimum that an earlier start found; the search ends there.
+        """
+        names = problem.parameters.names
+        for _ in range(MAX_ESCAPES):
+            point, normal = self.minimise(problem, point, normal)
+            least = CONVERGED * problem.scale(normal)
+            if abs(normal.cost - known) < least:
+                break
+            if FRICTION in names:
+                moved, cost = problem.scan(point, normal, names.index(FRICTION), FRICTION_MOVES)
+                if cost < normal.cost - least:
+                    point, normal = self.minimise(problem, moved, problem.normal(moved))
+            wide = problem.backward(point, [linear.residual for linear in normal.linearised], wide=True)
+            trial = problem.step(point, problem.assemble(point, wide), geodesic=False)
+            self.record_step(problem, trial)
+            if trial.cost > normal.cost - least:
+                break
+            point, normal = trial.point, problem.assemble(trial.point, replace_residuals(wide, trial.residuals))
+        return Minimum(point, normal)
+
 
 def descend(
     descent: Descent,
@@ -182,30 +223,44 @@ def descend(
     whole: Sequence[MotionResiduals],
     pieces: Sequence[MotionResiduals],
     prior_measurements: Sequence[PriorMeasurement],
-) -> tuple[LeastSquares, Point, NormalEquations]:
-    """Fit parameters and initial states to all motions by all stages of Levenberg-Marquardt.
+) -> tuple[LeastSquares, list[Minimum]]:
+    """Fit parameters and initial states to all motions by Levenberg-Marquardt from two or three starts.
 
-    Returned: the least-squares problem of all motions, its minimum, and the normal equations there. coarse, whole: all
-    motions, with the physics steps of the first stages and of the last stage. pieces: short pieces of the motions for a
-    first stage, empty to skip it. Raises InputError: the simulation diverges in a motion.
+    Returned: the least-squares problem of all motions and the minimum of each start, best first, with derivatives that
+    exclude jumps of the residuals. The first start begins
+    at the described robot, the others near the best minimum so far, with initial states as measured. They pass through
+    all stages if that minimum fails a test of the fit, and else through the last stage and a robust one before it.
+
+    coarse, whole: all motions, with the physics steps of the first stages and of the last stage. pieces: short pieces
+    of the motions for a first stage, empty to skip it. Raises InputError: the simulation diverges in a motion.
     """
     replay, z = descent.replay, np.zeros(len(parameters))
     if pieces:
         problem = LeastSquares(parameters, pieces, replay, prior_measurements, robust=True)
         begin = problem.nominal_point()
         z = descent.minimise(problem, begin, problem.normal(begin), PIECES_DECREASE)[0].z
-    minima = []
-    for _ in range(ATTEMPTS):
-        point, linearised = add_motions(descent, parameters, coarse, prior_measurements, z)
-        final = LeastSquares(parameters, whole, replay, prior_measurements)
+    final = LeastSquares(parameters, whole, replay, prior_measurements)
+    minima, rng = [], np.random.default_rng(0)
+    while len(minima) < 2 or (len(minima) < MAX_STARTS and not starts_agree(excess_costs(final, minima))):
+        staged = not minima or not all(test.passed for test in fit_tests(final, minima[0].normal))
+        if minima:
+            low, high = parameters.bounds()
+            z = np.clip(minima[0].point.z + DISPLACEMENT * rng.normal(size=len(z)), low, high)
+        if staged:
+            point, linearised = add_motions(descent, parameters, coarse, prior_measurements, z)
+        else:
+            problem = LeastSquares(parameters, coarse, replay, prior_measurements, robust=True)
+            point = Point(z, problem.nominal_point().starts)
+            point, normal = descent.minimise(problem, point, problem.normal(point), STAGE_DECREASE)
+            linearised = normal.linearised
         if whole is not coarse:
             linearised = replace_residuals(linearised, final.residuals(point))
-        point, normal = descent.minimise(final, point, final.assemble(point, linearised))
-        minima.append((final, point, normal))
-        if descent.shortfall < STUCK * max(1.0, normal.data_cost / final.count):
-            break
-        z = point.z
-    return min(minima, key=lambda minimum: minimum[2].cost)
+        known = minima[0].normal.cost if minima else math.inf
+        minima.append(descent.refine(final, point, final.assemble(point, linearised), known))
+        minima.sort(key=lambda minimum: minimum.normal.cost)
+    point, normal = minima[0]
+    backward = final.backward(point, [linear.residual for linear in normal.linearised])
+    return final, [Minimum(point, final.assemble(point, smaller_derivatives(normal.linearised, backward))), *minima[1:]]
 
 
 def add_motions(

@@ -23,6 +23,8 @@ CHANGE = 0.01
 """Step of a finite difference, in the unknown's posterior standard deviations if all others were known: small against
 the accuracy, large against the kinks of friction and contact."""
 LARGEST_CHANGE = 0.01  # largest step of a finite difference, in standard deviations of the prior
+WIDE, WIDEST_CHANGE = 100.0, 0.1
+"""[1] Steps of wide differences over those of `normal`, and the largest one in standard deviations of the prior."""
 
 
 @dataclass
@@ -110,6 +112,18 @@ def replace_residuals(linearised: Sequence[Linearised], residuals: Sequence[np.n
     return [Linearised(residual, old.jacobian) for residual, old in zip(residuals, linearised, strict=True)]
 
 
+def smaller_derivatives(one: Sequence[Linearised], other: Sequence[Linearised]) -> list[Linearised]:
+    """Return linearised motions with the smaller of two estimates of each derivative, and the residuals of `one`.
+
+    A jump of a residual beside the point enlarges only one of the forward and the backward difference.
+    """
+    pairs = zip(one, other, strict=True)
+    return [
+        Linearised(a.residual, np.where(np.abs(b.jacobian) < np.abs(a.jacobian), b.jacobian, a.jacobian))
+        for a, b in pairs
+    ]
+
+
 class LeastSquares:
     """Least-squares problem of motions, prior measurements and parameters with priors, evaluated in parallel worlds."""
 
@@ -129,6 +143,10 @@ class LeastSquares:
         self._low, self._high = parameters.bounds()
         self._change = [np.full(len(parameters) + motion.start_size, DIFFERENCE) for motion in motions]
 
+    def scale(self, normal: NormalEquations) -> float:
+        """Return the mean squared residual, at least 1: the change of the cost by one standard deviation."""
+        return max(1.0, normal.data_cost / self.count)
+
     def nominal_point(self) -> Point:
         """Return the point where all unknowns have the mean of their prior."""
         return Point(np.zeros(len(self.parameters)), [np.zeros(motion.start_size) for motion in self.motions])
@@ -147,6 +165,18 @@ class LeastSquares:
                 raise InputError(f"motion {name}: the simulation diverges; check targets, units, signs and base")
             linearised.append(linear)
         return self.assemble(point, linearised)
+
+    def backward(self, point: Point, residuals: Sequence[np.ndarray], wide: bool = False) -> list[Linearised]:
+        """Linearise all motions at a point, with residuals (m,) by motion there, by backward differences.
+
+        Their steps are those of `normal`, or, if `wide`, `WIDE` times as large: such differences average jumps of the
+        residuals, which occur where a paw strikes in another physics step.
+        """
+        linearised = []
+        for motion, start, change, residual in zip(self.motions, point.starts, self._change, residuals, strict=True):
+            step = np.minimum(WIDE * change, WIDEST_CHANGE) if wide else change
+            linearised.append(Linearised(residual, motion.linearise(self.replay, point.z, start, -step).jacobian))
+        return linearised
 
     def assemble(self, point: Point, linearised: Sequence[Linearised]) -> NormalEquations:
         """Assemble the normal equations at a point from residuals and Jacobians of all motions there, `linearised`.
@@ -179,6 +209,22 @@ class LeastSquares:
             normal.cost += residual**2
         normal.cost += normal.data_cost
         return normal
+
+    def scan(self, point: Point, normal: NormalEquations, index: int, moves: np.ndarray) -> tuple[Point, float]:
+        """Return the point of least cost when one parameter moves and all other unknowns follow to first order.
+
+        With its cost. index: of the parameter; moves: changes of its z, (K,).
+        """
+        covariance = np.linalg.inv(normal.information() + np.eye(len(point.z)))
+        along = covariance[:, index] / covariance[index, index]
+        z = np.clip(point.z + moves[:, None] * along, self._low, self._high)
+        starts = [
+            start - np.linalg.solve(matrix, cross.T @ (z - point.z).T).T
+            for start, matrix, cross in zip(point.starts, normal.start_matrices, normal.cross_matrices, strict=True)
+        ]
+        costs = self.costs(z, starts)
+        best = int(np.argmin(costs))
+        return Point(z[best], [start[best] for start in starts]), float(costs[best])
 
     def broyden_update(self, normal: NormalEquations, old: Point, trial: Trial) -> NormalEquations:
         """Return the normal equations after a step, with Jacobians updated by Broyden's formula.
