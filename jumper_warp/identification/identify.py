@@ -52,7 +52,7 @@ GOOD_STEP = 0.3  # Actual over predicted decrease of the cost above which a step
 HORIZONS = (0.4, 0.7, 1.0)
 """Fractions of a motion on the ground that are fitted in turn, as a paw's motion depends on all earlier contacts."""
 MAX_STARTS = 3  # largest number of starts; two suffice if they agree
-DISPLACEMENT = 0.1  # Standard deviation, in those of the priors, of the parameters of a start from an earlier minimum
+DISPLACEMENT = 0.03  # Standard deviation, in those of the priors, of the parameters of a start from an earlier minimum
 FRICTION = "paw_friction"
 """Parameter that can be trapped: while a paw sticks, the motion does not depend on its friction. `Descent.refine`
 tries the values at `FRICTION_MOVES`, standard deviations of the prior from the minimum."""
