@@ -3,7 +3,8 @@
 Unknowns are the parameters and the initial state of each motion. Residuals are divided by the noise; priors and prior
 measurements count like measurements. The sum of squares is minimised by Levenberg-Marquardt over parallel worlds, in
 stages: motions are first cut into short pieces, each with its own initial state, whose residuals are nearly linear in
-the parameters; then whole motions are fitted.
+the parameters; then whole motions are fitted. The cost has local minima, as contacts begin, slip and end: the minimum
+is confirmed by a second start, and the residuals are tested (`consistency`).
 """
 
 from __future__ import annotations
@@ -51,8 +52,10 @@ CONVERGED = 0.5
 GOOD_STEP = 0.3  # Actual over predicted decrease of the cost above which a step is good enough to reuse the Jacobian
 HORIZONS = (0.4, 0.7, 1.0)
 """Fractions of a motion on the ground that are fitted in turn, as a paw's motion depends on all earlier contacts."""
-MAX_STARTS = 3  # largest number of starts; two suffice if they agree
-DISPLACEMENT = 0.03  # Standard deviation, in those of the priors, of the parameters of a start from an earlier minimum
+MAX_STARTS = 4  # largest number of starts; two suffice if they agree, and three if the best fails a test of the fit
+DISPLACEMENT, LARGEST_DISPLACEMENT = 3.0, 0.1
+"""Standard deviation of the displacement of a start from an earlier minimum, in standard deviations of the estimate.
+Largest displacement of a parameter, in standard deviations of its prior."""
 FRICTION = "paw_friction"
 """Parameter that can be trapped: while a paw sticks, the motion does not depend on its friction. `Descent.refine`
 tries the values at `FRICTION_MOVES`, standard deviations of the prior from the minimum."""
@@ -224,7 +227,7 @@ def descend(
     pieces: Sequence[MotionResiduals],
     prior_measurements: Sequence[PriorMeasurement],
 ) -> tuple[LeastSquares, list[Minimum]]:
-    """Fit parameters and initial states to all motions by Levenberg-Marquardt from two or three starts.
+    """Fit parameters and initial states to all motions by Levenberg-Marquardt from two to four starts.
 
     Returned: the least-squares problem of all motions and the minimum of each start, best first, with derivatives that
     exclude jumps of the residuals. The first start begins
@@ -241,12 +244,14 @@ def descend(
         z = descent.minimise(problem, begin, problem.normal(begin), PIECES_DECREASE)[0].z
     final = LeastSquares(parameters, whole, replay, prior_measurements)
     minima, rng = [], np.random.default_rng(0)
-    while len(minima) < 2 or (len(minima) < MAX_STARTS and not starts_agree(excess_costs(final, minima))):
-        staged = not minima or not all(test.passed for test in fit_tests(final, minima[0].normal))
+    while not starts_agree(excess_costs(final, minima)):
+        fits = bool(minima) and all(test.passed for test in fit_tests(final, minima[0].normal))
+        if len(minima) == (MAX_STARTS if fits else MAX_STARTS - 1):
+            break
         if minima:
-            low, high = parameters.bounds()
-            z = np.clip(minima[0].point.z + DISPLACEMENT * rng.normal(size=len(z)), low, high)
-        if staged:
+            z = minima[0].point.z + displacement(minima[0].normal, rng)
+            z = np.clip(z, *parameters.bounds())
+        if not fits:
             point, linearised = add_motions(descent, parameters, coarse, prior_measurements, z)
         else:
             problem = LeastSquares(parameters, coarse, replay, prior_measurements, robust=True)
@@ -261,6 +266,13 @@ def descend(
     point, normal = minima[0]
     backward = final.backward(point, [linear.residual for linear in normal.linearised])
     return final, [Minimum(point, final.assemble(point, smaller_derivatives(normal.linearised, backward))), *minima[1:]]
+
+
+def displacement(normal: NormalEquations, rng: np.random.Generator) -> np.ndarray:
+    """Sample a displacement (P,) of a start from a minimum with the normal equations `normal`."""
+    covariance = np.linalg.inv(normal.information() + np.eye(len(normal.gradient)))
+    move = DISPLACEMENT * rng.multivariate_normal(np.zeros(len(covariance)), covariance, method="cholesky")
+    return np.clip(move, -LARGEST_DISPLACEMENT, LARGEST_DISPLACEMENT)
 
 
 def add_motions(

@@ -74,8 +74,8 @@ class Start:
 
 def excess_costs(problem: LeastSquares, minima: Sequence[Minimum]) -> np.ndarray:
     """Return the costs of minima (K,) above that of the first, the best, over its χ² if that is above 1."""
-    best = minima[0].normal
-    return np.array([minimum.normal.cost - best.cost for minimum in minima]) / problem.scale(best)
+    costs = np.array([minimum.normal.cost for minimum in minima])
+    return (costs - costs[0]) / problem.scale(minima[0].normal) if minima else costs
 
 
 def starts_agree(excess: Sequence[float] | np.ndarray) -> bool:
