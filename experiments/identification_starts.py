@@ -8,7 +8,8 @@ is identified. A fit is good if at most 20 % of its identified parameters are ou
 more than 5 standard deviations.
 
 `evaluation.jsonl` in the folder has one line for each fit. A later run with the same `--out` computes only the missing
-ones. `--shard 1/3` computes every third one; append the lines of all shards to one file, and run without `--shard`.
+ones. `--shard 1/3` computes every third one, in a folder of its own; a run without `--shard` in a folder with the
+lines of all shards computes the metrics.
 """
 
 from __future__ import annotations
@@ -25,6 +26,7 @@ from typing import Any
 import numpy as np
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import write_atomically
 from jumper_warp.utils.output import output_dir
 from jumper_warp.utils.progress import phase
 from support.far_robots import Stream, identify_far_robot
@@ -92,6 +94,7 @@ def main(args: Args) -> dict[str, Any]:
     folder = output_dir("identification_starts", args.out)
     path = folder / f"{args.stream}.jsonl"
     fits = saved_fits(path)
+    write_atomically(path, "".join(json.dumps(fit) + "\n" for fit in fits.values()).encode())
     shard, shards = map(int, args.shard.split("/"))
     every = [(robot, noise) for robot in range(args.num_robots) for noise in range(args.num_noises)]
     missing = [key for key in every[shard - 1 :: shards] if key not in fits]

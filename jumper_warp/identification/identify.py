@@ -17,14 +17,7 @@ import numpy as np
 import warp as wp
 
 from jumper_warp.identification.consistency import fit_tests
-from jumper_warp.identification.least_squares import (
-    LeastSquares,
-    NormalEquations,
-    Point,
-    Trial,
-    replace_residuals,
-    smaller_derivatives,
-)
+from jumper_warp.identification.least_squares import LeastSquares, NormalEquations, Point, Trial, replace_residuals
 from jumper_warp.identification.motions import NoiseLevels, RecordedMotion
 from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement
 from jumper_warp.identification.replay import MotionReplay
@@ -52,7 +45,7 @@ CONVERGED = 0.5
 GOOD_STEP = 0.3  # Actual over predicted decrease of the cost above which a step is good enough to reuse the Jacobian
 HORIZONS = (0.4, 0.7, 1.0)
 """Fractions of a motion on the ground that are fitted in turn, as a paw's motion depends on all earlier contacts."""
-MAX_STARTS = 4  # largest number of starts; two suffice if they agree, and three if the best fails a test of the fit
+MAX_STARTS = 4  # largest number of starts; there are only two if these agree or the best fails a test of the fit
 DISPLACEMENT, LARGEST_DISPLACEMENT = 3.0, 0.1
 """Standard deviation of the displacement of a start from an earlier minimum, in standard deviations of the estimate.
 Largest displacement of a parameter, in standard deviations of its prior."""
@@ -60,7 +53,6 @@ FRICTION = "paw_friction"
 """Parameter that can be trapped: while a paw sticks, the motion does not depend on its friction. `Descent.refine`
 tries the values at `FRICTION_MOVES`, standard deviations of the prior from the minimum."""
 FRICTION_MOVES = np.array([-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0])
-MAX_ESCAPES = 4  # largest number of times that a start leaves a point where it stopped
 MAX_STEPS = 40  # largest number of Levenberg-Marquardt steps in a stage
 
 
@@ -194,28 +186,17 @@ class Descent:
         self.advance()
         return point, normal
 
-    def refine(self, problem: LeastSquares, point: Point, normal: NormalEquations, known: float = math.inf) -> Minimum:
-        """Minimise the last stage's problem, and leave points at which Levenberg-Marquardt stops above the minimum.
+    def refine(self, problem: LeastSquares, point: Point, normal: NormalEquations) -> Minimum:
+        """Minimise the last stage's problem, also from other values of the paws' friction if one lowers the cost.
 
-        These are points where a paw sticks that slipped on the robot, or beside a jump of the residuals. normal: the
-        normal equations at the point. known: cost of a minimum that an earlier start found; the search ends there.
+        normal: the normal equations at the point.
         """
+        point, normal = self.minimise(problem, point, normal)
         names = problem.parameters.names
-        for _ in range(MAX_ESCAPES):
-            point, normal = self.minimise(problem, point, normal)
-            least = CONVERGED * problem.scale(normal)
-            if abs(normal.cost - known) < least:
-                break
-            if FRICTION in names:
-                moved, cost = problem.scan(point, normal, names.index(FRICTION), FRICTION_MOVES)
-                if cost < normal.cost - least:
-                    point, normal = self.minimise(problem, moved, problem.normal(moved))
-            wide = problem.backward(point, [linear.residual for linear in normal.linearised], wide=True)
-            trial = problem.step(point, problem.assemble(point, wide), geodesic=False)
-            self.record_step(problem, trial)
-            if trial.cost > normal.cost - least:
-                break
-            point, normal = trial.point, problem.assemble(trial.point, replace_residuals(wide, trial.residuals))
+        if FRICTION in names:
+            moved, cost = problem.scan(point, normal, names.index(FRICTION), FRICTION_MOVES)
+            if cost < normal.cost - CONVERGED * problem.scale(normal):
+                point, normal = self.minimise(problem, moved, problem.normal(moved))
         return Minimum(point, normal)
 
 
@@ -229,10 +210,9 @@ def descend(
 ) -> tuple[LeastSquares, list[Minimum]]:
     """Fit parameters and initial states to all motions by Levenberg-Marquardt from two to four starts.
 
-    Returned: the least-squares problem of all motions and the minimum of each start, best first, with derivatives that
-    exclude jumps of the residuals. The first start begins
-    at the described robot, the others near the best minimum so far, with initial states as measured. They pass through
-    all stages if that minimum fails a test of the fit, and else through the last stage and a robust one before it.
+    Returned: the least-squares problem of all motions and the minimum of each start, best first. Derivatives of the
+    best exclude jumps of the residuals. The first start begins at the described robot, the others near the best minimum
+    so far. All add the motions one after another, so that they leave a minimum that only one motion has.
 
     coarse, whole: all motions, with the physics steps of the first stages and of the last stage. pieces: short pieces
     of the motions for a first stage, empty to skip it. Raises InputError: the simulation diverges in a motion.
@@ -244,34 +224,25 @@ def descend(
         z = descent.minimise(problem, begin, problem.normal(begin), PIECES_DECREASE)[0].z
     final = LeastSquares(parameters, whole, replay, prior_measurements)
     minima, rng = [], np.random.default_rng(0)
-    while not starts_agree(excess_costs(final, minima)):
-        fits = bool(minima) and all(test.passed for test in fit_tests(final, minima[0].normal))
-        if len(minima) == (MAX_STARTS if fits else MAX_STARTS - 1):
+    while len(minima) < MAX_STARTS and not starts_agree(excess_costs(final, minima)):
+        if len(minima) > 1 and not all(test.passed for test in fit_tests(final, minima[0].normal)):
             break
         if minima:
             z = minima[0].point.z + displacement(minima[0].normal, rng)
             z = np.clip(z, *parameters.bounds())
-        if not fits:
-            point, linearised = add_motions(descent, parameters, coarse, prior_measurements, z)
-        else:
-            problem = LeastSquares(parameters, coarse, replay, prior_measurements, robust=True)
-            point = Point(z, problem.nominal_point().starts)
-            point, normal = descent.minimise(problem, point, problem.normal(point), STAGE_DECREASE)
-            linearised = normal.linearised
+        point, linearised = add_motions(descent, parameters, coarse, prior_measurements, z)
         if whole is not coarse:
             linearised = replace_residuals(linearised, final.residuals(point))
-        known = minima[0].normal.cost if minima else math.inf
-        minima.append(descent.refine(final, point, final.assemble(point, linearised), known))
+        minima.append(descent.refine(final, point, final.assemble(point, linearised)))
         minima.sort(key=lambda minimum: minimum.normal.cost)
     point, normal = minima[0]
-    backward = final.backward(point, [linear.residual for linear in normal.linearised])
-    return final, [Minimum(point, final.assemble(point, smaller_derivatives(normal.linearised, backward))), *minima[1:]]
+    return final, [Minimum(point, final.without_jumps(point, normal)), *minima[1:]]
 
 
 def displacement(normal: NormalEquations, rng: np.random.Generator) -> np.ndarray:
     """Sample a displacement (P,) of a start from a minimum with the normal equations `normal`."""
     covariance = np.linalg.inv(normal.information() + np.eye(len(normal.gradient)))
-    move = DISPLACEMENT * rng.multivariate_normal(np.zeros(len(covariance)), covariance, method="cholesky")
+    move = DISPLACEMENT * np.linalg.cholesky(covariance) @ rng.normal(size=len(covariance))
     return np.clip(move, -LARGEST_DISPLACEMENT, LARGEST_DISPLACEMENT)
 
 

@@ -23,8 +23,6 @@ CHANGE = 0.01
 """Step of a finite difference, in the unknown's posterior standard deviations if all others were known: small against
 the accuracy, large against the kinks of friction and contact."""
 LARGEST_CHANGE = 0.01  # largest step of a finite difference, in standard deviations of the prior
-WIDE, WIDEST_CHANGE = 100.0, 0.1
-"""[1] Steps of wide differences over those of `normal`, and the largest one in standard deviations of the prior."""
 
 
 @dataclass
@@ -112,18 +110,6 @@ def replace_residuals(linearised: Sequence[Linearised], residuals: Sequence[np.n
     return [Linearised(residual, old.jacobian) for residual, old in zip(residuals, linearised, strict=True)]
 
 
-def smaller_derivatives(one: Sequence[Linearised], other: Sequence[Linearised]) -> list[Linearised]:
-    """Return linearised motions with the smaller of two estimates of each derivative, and the residuals of `one`.
-
-    A jump of a residual beside the point enlarges only one of the forward and the backward difference.
-    """
-    pairs = zip(one, other, strict=True)
-    return [
-        Linearised(a.residual, np.where(np.abs(b.jacobian) < np.abs(a.jacobian), b.jacobian, a.jacobian))
-        for a, b in pairs
-    ]
-
-
 class LeastSquares:
     """Least-squares problem of motions, prior measurements and parameters with priors, evaluated in parallel worlds."""
 
@@ -166,17 +152,20 @@ class LeastSquares:
             linearised.append(linear)
         return self.assemble(point, linearised)
 
-    def backward(self, point: Point, residuals: Sequence[np.ndarray], wide: bool = False) -> list[Linearised]:
-        """Linearise all motions at a point, with residuals (m,) by motion there, by backward differences.
+    def without_jumps(self, point: Point, normal: NormalEquations) -> NormalEquations:
+        """Return the normal equations at a point with derivatives that exclude jumps of the residuals.
 
-        Their steps are those of `normal`, or, if `wide`, `WIDE` times as large: such differences average jumps of the
-        residuals, which occur where a paw strikes in another physics step.
+        Residuals jump where a paw strikes in another physics step. A jump beside the point enlarges only one of the
+        forward and the backward difference, so the smaller one is taken. normal: from forward differences.
         """
         linearised = []
-        for motion, start, change, residual in zip(self.motions, point.starts, self._change, residuals, strict=True):
-            step = np.minimum(WIDE * change, WIDEST_CHANGE) if wide else change
-            linearised.append(Linearised(residual, motion.linearise(self.replay, point.z, start, -step).jacobian))
-        return linearised
+        for motion, start, change, ahead in zip(
+            self.motions, point.starts, self._change, normal.linearised, strict=True
+        ):
+            behind = motion.linearise(self.replay, point.z, start, -change).jacobian
+            smaller = np.abs(behind) < np.abs(ahead.jacobian)  # False where a world diverges
+            linearised.append(Linearised(ahead.residual, np.where(smaller, behind, ahead.jacobian)))
+        return self.assemble(point, linearised)
 
     def assemble(self, point: Point, linearised: Sequence[Linearised]) -> NormalEquations:
         """Assemble the normal equations at a point from residuals and Jacobians of all motions there, `linearised`.
