@@ -1,4 +1,4 @@
-"""Measure how reliably `jumper sysid` tells good fits from local minima, on robots far from their description.
+"""Measure how reliably `jumper sysid` separates good fits from local minima, on robots far from their description.
 
     python experiments/identification_starts.py --workers 16 --out outputs/identification_starts
 
