@@ -61,11 +61,11 @@ class TrainArgs:
     observed. With 1 the observation has a third of the size; the policy learns faster on few worlds, and 1 is enough
     without randomisation and noise."""
     robot: Path | None = None
-    """Robot overlay, a file that `jumper sysid` writes. Its randomisation ranges override the task's; flags override
-    both."""
+    """Robot overlay, a file that `jumper sysid` writes. Robots are sampled around its values. Its randomisation ranges
+    override the task's; flags override both."""
     preset: str | None = None
     """Named group of settings, which other flags override: `laptop` trains a nominal robot in minutes on two cores."""
-    robot_of_run: Annotated[Any, tyro.conf.Suppress] = None  # Robot overlay of the run that is resumed
+    overlay: Annotated[Any, tyro.conf.Suppress] = None  # Overlay of --robot or the resumed run, with flags' ranges
     checkpoint: Annotated[Any, tyro.conf.Suppress] = None  # Checkpoint that is resumed
 
 
@@ -94,12 +94,16 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
         if checkpoint := find_checkpoint(named):
             settings, task = settings_of_run(checkpoint, default.cfg)
             default = dataclasses.replace(default, **settings)
-    parsed, task = parse_settings(for_robot(task, overlay_in(args[1:])), default, args[1:])
+    parsed, flagged = parse_settings(task, default, args[1:])
     if parsed.cfg.task != name:
         raise UsageError(f"give the task once, got {name} and --task {parsed.cfg.task}")
     from jumper_warp.tasks.observations import with_history
+    from jumper_warp.tasks.overlay_ranges import with_flagged_ranges
 
-    return parsed, with_history(task, parsed.history)
+    overlay = overlay_in(args[1:]) or default.overlay
+    if overlay is not None:
+        flagged, overlay = with_flagged_ranges(task, flagged, overlay, flagged_ranges(args[1:]))
+    return dataclasses.replace(parsed, overlay=overlay), with_history(flagged, parsed.history)
 
 
 def with_preset(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
@@ -149,29 +153,27 @@ def overlay_in(args: Sequence[str]) -> RobotOverlay | None:
     return load_overlay(Path(path[0]))
 
 
-def for_robot(task: TaskCfg, overlay: RobotOverlay | None) -> TaskCfg:
-    """Return a copy of the task with an overlay's randomisation ranges. Raises InputError: a range is invalid."""
-    if overlay is None:
-        return task
-    return dataclasses.replace(task, randomization=dataclasses.replace(task.randomization, **overlay.randomization))
+def flagged_ranges(args: Sequence[str]) -> set[str]:
+    """Return the names of the ranges of `RandomizationCfg` that have a flag in unparsed arguments."""
+    from jumper_warp.robot.overlay import RANDOMIZED
+
+    options = {option_of(arg) for arg in args}
+    return {name for name in RANDOMIZED if f"--env.randomization.{name.replace('_', '-')}" in options}
 
 
 def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
     """Return the function that makes a training's environment from num_envs, seed and device.
 
-    Raises InputError or OSError: the overlay is invalid; the function raises InputError: memory is too small.
+    It raises InputError: memory is too small.
     """
     from jumper_warp.cli.training_memory import check_memory
     from jumper_warp.envs.env import Env
-    from jumper_warp.robot.overlay import load_overlay
-
-    overlay = args.robot_of_run if args.robot is None else load_overlay(args.robot)
 
     def make_env(num_envs: int, seed: int, device: torch.device) -> VecEnv:
         """Return the environment, differentiable for trainer shac."""
         check_memory(task, args.cfg.ppo, args.solver, num_envs, device)
         settings: dict[str, Any] = {name: getattr(args, name) for name in ("solver", "randomize", "noise")}
-        env = Env(task, num_envs, seed=seed, device=str(device), robot=overlay, **settings)
+        env = Env(task, num_envs, seed=seed, device=str(device), robot=args.overlay, **settings)
         if args.cfg.trainer != "shac":
             return env
         from jumper_warp.diff.differentiable_env import DifferentiableEnv
@@ -233,6 +235,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     parsed, task = parse_train(args)
     from jumper_warp.rl.runner import train
     from jumper_warp.tasks.mirror import mirror_of
+    from jumper_warp.tasks.overlay_ranges import range_words
     from jumper_warp.utils.runtime import configure_device
 
     check_saving(task)
@@ -246,6 +249,8 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     is_rank_0 = os.environ.get("RANK", "0") == "0"
     if is_rank_0 and configure_device(parsed.cfg.device, parsed.cfg.threads).driver is None:
         report_cpu_time(parsed, () if parsed.preset else find_task(task.name)[1].presets)
+    if is_rank_0 and parsed.randomize and (words := range_words(task, parsed.overlay, changed=True)):
+        print(f"ranges of this robot: {', '.join(words)}", file=sys.stderr)
     as_rsl_rl = None
     if parsed.cfg.trainer == "rsl-rl":
         from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl

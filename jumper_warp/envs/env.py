@@ -32,6 +32,7 @@ from jumper_warp.sim.slices import SlicedGraph
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import Mirror, mirror_of, mirror_of_action
+from jumper_warp.tasks.overlay_ranges import moves_of, ranges_of
 from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.checks import check_count, check_seed
 from jumper_warp.utils.errors import InputError
@@ -92,7 +93,8 @@ class Env(Stages):
         randomize, noise: enable domain randomisation, observation noise. auto_reset: reset ended episodes in `step`.
         ground, block: as in `Simulation`; by default the terrain of the first task that has one, else the tasks'
         sampled ground (SolverJumper with randomize), else a plane. skill: index of each world's first task, (num_envs,)
-        or one for all. robot: differences from the robot description. threads: CPU threads, as in `Simulation`.
+        or one for all. robot: differences from the robot description, around which robots are randomised
+        (`jumper_warp.tasks.overlay_ranges`). threads: CPU threads, as in `Simulation`.
         refine: factor by which the physics step is shorter than in training.
         Raises InputError (a ValueError): see `checked_tasks` and `Simulation`, num_envs or refine no whole number of at
         least 1, a seed not in 0 to 2^31 - 1, or no such stream.
@@ -105,9 +107,11 @@ class Env(Stages):
         self.stream: Purpose = stream
         tasks = checked_tasks(task, handovers)
         self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
-        self.handovers, self._overlay, self._conditions = tuple(handovers), robot, (randomize, noise)
+        self.handovers, self.overlay, self._conditions = tuple(handovers), robot, (randomize, noise)
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
-        run, self._draws_ground = prepared_tasks(tasks, randomize, noise, may_vary)
+        if robot is not None and not isinstance(robot, RobotOverlay):
+            raise InputError(f"robot must be a RobotOverlay (see load_overlay), got {robot!r:.60}")
+        run, self._draws_ground = prepared_tasks(tasks, randomize, noise, may_vary, robot)
         terrains = [terrain for each in run if (terrain := each.terrain) is not None]
         ground = terrains[0] if terrains else ground
         self.sim = Simulation(
@@ -124,7 +128,7 @@ class Env(Stages):
             self.sim.physics.dynamics.robot.ground.blocks.zero_()  # until `reset` samples them
         self.physics_dt, self.step_dt = self.sim.dt, self.sim.dt * self.sim.substeps
         self._ends_episodes, self._started, self._compiled, self._graphs = True, False, False, {}
-        self._allocate(run, skill, handovers)
+        self._allocate(run, skill, handovers, moves_of(robot))
         self._show()
 
     def _show(self) -> None:
@@ -351,7 +355,7 @@ class Env(Stages):
         """Return all settings that define the environment as JSON data.
 
         `task` and `interface` are those of the first task; with several tasks, `tasks`, `first_skill` and `handovers`
-        (names of functions) are added, with a robot overlay, `robot`.
+        (names of functions) are added; with a robot overlay, `robot`, and `ranges` of the first task if randomised.
         """
         config = {
             "task": task_to_json(self.task),
@@ -366,8 +370,9 @@ class Env(Stages):
             "noise": self._conditions[1],
             "quaternion_order": "xyzw",
         }
-        if self._overlay is not None:
-            config = {"robot": self._overlay.to_json(), **config}
+        if self.overlay is not None:
+            config = {"robot": self.overlay.to_json(), **config}
+            config |= {"ranges": ranges_of(self.task, self.overlay)} if self._conditions[0] else {}
         if len(self.tasks) == 1:
             return config
         return {

@@ -30,6 +30,7 @@ from jumper_warp.kernels.mdp.track import track_kernel
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.slices import WorldRange
 from jumper_warp.tasks.cfg import Handover, TaskCfg
+from jumper_warp.tasks.overlay_ranges import RangeMoves
 from jumper_warp.utils.kernels import Kernel
 from jumper_warp.utils.streams import Purpose
 
@@ -62,13 +63,18 @@ class Stages:
     _started: bool  # Whether `reset` or `evaluation_reset` has begun the first episodes
     _ends_episodes: bool  # Whether ended episodes are reset; false after `evaluation_reset`
 
-    def _allocate(self, tasks: Sequence[TaskCfg], skill: np.ndarray | int, handovers: Sequence[Handover]) -> None:
-        """Allocate all arrays and build all kernels; skill: index of each world's first task, (num_envs,) or one."""
+    def _allocate(
+        self, tasks: Sequence[TaskCfg], skill: np.ndarray | int, handovers: Sequence[Handover], moves: RangeMoves
+    ) -> None:
+        """Allocate all arrays and build all kernels; skill: index of each world's first task, (num_envs,) or one.
+
+        moves: differences of the robot from the described one.
+        """
         n, device, sim = self.num_envs, self.wp_device, self.sim
         self._first_skill = checked_skill(skill, n, len(tasks))
         active, self._home = (wp.array(self._first_skill, dtype=int, device=device) for _ in range(2))
         self.skills = [TaskRuntime(task, i, n, self.step_dt, sim.substeps, device) for i, task in enumerate(tasks)]
-        self.parameters = robot_parameters(sim, tuple(tasks), active)
+        self.parameters = robot_parameters(sim, tuple(tasks), active, moves)
         self.robot, self._scene = robot_arrays(sim, self.step_dt), scene_of(sim)
         self.episodes = episode_arrays(n, self.seed, self.stream, active, device)
         self.delays = delay_arrays(n, self.parameters.latency, sim.substeps, device)

@@ -25,6 +25,7 @@ from jumper_warp.policies.skills import SkillNames, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.overlay_ranges import range_words
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import AnyMetrics, Metrics, MetricValue
 from jumper_warp.utils.output import output_dir, read_values, write_metrics
@@ -89,6 +90,7 @@ class Run(ABC):
         self.save_trials = False  # Whether `run_episodes` writes trials.npz
         self.name, self.print_flags = "", PrintFlags()  # Name of the evaluation; what `report` prints
         self.settings: dict[str, Any] = {}  # Settings of task, robot and test, reported with the conditions
+        self._ranges: list[str] = []  # Ranges of randomisation that the robot overlay changes, as text
         self._latency: list[np.ndarray] = []  # [physics steps] (num_envs,) per `run_episodes`
         self._physics_dt = PHYSICS_DT
 
@@ -121,6 +123,7 @@ class Run(ABC):
         words += [] if conditions.sensor_offset is None else [f"sensors ± {conditions.sensor_offset:g}°"]
         words += [] if conditions.gravity is None else [f"gravity {conditions.gravity:g} m/s²"]
         words += [] if conditions.robot is None else [f"robot of {conditions.robot.name}"]
+        words += [f"robot {self.settings['robot']}"] if "robot" in self.settings else []
         return ", ".join(words + (["pushed in flight too"] if conditions.push_in_flight else []))
 
     @property
@@ -137,6 +140,16 @@ class Run(ABC):
         if self._latency:
             values |= latency_values(np.concatenate(self._latency), self._physics_dt, conditions.latency)
         return values
+
+    def note_robot(self, env: Env) -> None:
+        """Keep the robot overlay of an environment, and the ranges of randomisation around it, for the report."""
+        if env.overlay is None:
+            return
+        if self.conditions.robot is None:
+            self.settings["robot"] = f"of the training{env.overlay.source and f' ({env.overlay.source:.60})'}"
+        if self.conditions.randomize:
+            self._ranges = range_words(env.task, env.overlay, changed=True)
+            self.settings["ranges"] = range_words(env.task, env.overlay)
 
     def run_episodes(
         self, env: Env, log: Log, *, film: str = "", film_scene: Mapping[str, Any] | None = None,
@@ -179,6 +192,7 @@ class Run(ABC):
         name, count = self.name.replace("_", " "), f"{count}, " if count else ""
         seconds = time.perf_counter() - self.started
         what = f"{self.source}, {name}: {count}{self.title}"
+        what += f"; ranges of this robot: {', '.join(self._ranges)}" if self._ranges else ""
         print_summary(self.folder, what, keys, flags=self.print_flags, seconds=seconds, **settings)
 
     def report(
@@ -256,6 +270,7 @@ class EvaluationRun(Run):
         self.policy.to(env.device)
         self.settings["gravity_m_s2"] = env.task.gravity
         self.settings["torque_limit_nm"] = torque_limit(env)
+        self.note_robot(env)
         return env
 
 
@@ -287,7 +302,9 @@ class SkillRun(Run):
 
     def env(self, count: int, **scene: Any) -> Env:
         """Return an environment with all skills and `count` worlds; scene: further arguments of `Env`, e.g. `block`."""
-        return self.skills.env(count, self.conditions, **scene)
+        env = self.skills.env(count, self.conditions, **scene)
+        self.note_robot(env)
+        return env
 
 
 def trained_range(task: TaskCfg) -> dict[str, list[float]]:
@@ -296,7 +313,7 @@ def trained_range(task: TaskCfg) -> dict[str, list[float]]:
     `trained_range_m`: smallest and largest apex height or distance straight ahead; `trained_velocities`: largest
     velocities ahead, back, to either side [m/s] and about z [rad/s].
     """
-    levels: Any = task.levels
+    levels: Any = task.levels or (None,)
     if hasattr(levels[0], "goal_lower"):
         axis = 2 if levels[0].goal_upper[2] > 0.0 else 0
         lower, upper = ([getattr(level, name)[axis] for level in levels] for name in ("goal_lower", "goal_upper"))

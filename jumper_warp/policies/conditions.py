@@ -12,7 +12,8 @@ from jumper_warp.policies.restore import task_of_policy
 from jumper_warp.robot.gravity import check_gravity
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.randomization import RandomizationCfg
+from jumper_warp.tasks.overlay_ranges import with_fixed_ranges
+from jumper_warp.tasks.randomization import RandomizationCfg, fixed_ranges
 from jumper_warp.tasks.saving import OPTIONAL
 from jumper_warp.utils.checks import check_seed
 from jumper_warp.utils.errors import InputError
@@ -90,7 +91,9 @@ class Conditions:
     def env_settings(self, config: dict[str, Any]) -> dict[str, Any]:
         """Return keyword arguments of `Env` for these conditions. Argument and errors: see `overlay`."""
         same = {name: getattr(self, name) for name in ("seed", "stream", "device", "solver", "noise", "threads")}
-        return {**same, "randomize": self.sets_parameters, "auto_reset": False, "robot": self.overlay(config)}
+        fixed = fixed_ranges(**self.fixed_parameters)
+        robot = with_fixed_ranges(self.overlay(config), fixed, nominal=not self.randomize)
+        return {**same, "randomize": self.sets_parameters, "auto_reset": False, "robot": robot}
 
     @property
     def sets_parameters(self) -> bool:
@@ -135,4 +138,4 @@ def env_of_policy(
     task = task_of_policy(policy, modules, leave_out=leave_out)
     task = conditions.applied(task if change is None else change(task))
     with phase(f"building {num_envs} robots"):
-        return Env(task, num_envs, **conditions.env_settings(policy.config), **scene)
+        return Env(task, num_envs, **conditions.env_settings(policy.config) | scene)
