@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import sys
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
 from jumper_warp.policies.restore import task_of_policy
+from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.gravity import check_gravity
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.tasks.cfg import TaskCfg
@@ -119,6 +121,26 @@ class Conditions:
             return task
         nominal = RandomizationCfg.off().with_fixed(friction=trained.nominal_friction)
         return replace(task, randomization=self._with_fixed_parameters(nominal), events=()).on_level_ground()
+
+
+def shared_config(configs: Mapping[str, dict[str, Any]], conditions: Conditions) -> dict[str, Any]:
+    """Return the configuration, of several policies on one robot, that holds their robot overlay; {}: none does.
+
+    configs: `Policy.config` by name of the policy. One line on standard error names policies of the described robot
+    that get the overlay of another one. The overlay of `conditions` replaces all of these.
+    Raises PolicyError: policies were trained with different overlays.
+    """
+    saved = {name: overlay for name, config in configs.items() if (overlay := config.get("env", {}).get("robot"))}
+    if conditions.robot is not None or not saved:
+        return {}
+    first, *others = saved
+    for other in others:
+        if any(saved[other].get(key) != saved[first].get(key) for key in ("values", "randomization")):
+            raise PolicyError(f"{first} and {other} were trained with different robots: choose one with --robot FILE")
+    if without := [name for name in configs if name not in saved]:
+        described = f"{' and '.join(without)} {'were' if len(without) > 1 else 'was'} trained without"
+        print(f"jumper: the robot has the overlay of {first}; {described}", file=sys.stderr)
+    return configs[first]
 
 
 def env_of_policy(
