@@ -19,6 +19,7 @@ import tyro
 from jumper_warp.evaluation.evaluations import EvaluationFlags, evaluation_of
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
+from jumper_warp.evaluation.trained import trained_range
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.skills import SkillNames, SkillPolicies
@@ -202,7 +203,8 @@ class Run(ABC):
         values = self.write(metrics)
         printed = [metrics[key] for key in keys if key in metrics]
         most = max(printed, key=lambda metric: metric.trials or 0, default=MetricValue(None))
-        self.summarise(f"{most.trials:,} {most.over}" if most.trials else "", keys, paper=paper)
+        over = most.over.removesuffix("s") if most.over and most.trials == 1 else most.over
+        self.summarise(f"{most.trials:,} {over}" if most.trials else "", keys, paper=paper)
         return values
 
 
@@ -305,20 +307,6 @@ class SkillRun(Run):
         env = self.skills.env(count, self.conditions, **scene)
         self.note_robot(env)
         return env
-
-
-def trained_range(task: TaskCfg) -> dict[str, list[float]]:
-    """Return the range of commands that a task samples at any level, by name; empty unless it jumps or walks.
-
-    `trained_range_m`: smallest and largest apex height or distance straight ahead; `trained_velocities`: largest
-    velocities ahead, back, to either side [m/s] and about z [rad/s].
-    """
-    levels: Any = task.levels or (None,)
-    if hasattr(levels[0], "goal_lower"):
-        axis = 2 if levels[0].goal_upper[2] > 0.0 else 0
-        lower, upper = ([getattr(level, name)[axis] for level in levels] for name in ("goal_lower", "goal_upper"))
-        return {"trained_range_m": [max(min(lower), 0.0), max(upper)]}
-    return {"trained_velocities": list(levels[-1].last_range)} if hasattr(levels[0], "last_range") else {}
 
 
 def write_trials(folder: Path, log: EvaluationLog, number: int) -> None:

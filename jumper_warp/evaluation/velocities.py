@@ -190,6 +190,10 @@ class VelocityLog(EvaluationLog):
         """Return the commands of some robots and their times: keys `commands`, `times_s`."""
         return {"commands": self.commands[list(worlds)].tolist(), "times_s": self.times.tolist()}
 
+    def all_commands(self) -> np.ndarray:
+        """Return all commanded velocities, (robots, commands, 3)."""
+        return self.commands
+
     def velocity_commands(self, worlds: Sequence[int]) -> np.ndarray:
         """Return the current commands of some robots, (worlds, 3)."""
         return self.command_history()[-1][list(worlds)]
