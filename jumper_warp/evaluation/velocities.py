@@ -301,7 +301,7 @@ class VelocityPlayFlags:
     velocity: tyro.conf.UseAppendAction[tuple[Velocity, ...]] = ()
     """[m/s], [m/s], [rad/s] Velocity ahead, to the left, about z; repeat the flag per command (default: six)."""
     default_velocities: tyro.conf.Suppress[tuple[Velocity, ...]] = (
-        (0.8, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0), (0.6, 0.3, 0.6), (0.0, 0.0, 0.0),
+        (0.8, 0.0, 0.0), (0.0, 0.4, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0), (0.6, 0.3, 0.6), (0.0, 0.0, 0.0),
     )  # fmt: skip
     """Commands if `velocity` is not passed; a default of `velocity` itself would be kept when the flag is passed."""
     command_interval: float = 2.5  # [s] Time from one command to the next
