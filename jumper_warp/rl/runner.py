@@ -10,6 +10,7 @@ import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from datetime import datetime
 from pathlib import Path
 from types import FrameType
@@ -30,6 +31,7 @@ from jumper_warp.rl.shac import STATISTICS as SHAC_STATISTICS
 from jumper_warp.rl.shac import Shac
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.locks import write_lock
 from jumper_warp.utils.runtime import git_commit, versions
 from jumper_warp.utils.sources import source_checksums
 from jumper_warp.utils.threads import set_threads
@@ -85,32 +87,40 @@ def train(
     by trainer rsl-rl. actor_init: initialisation from cfg.init_policy, required with it. checkpoint: the loaded
     checkpoint of cfg.resume (default: loaded here).
     Raises InputError: a setting does not fit the environment or the machine. CheckpointError: no usable checkpoint to
-    resume from, or the last one could not be saved. SystemExit with code INTERRUPTED: stopped by Ctrl-C or SIGTERM,
-    after a checkpoint was saved.
+    resume from, or the last one could not be saved; InputError: another process is writing the run's folder.
+    SystemExit with code INTERRUPTED: stopped by Ctrl-C or SIGTERM, after a checkpoint was saved.
     """
     set_threads(cfg.threads)
     rank = distributed.init_distributed(cfg.device, cfg.threads)
-    run: TrainingRun | None = None
-    try:
+    with ExitStack() as cleanup:
+        cleanup.callback(_leave_process_group)
         _check_processes(cfg, rank)
+        checkpoint = checkpoint or resume.find_checkpoint(cfg)
         if checkpoint is None and bool(cfg.init_policy) != (actor_init is not None):
             raise InputError("init_policy and actor_init, which is made from it, must be passed together")
+        if checkpoint is not None and rank.index == 0:
+            cleanup.enter_context(write_lock(checkpoint.path.parent.parent))
+            resume.check_unchanged(checkpoint)
         env = make_env(cfg.num_envs // rank.size, (cfg.seed + 1000 * rank.index) % 2**31, rank.device)
         if cfg.trainer == "rsl-rl":
             return _train_rsl_rl(cfg, env, as_rsl_rl, rank)
         torch.manual_seed(cfg.seed)  # the same weights in all processes
         run = TrainingRun(cfg, env, rank, command, actor_init, checkpoint)
+        cleanup.callback(run.ppo.close)
+        if checkpoint is None and rank.index == 0:
+            cleanup.enter_context(write_lock(run.folder))
         with StopRequest() as stop:
             result = run.iterate(stop)
         distributed.wait_for_ranks()
         if stop.requested:
             raise SystemExit(INTERRUPTED)
         return result
-    finally:
-        if run is not None:
-            run.ppo.close()
-        if torch.distributed.is_initialized():
-            torch.distributed.destroy_process_group()
+
+
+def _leave_process_group() -> None:
+    """Leave torch's process group, if this process is in one."""
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
 
 
 def _check_processes(cfg: TrainCfg, rank: Rank) -> None:
@@ -180,7 +190,7 @@ class TrainingRun:
 
     def _resume(self, checkpoint: Checkpoint) -> Path:
         """Load a checkpoint, and return its run's folder. Raises CheckpointError: it does not fit the settings."""
-        path, state, skipped = checkpoint
+        path, state, skipped, _ = checkpoint
         changed = resume.changed_settings(state, self.config)
         self.notes += [*(f"skipped: {reason}" for reason in skipped), f"resumed {path}", *changed]
         self.notes += resume.changed_user_files(state, self.config)
@@ -355,5 +365,6 @@ def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl | None, rank: R
     torch.manual_seed(cfg.seed + rank.index)
     env.reset()
     adapter = as_rsl_rl(env, cfg.ppo.num_steps)
-    train_rsl_rl(adapter, cfg.ppo, cfg.max_iterations, cfg.save_interval, cfg.seed, folder)
+    with write_lock(folder):
+        train_rsl_rl(adapter, cfg.ppo, cfg.max_iterations, cfg.save_interval, cfg.seed, folder)
     return TrainResult(folder, cfg.max_iterations, time.perf_counter() - begin, {})
