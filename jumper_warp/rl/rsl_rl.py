@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -43,15 +44,33 @@ def rsl_rl_config(cfg: PpoCfg, save_interval: int, seed: int) -> dict[str, Any]:
     }
 
 
+class _EndOfTraining(Exception):
+    """Signal that leaves rsl-rl's training loop."""
+
+
 def train_rsl_rl(
-    env: RslRlEnv, cfg: PpoCfg, iterations: int, save_interval: int, seed: int, folder: Path | None = None
-) -> OnPolicyRunner:
+    env: RslRlEnv, cfg: PpoCfg, iterations: int, save_interval: int, seed: int, folder: Path | None = None,
+    is_over: Callable[[], bool] | None = None,
+) -> OnPolicyRunner:  # fmt: skip
     """Train with rsl-rl's PPO, and return its runner.
 
     env: environment in rsl-rl's interface, already reset. folder: for checkpoints and TensorBoard events (None: no
-    files).
+    files). is_over: called after every iteration; True ends the training, with a checkpoint.
     """
     config = rsl_rl_config(cfg, save_interval, seed)
     runner = OnPolicyRunner(env, config, log_dir=folder and str(folder), device=str(env.device))
-    runner.learn(iterations)
+    log = runner.logger.log
+
+    def log_and_check(**values: Any) -> None:
+        """Log an iteration; raise _EndOfTraining if the training is over."""
+        log(**values)
+        if is_over and is_over():
+            raise _EndOfTraining
+
+    runner.logger.log = log_and_check  # rsl-rl calls it once in each iteration, and has no other way to end early
+    try:
+        runner.learn(iterations)
+    except _EndOfTraining:
+        if folder:
+            runner.save(str(folder / f"model_{runner.current_learning_iteration}.pt"))
     return runner

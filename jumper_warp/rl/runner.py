@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import math
 import shlex
 import signal
 import sys
@@ -365,6 +366,14 @@ def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl | None, rank: R
     torch.manual_seed(cfg.seed + rank.index)
     env.reset()
     adapter = as_rsl_rl(env, cfg.ppo.num_steps)
+    clock_start = math.inf  # the end of the first iteration
+
+    def is_over() -> bool:
+        """Return whether the time limit has passed since the first iteration."""
+        nonlocal clock_start
+        clock_start = min(clock_start, now := time.perf_counter())
+        return 0.0 < cfg.max_seconds <= now - clock_start
+
     with write_lock(folder):
-        train_rsl_rl(adapter, cfg.ppo, cfg.max_iterations, cfg.save_interval, cfg.seed, folder)
-    return TrainResult(folder, cfg.max_iterations, time.perf_counter() - begin, {})
+        runner = train_rsl_rl(adapter, cfg.ppo, cfg.max_iterations, cfg.save_interval, cfg.seed, folder, is_over)
+    return TrainResult(folder, runner.current_learning_iteration + 1, time.perf_counter() - begin, {})
