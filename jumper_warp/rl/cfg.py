@@ -183,6 +183,9 @@ class TrainCfg:
     trainer: Literal["ppo", "shac", "rsl-rl"] = "ppo"
     """Training algorithm: PPO, SHAC or rsl-rl-lib's PPO. SHAC uses gradients through the physics; rsl-rl-lib is for
     comparison."""
+    stop_on_nan: bool = False
+    """Whether the training ends with exit status 1, after a checkpoint, when a term is not finite for the first time.
+    Without it the value counts as 0, one line names it, and the state of its world is saved."""
     tensorboard: bool = True
     """Whether to write TensorBoard events."""
     wandb: bool = False
