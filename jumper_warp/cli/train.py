@@ -15,12 +15,12 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import tyro
 
-from jumper_warp.cli.flags import option_of, values_of
+from jumper_warp.cli.flags import list_flags, option_of, values_of
 from jumper_warp.cli.help import wants_help
 from jumper_warp.cli.main import TASK_MODULE, UsageError, parse
 from jumper_warp.cli.renamed_flags import use_new_names
 from jumper_warp.registry import TASKS, TaskEntry, find_task, make_task, task_names
-from jumper_warp.rl.cfg import TrainCfg
+from jumper_warp.rl.cfg import UNUSED, TrainCfg
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -73,7 +73,8 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
     """Parse the arguments of `jumper train` into settings and the task; exits after help or usage, and as tyro does.
 
     args: the task, then flags. With --resume the saved settings of the run are the defaults.
-    Raises InputError: the task is missing, unknown or given twice, a setting is out of range, or there is no such run.
+    Raises InputError: the task is missing, unknown or given twice, a setting is out of range, the trainer does not use
+    a flag, or there is no such run.
     """
     names = ", ".join(task_names())
     if wants_help(args[:1]):
@@ -82,7 +83,7 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
     if not args or args[0].startswith("-"):
         raise UsageError(f"the task comes first: jumper train TASK [flags]; tasks: {names}")
     name, entry = find_task(args[0])
-    args = [name, *with_preset(name, entry, args[1:])]
+    preset, args = preset_flags(name, entry, args[1:]), args[1:]
     default, task = TrainArgs(TrainCfg(task=name, ppo=entry.ppo, best_metric=entry.best_metric)), make_task(name)
     flags = {name: values_of(f"--{name.replace('_', '-')}", args) for name in ("resume", "log_root", "init_policy")}
     session = {name: values[0] for name, values in flags.items() if values}
@@ -94,34 +95,48 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
         if checkpoint := find_checkpoint(named):
             settings, task = settings_of_run(checkpoint, default.cfg)
             default = dataclasses.replace(default, **settings)
-    parsed, flagged = parse_settings(task, default, args[1:])
+    parsed, flagged = parse_settings(task, default, [*preset, *args])
     if parsed.cfg.task != name:
         raise UsageError(f"give the task once, got {name} and --task {parsed.cfg.task}")
+    if unused := unused_flags(parsed.cfg.trainer, args):
+        raise UsageError(f"{', '.join(unused)}: not supported with trainer {parsed.cfg.trainer}")
     from jumper_warp.tasks.observations import with_history
     from jumper_warp.tasks.overlay_ranges import with_flagged_ranges
 
-    overlay = overlay_in(args[1:]) or default.overlay
+    overlay = overlay_in(args) or default.overlay
     if overlay is not None:
-        flagged, overlay = with_flagged_ranges(task, flagged, overlay, flagged_ranges(args[1:]))
+        flagged, overlay = with_flagged_ranges(task, flagged, overlay, flagged_ranges([*preset, *args]))
     return dataclasses.replace(parsed, overlay=overlay), with_history(flagged, parsed.history)
 
 
-def with_preset(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
-    """Put the flags of a task's --preset before the other unparsed flags, which have precedence.
+def preset_flags(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
+    """Return the flags of a task's --preset in unparsed arguments, without those that the --trainer does not use.
 
     Raises UsageError: the task has no such preset.
     """
     names = values_of("--preset", args)
     if not names:
-        return list(args)
+        return []
     name = names[-1]
     if name not in entry.presets:
         available = ", ".join(
             f"{other} ({', '.join(known.presets)})" for other, known in TASKS.items() if known.presets
         )
         raise UsageError(f"{task} has no preset {name!r:.60}; tasks with presets: {available}")
-    print(f"preset {name}: {entry.presets[name]}", file=sys.stderr)
-    return [*shlex.split(entry.presets[name]), *args]
+    flags, option = [], ""
+    unused = unused_flags("".join(values_of("--trainer", args)[:1]), shlex.split(entry.presets[name]))
+    for word in shlex.split(entry.presets[name]):
+        option = option_of(word) or option
+        flags += [] if option in unused else [word]
+    print(f"preset {name}: {shlex.join(flags)}", file=sys.stderr)
+    return flags
+
+
+def unused_flags(trainer: str, args: Sequence[str]) -> list[str]:
+    """Return the flags in unparsed arguments that a trainer does not use."""
+    names = [name.replace("_", "-") for name in UNUSED.get(trainer, ())]
+    unused = {option for flag in list_flags(TrainArgs) if flag.name in names for option in flag.options}
+    return list(dict.fromkeys(option for arg in args if (option := option_of(arg)) in unused))
 
 
 def parse_settings(task: TaskCfg, default: TrainArgs, args: Sequence[str]) -> tuple[Any, TaskCfg]:

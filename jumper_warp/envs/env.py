@@ -35,6 +35,7 @@ from jumper_warp.tasks.mirror import Mirror, mirror_of, mirror_of_action
 from jumper_warp.tasks.overlay_ranges import moves_of, ranges_of
 from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.checks import check_count, check_seed
+from jumper_warp.utils.dumps import NonFiniteValue
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import load_kernels, records
 from jumper_warp.utils.streams import PURPOSES, Purpose
@@ -343,6 +344,14 @@ class Env(Stages):
         levels = np.bincount(self.episodes.level.numpy(), minlength=len(self.task.levels) + 1)
         fractions = levels / self.num_envs
         return metrics | {f"Curriculum/fraction_at_level_{i}": float(part) for i, part in enumerate(fractions)}
+
+    def non_finite(self) -> list[NonFiniteValue]:
+        """Return the first non-finite value of each reward, observation and curriculum term, and of the state.
+
+        Each term is returned once. Waits for the device. A termination is true or false, so that it has no such value;
+        a state or an action that is not finite ends the episode as `terminations.diverged`.
+        """
+        return [value for skill in self.skills for value in skill.non_finite()]
 
     def mirror(self, what: str) -> Mirror:
         """Return the left-right mirror image (order, signs) of the first task's "observation", or of an "action".

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -13,6 +12,7 @@ import numpy as np
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, finite, outcome_names
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.commands import layout_of
+from jumper_warp.utils.checks import FLOAT32_MAX
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, mean, rate
 
@@ -170,7 +170,7 @@ def check_episodes(count: int, command: tuple[float, ...], seconds: float) -> No
     """Raise InputError unless number of episodes, command and length [s] are within their limits."""
     if count < 1:
         raise InputError(f"num_episodes must be at least 1, got {count}")
-    if len(command) > MAX_COMMAND_SIZE or not all(math.isfinite(value) for value in command):
+    if len(command) > MAX_COMMAND_SIZE or not all(abs(value) <= FLOAT32_MAX for value in command):
         raise InputError(f"command takes up to {MAX_COMMAND_SIZE} finite numbers, got {command}")
     if not 0.0 < seconds <= MAX_SECONDS:
         raise InputError(f"seconds must be in (0, {MAX_SECONDS:g}], got {seconds}")

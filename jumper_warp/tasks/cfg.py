@@ -26,7 +26,7 @@ from jumper_warp.tasks.terms import (
     Term,
     TerminationTerm,
 )
-from jumper_warp.utils.checks import check_not_negative
+from jumper_warp.utils.checks import check_finite, check_not_negative
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Function
 
@@ -142,8 +142,8 @@ class TaskCfg:
         if not 0.0 <= self.self_collision_margin <= MIN_LINK_DISTANCE:
             limits = f"[0, {MIN_LINK_DISTANCE:g}], got {self.self_collision_margin}"
             raise InputError(f"{self.name}: self_collision_margin must be in {limits}")
-        if self.reward_floor is not None and not math.isfinite(self.reward_floor):
-            raise InputError(f"{self.name}: reward_floor must be finite or None, got {self.reward_floor}")
+        if self.reward_floor is not None:
+            check_finite(f"{self.name}: reward_floor", self.reward_floor)
 
     def without_margins(self) -> TaskCfg:
         """Return the task with collision margins of 0 m, as in evaluation."""

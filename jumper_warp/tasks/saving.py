@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
-import math
 import pkgutil
 import sys
 from collections.abc import Collection, Iterable
@@ -23,7 +22,7 @@ from jumper_warp.kernels.mdp.env import NoSettings
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.ranges import Pair
 from jumper_warp.tasks.terms import RewardTerm, Term
-from jumper_warp.utils.checks import NAME, version_error
+from jumper_warp.utils.checks import FLOAT32_MAX, NAME, in_float32, version_error
 from jumper_warp.utils.errors import InputError
 
 VERSION = 4  # of the saved format
@@ -72,8 +71,8 @@ def json_value(value: Any) -> Any:
         return [json_value(v) for v in value]
     if not (value is None or isinstance(value, bool | int | float | str)):
         raise TaskError(f"{shown(value)} cannot be saved: settings are numbers, strings, tuples and dataclasses")
-    if isinstance(value, float) and not math.isfinite(value):
-        raise TaskError(f"settings must be finite, got {value}")
+    if isinstance(value, float) and not abs(value) <= FLOAT32_MAX:
+        raise TaskError(f"settings must be finite, got {in_float32(value)}")
     return value
 
 

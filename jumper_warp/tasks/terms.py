@@ -17,7 +17,7 @@ from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, MODES
 from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.step import every_episode
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
-from jumper_warp.utils.checks import FLOAT32_MAX
+from jumper_warp.utils.checks import FLOAT32_MAX, check_finite
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Function
 
@@ -180,6 +180,7 @@ class ObservationTerm(Term):
             raise InputError(f"ObservationTerm {self.name}: history must be at least 1, got {history!r:.40}")
         if self.numbers["noise"] < 0.0 or self.numbers["clip"] <= 0.0:
             raise InputError(f"ObservationTerm {self.name}: noise must not be negative and clip must be positive")
+        check_finite(f"ObservationTerm {self.name}: scale times clip", self.numbers["scale"] * self.numbers["clip"])
 
     @property
     def width(self) -> int:
