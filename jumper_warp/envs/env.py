@@ -37,6 +37,7 @@ from jumper_warp.utils.checks import check_count, check_seed
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import load_kernels, records
 from jumper_warp.utils.streams import PURPOSES, Purpose
+from jumper_warp.utils.threads import WARP_LOCK, locked
 
 CONTACT_TOLERANCE = 1.0e-4
 """[m/s] Stopping tolerance of the contact iteration, looser than the solver's default, for a fifth fewer sweeps."""
@@ -56,6 +57,7 @@ class Step(NamedTuple):
 class Env(Stages):
     """Vectorised environment with one robot per world, on one task or several. `step` never waits for the device.
 
+    Python threads can have an environment each.
     With several tasks each world has one at a time. Attributes are tensors on the device that `reset` and `step`
     overwrite; observations and reward terms are those of the first task:
         obs, critic_obs: (num_envs, columns), after resets of ended episodes.
@@ -65,6 +67,7 @@ class Env(Stages):
     `Stages` holds the arrays and launches the kernels.
     """
 
+    @locked
     def __init__(
         self,
         task: TaskCfg | Sequence[TaskCfg],
@@ -143,6 +146,7 @@ class Env(Stages):
         self.reward, self.done, self.timeout, ended, cut = (wp.to_torch(getattr(self.episodes, name)) for name in names)
         self._step = Step(first.obs, self.reward, ended, cut, {"final_obs": first.final_obs, "time_outs": self.timeout})
 
+    @locked
     def reset(self, seed: int | None = None, *, worlds: Any = None) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Begin a new episode in every world; return (observations by group, extras), extras being empty.
 
@@ -167,6 +171,7 @@ class Env(Stages):
         self._observe(self._part(), after_reset=int(worlds is not None))
         return self._step.obs, {}
 
+    @locked
     def use_reset_mask(self) -> torch.Tensor:
         """Let `step` reset worlds by a mask instead of ended ones; return the mask, (num_envs,) float32, 0 at first.
 
@@ -179,6 +184,7 @@ class Env(Stages):
         self._reset_mask = wp.zeros(self.num_envs, dtype=float, device=self.wp_device)
         return wp.to_torch(self._reset_mask)
 
+    @locked
     def compile(self) -> None:
         """Compile all kernels of `reset` and `step` in parallel; the first `reset` calls this itself."""
         if not self._compiled:
@@ -211,10 +217,12 @@ class Env(Stages):
         shape = (len(self.skills), self.num_envs, 12) if several else (self.num_envs, 12)
         (self.actions if several else self.action).copy_(checked_action(action, shape, self.device))
         if self.wp_device.is_cuda and torch.cuda.is_current_stream_capturing():
-            self._launch_step()
+            with WARP_LOCK:
+                self._launch_step()
         elif (resets := self.auto_reset and self._ends_episodes) not in self._graphs:
-            self._launch_step()  # loads the modules; counts as this step
-            self._graphs[resets] = SlicedGraph(self._launch_step, self.sim.slices, self.wp_device)
+            with WARP_LOCK:
+                self._launch_step()  # loads the modules; counts as this step
+                self._graphs[resets] = SlicedGraph(self._launch_step, self.sim.slices, self.wp_device)
         else:
             self._graphs[resets].replay()
         return self._step
@@ -232,6 +240,7 @@ class Env(Stages):
         if not 0 <= skill < len(self.skills):
             raise InputError(f"skill must be an index below {len(self.skills)}, got {skill}")
 
+    @locked
     def evaluation_reset(self, commands: Any, headings: Any = 0.0, worlds: Any = None) -> None:
         """Begin an episode with a given command in the default pose and first skill; disables resets until `reset`.
 
@@ -258,6 +267,7 @@ class Env(Stages):
         self.episodes.done.zero_()
         self._observe(self._part(), after_reset=1)
 
+    @locked
     def command(self, commands: Any, worlds: Any = None) -> None:
         """Set commands within running episodes and update `obs`.
 
@@ -268,6 +278,7 @@ class Env(Stages):
         self._set_commands(self._array(chosen), 0, checked_commands(commands, chosen, self.tasks), self._all)
         self._observe(self._part(), after_reset=1)
 
+    @locked
     def request(self, skill: int, worlds: Any = None, commands: Any = None) -> None:
         """Request that worlds hand over to another skill as soon as the condition of a handover holds.
 
@@ -290,6 +301,7 @@ class Env(Stages):
     def _array(self, values: np.ndarray) -> wp.array:
         return wp.array(values, dtype=float, device=self.wp_device)
 
+    @locked
     def task_arrays(self, skill: int = 0) -> dict[str, np.ndarray]:
         """Return the fields of every world's state of a task as arrays (num_envs, ...) (waits for the device).
 
@@ -302,6 +314,7 @@ class Env(Stages):
         arrays |= {"base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_vel": qd[:, :3].copy()}
         return arrays | {name: getattr(self.episodes, name).numpy().copy() for name in ("done", "termination", "level")}
 
+    @locked
     def snapshot(self) -> Snapshot:
         """Return the robots' current state and parameters for `jumper_warp.diff`; does not wait for the device."""
         sim, n = self.sim, self.num_envs
@@ -328,6 +341,7 @@ class Env(Stages):
             wrench=wp.to_torch(self.robot.body_f).view(n, -1, 6)[:, 0].T,
         )
 
+    @locked
     def metrics(self) -> dict[str, float]:
         """Return metrics by name since the last call, see `TaskRuntime.metrics`, and clear the counters.
 
@@ -377,10 +391,12 @@ class Env(Stages):
             **config,
         }
 
+    @locked
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return the complete state that the next step depends on; see `jumper_warp.envs.state.save_state`."""
         return save_state(self)
 
+    @locked
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Restore a saved state, so that later steps are bitwise the same; see `jumper_warp.envs.state.load_state`."""
         load_state(self, state)

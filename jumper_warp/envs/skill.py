@@ -21,6 +21,7 @@ from jumper_warp.robot.motors import filter_params
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.params import ParamArrays
 from jumper_warp.utils.kernels import Kernel, records
+from jumper_warp.utils.threads import locked
 
 _KERNELS: dict[tuple, Kernel] = {}
 
@@ -115,6 +116,7 @@ class TaskRuntime:
         for key, value in numbers.items():
             self.params.set(f"{section}.{name}.{key}", value)
 
+    @locked
     def metrics(self) -> dict[str, float]:
         """Return metrics by name since the last call, and clear the counters (waits for the device).
 

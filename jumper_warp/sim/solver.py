@@ -31,6 +31,7 @@ from jumper_warp.sim.slices import WorldRange
 from jumper_warp.sim.tape import DifferentiableStep
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Control, Model, State
+from jumper_warp.utils.threads import locked
 
 MAX_SWEEPS = 50  # Largest number of contact sweeps in a step
 TOLERANCE = 1.0e-5  # [m/s] The contact iteration ends when a sweep changes every contact velocity by at most this
@@ -108,6 +109,7 @@ class SolverJumper(SolverBase):
     model: Model
     SUPPORTED_OBSERVABLES = frozenset({SolverBase.ObservableKind.BODY_QDD, SolverBase.ObservableKind.CONTACT_F})
 
+    @locked
     def __init__(
         self,
         model: Model,
@@ -148,6 +150,7 @@ class SolverJumper(SolverBase):
         self._no_body_f = wp.zeros(model.body_count, dtype=wp.spatial_vectorf, device=model.device)
         self._old_body_qd = wp.zeros(model.body_count, dtype=wp.spatial_vectorf, device=model.device)
 
+    @locked
     def step(
         self, state_in: State, state_out: State, control: Control | None, contacts: newton.Contacts | None, dt: float,
         *, observables: SolverBase.Observables | None = None,
@@ -161,6 +164,7 @@ class SolverJumper(SolverBase):
         drive = self.dynamics.drive(*self._forces(state_in, control))
         self._advance(state_in, state_out, drive, dt, 1, observables, bodies=True)
 
+    @locked
     def step_motors(
         self, state_in: State, state_out: State, motors: Any, target: wp.array, dt: float, substeps: int, *,
         control: Control | None = None, previous: wp.array | None = None, delay: wp.array | None = None,
@@ -223,6 +227,7 @@ class SolverJumper(SolverBase):
         if observables is not None and contact_f is not None and observables.contacts is not None:
             self._write_contacts(observables.contacts, state_out, contact_f)
 
+    @locked
     def update_contacts(self, contacts: newton.Contacts, state: State | None = None) -> None:
         """Write the paws' contacts of the last step: four rows a world, FL, FR, BL, BR, touching or not.
 
@@ -258,14 +263,17 @@ class SolverJumper(SolverBase):
         inputs = [shapes, dynamics.robot.ground, state.body_q, self.contact_force]
         wp.launch(paw_contacts_kernel, dim=(4, n), inputs=inputs, outputs=[rows, contact_f], device=device)
 
+    @locked
     def block_position(self) -> np.ndarray:
         """Return the centres of the blocks [m], world frame, (num_worlds, 2). Raises InputError without blocks."""
         return self._block_values()["center"].copy()
 
+    @locked
     def block_velocity(self) -> np.ndarray:
         """Return the velocities of the blocks [m/s], world frame, (num_worlds, 2). Raises InputError without blocks."""
         return self._block_values()["velocity"].copy()
 
+    @locked
     def place_blocks(self, center: np.ndarray, worlds: Sequence[int] | None = None) -> None:
         """Move the blocks of some worlds (indices), by default all, to new start positions, at rest.
 
@@ -276,6 +284,7 @@ class SolverJumper(SolverBase):
         self._blocks().assign(values)
         self.reset_blocks(worlds)
 
+    @locked
     def reset_blocks(self, worlds: Sequence[int] | wp.array | None = None) -> None:
         """Reset the blocks of some worlds, by default all, to their starts, at rest.
 
@@ -306,6 +315,7 @@ class SolverJumper(SolverBase):
             raise InputError("the solver was made without a block")
         return blocks
 
+    @locked
     def notify_model_changed(self, flags: ModelFlags | int) -> None:
         """Update the solver after parameters of the model, named by `flags`, have changed."""
         if flags & ModelFlags.BODY_INERTIAL_PROPERTIES:
@@ -321,6 +331,7 @@ class SolverJumper(SolverBase):
         if flags & ModelFlags.MODEL_PROPERTIES:
             self.dynamics.pack_gravity()
 
+    @locked
     def reset(self, state: State, world_mask: wp.array | None = None, flags: StateFlags | int | None = None) -> None:
         """Clear contact history and `diverged` of the masked worlds, and write the reference pose to their state.
 

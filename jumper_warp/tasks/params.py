@@ -15,6 +15,7 @@ import warp as wp
 
 from jumper_warp.tasks.terms import Term
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.threads import locked
 
 
 class TermSlot(SimpleNamespace):
@@ -76,6 +77,7 @@ class ParamArrays:
         self.changed = wp.full(len(params.values), math.inf, dtype=float, device=device)
         """Numbers changed by `set`, (len(values),); infinity elsewhere."""
 
+    @locked
     def set(self, name: str, value: float) -> None:
         """Change a parameter by its dotted name. Raises InputError: there is none, or the value is not finite."""
         if not math.isfinite(value):
