@@ -409,6 +409,8 @@ class Rollout:
                 raise InputError(
                     f"{name} must be {self.real.__name__} of shape {full}, got {values.dtype.__name__} {values.shape}"
                 )
+            if values.device != self.device:
+                raise InputError(f"{name} must be on {self.device}, got an array on {values.device}")
             return values
         values = np.asarray(values, dtype=np.float64)
         if values.shape == shape:
