@@ -106,6 +106,10 @@ def train(
         if stop.requested:
             raise SystemExit(INTERRUPTED)
         return result
+    except Exception as error:
+        if run is not None and any((run.folder / CHECKPOINTS).glob("*.pt")):
+            error.add_note(f"continue from the last checkpoint with: {run.resume_command}")
+        raise
     finally:
         if run is not None:
             run.ppo.close()
@@ -301,8 +305,12 @@ class TrainingRun:
             log.print_line(f"{folder}: checkpoint not saved, retried later: {error.strerror}")
             return
         if is_last:
-            hint = f", continue with: {self._command} --resume {shlex.quote(str(self.folder))}"
-            log.print_line(f"saved {path}{hint if stop.requested else ''}")
+            log.print_line(f"saved {path}{f', continue with: {self.resume_command}' if stop.requested else ''}")
+
+    @property
+    def resume_command(self) -> str:
+        """Command line that resumes this run."""
+        return f"{self._command} --resume {shlex.quote(str(self.folder))}"
 
     def _other_ranks(self, local: dict[str, Any]) -> list[dict[str, Any]]:
         """Return the other ranks' states (env, rng, and of ppo the episode) on rank 0; an empty list elsewhere."""

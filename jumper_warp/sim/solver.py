@@ -331,9 +331,9 @@ class SolverJumper(SolverBase):
         blocks, or for a shorter mask.
         """
         n, device = self._blocks().shape[0], self.model.device
-        mask = worlds
+        mask: Any = worlds
         if isinstance(worlds, wp.array):
-            self._check("worlds", worlds[:n], (n,))
+            self._check("worlds", mask[:n], (n,))
         else:
             selected = np.zeros(n, dtype=bool)
             selected[slice(None) if worlds is None else list(worlds)] = True
@@ -378,7 +378,7 @@ class SolverJumper(SolverBase):
         """Clear contact history and `diverged` of the masked worlds, and write the reference pose to their state.
 
         world_mask: bool (num_worlds + 1,), the last entry for the global world; None: all. Blocks return to their
-        starts. With `flags=StateFlags.NONE` state and blocks do not change. Raises InputError: a state of another model.
+        starts. With `flags=StateFlags.NONE` state and blocks do not change. Raises InputError: another model's state.
         """
         world_mask = self._normalize_reset_world_mask(world_mask)
         n, device = self.model.world_count, self.model.device
