@@ -64,7 +64,7 @@ class Env(Stages):
         final_obs, final_critic_obs: (num_envs, columns), before resets.
         reward_terms: (num_envs,) by name of the reward, weight and time step applied, of worlds on that task.
         reward, done, timeout: (num_envs,); done 1 where an episode ended, timeout 1 where it ended without failure.
-    `Stages` holds the arrays and launches the kernels.
+    `Stages` holds the arrays and launches the kernels. Python threads can have an environment each.
     """
 
     @locked
