@@ -37,7 +37,7 @@ COMMANDS = {
     "sysid": "Identify the robot's parameters from recorded motions.",
     "list": "List the tasks and the project's policies.",
     "info": "Describe a task or a policy: jumper info NAME.",
-    "doctor": "Check the installation: versions, devices, caches, one environment.",
+    "doctor": "Check the installation: versions, devices, caches, a simulation.",
     "completion": "Print the script that completes commands and flags in bash or zsh.",
 }
 """Help text by command; each command is a module of `jumper_warp.cli` with run(args, modules)."""

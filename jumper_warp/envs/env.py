@@ -57,7 +57,6 @@ class Step(NamedTuple):
 class Env(Stages):
     """Vectorised environment with one robot per world, on one task or several. `step` never waits for the device.
 
-    Python threads can have an environment each.
     With several tasks each world has one at a time. Attributes are tensors on the device that `reset` and `step`
     overwrite; observations and reward terms are those of the first task:
         obs, critic_obs: (num_envs, columns), after resets of ended episodes.
@@ -217,8 +216,7 @@ class Env(Stages):
         shape = (len(self.skills), self.num_envs, 12) if several else (self.num_envs, 12)
         (self.actions if several else self.action).copy_(checked_action(action, shape, self.device))
         if self.wp_device.is_cuda and torch.cuda.is_current_stream_capturing():
-            with WARP_LOCK:
-                self._launch_step()
+            locked(self._launch_step)()
         elif (resets := self.auto_reset and self._ends_episodes) not in self._graphs:
             with WARP_LOCK:
                 self._launch_step()  # loads the modules; counts as this step
