@@ -56,6 +56,7 @@ def cli_page() -> str:
         section("sysid actuator BENCH", doc(ActuatorCfg), list_flags(ActuatorCfg)),
         section("list", COMMANDS["list"], list_flags(settings_of("list")[0])),
         section("info NAME", COMMANDS["info"], list_flags(settings_of("info")[0])),
+        section("doctor", COMMANDS["doctor"], list_flags(settings_of("doctor")[0])),
         section("completion SHELL", COMMANDS["completion"], list_flags(CompletionCfg)),
     ]  # fmt: skip
     return "\n\n".join([summary(), *parts, completion(), exit_codes()]) + "\n"

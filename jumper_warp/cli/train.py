@@ -21,7 +21,7 @@ from jumper_warp.cli.main import TASK_MODULE, UsageError, parse
 from jumper_warp.cli.renamed_flags import use_new_names
 from jumper_warp.registry import TASKS, TaskEntry, find_task, make_task, task_names
 from jumper_warp.rl.cfg import UNUSED, TrainCfg
-from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.errors import InputError, OutOfMemoryError, is_out_of_memory
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -198,6 +198,22 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
     return make_env
 
 
+def memory_message(task: TaskCfg, args: TrainArgs, error: Exception) -> str:
+    """Return one line about a training that ran out of memory: need, number of worlds that fits, and how to resume."""
+    import torch
+    import warp as wp
+
+    from jumper_warp.cli.training_memory import describe_need, memory_pools
+
+    device = torch.device(wp.device_to_torch(wp.get_device(args.cfg.device)))
+    if device.type == "cuda":
+        device = torch.device("cuda", torch.cuda.current_device())  # of this rank
+    num_envs = args.cfg.num_envs // int(os.environ.get("WORLD_SIZE", "1"))
+    pools = memory_pools(task, args.cfg.ppo, args.solver, device, rebuilt=True)
+    parts = [f"out of memory: {describe_need(pools, args.cfg.ppo, num_envs)}", *getattr(error, "__notes__", [])]
+    return "; ".join(parts)
+
+
 def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
     """Return the command line of a training without --resume and --init-policy, for a later resume.
 
@@ -270,7 +286,12 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     if parsed.cfg.trainer == "rsl-rl":
         from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl
     make_env, command = env_maker(task, parsed), command_line(args, modules)
-    result = train(parsed.cfg, make_env, command, as_rsl_rl, actor_init, parsed.checkpoint)
+    try:
+        result = train(parsed.cfg, make_env, command, as_rsl_rl, actor_init, parsed.checkpoint)
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        raise OutOfMemoryError(memory_message(task, parsed, error)) from error
     if is_rank_0:
         print(result.folder)
     return result

@@ -24,6 +24,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.params import ParamArrays
 from jumper_warp.utils.dumps import NonFiniteValue
 from jumper_warp.utils.kernels import Kernel, records
+from jumper_warp.utils.threads import locked
 
 _KERNELS: dict[tuple, Kernel] = {}
 
@@ -169,6 +170,7 @@ class TaskRuntime:
         for key, value in numbers.items():
             self.params.set(f"{section}.{name}.{key}", value)
 
+    @locked
     def metrics(self) -> dict[str, float]:
         """Return metrics by name since the last call, and clear the counters (waits for the device).
 

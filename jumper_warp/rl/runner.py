@@ -108,8 +108,13 @@ def train(
         cleanup.callback(run.ppo.close)
         if checkpoint is None and rank.index == 0:
             cleanup.enter_context(write_lock(run.folder))
-        with StopRequest() as stop:
-            result = run.iterate(stop)
+        try:
+            with StopRequest() as stop:
+                result = run.iterate(stop)
+        except Exception as error:
+            if any((run.folder / CHECKPOINTS).glob("*.pt")):
+                error.add_note(f"continue from the last checkpoint with: {run.resume_command}")
+            raise
         distributed.wait_for_ranks()
         if run.failure:
             raise SystemExit(f"jumper: {run.failure}")  # printed by Python, which exits with status 1
@@ -318,8 +323,13 @@ class TrainingRun:
             log.print_line(f"{folder}: checkpoint not saved, retried later: {error.strerror}")
             return
         if is_last:
-            hint = f", continue with: {self._command} --resume {shlex.quote(str(self.folder))}"
+            hint = f", continue with: {self.resume_command}"
             log.print_line(f"saved {path}{hint if stop.requested or self.failure else ''}")
+
+    @property
+    def resume_command(self) -> str:
+        """Command line that resumes this run."""
+        return f"{self._command} --resume {shlex.quote(str(self.folder))}"
 
     def _other_ranks(self, local: dict[str, Any]) -> list[dict[str, Any]]:
         """Return the other ranks' states (env, rng, and of ppo the episode) on rank 0; an empty list elsewhere."""

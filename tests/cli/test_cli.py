@@ -76,6 +76,7 @@ HEAVY = ("torch", "newton", "pinocchio", "rerun", "matplotlib", "scipy", "onnx")
         (["evaluate", "--help"], (*HEAVY, "warp", "numpy")),
         (["export", "--help"], (*HEAVY, "warp")),
         (["list", "--help"], (*HEAVY, "warp")),
+        (["doctor", "--help"], (*HEAVY, "warp")),
     ],
     ids=" ".join,
 )
@@ -102,7 +103,7 @@ def test_help_lists_all_commands_and_task_module_flag(capsys):
 
 
 @pytest.mark.parametrize(
-    "command", [["train"], ["train", "vertical-jump"], ["play"], ["evaluate"], ["export"], ["list"]]
+    "command", [["train"], ["train", "vertical-jump"], ["play"], ["evaluate"], ["export"], ["list"], ["doctor"]]
 )
 def test_each_command_prints_help(capsys, command):
     code, out, _ = run(capsys, *command, "--help")
