@@ -17,12 +17,15 @@ from jumper_warp.rl.distributed import world_size
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.threads import checked_threads
 
 NUM_ACTIONS = 12  # motors
 BUILD_BYTES: dict[SolverName, int] = {"jumper": 70_000, "mujoco": 112_000}
 """[byte] Main memory for each world while the environment is built (`experiments/measure_memory.py`)."""
 ENV_BYTES: dict[SolverName, int] = {"jumper": 25_750, "mujoco": 71_400}
 """[byte] Device memory of the environment's arrays for each world, measured likewise."""
+RECORD_BYTES = 73_000
+"""[byte] Memory for the first non-finite values of a task's terms, for each thread of a CPU, or once on a GPU."""
 FLOAT_BYTES = 4  # [byte] Size of a float32
 INDEX_BYTES = 8  # [byte] Size of a sample's index in the order of an epoch
 MAX_PADDING = 21  # Largest number of floats that pad a sample's row
@@ -87,7 +90,9 @@ def memory_pools(
     rebuilt: count memory that this process uses as free.
     """
     num_obs, num_critic_obs = (max(end for _, end in task.layout(group).values()) for group in ("actor", "critic"))
+    threads = 1 if device.type == "cuda" else checked_threads(None)
     learning = learning_need(ppo, num_obs, num_critic_obs)
+    learning = learning._replace(fixed=learning.fixed + threads * RECORD_BYTES)
     main_free = free_main_memory() // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
     main_free += own_main_memory() if rebuilt else 0
     build_bytes = BUILD_BYTES[solver]

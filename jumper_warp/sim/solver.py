@@ -72,7 +72,7 @@ def warn_of_colliders(model: Model) -> None:
         warnings.warn(
             f"SolverJumper ignores the collisions of {len(ignored)} shapes, such as "
             f"{model.shape_label[ignored[0]]!r:.60}: only paws, ground and blocks have contact",
-            stacklevel=3,
+            stacklevel=4,  # this function, the constructor, and its lock
         )
 
 

@@ -257,7 +257,7 @@ def _scalar(saved: Any, hint: Any, where: str) -> Any:
             raise TaskError(f"{where}: must be one of {get_args(hint)}, got {shown(saved)}")
         return saved
     number = isinstance(saved, int | float) and not isinstance(saved, bool)
-    if number and not abs(saved) < 1.0e300:
+    if number and not abs(saved) <= FLOAT32_MAX:
         raise TaskError(f"{where}: must be finite, got {shown(saved)}")
     if kinds is None:
         if hint is Any and (saved is None or isinstance(saved, bool | int | float | str)):
