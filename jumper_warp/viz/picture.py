@@ -219,7 +219,8 @@ def _extent(scene: Composition) -> np.ndarray:
     low, high = scene.span()
     ground = scene.lowest - 0.1
     heights = [*scene.heights, *([ground] if scene.grounded else [])]
-    frame = [scene.point(along, height) for along in (low - 0.25, high) for height in heights]
+    scale = low - max(0.25, 0.08 * (high - low))  # the numbers of the scale are left of `low`
+    frame = [scene.point(along, height) for along in (scale, high) for height in heights]
     goals = (
         scene.recording.goals[scene.rank] if len(scene.recording.goals) and not scene.shift.any() else np.zeros((0, 3))
     )
