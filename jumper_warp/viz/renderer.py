@@ -33,7 +33,7 @@ SHADOW_EXTENT = 6.0  # [m] distance from the world's origin up to which OpenGL d
 SAMPLES = 4  # rays per pixel of the ray tracer
 LINE_WIDTH = 1.0 / 560.0  # [1] width of lines over the image's width
 GL_PACKAGES = "apt-get install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri"
-NO_GL = f"pip install jumper-warp[video], and on Debian {GL_PACKAGES}"
+NO_GL = f'pip install "jumper-warp[video]", and on Debian {GL_PACKAGES}'
 
 
 @dataclass(frozen=True)
@@ -198,8 +198,8 @@ class RayTracer(Renderer):
         self._sensor.create_default_light(direction=rays)
         self._sensor.set_ambient_light(AMBIENT)
         red, green, blue = (round(255 * channel) for channel in SKY)
-        clear = SensorCamera.ClearData(clear_color=0xFF000000 | blue << 16 | green << 8 | red)
-        self._sensor.default_clear_data = clear
+        color = (0xFF000000 | blue << 16 | green << 8 | red) - (1 << 32)  # as int32: clang warns about larger constants
+        self._sensor.default_clear_data = SensorCamera.ClearData(clear_color=color)
         self._sensor.default_render_config.enable_shadows = True
         self._sensor.default_render_config.anti_aliasing = SensorCamera.AntiAliasing.SSAA
         self._pixels: Any = self._sensor.allocate_image_color(1, *self.size)

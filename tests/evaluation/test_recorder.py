@@ -8,8 +8,11 @@ from jumper_warp.evaluation.heights import HeightLog
 from jumper_warp.evaluation.log import run_evaluation, termination_names
 from jumper_warp.evaluation.recorder import EnvRecorder, ankles
 from jumper_warp.registry import make_task
+from jumper_warp.robot.grounds import platform
+from jumper_warp.robot.model import build_model
 from jumper_warp.viz.props import BAR_OFFSET, RING_RADIUS, goal_shapes, with_blocks
 from jumper_warp.viz.recording import Recording
+from jumper_warp.viz.shapes import shape_meshes
 
 
 def recording(frames=3, worlds=2, spacing=2.0):
@@ -68,6 +71,15 @@ def test_goals_are_rings_of_the_tolerance_on_the_ground_spaced_by_world():
         assert np.linalg.norm(offset[:, :2], axis=1).max() == pytest.approx(RING_RADIUS, rel=1e-5)
         assert np.linalg.norm(offset[:, :2], axis=1).min() > 0.8 * RING_RADIUS
         assert offset[:, 2].min() == pytest.approx(0.0, abs=1e-6)
+
+
+def test_goal_off_a_platform_and_on_a_block_is_on_the_surface_under_it():
+    ground = shape_meshes(build_model(2, ground=platform(-0.15, edge=0.4), device="cpu"), ())
+    shown = with_blocks(replace(recording(), shapes=tuple(ground)), np.tile([0.0, -1.0], (3, 2, 1)),
+                        np.full((2, 2), 0.4), np.array([0.05, 0.2]))  # fmt: skip
+    goals = np.array([[[0.2, 0.0, 0.0], [1.0, 0.1, 0.0]], [[0.1, -1.1, 0.0], [0.3, -1.7, 0.0]]])
+    rings = goal_shapes(replace(shown, goals=goals))
+    assert [ring.vertices[:, 2].min() for ring in rings] == pytest.approx([0.0, -0.15, 0.2, 0.0], abs=1e-6)
 
 
 def test_commanded_heights_are_bars_to_the_left_of_the_base_at_its_start():
