@@ -66,13 +66,9 @@ class PpoCfg:
     symmetry: Literal["off", "actor"] = "off"
     """Left-right symmetry of the policy. With `actor`, mirrored observations give mirrored actions for any weights; the
     task must define the mirror image of its observation."""
-    tf32: bool = True
-    """Whether matrix products on a GPU may use TF32, which rounds their factors to 10 mantissa bits."""
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Data type of the hidden layers; the last layers, losses and statistics are float32."""
-    compile: Literal["auto", "on", "off"] = "auto"
-    """Whether torch.compile fuses elementwise operations; auto: on a GPU only. It needs a C++ compiler, and caches
-    compiled code on disk."""
+    fused: bool = True
+    """Whether a GPU of compute capability 9.0 or higher acts and updates with fused bfloat16 kernels, otherwise with
+    PyTorch in TF32; no effect on a CPU."""
     graphs: bool = True
     """Whether to capture an iteration as CUDA graphs and replay them; no effect on a CPU."""
 

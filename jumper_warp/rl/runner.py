@@ -202,7 +202,7 @@ class TrainingRun:
         cfg, ppo = self.cfg, self.ppo
         with ThreadPoolExecutor(1) as pool:
             kernels = pool.submit(getattr(self.env, "compile", lambda: None))  # optional for a `VecEnv`
-            distributed.local_rank_zero_first(ppo.compile)
+            ppo.compile()
             kernels.result()
         if self.iteration == 0:
             self.env.reset()
