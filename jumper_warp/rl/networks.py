@@ -1,8 +1,9 @@
 """Actor, critic, exploration noise, and the running statistics that normalise observations and values.
 
-`Layers` implements the forward and backward pass of a multilayer perceptron without autograd. The backward pass needs only the input of each layer, which is the output of the layer
-below. With y a layer's output, x its input and s = ∂L/∂(Wx + b): ∂L/∂W = sᵀx, ∂L/∂b = Σs, ∂L/∂x = sW. The
-derivative of each activation is a function of y: elu' = 1 + min(y, 0), relu' = [y > 0], tanh' = 1 - y².
+`Layers` implements the forward and backward pass of a multilayer perceptron without autograd. The backward pass needs
+only the input of each layer, which is the output of the layer below. With y a layer's output, x its input and
+s = ∂L/∂(Wx + b): ∂L/∂W = sᵀx, ∂L/∂b = Σs, ∂L/∂x = sW. The derivative of each activation is a function of y:
+elu' = 1 + min(y, 0), relu' = [y > 0], tanh' = 1 - y².
 """
 
 from __future__ import annotations

@@ -105,13 +105,14 @@ class Ppo:
             from jumper_warp.rl.fused.networks import FusedModel
             from jumper_warp.rl.fused.update import FusedUpdate
 
-            rows, dtype = max(self.batch_size // cfg.minibatches, env.num_envs), torch.bfloat16
-            networks = FusedModel(model, flat, rows, dtype if cuda else torch.float32)
+            rows = max(self.batch_size // cfg.minibatches, env.num_envs)
+            networks = FusedModel(model, flat, rows, torch.bfloat16 if cuda else torch.float32)
             self.collector = FusedCollector(env, cfg, model, flat, networks)
-            self.packer = self.fused = FusedUpdate(
-                self.collector, cfg, model, self.optimiser, networks, (self._desired_kl, self._entropy_coef), self._sums,
-                obs_mirror,
-            )  # fmt: skip
+            coefficients = (self._desired_kl, self._entropy_coef)
+            self.fused = FusedUpdate(
+                self.collector, cfg, model, self.optimiser, networks, coefficients, self._sums, obs_mirror
+            )
+            self.packer = self.fused
         else:
             self.fused = None
             self.collector = Collector(env, cfg, model, flat)
@@ -164,10 +165,17 @@ class Ppo:
 
         Also samples the order of the samples in every epoch.
         """
-        self.packer.pack()
+        if self.fused is None:
+            self.packer.pack()
+            self._sample_orders()
+        else:
+            self.fused.side_by_side(self._sample_orders, self.packer.pack)
+        return self.packer.batch()
+
+    def _sample_orders(self) -> None:
+        """Sample the order of the samples in every epoch."""
         for order in self._orders:
             order.copy_(self.order())
-        return self.packer.batch()
 
     def order(self) -> torch.Tensor:
         """Return a random permutation of the batch's samples, (batch_size,) int64."""
@@ -178,11 +186,11 @@ class Ppo:
         """Run one optimiser step per minibatch for all epochs."""
         for order in self._orders:
             for samples in order.chunk(self.cfg.minibatches):
-                if self.fused is not None:
-                    self.fused.step(samples)
-                else:
+                if isinstance(self.packer, BatchPacker):
                     torch.index_select(self.packer.rows, 0, samples, out=self._minibatch)
                     self.minibatch_step(self._minibatch)
+                else:
+                    self.packer.step(samples)
 
     @torch.no_grad()
     def minibatch_step(self, rows: torch.Tensor) -> StepStatistics:

@@ -43,7 +43,9 @@ class NoiseTask(PushTask):
         self.timeout.copy_(self.done * (torch.rand_like(self.done) < 0.5).float())
 
     def mirror(self, what):
-        return ([1, 0, 2, 4, 3], [1.0, 1.0, -1.0, -1.0, -1.0]) if what == "observation" else ([2, 1, 0], [1.0, -1.0, 1.0])
+        if what == "observation":
+            return [1, 0, 2, 4, 3], [1.0, 1.0, -1.0, -1.0, -1.0]
+        return [2, 1, 0], [1.0, -1.0, 1.0]
 
 
 def interpreted(function, *args):

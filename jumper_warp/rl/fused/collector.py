@@ -38,7 +38,7 @@ class ObservationWriter:
         """Allocate sums for num_steps steps; running: statistics that normalise; features: (…, num_envs, width)."""
         num_obs, (worlds, width) = len(running.mean), features.shape[-2:]
         self._running, self._grid = running, (blocks(worlds, ROWS), blocks(width, 64))
-        self._scaling = Scaling(*(torch.zeros(num_obs, device=features.device) for _ in Scaling._fields))
+        self._scaling = Scaling(*(x.to(features.device) for x in (torch.zeros(num_obs), torch.ones(num_obs))))
         self._sums = torch.zeros(num_steps + 1, self._grid[0], 2, width, device=features.device)
         self._num_obs, self._samples = num_obs, num_steps * worlds
 

@@ -7,8 +7,6 @@ samples is written as one partial sum per split of the samples, and `sum_partial
 Indices: row of a matrix is the sample. Tiles: BM rows, BN columns, BK terms of a product per pass.
 """
 
-from __future__ import annotations
-
 import triton
 import triton.language as tl
 
@@ -174,9 +172,9 @@ def actor_loss(
             order = tl.load(mirror + action).to(tl.int32)
             sign = tl.load(mirror + WIDTH + action)
             place = grad_output + (2 * row).to(tl.int64)[:, None] * WIDTH
-            half, dtype = 0.5 * grad_mean, grad_output.dtype.element_ty
-            tl.store(place + action[None, :], half.to(dtype), mask=inside[:, None])
-            tl.store(place + WIDTH + order[None, :], (half * sign[None, :]).to(dtype), mask=inside[:, None])
+            half, image = 0.5 * grad_mean, 0.5 * grad_mean * sign[None, :]
+            tl.store(place + action[None, :], half.to(grad_output.dtype.element_ty), mask=inside[:, None])
+            tl.store(place + WIDTH + order[None, :], image.to(grad_output.dtype.element_ty), mask=inside[:, None])
         else:
             place = grad_output + row.to(tl.int64)[:, None] * WIDTH + action[None, :]
             tl.store(place, grad_mean.to(grad_output.dtype.element_ty), mask=inside[:, None])
@@ -380,9 +378,9 @@ def sample_action(
 def record_step(
     reward, done, timeout, rewards, dones, timeouts, episode, finished, rows, scale, B: tl.constexpr
 ):  # fmt: skip
-    """Write a step's reward, done and timeout to the rollout, and update the returns and lengths of episodes.
+    """Write a step's reward, done and timeout, (rows,) each, to the rollout, and update the counts of episodes.
 
-    All of a step are (rows,), rewards scaled; episode: (2, rows) and finished: (3, rows), float64, as in `Collector`.
+    episode: (2, rows) and finished: (3, rows), float64, as in `Collector`.
     """
     i = tl.program_id(0) * B + tl.arange(0, B)
     mask = i < rows

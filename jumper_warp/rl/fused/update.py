@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 
 from jumper_warp.rl.cfg import PpoCfg
@@ -13,7 +15,7 @@ from jumper_warp.rl.fused.networks import SPLITS, FusedModel, blocks, launch, ro
 from jumper_warp.rl.graphs import CapturedProcedure
 from jumper_warp.rl.mirror import MirrorMap
 from jumper_warp.rl.networks import ActorCritic, Moments
-from jumper_warp.rl.samples import Batch, RolloutMoments, RowLayout, estimate_returns, update_statistics
+from jumper_warp.rl.samples import Batch, RolloutMoments, estimate_returns, update_statistics
 
 SUM_BLOCK = 128  # Entries of the flat gradient in a block of the kernels that sum it
 ADAM_BLOCK = 1024  # Entries of the flat vector in a block of Adam's kernel
@@ -41,9 +43,9 @@ class FusedUpdate:
         self._samples = rollout.samples.flatten(0, 1)
         self._head = torch.zeros(len(self._critic_features), device=device)  # the critic's outputs
         self._squares = torch.zeros(blocks(self._flat.size, SUM_BLOCK), 2, device=device)
-        self._critic_stream = torch.cuda.Stream(device) if device.type == "cuda" else None
-        self._index = torch.zeros(self._rows, dtype=torch.int64, device=device)  # of several ranks, whose graphs read it
-        capture = self._critic_stream is not None and cfg.graphs and world_size() > 1
+        self._side_stream = torch.cuda.Stream(device) if device.type == "cuda" else None
+        self._index = torch.zeros(self._rows, dtype=torch.int64, device=device)  # samples, for the graphs of many ranks
+        capture = self._side_stream is not None and cfg.graphs and world_size() > 1
         self._captured = (
             CapturedProcedure(lambda: self.compute_gradient(self._index), capture),
             CapturedProcedure(self.update_parameters, capture),
@@ -91,18 +93,22 @@ class FusedUpdate:
         all_reduce_mean(self._flat.all_reduced)
         update()
 
+    def side_by_side(self, first: Callable[[], object], second: Callable[[], object]) -> None:
+        """Run two independent procedures, on a GPU in two streams, which are two branches of a captured graph."""
+        if self._side_stream is None:
+            first()
+            second()
+            return
+        stream = torch.cuda.current_stream()
+        self._side_stream.wait_stream(stream)
+        with torch.cuda.stream(self._side_stream):
+            first()
+        second()
+        stream.wait_stream(self._side_stream)
+
     def compute_gradient(self, samples: torch.Tensor) -> None:
         """Write gradient and losses of a minibatch to `FlatParameters.all_reduced`; samples: indices (batch,)."""
-        if self._critic_stream is None:
-            self._critic_gradient(samples)
-            self._actor_gradient(samples)
-        else:
-            stream = torch.cuda.current_stream()
-            self._critic_stream.wait_stream(stream)
-            with torch.cuda.stream(self._critic_stream):
-                self._critic_gradient(samples)
-            self._actor_gradient(samples)
-            stream.wait_stream(self._critic_stream)
+        self.side_by_side(lambda: self._critic_gradient(samples), lambda: self._actor_gradient(samples))
         partial, layout, gradient = self._fused.partial, self._fused.layout, self._flat.all_reduced
         launch(kernels.sum_partials, (blocks(len(gradient), SUM_BLOCK),))(
             partial, layout.table, gradient, partial.stride(0), len(gradient), SPLITS, self._fused.mirrored, SUM_BLOCK
@@ -135,14 +141,14 @@ class FusedUpdate:
 
     def update_parameters(self) -> None:
         """Adapt the learning rate, clip the gradient, and run a step of Adam."""
-        flat, cfg, adam, squares, schedule = self._flat, self._cfg, self._optimiser, self._squares, self._optimiser.schedule
+        flat, cfg, adam, squares = self._flat, self._cfg, self._optimiser, self._squares
         launch(kernels.prepare_step, (len(squares),))(
-            flat.all_reduced, squares, schedule, self._desired_kl, flat.size, flat.actor_size, cfg.min_lr, cfg.max_lr,
-            cfg.desired_kl > 0.0, SUM_BLOCK,
+            flat.all_reduced, squares, adam.schedule, self._desired_kl, flat.size, flat.actor_size, cfg.min_lr,
+            cfg.max_lr, cfg.desired_kl > 0.0, SUM_BLOCK,
         )  # fmt: skip
         launch(kernels.adam_step, (blocks(flat.size, ADAM_BLOCK),))(
-            flat.value, flat.all_reduced, adam.exp_avg, adam.exp_avg_sq, squares, schedule, self._fused.weights,
-            self._fused.layout.table, self._sums, flat.size, flat.actor_size, cfg.max_grad_norm,
+            flat.value, flat.all_reduced, adam.exp_avg, adam.exp_avg_sq, squares, adam.schedule,
+            self._fused.weights, self._fused.layout.table, self._sums, flat.size, flat.actor_size, cfg.max_grad_norm,
             1 << (len(squares) - 1).bit_length(), len(squares), self._fused.mirrored, ADAM_BLOCK,
         )  # fmt: skip
 
