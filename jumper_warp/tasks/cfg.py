@@ -13,6 +13,7 @@ from jumper_warp.kernels.mdp.starts import MIN_LINK_DISTANCE
 from jumper_warp.kernels.mdp.terminations import diverged, too_long
 from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
+from jumper_warp.tasks.copying import Copyable
 from jumper_warp.tasks.params import TaskParams
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.ranges import Pair
@@ -26,13 +27,13 @@ from jumper_warp.tasks.terms import (
     Term,
     TerminationTerm,
 )
-from jumper_warp.utils.checks import check_not_negative
+from jumper_warp.utils.checks import check_finite, check_not_negative
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Function
 
 
 @dataclass(frozen=True)
-class Reset:
+class Reset(Copyable):
     """Function that samples the state at the start of an episode, with its settings."""
 
     func: Function
@@ -47,7 +48,7 @@ class Reset:
 
 
 @dataclass(frozen=True)
-class Command:
+class Command(Copyable):
     """Functions that set a task's command from outside and resample it within an episode."""
 
     set: Function
@@ -72,7 +73,7 @@ class ObservationsCfg:
 
 
 @dataclass(frozen=True)
-class TaskCfg:
+class TaskCfg(Copyable):
     """Definition of a task: everything that an environment needs, as data."""
 
     name: str
@@ -142,8 +143,8 @@ class TaskCfg:
         if not 0.0 <= self.self_collision_margin <= MIN_LINK_DISTANCE:
             limits = f"[0, {MIN_LINK_DISTANCE:g}], got {self.self_collision_margin}"
             raise InputError(f"{self.name}: self_collision_margin must be in {limits}")
-        if self.reward_floor is not None and not math.isfinite(self.reward_floor):
-            raise InputError(f"{self.name}: reward_floor must be finite or None, got {self.reward_floor}")
+        if self.reward_floor is not None:
+            check_finite(f"{self.name}: reward_floor", self.reward_floor)
 
     def without_margins(self) -> TaskCfg:
         """Return the task with collision margins of 0 m, as in evaluation."""
@@ -254,7 +255,7 @@ class TaskCfg:
 
 
 @dataclass(frozen=True)
-class Handover:
+class Handover(Copyable):
     """Switch of a world from one task to another, with its condition; the robot's state does not change."""
 
     source: TaskCfg

@@ -17,7 +17,8 @@ from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, MODES
 from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.step import every_episode
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
-from jumper_warp.utils.checks import FLOAT32_MAX
+from jumper_warp.tasks.copying import Copyable
+from jumper_warp.utils.checks import FLOAT32_MAX, check_finite
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Function
 
@@ -27,7 +28,7 @@ LEGS = ("FL", "FR", "BL", "BR")
 MOTORS = tuple(f"{leg}_{motor}" for leg in LEGS for motor in ("lateral", "outer", "inner"))
 
 
-class Term:
+class Term(Copyable):
     """Part of a task, such as a reward or a termination: a Warp function and values of its parameters.
 
     Equal terms have the same function, name, numbers and options.
@@ -95,7 +96,7 @@ class Term:
 
         Raises InputError like the constructor.
         """
-        return type(self)(**{"func": self.func, "name": self.name, **self.numbers, **self.options, **changes})
+        return type(self)(**self.arguments() | changes)
 
     @property
     def flat_numbers(self) -> dict[str, float]:
@@ -113,6 +114,10 @@ class Term:
     def of_state(self) -> Any:
         """Type of the function's argument `state`: a task's `@wp.struct`, or Any."""
         return self.func.input_types.get("state", Any)
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments of the constructor that make an equal term."""
+        return {"func": self.func, "name": self.name, **self.numbers, **self.options}
 
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and all(
@@ -180,6 +185,7 @@ class ObservationTerm(Term):
             raise InputError(f"ObservationTerm {self.name}: history must be at least 1, got {history!r:.40}")
         if self.numbers["noise"] < 0.0 or self.numbers["clip"] <= 0.0:
             raise InputError(f"ObservationTerm {self.name}: noise must not be negative and clip must be positive")
+        check_finite(f"ObservationTerm {self.name}: scale times clip", self.numbers["scale"] * self.numbers["clip"])
 
     @property
     def width(self) -> int:

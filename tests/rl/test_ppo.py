@@ -397,6 +397,7 @@ def test_load_state_dict_resumes_bitwise():
         ({"activation": "gelu"}, "activation must be one of elu, relu, tanh, got gelu"),
         ({"clip": float("nan")}, "clip must be positive"),
         ({"reward_scale": float("inf")}, "reward_scale must be positive and finite, got inf"),
+        ({"reward_scale": 1e-50}, "reward_scale must be positive and finite, got 1e-50, too small for float32"),
         ({"init_std": 1e39}, "init_std must be positive and finite"),  # infinite in float32
         ({"entropy_coef": float("nan")}, "entropy_coef must be finite and not negative, got nan"),
         ({"value_coef": float("inf")}, "value_coef must be finite"),
