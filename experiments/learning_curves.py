@@ -1,6 +1,6 @@
 """Measure how soon the vertical jump is learnt, for seeds and trainer variants, and write metrics and a plot.
 
-    python experiments/learning_curves.py --seconds 60 --seeds 0 1 2 --variants default eager
+    python experiments/learning_curves.py --seconds 60 --seeds 0 1 2 --variants default compiled_bfloat16
     python experiments/learning_curves.py --device cpu --num-envs 2048 --history 1 --variants small \
         --height-range 0.5 0.9 --seconds 450 --eval-interval 30                 # two cores of a CPU
 

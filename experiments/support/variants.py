@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from itertools import product
 from typing import Any
 
 from jumper_warp.rl.cfg import PpoCfg
@@ -11,10 +12,14 @@ from jumper_warp.utils.errors import InputError
 DEFAULT = "default"  # Name of the unchanged settings
 VARIANTS: dict[str, dict[str, Any]] = {
     DEFAULT: {},
-    "eager": {"fused": False},
+    **{
+        f"{name}_{precision}": {"compile": mode, "precision": precision}
+        for (mode, name), precision in product((("off", "eager"), ("on", "compiled")), ("float32", "bfloat16"))
+    },
+    "fused": {"fused": True},
     "four_minibatches": {"minibatches": 4},
     "less_noise": {"init_std": 0.5},
-    "less_noise_eager": {"init_std": 0.5, "fused": False},
+    "less_noise_bfloat16": {"init_std": 0.5, "precision": "bfloat16"},
     "small": {"hidden": (128, 64, 64), "final_desired_kl": 0.005},
 }
 """Changed fields of `PpoCfg` by name of the variant."""

@@ -1,4 +1,4 @@
-"""Flags that were renamed or removed: for one release the old ones print a line (docs/howto/upgrade.md)."""
+"""Flags that were renamed: for one release the old ones work and print the new ones (docs/howto/upgrade.md)."""
 
 from __future__ import annotations
 
@@ -53,8 +53,6 @@ RENAMED_ENV_PARTS = {
     "width": "std speed-scale angle",
 }  # fmt: skip
 """Old to new parts, between dots, of a task's flags `--env.…`; the first combination that is a flag counts."""
-REMOVED = {"ppo.compile": True, "ppo.precision": True, "ppo.tf32": False}
-"""Flags that have no effect, and whether a value follows them."""
 
 
 def name_of(arg: str) -> str:
@@ -71,27 +69,13 @@ def new_name(old: str, current: set[str]) -> str | None:
     return next((name for parts in itertools.product(*options) if (name := ".".join(parts)) in current), None)
 
 
-def without_removed(args: Sequence[str]) -> list[str]:
-    """Return a copy of the arguments without removed flags and their values; prints each on standard error."""
-    new_args, rest = [], iter(args)
-    for arg in rest:
-        if (old := name_of(arg)) not in REMOVED:
-            new_args.append(arg)
-            continue
-        print(f"jumper: --{old} was removed and has no effect", file=sys.stderr)
-        if REMOVED[old] and "=" not in arg:
-            next(rest, None)
-    return new_args
-
-
 def use_new_names(args: Sequence[str], cfg: Any) -> list[str]:
-    """Return a copy of the arguments with renamed flags under their new names, without removed flags; prints each.
+    """Return a copy of the arguments with renamed flags under their new names; prints each renaming on standard error.
 
     cfg: dataclass of the arguments' settings, or an instance; a flag of it is never renamed.
     Raises InputError: a flag is given under both names.
     """
-    new_args = without_removed(args)
-    args, arg_names = new_args.copy(), [name_of(arg) for arg in new_args]
+    arg_names, new_args = [name_of(arg) for arg in args], list(args)
     if not any(name in RENAMED or name.startswith("env.") for name in arg_names):
         return new_args
     current, renamed = {flag.name for flag in list_flags(cfg)}, {}

@@ -3,6 +3,7 @@
 import hashlib
 import io
 import os
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import torch
@@ -44,6 +45,18 @@ def same_on_all_ranks(text: str) -> bool:
     """Return whether all processes pass the same text (blocking)."""
     digest = int.from_bytes(hashlib.sha256(text.encode()).digest()[:7], "big")
     return all_reduce_max([digest, -digest]) == [digest, -digest]
+
+
+def local_rank_zero_first(procedure: Callable[[], None]) -> None:
+    """Run a procedure on local rank 0 of each machine, then on the other ranks, which read the files it cached."""
+    if world_size() == 1:
+        procedure()
+        return
+    local_rank_zero = os.environ.get("LOCAL_RANK", "0") == "0"
+    for turn in (True, False):
+        if local_rank_zero == turn:
+            procedure()
+        wait_for_ranks()
 
 
 def all_reduce_mean(x: torch.Tensor) -> torch.Tensor:

@@ -115,9 +115,7 @@ class FlatAdam:
         """Allocate Adam's state, all zeros; lr: initial learning rate, stored on the device as `self.lr`."""
         self.flat = flat
         self.exp_avg, self.exp_avg_sq = torch.zeros_like(flat.value), torch.zeros_like(flat.value)
-        self.schedule = torch.tensor([lr, 0.0, 0.0, 0.0], device=flat.value.device)
-        """Learning rate, number of steps, and the factors of both moments that the fused kernels derive from them."""
-        self.lr, self.step = self.schedule[0], self.schedule[1]
+        self.step, self.lr = (torch.full((), x, device=flat.value.device) for x in (0.0, lr))
         self.vectors = AdamVectors(flat.value, flat.gradient, self.exp_avg, self.exp_avg_sq, self.step, self.lr)
 
     def state_dict(self) -> dict[int, dict[str, torch.Tensor]]:

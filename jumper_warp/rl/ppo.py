@@ -7,15 +7,14 @@ Observations, returns and advantages are normalised; the learning rate adapts to
 from __future__ import annotations
 
 import math
-import sys
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import torch
 
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.rl.cfg import PpoCfg
-from jumper_warp.rl.distributed import all_ranks_agree, all_reduce_mean, world_size
+from jumper_warp.rl.distributed import all_reduce_mean
 from jumper_warp.rl.flat import (
     AdamVectors,
     FlatAdam,
@@ -25,18 +24,14 @@ from jumper_warp.rl.flat import (
     clip_gradient,
     flatten_aligned,
 )
-from jumper_warp.rl.fused import use_fused
-from jumper_warp.rl.graphs import CapturedProcedure
+from jumper_warp.rl.graphs import CapturedProcedure, Compiler
 from jumper_warp.rl.mirror import symmetry_of
-from jumper_warp.rl.networks import ActorCritic, ActorTensors, Layers, gaussian_kl, gaussian_log_prob
+from jumper_warp.rl.networks import DTYPES, ActorCritic, ActorTensors, Layers, gaussian_kl, gaussian_log_prob
 from jumper_warp.rl.rollout import Collector
 from jumper_warp.rl.samples import Batch, BatchPacker, RowLayout
 from jumper_warp.utils.allocator import keep_freed_memory
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.state_checks import check_parts, check_tensor, check_values
-
-if TYPE_CHECKING:
-    from jumper_warp.rl.fused.update import FusedUpdate
 
 
 class ActorLosses(NamedTuple):
@@ -74,8 +69,9 @@ class Ppo:
         """
         self.batch_size = cfg.batch_size(env.num_envs)
         self.env, self.cfg = env, cfg
-        if env.device.type == "cuda":
-            torch.set_float32_matmul_precision("high")  # TF32, factors rounded to 10 mantissa bits
+        cuda = env.device.type == "cuda"
+        if cuda:
+            torch.set_float32_matmul_precision("high" if cfg.tf32 else "highest")
         else:
             keep_freed_memory()
         num_critic_obs = env.num_critic_obs if cfg.asymmetric_critic else env.num_obs
@@ -88,41 +84,18 @@ class Ppo:
         self.lr = self.optimiser.lr
         self._desired_kl = torch.full((), cfg.desired_kl, device=env.device)
         self._entropy_coef = torch.full((), cfg.entropy_coef, device=env.device)
+        self.compiler = compiler = Compiler(cfg.compile == "on" or (cfg.compile == "auto" and cuda))
+        self.collector = Collector(env, cfg, self.model, self.flat, compiler)
+        self.rollout = self.collector.rollout
+        self.packer = BatchPacker(self.rollout, cfg, self.model, self.flat, compiler, symmetry and symmetry.obs)
+        self._minibatch = self.packer.rows.new_zeros(self.batch_size // cfg.minibatches, self.packer.rows.shape[1])
         self._orders = torch.zeros(cfg.epochs, self.batch_size, dtype=torch.int64, device=env.device)
         counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
         self._sums = torch.zeros(len(STATISTICS) + 1, **counts)  # sums of the statistics, and the number of steps
-        self.fused: FusedUpdate | None = None
-        """Update with fused kernels; None: with PyTorch."""
-        self._allocate(use_fused(cfg, env.device))
-
-    def _allocate(self, fused: bool) -> None:
-        """Allocate the rollout, and select the procedures of an iteration; fused: whether to use the fused kernels."""
-        env, cfg, model, flat = self.env, self.cfg, self.model, self.flat
-        obs_mirror = model.symmetry and model.symmetry.obs
-        cuda = env.device.type == "cuda"
-        if fused:
-            from jumper_warp.rl.fused.collector import FusedCollector
-            from jumper_warp.rl.fused.networks import FusedModel
-            from jumper_warp.rl.fused.update import FusedUpdate
-
-            rows = max(self.batch_size // cfg.minibatches, env.num_envs)
-            networks = FusedModel(model, flat, rows, torch.bfloat16 if cuda else torch.float32)
-            self.collector = FusedCollector(env, cfg, model, flat, networks)
-            coefficients = (self._desired_kl, self._entropy_coef)
-            self.fused = FusedUpdate(
-                self.collector, cfg, model, self.optimiser, networks, coefficients, self._sums, obs_mirror
-            )
-            self.packer = self.fused
-        else:
-            self.fused = None
-            self.collector = Collector(env, cfg, model, flat)
-            self.packer = BatchPacker(self.collector.rollout, cfg, model, flat, obs_mirror)
-            self._minibatch = self.packer.rows.new_zeros(self.batch_size // cfg.minibatches, self.packer.rows.shape[1])
-        self.rollout = self.collector.rollout
-        capture = cuda and cfg.graphs
-        self._roll = CapturedProcedure(self.collector.roll, capture)
-        self._batch = CapturedProcedure(self.batch, capture)
-        self._optimise = CapturedProcedure(self._run_epochs, capture and not (fused and world_size() > 1))
+        self._actor_gradient, self._critic_gradient = compiler(actor_gradient), compiler(critic_gradient)
+        self._optimiser_step = compiler(optimiser_step)
+        procedures: tuple[Callable[[], object], ...] = (self.collector.roll, self.batch, self._run_epochs)
+        self._roll, self._batch, self._optimise = (CapturedProcedure(each, cuda and cfg.graphs) for each in procedures)
 
     def iterate(self, mark: Callable[[], None] = lambda: None) -> None:
         """Run one iteration; mark: called after the launch of the rollout, and after the launch of the update."""
@@ -141,41 +114,27 @@ class Ppo:
         self._optimise()
 
     def compile(self) -> None:
-        """Compile the fused kernels by running them once, without effect; on failure print a line and use PyTorch."""
-        if self.fused is None:
+        """Compile all functions by running them once; parameters, optimiser and counts are restored afterwards."""
+        if not self.compiler.enabled:
             return
-        counts, reason = (self.collector.episode, self.collector.finished), ""
-        changed = [*self.optimiser.vectors[:4], self.optimiser.schedule, self._sums, *counts]
-        originals = [tensor.clone() for tensor in changed]
-        try:
-            self.fused.warm_up()
-        except Exception as error:  # compilers raise many types
-            reason = f": {' '.join(f'{type(error).__name__} {error}'.split())}"[:300]
-        for tensor, original in zip(changed, originals, strict=True):
+        modified = [*self.optimiser.vectors, self._sums, self.collector.episode, self.collector.finished]
+        originals = [tensor.clone() for tensor in modified]
+        self.collector.warm_up()
+        self.packer.warm_up()
+        self.minibatch_step(self._minibatch, all_reduce=False)
+        for tensor, original in zip(modified, originals, strict=True):
             tensor.copy_(original)
-        if not all_ranks_agree(not reason):
-            print(f"fused update failed, training is slower{reason}", file=sys.stderr)
-            self._allocate(fused=False)
-            for tensor, original in zip((self.collector.episode, self.collector.finished), counts, strict=True):
-                tensor.copy_(original)
 
     @torch.no_grad()
     def batch(self) -> Batch:
-        """Return the rollout's samples, time-major, as views of memory, and update the running statistics.
+        """Return the rollout's samples, time-major, as views of `packer.rows`, and update the running statistics.
 
         Also samples the order of the samples in every epoch.
         """
-        if self.fused is None:
-            self.packer.pack()
-            self._sample_orders()
-        else:
-            self.fused.side_by_side(self._sample_orders, self.packer.pack)
-        return self.packer.batch()
-
-    def _sample_orders(self) -> None:
-        """Sample the order of the samples in every epoch."""
+        self.packer.pack()
         for order in self._orders:
             order.copy_(self.order())
+        return self.packer.layout.split(self.packer.rows)
 
     def order(self) -> torch.Tensor:
         """Return a random permutation of the batch's samples, (batch_size,) int64."""
@@ -186,26 +145,24 @@ class Ppo:
         """Run one optimiser step per minibatch for all epochs."""
         for order in self._orders:
             for samples in order.chunk(self.cfg.minibatches):
-                if isinstance(self.packer, BatchPacker):
-                    torch.index_select(self.packer.rows, 0, samples, out=self._minibatch)
-                    self.minibatch_step(self._minibatch)
-                else:
-                    self.packer.step(samples)
+                torch.index_select(self.packer.rows, 0, samples, out=self._minibatch)
+                self.minibatch_step(self._minibatch)
 
     @torch.no_grad()
-    def minibatch_step(self, rows: torch.Tensor) -> StepStatistics:
-        """Run one optimiser step with PyTorch, without host synchronisation.
+    def minibatch_step(self, rows: torch.Tensor, all_reduce: bool = True) -> StepStatistics:
+        """Run one optimiser step, without host synchronisation; return its statistics, which `statistics` averages.
 
-        Returns its statistics, which `statistics` averages. rows: samples (batch, columns of `packer.layout`).
+        rows: samples (batch, columns of `packer.layout`); all_reduce: whether to average gradients over all ranks.
         """
-        flat, packer, cfg = self.flat, cast("BatchPacker", self.packer), self.cfg
-        value_loss = critic_gradient(rows, packer.layout, flat.critic, cfg, flat.critic_gradient)
-        losses = actor_gradient(
+        flat, packer, cfg = self.flat, self.packer, self.cfg
+        value_loss = self._critic_gradient(rows, packer.layout, flat.critic, cfg, flat.critic_gradient)
+        losses = self._actor_gradient(
             rows, packer.layout, flat.actor, packer.old_log_std, self._entropy_coef, cfg, flat.actor_gradient
         )
         flat.kl.copy_(losses.kl)
-        all_reduce_mean(flat.all_reduced)  # gradient and divergence
-        return optimiser_step(
+        if all_reduce:
+            all_reduce_mean(flat.all_reduced)  # gradient and divergence
+        return self._optimiser_step(
             self.optimiser.vectors, flat.actor_size, flat.kl, self._desired_kl, cfg, losses, value_loss, self._sums
         )
 
@@ -270,7 +227,7 @@ class Ppo:
 
     def close(self) -> None:
         """Delete all CUDA graphs; required before the process group is destroyed."""
-        for graph in (self._roll, self._batch, self._optimise, *([self.fused] if self.fused else [])):
+        for graph in (self._roll, self._batch, self._optimise):
             graph.close()
 
 
@@ -285,8 +242,8 @@ def critic_gradient(
 
     rows: (batch, columns of `layout`); out: the critic's slice of the flat gradient.
     """
-    batch = layout.split(rows)
-    output, layer_inputs = critic.forward(layout.critic_features(rows))
+    batch, dtype = layout.split(rows), DTYPES[cfg.precision]
+    output, layer_inputs = critic.forward(layout.critic_features(rows), dtype)
     value_change = output.squeeze(-1) - batch.value
     error = output.squeeze(-1) - batch.target
     loss, grad = error.square(), error
@@ -295,7 +252,7 @@ def critic_gradient(
         grad = torch.where(clipped_error.square() > loss, clipped_error * (value_change.abs() <= cfg.clip), error)
         loss = torch.maximum(loss, clipped_error.square())
     grad_output = grad * (2.0 * cfg.value_coef / rows.shape[0])
-    out.copy_(flatten_aligned(critic.backward(layer_inputs, grad_output[:, None])))
+    out.copy_(flatten_aligned(critic.backward(layer_inputs, grad_output[:, None], dtype)))
     return loss.mean()
 
 
@@ -310,15 +267,15 @@ def actor_gradient(
 
     rows: (batch, columns of `layout`); entropy_coef: (); out: the slice of actor and noise of the flat gradient.
     """
-    batch, log_std = layout.split(rows), actor.log_std
-    mean, difference, layer_inputs = actor.forward(layout.features(rows))
+    batch, dtype, log_std = layout.split(rows), DTYPES[cfg.precision], actor.log_std
+    mean, difference, layer_inputs = actor.forward(layout.features(rows), dtype)
     ratio = torch.exp(gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob)
     objective = batch.advantage * ratio
     clipped = batch.advantage * ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
     grad_log_prob = torch.where(objective > clipped, 0.0, objective)[:, None] / -rows.shape[0]
     z = (batch.action - mean) * torch.exp(-log_std)
     grad_log_std = (grad_log_prob * (z.square() - 1.0)).sum(0) - entropy_coef
-    gradients = actor.backward(layer_inputs, grad_log_prob * z * torch.exp(-log_std))
+    gradients = actor.backward(layer_inputs, grad_log_prob * z * torch.exp(-log_std), dtype)
     out.copy_(flatten_aligned([*gradients, grad_log_std]))
     entropy = (log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
     kl = gaussian_kl(batch.mean, old_log_std, mean, log_std).mean()

@@ -10,8 +10,9 @@ import torch
 from jumper_warp.envs.vec_env import sanitise
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import ROW_ALIGNMENT, FlatParameters, aligned
+from jumper_warp.rl.graphs import Compiler
 from jumper_warp.rl.mirror import MirrorMap
-from jumper_warp.rl.networks import ActorCritic, Layers, Moments, Scaling, all_reduce_moments, gaussian_log_prob
+from jumper_warp.rl.networks import DTYPES, ActorCritic, Layers, Moments, Scaling, all_reduce_moments, gaussian_log_prob
 from jumper_warp.rl.rollout import RolloutBuffer
 
 CPU_CHUNK_SIZE = 4096  # Samples per chunk on a CPU, so that intermediate tensors stay in its caches
@@ -135,7 +136,7 @@ class BatchPacker:
     """Packer of a rollout into training samples with values, advantages and returns, one in each of `rows`."""
 
     def __init__(
-        self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters,
+        self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, compiler: Compiler,
         obs_mirror: MirrorMap | None = None,
     ) -> None:  # fmt: skip
         """Allocate memory for the packed samples.
@@ -150,56 +151,50 @@ class BatchPacker:
         """Packed samples, (steps · worlds, columns of `layout`), time-major."""
         self.old_log_std = torch.zeros_like(rollout.log_std)  # (num_actions,) of the policy that acted
         self._chunk_size = CPU_CHUNK_SIZE if self.rows.device.type == "cpu" else None
+        self._compute_values_and_gae, self._write_rows = compiler(compute_values_and_gae), compiler(write_rows)
 
     @torch.no_grad()
     def pack(self) -> None:
         """Pack the rollout's samples into `rows`, and update the running statistics with them."""
-        model, rollout, chunk_size = self._model, self._rollout, self._chunk_size
-        moments = (model.obs_moments, model.critic_moments, model.value_moments)
-        scalings = Scalings(*(each.scaling() for each in moments))  # those that acted in the rollout
-        estimates = compute_values_and_gae(rollout, self._critic, scalings, self._cfg, chunk_size)
-        advantage, target = update_statistics(model, self._cfg, estimates.moments, self._obs_mirror)
-        write_rows(self.rows, self.layout, rollout, scalings, estimates, advantage, target, chunk_size)
-        self.old_log_std.copy_(rollout.log_std)
+        model = self._model
+        scalings = self._scalings()  # those that actor and critic used in the rollout
+        estimates = self._estimates(scalings)
+        moments = RolloutMoments(*all_reduce_moments(estimates.moments))
+        obs_moments = moments.obs
+        if self._obs_mirror is not None:
+            symmetric = self._obs_mirror.symmetrise_moments(obs_moments.mean, obs_moments.var)
+            obs_moments = Moments(*symmetric, obs_moments.count)
+        model.obs_moments.update_from_moments(obs_moments)
+        model.critic_moments.update_from_moments(moments.critic_obs)
+        if self._cfg.normalise_value:
+            model.value_moments.update_from_moments(moments.target)
+        mean, var, count = moments.advantage
+        advantage_scaling = Scaling(mean.float(), ((var * count / (count - 1)).sqrt() + 1.0e-8).float())
+        self._pack(scalings, estimates, advantage_scaling)
+        self.old_log_std.copy_(self._rollout.log_std)
 
-    def batch(self) -> Batch:
-        """Return the packed samples, time-major, as views."""
-        return self.layout.split(self.rows)
+    @torch.no_grad()
+    def warm_up(self) -> None:
+        """Compile all functions by packing the rollout once; overwrites `rows`."""
+        scalings = self._scalings()
+        self._pack(scalings, self._estimates(scalings), advantage_scaling=scalings.value)
 
+    def _scalings(self) -> Scalings:
+        """Return the current mean and standard deviation of observations and values."""
+        model = self._model
+        return Scalings(*(each.scaling() for each in (model.obs_moments, model.critic_moments, model.value_moments)))
 
-def update_statistics(
-    model: ActorCritic, cfg: PpoCfg, local: RolloutMoments, obs_mirror: MirrorMap | None
-) -> tuple[Scaling, Scaling]:
-    """Update a model's running statistics, and return the normalisations of advantages and returns, () each.
+    def _estimates(self, scalings: Scalings) -> Estimates:
+        """Compute values, advantages and returns of the rollout."""
+        return self._compute_values_and_gae(self._rollout, self._critic, scalings, self._cfg, self._chunk_size)
 
-    local: moments over this rank's samples; obs_mirror: map that symmetrises observation statistics.
-    """
-    moments = RolloutMoments(*all_reduce_moments(local))
-    obs_moments = moments.obs
-    if obs_mirror is not None:
-        symmetric = obs_mirror.symmetrise_moments(obs_moments.mean, obs_moments.var)
-        obs_moments = Moments(*symmetric, obs_moments.count)
-    model.obs_moments.update_from_moments(obs_moments)
-    model.critic_moments.update_from_moments(moments.critic_obs)
-    if cfg.normalise_value:
-        model.value_moments.update_from_moments(moments.target)
-    mean, var, count = moments.advantage
-    advantage = Scaling(mean.float(), ((var * count / (count - 1)).sqrt() + 1.0e-8).float())
-    return advantage, model.value_moments.scaling()
-
-
-def estimate_returns(
-    head: torch.Tensor, final_head: torch.Tensor, reward: torch.Tensor, done: torch.Tensor, timeout: torch.Tensor,
-    scaling: Scaling, cfg: PpoCfg,
-) -> tuple[torch.Tensor, torch.Tensor]:  # fmt: skip
-    """Return advantages and returns (num_steps · num_envs,) in scaled rewards, time-major.
-
-    A timeout adds the discounted value of the final observation. head: the critic's outputs (num_steps + 1, num_envs);
-    final_head, reward, done, timeout: (num_steps, num_envs); scaling: of values.
-    """
-    value, final_value = scaling.denormalise(head), scaling.denormalise(final_head)
-    advantage, target = gae(reward + cfg.gamma * timeout * final_value, done, value, cfg.gamma, cfg.lam)
-    return advantage.flatten(), target.flatten()
+    def _pack(self, scalings: Scalings, estimates: Estimates, advantage_scaling: Scaling) -> None:
+        """Pack the rollout's samples and estimates into `rows`; arguments: see `write_rows`."""
+        target_scaling = self._model.value_moments.scaling() if self._cfg.normalise_value else None
+        self._write_rows(
+            self.rows, self.layout, self._rollout, scalings, estimates, advantage_scaling, target_scaling,
+            self._chunk_size,
+        )  # fmt: skip
 
 
 def compute_values_and_gae(
@@ -207,20 +202,20 @@ def compute_values_and_gae(
 ) -> Estimates:
     """Return values, advantages and returns (num_steps · num_envs,) of a rollout, and moments of its samples.
 
-    chunk_size: samples per evaluation of the critic.
+    A timeout adds the discounted value of the final observation. chunk_size: samples per evaluation of the critic.
     """
-    columns = critic.weights[0].shape[1]
+    columns, dtype = critic.weights[0].shape[1], DTYPES[cfg.precision]
 
     def value_head(critic_obs: torch.Tensor) -> torch.Tensor:
         """Return the critic's output (steps, num_envs) for (steps, num_envs, num_critic_obs)."""
         scaling, chunks = scalings.critic_obs, _chunks(critic_obs.flatten(0, 1), chunk_size)
-        heads = [critic.forward(scaling.features(sanitise(chunk), columns))[0] for chunk in chunks]
+        heads = [critic.forward(scaling.features(sanitise(chunk), columns), dtype)[0] for chunk in chunks]
         return torch.cat(heads).view(critic_obs.shape[:2])
 
     head, final_head = value_head(buffer.critic_obs), value_head(buffer.final_critic_obs)
-    advantage, target = estimate_returns(
-        head, final_head, buffer.reward, buffer.done, buffer.timeout, scalings.value, cfg
-    )
+    value, final_value = scalings.value.denormalise(head), scalings.value.denormalise(final_head)
+    reward = buffer.reward + cfg.gamma * buffer.timeout * final_value
+    advantage, target = (x.flatten() for x in gae(reward, buffer.done, value, cfg.gamma, cfg.lam))
     samples = (advantage, target, buffer.obs[:-1].flatten(0, 1), buffer.critic_obs[:-1].flatten(0, 1))
     moments = RolloutMoments(*(Moments.from_samples(x, chunk_size) for x in samples))
     return Estimates(head[:-1].flatten(), advantage, target, moments)
@@ -228,14 +223,14 @@ def compute_values_and_gae(
 
 def write_rows(
     rows: torch.Tensor, layout: RowLayout, buffer: RolloutBuffer, scalings: Scalings, estimates: Estimates,
-    advantage_scaling: Scaling, target_scaling: Scaling, chunk_size: int | None,
+    advantage_scaling: Scaling, target_scaling: Scaling | None, chunk_size: int | None,
 ) -> None:  # fmt: skip
     """Pack the samples of a rollout into memory, one row per sample: rows (batch, columns of `layout`).
 
     chunk_size: samples packed at a time (None: all).
-    scalings normalise observations, advantage_scaling and target_scaling advantages and returns.
+    scalings normalise observations, advantage_scaling and target_scaling (None: not) advantages and returns.
     """
-    target = target_scaling.normalise(estimates.target)
+    target = estimates.target if target_scaling is None else target_scaling.normalise(estimates.target)
     steps = [x.flatten(0, 1) for x in (buffer.obs[:-1], buffer.critic_obs[:-1], buffer.action, buffer.mean)]
     pieces = [rows, *steps, estimates.value, advantage_scaling.normalise(estimates.advantage), target]
     for out, obs, critic_obs, action, mean, *estimated in zip(*[_chunks(x, chunk_size) for x in pieces], strict=True):

@@ -35,21 +35,6 @@ def test_old_flag_becomes_the_new_flag_and_prints_it(cfg, old, new, capsys):
     assert use_new_names(new, cfg) == new and not capsys.readouterr().err
 
 
-@pytest.mark.parametrize(
-    ("old", "rest"),
-    [
-        (["--ppo.compile", "off", "--seed", "1"], ["--seed", "1"]),
-        (["--ppo.precision=bfloat16", "--seed=1"], ["--seed=1"]),
-        (["--seed=1", "--ppo.no-tf32"], ["--seed=1"]),
-        (["--ppo.compile"], []),
-    ],
-)
-def test_removed_flag_and_its_value_are_dropped_with_a_line(old, rest, capsys):
-    assert use_new_names(old, TrainArgs()) == rest
-    (line,) = capsys.readouterr().err.splitlines()
-    assert re.fullmatch(r"jumper: --ppo\.[a-z0-9]+ was removed and has no effect", line)
-
-
 def test_keeps_flag_of_a_users_task_with_an_old_name(capsys):
     @dataclass
     class OwnFlags:

@@ -7,15 +7,19 @@ from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 from pathlib import Path
 
+import pytest
 import torch
 
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.checkpoint import load_checkpoint
-from jumper_warp.rl.ppo import Ppo
+from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.runner import CHECKPOINTS, train
+from jumper_warp.utils.errors import InputError
 from toy_task import PushTask, join, push_cfg
 
-FUSED = PpoCfg(num_steps=4, epochs=1, minibatches=2, hidden=(48, 16), max_grad_norm=0.3, lr=3e-3, desired_kl=1e-4)
+FUSED = PpoCfg(
+    num_steps=4, epochs=1, minibatches=2, hidden=(48, 16), max_grad_norm=0.3, lr=3e-3, desired_kl=1e-4, fused=True
+)
 
 
 class NoiseTask(PushTask):
@@ -66,7 +70,7 @@ def minibatch_gradients(cfgs):
     results = []
     for cfg in cfgs:
         torch.manual_seed(0)
-        ppo = Ppo(NoiseTask(12), cfg)
+        ppo = make_ppo(NoiseTask(12), cfg)
         ppo.collect()
         batch = ppo.batch()
         for segment in ppo.flat.segments:  # other weights than those that acted, and large actions
@@ -84,18 +88,29 @@ def minibatch_gradients(cfgs):
 
 def iterations(cfgs):
     """Return for each settings parameters, batch, statistics and optimiser after an iteration and another rollout."""
+    from jumper_warp.rl.fused.ppo import FusedPpo
+
     results = []
     for cfg in cfgs:
         torch.manual_seed(0)
-        ppo = Ppo(NoiseTask(8), cfg)
+        ppo = make_ppo(NoiseTask(8), cfg)
         ppo.compile()
         ppo.iterate()
         statistics = ppo.statistics()
         ppo.collect()
         batch = [part.float().clone() for part in ppo.batch()]
         state = ppo.state_dict()
-        results.append((ppo.fused is not None, state, batch, statistics))
+        results.append((isinstance(ppo, FusedPpo), state, batch, statistics))
     return results
+
+
+def failed_compilation():
+    """Return the message of kernels that do not compile."""
+    ppo = make_ppo(NoiseTask(4), FUSED)
+    ppo.fused.warm_up = lambda: torch.zeros(2).view(3)
+    with pytest.raises(InputError) as error:
+        ppo.compile()
+    return str(error.value)
 
 
 def whole_and_resumed(folder: Path):
@@ -115,7 +130,7 @@ def update_rank(rank, port, path):
     join(rank, port)
     torch.distributed.init_process_group("gloo")
     torch.manual_seed(0)
-    ppo = Ppo(NoiseTask(4), FUSED)
+    ppo = make_ppo(NoiseTask(4), FUSED)
     torch.manual_seed(1 + rank)
     ppo.compile()
     ppo.iterate()

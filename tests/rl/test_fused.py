@@ -2,12 +2,22 @@
 
 import dataclasses
 import importlib.util
-import types
 
 import pytest
 import torch
 
-from fused_runs import FUSED, NoiseTask, interpreted, iterations, minibatch_gradients, update_rank, whole_and_resumed
+from fused_runs import (
+    FUSED,
+    NoiseTask,
+    failed_compilation,
+    interpreted,
+    iterations,
+    minibatch_gradients,
+    update_rank,
+    whole_and_resumed,
+)
+from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.mirror import symmetry_of
 from jumper_warp.rl.networks import ActorCritic
 from jumper_warp.rl.ppo import Ppo
@@ -59,6 +69,11 @@ def test_iteration_agrees_with_pytorch():
 
 
 @needs_triton
+def test_kernels_that_do_not_compile_are_an_input_error():
+    assert interpreted(failed_compilation).startswith("--ppo.fused does not work here: RuntimeError shape '[3]'")
+
+
+@needs_triton
 def test_resumed_training_is_bitwise_equal(tmp_path):
     whole, resumed = interpreted(whole_and_resumed, tmp_path)
     for part in ("ppo", "env", "rng"):
@@ -86,20 +101,10 @@ def test_two_ranks_with_different_worlds_have_the_same_parameters(tmp_path):
 )
 def test_other_networks_use_pytorch_and_print_a_line(change, reason, capsys, monkeypatch):
     monkeypatch.setenv("TRITON_INTERPRET", "1")
-    assert Ppo(PushTask(4), dataclasses.replace(FUSED, **change)).fused is None
-    assert capsys.readouterr().err == f"fused update not used, training is slower: {reason}\n"
+    assert type(make_ppo(PushTask(4), dataclasses.replace(FUSED, **change))) is Ppo
+    assert capsys.readouterr().err == f"--ppo.fused has no effect: {reason}\n"
 
 
-def test_kernels_that_fail_are_replaced_by_pytorch_with_a_line(capsys):
-    def fail():
-        ppo.lr.zero_()
-        raise ValueError("no such\ninstruction")
-
-    ppo = Ppo(PushTask(4), FUSED)
-    ppo.collector.episode.fill_(7.0)
-    ppo.fused = types.SimpleNamespace(warm_up=fail)
-    ppo.compile()
-    assert capsys.readouterr().err == "fused update failed, training is slower: ValueError no such instruction\n"
-    assert ppo.fused is None and ppo.lr == pytest.approx(FUSED.lr) and (ppo.collector.episode == 7.0).all()
-    ppo.env.reset()
-    ppo.iterate()
+def test_fused_update_is_opt_in(capsys, monkeypatch):
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    assert type(make_ppo(PushTask(4), PpoCfg())) is Ppo and capsys.readouterr().err == ""

@@ -250,12 +250,13 @@ def sum_partials(partial, table, gradient, stride, total, SPLITS: tl.constexpr, 
 
 @triton.jit
 def prepare_step(
-    gradient, squares, schedule, desired_kl, size, actor_size, min_lr, max_lr, ADAPT: tl.constexpr, B: tl.constexpr
-):
+    gradient, squares, lr, num_steps, factors, desired_kl, size, actor_size, min_lr, max_lr, ADAPT: tl.constexpr,
+    B: tl.constexpr,
+):  # fmt: skip
     """Write sums of squares of the gradient by block, (blocks, 2) of actor and critic, and the step's learning rate.
 
-    gradient: (size + 32,), the last entry is the KL divergence. schedule: learning rate, number of steps, and Adam's
-    factors of both moments; the rate adapts as in `flat.adapted_lr`.
+    gradient: (size + 32,), the last entry is the KL divergence. lr, num_steps: () of `FlatAdam`; the rate adapts as in
+    `flat.adapted_lr`. factors: (2,) Adam's factors of both moments in this step.
     """
     block = tl.program_id(0)
     i = block * B + tl.arange(0, B)
@@ -263,27 +264,27 @@ def prepare_step(
     tl.store(squares + 2 * block, tl.sum(tl.where(i < actor_size, grad * grad, 0.0), 0))
     tl.store(squares + 2 * block + 1, tl.sum(tl.where(i < actor_size, 0.0, grad * grad), 0))
     if block == 0:
-        rate = tl.load(schedule)
-        step = tl.load(schedule + 1) + 1.0
+        rate = tl.load(lr)
+        step = tl.load(num_steps) + 1.0
         if ADAPT:
             kl, desired = tl.load(gradient + size + 31), tl.load(desired_kl)
             reduced = tl.where(kl > 2.0 * desired, tl.maximum(rate / 1.5, min_lr), rate)
             rate = tl.where((kl < 0.5 * desired) & (kl > 0.0), tl.minimum(rate * 1.5, max_lr), reduced)
         double = step.to(tl.float64)  # 1 - beta^step cancels in float32
-        tl.store(schedule, rate)
-        tl.store(schedule + 1, step)
-        tl.store(schedule + 2, rate / (1.0 - tl.exp(double * LOG_BETA_1)).to(tl.float32))
-        tl.store(schedule + 3, 1.0 / tl.sqrt(1.0 - tl.exp(double * LOG_BETA_2)).to(tl.float32))
+        tl.store(lr, rate)
+        tl.store(num_steps, step)
+        tl.store(factors, rate / (1.0 - tl.exp(double * LOG_BETA_1)).to(tl.float32))
+        tl.store(factors + 1, 1.0 / tl.sqrt(1.0 - tl.exp(double * LOG_BETA_2)).to(tl.float32))
 
 
 @triton.jit
 def adam_step(
-    value, gradient, exp_avg, exp_avg_sq, squares, schedule, weights, table, sums, size, actor_size, max_norm,
+    value, gradient, exp_avg, exp_avg_sq, squares, factors, weights, table, sums, size, actor_size, max_norm,
     BLOCKS: tl.constexpr, NUM_SQUARES: tl.constexpr, MIRROR: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
     """Clip the gradient, update parameters and moments by a step of Adam, and add the statistics to `sums`.
 
-    gradient, squares, schedule: of `prepare_step`, NUM_SQUARES blocks, a power of two BLOCKS at least. weights: the
+    gradient, squares, factors: of `prepare_step`, NUM_SQUARES blocks, a power of two BLOCKS at least. weights: the
     copy of the parameters for products, in the places of `table` (3, size + 32). A non-finite gradient counts as 0.
     """
     block = tl.arange(0, BLOCKS)
@@ -297,8 +298,8 @@ def adam_step(
     first = tl.load(exp_avg + i, mask=mask, other=0.0)
     first += 0.1 * (grad - first)
     second = 0.999 * tl.load(exp_avg_sq + i, mask=mask, other=0.0) + 0.001 * grad * grad
-    root = tl.sqrt(second) * tl.load(schedule + 3) + 1.0e-8
-    new = tl.load(value + i, mask=mask, other=0.0) - first / root * tl.load(schedule + 2)
+    root = tl.sqrt(second) * tl.load(factors + 1) + 1.0e-8
+    new = tl.load(value + i, mask=mask, other=0.0) - first / root * tl.load(factors)
     tl.store(exp_avg + i, first, mask=mask)
     tl.store(exp_avg_sq + i, second, mask=mask)
     tl.store(value + i, new, mask=mask)

@@ -14,8 +14,8 @@ from jumper_warp.rl.fused.collector import FusedCollector
 from jumper_warp.rl.fused.networks import SPLITS, FusedModel, blocks, launch, rows_per_split
 from jumper_warp.rl.graphs import CapturedProcedure
 from jumper_warp.rl.mirror import MirrorMap
-from jumper_warp.rl.networks import ActorCritic, Moments
-from jumper_warp.rl.samples import Batch, RolloutMoments, estimate_returns, update_statistics
+from jumper_warp.rl.networks import ActorCritic, Moments, Scaling, all_reduce_moments
+from jumper_warp.rl.samples import Batch, RolloutMoments, gae
 
 SUM_BLOCK = 128  # Entries of the flat gradient in a block of the kernels that sum it
 ADAM_BLOCK = 1024  # Entries of the flat vector in a block of Adam's kernel
@@ -42,6 +42,7 @@ class FusedUpdate:
         self._features, self._critic_features = rollout.features.flatten(0, 1), collector.critic_inputs
         self._samples = rollout.samples.flatten(0, 1)
         self._head = torch.zeros(len(self._critic_features), device=device)  # the critic's outputs
+        self._factors = torch.zeros(2, device=device)  # of Adam's moments
         self._squares = torch.zeros(blocks(self._flat.size, SUM_BLOCK), 2, device=device)
         self._side_stream = torch.cuda.Stream(device) if device.type == "cuda" else None
         self._index = torch.zeros(self._rows, dtype=torch.int64, device=device)  # samples, for the graphs of many ranks
@@ -54,7 +55,7 @@ class FusedUpdate:
     @torch.no_grad()
     def pack(self) -> None:
         """Compute values, advantages and returns of the rollout, and update the running statistics."""
-        rollout, model = self._collector.rollout, self._model
+        rollout, model, cfg = self._collector.rollout, self._model, self._cfg
         (steps, worlds), actions = rollout.reward.shape, rollout.action.shape[2]
         for start in range(0, len(self._head), self._rows):
             head = self._head[start : start + self._rows]
@@ -62,16 +63,29 @@ class FusedUpdate:
             head.copy_(output[: len(head), 0])
         head, final_head = self._head.view(-1, worlds).split((steps + 1, steps))
         scaling = model.value_moments.scaling()
-        advantage, target = estimate_returns(
-            head, final_head, rollout.reward, rollout.done, rollout.timeout, scaling, self._cfg
-        )
-        moments = (Moments.from_samples(advantage), Moments.from_samples(target))
-        observed = (self._collector.obs.moments(), self._collector.critic_obs.moments())
-        advantage_scaling, target_scaling = update_statistics(
-            model, self._cfg, RolloutMoments(*moments, *observed), self._obs_mirror
-        )
-        columns = (head[:-1].flatten(), advantage_scaling.normalise(advantage), target_scaling.normalise(target))
+        reward = rollout.reward + cfg.gamma * rollout.timeout * scaling.denormalise(final_head)
+        value = scaling.denormalise(head)
+        advantage, target = (x.flatten() for x in gae(reward, rollout.done, value, cfg.gamma, cfg.lam))
+        advantage_scaling = self._update_statistics(Moments.from_samples(advantage), Moments.from_samples(target))
+        normalised = (advantage_scaling.normalise(advantage), model.value_moments.scaling().normalise(target))
+        columns = (head[:-1].flatten(), *normalised)
         self._samples[:, 2 * actions + 1 : 2 * actions + 4] = torch.stack(columns, dim=1)
+
+    def _update_statistics(self, advantage: Moments, target: Moments) -> Scaling:
+        """Update the running statistics as `BatchPacker.pack`, and return the normalisation of advantages, () each."""
+        model, collector = self._model, self._collector
+        local = RolloutMoments(advantage, target, collector.obs.moments(), collector.critic_obs.moments())
+        moments = RolloutMoments(*all_reduce_moments(local))
+        obs_moments = moments.obs
+        if self._obs_mirror is not None:
+            symmetric = self._obs_mirror.symmetrise_moments(obs_moments.mean, obs_moments.var)
+            obs_moments = Moments(*symmetric, obs_moments.count)
+        model.obs_moments.update_from_moments(obs_moments)
+        model.critic_moments.update_from_moments(moments.critic_obs)
+        if self._cfg.normalise_value:
+            model.value_moments.update_from_moments(moments.target)
+        mean, var, count = moments.advantage
+        return Scaling(mean.float(), ((var * count / (count - 1)).sqrt() + 1.0e-8).float())
 
     def batch(self) -> Batch:
         """Return the samples, time-major, as views; features in the type of the products."""
@@ -143,11 +157,11 @@ class FusedUpdate:
         """Adapt the learning rate, clip the gradient, and run a step of Adam."""
         flat, cfg, adam, squares = self._flat, self._cfg, self._optimiser, self._squares
         launch(kernels.prepare_step, (len(squares),))(
-            flat.all_reduced, squares, adam.schedule, self._desired_kl, flat.size, flat.actor_size, cfg.min_lr,
-            cfg.max_lr, cfg.desired_kl > 0.0, SUM_BLOCK,
+            flat.all_reduced, squares, adam.lr, adam.step, self._factors, self._desired_kl, flat.size, flat.actor_size,
+            cfg.min_lr, cfg.max_lr, cfg.desired_kl > 0.0, SUM_BLOCK,
         )  # fmt: skip
         launch(kernels.adam_step, (blocks(flat.size, ADAM_BLOCK),))(
-            flat.value, flat.all_reduced, adam.exp_avg, adam.exp_avg_sq, squares, adam.schedule,
+            flat.value, flat.all_reduced, adam.exp_avg, adam.exp_avg_sq, squares, self._factors,
             self._fused.weights, self._fused.layout.table, self._sums, flat.size, flat.actor_size, cfg.max_grad_norm,
             1 << (len(squares) - 1).bit_length(), len(squares), self._fused.mirrored, ADAM_BLOCK,
         )  # fmt: skip
