@@ -75,7 +75,7 @@ def minibatch_gradients(cfgs):
         batch = ppo.batch()
         for segment in ppo.flat.segments:  # other weights than those that acted, and large actions
             segment.view(ppo.flat.value).add_(0.3 * torch.randn(segment.shape))
-        ppo.fused._fused.copy_weights()
+        ppo.networks.copy_weights()
         samples = torch.randperm(ppo.batch_size)[:21]
         ppo.fused.compute_gradient(samples)
         names = {id(param): name for name, param in ppo.model.named_parameters()}

@@ -30,7 +30,7 @@ class FusedPpo(Ppo):
         del self.collector, self.rollout, self.packer, self._minibatch, self._roll, self._batch, self._optimise
         model, cuda = self.model, env.device.type == "cuda"
         rows = max(self.batch_size // cfg.minibatches, env.num_envs)
-        networks = FusedModel(model, self.flat, rows, torch.bfloat16 if cuda else torch.float32)
+        self.networks = networks = FusedModel(model, self.flat, rows, torch.bfloat16 if cuda else torch.float32)
         collector = FusedCollector(env, cfg, model, self.flat, networks)
         self.collector, self.rollout = cast("Collector", collector), cast("RolloutBuffer", collector.rollout)
         coefficients, obs_mirror = (self._desired_kl, self._entropy_coef), model.symmetry and model.symmetry.obs
