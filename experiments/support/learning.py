@@ -16,6 +16,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.envs.vec_env import VecEnv
 from jumper_warp.evaluation.heights import run_jumps
 from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.ppo import Ppo
 from jumper_warp.rl.shac import Shac
 from jumper_warp.tasks.cfg import TaskCfg
@@ -95,7 +96,7 @@ def train_and_time(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Learning
     """
     torch.manual_seed(seed)
     env = Env(task, args.num_envs, seed=seed, device=args.device, randomize=args.randomize, noise=args.randomize)
-    trainer = Ppo(env, cfg)
+    trainer = make_ppo(env, cfg)
     warm_up(env, trainer)
     ready, eval_env = process_age(), make_eval_env(task, args.num_jumps, args.device)
     success_rate(trainer, eval_env)

@@ -14,8 +14,8 @@ import warp as wp
 from jumper_warp.envs.env import Env
 from jumper_warp.registry import make_task
 from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.logger import Stopwatch
-from jumper_warp.rl.ppo import Ppo
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.simulation import Simulation, SolverName
 from jumper_warp.sim.slices import SlicedGraph, WorldRange
@@ -197,7 +197,7 @@ def time_ppo(envs: int, cfg: PpoCfg, iterations: int, device: str | None) -> dic
     """
     env, _ = stepping_env(envs, device)
     begin = time.perf_counter()
-    ppo = Ppo(env, cfg)
+    ppo = make_ppo(env, cfg)
     before = ppo.model.log_std.detach().clone()
     ppo.compile()
     for _ in range(3):  # eager, capture, replay

@@ -16,6 +16,7 @@ VARIANTS: dict[str, dict[str, Any]] = {
         f"{name}_{precision}": {"compile": mode, "precision": precision}
         for (mode, name), precision in product((("off", "eager"), ("on", "compiled")), ("float32", "bfloat16"))
     },
+    "fused": {"fused": True},
     "four_minibatches": {"minibatches": 4},
     "less_noise": {"init_std": 0.5},
     "less_noise_bfloat16": {"init_std": 0.5, "precision": "bfloat16"},

@@ -75,6 +75,9 @@ class PpoCfg:
     compiled code on disk."""
     graphs: bool = True
     """Whether to capture an iteration as CUDA graphs and replay them; no effect on a CPU."""
+    fused: bool = False
+    """Whether to act and update with fused bfloat16 kernels, on GPUs of compute capability 9.0 or higher (experimental:
+    not yet measured on a GPU)."""
 
     def __post_init__(self) -> None:
         """Raise InputError (a ValueError) if a setting of PPO is out of range."""
@@ -216,12 +219,12 @@ class TrainCfg:
 RSL_RL_UNUSED = (
     "log_interval", "max_checkpoints", "best_metric", "tensorboard", "wandb", "ppo.normalise_value",
     "ppo.final_entropy_coef", "ppo.min_lr", "ppo.max_lr", "ppo.final_desired_kl", "ppo.reward_scale", "ppo.tf32",
-    "ppo.precision", "ppo.compile", "ppo.graphs",
+    "ppo.precision", "ppo.compile", "ppo.graphs", "ppo.fused",
 )  # fmt: skip
 SHAC_UNUSED = (
     "ppo.epochs", "ppo.minibatches", "ppo.clip", "ppo.value_coef", "ppo.clip_value", "ppo.entropy_coef",
     "ppo.final_entropy_coef", "ppo.lr", "ppo.min_lr", "ppo.max_lr", "ppo.desired_kl", "ppo.final_desired_kl",
-    "ppo.tf32", "ppo.precision", "ppo.compile", "ppo.graphs",
+    "ppo.tf32", "ppo.precision", "ppo.compile", "ppo.graphs", "ppo.fused",
 )  # fmt: skip
 _SHAC = tuple(f"shac.{spec.name}" for spec in fields(ShacCfg))
 UNUSED = {"ppo": _SHAC, "shac": SHAC_UNUSED, "rsl-rl": (*RSL_RL_UNUSED, *_SHAC)}

@@ -24,9 +24,10 @@ from jumper_warp.rl.actor_init import ActorInit, apply_actor_init
 from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import DECODE_ERRORS, Checkpoint, CheckpointError, one_line_message, save_checkpoint
 from jumper_warp.rl.distributed import Rank
+from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.logger import Stopwatch, TrainingLog
 from jumper_warp.rl.metrics_file import METRICS_FILE
-from jumper_warp.rl.ppo import STATISTICS, Ppo
+from jumper_warp.rl.ppo import STATISTICS
 from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.rl.run_folder import CONFIG, full_config, new_folder, report_non_finite, rescue_folder, write_config
 from jumper_warp.rl.shac import STATISTICS as SHAC_STATISTICS
@@ -160,7 +161,7 @@ class TrainingRun:
         self.cfg, self.env, self.rank = cfg, env, rank
         self._command = command or f"jumper train {cfg.task}"
         use_shac = cfg.trainer == "shac"
-        self.ppo = Shac(cast(DifferentiableVecEnv, env), cfg.ppo, cfg.shac) if use_shac else Ppo(env, cfg.ppo)
+        self.ppo = Shac(cast(DifferentiableVecEnv, env), cfg.ppo, cfg.shac) if use_shac else make_ppo(env, cfg.ppo)
         losses = {f"Loss/{name}" for name in (SHAC_STATISTICS if use_shac else STATISTICS)}
         _check_best_metric(cfg.best_metric, {*env.metrics(), *losses, *LEARNING, *PERF})
         self.config = full_config(cfg, env, rank)

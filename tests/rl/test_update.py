@@ -11,33 +11,11 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import FlatAdam, FlatParameters, adam_step
 from jumper_warp.rl.networks import ActorCritic, gaussian_log_prob
 from jumper_warp.rl.ppo import Ppo
+from ppo_oracle import reference_losses
 from toy_task import PushTask, fill
 
 CFG = PpoCfg(num_steps=8, epochs=3, minibatches=4, hidden=(16, 9), max_grad_norm=0.3, lr=3e-3)
 WORLDS = 16
-
-
-def reference_losses(model, part, old_log_std, cfg):
-    """Return surrogate, value loss, entropy, asymmetry and KL divergence, each (), by torch.distributions.
-
-    part: a minibatch, (samples, ...) by the fields of `Batch`. old_log_std: (num_actions,) of the policy that acted.
-    """
-    output, image = model.actor(part["features"]), -model.actor(-part["features"])  # the task's mirror map is -x
-    mean = 0.5 * (output + image) if cfg.symmetry == "actor" else output
-    asymmetry = torch.nn.functional.mse_loss(output, image) if cfg.symmetry != "off" else torch.zeros(())
-    policy = torch.distributions.Normal(mean, model.log_std.exp())
-    old = torch.distributions.Normal(part["mean"], old_log_std.exp())
-    ratio = (policy.log_prob(part["action"]) - old.log_prob(part["action"])).sum(-1).exp()
-    clipped = ratio.clamp(1 - cfg.clip, 1 + cfg.clip)
-    surrogate = -torch.min(ratio * part["advantage"], clipped * part["advantage"]).mean()
-    value = model.critic(part["critic_features"])[:, 0]
-    loss = (value - part["target"]) ** 2
-    if cfg.clip_value:
-        clipped_value = part["value"] + (value - part["value"]).clamp(-cfg.clip, cfg.clip)
-        loss = torch.max(loss, (clipped_value - part["target"]) ** 2)
-    entropy = policy.entropy()[0].sum()
-    kl = torch.distributions.kl_divergence(old, policy).sum(-1).mean()
-    return surrogate, loss.mean(), entropy, asymmetry, kl.detach()
 
 
 def reference_update(model, batch, old_log_std, orders, cfg):

@@ -1,0 +1,199 @@
+"""Check and time the fused update of PPO on random observations, and write metrics.
+
+    python experiments/fused_update.py --out outputs/fused_update
+
+It needs a GPU of compute capability 9.0 or higher and Triton. Gradients of a minibatch are compared with autograd in
+float64 on the same samples, without and with the mirror-symmetric actor; bfloat16 products cause errors of about 1 %.
+Two trainings with one seed must be bitwise equal. Times are of the fused and of the default update, as CUDA graphs;
+the environment's steps are empty. `benchmark_training.py --only-ppo --variants fused` times whole trainings.
+"""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from typing import TYPE_CHECKING, cast
+
+import torch
+import warp as wp
+
+from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.fused import make_ppo, use_fused
+from jumper_warp.rl.graphs import CapturedProcedure
+from jumper_warp.rl.networks import gaussian_log_prob
+from jumper_warp.rl.ppo import Ppo
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.output import output_dir, write_metrics
+from jumper_warp.utils.runtime import configure_device
+from support.scripts import DeviceArgs, report, run_script
+from support.timing import median_time
+
+if TYPE_CHECKING:
+    from jumper_warp.rl.fused.collector import FusedRollout
+    from jumper_warp.rl.fused.ppo import FusedPpo
+
+SIZES = {"obs": 147, "critic_obs": 208, "action": 12}  # of the vertical jump with four observation steps
+
+
+@dataclass(frozen=True)
+class Args(DeviceArgs):
+    """Flags of the check of the fused update."""
+
+    num_envs: int = 8192  # Number of environments
+    num_steps: int = 32  # Policy steps of each environment in an iteration
+    epochs: int = 5  # Passes over the samples in an update
+    hidden: tuple[int, ...] = (256, 128, 128)  # Widths of the hidden layers
+    calls: int = 20  # Number of calls in a repetition of a timing; the median of five repetitions is reported
+
+    def __post_init__(self) -> None:
+        if min(self.num_envs, self.num_steps, self.epochs, self.calls) < 1:
+            raise InputError("num_envs, num_steps, epochs and calls must be at least 1")
+
+
+class RandomEnv:
+    """A `VecEnv` with random observations and rewards; with `still` they are constant, so that a step costs nothing."""
+
+    num_obs, num_critic_obs, num_actions = SIZES.values()
+
+    def __init__(self, num_envs: int, device: torch.device, still: bool = False) -> None:
+        """Allocate observations, the critic's observations, rewards and ends of episodes."""
+        self.num_envs, self.device, self.still = num_envs, device, still
+        self.obs = self.final_obs = torch.randn(num_envs, self.num_obs, device=device)
+        self.critic_obs = self.final_critic_obs = torch.randn(num_envs, self.num_critic_obs, device=device)
+        self.reward, self.done, self.timeout = torch.zeros(3, num_envs, device=device)
+
+    def step(self, action: torch.Tensor) -> None:
+        """Draw new observations and rewards; observations depend on the action."""
+        if not self.still:
+            self.obs.normal_().add_(0.1 * action.mean())
+            self.critic_obs.normal_()
+            self.reward.normal_()
+
+    def reset(self) -> None:
+        """Do nothing."""
+
+    def mirror(self, what: str) -> tuple[list[int], list[float]]:
+        """Return a mirror map (order, signs) that exchanges neighbours and negates every other pair."""
+        size = SIZES["obs" if what == "observation" else "action"]
+        pairs = 2 * (size // 2)
+        order = [i ^ 1 for i in range(pairs)] + list(range(pairs, size))
+        return order, [-1.0 if i % 4 < 2 and i < pairs else 1.0 for i in range(size)]
+
+
+def build(args: Args, device: torch.device, still: bool = False, **changes: object) -> Ppo:
+    """Return compiled PPO with weights of seed 0, fused unless `changes` of the settings say otherwise."""
+    torch.manual_seed(0)
+    cfg = PpoCfg(num_steps=args.num_steps, epochs=args.epochs, hidden=args.hidden, fused=True)
+    ppo = make_ppo(RandomEnv(args.num_envs, device, still), dataclasses.replace(cfg, **changes))  # pyright: ignore
+    ppo.compile()
+    return ppo
+
+
+def gradient_errors(ppo: FusedPpo) -> dict[str, float]:
+    """Return the relative errors of a minibatch's gradient, by parameter and of the losses, against float64 autograd.
+
+    The weights differ from those that acted. Raises RuntimeError: the gradient does not repeat bitwise.
+    """
+    cfg, flat = ppo.cfg, ppo.flat
+    with torch.no_grad():
+        flat.actor.layers.weights[-1].mul_(30.0)  # the initial actions are too small to test the clipping
+        ppo.collector.roll()
+        ppo.batch()
+        for segment in flat.segments:
+            weights = segment.view(flat.value)
+            weights.add_(0.02 * weights.std(correction=0).clamp(min=0.1) * torch.randn_like(weights))
+    ppo.networks.copy_weights()
+    samples = ppo.order()[: ppo.batch_size // cfg.minibatches]
+    ppo.fused.compute_gradient(samples)
+    found = flat.all_reduced.clone()
+    ppo.fused.compute_gradient(samples)
+    if not torch.equal(found, flat.all_reduced):
+        raise RuntimeError("the gradient of a minibatch does not repeat bitwise")
+    batch = type(part := ppo.fused.batch())(*(each[samples].double() for each in part))
+    model = copy.deepcopy(ppo.model).double()
+    for param in model.parameters():
+        param.grad = None
+    mean, value = model.mean(batch.features), model.critic(batch.critic_features)[:, 0]
+    ratio = (gaussian_log_prob(batch.action, mean, model.log_std) - batch.log_prob).exp()
+    clipped = ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
+    surrogate = -torch.minimum(batch.advantage * ratio, batch.advantage * clipped).mean()
+    near = batch.value + (value - batch.value).clamp(-cfg.clip, cfg.clip)
+    value_loss = torch.maximum((value - batch.target).square(), (near - batch.target).square()).mean()
+    entropy = (model.log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
+    (surrogate + cfg.value_coef * value_loss - cfg.entropy_coef * entropy).backward()
+    errors = {
+        "surrogate": float(found[flat.size] / surrogate - 1.0),
+        "value": float(found[flat.size + 1] / value_loss - 1.0),
+    }
+    for (name, param), exact in zip(ppo.model.named_parameters(), model.parameters(), strict=True):
+        errors[name] = float((param.grad - exact.grad).norm() / exact.grad.norm())  # pyright: ignore
+    return {name: abs(error) for name, error in errors.items()}
+
+
+def repeats(args: Args, device: torch.device) -> bool:
+    """Return whether two trainings of four iterations with one seed have bitwise equal parameters and Adam state."""
+    results = []
+    for _ in range(2):
+        ppo = build(args, device)
+        for _ in range(4):  # eager, capture, replay
+            ppo.iterate()
+        results.append([each.clone() for each in ppo.optimiser.vectors])
+        ppo.close()
+    return all(map(torch.equal, *results))
+
+
+def times(ppo: Ppo, args: Args) -> dict[str, float]:
+    """Return the times of an acting step, an update and a fused minibatch's parts [us], on a GPU as graphs."""
+    for _ in range(3):  # eager, capture, replay
+        ppo.iterate()
+    parts: dict[str, Callable[[], object]] = {"collect": ppo.collect, "update": ppo.update}
+    if ppo.cfg.fused:
+        fused, samples = cast("FusedPpo", ppo), ppo.order()[: ppo.batch_size // ppo.cfg.minibatches].clone()
+        rollout = cast("FusedRollout", ppo.rollout)
+        parts |= {"gradient": lambda: fused.fused.compute_gradient(samples), "adam": fused.fused.update_parameters}
+        for name, features in (("actor", rollout.features), ("critic", rollout.critic_features)):
+            network, work = getattr(fused.networks, name), (features.flatten(0, 1), len(samples), samples)
+            parts |= {f"{name}_forward": partial(network.forward, *work)}
+            parts |= {f"{name}_backward": partial(network.backward, *work)}
+    values = {}
+    for name, part in parts.items():
+        captured = CapturedProcedure(part, ppo.env.device.type == "cuda" and name not in ("collect", "update"))
+        for _ in range(2):  # eager, capture
+            captured()
+        values[f"{name}_us"] = 1.0e6 * median_time(captured, args.device, args.calls)
+        captured.close()
+    return values | {"act_us": values["collect_us"] / args.num_steps}
+
+
+def main(args: Args) -> dict:
+    """Check gradients and repetition, time the fused and the default update, write and return the metrics.
+
+    Raises InputError: the device cannot use the fused update.
+    """
+    info = configure_device(args.device, 1)
+    device = torch.device(wp.device_to_torch(wp.get_device(args.device)))
+    if not use_fused(PpoCfg(hidden=args.hidden, fused=True), device):
+        raise InputError(f"the fused update cannot run on {info.name}")
+    folder = output_dir("fused_update", args.out)
+    values: dict = {"device": info.name, "num_envs": args.num_envs, "num_steps": args.num_steps, "epochs": args.epochs}
+    for symmetry in ("off", "actor"):
+        errors = gradient_errors(cast("FusedPpo", build(args, device, symmetry=symmetry)))
+        values |= {f"error_{symmetry}_{name}": error for name, error in errors.items()}
+        values[f"largest_error_{symmetry}"] = max(errors.values())
+    values["repeats_bitwise"] = repeats(args, device)
+    write_metrics(folder, values)
+    for name, changes in (("fused", {}), ("symmetric", {"symmetry": "actor"}), ("default", {"fused": False})):
+        ppo = build(args, device, still=True, **changes)
+        values |= {f"{name}_{key}": value for key, value in times(ppo, args).items()}
+        ppo.close()
+    values["update_speedup"] = values["default_update_us"] / values["fused_update_us"]
+    keys = [key for key in values if not key.startswith("error_")]
+    return report(args, folder, values, f"Fused update with {args.num_envs:,} environments, {info.name}", keys)
+
+
+if __name__ == "__main__":
+    run_script(main, Args)

@@ -1,0 +1,124 @@
+"""Rollout collection with the fused kernels: observations are stored normalised, as the inputs of both networks."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import torch
+
+from jumper_warp.envs.vec_env import RAW_LIMIT, VecEnv
+from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.flat import FlatParameters
+from jumper_warp.rl.fused import kernels
+from jumper_warp.rl.fused.networks import FusedModel, blocks, launch
+from jumper_warp.rl.networks import NORMALISED_LIMIT, ActorCritic, Moments, RunningMoments, Scaling
+from jumper_warp.rl.samples import RowLayout
+
+ROWS = 64  # Number of samples in a block of the kernels of this module
+
+
+class FusedRollout(NamedTuple):
+    """Transitions of all worlds over num_steps policy steps; features are normalised and zero-padded observations."""
+
+    features: torch.Tensor  # (num_steps, num_envs, padded num_obs)
+    critic_features: torch.Tensor  # (num_steps + 1, num_envs, padded num_critic_obs)
+    final_features: torch.Tensor  # (num_steps, num_envs, padded num_critic_obs) after the step, before a reset
+    samples: torch.Tensor  # (num_steps, num_envs, columns) the part of `RowLayout` that is not features
+    action: torch.Tensor  # (num_steps, num_envs, num_actions)
+    log_std: torch.Tensor  # (num_actions,) of the policy, the same in all steps
+    reward: torch.Tensor  # (num_steps, num_envs) times `PpoCfg.reward_scale`
+    done: torch.Tensor  # (num_steps, num_envs) 1 where the episode ended, by termination or timeout
+    timeout: torch.Tensor  # (num_steps, num_envs) 1 where the episode was truncated
+
+
+class ObservationWriter:
+    """Writer of features: sanitises and normalises observations, and sums them for the moments of a rollout."""
+
+    def __init__(self, running: RunningMoments, features: torch.Tensor, num_steps: int) -> None:
+        """Allocate sums for num_steps steps; running: statistics that normalise; features: (…, num_envs, width)."""
+        num_obs, (worlds, width) = len(running.mean), features.shape[-2:]
+        self._running, self._grid = running, (blocks(worlds, ROWS), blocks(width, 64))
+        self._scaling = Scaling(*(x.to(features.device) for x in (torch.zeros(num_obs), torch.ones(num_obs))))
+        self._sums = torch.zeros(num_steps + 1, self._grid[0], 2, width, device=features.device)
+        self._num_obs, self._samples = num_obs, num_steps * worlds
+
+    def begin(self) -> None:
+        """Adopt the current running statistics."""
+        for scaling, value in zip(self._scaling, self._running.scaling(), strict=True):
+            scaling.copy_(value)
+
+    def write(self, obs: torch.Tensor, features: torch.Tensor, step: int = -1) -> None:
+        """Write raw observations (num_envs, num_obs) as features (num_envs, width).
+
+        step: whose moments they count for (default: none).
+        """
+        launch(kernels.observe, self._grid, num_warps=8)(
+            obs, *obs.stride(), *self._scaling, features, self._sums[step], *obs.shape, features.shape[1], RAW_LIMIT,
+            NORMALISED_LIMIT, ROWS, 64,
+        )  # fmt: skip
+
+    def moments(self) -> Moments:
+        """Return the moments of the observations of all steps, float64."""
+        sums = self._sums[:-1].sum((0, 1), dtype=torch.float64)[:, : self._num_obs] / self._samples
+        return Moments(self._scaling.mean + sums[0], (sums[1] - sums[0].square()).clamp(min=0.0), self._samples)
+
+
+class FusedCollector:
+    """Collector of rollouts, with the interface of `Collector`; the kernels of the update act."""
+
+    def __init__(self, env: VecEnv, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, fused: FusedModel) -> None:
+        """Allocate the rollout; flat, fused: parameters and networks of `model`."""
+        self.env, self.cfg, self._fused, self._actor = env, cfg, fused, flat.actor
+        self._critic_obs = env.critic_obs if cfg.asymmetric_critic else env.obs
+        self._final_critic_obs = env.final_critic_obs if cfg.asymmetric_critic else env.final_obs
+        steps, worlds, device, dtype = cfg.num_steps, env.num_envs, env.device, fused.weights.dtype
+        width, critic_width = (layers[0].inputs for layers in (fused.layout.actor, fused.layout.critic))
+        columns = RowLayout(env.num_obs, self._critic_obs.shape[1], env.num_actions).widths[2]
+        critic_features = torch.zeros(2 * steps + 1, worlds, critic_width, dtype=dtype, device=device)
+        self.critic_inputs = critic_features.view(-1, critic_width)
+        """Features of `critic_features`, then `final_features`, (samples, width)."""
+        reward, done, timeout = (torch.zeros(steps, worlds, device=device) for _ in range(3))
+        self.rollout = FusedRollout(
+            torch.zeros(steps, worlds, width, dtype=dtype, device=device), critic_features[: steps + 1],
+            critic_features[steps + 1 :], torch.zeros(steps, worlds, columns, device=device),
+            torch.zeros(steps, worlds, env.num_actions, device=device), torch.zeros_like(flat.actor.log_std), reward,
+            done, timeout,
+        )  # fmt: skip
+        self.obs = ObservationWriter(model.obs_moments, self.rollout.features, steps)
+        self.critic_obs = ObservationWriter(model.critic_moments, critic_features, steps)
+        counts = {"dtype": torch.float64, "device": device}  # float32 counts to 2^24 only
+        self.episode, self.finished = (torch.zeros(n, worlds, **counts) for n in (2, 3))  # as in `Collector`
+
+    @torch.no_grad()
+    def roll(self) -> None:
+        """Fill the rollout by acting for `num_steps` policy steps."""
+        self.obs.begin()
+        self.critic_obs.begin()
+        self._fused.copy_weights()
+        self.rollout.log_std.copy_(self._actor.log_std)
+        self.rollout.action.normal_()
+        for step in range(self.cfg.num_steps):
+            self.act(step)
+            self.env.step(self.rollout.action[step])
+            self.record(step)
+        self.critic_obs.write(self._critic_obs, self.rollout.critic_features[-1])
+
+    def act(self, step: int) -> None:
+        """Sample the actions for the environment's current state, and write features and samples of a step."""
+        rollout, fused, worlds = self.rollout, self._fused, self.env.num_envs
+        self.obs.write(self.env.obs, rollout.features[step], step)
+        self.critic_obs.write(self._critic_obs, rollout.critic_features[step], step)
+        output = fused.actor.forward(rollout.features[step], worlds)
+        launch(kernels.sample_action, (blocks(worlds, ROWS),))(
+            output, fused.mirror, self._actor.log_std, rollout.action[step], rollout.samples[step], worlds,
+            self.env.num_actions, rollout.samples.shape[2], fused.mirrored, fused.actor.width, ROWS,
+        )  # fmt: skip
+
+    def record(self, step: int) -> None:
+        """Write the result of the environment's last step to the rollout, and count episodes."""
+        env, rollout, worlds = self.env, self.rollout, self.env.num_envs
+        self.critic_obs.write(self._final_critic_obs, rollout.final_features[step])
+        launch(kernels.record_step, (blocks(worlds, ROWS),))(
+            env.reward, env.done, env.timeout, rollout.reward[step], rollout.done[step], rollout.timeout[step],
+            self.episode, self.finished, worlds, self.cfg.reward_scale, ROWS,
+        )  # fmt: skip

@@ -1,0 +1,202 @@
+"""Actor and critic for the fused kernels: padded copies of the weights, activations, gradients and their partial sums.
+
+The mirror-symmetric actor evaluates f(x) and f(M x) (`jumper_warp.rl.mirror`). As W (M x) = (W M) x, its first layer
+has the weights W and W M below each other: its output (rows, 2 width) is, in memory, the input (2 rows, width) of the
+next layer. The table of `FusedLayout` ties the weights: the gradient of W is the sum of both blocks' gradients.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import torch
+
+from jumper_warp.rl.flat import ALIGNMENT, FlatParameters, Segment, aligned
+from jumper_warp.rl.fused import kernels
+from jumper_warp.rl.mirror import MirrorMap, Symmetry
+from jumper_warp.rl.networks import ActorCritic
+
+WIDTH = 16  # Widths of layers are padded to a multiple of this, the smallest tile of a matrix product
+INPUT_WIDTH = 32  # Widths of observations are padded to a multiple of this
+SPLITS = 32  # Number of splits of the samples whose sums are added in a fixed order; a power of two
+Launch = Callable[..., Any]  # A kernel with its grid
+
+
+class Layer(NamedTuple):
+    """Location of a layer in the vector of `FusedLayout`, and its padded widths."""
+
+    weight: int  # first entry of the weight (outputs, inputs)
+    bias: int  # first entry of the bias (outputs,)
+    inputs: int
+    outputs: int
+    parameter: Segment  # bias in `FlatParameters`
+
+
+class FusedLayout:
+    """Layout of the padded copy of the parameters, and of the partial sums of their gradients.
+
+    `table` (3, size of `FlatParameters.all_reduced`) int32 has for every entry of the flat vector its place in the
+    padded vector, the place of its mirror image, and the image's sign; 0 is a place that nothing uses.
+    """
+
+    def __init__(self, flat: FlatParameters, symmetry: Symmetry | None) -> None:
+        """Lay out actor, noise, critic and losses; symmetry: of the actor, if it is mirror-symmetric."""
+        self.size = WIDTH
+        self._flat, self._table = flat, torch.zeros(3, flat.all_reduced.numel(), dtype=torch.int64)
+        count = 2 * len(flat.actor.layers.weights)
+        obs = symmetry and MirrorMap(*(part.cpu() for part in symmetry.obs))
+        self.actor = self._network(flat.segments[:count], obs)
+        noise = flat.segments[count]
+        self.noise = self._place(noise.start + torch.arange(noise.shape[0]))
+        self.critic = self._network(flat.segments[count + 1 :], None)
+        self.losses = self._place(flat.size + torch.arange(ALIGNMENT))
+        self.table = self._table.to(flat.value.device, torch.int32)
+
+    def _place(self, index: torch.Tensor) -> int:
+        """Place a vector, given by the indices of its entries in the flat vector; return its first entry's place."""
+        start = self.size
+        self._table[0, index] = start + torch.arange(len(index))
+        self.size += aligned(len(index), WIDTH)
+        return start
+
+    def _network(self, segments: list[Segment], obs: MirrorMap | None) -> list[Layer]:
+        """Place a network's layers; obs: mirror map of the observation, which doubles the first layer."""
+        layers = []
+        for weight, bias in zip(segments[::2], segments[1::2], strict=True):
+            (num_out, num_in), first = weight.shape, not layers
+            mirror = obs if first else None
+            outputs = num_out if mirror is None else 2 * num_out
+            layer = Layer(
+                self.size, self.size + aligned(outputs, WIDTH) * aligned(num_in, INPUT_WIDTH if first else WIDTH),
+                aligned(num_in, INPUT_WIDTH if first else WIDTH), aligned(outputs, WIDTH), bias,
+            )  # fmt: skip
+            self.size = layer.bias + layer.outputs
+            out, col = torch.arange(num_out)[:, None], torch.arange(num_in)[None, :]
+            index = weight.start + out * weight.padded_shape[1] + col
+            self._table[0, index] = layer.weight + out * layer.inputs + col
+            self._table[0, bias.start + out[:, 0]] = layer.bias + out[:, 0]
+            if mirror is not None:
+                self._table[1, index] = layer.weight + (num_out + out) * layer.inputs + mirror.order[col]
+                self._table[2, index] = mirror.signs[col].to(torch.int64).expand(num_out, -1)
+                self._table[1, bias.start + out[:, 0]] = layer.bias + num_out + out[:, 0]
+                self._table[2, bias.start + out[:, 0]] = 1
+            layers.append(layer)
+        return layers
+
+    def copy_weights(self, weights: torch.Tensor) -> None:
+        """Copy the parameters to the padded vector (size,)."""
+        value, (place, image, sign) = self._flat.value, self.table[:, : self._flat.size].to(torch.int64)
+        weights[image] = (sign * value).to(weights.dtype)
+        weights[place] = value.to(weights.dtype)
+
+
+class FusedModel:
+    """Actor and critic of an `ActorCritic` for the fused kernels, with the copy of its weights."""
+
+    def __init__(self, model: ActorCritic, flat: FlatParameters, rows: int, dtype: torch.dtype) -> None:
+        """Allocate networks for at most `rows` samples; dtype: of weights, activations and their gradients."""
+        symmetry, device = model.symmetry, flat.value.device
+        self.mirrored = symmetry is not None
+        self.layout = layout = FusedLayout(flat, symmetry)
+        self.weights = torch.zeros(layout.size, dtype=dtype, device=device)
+        self.partial = torch.zeros(SPLITS, layout.size, device=device)
+        """Sums over the splits of the samples, (SPLITS, size of the layout)."""
+        networks = (self.weights, self.partial, rows)
+        self.actor = FusedNetwork(layout.actor, flat, *networks, mirrored=self.mirrored)
+        self.critic = FusedNetwork(layout.critic, flat, *networks)
+        self.mirror = torch.stack([torch.arange(float(self.actor.width)), torch.ones(self.actor.width)]).to(device)
+        """Order and signs of the action's mirror map, padded, (2, width of the actor's output)."""
+        if symmetry is not None:
+            self.mirror[:, : len(symmetry.action.order)] = torch.stack([*symmetry.action])
+
+    def copy_weights(self) -> None:
+        """Copy the parameters to the kernels' weights."""
+        self.layout.copy_weights(self.weights)
+
+
+class FusedNetwork:
+    """Forward and backward pass of actor or critic by the fused kernels, on at most `rows` samples at a time."""
+
+    def __init__(
+        self, layers: list[Layer], flat: FlatParameters, weights: torch.Tensor, partial: torch.Tensor, rows: int,
+        mirrored: bool = False,
+    ) -> None:  # fmt: skip
+        """Allocate activations; weights: (size of the layout,) copy of the parameters; partial: (SPLITS, size)."""
+        self._layers, self._partial, self._rows_per_sample = layers, partial, 2 if mirrored else 1
+        self._weights = [weights[layer.weight :] for layer in layers]
+        self._biases = [layer.parameter.view(flat.value) for layer in layers]
+        self._weight_partials = [partial[0, layer.weight :] for layer in layers]
+        self._bias_partials = [partial[0, layer.bias :] for layer in layers]
+        self._outputs, self._gradients = [], []
+        for layer in layers:
+            shape = (rows if layer is layers[0] else self._rows_per_sample * rows, layer.outputs)
+            dtype = torch.float32 if layer is layers[-1] else weights.dtype
+            self._outputs.append(weights.new_zeros(shape, dtype=dtype))
+            self._gradients.append(weights.new_zeros(shape))
+        self.output, self.grad_output = self._outputs[-1], self._gradients[-1]
+        """The last layer's output, float32, and the loss gradient with respect to it, (rows per sample · rows, width).
+
+        The mirror-symmetric actor has two rows for each sample, f(x) and f(M x).
+        """
+
+    @property
+    def width(self) -> int:
+        """Padded width of the output."""
+        return self._layers[-1].outputs
+
+    def forward(self, x: torch.Tensor, rows: int, index: torch.Tensor | None = None) -> torch.Tensor:
+        """Write `output` for normalised observations, and return it.
+
+        x: (…, padded width of the observation), the rows `index` of it if given, else the first `rows`.
+        """
+        for i, layer in enumerate(self._layers):
+            count = rows if i == 0 else self._rows_per_sample * rows
+            bn = tile(layer.outputs)
+            launch(kernels.layer_forward, (blocks(count, 128), blocks(layer.outputs, bn)), num_warps=8, num_stages=3)(
+                x, x if index is None else index, self._weights[i], self._biases[i], self._outputs[i], count,
+                layer.inputs, layer.outputs, self._biases[i].numel(), index is not None, i < len(self._layers) - 1,
+                128, bn, 32 if layer.inputs % 64 else 64,
+            )  # fmt: skip
+            x, index = self._outputs[i], None
+        return self.output
+
+    def backward(self, x: torch.Tensor, rows: int, index: torch.Tensor) -> None:
+        """Write the partial sums of all parameters' gradients for `grad_output`; arguments: as in `forward`."""
+        for i in reversed(range(len(self._layers))):
+            layer, count = self._layers[i], rows if i == 0 else self._rows_per_sample * rows
+            inputs = x if i == 0 else self._outputs[i - 1]
+            bm = tile(layer.outputs)
+            bn = min(tile(layer.inputs), 64 if layer.inputs % 128 or layer.inputs * layer.outputs <= 128 * 128 else 128)
+            grid = (blocks(layer.outputs, bm), blocks(layer.inputs, bn), SPLITS)
+            launch(kernels.weight_gradient, grid, num_warps=4, num_stages=2)(
+                self._gradients[i], inputs, index, self._weight_partials[i], self._bias_partials[i],
+                self._partial.stride(0), count, rows_per_split(count), layer.inputs, layer.outputs, i == 0, bm, bn, 128,
+            )  # fmt: skip
+            if i > 0:
+                bn = tile(layer.inputs)
+                grid = (blocks(count, 128), blocks(layer.inputs, bn))
+                launch(kernels.layer_backward, grid, num_warps=8, num_stages=3)(
+                    self._gradients[i], self._weights[i], inputs, self._gradients[i - 1], count, layer.inputs,
+                    layer.outputs, 128, bn, min(tile(layer.outputs), 64),
+                )  # fmt: skip
+
+
+def blocks(count: int, size: int) -> int:
+    """Return the number of blocks of a size that `count` entries need."""
+    return -(-count // size)
+
+
+def tile(width: int) -> int:
+    """Return the size of a tile for a matrix of a width: a power of two, at most 128."""
+    return min(128, 1 << (width - 1).bit_length())
+
+
+def rows_per_split(rows: int) -> int:
+    """Return the number of rows of each of the SPLITS splits, the last ones may have fewer."""
+    return aligned(blocks(rows, SPLITS), WIDTH)
+
+
+def launch(kernel: Any, grid: tuple[int, ...], num_warps: int = 4, num_stages: int = 1) -> Launch:
+    """Return a function that launches a kernel on a grid with its positional arguments."""
+    return lambda *args: kernel[grid](*args, num_warps=num_warps, num_stages=num_stages)
