@@ -6,11 +6,10 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal
 
-from jumper_warp.utils.checks import check_finite, check_not_negative, check_positive, check_seed
+from jumper_warp.utils.checks import ACTIVATIONS, check_finite, check_not_negative, check_positive, check_seed
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import checked_threads
 
-ACTIVATIONS = ("elu", "relu", "tanh")  # Names of the activations of hidden layers
 LATEST, LATEST_OR_NEW = "latest", "latest-or-new"  # Values of `TrainCfg.resume` that are not paths
 
 

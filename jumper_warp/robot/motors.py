@@ -14,7 +14,7 @@ from jumper_warp.kernels.actuation import command_filter
 from jumper_warp.kernels.actuation import motors as actuator
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.parts import Motor
-from jumper_warp.utils.checks import check_count, check_not_negative
+from jumper_warp.utils.checks import check_angle_limits, check_count, check_filter_speed, check_not_negative
 from jumper_warp.utils.errors import InputError
 
 OVERSPEED_START, OVERSPEED_END = math.radians(2000.0), math.radians(2500.0)
@@ -149,13 +149,8 @@ class LimitsCfg:
     """[deg] Width of the hard zone inside the upper limit."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless the angle's limits are finite, lower < upper, and zones >= 0 without overlap."""
-        if not -math.inf < self.lower < self.upper < math.inf:
-            raise InputError(f"lower limit must be below upper limit, both finite, got {self.lower}, {self.upper}")
-        if not (self.lower_zone >= 0.0 and self.upper_zone >= 0.0):
-            raise InputError(f"hard zones must be >= 0, got {self.lower_zone}, {self.upper_zone}")
-        if not self.lower_zone + self.upper_zone <= self.upper - self.lower:
-            raise InputError(f"hard zones {self.lower_zone}, {self.upper_zone} overlap between the limits")
+        """Raise InputError as `check_angle_limits`."""
+        check_angle_limits("angle", **vars(self))
 
 
 @dataclass(frozen=True)
@@ -172,10 +167,8 @@ class FilterCfg:
     """[deg/s] Least speed assumed toward a limit."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless horizon and speed floor of the command filter are finite and above 0."""
-        for name in ("horizon", "speed_floor"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise InputError(f"filter {name} must be finite and > 0, got {getattr(self, name)}")
+        """Raise InputError as `check_filter_speed`."""
+        check_filter_speed(self.horizon, self.speed_floor)
 
 
 JUMP_LATERAL = LimitsCfg(-15.0, 15.0, lower_zone=10.0, upper_zone=15.0)

@@ -1,3 +1,4 @@
+import dataclasses
 import hashlib
 import json
 import math
@@ -18,8 +19,12 @@ from jumper_warp.policies.onnx import export_onnx, onnx_bytes
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.rl.networks import ActorCritic, linear_layers
+from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.utils import assets
 from jumper_warp.utils.assets import policy_tasks
+
+FILTER = dataclasses.asdict(vertical_jump_filter())
+TERM = {"first": 0, "end": 1, "scale": 1.0, "clip": 100.0, "history": 1}  # of an observation layout
 
 
 def make_interface(num_obs=1, num_actions=1, hidden=(1,), **changes):
@@ -28,7 +33,7 @@ def make_interface(num_obs=1, num_actions=1, hidden=(1,), **changes):
         "task": "vertical-jump",
         "observation_names": tuple(f"obs_{i}" for i in range(num_obs)),
         "joint_names": tuple(f"motor_{i}" for i in range(num_actions)),
-        "command_filter": {"horizon": 8.0 / 60.0},
+        "command_filter": FILTER,
         "policy_dt": 1.0 / 60.0,
         "physics_dt": 1.0 / 480.0,
         "hidden": hidden,
@@ -401,9 +406,18 @@ def test_pickle_in_place_of_the_weights_is_not_executed(folder, tmp_path):
         ({"physics_dt": 0.1}, "physics_dt must be at most policy_dt"),
         ({"normalised_limit": 1e300}, "normalised_limit must lie in 0.001 to 1e"),
         ({"hidden": (1,) * 65}, "hidden must name 1 to 64 widths"),
-        ({"command_filter": {"horizon": math.inf}}, "command_filter horizon must be a number"),
+        (
+            {"command_filter": {"horizon": 0.1}},
+            "command_filter must have the fields lateral, transversal, sum, horizon",
+        ),
+        ({"command_filter": FILTER | {"horizon": math.inf}}, "command_filter horizon must be a finite number"),
+        ({"command_filter": FILTER | {"speed_floor": 0.0}}, "command_filter: filter speed_floor must be in 0.001"),
+        ({"command_filter": FILTER | {"sum": FILTER["lateral"] | {"lower": 20.0}}}, "sum: lower limit must be below"),
+        ({"action_scale": (-0.1,)}, "action_scale must lie in 0.0001 to 6.283, got -0.1"),
+        ({"observation_layout": {"x": TERM | {"clip": -1.0}}}, "'x': clip must lie in 1e-6 to 1e6, got -1.0"),
+        ({"observation_layout": {"x": TERM | {"history": 1.0}}}, "first, end and history whole numbers"),
         ({"torque_limit": (1.0, 2.0)}, "torque_limit needs 1 numbers"),
-        ({"action_scale": (math.nan,)}, "action_scale must lie in -6.283 to 6.283, got nan"),
+        ({"action_scale": (math.nan,)}, "action_scale must lie in 0.0001 to 6.283, got nan"),
         ({"policy_dt": 0.0}, "policy_dt must lie in 0.0001 to 1, got 0"),
         ({"hidden": ()}, "hidden must name 1 to 64 widths"),
         ({"activation": "gelu"}, "activation must be one of"),

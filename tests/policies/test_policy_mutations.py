@@ -34,8 +34,7 @@ COMMON = settings(max_examples=400, deadline=None, suppress_health_check=[Health
 def small_policy():
     """Return a policy with random weights of SIZES."""
     torch.manual_seed(2)
-    command_filter = {"sum": {"lower": 0.0, "upper": 240.0}, "horizon": 0.1}
-    interface = make_interface(SIZES[0], SIZES[-1], SIZES[1:-1], command_filter=command_filter)
+    interface = make_interface(SIZES[0], SIZES[-1], SIZES[1:-1])
     layers = [(torch.randn(o, i), torch.randn(o)) for i, o in itertools.pairwise(SIZES)]
     return Policy(layers, torch.randn(5), torch.rand(5) + 0.1, interface, {"env": {"seed": 5, "list": [1, 2.0, None]}})
 
