@@ -8,10 +8,9 @@ import math
 from dataclasses import dataclass, field
 from typing import Any, get_type_hints
 
-from jumper_warp.utils.checks import ACTIVATIONS, NAME, check_angle_limits, check_filter_speed
+from jumper_warp.utils.checks import ACTIVATIONS, MAX_HIDDEN, MAX_WIDTH, NAME, check_angle_limits, check_filter_speed
 from jumper_warp.utils.errors import InputError
 
-MAX_HIDDEN = 64  # Largest number of hidden layers
 FULL_TURN = 2.0 * math.pi
 JOINT_BOUNDS = {
     "action_scale": (1.0e-4, FULL_TURN),  # [rad]
@@ -87,8 +86,10 @@ class PolicyInterface:
                     raise PolicyError(f"{name} must lie in {low:.4g} to {high:.4g}, got {value:.4g}")
         if self.physics_dt > self.policy_dt:
             raise PolicyError(f"physics_dt must be at most policy_dt = {self.policy_dt}, got {self.physics_dt}")
-        if not 1 <= len(self.hidden) <= MAX_HIDDEN or not all(1 <= width <= 65536 for width in self.hidden):
-            raise PolicyError(f"hidden must name 1 to {MAX_HIDDEN} widths from 1 to 65536, got {self.hidden!s:.100}")
+        if not 1 <= len(self.hidden) <= MAX_HIDDEN or not all(1 <= width <= MAX_WIDTH for width in self.hidden):
+            raise PolicyError(
+                f"hidden must name 1 to {MAX_HIDDEN} widths from 1 to {MAX_WIDTH}, got {self.hidden!s:.100}"
+            )
         _check_filter(self.command_filter)
         _check_layout(self.observation_layout, len(self.observation_names))
         if self.activation not in ACTIVATIONS:

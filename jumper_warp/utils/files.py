@@ -82,27 +82,35 @@ def read_file(path: Path, purpose: str, limit: int = MAX_BYTES, error: ErrorType
     return data
 
 
-def read_json(path: Path, purpose: str, limit: int = MAX_JSON_BYTES, error: ErrorType = InputError) -> Any:
-    """Return the content of a JSON file; raises as `existing_file` and `parse_json`."""
-    return parse_json(read_file(path, purpose, limit, error), str(path), error)
+def read_json(
+    path: Path, purpose: str, limit: int = MAX_JSON_BYTES, error: ErrorType = InputError, finite: bool = True
+) -> Any:
+    """Return the content of a JSON file; arguments and errors as `existing_file` and `parse_json`."""
+    return parse_json(read_file(path, purpose, limit, error), str(path), error, finite)
 
 
-def parse_json(data: bytes | str, where: str, error: ErrorType = InputError) -> Any:
+def parse_json(data: bytes | str, where: str, error: ErrorType = InputError, finite: bool = True) -> Any:
     """Return the content of JSON data (UTF-8).
 
-    where: file or place, before the message. Raises `error`: it is not JSON, nests deeper than MAX_DEPTH, repeats a
-    key, or has a number that is not finite or an integer of more than MAX_DIGITS digits.
+    where: file or place, before the message. finite: whether to refuse NaN and infinite numbers. Raises `error`: it is
+    not JSON, nests deeper than MAX_DEPTH, repeats a key, or has such a number or an integer of more than MAX_DIGITS
+    digits.
     """
-    hooks = {"parse_constant": _number, "parse_float": _number, "parse_int": _integer}
+    hooks: dict[str, Any] = {"parse_int": _integer}
+    if finite:
+        hooks |= {"parse_constant": _number, "parse_float": _number}
     try:
         content = json.loads(data.decode() if isinstance(data, bytes) else data, object_pairs_hook=_unique, **hooks)
         if _depth(content, MAX_DEPTH) <= MAX_DEPTH:
+            json.dumps(content, ensure_ascii=False).encode()
             return content
         reason = f"more than {MAX_DEPTH} levels"
     except RecursionError:
         reason = f"more than {MAX_DEPTH} levels"
     except json.JSONDecodeError as problem:
         reason = f"line {problem.lineno}: {problem.msg}"
+    except UnicodeEncodeError:
+        reason = "a string has half of a surrogate pair"
     except UnicodeDecodeError as problem:
         reason = f"byte {problem.start} is not UTF-8"
     except ValueError as problem:
@@ -111,25 +119,25 @@ def parse_json(data: bytes | str, where: str, error: ErrorType = InputError) -> 
 
 
 def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """Return the entries of a JSON object as a dict. Raises ValueError: a key occurs twice."""
+    """Return the entries of a JSON object as a dict. Raises InputError: a key occurs twice."""
     table = dict(pairs)
     if len(table) < len(pairs):
-        raise ValueError(f"{Counter(key for key, _ in pairs).most_common(1)[0][0]!r:.60} occurs twice")
+        raise InputError(f"{Counter(key for key, _ in pairs).most_common(1)[0][0]!r:.60} occurs twice")
     return table
 
 
 def _number(text: str) -> float:
-    """Return a number of a JSON text. Raises ValueError: it is not finite."""
+    """Return a number of a JSON text. Raises InputError: it is not finite."""
     value = float(text)
     if not math.isfinite(value):
-        raise ValueError(f"{text:.20} is not a finite number")
+        raise InputError(f"{text:.20} is not a finite number")
     return value
 
 
 def _integer(text: str) -> int:
-    """Return an integer of a JSON text. Raises ValueError: it has too many digits."""
+    """Return an integer of a JSON text. Raises InputError: it has too many digits."""
     if len(text.lstrip("-")) > MAX_DIGITS:
-        raise ValueError(f"an integer of {len(text.lstrip('-'))} digits")
+        raise InputError(f"an integer of {len(text.lstrip('-'))} digits")
     return int(text)
 
 

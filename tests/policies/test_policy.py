@@ -219,6 +219,20 @@ def test_added_files_are_in_the_manifest(folder):
         load_policy(folder)
 
 
+@pytest.mark.parametrize("name", ["picture.webp", "sweep.png"])
+def test_missing_picture_is_accepted_and_an_altered_one_refused(folder, trained, name):
+    add_files(folder, {name: b"RIFF", "metrics.json": b"{}"})
+    (folder / name).unlink()
+    assert load_policy(folder).interface == trained.interface
+    (folder / name).write_bytes(b"JFIF")
+    with pytest.raises(PolicyError, match=rf"{name}: truncated or altered"):
+        load_policy(folder)
+    (folder / name).unlink()
+    (folder / "metrics.json").unlink()
+    with pytest.raises(PolicyError, match=r"metrics\.json: no such file"):
+        load_policy(folder)
+
+
 def test_add_files_refuses_policy_files_and_altered_policies(folder):
     with pytest.raises(PolicyError, match="is the policy itself"):
         add_files(folder, {"policy.onnx": b""})
@@ -310,7 +324,7 @@ F32 = np.float32
 NOT_REPRODUCIBLE = "the graph or metadata of the ONNX file differs from that of its weights and config.json"
 NEWER = "has version 4, expected version 3"
 REFUSALS = {
-    "manifest missing": (lambda f: (f / "manifest.json").unlink(), "manifest.json: cannot be read"),
+    "manifest missing": (lambda f: (f / "manifest.json").unlink(), "manifest.json: no such file"),
     "manifest not JSON": (lambda f: (f / "manifest.json").write_text("{"), "manifest.json: not JSON"),
     "manifest of another format": (edit_manifest(lambda m: m.update(format="x")), "not the manifest of"),
     "manifest lacks a checksum": (edit_manifest(lambda m: m["sha256"].pop("policy.onnx")), "lacks the checksums"),
@@ -323,13 +337,13 @@ REFUSALS = {
     ),
     "folder in place of a file": (
         lambda f: ((f / "policy.onnx").unlink(), (f / "policy.onnx").mkdir()),
-        "policy.onnx: cannot be read",
+        "policy.onnx: a folder, not a file",
     ),
     "pipe in place of a file": (
         lambda f: ((f / "policy.onnx").unlink(), os.mkfifo(f / "policy.onnx")),
-        r"policy.onnx: cannot be read \(not a file\)",
+        "policy.onnx: not a regular file",
     ),
-    "file missing": (lambda f: (f / "policy.onnx").unlink(), "policy.onnx: cannot be read"),
+    "file missing": (lambda f: (f / "policy.onnx").unlink(), "policy.onnx: no such file"),
     "truncated": (
         lambda f: (f / "policy.onnx").write_bytes((f / "policy.onnx").read_bytes()[:-4]),
         "policy.onnx: truncated or altered",
@@ -427,6 +441,17 @@ def test_pickle_in_place_of_the_weights_is_not_executed(folder, tmp_path):
 def test_refuses_an_invalid_interface(change, message):
     with pytest.raises(PolicyError, match=message):
         make_interface(**change)
+
+
+@pytest.mark.parametrize("activation", ["elu", "relu", "tanh"])
+def test_refuses_weights_that_could_overflow_unless_the_activation_is_bounded(activation):
+    layers = [(torch.full((4, 1), 1e20), torch.zeros(4)), (torch.full((1, 4), 1e20), torch.zeros(1))]
+    interface, std = make_interface(hidden=(4,), activation=activation), torch.ones(1)
+    if activation == "tanh":  # its output is bounded
+        assert Policy(layers, 0.0 * std, std, interface).act(torch.tensor([1e30])).isfinite().all()
+        return
+    with pytest.raises(PolicyError, match="overflow"):
+        Policy(layers, 0.0 * std, std, interface)
 
 
 # ---------------------------------------------------------------------- ONNX
