@@ -14,11 +14,17 @@ from jumper_warp.kernels.actuation import command_filter
 from jumper_warp.kernels.actuation import motors as actuator
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.parts import Motor
-from jumper_warp.utils.checks import check_angle_limits, check_count, check_filter_speed, check_not_negative
+from jumper_warp.utils.checks import check_angle_limits, check_bounds, check_count, check_filter_speed
 from jumper_warp.utils.errors import InputError
 
 OVERSPEED_START, OVERSPEED_END = math.radians(2000.0), math.radians(2500.0)
 """[rad/s] Speeds at which over-speed protection starts to reduce the torque, and at which the torque is 0."""
+MAX_FADE = 1.0e4  # [rad/s] Highest speed at which over-speed protection may end
+MOTOR_BOUNDS = {
+    "kp": (0.0, 1.0e4, "N m/rad"), "kd": (0.0, 1.0e3, "N m s/rad"), "saturation": (1.0e-3, 1.0e3, "N m"),
+    "peak": (1.0e-3, 1.0e3, "N m"), "cutoff_speed": (0.0, 1.0e3, "rad/s"), "no_load_speed": (0.0, 1.0e3, "rad/s"),
+}  # fmt: skip
+"""Smallest and largest value of the fields of `MotorKindCfg`, and unit."""
 MOTOR_CONSTANTS = ("kp", "kd", "saturation", "peak", "cutoff_speed", "no_load_speed", "offset")
 """Constants of a motor in `MotorArrays`; units as in `jumper_warp.kernels.actuation.motors`."""
 LIMITS = ("lower", "upper", "lower_zone", "upper_zone")
@@ -45,11 +51,8 @@ class MotorKindCfg:
     """[rad/s] Speed from which no driving torque is available."""
 
     def __post_init__(self) -> None:
-        """Raise InputError if a value is negative or not finite, a torque limit is 0, or no_load_speed is too low."""
-        for name, value in vars(self).items():
-            check_not_negative(f"motor {name}", value)
-        if self.saturation == 0.0 or self.peak == 0.0:
-            raise InputError("motor saturation and peak torque must be > 0, got 0")
+        """Raise InputError if a value is outside its range in MOTOR_BOUNDS, or no_load_speed is too low."""
+        check_bounds("motor", self, MOTOR_BOUNDS)
         if self.no_load_speed <= self.cutoff_speed:
             raise InputError(f"no_load_speed must be > cutoff_speed = {self.cutoff_speed}, got {self.no_load_speed}")
 
@@ -66,9 +69,10 @@ class MotorCfg:
     """[rad/s] Speed from which the torque is 0."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless the over-speed protection has finite speeds 0 <= fade_start < fade_end."""
-        if not 0.0 <= self.fade_start < self.fade_end < math.inf:
-            raise InputError(f"need 0 <= fade_start < fade_end, finite, got {self.fade_start}, {self.fade_end}")
+        """Raise InputError unless the over-speed protection has speeds 0 <= fade_start < fade_end <= MAX_FADE."""
+        if not 0.0 <= self.fade_start < self.fade_end <= MAX_FADE:
+            speeds = f"{self.fade_start}, {self.fade_end}"
+            raise InputError(f"need 0 <= fade_start < fade_end <= {MAX_FADE:g} rad/s, got {speeds}")
 
     @classmethod
     def from_description(
