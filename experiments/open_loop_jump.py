@@ -21,7 +21,8 @@ from typing import Any, Literal
 from jumper_warp.evaluation.run import SOLVER_TITLES
 from jumper_warp.robot.gravity import EARTH
 from jumper_warp.robot.motors import jumping_motors, loose_filter, vertical_jump_filter
-from jumper_warp.robot.overlay import load_overlay, with_springs
+from jumper_warp.robot.overlay import RobotOverlay, load_overlay, with_springs
+from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.utils.errors import InputError
 from support.open_loop import SQUAT, plot_trace, simulate_jump, trace_metrics
@@ -50,11 +51,17 @@ class Args(DeviceArgs):
             raise InputError("give springs or a robot, which may have springs")
 
 
+def factor_of(robot: RobotOverlay | None, name: str) -> float:
+    """Return the smallest factor of a robot overlay on a quantity of the transversal motors, 1 without overlay."""
+    return 1.0 if robot is None else float(getattr(robot.robots(), name)[0, list(TRANSVERSAL)].min())
+
+
 def measure(args: Args, folder: Path) -> tuple[dict[str, Any], str]:
     """Simulate the open-loop jump, write its plots and recording into a folder, return metrics and a title."""
-    variant = {"solver": args.solver, "gravity_m_s2": args.gravity, "torque_limit_nm": args.torque_limit,
-               "kp_nm_rad": args.kp, "loose_filter": args.loose, "squat_command_deg": args.squat_angle}  # fmt: skip
     robot = None if args.robot is None else load_overlay(args.robot)
+    limit, kp = (value * factor_of(robot, name) for name, value in (("saturation", args.torque_limit), ("kp", args.kp)))
+    variant = {"solver": args.solver, "gravity_m_s2": args.gravity, "torque_limit_nm": limit, "kp_nm_rad": kp,
+               "loose_filter": args.loose, "squat_command_deg": args.squat_angle}  # fmt: skip
     if args.spring is not None:
         robot = with_springs(*args.spring)
         variant |= {"spring_stiffness_n_m": args.spring[0], "spring_length_m": args.spring[1]}
@@ -71,9 +78,10 @@ def measure(args: Args, folder: Path) -> tuple[dict[str, Any], str]:
     values: dict[str, Any] = {**variant, **trace_metrics(trace), "hardware_apex_height_m": None}
     if args.torque_limit == 18.0 and args.gravity == EARTH and not args.loose and robot is None:
         values["hardware_apex_height_m"] = HARDWARE_APEX
-    words = [SOLVER_TITLES[args.solver], f"{args.torque_limit:g} N m", f"kp {args.kp:g} N m/rad"]
+    words = [SOLVER_TITLES[args.solver], f"{limit:.4g} N m", f"kp {kp:.4g} N m/rad"]
     words += [f"gravity {args.gravity:g} m/s²"] + ["loose command filter"] * args.loose
     words += [] if args.spring is None else ["springs of {:g} N/m, {:g} m".format(*args.spring)]
+    words += [] if args.robot is None else [f"robot of {args.robot.name}"]
     plot_trace(folder / "trace.png", trace, ", ".join(words), HARDWARE_APEX)
     recorder.save_rrd(folder / "jump.rrd")
     recorder.save_picture(folder / "jump.png", title="Open-loop jump, " + ", ".join(words))

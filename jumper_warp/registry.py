@@ -22,6 +22,7 @@ from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.utils.assets import dashed, policy_tasks
 from jumper_warp.utils.errors import InputError, suggestion
 from jumper_warp.utils.files import existing_file
+from jumper_warp.utils.sources import module_from_file
 
 if TYPE_CHECKING:
     from jumper_warp.tasks.cfg import TaskCfg
@@ -302,15 +303,11 @@ def _load_file(path: Path) -> ModuleType:
         return known
     if known is not None or name in sys.stdlib_module_names or _is_elsewhere(name, path):
         raise InputError(f"{path.name}: {name!r} is the name of another module; give the file another name")
-    spec = importlib.util.spec_from_file_location(name, path)
-    if spec is None or spec.loader is None:
+    if path.suffix != ".py":
         raise InputError(f"{path.name}: the name of a task's file must end in .py")
-    module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
     try:
-        spec.loader.exec_module(module)
+        return module_from_file(name, path)
     except BaseException as error:
-        del sys.modules[name]
         if isinstance(error, SyntaxError) and error.filename in (str(path), None):  # None: a null byte
             raise InputError(f"{path.name}:{error.lineno or 1}: {error.msg}") from error
         if isinstance(error, InputError):
@@ -318,7 +315,6 @@ def _load_file(path: Path) -> ModuleType:
                      if frame.f_code.co_filename == str(path)]  # fmt: skip
             raise InputError(f"{path.name}:{lines[-1] if lines else 1}: {error}") from error
         raise
-    return module
 
 
 def _is_elsewhere(name: str, path: Path) -> bool:

@@ -19,6 +19,7 @@ from jumper_warp.cli.sysid import ActuatorCfg, ExciteCfg, SysidCfg
 from jumper_warp.cli.task_flags import flags_of
 from jumper_warp.cli.train import SHORT_HELP
 from jumper_warp.evaluation.commands import EvaluateCfg, PlayCfg, ScriptCfg
+from jumper_warp.evaluation.dumps import DumpCfg
 from jumper_warp.evaluation.evaluations import EVALUATIONS
 from jumper_warp.evaluation.suites import SUITES
 from jumper_warp.registry import make_task
@@ -44,7 +45,7 @@ def cli_page() -> str:
                 more={f"Flags of a task, here {EXAMPLE_TASK}": list_flags(flags_of(make_task(EXAMPLE_TASK)), "env.")}),
         section("finetune POLICY", COMMANDS["finetune"], list_flags(settings_of("finetune")[0])),
         of_kinds("play", ABOUT_PLAY, {name: list_flags(PlayCfg(kind.play)) for name, kind in EVALUATIONS.items()},
-                 {"Flags with --script": list_flags(ScriptCfg)}),
+                 {"Flags with --script": list_flags(ScriptCfg), "Flags with --dump": list_flags(DumpCfg)}),
         of_kinds("evaluate", ABOUT_EVALUATE,
                  {name: list_flags(EvaluateCfg(kind.flags)) for name, kind in EVALUATIONS.items()},
                  {f"Flags with --suite {suite.name}": list_flags(suite) for suite in SUITES}),
@@ -55,6 +56,7 @@ def cli_page() -> str:
         section("sysid actuator BENCH", doc(ActuatorCfg), list_flags(ActuatorCfg)),
         section("list", COMMANDS["list"], list_flags(settings_of("list")[0])),
         section("info NAME", COMMANDS["info"], list_flags(settings_of("info")[0])),
+        section("doctor", COMMANDS["doctor"], list_flags(settings_of("doctor")[0])),
         section("completion SHELL", COMMANDS["completion"], list_flags(CompletionCfg)),
     ]  # fmt: skip
     return "\n\n".join([summary(), *parts, completion(), exit_codes()]) + "\n"

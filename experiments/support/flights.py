@@ -19,6 +19,7 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.jumps import DELAY, jump_commands, yaw_of
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, finite, outcome_names
 from jumper_warp.evaluation.run import HEIGHTS, EvaluationArgs, Run, conditions_of
+from jumper_warp.policies.conditions import shared_config
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.runs import open_policy
@@ -290,15 +291,15 @@ class FlightRun(Run):
         """Return an environment of `count` robots with the skills JUMP and TURN."""
         conditions = self.conditions
         tasks, handovers = flight_skills(*(conditions.applied(task) for task in self.tasks))
-        env = Env(
-            tasks, count, seed=conditions.seed, stream=conditions.stream, device=conditions.device,
-            solver=conditions.solver, randomize=conditions.sets_parameters, noise=conditions.noise, auto_reset=False,
-            threads=conditions.threads, handovers=handovers,
-        )  # fmt: skip
+        policies = {"the turning policy": self.turn, "the landing policy": self.landing}
+        configs = {name: policy.config for name, policy in policies.items() if policy is not None}
+        settings = conditions.env_settings(shared_config(configs, conditions))
+        env = Env(tasks, count, handovers=handovers, **settings)
         for policy in (self.turn, self.landing):
             if policy is not None:
                 policy.to(env.device)
         self.settings["gravity_m_s2"] = env.task.gravity
+        self.note_robot(env)
         return env
 
     def fly(self, env: Env, flights: FlightLog, film: str) -> FlightLog:

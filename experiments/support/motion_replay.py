@@ -13,7 +13,7 @@ import warp as wp
 
 from jumper_warp.diff.rollout import compact
 from jumper_warp.diff.torch_rollout import TorchTrajectory
-from jumper_warp.evaluation.recorder import ankles
+from jumper_warp.evaluation.recorder import ankles, largest_forces
 from jumper_warp.kernels.collision.robot import collision_kernel
 from jumper_warp.kernels.layout import COORDS
 from jumper_warp.robot.description import MOTOR_JOINTS
@@ -102,7 +102,8 @@ class MotionReplay:
         series = {"base/height [m]": row[1], "base/vertical speed [m s⁻¹]": row[2]}
         for i, name in enumerate(MOTOR_JOINTS):
             series |= {f"torque/{name} [N m]": row[8][i], f"angle/{name} [deg]": math.degrees(row[7][i])}
-        self.recorder.record(row[0], sim.state.body_q, series, ankles(pose[None])[0], sim.paw_force.numpy()[:, 0])
+        forces = largest_forces(np.array(self.impulses[-sim.substeps :])[:, :, 0] / sim.dt)
+        self.recorder.record(row[0], sim.state.body_q, series, ankles(pose[None])[0], forces)
 
     def _evaluate(self) -> None:
         """Compute the jump's takeoff, work, apex, landing acceleration, and paws lifted after touchdown."""

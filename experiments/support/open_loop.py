@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from jumper_warp.evaluation.limits import EXTEND, HOLD, RAMP
-from jumper_warp.evaluation.recorder import ankles
+from jumper_warp.evaluation.recorder import ankles, largest_forces
 from jumper_warp.robot.description import LEGS, MOTOR_JOINTS
 from jumper_warp.sim.simulation import Simulation, motor_values
 from jumper_warp.viz.plots import figure
@@ -70,20 +70,24 @@ def simulate_jump(sim: Simulation, notes: Mapping[str, Any], squat: float = SQUA
                 (now, q[2], sim.base_velocity()[0, 2], motor_values(q[7:]), motor_values(qd[6:]),
                  sim.torque.numpy()[:, 0].copy(), sim.paw_force.numpy()[:, 0].copy(), sim.loop_gap()[0])
             )  # fmt: skip
-        record(recorder, sim.state.body_q.numpy(), rows[-1])
+        forces = np.array([row[6] for row in rows[-sim.substeps :]])
+        record(recorder, sim.state.body_q.numpy(), rows[-1], largest_forces(forces))
     return Trace(*(np.array(column) for column in zip(*rows, strict=True))), recorder
 
 
-def record(recorder: Recorder, poses: np.ndarray, row: tuple) -> None:
-    """Add a frame to the jump's recording; poses: of the links, (21, 7); row: fields of `Trace` at one physics step."""
-    now, height, speed, angle, rate, torque, force, _ = row
+def record(recorder: Recorder, poses: np.ndarray, row: tuple, force: np.ndarray) -> None:
+    """Add a frame to the jump's recording; poses: of the links, (21, 7); row: fields of `Trace` at one physics step.
+
+    force [N]: largest on each paw in the policy step, (4, 3), world axes.
+    """
+    now, height, speed, angle, rate, torque, *_ = row
     series = {"base/height [m]": height, "base/vertical speed [m s⁻¹]": speed}
     for i, name in enumerate(MOTOR_JOINTS):
         series[f"torque/{name} [N m]"] = torque[i]
         series[f"angle/{name} [deg]"] = np.degrees(angle[i])
         series[f"speed/{name} [rad s⁻¹]"] = rate[i]
     for i, leg in enumerate(LEGS):
-        series[f"paw force/{leg} [N]"] = float(np.linalg.norm(force[i]))
+        series[f"peak paw force/{leg} [N]"] = float(np.linalg.norm(force[i]))
     recorder.record(now, poses, series, contact_points=ankles(poses[None])[0], contact_forces=force)
 
 

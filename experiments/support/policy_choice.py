@@ -24,8 +24,8 @@ SIDE = ("side", "side_friction_0.4_randomised", "side_friction_0.4")
 NEEDS = (
     Need("jump up", "vertical_jump", "heights above 1.08 m"),
     Need("jump to a place ahead", "horizontal_jump", "slippery floor; sideways; back"),
-    Need("jump in any direction", "omnidirectional_jump", "goals beyond 1 m"),
-    Need("jump sideways, also on a slippery floor", "omnidirectional_jump", "goals beyond 1 m", SIDE),
+    Need("jump in any direction", "omnidirectional_jump", "goals outside its training"),
+    Need("jump sideways, also on a slippery floor", "omnidirectional_jump", "goals outside its training", SIDE),
     Need("jump ahead on a slippery floor", "slippery_jump", "late commands (0.5 s after the reset)"),
     Need("jump diagonally on a slippery floor", "slippery_jump", "sideways goals",
          ("diagonal", "diagonal_friction_0.4_randomised", "diagonal_friction_0.4")),

@@ -83,9 +83,10 @@ def seed_section(rows: Sequence[Row]) -> str:
     count, compared = len(tests), len({test[:2] for test in tests})
     significant = [test for test in tests if test.p * count < LEVEL]
     text = (
-        f"{compared} rows have two seeds: {count:,} two-proportion tests of rates and Welch's t-tests of means.\n"
-        f"{len(significant)} differences are significant (p × {count:,} below {LEVEL:g}). "
-        + ("These are:\n" if significant else "The smallest p of all tests are:\n")
+        f"{compared} rows were measured with two seeds. Each of their {count:,} rates and means was compared:\n"
+        "rates by two-proportion tests, means by Welch's t-tests.\n"
+        f"{len(significant)} differences are significant (p-value times the number of tests below {LEVEL:g}). "
+        + ("These are:\n" if significant else "The smallest p-values are:\n")
     )
     lines = [
         [test.policy, CONDITIONS[test.condition].title, f"`{test.key}`",

@@ -208,15 +208,17 @@ class TestTable(NamedTuple):
     __test__ = False  # not a test class of pytest
 
 
+TRIALS = TableColumn("trials", ())
 GOALS = (SUCCESS, *columns(("error at rest [m]", "goal_distance_at_rest_mean_m"), ("falls", "fall_rate"),
-                           ("missed", "miss_rate"), ("no paw lifted", "no_paw_lift_rate")))  # fmt: skip
+                           ("missed", "miss_rate"), ("no paw lifted", "no_paw_lift_rate")), TRIALS)  # fmt: skip
+SIDEWAYS = (*GOALS[:4], *columns(("no jump", "no_jump_rate")), *GOALS[4:])
 GROUNDS = {"flat": "flat", "uneven": "bumps", "waves": "waves", "slope": "down a slope", "bowl": "up a slope",
            "stairs": "down steps", "pit": "up steps", "blocks": "blocks"}  # fmt: skip
 TEST_TABLES = {
     "slippery": TestTable(("friction_0.4", "diagonal_friction_0.4", "diagonal_friction_0.4_randomised",
                            "friction_0.3"), GOALS,
                           ("slippery_jump", "slippery_waiting_jump", "horizontal_jump", "sighted_jump")),
-    "side": TestTable(("side", "side_friction_0.4", "side_friction_0.4_randomised"), GOALS),
+    "side": TestTable(("side", "side_friction_0.4", "side_friction_0.4_randomised"), SIDEWAYS),
     "diagonal": TestTable(("diagonal",), GOALS),
     "paper": TestTable(("grid", "consecutive"), (SUCCESS, *columns(
         ("error at rest [m]", "goal_distance_at_rest_mean_m"), ("ten in a row, all succeed", "row_all_success_rate")))),
@@ -265,7 +267,8 @@ def test_table(name: str) -> str:
         rows = first_seed(policy)
         for test in (test for test in tests if test in rows):
             words = TESTS[test].words if test in TESTS else f"{rows[test].values['commands']}, {CONDITIONS[test].title}"
-            lines.append([policy, words, *(cell(column, rows[test].metrics) for column in wide)])
+            cells = (f"{trials_of(rows[test]):,}" if x is TRIALS else cell(x, rows[test].metrics) for x in wide)
+            lines.append([policy, words, *cells])
     titles = ["policy", "test", *(column.title for column in wide)]
     if len(policies) == 1:
         titles, lines = titles[1:], [line[1:] for line in lines]

@@ -75,20 +75,22 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 def settings_of(command: str) -> list[Any]:
     """Return the dataclasses, or instances of them, whose fields are the flags of a command, for tasks of any kind."""
-    from jumper_warp.cli import export, info, list, sysid, train
+    from jumper_warp.cli import doctor, export, info, list, sysid, train
     from jumper_warp.evaluation.commands import EvaluateCfg, PlayCfg, ScriptCfg
+    from jumper_warp.evaluation.dumps import DumpCfg
     from jumper_warp.evaluation.evaluations import EVALUATIONS
     from jumper_warp.evaluation.finetuning_cfg import FinetuneArgs
 
     return {
         "train": [train.TrainArgs],
         "finetune": [FinetuneArgs],
-        "play": [*(PlayCfg(kind.play) for kind in EVALUATIONS.values()), ScriptCfg],
+        "play": [*(PlayCfg(kind.play) for kind in EVALUATIONS.values()), ScriptCfg, DumpCfg],
         "evaluate": [EvaluateCfg(kind.flags) for kind in EVALUATIONS.values()],
         "export": [export.ExportCfg],
         "sysid": [sysid.SysidCfg, sysid.ExciteCfg, sysid.ActuatorCfg],
         "list": [list.ListCfg],
         "info": [info.InfoCfg],
+        "doctor": [doctor.DoctorCfg],
     }.get(command, [])
 
 

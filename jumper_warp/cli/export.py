@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -36,7 +37,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
 
 def export(cfg: ExportCfg) -> Path:
-    """Write the policy's folder or ONNX file, print its path and return it.
+    """Write the policy's folder or ONNX file, print its path and return it; name a run's checkpoint on standard error.
 
     Raises PolicyError: the source cannot be used, two policies cannot be blended, the folder has a file's suffix, or
     exists and `overwrite` is not set. CheckpointError: the checkpoint cannot be used.
@@ -45,12 +46,16 @@ def export(cfg: ExportCfg) -> Path:
     from jumper_warp.policies.folder import checked_folder, save_policy
     from jumper_warp.policies.onnx import export_onnx
     from jumper_warp.policies.runs import is_run, learning_curve, open_policy, run_folder
+    from jumper_warp.rl.resume import CHECKPOINTS
 
     source = Path(cfg.source)
     if cfg.out is not None and cfg.out.suffix != ".onnx":
         checked_folder(cfg.out)
     trained = is_run(source)
     policy = open_policy(cfg.source, newest=cfg.newest)
+    if trained:
+        chosen = ("newest " if cfg.newest else "best ") if (source / CHECKPOINTS).is_dir() else ""
+        print(f"{chosen}checkpoint: iteration {policy.config['iteration']}", file=sys.stderr)
     if cfg.blend is not None:
         policy = blend(policy, open_policy(cfg.blend[0]), cfg.blend[1])
     out = cfg.out

@@ -18,13 +18,14 @@ import traceback
 from collections.abc import Callable, Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
-from jumper_warp.utils.errors import InputError, suggestion
+from jumper_warp.utils.errors import InputError, is_out_of_memory, suggestion
 from jumper_warp.utils.version import __version__
 
 if TYPE_CHECKING:
     from jumper_warp.cli.flags import Flag
     from jumper_warp.cli.help import Short
 
+FAULT = 1  # Exit code for a fault of the program or the machine
 USAGE_ERROR = 2  # Exit code for input that cannot be used
 INTERRUPTED = 130  # Exit code after Ctrl-C
 COMMANDS = {
@@ -36,6 +37,7 @@ COMMANDS = {
     "sysid": "Identify the robot's parameters from recorded motions.",
     "list": "List the tasks and the project's policies.",
     "info": "Describe a task or a policy: jumper info NAME.",
+    "doctor": "Check the installation: versions, devices, caches, a simulation.",
     "completion": "Print the script that completes commands and flags in bash or zsh.",
 }
 """Help text by command; each command is a module of `jumper_warp.cli` with run(args, modules)."""
@@ -46,7 +48,7 @@ TASK_MODULE = "--task-module"
 TASK_MODULE_HELP = f"""\
 Every command takes {TASK_MODULE} FILE_OR_MODULE, any number of times: a
 FILE.py or an installed module that registers tasks of your own."""
-EXIT_CODES = "Exit codes: 0 done, 1 a fault in jumper, 2 invalid input, 130 after Ctrl-C."
+EXIT_CODES = "Exit codes: 0 done, 1 fault or no memory, 2 invalid input, 130 after Ctrl-C."
 
 
 class UsageError(InputError):
@@ -198,8 +200,8 @@ def parse_error(printed: str, flags: Sequence[Flag], args: Sequence[str]) -> str
 def run_command(command: Callable[[], object]) -> None:
     """Call a command or an experiment; exits with code 2 and one line on standard error if its input is invalid.
 
-    InputError, and OSError about a file, are printed as one line; a closed output pipe ends the command quietly with
-    code 0; any other exception propagates.
+    InputError, and OSError about a file, are printed as one line; so is exhausted memory, with code 1; a closed output
+    pipe ends the command quietly with code 0; any other exception propagates.
     """
     try:
         try:
@@ -216,10 +218,20 @@ def run_command(command: Callable[[], object]) -> None:
     except (InputError, OSError) as error:
         if isinstance(error, OSError) and error.filename is None:
             raise
-        colour = sys.stderr.isatty() and "NO_COLOR" not in os.environ
-        message = f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error)
-        print(f"{RED if colour else ''}jumper:{RESET if colour else ''} {message}", file=sys.stderr)
+        print_error(f"{error.filename}: {error.strerror}" if isinstance(error, OSError) else str(error))
         raise SystemExit(USAGE_ERROR) from None
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        reason = next(iter(str(error).splitlines()), "")
+        print_error(reason if "out of memory" in reason else f"out of memory: {reason:.200}".rstrip(": "))
+        raise SystemExit(FAULT) from None
+
+
+def print_error(message: str) -> None:
+    """Print a message with the program's name on standard error, coloured on a terminal."""
+    colour = sys.stderr.isatty() and "NO_COLOR" not in os.environ
+    print(f"{RED if colour else ''}jumper:{RESET if colour else ''} {message}", file=sys.stderr)
 
 
 if __name__ == "__main__":

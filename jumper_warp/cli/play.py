@@ -1,6 +1,7 @@
 """`jumper play POLICY` records a policy for the Rerun viewer, `jumper play --script FILE` several in sequence.
 
 The policy comes first: its task decides which flags there are. A script lists the commands to one robot.
+`jumper play --dump FILE` shows the state in which a term of a training was not finite.
 """
 
 from __future__ import annotations
@@ -15,17 +16,25 @@ ABOUT = """\
 Simulate a policy, and write a picture and a recording for the Rerun viewer;
 --viewer rerun opens it, --video FILE writes a film.
 jumper play --script FILE.json [flags] makes one robot walk and jump with
-several policies."""
-SCRIPT = "--script"
+several policies.
+jumper play --dump FILE [flags] shows a state that a training has saved because a
+term was not finite."""
+SCRIPT, DUMP = "--script", "--dump"
 
 
 def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
     """Run `jumper play` with the given arguments; modules: the user's, for tasks outside the project.
 
-    args: the policy, then flags, or flags with --script. Raises InputError or OSError: the policy, script or a flag is
-    invalid. Exits as tyro does.
+    args: the policy, then flags, or flags with --script or --dump. Raises InputError or OSError: the policy, a file or
+    a flag is invalid. Exits as tyro does.
     """
-    if args and args[0].startswith("-") and any(arg.partition("=")[0] == SCRIPT for arg in args):
+    names = {arg.partition("=")[0] for arg in args} if args and args[0].startswith("-") else set()
+    if DUMP in names:
+        from jumper_warp.evaluation.dumps import DumpCfg, play_dump
+
+        play_dump(parse_flags(DumpCfg, f"play {DUMP} FILE", args))
+        return
+    if SCRIPT in names:
         from jumper_warp.evaluation.commands import ScriptCfg, play_script
 
         play_script(parse_flags(ScriptCfg, f"play {SCRIPT} FILE", args))

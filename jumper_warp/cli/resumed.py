@@ -37,7 +37,7 @@ def settings_of_run(checkpoint: Checkpoint, cfg: TrainCfg) -> tuple[dict[str, An
         settings = {name: env[name] for name in ("randomize", "noise") if name in env}
         settings |= {"cfg": with_saved_settings(cfg, train), "checkpoint": checkpoint}
         settings["solver"] = "mujoco" if env.get("solver") == "SolverMuJoCo" else "jumper"
-        settings["robot_of_run"] = RobotOverlay.from_json(env["robot"]) if "robot" in env else None
+        settings["overlay"] = RobotOverlay.from_json(env["robot"]) if "robot" in env else None
         return settings, restored_task(saved, loaded_modules(), leave_out=())
     except DECODE_ERRORS as error:
         raise CheckpointError(f"{checkpoint.path}: settings in its configuration: {one_line_message(error)}") from error

@@ -15,13 +15,13 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, cast
 
 import tyro
 
-from jumper_warp.cli.flags import option_of, values_of
+from jumper_warp.cli.flags import list_flags, option_of, values_of
 from jumper_warp.cli.help import wants_help
 from jumper_warp.cli.main import TASK_MODULE, UsageError, parse
 from jumper_warp.cli.renamed_flags import use_new_names
 from jumper_warp.registry import TASKS, TaskEntry, find_task, make_task, task_names
-from jumper_warp.rl.cfg import TrainCfg
-from jumper_warp.utils.errors import InputError
+from jumper_warp.rl.cfg import UNUSED, TrainCfg
+from jumper_warp.utils.errors import InputError, OutOfMemoryError, is_out_of_memory
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -61,11 +61,11 @@ class TrainArgs:
     observed. With 1 the observation has a third of the size; the policy learns faster on few worlds, and 1 is enough
     without randomisation and noise."""
     robot: Path | None = None
-    """Robot overlay, a file that `jumper sysid` writes. Its randomisation ranges override the task's; flags override
-    both."""
+    """Robot overlay, a file that `jumper sysid` writes. Robots are sampled around its values. Its randomisation ranges
+    override the task's; flags override both."""
     preset: str | None = None
     """Named group of settings, which other flags override: `laptop` trains a nominal robot in minutes on two cores."""
-    robot_of_run: Annotated[Any, tyro.conf.Suppress] = None  # Robot overlay of the run that is resumed
+    overlay: Annotated[Any, tyro.conf.Suppress] = None  # Overlay of --robot or the resumed run, with flags' ranges
     checkpoint: Annotated[Any, tyro.conf.Suppress] = None  # Checkpoint that is resumed
 
 
@@ -73,7 +73,8 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
     """Parse the arguments of `jumper train` into settings and the task; exits after help or usage, and as tyro does.
 
     args: the task, then flags. With --resume the saved settings of the run are the defaults.
-    Raises InputError: the task is missing, unknown or given twice, a setting is out of range, or there is no such run.
+    Raises InputError: the task is missing, unknown or given twice, a setting is out of range, the trainer does not use
+    a flag, or there is no such run.
     """
     names = ", ".join(task_names())
     if wants_help(args[:1]):
@@ -82,7 +83,7 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
     if not args or args[0].startswith("-"):
         raise UsageError(f"the task comes first: jumper train TASK [flags]; tasks: {names}")
     name, entry = find_task(args[0])
-    args = [name, *with_preset(name, entry, args[1:])]
+    preset, args = preset_flags(name, entry, args[1:]), args[1:]
     default, task = TrainArgs(TrainCfg(task=name, ppo=entry.ppo, best_metric=entry.best_metric)), make_task(name)
     flags = {name: values_of(f"--{name.replace('_', '-')}", args) for name in ("resume", "log_root", "init_policy")}
     session = {name: values[0] for name, values in flags.items() if values}
@@ -94,30 +95,48 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
         if checkpoint := find_checkpoint(named):
             settings, task = settings_of_run(checkpoint, default.cfg)
             default = dataclasses.replace(default, **settings)
-    parsed, task = parse_settings(for_robot(task, overlay_in(args[1:])), default, args[1:])
+    parsed, flagged = parse_settings(task, default, [*preset, *args])
     if parsed.cfg.task != name:
         raise UsageError(f"give the task once, got {name} and --task {parsed.cfg.task}")
+    if unused := unused_flags(parsed.cfg.trainer, args):
+        raise UsageError(f"{', '.join(unused)}: not supported with trainer {parsed.cfg.trainer}")
     from jumper_warp.tasks.observations import with_history
+    from jumper_warp.tasks.overlay_ranges import with_flagged_ranges
 
-    return parsed, with_history(task, parsed.history)
+    overlay = overlay_in(args) or default.overlay
+    if overlay is not None:
+        flagged, overlay = with_flagged_ranges(task, flagged, overlay, flagged_ranges([*preset, *args]))
+    return dataclasses.replace(parsed, overlay=overlay), with_history(flagged, parsed.history)
 
 
-def with_preset(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
-    """Put the flags of a task's --preset before the other unparsed flags, which have precedence.
+def preset_flags(task: str, entry: TaskEntry, args: Sequence[str]) -> list[str]:
+    """Return the flags of a task's --preset in unparsed arguments, without those that the --trainer does not use.
 
     Raises UsageError: the task has no such preset.
     """
     names = values_of("--preset", args)
     if not names:
-        return list(args)
+        return []
     name = names[-1]
     if name not in entry.presets:
         available = ", ".join(
             f"{other} ({', '.join(known.presets)})" for other, known in TASKS.items() if known.presets
         )
         raise UsageError(f"{task} has no preset {name!r:.60}; tasks with presets: {available}")
-    print(f"preset {name}: {entry.presets[name]}", file=sys.stderr)
-    return [*shlex.split(entry.presets[name]), *args]
+    flags, option = [], ""
+    unused = unused_flags("".join(values_of("--trainer", args)[:1]), shlex.split(entry.presets[name]))
+    for word in shlex.split(entry.presets[name]):
+        option = option_of(word) or option
+        flags += [] if option in unused else [word]
+    print(f"preset {name}: {shlex.join(flags)}", file=sys.stderr)
+    return flags
+
+
+def unused_flags(trainer: str, args: Sequence[str]) -> list[str]:
+    """Return the flags in unparsed arguments that a trainer does not use."""
+    names = [name.replace("_", "-") for name in UNUSED.get(trainer, ())]
+    unused = {option for flag in list_flags(TrainArgs) if flag.name in names for option in flag.options}
+    return list(dict.fromkeys(option for arg in args if (option := option_of(arg)) in unused))
 
 
 def parse_settings(task: TaskCfg, default: TrainArgs, args: Sequence[str]) -> tuple[Any, TaskCfg]:
@@ -149,29 +168,27 @@ def overlay_in(args: Sequence[str]) -> RobotOverlay | None:
     return load_overlay(Path(path[0]))
 
 
-def for_robot(task: TaskCfg, overlay: RobotOverlay | None) -> TaskCfg:
-    """Return a copy of the task with an overlay's randomisation ranges. Raises InputError: a range is invalid."""
-    if overlay is None:
-        return task
-    return dataclasses.replace(task, randomization=dataclasses.replace(task.randomization, **overlay.randomization))
+def flagged_ranges(args: Sequence[str]) -> set[str]:
+    """Return the names of the ranges of `RandomizationCfg` that have a flag in unparsed arguments."""
+    from jumper_warp.robot.overlay import RANDOMIZED
+
+    options = {option_of(arg) for arg in args}
+    return {name for name in RANDOMIZED if f"--env.randomization.{name.replace('_', '-')}" in options}
 
 
 def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
     """Return the function that makes a training's environment from num_envs, seed and device.
 
-    Raises InputError or OSError: the overlay is invalid; the function raises InputError: memory is too small.
+    It raises InputError: memory is too small.
     """
     from jumper_warp.cli.training_memory import check_memory
     from jumper_warp.envs.env import Env
-    from jumper_warp.robot.overlay import load_overlay
-
-    overlay = args.robot_of_run if args.robot is None else load_overlay(args.robot)
 
     def make_env(num_envs: int, seed: int, device: torch.device) -> VecEnv:
         """Return the environment, differentiable for trainer shac."""
         check_memory(task, args.cfg.ppo, args.solver, num_envs, device)
         settings: dict[str, Any] = {name: getattr(args, name) for name in ("solver", "randomize", "noise")}
-        env = Env(task, num_envs, seed=seed, device=str(device), robot=overlay, **settings)
+        env = Env(task, num_envs, seed=seed, device=str(device), robot=args.overlay, **settings)
         if args.cfg.trainer != "shac":
             return env
         from jumper_warp.diff.differentiable_env import DifferentiableEnv
@@ -179,6 +196,22 @@ def env_maker(task: TaskCfg, args: TrainArgs) -> MakeEnv:
         return cast("VecEnv", DifferentiableEnv(env))
 
     return make_env
+
+
+def memory_message(task: TaskCfg, args: TrainArgs, error: Exception) -> str:
+    """Return one line about a training that ran out of memory: need, number of worlds that fits, and how to resume."""
+    import torch
+    import warp as wp
+
+    from jumper_warp.cli.training_memory import describe_need, memory_pools
+
+    device = torch.device(wp.device_to_torch(wp.get_device(args.cfg.device)))
+    if device.type == "cuda":
+        device = torch.device("cuda", torch.cuda.current_device())  # of this rank
+    num_envs = args.cfg.num_envs // int(os.environ.get("WORLD_SIZE", "1"))
+    pools = memory_pools(task, args.cfg.ppo, args.solver, device, rebuilt=True)
+    parts = [f"out of memory: {describe_need(pools, args.cfg.ppo, num_envs)}", *getattr(error, "__notes__", [])]
+    return "; ".join(parts)
 
 
 def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
@@ -233,6 +266,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     parsed, task = parse_train(args)
     from jumper_warp.rl.runner import train
     from jumper_warp.tasks.mirror import mirror_of
+    from jumper_warp.tasks.overlay_ranges import range_words
     from jumper_warp.utils.runtime import configure_device
 
     check_saving(task)
@@ -246,11 +280,18 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
     is_rank_0 = os.environ.get("RANK", "0") == "0"
     if is_rank_0 and configure_device(parsed.cfg.device, parsed.cfg.threads).driver is None:
         report_cpu_time(parsed, () if parsed.preset else find_task(task.name)[1].presets)
+    if is_rank_0 and parsed.randomize and (words := range_words(task, parsed.overlay, changed=True)):
+        print(f"ranges of this robot: {', '.join(words)}", file=sys.stderr)
     as_rsl_rl = None
     if parsed.cfg.trainer == "rsl-rl":
         from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl
     make_env, command = env_maker(task, parsed), command_line(args, modules)
-    result = train(parsed.cfg, make_env, command, as_rsl_rl, actor_init, parsed.checkpoint)
+    try:
+        result = train(parsed.cfg, make_env, command, as_rsl_rl, actor_init, parsed.checkpoint)
+    except (MemoryError, RuntimeError) as error:
+        if not is_out_of_memory(error):
+            raise
+        raise OutOfMemoryError(memory_message(task, parsed, error)) from error
     if is_rank_0:
         print(result.folder)
     return result

@@ -4,23 +4,28 @@ from __future__ import annotations
 
 import math
 import os
+from collections.abc import Sequence
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 
 import torch
+import warp as wp
 
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.distributed import world_size
 from jumper_warp.sim.simulation import SolverName
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.threads import checked_threads
 
 NUM_ACTIONS = 12  # motors
 BUILD_BYTES: dict[SolverName, int] = {"jumper": 70_000, "mujoco": 112_000}
 """[byte] Main memory for each world while the environment is built (`experiments/measure_memory.py`)."""
 ENV_BYTES: dict[SolverName, int] = {"jumper": 25_750, "mujoco": 71_400}
 """[byte] Device memory of the environment's arrays for each world, measured likewise."""
+RECORD_BYTES = 73_000
+"""[byte] Memory for the first non-finite values of a task's terms, for each thread of a CPU, or once on a GPU."""
 FLOAT_BYTES = 4  # [byte] Size of a float32
 INDEX_BYTES = 8  # [byte] Size of a sample's index in the order of an epoch
 MAX_PADDING = 21  # Largest number of floats that pad a sample's row
@@ -77,32 +82,68 @@ def free_main_memory() -> int:
         return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
 
 
+def memory_pools(
+    task: TaskCfg, ppo: PpoCfg, solver: SolverName, device: torch.device, *, rebuilt: bool = False
+) -> list[MemoryPool]:
+    """Return the memory of the machine and of a GPU with the need of a training by this process.
+
+    rebuilt: count memory that this process uses as free.
+    """
+    num_obs, num_critic_obs = (max(end for _, end in task.layout(group).values()) for group in ("actor", "critic"))
+    threads = 1 if device.type == "cuda" else checked_threads(None)
+    learning = learning_need(ppo, num_obs, num_critic_obs)
+    learning = learning._replace(fixed=learning.fixed + threads * RECORD_BYTES)
+    main_free = free_main_memory() // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
+    main_free += own_main_memory() if rebuilt else 0
+    build_bytes = BUILD_BYTES[solver]
+    if device.type != "cuda":
+        return [MemoryPool("main memory", main_free, MemoryNeed(learning.fixed, build_bytes + learning.per_world))]
+    on_device = MemoryNeed(learning.fixed, ENV_BYTES[solver] + learning.per_world)
+    free = torch.cuda.mem_get_info(device)[0] + (own_device_memory(device) if rebuilt else 0)
+    return [
+        MemoryPool("main memory", main_free, MemoryNeed(0, build_bytes)),
+        MemoryPool(f"memory of {device}", free, on_device),
+    ]
+
+
+def own_main_memory() -> int:
+    """Return the main memory that this process uses [byte]; 0 on systems without /proc."""
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * int(Path("/proc/self/statm").read_text().split()[1])
+    except OSError:
+        return 0
+
+
+def own_device_memory(device: torch.device) -> int:
+    """Return the memory of a GPU that torch's and Warp's allocators hold in this process [byte]."""
+    pooled = wp.get_mempool_used_mem_current(str(device)) if wp.is_mempool_enabled(str(device)) else 0
+    return torch.cuda.memory_reserved(device) + pooled
+
+
 def check_memory(task: TaskCfg, ppo: PpoCfg, solver: SolverName, num_envs: int, device: torch.device) -> None:
     """Raise InputError unless the `num_envs` worlds of this process fit into free memory.
 
     The message has the estimate, the free memory [GB], and a number of worlds that fits.
     """
-    num_obs, num_critic_obs = (max(end for _, end in task.layout(group).values()) for group in ("actor", "critic"))
-    learning = learning_need(ppo, num_obs, num_critic_obs)
-    main_free = free_main_memory() // int(os.environ.get("LOCAL_WORLD_SIZE", "1"))
-    build_bytes = BUILD_BYTES[solver]
-    if device.type == "cuda":
-        on_device = MemoryNeed(learning.fixed, ENV_BYTES[solver] + learning.per_world)
-        pools = [
-            MemoryPool("main memory", main_free, MemoryNeed(0, build_bytes)),
-            MemoryPool(f"memory of {device}", torch.cuda.mem_get_info(device)[0], on_device),
-        ]
-    else:
-        pools = [MemoryPool("main memory", main_free, MemoryNeed(learning.fixed, build_bytes + learning.per_world))]
+    pools = memory_pools(task, ppo, solver, device)
+    if num_envs > min(map(MemoryPool.max_worlds, pools)):
+        raise InputError(describe_need(pools, ppo, num_envs))
+
+
+def describe_need(pools: Sequence[MemoryPool], ppo: PpoCfg, num_envs: int) -> str:
+    """Return one line with need and size of the tightest memory [GB], and the largest number of worlds that fits.
+
+    If `num_envs`, of this process, should fit, half of it is suggested.
+    """
     tightest = min(pools, key=MemoryPool.max_worlds)
     max_worlds = tightest.max_worlds()
-    if num_envs <= max_worlds:
-        return
+    advice = "would fit" if max_worlds < num_envs else "may fit"
+    max_worlds = max_worlds if max_worlds < num_envs else num_envs // 2
     needed = (tightest.need.fixed + num_envs * tightest.need.per_world) / 1.0e9
     multiple = ppo.minibatches // math.gcd(ppo.minibatches, ppo.num_steps)  # num_envs is divisible by it
     largest = world_size() * (max_worlds // multiple * multiple)
-    raise InputError(
+    return (
         f"num_envs {world_size() * num_envs} needs about {needed:,.1f} GB of {tightest.name} in each process, "
         f"{tightest.free / 1.0e9:,.1f} GB are free: "
-        + (f"num_envs {largest} would fit" if largest > 0 else "none would fit")
+        + (f"num_envs {largest} {advice}" if largest > 0 else "none would fit")
     )

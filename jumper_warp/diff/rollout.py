@@ -34,7 +34,7 @@ from jumper_warp.sim.solver import check_step
 from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
-from jumper_warp.utils.threads import checked_threads, run_in_parallel
+from jumper_warp.utils.threads import checked_threads, locked, run_in_parallel
 
 MAX_SWEEPS = 200  # largest number of sweeps of the contact iteration in a physics step
 TOLERANCE = 1.0e-6  # [m/s] of the contact iteration in single precision; gradients inherit its error
@@ -101,6 +101,7 @@ class Rollout:
             of `every`.
     """
 
+    @locked
     def __init__(
         self,
         model: Model,
@@ -170,6 +171,7 @@ class Rollout:
         """
         return compact(self.dynamics.model.joint_q.numpy(), np.zeros(38 * self.num_worlds), self.num_worlds)
 
+    @locked
     def hold(self, worlds: Any = True) -> None:
         """Hold the bases at their initial pose and velocity in some worlds; release those of the others.
 
@@ -188,6 +190,7 @@ class Rollout:
         legs = self.dynamics.robot.geometry.numpy()
         return np.column_stack([legs["hip"], *(legs[name] for name in GEOMETRY_NAMES[3:])]).astype(np.float64)
 
+    @locked
     def set_geometry(self, lengths: np.ndarray) -> None:
         """Set the lengths [m] that define the geometry of the four legs in all worlds.
 
@@ -203,6 +206,7 @@ class Rollout:
             legs[name] = column
         self.dynamics.robot.geometry.assign(legs)
 
+    @locked
     def run(
         self,
         targets: Any,
@@ -264,6 +268,7 @@ class Rollout:
         arrays = (rows.q, rows.qd, rows.torque, rows.impulse, rows.pressed, filtered_target)
         return Trajectory(*arrays, commands, from_start=initial_target is None)
 
+    @locked
     def backward(
         self,
         trajectory: Trajectory,
@@ -404,6 +409,8 @@ class Rollout:
                 raise InputError(
                     f"{name} must be {self.real.__name__} of shape {full}, got {values.dtype.__name__} {values.shape}"
                 )
+            if values.device != self.device:
+                raise InputError(f"{name} must be on {self.device}, got an array on {values.device}")
             return values
         values = np.asarray(values, dtype=np.float64)
         if values.shape == shape:

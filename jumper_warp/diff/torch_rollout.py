@@ -14,6 +14,7 @@ from torch.autograd.function import once_differentiable
 from jumper_warp.diff.rollout import LATENCY_RANGE, Rollout, Trajectory
 from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.threads import WARP_LOCK
 
 COMMANDS = ("targets", "q", "qd", "initial_target", "wrench", "impulse")  # arguments of `Rollout.run`
 OUTPUTS = ("q", "qd", "torque", "impulse", "filtered_target")  # differentiable arrays of a `Trajectory`
@@ -119,7 +120,7 @@ class _Simulate(torch.autograd.Function):
 
         First the parameters are written. names: of `tensors`, in order. Returned: `OUTPUTS`.
         """
-        with _stream(rollout):
+        with WARP_LOCK, _stream(rollout):
             given = dict(zip(names, tensors, strict=True))
             _write_parameters(rollout, given)
             commands = {name: wp.from_torch(given[name].detach()) for name in COMMANDS if name in given}
@@ -144,7 +145,7 @@ class _Simulate(torch.autograd.Function):
         changed = {name for name, count in rollout.writes.items() if ctx.writes[name] != count}
         if lost := changed - given.keys():
             raise InputError(f"{min(lost)} was changed after this rollout: pass it to each call of simulate")
-        with _stream(rollout):
+        with WARP_LOCK, _stream(rollout):
             _write_parameters(rollout, given, changed)
             cotangents = {name: _cotangent(trajectory, name, grad) for name, grad in zip(OUTPUTS, grads, strict=False)}
             gradients = rollout.backward(trajectory, **cotangents)

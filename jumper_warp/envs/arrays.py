@@ -12,9 +12,11 @@ import warp as wp
 from jumper_warp.kernels.mdp.env import RING, Delays, EpisodeArrays, Scene
 from jumper_warp.kernels.mdp.view import RobotArrays
 from jumper_warp.robot.description import load_description
+from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.commands import check_commands
+from jumper_warp.tasks.overlay_ranges import with_own_ranges
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.streams import PURPOSES, Purpose
 
@@ -117,19 +119,19 @@ def checked_tasks(task: Any, handovers: Sequence[Handover]) -> tuple[TaskCfg, ..
 
 
 def prepared_tasks(
-    tasks: Sequence[TaskCfg], randomize: bool, noise: bool, ground_may_vary: bool
+    tasks: Sequence[TaskCfg], randomize: bool, noise: bool, ground_may_vary: bool, robot: RobotOverlay | None = None
 ) -> tuple[tuple[TaskCfg, ...], bool]:
     """Return tasks with the environment's randomisation and noise options applied, and whether any samples its ground.
 
-    Without randomize tasks are nominal. Without noise their observations are exact. Ground is sampled only with
-    randomize and ground_may_vary.
+    Without randomize tasks are nominal, with it they have the ranges of the overlay `robot`. Without noise their
+    observations are exact. Ground is sampled only with randomize and ground_may_vary.
     """
     prepared, draws = [], False
     for task in tasks:
         if not (randomize and ground_may_vary):
             task = task.on_level_ground()
         draws = draws or task.draws_ground
-        task = task if randomize else task.nominal()
+        task = with_own_ranges(task, robot) if randomize else task.nominal()
         prepared.append(task if noise else task.without_noise())
     return tuple(prepared), draws
 

@@ -32,11 +32,14 @@ from jumper_warp.sim.slices import SlicedGraph
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import Mirror, mirror_of, mirror_of_action
+from jumper_warp.tasks.overlay_ranges import moves_of, ranges_of
 from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.checks import check_count, check_seed
+from jumper_warp.utils.dumps import NonFiniteValue
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import load_kernels, records
 from jumper_warp.utils.streams import PURPOSES, Purpose
+from jumper_warp.utils.threads import WARP_LOCK, locked
 
 CONTACT_TOLERANCE = 1.0e-4
 """[m/s] Stopping tolerance of the contact iteration, looser than the solver's default, for a fifth fewer sweeps."""
@@ -62,9 +65,10 @@ class Env(Stages):
         final_obs, final_critic_obs: (num_envs, columns), before resets.
         reward_terms: (num_envs,) by name of the reward, weight and time step applied, of worlds on that task.
         reward, done, timeout: (num_envs,); done 1 where an episode ended, timeout 1 where it ended without failure.
-    `Stages` holds the arrays and launches the kernels.
+    `Stages` holds the arrays and launches the kernels. Python threads can have an environment each.
     """
 
+    @locked
     def __init__(
         self,
         task: TaskCfg | Sequence[TaskCfg],
@@ -92,7 +96,8 @@ class Env(Stages):
         randomize, noise: enable domain randomisation, observation noise. auto_reset: reset ended episodes in `step`.
         ground, block: as in `Simulation`; by default the terrain of the first task that has one, else the tasks'
         sampled ground (SolverJumper with randomize), else a plane. skill: index of each world's first task, (num_envs,)
-        or one for all. robot: differences from the robot description. threads: CPU threads, as in `Simulation`.
+        or one for all. robot: differences from the robot description, around which robots are randomised
+        (`jumper_warp.tasks.overlay_ranges`). threads: CPU threads, as in `Simulation`.
         refine: factor by which the physics step is shorter than in training.
         Raises InputError (a ValueError): see `checked_tasks` and `Simulation`, num_envs or refine no whole number of at
         least 1, a seed not in 0 to 2^31 - 1, or no such stream.
@@ -105,9 +110,11 @@ class Env(Stages):
         self.stream: Purpose = stream
         tasks = checked_tasks(task, handovers)
         self.task, self.tasks, self.num_envs, self.seed, self.auto_reset = tasks[0], tasks, num_envs, seed, auto_reset
-        self.handovers, self._overlay, self._conditions = tuple(handovers), robot, (randomize, noise)
+        self.handovers, self.overlay, self._conditions = tuple(handovers), robot, (randomize, noise)
         may_vary = solver == "jumper" and isinstance(ground, str) and ground == "plane" and block is None
-        run, self._draws_ground = prepared_tasks(tasks, randomize, noise, may_vary)
+        if robot is not None and not isinstance(robot, RobotOverlay):
+            raise InputError(f"robot must be a RobotOverlay (see load_overlay), got {robot!r:.60}")
+        run, self._draws_ground = prepared_tasks(tasks, randomize, noise, may_vary, robot)
         terrains = [terrain for each in run if (terrain := each.terrain) is not None]
         ground = terrains[0] if terrains else ground
         self.sim = Simulation(
@@ -124,7 +131,7 @@ class Env(Stages):
             self.sim.physics.dynamics.robot.ground.blocks.zero_()  # until `reset` samples them
         self.physics_dt, self.step_dt = self.sim.dt, self.sim.dt * self.sim.substeps
         self._ends_episodes, self._started, self._compiled, self._graphs = True, False, False, {}
-        self._allocate(run, skill, handovers)
+        self._allocate(run, skill, handovers, moves_of(robot))
         self._show()
 
     def _show(self) -> None:
@@ -143,6 +150,7 @@ class Env(Stages):
         self.reward, self.done, self.timeout, ended, cut = (wp.to_torch(getattr(self.episodes, name)) for name in names)
         self._step = Step(first.obs, self.reward, ended, cut, {"final_obs": first.final_obs, "time_outs": self.timeout})
 
+    @locked
     def reset(self, seed: int | None = None, *, worlds: Any = None) -> tuple[dict[str, torch.Tensor], dict[str, Any]]:
         """Begin a new episode in every world; return (observations by group, extras), extras being empty.
 
@@ -167,6 +175,7 @@ class Env(Stages):
         self._observe(self._part(), after_reset=int(worlds is not None))
         return self._step.obs, {}
 
+    @locked
     def use_reset_mask(self) -> torch.Tensor:
         """Let `step` reset worlds by a mask instead of ended ones; return the mask, (num_envs,) float32, 0 at first.
 
@@ -179,6 +188,7 @@ class Env(Stages):
         self._reset_mask = wp.zeros(self.num_envs, dtype=float, device=self.wp_device)
         return wp.to_torch(self._reset_mask)
 
+    @locked
     def compile(self) -> None:
         """Compile all kernels of `reset` and `step` in parallel; the first `reset` calls this itself."""
         if not self._compiled:
@@ -211,10 +221,11 @@ class Env(Stages):
         shape = (len(self.skills), self.num_envs, 12) if several else (self.num_envs, 12)
         (self.actions if several else self.action).copy_(checked_action(action, shape, self.device))
         if self.wp_device.is_cuda and torch.cuda.is_current_stream_capturing():
-            self._launch_step()
+            locked(self._launch_step)()
         elif (resets := self.auto_reset and self._ends_episodes) not in self._graphs:
-            self._launch_step()  # loads the modules; counts as this step
-            self._graphs[resets] = SlicedGraph(self._launch_step, self.sim.slices, self.wp_device)
+            with WARP_LOCK:
+                self._launch_step()  # loads the modules; counts as this step
+                self._graphs[resets] = SlicedGraph(self._launch_step, self.sim.slices, self.wp_device)
         else:
             self._graphs[resets].replay()
         return self._step
@@ -232,6 +243,7 @@ class Env(Stages):
         if not 0 <= skill < len(self.skills):
             raise InputError(f"skill must be an index below {len(self.skills)}, got {skill}")
 
+    @locked
     def evaluation_reset(self, commands: Any, headings: Any = 0.0, worlds: Any = None) -> None:
         """Begin an episode with a given command in the default pose and first skill; disables resets until `reset`.
 
@@ -258,6 +270,7 @@ class Env(Stages):
         self.episodes.done.zero_()
         self._observe(self._part(), after_reset=1)
 
+    @locked
     def command(self, commands: Any, worlds: Any = None) -> None:
         """Set commands within running episodes and update `obs`.
 
@@ -268,6 +281,7 @@ class Env(Stages):
         self._set_commands(self._array(chosen), 0, checked_commands(commands, chosen, self.tasks), self._all)
         self._observe(self._part(), after_reset=1)
 
+    @locked
     def request(self, skill: int, worlds: Any = None, commands: Any = None) -> None:
         """Request that worlds hand over to another skill as soon as the condition of a handover holds.
 
@@ -290,6 +304,7 @@ class Env(Stages):
     def _array(self, values: np.ndarray) -> wp.array:
         return wp.array(values, dtype=float, device=self.wp_device)
 
+    @locked
     def task_arrays(self, skill: int = 0) -> dict[str, np.ndarray]:
         """Return the fields of every world's state of a task as arrays (num_envs, ...) (waits for the device).
 
@@ -302,6 +317,7 @@ class Env(Stages):
         arrays |= {"base_pos": q[:, :3].copy(), "base_quat": q[:, 3:7].copy(), "base_vel": qd[:, :3].copy()}
         return arrays | {name: getattr(self.episodes, name).numpy().copy() for name in ("done", "termination", "level")}
 
+    @locked
     def snapshot(self) -> Snapshot:
         """Return the robots' current state and parameters for `jumper_warp.diff`; does not wait for the device."""
         sim, n = self.sim, self.num_envs
@@ -328,6 +344,7 @@ class Env(Stages):
             wrench=wp.to_torch(self.robot.body_f).view(n, -1, 6)[:, 0].T,
         )
 
+    @locked
     def metrics(self) -> dict[str, float]:
         """Return metrics by name since the last call, see `TaskRuntime.metrics`, and clear the counters.
 
@@ -340,6 +357,14 @@ class Env(Stages):
         fractions = levels / self.num_envs
         return metrics | {f"Curriculum/fraction_at_level_{i}": float(part) for i, part in enumerate(fractions)}
 
+    def non_finite(self) -> list[NonFiniteValue]:
+        """Return the first non-finite value of each reward, observation and curriculum term, and of the state.
+
+        Each term is returned once. Waits for the device. A termination is true or false, so that it has no such value;
+        a state or an action that is not finite ends the episode as `terminations.diverged`.
+        """
+        return [value for skill in self.skills for value in skill.non_finite()]
+
     def mirror(self, what: str) -> Mirror:
         """Return the left-right mirror image (order, signs) of the first task's "observation", or of an "action".
 
@@ -351,7 +376,7 @@ class Env(Stages):
         """Return all settings that define the environment as JSON data.
 
         `task` and `interface` are those of the first task; with several tasks, `tasks`, `first_skill` and `handovers`
-        (names of functions) are added, with a robot overlay, `robot`.
+        (names of functions) are added; with a robot overlay, `robot`, and `ranges` of the first task if randomised.
         """
         config = {
             "task": task_to_json(self.task),
@@ -366,8 +391,9 @@ class Env(Stages):
             "noise": self._conditions[1],
             "quaternion_order": "xyzw",
         }
-        if self._overlay is not None:
-            config = {"robot": self._overlay.to_json(), **config}
+        if self.overlay is not None:
+            config = {"robot": self.overlay.to_json(), **config}
+            config |= {"ranges": ranges_of(self.task, self.overlay)} if self._conditions[0] else {}
         if len(self.tasks) == 1:
             return config
         return {
@@ -377,10 +403,12 @@ class Env(Stages):
             **config,
         }
 
+    @locked
     def state_dict(self) -> dict[str, torch.Tensor]:
         """Return the complete state that the next step depends on; see `jumper_warp.envs.state.save_state`."""
         return save_state(self)
 
+    @locked
     def load_state_dict(self, state: dict[str, torch.Tensor]) -> None:
         """Restore a saved state, so that later steps are bitwise the same; see `jumper_warp.envs.state.load_state`."""
         load_state(self, state)

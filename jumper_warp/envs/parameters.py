@@ -12,6 +12,7 @@ from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.sim.dynamics import find_paws
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.overlay_ranges import RangeMoves
 
 MODEL = (
     "body_mass", "body_inv_mass", "body_com", "body_inertia", "body_inv_inertia", "joint_armature", "joint_friction",
@@ -24,11 +25,13 @@ NOMINAL = {
 """Arrays of the model whose values of one world are copied to `nominal_<value>`."""
 
 
-def robot_parameters(sim: Simulation, tasks: tuple[TaskCfg, ...], skill: wp.array) -> Any:
+def robot_parameters(
+    sim: Simulation, tasks: tuple[TaskCfg, ...], skill: wp.array, moves: RangeMoves | None = None
+) -> Any:  # fmt: skip
     """Return the arrays of robot parameters that domain randomisation writes, as views of a simulation's arrays.
 
     The model's current values become the nominal ones. skill: (num_worlds,) int, index in `tasks` of each world's
-    active task.
+    active task. moves: differences of the robot from the described one, None for the described one.
     """
     model, n, device = sim.model, sim.num_worlds, sim.device
     robot = RobotParameters()
@@ -63,4 +66,8 @@ def robot_parameters(sim: Simulation, tasks: tuple[TaskCfg, ...], skill: wp.arra
         setattr(robot, f"nominal_{name}", wp.array(np.array(rows, dtype=np.float32), dtype=float, device=device))
     offset = np.zeros(12) if overlay is None else overlay.offset[0]
     robot.nominal_offset = wp.array(offset, dtype=float, device=device)
+    moves = RangeMoves() if moves is None else moves
+    robot.motor_friction_move = wp.array(np.array(moves.motor_friction), dtype=float, device=device)
+    robot.friction_move = wp.vec2(moves.dynamic_friction, moves.static_friction)
+    robot.latency_move, robot.zero_latency = 1.0e-3 * moves.latency, 1.0e-3 * moves.zero_latency
     return robot

@@ -10,9 +10,11 @@ import numpy as np
 import torch
 import warp as wp
 
-from jumper_warp.envs.arrays import allocate
+from jumper_warp.envs.arrays import FIRST_STEP_COUNT, allocate
+from jumper_warp.kernels.layout import COORDS, DOFS
 from jumper_warp.kernels.mdp.env import RING, Counters, NoSettings, SkillSettings
 from jumper_warp.kernels.mdp.events import make_event_kernel
+from jumper_warp.kernels.mdp.non_finite import NO_WORLD, NonFinite
 from jumper_warp.kernels.mdp.observe import CHUNK, ObservationArrays, make_observe_kernel
 from jumper_warp.kernels.mdp.reset import make_reset_kernel, make_set_command_kernel
 from jumper_warp.kernels.mdp.step import make_step_kernel
@@ -20,7 +22,9 @@ from jumper_warp.kernels.mdp.view import vec12
 from jumper_warp.robot.motors import filter_params
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.params import ParamArrays
+from jumper_warp.utils.dumps import NonFiniteValue
 from jumper_warp.utils.kernels import Kernel, records
+from jumper_warp.utils.threads import locked
 
 _KERNELS: dict[tuple, Kernel] = {}
 
@@ -31,8 +35,13 @@ class TaskRuntime:
     kernels: see `kernels_of`. obs, final_obs: torch views (num_envs, columns) by group, after and before resets.
     """
 
-    def __init__(self, task: TaskCfg, index: int, num_envs: int, step_dt: float, substeps: int, device: Any) -> None:
-        """Allocate the task's arrays; index: its index in the environment; step_dt [s]: policy step of `substeps`."""
+    def __init__(
+        self, task: TaskCfg, index: int, num_envs: int, step_dt: float, substeps: int, device: Any, slices: int = 1
+    ) -> None:  # fmt: skip
+        """Allocate the task's arrays; index: its index in the environment; step_dt [s]: policy step of `substeps`.
+
+        slices: number of slices of worlds.
+        """
         self.task, self.index, self.num_envs, self.device = task, index, num_envs, device
         self.kernels = kernels_of(task)
         self.params = ParamArrays(task.params, device)
@@ -46,6 +55,7 @@ class TaskRuntime:
         self.settings = self._structs([] if task.reset.settings is None else [task.reset.settings.values(step_dt)])
         self.levels = self._structs([level.values() for level in task.levels], task.level_type)
         self._allocate_observations(substeps)
+        self._allocate_non_finite(slices)
 
     def _counters(self) -> Any:
         """Return the counters of episode statistics for the kernels, all 0."""
@@ -89,6 +99,51 @@ class TaskRuntime:
         self.observations = arrays
         self.obs, self.final_obs = (self._views(a, widths) for a in (arrays.now, arrays.final))
 
+    def _allocate_non_finite(self, slices: int) -> None:
+        """Allocate the records of non-finite values, for each slice of worlds, and the names of the terms."""
+        task, groups = self.task, self.task.groups
+        slots = [(group, slot.term) for group in groups for slot in task.params.slots[f"observations.{group}"]]
+        self._term_names = [f"rewards.{term.name}" for term in task.rewards]
+        self._term_names += [f"curriculum.{task.curriculum.name}", "terminations.diverged"]
+        self._term_names += [f"observations.{group}.{term.name}" for group, term in slots]
+        components = [f"{group}.{name}" for group, term in slots for name in term.columns[-term.width :]]
+        self._names = {"rewards": [term.name for term in task.rewards], "observations": components}
+        self._reported: set[int] = set()
+        found, rows = NonFinite(), slices * len(self._term_names)
+        found.num_rewards, found.num_terms = len(task.rewards), len(self._term_names)
+        found.world = wp.full(rows, NO_WORLD, dtype=int, device=self.device)
+        allocate(found, ("step",), rows, int, self.device)
+        allocate(found, ("value",), rows, float, self.device)
+        for name, columns in (("joint_q", int(COORDS)), ("joint_qd", int(DOFS)), ("action", 12),
+                              ("observations", len(components)), ("rewards", len(task.rewards))):  # fmt: skip
+            allocate(found, (name,), (rows, columns), float, self.device)
+        widths = [term.width for _, term in slots]
+        found.observation_term = wp.array(np.repeat(np.arange(len(slots)), widths), dtype=int, device=self.device)
+        self.found, self.found_states = found, wp.zeros(rows, dtype=task.state, device=self.device)
+
+    def non_finite(self) -> list[NonFiniteValue]:
+        """Return the first non-finite value of each term, once per term (waits for the device)."""
+        worlds = self.found.world.numpy().reshape(-1, self.found.num_terms)  # (slices, terms)
+        terms = [i for i in np.flatnonzero((worlds != NO_WORLD).any(0)).tolist() if i not in self._reported]
+        if not terms:
+            return []
+        self._reported |= set(terms)
+        found, states = self.found, records(self.found_states)
+        steps, values = found.step.numpy().reshape(worlds.shape), found.value.numpy()
+        values_by_term = []
+        for i in terms:
+            first = min(np.flatnonzero(worlds[:, i] != NO_WORLD), key=lambda part: (steps[part, i], worlds[part, i]))
+            row = first * found.num_terms + i
+            names = ("joint_q", "joint_qd", "action", "observations", "rewards")
+            arrays = {name: getattr(found, name).numpy()[row].copy() for name in names}
+            arrays |= {f"state.{name}": np.array(states[name][row]) for name in states.dtype.names or ()}
+            step = int(steps[first, i]) - FIRST_STEP_COUNT - 1  # the first reset counts as a step
+            name = self._term_names[i] if self.index == 0 else f"{self.task.name}/{self._term_names[i]}"
+            values_by_term.append(
+                NonFiniteValue(name, float(values[row]), int(worlds[first, i]), step, arrays, self._names)
+            )
+        return values_by_term
+
     def _views(self, array: wp.array, widths: dict[str, int]) -> dict[str, torch.Tensor]:
         """Return torch views (num_envs, columns) by group; array: flat, group after group; widths: columns by group."""
         flat, first, views = wp.to_torch(array), 0, {}
@@ -115,6 +170,7 @@ class TaskRuntime:
         for key, value in numbers.items():
             self.params.set(f"{section}.{name}.{key}", value)
 
+    @locked
     def metrics(self) -> dict[str, float]:
         """Return metrics by name since the last call, and clear the counters (waits for the device).
 

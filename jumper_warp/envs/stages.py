@@ -30,6 +30,7 @@ from jumper_warp.kernels.mdp.track import track_kernel
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.slices import WorldRange
 from jumper_warp.tasks.cfg import Handover, TaskCfg
+from jumper_warp.tasks.overlay_ranges import RangeMoves
 from jumper_warp.utils.kernels import Kernel
 from jumper_warp.utils.streams import Purpose
 
@@ -62,13 +63,20 @@ class Stages:
     _started: bool  # Whether `reset` or `evaluation_reset` has begun the first episodes
     _ends_episodes: bool  # Whether ended episodes are reset; false after `evaluation_reset`
 
-    def _allocate(self, tasks: Sequence[TaskCfg], skill: np.ndarray | int, handovers: Sequence[Handover]) -> None:
-        """Allocate all arrays and build all kernels; skill: index of each world's first task, (num_envs,) or one."""
+    def _allocate(
+        self, tasks: Sequence[TaskCfg], skill: np.ndarray | int, handovers: Sequence[Handover], moves: RangeMoves
+    ) -> None:
+        """Allocate all arrays and build all kernels; skill: index of each world's first task, (num_envs,) or one.
+
+        moves: differences of the robot from the described one.
+        """
         n, device, sim = self.num_envs, self.wp_device, self.sim
         self._first_skill = checked_skill(skill, n, len(tasks))
         active, self._home = (wp.array(self._first_skill, dtype=int, device=device) for _ in range(2))
-        self.skills = [TaskRuntime(task, i, n, self.step_dt, sim.substeps, device) for i, task in enumerate(tasks)]
-        self.parameters = robot_parameters(sim, tuple(tasks), active)
+        self.skills = [
+            TaskRuntime(task, i, n, self.step_dt, sim.substeps, device, len(sim.slices)) for i, task in enumerate(tasks)
+        ]
+        self.parameters = robot_parameters(sim, tuple(tasks), active, moves)
         self.robot, self._scene = robot_arrays(sim, self.step_dt), scene_of(sim)
         self.episodes = episode_arrays(n, self.seed, self.stream, active, device)
         self.delays = delay_arrays(n, self.parameters.latency, sim.substeps, device)
@@ -109,7 +117,7 @@ class Stages:
         env = EpisodeArrays()
         for name in EpisodeArrays.vars:
             setattr(env, name, getattr(self.episodes, name))
-        env.first = worlds.first
+        env.first, env.slice = worlds.first, self.sim.slices.index(worlds) if worlds in self.sim.slices else 0
         return WorldSlice(*worlds, env)
 
     def _launch_step(self, worlds: WorldRange | None = None) -> None:
@@ -152,8 +160,9 @@ class Stages:
         for skill in self.skills:
             self._launch(
                 skill.kernels["step"], part.count,
-                [skill.index, self.robot, self._scene.ground, len(skill.task.levels), skill.params.values, part.episode,
-                 skill.states, skill.episode_sum, skill.term_value, skill.counters],
+                [skill.index, self.robot, self._scene.ground, len(skill.task.levels), skill.params.values,
+                 skill.observations.raw, part.episode, skill.states, skill.episode_sum, skill.found, skill.found_states,
+                 skill.term_value, skill.counters],
             )  # fmt: skip
         if ended_before:
             self._launch(set_skill_kernel, part.count, [self._reset_mask, 0, part.episode])
@@ -242,7 +251,7 @@ class Stages:
             self._launch(
                 skill.kernels["observe"], (skill.num_chunks, part.count),
                 [skill.index, self.robot, self.parameters, self._scene.ground, part.episode, skill.states,
-                 skill.params.values, after_reset, arrays.raw],
+                 skill.params.values, after_reset, skill.term_value, arrays.raw, skill.found, skill.found_states],
             )  # fmt: skip
             inputs = [skill.index, part.episode, skill.columns, skill.params.values, after_reset, arrays]
             self._launch(postprocess_obs_kernel, (part.count, int(LANES)), inputs, POSTPROCESS_BLOCK)

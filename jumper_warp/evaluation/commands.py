@@ -135,10 +135,12 @@ def play(run: EvaluationRun, cfg: PlayCfg) -> Path:
     """
     from jumper_warp.evaluation.log import run_evaluation
     from jumper_warp.evaluation.recorder import EnvRecorder
+    from jumper_warp.evaluation.trained import warn_beyond_training
 
     flags, name = cfg.flags, run.policy.interface.task
     run.prepare("play", cfg.conditions, cfg.out)
     log = flags.log(run.evaluation.prepare_task(run.task))
+    warn_beyond_training(run.task, log.all_commands())
     env, worlds = run.env(log.count), range(log.count)
     notes = {"task": name, "solver": cfg.conditions.solver}
     recorder = EnvRecorder(env, log, worlds, notes=notes)
@@ -179,6 +181,7 @@ def play_script(cfg: ScriptCfg) -> Path:
     run = SkillRun(cfg.policies)
     run.prepare("play", cfg.conditions, cfg.out)
     course = CourseLog([script])
+    course.warn_beyond_training(run.skills.tasks)
     env = run.env(1, block=course.block)
     notes = {"task": cfg.script.stem, "solver": cfg.conditions.solver}
     recorder = EnvRecorder(env, course, [0], block=course.block, notes=notes)

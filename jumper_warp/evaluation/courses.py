@@ -17,6 +17,7 @@ import numpy as np
 
 from jumper_warp.evaluation.log import EvaluationLog, ended_by, finite, outcome_names
 from jumper_warp.evaluation.scripts import ScriptStep
+from jumper_warp.evaluation.trained import warn_beyond_training
 from jumper_warp.evaluation.velocities import (
     AXES,
     SETTLING_TIME,
@@ -28,6 +29,7 @@ from jumper_warp.evaluation.velocities import (
 )
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK
 from jumper_warp.robot.grounds import BlockCfg
+from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.switching import FALLS
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, largest, mean, rate, rmse
@@ -104,6 +106,12 @@ class CourseLog(EvaluationLog):
     def seconds(self) -> float:
         """Maximum simulated time [s]."""
         return float((self.durations.sum(axis=1) + JUMP_TIMEOUT * (self.target_skill != WALK).sum(axis=1)).max()) + 1.0
+
+    def warn_beyond_training(self, tasks: Sequence[TaskCfg]) -> None:
+        """Print one line for each task with commands beyond its training on standard error; tasks: by skill."""
+        for skill, task in enumerate(tasks):
+            if (chosen := self.target_skill == skill).any():
+                warn_beyond_training(task, self.goal[chosen])
 
     def begin(self, env: Any) -> None:
         """Reset every robot to the default pose at rest, and start its first command."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -12,6 +12,7 @@ import numpy as np
 from jumper_warp.evaluation.log import NO_END, EvaluationLog, ended_by, finite, outcome_names
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.commands import layout_of
+from jumper_warp.utils.checks import FLOAT32_MAX
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, mean, rate
 
@@ -26,7 +27,8 @@ MAX_COMMAND_SIZE = 4  # Maximum number of values in a command
 class EpisodeLog(EvaluationLog):
     """Log of one episode per world of any task; entries of a world do not change after its episode's end."""
 
-    commands: np.ndarray  # (num_envs, n) Command of each world, `jumper_warp.tasks.commands.layout_of`
+    commands: np.ndarray
+    """(num_envs, n) Command of each world, `jumper_warp.tasks.commands.layout_of`; n = 0: the task samples commands."""
     task: TaskCfg
     seconds: float = 10.0  # [s] Maximum simulated time
     end: np.ndarray = field(init=False)  # (num_envs,) Index of the termination that ended the episode, -1 while it runs
@@ -42,14 +44,29 @@ class EpisodeLog(EvaluationLog):
         self.end, self.length = np.full(count, -1), np.zeros(count)
         self.start_position, self.end_position = (np.full((count, 3), np.nan) for _ in range(2))
         self._height_sum, self._steps = np.zeros(count), np.zeros(count, dtype=int)
+        self._start: dict[str, np.ndarray] = {}  # Sampled numbers of the task's state at the start, (num_envs,) each
+        self.identical = count > 1  # Whether all worlds have been in equal states so far
 
     def begin(self, env: Env) -> None:
-        """Reset every world to the default pose and set its command."""
-        env.evaluation_reset(self.commands)
-        self.start_position = env.task_arrays()["base_pos"].copy()
+        """Reset every world to the default pose with its command, or as in training, with commands of all levels."""
+        if self.commands.shape[1]:
+            env.evaluation_reset(self.commands)
+        else:
+            env.episodes.level.fill_(len(self.task.levels))
+            env.reset()
+        arrays = env.task_arrays()
+        self.start_position = arrays["base_pos"].copy()
+        self._compare(arrays)
+        if not self.commands.shape[1]:
+            self._start = sampled_numbers(arrays)
+
+    def _compare(self, arrays: dict[str, np.ndarray]) -> None:
+        """Update `identical` from the arrays of `read_env`."""
+        self.identical = self.identical and all(map(rows_are_equal, arrays.values()))
 
     def update(self, arrays: dict[str, np.ndarray], step_dt: float) -> bool:
         """Record a policy step from the arrays of `read_env`; return whether all episodes have ended."""
+        self._compare(arrays)
         running = self.end < 0
         self.end_position[running] = arrays["base_pos"][running]
         self._height_sum[running] += arrays["base_pos"][running, 2]
@@ -79,8 +96,11 @@ class EpisodeLog(EvaluationLog):
         return np.array([*(bool(term.options[option]) for term in self.task.terminations), False])[self.end]
 
     def columns(self) -> dict[str, list]:
-        """Return lists with one value per episode: command_0 ..., length_s, mean_base_height_m, base_x_m ..., end."""
-        columns = {f"command_{i}": self.commands[:, i] for i in range(self.commands.shape[1])}
+        """Return lists with one value per episode: command_0 ..., length_s, mean_base_height_m, base_x_m ..., end.
+
+        Without commands, start_<field> is each number of the task's state that the reset sampled.
+        """
+        columns = {f"command_{i}": self.commands[:, i] for i in range(self.commands.shape[1])} | self._start
         columns |= {"length_s": self.length, "mean_base_height_m": self.mean_height}
         columns |= {f"base_{axis}_m": self.end_position[:, i] for i, axis in enumerate("xyz")}
         return {name: finite(values) for name, values in columns.items()} | {"end": self.outcomes.tolist()}
@@ -96,6 +116,33 @@ class EpisodeLog(EvaluationLog):
     def notes(self, worlds: Sequence[int]) -> dict[str, Any]:
         """Return the commands of some worlds: key `commands`, a list of rows."""
         return {"commands": self.commands[list(worlds)].tolist()}
+
+    def first(self) -> EpisodeLog:
+        """Return a log of the first episode alone."""
+        log = EpisodeLog(self.commands[:1], self.task, self.seconds)
+        for name in ("end", "length", "start_position", "end_position", "_height_sum", "_steps"):
+            setattr(log, name, getattr(self, name)[:1])
+        return log
+
+
+def rows_are_equal(values: np.ndarray) -> bool:
+    """Return whether all rows of an array are equal within rounding, NaN included."""
+    numbers = np.asarray(values, dtype=float)
+    return np.allclose(numbers, numbers[:1], rtol=1e-6, atol=1e-6, equal_nan=True)
+
+
+def sampled_numbers(arrays: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """Return the real numbers of a task's state that differ between worlds, as columns start_<field>, also with _<i>.
+
+    arrays: of `Env.task_arrays`.
+    """
+    columns = {}
+    for name, values in arrays.items():
+        if name.startswith("base_") or values.dtype.kind != "f" or values.ndim > 2 or rows_are_equal(values):
+            continue
+        parts = {f"_{i}": values[:, i] for i in range(values.shape[1])} if values.ndim == 2 else {"": values}
+        columns |= {f"start_{name}{end}": part.copy() for end, part in parts.items()}
+    return columns
 
 
 def episode_metrics(episodes: EpisodeLog) -> Metrics:
@@ -123,43 +170,60 @@ def check_episodes(count: int, command: tuple[float, ...], seconds: float) -> No
     """Raise InputError unless number of episodes, command and length [s] are within their limits."""
     if count < 1:
         raise InputError(f"num_episodes must be at least 1, got {count}")
-    if len(command) > MAX_COMMAND_SIZE or not all(math.isfinite(value) for value in command):
+    if len(command) > MAX_COMMAND_SIZE or not all(abs(value) <= FLOAT32_MAX for value in command):
         raise InputError(f"command takes up to {MAX_COMMAND_SIZE} finite numbers, got {command}")
     if not 0.0 < seconds <= MAX_SECONDS:
         raise InputError(f"seconds must be in (0, {MAX_SECONDS:g}], got {seconds}")
 
 
 def tile_command(command: tuple[float, ...], count: int, task: TaskCfg) -> np.ndarray:
-    """Repeat a command for `count` worlds, padded with zeros to the size n of the task's command: (count, n)."""
+    """Repeat a command for `count` worlds, padded with zeros to the size n of the task's command: (count, n).
+
+    An empty command stays empty: (count, 0).
+    """
+    if not command:
+        return np.zeros((count, 0))
     missing = max(layout_of(task).counts[-1] - len(command), 0)
     return np.tile(np.pad(np.array(command, dtype=float), (0, missing)), (count, 1))
 
 
 @dataclass(frozen=True)
 class EpisodeFlags:
-    """Flags of episodes that start at rest in the default pose."""
+    """Flags of episodes that start as in training, or with a command at rest in the default pose."""
 
     num_episodes: int = 200  # Number of episodes
-    command: tuple[float, ...] = ()  # Up to four values of the task's command; omitted ones are 0
+    command: tuple[float, ...] = ()
+    """Up to four values of the task's command; omitted ones are 0 (default: the task's reset samples each command)."""
     seconds: float = 10.0  # [s] Maximum length of an episode
 
     def __post_init__(self) -> None:
         check_episodes(self.num_episodes, self.command, self.seconds)
 
     def log(self, task: TaskCfg, seed: int) -> EpisodeLog:
-        """Return a new log of episodes with the flags' command in all worlds; seed has no effect."""
+        """Return a new log of episodes with the flags' command in all worlds.
+
+        seed has no effect: the environment's random streams sample the commands.
+        """
         return EpisodeLog(tile_command(self.command, self.num_episodes, task), task, self.seconds)
 
     def metrics(self, log: EpisodeLog) -> Metrics:
-        """Return lengths, heights and outcomes of a finished log of episodes as metrics."""
-        return episode_metrics(log)
+        """Return lengths, heights and outcomes of a finished log of episodes as metrics.
+
+        Identical episodes count as one trial, and one line on standard error says so.
+        """
+        if not log.identical:
+            return episode_metrics(log)
+        reason = "nothing was sampled; they count as one trial. --randomize samples robots"
+        print(f"jumper: all {log.count} episodes are identical: {reason}", file=sys.stderr)
+        return episode_metrics(log.first())
 
 
 @dataclass(frozen=True)
 class EpisodePlayFlags:
     """Flags of a recorded episode."""
 
-    command: tuple[float, ...] = ()  # Up to four values of the task's command; omitted ones are 0
+    command: tuple[float, ...] = ()
+    """Up to four values of the task's command; omitted ones are 0 (default: the task's reset samples each command)."""
 
     length = 10.0  # [s] Length of the recording
 

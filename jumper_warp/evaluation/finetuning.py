@@ -26,6 +26,7 @@ from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.policy import Policy
 from jumper_warp.robot.overlay import load_overlay
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.overlay_ranges import with_fixed_ranges
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.trajectory.gauss_newton import Anchor, Network, gauss_newton_step
 from jumper_warp.utils.errors import InputError
@@ -69,7 +70,11 @@ def make_groups(policy: Policy, cfg: FinetuneCfg, modules: Iterable[ModuleType] 
                 randomize=randomize, noise=name == "randomized", seed=cfg.seed, stream="tuning", device=cfg.device,
                 threads=cfg.threads,
             )  # fmt: skip
-            env = env_of_policy(policy, count, conditions, change=change_task, modules=modules)
+            robot = conditions.overlay(policy.config)
+            if robot is not None and name == "late":
+                own = {row: pair for row, pair in robot.randomization.items() if row == "latency"}
+                robot = with_fixed_ranges(robot, own, nominal=True)
+            env = env_of_policy(policy, count, conditions, change=change_task, modules=modules, robot=robot)
             target = evaluation_of(env.task).finetune_target
             if target is None:
                 raise InputError(f"fine-tuning supports jumps to heights and positions, not {env.task.name}")

@@ -162,6 +162,10 @@ class JumpLog(EvaluationLog):
     and yaw at their command. A jump's entries do not change after its end.
     """
 
+    def all_commands(self) -> np.ndarray:
+        """Return the goals of all jumps [m], (num_envs, jumps in a row, 3)."""
+        return self.goals
+
     def __init__(
         self,
         goals: np.ndarray,

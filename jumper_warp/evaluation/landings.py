@@ -17,6 +17,7 @@ from jumper_warp.evaluation.log import termination_names
 from jumper_warp.kernels.jump import terminations
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import TerminationTerm
+from jumper_warp.utils.checks import check_finite
 from jumper_warp.utils.errors import InputError
 
 Position2D = tuple[float, float]  # [m] Ahead and to the left
@@ -99,8 +100,8 @@ class LandingFlags(JumpFlags):
             low, high = getattr(self, name)
             if not -10.0 < low <= high < 10.0:
                 raise InputError(f"{name} must be in (-10, 10) m and rise, got {low}, {high}")
-        if self.heading != "any" and not math.isfinite(self.heading):
-            raise InputError(f"heading must be finite or any, got {self.heading}")
+        if self.heading != "any":
+            check_finite("heading", self.heading)
 
     def log(self, task: TaskCfg, seed: int) -> LandingLog:
         """Return a new log of one jump per world, with goals and headings from the flags."""

@@ -64,6 +64,10 @@ class EvaluationLog(ABC):
         """Return commanded heights [m] of the base at the apex, above the ground, (worlds,), or None."""
         return None
 
+    def all_commands(self) -> np.ndarray | None:
+        """Return the commands of all worlds, (..., 3), as in `evaluation.trained`; None if these have no range."""
+        return None
+
     def labels(self, worlds: Sequence[int]) -> list[str]:
         """Return the names of some worlds in recordings and pictures, such as their goals in metres."""
         return [f"{self.row_name} {world}" for world in worlds]

@@ -56,7 +56,7 @@ class EnvRecorder:
         """Append the environment's current state as a frame: link poses, series, ankle positions, paw forces."""
         sim, log = self.env.sim, self.log
         poses = self.links.read()[0][self.worlds]
-        forces = sim.paw_force.numpy().transpose(1, 0, 2)[self.worlds]
+        forces = peak_forces(sim)[self.worlds]
         if self.block is not None:
             self.block_positions.append(block_positions(sim)[self.worlds])
         self.frames += 1
@@ -106,6 +106,22 @@ def block_positions(sim: Simulation) -> np.ndarray:
 
     assert isinstance(sim.solver, SolverJumper)
     return sim.solver.block_position()
+
+
+def peak_forces(sim: Simulation) -> np.ndarray:
+    """Return the largest force on each paw in the last policy step [N], (num_worlds, 4, 3), world axes, legs as LEGS.
+
+    Its direction is that of the last physics step; upward if the paw was then in the air.
+    """
+    force = sim.paw_force.numpy().transpose(1, 0, 2).astype(float)
+    size = np.linalg.norm(force, axis=2, keepdims=True)
+    direction = np.where(size > 0.0, force / np.where(size > 0.0, size, 1.0), [0.0, 0.0, 1.0])
+    return direction * sim.physics.peak_paw_force.numpy().T[..., None]
+
+
+def largest_forces(forces: np.ndarray) -> np.ndarray:
+    """Return the largest force [N] on each paw in several physics steps, (4, 3); forces: (steps, 4, 3)."""
+    return forces[np.linalg.norm(forces, axis=2).argmax(axis=0), np.arange(forces.shape[1])]
 
 
 def ankles(poses: np.ndarray) -> np.ndarray:

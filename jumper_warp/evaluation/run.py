@@ -19,12 +19,14 @@ import tyro
 from jumper_warp.evaluation.evaluations import EvaluationFlags, evaluation_of
 from jumper_warp.evaluation.log import EvaluationLog, run_evaluation
 from jumper_warp.evaluation.recorder import EnvRecorder, save_recording
+from jumper_warp.evaluation.trained import trained_range
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.skills import SkillNames, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.values import TRANSVERSAL
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.overlay_ranges import range_words
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import AnyMetrics, Metrics, MetricValue
 from jumper_warp.utils.output import output_dir, read_values, write_metrics
@@ -89,6 +91,7 @@ class Run(ABC):
         self.save_trials = False  # Whether `run_episodes` writes trials.npz
         self.name, self.print_flags = "", PrintFlags()  # Name of the evaluation; what `report` prints
         self.settings: dict[str, Any] = {}  # Settings of task, robot and test, reported with the conditions
+        self._ranges: list[str] = []  # Ranges of randomisation that the robot overlay changes, as text
         self._latency: list[np.ndarray] = []  # [physics steps] (num_envs,) per `run_episodes`
         self._physics_dt = PHYSICS_DT
 
@@ -121,6 +124,7 @@ class Run(ABC):
         words += [] if conditions.sensor_offset is None else [f"sensors ± {conditions.sensor_offset:g}°"]
         words += [] if conditions.gravity is None else [f"gravity {conditions.gravity:g} m/s²"]
         words += [] if conditions.robot is None else [f"robot of {conditions.robot.name}"]
+        words += [f"robot {self.settings['robot']}"] if "robot" in self.settings else []
         return ", ".join(words + (["pushed in flight too"] if conditions.push_in_flight else []))
 
     @property
@@ -137,6 +141,16 @@ class Run(ABC):
         if self._latency:
             values |= latency_values(np.concatenate(self._latency), self._physics_dt, conditions.latency)
         return values
+
+    def note_robot(self, env: Env) -> None:
+        """Keep the robot overlay of an environment, and the ranges of randomisation around it, for the report."""
+        if env.overlay is None:
+            return
+        if self.conditions.robot is None:
+            self.settings["robot"] = f"of the training{env.overlay.source and f' ({env.overlay.source:.60})'}"
+        if self.conditions.randomize:
+            self._ranges = range_words(env.task, env.overlay, changed=True)
+            self.settings["ranges"] = range_words(env.task, env.overlay)
 
     def run_episodes(
         self, env: Env, log: Log, *, film: str = "", film_scene: Mapping[str, Any] | None = None,
@@ -179,6 +193,7 @@ class Run(ABC):
         name, count = self.name.replace("_", " "), f"{count}, " if count else ""
         seconds = time.perf_counter() - self.started
         what = f"{self.source}, {name}: {count}{self.title}"
+        what += f"; ranges of this robot: {', '.join(self._ranges)}" if self._ranges else ""
         print_summary(self.folder, what, keys, flags=self.print_flags, seconds=seconds, **settings)
 
     def report(
@@ -188,7 +203,8 @@ class Run(ABC):
         values = self.write(metrics)
         printed = [metrics[key] for key in keys if key in metrics]
         most = max(printed, key=lambda metric: metric.trials or 0, default=MetricValue(None))
-        self.summarise(f"{most.trials:,} {most.over}" if most.trials else "", keys, paper=paper)
+        over = most.over.removesuffix("s") if most.over and most.trials == 1 else most.over
+        self.summarise(f"{most.trials:,} {over}" if most.trials else "", keys, paper=paper)
         return values
 
 
@@ -256,6 +272,7 @@ class EvaluationRun(Run):
         self.policy.to(env.device)
         self.settings["gravity_m_s2"] = env.task.gravity
         self.settings["torque_limit_nm"] = torque_limit(env)
+        self.note_robot(env)
         return env
 
 
@@ -287,21 +304,9 @@ class SkillRun(Run):
 
     def env(self, count: int, **scene: Any) -> Env:
         """Return an environment with all skills and `count` worlds; scene: further arguments of `Env`, e.g. `block`."""
-        return self.skills.env(count, self.conditions, **scene)
-
-
-def trained_range(task: TaskCfg) -> dict[str, list[float]]:
-    """Return the range of commands that a task samples at any level, by name; empty unless it jumps or walks.
-
-    `trained_range_m`: smallest and largest apex height or distance straight ahead; `trained_velocities`: largest
-    velocities ahead, back, to either side [m/s] and about z [rad/s].
-    """
-    levels: Any = task.levels
-    if hasattr(levels[0], "goal_lower"):
-        axis = 2 if levels[0].goal_upper[2] > 0.0 else 0
-        lower, upper = ([getattr(level, name)[axis] for level in levels] for name in ("goal_lower", "goal_upper"))
-        return {"trained_range_m": [max(min(lower), 0.0), max(upper)]}
-    return {"trained_velocities": list(levels[-1].last_range)} if hasattr(levels[0], "last_range") else {}
+        env = self.skills.env(count, self.conditions, **scene)
+        self.note_robot(env)
+        return env
 
 
 def write_trials(folder: Path, log: EvaluationLog, number: int) -> None:

@@ -17,7 +17,8 @@ from jumper_warp.evaluation.jumps import DELAY, REST_TIME, TOLERANCE, with_jump_
 from jumper_warp.evaluation.landings import LandingFlags, LandingLog, random_headings, with_second_takeoff
 from jumper_warp.evaluation.limits import limit_metrics, open_loop_limits
 from jumper_warp.evaluation.log import termination_names, within
-from jumper_warp.evaluation.run import HEADLINES, HEIGHTS, PLACES, EvaluationArgs, EvaluationRun, trained_range
+from jumper_warp.evaluation.run import HEADLINES, HEIGHTS, PLACES, EvaluationArgs, EvaluationRun
+from jumper_warp.evaluation.trained import trained_range
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.metrics import Metrics, chosen, measure

@@ -190,6 +190,10 @@ class VelocityLog(EvaluationLog):
         """Return the commands of some robots and their times: keys `commands`, `times_s`."""
         return {"commands": self.commands[list(worlds)].tolist(), "times_s": self.times.tolist()}
 
+    def all_commands(self) -> np.ndarray:
+        """Return all commanded velocities, (robots, commands, 3)."""
+        return self.commands
+
     def velocity_commands(self, worlds: Sequence[int]) -> np.ndarray:
         """Return the current commands of some robots, (worlds, 3)."""
         return self.command_history()[-1][list(worlds)]
@@ -297,7 +301,7 @@ class VelocityPlayFlags:
     velocity: tyro.conf.UseAppendAction[tuple[Velocity, ...]] = ()
     """[m/s], [m/s], [rad/s] Velocity ahead, to the left, about z; repeat the flag per command (default: six)."""
     default_velocities: tyro.conf.Suppress[tuple[Velocity, ...]] = (
-        (0.8, 0.0, 0.0), (0.0, 0.5, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0), (0.6, 0.3, 0.6), (0.0, 0.0, 0.0),
+        (0.8, 0.0, 0.0), (0.0, 0.4, 0.0), (0.0, 0.0, 0.8), (-0.5, 0.0, 0.0), (0.6, 0.3, 0.6), (0.0, 0.0, 0.0),
     )  # fmt: skip
     """Commands if `velocity` is not passed; a default of `velocity` itself would be kept when the flag is passed."""
     command_interval: float = 2.5  # [s] Time from one command to the next

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+import sys
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any, Literal
 
 from jumper_warp.policies.restore import task_of_policy
+from jumper_warp.policies.spec import PolicyError
 from jumper_warp.robot.gravity import check_gravity
 from jumper_warp.robot.overlay import RobotOverlay, load_overlay
 from jumper_warp.tasks.cfg import TaskCfg
-from jumper_warp.tasks.randomization import RandomizationCfg
+from jumper_warp.tasks.overlay_ranges import with_fixed_ranges
+from jumper_warp.tasks.randomization import RandomizationCfg, fixed_ranges
 from jumper_warp.tasks.saving import OPTIONAL
 from jumper_warp.utils.checks import check_seed
 from jumper_warp.utils.errors import InputError
@@ -90,7 +93,9 @@ class Conditions:
     def env_settings(self, config: dict[str, Any]) -> dict[str, Any]:
         """Return keyword arguments of `Env` for these conditions. Argument and errors: see `overlay`."""
         same = {name: getattr(self, name) for name in ("seed", "stream", "device", "solver", "noise", "threads")}
-        return {**same, "randomize": self.sets_parameters, "auto_reset": False, "robot": self.overlay(config)}
+        fixed = fixed_ranges(**self.fixed_parameters)
+        robot = with_fixed_ranges(self.overlay(config), fixed, nominal=not self.randomize)
+        return {**same, "randomize": self.sets_parameters, "auto_reset": False, "robot": robot}
 
     @property
     def sets_parameters(self) -> bool:
@@ -118,6 +123,26 @@ class Conditions:
         return replace(task, randomization=self._with_fixed_parameters(nominal), events=()).on_level_ground()
 
 
+def shared_config(configs: Mapping[str, dict[str, Any]], conditions: Conditions) -> dict[str, Any]:
+    """Return the configuration, of several policies on one robot, that holds their robot overlay; {}: none does.
+
+    configs: `Policy.config` by name of the policy. One line on standard error names policies of the described robot
+    that get the overlay of another one. The overlay of `conditions` replaces all of these.
+    Raises PolicyError: policies were trained with different overlays.
+    """
+    saved = {name: overlay for name, config in configs.items() if (overlay := config.get("env", {}).get("robot"))}
+    if conditions.robot is not None or not saved:
+        return {}
+    first, *others = saved
+    for other in others:
+        if any(saved[other].get(key) != saved[first].get(key) for key in ("values", "randomization")):
+            raise PolicyError(f"{first} and {other} were trained with different robots: choose one with --robot FILE")
+    if without := [name for name in configs if name not in saved]:
+        described = f"{' and '.join(without)} {'were' if len(without) > 1 else 'was'} trained without"
+        print(f"jumper: the robot has the overlay of {first}; {described}", file=sys.stderr)
+    return configs[first]
+
+
 def env_of_policy(
     policy: Policy, num_envs: int, conditions: Conditions, *, change: Callable[[TaskCfg], TaskCfg] | None = None,
     modules: Iterable[ModuleType] = (), **scene: Any,
@@ -135,4 +160,4 @@ def env_of_policy(
     task = task_of_policy(policy, modules, leave_out=leave_out)
     task = conditions.applied(task if change is None else change(task))
     with phase(f"building {num_envs} robots"):
-        return Env(task, num_envs, **conditions.env_settings(policy.config), **scene)
+        return Env(task, num_envs, **conditions.env_settings(policy.config) | scene)

@@ -22,7 +22,7 @@ from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.mirror import Symmetry, Weights, expand_layers, mirror_map
 from jumper_warp.rl.networks import NORMALISED_LIMIT, VARIANCE_EPS
 from jumper_warp.rl.resume import CHECKPOINTS
-from jumper_warp.rl.runner import CONFIG
+from jumper_warp.rl.run_folder import CONFIG
 from jumper_warp.tasks.saving import TaskError, check_version
 from jumper_warp.utils.files import parse_json, read_file, read_json
 

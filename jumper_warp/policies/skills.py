@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
-from jumper_warp.policies.conditions import Conditions
+from jumper_warp.policies.conditions import Conditions, shared_config
 from jumper_warp.policies.restore import task_of_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.tasks.cfg import Handover, TaskCfg
@@ -40,8 +40,8 @@ class SkillPolicies:
         from jumper_warp.policies.runs import open_policy
 
         self.names = SkillNames() if names is None else names
-        sources = (self.names.walk, self.names.jump_up, self.names.jump_to)
-        self.policies = [open_policy(source) for source in sources]
+        self.sources = (self.names.walk, self.names.jump_up, self.names.jump_to)
+        self.policies = [open_policy(source) for source in self.sources]
         self.tasks = [task_of_policy(policy) for policy in self.policies]
         suites = (("velocity",), ("apex_height",), ("landing_position", "omnidirectional"))
         for task, accepted in zip(self.tasks, suites, strict=True):
@@ -64,12 +64,14 @@ class SkillPolicies:
     def env(self, count: int, conditions: Conditions, **scene: Any) -> Env:
         """Return an environment of `count` robots that start with WALK, and move the policies to its device.
 
-        scene: further arguments of `Env`.
+        The robot has the overlay of the policies' training. scene: further arguments of `Env`.
+        Raises PolicyError: policies were trained with different overlays.
         """
         from jumper_warp.envs.env import Env
 
         self.skills, self.handovers = self._skills_and_handovers(conditions)
-        settings = conditions.env_settings({})
+        configs = {source: policy.config for source, policy in zip(self.sources, self.policies, strict=True)}
+        settings = conditions.env_settings(shared_config(configs, conditions))
         env = Env(self.skills, count, skill=WALK, handovers=self.handovers, **settings, **scene)
         for policy in self.policies:
             policy.to(env.device)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Literal
 
@@ -192,6 +192,9 @@ class TrainCfg:
     trainer: Literal["ppo", "shac", "rsl-rl"] = "ppo"
     """Training algorithm: PPO, SHAC or rsl-rl-lib's PPO. SHAC uses gradients through the physics; rsl-rl-lib is for
     comparison."""
+    stop_on_nan: bool = False
+    """Whether the training ends with exit status 1, after a checkpoint, when a term is not finite for the first time.
+    Without it the value counts as 0, one line names it, and the state of its world is saved."""
     tensorboard: bool = True
     """Whether to write TensorBoard events."""
     wandb: bool = False
@@ -217,3 +220,18 @@ class TrainCfg:
             raise InputError("pass resume, to continue a training, or init_policy, to begin one, not both")
         if self.trainer != "ppo" and self.ppo.symmetry != "off":
             raise InputError(f"symmetry is not supported with trainer {self.trainer}")
+
+
+RSL_RL_UNUSED = (
+    "log_interval", "max_checkpoints", "best_metric", "tensorboard", "wandb", "ppo.normalise_value",
+    "ppo.final_entropy_coef", "ppo.min_lr", "ppo.max_lr", "ppo.final_desired_kl", "ppo.reward_scale", "ppo.tf32",
+    "ppo.precision", "ppo.compile", "ppo.graphs",
+)  # fmt: skip
+SHAC_UNUSED = (
+    "ppo.epochs", "ppo.minibatches", "ppo.clip", "ppo.value_coef", "ppo.clip_value", "ppo.entropy_coef",
+    "ppo.final_entropy_coef", "ppo.lr", "ppo.min_lr", "ppo.max_lr", "ppo.desired_kl", "ppo.final_desired_kl",
+    "ppo.tf32", "ppo.precision", "ppo.compile", "ppo.graphs",
+)  # fmt: skip
+_SHAC = tuple(f"shac.{spec.name}" for spec in fields(ShacCfg))
+UNUSED = {"ppo": _SHAC, "shac": SHAC_UNUSED, "rsl-rl": (*RSL_RL_UNUSED, *_SHAC)}
+"""Dotted names of the settings in `TrainCfg` that each trainer does not use and accepts with their defaults only."""

@@ -33,6 +33,7 @@ class Checkpoint(NamedTuple):
     path: Path
     state: dict[str, Any]  # contents, with at least the keys of REQUIRED
     skipped: list[str]  # reasons why newer checkpoints cannot be used, one line each
+    newest: str  # file name of the newest checkpoint in the folder when this one was loaded
 
 
 def save_checkpoint(folder: Path, state: dict[str, Any], score: float | None = None, max_checkpoints: int = 3) -> Path:
@@ -114,10 +115,17 @@ def latest_checkpoint(folder: Path) -> Checkpoint:
     skipped: list[str] = []
     for name in reversed(manifest):
         try:
-            return Checkpoint(folder / name, load_checkpoint(folder / name), skipped)
+            return Checkpoint(folder / name, load_checkpoint(folder / name), skipped, list(manifest)[-1])
         except CheckpointError as error:
             skipped.append(str(error))
     raise CheckpointError("; ".join([f"{folder}: no usable checkpoint", *skipped]))
+
+
+def newest_name(folder: Path) -> str:
+    """Return the file name of the last saved checkpoint, usable or not. Raises CheckpointError: there is none."""
+    if not (manifest := _read_manifest(folder)):
+        raise CheckpointError(f"{folder}: no checkpoint")
+    return list(manifest)[-1]
 
 
 def best_checkpoint(folder: Path) -> Path:
@@ -125,10 +133,7 @@ def best_checkpoint(folder: Path) -> Path:
 
     Raises CheckpointError: there is none.
     """
-    manifest = _read_manifest(folder)
-    if not manifest:
-        raise CheckpointError(f"{folder}: no checkpoint")
-    return folder / (_best(manifest) or list(manifest)[-1])
+    return folder / (_best(_read_manifest(folder)) or newest_name(folder))
 
 
 def _best(manifest: dict[str, dict[str, Any]]) -> str | None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import math
 import time
 from contextlib import suppress
 from itertools import pairwise
@@ -18,8 +17,6 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedCo
 from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.progress import format_duration
-
-REWARDS = ("Episode_Reward/", "Episode_Sum/")  # Parts of the names of metrics that are means of reward terms
 
 
 class Stopwatch:
@@ -122,8 +119,11 @@ class TrainingLog:
         self._progress.update(self._task, completed=iteration, description=summary)
         if not self._console.is_terminal:
             self.print_line(f"iteration {iteration}/{self._total}: {summary}, {format_duration(remaining)} left")
-        for name in _non_finite_terms(metrics):
-            self.print_line(f"reward term {name} was not finite in some steps and counted as 0: check its function")
+
+    def move(self, folder: Path) -> None:
+        """Continue the metrics file in another folder, also if it was deleted, without TensorBoard. Raises OSError."""
+        self._file = self._file.move(folder / METRICS_FILE)
+        self._events = None
 
     def _write_events(self, iteration: int, metrics: dict[str, float]) -> None:
         """Write TensorBoard events; the first failure disables them."""
@@ -158,12 +158,6 @@ def _summary(metrics: dict[str, float]) -> str:
     if (success := metrics.get("Metrics/success")) is not None:
         parts.append(f"success {100.0 * success:.1f} %")
     return ", ".join(parts)
-
-
-def _non_finite_terms(metrics: dict[str, float]) -> list[str]:
-    """Return the names of reward terms whose mean is not finite."""
-    faulty = [name for name, value in metrics.items() if not math.isfinite(value)]
-    return [name.replace(part, "") for name in faulty for part in REWARDS if part in name]
 
 
 def _event_writer(folder: Path, iteration: int) -> Any:

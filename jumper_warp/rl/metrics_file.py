@@ -15,7 +15,7 @@ METRICS_FILE = "metrics.jsonl"  # File in a run's folder, with one JSON object p
 class MetricsFile:
     """Metrics file with atomic appends; lines that could not be written are appended with the next one."""
 
-    def __init__(self, path: Path, iteration: int) -> None:
+    def __init__(self, path: Path, iteration: float) -> None:
         """Open the file to continue after `iteration`; lines of later iterations and malformed lines are removed.
 
         Raises OSError: the file cannot be read or written.
@@ -28,7 +28,7 @@ class MetricsFile:
         valid_content = b"".join(line + b"\n" for line in kept)
         if valid_content != content:
             write_atomically(path, valid_content)
-        self._file = path.open("ab", buffering=0)
+        self._file = path.open("a+b", buffering=0)
         self._size = len(valid_content)
         self._pending = b""
 
@@ -48,6 +48,15 @@ class MetricsFile:
                 self._file.truncate(self._size)
             raise
         self._size, self._pending = self._size + written, b""
+
+    def move(self, path: Path) -> MetricsFile:
+        """Close the file, and return a copy of it that continues, also if this one was deleted. Raises OSError."""
+        self._file.seek(0)
+        write_atomically(path, self._file.read())
+        self.close()
+        moved = MetricsFile(path, math.inf)
+        moved._pending = self._pending
+        return moved
 
     def close(self) -> None:
         """Close the file."""

@@ -17,6 +17,7 @@ from jumper_warp.rl.checkpoint import (
     CheckpointError,
     latest_checkpoint,
     load_checkpoint,
+    newest_name,
 )
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.sources import changed_sources
@@ -49,7 +50,15 @@ def find_checkpoint(cfg: TrainCfg) -> Checkpoint | None:
     if not (folder / MANIFEST).is_file():
         reason = "no run to resume" if path.exists() else "no such file or folder, no run to resume"
         raise CheckpointError(f"{path}: {reason}; pass a run's folder, one of its checkpoints, or latest")
-    return Checkpoint(path, load_checkpoint(path), []) if path.suffix == ".pt" else latest_checkpoint(folder)
+    if path.suffix == ".pt":
+        return Checkpoint(path, load_checkpoint(path), [], newest_name(folder))
+    return latest_checkpoint(folder)
+
+
+def check_unchanged(checkpoint: Checkpoint) -> None:
+    """Raise CheckpointError if another process saved a checkpoint in the folder after `checkpoint` was loaded."""
+    if newest_name(checkpoint.path.parent) != checkpoint.newest:
+        raise CheckpointError(f"{checkpoint.path.parent}: another process has saved a checkpoint; resume again")
 
 
 def rank_state(state: dict[str, Any], rank: Rank) -> dict[str, Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -43,15 +45,35 @@ def rsl_rl_config(cfg: PpoCfg, save_interval: int, seed: int) -> dict[str, Any]:
     }
 
 
+class _EndOfTraining(Exception):
+    """Signal that leaves rsl-rl's training loop."""
+
+
 def train_rsl_rl(
-    env: RslRlEnv, cfg: PpoCfg, iterations: int, save_interval: int, seed: int, folder: Path | None = None
-) -> OnPolicyRunner:
+    env: RslRlEnv, cfg: PpoCfg, iterations: int, save_interval: int, seed: int, folder: Path | None = None,
+    end_in: Callable[[int], Path | None] | None = None,
+) -> OnPolicyRunner:  # fmt: skip
     """Train with rsl-rl's PPO, and return its runner.
 
     env: environment in rsl-rl's interface, already reset. folder: for checkpoints and TensorBoard events (None: no
-    files).
+    files). end_in: function of the number of iterations so far, called after each; a folder that it returns ends the
+    training, with a checkpoint there.
     """
     config = rsl_rl_config(cfg, save_interval, seed)
     runner = OnPolicyRunner(env, config, log_dir=folder and str(folder), device=str(env.device))
-    runner.learn(iterations)
+    logger: Any = runner.logger
+    log = logger.log
+
+    def log_and_check(**values: Any) -> None:
+        """Log an iteration; save a checkpoint and raise _EndOfTraining if the training is over."""
+        last = end_in(runner.current_learning_iteration + 1) if end_in else None
+        if last in (None, folder):  # in a deleted folder TensorBoard's writer raises
+            log(**values)
+        if last:
+            runner.save(str(last / f"model_{runner.current_learning_iteration}.pt"))
+            raise _EndOfTraining
+
+    logger.log = log_and_check  # rsl-rl calls it once in each iteration, and has no other way to end early
+    with suppress(_EndOfTraining):
+        runner.learn(iterations)
     return runner

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
 import json
+import math
 import shlex
 import signal
 import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
-from datetime import datetime
+from contextlib import ExitStack
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple, cast
@@ -24,17 +25,16 @@ from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import DECODE_ERRORS, Checkpoint, CheckpointError, one_line_message, save_checkpoint
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.logger import Stopwatch, TrainingLog
+from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.ppo import STATISTICS, Ppo
 from jumper_warp.rl.resume import CHECKPOINTS
+from jumper_warp.rl.run_folder import CONFIG, full_config, new_folder, report_non_finite, rescue_folder, write_config
 from jumper_warp.rl.shac import STATISTICS as SHAC_STATISTICS
 from jumper_warp.rl.shac import Shac
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_atomically
-from jumper_warp.utils.runtime import git_commit, versions
-from jumper_warp.utils.sources import source_checksums
+from jumper_warp.utils.locks import write_lock
 from jumper_warp.utils.threads import set_threads
 
-CONFIG = "config.json"  # File in a run's folder with all settings, versions and the commit
 PERF = ("Perf/total_fps", "Perf/collection_time", "Perf/learning_time", "Perf/elapsed_s")
 """Performance metrics: policy steps per second, time of the rollout and of the update [s], training time [s]."""
 LEARNING = ("Loss/learning_rate", "Policy/mean_std", "Train/mean_reward", "Train/mean_episode_length")
@@ -85,32 +85,48 @@ def train(
     by trainer rsl-rl. actor_init: initialisation from cfg.init_policy, required with it. checkpoint: the loaded
     checkpoint of cfg.resume (default: loaded here).
     Raises InputError: a setting does not fit the environment or the machine. CheckpointError: no usable checkpoint to
-    resume from, or the last one could not be saved. SystemExit with code INTERRUPTED: stopped by Ctrl-C or SIGTERM,
-    after a checkpoint was saved.
+    resume from, or the last one could not be saved; InputError: another process is writing the run's folder.
+    SystemExit, after a checkpoint was saved: with code INTERRUPTED if Ctrl-C or SIGTERM stopped the training, with a
+    message if a term was not finite and `stop_on_nan` is set, or if the run's folder was deleted.
     """
     set_threads(cfg.threads)
     rank = distributed.init_distributed(cfg.device, cfg.threads)
-    run: TrainingRun | None = None
-    try:
+    with ExitStack() as cleanup:
+        cleanup.callback(_leave_process_group)
         _check_processes(cfg, rank)
+        checkpoint = checkpoint or resume.find_checkpoint(cfg)
         if checkpoint is None and bool(cfg.init_policy) != (actor_init is not None):
             raise InputError("init_policy and actor_init, which is made from it, must be passed together")
+        if checkpoint is not None and rank.index == 0:
+            cleanup.enter_context(write_lock(checkpoint.path.parent.parent))
+            resume.check_unchanged(checkpoint)
         env = make_env(cfg.num_envs // rank.size, (cfg.seed + 1000 * rank.index) % 2**31, rank.device)
         if cfg.trainer == "rsl-rl":
             return _train_rsl_rl(cfg, env, as_rsl_rl, rank)
         torch.manual_seed(cfg.seed)  # the same weights in all processes
         run = TrainingRun(cfg, env, rank, command, actor_init, checkpoint)
-        with StopRequest() as stop:
-            result = run.iterate(stop)
+        cleanup.callback(run.ppo.close)
+        if checkpoint is None and rank.index == 0:
+            cleanup.enter_context(write_lock(run.folder))
+        try:
+            with StopRequest() as stop:
+                result = run.iterate(stop)
+        except Exception as error:
+            if any((run.folder / CHECKPOINTS).glob("*.pt")):
+                error.add_note(f"continue from the last checkpoint with: {run.resume_command}")
+            raise
         distributed.wait_for_ranks()
+        if run.failure:
+            raise SystemExit(f"jumper: {run.failure}")  # printed by Python, which exits with status 1
         if stop.requested:
             raise SystemExit(INTERRUPTED)
         return result
-    finally:
-        if run is not None:
-            run.ppo.close()
-        if torch.distributed.is_initialized():
-            torch.distributed.destroy_process_group()
+
+
+def _leave_process_group() -> None:
+    """Leave torch's process group, if this process is in one."""
+    if torch.distributed.is_initialized():
+        torch.distributed.destroy_process_group()
 
 
 def _check_processes(cfg: TrainCfg, rank: Rank) -> None:
@@ -128,21 +144,6 @@ def _check_best_metric(name: str, logged: set[str]) -> None:
     if name not in logged:
         examples = ", ".join(sorted(each for each in logged if each.startswith(("Metrics/", "Train/"))))
         raise InputError(f"best_metric must name a logged metric, such as {examples}, got {name!r:.60}")
-
-
-def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
-    """Return the configuration of a run as JSON data: settings, environment, versions, commit, user files."""
-    settings = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
-    commit, env_config = git_commit(), env.config()
-    return {
-        "train": settings,
-        "env": env_config,
-        "processes": rank.size,
-        "device": str(rank.device),
-        "versions": versions(),
-        "commit": commit and commit._asdict(),
-        "sources": source_checksums(env_config),
-    }
 
 
 class TrainingRun:
@@ -167,6 +168,7 @@ class TrainingRun:
         self._clock_start: float | None = None  # time at which the run would have started without interruption
         self.metrics: dict[str, float] = {}
         self.notes: list[str] = []
+        self.failure = ""  # Reason why the training ends with exit status 1; empty: none
         checkpoint = checkpoint or resume.find_checkpoint(cfg)
         if not distributed.same_on_all_ranks(str(checkpoint and (checkpoint.path, checkpoint.state["iteration"]))):
             raise InputError("the processes found different checkpoints: log_root must be a folder shared by all")
@@ -176,11 +178,11 @@ class TrainingRun:
         torch.manual_seed(cfg.seed + 1 + rank.index)
         self.folder = new_folder(cfg, rank) if checkpoint is None else self._resume(checkpoint)
         if rank.index == 0:
-            write_atomically(self.folder / CONFIG, json.dumps(self.config, indent=1).encode())
+            write_config(self.folder, self.config)
 
     def _resume(self, checkpoint: Checkpoint) -> Path:
         """Load a checkpoint, and return its run's folder. Raises CheckpointError: it does not fit the settings."""
-        path, state, skipped = checkpoint
+        path, state, skipped, _ = checkpoint
         changed = resume.changed_settings(state, self.config)
         self.notes += [*(f"skipped: {reason}" for reason in skipped), f"resumed {path}", *changed]
         self.notes += resume.changed_user_files(state, self.config)
@@ -224,13 +226,17 @@ class TrainingRun:
                 if self.iteration == first_iteration:
                     self._start_clock()
                 is_last = is_last_iteration(self.iteration, cfg, self.sync_stop_request(stop))
-                if is_last or self.iteration % cfg.log_interval == 0:
+                logs, saves = (self.iteration % each == 0 for each in (cfg.log_interval, cfg.save_interval))
+                if is_last or logs or saves or cfg.stop_on_nan:
+                    self._check(log)
+                    is_last = is_last or bool(self.failure and self.rank.size == 1)
+                if is_last or logs:
                     times, seconds = watch.read()
                     self.metrics = self._read_metrics(times)
                     log.log(self.iteration, self.metrics, self._remaining(seconds))
                 elif self.iteration == first_iteration:  # discard its time, which includes warm-up
                     watch.read()
-                if is_last or self.iteration % cfg.save_interval == 0:
+                if is_last or saves:
                     self._save(log, is_last, stop)
         return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.metrics)
 
@@ -240,6 +246,19 @@ class TrainingRun:
             return _NoLog()
         cfg = self.cfg
         return TrainingLog(self.folder, self.config, cfg.max_iterations, cfg.tensorboard, cfg.wandb, self.iteration)
+
+    def _check(self, log: TrainingLog | _NoLog) -> None:
+        """Report terms that are not finite; set `failure` if one of them or a deleted folder ends the training."""
+        folder, print_line = self.folder, partial(print, file=sys.stderr)
+        if isinstance(log, TrainingLog):
+            print_line = log.print_line
+            self.folder, failure = rescue_folder(folder, self.config, (CONFIG, METRICS_FILE))
+            self.failure = self.failure or failure
+            if self.folder != folder:
+                log.move(self.folder)
+        found = report_non_finite(self.env, self.folder, self.config, self.iteration, print_line, self.rank.index)
+        if found and self.cfg.stop_on_nan:
+            self.failure = self.failure or f"--stop-on-nan: {found[0]}"
 
     def _start_clock(self) -> None:
         """Start counting the training time, after synchronising with the device."""
@@ -266,16 +285,19 @@ class TrainingRun:
         return remaining
 
     def sync_stop_request(self, stop: StopRequest) -> bool:
-        """Return whether to end the training: a process has a stop request or has reached the time limit.
+        """Return whether to end the training: a process has a stop request, a failure, or reached the time limit.
 
-        Several processes synchronise this, and `stop.requested`, only in logged iterations.
+        Several processes synchronise this, `stop.requested` and `failure` only in logged iterations.
         """
         over_time = 0.0 < self.cfg.max_seconds <= self._elapsed()
+        failed = bool(self.failure)
         if distributed.world_size() > 1:
             if self.iteration % self.cfg.log_interval:
                 return False
-            stop.requested, over_time = map(bool, distributed.all_reduce_max([int(stop.requested), int(over_time)]))
-        return stop.requested or over_time
+            flags = distributed.all_reduce_max([int(stop.requested), int(over_time), int(failed)])
+            stop.requested, over_time, failed = map(bool, flags)
+            self.failure = self.failure or ("another process has failed" if failed else "")
+        return stop.requested or over_time or failed
 
     def _read_metrics(self, times: list[float]) -> dict[str, float]:
         """Return the metrics to log; times: of rollout and update [s], as in PERF."""
@@ -301,8 +323,13 @@ class TrainingRun:
             log.print_line(f"{folder}: checkpoint not saved, retried later: {error.strerror}")
             return
         if is_last:
-            hint = f", continue with: {self._command} --resume {shlex.quote(str(self.folder))}"
-            log.print_line(f"saved {path}{hint if stop.requested else ''}")
+            hint = f", continue with: {self.resume_command}"
+            log.print_line(f"saved {path}{hint if stop.requested or self.failure else ''}")
+
+    @property
+    def resume_command(self) -> str:
+        """Command line that resumes this run."""
+        return f"{self._command} --resume {shlex.quote(str(self.folder))}"
 
     def _other_ranks(self, local: dict[str, Any]) -> list[dict[str, Any]]:
         """Return the other ranks' states (env, rng, and of ppo the episode) on rank 0; an empty list elsewhere."""
@@ -333,27 +360,35 @@ class _NoLog:
         """Discard the metrics."""
 
 
-def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
-    """Return the folder of a new run, log_root/task/time; rank 0 creates it."""
-    folder = cfg.log_root / cfg.task / datetime.now().strftime("%Y-%m-%d_%H-%M-%S_%f")
-    if rank.index == 0:
-        folder.mkdir(parents=True)
-    return folder
-
-
 def _train_rsl_rl(cfg: TrainCfg, env: VecEnv, as_rsl_rl: AsRslRl | None, rank: Rank) -> TrainResult:
-    """Train with rsl-rl's PPO; arguments and result: see `train`."""
+    """Train with rsl-rl's PPO; arguments, result and SystemExit: see `train`."""
     if as_rsl_rl is None:
         raise InputError("trainer rsl-rl needs as_rsl_rl, which adapts the environment")
     from jumper_warp.rl.rsl_rl import train_rsl_rl
 
-    folder = new_folder(cfg, rank)
-    if rank.index == 0:
-        print(f"run {folder}", file=sys.stderr)
-        write_atomically(folder / CONFIG, json.dumps(full_config(cfg, env, rank), indent=1).encode())
+    folder, config = new_folder(cfg, rank), full_config(cfg, env, rank)
+    print_line = partial(print, file=sys.stderr)
+    print_line(f"run {folder}")
+    write_config(folder, config)
     begin = time.perf_counter()
     torch.manual_seed(cfg.seed + rank.index)
     env.reset()
     adapter = as_rsl_rl(env, cfg.ppo.num_steps)
-    train_rsl_rl(adapter, cfg.ppo, cfg.max_iterations, cfg.save_interval, cfg.seed, folder)
-    return TrainResult(folder, cfg.max_iterations, time.perf_counter() - begin, {})
+    clock_start, failure = math.inf, ""  # the end of the first iteration; the reason of exit status 1
+
+    def end_in(iteration: int) -> Path | None:
+        """Return the folder for the last checkpoint if the training is over after this iteration, else None."""
+        nonlocal clock_start, failure
+        clock_start = min(clock_start, now := time.perf_counter())
+        kept, failure = rescue_folder(folder, config, [CONFIG])
+        found = report_non_finite(env, kept, config, iteration, print_line)
+        if found and cfg.stop_on_nan:
+            failure = failure or f"--stop-on-nan: {found[0]}"
+        return kept if failure or 0.0 < cfg.max_seconds <= now - clock_start else None
+
+    with write_lock(folder):
+        settings = (cfg.ppo, cfg.max_iterations, cfg.save_interval, cfg.seed, folder, end_in)
+        iteration = train_rsl_rl(adapter, *settings).current_learning_iteration + 1
+    if failure:
+        raise SystemExit(f"jumper: {failure}")
+    return TrainResult(folder, iteration, time.perf_counter() - begin, {})

@@ -23,6 +23,7 @@ from jumper_warp.robot.parts import Link, Shape
 from jumper_warp.utils.checks import check_count
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
+from jumper_warp.utils.threads import locked
 
 PHYSICS_DT = 1.0 / 480.0  # [s] Physics step that contacts and loops are tuned for
 
@@ -49,6 +50,7 @@ Extras = Callable[[newton.ModelBuilder], Any]
 """Adds sites and shapes to the builder of one robot, for every world; its result is ignored."""
 
 
+@locked
 def build_model(
     num_worlds: int,
     *,

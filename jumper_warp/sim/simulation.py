@@ -24,7 +24,7 @@ from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics
 from jumper_warp.sim.slices import SlicedGraph, WorldRange, slices_of
 from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance, state_arrays
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.threads import checked_threads
+from jumper_warp.utils.threads import WARP_LOCK, checked_threads, locked
 
 if TYPE_CHECKING:
     import torch
@@ -67,6 +67,7 @@ class Simulation:
         NotThisRobotError: `extras` adds more than sites and shapes.
     """
 
+    @locked
     def __init__(
         self,
         num_worlds: int,
@@ -147,6 +148,7 @@ class Simulation:
         self._base_velocity = wp.zeros(self.num_worlds, dtype=wp.vec3, device=self.device)
         self._graphs: dict[str, SlicedGraph | None] = {}
 
+    @locked
     def set_targets(self, angles: np.ndarray | torch.Tensor | Sequence) -> None:
         """Write raw motor targets [rad], (12, num_worlds), or (12,) for all worlds, to `target`.
 
@@ -164,6 +166,7 @@ class Simulation:
         """Advance one policy step of `substeps` physics steps towards `target`."""
         self._captured("step", self._step)
 
+    @locked
     def reset(self, mask: Sequence[bool] | np.ndarray | torch.Tensor | wp.array | None = None) -> None:
         """Reset worlds to the initial state of the simulation: standing at rest, with the standing pose as target.
 
@@ -223,16 +226,17 @@ class Simulation:
 
         body: launches them for a range of worlds. Within a capture it is called directly.
         """
-        if self.device.is_capturing:
-            body(WorldRange(0, self.num_worlds))
-            return
-        if name not in self._graphs:
-            body(WorldRange(0, self.num_worlds))
-            self._graphs[name] = None
-            return
-        graph = self._graphs[name]
-        if graph is None:
-            graph = self._graphs[name] = SlicedGraph(body, self.slices, self.device)
+        with WARP_LOCK:
+            if self.device.is_capturing:
+                body(WorldRange(0, self.num_worlds))
+                return
+            if name not in self._graphs:
+                body(WorldRange(0, self.num_worlds))
+                self._graphs[name] = None
+                return
+            graph = self._graphs[name]
+            if graph is None:
+                graph = self._graphs[name] = SlicedGraph(body, self.slices, self.device)
         graph.replay()
 
     def _filter_targets(self, worlds: WorldRange) -> None:
@@ -261,18 +265,22 @@ class Simulation:
         """Launch a kernel on the simulation's device."""
         wp.launch(kernel, dim=dim, inputs=inputs, outputs=outputs, device=self.device)
 
+    @locked
     def joint_q(self) -> np.ndarray:
         """Return the joint coordinates, (num_worlds, 43), in the layout of `jumper_warp.robot.model`."""
         return self.state.joint_q.numpy().reshape(self.num_worlds, -1)
 
+    @locked
     def joint_qd(self) -> np.ndarray:
         """Return the joint rates, (num_worlds, 38): base [m/s] at its COM, [rad/s], 20 hinges [rad/s], four ankles."""
         return self.state.joint_qd.numpy().reshape(self.num_worlds, -1)
 
+    @locked
     def base_velocity(self) -> np.ndarray:
         """Return the velocity of the base link's origin [m/s], world frame, (num_worlds, 3). Waits for the device."""
         return self.read_base_velocity().numpy().copy()
 
+    @locked
     def read_base_velocity(self) -> wp.array:
         """Return the velocity of the base link's origin [m/s], world frame, vec3 of shape (num_worlds,).
 
@@ -282,6 +290,7 @@ class Simulation:
         self._launch(base_velocity_kernel, self.num_worlds, inputs, [self._base_velocity])
         return self._base_velocity
 
+    @locked
     def loop_gap(self) -> np.ndarray:
         """Return the largest distance [m] between the two anchors of an ankle, over the four legs, (num_worlds,)."""
         model = self.model

@@ -7,14 +7,16 @@ across worlds, so that results depend neither on the slices nor on the threads.
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable
+from contextlib import AbstractContextManager, nullcontext
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import warp as wp
 
-from jumper_warp.utils.threads import run_in_parallel
+from jumper_warp.utils.threads import WARP_LOCK, locked, run_in_parallel
 
 MIN_WORLDS = 16
 """Smallest slice: for fewer worlds a thread costs more than it saves, and slices would share cache lines."""
@@ -34,9 +36,26 @@ def slices_of(num_worlds: int, threads: int) -> list[WorldRange]:
     return [WorldRange(a, b - a) for a, b in itertools.pairwise([*begins, num_worlds])]
 
 
+@functools.cache
+def _capture_stream(device: str) -> wp.Stream:
+    """Return the CUDA stream of a device that is used for captures alone; device: torch's name of the device.
+
+    It is a stream of torch, since other threads may not use the default stream while a stream of Warp is captured.
+    """
+    import torch
+
+    return wp.stream_from_torch(torch.cuda.Stream(device))
+
+
+def _on_capture_stream(device: wp.Device) -> AbstractContextManager[Any]:
+    """Return a context for a capture on a stream of its own, so that work of other threads stays out of the graph."""
+    return wp.ScopedStream(_capture_stream(wp.device_to_torch(device))) if device.is_cuda else nullcontext()
+
+
 class SlicedGraph:
     """Kernel launches captured as one graph for each slice of worlds, to replay them together."""
 
+    @locked
     def __init__(self, launch: Callable[[WorldRange], None], slices: list[WorldRange], device: wp.Device) -> None:
         """Capture the kernel launches of each slice of worlds as a graph.
 
@@ -44,7 +63,7 @@ class SlicedGraph:
         """
         self._device, self._graphs = device, []
         for worlds in slices:
-            with wp.ScopedCapture(device=device) as capture:
+            with _on_capture_stream(device), wp.ScopedCapture(device=device) as capture:
                 launch(worlds)
             self._graphs.append(capture.graph)
 
@@ -53,7 +72,10 @@ class SlicedGraph:
 
         With several graphs all have ended when this returns.
         """
-        if len(self._graphs) == 1:
+        if self._device.is_cuda:  # one graph; a capture changes the device's stream
+            with WARP_LOCK:
+                wp.capture_launch(self._graphs[0])
+        elif len(self._graphs) == 1:
             wp.capture_launch(self._graphs[0])
         else:
             run_in_parallel([partial(wp.capture_launch, graph) for graph in self._graphs], len(self._graphs))

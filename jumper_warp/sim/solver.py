@@ -26,11 +26,13 @@ from jumper_warp.kernels.layout import COORDS
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import other_colliders
+from jumper_warp.robot.motors import MOTOR_CONSTANTS
 from jumper_warp.sim.dynamics import JumperDynamics
 from jumper_warp.sim.slices import WorldRange
 from jumper_warp.sim.tape import DifferentiableStep
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Control, Model, State
+from jumper_warp.utils.threads import locked
 
 DT = (1.0e-6, 0.1)  # [s] Shortest and longest physics step
 MAX_SUBSTEPS = 1000  # Largest number of physics steps in a policy step
@@ -72,7 +74,7 @@ def warn_of_colliders(model: Model) -> None:
         warnings.warn(
             f"SolverJumper ignores the collisions of {len(ignored)} shapes, such as "
             f"{model.shape_label[ignored[0]]!r:.60}: only paws, ground and blocks have contact",
-            stacklevel=3,
+            stacklevel=4,  # this function, the constructor, and its lock
         )
 
 
@@ -110,6 +112,7 @@ class SolverJumper(SolverBase):
     model: Model
     SUPPORTED_OBSERVABLES = frozenset({SolverBase.ObservableKind.BODY_QDD, SolverBase.ObservableKind.CONTACT_F})
 
+    @locked
     def __init__(
         self,
         model: Model,
@@ -147,9 +150,12 @@ class SolverJumper(SolverBase):
         """1: the world diverged and is frozen until `reset`, int of shape (num_worlds,)."""
         self._differentiable = DifferentiableStep(self.dynamics, max_sweeps, min(tolerance, DIFFERENTIABLE_TOLERANCE))
         self._default_control = model.control(clone_variables=False)
+        n = model.world_count
+        self._state_shapes = {"joint_q": (43 * n,), "joint_qd": (38 * n,), "body_q": (21 * n,), "body_qd": (21 * n,)}
         self._no_body_f = wp.zeros(model.body_count, dtype=wp.spatial_vectorf, device=model.device)
         self._old_body_qd = wp.zeros(model.body_count, dtype=wp.spatial_vectorf, device=model.device)
 
+    @locked
     def step(
         self, state_in: State, state_out: State, control: Control | None, contacts: newton.Contacts | None, dt: float,
         *, observables: SolverBase.Observables | None = None,
@@ -157,12 +163,14 @@ class SolverJumper(SolverBase):
         """Advance every world by dt [s]. The solver finds the paws' contacts itself.
 
         contacts: not read; filled as by `update_contacts` where `observables` requests `contact_f`.
-        Raises InputError for a dt that is not finite and positive, or as `update_contacts`.
+        Raises InputError: a dt that is not finite and positive, arrays of another model or device, or as
+        `update_contacts`.
         """
         self.validate_observables(observables, contacts)
         drive = self.dynamics.drive(*self._forces(state_in, control))
         self._advance(state_in, state_out, drive, dt, 1, observables, bodies=True)
 
+    @locked
     def step_motors(
         self, state_in: State, state_out: State, motors: Any, target: wp.array, dt: float, substeps: int, *,
         control: Control | None = None, previous: wp.array | None = None, delay: wp.array | None = None,
@@ -178,17 +186,47 @@ class SolverJumper(SolverBase):
         accelerations over the whole call, and contacts of the last step, as in `step`. worlds: range to advance, by
         default all. `state_out` may be `state_in`.
 
-        Raises InputError: dt is not finite and positive, substeps no whole number of at least 1, or as
-        `update_contacts`.
+        Raises InputError: dt is not finite and positive, substeps no whole number of at least 1, arrays of another
+        shape or device, a range beyond the worlds, or as `update_contacts`.
         """
         self.validate_observables(observables, contacts)
+        self._check_motors(motors, target=target, previous=previous, delay=delay)
+        first, count = worlds or (0, self.model.world_count)
+        if not 0 <= first <= first + count <= self.model.world_count:
+            raise InputError(f"worlds must be in a range of {self.model.world_count} worlds, got {worlds}")
         drive = self.dynamics.drive(*self._forces(state_in, control), motors, target, previous, delay)
         self._advance(state_in, state_out, drive, dt, substeps, observables, bodies, worlds)
 
     def _forces(self, state: State, control: Control | None) -> tuple[wp.array, wp.array]:
         """Return the joint forces of a control and the body wrenches of a state, or zeros where they are None."""
         control = self._default_control if control is None else control
-        return control.joint_f, self._no_body_f if state.body_f is None else state.body_f
+        body_f = self._no_body_f if state.body_f is None else state.body_f
+        self._check("control.joint_f", control.joint_f, self._state_shapes["joint_qd"])
+        self._check("state_in.body_f", body_f, self._state_shapes["body_q"])
+        return control.joint_f, body_f
+
+    def _check(self, name: str, array: wp.array | None, shape: tuple[int, ...]) -> None:
+        """Raise InputError unless an array has this shape and is on the model's device; kernels check neither."""
+        if array is None or array.shape != shape or array.device is not self.model.device:
+            found = "None" if array is None else f"{array.shape} on {array.device}"
+            raise InputError(
+                f"{name} must have shape {shape} on {self.model.device}, for {self.model.world_count} worlds of this "
+                f"solver's model, got {found}"
+            )
+
+    def _check_state(self, name: str, state: State) -> None:
+        """Raise InputError unless the arrays of a state are those of a state of this model; name: for the message."""
+        for field, shape in self._state_shapes.items():
+            self._check(f"{name}.{field}", getattr(state, field), shape)
+
+    def _check_motors(self, motors: Any, **arrays: wp.array | None) -> None:
+        """Raise InputError unless constants of motors, targets and delay, those that are given, fit the worlds."""
+        n = self.model.world_count
+        for name in MOTOR_CONSTANTS:
+            self._check(f"motors.{name}", getattr(motors, name), (12, n))
+        for name, array in arrays.items():
+            if array is not None:
+                self._check(name, array, (n,) if name == "delay" else (12, n))
 
     def _advance(
         self, state_in: State, state_out: State, drive: Any, dt: float, substeps: int,
@@ -196,11 +234,15 @@ class SolverJumper(SolverBase):
     ) -> None:  # fmt: skip
         """Advance a range of worlds by `substeps` steps of dt [s]; drive: kernels' `Drive`; rest: see `step_motors`."""
         check_step(dt, substeps)
+        self._check_state("state_in", state_in)
+        if state_out is not state_in:
+            self._check_state("state_out", state_out)
         qdd, contact_f = state_out.body_qdd, None
         if observables is not None:
             qdd = qdd if observables.body_qdd is None else observables.body_qdd
             contact_f = observables.contact_f
         if qdd is not None:
+            self._check("body_qdd", qdd, self._state_shapes["body_qd"])
             wp.copy(self._old_body_qd, state_in.body_qd)
         coordinates = (state_in.joint_q, state_in.joint_qd)
         out = (state_out.joint_q, state_out.joint_qd)
@@ -225,12 +267,13 @@ class SolverJumper(SolverBase):
         if observables is not None and contact_f is not None and observables.contacts is not None:
             self._write_contacts(observables.contacts, state_out, contact_f)
 
+    @locked
     def update_contacts(self, contacts: newton.Contacts, state: State | None = None) -> None:
         """Write the paws' contacts of the last step: four rows a world, FL, FR, BL, BR, touching or not.
 
         Shape 0 is the paw, shape 1 the ground, on which a block counts as ground; without ground there are no rows.
         state: the last step's. `contacts.force`, if allocated, gets the force of the ground on the paw [N], world.
-        Raises InputError: there is no state, or the contacts hold fewer rows.
+        Raises InputError: there is no state of this model, or the contacts hold fewer rows.
         """
         if state is None:
             raise InputError("update_contacts needs the state of the last step")
@@ -245,6 +288,7 @@ class SolverJumper(SolverBase):
         As `update_contacts`. Raises InputError: too few rows.
         """
         dynamics, n, device = self.dynamics, self.model.world_count, self.model.device
+        self._check("state.body_q", state.body_q, self._state_shapes["body_q"])
         if contacts.rigid_contact_max < 4 * n:
             raise InputError(f"contacts must hold {4 * n} rows, four a world, got {contacts.rigid_contact_max}")
         if dynamics.ground_shape < 0:
@@ -260,14 +304,17 @@ class SolverJumper(SolverBase):
         inputs = [shapes, dynamics.robot.ground, state.body_q, self.contact_force]
         wp.launch(paw_contacts_kernel, dim=(4, n), inputs=inputs, outputs=[rows, contact_f], device=device)
 
+    @locked
     def block_position(self) -> np.ndarray:
         """Return the centres of the blocks [m], world frame, (num_worlds, 2). Raises InputError without blocks."""
         return self._block_values()["center"].copy()
 
+    @locked
     def block_velocity(self) -> np.ndarray:
         """Return the velocities of the blocks [m/s], world frame, (num_worlds, 2). Raises InputError without blocks."""
         return self._block_values()["velocity"].copy()
 
+    @locked
     def place_blocks(self, center: np.ndarray, worlds: Sequence[int] | None = None) -> None:
         """Move the blocks of some worlds (indices), by default all, to new start positions, at rest.
 
@@ -278,14 +325,18 @@ class SolverJumper(SolverBase):
         self._blocks().assign(values)
         self.reset_blocks(worlds)
 
+    @locked
     def reset_blocks(self, worlds: Sequence[int] | wp.array | None = None) -> None:
         """Reset the blocks of some worlds, by default all, to their starts, at rest.
 
-        `worlds`: indices, or a mask on the device, bool of shape (num_worlds,). Raises InputError without blocks.
+        `worlds`: indices, or a mask on the device, bool of shape (num_worlds,) or longer. Raises InputError without
+        blocks, or for a shorter mask.
         """
         n, device = self._blocks().shape[0], self.model.device
-        mask = worlds
-        if not isinstance(worlds, wp.array):
+        mask: Any = worlds
+        if isinstance(worlds, wp.array):
+            self._check("worlds", mask[:n], (n,))
+        else:
             selected = np.zeros(n, dtype=bool)
             selected[slice(None) if worlds is None else list(worlds)] = True
             mask = wp.array(selected, dtype=wp.bool, device=device)
@@ -308,6 +359,7 @@ class SolverJumper(SolverBase):
             raise InputError("the solver was made without a block")
         return blocks
 
+    @locked
     def notify_model_changed(self, flags: ModelFlags | int) -> None:
         """Update the solver after parameters of the model, named by `flags`, have changed."""
         if flags & ModelFlags.BODY_INERTIAL_PROPERTIES:
@@ -323,16 +375,19 @@ class SolverJumper(SolverBase):
         if flags & ModelFlags.MODEL_PROPERTIES:
             self.dynamics.pack_gravity()
 
+    @locked
     def reset(self, state: State, world_mask: wp.array | None = None, flags: StateFlags | int | None = None) -> None:
         """Clear contact history and `diverged` of the masked worlds, and write the reference pose to their state.
 
         world_mask: bool (num_worlds + 1,), the last entry for the global world; None: all. Blocks return to their
-        starts. With `flags=StateFlags.NONE` state and blocks do not change.
+        starts. With `flags=StateFlags.NONE` state and blocks do not change. Raises InputError: another model's state.
         """
         world_mask = self._normalize_reset_world_mask(world_mask)
         n, device = self.model.world_count, self.model.device
         if world_mask is None:
             world_mask = wp.full(n + 1, True, dtype=wp.bool, device=device)
+        if flags is None or int(flags) != int(StateFlags.NONE):
+            self._check_state("state", state)
         work = self.dynamics.work
         outputs = [work.impulse, work.contact_force, work.diverged]
         wp.launch(clear_contact_kernel, dim=n, inputs=[world_mask], outputs=outputs, device=device)

@@ -12,6 +12,7 @@ from jumper_warp.kernels.mdp.starts import MIN_LINK_DISTANCE
 from jumper_warp.kernels.mdp.terminations import diverged, too_long
 from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
+from jumper_warp.tasks.copying import Copyable
 from jumper_warp.tasks.params import TaskParams
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.ranges import Pair
@@ -38,7 +39,7 @@ TASK_BOUNDS = {
 
 
 @dataclass(frozen=True)
-class Reset:
+class Reset(Copyable):
     """Function that samples the state at the start of an episode, with its settings."""
 
     func: Function
@@ -53,7 +54,7 @@ class Reset:
 
 
 @dataclass(frozen=True)
-class Command:
+class Command(Copyable):
     """Functions that set a task's command from outside and resample it within an episode."""
 
     set: Function
@@ -78,7 +79,7 @@ class ObservationsCfg:
 
 
 @dataclass(frozen=True)
-class TaskCfg:
+class TaskCfg(Copyable):
     """Definition of a task: everything that an environment needs, as data."""
 
     name: str
@@ -263,7 +264,7 @@ class TaskCfg:
 
 
 @dataclass(frozen=True)
-class Handover:
+class Handover(Copyable):
     """Switch of a world from one task to another, with its condition; the robot's state does not change."""
 
     source: TaskCfg

@@ -14,7 +14,9 @@ import numpy as np
 import warp as wp
 
 from jumper_warp.tasks.terms import Term
+from jumper_warp.utils.checks import check_finite
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.threads import locked
 
 
 class TermSlot(SimpleNamespace):
@@ -76,10 +78,10 @@ class ParamArrays:
         self.changed = wp.full(len(params.values), math.inf, dtype=float, device=device)
         """Numbers changed by `set`, (len(values),); infinity elsewhere."""
 
+    @locked
     def set(self, name: str, value: float) -> None:
-        """Change a parameter by its dotted name. Raises InputError: there is none, or the value is not finite."""
-        if not math.isfinite(value):
-            raise InputError(f"{name} must be finite, got {value}")
+        """Change a parameter by its dotted name. Raises InputError: there is none, or it is not finite in float32."""
+        check_finite(name, value)
         i = self.params.index(name)
         for array in (self.values, self.changed):
             array[i : i + 1].fill_(value)

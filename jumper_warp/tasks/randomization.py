@@ -76,8 +76,8 @@ class RandomizationCfg:
     observation_latency: Range = None
     """[ms] Delay from sensor to policy, rounded to the nearest physics step."""
     zero_latency_probability: float = 0.0
-    """[1] Probability of zero latency, for either latency. At 0 training rarely samples the nominal case, where the
-    policy may then chatter."""
+    """[1] Probability of zero latency, for either latency; with a robot overlay, of its latency. At 0 training rarely
+    samples the nominal case, where the policy may then chatter."""
     push_force: Range = (-5.0, 5.0)
     """[N] Push on the base along each world axis, while a paw is on the ground."""
     push_torque: Range = (-3.0, 3.0)
@@ -140,21 +140,9 @@ class RandomizationCfg:
         timing = {} if self.push_interval else {"push_interval": PUSH_INTERVAL, "push_probability": PUSH_PROBABILITY}
         return replace(self, resample_at="reset", **timing)
 
-    def with_fixed(
-        self, *, latency: float | None = None, gains: tuple[float, float] | None = None, friction: float | None = None,
-        sensor_offset: float | None = None,
-    ) -> RandomizationCfg:  # fmt: skip
-        """Return a copy with fixed latency [ms], gains (factors on kp and kd [1]) or friction of the paws [1].
-
-        sensor_offset [deg]: largest error of a position sensor, sampled uniformly within plus and minus this per motor.
-        Raises InputError: a value out of range.
-        """
-        kp, kd = gains or (None, None)
-        fixed = {"latency": latency, "gains": kp, "damping_gains": kd, "dynamic_friction": friction,
-                 "static_friction": friction}  # fmt: skip
-        ranges = {name: (value, value) for name, value in fixed.items() if value is not None}
-        ranges |= {} if sensor_offset is None else {"joint_offset": (-sensor_offset, sensor_offset)}
-        return replace(self, **ranges)
+    def with_fixed(self, **values: Any) -> RandomizationCfg:
+        """Return a copy with fixed parameters; values: see `fixed_ranges`. Raises InputError: a value out of range."""
+        return replace(self, **fixed_ranges(**values))
 
     def events(self) -> tuple[EventTerm, ...]:
         """Return the events that sample robot parameters from the ranges that are not None; numbers are in SI units."""
@@ -204,3 +192,18 @@ class RandomizationCfg:
                           force_upper=force[1], torque_lower=torque[0], torque_upper=torque[1])
             )  # fmt: skip
         return tuple(terms)
+
+
+def fixed_ranges(
+    *, latency: float | None = None, gains: tuple[float, float] | None = None, friction: float | None = None,
+    sensor_offset: float | None = None,
+) -> dict[str, tuple[float, float]]:  # fmt: skip
+    """Return ranges of fixed latency [ms], gains (factors on kp and kd [1]) or friction of the paws [1], by field.
+
+    sensor_offset [deg]: largest error of a position sensor, sampled uniformly within plus and minus this per motor.
+    """
+    kp, kd = gains or (None, None)
+    fixed = {"latency": latency, "gains": kp, "damping_gains": kd, "dynamic_friction": friction,
+             "static_friction": friction}  # fmt: skip
+    ranges = {name: (value, value) for name, value in fixed.items() if value is not None}
+    return ranges | ({} if sensor_offset is None else {"joint_offset": (-sensor_offset, sensor_offset)})

@@ -8,7 +8,6 @@ from __future__ import annotations
 import dataclasses
 import functools
 import importlib
-import math
 import pkgutil
 import sys
 from collections.abc import Collection, Iterable
@@ -19,11 +18,11 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 import warp as wp
 
 import jumper_warp.tasks
-from jumper_warp.kernels.mdp.env import NoSettings
 from jumper_warp.tasks.cfg import Handover, TaskCfg
+from jumper_warp.tasks.copying import Struct, top_level
 from jumper_warp.tasks.ranges import Pair
 from jumper_warp.tasks.terms import RewardTerm, Term
-from jumper_warp.utils.checks import NAME, version_error
+from jumper_warp.utils.checks import FLOAT32_MAX, NAME, in_float32, version_error
 from jumper_warp.utils.errors import InputError
 
 VERSION = 4  # of the saved format
@@ -31,7 +30,6 @@ PROJECT_PREFIXES = ("jumper_warp.tasks.", "jumper_warp.robot.", "jumper_warp.ker
 """Prefixes of the project's modules that a saved task may name."""
 OPTIONAL = ("rewards", "critic", "events")  # sections that only training needs
 MAX_ENTRIES = 1000  # of a list: a kernel of more terms would compile for a day
-Struct = type(NoSettings)
 
 
 class TaskError(InputError):
@@ -47,13 +45,11 @@ def name_of(definition: Any) -> str:
     For a file that runs as a program, the module is the file's stem, under which `--task-module` loads it.
     Raises TaskError unless the definition is at the top level of its module.
     """
-    python: Any = definition.func if isinstance(definition, wp.Function) else getattr(definition, "cls", definition)
-    module, name = python.__module__, python.__qualname__
-    if vars(sys.modules.get(module, object)).get(name) is not definition:
+    found, module, name = top_level(definition)
+    if found is None:
         raise TaskError(f"{module}:{name} cannot be saved: define it under this name at the top level of a module")
     if module == "__main__":
-        main = sys.modules[module]
-        module = main.__spec__.name if main.__spec__ else Path(getattr(main, "__file__", module)).stem
+        module = found.__spec__.name if found.__spec__ else Path(getattr(found, "__file__", module)).stem
     return f"{module}:{name}"
 
 
@@ -72,8 +68,8 @@ def json_value(value: Any) -> Any:
         return [json_value(v) for v in value]
     if not (value is None or isinstance(value, bool | int | float | str)):
         raise TaskError(f"{shown(value)} cannot be saved: settings are numbers, strings, tuples and dataclasses")
-    if isinstance(value, float) and not math.isfinite(value):
-        raise TaskError(f"settings must be finite, got {value}")
+    if isinstance(value, float) and not abs(value) <= FLOAT32_MAX:
+        raise TaskError(f"settings must be finite, got {in_float32(value)}")
     return value
 
 
@@ -261,7 +257,7 @@ def _scalar(saved: Any, hint: Any, where: str) -> Any:
             raise TaskError(f"{where}: must be one of {get_args(hint)}, got {shown(saved)}")
         return saved
     number = isinstance(saved, int | float) and not isinstance(saved, bool)
-    if number and not abs(saved) < 1.0e300:
+    if number and not abs(saved) <= FLOAT32_MAX:
         raise TaskError(f"{where}: must be finite, got {shown(saved)}")
     if kinds is None:
         if hint is Any and (saved is None or isinstance(saved, bool | int | float | str)):

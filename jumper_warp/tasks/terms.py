@@ -18,6 +18,7 @@ from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, MODES
 from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.step import every_episode
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
+from jumper_warp.tasks.copying import Copyable
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Function
 
@@ -48,7 +49,7 @@ def shown_type(kind: Any) -> str:
     return getattr(kind, "__name__", None) or getattr(kind, "key", str(kind))
 
 
-class Term:
+class Term(Copyable):
     """Part of a task, such as a reward or a termination: a Warp function and values of its parameters.
 
     Equal terms have the same function, name, numbers and options.
@@ -144,7 +145,7 @@ class Term:
 
         Raises InputError like the constructor.
         """
-        return type(self)(**{"func": self.func, "name": self.name, **self.numbers, **self.options, **changes})
+        return type(self)(**self.arguments() | changes)
 
     @property
     def flat_numbers(self) -> dict[str, float]:
@@ -162,6 +163,10 @@ class Term:
     def of_state(self) -> Any:
         """Type of the function's argument `state`: a task's `@wp.struct`, or Any."""
         return self.func.input_types.get("state", Any)
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments of the constructor that make an equal term."""
+        return {"func": self.func, "name": self.name, **self.numbers, **self.options}
 
     def __eq__(self, other: object) -> bool:
         return type(self) is type(other) and all(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Mapping
 from typing import Any
@@ -18,29 +19,37 @@ FILTER_ANGLE = 1440.0  # [deg] Bound of limits in a command filter: twice the bo
 FLOAT32_MAX = 3.4028234e38  # Largest finite float32; settings are converted to float32 on a device
 MOST_WORLDS = 2**20  # Largest number of simulated worlds
 MOST_SETTING = 1.0e6  # Largest absolute value of a setting of a task, in its unit
+FLOAT32_MIN = 1.1754944e-38  # Smallest positive normal float32; a GPU may round smaller values to 0
 MOST_SEED = 2**31 - 1  # Largest valid seed; the kernels' random streams take an int32
 LAST_OF_PREVIOUS_VERSION = "05fa856"  # Last commit that reads policies, tasks and runs of the previous version
+
+
+def in_float32(value: float) -> str:
+    """Return a number as text for an error message, with the reason if float32 cannot hold it."""
+    if FLOAT32_MAX < abs(value) < math.inf:
+        return f"{value}, too large for float32"
+    return f"{value}, too small for float32" if 0.0 < value < FLOAT32_MIN else f"{value}"
 
 
 def check_finite(name: str, *values: float) -> None:
     """Raise InputError if a value is NaN or infinite in float32."""
     for value in values:
         if not abs(value) <= FLOAT32_MAX:
-            raise InputError(f"{name} must be finite, got {value}")
+            raise InputError(f"{name} must be finite, got {in_float32(value)}")
 
 
 def check_positive(name: str, *values: float) -> None:
     """Raise InputError unless all values are positive and finite in float32."""
     for value in values:
-        if not 0.0 < value <= FLOAT32_MAX:
-            raise InputError(f"{name} must be positive and finite, got {value}")
+        if not FLOAT32_MIN <= value <= FLOAT32_MAX:
+            raise InputError(f"{name} must be positive and finite, got {in_float32(value)}")
 
 
 def check_not_negative(name: str, *values: float) -> None:
     """Raise InputError unless all values are non-negative and finite in float32."""
     for value in values:
         if not 0.0 <= value <= FLOAT32_MAX:
-            raise InputError(f"{name} must be finite and not negative, got {value}")
+            raise InputError(f"{name} must be finite and not negative, got {in_float32(value)}")
 
 
 def check_within(name: str, values: np.ndarray, bounds: tuple[float, float]) -> None:

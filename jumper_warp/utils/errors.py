@@ -1,5 +1,6 @@
 """Base class of errors in user input, and suggestions for misspelt names in their messages."""
 
+import re
 from collections.abc import Iterable
 
 
@@ -12,6 +13,21 @@ class InputError(ValueError):
     def __init__(self, message: str) -> None:
         """Store the message of the error. message: text in which runs of whitespace become one space."""
         super().__init__(" ".join(message.split()))
+
+
+class OutOfMemoryError(RuntimeError):
+    """Error for exhausted memory of a GPU or the machine; commands print its one line and exit with code 1."""
+
+
+MEMORY_MESSAGES = re.compile(r"Failed to allocate \d+ bytes|out of memory|can't allocate memory", re.IGNORECASE)
+"""Messages of Warp, CUDA and torch's CPU allocator about exhausted memory."""
+
+
+def is_out_of_memory(error: BaseException) -> bool:
+    """Return whether an exception of Python, NumPy, torch or Warp is about exhausted memory."""
+    names = {kind.__name__ for kind in type(error).__mro__}
+    known = names & {"MemoryError", "OutOfMemoryError"}
+    return bool(known) or (isinstance(error, RuntimeError) and MEMORY_MESSAGES.search(str(error)) is not None)
 
 
 def suggestion(name: str, known: Iterable[str]) -> str:

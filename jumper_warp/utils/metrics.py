@@ -186,9 +186,12 @@ def print_table(table: Table) -> None:
 
 
 def format_value(value: Any) -> str:
-    """Return a value as text; floats, also in lists, have four significant digits, from 1000 on no decimals."""
+    """Return a value as text; floats, also in lists, have four significant digits, from 1000 on no decimals.
+
+    None is "undefined".
+    """
     if isinstance(value, list):
         return ", ".join(format_value(item) for item in value)
     if isinstance(value, float):
         return f"{value:,.0f}" if abs(value) >= 1.0e3 else f"{value:.4g}"
-    return str(value)
+    return "undefined" if value is None else str(value)

@@ -1,14 +1,34 @@
-"""Checksums of user files that a run depends on."""
+"""Loading of user files as modules, and checksums of those that a run depends on."""
 
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from types import ModuleType
 from typing import Any
 
 PROJECT_PREFIX = "jumper_warp."  # Prefix of the project's modules, whose content the commit identifies
+
+
+def module_from_file(name: str, path: str | Path) -> ModuleType:
+    """Import a file as a module with the given name, and return it; after an exception the name is free again.
+
+    Raises ImportError: the file's name does not end in .py.
+    """
+    spec = importlib.util.spec_from_file_location(name, path)
+    if spec is None or spec.loader is None:
+        raise ImportError(f"{Path(path).name}: the name of a module's file must end in .py")
+    module = importlib.util.module_from_spec(spec)
+    sys.modules[name] = module
+    try:
+        spec.loader.exec_module(module)
+    except BaseException:
+        del sys.modules[name]
+        raise
+    return module
 
 
 def source_checksums(saved: Any) -> dict[str, str]:

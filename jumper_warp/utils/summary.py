@@ -54,7 +54,7 @@ def print_summary(
         table = _columns_table(main, trial) if _has_columns(main) else _summary_table(main, paper)
         print_table(table)
     hints = ["rerun FILE shows a recording"] if any(folder.glob("*.rrd")) else []
-    hints += [f"--verbose prints all {len(metrics)} metrics"] if not flags.verbose and len(metrics) > len(main) else []
+    hints += [f"--verbose prints {len(metrics)} metrics"] if not flags.verbose and len(metrics) > len(main) else []
     end = "; ".join([f"{'time':9}  {seconds:.0f} s", *hints])
     print(*_file_lines(folder, list(films)), f"{'metrics':9}  {path}", end, sep="\n")
 

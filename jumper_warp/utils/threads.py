@@ -1,19 +1,74 @@
-"""Number of CPU threads of simulations, and a pool of worker threads for parallel jobs."""
+"""Number of CPU threads of simulations, a pool of worker threads for parallel jobs, and a lock of Warp's state."""
 
 from __future__ import annotations
 
+import functools
 import os
+import sys
 from collections.abc import Callable, Iterable
 from queue import SimpleQueue
-from threading import Thread
+from threading import RLock, Thread
+from typing import Any, ParamSpec, TypeVar
 
 from jumper_warp.utils.errors import InputError
 
 MAX_THREADS = 1024  # Largest number of threads of a simulation
+P = ParamSpec("P")
+T = TypeVar("T")
+FORKED = "a forked process cannot use CUDA: start it with multiprocessing.get_context('spawn')"
 _default_threads: int | None = None
 _workers: list[Thread] = []
 _jobs: SimpleQueue[Callable[[], None]] = SimpleQueue()
 """Jobs for the workers; a plain queue wakes a thread four times as fast as an executor."""
+
+
+class WarpLock:
+    """Reentrant lock of Warp's process-wide state, for module loading, allocations, launches and graph captures.
+
+    While one thread captures a graph, a launch of another thread would become part of it. Replays of CPU graphs need no
+    lock. A forked child process cannot use CUDA after its parent did: there the lock raises RuntimeError.
+    """
+
+    def __init__(self) -> None:
+        """Create the lock, and let forks of this process wait until no thread holds it."""
+        self._lock, self._used, self._forked = RLock(), False, False
+        release = self._lock.release
+        os.register_at_fork(before=self._lock.acquire, after_in_parent=release, after_in_child=self._after_fork)
+
+    def __enter__(self) -> None:
+        """Acquire the lock. Raises RuntimeError: this is a forked process whose parent had a CUDA device."""
+        if self._forked:
+            raise RuntimeError(FORKED)
+        self._lock.acquire()
+        self._used = True
+
+    def __exit__(self, *_: object) -> None:
+        """Release the lock."""
+        self._lock.release()
+
+    def _after_fork(self) -> None:
+        """Prepare a forked child process, in which the parent's worker threads and those of torch do not exist."""
+        global _jobs
+        self._lock.release()
+        self._forked = self._used and sys.modules["warp"].is_cuda_available()
+        _jobs = SimpleQueue()
+        _workers.clear()
+        if "torch" in sys.modules:
+            sys.modules["torch"].set_num_threads(1)
+
+
+WARP_LOCK = WarpLock()
+
+
+def locked(function: Callable[P, T]) -> Callable[P, T]:
+    """Return a function that holds `WARP_LOCK` while it runs."""
+
+    @functools.wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> Any:
+        with WARP_LOCK:
+            return function(*args, **kwargs)
+
+    return call
 
 
 def available_threads() -> int:
@@ -61,9 +116,12 @@ def run_in_parallel(jobs: Iterable[Callable[[], object]], threads: int) -> None:
                 pass
         errors.put(error)
 
-    while len(_workers) < workers:
-        _workers.append(Thread(target=_run_jobs, name=f"worlds_{len(_workers)}", daemon=True))
-        _workers[-1].start()
+    if len(_workers) < workers:
+        with WARP_LOCK:
+            while len(_workers) < workers:
+                worker = Thread(target=_run_jobs, name=f"worlds_{len(_workers)}", daemon=True)
+                worker.start()
+                _workers.append(worker)
     for _ in range(workers):
         _jobs.put(work)
     work()

@@ -81,7 +81,7 @@ def check_film(path: Path, size: tuple[int, int], fps: float, speed: float, eye:
     if path.suffix not in SUFFIXES:
         raise InputError(f"{path}: the suffix of a film must be one of {', '.join(SUFFIXES)}")
     if path.suffix == ".mp4" and find_spec("imageio_ffmpeg") is None:
-        raise InputError("MP4 films need imageio-ffmpeg: pip install jumper-warp[video]")
+        raise InputError('MP4 films need imageio-ffmpeg: pip install "jumper-warp[video]"')
     if not (64 <= min(size) and max(size) <= 7680 and 0.0 < fps <= 240.0 and 0.0 < speed <= 100.0):
         raise InputError(f"a film needs 64 to 7680 px, fps in (0, 240], speed in (0, 100]; got {size}, {fps}, {speed}")
     if path.suffix == ".gif" and fps > GIF_FPS:

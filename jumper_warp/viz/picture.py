@@ -27,7 +27,8 @@ SIDE_BY_SIDE = 0.8  # [m] least distance between two moments of a walk
 APART = (0.6, 0.6)  # [m] distance, to the right or up, from which two moments do not hide each other
 GHOST = 0.4  # opacity of moments that would hide others
 SPREAD = 0.95  # [m] distance between moments of a robot that stays in place
-STAYS = 0.6  # [m] horizontal distance up to which a robot stays in place
+STAYS = 0.6  # [m] horizontal distance up to which the moments are spread, since they would hide each other
+DRIFT = 0.15  # [m] horizontal distance up to which the picture shows the x axis, not the direction of the motion
 RISE = 0.1  # [m] of the base during a flight, above which the flight is a jump
 CONTACT = 1.0  # [N] paw force above which a paw touches
 MOST = 7  # largest number of moments in a picture
@@ -92,8 +93,8 @@ class Composition:
 def compose(recording: Recording, rank: int = 0) -> Composition:
     """Choose the times of a recording at which a composite picture shows the robot of the rank-th world.
 
-    A robot in place is drawn spread to the right. Frames after `valid_frames` are ignored. Raises InputError: no frame
-    remains.
+    The moments of a robot that moves by less than STAYS are drawn spread to the right. Frames after `valid_frames` are
+    ignored. Raises InputError: no frame remains.
     """
     count = valid_frames(recording, rank)
     if count == 0:
@@ -104,7 +105,7 @@ def compose(recording: Recording, rank: int = 0) -> Composition:
     displacement = base[-1, :2] - base[0, :2]
     distance = float(np.linalg.norm(displacement))
     stays = distance < STAYS
-    right = np.array([1.0, 0.0, 0.0]) if stays else np.append(displacement / distance, 0.0)
+    right = np.array([1.0, 0.0, 0.0]) if distance < DRIFT else np.append(displacement / distance, 0.0)
     flights = _flights(recording, rank)
     if not stays and flights:
         frames = _distinct(base @ np.stack([right, [0.0, 0.0, 1.0]], axis=1), flights)
@@ -218,7 +219,8 @@ def _extent(scene: Composition) -> np.ndarray:
     low, high = scene.span()
     ground = scene.lowest - 0.1
     heights = [*scene.heights, *([ground] if scene.grounded else [])]
-    frame = [scene.point(along, height) for along in (low - 0.25, high) for height in heights]
+    scale = low - max(0.25, 0.08 * (high - low))  # the numbers of the scale are left of `low`
+    frame = [scene.point(along, height) for along in (scale, high) for height in heights]
     goals = (
         scene.recording.goals[scene.rank] if len(scene.recording.goals) and not scene.shift.any() else np.zeros((0, 3))
     )

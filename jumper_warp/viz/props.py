@@ -19,7 +19,7 @@ BLOCK_COLOR = (0.55, 0.45, 0.35)  # RGB, each in [0, 1]
 
 
 def goal_shapes(recording: Recording) -> list[ShapeMesh]:
-    """Return the markers of goals (rings on the ground) and of commanded heights (bars), world frame.
+    """Return the markers of goals (rings on the surface under them) and of commanded heights (bars), world frame.
 
     A bar is parallel to x, to the left of the base's first position. Markers of later worlds are moved along y by the
     recording's spacing. Names: `goal_<rank>_<number>`, `height_<rank>`; NaN goals and heights have no marker.
@@ -28,7 +28,8 @@ def goal_shapes(recording: Recording) -> list[ShapeMesh]:
     for rank, goals in enumerate(recording.goals):
         for number, goal in enumerate(goals):
             ring = trimesh.creation.annulus(RING_RADIUS - RING_WIDTH, RING_RADIUS, RING_HEIGHT, sections=48)
-            shapes.append((f"goal_{rank}_{number}", rank, ring, goal + (0.0, 0.0, 0.5 * RING_HEIGHT)))
+            place = np.append(goal[:2], _surface_height(recording, rank, goal) + 0.5 * RING_HEIGHT)
+            shapes.append((f"goal_{rank}_{number}", rank, ring, place))
     for rank, height in enumerate(recording.heights):
         x, y = recording.body_poses(rank)[0, 0, :2]
         bar, place = trimesh.creation.box(extents=BAR_SIZE), np.array([x, y + BAR_OFFSET, height])
@@ -38,6 +39,31 @@ def goal_shapes(recording: Recording) -> list[ShapeMesh]:
         for name, rank, mesh, place in shapes
         if np.isfinite(place).all()
     ]
+
+
+def _surface_height(recording: Recording, rank: int, point: np.ndarray) -> float:
+    """Return the height [m] of the ground under a point (3,) [m], or of the world's block at the end; else the point's.
+
+    The highest surface counts.
+    """
+    block, heights = f"world_{recording.worlds[rank]}/block", []
+    for shape in recording.shapes:
+        if shape.body >= 0 and recording.bodies[shape.body] != block:
+            continue
+        origin = recording.poses[-1, shape.body, :3] if shape.body >= 0 else np.zeros(3)
+        a, b, c = np.moveaxis((shape.vertices + origin)[shape.triangles].astype(float), 1, 0)
+        ab, ac, offset = b - a, c - a, point - a
+        with np.errstate(divide="ignore", invalid="ignore"):  # a vertical triangle has no area seen from above
+            area = _cross(ab, ac)
+            u, v = _cross(offset, ac) / area, _cross(ab, offset) / area
+            inside = (u > -1.0e-6) & (v > -1.0e-6) & (u + v < 1.0 + 1.0e-6)
+            heights.extend((a[:, 2] + u * ab[:, 2] + v * ac[:, 2])[inside])
+    return float(max(heights, default=point[2]))
+
+
+def _cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """Return the z component of cross products, (n,), of vectors (n, 3)."""
+    return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
 
 
 def with_blocks(recording: Recording, centers: np.ndarray, half: np.ndarray, height: np.ndarray) -> Recording:

@@ -56,7 +56,7 @@ class Recording:
     labels: tuple[str, ...] = ()  # names of the worlds to show, such as their goals; default `world_<i>`
     states: dict[str, list[str]] = field(default_factory=dict)  # by name, a text for each frame, such as a phase
     goals: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))
-    """Goals on the ground [m], world frame, (num_worlds, goals, 3), NaN where there is none; no worlds: no goals."""
+    """Goals [m], world frame, (num_worlds, goals, 3), drawn on the surface under them; NaN or no worlds: no goals."""
     heights: np.ndarray = field(default_factory=lambda: np.zeros(0, np.float32))
     """Commanded heights of the base at the apex [m], above z = 0, (num_worlds,); NaN or no worlds: none."""
     commands: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3), np.float32))

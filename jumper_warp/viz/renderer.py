@@ -33,7 +33,7 @@ SHADOW_EXTENT = 6.0  # [m] distance from the world's origin up to which OpenGL d
 SAMPLES = 4  # rays per pixel of the ray tracer
 LINE_WIDTH = 1.0 / 560.0  # [1] width of lines over the image's width
 GL_PACKAGES = "apt-get install libegl1 libegl-mesa0 libgl1 libgl1-mesa-dri"
-NO_GL = f"pip install jumper-warp[video], and on Debian {GL_PACKAGES}"
+NO_GL = f'pip install "jumper-warp[video]", and on Debian {GL_PACKAGES}'
 
 
 @dataclass(frozen=True)
@@ -198,8 +198,8 @@ class RayTracer(Renderer):
         self._sensor.create_default_light(direction=rays)
         self._sensor.set_ambient_light(AMBIENT)
         red, green, blue = (round(255 * channel) for channel in SKY)
-        clear = SensorCamera.ClearData(clear_color=0xFF000000 | blue << 16 | green << 8 | red)
-        self._sensor.default_clear_data = clear
+        color = (0xFF000000 | blue << 16 | green << 8 | red) - (1 << 32)  # as int32: clang warns about larger constants
+        self._sensor.default_clear_data = SensorCamera.ClearData(clear_color=color)
         self._sensor.default_render_config.enable_shadows = True
         self._sensor.default_render_config.anti_aliasing = SensorCamera.AntiAliasing.SSAA
         self._pixels: Any = self._sensor.allocate_image_color(1, *self.size)
@@ -229,6 +229,26 @@ def open_renderer(
         reason = " ".join(str(error).split())[:100]
         print(f"no OpenGL ({reason}), using the slow ray tracer; to install OpenGL: {NO_GL}", file=sys.stderr)
         return RayTracer(shapes, num_bodies, size, opacity)
+
+
+def opengl_name() -> str:
+    """Return version and renderer of OpenGL without a display.
+
+    Raises ImportError: pyglet is missing; RuntimeError: no OpenGL.
+    """
+    import pyglet
+
+    pyglet.options["headless"] = True  # read when pyglet's window module is first imported
+    try:
+        window = pyglet.window.Window(width=16, height=16, visible=False)
+        info = window.context.get_info()
+        name = f"{info.get_version_string()}, {info.get_renderer()}"
+        window.close()
+    except ImportError:
+        raise
+    except Exception as error:  # pyglet raises many kinds, of no common base
+        raise RuntimeError(f"{type(error).__name__}: {error}") from error
+    return name
 
 
 def _gl_viewer(size: tuple[int, int]) -> Any:

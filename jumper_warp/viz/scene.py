@@ -163,5 +163,19 @@ def annotate(
         places = view.project(np.array([label.point for label in labels]), picture.size)
         for label, place in zip(labels, places, strict=True):
             if np.isfinite(place).all():
-                draw.text(tuple(place), label.text, anchor=label.anchor, align="center", **style)
+                options = {"font": font, "anchor": label.anchor, "align": "center"}
+                box = draw.textbbox(tuple(place), label.text, stroke_width=style["stroke_width"], **options)
+                place = place + _shift_inside(np.reshape(box, (2, 2)), picture.size)
+                draw.text(tuple(place), label.text, **{**style, **options})
     return picture
+
+
+def _shift_inside(box: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+    """Return the shift [px] (x, y) that moves a box into an image, zero if it is outside altogether.
+
+    box: least and largest corner [px], (2, 2). size: width and height of the image [px].
+    """
+    low, high = box
+    if (high < 0.0).any() or (low > size).any():
+        return np.zeros(2)
+    return np.maximum(-low, 0.0) - np.maximum(high - size, 0.0)

@@ -36,6 +36,7 @@ class EpisodeArrays:
     seed: int  # of all random streams, as is `purpose`
     purpose: int  # index in `jumper_warp.utils.streams.PURPOSES`
     first: int  # world of the first thread of a launch
+    slice: int  # index of the launch's slice of worlds
     step_count: wp.array(dtype=int)  # policy steps made; with seed and purpose, the whole state of the random streams
     skill: wp.array(dtype=int)  # index of a world's active task
     requested_task: wp.array(dtype=int)  # index of the requested task (`Env.request`), -1: none

@@ -6,6 +6,7 @@ import warp as wp
 
 from ..terrain.ground import Ground
 from .env import BEGUN, COMMANDED, RING, EpisodeArrays
+from .non_finite import NonFinite, record_non_finite
 from .options import FAST, kernel_name
 from .parameters import RobotParameters
 from .random import OBSERVATION, clamped_normal, step_key, stream_at
@@ -70,16 +71,21 @@ def load_column(columns: wp.array2d(dtype=int), component: int) -> ObservationCo
 
 
 @wp.func
-def store(value: float, row: int, world: int, out: wp.array2d(dtype=float)):
-    """Write the scalar value of an observation term in a world to out[row, world]."""
+def store(value: float, row: int, world: int, out: wp.array2d(dtype=float)) -> bool:
+    """Write the scalar value of an observation term in a world to out[row, world]; return whether it is finite."""
     out[row, world] = value
+    return wp.isfinite(value)
 
 
 @wp.func
-def store(value: Any, row: int, world: int, out: wp.array2d(dtype=float)):  # noqa: F811
-    """Write element j of the vector value of an observation term in a world to out[row + j, world]."""
+def store(value: Any, row: int, world: int, out: wp.array2d(dtype=float)) -> bool:  # noqa: F811
+    """Write element j of the vector value of an observation term in a world to out[row + j, world].
+
+    Returns whether all elements are finite.
+    """
     for j in range(len(value)):
         out[row + j, world] = value[j]
+    return wp.isfinite(value)
 
 
 def make_observe_kernel(task: Any) -> wp.Kernel:
@@ -101,30 +107,34 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
         states: wp.array(dtype=task.state),
         p: wp.array(dtype=float),
         after_reset: int,
+        term_value: wp.array2d(dtype=float),
         # out
         raw: wp.array2d(dtype=float),
+        found: NonFinite,
+        found_states: wp.array(dtype=task.state),
     ):
         """Evaluate a task's observation terms, and write their values to raw (components, num_worlds).
 
         One thread per (chunk of terms, world of `skill`). after_reset 1: only where an episode or the skill has just
-        begun, or a new command was set.
+        begun, or a new command was set. term_value, found, found_states: see `record_non_finite`.
         """
         chunk, world = wp.tid()
         world += episode.first
         if episode.skill[world] != skill or (after_reset != 0 and episode.history_reset[world] == 0):
             return
+        finite = bool(True)
         for c in range(wp.static((len(slots) + CHUNK - 1) // CHUNK)):
             if chunk == c:
                 robot = load_view(arrays, ground, world)
                 for i in range(wp.static(c * CHUNK), wp.static(min((c + 1) * CHUNK, len(slots)))):
                     if wp.static(reads_parameters[i]):
-                        store(wp.static(slots[i].func)(parameters, world), wp.static(rows[i]), world, raw)
+                        ok = store(wp.static(slots[i].func)(parameters, world), wp.static(rows[i]), world, raw)
                     elif wp.static(reads_ground[i]):
-                        store(wp.static(slots[i].func)(arrays, ground, world), wp.static(rows[i]), world, raw)
+                        ok = store(wp.static(slots[i].func)(arrays, ground, world), wp.static(rows[i]), world, raw)
                     elif wp.static(slots[i].parameterless):
-                        store(wp.static(slots[i].func)(robot, states[world]), wp.static(rows[i]), world, raw)
+                        ok = store(wp.static(slots[i].func)(robot, states[world]), wp.static(rows[i]), world, raw)
                     else:
-                        store(
+                        ok = store(
                             wp.static(slots[i].func)(
                                 robot, states[world], *p[wp.static(slots[i].start) : wp.static(slots[i].stop)]
                             ),
@@ -132,6 +142,15 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
                             world,
                             raw,
                         )
+                    finite = finite and ok
+        if not finite and episode.diverged[world] == 0:
+            for row in range(raw.shape[0]):
+                term = found.observation_term[row]
+                if term // CHUNK == chunk and not wp.isfinite(raw[row, world]):
+                    record_non_finite(
+                        found, found.num_rewards + 2 + term, raw[row, world], world, episode, arrays, raw, term_value,
+                        states, found_states,
+                    )  # fmt: skip
 
     return observe_kernel
 

@@ -1,8 +1,9 @@
 """Robot parameters that domain randomisation changes, and the events that change them (paper, Table V).
 
 An event is a function of (parameters, rng, named numbers) that samples parameters of world `rng.world`, relative to the
-nominal values. Its numbers lower and upper bound a uniform distribution. `rng.lanes` threads share loops over motors or
-links. Motors m are 0 to 11: legs FL, FR, BL, BR; each lateral, outer, inner.
+nominal values. Its numbers lower and upper bound a uniform distribution. Ranges of friction and latency are absolute
+and hold for the described robot; `*_move`, another robot's value minus the described one, moves them. `rng.lanes`
+threads share loops over motors or links. Motors m are 0 to 11: legs FL, FR, BL, BR; each lateral, outer, inner.
 """
 
 import warp as wp
@@ -47,7 +48,17 @@ class RobotParameters:
     nominal_cutoff: wp.array2d(dtype=float)  # [rad/s] (skills, 12) cutoff speed
     nominal_saturation: wp.array2d(dtype=float)  # [N m] (skills, 12) torque limit
     nominal_offset: wp.array(dtype=float)  # [rad] (12,) of the position sensors
+    zero_latency: float  # [s] latency from action to motor that is sampled with `zero_probability`
+    motor_friction_move: wp.array(dtype=float)  # [N m] (12,) added to ranges of motor friction
+    friction_move: wp.vec2  # [1] added to ranges of the paws' (dynamic, static) friction
+    latency_move: float  # [s] added to ranges of the latency from action to motor
     skill: wp.array(dtype=int)  # (num_worlds,) index of the active skill
+
+
+@wp.func
+def moved_uniform(rng: RngStream, i: int, lower: float, upper: float, move: float) -> float:
+    """Return the i-th random number of a stream, uniform from lower + move to upper + move, each end at least 0."""
+    return uniform(rng, i, wp.max(lower + move, 0.0), wp.max(upper + move, 0.0))
 
 
 @wp.func
@@ -92,9 +103,10 @@ def armature(robot: RobotParameters, rng: RngStream, lower: float, upper: float)
 
 @wp.func
 def motor_friction(robot: RobotParameters, rng: RngStream, lower: float, upper: float):
-    """Set the Coulomb friction of each motor to a sampled value from lower to upper [N m]."""
+    """Set the Coulomb friction of each motor to a value from lower to upper [N m], moved by `motor_friction_move`."""
     for m in range(rng.lane, 12, rng.lanes):
-        robot.joint_friction[rng.world * DOFS + 6 + motor_slot(m)] = uniform(rng, m, lower, upper)
+        value = moved_uniform(rng, m, lower, upper, robot.motor_friction_move[m])
+        robot.joint_friction[rng.world * DOFS + 6 + motor_slot(m)] = value
 
 
 @wp.func
@@ -179,9 +191,12 @@ def friction(
     robot: RobotParameters, rng: RngStream, dynamic_lower: float, dynamic_upper: float, static_lower: float,
     static_upper: float,
 ):  # fmt: skip
-    """Sample the friction coefficients [1] of a robot's paws; the static one is at least the dynamic one."""
-    dynamic = uniform(rng, 0, dynamic_lower, dynamic_upper)
-    static = wp.max(uniform(rng, 1, static_lower, static_upper), dynamic)
+    """Sample the friction coefficients [1] of a robot's paws, moved by `friction_move`.
+
+    The static one is at least the dynamic one.
+    """
+    dynamic = moved_uniform(rng, 0, dynamic_lower, dynamic_upper, robot.friction_move[0])
+    static = wp.max(moved_uniform(rng, 1, static_lower, static_upper, robot.friction_move[1]), dynamic)
     for k in range(4):
         robot.shape_mu[robot.paw_shapes[4 * rng.world + k]] = dynamic
     # without dynamic friction there is no static one either
@@ -195,17 +210,21 @@ def physics_steps(robot: RobotParameters, seconds: float) -> int:
 
 
 @wp.func
-def drawn_delay(robot: RobotParameters, rng: RngStream, lower: float, upper: float, zero_probability: float) -> int:
-    """Return a sampled delay [physics steps]: 0 with `zero_probability`, else from lower to upper [s]."""
-    if uniform(rng, 1, 0.0, 1.0) < zero_probability:
-        return 0
-    return physics_steps(robot, uniform(rng, 0, lower, upper))
+def is_nominal(rng: RngStream, nominal_probability: float) -> bool:
+    """Return whether a sampled delay is the nominal one, with `nominal_probability`."""
+    return uniform(rng, 1, 0.0, 1.0) < nominal_probability
 
 
 @wp.func
 def action_latency(robot: RobotParameters, rng: RngStream, lower: float, upper: float, zero_probability: float = 0.0):
-    """Sample the latency of actions from lower to upper [s]; with `zero_probability` it is 0."""
-    robot.latency[rng.world] = drawn_delay(robot, rng, lower, upper, zero_probability)
+    """Sample the latency of actions from lower to upper [s], moved by `latency_move`.
+
+    With `zero_probability` it is the nominal one, which is 0 for the described robot.
+    """
+    seconds = moved_uniform(rng, 0, lower, upper, robot.latency_move)
+    if is_nominal(rng, zero_probability):
+        seconds = robot.zero_latency
+    robot.latency[rng.world] = physics_steps(robot, seconds)
 
 
 @wp.func
@@ -213,7 +232,10 @@ def observation_latency(
     robot: RobotParameters, rng: RngStream, lower: float, upper: float, zero_probability: float = 0.0
 ):
     """Sample the latency of delayed observation terms from lower to upper [s]; with `zero_probability` it is 0."""
-    robot.observation_latency[rng.world] = drawn_delay(robot, rng, lower, upper, zero_probability)
+    seconds = uniform(rng, 0, lower, upper)
+    if is_nominal(rng, zero_probability):
+        seconds = 0.0
+    robot.observation_latency[rng.world] = physics_steps(robot, seconds)
 
 
 @wp.func

@@ -7,8 +7,9 @@ import warp as wp
 from ..terrain.ground import Ground
 from . import terminations
 from .env import BEGUN, Counters, EpisodeArrays
+from .non_finite import NonFinite, record_non_finite
 from .options import FAST, kernel_name
-from .view import RobotArrays, has_diverged, load_view
+from .view import RobotArrays, has_diverged, is_finite, load_view
 
 NOT_TERMINATED = wp.constant(-1)  # `EpisodeArrays.termination` of an episode that has not ended
 
@@ -80,10 +81,13 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         ground: Ground,
         num_levels: int,
         p: wp.array(dtype=float),
+        observed: wp.array2d(dtype=float),
         # in, out
         episode: EpisodeArrays,
         states: wp.array(dtype=task.state),
         episode_sum: wp.array2d(dtype=float),
+        found: NonFinite,
+        found_states: wp.array(dtype=task.state),
         # out
         term_value: wp.array2d(dtype=float),
         counters: Counters,
@@ -93,6 +97,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         One thread per world. p: numbers of the task's terms. The first termination that holds ends the episode.
         episode_sum: (rewards, num_worlds), sums of `term_value` since the episode, or this skill in it, began.
         term_value: (rewards, num_worlds), rewards of this step, weights applied; non-finite ones add 0 to the reward.
+        observed: observation terms before this step; found, found_states: see `record_non_finite`.
         """
         world = episode.first + wp.tid()
         if episode.skill[world] != skill:
@@ -109,8 +114,11 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         timeout = float(0.0)
         success = bool(False)
         diverged = arrays.diverged[world] != 0 or episode.bad_action[world] != 0 or has_diverged(robot)
+        faulty = int(-1)  # term with a non-finite value, other than a reward: curriculum or state
         if diverged:
             termination = wp.static(diverged_ending)
+            if arrays.diverged[world] != 0 or episode.bad_action[world] != 0 or not is_finite(robot):
+                faulty = wp.static(len(rewards) + 1)
         for i in range(wp.static(len(endings))):
             if termination == NOT_TERMINATED:
                 if wp.static(endings[i].parameterless):
@@ -127,6 +135,7 @@ def make_step_kernel(task: Any) -> wp.Kernel:
         begun = episode.history_reset[world] == BEGUN
         ended = termination != NOT_TERMINATED
         total = float(0.0)
+        finite = bool(True)
         for i in range(wp.static(len(rewards))):
             if wp.static(rewards[i].parameterless):
                 raw = wp.static(rewards[i].func)(robot, state)
@@ -146,6 +155,8 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                 counters.term_sum[i, world] = counters.term_sum[i, world] + wp.float64(running)
             if wp.isfinite(value):
                 total += value
+            else:
+                finite = False
         if not wp.isfinite(total):
             total = float(0.0)
         if wp.static(floor is not None):
@@ -156,9 +167,20 @@ def make_step_kernel(task: Any) -> wp.Kernel:
             counters.termination_count[termination, world] = counters.termination_count[termination, world] + 1
             if wp.static(curriculum.counts)(state):
                 error = wp.static(curriculum.func)(robot, state)
+                if not wp.isfinite(error) and faulty < 0:
+                    faulty = wp.static(len(rewards))
                 success = success and error <= p[wp.static(curriculum.tolerance)]
                 update_curriculum(
                     episode, counters, world, success, error, p[wp.static(curriculum.promote_after)], num_levels
                 )
+        if not finite or faulty >= 0:
+            for i in range(found.num_rewards + 2):
+                value = float(wp.NAN)
+                if i < found.num_rewards:
+                    value = term_value[i, world]
+                if i == faulty or (i < found.num_rewards and not wp.isfinite(value)):
+                    record_non_finite(
+                        found, i, value, world, episode, arrays, observed, term_value, states, found_states
+                    )
 
     return step_kernel

@@ -172,19 +172,25 @@ def load_view(arrays: RobotArrays, ground: Ground, world: int) -> RobotView:
 
 
 @wp.func
+def is_finite(robot: RobotView) -> bool:
+    """Return whether position, velocity, motor angles and rates of a robot are finite."""
+    total = wp.length_sq(robot.pos) + wp.length_sq(robot.lin_vel) + wp.length_sq(robot.ang_vel)
+    for m in range(12):
+        total += robot.rate[m] * robot.rate[m] + robot.angle[m] * robot.angle[m]  # max() would ignore a NaN
+    return wp.isfinite(total)
+
+
+@wp.func
 def has_diverged(robot: RobotView) -> bool:
     """Return whether the simulation of a robot diverged: its state is not finite or too fast.
 
     Too fast is more than 15 m/s or 40 rad/s of the base, or 120 rad/s of any motor.
     """
     fastest = float(0.0)
-    total = wp.length_sq(robot.pos) + wp.length_sq(robot.lin_vel) + wp.length_sq(robot.ang_vel)
     for m in range(12):
         fastest = wp.max(fastest, wp.abs(robot.rate[m]))
-        total += robot.rate[m] * robot.rate[m] + robot.angle[m] * robot.angle[m]  # max() would ignore a NaN
-    if not wp.isfinite(total):
-        return True
-    return wp.length(robot.lin_vel) > 15.0 or wp.length(robot.ang_vel) > 40.0 or fastest > 120.0
+    too_fast = wp.length(robot.lin_vel) > 15.0 or wp.length(robot.ang_vel) > 40.0 or fastest > 120.0
+    return too_fast or not is_finite(robot)
 
 
 @wp.func

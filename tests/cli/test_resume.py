@@ -12,6 +12,7 @@ from jumper_warp.cli.train import env_maker, parse_train
 from jumper_warp.registry import make_task
 from jumper_warp.rl.checkpoint import load_checkpoint, save_checkpoint
 from jumper_warp.robot.overlay import with_springs
+from jumper_warp.utils.locks import write_lock
 
 SMALL = ["--ppo.num-steps", "2", "--ppo.minibatches", "2", "--ppo.hidden", "8"]
 SAVED = ["--num-envs", "4", "--max-iterations", "1", "--seed", "3", "--save-interval", "7", "--no-noise",
@@ -153,3 +154,10 @@ def test_resume_without_value_exits_with_2(capsys):
 
 def test_new_training_has_default_task_settings():
     assert parse_train(["vertical-jump"])[1] == make_task("vertical-jump")
+
+
+def test_run_that_another_process_writes_is_refused(capsys, run):
+    with write_lock(run):
+        code, out, err = train(capsys, "--resume", str(run), "--max-iterations", "2")
+    assert (code, out) == (2, "")
+    assert err == [f"jumper: {run}: another process is writing this folder; wait for its end, or stop it"]

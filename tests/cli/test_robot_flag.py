@@ -7,11 +7,10 @@ import torch
 import tyro
 
 from jumper_warp.cli.main import main
-from jumper_warp.cli.train import TrainArgs, env_maker, for_robot, overlay_in
+from jumper_warp.cli.train import env_maker, parse_train
 from jumper_warp.evaluation.run import EvaluationArgs, conditions_of, torque_limit
 from jumper_warp.policies.conditions import env_of_policy
 from jumper_warp.policies.runs import open_policy
-from jumper_warp.registry import make_task
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.output import read_values
 
@@ -75,10 +74,8 @@ def test_refuses_misspelt_overlay_and_names_the_file(command, change, tmp_path, 
 
 
 def test_training_uses_and_saves_the_overlay(overlay):
-    flags = ["--robot", str(overlay)]
-    task = for_robot(make_task("vertical-jump"), overlay_in(flags))
-    args = tyro.cli(TrainArgs, args=[*flags, "--no-randomize"])
+    args, task = parse_train(["vertical-jump", "--robot", str(overlay), "--no-randomize"])
     env = env_maker(task, args)(2, 0, torch.device("cpu"))
     saved = RobotOverlay.from_json(json.loads(json.dumps(env.config()))["robot"])
     assert base_mass(env) == pytest.approx(saved.values["base_mass"][0]) and saved.values["kp"][0] == 0.8
-    assert task.randomization.base_mass == (-0.1, 0.1)
+    assert saved.randomization == {"base_mass": (-0.1, 0.1)}

@@ -19,6 +19,7 @@ import jumper_warp.cli.train  # noqa: F401
 from jumper_warp.cli.evaluate import saved_task
 from jumper_warp.cli.main import COMMANDS, main
 from jumper_warp.policies.catalog import find_policy
+from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.utils.errors import InputError
 
 ROOT = Path(__file__).parents[2]
@@ -166,7 +167,8 @@ class Commands:
         """Raise CommandError if a file or policy in parsed settings does not exist and no earlier command makes it."""
         for field in dataclasses.fields(settings) if dataclasses.is_dataclass(settings) else ():
             value = getattr(settings, field.name)
-            self.check_values(value)
+            if not isinstance(value, RobotOverlay):  # its file is checked
+                self.check_values(value)
             for item in value if isinstance(value, tuple) else (value,):
                 if isinstance(item, Path) and field.name not in OUTPUTS:
                     self.require(item)

@@ -13,6 +13,7 @@ from jumper_warp.evaluation.scripts import parse_script
 from jumper_warp.policies.conditions import Conditions
 from jumper_warp.policies.skills import JUMP_TO, JUMP_UP, WALK, SkillNames, SkillPolicies
 from jumper_warp.policies.spec import PolicyError
+from jumper_warp.robot.overlay import RobotOverlay
 
 N = 2
 SCRIPTS = [
@@ -137,3 +138,42 @@ def test_configuration_names_all_tasks_and_handovers(followed):
         "jump_up": "vertical_jump",
         "jump_to": "horizontal_jump",
     }
+
+
+# ---------------------------------------------------------------- robot overlays
+
+
+@pytest.fixture
+def trained_with():
+    """Return a function that loads the policies of the three skills as if trained with overlays of base masses [kg]."""
+
+    def load(*masses):
+        policies = SkillPolicies()
+        for policy, mass in zip(policies.policies, masses, strict=True):
+            robot = {} if mass is None else {"robot": RobotOverlay({"base_mass": (mass,)}, source="bench").to_json()}
+            policy.config = {"env": {"task": policy.config["env"]["task"], **robot}}
+        return policies
+
+    return load
+
+
+def mass_of(policies, **conditions):
+    """Return the base mass [kg] of the robot of three skills."""
+    env = policies.env(1, Conditions(device="cpu", **conditions))
+    return pytest.approx(float(env.sim.model.body_mass.numpy()[0]))
+
+
+def test_skills_have_the_robot_of_their_training(trained_with, capfd):
+    assert mass_of(trained_with(8.0, 8.0, 8.0)) == 8.0
+    assert "overlay" not in capfd.readouterr().err
+    assert mass_of(trained_with(None, 8.0, None)) == 8.0
+    line = "jumper: the robot has the overlay of vertical_jump; walking_flat and horizontal_jump were trained without"
+    assert line in capfd.readouterr().err.splitlines()
+
+
+def test_skills_of_different_robots_need_a_choice(trained_with, tmp_path):
+    policies = trained_with(8.0, None, 7.0)
+    with pytest.raises(PolicyError, match=r"walking_flat and horizontal_jump .* different robots.* --robot FILE"):
+        policies.env(1, Conditions(device="cpu"))
+    RobotOverlay({"base_mass": (9.0,)}).save(tmp_path / "robot.json")
+    assert mass_of(policies, robot=tmp_path / "robot.json") == 9.0

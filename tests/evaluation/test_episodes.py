@@ -8,7 +8,7 @@ from jumper_warp.evaluation.episodes import EpisodeFlags, EpisodeLog, EpisodePla
 from jumper_warp.policies.folder import save_policy
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.saving import task_to_json
-from jumper_warp.utils.output import read_values
+from jumper_warp.utils.output import read_metrics, read_values
 from landing_helpers import still_policy
 from metric_helpers import values
 
@@ -124,6 +124,36 @@ def test_policy_of_any_task_is_evaluated_with_metrics_and_trials(policy, tmp_pat
     assert saved["base_height_mean_m"] == pytest.approx(0.35, abs=0.02)
     assert saved["length_mean_s"] < 4.0 and saved["failure_termination_rate"] == 1.0
     assert trials["end"].tolist() == ["no_jump"] * 3 and trials["command_0"].tolist() == [0.5] * 3
+
+
+def goals_of(policy, folder, *flags):
+    """Evaluate a policy in four episodes; return its metrics, and the sampled goals x, y [m], (4, 2), or None."""
+    evaluate.run([policy, *"--num-episodes 4 --seconds 0.2 --save-trials --device cpu".split(), *flags,
+                  "--out", str(folder)], [])  # fmt: skip
+    trials = np.load(folder / "trials.npz")
+    goals = [trials[name] for name in ("start_goal_0", "start_goal_1") if name in trials]
+    return read_metrics(folder), np.stack(goals, axis=1) if goals else None
+
+
+def test_commands_are_drawn(policy, tmp_path):
+    metrics, goals = goals_of(policy, tmp_path / "a")
+    levels = make_task("horizontal-jump").levels
+    distance, start = np.linalg.norm(goals, axis=1), 0.3  # [m] of the goals from the origin; of the starts at most
+    assert len(np.unique(distance)) == 4 and metrics["length_mean_s"].trials == 4
+    assert min(level.goal_lower[0] for level in levels) - start <= distance.min()
+    assert distance.max() <= max(level.goal_upper[0] for level in levels) + start
+    np.testing.assert_array_equal(goals_of(policy, tmp_path / "b")[1], goals)
+    for flags in (("--seed", "1"), ("--stream", "selection")):
+        assert not np.isin(goals_of(policy, tmp_path / flags[0], *flags)[1], goals).any()
+
+
+def test_identical_episodes_are_one_trial(policy, tmp_path, capsys):
+    metrics, goals = goals_of(policy, tmp_path / "a", "--command", "0.5")
+    assert goals is None and metrics["length_mean_s"].trials == metrics["success_termination_rate"].trials == 1
+    printed = capsys.readouterr()
+    assert "all 4 episodes are identical" in printed.err and "1 episode, " in " ".join(printed.out.split())
+    assert goals_of(policy, tmp_path / "b", "--command", "0.5", "--randomize")[0]["length_mean_s"].trials == 4
+    assert "identical" not in capsys.readouterr().err
 
 
 def test_policy_of_any_task_is_recorded(policy, tmp_path):

@@ -16,6 +16,7 @@ from jumper_warp.policies.runs import open_policy
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.trajectory.gauss_newton import Network
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.locks import write_lock
 
 FEW = {"num_goals": 4, "num_delayed": 0, "num_randomized": 0, "height_range": (0.8, 1.05)}
 FEW |= {"iterations": 1, "device": "cpu"}
@@ -91,6 +92,14 @@ def test_finetune_command_writes_a_loadable_policy_and_refuses_to_overwrite_it(t
         main(["finetune", "vertical_jump", "--out", str(out)])
     assert end.value.code == 2
     assert capsys.readouterr().err == f"jumper: {out} exists; overwrite replaces it\n"
+
+
+def test_finetune_command_refuses_a_folder_that_another_process_makes(tmp_path, capsys):
+    out = tmp_path / "tuned"
+    with write_lock(out, tmp_path / ".tuned.lock"), pytest.raises(SystemExit) as end:
+        main(["finetune", "vertical_jump", "--out", str(out)])
+    assert end.value.code == 2
+    assert capsys.readouterr().err.startswith(f"jumper: {out}: another process is writing this folder")
 
 
 def test_landing_errors_on_mars_are_measured_at_rest():

@@ -8,7 +8,7 @@ import warp as wp
 from jumper_warp.evaluation.jump_metrics import jump_metrics, range_metrics
 from jumper_warp.evaluation.jumps import with_jump_terminations, wrapped, yaw_of
 from jumper_warp.evaluation.landings import LandingLog, with_second_takeoff
-from jumper_warp.evaluation.run import trained_range
+from jumper_warp.evaluation.trained import trained_range
 from jumper_warp.registry import make_task
 from metric_helpers import values
 

@@ -8,8 +8,11 @@ from jumper_warp.evaluation.heights import HeightLog
 from jumper_warp.evaluation.log import run_evaluation, termination_names
 from jumper_warp.evaluation.recorder import EnvRecorder, ankles
 from jumper_warp.registry import make_task
+from jumper_warp.robot.grounds import platform
+from jumper_warp.robot.model import build_model
 from jumper_warp.viz.props import BAR_OFFSET, RING_RADIUS, goal_shapes, with_blocks
 from jumper_warp.viz.recording import Recording
+from jumper_warp.viz.shapes import shape_meshes
 
 
 def recording(frames=3, worlds=2, spacing=2.0):
@@ -37,16 +40,24 @@ def test_ankle_positions_follow_shank_poses():
     assert points[0, 1] == pytest.approx([-0.3, 0.0, 1.0])
 
 
-def test_series_of_paw_forces_are_peaks_between_the_frames():
+def test_paw_forces_are_peaks_between_the_frames():
     env, log = make_env(1), HeightLog(np.array([0.9]), termination_names(make_task("vertical-jump")))
     recorder = EnvRecorder(env, log, [0])
     actions = iter(random_actions(1, 30))
-    run_evaluation(lambda obs: next(actions), env, log, seconds=0.5, on_step=recorder, stop=False)
+    sampled_last = []
+
+    def on_step():
+        recorder()
+        sampled_last.append(env.sim.paw_force.numpy()[:, 0].T.copy())  # (3, 4)
+
+    run_evaluation(lambda obs: next(actions), env, log, seconds=0.5, on_step=on_step, stop=False)
     shown = recorder.recording()
     sampled = np.linalg.norm(shown.contact_forces[:, 0], axis=2)
     peaks = np.stack([shown.series[f"peak paw force/{leg} [N]"] for leg in ("FL", "FR", "BL", "BR")], axis=1)
-    assert (peaks >= sampled - 1e-3).all()
-    assert (peaks > 2.0 * sampled + 50.0).any()  # [N] an impact is over before the frame
+    np.testing.assert_allclose(sampled, peaks, rtol=1e-5, atol=1e-3)  # [N] the arrows of the viewer
+    last = np.linalg.norm(np.array(sampled_last), axis=1)
+    assert (peaks >= last - 1e-3).all()
+    assert (peaks > 2.0 * last + 50.0).any()  # [N] an impact is over before the frame
     assert shown.labels == ("0.90 m",) and set(shown.states) == {"phase/0.90 m"}
 
 
@@ -60,6 +71,15 @@ def test_goals_are_rings_of_the_tolerance_on_the_ground_spaced_by_world():
         assert np.linalg.norm(offset[:, :2], axis=1).max() == pytest.approx(RING_RADIUS, rel=1e-5)
         assert np.linalg.norm(offset[:, :2], axis=1).min() > 0.8 * RING_RADIUS
         assert offset[:, 2].min() == pytest.approx(0.0, abs=1e-6)
+
+
+def test_goal_off_a_platform_and_on_a_block_is_on_the_surface_under_it():
+    ground = shape_meshes(build_model(2, ground=platform(-0.15, edge=0.4), device="cpu"), ())
+    shown = with_blocks(replace(recording(), shapes=tuple(ground)), np.tile([0.0, -1.0], (3, 2, 1)),
+                        np.full((2, 2), 0.4), np.array([0.05, 0.2]))  # fmt: skip
+    goals = np.array([[[0.2, 0.0, 0.0], [1.0, 0.1, 0.0]], [[0.1, -1.1, 0.0], [0.3, -1.7, 0.0]]])
+    rings = goal_shapes(replace(shown, goals=goals))
+    assert [ring.vertices[:, 2].min() for ring in rings] == pytest.approx([0.0, -0.15, 0.2, 0.0], abs=1e-6)
 
 
 def test_commanded_heights_are_bars_to_the_left_of_the_base_at_its_start():

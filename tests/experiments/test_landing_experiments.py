@@ -192,7 +192,7 @@ def test_distance_metrics_without_reliable_bin_are_none():
 
 
 def test_format_value_uses_four_digits_also_in_lists():
-    assert format_value([0.123456, None, 2]) == "0.1235, None, 2" and format_value(1.0 / 3.0) == "0.3333"
+    assert format_value([0.123456, None, 2]) == "0.1235, undefined, 2" and format_value(1.0 / 3.0) == "0.3333"
 
 
 def test_platform_scenes_have_specified_ground_block_and_headings():

@@ -68,7 +68,8 @@ def values_of(struct, kind) -> SimpleNamespace:
 def observe(skill, robot, parameters, ground, worlds, states, numbers, after_reset: int = 0) -> None:
     """Launch the observation stage of a skill; after_reset 1: only in worlds whose episode has just begun."""
     arrays = skill.observations
-    inputs = [skill.index, robot, parameters, ground, worlds, states, numbers, after_reset, arrays.raw]
+    inputs = [skill.index, robot, parameters, ground, worlds, states, numbers, after_reset, skill.term_value]
+    inputs += [arrays.raw, skill.found, skill.found_states]
     wp.launch(skill.kernels["observe"], (skill.num_chunks, skill.num_envs), inputs, device="cpu")
     inputs = [skill.index, worlds, skill.columns, numbers, after_reset, arrays]
     wp.launch(postprocess_obs_kernel, (skill.num_envs, int(LANES)), inputs, device="cpu")

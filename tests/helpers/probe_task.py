@@ -247,8 +247,9 @@ class Probe:
     def step(self) -> None:
         """Launch the end of a step."""
         skill = self.skill
-        inputs = [skill.index, self.robot, self.ground, len(self.task.levels), skill.params.values, self.episodes,
-                  skill.states, skill.episode_sum, skill.term_value, skill.counters]  # fmt: skip
+        inputs = [skill.index, self.robot, self.ground, len(self.task.levels), skill.params.values,
+                  skill.observations.raw, self.episodes, skill.states, skill.episode_sum, skill.found,
+                  skill.found_states, skill.term_value, skill.counters]  # fmt: skip
         wp.launch(skill.kernels["step"], self.n, inputs, device="cpu")
 
     def observe(self, after_reset: int = 0) -> None:

@@ -124,7 +124,7 @@ def test_latest_checkpoint_skips_damaged_ones(tmp_path):
     paths = [save_checkpoint(tmp_path, state(iteration)) for iteration in (1, 2, 3)]
     cut(paths[2])
     flip(paths[1])
-    path, loaded, skipped = latest_checkpoint(tmp_path)
+    path, loaded, skipped, _ = latest_checkpoint(tmp_path)
     assert (path, loaded["iteration"]) == (paths[0], 1)
     assert [reason.split(":")[0] for reason in skipped] == [str(paths[2]), str(paths[1])]
 

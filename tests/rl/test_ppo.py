@@ -397,6 +397,7 @@ def test_load_state_dict_resumes_bitwise():
         ({"activation": "gelu"}, "activation must be one of elu, relu, tanh, got gelu"),
         ({"clip": float("nan")}, "clip must be in 1e-06 to 100, got nan"),
         ({"reward_scale": float("inf")}, "reward_scale must be in .*, got inf"),
+        ({"reward_scale": 1e-50}, "reward_scale must be in .*, got 1e-50"),
         ({"init_std": 1e39}, "init_std must be in 0.0001 to 100, got 1e"),
         ({"entropy_coef": float("nan")}, "entropy_coef must be in .*, got nan"),
         ({"value_coef": float("inf")}, "value_coef must be in"),

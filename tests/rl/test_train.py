@@ -350,6 +350,13 @@ def test_train_with_rsl_rl_writes_model_and_config(cfg, tmp_path):
     assert (result.folder / CONFIG).exists()
 
 
+def test_time_limit_ends_a_training_with_rsl_rl_with_a_checkpoint(cfg):
+    cfg = dataclasses.replace(cfg, trainer="rsl-rl", max_seconds=1.0e-6, max_iterations=9)
+    result = train(cfg, make_env, as_rsl_rl=RslRlVecEnv)
+    assert result.iteration == 2  # the clock starts at the end of the first iteration
+    assert (result.folder / "model_1.pt").exists() and not (result.folder / "model_2.pt").exists()
+
+
 def test_rsl_rl_learns_to_push_the_mass_to_the_origin():
     torch.manual_seed(0)
     env = PushTask(128)

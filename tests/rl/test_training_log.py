@@ -90,17 +90,12 @@ def test_temporarily_full_disk_loses_no_metrics_and_warns_once(cfg, capsys, tens
         assert event_steps(result.folder) == [1]
 
 
-def test_non_finite_reward_term_is_reported_and_logged_as_null(tmp_path, capsys):
+def test_metric_that_is_not_finite_is_logged_as_null(tmp_path):
     terms = {"Episode_Reward/tilt": float("nan"), "hop/Episode_Reward/fall": float("inf")}
-    metrics = METRICS | terms | {"Loss/value": 1.0}
     with TrainingLog(tmp_path, {}, 10, tensorboard=False) as log:
         log.log(1, METRICS | {"Episode_Reward/tilt": 0.5}, remaining=5.0)
-        assert "reward term" not in capsys.readouterr().err
         for iteration in (2, 3):
-            log.log(iteration, metrics, remaining=5.0)
-            stderr = capsys.readouterr().err
-            assert "reward term tilt was not finite in some steps and counted as 0" in stderr
-            assert "reward term hop/fall was not finite" in stderr and stderr.count("reward term") == 2
+            log.log(iteration, METRICS | terms | {"Loss/value": 1.0}, remaining=5.0)
 
     def fail(constant):
         raise AssertionError(constant)  # NaN or Infinity in the file

@@ -7,7 +7,14 @@ import torch
 from experiments.measure_memory import array_bytes
 from jump_helpers import make_env
 from jumper_warp.cli import training_memory
-from jumper_warp.cli.training_memory import ENV_BYTES, check_memory, free_main_memory, learning_need, rollout_bytes
+from jumper_warp.cli.training_memory import (
+    ENV_BYTES,
+    RECORD_BYTES,
+    check_memory,
+    free_main_memory,
+    learning_need,
+    rollout_bytes,
+)
 from jumper_warp.registry import TASKS, make_task, trainer_settings
 from jumper_warp.rl.ppo import Ppo
 from toy_task import SMALL
@@ -24,17 +31,26 @@ def limit_memory(monkeypatch, main, gpu=10**15):
 
 @pytest.fixture(scope="module")
 def envs():
-    """Environments of 8 and 40 worlds, each with the bytes of the arrays that it allocated."""
-    envs_and_bytes = []
-    for count in (8, 40):
-        before = array_bytes()
-        envs_and_bytes.append((make_env(count, task=TASK, randomize=True), array_bytes() - before))
-    return envs_and_bytes
+    """Environments of 8 and 40 worlds on one thread, each with the bytes of the arrays that it allocated."""
+    return [allocated(count) for count in (8, 40)]
+
+
+def allocated(count, threads=1):
+    """Return an environment, and the bytes of the arrays that it allocated."""
+    before = array_bytes()
+    env = make_env(count, task=TASK, randomize=True, threads=threads)
+    return env, array_bytes() - before
 
 
 def test_memory_per_world_agrees_with_the_environments_arrays(envs):
     (_, bytes_of_8), (_, bytes_of_40) = envs
     assert (bytes_of_40 - bytes_of_8) / (40 - 8) == pytest.approx(ENV_BYTES["jumper"], rel=0.05)
+
+
+def test_memory_per_thread_agrees_with_the_environments_arrays(envs):
+    _, bytes_of_one = envs[1]
+    _, bytes_of_two = allocated(40, threads=2)
+    assert bytes_of_two - bytes_of_one == pytest.approx(RECORD_BYTES, rel=0.15)
 
 
 @pytest.mark.parametrize("asymmetric_critic", [True, False])

@@ -10,6 +10,7 @@ from newton.solvers import SolverBase
 from jumper_warp.robot.model import build_model
 from jumper_warp.sim.dynamics import NotThisRobotError
 from jumper_warp.sim.solver import SolverJumper
+from jumper_warp.utils.errors import InputError
 from simulation_helpers import simulation
 from solver_helpers import BODIES, COORDS, DOFS, KNEE_V, MOTOR_V
 
@@ -264,3 +265,63 @@ def test_body_accelerations_are_observable_and_joint_forces_are_not():
     assert observables.body_qdd.numpy() == pytest.approx(fall, abs=5e-3)
     with pytest.raises(ValueError, match="body_parent_f"):
         sim.solver.observables({"body_parent_f"})
+
+
+# ---------------------------------------------------------------- arrays of another model
+
+
+def parts(num_worlds):
+    """Return a simulation and the arguments of a step of its solver by name."""
+    sim = simulation(num_worlds)
+    arguments = {"state_in": sim.state, "state_out": sim.model.state(), "control": sim.control, "motors": sim.motors}
+    arguments |= {name: wp.clone(sim.target) for name in ("target", "previous")}
+    return sim, arguments | {"delay": wp.zeros(num_worlds, dtype=int, device="cpu")}
+
+
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("state_in", r"state_in\.body_f must have shape \(63,\) on cpu, for 3 worlds .*, got \(21,\) on cpu$"),
+        ("state_out", r"state_out\.joint_q must have shape \(129,\)"),
+        ("control", r"control\.joint_f must have shape \(114,\)"),
+        ("motors", r"motors\.kp must have shape \(12, 3\)"),
+        ("target", r"target must have shape \(12, 3\)"),
+        ("previous", r"previous must have shape \(12, 3\)"),
+        ("delay", r"delay must have shape \(3,\)"),
+    ],
+)
+def test_refuses_arrays_of_a_model_with_fewer_worlds(name, message):
+    sim, arguments = parts(3)
+    arguments[name] = parts(1)[1][name]
+    with pytest.raises(InputError, match=message):
+        sim.solver.step_motors(dt=DT, substeps=1, **arguments)
+    if name in ("state_in", "state_out", "control"):
+        with pytest.raises(InputError, match=message):
+            sim.solver.step(*(arguments[each] for each in ("state_in", "state_out", "control")), None, DT)
+
+
+@pytest.mark.parametrize("worlds", [(-1, 1), (0, 4), (3, 1), (2, -1)])
+def test_refuses_a_range_beyond_the_worlds(worlds):
+    sim, arguments = parts(3)
+    with pytest.raises(InputError, match="worlds must be in a range of 3 worlds, got"):
+        sim.solver.step_motors(dt=DT, substeps=1, worlds=worlds, **arguments)
+
+
+def test_refuses_coordinates_or_accelerations_of_another_model():
+    sim, other = simulation(3), simulation(1)
+    state = sim.model.state()
+    state.joint_qd = other.state.joint_qd
+    with pytest.raises(InputError, match=r"state_in\.joint_qd must have shape \(114,\)"):
+        sim.solver.step(state, sim.state, None, None, DT)
+    sim.state.body_qdd = wp.zeros(21, dtype=wp.spatial_vectorf, device="cpu")
+    with pytest.raises(InputError, match=r"body_qdd must have shape \(63,\)"):
+        sim.solver.step(sim.model.state(), sim.state, None, None, DT)
+
+
+def test_reset_and_contacts_refuse_a_state_of_another_model():
+    sim, state = simulation(3), simulation(1).state
+    with pytest.raises(InputError, match=r"state\.joint_q must have shape \(129,\)"):
+        sim.solver.reset(state)
+    contacts = newton.Contacts(rigid_contact_max=12, soft_contact_max=0, device="cpu")
+    with pytest.raises(InputError, match=r"state\.body_q must have shape \(63,\)"):
+        sim.solver.update_contacts(contacts, state)

@@ -223,7 +223,7 @@ def test_flags_of_a_film_are_checked_before_the_simulation(options):
 def test_missing_imageio_ffmpeg_is_one_line_with_its_installation(tmp_path, canvas, monkeypatch):
     found = util.find_spec
     monkeypatch.setattr(film, "find_spec", lambda name: None if name == "imageio_ffmpeg" else found(name))
-    with pytest.raises(InputError, match=r"imageio-ffmpeg: pip install jumper-warp\[video\]$"):
+    with pytest.raises(InputError, match=r'imageio-ffmpeg: pip install "jumper-warp\[video\]"$'):
         write_film(box_recording(walk(1.0)), tmp_path / "walk.mp4", size=SIZE)
     write_film(box_recording(walk(1.0)), tmp_path / "walk.webp", size=SIZE)  # needs no ffmpeg
 

@@ -64,6 +64,15 @@ def test_horizontal_jump_keeps_its_places_and_runs_to_the_right(heading):
     assert distance[~np.eye(len(distance), dtype=bool)].min() >= GAP - 1e-6  # [m]
 
 
+@pytest.mark.parametrize(("distance", "heading", "shown"), [(0.3, 1.5, 1.5), (0.1, 1.5, 0.0), (0.3, 3.0, 3.0)])
+def test_short_jump_is_spread_in_its_direction_and_a_drift_is_not(distance, heading, shown):
+    positions, forces = jump(distance)
+    turned = np.array([[np.cos(heading), np.sin(heading), 0.0], [-np.sin(heading), np.cos(heading), 0.0], [0, 0, 1.0]])
+    scene = compose(box_recording(positions @ turned, forces=forces))
+    assert scene.right == pytest.approx([np.cos(shown), np.sin(shown), 0.0], abs=1e-6)
+    assert np.diff(scene.bases @ scene.right).min() >= SPREAD - 1e-6  # [m]
+
+
 def test_each_of_two_jumps_in_a_row_has_its_apex():
     positions, forces = jump(1.0)
     later = positions + [1.0, 0.0, 0.0]

@@ -208,7 +208,7 @@ def test_ray_tracing_replaces_missing_opengl_and_names_the_packages_to_install(c
     with open_renderer([BALL], 1, SIZE) as renderer:
         assert isinstance(renderer, RayTracer)
     (line,) = capsys.readouterr().err.splitlines()
-    assert "NoSuchDisplayException" in line and "pip install jumper-warp[video]" in line and "apt-get install" in line
+    assert "NoSuchDisplayException" in line and 'pip install "jumper-warp[video]"' in line and "apt-get install" in line
 
 
 def test_ray_tracing_replaces_missing_pyglet(capsys, monkeypatch):
@@ -216,7 +216,7 @@ def test_ray_tracing_replaces_missing_pyglet(capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyglet", None)
     assert isinstance(open_renderer([BALL], 1, SIZE), RayTracer)
     (line,) = capsys.readouterr().err.splitlines()
-    assert "pyglet" in line and "pip install jumper-warp[video]" in line
+    assert "pyglet" in line and 'pip install "jumper-warp[video]"' in line
 
 
 def test_any_failure_of_the_viewer_counts_as_missing_opengl(monkeypatch):

@@ -133,6 +133,15 @@ def test_label_stands_above_its_point_and_is_skipped_behind_the_eye():
     assert (grey == 160).all()
 
 
+@pytest.mark.parametrize("side", [-1.0, 1.0])
+def test_label_at_the_edge_is_whole_and_a_label_outside_is_not_moved_inside(side):
+    grey, view = np.full((120, 200, 3), 160, np.uint8), View(np.array([-3.0, 0.0, 0.0]), np.zeros(3))
+    middle, edge, outside = (ink(annotate(grey, view, [Label("HH", np.array([0.0, y, 0.0]))], size=0.1))[1]
+                             for y in (0.0, side * 1.32, side * 3.0))  # fmt: skip
+    assert np.ptp(edge) == np.ptp(middle) and edge.min() > 0 and edge.max() < 199
+    assert not outside.size
+
+
 def test_heading_is_in_the_upper_left_corner():
     view = View(np.array([-3.0, 0.0, 0.0]), np.zeros(3))
     rows, columns = ink(annotate(np.full((120, 200, 3), 160, np.uint8), view, [], "HH", 0.1))

@@ -21,8 +21,12 @@ observation_latency push""".split()
 FUNCS = [getattr(parameters, name) for name in NAMES]
 COUNTS = [len(func.input_types) - 2 for func in FUNCS]
 MOTORS = ("kp", "kd", "saturation", "no_load_speed", "cutoff_speed", "offset")
-CHANGEABLE = [name for name in RobotParameters.vars if not name.startswith("nominal_") and name not in
-         ("motors", "physics_dt", "skill", "paw_shapes")]  # fmt: skip
+FIXED = ("motors", "physics_dt", "skill", "paw_shapes", "zero_latency")
+CHANGEABLE = [
+    name
+    for name in RobotParameters.vars
+    if not name.startswith("nominal_") and not name.endswith("_move") and name not in FIXED
+]
 
 
 @wp.kernel(enable_backward=False)

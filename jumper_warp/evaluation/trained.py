@@ -1,0 +1,74 @@
+"""Ranges of the commands that a task samples in training, and a warning about commands beyond them."""
+
+from __future__ import annotations
+
+import sys
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from jumper_warp.tasks.cfg import TaskCfg
+
+TOLERANCE = 1.0e-6  # [m], [m/s], [rad/s] Distance from a range that counts as rounding
+
+
+class Bounds(NamedTuple):
+    """Range of one component of a command in training."""
+
+    index: int  # Column in a command: x, y, z, or velocity ahead, to the left, about z
+    name: str
+    unit: str
+    low: float
+    high: float
+
+
+def trained_bounds(task: TaskCfg) -> tuple[Bounds, ...]:
+    """Return the ranges of all components that a task samples at any level; empty unless it jumps or walks."""
+    levels: Any = task.levels or (None,)
+    if hasattr(levels[0], "goal_lower"):
+        lower = np.min([level.goal_lower for level in levels], axis=0).tolist()
+        upper = np.max([level.goal_upper for level in levels], axis=0).tolist()
+        names = ((2, "height"),) if upper[2] > 0.0 else ((0, "distance ahead"), (1, "distance to the left"))
+        return tuple(Bounds(i, name, "m", lower[i], upper[i]) for i, name in names)
+    if not hasattr(levels[0], "last_range"):
+        return ()
+    ahead, back, side, yaw = levels[-1].last_range
+    return (
+        Bounds(0, "velocity ahead", "m/s", -back, ahead),
+        Bounds(1, "velocity to the left", "m/s", -side, side),
+        Bounds(2, "yaw rate", "rad/s", -yaw, yaw),
+    )
+
+
+def trained_range(task: TaskCfg) -> dict[str, list[float]]:
+    """Return the range of commands that a task samples at any level, by name; empty unless it jumps or walks.
+
+    `trained_range_m`: smallest and largest apex height or distance straight ahead; `trained_velocities`: largest
+    velocities ahead, back, to either side [m/s] and about z [rad/s].
+    """
+    bounds = trained_bounds(task)
+    if not bounds:
+        return {}
+    if bounds[0].unit == "m":
+        return {"trained_range_m": [max(bounds[0].low, 0.0), bounds[0].high]}
+    return {"trained_velocities": list(task.levels[-1].last_range)}
+
+
+def beyond_training(task: TaskCfg, commands: np.ndarray) -> list[str]:
+    """Return a text for each component of commands that is beyond its range in training, with its farthest value.
+
+    commands: (..., 3), x, y, z [m] or velocities [m/s], [m/s], [rad/s].
+    """
+    words, rows = [], np.reshape(commands, (-1, commands.shape[-1]))
+    for index, name, unit, low, high in trained_bounds(task):
+        values = rows[:, index]
+        excess = np.maximum(low - values, values - high)
+        if excess.max(initial=0.0) > TOLERANCE:
+            words.append(f"{name} {values[excess.argmax()]:g} {unit} (trained {low:g} to {high:g})")
+    return words
+
+
+def warn_beyond_training(task: TaskCfg, commands: np.ndarray | None) -> None:
+    """Print one line on standard error if commands are beyond the training; arguments: as in `beyond_training`."""
+    if commands is not None and (words := beyond_training(task, commands)):
+        print(f"jumper: beyond the training of {task.name}: {', '.join(words)}", file=sys.stderr)

@@ -1,0 +1,84 @@
+"""Folder of a run: its creation and configuration, dumps of non-finite values, and its rescue if it is deleted."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from collections.abc import Callable, Iterable
+from datetime import datetime
+from pathlib import Path
+from typing import Any
+
+from jumper_warp.envs.vec_env import VecEnv
+from jumper_warp.rl.cfg import TrainCfg
+from jumper_warp.rl.distributed import Rank, all_reduce_max
+from jumper_warp.utils.dumps import DUMPS, NonFiniteValue, write_dump
+from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.runtime import git_commit, versions
+from jumper_warp.utils.sources import source_checksums
+
+CONFIG = "config.json"  # File in a run's folder with all settings, versions and the commit
+
+
+def new_folder(cfg: TrainCfg, rank: Rank) -> Path:
+    """Return the folder of a new run, log_root/task/time of rank 0, the same on all ranks; rank 0 creates it."""
+    (microseconds,) = all_reduce_max([time.time_ns() // 1000 if rank.index == 0 else 0])
+    started = datetime.fromtimestamp(microseconds // 1_000_000).replace(microsecond=microseconds % 1_000_000)
+    folder = cfg.log_root / cfg.task / started.strftime("%Y-%m-%d_%H-%M-%S_%f")
+    if rank.index == 0:
+        folder.mkdir(parents=True)
+    return folder
+
+
+def full_config(cfg: TrainCfg, env: VecEnv, rank: Rank) -> dict[str, Any]:
+    """Return the configuration of a run as JSON data: settings, environment, versions, commit, user files."""
+    settings = json.loads(json.dumps(dataclasses.asdict(cfg), default=str))
+    commit, env_config = git_commit(), env.config()
+    return {
+        "train": settings,
+        "env": env_config,
+        "processes": rank.size,
+        "device": str(rank.device),
+        "versions": versions(),
+        "commit": commit and commit._asdict(),
+        "sources": source_checksums(env_config),
+    }
+
+
+def write_config(folder: Path, config: dict[str, Any]) -> None:
+    """Write the configuration of a run to its folder, which exists. Raises OSError."""
+    write_atomically(folder / CONFIG, json.dumps(config, indent=1).encode())
+
+
+def report_non_finite(
+    env: VecEnv, folder: Path, config: dict[str, Any], iteration: int, print_line: Callable[[str], None], rank: int = 0
+) -> list[NonFiniteValue]:
+    """Print a line about each term that is not finite for the first time, save its dump, and return the values.
+
+    config: of the run; rank: index of this process. A dump that cannot be written is reported in the line.
+    """
+    found: list[NonFiniteValue] = getattr(env, "non_finite", list)()  # optional for a `VecEnv`
+    for value in found:
+        prefix = f"rank_{rank}_" if rank else ""
+        path = folder / DUMPS / f"{prefix}{value.term.replace('/', '_')}.npz"
+        try:
+            write_dump(path, value, iteration=iteration, task=config["train"]["task"], config=config)
+            print_line(f"{value}; jumper play --dump {path}")
+        except OSError as error:
+            print_line(f"{value}; {path}: {error.strerror}")
+    return found
+
+
+def rescue_folder(folder: Path, config: dict[str, Any], names: Iterable[str]) -> tuple[Path, str]:
+    """Return a folder for the rest of a run, and a message, if one of its files `names` was deleted, else `folder`.
+
+    The new folder is made beside the old one, with the configuration. Raises OSError: it cannot be written.
+    """
+    lost = [name for name in names if not (folder / name).is_file()]
+    if not lost:
+        return folder, ""
+    rescued = folder.with_name(f"{folder.name}_rescued")
+    rescued.mkdir(parents=True, exist_ok=True)
+    write_config(rescued, config)
+    return rescued, f"{folder}: {' and '.join(lost)} deleted during the training; continue with {rescued}"

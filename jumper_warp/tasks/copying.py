@@ -1,0 +1,95 @@
+"""Copies and pickles of tasks and their parts, whose Warp functions and structs are pickled by name."""
+
+from __future__ import annotations
+
+import copy
+import dataclasses
+import importlib
+import os
+import pickle
+import sys
+from collections.abc import Callable
+from types import ModuleType
+from typing import Any, NamedTuple
+
+import warp as wp
+
+from jumper_warp.kernels.mdp.env import NoSettings
+from jumper_warp.utils.sources import module_from_file
+
+Struct = type(NoSettings)
+
+
+class Copyable:
+    """Base class of objects that are copied and pickled by the arguments of their constructor.
+
+    All other attributes are made again. Copies share Warp functions and structs; pickles have their names.
+    """
+
+    def arguments(self) -> dict[str, Any]:
+        """Return the arguments of the constructor that make an equal object; by default the dataclass's fields."""
+        fields = dataclasses.fields(self)  # pyright: ignore[reportArgumentType]
+        return {spec.name: getattr(self, spec.name) for spec in fields}
+
+    def __copy__(self) -> Any:
+        return type(self)(**self.arguments())
+
+    def __deepcopy__(self, memo: dict[int, Any]) -> Any:
+        arguments = self.arguments().items()
+        return type(self)(**{name: value if _is_named(value) else copy.deepcopy(value, memo)
+                             for name, value in arguments})  # fmt: skip
+
+    def __reduce__(self) -> tuple[Callable[..., Any], tuple[Any, ...]]:
+        """Return the call that makes an equal object. Raises pickle.PicklingError: see `Reference.to`."""
+        arguments = self.arguments().items()
+        return _make, (type(self), {k: Reference.to(value) if _is_named(value) else value for k, value in arguments})
+
+
+class Reference(NamedTuple):
+    """Name of a Warp function or struct in a pickle."""
+
+    module: str
+    name: str
+    path: str | None  # file of the module, for one that cannot be imported
+
+    @classmethod
+    def to(cls, definition: Any) -> Reference:
+        """Return the reference to a function or struct. Raises pickle.PicklingError: it is not at the top level."""
+        module, module_name, name = top_level(definition)
+        if module is None:
+            raise pickle.PicklingError(
+                f"{module_name}:{name} cannot be pickled: define it under this name at the top level of a module"
+            )
+        return cls(module_name, name, getattr(module, "__file__", None))
+
+    def definition(self) -> Any:
+        """Return the function or struct, after importing its module. Raises ImportError or AttributeError: none."""
+        try:
+            module = sys.modules.get(self.module) or importlib.import_module(self.module)
+        except ModuleNotFoundError:
+            if self.path is None or not os.path.isfile(self.path):
+                raise
+            module = module_from_file(self.module, self.path)
+        return getattr(module, self.name)
+
+
+def top_level(definition: Any) -> tuple[ModuleType | None, str, str]:
+    """Return module, module's name and qualified name of a Warp function, a struct or a class.
+
+    The module is None unless the definition is found under its name at the top level of its module.
+    """
+    python: Any = definition.func if isinstance(definition, wp.Function) else getattr(definition, "cls", definition)
+    module = sys.modules.get(python.__module__)
+    found = module is not None and vars(module).get(python.__qualname__) is definition
+    return module if found else None, python.__module__, python.__qualname__
+
+
+def _is_named(value: Any) -> bool:
+    """Return whether a value is a Warp function or struct."""
+    return isinstance(value, wp.Function | Struct)
+
+
+def _make(kind: type, arguments: dict[str, Any]) -> Any:
+    """Return an object of class `kind`; arguments: of its constructor, with references to functions and structs."""
+    values = arguments.items()
+    return kind(**{name: value.definition() if isinstance(value, Reference) else value for name, value in values})

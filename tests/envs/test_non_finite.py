@@ -1,0 +1,117 @@
+"""Terms that are not finite: the environment records the first value of each, with the state of its world."""
+
+import dataclasses
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+import warp as wp
+
+from jump_helpers import edit_coordinates, edit_episodes, make_env, only
+from jumper_warp.evaluation.dumps import DumpCfg, play_dump
+from jumper_warp.kernels.mdp.view import RobotView
+from jumper_warp.registry import make_task
+from jumper_warp.tasks.terms import ObservationTerm, RewardTerm
+from jumper_warp.utils.dumps import load_dump, write_dump
+from jumper_warp.utils.errors import InputError
+
+N = 48
+LIMIT = 1.0  # [m] The faulty terms are not finite above this height of the base
+REST = torch.zeros((N, 12))
+
+
+@wp.func
+def below(robot: RobotView, state: Any) -> float:
+    """Return the square root of the distance below LIMIT, NaN above it."""
+    return wp.sqrt(LIMIT - robot.pos[2])
+
+
+@wp.func
+def below_twice(robot: RobotView, state: Any) -> wp.vec2:
+    """Return 1 and the square root of the distance below LIMIT, NaN above it."""
+    return wp.vec2(1.0, wp.sqrt(LIMIT - robot.pos[2]))
+
+
+def faulty_task():
+    """Return a jump with a reward and an observation that are not finite above LIMIT."""
+    task = make_task("vertical-jump")
+    actor = (*task.observations.actor, ObservationTerm(below_twice, history=2))
+    observations = dataclasses.replace(task.observations, actor=actor)
+    return dataclasses.replace(task, rewards=(*task.rewards, RewardTerm(below, 2.0)), observations=observations)
+
+
+@pytest.fixture(scope="module", params=[1, 2], ids=["one slice", "two slices"])
+def env(request):
+    """Return N nominal worlds, on one thread and on two, with faulty terms."""
+    return make_env(N, task=faulty_task(), reset=only("default"), threads=request.param)
+
+
+def lift(env, *worlds):
+    """Lift the base of some worlds above LIMIT."""
+    edit_episodes(env, command_step=1000)
+    for world in worlds:
+        edit_coordinates(env, world, q={2: 1.5 + 0.01 * world})
+
+
+def test_first_value_of_each_term_is_reported_once_with_the_state_of_its_world(env):
+    for _ in range(3):
+        env.step(REST)
+    assert env.non_finite() == []
+    lift(env, 5, 40)
+    action = torch.linspace(-1.0, 1.0, 12 * N).reshape(N, 12)
+    env.step(action)
+    found = {value.term: value for value in env.non_finite()}
+    assert found.keys() == {"rewards.below", "observations.actor.below_twice"}
+    for value in found.values():
+        assert math.isnan(value.value) and (value.world, value.step) == (5, 4)
+        arrays, height = value.arrays, env.sim.joint_q()[5, 2]
+        assert arrays["joint_q"][2] == pytest.approx(height) and height > LIMIT
+        np.testing.assert_array_equal(arrays["action"], action[5].numpy())
+        assert arrays["joint_qd"].shape == (38,) and "state.command_step" in arrays
+        rewards = dict(zip(value.names["rewards"], arrays["rewards"], strict=True))
+        assert math.isnan(rewards["below"]) and math.isfinite(rewards[next(iter(rewards))])
+    observed = found["observations.actor.below_twice"]
+    components = dict(zip(observed.names["observations"], observed.arrays["observations"], strict=True))
+    assert [name for name, value in components.items() if math.isnan(value)] == ["actor.below_twice_y"]
+    env.step(REST)
+    assert env.non_finite() == []  # each term once
+    assert torch.isfinite(env.obs).all() and torch.isfinite(env.reward).all()
+
+
+def test_state_and_action_that_are_not_finite_are_reported_but_fast_motion_is_not():
+    env = make_env(N, task=make_task("vertical-jump"), reset=only("default"))
+    edit_episodes(env, command_step=1000)
+    edit_coordinates(env, 3, qd={2: 50.0})  # too fast, which ends the episode as `diverged`
+    env.step(REST)
+    assert env.done[3] == 1.0 and env.non_finite() == []
+    action = REST.clone()
+    action[4, 7] = math.inf
+    env.step(action)
+    (found,) = env.non_finite()
+    assert (found.term, found.world) == ("terminations.diverged", 4)
+
+
+def test_dump_is_read_and_played(tmp_path, capsys):
+    env = make_env(N, task=faulty_task(), reset=only("default"))
+    lift(env, 7)
+    env.step(REST)
+    path, found = tmp_path / "non_finite" / "below.npz", env.non_finite()[0]
+    write_dump(path, found, iteration=3, task="jump", config={"train": {"seed": 11}})
+    read, header = load_dump(path)
+    assert str(read) == str(found) and header["iteration"] == 3
+    for name, values in found.arrays.items():
+        np.testing.assert_array_equal(read.arrays[name], values)
+    recording = play_dump(DumpCfg(path, out=tmp_path / "film"))
+    assert recording.is_file() and recording.with_suffix(".png").is_file()
+    printed = capsys.readouterr().out
+    assert f"jump, iteration 3, seed 11: {found}" in printed and "rewards that are not finite: below" in printed
+
+
+def test_refuses_a_file_that_is_no_dump(tmp_path):
+    path = tmp_path / "other.npz"
+    for write in (lambda: None, lambda: path.write_bytes(b"PK"), lambda: np.savez(path, header=np.array("{}"))):
+        write()
+        with pytest.raises(InputError, match=r"other\.npz: cannot be read as a dump"):
+            load_dump(path)

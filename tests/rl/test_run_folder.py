@@ -1,0 +1,106 @@
+"""A training reports terms that are not finite, and saves what is left of a run whose folder is deleted."""
+
+import dataclasses
+import json
+import shutil
+
+import numpy as np
+import pytest
+
+from jumper_warp.envs.rsl_rl import RslRlVecEnv
+from jumper_warp.rl.checkpoint import latest_checkpoint
+from jumper_warp.rl.metrics_file import METRICS_FILE
+from jumper_warp.rl.runner import CHECKPOINTS, CONFIG, train
+from jumper_warp.utils.dumps import NonFiniteValue, load_dump
+from toy_task import SMALL, PushTask, push_cfg
+
+ARRAYS = {"joint_q": np.zeros(43), "joint_qd": np.zeros(38), "action": np.zeros(12), "rewards": np.array([np.nan])}
+ARRAYS |= {"observations": np.zeros(0)}
+FOUND = NonFiniteValue("rewards.tilt", float("nan"), 3, 21, ARRAYS, {"rewards": ["tilt"], "observations": []})
+LINE = "rewards.tilt is not finite (nan) in world 3 at step 21"
+TRAINERS = pytest.mark.parametrize("trainer", ["ppo", "rsl-rl"])
+
+
+class FaultyTask(PushTask):
+    """Task with a term that is not finite in the second iteration."""
+
+    def non_finite(self):
+        return [FOUND] if self.steps == 2 * SMALL.num_steps else []
+
+
+class DeletedTask(PushTask):
+    """Task during whose third iteration the folder of the run is deleted."""
+
+    def step(self, action):
+        super().step(action)
+        if self.steps == 2 * SMALL.num_steps + 1:
+            shutil.rmtree(self.folder())
+
+    @classmethod
+    def folder(cls):
+        (folder,) = cls.root.glob("push/*")
+        return folder
+
+
+@pytest.fixture
+def cfg(tmp_path):
+    """Settings of 4 iterations, of which every second one is logged and saved."""
+    return push_cfg(tmp_path / "logs")
+
+
+def end_of(cfg, task):
+    """Train, and return the code of the SystemExit that ends the training."""
+    with pytest.raises(SystemExit) as end:
+        train(cfg, task, as_rsl_rl=RslRlVecEnv)
+    return end.value.code
+
+
+@TRAINERS
+def test_term_that_is_not_finite_is_named_once_and_dumped(cfg, trainer, capsys):
+    result = train(dataclasses.replace(cfg, trainer=trainer), FaultyTask, as_rsl_rl=RslRlVecEnv)
+    path = result.folder / "non_finite" / "rewards.tilt.npz"
+    lines = [line for line in capsys.readouterr().err.splitlines() if "not finite" in line]
+    assert lines == [f"{LINE}; jumper play --dump {path}"]
+    found, header = load_dump(path)
+    assert str(found) == LINE and result.iteration == 4
+    assert (header["iteration"], header["task"], header["config"]["train"]["seed"]) == (2, "push", 1)
+
+
+@TRAINERS
+@pytest.mark.parametrize("log_interval", [1, 10])
+def test_stop_on_nan_ends_with_a_checkpoint_of_that_iteration(cfg, trainer, log_interval):
+    cfg = dataclasses.replace(cfg, trainer=trainer, stop_on_nan=True, log_interval=log_interval, save_interval=100)
+    assert end_of(cfg, FaultyTask) == f"jumper: --stop-on-nan: {LINE}"
+    (folder,) = cfg.log_root.glob("push/*")
+    assert (folder / "non_finite" / "rewards.tilt.npz").is_file()
+    last = "model_1.pt" if trainer == "rsl-rl" else f"{CHECKPOINTS}/iteration_000002.pt"
+    assert (folder / last).is_file()
+
+
+def test_dump_that_cannot_be_written_is_reported(cfg, capsys, monkeypatch):
+    def refuse(path, *_, **__):
+        raise OSError(28, "No space left on device", str(path))
+
+    monkeypatch.setattr("jumper_warp.rl.run_folder.write_dump", refuse)
+    result = train(cfg, FaultyTask)
+    path = result.folder / "non_finite" / "rewards.tilt.npz"
+    assert f"{LINE}; {path}: No space left on device" in capsys.readouterr().err.splitlines()
+
+
+@pytest.mark.filterwarnings("ignore::pytest.PytestUnhandledThreadExceptionWarning")  # in SummaryWriter's thread
+@TRAINERS
+def test_training_whose_folder_is_deleted_ends_and_saves_the_rest_beside_it(cfg, trainer, capsys):
+    DeletedTask.root = cfg.log_root
+    code = end_of(dataclasses.replace(cfg, trainer=trainer), DeletedTask)
+    (rescued,) = cfg.log_root.glob("push/*")
+    deleted = rescued.with_name(rescued.name.removesuffix("_rescued"))
+    names = CONFIG if trainer == "rsl-rl" else f"{CONFIG} and {METRICS_FILE}"
+    assert code == f"jumper: {deleted}: {names} deleted during the training; continue with {rescued}"
+    assert json.loads((rescued / CONFIG).read_text())["train"]["task"] == "push"
+    if trainer == "rsl-rl":
+        assert (rescued / "model_2.pt").is_file()
+        return
+    lines = [json.loads(line)["iteration"] for line in (rescued / METRICS_FILE).read_text().splitlines()]
+    assert lines == [2, 4] and latest_checkpoint(rescued / CHECKPOINTS).state["iteration"] == 4
+    resumed = train(dataclasses.replace(cfg, resume="latest", max_iterations=6), PushTask)
+    assert (resumed.folder, resumed.iteration) == (rescued, 6)

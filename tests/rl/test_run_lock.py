@@ -1,0 +1,101 @@
+"""One process at a time writes a run's folder; reading needs no lock."""
+
+import dataclasses
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from jumper_warp.envs.rsl_rl import RslRlVecEnv
+from jumper_warp.rl import resume
+from jumper_warp.rl.checkpoint import CheckpointError, latest_checkpoint
+from jumper_warp.rl.runner import CHECKPOINTS, train
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.locks import LOCK, write_lock
+from toy_task import PushTask, push_cfg
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from jumper_warp.utils.locks import write_lock
+with write_lock(Path(sys.argv[1])):
+    print("held", flush=True)
+    time.sleep(600)
+"""
+
+
+@pytest.fixture
+def cfg(tmp_path):
+    """Settings that resume a run of two iterations, to the fourth."""
+    cfg = push_cfg(tmp_path / "logs")
+    folder = train(dataclasses.replace(cfg, max_iterations=2), PushTask).folder
+    return dataclasses.replace(cfg, resume=str(folder))
+
+
+@pytest.fixture
+def holder(cfg):
+    """A process that holds the lock of the run."""
+    command = [sys.executable, "-c", HOLDER, cfg.resume]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as process:
+        assert process.stdout.readline() == "held\n"
+        yield process
+        process.kill()
+
+
+def test_second_writer_is_refused_and_changes_nothing(cfg, holder):
+    folder = Path(cfg.resume)
+    before = {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()}
+    with pytest.raises(InputError, match=f"^{re.escape(cfg.resume)}: another process is writing this folder"):
+        train(cfg, PushTask)
+    assert {path: path.read_bytes() for path in folder.rglob("*") if path.is_file()} == before
+    assert latest_checkpoint(folder / CHECKPOINTS).state["iteration"] == 2  # readers need no lock
+
+
+def test_lock_file_of_a_killed_process_does_not_block(cfg, holder):
+    holder.send_signal(signal.SIGKILL)
+    holder.wait()
+    assert (Path(cfg.resume) / LOCK).is_file()
+    assert train(cfg, PushTask).iteration == 4
+
+
+def test_copy_of_a_run_can_be_resumed_while_the_run_is_written(cfg, holder):
+    copy = shutil.copytree(cfg.resume, Path(cfg.resume).with_name("copy"))
+    assert train(dataclasses.replace(cfg, resume=str(copy)), PushTask).folder == copy
+
+
+class LockedDuringTraining(PushTask):
+    """Task that checks in each step that no other writer gets the lock of the only run."""
+
+    root: Path
+
+    def step(self, action):
+        super().step(action)
+        (folder,) = self.root.glob("push/*")
+        with pytest.raises(InputError, match="another process"), write_lock(folder):
+            pass
+
+
+@pytest.mark.parametrize("trainer", ["ppo", "rsl-rl"])
+def test_new_run_is_locked_until_its_end(tmp_path, trainer):
+    LockedDuringTraining.root = tmp_path
+    cfg = push_cfg(tmp_path, max_iterations=1, trainer=trainer)
+    folder = train(cfg, LockedDuringTraining, as_rsl_rl=RslRlVecEnv).folder
+    with write_lock(folder):
+        pass
+
+
+def test_checkpoint_saved_by_another_process_meanwhile_is_not_overwritten(cfg):
+    checkpoint = resume.find_checkpoint(cfg)
+    train(cfg, PushTask)
+    with pytest.raises(CheckpointError, match="another process has saved a checkpoint; resume again"):
+        train(cfg, PushTask, checkpoint=checkpoint)
+
+
+def test_lock_file_beside_a_folder_is_removed(tmp_path):
+    with write_lock(tmp_path / "tuned", tmp_path / ".tuned.lock"):
+        assert (tmp_path / ".tuned.lock").is_file()
+    assert not any(tmp_path.iterdir())
