@@ -231,7 +231,7 @@ def test_each_rank_resumes_its_own_worlds(cfg):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"max_iterations": 0}, "max_iterations must be at least 1, got 0"),
+        ({"max_iterations": 0}, "max_iterations must be a whole number of 1 to 1000000000, got 0"),
         ({"max_seconds": -1.0}, "max_seconds must be finite and not negative, got -1.0"),
         ({"max_seconds": math.nan}, "max_seconds must be finite and not negative, got nan"),
         ({"max_seconds": math.inf}, "max_seconds must be finite and not negative, got inf"),
