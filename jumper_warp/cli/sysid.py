@@ -157,7 +157,7 @@ def sysid(cfg: SysidCfg) -> None:
         print_result(result)
         print(folder / "report.html")
     if not result.consistent:
-        print(f"not consistent: {result.inconsistency}; robot: {folder / 'inconsistent.json'}", file=sys.stderr)
+        print(f"jumper: not consistent: {result.inconsistency}; robot: {folder / 'inconsistent.json'}", file=sys.stderr)
         raise SystemExit(INCONSISTENT)
 
 

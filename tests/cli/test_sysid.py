@@ -108,7 +108,7 @@ def test_inconsistent_fit_exits_with_3_and_renames_the_overlay(recorded, capsys)
         main(["sysid", str(scaled), *PARAMS, "--out", str(out)])
     assert end.value.code == 3
     line = capsys.readouterr().err.strip()
-    assert line.startswith("not consistent: scaled angle χ² ") and line.endswith("inconsistent.json")
+    assert line.startswith("jumper: not consistent: scaled angle χ² ") and line.endswith("inconsistent.json")
     assert not (out / "identified.json").exists()
     assert "the fit is not consistent: scaled angle" in load_overlay(out / "inconsistent.json").source
     report = json.loads((out / "report.json").read_text())
