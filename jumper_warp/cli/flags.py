@@ -7,6 +7,7 @@ import dataclasses
 import functools
 import inspect
 import itertools
+import math
 import re
 import textwrap
 from collections.abc import Sequence
@@ -139,7 +140,9 @@ def check_numbers(settings: Any) -> None:
         name = flag.name.split(".")[-1]
         limit = FLAG_LIMITS.get(name, MOST_TRIALS if name.startswith("num-") else LARGEST)
         for number in flag.default if isinstance(flag.default, tuple) else (flag.default,):
-            if isinstance(number, int | float) and not abs(number) <= limit:
+            if isinstance(number, float) and not math.isfinite(number):
+                raise InputError(f"--{flag.name} must be a finite number, got {number}")
+            if isinstance(number, int | float) and abs(number) > limit:
                 raise InputError(f"--{flag.name} must be at most {limit:.10g} in size, got {number!s:.40}")
 
 

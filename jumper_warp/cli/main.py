@@ -49,9 +49,7 @@ TASK_MODULE = "--task-module"
 TASK_MODULE_HELP = f"""\
 Every command takes {TASK_MODULE} FILE_OR_MODULE, any number of times: a
 FILE.py or an installed module that registers tasks of your own."""
-EXIT_CODES = (
-    "Exit codes: 0 done, 1 fault or no memory, 2 invalid input, 3 an inconsistent fit (sysid), 130 after Ctrl-C."
-)
+EXIT_CODES = "Exit codes: 0 done, 1 fault, 2 invalid input, 3 inconsistent fit, 130 Ctrl-C."
 
 
 class UsageError(InputError):

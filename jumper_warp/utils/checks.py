@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Mapping
-from typing import Any
-
-import numpy as np
+from numbers import Integral
+from typing import TYPE_CHECKING, Any
 
 from jumper_warp.utils.errors import InputError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}")
 """Valid names of tasks, terms, observation columns and joints, for comma-separated lists and file names."""
@@ -68,7 +70,7 @@ def check_probabilities(section: str, cfg: Any, *names: str) -> None:
 
 def check_count(name: str, value: Any, most: int = MOST_WORLDS) -> None:
     """Raise InputError unless the value is an integer from 1 to `most`, and not a bool."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 1 <= value <= most:
+    if isinstance(value, bool) or not isinstance(value, Integral) or not 1 <= value <= most:
         raise InputError(f"{name} must be a whole number of 1 to {most}, got {value!r:.40}")
 
 
@@ -88,7 +90,7 @@ def check_bounds(section: str, cfg: Any, bounds: Mapping[str, tuple[float, float
 
 def check_seed(value: Any) -> None:
     """Raise InputError unless the value is an integer from 0 to MOST_SEED, and not a bool."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value <= MOST_SEED:
+    if isinstance(value, bool) or not isinstance(value, Integral) or not 0 <= value <= MOST_SEED:
         raise InputError(f"seed must be in 0 .. {MOST_SEED}, got {value!r:.40}")
 
 

@@ -122,11 +122,8 @@ def test_each_command_prints_help(capsys, command):
         (["train", "vertical-jump", "--init-policy", "vertical_jmup"], "did you mean 'vertical_jump'?"),
         (["train", "--max-iterations", "3"], "the task comes first"),
         ([*TRAIN, "--task", "other"], "give the task once"),
-        (
-            [*TRAIN, "--env.rewards.jump-height.weight", "nan"],
-            "jump_height: parameter 'weight' must be a finite number",
-        ),
-        ([*TRAIN, "--env.terminations.tilted.angle", "inf"], "tilted: parameter 'angle' must be a finite number"),
+        ([*TRAIN, "--env.rewards.jump-height.weight", "nan"], "jump-height.weight must be a finite number"),
+        ([*TRAIN, "--env.terminations.tilted.angle", "inf"], "--env.terminations.tilted.angle must be a finite number"),
         (["list", "--task-module"], "--task-module needs a FILE.py or the name of a module"),
         (["list", "--task-module="], "--task-module needs a FILE.py or the name of a module"),
         (["train", "--task-module", "--max-iterations", "3"], "--task-module needs a FILE.py"),

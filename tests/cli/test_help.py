@@ -194,7 +194,7 @@ def test_module_is_the_command(module):
 def test_usage_lists_exit_codes(capsys):
     _, out, _ = run(capsys, "--help")
     assert max(map(len, out.splitlines())) <= 80
-    assert all(f"{code} " in out.splitlines()[-1] for code in (0, 1, 2, 130))
+    assert all(f"{code} " in out.splitlines()[-1] for code in (0, 1, 2, 3, 130))
 
 
 @pytest.mark.parametrize(

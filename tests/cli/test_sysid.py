@@ -142,7 +142,7 @@ def test_cma_method_identifies_latency_and_prints_its_report_as_json(recorded, c
 def test_actuator_fits_friction_from_bench_data(tmp_path, capsys):
     bench = synthetic_bench(described_constants("transversal") | {"friction": 0.3}, np.random.default_rng(0))
     rows = zip(*(getattr(bench, name) for name in COLUMNS), strict=True)
-    (tmp_path / "bench.csv").write_text("\n".join([",".join(COLUMNS), *(",".join(map(str, row)) for row in rows)]))
+    (tmp_path / "bench.csv").write_text("".join(f"{','.join(map(str, row))}\n" for row in (COLUMNS, *rows)))
     main(["sysid", "actuator", str(tmp_path / "bench.csv"), "--out", str(tmp_path), "--json"])
     printed = capsys.readouterr().out
     assert printed == (tmp_path / "actuator.json").read_text()
@@ -159,7 +159,7 @@ def test_actuator_fits_friction_from_bench_data(tmp_path, capsys):
         (["x.npz", "--params", "gears"], "unknown group of parameters 'gears'"),
         (["x.npz", "--exclude", "kd,kq"], "unknown parameter 'kq' to exclude"),
         (["x.npz", "--mass", "14500"], "must be in 7.25 to 29 kg (the robot is described with 14.5 kg), got 14500 kg"),
-        (["x.npz", "--noise.angle", "0"], "noise angle must be positive"),
+        (["x.npz", "--noise.angle", "0"], "noise angle must be in 1e-06 to 90 deg"),
     ],
 )
 def test_invalid_input_prints_one_line(args, words, tmp_path, monkeypatch, capsys):

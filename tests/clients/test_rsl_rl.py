@@ -108,7 +108,7 @@ def test_checkpoint_without_the_environments_configuration_is_refused(trained, t
     with pytest.raises(CheckpointError, match=re.escape(f"{path}: needs config.json beside it")):
         open_policy(path)
     path.with_name("config.json").write_text("{")
-    with pytest.raises(CheckpointError, match=r"config\.json: not readable"):
+    with pytest.raises(CheckpointError, match=r"config\.json: not JSON"):
         open_policy(path)
 
 

@@ -350,6 +350,8 @@ def put(value):
     """Return a mutation that replaces an entry by a value."""
 
     def change(table, key):
+        if isinstance(value, bool) and isinstance(table[key], bool):
+            return False  # the other choice
         table[key] = copy.deepcopy(value)
 
     return change
