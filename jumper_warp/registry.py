@@ -27,6 +27,7 @@ from jumper_warp.utils.sources import module_from_file
 if TYPE_CHECKING:
     from jumper_warp.tasks.cfg import TaskCfg
 
+MAX_SOURCE_BYTES = 2**20  # Size of the largest file of tasks that is imported
 GROUP = "jumper_warp.tasks"
 """Group of entry points `TASK = module:function`, where the function returns a `TaskCfg` or `TaskEntry`."""
 
@@ -293,7 +294,7 @@ def load_task_module(name: str) -> ModuleType:
 
 def _load_file(path: Path) -> ModuleType:
     """Import a file as a module named by its stem, and return it; a loaded file is not run again. Raises InputError."""
-    existing_file(path, "tasks of your own")
+    existing_file(path, "tasks of your own", MAX_SOURCE_BYTES)
     path, name = path.resolve(), path.stem
     if not name.isidentifier() or keyword.iskeyword(name):
         raise InputError(f"{path.name}: the name of a task's file must be one that Python can import")
@@ -307,8 +308,8 @@ def _load_file(path: Path) -> ModuleType:
     try:
         return module_from_file(name, path)
     except BaseException as error:
-        if isinstance(error, SyntaxError) and error.filename == str(path):
-            raise InputError(f"{path.name}:{error.lineno}: {error.msg}") from error
+        if isinstance(error, SyntaxError) and error.filename in (str(path), None):  # None: a null byte
+            raise InputError(f"{path.name}:{error.lineno or 1}: {error.msg}") from error
         if isinstance(error, InputError):
             lines = [line for frame, line in traceback.walk_tb(error.__traceback__)
                      if frame.f_code.co_filename == str(path)]  # fmt: skip

@@ -5,7 +5,6 @@ The policy comes first: its task decides which flags there are.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from types import ModuleType
@@ -14,7 +13,8 @@ from typing import TYPE_CHECKING, Any
 from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError
 from jumper_warp.cli.main import parse as parse_flags
 from jumper_warp.cli.renamed_flags import join_height_range
-from jumper_warp.utils.errors import suggestion
+from jumper_warp.utils.errors import InputError, suggestion
+from jumper_warp.utils.files import read_json
 
 if TYPE_CHECKING:
     from jumper_warp.evaluation.evaluations import Evaluation
@@ -103,8 +103,8 @@ def saved_task(source: str, modules: Sequence[ModuleType]) -> TaskCfg:
     path = Path(source)
     folder = path.parent.parent if path.suffix == ".pt" else find_policy(source)
     try:
-        config = json.loads((folder / CONFIG).read_bytes())
-    except (OSError, ValueError):
+        config = read_json(folder / CONFIG, "configuration")
+    except InputError:
         return open_run(source, modules).task
     return restored_task(config, modules)
 

@@ -16,6 +16,14 @@ from typing import Annotated, Any, Literal, NamedTuple, Union, get_args, get_ori
 
 import tyro
 
+from jumper_warp.utils.checks import MOST_WORLDS
+from jumper_warp.utils.errors import InputError
+
+LARGEST = 2.0**31  # Largest absolute value of a number in a flag
+MOST_TRIALS = 100_000  # Largest number of jumps, walks or robots, which needs some 10 GB
+FLAG_LIMITS = {"num-envs": MOST_WORLDS, "num-steps": LARGEST, "trials": MOST_TRIALS, "states": MOST_TRIALS,
+               "repeats": 10_000, "seconds": 3600.0}  # fmt: skip
+"""Largest value of a number in a flag by the last part of its name."""
 METAVARS: dict[Any, str] = {int: "INT", float: "FLOAT", str: "TEXT", Path: "PATH", type(None): "None"}
 
 
@@ -120,6 +128,19 @@ def metavar(kind: Any) -> str:
     if origin is tuple:
         return f"{metavar(parts[0])} ..." if Ellipsis in parts else " ".join(map(metavar, parts))
     return METAVARS.get(kind, getattr(kind, "__name__", str(kind)).upper())
+
+
+def check_numbers(settings: Any) -> None:
+    """Raise InputError for a number in parsed flags that no machine can hold, or that is not finite.
+
+    settings: dataclass of the flags; limits: `FLAG_LIMITS` by name, LARGEST for others.
+    """
+    for flag in list_flags(settings):
+        name = flag.name.split(".")[-1]
+        limit = FLAG_LIMITS.get(name, MOST_TRIALS if name.startswith("num-") else LARGEST)
+        for number in flag.default if isinstance(flag.default, tuple) else (flag.default,):
+            if isinstance(number, int | float) and not abs(number) <= limit:
+                raise InputError(f"--{flag.name} must be at most {limit:.10g} in size, got {number!s:.40}")
 
 
 def option_of(arg: str) -> str:

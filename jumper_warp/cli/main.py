@@ -27,6 +27,7 @@ if TYPE_CHECKING:
 
 FAULT = 1  # Exit code for a fault of the program or the machine
 USAGE_ERROR = 2  # Exit code for input that cannot be used
+INCONSISTENT = 3  # Exit code of `jumper sysid` for a fit that is not consistent with the data
 INTERRUPTED = 130  # Exit code after Ctrl-C
 COMMANDS = {
     "train": "Train a policy: jumper train TASK.",
@@ -48,7 +49,9 @@ TASK_MODULE = "--task-module"
 TASK_MODULE_HELP = f"""\
 Every command takes {TASK_MODULE} FILE_OR_MODULE, any number of times: a
 FILE.py or an installed module that registers tasks of your own."""
-EXIT_CODES = "Exit codes: 0 done, 1 fault or no memory, 2 invalid input, 130 after Ctrl-C."
+EXIT_CODES = (
+    "Exit codes: 0 done, 1 fault or no memory, 2 invalid input, 3 an inconsistent fit (sysid), 130 after Ctrl-C."
+)
 
 
 class UsageError(InputError):
@@ -99,7 +102,11 @@ def dispatch(args: Sequence[str]) -> None:
             modules += (load_task_module(file) for file in files)
         importlib.import_module(f"jumper_warp.cli.{name}").run(rest, modules)
     except Exception as error:
-        user_files = {os.path.abspath(path) for path in (*files, *(module.__file__ for module in modules)) if path}
+        user_files = {
+            os.path.abspath(path)
+            for path in (*files, *(getattr(module, "__file__", None) for module in modules))
+            if path
+        }
         if message := user_file_error(user_files, error):
             raise InputError(message) from error
         raise
@@ -143,7 +150,7 @@ def parse(
     the command). program: command line of a script in place of `jumper COMMAND`, without --task-module.
     Raises UsageError: there is no such flag, or a value is missing or of another type.
     """
-    from jumper_warp.cli.flags import Flag, list_flags, option_of
+    from jumper_warp.cli.flags import Flag, check_numbers, list_flags, option_of
     from jumper_warp.cli.help import help_page, wants_help
     from jumper_warp.cli.renamed_flags import use_new_names
 
@@ -171,6 +178,7 @@ def parse(
     except SystemExit:
         raise UsageError(parse_error(printed.getvalue(), flags, args)) from None
     print(printed.getvalue(), end="", file=sys.stderr)
+    check_numbers(parsed)
     return parsed
 
 
@@ -187,7 +195,7 @@ def parse_error(printed: str, flags: Sequence[Flag], args: Sequence[str]) -> str
     options = {option: flag for flag in flags for option in flag.options}
     for word in re.findall(r"--[\w.-]+", message):
         if flag := options.get(word.rstrip(".")):
-            got = " ".join(values_of(word, args)) or "nothing"
+            got = f"{' '.join(values_of(word, args)) or 'nothing':.100}"
             return f"--{flag.name} takes {flag.metavar}, got {got}"
     return re.sub(r"^Error parsing \w+: ", "", message).replace("Unrecognized options:", "unexpected argument")
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import json
 import sys
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
@@ -13,6 +12,7 @@ from jumper_warp.rl.checkpoint import DECODE_ERRORS, CheckpointError, one_line_m
 from jumper_warp.rl.resume import SESSION
 from jumper_warp.robot.overlay import RobotOverlay
 from jumper_warp.tasks.saving import TaskError, check_version
+from jumper_warp.utils.files import parse_json
 
 if TYPE_CHECKING:
     from jumper_warp.rl.cfg import TrainCfg
@@ -47,7 +47,7 @@ def _config(checkpoint: Checkpoint, task: str) -> dict[str, Any]:
     """Return a checkpoint's configuration. Raises CheckpointError: it has another task name or version, or none."""
     path = checkpoint.path
     try:
-        saved = json.loads(checkpoint.state["config"])
+        saved = parse_json(checkpoint.state["config"], "config")
         name = saved["train"]["task"]
         check_version(saved["env"]["task"])
     except TaskError as error:

@@ -7,15 +7,18 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import ModuleType
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import tyro
 
-from jumper_warp.cli.main import TASK_MODULE_HELP, UsageError, parse
+from jumper_warp.cli.main import INCONSISTENT, TASK_MODULE_HELP, UsageError, parse
 from jumper_warp.identification.motions import NoiseLevels, load_motions
 from jumper_warp.identification.parameters import jumper_parameters, total_mass, weighed_mass
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import json_bytes, write_atomically
+
+if TYPE_CHECKING:
+    from jumper_warp.identification.results import Identification
 
 HELP = f"""\
 usage: jumper sysid [fit] DATA ... [flags]
@@ -27,6 +30,8 @@ usage: jumper sysid [fit] DATA ... [flags]
   actuator  limits, friction and latency of one motor from a test bench
 
 The result identified.json is for --robot of jumper train, evaluate and play.
+If the fit is not consistent with the data, it is inconsistent.json, and the exit
+code is 3.
 jumper sysid fit --help, excite --help and actuator --help list the flags.
 
 {TASK_MODULE_HELP}"""
@@ -124,14 +129,10 @@ def split_names(text: str) -> list[str]:
 def sysid(cfg: SysidCfg) -> None:
     """Identify the robot's parameters from recorded motions, write the report and print the results as a table.
 
-    Raises as `run`.
+    Exits with code 3 if the fit is not consistent with the data. Raises as `run`.
     """
-    from rich.console import Console
-    from rich.table import Table
-
     from jumper_warp.identification.identify import identify, identify_by_evolution
     from jumper_warp.identification.report import write_results
-    from jumper_warp.utils.metrics import print_table
     from jumper_warp.utils.output import output_dir
     from jumper_warp.utils.progress import phase
     from jumper_warp.utils.runtime import configure_device
@@ -152,7 +153,22 @@ def sysid(cfg: SysidCfg) -> None:
         write_results(result, folder, f"jumper sysid of {', '.join(motion.name for motion in motions)}")
     if cfg.json:
         print((folder / "report.json").read_text(encoding="utf-8"), end="")
-        return
+    else:
+        print_result(result)
+        print(folder / "report.html")
+    if not result.consistent:
+        print(f"jumper: not consistent: {result.inconsistency}; robot: {folder / 'inconsistent.json'}", file=sys.stderr)
+        raise SystemExit(INCONSISTENT)
+
+
+def print_result(result: Identification) -> None:
+    """Print an identification: a table of the parameters, χ², starts, undetermined combinations and warnings."""
+    from rich.console import Console
+    from rich.table import Table
+
+    from jumper_warp.identification.report import starts_line
+    from jumper_warp.utils.metrics import print_table
+
     table = Table("parameter", "unit", "description", "identified", "95 % interval", box=None)
     rows = zip(result.parameters, result.values, result.intervals, result.identified, strict=True)
     for parameter, value, (low, high), identified in rows:
@@ -164,11 +180,11 @@ def sysid(cfg: SysidCfg) -> None:
         print_table(table)  # rich itself exits with 1 when the reader closes the pipe
     wider = f"; intervals {result.mismatch:.3g} times wider for the model's errors" if result.mismatch != 1.0 else ""
     print(f"χ² {result.chi2:.4g} (robot as described: {result.nominal_chi2:.4g}), {result.effort.seconds:.1f} s{wider}")
+    print(starts_line(result))
     for words in dict.fromkeys(direction.words for direction in result.directions):
         print(f"not identified: {words}")
     for line in result.warnings:
         print(f"warning: {line}")
-    print(folder / "report.html")
 
 
 def excite(cfg: ExciteCfg) -> None:

@@ -1,23 +1,26 @@
 """Inference of a policy on a real robot: sensor readings to observation, action and motor targets.
 
-It uses NumPy and ONNX Runtime. This module imports only `jumper_warp/utils/errors.py` from the package.
-`docs/tutorials/on_a_robot.md` defines each reading.
+It uses NumPy and ONNX Runtime, and neither PyTorch, Warp nor Newton. `docs/tutorials/on_a_robot.md` defines each
+reading, and lists the files of the package that this module needs.
 """
 
 from __future__ import annotations
 
-import json
+import hashlib
 import math
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import onnxruntime
 
+from jumper_warp.policies.spec import METADATA_VERSION, SOURCE_KEYS, PolicyInterface, checksum_entry
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import parse_json, read_file, read_json
 
 COMMAND_BOUND = 4.0 * math.pi  # [rad] Motor targets are clipped to ± this before the filter
+JOINTS = tuple(f"{leg}_{motor}" for leg in ("FL", "FR", "BL", "BR") for motor in ("lateral", "outer", "inner"))
+"""Names of the motors, in the order of all arrays."""
 LAST_ACTION = "last_action"  # Observation term that `DeployedPolicy` computes, so that readings must not contain it
 
 
@@ -26,25 +29,41 @@ class DeployedPolicy:
 
     It is a policy step: `observe`, `act` and `filter_targets`. Arrays with one value per motor, (12,), have the legs
     FL, FR, BL, BR in this order; each lateral, outer, inner.
+
+    `targets` and `observe` raise InputError for a reading that is missing, of another size or not finite, and change
+    nothing: hold the last target, and call `targets` again with the next readings. The history then has a gap of one
+    policy step. If faults last longer than 0.1 s, switch the motors to damping and call `reset` before a restart.
     """
 
     def __init__(self, file: str | Path) -> None:
         """Load an ONNX policy; its metadata becomes `interface`, a dict of the fields of `PolicyInterface`.
 
-        Raises InputError, a ValueError: the file is missing, or its metadata has no observation layout.
+        Raises InputError, a ValueError: the file is missing, damaged or no policy of this robot, or ONNX Runtime is not
+        installed.
         """
-        if not Path(file).is_file():
-            raise InputError(f"{file}: no such file (ONNX file of a policy)")
+        try:
+            import onnxruntime
+        except ImportError:
+            raise InputError('DeployedPolicy needs ONNX Runtime: pip install "jumper-warp[export]"') from None
+        data = _verified(Path(file))
         options = onnxruntime.SessionOptions()
         options.intra_op_num_threads = 1  # more threads slow down small networks
-        self._session = onnxruntime.InferenceSession(str(file), options, providers=["CPUExecutionProvider"])
-        metadata = self._session.get_modelmeta().custom_metadata_map
-        self.interface: dict[str, Any] = json.loads(metadata.get("jumper_warp", "{}"))
-        if not self.interface.get("observation_layout"):
-            raise InputError(f"{file}: the metadata lacks observation_layout: export the policy again")
-        self.layout = self.interface["observation_layout"]
+        options.log_severity_level = 4
+        try:
+            self._session = onnxruntime.InferenceSession(data, options, providers=["CPUExecutionProvider"])
+        except Exception as error:  # ONNX Runtime's errors have no common class
+            raise InputError(f"{file}: not an ONNX file that ONNX Runtime can load ({error!s:.200})") from None
+        self.interface = _interface(file, self._session.get_modelmeta().custom_metadata_map)
+        self.layout: dict[str, Any] = self.interface["observation_layout"]
         self.scale = np.array(self.interface["action_scale"], dtype=np.float32)  # (12,) [rad] for an action of 1
         self.default = np.array(self.interface["default_joint_pos"], dtype=np.float32)  # (12,) [rad]
+        self.reset()
+        try:
+            action = self.act(np.zeros(len(self.interface["observation_names"]), dtype=np.float32))
+        except Exception as error:
+            raise InputError(f"{file}: the network does not fit its metadata ({error!s:.200})") from None
+        if action.shape != (len(JOINTS),) or not np.isfinite(action).all():
+            raise InputError(f"{file}: the network must return {len(JOINTS)} finite numbers, got {action!s:.60}")
         self.reset()
 
     def reset(self) -> None:
@@ -56,7 +75,8 @@ class DeployedPolicy:
         """Return the motor targets until the next policy step [rad], (12,); call it every `policy_dt`.
 
         readings: sensor values of each observation term but last_action, by name; `angle`: (12,) [rad], the default
-        pose not subtracted; `rate`: (12,) [rad/s]. Raises InputError: one is missing, unknown, or of another size.
+        pose not subtracted; `rate`: (12,) [rad/s]. Raises InputError, and changes nothing: one is missing, unknown, of
+        another size, or not finite.
         """
         action = self.act(self.observe(readings))
         return self.filter_targets(self.default + self.scale * action, readings["angle"], readings["rate"])
@@ -64,23 +84,35 @@ class DeployedPolicy:
     def observe(self, readings: Mapping[str, Any]) -> np.ndarray:
         """Return the policy's observation, (num_obs,), and append the readings to the history.
 
-        Arguments: see `targets`.
+        Arguments and errors: see `targets`.
         """
-        different = sorted(set(readings) ^ (set(self.layout) - {LAST_ACTION}))
+        different = sorted(map(str, set(readings) ^ (set(self.layout) - {LAST_ACTION})))
         if different:
             raise InputError(f"readings missing or unknown: {', '.join(different)}")
-        return np.concatenate([self._term(name, term, readings) for name, term in self.layout.items()])
+        values = {name: self._reading(name, reading) for name, reading in readings.items()}
+        values[LAST_ACTION] = self.action
+        return np.concatenate([self._term(name, term, values[name]) for name, term in self.layout.items()])
 
-    def _term(self, name: str, term: Mapping[str, Any], readings: Mapping[str, Any]) -> np.ndarray:
-        """Append a reading, clipped and scaled, to an observation term's history, and return the history.
+    def _reading(self, name: str, reading: Any) -> np.ndarray:
+        """Return a reading as (width,) float32. Raises InputError: it is of another size, or not finite."""
+        try:
+            with np.errstate(over="ignore"):
+                value = np.atleast_1d(np.asarray(reading, dtype=np.float32))
+        except (TypeError, ValueError, OverflowError):
+            raise InputError(f"{name} must be numbers, got {reading!r:.60}") from None
+        width = _width(self.layout[name])
+        if value.shape != (width,):
+            raise InputError(f"{name} must have {width} values, got shape {value.shape}")
+        if not np.isfinite(value).all():
+            raise InputError(f"{name} is not finite: {value!s:.100}; hold the last target")
+        return value
+
+    def _term(self, name: str, term: Mapping[str, Any], value: np.ndarray) -> np.ndarray:
+        """Append a reading (width,), clipped and scaled, to an observation term's history, and return the history.
 
         Shape (history * width,). The oldest frame is first; the first reading after `reset` fills all frames. term:
         entry of `layout`.
         """
-        value = self.action if name == LAST_ACTION else np.atleast_1d(np.asarray(readings[name], dtype=np.float32))
-        width = (term["end"] - term["first"]) // term["history"]
-        if value.shape != (width,):
-            raise InputError(f"{name} must have {width} values, got shape {value.shape}")
         value = value - self.default if name == "angle" else value
         value = np.float32(term["scale"]) * np.clip(value, -term["clip"], term["clip"])
         frames = self._frames.get(name)
@@ -109,6 +141,50 @@ class DeployedPolicy:
         sums = (total, angle[:, 1] + angle[:, 2], rate[:, 1] + rate[:, 2])
         filtered[:, 1:] += 0.5 * (limit_command(*sums, settings["sum"], settings) - total)[:, None]
         return filtered.ravel()
+
+
+def _verified(file: Path) -> bytes:
+    """Return the content of a policy's ONNX file.
+
+    Raises InputError: it cannot be read, or differs from its checksum: in its metadata, or in the manifest of its
+    policy folder.
+    """
+    data = read_file(file, "ONNX file of a policy")
+    size = len(checksum_entry(b""))
+    if data[-size:] == checksum_entry(data[:-size]):
+        return data
+    manifest, checksums = file.with_name("manifest.json"), None
+    if manifest.is_file():
+        content = read_json(manifest, "manifest of a policy")
+        checksums = content.get("sha256") if isinstance(content, dict) else None
+    if isinstance(checksums, dict) and checksums.get(file.name) == hashlib.sha256(data).hexdigest():
+        return data
+    raise InputError(f"{file}: damaged, or without checksum: write it again with jumper export")
+
+
+def _interface(file: str | Path, metadata: Mapping[str, str]) -> dict[str, Any]:
+    """Return the fields of `PolicyInterface` in the metadata of an ONNX file. Raises InputError, with the file."""
+    content = parse_json(metadata.get("jumper_warp", "{}"), f"{file}: metadata")
+    if not isinstance(content, dict) or content.get("schema_version") != METADATA_VERSION:
+        raise InputError(f"{file}: the metadata lacks version {METADATA_VERSION}: export the policy again")
+    fields = {key: value for key, value in content.items() if key not in (*SOURCE_KEYS, "schema_version")}
+    try:
+        interface = PolicyInterface.from_json(fields).to_json()
+    except InputError as error:
+        raise InputError(f"{file}: {error}") from None
+    layout, wide = interface["observation_layout"], ("angle", "rate", LAST_ACTION)
+    if interface["joint_names"] != JOINTS:
+        raise InputError(f"{file}: expected the joints {', '.join(JOINTS)}")
+    if wrong := [name for name in wide if name in layout and _width(layout[name]) != len(JOINTS)]:
+        raise InputError(f"{file}: {wrong[0]} in the observation must have {len(JOINTS)} values a frame")
+    if missing := [name for name in ("angle", "rate") if name not in layout]:
+        raise InputError(f"{file}: the observation lacks {' and '.join(missing)}, which the command filter needs")
+    return interface
+
+
+def _width(term: Mapping[str, Any]) -> int:
+    """Return the number of values in one frame of an observation term, an entry of `DeployedPolicy.layout`."""
+    return (term["end"] - term["first"]) // term["history"]
 
 
 def limit_command(
@@ -154,7 +230,10 @@ class JumpCommand:
         """Follow the jump through takeoff and landing, and return `jump_command`, 0 or 1. Call it once per policy step.
 
         vertical_velocity: of the base, world frame, upward positive [m/s]. paws_down: number of paws on the ground.
+        Raises InputError, and changes nothing: one is not finite.
         """
+        if not (math.isfinite(vertical_velocity) and math.isfinite(paws_down)):
+            raise InputError(f"vertical_velocity and paws_down must be finite, got {vertical_velocity}, {paws_down}")
         rises = vertical_velocity > self._takeoff_speed
         if self.in_flight and paws_down > 0 and not rises:
             self.requested, self.in_flight = False, False

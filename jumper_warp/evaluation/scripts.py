@@ -7,7 +7,6 @@ A script is a JSON list of commands: `{"walk": [vx, vy, yaw_rate], "seconds": s}
 
 from __future__ import annotations
 
-import json
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import existing_file
+from jumper_warp.utils.files import read_json
 
 KINDS = {"walk": 3, "stand": 1, "jump_up": 1, "jump_to": 2, "jump_onto": 2}  # Number of values of each kind of command
 LIMITS = {"walk": 10.0, "stand": 600.0, "jump_up": 2.0, "jump_to": 5.0, "jump_onto": 5.0}
@@ -50,16 +49,7 @@ class ScriptStep:
 
 def read_script(path: Path) -> tuple[ScriptStep, ...]:
     """Read the commands of a script file. Raises InputError, with the path: unreadable, or a malformed command."""
-    existing_file(path, "script of commands")
-    try:
-        too_large = path.stat().st_size > MAX_BYTES
-        content = None if too_large else json.loads(path.read_bytes())
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-    except (ValueError, RecursionError) as error:
-        raise InputError(f"{path}: not JSON ({error!s:.100})") from error
-    if too_large:
-        raise InputError(f"{path}: larger than {MAX_BYTES >> 20} MiB")
+    content = read_json(path, "script of commands", MAX_BYTES)
     try:
         return parse_script(content)
     except InputError as error:

@@ -24,9 +24,8 @@ from jumper_warp.identification.motions import csv_rows
 from jumper_warp.identification.uncertainty import mismatch_factor
 from jumper_warp.robot.description import load_description
 from jumper_warp.robot.motors import OVERSPEED_END, OVERSPEED_START
-from jumper_warp.utils.checks import check_positive
+from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import existing_file
 
 COLUMNS = ("test", "time", "command", "speed", "torque")
 """Columns of a bench's CSV: test number, time [s], commanded torque [N m], output speed [rad/s] and torque [N m]."""
@@ -75,7 +74,7 @@ def load_bench(path: Path) -> Bench:
 
     Raises InputError: a missing file or column, rows that are not numbers, or as `Bench`; OSError: it cannot be read.
     """
-    rows = csv_rows(existing_file(path, "recording of a test bench"))
+    rows = csv_rows(path, "recording of a test bench")
     names = [name.strip() for name in rows[0]] if rows else []
     missing = [name for name in COLUMNS if name not in names]
     if missing:
@@ -165,7 +164,7 @@ def characterise_motor(
     kind: motor whose described constants are the prior's means. torque_noise [N m]: standard deviation of the torque
     sensor. Raises InputError: noise that is not positive, or a command that never changes.
     """
-    check_positive("torque noise", torque_noise)
+    check_within("torque noise", np.array([torque_noise]), (1.0e-6, 100.0))
     if np.ptp(bench.command) == 0.0:
         raise InputError("bench: the command must change to determine the motor's constants")
     nominal, names = described_constants(kind), list(PRIORS)

@@ -3,7 +3,8 @@
 Unknowns are the parameters and the initial state of each motion. Residuals are divided by the noise; priors and prior
 measurements count like measurements. The sum of squares is minimised by Levenberg-Marquardt over parallel worlds, in
 stages: motions are first cut into short pieces, each with its own initial state, whose residuals are nearly linear in
-the parameters; then whole motions are fitted.
+the parameters; then whole motions are fitted. The cost has local minima, as contacts begin, slip and end: the minimum
+is confirmed by a second start, and the residuals are tested (`consistency`).
 """
 
 from __future__ import annotations
@@ -15,12 +16,21 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import warp as wp
 
+from jumper_warp.identification.consistency import fit_tests
 from jumper_warp.identification.least_squares import LeastSquares, NormalEquations, Point, Trial, replace_residuals
 from jumper_warp.identification.motions import NoiseLevels, RecordedMotion
 from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement
 from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.residuals import Linearised, MotionResiduals, pieces_of
-from jumper_warp.identification.results import DescentStep, Effort, Identification, summarise
+from jumper_warp.identification.results import (
+    DescentStep,
+    Effort,
+    Identification,
+    Minimum,
+    excess_costs,
+    starts_agree,
+    summarise,
+)
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.progress import phase
@@ -35,10 +45,14 @@ CONVERGED = 0.5
 GOOD_STEP = 0.3  # Actual over predicted decrease of the cost above which a step is good enough to reuse the Jacobian
 HORIZONS = (0.4, 0.7, 1.0)
 """Fractions of a motion on the ground that are fitted in turn, as a paw's motion depends on all earlier contacts."""
-ATTEMPTS = 2  # largest number of passes over all motions
-STUCK = 20.0
-"""Predicted minus actual decrease of the last step, in mean squared residuals, above which contact kinks block it: the
-motions are then added one after another again, starting from the fitted parameters."""
+MAX_STARTS = 4  # largest number of starts; there are only two if these agree or the best fails a test of the fit
+DISPLACEMENT, LARGEST_DISPLACEMENT = 3.0, 0.1
+"""Standard deviation of the displacement of a start from an earlier minimum, in standard deviations of the estimate.
+Largest displacement of a parameter, in standard deviations of its prior."""
+FRICTION = "paw_friction"
+"""Parameter that can be trapped: while a paw sticks, the motion does not depend on its friction. `Descent.refine`
+tries the values at `FRICTION_MOVES`, standard deviations of the prior from the minimum."""
+FRICTION_MOVES = np.array([-2.0, -1.5, -1.0, -0.5, 0.5, 1.0, 1.5, 2.0])
 MAX_STEPS = 40  # largest number of Levenberg-Marquardt steps in a stage
 
 
@@ -75,8 +89,8 @@ def identify(
     stages = bool(pieces) + (num_free < len(whole)) + len(HORIZONS) * num_free + 1
     with phase("identifying parameters", stages) as advance:
         descent = Descent(replay, advance)
-        problem, point, normal = descend(descent, parameters, coarse, whole, pieces, prior_measurements)
-    return summarise(problem, point, normal, descent.steps, descent.effort)
+        problem, minima = descend(descent, parameters, coarse, whole, pieces, prior_measurements)
+    return summarise(problem, minima, descent.steps, descent.effort)
 
 
 def identify_by_evolution(
@@ -123,7 +137,7 @@ def identify_by_evolution(
             descent.steps.append(DescentStep(0, cost / problem.count, 0.0, effort.world_steps, effort.seconds))
             advance(effort.seconds - seconds)
     point = Point(np.clip(best, low, high), point.starts)
-    return summarise(problem, point, problem.normal(point), descent.steps, descent.effort)
+    return summarise(problem, [Minimum(point, problem.normal(point))], descent.steps, descent.effort)
 
 
 class Descent:
@@ -135,7 +149,6 @@ class Descent:
         replay: simulation whose physics steps are counted; advance: called after every stage.
         """
         self.replay, self.steps, self.stage, self.advance = replay, [], 0, advance
-        self.shortfall = 0.0  # Predicted minus actual decrease of the cost in the last step
         self._begin = (time.perf_counter(), time.process_time(), replay.world_steps)
 
     def effort(self) -> Effort:
@@ -159,11 +172,10 @@ class Descent:
         """
         new_jacobian, self.stage = decrease is not None, self.stage + 1
         for _ in range(MAX_STEPS):
-            least = max((decrease or 0.0) * normal.cost, CONVERGED * max(1.0, normal.data_cost / problem.count))
+            least = max((decrease or 0.0) * normal.cost, CONVERGED * problem.scale(normal))
             trial = problem.step(point, normal, geodesic=new_jacobian)
             self.record_step(problem, trial)
             gain, predicted = normal.cost - trial.cost, trial.predicted_decrease
-            self.shortfall = predicted - gain
             if gain < least and (new_jacobian or (decrease is not None and predicted < least)):
                 residuals = replace_residuals(normal.linearised, trial.residuals)
                 point, normal = trial.point, problem.assemble(trial.point, residuals)
@@ -174,6 +186,19 @@ class Descent:
         self.advance()
         return point, normal
 
+    def refine(self, problem: LeastSquares, point: Point, normal: NormalEquations) -> Minimum:
+        """Minimise the last stage's problem, also from other values of the paws' friction if one lowers the cost.
+
+        normal: the normal equations at the point.
+        """
+        point, normal = self.minimise(problem, point, normal)
+        names = problem.parameters.names
+        if FRICTION in names:
+            moved, cost = problem.scan(point, normal, names.index(FRICTION), FRICTION_MOVES)
+            if cost < normal.cost - CONVERGED * problem.scale(normal):
+                point, normal = self.minimise(problem, moved, problem.normal(moved))
+        return Minimum(point, normal)
+
 
 def descend(
     descent: Descent,
@@ -182,30 +207,43 @@ def descend(
     whole: Sequence[MotionResiduals],
     pieces: Sequence[MotionResiduals],
     prior_measurements: Sequence[PriorMeasurement],
-) -> tuple[LeastSquares, Point, NormalEquations]:
-    """Fit parameters and initial states to all motions by all stages of Levenberg-Marquardt.
+) -> tuple[LeastSquares, list[Minimum]]:
+    """Fit parameters and initial states to all motions by Levenberg-Marquardt from two to four starts.
 
-    Returned: the least-squares problem of all motions, its minimum, and the normal equations there. coarse, whole: all
-    motions, with the physics steps of the first stages and of the last stage. pieces: short pieces of the motions for a
-    first stage, empty to skip it. Raises InputError: the simulation diverges in a motion.
+    Returned: the least-squares problem of all motions and the minimum of each start, best first. Derivatives of the
+    best exclude jumps of the residuals. The first start begins at the described robot, the others near the best minimum
+    so far. All add the motions one after another, so that they leave a minimum that only one motion has.
+
+    coarse, whole: all motions, with the physics steps of the first stages and of the last stage. pieces: short pieces
+    of the motions for a first stage, empty to skip it. Raises InputError: the simulation diverges in a motion.
     """
     replay, z = descent.replay, np.zeros(len(parameters))
     if pieces:
         problem = LeastSquares(parameters, pieces, replay, prior_measurements, robust=True)
         begin = problem.nominal_point()
         z = descent.minimise(problem, begin, problem.normal(begin), PIECES_DECREASE)[0].z
-    minima = []
-    for _ in range(ATTEMPTS):
+    final = LeastSquares(parameters, whole, replay, prior_measurements)
+    minima, rng = [], np.random.default_rng(0)
+    while len(minima) < MAX_STARTS and not starts_agree(excess_costs(final, minima)):
+        if len(minima) > 1 and not all(test.passed for test in fit_tests(final, minima[0].normal)):
+            break
+        if minima:
+            z = minima[0].point.z + displacement(minima[0].normal, rng)
+            z = np.clip(z, *parameters.bounds())
         point, linearised = add_motions(descent, parameters, coarse, prior_measurements, z)
-        final = LeastSquares(parameters, whole, replay, prior_measurements)
         if whole is not coarse:
             linearised = replace_residuals(linearised, final.residuals(point))
-        point, normal = descent.minimise(final, point, final.assemble(point, linearised))
-        minima.append((final, point, normal))
-        if descent.shortfall < STUCK * max(1.0, normal.data_cost / final.count):
-            break
-        z = point.z
-    return min(minima, key=lambda minimum: minimum[2].cost)
+        minima.append(descent.refine(final, point, final.assemble(point, linearised)))
+        minima.sort(key=lambda minimum: minimum.normal.cost)
+    point, normal = minima[0]
+    return final, [Minimum(point, final.without_jumps(point, normal)), *minima[1:]]
+
+
+def displacement(normal: NormalEquations, rng: np.random.Generator) -> np.ndarray:
+    """Sample a displacement (P,) of a start from a minimum with the normal equations `normal`."""
+    covariance = np.linalg.inv(normal.information() + np.eye(len(normal.gradient)))
+    move = DISPLACEMENT * np.linalg.cholesky(covariance) @ rng.normal(size=len(covariance))
+    return np.clip(move, -LARGEST_DISPLACEMENT, LARGEST_DISPLACEMENT)
 
 
 def add_motions(

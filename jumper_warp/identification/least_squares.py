@@ -129,6 +129,10 @@ class LeastSquares:
         self._low, self._high = parameters.bounds()
         self._change = [np.full(len(parameters) + motion.start_size, DIFFERENCE) for motion in motions]
 
+    def scale(self, normal: NormalEquations) -> float:
+        """Return the mean squared residual, at least 1: the change of the cost by one standard deviation."""
+        return max(1.0, normal.data_cost / self.count)
+
     def nominal_point(self) -> Point:
         """Return the point where all unknowns have the mean of their prior."""
         return Point(np.zeros(len(self.parameters)), [np.zeros(motion.start_size) for motion in self.motions])
@@ -146,6 +150,21 @@ class LeastSquares:
                 name = motion.motion.name
                 raise InputError(f"motion {name}: the simulation diverges; check targets, units, signs and base")
             linearised.append(linear)
+        return self.assemble(point, linearised)
+
+    def without_jumps(self, point: Point, normal: NormalEquations) -> NormalEquations:
+        """Return the normal equations at a point with derivatives that exclude jumps of the residuals.
+
+        Residuals jump where a paw strikes in another physics step. A jump beside the point enlarges only one of the
+        forward and the backward difference, so the smaller one is taken. normal: from forward differences.
+        """
+        linearised = []
+        for motion, start, change, ahead in zip(
+            self.motions, point.starts, self._change, normal.linearised, strict=True
+        ):
+            behind = motion.linearise(self.replay, point.z, start, -change).jacobian
+            smaller = np.abs(behind) < np.abs(ahead.jacobian)  # False where a world diverges
+            linearised.append(Linearised(ahead.residual, np.where(smaller, behind, ahead.jacobian)))
         return self.assemble(point, linearised)
 
     def assemble(self, point: Point, linearised: Sequence[Linearised]) -> NormalEquations:
@@ -179,6 +198,22 @@ class LeastSquares:
             normal.cost += residual**2
         normal.cost += normal.data_cost
         return normal
+
+    def scan(self, point: Point, normal: NormalEquations, index: int, moves: np.ndarray) -> tuple[Point, float]:
+        """Return the point of least cost when one parameter moves and all other unknowns follow to first order.
+
+        With its cost. index: of the parameter; moves: changes of its z, (K,).
+        """
+        covariance = np.linalg.inv(normal.information() + np.eye(len(point.z)))
+        along = covariance[:, index] / covariance[index, index]
+        z = np.clip(point.z + moves[:, None] * along, self._low, self._high)
+        starts = [
+            start - np.linalg.solve(matrix, cross.T @ (z - point.z).T).T
+            for start, matrix, cross in zip(point.starts, normal.start_matrices, normal.cross_matrices, strict=True)
+        ]
+        costs = self.costs(z, starts)
+        best = int(np.argmin(costs))
+        return Point(z[best], [start[best] for start in starts]), float(costs[best])
 
     def broyden_update(self, normal: NormalEquations, old: Point, trial: Trial) -> NormalEquations:
         """Return the normal equations after a step, with Jacobians updated by Broyden's formula.

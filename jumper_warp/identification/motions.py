@@ -6,6 +6,7 @@ import csv
 import io
 import json
 import math
+import os
 import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -15,13 +16,17 @@ from typing import Any, Literal
 import numpy as np
 
 from jumper_warp.robot.description import MOTOR_JOINTS
-from jumper_warp.utils.checks import check_positive
+from jumper_warp.utils.arrays import read_npz
+from jumper_warp.utils.checks import check_bounds
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import existing_file, write_atomically
+from jumper_warp.utils.files import existing_file, parse_json, read_file, read_json, write_atomically
 
 PER_MOTOR = ("target", "angle", "rate", "torque")
 CHANNELS = ("angle", "rate", "torque", "position", "quaternion")
 """Names of measured channels; each is a field of `RecordedMotion`."""
+PURPOSE = "recorded motions"
+MAX_CSV_BYTES = 64 * 2**20  # Size of the largest CSV file that is read
+MAX_ROWS, MAX_COLUMNS = 1_000_000, 200  # Largest table of a motion, more than an hour at 240 Hz
 DEGREES = math.pi / 180.0
 UNITS = {
     "time": {"s": 1.0, "ms": 1.0e-3},
@@ -41,6 +46,13 @@ EXAMPLE = (
 )
 
 
+NOISE_BOUNDS = {
+    "angle": (1.0e-6, 90.0, "deg"), "rate": (1.0e-6, 1.0e4, "deg/s"), "torque": (1.0e-6, 100.0, "N m"),
+    "position": (1.0e-6, 1.0e3, "mm"), "orientation": (1.0e-6, 90.0, "deg"),
+}  # fmt: skip
+"""Smallest and largest standard deviation of the noise by field of `NoiseLevels`, and unit."""
+
+
 @dataclass(frozen=True)
 class NoiseLevels:
     """Standard deviations of the sensor noise of motor angles, rates, torques and the base's pose."""
@@ -52,9 +64,8 @@ class NoiseLevels:
     orientation: float = 0.5  # [deg] Noise of the base's orientation
 
     def check(self) -> None:
-        """Raise InputError unless all standard deviations of the noise are positive and finite."""
-        for name, value in vars(self).items():
-            check_positive(f"noise {name}", value)
+        """Raise InputError for a standard deviation of the noise outside its range in NOISE_BOUNDS."""
+        check_bounds("noise", self, NOISE_BOUNDS)
 
 
 @dataclass(frozen=True, eq=False)
@@ -83,8 +94,8 @@ class RecordedMotion:
     def __post_init__(self) -> None:
         """Raise InputError for a measured channel of wrong shape, not finite or out of range, or an invalid setting."""
         n, where = len(self.time), f"motion {self.name}"
-        if n < 3 or self.time.ndim != 1:
-            raise InputError(f"{where}: time must be one column of at least 3 rows, got shape {self.time.shape}")
+        if not 3 <= n <= MAX_ROWS or self.time.ndim != 1:
+            raise InputError(f"{where}: time must be one column of 3 to {MAX_ROWS} rows, got shape {self.time.shape}")
         if not np.isfinite(self.time).all() or not (np.diff(self.time) > 0.0).all():
             row = int(np.argmin(np.concatenate([[1.0], np.nan_to_num(np.diff(self.time), nan=-1.0)]) > 0.0))
             raise InputError(f"{where}: time must be finite and rise, it does not in row {row}")
@@ -114,7 +125,7 @@ class RecordedMotion:
             raise InputError(f"{where}: nothing is measured; expected one of {', '.join(CHANNELS)}")
         if self.base not in ("free", "fixed") or self.gains not in ("jumping", "walking"):
             raise InputError(f"{where}: base must be free or fixed and gains jumping or walking")
-        if not 0.1 <= self.torque_limit <= 1000.0:
+        if isinstance(self.torque_limit, bool) or not 0.1 <= self.torque_limit <= 1000.0:
             raise InputError(f"{where}: torque_limit must lie in 0.1 to 1000 N m, got {self.torque_limit}")
 
     @property
@@ -162,7 +173,7 @@ def load_motion(
     Raises InputError: the file or a channel is missing, of another shape or unit, or not finite; the message names it.
     OSError: the file cannot be read.
     """
-    path = existing_file(path, "recorded motions")
+    path = existing_file(path, PURPOSE)
     if path.suffix not in READERS:
         raise InputError(f"{path}: expected a file of {', '.join(READERS)}")
     channels, settings = READERS[path.suffix](path)
@@ -183,16 +194,9 @@ def load_motion(
         raise InputError(f"{path}: {error}") from None
 
 
-def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
-    """Read arrays by channel [SI] and settings by name from a motion's npz file. Raises InputError or OSError."""
-    try:
-        with np.load(path, allow_pickle=False) as file:
-            arrays = {name: file[name] for name in file.files}
-    except OSError as error:
-        error.filename = error.filename or str(path)
-        raise
-    except Exception as error:  # zip and header errors are of many kinds
-        raise InputError(f"{path}: not an npz file of plain arrays ({type(error).__name__})") from None
+def read_motion(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
+    """Read arrays by channel [SI] and settings by name from a motion's npz file. Raises InputError."""
+    arrays = read_npz(path, PURPOSE)
     settings = parse_settings(path, str(arrays.pop("settings", "{}")))
     known = ("time", *PER_MOTOR, "current", "position", "quaternion")
     for name in arrays:
@@ -208,22 +212,22 @@ def read_npz(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
 
 def parse_settings(path: Path, text: str) -> dict[str, Any]:
     """Parse a motion's settings from a JSON text; path: file named in errors. Raises InputError: not a JSON object."""
-    try:
-        settings = json.loads(text)
-    except json.JSONDecodeError as error:
-        raise InputError(f"{path}: settings must be JSON ({error.msg})") from None
+    settings = parse_json(text, f"{path}: settings")
     if not isinstance(settings, dict):
         raise InputError(f"{path}: settings must be a JSON object")
     return settings
 
 
-def csv_rows(path: Path) -> list[list[str]]:
-    """Return the cells of a CSV file as text, by row. Raises InputError (not CSV) or OSError."""
+def csv_rows(path: Path, purpose: str = PURPOSE) -> list[list[str]]:
+    """Return the cells of a CSV file as text, by row; purpose: for messages. Raises InputError: it is no CSV file."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            return list(csv.reader(file))
+        text = read_file(path, purpose, MAX_CSV_BYTES).decode()
+        rows = list(csv.reader(io.StringIO(text, newline=""), strict=True))
     except (UnicodeDecodeError, csv.Error) as error:
         raise InputError(f"{path}: expected CSV text ({error})") from None
+    if not text.endswith(("\n", "\r")):
+        raise InputError(f"{path}: the last line has no end: add a newline if the file is complete")
+    return rows
 
 
 def read_csv(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
@@ -265,10 +269,14 @@ def read_parquet(path: Path) -> tuple[dict[str, np.ndarray], dict[str, Any]]:
         raise InputError(
             f"{path}: reading Parquet needs pyarrow, which is not installed: pip install pyarrow"
         ) from None
+    data = read_file(path, PURPOSE)
     try:
-        table = pyarrow.parquet.read_table(path)
-    except pyarrow.ArrowException as error:
-        raise InputError(f"{path}: not a Parquet file ({error})") from None
+        file = pyarrow.parquet.ParquetFile(io.BytesIO(data))
+        if file.metadata.num_rows > MAX_ROWS or file.metadata.num_columns > MAX_COLUMNS:
+            raise InputError(f"{path}: expected at most {MAX_ROWS} rows and {MAX_COLUMNS} columns")
+        table = file.read()
+    except (pyarrow.ArrowException, OSError) as error:
+        raise InputError(f"{path}: not a Parquet file ({error!s:.200})") from None
     try:
         columns = [column.to_numpy(zero_copy_only=False).astype(np.float64) for column in table.columns]
     except (TypeError, ValueError):
@@ -282,7 +290,12 @@ def sidecar_settings(path: Path) -> dict[str, Any]:
     Empty if it does not exist. Raises InputError or OSError.
     """
     file = path.with_suffix(".json")
-    return parse_settings(file, file.read_text(encoding="utf-8")) if file.exists() else {}
+    if not os.path.lexists(file):
+        return {}
+    settings = read_json(file, "settings of a recorded motion")
+    if not isinstance(settings, dict):
+        raise InputError(f"{file}: settings must be a JSON object")
+    return settings
 
 
 def channels_of(path: Path, names: list[str], table: np.ndarray) -> dict[str, np.ndarray]:
@@ -321,5 +334,5 @@ def channels_of(path: Path, names: list[str], table: np.ndarray) -> dict[str, np
     return channels
 
 
-READERS = {".npz": read_npz, ".csv": read_csv, ".parquet": read_parquet}
+READERS = {".npz": read_motion, ".csv": read_csv, ".parquet": read_parquet}
 """Reader by suffix of the file: returns channels and settings of a path."""

@@ -12,7 +12,7 @@ import numpy as np
 
 from jumper_warp.robot.description import MOTOR_JOINTS, RobotDescription, load_description
 from jumper_warp.robot.values import LATERAL, LINK_KINDS, MOTOR_QUANTITIES, PAW_FRICTION, TRANSVERSAL, RobotValues
-from jumper_warp.utils.checks import check_positive
+from jumper_warp.utils.checks import check_within
 from jumper_warp.utils.errors import InputError
 
 GROUPS = ("motors", "masses", "friction", "latency", "offsets")  # Groups of parameters, see `jumper_parameters`
@@ -270,5 +270,5 @@ def weighed_mass(mass: float, std: float = 0.02) -> PriorMeasurement:
             f"weighed mass must be in {0.5 * described:.4g} to {2.0 * described:.4g} kg (the robot is described with "
             f"{described:.4g} kg), got {mass:.6g} kg"
         )
-    check_positive("deviation of the weighed mass", std)
+    check_within("deviation of the weighed mass", np.array([std]), (1.0e-6, 10.0))
     return PriorMeasurement("total mass", total_mass, mass, std)

@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from jumper_warp.identification.consistency import FAMILY_LEVEL
 from jumper_warp.identification.replay import MotionReplay
 from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.identification.results import Identification
@@ -59,6 +60,8 @@ def to_json(result: Identification) -> dict[str, Any]:
         "chi2": result.chi2,
         "nominal_chi2": result.nominal_chi2,
         "mismatch": result.mismatch,
+        "consistent": result.consistent,
+        "inconsistency": result.inconsistency,
         "doubts": list(result.warnings),
         "count": result.count,
         "dt_s": result.dt,
@@ -66,6 +69,10 @@ def to_json(result: Identification) -> dict[str, Any]:
         "cpu_s": result.effort.cpu_seconds,
         "world_steps": result.effort.world_steps,
         "fits": [vars(fit) for fit in result.fits],
+        "family_level": FAMILY_LEVEL,
+        "tests": [vars(test) | {"passed": test.passed} for test in result.tests],
+        "starts": [vars(start) for start in result.starts],
+        "starts_agree": result.starts_agree,
         "open_directions": [
             {"information": d.information, "words": d.words, "weights": dict(d.weights)} for d in result.directions
         ],
@@ -74,11 +81,16 @@ def to_json(result: Identification) -> dict[str, Any]:
 
 
 def write_results(result: Identification, folder: Path, source: str) -> None:
-    """Write `identified.json` (a robot overlay), `report.json` and `report.html` to a folder. Raises OSError.
+    """Write a robot overlay, `report.json` and `report.html` to a folder. Raises OSError.
 
-    source: origin of the data, saved in the overlay.
+    The overlay is `identified.json`, or `inconsistent.json` if the fit is not consistent; an earlier one of the other
+    name is removed. source: origin of the data, saved in the overlay.
     """
-    identified_overlay(result, source).save(folder / "identified.json")
+    names = ("identified.json", "inconsistent.json")
+    name, other = names if result.consistent else names[::-1]
+    (folder / other).unlink(missing_ok=True)
+    source += "" if result.consistent else f"; the fit is not consistent: {result.inconsistency}"
+    identified_overlay(result, source).save(folder / name)
     write_atomically(folder / "report.json", (json.dumps(to_json(result), indent=2) + "\n").encode())
     write_html(result, folder)
 
@@ -134,7 +146,7 @@ def write_html(result: Identification, folder: Path) -> None:
         fit_table(result),
         f"<p>{image(progress_plot(result))}</p>",
     ]
-    for motion, start in zip(result.motions, result.starts, strict=True):
+    for motion, start in zip(result.motions, result.initial_states, strict=True):
         parts.append(f"<h3>{html.escape(motion.motion.name)}</h3><p>{image(motion_plot(result, motion, start))}</p>")
     page = f"<!doctype html><html lang=en><meta charset=utf-8><title>{TITLE}</title><style>{STYLE}</style>"
     write_atomically(folder / "report.html", (page + "\n".join(parts) + "</html>\n").encode())
@@ -153,8 +165,21 @@ def summary(result: Identification) -> str:
             f"</p><p class=note>The model does not fit the data within the noise: intervals are "
             f"{result.mismatch:.3g} times as wide as from noise alone."
         )
-    notes = "".join(f"<p class=note>{html.escape(line)}</p>" for line in result.warnings)
-    return f"<p>{text}</p>{notes}"
+    doubts = [f"The fit is not consistent: {result.inconsistency}."] if result.inconsistency else []
+    notes = "".join(f"<p class=note>{html.escape(line)}</p>" for line in (*doubts, *result.warnings))
+    return f"<p>{text}</p>{notes}<p>{html.escape(starts_line(result))}</p>"
+
+
+def starts_line(result: Identification) -> str:
+    """Return one line on whether the starts of the optimisation agree."""
+    if result.starts_agree is None:
+        return "one start"
+    others = ", ".join(
+        f"+{start.excess:.1f} (parameters within {start.difference:.2g} standard deviations)"
+        for start in result.starts[1:]
+    )
+    verb = "agree" if result.starts_agree else "do not agree"
+    return f"starts {verb}: cost of the others {others}"
 
 
 def open_directions(result: Identification) -> str:
@@ -186,13 +211,20 @@ def parameter_table(result: Identification) -> str:
 
 
 def fit_table(result: Identification) -> str:
-    """Return the HTML table of the fit: χ² and rms error of each motion and channel."""
-    rows = []
-    for fit in result.fits:
-        unit, factor = UNITS[fit.channel]
-        values = (f"{fit.nominal_chi2:.4g}", f"{fit.chi2:.3f}", f"{factor * fit.rms:.3g} {unit}")
-        rows.append(("", (fit.motion, fit.channel, *values)))
-    return html_table(("motion", "channel", "described χ²", "found χ²", "rms error"), rows)
+    """Return the HTML table of the fit: χ², its limit and rms error of each motion and channel."""
+    rows, fits = [], {(fit.motion, fit.channel): fit for fit in result.fits}
+    for test in result.tests:
+        cells = (f"{test.chi2:.3f}", f"{test.limit:.3f}", "yes" if test.passed else "no")
+        if fit := fits.get((test.motion, test.channel)):
+            unit, factor = UNITS[fit.channel]
+            rows.append(
+                ("", (test.motion, test.channel, f"{fit.nominal_chi2:.4g}", *cells, f"{factor * fit.rms:.3g} {unit}"))
+            )
+        else:
+            rows.append(("", (test.motion, "all channels", "", *cells, "")))
+    note = f"<p>If the model is right, any of these χ² exceeds its limit with probability {FAMILY_LEVEL:g}.</p>"
+    heads = ("motion", "channel", "described χ²", "found χ²", "limit", "consistent", "rms error")
+    return html_table(heads, rows) + note
 
 
 def image(figure: Any) -> str:

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
 
+from jumper_warp.identification.consistency import FitTest, fit_tests
 from jumper_warp.identification.least_squares import LeastSquares, NormalEquations, Point
 from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement
 from jumper_warp.identification.residuals import MotionResiduals
@@ -18,6 +19,9 @@ from jumper_warp.robot.values import RobotValues
 CONFIDENCE = 1.959964  # Standard deviations on either side of a 95 % interval
 LARGEST_CHI2 = 10.0
 """χ² above which a warning is given; simulations with other physics but right base and units give 3 to 5."""
+SAME_COST = 5.0
+"""Difference of the costs (of minus twice the log-likelihoods) of two starts below which they agree: contacts in other
+physics steps change the cost at a minimum by up to 4."""
 LARGEST_PRIOR_ERROR = 3.0
 """Standard deviations between a prior measurement and the identified robot above which a warning is given."""
 
@@ -52,6 +56,33 @@ class Fit:
     rms: float  # root mean square error [SI unit of the channel]
 
 
+class Minimum(NamedTuple):
+    """Local minimum of the cost that one start of the optimisation ended in."""
+
+    point: Point
+    normal: NormalEquations  # at the point
+
+
+@dataclass(frozen=True)
+class Start:
+    """Result of one start of the optimisation, compared with the best one."""
+
+    excess: float  # [1] Cost above that of the best start, over χ² if that is above 1
+    difference: float
+    """Largest difference of an identified parameter from the result, in standard deviations of the result."""
+
+
+def excess_costs(problem: LeastSquares, minima: Sequence[Minimum]) -> np.ndarray:
+    """Return the costs of minima (K,) above that of the first, the best, over its χ² if that is above 1."""
+    costs = np.array([minimum.normal.cost for minimum in minima])
+    return (costs - costs[0]) / problem.scale(minima[0].normal) if minima else costs
+
+
+def starts_agree(excess: Sequence[float] | np.ndarray) -> bool:
+    """Return whether a second start confirms the best, the first: a cost that is higher by less than `SAME_COST`."""
+    return len(excess) > 1 and excess[1] < SAME_COST
+
+
 @dataclass(frozen=True)
 class Identification:
     """Result of an identification of P parameters: estimate, uncertainty and fit."""
@@ -62,6 +93,9 @@ class Identification:
     mismatch: float  # [1] Smallest factor by which the model's errors widen all intervals; 1 if the model fits
     systematic: np.ndarray
     """(P,) Standard deviations of z from contradictions between channels and motions; 0 if the model fits."""
+    spread: np.ndarray  # (P,) Standard deviations of z between the minima of all starts, weighed by their likelihood
+    starts: tuple[Start, ...]  # result of each start of the optimisation, best first
+    tests: tuple[FitTest, ...]  # tests of the fit of each channel of each motion, and of each motion
     chi2: float  # [1] Mean squared residual of the data over the noise
     nominal_chi2: float  # [1] χ² of the described robot at the nominal initial states
     count: int  # number of measured values
@@ -72,7 +106,7 @@ class Identification:
     effort: Effort
     prior_measurements: tuple[PriorMeasurement, ...]  # measurements of the robot other than motions, such as its mass
     motions: tuple[MotionResiduals, ...]
-    starts: tuple[np.ndarray, ...]  # identified coordinates (I,) of each motion's initial state
+    initial_states: tuple[np.ndarray, ...]  # identified coordinates (I,) of each motion's initial state
 
     @property
     def values(self) -> np.ndarray:
@@ -81,9 +115,9 @@ class Identification:
 
     @property
     def std(self) -> np.ndarray:
-        """Standard deviations of the normalised parameters, with errors of the model, at most the prior's 1, (P,)."""
+        """Standard deviations of the normalised parameters: noise, model and starts, at most the prior's 1, (P,)."""
         noise = self.mismatch * np.sqrt(np.diag(self.covariance))
-        return np.minimum(np.hypot(noise, self.systematic), 1.0)
+        return np.minimum(np.sqrt(noise**2 + self.systematic**2 + self.spread**2), 1.0)
 
     @property
     def intervals(self) -> np.ndarray:
@@ -97,6 +131,30 @@ class Identification:
     def identified(self) -> np.ndarray:
         """Whether the data determines each parameter: its standard deviation is below half the prior's, (P,) bool."""
         return self.std < 0.5
+
+    @property
+    def starts_agree(self) -> bool | None:
+        """Whether two starts ended in minima of the same cost; None if there was one start."""
+        return starts_agree([start.excess for start in self.starts]) if len(self.starts) > 1 else None
+
+    @property
+    def consistent(self) -> bool:
+        """Whether the fit passes all tests and its starts agree, if there were several."""
+        return self.starts_agree is not False and all(test.passed for test in self.tests)
+
+    @property
+    def inconsistency(self) -> str:
+        """Reasons why the fit is not consistent, one line; empty if it is."""
+        failed = sorted((test for test in self.tests if not test.passed), key=lambda test: test.limit / test.chi2)
+        reasons = [
+            f"{test.motion} {test.channel or 'in all channels'} χ² {test.chi2:.4g} above {test.limit:.4g}"
+            for test in failed[:3]
+        ]
+        if len(failed) > 3:
+            reasons.append(f"{len(failed) - 3} more")
+        if self.starts_agree is False:
+            reasons.append(f"no two of {len(self.starts)} starts agree")
+        return ", ".join(reasons)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -154,16 +212,13 @@ def channel_errors(problem: LeastSquares, point: Point) -> list[ChannelError]:
 
 
 def summarise(
-    problem: LeastSquares,
-    point: Point,
-    normal: NormalEquations,
-    steps: Sequence[DescentStep],
-    effort: Callable[[], Effort],
+    problem: LeastSquares, minima: Sequence[Minimum], steps: Sequence[DescentStep], effort: Callable[[], Effort]
 ) -> Identification:
-    """Summarise an identification that ended at `point`: estimate, uncertainty and fit.
+    """Summarise an identification: estimate, uncertainty and fit.
 
-    normal: the normal equations there. steps: log of the optimisation. effort: called after all evaluations.
+    minima: of all starts, best first. steps: log of the optimisation. effort: called after all evaluations.
     """
+    point, normal = minima[0]
     nominal, errors = (channel_errors(problem, at) for at in (problem.nominal_point(), point))
     fits = [
         Fit(error.motion, error.channel, error.cost / error.count, old.cost / old.count, error.rms)
@@ -179,12 +234,18 @@ def summarise(
     mismatch = mismatch_factor(tables)
     columns = [np.nonzero(motion.valid)[1] for motion in problem.motions]
     systematic = systematic_std(normal, columns, covariance) if mismatch > 1.0 else np.zeros(len(point.z))
-    return Identification(
+    excess = excess_costs(problem, minima)
+    distance = np.array([minimum.point.z - point.z for minimum in minima])
+    weight = np.exp(-0.5 * excess) / np.sum(np.exp(-0.5 * excess))
+    result = Identification(
         parameters=problem.parameters,
         z=point.z,
         covariance=covariance,
         mismatch=mismatch,
         systematic=systematic,
+        spread=np.sqrt(weight @ distance**2),
+        starts=(),
+        tests=fit_tests(problem, normal),
         chi2=sum(error.cost for error in errors) / problem.count,
         nominal_chi2=sum(error.cost for error in nominal) / problem.count,
         count=problem.count,
@@ -195,5 +256,8 @@ def summarise(
         effort=effort(),
         prior_measurements=tuple(problem.prior_measurements),
         motions=tuple(problem.motions),
-        starts=tuple(point.starts),
+        initial_states=tuple(point.starts),
     )
+    far = np.max(np.abs(distance / result.std), axis=1, where=result.identified, initial=0.0)
+    starts = tuple(Start(float(e), float(d)) for e, d in zip(excess, far, strict=True))
+    return replace(result, starts=starts)

@@ -56,23 +56,30 @@ def mismatch_factor(tables: Sequence[np.ndarray]) -> float:
     """
     squares = np.concatenate([table[np.isfinite(table)] for table in tables]) ** 2
     chi2 = float(np.mean(squares))
-    lags = np.zeros(MAX_LAGS + 1)
-    for table in tables:
-        for column in table.T:
-            values = column[np.isfinite(column)]
-            if len(values) < 8:
-                continue
-            n = len(values)
-            spectrum = np.fft.rfft(values, 2 * n)
-            correlation = np.fft.irfft(np.abs(spectrum) ** 2)[: min(n, MAX_LAGS + 1)]
-            lags[: len(correlation)] += correlation
-    correlation = lags[1:] / max(lags[0], 1.0e-300)
-    # the sum ends where noise dominates
-    below = np.flatnonzero(correlation < 3.0 / np.sqrt(len(squares)))
-    tau = 1.0 + 2.0 * float(np.sum(correlation[: below[0] if len(below) else len(correlation)]))
+    correlation = autocorrelation([column[np.isfinite(column)] for table in tables for column in table.T])
+    tau = 1.0 + 2.0 * float(np.sum(correlation))
     excess = max(chi2, 1.0) * max(tau, 1.0)
     # an excess within six standard deviations of chance is noise
     return float(np.sqrt(excess)) if excess > 1.0 + 6.0 * np.sqrt(2.0 / len(squares)) else 1.0
+
+
+def autocorrelation(columns: Sequence[np.ndarray]) -> np.ndarray:
+    """Return the common autocorrelation [1] of series of residuals at lags 1, 2, ... up to where noise dominates.
+
+    The last lag is before the first with an autocorrelation below three standard deviations of its chance value, and
+    at most `MAX_LAGS`. columns: (n,) each; series of less than 8 values do not count.
+    """
+    lags = np.zeros(MAX_LAGS + 1)
+    for values in columns:
+        n = len(values)
+        if n < 8:
+            continue
+        spectrum = np.fft.rfft(values, 2 * n)
+        products = np.fft.irfft(np.abs(spectrum) ** 2)[: min(n, MAX_LAGS + 1)]
+        lags[: len(products)] += products
+    correlation = lags[1:] / max(lags[0], 1.0e-300)
+    below = np.flatnonzero(correlation < 3.0 / np.sqrt(max(sum(map(len, columns)), 1)))
+    return correlation[: below[0] if len(below) else len(correlation)]
 
 
 def systematic_std(normal: NormalEquations, columns: Sequence[np.ndarray], covariance: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import json
+import os
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,7 +11,8 @@ from typing import Any
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import task_name
 from jumper_warp.utils.assets import POLICIES, policy_tasks
-from jumper_warp.utils.errors import suggestion
+from jumper_warp.utils.errors import InputError, suggestion
+from jumper_warp.utils.files import read_file, read_json
 
 MANIFEST = "manifest.json"
 CONFIG = "config.json"
@@ -92,17 +93,19 @@ def _no_policy(text: str, path: Path) -> str:
 def summarise(folder: Path) -> PolicySummary:
     """Return the summary of the policy in a folder. Raises PolicyError: it is no policy, or a file is malformed."""
     try:
-        task = json.loads((folder / CONFIG).read_bytes())["interface"]["task"]
+        task = read_json(folder / CONFIG, "configuration")["interface"]["task"]
         size, readme, metrics = (folder / ONNX).stat().st_size, folder / README, folder / METRICS
-        about = first_paragraph(readme.read_text(encoding="utf-8")) if readme.is_file() else ""
-        saved = json.loads(metrics.read_bytes()) if metrics.is_file() else {"rows": []}
+        about = first_paragraph(read_file(readme, "page").decode()) if os.path.lexists(readme) else ""
+        saved = read_json(metrics, "metrics") if os.path.lexists(metrics) else {"rows": []}
         rows = saved["rows"] if "rows" in saved else [{"condition": "as evaluated", "seed": 0, **saved}]
         summary = PolicySummary(folder.resolve().name, folder, str(task), about, size, rows)
         _ = summary.success, summary.error  # raise KeyError or TypeError for metrics of another format
         return summary
     except OSError as error:
         reason = f"{Path(error.filename or folder).name}: {error.strerror}"
-    except (ValueError, KeyError, TypeError, AttributeError) as error:
+    except InputError as error:
+        reason = str(error)
+    except (ValueError, LookupError, TypeError, AttributeError) as error:
         reason = f"{type(error).__name__}: {error}"
     raise PolicyError(f"{folder}: not a policy's folder ({reason}); jumper export makes one of a training run")
 

@@ -9,11 +9,9 @@ code.
 from __future__ import annotations
 
 import hashlib
-import json
 import os
 import re
 import shutil
-import stat
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -25,12 +23,13 @@ from jumper_warp.policies.onnx import onnx_bytes, policy_from_onnx
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.utils.checks import version_error
-from jumper_warp.utils.files import json_bytes, write_atomically
+from jumper_warp.utils.files import json_bytes, parse_json, read_file, write_atomically
 from jumper_warp.utils.runtime import source_versions
 
 FORMAT = "jumper-warp policy"
 SCHEMA_VERSION = 3
-MAX_BYTES = 256 * 2**20  # Larger files are refused without reading
+PURPOSE = "file of a policy"
+PICTURES = (".png", ".webp", ".jpg", ".gif")  # Suffixes of files that a policy does not need
 FILE_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 FILE_SUFFIXES = (".pt", ".pth", ".onnx", ".safetensors")  # Suffixes that a policy's folder may not have
 
@@ -110,7 +109,7 @@ def _write(folder: Path, files: Mapping[str, bytes], checksums: Mapping[str, str
 
 
 def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
-    """Return a policy by name or folder (see `find_policy`), after verifying every file.
+    """Return a policy by name or folder (see `find_policy`), after verifying every file; pictures may be missing.
 
     Raises PolicyError: the policy is missing, truncated, altered, of another version, or its weights are not finite or
     not of the shape in its configuration.
@@ -133,7 +132,7 @@ def _verified_checksums(folder: Path) -> dict[str, str]:
     Raises PolicyError.
     """
     path = folder / MANIFEST
-    manifest = _parse_json(path, _read_bytes(path))
+    manifest = _parse_json(path, read_file(path, PURPOSE, error=PolicyError))
     if manifest.get("format") != FORMAT:
         raise PolicyError(f"{path}: not the manifest of a {FORMAT}")
     _check_version(path, manifest)
@@ -143,7 +142,8 @@ def _verified_checksums(folder: Path) -> dict[str, str]:
     for name, digest in checksums.items():
         if not FILE_NAME.fullmatch(name):
             raise PolicyError(f"{path}: names a file {name!r:.60}")
-        _read_verified(folder / name, digest)
+        if not name.endswith(PICTURES) or os.path.lexists(folder / name):
+            _read_verified(folder / name, digest)
     return checksums
 
 
@@ -158,35 +158,15 @@ def _read_verified(path: Path, digest: Any) -> bytes:
 
     Raises PolicyError: it cannot be read, or its SHA-256 is not `digest`.
     """
-    data = _read_bytes(path)
+    data = read_file(path, PURPOSE, error=PolicyError)
     if hashlib.sha256(data).hexdigest() != digest:
         raise PolicyError(f"{path}: truncated or altered, its SHA-256 is not the manifest's")
     return data
 
 
-def _read_bytes(path: Path) -> bytes:
-    """Read a regular file of limited size.
-
-    Raises PolicyError: it cannot be read, is not a regular file, or is too large.
-    """
-    try:
-        status = path.stat()
-        if not stat.S_ISREG(status.st_mode):
-            raise PolicyError(f"{path}: cannot be read (not a file)")
-        if status.st_size > MAX_BYTES:
-            raise PolicyError(f"{path}: larger than {MAX_BYTES >> 20} MiB")
-        return path.read_bytes()
-    except OSError as error:
-        raise PolicyError(f"{path}: cannot be read ({error.strerror})") from error
-
-
 def _parse_json(path: Path, data: bytes) -> dict[str, Any]:
-    """Return the JSON object in `data`; path: for messages. Raises PolicyError: it is none, or holds NaN."""
-    try:
-        content = json.loads(data)
-        json_bytes(content)  # raises ValueError for content that could not be saved again
-    except (ValueError, RecursionError) as error:
-        raise PolicyError(f"{path}: not JSON ({type(error).__name__})") from error
+    """Return the JSON object in `data`; path: for messages. Raises PolicyError: it is none."""
+    content = parse_json(data, str(path), PolicyError)
     if not isinstance(content, dict):
         raise PolicyError(f"{path}: not a JSON object")
     return content

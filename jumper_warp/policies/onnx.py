@@ -19,15 +19,13 @@ from google.protobuf.message import DecodeError
 from onnx import TensorProto, helper, numpy_helper
 
 from jumper_warp.policies.policy import Policy, check_tensors
-from jumper_warp.policies.spec import PolicyError, PolicyInterface
+from jumper_warp.policies.spec import METADATA_VERSION, SOURCE_KEYS, PolicyError, PolicyInterface, checksum_entry
 from jumper_warp.utils.files import write_atomically
 
 OPSET = 18
 IR_VERSION = 9
 INPUT, OUTPUT = "obs", "actions"
 OPERATORS = {"elu": "Elu", "relu": "Relu", "tanh": "Tanh"}
-METADATA_VERSION = 2
-CONFIG_KEYS = ("commit", "dirty")  # Entries of a policy's configuration that are copied to the metadata
 NORMALISER_TENSORS = {"mean": "normaliser.mean", "std": "normaliser.std"}
 """Names of the normaliser's tensors in `Policy.tensors`, by ONNX initialiser."""
 LAYER_INITIALISER = re.compile(r"actor_(\d+)_(weight|bias|block)")
@@ -128,7 +126,7 @@ def metadata(policy: Policy, config: Mapping[str, Any]) -> dict[str, str]:
     interface = policy.interface
     joints = ("joint_names", "joint_stiffness", "joint_damping", "default_joint_pos", "action_scale")
     lists = {name: getattr(interface, name) for name in (*joints, "observation_names")}
-    commit = {key: config.get(key) for key in CONFIG_KEYS}
+    commit = {key: config.get(key) for key in SOURCE_KEYS}
     full = {**commit, "schema_version": METADATA_VERSION, **interface.to_json()}
     entries = {name: ",".join(map(str, values)) for name, values in lists.items()}
     return entries | {"jumper_warp": json.dumps(full, ensure_ascii=False, allow_nan=False)}
@@ -188,8 +186,9 @@ def _read_tensors(initialisers: Iterable[TensorProto]) -> dict[str, torch.Tensor
 
 
 def export_onnx(policy: Policy, path: Path) -> Path:
-    """Write a policy as one ONNX file, atomically, and return its path."""
+    """Write a policy as one ONNX file with its checksum, atomically, and return its path."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
-    write_atomically(path, onnx_bytes(policy))
+    data = onnx_bytes(policy)
+    write_atomically(path, data + checksum_entry(data))
     return path

@@ -24,6 +24,7 @@ from jumper_warp.rl.networks import NORMALISED_LIMIT, VARIANCE_EPS
 from jumper_warp.rl.resume import CHECKPOINTS
 from jumper_warp.rl.run_folder import CONFIG
 from jumper_warp.tasks.saving import TaskError, check_version
+from jumper_warp.utils.files import parse_json, read_file, read_json
 
 CURVE = (
     "iteration", "Perf/elapsed_s", "Train/mean_reward", "Train/mean_episode_length", "Metrics/success", "Metrics/score",
@@ -124,7 +125,7 @@ class CheckpointContents:
         Raises TaskError: its task has another version. CheckpointError: a part is missing or of another type.
         """
         try:
-            config = json.loads(state["config"])
+            config = parse_json(state["config"], "config")
             env, ppo = config["env"], config["train"]["ppo"]
             check_version(env["task"])
             model = state["ppo"]["model"]
@@ -163,12 +164,9 @@ def _with_source(config: dict[str, Any], iteration: int) -> dict[str, Any]:
 def _policy_of_rsl_rl(path: Path) -> Policy:
     """Return the policy of a checkpoint of rsl-rl. Raises PolicyError or CheckpointError, with its path."""
     file = path.parent / CONFIG
-    try:
-        config = json.loads(file.read_text())
-    except OSError as error:
-        raise CheckpointError(f"{path}: needs {CONFIG} beside it, see RslRlVecEnv.write_config") from error
-    except (ValueError, RecursionError) as error:
-        raise CheckpointError(f"{file}: not readable") from error
+    if not file.exists():
+        raise CheckpointError(f"{path}: needs {CONFIG} beside it, see RslRlVecEnv.write_config")
+    config = read_json(file, "settings of a run", error=CheckpointError)
     return _policy_of_checkpoint(path, partial(CheckpointContents.from_rsl_rl, load_foreign_checkpoint(path), config))
 
 
@@ -208,7 +206,7 @@ def _symmetry(model: dict[str, torch.Tensor]) -> Symmetry | None:
 def learning_curve(source: Path) -> bytes | None:
     """Return the thinned learning curve of a run, or of a checkpoint's run; None without a metrics file."""
     path = run_folder(source) / METRICS_FILE
-    return thinned_curve(path.read_bytes()) if path.is_file() else None
+    return thinned_curve(read_file(path, "metrics of a run")) if path.is_file() else None
 
 
 def thinned_curve(metrics: bytes) -> bytes:
@@ -225,7 +223,7 @@ def thinned_curve(metrics: bytes) -> bytes:
 def _curve_row(line: bytes) -> dict[str, Any]:
     """Return the learning curve's values (keys CURVE) in one line of metrics; empty for a malformed line."""
     try:
-        row = json.loads(line)
+        row = parse_json(line, "metrics")
         return {name: row[name] for name in CURVE if name in row}
     except (ValueError, TypeError):
         return {}

@@ -3,18 +3,17 @@
 from __future__ import annotations
 
 import dataclasses
+import hashlib
 import math
 from dataclasses import dataclass, field
 from typing import Any, get_type_hints
 
-from jumper_warp.rl.cfg import ACTIVATIONS
-from jumper_warp.utils.checks import NAME
+from jumper_warp.utils.checks import ACTIVATIONS, MAX_HIDDEN, MAX_WIDTH, NAME, check_angle_limits, check_filter_speed
 from jumper_warp.utils.errors import InputError
 
-MAX_HIDDEN = 64  # Largest number of hidden layers
 FULL_TURN = 2.0 * math.pi
 JOINT_BOUNDS = {
-    "action_scale": (-FULL_TURN, FULL_TURN),  # [rad]
+    "action_scale": (1.0e-4, FULL_TURN),  # [rad]
     "default_joint_pos": (-FULL_TURN, FULL_TURN),  # [rad]
     "joint_stiffness": (0.0, 1.0e4),  # [N m/rad]
     "joint_damping": (0.0, 1.0e3),  # [N m s/rad]
@@ -29,6 +28,12 @@ SCALAR_BOUNDS = {
 }
 """Lower and upper bounds of the interface's scalar fields."""
 LAYOUT_FIELDS = ("first", "end", "scale", "clip", "history")  # Fields of each term in an observation layout
+FILTERED = ("lateral", "transversal", "sum")  # Angles with limits in a command filter: two motors, and outer + inner
+LIMITS = ("lower", "upper", "lower_zone", "upper_zone")  # Limits of an angle in a command filter [deg]
+MAX_COLUMNS = 100_000  # Largest number of columns of an observation
+MAX_HISTORY = 1000  # Largest number of frames of an observation term
+METADATA_VERSION = 2  # Version of an ONNX file's metadata
+SOURCE_KEYS = ("commit", "dirty")  # Entries of a policy's configuration that are copied to the metadata
 
 
 class PolicyError(InputError):
@@ -67,8 +72,8 @@ class PolicyInterface:
         """Raise PolicyError if a field is out of range, or fields contradict each other."""
         for name in ("observation_names", "joint_names"):
             names = getattr(self, name)
-            if not names or len(set(names)) < len(names):
-                raise PolicyError(f"{name} must be distinct and not empty")
+            if not names or len(set(names)) < len(names) or len(names) > MAX_COLUMNS:
+                raise PolicyError(f"{name} must be distinct, 1 to {MAX_COLUMNS}")
         for name in (self.task, *self.observation_names, *self.joint_names):
             if not NAME.fullmatch(name):
                 raise PolicyError(f"names may contain letters, digits, _ . - and spaces, got {name!r:.60}")
@@ -81,8 +86,10 @@ class PolicyInterface:
                     raise PolicyError(f"{name} must lie in {low:.4g} to {high:.4g}, got {value:.4g}")
         if self.physics_dt > self.policy_dt:
             raise PolicyError(f"physics_dt must be at most policy_dt = {self.policy_dt}, got {self.physics_dt}")
-        if not 1 <= len(self.hidden) <= MAX_HIDDEN or not all(1 <= width <= 65536 for width in self.hidden):
-            raise PolicyError(f"hidden must name 1 to {MAX_HIDDEN} widths from 1 to 65536, got {self.hidden!s:.100}")
+        if not 1 <= len(self.hidden) <= MAX_HIDDEN or not all(1 <= width <= MAX_WIDTH for width in self.hidden):
+            raise PolicyError(
+                f"hidden must name 1 to {MAX_HIDDEN} widths from 1 to {MAX_WIDTH}, got {self.hidden!s:.100}"
+            )
         _check_filter(self.command_filter)
         _check_layout(self.observation_layout, len(self.observation_names))
         if self.activation not in ACTIVATIONS:
@@ -131,31 +138,62 @@ def _parse_field(name: str, value: Any, hint: str) -> Any:
     return tuple(values) if is_tuple else values[0]
 
 
+def _is_number(value: Any) -> bool:
+    """Return whether a value is a finite number, and not a bool."""
+    return isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1.0e300
+
+
 def _check_filter(fields: dict[str, Any]) -> None:
-    """Raise PolicyError unless a command filter's fields are numbers within ±1e6, or dicts of such fields."""
-    for name, value in fields.items():
-        if not NAME.fullmatch(name):
-            raise PolicyError(f"command_filter cannot hold {name!r:.60}")
-        if isinstance(value, dict):
-            _check_filter(value)
-        elif isinstance(value, bool) or not isinstance(value, int | float) or not abs(value) < 1.0e6:
-            raise PolicyError(f"command_filter {name} must be a number within 1e6, got {value!r:.60}")
+    """Raise PolicyError unless a command filter has exactly the fields of `FilterCfg`, with valid values."""
+    expected: dict[str, Any] = {name: dict.fromkeys(LIMITS, 0.0) for name in FILTERED} | {
+        "horizon": 0.0,
+        "speed_floor": 0.0,
+    }
+    for place, known in (("", expected), *((name, expected[name]) for name in FILTERED)):
+        table = fields.get(place) if place else fields
+        if not isinstance(table, dict) or set(table) != set(known):
+            raise PolicyError(f"command_filter{place and ' '}{place} must have the fields {', '.join(known)}")
+        for name, value in table.items():
+            if not isinstance(known[name], dict) and not _is_number(value):
+                raise PolicyError(f"command_filter {name} must be a finite number, got {value!r:.60}")
+    try:
+        check_filter_speed(fields["horizon"], fields["speed_floor"])
+        for name in FILTERED:
+            check_angle_limits(name, **fields[name])
+    except InputError as error:
+        raise PolicyError(f"command_filter: {error}") from error
 
 
 def _check_layout(layout: dict[str, Any], width: int) -> None:
     """Raise PolicyError unless an observation layout is empty, or its terms fill `width` columns without gaps."""
     first = 0
     for name, term in layout.items():
-        numbers = list(term.values()) if isinstance(term, dict) and set(term) == set(LAYOUT_FIELDS) else [None]
-        if not NAME.fullmatch(name) or not all(
-            isinstance(value, int | float) and not isinstance(value, bool) and abs(value) < 1.0e9 for value in numbers
-        ):
-            raise PolicyError(f"observation_layout {name!r:.60} must have the numbers {', '.join(LAYOUT_FIELDS)}")
-        if term["first"] != first or term["end"] <= first or (term["end"] - first) % max(term["history"], 1):
-            raise PolicyError(f"observation_layout {name!r:.60} must begin at column {first} and hold whole frames")
-        first = term["end"]
+        where = f"observation_layout {name!r:.60}"
+        fields = term if isinstance(term, dict) else {}
+        whole = all(type(fields.get(key)) is int for key in ("first", "end", "history"))
+        if set(fields) != set(LAYOUT_FIELDS) or not whole or not NAME.fullmatch(name):
+            raise PolicyError(f"{where} must have {', '.join(LAYOUT_FIELDS)}; first, end and history whole numbers")
+        if fields["first"] != first or fields["end"] <= first or not 1 <= fields["history"] <= MAX_HISTORY:
+            raise PolicyError(f"{where} must begin at column {first}, with 1 to {MAX_HISTORY} frames")
+        if (fields["end"] - first) % fields["history"]:
+            raise PolicyError(f"{where} must hold whole frames")
+        for key in ("scale", "clip"):
+            if not _is_number(fields[key]) or not 1.0e-6 <= fields[key] <= 1.0e6:
+                raise PolicyError(f"{where}: {key} must lie in 1e-6 to 1e6, got {fields[key]!r:.60}")
+        first = fields["end"]
     if layout and first != width:
         raise PolicyError(f"observation_layout has {first} columns, the observation {width}")
+
+
+def checksum_entry(data: bytes) -> bytes:
+    """Return the bytes that append the SHA-256 of an ONNX file's content to its metadata, under the key `sha256`.
+
+    They are a `StringStringEntryProto` in field 14, `metadata_props`, of a `ModelProto`; its key and value are fields 1
+    and 2. Protocol buffers may be concatenated: the entry is added to the list.
+    """
+    digest = hashlib.sha256(data).hexdigest().encode()
+    entry = b"\x0a\x06sha256\x12" + bytes([len(digest)]) + digest
+    return b"\x72" + bytes([len(entry)]) + entry
 
 
 def make_interface(

@@ -6,11 +6,28 @@ from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Literal
 
-from jumper_warp.utils.checks import check_finite, check_not_negative, check_positive, check_seed
+from jumper_warp.utils.checks import (
+    ACTIVATIONS,
+    MAX_HIDDEN,
+    MAX_WIDTH,
+    check_bounds,
+    check_count,
+    check_not_negative,
+    check_positive,
+    check_seed,
+)
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.threads import checked_threads
 
-ACTIVATIONS = ("elu", "relu", "tanh")  # Names of the activations of hidden layers
+MOST_ITERATIONS = 10**9  # Largest number of iterations of a training
+PPO_BOUNDS = {
+    "num_steps": (1, 10_000, ""), "epochs": (1, 1000, ""), "minibatches": (1, 100_000, ""), "lr": (1.0e-12, 10.0, ""),
+    "max_grad_norm": (1.0e-6, 1.0e12, ""), "init_std": (1.0e-4, 100.0, ""), "clip": (1.0e-6, 100.0, ""),
+    "reward_scale": (1.0e-6, 1.0e6, ""), "value_coef": (0.0, 1.0e6, ""), "entropy_coef": (0.0, 1.0e6, ""),
+    "final_entropy_coef": (0.0, 1.0e6, ""), "desired_kl": (0.0, 100.0, "nat"), "final_desired_kl": (0.0, 100.0, "nat"),
+    "gamma": (0.0, 1.0, ""), "lam": (0.0, 1.0, ""), "max_lr": (0.0, 10.0, ""),
+}  # fmt: skip
+"""Smallest and largest value of settings of PPO, and unit."""
 LATEST, LATEST_OR_NEW = "latest", "latest-or-new"  # Values of `TrainCfg.resume` that are not paths
 
 
@@ -81,22 +98,14 @@ class PpoCfg:
 
     def __post_init__(self) -> None:
         """Raise InputError (a ValueError) if a setting of PPO is out of range."""
-        for name in ("num_steps", "epochs", "minibatches", "lr", "max_grad_norm", "init_std", "clip", "reward_scale"):
-            check_positive(name, getattr(self, name))
-        for name in ("value_coef", "entropy_coef", "desired_kl", "final_desired_kl"):
-            check_not_negative(name, getattr(self, name))
-        if self.final_entropy_coef is not None:
-            check_not_negative("final_entropy_coef", self.final_entropy_coef)
-        for name in ("gamma", "lam"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise InputError(f"{name} must be in [0, 1], got {getattr(self, name)}")
-        check_finite("max_lr", self.max_lr)
+        check_bounds("ppo", self, PPO_BOUNDS)
         if not 0.0 < self.min_lr <= self.lr <= self.max_lr:
             raise InputError(f"need 0 < min_lr <= lr <= max_lr, got {self.min_lr}, {self.lr}, {self.max_lr}")
         if self.symmetry not in ("off", "actor"):
             raise InputError(f"symmetry must be off or actor, got {self.symmetry!r:.40}")
-        if not self.hidden or min(self.hidden) < 1:
-            raise InputError(f"hidden must name at least one positive width, got {self.hidden}")
+        if not 1 <= len(self.hidden) <= MAX_HIDDEN or not 1 <= min(self.hidden) <= max(self.hidden) <= MAX_WIDTH:
+            widths = f"1 to {MAX_HIDDEN} widths of 1 to {MAX_WIDTH}"
+            raise InputError(f"hidden must name {widths}, got {self.hidden!s:.60}")
         if self.activation not in ACTIVATIONS:
             raise InputError(f"activation must be one of {', '.join(ACTIVATIONS)}, got {self.activation}")
 
@@ -174,7 +183,8 @@ class TrainCfg:
     max_checkpoints: int = 3
     """Number of newest checkpoints to keep; the best checkpoint is never deleted."""
     best_metric: str = "Metrics/success"
-    """Logged metric that selects the best checkpoint; higher is better."""
+    """Logged metric that selects the best checkpoint; higher is better. Checkpoints saved while most worlds are below
+    the last curriculum level are left out."""
     resume: str | None = None
     """Run to continue: its folder, a checkpoint, latest or latest-or-new. `latest` is the task's latest run with a
     checkpoint; `latest-or-new` starts a new run if there is none. `jumper train` uses the saved settings of that run
@@ -201,9 +211,9 @@ class TrainCfg:
     def __post_init__(self) -> None:
         """Raise InputError (a ValueError) if a setting of the training is out of range."""
         object.__setattr__(self, "log_root", Path(self.log_root))
-        for name in ("num_envs", "max_iterations", "log_interval", "save_interval", "max_checkpoints"):
-            if getattr(self, name) < 1:
-                raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
+        check_count("num_envs", self.num_envs)
+        for name in ("max_iterations", "log_interval", "save_interval", "max_checkpoints"):
+            check_count(name, getattr(self, name), MOST_ITERATIONS)
         check_not_negative("max_seconds", self.max_seconds)
         checked_threads(self.threads)
         check_seed(self.seed)

@@ -12,12 +12,14 @@ from typing import Any, NamedTuple
 import torch
 
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.files import existing_file, read_file, read_json, write_atomically
 
 MANIFEST = "manifest.json"  # File in the checkpoints' folder with SHA-256, iteration and score of each
+PURPOSE = "checkpoint of a training"
+MAX_BYTES = 8 * 2**30  # Size of the largest checkpoint that is read
 REQUIRED = {"iteration": int, "ppo": dict, "env": dict, "rng": dict, "config": str}
 """Required keys of a checkpoint, and the types of their values."""
-DECODE_ERRORS = (LookupError, TypeError, ValueError, AttributeError, RuntimeError)
+DECODE_ERRORS = (LookupError, TypeError, ValueError, AttributeError, RuntimeError, ArithmeticError)
 """Exceptions raised on reading a part of a checkpoint that is missing or of another type."""
 
 
@@ -68,15 +70,11 @@ def load_checkpoint(path: Path) -> dict[str, Any]:
     Raises CheckpointError: the file is missing, damaged, without checksum, or no checkpoint; or its iteration
     differs from the manifest.
     """
-    if not path.is_file():
-        raise CheckpointError(f"{path}: no such file (checkpoint of a training)")
+    existing_file(path, PURPOSE, MAX_BYTES, CheckpointError)
     entry = _read_manifest(path.parent).get(path.name)
     if entry is None:
         raise CheckpointError(f"{path}: has no checksum in {MANIFEST}")
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise CheckpointError(f"{path}: {error.strerror}") from error
+    data = read_file(path, PURPOSE, MAX_BYTES, CheckpointError)
     if hashlib.sha256(data).hexdigest() != entry["sha256"]:
         raise CheckpointError(f"{path}: differs from its checksum in {MANIFEST}")
     state = _decoded(path, data)
@@ -95,10 +93,7 @@ def load_foreign_checkpoint(path: Path) -> Any:
 
     Raises CheckpointError: the file cannot be read, or holds something else.
     """
-    try:
-        return _decoded(path, path.read_bytes())
-    except OSError as error:
-        raise CheckpointError(f"{path}: {error.strerror}") from error
+    return _decoded(path, read_file(path, PURPOSE, MAX_BYTES, CheckpointError))
 
 
 def _decoded(path: Path, data: bytes) -> Any:
@@ -152,14 +147,9 @@ def _read_manifest(folder: Path, missing_ok: bool = False) -> dict[str, dict[str
     path = folder / MANIFEST
     if missing_ok and not path.exists():
         return {}
-    try:
-        manifest = json.loads(path.read_text())
-        if not all(_is_entry(entry) for entry in manifest.values()):
-            raise CheckpointError(f"{path}: not readable")
-    except OSError as error:
-        raise CheckpointError(f"{path}: {error.strerror}") from error
-    except (ValueError, AttributeError, RecursionError) as error:
-        raise CheckpointError(f"{path}: not readable") from error
+    manifest = read_json(path, "checksums of checkpoints", error=CheckpointError, finite=False)  # scores may be NaN
+    if not isinstance(manifest, dict) or not all(_is_entry(entry) for entry in manifest.values()):
+        raise CheckpointError(f"{path}: not readable")
     return manifest
 
 

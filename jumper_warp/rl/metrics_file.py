@@ -67,5 +67,5 @@ def _iteration_of(line: bytes) -> float:
     """Return the iteration of a line of metrics; infinity for a malformed line."""
     try:
         return int(json.loads(line)["iteration"])
-    except (ValueError, KeyError, TypeError, RecursionError):
+    except (ValueError, KeyError, TypeError, RecursionError, OverflowError):
         return math.inf

@@ -317,7 +317,7 @@ class TrainingRun:
         state["config"] = json.dumps(self.config)
         folder = self.folder / CHECKPOINTS
         try:
-            path = save_checkpoint(folder, state, self.metrics.get(self.cfg.best_metric), self.cfg.max_checkpoints)
+            path = save_checkpoint(folder, state, self._score(), self.cfg.max_checkpoints)
         except OSError as error:
             if is_last:
                 raise CheckpointError(f"{folder}: checkpoint not saved: {error.strerror}") from error
@@ -326,6 +326,12 @@ class TrainingRun:
         if is_last:
             hint = f", continue with: {self.resume_command}"
             log.print_line(f"saved {path}{hint if stop.requested or self.failure else ''}")
+
+    def _score(self) -> float | None:
+        """Return the metric that selects the best checkpoint; None while most worlds are below the last level."""
+        levels = [value for name, value in self.metrics.items() if name.startswith("Curriculum/fraction_at_level_")]
+        at_end = sum(levels[-2:])  # worlds at the last level, and those that passed it
+        return self.metrics.get(self.cfg.best_metric) if not levels or at_end >= 0.5 else None
 
     @property
     def resume_command(self) -> str:

@@ -7,9 +7,7 @@ from its twin. Quaternions are xyzw.
 from __future__ import annotations
 
 import functools
-import json
 import math
-from collections import Counter
 from collections.abc import Sequence
 from pathlib import Path
 from types import MappingProxyType
@@ -26,11 +24,13 @@ from jumper_warp.robot.parts import (
     Motor,
     RobotDescription,
     RobotDescriptionError,
+    description_error,
     make_read_only,
     require,
 )
 from jumper_warp.robot.urdf import UrdfReader, file_inside, read_text
 from jumper_warp.utils.assets import ASSETS
+from jumper_warp.utils.files import parse_json
 
 __all__ = [
     "DEFAULT_DESCRIPTION", "LEGS", "MOTOR_JOINTS", "RobotDescription", "RobotDescriptionError", "knee_angles",
@@ -84,33 +84,12 @@ class JsonReader:
 
     def __init__(self, file: Path):
         self.file = file
-        try:
-            self.root = json.loads(
-                read_text(file), object_pairs_hook=self.unique_keys, parse_constant=self.refuse_constant
-            )
-        except json.JSONDecodeError as err:
-            raise RobotDescriptionError(file, f"line {err.lineno}", f"expected JSON ({err.msg})") from err
-        except RobotDescriptionError:
-            raise
-        except (ValueError, RecursionError) as err:
-            raise RobotDescriptionError(file, "", f"expected JSON ({type(err).__name__})") from err
+        self.root = parse_json(read_text(file), str(file), description_error)
         self.require(isinstance(self.root, dict), "", "expected a JSON object")
 
     def require(self, holds: bool, part: str, problem: str) -> None:
         """Raise RobotDescriptionError, which names this file, unless `holds`; problem: text of the message."""
         require(holds, self.file, part, problem)
-
-    def unique_keys(self, pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-        """Convert the (key, value) pairs of a JSON object to a dict; refuse a key that occurs twice."""
-        table = dict(pairs)
-        if len(table) < len(pairs):
-            double = Counter(key for key, _ in pairs).most_common(1)[0][0]
-            raise RobotDescriptionError(self.file, double, "expected one entry, found two")
-        return table
-
-    def refuse_constant(self, name: str) -> None:
-        """Raise RobotDescriptionError for the JSON constants NaN and Infinity; `json` calls it."""
-        raise RobotDescriptionError(self.file, "", f"expected finite numbers, found {name}")
 
     def get(self, table: dict, key: str, part: str, kind: type) -> Any:
         """Return an entry of a JSON object; refuse one that is missing or not of the Python type `kind`."""

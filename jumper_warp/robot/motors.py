@@ -14,11 +14,17 @@ from jumper_warp.kernels.actuation import command_filter
 from jumper_warp.kernels.actuation import motors as actuator
 from jumper_warp.robot.description import RobotDescription, load_description
 from jumper_warp.robot.parts import Motor
-from jumper_warp.utils.checks import check_count, check_not_negative
+from jumper_warp.utils.checks import check_angle_limits, check_bounds, check_count, check_filter_speed
 from jumper_warp.utils.errors import InputError
 
 OVERSPEED_START, OVERSPEED_END = math.radians(2000.0), math.radians(2500.0)
 """[rad/s] Speeds at which over-speed protection starts to reduce the torque, and at which the torque is 0."""
+MAX_FADE = 1.0e4  # [rad/s] Highest speed at which over-speed protection may end
+MOTOR_BOUNDS = {
+    "kp": (0.0, 1.0e4, "N m/rad"), "kd": (0.0, 1.0e3, "N m s/rad"), "saturation": (1.0e-3, 1.0e3, "N m"),
+    "peak": (1.0e-3, 1.0e3, "N m"), "cutoff_speed": (0.0, 1.0e3, "rad/s"), "no_load_speed": (0.0, 1.0e3, "rad/s"),
+}  # fmt: skip
+"""Smallest and largest value of the fields of `MotorKindCfg`, and unit."""
 MOTOR_CONSTANTS = ("kp", "kd", "saturation", "peak", "cutoff_speed", "no_load_speed", "offset")
 """Constants of a motor in `MotorArrays`; units as in `jumper_warp.kernels.actuation.motors`."""
 LIMITS = ("lower", "upper", "lower_zone", "upper_zone")
@@ -45,11 +51,8 @@ class MotorKindCfg:
     """[rad/s] Speed from which no driving torque is available."""
 
     def __post_init__(self) -> None:
-        """Raise InputError if a value is negative or not finite, a torque limit is 0, or no_load_speed is too low."""
-        for name, value in vars(self).items():
-            check_not_negative(f"motor {name}", value)
-        if self.saturation == 0.0 or self.peak == 0.0:
-            raise InputError("motor saturation and peak torque must be > 0, got 0")
+        """Raise InputError if a value is outside its range in MOTOR_BOUNDS, or no_load_speed is too low."""
+        check_bounds("motor", self, MOTOR_BOUNDS)
         if self.no_load_speed <= self.cutoff_speed:
             raise InputError(f"no_load_speed must be > cutoff_speed = {self.cutoff_speed}, got {self.no_load_speed}")
 
@@ -66,9 +69,10 @@ class MotorCfg:
     """[rad/s] Speed from which the torque is 0."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless the over-speed protection has finite speeds 0 <= fade_start < fade_end."""
-        if not 0.0 <= self.fade_start < self.fade_end < math.inf:
-            raise InputError(f"need 0 <= fade_start < fade_end, finite, got {self.fade_start}, {self.fade_end}")
+        """Raise InputError unless the over-speed protection has speeds 0 <= fade_start < fade_end <= MAX_FADE."""
+        if not 0.0 <= self.fade_start < self.fade_end <= MAX_FADE:
+            speeds = f"{self.fade_start}, {self.fade_end}"
+            raise InputError(f"need 0 <= fade_start < fade_end <= {MAX_FADE:g} rad/s, got {speeds}")
 
     @classmethod
     def from_description(
@@ -149,13 +153,8 @@ class LimitsCfg:
     """[deg] Width of the hard zone inside the upper limit."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless the angle's limits are finite, lower < upper, and zones >= 0 without overlap."""
-        if not -math.inf < self.lower < self.upper < math.inf:
-            raise InputError(f"lower limit must be below upper limit, both finite, got {self.lower}, {self.upper}")
-        if not (self.lower_zone >= 0.0 and self.upper_zone >= 0.0):
-            raise InputError(f"hard zones must be >= 0, got {self.lower_zone}, {self.upper_zone}")
-        if not self.lower_zone + self.upper_zone <= self.upper - self.lower:
-            raise InputError(f"hard zones {self.lower_zone}, {self.upper_zone} overlap between the limits")
+        """Raise InputError as `check_angle_limits`."""
+        check_angle_limits("angle", **vars(self))
 
 
 @dataclass(frozen=True)
@@ -172,10 +171,8 @@ class FilterCfg:
     """[deg/s] Least speed assumed toward a limit."""
 
     def __post_init__(self) -> None:
-        """Raise InputError unless horizon and speed floor of the command filter are finite and above 0."""
-        for name in ("horizon", "speed_floor"):
-            if not 0.0 < getattr(self, name) < math.inf:
-                raise InputError(f"filter {name} must be finite and > 0, got {getattr(self, name)}")
+        """Raise InputError as `check_filter_speed`."""
+        check_filter_speed(self.horizon, self.speed_floor)
 
 
 JUMP_LATERAL = LimitsCfg(-15.0, 15.0, lower_zone=10.0, upper_zone=15.0)

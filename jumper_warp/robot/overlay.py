@@ -16,7 +16,7 @@ from jumper_warp.robot.bounds import Range
 from jumper_warp.robot.description import RobotDescription
 from jumper_warp.robot.values import RobotValues
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import existing_file, write_atomically
+from jumper_warp.utils.files import read_json, write_atomically
 
 SCHEMA = "jumper-warp robot overlay 1"
 RATIO = Range(0.05, 3.0, "times the described value")
@@ -41,12 +41,26 @@ RANGES = {
 }
 """Allowed values by field of `RobotValues`."""
 SECTIONS = ("schema", "source", "values", "randomization")
-RANDOMIZED = (
-    "static_friction", "dynamic_friction", "base_mass", "link_mass", "com_shift", "gains", "damping_gains",
-    "no_load_speed", "cutoff_speed", "motor_friction", "armature", "joint_offset", "latency", "observation_latency",
-    "push_force", "push_torque", "push_interval",
-)  # fmt: skip
-"""Names that `RobotOverlay.randomization` may have: the ranges of `RandomizationCfg`."""
+RANDOMIZED = {
+    "static_friction": RANGES["paw_friction"],
+    "dynamic_friction": RANGES["paw_friction"],
+    "base_mass": Range(-bounds.LINK_MASS.high, bounds.LINK_MASS.high, "kg"),
+    "link_mass": Range(0.0, 10.0, ""),
+    "com_shift": bounds.PLACE,
+    "gains": Range(0.0, 10.0, ""),
+    "damping_gains": Range(0.0, 10.0, ""),
+    "no_load_speed": Range(0.0, 10.0, ""),
+    "cutoff_speed": Range(0.0, 10.0, ""),
+    "motor_friction": bounds.MOTOR_FRICTION,
+    "armature": Range(0.0, 10.0, ""),
+    "joint_offset": Range(-30.0, 30.0, "deg"),
+    "latency": Range(0.0, 100.0, "ms"),
+    "observation_latency": Range(0.0, 100.0, "ms"),
+    "push_force": Range(-1.0e4, 1.0e4, "N"),
+    "push_torque": Range(-1.0e3, 1.0e3, "N m"),
+    "push_interval": Range(0.0, 1.0e3, "s"),
+}
+"""Allowed ends of the ranges that `RobotOverlay.randomization` may have: those of `RandomizationCfg`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,7 +82,11 @@ class RobotOverlay:
         for name, values in self.values.items():
             if len(values) != nominal[name].shape[1]:
                 raise InputError(f"robot overlay: {name} needs {nominal[name].shape[1]} values, got {len(values)}")
-            check_range(name, values)
+            check_range(name, values, RANGES[name])
+        for name, pair in self.randomization.items():
+            if len(pair) != 2 or not pair[0] <= pair[1]:
+                raise InputError(f"robot overlay: randomization {name!r:.60} must be [lower, upper], got {pair}")
+            check_range(f"randomization {name}", pair, RANDOMIZED[name])
         robot = self.robots()
         if not (robot.cutoff_speed < robot.no_load_speed).all():
             raise InputError("robot overlay: each cutoff_speed must be below the no_load_speed")
@@ -109,9 +127,6 @@ class RobotOverlay:
             if not isinstance(table, dict):
                 raise InputError(f"robot overlay: {section} must be an object")
             sections[section] = {name: finite_tuple(f"{section} {name}", values) for name, values in table.items()}
-        for name, pair in sections["randomization"].items():
-            if len(pair) != 2 or pair[0] > pair[1]:
-                raise InputError(f"robot overlay: randomization {name!r:.60} must be [lower, upper], got {pair}")
         return cls(**sections, source=str(saved.get("source", "")))
 
     def save(self, path: Path) -> None:
@@ -126,10 +141,10 @@ def check_names(noun: str, names: Iterable[str], known: Iterable[str]) -> None:
             raise InputError(f"robot overlay: unknown {noun} {name!r:.60}; expected one of {', '.join(known)}")
 
 
-def check_range(name: str, values: tuple[float, ...]) -> None:
-    """Raise InputError for a value of a quantity outside its range in `RANGES`."""
-    low, high, unit = RANGES[name]
-    hint = " (1: as described)" if RANGES[name] is RATIO else ""
+def check_range(name: str, values: tuple[float, ...], allowed: Range) -> None:
+    """Raise InputError for a value outside its range; name: of the quantity, for the message."""
+    low, high, unit = allowed
+    hint = " (1: as described)" if allowed is RATIO else ""
     for value in values:
         if not low <= value <= high:
             limits = f"{low:g} to {high:g}{unit and ' '}{unit}{hint}"
@@ -156,13 +171,11 @@ def with_springs(stiffness: float, length: float) -> RobotOverlay:
 def load_overlay(path: Path) -> RobotOverlay:
     """Read a robot overlay from a JSON file.
 
-    Raises InputError: it is missing or no overlay; OSError: it cannot be read.
+    Raises InputError: it cannot be read, or is no overlay.
     """
-    file = existing_file(path, "robot overlay, as jumper sysid writes it")
+    content = read_json(path, "robot overlay, as jumper sysid writes it")
     try:
-        return RobotOverlay.from_json(json.loads(file.read_text(encoding="utf-8")))
-    except (UnicodeDecodeError, json.JSONDecodeError, RecursionError) as error:
-        raise InputError(f"{path}: expected JSON ({type(error).__name__})") from None
+        return RobotOverlay.from_json(content)
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
 

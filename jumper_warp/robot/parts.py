@@ -26,6 +26,12 @@ class RobotDescriptionError(InputError):
         super().__init__(" ".join(f"{place}: {problem}".split()))
 
 
+def description_error(message: str) -> RobotDescriptionError:
+    """Return a RobotDescriptionError with a message that begins with the file."""
+    file, _, problem = message.partition(": ")
+    return RobotDescriptionError(Path(file), "", problem)
+
+
 def require(holds: bool, file: Path, part: str, problem: str) -> None:
     """Raise RobotDescriptionError, which names a file and a part of it, unless `holds`."""
     if not holds:

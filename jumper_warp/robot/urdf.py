@@ -10,9 +10,10 @@ from xml.parsers import expat
 
 import numpy as np
 
-from jumper_warp.robot.parts import Joint, Link, RobotDescriptionError, Shape, TriangleMesh, require
+from jumper_warp.robot.parts import Joint, Link, RobotDescriptionError, Shape, TriangleMesh, description_error, require
+from jumper_warp.utils.files import read_file
 
-MAX_FILE_BYTES = 8_000_000
+MAX_FILE_BYTES = 8 * 2**20
 SHAPE_SIZES = {"box": ("size", 3), "cylinder": ("radius length", 1), "sphere": ("radius", 1)}
 """By tag of the shape: its attributes, and the count of numbers [m] in each."""
 
@@ -20,15 +21,9 @@ SHAPE_SIZES = {"box": ("size", 3), "cylinder": ("radius length", 1), "sphere": (
 def read_text(file: Path) -> str:
     """Return the text of a UTF-8 file of at most MAX_FILE_BYTES. Raises RobotDescriptionError."""
     try:
-        if file.stat().st_size > MAX_FILE_BYTES:
-            raise RobotDescriptionError(file, "", f"expected at most {MAX_FILE_BYTES} bytes")
-        return file.read_bytes().decode("utf-8")
-    except OSError as err:
-        raise RobotDescriptionError(file, "", f"cannot be read ({err.strerror})") from err
+        return read_file(file, "robot description", MAX_FILE_BYTES, description_error).decode("utf-8")
     except UnicodeDecodeError as err:
         raise RobotDescriptionError(file, "", f"expected UTF-8 text ({err.reason} at byte {err.start})") from err
-    except ValueError as err:
-        raise RobotDescriptionError(file, "", "is not a file name") from err
 
 
 def parse_xml(file: Path, text: str) -> Element:

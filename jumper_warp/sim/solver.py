@@ -34,6 +34,8 @@ from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Control, Model, State
 from jumper_warp.utils.threads import locked
 
+DT = (1.0e-6, 0.1)  # [s] Shortest and longest physics step
+MAX_SUBSTEPS = 1000  # Largest number of physics steps in a policy step
 MAX_SWEEPS = 50  # Largest number of contact sweeps in a step
 TOLERANCE = 1.0e-5  # [m/s] The contact iteration ends when a sweep changes every contact velocity by at most this
 DIFFERENTIABLE_TOLERANCE = 1.0e-6
@@ -41,11 +43,11 @@ DIFFERENTIABLE_TOLERANCE = 1.0e-6
 
 
 def check_step(dt: float, substeps: int = 1) -> None:
-    """Raise InputError unless dt [s] is finite and above 0 and substeps a whole number of at least 1."""
-    if not 0.0 < dt < math.inf:
-        raise InputError(f"dt must be finite and above 0 [s], got {dt!r}")
-    if not isinstance(substeps, Integral) or substeps < 1:
-        raise InputError(f"substeps must be a whole number of at least 1, got {substeps!r}")
+    """Raise InputError unless dt [s] is in the range DT, and substeps a whole number from 1 to MAX_SUBSTEPS."""
+    if not DT[0] <= dt <= DT[1]:
+        raise InputError(f"dt must be in {DT[0]:g} to {DT[1]:g} s, got {dt!r}")
+    if not isinstance(substeps, Integral) or not 1 <= substeps <= MAX_SUBSTEPS:
+        raise InputError(f"substeps must be a whole number of 1 to {MAX_SUBSTEPS}, got {substeps!r:.40}")
 
 
 def check_tolerance(tolerance: float) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import functools
-import math
 import operator
 from dataclasses import dataclass, field, replace
 from typing import Any
@@ -27,9 +26,16 @@ from jumper_warp.tasks.terms import (
     Term,
     TerminationTerm,
 )
-from jumper_warp.utils.checks import check_finite, check_not_negative
+from jumper_warp.utils.checks import MOST_SETTING, check_bounds
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Function
+
+TASK_BOUNDS = {
+    "action_scale": (0.01, 360.0, "deg"), "eval_height_offset": (0.0, 10.0, "m"), "contact_force": (0.0, 1.0e4, "N"),
+    "obstacle_margin": (0.0, 1.0, "m"), "self_collision_margin": (0.0, MIN_LINK_DISTANCE, "m"),
+    "reward_floor": (-MOST_SETTING, MOST_SETTING, ""),
+}  # fmt: skip
+"""Smallest and largest value of settings of a task, and unit."""
 
 
 @dataclass(frozen=True)
@@ -132,19 +138,11 @@ class TaskCfg(Copyable):
         self._check_functions()
         if diverged not in [term.func for term in self.terminations]:
             raise InputError(f"{self.name} needs the termination diverged, which ends diverged simulations")
-        if not all(0.0 < scale < math.inf for scale in self.action_scale):
-            raise InputError(f"{self.name}: action_scale must be positive and finite [deg], got {self.action_scale}")
         for metric in self.metrics:
             for field_name in {metric.field, metric.per or metric.field} - set(self.state.vars):
                 raise InputError(f"{self.name}: metric {metric.name} needs a field {field_name!r} of the state")
         check_gravity(self.gravity)
-        for name in ("eval_height_offset", "contact_force", "obstacle_margin"):
-            check_not_negative(f"{self.name}: {name}", getattr(self, name))
-        if not 0.0 <= self.self_collision_margin <= MIN_LINK_DISTANCE:
-            limits = f"[0, {MIN_LINK_DISTANCE:g}], got {self.self_collision_margin}"
-            raise InputError(f"{self.name}: self_collision_margin must be in {limits}")
-        if self.reward_floor is not None:
-            check_finite(f"{self.name}: reward_floor", self.reward_floor)
+        check_bounds(f"{self.name}:", self, TASK_BOUNDS)
 
     def without_margins(self) -> TaskCfg:
         """Return the task with collision margins of 0 m, as in evaluation."""
@@ -171,6 +169,17 @@ class TaskCfg(Copyable):
                 if actual not in (Any, struct):
                     argument = f"argument {index + 1} of {func.key} is {getattr(actual, 'key', actual)}"
                     raise InputError(f"{self.name} {where}: {argument}, the task has {struct.key}")
+
+    def check_returned(self) -> None:
+        """Raise InputError if a function of a term returns a type that the term cannot use; names file and line."""
+        for slots in self.params.slots.values():
+            for slot in slots:
+                try:
+                    slot.term.check_returned(self.state)
+                except InputError:
+                    raise
+                except Exception:  # another error of the function, which the compilation reports
+                    continue
 
     @functools.cached_property
     def params(self) -> TaskParams:

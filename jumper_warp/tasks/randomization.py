@@ -9,8 +9,9 @@ from typing import Any, Literal
 
 from jumper_warp.kernels.mdp import parameters
 from jumper_warp.robot.description import load_description
+from jumper_warp.robot.overlay import RANDOMIZED
 from jumper_warp.tasks.terms import EventTerm
-from jumper_warp.utils.checks import check_finite, check_probabilities
+from jumper_warp.utils.checks import check_bounds, check_probabilities
 from jumper_warp.utils.errors import InputError
 
 Range = tuple[float, float] | None  # (lower, upper), or None: off
@@ -38,8 +39,6 @@ def _least(name: str) -> tuple[float, bool]:
         return -_base_mass(), True
     if name in ("link_mass", "gains", "damping_gains", "no_load_speed", "cutoff_speed", "armature", "push_interval"):
         return 0.0, True
-    if name in ("static_friction", "dynamic_friction", "motor_friction", "latency", "observation_latency"):
-        return 0.0, False
     return -math.inf, False
 
 
@@ -99,17 +98,13 @@ class RandomizationCfg:
         for name, value in vars(self).items():
             if not isinstance(value, tuple):
                 continue
-            check_finite(f"randomisation range {name}", *value)
+            check_bounds("randomisation range", self, {name: RANDOMIZED[name]})
             if not value[0] <= value[1]:
                 raise InputError(f"randomisation range {name} must rise, got {value}")
             least, exclusive = _least(name)
             if value[0] < least or (exclusive and value[0] == least):
                 bound = f"be above {least:g}" if exclusive else "not be negative"
                 raise InputError(f"randomisation range {name} must {bound}, got {value}")
-        for name in ("latency", "observation_latency"):
-            value = getattr(self, name)
-            if value is not None and not 0.0 <= value[0] <= value[1] <= LONGEST_LATENCY:
-                raise InputError(f"randomisation range {name} must be in 0 to {LONGEST_LATENCY:g} ms, got {value}")
         check_probabilities("randomisation", self, "push_probability", "zero_latency_probability")
 
     @classmethod

@@ -8,21 +8,21 @@ from typing import Any
 
 import warp as wp
 
-from jumper_warp.utils.checks import check_finite
+from jumper_warp.utils.checks import MOST_SETTING, check_bounds
 from jumper_warp.utils.errors import InputError
 
 Pair = tuple[float, float]  # (lower, upper) end of a range
 
 
 def check_ranges(prefix: str, cfg: Any, skip: Collection[str] = (), not_negative: Collection[str] = ()) -> None:
-    """Raise InputError if a dataclass has a number that is not finite or out of range, or a reversed pair.
+    """Raise InputError if a dataclass has a number beyond MOST_SETTING or out of range, or a reversed pair.
 
     prefix: before field names in messages. skip: fields to leave unchecked. not_negative: fields that must be >= 0.
     """
     for name, value in vars(cfg).items():
         if name in skip:
             continue
-        check_finite(f"{prefix} {name}", *(value if isinstance(value, tuple) else (value,)))
+        check_bounds(prefix, cfg, {name: (-MOST_SETTING, MOST_SETTING, "")})
         if isinstance(value, tuple) and not value[0] <= value[1]:
             raise InputError(f"{prefix} {name} must be (lower, upper), got {value}")
         least = value[0] if isinstance(value, tuple) else value

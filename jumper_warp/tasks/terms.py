@@ -9,7 +9,8 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, get_type_hints
+from pathlib import Path
+from typing import Any, ClassVar, cast, get_type_hints
 
 import warp as wp
 
@@ -18,14 +19,34 @@ from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.step import every_episode
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.tasks.copying import Copyable
-from jumper_warp.utils.checks import FLOAT32_MAX, check_finite
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Function
 
 REQUIRED = inspect.Parameter.empty
 AXES = {2: ("x", "y"), 3: ("x", "y", "z")}
 LEGS = ("FL", "FR", "BL", "BR")
+OBSERVATION_BOUNDS = {"noise": (0.0, 1.0e3), "scale": (1.0e-6, 1.0e6), "clip": (1.0e-6, 1.0e6)}
+"""Smallest and largest settings of an observation term; noise and clip in the unit of the function."""
+LARGEST = 1.0e9  # Largest absolute value of a term's number
+MAX_HISTORY = 1000  # Largest number of frames of an observation term
 MOTORS = tuple(f"{leg}_{motor}" for leg in LEGS for motor in ("lateral", "outer", "inner"))
+
+
+def place_of(func: Function) -> str:
+    """Return file and line of a Warp function, as `my_task.py:12`, for messages."""
+    python: Any = cast("wp.Function", func).func
+    code = python.__code__
+    return f"{Path(code.co_filename).name}:{code.co_firstlineno}"
+
+
+def shown_type(kind: Any) -> str:
+    """Return the name of a return type for messages, such as `int32`, `vec3f` or `nothing`."""
+    if kind in (None, type(None)):
+        return "nothing"
+    scalar = getattr(kind, "_wp_scalar_type_", None)
+    if scalar and hasattr(kind, "_length_"):
+        return f"a vector of {kind._length_}"
+    return getattr(kind, "__name__", None) or getattr(kind, "key", str(kind))
 
 
 class Term(Copyable):
@@ -56,7 +77,7 @@ class Term(Copyable):
             raise InputError(f"{kind}: {func!r:.60} is not a @wp.func")
         self.func, self.name = func, name or func.key.split(".")[-1]
         where = f"{kind} {self.name}"
-        self._check_types(where)
+        self._check_types(f"{place_of(func)}: {where}")
         python: Any = func.func
         params = list(inspect.signature(python).parameters.values())[self.context :]
         known = self.settings | {p.name: p.default for p in params}
@@ -76,8 +97,9 @@ class Term(Copyable):
                 raise InputError(f"{where}: parameter {key!r} is missing")
             parts = value if isinstance(known[key], tuple) and isinstance(value, tuple) else (value,)
             wrong = any(isinstance(part, bool) or not isinstance(part, int | float) for part in parts)
-            if wrong or not all(abs(part) <= FLOAT32_MAX for part in parts):
-                raise InputError(f"{where}: parameter {key!r} must be a finite number, got {value!r:.60}")
+            if wrong or not all(abs(part) <= LARGEST for part in parts):
+                limit = f"within {LARGEST:g}, got {value!r:.60}"
+                raise InputError(f"{where}: parameter {key!r} must be a finite number {limit}")
         self.options = {key: values.get(key, default) for key, default in type(self).options.items()}
         self.num_params = len(params)
 
@@ -87,9 +109,36 @@ class Term(Copyable):
         if first is not Any and first not in self.takes:
             takes = " or ".join(kind.key for kind in self.takes)
             raise InputError(f"{where}: the first argument of the function must be annotated {takes}")
-        returned = get_type_hints(self.func.func).get("return")
-        if self.returns and returned is not None and returned not in self.returns:
-            raise InputError(f"{where}: the function must return {self.returns[0].__name__}, it returns {returned}")
+        try:
+            returned = get_type_hints(self.func.func).get("return", REQUIRED)
+        except NameError as error:
+            raise InputError(f"{where}: an annotation of the function has an {error}") from None
+        if returned is not REQUIRED and not self._may_return(returned):
+            annotated = shown_type(returned)
+            raise InputError(f"{where}: the function must return {self.returned}, its annotation is {annotated}")
+
+    def _may_return(self, kind: Any) -> bool:
+        """Return whether the term's function may return values of a type."""
+        return not self.returns or kind in self.returns
+
+    @property
+    def returned(self) -> str:
+        """Type that the term's function must return, in words."""
+        return self.returns[0].__name__ if self.returns else "any type"
+
+    def check_returned(self, state: Any) -> None:
+        """Raise InputError if Warp infers another return type of the function than it must have.
+
+        It explains an error of a kernel's compilation. state: the task's `@wp.struct`.
+        """
+        func: Any = self.func
+        types = [state if kind is Any else kind for kind in func.input_types.values()]
+        overload = func.get_overload(types, {})
+        overload.build(None)
+        actual = overload.value_func(None, None)
+        if not self._may_return(actual):
+            where = f"{place_of(self.func)}: {type(self).__name__} {self.name}"
+            raise InputError(f"{where}: the function must return {self.returned}, it returns {shown_type(actual)}")
 
     def replace(self, **changes: Any) -> Any:
         """Return a copy of the term with changed function, name, numbers or options.
@@ -180,12 +229,26 @@ class ObservationTerm(Term):
         if isinstance(func, wp.Function) and RobotArrays in func.input_types.values():
             self.context = 3  # arrays, ground, world
         super().__init__(func, **values)
+        if "return" not in get_type_hints(self.func.func):
+            where = f"{place_of(self.func)}: ObservationTerm {self.name}"
+            raise InputError(f"{where}: the function needs an annotation of its return type, {self.returned}")
         history = self.options["history"]
-        if not isinstance(history, int) or history < 1:
-            raise InputError(f"ObservationTerm {self.name}: history must be at least 1, got {history!r:.40}")
-        if self.numbers["noise"] < 0.0 or self.numbers["clip"] <= 0.0:
-            raise InputError(f"ObservationTerm {self.name}: noise must not be negative and clip must be positive")
-        check_finite(f"ObservationTerm {self.name}: scale times clip", self.numbers["scale"] * self.numbers["clip"])
+        if not isinstance(history, int) or not 1 <= history <= MAX_HISTORY:
+            raise InputError(f"ObservationTerm {self.name}: history must be in 1 to {MAX_HISTORY}, got {history!r:.40}")
+        for key, (low, high) in OBSERVATION_BOUNDS.items():
+            if not low <= self.numbers[key] <= high:
+                limits = f"{low:g} to {high:g}, got {self.numbers[key]:.6g}"
+                raise InputError(f"ObservationTerm {self.name}: {key} must be in {limits}")
+
+    def _may_return(self, kind: Any) -> bool:
+        """Return whether the function may return values of a type: a number or a vector."""
+        vector = hasattr(kind, "_length_") and getattr(kind, "_wp_scalar_type_", None) is wp.float32
+        return kind in (float, wp.float32) or vector
+
+    @property
+    def returned(self) -> str:
+        """Type that the term's function must return, in words."""
+        return "float or a vector"
 
     @property
     def width(self) -> int:
@@ -241,6 +304,15 @@ class Advance(Term):
 
     Function: (robot: RobotView, state, ...) -> state.
     """
+
+    def _may_return(self, kind: Any) -> bool:
+        """Return whether the function may return values of a type: a `@wp.struct`."""
+        return kind is Any or hasattr(kind, "vars")
+
+    @property
+    def returned(self) -> str:
+        """Type that the term's function must return, in words."""
+        return "the state"
 
 
 class Curriculum(Term):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import re
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,12 @@ from jumper_warp.utils.errors import InputError
 
 NAME = re.compile(r"[A-Za-z0-9_][A-Za-z0-9_. -]{0,99}")
 """Valid names of tasks, terms, observation columns and joints, for comma-separated lists and file names."""
+ACTIVATIONS = ("elu", "relu", "tanh")  # Names of the activations of hidden layers
+MAX_HIDDEN, MAX_WIDTH = 64, 65536  # Largest number of hidden layers, and of units in one
+FILTER_ANGLE = 1440.0  # [deg] Bound of limits in a command filter: twice the bound of motor targets
 FLOAT32_MAX = 3.4028234e38  # Largest finite float32; settings are converted to float32 on a device
+MOST_WORLDS = 2**20  # Largest number of simulated worlds
+MOST_SETTING = 1.0e6  # Largest absolute value of a setting of a task, in its unit
 FLOAT32_MIN = 1.1754944e-38  # Smallest positive normal float32; a GPU may round smaller values to 0
 MOST_SEED = 2**31 - 1  # Largest valid seed; the kernels' random streams take an int32
 LAST_OF_PREVIOUS_VERSION = "05fa856"  # Last commit that reads policies, tasks and runs of the previous version
@@ -60,16 +66,53 @@ def check_probabilities(section: str, cfg: Any, *names: str) -> None:
             raise InputError(f"{section} {name} must be in [0, 1], got {value}")
 
 
-def check_count(name: str, value: Any) -> None:
-    """Raise InputError unless the value is an integer of at least 1, and not a bool."""
-    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise InputError(f"{name} must be a whole number of at least 1, got {value!r:.40}")
+def check_count(name: str, value: Any, most: int = MOST_WORLDS) -> None:
+    """Raise InputError unless the value is an integer from 1 to `most`, and not a bool."""
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 1 <= value <= most:
+        raise InputError(f"{name} must be a whole number of 1 to {most}, got {value!r:.40}")
+
+
+def check_bounds(section: str, cfg: Any, bounds: Mapping[str, tuple[float, float, str]]) -> None:
+    """Raise InputError for a number, or one of a pair, outside its range; None passes.
+
+    cfg: object with the fields that `bounds` names; bounds: (lower, upper, unit) by field. section: name of `cfg`, for
+    messages.
+    """
+    for name, (low, high, unit) in bounds.items():
+        value = getattr(cfg, name)
+        for number in value if isinstance(value, tuple) else (value,):
+            if number is not None and not low <= number <= high:
+                limits = f"{low:g} to {high:g}{unit and ' '}{unit}"
+                raise InputError(f"{section} {name} must be in {limits}, got {number!s:.40}")
 
 
 def check_seed(value: Any) -> None:
     """Raise InputError unless the value is an integer from 0 to MOST_SEED, and not a bool."""
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or not 0 <= value <= MOST_SEED:
         raise InputError(f"seed must be in 0 .. {MOST_SEED}, got {value!r:.40}")
+
+
+def check_angle_limits(name: str, lower: float, upper: float, lower_zone: float, upper_zone: float) -> None:
+    """Raise InputError unless limits of an angle [deg] are finite, lower < upper, without overlapping zones.
+
+    lower_zone, upper_zone: widths of the zones inside the limits [deg], >= 0.
+    """
+    if not -FILTER_ANGLE <= lower < upper <= FILTER_ANGLE:
+        raise InputError(
+            f"{name}: lower limit must be below upper limit, within {FILTER_ANGLE:g} deg, got {lower}, {upper}"
+        )
+    if not (lower_zone >= 0.0 and upper_zone >= 0.0 and lower_zone + upper_zone <= upper - lower):
+        raise InputError(f"{name}: hard zones must be >= 0 without overlap, got {lower_zone}, {upper_zone}")
+
+
+def check_filter_speed(horizon: float, speed_floor: float) -> None:
+    """Raise InputError for a command filter's horizon outside 1 ms to 10 s, or a speed floor outside 1e-3 to 1e4 deg/s.
+
+    horizon: [s]; speed_floor: [deg/s].
+    """
+    for name, value, low, high in (("horizon", horizon, 1.0e-3, 10.0), ("speed_floor", speed_floor, 1.0e-3, 1.0e4)):
+        if not low <= value <= high:
+            raise InputError(f"filter {name} must be in {low:g} to {high:g}, got {value}")
 
 
 def version_error(version: str, known: int) -> str:

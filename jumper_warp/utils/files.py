@@ -1,12 +1,21 @@
-"""Atomic file writes, and the check that a file exists."""
+"""Atomic file writes, and bounded reading of regular files and of JSON."""
 
 import json
+import math
 import os
-from collections.abc import Mapping
+import stat
+from collections import Counter
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
 from jumper_warp.utils.errors import InputError
+
+ErrorType = Callable[[str], InputError]
+MAX_BYTES = 256 * 2**20  # Size of the largest file that is read
+MAX_JSON_BYTES = 16 * 2**20  # Size of the largest JSON file that is read
+MAX_DEPTH = 50  # Levels of nested objects and lists in JSON
+MAX_DIGITS = 18  # Digits of an integer in JSON; all these are exact as int64
 
 
 def write_atomically(path: Path, data: bytes) -> None:
@@ -38,12 +47,103 @@ def json_bytes(content: Mapping[str, Any]) -> bytes:
     return (json.dumps(content, indent=2, ensure_ascii=False, allow_nan=False) + "\n").encode()
 
 
-def existing_file(path: Path, purpose: str) -> Path:
-    """Check that a file exists, and return its path.
+def existing_file(path: Path, purpose: str, limit: int = MAX_BYTES, error: ErrorType = InputError) -> Path:
+    """Check that a path is a regular file of at most `limit` bytes, and return it; the file is not opened.
 
-    Raises InputError, with the purpose of the file: it does not exist.
+    purpose: content of the file, for messages. error: class of the error. Raises `error` for anything else, such as a
+    folder, a pipe or a device; the message has the path.
     """
-    if not Path(path).is_file():
-        kind = "a folder, not a file" if Path(path).is_dir() else "no such file"
-        raise InputError(f"{path}: {kind} ({purpose})")
+    try:
+        status = os.stat(path)
+    except FileNotFoundError:
+        raise error(f"{path}: no such file ({purpose})") from None
+    except OSError as problem:
+        raise error(f"{path}: cannot be read: {problem.strerror} ({purpose})") from None
+    except ValueError:  # a null character
+        raise error(f"{path!s:.200}: is not a file name ({purpose})") from None
+    if not stat.S_ISREG(status.st_mode):
+        kind = "a folder, not a file" if stat.S_ISDIR(status.st_mode) else "not a regular file"
+        raise error(f"{path}: {kind} ({purpose})")
+    if status.st_size > limit:
+        raise error(f"{path}: larger than {limit >> 20} MiB ({purpose})")
     return Path(path)
+
+
+def read_file(path: Path, purpose: str, limit: int = MAX_BYTES, error: ErrorType = InputError) -> bytes:
+    """Return the content of a regular file; arguments and errors as `existing_file`."""
+    path = existing_file(path, purpose, limit, error)
+    try:
+        with path.open("rb") as file:
+            data = file.read(limit + 1)
+    except OSError as problem:
+        raise error(f"{path}: cannot be read: {problem.strerror} ({purpose})") from None
+    if len(data) > limit:  # it has grown, or its size is unknown as in /proc
+        raise error(f"{path}: larger than {limit >> 20} MiB ({purpose})")
+    return data
+
+
+def read_json(
+    path: Path, purpose: str, limit: int = MAX_JSON_BYTES, error: ErrorType = InputError, finite: bool = True
+) -> Any:
+    """Return the content of a JSON file; arguments and errors as `existing_file` and `parse_json`."""
+    return parse_json(read_file(path, purpose, limit, error), str(path), error, finite)
+
+
+def parse_json(data: bytes | str, where: str, error: ErrorType = InputError, finite: bool = True) -> Any:
+    """Return the content of JSON data (UTF-8).
+
+    where: file or place, before the message. finite: whether to refuse NaN and infinite numbers. Raises `error`: it is
+    not JSON, nests deeper than MAX_DEPTH, repeats a key, or has such a number or an integer of more than MAX_DIGITS
+    digits.
+    """
+    hooks: dict[str, Any] = {"parse_int": _integer}
+    if finite:
+        hooks |= {"parse_constant": _number, "parse_float": _number}
+    try:
+        content = json.loads(data.decode() if isinstance(data, bytes) else data, object_pairs_hook=_unique, **hooks)
+        if _depth(content, MAX_DEPTH) <= MAX_DEPTH:
+            json.dumps(content, ensure_ascii=False).encode()
+            return content
+        reason = f"more than {MAX_DEPTH} levels"
+    except RecursionError:
+        reason = f"more than {MAX_DEPTH} levels"
+    except json.JSONDecodeError as problem:
+        reason = f"line {problem.lineno}: {problem.msg}"
+    except UnicodeEncodeError:
+        reason = "a string has half of a surrogate pair"
+    except UnicodeDecodeError as problem:
+        reason = f"byte {problem.start} is not UTF-8"
+    except ValueError as problem:
+        reason = str(problem)
+    raise error(f"{where}: not JSON ({reason:.200})")
+
+
+def _unique(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """Return the entries of a JSON object as a dict. Raises InputError: a key occurs twice."""
+    table = dict(pairs)
+    if len(table) < len(pairs):
+        raise InputError(f"{Counter(key for key, _ in pairs).most_common(1)[0][0]!r:.60} occurs twice")
+    return table
+
+
+def _number(text: str) -> float:
+    """Return a number of a JSON text. Raises InputError: it is not finite."""
+    value = float(text)
+    if not math.isfinite(value):
+        raise InputError(f"{text:.20} is not a finite number")
+    return value
+
+
+def _integer(text: str) -> int:
+    """Return an integer of a JSON text. Raises InputError: it has too many digits."""
+    if len(text.lstrip("-")) > MAX_DIGITS:
+        raise InputError(f"an integer of {len(text.lstrip('-'))} digits")
+    return int(text)
+
+
+def _depth(content: Any, limit: int) -> int:
+    """Return the number of nested levels in JSON data, at most limit + 1."""
+    parts = content.values() if isinstance(content, dict) else content if isinstance(content, list) else None
+    if parts is None or limit < 0:
+        return 0
+    return 1 + max((_depth(part, limit - 1) for part in parts), default=0)

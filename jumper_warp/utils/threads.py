@@ -12,6 +12,7 @@ from typing import Any, ParamSpec, TypeVar
 
 from jumper_warp.utils.errors import InputError
 
+MAX_THREADS = 1024  # Largest number of threads of a simulation
 P = ParamSpec("P")
 T = TypeVar("T")
 FORKED = "a forked process cannot use CUDA: start it with multiprocessing.get_context('spawn')"
@@ -79,12 +80,12 @@ def available_threads() -> int:
 def checked_threads(threads: int | None) -> int:
     """Check a number of CPU threads and return it; None: the default of `set_threads`.
 
-    Raises InputError: it is not positive.
+    Raises InputError: it is not in 1 to MAX_THREADS.
     """
     if threads is None:
         return available_threads() if _default_threads is None else _default_threads
-    if isinstance(threads, bool) or not isinstance(threads, int) or threads < 1:
-        raise InputError(f"threads must be a whole number of at least 1, got {threads!r:.60}")
+    if isinstance(threads, bool) or not isinstance(threads, int) or not 1 <= threads <= MAX_THREADS:
+        raise InputError(f"threads must be a whole number of 1 to {MAX_THREADS}, got {threads!s:.60}")
     return threads
 
 

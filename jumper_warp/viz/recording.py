@@ -6,8 +6,6 @@ A recording is self-contained: it can be drawn without the Newton model.
 import io
 import json
 import re
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -15,8 +13,9 @@ from typing import Any
 
 import numpy as np
 
+from jumper_warp.utils.arrays import read_npz
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.files import parse_json, write_atomically
 from jumper_warp.viz.shapes import ShapeMesh
 
 FORMAT = "jumper-warp recording"
@@ -106,15 +105,13 @@ def load_npz(path: Path) -> Recording:
 
     Raises RecordingError (an InputError): the file is missing, damaged, of another kind or of another version.
     """
+    archive = read_npz(path, "recording", RecordingError)
     try:
-        with np.load(path, allow_pickle=False) as archive:
-            header = json.loads(str(archive["header"]))
-            if header["format"] != FORMAT or header["version"] != VERSION:
-                raise RecordingError(f"{path}: expected a {FORMAT} of version {VERSION}")
-            return _from_archive(header, archive)
-    except RecordingError:
-        raise
-    except (OSError, EOFError, KeyError, TypeError, ValueError, zipfile.BadZipFile, zlib.error) as error:
+        header = parse_json(str(archive["header"]), "header")
+        if header["format"] != FORMAT or header["version"] != VERSION:
+            raise RecordingError(f"expected a {FORMAT} of version {VERSION}")
+        return _from_archive(header, archive)
+    except (LookupError, TypeError, ValueError, AttributeError) as error:
         raise RecordingError(f"{path}: cannot be read as a recording ({type(error).__name__}: {error})") from error
 
 

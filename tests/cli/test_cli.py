@@ -308,7 +308,7 @@ def test_history_flag_sets_history_of_noisy_observations():
     assert [steps[name] for name in ("lin_vel", "ang_vel", "gravity", "angle", "last_action")] == [2] * 5
     assert steps["wanted_height"] == steps["rate"] == 1
     assert task.observations.critic == make_task("vertical-jump").observations.critic
-    with pytest.raises(InputError, match="history must be at least 1"):
+    with pytest.raises(InputError, match="history must be in 1 to 1000"):
         parse_train(["vertical-jump", "--history", "0"])
 
 

@@ -86,7 +86,7 @@ def test_training_accepts_old_flag_of_a_task(old, new, capsys):
 def test_command_accepts_old_flag_and_refuses_both(capsys):
     renamed = "jumper: --keep is now --max-checkpoints"
     code, _, err = run(capsys, "train", "vertical-jump", "--keep", "0")  # 0 fails before the training starts
-    assert (code, err) == (2, [renamed, "jumper: max_checkpoints must be at least 1, got 0"])
+    assert (code, err) == (2, [renamed, "jumper: max_checkpoints must be a whole number of 1 to 1000000000, got 0"])
     code, _, err = run(capsys, "train", "vertical-jump", "--keep", "2", "--max-checkpoints", "2")
     assert (code, err) == (2, [f"{renamed}: give only --max-checkpoints"])
 

@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import warnings
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -65,8 +66,9 @@ def test_sysid_writes_overlay_and_self_contained_report(recorded, capsys):
     assert page.count("data:image/png;base64,") == 6 and "offset/BR_inner" in page
     links = re.findall(r"(?:src|href)\s*=\s*[\"']?([^\"'\s>]*)", page)
     assert links and all(link.startswith("data:") for link in links) and "<script" not in page  # embedded data only
-    printed = capsys.readouterr().out
-    assert "χ²" in printed and "warning" not in printed and report["doubts"] == []
+    printed = capsys.readouterr()
+    assert "χ²" in printed.out and "warning" not in printed.out and report["doubts"] == []
+    assert "starts agree" in printed.out and report["consistent"] and "not consistent" not in printed.err
 
 
 def test_tutorial_gives_the_mass_of_its_robot():
@@ -79,16 +81,41 @@ def test_tutorial_gives_the_mass_of_its_robot():
 
 def test_prints_warning_of_a_wrong_mass(recorded, capsys):
     args = ["--params", "masses", "--mass", "20", "--mass-std", "0.5", "--out", str(recorded / "heavy")]
-    main(["sysid", str(recorded / "motions" / "2_standing_chirp.npz"), *args])
+    with pytest.raises(SystemExit) as end:
+        main(["sysid", str(recorded / "motions" / "2_standing_chirp.npz"), *args])
+    assert end.value.code == 3
     assert "warning: total mass is given as 20 ± 0.5 but found as" in capsys.readouterr().out
 
 
 def test_prints_warning_of_a_hung_robot_taken_as_free(recorded, capsys):
     write_csv_table(recorded / "hung.csv", load_motion(recorded / "motions" / "0_hung_chirp.npz"))
-    main(["sysid", str(recorded / "hung.csv"), *PARAMS, "--out", str(recorded / "as_free")])
+    with pytest.raises(SystemExit) as end:
+        main(["sysid", str(recorded / "hung.csv"), *PARAMS, "--out", str(recorded / "as_free")])
+    assert end.value.code == 3
     warnings = [line for line in capsys.readouterr().out.splitlines() if line.startswith("warning")]
     assert len(warnings) == 1 and "hung fits worst" in warnings[0] and "--base fixed" in warnings[0]
     assert "--base fixed" in (recorded / "as_free" / "report.html").read_text()
+
+
+def test_inconsistent_fit_exits_with_3_and_renames_the_overlay(recorded, capsys):
+    motion = load_motion(recorded / "motions" / "0_hung_chirp.npz")
+    out, scaled = recorded / "again", recorded / "scaled.npz"
+    scaled_motion = replace(motion, angle=1.02 * motion.angle)  # which no latency explains
+    scaled_motion.save(scaled)
+    out.mkdir()
+    (out / "identified.json").write_text("of an earlier fit")
+    with pytest.raises(SystemExit) as end:
+        main(["sysid", str(scaled), *PARAMS, "--out", str(out)])
+    assert end.value.code == 3
+    line = capsys.readouterr().err.strip()
+    assert line.startswith("jumper: not consistent: scaled angle χ² ") and line.endswith("inconsistent.json")
+    assert not (out / "identified.json").exists()
+    assert "the fit is not consistent: scaled angle" in load_overlay(out / "inconsistent.json").source
+    report = json.loads((out / "report.json").read_text())
+    assert not report["consistent"] and report["starts_agree"]
+    failed = [test for test in report["tests"] if not test["passed"]]
+    assert all(test["chi2"] > test["limit"] for test in failed) and failed[0]["channel"] == "angle"
+    assert "The fit is not consistent: scaled angle" in (out / "report.html").read_text()
 
 
 def test_refuses_negated_angles_without_warnings(recorded, capsys):
@@ -105,9 +132,11 @@ def test_cma_method_identifies_latency_and_prints_its_report_as_json(recorded, c
     pytest.importorskip("cma")
     out = recorded / "evolved"
     more = ["--method", "cma", "--max-seconds", "3", "--exclude", "offsets"]
-    main(["sysid", "fit", str(recorded / "motions" / "0_hung_chirp.npz"), *PARAMS, *more, "--json", "--out", str(out)])
+    with pytest.raises(SystemExit) as end:  # as the offsets are excluded
+        main(["sysid", str(recorded / "motions" / "0_hung_chirp.npz"), *PARAMS, *more, "--json", "--out", str(out)])
+    assert end.value.code == 3
     assert capsys.readouterr().out == (out / "report.json").read_text()
-    assert load_overlay(out / "identified.json").values["latency"][0] == pytest.approx(0.003, abs=1.0e-3)
+    assert load_overlay(out / "inconsistent.json").values["latency"][0] == pytest.approx(0.003, abs=1.0e-3)
 
 
 def test_actuator_fits_friction_from_bench_data(tmp_path, capsys):

@@ -1,20 +1,30 @@
 """`DeployedPolicy` against the environment of `jumper evaluate`, and in programs with mistakes."""
 
+import math
+import os
+import re
+import shutil
 import subprocess
 import sys
+from pathlib import Path
 
 import numpy as np
+import onnx
 import pytest
 
 from jumper_warp.deploy.policy import DeployedPolicy, JumpCommand
 from jumper_warp.policies.catalog import find_policy
 from jumper_warp.policies.conditions import Conditions, env_of_policy
 from jumper_warp.policies.folder import load_policy
+from jumper_warp.policies.onnx import export_onnx
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation, motor_values
+from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.rotations import CONJUGATE, rotate
 
 pytestmark = pytest.mark.usefixtures("one_thread")
+ROOT = Path(__file__).resolve().parents[2]
+TUTORIAL = ROOT / "docs" / "tutorials" / "on_a_robot.md"
 COMMAND_STEP = 30  # policy step of the command to jump
 
 
@@ -193,18 +203,76 @@ def test_history_starts_with_the_first_reading_and_shifts_each_step():
     np.testing.assert_array_equal(policy.observe(readings)[99:147], np.zeros(48))
 
 
+def zero_readings(policy):
+    """Return readings of zero for all terms of a policy's observation."""
+    widths = {name: (term["end"] - term["first"]) // term["history"] for name, term in policy.layout.items()}
+    return {name: np.zeros(width) for name, width in widths.items() if name != "last_action"}
+
+
+@pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf, 1e39])
+def test_refuses_a_reading_that_is_not_finite_and_continues_with_the_next(value):
+    policy, faultless = onnx_of("vertical_jump"), onnx_of("vertical_jump")
+    readings = zero_readings(policy)
+    first = policy.targets(readings)
+    np.testing.assert_array_equal(faultless.targets(readings), first)
+    for name, reading in readings.items():
+        faulty = np.array(reading)
+        faulty[-1] = value
+        with pytest.raises(InputError, match=f"^{name} is not finite: .*; hold the last target$"):
+            policy.targets(readings | {name: faulty})
+    np.testing.assert_array_equal(policy.targets(readings), faultless.targets(readings))
+
+
+@pytest.mark.parametrize("values", [(math.nan, 4), (0.0, math.nan)])
+def test_jump_command_refuses_values_that_are_not_finite(values):
+    command = JumpCommand()
+    command.request()
+    with pytest.raises(InputError, match="must be finite"):
+        command.update(*values)
+    assert command.requested
+
+
+def test_exported_file_has_its_checksum_and_the_weights_of_the_policy(tmp_path):
+    path = export_onnx(load_policy("walking_flat"), tmp_path / "walk.onnx")
+    onnx.checker.check_model(onnx.load(path), full_check=True)
+    exported, shipped = DeployedPolicy(path), onnx_of("walking_flat")
+    readings = zero_readings(shipped)
+    np.testing.assert_array_equal(exported.targets(readings), shipped.targets(readings))
+    assert exported.interface == shipped.interface
+
+
+def test_files_named_in_the_tutorial_suffice_on_the_robot(tmp_path):
+    files = re.findall(r"`(jumper_warp/\S+\.py)`", TUTORIAL.read_text(encoding="utf-8"))
+    for file in files:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(ROOT / file, tmp_path / file)
+    policy = find_policy("vertical_jump") / "policy.onnx"
+    code = f"from jumper_warp.deploy import policy\nprint(policy.DeployedPolicy({str(policy)!r}).default[1])"
+    settings = {"cwd": tmp_path, "env": os.environ | {"PYTHONPATH": str(tmp_path)}, "capture_output": True}
+    answer = subprocess.run([sys.executable, "-c", code], **settings, text=True)
+    assert answer.returncode == 0, answer.stderr
+    assert float(answer.stdout) == pytest.approx(math.radians(45.0))
+
+
+def test_missing_onnx_runtime_is_one_line_with_the_extra(monkeypatch):
+    monkeypatch.setitem(sys.modules, "onnxruntime", None)
+    with pytest.raises(InputError, match=re.escape('pip install "jumper-warp[export]"')):
+        onnx_of("vertical_jump")
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
         ({"jump_comand": 1.0}, "readings missing or unknown: jump_comand"),
         ({"last_action": np.zeros(12)}, "readings missing or unknown: last_action"),
         ({"lin_vel": np.zeros(2)}, r"lin_vel must have 3 values, got shape \(2,\)"),
+        ({"lin_vel": ["fast", 0.0, 0.0]}, "lin_vel must be numbers, got"),
+        ({"lin_vel": None}, r"lin_vel must have 3 values, got shape \(1,\)"),
     ],
 )
 def test_refuses_unknown_readings_and_wrong_sizes(change, message):
     policy = onnx_of("vertical_jump")
-    widths = {name: (term["end"] - term["first"]) // term["history"] for name, term in policy.layout.items()}
-    readings = {name: np.zeros(width) for name, width in widths.items() if name != "last_action"}
+    readings = zero_readings(policy)
     with pytest.raises(ValueError, match=message):
         policy.observe(readings | change)
 

@@ -161,5 +161,5 @@ def test_refuses_settings_out_of_range():
         TurnCfg((20.0, 200.0))
     with pytest.raises(InputError, match=r"must be \(lower, upper\)"):
         AttitudeResetCfg(lateral=(10.0, -10.0))
-    with pytest.raises(InputError, match="eval_height_offset must be finite"):
+    with pytest.raises(InputError, match="eval_height_offset must be in 0 to 10 m"):
         dataclasses.replace(make_task("attitude"), eval_height_offset=-1.0)

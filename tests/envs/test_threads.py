@@ -231,7 +231,7 @@ def test_all_cores_are_used_and_shared_by_the_processes_of_a_machine(monkeypatch
 
 @pytest.mark.parametrize("threads", [0, -1, 1.5, True, "2"])
 def test_refuses_an_invalid_number_of_threads(threads):
-    message = "threads must be a whole number of at least 1, got"
+    message = "threads must be a whole number of 1 to 1024, got"
     for use in (pool.set_threads, lambda n: TrainCfg(threads=n), lambda n: Simulation(1, device="cpu", threads=n)):
         with pytest.raises(InputError, match=message):
             use(threads)
@@ -243,4 +243,4 @@ def test_a_command_refuses_bad_threads_in_one_line(command, capsys):
         main([*command, "--threads", "0"])
     lines = capsys.readouterr().err.strip().splitlines()
     assert caught.value.code == 2
-    assert lines == ["jumper: threads must be a whole number of at least 1, got 0"]
+    assert lines == ["jumper: threads must be a whole number of 1 to 1024, got 0"]

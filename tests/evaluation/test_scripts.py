@@ -62,7 +62,7 @@ def test_parse_script_refuses_malformed_commands_in_one_line(content, message):
 
 @pytest.mark.parametrize(
     ("text", "message"),
-    [(None, "no such file (script of commands"), ("[{", "not JSON"), ('[{"stand": NaN}]', "stand takes 1 number"),
+    [(None, "no such file (script of commands"), ("[{", "not JSON"), ('[{"stand": NaN}]', "NaN is not a finite number"),
      (json.dumps([{"stand": 0}]), "command 1: seconds must be positive"), ("[" * 100_000, "not JSON"),
      (" " * (2**20 + 1), "larger than 1 MiB")],
 )  # fmt: skip

@@ -64,7 +64,7 @@ def test_load_bench_reads_csv_and_refuses_bad_files(tmp_path):
     bench, file = synthetic_bench(TRUTH), tmp_path / "bench.csv"
     rows = zip(*(getattr(bench, name) for name in COLUMNS), strict=True)
     lines = [",".join(COLUMNS), *(",".join(map(str, row)) for row in rows)]
-    file.write_text("\n".join(lines))
+    file.write_text("\n".join([*lines, ""]))
     np.testing.assert_allclose(load_bench(file).torque, bench.torque)
     for old, new, message in (  # a row: test, time [s], command [N m], speed [rad/s], torque [N m]
         ("torque", "moment", "column torque is missing"),
@@ -72,6 +72,6 @@ def test_load_bench_reads_csv_and_refuses_bad_files(tmp_path):
         (lines[5], "1,two,2,3,4", "every row must hold 5 numbers"),
         (lines[5], "0,0.4,2,3000,4", "is it in rpm"),
     ):
-        file.write_text("\n".join(lines).replace(old, new, 1))
+        file.write_text("\n".join([*lines, ""]).replace(old, new, 1))
         with pytest.raises(InputError, match=message):
             load_bench(file)

@@ -1,3 +1,4 @@
+import dataclasses
 import hashlib
 import json
 import math
@@ -18,8 +19,12 @@ from jumper_warp.policies.onnx import export_onnx, onnx_bytes
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.rl.networks import ActorCritic, linear_layers
+from jumper_warp.robot.motors import vertical_jump_filter
 from jumper_warp.utils import assets
 from jumper_warp.utils.assets import policy_tasks
+
+FILTER = dataclasses.asdict(vertical_jump_filter())
+TERM = {"first": 0, "end": 1, "scale": 1.0, "clip": 100.0, "history": 1}  # of an observation layout
 
 
 def make_interface(num_obs=1, num_actions=1, hidden=(1,), **changes):
@@ -28,7 +33,7 @@ def make_interface(num_obs=1, num_actions=1, hidden=(1,), **changes):
         "task": "vertical-jump",
         "observation_names": tuple(f"obs_{i}" for i in range(num_obs)),
         "joint_names": tuple(f"motor_{i}" for i in range(num_actions)),
-        "command_filter": {"horizon": 8.0 / 60.0},
+        "command_filter": FILTER,
         "policy_dt": 1.0 / 60.0,
         "physics_dt": 1.0 / 480.0,
         "hidden": hidden,
@@ -214,6 +219,20 @@ def test_added_files_are_in_the_manifest(folder):
         load_policy(folder)
 
 
+@pytest.mark.parametrize("name", ["picture.webp", "sweep.png"])
+def test_missing_picture_is_accepted_and_an_altered_one_refused(folder, trained, name):
+    add_files(folder, {name: b"RIFF", "metrics.json": b"{}"})
+    (folder / name).unlink()
+    assert load_policy(folder).interface == trained.interface
+    (folder / name).write_bytes(b"JFIF")
+    with pytest.raises(PolicyError, match=rf"{name}: truncated or altered"):
+        load_policy(folder)
+    (folder / name).unlink()
+    (folder / "metrics.json").unlink()
+    with pytest.raises(PolicyError, match=r"metrics\.json: no such file"):
+        load_policy(folder)
+
+
 def test_add_files_refuses_policy_files_and_altered_policies(folder):
     with pytest.raises(PolicyError, match="is the policy itself"):
         add_files(folder, {"policy.onnx": b""})
@@ -305,7 +324,7 @@ F32 = np.float32
 NOT_REPRODUCIBLE = "the graph or metadata of the ONNX file differs from that of its weights and config.json"
 NEWER = "has version 4, expected version 3"
 REFUSALS = {
-    "manifest missing": (lambda f: (f / "manifest.json").unlink(), "manifest.json: cannot be read"),
+    "manifest missing": (lambda f: (f / "manifest.json").unlink(), "manifest.json: no such file"),
     "manifest not JSON": (lambda f: (f / "manifest.json").write_text("{"), "manifest.json: not JSON"),
     "manifest of another format": (edit_manifest(lambda m: m.update(format="x")), "not the manifest of"),
     "manifest lacks a checksum": (edit_manifest(lambda m: m["sha256"].pop("policy.onnx")), "lacks the checksums"),
@@ -318,13 +337,13 @@ REFUSALS = {
     ),
     "folder in place of a file": (
         lambda f: ((f / "policy.onnx").unlink(), (f / "policy.onnx").mkdir()),
-        "policy.onnx: cannot be read",
+        "policy.onnx: a folder, not a file",
     ),
     "pipe in place of a file": (
         lambda f: ((f / "policy.onnx").unlink(), os.mkfifo(f / "policy.onnx")),
-        r"policy.onnx: cannot be read \(not a file\)",
+        "policy.onnx: not a regular file",
     ),
-    "file missing": (lambda f: (f / "policy.onnx").unlink(), "policy.onnx: cannot be read"),
+    "file missing": (lambda f: (f / "policy.onnx").unlink(), "policy.onnx: no such file"),
     "truncated": (
         lambda f: (f / "policy.onnx").write_bytes((f / "policy.onnx").read_bytes()[:-4]),
         "policy.onnx: truncated or altered",
@@ -401,9 +420,18 @@ def test_pickle_in_place_of_the_weights_is_not_executed(folder, tmp_path):
         ({"physics_dt": 0.1}, "physics_dt must be at most policy_dt"),
         ({"normalised_limit": 1e300}, "normalised_limit must lie in 0.001 to 1e"),
         ({"hidden": (1,) * 65}, "hidden must name 1 to 64 widths"),
-        ({"command_filter": {"horizon": math.inf}}, "command_filter horizon must be a number"),
+        (
+            {"command_filter": {"horizon": 0.1}},
+            "command_filter must have the fields lateral, transversal, sum, horizon",
+        ),
+        ({"command_filter": FILTER | {"horizon": math.inf}}, "command_filter horizon must be a finite number"),
+        ({"command_filter": FILTER | {"speed_floor": 0.0}}, "command_filter: filter speed_floor must be in 0.001"),
+        ({"command_filter": FILTER | {"sum": FILTER["lateral"] | {"lower": 20.0}}}, "sum: lower limit must be below"),
+        ({"action_scale": (-0.1,)}, "action_scale must lie in 0.0001 to 6.283, got -0.1"),
+        ({"observation_layout": {"x": TERM | {"clip": -1.0}}}, "'x': clip must lie in 1e-6 to 1e6, got -1.0"),
+        ({"observation_layout": {"x": TERM | {"history": 1.0}}}, "first, end and history whole numbers"),
         ({"torque_limit": (1.0, 2.0)}, "torque_limit needs 1 numbers"),
-        ({"action_scale": (math.nan,)}, "action_scale must lie in -6.283 to 6.283, got nan"),
+        ({"action_scale": (math.nan,)}, "action_scale must lie in 0.0001 to 6.283, got nan"),
         ({"policy_dt": 0.0}, "policy_dt must lie in 0.0001 to 1, got 0"),
         ({"hidden": ()}, "hidden must name 1 to 64 widths"),
         ({"activation": "gelu"}, "activation must be one of"),
@@ -413,6 +441,17 @@ def test_pickle_in_place_of_the_weights_is_not_executed(folder, tmp_path):
 def test_refuses_an_invalid_interface(change, message):
     with pytest.raises(PolicyError, match=message):
         make_interface(**change)
+
+
+@pytest.mark.parametrize("activation", ["elu", "relu", "tanh"])
+def test_refuses_weights_that_could_overflow_unless_the_activation_is_bounded(activation):
+    layers = [(torch.full((4, 1), 1e20), torch.zeros(4)), (torch.full((1, 4), 1e20), torch.zeros(1))]
+    interface, std = make_interface(hidden=(4,), activation=activation), torch.ones(1)
+    if activation == "tanh":  # its output is bounded
+        assert Policy(layers, 0.0 * std, std, interface).act(torch.tensor([1e30])).isfinite().all()
+        return
+    with pytest.raises(PolicyError, match="overflow"):
+        Policy(layers, 0.0 * std, std, interface)
 
 
 # ---------------------------------------------------------------------- ONNX

@@ -86,7 +86,7 @@ def break_manifest(path):
         (os.remove, "no such file .checkpoint of a training"),
         (empty_manifest, "has no checksum"),
         (break_manifest, "manifest.json: not readable"),
-        (lambda path: os.remove(path.parent / MANIFEST), "manifest.json: No such file"),
+        (lambda path: os.remove(path.parent / MANIFEST), "manifest.json: no such file"),
     ],
 )
 def test_refuses_a_damaged_checkpoint_in_one_line(tmp_path, damage, message):

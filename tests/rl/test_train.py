@@ -4,6 +4,7 @@ import math
 import os
 import signal
 import time
+from types import SimpleNamespace
 
 import pytest
 import torch
@@ -231,7 +232,7 @@ def test_each_rank_resumes_its_own_worlds(cfg):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"max_iterations": 0}, "max_iterations must be at least 1, got 0"),
+        ({"max_iterations": 0}, "max_iterations must be a whole number of 1 to 1000000000, got 0"),
         ({"max_seconds": -1.0}, "max_seconds must be finite and not negative, got -1.0"),
         ({"max_seconds": math.nan}, "max_seconds must be finite and not negative, got nan"),
         ({"max_seconds": math.inf}, "max_seconds must be finite and not negative, got inf"),
@@ -369,3 +370,12 @@ def test_rsl_rl_learns_to_push_the_mass_to_the_origin():
         for _ in range(40):
             env.step(actor(TensorDict({"actor": env.obs}, batch_size=[128])))
     assert env.obs[:, 0].abs().max() < 0.3  # distance from the origin
+
+
+@pytest.mark.parametrize(
+    ("fractions", "score"), [((1.0,), 0.9), ((0.6, 0.3, 0.1, 0.0), None), ((0.1, 0.3, 0.4, 0.2), 0.9), ((), 0.9)]
+)
+def test_checkpoint_has_a_score_once_half_of_the_worlds_are_at_the_last_level(fractions, score):
+    levels = {f"Curriculum/fraction_at_level_{i}": fraction for i, fraction in enumerate(fractions)}
+    run = SimpleNamespace(metrics={"Metrics/success": 0.9, **levels}, cfg=TrainCfg(task="t"))
+    assert TrainingRun._score(run) == score

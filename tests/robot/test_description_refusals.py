@@ -4,8 +4,6 @@ import re
 import shutil
 
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from jumper_warp.robot.description import DEFAULT_DESCRIPTION, RobotDescriptionError, load_description
 
@@ -106,7 +104,7 @@ BAD_URDF = {  # by fault: (pattern, replacement) for `edit`, and part of the mes
 
 BAD_JSON = {  # as BAD_URDF
     "missing loop": ((r'"BR_ankle": \{.*?\}', '"extra": {}'), "loop extra: expected one of"),
-    "doubled loop": (('"BR_ankle": ', '"BL_ankle": '), "BL_ankle: expected one entry, found two"),
+    "doubled loop": (('"BR_ankle": ', '"BL_ankle": '), "not JSON ('BL_ankle' occurs twice)"),
     "unknown link": (('"child": "FL_outer_shank"', '"child": "FL_paw"'), "loop FL_ankle: unknown link 'FL_paw'"),
     "other link": (('"FL_outer_shank"', '"FR_outer_shank"'), "loop FL_ankle: expected link FL_outer_shank"),
     "open anchor": ((r'"child_anchor": \[0, 0, -0.3', '"child_anchor": [0, 0, -0.31'),
@@ -132,9 +130,9 @@ BAD_JSON = {  # as BAD_URDF
     "sum in tenths": ((r"\[0, 240\]", "[0, 2400]"), "upper transversal_sum must be between -12.57 and 12.57 rad"),
     "long shank": ((r'"child_anchor": \[0, 0, -0.3', '"child_anchor": [0, 0, -300'),
         "loop FL_ankle: z of anchor on FL_outer_shank"),
-    "infinite number": (('"knee_damping": 0.1', '"knee_damping": 1e999'), "knee_damping to be a finite number"),
-    "nan": (('"knee_damping": 0.1', '"knee_damping": NaN'), "expected finite numbers, found NaN"),
-    "huge integer": (('"knee_damping": 0.1', '"knee_damping": ' + "9" * 5000), "expected JSON (ValueError)"),
+    "infinite number": (('"knee_damping": 0.1', '"knee_damping": 1e999'), "not JSON (1e999 is not a finite number)"),
+    "nan": (('"knee_damping": 0.1', '"knee_damping": NaN'), "not JSON (NaN is not a finite number)"),
+    "huge integer": (('"knee_damping": 0.1', '"knee_damping": ' + "9" * 5000), "not JSON (an integer of 5000 digits)"),
     "no default pose": (('"default": ', '"other": '), "poses: expected a pose named default"),
     "pose beyond stops": (('"transversal_deg": 45', '"transversal_deg": 150'),
         "pose default: expected FL_outer within"),
@@ -145,8 +143,8 @@ BAD_JSON = {  # as BAD_URDF
     "urdf missing": (('"jumper.urdf"', '"other.urdf"'), "urdf: missing file"),
     "urdf nul": (('"jumper.urdf"', r'"a\\u0000b"'), "is not a file name"),
     "list": (("^.*$", "[]"), "expected a JSON object"),
-    "deep": (("^.*$", "[" * 100000), "expected JSON (RecursionError)"),
-    "malformed": ((r"\}\s*$", ""), "expected JSON"),
+    "deep": (("^.*$", "[" * 100000), "not JSON (more than 50 levels)"),
+    "malformed": ((r"\}\s*$", ""), "not JSON (line"),
 }  # fmt: skip
 
 
@@ -172,8 +170,8 @@ def test_refuses_a_loop_that_cannot_close(assets):
 
 
 def test_refuses_a_missing_file_and_a_folder(tmp_path):
-    for path in (tmp_path / "none.json", tmp_path):
-        with pytest.raises(RobotDescriptionError, match="cannot be read"):
+    for path, message in ((tmp_path / "none.json", "no such file"), (tmp_path, "a folder, not a file")):
+        with pytest.raises(RobotDescriptionError, match=message):
             load_description(path)
 
 
@@ -185,25 +183,3 @@ def test_refuses_a_mesh_in_millimetres(assets):
 def test_refuses_a_mesh_with_an_index_beyond_its_vertices(assets):
     (assets / "meshes" / "thigh.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 4\n")
     assert "thigh.obj: expected triangles between the 3 vertices" in refusal(assets)
-
-
-TOKENS = rb'nan 1e999 -1 0 < > &lt; &x; " { ] null \ud800'.split() + [b"\xff", b"\x00"]
-
-
-@settings(max_examples=400, deadline=2000, suppress_health_check=[HealthCheck.function_scoped_fixture])
-@given(data=st.data())
-def test_damaged_files_load_or_raise_description_error(assets, data):
-    file = data.draw(st.sampled_from([URDF, JSON, "meshes/shank.obj"]))
-    original = (DEFAULT_DESCRIPTION.parent / file).read_bytes()
-    start = data.draw(st.integers(0, len(original)))
-    length = data.draw(st.integers(0, 40))
-    insert = data.draw(st.sampled_from([*TOKENS, b""]) | st.binary(max_size=8))
-    keep_tail = data.draw(st.booleans())
-    damaged = original[:start] + insert + (original[start + length :] if keep_tail else b"")
-    (assets / file).write_bytes(damaged)
-    try:
-        load_description(assets / JSON)
-    except RobotDescriptionError as err:
-        assert "\n" not in str(err)
-    finally:
-        (assets / file).write_bytes(original)

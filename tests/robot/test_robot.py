@@ -302,8 +302,8 @@ def test_model_with_requires_grad_has_gradients():
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ({"num_worlds": 0}, "num_worlds must be a whole number of at least 1, got 0"),
-        ({"num_worlds": "4"}, "num_worlds must be a whole number of at least 1, got '4'"),
+        ({"num_worlds": 0}, "num_worlds must be a whole number of 1 to 1048576, got 0"),
+        ({"num_worlds": "4"}, "num_worlds must be a whole number of 1 to 1048576, got '4'"),
         ({"num_worlds": 1, "friction": math.nan}, "friction must lie in 0 to 10, got nan"),
         ({"num_worlds": 1, "friction": -0.1}, "friction must lie in 0 to 10, got -0.1"),
         ({"num_worlds": 1, "friction": 1.0e8}, "friction must lie in 0 to 10"),

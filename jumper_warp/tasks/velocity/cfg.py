@@ -12,7 +12,7 @@ from jumper_warp.kernels.velocity.commands import CommandRanges
 from jumper_warp.kernels.velocity.start_states import TileMap, VelocitySettings
 from jumper_warp.robot.terrain import TerrainCfg, terrain_map
 from jumper_warp.tasks.ranges import Pair, check_ranges, filled
-from jumper_warp.utils.checks import check_finite, check_probabilities
+from jumper_warp.utils.checks import check_bounds, check_probabilities
 from jumper_warp.utils.errors import InputError
 
 if TYPE_CHECKING:
@@ -46,7 +46,7 @@ class CommandCfg:
 
     def __post_init__(self) -> None:
         """Raise InputError if a range shrinks or is not positive, or a count, time or probability is out of range."""
-        check_finite("command reach", *self.first_range, *self.last_range)
+        check_bounds("command", self, dict.fromkeys(("first_range", "last_range"), (-100.0, 100.0, "m/s, rad/s")))
         if not all(0.0 < low <= high for low, high in zip(self.first_range, self.last_range, strict=True)):
             raise InputError(f"command ranges must be positive and grow, got {self.first_range}, {self.last_range}")
         if self.levels < 0:

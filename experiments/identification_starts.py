@@ -1,0 +1,118 @@
+"""Measure how reliably `jumper sysid` separates good fits from local minima, on robots far from their description.
+
+    python experiments/identification_starts.py --workers 16 --out outputs/identification_starts
+
+Masses, gains, friction, damping and latency of each robot differ from the description by one to two standard deviations
+of their priors. Its two hung chirps, standing chirp and small jump are recorded with several noises, and each recording
+is identified. A fit is good if at most 20 % of its identified parameters are outside their 95 % intervals and none by
+more than 5 standard deviations.
+
+`evaluation.jsonl` in the folder has one line for each fit. A later run with the same `--out` computes only the missing
+ones. `--shard 1/3` computes every third one, in a folder of its own; a run without `--shard` in a folder with the
+lines of all shards computes the metrics.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.output import output_dir
+from jumper_warp.utils.progress import phase
+from support.far_robots import Stream, identify_far_robot
+from support.scripts import OutputArgs, report, run_script
+
+SUMMARY = (
+    "fits", "accepted", "accepted_bad", "good", "good_rejected_rate", "coverage", "worst_accepted", "three_starts",
+    "cpu_s_median", "cpu_s_largest",
+)  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Args(OutputArgs):
+    """Flags of the test of the starts of identification."""
+
+    num_robots: int = 40  # Number of robots
+    num_noises: int = 3  # Number of recordings of each robot
+    stream: Stream = "evaluation"  # Random numbers of robots, motions and noise; streams have none in common
+    workers: int = 1  # Number of processes, each on one CPU core
+    shard: str = "1/1"  # Part of the fits to compute, such as 2/3
+
+    def __post_init__(self) -> None:
+        numbers = re.fullmatch(r"([1-9]\d{0,3})/([1-9]\d{0,3})", self.shard)
+        if min(self.num_robots, self.num_noises, self.workers) < 1:
+            raise InputError("num_robots, num_noises and workers must be at least 1")
+        if not numbers or int(numbers[1]) > int(numbers[2]):
+            raise InputError(f"shard must be K/N with K in 1 to N, such as 2/3, got {self.shard:.20}")
+
+
+def saved_fits(path: Path) -> dict[tuple[int, int], dict[str, Any]]:
+    """Return the fits in a file of JSON lines by (robot, noise); a last line that was cut off is dropped."""
+    fits = {}
+    for line in path.read_text(encoding="utf-8").splitlines() if path.exists() else []:
+        try:
+            fit = json.loads(line)
+            fits[fit["robot"], fit["noise"]] = fit
+        except json.JSONDecodeError:
+            continue
+    return fits
+
+
+def summary(fits: list[dict[str, Any]]) -> dict[str, Any]:
+    """Return metrics of all fits: accepted and good ones, coverage and time."""
+    accepted, good = ([fit for fit in fits if fit[name]] for name in ("consistent", "good"))
+    bad = [fit for fit in accepted if not fit["good"]]
+    cpu = [fit["cpu_s"] for fit in fits]
+    return {
+        "fits": len(fits), "accepted": len(accepted), "accepted_bad": len(bad), "good": len(good),
+        "good_rejected": sum(not fit["consistent"] for fit in good),
+        "good_rejected_rate": sum(not fit["consistent"] for fit in good) / max(len(good), 1),
+        "coverage": 1.0 - sum(fit["outside"] for fit in accepted) / max(sum(fit["identified"] for fit in accepted), 1),
+        "worst_accepted": max((fit["worst"] for fit in accepted), default=0.0),
+        "accepted_bad_fits": [
+            {name: fit[name] for name in ("robot", "noise", "outside", "identified", "worst", "mass_error_std")}
+            for fit in bad
+        ],
+        "rejected_fits": [[fit["robot"], fit["noise"], fit["inconsistency"]] for fit in fits if not fit["consistent"]],
+        "three_starts": sum(len(fit["starts"]) > 2 for fit in fits),
+        "cpu_s_median": float(np.median(cpu)), "cpu_s_mean": float(np.mean(cpu)), "cpu_s_largest": max(cpu),
+    }  # fmt: skip
+
+
+def main(args: Args) -> dict[str, Any]:
+    """Identify the robots whose lines are missing in the folder, and write and return the metrics of all."""
+    folder = output_dir("identification_starts", args.out)
+    path = folder / f"{args.stream}.jsonl"
+    fits = saved_fits(path)
+    write_atomically(path, "".join(json.dumps(fit) + "\n" for fit in fits.values()).encode())
+    shard, shards = map(int, args.shard.split("/"))
+    every = [(robot, noise) for robot in range(args.num_robots) for noise in range(args.num_noises)]
+    missing = [key for key in every[shard - 1 :: shards] if key not in fits]
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):  # of the processes, which inherit them
+        os.environ[name] = "1"
+    with (
+        ProcessPoolExecutor(args.workers, get_context("spawn")) as pool,
+        path.open("a", encoding="utf-8") as file,
+        phase("identifying robots", len(missing)) as advance,
+    ):
+        for future in as_completed([pool.submit(identify_far_robot, args.stream, *key) for key in missing]):
+            fit = future.result()
+            fits[fit["robot"], fit["noise"]] = fit
+            print(json.dumps(fit), file=file, flush=True)
+            advance()
+    values = summary([fits[key] for key in every if key in fits])
+    return report(args, folder, values, f"Identification of {args.num_robots} robots far from the description", SUMMARY)
+
+
+if __name__ == "__main__":
+    run_script(main, Args)

@@ -1,0 +1,74 @@
+"""Robots far from the description: drawn, recorded with several noises, identified, and compared with the truth."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any, Literal
+
+import numpy as np
+
+from jumper_warp.identification.excitation import unsafe_reason
+from jumper_warp.identification.identify import identify
+from jumper_warp.identification.parameters import ParameterSet, jumper_parameters, total_mass, weighed_mass
+from jumper_warp.identification.recording import KINDS, measure, replay_plan, sample_plan
+from jumper_warp.identification.replay import MotionReplay
+from jumper_warp.utils.runtime import configure_device
+
+Stream = Literal["development", "evaluation"]
+STREAMS: dict[Stream, int] = {"development": 1, "evaluation": 2}  # First word of the seeds
+FAR = ("base_mass", "link_mass", "kp", "kd", "motor_friction", "knee_damping", "paw_friction")
+NEAREST, FARTHEST = 1.0, 2.0  # [1] Range of the distance of each of these quantities, in standard deviations of priors
+OWN, MOST = 0.5, 2.5  # [1] Standard deviation of each parameter around it, and limit, in the same unit
+LATENCY = (0.4, 2.0)  # [1] Range of the latency, in standard deviations of its prior (5 ms)
+SCALE_STD = 0.02  # [kg] Standard deviation of the weighed mass
+MOST_OUTSIDE, FARTHEST_OUTSIDE = 0.2, 5.0
+"""Limits of a good fit: fraction of identified parameters outside their 95 % intervals, and their largest error in
+standard deviations."""
+
+
+def far_robot(parameters: ParameterSet, rng: np.random.Generator) -> np.ndarray:
+    """Draw normalised parameters (P,) of a robot with masses, gains, friction and latency far from the described."""
+    z = OWN * rng.normal(size=len(parameters))
+    for quantity in FAR:
+        members = [i for i, parameter in enumerate(parameters) if parameter.quantity == quantity]
+        far = rng.choice([-1.0, 1.0]) * rng.uniform(NEAREST, FARTHEST)
+        z[members] = far + (z[members] if len(members) > 1 else 0.0)
+    z[parameters.names.index("latency")] = rng.uniform(*LATENCY)
+    return np.clip(z, -MOST, MOST)
+
+
+def identify_far_robot(stream: Stream, robot: int, noise: int) -> dict[str, Any]:
+    """Draw a robot, record its motions, identify it on one CPU thread, and return the result as one line of JSON.
+
+    robot, noise: indices of the robot with its motions, and of the noise of its sensors and scale.
+    """
+    configure_device("cpu", 1)
+    parameters, replay = jumper_parameters(), MotionReplay(device="cpu", threads=1)
+    rng, noise_rng = (
+        np.random.default_rng(seed) for seed in ([STREAMS[stream], robot], [STREAMS[stream], robot, 1 + noise])
+    )
+    truth = far_robot(parameters, rng)
+    robots, described = parameters.robots(truth), parameters.robots(np.zeros_like(truth))
+    simulate = partial(replay_plan, MotionReplay(device="cpu", threads=1))
+    motions = []
+    while len(motions) < len(KINDS):
+        plan = sample_plan(KINDS[len(motions)], rng)
+        record = simulate(plan, robots)
+        if not unsafe_reason(plan, simulate(plan, described)) and not unsafe_reason(plan, record):
+            motions.append(measure(plan, f"{len(motions)} {plan.kind}", record, robots, noise_rng))
+    mass_error = float(noise_rng.normal())
+    mass = weighed_mass(float(total_mass(robots)[0]) + SCALE_STD * mass_error, SCALE_STD)
+    result = identify(motions, parameters, prior_measurements=[mass], replay=replay)
+    error = np.abs(result.z - truth)[result.identified] / result.std[result.identified]
+    outside, worst = int((error > 1.96).sum()), float(error.max())
+    return {
+        "robot": robot, "noise": noise, "consistent": result.consistent, "inconsistency": result.inconsistency,
+        "good": outside <= MOST_OUTSIDE * len(error) and worst <= FARTHEST_OUTSIDE,
+        "identified": len(error), "outside": outside, "worst": worst, "mass_error_std": mass_error,
+        "chi2": result.chi2, "mismatch": result.mismatch,
+        "largest_test": max(test.chi2 / test.limit for test in result.tests),
+        "correlation": max(test.correlation for test in result.tests),
+        "starts": [[start.excess, start.difference] for start in result.starts],
+        "cpu_s": result.effort.cpu_seconds, "wall_s": result.effort.seconds,
+        "million_world_steps": result.effort.world_steps / 1.0e6,
+    }  # fmt: skip

@@ -1,0 +1,88 @@
+"""χ² tests of each channel and each motion, which find a fit that does not explain the data within the noise."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.special import chdtri
+
+from jumper_warp.identification.least_squares import LeastSquares, NormalEquations
+from jumper_warp.identification.uncertainty import autocorrelation
+
+FAMILY_LEVEL = 0.01
+"""[1] Probability that at least one test of an identification rejects although the model is right."""
+
+
+@dataclass(frozen=True)
+class FitTest:
+    """One-sided χ² test of the residuals of one motion, or of one of its channels."""
+
+    motion: str
+    channel: str  # empty: all channels of the motion
+    chi2: float  # [1] Mean squared residual over the noise
+    limit: float  # [1] χ² above which the test rejects
+    correlation: float  # [1] Factor of the variance of χ² by measured correlations of the residuals; 1: none
+
+    @property
+    def passed(self) -> bool:
+        """Whether χ² is at most the limit."""
+        return self.chi2 <= self.limit
+
+
+def chi2_limit(count: int, fitted: float, correlation: float, level: float) -> float:
+    """Return the χ² that a right model exceeds with probability `level`.
+
+    χ² is the mean square of `count` normal residuals of variance 1, of which the fit determines `fitted` (trace of the
+    hat matrix). Correlated residuals act like count / correlation independent ones.
+    """
+    freedom = max(count - fitted, 1.0)
+    effective = max(freedom / correlation, 1.0)
+    return float(chdtri(effective, level)) / effective * freedom / count
+
+
+def variance_factor(columns: Sequence[np.ndarray]) -> float:
+    """Return the factor by which correlations within series of residuals increase the variance of their χ².
+
+    It is 1 + 2 Σ ρ² over lags (Bartlett 1946), with the measured autocorrelation ρ up to the first lag where it is
+    within three standard deviations of 0. columns: series of equal variance, one per sensor, (n,) each.
+    """
+    correlation = autocorrelation(columns)
+    return 1.0 + 2.0 * float(np.sum(correlation**2))
+
+
+def fit_tests(problem: LeastSquares, normal: NormalEquations) -> tuple[FitTest, ...]:
+    """Test the residuals of each channel of each motion, and of each motion, with a family-wise level `FAMILY_LEVEL`.
+
+    normal: normal equations at the fit. All tests have the same level (Šidák).
+    """
+    names = [name for motion in problem.motions for name, columns in motion.channels if motion.valid[:, columns].any()]
+    level = -math.expm1(math.log1p(-FAMILY_LEVEL) / (len(names) + len(problem.motions)))
+    size = len(problem.parameters)
+    covariance = np.linalg.inv(normal.information() + np.eye(size))
+    tests = []
+    parts = zip(problem.motions, normal.linearised, normal.start_matrices, normal.cross_matrices, strict=True)
+    for motion, linear, start_matrix, cross in parts:
+        start_jacobian = linear.jacobian[:, size:]
+        marginal = linear.jacobian[:, :size] - start_jacobian @ np.linalg.solve(start_matrix, cross.T)
+        leverage = np.sum((marginal @ covariance) * marginal, axis=1)
+        leverage += np.sum((start_jacobian @ np.linalg.inv(start_matrix)) * start_jacobian, axis=1)
+        tables = np.full((2, *motion.valid.shape), math.nan)
+        tables[:, motion.valid] = linear.residual, leverage
+        rows = []  # by channel: sum of squares, number of values, number of fitted values, variance factor
+        for name, columns in motion.channels:
+            values, valid = tables[:, :, columns], motion.valid[:, columns]
+            if not valid.any():
+                continue
+            series = [values[0, valid[:, i], i] for i in range(valid.shape[1])]
+            squares, fitted = float(np.nansum(values[0] ** 2)), float(np.nansum(values[1]))
+            count, factor = int(valid.sum()), variance_factor(series)
+            rows.append((squares, count, fitted, factor * count))
+            limit = chi2_limit(count, fitted, factor, level)
+            tests.append(FitTest(motion.motion.name, name, squares / count, limit, factor))
+        squares, count, fitted, weighed = (sum(column) for column in zip(*rows, strict=True))
+        limit = chi2_limit(count, fitted, weighed / count, level)
+        tests.append(FitTest(motion.motion.name, "", squares / count, limit, weighed / count))
+    return tuple(tests)

@@ -1,0 +1,34 @@
+"""Bounded reading of NumPy archives."""
+
+from __future__ import annotations
+
+import io
+import zipfile
+from pathlib import Path
+
+import numpy as np
+
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import MAX_BYTES, ErrorType, read_file
+
+
+def read_npz(path: Path, purpose: str, error: ErrorType = InputError) -> dict[str, np.ndarray]:
+    """Return the arrays of an npz file by name, without pickled ones.
+
+    purpose: content of the file, for messages. error: class of the error. Raises `error`: it is no regular file, larger
+    than MAX_BYTES, also unpacked, damaged, or holds something else; the message has the path.
+    """
+    data = read_file(path, purpose, error=error)
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            entries = archive.infolist()
+            if sum(entry.file_size for entry in entries) > MAX_BYTES:
+                raise error(f"{path}: larger than {MAX_BYTES >> 20} MiB unpacked ({purpose})")
+            if archive.testzip() is not None or len({entry.filename for entry in entries}) < len(entries):
+                raise error(f"{path}: damaged ({purpose})")
+        with np.load(io.BytesIO(data), allow_pickle=False) as file:
+            return {name: file[name] for name in file.files}
+    except InputError:
+        raise
+    except Exception as problem:  # zip and header errors are of many kinds
+        raise error(f"{path}: not an npz file of plain arrays ({type(problem).__name__})") from None

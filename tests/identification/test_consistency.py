@@ -1,0 +1,63 @@
+"""χ² tests of a fit, starts that agree, and a paw that sticks in the simulation and slips on the robot."""
+
+import numpy as np
+import pytest
+
+from jumper_warp.identification.consistency import chi2_limit, variance_factor
+from jumper_warp.identification.identify import identify
+from jumper_warp.identification.parameters import ParameterSet, jumper_parameters
+from jumper_warp.identification.recording import measure, replay_plan, sample_plan
+from jumper_warp.identification.replay import MotionReplay
+from jumper_warp.identification.results import starts_agree
+
+
+@pytest.mark.parametrize(
+    ("count", "fitted", "correlation", "limit"),
+    [
+        (100, 0.0, 1.0, 124.342 / 100),  # tables of the χ² distribution at 5 %
+        (100, 0.0, 2.0, 67.505 / 50),  # as 50 independent values
+        (110, 10.0, 1.0, 124.342 / 110),
+    ],
+)
+def test_chi2_limit_is_that_of_chi2_tables(count, fitted, correlation, limit):
+    assert chi2_limit(count, fitted, correlation, 0.05) == pytest.approx(limit, rel=1e-5)
+
+
+def test_variance_factor_of_autoregressive_residuals_is_that_of_bartlett():
+    rng, noise = np.random.default_rng(0), np.zeros((12, 4000))
+    white = rng.normal(size=noise.shape)
+    for i in range(1, noise.shape[1]):
+        noise[:, i] = 0.6 * noise[:, i - 1] + white[:, i]
+    assert variance_factor(white) == pytest.approx(1.0, abs=0.01)
+    assert variance_factor(noise) == pytest.approx((1.0 + 0.36) / (1.0 - 0.36), rel=0.05)
+
+
+@pytest.mark.parametrize(("excess", "agree"), [([0.0], False), ([0.0, 1.0], True), ([0.0, 20.0, 21.0], False)])
+def test_starts_agree_if_the_second_best_costs_little_more(excess, agree):
+    assert starts_agree(excess) is agree
+
+
+@pytest.fixture(scope="module")
+def slipping():
+    """Return the paws' friction as the only parameter, a replay, and a motion whose paws slip at 0.6 instead of 0.9."""
+    parameters = ParameterSet(tuple(p for p in jumper_parameters() if p.name == "paw_friction"))
+    replay, rng = MotionReplay(threads=1), np.random.default_rng(1)
+    robots = parameters.robots(parameters.normalised(np.array([[0.6]])))
+    plan = sample_plan("standing chirp", rng, seconds=0.6)
+    return parameters, replay, measure(plan, "slipping", replay_plan(replay, plan, robots), robots, rng)
+
+
+def test_friction_of_paws_that_stick_as_described_is_identified(slipping):
+    parameters, replay, motion = slipping
+    result = identify([motion], parameters, replay=replay)
+    assert result.values[0] == pytest.approx(0.6, abs=0.02)
+    assert result.consistent and result.starts_agree and result.inconsistency == ""
+
+
+def test_fit_of_a_robot_with_another_friction_is_not_consistent(slipping):
+    _, replay, motion = slipping
+    result = identify([motion], jumper_parameters(["latency"]), replay=replay)
+    assert not result.consistent
+    assert "slipping rate χ² " in result.inconsistency
+    failed = {(test.motion, test.channel) for test in result.tests if not test.passed}
+    assert ("slipping", "rate") in failed and ("slipping", "orientation") not in failed

@@ -1,0 +1,99 @@
+"""A term whose function returns another type is refused with the function's file and line."""
+
+import dataclasses
+import inspect
+from typing import Any
+
+import pytest
+import warp as wp
+
+from jumper_warp.envs.skill import kernels_of
+from jumper_warp.kernels.mdp.view import RobotView
+from jumper_warp.registry import make_task
+from jumper_warp.tasks.terms import Advance, ObservationTerm, RewardTerm, TerminationTerm
+from jumper_warp.utils.errors import InputError
+
+
+@wp.func
+def whole(robot: RobotView, state: Any) -> int:
+    return 1
+
+
+@wp.func
+def vector(robot: RobotView, state: Any) -> wp.vec3:
+    return wp.vec3(1.0, 2.0, 3.0)
+
+
+@wp.func
+def text(robot: RobotView, state: Any) -> str:
+    return "x"
+
+
+@wp.func
+def nothing(robot: RobotView, state: Any) -> None:
+    x = 1.0  # noqa: F841
+
+
+@wp.func
+def whole_unannotated(robot: RobotView, state: Any):
+    return 1
+
+
+@wp.func
+def whole_as_float(robot: RobotView, state: Any) -> float:
+    return 1
+
+
+@wp.func
+def vector_unannotated(robot: RobotView, state: Any):
+    return wp.vec3(1.0, 2.0, 3.0)
+
+
+@wp.func
+def text_unannotated(robot: RobotView, state: Any):
+    return "x"
+
+
+@wp.func
+def nothing_unannotated(robot: RobotView, state: Any):
+    x = 1.0  # noqa: F841
+
+
+def place(func):
+    """Return file and line of a function of this file."""
+    return f"test_return_types.py:{inspect.unwrap(func.func).__code__.co_firstlineno}: "
+
+
+@pytest.mark.parametrize(
+    ("kind", "func", "message"),
+    [
+        (RewardTerm, whole, "RewardTerm whole: the function must return float, its annotation is int"),
+        (RewardTerm, vector, "the function must return float, its annotation is a vector of 3"),
+        (RewardTerm, text, "the function must return float, its annotation is str"),
+        (RewardTerm, nothing, "the function must return float, its annotation is nothing"),
+        (TerminationTerm, vector, "the function must return bool, its annotation is a vector of 3"),
+        (ObservationTerm, whole, "the function must return float or a vector, its annotation is int"),
+        (ObservationTerm, text, "the function must return float or a vector, its annotation is str"),
+        (ObservationTerm, nothing, "the function must return float or a vector, its annotation is nothing"),
+        (ObservationTerm, whole_unannotated, "needs an annotation of its return type, float or a vector"),
+        (Advance, vector, "the function must return the state, its annotation is a vector of 3"),
+    ],
+)
+def test_wrong_annotation_is_refused_at_the_definition(kind, func, message):
+    values = {"weight": 1.0} if kind is RewardTerm else {}
+    with pytest.raises(InputError) as refusal:
+        kind(func, **values)
+    assert str(refusal.value).startswith(place(func)) and message in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    ("func", "returned"),
+    [(whole_unannotated, "int32"), (whole_as_float, "int32"), (vector_unannotated, "a vector of 3"),
+     (text_unannotated, "str"), (nothing_unannotated, "nothing")],
+)  # fmt: skip
+def test_wrong_value_without_annotation_is_refused_when_kernels_are_built(func, returned):
+    task = dataclasses.replace(make_task("vertical-jump"), rewards=(RewardTerm(func, 1.0),))
+    with pytest.raises(InputError) as refusal:
+        kernels_of(task)
+    message = f"RewardTerm {func.key}: the function must return float, it returns {returned}"
+    assert str(refusal.value) == place(func) + message
