@@ -126,8 +126,8 @@ def gradient_errors(ppo: FusedPpo) -> dict[str, float]:
     entropy = (model.log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
     (surrogate + cfg.value_coef * value_loss - cfg.entropy_coef * entropy).backward()
     errors = {
-        "surrogate": float(found[flat.size] / surrogate - 1.0),
-        "value": float(found[flat.size + 1] / value_loss - 1.0),
+        "surrogate": found[flat.size].item() / surrogate.item() - 1.0,
+        "value": found[flat.size + 1].item() / value_loss.item() - 1.0,
     }
     for (name, param), exact in zip(ppo.model.named_parameters(), model.parameters(), strict=True):
         errors[name] = float((param.grad - exact.grad).norm() / exact.grad.norm())  # pyright: ignore
