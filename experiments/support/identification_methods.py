@@ -98,7 +98,7 @@ def compare_methods(parameters: ParameterSet, case: Case, replay: MotionReplay, 
     """
     problem = make_problem(parameters, case, replay)
     evolved = identify_by_evolution(case.motions, parameters, prior_measurements=[case.mass], max_seconds=seconds)
-    points = {"cma": Point(evolved.z, list(evolved.starts)), "scipy": scipy_fit(problem, seconds)}
+    points = {"cma": Point(evolved.z, list(evolved.initial_states)), "scipy": scipy_fit(problem, seconds)}
     metrics = {"methods_wall_s": seconds, "cma_million_world_steps": evolved.effort.world_steps / 1.0e6}
     for name, point in points.items():
         angle, height = prediction_errors(case, parameters.robots(point.z[None]), ours)

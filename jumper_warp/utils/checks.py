@@ -70,7 +70,7 @@ def check_probabilities(section: str, cfg: Any, *names: str) -> None:
 
 def check_count(name: str, value: Any, most: int = MOST_WORLDS) -> None:
     """Raise InputError unless the value is an integer from 1 to `most`, and not a bool."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or not 1 <= value <= most:
+    if isinstance(value, bool) or not isinstance(value, Integral) or not 1 <= int(value) <= most:
         raise InputError(f"{name} must be a whole number of 1 to {most}, got {value!r:.40}")
 
 
@@ -90,7 +90,7 @@ def check_bounds(section: str, cfg: Any, bounds: Mapping[str, tuple[float, float
 
 def check_seed(value: Any) -> None:
     """Raise InputError unless the value is an integer from 0 to MOST_SEED, and not a bool."""
-    if isinstance(value, bool) or not isinstance(value, Integral) or not 0 <= value <= MOST_SEED:
+    if isinstance(value, bool) or not isinstance(value, Integral) or not 0 <= int(value) <= MOST_SEED:
         raise InputError(f"seed must be in 0 .. {MOST_SEED}, got {value!r:.40}")
 
 
