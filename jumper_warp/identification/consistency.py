@@ -1,4 +1,4 @@
-"""χ² tests of each channel and each motion, which find a fit that does not explain the data within the noise."""
+"""χ² tests of a fit: the residuals of each channel and motion, and the parameters that each motion alone calls for."""
 
 from __future__ import annotations
 
@@ -14,17 +14,20 @@ from jumper_warp.identification.uncertainty import autocorrelation
 
 FAMILY_LEVEL = 0.01
 """[1] Probability that at least one test of an identification rejects although the model is right."""
+SHARED = "shared parameters"  # Name of the test of a motion's parameters, in place of a channel
+COMPARABLE = 10.0
+"""[1] Fisher information, over the prior's, that one motion and the others need about a combination of parameters."""
 
 
 @dataclass(frozen=True)
 class FitTest:
-    """One-sided χ² test of the residuals of one motion, or of one of its channels."""
+    """One-sided χ² test of one motion: of the residuals of a channel or of all channels, or of the parameters."""
 
     motion: str
-    channel: str  # empty: all channels of the motion
-    chi2: float  # [1] Mean squared residual over the noise
+    channel: str  # empty: all channels of the motion; `SHARED`: the parameters agree with those of the other motions
+    chi2: float  # [1] Mean squared residual over the noise, or difference of parameters over its standard deviation
     limit: float  # [1] χ² above which the test rejects
-    correlation: float  # [1] Factor of the variance of χ² by measured correlations of the residuals; 1: none
+    correlation: float  # [1] Factor by which measured correlations of the residuals raise the variance; 1: none
 
     @property
     def passed(self) -> bool:
@@ -53,13 +56,37 @@ def variance_factor(columns: Sequence[np.ndarray]) -> float:
     return 1.0 + 2.0 * float(np.sum(correlation**2))
 
 
-def fit_tests(problem: LeastSquares, normal: NormalEquations) -> tuple[FitTest, ...]:
-    """Test the residuals of each channel of each motion, and of each motion, with a family-wise level `FAMILY_LEVEL`.
-
-    normal: normal equations at the fit. All tests have the same level (Šidák).
-    """
+def test_level(problem: LeastSquares) -> float:
+    """Return the level of each test of a fit, for the family-wise level `FAMILY_LEVEL` (Šidák)."""
     names = [name for motion in problem.motions for name, columns in motion.channels if motion.valid[:, columns].any()]
-    level = -math.expm1(math.log1p(-FAMILY_LEVEL) / (len(names) + len(problem.motions)))
+    return -math.expm1(math.log1p(-FAMILY_LEVEL) / (len(names) + 2 * len(problem.motions)))
+
+
+def shared_parameter_tests(problem: LeastSquares, normal: NormalEquations, mismatch: float = 1.0) -> list[FitTest]:
+    """Test for each motion whether the other motions call for the same parameters: score tests (Rao 1948).
+
+    At the fit the scores of all motions and the prior cancel. The score of a motion with information I has the
+    covariance I - I C I, where C is the covariance of the parameters. Combinations of parameters below `COMPARABLE` are
+    left out, and motions without any others. normal: normal equations at the fit. mismatch: factor on standard
+    deviations by correlated residuals.
+    """
+    covariance = np.linalg.inv(normal.information() + np.eye(len(normal.gradient)))
+    tests, level = [], test_level(problem)
+    for i, motion in enumerate(problem.motions):
+        information, score = normal.of_motion(i)
+        variance, vectors = np.linalg.eigh(information - information @ covariance @ information)
+        known = variance > COMPARABLE
+        if rank := int(known.sum()):
+            squares = (vectors.T @ score)[known] ** 2 / variance[known]
+            limit = chi2_limit(rank, 0.0, 1.0, level)
+            chi2 = float(np.mean(squares)) / mismatch**2
+            tests.append(FitTest(motion.motion.name, SHARED, chi2, limit, mismatch**2))
+    return tests
+
+
+def residual_tests(problem: LeastSquares, normal: NormalEquations) -> list[FitTest]:
+    """Test the residuals of each channel of each motion, and of each motion; normal: normal equations at the fit."""
+    level = test_level(problem)
     size = len(problem.parameters)
     covariance = np.linalg.inv(normal.information() + np.eye(size))
     tests = []
@@ -85,4 +112,4 @@ def fit_tests(problem: LeastSquares, normal: NormalEquations) -> tuple[FitTest, 
         squares, count, fitted, weighed = (sum(column) for column in zip(*rows, strict=True))
         limit = chi2_limit(count, fitted, weighed / count, level)
         tests.append(FitTest(motion.motion.name, "", squares / count, limit, weighed / count))
-    return tuple(tests)
+    return tests

@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import warp as wp
 
-from jumper_warp.identification.consistency import fit_tests
+from jumper_warp.identification.consistency import residual_tests, shared_parameter_tests
 from jumper_warp.identification.least_squares import LeastSquares, NormalEquations, Point, Trial, replace_residuals
 from jumper_warp.identification.motions import NoiseLevels, RecordedMotion
 from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement
@@ -45,7 +45,7 @@ CONVERGED = 0.5
 GOOD_STEP = 0.3  # Actual over predicted decrease of the cost above which a step is good enough to reuse the Jacobian
 HORIZONS = (0.4, 0.7, 1.0)
 """Fractions of a motion on the ground that are fitted in turn, as a paw's motion depends on all earlier contacts."""
-MAX_STARTS = 4  # largest number of starts; there are only two if these agree or the best fails a test of the fit
+MAX_STARTS = 4  # largest number of starts; there are only two if these agree or the best fails a test of residuals
 DISPLACEMENT, LARGEST_DISPLACEMENT = 3.0, 0.1
 """Standard deviation of the displacement of a start from an earlier minimum, in standard deviations of the estimate.
 Largest displacement of a parameter, in standard deviations of its prior."""
@@ -211,8 +211,11 @@ def descend(
     """Fit parameters and initial states to all motions by Levenberg-Marquardt from two to four starts.
 
     Returned: the least-squares problem of all motions and the minimum of each start, best first. Derivatives of the
-    best exclude jumps of the residuals. The first start begins at the described robot, the others near the best minimum
-    so far. All add the motions one after another, so that they leave a minimum that only one motion has.
+    best exclude jumps of the residuals. The first start begins at the described robot and adds the motions one after
+    another. If its residuals pass their tests, the second begins with all motions, at the parameters that the best
+    minimum would have without the motion that contradicts the others most. Later starts alternate between both kinds,
+    the first kind from a displaced best minimum. They end if two starts agree and no motion contradicts the others, or
+    if the residuals of two starts fail.
 
     coarse, whole: all motions, with the physics steps of the first stages and of the last stage. pieces: short pieces
     of the motions for a first stage, empty to skip it. Raises InputError: the simulation diverges in a motion.
@@ -224,13 +227,28 @@ def descend(
         z = descent.minimise(problem, begin, problem.normal(begin), PIECES_DECREASE)[0].z
     final = LeastSquares(parameters, whole, replay, prior_measurements)
     minima, rng = [], np.random.default_rng(0)
-    while len(minima) < MAX_STARTS and not starts_agree(excess_costs(final, minima)):
-        if len(minima) > 1 and not all(test.passed for test in fit_tests(final, minima[0].normal)):
-            break
+    direct = False
+    while len(minima) < MAX_STARTS:
         if minima:
-            z = minima[0].point.z + displacement(minima[0].normal, rng)
+            best = minima[0].normal
+            fits = all(test.passed for test in residual_tests(final, best))
+            shared = shared_parameter_tests(final, best)
+            agree = starts_agree(excess_costs(final, minima)) and all(test.passed for test in shared)
+            if agree or (len(minima) > 1 and not fits):
+                break
+            direct = fits and not direct
+            z = minima[0].point.z + displacement(best, rng)
+            if direct and shared:
+                names = [motion.motion.name for motion in whole]
+                z += best.without_motion(names.index(max(shared, key=lambda test: test.chi2).motion))
             z = np.clip(z, *parameters.bounds())
-        point, linearised = add_motions(descent, parameters, coarse, prior_measurements, z)
+        if direct:
+            problem = LeastSquares(parameters, coarse, replay, prior_measurements, robust=True)
+            point = Point(z, problem.nominal_point().starts)
+            point, normal = descent.minimise(problem, point, problem.normal(point), STAGE_DECREASE)
+            linearised = normal.linearised
+        else:
+            point, linearised = add_motions(descent, parameters, coarse, prior_measurements, z)
         if whole is not coarse:
             linearised = replace_residuals(linearised, final.residuals(point))
         minima.append(descent.refine(final, point, final.assemble(point, linearised)))

@@ -51,6 +51,24 @@ class NormalEquations:
     linearised: list[Linearised]  # by motion: residuals and Jacobian
     weights: list[np.ndarray]  # by motion: (m,) weights of the residuals, 1 unless the problem is robust
 
+    def of_motion(self, index: int) -> tuple[np.ndarray, np.ndarray]:
+        """Return the Fisher information (P, P) and the score (P,) of one motion, its initial state marginalised.
+
+        About the normalised parameters; the score is the gradient of half the motion's cost. index: of the motion.
+        """
+        linear, weight = self.linearised[index], self.weights[index]
+        cross, start_matrix = self.cross_matrices[index], self.start_matrices[index]
+        jacobian = linear.jacobian[:, : len(self.gradient)]
+        eliminated = np.linalg.solve(start_matrix, np.column_stack([cross.T, self.start_gradients[index]]))
+        information = transposed_product(weight[:, None] * jacobian, jacobian) - cross @ eliminated[:, :-1]
+        score = np.einsum("mi,m->i", jacobian, weight * linear.residual) - cross @ eliminated[:, -1]
+        return 0.5 * (information + information.T), score
+
+    def without_motion(self, index: int) -> np.ndarray:
+        """Return the change of the parameters (P,) if the motion `index` were left out, to first order."""
+        information, score = self.of_motion(index)
+        return np.linalg.solve(self.information() + np.eye(len(score)) - information, score)
+
     def information(self) -> np.ndarray:
         """Return the data's Fisher information (P, P) about the normalised parameters, initial states marginalised."""
         information = self.matrix.copy()
