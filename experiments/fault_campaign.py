@@ -21,6 +21,7 @@ from typing import Any
 from jumper_warp.utils.checks import check_seed
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.files import write_atomically
+from jumper_warp.utils.locks import write_lock
 from jumper_warp.utils.output import output_dir
 from support.fault_trials import TRIALS, run_trial
 from support.faults import warm_up
@@ -36,7 +37,7 @@ class Args(OutputArgs):
     """Flags of the fault campaign."""
 
     trials: int = 60  # Number of trials, over all starts with the same --out
-    max_seconds: float = 480.0  # [s] Time after which no further trial starts
+    max_seconds: float = 480.0  # [s] Time after which no further trial starts; one takes some 5 s on two free cores
     seed: int = 0  # Seed of the faults
     faults: tuple[str, ...] = ("kills", "full_disk", "kills", "read_only", "kills", "deleted", "kills", "writers",
         "kills", "killed_rank", "kills", "clock")  # fmt: skip
@@ -85,18 +86,19 @@ def write_tables(folder: Path, trials: list[dict[str, Any]]) -> dict[str, Any]:
 
 def main(args: Args) -> dict[str, Any]:
     """Run the trials that are left, as far as the time allows, and return metrics of all trials."""
-    start, folder = time.monotonic(), output_dir("fault_campaign", args.out)
-    trials = read_trials(folder, args.seed)
-    warm_up()
-    for number in range(len(trials), args.trials):
-        if time.monotonic() - start > args.max_seconds:
-            break
-        trials.append(run_trial(args.faults[number % len(args.faults)], args.seed, number, folder.absolute()))
-        with (folder / LOG).open("a") as log:
-            log.write(json.dumps(trials[-1]) + "\n")
-        announce(f"trial {number}: {trials[-1]['faults']} {trials[-1]['unexpected']}".rstrip())
-        write_tables(folder, trials)
-    metrics = write_tables(folder, trials) | {"seed": args.seed}
+    start, folder = time.monotonic(), output_dir("fault_campaign", args.out).absolute()
+    with write_lock(folder):
+        trials = read_trials(folder, args.seed)
+        warm_up()
+        for number in range(len(trials), args.trials):
+            if time.monotonic() - start > args.max_seconds:
+                break
+            trials.append(run_trial(args.faults[number % len(args.faults)], args.seed, number, folder))
+            with (folder / LOG).open("a") as log:
+                log.write(json.dumps(trials[-1]) + "\n")
+            announce(f"trial {number}: {json.dumps(trials[-1]['faults'])} {trials[-1]['unexpected']}".rstrip())
+            write_tables(folder, trials)
+        metrics = write_tables(folder, trials) | {"seed": args.seed}
     return report(args, folder, metrics, f"{len(trials)} trainings with faults", SUMMARY)
 
 

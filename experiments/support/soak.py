@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+import gc
+import json
+import mmap
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
+from functools import partial
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
@@ -12,12 +17,18 @@ import torch
 import warp as wp
 
 from jumper_warp.envs.env import Env
+from jumper_warp.registry import make_task, task_names
 from jumper_warp.rl.graphs import CapturedProcedure
 from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.solver import SolverJumper
 from jumper_warp.tasks.cfg import TaskCfg
+from jumper_warp.tasks.commands import layout_of
+from jumper_warp.utils.checks import check_not_negative
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.files import write_atomically
 from support.scripts import ThreadArgs, tracked
+
+PARTS = "parts.jsonl"  # File in the output folder with the metrics of each part of a soak test
 
 
 @dataclass(frozen=True)
@@ -33,13 +44,21 @@ class SoakArgs(ThreadArgs):
     transversal: tuple[float, float] = (-30.0, 140.0)  # [deg] Least and largest transversal target
     command_filter: bool = False  # Pass the targets through the motor command filter
     task: str | None = None
-    """Name of a task whose environment is tested, with its limits and filter (default: the simulation alone)."""
+    """Name of a task whose environment is tested, with its limits and filter, or `all` for all tasks in turn (default:
+    the simulation alone)."""
+    max_seconds: float = 0.0
+    """[s] With --task: further parts of --steps policy steps, each with another seed and with `all` another task, run
+    until this time. Results add up over all starts with the same --out. 0: one part."""
+    rebuilds: int = 0  # With --task: number of environments that are made and dropped after the steps
+    resets: int = 0  # With --task: number of evaluation resets after the steps
     seed: int = 0  # Seed of actions, masses and friction
 
     def __post_init__(self) -> None:
         for name in ("num_envs", "steps", "hold_steps", "episode_steps"):
             if getattr(self, name) < 1:
                 raise InputError(f"{name} must be at least 1, got {getattr(self, name)}")
+        for name in ("max_seconds", "rebuilds", "resets"):
+            check_not_negative(name, getattr(self, name))
 
 
 def randomize(sim: Simulation, rng: np.random.Generator) -> None:
@@ -161,12 +180,68 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
 
     run, rounds = CapturedProcedure(step_held, env.device.type == "cuda"), -(-args.steps // args.hold_steps)
     check_interval = max(args.episode_steps // args.hold_steps, 1)
-    start = time.perf_counter()
-    for i in tracked(range(rounds), "rounds of random actions"):
+
+    def round_of_steps(i: int) -> None:
+        """Run a round of steps, and check the counters after some of the rounds."""
         run()
         if (i + 1) % check_interval == 0 and (rows := counters.read().rows):
             raise RuntimeError(f"{rows} rows hold values that are not finite, by step {(i + 1) * args.hold_steps}")
-    return soak_metrics(counters, rounds * args.hold_steps * env.num_envs, time.perf_counter() - start)
+
+    start = time.perf_counter()
+    growth = resident_growth(round_of_steps, rounds, "rounds of random actions")
+    wall = time.perf_counter() - start
+    return soak_metrics(counters, rounds * args.hold_steps * env.num_envs, wall) | {"resident_growth_kib": growth}
+
+
+def resident_growth(job: Callable[[int], object], count: int, title: str) -> int:
+    """Call a job `count` times with its index; return the growth of resident memory [KiB] after the first tenth.
+
+    0 where the operating system has no /proc.
+    """
+    before = 0
+    for i in tracked(range(count), title):
+        if i == count // 10:
+            before = resident_memory()
+        job(i)
+    return resident_memory() - before
+
+
+def resident_memory() -> int:
+    """Return the resident memory of this process [KiB] after garbage collection; 0 where there is no /proc."""
+    gc.collect()
+    statm = Path("/proc/self/statm")
+    return int(statm.read_text().split()[1]) * mmap.PAGESIZE // 1024 if statm.exists() else 0
+
+
+def rebuild_growth(make: Callable[[], Env], args: SoakArgs) -> dict[str, int]:
+    """Make and drop environments, and reset one for evaluations; return the growth of resident memory [KiB] of each.
+
+    After a reset and in a new environment, random actions are held for `args.hold_steps` policy steps.
+    """
+
+    def steps(env: Env) -> None:
+        """Take steps with random actions."""
+        action = torch.empty_like(env.action).uniform_(-1.0, 1.0)
+        for _ in range(args.hold_steps):
+            env.step(action)
+
+    def rebuild(i: int) -> None:
+        """Make an environment, and drop it after some steps."""
+        env = make()
+        env.reset()
+        steps(env)
+
+    env = make()
+
+    def reset(i: int) -> None:
+        """Begin an evaluation's episode; all components of its command are 1."""
+        env.evaluation_reset(np.ones(layout_of(env.task).counts[0]))
+        steps(env)
+
+    return {
+        "resident_growth_rebuilds_kib": resident_growth(rebuild, args.rebuilds, "environments"),
+        "resident_growth_resets_kib": resident_growth(reset, args.resets, "evaluation resets"),
+    }
 
 
 def soak_metrics(counters: SoakCounters, count: int, wall: float) -> dict:
@@ -178,5 +253,49 @@ def soak_metrics(counters: SoakCounters, count: int, wall: float) -> dict:
     return {
         "steps": count, "non_finite_worlds": totals.flagged, "non_finite_rows": totals.rows,
         "largest_speed_m_s": totals.speed, "largest_joint_speed_rad_s": totals.joint_speed,
-        "share_of_steps_contact_unsolved": totals.unsolved / count, "wall_s": wall, "steps_per_s": count / wall,
+        "unsolved_contacts": totals.unsolved, "share_of_steps_contact_unsolved": totals.unsolved / count,
+        "wall_s": wall, "steps_per_s": count / wall,
     }  # fmt: skip
+
+
+def soak_tasks(args: SoakArgs, folder: Path) -> dict:
+    """Soak-test environments of one task or of all in turn, in parts, and return the metrics of all parts.
+
+    The parts are in a file in the folder. With `args.max_seconds` its parts count too, and parts run while there is
+    time for another one.
+    """
+    start, longest, path = time.perf_counter(), 0.0, folder / PARTS
+    parts = [json.loads(line) for line in path.read_text().splitlines()] if args.max_seconds and path.is_file() else []
+    names = task_names() if args.task == "all" else (str(args.task),)
+    while True:
+        begin, seed, task = (
+            time.perf_counter(),
+            args.seed + len(parts),
+            hardest(make_task(names[len(parts) % len(names)])),
+        )
+        torch.manual_seed(seed)
+        make = partial(Env, task, args.num_envs, seed=seed, device=args.device, threads=args.threads)
+        parts.append(soak_env(make(), args) | {"task": task.name, "seed": seed, "envs": args.num_envs})
+        write_atomically(path, "".join(json.dumps(part) + "\n" for part in parts).encode())
+        longest = max(longest, time.perf_counter() - begin)
+        if time.perf_counter() - start + longest > args.max_seconds:
+            break
+    metrics = total_metrics(parts)
+    if args.rebuilds or args.resets:
+        metrics |= rebuild_growth(make, args)
+    growth = sum(metrics[name] for name in metrics if name.startswith("resident_growth"))
+    metrics["resident_growth_kib_per_1000_steps"] = 1000.0 * growth / (args.steps * len(parts))
+    return metrics | {"task": args.task}
+
+
+def total_metrics(parts: list[dict]) -> dict:
+    """Return the metrics of all parts of a soak test together, and the steps of each task."""
+    metrics = {name: max(part[name] for part in parts) for name in parts[0] if name.startswith("largest")}
+    names = ("steps", "non_finite_worlds", "non_finite_rows", "unsolved_contacts", "wall_s", "resident_growth_kib")
+    metrics |= {name: sum(part[name] for part in parts) for name in names}
+    metrics["share_of_steps_contact_unsolved"] = metrics["unsolved_contacts"] / metrics["steps"]
+    metrics["steps_per_s"] = metrics["steps"] / metrics["wall_s"]
+    for part in parts:
+        name = f"steps_{part['task'].replace('-', '_')}"
+        metrics[name] = metrics.get(name, 0) + part["steps"]
+    return metrics
