@@ -16,6 +16,7 @@ from experiments import (
     shac,
     soak_test,
 )
+from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.heights import HeightFlags, HeightLog, run_jumps
 from jumper_warp.evaluation.jumps import with_jump_terminations
 from jumper_warp.evaluation.limits import limit_metrics
@@ -227,8 +228,8 @@ def test_soak_of_simulation_and_environment_reports_no_invalid_worlds(tmp_path):
 
 
 def test_soak_counts_diverged_worlds(tmp_path, monkeypatch):  # 4 worlds diverge in each of 5 steps
-    step = soak_test.Env.step
-    monkeypatch.setattr(soak_test.Env, "step", lambda env, action: step(env, torch.full_like(action, torch.nan)))
+    step = Env.step
+    monkeypatch.setattr(Env, "step", lambda env, action: step(env, torch.full_like(action, torch.nan)))
     args = SoakArgs(
         num_envs=4, steps=5, hold_steps=5, episode_steps=100, task="vertical-jump", out=tmp_path, device="cpu"
     )
@@ -236,13 +237,13 @@ def test_soak_counts_diverged_worlds(tmp_path, monkeypatch):  # 4 worlds diverge
 
 
 def test_soak_raises_on_non_finite_reward(tmp_path, monkeypatch):
-    step = soak_test.Env.step
+    step = Env.step
 
     def step_with_nan(env, action):
         step(env, action)
         env.reward[2] = torch.nan
 
-    monkeypatch.setattr(soak_test.Env, "step", step_with_nan)
+    monkeypatch.setattr(Env, "step", step_with_nan)
     args = SoakArgs(num_envs=4, steps=40, episode_steps=20, task="vertical-jump", out=tmp_path, device="cpu")
     with pytest.raises(RuntimeError, match="20 rows hold values that are not finite, by step 20"):
         soak_test.main(args)
