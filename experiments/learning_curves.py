@@ -1,19 +1,21 @@
 """Measure how soon the vertical jump is learnt, for seeds and trainer variants, and write metrics and a plot.
 
-    python experiments/learning_curves.py --seconds 60 --seeds 0 1 2 --variants default compiled_bfloat16
+    python experiments/learning_curves.py --seconds 60 --seeds 0 1 2 --variants default eager
     python experiments/learning_curves.py --device cpu --num-envs 2048 --history 1 --variants small \
         --height-range 0.5 0.9 --seconds 450 --eval-interval 30                 # two cores of a CPU
+    python experiments/learning_curves.py --iterations 570 --seeds 0 1 2 3 4 5 6 7 --variants default eager --workers 4
 
 Trainings start from random weights, one after the other, each in a separate process. Every few seconds of training time
 the policy is evaluated on jumps to heights of 0.5 to 1.1 m. The metrics are the training times to success rates up to
 100 %, and the time from the start of the process to the start of the training, when everything is compiled. A second
-process loads compiled kernels and functions from the caches on disk. Variants are those of `support.variants`.
+process loads compiled kernels from the caches on disk. Variants are those of `support.variants`. Two variants are
+compared by rank tests. With `--iterations` all trainings have the same number of samples, and several can run at once.
 """
 
 from __future__ import annotations
 
 import itertools
-from concurrent.futures import ProcessPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from dataclasses import dataclass
 from multiprocessing import get_context
 from typing import Any
@@ -24,7 +26,7 @@ from jumper_warp.registry import make_task, trainer_settings
 from jumper_warp.tasks.observations import with_history
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.output import write_metrics
-from support.learning import TEST_HEIGHTS, LearningCurve, curve_metrics, plot_curves, train_and_time
+from support.learning import TEST_HEIGHTS, LearningCurve, compare, curve_metrics, plot_curves, train_and_time
 from support.scripts import DeviceArgs, announce, prepare, report, run_script, tracked
 from support.variants import DEFAULT, variant
 
@@ -36,6 +38,8 @@ class Args(DeviceArgs):
     """Flags of the measurement of learning curves."""
 
     seconds: float = 60.0  # [s] Time of each training, its evaluations not counted
+    iterations: int = 0  # Number of iterations of each training instead of a time; 0: `seconds` counts
+    workers: int = 1  # Number of trainings at once; more than one needs `iterations`
     eval_interval: float = 2.0  # [s] Training time between two evaluations
     seeds: tuple[int, ...] = (0, 1, 2)  # Seeds of weights, noise and worlds
     variants: tuple[str, ...] = (DEFAULT,)  # Variants of the trainer (`support.variants`)
@@ -53,6 +57,8 @@ class Args(DeviceArgs):
             raise InputError("at least one variant and one seed of 0 or more are needed")
         if self.seconds <= 0.0 or self.eval_interval <= 0.0:
             raise InputError(f"seconds and eval_interval must be positive, got {self.seconds} and {self.eval_interval}")
+        if self.iterations < 0 or self.workers < 1 or (self.workers > 1 and not self.iterations):
+            raise InputError(f"need workers >= 1, and iterations for more than one, got {self.workers}")
 
 
 def train(args: Args, name: str, seed: int) -> LearningCurve:
@@ -74,14 +80,20 @@ def main(args: Args) -> dict[str, Any]:
     values: dict[str, Any] = {"seconds": args.seconds, "envs": args.num_envs, "randomize": args.randomize}
     values |= {"seeds": list(args.seeds), "heights_m": list(args.height_range), "history": args.history}
     curves: dict[str, list[LearningCurve]] = {name: [] for name in args.variants}
-    for name, seed in tracked([*itertools.product(args.variants, args.seeds)], "trainings"):
-        curve = train_in_process(args, name, seed)
-        curves[name].append(curve)
-        values |= curve_metrics(curve, f"{name}_{seed}") | {f"ready_s_{name}_{seed}": curve.ready}
-        announce(f"{name}, seed {seed}: {curve.success[-1]:.1%} success after {curve.seconds[-1]:.0f} s of training")
+    runs = [*itertools.product(args.variants, args.seeds)]
+    with ThreadPoolExecutor(args.workers) as pool:
+        results = [pool.submit(train_in_process, args, *run) for run in runs]
+        for (name, seed), result in tracked([*zip(runs, results, strict=True)], "trainings"):
+            curve = result.result()
+            curves[name].append(curve)
+            values |= curve_metrics(curve, f"{name}_{seed}") | {f"ready_s_{name}_{seed}": curve.ready}
+            announce(f"{name}, seed {seed}: {curve.success[-1]:.1%} success, {curve.seconds[-1]:.0f} s of training")
+            write_metrics(folder, values)
+            plot_curves(curves, folder / "learning_curves.png")
+    if len(args.variants) == 2 and len(args.seeds) > 1:
+        values |= compare(*curves.values())
         write_metrics(folder, values)
-        plot_curves(curves, folder / "learning_curves.png")
-    keys = [key for key in values if key.startswith(("success_", "seconds_to_95_percent_"))]
+    keys = [key for key in values if key.startswith(("success_", "seconds_to_95_percent_", "p_"))]
     return report(args, folder, values, f"Learning curves of {TASK}, {args.num_envs:,} environments", keys)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -9,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.stats
 import torch
 import warp as wp
 
@@ -24,6 +26,7 @@ from jumper_warp.viz.plots import figure
 from support.timing import process_age
 
 RATES = (0.5, 0.8, 0.9, 0.95, 1.0)  # [1] Success rates for which the time to reach them is reported
+EVALUATIONS = 40  # Number of evaluations of a training with a given number of iterations
 TEST_HEIGHTS = (0.5, 1.1)  # [m] Default range of the heights of the evaluated jumps
 
 
@@ -36,6 +39,12 @@ class LearningCurve:
     steps: list[int] = field(default_factory=list)  # Policy steps of all worlds together so far
     iterations: int = 0  # Number of iterations of the training
     ready: float = 0.0  # [s] Time from the start of the process to the start of the training; 0 if not measured
+
+    def append(self, seconds: float, steps: int, success: float) -> None:
+        """Append an evaluation."""
+        self.seconds.append(seconds)
+        self.steps.append(steps)
+        self.success.append(success)
 
     def seconds_to(self, rate: float) -> float | None:
         """Return the training time [s] of the first evaluation with at least this success rate, or None."""
@@ -83,9 +92,29 @@ def train_and_evaluate(
             curve.iterations += 1
             wp.synchronize_device(device)
         trained += time.perf_counter() - start
-        curve.seconds.append(trained)
-        curve.steps.append(curve.iterations * trainer.batch_size)
-        curve.success.append(success_rate(trainer, eval_env, heights))
+        curve.append(trained, curve.iterations * trainer.batch_size, success_rate(trainer, eval_env, heights))
+    return curve
+
+
+def train_iterations(
+    env: VecEnv, trainer: Ppo | Shac, eval_env: Env, iterations: int, every: int, heights: tuple[float, float]
+) -> LearningCurve:
+    """Train for a number of iterations, evaluate after each `every` of them, and return the learning curve.
+
+    Other arguments: as in `train_and_evaluate`.
+    """
+    warm_up(env, trainer)
+    curve, trained, device = LearningCurve(), 0.0, wp.device_from_torch(env.device)
+    while curve.iterations < iterations:
+        wp.synchronize_device(device)
+        start = time.perf_counter()
+        for _ in range(min(every, iterations - curve.iterations)):
+            trainer.set_progress(curve.iterations / iterations)
+            trainer.iterate()
+            curve.iterations += 1
+        wp.synchronize_device(device)
+        trained += time.perf_counter() - start
+        curve.append(trained, curve.iterations * trainer.batch_size, success_rate(trainer, eval_env, heights))
     return curve
 
 
@@ -100,7 +129,11 @@ def train_and_time(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Learning
     warm_up(env, trainer)
     ready, eval_env = process_age(), make_eval_env(task, args.num_jumps, args.device)
     success_rate(trainer, eval_env)
-    curve = train_and_evaluate(env, trainer, eval_env, args.seconds, args.eval_interval, args.height_range)
+    if args.iterations:
+        every = max(1, args.iterations // EVALUATIONS)
+        curve = train_iterations(env, trainer, eval_env, args.iterations, every, args.height_range)
+    else:
+        curve = train_and_evaluate(env, trainer, eval_env, args.seconds, args.eval_interval, args.height_range)
     curve.ready = ready
     return curve
 
@@ -114,9 +147,28 @@ def curve_metrics(curve: LearningCurve, name: str) -> dict[str, Any]:
     values |= {f"curve_{series}_{name}": getattr(curve, series) for series in ("seconds", "steps", "success")}
     for rate in RATES:
         seconds, key = curve.seconds_to(rate), f"{100 * rate:g}_percent_{name}"
-        steps = None if seconds is None else curve.steps[curve.seconds.index(seconds)]
-        values |= {f"seconds_to_{key}": seconds, f"steps_to_{key}": steps}
+        steps = steps_to(curve, rate)
+        values |= {f"seconds_to_{key}": seconds, f"steps_to_{key}": steps if math.isfinite(steps) else None}
     return values
+
+
+def compare(first: Sequence[LearningCurve], second: Sequence[LearningCurve], rate: float = 0.95) -> dict[str, float]:
+    """Return p-values of the hypotheses that two trainers learn alike, corrected after Holm.
+
+    Two-sided rank tests (Mann-Whitney) of the steps to a success rate, infinite if it is not reached, and of the final
+    success. Keys: `p_steps_to_95_percent`, `p_final_success`.
+    """
+    samples = [[[steps_to(curve, rate), curve.success[-1]] for curve in curves] for curves in (first, second)]
+    pairs = zip(*(zip(*curves, strict=True) for curves in samples), strict=True)
+    p = [float(scipy.stats.mannwhitneyu(*pair).pvalue) for pair in pairs]
+    low, high = min(1.0, 2.0 * min(p)), max(p)
+    corrected = [low if value == min(p) else max(low, high) for value in p]
+    return dict(zip((f"p_steps_to_{100 * rate:g}_percent", "p_final_success"), corrected, strict=True))
+
+
+def steps_to(curve: LearningCurve, rate: float) -> float:
+    """Return the policy steps until the first evaluation with at least this success rate; infinite without one."""
+    return next((n for n, success in zip(curve.steps, curve.success, strict=True) if success >= rate), math.inf)
 
 
 def plot_curves(curves: Mapping[str, Sequence[LearningCurve]], path: Path) -> None:

@@ -99,7 +99,7 @@ def test_paws_penetrate_the_ground_by_less_than_a_millimetre(randomize):
 def test_trainings_are_cached_evaluated_with_task_terminations_and_refuse_other_settings(tmp_path, capsys, monkeypatch):
     args = departures.Args(
         only=("jumping_early",), iterations=1, num_envs=4, num_jumps=(2, 3), num_squats=2, out=tmp_path,
-        measure=False, train_flags="--ppo.compile off --ppo.num-steps 8 --ppo.minibatches 1", device="cpu", threads=1,
+        measure=False, train_flags="--ppo.num-steps 8 --ppo.minibatches 1", device="cpu", threads=1,
     )  # fmt: skip
     assert set(departures.main(args)) == {"task", "iterations", "envs"}
     assert not (tmp_path / "metrics.json").exists()
@@ -127,7 +127,7 @@ def test_trainings_are_cached_evaluated_with_task_terminations_and_refuse_other_
 
 
 def test_training_with_max_seconds_saves_checkpoint(tmp_path):
-    flags = "--ppo.compile off --ppo.num-steps 8 --ppo.minibatches 1 --max-seconds 0.001"
+    flags = "--ppo.num-steps 8 --ppo.minibatches 1 --max-seconds 0.001"
     args = departures.Args(only=("drift",), iterations=1000, num_envs=4, train_flags=flags, device="cpu", threads=1)
     checkpoint = train_or_load("", args.command("", 1, tmp_path))
     assert checkpoint.is_file() and int(checkpoint.stem.removeprefix("iteration_")) < 1000
