@@ -6,7 +6,8 @@ Speeds are policy steps of 1/60 s per second, 8 physics steps each, of all envir
 with standing robots; environment and training have random or learned actions, randomisation and noise. rsl-rl-lib
 trains on the same environment through the package's adapter. Outcomes are checked before the timing.
 
-`--variants all` times PPO compiled or not and in either precision. `--only-ppo` times PPO and its variants only.
+`--variants eager` also times PPO without the fused kernels, `--variants all` all variants of `support.variants`.
+`--only-ppo` times PPO and its variants only.
 `--baseline PATH` also runs the script of another checkout and reports the speed ratio.
 """
 

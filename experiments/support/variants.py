@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-from itertools import product
 from typing import Any
 
 from jumper_warp.rl.cfg import PpoCfg
@@ -12,14 +11,9 @@ from jumper_warp.utils.errors import InputError
 DEFAULT = "default"  # Name of the unchanged settings
 VARIANTS: dict[str, dict[str, Any]] = {
     DEFAULT: {},
-    **{
-        f"{name}_{precision}": {"compile": mode, "precision": precision}
-        for (mode, name), precision in product((("off", "eager"), ("on", "compiled")), ("float32", "bfloat16"))
-    },
-    "fused": {"fused": True},
+    "eager": {"fused": False},
     "four_minibatches": {"minibatches": 4},
     "less_noise": {"init_std": 0.5},
-    "less_noise_bfloat16": {"init_std": 0.5, "precision": "bfloat16"},
     "small": {"hidden": (128, 64, 64), "final_desired_kl": 0.005},
 }
 """Changed fields of `PpoCfg` by name of the variant."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import getpass
 import json
 import os
 import shutil
@@ -88,12 +87,11 @@ def threads() -> dict[str, int]:
 
 
 def folders() -> dict[str, Path]:
-    """Return the working folder, and the caches of Warp and of `torch.compile`, by name."""
+    """Return the working folder, and the caches of Warp and of Triton, by name."""
     import warp as wp
 
-    default = os.path.join(tempfile.gettempdir(), f"torchinductor_{getpass.getuser()}")
-    inductor = os.environ.get("TORCHINDUCTOR_CACHE_DIR", default)
-    return {"working": Path.cwd(), "kernels": Path(str(wp.config.kernel_cache_dir)), "torch.compile": Path(inductor)}
+    triton = Path(os.environ.get("TRITON_CACHE_DIR", Path.home() / ".triton" / "cache"))
+    return {"working": Path.cwd(), "kernels": Path(str(wp.config.kernel_cache_dir)), "Triton": triton}
 
 
 def describe_folder(path: Path) -> dict[str, Any]:

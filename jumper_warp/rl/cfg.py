@@ -85,16 +85,11 @@ class PpoCfg:
     task must define the mirror image of its observation."""
     tf32: bool = True
     """Whether matrix products on a GPU may use TF32, which rounds their factors to 10 mantissa bits."""
-    precision: Literal["float32", "bfloat16"] = "float32"
-    """Data type of the hidden layers; the last layers, losses and statistics are float32."""
-    compile: Literal["auto", "on", "off"] = "auto"
-    """Whether torch.compile fuses elementwise operations; auto: on a GPU only. It needs a C++ compiler, and caches
-    compiled code on disk."""
     graphs: bool = True
     """Whether to capture an iteration as CUDA graphs and replay them; no effect on a CPU."""
-    fused: bool = False
-    """Whether to act and update with fused bfloat16 kernels, on GPUs of compute capability 9.0 or higher (experimental:
-    not yet measured on a GPU)."""
+    fused: bool = True
+    """Whether to act and update with fused bfloat16 kernels on GPUs that can (`jumper_warp.rl.fused`); other networks,
+    older GPUs and CPUs use PyTorch."""
 
     def __post_init__(self) -> None:
         """Raise InputError (a ValueError) if a setting of PPO is out of range."""
@@ -229,12 +224,12 @@ class TrainCfg:
 RSL_RL_UNUSED = (
     "log_interval", "max_checkpoints", "best_metric", "tensorboard", "wandb", "ppo.normalise_value",
     "ppo.final_entropy_coef", "ppo.min_lr", "ppo.max_lr", "ppo.final_desired_kl", "ppo.reward_scale", "ppo.tf32",
-    "ppo.precision", "ppo.compile", "ppo.graphs", "ppo.fused",
+    "ppo.graphs", "ppo.fused",
 )  # fmt: skip
 SHAC_UNUSED = (
     "ppo.epochs", "ppo.minibatches", "ppo.clip", "ppo.value_coef", "ppo.clip_value", "ppo.entropy_coef",
     "ppo.final_entropy_coef", "ppo.lr", "ppo.min_lr", "ppo.max_lr", "ppo.desired_kl", "ppo.final_desired_kl",
-    "ppo.tf32", "ppo.precision", "ppo.compile", "ppo.graphs", "ppo.fused",
+    "ppo.tf32", "ppo.graphs", "ppo.fused",
 )  # fmt: skip
 _SHAC = tuple(f"shac.{spec.name}" for spec in fields(ShacCfg))
 UNUSED = {"ppo": _SHAC, "shac": SHAC_UNUSED, "rsl-rl": (*RSL_RL_UNUSED, *_SHAC)}

@@ -140,13 +140,14 @@ class FlatAdam:
 def adapted_lr(lr: torch.Tensor, kl: torch.Tensor, cfg: PpoCfg, desired_kl: torch.Tensor | float) -> torch.Tensor:
     """Adapt the learning rate () to the KL divergence of the policy update.
 
-    It is divided by 1.5 if kl > 2 desired_kl, and multiplied by 1.5 if kl < desired_kl / 2. It stays within cfg.min_lr
-    and cfg.max_lr, and is fixed if cfg.desired_kl is 0.
+    It is divided by 1.5 if kl > 2 desired_kl, and multiplied by 1.5 if kl < desired_kl / 2. A smaller kl
+    than 1e-6 desired_kl is a rounding error of an unchanged policy and changes nothing. The rate stays within
+    cfg.min_lr and cfg.max_lr, and is fixed if cfg.desired_kl is 0.
     """
     if cfg.desired_kl <= 0.0:
         return lr
     reduced = torch.where(kl > 2.0 * desired_kl, (lr / 1.5).clamp(min=cfg.min_lr), lr)
-    below_half = (kl < 0.5 * desired_kl) & (kl > 0.0)
+    below_half = (kl < 0.5 * desired_kl) & (kl > 1.0e-6 * desired_kl)
     return torch.where(below_half, (lr * 1.5).clamp(max=cfg.max_lr), reduced)
 
 

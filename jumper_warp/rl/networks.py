@@ -1,9 +1,9 @@
 """Actor, critic, exploration noise, and the running statistics that normalise observations and values.
 
-`Layers` implements the forward and backward pass of a multilayer perceptron without autograd, as functions of tensors
-that compile into few kernels. The backward pass needs only the input of each layer, which is the output of the layer
-below. With y a layer's output, x its input and s = ∂L/∂(Wx + b): ∂L/∂W = sᵀx, ∂L/∂b = Σs, ∂L/∂x = sW. The
-derivative of each activation is a function of y: elu' = 1 + min(y, 0), relu' = [y > 0], tanh' = 1 - y².
+`Layers` implements the forward and backward pass of a multilayer perceptron without autograd. The backward pass needs
+only the input of each layer, which is the output of the layer below. With y a layer's output, x its input and
+s = ∂L/∂(Wx + b): ∂L/∂W = sᵀx, ∂L/∂b = Σs, ∂L/∂x = sW. The derivative of each activation is a function of y:
+elu' = 1 + min(y, 0), relu' = [y > 0], tanh' = 1 - y².
 """
 
 from __future__ import annotations
@@ -25,7 +25,6 @@ from jumper_warp.utils.normalise import normalise
 NORMALISED_LIMIT = 10.0  # Normalised observations are clipped to ± this many standard deviations
 VARIANCE_EPS = 1.0e-5  # Constant added to a variance under the square root
 ACTIVATIONS = {"elu": nn.ELU, "relu": nn.ReLU, "tanh": nn.Tanh}  # Activation modules by `PpoCfg.activation`
-DTYPES = {"float32": torch.float32, "bfloat16": torch.bfloat16}  # Data type of the hidden layers, by `PpoCfg.precision`
 
 
 class Moments(NamedTuple):
@@ -229,31 +228,29 @@ class Layers(NamedTuple):
     biases: tuple[torch.Tensor, ...]  # (outputs,) each
     activation: str  # elu, relu or tanh, after all layers but the last
 
-    def forward(self, x: torch.Tensor, dtype: torch.dtype) -> tuple[torch.Tensor, list[torch.Tensor]]:
-        """Return the network's output (batch, outputs), float32, and the input of each layer for `backward`.
+    def forward(self, x: torch.Tensor) -> tuple[torch.Tensor, list[torch.Tensor]]:
+        """Return the network's output (batch, outputs), and the input of each layer for `backward`.
 
-        The last layer computes in float32, the others in `dtype`; x: (batch, columns of the first weight), float32.
+        x: (batch, columns of the first weight).
         """
         layer_inputs = []
         activation = getattr(functional, self.activation)
         for weight, bias in zip(self.weights[:-1], self.biases[:-1], strict=True):
-            layer_inputs.append(x.to(dtype))
-            x = activation(functional.linear(layer_inputs[-1], weight.to(dtype), bias.to(dtype)))
-        layer_inputs.append(x.float())
-        return functional.linear(layer_inputs[-1], self.weights[-1], self.biases[-1]), layer_inputs
+            layer_inputs.append(x)
+            x = activation(functional.linear(x, weight, bias))
+        return functional.linear(x, self.weights[-1], self.biases[-1]), [*layer_inputs, x]
 
-    def backward(self, layer_inputs: list[torch.Tensor], grad: torch.Tensor, dtype: torch.dtype) -> list[torch.Tensor]:
-        """Backward pass of `forward`: return the loss gradients of each layer's weight and bias, float32.
+    def backward(self, layer_inputs: list[torch.Tensor], grad: torch.Tensor) -> list[torch.Tensor]:
+        """Backward pass of `forward`: return the loss gradients of each layer's weight and bias.
 
         layer_inputs: from `forward`; grad: (batch, outputs) gradient of the loss with respect to the output.
         """
         gradients: list[torch.Tensor] = []
         for index in reversed(range(len(layer_inputs))):
             x = layer_inputs[index]
-            grad = grad.to(x.dtype)
-            gradients = [(grad.t() @ x).float(), grad.sum(0, dtype=torch.float32), *gradients]
+            gradients = [grad.t() @ x, grad.sum(0), *gradients]
             if index > 0:
-                grad = _activation_backward(self.activation, grad @ self.weights[index].to(x.dtype), x).to(dtype)
+                grad = _activation_backward(self.activation, grad @ self.weights[index], x)
         return gradients
 
 
@@ -264,25 +261,25 @@ class ActorTensors(NamedTuple):
     log_std: torch.Tensor  # (num_actions,) of the exploration noise
     symmetry: Symmetry | None  # its mirror map of observations is padded to the columns of the first weight
 
-    def forward(self, x: torch.Tensor, dtype: torch.dtype) -> ActorOutput:
+    def forward(self, x: torch.Tensor) -> ActorOutput:
         """Return the policy's mean action for normalised observations x; arguments: see `Layers.forward`."""
         if self.symmetry is None:
-            mean, layer_inputs = self.layers.forward(x, dtype)
+            mean, layer_inputs = self.layers.forward(x)
             return ActorOutput(mean, torch.zeros_like(mean), layer_inputs)
-        outputs, layer_inputs = self.layers.forward(torch.cat([x, self.symmetry.obs.apply(x)]), dtype)
+        outputs, layer_inputs = self.layers.forward(torch.cat([x, self.symmetry.obs.apply(x)]))
         output, mirrored_output = outputs.chunk(2)
         image = self.symmetry.action.apply(mirrored_output)
         return ActorOutput(0.5 * (output + image), output - image, layer_inputs)
 
-    def backward(self, layer_inputs: list[torch.Tensor], grad: torch.Tensor, dtype: torch.dtype) -> list[torch.Tensor]:
-        """Backward pass of `forward`: return the loss gradients of each layer's weight and bias, float32.
+    def backward(self, layer_inputs: list[torch.Tensor], grad: torch.Tensor) -> list[torch.Tensor]:
+        """Backward pass of `forward`: return the loss gradients of each layer's weight and bias.
 
         layer_inputs: from `forward`; grad: (batch, num_actions) gradient with respect to `ActorOutput.mean`.
         """
         if self.symmetry is None:
-            return self.layers.backward(layer_inputs, grad, dtype)
+            return self.layers.backward(layer_inputs, grad)
         half = 0.5 * grad
-        return self.layers.backward(layer_inputs, torch.cat([half, self.symmetry.action.apply(half)]), dtype)
+        return self.layers.backward(layer_inputs, torch.cat([half, self.symmetry.action.apply(half)]))
 
 
 class ActorOutput(NamedTuple):

@@ -24,9 +24,9 @@ from jumper_warp.rl.flat import (
     clip_gradient,
     flatten_aligned,
 )
-from jumper_warp.rl.graphs import CapturedProcedure, Compiler
+from jumper_warp.rl.graphs import CapturedProcedure
 from jumper_warp.rl.mirror import symmetry_of
-from jumper_warp.rl.networks import DTYPES, ActorCritic, ActorTensors, Layers, gaussian_kl, gaussian_log_prob
+from jumper_warp.rl.networks import ActorCritic, ActorTensors, Layers, gaussian_kl, gaussian_log_prob
 from jumper_warp.rl.rollout import Collector
 from jumper_warp.rl.samples import Batch, BatchPacker, RowLayout
 from jumper_warp.utils.allocator import keep_freed_memory
@@ -84,16 +84,13 @@ class Ppo:
         self.lr = self.optimiser.lr
         self._desired_kl = torch.full((), cfg.desired_kl, device=env.device)
         self._entropy_coef = torch.full((), cfg.entropy_coef, device=env.device)
-        self.compiler = compiler = Compiler(cfg.compile == "on" or (cfg.compile == "auto" and cuda))
-        self.collector = Collector(env, cfg, self.model, self.flat, compiler)
+        self.collector = Collector(env, cfg, self.model, self.flat)
         self.rollout = self.collector.rollout
-        self.packer = BatchPacker(self.rollout, cfg, self.model, self.flat, compiler, symmetry and symmetry.obs)
+        self.packer = BatchPacker(self.rollout, cfg, self.model, self.flat, symmetry and symmetry.obs)
         self._minibatch = self.packer.rows.new_zeros(self.batch_size // cfg.minibatches, self.packer.rows.shape[1])
         self._orders = torch.zeros(cfg.epochs, self.batch_size, dtype=torch.int64, device=env.device)
         counts = {"dtype": torch.float64, "device": env.device}  # float32 counts to 2^24 only
         self._sums = torch.zeros(len(STATISTICS) + 1, **counts)  # sums of the statistics, and the number of steps
-        self._actor_gradient, self._critic_gradient = compiler(actor_gradient), compiler(critic_gradient)
-        self._optimiser_step = compiler(optimiser_step)
         procedures: tuple[Callable[[], object], ...] = (self.collector.roll, self.batch, self._run_epochs)
         self._roll, self._batch, self._optimise = (CapturedProcedure(each, cuda and cfg.graphs) for each in procedures)
 
@@ -114,16 +111,7 @@ class Ppo:
         self._optimise()
 
     def compile(self) -> None:
-        """Compile all functions by running them once; parameters, optimiser and counts are restored afterwards."""
-        if not self.compiler.enabled:
-            return
-        modified = [*self.optimiser.vectors, self._sums, self.collector.episode, self.collector.finished]
-        originals = [tensor.clone() for tensor in modified]
-        self.collector.warm_up()
-        self.packer.warm_up()
-        self.minibatch_step(self._minibatch, all_reduce=False)
-        for tensor, original in zip(modified, originals, strict=True):
-            tensor.copy_(original)
+        """Do nothing; PyTorch's functions run eagerly (`FusedPpo` compiles kernels)."""
 
     @torch.no_grad()
     def batch(self) -> Batch:
@@ -149,20 +137,19 @@ class Ppo:
                 self.minibatch_step(self._minibatch)
 
     @torch.no_grad()
-    def minibatch_step(self, rows: torch.Tensor, all_reduce: bool = True) -> StepStatistics:
+    def minibatch_step(self, rows: torch.Tensor) -> StepStatistics:
         """Run one optimiser step, without host synchronisation; return its statistics, which `statistics` averages.
 
-        rows: samples (batch, columns of `packer.layout`); all_reduce: whether to average gradients over all ranks.
+        rows: samples (batch, columns of `packer.layout`).
         """
         flat, packer, cfg = self.flat, self.packer, self.cfg
-        value_loss = self._critic_gradient(rows, packer.layout, flat.critic, cfg, flat.critic_gradient)
-        losses = self._actor_gradient(
+        value_loss = critic_gradient(rows, packer.layout, flat.critic, cfg, flat.critic_gradient)
+        losses = actor_gradient(
             rows, packer.layout, flat.actor, packer.old_log_std, self._entropy_coef, cfg, flat.actor_gradient
         )
         flat.kl.copy_(losses.kl)
-        if all_reduce:
-            all_reduce_mean(flat.all_reduced)  # gradient and divergence
-        return self._optimiser_step(
+        all_reduce_mean(flat.all_reduced)  # gradient and divergence
+        return optimiser_step(
             self.optimiser.vectors, flat.actor_size, flat.kl, self._desired_kl, cfg, losses, value_loss, self._sums
         )
 
@@ -242,8 +229,8 @@ def critic_gradient(
 
     rows: (batch, columns of `layout`); out: the critic's slice of the flat gradient.
     """
-    batch, dtype = layout.split(rows), DTYPES[cfg.precision]
-    output, layer_inputs = critic.forward(layout.critic_features(rows), dtype)
+    batch = layout.split(rows)
+    output, layer_inputs = critic.forward(layout.critic_features(rows))
     value_change = output.squeeze(-1) - batch.value
     error = output.squeeze(-1) - batch.target
     loss, grad = error.square(), error
@@ -252,7 +239,7 @@ def critic_gradient(
         grad = torch.where(clipped_error.square() > loss, clipped_error * (value_change.abs() <= cfg.clip), error)
         loss = torch.maximum(loss, clipped_error.square())
     grad_output = grad * (2.0 * cfg.value_coef / rows.shape[0])
-    out.copy_(flatten_aligned(critic.backward(layer_inputs, grad_output[:, None], dtype)))
+    out.copy_(flatten_aligned(critic.backward(layer_inputs, grad_output[:, None])))
     return loss.mean()
 
 
@@ -267,15 +254,15 @@ def actor_gradient(
 
     rows: (batch, columns of `layout`); entropy_coef: (); out: the slice of actor and noise of the flat gradient.
     """
-    batch, dtype, log_std = layout.split(rows), DTYPES[cfg.precision], actor.log_std
-    mean, difference, layer_inputs = actor.forward(layout.features(rows), dtype)
+    batch, log_std = layout.split(rows), actor.log_std
+    mean, difference, layer_inputs = actor.forward(layout.features(rows))
     ratio = torch.exp(gaussian_log_prob(batch.action, mean, log_std) - batch.log_prob)
     objective = batch.advantage * ratio
     clipped = batch.advantage * ratio.clamp(1.0 - cfg.clip, 1.0 + cfg.clip)
     grad_log_prob = torch.where(objective > clipped, 0.0, objective)[:, None] / -rows.shape[0]
     z = (batch.action - mean) * torch.exp(-log_std)
     grad_log_std = (grad_log_prob * (z.square() - 1.0)).sum(0) - entropy_coef
-    gradients = actor.backward(layer_inputs, grad_log_prob * z * torch.exp(-log_std), dtype)
+    gradients = actor.backward(layer_inputs, grad_log_prob * z * torch.exp(-log_std))
     out.copy_(flatten_aligned([*gradients, grad_log_std]))
     entropy = (log_std + 0.5 * math.log(2.0 * math.pi * math.e)).sum()
     kl = gaussian_kl(batch.mean, old_log_std, mean, log_std).mean()

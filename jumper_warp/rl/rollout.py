@@ -9,8 +9,7 @@ import torch
 from jumper_warp.envs.vec_env import VecEnv, sanitise
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import FlatParameters
-from jumper_warp.rl.graphs import Compiler
-from jumper_warp.rl.networks import DTYPES, ActorCritic, ActorTensors, Scaling
+from jumper_warp.rl.networks import ActorCritic, ActorTensors, Scaling
 
 
 class RolloutBuffer(NamedTuple):
@@ -48,7 +47,7 @@ def make_rollout_buffer(num_steps: int, env: VecEnv, num_critic_obs: int) -> Rol
 class Collector:
     """Collector of rollouts: steps the environment with the current policy, and records transitions in `rollout`."""
 
-    def __init__(self, env: VecEnv, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, compiler: Compiler) -> None:
+    def __init__(self, env: VecEnv, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters) -> None:
         """Allocate the rollout; model: has the observation statistics; flat: parameters of `model`."""
         self.env, self.cfg = env, cfg
         self._critic_obs = env.critic_obs if cfg.asymmetric_critic else env.obs
@@ -62,7 +61,6 @@ class Collector:
         """Return and length of each world's current episode, (2, num_envs)."""
         self.finished = torch.zeros(3, env.num_envs, **counts)
         """Sum of returns, sum of lengths and number of the finished episodes, (3, num_envs)."""
-        self._sample_action, self._record = compiler(sample_action), compiler(record_transition)
 
     @torch.no_grad()
     def roll(self) -> None:
@@ -79,41 +77,28 @@ class Collector:
         rollout.obs[-1] = sanitise(env.obs)
         rollout.critic_obs[-1] = sanitise(self._critic_obs)
 
-    @torch.no_grad()
-    def warm_up(self) -> None:
-        """Compile all functions by running one step; overwrites the rollout and the episode counts."""
-        self._act_step(self._steps[0])
-        self._record_step(self._steps[0])
-
     def _act_step(self, step: RolloutBuffer) -> None:
         """Write observations, mean and action for the environment's current state to `step` (`RolloutBuffer.at`)."""
-        self._sample_action(
-            self.env.obs, self._critic_obs, step, self._actor, self._scaling, DTYPES[self.cfg.precision]
-        )
+        sample_action(self.env.obs, self._critic_obs, step, self._actor, self._scaling)
 
     def _record_step(self, step: RolloutBuffer) -> None:
         """Write the result of the environment's last step to `step` (`RolloutBuffer.at`)."""
         env, scale = self.env, self.cfg.reward_scale
         final_critic_obs, counts = self._final_critic_obs, (self.episode, self.finished)
-        self._record(env.reward, env.done, env.timeout, final_critic_obs, step, *counts, scale)
+        record_transition(env.reward, env.done, env.timeout, final_critic_obs, step, *counts, scale)
 
 
 def sample_action(
-    obs: torch.Tensor,
-    critic_obs: torch.Tensor,
-    step: RolloutBuffer,
-    actor: ActorTensors,
-    scaling: Scaling,
-    dtype: torch.dtype,
+    obs: torch.Tensor, critic_obs: torch.Tensor, step: RolloutBuffer, actor: ActorTensors, scaling: Scaling
 ) -> None:
     """Sample every world's action from the policy, and write it, its mean and the observations to `step`.
 
     obs, critic_obs: (num_envs, n) raw. step: `RolloutBuffer.at`; its action holds standard normal noise on entry.
-    scaling: normalises obs. dtype: of the hidden layers.
+    scaling: normalises obs.
     """
     step.obs.copy_(sanitise(obs))
     step.critic_obs.copy_(sanitise(critic_obs))
-    mean = actor.forward(scaling.features(sanitise(obs), actor.layers.weights[0].shape[1]), dtype).mean
+    mean = actor.forward(scaling.features(sanitise(obs), actor.layers.weights[0].shape[1])).mean
     step.mean.copy_(mean)
     step.action.mul_(actor.log_std.exp()).add_(mean)
 

@@ -10,9 +10,8 @@ import torch
 from jumper_warp.envs.vec_env import sanitise
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import ROW_ALIGNMENT, FlatParameters, aligned
-from jumper_warp.rl.graphs import Compiler
 from jumper_warp.rl.mirror import MirrorMap
-from jumper_warp.rl.networks import DTYPES, ActorCritic, Layers, Moments, Scaling, all_reduce_moments, gaussian_log_prob
+from jumper_warp.rl.networks import ActorCritic, Layers, Moments, Scaling, all_reduce_moments, gaussian_log_prob
 from jumper_warp.rl.rollout import RolloutBuffer
 
 CPU_CHUNK_SIZE = 4096  # Samples per chunk on a CPU, so that intermediate tensors stay in its caches
@@ -136,7 +135,7 @@ class BatchPacker:
     """Packer of a rollout into training samples with values, advantages and returns, one in each of `rows`."""
 
     def __init__(
-        self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters, compiler: Compiler,
+        self, rollout: RolloutBuffer, cfg: PpoCfg, model: ActorCritic, flat: FlatParameters,
         obs_mirror: MirrorMap | None = None,
     ) -> None:  # fmt: skip
         """Allocate memory for the packed samples.
@@ -151,7 +150,6 @@ class BatchPacker:
         """Packed samples, (steps · worlds, columns of `layout`), time-major."""
         self.old_log_std = torch.zeros_like(rollout.log_std)  # (num_actions,) of the policy that acted
         self._chunk_size = CPU_CHUNK_SIZE if self.rows.device.type == "cpu" else None
-        self._compute_values_and_gae, self._write_rows = compiler(compute_values_and_gae), compiler(write_rows)
 
     @torch.no_grad()
     def pack(self) -> None:
@@ -173,12 +171,6 @@ class BatchPacker:
         self._pack(scalings, estimates, advantage_scaling)
         self.old_log_std.copy_(self._rollout.log_std)
 
-    @torch.no_grad()
-    def warm_up(self) -> None:
-        """Compile all functions by packing the rollout once; overwrites `rows`."""
-        scalings = self._scalings()
-        self._pack(scalings, self._estimates(scalings), advantage_scaling=scalings.value)
-
     def _scalings(self) -> Scalings:
         """Return the current mean and standard deviation of observations and values."""
         model = self._model
@@ -186,12 +178,12 @@ class BatchPacker:
 
     def _estimates(self, scalings: Scalings) -> Estimates:
         """Compute values, advantages and returns of the rollout."""
-        return self._compute_values_and_gae(self._rollout, self._critic, scalings, self._cfg, self._chunk_size)
+        return compute_values_and_gae(self._rollout, self._critic, scalings, self._cfg, self._chunk_size)
 
     def _pack(self, scalings: Scalings, estimates: Estimates, advantage_scaling: Scaling) -> None:
         """Pack the rollout's samples and estimates into `rows`; arguments: see `write_rows`."""
         target_scaling = self._model.value_moments.scaling() if self._cfg.normalise_value else None
-        self._write_rows(
+        write_rows(
             self.rows, self.layout, self._rollout, scalings, estimates, advantage_scaling, target_scaling,
             self._chunk_size,
         )  # fmt: skip
@@ -204,12 +196,12 @@ def compute_values_and_gae(
 
     A timeout adds the discounted value of the final observation. chunk_size: samples per evaluation of the critic.
     """
-    columns, dtype = critic.weights[0].shape[1], DTYPES[cfg.precision]
+    columns = critic.weights[0].shape[1]
 
     def value_head(critic_obs: torch.Tensor) -> torch.Tensor:
         """Return the critic's output (steps, num_envs) for (steps, num_envs, num_critic_obs)."""
         scaling, chunks = scalings.critic_obs, _chunks(critic_obs.flatten(0, 1), chunk_size)
-        heads = [critic.forward(scaling.features(sanitise(chunk), columns), dtype)[0] for chunk in chunks]
+        heads = [critic.forward(scaling.features(sanitise(chunk), columns))[0] for chunk in chunks]
         return torch.cat(heads).view(critic_obs.shape[:2])
 
     head, final_head = value_head(buffer.critic_obs), value_head(buffer.final_critic_obs)

@@ -16,7 +16,6 @@ from fused_runs import (
     update_rank,
     whole_and_resumed,
 )
-from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.fused import make_ppo
 from jumper_warp.rl.mirror import symmetry_of
 from jumper_warp.rl.networks import ActorCritic
@@ -25,7 +24,14 @@ from ppo_oracle import reference_losses
 from toy_task import PushTask, equal, free_port
 
 needs_triton = pytest.mark.skipif(importlib.util.find_spec("triton") is None, reason="Triton is not installed")
-CASES = [{}, {"symmetry": "actor"}, {"clip_value": False, "hidden": (16,)}, {"clip": 0.02, "hidden": (144, 16, 32)}]
+CASES = [
+    {},
+    {"symmetry": "actor"},
+    {"clip_value": False, "hidden": (16,)},
+    {"clip": 0.02, "hidden": (144, 16, 32)},
+    {"hidden": (272, 16)},
+    {"symmetry": "actor", "hidden": (32, 16)},
+]
 CFGS = [dataclasses.replace(FUSED, **change) for change in CASES]
 
 
@@ -48,8 +54,9 @@ def test_gradients_agree_with_autograd_in_float64(case, minibatches):
     (surrogate + cfg.value_coef * value - cfg.entropy_coef * entropy).backward()
     torch.testing.assert_close(losses[[0, 1, 2, 3, 31]].double(), torch.stack([*expected, kl]), atol=1e-5, rtol=1e-5)
     for name, param in model.named_parameters():
-        torch.testing.assert_close(gradients[name].double(), param.grad, atol=1e-5, rtol=1e-4, msg=name)
-        assert param.grad.abs().max() > 1e-4, name
+        tolerance = 1e-6 * float(param.grad.abs().max()) + 1e-6  # sums of float32 products
+        torch.testing.assert_close(gradients[name].double(), param.grad, atol=tolerance, rtol=1e-4, msg=name)
+        assert param.grad.abs().max() > 1e-5, name
 
 
 @needs_triton
@@ -70,7 +77,9 @@ def test_iteration_agrees_with_pytorch():
 
 @needs_triton
 def test_kernels_that_do_not_compile_are_an_input_error():
-    assert interpreted(failed_compilation).startswith("--ppo.fused does not work here: RuntimeError shape '[3]'")
+    assert interpreted(failed_compilation).startswith(
+        "the fused kernels do not work here, pass --ppo.no-fused: RuntimeError shape '[3]'"
+    )
 
 
 @needs_triton
@@ -95,16 +104,18 @@ def test_two_ranks_with_different_worlds_have_the_same_parameters(tmp_path):
 @pytest.mark.parametrize(
     ("change", "reason"),
     [
-        ({"hidden": (16, 9)}, "hidden widths must be multiples of 16, got 16, 9"),
-        ({"activation": "tanh"}, "activation elu needed, got tanh"),
+        ({"hidden": (16, 9)}, "they need hidden widths that are multiples of 16, got 16, 9"),
+        ({"activation": "tanh"}, "they need the activation elu, got tanh"),
     ],
 )
 def test_other_networks_use_pytorch_and_print_a_line(change, reason, capsys, monkeypatch):
     monkeypatch.setenv("TRITON_INTERPRET", "1")
     assert type(make_ppo(PushTask(4), dataclasses.replace(FUSED, **change))) is Ppo
-    assert capsys.readouterr().err == f"--ppo.fused has no effect: {reason}\n"
+    assert capsys.readouterr().err == f"PPO trains with PyTorch, more slowly than with fused kernels: {reason}\n"
 
 
-def test_fused_update_is_opt_in(capsys, monkeypatch):
+def test_cpu_and_no_fused_use_pytorch_silently(capsys, monkeypatch):
+    assert type(make_ppo(PushTask(4), FUSED)) is Ppo
     monkeypatch.setenv("TRITON_INTERPRET", "1")
-    assert type(make_ppo(PushTask(4), PpoCfg())) is Ppo and capsys.readouterr().err == ""
+    assert type(make_ppo(PushTask(4), dataclasses.replace(FUSED, fused=False))) is Ppo
+    assert capsys.readouterr().err == ""

@@ -8,7 +8,6 @@ import torch
 from jumper_warp.cli.main import main
 from jumper_warp.policies.runs import open_policy
 from jumper_warp.registry import TASKS, TaskEntry, make_task
-from jumper_warp.rl import graphs
 from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.rl.checkpoint import save_checkpoint
 from jumper_warp.rl.flat import FlatParameters
@@ -19,7 +18,7 @@ from jumper_warp.tasks.interface import interface
 from jumper_warp.tasks.mirror import mirror_of, mirror_of_action
 from jumper_warp.tasks.saving import task_to_json
 from jumper_warp.utils.errors import InputError
-from toy_task import PushTask, fill
+from toy_task import PushTask
 
 OBS, ACTION = mirror_of(make_task("velocity-flat"), "actor"), mirror_of_action()
 WALKING = Symmetry(mirror_map(*OBS, "observation"), mirror_map(*ACTION, "action"))
@@ -120,23 +119,6 @@ def test_symmetric_actor_stays_symmetric_in_training():
     obs = torch.randn(50, 2)
     assert torch.equal(model.act(-obs), -model.act(obs))
     assert model.act(obs).abs().max() > 0.0
-
-
-def test_symmetric_update_traces_into_one_graph(monkeypatch):
-    monkeypatch.setattr(graphs, "BACKEND", "eager")
-    results = []
-    for compiled in ("off", "on"):
-        torch.manual_seed(0)
-        ppo = Ppo(PushTask(16), dataclasses.replace(CFG, compile=compiled))
-        fill(ppo, slice(None), 16)
-        torch.manual_seed(1)
-        ppo.update()
-        ppo.env.reset()
-        ppo.collect()
-        assert ppo.compiler.enabled == (compiled == "on")
-        results.append((ppo.flat.value.clone(), ppo.rollout.mean.clone()))
-    for off, on in zip(*results, strict=True):
-        torch.testing.assert_close(on, off)
 
 
 def test_checkpoint_of_a_symmetric_actor_opens_as_a_plain_policy(tmp_path):

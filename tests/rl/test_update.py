@@ -6,7 +6,6 @@ import math
 import pytest
 import torch
 
-from jumper_warp.rl import graphs
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.flat import FlatAdam, FlatParameters, adam_step
 from jumper_warp.rl.networks import ActorCritic, gaussian_log_prob
@@ -37,7 +36,7 @@ def reference_update(model, batch, old_log_std, orders, cfg):
             group = optimiser.param_groups[0]
             if kl > 2 * cfg.desired_kl:
                 group["lr"] = max(group["lr"] / 1.5, cfg.min_lr)
-            elif 0 < kl < cfg.desired_kl / 2:
+            elif 1e-6 * cfg.desired_kl < kl < cfg.desired_kl / 2:
                 group["lr"] = min(group["lr"] * 1.5, cfg.max_lr)
             optimiser.step()
             history.append([float(x.detach()) for x in (surrogate, value, entropy, asymmetry, kl, *norms)])
@@ -148,76 +147,13 @@ def test_flat_adam_agrees_with_torch_over_many_steps():
     assert not (padding * flat.value).any()  # stays zero
 
 
-def test_forward_and_backward_agree_with_autograd_in_float32_and_bfloat16():
+def test_forward_and_backward_agree_with_autograd():
     torch.manual_seed(0)
     model = ActorCritic(8, 3, (32, 16))
-    flat = FlatParameters(model, "elu")
-    layers = flat.actor.layers
+    layers = FlatParameters(model, "elu").actor.layers
     x, grad = torch.randn(64, 8), torch.randn(64, 3)
     expected = torch.autograd.grad(model.actor(x), list(model.actor.parameters()), grad)
-    for dtype, tolerance in ((torch.float32, 1e-5), (torch.bfloat16, 2e-2)):
-        output, layer_inputs = layers.forward(x, dtype)
-        assert [each.dtype for each in layer_inputs] == [dtype, dtype, torch.float32]
-        scale = model.actor(x).detach().abs().max()
-        assert (output - model.actor(x)).abs().max() < tolerance * scale
-        for gradient, reference in zip(layers.backward(layer_inputs, grad, dtype), expected, strict=True):
-            assert gradient.dtype == torch.float32
-            assert (gradient - reference).norm() < tolerance * reference.norm()
-
-
-def test_bfloat16_starts_from_a_ratio_of_one_and_learns():
-    torch.manual_seed(0)
-    cfg = dataclasses.replace(CFG, precision="bfloat16", epochs=1, minibatches=1, hidden=(32, 32))
-    ppo = Ppo(PushTask(64), cfg)
-    ppo.env.reset()
-    ppo.collect()
-    ppo.update()
-    assert abs(ppo.statistics()["Loss/kl"]) < 1e-6  # the first minibatch has the weights that acted
-    for _ in range(30):
-        ppo.collect()
-        ppo.update()
-    assert all(param.dtype == torch.float32 for param in ppo.model.parameters())
-    assert ppo.statistics()["Loss/value"] < 0.5
-
-
-# ---------------------------------------------------------------- compilation
-
-
-def test_compiled_minibatch_agrees_with_eager():
-    torch.manual_seed(0)
-    eager = Ppo(PushTask(WORLDS), dataclasses.replace(CFG, hidden=(8,)))
-    fill(eager, slice(None), WORLDS)
-    eager.batch()
-    compiled = Ppo(PushTask(WORLDS), dataclasses.replace(CFG, hidden=(8,), compile="on"))
-    compiled.load_state_dict(eager.state_dict())
-    for ppo in (eager, compiled):
-        ppo.packer.old_log_std.copy_(eager.rollout.log_std)
-        for samples in torch.arange(ppo.batch_size).chunk(4):
-            ppo.minibatch_step(eager.packer.rows[samples])
-    assert compiled.compiler.enabled
-    torch.testing.assert_close(compiled.flat.value, eager.flat.value, atol=1e-6, rtol=1e-5)
-    assert compiled.statistics() == pytest.approx(eager.statistics(), rel=1e-4, abs=1e-6)
-
-
-def test_failed_compilation_runs_eagerly_and_warns_once(capsys, monkeypatch):
-    def trained(mode):
-        """Return the parameters after one iteration with `PpoCfg.compile` set to mode."""
-        torch.manual_seed(0)
-        ppo = Ppo(PushTask(WORLDS), dataclasses.replace(CFG, compile=mode))
-        ppo.env.reset()
-        ppo.collect()
-        ppo.update()
-        return ppo.flat.value
-
-    expected = trained("off")
-    assert capsys.readouterr().err == ""
-    monkeypatch.setattr(graphs, "BACKEND", broken_backend)
-    assert torch.equal(trained("on"), expected)
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1 and lines[0].startswith("torch.compile failed, training is slower: ")
-    assert lines[0].endswith("OSError: no compiler here")
-
-
-def broken_backend(graph, inputs):
-    """Backend of torch.compile without a compiler."""
-    raise OSError("no compiler here")
+    output, layer_inputs = layers.forward(x)
+    torch.testing.assert_close(output, model.actor(x), atol=1e-6, rtol=1e-5)
+    for gradient, reference in zip(layers.backward(layer_inputs, grad), expected, strict=True):
+        assert (gradient - reference).norm() < 1e-5 * reference.norm()

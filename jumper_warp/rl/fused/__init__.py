@@ -1,9 +1,10 @@
-"""PPO's rollout and update in a few Triton kernels, on GPUs of compute capability 9.0 or higher; opt-in."""
+"""PPO's rollout and update in a few Triton kernels, on GPUs of compute capability 8.0 or higher."""
 
 from __future__ import annotations
 
 import importlib.util
 import os
+import shutil
 import sys
 
 import torch
@@ -14,7 +15,7 @@ from jumper_warp.rl.ppo import Ppo
 
 
 def make_ppo(env: VecEnv, cfg: PpoCfg) -> Ppo:
-    """Return PPO on an environment, with the fused kernels if `PpoCfg.fused` is set and the device can use them.
+    """Return PPO on an environment, with the fused kernels if the device can use them and `PpoCfg.fused` is set.
 
     Raises InputError as `Ppo`.
     """
@@ -33,16 +34,19 @@ def use_fused(cfg: PpoCfg, device: torch.device) -> bool:
     if not cfg.fused or (device.type == "cpu" and os.environ.get("TRITON_INTERPRET") != "1"):
         return False
     if reason := _obstacle(cfg, device):
-        print(f"--ppo.fused has no effect: {reason}", file=sys.stderr)
+        print(f"PPO trains with PyTorch, more slowly than with fused kernels: {reason}", file=sys.stderr)
     return not reason
 
 
 def _obstacle(cfg: PpoCfg, device: torch.device) -> str:
     """Return why the fused kernels cannot train with the settings on the device; empty if they can."""
-    if device.type == "cuda" and (capability := torch.cuda.get_device_capability(device)) < (9, 0):
-        return f"compute capability 9.0 needed, the GPU has {'.'.join(map(str, capability))}"
+    if device.type == "cuda" and (capability := torch.cuda.get_device_capability(device)) < (8, 0):
+        return f"they need compute capability 8.0, the GPU has {'.'.join(map(str, capability))}"
     if cfg.activation != "elu":
-        return f"activation elu needed, got {cfg.activation}"
+        return f"they need the activation elu, got {cfg.activation}"
     if any(width % 16 for width in cfg.hidden):
-        return f"hidden widths must be multiples of 16, got {', '.join(map(str, cfg.hidden))}"
-    return "" if importlib.util.find_spec("triton") else "Triton is not installed"
+        return f"they need hidden widths that are multiples of 16, got {', '.join(map(str, cfg.hidden))}"
+    if not importlib.util.find_spec("triton"):
+        return "Triton is not installed"
+    compilers = filter(None, (os.environ.get("CC"), "gcc", "clang"))
+    return "" if any(map(shutil.which, compilers)) else "Triton needs a C compiler, such as gcc"

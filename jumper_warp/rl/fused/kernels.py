@@ -77,36 +77,139 @@ def layer_backward(
 
 
 @triton.jit
-def weight_gradient(
-    grad_out, x, index, weight_partial, bias_partial, stride, rows, rows_per_split, num_in, num_out,
-    GATHER: tl.constexpr, BM: tl.constexpr, BN: tl.constexpr, BK: tl.constexpr,
+def network_forward(
+    x, index, weights, value, outputs, rows, LAYERS: tl.constexpr, BIASES: tl.constexpr, PADDED: tl.constexpr,
+    GATHER: tl.constexpr, BM: tl.constexpr, BK: tl.constexpr,
 ):  # fmt: skip
-    """Write the sums of grad_outᵀ x (num_out, num_in) and of grad_out (num_out,) over each split of the rows.
+    """Write the outputs of all layers of a network, without GATHER of the last only; a block keeps its rows.
 
-    grad_out: (rows, num_out); x, index: as in `layer_forward`; weight_partial, bias_partial: results of the first
-    split, those of the next are `stride` entries further.
+    x, index, GATHER: as in `layer_forward`; value: flat vector of the parameters; outputs: of each layer. LAYERS: of
+    each layer its weight's place in `weights`, its bias' place there, num_in, num_out and rows per sample; BIASES: its
+    bias' place in `value` and number of entries; PADDED: powers of two, num_out at least.
     """
-    out = tl.program_id(0) * BM + tl.arange(0, BM)
-    col = tl.program_id(1) * BN + tl.arange(0, BN)
-    split = tl.program_id(2)
-    first = split * rows_per_split
-    last = tl.minimum(first + rows_per_split, rows)
+    row = tl.program_id(0) * BM + tl.arange(0, BM)
+    source = row.to(tl.int64)
+    if GATHER:
+        source = tl.load(index + row, mask=row < rows, other=0)
+    num_in: tl.constexpr = LAYERS[0][2]
+    width: tl.constexpr = PADDED[0]
+    col = tl.arange(0, width)
+    acc = tl.zeros((BM, width), tl.float32)
+    for start in range(0, num_in, BK):
+        k = start + tl.arange(0, BK)
+        mask = (row < rows)[:, None] & (k < num_in)[None, :]
+        a = tl.load(x + source[:, None] * num_in + k[None, :], mask=mask, other=0.0)
+        mask = (k < num_in)[:, None] & (col < LAYERS[0][3])[None, :]
+        w = tl.load(weights + LAYERS[0][0] + col[None, :] * num_in + k[:, None], mask=mask, other=0.0)
+        acc = tl.dot(a, w, acc)
+    h = acc
+    for i in tl.static_range(len(LAYERS)):
+        if i > 0:
+            if LAYERS[i][4] > LAYERS[i - 1][4]:  # the mirrored half of each row is a row of its own
+                row = tl.program_id(0) * (2 * BM) + tl.arange(0, 2 * BM)
+                h = tl.reshape(h, (2 * BM, width // 2))
+            k = tl.arange(0, PADDED[i - 1] // (LAYERS[i][4] // LAYERS[i - 1][4]))
+            col = tl.arange(0, PADDED[i])
+            mask = (k < LAYERS[i][2])[:, None] & (col < LAYERS[i][3])[None, :]
+            w = tl.load(weights + LAYERS[i][0] + col[None, :] * LAYERS[i][2] + k[:, None], mask=mask, other=0.0)
+            acc = tl.dot(h, w)
+        acc += tl.load(value + BIASES[i][0] + col % BIASES[i][1], mask=col < LAYERS[i][3], other=0.0)[None, :]
+        if i < len(LAYERS) - 1:
+            h = tl.where(acc > 0.0, acc, tl.exp(acc) - 1.0).to(x.dtype.element_ty)
+        else:
+            h = acc
+        if GATHER or i == len(LAYERS) - 1:
+            out = outputs[i] + row.to(tl.int64)[:, None] * LAYERS[i][3] + col[None, :]
+            tl.store(out, h, mask=(row < rows * LAYERS[i][4])[:, None] & (col < LAYERS[i][3])[None, :])
+
+
+@triton.jit
+def network_backward(grad_outs, weights, outputs, rows, LAYERS: tl.constexpr, PADDED: tl.constexpr, BM: tl.constexpr):
+    """Write the gradients with respect to the outputs of all layers but the last, before their ELU.
+
+    grad_outs: of each layer, (rows, num_out), the last one is given; others: as in `network_forward`.
+    """
+    row = tl.program_id(0) * BM + tl.arange(0, BM)
+    col = tl.arange(0, PADDED[len(LAYERS) - 1])
+    place = grad_outs[len(LAYERS) - 1] + row.to(tl.int64)[:, None] * LAYERS[len(LAYERS) - 1][3] + col[None, :]
+    grad = tl.load(place, mask=(row < rows)[:, None] & (col < LAYERS[len(LAYERS) - 1][3])[None, :], other=0.0)
+    for j in tl.static_range(len(LAYERS) - 1):
+        grad = input_gradient(
+            grad, weights + LAYERS[len(LAYERS) - 1 - j][0], outputs[len(LAYERS) - 2 - j],
+            grad_outs[len(LAYERS) - 2 - j], row, rows, LAYERS[len(LAYERS) - 1 - j][2], LAYERS[len(LAYERS) - 1 - j][3],
+            PADDED[len(LAYERS) - 1 - j],
+            PADDED[len(LAYERS) - 2 - j] // (LAYERS[len(LAYERS) - 1 - j][4] // LAYERS[len(LAYERS) - 2 - j][4]),
+        )  # fmt: skip
+
+
+@triton.jit
+def input_gradient(
+    grad, weight, y, grad_in, row, rows, NUM_IN: tl.constexpr, NUM_OUT: tl.constexpr, BK: tl.constexpr,
+    BN: tl.constexpr,
+):  # fmt: skip
+    """Write and return the gradient of `layer_backward` for the rows `row`; grad: (len(row), BK)."""
+    k, col = tl.arange(0, BK), tl.arange(0, BN)
+    place = weight + k[:, None] * NUM_IN + col[None, :]
+    acc = tl.dot(grad, tl.load(place, mask=(k < NUM_OUT)[:, None] & (col < NUM_IN)[None, :], other=0.0))
+    mask = (row < rows)[:, None] & (col < NUM_IN)[None, :]
+    place = row.to(tl.int64)[:, None] * NUM_IN + col[None, :]
+    slope = 1.0 + tl.minimum(tl.load(y + place, mask=mask, other=0.0).to(tl.float32), 0.0)
+    grad = (acc * slope).to(grad_in.dtype.element_ty)
+    tl.store(grad_in + place, grad, mask=mask)
+    return grad
+
+
+@triton.jit
+def weight_gradients(
+    grad_outs, inputs, index, partial, stride, rows, rows_per_split, LAYERS: tl.constexpr, TILES: tl.constexpr,
+    BK: tl.constexpr,
+):  # fmt: skip
+    """Write the sums over each split of the rows of grad_outᵀ x (num_out, num_in) and of grad_out, of all layers.
+
+    grad_outs, inputs: gradient with respect to a layer's output and its input x, (…, num_out) and (…, num_in); the
+    first x has `rows` rows, of which the rows `index` are taken. partial: (SPLITS, stride), in the places of LAYERS, as
+    in `network_forward`. TILES: of each layer, its first tile, the next layer's first tile, BM and BN.
+    """
+    tile = tl.program_id(0)
+    for i in tl.static_range(len(LAYERS)):
+        if (tile >= TILES[i][0]) & (tile < TILES[i][1]):
+            weight_gradient_tile(
+                grad_outs[i], inputs[i], index, partial, stride, rows, rows_per_split, tile - TILES[i][0], LAYERS[i][0],
+                LAYERS[i][1], LAYERS[i][2], LAYERS[i][3], LAYERS[i][4], i == 0, TILES[i][2], TILES[i][3], BK,
+            )  # fmt: skip
+
+
+@triton.jit
+def weight_gradient_tile(
+    grad_out, x, index, partial, stride, rows, rows_per_split, tile, WEIGHT: tl.constexpr, BIAS: tl.constexpr,
+    NUM_IN: tl.constexpr, NUM_OUT: tl.constexpr, REPEAT: tl.constexpr, GATHER: tl.constexpr, BM: tl.constexpr,
+    BN: tl.constexpr, BK: tl.constexpr,
+):  # fmt: skip
+    """Write a tile of `weight_gradients`; the tiles of a layer are numbered along the rows of its weight first."""
+    tiles: tl.constexpr = (NUM_OUT + BM - 1) // BM
+    out = (tile % tiles) * BM + tl.arange(0, BM)
+    col = (tile // tiles) * BN + tl.arange(0, BN)
+    first = tl.program_id(1) * rows_per_split * REPEAT
+    last = tl.minimum(first + rows_per_split * REPEAT, rows * REPEAT)
     acc = tl.zeros((BM, BN), tl.float32)
-    bias = tl.zeros((BM,), tl.float32)
+    bias = tl.zeros((BM, 16), tl.float32)
+    ones = tl.full((BK, 16), 1.0, grad_out.dtype.element_ty)
     for start in range(first, last, BK):
         row = start + tl.arange(0, BK)
         source = row.to(tl.int64)
         if GATHER:
             source = tl.load(index + row, mask=row < last, other=0)
-        mask = (row < last)[None, :] & (out < num_out)[:, None]
-        a = tl.load(grad_out + row.to(tl.int64)[None, :] * num_out + out[:, None], mask=mask, other=0.0)
-        mask = (row < last)[:, None] & (col < num_in)[None, :]
-        acc = tl.dot(a, tl.load(x + source[:, None] * num_in + col[None, :], mask=mask, other=0.0), acc)
-        bias += tl.sum(a.to(tl.float32), 1)
-    place = weight_partial + split * stride + out[:, None] * num_in + col[None, :]
-    tl.store(place, acc, mask=(out < num_out)[:, None] & (col < num_in)[None, :])
-    if tl.program_id(1) == 0:
-        tl.store(bias_partial + split * stride + out, bias, mask=out < num_out)
+        mask = (row < last)[None, :] & (out < NUM_OUT)[:, None]
+        a = tl.load(grad_out + row.to(tl.int64)[None, :] * NUM_OUT + out[:, None], mask=mask, other=0.0)
+        mask = (row < last)[:, None] & (col < NUM_IN)[None, :]
+        acc = tl.dot(a, tl.load(x + source[:, None] * NUM_IN + col[None, :], mask=mask, other=0.0), acc)
+        bias = tl.dot(a, ones, bias)
+    place = partial + tl.program_id(1) * stride
+    weight = place + WEIGHT + out[:, None] * NUM_IN + col[None, :]
+    tl.store(weight, acc, mask=(out < NUM_OUT)[:, None] & (col < NUM_IN)[None, :])
+    if tile < tiles:
+        column = tl.arange(0, 16)[None, :]
+        tl.store((place + BIAS + out)[:, None] + 0 * column, bias, mask=(out < NUM_OUT)[:, None] & (column == 0))
 
 
 # ---------------------------------------------------------------- losses
@@ -238,13 +341,14 @@ def sum_partials(partial, table, gradient, stride, total, SPLITS: tl.constexpr, 
     table: (3, total) of `FusedLayout`, the entry that a parameter has in `partial`, that of its mirror image, the sign.
     """
     i = tl.program_id(0) * B + tl.arange(0, B)
-    split = tl.arange(0, SPLITS)[:, None] * stride
-    place = tl.load(table + i, mask=i < total, other=0)
-    grad = tl.sum(tl.load(partial + split + place[None, :]), 0)
-    if MIRROR:
-        place = tl.load(table + total + i, mask=i < total, other=0)
-        sign = tl.load(table + 2 * total + i, mask=i < total, other=0).to(tl.float32)
-        grad += sign * tl.sum(tl.load(partial + split + place[None, :]), 0)
+    place = partial + tl.load(table + i, mask=i < total, other=0)
+    image = partial + tl.load(table + total + i, mask=(i < total) & MIRROR, other=0)
+    sign = tl.load(table + 2 * total + i, mask=(i < total) & MIRROR, other=0).to(tl.float32)
+    grad = tl.zeros((B,), tl.float32)
+    for split in tl.static_range(SPLITS):
+        grad += tl.load(place + split * stride)
+        if MIRROR:
+            grad += sign * tl.load(image + split * stride)
     tl.store(gradient + i, grad, mask=i < total)
 
 
@@ -269,7 +373,7 @@ def prepare_step(
         if ADAPT:
             kl, desired = tl.load(gradient + size + 31), tl.load(desired_kl)
             reduced = tl.where(kl > 2.0 * desired, tl.maximum(rate / 1.5, min_lr), rate)
-            rate = tl.where((kl < 0.5 * desired) & (kl > 0.0), tl.minimum(rate * 1.5, max_lr), reduced)
+            rate = tl.where((kl < 0.5 * desired) & (kl > 1.0e-6 * desired), tl.minimum(rate * 1.5, max_lr), reduced)
         double = step.to(tl.float64)  # 1 - beta^step cancels in float32
         tl.store(lr, rate)
         tl.store(num_steps, step)

@@ -19,7 +19,8 @@ from jumper_warp.rl.networks import ActorCritic
 
 WIDTH = 16  # Widths of layers are padded to a multiple of this, the smallest tile of a matrix product
 INPUT_WIDTH = 32  # Widths of observations are padded to a multiple of this
-SPLITS = 32  # Number of splits of the samples whose sums are added in a fixed order; a power of two
+SPLITS = 64  # Number of splits of the samples whose sums are added in a fixed order; a power of two
+MAX_WIDTH = 256  # Largest width of a layer for the kernels of all layers, whose blocks keep their rows in registers
 Launch = Callable[..., Any]  # A kernel with its grid
 
 
@@ -123,14 +124,12 @@ class FusedNetwork:
         mirrored: bool = False,
     ) -> None:  # fmt: skip
         """Allocate activations; weights: (size of the layout,) copy of the parameters; partial: (SPLITS, size)."""
-        self._layers, self._partial, self._rows_per_sample = layers, partial, 2 if mirrored else 1
-        self._weights = [weights[layer.weight :] for layer in layers]
-        self._biases = [layer.parameter.view(flat.value) for layer in layers]
-        self._weight_partials = [partial[0, layer.weight :] for layer in layers]
-        self._bias_partials = [partial[0, layer.bias :] for layer in layers]
+        self._layers, self._weights, self._value, self._partial = layers, weights, flat.value, partial
+        repeats = [2 if mirrored and i > 0 else 1 for i in range(len(layers))]  # rows of a layer for each sample
+        self._rows_per_sample = repeats[-1]
         self._outputs, self._gradients = [], []
-        for layer in layers:
-            shape = (rows if layer is layers[0] else self._rows_per_sample * rows, layer.outputs)
+        for layer, repeat in zip(layers, repeats, strict=True):
+            shape = (repeat * rows, layer.outputs)
             dtype = torch.float32 if layer is layers[-1] else weights.dtype
             self._outputs.append(weights.new_zeros(shape, dtype=dtype))
             self._gradients.append(weights.new_zeros(shape))
@@ -139,6 +138,14 @@ class FusedNetwork:
 
         The mirror-symmetric actor has two rows for each sample, f(x) and f(M x).
         """
+        self._places = tuple((*layer[:4], repeat) for layer, repeat in zip(layers, repeats, strict=True))
+        self._biases = tuple((layer.parameter.start, layer.parameter.shape[0]) for layer in layers)
+        self._padded = tuple(power_of_two(layer.outputs) for layer in layers)
+        self._gradient_tiles = gradient_tiles(layers)
+        width = self._padded[0] // self._rows_per_sample
+        fits = max(width, *self._padded[1:]) <= MAX_WIDTH and (not mirrored or self._padded[0] == layers[0].outputs)
+        self._whole = fits
+        """Whether one kernel evaluates all layers; a mirrored first layer must fill its padding."""
 
     @property
     def width(self) -> int:
@@ -146,40 +153,46 @@ class FusedNetwork:
         return self._layers[-1].outputs
 
     def forward(self, x: torch.Tensor, rows: int, index: torch.Tensor | None = None) -> torch.Tensor:
-        """Write `output` for normalised observations, and return it.
+        """Write `output` for normalised observations, and return it; with an index also what `backward` needs.
 
         x: (…, padded width of the observation), the rows `index` of it if given, else the first `rows`.
         """
-        for i, layer in enumerate(self._layers):
-            count = rows if i == 0 else self._rows_per_sample * rows
-            bn = tile(layer.outputs)
-            launch(kernels.layer_forward, (blocks(count, 128), blocks(layer.outputs, bn)), num_warps=8, num_stages=3)(
-                x, x if index is None else index, self._weights[i], self._biases[i], self._outputs[i], count,
-                layer.inputs, layer.outputs, self._biases[i].numel(), index is not None, i < len(self._layers) - 1,
-                128, bn, 32 if layer.inputs % 64 else 64,
+        gather, block = index is not None, 32 if self._layers[0].inputs % 64 else 64
+        if self._whole:
+            launch(kernels.network_forward, (blocks(rows, 64),), num_warps=8 if self._rows_per_sample == 2 else 4)(
+                x, index if gather else x, self._weights, self._value, tuple(self._outputs), rows, self._places,
+                self._biases, self._padded, gather, 64, block,
             )  # fmt: skip
-            x, index = self._outputs[i], None
+            return self.output
+        for i, (layer, place) in enumerate(zip(self._layers, self._places, strict=True)):
+            count, bn = place[4] * rows, min(power_of_two(layer.outputs), 128)
+            launch(kernels.layer_forward, (blocks(count, 128), blocks(layer.outputs, bn)), num_warps=8)(
+                x, index if gather else x, self._weights[layer.weight :], self._value[layer.parameter.start :],
+                self._outputs[i], count, layer.inputs, layer.outputs, layer.parameter.shape[0], gather,
+                i < len(self._layers) - 1, 128, bn, 32 if layer.inputs % 64 else 64,
+            )  # fmt: skip
+            x, gather = self._outputs[i], False
         return self.output
 
     def backward(self, x: torch.Tensor, rows: int, index: torch.Tensor) -> None:
         """Write the partial sums of all parameters' gradients for `grad_output`; arguments: as in `forward`."""
-        for i in reversed(range(len(self._layers))):
-            layer, count = self._layers[i], rows if i == 0 else self._rows_per_sample * rows
-            inputs = x if i == 0 else self._outputs[i - 1]
-            bm = tile(layer.outputs)
-            bn = min(tile(layer.inputs), 64 if layer.inputs % 128 or layer.inputs * layer.outputs <= 128 * 128 else 128)
-            grid = (blocks(layer.outputs, bm), blocks(layer.inputs, bn), SPLITS)
-            launch(kernels.weight_gradient, grid, num_warps=4, num_stages=2)(
-                self._gradients[i], inputs, index, self._weight_partials[i], self._bias_partials[i],
-                self._partial.stride(0), count, rows_per_split(count), layer.inputs, layer.outputs, i == 0, bm, bn, 128,
-            )  # fmt: skip
-            if i > 0:
-                bn = tile(layer.inputs)
-                grid = (blocks(count, 128), blocks(layer.inputs, bn))
-                launch(kernels.layer_backward, grid, num_warps=8, num_stages=3)(
-                    self._gradients[i], self._weights[i], inputs, self._gradients[i - 1], count, layer.inputs,
-                    layer.outputs, 128, bn, min(tile(layer.outputs), 64),
+        count, gradients, outputs = self._rows_per_sample * rows, tuple(self._gradients), tuple(self._outputs)
+        if self._whole:
+            launch(kernels.network_backward, (blocks(count, 64),))(
+                gradients, self._weights, outputs, count, self._places, self._padded, 64
+            )
+        else:
+            for i in reversed(range(1, len(self._layers))):
+                layer = self._layers[i]
+                bn = min(power_of_two(layer.inputs), 128)
+                launch(kernels.layer_backward, (blocks(count, 128), blocks(layer.inputs, bn)), num_warps=8)(
+                    gradients[i], self._weights[layer.weight :], outputs[i - 1], gradients[i - 1], count, layer.inputs,
+                    layer.outputs, 128, bn, min(power_of_two(layer.outputs), 64),
                 )  # fmt: skip
+        launch(kernels.weight_gradients, (self._gradient_tiles[-1][1], SPLITS))(
+            gradients, (x, *outputs[:-1]), index, self._partial, self._partial.stride(0), rows, rows_per_split(rows),
+            self._places, self._gradient_tiles, 64,
+        )  # fmt: skip
 
 
 def blocks(count: int, size: int) -> int:
@@ -187,9 +200,19 @@ def blocks(count: int, size: int) -> int:
     return -(-count // size)
 
 
-def tile(width: int) -> int:
-    """Return the size of a tile for a matrix of a width: a power of two, at most 128."""
-    return min(128, 1 << (width - 1).bit_length())
+def power_of_two(width: int) -> int:
+    """Return the smallest power of two that is not less than a width."""
+    return 1 << (width - 1).bit_length()
+
+
+def gradient_tiles(layers: list[Layer]) -> tuple[tuple[int, int, int, int], ...]:
+    """Return the tiles of the weights' gradients: of each layer its first, the next layer's first, BM and BN."""
+    tiles, count = [], 0
+    for layer in layers:
+        bm, bn = (min(power_of_two(width), 128) for width in (layer.outputs, layer.inputs))
+        first, count = count, count + blocks(layer.outputs, bm) * blocks(layer.inputs, bn)
+        tiles.append((first, count, bm, bn))
+    return tuple(tiles)
 
 
 def rows_per_split(rows: int) -> int:
@@ -197,6 +220,6 @@ def rows_per_split(rows: int) -> int:
     return aligned(blocks(rows, SPLITS), WIDTH)
 
 
-def launch(kernel: Any, grid: tuple[int, ...], num_warps: int = 4, num_stages: int = 1) -> Launch:
+def launch(kernel: Any, grid: tuple[int, ...], num_warps: int = 4, num_stages: int = 3) -> Launch:
     """Return a function that launches a kernel on a grid with its positional arguments."""
     return lambda *args: kernel[grid](*args, num_warps=num_warps, num_stages=num_stages)

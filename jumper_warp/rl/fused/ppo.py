@@ -52,7 +52,8 @@ class FusedPpo(Ppo):
         try:
             self.fused.warm_up()
         except Exception as error:  # compilers raise many types
-            raise InputError(f"--ppo.fused does not work here: {type(error).__name__} {error}"[:300]) from error
+            reason = f"{type(error).__name__} {error}"[:240]
+            raise InputError(f"the fused kernels do not work here, pass --ppo.no-fused: {reason}") from error
         for tensor, original in zip(modified, originals, strict=True):
             tensor.copy_(original)
 

@@ -17,7 +17,7 @@ from jumper_warp.rl.mirror import MirrorMap
 from jumper_warp.rl.networks import ActorCritic, Moments, Scaling, all_reduce_moments
 from jumper_warp.rl.samples import Batch, RolloutMoments, gae
 
-SUM_BLOCK = 128  # Entries of the flat gradient in a block of the kernels that sum it
+SUM_BLOCK = 256  # Entries of the flat gradient in a block of the kernels that sum it
 ADAM_BLOCK = 1024  # Entries of the flat vector in a block of Adam's kernel
 LOSS_ROWS = 256  # Samples that a block of the losses' kernels handles at a time
 
