@@ -172,7 +172,7 @@ def test_training_saves_functions_by_module_and_name(runs):
 def test_export_does_not_need_the_module(capsys, runs, tmp_path):
     code, _, err = run(capsys, "export", str(runs["low-jump"]), "--out", str(tmp_path / "policy"))
     policy = load_policy(tmp_path / "policy")
-    assert (code, err) == (0, [f"best checkpoint: iteration {policy.config['iteration']}"])
+    assert (code, err) == (0, [f"{runs['low-jump']}: best checkpoint, iteration {policy.config['iteration']}"])
     assert "my_jumps" not in sys.modules
     assert policy.interface.task == "low-jump" and policy.interface == open_policy(runs["low-jump"]).interface
     assert run(capsys, "export", str(tmp_path / "policy"), "--out", str(tmp_path / "low.onnx"))[::2] == (0, [])
