@@ -81,8 +81,8 @@ class FilmCfg:
     fps: float = 30.0  # [1/s] Frames per second
     speed: float = 1.0  # Speed of the playback; 0.25 for slow motion
     eye: tuple[float, float, float] | None = None
-    """[m] Camera's offset from the robot, world axes: ahead, to the left, up (default: at the robot's side). The picture
-    has the same direction."""
+    """[m] Camera's offset from the robot, world axes: ahead, to the left, up (default: at the robot's side). It
+    also sets the direction of the picture."""
 
     def __post_init__(self) -> None:
         if self.eye is not None:

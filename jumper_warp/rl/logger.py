@@ -167,7 +167,7 @@ class _PipeSafeConsole(Console):
 
 
 def _summary(metrics: dict[str, float]) -> str:
-    """Return one line with steps per second and, if in metrics, reward of an episode, success rate, curriculum level."""
+    """Return one line with steps per second and, if in metrics, reward, success rate and curriculum level."""
     parts = [f"{metrics['Perf/total_fps']:,.0f} steps/s"]
     if (total := metrics.get("Train/mean_reward")) is not None:
         parts.append(f"reward {total:.2f}")

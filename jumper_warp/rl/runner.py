@@ -84,8 +84,8 @@ def train(
 
     command: command line printed for resuming, without `--resume` (default: `jumper train TASK`). as_rsl_rl: required
     by trainer rsl-rl. actor_init: initialisation from cfg.init_policy, required with it. checkpoint: the loaded
-    checkpoint of cfg.resume (default: loaded here). expected_rate: environment steps of all worlds per second [1/s]; one
-    line warns of less than half of it (0: no warning).
+    checkpoint of cfg.resume (default: loaded here). expected_rate: environment steps per second of all worlds; one line
+    warns of less than half of it (0: no warning).
     Raises InputError: a setting does not fit the environment or the machine. CheckpointError: no usable checkpoint to
     resume from, or the last one could not be saved; InputError: another process is writing the run's folder.
     SystemExit, after a checkpoint was saved: with code INTERRUPTED if Ctrl-C or SIGTERM stopped the training, with a

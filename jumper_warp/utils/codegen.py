@@ -12,13 +12,13 @@ from contextlib import contextmanager
 from jumper_warp.utils.errors import InputError, suggestion
 
 PLACE = re.compile(r'Error while parsing function "(\w+)" at (.+):\d+:\n(.*)\n')
-"""Function, file and source of the line in Warp's message about a kernel that does not compile; the last match has the error."""
+"""Function, file and source line in Warp's message about a kernel that does not compile; the last match has the error."""
 READ = re.compile(r"`(\w+)` is not an attribute of '[^']*'(?: \((?:.*\.)?(\w+)\))?")
 WRITTEN_IN_PYTHON = re.compile(r"Trying to set Warp struct attribute that does not exist (\w+)")
 
 
 def codegen_error(error: Exception) -> tuple[str, str, str] | None:
-    """Return file, place (`file.py:12, function name`) and cause of an error in a Warp function; None: another error."""
+    """Return file, place (`file.py:12, function name`) and cause of an error in a Warp function; None: another."""
     text = str(error.args[0]) if error.args else ""  # str(KeyError) would escape line breaks
     if not (places := PLACE.findall(text)):
         return None

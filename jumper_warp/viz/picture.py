@@ -93,7 +93,7 @@ class Composition:
     def point(self, along: float, height: float, in_front: float = 0.0) -> np.ndarray:
         """Return a point of the picture's vertical plane [m], (3,), world frame, from its two coordinates.
 
-        along: distance to the right of the plane's origin [m]; height: above the ground [m]; in_front: of the plane [m].
+        along: distance to the right of the plane's origin [m]; height: above the ground [m]; in_front: of it [m].
         """
         depth = self.base[0] @ self.toward_eye + in_front
         return along * self.right + depth * self.toward_eye + [0.0, 0.0, height]
@@ -102,8 +102,8 @@ class Composition:
 def compose(recording: Recording, rank: int = 0) -> Composition:
     """Choose the times of a recording at which a composite picture shows the robot of the rank-th world.
 
-    The moments of a robot that moves by less than STAYS, or DRIFT a hop, are drawn spread to the right. Frames after `valid_frames` are
-    ignored. Raises InputError: no frame remains.
+    The moments of a robot that moves by less than STAYS, or DRIFT a hop, are drawn spread to the right. Frames after
+    `valid_frames` are ignored. Raises InputError: no frame remains.
     """
     count = valid_frames(recording, rank)
     if count == 0:

@@ -286,7 +286,9 @@ def test_error_in_a_users_file_prints_one_line(right, wrong, message, tmp_path, 
     path = tmp_path / "own_faults.py"
     path.write_text(text.replace(right, wrong, 1))
     rows = text.splitlines()
-    line, use = (next(i for i, row in enumerate(rows, 1) if part in row) for part in ("RewardTerm(level", "tilt(robot)"))
+    line, use = (
+        next(i for i, row in enumerate(rows, 1) if part in row) for part in ("RewardTerm(level", "tilt(robot)")
+    )
     monkeypatch.delitem(sys.modules, "own_faults", raising=False)
     before = dict(TASKS)
     args = [*"--device cpu --num-envs 4 --max-iterations 1".split(), "--log-root", str(tmp_path)]

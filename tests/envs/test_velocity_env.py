@@ -133,7 +133,9 @@ def test_metrics_are_ratios_of_sums_over_worlds(flat):
     assert again["Metrics/error_vel_xy_settled_m_s"] == 0.0 and again["Curriculum/command_level"] == 3.5
 
 
-@pytest.mark.parametrize(("name", "key"), [("speed_m_s", "Metrics/speed_m_s"), ("Curriculum/level", "Curriculum/level")])
+@pytest.mark.parametrize(
+    ("name", "key"), [("speed_m_s", "Metrics/speed_m_s"), ("Curriculum/level", "Curriculum/level")]
+)
 def test_metric_without_a_group_is_logged_in_the_group_metrics(name, key):
     assert StateMetric(name, "score").name == key
 
