@@ -73,8 +73,8 @@ def run_suite(task: TaskCfg, args: Sequence[str], modules: Sequence[ModuleType])
 def policy_of(command: str, about: str, args: Sequence[str]) -> str:
     """Return the first argument, the policy; print the general help and exit with 0 if it is --help.
 
-    A task's log folder becomes its newest run. about: text for the help. Raises UsageError: the first argument is missing
-    or another flag.
+    A task's log folder becomes its newest run. about: text for the help. Raises UsageError: the first argument is
+    missing or another flag.
     """
     if args and args[0] in ("-h", "--help"):
         print(f"{HELP.format(command=command, about=about)}\n\n{TASK_MODULE_HELP}")

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from jumper_warp.utils.errors import InputError, suggestion
 
 PLACE = re.compile(r'Error while parsing function "(\w+)" at (.+):\d+:\n(.*)\n')
-"""Function, file and source line in Warp's message about a kernel that does not compile; the last match has the error."""
+"""Function, file and source line in Warp's message about a kernel that does not compile; the last match counts."""
 READ = re.compile(r"`(\w+)` is not an attribute of '[^']*'(?: \((?:.*\.)?(\w+)\))?")
 WRITTEN_IN_PYTHON = re.compile(r"Trying to set Warp struct attribute that does not exist (\w+)")
 
