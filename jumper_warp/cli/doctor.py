@@ -47,7 +47,6 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
     from jumper_warp.utils.runtime import init_warp, source_versions
 
-    wp.config.log_level = wp.LOG_WARNING
     init_warp()
     versions = source_versions()
     content = {

@@ -26,7 +26,8 @@ usage: jumper {command} POLICY [flags]
 
 {about}
 
-  POLICY    name or folder of a policy, folder of a training run, or checkpoint;
+  POLICY    name or folder of a policy, folder of a training run (logs/TASK: the
+            task's newest run), or checkpoint;
             `jumper list` shows the names
 
 jumper {command} POLICY --help lists the flags."""
@@ -72,14 +73,17 @@ def run_suite(task: TaskCfg, args: Sequence[str], modules: Sequence[ModuleType])
 def policy_of(command: str, about: str, args: Sequence[str]) -> str:
     """Return the first argument, the policy; print the general help and exit with 0 if it is --help.
 
-    about: text for the help. Raises UsageError: the first argument is missing or another flag.
+    A task's log folder becomes its newest run. about: text for the help. Raises UsageError: the first argument is
+    missing or another flag.
     """
     if args and args[0] in ("-h", "--help"):
         print(f"{HELP.format(command=command, about=about)}\n\n{TASK_MODULE_HELP}")
         raise SystemExit(0)
     if not args or args[0].startswith("-"):
         raise UsageError(f"the policy comes first: jumper {command} POLICY [flags]")
-    return args[0]
+    from jumper_warp.policies.catalog import newest_run
+
+    return str(newest_run(args[0]))
 
 
 def open_run(policy: str, modules: Sequence[ModuleType]) -> EvaluationRun:

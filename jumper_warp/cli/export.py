@@ -17,7 +17,8 @@ from jumper_warp.cli.main import parse
 class ExportCfg:
     """Save the policy of a training run as a folder, or a policy as one ONNX file."""
 
-    source: tyro.conf.Positional[str]  # Name or folder of a policy, folder of a training run, or checkpoint
+    source: tyro.conf.Positional[str]
+    """Name or folder of a policy, folder of a training run, logs/TASK for the task's newest run, or checkpoint."""
     out: Path | None = None
     """ONNX file, or folder of the new policy (default: policy/ in the run's folder; of a policy <task>.onnx)."""
     newest: bool = False  # Export the newest checkpoint of a run, not the best
@@ -43,19 +44,20 @@ def export(cfg: ExportCfg) -> Path:
     exists and `overwrite` is not set. CheckpointError: the checkpoint cannot be used.
     """
     from jumper_warp.policies.blend import blend
+    from jumper_warp.policies.catalog import newest_run
     from jumper_warp.policies.folder import checked_folder, save_policy
     from jumper_warp.policies.onnx import export_onnx
     from jumper_warp.policies.runs import is_run, learning_curve, open_policy, run_folder
     from jumper_warp.rl.resume import CHECKPOINTS
 
-    source = Path(cfg.source)
+    source = Path(newest_run(cfg.source))
     if cfg.out is not None and cfg.out.suffix != ".onnx":
         checked_folder(cfg.out)
     trained = is_run(source)
-    policy = open_policy(cfg.source, newest=cfg.newest)
+    policy = open_policy(source, newest=cfg.newest)
     if trained:
         chosen = ("newest " if cfg.newest else "best ") if (source / CHECKPOINTS).is_dir() else ""
-        print(f"{chosen}checkpoint: iteration {policy.config['iteration']}", file=sys.stderr)
+        print(f"{run_folder(source)}: {chosen}checkpoint, iteration {policy.config['iteration']}", file=sys.stderr)
     if cfg.blend is not None:
         policy = blend(policy, open_policy(cfg.blend[0]), cfg.blend[1])
     out = cfg.out

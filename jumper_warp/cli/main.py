@@ -18,6 +18,7 @@ import traceback
 from collections.abc import Callable, Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
+from jumper_warp.utils.codegen import codegen_error
 from jumper_warp.utils.errors import InputError, is_out_of_memory, suggestion
 from jumper_warp.utils.version import __version__
 
@@ -43,8 +44,6 @@ COMMANDS = {
 }
 """Help text by command; each command is a module of `jumper_warp.cli` with run(args, modules)."""
 RED, RESET = "\033[31m", "\033[0m"  # Colour of the program's name before an error
-CODEGEN = re.compile(r'Error while parsing function "(\w+)" at (.+):\d+:')
-"""Function and file in Warp's message about a kernel that does not compile; the last match has the error."""
 TASK_MODULE = "--task-module"
 TASK_MODULE_HELP = f"""\
 Every command takes {TASK_MODULE} FILE_OR_MODULE, any number of times: a
@@ -112,10 +111,9 @@ def dispatch(args: Sequence[str]) -> None:
 
 def user_file_error(files: Collection[str], error: Exception) -> str | None:
     """Return a message with file and line of an exception raised in one of `files` (absolute paths), else None."""
-    functions = CODEGEN.findall(str(error))
-    if functions and os.path.abspath(functions[-1][1]) in files:
-        name, path = functions[-1]
-        return f"{os.path.basename(path)}, function {name}: {str(error).rsplit(';Error', 1)[-1].strip(' ,')}"
+    found = codegen_error(error)
+    if found and os.path.abspath(found[0]) in files:
+        return f"{found[1]}: {found[2].removeprefix('Error, ')}"
     frames = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)]
     if isinstance(error, InputError) or not frames or os.path.abspath(frames[-1][0]) not in files:
         return None

@@ -22,6 +22,7 @@ from jumper_warp.cli.renamed_flags import use_new_names
 from jumper_warp.registry import TASKS, TaskEntry, find_task, make_task, task_names
 from jumper_warp.rl.cfg import UNUSED, TrainCfg
 from jumper_warp.utils.errors import InputError, OutOfMemoryError, is_out_of_memory
+from jumper_warp.utils.threads import checked_threads
 
 if TYPE_CHECKING:
     from types import ModuleType
@@ -35,6 +36,7 @@ if TYPE_CHECKING:
 
 
 CPU_STEPS_PER_SECOND = 10_000.0  # [1/s] Policy steps per thread, of all worlds, in a training on a CPU
+PRESET_STEPS_PER_SECOND = 6_000.0  # [1/s] Policy steps per thread with a preset, of all worlds, on up to two threads
 SHORT_TRAINING = 60.0  # [s] Time of a training on a CPU that is not announced
 SHORT_HELP = {
     "Size and length": ("preset", "num-envs", "max-iterations", "max-seconds", "seed"),
@@ -234,7 +236,6 @@ def command_line(args: Sequence[str], modules: Sequence[ModuleType]) -> str:
 def report_cpu_time(args: TrainArgs, presets: Iterable[str]) -> None:
     """Print one line about the time of a training on a CPU, unless it is short; presets: names of the task's."""
     from jumper_warp.rl.logger import format_duration
-    from jumper_warp.utils.threads import checked_threads
 
     cfg, done = args.cfg, args.checkpoint.state["iteration"] if args.checkpoint else 0
     steps = (cfg.max_iterations - done) * cfg.ppo.num_steps * cfg.num_envs
@@ -278,8 +279,11 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
 
         actor_init = actor_init_from_policy(parsed.cfg.init_policy, task, parsed.cfg.ppo)
     is_rank_0 = os.environ.get("RANK", "0") == "0"
+    rate = 0.0
     if is_rank_0 and configure_device(parsed.cfg.device, parsed.cfg.threads).driver is None:
-        report_cpu_time(parsed, () if parsed.preset else find_task(task.name)[1].presets)
+        report_cpu_time(parsed, () if parsed.preset or parsed.checkpoint else find_task(task.name)[1].presets)
+        if parsed.preset and parsed.solver == "jumper":
+            rate = PRESET_STEPS_PER_SECOND * min(checked_threads(parsed.cfg.threads), 2)
     if is_rank_0 and parsed.randomize and (words := range_words(task, parsed.overlay, changed=True)):
         print(f"ranges of this robot: {', '.join(words)}", file=sys.stderr)
     as_rsl_rl = None
@@ -287,7 +291,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> TrainResult:
         from jumper_warp.envs.rsl_rl import RslRlVecEnv as as_rsl_rl
     make_env, command = env_maker(task, parsed), command_line(args, modules)
     try:
-        result = train(parsed.cfg, make_env, command, as_rsl_rl, actor_init, parsed.checkpoint)
+        result = train(parsed.cfg, make_env, command, as_rsl_rl, actor_init, parsed.checkpoint, rate)
     except (MemoryError, RuntimeError) as error:
         if not is_out_of_memory(error):
             raise

@@ -63,7 +63,9 @@ class Env(Stages):
     overwrite; observations and reward terms are those of the first task:
         obs, critic_obs: (num_envs, columns), after resets of ended episodes.
         final_obs, final_critic_obs: (num_envs, columns), before resets.
-        reward_terms: (num_envs,) by name of the reward, weight and time step applied, of worlds on that task.
+        reward_terms: (num_envs,) by name of the reward: value times weight times policy step (1/60 s), or without the
+        policy step if the term has `scale_by_dt=False`; their sum, before `reward_floor`, is the reward. Of worlds on
+        that task.
         reward, done, timeout: (num_envs,); done 1 where an episode ended, timeout 1 where it ended without failure.
     `Stages` holds the arrays and launches the kernels. Python threads can have an environment each.
     """

@@ -22,6 +22,7 @@ from jumper_warp.kernels.mdp.view import vec12
 from jumper_warp.robot.motors import filter_params
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.params import ParamArrays
+from jumper_warp.utils.codegen import explained_fields
 from jumper_warp.utils.dumps import NonFiniteValue
 from jumper_warp.utils.kernels import Kernel, records
 from jumper_warp.utils.threads import locked
@@ -52,8 +53,9 @@ class TaskRuntime:
         self.term_value, self.episode_sum = (wp.zeros(terms, dtype=float, device=device) for _ in range(2))
         self.counters = self._counters()
         self._max_episode_length_s = task.max_episode_length_s(step_dt)
-        self.settings = self._structs([] if task.reset.settings is None else [task.reset.settings.values(step_dt)])
-        self.levels = self._structs([level.values() for level in task.levels], task.level_type)
+        with explained_fields(task.fields):
+            self.settings = self._structs([] if task.reset.settings is None else [task.reset.settings.values(step_dt)])
+            self.levels = self._structs([level.values() for level in task.levels], task.level_type)
         self._allocate_observations(substeps)
         self._allocate_non_finite(slices)
 
@@ -221,14 +223,15 @@ class TaskRuntime:
 def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
     """Return a task's kernels by name; tasks that differ only in numbers share them.
 
-    Raises InputError, with file and line: a term's function returns another type than it must. Other errors of a
-    function are Warp's.
+    Raises InputError, with file and line: a term's function returns another type than it must, or uses a field that a
+    struct does not have. Other errors of a function are Warp's.
     """
-    try:
-        return _kernels_of(task)
-    except Exception:
-        task.check_returned()
-        raise
+    with explained_fields(task.fields):
+        try:
+            return _kernels_of(task)
+        except Exception:
+            task.check_returned()
+            raise
 
 
 def _kernels_of(task: TaskCfg) -> dict[str, Kernel]:

@@ -81,9 +81,16 @@ class FilmCfg:
     fps: float = 30.0  # [1/s] Frames per second
     speed: float = 1.0  # Speed of the playback; 0.25 for slow motion
     eye: tuple[float, float, float] | None = None
-    """[m] Camera's offset from the robot, world axes: ahead, to the left, up (default: at the robot's side)."""
+    """[m] Camera's offset from the robot, world axes: ahead, to the left, up (default: at the robot's side). It
+    also sets the direction of the picture."""
 
     def __post_init__(self) -> None:
+        if self.eye is not None:
+            import numpy as np
+
+            from jumper_warp.viz.renderer import View
+
+            View(np.array(self.eye), np.zeros(3)).axes()  # raises InputError if it is vertical
         if self.video is not None:
             from jumper_warp.viz.film import check_film
 
@@ -206,7 +213,7 @@ def show_recording(
     """
     from jumper_warp.evaluation.recorder import save_recording
 
-    path = save_recording(recording, run.folder, name)
+    path = save_recording(recording, run.folder, name, cfg.film.eye)
     films = [] if cfg.film.video is None else [cfg.film.write(recording)]
     run.print_flags = cfg.printing
     run.summarise(count, keys, trial=name, films=films)

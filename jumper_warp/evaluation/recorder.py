@@ -89,14 +89,17 @@ class EnvRecorder:
         return with_blocks(recording, np.stack(self.block_positions), half, height)
 
 
-def save_recording(recording: Recording, folder: Path, name: str) -> Path:
-    """Write a recording as `<name>.rrd` (Rerun) and `<name>.png` (picture of one world); return the first."""
+def save_recording(recording: Recording, folder: Path, name: str, eye: Sequence[float] | None = None) -> Path:
+    """Write a recording as `<name>.rrd` (Rerun) and `<name>.png` (picture of one world); return the first.
+
+    eye: direction of the picture's camera from the robot, as in `write_picture`.
+    """
     from jumper_warp.viz.picture import write_picture
     from jumper_warp.viz.rerun import write_rrd
 
     with phase(f"writing {name}.rrd"):
         path = write_rrd(recording, folder / f"{name}.rrd")
-    write_picture(recording, folder / f"{name}.png", rank=round(SHOWN * (len(recording.worlds) - 1)))
+    write_picture(recording, folder / f"{name}.png", rank=round(SHOWN * (len(recording.worlds) - 1)), eye=eye)
     return path
 
 

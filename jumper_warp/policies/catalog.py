@@ -67,13 +67,31 @@ def find_policy(name: str | Path) -> Path:
 
     Raises PolicyError: there is no such policy or folder.
     """
-    text, path = str(name), Path(name)
-    own = POLICIES / text.replace("-", "_")
-    if len(path.parts) == 1 and (own / MANIFEST).is_file():
+    path = Path(name)
+    if own := _own_policy(path):
         return own
     if not path.is_dir():
-        raise PolicyError(_no_policy(text, path))
+        raise PolicyError(_no_policy(str(name), path))
     return path
+
+
+def _own_policy(name: Path) -> Path | None:
+    """Return the folder of the project's policy of this name (- counts as _), None: there is none."""
+    folder = POLICIES / str(name).replace("-", "_")
+    return folder if len(name.parts) == 1 and (folder / MANIFEST).is_file() else None
+
+
+def is_run_folder(folder: Path) -> bool:
+    """Return whether a folder holds checkpoints of a training, also of rsl-rl."""
+    return any(folder.glob("checkpoints/*.pt")) or any(folder.glob("model_[0-9]*.pt"))
+
+
+def newest_run(source: str | Path) -> str | Path:
+    """Return the newest run with a checkpoint in the log folder of a task, `logs/TASK`; another source unchanged."""
+    path = Path(source)
+    if _own_policy(path) or not path.is_dir():
+        return source
+    return max(filter(is_run_folder, path.glob("*")), default=source)
 
 
 def _no_policy(text: str, path: Path) -> str:

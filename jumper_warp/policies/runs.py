@@ -13,6 +13,7 @@ from typing import Any
 import torch
 
 from jumper_warp.envs.vec_env import RAW_LIMIT
+from jumper_warp.policies.catalog import newest_run
 from jumper_warp.policies.folder import load_policy
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, make_interface
@@ -58,10 +59,12 @@ def _rsl_rl_checkpoints(folder: Path) -> list[Path]:
 def open_policy(source: str | Path, *, newest: bool = False) -> Policy:
     """Return a policy; source: name or folder of a policy, path of a checkpoint, or folder of a training run.
 
+    A task's log folder, `logs/TASK`, stands for its newest run with a checkpoint.
     newest: whether to use the newest checkpoint of a run, not the best; of rsl-rl's runs it is always the newest.
     rsl-rl's checkpoints `model_N.pt` need a `config.json` beside them, see `RslRlVecEnv.write_config`.
     Raises PolicyError or CheckpointError: there is no such policy, or it cannot be used.
     """
+    source = newest_run(source)
     if not is_run(source):
         return load_policy(source)
     path = Path(source)

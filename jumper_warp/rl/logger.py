@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import os
 import time
 from contextlib import suppress
 from itertools import pairwise
@@ -12,7 +13,8 @@ from typing import Any
 
 import torch
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TimeElapsedColumn, TimeRemainingColumn
+from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn
+from rich.table import Column
 
 from jumper_warp.rl.metrics_file import METRICS_FILE, MetricsFile
 from jumper_warp.utils.errors import InputError
@@ -58,26 +60,28 @@ class TrainingLog:
     """Context manager that logs metrics of a training. A failure to write prints one warning, training continues."""
 
     def __init__(
-        self, folder: Path, config: dict[str, Any], total: int, tensorboard: bool = True, wandb: bool = False,
-        iteration: int = 0,
+        self, folder: Path, config: dict[str, Any], total: int, steps: int, tensorboard: bool = True,
+        wandb: bool = False, iteration: int = 0, expected_rate: float = 0.0,
     ) -> None:  # fmt: skip
         """Open the outputs; folder: the run's existing folder.
 
-        config: JSON-ready configuration of the run. total: iterations at the run's end. tensorboard: whether to write
-        events. wandb: whether to upload to Weights & Biases. iteration: iterations so far; lines logged of later
-        iterations are removed.
+        config: JSON-ready configuration of the run. total: largest number of iterations. steps: environment steps per
+        iteration, of all worlds. tensorboard: whether to write events. wandb: whether to upload to Weights & Biases.
+        iteration: iterations so far; lines logged of later iterations are removed. expected_rate: as in
+        `jumper_warp.rl.runner.train`.
         Raises InputError: Weights & Biases is requested but not installed. OSError: the metrics file cannot be used.
         """
         self._console = _PipeSafeConsole(stderr=True)
         self._file = MetricsFile(folder / METRICS_FILE, iteration)
         self._events = _event_writer(folder, iteration) if tensorboard else None
         self._disk_full = False
-        self._total = total
+        self._total, self._steps = total, steps
+        self._first, self._expected_rate = iteration + 1, expected_rate
         self._wandb = _wandb(folder, config) if wandb else None
-        columns = (BarColumn(bar_width=24), MofNCompleteColumn(), TimeElapsedColumn(), TimeRemainingColumn())
-        hidden = not self._console.is_terminal
-        self._progress = Progress("{task.description}", *columns, console=self._console, disable=hidden)
-        self._task = self._progress.add_task("training", total=total)
+        wrapped = TextColumn("{task.description}", table_column=Column(no_wrap=False))
+        columns, hidden = (TimeElapsedColumn(), BarColumn(bar_width=12), wrapped), not self._console.is_terminal
+        self._progress = Progress(*columns, console=self._console, disable=hidden)
+        self._task = self._progress.add_task("training", total=None)
 
     def __enter__(self) -> TrainingLog:
         """Show the training's progress bar; report lines that were removed from the metrics file."""
@@ -115,10 +119,22 @@ class TrainingLog:
         self._write_events(iteration, metrics)
         if self._wandb:
             self._wandb.log(metrics, step=iteration)
-        summary = _summary(metrics)
-        self._progress.update(self._task, completed=iteration, description=summary)
+        elapsed = metrics["Perf/elapsed_s"]
+        progress = f"iteration {iteration}/{self._total}, {iteration * self._steps / 1.0e6:.2f} M steps"
+        line = f"{progress}: {_summary(metrics)}, {format_duration(remaining)} left"
+        self._progress.update(self._task, completed=elapsed, total=elapsed + remaining, description=line)
         if not self._console.is_terminal:
-            self.print_line(f"iteration {iteration}/{self._total}: {summary}, {format_duration(remaining)} left")
+            self.print_line(line)
+        if iteration > self._first:
+            self._check_rate(metrics["Perf/total_fps"])
+
+    def _check_rate(self, rate: float) -> None:
+        """Print one line, once, if the step rate [1/s] is less than half of the expected one."""
+        if 2.0 * rate < self._expected_rate:
+            advice = "" if os.environ.get("OMP_NUM_THREADS") == "1" else ", or set OMP_NUM_THREADS=1"
+            usual = f"about {self._expected_rate:,.0f} are usual on these threads"
+            self.print_line(f"slow, {rate:,.0f} steps/s: {usual}; close programs that use the cores{advice}")
+            self._expected_rate = 0.0
 
     def move(self, folder: Path) -> None:
         """Continue the metrics file in another folder, also if it was deleted, without TensorBoard. Raises OSError."""
@@ -151,13 +167,20 @@ class _PipeSafeConsole(Console):
 
 
 def _summary(metrics: dict[str, float]) -> str:
-    """Return one line with steps per second and, if in metrics, mean reward of an episode and success rate."""
+    """Return one line with steps per second and, if in metrics, reward, success rate and curriculum level."""
     parts = [f"{metrics['Perf/total_fps']:,.0f} steps/s"]
     if (total := metrics.get("Train/mean_reward")) is not None:
         parts.append(f"reward {total:.2f}")
     if (success := metrics.get("Metrics/success")) is not None:
         parts.append(f"success {100.0 * success:.1f} %")
+    if levels := level_fractions(metrics):
+        parts.append(f"mean level {sum(i * part for i, part in enumerate(levels)):.1f} of {len(levels) - 1}")
     return ", ".join(parts)
+
+
+def level_fractions(metrics: dict[str, float]) -> list[float]:
+    """Return the fraction of the worlds at each curriculum level, and of those that passed the last one; [] if none."""
+    return [value for name, value in metrics.items() if name.startswith("Curriculum/fraction_at_level_")]
 
 
 def _event_writer(folder: Path, iteration: int) -> Any:

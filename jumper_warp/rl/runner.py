@@ -25,7 +25,7 @@ from jumper_warp.rl.cfg import TrainCfg
 from jumper_warp.rl.checkpoint import DECODE_ERRORS, Checkpoint, CheckpointError, one_line_message, save_checkpoint
 from jumper_warp.rl.distributed import Rank
 from jumper_warp.rl.fused import make_ppo
-from jumper_warp.rl.logger import Stopwatch, TrainingLog
+from jumper_warp.rl.logger import Stopwatch, TrainingLog, level_fractions
 from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.rl.ppo import STATISTICS
 from jumper_warp.rl.resume import CHECKPOINTS
@@ -78,13 +78,14 @@ class StopRequest:
 
 def train(
     cfg: TrainCfg, make_env: MakeEnv, command: str | None = None, as_rsl_rl: AsRslRl | None = None,
-    actor_init: ActorInit | None = None, checkpoint: Checkpoint | None = None,
+    actor_init: ActorInit | None = None, checkpoint: Checkpoint | None = None, expected_rate: float = 0.0,
 ) -> TrainResult:  # fmt: skip
     """Train to the last iteration or the time limit, save a checkpoint, and return the result.
 
     command: command line printed for resuming, without `--resume` (default: `jumper train TASK`). as_rsl_rl: required
     by trainer rsl-rl. actor_init: initialisation from cfg.init_policy, required with it. checkpoint: the loaded
-    checkpoint of cfg.resume (default: loaded here).
+    checkpoint of cfg.resume (default: loaded here). expected_rate: environment steps per second of all worlds; one line
+    warns of less than half of it (0: no warning).
     Raises InputError: a setting does not fit the environment or the machine. CheckpointError: no usable checkpoint to
     resume from, or the last one could not be saved; InputError: another process is writing the run's folder.
     SystemExit, after a checkpoint was saved: with code INTERRUPTED if Ctrl-C or SIGTERM stopped the training, with a
@@ -106,6 +107,7 @@ def train(
             return _train_rsl_rl(cfg, env, as_rsl_rl, rank)
         torch.manual_seed(cfg.seed)  # the same weights in all processes
         run = TrainingRun(cfg, env, rank, command, actor_init, checkpoint)
+        run.expected_rate = expected_rate
         cleanup.callback(run.ppo.close)
         if checkpoint is None and rank.index == 0:
             cleanup.enter_context(write_lock(run.folder))
@@ -169,6 +171,7 @@ class TrainingRun:
         self._clock_start: float | None = None  # time at which the run would have started without interruption
         self.metrics: dict[str, float] = {}
         self.notes: list[str] = []
+        self.expected_rate = 0.0  # [1/s] of environment steps, as in `train`
         self.failure = ""  # Reason why the training ends with exit status 1; empty: none
         checkpoint = checkpoint or resume.find_checkpoint(cfg)
         if not distributed.same_on_all_ranks(str(checkpoint and (checkpoint.path, checkpoint.state["iteration"]))):
@@ -216,9 +219,8 @@ class TrainingRun:
                 log.print_line(note)
             is_last = is_last_iteration(self.iteration, cfg, 0.0 < cfg.max_seconds <= self.seconds)
             if is_last:
-                seconds = f"--max-seconds {cfg.max_seconds:g}"
-                limit = f"--max-iterations {cfg.max_iterations}" if self.iteration >= cfg.max_iterations else seconds
-                log.print_line(f"the training is complete at iteration {self.iteration}: raise {limit} to continue")
+                complete = f"the training is complete at iteration {self.iteration}"
+                log.print_line(f"{complete}: raise {self._limit()} to continue")
             while not is_last:
                 watch.start()
                 ppo.set_progress(self._progress())
@@ -237,6 +239,8 @@ class TrainingRun:
                     log.log(self.iteration, self.metrics, self._remaining(seconds))
                 elif self.iteration == first_iteration:  # discard its time, which includes warm-up
                     watch.read()
+                if is_last and not self.failure:
+                    log.print_line(f"ended by {'an interruption' if stop.requested else self._limit()}")
                 if is_last or saves:
                     self._save(log, is_last, stop)
         return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.metrics)
@@ -246,7 +250,17 @@ class TrainingRun:
         if self.rank.index != 0:
             return _NoLog()
         cfg = self.cfg
-        return TrainingLog(self.folder, self.config, cfg.max_iterations, cfg.tensorboard, cfg.wandb, self.iteration)
+        outputs = (cfg.max_iterations, self._steps(), cfg.tensorboard, cfg.wandb)
+        return TrainingLog(self.folder, self.config, *outputs, self.iteration, self.expected_rate)
+
+    def _steps(self) -> int:
+        """Return the number of environment steps in an iteration, of all worlds."""
+        return self.cfg.ppo.num_steps * self.cfg.num_envs
+
+    def _limit(self) -> str:
+        """Return the limit that ends the training."""
+        ended = self.iteration >= self.cfg.max_iterations
+        return f"--max-iterations {self.cfg.max_iterations}" if ended else f"--max-seconds {self.cfg.max_seconds:g}"
 
     def _check(self, log: TrainingLog | _NoLog) -> None:
         """Report terms that are not finite; set `failure` if one of them or a deleted folder ends the training."""
@@ -302,8 +316,7 @@ class TrainingRun:
 
     def _read_metrics(self, times: list[float]) -> dict[str, float]:
         """Return the metrics to log; times: of rollout and update [s], as in PERF."""
-        steps = self.cfg.ppo.num_steps * self.cfg.num_envs
-        perf = (steps / sum(times), *times, self._elapsed())
+        perf = (self._steps() / sum(times), *times, self._elapsed())
         return {**self.ppo.statistics(), **self.env.metrics(), **dict(zip(PERF, perf, strict=True))}
 
     def _save(self, log: TrainingLog | _NoLog, is_last: bool, stop: StopRequest) -> None:
@@ -329,7 +342,7 @@ class TrainingRun:
 
     def _score(self) -> float | None:
         """Return the metric that selects the best checkpoint; None while most worlds are below the last level."""
-        levels = [value for name, value in self.metrics.items() if name.startswith("Curriculum/fraction_at_level_")]
+        levels = level_fractions(self.metrics)
         at_end = sum(levels[-2:])  # worlds at the last level, and those that passed it
         return self.metrics.get(self.cfg.best_metric) if not levels or at_end >= 0.5 else None
 

@@ -23,6 +23,7 @@ from jumper_warp.robot.parts import Link, Shape
 from jumper_warp.utils.checks import check_count
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model
+from jumper_warp.utils.runtime import init_warp
 from jumper_warp.utils.threads import locked
 
 PHYSICS_DT = 1.0 / 480.0  # [s] Physics step that contacts and loops are tuned for
@@ -87,6 +88,7 @@ def build_model(
     if not 0.0 <= friction <= MAX_FRICTION:
         raise InputError(f"friction must lie in 0 to {MAX_FRICTION:g}, got {friction}")
     check_gravity(gravity)
+    init_warp()
     description = load_description() if description is None else description
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
     newton.solvers.SolverMuJoCo.register_custom_attributes(builder)

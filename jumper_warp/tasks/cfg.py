@@ -7,9 +7,11 @@ import operator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from jumper_warp.kernels.mdp.env import NoSettings
+from jumper_warp.kernels.mdp.env import NoSettings, Scene, SkillSettings
+from jumper_warp.kernels.mdp.parameters import RobotParameters
 from jumper_warp.kernels.mdp.starts import MIN_LINK_DISTANCE
 from jumper_warp.kernels.mdp.terminations import diverged, too_long
+from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
 from jumper_warp.tasks.copying import Copyable
@@ -224,6 +226,13 @@ class TaskCfg(Copyable):
     def level_type(self) -> Any:
         """The `@wp.struct` of a curriculum level; `NoSettings` if there are no levels."""
         return self.levels[0].struct if self.levels else NoSettings
+
+    @property
+    def fields(self) -> dict[str, tuple[str, ...]]:
+        """Names of the fields of the structs that the task's functions use, by name of the struct."""
+        structs: tuple[Any, ...] = (self.state, self.level_type, self.settings_type, RobotView, RobotArrays)
+        structs += (RobotParameters, Scene, SkillSettings)
+        return {struct.key.rsplit(".", 1)[-1]: tuple(struct.vars) for struct in structs}
 
     def with_terms(self, section: str, **changes: dict[str, Any]) -> TaskCfg:
         """Return a copy of the task with changed terms; changes: new numbers and options, by name of the term.

@@ -339,7 +339,11 @@ class Curriculum(Term):
 class StateMetric:
     """A metric of the training log, from a float field of all worlds' task states."""
 
-    name: str  # Key in the log, with its unit
+    name: str  # Key in the log, with its unit; without a group, as in `Curriculum/level`, it becomes `Metrics/NAME`
     field: str  # Field of the task's state. With `per`, worlds accumulate in it, and logging sets both fields to 0.
     per: str | None = None
     """Field whose sum over all worlds divides the sum of `field`; None: log the mean of `field` and keep it."""
+
+    def __post_init__(self) -> None:
+        if "/" not in self.name:
+            object.__setattr__(self, "name", f"Metrics/{self.name}")

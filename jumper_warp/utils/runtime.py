@@ -67,12 +67,11 @@ def report_device(device: wp.DeviceLike = None, console: Console | None = None) 
 def configure_device(device: str | None, threads: int | None = None) -> DeviceInfo:
     """Set up Warp's device and the CPU threads of a command, and print the device once.
 
-    Silences Warp's module messages and returns the device's properties. device: a Warp device (default: the current
+    Returns the device's properties. device: a Warp device (default: the current
     one). threads: CPU threads of simulations, as in `set_threads`. Raises InputError: there is no such device, or the
     number of threads is invalid.
     """
     set_threads(threads)
-    wp.config.log_level = wp.LOG_WARNING
     init_warp()
     try:
         return _report_once(device, checked_threads(None))
@@ -87,11 +86,15 @@ def _report_once(device: str | None, threads: int) -> DeviceInfo:
     return report_device(device)
 
 
+@functools.cache
 def init_warp() -> None:
-    """Initialise Warp without its notice that there is no CUDA driver, which `report_device` includes.
+    """Initialise Warp at the first call, without messages about each module and a missing CUDA driver.
 
-    Warp's native library prints it, so that the process's standard error is a file meanwhile.
+    A log level that the user has set is kept. Warp's native library prints the notice about the driver, so that the
+    process's standard error is a file meanwhile.
     """
+    if wp.config.log_level == wp.LOG_INFO:  # Warp's default
+        wp.config.log_level = wp.LOG_WARNING
     sys.stderr.flush()
     with tempfile.TemporaryFile() as printed:
         stderr = os.dup(2)

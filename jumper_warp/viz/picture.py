@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -28,7 +29,8 @@ APART = (0.6, 0.6)  # [m] distance, to the right or up, from which two moments d
 GHOST = 0.4  # opacity of moments that would hide others
 SPREAD = 0.95  # [m] distance between moments of a robot that stays in place
 STAYS = 0.6  # [m] horizontal distance up to which the moments are spread, since they would hide each other
-DRIFT = 0.15  # [m] horizontal distance up to which the picture shows the x axis, not the direction of the motion
+DRIFT = 0.15  # [m] horizontal distance up to which the picture shows the x axis; of each hop, up to which a robot stays
+IN_FRONT = 0.7  # [m] distance of the time axis of a robot that stays in place from the plane of the picture
 RISE = 0.1  # [m] of the base during a flight, above which the flight is a jump
 CONTACT = 1.0  # [N] paw force above which a paw touches
 MOST = 7  # largest number of moments in a picture
@@ -56,6 +58,11 @@ class Composition:
         return self.base[self.frames] + self.shift[:, None] * self.right
 
     @property
+    def stays(self) -> bool:
+        """Whether the robot stays in place: the picture's horizontal axis is time, in the order of the moments."""
+        return bool(self.shift.any())
+
+    @property
     def heights(self) -> np.ndarray:
         """Commanded base heights of the recorded jump [m], (n,), at most one."""
         heights = self.recording.heights[self.rank : self.rank + 1]
@@ -80,21 +87,23 @@ class Composition:
     def span(self) -> tuple[float, float]:
         """Return the least and the largest coordinate of the picture's content along `right` [m]."""
         along = corners(self.bases) @ self.right
-        return float(along.min()) - 0.15, float(along.max()) + 0.15
+        label = 0.75 if self.stays and len(self.heights) else 0.0  # right of the last robot
+        return float(along.min()) - 0.15, float(along.max()) + 0.15 + label
 
-    def point(self, along: float, height: float) -> np.ndarray:
+    def point(self, along: float, height: float, in_front: float = 0.0) -> np.ndarray:
         """Return a point of the picture's vertical plane [m], (3,), world frame, from its two coordinates.
 
-        along: distance to the right of the plane's origin [m]; height: above the ground [m]."""
-        depth = self.base[0] @ self.toward_eye
+        along: distance to the right of the plane's origin [m]; height: above the ground [m]; in_front: of it [m].
+        """
+        depth = self.base[0] @ self.toward_eye + in_front
         return along * self.right + depth * self.toward_eye + [0.0, 0.0, height]
 
 
 def compose(recording: Recording, rank: int = 0) -> Composition:
     """Choose the times of a recording at which a composite picture shows the robot of the rank-th world.
 
-    The moments of a robot that moves by less than STAYS are drawn spread to the right. Frames after `valid_frames` are
-    ignored. Raises InputError: no frame remains.
+    The moments of a robot that moves by less than STAYS, or DRIFT a hop, are drawn spread to the right. Frames after
+    `valid_frames` are ignored. Raises InputError: no frame remains.
     """
     count = valid_frames(recording, rank)
     if count == 0:
@@ -104,15 +113,15 @@ def compose(recording: Recording, rank: int = 0) -> Composition:
     base = recording.body_poses(rank)[:, 0, :3].astype(float)
     displacement = base[-1, :2] - base[0, :2]
     distance = float(np.linalg.norm(displacement))
-    stays = distance < STAYS
-    right = np.array([1.0, 0.0, 0.0]) if distance < DRIFT else np.append(displacement / distance, 0.0)
     flights = _flights(recording, rank)
+    stays = distance < max(STAYS, DRIFT * len(flights))
+    right = np.array([1.0, 0.0, 0.0]) if distance < DRIFT else np.append(displacement / distance, 0.0)
     if not stays and flights:
         frames = _distinct(base @ np.stack([right, [0.0, 0.0, 1.0]], axis=1), flights)
     elif not stays:
         frames = _evenly_moved(base[:, None], int(np.clip(distance / SIDE_BY_SIDE + 1.0, 2.0, MOST)))
     elif flights:
-        frames = _events(base[:, 2], *flights[0])
+        frames = _events(base[:, 2], flights)
     else:
         frames = _evenly_moved(recording.body_poses(rank), 6)
     frames = np.unique(frames)
@@ -129,9 +138,16 @@ def _flights(recording: Recording, rank: int) -> list[tuple[int, int]]:
     return [(first, last) for first, last in runs if height[first : last + 1].max() - height[first] > RISE]
 
 
-def _events(height: np.ndarray, takeoff: int, touchdown: int) -> np.ndarray:
-    """Return the frames that show a jump in place: squat, takeoff, rise, apex, fall, touchdown, rest."""
-    apex = takeoff + int(np.argmax(height[takeoff : touchdown + 1]))
+def _events(height: np.ndarray, flights: list[tuple[int, int]]) -> np.ndarray:
+    """Return the frames that show a jump in place: squat, takeoff, rise, apex, fall, touchdown, rest.
+
+    Of several jumps: takeoff, apex and touchdown of the first two, and the squat between them.
+    """
+    apexes = [first + int(np.argmax(height[first : last + 1])) for first, last in flights]
+    (takeoff, touchdown), apex = flights[0], apexes[0]
+    if len(flights) > 1:
+        squat = touchdown + int(np.argmin(height[touchdown : flights[1][0] + 1]))
+        return np.array([takeoff, apex, touchdown, squat, flights[1][0], apexes[1], flights[1][1]])
     squat = int(np.argmin(height[: takeoff + 1]))
     return np.array([squat, takeoff, (takeoff + apex) // 2, apex, (apex + touchdown) // 2, touchdown, len(height) - 1])
 
@@ -164,21 +180,21 @@ def _evenly_moved(poses: np.ndarray, count: int) -> np.ndarray:
 
 
 def write_picture(
-    recording: Recording, path: Path, *, rank: int = 0, width: int = WIDTH, angle: float = 0.0, title: str | None = None
-) -> Path:
+    recording: Recording, path: Path, *, rank: int = 0, width: int = WIDTH, eye: Sequence[float] | None = None,
+    title: str | None = None,
+) -> Path:  # fmt: skip
     """Write a composite picture (.png, .webp or .jpg) of one world of a recording; return its path.
 
-    rank: index in `recording.worlds`. width: of the picture [px]; its height depends on the motion. angle [deg]: of
-    the camera about z, from the right of the path towards its end. title: default: task and name of the world.
-    Raises InputError: another suffix or width; OSError.
+    rank: index in `recording.worlds`. width: of the picture [px]; its height depends on the motion. eye: direction of
+    the camera from the robot, world frame, of any length (default: from the right of the path). title: default: task
+    and name of the world. Raises InputError: another suffix or width, or a vertical view; OSError.
     """
     path = Path(path)
     if path.suffix not in FORMATS or not 200 <= width <= 8000:
         raise InputError(f"{path}: a picture needs suffix {', '.join(FORMATS)} and width 200 to 8000 px, got {width}")
     scene = compose(recording, rank)
-    turn = np.arctan2(scene.toward_eye[1], scene.toward_eye[0]) + np.radians(angle)
-    points = _extent(scene)
-    view, size = _framed(points, np.array([np.cos(turn), np.sin(turn), ELEVATION]), width)
+    direction = scene.toward_eye + [0.0, 0.0, ELEVATION] if eye is None else np.array(eye, dtype=float)
+    view, size = _framed(_extent(scene), direction, width)
     poses = recording.body_poses(rank)[scene.frames].astype(float)
     poses[..., :3] += scene.shift[:, None, None] * scene.right
     with (
@@ -221,10 +237,10 @@ def _extent(scene: Composition) -> np.ndarray:
     heights = [*scene.heights, *([ground] if scene.grounded else [])]
     scale = low - max(0.25, 0.08 * (high - low))  # the numbers of the scale are left of `low`
     frame = [scene.point(along, height) for along in (scale, high) for height in heights]
-    goals = (
-        scene.recording.goals[scene.rank] if len(scene.recording.goals) and not scene.shift.any() else np.zeros((0, 3))
-    )
+    goals = scene.recording.goals[scene.rank] if len(scene.recording.goals) and not scene.stays else np.zeros((0, 3))
     boxes = corners(scene.bases, ground)
+    if scene.stays:
+        goals = np.array([scene.point(along, ground - 0.1, IN_FRONT) for along in (low, high)])  # labels of the axis
     return np.concatenate(
         [boxes, boxes + [0.0, 0.0, 0.2], np.reshape(frame, (-1, 3)), goals[np.isfinite(goals).all(axis=1)]]
     )
@@ -245,19 +261,23 @@ def _shapes(scene: Composition) -> list[ShapeMesh]:
     """Return the shapes to draw: robot, ground, and rings at the goals if the robot is at its true position."""
     own = {body: i for i, body in enumerate(scene.recording.body_indices(scene.rank))} | {-1: -1}
     shapes = [replace(shape, body=own[shape.body]) for shape in scene.recording.shapes if shape.body in own]
-    if scene.shift.any():
+    if scene.stays:
         return shapes
     moved = replace(scene.recording, spacing=0.0, heights=np.zeros(0))
     return shapes + [shape for shape in goal_shapes(moved) if shape.name.startswith(f"goal_{scene.rank}_")]
 
 
 def _lines(scene: Composition) -> list[Line]:
-    """Return the lines to draw: path of the base, bars at commanded heights, scales of height and ground distance."""
+    """Return the lines to draw: path of the base or time axis, bars at commanded heights, scale of height."""
     low, high = scene.span()
     first, last = scene.frames[0], scene.frames[-1]
-    frames = np.arange(first, last + 1)
-    shift = np.interp(frames, scene.frames, scene.shift)
-    lines = [Line(scene.base[frames] + shift[:, None] * scene.right, BASE_COLOR)]
+    if scene.stays:
+        axis = [[(low, 0.0), (high, 0.0)], [(high - 0.1, 0.03), (high, 0.0), (high - 0.1, -0.03)]]
+        axis += [[(along, 0.03), (along, 0.0)] for along in scene.bases @ scene.right]
+        paths = [np.stack([scene.point(x, scene.lowest + z, IN_FRONT) for x, z in path]) for path in axis]
+        lines = [Line(path, BASE_COLOR) for path in paths]
+    else:
+        lines = [Line(scene.base[first : last + 1], BASE_COLOR)]
     lines += [Line(np.stack([scene.point(low, z), scene.point(high, z)]), GOAL_COLOR) for z in scene.heights]
     ticks = _ticks(scene)
     if len(ticks):
@@ -278,14 +298,22 @@ def _ticks(scene: Composition) -> np.ndarray:
 
 
 def _labels(scene: Composition) -> list[Label]:
-    """Return the labels: time (and base height of a jump) above each drawn robot, numbers of scale and bars."""
+    """Return the labels: time (and base height of a jump) of each drawn robot, numbers of scale and bars.
+
+    Times are above the robots, or on the time axis of a robot that stays in place.
+    """
     low, high = scene.span()
     jumps, labels = bool(scene.flights), []
     for frame, base, opacity in zip(scene.frames, scene.bases, _opacity(scene), strict=True):
         if opacity < 1.0:
             continue
-        text = f"{scene.recording.times[frame]:.2f} s" + (f"\n{base[2]:.2f} m" if jumps else "")
-        labels.append(Label(text, base + [0.0, 0.0, 0.4 if len(scene.recording.commands) else 0.2]))
+        time, height = f"{scene.recording.times[frame]:.2f} s", [f"{base[2]:.2f} m"] if jumps else []
+        above = height if scene.stays else [time, *height]
+        labels.append(Label("\n".join(above), base + [0.0, 0.0, 0.4 if len(scene.recording.commands) else 0.2]))
+        if scene.stays:
+            labels.append(Label(time, scene.point(base @ scene.right, scene.lowest - 0.03, IN_FRONT), "ma"))
+    if scene.stays:
+        labels.append(Label("time", scene.point(low - 0.06, scene.lowest, IN_FRONT), "rm"))
     labels += [Label(f"{z:g} m", scene.point(low - 0.06, z), "rm") for z in _ticks(scene)]
     labels += [Label(f"commanded {z:.2f} m", scene.point(high, z + 0.01), "rd") for z in scene.heights]
     return labels

@@ -43,14 +43,17 @@ class RobotView:
     touchdown_speed: wp.vec4  # [m/s] downward speed of the paw in the policy step before its last touchdown
     paw_force: wp.vec4  # [N] on each paw, last physics step
     peak_force: wp.vec4  # [N] on each paw, largest of the policy step
-    paw_pos: mat43  # [m] centres, world
-    paw_vel: mat43  # [m/s] centres, world
+    paw_pos: mat43  # [m] centre of each paw in a row, world
+    paw_vel: mat43  # [m/s] centre of each paw in a row, world
     paw_height: wp.vec4  # [m] of each paw above the ground below it; 0 before the first step
 
 
 @wp.struct
 class RobotArrays:
-    """State of all robots; the `prev_` arrays hold the values of the previous policy step."""
+    """State of all robots, in Python `env.robot`; the `prev_` arrays hold the values of the previous policy step.
+
+    NumPy appends an axis for vectors: `env.robot.paw_pos.numpy()` has shape (4, num_worlds, 3), a `RobotView` (4, 3).
+    """
 
     joint_q: wp.array(dtype=float)  # (COORDS num_worlds,) base position [m], quaternion (xyzw), joint angles [rad]
     joint_qd: wp.array(dtype=float)  # (DOFS num_worlds,) base com [m/s], angular velocity, joints [rad/s]; world axes

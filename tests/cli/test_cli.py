@@ -1,6 +1,8 @@
 import dataclasses
 import json
 import os
+import re
+import shutil
 import subprocess
 import sys
 import tomllib
@@ -24,6 +26,7 @@ from jumper_warp.evaluation.landings import LandingFlags, LandingPlayFlags
 from jumper_warp.policies.folder import load_policy, save_policy
 from jumper_warp.policies.restore import restored_task
 from jumper_warp.policies.runs import open_policy
+from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import TASKS, WALKING, make_task
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.checkpoint import CheckpointError
@@ -385,6 +388,25 @@ def test_exported_policy_equals_the_policy_of_the_run(trained_run):
     assert restored_task(policy.config).curriculum.numbers["promote_after"] == 2
     assert policy.config["train"]["num_envs"] == 16 and policy.config["iteration"] == 2
     assert (trained_run / "policy" / "learning_curve.jsonl").read_text().count("\n") >= 1
+
+
+def test_log_folder_of_a_task_stands_for_its_newest_run(trained_run, tmp_path, capsys):
+    old, new = tmp_path / "logs" / "jump" / "2026-01-01", tmp_path / "logs" / "jump" / "2026-01-02"
+    for folder in (old, new):
+        shutil.copytree(trained_run / "checkpoints", folder / "checkpoints")
+    (tmp_path / "logs" / "jump" / "2026-01-03" / "checkpoints").mkdir(parents=True)  # a run without a checkpoint
+    code, out, err = run(capsys, "export", str(new.parent))
+    assert (code, out, err) == (0, f"{new / 'policy'}\n", [f"{new}: best checkpoint, iteration 2"])
+    assert open_policy(old.parent).interface == load_policy(new / "policy").interface
+    code, _, err = run(capsys, "evaluate", str(new.parent), "--save-to-policy", "--device", "cpu")
+    assert code == 2 and err[-1].endswith(f"{new}: a run keeps no metrics; export it first")
+
+
+@pytest.mark.parametrize("folder", [".", ".."])
+def test_loading_a_run_as_a_policy_names_the_export_command(trained_run, folder):
+    folder = trained_run / folder
+    with pytest.raises(PolicyError, match=f"a run's folder, not a policy's: .*jumper export {re.escape(str(folder))}$"):
+        load_policy(folder)
 
 
 def test_evaluate_writes_metrics_and_saves_them_to_the_policy(trained_run, tmp_path, capsys):

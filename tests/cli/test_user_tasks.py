@@ -172,7 +172,7 @@ def test_training_saves_functions_by_module_and_name(runs):
 def test_export_does_not_need_the_module(capsys, runs, tmp_path):
     code, _, err = run(capsys, "export", str(runs["low-jump"]), "--out", str(tmp_path / "policy"))
     policy = load_policy(tmp_path / "policy")
-    assert (code, err) == (0, [f"best checkpoint: iteration {policy.config['iteration']}"])
+    assert (code, err) == (0, [f"{runs['low-jump']}: best checkpoint, iteration {policy.config['iteration']}"])
     assert "my_jumps" not in sys.modules
     assert policy.interface.task == "low-jump" and policy.interface == open_policy(runs["low-jump"]).interface
     assert run(capsys, "export", str(tmp_path / "policy"), "--out", str(tmp_path / "low.onnx"))[::2] == (0, [])
@@ -276,7 +276,8 @@ def test_refuses_run_of_an_older_version(capsys, tmp_path, task, command):
     [
         ("import warp as wp\n", "import warp as wp\nimport not_there\n", "own_faults.py:7: ModuleNotFoundError"),
         ("weight=2.0, ", "", "own_faults.py:{line}: TypeError: RewardTerm.__init__() missing"),
-        ("tilt(robot)", "tilt(robot.quad)", "own_faults.py, function level: `quad` is not an attribute of 'robot'"),
+        ("tilt(robot)", "tilt(robot.quad)", "function level: RobotView has no field 'quad'; did you mean 'quat'?"),
+        ("tilt(robot)", "tlt(robot)", "own_faults.py:{use}, function level: "),
     ],
 )
 def test_error_in_a_users_file_prints_one_line(right, wrong, message, tmp_path, monkeypatch, capsys):
@@ -284,7 +285,10 @@ def test_error_in_a_users_file_prints_one_line(right, wrong, message, tmp_path, 
     assert right in text
     path = tmp_path / "own_faults.py"
     path.write_text(text.replace(right, wrong, 1))
-    line = next(i for i, row in enumerate(text.splitlines(), 1) if "RewardTerm(level" in row)
+    rows = text.splitlines()
+    line, use = (
+        next(i for i, row in enumerate(rows, 1) if part in row) for part in ("RewardTerm(level", "tilt(robot)")
+    )
     monkeypatch.delitem(sys.modules, "own_faults", raising=False)
     before = dict(TASKS)
     args = [*"--device cpu --num-envs 4 --max-iterations 1".split(), "--log-root", str(tmp_path)]
@@ -295,4 +299,4 @@ def test_error_in_a_users_file_prints_one_line(right, wrong, message, tmp_path, 
         TASKS.update(before)
         sys.modules.pop("own_faults", None)
     lines = [row for row in err if row.startswith("jumper:")]
-    assert code == 2 and len(lines) == 1 and message.format(line=line) in lines[0]
+    assert code == 2 and len(lines) == 1 and message.format(line=line, use=use) in lines[0]

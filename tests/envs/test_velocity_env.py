@@ -133,6 +133,13 @@ def test_metrics_are_ratios_of_sums_over_worlds(flat):
     assert again["Metrics/error_vel_xy_settled_m_s"] == 0.0 and again["Curriculum/command_level"] == 3.5
 
 
+@pytest.mark.parametrize(
+    ("name", "key"), [("speed_m_s", "Metrics/speed_m_s"), ("Curriculum/level", "Curriculum/level")]
+)
+def test_metric_without_a_group_is_logged_in_the_group_metrics(name, key):
+    assert StateMetric(name, "score").name == key
+
+
 def test_refuses_a_metric_of_an_unknown_field():
     with pytest.raises(InputError, match="metric Metrics/x needs a field 'speed' of the state"):
         dataclasses.replace(make_task("velocity-flat"), metrics=(StateMetric("Metrics/x", "speed"),))

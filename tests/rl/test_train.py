@@ -61,9 +61,10 @@ def test_logged_iterations_are_printed(cfg, capsys):
     fps, total = f"{metrics['Perf/total_fps']:,.0f}", f"{metrics['Train/mean_reward']:.2f}"
     success = f"{100.0 * metrics['Metrics/success']:.1f}"
     assert stderr[0] == f"run {result.folder}"
-    assert stderr[1].startswith("iteration 2/4: ") and stderr[1].endswith(" s left")
-    assert stderr[2] == f"iteration 4/4: {fps} steps/s, reward {total}, success {success} %, 0 s left"
-    assert stderr[3:] == [f"saved {result.folder / CHECKPOINTS / 'iteration_000004.pt'}"]
+    assert stderr[1].startswith("iteration 2/4, 0.00 M steps: ") and stderr[1].endswith(" s left")
+    assert stderr[2] == f"iteration 4/4, 0.00 M steps: {fps} steps/s, reward {total}, success {success} %, 0 s left"
+    saved = f"saved {result.folder / CHECKPOINTS / 'iteration_000004.pt'}"
+    assert stderr[3:] == ["ended by --max-iterations 4", saved]
 
 
 def resume_after(cfg, seconds, limit):
@@ -160,7 +161,8 @@ def test_signal_finishes_the_iteration_saves_and_prints_the_resume_command(cfg, 
     assert signal.getsignal(number) is before
     (path,) = cfg.log_root.glob("push/*/checkpoints/iteration_000003.pt")
     assert load_checkpoint(path)["env"]["steps"] == 48
-    last = capsys.readouterr().err.splitlines()[-1]
+    *_, cause, last = capsys.readouterr().err.splitlines()
+    assert cause == "ended by an interruption"
     assert last == f"saved {path}, continue with: jumper train push --resume {path.parent.parent}"
 
 

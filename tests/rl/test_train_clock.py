@@ -37,11 +37,12 @@ def train_clocked(monkeypatch, cfg, durations, **arguments):
     return train(cfg, lambda *_: env, **arguments)
 
 
-def test_time_limit_counts_from_the_end_of_the_first_iteration(cfg, monkeypatch):
+def test_time_limit_counts_from_the_end_of_the_first_iteration(cfg, monkeypatch, capsys):
     limited = dataclasses.replace(cfg, max_seconds=60.0)
     result = train_clocked(monkeypatch, limited, [500.0] + [1.0] * 79)  # 5 iterations of 16 steps; the first compiles
     assert (result.iteration, result.seconds) == (5, 515.0 + 4 * 16.0)
     assert (result.metrics["Perf/elapsed_s"], final_state(result)["seconds"]) == (64.0, 64.0)
+    assert capsys.readouterr().err.splitlines()[-2] == "ended by --max-seconds 60"
     longer = dataclasses.replace(limited, max_seconds=80.0, resume=str(result.folder))
     resumed = train_clocked(monkeypatch, longer, [700.0] + [1.0] * 31)  # one warm-up iteration, and one of 16 s
     assert (resumed.iteration, final_state(resumed)["seconds"]) == (7, 80.0)
@@ -55,5 +56,18 @@ def test_remaining_time_follows_iteration_time_and_time_limit(cfg, monkeypatch, 
     limited = dataclasses.replace(cfg, max_iterations=103, max_seconds=limit, log_interval=3)
     with pytest.raises(IndexError):  # after three iterations no durations are left
         train_clocked(monkeypatch, limited, [9000.0, *[seconds] * 3 * 16])
-    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("iteration 3/103: ")]
+    (line,) = [line for line in capsys.readouterr().err.splitlines() if line.startswith("iteration 3/103")]
     assert line.endswith(f", {left} left")
+
+
+@pytest.mark.parametrize(
+    ("threads", "rate", "advice"),
+    [("4", 65.0, ["close programs that use the cores, or set OMP_NUM_THREADS=1"]),
+     ("1", 65.0, ["close programs that use the cores"]), ("4", 63.0, [])],
+)  # fmt: skip
+def test_less_than_half_of_the_expected_step_rate_is_reported_once(cfg, monkeypatch, capsys, threads, rate, advice):
+    monkeypatch.setenv("OMP_NUM_THREADS", threads)
+    seconds = [9000.0, *[1.0] * (6 * 16 - 1)]  # 32 steps of all worlds per second after the first
+    train_clocked(monkeypatch, dataclasses.replace(cfg, max_iterations=6), seconds, expected_rate=rate)
+    slow = [line for line in capsys.readouterr().err.splitlines() if line.startswith("slow")]
+    assert slow == [f"slow, 32 steps/s: about {rate:.0f} are usual on these threads; {words}" for words in advice]

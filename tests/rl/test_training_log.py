@@ -12,7 +12,7 @@ from jumper_warp.rl.runner import CHECKPOINTS, train
 from jumper_warp.utils.progress import format_duration
 from toy_task import PushTask, push_cfg
 
-METRICS = {"Perf/total_fps": 1234.0, "Metrics/success": 0.5}  # steps per second, fraction
+METRICS = {"Perf/total_fps": 1234.0, "Perf/elapsed_s": 5.0, "Metrics/success": 0.5}  # steps per second, time, fraction
 
 
 @pytest.fixture
@@ -92,7 +92,7 @@ def test_temporarily_full_disk_loses_no_metrics_and_warns_once(cfg, capsys, tens
 
 def test_metric_that_is_not_finite_is_logged_as_null(tmp_path):
     terms = {"Episode_Reward/tilt": float("nan"), "hop/Episode_Reward/fall": float("inf")}
-    with TrainingLog(tmp_path, {}, 10, tensorboard=False) as log:
+    with TrainingLog(tmp_path, {}, 10, 50_000, tensorboard=False) as log:
         log.log(1, METRICS | {"Episode_Reward/tilt": 0.5}, remaining=5.0)
         for iteration in (2, 3):
             log.log(iteration, METRICS | terms | {"Loss/value": 1.0}, remaining=5.0)
@@ -105,6 +105,23 @@ def test_metric_that_is_not_finite_is_logged_as_null(tmp_path):
     assert saved[1]["Episode_Reward/tilt"] is None and saved[1]["Loss/value"] == 1.0
 
 
+def test_line_shows_steps_mean_curriculum_level_and_time_left(tmp_path, capsys):
+    levels = {f"Curriculum/fraction_at_level_{i}": part for i, part in enumerate((0.2, 0.6, 0.2))}
+    with TrainingLog(tmp_path, {}, 10, 50_000, tensorboard=False) as log:
+        log.log(3, METRICS | levels, remaining=240.0)
+    line = "iteration 3/10, 0.15 M steps: 1,234 steps/s, success 50.0 %, mean level 1.0 of 2, 4 min left"
+    assert capsys.readouterr().err.splitlines() == [line]
+
+
+@pytest.mark.parametrize("columns", ["60", "150"])
+def test_terminal_shows_the_estimated_time_left(tmp_path, capsys, monkeypatch, columns):
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    monkeypatch.setenv("COLUMNS", columns)
+    with TrainingLog(tmp_path, {}, 1000, 50_000, tensorboard=False) as log:
+        log.log(3, METRICS, remaining=240.0)
+    assert "4 min left" in capsys.readouterr().err
+
+
 def test_broken_pipe_does_not_stop_logging(tmp_path, monkeypatch):
     class BrokenPipe:
         def write(self, _):
@@ -112,7 +129,7 @@ def test_broken_pipe_does_not_stop_logging(tmp_path, monkeypatch):
 
         flush = fileno = isatty = lambda self: 0
 
-    with TrainingLog(tmp_path, {}, 10, tensorboard=False) as log:
+    with TrainingLog(tmp_path, {}, 10, 50_000, tensorboard=False) as log:
         log._console.file = BrokenPipe()
         for iteration in (1, 2):
             log.log(iteration, METRICS, remaining=5.0)

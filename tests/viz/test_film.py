@@ -213,8 +213,10 @@ def test_bad_arguments_are_refused_in_one_line_before_anything_is_drawn(tmp_path
 
 
 @pytest.mark.parametrize(
-    "options", [{"video": Path("walk.avi")}, {"size": (32, 32)}, {"speed": -1.0}, {"eye": (0.0, 0.0, 2.0)}]
-)
+    "options",
+    [{"video": Path("walk.avi")}, {"size": (32, 32)}, {"speed": -1.0}, {"eye": (0.0, 0.0, 2.0)},
+     {"video": None, "eye": (0.0, 0.0, 2.0)}],
+)  # fmt: skip
 def test_flags_of_a_film_are_checked_before_the_simulation(options):
     with pytest.raises(InputError):
         FilmCfg(**{"video": Path("walk.webp"), **options})

@@ -84,6 +84,22 @@ def test_each_of_two_jumps_in_a_row_has_its_apex():
     assert {APEX, second + APEX} <= set(scene.frames)
 
 
+@pytest.mark.parametrize("drift", [0.0, 0.1])  # [m] a hop
+def test_hops_in_place_show_the_first_two_over_time_without_their_path(drift):
+    positions, forces = jump(drift)
+    hops = np.concatenate([positions + [drift * i, 0.0, 0.0] for i in range(8)])
+    scene = compose(box_recording(hops, forces=np.tile(forces, 8)))
+    second = REST + 1
+    assert set(scene.frames) >= {TAKEOFF, APEX, TOUCHDOWN, *(second + TAKEOFF, second + APEX, second + TOUCHDOWN)}
+    assert len(scene.frames) == MOST and scene.frames[-1] == second + TOUCHDOWN
+    assert np.diff(scene.bases @ scene.right).min() >= SPREAD - 1e-6  # [m]
+    axis, *_ = (line.points for line in picture._lines(scene))
+    assert np.ptp(axis @ scene.right) > 6 * SPREAD and axis[:, 2] == pytest.approx(scene.lowest)
+    times = [label for label in picture._labels(scene) if label.text.endswith(" s")]
+    assert [label.text for label in times] == [f"{time:.2f} s" for time in scene.frames / RATE]
+    assert all(label.point[2] < scene.lowest for label in times)
+
+
 def test_lifted_paws_without_rise_are_no_jump():
     forces = np.full(61, 100.0)
     forces[10:20] = 0.0  # a trot with a flight phase
@@ -219,12 +235,12 @@ def test_bad_suffix_and_width_are_refused_before_drawing(tmp_path, monkeypatch, 
     assert not list(tmp_path.iterdir())
 
 
-@pytest.mark.parametrize(("angle", "toward"), [(0.0, (0.0, -1.0)), (90.0, (1.0, 0.0))])
-def test_eye_stands_on_the_right_of_the_path_and_turns_to_its_end(tmp_path, monkeypatch, angle, toward):
+@pytest.mark.parametrize(("eye", "toward"), [(None, (0.0, -1.0)), ((4.0, 3.0, 1.0), (0.8, 0.6))])
+def test_eye_is_on_the_right_of_the_path_or_in_a_direction(tmp_path, monkeypatch, eye, toward):
     views = []
     framed = picture._framed
     monkeypatch.setattr(picture, "_framed", lambda *args: views.append(framed(*args)) or views[-1])
-    write_picture(jump_recording(1.5), tmp_path / "jump.png", width=WIDTH, angle=angle)
+    write_picture(jump_recording(1.5), tmp_path / "jump.png", width=WIDTH, eye=eye)
     ((view, _),) = views
     aside = (view.eye - view.target)[:2]
     assert aside / np.linalg.norm(aside) == pytest.approx(toward, abs=1e-6)
