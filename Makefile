@@ -33,7 +33,7 @@ clients: ## test the use with TorchRL, skrl, OpenVINO and W&B, installed in .ven
 	$(CLIENTS)/bin/python -m pytest tests/clients tests/documents
 
 clean: ## delete environments and built documentation
-	rm -rf $(VENV) $(CLIENTS) docs/_build docs/_generated docs/reference/api docs/results/policies
+	rm -rf $(VENV) $(CLIENTS) docs/_build docs/_generated docs/reference/api docs/reference/mdp docs/results/policies
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

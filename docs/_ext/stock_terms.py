@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Callable
+from functools import partial
 from types import ModuleType
 from typing import Any
 
@@ -17,7 +18,8 @@ SPACES: dict[str, ModuleType] = {
     name: getattr(mdp, name) for name in ("rewards", "terminations", "observations", "events")
 }
 """Namespaces of stock terms."""
-TASK_KINDS = ("attitude", "jump", "velocity")
+TASK_KINDS = {"jump": "jumps", "velocity": "walks", "attitude": "turns"}
+"""Words for the skills, by the packages of `jumper_warp.kernels` with their terms."""
 EMPTY = inspect.Signature.empty
 
 
@@ -53,14 +55,12 @@ def helpers(space: str) -> dict[str, Any]:
     return {f"{mdp.__name__}.{space}.{name}": func for name, func in others.items()}
 
 
-def task_terms(space: str) -> dict[str, Any]:
-    """Return the terms that only some of the project's tasks can use, by full name."""
-    terms = {}
-    for kind in TASK_KINDS if space != "events" else ():
-        module = importlib.import_module(f"jumper_warp.kernels.{kind}.{space}")
-        found = functions_of(module, lambda func: is_term(space, func))
-        terms |= {f"{module.__name__}.{name}": func for name, func in found.items()}
-    return terms
+def task_terms(space: str, kind: str) -> dict[str, Any]:
+    """Return the terms of a namespace that only the project's tasks of one kind can use, by full name."""
+    if space == "events":
+        return {}
+    module = importlib.import_module(f"jumper_warp.kernels.{kind}.{space}")
+    return {f"{module.__name__}.{name}": func for name, func in functions_of(module, partial(is_term, space)).items()}
 
 
 def tasks_by_function() -> dict[Any, list[str]]:
