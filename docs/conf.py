@@ -42,6 +42,7 @@ repository_pages = {
 
 extensions = [
     "myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton", "sphinx_design", "api_pages", "mathml", "repository",
+    "units",
 ]  # fmt: skip
 exclude_patterns = ["_build", "_generated", "_ext"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
@@ -79,9 +80,9 @@ def write_pages() -> None:
     from cli_page import cli_page
     from mdp_page import mdp_pages
 
-    terms = mdp_pages()
-    texts = {"_generated/mdp.md": terms.pop("mdp.md"), "_generated/cli.md": cli_page(), "_generated/api.md": api_table()}
-    texts |= {f"reference/mdp/{name}": text for name, text in terms.items()}
+    texts = {"_generated/cli.md": cli_page(), "_generated/api.md": api_table()}
+    for name, text in mdp_pages().items():
+        texts[f"_generated/{name}" if name == "mdp.md" else f"reference/mdp/{name}"] = text
     texts |= {f"reference/api/{name}": text for name, text in api_pages().items()}
     for name, file in POLICY_PAGES.items():
         source = Path("../../..") / file.relative_to(ROOT)

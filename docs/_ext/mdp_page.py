@@ -20,7 +20,7 @@ from jumper_warp.kernels.kinematics.geometry import LegGeometry
 from jumper_warp.kernels.terrain.ground import Block
 from jumper_warp.tasks.terms import REQUIRED, Term
 from plain_text import to_markdown
-from stock_terms import SPACES, TASK_KINDS, helpers, stock_terms, task_terms, tasks_by_function
+from stock_terms import SPACES, TASK_KINDS, helpers, stock_terms, task_terms, tasks_by_function, words_for_tasks
 
 MDP = mdp.__name__
 STRUCT = type(mdp.RobotView)  # type of what @wp.struct returns
@@ -60,8 +60,8 @@ PAGES = {
     )),
     "observations": Page("Observations", "An observation term returns a number or a vector: a part of the network's "
                          "input.", (Section("Classes", ("ObservationTerm", "ObservationsCfg")),)),
-    "rewards": Page("Rewards", "A reward term returns a number; in each policy step it pays weight × number × 1/60 s.",
-                    (Section("Classes", ("RewardTerm",)),)),
+    "rewards": Page("Rewards", "A reward term returns a number. Each policy step adds weight × number × 1/60 s to the "
+                    "reward.", (Section("Classes", ("RewardTerm",)),)),
     "terminations": Page("Terminations", "A termination term returns whether the episode ends.",
                          (Section("Classes", ("TerminationTerm",)),)),
     "commands": Page("Commands and resets", "A command is the goal of a robot; a reset writes the first state of an "
@@ -85,16 +85,16 @@ def mdp_pages() -> dict[str, str]:
     inner = {struct.key: (f"{struct.cls.__module__}.{struct.key}", struct) for struct in INNER_STRUCTS}
     used, pages, rows = tasks_by_function(), {}, []
     for key, page in PAGES.items():
-        parts, names = [f"# {page.title}", page.about], []
+        parts, link = [f"# {page.title}", page.about], f"[{page.title}](../reference/mdp/{key}.md)"
         sections = [(title, [inner.get(name) or (f"{MDP}.{name}", getattr(mdp, name)) for name in members])
                     for title, members in page.sections]  # fmt: skip
         for title, things in (*sections, *(term_sections(key) if key in SPACES else ())):
             parts += [f"## {title}", *(described_thing(name, thing, used.get(thing)) for name, thing in things)]
-            names += [f"{{py:obj}}`~{name}`" for name, _ in things]
+            rows.append((link, title, ", ".join(f"{{py:obj}}`~{name}`" for name, _ in things)))
+            link = ""
         pages[f"{key}.md"] = "\n\n".join(parts) + "\n"
-        rows.append((f"[{page.title}](../reference/mdp/{key}.md)", ", ".join(names)))
     contents = "\n".join(["```{toctree}", ":hidden:", *(f"mdp/{key}" for key in PAGES), "```"])
-    return pages | {"mdp.md": f"{table(('Page', 'Names'), rows)}\n\n{contents}\n"}
+    return pages | {"mdp.md": f"{table(('Page', 'Section', 'Names'), rows)}\n\n{contents}\n"}
 
 
 def term_sections(space: str) -> list[tuple[str, list[tuple[str, Any]]]]:
@@ -148,7 +148,7 @@ def function_entry(name: str, func: Any, tasks: Sequence[str] | None = None) -> 
     returns = f" -> {plain_type(tree.returns)}" if tree.returns else ""
     for arg in tree.args.args:
         arg.annotation = ast.Name(plain_type(arg.annotation)) if arg.annotation else None
-    names = f"Used by {', '.join(f'`{task}`' for task in tasks)}." if tasks else ""
+    names = f"Used by {words_for_tasks(tasks)}." if tasks else ""
     about = to_markdown(inspect.getdoc(func.func) or "")
     return described("function", name, f"({ast.unparse(tree.args)}){returns}", about, names)
 

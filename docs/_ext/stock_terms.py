@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from types import ModuleType
 from typing import Any
@@ -61,6 +61,20 @@ def task_terms(space: str, kind: str) -> dict[str, Any]:
         return {}
     module = importlib.import_module(f"jumper_warp.kernels.{kind}.{space}")
     return {f"{module.__name__}.{name}": func for name, func in functions_of(module, partial(is_term, space)).items()}
+
+
+def words_for_tasks(names: Sequence[str]) -> str:
+    """Return tasks in words: those of a kind that are complete as "all jumps"."""
+    kinds: dict[str, list[str]] = {}
+    for name in TASKS:
+        kinds.setdefault(make_task(name).state.cls.__module__.split(".")[2], []).append(name)
+    if set(names) == set(TASKS):
+        return "all tasks"
+    words = []
+    for kind, members in kinds.items():
+        used = [name for name in members if name in names]
+        words += [f"all {TASK_KINDS[kind]}"] if used == members != used[:1] else [f"`{name}`" for name in used]
+    return ", ".join(words)
 
 
 def tasks_by_function() -> dict[Any, list[str]]:

@@ -11,9 +11,11 @@ import cli_page
 import mdp_page
 import plain_text
 import stock_terms
+import units
 from jumper_warp import mdp
 from jumper_warp.cli.main import COMMANDS
 from jumper_warp.cli.train import SHORT_HELP
+from jumper_warp.registry import TASKS, make_task
 from repository import relocated
 
 ROOT = Path(__file__).parents[2]
@@ -33,9 +35,7 @@ def test_every_public_name_and_stock_term_is_described_once_and_linked(types_and
     spaces = set(stock_terms.SPACES)
     public = {f"jumper_warp.mdp.{name}" for name in mdp.__all__ if name not in spaces and name != "vec12"}
     stock = {name for space in spaces for name in stock_terms.stock_terms(space)}
-    own = {
-        name for space in spaces for kind in stock_terms.TASK_KINDS for name in stock_terms.task_terms(space, kind)
-    }
+    own = {name for space in spaces for kind in stock_terms.TASK_KINDS for name in stock_terms.task_terms(space, kind)}
     assert len(stock | own) > 80
     pages = "".join(text for name, text in types_and_terms.items() if name != "mdp.md")
     directives = re.findall(r"^`{4}\{py:\w+\} ([\w.]+)", pages, re.M)
@@ -68,6 +68,12 @@ def test_fields_and_terms_have_shapes_units_and_signatures(types_and_terms, row)
 def test_terms_name_the_tasks_that_use_them(types_and_terms):
     text = types_and_terms["rewards.md"].partition("jump.rewards.jump_height(")[2].partition("````")[0]
     assert "Used by `vertical-jump`" in text
+    walks = [name for name in TASKS if make_task(name).state is mdp.VelocityState]
+    assert stock_terms.words_for_tasks([*walks, "attitude"]) == "all walks, `attitude`"
+
+
+def test_numbers_stay_with_their_units():
+    assert units.joined("0.5 m/s, 3 % or 2 mountains") == "0.5\xa0m/s, 3\xa0% or 2 mountains"
 
 
 def test_every_command_has_a_section_with_its_common_flags_before_the_collapsed_ones(command_line):
