@@ -5,7 +5,7 @@ from __future__ import annotations
 import importlib
 import inspect
 from collections.abc import Callable, Sequence
-from functools import partial
+from functools import cache, partial
 from types import ModuleType
 from typing import Any
 
@@ -63,15 +63,21 @@ def task_terms(space: str, kind: str) -> dict[str, Any]:
     return {f"{module.__name__}.{name}": func for name, func in functions_of(module, partial(is_term, space)).items()}
 
 
-def words_for_tasks(names: Sequence[str]) -> str:
-    """Return tasks in words: those of a kind that are complete as "all jumps"."""
+@cache
+def tasks_by_kind() -> dict[str, list[str]]:
+    """Return the names of the project's tasks by a key of `TASK_KINDS`."""
     kinds: dict[str, list[str]] = {}
     for name in TASKS:
         kinds.setdefault(make_task(name).state.cls.__module__.split(".")[2], []).append(name)
+    return kinds
+
+
+def words_for_tasks(names: Sequence[str]) -> str:
+    """Return tasks in words: those of a kind that are complete as "all jumps"."""
     if set(names) == set(TASKS):
         return "all tasks"
     words = []
-    for kind, members in kinds.items():
+    for kind, members in tasks_by_kind().items():
         used = [name for name in members if name in names]
         words += [f"all {TASK_KINDS[kind]}"] if used == members != used[:1] else [f"`{name}`" for name in used]
     return ", ".join(words)
