@@ -1,4 +1,5 @@
-# `make` lists the targets. Each makes .venv/ first if it is missing or older than pyproject.toml or constraints.txt.
+# `make` lists the targets. Those that need .venv/ make it first if it is missing or older than pyproject.toml or
+# constraints.txt.
 
 PYTHON ?= python3
 VENV := .venv
@@ -6,7 +7,7 @@ CLIENTS := .venv-clients
 STAMP := $(VENV)/.installed
 
 .DEFAULT_GOAL := help
-.PHONY: help demo test docs lint clients clean
+.PHONY: help demo wheel test docs lint clients clean
 .DELETE_ON_ERROR:
 
 help: ## list the targets
@@ -14,6 +15,9 @@ help: ## list the targets
 
 demo: $(STAMP) ## simulate jumps; writes metrics, plots, pictures, a film and recordings to outputs/demo
 	$(VENV)/bin/python experiments/demo.py --out outputs/demo
+
+wheel: ## build dist/jumper_warp-VERSION-py3-none-any.whl
+	$(PYTHON) -m pip wheel --no-deps --wheel-dir dist .
 
 test: $(STAMP) ## run all tests, and check the import rules
 	$(VENV)/bin/lint-imports --no-logo
@@ -33,7 +37,7 @@ clients: ## test the use with TorchRL, skrl, OpenVINO and W&B, installed in .ven
 	$(CLIENTS)/bin/python -m pytest tests/clients tests/documents
 
 clean: ## delete environments and built documentation
-	rm -rf $(VENV) $(CLIENTS) docs/_build docs/_generated docs/reference/api docs/results/policies
+	rm -rf $(VENV) $(CLIENTS) docs/_build docs/_generated docs/reference/api docs/reference/mdp docs/results/policies
 
 $(STAMP): pyproject.toml constraints.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \

@@ -10,8 +10,8 @@ Links. A page links to any file of the repository by its relative path, as on a 
 A target that does not exist is a warning, and `make docs` stops at warnings. In an included file links are relative to
 that file.
 
-Generated. docs/_generated holds the references, docs/reference/api and docs/results/policies generated pages. The three
-folders are rewritten by each build and are not in git.
+Generated. docs/_generated holds texts that pages include; docs/reference/api, docs/reference/mdp and
+docs/results/policies hold generated pages. The four folders are rewritten by each build and are not in git.
 """
 
 from __future__ import annotations
@@ -42,6 +42,7 @@ repository_pages = {
 
 extensions = [
     "myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton", "sphinx_design", "api_pages", "mathml", "repository",
+    "units",
 ]  # fmt: skip
 exclude_patterns = ["_build", "_generated", "_ext"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
@@ -77,9 +78,11 @@ def write_pages() -> None:
     """Write the generated references and pages."""
     from api_pages import api_pages, api_table
     from cli_page import cli_page
-    from mdp_page import mdp_page
+    from mdp_page import mdp_pages
 
-    texts = {"_generated/mdp.md": mdp_page(), "_generated/cli.md": cli_page(), "_generated/api.md": api_table()}
+    texts = {"_generated/cli.md": cli_page(), "_generated/api.md": api_table()}
+    for name, text in mdp_pages().items():
+        texts[f"_generated/{name}" if name == "mdp.md" else f"reference/mdp/{name}"] = text
     texts |= {f"reference/api/{name}": text for name, text in api_pages().items()}
     for name, file in POLICY_PAGES.items():
         source = Path("../../..") / file.relative_to(ROOT)

@@ -1,4 +1,4 @@
-"""Page of the types and stock terms of `jumper_warp.mdp`, as MyST Markdown from docstrings and field comments."""
+"""Pages of the types and stock terms of `jumper_warp.mdp`, as MyST Markdown from docstrings and field comments."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from jumper_warp.kernels.kinematics.geometry import LegGeometry
 from jumper_warp.kernels.terrain.ground import Block
 from jumper_warp.tasks.terms import REQUIRED, Term
 from plain_text import to_markdown
-from stock_terms import SPACES, helpers, stock_terms, task_terms, tasks_by_function
+from stock_terms import SPACES, TASK_KINDS, helpers, stock_terms, task_terms, tasks_by_function, words_for_tasks
 
 MDP = mdp.__name__
 STRUCT = type(mdp.RobotView)  # type of what @wp.struct returns
@@ -30,62 +30,100 @@ UNIT = re.compile(r"(\[[^\]]+\](?:, \[[^\]]+\])*),? ?")
 SHAPE = re.compile(r"(\([^()]*,[^()]*\))[,;]? ?")
 
 
-class Entry(NamedTuple):
-    """A documented object."""
+class Section(NamedTuple):
+    """Section of a page: a title and the names in `jumper_warp.mdp` that it describes."""
 
-    name: str  # full name in the reference, such as `jumper_warp.mdp.RobotView`
-    text: str  # directive that describes it
-
-
-def mdp_page() -> str:
-    """Return the Markdown of the page: a table of all names, then their descriptions by kind."""
-    public = {f"{MDP}.{name}": getattr(mdp, name) for name in mdp.__all__}
-    functions = {name: value for name, value in public.items() if isinstance(value, wp.Function)}
-    for space in SPACES:
-        functions |= helpers(space)
-    factories = {name: value for name, value in public.items() if inspect.isfunction(value)}
-    structs = {name: value for name, value in public.items() if isinstance(value, STRUCT)}
-    structs |= {f"{struct.cls.__module__}.{struct.key}": struct for struct in INNER_STRUCTS}
-    classes = {name: value for name, value in public.items() if inspect.isclass(value)}
-    used = tasks_by_function()
-    kinds = {
-        "Term classes": [term_class(name, kind) for name, kind in classes.items() if issubclass(kind, Term)],
-        "Task classes": [task_class(name, kind) for name, kind in classes.items() if dataclasses.is_dataclass(kind)],
-        "Structs": [struct_entry(name, struct) for name, struct in structs.items()],
-        "Constants": [constant(name, value) for name, value in public.items() if isinstance(value, int)],
-        "Functions": [function_entry(name, func) for name, func in functions.items()],
-        "Motors and filters": [factory(name, value) for name, value in factories.items()],
-    }
-    for space in SPACES:
-        kinds[f"Stock {space}"] = [
-            function_entry(name, func, used.get(func)) for name, func in stock_terms(space).items()
-        ]
-    for space in SPACES:
-        if terms := task_terms(space):
-            title = f"{space.capitalize()} of the project's tasks"
-            kinds[title] = [function_entry(name, func, used.get(func)) for name, func in terms.items()]
-    for entries in kinds.values():
-        entries.sort(key=lambda entry: entry.name.rpartition(".")[2].lower())
-    parts = [f"## {kind}\n\n" + "\n\n".join(entry.text for entry in entries) for kind, entries in kinds.items()]
-    return "\n\n".join([summary(kinds), *parts]) + "\n"
+    title: str
+    names: tuple[str, ...]
 
 
-def summary(kinds: dict[str, list[Entry]]) -> str:
-    """Return the table of all names by kind, each a link to its description."""
-    rows = []
-    for kind, entries in kinds.items():
-        anchor = re.sub(r"[^a-z -]", "", kind.lower()).replace(" ", "-")
-        rows.append((f"[{kind}](#{anchor})", ", ".join(f"{{py:obj}}`~{entry.name}`" for entry in entries)))
-    return table(("Kind", "Names"), rows)
+class Page(NamedTuple):
+    """A page: title, first sentence, and sections; pages of `SPACES` also have the terms of their namespace."""
+
+    title: str
+    about: str
+    sections: tuple[Section, ...]
 
 
-def described(kind: str, name: str, signature: str, *paragraphs: str) -> Entry:
-    """Return an entry: a directive `py:<kind>` of a full name, a signature, and paragraphs of Markdown."""
+PAGES = {
+    "tasks": Page("Tasks", "A task is a `TaskCfg`: terms, functions, motors and constants.", (
+        Section("Task", ("TaskCfg",)),
+        Section("Motors and command filters", ("jumping_motors", "walking_motors", "vertical_jump_filter",
+                                               "walking_filter")),
+    )),
+    "states": Page("Robot and states", "Terms read the robot as a `RobotView`, and the task's state as a struct of "
+                   "the task. `Advance` updates the state after each policy step.", (
+        Section("Robot", ("RobotView", "RobotArrays", "LegGeometry", "tilt", "yaw_of")),
+        Section("Task states", ("Advance", "JumpState", "STANCE", "FLIGHT", "LANDED", "VelocityState",
+                                "AttitudeState", "commanded", "waiting")),
+        Section("Scene and ground", ("Scene", "Ground", "Block", "surface", "world_ground")),
+    )),
+    "observations": Page("Observations", "An observation term returns a number or a vector: a part of the network's "
+                         "input.", (Section("Classes", ("ObservationTerm", "ObservationsCfg")),)),
+    "rewards": Page("Rewards", "A reward term returns a number. Each policy step adds weight × number × 1/60 s to the "
+                    "reward.", (Section("Classes", ("RewardTerm",)),)),
+    "terminations": Page("Terminations", "A termination term returns whether the episode ends.",
+                         (Section("Classes", ("TerminationTerm",)),)),
+    "commands": Page("Commands and resets", "A command is the goal of a robot; a reset writes the first state of an "
+                     "episode. Both sample random numbers.", (
+        Section("Commands", ("Command", "Handover")),
+        Section("Resets", ("Reset", "NoSettings", "SkillSettings", "write_default_pose")),
+        Section("Random numbers", ("RngStream", "uniform", "uniform_range", "clamped_normal", "fold_in")),
+    )),
+    "events": Page("Events", "An event writes parameters of a robot, at every reset or at intervals.", (
+        Section("Classes", ("EventTerm", "RandomizationCfg")),
+        Section("Parameters of a robot", ("RobotParameters", "MotorArrays", "FilterParams", "Limits")),
+    )),
+    "curricula": Page("Curricula and metrics", "A curriculum raises the level of a robot after successes. A metric is "
+                      "logged as its mean.", (Section("Classes", ("Curriculum", "StateMetric")),)),
+}  # fmt: skip
+"""Pages by file name."""
+
+
+def mdp_pages() -> dict[str, str]:
+    """Return the Markdown of the pages by file name, with `mdp.md`, the table of all pages and names."""
+    inner = {struct.key: (f"{struct.cls.__module__}.{struct.key}", struct) for struct in INNER_STRUCTS}
+    used, pages, rows = tasks_by_function(), {}, []
+    for key, page in PAGES.items():
+        parts, link = [f"# {page.title}", page.about], f"[{page.title}](../reference/mdp/{key}.md)"
+        sections = [(title, [inner.get(name) or (f"{MDP}.{name}", getattr(mdp, name)) for name in members])
+                    for title, members in page.sections]  # fmt: skip
+        for title, things in (*sections, *(term_sections(key) if key in SPACES else ())):
+            parts += [f"## {title}", *(described_thing(name, thing, used.get(thing)) for name, thing in things)]
+            rows.append((link, title, ", ".join(f"{{py:obj}}`~{name}`" for name, _ in things)))
+            link = ""
+        pages[f"{key}.md"] = "\n\n".join(parts) + "\n"
+    contents = "\n".join(["```{toctree}", ":hidden:", *(f"mdp/{key}" for key in PAGES), "```"])
+    return pages | {"mdp.md": f"{table(('Page', 'Section', 'Names'), rows)}\n\n{contents}\n"}
+
+
+def term_sections(space: str) -> list[tuple[str, list[tuple[str, Any]]]]:
+    """Return the sections of a namespace of stock terms: titles, and functions with full names."""
+    groups = {f"Stock {space}": stock_terms(space)}
+    groups |= {f"{space.capitalize()} of {words}": task_terms(space, kind) for kind, words in TASK_KINDS.items()}
+    groups["Functions"] = helpers(space)
+    return [(title, sorted(group.items(), key=lambda item: item[0].rpartition(".")[2].lower()))
+            for title, group in groups.items() if group]  # fmt: skip
+
+
+def described_thing(name: str, thing: Any, tasks: Sequence[str] | None) -> str:
+    """Return the directive that describes an object; tasks: names of those that use it as a term."""
+    if isinstance(thing, wp.Function):
+        return function_entry(name, thing, tasks)
+    if isinstance(thing, STRUCT):
+        return struct_entry(name, thing)
+    if isinstance(thing, int):
+        return constant(name, thing)
+    if inspect.isfunction(thing):
+        return factory(name, thing)
+    return (term_class if issubclass(thing, Term) else task_class)(name, thing)
+
+
+def described(kind: str, name: str, signature: str, *paragraphs: str) -> str:
+    """Return a directive `py:<kind>` of a full name, a signature, and paragraphs of Markdown."""
     local = name.removeprefix(f"{MDP}.").removeprefix("jumper_warp.kernels.")
     body = "\n\n".join(paragraph for paragraph in paragraphs if paragraph)
-    return Entry(
-        name, f"````{{py:{kind}}} {local}{signature}\n:module: {name.removesuffix(f'.{local}')}\n\n{body}\n````"
-    )
+    return f"````{{py:{kind}}} {local}{signature}\n:module: {name.removesuffix(f'.{local}')}\n\n{body}\n````"
 
 
 def parsed(thing: Any) -> Any:
@@ -104,24 +142,24 @@ def split(pattern: re.Pattern[str], text: str) -> tuple[str, str]:
     return (match[1], text[match.end() :]) if match else ("", text)
 
 
-def function_entry(name: str, func: Any, tasks: Sequence[str] | None = None) -> Entry:
+def function_entry(name: str, func: Any, tasks: Sequence[str] | None = None) -> str:
     """Return the entry of a Warp function; tasks: names of those that use it as a term."""
     tree = parsed(func.func)
     returns = f" -> {plain_type(tree.returns)}" if tree.returns else ""
     for arg in tree.args.args:
         arg.annotation = ast.Name(plain_type(arg.annotation)) if arg.annotation else None
-    names = f"Used by {', '.join(f'`{task}`' for task in tasks)}." if tasks else ""
+    names = f"Used by {words_for_tasks(tasks)}." if tasks else ""
     about = to_markdown(inspect.getdoc(func.func) or "")
     return described("function", name, f"({ast.unparse(tree.args)}){returns}", about, names)
 
 
-def factory(name: str, function: Any) -> Entry:
+def factory(name: str, function: Any) -> str:
     """Return the entry of a Python function that returns settings of a task."""
     return described("function", name, str(inspect.signature(function)).replace("'", ""),
                      to_markdown(inspect.getdoc(function) or ""))  # fmt: skip
 
 
-def struct_entry(name: str, struct: Any) -> Entry:
+def struct_entry(name: str, struct: Any) -> str:
     """Return the entry of a Warp struct, with the table of its fields."""
     docs, rows = field_docs(struct.cls), []
     for field in parsed(struct.cls).body:
@@ -135,7 +173,7 @@ def struct_entry(name: str, struct: Any) -> Entry:
     return described("class", name, "", about, table(("Field", "Type", "Unit", "Meaning"), rows))
 
 
-def term_class(name: str, kind: type[Term]) -> Entry:
+def term_class(name: str, kind: type[Term]) -> str:
     """Return the entry of a class of terms, with the table of its keyword arguments."""
     arguments = parsed(kind.__init__).args
     arguments.args = arguments.args[1:]  # without self
@@ -149,7 +187,7 @@ def term_class(name: str, kind: type[Term]) -> Entry:
     return described("class", name, f"({ast.unparse(arguments)})", about, keywords)
 
 
-def task_class(name: str, kind: type) -> Entry:
+def task_class(name: str, kind: type) -> str:
     """Return the entry of a dataclass, with the table of its fields."""
     docs, rows = field_docs(kind), []
     for field in dataclasses.fields(kind):
@@ -164,7 +202,7 @@ def task_class(name: str, kind: type) -> Entry:
     return described("class", name, "", to_markdown(inspect.getdoc(kind) or ""), fields)
 
 
-def constant(name: str, value: int) -> Entry:
+def constant(name: str, value: int) -> str:
     """Return the entry of a phase of a jump."""
     module: Any = inspect.getmodule(mdp.commanded.func)
     comment = re.search(rf"^{name.rpartition('.')[2]} = .*?# (?:phases: )?(.*)$", inspect.getsource(module), re.M)

@@ -17,7 +17,7 @@ from jumper_warp.robot.overlay import RANGES, RATIO
 from jumper_warp.robot.values import LATERAL, LINK_KINDS, TRANSVERSAL, RobotValues
 
 PAGE = Path(__file__).parents[1] / "reference" / "overlays.md"
-BEGIN, END = "<!-- begin: overlay_table.py -->\n", "<!-- end: overlay_table.py -->\n"
+BEGIN, END = "<!-- table: overlay -->\n", "<!-- end of table -->\n"
 HEAD = "| name | values | unit | described | range | content |\n|---|---|---|---|---|---|\n"
 COMMENT = re.compile(r"\(N, \d+\) \[(?P<unit>[^\]]*)\],? ?(?P<content>.*)", re.DOTALL)
 

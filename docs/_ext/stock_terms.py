@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import importlib
 import inspect
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from functools import cache, partial
 from types import ModuleType
 from typing import Any
 
@@ -17,7 +18,8 @@ SPACES: dict[str, ModuleType] = {
     name: getattr(mdp, name) for name in ("rewards", "terminations", "observations", "events")
 }
 """Namespaces of stock terms."""
-TASK_KINDS = ("attitude", "jump", "velocity")
+TASK_KINDS = {"jump": "jumps", "velocity": "walks", "attitude": "turns"}
+"""Words for the skills, by the packages of `jumper_warp.kernels` with their terms."""
 EMPTY = inspect.Signature.empty
 
 
@@ -53,14 +55,32 @@ def helpers(space: str) -> dict[str, Any]:
     return {f"{mdp.__name__}.{space}.{name}": func for name, func in others.items()}
 
 
-def task_terms(space: str) -> dict[str, Any]:
-    """Return the terms that only some of the project's tasks can use, by full name."""
-    terms = {}
-    for kind in TASK_KINDS if space != "events" else ():
-        module = importlib.import_module(f"jumper_warp.kernels.{kind}.{space}")
-        found = functions_of(module, lambda func: is_term(space, func))
-        terms |= {f"{module.__name__}.{name}": func for name, func in found.items()}
-    return terms
+def task_terms(space: str, kind: str) -> dict[str, Any]:
+    """Return the terms of a namespace that only the project's tasks of one kind can use, by full name."""
+    if space == "events":
+        return {}
+    module = importlib.import_module(f"jumper_warp.kernels.{kind}.{space}")
+    return {f"{module.__name__}.{name}": func for name, func in functions_of(module, partial(is_term, space)).items()}
+
+
+@cache
+def tasks_by_kind() -> dict[str, list[str]]:
+    """Return the names of the project's tasks by a key of `TASK_KINDS`."""
+    kinds: dict[str, list[str]] = {}
+    for name in TASKS:
+        kinds.setdefault(make_task(name).state.cls.__module__.split(".")[2], []).append(name)
+    return kinds
+
+
+def words_for_tasks(names: Sequence[str]) -> str:
+    """Return tasks in words: those of a kind that are complete as "all jumps"."""
+    if set(names) == set(TASKS):
+        return "all tasks"
+    words = []
+    for kind, members in tasks_by_kind().items():
+        used = [name for name in members if name in names]
+        words += [f"all {TASK_KINDS[kind]}"] if used == members != used[:1] else [f"`{name}`" for name in used]
+    return ", ".join(words)
 
 
 def tasks_by_function() -> dict[Any, list[str]]:

@@ -51,7 +51,7 @@ ERRORS = {
 
 
 def choice_table(tasks: Mapping[str, TaskCfg]) -> str:
-    """Return the table of NEEDS: policy, range of training, success and error in three conditions, and when not."""
+    """Return the table of NEEDS: policy, commands of test and training, success and error, and when not."""
     lines = []
     for words, policy, unless, tests in NEEDS:
         rows, task = first_seed(policy), tasks[policy]
@@ -59,8 +59,10 @@ def choice_table(tasks: Mapping[str, TaskCfg]) -> str:
         page = "mars" if policy.startswith("mars") else PAGES[kind]
         trained = trained_on(task, rows["nominal"].values)
         cells = [_success(rows.get(test), kind) for test in tests]
-        lines.append([words, f"[{policy}]({page}.md)", *cells, trained, unless])
-    return markdown(("need", "policy", "nominal", "randomised", "friction 0.4", "trained on", "not for"), lines)
+        tested = str(rows[tests[0]].values["commands"])
+        lines.append([words, f"[{policy}]({page}.md)", tested, *cells, trained, unless])
+    titles = ("need", "policy", "tested on", "nominal", "randomised", "friction 0.4", "trained on", "not for")
+    return markdown(titles, lines)
 
 
 def _success(row: Row | None, kind: str) -> str:

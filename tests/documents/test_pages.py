@@ -9,7 +9,7 @@ from snippets import Page
 
 PATTERNS = ("README.md", "CONTRIBUTING.md", "docs/**/*.md", "assets/policies/*/README.md", "experiments/README.md")
 APART = ("docs/tutorials", "docs/howto")  # in files of their own, for workers that take a file each
-BUILT = ("docs/_", "docs/reference/api/", "docs/results/policies/")  # written by `make docs`
+BUILT = ("docs/_", "docs/reference/api/", "docs/reference/mdp/", "docs/results/policies/")  # written by `make docs`
 PAGES = [
     page
     for pattern in PATTERNS

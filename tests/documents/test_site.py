@@ -1,5 +1,6 @@
 """Generators of the documentation site: references, links and docstrings."""
 
+import re
 import tomllib
 from pathlib import Path
 
@@ -10,9 +11,11 @@ import cli_page
 import mdp_page
 import plain_text
 import stock_terms
+import units
 from jumper_warp import mdp
 from jumper_warp.cli.main import COMMANDS
 from jumper_warp.cli.train import SHORT_HELP
+from jumper_warp.registry import TASKS, make_task
 from repository import relocated
 
 ROOT = Path(__file__).parents[2]
@@ -20,7 +23,7 @@ ROOT = Path(__file__).parents[2]
 
 @pytest.fixture(scope="module")
 def types_and_terms():
-    return mdp_page.mdp_page()
+    return mdp_page.mdp_pages()
 
 
 @pytest.fixture(scope="module")
@@ -28,13 +31,22 @@ def command_line():
     return cli_page.cli_page()
 
 
-def test_every_public_name_and_stock_term_is_described(types_and_terms):
+def test_every_public_name_and_stock_term_is_described_once_and_linked(types_and_terms):
     spaces = set(stock_terms.SPACES)
     public = {f"jumper_warp.mdp.{name}" for name in mdp.__all__ if name not in spaces and name != "vec12"}
-    terms = {name for space in spaces for terms in (stock_terms.stock_terms(space), stock_terms.task_terms(space))
-             for name in terms}  # fmt: skip
-    assert len(terms) > 80
-    assert [name for name in public | terms if f"{{py:obj}}`~{name}`" not in types_and_terms] == []
+    stock = {name for space in spaces for name in stock_terms.stock_terms(space)}
+    own = {name for space in spaces for kind in stock_terms.TASK_KINDS for name in stock_terms.task_terms(space, kind)}
+    assert len(stock | own) > 80
+    pages = "".join(text for name, text in types_and_terms.items() if name != "mdp.md")
+    directives = re.findall(r"^`{4}\{py:\w+\} ([\w.]+)", pages, re.M)
+    assert sorted(set(directives)) == sorted(directives)
+    for name in public | stock | own:
+        assert f"{{py:obj}}`~{name}`" in types_and_terms["mdp.md"]
+        assert name.removeprefix("jumper_warp.mdp.").removeprefix("jumper_warp.kernels.") in directives
+
+
+def test_pages_of_terms_are_short(types_and_terms):
+    assert max(len(text.split()) for text in types_and_terms.values()) < 4000
 
 
 @pytest.mark.parametrize(
@@ -50,12 +62,18 @@ def test_every_public_name_and_stock_term_is_described(types_and_terms):
     ],
 )
 def test_fields_and_terms_have_shapes_units_and_signatures(types_and_terms, row):
-    assert row in types_and_terms
+    assert any(row in text for text in types_and_terms.values())
 
 
 def test_terms_name_the_tasks_that_use_them(types_and_terms):
-    text = types_and_terms.partition("jump.rewards.jump_height(")[2].partition("````")[0]
+    text = types_and_terms["rewards.md"].partition("jump.rewards.jump_height(")[2].partition("````")[0]
     assert "Used by `vertical-jump`" in text
+    walks = [name for name in TASKS if make_task(name).state is mdp.VelocityState]
+    assert stock_terms.words_for_tasks([*walks, "attitude"]) == "all walks, `attitude`"
+
+
+def test_numbers_stay_with_their_units():
+    assert units.joined("0.5 m/s, 3 % or 2 mountains") == "0.5\xa0m/s, 3\xa0% or 2 mountains"
 
 
 def test_every_command_has_a_section_with_its_common_flags_before_the_collapsed_ones(command_line):
@@ -100,7 +118,8 @@ def test_links_of_an_included_file_lead_from_the_including_page():
 
 def test_generated_folders_are_ignored_by_git():
     ignored = (ROOT / ".gitignore").read_text().splitlines()
-    assert {"/docs/_build/", "/docs/_generated/", "/docs/reference/api/", "/docs/results/policies/"} <= set(ignored)
+    assert {"/docs/_build/", "/docs/_generated/", "/docs/reference/api/", "/docs/reference/mdp/"} <= set(ignored)
+    assert "/docs/results/policies/" in ignored
 
 
 def test_citation_has_the_version_of_the_package():
