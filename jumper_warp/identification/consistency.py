@@ -1,22 +1,24 @@
-"""χ² tests of a fit: the residuals of each channel and motion, and the parameters that each motion alone calls for."""
+"""χ² tests of a fit: the residuals of each channel and motion, and the parameters that each sensor calls for."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from scipy.special import chdtri
 
 from jumper_warp.identification.least_squares import LeastSquares, NormalEquations
+from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.identification.uncertainty import autocorrelation
+from jumper_warp.robot.description import MOTOR_JOINTS
 
 FAMILY_LEVEL = 0.01
 """[1] Probability that at least one test of an identification rejects although the model is right."""
-SHARED = "shared parameters"  # Name of the test of a motion's parameters, in place of a channel
 COMPARABLE = 10.0
-"""[1] Fisher information, over the prior's, that one motion and the others need about a combination of parameters."""
+"""[1] Fisher information, over the prior's, that a sensor and the others need about a combination of parameters."""
 
 
 @dataclass(frozen=True)
@@ -24,7 +26,7 @@ class FitTest:
     """One-sided χ² test of one motion: of the residuals of a channel or of all channels, or of the parameters."""
 
     motion: str
-    channel: str  # empty: all channels of the motion; `SHARED`: the parameters agree with those of the other motions
+    channel: str  # empty: all channels of the motion; "parameters by ...": of a sensor, compared with all others
     chi2: float  # [1] Mean squared residual over the noise, or difference of parameters over its standard deviation
     limit: float  # [1] χ² above which the test rejects
     correlation: float  # [1] Factor by which measured correlations of the residuals raise the variance; 1: none
@@ -56,32 +58,82 @@ def variance_factor(columns: Sequence[np.ndarray]) -> float:
     return 1.0 + 2.0 * float(np.sum(correlation**2))
 
 
+class Sensor(NamedTuple):
+    """A motor's angle and rate in one motion, or a channel of the base, and the parameters that it calls for."""
+
+    motion: MotionResiduals
+    name: str  # such as "BL_outer" or "position"
+    information: np.ndarray  # (P, P) Fisher information about the normalised parameters, without priors
+    score: np.ndarray  # (P,) gradient of half the sensor's cost
+
+
+def sensor_columns(motion: MotionResiduals) -> dict[str, list[int]]:
+    """Return the measurement columns of each sensor of a motion that measures anything, by its name."""
+    columns: dict[str, list[int]] = {}
+    for name, span in motion.channels:
+        indices = range(*span.indices(motion.valid.shape[1]))
+        names = MOTOR_JOINTS if len(indices) == len(MOTOR_JOINTS) else len(indices) * (name,)
+        for sensor, column in zip(names, indices, strict=True):
+            if motion.valid[:, column].any():
+                columns.setdefault(sensor, []).append(column)
+    return columns
+
+
+def sensors(problem: LeastSquares, normal: NormalEquations) -> list[Sensor]:
+    """Return the sensors of all motions that measure anything; normal: normal equations."""
+    result = []
+    for i, motion in enumerate(problem.motions):
+        column_of = np.nonzero(motion.valid)[1]
+        for name, columns in sensor_columns(motion).items():
+            result.append(Sensor(motion, name, *normal.of_rows(i, np.isin(column_of, columns))))
+    return result
+
+
 def test_level(problem: LeastSquares) -> float:
     """Return the level of each test of a fit, for the family-wise level `FAMILY_LEVEL` (Šidák)."""
-    names = [name for motion in problem.motions for name, columns in motion.channels if motion.valid[:, columns].any()]
-    return -math.expm1(math.log1p(-FAMILY_LEVEL) / (len(names) + 2 * len(problem.motions)))
+    count = len(problem.motions) + sum(len(sensor_columns(motion)) for motion in problem.motions)
+    count += sum(motion.valid[:, span].any() for motion in problem.motions for _, span in motion.channels)
+    return -math.expm1(math.log1p(-FAMILY_LEVEL) / count)
 
 
-def shared_parameter_tests(problem: LeastSquares, normal: NormalEquations, mismatch: float = 1.0) -> list[FitTest]:
-    """Test for each motion whether the other motions call for the same parameters: score tests (Rao 1948).
+def parameter_tests(
+    problem: LeastSquares, normal: NormalEquations, mismatch: float = 1.0
+) -> list[tuple[Sensor, FitTest]]:
+    """Test for each sensor whether all others call for the same parameters: score tests (Rao 1948).
 
-    At the fit the scores of all motions and the prior cancel. The score of a motion with information I has the
+    At the fit the scores of all sensors and the prior cancel. The score of a sensor with information I has the
     covariance I - I C I, where C is the covariance of the parameters. Combinations of parameters below `COMPARABLE` are
-    left out, and motions without any others. normal: normal equations at the fit. mismatch: factor on standard
+    left out, and sensors without any others. normal: normal equations at the fit. mismatch: factor on standard
     deviations by correlated residuals.
     """
     covariance = np.linalg.inv(normal.information() + np.eye(len(normal.gradient)))
     tests, level = [], test_level(problem)
-    for i, motion in enumerate(problem.motions):
-        information, score = normal.of_motion(i)
+    for sensor in sensors(problem, normal):
+        information = sensor.information
         variance, vectors = np.linalg.eigh(information - information @ covariance @ information)
         known = variance > COMPARABLE
         if rank := int(known.sum()):
-            squares = (vectors.T @ score)[known] ** 2 / variance[known]
+            squares = (vectors.T @ sensor.score)[known] ** 2 / variance[known]
             limit = chi2_limit(rank, 0.0, 1.0, level)
-            chi2 = float(np.mean(squares)) / mismatch**2
-            tests.append(FitTest(motion.motion.name, SHARED, chi2, limit, mismatch**2))
+            chi2, name = float(np.mean(squares)) / mismatch**2, f"parameters by {sensor.name}"
+            tests.append((sensor, FitTest(sensor.motion.motion.name, name, chi2, limit, mismatch**2)))
     return tests
+
+
+def contradictions(problem: LeastSquares, normal: NormalEquations) -> list[Sensor]:
+    """Return the sensors that call for other parameters than the fit, those of motions on the ground first.
+
+    Only their contacts make local minima. Of each kind, the sensor that contradicts the others most is first. normal:
+    normal equations at the fit.
+    """
+    failed = [(sensor, test) for sensor, test in parameter_tests(problem, normal) if not test.passed]
+    failed.sort(key=lambda pair: (not pair[0].motion.free, pair[1].limit / pair[1].chi2))
+    return [sensor for sensor, _ in failed]
+
+
+def without(normal: NormalEquations, sensor: Sensor) -> np.ndarray:
+    """Return the change of the parameters (P,) if a sensor were left out of a fit, to first order."""
+    return np.linalg.solve(normal.information() + np.eye(len(sensor.score)) - sensor.information, sensor.score)
 
 
 def residual_tests(problem: LeastSquares, normal: NormalEquations) -> list[FitTest]:

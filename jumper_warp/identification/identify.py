@@ -16,7 +16,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import warp as wp
 
-from jumper_warp.identification.consistency import residual_tests, shared_parameter_tests
+from jumper_warp.identification.consistency import contradictions, residual_tests, without
 from jumper_warp.identification.least_squares import LeastSquares, NormalEquations, Point, Trial, replace_residuals
 from jumper_warp.identification.motions import NoiseLevels, RecordedMotion
 from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement
@@ -45,7 +45,7 @@ CONVERGED = 0.5
 GOOD_STEP = 0.3  # Actual over predicted decrease of the cost above which a step is good enough to reuse the Jacobian
 HORIZONS = (0.4, 0.7, 1.0)
 """Fractions of a motion on the ground that are fitted in turn, as a paw's motion depends on all earlier contacts."""
-MAX_STARTS = 4  # largest number of starts; there are only two if these agree or the best fails a test of residuals
+MAX_STARTS = 4  # largest number of starts; two are enough if they agree and all tests pass, or if residuals fail
 DISPLACEMENT, LARGEST_DISPLACEMENT = 3.0, 0.1
 """Standard deviation of the displacement of a start from an earlier minimum, in standard deviations of the estimate.
 Largest displacement of a parameter, in standard deviations of its prior."""
@@ -212,10 +212,11 @@ def descend(
 
     Returned: the least-squares problem of all motions and the minimum of each start, best first. Derivatives of the
     best exclude jumps of the residuals. The first start begins at the described robot and adds the motions one after
-    another. If its residuals pass their tests, the second begins with all motions, at the parameters that the best
-    minimum would have without the motion that contradicts the others most. Later starts alternate between both kinds,
-    the first kind from a displaced best minimum. They end if two starts agree and no motion contradicts the others, or
-    if the residuals of two starts fail.
+    another. If a sensor contradicts the others, the next one begins with all motions, at the parameters that the best
+    minimum so far would have without this sensor; else it adds the motions again, from a random displacement. Such a
+    start often ends in the same wrong minimum as the first. So a minimum found without a sensor is confirmed by a start
+    that is displaced and has all motions; so does the last one. Starts end if two agree and no sensor contradicts the
+    others, or if the residuals of two fail.
 
     coarse, whole: all motions, with the physics steps of the first stages and of the last stage. pieces: short pieces
     of the motions for a first stage, empty to skip it. Raises InputError: the simulation diverges in a motion.
@@ -226,35 +227,38 @@ def descend(
         begin = problem.nominal_point()
         z = descent.minimise(problem, begin, problem.normal(begin), PIECES_DECREASE)[0].z
     final = LeastSquares(parameters, whole, replay, prior_measurements)
-    minima, rng = [], np.random.default_rng(0)
-    direct = False
+    minima, rng, left_out, initial = [], np.random.default_rng(0), set(), []
+    direct = found_direct = False  # whether a start, and that of the best minimum, begins with all motions
     while len(minima) < MAX_STARTS:
         if minima:
-            best = minima[0].normal
-            fits = all(test.passed for test in residual_tests(final, best))
-            shared = shared_parameter_tests(final, best)
-            agree = starts_agree(excess_costs(final, minima)) and all(test.passed for test in shared)
-            if agree or (len(minima) > 1 and not fits):
+            best, normal = minima[0]
+            fits = all(test.passed for test in residual_tests(final, normal))
+            failed = contradictions(final, normal)
+            if (starts_agree(excess_costs(final, minima)) and not failed) or (len(minima) > 1 and not fits):
                 break
-            direct = fits and not direct
-            z = minima[0].point.z + displacement(best, rng)
-            if direct and shared:
-                names = [motion.motion.name for motion in whole]
-                z += best.without_motion(names.index(max(shared, key=lambda test: test.chi2).motion))
-            z = np.clip(z, *parameters.bounds())
+            untried = [sensor for sensor in failed if (sensor.motion, sensor.name) not in left_out]
+            direct = fits and (bool(untried) or found_direct or len(minima) == MAX_STARTS - 1)
+            if fits and untried:
+                left_out.add((untried[0].motion, untried[0].name))
+                move = without(normal, untried[0])
+            else:
+                move = displacement(normal, rng)
+            z = np.clip(best.z + move, *parameters.bounds())
+            initial = normal.following(best.starts, z - best.z)
         if direct:
-            problem = LeastSquares(parameters, coarse, replay, prior_measurements, robust=True)
-            point = Point(z, problem.nominal_point().starts)
-            point, normal = descent.minimise(problem, point, problem.normal(point), STAGE_DECREASE)
-            linearised = normal.linearised
+            point = Point(z, initial)
+            linearised = final.normal(point).linearised
         else:
             point, linearised = add_motions(descent, parameters, coarse, prior_measurements, z)
-        if whole is not coarse:
-            linearised = replace_residuals(linearised, final.residuals(point))
-        minima.append(descent.refine(final, point, final.assemble(point, linearised)))
+            if whole is not coarse:
+                linearised = replace_residuals(linearised, final.residuals(point))
+        point, normal = descent.refine(final, point, final.assemble(point, linearised))
+        if not minima or normal.cost < minima[0].normal.cost:
+            found_direct = direct
+            normal = final.without_jumps(point, normal)
+        minima.append(Minimum(point, normal))
         minima.sort(key=lambda minimum: minimum.normal.cost)
-    point, normal = minima[0]
-    return final, [Minimum(point, final.without_jumps(point, normal)), *minima[1:]]
+    return final, minima
 
 
 def displacement(normal: NormalEquations, rng: np.random.Generator) -> np.ndarray:

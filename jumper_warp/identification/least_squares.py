@@ -51,23 +51,29 @@ class NormalEquations:
     linearised: list[Linearised]  # by motion: residuals and Jacobian
     weights: list[np.ndarray]  # by motion: (m,) weights of the residuals, 1 unless the problem is robust
 
-    def of_motion(self, index: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the Fisher information (P, P) and the score (P,) of one motion, its initial state marginalised.
+    def of_rows(self, index: int, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return the Fisher information (P, P) and the score (P,) of some residuals of a motion, (m,) bool `rows`.
 
-        About the normalised parameters; the score is the gradient of half the motion's cost. index: of the motion.
+        About the normalised parameters, while the motion's initial state follows them. The score is the gradient of
+        half the residuals' cost. index: of the motion.
         """
-        linear, weight = self.linearised[index], self.weights[index]
-        cross, start_matrix = self.cross_matrices[index], self.start_matrices[index]
-        jacobian = linear.jacobian[:, : len(self.gradient)]
-        eliminated = np.linalg.solve(start_matrix, np.column_stack([cross.T, self.start_gradients[index]]))
-        information = transposed_product(weight[:, None] * jacobian, jacobian) - cross @ eliminated[:, :-1]
-        score = np.einsum("mi,m->i", jacobian, weight * linear.residual) - cross @ eliminated[:, -1]
+        linear, weight = self.linearised[index], self.weights[index][rows]
+        jacobian = linear.jacobian[rows]
+        follow = -np.linalg.solve(self.start_matrices[index], self.cross_matrices[index].T)
+        along = np.vstack([np.eye(len(self.gradient)), follow])
+        information = along.T @ transposed_product(weight[:, None] * jacobian, jacobian) @ along
+        score = along.T @ np.einsum("mi,m->i", jacobian, weight * linear.residual[rows])
         return 0.5 * (information + information.T), score
 
-    def without_motion(self, index: int) -> np.ndarray:
-        """Return the change of the parameters (P,) if the motion `index` were left out, to first order."""
-        information, score = self.of_motion(index)
-        return np.linalg.solve(self.information() + np.eye(len(score)) - information, score)
+    def following(self, starts: Sequence[np.ndarray], moves: np.ndarray) -> list[np.ndarray]:
+        """Return the initial states (K, I) by motion that follow moves of the parameters (K, P) to first order.
+
+        starts: (I,) by motion, before the moves.
+        """
+        return [
+            start - np.linalg.solve(matrix, cross.T @ moves.T).T
+            for start, matrix, cross in zip(starts, self.start_matrices, self.cross_matrices, strict=True)
+        ]
 
     def information(self) -> np.ndarray:
         """Return the data's Fisher information (P, P) about the normalised parameters, initial states marginalised."""
@@ -225,10 +231,7 @@ class LeastSquares:
         covariance = np.linalg.inv(normal.information() + np.eye(len(point.z)))
         along = covariance[:, index] / covariance[index, index]
         z = np.clip(point.z + moves[:, None] * along, self._low, self._high)
-        starts = [
-            start - np.linalg.solve(matrix, cross.T @ (z - point.z).T).T
-            for start, matrix, cross in zip(point.starts, normal.start_matrices, normal.cross_matrices, strict=True)
-        ]
+        starts = normal.following(point.starts, z - point.z)
         costs = self.costs(z, starts)
         best = int(np.argmin(costs))
         return Point(z[best], [start[best] for start in starts]), float(costs[best])

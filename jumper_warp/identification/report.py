@@ -211,7 +211,7 @@ def parameter_table(result: Identification) -> str:
 
 
 def fit_table(result: Identification) -> str:
-    """Return the HTML table of the fit: χ², its limit and rms error of each motion and channel."""
+    """Return the HTML table of the fit: χ², its limit and rms error of each motion and channel; failed other tests."""
     rows, fits = [], {(fit.motion, fit.channel): fit for fit in result.fits}
     for test in result.tests:
         cells = (f"{test.chi2:.3f}", f"{test.limit:.3f}", "yes" if test.passed else "no")
@@ -220,9 +220,12 @@ def fit_table(result: Identification) -> str:
             rows.append(
                 ("", (test.motion, test.channel, f"{fit.nominal_chi2:.4g}", *cells, f"{factor * fit.rms:.3g} {unit}"))
             )
-        else:
-            rows.append(("", (test.motion, "all channels", "", *cells, "")))
-    note = f"<p>If the model is right, any of these χ² exceeds its limit with probability {FAMILY_LEVEL:g}.</p>"
+        elif not test.channel or not test.passed:
+            rows.append(("", (test.motion, test.channel or "all channels", "", *cells, "")))
+    note = f"<p>If the model is right, any of these χ² exceeds its limit with probability {FAMILY_LEVEL:g}. "
+    note += (
+        "Rows <i>parameters by</i> a sensor, which compare its parameters with all others, are shown if they fail.</p>"
+    )
     heads = ("motion", "channel", "described χ²", "found χ²", "limit", "consistent", "rms error")
     return html_table(heads, rows) + note
 

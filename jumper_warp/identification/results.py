@@ -9,7 +9,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jumper_warp.identification.consistency import FitTest, residual_tests, shared_parameter_tests
+from jumper_warp.identification.consistency import FitTest, parameter_tests, residual_tests
 from jumper_warp.identification.least_squares import LeastSquares, NormalEquations, Point
 from jumper_warp.identification.parameters import ParameterSet, PriorMeasurement
 from jumper_warp.identification.residuals import MotionResiduals
@@ -245,7 +245,7 @@ def summarise(
         systematic=systematic,
         spread=np.sqrt(weight @ distance**2),
         starts=(),
-        tests=(*residual_tests(problem, normal), *shared_parameter_tests(problem, normal, mismatch)),
+        tests=(*residual_tests(problem, normal), *(t for _, t in parameter_tests(problem, normal, mismatch))),
         chi2=sum(error.cost for error in errors) / problem.count,
         nominal_chi2=sum(error.cost for error in nominal) / problem.count,
         count=problem.count,

@@ -76,8 +76,8 @@ class RandomizationCfg:
     observation_latency: Range = None
     """[ms] Delay from sensor to policy, rounded to the nearest physics step."""
     zero_latency_probability: float = 0.0
-    """[1] Probability of zero latency, for either latency; with a robot overlay, of its latency. At 0 training rarely
-    samples the nominal case, where the policy may then chatter."""
+    """[1] Probability of zero latency, for either latency unless its range is a single value; with a robot overlay, of
+    its latency. At 0 training rarely samples the nominal case, where the policy may then chatter."""
     push_force: Range = (-5.0, 5.0)
     """[N] Push on the base along each world axis, while a paw is on the ground."""
     push_torque: Range = (-3.0, 3.0)

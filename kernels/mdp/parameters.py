@@ -210,19 +210,19 @@ def physics_steps(robot: RobotParameters, seconds: float) -> int:
 
 
 @wp.func
-def is_nominal(rng: RngStream, nominal_probability: float) -> bool:
-    """Return whether a sampled delay is the nominal one, with `nominal_probability`."""
-    return uniform(rng, 1, 0.0, 1.0) < nominal_probability
+def is_nominal(rng: RngStream, lower: float, upper: float, nominal_probability: float) -> bool:
+    """Return whether a delay is the nominal one, with `nominal_probability`; never if its range is a single value."""
+    return lower < upper and uniform(rng, 1, 0.0, 1.0) < nominal_probability
 
 
 @wp.func
 def action_latency(robot: RobotParameters, rng: RngStream, lower: float, upper: float, zero_probability: float = 0.0):
     """Sample the latency of actions from lower to upper [s], moved by `latency_move`.
 
-    With `zero_probability` it is the nominal one, which is 0 for the described robot.
+    With `zero_probability` it is the nominal one, which is 0 for the described robot, unless lower is upper.
     """
     seconds = moved_uniform(rng, 0, lower, upper, robot.latency_move)
-    if is_nominal(rng, zero_probability):
+    if is_nominal(rng, lower, upper, zero_probability):
         seconds = robot.zero_latency
     robot.latency[rng.world] = physics_steps(robot, seconds)
 
@@ -233,7 +233,7 @@ def observation_latency(
 ):
     """Sample the latency of delayed observation terms from lower to upper [s]; with `zero_probability` it is 0."""
     seconds = uniform(rng, 0, lower, upper)
-    if is_nominal(rng, zero_probability):
+    if is_nominal(rng, lower, upper, zero_probability):
         seconds = 0.0
     robot.observation_latency[rng.world] = physics_steps(robot, seconds)
 

@@ -3,11 +3,14 @@
 import numpy as np
 import pytest
 
-from jumper_warp.identification.consistency import chi2_limit, variance_factor
-from jumper_warp.identification.identify import identify
+from jumper_warp.identification.consistency import chi2_limit, contradictions, variance_factor, without
+from jumper_warp.identification.identify import Descent, identify
+from jumper_warp.identification.least_squares import LeastSquares
+from jumper_warp.identification.motions import NoiseLevels
 from jumper_warp.identification.parameters import ParameterSet, jumper_parameters
 from jumper_warp.identification.recording import measure, replay_plan, sample_plan
 from jumper_warp.identification.replay import MotionReplay
+from jumper_warp.identification.residuals import MotionResiduals
 from jumper_warp.identification.results import starts_agree
 
 
@@ -61,3 +64,21 @@ def test_fit_of_a_robot_with_another_friction_is_not_consistent(slipping):
     assert "slipping rate χ² " in result.inconsistency
     failed = {(test.motion, test.channel) for test in result.tests if not test.passed}
     assert ("slipping", "rate") in failed and ("slipping", "orientation") not in failed
+
+
+def test_a_motor_whose_gain_changed_between_motions_contradicts_the_others_most():
+    parameters = ParameterSet(tuple(p for p in jumper_parameters() if p.quantity == "kp"))
+    replay, rng, index = MotionReplay(threads=1), np.random.default_rng(2), parameters.names.index("kp/FL_outer")
+    plan, motions = sample_plan("hung chirp", rng, seconds=0.5), []
+    for name, z in (("described", 0.0), ("stiffer", 0.2)):  # kp 1 and 1.04
+        robots = parameters.robots(z * np.eye(len(parameters))[index : index + 1])
+        motion = measure(plan, name, replay_plan(replay, plan, robots), robots, rng)
+        motions.append(MotionResiduals(motion, parameters, NoiseLevels(), replay.description))
+    problem = LeastSquares(parameters, motions, replay)
+    point = problem.nominal_point()
+    point, normal = Descent(replay).minimise(problem, point, problem.normal(point))
+    assert 0.05 < point.z[index] < 0.15  # between both
+    failed = {(each.motion.motion.name, each.name): each for each in contradictions(problem, normal)}
+    assert set(list(failed)[:2]) == {("described", "FL_outer"), ("stiffer", "FL_outer")}
+    for left_out, other in (("stiffer", 0.0), ("described", 0.2)):
+        assert (point.z + without(normal, failed[left_out, "FL_outer"]))[index] == pytest.approx(other, abs=0.04)

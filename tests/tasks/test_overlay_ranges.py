@@ -139,6 +139,12 @@ def test_nominal_latency_is_sampled_with_the_probability_of_zero():
     assert not drawn(None, cfg, 8)["latency"].any()
 
 
+def test_fixed_latency_is_fixed_where_zero_is_sampled():
+    cfg = replace(CFG, zero_latency_probability=1.0, observation_latency=(4.0, 4.0)).with_fixed(latency=25.0)
+    samples = drawn(None, cfg, 8)
+    assert (samples["latency"] == 12).all() and (samples["observation_latency"] == 2).all()
+
+
 @pytest.mark.parametrize("quantity", list(VALUES))
 def test_a_quantity_moves_only_its_own_samples(described, quantity):
     same = drawn(RobotOverlay({quantity: tuple(vars(RobotValues.nominal(1))[quantity][0])}))
