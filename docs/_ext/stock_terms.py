@@ -56,8 +56,8 @@ def helpers(space: str) -> dict[str, Any]:
 def task_terms(space: str) -> dict[str, Any]:
     """Return the terms that only some of the project's tasks can use, by full name."""
     terms = {}
-    for kind in TASK_KINDS if space != "events" else ():
-        module = importlib.import_module(f"jumper_warp.kernels.{kind}.{space}")
+    names = [f"{kind}.{space}" for kind in TASK_KINDS] + ["jump.paper"] if space != "events" else []
+    for module in (importlib.import_module(f"jumper_warp.kernels.{name}") for name in names):
         found = functions_of(module, lambda func: is_term(space, func))
         terms |= {f"{module.__name__}.{name}": func for name, func in found.items()}
     return terms

@@ -72,7 +72,7 @@ REWARDS = (
     RewardTerm(mdp_rewards.joint_acceleration, -2.0e-7),
     RewardTerm(mdp_rewards.action_rate, -0.08),
     RewardTerm(mdp_rewards.action_acceleration, -0.03),
-    RewardTerm(rewards.torque_sign_changes, -5.0e-3),
+    RewardTerm(mdp_rewards.torque_sign_changes, -5.0e-3),
 )
 
 TERMINATIONS = (
