@@ -19,7 +19,7 @@ ROBOT = (
 )
 """Observation terms common to the paper's policies: velocities, gravity direction, motors and last action."""
 
-PAPER_ROBOT = tuple(term.replace(noise_limit=10.0) for term in ROBOT)
+PAPER_ROBOT = tuple(term.replace(noise_limit=10.0) if term.numbers["noise"] else term for term in ROBOT)
 """The same terms with the paper's Gaussian noise: it is not cut (10 standard deviations do not occur)."""
 
 DRAWN = (
