@@ -2,6 +2,7 @@
 
 import dataclasses
 import json
+from pathlib import Path
 
 import pytest
 
@@ -13,6 +14,7 @@ from jumper_warp.utils.output import read_values, write_metrics
 from support.paper_runs import ARMS, OFF, arm_flags, make_log, names_of_tests
 from support.paper_table import GAP, NEVER, results_table
 
+DOCS = Path(__file__).parents[2] / "docs"
 JUMPS = ["vertical-jump-paper", "horizontal-jump-paper", "vertical-jump"]
 
 
@@ -88,6 +90,11 @@ def test_finished_arms_are_skipped_and_the_table_names_gaps(tmp_path, monkeypatc
     rows = [line.split(" | ") for line in results_table(tmp_path).splitlines()[2:]]
     assert rows[0][3:5] == ["0.85 (0.8–0.9), 2 of 2 seeds", GAP]
     assert rows[3][3] == "3 (2–4), 2 of 2 seeds" and rows[3][5] == NEVER
+
+
+def test_the_page_has_the_table_of_the_committed_metrics():
+    page = DOCS / "results" / "paper.md"
+    assert results_table(page.with_suffix("")) in page.read_text()
 
 
 def test_an_interrupted_training_continues_and_is_tested(tmp_path):

@@ -2,8 +2,8 @@
 
 Sources of the constants are at the ends of the lines. P: the paper, with its table or section. A: the authors' public
 code. R: our reading, where the paper is silent or contradicts itself. Forms of rewards are those of Tables II and III;
-the paper prints neither their weights nor their widths. `docs/results/departures.csv` has the reasons of all readings,
-and the values of our own task beside these.
+the paper prints neither their weights nor their widths. `docs/results/paper.md` has the reasons of all readings, and
+`docs/results/departures.csv` the values of our own task beside these.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
 """Table of all numbers of the project's tasks beside the paper's: `docs/results/departures.csv`.
 
-    python docs/_ext/departures.py
+    python docs/_ext/departure_table.py
 
 writes the present numbers of the tasks into the file, and keeps its sources and reasons. A row with another value than
 the paper's needs a reason, and a value of the paper its source: P (paper), A (authors' code) or R (our reading).
@@ -54,7 +54,7 @@ def text(value: Any) -> str:
 
 
 def term_text(term: Term) -> str:
-    """Return the numbers of a term as text, without those that its class sets by default; forms of the paper by name."""
+    """Return the numbers of a term as text, without defaults of its class, and whether its form is the paper's."""
     kind = type(term)
     values = {key: value for key, value in term.numbers.items() if value != kind.settings.get(key, REQUIRED)}
     values |= {key: option for key, option in term.options.items()

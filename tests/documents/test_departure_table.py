@@ -4,7 +4,7 @@ import dataclasses
 
 import pytest
 
-from departures import BASES, PAPERS, read, rows_of
+from departure_table import BASES, PAPERS, read, rows_of
 from jumper_warp.registry import TASKS, make_task
 
 ROWS = read()
@@ -23,7 +23,7 @@ def test_the_file_has_all_tasks():
 
 @pytest.mark.parametrize("task", [*PAPERS, *BASES])
 def test_tasks_and_the_papers_tasks_have_the_numbers_of_the_file(task):
-    """If a number changed on purpose: `python docs/_ext/departures.py`, then write its reason into the file."""
+    """If a number changed on purpose: `python docs/_ext/departure_table.py`, then write its reason into the file."""
     assert rows_of(task) == rows_in_file(task)
 
 
