@@ -20,7 +20,7 @@ from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.terms import REQUIRED, Term
 
 FILE = Path(__file__).parents[1] / "results" / "departures.csv"
-COLUMNS = ("task", "name", "ours", "paper", "source", "reason")
+COLUMNS: list[str] = ["task", "name", "ours", "paper", "source", "reason"]
 ABSENT = "none"  # Cell of a term or setting that a task lacks
 PAPERS = {"vertical-jump": "vertical-jump-paper", "horizontal-jump": "horizontal-jump-paper",
           "velocity-flat": "velocity-paper"}  # fmt: skip

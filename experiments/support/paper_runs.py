@@ -7,6 +7,7 @@ import json
 import shlex
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -141,7 +142,8 @@ def learning_curve(run_folder: Path, num_jumps: int, conditions: Conditions) -> 
         policy.to(env.device)
         run_evaluation(policy.act, env, log)
         curve["iterations"].append(int(checkpoint.stem.removeprefix("iteration_")))
-        curve["values"].append(float(metrics_of(run, log)[key].value))
+        value: Any = metrics_of(run, log)[key].value
+        curve["values"].append(float(value))
     return curve
 
 
