@@ -18,7 +18,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import TYPE_CHECKING, Any
 
-from jumper_warp.rl.cfg import PpoCfg
+from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.utils.assets import dashed, policy_tasks
 from jumper_warp.utils.errors import InputError, suggestion
 from jumper_warp.utils.files import existing_file
@@ -43,6 +43,8 @@ class TaskEntry:
     best_metric: str = "Metrics/success"  # Default metric of the log whose largest value selects the best checkpoint
     about: str = ""  # What the robot does, in a few words, for `jumper list`; default: the factory's first sentence
     presets: dict[str, str] = field(default_factory=dict)  # Groups of flags of `jumper train` by name, such as `laptop`
+    num_envs: int = TrainCfg.num_envs  # Default number of worlds for training
+    max_iterations: int = TrainCfg.max_iterations  # Default number of iterations of a training
 
     @property
     def origin(self) -> str:
@@ -57,6 +59,13 @@ class TaskEntry:
         """
         doc = "" if isinstance(self.make, str) else getattr(self.make, "__doc__", None) or ""
         return self.about or first_sentence(doc)
+
+    def training(self, name: str) -> TrainCfg:
+        """Return the default settings of a training; name: of the task."""
+        return TrainCfg(
+            task=name, num_envs=self.num_envs, max_iterations=self.max_iterations, best_metric=self.best_metric,
+            ppo=self.ppo,
+        )  # fmt: skip
 
     def factory(self) -> Callable[[], TaskCfg]:
         """Import the factory function if it is given by name, and return it."""
@@ -90,6 +99,11 @@ ON_MARS = replace(HEIGHTS, symmetry="actor")
 """PPO settings for vertical jumps on Mars, with symmetry: in long flights even a slow rotation turns the robot far."""
 PLACES = PpoCfg(gamma=0.99, entropy_coef=0.0003, symmetry="actor")  # Training of jumps to goal positions
 TURNS = PpoCfg(gamma=0.99, entropy_coef=0.001, init_std=0.5, symmetry="actor")  # Training of turning in flight
+PAPER = PpoCfg(asymmetric_critic=False, final_desired_kl=0.01)
+"""Settings of PPO that the paper's tasks share, from the authors' public code."""
+PAPER_HEIGHTS = replace(PAPER, num_steps=45, minibatches=6, gamma=0.985, entropy_coef=0.00075)
+PAPER_PLACES = replace(PAPER, num_steps=30, minibatches=4, gamma=0.99, entropy_coef=0.001)
+PAPER_WALKING = replace(PAPER, num_steps=30, minibatches=4, gamma=0.985, entropy_coef=0.0025, hidden=(512, 256, 128))
 
 NOMINAL = "--no-randomize --no-noise --history 1 --ppo.hidden 128 64 64"
 """Flags of trainings on two CPU cores: no randomisation, no noise, a short observation and a small network."""
@@ -143,6 +157,18 @@ TASKS: dict[str, TaskEntry] = {
     "velocity-trot": TaskEntry(
         "jumper_warp.tasks.velocity.flat:velocity_trot", WALKING, best_metric="Metrics/score",
         about="trot on level ground",
+    ),
+    "vertical-jump-paper": TaskEntry(
+        "jumper_warp.tasks.jump.paper:vertical_jump_paper", PAPER_HEIGHTS, about="jump to a height, as in the paper",
+        num_envs=4096, max_iterations=4000,
+    ),
+    "horizontal-jump-paper": TaskEntry(
+        "jumper_warp.tasks.jump.paper:horizontal_jump_paper", PAPER_PLACES, about="jump to a place, as in the paper",
+        num_envs=4096, max_iterations=4000,
+    ),
+    "velocity-paper": TaskEntry(
+        "jumper_warp.tasks.velocity.paper:velocity_paper", PAPER_WALKING, best_metric="Metrics/score",
+        about="walk as in the paper", num_envs=4096, max_iterations=2000,
     ),
     "attitude": TaskEntry(
         "jumper_warp.tasks.attitude.flight:attitude_in_flight", TURNS, best_metric="Metrics/settled",

@@ -28,7 +28,8 @@ from jumper_warp.utils.errors import InputError
 PROJECT_TASKS = (
     "vertical-jump", "horizontal-jump", "horizontal-jump-slippery", "horizontal-jump-sighted", "omnidirectional-jump",
     "vertical-jump-mars", "vertical-jump-mars-loose", "horizontal-jump-mars", "horizontal-jump-mars-loose",
-    "velocity-flat", "velocity-rough", "velocity-trot", "attitude",
+    "velocity-flat", "velocity-rough", "velocity-trot", "vertical-jump-paper", "horizontal-jump-paper",
+    "velocity-paper", "attitude",
 )  # fmt: skip
 TASK_FILE = """\
 from dataclasses import replace

@@ -59,8 +59,12 @@ def task_terms(space: str, kind: str) -> dict[str, Any]:
     """Return the terms of a namespace that only the project's tasks of one kind can use, by full name."""
     if space == "events":
         return {}
-    module = importlib.import_module(f"jumper_warp.kernels.{kind}.{space}")
-    return {f"{module.__name__}.{name}": func for name, func in functions_of(module, partial(is_term, space)).items()}
+    names = [f"{kind}.{space}", *(["jump.paper"] if kind == "jump" else [])]
+    terms: dict[str, Any] = {}
+    for module in (importlib.import_module(f"jumper_warp.kernels.{name}") for name in names):
+        found = functions_of(module, partial(is_term, space))
+        terms |= {f"{module.__name__}.{name}": func for name, func in found.items()}
+    return terms
 
 
 @cache

@@ -1,6 +1,7 @@
 """Departures of the jumps from the paper and its authors' configuration, undone one at a time.
 
-`docs/results/paper.md` has their reasons and their effects, measured by `experiments/departures.py`.
+`docs/results/departures.csv` has all departures and their reasons, `docs/results/paper.md` the effects of these,
+measured by `experiments/departures.py`.
 """
 
 from __future__ import annotations
@@ -83,7 +84,6 @@ DEPARTURES: dict[str, dict[str, Ablation]] = {
         "shares_of_resets": "--env.reset.balance-by resets",
         "none_pushing_off": "--env.reset.start-probability.pushing 0 --env.reset.start-probability.standing 0.6",
         "promoted_after_one": "--env.curriculum.promote-after 1",
-        "tolerance_of_levels": "--env.curriculum.tolerance 0.1",
         "jumping_early": may_jump_early,
         "ground_forces": "--env.rewards.ground-force.weight 0",
         "rewards_below_zero": "--env.reward-floor None",

@@ -86,7 +86,7 @@ def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
         raise UsageError(f"the task comes first: jumper train TASK [flags]; tasks: {names}")
     name, entry = find_task(args[0])
     preset, args = preset_flags(name, entry, args[1:]), args[1:]
-    default, task = TrainArgs(TrainCfg(task=name, ppo=entry.ppo, best_metric=entry.best_metric)), make_task(name)
+    default, task = TrainArgs(entry.training(name)), make_task(name)
     flags = {name: values_of(f"--{name.replace('_', '-')}", args) for name in ("resume", "log_root", "init_policy")}
     session = {name: values[0] for name, values in flags.items() if values}
     if "resume" in session:

@@ -86,8 +86,8 @@ class TaskRuntime:
             for slot in task.params.slots[f"observations.{group}"]:
                 width, oldest, delayed = slot.term.width, layouts[group][slot.term.name][0], int(slot.delayed)
                 for j in range(width):
-                    columns.append((len(columns), index, start, widths[group], slot.noise, slot.scale, slot.clip,
-                                    oldest + j, width, slot.history, delayed, past))  # fmt: skip
+                    columns.append((len(columns), index, start, widths[group], slot.noise, slot.noise_limit, slot.scale,
+                                    slot.clip, oldest + j, width, slot.history, delayed, past))  # fmt: skip
                     past += delayed
             start += n * widths[group]
         self.columns = wp.array(np.array(columns, dtype=np.int32).T, dtype=int, device=self.device)

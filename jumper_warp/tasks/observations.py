@@ -1,4 +1,4 @@
-"""Observation terms that the tasks share, with the noise of the paper's Table VI."""
+"""Observation terms that the tasks share, with the standard deviations of the paper's Table VI."""
 
 from dataclasses import replace
 
@@ -18,6 +18,9 @@ ROBOT = (
     ObservationTerm(obs.last_action),
 )
 """Observation terms common to the paper's policies: velocities, gravity direction, motors and last action."""
+
+PAPER_ROBOT = tuple(term.replace(noise_limit=10.0) if term.numbers["noise"] else term for term in ROBOT)
+"""The same terms with the paper's Gaussian noise: it is not cut (10 standard deviations do not occur)."""
 
 DRAWN = (
     ObservationTerm(obs.drawn_mass),

@@ -25,7 +25,9 @@ from jumper_warp.utils.kernels import Function
 REQUIRED = inspect.Parameter.empty
 AXES = {2: ("x", "y"), 3: ("x", "y", "z")}
 LEGS = ("FL", "FR", "BL", "BR")
-OBSERVATION_BOUNDS = {"noise": (0.0, 1.0e3), "scale": (1.0e-6, 1.0e6), "clip": (1.0e-6, 1.0e6)}
+OBSERVATION_BOUNDS = {
+    "noise": (0.0, 1.0e3), "noise_limit": (1.0e-3, 10.0), "scale": (1.0e-6, 1.0e6), "clip": (1.0e-6, 1.0e6)
+}  # fmt: skip
 """Smallest and largest settings of an observation term; noise and clip in the unit of the function."""
 LARGEST = 1.0e9  # Largest absolute value of a term's number
 MAX_HISTORY = 1000  # Largest number of frames of an observation term
@@ -216,12 +218,12 @@ class ObservationTerm(Term):
 
     Function: (robot: RobotView, state, ...) -> float or vector, one frame of columns. Other signatures: (parameters:
     RobotParameters, world: int, ...) and, to read the ground, (arrays: RobotArrays, ground: Ground, world: int, ...).
-    noise: standard deviation of Gaussian noise, cut at one standard deviation, in the function's unit; then values are
-    clipped to [-clip, clip] and multiplied by scale. history: number of frames, oldest first. delayed: whether the
-    world's observation latency applies.
+    noise: standard deviation of Gaussian noise, in the function's unit, cut at noise_limit standard deviations; then
+    values are clipped to [-clip, clip] and multiplied by scale. history: number of frames, oldest first. delayed:
+    whether the world's observation latency applies.
     """
 
-    settings: ClassVar = {"noise": 0.0, "scale": 1.0, "clip": 100.0}
+    settings: ClassVar = {"noise": 0.0, "noise_limit": 1.0, "scale": 1.0, "clip": 100.0}
     options: Mapping[str, Any] = {"history": 1, "delayed": False}
     takes: ClassVar = (RobotView, RobotParameters, RobotArrays)
 

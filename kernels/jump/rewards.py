@@ -1,4 +1,4 @@
-"""Reward terms of jumps (paper, Tables I to III), as functions of the robot's state, the jump's state and parameters.
+"""Reward terms of jumps (paper, Tables II and IV), as functions of the robot's state, the jump's state and parameters.
 
 Penalties have negative weights in the tasks, unless their values are negative. Times are counted in policy steps of
 1/60 s. phi, psi: Gaussian and Laplacian kernels of `mdp.rewards`; std_* and scale_*: their widths, in the unit of their

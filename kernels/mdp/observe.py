@@ -9,7 +9,7 @@ from .env import BEGUN, COMMANDED, RING, EpisodeArrays
 from .non_finite import NonFinite, record_non_finite
 from .options import FAST, kernel_name
 from .parameters import RobotParameters
-from .random import OBSERVATION, clamped_normal, step_key, stream_at
+from .random import OBSERVATION, normal, step_key, stream_at
 from .view import RobotArrays, load_view
 
 wp.set_module_options(FAST)
@@ -27,6 +27,7 @@ class ObservationColumn:
     start: int  # index of the group's first element in `now` and `final`
     stride: int  # columns of the group
     noise: int  # index of the noise level in the array of the terms' numbers `p`
+    noise_limit: int  # index of the largest noise over its level in `p`
     scale: int  # index of the scale in `p`
     clip: int  # index of the limit in `p`
     oldest: int  # column of the component's oldest frame in the group
@@ -60,13 +61,14 @@ def load_column(columns: wp.array2d(dtype=int), component: int) -> ObservationCo
     column.start = columns[2, component]
     column.stride = columns[3, component]
     column.noise = columns[4, component]
-    column.scale = columns[5, component]
-    column.clip = columns[6, component]
-    column.oldest = columns[7, component]
-    column.width = columns[8, component]
-    column.history = columns[9, component]
-    column.delayed = columns[10, component]
-    column.past = columns[11, component]
+    column.noise_limit = columns[5, component]
+    column.scale = columns[6, component]
+    column.clip = columns[7, component]
+    column.oldest = columns[8, component]
+    column.width = columns[9, component]
+    column.history = columns[10, component]
+    column.delayed = columns[11, component]
+    column.past = columns[12, component]
     return column
 
 
@@ -227,7 +229,7 @@ def postprocess(
     noise = p[column.noise]
     if noise > 0.0:
         rng = stream_at(m.step_key, m.purpose, m.world, OBSERVATION + column.group)
-        value += noise * clamped_normal(rng, column.oldest)
+        value += noise * wp.clamp(normal(rng, column.oldest), -p[column.noise_limit], p[column.noise_limit])
     value = finite_or_zero(p[column.scale] * wp.clamp(value, -p[column.clip], p[column.clip]), m.diverged)
     i = column.start + m.world * column.stride + column.oldest
     keep_frames = after_reset != 0 and m.history_reset == COMMANDED

@@ -78,6 +78,12 @@ def uniform_range(rng: RngStream, i: int, pair: wp.vec2) -> float:
 
 
 @wp.func
+def normal(rng: RngStream, i: int) -> float:
+    """Return the i-th random number of a stream, standard normal."""
+    return wp.randn(wp.rand_init(int(rng.seed), rng.start + i))
+
+
+@wp.func
 def clamped_normal(rng: RngStream, i: int) -> float:
     """Return the i-th random number of a stream, standard normal, clamped to [-1, 1]."""
-    return wp.clamp(wp.randn(wp.rand_init(int(rng.seed), rng.start + i)), -1.0, 1.0)
+    return wp.clamp(normal(rng, i), -1.0, 1.0)

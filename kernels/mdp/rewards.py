@@ -86,6 +86,15 @@ def action_acceleration(robot: RobotView, state: Any) -> float:
 
 
 @wp.func
+def torque_sign_changes(robot: RobotView, state: Any) -> float:
+    """Penalty of jerky motor torques. It is the number of motors whose torque changed its sign in a policy step."""
+    total = float(0.0)
+    for m in range(12):
+        total += wp.where(wp.sign(robot.torque[m]) != wp.sign(robot.prev_torque[m]), 1.0, 0.0)
+    return total
+
+
+@wp.func
 def collision(robot: RobotView, state: Any) -> float:
     """Penalty of collisions: 1 if anything but a paw touched the ground or links touched each other, else 0."""
     return wp.where(robot.collisions != 0, 1.0, 0.0)

@@ -24,6 +24,7 @@ class CommandRanges:
     standing_probability: float  # of the command to stand
     turn_in_place_probability: float  # of a command with a yaw rate only
     resampling_time_range: wp.vec2  # [policy steps] from command to command
+    smallest: float  # [m/s], [rad/s] least magnitude of each sampled component; 0: no limit
 
 
 @wp.func
@@ -39,6 +40,17 @@ def command_limits(ranges: CommandRanges, level: int) -> wp.vec4:
 
 
 @wp.func
+def sample_component(rng: RngStream, i: int, lower: float, upper: float, smallest: float) -> float:
+    """Return a sampled component of a command, uniform between lower < 0 and upper > 0, at least `smallest` from 0."""
+    value = uniform(rng, i, lower, upper)
+    if smallest <= 0.0:
+        return value
+    limit = wp.where(value < 0.0, -lower, upper)
+    magnitude = smallest + wp.abs(value) / limit * (limit - smallest)
+    return wp.where(value < 0.0, -magnitude, magnitude)
+
+
+@wp.func
 def sample_velocity_command(rng: RngStream, ranges: CommandRanges, level: int) -> wp.vec3:
     """Return a sampled command of a level: velocity ahead, to the left [m/s], yaw rate [rad/s], body axes.
 
@@ -51,11 +63,11 @@ def sample_velocity_command(rng: RngStream, ranges: CommandRanges, level: int) -
     easy = level == 0 or uniform(rng, streams.NARROW, 0.0, 1.0) < ranges.first_range_probability
     if easy:
         limits = ranges.first_range
-    spin = uniform(rng, streams.TURN, -limits[3], limits[3])
+    spin = sample_component(rng, streams.TURN, -limits[3], limits[3], ranges.smallest)
     if kind < ranges.standing_probability + ranges.turn_in_place_probability:
         return wp.vec3(0.0, 0.0, spin)
-    ahead = uniform(rng, streams.AHEAD, -limits[1], limits[0])
-    side = uniform(rng, streams.SIDE, -limits[2], limits[2])
+    ahead = sample_component(rng, streams.AHEAD, -limits[1], limits[0], ranges.smallest)
+    side = sample_component(rng, streams.SIDE, -limits[2], limits[2], ranges.smallest)
     if easy:
         return wp.vec3(ahead, side, spin)
     fraction = ahead / wp.where(ahead > 0.0, ranges.last_range[0], ranges.last_range[1])

@@ -1,4 +1,4 @@
-"""Reward terms of velocity tracking (paper, Tables III and IV), as functions of robot, command and parameters.
+"""Reward terms of velocity tracking (paper, Tables II and III), as functions of robot, command and parameters.
 
 Penalties have negative weights in the tasks, unless their values are negative. phi: Gaussian kernel of `mdp.rewards`;
 std: its width, in the unit of its argument.
@@ -6,7 +6,7 @@ std: its width, in the unit of its argument.
 
 import warp as wp
 
-from ..mdp.rewards import phi
+from ..mdp.rewards import phi, torque_sign_changes  # noqa: F401  (saved configurations name it here)
 from ..mdp.view import RobotView
 from .state import VelocityState, velocity_error
 
@@ -53,14 +53,17 @@ def flat_orientation_l2(robot: RobotView, state: VelocityState) -> float:
 
 
 @wp.func
-def standing_posture(robot: RobotView, state: VelocityState, std: float) -> float:
-    """Reward for transversal motors near the default pose when commanded to stand: phi_std of rms offset [rad]."""
+def standing_posture(robot: RobotView, state: VelocityState, std: float, shift: float = 0.0) -> float:
+    """Reward for transversal motors near the default pose plus `shift` [rad] when commanded to stand.
+
+    It is phi_std of the rms offset [rad].
+    """
     if state.standing == 0:
         return 0.0
     total = float(0.0)
     for m in range(12):
         if m % 3 != 0:
-            offset = robot.angle[m] - robot.default_angle[m]
+            offset = robot.angle[m] - robot.default_angle[m] - shift
             total += offset * offset
     return phi(wp.sqrt(total / 8.0), std)
 
@@ -113,6 +116,18 @@ def rapid_stepping(robot: RobotView, state: VelocityState, threshold: float) -> 
 
 
 @wp.func
+def clamped_rapid_stepping(robot: RobotView, state: VelocityState, threshold: float, limit: float) -> float:
+    """Penalty of rapid stepping: sum over paws of exp(max(0, touchdowns in the last 0.75 s - threshold)) - 1.
+
+    limit [1]: largest penalty.
+    """
+    total = float(0.0)
+    for k in range(4):
+        total += wp.exp(wp.max(state.recent_steps[k] - threshold, 0.0)) - 1.0
+    return wp.min(total, limit)
+
+
+@wp.func
 def restless_stand(robot: RobotView, state: VelocityState) -> float:
     """Penalty of lifted paws when commanded to stand. It is the number of paws off the ground, 0 to 4."""
     return float(4 - robot.contacts) * (1.0 - moving(state))
@@ -149,15 +164,6 @@ def touchdown(robot: RobotView, state: VelocityState) -> float:
     total = float(0.0)
     for k in range(4):
         total += robot.first_contact[k] * robot.touchdown_speed[k] * robot.touchdown_speed[k]
-    return total
-
-
-@wp.func
-def torque_sign_changes(robot: RobotView, state: VelocityState) -> float:
-    """Penalty of jerky motor torques. It is the number of motors whose torque changed its sign in a policy step."""
-    total = float(0.0)
-    for m in range(12):
-        total += wp.where(wp.sign(robot.torque[m]) != wp.sign(robot.prev_torque[m]), 1.0, 0.0)
     return total
 
 

@@ -67,7 +67,7 @@ def phi(x, std):
 
 
 def height_kernel(error, params):
-    """Return the height reward of Table III plus a wide Gaussian kernel, for a height error [m]."""
+    """Return the height reward of Table IV plus a wide Gaussian kernel, for a height error [m]."""
     return (
         phi(error, params["std_fine"])
         + 3.0 * np.exp(-np.abs(error) / params["scale_sharp"])

@@ -1,7 +1,7 @@
 """Horizontal jump: one jump to a goal position in the plane, then standing there.
 
-Terms and constants are those of the paper and of its authors' training configuration. `docs/results/paper.md` lists
-all differences, their reasons and how to undo them.
+Terms and constants are based on the paper and its authors' code. `docs/results/departures.csv` has all differences and
+their reasons; `paper.py` is the paper's own task.
 """
 
 from __future__ import annotations
@@ -109,7 +109,7 @@ NEAREST = level((0.2, 0.5), 0.0, next_jump_probability=0.0)  # First level of ev
 
 
 def horizontal_jump() -> TaskCfg:
-    """Return the horizontal jump with the torque limits of the paper's tests: 18 N m, lateral motors 12 N m."""
+    """Return the horizontal jump with torque limits of 18 N m and, for lateral motors, the authors' 12 N m."""
     return TaskCfg(
         name="horizontal-jump",
         state=JumpState,

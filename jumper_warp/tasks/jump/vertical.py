@@ -1,7 +1,7 @@
 """Vertical jump: reach a commanded base height, then land.
 
-Terms and constants are those of the paper and of its authors' training configuration. `docs/results/paper.md` lists
-all differences, their reasons and how to undo them.
+Terms and constants are based on the paper and its authors' code. `docs/results/departures.csv` has all differences and
+their reasons; `paper.py` is the paper's own task.
 """
 
 from __future__ import annotations
@@ -84,7 +84,7 @@ def heights(*pairs: tuple[float, float]) -> tuple[Level, ...]:
 
 
 def vertical_jump() -> TaskCfg:
-    """Return the vertical jump with the torque limits of the paper's tests: 18 N m, lateral motors 10 N m."""
+    """Return the vertical jump with torque limits of 18 N m and, for lateral motors, the authors' 10 N m."""
     return TaskCfg(
         name="vertical-jump",
         state=JumpState,

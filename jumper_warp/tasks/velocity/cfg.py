@@ -40,6 +40,8 @@ class CommandCfg:
     """[1] Probability of a command to turn on the spot."""
     resampling_time_range: Pair = (2.0, 6.0)
     """[s] Time from one command to the next."""
+    smallest: float = 0.0
+    """[m/s], [rad/s] Least magnitude of each sampled component of a command other than to stand."""
 
     struct = CommandRanges
     """Type of the kernel struct that `values` returns."""
@@ -49,6 +51,8 @@ class CommandCfg:
         check_bounds("command", self, dict.fromkeys(("first_range", "last_range"), (-100.0, 100.0, "m/s, rad/s")))
         if not all(0.0 < low <= high for low, high in zip(self.first_range, self.last_range, strict=True)):
             raise InputError(f"command ranges must be positive and grow, got {self.first_range}, {self.last_range}")
+        if not 0.0 <= self.smallest <= min(self.first_range):
+            raise InputError(f"the smallest command must be in 0 to {min(self.first_range)}, got {self.smallest}")
         if self.levels < 0:
             raise InputError(f"command levels must not be negative, got {self.levels}")
         kinds = ("standing_probability", "turn_in_place_probability")

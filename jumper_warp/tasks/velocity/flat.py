@@ -1,6 +1,7 @@
 """Velocity tracking on a plane: walk ahead, back and sideways, and turn, as commanded.
 
-Terms and constants are those of the paper and of its authors' training configuration, with these exceptions. Tracking
+Terms and constants are based on the paper and its authors' code, with these exceptions (`paper.py` is the paper's own
+task). Tracking
 terms have second, narrow kernels, since the wide ones are flat at errors of a few cm/s. Air time has sixteen times the
 weight, which makes the robot trot without short quick steps. The penalty of rapid stepping grows linearly, since the
 clamped exponential has no slope at the start of training. Swing height, slip and touchdown speed have terms. Torques,
@@ -72,7 +73,7 @@ REWARDS = (
     RewardTerm(mdp_rewards.joint_acceleration, -2.0e-7),
     RewardTerm(mdp_rewards.action_rate, -0.08),
     RewardTerm(mdp_rewards.action_acceleration, -0.03),
-    RewardTerm(rewards.torque_sign_changes, -5.0e-3),
+    RewardTerm(mdp_rewards.torque_sign_changes, -5.0e-3),
 )
 
 TERMINATIONS = (
@@ -96,7 +97,7 @@ METRICS = (
 
 
 def velocity_flat() -> TaskCfg:
-    """Return velocity tracking on a plane, with the gains and the 10 N m torque limit of the paper's walking tests."""
+    """Return velocity tracking on a plane, with the gains and the 10 N m torque limit of the authors' code."""
     return TaskCfg(
         name="velocity-flat",
         state=VelocityState,

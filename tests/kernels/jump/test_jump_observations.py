@@ -104,7 +104,7 @@ def noise_samples():
     return raw[..., SCALES > 0.0] / SCALES[SCALES > 0.0], raw
 
 
-def test_noise_has_the_papers_size_and_is_clamped_at_one_sigma(noise_samples):
+def test_noise_is_clamped_at_one_standard_deviation_by_default(noise_samples):
     scaled, raw = noise_samples
     assert not raw[..., SCALES == 0.0].any()  # commanded height, command and last actions have no noise
     assert np.abs(scaled).max() <= 1.0 + 1e-4
@@ -113,6 +113,18 @@ def test_noise_has_the_papers_size_and_is_clamped_at_one_sigma(noise_samples):
     assert np.mean(np.abs(scaled) > 0.9999, axis=(0, 1)) == pytest.approx(0.3173, abs=4.0 * 0.466 / math.sqrt(cells))
     assert scaled.std(axis=(0, 1)) == pytest.approx(math.sqrt(0.5161), abs=4.0 * 0.4 / math.sqrt(cells))
     assert scaled.mean(axis=(0, 1)) == pytest.approx(0.0, abs=4.0 * 0.7184 / math.sqrt(cells))
+
+
+def test_noise_of_the_papers_task_is_gaussian_with_table_vi_as_standard_deviations():
+    task = make_task("vertical-jump-paper")
+    robots, n = Robots(task, 4096), 4096
+    noise = robots.observe(noise=True) - robots.observe()
+    assert not noise[:, :3].any() and not noise[:, 36:].any()  # commanded height, command, height; last actions
+    sizes = np.concatenate([[0.1] * 6, [0.05] * 3, [3.0 * DEG] * 12, [10.0 * DEG] * 12])
+    scaled = noise[:, 3:36] / sizes
+    assert scaled.std(axis=0) == pytest.approx(1.0, abs=4.0 / math.sqrt(2.0 * n))
+    beyond = np.mean(np.abs(scaled) > 2.0)  # 4.55 % of a Gaussian
+    assert beyond == pytest.approx(0.0455, abs=4.0 * math.sqrt(0.0455 / (33 * n)))
 
 
 def correlation(a, b):

@@ -148,3 +148,13 @@ def test_reset_settings_reach_the_kernel_struct_in_policy_steps_and_radians():
     assert values.episode_steps == 300 and values.pace == pytest.approx(1.0 / 30.0)
     assert tuple(values.height) == pytest.approx((0.40, 0.41)) and values.map.rows == 0
     assert values.heading == pytest.approx(np.pi)
+
+
+def test_sampled_commands_of_the_papers_task_keep_away_from_zero():
+    env = walking_env(N, task=make_task("velocity-paper"))
+    env.reset(seed=1)
+    command = np.abs(states_of(env)["command"])
+    moving = command[(command > 0.0).all(axis=1)]
+    assert 0.78 < len(moving) / N < 0.88  # 12 % stand, 5 % turn on the spot
+    assert moving.min() >= 0.12 and moving.max() <= 0.75
+    assert np.histogram(moving, 7, (0.12, 0.75))[0].min() > 0.12 * moving.size

@@ -11,12 +11,13 @@ from jumper_warp.kernels.mdp.view import mat43, vec12
 from jumper_warp.kernels.velocity import rewards
 from jumper_warp.kernels.velocity.state import VelocityState
 from jumper_warp.tasks.velocity.flat import velocity_trot
+from jumper_warp.tasks.velocity.paper import velocity_paper
 from jumper_warp.tasks.velocity.rough import velocity_rough
 from mdp_helpers import DEFAULT_ANGLE
 
 NAMES = """linear_velocity yaw_rate lin_vel_z_l2 ang_vel_xy_l2 flat_orientation_l2 standing_posture lateral_position
-transversal_position air_time rapid_stepping restless_stand foot_clearance slip touchdown torque_sign_changes
-trot_schedule shank_lean"""
+transversal_position air_time rapid_stepping clamped_rapid_stepping restless_stand foot_clearance slip touchdown
+torque_sign_changes trot_schedule shank_lean"""
 reward = Table(functions(rewards, NAMES), float, VelocityState)
 TRANSVERSAL = np.arange(12) % 3 != 0
 N = 16
@@ -100,8 +101,8 @@ EXPECTED = {
     "ang_vel_xy_l2": ({}, lambda r: np.sum(r["ang_vel"][:2] ** 2)),
     "flat_orientation_l2": ({}, lambda r: np.sum(r["projected_gravity"][:2] ** 2)),
     "standing_posture": (
-        {"std": 0.5},
-        lambda r: np.exp(-np.mean(OFF["angle"](r)[TRANSVERSAL] ** 2) / 0.25) * r["standing"],
+        {"std": 0.5, "shift": 0.2},
+        lambda r: np.exp(-np.mean((OFF["angle"](r)[TRANSVERSAL] - 0.2) ** 2) / 0.25) * r["standing"],
     ),
     "lateral_position": (
         {"steepness": 100.0},
@@ -116,6 +117,10 @@ EXPECTED = {
         lambda r: np.sum(r["first_contact"] * (r["air_time"] - 0.25)) * (1 - r["standing"]),
     ),
     "rapid_stepping": ({"threshold": 2.0}, lambda r: np.sum(np.maximum(r["recent_steps"] - 2.0, 0.0))),
+    "clamped_rapid_stepping": (
+        {"threshold": 2.0, "limit": 5.0},
+        lambda r: min(np.sum(np.exp(np.maximum(r["recent_steps"] - 2.0, 0.0)) - 1.0), 5.0),
+    ),
     "restless_stand": ({}, lambda r: np.sum(1.0 - r["contact"]) * r["standing"]),
     "foot_clearance": ({"target_height": 0.07}, lambda r: clearance(r, 0.07)),
     "slip": ({}, lambda r: np.sum(r["contact"] * np.sum(r["paw_vel"][:, :2] ** 2, axis=1))),
@@ -136,9 +141,10 @@ def test_reward_equals_its_numpy_formula(name):
 
 
 def test_expected_covers_every_velocity_reward_of_the_tasks():
-    used = {term.func.func for task in (velocity_rough(), velocity_trot()) for term in task.rewards}
+    tasks = (velocity_rough(), velocity_trot(), velocity_paper())
+    used = {term.func.func for task in tasks for term in task.rewards}
     names = {f.__name__ for f in used if inspect.getmodule(f).__name__ == "jumper_warp.kernels.velocity.rewards"}
-    assert names == set(EXPECTED)
+    assert names | {"torque_sign_changes"} == set(EXPECTED)  # one of those for any task
 
 
 def test_shank_lean_in_the_default_pose_is_that_of_the_geometry():
@@ -154,5 +160,5 @@ def test_shank_lean_in_the_default_pose_is_that_of_the_geometry():
 def test_a_robot_at_rest_in_the_default_pose_gets_full_standing_rewards():
     state = make_state(standing=1)
     assert reward("linear_velocity", make_view(), state, std=0.1) == pytest.approx(1.0)
-    assert reward("standing_posture", make_view(), state, std=0.1) == pytest.approx(1.0)
+    assert reward("standing_posture", make_view(), state, std=0.1, shift=0.0) == pytest.approx(1.0)
     assert vec12(*DEFAULT_ANGLE) == make_view().default_angle

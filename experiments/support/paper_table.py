@@ -1,0 +1,51 @@
+"""Table of the trainings of the paper's tasks beside the paper's results, from their metric files, as Markdown."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from jumper_warp.utils.output import read_values
+from support.paper_runs import ARMS
+
+GAP, NEVER = "not measured", "not reached"
+ROWS = (
+    ("vertical-jump-paper", "0.5–1.2 m, success", "nominal_sweep_goal_reached_rate", "0.91"),
+    ("vertical-jump-paper", "0.5–1.1 m, success", "nominal_sweep_in_range_goal_reached_rate", "1.00"),
+    ("vertical-jump-paper", "mean error [m]", "nominal_sweep_apex_error_abs_mean_m", "0.040"),
+    ("vertical-jump-paper", "steps to 50 % [million]", "steps_to_50_percent", "–"),
+    ("horizontal-jump-paper", "0.3–1.5 m, success", "nominal_straight_goal_reached_rate", "0.97"),
+    ("horizontal-jump-paper", "0.3–1.4 m, success", "nominal_straight_in_range_goal_reached_rate", "1.00"),
+    ("horizontal-jump-paper", "mean error [m]", "nominal_straight_goal_distance_at_end_mean_m", "0.026"),
+    ("horizontal-jump-paper", "grid, success", "nominal_grid_goal_reached_rate", "0.968"),
+    ("horizontal-jump-paper", "grid, mean error [m]", "nominal_grid_goal_distance_at_end_mean_m", "0.025"),
+    ("horizontal-jump-paper", "steps to 50 % [million]", "steps_to_50_percent", "–"),
+    ("velocity-paper", "RMSE ahead [m/s]", "nominal_walk_slewed_rmse_vx_m_s", "0.17"),
+    ("velocity-paper", "RMSE left [m/s]", "nominal_walk_slewed_rmse_vy_m_s", "0.05"),
+    ("velocity-paper", "RMSE yaw rate [rad/s]", "nominal_walk_slewed_rmse_yaw_rate_rad_s", "0.12"),
+    ("velocity-paper", "falls", "nominal_walk_fall_rate", "–"),
+)
+"""Task, words, metric and the paper's value of each row; the paper's walk is one of its robot."""
+
+
+def cell(folder: Path, task: str, arm: str, key: str) -> str:
+    """Return mean and range over the seeds of a metric of an arm; GAP: no seed has it, NEVER: no seed reached it."""
+    files = sorted((folder / task).glob(f"{arm}_*/metrics.json"))
+    seeds = [values for path in files if "curve_steps" in (values := read_values(path.parent))]
+    found = [values[key] for values in seeds if values.get(key) is not None]
+    if not found:
+        return NEVER if seeds and key.startswith("steps") else GAP
+    values = np.array(found) * (1.0e-6 if key.startswith("steps") else 1.0)
+    spread = f" ({values.min():.3g}–{values.max():.3g})" if len(values) > 1 else ""
+    return f"{values.mean():.3g}{spread}, {len(values)} of {len(seeds)} seeds"
+
+
+def results_table(folder: Path) -> str:
+    """Return the table of all arms in a folder of `experiments/paper_trainings.py`."""
+    lines = [f"| task | test | paper | {' | '.join(arm.replace('_', ' ') for arm in ARMS)} |", "|---" * 7 + "|"]
+    for task, words, key, paper in ROWS:
+        arms = ARMS if task != "velocity-paper" else ARMS[:1]
+        cells = [cell(folder, task, arm, key) for arm in arms] + ["–"] * (len(ARMS) - len(arms))
+        lines.append(f"| `{task}` | {words} | {paper} | {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
