@@ -34,8 +34,8 @@ BASES = {
 }  # fmt: skip
 """Task whose numbers a variant has, except in its own rows; empty: none."""
 TRAINING = ("num_envs", "max_iterations", "ppo")
-SKIPPED = ("name", "state", "command", "metrics", "evaluation_suite", "ppo.tf32", "ppo.precision", "ppo.compile",
-           "ppo.graphs", "ppo.fused")  # fmt: skip
+SKIPPED = ("name", "state", "command", "metrics", "evaluation_suite", "ppo.tf32", "ppo.graphs",
+           "ppo.fused")  # fmt: skip
 """Settings without an effect on what is learnt."""
 
 

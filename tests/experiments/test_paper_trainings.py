@@ -98,7 +98,7 @@ def test_the_page_has_the_table_of_the_committed_metrics():
 
 
 def test_an_interrupted_training_continues_and_is_tested(tmp_path):
-    flags = "--num-envs 4 --max-iterations 1 --ppo.num-steps 8 --ppo.minibatches 1 --ppo.compile off"
+    flags = "--num-envs 4 --max-iterations 1 --ppo.num-steps 8 --ppo.minibatches 1"
     args = paper_trainings.Args(tasks=(JUMPS[0],), arms=("no_curriculum",), seeds=(0,), num_jumps=2, save_interval=1,
                                 train_flags=flags, out=tmp_path, device="cpu", threads=1)  # fmt: skip
     folder = tmp_path / JUMPS[0] / "no_curriculum_0"
