@@ -37,7 +37,7 @@ from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.checks import check_count, check_seed
 from jumper_warp.utils.dumps import NonFiniteValue
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.kernels import load_kernels, records
+from jumper_warp.utils.kernels import records
 from jumper_warp.utils.streams import PURPOSES, Purpose
 from jumper_warp.utils.threads import WARP_LOCK, locked
 
@@ -190,9 +190,12 @@ class Env(Stages):
 
     @locked
     def compile(self) -> None:
-        """Compile all kernels of `reset` and `step` in parallel; the first `reset` calls this itself."""
+        """Compile all kernels of `reset` and `step` in parallel; the first `reset` calls this itself.
+
+        Raises InputError: a term's function returns another type than it must.
+        """
         if not self._compiled:
-            load_kernels(self.kernels(), self.wp_device)
+            self._load_kernels()
             self._compiled = True
 
     def _start_over(self, seed: int) -> None:
@@ -257,7 +260,7 @@ class Env(Stages):
         mask = self._array(chosen)
         self._ends_episodes = False
         if not self._started:
-            load_kernels(self.kernels(draws=False), self.wp_device)
+            self._load_kernels(draws=False)
         if self._draws_ground:
             self._scene.ground.blocks.zero_()
         self._advance_rng(mask)

@@ -31,7 +31,7 @@ from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.slices import WorldRange
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.overlay_ranges import RangeMoves
-from jumper_warp.utils.kernels import Kernel
+from jumper_warp.utils.kernels import Kernel, load_kernels
 from jumper_warp.utils.streams import Purpose
 
 BLOCK = 32  # Default threads of a block; small, to spread a few thousand heavy threads over all multiprocessors
@@ -109,6 +109,19 @@ class Stages:
         kernels = [(skill.kernels[name], BLOCKS.get(name, BLOCK)) for skill in self.skills for name in names]
         kernels += [(postprocess_obs_kernel, POSTPROCESS_BLOCK), *((kernel, BLOCK) for kernel in shared)]
         return kernels + self.sim.physics.kernels()
+
+    def _load_kernels(self, draws: bool = True) -> None:
+        """Compile or load the kernels in parallel; draws: as in `kernels`.
+
+        Raises InputError, with file and line: a term's function returns another type than it must. Other errors of a
+        function are Warp's.
+        """
+        try:
+            load_kernels(self.kernels(draws), self.wp_device)
+        except Exception:
+            for task in self.tasks:
+                task.check_returned()
+            raise
 
     def _part(self, worlds: WorldRange | None = None) -> WorldSlice:
         """Return a range of worlds (default: all) with the `EpisodeArrays` that begin at its first world."""
