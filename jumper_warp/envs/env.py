@@ -20,13 +20,14 @@ from jumper_warp.envs.arrays import (
     checked_worlds,
     prepared_tasks,
 )
-from jumper_warp.envs.stages import Stages
+from jumper_warp.envs.stages import Stages, loading_usual_kernels
 from jumper_warp.envs.state import load_state, save_state
 from jumper_warp.kernels.mdp.reset import default_pose_kernel
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.motors import MOTOR_CONSTANTS
 from jumper_warp.robot.overlay import RobotOverlay
+from jumper_warp.sim.dynamics import advance_kernel
 from jumper_warp.sim.simulation import SUBSTEPS, Simulation, SolverName
 from jumper_warp.sim.slices import SlicedGraph
 from jumper_warp.tasks.cfg import Handover, TaskCfg
@@ -37,7 +38,7 @@ from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.checks import check_count, check_seed
 from jumper_warp.utils.dumps import NonFiniteValue
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.kernels import records
+from jumper_warp.utils.kernels import load_kernels, records
 from jumper_warp.utils.streams import PURPOSES, Purpose
 from jumper_warp.utils.threads import WARP_LOCK, locked
 
@@ -90,7 +91,7 @@ class Env(Stages):
         threads: int | None = None,
         refine: int = 1,
     ):
-        """Allocate simulation and arrays; call `reset` before the first step.
+        """Allocate simulation and arrays, and compile most kernels meanwhile; call `reset` before the first step.
 
         stream: purpose of all random numbers; numbers of two purposes differ for any seeds, also after `reset(seed)`.
         randomize, noise: enable domain randomisation, observation noise. auto_reset: reset ended episodes in `step`.
@@ -100,7 +101,8 @@ class Env(Stages):
         (`jumper_warp.tasks.overlay_ranges`). threads: CPU threads, as in `Simulation`.
         refine: factor by which the physics step is shorter than in training.
         Raises InputError (a ValueError): see `checked_tasks` and `Simulation`, num_envs or refine no whole number of at
-        least 1, a seed not in 0 to 2^31 - 1, or no such stream.
+        least 1, a seed not in 0 to 2^31 - 1, no such stream, or a term's function that returns another type than it
+        must, with file and line. Other errors of a function are Warp's.
         """
         check_count("num_envs", num_envs)
         check_count("refine", refine)
@@ -117,13 +119,16 @@ class Env(Stages):
         run, self._draws_ground = prepared_tasks(tasks, randomize, noise, may_vary, robot)
         terrains = [terrain for each in run if (terrain := each.terrain) is not None]
         ground = terrains[0] if terrains else ground
-        self.sim = Simulation(
-            num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=device and str(device),
-            ground=ground, block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,
-            friction=self.task.randomization.nominal_friction, gravity=self.task.gravity, robot=robot, threads=threads,
-            dt=PHYSICS_DT / refine, substeps=SUBSTEPS * refine, keep_momentum=any(each.keep_momentum for each in tasks),
-        )  # fmt: skip
-        self.wp_device = self.sim.device
+        self.wp_device = wp.get_device(device and str(device))
+        physics = [advance_kernel(self.wp_device)] if solver == "jumper" else []
+        with loading_usual_kernels(run, physics, auto_reset, self.wp_device):
+            self.sim = Simulation(
+                num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=self.wp_device, ground=ground,
+                block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,
+                friction=self.task.randomization.nominal_friction, gravity=self.task.gravity, robot=robot,
+                threads=threads, dt=PHYSICS_DT / refine, substeps=SUBSTEPS * refine,
+                keep_momentum=any(each.keep_momentum for each in tasks),
+            )  # fmt: skip
         self.device = torch.device(wp.device_to_torch(self.wp_device))
         if self.wp_device.is_cuda:
             torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(self.wp_device)))
@@ -190,12 +195,9 @@ class Env(Stages):
 
     @locked
     def compile(self) -> None:
-        """Compile all kernels of `reset` and `step` in parallel; the first `reset` calls this itself.
-
-        Raises InputError: a term's function returns another type than it must.
-        """
+        """Compile all kernels of `reset` and `step` in parallel; the first `reset` calls this itself."""
         if not self._compiled:
-            self._load_kernels()
+            load_kernels(self.kernels(), self.wp_device)
             self._compiled = True
 
     def _start_over(self, seed: int) -> None:
@@ -260,7 +262,7 @@ class Env(Stages):
         mask = self._array(chosen)
         self._ends_episodes = False
         if not self._started:
-            self._load_kernels(draws=False)
+            load_kernels(self.kernels(draws=False), self.wp_device)
         if self._draws_ground:
             self._scene.ground.blocks.zero_()
         self._advance_rng(mask)

@@ -66,6 +66,19 @@ def kernel_modules(double: bool = False) -> KernelModules:
     return KernelModules(double)
 
 
+def advance_kernel(
+    device: wp.Device, modules: KernelModules | None = None, by_legs: bool | None = None
+) -> tuple[wp.Kernel, int]:
+    """Return the kernel that advances the physics, and its threads per block.
+
+    modules: default in single precision; by_legs: as in `JumperDynamics.advance`.
+    """
+    modules = modules or kernel_modules()
+    if device.is_cuda if by_legs is None else by_legs:
+        return modules.advance_legs.advance_legs_kernel, 32 if device.is_cuda else 4
+    return modules.advance.advance_kernel, 32 if device.is_cuda else 1
+
+
 def check_model(model: Model) -> None:
     """Raise NotThisRobotError unless every world of a model is this robot, with its labels in the expected order."""
     bodies = ["body"] + [f"{leg}_{link}" for leg in LEGS for link in LINKS]
@@ -338,9 +351,7 @@ class JumperDynamics:
 
     def advance_kernel(self, by_legs: bool | None = None) -> tuple[wp.Kernel, int]:
         """Return the kernel that advances the physics, and its threads per block. by_legs: see `advance`."""
-        if self.device.is_cuda if by_legs is None else by_legs:
-            return self.modules.advance_legs.advance_legs_kernel, 32 if self.device.is_cuda else 4
-        return self.modules.advance.advance_kernel, 32 if self.device.is_cuda else 1
+        return advance_kernel(self.device, self.modules, by_legs)
 
     def advance(
         self, settings: Any, drive: Any, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array,

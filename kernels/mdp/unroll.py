@@ -20,7 +20,7 @@ class _Unroller(ast.NodeTransformer):
     def __init__(self, names: dict[str, Any]) -> None:
         self._names = names
 
-    def visit_For(self, node: ast.For) -> Any:  # noqa: N802 (name of ast's interface)
+    def visit_For(self, node: ast.For) -> Any:
         """Return the statements in place of a loop over a range whose bounds are static."""
         if not isinstance(node.target, ast.Name) or not _uses_in_static(node, node.target.id):
             return self.generic_visit(node)
@@ -44,7 +44,7 @@ class _Substitution(ast.NodeTransformer):
     def __init__(self, name: str, value: int) -> None:
         self._name, self._value = name, value
 
-    def visit_Name(self, node: ast.Name) -> ast.expr:  # noqa: N802
+    def visit_Name(self, node: ast.Name) -> ast.expr:
         """Return the constant in place of the name, any other name unchanged."""
         return ast.copy_location(ast.Constant(self._value), node) if node.id == self._name else node
 

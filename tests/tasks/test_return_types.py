@@ -93,8 +93,7 @@ def test_wrong_annotation_is_refused_at_the_definition(kind, func, message):
 )  # fmt: skip
 def test_wrong_value_without_annotation_is_refused_when_kernels_are_compiled(func, returned):
     task = dataclasses.replace(make_task("vertical-jump"), rewards=(RewardTerm(func, 1.0),))
-    env = Env(task, 1, device="cpu")
     with pytest.raises(InputError) as refusal:
-        env.compile()
+        Env(task, 1, device="cpu")
     message = f"RewardTerm {func.key}: the function must return float, it returns {returned}"
     assert str(refusal.value) == place(func) + message
