@@ -79,9 +79,7 @@ def print_tables(tasks: Sequence[dict[str, Any]], policies: Sequence[PolicySumma
     from jumper_warp.utils.tables import print_table
 
     style: dict[str, Any] = {"box": None, "pad_edge": False, "padding": (0, 2, 0, 0)}
-    table = Table(
-        Column("TASK", no_wrap=True), "what the robot does", Column("its policies", no_wrap=True), **style
-    )  # fmt: skip
+    table = Table(Column("TASK", no_wrap=True), "what the robot does", Column("its policies", no_wrap=True), **style)
     for task in tasks:
         table.add_row(task["name"], task["about"], ",\n".join(task["policies"]))
     print_table(table)

@@ -34,7 +34,8 @@ class DeferredModule(ModuleType):
                 assert isinstance(loader, DeferredLoader)
                 try:
                     loader.loader.exec_module(self)
-                    self.__class__ = ModuleType
+                    module: ModuleType = self
+                    module.__class__ = ModuleType
                 finally:
                     del self._running
         return ModuleType.__getattribute__(self, name)
