@@ -34,7 +34,7 @@ class DeferredModule(ModuleType):
                 assert isinstance(loader, DeferredLoader)
                 try:
                     loader.loader.exec_module(self)
-                    module: ModuleType = self
+                    module: Any = self
                     module.__class__ = ModuleType
                 finally:
                     del self._running
