@@ -15,7 +15,7 @@ import tyro
 
 from jumper_warp.cli.list import describe, size_text
 from jumper_warp.cli.main import parse
-from jumper_warp.utils.metrics import WIDTH
+from jumper_warp.utils.tables import WIDTH
 
 if TYPE_CHECKING:
     from jumper_warp.policies.catalog import PolicySummary

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import sys
 from collections.abc import Sequence
@@ -75,28 +74,24 @@ def describe(policy: PolicySummary) -> dict[str, Any]:
 
 def print_tables(tasks: Sequence[dict[str, Any]], policies: Sequence[PolicySummary]) -> None:
     """Print one table of the tasks and one of the policies, each under a heading."""
-    from rich.console import Console
     from rich.table import Column, Table
 
-    from jumper_warp.utils.metrics import WIDTH
+    from jumper_warp.utils.tables import print_table
 
-    text = io.StringIO()  # rich would exit with 1 where the reader closes a pipe
-    console = Console(file=text, width=WIDTH, highlight=False)
-    table = Table(
-        Column("TASK", no_wrap=True), "what the robot does", Column("its policies", no_wrap=True), box=None,
-        pad_edge=False, padding=(0, 2, 0, 0),
-    )  # fmt: skip
+    style: dict[str, Any] = {"box": None, "pad_edge": False, "padding": (0, 2, 0, 0)}
+    table = Table(Column("TASK", no_wrap=True), "what the robot does", Column("its policies", no_wrap=True), **style)
     for task in tasks:
         table.add_row(task["name"], task["about"], ",\n".join(task["policies"]))
-    console.print(table)
-    console.print()
-    table = Table("POLICY", "its task", *(Column(name, justify="right") for name in ("success", "error", "size")),
-                  box=None, pad_edge=False, padding=(0, 2, 0, 0))  # fmt: skip
+    print_table(table)
+    print()
+    table = Table(
+        "POLICY", "its task", *(Column(name, justify="right") for name in ("success", "error", "size")), **style
+    )
     for policy in policies:
         success = "" if policy.success is None else f"{100.0 * policy.success:.1f} %"
         table.add_row(policy.name, policy.task, success, quantity(policy.error), size_text(policy.size_bytes))
-    console.print(table)
-    print("\n".join(line.rstrip() for line in text.getvalue().splitlines()), LEGEND, sep="\n\n")
+    print_table(table)
+    print("", LEGEND, sep="\n")
 
 
 def quantity(metric: dict[str, Any] | None) -> str:

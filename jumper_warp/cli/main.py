@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Any
 
 from jumper_warp.utils.codegen import codegen_error
 from jumper_warp.utils.errors import InputError, is_out_of_memory, suggestion
+from jumper_warp.utils.startup import prepare_imports
 from jumper_warp.utils.version import __version__
 
 if TYPE_CHECKING:
@@ -72,6 +73,7 @@ def main(argv: Sequence[str] | None = None) -> None:
     if not args:
         print(usage(), file=sys.stderr)
         raise SystemExit(USAGE_ERROR)
+    prepare_imports()
     run_command(lambda: dispatch(args))
 
 

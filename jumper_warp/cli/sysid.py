@@ -167,7 +167,7 @@ def print_result(result: Identification) -> None:
     from rich.table import Table
 
     from jumper_warp.identification.report import starts_line
-    from jumper_warp.utils.metrics import print_table
+    from jumper_warp.utils.tables import print_table
 
     table = Table("parameter", "unit", "description", "identified", "95 % interval", box=None)
     rows = zip(result.parameters, result.values, result.intervals, result.identified, strict=True)

@@ -20,13 +20,14 @@ from jumper_warp.envs.arrays import (
     checked_worlds,
     prepared_tasks,
 )
-from jumper_warp.envs.stages import Stages
+from jumper_warp.envs.stages import Stages, loading_usual_kernels
 from jumper_warp.envs.state import load_state, save_state
 from jumper_warp.kernels.mdp.reset import default_pose_kernel
 from jumper_warp.robot.grounds import BlockCfg
 from jumper_warp.robot.model import PHYSICS_DT
 from jumper_warp.robot.motors import MOTOR_CONSTANTS
 from jumper_warp.robot.overlay import RobotOverlay
+from jumper_warp.sim.dynamics import advance_kernel
 from jumper_warp.sim.simulation import SUBSTEPS, Simulation, SolverName
 from jumper_warp.sim.slices import SlicedGraph
 from jumper_warp.tasks.cfg import Handover, TaskCfg
@@ -92,7 +93,7 @@ class Env(Stages):
         threads: int | None = None,
         refine: int = 1,
     ):
-        """Allocate simulation and arrays; call `reset` before the first step.
+        """Allocate simulation and arrays, and compile most kernels meanwhile; call `reset` before the first step.
 
         stream: purpose of all random numbers; numbers of two purposes differ for any seeds, also after `reset(seed)`.
         randomize, noise: enable domain randomisation, observation noise. auto_reset: reset ended episodes in `step`.
@@ -102,7 +103,8 @@ class Env(Stages):
         (`jumper_warp.tasks.overlay_ranges`). threads: CPU threads, as in `Simulation`.
         refine: factor by which the physics step is shorter than in training.
         Raises InputError (a ValueError): see `checked_tasks` and `Simulation`, num_envs or refine no whole number of at
-        least 1, a seed not in 0 to 2^31 - 1, or no such stream.
+        least 1, a seed not in 0 to 2^31 - 1, no such stream, or a term's function that returns another type than it
+        must, with file and line. Other errors of a function are Warp's.
         """
         check_count("num_envs", num_envs)
         check_count("refine", refine)
@@ -119,13 +121,16 @@ class Env(Stages):
         run, self._draws_ground = prepared_tasks(tasks, randomize, noise, may_vary, robot)
         terrains = [terrain for each in run if (terrain := each.terrain) is not None]
         ground = terrains[0] if terrains else ground
-        self.sim = Simulation(
-            num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=device and str(device),
-            ground=ground, block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,
-            friction=self.task.randomization.nominal_friction, gravity=self.task.gravity, robot=robot, threads=threads,
-            dt=PHYSICS_DT / refine, substeps=SUBSTEPS * refine, keep_momentum=any(each.keep_momentum for each in tasks),
-        )  # fmt: skip
-        self.wp_device = self.sim.device
+        self.wp_device = wp.get_device(device and str(device))
+        physics = [advance_kernel(self.wp_device)] if solver == "jumper" else []
+        with loading_usual_kernels(run, physics, auto_reset, self.wp_device):
+            self.sim = Simulation(
+                num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=self.wp_device, ground=ground,
+                block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,
+                friction=self.task.randomization.nominal_friction, gravity=self.task.gravity, robot=robot,
+                threads=threads, dt=PHYSICS_DT / refine, substeps=SUBSTEPS * refine,
+                keep_momentum=any(each.keep_momentum for each in tasks),
+            )  # fmt: skip
         self.device = torch.device(wp.device_to_torch(self.wp_device))
         if self.wp_device.is_cuda:
             torch.cuda.set_stream(wp.stream_to_torch(wp.get_stream(self.wp_device)))

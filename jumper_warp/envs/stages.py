@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -17,7 +18,7 @@ from jumper_warp.envs.arrays import (
     scene_of,
 )
 from jumper_warp.envs.parameters import robot_parameters
-from jumper_warp.envs.skill import TaskRuntime
+from jumper_warp.envs.skill import TaskRuntime, kernels_of
 from jumper_warp.kernels.mdp import attempts, events
 from jumper_warp.kernels.mdp.actions import action_kernel
 from jumper_warp.kernels.mdp.env import EpisodeArrays, SkillSettings
@@ -31,7 +32,9 @@ from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.slices import WorldRange
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.overlay_ranges import RangeMoves
-from jumper_warp.utils.kernels import Kernel
+from jumper_warp.utils.codegen import explained_fields
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.kernels import Kernel, loading_kernels
 from jumper_warp.utils.streams import Purpose
 
 BLOCK = 32  # Default threads of a block; small, to spread a few thousand heavy threads over all multiprocessors
@@ -39,6 +42,38 @@ BLOCKS = {"reset": 128, "event": 256}  # Threads of a block of task kernels by n
 POSTPROCESS_BLOCK = 256
 EVENT_BLOCKS = 264
 """Largest number of blocks of event kernels. Most threads are idle, and a new block costs more than another pass."""
+
+
+def usual_kernels(tasks: Sequence[TaskCfg], draws: bool) -> list[tuple[Kernel, int]]:
+    """Return the kernels of tasks and of all environments, each with its block size; the slowest compile first.
+
+    draws: include those of `reset`, else those of `evaluation_reset`.
+    """
+    names = ("reset" if draws else "set_command", "step", "observe", "event")
+    shared = [track_kernel, action_kernel, motors_kernel, clear_history_kernel, advance_rng_kernel]
+    kernels = [(kernels_of(task)[name], BLOCKS.get(name, BLOCK)) for name in names for task in tasks]
+    return [*kernels, *((kernel, BLOCK) for kernel in shared), (postprocess_obs_kernel, POSTPROCESS_BLOCK)]
+
+
+@contextmanager
+def loading_usual_kernels(
+    tasks: Sequence[TaskCfg], physics: Sequence[tuple[Kernel, int]], draws: bool, device: wp.Device
+) -> Iterator[None]:
+    """Compile or load `usual_kernels` and kernels of the physics in other threads while the block runs.
+
+    Raises InputError, with file and line: a term's function returns another type than it must, or uses a field that a
+    struct does not have.
+    """
+    with explained_fields({struct: names for task in tasks for struct, names in task.fields.items()}):
+        try:
+            with loading_kernels([*physics, *usual_kernels(tasks, draws)], device):
+                yield
+        except InputError:
+            raise
+        except Exception:
+            for task in tasks:
+                task.check_returned()
+            raise
 
 
 class WorldSlice(NamedTuple):
@@ -100,15 +135,12 @@ class Stages:
         self.sim.physics.parameters_changed()
 
     def kernels(self, draws: bool = True) -> list[tuple[Kernel, int]]:
-        """Return the kernels of `reset` and `step`, each with its block size; draws: include those of `reset`."""
-        shared = [action_kernel, motors_kernel, clear_history_kernel, advance_rng_kernel, track_kernel]
-        shared += [restore_task_kernel] if len(self.skills) > 1 else []
+        """Return the kernels of a reset and of `step`, each with its block size; draws: as in `usual_kernels`."""
+        shared = [restore_task_kernel] if len(self.skills) > 1 else []
         shared += [set_skill_kernel] if self._reset_mask is not self.episodes.done else []
         shared += [kernel for kernel, _, _ in self._handovers]
-        names = [name for name in self.skills[0].kernels if draws or name != "reset"]
-        kernels = [(skill.kernels[name], BLOCKS.get(name, BLOCK)) for skill in self.skills for name in names]
-        kernels += [(postprocess_obs_kernel, POSTPROCESS_BLOCK), *((kernel, BLOCK) for kernel in shared)]
-        return kernels + self.sim.physics.kernels()
+        kernels = usual_kernels([skill.task for skill in self.skills], draws)
+        return [*kernels, *((kernel, BLOCK) for kernel in shared), *self.sim.physics.kernels()]
 
     def _part(self, worlds: WorldRange | None = None) -> WorldSlice:
         """Return a range of worlds (default: all) with the `EpisodeArrays` that begin at its first world."""

@@ -63,6 +63,7 @@ def build_model(
     requires_grad: bool = False,
     visuals: bool = True,
     extras: Extras | None = None,
+    mujoco: bool = True,
 ) -> Model:
     """Return a Newton model of `num_worlds` robots, standing in the default pose; labels start with `world_i/`.
 
@@ -78,6 +79,8 @@ def build_model(
             `builder.body_label.index("FL_inner_shank")`. Sites and shapes that do not collide work with every solver.
             Colliding shapes and obstacles (body -1) act in Newton's solvers; SolverJumper ignores them with a warning.
             SolverJumper refuses bodies, joints and particles.
+        mujoco: Whether to add the attributes of SolverMuJoCo. Without them that solver, which takes a second to
+            import, is not imported.
 
     Raises:
         InputError: `num_worlds` no whole number above 0, `friction` not in 0 to 10, `gravity` not in 0 to 100, or an
@@ -90,9 +93,8 @@ def build_model(
     check_gravity(gravity)
     init_warp()
     description = load_description() if description is None else description
-    builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
-    newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
-    robot = _robot_builder(description, friction, gravity, visuals)
+    builder = _empty_builder(gravity, mujoco)
+    robot = _robot_builder(description, friction, _empty_builder(gravity, mujoco), visuals)
     if extras is not None:
         extras(robot)
     builder.replicate(robot, num_worlds, label_prefixes=[f"world_{i}" for i in range(num_worlds)])
@@ -157,12 +159,24 @@ def _paw_depth(leg: LegDimensions, lateral: float, ankle_z: float) -> float:
     return leg.paw_radius - math.cos(lateral) * ankle_z - leg.side * math.sin(lateral) * ankle_y
 
 
-def _robot_builder(
-    description: RobotDescription, friction: float, gravity: float, visuals: bool
-) -> newton.ModelBuilder:
-    """Return a Newton builder of one robot in the default pose; friction [1] of the paws; gravity [m/s^2]: downward."""
+def _empty_builder(gravity: float, mujoco: bool) -> newton.ModelBuilder:
+    """Return a Newton builder without bodies; gravity [m/s^2]: downward; mujoco: as in `build_model`."""
     builder = newton.ModelBuilder(gravity=(0.0, 0.0, -gravity))
-    newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+    if mujoco:
+        newton.solvers.SolverMuJoCo.register_custom_attributes(builder)
+    return builder
+
+
+def _contact_attributes(builder: newton.ModelBuilder) -> dict[str, Any]:
+    """Return the attributes of a colliding shape for SolverMuJoCo; none if the builder lacks them."""
+    name = "mujoco:geom_solimp"
+    return {name: CONTACT_IMPEDANCE} if builder.has_custom_attribute(name) else {}
+
+
+def _robot_builder(
+    description: RobotDescription, friction: float, builder: newton.ModelBuilder, visuals: bool
+) -> newton.ModelBuilder:
+    """Add one robot in the default pose to an empty Newton builder, and return it; friction [1] of the paws."""
     bodies = {}
     for link in description.links:
         bodies[link.name] = builder.add_link(
@@ -238,7 +252,7 @@ def _add_paw(
         radius=paw.size[0],
         cfg=config,
         label=label,
-        custom_attributes={"mujoco:geom_solimp": CONTACT_IMPEDANCE},
+        custom_attributes=_contact_attributes(builder),
     )
 
 
@@ -274,7 +288,7 @@ def _add_ground(builder: newton.ModelBuilder, ground: str | newton.Heightfield |
         "cfg": config,
         "color": GROUND_COLOR,
         "label": "ground",
-        "custom_attributes": {"mujoco:geom_solimp": CONTACT_IMPEDANCE},
+        "custom_attributes": _contact_attributes(builder),
     }
     if isinstance(ground, newton.Heightfield):
         builder.add_shape_heightfield(heightfield=ground, **common)

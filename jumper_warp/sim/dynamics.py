@@ -5,8 +5,9 @@ In single or double precision.
 
 from __future__ import annotations
 
+import functools
 import importlib
-from types import ModuleType, SimpleNamespace
+from types import ModuleType
 from typing import Any
 
 import newton
@@ -39,15 +40,43 @@ class NotThisRobotError(InputError):
     """Error raised for a Newton model whose bodies, joints or shapes are not those of this robot."""
 
 
-def kernel_modules(double: bool = False) -> SimpleNamespace:
-    """Return the Warp kernel modules of the robot's dynamics, compiled in single or double precision.
+class KernelModules:
+    """Warp kernel modules of the robot's dynamics, in single or double precision.
 
-    Each is an attribute, named after the module, for those in `KERNEL_MODULES`.
+    Each is an attribute, named after the module, for those in `KERNEL_MODULES`; it is imported at its first use.
     """
-    package = float64_kernels().__name__ if double else "jumper_warp.kernels"
-    return SimpleNamespace(
-        **{name.split(".")[-1]: importlib.import_module(f"{package}.{name}") for name in KERNEL_MODULES}
-    )
+
+    def __init__(self, double: bool = False) -> None:
+        """Import no module yet; double: whether the kernels compute in float64."""
+        self._package = float64_kernels().__name__ if double else "jumper_warp.kernels"
+
+    def __getattr__(self, name: str) -> Any:
+        """Import a kernel module and keep it. Raises AttributeError: there is no such module."""
+        for path in KERNEL_MODULES:
+            if path.split(".")[-1] == name:
+                module = importlib.import_module(f"{self._package}.{path}")
+                setattr(self, name, module)
+                return module
+        raise AttributeError(f"no kernel module {name!r}")
+
+
+@functools.cache
+def kernel_modules(double: bool = False) -> KernelModules:
+    """Return the kernel modules of the robot's dynamics; double: whether in float64."""
+    return KernelModules(double)
+
+
+def advance_kernel(
+    device: wp.Device, modules: KernelModules | None = None, by_legs: bool | None = None
+) -> tuple[wp.Kernel, int]:
+    """Return the kernel that advances the physics, and its threads per block.
+
+    modules: default in single precision; by_legs: as in `JumperDynamics.advance`.
+    """
+    modules = modules or kernel_modules()
+    if device.is_cuda if by_legs is None else by_legs:
+        return modules.advance_legs.advance_legs_kernel, 32 if device.is_cuda else 4
+    return modules.advance.advance_kernel, 32 if device.is_cuda else 1
 
 
 def check_model(model: Model) -> None:
@@ -140,7 +169,7 @@ def ground_struct(model: Model, shape: int, ground_module: ModuleType) -> Any:
     return ground
 
 
-def block_array(cfg: BlockCfg | None, num_worlds: int, modules: SimpleNamespace, device: wp.DeviceLike) -> wp.array:
+def block_array(cfg: BlockCfg | None, num_worlds: int, modules: KernelModules, device: wp.DeviceLike) -> wp.array:
     """Return the sliding blocks of all worlds as an array of structs for the kernels, at rest at their starts.
 
     Shape (num_worlds,), or (0,) if cfg is None.
@@ -322,9 +351,7 @@ class JumperDynamics:
 
     def advance_kernel(self, by_legs: bool | None = None) -> tuple[wp.Kernel, int]:
         """Return the kernel that advances the physics, and its threads per block. by_legs: see `advance`."""
-        if self.device.is_cuda if by_legs is None else by_legs:
-            return self.modules.advance_legs.advance_legs_kernel, 32 if self.device.is_cuda else 4
-        return self.modules.advance.advance_kernel, 32 if self.device.is_cuda else 1
+        return advance_kernel(self.device, self.modules, by_legs)
 
     def advance(
         self, settings: Any, drive: Any, q: wp.array, qd: wp.array, q_out: wp.array, qd_out: wp.array,

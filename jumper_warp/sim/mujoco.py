@@ -1,5 +1,7 @@
 """Newton's MuJoCo solver with settings for this robot."""
 
+from __future__ import annotations
+
 import math
 
 import newton

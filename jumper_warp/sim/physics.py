@@ -8,7 +8,6 @@ from typing import Any
 import newton
 import warp as wp
 from newton import ModelFlags
-from newton.sensors import SensorContact
 
 from jumper_warp.kernels.actuation.motors import motor_torque_kernel
 from jumper_warp.kernels.actuation.passive import passive_torque_kernel
@@ -195,7 +194,7 @@ class MujocoPhysics(Physics):
                 model, rigid_contact_max=self.solver.get_max_contact_count(), soft_contact_max=0
             )
             self._contacts = pipeline.contacts()
-            self._sensor = SensorContact(model, sensing_shapes="*_paw", request_contact_attributes=False)
+            self._sensor = newton.sensors.SensorContact(model, sensing_shapes="*_paw", request_contact_attributes=False)
             self._observables = self.solver.observables({"contact_f"}, contacts=self._contacts)
 
     def advance(

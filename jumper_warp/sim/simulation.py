@@ -101,7 +101,7 @@ class Simulation:
         threads = checked_threads(threads)
         self.model = build_model(
             num_worlds, ground=ground, friction=friction, gravity=gravity, visuals=visuals, extras=extras,
-            device=device,
+            device=device, mujoco=solver == "mujoco",
         )  # fmt: skip
         self.device, self.num_worlds, self.block = self.model.device, num_worlds, block
         self.dt, self.substeps = dt, substeps

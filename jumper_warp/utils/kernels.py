@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from functools import partial
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
@@ -11,7 +12,7 @@ import warp as wp
 from numpy.typing import NDArray
 
 from jumper_warp.utils.progress import phase
-from jumper_warp.utils.threads import available_threads, run_in_parallel
+from jumper_warp.utils.threads import available_threads
 
 if TYPE_CHECKING:  # Warp annotates its decorators as if they returned the decorated function
     Function = wp.Function | Callable[..., Any]
@@ -26,11 +27,32 @@ def records(structs: wp.array) -> NDArray[np.void]:
 
 
 def load_kernels(kernels: Iterable[tuple[Kernel, int]], device: wp.Device) -> None:
-    """Compile the modules of kernels in parallel, or load them from Warp's cache on disk.
+    """Compile the modules of kernels in parallel, or load them from Warp's cache; arguments as `loading_kernels`."""
+    with loading_kernels(kernels, device):
+        pass
 
-    kernels: pairs of a kernel and its launch's threads per block (ignored on a CPU). Compiler errors propagate.
+
+@contextmanager
+def loading_kernels(kernels: Iterable[tuple[Kernel, int]], device: wp.Device) -> Iterator[None]:
+    """Compile the modules of kernels, or load them from Warp's cache, in other threads while the block runs.
+
+    The block must launch none of them. At its end this thread compiles too, until all are loaded. kernels: pairs of a
+    kernel and its launch's threads per block (ignored on a CPU). Compiler errors propagate.
     """
     variants = {(kernel.module, block if device.is_cuda else None): None for kernel, block in kernels}
-    loads = [partial(wp.force_load, device, [module], block, 0) for module, block in variants]
-    with phase("compiling or loading kernels"):
-        run_in_parallel(loads, available_threads())
+    remaining = iter(list(variants))
+
+    def load() -> None:
+        for module, block in remaining:
+            wp.force_load(device, [module], block, 0)
+
+    with phase("compiling or loading kernels"), ThreadPoolExecutor(max(1, available_threads() - 1)) as pool:
+        workers = [pool.submit(load) for _ in range(min(len(variants), max(1, available_threads() - 1)))]
+        try:
+            yield
+            load()
+            for worker in workers:
+                worker.result()
+        finally:
+            for _ in remaining:  # skip the rest after an error
+                pass

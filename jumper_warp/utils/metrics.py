@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import re
 import textwrap
 from collections.abc import Callable, Iterable, Mapping
@@ -10,8 +9,9 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike
-from rich.console import Console
 from rich.table import Column, Table
+
+from jumper_warp.utils.tables import WIDTH, print_table
 
 Scalar = float | int | str | bool | None  # Type of a value, or of each item of a list of values
 UNITS = {
@@ -35,7 +35,6 @@ Metrics = dict[str, MetricValue]  # Metrics by key
 Z = 1.959964  # [1] Two-sided 95 % quantile of the normal distribution
 RESAMPLES, BOOTSTRAP_SEED = 2000, 0  # Number of bootstrap samples of each mean, and seed of their draws
 BATCH = 4_000_000  # Number of values drawn at once, which limits the memory
-WIDTH = 80  # Characters in a line of a printed table
 
 
 class Outcome(Protocol):
@@ -176,13 +175,6 @@ def print_metrics(
     print_table(table)
     for key, value in lists.items():
         print(textwrap.fill(f"{key}: {format_value(value)}", WIDTH))
-
-
-def print_table(table: Table) -> None:
-    """Print a table of at most WIDTH characters a line; a closed pipe raises BrokenPipeError."""
-    text = io.StringIO()  # rich itself exits with 1 when the reader closes the pipe
-    Console(file=text, width=WIDTH, highlight=False).print(table)
-    print("\n".join(line.rstrip() for line in text.getvalue().splitlines()))
 
 
 def format_value(value: Any) -> str:

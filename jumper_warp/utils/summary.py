@@ -13,8 +13,9 @@ from typing import Any
 import tyro
 from rich.table import Column, Table
 
-from jumper_warp.utils.metrics import WIDTH, MetricValue, format_value, print_metrics, print_table, split_unit
+from jumper_warp.utils.metrics import MetricValue, format_value, print_metrics, split_unit
 from jumper_warp.utils.output import read_metrics
+from jumper_warp.utils.tables import WIDTH, print_table
 
 KINDS = {"picture": (".png", ".webp"), "film": (".mp4", ".gif"), "recording": (".rrd",), "folder": ("",)}
 """Ends of the names of files by kind, in the order of the summary."""

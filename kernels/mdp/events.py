@@ -6,6 +6,7 @@ from .env import EpisodeArrays
 from .options import FAST
 from .parameters import RobotParameters
 from .random import EVENT, INTERVAL, RngStream, make_stream, uniform
+from .unroll import unrolled
 
 STARTUP, AT_RESET, AT_STEP = 0, 1, 2  # stages at which `event_kernel` is launched
 LANES = 8  # Threads of a GPU that share the loops of an event
@@ -25,7 +26,6 @@ def make_event_kernel(slots: list) -> wp.Kernel:
     """Return the kernel that runs a task's events; slots: its `jumper_warp.tasks.params.TermSlot`s of events."""
     modes = [MODES[slot.mode] for slot in slots]
 
-    @wp.kernel(module="unique", module_options=FAST)
     def event_kernel(
         # in
         skill: int,
@@ -78,4 +78,4 @@ def make_event_kernel(slots: list) -> wp.Kernel:
                     else:
                         wp.static(slots[i].func)(robot, rng, *p[wp.static(slots[i].start) : wp.static(slots[i].stop)])
 
-    return event_kernel
+    return wp.kernel(unrolled(event_kernel), module="unique", module_options=FAST)

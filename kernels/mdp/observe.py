@@ -10,6 +10,7 @@ from .non_finite import NonFinite, record_non_finite
 from .options import FAST, kernel_name
 from .parameters import RobotParameters
 from .random import OBSERVATION, normal, step_key, stream_at
+from .unroll import unrolled
 from .view import RobotArrays, load_view
 
 wp.set_module_options(FAST)
@@ -98,7 +99,6 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
     reads_ground = [kind is RobotArrays for kind in input_types]
     rows = [sum(slot.term.width for slot in slots[:i]) for i in range(len(slots))]
 
-    @wp.kernel(name=kernel_name("observe_kernel", task.state), module="unique", module_options=FAST)
     def observe_kernel(
         # in
         skill: int,
@@ -154,7 +154,8 @@ def make_observe_kernel(task: Any) -> wp.Kernel:
                         states, found_states,
                     )  # fmt: skip
 
-    return observe_kernel
+    name = kernel_name("observe_kernel", task.state)
+    return wp.kernel(unrolled(observe_kernel), name=name, module="unique", module_options=FAST)
 
 
 @wp.func

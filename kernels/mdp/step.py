@@ -9,6 +9,7 @@ from . import terminations
 from .env import BEGUN, Counters, EpisodeArrays
 from .non_finite import NonFinite, record_non_finite
 from .options import FAST, kernel_name
+from .unroll import unrolled
 from .view import RobotArrays, has_diverged, is_finite, load_view
 
 NOT_TERMINATED = wp.constant(-1)  # `EpisodeArrays.termination` of an episode that has not ended
@@ -73,7 +74,6 @@ def make_step_kernel(task: Any) -> wp.Kernel:
     diverged_ending = [slot.func for slot in endings].index(terminations.diverged)
     floor = task.reward_floor
 
-    @wp.kernel(name=kernel_name("step_kernel", task.state), module="unique", module_options=FAST)
     def step_kernel(
         # in
         skill: int,
@@ -183,4 +183,5 @@ def make_step_kernel(task: Any) -> wp.Kernel:
                         found, i, value, world, episode, arrays, observed, term_value, states, found_states
                     )
 
-    return step_kernel
+    name = kernel_name("step_kernel", task.state)
+    return wp.kernel(unrolled(step_kernel), name=name, module="unique", module_options=FAST)

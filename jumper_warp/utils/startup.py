@@ -1,0 +1,77 @@
+"""Faster start of a command's process: fewer garbage collections, and imports of Newton's unused parts deferred."""
+
+from __future__ import annotations
+
+import gc
+import sys
+from importlib.abc import Loader, MetaPathFinder
+from importlib.machinery import ModuleSpec, PathFinder
+from threading import RLock
+from types import ModuleType
+from typing import Any
+
+DEFERRED = frozenset(f"newton.{name}" for name in ("actuators", "controllers", "ik", "selection", "sensors", "viewer"))
+"""Modules that `import newton` imports and few commands need; `newton.viewer` imports the Rerun SDK."""
+COLLECTION_THRESHOLD = 50_000
+"""Surplus of allocated objects that starts a garbage collection. Imports allocate millions of objects that stay."""
+
+
+class DeferredModule(ModuleType):
+    """Module that is executed at the first access to a name that it lacks until then.
+
+    Unlike with `importlib.util.LazyLoader`, `__file__` and other names of the import system do not execute it:
+    `inspect` and PyTorch read those of all modules.
+    """
+
+    _lock, _running = RLock(), False
+
+    def __getattr__(self, name: str) -> Any:
+        """Execute the module, and return the attribute. Raises AttributeError: the module has no such name."""
+        with DeferredModule._lock:
+            if type(self) is DeferredModule and not self._running:
+                self._running = True
+                loader = self.__spec__.loader if self.__spec__ else None
+                assert isinstance(loader, DeferredLoader)
+                try:
+                    loader.loader.exec_module(self)
+                    module: Any = self
+                    module.__class__ = ModuleType
+                finally:
+                    del self._running
+        return ModuleType.__getattribute__(self, name)
+
+
+class DeferredLoader(Loader):
+    """Loader that turns a module into a `DeferredModule` instead of executing it by its own loader."""
+
+    def __init__(self, loader: Loader) -> None:
+        self.loader = loader
+
+    def create_module(self, spec: ModuleSpec) -> ModuleType | None:
+        """Return what the module's own loader returns, None for a usual module."""
+        return self.loader.create_module(spec)
+
+    def exec_module(self, module: ModuleType) -> None:
+        """Make the module a `DeferredModule`, whose names of the import system are set already."""
+        module.__class__ = DeferredModule
+
+
+class DeferredFinder(MetaPathFinder):
+    """Finder of the modules in `DEFERRED`."""
+
+    def find_spec(self, fullname: str, path: Any = None, target: ModuleType | None = None) -> ModuleSpec | None:
+        """Return the specification of a deferred module, None for any other module."""
+        spec = PathFinder.find_spec(fullname, path, target) if fullname in DEFERRED else None
+        if spec is not None and spec.loader is not None:
+            spec.loader = DeferredLoader(spec.loader)
+        return spec
+
+
+def prepare_imports() -> None:
+    """Defer imports of Newton's unused parts and collect garbage less often, for the rest of this process.
+
+    Call it in a process of a command, before its imports.
+    """
+    gc.set_threshold(COLLECTION_THRESHOLD)
+    if not any(isinstance(finder, DeferredFinder) for finder in sys.meta_path):
+        sys.meta_path.insert(0, DeferredFinder())
