@@ -41,8 +41,8 @@ repository_pages = {
 }
 
 extensions = [
-    "myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton", "sphinx_design", "api_pages", "mathml", "repository",
-    "units",
+    "myst_parser", "sphinx.ext.autodoc", "sphinx_copybutton", "sphinx_design", "api_pages", "mathml", "navigation",
+    "repository", "units",
 ]  # fmt: skip
 exclude_patterns = ["_build", "_generated", "_ext"]
 source_suffix = {".md": "markdown", ".rst": "restructuredtext"}
