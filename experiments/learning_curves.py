@@ -91,7 +91,8 @@ def main(args: Args) -> dict[str, Any]:
             write_metrics(folder, values)
             plot_curves(curves, folder / "learning_curves.png")
     if len(args.variants) == 2 and len(args.seeds) > 1:
-        values |= compare(*curves.values())
+        first, second = curves.values()
+        values |= compare(first, second)
         write_metrics(folder, values)
     keys = [key for key in values if key.startswith(("success_", "seconds_to_95_percent_", "p_"))]
     return report(args, folder, values, f"Learning curves of {TASK}, {args.num_envs:,} environments", keys)
