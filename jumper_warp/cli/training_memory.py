@@ -22,7 +22,7 @@ from jumper_warp.utils.threads import checked_threads
 NUM_ACTIONS = 12  # motors
 BUILD_BYTES: dict[SolverName, int] = {"jumper": 70_000, "mujoco": 112_000}
 """[byte] Main memory for each world while the environment is built (`experiments/measure_memory.py`)."""
-ENV_BYTES: dict[SolverName, int] = {"jumper": 25_750, "mujoco": 71_400}
+ENV_BYTES: dict[SolverName, int] = {"jumper": 23_400, "mujoco": 71_400}
 """[byte] Device memory of the environment's arrays for each world, measured likewise."""
 RECORD_BYTES = 73_000
 """[byte] Memory for the first non-finite values of a task's terms, for each thread of a CPU, or once on a GPU."""

@@ -223,8 +223,8 @@ def _object(saved: dict[str, Any], hint: Any, where: str, find: Finder) -> Any:
 def _term(kind: type[Term], saved: dict[str, Any], where: str, find: Finder) -> Term:
     """Return a term of class `kind` from its saved function, numbers and options. Raises TaskError."""
     func = _value(saved.pop("func", None), wp.Function, where, find)
-    name = saved.get("name", "")
-    if not isinstance(name, str) or (name and not NAME.fullmatch(name)):
+    name = saved.get("name")
+    if "name" in saved and (not isinstance(name, str) or not NAME.fullmatch(name)):
         raise TaskError(f"{where}: a name may contain letters, digits, _ . - and spaces, got {shown(name)}")
     for key, default in kind.options.items():
         if key not in saved:

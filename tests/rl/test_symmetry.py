@@ -62,10 +62,10 @@ def test_symmetric_forward_and_backward_agree_with_autograd():
     mean = 0.5 * (output + image)
     expected = torch.autograd.grad(mean, list(model.actor.parameters()), grad)
     wide = torch.nn.functional.pad(x, (0, actor.layers.weights[0].shape[1] - NUM_OBS))
-    *outputs, layer_inputs = actor.forward(wide, torch.float32)
+    *outputs, layer_inputs = actor.forward(wide)
     for result, reference in zip(outputs, (mean, output - image), strict=True):
         torch.testing.assert_close(result, reference, atol=1e-5, rtol=1e-5)
-    first, *others = actor.backward(layer_inputs, grad, torch.float32)
+    first, *others = actor.backward(layer_inputs, grad)
     for gradient, reference in zip((first[:, :NUM_OBS], *others), expected, strict=True):
         torch.testing.assert_close(gradient, reference, atol=1e-4, rtol=1e-4)
 
