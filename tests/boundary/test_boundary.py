@@ -27,6 +27,7 @@ HARMLESS = {
     ("task", "levels"): "levels may repeat",
     ("task", "randomization"): "null means that a parameter is not randomised",
     ("task", "metrics"): "metrics may be null or repeat",
+    ("task", "evaluation_suite"): "an unknown suite is refused when a policy is evaluated",
 }
 """Reason by reader and file or dotted entry, without indices of lists; it holds for the entries inside, too."""
 SYSTEMATIC = ["policy", "manifest", "deploy", "overlay", "script", "npz", "csv", "checkpoint"]
