@@ -17,10 +17,11 @@ def titles(env: BuildEnvironment) -> dict[str, nodes.bullet_list]:
     found = {}
     for page, contents in env.tocs.items():
         found[page] = contents
-        if len(contents) == 1 and len(contents[0]) > 1:  # as Sphinx's option titles_only
+        children = contents[0].children if len(contents) == 1 else []
+        if len(children) > 1:  # as Sphinx's option titles_only
             lists = [each.deepcopy() for each in contents[0].findall(addnodes.toctree)]
             below = [nodes.bullet_list("", *lists)] if lists else []
-            found[page] = nodes.bullet_list("", nodes.list_item("", contents[0][0].deepcopy(), *below))
+            found[page] = nodes.bullet_list("", nodes.list_item("", children[0].deepcopy(), *below))
     return found
 
 
