@@ -23,11 +23,26 @@ HARMLESS = {
     ("csv", "torque_limit"): "as of npz",
     ("csv", "walk.json"): "a table needs no file of settings",
     ("checkpoint", "iteration_000007.pt.score"): "a score orders the checkpoints of a run; here is only one",
+    ("description", "poses.nominal"): "only the default pose is needed",
     ("task", "reward_floor"): "null means that the reward has no floor",
     ("task", "levels"): "levels may repeat",
     ("task", "randomization"): "null means that a parameter is not randomised",
     ("task", "metrics"): "metrics may be null or repeat",
     ("task", "evaluation_suite"): "an unknown suite is refused when a policy is evaluated",
+    ("task", "reset.settings.ground"): "the vertical jump stands on flat ground",
+    ("task", "curriculum.unit"): "a label of the log",
+    **{
+        ("task", f"{part}name"): "names are free: they label logs and flags"
+        for part in (
+            "",
+            "advance.",
+            "curriculum.",
+            "rewards.",
+            "terminations.",
+            "observations.actor.",
+            "observations.critic.",
+        )
+    },
 }
 """Reason by reader and file or dotted entry, without indices of lists; it holds for the entries inside, too."""
 SYSTEMATIC = ["policy", "manifest", "deploy", "overlay", "script", "npz", "csv", "checkpoint"]
