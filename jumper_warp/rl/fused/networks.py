@@ -143,8 +143,8 @@ class FusedNetwork:
         self._padded = tuple(power_of_two(layer.outputs) for layer in layers)
         self._gradient_tiles = gradient_tiles(layers)
         width = self._padded[0] // self._rows_per_sample
-        fits = max(width, *self._padded[1:]) <= MAX_WIDTH and (not mirrored or self._padded[0] == layers[0].outputs)
-        self._whole = fits
+        filled = self._padded[0] == layers[0].outputs or not mirrored
+        self._whole = filled and max(width, *self._padded[1:]) <= MAX_WIDTH
         """Whether one kernel evaluates all layers; a mirrored first layer must fill its padding."""
 
     @property
@@ -179,7 +179,7 @@ class FusedNetwork:
         count, gradients, outputs = self._rows_per_sample * rows, tuple(self._gradients), tuple(self._outputs)
         if self._whole:
             launch(kernels.network_backward, (blocks(count, 64),))(
-                gradients, self._weights, outputs, count, self._places, self._padded, 64
+                gradients[::-1], self._weights, outputs[::-1], count, self._places[::-1], self._padded[::-1], 64
             )
         else:
             for i in reversed(range(1, len(self._layers))):

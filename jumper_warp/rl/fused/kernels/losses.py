@@ -1,0 +1,122 @@
+"""The policy's mean action, and the losses of actor and critic with their gradients."""
+
+import triton
+import triton.language as tl
+
+from jumper_warp.rl.fused.kernels.scalar import HALF_LOG_TAU
+
+
+@triton.jit
+def policy_mean(output, mirror, row, action, mask, width, MIRROR: tl.constexpr):
+    """Return the policy's mean action and f(x) - N f(M x) for rows of the network's output; (len(row), len(action)).
+
+    MIRROR: rows 2 i and 2 i + 1 of `output` are f(x) and f(M x) of row i; mirror: (2, width) order and signs of N.
+    """
+    if MIRROR:
+        order = tl.load(mirror + action).to(tl.int32)
+        sign = tl.load(mirror + width + action)
+        base = output + (2 * row).to(tl.int64)[:, None] * width
+        direct = tl.load(base + action[None, :], mask=mask, other=0.0)
+        image = tl.load(base + width + order[None, :], mask=mask, other=0.0) * sign[None, :]
+        return 0.5 * (direct + image), direct - image
+    mean = tl.load(output + row.to(tl.int64)[:, None] * width + action[None, :], mask=mask, other=0.0)
+    return mean, tl.zeros_like(mean)
+
+
+@triton.jit
+def actor_loss(
+    output, mirror, samples, sample_width, index, log_std, old_log_std, entropy_coef, grad_output, noise_partial,
+    loss_partial, stride, rows, rows_per_split, num_actions, clip, MIRROR: tl.constexpr, WIDTH: tl.constexpr,
+    BM: tl.constexpr,
+):  # fmt: skip
+    """Write the gradients of `ppo.actor_gradient`'s loss with respect to output and noise, and the losses.
+
+    output, grad_output: (rows, WIDTH), twice the rows with MIRROR, as in `policy_mean`. samples: (…, sample_width), of
+    which the rows `index` are taken. noise_partial: (num_actions,) and loss_partial: surrogate, -, entropy, asymmetry,
+    KL, sums over each split as in `weight_gradient`.
+    """
+    split, action = tl.program_id(0), tl.arange(0, WIDTH)
+    first = split * rows_per_split
+    last = tl.minimum(first + rows_per_split, rows)
+    used = action < num_actions
+    new, old = tl.load(log_std + action, mask=used, other=0.0), tl.load(old_log_std + action, mask=used, other=0.0)
+    precision = tl.exp(-new)
+    grad_noise = tl.zeros((WIDTH,), tl.float32)
+    surrogate, asymmetry, kl = tl.zeros((BM,), tl.float32), tl.zeros((BM,), tl.float32), tl.zeros((BM,), tl.float32)
+    for start in range(first, last, BM):
+        row = start + tl.arange(0, BM)
+        inside = row < last
+        mask = inside[:, None] & used[None, :]
+        mean, difference = policy_mean(output, mirror, row, action, mask, WIDTH, MIRROR)
+        sample = samples + tl.load(index + row, mask=inside, other=0) * sample_width
+        chosen = tl.load(sample[:, None] + action[None, :], mask=mask, other=0.0)
+        old_mean = tl.load(sample[:, None] + num_actions + action[None, :], mask=mask, other=0.0)
+        old_log_prob = tl.load(sample + 2 * num_actions, mask=inside, other=0.0)
+        advantage = tl.load(sample + 2 * num_actions + 2, mask=inside, other=0.0)
+        z = tl.where(mask, (chosen - mean) * precision[None, :], 0.0)
+        log_prob = tl.sum(tl.where(mask, -0.5 * z * z - new[None, :] - HALF_LOG_TAU, 0.0), 1)
+        ratio = tl.exp(log_prob - old_log_prob)
+        objective = advantage * ratio
+        clipped = advantage * tl.minimum(tl.maximum(ratio, 1.0 - clip), 1.0 + clip)
+        grad = tl.where(inside & (objective <= clipped), -objective / rows, 0.0)
+        grad = tl.where(objective == objective, grad, objective)  # NaN must reach the gradient, which is then skipped
+        grad_noise += tl.sum(tl.where(mask, grad[:, None] * (z * z - 1.0), 0.0), 0)
+        grad_mean = grad[:, None] * z * precision[None, :]
+        if MIRROR:
+            order = tl.load(mirror + action).to(tl.int32)
+            sign = tl.load(mirror + WIDTH + action)
+            place = grad_output + (2 * row).to(tl.int64)[:, None] * WIDTH
+            half, image = 0.5 * grad_mean, 0.5 * grad_mean * sign[None, :]
+            tl.store(place + action[None, :], half.to(grad_output.dtype.element_ty), mask=inside[:, None])
+            tl.store(place + WIDTH + order[None, :], image.to(grad_output.dtype.element_ty), mask=inside[:, None])
+        else:
+            place = grad_output + row.to(tl.int64)[:, None] * WIDTH + action[None, :]
+            tl.store(place, grad_mean.to(grad_output.dtype.element_ty), mask=inside[:, None])
+        shift = tl.where(mask, (old_mean - mean) * precision[None, :], 0.0)
+        surrogate -= tl.where(inside, tl.minimum(objective, clipped), 0.0)
+        asymmetry += tl.sum(tl.where(mask, difference * difference, 0.0), 1)
+        divergence = new - old + 0.5 * (tl.exp(2.0 * (old - new)) - 1.0)
+        kl += tl.sum(tl.where(mask, divergence[None, :] + 0.5 * shift * shift, 0.0), 1)
+    is_first = tl.where(split == 0, 1.0, 0.0)
+    grad_noise -= is_first * tl.load(entropy_coef)
+    tl.store(noise_partial + split * stride + action, grad_noise, mask=used)
+    loss = loss_partial + split * stride
+    tl.store(loss, tl.sum(surrogate, 0) / rows)
+    tl.store(loss + 2, is_first * tl.sum(tl.where(used, new + HALF_LOG_TAU + 0.5, 0.0), 0))
+    tl.store(loss + 3, tl.sum(asymmetry, 0) / (rows * num_actions))
+    tl.store(loss + 31, tl.sum(kl, 0) / rows)
+
+
+@triton.jit
+def critic_loss(
+    output, samples, sample_width, index, grad_output, loss_partial, stride, rows, rows_per_split, num_actions, clip,
+    weight, CLIP_VALUE: tl.constexpr, WIDTH: tl.constexpr, BM: tl.constexpr,
+):  # fmt: skip
+    """Write the gradient of `ppo.critic_gradient`'s loss with respect to the output, and the value loss.
+
+    output, grad_output: (rows, WIDTH), of which column 0 counts; samples, index, loss_partial: as in `actor_loss`.
+    """
+    split, col = tl.program_id(0), tl.arange(0, WIDTH)
+    first = split * rows_per_split
+    last = tl.minimum(first + rows_per_split, rows)
+    total = tl.zeros((BM,), tl.float32)
+    for start in range(first, last, BM):
+        row = start + tl.arange(0, BM)
+        inside = row < last
+        new = tl.load(output + row.to(tl.int64) * WIDTH, mask=inside, other=0.0)
+        sample = samples + tl.load(index + row, mask=inside, other=0) * sample_width + 2 * num_actions
+        value = tl.load(sample + 1, mask=inside, other=0.0)
+        target = tl.load(sample + 3, mask=inside, other=0.0)
+        grad = new - target
+        loss = grad * grad
+        if CLIP_VALUE:
+            change = new - value
+            error = value + tl.minimum(tl.maximum(change, -clip), clip) - target
+            free = tl.where(tl.abs(change) <= clip, error, 0.0)
+            grad = tl.where(error * error > loss, free, grad)
+            loss = tl.where(error * error > loss, error * error, loss)
+        total += loss
+        place = grad_output + row.to(tl.int64)[:, None] * WIDTH + col[None, :]
+        scaled = tl.where((col == 0)[None, :], (grad * (2.0 * weight / rows))[:, None], 0.0)
+        tl.store(place, scaled.to(grad_output.dtype.element_ty), mask=inside[:, None])
+    tl.store(loss_partial + split * stride + 1, tl.sum(total, 0) / rows)
