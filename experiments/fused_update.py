@@ -2,10 +2,10 @@
 
     python experiments/fused_update.py --out outputs/fused_update
 
-It needs a GPU of compute capability 9.0 or higher and Triton. Gradients of a minibatch are compared with autograd in
+It needs a GPU of compute capability 8.0 or higher and Triton. Gradients of a minibatch are compared with autograd in
 float64 on the same samples, without and with the mirror-symmetric actor; bfloat16 products cause errors of about 1 %.
-Two trainings with one seed must be bitwise equal. Times are of the fused and of the default update, as CUDA graphs;
-the environment's steps are empty. `benchmark_training.py --only-ppo --variants fused` times whole trainings.
+Two trainings with one seed must be bitwise equal. Times are of the fused and of the eager update, as CUDA graphs;
+the environment's steps are empty. `benchmark_training.py --only-ppo --variants eager` times whole trainings.
 """
 
 from __future__ import annotations
@@ -170,7 +170,7 @@ def times(ppo: Ppo, args: Args) -> dict[str, float]:
 
 
 def main(args: Args) -> dict:
-    """Check gradients and repetition, time the fused and the default update, write and return the metrics.
+    """Check gradients and repetition, time the fused and the eager update, write and return the metrics.
 
     Raises InputError: the device cannot use the fused update.
     """
@@ -186,11 +186,11 @@ def main(args: Args) -> dict:
         values[f"largest_error_{symmetry}"] = max(errors.values())
     values["repeats_bitwise"] = repeats(args, device)
     write_metrics(folder, values)
-    for name, changes in (("fused", {}), ("symmetric", {"symmetry": "actor"}), ("default", {"fused": False})):
+    for name, changes in (("fused", {}), ("symmetric", {"symmetry": "actor"}), ("eager", {"fused": False})):
         ppo = build(args, device, still=True, **changes)
         values |= {f"{name}_{key}": value for key, value in times(ppo, args).items()}
         ppo.close()
-    values["update_speedup"] = values["default_update_us"] / values["fused_update_us"]
+    values["update_speedup"] = values["eager_update_us"] / values["fused_update_us"]
     keys = [key for key in values if not key.startswith("error_")]
     return report(args, folder, values, f"Fused update with {args.num_envs:,} environments, {info.name}", keys)
 

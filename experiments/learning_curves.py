@@ -77,7 +77,8 @@ def train_in_process(args: Args, name: str, seed: int) -> LearningCurve:
 def main(args: Args) -> dict[str, Any]:
     """Train every variant with every seed, write metrics and plot after each, and return the metrics."""
     folder = prepare("learning_curves", args)
-    values: dict[str, Any] = {"seconds": args.seconds, "envs": args.num_envs, "randomize": args.randomize}
+    length = {"iterations": args.iterations} if args.iterations else {"seconds": args.seconds}
+    values: dict[str, Any] = {**length, "envs": args.num_envs, "randomize": args.randomize}
     values |= {"seeds": list(args.seeds), "heights_m": list(args.height_range), "history": args.history}
     curves: dict[str, list[LearningCurve]] = {name: [] for name in args.variants}
     runs = [*itertools.product(args.variants, args.seeds)]

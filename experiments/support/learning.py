@@ -40,15 +40,9 @@ class LearningCurve:
     iterations: int = 0  # Number of iterations of the training
     ready: float = 0.0  # [s] Time from the start of the process to the start of the training; 0 if not measured
 
-    def append(self, seconds: float, steps: int, success: float) -> None:
-        """Append an evaluation."""
-        self.seconds.append(seconds)
-        self.steps.append(steps)
-        self.success.append(success)
-
-    def seconds_to(self, rate: float) -> float | None:
-        """Return the training time [s] of the first evaluation with at least this success rate, or None."""
-        return next((t for t, success in zip(self.seconds, self.success, strict=True) if success >= rate), None)
+    def reached(self, rate: float) -> int | None:
+        """Return the index of the first evaluation with at least this success rate, or None."""
+        return next((i for i, success in enumerate(self.success) if success >= rate), None)
 
 
 def make_eval_env(task: TaskCfg, jumps: int, device: str | None) -> Env:
@@ -71,50 +65,30 @@ def warm_up(env: VecEnv, trainer: Ppo | Shac) -> None:
 
 
 def train_and_evaluate(
-    env: VecEnv, trainer: Ppo | Shac, eval_env: Env, seconds: float, every: float,
-    heights: tuple[float, float] = TEST_HEIGHTS,
+    env: VecEnv, trainer: Ppo | Shac, eval_env: Env, length: float, every: float,
+    heights: tuple[float, float] = TEST_HEIGHTS, by_iterations: bool = False,
 ) -> LearningCurve:  # fmt: skip
-    """Train for `seconds` as `jumper train --max-seconds` does, and return the learning curve.
+    """Train as `jumper train --max-seconds` or `--max-iterations` does, and return the learning curve.
 
     Compilation (`warm_up`) and evaluations do not count as training time.
-    env: environment of the training, not yet reset; eval_env: one world per evaluated jump; every [s]: training time
-    between two evaluations; heights [m]: range of the evaluated jumps.
+    env: environment of the training, not yet reset; eval_env: one world per evaluated jump; length: of the training,
+    and every: between two evaluations, [s] or number of iterations; heights [m]: range of the evaluated jumps.
     """
     warm_up(env, trainer)
-    curve, trained, device = LearningCurve(), 0.0, wp.device_from_torch(env.device)
-    while trained < seconds:
+    curve, trained, spent, device = LearningCurve(), 0.0, 0.0, wp.device_from_torch(env.device)
+    while spent < length:
         wp.synchronize_device(device)
-        start = time.perf_counter()
-        until = min(trained + every, seconds)
-        while (spent := trained + time.perf_counter() - start) < until:
-            trainer.set_progress(spent / seconds)
+        start, before, until = time.perf_counter(), trained, min(spent + every, length)
+        while spent < until:
+            trainer.set_progress(spent / length)
             trainer.iterate()
             curve.iterations += 1
             wp.synchronize_device(device)
-        trained += time.perf_counter() - start
-        curve.append(trained, curve.iterations * trainer.batch_size, success_rate(trainer, eval_env, heights))
-    return curve
-
-
-def train_iterations(
-    env: VecEnv, trainer: Ppo | Shac, eval_env: Env, iterations: int, every: int, heights: tuple[float, float]
-) -> LearningCurve:
-    """Train for a number of iterations, evaluate after each `every` of them, and return the learning curve.
-
-    Other arguments: as in `train_and_evaluate`.
-    """
-    warm_up(env, trainer)
-    curve, trained, device = LearningCurve(), 0.0, wp.device_from_torch(env.device)
-    while curve.iterations < iterations:
-        wp.synchronize_device(device)
-        start = time.perf_counter()
-        for _ in range(min(every, iterations - curve.iterations)):
-            trainer.set_progress(curve.iterations / iterations)
-            trainer.iterate()
-            curve.iterations += 1
-        wp.synchronize_device(device)
-        trained += time.perf_counter() - start
-        curve.append(trained, curve.iterations * trainer.batch_size, success_rate(trainer, eval_env, heights))
+            trained = before + time.perf_counter() - start
+            spent = float(curve.iterations) if by_iterations else trained
+        curve.seconds.append(trained)
+        curve.steps.append(curve.iterations * trainer.batch_size)
+        curve.success.append(success_rate(trainer, eval_env, heights))
     return curve
 
 
@@ -129,11 +103,10 @@ def train_and_time(task: TaskCfg, cfg: PpoCfg, args: Any, seed: int) -> Learning
     warm_up(env, trainer)
     ready, eval_env = process_age(), make_eval_env(task, args.num_jumps, args.device)
     success_rate(trainer, eval_env)
+    length, every = args.seconds, args.eval_interval
     if args.iterations:
-        every = max(1, args.iterations // EVALUATIONS)
-        curve = train_iterations(env, trainer, eval_env, args.iterations, every, args.height_range)
-    else:
-        curve = train_and_evaluate(env, trainer, eval_env, args.seconds, args.eval_interval, args.height_range)
+        length, every = args.iterations, max(1, args.iterations // EVALUATIONS)
+    curve = train_and_evaluate(env, trainer, eval_env, length, every, args.height_range, bool(args.iterations))
     curve.ready = ready
     return curve
 
@@ -146,9 +119,9 @@ def curve_metrics(curve: LearningCurve, name: str) -> dict[str, Any]:
     values = {f"success_{name}": curve.success[-1], f"steps_per_s_{name}": curve.steps[-1] / curve.seconds[-1]}
     values |= {f"curve_{series}_{name}": getattr(curve, series) for series in ("seconds", "steps", "success")}
     for rate in RATES:
-        seconds, key = curve.seconds_to(rate), f"{100 * rate:g}_percent_{name}"
-        steps = steps_to(curve, rate)
-        values |= {f"seconds_to_{key}": seconds, f"steps_to_{key}": steps if math.isfinite(steps) else None}
+        i, key = curve.reached(rate), f"{100 * rate:g}_percent_{name}"
+        values[f"seconds_to_{key}"] = None if i is None else curve.seconds[i]
+        values[f"steps_to_{key}"] = None if i is None else curve.steps[i]
     return values
 
 
@@ -158,17 +131,15 @@ def compare(first: Sequence[LearningCurve], second: Sequence[LearningCurve], rat
     Two-sided rank tests (Mann-Whitney) of the steps to a success rate, infinite if it is not reached, and of the final
     success. Keys: `p_steps_to_95_percent`, `p_final_success`.
     """
-    samples = [[[steps_to(curve, rate), curve.success[-1]] for curve in curves] for curves in (first, second)]
-    pairs = zip(*(zip(*curves, strict=True) for curves in samples), strict=True)
-    p = [float(scipy.stats.mannwhitneyu(*pair).pvalue) for pair in pairs]
-    low, high = min(1.0, 2.0 * min(p)), max(p)
-    corrected = [low if value == min(p) else max(low, high) for value in p]
-    return dict(zip((f"p_steps_to_{100 * rate:g}_percent", "p_final_success"), corrected, strict=True))
-
-
-def steps_to(curve: LearningCurve, rate: float) -> float:
-    """Return the policy steps until the first evaluation with at least this success rate; infinite without one."""
-    return next((n for n, success in zip(curve.steps, curve.success, strict=True) if success >= rate), math.inf)
+    steps, final = [], []
+    for curves in (first, second):
+        indices = [curve.reached(rate) for curve in curves]
+        steps.append([math.inf if i is None else curve.steps[i] for i, curve in zip(indices, curves, strict=True)])
+        final.append([curve.success[-1] for curve in curves])
+    p = [float(scipy.stats.mannwhitneyu(*pair).pvalue) for pair in (steps, final)]
+    smallest = min(1.0, 2.0 * min(p))
+    names = (f"p_steps_to_{100 * rate:g}_percent", "p_final_success")
+    return {name: smallest if value == min(p) else max(smallest, value) for name, value in zip(names, p, strict=True)}
 
 
 def plot_curves(curves: Mapping[str, Sequence[LearningCurve]], path: Path) -> None:

@@ -1,13 +1,14 @@
-"""Learning curves: schedule and evaluations of a timed training."""
+"""Learning curves: schedule and evaluations of a training, and the comparison of two trainers."""
 
 import time
 from types import SimpleNamespace
 
+import pytest
 import torch
 import warp as wp
 
 from support import learning
-from support.learning import LearningCurve, train_and_evaluate
+from support.learning import LearningCurve, compare, train_and_evaluate
 
 
 class Trainer:
@@ -28,11 +29,16 @@ class Trainer:
         time.sleep(0.01)
 
 
-def test_timed_training_sets_progress_from_0_to_1_without_evaluation_time(monkeypatch):
-    env = SimpleNamespace(
+@pytest.fixture
+def env():
+    """Stub of an environment."""
+    return SimpleNamespace(
         num_envs=2, num_actions=12, device=torch.device("cpu"), wp_device=wp.get_device("cpu"), reset=lambda: None,
         step=lambda action: None, metrics=dict,
     )  # fmt: skip
+
+
+def test_timed_training_sets_progress_from_0_to_1_without_evaluation_time(env, monkeypatch):
     evaluated = []
 
     def evaluate(trainer, eval_env, heights):
@@ -49,6 +55,30 @@ def test_timed_training_sets_progress_from_0_to_1_without_evaluation_time(monkey
     assert len(curve.seconds) == len(curve.success) == len(evaluated) == 3 and evaluated[0] == (0.5, 0.9)
 
 
-def test_seconds_to_returns_time_of_first_evaluation_with_the_rate():
+def test_training_of_a_number_of_iterations_is_evaluated_at_equal_steps(env, monkeypatch):
+    monkeypatch.setattr(learning, "success_rate", lambda *_: 0.5)
+    trainer = Trainer()
+    curve = train_and_evaluate(env, trainer, None, 5, 2, by_iterations=True)
+    assert trainer.progress == [0.0, 0.2, 0.4, 0.6, 0.8]
+    assert (curve.iterations, curve.steps) == (5, [128, 256, 320])
+
+
+def test_reached_returns_first_evaluation_with_the_rate():
     curve = LearningCurve([1.0, 2.0, 3.0], [0.2, 0.96, 0.9])
-    assert curve.seconds_to(0.95) == 2.0 and curve.seconds_to(1.0) is None
+    assert curve.reached(0.95) == 1 and curve.reached(1.0) is None
+
+
+def curves(steps, final):
+    """Return learning curves that reach 96 % after some steps (None: never), and a final success."""
+    ends = zip(steps, final, strict=True)
+    return [LearningCurve([1.0, 2.0], [0.96 if n else 0.1, success], [n or 1, 500]) for n, success in ends]
+
+
+def test_trainers_that_never_overlap_differ_and_equal_ones_do_not():
+    slow, low = [210, 220, 230, None], [0.5, 0.6, 0.7, 0.8]
+    first = curves([10, 20, 30, 40], [0.91, 0.92, 0.93, 0.94])
+    p = compare(first, curves(slow, [0.915, 0.925, 0.935, 0.905]))
+    assert p["p_steps_to_95_percent"] == pytest.approx(4.0 / 70.0)  # 2 of 70 orders are this extreme, two tests
+    assert p["p_final_success"] > 0.5
+    assert list(compare(first, curves(slow, low)).values()) == [pytest.approx(4.0 / 70.0)] * 2
+    assert compare(first, first) == {"p_steps_to_95_percent": 1.0, "p_final_success": 1.0}
