@@ -106,8 +106,7 @@ def train(
         if cfg.trainer == "rsl-rl":
             return _train_rsl_rl(cfg, env, as_rsl_rl, rank)
         torch.manual_seed(cfg.seed)  # the same weights in all processes
-        run = TrainingRun(cfg, env, rank, command, actor_init, checkpoint)
-        run.expected_rate = expected_rate
+        run = TrainingRun(cfg, env, rank, command, actor_init, checkpoint, expected_rate)
         cleanup.callback(run.ppo.close)
         if checkpoint is None and rank.index == 0:
             cleanup.enter_context(write_lock(run.folder))
@@ -154,14 +153,14 @@ class TrainingRun:
 
     def __init__(
         self, cfg: TrainCfg, env: VecEnv, rank: Rank, command: str | None = None, actor_init: ActorInit | None = None,
-        checkpoint: Checkpoint | None = None,
+        checkpoint: Checkpoint | None = None, expected_rate: float = 0.0,
     ) -> None:  # fmt: skip
         """Build the algorithm, and load the checkpoint of cfg.resume, else apply `actor_init` if given.
 
-        command, actor_init, checkpoint: as in `train`. Raises InputError or CheckpointError as `train`.
+        command, actor_init, checkpoint, expected_rate: as in `train`. Raises InputError or CheckpointError as `train`.
         """
         self.cfg, self.env, self.rank = cfg, env, rank
-        self._command = command or f"jumper train {cfg.task}"
+        self._command, self._expected_rate = command or f"jumper train {cfg.task}", expected_rate
         use_shac = cfg.trainer == "shac"
         self.ppo = Shac(cast(DifferentiableVecEnv, env), cfg.ppo, cfg.shac) if use_shac else make_ppo(env, cfg.ppo)
         losses = {f"Loss/{name}" for name in (SHAC_STATISTICS if use_shac else STATISTICS)}
@@ -171,7 +170,6 @@ class TrainingRun:
         self._clock_start: float | None = None  # time at which the run would have started without interruption
         self.metrics: dict[str, float] = {}
         self.notes: list[str] = []
-        self.expected_rate = 0.0  # [1/s] of environment steps, as in `train`
         self.failure = ""  # Reason why the training ends with exit status 1; empty: none
         checkpoint = checkpoint or resume.find_checkpoint(cfg)
         if not distributed.same_on_all_ranks(str(checkpoint and (checkpoint.path, checkpoint.state["iteration"]))):
@@ -251,7 +249,7 @@ class TrainingRun:
             return _NoLog()
         cfg = self.cfg
         outputs = (cfg.max_iterations, self._steps(), cfg.tensorboard, cfg.wandb)
-        return TrainingLog(self.folder, self.config, *outputs, self.iteration, self.expected_rate)
+        return TrainingLog(self.folder, self.config, *outputs, self.iteration, self._expected_rate)
 
     def _steps(self) -> int:
         """Return the number of environment steps in an iteration, of all worlds."""
