@@ -116,7 +116,8 @@ def curve_metrics(curve: LearningCurve, name: str) -> dict[str, Any]:
 
     Keys: `<metric>_<name>`.
     """
-    values = {f"success_{name}": curve.success[-1], f"steps_per_s_{name}": curve.steps[-1] / curve.seconds[-1]}
+    values: dict[str, Any] = {f"success_{name}": curve.success[-1]}
+    values |= {f"steps_per_s_{name}": curve.steps[-1] / curve.seconds[-1]}
     values |= {f"curve_{series}_{name}": getattr(curve, series) for series in ("seconds", "steps", "success")}
     for rate in RATES:
         i, key = curve.reached(rate), f"{100 * rate:g}_percent_{name}"
