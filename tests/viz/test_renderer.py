@@ -29,9 +29,9 @@ def poses(*positions):
 
 @pytest.fixture(scope="module")
 def opengl():
-    """Skip tests if pyglet cannot open a window, unless REQUIRE_OPENGL is set, as it is where OpenGL was installed.
+    """Skip tests if pyglet cannot open a window, unless the environment sets REQUIRE_OPENGL.
 
-    Any later failure is a fault of the renderer.
+    CI installs OpenGL and sets the variable. Any later failure is a fault of the renderer.
     """
     pyglet = pytest.importorskip("pyglet")
     pyglet.options["headless"] = True
