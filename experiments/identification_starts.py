@@ -5,7 +5,8 @@
 Masses, gains, friction, damping and latency of each robot differ from the description by one to two standard deviations
 of their priors. Its two hung chirps, standing chirp and small jump are recorded with several noises, and each recording
 is identified. A fit is good if at most 20 % of its identified parameters are outside their 95 % intervals and none by
-more than 5 standard deviations.
+more than 5 standard deviations. `accepted_bad_expected` is the expected number of bad ones among the accepted fits if
+all of these ended in the right minimum.
 
 `evaluation.jsonl` in the folder has one line for each fit. A later run with the same `--out` computes only the missing
 ones. `--shard 1/3` computes every third one, in a folder of its own; a run without `--shard` in a folder with the
@@ -33,8 +34,8 @@ from support.far_robots import Stream, identify_far_robot
 from support.scripts import OutputArgs, report, run_script
 
 SUMMARY = (
-    "fits", "accepted", "accepted_bad", "good", "good_rejected_rate", "coverage", "worst_accepted", "three_starts",
-    "cpu_s_median", "cpu_s_largest",
+    "fits", "accepted", "accepted_bad", "accepted_bad_expected", "good", "good_rejected_rate", "coverage",
+    "worst_accepted", "three_starts", "cpu_s_median", "cpu_s_largest",
 )  # fmt: skip
 
 
@@ -78,6 +79,7 @@ def summary(fits: list[dict[str, Any]]) -> dict[str, Any]:
         "good_rejected": sum(not fit["consistent"] for fit in good),
         "good_rejected_rate": sum(not fit["consistent"] for fit in good) / max(len(good), 1),
         "coverage": 1.0 - sum(fit["outside"] for fit in accepted) / max(sum(fit["identified"] for fit in accepted), 1),
+        "accepted_bad_expected": sum(fit["bad_probability"] for fit in accepted),
         "worst_accepted": max((fit["worst"] for fit in accepted), default=0.0),
         "accepted_bad_fits": [
             {name: fit[name] for name in ("robot", "noise", "outside", "identified", "worst", "mass_error_std")}

@@ -12,6 +12,7 @@ from jumper_warp.identification.identify import identify
 from jumper_warp.identification.parameters import ParameterSet, jumper_parameters, total_mass, weighed_mass
 from jumper_warp.identification.recording import KINDS, measure, replay_plan, sample_plan
 from jumper_warp.identification.replay import MotionReplay
+from jumper_warp.identification.results import CONFIDENCE, Identification
 from jumper_warp.utils.runtime import configure_device
 
 Stream = Literal["development", "evaluation"]
@@ -24,6 +25,7 @@ SCALE_STD = 0.02  # [kg] Standard deviation of the weighed mass
 MOST_OUTSIDE, FARTHEST_OUTSIDE = 0.2, 5.0
 """Limits of a good fit: fraction of identified parameters outside their 95 % intervals, and their largest error in
 standard deviations."""
+DRAWS = 10_000  # Number of sampled errors of an estimate
 
 
 def far_robot(parameters: ParameterSet, rng: np.random.Generator) -> np.ndarray:
@@ -35,6 +37,23 @@ def far_robot(parameters: ParameterSet, rng: np.random.Generator) -> np.ndarray:
         z[members] = far + (z[members] if len(members) > 1 else 0.0)
     z[parameters.names.index("latency")] = rng.uniform(*LATENCY)
     return np.clip(z, -MOST, MOST)
+
+
+def is_good(error: np.ndarray) -> np.ndarray:
+    """Return whether fits are good, (...); error: of identified parameters, in standard deviations, (..., P)."""
+    outside = (error > CONFIDENCE).mean(axis=-1)
+    return (outside <= MOST_OUTSIDE) & (error.max(axis=-1) <= FARTHEST_OUTSIDE)
+
+
+def bad_probability(result: Identification, truth: np.ndarray, rng: np.random.Generator) -> float:
+    """Return the probability that a fit in the right minimum is bad by chance, from `DRAWS` normal errors.
+
+    An error common to many parameters leaves many intervals at once. With the covariance C of the posterior, and the
+    unit prior at 0, the estimate of a robot z has mean z - C z and covariance C - C C. truth: z, (P,).
+    """
+    covariance = result.covariance
+    errors = rng.multivariate_normal(-covariance @ truth, covariance - covariance @ covariance, size=DRAWS)
+    return float(1.0 - is_good(np.abs(errors / result.std)[:, result.identified]).mean())
 
 
 def identify_far_robot(stream: Stream, robot: int, noise: int) -> dict[str, Any]:
@@ -60,10 +79,10 @@ def identify_far_robot(stream: Stream, robot: int, noise: int) -> dict[str, Any]
     mass = weighed_mass(float(total_mass(robots)[0]) + SCALE_STD * mass_error, SCALE_STD)
     result = identify(motions, parameters, prior_measurements=[mass], replay=replay)
     error = np.abs(result.z - truth)[result.identified] / result.std[result.identified]
-    outside, worst = int((error > 1.96).sum()), float(error.max())
+    outside, worst = int((error > CONFIDENCE).sum()), float(error.max())
     return {
         "robot": robot, "noise": noise, "consistent": result.consistent, "inconsistency": result.inconsistency,
-        "good": outside <= MOST_OUTSIDE * len(error) and worst <= FARTHEST_OUTSIDE,
+        "good": bool(is_good(error)), "bad_probability": bad_probability(result, truth, rng),
         "identified": len(error), "outside": outside, "worst": worst, "mass_error_std": mass_error,
         "chi2": result.chi2, "mismatch": result.mismatch,
         "largest_test": max(test.chi2 / test.limit for test in result.tests),
