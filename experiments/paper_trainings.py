@@ -1,7 +1,7 @@
 """Train the paper's tasks and the ablations of its thesis, test them as the paper did, and write a metric file per arm.
 
     python experiments/paper_trainings.py --tasks vertical-jump-paper --arms full --seeds 0 --out outputs/paper
-    python experiments/paper_trainings.py --table --out outputs/paper     # the results so far, as Markdown
+    python experiments/paper_trainings.py --table --out outputs/paper     # table and curves so far
 
 An arm is a task, an ablation and a seed. Its folder in `--out` has the training and `metrics.json`. Before the training
 this file names the primary metrics, with no values: the success of nominal robots over the paper's range at the end,
@@ -38,7 +38,7 @@ from support.paper_runs import (
     train_arm,
     training_metrics,
 )
-from support.paper_table import results_table
+from support.paper_table import plot_curves, results_table
 from support.scripts import ThreadArgs, announce, prepare, run_script, tracked
 
 STEPS = f"steps_to_{100 * RATE:g}_percent"
@@ -55,7 +55,7 @@ class Args(ThreadArgs):
     num_jumps: int = 200  # Number of jumps, or of walks, of a test
     save_interval: int = 100  # Number of iterations between two points of the learning curve
     train_flags: str = ""  # More flags of `jumper train`: --train-flags="--max-iterations 10 --num-envs 64"
-    table: bool = False  # Write the table of the results in --out, and train nothing
+    table: bool = False  # Print the table and plot the curves of --out, and train nothing
 
     def __post_init__(self) -> None:
         if unknown := set(self.arms) - set(ARMS):
@@ -105,15 +105,15 @@ def run_arm(args: Args, name: str, arm: str, seed: int, folder: Path) -> dict[st
 
 
 def main(args: Args) -> dict[str, Any]:
-    """Run the arms one after the other, write the table of all results, and return the primary metrics by arm."""
+    """Run the arms one after the other, print the table and plot the curves of all; return primary metrics by arm."""
     folder, results = prepare("paper_trainings", args, args.threads), {}
     for name, arm, seed in [] if args.table else tracked([*args.trainings()], "arms"):
         values = run_arm(args, name, arm, seed, folder / name / f"{arm}_{seed}")
         key = f"{NOMINAL}_{PRIMARY[make_task(name).evaluation_suite]}"
         results[f"{name}_{arm}_{seed}"] = values[key]
         announce(f"{name}, {arm}, seed {seed}: {key.replace('_', ' ')} {values[key]:.3g}")
-    (folder / "results.md").write_text(results_table(folder))
-    print((folder / "results.md").read_text(), end="")
+    plot_curves(folder, folder / "curves.webp")
+    print(results_table(folder), end="")
     return results
 
 

@@ -1,12 +1,14 @@
-"""Table of the trainings of the paper's tasks beside the paper's results, from their metric files, as Markdown."""
+"""Table and learning curves of the trainings of the paper's tasks beside the paper's results, from metric files."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from jumper_warp.utils.output import read_values
+from jumper_warp.viz.plots import figure
 from support.paper_runs import ARMS
 
 GAP, NEVER = "not measured", "not reached"
@@ -28,12 +30,23 @@ ROWS = (
     ("velocity-paper", "falls", "nominal_walk_fall_rate", "–"),
 )
 """Task, words, metric and the paper's value of each row; the paper's walk is one of its robot."""
+CURVES = (
+    ("vertical-jump-paper", "success, 0.5–1.2 m", 0.91),
+    ("horizontal-jump-paper", "success, 0.3–1.5 m", 0.97),
+    ("velocity-paper", "RMSE ahead [m/s]", 0.17),
+)
+"""Task, label of the primary metric and the paper's value of each plot of `plot_curves`."""
+
+
+def finished(folder: Path, task: str, arm: str) -> list[dict[str, Any]]:
+    """Return the metrics of the finished trainings of an arm by seed."""
+    files = sorted((folder / task).glob(f"{arm}_*/metrics.json"))
+    return [values for path in files if "curve_steps" in (values := read_values(path.parent))]
 
 
 def cell(folder: Path, task: str, arm: str, key: str) -> str:
     """Return mean and range over the seeds of a metric of an arm; GAP: no seed has it, NEVER: no seed reached it."""
-    files = sorted((folder / task).glob(f"{arm}_*/metrics.json"))
-    seeds = [values for path in files if "curve_steps" in (values := read_values(path.parent))]
+    seeds = finished(folder, task, arm)
     found = [values[key] for values in seeds if values.get(key) is not None]
     if not found:
         return NEVER if seeds and key.startswith("steps") else GAP
@@ -50,3 +63,15 @@ def results_table(folder: Path) -> str:
         cells = [cell(folder, task, arm, key) for arm in arms] + ["–"] * (len(ARMS) - len(arms))
         lines.append(f"| `{task}` | {words} | {paper} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def plot_curves(folder: Path, path: Path) -> None:
+    """Plot the primary metric of nominal robots over steps into a file: a line per training, a colour per arm."""
+    with figure(path, 1, len(CURVES), figsize=(11, 4), title="Learning curves of the paper's tasks") as axes:
+        for axis, (task, label, paper) in zip(axes, CURVES, strict=True):
+            for i, arm in enumerate(ARMS):
+                for number, values in enumerate(finished(folder, task, arm)):
+                    steps, curve = np.array(values["curve_steps"]) * 1.0e-6, values["curve_values"]
+                    axis.plot(steps, curve, color=f"C{i}", marker=".", label=None if number else arm.replace("_", " "))
+            axis.axhline(paper, color="black", linestyle=":", label="the paper")
+            axis.set(title=task, xlabel="policy steps [million]", ylabel=label, xlim=(0.0, None), ylim=(0.0, None))

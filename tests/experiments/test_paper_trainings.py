@@ -80,14 +80,16 @@ def test_finished_arms_are_skipped_and_the_table_names_gaps(tmp_path, monkeypatc
     for seed, steps in ((0, 2.0e6), (1, 4.0e6)):
         folder = tmp_path / JUMPS[0] / f"full_{seed}"
         folder.mkdir(parents=True)
-        values = {"nominal_sweep_goal_reached_rate": 0.8 + 0.1 * seed, "steps_to_50_percent": steps, "curve_steps": [1]}
-        write_metrics(folder, values)
+        values = {"nominal_sweep_goal_reached_rate": 0.8 + 0.1 * seed, "steps_to_50_percent": steps}
+        write_metrics(folder, values | {"curve_steps": [1], "curve_values": [0.5]})
     other = tmp_path / JUMPS[0] / "no_estimates_0"
     other.mkdir()
-    write_metrics(other, {"nominal_sweep_goal_reached_rate": 0.1, "steps_to_50_percent": None, "curve_steps": [1]})
+    values = {"nominal_sweep_goal_reached_rate": 0.1, "steps_to_50_percent": None}
+    write_metrics(other, values | {"curve_steps": [1], "curve_values": [0.1]})
     args = paper_trainings.Args(tasks=(JUMPS[0],), arms=("full",), seeds=(0, 1), out=tmp_path, device="cpu")
     assert paper_trainings.main(args) == {f"{JUMPS[0]}_full_0": 0.8, f"{JUMPS[0]}_full_1": pytest.approx(0.9)}
     rows = [line.split(" | ") for line in results_table(tmp_path).splitlines()[2:]]
+    assert (tmp_path / "curves.webp").stat().st_size > 1000
     assert rows[0][3:5] == ["0.85 (0.8–0.9), 2 of 2 seeds", GAP]
     assert rows[3][3] == "3 (2–4), 2 of 2 seeds" and rows[3][5] == NEVER
 
