@@ -43,7 +43,9 @@ def text(value: Any) -> str:
     """Return a number, choice, range or group of settings as text."""
     if isinstance(value, bool):
         return "yes" if value else "no"
-    if isinstance(value, int | float):
+    if isinstance(value, int):
+        return str(value)
+    if isinstance(value, float):
         return f"{value + 0.0:.6g}"  # + 0: -0 is 0
     if isinstance(value, tuple):
         return " to ".join(map(text, value)) if len(value) == 2 else " / ".join(map(text, value))
