@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+from jumper_warp.evaluation.jumps import updated_apex
 from jumper_warp.evaluation.log import EvaluationLog, ended_by, finite, outcome_names
 from jumper_warp.evaluation.scripts import ScriptStep
 from jumper_warp.evaluation.trained import warn_beyond_training
@@ -85,7 +86,7 @@ class CourseLog(EvaluationLog):
         self.switch_step = np.full(shape, -1)  # (robots, commands) policy step in which the jump skill took over
         self.takeoff_step = np.full(shape, -1)  # (robots, commands) policy step of the takeoff
         self.finish_step = np.full(shape, -1)  # (robots, commands) policy step in which the command finished
-        self.apex = np.full(shape, np.nan)  # [m] (robots, commands) largest base height of the jump
+        self.apex = np.full(shape, np.nan)  # [m] (robots, commands) apex of the jump so far, see `updated_apex`
         self.offset = np.full((n, k, 2), np.nan)  # [m] from the goal to the base as walking takes over, world axes
         self.goal_world = np.full((n, k, 2), np.nan)  # [m] of jumps to a place whose skill took over, world axes
         # one array per policy step
@@ -136,7 +137,7 @@ class CourseLog(EvaluationLog):
         }  # fmt: skip
         rows = np.arange(len(q))
         kind = self.target_skill[rows, np.minimum(self.current, self.target_skill.shape[1] - 1)]
-        for name in ("max_height", "goal", "took_off"):
+        for name in ("goal", "phase", "took_off", "touched_down"):
             by_skill = [env.skills[skill].states.numpy()[name] for skill in (JUMP_UP, JUMP_TO)]
             arrays[f"jump_{name}"] = np.array(by_skill)[np.where(kind == JUMP_TO, 1, 0), rows]
         return arrays
@@ -204,11 +205,12 @@ class CourseLog(EvaluationLog):
         left = jumps & (skill[row] != kind) & (previous[row] == kind)
         took_off = jumps & (previous[row] == kind) & (arrays["jump_took_off"][row] == 1)
         self.takeoff_step[row[took_off], self.current[row[took_off]]] = step
-        for name, values in (
-            ("apex", arrays["jump_max_height"]),
-            ("offset", arrays["base_pos"][:, :2] - arrays["jump_goal"][:, :2]),
-        ):
-            getattr(self, name)[row[left], self.current[row[left]]] = values[row[left]]
+        jumping = row[jumps & (previous[row] == kind)]
+        jump = {name: arrays[f"jump_{name}"][jumping] for name in ("phase", "took_off", "touched_down")}
+        now = (jumping, self.current[jumping])
+        self.apex[now] = updated_apex(self.apex[now], jump | {"base_pos": arrays["base_pos"][jumping]})
+        offset = (arrays["base_pos"] - arrays["jump_goal"])[row[left], :2]
+        self.offset[row[left], self.current[row[left]]] = offset
         walked = ~jumps & (since >= np.round(self.durations[at] / step_dt))
         finished = walked | left
         no_jump = left & (self.takeoff_step[at] < 0)
@@ -254,7 +256,8 @@ class CourseLog(EvaluationLog):
     @property
     def apex_error(self) -> np.ndarray:
         """Apex minus commanded height [m], (robots, commands); NaN unless the command is a finished jump up."""
-        return np.where(self.target_skill == JUMP_UP, self.apex - self.goal[..., 2], np.nan)
+        finished = (self.target_skill == JUMP_UP) & (self.finish_step >= 0)
+        return np.where(finished, self.apex - self.goal[..., 2], np.nan)
 
     @property
     def landing_error(self) -> np.ndarray:

@@ -15,7 +15,7 @@ import torch
 
 from jumper_warp.diff.closed_loop import ClosedLoop, LoopState
 from jumper_warp.envs.env import Env
-from jumper_warp.evaluation.jumps import LANDED, REST_TIME
+from jumper_warp.evaluation.jumps import LANDED, REST_TIME, updated_apex
 from jumper_warp.trajectory.gauss_newton import Network, Tape, per_world_gradients
 from jumper_warp.utils.progress import phase
 
@@ -66,29 +66,24 @@ class JumpGroup:
         return torch.where(errors.valid, huber, 0.0) / (self.std**2 * len(errors.value))
 
 
-def apex_heights(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np.ndarray]) -> list[torch.Tensor]:
+def apex_heights(loop: ClosedLoop, states: list[LoopState], steps: torch.Tensor) -> list[torch.Tensor]:
     """Return the differentiable base heights at the apex [m], in a list with one entry (n,).
 
-    states: of every policy step; arrays: `env.task_arrays` after the last one, whose `max_height` picks the step.
+    states: of every policy step; steps: indices of the apexes in them, (n,).
     """
-    heights = torch.stack([state.q[2] for state in states])
-    reached = torch.as_tensor(arrays["max_height"], dtype=heights.dtype, device=heights.device)
-    row = (heights.detach() - reached).abs().argmin(0, keepdim=True)
-    return [heights.gather(0, row)[0]]
+    return [torch.stack([state.q[2] for state in states]).gather(0, steps[None])[0]]
 
 
-def ballistic_landing(loop: ClosedLoop, states: list[LoopState], arrays: dict[str, np.ndarray]) -> list[torch.Tensor]:
+def ballistic_landing(loop: ClosedLoop, states: list[LoopState], steps: torch.Tensor) -> list[torch.Tensor]:
     """Return the differentiable landing point [m] of the ballistic flight from the apex, [x, y].
 
     Each is (n,), world frame.
-    states, arrays: see `apex_heights`. The base lands at LANDING_HEIGHT.
+    states, steps: see `apex_heights`. The base lands at LANDING_HEIGHT.
     """
-    reached = torch.as_tensor(arrays["max_height"], device=states[0].q.device)
-    row = (torch.stack([state.q[2].detach() for state in states]) - reached).abs().argmin(0)
     motions = [loop.motion(state) for state in states]
     pos, vel = (torch.stack([getattr(motion, name) for motion in motions]) for name in ("pos", "lin_vel"))
-    worlds = torch.arange(len(row), device=row.device)
-    pos, vel = pos[row, worlds], vel[row, worlds]
+    worlds = torch.arange(len(steps), device=steps.device)
+    pos, vel = pos[steps, worlds], vel[steps, worlds]
     g, drop = loop.task.gravity, (pos[:, 2] - LANDING_HEIGHT).clamp(min=0.0)
     fall_time = (vel[:, 2] + (vel[:, 2].square() + 2.0 * g * drop).sqrt()) / g
     return [pos[:, i] + fall_time * vel[:, i] for i in range(2)]
@@ -104,6 +99,7 @@ def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> Jum
             env.step(network.act(env.obs))
     state, states, tape = loop.state(), [], Tape()
     arrays: dict[str, np.ndarray] = {}
+    apex, apex_step = np.full(len(group.commands), np.nan), np.zeros(len(group.commands), dtype=np.int64)
     with phase(f"simulating {len(group.commands)} {group.name} jumps", last - begin) as advance:
         for _ in range(begin, last):
             if derivatives:
@@ -112,20 +108,23 @@ def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> Jum
                 env.step(network.act(env.obs))
                 state = loop.state()
             states.append(state)
-            arrays = env.task_arrays()
+            arrays, earlier = env.task_arrays(), apex
+            apex = updated_apex(earlier, arrays)
+            apex_step[apex != earlier] = len(states) - 1
             if (arrays["apex_passed"] > 0)[arrays["phase"] > 0].all() and (arrays["phase"] > 0).all():
                 break
             advance()
     valid = torch.as_tensor(arrays["phase"] > 0, device=env.device)
     if to_height:
-        errors = [arrays["max_height"] - group.commands[:, 2]]
+        errors = [apex - group.commands[:, 2]]
     else:
         errors = _landing_errors(env, network)
     value = torch.as_tensor(np.concatenate(errors), dtype=loop.dtype, device=env.device)
     valid = valid.repeat(len(errors)) & value.isfinite()
     jacobian = value.new_zeros(0)
     if derivatives:
-        outcomes = (apex_heights if to_height else ballistic_landing)(loop, states, arrays)
+        steps = torch.as_tensor(apex_step, device=env.device)
+        outcomes = (apex_heights if to_height else ballistic_landing)(loop, states, steps)
         rows = [per_world_gradients(outcome.sum(), tape) for outcome in outcomes]
         jacobian = torch.cat(rows).nan_to_num(0.0, 0.0, 0.0)
     return JumpErrors(torch.where(valid, value, 0.0), jacobian, valid)

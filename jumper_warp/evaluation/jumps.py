@@ -59,6 +59,16 @@ def paw_arrays(env: Env) -> dict[str, np.ndarray]:
     return {"paws_down": (force > env.task.contact_force).T, "paw_pos": pos, "up": env.sim.base_velocity()[:, 2]}
 
 
+def updated_apex(apex: np.ndarray, jump: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the apexes of n jumps [m] after another policy step, (n,): largest base heights in flight.
+
+    Before takeoff an apex is the current height; after touchdown it stays. jump: arrays (n, ...) of the step.
+    """
+    begins = (jump["phase"] == STANCE) | (jump["took_off"] == 1)
+    flies, height = (jump["phase"] != LANDED) | (jump["touched_down"] == 1), jump["base_pos"][:, 2]
+    return np.where(begins, height, np.where(flies, np.fmax(apex, height), apex))
+
+
 def jump_commands(goals: np.ndarray, delay: np.ndarray | float, step_dt: float) -> np.ndarray:
     """Return commands of jump tasks, (num_envs, 4): goal x, y, z [m] and policy step of the command.
 
@@ -248,10 +258,8 @@ class JumpLog(EvaluationLog):
         self.heading[at] = jump["heading"]
         self.yaw[at] = wrapped(yaw_of(jump["base_quat"]) - jump["heading"])
         self.drift[at] = np.linalg.norm((jump["base_pos"] - jump["start"])[:, :2], axis=1)
-        landed, height, self.tilt[at] = jump["phase"] == LANDED, jump["base_pos"][:, 2], jump["peak_tilt"]
-        begins = (jump["phase"] == STANCE) | (jump["took_off"] == 1)
-        rises = ~landed | (jump["touched_down"] == 1)
-        self.apex[at] = np.where(begins, height, np.where(rises, np.fmax(self.apex[at], height), self.apex[at]))
+        landed, self.tilt[at] = jump["phase"] == LANDED, jump["peak_tilt"]
+        self.apex[at] = updated_apex(self.apex[at], jump)
         self._record_landing(jump, at, landed, step_dt)
         failed = (jump["termination"] >= 0) & (jump["termination"] != self._success)
         rested = ~failed & landed & (jump["phase_steps"] >= round(self.rest / step_dt))

@@ -53,7 +53,12 @@ class ScriptedEnv:
         """Advance by a policy step, and return the arrays of `CourseLog.read_env`."""
         self.steps += 1
         self.age += 1
-        took_off = (self.skill >= JUMP_UP) & (self.age == 25)
+        jumping = self.skill >= JUMP_UP
+        took_off, touched_down = jumping & (self.age == 25), jumping & (self.age == 45)
+        phase = jumping * ((self.age >= 25).astype(int) + (self.age >= 45))
+        heights = 0.78 - 0.002 * (self.age - 35) ** 2  # [m] apex 35 steps after the handover, back at 0.58 m
+        base_pos = np.stack([np.full(self.n, 0.05), np.zeros(self.n), np.where(jumping, heights, 0.4)], axis=1)
+        base_pos[jumping & (self.age > 50), 2] = 0.9  # [m] higher after touchdown, which is no apex
         for w in range(self.n):
             if self.skill[w] == WALK and self.commands[w] >= 0 and self.age[w] >= 50 and not self.never_stops:
                 self.skill[w], self.commands[w], self.age[w] = self.commands[w], -1, 0
@@ -61,13 +66,13 @@ class ScriptedEnv:
                 self.skill[w], self.age[w] = WALK, 0
         termination = np.where(self.falls_at == self.steps, 1, -1) * np.ones(self.n, int)
         return {
-            "base_pos": np.tile([0.05, 0.0, 0.4], (self.n, 1)), "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (self.n, 1)),
+            "base_pos": base_pos, "base_quat": np.tile([0.0, 0.0, 0.0, 1.0], (self.n, 1)),
             "base_vel": self.velocity * [1, 1, 0] + self.error * [1, 1, 0],
             "base_ang_vel": (self.velocity + self.error)[:, 2:] * [0.0, 0.0, 1.0],
             "skill": self.skill.copy(), "termination": termination,
             "force": np.tile([30.0, 31.0, 32.0, 33.0], (self.n, 1)) + (self.steps % 2),
-            "jump_max_height": np.full(self.n, 0.78), "jump_goal": np.zeros((self.n, 3)),
-            "jump_took_off": took_off.astype(int), "jump_phase": np.zeros(self.n, int),
+            "jump_goal": np.zeros((self.n, 3)), "jump_took_off": took_off.astype(int),
+            "jump_touched_down": touched_down.astype(int), "jump_phase": phase,
         }  # fmt: skip
 
 
