@@ -80,10 +80,12 @@ def identify_far_robot(stream: Stream, robot: int, noise: int) -> dict[str, Any]
     result = identify(motions, parameters, prior_measurements=[mass], replay=replay)
     error = np.abs(result.z - truth)[result.identified] / result.std[result.identified]
     outside, worst = int((error > CONFIDENCE).sum()), float(error.max())
+    names = np.array(parameters.names)[result.identified]
     return {
         "robot": robot, "noise": noise, "consistent": result.consistent, "inconsistency": result.inconsistency,
         "good": bool(is_good(error)), "bad_probability": bad_probability(result, truth, rng),
-        "identified": len(error), "outside": outside, "worst": worst, "mass_error_std": mass_error,
+        "identified": len(error), "outside": outside, "worst": worst, "worst_parameter": str(names[error.argmax()]),
+        "mass_error_std": mass_error,
         "chi2": result.chi2, "mismatch": result.mismatch,
         "largest_test": max(test.chi2 / test.limit for test in result.tests),
         "correlation": max(test.correlation for test in result.tests),
