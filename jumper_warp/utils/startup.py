@@ -1,7 +1,8 @@
-"""Faster start of a command's process: fewer garbage collections, and imports of Newton's unused parts deferred."""
+"""Faster start and end of a command: fewer garbage collections, and imports of Newton's unused parts deferred."""
 
 from __future__ import annotations
 
+import atexit
 import gc
 import sys
 from importlib.abc import Loader, MetaPathFinder
@@ -13,7 +14,9 @@ from typing import Any
 DEFERRED = frozenset(f"newton.{name}" for name in ("actuators", "controllers", "ik", "selection", "sensors", "viewer"))
 """Modules that `import newton` imports and few commands need; `newton.viewer` imports the Rerun SDK."""
 COLLECTION_THRESHOLD = 50_000
-"""Surplus of allocated objects that starts a garbage collection. Imports allocate millions of objects that stay."""
+"""Surplus of allocated objects that starts a garbage collection after the first one."""
+FIRST_COLLECTION_THRESHOLD = 1_200_000
+"""Surplus of allocated objects that starts the first garbage collection. Imports allocate a million that stay."""
 
 
 class DeferredModule(ModuleType):
@@ -70,8 +73,18 @@ class DeferredFinder(MetaPathFinder):
 def prepare_imports() -> None:
     """Defer imports of Newton's unused parts and collect garbage less often, for the rest of this process.
 
-    Call it in a process of a command, before its imports.
+    The process also ends without a garbage collection, which would take seconds. Call it in a process of a command,
+    before its imports.
     """
+    if any(isinstance(finder, DeferredFinder) for finder in sys.meta_path):
+        return
+    sys.meta_path.insert(0, DeferredFinder())
+    gc.set_threshold(FIRST_COLLECTION_THRESHOLD)
+    gc.callbacks.append(_after_first_collection)
+    atexit.register(gc.freeze)
+
+
+def _after_first_collection(phase: str, info: dict[str, int]) -> None:
+    """Collect garbage more often after the first collection, since the imports are over."""
     gc.set_threshold(COLLECTION_THRESHOLD)
-    if not any(isinstance(finder, DeferredFinder) for finder in sys.meta_path):
-        sys.meta_path.insert(0, DeferredFinder())
+    gc.callbacks.remove(_after_first_collection)
