@@ -17,6 +17,13 @@ from jumper_warp.utils.normalise import normalise
 MAX_OUTPUT = 1.0e38  # Bound of layer outputs, below the largest float32
 
 
+class _Linear(nn.Linear):
+    """Linear layer without initial weights: `nn.utils.skip_init` avoids them too, but imports SymPy."""
+
+    def reset_parameters(self) -> None:
+        """Leave the weights and the random streams unchanged."""
+
+
 class Policy(nn.Module):
     """Actor network with its observation normaliser; `act` maps raw observations to actions. Inherits `to(device)`."""
 
@@ -47,7 +54,7 @@ class Policy(nn.Module):
         self.actor = nn.Sequential()
         for i in range(len(layers)):
             weight = tensors[f"actor.{i}.weight"]
-            linear = nn.utils.skip_init(nn.Linear, weight.shape[1], weight.shape[0])
+            linear = _Linear(weight.shape[1], weight.shape[0], device="cpu")
             linear.weight.data, linear.bias.data = weight, tensors[f"actor.{i}.bias"]
             self.actor.append(linear)
             if i < len(layers) - 1:
