@@ -1,6 +1,6 @@
 """Conversion of tasks to JSON and back. Functions and types are saved as `module:name`.
 
-Names are resolved in the project's modules and in those that the user passes; no module is imported for a name.
+Names are resolved in the project's modules and in those that the user passes; no other module is imported for a name.
 """
 
 from __future__ import annotations
@@ -9,7 +9,6 @@ import dataclasses
 import functools
 import importlib
 import pkgutil
-import sys
 from collections.abc import Collection, Iterable
 from pathlib import Path
 from types import ModuleType, UnionType
@@ -17,6 +16,8 @@ from typing import Any, Union, get_args, get_origin, get_type_hints
 
 import warp as wp
 
+import jumper_warp.kernels
+import jumper_warp.robot
 import jumper_warp.tasks
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.copying import Struct, top_level
@@ -26,8 +27,6 @@ from jumper_warp.utils.checks import FLOAT32_MAX, NAME, in_float32, version_erro
 from jumper_warp.utils.errors import InputError
 
 VERSION = 4  # of the saved format
-PROJECT_PREFIXES = ("jumper_warp.tasks.", "jumper_warp.robot.", "jumper_warp.kernels.")
-"""Prefixes of the project's modules that a saved task may name."""
 OPTIONAL = ("rewards", "critic", "events")  # sections that only training needs
 MAX_ENTRIES = 1000  # of a list: a kernel of more terms would compile for a day
 
@@ -95,10 +94,11 @@ def shown(value: Any) -> str:
 
 
 @functools.cache
-def load_project_tasks() -> None:
-    """Import all modules of `jumper_warp.tasks`, and so the kernels that saved tasks may name; once."""
-    for module in pkgutil.walk_packages(jumper_warp.tasks.__path__, f"{jumper_warp.tasks.__name__}."):
-        importlib.import_module(module.name)
+def project_modules() -> frozenset[str]:
+    """Return the names of the project's modules that a saved task may name."""
+    packages = (jumper_warp.kernels, jumper_warp.robot, jumper_warp.tasks)
+    walks = (pkgutil.walk_packages(package.__path__, f"{package.__name__}.") for package in packages)
+    return frozenset(module.name for walk in walks for module in walk)
 
 
 class Finder:
@@ -106,7 +106,6 @@ class Finder:
 
     def __init__(self, modules: Iterable[ModuleType] = ()) -> None:
         """Look names up in the project's modules and in `modules`, the user's loaded ones."""
-        load_project_tasks()
         self.modules = {module.__name__: module for module in modules}
 
     def __call__(self, name: Any, where: str) -> Any:
@@ -118,14 +117,14 @@ class Finder:
             raise TaskError(f"{where}: expected module:name, got {shown(name)}")
         module_name, _, attribute = name.partition(":")
         module = self.modules.get(module_name)
-        if module is None and module_name.startswith(PROJECT_PREFIXES):
-            module = sys.modules.get(module_name)
+        if module is None and module_name in project_modules():
+            module = importlib.import_module(module_name)
         value = None if module is None else vars(module).get(attribute)
         usable = isinstance(value, wp.Function | Struct)
         if isinstance(value, type):
             usable = dataclasses.is_dataclass(value) or issubclass(value, Term)
         if not usable:
-            known = module is not None or module_name.startswith(PROJECT_PREFIXES)
+            known = module is not None or module_name.startswith("jumper_warp.")
             hint = "no such function or type" if known else "pass the file that defines it with --task-module"
             raise TaskError(f"{where} needs {name!r:.80}: {hint}")
         return value

@@ -146,6 +146,8 @@ def test_setting_that_json_cannot_restore_is_not_saved(value):
         (lambda t: t["rewards"][0].update(weight=10**400), r"weight: must be finite, got a huge integer"),
         (lambda t: t["rewards"][0].update(func="jumper_warp.kernels.jump.state:JumpState"), "is not a @wp.func"),
         (lambda t: t["rewards"][0].update(func="jumper_warp.kernels.jump.rewards:wp"), "no such function or type"),
+        (lambda t: t["rewards"][0].update(func="jumper_warp.kernels.jump.none:f"), "no such function or type"),
+        (lambda t: t["rewards"][0].update(func="jumper_warp.cli.main:parse"), "no such function or type"),
         (lambda t: t["rewards"][0].update(func=f"{JUMP}.terminations:landed_for", steps=1.0), "must return float"),
         (lambda t: t["rewards"][0].update(type="jumper_warp.tasks.terms:TerminationTerm"), "expected .* RewardTerm"),
         (lambda t: t["observations"]["actor"][0].update(history=10**9), "history must be at most"),
