@@ -1,7 +1,6 @@
 """Kernel functions with written-out loops, whose hash Warp computes without building the kernel."""
 
 import ast
-import copy
 import hashlib
 import inspect
 import linecache
@@ -11,42 +10,31 @@ from types import FunctionType
 from typing import Any
 
 
-class _Unroller(ast.NodeTransformer):
-    """Replaces a loop by copies of its body, one a value, if its `wp.static` expressions depend on the loop variable.
+def _written_out(node: Any, names: dict[str, Any], values: dict[str, int]) -> Any:
+    """Return a copy of a syntax tree or a list of them, with loops written out; a loop becomes a list of statements.
 
-    names: values of the function's free and global names.
+    A loop is replaced by copies of its body, one a value, if its `wp.static` expressions depend on the loop variable.
+    names: values of the function's free and global names. values: of the variables of the loops around the node.
     """
-
-    def __init__(self, names: dict[str, Any]) -> None:
-        self._names = names
-
-    def visit_For(self, node: ast.For) -> Any:
-        """Return the statements in place of a loop over a range whose bounds are static."""
-        if not isinstance(node.target, ast.Name) or not _uses_in_static(node, node.target.id):
-            return self.generic_visit(node)
+    if isinstance(node, list):
+        parts = [_written_out(each, names, values) for each in node]
+        return [each for part in parts for each in (part if isinstance(part, list) else [part])]
+    if isinstance(node, ast.Name) and node.id in values:
+        return ast.Constant(values[node.id])
+    if isinstance(node, ast.For) and isinstance(node.target, ast.Name) and _uses_in_static(node, node.target.id):
         assert isinstance(node.iter, ast.Call)
-        statements = []
-        for value in range(*map(self._evaluate, node.iter.args)):
-            for statement in copy.deepcopy(node.body):
-                new = self.visit(_Substitution(node.target.id, value).visit(statement))
-                statements += new if isinstance(new, list) else [new]
-        return statements
-
-    def _evaluate(self, node: ast.expr) -> int:
-        """Return the value of a bound, a constant or `wp.static(...)`."""
-        inner = node.args[0] if isinstance(node, ast.Call) else node
-        return eval(compile(ast.Expression(inner), "<bound of a loop>", "eval"), self._names)
+        bounds = [_evaluated(bound, {**names, **values}) for bound in node.iter.args]
+        bodies = [_written_out(node.body, names, {**values, node.target.id: value}) for value in range(*bounds)]
+        return [statement for body in bodies for statement in body]
+    if not isinstance(node, ast.AST):
+        return node
+    return type(node)(**{field: _written_out(child, names, values) for field, child in ast.iter_fields(node)})
 
 
-class _Substitution(ast.NodeTransformer):
-    """Replaces a name by a constant."""
-
-    def __init__(self, name: str, value: int) -> None:
-        self._name, self._value = name, value
-
-    def visit_Name(self, node: ast.Name) -> ast.expr:
-        """Return the constant in place of the name, any other name unchanged."""
-        return ast.copy_location(ast.Constant(self._value), node) if node.id == self._name else node
+def _evaluated(bound: ast.expr, names: dict[str, Any]) -> int:
+    """Return the value of a bound of a loop, a constant or `wp.static(...)`."""
+    inner = bound.args[0] if isinstance(bound, ast.Call) else bound
+    return eval(compile(ast.Expression(inner), "<bound of a loop>", "eval"), names)
 
 
 def _uses_in_static(loop: ast.For, name: str) -> bool:
@@ -74,8 +62,7 @@ def unrolled(function: Callable[..., None]) -> Callable[..., None]:
     assert isinstance(definition, ast.FunctionDef)
     for argument in definition.args.args:
         argument.annotation = None  # evaluated already
-    definition.body = _Unroller(names).visit(definition).body
-    source = ast.unparse(ast.fix_missing_locations(tree)) + "\n"
+    source = ast.unparse(ast.fix_missing_locations(_written_out(definition, names, {}))) + "\n"
     file = f"<{function.__module__}.{function.__name__} {hashlib.sha256(source.encode()).hexdigest()[:16]}>"
     linecache.cache[file] = (len(source), None, source.splitlines(keepends=True), file)  # for Warp, which reads sources
     exec(compile(source, file, "exec"), names)
