@@ -45,7 +45,7 @@ class EnvRecorder:
         self.env, self.log, self.worlds = env, log, list(worlds)
         self.links = LinkReader(env.sim)
         spacing = log.spacing if isinstance(ground, str) else 0.0  # robots on a heightfield are not moved apart
-        model = build_model(len(worlds), ground=ground, device=env.wp_device)
+        model = build_model(len(worlds), ground=ground, device=env.wp_device, mujoco=False)
         labels, notes = log.names(self.worlds), {**(notes or {}), **log.notes(self.worlds)}
         self.recorder = Recorder(model, range(len(worlds)), spacing=spacing, notes=notes, labels=labels)
         self.frames = 0

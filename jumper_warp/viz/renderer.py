@@ -16,8 +16,6 @@ from typing import Any, ClassVar, cast
 import newton
 import numpy as np
 import warp as wp
-from newton.sensors import SensorCamera
-from scipy.spatial.transform import Rotation
 
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.newton_types import Model, State
@@ -192,6 +190,8 @@ class RayTracer(Renderer):
 
     def load(self, shapes: Sequence[ShapeMesh], num_bodies: int, opacity: Sequence[float] = (1.0,)) -> None:
         """Load copies of bodies to be drawn; see `Renderer.load`."""
+        from newton.sensors import SensorCamera  # takes half a second, which OpenGL does not need
+
         super().load(shapes, num_bodies, opacity)
         self._sensor = SensorCamera(self.model)
         rays: Any = wp.vec3(*(-np.array(SUN) / np.linalg.norm(SUN)))
@@ -205,6 +205,9 @@ class RayTracer(Renderer):
         self._pixels: Any = self._sensor.allocate_image_color(1, *self.size)
 
     def _image(self, view: View, lines: Sequence[Line]) -> np.ndarray:
+        from newton.sensors import SensorCamera
+        from scipy.spatial.transform import Rotation
+
         if view.field_of_view != self._field_of_view:
             self._field_of_view = view.field_of_view
             self._rays = SensorCamera.compute_camera_rays_pinhole(
