@@ -58,3 +58,16 @@ def test_commands_import_newton_without_its_viewer():
     )
     output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert output.split() == ["False", "ViewerNull", "True"]
+
+
+def test_first_garbage_collection_is_late_and_there_is_none_at_the_end():
+    code = (
+        "import gc; from jumper_warp.utils.startup import prepare_imports; prepare_imports()\n"
+        "print(gc.get_threshold()[0]); gc.collect(); print(gc.get_threshold()[0])\n"
+        "class Cycle:\n"
+        "    def __init__(self): self.me = self\n"
+        "    def __del__(self): print('collected')\n"
+        "Cycle(); print('end')"
+    )
+    output = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
+    assert output.split() == [str(startup.FIRST_COLLECTION_THRESHOLD), str(startup.COLLECTION_THRESHOLD), "end"]
