@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import weakref
 from abc import ABC, abstractmethod
 from typing import Any
 
@@ -51,8 +52,11 @@ class Physics(ABC):
     peak_paw_force: wp.array  # (4, num_worlds) [N] Largest force on each paw in the last call of `advance`
 
     def __init__(self, sim: Any) -> None:
-        """Keep a reference to a `Simulation`, whose model, state, control and motors are allocated."""
-        self._sim = sim
+        """Keep a weak reference to a `Simulation`, whose model, state, control and motors are allocated.
+
+        The simulation owns the physics: with a strong reference, its memory would wait for a garbage collection.
+        """
+        self._sim: Any = weakref.proxy(sim)
 
     @abstractmethod
     def advance(

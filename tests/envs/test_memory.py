@@ -12,12 +12,12 @@ from jump_helpers import make_env
 COUNTED = (wp.array, wp.Kernel, wp.Module)
 
 
-def dropped() -> weakref.ref:
-    """Make an environment, step it, drop it, and return a weak reference to it."""
+def dropped() -> tuple[weakref.ref, weakref.ref]:
+    """Make an environment, step it, drop it, and return weak references to it and to its simulation."""
     env = make_env(2)
     env.step(torch.zeros_like(env.action))
     env.evaluation_reset(np.array([[0.5, 0.0, 0.0, 30.0]] * 2))
-    return weakref.ref(env)
+    return weakref.ref(env), weakref.ref(env.sim)
 
 
 def live_objects() -> list[int]:
@@ -26,10 +26,17 @@ def live_objects() -> list[int]:
 
 
 def test_dropped_environments_leave_no_arrays_kernels_or_modules():
-    env, counts = dropped(), []
+    counts = []
     for _ in range(2):
         dropped()
         gc.collect()
         counts.append(live_objects())
-    assert env() is None
     assert counts[0] == counts[1] and min(counts[0]) > 0
+
+
+def test_dropped_environments_do_not_wait_for_a_garbage_collection():
+    gc.disable()
+    try:
+        assert [reference() for reference in dropped()] == [None, None]
+    finally:
+        gc.enable()
