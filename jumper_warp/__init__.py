@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import importlib
-import os
 from typing import TYPE_CHECKING, Any
 
+from jumper_warp.utils.threads import limit_spinning
 from jumper_warp.utils.version import __version__ as __version__
 
 if TYPE_CHECKING:
@@ -27,10 +27,7 @@ _MODULES = {
 """Module of each public name, imported at the name's first use."""
 __all__ = ["Env", "Simulation", "SolverJumper", "build_model", "load_policy", "make_task"]
 
-# Torch's CPU threads spin for milliseconds after each operation, on cores that the simulation's threads need next.
-# libgomp reads this number of spin rounds when torch is loaded; its default is 300,000.
-if "OMP_WAIT_POLICY" not in os.environ:
-    os.environ.setdefault("GOMP_SPINCOUNT", "20000")
+limit_spinning()
 
 
 def __getattr__(name: str) -> Any:

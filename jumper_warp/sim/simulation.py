@@ -24,7 +24,7 @@ from jumper_warp.sim.physics import JumperPhysics, MujocoPhysics, Physics
 from jumper_warp.sim.slices import SlicedGraph, WorldRange, slices_of
 from jumper_warp.sim.solver import TOLERANCE, check_step, check_tolerance, state_arrays
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.threads import WARP_LOCK, checked_threads, locked
+from jumper_warp.utils.threads import WARP_LOCK, checked_threads, locked, stop_spinning
 
 if TYPE_CHECKING:
     import torch
@@ -118,6 +118,8 @@ class Simulation:
             write_springs(self.physics.dynamics, self.robot)
         shared = self.physics.sliced and not self.device.is_cuda
         self.slices = slices_of(num_worlds, threads if shared else 1)
+        if len(self.slices) > 1:
+            stop_spinning()
         self.solver = self.physics.solver
         self.torque, self.paw_force = self.physics.torque, self.physics.paw_force
         self.peak_force = self.physics.peak_force

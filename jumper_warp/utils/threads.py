@@ -1,4 +1,4 @@
-"""Number of CPU threads of simulations, a pool of worker threads for parallel jobs, and a lock of Warp's state."""
+"""Number of CPU threads of simulations and of torch, a pool of worker threads for jobs, and a lock of Warp's state."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ MAX_THREADS = 1024  # Largest number of threads of a simulation
 P = ParamSpec("P")
 T = TypeVar("T")
 FORKED = "a forked process cannot use CUDA: start it with multiprocessing.get_context('spawn')"
+SPIN_COUNT = "20000"  # Rounds in which an idle thread of torch waits for work before it sleeps; libgomp's own: 300,000
 _default_threads: int | None = None
+_torch_spins = False  # whether torch was loaded with libgomp's own number of rounds
 _workers: list[Thread] = []
 _jobs: SimpleQueue[Callable[[], None]] = SimpleQueue()
 """Jobs for the workers; a plain queue wakes a thread four times as fast as an executor."""
@@ -93,6 +95,25 @@ def set_threads(threads: int | None) -> None:
     """Set the default number of threads of new simulations (None: `available_threads`); raises as `checked_threads`."""
     global _default_threads
     _default_threads = None if threads is None else checked_threads(threads)
+
+
+def limit_spinning() -> None:
+    """Let torch's idle CPU threads sleep soon, since the simulation's threads need their cores; call it before torch.
+
+    libgomp reads the number of rounds when torch is loaded. If that was earlier, `stop_spinning` helps.
+    """
+    global _torch_spins
+    if not {"OMP_WAIT_POLICY", "GOMP_SPINCOUNT"} & set(os.environ):
+        os.environ["GOMP_SPINCOUNT"] = SPIN_COUNT
+        _torch_spins = "torch" in sys.modules
+
+
+def stop_spinning() -> None:
+    """Give torch one CPU thread at the first call, if its idle threads spin and OMP_NUM_THREADS is not set."""
+    global _torch_spins
+    if _torch_spins and "OMP_NUM_THREADS" not in os.environ:
+        sys.modules["torch"].set_num_threads(1)
+    _torch_spins = False
 
 
 def run_in_parallel(jobs: Iterable[Callable[[], object]], threads: int) -> None:

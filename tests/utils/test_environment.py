@@ -16,6 +16,28 @@ def test_import_sets_openmp_spin_count_unless_the_user_did_and_does_not_import_t
     assert done.stdout.split() == [spin_count, "False"], done.stderr
 
 
+@pytest.mark.parametrize(
+    ("first", "variables", "worlds", "threads"),
+    [
+        ("torch", {}, 64, 1), ("torch", {}, 2, 2), ("jumper_warp", {}, 64, 2),
+        ("torch", {"OMP_NUM_THREADS": "2"}, 64, 2), ("torch", {"GOMP_SPINCOUNT": "7"}, 64, 2),
+    ],
+)  # fmt: skip
+def test_torch_gets_one_thread_if_its_idle_threads_would_spin_beside_a_simulation(first, variables, worlds, threads):
+    names = ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY", "OMP_NUM_THREADS")
+    inherited = {name: value for name, value in os.environ.items() if name not in names}
+    code = f"""if True:
+        import {first}, torch
+        if "OMP_NUM_THREADS" not in {variables}:
+            torch.set_num_threads(2)
+        from jumper_warp import Simulation
+        Simulation({worlds}, threads=2, device="cpu", visuals=False)
+        print(torch.get_num_threads())
+    """
+    done = subprocess.run([sys.executable, "-c", code], env=inherited | variables, capture_output=True, text=True)
+    assert done.stdout.split()[-1:] == [str(threads)], done.stderr
+
+
 @pytest.mark.parametrize(("level", "loud"), [("", False), ("wp.config.log_level = wp.LOG_DEBUG", True)])
 def test_a_script_is_quiet_about_loaded_kernels_and_a_missing_driver_unless_the_user_sets_the_level(level, loud):
     code = f"import warp as wp; from jumper_warp import build_model; {level or 'pass'}; build_model(1)"
