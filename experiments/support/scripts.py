@@ -13,6 +13,7 @@ from jumper_warp.cli.main import parse, run_command
 from jumper_warp.utils.output import output_dir, write_metrics
 from jumper_warp.utils.progress import phase
 from jumper_warp.utils.runtime import configure_device
+from jumper_warp.utils.startup import prepare_imports
 from jumper_warp.utils.summary import PrintFlags, print_summary
 from support.timing import process_age
 
@@ -43,6 +44,7 @@ class ThreadArgs(DeviceArgs):
 
 def run_script(main: Callable[[Args], Any], kind: type[Args]) -> None:
     """Call `main` with the flags of a script, of type `kind`; print InputError and OSError as one line, exit code 2."""
+    prepare_imports()
     run_command(lambda: main(parse_flags(kind)))
 
 
