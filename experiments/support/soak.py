@@ -194,13 +194,13 @@ def soak_env(env: Env, args: SoakArgs) -> dict:
 
 
 def resident_growth(job: Callable[[int], object], count: int, title: str) -> int:
-    """Call a job `count` times with its index; return the growth of resident memory [KiB] after the first tenth.
+    """Call a job `count` times with its index; return the growth of resident memory [KiB] in the second half.
 
-    0 where the operating system has no /proc.
+    In the first half the allocator's pools grow. 0 where the operating system has no /proc.
     """
     before = 0
     for i in tracked(range(count), title):
-        if i == count // 10:
+        if i == count // 2:
             before = resident_memory()
         job(i)
     return resident_memory() - before
@@ -284,7 +284,7 @@ def soak_tasks(args: SoakArgs, folder: Path) -> dict:
     if args.rebuilds or args.resets:
         metrics |= rebuild_growth(make, args)
     growth = sum(metrics[name] for name in metrics if name.startswith("resident_growth"))
-    metrics["resident_growth_kib_per_1000_steps"] = 1000.0 * growth / (args.steps * len(parts))
+    metrics["resident_growth_kib_per_1000_steps"] = 1000.0 * growth / (0.5 * args.steps * len(parts))
     return metrics | {"task": args.task}
 
 
