@@ -21,6 +21,7 @@ from jumper_warp.utils.progress import phase
 
 LANDING_HEIGHT = 0.30  # [m] Base height at which the ballistic flight lands
 LATEST = 2.5  # [s] Time after the last command at which all jumps are past their apex
+DESCENT = 0.05  # [m] Descent from the largest height in flight after which no base rises above it again
 HUBER = 0.02  # [m] Threshold of the Huber weight: larger errors, as of robots too weak for a jump, count less
 
 
@@ -111,7 +112,7 @@ def jump_errors(group: JumpGroup, network: Network, *, derivatives: bool) -> Jum
             arrays, earlier = env.task_arrays(), apex
             apex = updated_apex(earlier, arrays)
             apex_step[apex != earlier] = len(states) - 1
-            if (arrays["apex_passed"] > 0)[arrays["phase"] > 0].all() and (arrays["phase"] > 0).all():
+            if ((arrays["phase"] == LANDED) | (apex - arrays["base_pos"][:, 2] > DESCENT)).all():
                 break
             advance()
     valid = torch.as_tensor(arrays["phase"] > 0, device=env.device)

@@ -55,6 +55,21 @@ def test_jump_errors_match_environment_with_and_without_derivatives():
     np.testing.assert_allclose(errors.value.numpy(), misses, rtol=0.0, atol=1.0e-4)
 
 
+def test_errors_of_bases_that_rise_twice_are_those_of_the_evaluation():
+    """The last robot's base rises again after every other robot has passed its apex, by 13.7 mm."""
+    policy, count = open_policy("vertical_jump"), 64
+    _, group = make_groups(policy, FinetuneCfg(num_goals=2, num_delayed=0, num_randomized=count, device="cpu"))
+    errors = jump_errors(group, Network(policy), derivatives=False)
+    jumps = HeightLog(group.commands[:, 2], termination_names(group.env.task))
+    group.begin()
+    for _ in range(180):  # 3 s, until after the landing
+        group.env.step(policy.act(group.env.obs))
+        jumps.update(jumps.read_env(group.env), group.env.step_dt)
+    landed = jumps.outcome.landed[:, 0]
+    assert landed.sum() > 0.9 * count
+    np.testing.assert_allclose(errors.value.numpy()[landed], jumps.outcome.apex_error_m[landed, 0], rtol=0.0, atol=1e-4)
+
+
 def test_one_iteration_reduces_error_of_biased_policy_with_small_change_of_actions(tuned):
     _, record = tuned
     before, after = (step["mean_abs_miss_m"]["nominal"] for step in record["steps"])
