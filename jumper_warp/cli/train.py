@@ -72,7 +72,7 @@ class TrainArgs:
 
 
 def parse_train(args: Sequence[str]) -> tuple[TrainArgs, TaskCfg]:
-    """Parse the arguments of `jumper train` into settings and the task; exits after help or usage, and as tyro does.
+    """Return the settings of `jumper train`, and the task changed by --env flags; exits after help and as tyro does.
 
     args: the task, then flags. With --resume the saved settings of the run are the defaults.
     Raises InputError: the task is missing, unknown or given twice, a setting is out of range, the trainer does not use

@@ -33,7 +33,7 @@ _KERNELS: dict[tuple, Kernel] = {}
 class TaskRuntime:
     """Kernels and arrays of one task in an environment; attributes that are structs or arrays are kernel arguments.
 
-    kernels: see `kernels_of`. obs, final_obs: torch views (num_envs, columns) by group, after and before resets.
+    kernels: see `kernels_of`. params: numbers of the terms; `params.values` is the kernels' argument `p`. obs, final_obs: torch views (num_envs, columns) by group, after and before resets.
     """
 
     def __init__(
@@ -221,7 +221,10 @@ class TaskRuntime:
 
 
 def kernels_of(task: TaskCfg) -> dict[str, Kernel]:
-    """Return a task's kernels by name; tasks that differ only in numbers share them. It compiles nothing."""
+    """Return a task's kernels by name, each built by its `make_<name>_kernel`; it compiles nothing.
+
+    Names: step, reset, set_command, observe, event. Tasks that differ only in numbers share kernels.
+    """
     slots = task.params.slots
     compiled = {section: tuple(slot.compiled for slot in section_slots) for section, section_slots in slots.items()}
     ends = tuple(compiled[section] for section in ("advance", "curriculum", "rewards", "terminations"))

@@ -276,7 +276,6 @@ def motion_plot(result: Identification, motion: MotionResiduals, start: np.ndarr
     """Plot one motion, measured and simulated, and its residuals; start: coordinates of its initial state, (I,).
 
     Above: measured and simulated values of the first channel at three motors (or axes). Below: residuals of channels.
-    Above: measured and simulated values of the first channel at three motors (or axes). Below: residuals of channels.
     """
     figure = new_figure(10.0, 4.6)
     axes = figure.subplots(2, 3, sharex=True)

@@ -1,4 +1,4 @@
-"""Reset of the jump task, and the next jump in an episode: start mode, goal, ground and command.
+"""Reset of all jump tasks (`reset_jump`), and the next jump in an episode: start mode, goal, ground and command.
 
 `start_states` samples the state of the robot.
 """
@@ -180,7 +180,7 @@ def reset_jump(
     arrays: RobotArrays, scene: Scene, skill: SkillSettings, old: JumpState, settings: JumpSettings, level: JumpLevel,
     rng: RngStream,
 ) -> JumpState:  # fmt: skip
-    """Write a sampled start state of a jump to world `rng.world`, and return the task state of its new episode.
+    """Write a start state of a jump to world `rng.world` (`write_start`), and return the state of its new episode.
 
     old: state of the previous episode, whose policy steps count toward its start mode.
     """

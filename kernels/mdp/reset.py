@@ -32,7 +32,7 @@ def previous_state(old: Any, done: float):
 
 
 def make_reset_kernel(task: Any) -> wp.Kernel:
-    """Return the kernel that begins episodes of a task and samples its commands within episodes.
+    """Return the kernel that begins episodes by `task.reset.func` and samples a task's commands within episodes.
 
     task: see `jumper_warp.tasks.cfg.TaskCfg`.
     """
