@@ -33,7 +33,8 @@ _KERNELS: dict[tuple, Kernel] = {}
 class TaskRuntime:
     """Kernels and arrays of one task in an environment; attributes that are structs or arrays are kernel arguments.
 
-    kernels: see `kernels_of`. params: numbers of the terms; `params.values` is the kernels' argument `p`. obs, final_obs: torch views (num_envs, columns) by group, after and before resets.
+    kernels: see `kernels_of`. params: numbers of the terms; `params.values` is the kernels' argument `p`. obs,
+    final_obs: torch views (num_envs, columns) by group, after and before resets.
     """
 
     def __init__(
