@@ -10,6 +10,7 @@ from typing import Any
 
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import task_name
+from jumper_warp.rl.metrics_file import METRICS_FILE
 from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.errors import InputError, suggestion
 from jumper_warp.utils.files import read_file, read_json
@@ -65,13 +66,16 @@ class PolicySummary:
 def find_policy(name: str | Path) -> Path:
     """Return the folder of a policy: of the project's policy of this name (- counts as _), else `name` as a path.
 
-    Raises PolicyError: there is no such policy or folder.
+    Raises PolicyError: there is no such policy or folder, or it is that of a training without a checkpoint.
     """
     path = Path(name)
     if own := _own_policy(path):
         return own
     if not path.is_dir():
         raise PolicyError(_no_policy(str(name), path))
+    runs = [file.parent for pattern in (METRICS_FILE, f"*/{METRICS_FILE}") for file in path.glob(pattern)]
+    if runs and not any(map(is_run_folder, runs)):
+        raise PolicyError(f"{path}: no checkpoint yet; a training saves them at its end and each --save-interval")
     return path
 
 

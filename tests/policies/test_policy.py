@@ -521,3 +521,12 @@ def test_repeated_diagonal_block_is_stored_once(tmp_path):
     layers[1][0][0, 16] = -0.0  # not bitwise the zero that the graph pads with
     whole = save_policy(tmp_path / "whole", Policy(layers, policy.mean, policy.std, policy.interface))
     assert initialiser(onnx.load(whole / "policy.onnx"), "actor_1_weight").dims == [16, 32]
+
+
+@pytest.mark.parametrize("source", ["vertical-jump", "vertical-jump/run"])
+def test_a_training_without_a_checkpoint_is_named_as_such(tmp_path, source):
+    run = tmp_path / "vertical-jump" / "run"
+    run.mkdir(parents=True)
+    (run / "metrics.jsonl").write_text("{}\n")
+    with pytest.raises(PolicyError, match=f"{source}: no checkpoint yet; a training saves them at its end"):
+        load_policy(tmp_path / source)
