@@ -70,7 +70,7 @@ class RobotOverlay:
     values: Mapping[str, tuple[float, ...]]
     """By field of `RobotValues`, its values for one robot, in its unit."""
     randomization: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """By field of `RandomizationCfg`, its range (lower, upper), relative to these values."""
+    """By field of `RandomizationCfg`, (lower, upper) in the field's unit and meaning: factor, offset or value."""
     source: str = ""
     """Origin of the values, free text."""
 

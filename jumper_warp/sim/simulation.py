@@ -210,7 +210,8 @@ class Simulation:
     def filter_targets(self) -> None:
         """Run the motor command filter on `target` once, with measured angles (true angle + `motors.offset`).
 
-        Call `physics_step` afterwards. A captured graph may contain both calls.
+        `target` stays; the next physics steps use the filtered targets. Call `physics_step` afterwards. A captured
+        graph may contain both calls.
         """
         self._captured("filter", self._filter_targets)
 

@@ -172,7 +172,8 @@ def completed_step(
 ) -> LegState:  # fmt: skip
     """Return a thread's state after a completed physics step, from its state `old` before it and the step's results.
 
-    base, angles [rad], rates [rad/s]: at the end. total [N s]: sum of the paws' impulses. pressed: the leg's set.
+    base, angles [rad], rates [rad/s]: at the end. torque [N m]: of the motors in the step. total [N s]: sum of the
+    paws' impulses. pressed: set of hard stops that the leg presses.
     """
     new = old
     new.base = base

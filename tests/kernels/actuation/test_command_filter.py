@@ -296,6 +296,7 @@ def test_filter_bounds_overshoot_of_extreme_actions():
 
 def test_filter_reduces_overshoot_of_commands_beyond_the_limits():
     low, high = (-180.0,) * 3, (180.0,) * 3
+    # [deg] of lateral, outer, inner, outer + inner
     assert np.all(worst_overshoot(low, high, filtered=True) < [30.0, 21.0, 21.0, 60.0])
     assert np.all(worst_overshoot(low, high, filtered=False) > [120.0, 120.0, 120.0, 300.0])
 
