@@ -15,10 +15,12 @@ GAP, NEVER = "not measured", "not reached"
 ROWS = (
     ("vertical-jump-paper", "0.5–1.2 m, success", "nominal_sweep_goal_reached_rate", "0.91"),
     ("vertical-jump-paper", "0.5–1.1 m, success", "nominal_sweep_in_range_goal_reached_rate", "1.00"),
+    ("vertical-jump-paper", "0.5–1.2 m, also on command, landed, at rest", "nominal_sweep_success_rate", "–"),
     ("vertical-jump-paper", "mean error [m]", "nominal_sweep_apex_error_abs_mean_m", "0.040"),
     ("vertical-jump-paper", "steps to 50 % [million]", "steps_to_50_percent", "–"),
     ("horizontal-jump-paper", "0.3–1.5 m, success", "nominal_straight_goal_reached_rate", "0.97"),
     ("horizontal-jump-paper", "0.3–1.4 m, success", "nominal_straight_in_range_goal_reached_rate", "1.00"),
+    ("horizontal-jump-paper", "0.3–1.5 m, also landed, at rest", "nominal_straight_success_rate", "–"),
     ("horizontal-jump-paper", "mean error, all jumps [m]", "nominal_straight_goal_distance_at_end_mean_m", "0.026"),
     ("horizontal-jump-paper", "mean error, at rest [m]", "nominal_straight_goal_distance_at_rest_mean_m", "0.026"),
     ("horizontal-jump-paper", "grid, success", "nominal_grid_goal_reached_rate", "0.968"),
@@ -66,12 +68,17 @@ def results_table(folder: Path) -> str:
 
 
 def plot_curves(folder: Path, path: Path) -> None:
-    """Plot the primary metric of nominal robots over steps into a file: a line per training, a colour per arm."""
+    """Plot the primary metric of nominal robots over steps into a file: a line per training, a thick one per mean."""
     with figure(path, 1, len(CURVES), figsize=(11, 4), title="Learning curves of the paper's tasks") as axes:
         for axis, (task, label, paper) in zip(axes, CURVES, strict=True):
             for i, arm in enumerate(ARMS):
-                for number, values in enumerate(finished(folder, task, arm)):
-                    steps, curve = np.array(values["curve_steps"]) * 1.0e-6, values["curve_values"]
-                    axis.plot(steps, curve, color=f"C{i}", marker=".", label=None if number else arm.replace("_", " "))
+                curves = [(values["curve_steps"], values["curve_values"]) for values in finished(folder, task, arm)]
+                if not curves:
+                    continue
+                steps = max((steps for steps, _ in curves), key=len)
+                means = np.mean([np.interp(steps, *curve) for curve in curves], axis=0)
+                for those, curve in curves:
+                    axis.plot(np.array(those) * 1.0e-6, curve, color=f"C{i}", linewidth=0.7, alpha=0.5)
+                axis.plot(np.array(steps) * 1.0e-6, means, color=f"C{i}", linewidth=2.5, label=arm.replace("_", " "))
             axis.axhline(paper, color="black", linestyle=":", label="the paper")
             axis.set(title=task, xlabel="policy steps [million]", ylabel=label, xlim=(0.0, None), ylim=(0.0, None))
