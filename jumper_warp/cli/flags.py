@@ -152,6 +152,11 @@ def option_of(arg: str) -> str:
     return match[1].replace("_", "-") if match else ""
 
 
+def switch_of(option: str) -> str:
+    """Return the flag of an option, as `--noise` of `--no-noise`; other options are returned unchanged."""
+    return re.sub(r"(--|\.)no-([^.]+)$", r"\1\2", option)
+
+
 def values_of(option: str, args: Sequence[str]) -> list[str]:
     """Return the values after the last appearance of a flag (with dashes) in unparsed arguments."""
     values: list[str] = []

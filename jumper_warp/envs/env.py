@@ -39,6 +39,7 @@ from jumper_warp.utils.checks import check_count, check_seed
 from jumper_warp.utils.dumps import NonFiniteValue
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import load_kernels, records
+from jumper_warp.utils.runtime import init_warp
 from jumper_warp.utils.streams import PURPOSES, Purpose
 from jumper_warp.utils.threads import WARP_LOCK, locked
 
@@ -121,6 +122,7 @@ class Env(Stages):
         run, self._draws_ground = prepared_tasks(tasks, randomize, noise, may_vary, robot)
         terrains = [terrain for each in run if (terrain := each.terrain) is not None]
         ground = terrains[0] if terrains else ground
+        init_warp()
         self.wp_device = wp.get_device(device and str(device))
         physics = [advance_kernel(self.wp_device)] if solver == "jumper" else []
         with loading_usual_kernels(run, physics, auto_reset, self.wp_device):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib
-import os
 import time
 from contextlib import suppress
 from itertools import pairwise
@@ -40,6 +39,10 @@ class Stopwatch:
         if self._cuda:
             mark.record()
         self._laps[-1].append(mark)
+
+    def lap_time(self) -> float:
+        """Return the time from the beginning of the current lap to its last mark [s]; 0 on a GPU."""
+        return 0.0 if self._cuda else self._laps[-1][-1] - self._laps[-1][0]
 
     def read(self) -> tuple[list[float], float]:
         """Return the mean time of each part [s] over the laps since the last call, and the host time per lap [s].
@@ -126,14 +129,20 @@ class TrainingLog:
         if not self._console.is_terminal:
             self.print_line(line)
         if iteration > self._first:
-            self._check_rate(metrics["Perf/total_fps"])
+            self.check_rate(metrics["Perf/total_fps"])
 
-    def _check_rate(self, rate: float) -> None:
+    def print_speed(self, rate: float, remaining: float) -> None:
+        """Print the measured step rate [1/s] and the estimated time to the end [s]; as `check_rate` if it is low."""
+        self.print_line(f"measured speed: {rate:,.0f} steps/s, about {format_duration(remaining)} left")
+        self.check_rate(rate)
+
+    def check_rate(self, rate: float) -> None:
         """Print one line, once, if the step rate [1/s] is less than half of the expected one."""
         if 2.0 * rate < self._expected_rate:
-            advice = "" if os.environ.get("OMP_NUM_THREADS") == "1" else ", or set OMP_NUM_THREADS=1"
-            usual = f"about {self._expected_rate:,.0f} are usual on these threads"
-            self.print_line(f"slow, {rate:,.0f} steps/s: {usual}; close programs that use the cores{advice}")
+            usual = f"below {self._expected_rate / 2.0:,.0f} steps/s, {self._expected_rate:,.0f} are usual on two cores"
+            waiting = ", or restart with OMP_NUM_THREADS=1, since torch's threads wait for them"
+            advice = f"close other programs that use the cores{waiting if torch.get_num_threads() > 1 else ''}"
+            self.print_line(f"slow: {usual}; {advice}")
             self._expected_rate = 0.0
 
     def move(self, folder: Path) -> None:

@@ -40,6 +40,7 @@ PERF = ("Perf/total_fps", "Perf/collection_time", "Perf/learning_time", "Perf/el
 """Performance metrics: policy steps per second, time of the rollout and of the update [s], training time [s]."""
 LEARNING = ("Loss/learning_rate", "Policy/mean_std", "Train/mean_reward", "Train/mean_episode_length")
 """Learning metrics in addition to the losses; those of Train/ exist only if an episode has ended."""
+WARM_UP = 5.0  # [s] A first iteration that takes longer measures the speed of a training on a CPU
 INTERRUPTED = 130  # Exit code of a training that a signal stopped
 MakeEnv = Callable[[int, int, torch.device], VecEnv]
 """Function that makes an environment from the number of worlds, the seed and the device."""
@@ -84,8 +85,8 @@ def train(
 
     command: command line printed for resuming, without `--resume` (default: `jumper train TASK`). as_rsl_rl: required
     by trainer rsl-rl. actor_init: initialisation from cfg.init_policy, required with it. checkpoint: the loaded
-    checkpoint of cfg.resume (default: loaded here). expected_rate: environment steps per second of all worlds; one line
-    warns of less than half of it (0: no warning).
+    checkpoint of cfg.resume (default: loaded here). expected_rate: usual environment steps per second of all worlds on
+    two CPU cores; one line warns of less than half of it (0: no warning).
     Raises InputError: a setting does not fit the environment or the machine. CheckpointError: no usable checkpoint to
     resume from, or the last one could not be saved; InputError: another process is writing the run's folder.
     SystemExit, after a checkpoint was saved: with code INTERRUPTED if Ctrl-C or SIGTERM stopped the training, with a
@@ -167,6 +168,7 @@ class TrainingRun:
         _check_best_metric(cfg.best_metric, {*env.metrics(), *losses, *LEARNING, *PERF})
         self.config = full_config(cfg, env, rank)
         self.iteration, self.seconds = 0, 0.0  # of the run before this process
+        self._is_timed = rank.device.type == "cuda"  # whether the speed has been printed; a GPU's log comes soon
         self._clock_start: float | None = None  # time at which the run would have started without interruption
         self.metrics: dict[str, float] = {}
         self.notes: list[str] = []
@@ -222,7 +224,7 @@ class TrainingRun:
             while not is_last:
                 watch.start()
                 ppo.set_progress(self._progress())
-                ppo.iterate(watch.mark)
+                ppo.iterate(partial(self._mark, watch, log))
                 self.iteration += 1
                 if self.iteration == first_iteration:
                     self._start_clock()
@@ -232,13 +234,13 @@ class TrainingRun:
                     self._check(log)
                     is_last = is_last or bool(self.failure and self.rank.size == 1)
                 if is_last or logs:
-                    times, seconds = watch.read()
+                    (times, seconds), self._is_timed = watch.read(), True
                     self.metrics = self._read_metrics(times)
                     log.log(self.iteration, self.metrics, self._remaining(seconds))
-                elif self.iteration == first_iteration:  # discard its time, which includes warm-up
-                    watch.read()
+                elif self.iteration == first_iteration or not self._is_timed:
+                    self._print_speed(log, watch, self.iteration == first_iteration)
                 if is_last and not self.failure:
-                    log.print_line(f"ended by {'an interruption' if stop.requested else self._limit()}")
+                    log.print_line(f"ended by {self._reason(stop)}")
                 if is_last or saves:
                     self._save(log, is_last, stop)
         return TrainResult(self.folder, self.iteration, time.perf_counter() - start, self.metrics)
@@ -259,6 +261,25 @@ class TrainingRun:
         """Return the limit that ends the training."""
         ended = self.iteration >= self.cfg.max_iterations
         return f"--max-iterations {self.cfg.max_iterations}" if ended else f"--max-seconds {self.cfg.max_seconds:g}"
+
+    def _reason(self, stop: StopRequest) -> str:
+        """Return the reason of the training's end, and the steps made if they are not all."""
+        done, total = (count * self._steps() / 1.0e6 for count in (self.iteration, self.cfg.max_iterations))
+        steps = f" after {done:.2f} M of {total:.2f} M steps" if done < total else ""
+        return f"{'an interruption' if stop.requested else self._limit()}{steps}"
+
+    def _mark(self, watch: Stopwatch, log: TrainingLog | _NoLog) -> None:
+        """End a part of an iteration; warn of a low step rate before a long first iteration has ended."""
+        watch.mark()
+        if self._clock_start is None and (seconds := watch.lap_time()) > WARM_UP:
+            log.check_rate(self._steps() / seconds)
+
+    def _print_speed(self, log: TrainingLog | _NoLog, watch: Stopwatch, is_first: bool) -> None:
+        """Print a CPU's speed; the time of the first iteration is discarded unless it is much longer than warm-up."""
+        times, seconds = watch.read()
+        if not self._is_timed and (seconds > WARM_UP or not is_first):
+            log.print_speed(self._steps() / sum(times), self._remaining(seconds))
+            self._is_timed = True
 
     def _check(self, log: TrainingLog | _NoLog) -> None:
         """Report terms that are not finite; set `failure` if one of them or a deleted folder ends the training."""
@@ -373,6 +394,12 @@ class _NoLog:
 
     def print_line(self, line: str) -> None:
         """Discard the line."""
+
+    def print_speed(self, rate: float, remaining: float) -> None:
+        """Discard the speed."""
+
+    def check_rate(self, rate: float) -> None:
+        """Discard the step rate."""
 
     def log(self, iteration: int, metrics: dict[str, float], remaining: float) -> None:
         """Discard the metrics."""

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import os
 import sys
+import threading
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from functools import partial
+from functools import partial, wraps
+from typing import ParamSpec, TypeVar
 
 from rich.console import Console
 from rich.progress import BarColumn, Progress, ProgressColumn, Task, TimeElapsedColumn
 from rich.text import Text
 
+P = ParamSpec("P")
+T = TypeVar("T")
 _shown: Progress | None = None  # Display of the outermost phase, which shows the phases within it too
 
 
@@ -57,3 +61,16 @@ def phase(title: str, total: int | None = None) -> Iterator[Callable[..., object
         _shown = outer
         if outer is None:
             progress.stop()
+
+
+def shown(title: str, function: Callable[P, T]) -> Callable[P, T]:
+    """Return a function that is a phase of its own where it runs in the main thread outside of other phases."""
+
+    @wraps(function)
+    def call(*args: P.args, **kwargs: P.kwargs) -> T:
+        if _shown is not None or threading.current_thread() is not threading.main_thread():
+            return function(*args, **kwargs)
+        with phase(title):
+            return function(*args, **kwargs)
+
+    return call

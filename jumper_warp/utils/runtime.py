@@ -14,6 +14,7 @@ import warp as wp
 from rich.console import Console
 
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.progress import shown
 from jumper_warp.utils.threads import checked_threads, set_threads
 from jumper_warp.utils.version import __version__
 
@@ -90,8 +91,8 @@ def _report_once(device: str | None, threads: int) -> DeviceInfo:
 def init_warp() -> None:
     """Initialise Warp at the first call, without messages about each module and a missing CUDA driver.
 
-    A log level that the user has set is kept. Warp's native library prints the notice about the driver, so that the
-    process's standard error is a file meanwhile.
+    A log level that the user has set is kept. A terminal shows when kernels are compiled. Warp's native library prints
+    the notice about the driver, so that the process's standard error is a file meanwhile.
     """
     if wp.config.log_level == wp.LOG_INFO:  # Warp's default
         wp.config.log_level = wp.LOG_WARNING
@@ -107,6 +108,8 @@ def init_warp() -> None:
             printed.seek(0)
             lines = [line for line in printed.read().decode(errors="replace").splitlines() if NO_DRIVER not in line]
             print("".join(f"{line}\n" for line in lines), end="", file=sys.stderr)
+    compiler = "_compile"  # method of Warp 1.19 that is called only for a module that is not in the cache
+    setattr(wp.Module, compiler, shown("compiling kernels", getattr(wp.Module, compiler)))
 
 
 def git_commit(folder: Path | None = None) -> Commit | None:

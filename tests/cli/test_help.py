@@ -200,8 +200,14 @@ def test_usage_lists_exit_codes(capsys):
 @pytest.mark.parametrize(
     ("args", "presets", "message"),
     [
-        (TrainArgs(TrainCfg(threads=2)), (), "without a GPU this training takes about 10 h\n"),
-        (TrainArgs(TrainCfg(threads=1)), ("laptop",), "about 20 h; settings for such a machine: --preset laptop\n"),
+        (TrainArgs(TrainCfg(threads=2)), (),
+         "without a GPU this training takes about 10 h: 734.0 M steps at 20,000 steps/s\n"),
+        (TrainArgs(TrainCfg(threads=1)), ("laptop",),
+         "about 20 h: 734.0 M steps at 10,000 steps/s; settings for such a machine: --preset laptop\n"),
+        (TrainArgs(TrainCfg(threads=1, num_envs=1024, max_iterations=140), preset="laptop"), (),
+         "about 11 min: 4.6 M steps at 7,000 steps/s\n"),
+        (TrainArgs(TrainCfg(threads=4, num_envs=1024, max_iterations=140), preset="laptop"), (),
+         "about 5 min: 4.6 M steps at 14,000 steps/s\n"),
         (TrainArgs(TrainCfg(threads=1, max_seconds=120.0)), ("a", "b"),
          "2 min; settings for such a machine: --preset a or --preset b\n"),
         (TrainArgs(TrainCfg(threads=1, num_envs=64, max_iterations=2)), ("laptop",), ""),
@@ -214,9 +220,12 @@ def test_time_of_a_training_without_gpu_is_announced_unless_short(capsys, args, 
 
 
 @pytest.mark.parametrize("task", [name for name, entry in TASKS.items() if entry.presets])
-def test_preset_sets_flags_and_other_flags_override_it(task):
+def test_preset_sets_and_prints_flags_that_other_flags_do_not_override(task, capsys):
     parsed, made = parse_train([task.replace("-", "_"), "--num-envs", "8", "--preset", "laptop", "--noise"])
     assert (parsed.cfg.num_envs, parsed.randomize, parsed.noise) == (8, False, True)
+    line = capsys.readouterr().err
+    assert line.startswith("preset laptop: --no-randomize --history 1 --ppo.hidden 128 64 64 --")
+    assert "--num-envs" not in line and "--no-noise" not in line
     assert parsed.cfg.ppo.hidden == (128, 64, 64) and parsed.cfg.ppo.desired_kl == 0.02
     widths = [max(end for _, end in each.layout("actor").values()) for each in (made, make_task(task))]
     assert widths[0] < widths[1]  # one step of observations

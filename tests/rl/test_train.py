@@ -162,7 +162,7 @@ def test_signal_finishes_the_iteration_saves_and_prints_the_resume_command(cfg, 
     (path,) = cfg.log_root.glob("push/*/checkpoints/iteration_000003.pt")
     assert load_checkpoint(path)["env"]["steps"] == 48
     *_, cause, last = capsys.readouterr().err.splitlines()
-    assert cause == "ended by an interruption"
+    assert cause == "ended by an interruption after 0.00 M of 0.05 M steps"
     assert last == f"saved {path}, continue with: jumper train push --resume {path.parent.parent}"
 
 

@@ -38,8 +38,12 @@ def test_torch_gets_one_thread_if_its_idle_threads_would_spin_beside_a_simulatio
     assert done.stdout.split()[-1:] == [str(threads)], done.stderr
 
 
-@pytest.mark.parametrize(("level", "loud"), [("", False), ("wp.config.log_level = wp.LOG_DEBUG", True)])
-def test_a_script_is_quiet_about_loaded_kernels_and_a_missing_driver_unless_the_user_sets_the_level(level, loud):
-    code = f"import warp as wp; from jumper_warp import build_model; {level or 'pass'}; build_model(1)"
+@pytest.mark.parametrize(
+    ("level", "first", "loud"),
+    [("pass", "build_model(1)", False), ("wp.config.log_level = wp.LOG_DEBUG", "build_model(1)", True),
+     ("pass", "Env(make_task('attitude'), 1)", False)],
+)  # fmt: skip
+def test_a_script_is_quiet_about_loaded_kernels_and_a_missing_driver_unless_the_user_sets_the_level(level, first, loud):
+    code = f"import warp as wp; from jumper_warp import Env, build_model, make_task; {level}; {first}"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert ("Module " in done.stdout + done.stderr) == loud and "NVIDIA CUDA driver" not in done.stderr

@@ -7,13 +7,14 @@ from jumper_warp.utils.progress import phase
 
 CODE = """
 import time
-from jumper_warp.utils.progress import phase
+from jumper_warp.utils.progress import phase, shown
 
+shown("alone", time.sleep)(0.3)
 with phase("outer", 4) as advance:
     advance(2)
     with phase("inner") as step:
         step()
-        time.sleep(0.3)
+        shown("hidden", time.sleep)(0.3)
     print("result")
 """
 
@@ -32,7 +33,8 @@ def test_phases_show_on_a_terminal_and_leave_standard_output_alone():
     while part := _read(reader):
         shown += part
     assert process.stdout == "result\n"
-    assert b"outer" in shown and b"inner" in shown and b"result" not in shown
+    assert all(title in shown for title in (b"alone", b"outer", b"inner"))
+    assert b"hidden" not in shown and b"result" not in shown
 
 
 def _read(reader):
