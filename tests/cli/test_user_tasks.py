@@ -13,9 +13,8 @@ from jumper_warp.cli import main as cli
 from jumper_warp.cli.main import split_task_modules
 from jumper_warp.cli.train import check_saving, command_line
 from jumper_warp.kernels.jump import rewards
-from jumper_warp.policies.folder import load_policy
 from jumper_warp.policies.restore import restored_task
-from jumper_warp.policies.runs import open_policy
+from jumper_warp.policies.runs import load_policy, open_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import TASKS, load_task_module, make_task
 from jumper_warp.rl.checkpoint import save_checkpoint
