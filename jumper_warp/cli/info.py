@@ -145,15 +145,16 @@ def properties(values: Mapping[str, str]) -> list[str]:
 def task_info(name: str, modules: Sequence[ModuleType] = ()) -> tuple[dict[str, Any], list[str]]:
     """Return the description of a task as JSON data and as lines of text; modules: as of `run`.
 
-    Raises InputError: it is unknown, or jumper train would refuse it.
+    Raises InputError: it is unknown, invalid, or cannot be saved.
     """
-    from jumper_warp.cli.train import check_saving, command_line
+    from jumper_warp.cli.train import command_line
     from jumper_warp.registry import find_task, first_sentence
+    from jumper_warp.tasks.saving import task_to_json
     from jumper_warp.utils.assets import policy_tasks
 
     name, entry = find_task(name)
     task = entry.task(name)
-    check_saving(task)
+    task_to_json(task)  # raises TaskError, as in a training
     content = {
         "name": name, "about": entry.description, "details": first_sentence(entry.factory().__doc__ or ""),
         "policies": [policy for policy, of in policy_tasks().items() if of == name], "aliases": list(entry.aliases),
