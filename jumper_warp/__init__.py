@@ -10,7 +10,7 @@ from jumper_warp.utils.version import __version__ as __version__
 
 if TYPE_CHECKING:
     from jumper_warp.envs.env import Env as Env
-    from jumper_warp.policies.folder import load_policy as load_policy
+    from jumper_warp.policies.runs import load_policy as load_policy
     from jumper_warp.registry import make_task as make_task
     from jumper_warp.robot.model import build_model as build_model
     from jumper_warp.sim.simulation import Simulation as Simulation
@@ -21,7 +21,7 @@ _MODULES = {
     "Simulation": "jumper_warp.sim.simulation",
     "SolverJumper": "jumper_warp.sim.solver",
     "build_model": "jumper_warp.robot.model",
-    "load_policy": "jumper_warp.policies.folder",
+    "load_policy": "jumper_warp.policies.runs",
     "make_task": "jumper_warp.registry",
 }
 """Module of each public name, imported at the name's first use."""

@@ -8,9 +8,9 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import inspect
 import keyword
 import sys
-import traceback
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from importlib.metadata import EntryPoint, entry_points
@@ -22,7 +22,7 @@ from jumper_warp.rl.cfg import PpoCfg, TrainCfg
 from jumper_warp.utils.assets import dashed, policy_tasks
 from jumper_warp.utils.errors import InputError, suggestion
 from jumper_warp.utils.files import existing_file
-from jumper_warp.utils.sources import module_from_file
+from jumper_warp.utils.sources import PROJECT_PREFIX, module_from_file, own_fault
 
 if TYPE_CHECKING:
     from jumper_warp.tasks.cfg import TaskCfg
@@ -75,10 +75,17 @@ class TaskEntry:
         return getattr(importlib.import_module(module), function)
 
     def task(self, name: str) -> TaskCfg:
-        """Make and return the task. Raises InputError: the result is no TaskCfg, or has another name."""
+        """Make and return the task. Raises InputError: it is invalid, no TaskCfg, or has another name."""
         from jumper_warp.tasks.cfg import TaskCfg
 
-        task = self.factory()()
+        make = self.factory()
+        try:
+            task = make()
+        except (InputError, TypeError) as error:
+            if self.origin.startswith(PROJECT_PREFIX):
+                raise
+            code = getattr(inspect.unwrap(make), "__code__", None)
+            raise own_fault(error, code.co_filename if code else "") from error
         if not isinstance(task, TaskCfg):
             raise InputError(f"task {name!r} of {self.origin}: expected a TaskCfg, got {type(task).__name__}")
         if task.name != name:
@@ -335,12 +342,10 @@ def _load_file(path: Path) -> ModuleType:
     try:
         return module_from_file(name, path)
     except BaseException as error:
-        if isinstance(error, SyntaxError) and error.filename in (str(path), None):  # None: a null byte
-            raise InputError(f"{path.name}:{error.lineno or 1}: {error.msg}") from error
+        if isinstance(error, SyntaxError):  # of the file, or of one that it imports; without a name for a null byte
+            raise InputError(f"{Path(error.filename or path).name}:{error.lineno or 1}: {error.msg}") from error
         if isinstance(error, InputError):
-            lines = [line for frame, line in traceback.walk_tb(error.__traceback__)
-                     if frame.f_code.co_filename == str(path)]  # fmt: skip
-            raise InputError(f"{path.name}:{lines[-1] if lines else 1}: {error}") from error
+            raise own_fault(error, str(path)) from error
         raise
 
 

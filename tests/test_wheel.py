@@ -19,7 +19,7 @@ INSTALL = ("-m", "pip", "install", "--no-deps", "--no-index", "--disable-pip-ver
 USE = """
 import jumper_warp
 from jumper_warp.cli.main import main
-from jumper_warp.policies.folder import load_policy
+from jumper_warp.policies.runs import load_policy
 from jumper_warp.utils.assets import policy_tasks
 from jumper_warp.robot.description import load_description
 

@@ -66,7 +66,7 @@ def run(args: Sequence[str], modules: Sequence[ModuleType] = ()) -> None:
 
     task = task_name(cfg.name)
     if cfg.task or (task is not None and cfg.name not in policy_tasks()):
-        content, lines = task_info(cfg.name)
+        content, lines = task_info(cfg.name, modules)
     else:
         summary = summarise(find_policy(cfg.name))
         content, lines = policy_info(summary)
@@ -142,20 +142,28 @@ def properties(values: Mapping[str, str]) -> list[str]:
     return [line.replace(UNBROKEN, " ") for line in lines]
 
 
-def task_info(name: str) -> tuple[dict[str, Any], list[str]]:
-    """Return the description of a task as JSON data and as lines of text. Raises InputError: it is unknown."""
+def task_info(name: str, modules: Sequence[ModuleType] = ()) -> tuple[dict[str, Any], list[str]]:
+    """Return the description of a task as JSON data and as lines of text; modules: as of `run`.
+
+    Raises InputError: it is unknown, invalid, or cannot be saved.
+    """
+    from jumper_warp.cli.train import command_line
     from jumper_warp.registry import find_task, first_sentence
+    from jumper_warp.tasks.saving import task_to_json
     from jumper_warp.utils.assets import policy_tasks
 
     name, entry = find_task(name)
     task = entry.task(name)
+    task_to_json(task)  # raises TaskError, as in a training
     content = {
         "name": name, "about": entry.description, "details": first_sentence(entry.factory().__doc__ or ""),
         "policies": [policy for policy, of in policy_tasks().items() if of == name], "aliases": list(entry.aliases),
         "module": entry.origin, **contents_of(task),
     }  # fmt: skip
     sizes, rewards = content["observation_sizes"], content["rewards"]
-    lines = [f"{name}: {entry.description}", "", *textwrap.wrap(f"{content['details']}.", WIDTH), ""]
+    lines = [f"{name}: {entry.description}" if entry.description else name, ""]
+    if content["details"] not in ("", entry.description):
+        lines += [*textwrap.wrap(f"{content['details']}.", WIDTH), ""]
     lines += properties({
         "observation": f"{sizes['actor']} numbers: {', '.join(content['observations'])}",
         "critic": f"observes {sizes['critic']} numbers",
@@ -163,7 +171,7 @@ def task_info(name: str) -> tuple[dict[str, Any], list[str]]:
         "rewards": ", ".join(f"{term}{UNBROKEN}{weight:g}" for term, weight in rewards.items()),
         "terminations": ", ".join(content["terminations"]),
         "policies": ", ".join(content["policies"]), "aliases": ", ".join(entry.aliases), "module": entry.origin,
-        "train": f"jumper train {name}",
+        "train": command_line([name], modules).replace(" ", UNBROKEN),
         "presets": ", ".join(f"--preset {preset}" for preset in entry.presets),
     })  # fmt: skip
     return content, lines

@@ -18,7 +18,6 @@ import traceback
 from collections.abc import Callable, Collection, Sequence
 from typing import TYPE_CHECKING, Any
 
-from jumper_warp.utils.codegen import codegen_error
 from jumper_warp.utils.errors import InputError, is_out_of_memory, suggestion
 from jumper_warp.utils.startup import prepare_imports
 from jumper_warp.utils.version import __version__
@@ -101,23 +100,17 @@ def dispatch(args: Sequence[str]) -> None:
             modules += (load_task_module(file) for file in files)
         importlib.import_module(f"jumper_warp.cli.{name}").run(rest, modules)
     except Exception as error:
-        user_files = {
-            os.path.abspath(path)
-            for path in (*files, *(getattr(module, "__file__", None) for module in modules))
-            if path
-        }
-        if message := user_file_error(user_files, error):
+        paths = [*files, *(getattr(module, "__file__", None) for module in modules)]
+        folders = {os.path.dirname(os.path.abspath(path)) for path in paths if path}
+        if message := user_file_error(folders, error):
             raise InputError(message) from error
         raise
 
 
-def user_file_error(files: Collection[str], error: Exception) -> str | None:
-    """Return a message with file and line of an exception raised in one of `files` (absolute paths), else None."""
-    found = codegen_error(error)
-    if found and os.path.abspath(found[0]) in files:
-        return f"{found[1]}: {found[2].removeprefix('Error, ')}"
+def user_file_error(folders: Collection[str], error: Exception) -> str | None:
+    """Return a message with file and line of an exception raised in a file of `folders` (absolute paths), else None."""
     frames = [(frame.f_code.co_filename, line) for frame, line in traceback.walk_tb(error.__traceback__)]
-    if isinstance(error, InputError) or not frames or os.path.abspath(frames[-1][0]) not in files:
+    if isinstance(error, InputError) or not frames or os.path.dirname(os.path.abspath(frames[-1][0])) not in folders:
         return None
     return f"{os.path.basename(frames[-1][0])}:{frames[-1][1]}: {type(error).__name__}: {error}"
 

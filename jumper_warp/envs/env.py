@@ -20,7 +20,7 @@ from jumper_warp.envs.arrays import (
     checked_worlds,
     prepared_tasks,
 )
-from jumper_warp.envs.stages import Stages, loading_usual_kernels
+from jumper_warp.envs.stages import Stages, usual_kernels
 from jumper_warp.envs.state import load_state, save_state
 from jumper_warp.kernels.mdp.reset import default_pose_kernel
 from jumper_warp.robot.grounds import BlockCfg
@@ -38,7 +38,7 @@ from jumper_warp.tasks.saving import handover_to_json, task_to_json
 from jumper_warp.utils.checks import check_count, check_seed
 from jumper_warp.utils.dumps import NonFiniteValue
 from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.kernels import load_kernels, records
+from jumper_warp.utils.kernels import load_kernels, loading_kernels, records
 from jumper_warp.utils.runtime import init_warp
 from jumper_warp.utils.streams import PURPOSES, Purpose
 from jumper_warp.utils.threads import WARP_LOCK, locked
@@ -104,8 +104,7 @@ class Env(Stages):
         (`jumper_warp.tasks.overlay_ranges`). threads: CPU threads, as in `Simulation`.
         refine: factor by which the physics step is shorter than in training.
         Raises InputError (a ValueError): see `checked_tasks` and `Simulation`, num_envs or refine no whole number of at
-        least 1, a seed not in 0 to 2^31 - 1, no such stream, or a term's function that returns another type than it
-        must, with file and line. Other errors of a function are Warp's.
+        least 1, a seed not in 0 to 2^31 - 1, or no such stream.
         """
         check_count("num_envs", num_envs)
         check_count("refine", refine)
@@ -125,7 +124,7 @@ class Env(Stages):
         init_warp()
         self.wp_device = wp.get_device(device and str(device))
         physics = [advance_kernel(self.wp_device)] if solver == "jumper" else []
-        with loading_usual_kernels(run, physics, auto_reset, self.wp_device):
+        with loading_kernels([*physics, *usual_kernels(run, auto_reset)], self.wp_device):
             self.sim = Simulation(
                 num_envs, solver=solver, motors=self.task.motors, visuals=visuals, device=self.wp_device, ground=ground,
                 block=BlockCfg((0.0, 0.0)) if self._draws_ground else block, tolerance=CONTACT_TOLERANCE,

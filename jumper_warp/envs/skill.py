@@ -22,7 +22,6 @@ from jumper_warp.kernels.mdp.view import vec12
 from jumper_warp.robot.motors import filter_params
 from jumper_warp.tasks.cfg import TaskCfg
 from jumper_warp.tasks.params import ParamArrays
-from jumper_warp.utils.codegen import explained_fields
 from jumper_warp.utils.dumps import NonFiniteValue
 from jumper_warp.utils.kernels import Kernel, records
 from jumper_warp.utils.threads import locked
@@ -54,9 +53,8 @@ class TaskRuntime:
         self.term_value, self.episode_sum = (wp.zeros(terms, dtype=float, device=device) for _ in range(2))
         self.counters = self._counters()
         self._max_episode_length_s = task.max_episode_length_s(step_dt)
-        with explained_fields(task.fields):
-            self.settings = self._structs([] if task.reset.settings is None else [task.reset.settings.values(step_dt)])
-            self.levels = self._structs([level.values() for level in task.levels], task.level_type)
+        self.settings = self._structs([] if task.reset.settings is None else [task.reset.settings.values(step_dt)])
+        self.levels = self._structs([level.values() for level in task.levels], task.level_type)
         self._allocate_observations(substeps)
         self._allocate_non_finite(slices)
 

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,9 +31,7 @@ from jumper_warp.sim.simulation import Simulation
 from jumper_warp.sim.slices import WorldRange
 from jumper_warp.tasks.cfg import Handover, TaskCfg
 from jumper_warp.tasks.overlay_ranges import RangeMoves
-from jumper_warp.utils.codegen import explained_fields
-from jumper_warp.utils.errors import InputError
-from jumper_warp.utils.kernels import Kernel, loading_kernels
+from jumper_warp.utils.kernels import Kernel
 from jumper_warp.utils.streams import Purpose
 
 BLOCK = 32  # Default threads of a block; small, to spread a few thousand heavy threads over all multiprocessors
@@ -53,27 +50,6 @@ def usual_kernels(tasks: Sequence[TaskCfg], draws: bool) -> list[tuple[Kernel, i
     shared = [track_kernel, action_kernel, motors_kernel, clear_history_kernel, advance_rng_kernel]
     kernels = [(kernels_of(task)[name], BLOCKS.get(name, BLOCK)) for name in names for task in tasks]
     return [*kernels, *((kernel, BLOCK) for kernel in shared), (postprocess_obs_kernel, POSTPROCESS_BLOCK)]
-
-
-@contextmanager
-def loading_usual_kernels(
-    tasks: Sequence[TaskCfg], physics: Sequence[tuple[Kernel, int]], draws: bool, device: wp.Device
-) -> Iterator[None]:
-    """Compile or load `usual_kernels` and kernels of the physics in other threads while the block runs.
-
-    Raises InputError, with file and line: a term's function returns another type than it must, or uses a field that a
-    struct does not have.
-    """
-    with explained_fields({struct: names for task in tasks for struct, names in task.fields.items()}):
-        try:
-            with loading_kernels([*physics, *usual_kernels(tasks, draws)], device):
-                yield
-        except InputError:
-            raise
-        except Exception:
-            for task in tasks:
-                task.check_returned()
-            raise
 
 
 class WorldSlice(NamedTuple):

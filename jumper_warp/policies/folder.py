@@ -16,9 +16,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import torch
-
-from jumper_warp.policies.catalog import CONFIG, MANIFEST, ONNX, README, find_policy, is_run_folder, newest_run
+from jumper_warp.policies.catalog import CONFIG, MANIFEST, ONNX, README, find_policy
 from jumper_warp.policies.onnx import onnx_bytes, policy_from_onnx
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
@@ -108,22 +106,20 @@ def _write(folder: Path, files: Mapping[str, bytes], checksums: Mapping[str, str
         write_atomically(folder / name, data)
 
 
-def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
+def read_policy(name: str | Path) -> Policy:
     """Return a policy by name or folder (see `find_policy`), after verifying every file; pictures may be missing.
 
     Raises PolicyError: the policy is missing, truncated, altered, of another version, or its weights are not finite or
-    not of the shape in its configuration; or the folder is a training run.
+    not of the shape in its configuration.
     """
     folder = find_policy(name)
-    if not (folder / MANIFEST).exists() and is_run_folder(Path(newest_run(folder))):
-        raise PolicyError(f"{folder}: a run's folder, not a policy's: export it first with jumper export {folder}")
     checksums = _verified_checksums(folder)
     config = _parse_json(folder / CONFIG, _read_verified(folder / CONFIG, checksums[CONFIG]))
     _check_version(folder / CONFIG, config)
     data = _read_verified(folder / ONNX, checksums[ONNX])
     try:
         interface = PolicyInterface.from_json(config.get("interface"))
-        return policy_from_onnx(data, interface, config).to(device)
+        return policy_from_onnx(data, interface, config)
     except PolicyError as error:
         raise PolicyError(f"{folder}: {error}") from error
 

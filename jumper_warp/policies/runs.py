@@ -14,7 +14,7 @@ import torch
 
 from jumper_warp.envs.vec_env import RAW_LIMIT
 from jumper_warp.policies.catalog import newest_run
-from jumper_warp.policies.folder import load_policy
+from jumper_warp.policies.folder import read_policy
 from jumper_warp.policies.policy import Policy
 from jumper_warp.policies.spec import PolicyError, make_interface
 from jumper_warp.rl import checkpoint as checkpoints
@@ -56,6 +56,11 @@ def _rsl_rl_checkpoints(folder: Path) -> list[Path]:
     return [found[iteration] for iteration in sorted(found)]
 
 
+def load_policy(name: str | Path, device: str | torch.device = "cpu") -> Policy:
+    """Return a policy on a device; name and errors: as `open_policy`."""
+    return open_policy(name).to(device)
+
+
 def open_policy(source: str | Path, *, newest: bool = False) -> Policy:
     """Return a policy; source: name or folder of a policy, path of a checkpoint, or folder of a training run.
 
@@ -66,7 +71,7 @@ def open_policy(source: str | Path, *, newest: bool = False) -> Policy:
     """
     source = newest_run(source)
     if not is_run(source):
-        return load_policy(source)
+        return read_policy(source)
     path = Path(source)
     if path.suffix != ".pt" and (theirs := _rsl_rl_checkpoints(path)):
         path = theirs[-1]

@@ -7,14 +7,17 @@ import operator
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import warp as wp
+
 from jumper_warp.kernels.mdp.env import NoSettings, Scene, SkillSettings
-from jumper_warp.kernels.mdp.parameters import RobotParameters
+from jumper_warp.kernels.mdp.random import RngStream
 from jumper_warp.kernels.mdp.starts import MIN_LINK_DISTANCE
 from jumper_warp.kernels.mdp.terminations import diverged, too_long
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
 from jumper_warp.robot.gravity import EARTH, check_gravity
 from jumper_warp.robot.motors import FilterCfg, MotorCfg
-from jumper_warp.tasks.copying import Copyable
+from jumper_warp.tasks.copying import Copyable, Struct
+from jumper_warp.tasks.functions import check_result, check_values, place_of, shown_type
 from jumper_warp.tasks.params import TaskParams
 from jumper_warp.tasks.randomization import RandomizationCfg
 from jumper_warp.tasks.ranges import Pair
@@ -28,7 +31,7 @@ from jumper_warp.tasks.terms import (
     Term,
     TerminationTerm,
 )
-from jumper_warp.utils.checks import MOST_SETTING, check_bounds
+from jumper_warp.utils.checks import MOST_SETTING, NAME, check_bounds, check_types
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Function
 
@@ -127,16 +130,21 @@ class TaskCfg(Copyable):
     """Names of the observation groups."""
 
     def __post_init__(self) -> None:
-        """Raise InputError if terms share a name, a function does not fit the state, or a setting is out of range."""
+        """Raise InputError for a setting of a wrong type or size, or a function or struct that does not fit the task.
+
+        Own functions are compiled as far as file and line of an error need it.
+        """
+        check_types(f"{self.name}:", self)
+        if not NAME.fullmatch(self.name):
+            raise InputError(f"a task's name may contain letters, digits, _ . - and spaces, got {self.name!r:.60}")
+        self._check_structs()
         for section in ("rewards", "terminations", "observations.actor", "observations.critic", "events"):
             names = [term.name for term in operator.attrgetter(section)(self)]
             if len(set(names)) < len(names):
                 raise InputError(f"{self.name} {section}: names of terms must be unique, got {names}")
-        for section, slots in self.params.slots.items():
-            for term in (slot.term for slot in slots):
-                if term.of_state not in (Any, self.state):
-                    wanted = f"is for {term.of_state.key}, not {self.state.key}"
-                    raise InputError(f"{self.name} {section}: {term.name} {wanted}")
+        for slots in self.params.slots.values():
+            for slot in slots:
+                slot.term.check(self.state)
         self._check_functions()
         if diverged not in [term.func for term in self.terminations]:
             raise InputError(f"{self.name} needs the termination diverged, which ends diverged simulations")
@@ -150,38 +158,35 @@ class TaskCfg(Copyable):
         """Return the task with collision margins of 0 m, as in evaluation."""
         return replace(self, self_collision_margin=0.0, obstacle_margin=0.0)
 
-    def _check_functions(self) -> None:
-        """Raise InputError if functions of reset, command or curriculum take structs of another task."""
+    def _check_structs(self) -> None:
+        """Raise InputError if the state, the settings of the reset or a level is no struct for kernels."""
+        if not isinstance(self.state, Struct):
+            raise InputError(f"{self.name}: state must be a @wp.struct, got {self.state!r:.60}")
+        steps = self.state.vars.get("steps")
+        if steps is None or steps.type not in (int, wp.int32):
+            missing = f"the state {shown_type(self.state)} of {self.name} needs a field steps: int"
+            raise InputError(f"{place_of(self.state)}: {missing}, the policy steps of the episode")
+        if self.reset.settings is not None:
+            check_values(f"{self.name} reset.settings", self.reset.settings, 1.0 / 60.0)  # [s]
+        for i, level in enumerate(self.levels):
+            check_values(f"{self.name} levels[{i}]", level)
         if len({level.struct for level in self.levels}) > 1:
             raise InputError(f"{self.name}: all levels must be of one type")
-        state, level = self.state, self.level_type
-        expected = {  # by place: the function, and the struct of each argument by its index
-            "reset": (self.reset.func, {3: state, 4: self.settings_type, 5: level}),
-            "command set": (self.command.set, {2: state}),
-            "command resample_due": (self.command.resample_due, {0: state}),
-            "command resample": (self.command.resample, {2: state, 3: level}),
-            "curriculum counts": (self.curriculum.options["counts"], {0: state}),
-        }
-        for where, (func, structs) in expected.items():
-            if func is None:
-                continue
-            types = list(func.input_types.values())
-            for index, struct in structs.items() if types else ():
-                actual = types[index] if len(types) > index else None
-                if actual not in (Any, struct):
-                    argument = f"argument {index + 1} of {func.key} is {getattr(actual, 'key', actual)}"
-                    raise InputError(f"{self.name} {where}: {argument}, the task has {struct.key}")
 
-    def check_returned(self) -> None:
-        """Raise InputError if a function of a term returns a type that the term cannot use; names file and line."""
-        for slots in self.params.slots.values():
-            for slot in slots:
-                try:
-                    slot.term.check_returned(self.state)
-                except InputError:
-                    raise
-                except Exception:  # another error of the function, which the compilation reports
-                    continue
+    def _check_functions(self) -> None:
+        """Raise InputError if a function of reset, command or curriculum does not fit the task."""
+        state, level, command = self.state, self.level_type, self.command
+        reset = (RobotArrays, Scene, SkillSettings, state, self.settings_type, level, RngStream)
+        robot = (RobotView, Scene, state)
+        for where, func, takes, returns in (
+            ("reset", self.reset.func, reset, state),
+            ("command.set", command.set, (*robot, wp.vec4, wp.float32), state),
+            ("command.resample_due", command.resample_due, (state,), wp.bool),
+            ("command.resample", command.resample, (*robot, level, RngStream), state),
+            ("curriculum.counts", self.curriculum.options["counts"], (state,), wp.bool),
+        ):
+            if func is not None:
+                check_result(f"{self.name} {where}", func, takes, returns)
 
     @functools.cached_property
     def params(self) -> TaskParams:
@@ -226,13 +231,6 @@ class TaskCfg(Copyable):
     def level_type(self) -> Any:
         """The `@wp.struct` of a curriculum level; `NoSettings` if there are no levels."""
         return self.levels[0].struct if self.levels else NoSettings
-
-    @property
-    def fields(self) -> dict[str, tuple[str, ...]]:
-        """Names of the fields of the structs that the task's functions use, by name of the struct."""
-        structs: tuple[Any, ...] = (self.state, self.level_type, self.settings_type, RobotView, RobotArrays)
-        structs += (RobotParameters, Scene, SkillSettings)
-        return {struct.key.rsplit(".", 1)[-1]: tuple(struct.vars) for struct in structs}
 
     def with_terms(self, section: str, **changes: dict[str, Any]) -> TaskCfg:
         """Return a copy of the task with changed terms; changes: new numbers and options, by name of the term.
@@ -282,3 +280,10 @@ class Handover(Copyable):
     begin: Function
     """Function that begins the target task: @wp.func (robot, state of source) -> state of target; then `Command.set`
     if the request has a command."""
+
+    def __post_init__(self) -> None:
+        """Raise InputError if a field has a wrong type, or a function does not fit the states of the tasks."""
+        check_types("handover:", self)
+        source, where = self.source.state, f"handover from {self.source.name} to {self.target.name},"
+        check_result(f"{where} when", self.when, (RobotView, source, wp.bool), wp.bool)
+        check_result(f"{where} begin", self.begin, (RobotView, source), self.target.state)

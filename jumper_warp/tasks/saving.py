@@ -25,6 +25,7 @@ from jumper_warp.tasks.ranges import Pair
 from jumper_warp.tasks.terms import RewardTerm, Term
 from jumper_warp.utils.checks import FLOAT32_MAX, NAME, in_float32, version_error
 from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.sources import with_neighbours
 
 VERSION = 4  # of the saved format
 OPTIONAL = ("rewards", "critic", "events")  # sections that only training needs
@@ -105,8 +106,8 @@ class Finder:
     """Look-up of functions and types by `module:name`, in the project's modules and the user's."""
 
     def __init__(self, modules: Iterable[ModuleType] = ()) -> None:
-        """Look names up in the project's modules and in `modules`, the user's loaded ones."""
-        self.modules = {module.__name__: module for module in modules}
+        """Look names up in the project's modules, in `modules`, the user's loaded ones, and in their neighbours."""
+        self.modules = {module.__name__: module for module in with_neighbours(list(modules))}
 
     def __call__(self, name: Any, where: str) -> Any:
         """Return the Warp function, struct, dataclass or subclass of `Term` called `name`; where: place for messages.
@@ -168,8 +169,6 @@ def _build(kind: type, saved: dict[str, Any], where: str, find: Finder) -> Any:
         if name not in saved and spec.default is spec.default_factory is dataclasses.MISSING:
             raise TaskError(f"{where}.{name} is missing")
     values = {name: _value(value, hints[name], f"{where}.{name}", find) for name, value in saved.items()}
-    if kind is TaskCfg:
-        _check_kernel_types(values)
     try:
         return kind(**values)
     except ValueError as error:
@@ -274,18 +273,3 @@ def _word(hint: Any) -> str:
     if isinstance(hint, type) and (dataclasses.is_dataclass(hint) or issubclass(hint, Term)):
         return f"settings by name, a {hint.__name__}"
     return getattr(hint, "__name__", str(hint))
-
-
-def _check_kernel_types(task: dict[str, Any]) -> None:
-    """Raise TaskError unless a task's name is valid and kernels accept its state, reset settings and levels."""
-    if not NAME.fullmatch(task["name"]):
-        raise TaskError(f"task.name may contain letters, digits, _ . - and spaces, got {task['name']!r:.60}")
-    if not isinstance(task["state"], Struct) or "steps" not in task["state"].vars:
-        raise TaskError("task.state must be a @wp.struct with a field steps")
-    levels, settings = task.get("levels", ()), task["reset"].settings
-    checked = [] if settings is None else [("reset.settings", settings)]
-    for where, value in [*checked, *((f"levels[{i}]", level) for i, level in enumerate(levels))]:
-        if not isinstance(getattr(value, "struct", None), Struct) or not callable(getattr(value, "values", None)):
-            raise TaskError(f"task.{where}: {shown(value)} must have the attributes struct and values()")
-    if len({type(level) for level in levels}) > 1:
-        raise TaskError("task.levels must all be of one type")

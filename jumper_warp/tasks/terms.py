@@ -9,16 +9,18 @@ from __future__ import annotations
 import inspect
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any, ClassVar, cast, get_type_hints
+from typing import Any, ClassVar, get_type_hints
 
 import warp as wp
 
 from jumper_warp.kernels.mdp.events import AT_RESET, AT_STEP, MODES
 from jumper_warp.kernels.mdp.parameters import RobotParameters
+from jumper_warp.kernels.mdp.random import RngStream
 from jumper_warp.kernels.mdp.step import every_episode
 from jumper_warp.kernels.mdp.view import RobotArrays, RobotView
+from jumper_warp.kernels.terrain.ground import Ground
 from jumper_warp.tasks.copying import Copyable
+from jumper_warp.tasks.functions import check_function, place_of, shown_type
 from jumper_warp.utils.errors import InputError
 from jumper_warp.utils.kernels import Function
 
@@ -34,33 +36,15 @@ MAX_HISTORY = 1000  # Largest number of frames of an observation term
 MOTORS = tuple(f"{leg}_{motor}" for leg in LEGS for motor in ("lateral", "outer", "inner"))
 
 
-def place_of(func: Function) -> str:
-    """Return file and line of a Warp function, as `my_task.py:12`, for messages."""
-    python: Any = cast("wp.Function", func).func
-    code = python.__code__
-    return f"{Path(code.co_filename).name}:{code.co_firstlineno}"
-
-
-def shown_type(kind: Any) -> str:
-    """Return the name of a return type for messages, such as `int32`, `vec3f` or `nothing`."""
-    if kind in (None, type(None)):
-        return "nothing"
-    scalar = getattr(kind, "_wp_scalar_type_", None)
-    if scalar and hasattr(kind, "_length_"):
-        return f"a vector of {kind._length_}"
-    return getattr(kind, "__name__", None) or getattr(kind, "key", str(kind))
-
-
 class Term(Copyable):
     """Part of a task, such as a reward or a termination: a Warp function and values of its parameters.
 
     Equal terms have the same function, name, numbers and options.
     """
 
-    context: int = 2
-    """Number of leading arguments that the kernel passes; the others are the term's numbers."""
-    takes: ClassVar[tuple[Any, ...]] = (RobotView,)
-    """Allowed types of the first argument."""
+    takes: ClassVar[tuple[tuple[Any, ...], ...]] = ((RobotView, Any),)
+    """Allowed types of the leading arguments, which the kernel passes; Any: the task's state. The first argument
+    decides. All other arguments are the term's numbers."""
     returns: ClassVar[tuple[Any, ...]] = ()
     """Allowed return types; empty: any."""
     settings: ClassVar[dict[str, Any]] = {}
@@ -81,7 +65,7 @@ class Term(Copyable):
         where = f"{kind} {self.name}"
         self._check_types(f"{place_of(func)}: {where}")
         python: Any = func.func
-        params = list(inspect.signature(python).parameters.values())[self.context :]
+        params = list(inspect.signature(python).parameters.values())[len(self._leading()) :]
         known = self.settings | {p.name: p.default for p in params}
         if len(known) < len(self.settings) + len(params) or set(known) & {"func", "name", *self.options}:
             raise InputError(
@@ -107,9 +91,8 @@ class Term(Copyable):
 
     def _check_types(self, where: str) -> None:
         """Raise InputError unless the function's first argument is in `takes` and its result in `returns`."""
-        first = next(iter(self.func.input_types.values()), None)
-        if first is not Any and first not in self.takes:
-            takes = " or ".join(kind.key for kind in self.takes)
+        if not self._leading():
+            takes = " or ".join(kinds[0].key for kinds in self.takes)
             raise InputError(f"{where}: the first argument of the function must be annotated {takes}")
         try:
             returned = get_type_hints(self.func.func).get("return", REQUIRED)
@@ -119,8 +102,13 @@ class Term(Copyable):
             annotated = shown_type(returned)
             raise InputError(f"{where}: the function must return {self.returned}, its annotation is {annotated}")
 
-    def _may_return(self, kind: Any) -> bool:
-        """Return whether the term's function may return values of a type."""
+    def _leading(self) -> tuple[Any, ...]:
+        """Return the entry of `takes` that fits the first argument of the term's function; empty: none does."""
+        first = next(iter(self.func.input_types.values()), None)
+        return next((kinds for kinds in self.takes if first in (Any, kinds[0])), ())
+
+    def _may_return(self, kind: Any, state: Any = Any) -> bool:
+        """Return whether the function of a term of a task with this `state` may return values of a type."""
         return not self.returns or kind in self.returns
 
     @property
@@ -128,19 +116,11 @@ class Term(Copyable):
         """Type that the term's function must return, in words."""
         return self.returns[0].__name__ if self.returns else "any type"
 
-    def check_returned(self, state: Any) -> None:
-        """Raise InputError if Warp infers another return type of the function than it must have.
-
-        It explains an error of a kernel's compilation. state: the task's `@wp.struct`.
-        """
-        func: Any = self.func
-        types = [state if kind is Any else kind for kind in func.input_types.values()]
-        overload = func.get_overload(types, {})
-        overload.build(None)
-        actual = overload.value_func(None, None)
-        if not self._may_return(actual):
-            where = f"{place_of(self.func)}: {type(self).__name__} {self.name}"
-            raise InputError(f"{where}: the function must return {self.returned}, it returns {shown_type(actual)}")
+    def check(self, state: Any) -> None:
+        """Raise InputError unless the term's function fits the task's `state`, a `@wp.struct`, and can be compiled."""
+        takes = [state if kind is Any else kind for kind in self._leading()] + [wp.float32] * self.num_params
+        where = f"{type(self).__name__} {self.name}"
+        check_function(where, self.func, takes, self.returned, lambda kind: self._may_return(kind, state))
 
     def replace(self, **changes: Any) -> Any:
         """Return a copy of the term with changed function, name, numbers or options.
@@ -160,11 +140,6 @@ class Term(Copyable):
             pair = isinstance(value, tuple)
             flat |= {f"{key}.lower": value[0], f"{key}.upper": value[1]} if pair else {key: value}
         return flat
-
-    @property
-    def of_state(self) -> Any:
-        """Type of the function's argument `state`: a task's `@wp.struct`, or Any."""
-        return self.func.input_types.get("state", Any)
 
     def arguments(self) -> dict[str, Any]:
         """Return the arguments of the constructor that make an equal term."""
@@ -225,11 +200,9 @@ class ObservationTerm(Term):
 
     settings: ClassVar = {"noise": 0.0, "noise_limit": 1.0, "scale": 1.0, "clip": 100.0}
     options: Mapping[str, Any] = {"history": 1, "delayed": False}
-    takes: ClassVar = (RobotView, RobotParameters, RobotArrays)
+    takes: ClassVar = ((RobotView, Any), (RobotParameters, wp.int32), (RobotArrays, Ground, wp.int32))
 
     def __init__(self, func: Function, **values: Any) -> None:
-        if isinstance(func, wp.Function) and RobotArrays in func.input_types.values():
-            self.context = 3  # arrays, ground, world
         super().__init__(func, **values)
         if "return" not in get_type_hints(self.func.func):
             where = f"{place_of(self.func)}: ObservationTerm {self.name}"
@@ -242,7 +215,7 @@ class ObservationTerm(Term):
                 limits = f"{low:g} to {high:g}, got {self.numbers[key]:.6g}"
                 raise InputError(f"ObservationTerm {self.name}: {key} must be in {limits}")
 
-    def _may_return(self, kind: Any) -> bool:
+    def _may_return(self, kind: Any, state: Any = Any) -> bool:
         """Return whether the function may return values of a type: a number or a vector."""
         vector = hasattr(kind, "_length_") and getattr(kind, "_wp_scalar_type_", None) is wp.float32
         return kind in (float, wp.float32) or vector
@@ -282,7 +255,7 @@ class EventTerm(Term):
 
     settings: ClassVar = {"interval_range_s": (0.0, 0.0)}
     options: Mapping[str, Any] = {"mode": "reset", "update_solver": True, "parallel": False}
-    takes: ClassVar = (RobotParameters,)
+    takes: ClassVar = ((RobotParameters, RngStream),)
 
     def __init__(self, func: Function, **values: Any) -> None:
         super().__init__(func, **values)
@@ -307,9 +280,9 @@ class Advance(Term):
     Function: (robot: RobotView, state, ...) -> state.
     """
 
-    def _may_return(self, kind: Any) -> bool:
-        """Return whether the function may return values of a type: a `@wp.struct`."""
-        return kind is Any or hasattr(kind, "vars")
+    def _may_return(self, kind: Any, state: Any = Any) -> bool:
+        """Return whether the function may return values of a type: the state, or if it is unknown a `@wp.struct`."""
+        return kind in (Any, state) or (state is Any and hasattr(kind, "vars"))
 
     @property
     def returned(self) -> str:

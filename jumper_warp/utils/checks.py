@@ -2,11 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+import functools
 import math
 import re
 from collections.abc import Mapping
-from numbers import Integral
-from typing import TYPE_CHECKING, Any
+from numbers import Integral, Real
+from types import UnionType
+from typing import TYPE_CHECKING, Any, Union, get_args, get_origin, get_type_hints
 
 from jumper_warp.utils.errors import InputError
 
@@ -72,6 +75,55 @@ def check_count(name: str, value: Any, most: int = MOST_WORLDS) -> None:
     """Raise InputError unless the value is an integer from 1 to `most`, and not a bool."""
     if isinstance(value, bool) or not isinstance(value, Integral) or not 1 <= int(value) <= most:
         raise InputError(f"{name} must be a whole number of 1 to {most}, got {value!r:.40}")
+
+
+def check_types(section: str, cfg: Any) -> None:
+    """Raise InputError for a field of a dataclass, or of one that it contains, whose type is not the annotated one.
+
+    section: name of `cfg`, for messages. Annotations that Python cannot evaluate, or of other kinds, accept anything.
+    """
+    hints = _hints(type(cfg))
+    for spec in dataclasses.fields(cfg):
+        value = getattr(cfg, spec.name)
+        if not _fits(value, hints.get(spec.name, Any)):
+            raise InputError(f"{section} {spec.name} must be {_shown(hints[spec.name])}, got {value!r:.60}")
+        for part in value if isinstance(value, tuple) else (value,):
+            if dataclasses.is_dataclass(part) and not isinstance(part, type):
+                check_types(f"{section} {spec.name}", part)
+
+
+@functools.cache
+def _hints(kind: type) -> dict[str, Any]:
+    """Return the evaluated annotations of a dataclass, empty if one cannot be evaluated."""
+    try:
+        return get_type_hints(kind)
+    except (NameError, TypeError):
+        return {}
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    """Return whether a value has an annotated type."""
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return any(_fits(value, part) for part in parts)
+    if origin is tuple:
+        if isinstance(value, tuple) and parts[-1:] == (Ellipsis,):
+            return all(_fits(part, parts[0]) for part in value)
+        return isinstance(value, tuple) and len(value) == len(parts) and all(map(_fits, value, parts))
+    if hint in (float, int):
+        return isinstance(value, Real if hint is float else Integral) and not isinstance(value, bool)
+    return hint is Any or not isinstance(hint, type) or isinstance(value, hint)
+
+
+def _shown(hint: Any) -> str:
+    """Return an annotated type for messages, as `(float, float)` or `(RewardTerm, ...)`."""
+    origin, parts = get_origin(hint), get_args(hint)
+    if origin in (Union, UnionType):
+        return " or ".join(map(_shown, parts))
+    if origin is tuple:
+        return f"({', '.join(map(_shown, parts))})"
+    name = "..." if hint is Ellipsis else "None" if hint is type(None) else getattr(hint, "__name__", str(hint))
+    return "a @wp.func" if name == "Function" else name
 
 
 def check_bounds(section: str, cfg: Any, bounds: Mapping[str, tuple[float, float, str]]) -> None:

@@ -4,31 +4,65 @@ from __future__ import annotations
 
 import hashlib
 import importlib.util
+import os
+import re
 import sys
-from collections.abc import Iterator
+import traceback
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from types import ModuleType
 from typing import Any
 
+from jumper_warp.utils.errors import InputError
+
+PLACE = re.compile(r"\S+\.py:\d+[:,]")  # File and line at the start of a message
 PROJECT_PREFIX = "jumper_warp."  # Prefix of the project's modules, whose content the commit identifies
 
 
 def module_from_file(name: str, path: str | Path) -> ModuleType:
     """Import a file as a module with the given name, and return it; after an exception the name is free again.
 
+    As for a program, the file can import its neighbours while it runs.
     Raises ImportError: the file's name does not end in .py.
     """
     spec = importlib.util.spec_from_file_location(name, path)
     if spec is None or spec.loader is None:
         raise ImportError(f"{Path(path).name}: the name of a module's file must end in .py")
     module = importlib.util.module_from_spec(spec)
-    sys.modules[name] = module
+    sys.modules[name], folder = module, str(Path(path).resolve().parent)
+    sys.path.insert(0, folder)
     try:
         spec.loader.exec_module(module)
     except BaseException:
         del sys.modules[name]
         raise
+    finally:
+        sys.path.remove(folder)
     return module
+
+
+def with_neighbours(modules: Sequence[ModuleType]) -> list[ModuleType]:
+    """Return a user's modules, then the loaded modules from the folders of their files, which they may have imported.
+
+    Folders of installed packages are left out.
+    """
+    files = {file: module for module in modules if (file := getattr(module, "__file__", None))}
+    folders = {os.path.dirname(file) for file in files if os.path.basename(os.path.dirname(file)) != "site-packages"}
+    near = []
+    for name, module in list(sys.modules.items()):
+        file, path = getattr(module, "__file__", None), name.replace(".", os.sep)
+        if file not in files and any(file in (f"{f}/{path}.py", f"{f}/{path}/__init__.py") for f in folders):
+            near.append(module)
+    return [*modules, *near]
+
+
+def own_fault(error: Exception, path: str) -> InputError:
+    """Return an exception as InputError with the line of a file that caused it; path: the file, as in tracebacks."""
+    message = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+    lines = [line for frame, line in traceback.walk_tb(error.__traceback__) if frame.f_code.co_filename == path]
+    if not lines or PLACE.match(message):
+        return InputError(message)
+    return InputError(f"{Path(path).name}:{lines[-1]}: {message}")
 
 
 def source_checksums(saved: Any) -> dict[str, str]:

@@ -1,7 +1,6 @@
 import dataclasses
 import json
 import os
-import re
 import shutil
 import subprocess
 import sys
@@ -23,10 +22,9 @@ from jumper_warp.envs.env import Env
 from jumper_warp.evaluation.commands import PlayCfg, viewer_command
 from jumper_warp.evaluation.heights import HeightFlags, HeightPlayFlags
 from jumper_warp.evaluation.landings import LandingFlags, LandingPlayFlags
-from jumper_warp.policies.folder import load_policy, save_policy
+from jumper_warp.policies.folder import save_policy
 from jumper_warp.policies.restore import restored_task
-from jumper_warp.policies.runs import open_policy
-from jumper_warp.policies.spec import PolicyError
+from jumper_warp.policies.runs import load_policy, open_policy
 from jumper_warp.registry import TASKS, WALKING, make_task
 from jumper_warp.rl.cfg import PpoCfg
 from jumper_warp.rl.checkpoint import CheckpointError
@@ -403,10 +401,10 @@ def test_log_folder_of_a_task_stands_for_its_newest_run(trained_run, tmp_path, c
 
 
 @pytest.mark.parametrize("folder", [".", ".."])
-def test_loading_a_run_as_a_policy_names_the_export_command(trained_run, folder):
-    folder = trained_run / folder
-    with pytest.raises(PolicyError, match=f"a run's folder, not a policy's: .*jumper export {re.escape(str(folder))}$"):
-        load_policy(folder)
+def test_run_or_log_folder_is_loaded_as_the_policy_of_its_best_checkpoint(trained_run, folder):
+    policy, same = load_policy(trained_run / folder), open_policy(trained_run)
+    assert policy.interface == same.interface and policy.config["iteration"] == 2
+    assert all(np.array_equal(policy.tensors()[name], tensor) for name, tensor in same.tensors().items())
 
 
 def test_evaluate_writes_metrics_and_saves_them_to_the_policy(trained_run, tmp_path, capsys):

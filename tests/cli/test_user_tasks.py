@@ -13,13 +13,12 @@ from jumper_warp.cli import main as cli
 from jumper_warp.cli.main import split_task_modules
 from jumper_warp.cli.train import check_saving, command_line
 from jumper_warp.kernels.jump import rewards
-from jumper_warp.policies.folder import load_policy
 from jumper_warp.policies.restore import restored_task
-from jumper_warp.policies.runs import open_policy
+from jumper_warp.policies.runs import load_policy, open_policy
 from jumper_warp.policies.spec import PolicyError
 from jumper_warp.registry import TASKS, load_task_module, make_task
 from jumper_warp.rl.checkpoint import save_checkpoint
-from jumper_warp.tasks.saving import TaskError
+from jumper_warp.tasks.saving import TaskError, task_from_json, task_to_json
 
 LEVEL_JUMP = Path(__file__).parents[1] / "helpers" / "level_jump.py"
 TASK = '''\
@@ -156,6 +155,34 @@ def test_list_shows_installed_tasks_and_errors_of_others(capsys, tmp_path, monke
     assert "task bad-jump of package their-tasks is left out: ZeroDivisionError: division by zero" in err
 
 
+@pytest.mark.parametrize(("doc", "head"), [("Only what a training needs is this file's.", True), ("", False)])
+def test_info_of_a_users_task_has_its_module_and_its_description_once(capsys, path, tmp_path, doc, head):
+    file = tmp_path / "my_jumps.py"
+    file.write_text(TASK.replace("Only what a training needs is this file's.", doc))
+    code, out, err = run(capsys, "info", "tame-jump", "--task-module", str(file))
+    assert (code, err) == (0, [])
+    lines = [line.rstrip() for line in out.splitlines()]
+    assert f"train         jumper train tame-jump --task-module {file}" in lines
+    assert lines[0] == ("tame-jump: Only what a training needs is this file's" if head else "tame-jump")
+    assert out.count("Only what") == head and "." not in lines and lines[2].startswith("observation")
+
+
+def test_functions_of_a_neighbour_are_saved_and_found_again(capsys, tmp_path):
+    (tmp_path / "my_jumps.py").write_text(
+        TASK.replace("@wp.func\ndef too_high", "from my_ends import too_high\n\n\ndef unused")
+    )
+    end = TASK[TASK.index("@wp.func\ndef too_high") : TASK.index("def tame_jump")]
+    (tmp_path / "my_ends.py").write_text(TASK[: TASK.index("@wp.func")] + end)
+    sys.modules.pop("my_ends", None)
+    before = list(sys.path)
+    module = load_task_module(str(tmp_path / "my_jumps.py"))
+    saved = task_to_json(make_task("low-jump"))
+    assert saved["terminations"][-1]["func"] == "my_ends:too_high" and sys.path == before
+    assert task_from_json(saved, [module]) == make_task("low-jump")
+    with pytest.raises(TaskError, match="needs 'my_ends:too_high'"):
+        task_from_json(saved | {"rewards": [], "events": [], "observations": saved["observations"] | {"critic": []}})
+
+
 def test_help_lists_flags_of_the_users_task(capsys, path):
     code, out, _ = run(capsys, "train", "Tame", "--task-module", path, "--help-all")
     assert code == 0 and "--env.rewards.base-at-rest.height FLOAT" in out and "--env.events.slow.lower FLOAT" in out
@@ -278,13 +305,18 @@ def test_refuses_run_of_an_older_version(capsys, tmp_path, task, command):
         ("weight=2.0, ", "", "own_faults.py:{line}: TypeError: RewardTerm.__init__() missing"),
         ("tilt(robot)", "tilt(robot.quad)", "function level: RobotView has no field 'quad'; did you mean 'quat'?"),
         ("tilt(robot)", "tlt(robot)", "own_faults.py:{use}, function level: "),
+        ('task, name="own', 'task, action_scale=15.0, name="own',
+         "own_faults.py:{line}: own-faults: action_scale must be (float, float), got 15.0"),
+        ("RewardTerm(level", "RewardTerm(kept", "own_faults:level cannot be saved: define it under this name"),
     ],
-)
-def test_error_in_a_users_file_prints_one_line(right, wrong, message, tmp_path, monkeypatch, capsys):
+)  # fmt: skip
+@pytest.mark.parametrize("command", ["train", "info"])
+def test_error_in_a_users_file_prints_one_line(command, right, wrong, message, tmp_path, monkeypatch, capsys):
     text = LEVEL_JUMP.read_text(encoding="utf-8").replace("level-jump", "own-faults")
     assert right in text
     path = tmp_path / "own_faults.py"
-    path.write_text(text.replace(right, wrong, 1))
+    end = "\nkept, level = level, None\n" if "kept" in wrong else ""
+    path.write_text(text.replace(right, wrong, 1).replace("\n\nregister", f"{end}\nregister"))
     rows = text.splitlines()
     line, use = (
         next(i for i, row in enumerate(rows, 1) if part in row) for part in ("RewardTerm(level", "tilt(robot)")
@@ -292,8 +324,9 @@ def test_error_in_a_users_file_prints_one_line(right, wrong, message, tmp_path, 
     monkeypatch.delitem(sys.modules, "own_faults", raising=False)
     before = dict(TASKS)
     args = [*"--device cpu --num-envs 4 --max-iterations 1".split(), "--log-root", str(tmp_path)]
+    args = args if command == "train" else []
     try:
-        code, _, err = run(capsys, "train", "own-faults", "--task-module", str(path), *args)
+        code, _, err = run(capsys, command, "own-faults", "--task-module", str(path), *args)
     finally:
         TASKS.clear()
         TASKS.update(before)

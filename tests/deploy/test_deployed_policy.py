@@ -15,8 +15,8 @@ import pytest
 from jumper_warp.deploy.policy import DeployedPolicy, JumpCommand
 from jumper_warp.policies.catalog import find_policy
 from jumper_warp.policies.conditions import Conditions, env_of_policy
-from jumper_warp.policies.folder import load_policy
 from jumper_warp.policies.onnx import export_onnx
+from jumper_warp.policies.runs import load_policy
 from jumper_warp.robot.motors import jumping_motors
 from jumper_warp.sim.simulation import Simulation, motor_values
 from jumper_warp.utils.errors import InputError

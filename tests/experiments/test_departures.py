@@ -11,7 +11,7 @@ from experiments import departures
 from jumper_warp.cli.train import parse_train
 from jumper_warp.evaluation.jumps import TERMINATIONS, jump_commands
 from jumper_warp.policies.conditions import Conditions, env_of_policy
-from jumper_warp.policies.folder import load_policy
+from jumper_warp.policies.runs import load_policy
 from jumper_warp.registry import make_task
 from jumper_warp.tasks.saving import task_from_json, task_to_json
 from jumper_warp.utils.errors import InputError

@@ -13,7 +13,7 @@ from jumper_warp.cli.main import main as jumper
 from jumper_warp.evaluation.evaluations import EVALUATIONS
 from jumper_warp.evaluation.run import EvaluationRun
 from jumper_warp.policies.conditions import Conditions
-from jumper_warp.policies.folder import load_policy
+from jumper_warp.policies.runs import load_policy
 from jumper_warp.robot.overlay import with_springs
 from jumper_warp.utils.assets import POLICIES, policy_tasks
 from jumper_warp.utils.errors import InputError

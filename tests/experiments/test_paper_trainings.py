@@ -91,7 +91,7 @@ def test_finished_arms_are_skipped_and_the_table_names_gaps(tmp_path, monkeypatc
     rows = [line.split(" | ") for line in results_table(tmp_path).splitlines()[2:]]
     assert (tmp_path / "curves.webp").stat().st_size > 1000
     assert rows[0][3:5] == ["0.85 (0.8–0.9), 2 of 2 seeds", GAP]
-    assert rows[3][3] == "3 (2–4), 2 of 2 seeds" and rows[3][5] == NEVER
+    assert rows[4][3] == "3 (2–4), 2 of 2 seeds" and rows[4][5] == NEVER
 
 
 def test_the_page_has_the_table_of_the_committed_metrics():

@@ -24,9 +24,10 @@ from jumper_warp.cli.main import dispatch
 from jumper_warp.deploy.policy import JOINTS, DeployedPolicy
 from jumper_warp.evaluation.scripts import read_script
 from jumper_warp.identification.motions import RecordedMotion, load_motion
-from jumper_warp.policies.folder import add_files, load_policy, save_policy
+from jumper_warp.policies.folder import add_files, save_policy
 from jumper_warp.policies.onnx import onnx_model
 from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.runs import load_policy
 from jumper_warp.policies.spec import PolicyInterface, checksum_entry
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.rl.checkpoint import best_checkpoint, load_checkpoint, save_checkpoint
@@ -276,7 +277,7 @@ def module_reader(folder):
         try:
             with contextlib.redirect_stdout(printed):
                 dispatch(["info", "boundary-jump", "--task-module", str(where / "boundary_tasks.py")])
-            return printed.getvalue()
+            return printed.getvalue().replace(str(where), "FOLDER")
         finally:
             sys.modules.pop("boundary_tasks", None)
             TASKS.clear()

@@ -14,9 +14,10 @@ import torch
 
 from jumper_warp.policies import catalog
 from jumper_warp.policies.catalog import find_policy
-from jumper_warp.policies.folder import add_files, load_policy, save_policy
+from jumper_warp.policies.folder import add_files, save_policy
 from jumper_warp.policies.onnx import export_onnx, onnx_bytes
 from jumper_warp.policies.policy import Policy
+from jumper_warp.policies.runs import load_policy
 from jumper_warp.policies.spec import PolicyError, PolicyInterface
 from jumper_warp.rl.networks import ActorCritic, linear_layers
 from jumper_warp.robot.motors import vertical_jump_filter

@@ -138,7 +138,7 @@ def test_refuses_a_function_that_is_not_a_termination(saved, name, prefix):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda t: t.update(name=""), "task.name may contain letters"),
+        (lambda t: t.update(name=""), "a task.s name may contain letters"),
         (lambda t: t.pop("terminations"), "task.terminations is missing"),
         (lambda t: t["terminations"][1].update(func="os:system"), r"task.terminations\[1\] needs 'os:system'"),
         (

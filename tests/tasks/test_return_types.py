@@ -7,9 +7,10 @@ from typing import Any
 import pytest
 import warp as wp
 
-from jumper_warp.envs.env import Env
+from jumper_warp.kernels.jump.state import JumpState
 from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import make_task
+from jumper_warp.tasks.cfg import Handover
 from jumper_warp.tasks.terms import Advance, ObservationTerm, RewardTerm, TerminationTerm
 from jumper_warp.utils.errors import InputError
 
@@ -91,9 +92,27 @@ def test_wrong_annotation_is_refused_at_the_definition(kind, func, message):
     [(whole_unannotated, "int32"), (whole_as_float, "int32"), (vector_unannotated, "a vector of 3"),
      (text_unannotated, "str"), (nothing_unannotated, "nothing")],
 )  # fmt: skip
-def test_wrong_value_without_annotation_is_refused_when_kernels_are_compiled(func, returned):
-    task = dataclasses.replace(make_task("vertical-jump"), rewards=(RewardTerm(func, 1.0),))
+def test_wrong_value_without_annotation_is_refused_by_the_task(func, returned):
+    term = RewardTerm(func, 1.0)
     with pytest.raises(InputError) as refusal:
-        Env(task, 1, device="cpu")
+        dataclasses.replace(make_task("vertical-jump"), rewards=(term,))
     message = f"RewardTerm {func.key}: the function must return float, it returns {returned}"
     assert str(refusal.value) == place(func) + message
+
+
+@wp.func
+def may_switch(robot: RobotView, state: JumpState, requested: bool):
+    x = 1.0  # noqa: F841
+
+
+@wp.func
+def begin_jump(robot: RobotView, state: JumpState) -> JumpState:
+    return state
+
+
+def test_handover_whose_condition_returns_nothing_is_refused():
+    jump = make_task("vertical-jump")
+    with pytest.raises(InputError) as refusal:
+        Handover(jump, jump, may_switch, begin_jump)
+    subject = "handover from vertical-jump to vertical-jump, when may_switch"
+    assert str(refusal.value) == f"{place(may_switch)}{subject}: the function must return bool, it returns nothing"

@@ -11,7 +11,6 @@ import warp as wp
 
 import hold_height
 from jumper_warp.kernels.jump import rewards
-from jumper_warp.kernels.jump.state import JumpState
 from jumper_warp.kernels.mdp.view import RobotView
 from jumper_warp.registry import TASKS, make_task
 from jumper_warp.tasks.saving import MAX_ENTRIES, OPTIONAL, TaskError, json_value, name_of, task_from_json, task_to_json
@@ -152,9 +151,9 @@ def test_setting_that_json_cannot_restore_is_not_saved(value):
         (lambda t: t["rewards"][0].update(type="jumper_warp.tasks.terms:TerminationTerm"), "expected .* RewardTerm"),
         (lambda t: t["observations"]["actor"][0].update(history=10**9), "history must be at most"),
         (lambda t: t["advance"].update(func="jumper_warp.kernels.mdp.view:load_view"), "must be annotated RobotView"),
-        (lambda t: t.update(state="jumper_warp.kernels.mdp.env:NoSettings"), "@wp.struct with a field steps"),
+        (lambda t: t.update(state="jumper_warp.kernels.mdp.env:NoSettings"), "NoSettings of .* needs a field steps"),
         (lambda t: t["levels"].append({"type": "jumper_warp.robot.motors:LimitsCfg", "lower": 0.0, "upper": 1.0}),
-         r"task.levels\[6\]: .* must have the attributes struct and values"),
+         r"levels\[6\]: .* must have the attributes struct and values"),
         (lambda t: t.update(levels=t["levels"] * MAX_ENTRIES), f"expected at most {MAX_ENTRIES} entries"),
         (lambda t: t["reset"].update(settings={"type": "jumper_warp.robot.motors:LimitsCfg", "lower": 0, "upper": 1}),
          "must have the attributes struct and values"),
@@ -193,5 +192,5 @@ def test_json_without_version_or_fields_is_refused(content):
 def test_state_of_another_task_is_refused():
     content = saved(hold_height.hold_height())
     content["state"] = "jumper_warp.kernels.jump.state:JumpState"
-    with pytest.raises(TaskError, match=f"is for .*HoldState, not .*{JumpState.key}"):
+    with pytest.raises(TaskError, match="is HoldState, the task has JumpState"):
         task_from_json(content, [hold_height])

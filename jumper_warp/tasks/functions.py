@@ -1,0 +1,108 @@
+"""Checks of a task's Warp functions and structs, before a kernel is compiled."""
+
+from __future__ import annotations
+
+import functools
+import inspect
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import warp as wp
+
+from jumper_warp.tasks.copying import Struct
+from jumper_warp.utils.codegen import explained
+from jumper_warp.utils.errors import InputError
+from jumper_warp.utils.sources import PROJECT_PREFIX
+from jumper_warp.utils.threads import locked
+
+SAME = {float: wp.float32, int: wp.int32, bool: wp.bool}  # Warp's types by Python's
+
+
+def source_of(definition: Any) -> Any:
+    """Return the Python function or class of a Warp function or struct, or the class of an instance."""
+    if isinstance(definition, wp.Function):
+        return definition.func
+    return definition.cls if isinstance(definition, Struct) else type(definition)
+
+
+def place_of(definition: Any) -> str:
+    """Return file and line of a Warp function, a struct, or the class of an instance, as `my_task.py:12`."""
+    source = source_of(definition)
+    try:
+        return f"{Path(inspect.getsourcefile(source) or '').name}:{inspect.getsourcelines(source)[1]}"
+    except (OSError, TypeError):  # without a file, as in a terminal
+        return source.__module__
+
+
+def is_own(definition: Any) -> bool:
+    """Return whether a Warp function or struct, or the class of an instance, is defined outside the project."""
+    return not source_of(definition).__module__.startswith(PROJECT_PREFIX)
+
+
+def shown_type(kind: Any) -> str:
+    """Return the name of a type for messages, such as `int32`, `vec3f` or `nothing`."""
+    if kind in (None, type(None)):
+        return "nothing"
+    scalar = getattr(kind, "_wp_scalar_type_", None)
+    if scalar and hasattr(kind, "_length_"):
+        return f"a vector of {kind._length_}"
+    return getattr(kind, "__name__", None) or getattr(kind, "key", str(kind)).rsplit(".", 1)[-1]
+
+
+def check_function(
+    where: str, func: Any, takes: Sequence[Any], returns: str, may_return: Callable[[Any], bool]
+) -> None:
+    """Raise InputError, with file and line, unless a function takes arguments of types `takes` and returns a valid one.
+
+    The body is checked of functions from outside the project. where: part of the task, for messages. returns: type of
+    the result in words; may_return: whether a type is valid.
+    """
+    name, actual = func.key.rsplit(".", 1)[-1], list(func.input_types.values())
+    if len(actual) != len(takes):
+        wanted = f"must have {len(takes)} arguments ({', '.join(map(shown_type, takes))})"
+        raise InputError(f"{place_of(func)}: {where}: the function {wanted}, it has {len(actual)}")
+    for i, (kind, wanted) in enumerate(zip(actual, takes, strict=True), 1):
+        if isinstance(kind, Struct) or SAME.get(kind, kind) in SAME.values():
+            if SAME.get(kind, kind) is not SAME.get(wanted, wanted):
+                found = f"is {shown_type(kind)}, the task has {shown_type(wanted)}"
+                raise InputError(f"{place_of(func)}: {where}: argument {i} of {name} {found}")
+    if not is_own(func):
+        return
+    with explained(takes):
+        returned = _returned(func, tuple(takes))
+    if not may_return(returned):
+        found = f"the function must return {returns}, it returns {shown_type(returned)}"
+        raise InputError(f"{place_of(func)}: {where}: {found}")
+
+
+def check_result(where: str, func: Any, takes: Sequence[Any], returns: Any) -> None:
+    """Raise InputError as `check_function` unless a function returns the type `returns`."""
+    where = f"{where} {func.key.rsplit('.', 1)[-1]}"
+    check_function(where, func, takes, shown_type(returns), lambda kind: SAME.get(kind, kind) is returns)
+
+
+@functools.cache
+@locked
+def _returned(func: wp.Function, takes: tuple[Any, ...]) -> Any:
+    """Return the type that a function returns for arguments of types `takes`, None without a `return`."""
+    overload: Any = func.get_overload(list(takes), {})
+    if overload is None:
+        raise InputError(f"{place_of(func)}: {func.key} must take ({', '.join(map(shown_type, takes))})")
+    overload.build(None, overload.module.options)
+    if overload.native_snippet is None and not overload.adj.return_var:
+        return None
+    return overload.value_func(None, None)
+
+
+def check_values(where: str, settings: Any, *args: float) -> None:
+    """Raise InputError unless settings for kernels have a struct, of which `values(*args)` returns an instance."""
+    struct, values = getattr(settings, "struct", None), getattr(settings, "values", None)
+    if not isinstance(struct, Struct) or not callable(values):
+        raise InputError(f"{where}: {type(settings).__name__} must have the attributes struct and values()")
+    if is_own(settings):
+        with explained([struct]):
+            made = values(*args)
+        if getattr(made, "_cls", None) is not struct:
+            found = f"must return {shown_type(struct)}, it returns {type(made).__name__}"
+            raise InputError(f"{place_of(settings)}: {where}: values of {type(settings).__name__} {found}")
